@@ -74,7 +74,7 @@ paper: $(BIN)/.ok-dev
 
 FAULTS ?=
 
-# Runs the fault-injection tests of the archive (FAULTS="disk_full clocks" selects some). Half an hour.
+# Runs the fault-injection tests of the archive (FAULTS="disk_full flips" selects some). Half an hour.
 # `make test` runs a quick part of each.
 faults: $(BIN)/.ok-dev
 	OMP_NUM_THREADS=1 $(BIN)/python tests/faults $(FAULTS)

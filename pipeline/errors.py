@@ -125,10 +125,6 @@ class IncompleteStoreError(PipelineError, LookupError):
     """A store has no valid manifest, or its content does not match it."""
 
 
-class OldStoreError(IncompleteStoreError):
-    """A complete store has a version that this package does not read."""
-
-
 class WorkerError(PipelineError, RuntimeError):
     """Worker processes died, or the connection to their scheduler was lost."""
 

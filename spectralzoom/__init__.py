@@ -1,6 +1,6 @@
 """SpectralZoom from Python: survey a field, open what an archive holds as xarray, judge and train weights.
 
-Importing it loads nothing of weight: what a function needs is loaded when it is called.
+The import is light: functions load their modules when they are called.
 """
 
 from __future__ import annotations

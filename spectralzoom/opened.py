@@ -1,6 +1,6 @@
-"""An archive opened to look at: its runs by name, and what each left as xarray.
+"""Read an archive: its runs by name, and their products as xarray.
 
-Every axis has a coordinate, as the stores name it; bands are found by wavelength, classes are numbers.
+Every axis has a coordinate; bands are selected by wavelength, classes are numbers.
 """
 
 from __future__ import annotations
@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import ArchiveError, IncompleteStoreError, OldStoreError
+from pipeline.errors import ArchiveError, IncompleteStoreError
 from pipeline.lazy import deferred
 from storage.archive.archive import Archive
 from storage.archive.records import Run, read_run
 from storage.arrays.layout import damage_named
-from storage.arrays.signal_cubes import REPROCESS
 from storage.readers.recordings import LINE_PRODUCTS
 
 if TYPE_CHECKING:
@@ -28,39 +27,52 @@ if TYPE_CHECKING:
 else:
     spectra = deferred("spectralzoom.spectra")
     opening = deferred("storage.remote.opening")
-    xarray = deferred("xarray")  # a second, which most commands do without
+    xarray = deferred("xarray")  # takes a second to import
 
 LATEST = "latest"
 PICTURES = ("quicklook",)  # for viewers, on axes of their own
 
 
 def open(archive: str | Path) -> OpenedArchive:
-    """Open an archive to look at: a folder, or s3://bucket/prefix. Nothing is written to it.
+    """Open an archive for reading.
 
-    Raises ArchiveError: there is none, or it cannot be read.
+    Parameters
+    ----------
+    archive
+        A folder, or s3://bucket/prefix.
+
+    Returns
+    -------
+    OpenedArchive
+        The published runs by name.
+
+    Raises
+    ------
+    ArchiveError
+        There is no archive, or it cannot be read.
     """
     return OpenedArchive(opening.open_archive(archive, create=False, write=False))
 
 
 class OpenedArchive(Mapping[str, "OpenedRun"]):
-    """The published runs of an archive by their names, the latest first; `latest` is a name of the first as well."""
+    """The published runs of an archive by name, the latest first; ``latest`` also names the first."""
 
     def __init__(self, archive: Archive) -> None:
         self._archive = archive
 
     @property
     def name(self) -> str:
-        """The address that it was opened by."""
+        """Address of the archive."""
         return self._archive.name
 
     @property
     def runs(self) -> Mapping[str, OpenedRun]:
-        """The runs, by their names, the latest first: the archive itself."""
+        """The runs by name, the latest first: the archive itself."""
         return self
 
     @property
     def latest(self) -> OpenedRun:
-        """The run published last. Raises ArchiveError where there is none."""
+        """The run published last. Raises ArchiveError without a run."""
         return self[LATEST]
 
     def __getitem__(self, name: str) -> OpenedRun:
@@ -89,11 +101,10 @@ class NoRunError(ArchiveError, KeyError):
 
 
 class OpenedRun:
-    """One published run. Arrays are read when they are used; see `OpenedArchive` for how to come by one.
+    """One published run, by `OpenedArchive`. Arrays are read when they are used.
 
-    What lies on the scene's own grid (class map, confidence, mosaic, class probabilities) has the scene's CRS where it
-    had one, and directions seen from the rig [rad] where it had none. A run with a ``[pose]`` has a ``ground_map``
-    besides.
+    Class map, confidence, mosaic and class probabilities lie on the scene's grid: in its CRS, else in directions from
+    the rig [rad]. A run with a ``[pose]`` also has a ``ground_map``.
     """
 
     def __init__(self, archive: Archive, folder: Path) -> None:
@@ -102,7 +113,7 @@ class OpenedRun:
 
     @property
     def name(self) -> str:
-        """Its name in the archive: when its survey began, and of what field."""
+        """Name in the archive: start of the survey, and the field."""
         return self.folder.name
 
     @property
@@ -123,67 +134,65 @@ class OpenedRun:
 
     @property
     def report(self) -> Path:
-        """The page for people: one file, opens in any browser."""
+        """Path of the report, one HTML file."""
         return self._archive.locate(f"runs/{self.name}/report.html")
 
     @property
     def quicklook(self) -> Path:
-        """Four panels in one picture."""
+        """Path of the quicklook, a PNG."""
         return self._archive.locate(f"runs/{self.name}/quicklook.png")
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        """Names of the numbers in its class map."""
+        """Names of the classes, by their numbers in the class map."""
         return tuple(self.dataset("class_map").attrs["class_names"])
 
     @property
     def class_map(self) -> xarray.DataArray:
-        """(y, x) uint8 number of each pixel's class, 255 where there is none; names in ``flag_meanings``."""
+        """(y, x) uint8 class numbers, 255 without a class; names in ``flag_meanings``."""
         return self.dataset("class_map")["classes"]
 
     @property
     def confidence(self) -> xarray.DataArray:
-        """(y, x) float32 probability of the class given, 0 to 1; NaN where there is none."""
+        """(y, x) float32 probability of the mapped class, 0 to 1; NaN without a class."""
         return self.dataset("class_map")["confidence"]
 
     @property
     def mosaic(self) -> xarray.DataArray:
-        """(y, x, band) float32 values of the first pass, NaN where nothing was seen; indexed by ``wavelength`` too."""
+        """(y, x, band) float32 values of the first pass, NaN where not captured; also indexed by ``wavelength``."""
         return spectra.open_lazy_mosaic(self._place("mosaic"))
 
     @property
     def cube(self) -> xarray.DataArray:
-        """(y, x, band) float32 values in the finest pixels that were captured: those of the fine pass, if there is one.
+        """(y, x, band) float32 values in the finest captured pixels: of the fine pass, if there is one.
 
-        NaN where that pass saw nothing. Spectra are restored from their components when they are used.
+        NaN where that pass captured nothing. Spectra are restored from their components when they are used.
         """
         name = "detail" if "detail" in self.receipt["products"] else "mosaic"
         return spectra.open_lazy_mosaic(self._place(name))
 
     @property
     def lines(self) -> dict[str, xarray.DataArray]:
-        """Calibrated lines by the sweep's name: (line, sample, band) float32, NaN where a spectrum was unusable.
+        """Calibrated lines by the sweep's name: (line, sample, band) float32, NaN for unusable spectra.
 
-        They are restored from their components when they are used, with what was kept of rare spectra; time, mirror
-        and exposure of each line are coordinates.
+        They are restored from their components and from residuals of rare spectra when they are used. Time, mirror and
+        exposure of each line are coordinates.
         """
         names = [name for name in LINE_PRODUCTS.values() if name in self.receipt["products"]]
-        if not names and any(name in self.receipt["products"] for name in LINE_PRODUCTS):
-            raise OldStoreError(f"the run {self.name} of {self.archive_name} has no condensed lines; {REPROCESS}")
         stores = [path for name in names for path in sorted(self._place(name).glob("*.zarr"))]
         return {path.stem: spectra.open_lazy_lines(path) for path in stores}
 
     @property
     def attention(self) -> xarray.Dataset:
-        """Worth (``score``) and order (``rank``, -1 not looked at) of every patch, (patch_y, patch_x)."""
+        """Expected gain (``score``) and order (``rank``, -1: not chosen) of every patch, (patch_y, patch_x)."""
         return self.dataset("attention")
 
     @property
     def ground_map(self) -> xarray.Dataset:
-        """All on the map, where the survey had a ``[pose]``; its CRS in ``spatial_ref``.
+        """Images on the ground of a survey with a ``[pose]``; their CRS is in ``spatial_ref``.
 
-        ``classes``, ``confidence`` and ``picture``; ``age`` [days], and of a later visit ``changed`` (fraction of the
-        patch) and ``changed_from`` (class before, 255 where it is the same).
+        They are ``classes``, ``confidence``, ``picture`` and ``age`` [days]. A later visit also has ``changed``
+        (fraction of the patch) and ``changed_from`` (previous class, 255 where unchanged).
         """
         return self.dataset("ground_map")
 
@@ -191,7 +200,7 @@ class OpenedRun:
     def sweeps(self) -> dict[str, xarray.Dataset]:
         """Raw lines by the sweep's name: ``dn`` (line, sample, band), with time and mirror of each line.
 
-        Raises IncompleteStoreError: they were cleared away, see ``keep`` in the settings; `lines` stay.
+        Raises IncompleteStoreError: they were cleared away by the setting ``keep``; `lines` stay.
         """
         names = [name for name in LINE_PRODUCTS if name in self.receipt["products"]]
         for name in names:
@@ -205,20 +214,20 @@ class OpenedRun:
 
     @property
     def products(self) -> tuple[str, ...]:
-        """Names that `dataset` takes."""
+        """Names of the products for `dataset`."""
         return tuple(name for name, where in self.receipt["products"].items() if where.endswith(".zarr"))
 
     def dataset(self, product: str) -> xarray.Dataset:
-        """Open all arrays of a product, such as ``probabilities`` or ``geolocation``.
+        """Return all arrays of a product, such as ``probabilities`` or ``geolocation``.
 
-        Raises IncompleteStoreError: this run has left no such product, or it is damaged.
+        Raises IncompleteStoreError: the run has no such product, or it is damaged.
         """
         return open_labelled(self._place(product))
 
     def _place(self, product: str) -> Path:
         where = self.receipt["products"].get(product)
         if where is None:
-            raise IncompleteStoreError(f"the run {self.name} left no {product}; it left {', '.join(self.products)}")
+            raise IncompleteStoreError(f"the run {self.name} has no {product}. It has {', '.join(self.products)}")
         return self._archive.locate(where)
 
     def __repr__(self) -> str:
@@ -230,11 +239,10 @@ class OpenedRun:
 def open_labelled(path: Path) -> xarray.Dataset:
     """Open a store lazily, in dask's blocks of whole shards, with a coordinate on every axis.
 
-    ``y`` and ``x`` are in metres where the store lies on a map (its CRS in ``spatial_ref``), else tangents of the angle
-    from the undeflected direction [rad], else pixels; ``band`` and ``wavelength`` are in nm, both an index. Numbers are
-    those of the store: no class becomes a float, whatever stands for none. Attributes are text, numbers or lists of
-    them, and JSON text of what else a store has, so that ``to_netcdf`` and ``to_zarr`` write them. Raises
-    IncompleteStoreError: there is no such store, or its metadata is damaged.
+    ``y`` and ``x`` are in metres for a georeferenced store (its CRS in ``spatial_ref``). Otherwise they are tangents of
+    the angle from the undeflected direction [rad], or pixels. ``band`` and ``wavelength`` are in nm, both an index.
+    Numbers keep their type: no class becomes a float. Attributes are text, numbers or lists of them, others JSON text,
+    so that ``to_netcdf`` and ``to_zarr`` write them. Raises IncompleteStoreError: the store is missing or damaged.
     """
     with damage_named(str(path)):
         opened = xarray.open_dataset(
@@ -246,7 +254,7 @@ def open_labelled(path: Path) -> xarray.Dataset:
 
 
 def _in_shards(opened: xarray.Dataset) -> xarray.Dataset:
-    """Arrays as dask's, in blocks of what is one file each; coordinates stay as they are."""
+    """Return the arrays as dask arrays with a block for each file; coordinates stay."""
 
     def split(one: xarray.DataArray) -> xarray.DataArray:
         blocks = one.encoding.get("shards") or one.encoding.get("chunks") or one.shape

@@ -1,4 +1,4 @@
-"""Spectra of condensed stores as xarray arrays: what is asked for is restored, scores * step @ axes + mean."""
+"""Give the spectra of condensed stores as xarray arrays, restored on indexing: scores * step @ axes + mean."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from xarray.core.indexing import IndexSelResult
 from storage.arrays.georeference import GRID_MAPPING
 from storage.arrays.layout import open_group
 from storage.arrays.mosaics import Mosaic, open_mosaic
-from storage.arrays.signal_cubes import SignalCube, check_condensed, open_signal_cube, read_coordinates, score_layout
+from storage.arrays.signal_cubes import SignalCube, open_signal_cube, read_coordinates, score_layout
 
 Restore = Callable[[slice, slice, Sequence[int]], NDArray[np.float32]]  # rows, columns, bands: (row, column, band)
 OF_WAVELENGTHS = ("band", "wavelength")
@@ -30,7 +30,7 @@ VALUE = {"long_name": "scene value", "units": "1"}
 
 
 class RestoredArray(BackendArray):
-    """Spectra (row, column, band) float32 that are restored when they are indexed, and only those."""
+    """Spectra (row, column, band) float32; indexing restores only the selected ones."""
 
     def __init__(self, shape: tuple[int, ...], restore: Restore) -> None:
         self.shape, self.dtype, self._restore = shape, np.dtype(np.float32), restore
@@ -39,7 +39,7 @@ class RestoredArray(BackendArray):
         return indexing.explicit_indexing_adapter(key, self.shape, indexing.IndexingSupport.OUTER, self._outer)
 
     def _outer(self, key: tuple[Any, ...]) -> NDArray[np.float32]:
-        """Values at numbers, slices or (n,) places along each axis; a number takes its axis away."""
+        """Return the values at numbers, slices or (n,) places along each axis; a number removes its axis."""
         chosen = [np.arange(size)[one] for size, one in zip(self.shape, key, strict=True)]
         kept = [one.size for one in chosen if one.ndim]
         if 0 in kept:
@@ -58,7 +58,7 @@ def _span(places: NDArray[np.intp]) -> tuple[slice, slice | NDArray[np.intp]]:
 
 @dataclass(frozen=True)
 class _MosaicSpectra:
-    """Restores pixels of a mosaic, which is opened when the first are asked for."""
+    """Restore pixels of a mosaic, which is opened at the first call."""
 
     path: Path
 
@@ -72,7 +72,7 @@ class _MosaicSpectra:
 
 @dataclass(frozen=True)
 class _LineSpectra:
-    """Restores lines of a condensed sweep, which is opened when the first are asked for."""
+    """Restore lines of a condensed sweep, which is opened at the first call."""
 
     path: Path
 
@@ -87,7 +87,7 @@ class _LineSpectra:
 def open_lazy_mosaic(path: Path) -> xarray.DataArray:
     """Open a mosaic as (y, x, band) scene values, with a coordinate on every axis.
 
-    Raises IncompleteStoreError: it is missing, damaged or of an earlier version.
+    Raises IncompleteStoreError: it is missing or damaged.
     """
     return _open(path, ("y", "x", "band"), OF_PLACES, _MosaicSpectra(path))
 
@@ -100,7 +100,6 @@ def open_lazy_lines(path: Path) -> xarray.DataArray:
 def _open(path: Path, dims: tuple[str, str, str], places: Sequence[str], restore: Restore) -> xarray.DataArray:
     """Return spectra with the coordinates of their store, in dask's blocks of whole shards of scores."""
     group = open_group(path)
-    check_condensed(group, path)
     size, block = score_layout(group)
     coords = {name: xarray.Variable(*one) for name, one in read_coordinates(group, (*places, *OF_BANDS)).items()}
     shape = (*size, coords["wavelength"].sizes["band"])
@@ -112,7 +111,7 @@ def _open(path: Path, dims: tuple[str, str, str], places: Sequence[str], restore
 
 
 class BandIndex(xarray.indexes.PandasIndex):
-    """An index of bands that finds the nearest in whatever order they are: two spectrometers may overlap."""
+    """An index that finds the nearest band in any order of bands, as of two overlapping spectrometers."""
 
     def sel(self, labels: dict[Any, Any], method: str | None = None, tolerance: Any = None) -> IndexSelResult:
         """Find bands as pandas does; with a method among the bands in ascending order, the first of equal ones."""
@@ -124,16 +123,16 @@ class BandIndex(xarray.indexes.PandasIndex):
 
 
 def _renumbered(found: Any, place: NDArray[np.intp]) -> Any:
-    """Return the places of what was found, in the form in which it was asked for."""
+    """Return the places of the found bands, in the type of ``found``."""
     if isinstance(found, xarray.Variable | xarray.DataArray):
         return found.copy(data=place[found.values])
     return place[found]
 
 
 def by_wavelength(opened: xarray.Dataset) -> xarray.Dataset:
-    """Have the nearest band found by ``band`` and by ``wavelength``: ``.sel(wavelength=660, method="nearest")``.
+    """Index by ``band`` and ``wavelength``, as in ``.sel(wavelength=660, method="nearest")``.
 
-    Slices work where wavelengths rise or fall without a break.
+    Slices need monotonic wavelengths.
     """
     for name in OF_WAVELENGTHS:
         if name in opened.coords and opened[name].dims == ("band",):
@@ -142,7 +141,7 @@ def by_wavelength(opened: xarray.Dataset) -> xarray.Dataset:
 
 
 def with_plain_attributes(opened: xarray.Dataset) -> xarray.Dataset:
-    """Return arrays whose attributes NetCDF holds as well: text, numbers and lists of them; all else is JSON text."""
+    """Return arrays with attributes that NetCDF can hold: text, numbers and lists of them; others become JSON text."""
     found = opened.copy()
     holders: tuple[Any, ...] = (found, *found.variables.values())
     for one in holders:

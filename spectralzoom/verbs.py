@@ -1,4 +1,4 @@
-"""Verbs of the command line as functions: quiet, keywords for settings, a callback for progress, errors raised."""
+"""Offer the verbs of the command line as functions, with keywords for settings and a callback for progress."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ else:
 
 Asked = str | Path | Mapping[str, Any] | None  # a settings file, a table of settings, or keywords alone
 Told = Callable[[str, float, float], None]
-USUAL = {"engine": "plain"}  # a server of Prefect's is started where it is asked for
+USUAL = {"engine": "plain"}  # a Prefect server starts only on request
 TOKENS = ("dim", "layers", "heads", "mlp_ratio")
 MADE_HERE = ("dataset", "choices", "tokens", "settings", "command", "camera")  # of requests
 FILES = ("weights",)
@@ -55,26 +55,26 @@ OF_ONE_SCENE = ("labels", "bands", "wavelengths", "train_mask", "mask_classes")
 
 
 def survey(settings: Asked = None, *, progress: Told | None = None, quiet: bool = True, **flags: Any) -> OpenedRun:
-    """Survey a field as `spectralzoom survey` does, publish the run and give it.
+    """Survey a field as `spectralzoom survey` does, publish the run and return it.
 
-    What is in the archive already is not made again: the same call goes on where one was stopped.
+    Stores in the archive are reused, so that the same call continues a stopped survey.
 
     Parameters
     ----------
     settings
         A settings file (TOML), or its content as a dictionary. Keywords win over it.
     progress
-        Called as ``progress(stage, done, total)`` whenever a stage has come further; ``done / total`` is its fraction.
+        Called as ``progress(stage, done, total)`` at each step of a stage; ``done / total`` is its fraction.
     quiet
-        False prints on stderr what the command would.
+        False prints the output of the command on stderr.
     flags
-        Every setting by its name: ``budget=0.5``, ``camera={"exposure_ms": 50}``. ``engine`` is ``"plain"`` unless
-        asked for otherwise.
+        Every setting by its name: ``budget=0.5``, ``camera={"exposure_ms": 50}``. ``engine`` is ``"plain"`` by
+        default.
 
     Raises
     ------
     Error
-        What was expected, what came, where, and what to do; nothing that was captured is lost.
+        The survey failed; captured lines are kept.
     """
     asked = _settings(settings, flags)
     with _working(progress, quiet=quiet) as console:
@@ -83,11 +83,25 @@ def survey(settings: Asked = None, *, progress: Told | None = None, quiet: bool 
 
 
 def plan(settings: Asked = None, *, preview: str | Path | None = None, **flags: Any) -> dict[str, Any]:
-    """Tell what `survey` with the same arguments would make, and how long it takes; nothing is captured or written.
+    """Return the plan of a `survey` with the same arguments; nothing is captured or written.
 
-    Gives what `spectralzoom plan --json` prints: ``field``, how large and how finely seen, ``stages``, each with its
-    state, reason, seconds and bytes, their sums, and the plain ``scans`` of the weights' record. Sweeps are drawn into
-    ``preview``, a PNG. Raises Error where a survey could not be.
+    Parameters
+    ----------
+    settings, flags
+        As for `survey`.
+    preview
+        A PNG to draw the sweeps into.
+
+    Returns
+    -------
+    dict
+        The content of `spectralzoom plan --json`: ``field``, ``stages`` with state, reason, seconds and bytes, their
+        sums, and the uniform ``scans`` of the weights' record.
+
+    Raises
+    ------
+    Error
+        The survey is not possible.
     """
     asked, picture = _settings(settings, flags), None if preview is None else Path(preview)
     with _working(None):
@@ -96,13 +110,13 @@ def plan(settings: Asked = None, *, preview: str | Path | None = None, **flags: 
 
 
 def evaluate(dataset: str | Path | OpenedRun, *, progress: Told | None = None, **flags: Any) -> dict[str, Any]:
-    """Judge weights on scenes that they were not trained on, or the map of a run against labels; give the scores.
+    """Evaluate weights on scenes that they were not trained on, or the map of a run against labels.
 
     Parameters
     ----------
     dataset
-        A data set as `spectralzoom evaluate` takes it, with ``weights`` (a file or several); or a run, whose accuracy
-        is added to it, with ``labels`` and ``controls`` where other than its survey's are meant.
+        A data set of `spectralzoom evaluate`, with ``weights`` (one or several files). Or a run, to which the accuracy
+        is added; ``labels`` and ``controls`` replace those of its survey.
     progress
         As for `survey`.
     flags
@@ -110,12 +124,13 @@ def evaluate(dataset: str | Path | OpenedRun, *, progress: Told | None = None, *
 
     Returns
     -------
-    Of weights what `spectralzoom evaluate --json` prints; of a run the ``accuracy`` of its receipt.
+    dict
+        For weights the content of `spectralzoom evaluate --json`, for a run the ``accuracy`` of its receipt.
 
     Raises
     ------
     Error
-        What was expected, what came, where, and what to do.
+        A value or a file is not valid.
     """
     if isinstance(dataset, OpenedRun):
         return _judge(dataset, progress, **flags)
@@ -140,9 +155,9 @@ def evaluate(dataset: str | Path | OpenedRun, *, progress: Told | None = None, *
 def train(
     dataset: str | Path, out: str | Path, *, progress: Told | None = None, quiet: bool = True, **flags: Any
 ) -> Path:
-    """Train weights on a data set as `spectralzoom train` does; give the file of weights.
+    """Train weights on a data set as `spectralzoom train` does, and return their file.
 
-    The state of the training is kept beside the weights: the same call goes on where one was stopped.
+    The state is kept beside the weights, so that the same call continues a stopped training.
 
     Parameters
     ----------
@@ -158,7 +173,7 @@ def train(
     Raises
     ------
     Error
-        What was expected, what came, where, and what to do.
+        A value or a file is not valid.
     """
     kind, how, asked = train_scenes.TrainRequest, models_training.TrainingSettings, {**flags}
     command = f"spectralzoom.train({', '.join([repr(Path(dataset).name), *(f'{k}={v!r}' for k, v in asked.items())])})"
@@ -179,14 +194,14 @@ def train(
 
 
 def _settings(given: Asked, flags: Mapping[str, Any]) -> Settings:
-    """The settings of a file or a table, with keywords laid over them."""
+    """Return the settings of a file or a table; keywords win over them."""
     path = None if given is None or isinstance(given, Mapping) else given
     table = _by_key(given) if isinstance(given, Mapping) else {}
     return settings_load.load_settings(path, table | _by_key(flags), usual=USUAL)
 
 
 def _by_key(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings by their keys, those in tables as ``camera.exposure_ms``; paths as text, lists as they are written."""
+    """Return settings by their keys, such as ``camera.exposure_ms``, with paths as text."""
     found: dict[str, Any] = {}
     for name, value in table.items():
         inner = {f"{name}.{key}": one for key, one in value.items()} if isinstance(value, Mapping) else {name: value}
@@ -196,11 +211,11 @@ def _by_key(table: Mapping[str, Any]) -> dict[str, Any]:
 
 @contextmanager
 def _working(progress: Told | None, *, quiet: bool = True) -> Iterator[Console]:
-    """Work as a command does: told to ``progress``, on one thread of BLAS, caches where they can be kept."""
+    """Set up caches, progress and one BLAS thread as for a command, and yield a console."""
     processes.place_caches()
     console = terminal_progress.on_stderr()
     console.quiet = quiet
-    # Split among threads, sums are rounded otherwise: what lies behind one key would differ with the number of cores.
+    # With several threads, rounding of sums and so the content of stores would depend on the number of cores.
     with terminal_progress.heard_by(progress), threadpoolctl.threadpool_limits(1, user_api="blas"):
         yield console
 
@@ -208,7 +223,7 @@ def _working(progress: Told | None, *, quiet: bool = True) -> Iterator[Console]:
 def _judge(
     run: OpenedRun, progress: Told | None, labels: str | Path | None = None, controls: bool | None = None
 ) -> dict[str, Any]:
-    """Add its accuracy to a run, and give it."""
+    """Add the accuracy to a run, and return it."""
     asked = None if labels is None else str(labels)
     with _working(progress) as console:
         receipt = reprocess_command.run_judge(run.archive_name, run.name, console, controls=controls, labels=asked)
@@ -221,17 +236,17 @@ def _tell(progress: Told | None, what: str, done: float) -> None:
 
 
 def _several(value: Any) -> Sequence[Any]:
-    """One, or as many as there are."""
+    """Return a list of one value or of several."""
     return [value] if isinstance(value, str | Path | float | int) else list(value)
 
 
 def _taken(flags: dict[str, Any], names: Sequence[str]) -> dict[str, Any]:
-    """Take some of the keywords out."""
+    """Remove some keywords and return them."""
     return {name: flags.pop(name) for name in names if name in flags}
 
 
 def _check_known(flags: Mapping[str, Any], kind: Any, verb: str, *, also: Sequence[str]) -> None:
-    """Refuse a keyword that is no field of the request and none of what was taken before (SettingsError)."""
+    """Raise SettingsError for a keyword that the verb does not have."""
     own = [one.name for one in fields(kind) if one.name not in MADE_HERE]
     for name in flags:
         if name not in own:

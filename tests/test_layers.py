@@ -113,7 +113,7 @@ def test_storage_stores() -> None:
         "storage/arrays/geolocation.py": {"pipeline.rectify.placed", "pipeline.rectify.scan_paths"},
         "storage/arrays/mosaics.py": {"pipeline.signal.components"},
         "storage/arrays/signal_cubes.py": {f"pipeline.signal.{one}" for one in ("calibrate", "components", "condense")},
-        "storage/arrays/statistics.py": {"pipeline.signal.subspace"},
+        "storage/arrays/cubes.py": {"pipeline.signal.subspace"},
         "storage/readers/cube_sources.py": {"pipeline.signal.calibrate"},
         "storage/readers/recorded_cubes.py": {"pipeline.signal.calibrate"},
     }

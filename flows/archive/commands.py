@@ -145,7 +145,7 @@ def run_verify(archive: str | Path, console: Console, *, remake: bool = False, a
     kept = {name: getattr(done, name) for name in ("remade", "dropped", "failed", "complete")}
     content["repair"] = {**kept, "hopeless": done.plan.hopeless}
     put_out(content, show_repair, as_json=as_json)
-    stray = any(finding.kind in ("stray", "growing") for finding in bad)
+    stray = any(finding.kind == "stray" for finding in bad)
     return DONE if done.complete and not stray else PARTLY if done.remade or done.dropped else FAILED
 
 

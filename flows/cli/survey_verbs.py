@@ -72,11 +72,16 @@ def by_setting(flags: Any) -> dict[str, object]:
 
 
 NO_FLAGS = SurveyFlags()
+Verbose = Annotated[
+    bool, Parameter(name=("--verbose", "-v"), negative="", help="Print all savings, stages, effects and versions.")
+]
 NO_SIMULATION_FLAGS = SimulationFlags()
 NO_RENDERING_FLAGS = RenderingFlags()
 
 
-def survey(settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = False) -> int:
+def survey(
+    settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = False, verbose: Verbose = False
+) -> int:
     """Survey a field: capture it in one or two passes, map its classes, and publish a receipt and a report.
 
     Parameters
@@ -86,7 +91,7 @@ def survey(settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_js
     """
     requested = load_settings(settings, by_setting(flags))
     try:
-        published = survey_command.run_survey(requested, stderr)
+        published = survey_command.run_survey(requested, stderr, verbose=verbose)
     except NothingToMend as skipped:
         if as_json:
             print_json({"captured": False, "run": skipped.run, "why": str(skipped)})

@@ -1,7 +1,6 @@
-"""The account of bytes of a run, and its publication with it: captured, written, kept and moved against one reference.
+"""Count the bytes of a run (captured, written, kept, moved) against one reference, and publish the run with them.
 
-What is kept includes the receipt and the report that tell it, so that they are written until the figure is that of the
-folder with themselves in it.
+The bytes kept include the receipt and the report. Both are written again until the figure in them is right.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ REPORT = "report.html"
 
 
 def open_account(run: SurveyRun, plan: FinePlan) -> Facts:
-    """Return what the passes of a run deliver and the reference; what is counted at publication is 0 until then."""
+    """Return the bytes of the passes and of the reference; figures that are counted at publication are 0."""
     bands = len(run.scene.wavelength_nm)
     if run.raster is None:
         captured = raw_bytes([*run.plan.coarse, *plan.sweeps], run.camera, bands)
@@ -51,10 +50,10 @@ def publish_counted(
     rests_on: Mapping[str, str],
     written: int = 0,
 ) -> Receipt:
-    """Publish a run with receipt and page, and return the receipt: its bytes are those of the published run.
+    """Publish a run with receipt and page, and return the receipt with the bytes of the published run.
 
     All other files are in the draft's folder. ``rests_on`` is of `Archive.manifest_hashes`, ``written`` are bytes of
-    stores that are not told yet.
+    stores that the receipt does not count yet.
     """
     facts: dict[str, Any] = {"survey": receipt["survey"], "settings": receipt["settings"], "rests_on": rests_on}
     stores, moved = archive.sizes(rests_on), archive.take_moved()
@@ -73,21 +72,21 @@ def publish_counted(
         for name, text in ((RECEIPT, to_json(receipt)), (REPORT, page_of(receipt))):
             content = text.encode()
             longest[name] = max(longest[name], len(content))
-            draft.write_file(name, content.ljust(longest[name], b"\n"))  # none shrinks again: the figures come to rest
+            draft.write_file(name, content.ljust(longest[name], b"\n"))  # no file shrinks, so that the loop ends
         size = draft.bytes_published(**facts)
         if size == folder:
             break
         folder = size
     draft.publish(**facts)
-    archive.take_moved()  # by the upload of the folder, which is counted
+    archive.take_moved()  # the upload of the folder is counted already
     return receipt
 
 
 def recount_bytes(archive: Archive, run: str, replace_rows: Callable[[str, Receipt], str]) -> Receipt:
-    """Publish a run again with its bytes as they are now, such as after stores were cleared away; return its receipt.
+    """Publish a run again with its present bytes, such as after stores were cleared away; return its receipt.
 
-    ``run`` is the name of its folder; ``replace_rows`` gives a page with the bytes of a receipt in it. Nothing else of
-    the run changes. Raises ArchiveError: there is no such run; IncompleteStoreError: it is damaged.
+    ``run`` is the name of its folder; ``replace_rows`` puts the savings of a receipt into a page. Nothing else changes.
+    Raises ArchiveError: there is no such run; IncompleteStoreError: it is damaged.
     """
     draft = archive.extend_run(run)
     assert draft is not None
@@ -97,7 +96,7 @@ def recount_bytes(archive: Archive, run: str, replace_rows: Callable[[str, Recei
         if found.problem is not None:
             raise IncompleteStoreError(f"{found.uri}: {found.problem}; run verify --repair on the archive")
         for path in place.iterdir():
-            if path.name not in (RECEIPT, REPORT, MANIFEST_NAME):  # those are written anew
+            if path.name not in (RECEIPT, REPORT, MANIFEST_NAME):  # written below
                 shutil.copyfile(path, draft.folder / path.name)
         page = (place / REPORT).read_text(encoding="utf-8")
         there = [uri.split("/")[1:] for uri in found.recorded if (archive.root / uri / MANIFEST_NAME).is_file()]

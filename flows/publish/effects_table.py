@@ -1,4 +1,4 @@
-"""The effects of a simulated rig as a table: what each changes at most, what leaving it out saves, and why."""
+"""Print the effects of a simulated rig as a table: their error bounds, the seconds saved, and the reason."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from pipeline.simulator.selection.choice import UNIT_NAMES
 
 COLOURS = {"on": "green", "off": "dim"}
 _KEY = (
-    "left out: what any stored number would change by at most without the effect [{unit}]; error: by what is done"
-    " instead of the exact; measured: the same on the worst lines of the scene."
+    "left out: largest change of a stored number without the effect [{unit}]; error: largest change by the chosen"
+    " variant; measured: the same on the worst lines of the scene."
 )
 Row = Mapping[str, Any]
 
 
 def print_effects(effects: Iterable[Row], total: Row, console: Console) -> None:
-    """Print a row for every effect of the rig and what all come to; words stand below the table."""
+    """Print a row for every effect of the rig, their magnitudes and reasons, and the totals."""
     rows = list(effects)
     there = [row for row in rows if row["reason"] != "absent"]
     columns = ("effect", "computed", "left out", "error", "measured", "CPU")
@@ -31,13 +31,13 @@ def print_effects(effects: Iterable[Row], total: Row, console: Console) -> None:
         console.print(f"[bold]{escape(row['name'])}[/]: {escape(_format_row(row))}")
     absent = [f"{row['name']} ({row['magnitude']})" for row in rows if row["reason"] == "absent"]
     if absent:
-        console.print(f"[bold]Not there[/]: {escape(', '.join(absent))}.")
+        console.print(f"[bold]Absent[/]: {escape(', '.join(absent))}.")
     for sentence in format_total(total):
         console.print(escape(sentence))
 
 
 def _figures(row: Row, total: Row) -> list[str]:
-    """Name, variant or off, what leaving it out would change, what is changed, measured, seconds."""
+    """Return the cells of a row: name, variant, change without it, error bound, measured, seconds."""
     most, bound = total["tolerance"], row["bound"]
     beyond = row["state"] == "off" and most is not None and (bound is None or bound > most)
     colour = "yellow" if beyond else COLOURS[row["state"]]
@@ -52,13 +52,13 @@ def _figures(row: Row, total: Row) -> list[str]:
 
 
 def _format_row(row: Row) -> str:
-    """Return how large an effect is, and why it is nevertheless there or left out where its figures do not tell."""
+    """Return the magnitude of an effect, and the reason for its state where its figures do not give it."""
     said = {
         "exact": "",
         "needed": "",
         "small": "",
-        "unseen": "the scene shows nothing of it: ",
-        "spent": "the tolerance is spent where it saves more: ",
+        "unseen": "not visible in the scene: ",
+        "spent": "tolerance used for effects that save more: ",
         "asked": "asked for: ",
         "unasked": "not asked for: ",
         "always": "always there: ",
@@ -68,26 +68,24 @@ def _format_row(row: Row) -> str:
 
 
 def format_change(value: float | None, *, endless: bool = False) -> str:
-    """A change in units of the tolerance; what is not there is a dash, or where ``endless`` has no bound at all."""
+    """Return a change in units of the tolerance; None is a dash, or 'none' where ``endless``: there is no bound."""
     if value is None:
         return "none" if endless else DASH
     return f"{value:.2g}"
 
 
 def format_total(total: Mapping[str, Any]) -> Sequence[str]:
-    """Return what was asked for and what is left out, against the tolerance, and the seconds that this saves."""
+    """Return sentences on the effects computed, the error bound against the tolerance, and the seconds saved."""
     unit, count = UNIT_NAMES[total["unit"]], total["on"] + total["off"]
     tolerance = "any number of" if total["tolerance"] is None else f"{total['tolerance']:g}"
-    words = [f"{total['on']} of {count} effects are computed (asked: {total['asked']}, tolerance {tolerance} {unit})."]
+    words = [f"Effects computed: {total['on']} of {count} (asked: {total['asked']}, tolerance {tolerance} {unit})."]
     if total["bound"] is None:
-        words.append("What is left out has no bound.")
+        words.append("The error of the omitted effects has no bound.")
     else:
         measured = "" if total["measured"] is None else f", measured on the worst lines {total['measured']:.2g}"
-        if total["measured"] is not None and total["measured"] > total["bound"]:
-            measured += ", more by what arithmetic makes of light with such contrasts"
         words.append(
-            f"What is left out or cheapened changes a stored number by at most {total['bound']:.2g} {unit}{measured}."
+            f"Omitted and simplified effects change a stored number by at most {total['bound']:.2g} {unit}{measured}."
         )
     exact = format_seconds(max(total["saved_s"], 0.0))
-    words.append(f"That saves about {exact} of CPU in all sweeps decided on against all effects in full.")
+    words.append(f"Saved processor time against all effects in full: about {exact}.")
     return words

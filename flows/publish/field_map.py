@@ -1,4 +1,4 @@
-"""The map of a report: the pictures of a run as layers that lie upon each other, each in the page itself."""
+"""Make the map of a report: the pictures of a run as layers, each embedded in the page."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from storage.arrays.class_maps import ProbabilityStore
 from storage.arrays.layout import open_group, read_array
 from storage.arrays.quicklooks import choose_bands
 
-MOST_PX = 2048  # of a map's longer side; of larger ones every n-th pixel is shown
+MOST_PX = 2048  # of a map's longer side; larger maps are subsampled
 QUALITY = 80  # of a photograph as WebP
-LEVELS = 50  # of a ramp of colours; the next number is see-through
+LEVELS = 50  # of a colour ramp; the next number is transparent
 CHANGED_RGB, PATCH_RGB = (196, 38, 46), (0, 190, 200)
 ERROR_COLOURS = {"right": "#c9d3c4", "wrong": "#c4262e"}  # of labelled pixels
 Bytes = NDArray[np.uint8]
@@ -48,34 +48,34 @@ class MapLayer:
 
 @dataclass(frozen=True)
 class FieldMap:
-    """Content of the page: size (width, height) [px], layers from the lowest up, classes with colour and share."""
+    """Content of the map: size (width, height) [px], layers from the lowest up, classes with colour and fraction."""
 
     size: tuple[int, int]
     layers: Sequence[MapLayer]
     classes: Sequence[dict[str, str]]
-    errors: str | None = None  # as an address of data: where map and labels differ, None without labels
+    errors: str | None = None  # data address of the errors against the labels; None without labels
 
     @property
     def data(self) -> dict[str, Any]:
-        """Return what the page's script is given."""
+        """Return the data for the page's script."""
         return {"size": list(self.size), "layers": [asdict(layer) for layer in self.layers]}
 
 
 @dataclass(frozen=True)
 class PriorMapField:
-    """Images of the earlier run whose map is the prior map."""
+    """Images of the prior map: the class map of an earlier run, and the changes since."""
 
     run: str
     days: float  # between that capture and this one
-    classes: Bytes  # (y, x) of that run's map, by the numbers of today's; 255 for those that today has not
+    classes: Bytes  # (y, x) of that run's map, by the class numbers of this run; 255 for other classes
     changed: NDArray[np.float32]  # (patch_y, patch_x) fractions of pixels of another class
     age_days: NDArray[np.float32]  # (y, x) since a pixel was captured, NaN where it never was
 
 
 def prior_map(prior: Prior | None, drawn: StageRef, receipt: Receipt) -> PriorMapField | None:
-    """Return what the prior map shows; None where there is none, or it was put aside.
+    """Return the images of the prior map; None without one, or where it was not used.
 
-    ``drawn`` is the store of the class map and of the class probabilities.
+    ``drawn`` is the store of the class map and the class probabilities.
     """
     memory = receipt.get("memory")
     if memory is None or prior is None or memory["put_aside"]:
@@ -92,7 +92,7 @@ def prior_map(prior: Prior | None, drawn: StageRef, receipt: Receipt) -> PriorMa
 
 
 def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: PriorMapField | None) -> FieldMap:
-    """Gather the layers of a run; ``shown`` is what its quicklook shows."""
+    """Return the map of a run; ``shown`` are the data of its quicklook."""
     height, width = shown.class_map.shape
     thin = slice(None, None, -(-max(height, width) // MOST_PX))
     palette = palette_bytes(shown.class_colours)
@@ -146,7 +146,7 @@ def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: Prio
 def error_address(class_map: NDArray[np.integer], labels: NDArray[np.integer]) -> str:
     """Return the data address of a picture of where (y, x) classes differ from labels, by `ERROR_COLOURS`.
 
-    Pixels that either lacks are see-through.
+    Pixels without class or label are transparent.
     """
     judged = (class_map != UNLABELLED) & (labels != UNLABELLED)
     colours = [(0, 0, 0, 0), *(np.rint(255 * np.array(to_rgba(one))) for one in ERROR_COLOURS.values())]
@@ -166,7 +166,7 @@ def layer_address(numbers: Bytes, colours: Bytes) -> str:
 
 
 def png_address(numbers: Bytes, colours: Bytes) -> str:
-    """Return that of a PNG, from which the numbers can be read again."""
+    """Return the data address of a PNG from which the numbers can be read again."""
     picture, table, file = Image.fromarray(np.ascontiguousarray(numbers)), _table(colours), io.BytesIO()
     picture.putpalette(table[:, :3].tobytes())
     picture.save(file, "PNG", transparency=table[:, 3].tobytes())
@@ -181,7 +181,7 @@ def _table(colours: Bytes) -> Bytes:
 
 
 def _ramp_address(values: NDArray[np.floating], most: float) -> str:
-    """Draw (y, x) values from 0 to ``most`` from dark to bright; what is not known is see-through."""
+    """Draw (y, x) values from 0 to ``most`` from dark to bright; unknown ones are transparent."""
     table = np.zeros((LEVELS + 2, 4), np.uint8)
     table[: LEVELS + 1] = np.rint(255 * colormaps["viridis"](np.linspace(0, 1, LEVELS + 1)))
     known = np.isfinite(values)

@@ -1,4 +1,4 @@
-"""Findings of a run: hectares of each class, changes, ages; its zones and plots; the map's own figures."""
+"""Compute the findings of a run: areas, changes, ages, zones, plots, unknown pixels, expected score."""
 
 from __future__ import annotations
 
@@ -31,15 +31,14 @@ from storage.arrays.ground_maps import GroundMap
 
 OLDER_DAYS = (1, 7, 30)  # since a capture, for which hectares are given
 PLOTS_FILE = "plots.csv"
-STRIP_ROWS = 256  # of class probabilities that are read at a time
+STRIP_ROWS = 256  # rows of class probabilities read at a time
 
 
 def field_figures(run: SurveyRun, fine: FinePlan | None) -> dict[str, Any]:
-    """Return figures of the field and of the captures, for JSON; None for what is unknown.
+    """Return figures of the field and of the captures, for JSON; None for unknown ones.
 
-    ``fine`` is the fine pass where it is planned already, else it takes what the budget leaves at most. Hectares are
-    those that the survey keeps to, and those an hour are of all of the camera's seconds. A raster has no camera: no
-    view but by a pose, no seconds, no lines.
+    Without a planned fine pass, ``fine``, its seconds are those that the budget leaves. Hectares are those within the
+    zones, and hectares per hour refer to all capture time. A raster has neither capture time nor lines.
     """
     scale, fine_s = run.zones.place.scale(run.camera.ifov_rad), run.plan.fine_s if fine is None else fine.seconds
     seconds = run.plan.coarse_s + fine_s
@@ -59,28 +58,26 @@ def field_figures(run: SurveyRun, fine: FinePlan | None) -> dict[str, Any]:
         if footprint is None
         else dict(zip(("nearest", "median", "farthest"), footprint.range_m, strict=True)),
         "footprint_m": None if footprint is None else {"width": footprint.width_m, "depth": footprint.depth_m},
-        "footprint_east_north_m": None if footprint is None else footprint.outline_m.tolist(),
         "hectares": kept.hectares,
         "kept_fraction": None if run.zones.kept is None else float(run.zones.kept.kept.mean()),
         "camera_s": camera_s if captured else None,
         "fine_planned": fine is not None or run.plan.plain,
         "lines": lines if captured else None,
         "hectares_per_hour": kept.hectares_per_hour(seconds) if captured else None,
-        "full_scan_hectares_per_hour": kept.hectares_per_hour(run.plan.full_s) if captured else None,
     }
 
 
 def _kept(run: SurveyRun, scale: FieldScale) -> FieldScale:
-    """The scale of what zones leave of the field."""
+    """Return the scale with the area within the zones."""
     if run.zones.kept is None or scale.area_m2 is None:
         return scale
     return replace(scale, area_m2=_ground_m2(run, run.zones.kept.kept))
 
 
 def find_areas(run: SurveyRun, posed: GroundMap | None, drawn: ClassMap) -> dict[str, Any]:
-    """Return ``areas``: pixels of each class, and hectares where something says how large a pixel is.
+    """Return ``areas``: pixels of each class, and hectares where the size of a pixel is known.
 
-    Those of a run with a pose are of its map on the ground.
+    With a pose, hectares are those of the map on the ground.
     """
     names = drawn.names
     pixels = np.bincount(drawn.classes.ravel(), minlength=len(names)).tolist()
@@ -98,7 +95,7 @@ def find_ground(
     probabilities: ProbabilityStore,
     memory: Mapping[str, Any] | None,
 ) -> dict[str, Any]:
-    """Return ``ground``: grid, what changed by ``memory``, and what is old. Empty for a run without a place."""
+    """Return ``ground``: grid, changes against the prior map, and old areas. Empty without a georeference."""
     geobox = run.scene.geobox if posed is None else posed.geobox
     if geobox is None:
         return {}
@@ -115,8 +112,8 @@ def find_ground(
 
 
 def older_hectares(place: FieldPlace, age_days: NDArray[np.float32]) -> dict[str, float]:
-    """Hectares of (y, x) pixels that were looked at longer ago than each of `OLDER_DAYS`, by these; NaN is left out."""
-    passed = np.searchsorted(OLDER_DAYS, age_days, side="left")  # how many of them an age is above
+    """Return the hectares of (y, x) pixels captured longer ago than each of `OLDER_DAYS`; NaN is left out."""
+    passed = np.searchsorted(OLDER_DAYS, age_days, side="left")  # number of limits that an age exceeds
     areas = areas_by_number(place, np.where(np.isnan(age_days), -1, passed), len(OLDER_DAYS) + 1)
     assert areas is not None
     above = areas[::-1].cumsum()[::-1][1:] / M2_PER_HECTARE
@@ -128,8 +125,8 @@ def changed_hectares(
 ) -> list[list[Any]]:
     """Return hectares, class before and class now of the (y, x) pixels that changed, largest first.
 
-    ``old_class`` is 255 where memory and map do not differ. ``beyond`` is the fraction of the differing pixels that two
-    maps of the same ground would not differ by, by class before and now; pairs without one did not change.
+    ``old_class`` is 255 where prior map and map agree. ``beyond`` is the fraction of differing pixels in excess of the
+    differences between two maps of the same ground, by class before and now. Pairs without it did not change.
     """
     names, count = found.names, len(found.names)
     differing = (old_class != UNLABELLED) & (found.classes != UNLABELLED)
@@ -143,7 +140,7 @@ def changed_hectares(
 
 
 def find_zones(run: SurveyRun, drawn: ClassMap) -> dict[str, Any]:
-    """``zones``: how much of the field is kept to; ``plots``: a row each. Empty for a survey without either."""
+    """Return ``zones``, the size of the mapped part, and ``plots``, a row each; empty without either."""
     zones, found = run.zones, dict[str, Any]()
     if zones.kept is not None:
         kept = zones.kept.kept
@@ -168,7 +165,7 @@ def _ground_m2(run: SurveyRun, kept: NDArray[np.bool_]) -> float | None:
 
 
 def plots_csv(plots: Sequence[Mapping[str, Any]]) -> str:
-    """Every figure of every plot, a row each; empty where nothing is known."""
+    """Return the figures of all plots as CSV, one row for each plot; unknown cells are empty."""
     names = list(plots[0]["fractions"]) if plots else []
     head = ["plot", "pixels", "mapped_pixels", "area_m2", "confidence"]
     text = io.StringIO()
@@ -181,13 +178,13 @@ def plots_csv(plots: Sequence[Mapping[str, Any]]) -> str:
 
 
 def find_map(run: SurveyRun, ref: StageRef, drawn: ClassMap) -> dict[str, Any]:
-    """Findings of a map in the stage ``ref``: ``unknown``, ``pixels`` and ``expected``, each where there is one."""
+    """Return ``unknown``, ``pixels`` and ``expected`` of the map in the store ``ref``, each only if it applies."""
     found: dict[str, Any] = {}
     unclassed, fraction = drawn.classes == UNLABELLED, 0.0
     if (rate := run.settings.unknown_rate) is not None and run.ood_detector is not None:
         count = int(np.count_nonzero(drawn.classes == run.described.config.classes))
-        told_pixels = int(np.count_nonzero(~unclassed))
-        fraction = count / told_pixels if told_pixels else 0.0
+        classified = int(np.count_nonzero(~unclassed))
+        fraction = count / classified if classified else 0.0
         found["unknown"] = {"pixels": count, "fraction": fraction, "rate": rate}
     if run.zones.left_out is not None:
         unclassed &= ~run.zones.left_out
@@ -206,8 +203,8 @@ def find_map(run: SurveyRun, ref: StageRef, drawn: ClassMap) -> dict[str, Any]:
 def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
     """Return the expected score by the map's own probabilities; None where these were never compared with labels.
 
-    That is known of maps of uniform scans that are read whole, without a memory. Pixels without a class do not count. A
-    score of which the error leaves open nearly everything is not predicted, and the words say so.
+    They were compared for maps of uniform scans segmented in full without a prior map. Pixels without a class do not
+    count. A score with too large an error is not predicted.
     """
     settings, step = run.settings, run.settings.scan_step
     memory = prior_map_figures(ref.path)

@@ -1,4 +1,4 @@
-"""Parts of pictures of a map: palettes, outlines of patches, scale bars; and the map on the ground."""
+"""Draw parts of pictures: palettes, outlines of patches, the map on the ground, spectra of the classes."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from flows.terminal.figures import format_area
 from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.class_maps import ClassMap
 from storage.arrays.ground_maps import GroundMap
+from storage.arrays.mosaics import Mosaic
 from storage.arrays.quicklooks import stretch
 
 GROUND_IN, GROUND_DPI, GROUND_MOST_PX = 9.0, 130, 1200
@@ -47,20 +48,20 @@ def save_png(figure: Figure, file: str | Path | IO[bytes], **choices: Any) -> No
 
 
 def webp(picture: Image.Image, **choices: Any) -> bytes:
-    """Pack a picture as Pillow's ``choices`` say: a tenth to a third shorter than PNG and JPEG that look the same."""
+    """Return a picture as WebP; ``choices`` are those of Pillow."""
     file = io.BytesIO()
     picture.save(file, "WEBP", **choices)
     return file.getvalue()
 
 
 def data_address(content: bytes) -> str:
-    """Return a PNG or WebP as an address of data, for a page."""
+    """Return a PNG or WebP as a data address for a page."""
     kind = "webp" if content.startswith(b"RIFF") else "png"
     return f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 
 def grey_of(image: NDArray[np.floating]) -> NDArray[np.float32]:
-    """(y, x) brightness 0..1 of a field, the mean of its bands stretched."""
+    """Return the brightness (y, x) of a field, 0..1: the mean of its bands, stretched."""
     known = np.isfinite(image)
     total = np.where(known, image, 0).sum(axis=-1, dtype=np.float32)
     count = known.sum(axis=-1)
@@ -74,7 +75,7 @@ def class_palette(colours: NDArray[np.integer]) -> NDArray[np.float32]:
 
 
 def class_rgb(classes: NDArray[np.integer], palette: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(y, x, 3) picture of a class map; numbers without a colour (255 among them) are light grey."""
+    """Return a class map as a picture (y, x, 3); numbers without a colour, such as 255, are light grey."""
     table = np.tile(np.asarray(UNLABELLED_COLOUR, np.float32), (256, 1))
     table[: len(palette)] = palette
     picture: NDArray[np.float32] = table[np.clip(classes, 0, UNLABELLED)]
@@ -82,7 +83,7 @@ def class_rgb(classes: NDArray[np.integer], palette: NDArray[np.float32]) -> NDA
 
 
 def outline(chosen: NDArray[np.bool_], patch_px: int, shape: tuple[int, int]) -> list[list[tuple[float, float]]]:
-    """Border of a set of patches as line segments ((x, y), (x, y)) in scene px, clipped to the scene's (y, x) size."""
+    """Return the border of some patches as segments ((x, y), (x, y)) in scene px, clipped to the (y, x) ``shape``."""
     padded = np.pad(chosen, 1)
     limit = np.array([shape[1], shape[0]], np.float64)
     segments = []
@@ -121,7 +122,7 @@ def draw_difference(path: Path, maps: Sequence[ClassMap], titles: Sequence[str])
 
 
 def draw_ground(found: GroundMap) -> bytes:
-    """Picture and class map side by side, PNG: north up, metres from the lower left corner, hectares in the legend."""
+    """Draw picture and class map side by side as PNG: north up, axes in metres, hectares in the legend."""
     box = found.geobox.boundingbox
     extent = (0.0, box.right - box.left, 0.0, box.top - box.bottom)
     tall = extent[3] / extent[1]
@@ -154,3 +155,70 @@ def draw_ground(found: GroundMap) -> bytes:
     buffer = io.BytesIO()
     save_png(figure, buffer)
     return buffer.getvalue()
+
+
+LEAST_BANDS = 5  # of a curve
+GAP = 1.9  # times the median distance of bands, from which on bands were removed between two
+CONTIGUOUS_NM = 20.0  # median distance of bands up to which they cover a spectrum; a satellite's few lie apart anyway
+DOTS: Any = {"marker": ".", "markersize": 2.4, "markeredgewidth": 0}  # they show a band between two gaps
+
+
+def draw_spectra(mosaic: Mosaic, found: ClassMap) -> bytes | None:
+    """Draw the mean spectrum of each mapped class as WebP; None with fewer than `LEAST_BANDS` bands or no value."""
+    spectra = class_spectra(mosaic, found.classes, len(found.names))
+    if len(mosaic.wavelength_nm) < LEAST_BANDS or not np.isfinite(spectra).any():
+        return None
+    names = [name.replace("_", " ") for name in found.names]
+    palette = class_palette(found.colours)
+    with mpl.rc_context({**STYLE, "font.size": 9}):
+        figure = Figure(figsize=(9, 3.6), dpi=110, layout="constrained", facecolor=PAPER)
+        axes = figure.subplots()
+        axes.set_facecolor(PAPER)
+        for name, spectrum, colour in zip(names, spectra, palette, strict=False):
+            if (known := np.isfinite(spectrum)).any():
+                nm, curve = curve_with_gaps(mosaic.wavelength_nm[known], spectrum[known])
+                axes.plot(nm, curve, color=colour, linewidth=1.2, label=name, **DOTS)
+        axes.set(xlabel="wavelength [nm]", ylabel="value of the scene")
+        axes.legend(loc="best", ncols=2, fontsize=7, frameon=False)
+        drawn = io.BytesIO()
+        save_png(figure, drawn)
+    with Image.open(drawn) as opened:
+        flat = opened.convert("RGB").quantize(256, dither=Image.Dither.NONE)
+    return webp(flat.convert("RGB"), lossless=True)
+
+
+def class_spectra(mosaic: Mosaic, classes: NDArray[np.integer], count: int) -> NDArray[np.float32]:
+    """Return the mean spectra (class, band) of ``count`` classes; NaN for one that no pixel of the mosaic shows.
+
+    ``classes`` (y, x) are of the fine grid; a pixel of the mosaic has the class at its centre.
+    """
+    half, step = mosaic.factor // 2, mosaic.factor
+    sums, pixels, top = np.zeros((count, len(mosaic.components))), np.zeros(count), 0
+    for scores in mosaic.row_blocks():
+        rows = np.minimum(np.arange(top, top + len(scores)) * step + half, classes.shape[0] - 1)
+        columns = np.minimum(np.arange(scores.shape[1]) * step + half, classes.shape[1] - 1)
+        under, seen = classes[np.ix_(rows, columns)], np.isfinite(scores).all(axis=2)
+        for number in range(count):
+            here = scores[seen & (under == number)]
+            sums[number] += here.sum(axis=0, dtype=np.float64)
+            pixels[number] += len(here)
+        top += len(scores)
+    means = np.where(pixels[:, None] > 0, sums / np.maximum(pixels, 1)[:, None], np.nan)
+    spectra = mosaic.spectra(means.astype(np.float32))
+    spectra[pixels == 0] = np.nan
+    return spectra
+
+
+def curve_with_gaps(
+    wavelength_nm: NDArray[np.floating], values: NDArray[np.floating]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return a curve (band,) in the order of wavelengths, with a NaN wherever bands were removed.
+
+    Bands that do not cover the spectrum (`CONTIGUOUS_NM`) have no gaps.
+    """
+    order = np.argsort(wavelength_nm, kind="stable")
+    nm, curve = np.asarray(wavelength_nm, np.float64)[order], np.asarray(values, np.float64)[order]
+    apart = np.diff(nm)
+    usual = float(np.median(apart)) if len(apart) else np.inf
+    breaks = np.flatnonzero((apart > GAP * usual) & (usual <= CONTIGUOUS_NM)) + 1
+    return np.insert(nm, breaks, np.nan), np.insert(curve, breaks, np.nan)

@@ -1,7 +1,7 @@
-"""The tasks that end a survey: publish the run of its map, add its accuracy, and show both on Prefect's pages.
+"""Publish the run of a survey, add its accuracy, and create Prefect's artifacts.
 
-A run is published once its map is drawn, so that nothing that is lost later is the map; the accuracy is added to it. A
-survey that was stopped while its map was judged continues with the run that it had published.
+A run is published as soon as it has a class map, and its accuracy is added later. A survey that was stopped in between
+continues with the run that it has published.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 
 from flows.publish.byte_account import recount_bytes
 from flows.publish.receipt import is_pending
-from flows.publish.receipt_table import byte_rows, cost_rows, finding_rows, headline
-from flows.publish.report import render_markdown, replace_bytes
+from flows.publish.receipt_table import finding_rows, headline, saving_rows
+from flows.publish.report import render_markdown, replace_savings
 from flows.publish.retention import is_outlived
 from flows.publish.run_folder import Published, asked_settings, extend_with_accuracy, publish_run
 from flows.settings.survey_settings import OF_THE_MACHINE
@@ -38,13 +38,12 @@ else:
     prefect_artifacts = deferred("prefect.artifacts")
 
 PASSES = (capture_fine.name, capture_coarse.name)  # in the order in which they are condensed
-NOT_ASKED = ("notes", "out", "engine", *OF_THE_MACHINE)  # of a receipt's settings: no byte depends on them
-MOST_BYTES = 100 * 1024  # of the picture, as it stands in the text
-WIDTHS_PX = (1200, 1000, 800, 600, 400, 200)
+NOT_ASKED = ("notes", "out", "engine", *OF_THE_MACHINE)  # settings without an effect on the results
+WIDTH_PX = 800  # of the picture in the text
 
 
 def publish(plan: OpenSurvey) -> RunRef:
-    """Publish the run of a drawn map, with its accuracy where the archive has it already; in a flow as a task."""
+    """Publish the run of a class map, with its accuracy if that is in the archive; in a flow as a task."""
     return as_task(_publish, "publish")(plan, *plan.products.values())
 
 
@@ -65,7 +64,7 @@ def _publish(plan: OpenSurvey, *products: StageRef) -> RunRef:
 
 
 def add_accuracy(plan: OpenSurvey, run: RunRef, accuracy: StageRef) -> RunRef:
-    """Publish a run again with its accuracy, in the place of what was published before."""
+    """Replace a published run by one with its accuracy."""
     draft = plan.run.archive.extend_run(run.name)
     assert draft is not None
     with draft:
@@ -75,9 +74,9 @@ def add_accuracy(plan: OpenSurvey, run: RunRef, accuracy: StageRef) -> RunRef:
 
 
 def clear_raw(plan: OpenSurvey, run: RunRef) -> RunRef:
-    """Clear raw lines away that the settings do not keep, once each was compared; in a flow as a task.
+    """Compare and clear the raw lines that the settings do not keep; in a flow as a task.
 
-    The run is published again with the bytes that stay.
+    The run is published again with the remaining bytes.
     """
     if plan.run.settings.keep != KEEP_SIGNAL or not plan.products.there(*PASSES):
         return run
@@ -99,7 +98,7 @@ def _clear_raw(plan: OpenSurvey, run: RunRef) -> RunRef:
 
 
 def _kept_by_others(plan: OpenSurvey, stage: str, raw: StageRef) -> str | None:
-    """Say which other run keeps raw lines that were there before this survey; None where no other does."""
+    """Return the other run that keeps raw lines of an earlier survey; None without one."""
     if plan.records[stage].state == "ran":
         return None
     archive = plan.run.archive
@@ -108,8 +107,8 @@ def _kept_by_others(plan: OpenSurvey, stage: str, raw: StageRef) -> str | None:
 
 
 def recount(plan: OpenSurvey, run: RunRef) -> RunRef:
-    """Publish a run again with its bytes as they are now, once stores were cleared away."""
-    receipt = recount_bytes(plan.run.archive, run.name, replace_bytes)
+    """Publish a run again with its present bytes, after stores were cleared away."""
+    receipt = recount_bytes(plan.run.archive, run.name, replace_savings)
     _show_artifacts(plan, Published(receipt, run.folder, run.captured_again))
     return run
 
@@ -122,12 +121,12 @@ def _accuracy_is_stored(plan: OpenSurvey) -> bool:
     try:
         one = STAGES[evaluate.name]
         return one.find(plan.run.archive, one.wants(plan.run, *plan.products.judged)) is not None
-    except Exception:  # what is wrong is said when the map is judged: until then it is published
+    except Exception:  # the evaluation reports the error, after the run is published
         return False
 
 
 def _stopped_run(plan: OpenSurvey) -> RunRef | None:
-    """Return the run that the same survey published before it was stopped; None where another process judges it."""
+    """Return the run that the same survey published before it was stopped; None without one, or if it is locked."""
     for folder in reversed(plan.run.archive.runs()):
         if not _is_stopped(plan, read_run(folder, {})):
             continue
@@ -152,23 +151,22 @@ def _is_stopped(plan: OpenSurvey, run: Run) -> bool:
 
 
 def _show_artifacts(plan: OpenSurvey, published: Published) -> None:
-    """Give text, picture and table of a run to the server of the flow that this is called in, and link its report."""
+    """Create artifacts of a run in the present flow: summary with picture, table of savings, link to the report."""
     if not inside_flow():
         return
     letters = (letter if letter.isalnum() and letter.isascii() else "-" for letter in plan.run.name.lower())
     key, where = "".join(letters).strip("-"), f"{plan.run.archive.name}/runs/{published.folder.name}"
     report = (published.folder / "report.html").absolute().as_uri()
     receipt = published.receipt
-    with suppress(Exception):  # a server that is gone: the archive has it all
-        costs = [*cost_rows(receipt["savings"]), *byte_rows(receipt)]
+    with suppress(Exception):  # without a server the archive has everything
         rows = [
             {
                 "cost": row["label"],
                 "this survey": row["done"],
-                "everything": row["full"],
+                "reference": row["full"],
                 "fraction": format_percent(row["ratio"]),
             }
-            for row in costs
+            for row in saving_rows(receipt)
         ]
         text = render_markdown(
             "survey.md",
@@ -186,15 +184,12 @@ def _show_artifacts(plan: OpenSurvey, published: Published) -> None:
 
 
 def small_jpeg(png: bytes) -> bytes:
-    """Return a picture as a JPEG that takes at most 100 KiB in base64, as large as that lets it be."""
+    """Return a picture as a JPEG of at most 800 px width, which stays below 100 KiB in base64."""
     from PIL import Image
 
+    file = io.BytesIO()
     with Image.open(io.BytesIO(png)) as opened:
         picture = opened.convert("RGB")
-    for width in WIDTHS_PX:
-        smaller, file = picture.copy(), io.BytesIO()
-        smaller.thumbnail((width, 10 * width))
-        smaller.save(file, "JPEG", quality=80, optimize=True)
-        if len(file.getvalue()) * 4 / 3 <= MOST_BYTES - 4:
-            break
+    picture.thumbnail((WIDTH_PX, 10 * WIDTH_PX))
+    picture.save(file, "JPEG", quality=60, optimize=True)
     return file.getvalue()

@@ -1,4 +1,4 @@
-"""The quicklook, a survey at a glance as one PNG: raw lines and field, where it captured again, class map, truth."""
+"""Draw the quicklook of a survey as one PNG: raw lines and field, attention, class map, labels."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -20,88 +19,53 @@ from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 from numpy.typing import NDArray
 from PIL import Image
 
-from flows.publish.panels import (
-    INK,
-    MUTED,
-    PAPER,
-    STYLE,
-    UNLABELLED_COLOUR,
-    class_palette,
-    class_rgb,
-    grey_of,
-    outline,
-    save_png,
-)
+from flows.publish.panels import MUTED, STYLE, UNLABELLED_COLOUR, class_palette, class_rgb, grey_of, outline, save_png
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.geometry.scan import Axis
 from storage.arrays.quicklooks import choose_bands, develop, stretch
 
 Box = tuple[int, int, int, int]
-COLOURS, RAMP = 256, 32  # of the picture, and of them for a key
+COLOURS = 256
 HEAT_ALPHA = 0.72  # of scores over the field
-FIXED = (PAPER, INK, MUTED, UNLABELLED_COLOUR, "white", "black")
 
 
 @dataclass(frozen=True)
 class QuicklookData:
-    """Content of the four panels, as plain arrays. Pixels are scene pixels; patches are numbered row by row."""
+    """Data of the panels, as arrays. Pixels are scene pixels; patches are numbered row by row."""
 
     survey: str
     seed: int
-    about: str  # how it was looked at
-    policy: str | None  # that chose the patches; None of a uniform scan of which all are read
-    raw: tuple[NDArray[np.generic], ...]  # sweeps as they came, calibrated, (line, sample, band) each, by strip
-    raw_lines: int  # captured in them; a large sweep shows every n-th
+    about: str  # how the field was captured
+    policy: str | None  # of the choice of patches; None where all are segmented at full resolution
+    raw: tuple[NDArray[np.generic], ...]  # calibrated sweeps, (line, sample, band) each, by strip
+    raw_lines: int  # captured in them; a large sweep is subsampled
     rectified: NDArray[np.floating]  # (y, x, band), NaN where nothing was captured
     wavelength_nm: NDArray[np.floating]  # (band,) of raw and rectified
     score: NDArray[np.floating]  # (row, column) of the padded grid's patches; NaN or -inf without a score
     patch_px: int
-    patch_index: NDArray[np.integer]  # asked for, in order of rank
-    blocks: tuple[Box, ...]  # captured in detail: (y0, y1, x0, x1), half open [px]
+    patch_index: NDArray[np.integer]  # chosen, in order of rank
+    blocks: tuple[Box, ...]  # captured at full resolution: (y0, y1, x0, x1), half open [px]
     class_map: NDArray[np.integer]  # (y, x), 255 unlabelled
     class_names: tuple[str, ...]
     class_colours: NDArray[np.integer]  # (class, 3) 0..255
     truth: NDArray[np.integer] | None = None  # (y, x), 255 unlabelled
-    confidence: NDArray[np.floating] | None = None  # (y, x) 0..1, shown where there is no truth
+    confidence: NDArray[np.floating] | None = None  # (y, x) 0..1, shown without labels
     along: Axis = "x"  # of the scene along which the raw lines lie
     note: str = ""  # at the end of the title line, such as the accuracy
     changed: bool = False  # ``score`` is the fraction of a patch's pixels that the full network changed, NaN elsewhere
-    scan: bool = False  # a uniform scan, which looked nowhere twice
-    raster: bool = False  # no lines were taken: ``raw`` is the image of its coarse means
-    was: NDArray[np.integer] | None = None  # (y, x) class before of pixels that changed, 255 elsewhere
+    scan: bool = False  # a uniform scan
+    raster: bool = False  # without lines: ``raw`` is the image of its coarse means
+    was: NDArray[np.integer] | None = None  # (y, x) previous class of changed pixels, 255 elsewhere
     days: float = 0.0  # since the visit before
 
 
 def draw_quicklook(path: str | Path, panels: QuicklookData) -> None:
-    """Draw the four panels as a PNG of about 1800 x 1400 px (flatter or taller for fields that are); OSError.
-
-    It has 256 colours, those of classes, paper, words and keys among them: a third of the bytes.
-    """
+    """Draw the four panels as a PNG of about 1800 x 1400 px with 256 colours; raises OSError."""
     drawn = io.BytesIO()
     with mpl.rc_context(_STYLE):
         save_png(_compose(panels), drawn)
-    name, alpha = ("viridis", 1.0) if panels.policy is None else ("inferno", HEAT_ALPHA)
-    key = alpha * mpl.colormaps[name](np.linspace(0, 1, RAMP))[:, :3] + 1 - alpha  # over white
-    fixed = np.array([to_rgb(colour) for colour in FIXED])
-    kept = np.rint(255 * np.vstack([class_palette(panels.class_colours)[: COLOURS // 4], fixed, key])).astype(np.uint8)
     with Image.open(drawn) as opened:
-        picture = opened.convert("RGB")
-    _in_colours(picture, kept).save(path, "PNG", optimize=True)
-
-
-def _in_colours(picture: Image.Image, kept: NDArray[np.uint8]) -> Image.Image:
-    """A picture in 256 colours: those (colour, 3) that are ``kept`` as they are, and what stands best for others."""
-    others = picture.quantize(COLOURS - len(kept), dither=Image.Dither.NONE).getpalette() or []
-    table = Image.new("P", (1, 1))
-    table.putpalette(kept.tobytes() + bytes(others))
-    numbers = np.array(picture.quantize(palette=table, dither=Image.Dither.NONE))  # looked up coarsely
-    place = np.array([1 << 16, 1 << 8, 1], np.uint32)
-    own = np.asarray(picture) @ place
-    for number, colour in enumerate(kept @ place):
-        numbers[own == colour] = number
-    found = Image.fromarray(numbers)
-    found.putpalette(table.getpalette() or [])
-    return found
+        opened.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(path, "PNG", optimize=True)
 
 
 _STYLE: Any = {**STYLE, "axes.titlesize": 14, "axes.titleweight": "bold", "axes.titlelocation": "left"}
@@ -124,20 +88,17 @@ def _compose(data: QuicklookData) -> Figure:
     rows = figure.subfigures(len(counts), 1, height_ratios=tall, squeeze=False).ravel()
     for row, count in zip(rows, counts, strict=True):
         for axes in row.subplots(1, count, squeeze=False).ravel():
-            axes.set_anchor("N")  # captions of a row stand at one height
+            axes.set_anchor("N")  # to align the captions of a row
             next(panels)(axes, data)
     _draw_legend(figure, data, max(1, int(page / 2.9)))
     return figure
 
 
 def _draw_raw(axes: Axes, data: QuicklookData) -> None:
-    """Panel 1, first half: the sweeps as they came, next to each other, stretched to the field's shape.
-
-    Of a raster the means that attention looks at.
-    """
+    """Draw the sweeps side by side, stretched to the field's shape; for a raster its coarse means."""
     if data.raster:
         _show(axes, colours_of(data, data.raw[0]), interpolation="nearest")
-        return _caption(axes, "1  Coarse means", "of the raster: what attention looks at first")
+        return _caption(axes, "1  Coarse means", "of the raster")
     sweeps = [colours_of(data, np.asarray(sweep)) for sweep in data.raw]
     tall, gap = max(one.shape[0] for one in sweeps), max(1, sum(one.shape[1] for one in sweeps) // 60)
     image = np.full((tall, sum(one.shape[1] for one in sweeps) + gap * (len(sweeps) - 1), 3), 0.98, np.float32)
@@ -149,18 +110,18 @@ def _draw_raw(axes: Axes, data: QuicklookData) -> None:
     axes.set_aspect("auto")
     axes.set_box_aspect(data.class_map.shape[0] / data.class_map.shape[1])
     count, kind = len(data.raw), "sweep" if data.policy is None or data.scan else "coarse sweep"
-    words = f"{count} {kind}{'s' if count != 1 else ''}, {data.raw_lines} lines as they came"
+    words = f"{count} {kind}{'s' if count != 1 else ''}, {data.raw_lines} lines"
     return _caption(axes, "1  Raw lines", words)
 
 
 def _draw_rectified(axes: Axes, data: QuicklookData) -> None:
-    """Panel 1, second half: the field; of a revisit the field in grey, and today's classes where they are new."""
+    """Draw the field; for a revisit the field in grey, with the present classes of changed pixels."""
     if data.was is not None:
         changed = data.was != UNLABELLED
         grey = np.repeat((0.25 + 0.6 * grey_of(data.rectified))[..., None], 3, axis=-1)
         classes = class_rgb(data.class_map, class_palette(data.class_colours))
         _show(axes, np.where(changed[..., None], classes, grey).astype(np.float32), interpolation="nearest")
-        words = f"{np.count_nonzero(changed)} px of another class than {data.days:.3g} days before, in today's colours"
+        words = f"{np.count_nonzero(changed)} px with another class than {data.days:.3g} days before"
         return _caption(axes, "Changed", words)
     _, words = choose_bands(data.wavelength_nm)
     _show(axes, colours_of(data, data.rectified))
@@ -168,7 +129,7 @@ def _draw_rectified(axes: Axes, data: QuicklookData) -> None:
 
 
 def colours_of(data: QuicklookData, image: NDArray[np.generic]) -> NDArray[np.float32]:
-    """Three bands of lines or field: true colours on one scale, others stretched band by band."""
+    """Return three bands of lines or field as colours: true colours on one scale, others stretched by band."""
     bands, words = choose_bands(data.wavelength_nm)
     chosen = list(bands)
     if words.startswith("true colour"):
@@ -177,9 +138,9 @@ def colours_of(data: QuicklookData, image: NDArray[np.generic]) -> NDArray[np.fl
 
 
 def _draw_attention(axes: Axes, data: QuicklookData) -> None:
-    """Panel 2: the score of every patch over the field in grey, patches asked for and blocks captured outlined.
+    """Draw the score of every patch over the field in grey, with outlines of chosen patches and captured blocks.
 
-    Of a uniform scan, which looked nowhere twice, the confidence of the map.
+    For a uniform scan draw the confidence of the map.
     """
     if data.policy is None:
         return _draw_confidence(axes, data.confidence, "2  Confidence")
@@ -208,16 +169,16 @@ def _draw_attention(axes: Axes, data: QuicklookData) -> None:
         _heat_key(heat, (f"{low:.0%}", f"{high:.0%}"))
         mean = float(np.nanmean(data.score)) if len(data.patch_index) else 0.0
         words = f"{len(data.patch_index)} patches by {data.policy} (cyan); {mean:.0%} of their pixels changed class"
-        return _caption(axes, "2  Read in full, and what changed", words)
+        return _caption(axes, "2  Segmented at full resolution, and changes", words)
     _heat_key(heat, ("low", "high"))
     words = f"{len(data.patch_index)} patches chosen by {data.policy} (cyan)"
     if data.scan:
-        return _caption(axes, "2  What is read in detail", words)
-    return _caption(axes, "2  Where it captured again", f"{words}; captured in detail (dashed)")
+        return _caption(axes, "2  Segmented at full resolution", words)
+    return _caption(axes, "2  Captured again", f"{words}; captured in detail (dashed)")
 
 
 def _score_range(score: NDArray[np.floating]) -> tuple[NDArray[np.float64], float, float]:
-    """Scores fit to draw (NaN where there is none, the greatest for +inf) with the ends of their scale."""
+    """Return scores to draw (the greatest for +inf, NaN without one) and the ends of their scale."""
     known = score[np.isfinite(score)].astype(np.float64)
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
     shown = np.where(np.isposinf(score), high, np.where(np.isfinite(score), score, np.nan)).astype(np.float64)
@@ -229,21 +190,21 @@ def _draw_classes(axes: Axes, data: QuicklookData) -> None:
     most = max(data.class_map.shape[1] / 4, 1)  # of a bar of a round number of pixels
     length = max(step * 10 ** int(np.log10(most)) for step in (1, 2, 5) if step * 10 ** int(np.log10(most)) <= most)
     axes.add_artist(AnchoredSizeBar(axes.transData, length, f"{length} px", "lower left", borderpad=0.5))
-    _caption(axes, "3  Class map", "what the model says grows where")
+    _caption(axes, "3  Class map", "by the model")
 
 
 def _draw_truth(axes: Axes, data: QuicklookData) -> None:
-    """Panel 4: the truth, without it the confidence, without both a word that there is neither."""
+    """Draw the labels; without labels the confidence."""
     if data.truth is not None:
         _show(axes, class_rgb(data.truth, class_palette(data.class_colours)), interpolation="nearest")
         labelled = (data.truth != UNLABELLED) & (data.class_map != UNLABELLED)
         right = float(np.mean(data.truth[labelled] == data.class_map[labelled])) if labelled.any() else float("nan")
-        words = f"{100 * right:.1f} % of the labelled pixels agree" if labelled.any() else "no pixel is labelled"
-        return _caption(axes, "4  Truth", words)
+        words = f"labelled pixels correct: {100 * right:.1f} %" if labelled.any() else "no pixel is labelled"
+        return _caption(axes, "4  Labels", words)
     if data.confidence is not None and data.policy is not None:
         return _draw_confidence(axes, data.confidence, "4  Confidence", " (no labels given)")
     axes.axis("off")
-    return _caption(axes, "4  Truth", "no labels were given")
+    return _caption(axes, "4  Labels", "no labels were given")
 
 
 def _draw_confidence(axes: Axes, confidence: NDArray[np.floating] | None, title: str, why: str = "") -> None:
@@ -253,7 +214,7 @@ def _draw_confidence(axes: Axes, confidence: NDArray[np.floating] | None, title:
     image = axes.imshow(confidence, cmap="viridis", vmin=0, vmax=1)
     _frame(axes, confidence.shape)
     _heat_key(image, ("0", "1"))
-    return _caption(axes, title, f"of the model in its own map{why}")
+    return _caption(axes, title, f"of the model{why}")
 
 
 def _draw_legend(figure: Figure, data: QuicklookData, columns: int) -> None:
@@ -267,7 +228,7 @@ def _draw_legend(figure: Figure, data: QuicklookData, columns: int) -> None:
     if any((image == UNLABELLED).any() for image in others):
         marks.append(Patch(facecolor=UNLABELLED_COLOUR, edgecolor="#555555", linewidth=0.6))
         names.append("unlabelled")
-    for count in range(min(columns, len(names)), 0, -1):  # long names leave room for fewer beside each other
+    for count in range(min(columns, len(names)), 0, -1):  # fewer columns for long names
         legend = figure.legend(marks, names, loc="outside lower center", ncol=count, frameon=False, fontsize=13)
         if legend.get_window_extent().width <= figure.bbox.width:
             return
@@ -289,11 +250,11 @@ def _caption(axes: Axes, title: str, words: str) -> None:
     axes.set_title(f"{title}\n")
     placed: Any = {"xycoords": "axes fraction", "textcoords": "offset points"}
     line = axes.annotate(words, (0, 1), (0, 7), color=MUTED, size=12, **placed)
-    line.set_in_layout(False)  # the title leaves room above; words wider than a narrow panel take none from it
+    line.set_in_layout(False)  # long captions do not narrow the panel
 
 
 def _heat_key(image: AxesImage, ends: tuple[str, str]) -> None:
-    """Draw the colours in the lower right corner, with what their ends stand for."""
+    """Draw a colour bar with the values of its ends in the lower right corner."""
     axes = image.axes
     box = axes.inset_axes((0.62, 0.09, 0.3, 0.03))
     bar = axes.figure.colorbar(image, cax=box, orientation="horizontal")

@@ -1,7 +1,7 @@
-"""The receipt of a run: what was captured, stored and computed against everything, and what that did to accuracy.
+"""Define the receipt of a run: costs against the reference, accuracy, findings, settings and products.
 
-Its fields stand here alone: what is published is checked against the model, and stands in its order in receipt.json. A
-receipt that was read is a plain dictionary of the same keys.
+A published receipt is checked against the model, and has its fields in this order in receipt.json. A receipt that was
+read is a dictionary with the same keys.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ from storage.archive.records import StageRecord
 from storage.archive.whole_files import to_json
 
 Receipt = dict[str, Any]
-AccuracyIs = Literal["judged", "pending", "left out", "without labels"]  # pending: it is worked out after the map
+AccuracyIs = Literal[
+    "judged", "pending", "left out", "without labels"
+]  # pending: it is added after the publication of the map
 Facts = dict[str, Any]
 COSTS = ("lines", "samples", "capture_s", "patches", "multiply_adds")
 
@@ -29,7 +31,7 @@ class _Part(BaseModel):
 
 
 class Saving(_Part):
-    """One cost: what was spent, what everything costs, their ratio (null where that is 0)."""
+    """One cost: of the run, of the reference, and their ratio (null if the reference is 0)."""
 
     done: float
     full: float
@@ -38,7 +40,7 @@ class Saving(_Part):
 
 
 class MultiplyAddsSaving(Saving):
-    """Multiply-adds, also by what they were for: overview, scores, the full network."""
+    """Multiply-adds, also split into overview, scores of patches, and full network (detail)."""
 
     overview: float
     score: float
@@ -46,10 +48,10 @@ class MultiplyAddsSaving(Saving):
 
 
 class CaptureSaving(Saving):
-    """Seconds of capture. Everything is every line at the camera's exposure.
+    """Seconds of capture; the reference is every line at the camera's exposure.
 
-    ``uniform`` are the seconds of the cheapest uniform scan that is nearly as good as any by the weights' record, and
-    ``uniform_scan`` names it; both are missing without such a record.
+    ``uniform`` are the seconds of the cheapest uniform scan with nearly the best score, and ``uniform_scan`` names it.
+    Both are missing where the weights have no scan performance table.
     """
 
     uniform: float | None = None
@@ -57,7 +59,7 @@ class CaptureSaving(Saving):
 
 
 class Savings(_Part):
-    """Costs of the run against every line, sample and patch; of a raster, of which nothing is captured, less."""
+    """Costs of the run against every line, sample and patch; a raster has no capture."""
 
     lines: Saving | None = None
     samples: Saving | None = None
@@ -67,15 +69,15 @@ class Savings(_Part):
 
 
 class DataBytes(_Part):
-    """Bytes of a run, each counted over whole files and told against ``reference``.
+    """Bytes of a run, counted over whole files, and the reference.
 
-    The reference is every line at the camera's own exposure as it is captured (uint16, uncompressed), of a raster every
+    The reference is every line at the camera's own exposure as captured (uint16, uncompressed), for a raster every
     pixel as uint16.
     """
 
     captured: int  # as the camera delivers them, of all passes
-    written: int  # stores that were built, also those cleared since, spools of their lines, and the run's folder
-    kept: int  # all files of the archive that the run names or rests on, and its folder
+    written: int  # stores that were built, including cleared ones, spools, and the run's folder
+    kept: int  # the run's folder, and all stores that it names with their inputs
     moved_bucket: int  # to and from a bucket, 0 without one
     moved_workers: int | None  # to workers that share no memory, 0 without any; None: not counted
     reference: int
@@ -83,9 +85,9 @@ class DataBytes(_Part):
 
 
 class Score(_Part):
-    """Score of one map, 0..1, over the classes of the truth; IoU is null for a class that the truth lacks.
+    """Score of one map, 0..1, over the classes of the labels; IoU is null for a class without labels.
 
-    ``false_classes`` are those that the map shows and the truth lacks, with pixels.
+    ``false_classes`` are the pixels of mapped classes without labels.
     """
 
     miou: float | None
@@ -95,14 +97,14 @@ class Score(_Part):
 
 
 class Control(_Part):
-    """mIoU of another placement of patches, and its spread over repeats (null where chance has no part)."""
+    """mIoU of another choice of patches, and its spread over repeats (null for a deterministic one)."""
 
     miou: float | None
     spread: float | None
 
 
 class Accuracy(Score):
-    """Accuracy against labels: this map, no fine patch, every fine patch, and other placements."""
+    """Accuracy against labels: of this map, without fine patches, with all of them, and with other choices."""
 
     none: Score
     all: Score
@@ -111,7 +113,7 @@ class Accuracy(Score):
 
 
 class ReceiptFields(_Part):
-    """All fields of a receipt. Those from ``field`` to ``pixels`` are findings, each only where it says something."""
+    """All fields of a receipt; those from ``field`` to ``pixels`` are findings, each present only if it applies."""
 
     survey: str
     source: str
@@ -159,9 +161,9 @@ class ReceiptFields(_Part):
 
 
 def build_receipt(**fields: object) -> Receipt:
-    """Put a receipt together from its fields, in their order; those that are None or empty findings are left out.
+    """Return a receipt of these fields, in order, without empty findings.
 
-    Raises ShapeError: a field is missing, or not of the design; names it.
+    Raises ShapeError: a field is missing or not valid.
     """
     needed = {name for name, one in ReceiptFields.model_fields.items() if one.is_required()}
     known = {
@@ -173,10 +175,10 @@ def build_receipt(**fields: object) -> Receipt:
 def with_accuracy(
     receipt: Receipt, accuracy: Mapping[str, Any], stage: StageRecord, address: str, *, settings: Facts, judged: str
 ) -> Receipt:
-    """Return the receipt of a run once its map is judged; nothing that was spent on the survey itself changes.
+    """Return a receipt with an accuracy added; the costs of the survey do not change.
 
-    ``stage`` is the judging's, in the place of an earlier one; ``address`` is of the product ``accuracy``; by
-    ``settings`` the map was judged; ``judged`` is when. Raises ShapeError: a field is missing, or not of the design.
+    ``stage`` is the record of the evaluation, ``address`` that of the product ``accuracy``. ``settings`` are those of
+    the evaluation, ``judged`` is its time. Raises ShapeError: a field is missing or not valid.
     """
     files = {name: place for name, place in receipt["products"].items() if place.startswith("runs/")}
     stores = {name: place for name, place in receipt["products"].items() if name not in (*files, "accuracy")}
@@ -190,7 +192,7 @@ def with_accuracy(
 
 
 def check_receipt(receipt: Mapping[str, Any]) -> Receipt:
-    """Return the receipt itself if it has every field of the design; ShapeError naming the first that it lacks."""
+    """Return the receipt if it is complete; ShapeError names the first field that is missing or not valid."""
     try:
         ReceiptFields.model_validate(receipt)
     except ValidationError as error:
@@ -202,12 +204,12 @@ def check_receipt(receipt: Mapping[str, Any]) -> Receipt:
 
 
 def is_pending(receipt: Mapping[str, Any]) -> bool:
-    """Return whether a run was published before its map was judged, and has not been judged since."""
+    """Return whether a run waits for its accuracy."""
     return receipt.get("accuracy_is") == "pending"
 
 
 def hectares_of_classes(receipt: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """Return the hectares of each class, where something says how large a pixel is."""
+    """Return the hectares of each class; None where the size of a pixel is not known."""
     areas = receipt.get("areas")
     hectares = areas.get("ha") if isinstance(areas, Mapping) else None
     return hectares if isinstance(hectares, Mapping) else None

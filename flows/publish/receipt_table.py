@@ -1,7 +1,8 @@
-"""A receipt for people: the headline, what was spent as a table, and what was found, a row each."""
+"""Format a receipt for people: the savings as a table, the score, and the findings, one row for each part."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
+from flows.publish.effects_table import print_effects
 from flows.publish.receipt import Receipt, hectares_of_classes, is_pending
 from flows.tasks.scene import TRAINING_SCENE
 from flows.tasks.scores import format_prediction, format_worst_class
@@ -28,158 +30,184 @@ from flows.terminal.progress import table
 from pipeline.ground.field_places import M2_PER_HECTARE
 from pipeline.planning.uniform_scans import format_scan
 
-COST_LABELS = {
-    "capture_s": ("time at the camera", format_seconds),
+COST_LABELS: Mapping[str, tuple[str, Callable[[float | None], str]]] = {
+    "capture_s": ("capture time", format_seconds),
+    "multiply_adds": ("multiply-adds", format_count),
     "lines": ("lines", format_count),
     "samples": ("samples on the field", format_count),
-    "patches": ("patches read in full", format_count),
-    "multiply_adds": ("model's multiply-adds", format_count),
+    "patches": ("patches at full resolution", format_count),
 }
 BYTE_LABELS = {
+    "kept": "bytes kept",
     "captured": "bytes captured",
     "written": "bytes written",
-    "kept": "bytes kept",
-    "moved_bucket": "bytes moved, bucket",
-    "moved_workers": "bytes moved, workers",
+    "moved_bucket": "bytes to and from the bucket",
+    "moved_workers": "bytes to workers",
 }
-MOST_CHANGES = 4  # in words
-LEAST_REFERENCE = 100_000  # bytes from which on all are told in MB
-LEADING = 3  # classes of a plot in words
-FOREIGN = 0.2  # fraction of a map that is unknown from which on its weights are the wrong ones
+LEADING = ("capture time", "bytes kept", "multiply-adds")  # of the rows, those printed at the end of a survey
+LEAST_REFERENCE = 100_000  # bytes; with a smaller reference, rows are not in MB
+MOST_NAMED = 4  # changes of class in a row
+LEADING_CLASSES = 3  # of a plot
+FOREIGN = 0.2  # fraction of unknown pixels above which the weights do not fit the field
 FOREIGN_WORDS = (
     "These weights do not know this field: train some on labelled scenes of it (spectralzoom train DATASET), or leave "
     "the class out with --unknown off"
 )
 
 
-def cost_rows(savings: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return what was spent against everything, a row each: a saving with its label, figures in words."""
-    return [
-        {**savings[name], "label": label, "done": show(savings[name]["done"]), "full": show(savings[name]["full"])}
-        for name, (label, show) in COST_LABELS.items()
-        if name in savings  # a raster takes no line and no second
-    ]
+def saving_rows(receipt: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return costs and bytes of a run against the reference, one row each, with formatted figures.
 
-
-def byte_rows(receipt: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the bytes of a run against the reference, a row each.
-
-    They are in MB, so that rows compare, but where the reference is smaller than a tenth of one. Bytes moved have a row
-    where some were.
+    A raster has no capture. Bytes are in MB, so that rows compare, unless the reference is smaller than a tenth of one.
     """
-    told, rows = receipt["data_bytes"], []
-    full = told["reference"]
-    show = format_bytes if full is not None and full < LEAST_REFERENCE else format_megabytes
+    savings, account = receipt["savings"], receipt["data_bytes"]
+    rows = [
+        {"label": label, "done": show(one["done"]), "full": show(one["full"]), "ratio": one["ratio"]}
+        for name, (label, show) in COST_LABELS.items()
+        if (one := savings.get(name)) is not None
+    ]
+    full = account["reference"]
+    show_bytes = format_bytes if full is not None and full < LEAST_REFERENCE else format_megabytes
     for name, label in BYTE_LABELS.items():
-        done = told[name]
-        if done == 0 and name.startswith("moved"):
-            continue
-        words = "not counted" if done is None else show(done)
-        ratio = None if done is None or not full else done / full
-        rows.append({"label": label, "done": words, "full": show(full), "ratio": ratio})
-    return rows
+        done = account[name]
+        if done or not name.startswith("moved"):
+            ratio = done / full if done is not None and full else None
+            rows.append({"label": label, "done": show_bytes(done), "full": show_bytes(full), "ratio": ratio})
+        elif done is None:
+            rows.append({"label": label, "done": "not counted", "full": show_bytes(full), "ratio": None})
+    return sorted(rows, key=lambda row: LEADING.index(row["label"]) if row["label"] in LEADING else len(LEADING))
+
+
+def format_reference(receipt: Mapping[str, Any]) -> str:
+    """Return a sentence on the reference, and on the cheapest good uniform scan where the weights have a record."""
+    if (capture := receipt["savings"].get("capture_s")) is None:
+        return "Reference: every pixel of the raster, segmented at full resolution."
+    usual = f"{receipt['settings']['camera']['exposure_ms']:g} ms"
+    words = f"Reference: every line at {usual}, kept as captured, every patch segmented at full resolution."
+    if capture.get("uniform") is None:
+        return words
+    scan = f"{format_seconds(capture['uniform'])} ({capture['uniform_scan']})"
+    return f"{words} The cheapest uniform scan with nearly the best score takes {scan}."
 
 
 def format_reused(receipt: Mapping[str, Any]) -> str:
-    """Return what of the bytes kept was found in the archive and not built; empty where all was built."""
+    """Return the number and size of stores that were in the archive before; empty where all were built."""
     reused = receipt["data_bytes"]["reused"]
     if not reused:
         return ""
-    size = format_megabytes(sum(reused.values()))
-    return f"Reused, found and not written again: {counted(len(reused), 'store')}, {size} of the bytes kept."
+    return f"Reused stores: {len(reused)}, {format_megabytes(sum(reused.values()))} of the bytes kept."
 
 
-def print_table(receipt: Receipt, console: Console) -> None:
-    """Print the savings to the terminal, and what became of a prior map or of weights that do not know the field."""
-    columns = ("cost", "this survey", "everything", "ratio")
-    costs = [*cost_rows(receipt["savings"]), *byte_rows(receipt)]
-    rows = [[row["label"], row["done"], row["full"], format_percent(row["ratio"])] for row in costs]
-    console.print(table(columns, rows, whole=columns[1:]))
-    if "capture_s" in receipt["savings"]:
-        usual = f"{receipt['settings']['camera']['exposure_ms']:g} ms"
-        console.print(f"Everything: every line of {usual}, kept as captured, each of its patches read in full.")
-    if reused := format_reused(receipt):
-        console.print(escape(reused))
-    for name, words in finding_rows({name: receipt[name] for name in ("memory", "unknown") if name in receipt}):
-        if name != "unknown" or receipt["unknown"]["fraction"] > FOREIGN:
-            console.print(escape(f"{name}: {words}"))
+def format_score(receipt: Mapping[str, Any]) -> str:
+    """Return the score of the map in one or two sentences: against labels, else as its own probabilities expect."""
+    if (accuracy := receipt.get("accuracy")) is not None:
+        scene = f" on {TRAINING_SCENE[receipt['training_scene']]}" if "training_scene" in receipt else ""
+        right = format_points(accuracy.get("overall_accuracy"))
+        score = (
+            f"mIoU {format_points(accuracy['miou'])} of 100 against the labels{scene} ({right} % of pixels correct)."
+        )
+        alone = receipt.get("plan", {}).get("kind") in ("scan", "raster") and "kept" not in receipt
+        return f"{score} {format_worst_class(accuracy, alone=alone)}".rstrip()
+    if is_foreign(receipt):
+        return f"Unknown: {format_percent(receipt['unknown']['fraction'])} of the map. {FOREIGN_WORDS}."
+    later = " The accuracy against the labels is added later." if is_pending(receipt) else ""
+    expected = receipt.get("expected") or {}
+    if predicted := format_prediction(expected.get("miou"), expected.get("error")):
+        return f"Expected mIoU {predicted} of 100, estimated from the map's own probabilities.{later}"
+    return later.strip() or "The score is not known: there are no labels."
 
 
 def headline(receipt: Receipt, captured_again: float | None = None) -> str:
-    """Return the run in a few sentences for a farmer, plain text: how long, how good, and where it is worst.
+    """Return the score, the capture time and the fraction of the field captured again, as plain sentences.
 
     ``captured_again`` is the fraction of the field that was captured in detail, 0..1; None leaves it out.
     """
-    savings, scan = receipt["savings"], receipt.get("plan", {}).get("kind") in ("scan", "raster")
-    words = []
-    if captured_again == 0:
-        words.append("The camera captured nothing again: no run of fine lines fits into the time left, or pays.")
-    elif captured_again is not None:
-        words.append(f"The camera captured {format_percent(captured_again)} of the field again.")
-    if (capture := savings.get("capture_s")) is None:
-        read = format_percent(savings["multiply_adds"]["ratio"])
-        words.append(
-            f"The raster's pixels were taken as they are: its map took {read} of the multiply-adds of reading every "
-            "pixel."
-        )
-    else:
-        usual = f"every line of {receipt['settings']['camera']['exposure_ms']:g} ms"
+    sentences = [format_score(receipt)]
+    if (capture := receipt["savings"].get("capture_s")) is not None:
         done, full = (format_seconds(capture[name]) for name in ("done", "full"))
-        words.append(f"Capture took {done} instead of {full} for {usual} ({format_percent(capture['ratio'])}).")
-        if capture.get("uniform") is not None:
-            least = f"{format_seconds(capture['uniform'])} ({capture['uniform_scan']})"
-            words.append(f"The cheapest uniform scan that is nearly as good as any takes {least}.")
-    if is_pending(receipt):
-        words.append("The map is not judged yet: its accuracy is added once it is.")
-    if (accuracy := receipt.get("accuracy")) is not None:
-        alone = scan and "kept" not in receipt  # everything is read
-        others = {} if alone else {"the overview alone gives": accuracy["none"], "a full reading": accuracy["all"]}
-        beside = [f"{name} {format_points(one['miou'])}" for name, one in others.items() if one["miou"] is not None]
-        right = format_points(accuracy.get("overall_accuracy"))
-        seen = f" on {TRAINING_SCENE[receipt['training_scene']]}" if "training_scene" in receipt else ""
-        words.append(
-            f"The map scores {format_points(accuracy['miou'])} of 100 against the truth{seen} ({right} % of its pixels "
-            f"are right){'; ' if beside else ''}{', '.join(beside)}."
-        )
-        words.append(format_worst_class(accuracy, alone=alone))
-    return " ".join(filter(None, words))
+        sentences.append(f"Capture time: {done} ({format_percent(capture['ratio'])} of the reference, {full}).")
+    if captured_again is not None:
+        sentences.append(f"Captured again at full resolution: {format_percent(captured_again)} of the field.")
+    return " ".join(sentences)
+
+
+def print_summary(receipt: Receipt, console: Console) -> None:
+    """Print the score, the leading savings and their reference; and the prior map's state where there was one."""
+    console.print(escape(format_score(receipt)))
+    rows = [row for row in saving_rows(receipt) if row["label"] in LEADING]
+    cells = [[row["label"], row["done"], row["full"], format_percent(row["ratio"])] for row in rows]
+    columns = ("", "this survey", "reference", "fraction")
+    console.print(table(columns, cells, whole=columns[1:]))
+    console.print(escape(format_reference(receipt)))
+    for name, words in finding_rows({"memory": receipt.get("memory")}):
+        console.print(escape(f"{name}: {words}"))
+
+
+def print_details(receipt: Receipt, console: Console) -> None:
+    """Print all savings, the stages that ran or were read from the archive, the effects and the versions."""
+    columns = ("", "this survey", "reference", "fraction")
+    cells = [[row["label"], row["done"], row["full"], format_percent(row["ratio"])] for row in saving_rows(receipt)]
+    console.print(table(columns, cells, whole=columns[1:]))
+    stages = [
+        [escape(one["name"]), one["state"], format_seconds(one["wall_s"]), format_bytes(one["bytes_out"])]
+        for one in receipt["stages"]
+        if one["state"] != "skipped"
+    ]
+    console.print(table(("stage", "state", "wall time", "written"), stages, left=2))
+    if "effects_total" in receipt:
+        print_effects(receipt["effects"], receipt["effects_total"], console)
+    console.print(escape(", ".join(f"{name} {number}" for name, number in receipt["versions"].items())))
+
+
+def is_foreign(found: Mapping[str, Any]) -> bool:
+    """Return whether so many pixels are unknown that the weights do not fit the field."""
+    return ((found.get("unknown") or {}).get("fraction") or 0.0) > FOREIGN
 
 
 def finding_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return the findings of a receipt as rows of a table: label, and figures with their names.
 
-    Of a field that the weights do not know no score is predicted: their record is of others.
+    With weights that do not fit the field, no score is predicted.
     """
-    foreign = (found.get("unknown") or {}).get("fraction", 0.0) > FOREIGN
-    if foreign and "scans" in found:
+    if is_foreign(found) and "scans" in found:
         scans = {name: {**scan, "expected_miou": None} for name, scan in found["scans"].items()}
         found = {**found, "scans": scans}
-    rows = [
-        (_LABELS.get(part, part), _figures(part, found.get(part))) for part in dict.fromkeys(f[0] for f in _FIGURES)
-    ]
-    rows += [
-        (f"pointing, {name}", _figures("pass", one))
-        for name, one in found.get("pointing", {}).items()
-        if isinstance(one, Mapping)
-    ]
-    rows += [
-        (f"sweep {name}", f"lines {', '.join(f'{count} {what}' for what, count in facts.items() if count)}: left out")
-        for name, facts in found.get("lines", {}).items()
-    ]
-    if "scans" not in found and found.get("plan", {}).get("kind", "raster") != "raster":
-        words = "the weights have no scan performance table, so that seconds stand beside every line at full exposure"
-        rows.append(("uniform scans", f"{words}; train --min-exposure-ms 3 makes one, by scenes kept for validation"))
-    if foreign:
+    rows = [(label, _figures(found.get(part), names)) for part, (label, names) in _SHOWN.items()]
+    for name, one in found.get("pointing", {}).items():
+        if isinstance(one, Mapping):
+            rows.append((f"pointing, {name}", _figures(one, _OF_POINTING)))
+    for name, facts in found.get("lines", {}).items():
+        counts = ", ".join(f"{count} {what}" for what, count in facts.items() if count)
+        rows.append((f"sweep {name}", f"lines left out: {counts}"))
+    if is_foreign(found):
         rows.append(("weights", FOREIGN_WORDS))
     return [(label, words) for label, words in rows if words]
 
 
-def _figures(part: str, found: Mapping[str, Any] | None) -> str:
-    """Return the figures of a part that say something, in words; None, 0 and what is empty say nothing."""
-    largest = [one[1:] for one in _FIGURES if one[0] == part] if found else []
-    return "; ".join(
-        filter(None, (words.format(show(found[name])) for name, words, show in largest if found and found.get(name)))
-    )
+def _figures(found: Mapping[str, Any] | None, names: Sequence[str]) -> str:
+    """Return the named figures of a part; None, 0 and what is empty are left out."""
+    told = [(name, found[name]) for name in names if found and found.get(name)]
+    return "; ".join(words for name, value in told if (words := format_figure(name, value)))
+
+
+def format_figure(name: str, value: Any) -> str:
+    """Return a figure with its label, both by the name that it has in a receipt."""
+    if name in _FORMATS:
+        return _FORMATS[name](value)
+    if name in _VALUES:
+        return f"{_spaced(name)} {_VALUES[name](value)}"
+    label, _, unit = name.rpartition("_")
+    if unit in _UNITS:
+        return f"{_spaced(label)} {_UNITS[unit](value)}"
+    return _spaced(name) if value is True else f"{_spaced(name)} {_format_value(value)}"
+
+
+def _format_value(value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_format_value, value))
+    return format_count(value) if isinstance(value, int) else three_digits(value)
 
 
 def format_days(days: float) -> str:
@@ -190,11 +218,11 @@ def format_days(days: float) -> str:
 
 
 def plot_rows(plots: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
-    """Return the table of plots in words: name, ground, leading classes, confidence."""
+    """Return the table of plots: name, area, leading classes, confidence."""
 
     def leading(fractions: Mapping[str, float | None]) -> str:
         known = sorted(((fraction, name) for name, fraction in fractions.items() if fraction), key=lambda one: -one[0])
-        return ", ".join(f"{_spaced(name)} {format_percent(fraction)}" for fraction, name in known[:LEADING])
+        return ", ".join(f"{_spaced(name)} {format_percent(fraction)}" for fraction, name in known[:LEADING_CLASSES])
 
     return [
         {
@@ -210,14 +238,14 @@ def plot_rows(plots: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
 
 
 def area_rows(receipt: Mapping[str, Any]) -> list[dict[str, str]]:
-    """Return the classes of a map as a table in words: name, pixels, share of the pixels that have a class, hectares.
+    """Return the classes of a map as a table: name, pixels, fraction of the pixels that have a class, hectares.
 
-    Hectares are left out where nothing says how large a pixel is.
+    Hectares are left out where the size of a pixel on the ground is not known.
     """
     pixels: Mapping[str, int] = (receipt.get("areas") or {}).get("px", {})
     hectares, every = hectares_of_classes(receipt), sum(pixels.values())
     return [
-        {"class": _spaced(name), "pixels": format_count(count), "share": format_percent(count / every)}
+        {"class": _spaced(name), "pixels": format_count(count), "fraction": format_percent(count / every)}
         | ({} if hectares is None else {"area": format_area(hectares.get(name, 0.0))})
         for name, count in pixels.items()
         if count
@@ -232,102 +260,78 @@ def _areas(areas: Mapping[str, float]) -> str:
     return ", ".join(f"{_spaced(name)} {format_area(area)}" for name, area in areas.items() if area)
 
 
-def _pixels(pixels: Mapping[str, int]) -> str:
-    every = sum(pixels.values())
-    shown = (
-        f"{_spaced(name)} {format_count(count)} px ({format_percent(count / every)})"
-        for name, count in pixels.items()
-        if count
-    )
-    return ", ".join(shown) or "no pixel has a class"
-
-
 def _changes(changes: Sequence[Sequence[Any]]) -> str:
-    most = [f"{_spaced(old)} to {_spaced(new)} {format_area(area)}" for area, old, new in changes[:MOST_CHANGES]]
-    return f"{format_area(sum(area for area, _, _ in changes))} changed: {', '.join(most)}"
+    most = [f"{_spaced(old)} to {_spaced(new)} {format_area(area)}" for area, old, new in changes[:MOST_NAMED]]
+    return f"changed {format_area(sum(area for area, _, _ in changes))}: {', '.join(most)}"
 
 
 def _older(areas: Mapping[str, float]) -> str:
-    return "; ".join(
-        f"{format_area(area)} last captured more than {counted(int(days), 'day')} ago"
-        for days, area in areas.items()
-        if area
-    )
-
-
-def _fraction(cost: Mapping[str, float]) -> str:
-    return format_percent(cost["done"] / cost["everything"])
+    older = [f"{counted(int(days), 'day')} {format_area(area)}" for days, area in areas.items() if area]
+    return f"captured longer ago than {', '.join(older)}" if older else ""
 
 
 def _scan(scan: Mapping[str, Any]) -> str:
     words = f"{format_scan(scan['step'], scan['exposure_ms'])}, {scan['seconds']:.1f} s"
-    score, spread = scan["expected_miou"], scan.get("expected_spread")
-    if score is None:  # of a field that the weights do not know
-        return words
-    if not (predicted := format_prediction(score, spread)):
-        return f"{words}, no score predicted: scenes differ by {format_points(spread)} points (one standard deviation)"
-    return f"{words}, about {predicted}"
+    predicted = format_prediction(scan["expected_miou"], scan.get("expected_spread"))
+    return f"{words}, expected mIoU {predicted}" if predicted else words
 
 
-def _most_px(sweeps: Mapping[str, Sequence[float]]) -> str:
-    return f"{max(float(np.hypot(down, across)) for down, across in sweeps.values()):.1f}"
+def _shift(shift_px: Sequence[float]) -> str:
+    return f"shifted by {math.hypot(*shift_px):.0f} px" if any(shift_px) else ""
 
 
-# parts of a receipt whose rows are called otherwise
-_LABELS = {
-    **{"extent": "captured", "kept": "read in detail", "memory": "prior map", "expected": "expected score"},
-    **{"scans": "uniform scans", "ground": "on the ground", "areas": "classes"},
+def _offsets(sweeps: Mapping[str, Sequence[float]]) -> str:
+    return f"corrected by up to {max(math.hypot(*offset) for offset in sweeps.values()):.1f} px"
+
+
+def _multiply_adds(cost: Mapping[str, float]) -> str:
+    return f"multiply-adds {format_percent(cost['done'] / cost['everything'])} of full resolution"
+
+
+# parts of a receipt: their label, and the figures that are shown, in order
+_SHOWN: Mapping[str, tuple[str, Sequence[str]]] = {
+    "field": ("field", ("view_deg", "range_m", "hectares", "ground_pixel_m", "hectares_per_hour")),
+    "plan": ("plan", ("reason", "lines", "out_of_reach")),
+    "recording": ("recording", ("lines_read", "lines_recorded", "passes_s", "full_scan_s")),
+    "extent": ("captured", ("lines", "fraction", "expected_wrong", "due_left")),
+    "kept": ("at full resolution", ("patches", "multiply_adds")),
+    "memory": (
+        "prior map",
+        (
+            *("run", "days", "shift_px", "turned_deg", "put_aside", "agreement"),
+            *("differing_px", "expected_differing_px", "changed_px"),
+        ),
+    ),
+    "unknown": ("unknown", ("fraction", "rate")),
+    "expected": ("expected mIoU", ("miou", "error", "not_predicted")),
+    "scans": ("uniform scans", ("taken", "best_in_time", "reference")),
+    "areas": ("classes", ("ha",)),
+    "zones": ("zones", ("kept_px", "kept_m2", "no_go_px")),
+    "ground": ("on the ground", ("crs", "resolution_m", "changes_ha", "older_ha")),
 }
-# part of a receipt, figure, its words and its form, in the order of rows and of words
-_FIGURES: Sequence[tuple[str, str, str, Callable[[Any], Any]]] = (
-    ("field", "view_deg", "{} degrees of the view", lambda one: f"{one[0]:.3g} x {one[1]:.3g}"),
-    ("field", "range_m", "{} away in the middle", lambda one: format_metres(one["median"])),
-    ("field", "hectares", "{}", format_area),
-    ("field", "ground_pixel_m", "{} a pixel", format_metres),
-    ("field", "hectares_per_hour", "{} ha an hour of the camera", three_digits),
-    ("plan", "reason", "{}", str),
-    ("plan", "lines", "{} fine lines", format_count),
-    ("plan", "out_of_reach", "{} patches worth a second pass lie beyond the mirror's range", format_count),
-    ("recording", "lines_read", "{} lines were read", format_count),
-    ("recording", "lines_recorded", "{} are recorded", format_count),
-    ("recording", "passes_s", "a camera would take {} for these passes, by the cost model", format_seconds),
-    ("recording", "full_scan_s", "{} for a scan of every line", format_seconds),
-    ("extent", "lines", "lines {}", str),
-    ("extent", "fraction", "{} of the field", format_percent),
-    ("extent", "remembers", "the rest is unchanged", bool),
-    ("extent", "expected_wrong", "about {} of the prior map was expected to be wrong there", format_percent),
-    ("extent", "due_left", "{} places that were due had to wait", format_count),
-    ("kept", "patches", "{} patches", format_count),
-    ("kept", "multiply_adds", "{} of the multiply-adds of reading everything", _fraction),
-    ("memory", "run", "{}", str),
-    ("memory", "days", "{}", format_days),
-    ("memory", "shift_px", "{}", lambda one: f"lay {np.hypot(*one):.0f} px beside it" if any(one) else ""),
-    ("memory", "turned_deg", "{}", lambda one: f"turned by {abs(one):.1f} degrees" if abs(one) >= 1 else ""),
-    ("memory", "put_aside", "put aside: {}", str),
-    ("memory", "agreement", "today's capture agrees with {} of it", format_percent),
-    ("memory", "differing_px", "{} px differ from it", format_count),
-    ("memory", "expected_differing_px", "two maps of the same ground would differ at about {}", format_count),
-    ("memory", "changed_px", "{} px changed beyond that", format_count),
-    ("unknown", "fraction", "{} of the map is unknown, unlike all that the weights were trained on", format_percent),
-    ("unknown", "rate", "of what they know it would be about {}", format_percent),
-    ("expected", "miou", "about {}, with no label asked", format_points),
-    ("expected", "error", "error {}", format_points),
-    ("expected", "not_predicted", "no score predicted: {}", str),
-    ("scans", "taken", "this one, read whole: {}", _scan),
-    ("scans", "best_in_time", "best in the same seconds: {}", _scan),
-    ("scans", "reference", "nearly as good as any: {}", _scan),
-    ("areas", "ha", "{}", _areas),
-    ("areas", "px", "{}", _pixels),
-    ("zones", "kept_px", "{} px are mapped", format_count),
-    ("zones", "kept_m2", "{}", lambda one: format_area(one / M2_PER_HECTARE)),
-    ("zones", "no_go_px", "no-go zones touch {} px", format_count),
-    ("ground", "crs", "{}", str),
-    ("ground", "resolution_m", "{:.4g} m a pixel", float),
-    ("ground", "changes_ha", "{}", _changes),
-    ("ground", "older_ha", "{}", _older),
-    ("pass", "sweeps", "put right by up to {} px", _most_px),
-    ("pass", "residual_rms_px", "{:.2f} px rms are left at the seams", float),
-    ("pass", "not_found", "{} left where the mirror reported: nothing was found", ", ".join),
-    ("pass", "too_narrow", "{} too narrow to compare", lambda one: counted(len(one), "overlap")),
-    ("pass", "partly_seen", "{} chosen patches not captured whole", format_count),
-)
+_OF_POINTING = ("sweeps", "residual_rms_px", "not_found", "too_narrow", "partly_seen")
+_UNITS: Mapping[str, Callable[[Any], str]] = {
+    "px": lambda value: f"{format_count(value) if isinstance(value, int) else f'{value:.2f}'} px",
+    "s": format_seconds,
+    "m": lambda value: format_metres(value["median"] if isinstance(value, Mapping) else value),
+    "m2": lambda value: format_area(value / M2_PER_HECTARE),
+    "deg": lambda value: f"{' x '.join(f'{one:.3g}' for one in np.atleast_1d(value))} degrees",
+}
+_FORMATS: Mapping[str, Callable[[Any], str]] = {
+    **dict.fromkeys(("run", "crs", "reason", "not_predicted"), str),
+    "days": format_days,
+    "hectares": format_area,
+    "shift_px": _shift,
+    "put_aside": lambda value: f"not used: {value}",
+    "multiply_adds": _multiply_adds,
+    "ha": _areas,
+    "changes_ha": _changes,
+    "older_ha": _older,
+    "sweeps": _offsets,
+    "too_narrow": lambda value: f"{counted(len(value), 'overlap')} too narrow to compare",
+}
+_VALUES: Mapping[str, Callable[[Any], str]] = {
+    **dict.fromkeys(("fraction", "rate", "agreement", "expected_wrong"), format_percent),
+    **dict.fromkeys(("miou", "error"), format_points),
+    **dict.fromkeys(("taken", "best_in_time", "reference"), _scan),
+}

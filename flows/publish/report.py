@@ -1,6 +1,6 @@
-"""Pages for people from the templates beside this file: each one file that opens from disk and loads nothing.
+"""Render reports and pages from templates, each as one file without external resources.
 
-Whatever a page shows is escaped here and nowhere else: no markup, and nothing that turns the words beside it round.
+All text is escaped here: markup, and characters that change the direction of text.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from flows.publish.panels import data_address
 from flows.publish.receipt import Receipt
 from flows.publish.receipt_table import (
     area_rows,
-    byte_rows,
-    cost_rows,
     finding_rows,
+    format_reference,
     format_reused,
     headline,
     plot_rows,
+    saving_rows,
 )
 from flows.tasks.scores import error_matrix, format_false_classes
 from flows.terminal.figures import format_bytes, format_percent, format_points, format_seconds
@@ -47,20 +47,20 @@ SHA256 = {
     f"{LEAFLET}/LICENSE": "53e8dc25862014e4324741ca18fbe3611e11d42ef69f59f86ea8c5389647d4cb",
 }
 MAP_SCRIPTS = (f"{LEAFLET}/leaflet.js", "scripts/field_map.js")
-BYTES_SECTION = '<section id="bytes">'  # of a report, which ends with it
+SAVINGS_SECTION = '<section id="savings">'  # of a report
 _MARKDOWN = "\\`*_{}[]<>#|"
 
 
 @cache
 def part(name: str) -> str:
-    """Return a file beside this module as it stands in a page: without what would point at files elsewhere."""
+    """Return a file of this folder for a page, without lines that refer to other files."""
     text = files("flows.publish").joinpath(name).read_text(encoding="utf-8").replace("\r\n", "\n")
-    elsewhere = "url(" if name.endswith(".css") else "//# sourceMappingURL="  # pictures that no page uses; a debugger's
+    elsewhere = "url(" if name.endswith(".css") else "//# sourceMappingURL="  # unused pictures; source maps
     return "\n".join(line for line in text.split("\n") if elsewhere not in line)
 
 
 def policy(names: tuple[str, ...]) -> str:
-    """Return the content security policy of a page: these scripts alone run, and nothing is loaded from anywhere."""
+    """Return the content security policy of a page: only these scripts run, and nothing is loaded."""
     sources = [f"'sha256-{base64.b64encode(hashlib.sha256(part(name).encode()).digest()).decode()}'" for name in names]
     allowed = " ".join(sources) or "'none'"
     return (
@@ -70,17 +70,14 @@ def policy(names: tuple[str, ...]) -> str:
 
 
 def render_page(template: str, carries: tuple[str, ...] = (), **facts: Any) -> str:
-    """Fill in an HTML template; every word of ``facts`` that is no `Markup` is escaped.
-
-    ``carries`` are the scripts that run in the page, after all of it is there; no others do.
-    """
+    """Render an HTML template; text of ``facts`` that is no `Markup` is escaped. ``carries`` are the page's scripts."""
     scripts = Markup("\n").join(Markup("<script>{}</script>").format(Markup(part(name))) for name in carries)
     own = {"policy": policy(carries), "scripts": scripts}
     return visible(_environment(markdown=False).get_template(template).render(facts | own))
 
 
 def render_markdown(template: str, **facts: Any) -> str:
-    """Fill in a Markdown template; in words that are no `Markup` nothing has a meaning of its own."""
+    """Render a Markdown template; text that is no `Markup` is escaped."""
     return visible(_environment(markdown=True).get_template(template).render(facts))
 
 
@@ -102,7 +99,7 @@ def _environment(*, markdown: bool) -> Environment:
         "points": format_points,
         "seconds": format_seconds,
         "json": partial(json.dumps, ensure_ascii=False),
-        # for scripts of a page: nothing ends a tag, words are `visible` ones
+        # data for scripts, which cannot end their tag
         "data": lambda content: htmlsafe_json_dumps(_format_visible(content), separators=(",", ":")),
     }
     found.globals["part"] = lambda name: Markup(part(name))
@@ -120,7 +117,7 @@ def _format_visible(content: Any) -> Any:
 
 
 def _plain(value: object) -> object:
-    """Words as Markdown shows them letter by letter."""
+    """Return text escaped for Markdown."""
     if isinstance(value, Markup):
         return value
     return "".join(f"\\{letter}" if letter in _MARKDOWN else letter for letter in visible(str(value)))
@@ -128,7 +125,7 @@ def _plain(value: object) -> object:
 
 @dataclass(frozen=True)
 class Picture:
-    """A PNG or WebP with the words below it."""
+    """A PNG or WebP with its caption."""
 
     content: bytes
     caption: str
@@ -142,15 +139,13 @@ def render_report(
     captured_again: float | None = None,
     field: FieldMap | None = None,
 ) -> str:
-    """The page as text, ``pictures`` below the quicklook; the same receipt, pictures and map give the same bytes.
+    """Return the report as HTML; the same receipt, pictures and map give the same bytes.
 
-    ``captured_again`` is the fraction of the field captured in detail, 0..1, for the first sentence; None leaves it
-    out. ``field`` is the map to move in, above all pictures; None leaves it out, with all scripts.
+    ``captured_again`` is the fraction of the field captured at full resolution, 0..1, or None. ``field`` is the map
+    with layers; without it the quicklook is shown first and the page has no script.
     """
     shown = [Picture(quicklook, "The survey at a glance."), *pictures]
     scene = split_variable(receipt["settings"]["scene"])[0].name
-    split: Mapping[str, Any] = receipt["savings"]["multiply_adds"]
-    parts = [name for name in ("overview", "score", "detail") if split["done"] and split[name] is not None]
     total, accuracy = receipt.get("effects_total"), receipt.get("accuracy")
     return render_page(
         "report.html",
@@ -166,10 +161,7 @@ def render_report(
         leaflet=LEAFLET,
         error_colours=ERROR_COLOURS,
         pictures=[{"address": data_address(one.content), "caption": one.caption} for one in shown],
-        costs=cost_rows(receipt["savings"]),
-        byte_rows=byte_rows(receipt),
-        reused=format_reused(receipt),
-        fractions={name: split[name] / split["done"] for name in parts},
+        **_savings(receipt),
         areas=area_rows(receipt),
         findings=finding_rows({name: one for name, one in receipt.items() if name != "areas"}),
         plots=plot_rows(receipt.get("plots", [])),
@@ -189,9 +181,9 @@ def render_report(
 
 
 def product_links(receipt: Receipt) -> dict[str, str]:
-    """Return the products of a run by name, each as an address seen from its report.
+    """Return the products of a run by name, as addresses relative to its report.
 
-    Raw lines are left out: they may be cleared away later. So is the report itself.
+    Raw lines, which may be cleared away, and the report itself are left out.
     """
     return {
         name.replace("_", " "): quote(posixpath.relpath(address, _run_folder(receipt)))
@@ -205,10 +197,20 @@ def _run_folder(receipt: Receipt) -> str:
     return next(posixpath.dirname(one) for one in products.values() if one.startswith("runs/"))
 
 
-def replace_bytes(page: str, receipt: Receipt) -> str:
-    """Return a report with the bytes of a receipt in the place of those that it tells."""
-    begin, end = BYTES_SECTION, "</section>"
-    head, there, rest = page.partition(begin)
-    template = _environment(markdown=False).get_template("bytes.html")
-    rows = visible(template.render(byte_rows=byte_rows(receipt), reused=format_reused(receipt)))
-    return f"{head}{rows.rstrip()}{rest.partition(end)[2]}" if there else page
+def replace_savings(page: str, receipt: Receipt) -> str:
+    """Return a report with the savings of a receipt, such as after its bytes were counted again."""
+    head, there, rest = page.partition(SAVINGS_SECTION)
+    template = _environment(markdown=False).get_template("savings.html")
+    section = visible(template.render(_savings(receipt))).rstrip()
+    return f"{head}{section}{rest.partition('</section>')[2]}" if there else page
+
+
+def _savings(receipt: Receipt) -> dict[str, Any]:
+    split: Mapping[str, Any] = receipt["savings"]["multiply_adds"]
+    parts = [name for name in ("overview", "score", "detail") if split["done"] and split[name] is not None]
+    return {
+        "savings": saving_rows(receipt),
+        "reference": format_reference(receipt),
+        "reused": format_reused(receipt),
+        "fractions": {name: split[name] / split["done"] for name in parts},
+    }

@@ -1,7 +1,7 @@
-"""Retention of raw lines: those whose time is over go, once each was compared with what was condensed from it.
+"""Clear the raw lines that no run keeps any longer, after comparing them with their condensed signal.
 
-A run's setting ``keep`` says for how long its raw lines stay. Lines that several runs name stay as long as one of them
-keeps them. A killed clearing leaves a store either whole or cleared; the next one counts the bytes of its runs again.
+The setting ``keep`` of a run is the time for which its raw lines stay. Lines of several runs stay as long as one keeps
+them. A killed process leaves each store complete or cleared; the next one counts the bytes of the runs again.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
 from flows.publish.byte_account import recount_bytes
-from flows.publish.report import replace_bytes
+from flows.publish.report import replace_savings
 from flows.settings.values import parse_keep, raw_days
 from flows.tasks.stages.condense import SIGNAL, SIGNAL_FINE, camera_of, raw_differs
 from storage.archive.archive import Archive
@@ -26,7 +26,7 @@ PRESENT = {one.name: str(one.version) for one in (SIGNAL, SIGNAL_FINE)}
 
 @dataclass
 class RawClearance:
-    """Raw lines that go, by address why others of those stay whose time is over, and why none goes."""
+    """Raw lines that were cleared, expired ones that stay with the reason, and why none is cleared."""
 
     removals: list[Removal] = field(default_factory=list)
     kept: dict[str, str] = field(default_factory=dict)
@@ -35,7 +35,7 @@ class RawClearance:
 
 @dataclass(frozen=True)
 class OutlivedLines:
-    """Raw lines whose time is over, the store condensed from them, and the words of the settings."""
+    """Expired raw lines, the store condensed from them, and the reason."""
 
     raw: Store
     signal: Store
@@ -45,9 +45,9 @@ class OutlivedLines:
 def clear_raw_lines(
     archive: Archive, *, dry_run: bool = False, progress: Callable[[str, float], None] | None = None
 ) -> RawClearance:
-    """Clear raw lines whose time is over by the settings of every run that names them; receipts count bytes again.
+    """Clear the raw lines that have expired for every run that names them, and update the bytes in receipts.
 
-    Every line is compared first; lines that differ, or cannot be read, stay. With ``dry_run`` nothing is compared or
+    Every line is compared first; lines that differ or cannot be read stay. With ``dry_run`` nothing is compared or
     removed. Raises ArchiveError: the disk refuses.
     """
     found = list(outlived_lines(Catalogue.read(archive.root), archive.now()))
@@ -73,10 +73,10 @@ def clear_raw_lines(
 
 
 def outlived_lines(catalogue: Catalogue, now: datetime) -> Iterator[OutlivedLines]:
-    """Yield the raw lines of published runs that no run keeps any longer, and that were condensed."""
+    """Yield the condensed raw lines of published runs that no run keeps any longer."""
     found = set[str]()
     for run in catalogue.runs:
-        for names in reversed(LINE_PRODUCTS.items()):  # later passes first: their comparison asks for the first's
+        for names in reversed(LINE_PRODUCTS.items()):  # fine pass first: its comparison needs the coarse one
             raw, signal = (_whole(catalogue, run, name) for name in names)
             if raw is None or signal is None or raw.ref.uri in found:
                 continue
@@ -91,13 +91,13 @@ def outlived_lines(catalogue: Catalogue, now: datetime) -> Iterator[OutlivedLine
 
 
 def _whole(catalogue: Catalogue, run: Run, product: str) -> Store | None:
-    """Return the store of a product, None where it or its files are gone."""
+    """Return the store of a product; None where it is missing, damaged or cleared."""
     store = catalogue.stores.get(run.products.get(product, ""))
     return None if store is None or store.problem is not None or store.cleared else store
 
 
 def is_outlived(run: Run, now: datetime) -> bool:
-    """Return whether the time is over for which a run keeps its raw lines; no, where it does not tell that time."""
+    """Return whether the raw lines of a run have expired; False where that is not known."""
     try:
         days = raw_days(parse_keep(run.settings["keep"]))
         made = datetime.fromisoformat(run.created)
@@ -112,11 +112,11 @@ def _removal(one: OutlivedLines) -> Removal:
 
 
 def _recount(archive: Archive) -> None:
-    """Publish runs again whose receipts count raw lines that were cleared, now or by a clearing that was killed."""
+    """Publish runs again whose receipts still count cleared raw lines."""
     catalogue = Catalogue.read(archive.root)
     cleared = {uri for uri, store in catalogue.stores.items() if store.cleared}
     for run in catalogue.runs:
         account = run.receipt.get("data_bytes")
         named = any(run.products.get(name) in cleared for name in LINE_PRODUCTS)
         if named and isinstance(account, dict) and account.get("kept") != archive.kept_bytes(run, catalogue):
-            recount_bytes(archive, run.folder.name, replace_bytes)
+            recount_bytes(archive, run.folder.name, replace_savings)

@@ -1,6 +1,6 @@
-"""The end of a survey: receipt, quicklook and report from what the stages left, published as one run folder.
+"""Make receipt, quicklook and report of a survey, and publish them as one run folder.
 
-Once the map is judged they are made again with its accuracy, and take the place of those that were published.
+When the accuracy is known, the folder is made again with it and replaces the first.
 """
 
 from __future__ import annotations
@@ -19,11 +19,10 @@ from PIL import Image
 from flows.publish.byte_account import open_account, publish_counted
 from flows.publish.field_map import block_of, field_map, prior_map
 from flows.publish.findings import PLOTS_FILE, field_figures, find_areas, find_ground, find_map, find_zones, plots_csv
-from flows.publish.panels import draw_ground, webp
+from flows.publish.panels import draw_ground, draw_spectra, webp
 from flows.publish.quicklook import QuicklookData, draw_quicklook
 from flows.publish.receipt import AccuracyIs, Receipt, build_receipt, check_receipt, with_accuracy
 from flows.publish.report import Picture, render_report
-from flows.publish.spectra import draw_spectra
 from flows.settings.load import anchor_paths
 from flows.settings.values import EXTENT_WHOLE
 from flows.tasks.capture_plan import as_figures
@@ -59,15 +58,15 @@ LIBRARIES = ("spectralzoom", "numpy", "numba", "torch", "zarr", "xarray", "prefe
 
 @dataclass(frozen=True)
 class Published:
-    """A published run: the receipt and where its folder lies."""
+    """A published run: its receipt and its folder."""
 
     receipt: Receipt
     folder: Path
-    captured_again: float | None  # None of a uniform scan; fraction of the field's patches captured in detail
+    captured_again: float | None  # fraction of patches captured at full resolution; None for a uniform scan
 
 
 def publish_run(survey: OpenSurvey) -> Published:
-    """Write receipt.json, quicklook.png and report.html into a run folder and publish it as a whole."""
+    """Publish a run folder with receipt.json, quicklook.png and report.html."""
     plan = load_plan(survey.products["score"])
     with survey.run.archive.new_run(survey.run.name) as draft:
         receipt = make_receipt(survey, plan, f"runs/{draft.id}")
@@ -75,10 +74,9 @@ def publish_run(survey: OpenSurvey) -> Published:
 
 
 def extend_with_accuracy(survey: OpenSurvey, draft: RunDraft, accuracy: StageRef) -> Published:
-    """Publish a run again with its accuracy, in the place of what was published before.
+    """Replace a published run by one with its accuracy.
 
-    ``draft`` is of `Archive.extend_run`, ``accuracy`` the store of the judging. All that the receipt says of the
-    survey itself stays as it is.
+    ``draft`` is of `Archive.extend_run`, ``accuracy`` the store of the evaluation. All else of the receipt stays.
     """
     judge, before, asked = STAGES["evaluate"], load_receipt(draft.published), asked_settings(survey.run)
     other_labels = asked["labels"] != before["settings"].get("labels")
@@ -95,7 +93,7 @@ def extend_with_accuracy(survey: OpenSurvey, draft: RunDraft, accuracy: StageRef
 
 
 def load_receipt(folder: Path) -> Receipt:
-    """The receipt of a published run; IncompleteStoreError: not as it was published, ShapeError: it lacks a part."""
+    """Return the receipt of a published run (IncompleteStoreError: it has changed; ShapeError: it is not valid)."""
     found = read_run(folder, {})
     if found.problem is not None:
         raise IncompleteStoreError(f"{found.uri}: {found.problem}; run verify --repair on the archive")
@@ -130,14 +128,14 @@ def _publish(survey: OpenSurvey, draft: RunDraft, plan: FinePlan, receipt: Recei
 
 
 def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str) -> Receipt:
-    """Put together what the run has to say for itself."""
+    """Return the receipt of a run, without counted bytes."""
     run, products = survey.run, survey.products
     accuracy = load_accuracy(products["evaluate"]) if "evaluate" in products else None
     effects = load_manifest(products["choose_effects"]) if run.source.simulates else {}
     stores: dict[str, str] = {}
     for name, ref in products.items():
         stores |= STAGES[name].addresses(ref)
-    if (products["segment"].path / READING).exists():  # patches were chosen while the map was drawn
+    if (products["segment"].path / READING).exists():  # patches were chosen in the segmentation
         stores["attention"] = f"{products['segment'].uri}/{READING}"
     files = ("receipt.json", "quicklook.png", "report.html", *([PLOTS_FILE] if run.zones.plots is not None else []))
     unjudged: AccuracyIs = "pending" if run.settings.accuracy else "left out"
@@ -177,18 +175,18 @@ def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str) -> Receipt:
 
 
 def asked_settings(run: SurveyRun) -> dict[str, object]:
-    """The settings, so that they can be asked for from anywhere, and what was assumed beside them."""
+    """Return the settings with absolute paths, and the notes on assumptions."""
     return {**anchor_paths(run.settings.to_dict(), Path.cwd()), "notes": list(run.notes)}
 
 
 def _savings(run: SurveyRun, plan: FinePlan, read: NDArray[np.intp]) -> dict[str, Any]:
-    """Everything done against the full scan; of a raster, of which nothing is captured, what the model reads."""
+    """Return the costs against the full scan; for a raster those of the model alone."""
     if run.raster is not None:
         return _model_savings(run, read)
     done = [*run.plan.coarse, *plan.sweeps]
     entries = capture_savings(done, run.plan.full, run.camera, run.grid, cost=run.settings.cost)
     capture = SavingEntry(run.plan.coarse_s + plan.seconds, run.plan.full_s, "predicted").as_dict()
-    if (uniform := run.scans.reference) is not None:  # the cheapest scan that is nearly as good as any
+    if (uniform := run.scans.reference) is not None:  # the cheapest scan with nearly the best score
         capture |= {"uniform": uniform.seconds, "uniform_scan": uniform.words}
     return {
         **{name: entry.as_dict() for name, entry in entries.items()},
@@ -198,7 +196,7 @@ def _savings(run: SurveyRun, plan: FinePlan, read: NDArray[np.intp]) -> dict[str
 
 
 def _model_savings(run: SurveyRun, read: NDArray[np.intp]) -> dict[str, Any]:
-    """Patches that are read in full, and multiply-adds, beside those of reading every patch."""
+    """Return the patches segmented at full resolution and the multiply-adds, against those of every patch."""
     did, scan = run.work_done(read), run.costs.of_map(run.grid.valid_patches())
     return {
         "patches": SavingEntry(len(read), len(run.grid.valid_patches()), "predicted").as_dict(),
@@ -207,7 +205,7 @@ def _model_savings(run: SurveyRun, read: NDArray[np.intp]) -> dict[str, Any]:
 
 
 def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: Receipt) -> QuicklookData:
-    """Gather what the panels show, three bands of it."""
+    """Return the data of the quicklook, with three bands."""
     bands, _ = choose_bands(run.scene.wavelength_nm)
     chosen = list(bands)
     mosaic = open_mosaic(products.mosaic.path / "mosaic.zarr")
@@ -256,17 +254,17 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
 
 
 def _format_asked(run: SurveyRun) -> str:
-    """Return how the field was looked at, in a few words."""
+    """Return a short description of the capture."""
     if run.raster is not None:
-        return "raster, taken as it is"
+        return "raster"
     if run.plan.plain:
         return format_scan(run.settings.scan_step or 1, run.settings.scan_exposure_ms or run.camera.exposure_ms)
     first = format_scan(run.plan.coarse[0].step, run.settings.coarse_exposure_ms or run.camera.exposure_ms)
-    return f"first {first}, then the lines between where they promise most"
+    return f"first {first}, then the lines between in chosen patches"
 
 
 def _calibrated(run: SurveyRun, cube: SignalCube, bands: list[int]) -> NDArray[np.float32]:
-    """Some bands of a sweep in scene values, by its stored picture alone; NaN where a sample looked past the scene."""
+    """Return some bands of a sweep in scene values, from its stored picture; NaN outside the scene."""
     seen = cube.quicklook()
     if seen is not None and list(seen.bands) == bands:
         thin = slice(None, None, seen.step)
@@ -279,16 +277,13 @@ def _calibrated(run: SurveyRun, cube: SignalCube, bands: list[int]) -> NDArray[n
 
 
 def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
-    """``plan``, and what not every survey has: see `flows.publish.receipt.FINDINGS`."""
+    """Return the findings of a run by their names in the receipt."""
     plan = load_plan(products["score"])
     figures: dict[str, Any] = {
         "kind": plan.kind,
         "reason": plan.reason,
         "lines": plan.lines,
         "seconds": plan.seconds,
-        "score_fraction": plan.expected_gain / plan.wanted_gain if plan.wanted_gain else None,
-        "score_per_second": plan.gain_per_second,
-        "full_seconds": plan.full_seconds,
         "out_of_reach": plan.out_of_reach,
     }
     found: dict[str, Any] = {"field": field_figures(run, plan), "plan": figures}
@@ -325,7 +320,7 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
 
 
 def _partly_seen(run: SurveyRun, mosaic: StageRef, plan: FinePlan) -> int:
-    """Count the patches that were to be captured again and of which later lines missed a pixel."""
+    """Count the chosen patches that the fine pass did not capture completely."""
     kinds = open_mosaic(mosaic.path / "mosaic.zarr").captures()
     if kinds is None:
         return 0
@@ -334,21 +329,19 @@ def _partly_seen(run: SurveyRun, mosaic: StageRef, plan: FinePlan) -> int:
 
 
 def _recording(run: SurveyRun, recorded: RecordedPasses, plan: FinePlan) -> dict[str, Any]:
-    """Return what was read of a recording, and what its passes would have taken of a camera beside every line."""
+    """Return the lines read of a recording, and the predicted capture time of its passes and of every line."""
     done, full, cost = [*run.plan.coarse, *plan.sweeps], run.plan.full, run.settings.cost
-    whole = recorded.served(full) is not None
     return {
         "sweeps": str(run.settings.sweeps),
         "lines_read": recorded.lines_served(done),
         "lines_recorded": recorded.source.lines_recorded,
         "passes_s": run.plan.coarse_s + plan.seconds,
         "full_scan_s": cost.seconds(full, run.camera),
-        "full_scan_is": "recorded" if whole else "planned",
     }
 
 
 def _pointing(ref: StageRef) -> dict[str, Any]:
-    """Corrections of one pass; what they leave is given only where windows are more than offsets and drifts."""
+    """Return the pointing corrections of a pass; residuals only where there are more windows than unknowns."""
     record = load_registration(ref)
     left = np.array([window["residual_px"] for window in record["windows"] if window.get("residual_px")])
     tells = len(left) > 2 * (len(record["sweeps"]) - len(record["untied"]) - 1)

@@ -1,4 +1,4 @@
-"""The verb `survey`: the flow with a bar for each stage, then the receipt."""
+"""Run the verb `survey`: the flow with progress bars, then a summary of the receipt."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.markup import escape
 
-from flows.publish.receipt_table import headline, print_table
+from flows.publish.receipt_table import print_details, print_summary
 from flows.publish.run_folder import Published, load_receipt
 from flows.settings.parameters import SurveySettings
 from flows.settings.survey_settings import Settings
@@ -38,10 +38,10 @@ else:
     survey_flow = deferred("flows.survey")
 
 
-def run_survey(settings: Settings, console: Console) -> Published:
-    """Survey, publish the run and print its receipt on ``console``.
+def run_survey(settings: Settings, console: Console, *, verbose: bool = False) -> Published:
+    """Survey, publish the run and print its summary on ``console``; with ``verbose`` also its stages and effects.
 
-    Raises PipelineError: from the flow, as it is; NothingToMend: an earlier map is sure enough.
+    Raises PipelineError: of the flow; NothingToMend: the expected error of an earlier map is small enough.
     """
     use_one_thread()
     keep_freed_memory()
@@ -53,14 +53,14 @@ def run_survey(settings: Settings, console: Console) -> Published:
         with observed_by(Observer(progress.watch, note, progress.say)), opened_first(settings):
             run = _survey(settings, console)
     published = Published(load_receipt(run.folder), run.folder, run.captured_again)
-    show_published(published, settings.out, console)
+    show_published(published, settings.out, console, verbose=verbose)
     return published
 
 
 def _survey(settings: Settings, console: Console) -> RunRef:
-    """Run the flow on a server of this process, or on the one that PREFECT_API_URL names; plainly where there is none.
+    """Run the flow on a server of this process or at PREFECT_API_URL; without Prefect where that fails.
 
-    Inside a flow of the user's own its tasks become tasks of that flow.
+    Inside another flow its tasks become tasks of that flow.
     """
     asked = SurveySettings.of(settings)
     if settings.engine != "plain" and not inside_flow():
@@ -71,16 +71,16 @@ def _survey(settings: Settings, console: Console) -> RunRef:
                 found: RunRef = state.result()
                 return found
         except ServerUnavailable as error:
-            console.print(f"[yellow]{escape(str(error))}; going on with --engine plain[/]")
+            console.print(f"[yellow]{escape(str(error))}; the survey runs with --engine plain[/]")
     plain: RunRef = survey_flow.survey.fn(asked)
     return plain
 
 
 @contextmanager
 def _prefect_server(out: str) -> Iterator[None]:
-    """Have a server for one survey, its files in the archive; one that PREFECT_API_URL names is used as it is.
+    """Start a server for one survey, with its files in the archive, or use the one at PREFECT_API_URL.
 
-    A second survey of the archive has a folder of its own, which goes with it. Raises ServerUnavailable.
+    A second survey of the archive has a temporary folder of its own. Raises ServerUnavailable.
     """
     if "PREFECT_API_URL" in os.environ:
         check_answers(os.environ["PREFECT_API_URL"])
@@ -99,11 +99,11 @@ def _prefect_server(out: str) -> Iterator[None]:
             release()
 
 
-def show_published(published: Published, out: str, console: Console) -> None:
-    """Print the headline, what was spent, and where the files lie that say the rest."""
-    console.print(escape(headline(published.receipt, published.captured_again)))
-    print_table(published.receipt, console)
+def show_published(published: Published, out: str, console: Console, *, verbose: bool = False) -> None:
+    """Print the score, the savings and the place of the report; with ``verbose`` stages, effects and versions."""
+    print_summary(published.receipt, console)
+    if verbose:
+        print_details(published.receipt, console)
     if is_remote(out):
-        console.print(f"  {escape(out)}/runs/{published.folder.name}, and on this machine", soft_wrap=True)
-    beside = ", with quicklook.png and receipt.json beside it"
-    console.print(f"  {escape(str(published.folder / 'report.html'))}{beside}", soft_wrap=True)
+        console.print(f"Run: {escape(out)}/runs/{published.folder.name}", soft_wrap=True)
+    console.print(f"Report: {escape(str(published.folder / 'report.html'))}", soft_wrap=True)

@@ -7,8 +7,8 @@
     spool/<key>/              lines of a capture under way
     .locks/                   held while something is made
 
-A folder whose name ends in ``.part`` is not finished: the next process that makes the same thing removes it. An archive
-in a bucket (`storage.remote.object_archive`) has the same addresses.
+A folder whose name ends in ``.part`` is not finished: the next process that builds the same store removes it. An
+archive in a bucket (`storage.remote.object_archive`) has the same addresses.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from storage.archive.manifests import (
     write_manifest,
 )
 from storage.archive.records import Run
-from storage.archive.run_folders import RunDraft, date_of_store, finish_extensions, take_its_place
+from storage.archive.run_folders import RunDraft, finish_extensions, take_its_place
 from storage.archive.staging import (
     PART_SUFFIX,
     bytes_below,
@@ -63,7 +63,7 @@ __all__ = ["Archive", "RunDraft", "StageRef", "StagedStore", "stage_key"]
 
 @dataclass(frozen=True)
 class StagedStore:
-    """A store being made. ``done`` says that another run published it while this one waited: nothing is to be made."""
+    """A store that is being built; ``done`` where another process has published it meanwhile."""
 
     path: Path  # folder to write into
     ref: StageRef
@@ -71,7 +71,7 @@ class StagedStore:
 
 
 class Archive:
-    """A folder of immutable stores. Kill the process anywhere: what has a final name is whole."""
+    """A folder of immutable stores. A folder with its final name is complete, wherever a process was killed."""
 
     in_bucket = False  # whether `root` is a working copy alone
 
@@ -81,9 +81,9 @@ class Archive:
 
     @classmethod
     def open(cls, root: str | Path, *, create: bool = True, write: bool = True) -> Archive:
-        """Open the archive in a folder, or make it where ``create``; `storage.remote.opening` knows buckets as well.
+        """Open the archive in a folder, or create it with ``create``; `storage.remote.opening` opens buckets as well.
 
-        Raises ArchiveError: the path is a file, is not there, or does not let itself be written to (``write``).
+        Raises ArchiveError: the path is a file, is missing, or cannot be written to (``write``).
         """
         path = Path(root).absolute()
         open_folder(path, create=create, write=write)
@@ -94,41 +94,41 @@ class Archive:
 
     @property
     def name(self) -> str:
-        """Return the address by which a person opens it again."""
+        """Return the address that opens it again."""
         return str(self.root)
 
     @property
     def around(self) -> Path:
-        """Folder in which what belongs beside the archive is put."""
+        """Return the folder for files that belong beside the archive."""
         return self.root.parent
 
     # --- stages -------------------------------------------------------------------------------------------------------
 
     def ref(self, stage: str, key: str) -> StageRef:
-        """Return the address of a store, whether it is there or not."""
+        """Return the address of a store, whether it exists or not."""
         return store_at(self.root, stage, key)
 
     def locate(self, address: str) -> Path:
-        """Return the path on this machine of a product, by its address relative to the archive, as a receipt gives it.
+        """Return the path on this machine of a product, by its address in a receipt.
 
-        Raises IncompleteStoreError: the store is not there, or its files were cleared away. So does a file that is
-        missing, cut short, a link or no plain file.
+        Raises IncompleteStoreError: the store is missing or was cleared, or a file is missing, cut short or no plain
+        file.
         """
         uri = in_text(address)
         if uri is not None:
             check_files(self.root / uri, hashes=False)
             if is_cleared(read_manifest(self.root / uri)):
                 raise IncompleteStoreError(
-                    f"{self.name}/{uri}: its files were cleared away by gc; run its survey again (explain tells the"
-                    " command): only what was cleared is made again"
+                    f"{self.name}/{uri}: its files were cleared away by gc. Run its survey again (explain prints the"
+                    " command): only cleared stores are built again"
                 )
         return self.root / address
 
     def find(self, stage: str, key: str) -> StageRef | None:
         """Return the published store; None where there is none or its files were cleared away.
 
-        Sizes are compared with the manifest, content only by `verify`. Raises IncompleteStoreError: it is there, but
-        its manifest or a file is missing, or has another size.
+        Sizes are compared with the manifest; only `verify` compares content. Raises IncompleteStoreError: its manifest
+        or a file is missing, or has another size.
         """
         ref = store_at(self.root, stage, key)
         if not os.path.lexists(ref.path):
@@ -137,12 +137,12 @@ class Archive:
         return None if is_cleared(read_manifest(ref.path)) else ref
 
     def is_there(self, uri: str) -> bool:
-        """Return whether a store's files are there, not only what tells of them."""
+        """Return whether a store has its files, not its manifest alone."""
         path = self.root / uri
         return path.is_dir() and not is_cleared(read_manifest(path))
 
     def is_known(self, ref: StageRef) -> bool:
-        """Return whether a store was published here, also where its files were cleared away since."""
+        """Return whether a store was published here, even if its files were cleared away."""
         return (self.root / ref.uri).is_dir()
 
     @contextmanager
@@ -157,9 +157,8 @@ class Archive:
     ) -> Iterator[StagedStore]:
         """Yield a folder to write into, and publish it when the block ends well.
 
-        One process at a time makes a key; the others wait and then find ``done``. When the block fails, the folder is
-        removed and the archive is unchanged. Raises ArchiveError: the disk refuses; the message names the path and what
-        to do.
+        One process at a time builds a key; the others wait and then find ``done``. When the block fails, the folder is
+        removed and the archive is unchanged. Raises ArchiveError: the disk refuses.
         """
         ref = self.ref(stage, key)
         final = self.root / ref.uri
@@ -172,7 +171,6 @@ class Archive:
             try:
                 yield StagedStore(part, ref, done)
                 if not done:
-                    facts |= {"created": date_of_store(self.root, ref.uri)}
                     consolidate_stores(part)
                     write_manifest(part, facts)
                     self._put_in_place(part, final)
@@ -194,7 +192,7 @@ class Archive:
         params: Mapping[str, Any],
         inputs: Sequence[str] = (),
     ) -> tuple[StageRef, bool]:
-        """Find the store of these facts, or have ``build`` write it; the second value says whether it was built."""
+        """Return the store with this key, and whether ``build`` wrote it now or it existed."""
         key = stage_key(stage, version, params, inputs)
         found = self.find(stage, key)
         if found is not None:
@@ -205,14 +203,11 @@ class Archive:
         return staged.ref, not staged.done
 
     def manifest(self, ref: StageRef) -> dict[str, Any]:
-        """Return the facts of a store: stage, key, version, params, inputs, created, libraries, files."""
+        """Return the manifest of a store: stage, key, version, params, inputs, created, libraries, files."""
         return read_manifest(self.root / ref.uri)
 
     def stored_bytes(self, ref: StageRef) -> int:
-        """Return the size of a store's files by its manifest, as they were made.
-
-        Files that were cleared away count too.
-        """
+        """Return the size of a store's files as they were published; cleared files count too."""
         return made_bytes(self.manifest(ref))
 
     def manifest_hash(self, ref: StageRef) -> str:
@@ -220,10 +215,7 @@ class Archive:
         return manifest_sha256(self.root / ref.uri)
 
     def manifest_hashes(self, refs: Iterable[StageRef]) -> dict[str, str]:
-        """Return the `manifest_hash` of stores and of all they rest on, by address.
-
-        See ``RunDraft.publish(rests_on=...)``.
-        """
+        """Return the `manifest_hash` of stores and of all their inputs, by address."""
         plain = [store_at(self.root, ref.stage, ref.key) for ref in refs]
         return {ref.uri: manifest_sha256(ref.path) for ref in rests_on(self.root, plain)}
 
@@ -232,10 +224,9 @@ class Archive:
         return published_stores(self.root, stage)
 
     def discard(self, ref: StageRef, *, wait: bool = True, unnamed: bool = False) -> bool:
-        """Take one store away, for good; a key that is asked for again is made again.
+        """Remove one store; False where another process holds it and ``wait`` is false.
 
-        False where another process works on it and ``wait`` is false. ``unnamed`` says that no run may name it, which
-        in a bucket is looked after once more: here the process that clears up is alone.
+        With ``unnamed``, an archive in a bucket checks once more that no run names it.
         """
         with refusals(self.root, "remove from the archive"), self._locked(f"{ref.stage}-{ref.key}", wait=wait) as held:
             if held:
@@ -243,9 +234,9 @@ class Archive:
         return held
 
     def clear(self, ref: StageRef, *, wait: bool = True) -> bool:
-        """Take a store's files away and keep what its manifest tells; asked for again, it is made again.
+        """Remove a store's files and keep its manifest; a later request builds them again.
 
-        False where another process works on it and ``wait`` is false. Raises IncompleteStoreError: its manifest is
+        False where another process holds it and ``wait`` is false. Raises IncompleteStoreError: its manifest is
         damaged.
         """
         final = self.root / ref.uri
@@ -255,7 +246,7 @@ class Archive:
                 try:
                     remove_tree(part)
                     part.mkdir()
-                    write_manifest(part, cleared_facts(before, manifest_sha256(final)))
+                    write_manifest(part, cleared_facts(before))
                     take_its_place(part, final)
                 finally:
                     remove_tree(part)
@@ -263,9 +254,9 @@ class Archive:
 
     @contextmanager
     def in_use(self, *, alone: bool = False) -> Iterator[bool]:
-        """Keep others from clearing stores away while the block runs; many may do so at a time.
+        """Keep other processes from removing stores while the block runs; many may use an archive at a time.
 
-        ``alone`` asks to be the only one, and gives False at once where another process uses the archive.
+        ``alone`` asks for exclusive use, and yields False at once where another process uses the archive.
         """
         with refusals(self.root, "write to the archive"):
             release = take_lock(self._lock_path("use"), wait=not alone, shared=not alone)
@@ -278,7 +269,7 @@ class Archive:
     # --- verification and clearing up ---------------------------------------------------------------------------------
 
     def reclaim(self) -> list[str]:
-        """Remove unfinished folders that no living process works on; gives their addresses."""
+        """Remove unfinished folders that no process holds; return their addresses."""
         removed: list[str] = []
         with refusals(self.root, "clear up the archive"):
             finish_extensions(self.root)
@@ -291,11 +282,11 @@ class Archive:
         return removed
 
     def now(self) -> datetime:
-        """Return the time by the clock that the age of stores is counted by."""
+        """Return the time from which the age of stores is counted."""
         return datetime.now(UTC)
 
     def size_of(self, uri: str) -> int:
-        """Return the bytes of all files of a store or run, manifest included, as they are there now."""
+        """Return the present bytes of all files of a store or run, manifest included."""
         return bytes_below(self.root / uri)
 
     def sizes(self, uris: Iterable[str]) -> dict[str, int]:
@@ -303,50 +294,40 @@ class Archive:
         return {uri: self.size_of(uri) for uri in uris}
 
     def kept_bytes(self, run: Run, catalogue: Catalogue) -> int:
-        """Return the bytes kept for a run: of its folder, of the stores that it names and of those they rest on.
-
-        Manifests count, and a store whose files were cleared away has its manifest alone.
-        """
+        """Return the bytes kept for a run: its folder, the stores that it names, and their inputs, with manifests."""
         return sum(self.sizes([run.uri, *catalogue.named_and_below[run.uri]]).values())
 
     def all_sizes(self, catalogue: Catalogue) -> dict[str, int]:
-        """Return the bytes of all files of every store and run, by address, also of stores that are only named."""
+        """Return the bytes of every store and run, by address; missing stores that a run names are included."""
         below = catalogue.named_and_below
         return self.sizes(sorted({*catalogue.stores, *below, *(uri for uris in below.values() for uri in uris)}))
 
     def take_moved(self) -> int:
-        """Return the bytes that went to and from a bucket since the last call, or since the archive was opened."""
+        """Return the bytes transferred to and from a bucket since the last call."""
         return 0
 
     def lost_runs(self) -> list[str]:
-        """Return the addresses of runs that have lost their manifest, so that their stores are unknown."""
+        """Return the addresses of runs without a manifest, whose stores are unknown."""
         return [
             f"runs/{path.name}" for path in without_manifest(self.root) if path.parent.name == "runs" and path.is_dir()
         ]
 
     def leftovers(self, keep_days: float) -> dict[str, int]:
-        """Return address and bytes of files that broken-off uploads left in a bucket for ``keep_days``.
-
-        None in a folder.
-        """
+        """Return addresses and bytes of incomplete uploads in a bucket that are older than ``keep_days``."""
         return {}
 
     def drop_leftover(self, uri: str) -> None:
         """Remove one of `leftovers`."""
 
-    def restore(self, uri: str) -> bool:
-        """Return whether a broken store or run of a bucket could be written again as it is on this machine."""
-        return False
-
     def drop_run(self, uri: str) -> None:
-        """Take a damaged run away."""
+        """Remove a damaged run."""
         with refusals(self.root, "remove from the archive"):
             retire(self.root / uri)
 
     # --- runs and spools ----------------------------------------------------------------------------------------------
 
     def new_run(self, name: str) -> RunDraft:
-        """Create the folder of one run; it is not seen under ``runs`` before :meth:`RunDraft.publish`."""
+        """Create the folder of one run, which `RunDraft.publish` puts below ``runs``."""
         stem = f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{run_stem(name)}"
         run_id, number = stem, 1
         with refusals(self.root, "write to the archive"):
@@ -356,14 +337,14 @@ class Archive:
         return draft
 
     def _begin_run(self, run_id: str) -> RunDraft | None:
-        """Take a run's name and make its folder, empty; None where the name is taken."""
+        """Create an empty folder for a new run; None where its name is taken."""
         return self._draft(run_id, wait=False, extends=False)
 
     def extend_run(self, run_id: str, *, wait: bool = True) -> RunDraft | None:
-        """Open a published run to add to it; it stays as it is until :meth:`RunDraft.publish` of the draft returned.
+        """Return a draft that replaces a published run; the run is unchanged until `RunDraft.publish`.
 
-        One process at a time does so; None where another does and ``wait`` is false. Raises ArchiveError: there is no
-        run of this name.
+        One process at a time extends a run; None where another does and ``wait`` is false. Raises ArchiveError: there
+        is no run of this name.
         """
         check_name(run_id)
         with refusals(self.root, "write to the archive"):
@@ -374,7 +355,7 @@ class Archive:
         return draft
 
     def _draft(self, run_id: str, *, wait: bool, extends: bool) -> RunDraft | None:
-        """Make an empty folder for a run, once it is held; None where another holds it, or has just published it."""
+        """Lock a run and create its draft; None where another process holds or has published it."""
         folder = self.root / "runs" / (run_id + PART_SUFFIX)
         release = take_lock(self._lock_path(f"runs-{run_id}"), wait=wait)
         if release is None:
@@ -395,7 +376,7 @@ class Archive:
         return published_runs(self.root)
 
     def spool_folder(self, key: str) -> Path:
-        """Return the folder for the lines of a capture under way; it outlives the process, unlike a staged store."""
+        """Return the folder for the lines of a running capture; unlike a staged store it outlives the process."""
         check_name(key)
         folder = self.root / "spool" / key
         with refusals(self.root, "write to the archive"):
@@ -403,14 +384,14 @@ class Archive:
         return folder
 
     def drop_spool(self, key: str) -> None:
-        """Remove a spool whose lines are published; an archive opened for reading keeps it."""
+        """Remove a spool whose lines are published; a read-only archive keeps it."""
         check_name(key)
         if self.writes:
             self._spooled += bytes_below(self.root / "spool" / key)
             remove_tree(self.root / "spool" / key)
 
     def take_spooled(self) -> int:
-        """Return the bytes of the spools that were removed since the last call, or since the archive was opened."""
+        """Return the bytes of the spools removed since the last call."""
         taken, self._spooled = self._spooled, 0
         return taken
 
@@ -419,7 +400,7 @@ class Archive:
 
     @contextmanager
     def _locked(self, name: str, *, wait: bool = True) -> Iterator[bool]:
-        """Hold a lock while the block runs; gives False where another holds it and ``wait`` is false."""
+        """Hold a lock while the block runs; yield False where another process holds it and ``wait`` is false."""
         release = take_lock(self._lock_path(name), wait=wait)
         try:
             yield release is not None
@@ -429,5 +410,5 @@ class Archive:
 
 
 def run_stem(name: str) -> str:
-    """Return what the folder of a run is called by its survey's name, after its time."""
+    """Return a survey's name as it stands in the name of a run's folder, behind the time."""
     return re.sub(r"[^A-Za-z0-9_-]+", "-", name).strip("-")[:60] or "run"

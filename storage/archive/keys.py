@@ -1,6 +1,6 @@
-"""Keys of stages, a hash of what went in, so that the same work has the same address; and addresses in an archive.
+"""Compute the keys of stores, hashes of everything that determines their content, and the addresses in an archive.
 
-Tell stores and runs from other files, and the folder of an archive from other folders.
+Find stores and runs among other files, and check that a folder can be an archive.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def canonical_json(value: object) -> str:
 
 
 def plain(value: object) -> Any:
-    """Return the value as JSON knows it. Arrays become the hash of their bytes; NaN and infinities become words."""
+    """Return the value in JSON types. Arrays become the hash of their bytes; NaN and infinities become text."""
     if value is None or isinstance(value, bool | str):
         return value
     if isinstance(value, np.generic):
@@ -90,7 +90,7 @@ SECOND = len("20261120T101701")  # of a run's name: when it was begun
 
 @dataclass(frozen=True)
 class StageRef:
-    """Address of one published store: what tasks hand to each other instead of arrays."""
+    """Address of one published store, which tasks pass on instead of arrays."""
 
     stage: str
     key: str
@@ -103,7 +103,7 @@ class StageRef:
 
 
 def store_at(root: Path, stage: str, key: str) -> StageRef:
-    """Return the address of a store, whether it is there or not. Raises ArchiveError: no store can have such names."""
+    """Return the address of a store, whether it exists or not. Raises ArchiveError: a name is not allowed."""
     check_name(stage)
     check_name(key)
     return StageRef(stage, key, root / "stages" / stage / key)
@@ -126,7 +126,7 @@ def published_runs(root: Path) -> list[Path]:
 
 
 def _is_published(folder: Path) -> bool:
-    """Return whether a folder has a manifest, be it a damaged one, or a link."""
+    """Return whether a folder has a manifest, even a damaged one or a link."""
     return not folder.name.endswith(PART_SUFFIX) and os.path.lexists(folder / MANIFEST_NAME)
 
 
@@ -149,9 +149,9 @@ PARTS = ("stages", "runs", "spool", ".locks")
 
 
 def open_folder(path: Path, *, create: bool, write: bool) -> None:
-    """Make an archive's folder where ``create``, and see whether it can be used.
+    """Create an archive's folder with ``create``, and check that it can be used.
 
-    Raises ArchiveError: the path is a file, is not there, or does not let itself be read or written to (``write``).
+    Raises ArchiveError: the path is a file, is missing, or cannot be read or written to (``write``).
     """
     try:
         with refusals(path, "use the archive"):

@@ -1,7 +1,7 @@
-"""Lineage: which stores every store and run of an archive rests on, by their manifests and receipts.
+"""Find the stores that every store and run of an archive was made of, by manifests and receipts.
 
-Products by the names that people give them, and what differs between a store and the version of it before. Nothing here
-trusts what it reads: a damaged manifest is a store with a problem, an input that is not there a name.
+Find products by name, and the differences between a store and its predecessor. A damaged manifest gives a store with a
+problem, a missing input a bare key.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Catalogue:
 
     @classmethod
     def read(cls, root: Path) -> Catalogue:
-        """Read every manifest and receipt of an archive; damaged ones are in it as such."""
+        """Read every manifest and receipt of an archive; damaged ones have a ``problem``."""
         stores = {ref.uri: read_store(ref) for ref in published_stores(root)}
         by_key: dict[str, list[str]] = {}
         for store in stores.values():
@@ -44,7 +44,7 @@ class Catalogue:
 
     @cached_property
     def by_key(self) -> dict[str, list[str]]:
-        """Addresses of stores by key, also of those that are only named or lost; one, but for keys given by hand."""
+        """Return addresses of stores by key, also of missing ones that a run names."""
         found: dict[str, list[str]] = {}
         for uri in dict.fromkeys((*self.stores, *self.lost, *(uri for run in self.runs for uri in sorted(run.names)))):
             found.setdefault(uri.rpartition("/")[2], []).append(uri)
@@ -66,15 +66,15 @@ class Catalogue:
         return found
 
     def ancestors(self, uris: Iterable[str]) -> set[str]:
-        """Return the stores that these rest on, themselves not counted; with keys that are nowhere."""
+        """Return all inputs of these stores, direct and indirect, without themselves; missing ones as bare keys."""
         return reach(uris, self.inputs_of)
 
     def dependents(self, uris: Iterable[str]) -> set[str]:
-        """Return the stores and runs that rest on these stores, themselves not counted."""
+        """Return all stores made of these, directly or indirectly, without themselves."""
         return reach(uris, lambda uri: self._made_of_it.get(uri, []))
 
     def inputs_first(self, uris: Iterable[str]) -> list[str]:
-        """Return these stores in an order in which inputs come before the stores made of them."""
+        """Return these stores with inputs before the stores made of them."""
         wanted, done, ordered = set(uris), set[str](), list[str]()
         for start in sorted(wanted):
             waiting: list[tuple[str, Iterator[str]]] = [] if start in done else [(start, iter(self.inputs_of(start)))]
@@ -91,7 +91,7 @@ class Catalogue:
         return ordered
 
     def named_by(self, uri: str) -> list[Run]:
-        """Return the runs that name a store, or rest on it."""
+        """Return the runs that name a store or one made of it."""
         return self._namers.get(uri, [])
 
     @cached_property
@@ -103,17 +103,8 @@ class Catalogue:
         return found
 
     @cached_property
-    def recorded_by(self) -> dict[str, list[tuple[Run, str]]]:
-        """Return for each store the runs that recorded the SHA-256 of its manifest, oldest first, with that."""
-        found: dict[str, list[tuple[Run, str]]] = {}
-        for run in self.runs:
-            for uri, sha256 in run.recorded.items():
-                found.setdefault(uri, []).append((run, sha256))
-        return found
-
-    @cached_property
     def named_and_below(self) -> dict[str, set[str]]:
-        """For each run the stores that it names, and what these rest on."""
+        """Return for each run the stores that it names, and all their inputs."""
         return {run.uri: set(run.names) | self.ancestors(run.names) for run in self.runs}
 
     def kept_by_runs(self, sizes: Mapping[str, int]) -> dict[str, int]:
@@ -121,9 +112,9 @@ class Catalogue:
         return {run: sum(sizes[uri] for uri in (run, *uris)) for run, uris in self.named_and_below.items()}
 
     def own_by_runs(self, sizes: Mapping[str, int]) -> dict[str, int]:
-        """Return the bytes of each run's folder and of the stores that no other run names or rests on, by its address.
+        """Return the bytes that would go with each run: its folder, and the stores that no other run needs.
 
-        So much goes with it. ``sizes`` are of `Archive.all_sizes`.
+        ``sizes`` are of `Archive.all_sizes`.
         """
         return {
             run: sizes[run] + sum(sizes[uri] for uri in uris if len(self.named_by(uri)) == 1)
@@ -143,7 +134,7 @@ class Catalogue:
         return found
 
     def is_only_copy(self, uri: str) -> bool:
-        """Return whether a store holds raw lines that cannot be had again; simulated ones can."""
+        """Return whether a store holds raw lines that cannot be captured again; simulated ones can."""
         if uri.split("/")[1] not in RAW_STAGES:
             return False
         runs, store = self.named_by(uri), self.stores.get(uri)
@@ -155,7 +146,7 @@ class Catalogue:
 
 
 def rests_on(root: Path, refs: Iterable[StageRef]) -> list[StageRef]:
-    """Return these stores and all that they were made of, where these are there, sorted by address."""
+    """Return these stores and all their existing inputs, sorted by address."""
     found: dict[str, StageRef] = {}
     waiting = list(refs)
     while waiting:
@@ -169,7 +160,7 @@ def rests_on(root: Path, refs: Iterable[StageRef]) -> list[StageRef]:
 
 
 def reach(starts: Iterable[str], following: Callable[[str], Iterable[str]]) -> set[str]:
-    """Return all that can be reached from the starts, without the starts themselves."""
+    """Return everything that can be reached from the starts, without the starts."""
     begun = set(starts)
     found, waiting = set(begun), list(begun)
     while waiting:
@@ -186,7 +177,7 @@ LATEST = "latest"  # the newest run
 def find_product(catalogue: Catalogue, text: str) -> str | Run:
     """Return the address of a store that is there, or a run.
 
-    Raises ArchiveError: nothing is called so, several things are, or it could not be a name in any archive.
+    Raises ArchiveError: nothing or more than one product has this name, or the name is not allowed.
     """
     parts = text.rstrip("/").split("/")
     for part in parts:
@@ -226,7 +217,9 @@ def _named(catalogue: Catalogue, text: str) -> str:
     if text in products:
         uri = in_text(products[text])
         if newest is not None and uri is None:
-            raise ArchiveError(f"{text} is no store but a file of {newest.uri}; explain {newest.uri} tells of that run")
+            raise ArchiveError(
+                f"{text} is no store but a file of {newest.uri}; explain {newest.uri} describes that run"
+            )
         return _store(catalogue, uri or text)
     keys = [uri for uri in catalogue.stores if len(text) >= SHORTEST and uri.rpartition("/")[2].startswith(text)]
     if len(keys) == 1:

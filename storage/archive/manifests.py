@@ -1,6 +1,6 @@
-"""Manifests: the facts of a published folder, the hash and size of every file, and a seal over the manifest itself.
+"""Write and check manifests: the facts of a published folder, and hash and size of every file.
 
-The seal is the SHA-256 of the manifest's text without it. A flipped bit in the manifest is found by the manifest alone.
+The ``seal`` is the SHA-256 of the manifest's text without it, so that a flipped bit in the manifest itself is found.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from storage.archive.staging import (
 )
 
 FORMAT = 2
-CLEARED = "cleared"  # what a store was before its files were cleared away, as they can be made again
-EXTENDED = "extended"  # what a run was before something was added to it
+CLEARED = "cleared"  # in a manifest: when the files of a store were cleared away, and their size
+EXTENDED = "extended"  # in a manifest: when a run was extended, and its manifests before
 CURE = "restore it from a copy, or run verify --repair on the archive"
 _DISTRIBUTIONS = ("spectralzoom", "numpy", "numba", "torch", "xarray", "zarr", "numcodecs")
 
@@ -38,7 +38,7 @@ _DISTRIBUTIONS = ("spectralzoom", "numpy", "numba", "torch", "xarray", "zarr", "
 def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:
     """Sync every file of a staged folder and write ``manifest.json`` with their hashes and sizes beside ``facts``.
 
-    When it was made and with which libraries are those of now, where ``facts`` does not say them.
+    The date and the versions of libraries are the present ones, unless ``facts`` has them.
     """
     files: dict[str, dict[str, Any]] = {}
     for path in files_below(folder):
@@ -46,8 +46,8 @@ def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:
         files[path.relative_to(folder).as_posix()] = {"sha256": file_hash(path), "size": path.stat().st_size}
     known = {"created": datetime.now(UTC).isoformat(timespec="milliseconds"), "libraries": library_versions()}
     content = {**known, **facts, "files": files, "format": FORMAT}
-    manifest = folder / MANIFEST_NAME
-    manifest.write_text(_text(content | {"seal": _seal(content)}), encoding="utf-8")
+    manifest, checksummed = folder / MANIFEST_NAME, content | {"seal": _seal(content)}
+    manifest.write_text(_text(checksummed), encoding="utf-8")
     sync_path(manifest)
     for inner in sorted(path for path in folder.rglob("*") if path.is_dir()):
         sync_path(inner)
@@ -57,8 +57,7 @@ def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:
 def read_manifest(folder: Path) -> dict[str, Any]:
     """Return the content of a published folder's manifest.
 
-    Raises IncompleteStoreError: there is none, it cannot be read, or its own seal contradicts it. So does a listed file
-    that cannot lie in this folder.
+    Raises IncompleteStoreError: it is missing, cannot be read, does not match its seal, or lists a file outside.
     """
     content, problem = try_manifest(folder)
     if problem is not None:
@@ -67,7 +66,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def try_manifest(folder: Path) -> tuple[dict[str, Any], str | None]:
-    """Return the content of a published folder's manifest and None, or nothing and its fault."""
+    """Return the content of a published folder's manifest and None, or an empty table and the problem."""
     if folder.is_symlink():
         return {}, f"{folder.name} is a link, which is not followed: put there what it leads to"
     try:
@@ -79,7 +78,7 @@ def try_manifest(folder: Path) -> tuple[dict[str, Any], str | None]:
 
 
 def parse_manifest(written: bytes) -> tuple[dict[str, Any], str | None]:
-    """Return the content of a manifest's text and None, or nothing and its fault."""
+    """Return the content of a manifest's text and None, or an empty table and the problem."""
     try:
         text = written.decode()
         content = json.loads(text)
@@ -103,7 +102,7 @@ def parse_manifest(written: bytes) -> tuple[dict[str, Any], str | None]:
 
 
 def manifest_sha256(folder: Path) -> str:
-    """Return the SHA-256 of a published folder's manifest.json, which runs record of each store they rest on.
+    """Return the SHA-256 of a published folder's manifest.json; runs record it of each store.
 
     Raises IncompleteStoreError: there is none.
     """
@@ -119,30 +118,26 @@ def listed_bytes(manifest: Mapping[str, Any]) -> int:
 
 
 def made_bytes(manifest: Mapping[str, Any]) -> int:
-    """Return the size of all files as they were made, those cleared away since included."""
+    """Return the size of all files as they were published, including cleared ones."""
     size = _table(manifest.get(CLEARED)).get("bytes_before")
     return size if isinstance(size, int) else listed_bytes(manifest)
 
 
-def cleared_facts(before: Mapping[str, Any], sha256: str) -> dict[str, Any]:
-    """Return the facts for the manifest of a store whose files are cleared away: earlier ones, and what was removed.
-
-    ``before`` and ``sha256`` are the manifest that it has until then, and the SHA-256 of its file.
-    """
+def cleared_facts(before: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the facts for the manifest of a store whose files are cleared away: those of ``before``, and the size."""
     kept = {name: value for name, value in before.items() if name not in ("files", "format", "seal")}
     at = datetime.now(UTC).isoformat(timespec="milliseconds")
-    entry = {"at": at, "bytes_before": listed_bytes(before), "manifests": [sha256]}
-    return kept | {CLEARED: entry}
+    return kept | {CLEARED: {"at": at, "bytes_before": listed_bytes(before)}}
 
 
 def is_cleared(manifest: Mapping[str, Any]) -> bool:
-    """Return whether a store's files were cleared away: it is made again when it is needed."""
+    """Return whether a store's files were cleared away."""
     return CLEARED in manifest
 
 
-def manifests_before(manifest: Mapping[str, Any], change: str) -> list[str]:
-    """Return SHA-256 of a folder's manifests before a ``change``, CLEARED or EXTENDED, oldest first."""
-    found = _table(manifest.get(change)).get("manifests")
+def manifests_before(manifest: Mapping[str, Any]) -> list[str]:
+    """Return the SHA-256 of a run's manifests before it was extended, oldest first."""
+    found = _table(manifest.get(EXTENDED)).get("manifests")
     return [one for one in found if isinstance(one, str)] if isinstance(found, list) else []
 
 
@@ -151,26 +146,26 @@ def _table(value: object) -> Mapping[str, Any]:
 
 
 def extended_facts(before: Mapping[str, Any], sha256: str) -> dict[str, Any]:
-    """Return the facts for the manifest of a run that is extended; its time of publication stays.
+    """Return the facts for the manifest of an extended run; its time of publication stays.
 
-    ``before`` and ``sha256`` are the manifest that it has until then, and the SHA-256 of its file.
+    ``before`` and ``sha256`` are its present manifest and the SHA-256 of that file.
     """
     at = datetime.now(UTC).isoformat(timespec="milliseconds")
     created = {} if "created" not in before else {"created": before["created"]}
-    return created | {EXTENDED: {"at": at, "manifests": [*manifests_before(before, EXTENDED), sha256]}}
+    return created | {EXTENDED: {"at": at, "manifests": [*manifests_before(before), sha256]}}
 
 
 def check_files(folder: Path, *, hashes: bool) -> None:
     """Compare a published folder with its manifest: names and sizes, and every byte where ``hashes``.
 
-    Raises IncompleteStoreError: names the first file that is missing, has another size or content, or is not listed.
+    Raises IncompleteStoreError: a file is missing, has another size or content, or is not listed.
     """
     for name, problem in broken_files(folder, read_manifest(folder), hashes=hashes):
         raise IncompleteStoreError(f"{folder / name} {problem}; {CURE}")
 
 
 def broken_files(folder: Path, manifest: Mapping[str, Any], *, hashes: bool) -> Iterator[tuple[str, str]]:
-    """Yield name and problem of every file that is not as the manifest lists it; with ``hashes`` also extra ones."""
+    """Yield name and problem of every file that differs from the manifest; with ``hashes`` also of extra files."""
     listed = manifest["files"]
     inner = {parent for name in listed for parent in PurePosixPath(name).parents}
     links = sorted(one for one in inner if (folder / one).is_symlink())  # the outer ones first
@@ -192,7 +187,7 @@ def broken_files(folder: Path, manifest: Mapping[str, Any], *, hashes: bool) -> 
 
 
 def file_problem(path: Path, entry: Mapping[str, Any], *, hashes: bool) -> str | None:
-    """Return a file's difference from its ``entry`` in the manifest, to follow its name; None where it is whole."""
+    """Return the difference of a file from its ``entry`` in the manifest, as text behind its name; None without one."""
     try:
         size = plain_size(path)
         if size != entry["size"]:

@@ -1,6 +1,6 @@
-"""Records of single stores and runs: manifest and receipt, read without trust.
+"""Read single stores and runs by manifest and receipt, whatever these files contain.
 
-A damaged manifest is a record with a problem; whatever else a file says where something was expected counts as nothing.
+A damaged manifest gives a record with a ``problem``; values of another type than expected are ignored.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from storage.archive.keys import StageRef, in_text
-from storage.archive.manifests import EXTENDED, is_cleared, listed_bytes, try_manifest
+from storage.archive.manifests import is_cleared, listed_bytes, try_manifest
 from storage.archive.staging import MANIFEST_NAME, file_hash, read_plain
 
 RECEIPT = "receipt.json"
@@ -23,10 +23,7 @@ RESTS_ON = "rests_on"  # in a run's manifest: address of a store -> SHA-256 of i
 
 @dataclass(frozen=True)
 class StageRecord:
-    """One stage of a run, as its receipt has it.
-
-    Figures that were not measured (a stage read from the archive) are None.
-    """
+    """One stage of a run; figures of a stage that was read from the archive are None."""
 
     name: str
     key: str
@@ -41,7 +38,7 @@ class StageRecord:
 
 @dataclass(frozen=True)
 class Store:
-    """One store by its manifest; where that is damaged, ``problem`` says so and the rest is empty."""
+    """One store by its manifest; of a damaged one ``problem`` is set and the rest is empty."""
 
     ref: StageRef
     facts: Mapping[str, Any] = field(default_factory=dict)
@@ -70,12 +67,12 @@ class Store:
 
     @property
     def created(self) -> str:
-        """When it was published, ISO 8601 in UTC; empty where that is not known."""
+        """Time of publication, ISO 8601 in UTC; empty where not known."""
         return _text(self.facts.get("created"))
 
     @property
     def cleared(self) -> bool:
-        """Return whether its files were cleared away, to be made again when they are asked for."""
+        """Return whether its files were cleared away."""
         return is_cleared(self.facts)
 
     @property
@@ -86,7 +83,7 @@ class Store:
 
 @dataclass(frozen=True)
 class Run:
-    """One run. ``receipt`` is empty where it is damaged; ``names`` are the stores that it or its manifest names."""
+    """One run; a damaged ``receipt`` is empty, ``names`` are the stores that receipt and manifest name."""
 
     folder: Path
     facts: Mapping[str, Any]  # of its manifest
@@ -101,7 +98,7 @@ class Run:
 
     @property
     def recorded(self) -> dict[str, str]:
-        """SHA-256 of the manifests that it rests on, as it knew them: by its stages, and by its own manifest."""
+        """Return the SHA-256 of the manifests of its stores at publication, by address."""
         told = {_text(row.get("key")): row.get(MANIFEST_HASH) for row in self.stages}
         by_stage = {uri: told[key] for uri in self.names if (key := uri.rpartition("/")[2]) in told}
         found = {**by_stage, **_table(self.receipt.get(RESTS_ON)), **_table(self.facts.get(RESTS_ON))}
@@ -109,17 +106,17 @@ class Run:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Return the settings of the survey; from the run's manifest where that has them."""
+        """Return the settings of the survey, from the manifest or else from the receipt."""
         return _table(self.facts.get("settings")) or _table(self.receipt.get("settings"))
 
     @property
     def products(self) -> dict[str, str]:
-        """Names of what it left, and their addresses."""
+        """Names and addresses of its products."""
         return {name: uri for name, uri in _table(self.receipt.get("products")).items() if isinstance(uri, str)}
 
     @property
     def stages(self) -> list[dict[str, Any]]:
-        """Its stages, each with name, key, state and what it took."""
+        """Its stages, each with name, key, state and costs."""
         rows = self.receipt.get("stages")
         return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
 
@@ -129,13 +126,8 @@ class Run:
         return _text(self.facts.get("created")) or _text(self.receipt.get("finished"))
 
     @property
-    def checksummed(self) -> str:
-        """When its manifest was written: at its publication, or when something was last added to it; ISO 8601."""
-        return _text(_table(self.facts.get(EXTENDED)).get("at")) or self.created
-
-    @property
     def simulated(self) -> bool:
-        """Return whether its light came from the simulator, and so can be had again."""
+        """Return whether its lines were simulated, and can be made again."""
         return self.settings.get("source") == "sim"
 
 
@@ -146,7 +138,7 @@ def read_store(ref: StageRef) -> Store:
 
 
 def read_run(folder: Path, by_key: Mapping[str, list[str]]) -> Run:
-    """Return one run by its manifest and receipt, damaged or not; ``by_key`` says which stores there are."""
+    """Return one run by its manifest and receipt, damaged or not; ``by_key`` are the addresses of stores by key."""
     facts, broken = try_manifest(folder)
     problem = broken and f"{MANIFEST_NAME} is damaged: {broken}"
     receipt: dict[str, Any] = {}
@@ -163,7 +155,7 @@ def read_run(folder: Path, by_key: Mapping[str, list[str]]) -> Run:
 
 
 def _receipt(folder: Path, facts: Mapping[str, Any]) -> tuple[dict[str, Any], str | None]:
-    """Return the receipt, if every byte is as published, or its fault; a folder without a receipt has none."""
+    """Return the receipt if it is as published, else an empty table and the problem."""
     entry = facts["files"].get(RECEIPT)
     if entry is None:
         return {}, None

@@ -1,7 +1,7 @@
-"""The folder of one run: receipt, report and pictures, published together, and again as a whole with what is added.
+"""Publish the folder of one run: receipt, report and pictures; and replace it as a whole when something is added.
 
-A run's facts may grow once its accuracy is known. Then a new folder replaces the old one in one step, under the same
-name and date, and its manifest names the earlier one. Killed anywhere, one of the two lies there whole.
+When the accuracy is known, a new folder replaces the old one in one step, under the same name and date. Its manifest
+names the earlier one. Wherever the process is killed, one of the two is there and complete.
 """
 
 from __future__ import annotations
@@ -11,14 +11,12 @@ import errno
 import os
 import secrets
 from collections.abc import Callable, Iterator, Mapping
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from storage.archive.keys import plain, published_runs
+from storage.archive.keys import plain
 from storage.archive.manifests import (
-    EXTENDED,
     extended_facts,
     manifest_sha256,
     manifests_before,
@@ -26,9 +24,7 @@ from storage.archive.manifests import (
     try_manifest,
     write_manifest,
 )
-from storage.archive.records import read_run
 from storage.archive.staging import (
-    MANIFEST_NAME,
     PART_SUFFIX,
     bytes_below,
     check_name,
@@ -39,33 +35,15 @@ from storage.archive.staging import (
     take_lock,
 )
 
-TICK_S = 0.02  # dates have milliseconds, and those of files are some of them late
 _AT_FDCWD = -100  # names are absolute, or of the working folder
 _RENAME_EXCHANGE = 2
 _UNSUPPORTED = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP)
 
 
-def date_of_store(root: Path, uri: str) -> str:
-    """Return the date of a new store: now, or after the last run that knows its address where the clock was set back.
-
-    `verify` uses the date to tell a store that was made anew from one whose manifest was written later.
-    """
-    now = datetime.now(UTC)
-    folders = published_runs(root)
-    if any((folder / MANIFEST_NAME).lstat().st_mtime >= now.timestamp() - TICK_S for folder in folders):
-        runs = (read_run(folder, {}) for folder in folders)
-        for known in (run.checksummed for run in runs if uri in run.recorded):
-            try:
-                now = max(now, datetime.fromisoformat(known) + timedelta(milliseconds=1))
-            except (ValueError, TypeError, OverflowError):
-                continue  # it does not say when it was published
-    return now.isoformat(timespec="milliseconds")
-
-
 class RunDraft:
-    """The folder of one run while it is written. Published as a whole, or abandoned.
+    """The folder of one run while it is written; published as a whole or abandoned.
 
-    A run that ``extends`` another is published already, and stays as it is unless `publish` is called.
+    A draft that ``extends`` a published run replaces it only when `publish` is called.
     """
 
     def __init__(
@@ -74,7 +52,7 @@ class RunDraft:
         self.id = run_id
         self.folder = folder
         self.extends = extends
-        self.send: Callable[[str], None] | None = None  # where a run goes by its address once it is published
+        self.send: Callable[[str], None] | None = None  # called with the address of the published run
         self._root = root
         self._release = release
 
@@ -99,7 +77,7 @@ class RunDraft:
             self.abandon()
 
     def write_file(self, name: str, content: str | bytes) -> Path:
-        """Write one file of the run, such as ``receipt.json``, and give its path."""
+        """Write one file of the run, such as ``receipt.json``, and return its path."""
         check_name(name)
         with refusals(self._root, "write to the archive"):
             path = self.folder / name
@@ -107,10 +85,10 @@ class RunDraft:
         return path
 
     def publish(self, *, rests_on: Mapping[str, str] | None = None, **facts: Any) -> Path:
-        """Make the run seen under ``runs``; gives its folder. ``facts`` go into the manifest.
+        """Publish the run below ``runs`` and return its folder; ``facts`` go into the manifest.
 
-        ``rests_on`` is the result of `Archive.manifest_hashes` for the run's products. `verify` compares their
-        manifests with it, and `gc` keeps these stores even where the receipt is damaged.
+        ``rests_on`` is the result of `Archive.manifest_hashes` for the run's products. `gc` keeps these stores even
+        where the receipt is damaged.
         """
         final = self.published
         with refusals(self._root, "write to the archive"):
@@ -125,16 +103,13 @@ class RunDraft:
         return final
 
     def bytes_published(self, *, rests_on: Mapping[str, str] | None = None, **facts: Any) -> int:
-        """Return the bytes of the folder, manifest included, if it were published now with these facts.
-
-        See `publish`.
-        """
+        """Return the bytes of the folder, manifest included, if it were published now with these facts."""
         with refusals(self._root, "write to the archive"):
             self._write_manifest(rests_on, facts)
             return bytes_below(self.folder)
 
     def _write_manifest(self, rests_on: Mapping[str, str] | None, facts: Mapping[str, Any]) -> None:
-        """Write the manifest; with the same files and facts one of later has the same size."""
+        """Write the manifest; its size depends on files and facts alone."""
         final = self.published
         content = {"run": self.id, "rests_on": dict(rests_on or {}), **plain(facts)}
         if self.extends:
@@ -142,16 +117,16 @@ class RunDraft:
         write_manifest(self.folder, content)
 
     def abandon(self) -> None:
-        """Remove what is not published; harmless afterwards."""
+        """Remove an unpublished draft and release its lock; may be called again."""
         remove_tree(self.folder)
         self._release()
 
 
 def take_its_place(part: Path, final: Path) -> None:
-    """Put a whole folder in the place of another, which goes.
+    """Replace a folder by a complete one, and remove it.
 
-    Some file systems cannot exchange two folders: for a moment only the unfinished name leads to the run. If the
-    process is killed then, `finish_extensions` completes the exchange.
+    Some file systems cannot exchange two folders: there the run has its unfinished name for a moment. If the process is
+    killed then, `finish_extensions` completes the exchange.
     """
     sync_path(final.parent)
     away = part
@@ -169,10 +144,10 @@ def take_its_place(part: Path, final: Path) -> None:
 
 
 def try_exchange(one: Path, other: Path) -> bool:
-    """Return two folders of one file system each other's name in one step, and have the disk know it.
+    """Exchange the names of two folders in one step and sync them.
 
-    Linux does that (renameat2) on its local file systems. Elsewhere, as on most network file systems, nothing is
-    changed and the answer is False.
+    Linux does so (renameat2) on local file systems. Elsewhere, as on most network file systems, nothing is changed and
+    the result is False.
     """
     call = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
     if call is None:
@@ -189,17 +164,17 @@ def try_exchange(one: Path, other: Path) -> bool:
 
 
 def unfinished_extensions(root: Path) -> Iterator[Path]:
-    """Yield whole folders that were about to replace a run and whose run is gone."""
+    """Yield complete folders that were about to replace a run, and whose run has no name."""
     for part in sorted((root / "runs").glob(f"*{PART_SUFFIX}")):
         facts, problem = try_manifest(part)
         named = part.name.removesuffix(PART_SUFFIX)
-        whole = problem is None and bool(manifests_before(facts, EXTENDED)) and facts.get("run") == named
+        whole = problem is None and bool(manifests_before(facts)) and facts.get("run") == named
         if whole and not (root / "runs" / named).exists():
             yield part
 
 
 def finish_extensions(root: Path) -> None:
-    """Give the runs of `unfinished_extensions` their names back, unless a living process is about to."""
+    """Give the runs of `unfinished_extensions` their names, unless a running process does."""
     for part in unfinished_extensions(root):
         release = take_lock(root / ".locks" / f"runs-{part.stem}.lock", wait=False)
         if release is not None:

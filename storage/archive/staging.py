@@ -1,8 +1,7 @@
-"""Files and folders on their way into an archive and out of it: names, refusals of the disk, syncing, locks.
+"""Handle the files and folders of an archive: names, errors of the disk, syncing, locks, and settings in TOML.
 
-Files are opened as what they should be: no link is followed, and nothing else that can be opened waits. A pipe without
-a writer would hold a reader for ever, a device may give bytes without end, a link leads elsewhere. TOML that people
-write is read whole or refused in one sentence.
+Only plain files are opened. A pipe without a writer would block a reader, a device may have no end, and a link leads
+outside the archive.
 """
 
 from __future__ import annotations
@@ -38,11 +37,11 @@ _APART = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
 
 class NotPlainError(OSError):
-    """A link, a pipe or the like lies where a file or a folder is expected; ``strerror`` says which."""
+    """A link, a pipe or another special file where a plain file is expected; ``strerror`` names its kind."""
 
 
 def kind_of(path: Path) -> str | None:
-    """Return what lies at a path, in words, the path's last name not followed; None where nothing does."""
+    """Return the kind of what lies at a path, such as "a link", not following it; None where there is nothing."""
     try:
         return _kind(path.lstat().st_mode)
     except (FileNotFoundError, NotADirectoryError):
@@ -52,7 +51,7 @@ def kind_of(path: Path) -> str | None:
 def plain_size(path: Path) -> int:
     """Return the size of a file in bytes.
 
-    Raises NotPlainError: it is a link, a pipe, or whatever else is no file. FileNotFoundError, OSError.
+    Raises NotPlainError: it is a link, a pipe or another special file. FileNotFoundError, OSError.
     """
     found = path.lstat()
     _check(path, found.st_mode)
@@ -60,9 +59,9 @@ def plain_size(path: Path) -> int:
 
 
 def open_plain(path: Path, flags: int = os.O_RDONLY) -> int:
-    """Return a descriptor of a file, which the caller closes.
+    """Return an open descriptor of a file; the caller closes it.
 
-    Raises NotPlainError: it is a link, a pipe, or whatever else is no file. FileNotFoundError, OSError.
+    Raises NotPlainError: it is a link, a pipe or another special file. FileNotFoundError, OSError.
     """
     if not flags & os.O_CREAT:
         _check(path, path.lstat().st_mode)  # before it is opened: some devices act on that
@@ -104,9 +103,9 @@ MOST_BYTES = 10_000_000  # settings are a page long
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Return the tables of a file; a byte order mark, as some editors write it, is passed over.
+    """Return the tables of a TOML file, with or without a byte order mark.
 
-    Raises FileNotFoundError: there is no such file. ValueError: it cannot be read as TOML; the message says why.
+    Raises FileNotFoundError: there is no such file. ValueError: it cannot be read as TOML.
     """
     try:
         with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
@@ -157,14 +156,14 @@ def is_name(name: str) -> bool:
 
 
 def check_name(name: str) -> None:
-    """Refuse what cannot be one folder's or file's name in an archive (ArchiveError)."""
+    """Raise ArchiveError for a name that no folder or file of an archive can have."""
     if not is_name(name):
         raise ArchiveError(f"{name!r} cannot be a name in an archive; use letters, digits, '_', '-' and '.'")
 
 
 @contextmanager
 def refusals(path: Path, doing: str) -> Iterator[None]:
-    """Turn a disk's refusal under ``path`` into an ArchiveError that says what to do; other errors pass."""
+    """Turn a disk error below ``path`` into an ArchiveError with advice; other errors pass."""
     try:
         yield
     except ArchiveError:
@@ -181,7 +180,7 @@ def refusals(path: Path, doing: str) -> Iterator[None]:
 
 
 def disk_advice(error: OSError) -> str | None:
-    """Return the meaning of a refusal of the disk, and the remedy; None where the error is another."""
+    """Return the meaning of a disk error and what to do; None for other errors."""
     return _ADVICE.get(error.errno or 0)
 
 
@@ -191,14 +190,14 @@ def format_disk_error(error: OSError) -> str:
 
 
 def write_all(descriptor: int, content: bytes) -> None:
-    """Write every byte; a full disk may take only some of them before it refuses."""
+    """Write every byte, in several calls if need be."""
     view = memoryview(content)
     while view:
         view = view[os.write(descriptor, view) :]
 
 
 def remove_tree(path: Path) -> None:
-    """Remove a folder if it is there; one that cannot be removed is left for the next run to reclaim."""
+    """Remove a folder if it exists; a folder that cannot be removed is left for the next run."""
     if path.is_symlink():  # what it points at is not the archive's
         with suppress(OSError):
             path.unlink()
@@ -207,7 +206,7 @@ def remove_tree(path: Path) -> None:
 
 
 def retire(path: Path) -> None:
-    """Take a published folder away in one step: first its name, then its files."""
+    """Remove a published folder: first its name, in one step, then its files."""
     if os.path.lexists(path):
         away = path.with_name(f"{path.name}-{secrets.token_hex(4)}{PART_SUFFIX}")
         path.rename(away)
@@ -216,7 +215,7 @@ def retire(path: Path) -> None:
 
 
 def sync_path(path: Path) -> None:
-    """Write a file's content, or a folder's names, through to the disk."""
+    """Sync a file's content, or a folder's names, to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -225,7 +224,7 @@ def sync_path(path: Path) -> None:
 
 
 def rename_into_place(part: Path, final: Path) -> None:
-    """Give a finished folder its final name, for good."""
+    """Give a complete folder its final name, and sync it."""
     sync_path(final.parent.parent)  # the parent may be new: without its own name what it holds is lost
     part.rename(final)
     sync_path(final.parent)
@@ -237,7 +236,7 @@ def files_below(folder: Path) -> list[Path]:
 
 
 def bytes_below(folder: Path) -> int:
-    """Return the bytes of a folder's files, as far as they are there; 0 for a link to a folder."""
+    """Return the bytes of a folder's files; 0 for a link to a folder."""
     if folder.is_symlink():
         return 0
     sizes = [path.lstat().st_size for path in files_below(folder) if path.exists()]
@@ -260,9 +259,8 @@ def file_hash(path: Path) -> str:
 def take_lock(path: Path, *, wait: bool = True, shared: bool = False) -> Callable[[], None] | None:
     """Hold ``path`` against other processes and threads until the function returned is called, or the process dies.
 
-    None where another holds it and ``wait`` is false. Holders of a ``shared`` lock keep out only those that want it for
-    themselves. The file goes away with a lock that is not shared; letting go twice is harmless. Raises ArchiveError: a
-    link, or something else than a file, is in its place: what it leads to is not touched.
+    None where another holds it and ``wait`` is false. A ``shared`` lock excludes only exclusive ones. An exclusive
+    lock's file is removed on release; a second release does nothing. Raises ArchiveError: the path is no plain file.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     while True:
@@ -284,7 +282,7 @@ def take_lock(path: Path, *, wait: bool = True, shared: bool = False) -> Callabl
 
 
 def _open_lock(path: Path) -> int:
-    """Open a lock's file, made where it is missing, and never through a link."""
+    """Open or create a lock's file, never through a link."""
     if path.parent.name in _OF_LOCKS and path.parent.is_symlink():
         raise _misplaced(path.parent, "a folder")
     try:
@@ -306,13 +304,13 @@ def _misplaced(path: Path, expected: str) -> ArchiveError:
 
 
 def _drop_name(path: Path) -> None:
-    """Take a lock's file away; where the disk refuses it stays, and blocks no process."""
+    """Remove a lock's file; if the disk refuses, it stays and blocks no process."""
     with suppress(OSError):
         path.unlink()
 
 
 def _is_still(descriptor: int, path: Path) -> bool:
-    """Return whether an open file has its name yet: the last holder of the lock may have removed it."""
+    """Return whether an open file still has its name, which the last holder of the lock may have removed."""
     try:
         return os.path.samestat(path.lstat(), os.fstat(descriptor))
     except FileNotFoundError:

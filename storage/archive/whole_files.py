@@ -1,4 +1,4 @@
-"""Files that people take away: written aside, synced, and given their names only when they are whole."""
+"""Write exported files aside, and give them their names only when they are complete."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ PROBE_BYTES = 1 << 20  # a disk without room for so much is full
 def written_aside(folder: Path, names: Sequence[str]) -> Iterator[Path]:
     """Yield an empty folder to write ``names`` into; when the block ends well they replace those in ``folder``.
 
-    Old and new files are never mixed. Old files of all names but the first are removed before the first is replaced;
-    the last one to appear vouches for the others. When the block fails, ``folder`` is unchanged. Raises ArchiveError:
-    the folder is or lies below a file, or the disk refuses; the message names it and what to do.
+    Old and new files are never mixed: old files of all names but the first are removed before the first is replaced.
+    When the block fails, ``folder`` is unchanged. Raises ArchiveError: the folder is or lies below a file, or the disk
+    refuses.
     """
     with refusals(folder, "export to"):
         make_folder(folder)
         with tempfile.TemporaryDirectory(prefix=_PREFIX, suffix=PART_SUFFIX, dir=folder) as aside:
-            with _told_by_the_disk(Path(aside)):
+            with _disk_errors(Path(aside)):
                 yield Path(aside)
             for name in names:
                 sync_path(Path(aside) / name)
@@ -39,8 +39,8 @@ def written_aside(folder: Path, names: Sequence[str]) -> Iterator[Path]:
 
 
 @contextmanager
-def _told_by_the_disk(folder: Path) -> Iterator[None]:
-    """Raise the disk's refusal (OSError) where an error comes of it: GDAL's and others hide the system's number."""
+def _disk_errors(folder: Path) -> Iterator[None]:
+    """Raise the disk's own OSError where a library such as GDAL reports a full disk as another error."""
     try:
         yield
     except PipelineError:
@@ -53,7 +53,7 @@ def _told_by_the_disk(folder: Path) -> Iterator[None]:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder to export to, if it is not there (ArchiveError: it is or lies below a file)."""
+    """Create a folder to export to (ArchiveError: it is or lies below a file)."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:
@@ -61,13 +61,13 @@ def make_folder(folder: Path) -> None:
 
 
 def write_whole(path: Path, content: str) -> None:
-    """Write one text file as a whole."""
+    """Write one text file aside and rename it into place."""
     with written_aside(path.parent, [path.name]) as aside:
         (aside / path.name).write_text(content, encoding="utf-8")
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove what killed writers left in a folder; no process may be writing there."""
+    """Remove the leftovers of killed writers from a folder; no process may be writing there."""
     for part in folder.glob(f"{_PREFIX}*{PART_SUFFIX}"):
         remove_tree(part)
 

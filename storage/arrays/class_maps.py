@@ -1,9 +1,13 @@
-"""Maps of classes on the grid of a mosaic, and class probabilities of each pixel; those of the ground: `ground_maps`.
+"""Store class maps and class probabilities on the grid of a mosaic; `ground_maps` stores maps on the ground.
 
-Names of classes are CF flags. Each pixel has log-probabilities of its classes, and age and light of its last capture.
-They are packed by CF's rules (scale_factor, add_offset), so that any reader of netCDF or Zarr gets numbers. A byte
-counts twentieths of a nat for probabilities and sixteenths of an octave for light; two bytes count eighths of a day.
-Classes less likely than one in 1100 are all stored as equally unlikely, and confidence as floats in steps of 1/256.
+Names of classes are CF flags. Each pixel has log-probabilities of its classes, and age and light of its last capture,
+packed by CF's rules (scale_factor, add_offset). Units of the packed integers:
+
+    log_probability   one byte, 0.05 nat; all classes less likely than 1 in 1100 have the same value
+    log2_light        one byte, 1/16 octave
+    age               two bytes, 1/8 day
+
+Confidence is stored as floats in steps of 1/256.
 """
 
 from __future__ import annotations
@@ -38,11 +42,11 @@ from storage.arrays.layout import (
 
 CONFIDENCE = {"long_name": "probability of the class given", "units": "1", "valid_range": [0.0, 1.0]}
 CONFIDENCE_STEP = 1 / 256
-STEP, FAINTEST, NOTHING = 0.05, -12.7, 255  # nats; 254 is certainty, 255 that nothing is known
-LEAST, UNLIKELY = -7.0, -11.0  # nats: what is less is stored as the mean of such, in a tenth of the bytes
+STEP, FAINTEST, NOTHING = 0.05, -12.7, 255  # nats; 254 is certainty, 255 unknown
+LEAST, UNLIKELY = -7.0, -11.0  # nats: lower values are stored as their mean, in a tenth of the bytes
 DAY_STEP, NEVER = 0.125, 65535
 OCTAVE_STEP, DARKEST, DARK = 0.0625, -10.0, 255  # log2 of reference exposures; 255 where there was no light
-# what the images of a pixel hold of which nothing is known
+# values of the images in unknown pixels
 NOT_BELIEVED = {"log_probability": NOTHING, "age": NEVER, "log2_light": DARK}
 OLD_CLASS = "changed_from"
 CHANGED = {"long_name": "fraction of the patch's pixels with another class than remembered", "units": "1"}
@@ -72,7 +76,7 @@ UNKNOWN, UNKNOWN_COLOUR = "unknown", (200, 0, 200)
 
 
 def with_unknown(legend: ClassNames) -> ClassNames:
-    """Return the classes and one more, for pixels unlike all that the weights were trained on."""
+    """Return the classes and one more, for out-of-distribution pixels."""
     name = UNKNOWN if UNKNOWN not in legend.names else f"{UNKNOWN}_spectrum"
     return ClassNames((*legend.names, name), np.vstack([legend.colours, np.array([UNKNOWN_COLOUR], np.uint8)]))
 
@@ -80,7 +84,7 @@ def with_unknown(legend: ClassNames) -> ClassNames:
 def create_class_map(
     path: Path, shape: tuple[int, ...], legend: ClassNames, *, grid: AngularGrid | None = None
 ) -> None:
-    """Create a class map of (y, x) ``shape`` in which no pixel has a class yet."""
+    """Create a class map of (y, x) ``shape`` without classified pixels."""
     names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
     group, place = create_placed_group(path, "class map", grid, shape, names)
     about = {**class_flags(legend.names, legend.colours), **place}
@@ -98,10 +102,10 @@ def _create_flat(
 def write_class_tile(
     path: Path, origin: tuple[int, int], classes: NDArray[np.integer], confidence: NDArray[np.floating]
 ) -> None:
-    """Store (y, x) classes and confidence of whole shards from row and column ``origin`` on.
+    """Store (y, x) classes and confidence of whole shards; ``origin`` is their first row and column.
 
-    Threads and processes may write different tiles of one map at once. Raises ShapeError: a pixel has a class without a
-    name. ChunkError: the tile splits a shard. IncompleteStoreError: there is no map.
+    Threads and processes may write different tiles at once. Raises ShapeError: a class has no name; ChunkError: the
+    tile splits a shard; IncompleteStoreError: there is no map.
     """
     group = open_group(path, "r+")
     check_named(classes, len(legend_of(group).names))
@@ -112,7 +116,7 @@ def write_class_tile(
 
 
 def check_named(classes: NDArray[np.integer], count: int) -> None:
-    """Refuse (y, x) classes with an index for which there is no name (ShapeError)."""
+    """Raise ShapeError where a pixel of (y, x) has a class without a name."""
     worst = int(classes.max(initial=0, where=classes != UNLABELLED))
     if worst >= count and (classes == worst).any():
         raise ShapeError(f"class {worst} is in the map, but only {count} classes have names")
@@ -130,7 +134,7 @@ def class_flags(names: Sequence[str], colours: NDArray[np.uint8]) -> dict[str, A
 
 
 def legend_of(group: zarr.Group) -> ClassNames:
-    """Return the classes that a group's attributes name."""
+    """Read names and colours of the classes from a group's attributes."""
     attributes: dict[str, Any] = dict(group.attrs)
     colours = np.array(attributes.get("class_colours", ()), np.uint8).reshape(-1, 3)
     return ClassNames(tuple(attributes.get("class_names", ())), colours)
@@ -146,9 +150,9 @@ def load_class_map(path: Path) -> ClassMap:
 def create_probabilities(
     path: Path, shape: tuple[int, int], legend: ClassNames, *, grid: AngularGrid | None = None, goes_on: bool = False
 ) -> None:
-    """Create a store for a field of (y, x) ``shape`` whose pixels are all unknown.
+    """Create class probabilities of (y, x) ``shape``, all unknown.
 
-    A store that ``goes_on`` from an earlier one also has the earlier classes of changed pixels: `OLD_CLASS`.
+    A store of a later visit (``goes_on``) also has the previous classes of changed pixels: `OLD_CLASS`.
     """
     names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
     group, place = create_placed_group(path, "class_probabilities", grid, shape, names)
@@ -172,7 +176,7 @@ def create_probabilities(
 
 
 def old_class_flags(legend: ClassNames) -> dict[str, Any]:
-    """Return CF's flag attributes of an image of the classes that pixels had before."""
+    """Return CF's flag attributes of an image of the previous classes."""
     words = f"class remembered, where the map is sure of another one; {UNLABELLED} everywhere else"
     return {**class_flags(legend.names, legend.colours), "long_name": words}
 
@@ -180,16 +184,18 @@ def old_class_flags(legend: ClassNames) -> dict[str, Any]:
 def write_probabilities_tile(
     path: Path, origin: tuple[int, int], log_probability: Floats, age_days: Floats, light: Floats
 ) -> None:
-    """Store (y, x, class) log-probabilities, (y, x) ages and light of whole shards from row and column ``origin`` on.
+    """Store (y, x, class) log-probabilities, (y, x) ages and light of whole shards, the first pixel at ``origin``.
 
-    NaN is what nothing is known of; what is less than `LEAST` becomes `UNLIKELY`.
+    NaN stands for unknown; values below `LEAST` become `UNLIKELY`.
 
     Raises ChunkError: the tile splits a shard; IncompleteStoreError: there is no store.
     """
     group = open_group(path, "r+")
     likelihood, ages, octave = (array_of(group, name) for name in ("log_probability", "age", "log2_light"))
     place = tile_place("the class probabilities", origin, age_days.shape, ages)
-    for top in range(0, len(age_days), SHARD_ROWS):  # what is packed never lies there for all rows at once
+    for top in range(
+        0, len(age_days), SHARD_ROWS
+    ):  # so that the packed values of all rows are never in memory together
         part = log_probability[top : top + SHARD_ROWS]
         likely = np.where(part < LEAST, UNLIKELY, np.minimum(part, 0))
         packed = np.rint((likely - FAINTEST) / STEP)
@@ -203,34 +209,34 @@ def write_probabilities_tile(
 
 
 def write_changes_tile(path: Path, origin: tuple[int, int], old_class: NDArray[np.uint8]) -> None:
-    """Store (y, x) classes that pixels had, 255 where they have them still, of whole shards from ``origin`` on.
+    """Store the previous (y, x) classes, 255 where unchanged, of whole shards, the first pixel at ``origin``.
 
-    Raises ChunkError: the tile splits a shard; IncompleteStoreError: the store has no earlier visit, or is not there.
+    Raises ChunkError: the tile splits a shard; IncompleteStoreError: the store is missing, or is of a first visit.
     """
     array = array_of(open_group(path, "r+"), OLD_CLASS)
     array[tile_place("the class probabilities", origin, old_class.shape, array)] = old_class
 
 
 def drop_changes(path: Path) -> None:
-    """Remove the classes of the earlier visit from stored class probabilities: the visit starts from none."""
+    """Remove the previous classes from stored class probabilities."""
     group = open_group(path, "r+")
     with damage_named(str(path)):
         del group[OLD_CLASS]
 
 
 def write_changes(path: Path, changed: Floats, patch_px: int) -> None:
-    """Add (patch_y, patch_x) fractions of changed pixels to stored class probabilities, by patches of ``patch_px``."""
+    """Add the fraction of changed pixels of each patch (patch_y, patch_x) of ``patch_px`` to class probabilities."""
     about = {**CHANGED, "patch_px": patch_px}
     write_image(open_group(path, "r+"), "changed", ("patch_y", "patch_x"), changed, about)
 
 
 def unpacked_days(packed: NDArray[np.uint16]) -> Floats:
-    """Return stored ages in days; NaN where nothing is known."""
+    """Return packed ages in days; NaN where unknown."""
     return np.where(packed == NEVER, np.float32(np.nan), packed * np.float32(DAY_STEP)).astype(np.float32)
 
 
 class ProbabilityStore:
-    """Stored class probabilities, read in parts. Raises IncompleteStoreError where there are none, or damaged ones."""
+    """Stored class probabilities, read in parts. Raises IncompleteStoreError: they are missing or damaged."""
 
     def __init__(self, path: Path) -> None:
         self._group = open_group(path)
@@ -245,8 +251,7 @@ class ProbabilityStore:
     def read(self, rows: slice = slice(None), columns: slice = slice(None)) -> tuple[Floats, Floats, Floats]:
         """Return log-probabilities (y, x, class), ages in days (y, x) and light (y, x).
 
-        The exponentials of the log-probabilities sum to 1. NaN stands where nothing is known; light is NaN where there
-        was none.
+        The exponentials of the log-probabilities sum to 1. Unknown pixels are NaN; without light, light is 0.
         """
         packed = read_array(self._group, "log_probability", np.s_[rows, columns])
         values = (packed * np.float32(STEP) + np.float32(FAINTEST)).astype(np.float32)
@@ -258,16 +263,16 @@ class ProbabilityStore:
         return values, days, np.where(packed_light == DARK, 0, light).astype(np.float32)
 
     def age(self, rows: slice = slice(None), columns: slice = slice(None)) -> Floats:
-        """Return (y, x) days since each pixel was captured; NaN where nothing is known."""
+        """Return (y, x) days since each pixel was captured; NaN where unknown."""
         return unpacked_days(read_array(self._group, "age", np.s_[rows, columns]))
 
     def old_class(self) -> NDArray[np.uint8] | None:
-        """Return (y, x) earlier classes of pixels that changed, else 255; None for a first visit."""
+        """Return the previous (y, x) classes of changed pixels, else 255; None for a first visit."""
         return read_array(self._group, OLD_CLASS) if OLD_CLASS in self._group else None
 
     @property
     def patch_px(self) -> int:
-        """Pixels a side of the patches of which it holds changes."""
+        """Side of the patches of `changed` [px]."""
         return int(self._group["changed"].attrs["patch_px"])  # type: ignore[arg-type]
 
     def changed(self) -> Floats | None:

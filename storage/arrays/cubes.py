@@ -1,4 +1,4 @@
-"""The raw cube of one sweep: (line, sample, band) uint16, with what is known of every line and a picture."""
+"""Store the raw cube of one sweep, (line, sample, band) uint16, with facts of every line, a picture and statistics."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.scan import Sweep
+from pipeline.signal.subspace import SignalStatistics
 from pipeline.source import Line, References
 from storage.arrays.layout import (
     RAW_PACKING,
@@ -36,15 +37,15 @@ _LINE_COORDINATES = "time mirror_x mirror_y exposure_ms valid_line"
 
 @dataclass(frozen=True)
 class SweepHeader:
-    """Facts of a sweep before its first line."""
+    """Facts of a sweep that are known before its first line."""
 
     sweep: Sweep
     references: References
     wavelength_nm: NDArray[np.float64]  # (band,)
     fwhm_nm: NDArray[np.float64] | None = None
-    source: str = ""  # what the source calls itself
+    source: str = ""  # the source's name
     started: str | None = None  # ISO 8601; None leaves ``time`` counted from the start of the sweep
-    simulation: Mapping[str, Any] | None = None  # what was simulated and what left out; None of a rig
+    simulation: Mapping[str, Any] | None = None  # effects that were simulated or left out; None for a rig
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -89,7 +90,7 @@ class RawCubeWriter:
             self.close()
 
     def write(self, lines: Sequence[Line]) -> None:
-        """Take the next lines; any number, in order."""
+        """Write the next lines, in order, any number of them."""
         for line in lines:
             self._waiting.append(line)
             self._facts.append((line.time_s, line.mirror_x, line.mirror_y, line.exposure_ms, line.valid))
@@ -97,7 +98,7 @@ class RawCubeWriter:
                 self._flush()
 
     def close(self) -> None:
-        """Write what waits, the lines' coordinates and the picture (IncompleteStoreError: lines are missing)."""
+        """Write the last lines, the lines' coordinates and the picture (IncompleteStoreError: lines are missing)."""
         if len(self._facts) != self._header.sweep.lines:
             raise IncompleteStoreError(
                 f"sweep {self._header.sweep.name} has {len(self._facts)} of {self._header.sweep.lines} lines; "
@@ -117,7 +118,7 @@ class RawCubeWriter:
 
 
 def write_references(group: zarr.Group, references: References) -> None:
-    """Store the frames of a sweep."""
+    """Store the dark and white frames of a sweep, and the state of its detector."""
     about = {"units": "1", "coordinates": "wavelength"}
     frames: dict[str, tuple[tuple[str, ...], Any, type[np.generic], str]] = {
         "dark": (("sample", "band"), references.dark, np.float32, "dark reference frame"),
@@ -148,7 +149,7 @@ def write_line_facts(
 
 @dataclass(frozen=True)
 class StoredSweep:
-    """A stored sweep, opened. Values of lines and bands are in memory; spectra are read when asked for."""
+    """A stored sweep, opened. Facts of lines and bands are in memory; spectra are read on request."""
 
     sweep: Sweep
     wavelength_nm: NDArray[np.float64]  # (band,)
@@ -163,15 +164,12 @@ class StoredSweep:
 
     @property
     def simulation(self) -> Mapping[str, Any] | None:
-        """Effects that were simulated and left out, by its attributes; None of a rig's lines."""
+        """Effects that were simulated or left out; None for a rig's lines."""
         found = dict(self.group.attrs).get("simulation")
         return found if isinstance(found, Mapping) else None
 
     def quicklook(self) -> Quicklook | None:
-        """Return a small picture of the sweep, its values over the white reference.
-
-        None where it was stored without one.
-        """
+        """Return the small picture of the sweep, in values of the white reference; None without one."""
         return quicklook_of(self.group)
 
 
@@ -196,7 +194,7 @@ class RawCube(StoredSweep):
     def read_lines(self, numbers: NDArray[np.intp]) -> NDArray[np.uint16]:
         """Return the raw numbers of single lines in ascending order, (line, sample, band) uint16.
 
-        Decodes each chunk once.
+        Each chunk is decoded once.
         """
         parts = np.split(numbers, np.flatnonzero(np.diff(numbers // SHARD_ROWS)) + 1)
         return np.concatenate([self.read(int(part[0]), int(part[-1]) + 1)[part - part[0]] for part in parts])
@@ -204,7 +202,7 @@ class RawCube(StoredSweep):
     def read_window(self, lines: slice, samples: slice) -> NDArray[np.uint16]:
         """Return the raw numbers of some lines and samples, (line, sample, band) uint16.
 
-        Decodes the chunks that hold them.
+        Only the chunks that hold them are decoded.
         """
         return read_array(self.group, "dn", (lines, samples))
 
@@ -236,9 +234,9 @@ def read_references(group: zarr.Group) -> References:
 
 
 def open_raw_cube(path: Path) -> RawCube:
-    """Open a sweep that :class:`RawCubeWriter` stored.
+    """Open a sweep that `RawCubeWriter` stored.
 
-    Raises IncompleteStoreError: there is none, it was not closed, or it is damaged.
+    Raises IncompleteStoreError: it is missing, was not closed, or is damaged.
     """
     group = open_group(path)
     return RawCube(**read_line_facts(group, path), references=read_references(group))
@@ -247,3 +245,17 @@ def open_raw_cube(path: Path) -> RawCube:
 def open_raw_cubes(folder: Path) -> list[RawCube]:
     """Open the sweeps of a capture, in the order of their names; raises as `open_raw_cube`."""
     return [open_raw_cube(path) for path in sorted(folder.glob("*.zarr"))]
+
+
+STATISTICS = "statistics.npz"
+
+
+def write_statistics(folder: Path, found: SignalStatistics) -> None:
+    """Store the statistics of a capture in its folder."""
+    np.savez(folder / STATISTICS, allow_pickle=False, **found.arrays())
+
+
+def read_statistics(folder: Path) -> SignalStatistics:
+    """Read the statistics of a capture (IncompleteStoreError: they are missing or damaged)."""
+    with damage_named(str(folder / STATISTICS)), np.load(folder / STATISTICS) as stored:
+        return SignalStatistics.of_arrays(stored)

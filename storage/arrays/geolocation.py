@@ -1,4 +1,4 @@
-"""Lookup tables as a stored artefact: one group a sweep, in it one a track, so that a second run makes none again."""
+"""Store geolocation grids: a group for each sweep, in it one for each scan path with its tie points."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ _TANGENT = "tangent of the undeflected direction's plane"
 def path_digest(
     position: NDArray[np.floating], usable: NDArray[np.bool_] | None = None, shift: NDArray[np.floating] | None = None
 ) -> str:
-    """Return a sweep's path as 20 hex digits of all that its scan paths depend on: usable lines and their places.
+    """Return 20 hex digits of everything that a sweep's scan paths depend on: its usable lines and their positions.
 
     Positions and their corrections ``shift`` are (line, 2), as of :func:`pipeline.rectify.scan_paths.make_scan_paths`.
-    Positions of unusable lines do not count, nor whether a correction is zero or none. Camera, binning, step and grid
-    are the stage's own parameters.
+    Positions of unusable lines do not count; a correction of zero is none. Camera, binning, step and grid are
+    parameters of the stage.
     """
     lines = np.asarray(position, np.float64)
     flags = np.ones(len(lines), np.bool_) if usable is None else np.asarray(usable, np.bool_)

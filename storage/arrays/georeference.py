@@ -1,8 +1,8 @@
-"""Georeference of stored images: GeoBox or the camera's angles as attributes and coordinates, written and read.
+"""Write and read the georeference of stored images: a GeoBox, or the camera's angles.
 
 A GeoBox is written as CF's grid mapping with coordinates of pixel centres, and as GeoZarr's attributes ``proj:`` and
-``spatial:``. Plain xarray, rioxarray and odc-geo find the same. A turned grid has no centres along its axes. Its
-coordinates count pixels, as in odc-geo, and the grid mapping's GeoTransform has the rest.
+``spatial:``. Plain xarray, rioxarray and odc-geo read both. The coordinates of a rotated grid count pixels, as in
+odc-geo; its grid mapping has the GeoTransform.
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ _EVEN = 1e-3  # of a step, by which coordinates may differ from an even grid's
 def create_placed_group(
     path: Path, title: str, grid: AngularGrid | None, shape: tuple[int, ...], attributes: Mapping[str, Any]
 ) -> tuple[zarr.Group, dict[str, Any]]:
-    """Create a store of images of (y, x) ``shape`` on a scene's grid, with the coordinates y and x.
+    """Create a store for images of (y, x) ``shape`` on a scene's grid, with the coordinates y and x.
 
-    Gives the store, and the attributes that say of each of its images where it lies.
+    Returns the store, and the georeference attributes for each of its images.
     """
     if grid is None:
         return create_group(path, title, attributes), {}
@@ -97,7 +97,7 @@ def map_attributes(geobox: GeoBox) -> dict[str, Any]:
 
 
 def write_map_coordinates(group: zarr.Group, geobox: GeoBox) -> None:
-    """Store ``x``, ``y`` and the grid mapping ``spatial_ref`` of a map, as CF wants them."""
+    """Store ``x``, ``y`` and the grid mapping ``spatial_ref`` of a map by CF's rules."""
     crs = _crs_of(geobox)
     a, _, c, _, e, f = (float(number) for number in geobox.affine[:6])
     for name, size, step, first in (("x", geobox.shape[1], a, c), ("y", geobox.shape[0], e, f)):
@@ -138,7 +138,7 @@ def _crs_of(geobox: GeoBox) -> CRS:
 def load_geobox(path: Path) -> GeoBox | None:
     """Read the grid of a stored map; None where the store lies on an angular grid.
 
-    Raises IncompleteStoreError: the store is missing, or what says its grid is damaged.
+    Raises IncompleteStoreError: the store is missing, or its grid is damaged.
     """
     return geobox_of_group(open_group(path))
 
@@ -161,9 +161,9 @@ def find_geobox(
 ) -> GeoBox | None:
     """Return the grid on the earth of an image of (y, x) ``shape``, by its store; None without CRS and grid.
 
-    ``attributes`` are the image's and its group's, ``arrays`` what else lies in the group, ``dims`` the names of the
-    image's axes. Asked are GeoZarr's ``proj:`` and ``spatial:transform``, the grid mapping with its GeoTransform, and
-    even coordinates of pixel centres along both axes.
+    ``attributes`` are those of the image and its group, ``arrays`` the other arrays of the group, ``dims`` the names of
+    the image's axes. Read are GeoZarr's ``proj:`` and ``spatial:transform``, the grid mapping with its GeoTransform,
+    and evenly spaced coordinates of pixel centres.
     """
     mapping = _mapping(attributes, arrays)
     places = ((mapping, ("crs_wkt", "spatial_ref")), (attributes, ("proj:wkt2", "proj:code", "proj:projjson")))
@@ -180,7 +180,7 @@ def find_geobox(
 
 
 def _mapping(attributes: Mapping[str, Any], arrays: Mapping[str, zarr.Array[Any]]) -> dict[str, Any]:
-    """Return the attributes of the grid mapping that the image names, else of the only array that could be one."""
+    """Return the attributes of the grid mapping that the image names, else of the only array that is one."""
     named = str(attributes.get("grid_mapping", "")).split(":")[0].split(" ")[0]
     if named in arrays:
         return dict(arrays[named].attrs)
@@ -190,7 +190,7 @@ def _mapping(attributes: Mapping[str, Any], arrays: Mapping[str, zarr.Array[Any]
 
 
 def _transform_of_axes(arrays: Mapping[str, zarr.Array[Any]], dims: tuple[str, str]) -> Affine | None:
-    """Return the transform by coordinates of pixel centres, where both axes have even ones of two or more pixels."""
+    """Return the transform by coordinates of pixel centres; None where they are missing or not evenly spaced."""
     if not all(name in arrays and arrays[name].ndim == 1 and arrays[name].shape[0] > 1 for name in dims):
         return None
     y, x = (np.asarray(arrays[name][...], np.float64) for name in dims)

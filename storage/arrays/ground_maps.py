@@ -1,7 +1,4 @@
-"""Images on the ground: maps of classes there with a picture and each class's area, and any stored image by its rows.
-
-Images too large for the memory are read some rows at a time.
-"""
+"""Store class maps on the ground with a picture and the area of each class; read any stored image by rows."""
 
 from __future__ import annotations
 
@@ -67,7 +64,7 @@ class StoredImage:
         return geobox_of_group(self.group)
 
     def rows(self) -> Iterator[tuple[int, NDArray[Any]]]:
-        """Yield the number of the first row and the rows, as many at a time as a shard has.
+        """Yield the number of the first row and the rows of each shard.
 
         Raises IncompleteStoreError: a checksum says that the bytes have changed.
         """
@@ -92,18 +89,18 @@ class GroundMap:
     legend: ClassNames
     geobox: GeoBox
     areas: dict[str, dict[str, float]]  # of each class: m2, ha, fraction of the classified area
-    age_days: NDArray[np.float32]  # (y, x) since a pixel was looked at, NaN where not seen
+    age_days: NDArray[np.float32]  # (y, x) since a pixel was captured, NaN where not seen
     changed: NDArray[np.float32] | None  # (y, x) fraction of its patch that changed, NaN where not seen; None at first
-    old_class: NDArray[np.uint8] | None  # (y, x) class remembered where it is another now, else 255; None at first
+    old_class: NDArray[np.uint8] | None  # (y, x) previous class where it changed, else 255; None at first
 
 
 class GroundMapWriter:
-    """Write a map block by block, so that it never has to be in memory as a whole."""
+    """Write a map block by block, so that it need not fit into memory."""
 
     def __init__(
         self, path: Path, geobox: GeoBox, legend: ClassNames, *, about: Mapping[str, Any], goes_on: bool = False
     ) -> None:
-        """Create a map; one of a survey that ``goes_on`` from an earlier one has images of the changes as well."""
+        """Create a map; one of a later visit (``goes_on``) also has images of the changes."""
         place = map_attributes(geobox)
         names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
         self._group = create_group(path, "class map on the ground", {**place, **names, **about})

@@ -1,10 +1,7 @@
-"""The common layout of stored arrays: Zarr v3 codecs and chunks, bands, CF and GeoZarr attributes, rounding.
+"""Define the layout of stored arrays: Zarr v3 codecs and chunks, bands, CF and GeoZarr attributes.
 
-Chunks are 32 x 32 px with all bands, in shards of 64 rows, each with its own crc32c. One patch is one range read, and a
-flipped bit is an error instead of a wrong number. Images without bands are one chunk a shard. Codecs to choose from are
-tried in memory in the same layout.
-
-Pixels of which a scene knows nothing are taken out of stored images: no class, no value, no memory.
+Chunks are 32 x 32 px with all bands, in shards of 64 rows, each with its own crc32c. A patch is one range read, and a
+flipped bit is an error instead of a wrong number. An image without bands has one chunk in each shard.
 """
 
 from __future__ import annotations
@@ -46,13 +43,13 @@ _SPATIAL_CONVENTION = {
     "spec_url": "https://github.com/zarr-conventions/spatial/blob/v1/README.md",
     "description": "Relation of array indices to tangents of the undeflected direction; there is no CRS",
 }
-# of each kind of store: its images, and the number that stands for nothing in them
+# images of a class map, and their value for nodata
 NO_CLASS = {"classes": UNLABELLED, "confidence": np.nan}
 
 
 @dataclass(frozen=True)
 class AngularGrid:
-    """Tangents of an image's pixels from the undeflected direction, the scene's centre; and their place on earth."""
+    """The grid of an image in tangents from the undeflected direction, the scene's centre; and its place on earth."""
 
     ifov_rad: float
     scene_shape: tuple[int, int]  # (y, x) of the fine grid [px]
@@ -111,10 +108,8 @@ class ArraySpec:
 def image_spec(dims: Sequence[str], shape: Sequence[int], dtype: str, *, whole: bool = False) -> ArraySpec:
     """Return the layout of an image: rows and columns first, all bands in one chunk.
 
-    A shard has 64 rows and at most 640 columns.
-
-    It is one chunk where it is to be read ``whole``, and in images without bands: chunks of few bytes cost more calls
-    than unpacking.
+    A shard has 64 rows and at most 640 columns. It is one chunk where it is read as a ``whole``, and in images without
+    bands.
     """
     rows, columns, *rest = shape
     chunk = (min(CHUNK_PX, max(rows, 1)), min(CHUNK_PX, max(columns, 1)))
@@ -128,7 +123,7 @@ def _whole_chunks(size: int, chunk: int) -> int:
 
 
 def tile_place(what: str, origin: Sequence[int], size: Sequence[int], array: zarr.Array[Any]) -> tuple[slice, slice]:
-    """Return the rows and columns of an image that a tile of (y, x) ``size`` takes from ``origin`` on.
+    """Return the rows and columns of a tile of (y, x) ``size`` at ``origin`` of an image.
 
     Raises ChunkError: they split a shard of the image, or reach beyond it.
     """
@@ -153,10 +148,10 @@ def create_array(
     packing: Packing = PACKING,
     flat: bool = False,
 ) -> zarr.Array[Any]:
-    """Add an empty array: NaN where floating; ``_FillValue``, ``nodata`` or 0 where not; checksums come last.
+    """Add an empty array, filled with NaN where floating, else with ``_FillValue``, ``nodata`` or 0.
 
-    ``packing`` is blosc's codec and its level. Most pixels of a ``flat`` image, such as a map, are like their
-    neighbours. Its bytes are packed whole, channel after channel, and its files lie in one folder.
+    ``packing`` is blosc's codec and its level. Most pixels of a ``flat`` image, such as a map, equal their neighbours.
+    Its bytes are packed channel after channel, and its files lie in one folder.
     """
     kind, (codec, level) = np.dtype(spec.dtype), packing
     shuffle = BloscShuffle.shuffle if flat else BloscShuffle.bitshuffle
@@ -202,7 +197,7 @@ def write_image(
 
 
 def write_bands(group: zarr.Group, wavelength_nm: NDArray[np.float64], fwhm_nm: NDArray[np.float64] | None) -> str:
-    """Store the coordinates of ``band`` and give their names for a ``coordinates`` attribute."""
+    """Store the coordinates of ``band`` and return their names for a ``coordinates`` attribute."""
     centre = np.asarray(wavelength_nm, np.float64)
     about = {"standard_name": "radiation_wavelength", "long_name": "wavelength at the band's centre", "units": "nm"}
     write_small(group, "wavelength", ("band",), centre, about)
@@ -220,10 +215,7 @@ _FILTERING = Lock()
 
 
 def consolidate_stores(folder: Path) -> None:
-    """Put the metadata of all arrays of each store in a folder together, so that it opens at once and without a word.
-
-    After this nothing may be written to the stores' attributes.
-    """
+    """Consolidate the metadata of each store in a folder; afterwards the stores' attributes may not change."""
     for path in sorted(folder.glob("*.zarr")):
         if (path / "zarr.json").is_file():
             with _FILTERING, warnings.catch_warnings():  # filters are of the process, not of a thread
@@ -263,7 +255,7 @@ def read_bands(group: zarr.Group) -> tuple[NDArray[np.float64], NDArray[np.float
 
 @contextmanager
 def damage_named(where: str) -> Iterator[None]:
-    """Turn what decoders raise on damaged bytes into an IncompleteStoreError that names the array."""
+    """Turn the errors of decoders on damaged bytes into an IncompleteStoreError that names the array."""
     try:
         yield
     except (OSError, ValueError, KeyError, TypeError, RuntimeError, IndexError) as error:
@@ -271,7 +263,7 @@ def damage_named(where: str) -> Iterator[None]:
 
 
 def numbers_in_memory(values: NDArray[Any]) -> tuple[int, zarr.Array[Any]]:
-    """Store whole numbers (line, sample, band) in memory, in chunks of raw lines; the bytes taken, and the array."""
+    """Store integers (line, sample, band) in memory, in chunks of raw lines; return the bytes and the array."""
     held: dict[str, Any] = {}
     group = zarr.create_group(MemoryStore(store_dict=held), zarr_format=3)
     spec = image_spec(("line", "sample", "band"), values.shape, values.dtype.str)
@@ -281,12 +273,12 @@ def numbers_in_memory(values: NDArray[Any]) -> tuple[int, zarr.Array[Any]]:
 
 
 def bytes_held(held: Mapping[str, Any], *names: str) -> int:
-    """Return the bytes that some arrays of a store take in memory, without their metadata."""
+    """Return the bytes of some arrays of a store in memory, without metadata."""
     return sum(len(part) for key, part in held.items() if key.split("/")[0] in names and not key.endswith("zarr.json"))
 
 
 def blank_pixels(path: Path, where: NDArray[np.bool_], images: Mapping[str, float]) -> None:
-    """Write nothing into the (y, x) pixels ``where`` of a store's images, one shard at a time.
+    """Set the (y, x) pixels ``where`` of a store's images to their nodata value, one shard at a time.
 
     Raises IncompleteStoreError: an image is missing or damaged.
     """

@@ -1,4 +1,4 @@
-"""The mosaic: scores of a field's pixels, (component, y, x) on the scene grid; and the scores that chose patches."""
+"""Store mosaics, scores (component, y, x) on the scene grid; and attention, the scores by which patches are chosen."""
 
 from __future__ import annotations
 
@@ -34,7 +34,6 @@ from storage.arrays.layout import (
 )
 from storage.arrays.signal_cubes import (
     LARGEST_SHORT,
-    check_condensed,
     read_components,
     score_spec,
     step_of,
@@ -44,11 +43,11 @@ from storage.arrays.signal_cubes import (
 from storage.parallel.pool import WorkerPool, run_blocks
 
 CAPTURES = "capture"  # array of a mosaic whose pixels were captured in several ways
-HALF = 0.5  # of a pixel's finer ones: of fewer seen it has no value
+HALF = 0.5  # least fraction of its finer pixels with which a pixel has a value
 
 
 class MosaicWriter:
-    """Write scores of a field's pixels in tiles of whole shards, so that they never have to be in memory together."""
+    """Write a mosaic in tiles of whole shards, so that it need not fit into memory."""
 
     def __init__(
         self,
@@ -63,7 +62,7 @@ class MosaicWriter:
         grid: AngularGrid | None = None,
         simulation: Mapping[str, Any] | None = None,
     ) -> None:
-        """Create a mosaic of (y, x) ``shape``; ``largest`` is the greatest size of a score."""
+        """Create a mosaic of (y, x) ``shape``; ``largest`` is the greatest absolute score."""
         simulated = {} if simulation is None else {"simulation": dict(simulation)}
         self.path = path
         self.group, place = create_placed_group(path, "mosaic", grid, shape, simulated)
@@ -79,9 +78,9 @@ class MosaicWriter:
 
     @classmethod
     def reopen(cls, path: Path) -> MosaicWriter:
-        """Continue a mosaic that another writer has begun, in this process or another.
+        """Return a writer for a mosaic that was created before, in this process or another.
 
-        Raises IncompleteStoreError: no mosaic has been begun there.
+        Raises IncompleteStoreError: there is no mosaic.
         """
         writer = cls.__new__(cls)
         writer.path, writer.group = path, open_group(path, "r+")
@@ -91,7 +90,7 @@ class MosaicWriter:
 
     @property
     def tile_shape(self) -> tuple[int, int]:
-        """(y, x) of a shard, the least that can be written by itself: 64 rows of at most 640 columns."""
+        """(y, x) size of a shard: 64 rows of at most 640 columns."""
         _, rows, columns = self._scores.shards or self._scores.chunks
         return rows, columns
 
@@ -108,7 +107,7 @@ class MosaicWriter:
         coverage are not of one tile.
         """
         count = self._scores.shape[0]
-        if scores.shape != (*coverage.shape, count):  # Zarr would repeat what is too little
+        if scores.shape != (*coverage.shape, count):  # Zarr would broadcast a smaller tile
             raise ShapeError(f"a tile of the mosaic has the shape {scores.shape}, expected {(*coverage.shape, count)}")
         rows, columns = tile_place("the mosaic", (first_row, first_column), coverage.shape, self._coverage)
         seen = coverage > 0
@@ -120,7 +119,7 @@ class MosaicWriter:
         self._coverage[rows, columns] = np.where(seen, coverage, 0).astype(np.uint8)
 
     def write_rows(self, first: int, scores: NDArray[np.floating], seen: NDArray[np.bool_]) -> None:
-        """Store whole rows of scores (y, x, component) from a row on, a multiple of 64, and which (y, x) were seen."""
+        """Store rows of scores (y, x, component) and of the mask ``seen`` (y, x); ``first`` is a multiple of 64."""
         deep, wide = self.tile_shape
         for top in range(0, len(scores), deep):
             for left in range(0, scores.shape[1], wide):
@@ -128,7 +127,7 @@ class MosaicWriter:
                 self.write_tile(first + top, left, scores[part], seen[part])
 
     def write_captures(self, specs: Sequence[Sequence[float]], number: NDArray[np.uint8]) -> None:
-        """Store how each pixel was captured: ``number`` (y, x) counts the ``specs``, numbers of the network's input."""
+        """Store the kind of capture of each pixel: ``number`` (y, x) is an index into ``specs``."""
         about = {"long_name": "kind of capture", "units": "1", "kinds": [list(one) for one in specs]}
         write_image(self.group, CAPTURES, ("y", "x"), number, about)
 
@@ -155,9 +154,9 @@ def write_tiles(
     paths: Sequence[Path] = (),
     report: Callable[[float], None] = lambda done: None,
 ) -> None:
-    """Store what ``make`` gives for the rows and columns of ``places``, each in a task of its own.
+    """Store the tiles that ``make`` returns for the rows and columns of ``places``, one task for each.
 
-    Any worker's tiles give the same bytes. See `run_blocks` for what is raised.
+    Every worker gives the same bytes. Raises as `run_blocks`.
     """
     task = _TileTask(make, writer.path.absolute())
     if pool.shares_memory:
@@ -168,7 +167,7 @@ def write_tiles(
 
 @dataclass(frozen=True)
 class _TileTask:
-    """Makes and stores a tile in any process: a shard of its own, whose files nothing else touches."""
+    """Make and store a tile in any process; a shard's files are written by one task alone."""
 
     make: MakeTile
     out: Path  # the mosaic, begun
@@ -186,7 +185,7 @@ def _reopened(path: Path) -> MosaicWriter:
 
 @dataclass(frozen=True)
 class Mosaic:
-    """A stored mosaic, opened: scores of a field's pixels, read when asked for, and the law that gives spectra."""
+    """A stored mosaic, opened: scores are read on request, components give the spectra."""
 
     group: zarr.Group
     components: Components
@@ -203,7 +202,7 @@ class Mosaic:
 
     @property
     def factor(self) -> int:
-        """Pixels of the fine grid to a side of its own."""
+        """Side of a pixel in pixels of the fine grid."""
         return 1 if self.grid is None else self.grid.factor
 
     def scores(self, rows: slice = slice(None), columns: slice = slice(None)) -> NDArray[np.float32]:
@@ -218,7 +217,7 @@ class Mosaic:
         return found
 
     def coverage(self, rows: slice = slice(None), columns: slice = slice(None)) -> NDArray[np.uint8]:
-        """Count the sweeps that saw some pixels, (y, x)."""
+        """Return the number of sweeps that saw each pixel, (y, x)."""
         return read_array(self.group, "coverage", (rows, columns))
 
     def captures(
@@ -250,7 +249,7 @@ class Mosaic:
         return (self.components if bands is None else self.components.of_bands(bands)).restore(scores)
 
     def rows(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
-        """Yield the number of the first row and scene values (y, x, band), as many rows at a time as a shard has."""
+        """Yield the number of the first row and the scene values (y, x, band) of each row of shards."""
         for first in range(0, self.shape[0], SHARD_ROWS):
             yield first, self.values(slice(first, min(first + SHARD_ROWS, self.shape[0])))
 
@@ -277,10 +276,11 @@ class Mosaic:
     def row_blocks(
         self, factor: int | None = None, rows: slice = slice(None), columns: slice = slice(None)
     ) -> Iterator[NDArray[np.float32]]:
-        """Yield the scores of a window from the top down, (y, x, component), that end where shards do.
+        """Yield the scores of a window, (y, x, component), from the top down in blocks that end at shards.
 
-        ``factor`` is the side of the wanted pixels in fine ones, a multiple of the store's own. Such pixels are means
-        of the captured ones, NaN where fewer than half are. Rows and columns count such pixels. None: its own pixels.
+        ``factor`` is the side of the returned pixels in fine ones, a multiple of the store's own; None: its own pixels.
+        Larger pixels are means of the captured ones, NaN where fewer than half are. Rows and columns count returned
+        pixels.
         """
         times = 1 if factor is None else factor // self.factor
         (first, last, _), (left, right, _) = (
@@ -300,16 +300,15 @@ class Mosaic:
 
 
 def open_mosaic(path: Path) -> Mosaic:
-    """Open a mosaic. Raises IncompleteStoreError where it is missing, damaged or of an earlier version."""
+    """Open a mosaic. Raises IncompleteStoreError where it is missing or damaged."""
     group = open_group(path)
-    check_condensed(group, path)
     wavelength, fwhm = read_bands(group)
     return Mosaic(group, read_components(group), step_of(group), wavelength, fwhm, grid_of(dict(group.attrs)))
 
 
 @dataclass(frozen=True)
 class Attention:
-    """Scores of all patches, the order in which patches were chosen, and what the full network changed there."""
+    """Scores of all patches, the order in which they were chosen, and the changes by the full network."""
 
     score: NDArray[np.float64]  # (patch_y, patch_x), NaN where there is none
     rank: NDArray[np.int32]  # (patch_y, patch_x), 0 = chosen first, -1 = not chosen

@@ -1,12 +1,11 @@
-"""Quicklooks: a small picture stored beside every cube, which need not be read to show it.
+"""Store a small picture beside every cube, so that it can be shown without reading the cube.
 
 ::
 
     <cube>.zarr/quicklook     (y, x, 3) uint8: every 4th line and sample, three bands, 2-98 % of each; 0 where missing
 
-It is gathered while lines are written, from three bands of those lines alone. Attributes name the bands, the step
-between pixels, and the values that 0 and 255 stand for. All three bands have one scale where frames make scene values
-of them and they are near red, green and blue, else one each.
+The picture is made while lines are written. Its attributes have the bands, the step between pixels, and the values of
+0 and 255. True colours have one scale for all bands, false colours one for each.
 """
 
 from __future__ import annotations
@@ -25,15 +24,15 @@ DIMS = ("quicklook_y", "quicklook_x", "rgb")
 STEP, LEAST_PX, MOST_PX = 4, 128, 1024  # of the longer side; small cubes are thinned less
 RGB_NM = (640.0, 550.0, 460.0)
 FAR_NM = 60.0
-MID_GREY = 0.42  # to which a photograph's median is lifted
+MID_GREY = 0.42  # of the median of a picture
 
 Kind = Literal["true colour", "false colour", "grey", "by number"]
 
 
 def picture_bands(wavelength_nm: NDArray[np.floating] | None, count: int) -> tuple[tuple[int, int, int], Kind]:
-    """Return the bands to show as red, green and blue: those nearest 640, 550 and 460 nm, where they are near.
+    """Return the bands to show as red, green and blue: those nearest to 640, 550 and 460 nm, if within 60 nm.
 
-    Else the longest, the middle and the shortest wavelength; without wavelengths at 3, 2 and 1 quarters of ``count``.
+    Otherwise the longest, middle and shortest wavelength; without wavelengths the bands at 3/4, 2/4 and 1/4.
     """
     if wavelength_nm is None or not np.isfinite(wavelength_nm).all():
         red, green, blue = ((count - 1) * fraction // 4 for fraction in (3, 2, 1))
@@ -71,7 +70,7 @@ def picture_step(shape: tuple[int, ...]) -> int:
 
 @dataclass(frozen=True)
 class Quicklook:
-    """A picture and what it stands for. ``low`` and ``high`` are the values of 0 and 255; empty where not known."""
+    """A picture with its scale: ``low`` and ``high`` are the values of 0 and 255; empty where not known."""
 
     image: NDArray[np.uint8]  # (y, x, 3)
     low: tuple[float, ...] = ()  # (3,)
@@ -80,7 +79,7 @@ class Quicklook:
     bands: tuple[int, ...] = ()  # (3,) of the cube
 
     def values(self) -> NDArray[np.float32]:
-        """Return the cube's values, (y, x, 3), as far as 8 bits between ``low`` and ``high`` hold them."""
+        """Return the cube's values, (y, x, 3), to 8 bits between ``low`` and ``high``."""
         low, high = (np.array(ends, np.float32) for ends in (self.low, self.high))
         values: NDArray[np.float32] = low + self.image.astype(np.float32) / np.float32(255) * (high - low)
         return values
@@ -91,8 +90,7 @@ def stretched(
 ) -> Quicklook:
     """Return the 2nd to 98th percentile of each band as 0..255, (y, x, band) in and out.
 
-    Values that are not finite become 0. ``together`` gives all bands one scale, from the least to the greatest of
-    these: colours stay true.
+    Values that are not finite become 0. ``together`` gives all bands one scale, so that colours are true.
     """
     ends = np.array([_ends(image[..., band]) for band in range(image.shape[-1])])
     low, high = (ends[:, 0], ends[:, 1])
@@ -132,10 +130,7 @@ def stretch(image: NDArray[np.generic]) -> NDArray[np.float32]:
 
 
 def develop(image: NDArray[np.generic], field: NDArray[np.generic]) -> NDArray[np.float32]:
-    """Return the scene values as a photograph, (y, x, 3) float32 0..1.
-
-    All bands have one scale, so that colours stay true.
-    """
+    """Return scene values as a picture (y, x, 3) float32 0..1 in true colours, with one scale for all bands."""
     known = np.asarray(field, np.float32)
     known = known[np.isfinite(known)]
     if not known.size or not (white := float(np.percentile(known, 99))) > 0:
@@ -147,7 +142,7 @@ def develop(image: NDArray[np.generic], field: NDArray[np.generic]) -> NDArray[n
 
 
 class LineThumbnail:
-    """Every n-th line and sample of three bands, gathered as lines pass, over the white reference where it is known."""
+    """Collect every n-th line and sample of three bands, in values of the white reference where it is known."""
 
     def __init__(
         self,
@@ -172,7 +167,7 @@ class LineThumbnail:
         self._rows: list[NDArray[np.float32]] = []
 
     def add(self, start: int, lines: NDArray[Any], valid: NDArray[np.bool_]) -> None:
-        """Take what it needs of (line, sample, band) ``lines`` from line ``start`` on; those not valid become black."""
+        """Add the (line, sample, band) ``lines`` from line ``start`` on; invalid ones become black."""
         rows = slice(-start % self._step, None, self._step)
         part = np.asarray(lines[rows, :: self._step][..., list(self._bands)], np.float32)
         if self._frames is not None:
@@ -196,7 +191,7 @@ def write_quicklook(group: zarr.Group, found: Quicklook) -> None:
 
 
 def quicklook_of(group: zarr.Group) -> Quicklook | None:
-    """Return the picture of an opened cube or mosaic, None where it has none. The cube is not read.
+    """Return the picture of an opened cube or mosaic; None without one.
 
     Raises IncompleteStoreError: the picture is damaged.
     """

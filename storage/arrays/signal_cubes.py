@@ -1,11 +1,11 @@
-"""A condensed sweep: scores of every spectrum, (component, line, sample), and all that gives its raw lines back.
+"""Store condensed sweeps: scores of every spectrum (component, line, sample), and the data that restore raw lines.
 
     spectrum = scores * step @ axes + mean          # axes in the unit of scene values
 
 Any Zarr v3 reader opens the arrays ``scores`` (``scale_factor`` is the step), ``axes``, ``mean`` and ``noise``.
-``quality`` says of a spectrum whether all bands were seen (0), some were restored from the others (1) or less than half
-were seen (2). ``rare_*`` hold the residuals of spectra that components do not hold. Dark and white frames are those of
-the sweep, so that a later calibration can take their place.
+``quality`` of a spectrum is 0 where all bands were seen and 1 where some were restored from the others. It is 2 where
+less than half were seen. ``rare_*`` are the residuals of spectra that the components do not represent. The dark and
+white frames of the sweep are stored for a later calibration.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ import zarr
 from numpy.typing import NDArray
 from zarr.storage import MemoryStore
 
-from pipeline.errors import OldStoreError
 from pipeline.geometry.mirror import mirror_throughput
 from pipeline.signal.calibrate import judge_elements
 from pipeline.signal.components import Components
@@ -54,10 +53,9 @@ from storage.arrays.layout import (
 )
 from storage.arrays.quicklooks import Quicklook, write_quicklook
 
-CHUNK = 64  # lines and samples of a chunk of scores, all components of them: what lies together packs together
+CHUNK = 64  # lines and samples of a chunk of scores, with all components
 SHARD_SAMPLES = 640
 FRAMES_OF = "frames_of"  # attribute: the sweep beside it that holds the dark and white frames of both
-REPROCESS = "`spectralzoom reprocess ARCHIVE` makes its run anew"
 MOST_DN = np.iinfo(np.uint16).max
 SIGNAL_ARRAYS = ("scores", "quality", "axes", "mean", "noise", "rare_line", "rare_sample", "rare_residual")
 LARGEST_SHORT = 32_000  # of scores and residuals in steps; larger ones are stored in 32 bits
@@ -69,7 +67,7 @@ def _kind(largest: float) -> str:
 
 @dataclass(frozen=True)
 class LineRows:
-    """Facts of every line beside its light, (line,) each."""
+    """Facts of every line, (line,) each."""
 
     time_s: NDArray[np.float64]
     mirror_x: NDArray[np.float64]
@@ -78,13 +76,13 @@ class LineRows:
     valid: NDArray[np.bool_]
 
     def rows(self) -> list[tuple[float, float, float, float, bool]]:
-        """Return them line by line."""
+        """Return the facts of each line as a tuple."""
         columns = (self.time_s, self.mirror_x, self.mirror_y, self.exposure_ms, self.valid)
         return list(zip(*(column.tolist() for column in columns), strict=True))
 
 
 def score_spec(dims: tuple[str, str, str], shape: tuple[int, int, int], largest: float) -> ArraySpec:
-    """Return the layout of scores (component, row, column), whose size in steps is at most ``largest``."""
+    """Return the layout of scores (component, row, column) of at most ``largest`` steps."""
     count, rows, columns = shape
     chunk = (max(count, 1), min(CHUNK, max(rows, 1)), min(CHUNK, max(columns, 1)))
     whole = (
@@ -95,14 +93,14 @@ def score_spec(dims: tuple[str, str, str], shape: tuple[int, int, int], largest:
 
 
 def steps_within(scores: NDArray[np.floating], step: float, kind: np.dtype[Any]) -> NDArray[np.floating]:
-    """Return scores in whole steps, at most what a type of integers holds: few bands may tell a component badly."""
+    """Return scores in whole steps, clipped to the range of an integer type."""
     most = np.iinfo(kind).max & ~127  # a float32
     steps: NDArray[np.floating] = np.clip(whole_steps(scores, step), -most, most)
     return steps
 
 
 def write_components(group: zarr.Group, components: Components) -> None:
-    """Store the linear law that gives spectra back."""
+    """Store the components that restore spectra."""
     about = {"coordinates": "wavelength", "units": "1"}
     rows = components.axes * np.nan_to_num(components.noise)
     write_small(group, "axes", ("component", "band"), rows, {"long_name": "scene value of a score of 1", **about})
@@ -137,7 +135,7 @@ class SignalCubeWriter:
         largest: float,
         frames_of: str | None = None,
     ) -> None:
-        """Create a sweep; ``largest`` is the greatest size of a score, ``frames_of`` a sweep with the same frames."""
+        """Create a sweep; ``largest`` is the greatest absolute score, ``frames_of`` a sweep with the same frames."""
         lines, samples, _ = header.shape
         self._header, self._step = header, step
         facts: dict[str, Any] = {"sweep": asdict(header.sweep), "source": header.source}
@@ -171,7 +169,7 @@ class SignalCubeWriter:
     def close(
         self, facts: LineRows, rare: NDArray[np.intp], residuals: NDArray[np.int32], picture: Quicklook | None
     ) -> None:
-        """Store quality, what is known of lines, and (rare, 2) lines and samples with (rare, band) residual steps."""
+        """Store quality, facts of lines, and (rare, 2) lines and samples with (rare, band) residual steps."""
         self._quality[...] = self._seen
         write_line_facts(self.group, facts.rows(), self._header.started)
         for name, column in (("rare_line", 0), ("rare_sample", 1)):
@@ -189,11 +187,11 @@ class SignalCubeWriter:
 
 @dataclass(frozen=True)
 class SignalCube(StoredSweep):
-    """A condensed sweep, opened. Scores are read when asked for."""
+    """A condensed sweep, opened. Scores are read on request."""
 
     components: Components
     step: float
-    largest: float  # size that no score exceeds
+    largest: float  # greatest absolute score
     path: Path | None  # None: in memory
 
     @cached_property
@@ -253,24 +251,15 @@ class SignalCube(StoredSweep):
         return values
 
 
-def check_condensed(group: zarr.Group, path: StorePlace) -> None:
-    """Refuse a store of spectra that an earlier version wrote band by band (OldStoreError)."""
-    if "scores" not in group and "values" in group:
-        raise OldStoreError(f"{path} holds spectra band by band, as earlier versions stored them; {REPROCESS}")
-
-
 def step_of(group: zarr.Group, said: str = "scale_factor") -> float:
-    """Return a step of the scores of a store, or another number that they say (IncompleteStoreError: damaged)."""
+    """Return the step of a store's scores, or another numeric attribute (IncompleteStoreError: damaged)."""
     scores = array_of(group, "scores")
     with damage_named(str(group.store_path)):
         return float(scores.attrs[said])  # type: ignore[arg-type]
 
 
 def score_layout(group: zarr.Group) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Return the rows and columns of a store of scores, and of one of its files.
-
-    Raises IncompleteStoreError: it is damaged.
-    """
+    """Return the rows and columns of scores, and of a shard of them (IncompleteStoreError: damaged)."""
     scores = array_of(group, "scores")
     (_, rows, columns), (_, deep, wide) = scores.shape, scores.shards or scores.chunks
     return (rows, columns), (deep, wide)
@@ -279,7 +268,7 @@ def score_layout(group: zarr.Group) -> tuple[tuple[int, int], tuple[int, int]]:
 def read_coordinates(
     group: zarr.Group, names: Sequence[str]
 ) -> dict[str, tuple[tuple[str, ...], NDArray[Any], dict[str, Any]]]:
-    """Read dimensions, values and attributes of those of some arrays that are there (IncompleteStoreError: damaged)."""
+    """Read dimensions, values and attributes of the named arrays that exist (IncompleteStoreError: damaged)."""
     with damage_named(str(group.store_path)):
         there = {name: one for name, one in group.arrays() if name in names}
     dims = {name: getattr(one.metadata, "dimension_names", None) or () for name, one in there.items()}
@@ -287,12 +276,8 @@ def read_coordinates(
 
 
 def open_signal_cube(path: StorePlace) -> SignalCube:
-    """Open a condensed sweep.
-
-    Raises IncompleteStoreError: there is none, it was not closed, it is damaged, or of an earlier version.
-    """
+    """Open a condensed sweep. Raises IncompleteStoreError: there is none, it was not closed, or it is damaged."""
     group = open_group(path)
-    check_condensed(group, path)
     return SignalCube(
         **read_line_facts(group, path),
         components=read_components(group),
@@ -309,9 +294,9 @@ def open_signal_cubes(folder: Path) -> list[SignalCube]:
 
 @dataclass(frozen=True)
 class RestoredCube(RawCube):
-    """Raw lines as their components give them back: their signal, rounded to whole numbers; the noise is gone.
+    """Raw lines restored from their components: the signal in whole numbers, without noise.
 
-    Unusable numbers come back as the largest number, which counts as saturated.
+    Unusable values become the largest number, which counts as saturated.
     """
 
     signal: SignalCube
@@ -336,7 +321,7 @@ class RestoredCube(RawCube):
 
 
 def open_lines(path: Path) -> RawCube:
-    """Open a sweep as raw lines, whether it was stored as such or condensed; raises as `open_raw_cube`."""
+    """Open a raw or condensed sweep as raw lines; raises as `open_raw_cube`."""
     if "dn" in open_group(path):
         return open_raw_cube(path)
     one = open_signal_cube(path)
@@ -345,7 +330,7 @@ def open_lines(path: Path) -> RawCube:
 
 
 class SignalCubeInMemory:
-    """A condensed sweep that is written to memory, by the writer of files and read by their reader."""
+    """A condensed sweep in memory, written and read like a stored one."""
 
     def __init__(self, header: SweepHeader, components: Components, *, step: float, largest: float) -> None:
         self._held: dict[str, Any] = {}
@@ -354,7 +339,7 @@ class SignalCubeInMemory:
 
     @property
     def size(self) -> int:
-        """Bytes of the signal: scores, their law and rare spectra, without what stores of raw lines hold as well."""
+        """Bytes of the signal: scores, components and rare spectra, without frames and facts of lines."""
         return bytes_held(self._held, *SIGNAL_ARRAYS)
 
     def open(self) -> SignalCube:

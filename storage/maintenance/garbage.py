@@ -1,6 +1,6 @@
-"""Clearing an archive up: what no run names goes, what a run names or rests on never does.
+"""Remove from an archive the stores that no run names or needs, and leftovers of dead processes.
 
-Stores go before those that they were made of, each in one step, so that an archive is whole wherever this is killed.
+Stores are removed before their inputs, each in one step, so that the archive stays valid wherever this is killed.
 """
 
 from __future__ import annotations
@@ -30,12 +30,14 @@ from storage.archive.staging import (
 
 DAY_S = 86400.0
 IN_USE = "the archive is in use: run gc again when it is free"
-What = Literal["store", "files", "spool", "unfinished", "upload"]  # files: raw lines of a run, by its setting `keep`
+What = Literal[
+    "store", "files", "spool", "unfinished", "upload"
+]  # files: raw lines that the setting `keep` of a run does not keep
 
 
 @dataclass(frozen=True)
 class Removal:
-    """Something that can go: its address, what it is, its size [bytes] and why."""
+    """Something that can be removed: its address, kind, size [bytes] and the reason."""
 
     uri: str
     what: What
@@ -45,11 +47,11 @@ class Removal:
 
 @dataclass(frozen=True)
 class Clearance:
-    """Things that can be removed, in that order."""
+    """Things that can be removed, in this order."""
 
     removals: tuple[Removal, ...]
-    kept: dict[str, str]  # what no run names and stays nevertheless, with the reason
-    obstacle: str | None  # why no store goes
+    kept: dict[str, str]  # stores that no run names and that stay, with the reason
+    obstacle: str | None  # why no store is removed
 
     @property
     def size(self) -> int:
@@ -65,7 +67,7 @@ def clear_up(
     dry_run: bool = False,
     progress: Callable[[Removal, float], None] | None = None,
 ) -> Clearance:
-    """Remove what `plan_clearance` finds; what another process holds stays, and is not among the removals given.
+    """Remove what `plan_clearance` finds, except what another process holds; return what was removed.
 
     Raises ArchiveError: the disk refuses.
     """
@@ -91,10 +93,10 @@ def clear_up(
 
 
 def plan_clearance(archive: Archive, *, keep_days: float = 1.0, raw_too: bool = False) -> Clearance:
-    """Find what can go: stores that no run names, spools of published captures, and what a dead process left.
+    """Find stores that no run names, spools of published captures, and leftovers of dead processes.
 
-    Stores younger than ``keep_days`` stay, and so does what they rest on: a survey may be about to name them.
-    ``raw_too`` also takes raw lines of a rig (or that were ingested) that no run names; they cannot be had again.
+    Stores younger than ``keep_days`` stay with their inputs: a running survey may name them. ``raw_too`` also takes raw
+    lines of a rig or ingested ones that no run names; they cannot be captured again.
     Raises SettingsError: ``keep_days`` is negative or no number.
     """
     if not (math.isfinite(keep_days) and keep_days >= 0):
@@ -104,7 +106,7 @@ def plan_clearance(archive: Archive, *, keep_days: float = 1.0, raw_too: bool = 
     moment = archive.now()
     spared = _spared(catalogue, named, keep_days, raw_too, moment)
     below = catalogue.ancestors(spared) & set(catalogue.stores) - named
-    kept = dict.fromkeys(below, "what stays was made of it") | spared
+    kept = dict.fromkeys(below, "an input of a store that stays") | spared
     obstacle = _obstacle(archive, catalogue, named | set(kept))
     gone = [] if obstacle else [uri for uri in catalogue.stores if uri not in named and uri not in kept]
     removals = [
@@ -123,7 +125,7 @@ def plan_clearance(archive: Archive, *, keep_days: float = 1.0, raw_too: bool = 
 
 
 def _spared(catalogue: Catalogue, named: set[str], keep_days: float, raw_too: bool, now: datetime) -> dict[str, str]:
-    """Return the stores that no run names and that are kept all the same, with the reason."""
+    """Return the stores that no run names and that stay, with the reason."""
     kept: dict[str, str] = {}
     for uri, store in catalogue.stores.items():
         if uri in named:
@@ -132,40 +134,37 @@ def _spared(catalogue: Catalogue, named: set[str], keep_days: float, raw_too: bo
             kept[uri] = f"younger than {keep_days:g} days"
         elif not raw_too and catalogue.is_only_copy(uri):
             kept[uri] = "raw lines that cannot be had again; --raw-too removes them"
-    # Stores made of them are younger still: by its dates it can be older only where the clock was set back.
+    # A store made of a young one is young too: its date is older only where the clock was set back.
     younger = [uri for uri, store in catalogue.stores.items() if _age_days(store, now) < keep_days]
     for uri in catalogue.dependents(younger) - named:
-        kept.setdefault(uri, f"made of what is younger than {keep_days:g} days")
+        kept.setdefault(uri, f"made of a store younger than {keep_days:g} days")
     return kept
 
 
 def _age_days(store: Store, now: datetime) -> float:
-    """Return the days since a store was made or copied, by the later of both clocks; negative where one runs ahead."""
+    """Return the days since a store was made or copied, whichever is later."""
     made = (store.ref.path / MANIFEST_NAME).lstat().st_mtime
     try:
         created = datetime.fromisoformat(store.created)
         made = max(made, (created if created.tzinfo else created.replace(tzinfo=UTC)).timestamp())
     except (ValueError, OverflowError):
-        pass  # damaged, or of another time: the file's own date stands
+        pass  # damaged: the date of the file counts
     return (now.timestamp() - made) / DAY_S
 
 
 def _obstacle(archive: Archive, catalogue: Catalogue, staying: set[str]) -> str | None:
-    """Return why no store may be removed; None where stores may be.
-
-    A damaged or missing receipt or manifest is an obstacle where it would name stores to keep.
-    """
+    """Return why no store may be removed: a damaged receipt or manifest may name stores to keep; else None."""
     for uri in archive.lost_runs():
-        return f"no store is removed: {uri} has lost its {MANIFEST_NAME} and does not tell what it names"
+        return f"no store is removed: {uri} has lost its {MANIFEST_NAME}, so that its stores are not known"
     for run in catalogue.runs:
         if run.problem is not None and not run.recorded:
-            return f"no store is removed: {run.uri} does not tell what it rests on ({run.problem})"
+            return f"no store is removed: the stores of {run.uri} are not known ({run.problem})"
     told = set[str]().union(*(run.recorded for run in catalogue.runs))  # with all that these were made of
     for uri in sorted(staying - told):
         store = catalogue.stores.get(uri)
         problem = "it is not there" if store is None else store.problem
         if problem is not None:
-            return f"no store is removed: {uri} does not tell what it was made of ({problem}); run verify --repair"
+            return f"no store is removed: the inputs of {uri} are not known ({problem}); run verify --repair"
     return None
 
 
@@ -190,7 +189,7 @@ def _lock_of(root: Path, uri: str, what: What) -> Path:
 
 
 def _remove(archive: Archive, removal: Removal) -> bool:
-    """Take one thing away; False where another process holds it."""
+    """Remove one thing; False where another process holds it."""
     path = archive.root / removal.uri
     if removal.what == "store":
         return archive.discard(StageRef(path.parent.name, path.name, path), wait=False, unnamed=True)
@@ -206,4 +205,4 @@ def _remove(archive: Archive, removal: Removal) -> bool:
         remove_tree(path)
     finally:
         release()
-    return not path.exists()  # what does not let itself be removed is not gone
+    return not path.exists()  # the disk may have refused

@@ -1,7 +1,6 @@
-"""Making an archive whole again: what is broken is named, taken away, and made anew by the surveys that name it.
+"""Repair an archive: remove damaged stores, and run the surveys again that name them.
 
-Raw lines of a rig cannot be made anew, nor can stores of a former version of a stage: they stay as they are. Stores in
-a bucket that this machine's working copy has whole are uploaded again.
+Raw lines of a rig cannot be made again, nor can stores of another version of a stage: they stay.
 """
 
 from __future__ import annotations
@@ -22,37 +21,37 @@ Rerun = Callable[[dict[str, Any]], None]  # settings of a survey: runs and publi
 
 @dataclass(frozen=True)
 class RepairPlan:
-    """Steps of a repair. Addresses are relative to the archive, of stores with those that they were made of last."""
+    """Steps of a repair, with addresses relative to the archive; inputs come after the stores made of them."""
 
-    remade: tuple[str, ...]  # broken or missing stores
-    hopeless: dict[str, str]  # broken and left as they are, with the reason
-    surveys: tuple[tuple[Run, dict[str, Any]], ...]  # one run for each different settings, and these
+    remade: tuple[str, ...]  # damaged or missing stores
+    hopeless: dict[str, str]  # damaged stores that stay, with the reason
+    surveys: tuple[tuple[Run, dict[str, Any]], ...]  # a run for each different settings, and the settings
     broken_runs: dict[str, str]  # run folders that are damaged -> canonical settings, empty where not known
 
 
 @dataclass
 class Repaired:
-    """Outcome of a repair."""
+    """Result of a repair."""
 
     plan: RepairPlan
     remade: list[str] = field(default_factory=list)
-    dropped: list[str] = field(default_factory=list)  # broken, and no run named it
+    dropped: list[str] = field(default_factory=list)  # damaged stores that no run named
     failed: dict[str, str] = field(default_factory=dict)  # run or store that was not made again -> message
 
     @property
     def complete(self) -> bool:
-        """Return whether nothing broken is left."""
+        """Return whether no damage is left."""
         return not (self.plan.hopeless or self.failed)
 
 
 def plan_repair(
     archive: Archive, findings: Iterable[Finding], *, versions: Mapping[str, int | str] | None = None
 ) -> RepairPlan:
-    """Return the repairs for these findings; ``versions`` are those that the stages have now."""
+    """Return the repairs for these findings; ``versions`` are the present ones of the stages."""
     catalogue = Catalogue.read(archive.root)
     bad = [one.uri for one in findings if one.kind in ("broken", "missing")]
     stores = [uri for uri in bad if uri.startswith("stages/") and uri.count("/") == 2]
-    hopeless = dict.fromkeys((uri for uri in bad if "/" not in uri), "nothing tells what it was or how to make it")
+    hopeless = dict.fromkeys((uri for uri in bad if "/" not in uri), "its stage and settings are not known")
     hopeless |= {uri: why for uri in stores if (why := _hopeless(catalogue, uri, versions))}
     broken = set(stores) - set(hopeless)
     ordered = [uri for uri in reversed(catalogue.inputs_first(broken)) if uri in catalogue.stores]
@@ -67,19 +66,17 @@ def plan_repair(
 def repair(
     archive: Archive, findings: Iterable[Finding], rerun: Rerun, *, versions: Mapping[str, int | str] | None = None
 ) -> Repaired:
-    """Take away what is broken, and run the surveys that name any of it again.
+    """Remove the damaged stores, and run the surveys again that name them.
 
-    ``findings`` are those of `verify_archive`. ``rerun`` runs a survey by its settings, as the receipt has them, into
-    this archive, and finds there what is whole. ``versions`` are the stages' as they are made now: stores of others are
-    not made again, and stay. Raises ArchiveError: another process uses the archive, or the disk or bucket refuses.
+    ``findings`` are those of `verify_archive`. ``rerun`` runs a survey into this archive by its settings.
+    ``versions`` are the present ones of the stages; stores of other versions stay. Raises ArchiveError: another process
+    uses the archive, or the disk or bucket refuses.
     """
     with archive.in_use(alone=True) as alone:
         if not alone:
             raise ArchiveError(f"{archive.name} is in use; run verify --repair again when the survey there has ended")
-        bad = list(findings)
-        restored = [uri for uri in dict.fromkeys(one.uri for one in bad) if archive.restore(uri)]
-        plan = plan_repair(archive, [one for one in bad if one.uri not in restored], versions=versions)
-        done = Repaired(plan, remade=restored)
+        plan = plan_repair(archive, findings, versions=versions)
+        done = Repaired(plan)
         for uri in plan.remade:
             archive.discard(archive.ref(*uri.split("/")[1:]))
     succeeded: set[str] = set()
@@ -96,7 +93,7 @@ def repair(
         elif not catalogue.named_by(uri):
             done.dropped.append(uri)
         else:
-            done.failed[uri] = "; ".join(done.failed.values()) or "its survey ran again and did not make it"
+            done.failed[uri] = "; ".join(done.failed.values()) or "its survey ran again without building it"
     for uri, text in plan.broken_runs.items():
         if text in succeeded:  # its survey has run again, into a folder of its own
             archive.drop_run(uri)
@@ -108,16 +105,16 @@ def repair(
 
 
 def _hopeless(catalogue: Catalogue, uri: str, versions: Mapping[str, int | str] | None) -> str:
-    """Return why a store cannot be made again; empty where it can."""
+    """Return why a store cannot be built again; empty where it can."""
     store, stage = catalogue.stores.get(uri), uri.split("/")[1]
     if catalogue.is_only_copy(uri):
-        return "raw lines that cannot be had again: restore them from a copy; lines not named can still be read"
+        return "raw lines cannot be captured again: restore them from a copy. Undamaged lines can still be read"
     if uri in catalogue.lost and versions is not None and stage not in versions:
-        return f"there is no stage {stage}, so nothing tells what it was: take it out of the archive"
+        return f"there is no stage {stage}: take it out of the archive"
     made = "" if store is None else store.version
     if versions is not None and made and str(versions.get(stage)) != made:
         now = versions.get(stage, "none")
-        return f"made by version {made} of the stage {stage}, which is now {now}: reprocess makes a new generation"
+        return f"made by version {made} of the stage {stage}, which is now {now}: reprocess builds it again"
     runs = catalogue.named_by(uri)
     if runs and not any(run.settings for run in runs):
         return f"the settings of {runs[-1].uri}, which names it, cannot be read: run that survey again by hand"
@@ -125,6 +122,6 @@ def _hopeless(catalogue: Catalogue, uri: str, versions: Mapping[str, int | str] 
 
 
 def _settings_text(run: Run) -> str:
-    """Return the settings as one text, without the archive's place and the notes, which change nothing."""
+    """Return the settings as canonical text, without the archive's place and the notes."""
     asked = {name: value for name, value in run.settings.items() if name not in ("notes", "out")}
     return canonical_json(asked) if asked else ""

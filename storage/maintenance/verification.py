@@ -1,7 +1,7 @@
-"""Reading a whole archive again: every byte against its manifest, every manifest against its seal and its runs.
+"""Verify an archive: compare every byte with its manifest, and every manifest with its seal and its address.
 
-A link or a pipe in the place of a file is reported and never opened. A finding on a broken file of an array names the
-part that it holds.
+A link or a pipe instead of a file is reported and never opened. The finding on a damaged file of an array names its
+rows and columns.
 """
 
 from __future__ import annotations
@@ -14,33 +14,20 @@ from typing import Any, Literal
 
 import zarr
 
-from pipeline.json_lines import read_checked
-from pipeline.rig.capture import JOURNAL
 from storage.archive.keys import without_manifest
 from storage.archive.lineage import Catalogue
-from storage.archive.manifests import (
-    CLEARED,
-    EXTENDED,
-    broken_files,
-    listed_bytes,
-    manifest_sha256,
-    manifests_before,
-    try_manifest,
-)
+from storage.archive.manifests import broken_files, listed_bytes, manifests_before, try_manifest
 from storage.archive.run_folders import unfinished_extensions
-from storage.archive.staging import MANIFEST_NAME, NotPlainError, kind_of, read_plain
-from storage.arrays.fetched_files import SUMS, first_unlike
-from storage.arrays.spool import ENDING, spool_problems
+from storage.archive.staging import MANIFEST_NAME, kind_of
 
 WORDS = {"y": "rows", "x": "columns", "line": "lines", "sample": "samples", "band": "bands", "patch": "patches"}
-SPOOLS = "spool"
 _NO_ARRAY = (OSError, ValueError, KeyError, TypeError, IndexError, RecursionError)
 
 
 def name_damage(store: Path, name: str) -> str:
-    """Return the known part of a store in a broken file, to follow its name; empty where it belongs to no array.
+    """Return the part of an array in a damaged file, as text behind its name; empty where it belongs to no array.
 
-    For example ``(values: rows 0 to 63, columns 0 to 639)``; a dimension of which it has everything is left out.
+    For example ``(values: rows 0 to 63, columns 0 to 639)``; dimensions that the file covers are left out.
     """
     file = store / name
     inner = [path for path in file.parents if path.is_relative_to(store)]
@@ -63,16 +50,15 @@ def name_damage(store: Path, name: str) -> str:
     return f" ({folder.relative_to(store).as_posix()}: {', '.join(ranges) or 'all of it'})"
 
 
-Kind = Literal["whole", "broken", "missing", "stray", "growing"]
-Progress = Callable[[str, float], None]  # address of what is being read, how far of all bytes, 0..1
+Kind = Literal["whole", "broken", "missing", "stray"]
+Progress = Callable[[str, float], None]  # address being read, fraction of all bytes
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Finding of ``verify`` on one store or run; ``problem`` is None where every byte is as published.
+    """Finding on one store or run; ``problem`` is None where every byte is as published.
 
-    ``missing``: something names or rests on a store that is not there. ``stray``: what is no part of the archive.
-    ``growing``: something of a spool that is damaged; the rest of it is used.
+    ``missing``: a run or store names a store that is not there. ``stray``: something that is no part of an archive.
     """
 
     uri: str
@@ -83,9 +69,9 @@ class Finding:
 def verify_everything(
     root: Path, progress: Progress | None = None, problems_of: Callable[[Path], Iterator[str]] | None = None
 ) -> list[Finding]:
-    """Check every store and run of an archive; a finding for each that is whole, and for each thing that is not.
+    """Return a finding for each store and run without damage, and for each problem.
 
-    ``problems_of`` reads one published folder again where its files lie elsewhere.
+    ``problems_of`` reads one published folder whose files lie elsewhere, as in a bucket.
     """
     read_again = problems_of or _problems
     catalogue = Catalogue.read(root)
@@ -107,46 +93,9 @@ def verify_everything(
         if not problems:
             found.append(Finding(uri, None))
     found += [*_misplaced(catalogue, root), *_missing(catalogue)]
-    words = "what was added to it lacks its last step, a name; any command that writes into the archive gives it"
+    words = "its extension is not finished; any command that writes into the archive finishes it"
     found += [Finding(f"runs/{part.stem}", words, "stray") for part in unfinished_extensions(root)]
-    return [*found, *verify_growing(root)]
-
-
-def verify_growing(root: Path) -> Iterator[Finding]:
-    """Yield the findings about spools and what lies beside them; none where all is as it was written."""
-    for folder in _inside(root / SPOOLS):
-        for problem in _spool_problems(folder):
-            yield Finding(f"{SPOOLS}/{folder.name}", problem, "growing")
-    if kind_of(root / SPOOLS) not in (None, "a folder"):
-        yield Finding(SPOOLS, f"is {kind_of(root / SPOOLS)}, expected a folder; take it out of the archive", "stray")
-    for place, folders, files in os.walk(root / SPOOLS):
-        for path in (Path(place, one) for one in (*folders, *files)):
-            if (kind := kind_of(path)) not in (None, "a file", "a folder"):
-                uri = path.relative_to(root).as_posix()
-                yield Finding(uri, f"is {kind}, expected a file; take it out of the archive", "stray")
-
-
-def _spool_problems(folder: Path) -> Iterator[str]:
-    """Yield what has changed in the folder of a capture under way: lines, and the rig's files beside them."""
-    for path in (one for one in (*_inside(folder), *(file for inner in _inside(folder) for file in _inside(inner)))):
-        name = path.relative_to(folder).as_posix()
-        try:
-            if path.suffix == ENDING:
-                yield from spool_problems(path)
-            elif path.name == JOURNAL:
-                changed = [line.number for line in read_checked(read_plain(path)) if line.state == "changed"]
-                yield from (f"{name}: line {number} has changed since it was written" for number in changed)
-            elif name.endswith(SUMS) and (at := first_unlike(path.with_name(path.name.removesuffix(SUMS)))) is not None:
-                where = f"{name.removesuffix(SUMS)} is not as it was fetched from byte {at} on"
-                yield f"{where}; it is asked for again when the capture goes on"
-        except (FileNotFoundError, NotPlainError):
-            continue  # its lines are published; or it is a link and the like, which is reported for all of them
-        except OSError as error:
-            yield f"{name} cannot be read: {error.strerror}"
-
-
-def _inside(folder: Path) -> list[Path]:
-    return sorted(folder.iterdir()) if kind_of(folder) == "a folder" else []
+    return found
 
 
 def _changed_since(catalogue: Catalogue, uri: str) -> bool:
@@ -154,11 +103,11 @@ def _changed_since(catalogue: Catalogue, uri: str) -> bool:
     run = None if uri in catalogue.stores else next((run for run in catalogue.runs if run.uri == uri), None)
     if run is None:
         return False
-    return manifests_before(try_manifest(run.folder)[0], EXTENDED) != manifests_before(run.facts, EXTENDED)
+    return manifests_before(try_manifest(run.folder)[0]) != manifests_before(run.facts)
 
 
 def _problems(folder: Path) -> Iterator[str]:
-    """Yield what is wrong with one published folder, file by file."""
+    """Yield the problems of one published folder, file by file."""
     manifest, problem = try_manifest(folder)
     if problem is not None:
         yield f"{MANIFEST_NAME} is damaged: {problem}"
@@ -168,22 +117,17 @@ def _problems(folder: Path) -> Iterator[str]:
 
 
 def _identity_problems(catalogue: Catalogue, uri: str) -> Iterator[str]:
-    """Yield whether a store is the one that its place and the runs say."""
+    """Yield whether the manifest of a store is that of another address."""
     store = catalogue.stores.get(uri)
     if store is None or store.problem is not None or kind_of(store.ref.path / MANIFEST_NAME) != "a file":
         return  # which is reported already
     stated = f"stages/{store.facts.get('stage')}/{store.facts.get('key')}"
     if stated != uri:
         yield f"its {MANIFEST_NAME} is that of {stated}; move it back, or take it out of the archive"
-    knowing = catalogue.recorded_by.get(uri, [])
-    own = {manifest_sha256(store.ref.path), *manifests_before(store.facts, CLEARED)} if knowing else set()
-    anew = all(store.created > run.checksummed for run, _ in knowing)
-    if not anew and not any(sha256 in own for _, sha256 in knowing):
-        yield f"its {MANIFEST_NAME} has changed since {knowing[-1][0].uri} was published (its SHA-256 differs)"
 
 
 def _misplaced(catalogue: Catalogue, root: Path) -> Iterator[Finding]:
-    """Yield findings on runs that name another run (copies, or renamed), and on leftovers without a manifest."""
+    """Yield findings on runs with another run's name (copies, or renamed), and on folders without a manifest."""
     there = {run.folder.name for run in catalogue.runs}
     for run in catalogue.runs:
         stated = run.facts.get("run", run.folder.name)
@@ -199,7 +143,7 @@ def _misplaced(catalogue: Catalogue, root: Path) -> Iterator[Finding]:
 
 
 def _missing(catalogue: Catalogue) -> Iterator[Finding]:
-    """Yield what runs name and stores rest on, and is not there."""
+    """Yield the stores that a run or another store names and that are missing."""
     there, told = set(catalogue.stores), set[str]()
     for run in catalogue.runs:
         for uri in sorted(run.names - there - told):

@@ -1,8 +1,7 @@
-"""One task a block, on threads of this process, on processes beside it, or on a cluster that a dask scheduler leads.
+"""Map a function over blocks, one task for each, on threads, on processes, or on the workers of a dask scheduler.
 
-All three are executors as Python's `concurrent.futures` has them, and blocks are sent to each in the same way. A block
-is a whole shard (or reads whole shards): no two tasks ever touch one file, so nothing has to be locked. For the same
-bytes to come out, code, threads of arithmetic and files have to be the same wherever blocks are made.
+All three are executors of `concurrent.futures`. A block is a whole shard, so that no two tasks write the same file. The
+results are the same bytes everywhere if code, files and the number of arithmetic threads are the same.
 """
 
 from __future__ import annotations
@@ -44,8 +43,8 @@ if TYPE_CHECKING:
 else:
     dask_distributed = deferred("dask.distributed")
 
-ANSWER_S = 5.0  # a scheduler that is there answers at once
-AHEAD = 2  # blocks sent to a worker: one in the making, one waiting
+ANSWER_S = 5.0  # time limit of a scheduler's answer
+AHEAD = 2  # blocks sent to a worker: one running, one waiting
 TRIES = 3  # of a block whose worker dies
 ROOMS = ("pipeline", "models", "storage", "flows")  # blocks of regions are made in flows
 LIBRARIES = ("numpy", "zarr", "numcodecs", "torch", "distributed")
@@ -67,22 +66,22 @@ Report = Callable[[float], None]  # share done, 0..1, from the thread that asked
 
 
 def mib(size: int) -> str:
-    """Return bytes in whole MiB, rounded up, as the setting ``memory`` takes them."""
+    """Return bytes in whole MiB, rounded up, as in the setting ``memory``."""
     return f"{-(-size // 2**20)} MiB"
 
 
 def memory_refusal(least: int, memory: int, why: str) -> SettingsError:
-    """Return the error of work that takes more than the setting ``memory`` [bytes]: why, and the least."""
+    """Return the error for work that needs more than the setting ``memory`` [bytes], with the least that it needs."""
     over = f"projected memory {mib(least)} exceeds --memory {mib(memory)}"
     return SettingsError(f"{over}: {why}; give at least --memory {mib(least)}")
 
 
 @dataclass(frozen=True)
 class WorkerPool:
-    """Workers that make blocks: ``threads``, ``processes``, or those of a dask scheduler at ``tcp://host:port``."""
+    """Workers for blocks: ``threads``, ``processes``, or those of a dask scheduler at ``tcp://host:port``."""
 
     scheduler: str = "threads"
-    workers: int | None = None  # at a time; None is one a core. A scheduler elsewhere has workers of its own
+    workers: int | None = None  # None: one for each core; ignored with a dask scheduler
 
     def __post_init__(self) -> None:
         if self.scheduler not in ("threads", "processes") and not _ADDRESS.fullmatch(self.scheduler):
@@ -100,21 +99,21 @@ class WorkerPool:
 
     @property
     def shares_memory(self) -> bool:
-        """Return whether work may hold open files and arrays; otherwise it holds paths and is pickled."""
+        """Return whether work may hold open files and arrays; otherwise it is pickled and holds paths."""
         return self.scheduler == "threads"
 
     @property
     def count(self) -> int:
-        """Blocks at a time on this machine."""
+        """Number of blocks at a time on this machine."""
         if self.workers is not None:
             return self.workers
         return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
     @contextmanager
     def open(self) -> Iterator[WorkerPool]:
-        """Keep this worker pool's workers from one `run_blocks` to the next until the block ends.
+        """Keep the workers from one `run_blocks` to the next while the block runs; may be nested.
 
-        Costs nothing by itself: they are started by the first `run_blocks` that needs them. May be nested.
+        The first `run_blocks` starts them.
         """
         with _guard:
             held = _open.setdefault(self, _Open())
@@ -123,7 +122,7 @@ class WorkerPool:
             yield self
         except Exception:
             raise
-        except BaseException:  # blocks that are being made are abandoned
+        except BaseException:  # running blocks are abandoned
             held.dismiss()
             raise
         finally:
@@ -141,13 +140,13 @@ THREADS = WorkerPool()
 
 @dataclass
 class _Open:
-    """The workers of an open worker pool, once they are needed."""
+    """The workers of an open pool, once they are started."""
 
     users: int = 0
     team: Executor | None = None
 
     def dismiss(self) -> None:
-        """Dismiss the workers at once: the next use starts others."""
+        """Kill the workers; the next use starts others."""
         team, self.team = self.team, None
         if isinstance(team, ProcessPoolExecutor):
             for process in list((team._processes or {}).values()):
@@ -170,16 +169,14 @@ def run_blocks(
 ) -> list[Result]:
     """Call ``make`` with every item, each in a task of its own.
 
-    They are begun in order, none more than a few before the oldest unfinished one: neighbours share what they read.
-    The first error is raised once no block is being made any more: none writes after that.
+    Blocks start in order, at most a few ahead of the oldest unfinished one, since neighbours share input. The first
+    error is raised when no block is running any more. Returns the results in the order of the items.
 
-    On threads ``make`` is anything that may be called from several at once. Otherwise it and the items are pickled.
-    They hold absolute paths, never arrays or open files, and writing a block twice must give the same bytes. ``report``
-    is called with the share done after each. Workers elsewhere are asked if they see the same in ``paths``, the folders
-    that the work reads or writes. Those in a staged store (``*.part``) are cleared of partial files that a killed
-    worker left and another wrote again. Gives the results in the order of the items. Raises SettingsError: no scheduler
-    answers, or its workers see other files or run other versions. WorkerError: workers died, more often than a block is
-    tried again.
+    On threads ``make`` must be safe to call from several at once. Otherwise it and the items are pickled and hold
+    absolute paths, and writing a block twice must give the same bytes. ``report`` is called with the fraction done.
+    Workers of a dask scheduler must see the same files in ``paths``, the folders that the work reads or writes. Partial
+    files of killed workers are removed from staged stores (``*.part``) among them. Raises SettingsError: no scheduler
+    answers, or its workers see other files or run other versions; WorkerError: workers died repeatedly.
     """
     results: dict[int, Any] = {}
 
@@ -211,7 +208,7 @@ def _send_away(
     paths: Sequence[Path],
     ended: Callable[[int, Any], None],
 ) -> None:
-    """Make blocks in processes; blocks whose worker died are made again by others."""
+    """Run blocks in processes; blocks whose worker died are run again by others."""
     left, held, deaths = dict.fromkeys(range(len(items))), _open[pool], 0
 
     def tick(number: int, result: Any) -> None:
@@ -233,14 +230,14 @@ def _send_away(
             deaths += 1
             if pool.elsewhere and isinstance(error, CancelledError):
                 gone = f"--scheduler {pool.scheduler}: the scheduler is gone"
-                raise WorkerError(f"{gone}; the same command goes on once it is there again") from None
+                raise WorkerError(f"{gone}. Start it again and repeat the command: finished blocks are kept") from None
             if isinstance(error, WorkerError | CancelledError):
                 raise
             if deaths == TRIES or pool.elsewhere:
                 who = f"--scheduler {pool.scheduler}" if pool.elsewhere else f"{pool.count} worker processes"
                 raise WorkerError(
-                    f"{who}: workers died several times in the same block; were they out of memory? use fewer "
-                    "--workers, or --scheduler threads"
+                    f"{who}: workers died several times in the same block, perhaps out of memory. Use "
+                    "fewer --workers, or --scheduler threads"
                 ) from None
 
 
@@ -252,9 +249,9 @@ def _send(
     window: int,
     ended: Callable[[int, Any], None],
 ) -> None:
-    """Send blocks in order, none ``window`` or more behind the oldest unfinished one; ``ended`` takes each result.
+    """Send blocks in order, fewer than ``window`` ahead of the oldest unfinished one; ``ended`` takes each result.
 
-    Running blocks are waited for before an error is raised.
+    An error is raised when the running blocks have ended.
     """
     running: dict[Future[Any], int] = {}
     sent = 0
@@ -265,7 +262,7 @@ def _send(
                 sent += 1
             done = wait(running, timeout=ANSWER_S, return_when=FIRST_COMPLETED).done
             if not done and isinstance(team, Cluster):
-                team.count()  # one without workers ends no block
+                team.count()  # raises where no worker is left
             for future in sorted(done, key=running.__getitem__):
                 ended(numbers[running[future]], future.result())
                 del running[future]
@@ -278,7 +275,7 @@ def _send(
 
 
 def start(workers: int) -> ProcessPoolExecutor:
-    """Start processes of one thread each (WorkerError: they do not start)."""
+    """Start processes with one arithmetic thread each (WorkerError: they do not start)."""
     try:
         with _inherited():
             team = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _end_with_parent)
@@ -290,7 +287,7 @@ def start(workers: int) -> ProcessPoolExecutor:
 
 
 def _end_with_parent() -> None:
-    """End this process once the one that started it has ended, however that came."""
+    """End this process when its parent has ended."""
     parent = multiprocessing.parent_process()
     assert parent is not None
 
@@ -303,9 +300,9 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _inherited() -> Iterator[None]:
-    """Give new processes and threads the environment of workers while the block runs, and keep Ctrl-C from them."""
+    """Set the environment of workers while the block starts them, and block Ctrl-C in them."""
     before = {name: os.environ.get(name) for name in _ENVIRONMENT}
-    resource_tracker.ensure_running()  # where it starts later it lets signals through again
+    resource_tracker.ensure_running()  # started later it would unblock signals
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     os.environ.update(_ENVIRONMENT)
     try:
@@ -325,7 +322,7 @@ class Cluster(Executor):
 
     def __init__(self, scheduler: str) -> None:
         self.name = f"--scheduler {scheduler}"
-        for name in ("distributed", "distributed.client"):  # lost connections are reported once, by an error
+        for name in ("distributed", "distributed.client"):  # an error reports lost connections once
             logging.getLogger(name).setLevel(logging.CRITICAL)
         try:
             self.client: Any = dask_distributed.Client(scheduler, timeout=ANSWER_S, set_as_default=False)  # type: ignore[no-untyped-call]
@@ -346,7 +343,7 @@ class Cluster(Executor):
         self.client.close()
 
     def count(self) -> int:
-        """Return how many blocks can be made at a time. Raises WorkerError: there are no workers."""
+        """Return the number of blocks at a time. Raises WorkerError: there are no workers."""
         try:
             self.client.wait_for_workers(1, timeout=ANSWER_S)
         except TimeoutError:
@@ -357,18 +354,19 @@ class Cluster(Executor):
         return max(1, sum(int(threads) for threads in self.client.nthreads().values()))
 
     def check(self, paths: Sequence[Path]) -> int:
-        """Ask every worker for its versions and threads, and what it sees in some folders; return `count`.
+        """Compare versions, threads and the content of folders of every worker with this process; return `count`.
 
-        Raises SettingsError: one differs from this process; names it, both values and what to do. WorkerError: there is
-        none, or one was lost meanwhile.
+        Raises SettingsError: a worker differs; WorkerError: there is none, or one was lost meanwhile.
         """
         folders = [str(path.absolute()) for path in paths]
         expected, count = {**about_here(folders), THREADS_OF: "1"}, self.count()
         try:
             theirs = self.client.run(about_here, folders)
         except OSError as error:
-            raise WorkerError(f"{self.name}: a worker was lost ({error}); the same command goes on") from None
-        except Exception as error:  # of any type: what cannot be unpickled there comes back as text
+            raise WorkerError(
+                f"{self.name}: a worker was lost ({error}). Repeat the command: finished blocks are kept"
+            ) from None
+        except Exception as error:  # of any type: errors of unpickling come back as text
             raise SettingsError(
                 f"{self.name}: a worker cannot import SpectralZoom ({error}); install the same version there, or use "
                 "--scheduler processes"
@@ -384,14 +382,14 @@ class Cluster(Executor):
 
 
 def about_here(folders: Sequence[str]) -> dict[str, str]:
-    """Return the versions and threads of this process, and its view of some folders, by name."""
+    """Return versions, threads and the content of folders as this process sees them, by name."""
     threads = {THREADS_OF: os.environ.get(THREADS_OF, "not set")}
     return versions_here() | threads | {folder: _seen(folder) for folder in folders}
 
 
 @cache
 def versions_here() -> dict[str, str]:
-    """Return what this process runs, by name, as it was when first asked: so it runs whatever changes on the disk."""
+    """Return the versions of code and libraries in this process, as they were at the first call."""
     root, found = Path(__file__).parents[2], hashlib.sha256()
     for path in sorted(path for room in ROOMS for path in (root / room).rglob("*.py")):
         found.update(path.relative_to(root).as_posix().encode() + path.read_bytes())

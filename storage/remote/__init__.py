@@ -1,1 +1,1 @@
-"""Archives in a bucket: the same stores and keys, worked on in a folder of this machine."""
+"""Archives in a bucket, with a working copy on this machine."""

@@ -1,12 +1,12 @@
-"""An archive in a bucket: the same stores, keys and runs, worked on in a folder of this machine.
+"""An archive in a bucket, with the same stores, keys and runs as in a folder, and a working copy on this machine.
 
 A store's or run's manifest has the same address in the bucket. Its files lie below ``<address>/<attempt>/``. The
-attempt is the beginning of the SHA-256 of the manifest that lists them, so that two writers never mix theirs. A store
-is published in the working copy first, then uploaded. A conditional put of its manifest, last, publishes it: the first
-writer wins, for ever, and others take what stands. Files are fetched when their path is asked for.
+attempt is the beginning of the SHA-256 of their manifest, so that two writers never mix their files. A store is
+published in the working copy first, then uploaded. A conditional put of its manifest publishes it: the first writer
+wins, and others take its store. Files are fetched when their path is used.
 
-Results stay in the working copy where the bucket stops answering, and the same command uploads them. All of the working
-copy that is in the bucket may be deleted at any time while no process works on it.
+If the bucket stops answering, results stay in the working copy, and the same command uploads them. The uploaded part of
+a working copy may be deleted while no process uses it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from datetime import datetime, timedelta
+from datetime import datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -28,7 +28,6 @@ from pipeline.errors import ArchiveError, IncompleteStoreError
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, in_text, open_folder, store_at
 from storage.archive.manifests import (
-    EXTENDED,
     check_files,
     file_problem,
     is_cleared,
@@ -43,12 +42,12 @@ from storage.archive.staging import MANIFEST_NAME, is_name, refusals, remove_tre
 from storage.maintenance.verification import Finding, Progress, name_damage, verify_everything
 from storage.remote.object_stores import Listed, Objects, parse_place, some_at_a_time
 
-MARK = "archive.json"  # at the prefix: here is an archive
+MARK = "archive.json"  # marks a prefix as an archive
 MARK_TEXT = b'{"archive": "spectralzoom", "layout": 1}\n'
 ATTEMPT = re.compile(r"((?:stages/[^/]+|runs)/[^/]+)/([0-9a-f]{16})/.+")  # a file's address, and its upload
-ASIDE = ".fetch-"  # begins the names of folders of the working copy for what is not whole yet
+ASIDE = ".fetch-"  # prefix of folders of the working copy for incomplete files
 DAY_S = 86400.0
-UPLOAD_S = 3600.0  # the files of a run that lie there so long without a manifest are no upload under way
+UPLOAD_S = 3600.0  # after which a run without a manifest is no running upload
 
 
 class ObjectArchive(Archive):
@@ -64,24 +63,22 @@ class ObjectArchive(Archive):
 
     @property
     def name(self) -> str:
-        """Address of the archive, as the user gives it."""
+        """Return the address of the archive."""
         return self.objects.place.url
 
     @property
     def around(self) -> Path:
-        """The folder in which the user works: there is none around a bucket."""
+        """Return the working folder of the process."""
         return Path.cwd()
 
     # --- stores -------------------------------------------------------------------------------------------------------
 
     def ref(self, stage: str, key: str) -> StageRef:
-        """Return the address of a store, whether it is there or not; its path fetches it."""
+        """Return the address of a store, whether it exists or not; its path fetches the store."""
         return RemoteRef(stage, key, store_at(self.root, stage, key).path, self._fetch)
 
     def find(self, stage: str, key: str) -> StageRef | None:
-        """Return the published store; None where there is none or its files were cleared away.
-
-        A store that waits here is uploaded.
+        """Return the published store, None without one or where it was cleared; upload it if it is only here.
 
         Raises IncompleteStoreError: its manifest in the bucket is damaged.
         """
@@ -95,29 +92,27 @@ class ObjectArchive(Archive):
         return None if is_cleared(read_manifest(self.root / ref.uri)) else ref
 
     def is_known(self, ref: StageRef) -> bool:
-        """Return whether a store was published, also where its files were cleared away since.
+        """Return whether a store was published, even if its files were cleared away; fetch its manifest.
 
-        Its manifest is here then.
-
-        Its manifest is here then. Raises IncompleteStoreError: its manifest in the bucket is damaged.
+        Raises IncompleteStoreError: its manifest in the bucket is damaged.
         """
         return super().is_known(ref) or self._find(ref.uri)
 
     def manifest_hashes(self, refs: Iterable[StageRef]) -> dict[str, str]:
-        """Return the `manifest_hash` of stores and of all they rest on, by address, once each is in the bucket."""
+        """Upload stores and all their inputs, and return their `manifest_hash` by address."""
         given = list(refs)
         self._ensure(super().manifest_hashes(given))
         return super().manifest_hashes(given)
 
     def locate(self, address: str) -> Path:
-        """Return the path on this machine of a product, by its address relative to the archive; fetched if need be."""
+        """Fetch a product and return its path on this machine, by its address in a receipt."""
         self._fetch(in_text(address) or "/".join(address.split("/")[:2]))
         return super().locate(address)
 
     def discard(self, ref: StageRef, *, wait: bool = True, unnamed: bool = False) -> bool:
-        """Take one store away for good, here and in the bucket; see `Archive.discard`.
+        """Remove one store here and in the bucket; see `Archive.discard`.
 
-        Its manifest goes first. An ``unnamed`` store comes back where a run that names it has been published since this
+        Its manifest is removed first. An ``unnamed`` store is put back if a run that names it was published since this
         archive was opened. Publishing a run looks for its stores after that.
         """
         manifest = f"{ref.uri}/{MANIFEST_NAME}"
@@ -138,33 +133,15 @@ class ObjectArchive(Archive):
         return gone
 
     def clear(self, ref: StageRef, *, wait: bool = True) -> bool:
-        """Take a store's files away, here and in the bucket; see `Archive.clear`."""
+        """Remove a store's files here and in the bucket; see `Archive.clear`."""
         self._ensure([ref.uri])
         cleared = super().clear(store_at(self.root, ref.stage, ref.key), wait=wait)
         if cleared:
             self._upload(ref.uri, first=False)
         return cleared
 
-    def restore(self, uri: str) -> bool:
-        """Write a broken store or run of the bucket again, if the working copy has it as it was published."""
-        folder = self.root / uri
-        standing = self.objects.read(f"{uri}/{MANIFEST_NAME}")
-        manifest, problem = try_manifest(folder)
-        if problem is not None or is_cleared(manifest):
-            return False
-        if standing not in (None, (folder / MANIFEST_NAME).read_bytes()) and parse_manifest(standing)[1] is None:
-            return False  # another machine has made it anew since
-        try:
-            self._fetch_files(uri)
-            check_files(folder, hashes=True)
-        except IncompleteStoreError:
-            return False
-        self.objects.remove(self.objects.listing(uri))
-        self._upload(uri, first=True)
-        return True
-
     def drop_run(self, uri: str) -> None:
-        """Take a damaged run away, here and in the bucket."""
+        """Remove a damaged run here and in the bucket."""
         super().drop_run(uri)
         self.objects.remove(self.objects.listing(uri))
 
@@ -174,11 +151,11 @@ class ObjectArchive(Archive):
         return self._sending(super()._begin_run(f"{run_id}-{secrets.token_hex(3)}"))  # which no other machine takes
 
     def extend_run(self, run_id: str, *, wait: bool = True) -> RunDraft | None:
-        """Open a run that is published here or in the bucket to add to it; see `Archive.extend_run`."""
+        """Return a draft that replaces a published run; see `Archive.extend_run`."""
         return self._sending(super().extend_run(run_id, wait=wait))
 
     def _sending(self, draft: RunDraft | None) -> RunDraft | None:
-        """Upload a run once it is published in the working copy, and then look for its stores once more."""
+        """Have a draft upload its run once it is published here, and then check its stores in the bucket."""
 
         def send(uri: str) -> None:
             self._upload(uri, first=draft is not None and not draft.extends)
@@ -191,7 +168,7 @@ class ObjectArchive(Archive):
         return draft
 
     def send_runs(self) -> None:
-        """Upload the runs, and what was added to some, that a command which was killed could not upload."""
+        """Upload runs and extensions of runs that a killed command has left in the working copy."""
         there = _manifests(self.objects.listing("runs"))
         for uri in (f"runs/{folder.name}" for folder in self.runs() if try_manifest(folder)[1] is None):
             if uri not in there:
@@ -199,13 +176,13 @@ class ObjectArchive(Archive):
                 self._upload(uri, first=True)
             elif not self._is_dated(uri, there[uri]):
                 standing = hashlib.sha256(self.objects.read(f"{uri}/{MANIFEST_NAME}") or b"").hexdigest()
-                if standing in manifests_before(read_manifest(self.root / uri), EXTENDED):  # something was added to it
+                if standing in manifests_before(read_manifest(self.root / uri)):  # something was added to it
                     self._upload(uri, first=False)
 
     # --- the whole of it ----------------------------------------------------------------------------------------------
 
     def mirror(self) -> None:
-        """Bring the manifests of all stores, and the runs with their receipts."""
+        """Fetch the manifests of all stores, and of runs the receipts too."""
         stages = [f"stages/{stage}" for stage in self.objects.children("stages")]
         found = [f"{folder}/{key}" for folder in stages for key in self.objects.children(folder)]
         with refusals(self.root, "write to the working copy"):
@@ -214,7 +191,7 @@ class ObjectArchive(Archive):
         self._later_runs.clear()
 
     def _mirror_runs(self) -> None:
-        """Bring the runs that are new in the bucket, or that something was added to, with their receipts."""
+        """Fetch manifests and receipts of new and extended runs."""
         found = _manifests(self.objects.listing("runs"))
         changed = [uri for uri, one in found.items() if not self._is_dated(uri, one)]
         some_at_a_time(self._bring, changed)
@@ -224,14 +201,6 @@ class ObjectArchive(Archive):
         with suppress(IncompleteStoreError):  # its reader says so
             if _is_address(uri) and self._find(uri) and uri.startswith("runs/"):
                 self._fetch_files(uri, [RECEIPT])
-
-    def now(self) -> datetime:
-        """Return the time by the clock that dates the objects, rounded up to whole seconds."""
-        if not self.writes:
-            return super().now()
-        self.objects.write(".now", b"")
-        dated = self.objects.read_dated(".now")
-        return super().now() if dated is None else dated[1] + timedelta(seconds=1)
 
     def size_of(self, uri: str) -> int:
         """Return the bytes of all objects of a store or run."""
@@ -243,16 +212,16 @@ class ObjectArchive(Archive):
         return dict(zip(names, some_at_a_time(self.size_of, names), strict=True))
 
     def take_moved(self) -> int:
-        """Return the bytes of objects sent and received since the last call, or since the archive was opened."""
+        """Return the bytes of objects sent and received since the last call."""
         return self.objects.take_moved()
 
     def lost_runs(self) -> list[str]:
-        """Return the addresses of runs in the bucket that have files, but no manifest there or here."""
+        """Return the addresses of runs that have files in the bucket, but no manifest there or here."""
         here = {f"runs/{folder.name}" for folder in self.runs()}
         return [uri for uri in _lost_runs(self.objects.listing("runs")) if uri not in here]
 
     def leftovers(self, keep_days: float) -> dict[str, int]:
-        """Return folders and bytes of files in the bucket that no manifest publishes, older than ``keep_days``."""
+        """Return addresses and bytes of incomplete uploads that are older than ``keep_days``."""
         there = self.objects.listing()
         latest = max((one.changed for one in there.values()), default=None)
         uploads: dict[str, list[Listed]] = {}
@@ -274,7 +243,7 @@ class ObjectArchive(Archive):
         self.objects.remove(self.objects.listing(uri))
 
     def verify_everything(self, progress: Progress | None = None) -> list[Finding]:
-        """Check every store and run in the bucket; nothing is taken from the working copy but what grows there."""
+        """Check every store and run in the bucket, not in the working copy."""
         there = self.objects.listing()
         with TemporaryDirectory(prefix="spectralzoom-verify-") as named, refusals(Path(named), "read manifests into"):
             root = Path(named)
@@ -304,7 +273,7 @@ class ObjectArchive(Archive):
         self._send(uri)
 
     def _is_whole(self, uri: str) -> bool:
-        """Return whether all of a store is here, by its manifest and the sizes of its files; not if it was cleared."""
+        """Return whether a store is complete here by the sizes of its files, and not cleared."""
         manifest, problem = try_manifest(self.root / uri)
         return problem is None and not is_cleared(manifest) and not self._lacks(uri, manifest)
 
@@ -312,12 +281,12 @@ class ObjectArchive(Archive):
         return [name for name, one in manifest["files"].items() if _size(self.root / uri / name) != one["size"]]
 
     def _is_dated(self, uri: str, listed: Listed) -> bool:
-        """Return whether the manifest here has size and date of an object, as one brought from the bucket has."""
+        """Return whether the manifest here has the size and date of the object in the bucket."""
         path = self.root / uri / MANIFEST_NAME
         return _size(path) == listed.size and int(path.stat().st_mtime) == int(listed.changed.timestamp())
 
     def _find(self, uri: str, *, keep: bool = False) -> bool:
-        """Return whether a manifest stands in the bucket, and bring it; a cleared one does not count, to ``keep`` ours.
+        """Fetch a manifest from the bucket; False without one, or where it is cleared and ``keep`` is true.
 
         Raises IncompleteStoreError: it is damaged.
         """
@@ -325,13 +294,13 @@ class ObjectArchive(Archive):
         if dated is None or (keep and is_cleared(parse_manifest(dated[0])[0])):
             return False
         if parse_manifest(dated[0])[1] is None or try_manifest(self.root / uri)[1] is not None:
-            self._lay(uri, *dated)  # else what has rotted in the bucket would take the place of what is whole here
+            self._lay(uri, *dated)  # a damaged one does not replace a valid one
         read_manifest(self.root / uri)
         self._standing[uri] = dated[0]
         return True
 
     def _lay(self, uri: str, manifest: bytes, changed: datetime) -> None:
-        """Write a manifest here, with the date of its object; files that it lists otherwise are removed."""
+        """Write a manifest here with the date of its object; remove files that do not match it."""
         folder = self.root / uri
         with self._locked(f"copy-{uri.replace('/', '-')}"), self._aside() as aside:
             before, problem = try_manifest(folder)
@@ -351,7 +320,7 @@ class ObjectArchive(Archive):
 
     @contextmanager
     def _aside(self) -> Iterator[Path]:
-        """Yield a folder of the working copy for what is not whole yet; a disk that refuses says so in words."""
+        """Yield a temporary folder of the working copy for incomplete files."""
         with (
             refusals(self.root, "write to the working copy"),
             TemporaryDirectory(prefix=ASIDE, dir=self.root, ignore_cleanup_errors=True) as named,
@@ -359,9 +328,9 @@ class ObjectArchive(Archive):
             yield Path(named)
 
     def _fetch(self, uri: str) -> None:
-        """Fetch a whole store or run; an unknown one is left to the reader, who reports its absence.
+        """Fetch a store or run whose manifest is here.
 
-        Raises IncompleteStoreError: an object of it is missing or has changed, or all of it was removed since.
+        Raises IncompleteStoreError: an object of it is missing or has changed, or it was removed meanwhile.
         """
         if not (self.root / uri / MANIFEST_NAME).is_file() or not self._lacks(uri, read_manifest(self.root / uri)):
             return
@@ -377,7 +346,7 @@ class ObjectArchive(Archive):
             self._fetch_files(uri)  # cleared away, and made again since
 
     def _fetch_files(self, uri: str, only: Iterable[str] | None = None) -> None:
-        """Bring the files that are not here (of ``only`` these names), each checked by its hash."""
+        """Fetch the missing files (``only`` these names), each checked by its hash."""
         folder = self.root / uri
         manifest = read_manifest(folder)
         place = _files_at(uri, (folder / MANIFEST_NAME).read_bytes())
@@ -392,9 +361,9 @@ class ObjectArchive(Archive):
             some_at_a_time(fetch, lacking)
 
     def _send(self, uri: str) -> None:
-        """Upload what is published here; where another came first, take that one, unless its files were cleared away.
+        """Upload a store that is published here, or take the one in the bucket unless that is cleared.
 
-        Raises IncompleteStoreError: a file of it is not as it was published.
+        Raises IncompleteStoreError: a file of it has changed since it was published.
         """
         dated = self.objects.read_dated(f"{uri}/{MANIFEST_NAME}")
         if dated is None or is_cleared(parse_manifest(dated[0])[0]):
@@ -404,7 +373,7 @@ class ObjectArchive(Archive):
             self._standing[uri] = dated[0]
 
     def _upload(self, uri: str, *, first: bool) -> None:
-        """Upload a folder's files, then its manifest; where that is not the ``first``, what stands is replaced."""
+        """Upload a folder's files, then its manifest; ``first`` by a conditional put, else in place of the old one."""
         folder, objects = self.root / uri, self.objects
         text, files = (folder / MANIFEST_NAME).read_bytes(), read_manifest(folder)["files"]
         check_files(folder, hashes=True)
@@ -416,16 +385,16 @@ class ObjectArchive(Archive):
             objects.write(f"{uri}/{MANIFEST_NAME}", text)
             objects.remove([path for path in there if ATTEMPT.fullmatch(path) and not path.startswith(f"{place}/")])
         elif not objects.create(f"{uri}/{MANIFEST_NAME}", text):
-            self._find(uri)  # another was first; or it was this upload, of which the answer was lost
+            self._find(uri)  # another writer was first, or the answer to this put was lost
             return
         self._standing[uri] = text
         if uri.startswith("runs/") and (dated := objects.read_dated(f"{uri}/{MANIFEST_NAME}")) is not None:
-            self._lay(uri, *dated)  # by its date it is known as what stands
+            self._lay(uri, *dated)  # with the date of the object
 
     def _ensure(self, uris: Iterable[str]) -> None:
-        """Upload the stores that are not in the bucket as they are known here.
+        """Upload the stores that are missing in the bucket.
 
-        Raises IncompleteStoreError: one is neither in the bucket nor whole here.
+        Raises IncompleteStoreError: one is neither in the bucket nor complete here.
         """
 
         def ensure(uri: str) -> None:
@@ -439,11 +408,11 @@ class ObjectArchive(Archive):
         some_at_a_time(ensure, list(uris))
 
     def _removed(self, uri: str) -> IncompleteStoreError:
-        return IncompleteStoreError(f"{self.name}/{uri} was removed meanwhile; run again, and it is made again")
+        return IncompleteStoreError(f"{self.name}/{uri} was removed meanwhile. Run again: it is built again")
 
 
 def _is_address(uri: str) -> bool:
-    """Return whether an object's name can be an address in an archive: what a bucket lists is not trusted."""
+    """Return whether an object's name can be an address in an archive."""
     return all(is_name(part) for part in uri.split("/"))
 
 
@@ -464,7 +433,7 @@ def _manifests(there: Mapping[str, Listed]) -> dict[str, Listed]:
 
 
 def _lost_runs(there: Mapping[str, Listed]) -> list[str]:
-    """Return the runs that have files, but no manifest, and that are not about to be uploaded."""
+    """Return the runs that have files but no manifest, and that are not being uploaded."""
     files = {path: found[1] for path in there if path.startswith("runs/") and (found := ATTEMPT.fullmatch(path))}
     latest = max((one.changed for one in there.values()), default=None)
     old = {uri for path, uri in files.items() if latest and (latest - there[path].changed).total_seconds() >= UPLOAD_S}
@@ -472,7 +441,7 @@ def _lost_runs(there: Mapping[str, Listed]) -> list[str]:
 
 
 def _lay_out(objects: Objects, root: Path, uri: str) -> None:
-    """Write the manifest of what is published at an address, and of a run the receipt, damaged or not."""
+    """Write the manifest at an address into a folder, and of a run the receipt, damaged or not."""
     text = objects.read(f"{uri}/{MANIFEST_NAME}")
     if text is None:
         return
@@ -483,7 +452,7 @@ def _lay_out(objects: Objects, root: Path, uri: str) -> None:
 
 
 def _problems(objects: Objects, there: Mapping[str, Listed], folder: Path, place: str) -> Iterator[str]:
-    """Yield what is wrong with one published folder, whose files lie at ``place``, object by object."""
+    """Yield the problems of one published folder whose files lie at ``place``, object by object."""
     manifest, problem = try_manifest(folder)
     if problem is not None:
         yield f"{MANIFEST_NAME} is damaged: {problem}"
@@ -497,7 +466,7 @@ def _problems(objects: Objects, there: Mapping[str, Listed], folder: Path, place
             file.unlink(missing_ok=True)
         if (problem := file_problem(file, entry, hashes=True)) is not None:
             broken[name] = problem
-        elif file.name != "zarr.json":  # which says what part of an array a broken file is
+        elif file.name != "zarr.json":  # it tells the part of an array in a damaged file
             file.unlink()
     yield from (f"{name} {problem}{name_damage(folder, name)}" for name, problem in broken.items())
     extra = {path.removeprefix(f"{place}/") for path in there if path.startswith(f"{place}/")} - set(manifest["files"])
@@ -512,11 +481,11 @@ def _size(path: Path) -> int:
 
 
 def open_object_archive(text: str | Path, *, create: bool = True, write: bool = True) -> ObjectArchive:
-    """Open the archive at ``s3://bucket/prefix``, or begin it where ``create``.
+    """Open the archive at ``s3://bucket/prefix``, or create it with ``create``.
 
-    Without ``create`` all manifests and receipts are brought, for verbs that read the whole of it. Raises
-    SettingsError: the address is none. UnreachableError: the bucket refuses, or does not answer. ArchiveError: there is
-    no archive, the store has no conditional puts, or the working copy cannot be written.
+    Without ``create`` all manifests and receipts are fetched. Raises SettingsError: the address is not valid;
+    UnreachableError: the bucket refuses or does not answer; ArchiveError: there is no archive, the store has no
+    conditional puts, or the working copy cannot be written.
     """
     place = parse_place(text)
     archive = ObjectArchive(place.working_copy(), Objects(place), writes=write)
@@ -533,10 +502,7 @@ def open_object_archive(text: str | Path, *, create: bool = True, write: bool = 
 
 
 def _find_mark(objects: Objects, *, create: bool) -> None:
-    """Check that a prefix has the mark that makes it an archive; ``create`` writes it where it is missing.
-
-    A store that anyone may overwrite is refused.
-    """
+    """Check the mark of an archive, or write it with ``create``; refuse a store without conditional puts."""
     name = objects.place.url
     if create and objects.create(MARK, MARK_TEXT):
         if objects.create(MARK, MARK_TEXT):
@@ -549,12 +515,12 @@ def _find_mark(objects: Objects, *, create: bool) -> None:
     if found is None:
         raise ArchiveError(f"{name} is not there; check the name, or make an archive with survey --out")
     if found != MARK_TEXT:
-        raise ArchiveError(f"{name}/{MARK} is not as expected: what answers is no archive, or one of a later version")
+        raise ArchiveError(f"{name}/{MARK} is not as expected: this is no archive, or one of a later version")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RemoteRef(StageRef):
-    """A store that may not be on this machine yet: asking for its path fetches it, and waits."""
+    """A store that may not be on this machine: reading its path fetches it."""
 
     fetch: Callable[[str], None]
 

@@ -1,7 +1,7 @@
-"""An archive's place in a bucket, and its objects: read, written, listed and removed, each of them as a whole.
+"""Read, write, list and remove the objects of an archive in a bucket.
 
-The environment says how the bucket is reached, as for any S3 client: AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY,
-AWS_REGION, AWS_ENDPOINT_URL. SPECTRALZOOM_WORK names the folder of working copies.
+The environment has the access data, as for any S3 client: AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_REGION,
+AWS_ENDPOINT_URL. SPECTRALZOOM_WORK names the folder of working copies.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from storage.archive.staging import sync_path
 if TYPE_CHECKING:
     from obstore.store import BackoffConfig, ClientConfig, RetryConfig, S3Config, S3Store
 
-AT_ONCE = 8  # objects on their way
-PART_BYTES = 8 << 20  # of a large object's parts, and of what is held of it
-RETRIES = 6  # of one request, after waits that grow up to threefold: some ten seconds in all
+AT_ONCE = 8  # transfers in parallel
+PART_BYTES = 8 << 20  # of the parts of a large object
+RETRIES = 6  # of one request, in about ten seconds
 BACKOFF: BackoffConfig = {"init_backoff": timedelta(seconds=0.5), "max_backoff": timedelta(seconds=8), "base": 3}
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 _ADDRESS = re.compile(r"s3:/+([^/]*)/*(.*)")  # also as a path has it, which makes one slash of two
 _BUCKET = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")
 _PART = re.compile(r"[A-Za-z0-9_.=+-]+")
-_MEANINGS = {  # what a store's answer begins with or holds -> what it means and what to do
+_MEANINGS = {  # part of a store's answer: its meaning and what to do
     "NoSuchBucket": "there is no such bucket: create it, or check its name, AWS_REGION and AWS_ENDPOINT_URL",
     "169.254.16": "there are no credentials: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY",
     "SignatureDoesNotMatch": "the credentials are refused: check AWS_SECRET_ACCESS_KEY",
@@ -49,8 +49,8 @@ _MEANINGS = {  # what a store's answer begins with or holds -> what it means and
     "error sending request": "it cannot be reached: check the network and AWS_ENDPOINT_URL",
     "timed out": "it does not answer in time: check the network and AWS_ENDPOINT_URL",
     "response body error": "its answer was broken off: check the network",
-    "501 Not Implemented": "it lacks what an archive needs (conditional puts, listing): use another store",
-    "status code: 5": "it has trouble of its own, or is asked too much: run again later",
+    "501 Not Implemented": "it has no conditional puts or listing, which an archive needs: use another store",
+    "status code: 5": "it has an internal error or too many requests: run again later",
 }
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -84,17 +84,17 @@ class ObjectPlace:
 
 
 def is_remote(root: str | Path) -> bool:
-    """Return whether an archive's name is an address on S3, and no folder's (SettingsError: of another kind)."""
+    """Return whether an archive's name is an address on S3 (SettingsError: it is an address of another kind)."""
     found = _ADDRESS.fullmatch(str(root)) is not None
     if "://" in str(root) and not found:
-        raise SettingsError(f"{str(root)!r} is no place for an archive; expected a folder, or s3://bucket/prefix")
+        raise SettingsError(f"{str(root)!r} is not valid for an archive; expected a folder, or s3://bucket/prefix")
     return found
 
 
 def parse_place(text: str | Path) -> ObjectPlace:
     """Read ``s3://bucket/prefix``; the endpoint comes from the environment.
 
-    Raises SettingsError: it is no such address, or the endpoint is none that can be used.
+    Raises SettingsError: the address or the endpoint is not valid.
     """
     found = _ADDRESS.fullmatch(str(text))
     bucket, prefix = ("", "") if found is None else (found[1], found[2].strip("/"))
@@ -130,9 +130,9 @@ def _endpoint() -> str | None:
 
 
 def connect(place: ObjectPlace) -> S3Store:
-    """Open a place as a store whose names begin there; nothing is asked of the network yet.
+    """Return a store for a place, without a request to the network.
 
-    Raises ArchiveError: a setting of AWS in the environment is none, or obstore is not installed.
+    Raises ArchiveError: a setting of AWS in the environment is not valid, or obstore is not installed.
     """
     try:
         from obstore.exceptions import BaseError  # an extra
@@ -155,7 +155,7 @@ def connect(place: ObjectPlace) -> S3Store:
 
 @contextmanager
 def answers_of(place: ObjectPlace) -> Iterator[None]:
-    """Turn what a store answers, or that it does not answer, into an UnreachableError that says what to do."""
+    """Turn the errors of a store into an UnreachableError with advice."""
     from obstore.exceptions import BaseError
 
     try:
@@ -166,7 +166,7 @@ def answers_of(place: ObjectPlace) -> Iterator[None]:
         text = str(error)
         meaning = next((words for sign, words in _MEANINGS.items() if sign in text), _first_line(error))
         if "invalid path" in text:
-            meaning += "; take it out of the bucket: nothing in an archive is called so"
+            meaning += "; take it out of the bucket: no object of an archive has such a name"
         at = "" if place.endpoint is None else f" at {place.endpoint}"
         raise UnreachableError(f"{place.url}{at}: {meaning}") from error
 
@@ -207,14 +207,11 @@ class Objects:
             self._moved += size
 
     def read(self, name: str) -> bytes | None:
-        """Return the content of a small object, None where there is none."""
+        """Return the content of a small object; None without one."""
         return None if (found := self.read_dated(name)) is None else found[0]
 
     def read_dated(self, name: str) -> tuple[bytes, datetime] | None:
-        """Return the content of a small object and its time of writing; None where there is none.
-
-        The time is by the store's clock.
-        """
+        """Return the content of a small object and its time of writing by the store's clock; None without one."""
         with answers_of(self.place):
             try:
                 answer = self.store.get(name)
@@ -227,7 +224,7 @@ class Objects:
                 return None
 
     def create(self, name: str, content: bytes) -> bool:
-        """Write an object unless there is one of this name (``If-None-Match: *``); tells whether it was written."""
+        """Write an object unless its name exists (``If-None-Match: *``); return whether it was written."""
         from obstore.exceptions import AlreadyExistsError  # an extra
 
         with answers_of(self.place):
@@ -240,7 +237,7 @@ class Objects:
         return True
 
     def write(self, name: str, source: Path | bytes) -> None:
-        """Write an object from a file, whatever was there; readers never see a part of it."""
+        """Write an object from a file or bytes, replacing any old one; readers never see a part of it."""
         with answers_of(self.place):
             self.store.put(name, source, chunk_size=PART_BYTES, max_concurrency=2)
         self._count(len(source) if isinstance(source, bytes) else source.stat().st_size)
@@ -254,7 +251,7 @@ class Objects:
                 yield found
 
     def save(self, name: str, path: Path) -> str:
-        """Write an object into a new file; gives its SHA-256 (FileNotFoundError: there is none)."""
+        """Write an object into a new file and return its SHA-256 (FileNotFoundError: there is none)."""
         digest = hashlib.sha256()
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("wb") as file:
@@ -264,9 +261,9 @@ class Objects:
         return digest.hexdigest()
 
     def fetch(self, name: str, path: Path, sha256: str, aside: Path) -> None:
-        """Bring an object to ``path``, by way of the file ``aside``, if every byte of it is as it was published.
+        """Fetch an object to ``path``, through the file ``aside``, if its SHA-256 matches.
 
-        Raises IncompleteStoreError: it is missing or has changed; nothing has come to ``path``.
+        Raises IncompleteStoreError: it is missing or has changed; ``path`` is not written.
         """
         advice = f"restore it from a copy, or run verify on {self.place.url}"
         try:
@@ -301,7 +298,7 @@ class Objects:
         return found
 
     def remove(self, names: Iterable[str]) -> None:
-        """Remove objects; those that are not there are no matter."""
+        """Remove objects; missing ones are ignored."""
         waiting = list(names)
         if waiting:
             with answers_of(self.place), suppress(FileNotFoundError):
@@ -309,6 +306,6 @@ class Objects:
 
 
 def some_at_a_time(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """Do work that waits for the network on a few items at a time; results in their order, the first error raised."""
+    """Run ``work`` on a few items at a time and return the results in order; raise the first error."""
     with ThreadPoolExecutor(AT_ONCE) as pool:
         return list(pool.map(work, items))  # which, after an error, cancels what has not begun

@@ -1,20 +1,20 @@
-"""Archives of either kind, a folder of this machine or a prefix of a bucket: what differs is chosen here."""
+"""Open and verify archives in a folder of this machine or below a prefix of a bucket."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from storage.archive.archive import Archive
-from storage.maintenance.verification import Finding, Progress, verify_everything, verify_growing
+from storage.maintenance.verification import Finding, Progress, verify_everything
 from storage.remote.object_archive import MARK, ObjectArchive, open_object_archive
 from storage.remote.object_stores import Objects, is_remote, parse_place
 
 
 def open_archive(address: str | Path, *, create: bool = True, write: bool = True) -> Archive:
-    """Open the archive at a folder or ``s3://bucket/prefix``, or make it where ``create``.
+    """Open the archive at a folder or ``s3://bucket/prefix``, or create it with ``create``.
 
-    Raises ArchiveError: the path is a file, is not there, or cannot be written to (``write``). So does a missing
-    obstore, which an archive on S3 needs. SettingsError: an address on S3 that is none.
+    Raises ArchiveError: the path is a file, is missing, or cannot be written to (``write``), or obstore is not
+    installed; SettingsError: the address on S3 is not valid.
     """
     if is_remote(address):
         return open_object_archive(address, create=create, write=write)
@@ -22,9 +22,9 @@ def open_archive(address: str | Path, *, create: bool = True, write: bool = True
 
 
 def is_archive(address: str | Path) -> bool:
-    """Return whether there is something to open: an archive, or a file that will be refused.
+    """Return whether there is an archive to open, or a file that will be refused.
 
-    Raises UnreachableError: that cannot be told of an address on S3.
+    Raises UnreachableError: a bucket does not answer.
     """
     if is_remote(address):
         return Objects(parse_place(address)).read(MARK) is not None
@@ -34,9 +34,8 @@ def is_archive(address: str | Path) -> bool:
 def verify_archive(archive: Archive, progress: Progress | None = None) -> list[Finding]:
     """Check every store and every run; each file and shard that is broken has a finding of its own.
 
-    Every object of an archive in a bucket is read again, and all that grows in the working copy. Findings are named as
-    in a folder.
+    Every object of an archive in a bucket is read again. Findings are named as in a folder.
     """
     if isinstance(archive, ObjectArchive):
-        return [*archive.verify_everything(progress), *verify_growing(archive.root)]
+        return archive.verify_everything(progress)
     return verify_everything(archive.root, progress)

@@ -20,9 +20,8 @@ from pipeline.signal.calibrate import judge_elements
 from pipeline.signal.condense import RESIDUAL_STEP, Condenser, ResidualLaw, calibrated_blocks
 from storage.archive.archive import Archive
 from storage.archive.records import read_run, read_store
-from storage.arrays.cubes import RawCube, open_raw_cubes
+from storage.arrays.cubes import RawCube, open_raw_cubes, read_statistics
 from storage.arrays.signal_cubes import SignalCube, open_signal_cubes
-from storage.arrays.statistics import read_statistics
 
 RAW, KEPT, PART = "0.75", "tab:blue", "tab:orange"
 LINE_NM, WIDTH_NM, HEIGHT = 600.0, 8.0, 6.0  # of the planted emission: centre, standard deviation, noise's deviations

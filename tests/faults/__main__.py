@@ -27,10 +27,8 @@ PLACES = {
     "disk_full": "disk_full:full_rows",
     "refused_writes": "disk_full:refused_rows",
     "many_writers": "many_writers:rows",
-    "clocks": "clocks:rows",
     "lost_lines": "lost_lines:rows",
     "growing_files": "growing_files:rows",
-    "spool_rate": "lost_lines:pace_rows",
     "checksummed_flips": "checksummed_flips:weight_rows",
 }
 FAULTS = {name: rows_of(f"tests.faults.{place}") for name, place in PLACES.items()}

@@ -1,4 +1,4 @@
-"""Faults put into a process from the inside: calls of the system that are refused, clocks that are wrong.
+"""Faults put into a process from the inside: calls of the system that are refused, ends before a call.
 
 Every function here is called once, in a process that does nothing else and ends soon: nothing is put back.
 """
@@ -7,16 +7,12 @@ from __future__ import annotations
 
 import _pyio  # type: ignore[import-not-found]
 import builtins
-import datetime
 import errno
 import functools
 import importlib
 import io
 import os
-import random
-import sys
 import threading
-import time
 from collections.abc import Callable
 from itertools import count
 from pathlib import Path
@@ -162,40 +158,6 @@ def _fill(ballast: Path) -> None:
 
 
 _ON_FILES = {"write", "fsync", "fdatasync", "ftruncate"}  # errors of these carry no name
-
-
-def wrong_clock(shift_s: float, *, jumps_s: float = 0.0, frozen: bool = False, seed: int = 0) -> None:
-    """Let this process see another time of day: shifted, jumping by up to ``jumps_s`` at each look, or standing."""
-    real, chance, began = time.time, random.Random(seed), time.time()
-
-    def now() -> float:
-        return (began if frozen else real()) + shift_s + chance.uniform(-jumps_s, jumps_s)
-
-    class Wrong(datetime.datetime):
-        """A datetime whose now is wrong."""
-
-        @classmethod
-        def now(cls, tz: datetime.tzinfo | None = None) -> datetime.datetime:  # type: ignore[override]
-            return _DATETIME.fromtimestamp(now(), tz)
-
-        @classmethod
-        def utcnow(cls) -> datetime.datetime:  # type: ignore[override]
-            return _DATETIME.fromtimestamp(now(), datetime.UTC).replace(tzinfo=None)
-
-    for module in list(sys.modules.values()):
-        if getattr(module, "__dict__", {}).get("datetime") is _DATETIME:
-            module.datetime = Wrong  # type: ignore[attr-defined]
-    for name in ("gmtime", "localtime"):
-        setattr(time, name, _or_now(getattr(time, name), now))
-    time.time = now
-    time.time_ns = lambda: int(now() * 1e9)
-
-
-_DATETIME = datetime.datetime
-
-
-def _or_now(call: Callable[[float], time.struct_time], now: Callable[[], float]) -> Callable[..., time.struct_time]:
-    return lambda seconds=None: call(now() if seconds is None else seconds)
 
 
 def logged_calls(log: Path) -> list[tuple[int, str, str]]:

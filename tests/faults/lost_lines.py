@@ -1,10 +1,7 @@
-"""What a capture loses when it dies, or cannot keep up: ``python tests/faults lost_lines spool_rate``.
+"""Count the lines that a capture loses when it dies: ``python tests/faults lost_lines``.
 
 A killed process loses nothing that it had written: the system has it. When the power fails, a file is what the disk
 was last asked to keep, and of what came after anything: cut off, zeros, other bytes.
-
-At a camera's pace line n is ready n periods after the first; a camera keeps some until they are fetched, and drops
-what is not fetched by then. Half a minute of it lies beside a process that reads the disk and syncs files of its own.
 """
 
 from __future__ import annotations
@@ -18,13 +15,11 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.source import Line
 from storage.arrays.spool import SYNC_LINES, Spool
@@ -36,9 +31,6 @@ LINES = 5 * SYNC_LINES + 13
 KILLS, CUTS = 20, 400
 HEADER = {"sweep": "a"}
 FATES = ("as written", "cut off", "cut short", "zeros", "other bytes", "some pages")
-WIDE, DEEP, RATE_HZ = 640, 270, 100.0  # samples and bands of a camera
-HELD = 64  # lines that a camera or its driver keeps: 22 MB
-MOST_CORE = 0.20
 
 WRITER = """
 import os, sys
@@ -163,13 +155,12 @@ def try_power(cuts: int, folder: Path, seed: int = 0) -> Losses:
 
 def _go_on(place: Path, appended: int, found: Losses) -> Iterator[str]:
     with Spool.open(place, SAMPLES, BANDS, header=HEADER) as spool:
-        lost = max(appended - spool.count, 0) + len(spool.lost)
+        lost = max(appended - spool.count, 0)
         found.lost[lost] += 1
         if lost > SYNC_LINES:
             yield f"{lost} lines lost"
-        spool.mend(line(number) for number in spool.lost)
         kept = [one for block in spool.blocks() for one in block]
-        yield from (f"line {one.number} is another" for one in kept if not _same(one, line(one.number)))
+        yield from (f"line {one.number} is another" for one in kept if not same(one, line(one.number)))
         fill(spool, LINES)
 
 
@@ -192,11 +183,11 @@ def try_kills(kills: int, folder: Path, seed: int = 0) -> Losses:
             kept = [one for block in spool.blocks() for one in block]
             if appended > spool.count:
                 found.wrong.append(f"{appended - spool.count} of {appended} lines lost")
-            found.wrong += [f"line {one.number} is another" for one in kept if not _same(one, line(one.number))]
+            found.wrong += [f"line {one.number} is another" for one in kept if not same(one, line(one.number))]
     return found
 
 
-def _same(one: Line, other: Line) -> bool:
+def same(one: Line, other: Line) -> bool:
     return np.array_equal(one.data, other.data) and _facts(one) == _facts(other)
 
 
@@ -221,105 +212,4 @@ def rows(quick: bool = False) -> list[Row]:
             clock, count = Clock(), counts[quick]
             losses = tried(count, Path(name))
             found.append(Row(fault, injected, count, demanded, losses.words(), not losses.wrong, clock.seconds))
-    return found
-
-
-# --- at a camera's pace -----------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Pace:
-    """How a spool kept up."""
-
-    lines: int
-    dropped: int
-    latency_s: NDArray[np.float64]  # from when a line was ready to when the spool had taken it
-    cpu_s: float
-    wall_s: float
-    kept: int  # lines that a reader finds afterwards, as captured
-
-    @property
-    def core(self) -> float:
-        """Fraction of one core."""
-        return self.cpu_s / self.wall_s
-
-    @property
-    def met(self) -> bool:
-        """No line dropped or changed, and a fifth of a core at most."""
-        return self.dropped == 0 and self.kept == self.lines and self.core <= MOST_CORE
-
-    def words(self) -> str:
-        """The figures."""
-        slowest, late = self.latency_s.max(initial=0.0), np.count_nonzero(self.latency_s > 1 / RATE_HZ)
-        return (
-            f"{self.lines} lines, {self.dropped} dropped, {self.kept} read back as captured; {self.core:.1%} of a core;"
-            f" {late} late, {int(slowest * RATE_HZ)} waiting at most, latency {np.median(self.latency_s) * 1e3:.1f} ms,"
-            f" slowest {slowest * 1e3:.0f} ms"
-        )
-
-
-def keep_pace(folder: Path, seconds: float) -> Pace:
-    """Append lines at ``RATE_HZ`` for some seconds, then read them again."""
-    rng = np.random.default_rng(0)
-    frames = [rng.integers(0, 4096, (WIDE, DEEP), dtype=np.uint16) for _ in range(SYNC_LINES)]
-    count, period = round(seconds * RATE_HZ), 1 / RATE_HZ
-    latency, dropped, number = np.zeros(count), 0, 0
-    with Spool.open(folder, WIDE, DEEP, header={"sweep": "pace"}) as spool:
-        cpu, began = time.process_time(), time.monotonic()
-        for ready in range(count):
-            at = began + ready * period
-            if (wait := at - time.monotonic()) > 0:
-                time.sleep(wait)
-            if time.monotonic() > at + HELD * period:
-                dropped += 1  # the camera has overwritten it
-                continue
-            spool.append(Line(number, frames[number % len(frames)], 0.0, 1e-4 * ready, ready * period, 10.0))
-            latency[number] = time.monotonic() - at
-            number += 1
-        spool.sync()
-        cpu, wall = time.process_time() - cpu, max(time.monotonic() - began, count * period)
-        kept = sum(_as_captured(block, frames) for block in spool.blocks())
-    return Pace(count, dropped, latency[:number], cpu, wall, kept)
-
-
-def _as_captured(block: list[Line], frames: list[NDArray[np.uint16]]) -> int:
-    return sum(np.array_equal(line.data, frames[line.number % len(frames)]) for line in block)
-
-
-@contextmanager
-def loaded_disk(folder: Path) -> Iterator[None]:
-    """Let another process write, sync and read 4 MB at a time in ``folder`` while the block runs."""
-    child = os.fork()
-    if child == 0:
-        _load(folder / "load.bin")
-    try:
-        yield
-    finally:
-        os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
-
-
-def _load(path: Path) -> None:
-    block = os.urandom(1 << 22)
-    while True:
-        with path.open("wb") as file:
-            for _ in range(16):
-                file.write(block)
-                file.flush()
-                os.fsync(file.fileno())
-                time.sleep(0.02)
-        path.read_bytes()
-
-
-def pace_rows(quick: bool = False) -> list[Row]:
-    """Five minutes of the paper's line, and half a minute beside a busy disk."""
-    found = []
-    demanded = f"none dropped ({HELD} held by the camera), at most {MOST_CORE:.0%} of a core"
-    for seconds, busy in ((2.0, False),) if quick else ((300.0, False), (30.0, True)):
-        clock = Clock()
-        with tempfile.TemporaryDirectory() as name, loaded_disk(Path(name)) if busy else nullcontext():
-            pace = keep_pace(Path(name) / "spool", seconds)
-        beside = ", another process writing and syncing beside it" if busy else ""
-        injected = f"lines of {WIDE} x {DEEP} at {RATE_HZ:.0f} Hz for {seconds:.0f} s{beside}"
-        found.append(Row("camera's pace", injected, pace.lines, demanded, pace.words(), pace.met, clock.seconds))
     return found

@@ -50,7 +50,7 @@ def test_a_receipt_says_no_metres_where_nobody_knows(surveyed_png: Survey, tmp_p
     receipt = surveyed_png(tmp_path / "archive").receipt
     assert receipt["field"]["ground_pixel_m"] is None
     assert receipt["field"]["size_px"] == [128, 96]
-    assert dict(finding_rows(receipt))["field"] == "0.775 x 0.581 degrees of the view"
+    assert dict(finding_rows(receipt))["field"] == "view 0.775 x 0.581 degrees"
 
 
 def test_words_are_those_of_the_figures() -> None:
@@ -63,4 +63,4 @@ def test_words_are_those_of_the_figures() -> None:
         "hectares_per_hour": 1.887 / 24.5 * 3600,
     }
     ((_, said),) = finding_rows({"field": field})
-    assert "860 m away in the middle; 1.89 ha; 12 cm a pixel; 277 ha an hour of the camera" in said
+    assert said == "view 7.74 x 6.2 degrees; range 860 m; 1.89 ha; ground pixel 12 cm; hectares per hour 277"

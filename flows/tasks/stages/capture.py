@@ -28,9 +28,8 @@ from pipeline.source import Line, Source
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, stage_key
 from storage.archive.manifests import write_table
-from storage.arrays.cubes import RawCubeWriter, SweepHeader
+from storage.arrays.cubes import RawCubeWriter, SweepHeader, write_statistics
 from storage.arrays.spool import Spool
-from storage.arrays.statistics import write_statistics
 from storage.parallel.pool import WorkerPool
 
 RAW = Product("capture", version=12)
@@ -103,10 +102,7 @@ class SweepRecorder:
         found: SignalStatistics,
         taken: Callable[[int], None],
     ) -> None:
-        """Write lines into spool and cube, one by one, and resume a stopped capture.
-
-        Damaged lines of the spool are requested again; a rig reads them from its files, or marks them invalid.
-        """
+        """Write lines into spool and cube, one by one, and resume a stopped capture."""
         references = source.references(sweep)
         header = SweepHeader(sweep, references, self.wavelength_nm, self.fwhm_nm, source.name, simulation=effects)
         samples, bands = references.dark.shape
@@ -123,7 +119,6 @@ class SweepRecorder:
                 statistics.add(line)
                 taken(spool.count)
 
-            spool.mend(source.lines_again(sweep, spool.lost))
             for block in spool.blocks():
                 cube.write(block)
                 for line in block:

@@ -38,12 +38,11 @@ from pipeline.signal.subspace import FEW_BANDS, SignalStatistics, bands_alone, c
 from pipeline.simulator.scenes.scene import RasterScene
 from storage.archive.keys import StageRef
 from storage.archive.manifests import check_files, read_table, write_table
-from storage.arrays.cubes import RawCube, SweepHeader, open_raw_cubes
+from storage.arrays.cubes import RawCube, SweepHeader, open_raw_cubes, read_statistics
 from storage.arrays.layout import SHARD_ROWS, numbers_in_memory
 from storage.arrays.mosaics import MosaicWriter
 from storage.arrays.signal_cubes import LineRows, SignalCubeWriter, open_signal_cubes
 from storage.arrays.spool import line_values
-from storage.arrays.statistics import read_statistics
 from storage.readers.raster_fields import RasterPixels
 
 SIGNAL = Product("condense", version=1)

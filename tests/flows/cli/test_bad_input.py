@@ -26,7 +26,7 @@ from tests.flows.conftest import act_instead
 
 ROOT = Path(__file__).parents[3]
 NM = "460,500,550,600,620,640"
-RAN = "The camera captured"
+RAN = "Report: "
 CAMERA = "[camera]\nsamples = 64\n"  # a narrow one: most of a small survey's time goes into samples beside the field
 
 

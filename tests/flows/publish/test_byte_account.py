@@ -12,13 +12,12 @@ import pytest
 from rich.console import Console
 
 from flows.archive.commands import contents
-from flows.archive.compare_command import compare
 from flows.archive.history import read_history
 from flows.publish import publishing
 from flows.publish.byte_account import publish_counted, recount_bytes
 from flows.publish.receipt import Receipt
-from flows.publish.receipt_table import byte_rows, print_table
-from flows.publish.report import render_report, replace_bytes
+from flows.publish.receipt_table import print_details, saving_rows
+from flows.publish.report import render_report, replace_savings
 from flows.publish.run_folder import Published
 from flows.terminal.figures import format_megabytes
 from storage.archive.archive import Archive
@@ -137,8 +136,7 @@ def test_what_is_found_counts_as_kept_and_not_as_written(
     assert account["kept"] == walked(root / "stages", again.folder)
     assert account["reused"] == {ref.uri: walked(ref.path) for ref in Archive.open(root).refs()}
     assert account["captured"] == first["captured"]  # its passes are the same
-    assert "Reused, found" in _printed(again.receipt)
-    assert "Reused, found" in (again.folder / "report.html").read_text()
+    assert "Reused stores" in (again.folder / "report.html").read_text()
 
 
 def test_a_recount_after_clearing_tells_what_is_left(survey_png: Survey, tmp_path: Path) -> None:
@@ -150,7 +148,7 @@ def test_a_recount_after_clearing_tells_what_is_left(survey_png: Survey, tmp_pat
     raw = archive.refs("capture")
     assert len(raw) == 2
     assert all(map(archive.clear, raw))
-    receipt = recount_bytes(archive, published.folder.name, replace_bytes)
+    receipt = recount_bytes(archive, published.folder.name, replace_savings)
     account = told(published.folder)
     assert account == receipt["data_bytes"]
     assert account["kept"] == walked(root / "stages", root / "runs") < first["kept"]
@@ -159,11 +157,11 @@ def test_a_recount_after_clearing_tells_what_is_left(survey_png: Survey, tmp_pat
     page = (published.folder / "report.html").read_text()
     Page(page)
     assert format_megabytes(account["kept"]) in page
-    section = re.compile('<section id="bytes">.*?</section>', re.DOTALL)
+    section = re.compile('<section id="savings">.*?</section>', re.DOTALL)
     assert section.sub("", page).rstrip() == section.sub("", before).rstrip()
     assert section.findall(page) != section.findall(before)
     assert problems(root) == []
-    recount_bytes(archive, published.folder.name, replace_bytes)
+    recount_bytes(archive, published.folder.name, replace_savings)
     assert told(published.folder)["kept"] == walked(root / "stages", root / "runs")
 
 
@@ -189,13 +187,6 @@ def test_a_run_in_a_bucket_counts_its_objects(
     assert again["written"] < again["moved_bucket"] < again["written"] + 1.2 * stores
 
 
-def test_what_goes_to_worker_processes_is_not_counted(survey_png: Survey, tmp_path: Path) -> None:
-    """The receipt has no number of it, and the table says so."""
-    receipt = survey_png(tmp_path / "archive", accuracy=False, scheduler="processes", workers="2").receipt
-    assert receipt["data_bytes"]["moved_workers"] is None
-    assert "not counted" in _printed(receipt)
-
-
 @pytest.mark.parametrize("stores", [899, 99_000, 999_400, 9_999_999_000])
 def test_the_figure_of_a_folder_that_holds_the_figure(
     stores: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -213,23 +204,22 @@ def test_the_figure_of_a_folder_that_holds_the_figure(
 
 def _printed(receipt: Receipt, width: int = 80) -> str:
     console = Console(file=io.StringIO(), width=width)
-    print_table(receipt, console)
+    print_details(receipt, console)
     return " ".join(console.file.getvalue().split())  # type: ignore[attr-defined]
 
 
 def test_terminal_and_page_show_megabytes_against_one_reference() -> None:
-    """A row each, with its fraction of the reference; what was reused stands below."""
-    rows = byte_rows(make_receipt())
+    """A row each, with its fraction of the reference; the page has the reused stores too."""
+    rows = [row for row in saving_rows(make_receipt()) if row["label"].startswith("bytes")]
     assert [(row["label"], row["done"], row["full"], row["ratio"]) for row in rows] == [
+        ("bytes kept", "1.5 MB", "4 MB", 0.375),
         ("bytes captured", "2 MB", "4 MB", 0.5),
         ("bytes written", "7 MB", "4 MB", 1.75),
-        ("bytes kept", "1.5 MB", "4 MB", 0.375),
     ]
-    words = "Reused, found and not written again: 1 store, 0.25 MB of the bytes kept."
     page = render_report(make_receipt(), PNG)
     Page(page)
+    assert "Reused stores: 1, 0.25 MB of the bytes kept." in page
     for text in (_printed(make_receipt()), page):
-        assert words in text
         for figure in ("bytes kept", "1.5 MB", "38 %", "4 MB"):
             assert figure in text, figure
 
@@ -239,21 +229,9 @@ def test_a_tiny_field_has_no_absurd_percentage() -> None:
     told = {"captured": 384, "written": 655_553, "kept": 655_553, "moved_bucket": 0, "reference": 384}
     receipt = make_receipt()
     receipt["data_bytes"] |= told
-    rows = {row["label"]: (row["done"], row["full"]) for row in byte_rows(receipt)}
+    rows = {row["label"]: (row["done"], row["full"]) for row in saving_rows(receipt)}
     assert rows["bytes captured"] == ("384 B", "384 B")
     assert rows["bytes kept"] == ("656 kB", "384 B")
     for text in (_printed(receipt), render_report(receipt, PNG).replace("\u202f", " ")):
         assert "1 710 times" in text
         assert "170717" not in text
-
-
-def test_compare_has_the_bytes_of_both(published: Published, survey_png: Survey, capsys: Any, tmp_path: Path) -> None:
-    """Each figure of both runs beside the other's."""
-    other = survey_png(tmp_path / "archive", accuracy=False, budget="0.7")
-    capsys.readouterr()
-    names = (published.folder.name, other.folder.name)
-    compare(tmp_path / "archive", *names, out=tmp_path, as_json=True)
-    found = json.loads(capsys.readouterr().out)["data_bytes"]
-    accounts = [told(one.folder) for one in (published, other)]
-    assert found["kept"] == [account["kept"] for account in accounts]
-    assert found["captured"] == [account["captured"] for account in accounts]

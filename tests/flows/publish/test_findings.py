@@ -48,26 +48,16 @@ def test_changed_hectares_are_told_from_class_to_class() -> None:
     assert [(round(area, 6), *pair) for area, *pair in found] == [(0.02, "soil", "crop"), (0.005, "soil", "unknown")]
 
 
-def test_words_tell_the_pixels_of_each_class_and_hectares_where_they_are_known() -> None:
-    """Classes that the map lacks are left out; a map without a class says so."""
-    areas: dict[str, Any] = {"px": {"bare_soil": 30, "crop": 10, "weed": 0}}
-    pixels = "bare soil 30 px (75 %), crop 10 px (25 %)"
-    assert finding_rows({"areas": areas}) == [("classes", pixels)]
-    with_ha = areas | {"ha": {"bare_soil": 0.3, "crop": 0.1, "weed": 0.0}}
-    assert finding_rows({"areas": with_ha}) == [("classes", f"bare soil 0.3 ha, crop 0.1 ha; {pixels}")]
-    assert finding_rows({"areas": {"px": {"weed": 0}}}) == [("classes", "no pixel has a class")]
-
-
-def test_words_tell_what_changed_and_what_is_old() -> None:
-    """From which class to which, with hectares; days with what is older; of a first capture nothing of either."""
+def test_rows_have_hectares_and_changes_where_they_are_known() -> None:
+    """Hectares of classes that the map has; changes with their classes; days with older hectares."""
+    areas = {"px": {"bare_soil": 30}, "ha": {"bare_soil": 0.3, "crop": 0.1, "weed": 0.0}}
+    assert finding_rows({"areas": areas}) == [("classes", "bare soil 0.3 ha, crop 0.1 ha")]
     later = {"changes_ha": [[0.5, "crop", "bare_soil"], [0.0004, "weed", "crop"]], "older_ha": {"1": 0.25, "7": 0.0}}
-    first = "EPSG:32632; 0.12 m a pixel"
+    first = "EPSG:32632; resolution 12 cm"
     assert finding_rows({"ground": GROUND | {"older_ha": {"1": 0.0}}}) == [("on the ground", first)]
     ((_, words),) = finding_rows({"ground": GROUND | later})
-    assert words == (
-        f"{first}; 0.5 ha changed: crop to bare soil 0.5 ha, weed to crop 4 m²; 0.25 ha last captured more than 1 day "
-        "ago"
-    )
+    changed = "changed 0.5 ha: crop to bare soil 0.5 ha, weed to crop 4 m²"
+    assert words == f"{first}; {changed}; captured longer ago than 1 day 0.25 ha"
 
 
 def _judged(weights: Path, folder: Path, content: dict[str, Any], limit: float = 1e6) -> Path:
@@ -92,8 +82,8 @@ def test_a_plain_scan_is_told_what_its_map_scores_by_itself(survey_png: Survey, 
     assert receipt["expected"]["miou"] == pytest.approx(told.miou, abs=1e-5)
     assert receipt["expected"]["error"] == pytest.approx(told.error, abs=1e-5)
     assert set(receipt["expected"]["per_class_iou"]) <= set(CLASSES)
-    words = f"about {100 * told.miou:.1f}, with no label asked; error {100 * told.error:.1f}"
-    assert words in dict(finding_rows(receipt))["expected score"]
+    words = f"miou {100 * told.miou:.1f}; error {100 * told.error:.1f}"
+    assert words in dict(finding_rows(receipt))["expected mIoU"]
 
 
 def test_a_score_that_may_be_any_is_not_predicted(survey_png: Survey, weights: Path, tmp_path: Path) -> None:
@@ -102,17 +92,15 @@ def test_a_score_that_may_be_any_is_not_predicted(survey_png: Survey, weights: P
     path = _judged(weights, tmp_path, content)
     receipt: Any = survey_png(tmp_path / "a", weights=str(path), effects="none", budget=None, scan_step="1").receipt
     assert "miou" not in receipt["expected"]
-    words = dict(finding_rows(receipt))["expected score"]
-    assert re.fullmatch(
-        r"no score predicted: it would be off by 3[78]\.\d points \(one .*\); judge the map by labels", words
-    )
+    words = dict(finding_rows(receipt))["expected mIoU"]
+    assert re.fullmatch(r"it would be off by 3[78]\.\d points \(one .*\); judge the map by labels", words)
 
 
 @pytest.mark.parametrize(
     ("spread", "unknown", "words"),
     [
-        (0.038, 0.0, "every line, 25 ms, 9.0 s, about 92.7 ± 3.8"),
-        (0.371, 0.0, "every line, 25 ms, 9.0 s, no score predicted: scenes differ by 37.1 points"),
+        (0.038, 0.0, "every line, 25 ms, 9.0 s, expected mIoU 92.7 ± 3.8"),
+        (0.371, 0.0, "every line, 25 ms, 9.0 s$"),
         (0.038, 1.0, "every line, 25 ms, 9.0 s$"),
     ],
     ids=["known", "spread too wide", "all of it unknown"],
@@ -125,12 +113,12 @@ def test_scans_promise_what_their_record_can_say(spread: float, unknown: float, 
 
 
 def test_words_of_a_memory_tell_change_beyond_what_maps_differ_by() -> None:
-    """Where about as many pixels differ as of two maps of the same ground none is said to have changed."""
+    """Where about as many pixels differ as of two maps of the same ground, none has changed."""
     memory = {"run": "r", "days": 3.0, "differing_px": 950, "expected_differing_px": 810, "changed_px": 0}
-    words = "r; 3.0 days earlier; 950 px differ from it; two maps of the same ground would differ at about 810"
+    words = "r; 3.0 days earlier; differing 950 px; expected differing 810 px"
     assert dict(finding_rows({"memory": memory}))["prior map"] == words
     changed = dict(finding_rows({"memory": memory | {"changed_px": 700}}))["prior map"]
-    assert changed == f"{words}; 700 px changed beyond that"
+    assert changed == f"{words}; changed 700 px"
 
 
 @pytest.mark.parametrize(

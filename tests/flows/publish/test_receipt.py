@@ -16,7 +16,7 @@ from rich.console import Console
 
 from flows.publish.field_map import ERROR_COLOURS, FieldMap, error_address
 from flows.publish.receipt import COSTS, Receipt, build_receipt, check_receipt
-from flows.publish.receipt_table import finding_rows, headline, print_table
+from flows.publish.receipt_table import finding_rows, format_score, headline, print_details, print_summary
 from flows.publish.report import Picture, render_report
 from flows.settings.survey_settings import Settings
 from flows.terminal.figures import format_area
@@ -64,6 +64,9 @@ def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:
         "measured": None,
         "cost_s": 1.5,
         "why": "asked for",
+        "reason": "asked",
+        "left_out": 0.5,
+        "magnitude": "shot noise",
         "unit": "sigma",
     }
     total = {
@@ -188,36 +191,66 @@ def test_comparable_leaves_times_out_and_nothing_else():
     assert comparable(one) != comparable({**one, "seed": 8})
 
 
-def test_the_table_fits_80_columns():
-    """Figures with their units, beside everything; small areas in square metres."""
-    text = _printed(make_receipt())
-    for words in ("104 s", "209 s", "50 %"):
-        assert words in text, words
-    assert max(map(len, _printed(make_receipt(), 80).splitlines())) <= 80
-    assert [format_area(hectares) for hectares in (2.5, 0.1, 0.0999, 0.0012)] == ["2.5 ha", "0.1 ha", "999 m²", "12 m²"]
-
-
-def _printed(receipt: Receipt, width: int = 100) -> str:
+def _printed(receipt: Receipt, width: int = 100, *, details: bool = False) -> str:
     console = Console(file=io.StringIO(), width=width)
-    print_table(receipt, console)
+    (print_details if details else print_summary)(receipt, console)
     return console.file.getvalue()
 
 
-def test_headline_is_one_paragraph_with_the_figures():
-    """Where, how long, how well, and the worst class of the truth; what was not judged is not mentioned."""
-    text = headline(make_receipt(), 0.23)
-    assert text.startswith("The camera captured 23 % of the field again. Capture took 104 s instead of 209 s")
-    assert "75.0 of 100" in text
-    assert "93.4 % of its pixels are right" in text
-    assert headline(make_receipt(), 0.0).startswith("The camera captured nothing again: no run of fine lines fits")
-    assert "truth" not in headline(make_receipt(labels=False))
-    words = "Its worst class is bare weed with 60.0: the overview alone gives 20.0, a full reading 80.0."
-    assert headline(make_receipt()).endswith(words)
+def test_the_end_of_a_survey_fits_the_terminal():
+    """Score, seconds, bytes kept and multiply-adds against the reference, in at most 13 lines of 80 columns."""
+    lines = _printed(make_receipt(), 80).rstrip().splitlines()
+    assert len(lines) <= 13
+    assert max(map(len, lines)) <= 80
+    for words in (
+        "capture time",
+        "104 s",
+        "209 s",
+        "50 %",
+        "bytes kept",
+        "1.5 MB",
+        "multiply-adds",
+        "mIoU 75.0 of 100",
+    ):
+        assert any(words in line for line in lines), words
+    assert not any(words in line for line in lines for words in ("rectify", "torch", "shot", "samples"))
+    assert [format_area(hectares) for hectares in (2.5, 0.1, 0.0999, 0.0012)] == ["2.5 ha", "0.1 ha", "999 m²", "12 m²"]
+
+
+def test_the_details_have_stages_effects_and_versions():
+    """A stage that was skipped has no row."""
     receipt = make_receipt()
-    receipt["accuracy"]["all"] = {"miou": None, "per_class_iou": {}}
-    text = headline(receipt)
-    assert "the overview alone gives 50.0. Its worst class" in text
-    assert text.endswith("bare weed with 60.0: the overview alone gives 20.0.")
+    receipt["stages"][1]["state"] = "skipped"
+    text = _printed(receipt, details=True)
+    for words in ("samples on the field", "capture", "torch 2.13.0", "Effects computed: 1 of 1"):
+        assert words in text, words
+    assert "rectify" not in text
+
+
+@pytest.mark.parametrize(
+    ("found", "words"),
+    [
+        ({}, "The score is not known: there are no labels."),
+        ({"expected": {"miou": 0.94, "error": 0.02}}, "Expected mIoU 94.0 ± 2.0 of 100, estimated from the map's own"),
+        ({"expected": {"miou": 0.94, "error": 0.4}, "accuracy_is": "pending"}, "is added later."),
+        ({"unknown": {"fraction": 0.5}, "expected": {"miou": 0.9, "error": 0.0}}, "Unknown: 50 % of the map. These"),
+    ],
+)
+def test_a_map_without_labels_has_its_own_estimate(found: dict, words: str):
+    """None where the error leaves nearly everything open, or where the weights do not fit the field."""
+    text = format_score({**make_receipt(labels=False), **found})
+    assert words in text
+    assert ("mIoU" in text) == ("Expected" in words)
+
+
+def test_headline_is_one_paragraph_with_the_figures():
+    """Score, worst class of the labels, capture time, fraction captured again; nothing on what was not judged."""
+    assert headline(make_receipt(), 0.23) == (
+        "mIoU 75.0 of 100 against the labels (93.4 % of pixels correct). Its worst class is bare weed with 60.0: the"
+        " overview alone gives 20.0, a full reading 80.0. Capture time: 104 s (50 % of the reference, 209 s). Captured"
+        " again at full resolution: 23 % of the field."
+    )
+    assert "labels (" not in headline(make_receipt(labels=False))
 
 
 PNG = b"\x89PNG\r\n\x1a\nnot a real picture"
@@ -256,25 +289,25 @@ def test_words_are_escaped():
 def test_page_has_the_figures():
     """Savings, accuracy, settings and versions; without a truth nothing of accuracy; dollar signs survive."""
     page = render_report(make_receipt(), PNG, captured_again=0.23)
-    figures = ("104 s", "predicted", "50 %", "75.0", "93.4", "56.2 ± 1.2", "67 %", "budget", "torch", "Class by class")
-    for words in (*figures, "this survey wheat 2 px", "2 of 3 classes are in the truth"):
+    figures = ("104 s", "50 %", "75.0", "93.4", "56.2 ± 1.2", "67 %", "budget", "torch", "Class by class")
+    for words in (*figures, "this survey wheat 2 px", "2 of 3 classes are in the labels"):
         assert words in page, words
     receipt = make_receipt(labels=False)
     receipt["survey"] = "field $title"
     page = render_report(receipt, PNG)
     Page(page)
-    assert "How good the map is" not in page
+    assert "<h2>Accuracy</h2>" not in page
     assert "field $title" in page
 
 
-def test_seconds_stand_beside_the_cheapest_good_scan():
-    """With a scan performance table it is named."""
+def test_the_cheapest_good_scan_is_named():
+    """The weights' scan performance table has it; without a table there is none."""
     receipt = make_receipt()
-    receipt["savings"]["capture_s"] |= {"done": 30.0, "full": 214.0, "ratio": 0.14, "uniform": 40.0}
-    receipt["savings"]["capture_s"]["uniform_scan"] = "every line, 17 ms"
-    words = headline(receipt)
-    assert "Capture took 30 s instead of 214 s for every line of 100 ms (14 %)." in words
-    assert "The cheapest uniform scan that is nearly as good as any takes 40 s (every line, 17 ms)." in words
+    assert "uniform scan" not in _printed(receipt)
+    receipt["savings"]["capture_s"] |= {"uniform": 40.0, "uniform_scan": "every line, 17 ms"}
+    assert "uniform scan with nearly the best score takes 40 s (every line, 17 ms)." in " ".join(
+        _printed(receipt).split()
+    )
 
 
 def test_findings_are_rows_and_what_is_not_there_is_none():
@@ -284,10 +317,15 @@ def test_findings_are_rows_and_what_is_not_there_is_none():
         "zones": {"kept_px": 50, "field_px": 100, "no_go_px": 0, "kept_m2": 5e4},
         "expected": {"miou": 0.8, "error": 0.02},
     }
-    assert finding_rows(found) == [
-        ("expected score", "about 80.0, with no label asked; error 2.0"),
-        ("zones", "50 px are mapped; 5 ha"),
-    ]
+    assert finding_rows(found) == [("expected mIoU", "miou 80.0; error 2.0"), ("zones", "kept 50 px; kept 5 ha")]
+
+
+def test_a_report_begins_with_map_savings_and_score():
+    """Effects, stages, settings and versions are folded behind everything else."""
+    page = render_report(make_receipt(), PNG, field=FieldMap((2, 2), [], []))
+    order = ('class="lead">mIoU 75.0', 'id="field"', 'id="savings"', 'id="areas"', 'id="files"', '<details id="stages"')
+    places = [page.index(words) for words in order]
+    assert places == sorted(places)
 
 
 def test_a_report_has_the_confusion_matrix() -> None:
@@ -297,7 +335,13 @@ def test_a_report_has_the_confusion_matrix() -> None:
     receipt["accuracy"] |= {"confusion": [[8, 2, 1], [1, 6, 1], [0, 0, 0]], "kappa": 0.4875}
     page = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", render_report(receipt, b"")))
     assert "mapped as soil bare weed user's accuracy" in page.replace("&#39;", "'")
-    for row in ("soil 8 1 88.9", "bare weed 2 6 75.0", "wheat 1 1 0.0", "producer's accuracy 72.7 75.0", "is 0.487"):
+    for row in (
+        "soil 8 1 88.9",
+        "bare weed 2 6 75.0",
+        "wheat 1 1 0.0",
+        "producer's accuracy 72.7 75.0",
+        "kappa: 0.487",
+    ):
         assert row in page.replace("&#39;", "'"), row
 
 
@@ -326,11 +370,11 @@ def test_a_report_links_the_products() -> None:
 def test_the_effects_of_the_simulator_are_folded() -> None:
     """Their table opens on a click; nothing of it where nothing was simulated."""
     page = render_report(make_receipt(), PNG)
-    folded = page.partition('<details id="effects"><summary>What the simulator took into account</summary>')[2]
+    folded = page.partition('<details id="effects"><summary>Simulated effects</summary>')[2]
     assert "asked for" in folded.partition("</details>")[0]
     receipt = make_receipt()
     del receipt["effects"], receipt["effects_total"]
-    assert "simulator" not in render_report(receipt, PNG)
+    assert "Simulated effects" not in render_report(receipt, PNG)
 
 
 def test_an_error_map_stands_beside_the_scores() -> None:
@@ -344,5 +388,5 @@ def test_an_error_map_stands_beside_the_scores() -> None:
     assert tuple(shown[0, 1]) == wrong
     assert shown[1, :, 3].tolist() == [0, 0]
     page = render_report(make_receipt(), PNG, field=FieldMap((2, 2), [], [], address))
-    assert address in page.partition("Where map and labels differ")[2]
-    assert "labels differ" not in render_report(make_receipt(), PNG, field=FieldMap((2, 2), [], []))
+    assert address in page.partition("<h3>Errors</h3>")[2]
+    assert "<h3>Errors" not in render_report(make_receipt(), PNG, field=FieldMap((2, 2), [], []))

@@ -199,7 +199,6 @@ def test_nothing_goes_while_a_survey_works(archive: Archive) -> None:
     [
         ("storage.archive.archive", "take_its_place", "before", 2),
         ("storage.archive.archive", "take_its_place", "after", 1),
-        ("flows.publish.retention", "recount_bytes", "before", 0),
         ("flows.publish.byte_account", "publish_counted", "after", 0),
     ],
 )

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flows.publish.spectra import class_spectra, curve_with_gaps, draw_spectra
+from flows.publish.panels import class_spectra, curve_with_gaps, draw_spectra
 from pipeline.signal.components import Components
 from storage.arrays.class_maps import ClassMap
 from storage.arrays.mosaics import Mosaic, MosaicWriter, open_mosaic

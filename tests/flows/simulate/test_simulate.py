@@ -71,12 +71,7 @@ def test_a_scan_that_is_there_draws_nothing(
     monkeypatch.setattr(SceneRaster, "thinned", refuse)
     ended = command_line(*words(scene_files, archive))
     assert (ended.code, ended.out) == (0, "")
-    for name in (
-        *(effect.name for effect in EFFECTS),
-        "already there",
-        "6 of 33 effects are computed",
-        "coarse-0.zarr",
-    ):
+    for name in (*(effect.name for effect in EFFECTS), "already there", "Effects computed: 6 of 33", "coarse-0.zarr"):
         assert name in " ".join(ended.err.split())
     again = json.loads(command_line(*words(scene_files, archive, "--json")).out)
     assert again["cached"]
@@ -205,4 +200,4 @@ def test_the_table_fits_the_terminal(width: int) -> None:
     assert "< 0.01 s" in row
     assert "0.3 nm" not in row
     assert "smile: smile" not in said.getvalue()
-    assert "Not there: wind (the air is calm)." in said.getvalue()
+    assert "Absent: wind (the air is calm)." in said.getvalue()

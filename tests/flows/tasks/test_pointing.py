@@ -75,7 +75,7 @@ def test_what_the_mirror_missed_is_told_and_detail_still_helps(surveyed: tuple[d
     unseen = unseen[json.loads((archive / receipt["products"]["plan"]).read_text())["patch_index"]]
     assert receipt["pointing"]["fine"]["partly_seen"] == np.count_nonzero(unseen.any(axis=(1, 2)))
     rows = dict(finding_rows(surveyed[0]))
-    assert all("put right by up to" in rows[f"pointing, {name}"] for name in ("coarse", "fine"))
+    assert all("corrected by up to" in rows[f"pointing, {name}"] for name in ("coarse", "fine"))
     accuracy = surveyed[0]["accuracy"]
     assert accuracy["miou"] > accuracy["none"]["miou"]
 
@@ -95,16 +95,16 @@ def found_of(**told: Any) -> dict[str, Any]:
 TOLD: dict[str, tuple[dict[str, Any], str]] = {
     "put right": (
         {"sweeps": {"a": [0, 0], "b": [3, -4]}, "residual_rms_px": 0.123},
-        "put right by up to 5.0 px; 0.12 px rms are left at the seams",
+        "corrected by up to 5.0 px; residual rms 0.12 px",
     ),
-    "nothing left": ({"sweeps": {"a": [0, 0], "b": [3, -4]}}, "put right by up to 5.0 px"),
+    "nothing left": ({"sweeps": {"a": [0, 0], "b": [3, -4]}}, "corrected by up to 5.0 px"),
     "none found": (
         {"held": "the mosaic", "sweeps": {"b": [0, 0]}, "not_found": ["b"]},
-        "put right by up to 0.0 px; b left where the mirror reported: nothing was found",
+        "corrected by up to 0.0 px; not found b",
     ),
     "partly seen": (
         {"sweeps": {"a": [0, 0], "b": [3, -4]}, "too_narrow": [{}], "partly_seen": 7},
-        "put right by up to 5.0 px; 1 overlap too narrow to compare; 7 chosen patches not captured whole",
+        "corrected by up to 5.0 px; 1 overlap too narrow to compare; partly seen 7",
     ),
 }
 

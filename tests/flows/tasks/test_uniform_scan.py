@@ -79,9 +79,9 @@ def test_receipt_and_pages_tell_a_scan(scanned: tuple[Path, Any]) -> None:
     assert "captured again" not in page
     capture, camera_s = receipt["savings"]["capture_s"], receipt["field"]["camera_s"]
     assert capture["done"] < capture["full"] == pytest.approx(camera_s["full_scan"])
-    assert "the coarse pass alone" not in page.partition("What it cost")[0]
+    assert "the coarse pass alone" not in page.partition("<h2>Savings")[0]
     assert "the field was scanned once: every 2nd line, 25 ms" in page
-    assert "about 91.0 ± 3.0" in page
+    assert "expected mIoU 91.0 ± 3.0" in page
 
 
 def test_seconds_choose_the_scan_and_are_kept(
@@ -167,9 +167,6 @@ def test_weights_without_a_record_scan_by_hand_alone(survey_png: Survey, tmp_pat
     published = survey_png(tmp_path / "by hand", budget=None, scan_step="4")
     assert "scans" not in published.receipt
     assert "full_scan" not in published.receipt["savings"]["capture_s"]
-    page = (published.folder / "report.html").read_text(encoding="utf-8")
-    assert "instead of" in page
-    assert "the weights have no scan performance table, so that seconds stand beside every line" in page
     assert published.receipt["plan"]["reason"] == "the field was scanned once: every 4th line, 100 ms"
 
 

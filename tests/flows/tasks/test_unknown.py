@@ -132,7 +132,7 @@ def test_a_map_of_nothing_known_is_published_and_says_what_to_do(
     assert receipt["unknown"]["fraction"] == 1
     assert receipt["accuracy"]["miou"] == 0
     words = dict(finding_rows(receipt))
-    assert "100 % of the map is unknown" in words["unknown"]
+    assert "fraction 100 %" in words["unknown"]
     assert "These weights do not know this field: train" in words["weights"]
     assert "--unknown off" in (published.folder / "report.html").read_text(encoding="utf-8")
     assert json.loads((published.folder / "receipt.json").read_text())["unknown"]["pixels"] == 96 * 128

@@ -341,7 +341,7 @@ PLAIN = st.recursive(
 
 
 @given(st.dictionaries(st.text(max_size=4), PLAIN, max_size=5))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 def test_order_of_parameters_does_not_count(params: dict[str, object]) -> None:
     """The same table in another order has the same key."""
     turned = dict(reversed(params.items()))
@@ -349,7 +349,7 @@ def test_order_of_parameters_does_not_count(params: dict[str, object]) -> None:
 
 
 @given(st.floats(1e-6, 1e6))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 def test_rounding_noise_does_not_count(value: float) -> None:
     """A float and the float that its 12 digits give are one parameter; a change in the ninth digit is another."""
     key = stage_key("plan", 1, {"a": value}, [])

@@ -31,7 +31,7 @@ Case = tuple[str, str]  # what lies in the place, and the place
 STORE = ("store", "store manifest", "store file")
 CASES = [
     *(("link", place) for place in (*STORE, "run")),
-    *(("pipe", place) for place in (*STORE, "store beside", "run receipt", "spool")),
+    *(("pipe", place) for place in (*STORE, "store beside", "run receipt")),
     *(("link nowhere", place) for place in ("store", "run manifest")),
 ]
 
@@ -40,7 +40,7 @@ def put(small: Small, case: Case) -> str:
     """Put a link, or a pipe without a writer, in a place of an archive or beside it; gives the address."""
     what, place = case
     kind, _, part = place.partition(" ")
-    folder = {"store": small.mosaic.path, "run": small.run, "spool": small.run.parents[1] / "spool" / "key"}[kind]
+    folder = {"store": small.mosaic.path, "run": small.run}[kind]
     names = {
         "": ".",
         "manifest": "manifest.json",
@@ -48,7 +48,7 @@ def put(small: Small, case: Case) -> str:
         "receipt": "receipt.json",
         "beside": "inner/more",
     }
-    path = folder / ("lines.lines" if kind == "spool" else names[part])
+    path = folder / names[part]
     if path.exists():
         target = away(path)
     else:
@@ -57,7 +57,7 @@ def put(small: Small, case: Case) -> str:
         os.mkfifo(path)
     else:
         path.symlink_to("nowhere" if what == "link nowhere" else target)
-    return {"store": small.mosaic.uri, "run": f"runs/{small.run.name}", "spool": "spool/key/lines.lines"}[kind]
+    return {"store": small.mosaic.uri, "run": f"runs/{small.run.name}"}[kind]
 
 
 @pytest.mark.parametrize("case", CASES)

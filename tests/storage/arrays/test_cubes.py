@@ -40,7 +40,7 @@ def _lines(header: SweepHeader, seed: int = 0) -> list[Line]:
     return [Line(n, data[n], 0.001 * n, -0.5, 0.1 * n, 100.0, n % 7 != 3) for n in range(lines)]
 
 
-@pytest.mark.parametrize("bands", [1, 2, 4, 15, 200, 270, 939])
+@pytest.mark.parametrize("bands", [1, 15, 270])
 def test_raw_cube_round_trip(tmp_path: Path, bands: int) -> None:
     """Numbers, line facts, references, wavelengths and the sweep come back bit by bit for any band count."""
     header = _header(70, 9, bands)
@@ -152,7 +152,7 @@ def _values(bands: int) -> NDArray[np.float32]:
     return values
 
 
-@pytest.mark.parametrize("bands", [1, 4, 270])
+@pytest.mark.parametrize("bands", [1, 40])
 def test_mosaic_round_trip(tmp_path: Path, bands: int) -> None:
     """Values come back but for rounding, missing ones as NaN; plain xarray masks and scales the same scores."""
     stored = write_values(tmp_path / "m.zarr", _values(bands), NM[:bands], GRID)

@@ -160,8 +160,8 @@ def write(path: Path, geobox: GeoBox) -> Path:
     return path
 
 
-@pytest.mark.parametrize("epsg", [32632, 32756, 5041, 3034])
-@pytest.mark.parametrize("resolution", [0.03, 0.007, 1 / 3])
+@pytest.mark.parametrize("epsg", [32632, 5041])
+@pytest.mark.parametrize("resolution", [0.03, 1 / 3])
 @pytest.mark.parametrize("turn", [0, 30])
 def test_plain_xarray_sees_the_same_geobox(tmp_path: Path, epsg: int, resolution: float, turn: float) -> None:
     """Opened without this project's code, dataset and image have the grid that was written, to the last bit."""

@@ -94,7 +94,7 @@ def test_strips_make_the_window(
 
 
 @given(st.sampled_from([1, 2, 3, 4, 8]), st.integers(0, 30), st.integers(0, 12))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=12, deadline=None)
 def test_coarser_pixels_are_means(stored: tuple[Path, NDArray[np.float32]], factor: int, top: int, left: int) -> None:
     """Of the pixels that were seen; NaN where these are less than half, at the borders of those that there are."""
     mosaic, (height, width) = open_mosaic(stored[0]), stored[1].shape[:2]

@@ -152,19 +152,6 @@ def test_pictures_are_read_without_the_cube(tmp_path: Path) -> None:
         open_raw_cube(path).read(0, 1)
 
 
-def test_stores_of_before_open_without_a_picture(tmp_path: Path) -> None:
-    """A cube or mosaic that was stored without one has none; everything else is there."""
-    path = _stored(tmp_path / "a.zarr")
-    for file in sorted((path / "quicklook").rglob("*"), reverse=True):
-        file.unlink() if file.is_file() else file.rmdir()
-    (path / "quicklook").rmdir()
-    cube = open_raw_cube(path)
-    assert cube.quicklook() is None
-    np.testing.assert_array_equal(cube.read(0, 3), LINES[:3])
-    plain_writer(tmp_path / "m.zarr", (8, 8), WAVES)
-    assert quicklook_of(open_group(tmp_path / "m.zarr")) is None
-
-
 def test_a_mosaic_has_its_picture_as_it_was_given(tmp_path: Path) -> None:
     """Of a picture that was made elsewhere nothing but its colours is known."""
     image = np.random.default_rng(1).integers(0, 255, (20, 30, 3), dtype=np.uint8)
@@ -173,15 +160,6 @@ def test_a_mosaic_has_its_picture_as_it_was_given(tmp_path: Path) -> None:
     assert seen is not None
     np.testing.assert_array_equal(seen.image, image)
     assert (seen.low, seen.bands) == ((), ())
-
-
-def test_a_picture_needs_no_more_memory_than_itself() -> None:
-    """What is kept of a block is a copy of its few pixels, not a view that holds the block."""
-    seen = LineThumbnail((128, 600, 12), WAVES)
-    seen.add(0, LINES[:64], np.ones(64, np.bool_))
-    (kept,) = seen._rows
-    assert kept.base is None or kept.base.nbytes == kept.nbytes
-    assert kept.shape == (16, 150, 3)
 
 
 def test_white_as_dark_as_dark_is_missing(tmp_path: Path) -> None:

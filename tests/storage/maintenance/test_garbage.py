@@ -42,8 +42,8 @@ def test_young_stores_stay_with_what_they_rest_on(archive: Archive) -> None:
     plan = plan_clearance(archive, keep_days=2)
     assert {one.uri for one in plan.removals} == {other.raw.uri, other.mosaic.uri, other.map.uri}
     assert plan.kept == {
-        small.raw.uri: "what stays was made of it",
-        small.mosaic.uri: "what stays was made of it",
+        small.raw.uri: "an input of a store that stays",
+        small.mosaic.uri: "an input of a store that stays",
         small.map.uri: "younger than 2 days",
     }
     assert len(plan_clearance(archive, keep_days=4).removals) == 0
@@ -55,7 +55,7 @@ def test_what_was_made_of_young_stores_is_young_itself(archive: Archive) -> None
     grow_old(small.map, days=3)
     plan = plan_clearance(archive, keep_days=2)
     assert plan.removals == ()
-    assert plan.kept[small.map.uri] == "made of what is younger than 2 days"
+    assert plan.kept[small.map.uri] == "made of a store younger than 2 days"
 
 
 def test_raw_lines_of_a_rig_go_only_when_asked(archive: Archive) -> None:
@@ -151,7 +151,7 @@ def test_no_store_goes_where_a_run_cannot_tell_what_it_names(archive: Archive, v
         assert (found.obstacle, len(found.removals)) == (None, 3)
         return
     assert found.obstacle is not None
-    assert found.obstacle.startswith(f"no store is removed: runs/{small.run.name} does not tell")
+    assert found.obstacle.startswith(f"no store is removed: the stores of runs/{small.run.name} are not known")
     (small.run / victim).unlink()
     found = clear_up(archive, keep_days=0)
     assert found.obstacle is not None
@@ -167,7 +167,7 @@ def test_no_store_goes_where_a_store_cannot_tell_what_it_rests_on(archive: Archi
     (small.map.path / "manifest.json").write_text("{")
     found = clear_up(archive, keep_days=0)
     assert found.obstacle is not None
-    assert f"{small.map.uri} does not tell what it was made of" in found.obstacle
+    assert f"the inputs of {small.map.uri} are not known" in found.obstacle
     assert len(archive.refs()) == 3
 
 

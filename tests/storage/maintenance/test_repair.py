@@ -82,7 +82,7 @@ def test_raw_lines_of_a_rig_stay_with_all_that_was_made_of_them(archive: Archive
     flip(small.raw.path / "data.bin")
     done = _repair(archive, lambda settings: pytest.fail("nothing to run"))
     assert not done.complete
-    assert "raw lines that cannot be had again" in done.plan.hopeless[small.raw.uri]
+    assert "raw lines cannot be captured again" in done.plan.hopeless[small.raw.uri]
     assert _moments(archive) == before
     assert _bad(archive) == [small.raw.uri]
     flip(small.map.path / "data.bin")

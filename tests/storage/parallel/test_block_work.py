@@ -269,7 +269,9 @@ def test_a_scheduler_that_goes_away_is_one_error(tmp_path: Path) -> None:
         address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
     with run_script(tmp_path, GONE, address) as started:
         printed, said = started.communicate(timeout=60)
-    gone = f"--scheduler {address}: the scheduler is gone; the same command goes on once it is there again"
+    gone = (
+        f"--scheduler {address}: the scheduler is gone. Start it again and repeat the command: finished blocks are kept"
+    )
     assert (started.returncode, printed.splitlines(), said) == (0, [gone, "[0, 1, 2]"], "")
 
 

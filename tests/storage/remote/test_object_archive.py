@@ -339,7 +339,7 @@ def test_addresses_of_other_kinds_are_no_folders(text: str, tmp_path: Path, monk
     [
         ("Server returned non-2xx status code: 503 Service Unavailable: SlowDown", "run again later"),
         ("HTTP error: request or response body error", "broken off"),
-        ("Server returned non-2xx status code: 501 Not Implemented: ", "lacks what an archive needs"),
+        ("Server returned non-2xx status code: 501 Not Implemented: ", "has no conditional puts"),
         ("Received redirect without LOCATION", "set AWS_REGION"),
         ('Encountered object with invalid path: Path "x//y"', 'Path "x//y"; take it out of the bucket'),
         ("The AWS Access Key Id does not exist: InvalidAccessKeyId", "check AWS_ACCESS_KEY_ID"),
