@@ -120,15 +120,6 @@ def test_parts_are_means_of_the_held_positions(positions: float, step: int, part
         np.testing.assert_allclose(found[line], held.mean(axis=1) - planned, atol=1e-3 / positions + 3e-4)
 
 
-@pytest.mark.parametrize("positions", [1.0, 2.0, 5.0])
-def test_whole_numbers_do_not_shake_lines(positions: float):
-    """A whole number of positions per line leaves every line where it is planned."""
-    shift = STAIRCASE.aim(block(positions), "exact")
-    assert shift.shape == (41, int(positions), 2)
-    np.testing.assert_allclose(shift.mean(axis=1), 0, atol=1e-12)
-    np.testing.assert_allclose(shift[:, :, 1], np.tile((np.arange(positions) + 0.5) / positions - 0.5, (41, 1)))
-
-
 @pytest.mark.parametrize("image", ["waves", "step", "point"])
 @pytest.mark.parametrize("positions", [0.5, 0.9, 1.5, 2.5, 7.3])
 def test_bound_holds_and_is_tight(positions: float, image: str):

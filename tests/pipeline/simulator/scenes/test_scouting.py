@@ -7,9 +7,15 @@ import pytest
 from scipy import ndimage
 
 from pipeline.errors import SceneError
-from pipeline.simulator.scenes.built_in import built_in_scene, is_built_in_key
+from pipeline.simulator.scenes.built_in import (
+    SCOUTED,
+    built_in_scene,
+    is_built_in_key,
+    patches_of,
+    scouting_plan,
+    scouting_scene,
+)
 from pipeline.simulator.scenes.farm.farm_plan import CLASS_COLOURS, CLASSES
-from pipeline.simulator.scenes.farm.scouting import SCOUTED, patches_of, scouting_plan, scouting_scene
 from pipeline.simulator.scenes.scene import RasterScene
 
 SIZE = (320, 400)
