@@ -34,7 +34,7 @@ Floats = NDArray[np.float64]
 PERIOD_PX = 768
 TILE_PX = 120  # of a tile, within a scene that is even about it
 EDGE_PX = 8
-SAMPLES = 2  # of a tile that are compared
+SAMPLES = 3  # of a tile that are compared
 KINDS = ("noise", "edges", "points", "field")
 ALL: dict[Effect, str] = {
     effect: effect.variants[0] for effect in (KEYSTONE, ABERRATION, DEFOCUS, DIFFRACTION, SLIT, SMEAR, ROTATION)

@@ -13,7 +13,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import scene_to_direction
 from pipeline.geometry.scan import Sweep, sweep_to_scene
 from pipeline.simulator.effects.air import PARALLAX, TURBULENCE, WIND, closeness, rytov_variance, sway_px, turbulence_px
-from pipeline.simulator.effects.effect import SweepBlock
+from pipeline.simulator.effects.effect import SweepBlock, survey_stream
 from pipeline.simulator.rig_model import Air, Rig
 from tests.pipeline.geometry.test_second_order import relief_error
 from tests.pipeline.simulator.fine_image import IMAGES, SWEEP, change, probe_of, shifted
@@ -162,6 +162,16 @@ def test_sizes():
     assert np.hypot(along, scan).max() == pytest.approx(6.306, rel=0.01)
     moved = np.hypot(np.diff(along[:, 320]), np.diff(scan[:, 320])).max()
     assert 0.9 < moved / (2 * 6.306 * math.sin(0.1 * math.pi)) < 1.01
+
+
+@pytest.mark.parametrize("along", ["x", "y"])
+def test_the_crop_sways_along_the_wind(along: str):
+    """The motion lies along the heading that is drawn for the survey, on the scene's own axes."""
+    heading = survey_stream(0, WIND.name).uniform(0, 2 * math.pi, 2)[1]
+    first, second = wind_shown(BREEZE, sweep=replace(SWEEP, along=along))
+    right, down = (first, second) if along == "x" else (second, first)
+    np.testing.assert_allclose(right * math.sin(heading), down * math.cos(heading), atol=1e-9)
+    assert np.abs(right).max() == pytest.approx(6.306 * abs(math.cos(heading)), rel=0.02)
 
 
 def test_fast_sways_are_aliased():

@@ -81,7 +81,7 @@ def test_settling_takes_the_way_back_away():
     assert abs(transient(rig(100.0), SWEEP, np.arange(1))[0, 0]) < 1e-4
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(st.floats(0.01, 10.0), st.floats(0.5, 1000.0), st.floats(0.1, 500.0), st.floats(0.0, 1.0), st.integers(1, 5))
 def test_any_mirror_is_finite_and_within_its_bound(damping: float, ms: float, hz: float, settled: float, step: int):
     """Stiff or slack, no NaN; and the change of a wave stays below the bound."""
@@ -107,7 +107,7 @@ def block(positions: float, sweep: Sweep = STAIRCASE_SWEEP, lines: range = range
     return SweepBlock(staircase_rig(positions), sweep, lines, np.array([500.0]), (64, 64))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(st.floats(0.05, 40.0), st.integers(1, 5), st.integers(1, 4))
 def test_parts_are_means_of_the_held_positions(positions: float, step: int, parts: int):
     """Each part has the mean of what the mirror holds in it, taken here at many moments."""

@@ -98,7 +98,7 @@ def test_one_sweep_of_640_lines_changes_138_dn():
 
 
 @given(st.integers(-4500, 4500), st.integers(-4500, 4000), st.integers(1, 60), st.integers(1, 8))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_bounds_hold_and_are_tight(swath_px, start_px, lines, step):
     """The greatest way from 1 among all lines is the bound's, within 1 %."""
     sweep = vignetting_sweep_at(swath_px, start_px, lines, step)

@@ -64,12 +64,12 @@ def test_spread_of_the_draws():
 
 
 def test_bound_holds_and_is_tight():
-    """Waves in random directions change by less than the bound in 8 surveys, at the median by a sixth at least."""
+    """Waves in random directions change by less than the bound in 4 surveys, at the median by a sixth at least."""
     rng = np.random.default_rng(5)
     ratios = []
-    for seed in range(8):
+    for seed in range(4):
         wave = rng.normal(0, 0.4, (3, 2))
-        place, phase = rng.uniform(-9, 9, (400, 2)), rng.uniform(0, 7, 3)
+        place, phase = rng.uniform(-9, 9, (200, 2)), rng.uniform(0, 7, 3)
         slope = np.abs(np.cos(place @ wave.T + phase) @ wave).max(axis=0) * 1.02
         scan_pass = np.sin(place @ wave.T + phase)
         shift = shifts(seed=seed)

@@ -59,7 +59,7 @@ def light_of(lines: range, seed: int = 0) -> NDArray[np.float32]:
 
 
 @pytest.mark.parametrize("variant", ["exact", "gaussian"])
-@pytest.mark.parametrize("level", [1.0, 10.0, 100.0, 650.0, 1000.0, 10_000.0, 60_000.0])
+@pytest.mark.parametrize("level", [1.0, 100.0, 10_000.0])
 def test_mean_and_variance_follow_the_photon_law(level: float, variant: str) -> None:
     """2e5 draws: the variance is the mean's and the mean the light's, within 1 % or 3 sigma."""
     counts = read_out(even(level), block_of(Rig(camera=COUNTING), seed=3), {SHOT: variant}).astype(np.float64)
@@ -70,7 +70,7 @@ def test_mean_and_variance_follow_the_photon_law(level: float, variant: str) -> 
 
 
 @pytest.mark.parametrize("variant", ["exact", "gaussian"])
-@pytest.mark.parametrize("level", [0.0, 30.0, 400.0, 5000.0])
+@pytest.mark.parametrize("level", [0.0, 400.0])
 def test_read_noise_adds_its_variance(level: float, variant: str) -> None:
     """20 e- in quadrature, and 1/12 of a DN by rounding, whether in one draw with the shot noise or its own."""
     camera = LineCamera(electrons_per_dn=2.0, bits=16, dark_dn=200.0)

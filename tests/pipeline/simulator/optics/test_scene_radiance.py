@@ -110,13 +110,14 @@ def test_the_last_pixels_are_seen_as_any(kind: str) -> None:
 
 
 def far_and_near() -> np.ndarray:
-    """Light of samples in small scenes, far beside them and nowhere, of all kinds: a block of 64, and a part of one."""
+    """Light of samples in small scenes, far beside them and nowhere: a block of 64, and a part of one."""
     views = views_of(66, 60.0)
     views = replace(views, scan=np.where(np.arange(66) % 5, views.scan, np.nan))
-    found = [scan_pass(scene_of(kind), views, along_y=bool(number % 2)) for number, kind in enumerate(KINDS)]
+    found = [scan_pass(scene_of(kind, 9), views, along_y=bool(number % 2)) for number, kind in enumerate(CHECKED_KINDS)]
     return np.concatenate([light.ravel() for light in found])
 
 
+CHECKED_KINDS = ("few", "materials", "own plane")
 CHECKED = """
 import sys
 import numpy

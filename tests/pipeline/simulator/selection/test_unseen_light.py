@@ -11,6 +11,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.probe import lights_within
 from pipeline.simulator.rig_model import Optics, Rig
+from pipeline.simulator.selection.extrema import find_extrema
 from pipeline.simulator.selection.survey_probe import line_means, probe_scene
 from tests.pipeline.simulator.bound_trials import trials
 from tests.pipeline.simulator.random_cases import Case
@@ -94,6 +95,18 @@ def test_least_light_of_a_dark_band_is_that_of_its_group() -> None:
     light = (scene.planes * scene.electrons)[0, 0]
     assert (low <= 1.001 * light).all()
     assert (high >= 0.999 * light).all()
+
+
+@pytest.mark.parametrize("bands", [3, 12])
+def test_places_lie_within_the_scene(bands: int) -> None:
+    """The brightest pixel is the last one, of a scene whose tiles end beyond it; its edge is repeated there."""
+    values = np.ones((45, 43, bands))
+    values[-1, -1] = 5.0
+    scene = image_scene(values, CAMERA, np.linspace(400, 1000, bands))
+    places = find_extrema(scene, CAMERA, [Sweep("s", "fine", "x", 0.0, -22.0, 45)], 200)
+    assert [44.0, 42.0] in places.tolist()
+    assert (places >= 0).all()
+    assert (places < scene.shape).all()
 
 
 def test_means_of_lines_are_those_of_their_pixels() -> None:
