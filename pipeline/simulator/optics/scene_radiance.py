@@ -82,12 +82,14 @@ class SceneSampler:
         windows, whole = self.footprint.windows(), self.footprint
         return [(level, some, Gatherer(whole.part(level, some), self._extremes)) for level, some in windows]
 
-    def scan_pass(self, scene: RasterScene, steps: Sequence[RayViews], *, along_y: bool, exposures: float) -> Radiance:
+    def scan_pass(
+        self, scene: RasterScene, steps: Sequence[RayViews], *, along_y: bool, exposure_ratio: float
+    ) -> Radiance:
         """Return the light (n, band) of samples that look so at each of the held positions. [e-]
 
         A sample's light does not depend on the others.
         """
-        spectra = scene.electrons * np.float32(exposures)
+        spectra = scene.electrons * np.float32(exposure_ratio)
         levels = np.unique(self.footprint.level).tolist()
         rasters = {level: np.ascontiguousarray(scene.raster.thinned(level), np.float32) for level in levels}
         pixels = {level: ScenePixels(raster, along_y) for level, raster in rasters.items()}

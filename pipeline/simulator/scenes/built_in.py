@@ -1,4 +1,4 @@
-"""A scouted field: one crop, and patches of weeds, bare ground, poor growth and, in wheat, lodging.
+"""The built-in scenes by name, and the scouted field: one crop with patches of weeds, bare soil, poor growth, lodging.
 
 Law ``scouting@1``. Spectra, calendars, rows, weeds, classes and colours are the farm's; each part draws from its own
 stream of the seed. U(a, b) is uniform, sizes are in px of 12 cm.
@@ -6,7 +6,7 @@ stream of the seed. U(a, b) is uniform, sizes are in px of 12 cm.
 * Field: maize, sugar beet or winter wheat by the farm's calendar, row crops 8 to 14 days before it. Rows run in any
   direction, wheel marks in pairs along them. Outside of the patches weeds and gaps are few, and growth is even.
 * Patches: the highest part of ``-d + 0.08 n``. Here d is the distance from a centre over the side of a square as large
-  as the scene; n is noise, its bumps 45 px wide. So patches lie together in one part of the field, as those of weeds
+  as the scene. The noise n has bumps 45 px wide. So patches lie together in one part of the field, as those of weeds
   do. They cover the share of the scene that is asked for, U(0.02, 0.10) by default, to a pixel.
 * Kinds: in each place the one whose own noise (60 px) is highest. Bare ground and poor growth are labelled by what
   covers most of a pixel, lodged wheat is wheat. Weeds come up and wheat lodges on the farm's days, not before.

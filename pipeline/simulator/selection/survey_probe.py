@@ -245,7 +245,7 @@ def light_seen(
 
     Rays are turned and points moved (along, scan) by shifts [px].
     """
-    exposures, ifov = camera.exposure_ms / DEFAULT_EXPOSURE_MS, camera.ifov_rad
+    exposure_ratio, ifov = camera.exposure_ms / DEFAULT_EXPOSURE_MS, camera.ifov_rad
     light = np.empty((len(shifts), len(views.slope), len(scene.wavelength_nm)), np.float32)
     for along_y in (False, True):
         which = np.flatnonzero(views.along_y == along_y)
@@ -258,7 +258,7 @@ def light_seen(
             seen = _rays_of(some, camera, turned)
             along, scan = seen.along / ifov + moved[0], seen.scan / ifov + moved[1]
             at_points = replace(seen, along=along + (size[0] - 1) / 2, scan=scan + (size[1] - 1) / 2)
-            light[number, which] = sampler.scan_pass(scene, [at_points], along_y=along_y, exposures=exposures)
+            light[number, which] = sampler.scan_pass(scene, [at_points], along_y=along_y, exposure_ratio=exposure_ratio)
     return light
 
 

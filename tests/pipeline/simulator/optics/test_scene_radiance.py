@@ -52,7 +52,9 @@ def views_of(count: int, far: float = 6.0) -> RayViews:
 
 def scan_pass(scene: RasterScene, views: RayViews, *, along_y: bool = False) -> np.ndarray:
     """Light (n, band) of one exposure."""
-    return SceneSampler(footprint_of(scene), views_of(COUNT)).scan_pass(scene, [views], along_y=along_y, exposures=1.0)
+    return SceneSampler(footprint_of(scene), views_of(COUNT)).scan_pass(
+        scene, [views], along_y=along_y, exposure_ratio=1.0
+    )
 
 
 @pytest.mark.parametrize(("kind", "along_y"), [(kind, bool(number % 2)) for number, kind in enumerate(KINDS)])
@@ -78,7 +80,7 @@ def test_kernels_alike_whatever_the_boxes_are_looked_through_once(kind: str) -> 
     assert set(parted.level.tolist()) == {1}
 
     def seen(footprint: Footprint) -> np.ndarray:
-        return SceneSampler(footprint, views).scan_pass(scene, [views], along_y=False, exposures=1.0)
+        return SceneSampler(footprint, views).scan_pass(scene, [views], along_y=False, exposure_ratio=1.0)
 
     np.testing.assert_allclose(seen(parted) + seen(alike), seen(three), rtol=2e-6)
     np.testing.assert_array_equal(seen(alike), seen(one.by_parts()[1]))
@@ -103,7 +105,7 @@ def test_the_last_pixels_are_seen_as_any(kind: str) -> None:
     sharp = fold((2.7, 1.0), (3, 1), 1, Moments(np.zeros((2, 1)), np.zeros((2, 1))))
     sharp = replace(sharp, between=np.ones((1, len(scene.wavelength_nm))))
     one, other = (
-        SceneSampler(sharp, corner).scan_pass(some, [corner], along_y=False, exposures=1.0)
+        SceneSampler(sharp, corner).scan_pass(some, [corner], along_y=False, exposure_ratio=1.0)
         for some in (scene, made_scene(wide, scene.electrons, scene.wavelength_nm))
     )
     np.testing.assert_array_equal(one, other)
