@@ -39,7 +39,7 @@ from flows.settings.values import EXTENT_PART, EXTENT_WHOLE, parse_moment, parse
 from pipeline.errors import BudgetError, PoseError, SettingsError
 from pipeline.rig.device_settings import MOST_PAIRS
 from pipeline.setting_fields import format_number, span_of
-from pipeline.simulator.scenes.farm.scouting import SCOUTING_NAMES
+from pipeline.simulator.scenes.built_in import SCOUTING_NAMES
 from storage.archive.staging import read_toml
 from storage.readers.recordings import find_recorded_run
 

@@ -15,9 +15,8 @@ from flows.terminal.figures import counted
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.simulator.scenes.built_in import built_in_laws, built_in_scene
+from pipeline.simulator.scenes.built_in import SCOUTING_LAW, built_in_laws, built_in_scene
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW
-from pipeline.simulator.scenes.farm.scouting import SCOUTING_LAW
 from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
 from storage.readers.datasets import DataSet, load_data_set
 from storage.readers.scene_files import SceneFile

@@ -1,10 +1,10 @@
 """The simulator in compiled loops: noise, bands, and sums over windows of pixels.
 
-What a sample gets does not depend on its place. A library's product of matrices is no faster here, and rounds rows
+A sample's result does not depend on its place. A library's product of matrices is no faster here, and rounds rows
 otherwise where they stand elsewhere in a block.
 
-All are compiled, for arrays of one type each, and may be called by several threads at once. What a sample sees depends
-on nothing but itself: it is summed tap after tap, in the same order wherever it stands.
+All are compiled, for arrays of one type each, and may be called by several threads at once. A sample's light depends on
+nothing but its own view. It is summed tap after tap, in the same order wherever it stands.
 """
 
 from __future__ import annotations
@@ -28,8 +28,9 @@ _ENDLESS = 0x7F800000  # bits of an infinite float32; of what is no number they 
 def draw_pairs(words: NDArray[np.uint32], piece: int, drawn: Radiance) -> None:
     """Write standard normal deviates, a piece after the other: of each, words for radii, then as many for turns.
 
-    r = sqrt(-2 ln u) and a turn t give r cos t and r sin t. ln is that of 2^e m with m about 1: a polynomial of m - 1,
-    right to 1e-7; so are sine and cosine within an eighth of a turn, and the quarter says which and with which sign.
+    A radius r = sqrt(-2 ln u) and a turn t give r cos t and r sin t. The logarithm is that of 2^e m with m about 1: a
+    polynomial of m - 1, right to 1e-7. Sine and cosine are polynomials within an eighth of a turn. The quarter says
+    which of them, and with which sign.
     """
     radius, rest = np.empty(_AT_ONCE, np.float32), np.empty(_AT_ONCE, np.float32)
     bits = radius.view(np.int32)
@@ -86,9 +87,9 @@ def read_merged(
 ) -> bool:
     """Write the numbers of light with shot and read noise of one deviate z; whether all that is expected was finite.
 
-    The electrons are mean + sqrt(V) z + (k3 / 6 V) (z^2 - 1): three cumulants are right (Cornish and Fisher, 1938,
-    second order); what is left is bounded by `noise.divergence`. ``light`` below 0 counts as 0; ``added`` comes to it,
-    one number or as many as light. All [e-]. Numbers are rounded half to even, within 0 and full scale.
+    The electrons are mean + sqrt(V) z + (k3 / 6 V) (z^2 - 1). Three cumulants are right (Cornish and Fisher, 1938,
+    second order). `divergence` in `effects.counting` bounds the rest. ``light`` below 0 counts as 0; ``added`` comes to
+    it, one number or as many as light. All [e-]. Numbers are rounded half to even, within 0 and full scale.
     """
     read, per_dn, dark, most = (
         np.float32(read_noise_e * read_noise_e),
@@ -232,7 +233,7 @@ def mix_bands(
     """Write some bands of light (n, band), from the first on: components (node, n, component) times their mixing.
 
     Nodes from ``lower`` to before ``upper`` are taken; ``mixing`` (node * component, band) is as `mixing_rows` has it.
-    Of many components a sample has few: terms are added one by one, and those of 0 may be left out.
+    A sample has few of many components. Terms are added one by one, and those of 0 may be left out.
     """
     count, wide = nodes.shape[1], mixing.shape[1]
     taken, rows = np.empty((TERMS, len(mixing)), np.float32), np.empty(len(mixing), np.int64)
@@ -256,38 +257,6 @@ def mixing_rows(mixing: Radiance) -> Radiance:
     found = room[first : first + rows * columns].reshape(rows, columns)
     found[:terms, :bands] = mixing
     return found
-
-
-_SHIFTS = rows_of(FLOATS, 3)
-
-
-@compiled(_SHIFTS, _SHIFTS, _SHIFTS, OFFSETS, DOUBLES, rows_of(DOUBLES, 1))
-def greatest_changes(
-    light: Radiance, finest: Radiance, scale: Radiance, binning: int, rounding: float, greatest: NDArray[np.float64]
-) -> None:
-    """Write the greatest change of each stored number over its unit, (number,): of all shifts and bands.
-
-    ``light`` and ``finest`` are (shift, number * binning, band), ``scale`` the unit (shift, number, band). Changes
-    count with their signs within a number, and as 0 where they are at most ``rounding`` times the light.
-    """
-    bands, least, fraction = light.shape[2], np.float32(rounding), np.float32(1 / binning)
-    summed, most = np.empty(bands, np.float32), np.empty(bands, np.float32)
-    for number in range(len(greatest)):
-        for band in range(bands):
-            most[band] = np.float32(0)
-        for shift in range(len(light)):
-            for band in range(bands):
-                summed[band] = np.float32(0)
-            for sample in range(number * binning, (number + 1) * binning):
-                for band in range(bands):
-                    at = finest[shift, sample, band]
-                    change = light[shift, sample, band] - at
-                    summed[band] += change if abs(change) > least * abs(at) else np.float32(0)
-            for band in range(bands):
-                changed = abs(summed[band]) * fraction / scale[shift, number, band]
-                most[band] = changed if changed > most[band] else most[band]
-        for band in range(bands):
-            greatest[number] = max(greatest[number], most[band])
 
 
 Floats = NDArray[np.float64]
@@ -330,8 +299,8 @@ def place_parts(
     """Write the scales (2, n) of a kernel and how far beside their pixel its parts lie, (2, part, n) [px].
 
     All along the line, then the scan. ``views`` (6, n) are `RayViews`, ``beside`` (2, n) how far from their pixel they
-    look. Scales, and the lean of the parts by which they are moved along the line per px across, are such that all
-    parts together have the second moments that rays give the footprint.
+    look. The lean is the way of the parts along the line per px across. With scales and lean, all parts together have
+    the second moments that rays give the footprint.
     """
     run, turn = kernels.variance[0, kernel], kernels.variance[1, kernel]
     runs, turns = kernels.shift[0, kernel], kernels.shift[1, kernel]

@@ -53,7 +53,7 @@ def read_out(light: Radiance, block: SweepBlock, chosen: Mapping[Any, str] | Cho
 
 
 def dark_frame(block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> Radiance:
-    """Give what the chosen readout shows without light, on average, (sample, band) float32, before rounding. [DN]"""
+    """Return what the chosen readout shows without light, on average, (sample, band) float32, before rounding. [DN]"""
     readout, camera = Readout(block, Choice.of(chosen)), block.rig.camera
     dark = np.zeros((camera.samples, len(block.wavelength_nm)), np.float32)
     dark += readout.added
@@ -70,7 +70,7 @@ class Readout:
     choice: Choice
 
     def numbers(self, light: Radiance, number: int) -> NDArray[np.uint16]:
-        """Give the converter's numbers of one line's light, (sample, band) [e-]."""
+        """Return the converter's numbers of one line's light, (sample, band) [e-]."""
         if not self._merges:
             return self.converted(self.electrons(light, number))
         seen = np.ascontiguousarray(light if self.dead is None else np.where(self.dead, 0, light), np.float32)
@@ -94,7 +94,7 @@ class Readout:
         return raw
 
     def electrons(self, light: Radiance, number: int) -> Radiance:
-        """Give what leaves the amplifier for one line's light, (sample, band); each noise of its own draw. [e-]"""
+        """Return what leaves the amplifier for one line's light, (sample, band); each noise of its own draw. [e-]"""
         expected, shot = self._expected(light, number), self._variant(SHOT.name)
         electrons = expected
         if shot != OFF:
@@ -110,7 +110,7 @@ class Readout:
         return electrons
 
     def converted(self, electrons: Radiance) -> NDArray[np.uint16]:
-        """Give the converter's numbers, rounded half to even, within 0 and its full scale."""
+        """Return the converter's numbers, rounded half to even, within 0 and its full scale."""
         camera = self.block.rig.camera
         dn = electrons / np.float32(camera.electrons_per_dn)
         dn += np.float32(camera.dark_dn)
@@ -119,7 +119,7 @@ class Readout:
 
     @cached_property
     def added(self) -> Radiance | np.float32:
-        """Electrons that come without light: a number, or (sample, band) where there are hot elements."""
+        """Return electrons that come without light: a number, or (sample, band) where there are hot elements."""
         dark = self._variant(DARK_CURRENT.name) != OFF
         same = np.float32(dark_electrons(self.block.rig) if dark else 0.0)
         if self._variant(DEFECTS.name) == OFF or not self.block.rig.detector.hot_fraction:
@@ -128,19 +128,19 @@ class Readout:
 
     @cached_property
     def dead(self) -> NDArray[np.bool_] | None:
-        """Elements without response, (sample, band); None where there are none."""
+        """Return elements without response, (sample, band); None where there are none."""
         if self._variant(DEFECTS.name) == OFF or not self.block.rig.detector.dead_fraction:
             return None
         return dead_elements(self.block.rig, len(self.block.wavelength_nm))
 
     @cached_property
     def read_noise_e(self) -> float:
-        """Standard deviation of the amplifier's noise; 0 where it is off. [e-]"""
+        """Return standard deviation of the amplifier's noise; 0 where it is off. [e-]"""
         return 0.0 if self._variant(READ_NOISE.name) == OFF else self.block.rig.camera.read_noise_e
 
     @cached_property
     def full_well_e(self) -> float | None:
-        """Electrons that an element holds; None where the converter ends before any could overflow, or it is off."""
+        """Return the electrons that an element holds; None where the converter ends first, or saturation is off."""
         on = self._variant(SATURATION.name) != OFF and well_reached(self.block.rig, self.read_noise_e)
         return self.block.rig.detector.full_well_e if on else None
 
@@ -151,7 +151,7 @@ class Readout:
         return cheap and self.read_noise_e >= LEAST_MERGED_READ_E and self.full_well_e is None
 
     def _expected(self, light: Radiance, number: int) -> Radiance:
-        """Electrons that a line's elements expect, (sample, band) (SceneError: one is not finite)."""
+        """Return electrons that a line's elements expect, (sample, band) (SceneError: one is not finite)."""
         expected = np.maximum(light, 0)
         if self.dead is not None:
             expected[self.dead] = 0
@@ -165,7 +165,7 @@ class Readout:
         return expected
 
     def _deviates(self, stream: str, number: int) -> Radiance:
-        """Standard normal deviates of one line, (sample, band)."""
+        """Return standard normal deviates of one line, (sample, band)."""
         size = self.block.rig.camera.samples, len(self.block.wavelength_nm)
         return normal_deviates(self.block.stream(stream, number), math.prod(size)).reshape(size)
 

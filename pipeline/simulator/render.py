@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -27,29 +26,27 @@ from pipeline.simulator.effects.counting import (
     SHOT,
 )
 from pipeline.simulator.effects.effect import OFF, Effect, SweepBlock
-from pipeline.simulator.effects.lighting import BRDF, CLOUD, DRIFT
+from pipeline.simulator.effects.lighting import BRDF, CLOUD, DRIFT, POLARISATION, VIGNETTING
 from pipeline.simulator.effects.line import (
+    BOXES,
     FOLDED,
     ROTATION,
     SLIT,
     SMEAR,
     box_of,
-    box_parts,
     folded_positions,
     smeared_positions,
 )
-from pipeline.simulator.effects.mirror_throughput import POLARISATION, VIGNETTING
 from pipeline.simulator.effects.pointing import HYSTERESIS, JITTER, LAG, STAIRCASE, THERMAL_DRIFT
 from pipeline.simulator.effects.spectrometer import PRNU, RESPONSE, SMILE, STRAY_LIGHT, STRIPING
-from pipeline.simulator.optics.kernel_fit import Footprint, Moments, fold
+from pipeline.simulator.optics.kernel_fit import Moments, fold
 from pipeline.simulator.optics.rays import RayViews, exact_views, middle_normal
-from pipeline.simulator.optics.scene_radiance import Looker
+from pipeline.simulator.optics.scene_radiance import SceneSampler
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 
 Floats = NDArray[np.float64]
 Radiance = NDArray[np.float32]
-_BEYOND_PX, _RINGS, _TURNS = 1000.0, 97, 16  # places at which tails of footprints are compared
 PROBES = 17  # lines of a sweep and samples of a line that tell how far a footprint's shape varies
 
 
@@ -76,29 +73,27 @@ class Choice:
         return Choice(tuple((effect, variant) for effect, variant in chosen.items() if variant != OFF))
 
     def variant(self, name: str) -> str:
-        """Give the variant of an effect by its name; off where it is not chosen."""
+        """Return the variant of an effect by its name; off where it is not chosen."""
         return next((variant for effect, variant in self.effects if effect.name == name), OFF)
 
     def doing(self, action: str) -> Iterator[tuple[Any, str]]:
-        """Give the effects that have this action, as (effect, variant) in the order of the chain."""
+        """Return the effects that have this action, as (effect, variant) in the order of the chain."""
         return ((effect, variant) for effect, variant in self.effects if hasattr(effect, action))
 
 
 def expected_light(scene: RasterScene, block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> Radiance:
-    """Give the electrons that the samples of some lines gather on average, before the readout.
+    """Return the electrons that the samples of some lines gather on average, before the readout.
 
-    ``chosen``: The effects that are on, in the order of the chain, each with its variant; none is a camera of rays that
-    stands still and whose lines lie straight.
-    Returns (line, sample, band) float32. [e-]
-    Raises PoseError: a position, with what aims add, is out of the mirror's reach. SettingsError: an effect has no such
-    variant.
+    ``chosen``: the effects that are on, in the order of the chain, each with its variant. Without any, the camera
+    stands still and its lines lie straight. Returns (line, sample, band) float32. [e-] Raises PoseError: a position,
+    with what aims add, is out of the mirror's reach. SettingsError: an effect has no such variant.
     """
     choice = Choice.of(chosen)
     steps = [views.flat() for views in _views(block, choice, scene.shape)]
-    exposures = block.rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS
+    exposure_ratio = block.rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS
     moments, names = tuple(choice.doing("moments")), tuple(map(choice.variant, ("slit", "smear", "rotation")))
-    light = _looker(block.rig, block.sweep, block.wavelength_nm.tobytes(), moments, names).scan_pass(
-        scene, steps, along_y=block.sweep.along == "y", exposures=exposures
+    light = _sampler(block.rig, block.sweep, block.wavelength_nm.tobytes(), moments, names).scan_pass(
+        scene, steps, along_y=block.sweep.along == "y", exposure_ratio=exposure_ratio
     )
     light = light.reshape(len(block.lines), -1, light.shape[1])
     pending: Radiance | None = None
@@ -120,7 +115,7 @@ def expected_light(scene: RasterScene, block: SweepBlock, chosen: Mapping[Any, s
 
 
 def held_positions(block: SweepBlock, choice: Choice) -> Floats:
-    """Give what the mirror holds in each exposure, aims included, (line, step, 2); each for as long as the others."""
+    """Return what the mirror holds in each exposure, aims included, (line, step, 2); each for as long as the others."""
     position = smeared_positions(block, choice.variant("smear"))
     for aim, variant in choice.doing("aim"):
         shift = aim.aim(block, variant)
@@ -154,50 +149,21 @@ def _tangents(position: Floats, slopes: Floats, *, exact: bool) -> RayViews:
 
 
 @lru_cache(maxsize=8)
-def _looker(
+def _sampler(
     rig: Rig, sweep: Sweep, wavelengths: bytes, blurs: tuple[tuple[Any, str], ...], names: tuple[str, ...]
-) -> Looker:
+) -> SceneSampler:
     wavelength, normal = np.frombuffer(wavelengths), middle_normal(sweep, rig.camera)
     moments = [blur.moments(rig, wavelength, variant, normal) for blur, variant in blurs]
     slit, smear, rotation = names
-    views = views_all_over(rig, sweep, exact=rotation != OFF)
+    views = sweep_views(rig, sweep, exact=rotation != OFF)
     together = Moments.together(moments, len(wavelength))
-    return Looker(fold(box_of(slit, rig), box_parts(slit, rig, views), folded_positions(sweep, smear), together), views)
+    return SceneSampler(
+        fold(box_of(slit, rig), BOXES.get(slit, (1, 1)), folded_positions(sweep, smear), together), views
+    )
 
 
-def kernel_error(block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> float:
-    """Give by how much of a wave's amplitude the kernels of a choice's footprint are wrong at most."""
-    return _footprint(block, Choice.of(chosen)).error
-
-
-def tails_apart(
-    block: SweepBlock, one: Mapping[Any, str] | Choice, other: Mapping[Any, str] | Choice, reach_px: float
-) -> Floats:
-    """Give the fraction of light, by size, that the kernels of two choices put elsewhere beyond a reach, (band,).
-
-    Where their blurs or held positions differ, other kernels are fitted to the same patterns; where these have tails,
-    so has what the kernels are wrong by.
-    """
-    held = block.sweep.positions
-    found = [replace(_footprint(block, choice), held=held) for choice in map(Choice.of, (one, other))]
-    log_px, turn = np.linspace(math.log(reach_px), math.log(_BEYOND_PX), _RINGS), 2 * np.pi / _TURNS
-    radius, angle = np.repeat(np.exp(log_px), _TURNS), np.tile(np.arange(_TURNS) * turn, _RINGS)
-    along, scan = radius * np.cos(angle), radius * np.sin(angle)
-    apart = np.abs(found[0].afar(along, scan) - found[1].afar(along, scan))
-    area = radius**2 * (log_px[1] - log_px[0]) * turn
-    return np.asarray(area @ apart)
-
-
-def _footprint(block: SweepBlock, choice: Choice) -> Footprint:
-    normal = middle_normal(block.sweep, block.rig.camera)
-    found = [one.moments(block.rig, block.wavelength_nm, way, normal) for one, way in choice.doing("moments")]
-    box = box_of(choice.variant("slit"), block.rig)
-    held = folded_positions(block.sweep, choice.variant("smear"))
-    return fold(box, (1, 1), held, Moments.together(found, len(block.wavelength_nm)))
-
-
-def views_all_over(rig: Rig, sweep: Sweep, *, exact: bool) -> RayViews:
-    """Give views all over a sweep: the shape of a footprint varies smoothly between them."""
+def sweep_views(rig: Rig, sweep: Sweep, *, exact: bool) -> RayViews:
+    """Return views all over a sweep: the shape of a footprint varies smoothly between them."""
     whole = line_positions(replace(sweep, lines=max(sweep.lines, 1)), rig.camera)
     lines = np.linspace(0, len(whole) - 1, PROBES).round().astype(np.intp)
     slopes = np.linspace(-0.5, 0.5, PROBES) * rig.camera.samples * rig.camera.ifov_rad

@@ -31,7 +31,7 @@ class Optics:
     focus_m: float = assumed(math.inf, "Distance that is sharp", "m", 0.01)
     aberration_px: float = assumed(0.2, "Standard deviation of the lens's own blur", "px", 0.0, 1e3)
     keystone_px: float = assumed(0.15, "Shift along the line, first wavelength to last", "px", 0.0, 1e3)
-    smile_nm: float = assumed(0.3, "How much longer wavelengths are at a line's ends", "nm", -100.0, 100.0)
+    smile_nm: float = assumed(0.3, "Excess of the wavelengths at a line's ends", "nm", -100.0, 100.0)
     fwhm_nm: float = stated(6.0, "Width of a band", "nm", 0.0, 1e3, source="data sheet")
     stray_fraction: float = assumed(1e-3, "Fraction of a line's light that is spread over its detector", "", 0.0, 0.5)
     stray_even: float = assumed(0.5, "Fraction of the stray light that falls evenly; the rest is a halo", "", 0.0, 1.0)
@@ -68,12 +68,12 @@ class Detector:
     striping_std: float = assumed(
         0.002, "Standard deviation of the gain that a sample's whole column shares", "", 0.0, 0.5
     )
-    dead_fraction: float = assumed(0.0, "Pixels that give nothing", "", 0.0, 0.5)
-    hot_fraction: float = assumed(0.0, "Pixels that glow", "", 0.0, 0.5)
-    hot_e_per_s: float = assumed(5e4, "More than a sound pixel's dark current, at 25 deg C", "e-/s", 0.0, 1e9)
+    dead_fraction: float = assumed(0.0, "Fraction of dead pixels", "", 0.0, 0.5)
+    hot_fraction: float = assumed(0.0, "Fraction of hot pixels", "", 0.0, 0.5)
+    hot_e_per_s: float = assumed(5e4, "Dark current of a hot pixel over a sound one, at 25 deg C", "e-/s", 0.0, 1e9)
     full_well_e: float = assumed(math.inf, "Electrons that a pixel holds; inf: the converter clips first", "e-", 1.0)
     noiseless: bool = stated(False, "An ideal sensor, for references: no shot noise, read noise or dark current")
-    unit: int = stated(0, "Which copy of the sensor: its fixed pattern follows from this number", "", 0, 2**31 - 1)
+    unit: int = stated(0, "Number of the sensor; its fixed pattern follows from it", "", 0, 2**31 - 1)
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Air:
     """Air between rig and scene. A scene without a distance is light at the aperture: no air, no parallax."""
 
     distance_m: float | None = stated(None, "Distance of the scene's middle", "m", LEAST_DISTANCE_M, example=30.0)
-    relief: Relief = stated("flat", "How the scene's distance changes over it")
+    relief: Relief = stated("flat", "Course of the distance over the scene")
     nearest_m: float | None = stated(
         None, "Nearest part of the scene; by default distance_m", "m", LEAST_DISTANCE_M, example=25.0
     )
@@ -89,12 +89,12 @@ class Air:
         None, "Farthest part of the scene; by default distance_m", "m", LEAST_DISTANCE_M, example=40.0
     )
     lever_m: float = assumed(0.1, "Virtual pinhole behind the pivot", "m", 0.0, 10.0)
-    visibility_km: float = assumed(23.0, "How far one sees", "km", 0.05, 1e6)
+    visibility_km: float = assumed(23.0, "Meteorological visibility", "km", 0.05, 1e6)
     airlight_fraction: float = assumed(0.3, "Light of endless air over the white reference's", "", 0.0, 5.0)
     vapour_g_per_m3: float = assumed(10.0, "Water in the air, absolute humidity", "g/m^3", 0.0, 100.0)
     turbulence_cn2: float = assumed(1e-13, "Strength of the turbulence", "m^(-2/3)", 0.0, 1e-6)
-    wind_amplitude_m: float = assumed(0.0, "How far the canopy sways", "m", 0.0, 100.0)
-    wind_hz: float = assumed(1.0, "How often the canopy sways", "Hz", 0.0, 50.0)
+    wind_amplitude_m: float = assumed(0.0, "Amplitude of the canopy's sway", "m", 0.0, 100.0)
+    wind_hz: float = assumed(1.0, "Frequency of the canopy's sway", "Hz", 0.0, 50.0)
 
 
 @dataclass(frozen=True)
@@ -150,19 +150,19 @@ class Rig:
             raise SettingsError(f"sky.started needs a time zone, got {self.sky.started}; add +00:00 for UTC")
 
     def taking(self, sweep: Sweep) -> Rig:
-        """Give the rig as it takes the lines of a sweep: with the sweep's exposure, if it has one of its own."""
+        """Return the rig as it takes the lines of a sweep: with the sweep's exposure, if it has one of its own."""
         camera = exposing(self.camera, sweep)
         return self if camera is self.camera else replace(self, camera=camera)
 
     @property
     def distances_m(self) -> tuple[float, float] | None:
-        """Nearest and farthest part of the scene [m]; None for a scene without a distance."""
+        """Return nearest and farthest part of the scene [m]; None for a scene without a distance."""
         air = self.air
         if air.distance_m is None:
             return None
         return (air.nearest_m or air.distance_m, air.farthest_m or air.distance_m)
 
     def moment(self, seconds: float) -> datetime | None:
-        """Time of day so many seconds after the survey's start; None where it has none."""
+        """Return time of day so many seconds after the survey's start; None where it has none."""
         started = self.sky.started
         return None if started is None else datetime.fromtimestamp(started.timestamp() + seconds, UTC)

@@ -1,7 +1,7 @@
 """The simulated source: a scene as a rig sees it line by line, whatever the block, and the frames that calibrate it.
 
-Calibration sees the detector and the spectrograph: dark current, response, smile, gains and defects of elements. What
-it cannot know stays in the data: stray light, blur and keystone, what the air and the sky do, and the sun's course.
+Calibration sees the detector and the spectrograph: dark current, response, smile, gains and defects of elements. The
+rest stays in the data: stray light, blur and keystone, air, sky, and the sun's course.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pipeline.geometry.camera import LineCamera, bin_samples
 from pipeline.geometry.scan import CostModel, Sweep, exposing, line_positions, memory_loads
 from pipeline.simulator.effects.counting import DEFECTS, dead_elements, hot_electrons
 from pipeline.simulator.effects.effect import OFF, SweepBlock
-from pipeline.simulator.effects.mirror_throughput import VIGNETTING
+from pipeline.simulator.effects.lighting import VIGNETTING
 from pipeline.simulator.effects.pointing import PointingErrors
 from pipeline.simulator.effects.spectrometer import PRNU, RESPONSE, SMILE, STRIPING
 from pipeline.simulator.readout import dark_frame, read_out
@@ -38,9 +38,9 @@ SEEN = frozenset({RESPONSE.name, SMILE.name, PRNU.name, STRIPING.name})  # by li
 class SimulatedSource:
     """A source that looks at ``scene`` with ``rig``. Quantisation and saturation are always on: raw lines are uint16.
 
-    Streams are keyed (seed, sweep name, effect, line number): neither the first line asked for nor the order of sweeps
-    nor other effects change a line. ``chosen`` are the effects that are on, {effect: variant}, in the order of the
-    chain. ``clock`` says when sweeps start, by name, after the survey did [s]; a sweep it does not name is at once.
+    Streams are keyed (seed, sweep name, effect, line number). So a line does not depend on the first line asked for,
+    the order of sweeps, or other effects. ``chosen`` are the effects that are on, {effect: variant}, in the order of
+    the chain. ``clock`` says when sweeps start, by name, after the survey did [s]; a sweep it does not name is at once.
     With ``pointing`` the mirror looks beside the planned positions and still reports those.
     """
 
@@ -57,7 +57,7 @@ class SimulatedSource:
 
     @cached_property
     def choice(self) -> Choice:
-        """All effects that are on, pointing among them."""
+        """Return all effects that are on, pointing among them."""
         chosen = Choice.of(self.chosen)
         return chosen if self.pointing is None else Choice(((self.pointing, "exact"), *chosen.effects))
 
@@ -81,13 +81,13 @@ class SimulatedSource:
         return render_lines(self.scene, self.rig, self.choice, sweep, lines, seed=self.seed, started_s=started_s)
 
     def lines(self, sweep: Sweep, first: int = 0) -> Iterator[Line]:
-        """Give the sweep's lines one by one, from line ``first`` on. Raises ShapeError, PoseError as `render_lines`."""
+        """Yield the sweep's lines from line ``first`` on. Raises ShapeError, PoseError as `render_lines`."""
         check_binning(sweep, self.camera)
         for start in range(first, sweep.lines, BLOCK_LINES):
             yield from self.lines_of(sweep, range(start, min(start + BLOCK_LINES, sweep.lines)))
 
     def lines_of(self, sweep: Sweep, numbers: range) -> list[Line]:
-        """Give some lines of the sweep, as `lines` does. Threads may ask at the same time."""
+        """Return some lines of the sweep, as `lines` does. Threads may ask at the same time."""
         camera, middle = exposing(self.camera, sweep), line_positions(sweep, self.camera)
         return [
             Line(
@@ -102,13 +102,13 @@ class SimulatedSource:
         ]
 
     def lines_again(self, sweep: Sweep, numbers: Sequence[int]) -> Iterator[Line]:
-        """Give single lines that were given before: the same, bit for bit."""
+        """Return single lines that were given before: the same, bit for bit."""
         for number in numbers:
             yield from self.lines_of(sweep, range(number, number + 1))
 
     @property
     def record(self) -> None:
-        """Nothing: the manifest of the effects tells all."""
+        """Return nothing: the manifest of the effects has it all."""
         return None
 
     def references(self, sweep: Sweep) -> References:
@@ -132,7 +132,7 @@ class SimulatedSweep:
 
     @property
     def time_s(self) -> NDArray[np.float64]:
-        """(line,) of mid exposure, since the start of the sweep [s]."""
+        """Return the time of each line at mid exposure, since the start of the sweep [s]."""
         camera = exposing(self.source.camera, self.sweep)
         return camera.mid_exposure_s(np.arange(self.sweep.lines, dtype=np.float64))
 
@@ -148,11 +148,11 @@ class SimulatedSweep:
 def sweep_starts(
     sweeps: Sequence[Sweep], camera: LineCamera, cost: CostModel, *, after_s: float = 0.0
 ) -> dict[str, float]:
-    """Give when the first line of each sweep begins, by the sweep's name, since the survey's start. [s]
+    """Return when the first line of each sweep begins, by the sweep's name, since the survey's start. [s]
 
-    ``sweeps`` are in the order in which they are taken, ``after_s`` is what the survey has spent before. Before a sweep
-    come those before, a set-up for each and its own, and the loads of the vector memory until then; a load in the midst
-    of one delays the next sweep only.
+    ``sweeps`` are in the order in which they are taken, ``after_s`` is what the survey has spent before. The sweeps
+    before, a set-up for each and the loads of the vector memory come first. A load in the midst of a sweep delays the
+    next one only.
     """
     loads_before: dict[int, int] = {}
     for number, load in enumerate(memory_loads(sweeps, cost.vector_pairs), 1):
@@ -173,7 +173,7 @@ def sweep_starts(
 def sweep_block(
     scene: RasterScene, rig: Rig, sweep: Sweep, lines: range, *, seed: int = 0, started_s: float = 0.0
 ) -> SweepBlock:
-    """Give some lines of a sweep, which starts ``started_s`` after the survey did, as effects ask about them."""
+    """Return some lines of a sweep, which starts ``started_s`` after the survey did, as effects ask about them."""
     rig = rig.taking(sweep)
     white = scene.white_reference_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
     return SweepBlock(rig, sweep, lines, scene.wavelength_nm, scene.shape, seed, started_s, scene.fwhm_nm, white)
@@ -189,7 +189,7 @@ def render_lines(
     seed: int = 0,
     started_s: float = 0.0,
 ) -> Raw:
-    """Give the raw numbers of some lines, (line, sample, band) uint16, binned [DN]. Pure: threads may share arguments.
+    """Return the raw numbers of some lines, (line, sample, band) uint16, binned [DN]. Threads may share arguments.
 
     Neither the other lines asked for nor the order of calls changes a number. Raises ShapeError: sums of
     ``sweep.binning`` samples at full scale do not fit uint16. PoseError: a position is out of the mirror's reach.
@@ -218,9 +218,9 @@ def check_binning(sweep: Sweep, camera: LineCamera) -> None:
 
 
 def take_references(scene: RasterScene, rig: Rig, choice: Choice, sweep: Sweep) -> References:
-    """Give mean dark and white frames (sample, band) with the sweep's binning, free of noise. [DN]
+    """Return mean dark and white frames (sample, band) with the sweep's binning, free of noise. [DN]
 
-    The white frame is scaled from a shorter exposure, so that it does not saturate; it is taken with the mirror at
+    The white frame is scaled from a shorter exposure, so that it does not saturate. It is taken with the mirror at
     rest, by the light of the survey's start. Dead and hot elements count as bad; the white reference's values are in
     the rig's bands.
     """
@@ -241,8 +241,8 @@ def take_references(scene: RasterScene, rig: Rig, choice: Choice, sweep: Sweep) 
     if choice.variant(DEFECTS.name) != OFF:
         dead = dead_elements(rig, seen.shape[1])
         seen[dead] = 0
-        told = dead | (hot_electrons(rig, seen.shape[1]) > 0)  # of a sum one is enough
-        bad = _binned(told.astype(np.float32), sweep.binning) > 0 if told.any() else None
+        elements = dead | (hot_electrons(rig, seen.shape[1]) > 0)  # of a sum one is enough
+        bad = _binned(elements.astype(np.float32), sweep.binning) > 0 if elements.any() else None
     white = dark + seen / np.float32(rig.camera.electrons_per_dn)
     white_reference = scene.white_reference.astype(np.float32)
     if (response := choice.variant(RESPONSE.name)) != OFF:

@@ -76,7 +76,6 @@ def test_black_scene_without_dark_current_has_no_shot_noise() -> None:
 def test_gradient_bounds_a_point_of_infinite_curvature() -> None:
     """Where the image has no second derivative the bound is slope times width, and no axis without blur counts."""
     probe = probed(scene_of(TEXTURE), RIG)
-    probe = replace(probe, anywhere=None, beside=(), afar=None)  # as where sweeps see all of the scene
     point = replace(probe, curvature=np.full((2, 3), np.inf))
     width = RIG.optics.aberration_px * math.sqrt(2 / math.pi)  # what a Gaussian moves light on average
     by_slope = np.minimum(width * point.slope.sum(axis=0), point.span).max()

@@ -115,7 +115,8 @@ def test_every_permitted_setting_is_decided_and_verified(asked: Asked) -> None:
         )
     ]
     worst = worst_blocks(chips, lambda chip: expected_light(scene, chip, FOOTPRINT), units)
-    measured = verify(decision, lambda chip, chosen: expected_light(scene, chip, chosen), worst, units)
+    range_e = max(one.brightest_e for one in probes) - min(one.darkest_e for one in probes)
+    measured = verify(decision, lambda chip, chosen: expected_light(scene, chip, chosen), worst, units, range_e)
     assert np.isfinite(measured[TOTAL])
 
 

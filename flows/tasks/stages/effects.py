@@ -150,4 +150,6 @@ def _verified(
         for block in candidate_blocks([one for one in whole if one.sweep in probe.sweeps], probe.places)
     ]
     worst = worst_blocks(candidates, lambda block: expected_light(scene, block, FOOTPRINT), units)
-    return verify(decision, render, worst, units)
+    ends_e = [(probe.darkest_e, probe.brightest_e) for probe in probes]
+    range_e = max(high for _, high in ends_e) - min(low for low, _ in ends_e)
+    return verify(decision, render, worst, units, range_e)

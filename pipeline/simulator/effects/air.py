@@ -1,18 +1,16 @@
 """Air and depth: distances, parallax, turbulence, wind in the crop; haze and gases.
 
-[3] Koschmieder, "Theorie der horizontalen Sichtweite", Beitraege zur Physik der freien Atmosphaere 12, 1924: a
-   contrast of 2 % is left at the visibility V, so that extinction is 3.912 / V: all of it, molecules included.
-[4] Bird and Riordan, "Simple solar spectral model for direct and diffuse irradiance on horizontal and tilted
-   planes at the earth's surface for cloudless atmospheres", TR-215-2436, 1984, with the constant 118.3 of its
-   published program. doi:10.2172/5986936
-[5] Kruse, McGlauchlin and McQuistan, "Elements of Infrared Technology", Wiley, 1962: Angstrom's exponent is 0.585
-   V^(1/3) below 6 km.
+[3] Koschmieder, "Theorie der horizontalen Sichtweite", Beitraege zur Physik der freien Atmosphaere 12, 1924. A contrast
+of 2 % is left at the visibility V, so that extinction is 3.912 / V, molecules included. [4] Bird and Riordan, "Simple
+solar spectral model for direct and diffuse irradiance on horizontal and tilted planes at the earth's surface for
+cloudless atmospheres", TR-215-2436, 1984. doi:10.2172/5986936. The constant 118.3 is that of its published program. [5]
+Kruse, McGlauchlin and McQuistan, "Elements of Infrared Technology", Wiley, 1962. Angstrom's exponent is 0.585 V^(1/3)
+below 6 km.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -68,9 +66,8 @@ class Turbulence(Aim):
         if not sigma:
             return Bound(0.0, "no distance or no turbulence")
         farthest = sigma * math.sqrt(2 * math.log(max(probe.lines, 1) / RISK))
-        near = probe.within(farthest)
-        steep = np.hypot(*near.slope)
-        change = float(np.minimum(steep * farthest, near.span).max(initial=0.0))
+        steep = np.hypot(*probe.slope)
+        change = float(np.minimum(steep * farthest, probe.span).max(initial=0.0))
         strength = rytov_variance(rig, float(np.min(probe.wavelength_nm, initial=np.inf)))
         beyond = f"; a guess, beyond weak turbulence (Rytov variance {strength:.2g})" if strength > 1 else ""
         return Bound(
@@ -85,9 +82,9 @@ def turbulence_px(rig: Rig) -> float:
 
     In spherical waves air near the point tilts them less than air near the aperture, by (z / d)^(5/3) a length of way.
     So 3/8 of a plane wave's 2.91 are left [1]. D is the aperture as seen at rest, 10.6 mm of 15. It is valid for
-    Kolmogorov's spectrum with one Cn2 all along the way, and D between inner and outer scale. sqrt(lambda d) must not
-    be much wider than D, and turbulence weak: `rytov_variance` up to 1. 0 without a distance; no way is longer than
-    `FARTHEST_M`.
+    Kolmogorov's spectrum with one Cn2 all along the way, and D between inner and outer scale. The Fresnel width
+    sqrt(lambda d) must not be much wider than D. Turbulence must be weak (`rytov_variance` up to 1). Returns 0 without
+    a distance; no way is longer than `FARTHEST_M`.
     """
     metres = _way_m(rig)
     aperture_m = rig.optics.aperture_mm * 1e-3 * _REST
@@ -110,8 +107,8 @@ class Wind(Displacement):
     """Crop motion: the scene sways by a travelling wave along the wind, its phase and direction drawn for a survey.
 
     All of the scene sways, as one that stands at mid exposure. A fast sway shows as a slow one if f t_frame is above
-    one half. The smear within an exposure is neither modelled nor counted. It is up to 2 pi f t_exp of the amplitude: 2
-    % of it at 1 Hz in 3 ms and 62 % in 100 ms. ``why`` tells how many px that are.
+    one half. The smear within an exposure is neither modelled nor counted. It is up to 2 pi f t_exp of the amplitude:
+    at 1 Hz 2 % of it in 3 ms, 62 % in 100 ms.
     """
 
     name = "wind"
@@ -138,14 +135,9 @@ class Wind(Displacement):
         sway = sway_px(rig)
         if sway == 0:
             return Bound(0.0, "the air is calm")
-        near = probe.within(sway)
-        steep = sway * np.hypot(*near.slope)
-        aliased = ", too fast for the lines to follow" if sways_per_line(rig) > 0.5 else ""
-        smeared = f"up to {within_exposure_px(rig):.2g} px of smear within an exposure are not modelled"
-        return Bound(
-            float(np.minimum(steep, near.span).max(initial=0.0)),
-            f"the crop sways by {sway:.2g} px, {line_to_line_px(rig):.2g} px from line to line{aliased}; {smeared}",
-        )
+        steep = sway * np.hypot(*probe.slope)
+        change = float(np.minimum(steep, probe.span).max(initial=0.0))
+        return Bound(change, f"the crop sways by {sway:.2g} px, {rig.air.wind_hz:g} times a second")
 
 
 def sway_px(rig: Rig) -> float:
@@ -157,21 +149,6 @@ def sway_px(rig: Rig) -> float:
 def sway_gradient(rig: Rig) -> float:
     """Return by how much the sway differs from one px to the next at most, 2 pi A over the length of a gust."""
     return 2 * math.pi * rig.air.wind_amplitude_m / GUST_M if sway_px(rig) else 0.0
-
-
-def line_to_line_px(rig: Rig) -> float:
-    """Return the most that the crop moves from one line to the next, 2 A |sin(pi f t_frame)| / (d IFOV). [px]"""
-    return 2 * sway_px(rig) * abs(math.sin(math.pi * sways_per_line(rig)))
-
-
-def within_exposure_px(rig: Rig) -> float:
-    """Return the most that the crop moves while a line is exposed, 2 A |sin(pi f t_exp)| / (d IFOV) up to 2 A. [px]"""
-    sways = min(rig.air.wind_hz * rig.camera.exposure_ms * 1e-3, 0.5)
-    return 2 * sway_px(rig) * math.sin(math.pi * sways)
-
-
-def sways_per_line(rig: Rig) -> float:
-    return rig.air.wind_hz * rig.camera.frame_ms * 1e-3
 
 
 @dataclass(frozen=True)
@@ -248,11 +225,6 @@ def reach_m(rig: Rig) -> tuple[float, float] | None:
     return min(*ends, FARTHEST_M), min(max(ends), FARTHEST_M)
 
 
-def has_relief(rig: Rig) -> bool:
-    reach = reach_m(rig)
-    return reach is not None and reach[0] != reach[1]
-
-
 def sample_distances(block: SweepBlock) -> Floats:
     """Return the distance at which each sample looks by the plan, (line, sample) [m]; (1, 1) if all are alike."""
     ends = reach_m(block.rig)
@@ -265,7 +237,7 @@ def sample_distances(block: SweepBlock) -> Floats:
     return 1 / np.clip(inverse, 1 / ends[1], 1 / ends[0])
 
 
-def spoken_reach(ends: tuple[float, float]) -> str:
+def format_reach(ends: tuple[float, float]) -> str:
     return f"{ends[1]:g} m" if ends[0] == ends[1] else f"{ends[0]:g} to {ends[1]:g} m"
 
 
@@ -305,9 +277,6 @@ class Absorption(Gain):
     name = "absorption"
     cost_ns = MappingProxyType({RANGE: 2.7, UNIFORM: 0.2})  # of a scene with relief
 
-    def cost_at(self, probe: Probe, rig: Rig) -> Mapping[str, float]:
-        return self.cost_ns if has_relief(rig) else dict.fromkeys(self.variants, self.cost_ns[UNIFORM])
-
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by level times the fraction that gases take, or that a variant misses."""
         reach = reach_m(rig)
@@ -320,7 +289,7 @@ class Absorption(Gain):
         verb = "take" if variant == OFF else "at one distance for all are wrong by"
         where = f" at {probe.wavelength_nm[int(fraction.argmax())]:.0f} nm" if fraction.size else ""
         why = (
-            f"oxygen and water vapour {verb} at most {fraction.max(initial=0.0):.2%}{where} over {spoken_reach(reach)}"
+            f"oxygen and water vapour {verb} at most {fraction.max(initial=0.0):.2%}{where} over {format_reach(reach)}"
         )
         return Bound(probe.scaled(fraction), why)
 
@@ -379,9 +348,6 @@ class PathRadiance(LightChange):
     name = "path-radiance"
     cost_ns = MappingProxyType({RANGE: 3.1, UNIFORM: 0.5})  # of a scene with relief
 
-    def cost_at(self, probe: Probe, rig: Rig) -> Mapping[str, float]:
-        return self.cost_ns if has_relief(rig) else dict.fromkeys(self.variants, self.cost_ns[UNIFORM])
-
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by the fraction that is lost, or that a variant misses, times the greatest difference of signal and H.
 
@@ -400,7 +366,7 @@ class PathRadiance(LightChange):
         worst = float((_contrast(probe, rig) * lost).max(initial=0.0))
         verb = "takes" if variant == OFF else "at one distance for all is wrong by"
         most = f"at most {lost.max(initial=0.0):.2%} of the light"
-        return Bound(worst, f"air {verb} {most} and adds its own, over {spoken_reach(reach)}")
+        return Bound(worst, f"air {verb} {most} and adds its own, over {format_reach(reach)}")
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
         """Return what passes between the nearest and the farthest sample, and the greatest light that air adds. [e-]

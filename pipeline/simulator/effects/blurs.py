@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from types import MappingProxyType
@@ -12,10 +11,10 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from pipeline.simulator.effects.effect import Blur, Bound, Merged
+from pipeline.simulator.effects.effect import Blur, Bound
 from pipeline.simulator.effects.probe import UNITS, Probe
-from pipeline.simulator.optics.kernel_fit import Moments, disc_points
-from pipeline.simulator.optics.rays import normals_met, pupil_contrast, spread_of_rays, spread_of_waves
+from pipeline.simulator.optics.kernel_fit import Moments
+from pipeline.simulator.optics.rays import extreme_normals, pupil_contrast, spread_of_rays, spread_of_waves
 from pipeline.simulator.rig_model import Rig
 
 Floats = NDArray[np.float64]
@@ -23,7 +22,6 @@ AIRY = "airy"
 FIRST_NM, LAST_NM = 400.0, 1000.0  # of the spectrograph
 _ALONE: Floats = np.ones(1)
 GAUSSIAN_WAY, DISC_WAY = math.sqrt(2 / math.pi), 8 / (3 * math.pi)  # mean of |x| over the standard deviation
-_POINT_NS = 0.85  # of each point that stands for a disc
 
 
 def blurred_bound(
@@ -76,7 +74,7 @@ class Diffraction(Blur):
         Each changes the image at most as much as its variance does.
         """
         fraction, size = airy_gaussians()
-        found = [_waves(rig, probe.wavelength_nm, normal) for normal in normals_met(probe.sweeps, rig.camera)]
+        found = [_waves(rig, probe.wavelength_nm, normal) for normal in extreme_normals(probe.sweeps, rig.camera)]
         missing = [[(one * waves) ** 2 for one in size] for waves in found]
         return blurred_bound(probe, "diffraction", np.max(missing, axis=0), fraction)
 
@@ -128,12 +126,6 @@ class Defocus(Blur):
     name = "defocus"
     cost_ns = MappingProxyType({"disc": 5.7})  # of seven points
 
-    def cost_at(self, probe: Probe, rig: Rig) -> Mapping[str, float]:
-        """Return the cost of as many points as stand for the disc; one is a Gaussian, which costs nothing."""
-        along, scan = defocus_px(rig, rig.air.distance_m).tolist()
-        points = disc_points((along, scan))[0].shape[1]
-        return {"disc": _POINT_NS * points if points > 1 else 0.0}
-
     def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
         none, (along, scan) = np.zeros((2, len(wavelength_nm))), defocus_px(rig, rig.air.distance_m, normal).tolist()
         return Moments(none, none, disc=(along, scan))
@@ -141,7 +133,7 @@ class Defocus(Blur):
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         if rig.distances_m is None:
             return Bound(0.0, "the scene has no distance")
-        normals = normals_met(probe.sweeps, rig.camera)
+        normals = extreme_normals(probe.sweeps, rig.camera)
         worst = np.max([defocus_px(rig, rig.air.distance_m, normal) ** 2 / 16 for normal in normals], axis=0)
         cause = f"defocus at {rig.air.distance_m:g} m, focused at {rig.optics.focus_m:g} m"
         variance = even(worst, len(probe.wavelength_nm)).variance[None]
@@ -169,11 +161,7 @@ class Keystone(Blur):
     """
 
     name = "keystone"
-    cost_ns = MappingProxyType({"linear": 3.9})
-
-    def merged(self, rig: Rig) -> Merged:
-        """Return what it costs beside diffraction, whose several widths have to be shifted each."""
-        return Merged(DIFFRACTION.name, AIRY, 6.5)
+    cost_ns = MappingProxyType({"linear": 6.5})  # beside diffraction, each of whose widths has to be shifted
 
     def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
         shift = np.zeros((2, len(wavelength_nm)))
@@ -183,15 +171,14 @@ class Keystone(Blur):
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by the slope along the line times each band's shift, never more than the span."""
         shift = np.abs(keystone_shift(rig, probe.wavelength_nm))
-        near = probe.within(float(shift.max(initial=0.0)))
-        change = np.minimum(near.slope[0] * shift, near.span)
+        change = np.minimum(probe.slope[0] * shift, probe.span)
         if not shift.any():
             return Bound(0.0, "no shift along the line")
         band = int(np.argmax(change))
         return Bound(
             float(change[band]),
             f"{shift[band]:.2g} px along the line at {probe.wavelength_nm[band]:.0f} nm,"
-            f" on edges of at most {near.slope[0, band]:.3g} {UNITS[probe.unit]}/px",
+            f" on edges of at most {probe.slope[0, band]:.3g} {UNITS[probe.unit]}/px",
         )
 
 

@@ -1,4 +1,4 @@
-"""The readout: draws of shot and read noise, and the effects dark current, defects, saturation and quantisation.
+"""Draws of shot and read noise, and the readout's effects: dark current, defects, saturation, quantisation.
 
 Every element takes one deviate, whatever its light. The count of photons grows with both. So two images of nearly the
 same light have nearly the same noise, and their difference is that of the light.
@@ -7,7 +7,6 @@ same light have nearly the same noise, and their difference is that of the light
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from types import MappingProxyType
@@ -17,7 +16,7 @@ import scipy
 from numpy.typing import NDArray
 
 from pipeline.simulator import compiled_loops
-from pipeline.simulator.effects.effect import Bound, Effect, Merged, unit_stream
+from pipeline.simulator.effects.effect import Bound, Effect, unit_stream
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Rig
 
@@ -82,8 +81,9 @@ def rounded_counts(expected: Radiance, deviate: Radiance) -> Radiance:
 def divergence(expected: Floats, read_noise_e: float) -> Floats:
     """Bound how far one cheap draw's distribution is from the exact one's (chi-square divergence).
 
-    These are the leading terms of its Gram-Charlier expansion: c2^2 / 2 + c4^2 / 24. c2 and c4 are the differences of
-    variance and fourth cumulant, in units of the standard deviation. Without read noise that is 1 / (216 expected^2).
+    These are the leading terms of its Gram-Charlier expansion, c2^2 / 2 + c4^2 / 24. Here c2 and c4 are the differences
+    of variance and fourth cumulant, in units of the standard deviation. Without read noise that is 1 / (216
+    expected^2).
     """
     variance = np.maximum(expected + read_noise_e**2, np.finfo(float).tiny)
     fraction = expected / variance
@@ -96,7 +96,7 @@ def divergence(expected: Floats, read_noise_e: float) -> Floats:
 def least_expected(read_noise_e: float) -> float:
     """Return from how many expected electrons on cheap draws may stand for exact ones; 0 is at any light.
 
-    From there on, a patch of `CHIP_SAMPLES` cheap numbers and one of exact ones are close: their total variation is at
+    From there on, a patch of `CHIP_SAMPLES` cheap numbers is close to one of exact numbers. Their total variation is at
     most sqrt(N divergence) / 2 <= `MOST_VARIATION`.
     """
     levels = np.geomspace(1e-3, 1e6, 4096)
@@ -128,9 +128,9 @@ def separable(sd: float, other: float) -> float:
 def _series_quantile(mean: Floats, z: Floats) -> Floats:
     """Return the Poisson quantile at Phi(z) for means from `SERIES_FROM_E` on.
 
-    C(x) = Gamma(x, mean) / Gamma(x) runs smoothly through the distribution, F(k) = C(k + 1): where C(x) = Phi(z), the
-    quantile is floor(x). x is expanded in 1 / sqrt(mean) [1]. If it comes as near to a whole number as the expansion
-    may err, the distribution itself is asked.
+    C(x) = Gamma(x, mean) / Gamma(x) runs smoothly through the distribution: F(k) = C(k + 1). The quantile is floor(x)
+    where C(x) = Phi(z). The solution x is expanded in 1 / sqrt(mean) [1]. If it comes as near to a whole number as the
+    expansion may err, the distribution itself is asked.
 
     [1] Giles, "Algorithm 955: approximation of the inverse Poisson cumulative distribution function", ACM Trans. Math.
     Softw. 42, 2016. doi:10.1145/2699466
@@ -167,7 +167,6 @@ def _summed_quantile(mean: Floats, z: Floats) -> Floats:
 
 REACH = 6.0  # deviations of the noise that the brightest sample may lie above its mean
 EXACT, GAUSSIAN = "exact", "gaussian"
-DIM_NS = 80.0  # of an exact count below `SERIES_FROM_E`, in lines of any light
 REFERENCE_DEG_C = 25.0
 ZERO_DEG_C_K = 273.15
 BOLTZMANN_EV_PER_K = 8.617333e-5
@@ -319,20 +318,6 @@ class Shot(Effect):
     name = "shot"
     cost_ns = MappingProxyType({EXACT: 10.0, GAUSSIAN: 3.9})  # of light above `SERIES_FROM_E`
 
-    def cost_at(self, probe: Probe, rig: Rig) -> Mapping[str, float]:
-        """Return the cost at the light along the probe's lines: few electrons are counted one by one.
-
-        Cheap draws pay for the exact ones that stand in for them where too few electrons are expected.
-        """
-        if probe.usual_e is None:
-            return self.cost_ns
-        expected = probe.usual_e + dark_electrons(rig)
-        counted = self.cost_ns[EXACT] + (DIM_NS - self.cost_ns[EXACT]) * float((expected < SERIES_FROM_E).mean())
-        read = rig.camera.read_noise_e
-        merged = read >= LEAST_MERGED_READ_E and not well_reached(rig, read)
-        dim = float((expected < least_expected(read if merged else 0.0)).mean())
-        return {EXACT: counted, GAUSSIAN: self.cost_ns[GAUSSIAN] + dim * counted}
-
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound it at the brightest sample, where it is the greatest fraction of all noise."""
         brightest = max(probe.brightest_e, 0.0) + dark_electrons(rig) + most_hot_electrons(rig)
@@ -371,13 +356,7 @@ class ReadNoise(Effect):
     """
 
     name = "read-noise"
-    cost_ns = MappingProxyType({"exact": 3.2})
-
-    def merged(self, rig: Rig) -> Merged | None:
-        """Return what it costs in the shot noise's draw: nothing, where no well comes between them."""
-        if rig.camera.read_noise_e < LEAST_MERGED_READ_E or well_reached(rig, rig.camera.read_noise_e):
-            return None
-        return Merged(SHOT.name, GAUSSIAN, 0.0)
+    cost_ns = MappingProxyType({"exact": 0.0})  # 3.2 where shot noise is exact or off
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound it at the darkest sample, where it is the greatest fraction of all noise."""

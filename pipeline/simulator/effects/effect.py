@@ -11,7 +11,7 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,20 +38,8 @@ class Bound:
     why: str
 
 
-class Merged(NamedTuple):
-    """Cost of an effect beside a variant of another, with which it shares a draw, or kernels. [ns]"""
-
-    other: str
-    variant: str
-    cost_ns: float
-
-
 class Effect(Protocol):
-    """Interface of an effect to the decision, by name. Variants go from exact to cheap; off is none of them.
-
-    ``merged(rig)`` says what it shares with another's work, ``cost_at(probe, rig)`` its cost where that follows the
-    light.
-    """
+    """Interface of an effect to the decision, by name. Variants go from exact to cheap; off is none of them."""
 
     @property
     def name(self) -> str:
@@ -59,11 +47,11 @@ class Effect(Protocol):
 
     @property
     def cost_ns(self) -> Mapping[str, float]:
-        """Measured cost of each variant per px and band, the exact one first [ns]."""
+        """Return measured cost of each variant per px and band, the exact one first [ns]."""
 
     @property
     def variants(self) -> tuple[str, ...]:
-        """Ways to compute it, the exact one first."""
+        """Return ways to compute it, the exact one first."""
         return tuple(self.cost_ns)
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
@@ -128,39 +116,39 @@ class SweepBlock:
 
     @property
     def numbers(self) -> NDArray[np.int64]:
-        """(line,) numbers within the sweep."""
+        """Return the numbers of the lines within the sweep."""
         return np.arange(self.lines.start, self.lines.stop, self.lines.step, dtype=np.int64)
 
     @property
     def slopes(self) -> Floats:
-        """(sample,) tangent of each sample's ray along the line."""
+        """Return the tangent of each sample's ray along the line."""
         return self.rig.camera.pixel_slopes()
 
     @property
     def time_s(self) -> Floats:
-        """(line,) of mid exposure, since the survey's start [s]."""
+        """Return the time of each line at mid exposure, since the survey's start [s]."""
         return self.started_s + self.rig.camera.mid_exposure_s(self.numbers.astype(np.float64))
 
     @cached_property
     def positions(self) -> Floats:
-        """(line, step, 2) device X and Y that are held, as planned."""
+        """Return device X and Y that are held, as planned, (line, step, 2)."""
         return sweep_positions(self.sweep, self.rig.camera)[self.numbers]
 
     @cached_property
     def middle(self) -> Floats:
-        """(line, 2) device X and Y at mid exposure, as planned."""
+        """Return device X and Y of each line at mid exposure, as planned."""
         return line_positions(self.sweep, self.rig.camera)[self.numbers]
 
     @cached_property
     def normals(self) -> Floats:
-        """(line, 3) of the mirror at mid exposure, as planned; ``-n_z`` is the cosine of incidence of the chief ray."""
+        """Return the mirror's normals at mid exposure, as planned, (line, 3); ``-n_z`` is the cosine of incidence."""
         # for the whole sweep: the product with the axes rounds otherwise for a single line than for several.
         whole: Floats = position_to_normal(line_positions(self.sweep, self.rig.camera))
         return whole[self.numbers]
 
     @property
     def scan_px(self) -> Floats:
-        """(line,) scan coordinate at mid exposure [px]."""
+        """Return the scan coordinate of each line at mid exposure [px]."""
         return self.sweep.line_px()[self.numbers]
 
     def stream(self, effect: str, number: int) -> np.random.Generator:

@@ -17,8 +17,7 @@ from pipeline.simulator.effects.effect import OFF, Bound, Effect, SweepBlock
 from pipeline.simulator.effects.pointing import at_line_ends, beside_plan, end_gains, greatest_lag_px, transient
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.optics.kernel_fit import BETWEEN_ROWS, SCALE_STEP
-from pipeline.simulator.optics.rays import RayViews
-from pipeline.simulator.optics.tap_sums import TABULATED, Parts, fewest_parts
+from pipeline.simulator.optics.scene_radiance import TABULATED
 from pipeline.simulator.rig_model import Rig
 
 MARGIN = 1.5  # over what the probe measured at the roughest places found
@@ -26,8 +25,7 @@ UPRIGHT = "1x1"  # the slit's variant of one box that does not lie turned
 _RAY_PER_TILT = 2.6  # a ray turns by twice the tilt; the scene plane is oblique to it by up to 30 deg
 Floats = NDArray[np.float64]
 _PROBES = 33  # lines of a sweep and samples of a line at which its course is taken; both are smooth
-_COUNTED: dict[str, Parts] = {"9x3": (9, 3), "5x2": (5, 2), "3x1": (3, 1), UPRIGHT: (1, 1)}
-_STATED = {"1-percent": 0.01, "3-percent": 0.03}  # of the light that a sweep's boxes may misplace
+BOXES = {"9x3": (9, 3), "5x2": (5, 2), "3x1": (3, 1), UPRIGHT: (1, 1)}  # of the slit's variants, across and along
 POSITIONS, FOLDED = "positions", "folded"
 
 
@@ -83,14 +81,13 @@ def _course(sweep: Sweep, camera: LineCamera, beside: tuple[float, float]) -> tu
 class SlitBox(Effect):
     """The footprint of slit and pixel, a box in closed form. Off, a sample sees what its middle ray meets.
 
-    Variants tell into how many boxes that do not lie turned, across and along, it is parted; from two across on they
-    have its covariance. Those of a stated error take, for each sweep, as few as misplace at most as much light as
-    that.
+    A variant parts it into so many boxes across and along that do not lie turned. Two across and more have its
+    covariance.
     """
 
     name = "slit"
     # measured at a strip of 320 px: `python tests/benchmarks costs`. One box is no dearer than none.
-    cost_ns = MappingProxyType({"9x3": 10.0, "5x2": 3.4, "3x1": 0.5, "1-percent": 0.3, "3-percent": 0.2, UPRIGHT: 0.0})
+    cost_ns = MappingProxyType({"9x3": 10.0, "5x2": 3.4, "3x1": 0.5, UPRIGHT: 0.0})
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by half as much again as the probe measured; where it has not, by the box's variance and the span.
@@ -99,7 +96,8 @@ class SlitBox(Effect):
         Rounding in tables adds a little, and so do lines that turn more where the mirror looks beside its plan.
         """
         width, bands = rig.camera.slit_px, len(probe.wavelength_nm)
-        why = f"{_words(variant)} in place of a footprint {width:.2g} px wide and 1 px long"
+        instead = "its middle ray" if variant == OFF else f"{variant.replace('x', ' x ')} boxes that are not turned"
+        why = f"{instead} in place of a footprint {width:.2g} px wide and 1 px long"
         box = np.array([[1.0], [width**2]]) / 12
         whole = probe.blurred(np.repeat(box, bands, axis=1))
         if variant not in probe.slit_errors:
@@ -112,24 +110,9 @@ class SlitBox(Effect):
         return Bound(value, f"{why}, measured where the scene is roughest")
 
 
-def box_parts(variant: str, rig: Rig, views: RayViews) -> Parts:
-    """Return into how many boxes a variant parts the footprint, across and along, for views all over a sweep."""
-    if variant in _STATED:
-        return fewest_parts(_STATED[variant], box_of(variant, rig), views)
-    return _COUNTED.get(variant, (1, 1))
-
-
 def box_of(variant: str, rig: Rig) -> tuple[float, float]:
     """Return the widths of slit and pixel; 0 where the footprint is off. [px]"""
     return (0.0, 0.0) if variant == OFF else (rig.camera.slit_px, 1.0)
-
-
-def _words(variant: str) -> str:
-    if variant == OFF:
-        return "its middle ray"
-    if variant in _STATED:
-        return f"boxes that are not turned and misplace at most {_STATED[variant]:.0%} of the light"
-    return f"{variant.replace('x', ' x ')} boxes that are not turned"
 
 
 @dataclass(frozen=True)
@@ -155,13 +138,12 @@ class Smear(Effect):
             along, scan = _beside(probe.sweeps, rig)
             along, scan = along + sway_gradient(rig), scan + sway_gradient(rig) + greatest_fraction(rig.air)
             way, area = np.abs(np.arange(most) - (most - 1) / 2).mean(), 2 * variance
-            near = probe.within(most / 2)
-            by_scan = np.minimum(near.slope[1] * way, near.curvature[1] * area) * scan
+            by_scan = np.minimum(probe.slope[1] * way, probe.curvature[1] * area) * scan
             beside = (ways - ways.mean(axis=1, keepdims=True) for ways in _courses(probe.sweeps, rig))
             uneven = max((float(np.abs(one).mean(axis=1).max()) for one in beside), default=0.0)
             course = at_line_ends(probe.sweeps, rig.camera, 0.0, uneven)
-            by_course = near.slope[0] * course[0] + near.slope[1] * course[1]
-            change = np.minimum(near.slope[0] * way * along + by_scan + by_course, near.span)
+            by_course = probe.slope[0] * course[0] + probe.slope[1] * course[1]
+            change = np.minimum(probe.slope[0] * way * along + by_scan + by_course, probe.span)
             # at a step of the relief up to half of the positions see the other depth, at most twice as far off
             step = PARALLAX.bound(probe, rig).value if rig.air.relief == "step" else 0.0
             return Bound(float(change.max(initial=0.0)) + step, f"lines of an exposure lie as one, {most} px")

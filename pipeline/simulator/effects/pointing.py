@@ -77,8 +77,8 @@ class Jitter(Aim):
         """Bound what the worst of all lines' deviates changes; with a probability of 1e-3 a survey goes beyond.
 
         A line changes by at most its slope's share in the two tilts times the length of the two deviates. That length
-        exceeds m with probability exp(-m^2 / 2), so any of n lines' does with at most n exp(-m^2 / 2). m is sqrt(2 ln(n
-        / 1e-3)), 5.4 for 2560 lines.
+        exceeds m with probability exp(-m^2 / 2), so any of n lines' does with at most n exp(-m^2 / 2). The limit m is
+        sqrt(2 ln(n / 1e-3)), 5.4 for 2560 lines.
         """
         sigma, lines = _sigma_px(rig), probe.lines
         if sigma == 0 or lines == 0:
@@ -93,9 +93,8 @@ class Jitter(Aim):
                 worst = np.maximum(worst, [size[..., 0].max(), size[..., 1].max(), common.max()])
         along, scan, common = float(worst[0]), float(worst[1]), float(worst[2])
         most = math.sqrt(2 * math.log(lines / EXCEEDED))
-        near = probe.within(most * sigma * max(along, scan))
-        g, h = near.slope[0] * along, near.slope[1] * scan
-        value = np.minimum(most * sigma * np.sqrt(g * g + h * h + 2 * common * g * h), near.span).max(initial=0.0)
+        g, h = probe.slope[0] * along, probe.slope[1] * scan
+        value = np.minimum(most * sigma * np.sqrt(g * g + h * h + 2 * common * g * h), probe.span).max(initial=0.0)
         why = f"lines jump by {sigma * scan:.2f} px rms along the scan and {sigma * along:.2f} along the line"
         return Bound(float(value), f"{why}, one of {lines} by {most:.1f} times that")
 
@@ -181,7 +180,7 @@ def pointing_field(unit: int, position: Floats) -> Floats:
 
 
 def _course(rig: Rig, sweep: Sweep, position: Floats) -> Floats:
-    """Shift (line, 2) of lines at some positions of a sweep. [px]"""
+    """Return shift (line, 2) of lines at some positions of a sweep. [px]"""
     return rig.mirror.hysteresis_px * scan_sign(sweep) * pointing_field(rig.detector.unit, position)
 
 
@@ -250,8 +249,8 @@ class Staircase(Aim):
     """Sample and hold with any number of positions per px of path. Off, each px of the path has its one position.
 
     The memory is played at a steady rate while lines are exposed, timed so that in the long run lines lie where they
-    are planned. ``exact`` gives the mean position in equal parts of the exposure, so many that no position changes
-    within a part where :data:`MOST_PARTS` are enough; ``centres`` that of the whole exposure, or of each px of path.
+    are planned. ``exact`` gives the mean position in equal parts of the exposure: so many that no position changes
+    within a part, at most :data:`MOST_PARTS`. ``centres`` gives that of the whole exposure, or of each px of path.
     """
 
     name = "staircase"
@@ -399,7 +398,7 @@ def _early_rise(time: Floats, damping: float) -> Floats:
 
 
 def _at_start(mirror: MirrorMotion, sweep: Sweep, period: float, held: float) -> Floats:
-    """State (place [px], rate) as line 0 begins: at rest, less steady motion; and what is left of the way back.
+    """Return state (place [px], rate) as line 0 begins: at rest, less steady motion; and what is left of the way back.
 
     A mirror in steady motion has the errors of all steps before, a geometric series over lines. Its denominator is I -
     exp(A period), whose determinant h^2 + 2 zeta h g + g^2 is a sum.

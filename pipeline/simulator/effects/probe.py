@@ -8,12 +8,11 @@ stored number in its own sigmas, whatever the binning.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Literal, TypeVar
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from pipeline.geometry.scan import Sweep
@@ -26,27 +25,9 @@ Radiance = NDArray[np.float32]
 Real = TypeVar("Real", np.float32, np.float64)
 
 
-WIDE_PX = 16 / 3  # sd of a blur from which on only means of several pixels count that lie far from a sample
-_FAR_SDS = 3.0  # of a blur, within which derivatives are taken; beyond counts its fraction of the light and the span
-
-
-@dataclass(frozen=True)
-class Detail:
-    """Greatest changes of light within a reach of the samples of all sweeps, theirs among it, band by band.
-
-    They are as those of the probe, over the least unit that a sample has.
-    """
-
-    reach_px: float
-    span: Floats  # (band,) greatest difference of a sample's signal and anything there
-    slope: Floats  # (2, band) [1/px]
-    curvature: Floats  # (2, band) [1/px^2]
-    spectral: Floats  # (2, band) first and second divided difference over wavelength [1/nm, 1/nm^2]
-
-
 @dataclass(frozen=True)
 class Probe:
-    """Maxima over the samples of a few lines, band by band, as the footprint of slit and pixel alone shows the scene.
+    """Maxima over a scene, band by band, as the footprint of slit and pixel alone shows it.
 
     All but the electrons are over the unit of the tolerance. That is one standard deviation of the noise of the stored
     number, or one DN of it. If that sums ``binning`` samples, a maximum is of the mean of their sizes over the noise of
@@ -72,40 +53,14 @@ class Probe:
     seconds: float  # from the first line to the last
     white_e: Floats | None = None  # (band,) electrons of the white reference in one exposure; None where not known
     slit_errors: Mapping[str, float] = field(default_factory=dict)  # measured change by variant of the slit, or off
-    usual_e: Floats | None = None  # evenly spaced quantiles of the light along the lines; None where not known
-    places: Floats = field(default_factory=lambda: np.zeros((0, 2)))  # the telling ones, rows and columns, worst first
+    places: Floats = field(default_factory=lambda: np.zeros((0, 2)))  # of the maxima, rows and columns, worst first
     binning: int = 1  # samples that a stored number sums, the same in all of the sweeps
-    beside: tuple[Detail, ...] = ()  # what lies beside the sweeps, the nearest first; none where they see all there is
-    afar: Detail | None = None  # all of the scene, as what is `WIDE_PX` wide and more sees it: means of several pixels
-    anywhere: Floats | None = None  # (band,) greatest difference of a sample's signal and any of the scene
-    anywhere_spectral: Floats | None = None  # (2, band) as `Detail.spectral`, of any spectra between `ends_e`
-    own_e: Floats | None = None  # (2, band) least and greatest light of samples; None: level and span tell [e-]
-    ends_e: Floats | None = None  # (2, band) least and greatest light of all the scene, None as `anywhere` [e-]
-
-    def within(self, reach_px: float) -> Probe:
-        """Return the probe of the light no farther from the samples, with the greatest slope, curvature and span there.
-
-        Farther than has been looked, light changes by at most the greatest difference in a px.
-        """
-        if self.anywhere is None or reach_px == 0:
-            return self
-        for one in self.beside:
-            if reach_px <= one.reach_px:
-                return self.with_detail(one)
-        both, spectral = np.stack([self.anywhere] * 2), self.anywhere_spectral
-        found = replace(self, span=self.anywhere, slope=both, curvature=4 * both)
-        return found if spectral is None else replace(found, spectral_slope=spectral[0], spectral_curvature=spectral[1])
-
-    def blurred_by(self, sd_px: float) -> Probe:
-        """Return the probe of what a Gaussian of this size sees of the scene, its derivatives among it."""
-        wide = self.afar is not None and sd_px > WIDE_PX
-        return self.with_detail(self.afar) if wide and self.afar else self.within(_FAR_SDS * sd_px)
+    own_e: Floats | None = None  # (2, band) least and greatest light; None: it follows from level and span [e-]
 
     def moved(self, along_px: float, scan_px: float) -> float:
         """Bound what a shift of the image by at most so much changes: slope times way, never more than the span."""
-        near = self.within(max(abs(along_px), abs(scan_px)))
-        steep = _times(near.slope[0], abs(along_px)) + _times(near.slope[1], abs(scan_px))
-        return float(np.minimum(steep, near.span).max(initial=0.0))
+        steep = _times(self.slope[0], abs(along_px)) + _times(self.slope[1], abs(scan_px))
+        return float(np.minimum(steep, self.span).max(initial=0.0))
 
     def blurred(self, variance_px2: Floats) -> float:
         """Bound what a kernel of mean 0 and (2, band) variance changes in any band."""
@@ -115,36 +70,7 @@ class Probe:
         """Bound what it changes in each band, (band,): C s^2 / 2, or G E|x| where that is less, or the span.
 
         E|x| is ``mean_way`` times s, at most 1; the smaller bound takes over where the image is a step or a point.
-        Light beside the sweeps counts as far as the kernel reaches, and beyond by the fraction of it that does. A wide
-        Gaussian is taken as a narrow one, followed by one of the remaining variance over means of several pixels.
         """
-        widest = float(np.sqrt(np.max(variance_px2, initial=0.0)))
-        if self.anywhere is None or widest == 0:
-            return self._changed(variance_px2, mean_way)
-        if self.afar is None or widest <= WIDE_PX:
-            near = [one for one in self.beside if one.reach_px >= _FAR_SDS * widest]
-            beyond = [4 * scipy.special.ndtr(-one.reach_px / widest) for one in near]
-            ways = [
-                self.with_detail(one)._changed(variance_px2, mean_way) + more * self.anywhere
-                for one, more in zip(near, beyond, strict=True)
-            ]
-            return np.asarray(np.min([*ways, self.anywhere], axis=0))
-        narrow = np.minimum(variance_px2, WIDE_PX**2)
-        wide = self.with_detail(self.afar)._changed(variance_px2 - narrow, mean_way)
-        return np.asarray(np.minimum(self.change_blurred(narrow, mean_way) + wide, self.anywhere))
-
-    def with_detail(self, detail: Detail) -> Probe:
-        """Return the same probe with the steepest and the most curved light of another place."""
-        return replace(
-            self,
-            span=detail.span,
-            slope=detail.slope,
-            curvature=detail.curvature,
-            spectral_slope=detail.spectral[0],
-            spectral_curvature=detail.spectral[1],
-        )
-
-    def _changed(self, variance_px2: Floats, mean_way: float) -> Floats:
         by_curvature = _times(self.curvature, variance_px2 / 2)
         by_slope = _times(self.slope, mean_way * np.sqrt(variance_px2))
         return np.asarray(np.minimum(np.minimum(by_curvature, by_slope).sum(axis=0), self.span))
@@ -210,8 +136,8 @@ def unit_electrons(light_e: Floats, probe: Probe, rig: Rig) -> Floats:
 def lights_within(probe: Probe, rig: Rig) -> tuple[Floats, Floats]:
     """Return least and greatest light of every band, (band,) each [e-]: where level and span have their units from.
 
-    Where the probe does not hold them: with U(S)^2 = (S + n) / m for means of m samples, the greatest S has level S /
-    U(S), and the least a difference of span U to it, or a smaller.
+    If the probe has none, they are solved from level and span. The unit of means of m samples is U(S)^2 = (S + n) / m.
+    The greatest S has level S / U(S); the least differs from it by span U or less.
     """
     if probe.own_e is not None:
         return probe.own_e[0], probe.own_e[1]
@@ -230,8 +156,8 @@ class GainRange:
     """Factors of light that a gain has anywhere in a survey, (band,) each.
 
     ``uneven`` is the greatest difference of two factors within one line. ``steepest`` and ``bend`` are the greatest
-    first and second differences of the factor over wavelength; ``added_e`` is light that is added, with differences
-    of its own.
+    first and second differences of the factor over wavelength. ``added_e`` is light that is added, with differences of
+    its own.
     """
 
     least: Floats
@@ -307,19 +233,3 @@ def steepest_difference(spectra: NDArray[Real], wavelength_nm: Floats) -> NDArra
     out[..., :-1] = steep
     np.maximum(out[..., 1:], steep, out=out[..., 1:])
     return out
-
-
-def spectral_differences_between(ends_e: Floats, wavelength_nm: Floats) -> Floats:
-    """Return the greatest divided differences, (2, band), of any spectra between two, (2, band): for unprobed light.
-
-    Second differences are greatest where bands are at one end and their neighbours at the other.
-    """
-    if len(wavelength_nm) < 2:
-        return np.zeros((2, len(wavelength_nm)))
-    low, high = ends_e
-    gaps = np.diff(wavelength_nm)
-    step = np.maximum(high[1:] - low[:-1], high[:-1] - low[1:])  # to the next band
-    steep = np.divide(step, gaps, out=np.zeros_like(gaps), where=gaps > 0)
-    down, up = difference_rates(wavelength_nm)
-    to_last, to_next = np.append(0.0, step), np.append(step, 0.0)
-    return np.stack([np.maximum(np.append(steep, 0.0), np.append(0.0, steep)), down * to_last + up * to_next])

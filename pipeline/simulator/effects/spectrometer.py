@@ -327,7 +327,7 @@ class StrayLight(LightChange):
             return Bound(0.0, "no light is scattered")
         spread = float(np.max(probe.spread, initial=0))
         halo = optics.stray_fraction * (1 - optics.stray_even) * _most_halo(probe, rig, spread)
-        why = f"{optics.stray_fraction:.2g} of a line's light, signals up to {spread:.3g} {probe.unit} from its mean"
+        why = f"{optics.stray_fraction:.2g} times a line's light, signals up to {spread:.3g} {probe.unit} from its mean"
         return Bound(optics.stray_fraction * spread + halo, why)
 
     def change(self, light: Radiance, block: SweepBlock, variant: str) -> Radiance:
@@ -348,9 +348,9 @@ class StrayLight(LightChange):
 def _most_halo(probe: Probe, rig: Rig, spread: float) -> float:
     """Bound |H - mean| over the unit at any sample, H the halo's own light.
 
-    It is at most the light that the kernel takes elsewhere than an even one would, times the range of signals, the
-    brightest less the darkest. It is never more than twice the greatest way from the mean. That is ``spread`` units,
-    each at most the unit at the brightest sample.
+    It is at most the light that the kernel takes elsewhere than an even one would, times the range of signals
+    (brightest less darkest). It is never more than twice the greatest way from the mean. That is ``spread`` units, each
+    at most the unit at the brightest sample.
     """
     elsewhere = _uneven_fraction((rig.camera.samples, len(probe.wavelength_nm)), rig.optics.stray_halo_px)
     per_dn = rig.camera.electrons_per_dn

@@ -1,9 +1,9 @@
 """Footprints: slit, pixel and every blur folded to few kernels that all bands share; tables of their weights.
 
-A kernel is a box (the slit across the line, the pixel along it) convolved with a Gaussian of a shift and a variance of
-its own. Gaussians of a ladder of sizes, at a few of the bands' shifts, stand for all bands. The waves that a sum passes
-are compared with the optical transfer function behind the footprint of slit, pixel and scene. Wide ones look at every
-second, fourth, ... pixel of the scene, blurred before: see `SceneRaster.thinned`.
+A kernel is a box convolved with a Gaussian of its own shift and variance. The box is the slit across the line and the
+pixel along it. Gaussians of a ladder of sizes, at a few of the bands' shifts, stand for all bands. The waves that a sum
+passes are compared with the optical transfer function behind the footprint of slit, pixel and scene. Wide ones look at
+every second, fourth, ... pixel of the scene, blurred before: see `SceneRaster.thinned`.
 """
 
 from __future__ import annotations
@@ -105,13 +105,11 @@ class Kernels:
 
 
 @lru_cache(maxsize=64)
-def _fit(
-    told: bytes, bands: int, box: tuple[float, float], held: int, disc: Axes
-) -> tuple[Kernels, Floats, Floats, float]:
-    """Return kernels, fractions and their error for bands (6, band), no two alike: shift, variance and waves."""
-    moments = np.frombuffer(told).reshape(6, bands)
+def _fit(packed: bytes, bands: int, box: tuple[float, float], held: int, disc: Axes) -> tuple[Kernels, Floats, Floats]:
+    """Return kernels and their fractions for bands (6, band), no two alike: shift, variance and waves."""
+    moments = np.frombuffer(packed).reshape(6, bands)
     if bands <= _OWN and not moments[4:].any():
-        return Kernels(moments[:2], moments[2:4], np.ones(bands, np.intp)), np.eye(bands), np.eye(bands), 0.0
+        return Kernels(moments[:2], moments[2:4], np.ones(bands, np.intp)), np.eye(bands), np.eye(bands)
     size = np.concatenate([moments[:2], np.sqrt(moments[2:4]), moments[4:]])
     place = np.linalg.svd(size - size.mean(axis=1, keepdims=True), full_matrices=False)[2][0]
     order = np.argsort(place)
@@ -137,7 +135,7 @@ def _fit(
         off = np.abs(passed @ (fractions @ between[:, judged]) - wanted)
         if off.max() <= enough or count >= bands:
             break
-    return chosen, fractions, between, float((off / _STRICT[:, None]).max())
+    return chosen, fractions, between
 
 
 def _needed(passed: Transfer, wanted: Transfer, enough: float) -> list[int]:
@@ -266,9 +264,10 @@ def _fractions(passed: Transfer, wanted: Transfer) -> Floats:
 class Moments:
     """Moments of a blur in each band, (2, band) each: along the line and the scan.
 
-    A shift [px], a Gaussian of a variance [px^2], and diffraction at an elliptic pupil, told by the wavelength over the
-    pupil's widths [px]; None without any. The pattern of a pupil has no variance: no Gaussian stands for it. ``disc``
-    are the diameters along line and scan of what a point out of focus is imaged to, in all bands alike [px].
+    They are a shift [px] and a Gaussian's variance [px^2]. ``waves`` is for diffraction at an elliptic pupil: the
+    wavelength over the pupil's widths [px], None without any. The pattern of a pupil has no variance: no Gaussian
+    stands for it. ``disc`` are the diameters along line and scan of what a point out of focus is imaged to, in all
+    bands alike [px].
     """
 
     shift: Floats
@@ -278,7 +277,7 @@ class Moments:
 
     @property
     def spread(self) -> Floats:
-        """Variance of Gaussian and disc, (2, band). [px^2]"""
+        """Return variance of Gaussian and disc, (2, band). [px^2]"""
         return self.variance + np.array(self.disc)[:, None] ** 2 / 16
 
     @staticmethod
@@ -294,11 +293,10 @@ class Moments:
 class Footprint:
     """Kernels of a footprint and how much each counts in each band. All widths in px of the camera, or of the level.
 
-    ``shift`` and ``variance`` are (2, kernel) along the line and the scan; ``fractions`` (kernel, node) of some bands,
-    and ``between`` (node, band) between which two each band lies; ``parts`` how many boxes across and along stand for
-    one that lies turned; ``level`` (kernel,) of which pixels each looks at: 1 is all, 2 every second, and so on;
-    ``error`` by how much of its amplitude a wave is passed too much or too little at most; ``disc`` the diameters along
-    line and scan of what each kernel is blurred by besides.
+    ``shift`` and ``variance`` are (2, kernel) along the line and the scan. ``fractions`` (kernel, node) are those of
+    some bands; ``between`` (node, band) says between which two each band lies. ``parts`` is the number of boxes across
+    and along that stand for one that lies turned. ``level`` (kernel,) says which pixels each looks at: 1 is all, 2
+    every second, and so on. ``disc`` are the diameters along line and scan of a disc that blurs each kernel.
     """
 
     box: tuple[float, float]  # across and along; 0 is none
@@ -309,7 +307,6 @@ class Footprint:
     fractions: Floats
     between: Floats
     level: NDArray[np.intp]
-    error: float
     disc: Axes = (0.0, 0.0)
 
     @property
@@ -320,19 +317,6 @@ class Footprint:
     def mixing(self) -> Floats:
         """Return the weight of each kernel in each band, (kernel, band); of sum 1 in each."""
         return self.fractions @ self.between
-
-    def afar(self, along: Floats, scan: Floats) -> Floats:
-        """Return the light at places (place,) some px beyond slit and pixel, (place, band). [1/px^2]
-
-        Box, disc, held positions and pixels count by their variance: there they are small beside the Gaussians that
-        reach.
-        """
-        own = np.array([self.box[1] ** 2, self.box[0] ** 2 + self.held**2 - 1]) / 12 + 1 / 6
-        own += np.array(self.disc) ** 2 / 16
-        wide, high = self.variance + own[:, None]
-        aside, ahead = along[:, None] - self.shift[0], scan[:, None] - self.shift[1]
-        light: Floats = np.exp(-(aside**2 / wide + ahead**2 / high) / 2) / (2 * np.pi * np.sqrt(wide * high))
-        return light @ self.mixing
 
     def windows(self) -> list[tuple[int, NDArray[np.intp]]]:
         """Return the levels, and numbers of kernels that look at pixels of that level through one window."""
@@ -379,12 +363,10 @@ def fold(box: tuple[float, float], parts: tuple[int, int], held: int, blurs: Mom
     that were tried. No share is below 0, and they sum to 1.
     """
     waves = blurs.waves if blurs.waves is not None and blurs.waves.any() else np.zeros_like(blurs.shift)
-    told, band = np.unique(np.concatenate([blurs.shift, blurs.variance, waves]), axis=1, return_inverse=True)
-    kernels, fractions, between, error = _fit(told.tobytes(), told.shape[1], box, held, blurs.disc)
+    moments, band = np.unique(np.concatenate([blurs.shift, blurs.variance, waves]), axis=1, return_inverse=True)
+    kernels, fractions, between = _fit(moments.tobytes(), moments.shape[1], box, held, blurs.disc)
     between = between[:, band.ravel()]
-    return Footprint(
-        box, parts, held, kernels.shift, kernels.variance, fractions, between, kernels.level, error, blurs.disc
-    )
+    return Footprint(box, parts, held, kernels.shift, kernels.variance, fractions, between, kernels.level, blurs.disc)
 
 
 Weights = NDArray[np.float32]

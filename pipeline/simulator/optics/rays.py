@@ -107,11 +107,11 @@ def pupil_contrast(u: Floats) -> Floats:
     return np.asarray(2 / np.pi * (np.arccos(inside) - inside * np.sqrt(1 - inside * inside)))
 
 
-def normals_met(sweeps: Iterable[Sweep], camera: LineCamera) -> Floats:
+def extreme_normals(sweeps: Iterable[Sweep], camera: LineCamera) -> Floats:
     """Return the mirror's normals at rest and at both ends of every sweep, (n, 3).
 
-    Both spreads are monotonic along a sweep (n_x / n_z = 1 / (eta - sqrt(1 + xi^2 + eta^2)) in scene tangents), so the
-    ends hold the extremes.
+    Both spreads are monotonic along a sweep, so the ends hold the extremes. In scene tangents n_x / n_z = 1 / (eta -
+    sqrt(1 + xi^2 + eta^2)).
     """
     taken = [sweep for sweep in sweeps if sweep.lines > 0]
     ends = [(sweep.swath_px, scan) for sweep in taken for scan in sweep.held_px().ravel()[[0, -1]]]

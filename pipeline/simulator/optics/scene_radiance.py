@@ -1,4 +1,9 @@
-"""Light that a scene's pixels send through a footprint to samples: components through every kernel, mixed to bands."""
+"""Light that a scene's pixels send through a footprint to samples: components through every kernel, mixed to bands.
+
+For every sample there is one window of pixels, and for every kernel a weight for each of them. A footprint that lies
+turned in the scene is parted across the slit. Each part is a box parallel to the scene's axes, in its right place. The
+parts are moved and widened so that all together have the second moments of the turned footprint.
+"""
 
 from __future__ import annotations
 
@@ -11,15 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.simulator import compiled_loops
-from pipeline.simulator.optics.kernel_fit import Footprint
+from pipeline.simulator.optics.kernel_fit import TAIL, Footprint, TapTable, disc_points
 from pipeline.simulator.optics.rays import RayViews
-from pipeline.simulator.optics.tap_sums import Gatherer, ScenePixels
 from pipeline.simulator.scenes.scene import THINNED_MARGIN, RasterScene
 
 Floats = NDArray[np.float64]
 Radiance = NDArray[np.float32]
 MOST_PARTS = 1_500_000  # components of samples through kernels, at once: few calls, and little memory
 LEAST_BANDS = 16  # that are mixed by themselves: fewer cost as much
+TABULATED = 2e-5  # fraction of the light, by size, that a table of either axis misplaces at most, but for what follows
 
 
 class _BandProduct(NamedTuple):
@@ -63,8 +68,8 @@ class _Mixing:
             compiled_loops.mix_bands(nodes, some.start, some.stop, rows, bands.start, bands.stop - bands.start, light)
 
 
-class Looker:
-    """Looks at scenes through one footprint, from views whose shape is within a range."""
+class SceneSampler:
+    """Sample scenes through one footprint, from views whose shape is within a range."""
 
     def __init__(self, footprint: Footprint, extremes: RayViews) -> None:
         """Take ``extremes``: views spread over all that will be sampled; their places do not matter."""
@@ -77,12 +82,14 @@ class Looker:
         windows, whole = self.footprint.windows(), self.footprint
         return [(level, some, Gatherer(whole.part(level, some), self._extremes)) for level, some in windows]
 
-    def scan_pass(self, scene: RasterScene, steps: Sequence[RayViews], *, along_y: bool, exposures: float) -> Radiance:
+    def scan_pass(
+        self, scene: RasterScene, steps: Sequence[RayViews], *, along_y: bool, exposure_ratio: float
+    ) -> Radiance:
         """Return the light (n, band) of samples that look so at each of the held positions. [e-]
 
         A sample's light does not depend on the others.
         """
-        spectra = scene.electrons * np.float32(exposures)
+        spectra = scene.electrons * np.float32(exposure_ratio)
         levels = np.unique(self.footprint.level).tolist()
         rasters = {level: np.ascontiguousarray(scene.raster.thinned(level), np.float32) for level in levels}
         pixels = {level: ScenePixels(raster, along_y) for level, raster in rasters.items()}
@@ -121,3 +128,82 @@ class Looker:
             for level, some, gatherer in self.gatherers:
                 seen = views.thinned(level, THINNED_MARGIN)
                 gatherer.gather(pixels[level], seen, out, numbers[some], gains[some])
+
+
+@dataclass(frozen=True)
+class ScenePixels:
+    """A scene's planes (y, x, component), C-contiguous float32, and whether lines lie along y."""
+
+    planes: Radiance
+    along_y: bool
+
+
+class Gatherer:
+    """Gathers a scene's components through a footprint at views whose shape is within a range."""
+
+    def __init__(self, footprint: Footprint, views: RayViews) -> None:
+        """Take ``views`` that include the extremes of all that will be gathered."""
+        self.footprint = footprint
+        width, (across, along) = footprint.box, footprint.parts
+        variance = footprint.variance + disc_points(footprint.disc)[1][:, None]
+        scale, off = place_parts(footprint, views)
+        reach = np.abs(off).max(axis=(0, 2, 3), initial=0.0) + 0.02
+        ranges = [(float(one.min()), float(one.max())) for one in scale.swapaxes(0, 1)]
+        tail = TAIL / float(footprint.fractions.max(initial=0.0) or 1.0)
+        self._kernels = kernels_of(footprint)
+        self._along = TapTable.of(width[1] / along, variance[0], 1, ranges[0], float(reach[0]), tail)
+        self._scan = TapTable.of(width[0] / across, variance[1], footprint.held, ranges[1], float(reach[1]), tail)
+
+    @property
+    def parts(self) -> int:
+        """Return the number of boxes that each kernel is summed over."""
+        return int(self._kernels.place.shape[1])
+
+    def gather(
+        self, pixels: ScenePixels, views: RayViews, out: Radiance, numbers: NDArray[np.intp], gains: Radiance
+    ) -> None:
+        """Add the components that some samples see through every kernel to ``out`` (number, n, component).
+
+        They are sums over the parts, times ``gains`` (kernel, component). ``views`` are in px of the pixels,
+        ``numbers`` (kernel,) where in ``out`` kernels belong. A sample's light does not depend on the others.
+        """
+        (rows, columns, components), along_y = pixels.planes.shape, pixels.along_y
+        raster = compiled_loops.PixelTable(columns, rows, components, along_y)
+        table = views.table()
+        compiled_loops.gather_windows(
+            pixels.planes.reshape(-1), raster, table, self._kernels, self._along, self._scan, numbers, gains, out
+        )
+
+
+def kernels_of(footprint: Footprint) -> compiled_loops.PartedKernels:
+    """Return a footprint's kernels and the parts of its box as the compiled loops take them."""
+    (across, along), (slit, pixel) = footprint.parts, footprint.box
+    variance = footprint.variance + np.array([[pixel / along], [slit / across]]) ** 2 / 12
+    points, about = disc_points(footprint.disc)
+    variance = np.array(variance + about[:, None], order="C")
+    between = slit**2 / 12 * (1 - 1 / across**2) + float((points[1] ** 2).mean())
+    shift = np.array(footprint.shift, np.float32, order="C")
+    return compiled_loops.PartedKernels(shift, variance, between, part_places(footprint))
+
+
+def place_parts(footprint: Footprint, views: RayViews) -> tuple[Floats, Radiance]:
+    """Return the places of the parts of kernels for samples in the middle of a pixel, along and scan.
+
+    Returns scales of one part (kernel, 2, n), and how far beside the pixel parts lie, (kernel, 2, part, n) [px].
+    """
+    kernels, count = kernels_of(footprint), len(views.along)
+    scale = np.empty((footprint.kernels, 2, count))
+    off = np.empty((footprint.kernels, 2, kernels.place.shape[1], count), np.float32)
+    table, beside = views.table(), np.zeros((2, count), np.float32)
+    for kernel in range(footprint.kernels):
+        compiled_loops.place_parts(table, beside, kernel, kernels, scale[kernel], off[kernel])
+    return scale, off
+
+
+def part_places(footprint: Footprint) -> Radiance:
+    """Return the middles of the parts, (2, part) across and along, in px of the camera: of boxes at a disc's points."""
+    across, along = footprint.parts
+    turn = ((np.arange(across) + 0.5) / across - 0.5) * footprint.box[0]
+    run = ((np.arange(along) + 0.5) / along - 0.5) * footprint.box[1]
+    boxes, points = np.stack([np.repeat(turn, along), np.tile(run, across)]), disc_points(footprint.disc)[0][::-1]
+    return (boxes[:, :, None] + points[:, None]).reshape(2, -1).astype(np.float32)

@@ -1,7 +1,7 @@
 """Daylight through a survey: where the sun stands, and how much light falls on level ground in each band.
 
-The sun's place is from the algorithm of Reda and Andreas [1], the light from Bird and Riordan's SPECTRL2 [2], both by
-package ``pvlib``, under a clear sky at sea level. Times are seconds since the survey's start.
+Package ``pvlib`` gives the sun's place by the algorithm of Reda and Andreas [1], and the light by Bird and Riordan's
+SPECTRL2 [2]. The sky is clear, at sea level. Times are seconds since the survey's start.
 
 [1] Reda and Andreas, "Solar position algorithm for solar radiation applications", Solar Energy 76, 2004.
    doi:10.1016/j.solener.2003.12.003
@@ -34,7 +34,7 @@ _DAY_S = 86400.0
 
 
 def sun_elevation_deg(sky: Sky, seconds: Floats) -> Floats:
-    """Give the sun's height over the horizon at some times, refraction included, (time,) [deg].
+    """Return the sun's height over the horizon at some times, refraction included, (time,) [deg].
 
     Raises SettingsError: the sky has no time of day.
     """
@@ -42,10 +42,10 @@ def sun_elevation_deg(sky: Sky, seconds: Floats) -> Floats:
 
 
 def relative_daylight(sky: Sky, wavelength_nm: Floats, seconds: Floats) -> Floats:
-    """Give the light on level ground over that at the survey's start, (time, band).
+    """Return the light on level ground over that at the survey's start, (time, band).
 
-    It is 0 with the sun at the horizon or below. A survey that starts in less light than the sun gives from 1 deg is
-    relative to that light instead, since no exposure fits the night; so the ratio is finite and goes to 0 evenly.
+    It is 0 with the sun at the horizon or below. No exposure fits the night: a survey that starts in less light than
+    the sun gives from 1 deg is relative to that light. So the ratio is finite and goes to 0 evenly.
 
     Raises SettingsError: the sky has no time of day.
     """
@@ -56,7 +56,7 @@ def relative_daylight(sky: Sky, wavelength_nm: Floats, seconds: Floats) -> Float
 
 
 def knots_within(sky: Sky, seconds: float) -> Floats:
-    """Give the times between which ``relative_daylight`` is straight: 0, its knots and the last, (time,) [s]."""
+    """Return the times between which ``relative_daylight`` is straight: 0, its knots and the last, (time,) [s]."""
     start = _started(sky)
     first, last = np.floor(start / KNOT_S) + 1, np.ceil((start + seconds) / KNOT_S)
     return np.concatenate([[0.0], np.arange(first, last) * KNOT_S - start, [seconds]])
@@ -69,7 +69,7 @@ def _started(sky: Sky) -> float:
 
 
 def _irradiance(latitude: float, longitude: float, moments: Floats, wavelength_nm: Floats) -> Floats:
-    """Light at moments [s since 1970], (time, band) [W/m^2/nm]: straight between the knots of each hour's table."""
+    """Return light at moments [s since 1970], (time, band) [W/m^2/nm], linear between knots."""
     knot = moments / KNOT_S
     low = np.floor(knot)
     hours, row = np.divmod(low.astype(np.int64), _KNOTS_AN_HOUR)
@@ -84,7 +84,7 @@ def _irradiance(latitude: float, longitude: float, moments: Floats, wavelength_n
 
 @lru_cache(maxsize=64)
 def _table(latitude: float, longitude: float, hour: int) -> Floats:
-    """Light at the knots of one hour and the first of the next, (knot, wavelength of the model)."""
+    """Return light at the knots of one hour and the first of the next, (knot, wavelength of the model)."""
     moments = (hour * _KNOTS_AN_HOUR + np.arange(_KNOTS_AN_HOUR + 1.0)) * KNOT_S
     table = _light_of(_elevation_deg(latitude, longitude, moments), moments)
     table.setflags(write=False)
@@ -98,7 +98,7 @@ def _elevation_deg(latitude: float, longitude: float, moments: Floats) -> Floats
 
 
 def clear_sky(zenith_deg: Floats | float, airmass: Floats | float, day: Floats | float) -> tuple[Floats, Floats]:
-    """Give SPECTRL2's wavelengths [nm] and its light on level ground (wavelength, sun) [W/m^2/nm]: one air for all."""
+    """Return SPECTRL2's wavelengths [nm] and light on level ground (wavelength, sun) [W/m^2/nm]."""
     turned = {"apparent_zenith": zenith_deg, "aoi": zenith_deg, "surface_tilt": 0.0, "relative_airmass": airmass}
     air = {"surface_pressure": 101325.0, "precipitable_water": 1.5, "ozone": 0.31, "aerosol_turbidity_500nm": 0.1}
     sky = pvlib.spectrum.spectrl2(**turned, **air, ground_albedo=0.2, dayofyear=day)  # Pa, cm, atm cm
@@ -106,7 +106,7 @@ def clear_sky(zenith_deg: Floats | float, airmass: Floats | float, day: Floats |
 
 
 def _light_of(elevation_deg: Floats, moments: Floats) -> Floats:
-    """Light on level ground for heights of the sun, (time, wavelength of the model); 0 at the horizon and below."""
+    """Return light on level ground by the sun's height, (time, wavelength of the model); 0 at the horizon and below."""
     zenith = 90.0 - np.maximum(elevation_deg, 0.0)
     moment = np.asarray(moments * 1e6, "datetime64[us]")
     start_of_year = moment.astype("datetime64[Y]").astype("datetime64[us]")

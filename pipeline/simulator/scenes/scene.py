@@ -57,17 +57,16 @@ class SceneRaster:
         return raster
 
     def drawn(self) -> Drawn:
-        """Planes and labels (None without any); SceneError where what is drawn is not what was announced."""
+        """Return planes and labels (None without any); SceneError where what is drawn is not what was announced."""
         return self._drawn()
 
     def thinned(self, level: int) -> NDArray[np.float32]:
-        """Give the planes blurred, and every ``level``-th pixel of them: 1, 2, 4, 8, ...
+        """Return the planes blurred, and every ``level``-th pixel of them: 1, 2, 4, 8, ...
 
-        Beyond 1 the scene's first pixel comes after `THINNED_MARGIN` others, and as many follow: where blurred pixels
-        end all is edge, so that repeating the outermost one equals repeating the scene's edge. From each level
-        to the next every second pixel is left, after the binomial kernel of nine taps (variance 2, Burt, Adelson,
-        1983): what it passes of waves that fewer pixels would show as others is below 2 % from 0.3 cycles per px on.
-        Light is kept.
+        Beyond 1 the scene's first pixel comes after `THINNED_MARGIN` others, and as many follow. There all is edge, so
+        that repeating the outermost pixel equals repeating the scene's edge. From each level to the next every second
+        pixel is left, after the binomial kernel of nine taps (variance 2, Burt, Adelson, 1983). It passes less than 2 %
+        of waves from 0.3 cycles per px on, which fewer pixels would alias. Light is kept.
         """
         if level == 1:
             return self.drawn()[0]
@@ -84,7 +83,7 @@ class SceneRaster:
 
 
 def _halved(planes: NDArray[np.float32], before: int) -> NDArray[np.float32]:
-    """Every second pixel of blurred planes, along either axis, counted from the one that ``before`` others precede."""
+    """Return every second pixel of blurred planes along either axis, from the one that ``before`` others precede."""
     half = len(_BINOMIAL) // 2
     counts = [-(-(size - 1 + half - before) // 2) + THINNED_MARGIN + 1 for size in planes.shape[:2]]
     rows, columns = (before + 2 * (np.arange(count) - THINNED_MARGIN) - half for count in counts)
@@ -96,7 +95,7 @@ def _halved(planes: NDArray[np.float32], before: int) -> NDArray[np.float32]:
 
 
 def _binomial(planes: NDArray[np.float32], firsts: NDArray[np.intp], axis: int) -> NDArray[np.float32]:
-    """Sums of nine pixels along an axis, from each of ``firsts`` on; outside of the planes their edge is repeated."""
+    """Return sums of nine pixels along an axis, from each of ``firsts`` on; the planes' edge is repeated."""
     total: NDArray[np.float32] = planes.take(firsts, axis=axis, mode="clip") * _BINOMIAL[0]
     for offset, weight in enumerate(_BINOMIAL[1:], 1):
         some = planes.take(firsts + offset, axis=axis, mode="clip")
@@ -117,21 +116,20 @@ class SceneRadiance:
 class RasterScene:
     """A scene of pixels; between their centres light is linear, and outside the edge pixel is repeated.
 
-    Of the ways to join pixels that neither give light below 0 nor lose or gain any, wherever it is looked at, it is the
-    sharpest whose slope has no jump behind a pixel or a slit: what is left out is bounded by slopes and curvatures.
-    A wave of f cycles per px keeps sinc^2 f, 0.81 at a quarter, of what the pixels have of it.
+    No light is below 0, and none is lost or gained. It is the sharpest such interpolation whose slope has no jump
+    behind a pixel or a slit. Slopes and curvatures bound what is left out. A wave of f cycles per px keeps sinc^2 f,
+    0.81 at a quarter, of what the pixels have of it.
 
     ``planes`` is (y, x, component) float32 and ``electrons`` (component, band), or (band,) where each band has its own
     plane. Labels are (y, x) uint8 with 255 for unlabelled. ``filled_px`` counts pixels that came without a value in a
-    band; ``missing`` (y, x) are those without one in most bands, of which nothing is known (None: no such pixel).
-    ``white_reference`` is the scene value of the white reference, ``wavelength_nm`` and ``fwhm_nm`` are centres and
-    widths of the bands, all (band,); widths are None where not known. Equal keys give equal light. ``geobox`` is where
-    the pixels lie on the earth, as the scene's file says (None: it does not); ``pixel_m`` is how large a pixel of a
-    scene without one is on the ground, where the scene's own law says so. ``regridded`` says that the labels came on
-    another grid and were brought to the scene's. ``content`` are hashes of the files that it was read from, whatever
-    bands of them are taken. ``light_fraction`` is the light on the scene over that of a clear sky; electrons have it
-    in them, scene values do not. Planes, labels and electrons may be made when
-    they are first asked for; all else is known at once.
+    band. ``missing`` (y, x) are pixels without one in most bands (None: no such pixel). ``white_reference`` is the
+    scene value of the white reference. ``wavelength_nm`` and ``fwhm_nm`` are centres and widths of the bands. All are
+    (band,); widths are None where not known. Equal keys give equal light. ``geobox`` is the place of the pixels on the
+    earth, None where the scene's file has none. ``pixel_m`` is the size of a pixel on the ground of a scene without
+    one, where its law states it. ``regridded`` says that the labels came on another grid and were brought to the
+    scene's. ``content`` are hashes of the files that it was read from, whatever bands of them are taken.
+    ``light_fraction`` is the light on the scene over that of a clear sky; electrons have it in them, scene values do
+    not. Planes, labels and electrons may be made when they are first asked for; all else is known at once.
     """
 
     name: str
@@ -173,7 +171,7 @@ class RasterScene:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(y, x) size [px]."""
+        """Return the size (y, x) [px]."""
         return self.raster.shape[:2]
 
     def in_light(self, fraction: float) -> RasterScene:
@@ -199,17 +197,17 @@ class RasterScene:
 
     @property
     def electrons(self) -> NDArray[np.float32]:
-        """(component, band) electrons at the default exposure per unit of component; (band,) means a diagonal."""
+        """Return electrons at the default exposure per unit of component, (component, band); (band,) is a diagonal."""
         return self._checked_light().electrons
 
     @property
     def white_reference_electrons(self) -> NDArray[np.float32]:
-        """(band,) electrons that the white reference gives at the default exposure."""
+        """Return the electrons that the white reference gives at the default exposure."""
         return self._checked_light().white_reference_electrons
 
     @property
     def planes(self) -> NDArray[np.float32]:
-        """(y, x, component) how much of each component a pixel has."""
+        """Return the amount of each component in each pixel, (y, x, component)."""
         return self.raster.drawn()[0]
 
     @property
@@ -219,15 +217,15 @@ class RasterScene:
 
     @property
     def labels(self) -> NDArray[np.uint8] | None:
-        """(y, x) classes, 255 for unlabelled; None without any."""
+        """Return the classes (y, x), 255 for unlabelled; None without any."""
         return self.raster.drawn()[1] if self.labelled else None
 
     def spectra(self) -> NDArray[np.float32]:
-        """Scene value per unit of component, shaped as ``electrons``."""
+        """Return scene value per unit of component, shaped as ``electrons``."""
         return self.electrons * (self.white_reference / self.white_reference_electrons).astype(np.float32)
 
     def values(self) -> NDArray[np.float32]:
-        """(y, x, band) float32 scene values: what a perfect survey returns. The whole cube, in memory."""
+        """Return the scene values of all pixels, (y, x, band) float32, as a perfect survey returns them."""
         return to_bands(self.planes, self.spectra())
 
 
@@ -251,9 +249,9 @@ def raster_from_values(
 ) -> RasterScene:
     """Turn an image (y, x, band) without a radiance law into a scene of relative, linear light.
 
-    The 99.9th percentile of the finite values fills 60 % of the full well at the default exposure; a scene without
-    positive light takes 1 in its place. Values that are not finite get the band's median, their pixels are counted in
-    ``filled_px``; where that is so in more than half of the bands, the pixel is ``missing`` and loses its label.
+    The 99.9th percentile of the finite values fills 60 % of the full well at the default exposure. A scene without
+    positive light takes 1 in its place. Values that are not finite get the band's median, and ``filled_px`` counts
+    their pixels. A pixel without finite values in more than half of the bands is ``missing`` and loses its label.
     Negative values give no electrons. ``key``: identity of the content, by default the hash of the values.
 
     Raises SceneError: not three axes, empty, no finite value, one that is no reading (`pipeline.readings`), or labels
@@ -297,7 +295,7 @@ def raster_from_values(
 
 
 def _missing_pixels(planes: NDArray[np.float32]) -> NDArray[np.bool_] | None:
-    """(y, x) pixels with no finite value in more than half of their bands; None without any."""
+    """Return the pixels (y, x) with no finite value in more than half of their bands; None without any."""
     known = np.isfinite(planes)
     if known.all():
         return None
@@ -313,7 +311,7 @@ def content_key(planes: NDArray[np.float32]) -> str:
 
 
 def _bright_value(planes: NDArray[np.float32], name: str) -> float:
-    """Bright end of the finite values; 1 where there is no positive light.
+    """Return bright end of the finite values; 1 where there is no positive light.
 
     Read on every n-th pixel of scenes above 2^24 values: the rank of so many is known to 1e-5.
     """
@@ -324,8 +322,7 @@ def _bright_value(planes: NDArray[np.float32], name: str) -> float:
     bright = float(np.percentile(finite, BRIGHT_PERCENTILE))
     if 0 < bright < LEAST_BRIGHT:
         raise SceneError(
-            f"the brightest values of scene {name} are {bright:.3g}, too small to be told from nothing; give them in a"
-            " smaller unit"
+            f"the brightest values of scene {name} are {bright:.3g}, too small for float32; give them in a smaller unit"
         )
     return bright if bright > 0 else 1.0
 

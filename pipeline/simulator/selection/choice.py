@@ -1,4 +1,4 @@
-"""The decision: which effects to compute, and how, so that what is left out stays within one tolerance; its manifest.
+"""Choose which effects to compute, and how, so that what is left out stays within one tolerance; list what was chosen.
 
 The tolerance applies to stored numbers, sums of samples where a sweep bins them. An effect counts by its change at the
 binning where that is greatest.
@@ -21,7 +21,7 @@ from pipeline.errors import SettingsError
 from pipeline.simulator.effects.effect import OFF, Effect
 from pipeline.simulator.effects.probe import Probe, Unit
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.selection.options import ALWAYS_ON, Menu, Option, cost_of, list_options
+from pipeline.simulator.selection.options import ALWAYS_ON, Menu, Option, list_options
 
 Reason = Literal["absent", "unseen", "small", "needed", "spent", "exact", "asked", "unasked", "always"]
 UNIT_NAMES: dict[Unit, str] = {"sigma": "sigma of the noise", "dn": "DN"}
@@ -64,32 +64,28 @@ class Decision:
 
     @property
     def chosen(self) -> dict[Effect, str]:
-        """Effects that are on with their variants, as the renderer takes them."""
+        """Return effects that are on with their variants, as the renderer takes them."""
         return {one.menu.effect: one.option.variant for one in self.taken if one.is_on}
 
     @property
     def exact(self) -> dict[Effect, str]:
-        """Everything that the rig has, in its exact variant: the reference."""
+        """Return everything that the rig has, in its exact variant: the reference."""
         return {one.menu.effect: one.menu.exact.variant for one in self.taken if one.menu.present}
 
     @property
     def error(self) -> float:
         """Bound on the change of any number by all that is left out or cheapened; above the tolerance only if asked."""
-        return _error([one.option for one in self.taken])
+        return math.fsum(one.option.error for one in self.taken)
 
     @property
     def cost_ns(self) -> float:
-        return cost_of((one.menu for one in self.taken), {one.name: one.option for one in self.taken})
-
-    def cost_of(self, one: Treatment) -> float:
-        """Return the cost per px and band of one effect beside the other effects as chosen [ns]."""
-        return one.menu.cost_beside(one.option, {other.name: other.option for other in self.taken})
+        """Return cost per px and band of what is on [ns]."""
+        return math.fsum(one.option.cost_ns for one in self.taken)
 
     @property
     def exact_cost_ns(self) -> float:
-        """Per px and band, of everything that the rig has, exact [ns]."""
-        menus = [one.menu for one in self.taken if one.menu.present]
-        return cost_of(menus, {menu.name: menu.exact for menu in menus})
+        """Return cost per px and band of everything that the rig has, exact [ns]."""
+        return math.fsum(one.menu.exact.cost_ns for one in self.taken if one.menu.present)
 
 
 def decide(
@@ -109,16 +105,17 @@ def decide(
         raise SettingsError(f"the tolerance must be 0 or more, got {tolerance}; 0 computes everything")
     named = named_effects(asked, [effect.name for effect in effects])
     menus = list_options(probes, rig, effects)
-    taken = {one.name: one for one in _settled(menus, tolerance, named, exact=asked == "all")}
-    open_menus = [menu for menu in menus if menu.name not in taken]
+    settled = {menu.name: _settled(menu, tolerance, named, exact=asked == "all") for menu in menus}
+    open_menus = [menu for menu in menus if settled[menu.name] is None]
     options = _cheapened(open_menus, tolerance, forced=named is not None)
-    for menu in open_menus:
-        option = options[menu.name]
-        taken[menu.name] = Treatment(menu, option, _reason(menu, option, tolerance, named))
+    taken = [
+        settled[menu.name] or Treatment(menu, options[menu.name], _reason(menu, options[menu.name], tolerance, named))
+        for menu in menus
+    ]
     every = [probes] if isinstance(probes, Probe) else probes
     lines = sum(sweep.lines for probe in every for sweep in probe.sweeps)
     px_bands = lines * rig.camera.samples * len(every[0].wavelength_nm)
-    return Decision(tuple(taken[menu.name] for menu in menus), tolerance, every[0].unit, asked, px_bands)
+    return Decision(tuple(taken), tolerance, every[0].unit, asked, px_bands)
 
 
 def named_effects(asked: str, known: Sequence[str]) -> frozenset[str] | None:
@@ -141,37 +138,18 @@ def named_effects(asked: str, known: Sequence[str]) -> frozenset[str] | None:
     return frozenset(words)
 
 
-def _settled(
-    menus: Sequence[Menu], tolerance: float, named: frozenset[str] | None, *, exact: bool
-) -> Iterator[Treatment]:
-    for menu in menus:
-        kept = menu.name in ALWAYS_ON
-        if not menu.present:
-            yield Treatment(menu, menu.off, "absent")
-        elif named is not None and menu.name not in named and not kept:
-            yield Treatment(menu, menu.off, "unasked")
-        elif tolerance == 0 or exact:
-            yield Treatment(menu, menu.exact, "always" if kept else "exact" if named is None else "asked")
-        elif named is None and not kept and menu.off.error == 0:
-            yield Treatment(menu, menu.off, "unseen")
-
-
-def _cheapened(menus: Sequence[Menu], tolerance: float, *, forced: bool) -> dict[str, Option]:
-    exact = {menu.name: menu.exact for menu in menus}
-    first = (step for menu in menus for step in _steps(menu, exact, menus, forced=forced))
-    starts = [exact, *(exact | {step.name: step.option} for step in sorted(first) if step.option.error <= tolerance)]
-    ends = (_greedy(menus, tolerance, start, forced=forced) for start in starts)
-    return min(ends, key=lambda end: cost_of(menus, end))  # the first among equals
-
-
-def _greedy(menus: Sequence[Menu], tolerance: float, start: Mapping[str, Option], *, forced: bool) -> dict[str, Option]:
-    current = dict(start)
-    while True:
-        steps = sorted(step for menu in menus for step in _steps(menu, current, menus, forced=forced))
-        fitting = (step for step in steps if _error((current | {step.name: step.option}).values()) <= tolerance)
-        if (step := next(fitting, None)) is None:
-            return current
-        current[step.name] = step.option
+def _settled(menu: Menu, tolerance: float, named: frozenset[str] | None, *, exact: bool) -> Treatment | None:
+    """Return the decision on an effect that needs no search; None for the others."""
+    kept = menu.name in ALWAYS_ON
+    if not menu.present:
+        return Treatment(menu, menu.off, "absent")
+    if named is not None and menu.name not in named and not kept:
+        return Treatment(menu, menu.off, "unasked")
+    if tolerance == 0 or exact:
+        return Treatment(menu, menu.exact, "always" if kept else "exact" if named is None else "asked")
+    if named is None and not kept and menu.off.error == 0:
+        return Treatment(menu, menu.off, "unseen")
+    return None
 
 
 class _Step(NamedTuple):
@@ -184,19 +162,34 @@ class _Step(NamedTuple):
     option: Option
 
 
-def _steps(menu: Menu, taken: Mapping[str, Option], menus: Sequence[Menu], *, forced: bool) -> Iterator[_Step]:
-    now, stays = taken[menu.name], forced or menu.name in ALWAYS_ON
-    sharing = [one for one in menus if one is menu or (one.merged is not None and one.merged.other == menu.name)]
-    for option in menu.variants if stays else (*menu.variants, menu.off):
-        then = {**taken, menu.name: option} if len(sharing) > 1 or menu.merged else {menu.name: option}
-        saved = cost_of(sharing, taken) - cost_of(sharing, then)
-        if saved > 0:
-            added = max(0.0, option.error - now.error)
-            yield _Step(added / saved, added, menu.name, option.variant, option)
+def _cheapened(menus: Sequence[Menu], tolerance: float, *, forced: bool) -> dict[str, Option]:
+    exact = {menu.name: menu.exact for menu in menus}
+    first = sorted(_steps(menus, exact, forced=forced))
+    starts = [exact, *(exact | {step.name: step.option} for step in first if step.option.error <= tolerance)]
+    ends = (_greedy(menus, tolerance, start, forced=forced) for start in starts)
+    return min(ends, key=lambda end: math.fsum(one.cost_ns for one in end.values()))  # the first among equals
 
 
-def _error(options: Iterable[Option]) -> float:
-    return math.fsum(option.error for option in options)
+def _greedy(menus: Sequence[Menu], tolerance: float, start: Mapping[str, Option], *, forced: bool) -> dict[str, Option]:
+    current = dict(start)
+    while True:
+        for step in sorted(_steps(menus, current, forced=forced)):
+            if math.fsum(one.error for one in (current | {step.name: step.option}).values()) <= tolerance:
+                current[step.name] = step.option
+                break
+        else:
+            return current
+
+
+def _steps(menus: Iterable[Menu], taken: Mapping[str, Option], *, forced: bool) -> Iterator[_Step]:
+    """Yield the options that cost less than the ones taken."""
+    for menu in menus:
+        now = taken[menu.name]
+        for option in menu.variants if forced or menu.name in ALWAYS_ON else (*menu.variants, menu.off):
+            saved = now.cost_ns - option.cost_ns
+            if saved > 0:
+                added = max(0.0, option.error - now.error)
+                yield _Step(added / saved, added, menu.name, option.variant, option)
 
 
 def _reason(menu: Menu, option: Option, tolerance: float, named: frozenset[str] | None) -> Reason:
@@ -212,10 +205,10 @@ def _reason(menu: Menu, option: Option, tolerance: float, named: frozenset[str] 
 def list_effects(decision: Decision, measured: Mapping[str, float] | None = None) -> list[dict[str, Any]]:
     """Return one plain row for every effect, in the order of the chain; ``measured`` is what `verify` found, by name.
 
-    ``bound`` is on the change of any stored number, at the worst binning, with the factor of safety, in ``unit`` (0
-    where exact or absent, None where there is none); ``cost_s`` are estimated CPU seconds of all sweeps; ``why`` is a
-    sentence, and its parts are ``reason`` (see `Treatment`), ``left_out``, the bound on leaving it out, and
-    ``magnitude``, the words of that bound.
+    ``bound`` is on the change of any stored number, at the worst binning, with the factor of safety, in ``unit``. It is
+    0 where exact or absent, None where there is none. ``cost_s`` are estimated CPU seconds of all sweeps. ``why`` is a
+    sentence. Its parts are ``reason`` (see `Treatment`), ``left_out``, the bound on leaving it out, and ``magnitude``,
+    the words of that bound.
     """
     return [
         {
@@ -224,7 +217,7 @@ def list_effects(decision: Decision, measured: Mapping[str, float] | None = None
             "variant": one.option.variant if one.is_on else None,
             "bound": _finite(one.option.error),
             "measured": None if measured is None else measured.get(one.name),
-            "cost_s": _seconds(decision.cost_of(one), decision),
+            "cost_s": one.option.cost_ns * 1e-9 * decision.px_bands,
             "why": explain(one, decision),
             "reason": one.reason,
             "left_out": _finite(one.menu.off.error),
@@ -238,9 +231,9 @@ def list_effects(decision: Decision, measured: Mapping[str, float] | None = None
 def sum_up(decision: Decision, measured: Mapping[str, float] | None = None) -> dict[str, Any]:
     """Return the totals: bound beside tolerance, and the CPU seconds that were saved against everything exact.
 
-    Without the rays through the footprint that every simulation takes.
+    They are without the rays through the footprint that every simulation takes.
     """
-    cost, exact = (_seconds(ns, decision) for ns in (decision.cost_ns, decision.exact_cost_ns))
+    cost, exact = (ns * 1e-9 * decision.px_bands for ns in (decision.cost_ns, decision.exact_cost_ns))
     return {
         "asked": decision.asked,
         "tolerance": _finite(decision.tolerance),
@@ -272,11 +265,11 @@ def explain(one: Treatment, decision: Decision) -> str:
         "unasked": f"not asked for; {left_out}",
         "always": "always there, for raw lines are whole numbers of limited size",
     }
-    said = f"{reasons[one.reason]}: {one.menu.off.why}"
+    why = f"{reasons[one.reason]}: {one.menu.off.why}"
     if one.is_on and one.option is not one.menu.exact:
         off_by = f"{_number(one.option.error)} {unit}"
-        said += f"; {one.option.variant} differs from exact by at most {off_by}: {one.option.why}"
-    return said
+        why += f"; {one.option.variant} differs from exact by at most {off_by}: {one.option.why}"
+    return why
 
 
 def _number(value: float) -> str:
@@ -285,7 +278,3 @@ def _number(value: float) -> str:
 
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
-
-
-def _seconds(cost_ns: float, decision: Decision) -> float:
-    return cost_ns * 1e-9 * decision.px_bands

@@ -7,7 +7,7 @@ it counts. Noise that changes it by ``t`` counts ``2 t`` deviations, as much as 
 often. Total variation is a metric and no later stage increases it: so all bounds may be summed.
 
 Kernels that are not negative and sum to 1 have gain 1 at most, readout none. Gains of light (vignetting, drift, ...)
-multiply the errors of all other effects in the light, each by its own greatest factor, and change the unit: with
+multiply the errors of all other effects in the light, each by its own greatest factor, and change the unit. With
 sigma(S)^2 = S + n, g sigma(S) / sigma(g S) grows with g. So the greatest gains count for errors made elsewhere, and the
 least of its own for a gain that is left out. Blurs and shifts of each band's own colour edges: light then changes over
 wavelength where the scene's does not.
@@ -16,7 +16,7 @@ wavelength where the scene's does not.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError
 from pipeline.simulator.effects.blurs import airy_gaussians
-from pipeline.simulator.effects.effect import OFF, Effect, Merged
+from pipeline.simulator.effects.effect import OFF, Effect
 from pipeline.simulator.effects.probe import (
     GainRange,
     Probe,
@@ -35,9 +35,8 @@ from pipeline.simulator.effects.probe import (
     unit_electrons,
 )
 from pipeline.simulator.optics.kernel_fit import Moments
-from pipeline.simulator.optics.rays import normals_met
+from pipeline.simulator.optics.rays import extreme_normals
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.selection.adjacency import blended_surroundings, light_brought
 
 SAFETY = 1.2  # maxima are read off a sample of the scene, derivatives off differences
 LEAST_COST_NS = 1e-3  # nothing that is computed is free: of two that bound alike, the one without cost stays on longer
@@ -68,7 +67,6 @@ class Menu:
     variants: tuple[Option, ...]
     off: Option
     present: bool
-    merged: Merged | None = None
 
     @property
     def name(self) -> str:
@@ -77,13 +75,6 @@ class Menu:
     @property
     def exact(self) -> Option:
         return self.variants[0]
-
-    def cost_beside(self, option: Option, others: Mapping[str, Option]) -> float:
-        """Return the cost of an option beside those taken for other effects, by name [ns]: draws may be shared."""
-        one = self.merged
-        if one is None or option.variant == OFF or one.other not in others or others[one.other].variant != one.variant:
-            return option.cost_ns
-        return max(one.cost_ns, LEAST_COST_NS)
 
 
 def acts_on_light(effect: Effect) -> bool:
@@ -100,49 +91,42 @@ def list_options(probes: Probe | Sequence[Probe], rig: Rig, effects: Sequence[Ef
     """
     some = [probes] if isinstance(probes, Probe) else probes
     each = [_options_of(probe, rig.taking(probe.sweeps[0]) if probe.sweeps else rig, effects) for probe in some]
-    return tuple(_worst_of(menus) for menus in zip(*each, strict=True))
 
-
-def _worst_of(menus: Sequence[Menu]) -> Menu:
     def worst(options: Iterable[Option]) -> Option:
         return max(options, key=lambda option: option.error)
 
-    variants = zip(*(menu.variants for menu in menus), strict=True)
-    return replace(
-        menus[0],
-        variants=tuple(map(worst, variants)),
-        off=worst(menu.off for menu in menus),
-        present=any(menu.present for menu in menus),
+    return tuple(
+        Menu(
+            menus[0].effect,
+            tuple(map(worst, zip(*(menu.variants for menu in menus), strict=True))),
+            worst(menu.off for menu in menus),
+            any(menu.present for menu in menus),
+        )
+        for menus in zip(*each, strict=True)
     )
 
 
-def _options_of(probe: Probe, rig: Rig, effects: Sequence[Effect]) -> tuple[Menu, ...]:
+def _options_of(probe: Probe, rig: Rig, effects: Sequence[Effect]) -> list[Menu]:
     present = [_is_present(effect, probe, rig) for effect in effects]
     ranges = [_gain_range(one, probe, rig) if there else None for one, there in zip(effects, present, strict=True)]
-    moving = [one for one, there in zip(effects, present, strict=True) if there and _moves_light(one)]
-    probe = blended_surroundings(probe, rig, moving)
-    growth = Growth(probe, rig)
     blurs = [effect for effect, there in zip(effects, present, strict=True) if there and hasattr(effect, "moments")]
-    through = light_brought(light_through(probe, rig, blurs), rig, moving)
+    through = light_through(probe, rig, blurs)
     menus = []
     for place, effect in enumerate(effects):
         arriving = probe
         if hasattr(effect, "change") or hasattr(effect, "gain"):
             arriving = light_after(through, [one for one in ranges[:place] if one is not None], rig)
-        gain = _gain_beside(effect, ranges, place, growth)
-        menus.append(_menu(effect, arriving, rig, present[place], gain))
-    return tuple(menus)
-
-
-def _moves_light(effect: Effect) -> bool:
-    """Return whether light comes from elsewhere by it; the slit's is in the probe already."""
-    acts = any(hasattr(effect, action) for action in ("aim", "displaced", "moments"))
-    return acts or effect.name in LIGHT_EFFECTS - {"slit"}
+        growth = 1.0
+        if acts_on_light(effect):
+            beside = ranges[:place] + ranges[place + 1 :]
+            greatest = [np.maximum(one.greatest, 1.0) for one in beside if one is not None]
+            others = float(np.prod(greatest, axis=0).max(initial=1.0)) if greatest else 1.0
+            growth = error_growth(probe, rig, ranges[place], others)
+        menus.append(_menu(effect, arriving, rig, present[place], growth))
+    return menus
 
 
 def _menu(effect: Effect, probe: Probe, rig: Rig, present: bool, gain: float) -> Menu:
-    costs = effect.cost_at(probe, rig) if hasattr(effect, "cost_at") else effect.cost_ns
-
     def option(variant: str) -> Option:
         """Bound and price one variant of the effect, or its absence; SettingsError: a bound that is no number."""
         bound = effect.bound(probe, rig, variant)
@@ -151,32 +135,25 @@ def _menu(effect: Effect, probe: Probe, rig: Rig, present: bool, gain: float) ->
                 f"effect {effect.name}, {variant}: its bound is {bound.value}, expected 0 or more ({bound.why});"
                 " check the rig's numbers and the scene for values that are not finite"
             )
-
         error = bound.value * gain * SAFETY if bound.value else 0.0
         why = bound.why if probe.binning == 1 or not error else f"{bound.why}, in sums of {probe.binning} samples"
-        return Option(variant, error, _cost_ns(costs, variant), why)
+        return Option(variant, error, 0.0 if variant == OFF else max(effect.cost_ns[variant], LEAST_COST_NS), why)
 
-    exact = Option(effect.variants[0], 0.0, _cost_ns(costs, effect.variants[0]), "exact")
-    merged: Merged | None = effect.merged(rig) if hasattr(effect, "merged") else None
-    return Menu(effect, (exact, *map(option, effect.variants[1:])), option(OFF), present, merged)
-
-
-def _cost_ns(costs: Mapping[str, float], variant: str) -> float:
-    return 0.0 if variant == OFF else max(costs[variant], LEAST_COST_NS)
+    exact = replace(option(effect.variants[0]), error=0.0, why="exact")
+    return Menu(effect, (exact, *map(option, effect.variants[1:])), option(OFF), present)
 
 
 def _is_present(effect: Effect, probe: Probe, rig: Rig) -> bool:
     bright = max(probe.brightest_e, rig.camera.full_scale_e)
     loud = replace(_even_probe(probe, 1.0), brightest_e=bright, slit_errors={})
-    shown = max(effect.bound(loud, rig, OFF).value, effect.bound(probe, rig, OFF).value)
-    return effect.name in ALWAYS_ON or shown > 0
+    greatest = max(effect.bound(loud, rig, OFF).value, effect.bound(probe, rig, OFF).value)
+    return effect.name in ALWAYS_ON or greatest > 0
 
 
 def _even_probe(probe: Probe, derivatives: float) -> Probe:
     """Return the probe of a scene of level 1 and the same derivatives in every band."""
     ones, both = np.ones(len(probe.wavelength_nm)), np.full((2, len(probe.wavelength_nm)), derivatives)
-    alone = replace(probe, beside=(), afar=None, anywhere=None, own_e=None, ends_e=None)
-    seen = replace(alone, level=ones, spread=ones, span=ones, slope=both, curvature=both)
+    seen = replace(probe, own_e=None, level=ones, spread=ones, span=ones, slope=both, curvature=both)
     return replace(seen, spectral_slope=both[0], spectral_curvature=both[1])
 
 
@@ -191,53 +168,30 @@ def _gain_range(effect: Effect, probe: Probe, rig: Rig) -> GainRange | None:
     return GainRange.between(max(1 - off, 0.0), 1 + off, len(probe.wavelength_nm), uneven=2 * off)
 
 
-def _gain_beside(effect: Effect, ranges: Sequence[GainRange | None], place: int, growth: Growth) -> float:
-    if not acts_on_light(effect):
+def error_growth(probe: Probe, rig: Rig, own: GainRange | None, others: float) -> float:
+    """Return the most that gains multiply an error, with the unit that follows the light.
+
+    ``others`` is the greatest product of the other gains, 1 or more. ``own`` is the range of an effect's own gain: its
+    error is made in light without it.
+    """
+    low, high = (1.0, 1.0) if own is None else (float(own.least.min(initial=1.0)), float(own.greatest.max(initial=1.0)))
+    off = max(abs(high - 1), abs(low - 1))
+    if off == 0:
+        return others * unit_ratio(probe, rig, others)
+    return others * max(abs(end - 1) / off * unit_ratio(probe, rig, end * others) for end in (low, high))
+
+
+def unit_ratio(probe: Probe, rig: Rig, gain: float) -> float:
+    """Return the most that a unit is over the one that light multiplied by ``gain`` has."""
+    if probe.unit == "dn" or rig.detector.noiseless:
         return 1.0
-    beside = [one for other, one in enumerate(ranges) if one is not None and other != place]
-    greatest = [np.maximum(one.greatest, 1.0) for one in beside]
-    others = float(np.prod(greatest, axis=0).max(initial=1.0)) if greatest else 1.0
-    return growth.of_gain(ranges[place], others)
-
-
-def cost_of(menus: Iterable[Menu], options: Mapping[str, Option]) -> float:
-    """Return the cost of options together, one for each menu by its name, per px and band [ns]."""
-    return math.fsum(menu.cost_beside(options[menu.name], options) for menu in menus)
-
-
-@dataclass(frozen=True)
-class Growth:
-    """Growth of an error through the gains, with the unit that follows the light."""
-
-    probe: Probe
-    rig: Rig
-
-    def of_errors(self, gain: float) -> float:
-        """Return the most that gains up to ``gain``, 1 or more, multiply an error made elsewhere."""
-        return gain * self.unit_ratio(gain)
-
-    def of_gain(self, own: GainRange | None, others: float) -> float:
-        """Return the most that the other gains, and its own light, multiply the error of a gain that is left out."""
-        if own is None:
-            return self.of_errors(others)
-        low, high = float(own.least.min(initial=1.0)), float(own.greatest.max(initial=1.0))
-        off = max(abs(high - 1), abs(low - 1))
-        if off == 0:
-            return self.of_errors(others)
-        ends = ((abs(end - 1) / off * self.unit_ratio(end * others)) for end in (low, high))
-        return others * max(ends)
-
-    def unit_ratio(self, gain: float) -> float:
-        """Return the most that a unit is over the one that light multiplied by ``gain`` has."""
-        if self.probe.unit == "dn" or self.rig.detector.noiseless:
-            return 1.0
-        fixed = fixed_variance(self.rig)
-        ends = (max(self.probe.darkest_e, 0.0), max(self.probe.brightest_e, 0.0))
-        return max(math.sqrt((light + fixed) / (gain * light + fixed)) for light in ends)
+    fixed = fixed_variance(rig)
+    ends = (max(probe.darkest_e, 0.0), max(probe.brightest_e, 0.0))
+    return max(math.sqrt((light + fixed) / (gain * light + fixed)) for light in ends)
 
 
 def light_after(probe: Probe, ranges: Iterable[GainRange], rig: Rig) -> Probe:
-    """Return the probe of light after some gains, their greatest factors taken off: those are for `Growth`.
+    """Return the probe of light after some gains, their greatest factors taken off: those are for `error_growth`.
 
     Leibniz' rule for differences gives (g I)' <= g I' + g' I and (g I)'' <= g I'' + 2 g' I' + g'' I. Added light has
     its own differences. Light that the factor does not reduce counts by the unit of the darkest.
@@ -258,7 +212,7 @@ def light_after(probe: Probe, ranges: Iterable[GainRange], rig: Rig) -> Probe:
         added_bend = added_bend + 2 * added_steep * one.steepest + added * one.bend + one.added_bend
         added_steep = added_steep + added * one.steepest + one.added_steepest
         added = added + one.added_e
-    ratio = Growth(probe, rig).unit_ratio(float(least.min()))
+    ratio = unit_ratio(probe, rig, float(least.min()))
     unit_e = probe.unit_least_dn * rig.camera.electrons_per_dn / ratio
     follows = probe.unit == "sigma" and not rig.detector.noiseless
     return replace(
@@ -279,8 +233,8 @@ def light_after(probe: Probe, ranges: Iterable[GainRange], rig: Rig) -> Probe:
 def light_through(probe: Probe, rig: Rig, blurs: Iterable[Any]) -> Probe:
     """Return the probe of light that has passed blurs (their exact variants), with the spectral differences they make.
 
-    A kernel of shift s and variance v makes I(x + s) blurred, whose derivative over wavelength is s' I_x + v' I_xx / 2
-    beside the scene's own, and its second one s'' I_x + v'' I_xx / 2 + (s' + v' d/dx / 2)^2 I_xx. At a step v' I_xx / 2
+    A kernel of shift s and variance v makes I(x + s) blurred. Its derivative over wavelength is s' I_x + v' I_xx / 2,
+    beside the scene's own. Its second one is s'' I_x + v'' I_xx / 2 + (s' + v' d/dx / 2)^2 I_xx. At a step v' I_xx / 2
     is at most I_x times the change of the width. Diffraction is a sum of Gaussians whose widths grow with the
     wavelength. The derivatives of a wide one over the width's logarithm are at most certain parts of the span.
     """
@@ -288,7 +242,7 @@ def light_through(probe: Probe, rig: Rig, blurs: Iterable[Any]) -> Probe:
     if not passed or len(probe.wavelength_nm) < 2:
         return probe
     steep, bend = np.zeros((2, *probe.slope.shape))
-    for normal in normals_met(probe.sweeps, rig.camera):
+    for normal in extreme_normals(probe.sweeps, rig.camera):
         first, second = _differences(probe, rig, passed, normal)
         steep, bend = np.maximum(steep, first), np.maximum(bend, second)
     return replace(
@@ -308,8 +262,7 @@ def _differences(probe: Probe, rig: Rig, blurs: list[Any], normal: Floats) -> tu
         fractions, sizes = airy_gaussians()
         widths = sizes[:, None, None] * blurred.waves
     for fraction, waves in zip(fractions.tolist(), widths, strict=True):
-        near = probe.blurred_by(float(np.sqrt((blurred.spread + waves**2).max(initial=0.0))))
-        first, second = _by_gaussian(near, nm, blurred.shift, blurred.variance + waves**2, waves)
+        first, second = _by_gaussian(probe, nm, blurred.shift, blurred.variance + waves**2, waves)
         steep, bend = steep + fraction * first, bend + fraction * second
     return steep, bend
 

@@ -1,9 +1,12 @@
-"""Sums up a scene as a survey is going to see it: a close look at extrema and along lines, and the maxima there."""
+"""Probe a scene for a survey: a close look at its extrema and along lines, and the maxima that effects are bounded by.
+
+The whole scene is probed, whatever part of it the sweeps see: blurs and shifts bring light from beside them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -11,139 +14,323 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import CostModel, Sweep, exposing
-from pipeline.simulator import compiled_loops
+from pipeline.geometry.mirror import direction_to_normal, scene_to_direction
+from pipeline.geometry.scan import CostModel, Sweep, exposing, points_of_scan, scene_to_sweep
 from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.effect import OFF
-from pipeline.simulator.effects.line import SLIT, UPRIGHT, box_of, box_parts
-from pipeline.simulator.effects.probe import (
-    Detail,
-    Probe,
-    Unit,
-    second_difference,
-    spectral_differences_between,
-    steepest_difference,
-    stored_mean,
-    unit_at,
-)
+from pipeline.simulator.effects.line import BOXES, SLIT, UPRIGHT, box_of
+from pipeline.simulator.effects.probe import Probe, Unit, second_difference, steepest_difference, stored_mean, unit_at
 from pipeline.simulator.optics.kernel_fit import Footprint, Moments, fold
-from pipeline.simulator.optics.rays import middle_normal
-from pipeline.simulator.optics.tap_sums import LADDER
-from pipeline.simulator.render import EFFECTS, views_all_over
+from pipeline.simulator.optics.rays import RayViews, exact_views, middle_normal
+from pipeline.simulator.optics.scene_radiance import SceneSampler
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
-from pipeline.simulator.selection.adjacency import REACHES, greatest_way_px, reached_cells, seen_widely
-from pipeline.simulator.selection.extrema import CHOSEN_BANDS, Extrema, band_groups, find_extrema
-from pipeline.simulator.selection.sample_views import (
-    SampleViews,
-    joined,
-    light_seen,
-    line_means,
-    places_beyond,
-    sample_offsets,
-    views_of_lines,
-    views_of_places,
-)
+from pipeline.simulator.selection.extrema import CHOSEN_BANDS, band_groups, find_extrema
 
 Floats = NDArray[np.float64]
 Radiance = NDArray[np.float32]
-Way = tuple[float, float]
-_DERIVATIVES = ("span", "slope", "curvature", "spectral_slope", "spectral_curvature")
-_BY_BAND = ("level", "spread", *_DERIVATIVES, "anywhere", "anywhere_spectral")  # of a probe
+Way = tuple[float, float]  # along the line and the scan [px]
+MOST_VALUES = 1_000_000  # samples times bands; each is seen a few times over, a fraction of a px apart
+MOST_SAMPLES = 6_000
+FINEST_SAMPLES = 1000  # at which variants of the slit are compared with the finest
+LINE_SAMPLES = 64  # of a line, evenly from end to end, in sums where samples are summed
+_LEAST_SUMS = 16  # of a line
+_LEAST_OF_SWEEP = 50
+_LEAST_PLACES = 24  # where samples are summed, however many samples that takes
+_BESIDE = 2  # samples to either side of a place; of sums, one
+_LINES_AT_ONCE = 256
+_PROBE, _CLOSE = (2, 1), (3, 1)  # boxes of the probe, and boxes that find where variants differ
+_ALIKE = 0.02  # fraction by which blurs may differ and count as one
 _ROUNDING = 2e-6  # of the level: less is rounding of float32
 _NEAR, _FAR = 0.25, 0.5  # px by which the footprint is shifted
+_STILL: Way = (0.0, 0.0)
+_PHASES = tuple(((along, scan), _STILL) for along in (0.0, 0.5) for scan in (0.0, 0.5))  # at which boxes are compared
+_OPTICS = (DIFFRACTION, DEFOCUS, ABERRATION, KEYSTONE)
+_BY_BAND = ("level", "spread", "span", "slope", "curvature", "spectral_slope", "spectral_curvature")  # of a probe
 
 
 def _shifts() -> list[tuple[Way, Way]]:
-    none = (0.0, 0.0)
-    found = [(none, none)]
+    found = [(_STILL, _STILL)]
     for axis in (0, 1):
         both = [(way, 0.0) if axis == 0 else (0.0, way) for way in (-_FAR, -_NEAR, _NEAR, _FAR)]
-        found += [(way, none) for way in both] + [(none, way) for way in (both[0], both[3])]
+        found += [(way, _STILL) for way in both] + [(_STILL, way) for way in (both[0], both[3])]
     return found
 
 
-SHIFTS = tuple(_shifts())  # of rays and of points, (along, scan) px each, that derivatives are taken from
+SHIFTS = tuple(_shifts())  # of rays and of points; derivatives are differences between them
+
+
+def probe_survey(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "sigma") -> tuple[Probe, ...]:
+    """Return a probe for each pair of binning and exposure of the sweeps, the smallest binning first.
+
+    They have time and lines in common.
+
+    Raises SceneError, SettingsError, PoseError as `probe_scene`.
+    """
+    taken = _taken(sweeps)
+    alike: dict[tuple[int, float], list[Sweep]] = {}
+    for sweep in taken:
+        alike.setdefault((sweep.binning, exposing(rig.camera, sweep).exposure_ms), []).append(sweep)
+    probes = [probe_scene(scene, rig, some, unit) for _, some in sorted(alike.items())]
+    lines, seconds = sum(one.lines for one in probes), CostModel().seconds(list(taken), rig.camera)
+    return tuple(replace(one, lines=lines, seconds=seconds) for one in probes)
+
+
+def probe_scene(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "sigma") -> Probe:
+    """Return the maxima of the scene through slit and pixel: at its extrema, and along some lines of the sweeps.
+
+    Extrema are found on the scene's own pixels, so that the maxima hold for the whole image. Sweeps are of one binning
+    and exposure. Raises SceneError: the scene holds a number that is not finite; SettingsError: no line to take;
+    PoseError: a sweep is out of the mirror's reach.
+    """
+    taken = _taken(sweeps)
+    rig = rig.taking(taken[0])
+    binning, camera, bands = taken[0].binning, rig.camera, len(scene.wavelength_nm)
+    room = max(min(MOST_VALUES // bands, MOST_SAMPLES), 64)
+    lines = views_of_lines(taken, camera, room // 3)
+    most = (room - room // 3) // (len(_patch_steps(binning)) * binning * len({sweep.along for sweep in taken}))
+    places = find_extrema(scene, camera, taken, max(most, 1 if binning == 1 else _LEAST_PLACES))
+    views = joined([lines, views_of_places(places, scene, camera, taken)])
+    seen = light_seen(scene, camera, views, _footprint(SLIT.variants[0], rig, _PROBE, None, scene), SHIFTS)
+    found = replace(
+        sum_up_light(seen, scene, rig, taken, unit, line_means(scene, camera, taken)),
+        places=places,
+        slit_errors=_slit_errors(scene, rig, views, taken, unit),
+    )
+    return worst_of_groups(found) if scene.electrons.ndim == 1 and bands > CHOSEN_BANDS else found
+
+
+def _taken(sweeps: Sequence[Sweep]) -> tuple[Sweep, ...]:
+    taken = tuple(sweep for sweep in sweeps if sweep.lines > 0)
+    if not taken:
+        raise SettingsError("no sweep has a line, so there is nothing to probe; plan at least one line")
+    return taken
 
 
 @dataclass(frozen=True)
-class ProbedLines:
-    """Light (shift, view, band) of the sweeps' own samples, and of places within each reach of them and beyond. [e-]
+class SampleViews:
+    """Samples at any place of any sweep, (view,) each: the line's centre and the camera's slope.
 
-    ``scale`` is the unit of the tolerance at each stored number of theirs, (number, band) [e-].
+    ``binning`` in a row are the samples of one stored number.
     """
 
-    own: Radiance
-    around: tuple[Radiance, ...]
-    scale: Radiance
-    binning: int
-    rig: Rig
-    unit: Unit
+    swath_px: Floats
+    scan_px: Floats
+    slope: Floats
+    along_y: NDArray[np.bool_]
+    sweep: NDArray[np.intp]  # number of the sweep
+    binning: int = 1
 
-    @staticmethod
-    def of(parts: Sequence[Radiance], binning: int, rig: Rig, unit: Unit) -> ProbedLines:
-        scale = unit_at(np.asarray(stored_mean(parts[0].min(axis=0), binning), np.float32), rig, unit, binning)
-        return ProbedLines(parts[0], tuple(parts[1:]), scale, binning, rig, unit)
-
-    def span_to(self, low: Radiance, high: Radiance) -> Floats:
-        """Return the greatest difference of a stored number and light between two ends, (band,), over its unit."""
-        least, most = self.own.min(axis=0), self.own.max(axis=0)
-        off = np.maximum(most - low, high - least)
-        return _greatest(stored_mean(_above(off, np.maximum(np.abs(low), np.abs(high))), self.binning) / self.scale)
-
-    def beside(self, scene: RasterScene, covered: bool) -> dict[str, Any]:
-        """Return the probe's values beside the sweeps; ``covered``: sweeps see all of the scene but a px or two."""
-        least_unit = self.scale.min(axis=0)[None]
-        low, high = self.own.min(axis=(0, 1)), self.own.max(axis=(0, 1))
-        own_unit = unit_at(np.minimum(low, high)[None], self.rig, self.unit, self.binning)
-        slope, curvature = _derivatives(self.own, self.scale, self.binning)
-        nm, unit = np.asarray(scene.wavelength_nm, np.float64), np.minimum(least_unit, own_unit)
-        spectral = _spectral_derivatives(self.own[0], nm, self.scale, self.binning)
-        found = []
-        for reach, seen in zip((*REACHES, np.inf), self.around, strict=True):
-            if seen.size:
-                low, high = np.minimum(low, seen.min(axis=(0, 1))), np.maximum(high, seen.max(axis=(0, 1)))
-            if reach < np.inf:
-                if seen.size:
-                    steep, bent = _derivatives(seen, unit, self.binning)
-                    slope, curvature = np.maximum(slope, steep), np.maximum(curvature, bent)
-                    spectral = np.maximum(spectral, _spectral_derivatives(seen[0], nm, unit, self.binning))
-                found.append(Detail(reach, self.span_to(low, high), slope, curvature, spectral))
-        ends = np.stack([low, high]).astype(np.float64)
-        between = {"anywhere_spectral": spectral_differences_between(ends, nm) / unit, "ends_e": ends}
-        if covered:
-            found[-1] = replace(found[-1], reach_px=np.inf)
-            return {"beside": tuple(found), "anywhere": found[-1].span, **between}
-        wide = seen_widely(scene, self.rig.camera.exposure_ms)
-        afar = Detail(
-            np.inf,
-            self.span_to(wide.low, wide.high),
-            wide.slope / least_unit,
-            wide.curvature / least_unit,
-            wide.spectral / unit,
-        )
-        return {"beside": tuple(found), "afar": afar, "anywhere": self.span_to(low, high), **between}
+    def chosen(self, which: NDArray[np.intp]) -> SampleViews:
+        some: dict[str, Any] = {name: getattr(self, name)[which] for name in _OF_A_VIEW}
+        return replace(self, **some)
 
 
-def sum_up_probes(probes: ProbedLines, scene: RasterScene, sweeps: tuple[Sweep, ...], means: Radiance) -> Probe:
-    """Turn what samples see, and the means of lines (line,), into the probe's maxima."""
-    rig, seen, scale, binning = probes.rig, probes.own, probes.scale, probes.binning
-    camera, least, most = rig.camera, seen.min(axis=0), seen.max(axis=0)
+_OF_A_VIEW = tuple(one.name for one in fields(SampleViews) if one.name != "binning")
+
+
+def joined(parts: list[SampleViews]) -> SampleViews:
+    """Return views of one binning, one part after the other."""
+    every: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in parts]) for name in _OF_A_VIEW}
+    return replace(parts[0], **every)
+
+
+def views_of_lines(sweeps: tuple[Sweep, ...], camera: LineCamera, room: int) -> SampleViews:
+    """Return lines spread over all sweeps, the most oblique included, with samples evenly from end to end.
+
+    All sweeps sum as many samples to a number.
+    """
+    order = {id(sweep): place for place, sweep in enumerate(sweeps)}
+    binning = sweeps[0].binning
+    per_line = min(camera.samples // binning, max(LINE_SAMPLES // binning, _LEAST_SUMS))
+    numbers = [(sweep, number) for sweep in sweeps for number in {0, sweep.lines // 2, sweep.lines - 1}]
+    numbers.sort(key=lambda one: -float(np.hypot(one[0].swath_px, one[0].line_px()[one[1]])))
+    most = max(room // (per_line * binning), 1)
+    kept = numbers[: most // 2 or 1]
+    rest = [(sweep, round(fraction * (sweep.lines - 1))) for sweep in sweeps for fraction in (0.25, 0.75)]
+    rest += numbers[len(kept) :]
+    kept += [rest[round(at)] for at in np.linspace(0, len(rest) - 1, most - len(kept))] if most > len(kept) else []
+    sums = np.linspace(0, camera.samples // binning - 1, per_line).round().astype(np.intp)
+    slopes = camera.pixel_slopes()[_samples_of(sums, binning)]
+    count = len(slopes)
+    return SampleViews(
+        np.repeat([sweep.swath_px for sweep, _ in kept], count).astype(np.float64),
+        np.repeat([sweep.line_px()[number] for sweep, number in kept], count),
+        np.tile(slopes, len(kept)),
+        np.repeat([sweep.along == "y" for sweep, _ in kept], count),
+        np.repeat([order[id(sweep)] for sweep, _ in kept], count),
+        binning,
+    )
+
+
+def views_of_places(places: Floats, scene: RasterScene, camera: LineCamera, sweeps: tuple[Sweep, ...]) -> SampleViews:
+    """Return patches about places, in the view of the finest and the most oblique sweep of each orientation.
+
+    A place that no sweep sees is looked at as if the lines and samples of the finest continued. All sweeps sum as many
+    samples to a number.
+    """
+    centred = places - (np.array(scene.shape) - 1) / 2
+    found = []
+    for along_y in (False, True):
+        numbers = [number for number, sweep in enumerate(sweeps) if (sweep.along == "y") == along_y]
+        finest = sorted(numbers, key=lambda number: sweeps[number].step)
+        oblique = sorted(numbers, key=lambda number: -abs(sweeps[number].swath_px))
+        along, scan = (centred if along_y else centred[:, ::-1]).T
+        seen = [_first_seeing(order, sweeps, camera, along, scan) for order in (finest, oblique)]
+        for number in numbers:
+            which = (seen[0] == number) | (seen[1] == number)
+            if number == finest[0]:
+                which |= seen[0] < 0
+            line, sample = scene_to_sweep(_held(sweeps[number]), camera, along[which], scan[which]).T
+            reached = np.isfinite(line) & np.isfinite(sample)
+            found.append(_patches(sweeps[number], number, camera, line[reached], sample[reached]))
+    return joined(found)
+
+
+def _first_seeing(
+    order: list[int], sweeps: tuple[Sweep, ...], camera: LineCamera, along: Floats, scan: Floats
+) -> NDArray[np.intp]:
+    """Return the number of the first sweep that sees each place, or nearly; -1 where none does."""
+    found = np.full(len(along), -1)
+    for number in order:
+        left = np.flatnonzero(found < 0)
+        held = _held(sweeps[number])
+        line, sample = scene_to_sweep(held, camera, along[left], scan[left]).T
+        with np.errstate(invalid="ignore"):  # places that no ray reaches
+            inside = (line > -2) & (line < held.lines + 1) & (sample > -3) & (sample < camera.samples + 2)
+        found[left[inside]] = number
+    return found
+
+
+def _held(sweep: Sweep) -> Sweep:
+    return replace(sweep, step=1, lines=sweep.lines * sweep.step, binning=1)
+
+
+def _patch_steps(binning: int) -> Floats:
+    """Return the steps of a patch about a place, (number, 2): stored numbers along the line, and lines."""
+    beside = _BESIDE if binning == 1 else 1
+    return np.stack(np.meshgrid(np.arange(-beside, beside + 1.0), np.arange(-1.0, 2.0)), axis=-1).reshape(-1, 2)
+
+
+def _patches(sweep: Sweep, number: int, camera: LineCamera, line: Floats, sample: Floats) -> SampleViews:
+    patch, binning = _patch_steps(sweep.binning), sweep.binning
+    middle = sample if binning == 1 else (sample + 0.5) / binning - 0.5
+    sums = np.rint(middle[:, None] + patch[:, 0]).ravel()
+    lines = (line[:, None] + patch[:, 1]).ravel()
+    number_of = _samples_of(sums.astype(np.intp), binning).astype(np.float64)
+    slopes = (number_of - (camera.samples - 1) / 2) * camera.ifov_rad
+    count = len(slopes)
+    return SampleViews(
+        np.full(count, sweep.swath_px),
+        sweep.start_px + np.repeat(lines, binning),
+        slopes,
+        np.full(count, sweep.along == "y"),
+        np.full(count, number, np.intp),
+        binning,
+    )
+
+
+def _samples_of(sums: NDArray[np.intp], binning: int) -> NDArray[np.intp]:
+    return (sums[:, None] * binning + np.arange(binning)).ravel()
+
+
+def light_seen(
+    scene: RasterScene,
+    camera: LineCamera,
+    views: SampleViews,
+    footprint: Footprint,
+    shifts: Sequence[tuple[Way, Way]] = ((_STILL, _STILL),),
+) -> Radiance:
+    """Return light (shift, view, band) through a footprint [e-].
+
+    Rays are turned and points moved (along, scan) by shifts [px].
+    """
+    exposure_ratio, ifov = camera.exposure_ms / DEFAULT_EXPOSURE_MS, camera.ifov_rad
+    light = np.empty((len(shifts), len(views.slope), len(scene.wavelength_nm)), np.float32)
+    for along_y in (False, True):
+        which = np.flatnonzero(views.along_y == along_y)
+        if not which.size:
+            continue
+        some = views.chosen(which)
+        sampler = SceneSampler(footprint, _rays_of(some, camera, _STILL))
+        size = scene.shape if along_y else scene.shape[::-1]
+        for number, (turned, moved) in enumerate(shifts):
+            seen = _rays_of(some, camera, turned)
+            along, scan = seen.along / ifov + moved[0], seen.scan / ifov + moved[1]
+            at_points = replace(seen, along=along + (size[0] - 1) / 2, scan=scan + (size[1] - 1) / 2)
+            light[number, which] = sampler.scan_pass(scene, [at_points], along_y=along_y, exposure_ratio=exposure_ratio)
+    return light
+
+
+def _rays_of(views: SampleViews, camera: LineCamera, turned: Way) -> RayViews:
+    """Return the middle rays of samples, moved by (along, across) px of the camera, in tangents."""
+    ifov = camera.ifov_rad
+    tangents = np.stack([views.swath_px, views.scan_px], axis=-1) * ifov
+    normal = direction_to_normal(scene_to_direction(tangents))
+    return exact_views(normal, turned[1] * ifov, views.slope + turned[0] * ifov)
+
+
+def line_means(scene: RasterScene, camera: LineCamera, sweeps: Sequence[Sweep]) -> Radiance:
+    """Return the mean over samples and bands of lines in the sweeps' strips, over all of the scene, (position,) [e-].
+
+    Means are those of the pixels that middle rays meet. A slit, and positions that one line holds, give means between
+    these. Positions continue beyond a sweep's ends, and beyond the scene, as far as the slit reaches.
+    """
+    spectra = scene.electrons * np.float32(camera.exposure_ms / DEFAULT_EXPOSURE_MS)
+    mean = spectra / spectra.shape[0] if spectra.ndim == 1 else spectra.mean(axis=1)
+    grey = (scene.planes.reshape(-1, scene.planes.shape[2]) @ mean.astype(np.float32)).reshape(scene.shape)
+    beyond, found = np.ceil(camera.slit_px / 2 + 1), []
+    for along_y, swath, start, stop in sorted({_held_range(sweep, scene.shape) for sweep in sweeps if sweep.lines}):
+        pixels, middle = (grey.T if along_y else grey), (np.array(scene.shape) - 1) / 2
+        down, right = middle[::-1] if along_y else middle
+        held = np.arange(start - beyond, stop + beyond)
+        for first in range(0, len(held), _LINES_AT_ONCE):
+            some = held[first : first + _LINES_AT_ONCE]
+            along, scan = points_of_scan(swath, camera, some[:, None], camera.pixel_slopes())
+            row = np.rint(scan + down).clip(0, pixels.shape[0] - 1).astype(np.intp)
+            column = np.rint(along + right).clip(0, pixels.shape[1] - 1).astype(np.intp)
+            found.append(pixels[row, column].mean(axis=1))
+    return np.concatenate(found)
+
+
+def _held_range(sweep: Sweep, shape: tuple[int, int]) -> tuple[bool, float, float, float]:
+    """Return orientation, swath, and the held positions from start to stop, extended to the scene's ends [px]."""
+    half, stop = shape[1 if sweep.along == "y" else 0] / 2, sweep.start_px + sweep.lines * sweep.step
+    before, after = max(np.ceil(sweep.start_px + half), 0.0), max(np.ceil(half - stop), 0.0)
+    return sweep.along == "y", sweep.swath_px, sweep.start_px - before, stop + after
+
+
+def sum_up_light(
+    seen: Radiance, scene: RasterScene, rig: Rig, sweeps: tuple[Sweep, ...], unit: Unit, means: Radiance
+) -> Probe:
+    """Return the maxima of light (shift, view, band) [e-]; ``means`` (line,) are the means of lines [e-]."""
+    camera, binning, nm = rig.camera, sweeps[0].binning, np.asarray(scene.wavelength_nm, np.float64)
+    least, most = seen.min(axis=0), seen.max(axis=0)
     darkest, brightest = stored_mean(least, binning), stored_mean(most, binning)
-    slope, curvature = _derivatives(seen, scale, binning)
-    spectral = _spectral_derivatives(seen[0], scene.wavelength_nm, scale, binning)
+    scale = unit_at(np.asarray(darkest, np.float32), rig, unit, binning)  # of each stored number [e-]
+    level = np.maximum(
+        np.abs(brightest) / unit_at(np.asarray(brightest, np.float32), rig, unit, binning), np.abs(darkest) / scale
+    )
     low, high = least.min(axis=0), most.max(axis=0)
-    unit_brightest = unit_at(np.asarray(brightest, np.float32), rig, probes.unit, binning)
-    level = np.maximum(np.abs(brightest) / unit_brightest, np.abs(darkest) / scale)
-    off_mean = np.maximum(most - means.min(), means.max() - least)
+
+    def greatest(difference: Radiance, beside: Radiance) -> Floats:
+        """Return the greatest difference over the unit, (band,); differences that may be rounding count as 0."""
+        shown = np.where(difference > _ROUNDING * np.abs(beside), difference, np.float32(0))
+        return _greatest(stored_mean(shown, binning) / scale)
+
+    slope, curvature = _derivatives(seen, scale, binning)
+    spectral = np.zeros((2, len(nm)))
+    if len(nm) > 1:
+        differences = steepest_difference(seen[0], nm), np.abs(second_difference(seen[0], nm))
+        spectral = np.stack([_greatest(stored_mean(one, binning) / scale) for one in differences])
     return Probe(
-        unit=probes.unit,
+        unit=unit,
         sweeps=sweeps,
         wavelength_nm=scene.wavelength_nm,
         fwhm_nm=scene.fwhm_nm,
         level=_greatest(level),
-        spread=_greatest(stored_mean(_above(off_mean, high), binning) / scale),
-        span=probes.span_to(low, high),
+        spread=greatest(np.maximum(most - means.min(), means.max() - least), high),
+        span=greatest(np.maximum(most - low, high - least), np.maximum(np.abs(low), np.abs(high))),
         slope=slope,
         curvature=curvature,
         spectral_slope=spectral[0],
@@ -159,39 +346,6 @@ def sum_up_probes(probes: ProbedLines, scene: RasterScene, sweeps: tuple[Sweep, 
     )
 
 
-def worst_of_groups(probe: Probe) -> Probe:
-    """Return the probe with the worst of each group of neighbouring bands in all of them: one was looked at for each.
-
-    Lights of the groups are the least and the greatest of any of their bands. A level of one band and the span of
-    another do not give the least light of a third.
-    """
-    groups = band_groups(len(probe.wavelength_nm))
-
-    def worst(values: Floats) -> Floats:
-        parts = [
-            np.broadcast_to(some.max(axis=-1, keepdims=True), some.shape)
-            for some in (values[..., one] for one in groups)
-        ]
-        return np.concatenate(parts, axis=-1)
-
-    def of_detail(one: Detail) -> Detail:
-        return Detail(one.reach_px, *map(worst, (one.span, one.slope, one.curvature, one.spectral)))
-
-    def ends(values: Floats | None) -> Floats | None:
-        return None if values is None else np.stack([-worst(-values[0]), worst(values[1])])
-
-    values: dict[str, Any] = {name: getattr(probe, name) for name in _BY_BAND}
-    values = {name: None if one is None else worst(one) for name, one in values.items()}
-    return replace(
-        probe,
-        **values,
-        beside=tuple(map(of_detail, probe.beside)),
-        afar=None if probe.afar is None else of_detail(probe.afar),
-        own_e=ends(probe.own_e),
-        ends_e=ends(probe.ends_e),
-    )
-
-
 def _derivatives(seen: Radiance, scale: Radiance, binning: int) -> tuple[Floats, Floats]:
     """Return the greatest first and second derivatives, (2, band) each over the unit, by differences within half a px.
 
@@ -200,7 +354,8 @@ def _derivatives(seen: Radiance, scale: Radiance, binning: int) -> tuple[Floats,
     level, high = seen[0], np.abs(seen[0]).max(axis=0)
 
     def size(difference: Radiance) -> Floats:
-        return _greatest(stored_mean(_above(np.abs(difference), high), binning) / scale)
+        shown = np.where(np.abs(difference) > _ROUNDING * high, np.abs(difference), np.float32(0))
+        return _greatest(stored_mean(shown, binning) / scale)
 
     slope, curvature = [], []
     for axis in (0, 1):
@@ -213,160 +368,63 @@ def _derivatives(seen: Radiance, scale: Radiance, binning: int) -> tuple[Floats,
     return np.array(slope), np.array(curvature)
 
 
-def _spectral_derivatives(level: Radiance, wavelength_nm: Floats, scale: Radiance, binning: int) -> Floats:
-    """Return the greatest first and second divided differences over wavelength, (2, band) over the unit.
-
-    0 where there is none.
-    """
-    nm = np.asarray(wavelength_nm, np.float64)
-    if len(nm) < 2:
-        return np.zeros((2, len(nm)))
-    both = steepest_difference(level, nm), np.abs(second_difference(level, nm))
-    return np.stack([_greatest(stored_mean(one, binning) / scale) for one in both])
-
-
-def _above(difference: Radiance, high: Radiance) -> Radiance:
-    """Return the difference; 0 where it is at most rounding."""
-    return np.where(difference > _ROUNDING * np.abs(high), difference, np.float32(0))
-
-
 def _greatest(values: NDArray[np.floating]) -> Floats:
     return np.asarray(values.max(axis=0).astype(np.float64))
 
 
-MOST_VALUES = 1_000_000  # samples times bands; each is seen a few times over, a fraction of a px apart
-MOST_SAMPLES = 6_000
-USUAL_LIGHTS = 101  # quantiles of the light that are kept
-FINEST_SAMPLES = 1000  # at which variants of the slit are held against the finest
-_LEAST_OF_SWEEP = 50
-_LEAST_PLACES = 24  # that are looked at where samples are summed, however many samples that takes
-_PROBE, _CLOSE = (2, 1), (3, 1)  # boxes that are looked through, and that tell where variants differ
-_ALIKE = 0.02  # share by which blurs may differ and count as one
-_OPTICS = (DIFFRACTION, DEFOCUS, ABERRATION, KEYSTONE)
-_LINES_BESIDE = tuple(sign * reach for reach in (0.0, REACHES[-1]) for sign in (-1.0, 1.0))  # whose light may come
-_FAR_PLACES = 8  # the brightest and the darkest of what lies beyond
-_PHASES = tuple(((along, scan), (0.0, 0.0)) for along in (0.0, 0.5) for scan in (0.0, 0.5))  # at which boxes differ
+def worst_of_groups(probe: Probe) -> Probe:
+    """Return the probe with the worst of each group of neighbouring bands in all of them: one was looked at for each.
 
-
-def probe_survey(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "sigma") -> tuple[Probe, ...]:
-    """Probe the scene for sweeps of any binning and exposure: one probe for each pair, the smallest binning first.
-
-    Time, lines and the usual light, by the exposure, they have in common.
-
-    Raises SceneError, SettingsError, PoseError as `probe_scene`.
+    Lights of the groups are the least and the greatest of any of their bands. A level of one band and the span of
+    another do not give the least light of a third.
     """
-    taken = _taken(sweeps)
-    alike: dict[tuple[int, float], list[Sweep]] = {}
-    for sweep in taken:
-        alike.setdefault((sweep.binning, exposing(rig.camera, sweep).exposure_ms), []).append(sweep)
-    each = sorted(alike.items())
-    probes = [probe_scene(scene, rig, some, unit) for _, some in each]
-    lines, seconds = sum(one.lines for one in probes), CostModel().seconds(list(taken), rig.camera)
-    first, usual = each[0][0][1], probes[0].usual_e
-    assert usual is not None
-    return tuple(
-        replace(one, lines=lines, seconds=seconds, usual_e=usual * (exposure_ms / first))
-        for one, ((_, exposure_ms), _) in zip(probes, each, strict=True)
-    )
+    groups = band_groups(len(probe.wavelength_nm))
 
+    def worst(values: Floats) -> Floats:
+        parts = [values[..., one] for one in groups]
+        return np.concatenate([np.broadcast_to(one.max(axis=-1, keepdims=True), one.shape) for one in parts], axis=-1)
 
-def probe_scene(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "sigma") -> Probe:
-    """Look at the scene through the footprint alone where it is steepest, brightest and darkest, and along some lines.
-
-    The places to look are found on the scene's own pixels, so that the maxima hold for the whole image. Sweeps are of
-    one binning and exposure. Raises SceneError: the scene holds a number that is not finite; SettingsError: no line to
-    take; PoseError: a sweep is out of the mirror's reach.
-    """
-    taken = _taken(sweeps)
-    rig = rig.taking(taken[0])
-    binning, camera, bands = taken[0].binning, rig.camera, len(scene.wavelength_nm)
-    room = max(min(MOST_VALUES // bands, MOST_SAMPLES), 64)
-    lines = views_of_lines(taken, camera, room // 3)
-    most = (room - room // 3) // (len(sample_offsets(binning)) * binning * len({sweep.along for sweep in taken}))
-    most = max(most, 1 if binning == 1 else _LEAST_PLACES)
-    cells = reached_cells(scene.shape, camera, taken)
-    counts = (most, *(max(most // 4, 1) for _ in REACHES), _FAR_PLACES)
-    places = find_extrema(scene, camera, taken, cells, REACHES, counts)
-    own = joined([lines, views_of_places(places.seen, scene, camera, taken)])
-    beside = _views_beside(scene, camera, taken, places)
-    views = joined([own, *beside])
-    seen = light_seen(scene, camera, views, _footprint(SLIT.variants[0], rig, _PROBE, None, scene), SHIFTS)
-    ends = np.cumsum([len(one.slope) for one in (own, *beside)])
-    probes = ProbedLines.of(np.split(seen, ends[:-1], axis=1), binning, rig, unit)
-    summed = sum_up_probes(probes, scene, taken, line_means(scene, camera, taken, _LINES_BESIDE if beside else (0.0,)))
-    usual = np.quantile(seen[0, : len(lines.slope)], np.linspace(0, 1, USUAL_LIGHTS)).astype(np.float64)
-    found = replace(summed, usual_e=usual, places=places.seen)
-    if beside:
-        found = replace(found, **probes.beside(scene, cells.covers))
-        way_px = greatest_way_px(found, rig, EFFECTS)  # shifts of the image may bring samples to what lies as near
-        beside = [one for one, nearer in zip(beside, (0.0, *REACHES), strict=True) if nearer < way_px]
-    found = replace(found, slit_errors=_slit_errors(scene, rig, joined([own, *beside]), taken, unit))
-    return worst_of_groups(found) if scene.electrons.ndim == 1 and bands > CHOSEN_BANDS else found
-
-
-def _views_beside(
-    scene: RasterScene, camera: LineCamera, sweeps: tuple[Sweep, ...], places: Extrema
-) -> list[SampleViews]:
-    """Return patches beside the sweeps, within each distance and beyond it; none where nothing is there."""
-    beyond = places.seen[places_beyond(places.seen, scene, camera, sweeps)]
-    near = [np.concatenate([beyond, places.beside[0]]), *places.beside[1:]]
-    if not any(map(len, (*near, places.far))):
-        return []
-    anywhere = float(10 * max(scene.shape))
-    return [views_of_places(some, scene, camera, sweeps, anywhere) for some in (*near, places.far)]
-
-
-def _taken(sweeps: Sequence[Sweep]) -> tuple[Sweep, ...]:
-    taken = tuple(sweep for sweep in sweeps if sweep.lines > 0)
-    if not taken:
-        raise SettingsError("a scene is summed up for the sweeps that look at it; expected lines to take, got none")
-    return taken
+    values: dict[str, Any] = {name: worst(getattr(probe, name)) for name in _BY_BAND}
+    assert probe.own_e is not None
+    return replace(probe, **values, own_e=np.stack([-worst(-probe.own_e[0]), worst(probe.own_e[1])]))
 
 
 def _slit_errors(
     scene: RasterScene, rig: Rig, views: SampleViews, sweeps: tuple[Sweep, ...], unit: Unit
 ) -> dict[str, float]:
-    """Return the greatest change by every variant of the slit, over the unit.
+    """Return the greatest change by every variant of the slit, and by leaving it out, over the unit.
 
-    A variant is off, or compared with the finest, with all of the rig's blurs.
-
-    Each sweep is seen through the boxes that a variant takes for it.
+    It is against the finest variant, with all of the rig's blurs.
     """
     rough = _roughest(scene, rig, views, unit)
     views = views.chosen((rough[:, None] * views.binning + np.arange(views.binning)).ravel())
-    sweep_of = views.sweep[:: views.binning]
-    whole = [views_all_over(rig, sweep, exact=True) for sweep in sweeps]
     errors = dict.fromkeys((*SLIT.variants[1:], OFF), 0.0)
     for moments in _blurs(rig, scene.wavelength_nm, sweeps):
-        boxes = {parts: _footprint(SLIT.variants[0], rig, parts, moments, scene) for parts in LADDER}
-        parted, alike = boxes[LADDER[-1]].by_parts()
+        boxes = {variant: _footprint(variant, rig, BOXES[variant], moments, scene) for variant in SLIT.variants}
+        parted, alike = boxes[SLIT.variants[0]].by_parts()
         sharp = light_seen(scene, rig.camera, views, parted, _PHASES)
         finest = sharp if alike is None else sharp + light_seen(scene, rig.camera, views, alike, _PHASES)
         scale = unit_at(_stored(finest, views), rig, unit, views.binning)
-        fewer = {parts: boxes[parts].by_parts()[0] for parts in LADDER[:-1]}
-        found = {parts: _changes(scene, rig, views, one, sharp, scale) for parts, one in fewer.items()}
-        found[LADDER[-1]] = np.zeros(views.sums)
         for variant in SLIT.variants[1:]:
-            taken = [box_parts(variant, rig, one) for one in whole]
-            seen = [found.get(parts, found[LADDER[-1]])[sweep_of == number] for number, parts in enumerate(taken)]
-            errors[variant] = max(errors[variant], *(float(one.max(initial=0.0)) for one in seen))
+            change = _changes(scene, rig, views, boxes[variant].by_parts()[0], sharp, scale)
+            errors[variant] = max(errors[variant], float(change.max(initial=0.0)))
         off = _changes(scene, rig, views, _footprint(OFF, rig, (1, 1), moments, scene), finest, scale)
         errors[OFF] = max(errors[OFF], float(off.max(initial=0.0)))
     return errors
 
 
 def _roughest(scene: RasterScene, rig: Rig, views: SampleViews, unit: Unit) -> NDArray[np.intp]:
+    """Return the stored numbers that the slit, or one upright box in its place, changes most: of all, of each sweep."""
     boxes = _footprint(SLIT.variants[0], rig, _CLOSE, None, scene)
     close = light_seen(scene, rig.camera, views, boxes, _PHASES)
     scale, found = unit_at(_stored(close, views), rig, unit, views.binning), []
     sweep_of, count = views.sweep[:: views.binning], max(FINEST_SAMPLES // views.binning, 2 * _LEAST_OF_SWEEP)
+    numbers = np.unique(sweep_of)
+    each = max(count // 2 // len(numbers), _LEAST_OF_SWEEP)
     for variant in (OFF, UPRIGHT):
         other = _footprint(variant, rig, (1, 1), None, scene)
         order = np.argsort(-_changes(scene, rig, views, other, close, scale), kind="stable")
-        found.append(order[: count // 2])
-        numbers = np.unique(sweep_of)
-        each = max(count // 2 // len(numbers), _LEAST_OF_SWEEP)
-        found += [order[sweep_of[order] == number][:each] for number in numbers]
+        found += [order[: count // 2], *(order[sweep_of[order] == number][:each] for number in numbers)]
     return np.unique(np.concatenate(found))
 
 
@@ -374,9 +432,9 @@ def _changes(
     scene: RasterScene, rig: Rig, views: SampleViews, footprint: Footprint, finest: Radiance, scale: Radiance
 ) -> Floats:
     """Return the greatest signed change of each stored number by another footprint, over the unit, (number,)."""
-    light, greatest = light_seen(scene, rig.camera, views, footprint, _PHASES), np.zeros(views.sums)
-    compiled_loops.greatest_changes(light, finest, scale, views.binning, _ROUNDING, greatest)
-    return greatest
+    change = light_seen(scene, rig.camera, views, footprint, _PHASES) - finest
+    change[np.abs(change) <= _ROUNDING * np.abs(finest)] = 0
+    return np.asarray((np.abs(_stored(change, views)) / scale).max(axis=(0, 2), initial=0.0), np.float64)
 
 
 def _footprint(
@@ -389,19 +447,15 @@ def _footprint(
 def _blurs(rig: Rig, wavelength_nm: Floats, sweeps: Sequence[Sweep]) -> list[Moments]:
     """Return all blurs and shifts of the rig's optics in the sweeps where they are least and most.
 
-    One where both agree. The slit's variants stand beside all other effects: what leaving out a blur changes is bounded
-    for any slit.
+    One where both agree.
     """
     normals = [middle_normal(sweep, rig.camera) for sweep in sweeps]
     all_blurs = [[blur.moments(rig, wavelength_nm, blur.variants[0], one) for blur in _OPTICS] for one in normals]
     found = [Moments.together(blurs, len(wavelength_nm)) for blurs in all_blurs]
-    found.sort(key=lambda one: float(_size(one).sum()))
-    least, most = found[0], found[-1]
-    return [least] if np.allclose(_size(least), _size(most), rtol=_ALIKE) else [least, most]
-
-
-def _size(blurs: Moments) -> Floats:
-    return blurs.spread if blurs.waves is None else blurs.spread + blurs.waves**2
+    sizes = [one.spread if one.waves is None else one.spread + one.waves**2 for one in found]
+    order = sorted(range(len(found)), key=lambda number: float(sizes[number].sum()))
+    least, most = order[0], order[-1]
+    return [found[least]] if np.allclose(sizes[least], sizes[most], rtol=_ALIKE) else [found[least], found[most]]
 
 
 def _stored(values: Radiance, views: SampleViews) -> Radiance:

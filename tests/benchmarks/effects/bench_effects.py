@@ -178,7 +178,8 @@ def _verified(scene: RasterScene, name: str, decision: Decision, probe: Probe, b
     chips = worst_blocks(
         candidate_blocks(whole, probe.places), lambda chip: expected_light(scene, chip, FOOTPRINT), units
     )
-    measured = verify(decision, lambda chip, chosen: expected_light(scene, chip, chosen), chips, units)
+    range_e = probe.brightest_e - probe.darkest_e
+    measured = verify(decision, lambda chip, chosen: expected_light(scene, chip, chosen), chips, units, range_e)
     spent = time.process_time() - clock
     worst = max(measured.values())
     return Row(

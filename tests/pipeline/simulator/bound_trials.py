@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
 
 import numpy as np
+import scipy
 
 from pipeline.simulator.effects.effect import OFF, Effect, Radiance, SweepBlock
 from pipeline.simulator.effects.probe import noise_electrons
 from pipeline.simulator.render import EFFECTS, READOUT, expected_light
 from pipeline.simulator.selection.options import SAFETY, Menu, list_options
-from pipeline.simulator.selection.verification import (
-    ROUNDING,
-    TAILS_PX,
-    contrast_about,
-    misplaced_electrons,
-    misplaced_fraction,
-    tails_fraction,
-)
+from pipeline.simulator.selection.verification import ROUNDING, misplaced_fraction
 from tests.pipeline.simulator.random_cases import Case
 
+REACH_PX = 16  # along a line, within which arithmetic may put light elsewhere
 DRAWN = frozenset({"jitter", "turbulence"})  # one survey of 1000 may go beyond their bounds
 IN_THE_LIGHT: tuple[Effect, ...] = tuple(effect for effect in EFFECTS if effect not in READOUT)
 
@@ -59,40 +53,18 @@ class _Stored:
     binning: int
     menus: tuple[Menu, ...]
     noise: list[Radiance]  # of each block with everything on, of the sums (line, number, band) [e-]
-    contrast: list[Radiance]  # of the scene about each sum (1, number, band) [e-]
+    contrast: list[Radiance]  # of the light about each sample, summed (1, number, band) [e-]
     rounding: float
 
-    def change(
-        self, light: list[Radiance], full: list[Radiance], fraction: float, tails: list[Radiance]
-    ) -> tuple[float, float]:
-        """Greatest change of a stored number in its own sigmas, and what of it arithmetic does not explain."""
+    def change(self, light: list[Radiance], full: list[Radiance], fraction: float) -> tuple[float, float]:
+        """Return the greatest change of a stored number in its own sigmas, and what arithmetic does not explain."""
         most, left = 0.0, 0.0
-        every = zip(light, full, self.noise, self.contrast, tails, strict=True)
-        for one, other, noise, contrast, tail in every:
+        for one, other, noise, contrast in zip(light, full, self.noise, self.contrast, strict=True):
             change = np.abs(_summed(one - other, self.binning))
-            misplaced = misplaced_electrons(_summed(other, self.binning), contrast, fraction)
-            misplaced = misplaced + _summed(tail, self.binning)
+            misplaced = fraction * contrast + self.binning * ROUNDING * float(np.abs(other).max())
             most = max(most, float((change / noise).max()))
             left = max(left, float(((change - misplaced) / noise).max()))
         return most, left
-
-
-@dataclass(frozen=True)
-class _Afar:
-    """What lies far about the samples of a block; only looked at where tails differ."""
-
-    block: SweepBlock
-    render: Callable[..., Radiance]
-
-    @cached_property
-    def contrast(self) -> Radiance:
-        return np.asarray(contrast_about(self.block, self.render, TAILS_PX))
-
-    def of(self, fraction: Radiance) -> Radiance:
-        """What tails misplace at each sample, (1, sample, band) [e-]."""
-        return (
-            fraction * self.contrast if fraction.any() else np.zeros((1, self.block.rig.camera.samples, len(fraction)))
-        )
 
 
 def trials(case: Case, binnings: Sequence[int] = (1,), only: str = "") -> Iterator[Trial]:
@@ -107,31 +79,32 @@ def trials(case: Case, binnings: Sequence[int] = (1,), only: str = "") -> Iterat
     exact: dict[Effect, str] = {menu.effect: menu.exact.variant for menu in present}
     blocks = case.blocks(probes[0])
     full = [expected_light(case.scene, block, exact) for block in blocks]
-    render = partial(expected_light, case.scene)
-    contrast = [np.asarray(contrast_about(block, render)) for block in blocks]
-    afar = [_Afar(block, render) for block in blocks]
-    stored = [_stored(full, contrast, case, binning, found) for binning, found in zip(binnings, menus, strict=True)]
+    stored = [_stored(full, case, binning, found) for binning, found in zip(binnings, menus, strict=True)]
     for menu in (one for one in present if only in ("", one.name)):
         for variant in (OFF, *(option.variant for option in menu.variants[1:])):
             chosen = {effect: variant if effect is menu.effect else way for effect, way in exact.items()}
             light = [_light(case, block, chosen) for block in blocks]
             shown = {one: way for one, way in chosen.items() if way != OFF}
-            fraction = max(misplaced_fraction(block, exact, shown) for block in blocks)
-            tails = [far.of(tails_fraction(block, exact, shown)) for block, far in zip(blocks, afar, strict=True)]
+            fraction = misplaced_fraction(exact, shown)
             for one in stored:
                 bound = _error(one.menus, menu.name, variant) / SAFETY
-                yield Trial(
-                    menu.name, variant, one.binning, bound, *one.change(light, full, fraction, tails), one.rounding
-                )
+                yield Trial(menu.name, variant, one.binning, bound, *one.change(light, full, fraction), one.rounding)
 
 
-def _stored(
-    full: list[Radiance], contrast: list[Radiance], case: Case, binning: int, menus: tuple[Menu, ...]
-) -> _Stored:
+def _stored(full: list[Radiance], case: Case, binning: int, menus: tuple[Menu, ...]) -> _Stored:
     noise = [np.sqrt(_summed(np.square(noise_electrons(light, case.rig)), binning)) for light in full]
     sums = [_summed(np.abs(light), binning) for light in full]
     level = max(float((light / one).max()) for light, one in zip(sums, noise, strict=True))
-    return _Stored(binning, menus, noise, [_summed(one, binning) for one in contrast], ROUNDING * level)
+    contrast = [_summed(_range_about(light), binning) for light in full]
+    return _Stored(binning, menus, noise, contrast, ROUNDING * level)
+
+
+def _range_about(light: Radiance) -> Radiance:
+    """Return the range of light within `REACH_PX` of each sample, of all lines, (1, sample, band) [e-]."""
+    most, least = light.max(axis=0), light.min(axis=0)
+    size = 2 * REACH_PX + 1
+    high = scipy.ndimage.maximum_filter1d(most, size, axis=0, mode="nearest")
+    return np.asarray((high - scipy.ndimage.minimum_filter1d(least, size, axis=0, mode="nearest"))[None])
 
 
 def _summed(values: Radiance, binning: int) -> Radiance:

@@ -18,7 +18,7 @@ from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, K
 from pipeline.simulator.effects.effect import OFF, Effect, SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR
 from pipeline.simulator.optics.kernel_fit import Moments
-from pipeline.simulator.render import Choice, expected_light
+from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Optics, Rig
 from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster
 from tests.pipeline.simulator.small_scenes import image_scene, made_scene
@@ -247,9 +247,3 @@ def test_gains_and_changes_run_in_the_order_given() -> None:
     last = expected_light(scene, block, {Nudge("change"): "only", Nudge("gain"): "only"})
     np.testing.assert_allclose(first, plain * gain + 7, rtol=1e-6)
     np.testing.assert_allclose(last, (plain + 7) * gain, rtol=1e-6)
-
-
-def test_choice_leaves_out_what_is_off() -> None:
-    """Effects that are off are not part of a choice, and their variant is off."""
-    choice = Choice.of({SLIT: "off", SMEAR: "positions"})
-    assert (choice.variant("slit"), choice.variant("smear"), len(choice.effects)) == ("off", "positions", 1)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import fields, replace
 from datetime import UTC, datetime
-from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -19,11 +18,10 @@ from pipeline.geometry.scan import CostModel, Sweep, line_positions
 from pipeline.signal.calibrate import calibrate
 from pipeline.simulator.effects.counting import SHOT, dark_electrons, dead_elements, hot_electrons
 from pipeline.simulator.effects.spectrometer import response_gain, stripe_gain
-from pipeline.simulator.render import BY_NAME, EFFECTS, USUAL
 from pipeline.simulator.rig_model import Detector, Rig, Sky
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_block, sweep_starts
-from pipeline.source import References, Source
+from pipeline.source import Source
 from tests.pipeline.simulator.small_scenes import effects_on, image_scene, made_scene
 
 CAMERA = LineCamera()
@@ -83,18 +81,6 @@ def test_line_says_when_and_where() -> None:
     assert {line.exposure_ms for line in lines} == {100.0}
 
 
-def test_noise_is_keyed_by_seed_sweep_and_line() -> None:
-    """Another seed, another sweep's name and another line have other noise; the same key has the same."""
-    flat = np.ones((40, 40, 1))
-    raws = [
-        raw_of(source_of(flat, seed=seed), replace(SWEEP, name=name)) for seed, name in ((0, "a"), (1, "a"), (0, "b"))
-    ]
-    np.testing.assert_array_equal(raws[0], raw_of(source_of(flat), replace(SWEEP, name="a")))
-    noise = np.stack([*raws, np.roll(raws[0], 1, axis=0)]).reshape(4, -1).astype(float)
-    correlation = np.corrcoef(noise)[0, 1:]
-    assert np.abs(correlation).max() < 5 / np.sqrt(noise.shape[1])
-
-
 def test_binned_lines_are_sums_and_saturate_without_wrapping() -> None:
     """Twice the light that fills the well gives sums at full scale, and dark stays dark beside it."""
     values = np.zeros((40, 640, 2))
@@ -138,12 +124,6 @@ def test_black_scene_reads_dark() -> None:
     assert abs(out.mean()) < 1e-3 * source.scene.white_reference[0]
 
 
-def test_lines_come_one_by_one() -> None:
-    """The first lines of an endless sweep are there without rendering the rest."""
-    endless = replace(SWEEP, lines=2_000)
-    assert [line.number for line in islice(source_of(np.ones((8, 8, 1))).lines(endless, 3), 2)] == [3, 4]
-
-
 def test_impossible_settings_are_refused() -> None:
     """Unknown variants, and sums that overflow uint16 are named."""
     with pytest.raises(SettingsError, match=r"shot has no variant 'rough'"):
@@ -167,18 +147,6 @@ def test_sweeps_follow_one_another() -> None:
     )
     starts = sweep_starts(sweeps_of(1000, 1000, 5), CAMERA, COST)  # the second begins in the first load
     assert starts == pytest.approx({"sweep 0": 2.05, "sweep 1": 102.5, "sweep 2": 204.55})
-
-
-def test_fine_sweeps_come_after_the_coarse_ones() -> None:
-    """What was spent before is added to every start."""
-    first, later = (sweep_starts(sweeps_of(10, 20), CAMERA, COST, after_s=seconds) for seconds in (0.0, 60.0))
-    assert {name: start + 60 for name, start in first.items()} == later
-
-
-def test_no_sweeps_have_no_starts() -> None:
-    """A plan without sweeps is empty, and one without lines takes a set-up."""
-    assert sweep_starts([], CAMERA, COST) == {}
-    assert sweep_starts(sweeps_of(0), CAMERA, COST) == pytest.approx({"sweep 0": 0.45})
 
 
 @given(st.lists(st.integers(0, 2000), max_size=12), st.integers(1, 4))
@@ -311,11 +279,6 @@ def test_defects_are_told_as_bad() -> None:
     assert white_reference_source_of(rig=rig).references(WHITE_REFERENCE_SWEEP).bad is None
 
 
-def test_a_sound_sensor_has_no_bad_elements() -> None:
-    """With defects on and none there, nothing is told as bad."""
-    assert white_reference_source_of("defects").references(WHITE_REFERENCE_SWEEP).bad is None
-
-
 def test_bad_elements_are_filled_by_calibration() -> None:
     """An even scene seen with dead and hot elements comes back even."""
     rig = replace(RIG, detector=Detector(dead_fraction=0.02, hot_fraction=0.02, hot_e_per_s=2e4))
@@ -335,34 +298,6 @@ def test_white_reference_is_stated_in_the_rigs_bands() -> None:
     np.testing.assert_array_equal(plain, scene.white_reference)
     assert wide.min() > plain.min() + 0.05
     np.testing.assert_allclose(wide.mean(), plain.mean(), atol=0.02)
-
-
-def test_calibration_does_not_know_the_rest() -> None:
-    """Effects that it cannot see change no frame."""
-    seen = {"dark-current", "defects", "prnu", "striping", "response", "smile", "vignetting"}
-    plain = white_reference_source_of().references(WHITE_REFERENCE_SWEEP)
-    for effect in EFFECTS:
-        if effect.name in seen:
-            continue
-        found = white_reference_source_of(effect.name).references(WHITE_REFERENCE_SWEEP)
-        assert isinstance(found, References)
-        np.testing.assert_array_equal(found.white, plain.white, err_msg=effect.name)
-        np.testing.assert_array_equal(found.dark, plain.dark, err_msg=effect.name)
-
-
-def test_usual_effects_are_those_of_any_camera_behind_a_mirror() -> None:
-    """By default rays, footprint, vignetting and noise are on; names and mapping say the same."""
-    assert [effect.name for effect, _ in USUAL.effects] == [
-        "rotation",
-        "slit",
-        "smear",
-        "vignetting",
-        "shot",
-        "read-noise",
-    ]
-    assert effects_on("shot", "slit").effects == effects_on("slit", "shot").effects
-    assert effects_on().effects == ()
-    assert {effect for effect, _ in USUAL.effects} <= set(BY_NAME.values())
 
 
 RIG_MODEL_RIG = Rig()

@@ -78,7 +78,7 @@ class Ground:
         return cls(moisture, smooth_noise(rng, shape, 55), smooth_noise(rng, shape, 3), grain, light)
 
     def at(self, index: NDArray[np.intp]) -> Ground:
-        """The fields at flat pixel numbers, (n,) each."""
+        """Return the fields at flat pixel numbers, (n,) each."""
         parts = (self.moisture, self.vigour, self.tuft, self.grain, self.light)
         return Ground(*(part.ravel()[index] for part in parts))
 
@@ -115,7 +115,7 @@ class Canvas:
         self.materials[:, self._column["shade"]] += 1 - light.ravel()
 
     def drawn(self) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """Abundances (y, x, material), summing to 1, and the class that covers most of each pixel (y, x)."""
+        """Return abundances (y, x, material), summing to 1, and the class that covers most of each pixel (y, x)."""
         self.materials /= self.materials.sum(axis=1, keepdims=True)
         labels = self.classes.argmax(axis=1).astype(np.uint8)
         return self.materials.reshape(*self.shape, -1), labels.reshape(self.shape)
@@ -131,7 +131,7 @@ class Painting:
 
 
 def moist_soil(plan: FarmPlan, here: Ground, wetter: float = 0.0) -> Mixture:
-    """Bare soil with its water; clods throw longer shadows under a lower sun, up to a third of the pixel."""
+    """Return bare soil with its water; clods throw longer shadows under a lower sun, up to a third of the pixel."""
     water = plan.moisture + wetter + 0.035 * here.moisture + 0.008 * here.tuft
     wet = wet_fraction(np.clip(water, 0.02, 0.45))
     low = min(float(np.hypot(*plan.sun.cast)), 3.0)
@@ -141,14 +141,14 @@ def moist_soil(plan: FarmPlan, here: Ground, wetter: float = 0.0) -> Mixture:
 
 
 def grass(ground: Ground, dryness: float = 0.3) -> Mixture:
-    """Green and dry grass in tufts over a little soil."""
+    """Return green and dry grass in tufts over a little soil."""
     dry = np.clip(dryness - 0.14 * ground.moisture + 0.10 * ground.tuft + 0.04 * ground.grain, 0.02, 0.85)
     soil = np.clip(0.06 + 0.03 * ground.grain, 0, 0.2)
     return {"grass_green": (1 - dry) * (1 - soil), "grass_dry": dry * (1 - soil), "soil_dry": soil}
 
 
 def hard_track(ground: Ground) -> Mixture:
-    """Gravel trodden into dry soil."""
+    """Return gravel trodden into dry soil."""
     stone = np.clip(0.75 + 0.08 * ground.tuft + 0.05 * ground.grain, 0, 1)
     return {"gravel": stone, "soil_dry": 0.85 * (1 - stone), "soil_wet": 0.15 * (1 - stone)}
 
@@ -198,7 +198,7 @@ class FieldPlan:
         return land_on(self.use, day, self.late_days)
 
     def materials_on(self, day: int) -> set[str]:
-        """Spectra of the crop that may stand on the field on a day."""
+        """Return spectra of the crop that may stand on the field on a day."""
         crop, land = self.crop, self.land_on(day)
         if crop is None or land.phase != "crop":
             return set()
@@ -224,10 +224,10 @@ class FarmPlan:
 
     @cached_property
     def moisture(self) -> float:
-        """Water in the topsoil by volume, 0.05 (dry) to 0.38, before it varies over the farm.
+        """Return the water in the topsoil by volume, 0.05 (dry) to 0.38, before it varies over the farm.
 
-        An antecedent precipitation index, P + k P', of rain on 32 % of days of a year of this seed, 5 mm each on
-        average; k is 0.85 in July and 0.95 in January.
+        It follows an antecedent precipitation index, P + k P', with k 0.85 in July and 0.95 in January. Rain falls on
+        32 % of the days of a year of this seed, 5 mm each on average.
         """
         rng = stream(self.seed, "rain")
         rain = np.where(rng.uniform(size=YEAR_DAYS) < 0.32, rng.exponential(5.0, YEAR_DAYS), 0.0)
@@ -239,7 +239,7 @@ class FarmPlan:
 
     @cached_property
     def materials(self) -> tuple[str, ...]:
-        """Spectra that the scene mixes, in the order of its planes: those that the day can show."""
+        """Return spectra that the scene mixes, in the order of its planes: those that the day can show."""
         there = {"soil_dry", "soil_wet", "gravel", "water", "straw", "straw_grey", "grass_green", "grass_dry", "shade"}
         there |= {"weed_leafy", "weed_red", "volunteer", "blossom"}
         there |= {name for name, fraction in foliage(self.day).items() if fraction > 0}

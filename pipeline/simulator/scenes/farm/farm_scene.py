@@ -1,22 +1,23 @@
 """The built-in farm through the year: one seed is one land, which looks as day and hour make it.
 
-Law ``farm@2``. One pixel is about 12 cm of a trial farm; sizes are in px, U(a, b) is uniform, LN(s) log-normal of sigma
-s about 1. Every part draws from its own stream of the seed. What is drawn, and where its laws stand:
+Law ``farm@2``. One pixel is about 12 cm of a trial farm; sizes are in px. U(a, b) is uniform, LN(s) log-normal of sigma
+s about 1. Every part draws from its own stream of the seed. Parts, and the modules of their laws:
 
-* Land (``land``): a rectangle 80 px larger than the scene (and at least 640 x 640) is split along two directions
-  (turned by U(-0.6, 0.6) rad, each cut up to 0.12 rad off) at 0.36-0.64 of its length, until a parcel has less than
-  95 000 U(1.15, 1.9) px. Uses go by ``USE_FRACTIONS`` blurred by LN(0.25), the largest parcel to the use that lacks
-  most, each use at least once where there are enough parcels; lines between parcels by ``BORDER_FRACTIONS``, likewise.
+* Land (``land``): a rectangle 80 px larger than the scene (and at least 640 x 640) is split along two directions. They
+  are turned by U(-0.6, 0.6) rad; each cut is up to 0.12 rad off, at 0.36-0.64 of the length. It ends where a parcel has
+  less than 95 000 U(1.15, 1.9) px. Uses go by ``USE_FRACTIONS`` blurred by LN(0.25): the largest parcel to the use that
+  lacks most. Each use comes at least once where there are enough parcels. Lines between parcels go by
+  ``BORDER_FRACTIONS``, likewise.
 * ``farm_plan``: heading and period of each field's rows, tramlines, weeds, lodging.
 * ``seasons``: calendars, cover, stages, lodging, weeds' growth, leaves of trees, water in the soil, the sun's place.
 * ``spectra``: materials at their stages, the soil line.
 * ``fields``, ``weeds``, ``borders``: the painting. Shadows fall away from the sun, cot(elevation) long. ``wheat_b`` is
-  ``wheat_a`` but for 690-740 nm, and 0.80 of a pixel's wheat (sd 0.17 from pixel to pixel, 0.05 over 55 px) has its own
-  variety's red edge, the rest the other's.
-* Light: 0.95 with sd 0.03 (260 px wide), at most 1. What is missing from full light is the material shade, so that
+  ``wheat_a`` but for 690-740 nm. A fraction of 0.80 of a pixel's wheat has its own variety's red edge, the rest the
+  other's. It varies by 0.17 (sd) from pixel to pixel, by 0.05 over 55 px.
+* Light: 0.95 with sd 0.03 (260 px wide), at most 1. The material shade stands for light that is missing, so that
   abundances stay non-negative and sum to 1.
 
-A pixel's label is the class that covers most of it; harvested cereals and maize are stubble until they are tilled, a
+A pixel's label is the class that covers most of it. Harvested cereals and maize are stubble until they are tilled; a
 crop that hardly covers the soil is soil. Edges are mixed by the fraction of the pixel that they cover.
 """
 
@@ -78,7 +79,7 @@ def farm_scene(
     day: int | None = None,
     hour: float | None = None,
 ) -> RasterScene:
-    """Give a farm on a day: equal arguments give the same scene, bit for bit. It is drawn when first looked at.
+    """Return a farm on a day: equal arguments give the same scene, bit for bit. It is drawn when first looked at.
 
     ``seed`` is not negative; another day of the same seed and shape is the same land. ``shape`` (y, x) is any from 1 x
     1 [px], ``bands`` equally spaced from 400 to 1000 nm, at least 2. The camera's full well sets the electrons. ``day``
@@ -94,7 +95,7 @@ def farm_scene(
 def planned_scene(
     name: str, law: str, plan: FarmPlan, bands: int, camera: LineCamera, draw: Callable[[], Drawn], more: str = ""
 ) -> RasterScene:
-    """Give the scene of a plan, in the farm's materials and classes; ``more`` stands in its key behind the hour.
+    """Return the scene of a plan, in the farm's materials and classes; ``more`` stands in its key behind the hour.
 
     Raises WavelengthError: one band.
     """
@@ -123,7 +124,7 @@ def planned_scene(
 
 
 def _draw(plan: FarmPlan) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Abundances (y, x, material) and labels (y, x)."""
+    """Return abundances (y, x, material) and labels (y, x)."""
     ground = Ground.draw(stream(plan.seed, "ground"), plan.shape)
     work = Painting(plan, ground, Canvas(plan.shape, plan.materials))
     paint_fields(work)
@@ -170,7 +171,7 @@ def _cover(canvas: Canvas, band: Band, half: float, mixture: Mixture, label: str
 
 
 def dig_ponds(work: Painting) -> None:
-    """Ponds with grass round them, in meadows where there are any: one, and one more for every 650 000 px."""
+    """Paint ponds with grass round them, in meadows where there are any: one, and one more for every 650 000 px."""
     canvas, plan = work.canvas, work.plan
     rng, shape = stream(plan.seed, "ponds"), plan.shape
     shore = smooth_noise(rng, shape, 14).ravel()
@@ -189,7 +190,7 @@ def dig_ponds(work: Painting) -> None:
 
 
 def crowns_of(work: Painting) -> Points:
-    """Crowns of hedges and of trees beside the lines: y, x and radius, (n, 3)."""
+    """Return the crowns of hedges and of trees beside the lines: y, x and radius, (n, 3)."""
     plan = work.plan
     rng = stream(plan.seed, "trees")
     trees = [np.zeros((0, 3))]
@@ -212,7 +213,7 @@ def crowns_of(work: Painting) -> Points:
 
 
 def plant_trees(work: Painting) -> None:
-    """Shadows on the ground, away from the sun, then crowns that are darker on that side, in the leaves of the day."""
+    """Paint shadows away from the sun, then crowns that are darker on that side, in the leaves of the day."""
     canvas, plan = work.canvas, work.plan
     crowns = crowns_of(work)
     centres, radius = crowns[:, :2], crowns[:, 2]
@@ -236,8 +237,8 @@ def crown_shadows(
 ) -> NDArray[np.float32]:
     """Cover of the ground by shadows of ellipsoid crowns, (y, x) from 0 to 1.
 
-    A crown is ``radius`` wide and 0.9 ``radius`` high each way about a point 1.2 ``radius`` above the ground; its
-    shadow is an ellipse, and where shadows meet the darker counts.
+    A crown is ``radius`` wide and 0.9 ``radius`` high each way about a point 1.2 ``radius`` above the ground. Its
+    shadow is an ellipse; the darker one counts where shadows meet.
     """
     covered = np.zeros(shape, np.float32)
     length = float(np.hypot(*sun.cast))

@@ -125,7 +125,7 @@ def _standing_crop(
 
 
 def _stand(field: FieldPlan, crop: Crop, here: Ground, local: Points, down: Field) -> Mixture:
-    """Plants alone, by stage; wheat stands and lies, and 0.80 of a pixel has its own variety's red edge."""
+    """Return plants alone, by stage; wheat stands and lies, and 0.80 of a pixel has its own variety's red edge."""
     fractions = stage_fractions(crop, local)
     if field.use not in TWINS:
         return fractions
@@ -193,8 +193,9 @@ def _lodged(noise: Field, field: FieldPlan, day: int) -> Field:
 class Rows:
     """Pixels against the rows, (n,) each; on headlands rows run along the field's end.
 
-    ``across`` and ``along`` are distances in the field's own frame, ``place`` the distance across the rows where the
-    pixel is, ``onward`` along them, ``ends`` to the nearest end of the field [px], ``normal`` (n, 2) across the rows.
+    ``across`` and ``along`` are distances in the field's own frame. ``place`` is the distance across the rows where the
+    pixel is, ``onward`` along them, ``ends`` to the nearest end of the field [px]. ``normal`` (n, 2) points across the
+    rows.
     """
 
     across: Floats
@@ -225,7 +226,7 @@ def rows_of(rng: np.random.Generator, field: FieldPlan, centres: Points) -> Rows
 
 
 def row_gaps(salt: int, field: FieldPlan, rows: Rows, here: Ground) -> Field:
-    """Fraction of each pixel where nothing came up: pieces of rows, more of them where vigour is poor."""
+    """Return the fraction of each pixel where nothing came up: pieces of rows, more of them where vigour is poor."""
     number = np.rint(rows.place / field.row_period_px).astype(np.int64)
     position = rows.onward / PIECE_PX + _scatter(number, number, salt)
     piece = np.floor(position).astype(np.int64)
@@ -237,7 +238,7 @@ def row_gaps(salt: int, field: FieldPlan, rows: Rows, here: Ground) -> Field:
 
 
 def row_shadow(sun: Sun, height: float, rows: Rows, period: float, width: Floats) -> Field:
-    """Fraction of each pixel in the shadow of rows of a height, outside the rows themselves."""
+    """Return the fraction of each pixel in the shadow of rows of a height, outside the rows themselves."""
     room = np.maximum(period - width, 0)
     shift = np.clip(height * (rows.normal @ sun.cast), -room, room)
     both = stripes_of(rows.place - shift / 2, period, width + np.abs(shift))
@@ -245,7 +246,7 @@ def row_shadow(sun: Sun, height: float, rows: Rows, period: float, width: Floats
 
 
 def stripes_of(place: Floats, period: float, width: Floats) -> Field:
-    """Fraction of each pixel covered by stripes whose width differs from pixel to pixel (``land.stripes``)."""
+    """Return the cover of each pixel by stripes whose width differs from pixel to pixel (``land.stripes``)."""
     start = place + (width - 1) / 2
     whole, rest = np.divmod(start, period)
     last, left = np.divmod(start + 1, period)
@@ -253,7 +254,7 @@ def stripes_of(place: Floats, period: float, width: Floats) -> Field:
 
 
 def wheel_marks(field: FieldPlan, rows: Rows) -> Field:
-    """Fraction of each pixel under tramlines, which also go round on the headland; 0 where the field has none."""
+    """Return the fraction of each pixel under tramlines, which also turn on the headland; 0 without tramlines."""
     trams = field.tramlines
     if trams is None:
         return np.zeros(len(rows.across), np.float32)
@@ -266,7 +267,7 @@ def wheel_marks(field: FieldPlan, rows: Rows) -> Field:
 
 
 def _scatter(first: NDArray[np.int64], second: NDArray[np.int64], salt: int) -> Floats:
-    """Evenly spread numbers from 0 to below 1 that only depend on what is given (integer hash)."""
+    """Return evenly spread numbers from 0 to below 1 that only depend on what is given (integer hash)."""
     mixed = first.astype(np.uint32) * np.uint32(0x9E3779B1) ^ second.astype(np.uint32) * np.uint32(0x85EBCA6B)
     mixed ^= np.uint32((salt * 0xC2B2AE35) & 0xFFFFFFFF)
     for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B)):
@@ -291,7 +292,9 @@ def draw_weeds(work: Painting, grown: Mapping[str, Points]) -> None:
 
 
 def field_weeds(rng: np.random.Generator, field: FieldPlan, day: int) -> dict[str, Points]:
-    """Weeds of one field on a day: y, x and radius (n, 3) by spectrum. Poisson in number, clustered as by Thomas [1].
+    """Return the weeds of one field on a day: y, x and radius (n, 3) by spectrum.
+
+    Their number is Poisson distributed; they are clustered as by Thomas [1].
 
     [1] Thomas, "A generalization of Poisson's binomial limit for use in ecology", Biometrika 36, 1949.
     """
@@ -320,7 +323,7 @@ def field_weeds(rng: np.random.Generator, field: FieldPlan, day: int) -> dict[st
 
 
 def _clustered(rng: np.random.Generator, field: FieldPlan, count: int) -> Points:
-    """Places of plants, (n, 2): some anywhere, the rest round parents; those thrown over the border fall anywhere."""
+    """Return places of plants, (n, 2): some anywhere, the rest round parents, none beyond the border."""
     corners = field.parcel.corners
     places = points_within(rng, corners, count)
     parents = points_within(rng, corners, max(1, round(CLUSTERED * count / CLUSTER)))
@@ -336,7 +339,7 @@ def _clustered(rng: np.random.Generator, field: FieldPlan, count: int) -> Points
 
 
 def points_within(rng: np.random.Generator, corners: Points, count: int) -> Points:
-    """Points spread evenly over a convex polygon, (n, 2)."""
+    """Return points spread evenly over a convex polygon, (n, 2)."""
     fans = [corners[[0, number, number + 1]] for number in range(1, len(corners) - 1)]
     areas = np.array([polygon_area(fan) for fan in fans])
     chosen = np.array(fans)[rng.choice(len(fans), count, p=areas / areas.sum())]

@@ -1,12 +1,12 @@
 """The land of a farm: points, fields and rows, and what the season makes of its crops.
 
-Positions are (y, x) in px from the scene's centre. Coverage of a pixel by a straight edge is taken as if the edge
-lay along the pixel's side: exact at right angles, at most 0.043 off at 45 degrees.
+Positions are (y, x) in px from the scene's centre. Coverage of a pixel by a straight edge is taken as if the edge lay
+along the pixel's side. It is exact at right angles, at most 0.043 off at 45 degrees.
 
-The year is a circle of 366 days. Ground cover follows the curve of AquaCrop [1]: exponential growth to half of its
-end, then exponential approach. Its numbers, the calendars (a farm at 52 degrees north) and all other laws here are this
+The year is a circle of 366 days. Ground cover follows the curve of AquaCrop [1]: exponential growth to half of its end,
+then exponential approach. Its numbers, the calendars (a farm at 52 degrees north) and all other laws here are this
 project's. A stand's spectrum is a mixture of those of neighbouring stages, straight in days. North is up in the scene
-(towards smaller y), east to the right; hours are true solar time: the sun is in the south at 12.
+(towards smaller y), east to the right. Hours are true solar time: the sun is in the south at 12.
 
 [1] Steduto et al., "AquaCrop: The FAO crop model to simulate yield response to water: I. Concepts and underlying
    principles", Agronomy Journal 101, 2009. doi:10.2134/agronj2008.0139s
@@ -59,7 +59,7 @@ class Band:
 
 
 def stream(seed: int, name: str) -> np.random.Generator:
-    """Give the random stream of one named part: drawing more in one part does not change another."""
+    """Return the random stream of one named part: drawing more in one part does not change another."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(zlib.crc32(name.encode()),)))
 
 
@@ -93,7 +93,7 @@ def _span(corners: Points, angle: float) -> tuple[float, float]:
 
 
 def clip_polygon(corners: Points, cut: tuple[float, float, float]) -> Points:
-    """Part of a convex polygon where ny y + nx x >= offset, (m, 2); m may be 0."""
+    """Return part of a convex polygon where ny y + nx x >= offset, (m, 2); m may be 0."""
     height = corners @ np.array(cut[:2]) - cut[2]
     kept = []
     for here, there, a, b in zip(corners, np.roll(corners, -1, axis=0), height, np.roll(height, -1), strict=True):
@@ -105,7 +105,7 @@ def clip_polygon(corners: Points, cut: tuple[float, float, float]) -> Points:
 
 
 def polygon_area(corners: Points) -> float:
-    """Area of a polygon by the shoelace formula [px^2]; 0 for fewer than 3 corners."""
+    """Return the area of a polygon by the shoelace formula [px^2]; 0 for fewer than 3 corners."""
     y, x = corners[:, 0], corners[:, 1]
     return float(abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2)
 
@@ -118,7 +118,7 @@ def visible_area(parcel: Parcel, shape: tuple[int, int]) -> float:
 
 
 def allot(rng: np.random.Generator, sizes: list[float], fractions: dict[str, float]) -> list[str]:
-    """Give every piece a kind so that sizes approach the shares, each kind at least once where pieces suffice.
+    """Return every piece a kind so that sizes approach the shares, each kind at least once where pieces suffice.
 
     The shares are first blurred by a log-normal factor (sigma 0.25), so that no two farms are alike.
     """
@@ -137,7 +137,7 @@ def allot(rng: np.random.Generator, sizes: list[float], fractions: dict[str, flo
 
 
 def parcel_pixels(parcel: Parcel, shape: tuple[int, int]) -> tuple[NDArray[np.intp], Field, Points]:
-    """Pixels that a parcel covers: flat numbers (n,), coverage (n,), centres (n, 2). Parcels' coverages sum to 1."""
+    """Return the pixels of a parcel: flat numbers (n,), coverage (n,), centres (n, 2). Parcels' coverages sum to 1."""
     low, high = parcel.corners.min(axis=0) - 1, parcel.corners.max(axis=0) + 1
     middle = (np.array(shape) - 1) / 2
     first = np.clip(np.floor(low + middle), 0, shape).astype(int)
@@ -153,7 +153,7 @@ def parcel_pixels(parcel: Parcel, shape: tuple[int, int]) -> tuple[NDArray[np.in
 
 
 def band_pixels(border: Border, reach: float, shape: tuple[int, int]) -> Band:
-    """Pixels within ``reach`` of a line (and a little more at its ends), found row by row or column by column."""
+    """Return the pixels within ``reach`` of a line, and a little more at its ends, row by row or column by column."""
     step = (border.end - border.start) / max(border.length, 1e-9)
     major = int(abs(step[1]) >= abs(step[0]))
     middle = (np.array(shape) - 1) / 2
@@ -173,7 +173,7 @@ def band_pixels(border: Border, reach: float, shape: tuple[int, int]) -> Band:
 
 
 def stripes(position: NDArray[np.floating], period: float, width: float) -> Field:
-    """Fraction of each pixel covered by stripes of ``width`` centred on multiples of ``period`` (box of 1 px)."""
+    """Return each pixel's cover by stripes of ``width`` centred on multiples of ``period`` (box of 1 px)."""
     start = np.asarray(position, dtype=np.float64) + (width - 1) / 2
     whole, rest = np.divmod(np.stack([start, start + 1]), period)
     filled = whole * width + np.minimum(rest, width)
@@ -181,14 +181,14 @@ def stripes(position: NDArray[np.floating], period: float, width: float) -> Fiel
 
 
 def edge(distance: NDArray[np.floating]) -> Field:
-    """Coverage of a pixel whose centre lies ``distance`` inside an edge."""
+    """Return the coverage of a pixel whose centre lies ``distance`` inside an edge."""
     return np.asarray(np.clip(np.asarray(distance, dtype=np.float32) + np.float32(0.5), 0, 1))
 
 
 def disc_pixels(
     centres: Points, radius: NDArray[np.float64], shape: tuple[int, int]
 ) -> tuple[NDArray[np.intp], Field, NDArray[np.intp]]:
-    """Pixels under discs: flat numbers, coverage and number of the disc that covers most of the pixel, (n,) each."""
+    """Return pixels under discs: flat numbers, coverage, number of the disc that covers most, (n,) each."""
     reach = int(np.ceil(radius.max(initial=0.0) + 1))
     offset = np.arange(-reach, reach + 1)
     place = centres + (np.array(shape) - 1) / 2
@@ -209,7 +209,7 @@ def scene_points(index: NDArray[np.intp], shape: tuple[int, int]) -> Points:
 
 
 def smooth_noise(rng: np.random.Generator, shape: tuple[int, int], cell: float) -> Field:
-    """Random field of sd about 1 whose bumps are about ``cell`` px wide: cubic B-spline over white noise, (y, x)."""
+    """Return noise of sd about 1 with bumps about ``cell`` px wide: a cubic B-spline over white noise, (y, x)."""
     knots = [int(size / cell) + 5 for size in shape]
     field = rng.standard_normal((knots[0], knots[1])).astype(np.float32)
     shift = rng.uniform(0, 1, 2)
@@ -219,7 +219,7 @@ def smooth_noise(rng: np.random.Generator, shape: tuple[int, int], cell: float) 
 
 
 def _spline(knots: Field, position: Points) -> Field:
-    """Cubic B-spline along the first axis at ``position`` (in knots, from the second on)."""
+    """Return cubic B-spline along the first axis at ``position`` (in knots, from the second on)."""
     first = position.astype(int)
     t = (position - first).astype(np.float32).reshape(-1, *[1] * (knots.ndim - 1))
     weights = ((1 - t) ** 3 / 6, (3 * t**3 - 6 * t**2 + 4) / 6, (-3 * t**3 + 3 * t**2 + 3 * t + 1) / 6, t**3 / 6)
@@ -304,7 +304,7 @@ class Sun:
 
 
 def sun_over_farm(day: int, hour: float) -> Sun:
-    """Give the sun's place: declination by Spencer's series [1], hour angle 15 degrees an hour.
+    """Return the sun's place: declination by Spencer's series [1], hour angle 15 degrees an hour.
 
     Right to 0.7 degrees in the years about 2025; refraction is left out.
 
@@ -331,7 +331,7 @@ def sun_over_farm(day: int, hour: float) -> Sun:
 
 
 def since(day: float, event: float) -> float:
-    """Days from the last time that the year's circle passed an event, from 0 to below 366."""
+    """Return the days from the last time that the year's circle passed an event, from 0 to below 366."""
     return (day - event) % YEAR_DAYS
 
 
@@ -354,7 +354,7 @@ def land_on(use: str, day: float, late: float) -> Land:
 
 
 def canopy_cover(crop: Crop, age: ArrayLike) -> NDArray[np.float64]:
-    """Fraction of the ground under plants, by days since emergence; 0 before, never falling: brown plants cover too."""
+    """Return the fraction of the ground under plants, brown ones included, by days since emergence; 0 before."""
     first, growth, last = crop.cover
     days = np.asarray(age, np.float64)
     half_way = np.log(last / (2 * first)) / growth
@@ -375,13 +375,13 @@ def stage_fractions(crop: Crop, age: ArrayLike) -> dict[str, Field]:
 
 
 def lodged_fraction(day: float) -> float:
-    """Fraction of what will lodge in a cereal that lies already: 0 before ``LODGES``, 1 after, smooth between."""
+    """Return the fraction of a cereal's lodging that is done on a day: 0 before ``LODGES``, 1 after, smooth between."""
     t = float(np.clip((day - LODGES[0]) / (LODGES[1] - LODGES[0]), 0, 1))
     return t * t * (3 - 2 * t)
 
 
 def days_since_turned(use: str, day: float, late: float) -> float:
-    """Days since weeds were last killed on a field by tillage, sowing included; a whole year without tillage."""
+    """Return the days since weeds were last killed on a field by tillage, sowing included; a year without tillage."""
     if use in CROPS:
         crop = CROPS[use]
         return min(since(day, crop.tillage + late), since(day, crop.emergence + late - 9))
@@ -389,7 +389,7 @@ def days_since_turned(use: str, day: float, late: float) -> float:
 
 
 def foliage(day: float) -> dict[str, float]:
-    """Shares of green leaves, turning leaves and bare twigs of a crown, summing to 1."""
+    """Return shares of green leaves, turning leaves and bare twigs of a crown, summing to 1."""
     out, turn, fall = (float(np.interp(day, ends, (0, 1))) for ends in (LEAF_OUT, LEAF_TURN, LEAF_FALL))
     leaves = out * (1 - fall)
     return {"tree": leaves * (1 - turn), "tree_autumn": leaves * turn, "twigs": 1 - leaves}

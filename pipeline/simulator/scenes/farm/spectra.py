@@ -1,9 +1,9 @@
 """Spectra of the built-in farm: what its materials reflect, and how many electrons that gives in each band.
 
-Plant stands come from PROSPECT-D and 4SAIL [1] [2] (package ``prosail``), seen from above; soil from the dry and the
-wet spectrum of that package, mixed by moisture [3]; sun and sky from Bird and Riordan's SPECTRL2 [4] (package
-``pvlib``). What those do not give follows laws of this project, written at each function; so do the stages' parameters
-and the camera's quantum efficiency (assumed). Everything is held at 1 nm and seen through Gaussian bands.
+Plant stands come from PROSPECT-D and 4SAIL [1] [2] (package ``prosail``), seen from above. Soil is the dry and the wet
+spectrum of that package, mixed by moisture [3]. Sun and sky come from Bird and Riordan's SPECTRL2 [4] (package
+``pvlib``). The rest follows laws of this project, written at each function, as do the stages' parameters and the
+camera's quantum efficiency (assumed). Everything is held at 1 nm and seen through Gaussian bands.
 
 [1] Feret et al., "PROSPECT-D: Towards modeling leaf optical properties through a complete lifecycle", Remote
    Sensing of Environment 193, 2017. doi:10.1016/j.rse.2017.03.004
@@ -51,10 +51,10 @@ _SUN_ZENITH_DEG = 30.0
 class Canopy:
     """One plant stand for PROSPECT-D and 4SAIL, seen from above with the sun 30 degrees from the zenith.
 
-    Ranges of living plants here: structure n 1.3-2.1; chlorophyll ``cab`` 8-62, carotenoids ``car`` 4-14 and
-    anthocyanins ``ant`` 0-6 ug/cm2; brown pigment 0-1; water ``cw`` 0.004-0.030 cm; dry matter ``cm`` 0.003-0.012
-    g/cm2; leaf area index 1-6; mean leaf angle ``lidfa`` 16-72 degrees from the horizontal; ``dry_soil`` is the
-    fraction of dry soil below.
+    Living plants here have structure n 1.3-2.1 and brown pigment 0-1. They have chlorophyll ``cab`` 8-62, carotenoids
+    ``car`` 4-14 and anthocyanins ``ant`` 0-6 ug/cm2. Water ``cw`` is 0.004-0.030 cm, dry matter ``cm`` 0.003-0.012
+    g/cm2. The leaf area index is 1-6, the mean leaf angle ``lidfa`` 16-72 degrees from the horizontal. ``dry_soil`` is
+    the fraction of dry soil below.
     """
 
     n: float
@@ -103,7 +103,7 @@ MATERIALS: tuple[str, ...] = (*_LASTING, *STAGES, *_TWINS, "straw_grey", "twigs"
 class SpectralLibrary:
     """Materials as the camera sees them under the stated sun.
 
-    ``reflectance`` is (material, band), weighted in each band by light and response; ``light`` is (band,), the signal
+    ``reflectance`` is (material, band), weighted in each band by light and response. ``light`` is (band,), the signal
     of a perfect white, at most 1 over the bands.
     """
 
@@ -113,19 +113,19 @@ class SpectralLibrary:
     light: Spectrum
 
     def electrons(self, camera: LineCamera) -> NDArray[np.float32]:
-        """Expected electrons of each pure material in one default exposure, (material, band) [e-].
+        """Return expected electrons of each pure material in one default exposure, (material, band) [e-].
 
         Exposure and aperture are such that a perfect white fills 95 % of the full well in the brightest band.
         """
         return (self.reflectance * self.light * FILL * camera.full_scale_e).astype(np.float32)
 
     def white_reference_electrons(self, camera: LineCamera) -> NDArray[np.float32]:
-        """Expected electrons of the white reference panel, (band,) [e-]."""
+        """Return expected electrons of the white reference panel, (band,) [e-]."""
         return (WHITE_REFERENCE_REFLECTANCE * self.light * FILL * camera.full_scale_e).astype(np.float32)
 
 
 def band_centres(bands: int) -> tuple[Spectrum, Spectrum]:
-    """Centres and widths of ``bands`` equally spaced bands from 400 to 1000 nm, (band,) each [nm].
+    """Return centres and widths of ``bands`` equally spaced bands from 400 to 1000 nm, (band,) each [nm].
 
     Raises WavelengthError: fewer than 2 bands.
     """
@@ -155,7 +155,7 @@ def spectral_library(bands: int, materials: tuple[str, ...] = MATERIALS) -> Spec
 
 
 def wet_fraction(moisture: ArrayLike) -> NDArray[np.float32]:
-    """Fraction of the wet soil's spectrum by water in the topsoil (by volume), from 0 to below 1.
+    """Return the fraction of the wet soil's spectrum by water in the topsoil (by volume), from 0 to below 1.
 
     The exponential law of [3] with one exponent for all bands, so that bare soil lies on one line.
     """
@@ -163,7 +163,7 @@ def wet_fraction(moisture: ArrayLike) -> NDArray[np.float32]:
 
 
 def band_response(wavelength_nm: Spectrum, fwhm_nm: Spectrum) -> NDArray[np.float64]:
-    """Weights of Gaussian bands on the 1 nm grid from 400 to 1030 nm, (band, grid), each row of sum 1.
+    """Return the weights of Gaussian bands on the 1 nm grid from 400 to 1030 nm, (band, grid), each row of sum 1.
 
     A band at 400 nm keeps its upper half: nothing is known below.
     """
@@ -174,7 +174,7 @@ def band_response(wavelength_nm: Spectrum, fwhm_nm: Spectrum) -> NDArray[np.floa
 
 @lru_cache(maxsize=1)
 def _known_spectra() -> dict[str, Spectrum]:
-    """Reflectance of each of ``MATERIALS`` on the 1 nm grid from 400 to 1030 nm; what no model gives is a law here."""
+    """Return the reflectance of each of ``MATERIALS`` on the 1 nm grid from 400 to 1030 nm, by models or laws."""
 
     def stand(one: Canopy) -> Spectrum:
         leaf, blades = (one.n, one.cab, one.car, one.cbrown, one.cw, one.cm), (one.lai, one.lidfa)

@@ -74,13 +74,6 @@ def test_disc_at_grazing_incidence():
     )
 
 
-@given(st.floats(0.5, 1e6), st.floats(0.5, 1e6))
-def test_nearer_and_farther_blur_alike(distance: float, focus: float):
-    """The disc depends on |1/d - 1/d_f| alone: distance and focus may change places."""
-    there, back = defocus_px(rig_at(distance, focus), distance), defocus_px(rig_at(focus, distance), focus)
-    assert there == pytest.approx(back)
-
-
 @pytest.mark.parametrize(("distance", "focus"), [(None, 30.0), (30.0, 30.0), (math.inf, math.inf)])
 def test_in_focus_or_without_distance(distance: float | None, focus: float):
     """No blur and a bound of 0, no NaN from infinity less infinity."""

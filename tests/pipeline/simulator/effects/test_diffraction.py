@@ -38,14 +38,6 @@ def test_widths_at_rest():
     assert along == pytest.approx(scan * np.sqrt(0.5))
 
 
-def test_width_at_grazing_incidence():
-    """1.9 px at 1000 nm and 70 deg incidence, and no wider along the line than at rest."""
-    normal = np.array([np.sin(np.deg2rad(70)), 0, -np.cos(np.deg2rad(70))])
-    along, scan = fwhm(normal)
-    assert scan[2] == pytest.approx(1.9, abs=0.005)
-    assert along == pytest.approx(fwhm()[0])
-
-
 @pytest.mark.parametrize("u", [0.02, 0.1, 0.3, 0.6, 0.95])
 def test_contrast_of_the_pupil_is_the_transform_of_its_pattern(u: float):
     """The closed form is Hankel's transform of the Airy pattern, summed out to 600 rings."""

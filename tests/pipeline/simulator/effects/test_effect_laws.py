@@ -25,7 +25,6 @@ from pipeline.simulator.render import AIMS, BY_NAME, EFFECTS, FOOTPRINT, LIGHT, 
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.selection.choice import decide, list_effects
-from pipeline.simulator.selection.options import ALWAYS_ON
 from pipeline.simulator.selection.survey_probe import probe_scene
 from pipeline.simulator.simulated import sweep_block
 from tests.pipeline.simulator.bound_trials import IN_THE_LIGHT, trials
@@ -233,15 +232,6 @@ def test_every_effect_of_every_module_is_registered_once():
     ]
     assert {type(one) for one in there} == {type(one) for one in EFFECTS}
     assert len(EFFECTS) == len({type(one) for one in EFFECTS}) == len(there)
-
-
-def test_names_are_unique_and_as_flags_write_them():
-    """Lower case with hyphens, none that flags give another meaning."""
-    assert list(BY_NAME) == [effect.name for effect in EFFECTS]
-    assert len(BY_NAME) == len(EFFECTS)
-    assert all(name.replace("-", "").isalnum() and name == name.lower() for name in BY_NAME)
-    assert not {"auto", "all", "none", OFF} & set(BY_NAME)
-    assert set(BY_NAME) >= ALWAYS_ON
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,6 @@ from pipeline.simulator.selection import survey_probe
 from tests.pipeline.simulator.outdoors import (
     BANDS,
     MORNING,
-    NIGHT,
     WAVELENGTH,
     block_of,
     measured,
@@ -66,21 +65,6 @@ def test_clearer_air_takes_no_more(visibility_km: float, times: float) -> None:
     assert (clear <= hazy * (1 + 1e-12)).all()
     assert (clear >= rayleigh_per_m(WAVELENGTH)).all()
     assert (np.diff(hazy) < 0).all()
-
-
-@pytest.mark.parametrize("visibility_km", [336.0, 1e5, math.inf])
-def test_no_air_is_clearer_than_its_molecules(visibility_km: float) -> None:
-    """From 336 km on nothing but Rayleigh's scattering is left."""
-    found = extinction_per_m(Air(visibility_km=visibility_km), WAVELENGTH)
-    np.testing.assert_allclose(found, rayleigh_per_m(WAVELENGTH), rtol=1e-3)
-
-
-def test_fog_is_grey() -> None:
-    """Over 400 to 1000 nm aerosol falls by 2.8 times at 23 km, but by less than 1.4 times at 100 m."""
-    ends = np.array([400.0, 1000.0])
-    for km, least, most in ((23.0, 2.8, 2.9), (0.1, 1.2, 1.4)):
-        blue, red = extinction_per_m(Air(visibility_km=km), ends) - rayleigh_per_m(ends)
-        assert least < blue / red < most
 
 
 def test_endless_air_is_the_horizon() -> None:
@@ -137,12 +121,6 @@ def test_bound_with_the_sun_rising() -> None:
     seen = measured(PATH_RADIANCE, rig, started_s=14400.0)
     assert measured(PATH_RADIANCE, rig_with(HAZY_300_M)) < seen
     assert seen <= 1.2 * PATH_RADIANCE.bound(probe_of(rig, seconds=14406.0), rig).value
-
-
-def test_air_is_dark_at_night() -> None:
-    """Nothing is added with the sun down."""
-    block = block_of(rig_with(HAZY_300_M, started=NIGHT), range(2))
-    assert not PATH_RADIANCE.change(np.zeros((2, 640, BANDS), np.float32), block, "range").any()
 
 
 @pytest.mark.parametrize("air", [CLEAR_30_M, HAZY_300_M, Air(math.inf), SLOPING])

@@ -81,7 +81,7 @@ def test_settling_takes_the_way_back_away():
     assert abs(transient(rig(100.0), SWEEP, np.arange(1))[0, 0]) < 1e-4
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(st.floats(0.01, 10.0), st.floats(0.5, 1000.0), st.floats(0.1, 500.0), st.floats(0.0, 1.0), st.integers(1, 5))
 def test_any_mirror_is_finite_and_within_its_bound(damping: float, ms: float, hz: float, settled: float, step: int):
     """Stiff or slack, no NaN; and the change of a wave stays below the bound."""
@@ -107,7 +107,7 @@ def block(positions: float, sweep: Sweep = STAIRCASE_SWEEP, lines: range = range
     return SweepBlock(staircase_rig(positions), sweep, lines, np.array([500.0]), (64, 64))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(st.floats(0.05, 40.0), st.integers(1, 5), st.integers(1, 4))
 def test_parts_are_means_of_the_held_positions(positions: float, step: int, parts: int):
     """Each part has the mean of what the mirror holds in it, taken here at many moments."""
@@ -118,15 +118,6 @@ def test_parts_are_means_of_the_held_positions(positions: float, step: int, part
         held = np.floor(positions * time) / positions + 0.5 / positions - 0.5
         planned = line * step + np.arange(step * parts) // parts
         np.testing.assert_allclose(found[line], held.mean(axis=1) - planned, atol=1e-3 / positions + 3e-4)
-
-
-@pytest.mark.parametrize("positions", [1.0, 2.0, 5.0])
-def test_whole_numbers_do_not_shake_lines(positions: float):
-    """A whole number of positions per line leaves every line where it is planned."""
-    shift = STAIRCASE.aim(block(positions), "exact")
-    assert shift.shape == (41, int(positions), 2)
-    np.testing.assert_allclose(shift.mean(axis=1), 0, atol=1e-12)
-    np.testing.assert_allclose(shift[:, :, 1], np.tile((np.arange(positions) + 0.5) / positions - 0.5, (41, 1)))
 
 
 @pytest.mark.parametrize("image", ["waves", "step", "point"])

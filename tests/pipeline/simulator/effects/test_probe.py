@@ -27,7 +27,7 @@ from pipeline.simulator.effects.probe import (
 )
 from pipeline.simulator.optics.rays import pupil_contrast
 from pipeline.simulator.rig_model import Detector, Optics, Rig
-from pipeline.simulator.selection.options import Growth, light_after, light_through
+from pipeline.simulator.selection.options import error_growth, light_after, light_through
 from tests.pipeline.simulator.made_up_effects import RIG, even_probe
 
 NM = np.linspace(400.0, 1000.0, 25)
@@ -74,14 +74,15 @@ def test_errors_grow_with_the_light_over_its_noise():
     """At the darkest sample: 100 e- and 400 e- of read noise doubled, an error of 1 unit is 2 sqrt(502 / 602)."""
     probe, fixed = even_probe(), fixed_variance(RIG)
     expected = 2 * np.sqrt((100 + fixed) / (200 + fixed))
-    assert Growth(probe, RIG).of_errors(2.0) == pytest.approx(expected)
-    assert Growth(replace(probe, unit="dn"), RIG).of_errors(2.0) == 2.0
+    assert error_growth(probe, RIG, None, 2.0) == pytest.approx(expected)
+    assert error_growth(replace(probe, unit="dn"), RIG, None, 2.0) == 2.0
 
 
 def test_what_a_shadow_takes_counts_by_the_noise_within_it():
     """Half of 10,000 e- is 5,000 e- over the noise of 5,000 e-."""
     probe, rig = even_probe(darkest_e=1e4), Rig()
-    lost = 1e4 / np.sqrt(1e4 + fixed_variance(rig)) / 2 * Growth(probe, rig).of_gain(GainRange.between(0.5, 1, 1), 1.0)
+    growth = error_growth(probe, rig, GainRange.between(0.5, 1, 1), 1.0)
+    lost = 1e4 / np.sqrt(1e4 + fixed_variance(rig)) / 2 * growth
     assert lost == pytest.approx(5e3 / np.sqrt(5e3 + fixed_variance(rig)))
 
 

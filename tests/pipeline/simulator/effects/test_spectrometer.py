@@ -35,13 +35,6 @@ def kernel(wavelength, fwhm, wanted=6.0):
     return widen_bands(np.eye(len(wavelength)), wavelength, fwhm, wanted).T
 
 
-def test_widths_add_in_squares():
-    """From 2 to 6 nm 32 / 5.545 = 5.771 nm^2 are missing; from 6 nm on, or where not known, none."""
-    found = missing_variance(6.0, np.array([2.0, 6.0, 9.0, np.nan, np.inf, 0.0]), 6)
-    np.testing.assert_allclose(found, [5.7708, 0, 0, 0, 0, VARIANCE_OF_6], atol=1e-4)
-    assert not missing_variance(6.0, None, 3).any()
-
-
 @pytest.mark.parametrize("fwhm_nm", [0.0, 2.0, 5.9])
 def test_kernel_has_the_missing_variance_on_uneven_bands(fwhm_nm):
     """No weight below 0, sum 1, mean 0 and the variance to 1e-6, however few bands a width spans."""
@@ -97,15 +90,6 @@ def test_one_or_two_bands_stay(bands):
     made = widen_bands(light, nm, np.zeros(bands), 6.0)
     np.testing.assert_allclose(made, light)
     assert RESPONSE.bound(probe_of(light, nm, fwhm_nm=np.zeros(bands)), rig_with()).value == 0
-
-
-def test_detectors_do_not_mix():
-    """Bands whose wavelengths fall back begin another run, widened as if alone."""
-    first, light = random_light(1, bands=30)
-    second, other = random_light(2, bands=20)
-    made = widen_bands(np.concatenate([light, other], axis=2), np.concatenate([first, second]), np.ones(50), 6.0)
-    np.testing.assert_allclose(made[..., :30], widen_bands(light, first, np.ones(30), 6.0), rtol=1e-6)
-    np.testing.assert_allclose(made[..., 30:], widen_bands(other, second, np.ones(20), 6.0), rtol=1e-6)
 
 
 def test_bound_is_within_6_times_at_the_median():

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from pipeline.simulator.optics.kernel_fit import Moments, disc_contrast, disc_points, fold
-from pipeline.simulator.optics.tap_sums import kernels_of
+from pipeline.simulator.optics.scene_radiance import kernels_of
 
 NONE = np.zeros(1)
 

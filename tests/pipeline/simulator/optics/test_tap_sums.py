@@ -76,8 +76,6 @@ class Moved:
         (MIDDLE, 1280, "9x3", 1e-3, 2e-3),
         (CORNER, 2, "9x3", 1e-3, 1e-2),
         (CORNER, 2, "3x1", 3e-3, 1e-2),
-        (CORNER, 2, "1-percent", 3e-2, 3e-2),
-        (CORNER, 2, "3-percent", 9e-2, 9e-2),
     ],
 )
 def test_closed_form_is_what_thousands_of_rays_give(
@@ -85,9 +83,9 @@ def test_closed_form_is_what_thousands_of_rays_give(
 ) -> None:
     """In the middle of a survey and at its corner, where lines are turned by 9 deg, with blurs and without.
 
-    Tables misplace 1e-4 of the light, and grain ranges over 6 of its deviations: .0003 for either axis. A variant of a
-    stated fraction changes half of that times the range. With blurs, boxes at the corner are moved for the Gaussian's
-    covariance as well as their own, which leaves its fourth moments wrong: .008 of the deviation.
+    Tables misplace 1e-4 of the light, and grain ranges over 6 of its deviations: .0003 for either axis.
+    With blurs, boxes at the corner are moved for the covariance of the Gaussian as well as their own. That leaves its
+    fourth moments wrong: .008 of the deviation.
     """
     assert error(sweep, line, variant, {}) < sharp
     assert error(sweep, line, variant, BLURS) < blurred
@@ -144,7 +142,7 @@ def test_gaussian_is_that_of_many_steps(held: int) -> None:
         np.testing.assert_allclose(row, wanted, atol=1e-7)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(width=st.sampled_from([0.0, 0.9, 2.7]), blur=st.floats(0, 1), scale=st.floats(0.99, 1.04), off=st.floats(-1, 1))
 def test_table_is_the_kernel_at_any_place_and_scale(width: float, blur: float, scale: float, off: float) -> None:
     """Weights out of the table sum to 1 and are those of the kernel, by place and by scale right to a thousandth."""

@@ -9,13 +9,6 @@ from numpy.typing import NDArray
 from pipeline.simulator.scenes.farm.farm_plan import FarmPlan, FieldPlan, farm_plan
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.farm.land import Parcel, clip_polygon, divide_land, parcel_pixels, polygon_area, stream
-from pipeline.simulator.scenes.scene import RasterScene
-
-
-@pytest.fixture(scope="module")
-def farms() -> list[RasterScene]:
-    """Three farms of the default size in few bands."""
-    return [farm_scene(seed, bands=4) for seed in range(3)]
 
 
 def test_bands_do_not_move_the_farm() -> None:
@@ -51,9 +44,9 @@ WINDOW = 128
 
 
 @pytest.fixture(scope="module")
-def survey(farms: list[RasterScene]) -> tuple[FarmPlan, NDArray[np.float32]]:
+def survey() -> tuple[FarmPlan, NDArray[np.float32]]:
     """A farm's plan in June and what the near infrared shows of it, (y, x)."""
-    scene = farms[1]
+    scene = farm_scene(1, bands=4)
     return farm_plan(1), scene.planes @ np.ascontiguousarray(scene.spectra()[:, 3])
 
 

@@ -9,15 +9,7 @@ from hypothesis import strategies as st
 
 from pipeline.geometry.camera import LineCamera, digitise
 from pipeline.simulator.scenes.farm.farm_scene import crown_shadows
-from pipeline.simulator.scenes.farm.land import (
-    CROPS,
-    LATITUDE_DEG,
-    Sun,
-    canopy_cover,
-    land_on,
-    stage_fractions,
-    sun_over_farm,
-)
+from pipeline.simulator.scenes.farm.land import CROPS, LATITUDE_DEG, Sun, land_on, stage_fractions, sun_over_farm
 from pipeline.simulator.scenes.farm.spectra import FWHM_NM, MATERIALS, band_response, spectral_library
 
 
@@ -28,11 +20,6 @@ def test_stages_fraction_the_stand(use: str, age: float) -> None:
     assert 1 <= len(fractions) <= 2
     assert sum(float(fraction[0]) for fraction in fractions.values()) == pytest.approx(1, abs=1e-6)
     assert all(fraction[0] >= 0 and name in MATERIALS for name, fraction in fractions.items())
-
-
-def test_cover_by_hand() -> None:
-    """Maize 20 days old covers 0.005 exp(0.12 x 20); 60 days old 0.96 - 0.25 x 0.96^2 / 0.005 exp(-0.12 x 60)."""
-    np.testing.assert_allclose(canopy_cover(CROPS["maize"], [20.0, 60.0]), [0.0551159, 0.9255975], rtol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -132,11 +119,3 @@ def test_white_reference_and_materials_fraction_one_light() -> None:
     camera, library = LineCamera(), spectral_library(32)
     back = library.electrons(camera) / library.white_reference_electrons(camera) * 0.99
     np.testing.assert_allclose(back, library.reflectance, rtol=1e-5)
-
-
-def test_library_cannot_be_changed() -> None:
-    """The cached spectra are read-only: one scene cannot spoil another's."""
-    library = spectral_library(4)
-    assert library is spectral_library(4)
-    with pytest.raises(ValueError, match="read-only"):
-        library.reflectance[0, 0] = 1

@@ -13,12 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import SettingsError
-from pipeline.simulator.effects.blurs import DIFFRACTION, KEYSTONE
-from pipeline.simulator.effects.counting import READ_NOISE, SHOT
 from pipeline.simulator.effects.lighting import CLOUD
-from pipeline.simulator.rig_model import Detector, Rig, Sky
+from pipeline.simulator.rig_model import Rig, Sky
 from pipeline.simulator.selection.choice import Decision, decide, list_effects, named_effects, sum_up
-from pipeline.simulator.selection.options import LEAST_COST_NS, SAFETY, cost_of, list_options
+from pipeline.simulator.selection.options import SAFETY, list_options
 from tests.pipeline.simulator.made_up_effects import RIG, Brightening, MadeUp, Shift, even_probe
 
 PROBE = even_probe()
@@ -157,13 +155,6 @@ def test_worked_by_hand(effects: list[MadeUp], tolerance: float, asked: str, wan
     assert decision.error <= tolerance or asked != "auto"
 
 
-def test_totals_of_a_decision():
-    """Errors sum with the factor of safety."""
-    assert (decide(PROBE, RIG, THREE, 0.11).error, decide(PROBE, RIG, THREE, 0.11).cost_ns) == pytest.approx(
-        (0.108, 0.3)
-    )
-
-
 def test_gains_multiply_the_errors_of_others_but_not_their_own():
     """Light that is brightened by a quarter carries a shift's error a quarter higher; a unit of DN follows no light."""
     effects = [
@@ -204,40 +195,6 @@ def test_later_gains_multiply_errors_of_what_the_renderer_does(name: str):
     effects = [MadeUp(name, 0.1), MadeUp("read", 0.1), Brightening("drift", 0.5, fraction=0.5)]
     errors = [menu.off.error for menu in list_options(replace(PROBE, unit="dn"), RIG, effects)]
     assert errors[:2] == pytest.approx([0.15 * SAFETY, 0.1 * SAFETY])
-
-
-@pytest.mark.parametrize(("light_e", "exact_ns"), [(100.0, 10.0), (1.0, 80.0)])
-def test_exact_counts_cost_by_the_light(light_e: float, exact_ns: float):
-    """Few electrons are counted one by one; a third of them dim costs as much of the way."""
-    rig = replace(RIG, detector=Detector(dark_e_per_s=0.0))
-    even = replace(PROBE, usual_e=np.full(9, light_e))
-    mixed = replace(PROBE, usual_e=np.array([1.0, 100.0, 1000.0]))
-    assert list_options(even, rig, [SHOT])[0].exact.cost_ns == pytest.approx(exact_ns)
-    assert list_options(mixed, rig, [SHOT])[0].exact.cost_ns == pytest.approx(10 + 70 / 3)
-
-
-def test_cheap_counts_pay_for_the_exact_ones_where_few_are_expected():
-    """Without read noise to hide them, whole numbers show up to some hundred electrons."""
-    dim, bright = (replace(PROBE, usual_e=np.full(9, light)) for light in (100.0, 1e4))
-    sharp = replace(RIG, camera=replace(RIG.camera, read_noise_e=0.0))
-    costs = [list_options(probe, rig, [SHOT])[0].variants[1].cost_ns for rig in (RIG, sharp) for probe in (dim, bright)]
-    assert costs == pytest.approx([3.9, 3.9, 13.9, 3.9])
-
-
-def test_kernels_that_two_blurs_need_are_paid_as_both_need_them():
-    """Keystone costs more beside the several widths of diffraction than its own price."""
-    menus = list_options(PROBE, Rig(), [DIFFRACTION, KEYSTONE])
-    shared = KEYSTONE.merged(Rig())
-    cost = cost_of(menus, {"diffraction": menus[0].exact, "keystone": menus[1].exact})
-    assert shared.cost_ns > KEYSTONE.cost_ns["linear"]
-    assert cost - menus[0].exact.cost_ns == pytest.approx(shared.cost_ns)
-
-
-def test_a_draw_that_two_fraction_is_paid_once():
-    """Read noise costs nothing in the cheap draw of the shot noise, and its own price beside the exact one."""
-    decision = decide(PROBE, RIG, [SHOT, READ_NOISE], 1e-3)
-    assert decision.cost_ns == pytest.approx(SHOT.cost_ns["gaussian"] + LEAST_COST_NS)
-    assert decision.exact_cost_ns == pytest.approx(SHOT.cost_ns["exact"] + READ_NOISE.cost_ns["exact"])
 
 
 def test_even_scene_shows_no_geometry_but_the_rig_has_it():
@@ -343,15 +300,6 @@ def test_asked_effects_may_leave_the_tolerance():
 def test_reasons_say_why_in_words_and_numbers(name: str, why: str):
     """Every case of the rule."""
     assert whys(0.1)[name] == why
-
-
-def test_reasons_name_what_was_asked():
-    """Also where the rig lacks it, and where the tolerance is 0."""
-    asked = whys(0.1, "wind, blur")
-    assert asked["wind"].startswith("asked for, but the rig has none of it: ")
-    assert asked["blur"].startswith("asked for: ")
-    assert asked["smile"].startswith("not asked for; left out it could change a stored number by 0.072 sigma")
-    assert whys(0.0)["rotation"].startswith("the tolerance is 0, so everything is computed: ")
 
 
 def test_bounds_without_limit_become_null():

