@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -74,9 +74,6 @@ class Source(Protocol):
 
     def lines(self, sweep: Sweep, first: int = 0) -> Iterator[Line]:
         """Yield the sweep's lines one by one, from line ``first`` on."""
-
-    def lines_again(self, sweep: Sweep, numbers: Sequence[int]) -> Iterator[Line]:
-        """Yield single lines of an earlier capture again, in order; not valid if they are gone."""
 
     def references(self, sweep: Sweep) -> References:
         """Return dark and white frames with the sweep's binning."""

@@ -175,12 +175,6 @@ class RecordedSource:
         for start in range(first, sweep.lines, BLOCK_LINES):
             yield from self._lines_of(sweep, picked, np.arange(start, min(start + BLOCK_LINES, sweep.lines)))
 
-    def lines_again(self, sweep: Sweep, numbers: Sequence[int]) -> Iterator[Line]:
-        """Yield single lines that were given before, bit for bit; raises as `lines`."""
-        picked = self.pick(sweep)
-        for number in numbers:
-            yield from self._lines_of(sweep, picked, np.array([number]))
-
     def references(self, sweep: Sweep) -> References:
         """Return dark and white frames of the lines that serve a sweep, summed to its binning; raises as `lines`."""
         served = self.sweeps[int(self.pick(sweep).place[0])] if sweep.lines else self.sweeps[0]

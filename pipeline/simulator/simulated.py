@@ -101,11 +101,6 @@ class SimulatedSource:
             for number, data in zip(numbers, self.render(sweep, numbers), strict=True)
         ]
 
-    def lines_again(self, sweep: Sweep, numbers: Sequence[int]) -> Iterator[Line]:
-        """Return single lines that were given before: the same, bit for bit."""
-        for number in numbers:
-            yield from self.lines_of(sweep, range(number, number + 1))
-
     @property
     def record(self) -> None:
         """Return nothing: the manifest of the effects has it all."""

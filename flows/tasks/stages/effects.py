@@ -32,7 +32,7 @@ from storage.archive.manifests import read_table
 from storage.archive.whole_files import to_json
 
 RECORD = "effects.json"
-MANIFEST = Product("effects", version=9, files=(RECORD,))
+MANIFEST = Product("effects", version=10, files=(RECORD,))
 FOOTPRINT = {ROTATION: ROTATION.variants[0], SLIT: SLIT.variants[-1]}  # effects that choose lines for verification
 DRAFT, VERIFIED = 0.3, 1.0
 

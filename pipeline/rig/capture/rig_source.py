@@ -14,7 +14,7 @@ continues a transfer where it broke off, and captures only what the camera does 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import asdict
@@ -175,41 +175,6 @@ class RigSource:
                             f"{taken.folder}: {reason}. The {line} lines before it are kept; mend that and run again"
                         )
                     LOG.warning("%s: line %d is captured again; %s: %s", sweep.name, line, taken.folder, reason)
-
-    def lines_again(self, sweep: Sweep, numbers: Sequence[int]) -> Iterator[Line]:
-        """Yield single lines that were given before, in order, from the files of their captures.
-
-        Nothing is captured again. A line that no capture gives is yielded as not valid. Raises RigError: a device
-        failed, or the password is refused.
-        """
-        waiting = list(numbers)
-        with self.session() as runner:
-            while waiting:
-                held = self._journal.holding(sweep, waiting[0])
-                found = {} if held is None else self._found_again(runner, held, waiting)
-                given = [number for number in waiting if held is not None and number < held.stop] or waiting[:1]
-                yield from (found.get(number) or self._lost(sweep, number) for number in given)
-                waiting = waiting[len(given) :]
-
-    def _found_again(self, runner: CaptureRunner, held: CaptureRecord, wanted: Sequence[int]) -> dict[int, Line]:
-        """Return the wanted lines that a held capture still has, by number."""
-        found: dict[int, Line] = {}
-        try:
-            for line in self._read(runner, runner.recovered(held), wanted[0]):
-                if line.number in wanted:
-                    found[line.number] = line
-        except (UnusableCaptureError, DeviceRefused) as error:
-            if getattr(error, "code", None) == NOT_LOGGED_IN:
-                raise
-            LOG.warning("%s, from line %d on: lost; %s: %s", held.sweep.name, wanted[0], held.folder, error)
-        return found
-
-    def _lost(self, sweep: Sweep, number: int) -> Line:
-        path = path_of(sweep, (number, number + 1), self.camera, triggered=can_trigger(self.rig.pulses, sweep))
-        frame = (self.camera.samples // sweep.binning, len(self.wavelength_nm))
-        nothing, (x, y) = np.zeros(frame, np.uint16), path.middle[0]
-        time_s = self._time_s(sweep, number, -1)
-        return Line(number, nothing, float(x), float(y), time_s, exposing(self.camera, sweep).exposure_ms, valid=False)
 
     def references(self, sweep: Sweep) -> References:
         """Return the dark and white frames with the sweep's binning; they are captured once for each exposure."""

@@ -34,13 +34,12 @@ def assert_same_references(found: References, expected: References) -> None:
     "sweep", [FULL, Sweep("c", "coarse", "x", 0.0, -39.5, 20, step=4, binning=4, exposure_ms=25.0)]
 )
 def test_a_recorded_copy_of_a_sweep_gives_its_lines(sweep: Sweep) -> None:
-    """Lines, references and single lines again are those of the source that was recorded, bit for bit."""
+    """Lines and references are those of the recorded source, bit for bit."""
     source = simulated()
     recorded = recorded_source(source, [record(source, sweep)])
     lines = list(source.lines(sweep))
     assert_same_lines(list(recorded.lines(sweep)), lines)
     assert_same_lines(list(recorded.lines(sweep, 17)), lines[17:])
-    assert_same_lines(list(recorded.lines_again(sweep, [3, 11])), [lines[3], lines[11]])
     assert_same_references(recorded.references(sweep), source.references(sweep))
     assert recorded.lines_recorded == sweep.lines
 

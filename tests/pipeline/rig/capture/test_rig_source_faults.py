@@ -293,38 +293,6 @@ def test_mirror_that_never_rests_is_not_captured_with(scan_pass: str):
         assert not any(said.startswith("capture(") for said in rig.emulated.camera.commands)
 
 
-def test_lines_that_were_lost_come_from_the_kept_files():
-    """Single lines of an earlier session are given again as they were, over several captures; nothing is captured."""
-    with small_rig(vector_pairs=12) as rig:
-        kept = KeptInMemory()
-        given = list(rig.source(kept).lines(FINE))
-        taken = len(rig.captures)
-        assert taken > 1
-        numbers = [0, 3, 8, 9, 16]
-        again = list(rig.source(kept).lines_again(FINE, numbers))
-        assert len(rig.captures) == taken
-    for line, number in zip(again, numbers, strict=True):
-        assert replace(line, data=given[number].data) == given[number]
-        np.testing.assert_array_equal(line.data, given[number].data)
-
-
-@pytest.mark.parametrize("gone", ["the journal", "the camera's files"])
-def test_lines_that_no_capture_gives_any_more_are_lost(gone: str):
-    """They come as lines that the camera dropped: in their places, dark and not valid; nothing is captured for them."""
-    kept = KeptInMemory()
-    with small_rig() as rig:
-        given = list(rig.source(kept).lines(FINE))
-    if gone == "the journal":
-        kept.files.clear()
-    with small_rig() as rig:
-        lost = list(rig.source(kept).lines_again(FINE, [2, 5]))
-        assert not rig.captures
-    assert [(line.number, line.valid, line.data.any()) for line in lost] == [(2, False, False), (5, False, False)]
-    assert [line.data.shape for line in lost] == [given[2].data.shape] * 2
-    for line in lost:
-        assert (line.mirror_x, line.mirror_y) == (given[line.number].mirror_x, given[line.number].mirror_y)
-
-
 def test_log_that_has_changed_tie_points_no_line():
     """A bit of the kept log flips: its capture is taken again, and no position of it is believed."""
     with small_rig(pulses="none", log_samples=16000) as rig:
