@@ -58,7 +58,7 @@ def _publish(plan: OpenSurvey, *products: StageRef) -> RunRef:
         judged = False
     published = publish_run(plan)
     if judged:
-        plan.observer.note(f"published: {published.folder}; its accuracy is judged now and added to it")
+        plan.observer.note(f"published: {published.folder}; accuracy follows")
     _show_artifacts(plan, published)
     return _ref(published, pending=judged)
 

@@ -30,7 +30,7 @@ from storage.archive.keys import StageRef
 from storage.readers.scene_files import load_scene_file
 from storage.remote.opening import open_archive
 
-TITLES = {"effects": "effects that matter", "capture": "scan"}
+TITLES = {"effects": "choice of effects", "capture": "scan"}
 PATCH, FACTOR = 16, 4  # of the shipped weights, so that scans are those of their surveys
 
 

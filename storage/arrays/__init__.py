@@ -1,1 +1,1 @@
-"""Stored arrays of a survey: raw cubes and their spool, lookups, mosaics, patches, class maps."""
+"""Stored arrays of a survey: raw cubes and their spool, signal, geolocation grids, mosaics, class maps."""

@@ -110,8 +110,8 @@ def sentences_of_code(path: Path, tree: ast.Module) -> Iterator[Sentence]:
             continue
         line = node.body[0].lineno
         inner.add(id(node.body[0].value))  # type: ignore[attr-defined]
-        for paragraph in re.split(r"\n\s*\n", text):
-            if "----" not in paragraph and not re.search(r"\S {3,}\S", paragraph):  # no table
+        for paragraph in re.split(r"\n\s*\n|\n\s*(?=- |\[\d)", text):  # items of lists are apart
+            if not re.search(r"----|\S {3,}\S|^\[\d", paragraph):  # no table, no reference to literature
                 yield from _split(path, line, "docstring", re.sub(r"``([^`]*)``", r"`\1`", " ".join(paragraph.split())))
     joined = {id(part) for node in nodes(tree) if isinstance(node, ast.JoinedStr) for part in node.values}
     for node in nodes(tree):

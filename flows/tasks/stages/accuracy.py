@@ -53,7 +53,7 @@ RECORD = "accuracy.json"
 ACCURACY = Product("evaluate", version=12, files=(RECORD,), by_weights=True)
 
 
-@stage("evaluate", "accuracy (not part of the survey)", ACCURACY)
+@stage("evaluate", "accuracy, after publication", ACCURACY)
 def evaluate(
     mosaic: StageRef,
     attention: StageRef,

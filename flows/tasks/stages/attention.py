@@ -41,7 +41,7 @@ PLANNED = 2  # spacings and exposures with the highest bound of gain, of which p
 TRIES = 5  # to fit runs into the time
 
 
-@stage("score", "attention and plan", ATTENTION)
+@stage("score", "patch scores", ATTENTION)
 def score(
     mosaic: StageRef,
     *,

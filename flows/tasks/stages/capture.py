@@ -36,13 +36,13 @@ RAW = Product("capture", version=12)
 RIG_RECORD = "rig.json"  # record of a rig's captures, beside the cubes
 
 
-@stage("capture_coarse", "coarse sweep", RAW, inputs=1, retries=2, named="raw_coarse")
+@stage("capture_coarse", "capture", RAW, inputs=1, retries=2, named="raw_coarse")
 def capture_coarse(effects: StageRef, *, plan: CapturePlan, recorder: SweepRecorder, report: Report) -> Wanted:
     """Capture the first pass, or the uniform scan."""
     return recorder.wanted(plan.coarse, [effects], report)
 
 
-@stage("capture_fine", "fine sweeps", RAW, inputs=2, retries=2, named="raw_fine")
+@stage("capture_fine", "capture of requested lines", RAW, inputs=2, retries=2, named="raw_fine")
 def capture_fine(
     attention: StageRef, effects: StageRef, *, plan: CapturePlan, recorder: SweepRecorder, report: Report
 ) -> Wanted:

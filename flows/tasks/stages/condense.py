@@ -133,7 +133,7 @@ def condense(
     return Wanted(build, key if limit is None else {**key, "kept": asdict(limit)}, list(passes))
 
 
-condense_coarse = stage("condense_coarse", "signal of the sweeps", SIGNAL, named="signal_coarse")(condense)
+condense_coarse = stage("condense_coarse", "signal", SIGNAL, named="signal_coarse")(condense)
 condense_fine = stage("condense_fine", "signal of all passes", SIGNAL_FINE, named="signal_fine")(condense)
 
 

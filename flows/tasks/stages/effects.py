@@ -37,7 +37,7 @@ FOOTPRINT = {ROTATION: ROTATION.variants[0], SLIT: SLIT.variants[-1]}  # effects
 DRAFT, VERIFIED = 0.3, 1.0
 
 
-@stage("choose_effects", "effects that matter", MANIFEST)
+@stage("choose_effects", "choice of effects", MANIFEST)
 def choose_effects(
     *,
     source: FieldSource,

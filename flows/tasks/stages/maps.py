@@ -198,7 +198,7 @@ STORE = "ground_map.zarr"
 GROUND = Product("ground", version=4, files=(STORE,))
 
 
-@stage("ground", "map on the ground", GROUND)
+@stage("ground", "map in a projected CRS", GROUND)
 def ground(
     class_map: StageRef, mosaic: StageRef, *, ground_grid: GroundGrid, map_choice: MapChoice, report: Report
 ) -> Wanted:

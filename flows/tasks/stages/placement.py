@@ -48,7 +48,7 @@ def record_of(registration: StageRef | None) -> Path | None:
     return None if registration is None else registration.path / RECORD
 
 
-@stage("register_coarse", "seams of the coarse sweeps", POINTING, inputs=1, named="coarse_pointing")
+@stage("register_coarse", "registration of the sweeps", POINTING, inputs=1, named="coarse_pointing")
 def register_coarse(
     signal: StageRef, *, camera: LineCamera, pointing_px: float, frame: FieldFrame, report: Report
 ) -> Wanted:
@@ -106,7 +106,7 @@ def _window_record(seen: SeamWindow, names: Sequence[str]) -> dict[str, Any]:
     }
 
 
-@stage("register_fine", "fine sweeps on the mosaic", POINTING, inputs=2, named="fine_pointing")
+@stage("register_fine", "registration to the mosaic", POINTING, inputs=2, named="fine_pointing")
 def register_fine(
     signal: StageRef, mosaic: StageRef, *, camera: LineCamera, pointing_px: float, frame: FieldFrame, report: Report
 ) -> Wanted:
@@ -140,7 +140,7 @@ def load_registration(registration: StageRef) -> dict[str, Any]:
     return read_table(registration.path / RECORD)
 
 
-@stage("locate", "lookup", GEOLOCATION)
+@stage("locate", "geolocation grid", GEOLOCATION)
 def locate(
     signal: StageRef, registration: StageRef | None = None, *, camera: LineCamera, frame: FieldFrame, report: Report
 ) -> Wanted:

@@ -213,7 +213,7 @@ def test_interrupted_survey_says_how_to_go_on(
     monkeypatch.setitem(STAGES, "score", real)
     ended = command_line(*words)
     assert ended.code == 0
-    assert "coarse sweep: 100% cached" in ended.err
+    assert "capture: 100% cached" in ended.err
 
 
 TRAINING = {

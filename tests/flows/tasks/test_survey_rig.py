@@ -240,7 +240,7 @@ def test_what_the_rig_is_at_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyP
     settings = small_settings(tmp_path, source="rig", visit="first", budget=0.5)
     with emulated(settings, {}, monkeypatch):
         run_survey(settings, Console(file=out, width=200))
-    told = [line.removeprefix("coarse sweep: 0% ") for line in out.getvalue().splitlines() if "sweep: 0% " in line]
+    told = [line.removeprefix("capture: 0% ") for line in out.getvalue().splitlines() if "capture: 0% " in line]
     kinds = [re.sub(r"\d[\d.]*", "N", words) for words in told]
     wanted = ["path: N of N cells", "capturing: N of N s", "fetching: N of N MB"]
     coarse = kinds[kinds.index(wanted[0]) :]  # behind the references
