@@ -21,7 +21,7 @@ from pipeline.signal.subspace import SMALL_FIELD
 
 TITLE = "Estimates: nothing of this has run"
 LABELS: Mapping[str, tuple[str, Callable[[float | None], str]]] = {
-    "capture_s": ("time at the camera", format_seconds),
+    "capture_s": ("capture time", format_seconds),
     "bytes_captured": ("bytes captured", format_bytes),
     "bytes_kept": ("bytes kept", format_bytes),
     "multiply_adds": ("model's multiply-adds", format_count),

@@ -26,7 +26,7 @@ from storage.arrays.spool import Spool
 from storage.remote.opening import verify_archive
 from tests.faults.nursery import ROOT, Ended
 from tests.faults.small_survey import Subject, problems, stored, words, wrong_after_fault, wrong_after_rerun
-from tests.flows.small_fields import write_field, write_weights
+from tests.flows.small_fields import write_field
 from tests.receipts import comparable
 
 GOING_ON = "terminated; run the same command to resume"
@@ -94,18 +94,6 @@ def test_training_goes_on(subject: Subject, tmp_path: Path) -> None:
     assert not out.exists()
     assert subject.nursery.run(asked).code == 0
     assert out.exists()
-
-
-def test_an_evaluation_goes_on(subject: Subject, tmp_path: Path) -> None:
-    """Frames that were judged are kept, and not judged again."""
-    field, file, out = write_field(tmp_path / "field"), tmp_path / "w.safetensors", tmp_path / "out"
-    how = "--fractions 0.5 --policies random --draws 20"
-    asked = ["evaluate", str(field), "--weights", str(write_weights(file)), "-o", str(out), *how.split()]
-    place = {"place": "flows.evaluate.command:judge_frame", "number": signal.SIGTERM}
-    ended = subject.nursery.run(asked, "end_before", call=3, **place)
-    assert told(ended), ended.text
-    again = subject.nursery.run(asked, "end_before", call=2, **place)  # one frame is left
-    assert (again.code, (out / "evaluation.json").is_file()) == (0, True), again.text
 
 
 # --- while the map is judged ------------------------------------------------------------------------------------------

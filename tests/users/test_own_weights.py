@@ -79,14 +79,14 @@ def test_a_score_on_a_scene_of_the_training_says_so_in_its_sentence(
     labels = ["--labels", str(made / "field" / "labels" / "t1.tif")]
     for words in ([], ["--bands", "0-8"]):
         said, receipt = survey(command_line, made, scene, tmp_path / "a", *labels, *words)
-        sentence = "of 100 against the truth on a training scene (not valid for other fields) ("
+        sentence = "of 100 against the labels on a training scene (not valid for other fields) ("
         assert sentence in said
         assert receipt["training_scene"] == "all"
         page = (open_archive(tmp_path / "a").latest.folder / "report.html").read_text()
         assert sentence in page
     assert "* on a scene that the weights were trained on" in command_line("ls", tmp_path / "a").out
     said, receipt = survey(command_line, made, made / "field" / "images" / "t0.tif", tmp_path / "b")
-    assert "of 100 against the truth (" in said
+    assert "of 100 against the labels (" in said
     assert "training_scene" not in receipt
     assert "*" not in command_line("ls", tmp_path / "b").out
 
@@ -96,7 +96,7 @@ def test_a_field_of_tiles_tells_that_some_are_scenes_of_the_training(
 ) -> None:
     """Three of the four tiles taught the weights."""
     said, receipt = survey(command_line, made, made / "field" / "images", tmp_path / "a")
-    assert "against the truth on a field with tiles of the training" in said
+    assert "against the labels on a field with tiles of the training" in said
     assert receipt["training_scene"] == "tiles"
 
 

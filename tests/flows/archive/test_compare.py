@@ -57,7 +57,7 @@ def test_two_budgets_are_told_apart_either_way(
         assert picture.width > 3 * 400
     compare(two_budgets, "previous", "latest", out=tmp_path)
     out = capsys.readouterr().out
-    for words in ("budget", "time at the camera", "IoU of A and B", "stage.score", "compare-"):
+    for words in ("budget", "capture time", "IoU of A and B", "stage.score", "compare-"):
         assert words in out
     one, other = (
         _compared(capsys, two_budgets, *runs, tmp_path) for runs in (("previous", "latest"), ("latest", "previous"))

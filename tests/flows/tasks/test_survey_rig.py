@@ -334,7 +334,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "frame period of the camera": (
         {"source": "rig", "camera.exposure_ms": 9500, "camera.readout_ms": 900},
-        r"frame period of 10400 ms is above",
+        r"frame period 10400 ms is above",
     ),
 }
 

@@ -223,8 +223,8 @@ def test_a_survey_says_that_a_scene_was_trained_on(folder: Path, out: Path) -> N
         scene = folder / "images" / f"{number}_image.png"
         flags = {"scene": str(scene), "source": "sim", "weights": str(out), "out": str(out.parent / "a"), "budget": 1}
         notes[number] = " ".join(open_run(load_settings(None, flags)).notes)
-    assert "a scene of the training" in notes["001"]
-    assert "a scene of the training" not in notes["002"]
+    assert "a training scene" in notes["001"]
+    assert "a training scene" not in notes["002"]
 
 
 def test_pixels_trained_on_are_not_judged(out: Path, tmp_path: Path) -> None:

@@ -85,11 +85,7 @@ def test_the_command_trains_judges_and_says_how(tmp_path: Path, monkeypatch: pyt
 @pytest.mark.parametrize(
     ("dataset", "out", "why"),
     [
-        (
-            "frames",
-            "x.safetensors",
-            "--train-temporal trains on one land at several days, which only the built-in farm gives",
-        ),
+        ("frames", "x.safetensors", "expected farm, the only data set with several days of one land"),
         ("farm", "no/x.safetensors", "expected the name of a file in a folder that exists"),
     ],
 )
