@@ -14,7 +14,7 @@ from tests.prior_work import with_effects, without_effects
 
 WITH_BLOCKS = [page for page in PAGES if blocks_of(page)]
 OF_EFFECTS = {DOCS / "background" / "simulator.md"}  # pages that show which effects are chosen; others need no choice
-README_LINES = 150
+README_LINES = 130
 PATH = re.compile(
     r"(?:pipeline|models|storage|flows|tests|docs|\.ci)(?:/[\w.-]+)*/?|[\w-]+\.(?:md|toml|yaml|txt)|Makefile"
 )
