@@ -48,6 +48,7 @@ test: $(BIN)/.ok-dev
 
 lint: $(BIN)/.ok-dev
 	$(BIN)/ruff check .
+	$(BIN)/ruff check --select D --ignore D105 --config 'lint.pydocstyle.convention="numpy"' spectralzoom
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 

@@ -37,7 +37,7 @@ GATES = 3  # of the temporal reader: weight of prior map, weight of visit, weigh
 
 
 def level_widths(width: int, patch: int) -> list[int]:
-    """Channels of each level, from full patch resolution down to ``BOTTOM`` px: width, 2 width, then 3 width."""
+    """Return the channels of each level, from full resolution down to ``BOTTOM`` px: width, 2 width, then 3 width."""
     levels = (patch // BOTTOM).bit_length()
     if patch < BOTTOM or patch != BOTTOM << (levels - 1):
         raise ShapeError(f"a patch must be {BOTTOM} px times a power of two, got {patch}; choose 8, 16 or 32")
@@ -138,6 +138,6 @@ def _pyramid(inputs: int, width: int, size: int) -> int:
 
 
 def _transformer(config: SegmenterConfig, tokens: int) -> int:
-    """Closed form L ((4 + 2 r) d^2 N + 2 N^2 d) of N tokens that read each other."""
+    """Return L ((4 + 2 r) d^2 N + 2 N^2 d), the multiply-adds of N tokens that read each other."""
     d, r = config.dim, config.mlp_ratio
     return config.layers * ((4 + 2 * r) * d * d * tokens + 2 * tokens * tokens * d)

@@ -124,7 +124,7 @@ def _summed(
 
 
 def find_regions(classes: Classes) -> tuple[NDArray[np.int32], RegionGraph]:
-    """Number the regions of a class map, (y, x), and return their graph."""
+    """Return the number of the region of each pixel of a class map, (y, x), and the graph of the regions."""
     label: Any = skimage.measure.label
     numbers: NDArray[np.int32] = label(classes.astype(np.int16) + 1, connectivity=1, background=0).astype(np.int32) - 1
     count = int(numbers.max(initial=-1)) + 1
