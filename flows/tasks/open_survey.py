@@ -137,12 +137,13 @@ class OpenSurvey:
 
     def __call__(self, stage: str, /, *inputs: StageRef) -> StageRef:
         """Return the store of a stage, from the archive or built."""
+        shown = True
 
         def watch(stage: str, state: str, done: float) -> None:
-            self.observer.watch(stage, state, done)
+            if shown or state == "failed":
+                self.observer.watch(stage, state, done)
             self.observer.progress(TITLES[stage], (list(STAGES).index(stage) + done) / len(STAGES))
 
-        watch(stage, "running", 0.0)
         meter, reached = _Meter(), 0.0
 
         def report(done: float) -> None:
@@ -152,6 +153,8 @@ class OpenSurvey:
 
         try:
             wanted = STAGES[stage].wants(replace(self.run, report=report), *inputs)
+            shown = wanted.shown
+            watch(stage, "running", 0.0)
             ref, built = STAGES[stage].produce(self.run.archive, wanted)
         except BaseException:
             watch(stage, "failed", reached)

@@ -77,6 +77,7 @@ class Wanted:
     params: Mapping[str, Any]
     inputs: Sequence[StageRef] = ()
     then: Callable[[], object] = field(default=lambda: None)  # called once the store exists
+    shown: bool = True  # on terminals; False if there is nothing to decide or compute
 
 
 class Survey(Protocol):

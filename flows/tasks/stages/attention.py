@@ -137,7 +137,7 @@ def score(
         **({} if budget is None else {"macs": budget.macs}),
         **zones.key,
     }
-    return Wanted(build, params, [mosaic])
+    return Wanted(build, params, [mosaic], shown=not plan.plain or budget is not None)
 
 
 def all_seen(grid: SceneGrid, sweeps: Sequence[Sweep], camera: LineCamera, *, part: bool) -> FinePlan:
