@@ -153,7 +153,7 @@ def render_report(
         kicker="SpectralZoom survey",
         title=receipt["survey"],
         lead=headline(receipt, captured_again),
-        about=f"{scene} seen by {receipt['source']}, seed {receipt['seed']}, finished {receipt['finished']}",
+        about=f"{scene}, source {receipt['source']}, seed {receipt['seed']}, finished {receipt['finished']}",
         receipt=receipt,
         links=product_links(receipt),
         export=shlex.join(["spectralzoom", "export", receipt["settings"]["out"], *_run_folder(receipt).split("/")[1:]]),

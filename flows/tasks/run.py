@@ -202,7 +202,7 @@ class SurveyRun(CaptureRun):
         It follows from the accepted loss, unless the settings limit multiply-adds.
         """
         settings, cascade = self.settings, self.cascade
-        chosen = cascade is not None and settings.macs is None and settings.policy == "gain" and not self.part
+        chosen = cascade is not None and settings.macs is None and settings.policy == "gain"
         return cascade[0] if cascade is not None and chosen else None
 
     @property

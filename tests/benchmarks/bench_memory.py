@@ -18,10 +18,11 @@ from collections.abc import Callable, Iterator, Sequence
 
 from measure import Row
 from visits.changes import other_light, planted_changes
-from visits.seasons import after_days, season
+from visits.seasons import after_days, revisits, season
 
 PARTS: dict[str, Callable[[], Iterator[Row]]] = {
     "days": after_days,
+    "revisits": revisits,
     "season": season,
     "changes": planted_changes,
     "light": other_light,

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 from measure import Row
+from numpy.typing import NDArray
 from visits.farm_visits import (
     ANEW,
     FIRST_DAY,
@@ -18,15 +19,18 @@ from visits.farm_visits import (
     Seen,
     later,
     mean_figure,
+    shipped,
     view_farm,
 )
 
+from models.evaluation.metrics import confusion
 from models.reading.prior_map import ClassProbabilities, first_probabilities
 
 SIX = (1, 2, 3, 4, 5, 6)
 BEHIND = {1: 0.2, 3: 0.5, 7: 1.0}  # points of mIoU that a later visit may lie behind one that scans anew, by days
 HELD = (2, 3, 4)  # visits from one full scan to the next
 SURE = 0.97
+REVISITED, REVISITED_DAYS = range(71, 79), (110, 172, 255)  # farms; days of April, June and September
 
 
 def after_days() -> Iterator[Row]:
@@ -59,6 +63,39 @@ def after_days() -> Iterator[Row]:
             least = max(np.mean(anew) - BEHIND[days], np.mean(scores["old map kept"]))
             goal = (f">= {least:.1f}", bool(np.mean(values) >= least)) if name == "memory" else ("", None)
             yield Row(f"{days} d later, {name}", mean_figure(values), *goal)
+
+
+def revisits() -> Iterator[Row]:
+    """Yield the fraction of the gap between a quick scan and a full one that the prior map closes after a week."""
+    closed, worst = list[float](), list[float]()
+    for day in REVISITED_DAYS:
+        scores: dict[str, list[float]] = {"old": [], "quick": [], "fused": [], "full": []}
+        for seed in REVISITED:
+            before, now, full = (
+                view_farm(seed, when, HOUR, how, noise)
+                for when, how, noise in ((day, ANEW, 0), (day + 7, QUICK, 1), (day + 7, ANEW, 1))
+            )
+            fused = later(before, first_probabilities(before.observation), now, 7).classes()[0]
+            for name, one in zip(scores, (before.alone, now.alone, fused, full.alone), strict=True):
+                scores[name].append(now.score(one))
+            quick, both, best = (scores[name][-1] for name in ("quick", "fused", "full"))
+            closed.append(100 * (both - quick) / (best - quick))
+            worst.append(float(np.nanmin(_class_ious(now, fused) - _class_ious(now, now.alone))))
+        figures = ", ".join(f"{name} {np.mean(each):.1f}" for name, each in scores.items())
+        mine = closed[-len(REVISITED) :]
+        yield Row(f"a week after day {day}, mIoU", figures, "", None)
+        yield Row(f"a week after day {day}, gap closed [%]", f"{np.mean(mine):.0f}, least {min(mine):.0f}", "", None)
+    met = float(np.mean(closed)) >= 65 and min(closed) >= 45
+    yield Row("gap closed, all [%]", f"{np.mean(closed):.0f}, least {min(closed):.0f}", "65, least 45", met)
+    yield Row("worst class against the quick scan alone", f"{min(worst):+.1f} points", ">= -1", min(worst) >= -1)
+
+
+def _class_ious(now: Seen, classes: Classes) -> NDArray[np.float64]:
+    """Return the IoU of each class [points]; NaN for a class that the labels lack."""
+    counts = confusion(now.labels, classes, len(shipped().class_names)).astype(np.float64)
+    right = np.diag(counts)
+    union = counts.sum(axis=0) + counts.sum(axis=1) - right
+    return np.where(counts.sum(axis=1) > 0, 100 * right / np.maximum(union, 1), np.nan)
 
 
 def _unless_surer(before: Seen, now: Seen) -> Classes:

@@ -351,7 +351,7 @@ def test_a_report_names_the_file_of_the_scene() -> None:
     receipt["scene"] = "9f86d081884c7d65"
     receipt["settings"]["scene"] = "/data/fields/north.mat:cube"
     page = render_report(receipt, PNG)
-    assert "north.mat seen by sim, seed 7" in page
+    assert "north.mat, source sim, seed 7" in page
     assert "9f86d081884c7d65" not in page
 
 
