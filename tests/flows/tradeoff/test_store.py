@@ -19,6 +19,9 @@ from pipeline.geometry.camera import LineCamera
 SMALL = (96, 160)
 BYTES, BLOCK, MIOU = STORE.beside  # a spectrum, of means, of the map
 STEPS = tuple(f"condensed, step {step:g}" for step in store.STEPS)
+ROUNDED = tuple(f"rounded, {step:g}" for step in store.ROUNDED)
+PRINCIPAL = ("PCA, step 0.5", "PCA, step 3")
+PACKED = ("PCA, JPEG 2000, 2 B", "condensed, JPEG 2000, 2 B", "ZFP, tolerance 8")
 
 
 @pytest.fixture(scope="module")
@@ -29,8 +32,9 @@ def farm() -> ScanLines:
 
 @pytest.fixture(scope="module")
 def points(farm: ScanLines) -> dict[str, Point]:
-    """Every way on those lines, by its name."""
-    found = measure_tradeoff(replace(STORE, prepare=lambda seed: farm), repeats=1)
+    """Ways of each family on those lines, by their names."""
+    settings = ("raw", *STEPS, *ROUNDED, *PRINCIPAL, *PACKED, "binned, 17 bands")
+    found = measure_tradeoff(replace(STORE, prepare=lambda seed: farm, settings=settings), repeats=1)
     return {str(point.setting): point for point in found.points}
 
 
@@ -46,7 +50,7 @@ def cube_of(path: Path, shape: tuple[int, int, int] = (24, 24, 12), offset: floa
 
 def test_bytes_fall_with_the_step_and_the_error_grows(points: dict[str, Point]) -> None:
     """Condensed spectra, rounded numbers and principal components alike."""
-    for family in (STEPS, [f"rounded, {step:g}" for step in store.ROUNDED], [f"PCA, step {s:g}" for s in store.STEPS]):
+    for family in (STEPS, ROUNDED, PRINCIPAL):
         rows = [points[name] for name in family]
         sizes, errors = [row.beside[BYTES] for row in rows], [row.error for row in rows]
         assert sizes == sorted(sizes, reverse=True)
@@ -67,6 +71,14 @@ def test_the_map_is_drawn_of_what_comes_back(points: dict[str, Point]) -> None:
     """Nearly that of raw lines from fine components, a poorer one of wide bins."""
     assert 0 < points["binned, 17 bands"].beside[MIOU] < points["raw"].beside[MIOU] - 5
     assert points[STEPS[0]].beside[MIOU] == pytest.approx(points["raw"].beside[MIOU], abs=5)
+
+
+def test_packed_spectra_take_few_bytes_and_err_by_less_than_noise(points: dict[str, Point]) -> None:
+    """Components as JPEG 2000 keep their rate and err by less than the noise; ZFP stays within its tolerance."""
+    pca, condensed, zfp = (points[name] for name in PACKED)
+    assert max(pca.beside[BYTES], condensed.beside[BYTES]) < points["raw"].beside[BYTES] / 4
+    assert condensed.error < 1
+    assert zfp.error < 8
 
 
 def test_lossless_ways_give_raw_lines_back(farm: ScanLines) -> None:
