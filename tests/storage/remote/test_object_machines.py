@@ -6,6 +6,7 @@ import errno
 import os
 import time
 from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import pytest
 pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
 
 from pipeline.errors import ArchiveError, IncompleteStoreError
+from storage.archive.archive import Archive
 from storage.maintenance.garbage import clear_up
 from storage.remote import object_archive
 from storage.remote.object_stores import Objects
@@ -106,6 +108,14 @@ def test_a_run_that_lost_its_manifest_keeps_its_stores(machine: Machine, monkeyp
     done = clear_up(other, keep_days=0)
     assert done.removals == ()
     assert "has lost its manifest.json" in str(done.obstacle)
+
+
+def test_ages_are_counted_by_the_clock_of_the_bucket(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine whose clock is days ahead removes no fresh store."""
+    small_survey(machine(FIRST), named=False)
+    opened = machine(SECOND, create=False)
+    monkeypatch.setattr(Archive, "now", lambda self: datetime.now(UTC) + timedelta(days=9))
+    assert clear_up(opened, keep_days=1).removals == ()
 
 
 def test_a_store_that_is_cleared_away_under_verify_is_no_damage(
