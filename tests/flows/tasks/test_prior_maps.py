@@ -101,6 +101,13 @@ def test_a_later_look_goes_on_from_the_one_before(twice: tuple[Path, Any, Any]) 
     np.testing.assert_array_equal(probabilities.changed.values, there)
 
 
+def test_a_uniform_scan_shows_no_stage_of_scores(visited: Path, survey_png: Survey) -> None:
+    """All of its patches are read, so that the terminal names the class map and no scores."""
+    words, _ = words_of(visited, survey_png, visit=FIRST)
+    assert "class map: 100%" in words
+    assert "patch scores" not in words
+
+
 def test_by_hand_nothing_is_remembered_unless_asked(visited: Path, survey_png: Survey) -> None:
     """The default of a survey is none, and its map that of a first look, found and not made again."""
     published = survey_png(visited, **UNIFORM, visit=LATER)
