@@ -15,7 +15,6 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from flows.archive.compare_command import find_run
 from flows.archive.stale_runs import asked_again, called, from_raw_cubes, is_called, is_current, newest_runs, renewals
 from flows.cli.app import ArchiveName, AsJson, Scheduler, Switch, Workers, stderr
 from flows.publish.receipt import Receipt
@@ -35,7 +34,7 @@ from models.network.machine import keep_freed_memory, use_one_thread
 from pipeline.errors import ArchiveError, PipelineError, SceneError, SettingsError, WeightsError
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
-from storage.archive.lineage import Catalogue
+from storage.archive.lineage import LATEST, Catalogue, find_product
 from storage.archive.records import Run, read_run
 from storage.parallel.pool import THREADS, WorkerPool
 from storage.remote.opening import open_archive
@@ -176,13 +175,14 @@ def run_judge(
 ) -> Receipt:
     """Judge a run's map and add its accuracy to the run; return its receipt.
 
-    ``name`` may be `latest` or `previous`; ``controls`` and ``labels`` are those of the survey if None. A run that has
+    ``name`` may be `latest`; ``controls`` and ``labels`` are those of the survey if None. A run that has
     its accuracy already stays as it is. Raises ArchiveError: there is no such run, or it is damaged or incomplete;
     SceneError, WeightsError: scene, labels or weights are not those of the run, or there are no labels.
     """
     opened = open_archive(archive, create=False)
     catalogue = Catalogue.read(opened.root)
-    found = find_run(catalogue, name)
+    found = find_product(catalogue, name if name == LATEST else f"runs/{name.rstrip('/').removeprefix('runs/')}")
+    assert isinstance(found, Run)
     receipt = load_receipt(found.folder)
     settings = replace(asked_again(found, opened.name, None), accuracy=True)
     if controls is not None:

@@ -26,7 +26,6 @@ VERBS = {  # verb: module of its function, loaded on demand
     "explain": "flows.archive.commands",
     "verify": "flows.archive.commands",
     "gc": "flows.archive.commands",
-    "compare": "flows.archive.compare_command",
     "export": "flows.archive.export_command",
     "ingest": "flows.archive.ingest_command",
     "reprocess": "flows.archive.reprocess_command",

@@ -234,7 +234,7 @@ def evaluate(
     dataset
         `farm`, `scouting`, a folder of labelled scenes, one scene file, or an archive with RUN.
     run
-        Run of the archive: its name, `latest` or `previous`. `evaluate archive/runs/NAME` is equivalent.
+        Run of the archive: its name, or `latest`. `evaluate archive/runs/NAME` is equivalent.
     weights
         Weights; repeat the flag for several seeds or folds. Each frame is evaluated by the weights that were not
         trained on it.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -162,22 +161,10 @@ def palette_bytes(colours: NDArray[np.integer]) -> Bytes:
 
 def layer_address(numbers: Bytes, colours: Bytes) -> str:
     """Return the data address of a picture of (y, x) numbers, each in its row of ``colours`` (number, 3 or 4)."""
-    return data_address(webp(Image.fromarray(_table(colours)[numbers]), lossless=True))
-
-
-def png_address(numbers: Bytes, colours: Bytes) -> str:
-    """Return the data address of a PNG from which the numbers can be read again."""
-    picture, table, file = Image.fromarray(np.ascontiguousarray(numbers)), _table(colours), io.BytesIO()
-    picture.putpalette(table[:, :3].tobytes())
-    picture.save(file, "PNG", transparency=table[:, 3].tobytes())
-    return data_address(file.getvalue())
-
-
-def _table(colours: Bytes) -> Bytes:
     table = np.zeros((256, 4), np.uint8)
     table[:, 3] = 255
     table[: len(colours), : colours.shape[1]] = colours
-    return table
+    return data_address(webp(Image.fromarray(table[numbers]), lossless=True))
 
 
 def _ramp_address(values: NDArray[np.floating], most: float) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -94,31 +93,6 @@ def outline(chosen: NDArray[np.bool_], patch_px: int, shape: tuple[int, int]) ->
         ends = np.minimum(np.stack([start, end], axis=1) * patch_px, limit) - 0.5
         segments += [[tuple(point) for point in pair] for pair in ends if (pair[0] != pair[1]).any()]
     return segments
-
-
-def draw_difference(path: Path, maps: Sequence[ClassMap], titles: Sequence[str]) -> None:
-    """Draw two maps of one field with one list of classes, and red where they differ, as a PNG of three panels."""
-    old, new = (one.classes for one in maps)
-    differs = old != new
-    tall = min(max(old.shape[0] / old.shape[1], 0.3), 2.0)
-    step = -(-max(old.shape) // GROUND_MOST_PX)
-    beyond = tuple((0, -size % step) for size in old.shape)
-    blocks = np.pad(differs, beyond).reshape(-(-old.shape[0] // step), step, -1, step)
-    palette = class_palette(maps[0].colours)
-    changed = np.where(np.asarray(blocks.any(axis=(1, 3)))[..., None], (0.77, 0.15, 0.18), (0.96, 0.96, 0.95))
-    with mpl.rc_context({"text.parse_math": False}):  # names may hold dollar signs
-        figure = Figure(figsize=(14, 4.6 * tall + 1.2), dpi=GROUND_DPI, layout="constrained")
-        pictures = (*(class_rgb(one[::step, ::step], palette) for one in (old, new)), changed)
-        for axes, picture, title in zip(figure.subplots(1, 3), pictures, titles, strict=True):
-            axes.imshow(picture, interpolation="nearest")
-            axes.set_title(title, fontsize=9, loc="left")
-            axes.set_axis_off()
-        marks = [
-            Patch(facecolor=colour, edgecolor="0.4", linewidth=0.5, label=name.replace("_", " "))
-            for name, colour in zip(maps[0].names, palette.tolist(), strict=True)
-        ]
-        figure.legend(handles=marks, loc="outside lower center", ncols=6, fontsize=8, frameon=False)
-        save_png(figure, path)
 
 
 def draw_ground(found: GroundMap) -> bytes:

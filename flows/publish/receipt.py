@@ -141,7 +141,7 @@ class ReceiptFields(_Part):
     memory: Facts | None = None  # what became of the prior map
     pointing: Facts | None = None  # where the mirror may look beside the plan
     lines: Facts | None = None  # sweeps with lines lost, repeated, out of order, late or invalid
-    areas: Facts | None = None  # px of each class; ha where something says how large a pixel is
+    areas: dict[str, dict[str, float]] | None = None  # px of each class; ha where something says how large a pixel is
     ground: Facts | None = None  # with a pose or a placed scene: grid, what changed, what is old
     zones: Facts | None = None  # where zones leave something out: what is kept
     plots: list[Facts] | None = None  # where plots are given: ground, classes, confidence of each

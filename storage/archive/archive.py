@@ -97,11 +97,6 @@ class Archive:
         """Return the address that opens it again."""
         return str(self.root)
 
-    @property
-    def around(self) -> Path:
-        """Return the folder for files that belong beside the archive."""
-        return self.root.parent
-
     # --- stages -------------------------------------------------------------------------------------------------------
 
     def ref(self, stage: str, key: str) -> StageRef:

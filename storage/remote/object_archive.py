@@ -66,11 +66,6 @@ class ObjectArchive(Archive):
         """Return the address of the archive."""
         return self.objects.place.url
 
-    @property
-    def around(self) -> Path:
-        """Return the working folder of the process."""
-        return Path.cwd()
-
     # --- stores -------------------------------------------------------------------------------------------------------
 
     def ref(self, stage: str, key: str) -> StageRef:

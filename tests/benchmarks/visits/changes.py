@@ -23,11 +23,11 @@ from visits.farm_visits import (
     view_farm,
 )
 
-from flows.archive.history import CHANGED_FRACTION
 from models.reading.prior_map import PriorMap, changed_fractions, changed_from, first_probabilities
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import RasterScene, SceneRaster
 
+CHANGED_FRACTION = 0.25  # of a patch's pixels, from which the patch counts as changed
 PLANTED, PLANTED_SEEDS = 3, range(1, 10)  # changes of each kind on each land, and the lands
 LOW_SUN, HIGH_SUN = 6.2, 12.0  # hours of June 21 at which the sun stands at 20 and 61 degrees
 

@@ -123,9 +123,6 @@ def test_verbs_read_an_archive_in_a_bucket(
     assert tree["product"].startswith("stages/segment/")
     assert json.loads(command_line("verify", bucket, "--json").out)["problems"] == []
     assert command_line("survey", "--out", bucket, *SMALL).code == 0
-    compared = json.loads(command_line("compare", bucket, "previous", "latest", "--json").out)
-    assert compared["differing"]["pixels"] == 0
-    assert Path(compared["picture"]).parent == tmp_path
     again = json.loads(command_line("reprocess", bucket, "--json").out)
     assert [row["state"] for row in again["fields"]] == ["skipped"]
     cleared = json.loads(command_line("gc", bucket, "--keep-days", "0", "--json").out)

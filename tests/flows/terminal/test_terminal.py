@@ -69,16 +69,9 @@ def test_bars_and_json_show_names_as_escapes() -> None:
 
 def _history(words: str) -> FieldHistory:
     row = {
-        "run": words,
-        "created": "2026-06-01T10:00:00Z",
-        "miou": 0.5,
-        "unit": "fraction",
-        "overall_accuracy": None,
-        "training_scene": None,
-        "savings": {"capture_s": 0.5},
-        "areas": {words: 1.0},
-        "capture_seconds": {"done": None, "full": None},
-        "colours": {},
+        **{"run": words, "created": "2026-06-01T10:00:00Z", "visited": "2026-06-01T10:00:00Z", "visit": words},
+        **{"miou": 0.5, "overall_accuracy": None, "training_scene": None, "capture_s": 9.0},
+        **{"areas": {words: 1.0}, "unit": "fraction"},
     }
     return FieldHistory(words, words, [row])
 

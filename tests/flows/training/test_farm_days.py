@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flows.archive.compare_command import compare, find_run
 from flows.archive.stale_runs import asked_again, newest_runs
 from flows.settings.load import parse_settings
 from flows.settings.survey_settings import Settings
@@ -18,7 +17,7 @@ from flows.training.data import farm_days, farm_test_data, open_training_data, r
 from flows.training.observed_scenes import observe_scene
 from models.network.spectral import SpectralBasis
 from models.training.examples import observe
-from pipeline.errors import ArchiveError, SceneError, SettingsError
+from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.simulator.scenes.farm.farm_plan import CLASSES
@@ -79,21 +78,6 @@ def _publish(archive: Archive, key: str, **settings: Any) -> str:
     with archive.new_run("farm") as draft:
         draft.write_file("receipt.json", json.dumps(receipt))
         return draft.id
-
-
-def test_days_of_one_land_are_compared(tmp_path: Path) -> None:
-    """The run before of the same land counts, whatever day and hour it is of; another seed's does not."""
-    archive = Archive.open(tmp_path)
-    made = [
-        _publish(archive, f"farm@2/seed={seed}/day={day}/shape=8x8/hour=11/bands=9", scene="farm@2", day=day)
-        for seed, day in ((0, 100), (1, 150), (0, 200))
-    ]
-    catalogue = Catalogue.read(tmp_path)
-    assert find_run(catalogue, "previous").folder.name == made[0]
-    with pytest.raises(SceneError, match="of different fields"):
-        compare(tmp_path, made[1], made[2])
-    with pytest.raises(ArchiveError, match="missing or damaged"):  # of one field: it comes as far as the maps
-        compare(tmp_path, made[0], made[2])
 
 
 def test_the_usual_day_of_a_farm_is_one_field(tmp_path: Path) -> None:
