@@ -82,30 +82,28 @@ def survey(settings: Asked = None, *, progress: Told | None = None, quiet: bool 
     return opened.open(asked.out)[published.folder.name]
 
 
-def plan(settings: Asked = None, *, preview: str | Path | None = None, **flags: Any) -> dict[str, Any]:
+def plan(settings: Asked = None, **flags: Any) -> dict[str, Any]:
     """Return the plan of a `survey` with the same arguments; nothing is captured or written.
 
     Parameters
     ----------
     settings, flags
         As for `survey`.
-    preview
-        A PNG to draw the sweeps into.
 
     Returns
     -------
     dict
-        The content of `spectralzoom plan --json`: ``field``, ``stages`` with state, reason, seconds and bytes, their
-        sums, and the uniform ``scans`` of the weights' record.
+        The content of `spectralzoom plan --json`: ``field``, ``stages`` with their state, the ``estimate`` of seconds,
+        bytes, multiply-adds and mIoU, and the uniform ``scans`` that are taken and referred to.
 
     Raises
     ------
     Error
         The survey is not possible.
     """
-    asked, picture = _settings(settings, flags), None if preview is None else Path(preview)
+    asked = _settings(settings, flags)
     with _working(None):
-        content: dict[str, Any] = plan_command.plan_content(asked, picture)
+        content: dict[str, Any] = plan_command.plan_content(asked)
     return content
 
 

@@ -30,7 +30,6 @@ from pipeline.planning.uniform_scans import (
     UniformScan,
     choose_scan,
     exposures_between,
-    frontier,
     longest_exposure,
     priced_scan,
     reference_scan,
@@ -193,11 +192,6 @@ class ScanChoice:
     def reference(self) -> UniformScan | None:
         """Return the reference: the cheapest scan that is nearly as good as the best; None without a table."""
         return reference_scan(self.offered) if self.offered else None
-
-    @property
-    def frontier(self) -> list[UniformScan]:
-        """Return the scans on the Pareto front of time and mIoU, by ascending time."""
-        return frontier(self.offered)
 
 
 def choose_uniform_scan(

@@ -120,15 +120,6 @@ def on_scene(shape: tuple[int, int], camera: LineCamera, sweep: Sweep) -> NDArra
     return inside
 
 
-def sweep_outline(sweep: Sweep, camera: LineCamera) -> NDArray[np.float64]:
-    """Return the outline of a sweep's lines as a polygon, (point, 2) x and y from the scene's centre [px]."""
-    scan = np.linspace(sweep.start_px - 0.5, sweep.start_px + sweep.lines * sweep.step - 0.5, 33)
-    edges = np.array([-camera.samples / 2, camera.samples / 2]) * camera.ifov_rad
-    along, across = points_of_scan(sweep.swath_px, camera, scan[:, None], edges)
-    sides = np.stack([along, across] if sweep.along == "x" else [across, along], axis=-1)
-    return np.concatenate([sides[:, 0], sides[::-1, 1]])
-
-
 def field_px(grid: SceneGrid, along: Axis) -> tuple[int, int]:
     """Return the scene's size along the line and along the scan [px]."""
     return (grid.width, grid.height) if along == "x" else (grid.height, grid.width)

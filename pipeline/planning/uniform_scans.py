@@ -215,15 +215,6 @@ def reference_scan(scans: Sequence[UniformScan]) -> UniformScan:
     return min((scan for scan in scans if scan.expected[MIOU] >= best - REFERENCE_LOSS), key=lambda scan: scan.seconds)
 
 
-def frontier(scans: Sequence[UniformScan]) -> list[UniformScan]:
-    """Return the Pareto front of scans in seconds and score, by ascending seconds."""
-    kept: list[UniformScan] = []
-    for scan in sorted(scans, key=lambda one: (one.seconds, -one.expected[MIOU])):
-        if not kept or scan.expected[MIOU] > kept[-1].expected[MIOU]:
-            kept.append(scan)
-    return kept
-
-
 def _too_little(scans: Sequence[UniformScan], limits: ScanLimits) -> str:
     """Return a message that names the limits and the least costs of a scan."""
     fastest, smallest = min(scans, key=lambda scan: scan.seconds), min(scans, key=lambda scan: scan.bytes_raw)

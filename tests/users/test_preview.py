@@ -1,4 +1,4 @@
-"""The preview before going out: figures of field and captures in the plan, and a picture of the sweeps."""
+"""Before going out: figures of field and captures in the plan."""
 
 from __future__ import annotations
 
@@ -10,19 +10,16 @@ import numpy as np
 import pyproj
 import pytest
 import shapely
-from PIL import Image
 
-from flows.archive.plan_command import figure_lines, plan_content
-from flows.cli.main import main
+from flows.archive.plan_command import format_field, plan_content
 from flows.settings.load import load_settings
-from tests.conftest import Survey
 from tests.users.zone_sketches import sketch
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 DOWN = {"pose.lon_deg": 7.6, "pose.lat_deg": 51.96, "pose.height_m": 100, "pose.heading_deg": 0, "pose.tilt_deg": 90}
 
 
-def planned(scene_files: Path, weights: Path, out: Path, preview: Path | None = None, **flags: Any) -> dict[str, Any]:
+def planned(scene_files: Path, weights: Path, out: Path, **flags: Any) -> dict[str, Any]:
     """What `plan --json` gives of the small picture."""
     given = {
         "scene": str(scene_files / "scene.png"),
@@ -31,7 +28,7 @@ def planned(scene_files: Path, weights: Path, out: Path, preview: Path | None = 
         "out": str(out),
         "budget": "0.8",
     }
-    return plan_content(load_settings(None, given | flags), preview)
+    return plan_content(load_settings(None, given | flags))
 
 
 def test_figures_of_a_posed_field_are_those_of_its_geometry(scene_files: Path, weights: Path, tmp_path: Path) -> None:
@@ -54,7 +51,7 @@ def test_without_a_place_there_are_pixels_and_degrees(scene_files: Path, weights
     assert field["size_px"] == [128, 96]
     assert field["view_deg"] == pytest.approx(np.rad2deg(2 * np.arctan(np.array([64, 48]) * 7.4e-3 / 70)))
     assert [field[name] for name in ("ground_pixel_m", "range_m", "hectares", "hectares_per_hour")] == [None] * 4
-    assert "[pose]" in "\n".join(figure_lines(field))
+    assert "[pose]" in format_field(field)
 
 
 def test_hectares_are_those_of_the_area(scene_files: Path, weights: Path, tmp_path: Path) -> None:
@@ -67,56 +64,3 @@ def test_hectares_are_those_of_the_area(scene_files: Path, weights: Path, tmp_pa
     half = planned(scene_files, weights, tmp_path, **DOWN, **{"zones.area": str(path)})["field"]
     assert half["hectares"] == pytest.approx(whole["hectares"] / 2, rel=0.05)
     assert half["kept_fraction"] == pytest.approx(0.5, abs=0.03)
-
-
-def _rgb(picture: Path) -> np.ndarray[Any, np.dtype[np.int64]]:
-    """A picture's colours, (y, x, 3)."""
-    with Image.open(picture) as found:
-        return np.asarray(found.convert("RGB"), np.int64)
-
-
-def _blue(picture: Path) -> int:
-    """Pixels in the colour of coarse sweeps."""
-    rgb = _rgb(picture)
-    return int((np.abs(rgb - (0, 114, 178)).max(axis=-1) < 30).sum())
-
-
-def test_the_preview_of_a_new_archive_shows_sweeps_over_the_outline(
-    scene_files: Path, weights: Path, tmp_path: Path
-) -> None:
-    """Nothing but the picture is written."""
-    content = planned(scene_files, weights, tmp_path / "new", tmp_path / "one.png")
-    assert content["preview"] == str(tmp_path / "one.png")
-    assert _blue(tmp_path / "one.png") > 500
-    assert [path.name for path in tmp_path.iterdir()] == ["one.png"]
-
-
-def test_the_preview_of_a_field_lies_over_its_last_map(
-    surveyed_png: Survey, scene_files: Path, weights: Path, tmp_path: Path
-) -> None:
-    """The colours of the map's classes, made paler, are in the picture; a new field's are not."""
-    surveyed_png(tmp_path / "archive")
-    labels = {"labels": str(scene_files / "labels.png"), "controls": False, "camera.samples": 64}
-    planned(scene_files, weights, tmp_path / "archive", tmp_path / "map.png", **labels)
-    planned(scene_files, weights, tmp_path / "new", tmp_path / "outline.png", **labels)
-    shown = [np.unique(_rgb(tmp_path / name).reshape(-1, 3), axis=0) for name in ("map.png", "outline.png")]
-    assert len(shown[0]) > len(shown[1])
-
-
-def test_plan_writes_the_preview_where_it_is_told(
-    scene_files: Path,
-    weights: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """By the command line, with the figures in words; a folder that is not there is one message."""
-    monkeypatch.chdir(tmp_path)
-    words = ["plan", "--scene", str(scene_files / "scene.png"), "--weights", str(weights), "--preview"]
-    with pytest.raises(SystemExit, match="0"):
-        main([*words, "plan.png"])
-    assert "128 x 96 px" in capsys.readouterr().out
-    assert (tmp_path / "plan.png").stat().st_size > 10_000
-    with pytest.raises(SystemExit, match="1"):
-        main([*words, "no/such/plan.png"])
-    assert "no/such" in capsys.readouterr().err

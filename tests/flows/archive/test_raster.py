@@ -166,7 +166,7 @@ def test_the_plan_says_what_the_survey_does(surveyed: Raster, scene_files: Path,
     assert {row["state"] for row in after["stages"]} == {"cached"}
     shown = Console(width=200, file=StringIO())
     show_plan(after, shown)
-    assert "camera: none; the pixels of the raster are taken as they are" in shown.file.getvalue()  # type: ignore[attr-defined]
+    assert "no camera: the pixels of the raster are taken as they are" in shown.file.getvalue()  # type: ignore[attr-defined]
 
 
 def test_an_export_has_the_rasters_own_pixels(surveyed: Raster, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from flows.archive.plan_command import format_kept, plan_content
+from flows.archive.plan_command import plan_content
 from flows.settings.load import load_settings
 from models.evaluation.cascade import CascadeTable
 from models.weights.files import CASCADE, save_weights
@@ -118,4 +118,3 @@ def test_a_plan_tells_how_much_is_likely_to_be_read(judged: Path, scene_files: P
     given = {"scene": str(scene_files / "scene.png"), "source": "sim", "weights": str(judged), "out": str(tmp_path)}
     kept = plan_content(load_settings(None, {**given, "scan_step": "1"}))["kept"]
     assert kept["patches"] == round(0.4 * kept["of_patches"])
-    assert format_kept(kept).startswith(f"full reading: likely {kept['patches']} of {kept['of_patches']} patches")

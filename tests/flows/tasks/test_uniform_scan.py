@@ -105,8 +105,8 @@ def test_seconds_choose_the_scan_and_are_kept(
     assert {one["name"]: one["state"] for one in again["stages"]}["capture_coarse"] == "cached"
 
 
-def test_plan_shows_what_seconds_buy(scene_files: Path, recorded: Path, tmp_path: Path) -> None:
-    """The frontier rises in seconds and expected mIoU; the scan that would be taken stands beside it."""
+def test_a_plan_tells_the_scan_of_a_goal(scene_files: Path, recorded: Path, tmp_path: Path) -> None:
+    """Its expected mIoU reaches the goal; the reference is nearly the best."""
     given = {
         "scene": str(scene_files / "scene.png"),
         "source": "sim",
@@ -115,12 +115,8 @@ def test_plan_shows_what_seconds_buy(scene_files: Path, recorded: Path, tmp_path
         "out": str(tmp_path),
     }
     told = plan_content(load_settings(None, given))["scans"]
-    seconds = [scan["seconds"] for scan in told["frontier"]]
-    expected = [scan["expected_miou"] for scan in told["frontier"]]
-    assert seconds == sorted(seconds)
-    assert expected == sorted(expected)
     assert told["taken"]["expected_miou"] >= 0.88
-    assert told["reference"]["expected_miou"] >= max(expected) - 0.005
+    assert told["reference"]["expected_miou"] >= told["taken"]["expected_miou"] - 0.005
 
 
 @pytest.mark.parametrize(
@@ -254,6 +250,3 @@ def test_candidates_are_those_of_the_weights_that_would_read_them(tmp_path: Path
     told = [plan_content(load_settings(None, farm | more))["scans"] for more in asked]
     assert [one["reference"] for one in told] == [told[0]["reference"]] * len(asked)
     assert told[0]["taken"] == told[0]["reference"]
-    for figure in (min, max):
-        ends = [figure(scan["expected_miou"] for scan in one["frontier"]) for one in told]
-        assert ends == [ends[0]] * len(asked)

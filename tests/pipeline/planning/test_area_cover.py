@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis
-from pipeline.planning.coverage import full_sweeps, sweep_outline, sweeps_over, uniform_sweeps
+from pipeline.planning.coverage import full_sweeps, sweeps_over, uniform_sweeps
 from pipeline.planning.swaths import covered_patches
 
 GRID, CAMERA = SceneGrid(320, 416, 16, 4), LineCamera(samples=160)
@@ -50,11 +49,3 @@ def test_swaths_beside_the_area_are_left_out() -> None:
     assert len(sweeps) == 3
     assert [one.name for one in sweeps_over(sweeps, GRID, CAMERA, shown_of(0, 0, 3, 3))] == ["full-0"]
     assert sweeps_over(sweeps, GRID, CAMERA, np.zeros_like(shown_of(0, 0, 1, 1))) == []
-
-
-def test_the_outline_of_a_sweep_is_as_large_as_its_lines() -> None:
-    """Samples times held positions, for one strip at the axis."""
-    (sweep,) = full_sweeps(SceneGrid(64, 96, 16, 4), LineCamera(samples=96), "x")
-    x, y = sweep_outline(sweep, LineCamera(samples=96)).T
-    assert np.ptp(x) == pytest.approx(96, rel=1e-3)
-    assert np.ptp(y) == pytest.approx(sweep.lines, rel=1e-3)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -23,7 +22,6 @@ from pipeline.planning.uniform_scans import (
     ScanPerformance,
     UniformScan,
     choose_scan,
-    frontier,
     priced_scan,
     reference_scan,
     uniform_scans,
@@ -148,16 +146,6 @@ def test_goals_out_of_reach_name_the_best_there_is() -> None:
     torn = uniform_scans(replace(RECORD, scores=scores), SWEEPS, CAMERA, COST, 270)
     with pytest.raises(BudgetError, match="no one scan of these weights reaches all of them"):
         choose_scan(torn, ScanLimits(goals={MIOU: 0.93, "weed": 0.93}))
-
-
-def test_the_frontier_holds_every_best_scan_of_its_seconds() -> None:
-    """It rises, and whatever the seconds, nothing off it beats the last of it that they pay for."""
-    best = frontier(SCANS)
-    for before, after in pairwise(best):
-        assert before.seconds < after.seconds
-        assert before.expected[MIOU] < after.expected[MIOU]
-    for scan in SCANS:
-        assert max(one.expected[MIOU] for one in best if one.seconds <= scan.seconds) >= scan.expected[MIOU]
 
 
 def test_the_reference_is_the_cheapest_scan_that_is_nearly_as_good_as_any() -> None:
