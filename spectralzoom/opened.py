@@ -30,7 +30,6 @@ else:
     xarray = deferred("xarray")  # takes a second to import
 
 LATEST = "latest"
-PICTURES = ("quicklook",)  # for viewers, on axes of their own
 
 
 def open(archive: str | Path) -> OpenedArchive:
@@ -248,7 +247,7 @@ def open_labelled(path: Path) -> xarray.Dataset:
         opened = xarray.open_dataset(
             path, engine="zarr", consolidated=False, mask_and_scale=False, chunks=None, cache=False
         )
-        opened = _in_shards(opened.drop_vars([name for name in PICTURES if name in opened]))
+        opened = _in_shards(opened)
     bare = {name: np.arange(size) for name, size in opened.sizes.items() if name not in opened.variables}  # as rgb
     return spectra.by_wavelength(spectra.with_plain_attributes(opened.assign_coords(bare)))
 

@@ -94,8 +94,8 @@ def _kind_of(panels: QuicklookData) -> object:
     """What decides how a picture is drawn, but for the numbers that it shows."""
     there = panels.truth is None, panels.confidence is None, panels.class_colours is None
     holes = tuple(bool(np.isnan(shown).any()) for shown in (panels.rectified, panels.score))
-    raw = tuple(np.ndim(sweep) for sweep in panels.raw), panels.along, np.size(panels.patch_index) == 0
-    return "picture", panels.class_map.shape, panels.wavelength_nm.shape, panels.class_names, there, holes, raw
+    none = np.size(panels.patch_index) == 0
+    return "picture", panels.class_map.shape, panels.wavelength_nm.shape, panels.class_names, there, holes, none
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Draw the quicklook of a survey as one PNG: raw lines and field, attention, class map, labels."""
+"""Draw the quicklook of a survey as one PNG: field, attention, class map, labels."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from PIL import Image
 
 from flows.publish.panels import MUTED, STYLE, UNLABELLED_COLOUR, class_palette, class_rgb, grey_of, outline, save_png
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.geometry.scan import Axis
 from storage.arrays.quicklooks import choose_bands, develop, stretch
 
 Box = tuple[int, int, int, int]
@@ -37,10 +36,8 @@ class QuicklookData:
     seed: int
     about: str  # how the field was captured
     policy: str | None  # of the choice of patches; None where all are segmented at full resolution
-    raw: tuple[NDArray[np.generic], ...]  # calibrated sweeps, (line, sample, band) each, by strip
-    raw_lines: int  # captured in them; a large sweep is subsampled
     rectified: NDArray[np.floating]  # (y, x, band), NaN where nothing was captured
-    wavelength_nm: NDArray[np.floating]  # (band,) of raw and rectified
+    wavelength_nm: NDArray[np.floating]  # (band,)
     score: NDArray[np.floating]  # (row, column) of the padded grid's patches; NaN or -inf without a score
     patch_px: int
     patch_index: NDArray[np.integer]  # chosen, in order of rank
@@ -50,11 +47,10 @@ class QuicklookData:
     class_colours: NDArray[np.integer]  # (class, 3) 0..255
     truth: NDArray[np.integer] | None = None  # (y, x), 255 unlabelled
     confidence: NDArray[np.floating] | None = None  # (y, x) 0..1, shown without labels
-    along: Axis = "x"  # of the scene along which the raw lines lie
     note: str = ""  # at the end of the title line, such as the accuracy
     changed: bool = False  # ``score`` is the fraction of a patch's pixels that the full network changed, NaN elsewhere
     scan: bool = False  # a uniform scan
-    raster: bool = False  # without lines: ``raw`` is the image of its coarse means
+    raster: bool = False  # without lines
     was: NDArray[np.integer] | None = None  # (y, x) previous class of changed pixels, 255 elsewhere
     days: float = 0.0  # since the visit before
 
@@ -78,13 +74,13 @@ _FLAT, _TALL = 0.3, 2.0  # height over width beyond which the panels are stacked
 def _compose(data: QuicklookData) -> Figure:
     height, width = data.class_map.shape
     tallness = height / width
-    counts = (1,) * 5 if tallness < _FLAT else (5,) if tallness > _TALL else (3, 2)
+    counts = (1,) * 4 if tallness < _FLAT else (4,) if tallness > _TALL else (2, 2)
     page = 18.0 if len(counts) != 2 else min(18.0, 12.5 / (tallness * sum(1 / count for count in counts)))
     tall = [min(max(page * tallness / count, 1.1), 12.0) + 0.9 for count in counts]  # with words above
     figure = Figure(figsize=(page, sum(tall) + 1.6), dpi=_DPI, layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.08))
     about = [f"{width} × {height} px", data.about, f"seed {data.seed}", *([data.note] if data.note else [])]  # noqa: RUF001
     figure.suptitle(f"{data.survey}   ·   {'   ·   '.join(about)}", x=0.01, ha="left", size=15, weight="bold")
-    panels = iter((_draw_raw, _draw_rectified, _draw_attention, _draw_classes, _draw_truth))
+    panels = iter((_draw_rectified, _draw_attention, _draw_classes, _draw_truth))
     rows = figure.subfigures(len(counts), 1, height_ratios=tall, squeeze=False).ravel()
     for row, count in zip(rows, counts, strict=True):
         for axes in row.subplots(1, count, squeeze=False).ravel():
@@ -92,26 +88,6 @@ def _compose(data: QuicklookData) -> Figure:
             next(panels)(axes, data)
     _draw_legend(figure, data, max(1, int(page / 2.9)))
     return figure
-
-
-def _draw_raw(axes: Axes, data: QuicklookData) -> None:
-    """Draw the sweeps side by side, stretched to the field's shape; for a raster its coarse means."""
-    if data.raster:
-        _show(axes, colours_of(data, data.raw[0]), interpolation="nearest")
-        return _caption(axes, "1  Coarse means", "of the raster")
-    sweeps = [colours_of(data, np.asarray(sweep)) for sweep in data.raw]
-    tall, gap = max(one.shape[0] for one in sweeps), max(1, sum(one.shape[1] for one in sweeps) // 60)
-    image = np.full((tall, sum(one.shape[1] for one in sweeps) + gap * (len(sweeps) - 1), 3), 0.98, np.float32)
-    left = 0
-    for one in sweeps:
-        image[: one.shape[0], left : left + one.shape[1]] = one
-        left += one.shape[1] + gap
-    _show(axes, image if data.along == "x" else image.swapaxes(0, 1))
-    axes.set_aspect("auto")
-    axes.set_box_aspect(data.class_map.shape[0] / data.class_map.shape[1])
-    count, kind = len(data.raw), "sweep" if data.policy is None or data.scan else "coarse sweep"
-    words = f"{count} {kind}{'s' if count != 1 else ''}, {data.raw_lines} lines"
-    return _caption(axes, "1  Raw lines", words)
 
 
 def _draw_rectified(axes: Axes, data: QuicklookData) -> None:
@@ -122,10 +98,10 @@ def _draw_rectified(axes: Axes, data: QuicklookData) -> None:
         classes = class_rgb(data.class_map, class_palette(data.class_colours))
         _show(axes, np.where(changed[..., None], classes, grey).astype(np.float32), interpolation="nearest")
         words = f"{np.count_nonzero(changed)} px with another class than {data.days:.3g} days before"
-        return _caption(axes, "Changed", words)
+        return _caption(axes, "1  Changed", words)
     _, words = choose_bands(data.wavelength_nm)
     _show(axes, colours_of(data, data.rectified))
-    return _caption(axes, "Raster" if data.raster else "Rectified", words)
+    return _caption(axes, "1  Raster" if data.raster else "1  Rectified", words)
 
 
 def colours_of(data: QuicklookData, image: NDArray[np.generic]) -> NDArray[np.float32]:

@@ -38,7 +38,6 @@ from flows.tasks.stages.placement import load_registration
 from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.grid import patch_pixels
-from pipeline.planning.coverage import on_scene
 from pipeline.planning.fine_pass import FinePlan
 from pipeline.planning.prices import SavingEntry, capture_savings
 from pipeline.planning.uniform_scans import format_scan
@@ -50,7 +49,6 @@ from storage.arrays.class_maps import ProbabilityStore, load_class_map
 from storage.arrays.ground_maps import load_ground_map
 from storage.arrays.mosaics import load_attention, open_mosaic
 from storage.arrays.quicklooks import choose_bands
-from storage.arrays.signal_cubes import SignalCube, open_signal_cubes
 
 SPECTRA_CAPTION = "Mean spectra of the classes as mapped."
 LIBRARIES = ("spectralzoom", "numpy", "numba", "torch", "zarr", "xarray", "prefect")
@@ -222,9 +220,6 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
     if accuracy is not None and accuracy["miou"] is not None:
         where = " on a scene of the training" if "training_scene" in receipt else ""
         notes.append(f"mIoU {100 * accuracy['miou']:.1f} %{where}")
-    cubes = [cube for ref in products.signals for cube in open_signal_cubes(ref.path)]  # of a raster none
-    sweeps = [cube for cube in cubes if run.plan.plain or cube.sweep.kind == "coarse"]  # of a first pass alone
-    strips = sorted(sweeps, key=lambda cube: cube.sweep.swath_px)  # as they lie there
     return QuicklookData(
         survey=run.name,
         seed=run.settings.seed,
@@ -232,8 +227,6 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
         policy=run.settings.policy if run.chooses else None,
         scan=run.plan.plain,
         raster=run.raster is not None,
-        raw=(coarse,) if run.raster is not None else tuple(_calibrated(run, cube, chosen) for cube in strips),
-        raw_lines=sum(cube.sweep.lines for cube in strips),
         rectified=coarse,
         wavelength_nm=run.scene.wavelength_nm[chosen],
         score=attention.score if changed is None else np.where(attention.rank >= 0, changed, np.nan),
@@ -246,7 +239,6 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
         class_colours=found.colours,
         truth=run.labels,
         confidence=found.confidence,
-        along=run.plan.along,
         note="   ·   ".join(notes),
         was=None if memory is None or memory["put_aside"] else drawn.old_class(),
         days=0.0 if memory is None else memory["days"],
@@ -261,19 +253,6 @@ def _format_asked(run: SurveyRun) -> str:
         return format_scan(run.settings.scan_step or 1, run.settings.scan_exposure_ms or run.camera.exposure_ms)
     first = format_scan(run.plan.coarse[0].step, run.settings.coarse_exposure_ms or run.camera.exposure_ms)
     return f"first {first}, then the lines between in chosen patches"
-
-
-def _calibrated(run: SurveyRun, cube: SignalCube, bands: list[int]) -> NDArray[np.float32]:
-    """Return some bands of a sweep in scene values, from its stored picture; NaN outside the scene."""
-    seen = cube.quicklook()
-    if seen is not None and list(seen.bands) == bands:
-        thin = slice(None, None, seen.step)
-        picture = seen.values()
-        picture[~on_scene(run.scene.shape, run.camera, cube.sweep)[thin, thin] | ~cube.valid_line[thin, None]] = np.nan
-        return picture
-    values = cube.components.of_bands(bands).restore(cube.read() * np.float32(cube.step))
-    values[~on_scene(run.scene.shape, run.camera, cube.sweep) | ~cube.usable | ~cube.valid_line[:, None]] = np.nan
-    return values
 
 
 def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Store the raw cube of one sweep, (line, sample, band) uint16, with facts of every line, a picture and statistics."""
+"""Store the raw cube of one sweep, (line, sample, band) uint16, with facts of every line and statistics."""
 
 from __future__ import annotations
 
@@ -30,7 +30,6 @@ from storage.arrays.layout import (
     write_counts,
     write_small,
 )
-from storage.arrays.quicklooks import LineThumbnail, Quicklook, quicklook_of, write_quicklook
 
 _LINE_COORDINATES = "time mirror_x mirror_y exposure_ms valid_line"
 
@@ -68,15 +67,7 @@ class RawCubeWriter:
         write_counts(self._group, line=header.shape[0], sample=header.shape[1])
         spec = image_spec(("line", "sample", "band"), header.shape, "<u2", whole=True)
         self._dn = create_array(self._group, "dn", spec, about, packing=RAW_PACKING)
-        known = header.references
-        write_references(self._group, known)
-        self._seen = LineThumbnail(
-            header.shape,
-            header.wavelength_nm,
-            dark=known.dark,
-            white=known.white,
-            white_reference=known.white_reference,
-        )
+        write_references(self._group, header.references)
         self._waiting: list[Line] = []
         self._facts: list[tuple[float, float, float, float, bool]] = []
 
@@ -98,7 +89,7 @@ class RawCubeWriter:
                 self._flush()
 
     def close(self) -> None:
-        """Write the last lines, the lines' coordinates and the picture (IncompleteStoreError: lines are missing)."""
+        """Write the last lines and the lines' coordinates (IncompleteStoreError: lines are missing)."""
         if len(self._facts) != self._header.sweep.lines:
             raise IncompleteStoreError(
                 f"sweep {self._header.sweep.name} has {len(self._facts)} of {self._header.sweep.lines} lines; "
@@ -106,14 +97,12 @@ class RawCubeWriter:
             )
         self._flush()
         write_line_facts(self._group, self._facts, self._header.started)
-        write_quicklook(self._group, self._seen.finish())
 
     def _flush(self) -> None:
         if self._waiting:
             first = self._waiting[0].number
             block = np.stack([line.data for line in self._waiting])
             self._dn[first : first + len(block)] = block
-            self._seen.add(first, block, np.array([line.valid for line in self._waiting], np.bool_))
             self._waiting.clear()
 
 
@@ -167,10 +156,6 @@ class StoredSweep:
         """Effects that were simulated or left out; None for a rig's lines."""
         found = dict(self.group.attrs).get("simulation")
         return found if isinstance(found, Mapping) else None
-
-    def quicklook(self) -> Quicklook | None:
-        """Return the small picture of the sweep, in values of the white reference; None without one."""
-        return quicklook_of(self.group)
 
 
 @dataclass(frozen=True)

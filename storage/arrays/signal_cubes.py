@@ -51,7 +51,6 @@ from storage.arrays.layout import (
     write_counts,
     write_small,
 )
-from storage.arrays.quicklooks import Quicklook, write_quicklook
 
 CHUNK = 64  # lines and samples of a chunk of scores, with all components
 SHARD_SAMPLES = 640
@@ -166,9 +165,7 @@ class SignalCubeWriter:
             self._scores[:, first:stop] = np.ascontiguousarray(steps.transpose(2, 0, 1)).astype(self._scores.dtype)
         self._seen[first:stop] = quality
 
-    def close(
-        self, facts: LineRows, rare: NDArray[np.intp], residuals: NDArray[np.int32], picture: Quicklook | None
-    ) -> None:
+    def close(self, facts: LineRows, rare: NDArray[np.intp], residuals: NDArray[np.int32]) -> None:
         """Store quality, facts of lines, and (rare, 2) lines and samples with (rare, band) residual steps."""
         self._quality[...] = self._seen
         write_line_facts(self.group, facts.rows(), self._header.started)
@@ -181,8 +178,6 @@ class SignalCubeWriter:
         array = create_array(self.group, "rare_residual", spec, about)
         if residuals.size:
             array[...] = residuals
-        if picture is not None:
-            write_quicklook(self.group, picture)
 
 
 @dataclass(frozen=True)

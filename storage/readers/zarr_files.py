@@ -9,7 +9,6 @@ refused, so that reading never runs code of the store. A cube of files is ingest
     cube.zarr/wavelength      (band,) nm, fwhm beside it, if known
     cube.zarr/valid_line      (line,) false for lines that no file holds whole; time, exposure_ms, frame if known
     cube.zarr/dark, white     (sample, band) reference frames, if there are some
-    cube.zarr/quicklook       (y, x, 3) uint8 for viewers; the same as quicklook.png beside the cube
 
 Attributes have file names without folders, sizes, SHA-256, header texts and notes.
 """
@@ -27,12 +26,10 @@ from typing import Any
 import numpy as np
 import zarr
 from numpy.typing import NDArray
-from PIL import Image
 
 from pipeline.errors import SceneError
 from storage.arrays.georeference import ON_THE_MAP, map_attributes, write_grid_mapping
 from storage.arrays.layout import create_array, create_group, image_spec, write_bands, write_counts, write_small
-from storage.arrays.quicklooks import LineThumbnail, write_quicklook
 from storage.readers.array_cubes import cube_source, dims_of, find_cube, names_beside
 from storage.readers.cube_sources import BLOCK_LINES, CubeSource, LineFacts, check_claim, check_memory, reading
 
@@ -173,7 +170,7 @@ class SourceFile:
 def write_ingested_cube(
     folder: Path, source: CubeSource, files: Sequence[SourceFile], *, name: str, report: Report = lambda done: None
 ) -> None:
-    """Write a cube as ``cube.zarr`` and ``quicklook.png`` into a folder, 64 lines at a time.
+    """Write a cube as ``cube.zarr`` into a folder, 64 lines at a time.
 
     ``report`` is called with the progress, 0..1. Raises SceneError: lines cannot be read.
     """
@@ -183,7 +180,6 @@ def write_ingested_cube(
     group = create_group(folder / "cube.zarr", f"{KIND} {name}", _attributes(source, files, name))
     about: dict[str, Any] = {"long_name": "numbers of the file", "units": "1", **_write_coordinates(group, source)}
     array = create_array(group, "values", image_spec(("line", "sample", "band"), source.shape, kind.str), about)
-    thumbnail = LineThumbnail(source.shape, source.bands.wavelength_nm, dark=source.dark, white=source.white)
     for start in range(0, source.shape[0], BLOCK_LINES):
         stop = min(start + BLOCK_LINES, source.shape[0])
         lines, valid = source.read(start, stop), source.valid[start:stop]
@@ -192,11 +188,7 @@ def write_ingested_cube(
         if not valid.all():
             block[~valid] = np.nan if kind.kind == "f" else 0
         array[start:stop] = block
-        thumbnail.add(start, lines, valid)
         report(begin + (1 - begin) * stop / source.shape[0])
-    picture = thumbnail.finish()
-    write_quicklook(group, picture)
-    Image.fromarray(picture.image).save(folder / "quicklook.png")
 
 
 def stored_dtype(source: CubeSource, report: Report = lambda done: None) -> np.dtype[Any]:

@@ -56,4 +56,4 @@ def write_plain_sweep(path: Path, header: SweepHeader, values: NDArray[np.floati
     count, x_y = len(values), line_positions(header.sweep, LineCamera())
     facts = LineRows(np.arange(count) * 0.1, *x_y.T, np.full(count, 100.0), np.ones(count, np.bool_))
     none = np.zeros((0, values.shape[2]), np.int16)
-    writer.close(facts, np.zeros((0, 2), np.intp), none, None)
+    writer.close(facts, np.zeros((0, 2), np.intp), none)

@@ -40,7 +40,7 @@ EVERY_STORE = (
     *("class_map", "class_probabilities", "mosaic", "detail", "attention"),
     *("raw_coarse", "raw_fine", "signal_coarse", "signal_fine"),
 )
-UNCOUNTED = ("quicklook", "rgb", "rare")  # rare spectra are found by their line and sample
+UNCOUNTED = ("rgb", "rare")  # rare spectra are found by their line and sample
 GAP = np.s_[:20, :24]
 QUIET = Console(quiet=True)
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")

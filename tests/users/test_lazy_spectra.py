@@ -56,7 +56,7 @@ def sweep(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, NDArray[np.fl
         writer.write(first, scores[first : first + 64], quality[first : first + 64])
     left = rng.integers(-50, 50, (2, BANDS)).astype(np.int16)
     column = np.arange(LINES, dtype=float)
-    writer.close(LineRows(column * 0.02, column / 100, column * 0, column * 0 + 20, column >= 0), RARE, left, None)
+    writer.close(LineRows(column * 0.02, column / 100, column * 0, column * 0 + 20, column >= 0), RARE, left)
     values = restored(scores)
     values[RARE[:, 0], RARE[:, 1]] += left * RESIDUAL_STEP * law().noise
     values[10, 20] = np.nan

@@ -187,7 +187,7 @@ def _write_sweeps(
         done.append(condenser.sweep(cube, writer.write, part))
         x, y = cube.position.T
         facts = LineRows(cube.time_s, x, y, cube.exposure_ms, cube.valid_line)
-        writer.close(facts, done[-1].rare, done[-1].residuals, cube.quicklook())
+        writer.close(facts, done[-1].rare, done[-1].residuals)
     return done
 
 

@@ -29,7 +29,6 @@ from storage.archive.manifests import read_table, write_table
 from storage.arrays.geolocation import path_digest, write_geolocation
 from storage.arrays.layout import blank_pixels
 from storage.arrays.mosaics import MosaicWriter, nothing_seen, open_mosaic
-from storage.arrays.quicklooks import Quicklook, choose_bands, stretched, write_quicklook
 from storage.arrays.signal_cubes import open_signal_cubes
 from storage.parallel.pool import WorkerPool
 
@@ -38,7 +37,6 @@ POINTING = Product("register", version=2, files=(RECORD,))
 GEOLOCATION = Product("locate", version=3, files=("geolocation.zarr",))
 MOSAIC = Product("rectify", version=5, files=("mosaic.zarr",))
 DETAIL = Product("rectify_fine", version=2, files=("mosaic.zarr",))
-QUICKLOOK_PX = 512
 MOSAIC_STEP = 0.5  # quantisation step, relative to the sweeps: resampled scores have less noise
 KERNEL_GAIN = 2.0  # greatest overshoot of the kernels
 
@@ -189,7 +187,7 @@ def rectify(
     """Resample the sweeps of the first pass to the scene grid, and blend them into one mosaic, tile by tile."""
 
     def build(path: Path) -> None:
-        """Write mosaic, quicklook and the record of each sweep's lines."""
+        """Write mosaic and the record of each sweep's lines."""
         recipe = MosaicRecipe(
             signal.path,
             camera,
@@ -223,7 +221,7 @@ def rectify_fine(
     """Resample the lines of both passes to the scene grid, merged by position; each pixel is from the closest lines."""
 
     def build(path: Path) -> None:
-        """Write mosaic, quicklook, the capture of each pixel, and the record of each sweep's lines."""
+        """Write mosaic, the capture of each pixel, and the record of each sweep's lines."""
         grid = PixelGrid.of_scene(frame.grid, 1)
         recipe = MosaicRecipe(
             signal.path, camera, grid, resampling, registration=record_of(registration), interlaced=True
@@ -265,12 +263,9 @@ def mosaic_of_sweeps(path: Path, signal: StageRef, frame: FieldFrame) -> MosaicW
 
 
 def finish_mosaic(writer: MosaicWriter, frame: FieldFrame) -> None:
-    """Set nodata pixels, and write the quicklook."""
+    """Set nodata pixels."""
     if frame.missing is not None:
         blank_pixels(writer.path, frame.missing, nothing_seen(writer.path))
-    mosaic = open_mosaic(writer.path)
-    step, bands = -(-max(mosaic.shape) // QUICKLOOK_PX), choose_bands(frame.wavelength_nm)[0]
-    write_quicklook(writer.group, Quicklook(stretched(mosaic.thinned(step, bands)).image))
 
 
 def _there(registration: StageRef | None) -> list[StageRef]:

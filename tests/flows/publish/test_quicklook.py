@@ -13,7 +13,7 @@ from PIL import Image
 
 from flows.publish import quicklook
 from flows.publish.panels import class_palette, class_rgb, outline
-from flows.publish.quicklook import QuicklookData, _draw_attention, _draw_raw, draw_quicklook
+from flows.publish.quicklook import QuicklookData, _draw_attention, draw_quicklook
 from storage.arrays.quicklooks import choose_bands
 
 WAVES = np.linspace(400, 1000, 61)
@@ -28,8 +28,6 @@ def make_data(height: int, width: int, bands: int = 5, *, patch: int = 16) -> Qu
         seed=1,
         about="budget 0.5",
         policy="entropy",
-        raw=(rng.integers(0, 4095, (max(1, height // 4), 10, bands)).astype(np.uint16),) * 2,
-        raw_lines=2 * max(1, height // 4),
         rectified=rng.random((height, width, bands), np.float32),
         wavelength_nm=np.linspace(450, 900, bands),
         score=rng.random((rows, columns)),
@@ -51,20 +49,6 @@ def test_picture_has_a_readable_size(tmp_path: Path, height, width):
     with Image.open(tmp_path / "q.png") as image:
         assert 1200 <= image.width <= 1800
         assert 600 <= image.height <= 2000
-
-
-@pytest.mark.parametrize("along", ["x", "y"])
-def test_raw_lines_lie_as_they_looked_at_the_field(along):
-    """What is bright at the scene's top stands at the top of the raw lines, in either orientation; strips abut."""
-    data, field = make_data(40, 60), np.zeros((40, 60, 5), np.float32)
-    field[:20] = 1
-    turned = field if along == "x" else field.swapaxes(0, 1)
-    sweeps = tuple(np.array_split(turned, 2, axis=1))
-    axes = Figure(figsize=(8, 6)).add_subplot()
-    _draw_raw(axes, replace(data, raw=sweeps, rectified=field, along=along))
-    shown = np.asarray(axes.images[0].get_array())
-    assert shown[:15].mean() > 0.9
-    assert shown[25:].mean() < 0.1
 
 
 @pytest.mark.parametrize("score", [-np.inf, np.inf, 0.0])
@@ -97,10 +81,16 @@ def test_pictures_of_less_and_of_the_same(tmp_path: Path):
 
 
 def test_colours_of_bands_and_of_pixels_without_a_class():
-    """The bands nearest 640, 550 and 460 nm, sorted or not; 255 and numbers without a name are grey."""
+    """The bands nearest 640, 550 and 460 nm, sorted or not, else the ends and the middle; 255 is grey."""
     assert choose_bands(WAVES)[0] == (24, 15, 6)
     order = np.random.default_rng(0).permutation(61)
     assert choose_bands(WAVES[order])[0] == tuple(np.argsort(order)[[24, 15, 6]])
+    for waves, told in (
+        (np.arange(1000.0, 2000.0, 100), ((9, 4, 0), "false colour, 1900 / 1400 / 1000 nm")),
+        (np.array([660.0, 800.0]), ((1, 0, 0), "false colour, 800 / 660 / 660 nm")),
+        (np.array([800.0]), ((0, 0, 0), "grey, 800 nm")),
+    ):
+        assert choose_bands(waves) == told
     picture = class_rgb(np.array([[0, 9, 255]], np.uint8), class_palette(np.array([[230, 159, 0], [0, 158, 115]])))
     np.testing.assert_array_equal(picture[0, 1], picture[0, 2])
     assert (picture[0, 0] != picture[0, 1]).any()
@@ -117,28 +107,15 @@ def test_outline_is_the_border_of_the_patches():
     assert segments[..., 0].max() == 14.5
 
 
-def test_sweeps_stand_apart_and_shorter_ones_are_filled_up():
-    """Between two sweeps there is a light gap; below a shorter one as well."""
-    data = replace(make_data(60, 60), raw=(np.zeros((30, 40, 5), np.uint16), np.zeros((20, 80, 5), np.uint16)))
-    axes = Figure().subplots()
-    _draw_raw(axes, data)
-    image = np.asarray(axes.images[0].get_array())
-    assert image.shape[:2] == (30, 40 + 2 + 80)
-    np.testing.assert_allclose(image[:, 40:42], 0.98)
-    np.testing.assert_allclose(image[20:, 42:], 0.98)
-    assert (image[:20, 42:] < 0.9).all()
-
-
 @pytest.mark.parametrize("confident", [True, False])
 def test_a_plain_scan_shows_how_sure_its_map_is(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, confident):
-    """In the place of where it captured again, which it did not; all lines are counted, shown or not."""
+    """In the place of where it captured again, which it did not."""
     words = []
     monkeypatch.setattr(quicklook, "_caption", lambda axes, title, text: words.append((title, text)))
     data = make_data(96, 128)
     confidence = data.confidence if confident else None
-    draw_quicklook(tmp_path / "q.png", replace(data, policy=None, blocks=(), raw_lines=2098, confidence=confidence))
+    draw_quicklook(tmp_path / "q.png", replace(data, policy=None, blocks=(), confidence=confidence))
     told = dict(words)
-    assert told["1  Raw lines"] == "2 sweeps, 2098 lines"
     assert told["2  Confidence"] == ("of the model" if confident else "the map has none")
     assert "2  Captured again" not in told
 
@@ -154,8 +131,8 @@ def test_a_revisit_shows_what_changed(monkeypatch: pytest.MonkeyPatch, tmp_path:
     was[5:7, 10:20] = 1
     now = np.where(was == 255, data.class_map, 0).astype(np.uint8)
     draw_quicklook(tmp_path / "picture.png", replace(data, was=was, days=7.0, class_map=now))
-    assert ("Changed", "20 px with another class than 7 days before") in words
-    changed = images[1]
+    assert ("1  Changed", "20 px with another class than 7 days before") in words
+    changed = images[0]
     assert (changed[was != 255] == np.float32(data.class_colours[0] / 255)).all()
     assert np.ptp(changed[was == 255], axis=-1).max() == 0
 

@@ -15,6 +15,7 @@ import xarray as xr
 from PIL import Image
 from rich.console import Console
 
+from flows.archive.plan_command import plan_content
 from flows.archive.reprocess_command import run_reprocess
 from flows.settings.load import load_settings
 from flows.tasks.extent_choice import ExtentGains

@@ -21,10 +21,7 @@ from flows.settings.load import load_settings
 from pipeline.errors import RigError
 from pipeline.source import Line
 from storage.archive.archive import Archive
-from storage.arrays.cubes import RawCube, open_raw_cube
-from storage.arrays.layout import open_group
-from storage.arrays.quicklooks import quicklook_of
-from storage.arrays.signal_cubes import SignalCube
+from storage.arrays.cubes import open_raw_cube
 from storage.arrays.spool import Spool
 from storage.remote.opening import verify_archive
 from tests.conftest import Survey
@@ -94,23 +91,6 @@ def test_raw_is_stored_once_and_as_uint16(surveyed: tuple[Path, Published]) -> N
         for kind, name in (("capture", "dn"), ("condense_fine", "scores"))
     )
     assert signal < lines
-
-
-PICTURED = ("capture", "condense", "condense_fine", "rectify")
-
-
-def test_the_picture_of_raw_lines_reads_no_raw_line(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A warm survey draws it from the quicklooks alone."""
-
-    def read(*given: object) -> None:
-        raise AssertionError("a cube was scanned for a picture")
-
-    monkeypatch.setattr(RawCube, "read", read)
-    monkeypatch.setattr(RawCube, "read_window", read)
-    monkeypatch.setattr(SignalCube, "read_window", read)
-    assert (_survey_farm(copied).folder / "quicklook.png").stat().st_size > 10_000
-    stores = [ref.path for stage in PICTURED for ref in Archive.open(copied).refs(stage)]
-    assert all(quicklook_of(open_group(path)) for store in stores for path in store.glob("*.zarr"))
 
 
 BROKEN_AT = 21

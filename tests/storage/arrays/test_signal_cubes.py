@@ -62,7 +62,7 @@ def store(
     done = Condenser(components, law, CAMERA, 1e-3, step).sweep(lines, writer.write)
     x, y = lines.position.T
     facts = LineRows(lines.time_s, x, y, np.full(len(x), 100.0), lines.valid_line)
-    writer.close(facts, done.rare, done.residuals, None)
+    writer.close(facts, done.rare, done.residuals)
     return open_signal_cube(path), done
 
 
@@ -84,7 +84,7 @@ def test_what_is_stored_comes_back(tmp_path: Path) -> None:
     np.testing.assert_array_equal(cube.time_s, lines.time_s)
     np.testing.assert_array_equal(cube.references.white, lines.references.white)
     assert list(zip(*(part.tolist() for part in cube.rare), strict=True)) == RARE == [tuple(p) for p in done.rare]
-    assert (cube.quicklook(), cube.simulation) == (None, None)
+    assert cube.simulation is None
     np.testing.assert_allclose(cube.components.axes @ cube.components.axes.T, np.eye(cube.shape[2]), atol=1e-9)
     assert [one.sweep.name for one in open_signal_cubes(tmp_path)] == ["fine-0"]
 
@@ -243,7 +243,7 @@ def test_scores_beyond_16_bits_are_stored_in_32(tmp_path: Path, largest: float, 
     steps = np.array([[70_000, -3], [0, 9]]).repeat(BANDS // 2, axis=1).astype(np.int32)
     x, y = lines.position.T
     facts = LineRows(lines.time_s, x, y, np.full(len(x), 100.0), lines.valid_line)
-    writer.close(facts, np.array([[0, 1], [5, 6]]), steps, None)
+    writer.close(facts, np.array([[0, 1], [5, 6]]), steps)
     cube = open_signal_cube(tmp_path / "a.zarr")
     assert cube.read().dtype == kind
     np.testing.assert_array_equal(cube.read(), np.rint(scores))
@@ -281,7 +281,7 @@ def test_full_scale_lines_are_stored_in_32_bits_and_come_back(tmp_path: Path) ->
     writer.write(0, scores, np.zeros(SHAPE, np.uint8))
     x, y = lines.position.T
     facts = LineRows(lines.time_s, x, y, np.full(len(x), 100.0), lines.valid_line)
-    writer.close(facts, np.zeros((0, 2), np.intp), np.zeros((0, BANDS), np.int32), None)
+    writer.close(facts, np.zeros((0, 2), np.intp), np.zeros((0, BANDS), np.int32))
     cube = open_signal_cube(tmp_path / "a.zarr")
     off = (cube.spectra(0, 130) - values) / made.noise
     assert np.sqrt(np.mean(off**2)) == pytest.approx(1, abs=0.1)
