@@ -16,7 +16,7 @@ from rich.markup import escape
 
 from flows.archive.export_layers import ExportedRun, Layer, map_layers, open_exported, prior_map_layers
 from flows.archive.export_values import CSV, spectral_layers, write_areas
-from flows.archive.export_zones import check_zones, write_zones, zone_notes
+from flows.archive.export_zones import check_zones, write_zones
 from flows.archive.product_choice import NO_PRODUCTS, ProductChoice, ProductFlags, choose_products
 from flows.cli.app import ArchiveName, AsJson, OutFile, Switch, check_outside, stderr
 from flows.terminal.processes import DONE
@@ -119,8 +119,6 @@ def run_export(
     placed = opened.geobox is not None
     if not placed:
         console.print("[dim]note: neither a rig pose nor the scene has a place on the earth; images have no CRS[/]")
-    for note in zone_notes(opened, choice):
-        console.print(f"[dim]note: {note}[/]")
     for path in (*(out / name for name in files.values()), item, collection):
         console.print(f"  {escape(str(path))}", soft_wrap=True)
     return {"run": opened.id, "item": str(item), "collection": str(collection), "placed": placed, "files": files}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,9 +20,7 @@ else:
     pyproj = deferred("pyproj")
 
 Floats = NDArray[np.float64]
-Places = Callable[[Floats, Floats], Floats]  # of x and y
 WGS84 = 4326  # by EPSG
-APART_DEG = 1e-3  # between places for the length of a degree
 STEP_M = 100.0  # for the slopes of a projection
 TIE_POINTS = 9  # along each side of a grid, between which the scale of its map is linear
 OFF_GRID_PX = 0.02  # allowed offset of pixels on one grid: coordinates in files are rounded
@@ -112,51 +110,3 @@ def _m2_of_units(geobox: GeoBox, column: Floats, row: Floats) -> Floats:
     bent = 1 - ellipsoid.es * np.sin(lat) ** 2  # radii of curvature are a (1 - e2) / bent^1.5 and a / sqrt(bent)
     metres = ellipsoid.a**2 * (1 - ellipsoid.es) / bent**2 * np.cos(lat)
     return np.asarray(np.abs(east[0] * north[1] - east[1] * north[0]) * metres, np.float64)
-
-
-def crs_wkt(geobox: GeoBox) -> str:
-    """Return a grid's CRS as WKT."""
-    assert geobox.crs is not None
-    return geobox.crs.to_wkt()
-
-
-def to_degrees(geobox: GeoBox) -> Places:
-    """Return a function from a map's x and y to (..., 2) latitude and longitude [deg]."""
-    transformer = pyproj.Transformer.from_crs(crs_wkt(geobox), WGS84, always_xy=True)
-    return lambda x, y: np.stack(transformer.transform(x, y)[::-1], axis=-1)
-
-
-def degree_m(geobox: GeoBox) -> tuple[float, float]:
-    """Return the metres of a degree to the north and of one to the east, in the middle of a map."""
-    middle = geobox.affine * (geobox.shape[1] / 2, geobox.shape[0] / 2)
-    lat, lon = to_degrees(geobox)(*np.array(middle)[:, None])[0].tolist()
-    geod = pyproj.Geod(ellps="WGS84")
-    north, east = (
-        geod.inv(lon, lat, lon + across, lat + along)[2] / APART_DEG
-        for along, across in ((APART_DEG, 0.0), (0.0, APART_DEG))
-    )
-    return float(north), float(east)
-
-
-def to_plane(geobox: GeoBox) -> tuple[Places, str]:
-    """Return a function from a map's x and y to (..., 2) metres east and north, and the CRS (WKT) of these.
-
-    It is the map's own CRS if that is projected in metres, else the UTM zone of its middle.
-    """
-    crs = pyproj.CRS.from_wkt(crs_wkt(geobox))
-    if crs.is_projected and all(axis.unit_conversion_factor == 1 for axis in crs.axis_info[:2]):
-        return (lambda x, y: np.stack([x, y], axis=-1)), crs.to_wkt()
-    middle = geobox.affine * (geobox.shape[1] / 2, geobox.shape[0] / 2)
-    lat, lon = to_degrees(geobox)(*np.array(middle)[:, None])[0]
-    zone = pyproj.CRS.from_epsg((32600 if lat >= 0 else 32700) + int((lon + 180) % 360 // 6) + 1)
-    transformer = pyproj.Transformer.from_crs(crs, zone, always_xy=True)
-    return (lambda x, y: np.stack(transformer.transform(x, y), axis=-1)), zone.to_wkt()
-
-
-def plane_pixel_m(geobox: GeoBox) -> float:
-    """Return the side of the square with the area of the middle pixel in the plane of `to_plane` [m]."""
-    rows, columns = geobox.shape
-    column, row = columns // 2 + np.array([0.0, 1.0, 0.0]), rows // 2 + np.array([0.0, 0.0, 1.0])
-    a, b, c, d, e, f = geobox.affine[:6]
-    corner, right, below = to_plane(geobox)[0](a * column + b * row + c, d * column + e * row + f)
-    return float(np.sqrt(abs(np.linalg.det(np.stack([right - corner, below - corner])))))

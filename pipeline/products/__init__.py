@@ -1,1 +1,1 @@
-"""Compute products of a map: spectral indices, regions, prescriptions, areas."""
+"""Compute products of a map: spectral indices and areas."""

@@ -1,26 +1,25 @@
-"""Write vector files for map programs and machines: polygons with QGIS styles, and ISOXML task data.
+"""Write vector files for map programs and machines: polygons, and ISOXML task data.
 
-Polygons are GeoPackage, GeoJSON and shapefile, by GDAL. Task data (ISO 11783-10, version 4) is TASKDATA.XML and a
-binary grid of type 2. Its rows begin at the south-west corner. Each cell has the dose as a 32 bit integer in the steps
-of its data dictionary entity.
+Polygons are GeoPackage and GeoJSON, by GDAL. Task data (ISO 11783-10, version 4) is TASKDATA.XML and a binary grid of
+type 2. Its rows begin at the south-west corner. Each cell has the dose as a 32 bit integer in the steps of its data
+dictionary entity.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
-from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ArchiveError, SettingsError
 from pipeline.lazy import deferred
-from storage.archive.whole_files import write_whole, written_aside
+from storage.archive.whole_files import written_aside
 
 if TYPE_CHECKING:
     import geopandas
@@ -31,8 +30,6 @@ else:
 
 GEOPACKAGE = "application/geopackage+sqlite3"
 GEOJSON = "application/geo+json"
-SHAPEFILE = "application/vnd.shp"
-SHAPE_PARTS = (".shp", ".shx", ".dbf", ".prj", ".cpg")
 DEGREE_DIGITS = 9  # of a degree: 0.1 mm
 
 Columns = Mapping[str, Any]  # one value a polygon, each a sequence or an array
@@ -40,30 +37,21 @@ FOLDER, XML, NUMBERS = "TASKDATA", "TASKDATA.XML", "GRD00000.bin"
 DESIGNATOR = 32  # letters of a name
 MOST_NUMBER = 2**31 - 1
 TREATED, UNTREATED = 1, 0  # codes of treatment zones; UNTREATED also without a signal and outside the field
-STYLE = "application/xml"
-QGIS_VERSION = "3.34"  # the earliest that these were written for
-REDS = ((255, 235, 205), (245, 130, 50), (150, 0, 20))  # of doses above 0
-NONE = (215, 215, 215)  # of a dose of 0
-
-Colour = tuple[int, ...]
-Entry = tuple[Any, str, Colour]  # value, name, red green blue
 
 
 def write_polygons(
     path: Path, polygons: Any, columns: Columns, crs: str | None, *, layer: str | None = None, when: str | None = None
 ) -> None:
-    """Write polygons as a GeoPackage, as GeoJSON or as a shapefile, by the ending of ``path``.
+    """Write polygons as a GeoPackage or as GeoJSON, by the ending of ``path``.
 
     ``polygons`` are shapely's, ``columns`` values of each, ``crs`` WKT or None. A GeoPackage has ``when`` (ISO 8601) as
-    its date, so that the same polygons give the same bytes. GeoJSON is in longitude and latitude (RFC 7946). A
-    shapefile has its other parts beside it, and column names of 10 letters. Raises ArchiveError: GDAL or the disk
-    refuses.
+    its date, so that the same polygons give the same bytes. GeoJSON is in longitude and latitude (RFC 7946). Raises
+    ArchiveError: GDAL or the disk refuses.
     """
     kind = path.suffix
-    names = [path.with_suffix(part).name for part in reversed(SHAPE_PARTS)] if kind == ".shp" else [path.name]
     pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": when})
     try:
-        with written_aside(path.parent, names) as aside, warnings.catch_warnings():
+        with written_aside(path.parent, [path.name]) as aside, warnings.catch_warnings():
             warnings.filterwarnings("ignore", "'crs' was not provided", UserWarning)
             frame = geopandas.GeoDataFrame(dict(columns), geometry=list(polygons), crs=crs)
             frame = frame.to_crs(4326) if kind == ".geojson" else frame
@@ -77,7 +65,6 @@ def write_polygons(
 _OPTIONS: Mapping[str, Mapping[str, Any]] = {
     ".gpkg": {"driver": "GPKG"},
     ".geojson": {"driver": "GeoJSON", "RFC7946": "YES", "COORDINATE_PRECISION": DEGREE_DIGITS},
-    ".shp": {"driver": "ESRI Shapefile", "encoding": "UTF-8"},
 }
 
 
@@ -175,35 +162,3 @@ def _task_file(grid: TaskGrid, text: TaskText, length: int) -> ElementTree.Eleme
     shown = {"A": "VPN1", "B": "0", "C": f"{1 / grid.unit.per_unit:g}", "D": "2", "E": grid.unit.name}
     ElementTree.SubElement(root, "VPN", shown)
     return root
-
-
-def ramp_colour(fraction: float, ramp: Sequence[Colour]) -> Colour:
-    """Return the colour at a fraction, 0 to 1, of a ramp of evenly spaced colours."""
-    positions = np.linspace(0, 1, len(ramp))
-    return tuple(round(float(np.interp(fraction, positions, channel))) for channel in zip(*ramp, strict=True))
-
-
-def write_polygon_style(path: Path, column: str, entries: Sequence[Entry]) -> None:
-    """Write the style of polygons by the values of one column."""
-    root = Element("qgis", version=QGIS_VERSION, styleCategories="Symbology")
-    about = {"type": "categorizedSymbol", "attr": column, "symbollevels": "0", "enableorderby": "0"}
-    renderer = SubElement(root, "renderer-v2", about)
-    categories, symbols = SubElement(renderer, "categories"), SubElement(renderer, "symbols")
-    for number, (value, name, colour) in enumerate(entries):
-        kind = "string" if isinstance(value, str) else "double"
-        about = {"symbol": str(number), "value": str(value), "label": name, "type": kind, "render": "true"}
-        SubElement(categories, "category", about)
-        symbol = SubElement(symbols, "symbol", {"name": str(number), "type": "fill", "alpha": "0.8"})
-        options = SubElement(SubElement(symbol, "layer", {"class": "SimpleFill", "enabled": "1"}), "Option", type="Map")
-        fill = ",".join(map(str, (*colour, 255)))
-        for key, text in (
-            ("color", fill),
-            ("style", "solid"),
-            ("outline_color", "60,60,60,255"),
-            ("outline_width", "0.1"),
-        ):
-            SubElement(options, "Option", {"name": key, "type": "QString", "value": text})
-    SubElement(root, "layerGeometryType").text = "2"
-    ElementTree.indent(root, " ")
-    text = ElementTree.tostring(root, encoding="unicode")
-    write_whole(path, f"<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n{text}\n")

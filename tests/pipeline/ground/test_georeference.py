@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from odc.geo.geobox import GeoBox
 
 from pipeline.geometry.grid import SceneGrid, patch_pixels
-from pipeline.ground.georeference import pixel_rows_m2, pixel_side_m, plane_pixel_m, zoomed_out
+from pipeline.ground.georeference import pixel_rows_m2, pixel_side_m, zoomed_out
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")
 PLACES = {32632: (8.0, 51.0), 3857: (8.0, 60.0), 3035: (8.0, 51.0), 4326: (8.0, 51.0), 2263: (-74.0, 40.7)}
@@ -41,13 +41,6 @@ def test_areas_are_those_of_the_ellipsoid(epsg: int, step: float) -> None:
     outline = abs(ellipsoid.polygon_area_perimeter(*places)[0])
     assert np.sum(list(pixel_rows_m2(geobox))) == pytest.approx(outline, rel=1e-5)
     assert pixel_side_m(geobox) == pytest.approx(np.sqrt(outline / rows / columns), rel=1e-3)
-
-
-def test_pixels_of_a_metric_map_have_the_side_that_it_says() -> None:
-    """Turned or not; of one in degrees and feet that of the UTM zone, off by its scale alone."""
-    assert plane_pixel_m(box(32632, 10.0)) == pytest.approx(10.0)
-    for epsg, step in ((4326, 1e-4), (2263, 30.0)):
-        assert plane_pixel_m(box(epsg, step)) == pytest.approx(pixel_side_m(box(epsg, step)), rel=1e-3)
 
 
 @given(st.integers(1, 70), st.integers(1, 70), st.sampled_from([1, 2, 4, 8]), st.floats(-180, 180))

@@ -1,4 +1,4 @@
-"""Task data, read again by a library that did not write them and held against ISO's schema; and QGIS styles."""
+"""Task data, read again by a library that did not write them and held against ISO's schema."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -16,12 +15,11 @@ from isoxml.models.ddi_entities import DDEntity
 from isoxml.util.isoxml_io import isoxml_from_path
 
 from pipeline.errors import SettingsError
-from storage.export.map_files import REDS, UNITS, TaskGrid, TaskText, ramp_colour, write_polygon_style, write_task_data
+from storage.export.map_files import UNITS, TaskGrid, TaskText, write_task_data
 
 DOSES = np.array([[0.0, 2.5, np.nan], [200.0, 0.0, 0.01]])
 GRID = TaskGrid(51.960197927, -7.600100835, 2.7e-05, 4.4e-05, DOSES, UNITS["l/ha"])
 WORDS = TaskText("spot spraying of the northern field", "north", "weed 2.5 l/ha", "0.1.0", 12_345.6)
-ENTRIES = [(0, "soil & stones", (158, 119, 82)), (7, 'weed "wild"', (220, 30, 30))]
 
 
 def schema_problems(found: Any, of: str = "") -> Iterator[str]:
@@ -89,25 +87,3 @@ def test_a_dose_beyond_the_format_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match="doses up to 214748 l/ha, got 300000"):
         write_task_data(tmp_path, replace(GRID, doses=np.array([[3e5]])), WORDS)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_polygons_have_a_symbol_each(tmp_path: Path) -> None:
-    """Every category of the column leads to a symbol with its colour."""
-    write_polygon_style(tmp_path / "a.qml", "dose", [(0.0, "none", (215, 215, 215)), (2.5, "2.5 l/ha", (150, 0, 20))])
-    (renderer,) = ElementTree.parse(tmp_path / "a.qml").iterfind("renderer-v2[@attr='dose']")
-    found = {}
-    for category in renderer.iterfind("categories/category"):
-        symbol = renderer.find(f"symbols/symbol[@name='{category.attrib['symbol']}']")
-        assert symbol is not None
-        colour = symbol.find(".//Option[@name='color']")
-        assert colour is not None
-        found[float(category.attrib["value"])] = colour.attrib["value"]
-    assert found == {0.0: "215,215,215,255", 2.5: "150,0,20,255"}
-
-
-@pytest.mark.parametrize(
-    ("fraction", "colour"), [(0, REDS[0]), (0.5, REDS[1]), (1, REDS[2]), (2, REDS[2]), (-1, REDS[0])]
-)
-def test_a_ramp_meets_its_colours(fraction: float, colour: tuple[int, ...]) -> None:
-    """At its ends and in its middle; beyond the ends those stay."""
-    assert ramp_colour(fraction, REDS) == colour
