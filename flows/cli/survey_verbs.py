@@ -73,7 +73,7 @@ def by_setting(flags: Any) -> dict[str, object]:
 
 NO_FLAGS = SurveyFlags()
 Verbose = Annotated[
-    bool, Parameter(name=("--verbose", "-v"), negative="", help="Print all savings, stages, effects and versions.")
+    bool, Parameter(name=("--verbose", "-v"), negative="", help="Print all savings, stages and effects.")
 ]
 NO_SIMULATION_FLAGS = SimulationFlags()
 NO_RENDERING_FLAGS = RenderingFlags()

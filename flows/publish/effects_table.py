@@ -12,59 +12,26 @@ from flows.terminal.figures import DASH, format_seconds
 from flows.terminal.progress import table
 from pipeline.simulator.selection.choice import UNIT_NAMES
 
-COLOURS = {"on": "green", "off": "dim"}
-_KEY = (
-    "left out: largest change of a stored number without the effect [{unit}]; error: largest change by the chosen"
-    " variant; measured: the same on the worst lines of the scene."
-)
 Row = Mapping[str, Any]
 
 
 def print_effects(effects: Iterable[Row], total: Row, console: Console) -> None:
-    """Print a row for every effect of the rig, their magnitudes and reasons, and the totals."""
-    rows = list(effects)
-    there = [row for row in rows if row["reason"] != "absent"]
-    columns = ("effect", "computed", "left out", "error", "measured", "CPU")
-    console.print(table(columns, (_figures(row, total) for row in there), left=2, whole=columns))
-    console.print(escape(_KEY.format(unit=UNIT_NAMES[total["unit"]])), style="dim")
-    for row in there:
-        console.print(f"[bold]{escape(row['name'])}[/]: {escape(_format_row(row))}")
-    absent = [f"{row['name']} ({row['magnitude']})" for row in rows if row["reason"] == "absent"]
-    if absent:
-        console.print(f"[bold]Absent[/]: {escape(', '.join(absent))}.")
+    """Print a row for every effect that the rig has, with its error bound and the reason for its state; the totals."""
+    cells = [
+        [
+            escape(row["name"]),
+            escape(row["variant"] or "off"),
+            format_change(row["bound"], endless=True),
+            format_change(row["measured"]),
+            escape(row["why"] or ""),
+        ]
+        for row in effects
+        if row["reason"] != "absent"
+    ]
+    columns = ("effect", "computed", "error", "measured", "why")
+    console.print(table(columns, cells, left=2, whole=columns[:4]))
     for sentence in format_total(total):
         console.print(escape(sentence))
-
-
-def _figures(row: Row, total: Row) -> list[str]:
-    """Return the cells of a row: name, variant, change without it, error bound, measured, seconds."""
-    most, bound = total["tolerance"], row["bound"]
-    beyond = row["state"] == "off" and most is not None and (bound is None or bound > most)
-    colour = "yellow" if beyond else COLOURS[row["state"]]
-    return [
-        escape(row["name"]),
-        f"[{colour}]{escape(row['variant'] or 'off')}[/]",
-        format_change(row["left_out"], endless=True),
-        format_change(row["bound"], endless=True),
-        "" if row["measured"] is None else format_change(row["measured"]),
-        "" if not row["cost_s"] else "< 0.01 s" if row["cost_s"] < 0.01 else format_seconds(row["cost_s"]),
-    ]
-
-
-def _format_row(row: Row) -> str:
-    """Return the magnitude of an effect, and the reason for its state where its figures do not give it."""
-    said = {
-        "exact": "",
-        "needed": "",
-        "small": "",
-        "unseen": "not visible in the scene: ",
-        "spent": "tolerance used for effects that save more: ",
-        "asked": "asked for: ",
-        "unasked": "not asked for: ",
-        "always": "always there: ",
-    }[row["reason"]]
-    magnitude: str = row["magnitude"]
-    return said + magnitude.removeprefix(f"{row['name']}: ")
 
 
 def format_change(value: float | None, *, endless: bool = False) -> str:

@@ -1,4 +1,4 @@
-"""Publish the run of a survey, add its accuracy, and create Prefect's artifacts.
+"""Publish the run of a survey, add its accuracy, and create Prefect's artifact.
 
 A run is published as soon as it has a class map, and its accuracy is added later. A survey that was stopped in between
 continues with the run that it has published.
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from flows.publish.byte_account import recount_bytes
 from flows.publish.receipt import is_pending
-from flows.publish.receipt_table import finding_rows, headline, saving_rows
+from flows.publish.receipt_table import finding_rows, headline
 from flows.publish.report import render_markdown, replace_savings
 from flows.publish.retention import is_outlived
 from flows.publish.run_folder import Published, asked_settings, extend_with_accuracy, publish_run
@@ -25,7 +25,6 @@ from flows.tasks.prefect_tasks import as_task, inside_flow
 from flows.tasks.stages.accuracy import evaluate
 from flows.tasks.stages.capture import capture_coarse, capture_fine
 from flows.tasks.stages.condense import raw_differs
-from flows.terminal.figures import format_percent
 from pipeline.lazy import deferred
 from storage.archive.keys import StageRef, canonical_json
 from storage.archive.lineage import Catalogue
@@ -59,7 +58,7 @@ def _publish(plan: OpenSurvey, *products: StageRef) -> RunRef:
     published = publish_run(plan)
     if judged:
         plan.observer.note(f"published: {published.folder}; accuracy follows")
-    _show_artifacts(plan, published)
+    _show_artifact(plan, published)
     return _ref(published, pending=judged)
 
 
@@ -69,7 +68,7 @@ def add_accuracy(plan: OpenSurvey, run: RunRef, accuracy: StageRef) -> RunRef:
     assert draft is not None
     with draft:
         published = extend_with_accuracy(plan, draft, accuracy)
-    _show_artifacts(plan, published)
+    _show_artifact(plan, published)
     return _ref(published)
 
 
@@ -109,7 +108,7 @@ def _kept_by_others(plan: OpenSurvey, stage: str, raw: StageRef) -> str | None:
 def recount(plan: OpenSurvey, run: RunRef) -> RunRef:
     """Publish a run again with its present bytes, after stores were cleared away."""
     receipt = recount_bytes(plan.run.archive, run.name, replace_savings)
-    _show_artifacts(plan, Published(receipt, run.folder, run.captured_again))
+    _show_artifact(plan, Published(receipt, run.folder, run.captured_again))
     return run
 
 
@@ -150,36 +149,22 @@ def _is_stopped(plan: OpenSurvey, run: Run) -> bool:
     return found == stores and len(set(asked)) == 1
 
 
-def _show_artifacts(plan: OpenSurvey, published: Published) -> None:
-    """Create artifacts of a run in the present flow: summary with picture, table of savings, link to the report."""
+def _show_artifact(plan: OpenSurvey, published: Published) -> None:
+    """Create the artifact of a run in the present flow: score, picture, findings, and where its files are."""
     if not inside_flow():
         return
     letters = (letter if letter.isalnum() and letter.isascii() else "-" for letter in plan.run.name.lower())
     key, where = "".join(letters).strip("-"), f"{plan.run.archive.name}/runs/{published.folder.name}"
-    report = (published.folder / "report.html").absolute().as_uri()
-    receipt = published.receipt
     with suppress(Exception):  # without a server the archive has everything
-        rows = [
-            {
-                "cost": row["label"],
-                "this survey": row["done"],
-                "reference": row["full"],
-                "fraction": format_percent(row["ratio"]),
-            }
-            for row in saving_rows(receipt)
-        ]
         text = render_markdown(
             "survey.md",
-            survey=receipt["survey"],
-            headline=headline(receipt, published.captured_again),
+            survey=published.receipt["survey"],
+            headline=headline(published.receipt, published.captured_again),
             picture=base64.b64encode(small_jpeg((published.folder / "quicklook.png").read_bytes())).decode("ascii"),
-            rows=rows,
-            findings=[f"{name}: {words}" for name, words in finding_rows(receipt)],
+            findings=[f"{name}: {words}" for name, words in finding_rows(published.receipt)],
             where=where,
         )
         prefect_artifacts.create_markdown_artifact(text, key=f"survey-{key}", description=where)
-        prefect_artifacts.create_table_artifact(rows, key=f"savings-{key}", description=where)
-        prefect_artifacts.create_link_artifact(report, link_text="report.html", key=f"report-{key}", description=where)
         plan.observer.progress("published", 1.0)
 
 

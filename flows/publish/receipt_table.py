@@ -131,23 +131,21 @@ def headline(receipt: Receipt, captured_again: float | None = None) -> str:
     return " ".join(sentences)
 
 
-def print_summary(receipt: Receipt, console: Console) -> None:
-    """Print the score, the leading savings and their reference; and the prior map's state where there was one."""
+def print_summary(receipt: Receipt, console: Console, *, verbose: bool = False) -> None:
+    """Print the score, the leading savings and their reference, and the prior map's state where there was one.
+
+    With ``verbose`` print all savings, the stages that ran or were read from the archive, and the effects.
+    """
     console.print(escape(format_score(receipt)))
-    rows = [row for row in saving_rows(receipt) if row["label"] in LEADING]
+    rows = [row for row in saving_rows(receipt) if verbose or row["label"] in LEADING]
     cells = [[row["label"], row["done"], row["full"], format_percent(row["ratio"])] for row in rows]
     columns = ("", "this survey", "reference", "fraction")
     console.print(table(columns, cells, whole=columns[1:]))
     console.print(escape(format_reference(receipt)))
     for name, words in finding_rows({"memory": receipt.get("memory")}):
         console.print(escape(f"{name}: {words}"))
-
-
-def print_details(receipt: Receipt, console: Console) -> None:
-    """Print all savings, the stages that ran or were read from the archive, the effects and the versions."""
-    columns = ("", "this survey", "reference", "fraction")
-    cells = [[row["label"], row["done"], row["full"], format_percent(row["ratio"])] for row in saving_rows(receipt)]
-    console.print(table(columns, cells, whole=columns[1:]))
+    if not verbose:
+        return
     stages = [
         [escape(one["name"]), one["state"], format_seconds(one["wall_s"]), format_bytes(one["bytes_out"])]
         for one in receipt["stages"]
@@ -156,7 +154,6 @@ def print_details(receipt: Receipt, console: Console) -> None:
     console.print(table(("stage", "state", "wall time", "written"), stages, left=2))
     if "effects_total" in receipt:
         print_effects(receipt["effects"], receipt["effects_total"], console)
-    console.print(escape(", ".join(f"{name} {number}" for name, number in receipt["versions"].items())))
 
 
 def is_foreign(found: Mapping[str, Any]) -> bool:

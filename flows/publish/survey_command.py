@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.markup import escape
 
-from flows.publish.receipt_table import print_details, print_summary
+from flows.publish.receipt_table import print_summary
 from flows.publish.run_folder import Published, load_receipt
 from flows.settings.parameters import SurveySettings
 from flows.settings.survey_settings import Settings
@@ -100,10 +100,8 @@ def _prefect_server(out: str) -> Iterator[None]:
 
 
 def show_published(published: Published, out: str, console: Console, *, verbose: bool = False) -> None:
-    """Print the score, the savings and the place of the report; with ``verbose`` stages, effects and versions."""
-    print_summary(published.receipt, console)
-    if verbose:
-        print_details(published.receipt, console)
+    """Print the score, the savings and the place of the report; with ``verbose`` all savings, stages and effects."""
+    print_summary(published.receipt, console, verbose=verbose)
     if is_remote(out):
         console.print(f"Run: {escape(out)}/runs/{published.folder.name}", soft_wrap=True)
     console.print(f"Report: {escape(str(published.folder / 'report.html'))}", soft_wrap=True)

@@ -15,7 +15,7 @@ from flows.archive.commands import contents
 from flows.publish import publishing
 from flows.publish.byte_account import publish_counted, recount_bytes
 from flows.publish.receipt import Receipt
-from flows.publish.receipt_table import print_details, saving_rows
+from flows.publish.receipt_table import print_summary, saving_rows
 from flows.publish.report import render_report, replace_savings
 from flows.publish.run_folder import Published
 from flows.terminal.figures import format_megabytes
@@ -201,7 +201,7 @@ def test_the_figure_of_a_folder_that_holds_the_figure(
 
 def _printed(receipt: Receipt, width: int = 80) -> str:
     console = Console(file=io.StringIO(), width=width)
-    print_details(receipt, console)
+    print_summary(receipt, console, verbose=True)
     return " ".join(console.file.getvalue().split())  # type: ignore[attr-defined]
 
 

@@ -226,11 +226,10 @@ def test_prefect_makes_the_stores_that_plain_makes(
     assert edges(tasks, "rectify_fine") == {"plan_capture", "condense_fine"}
     assert edges(tasks, "add_accuracy") == {"plan_capture", "publish", "evaluate"}
     assert any(words.startswith("mosaic: ") and "stages/rectify/" in words for words in log)
-    assert set(artifacts) == {None, "survey-scene", "savings-scene", "report-scene"}
+    assert set(artifacts) == {None, "survey-scene"}
     assert artifacts[None].data == 100.0
     assert "data:image/jpeg;base64," in artifacts["survey-scene"].data
-    assert "report.html" in artifacts["report-scene"].data
-    assert len(json.loads(artifacts["savings-scene"].data)) > 4
+    assert "report.html" in artifacts["survey-scene"].data
 
 
 STEPS = ("plan_capture", "publish", "add_accuracy", "clear_raw")
