@@ -5,23 +5,21 @@ The bytes kept include the receipt and the report. Both are written again until 
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from flows.publish.receipt import Facts, Receipt, check_receipt
+from flows.settings.values import KEEP_SIGNAL
 from flows.tasks.run import SurveyRun
-from pipeline.errors import IncompleteStoreError
 from pipeline.planning.fine_pass import FinePlan
 from pipeline.planning.prices import BYTES_PER_SAMPLE, raw_bytes
 from storage.archive.archive import Archive
-from storage.archive.keys import store_at
-from storage.archive.records import RECEIPT, read_run
+from storage.archive.records import RECEIPT
 from storage.archive.run_folders import RunDraft
-from storage.archive.staging import MANIFEST_NAME
 from storage.archive.whole_files import to_json
+from storage.readers.recordings import LINE_PRODUCTS
 
 REPORT = "report.html"
 
@@ -52,11 +50,15 @@ def publish_counted(
 ) -> Receipt:
     """Publish a run with receipt and page, and return the receipt with the bytes of the published run.
 
-    All other files are in the draft's folder. ``rests_on`` is of `Archive.manifest_hashes`, ``written`` are bytes of
+    Raw lines that the setting ``keep`` drops after the publication do not count as kept. All other files are in the
+    draft's folder. ``rests_on`` is of `Archive.manifest_hashes`, ``written`` are bytes of
     stores that the receipt does not count yet.
     """
     facts: dict[str, Any] = {"survey": receipt["survey"], "settings": receipt["settings"], "rests_on": rests_on}
-    stores, moved = archive.sizes(rests_on), archive.take_moved()
+    products, drops_raw = receipt["products"], receipt["settings"]["keep"] == KEEP_SIGNAL
+    dropped = {products[name] for name in LINE_PRODUCTS if drops_raw and name in products}
+    stores = {uri: size for uri, size in archive.sizes(rests_on).items() if uri not in dropped}
+    moved = archive.take_moved()
     before, longest, folder = receipt["data_bytes"], {RECEIPT: 0, REPORT: 0}, 0
     built = {row["key"] for row in receipt["stages"] if row["state"] == "ran"}
     reused = {uri: size for uri, size in stores.items() if uri.rpartition("/")[2] not in built}
@@ -80,27 +82,3 @@ def publish_counted(
     draft.publish(**facts)
     archive.take_moved()  # the upload of the folder is counted already
     return receipt
-
-
-def recount_bytes(archive: Archive, run: str, replace_rows: Callable[[str, Receipt], str]) -> Receipt:
-    """Publish a run again with its present bytes, such as after stores were cleared away; return its receipt.
-
-    ``run`` is the name of its folder; ``replace_rows`` puts the savings of a receipt into a page. Nothing else changes.
-    Raises ArchiveError: there is no such run; IncompleteStoreError: it is damaged.
-    """
-    draft = archive.extend_run(run)
-    assert draft is not None
-    with draft:
-        place = archive.locate(f"runs/{run}")
-        found = read_run(place, {})
-        if found.problem is not None:
-            raise IncompleteStoreError(f"{found.uri}: {found.problem}; run verify --repair on the archive")
-        for path in place.iterdir():
-            if path.name not in (RECEIPT, REPORT, MANIFEST_NAME):  # written below
-                shutil.copyfile(path, draft.folder / path.name)
-        page = (place / REPORT).read_text(encoding="utf-8")
-        there = [uri.split("/")[1:] for uri in found.recorded if (archive.root / uri / MANIFEST_NAME).is_file()]
-        rests_on = archive.manifest_hashes(store_at(archive.root, stage, key) for stage, key in there)
-        return publish_counted(
-            archive, draft, dict(found.receipt), lambda receipt: replace_rows(page, receipt), rests_on=rests_on
-        )

@@ -12,10 +12,9 @@ import json
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from flows.publish.byte_account import recount_bytes
 from flows.publish.receipt import is_pending
 from flows.publish.receipt_table import finding_rows, headline
-from flows.publish.report import render_markdown, replace_savings
+from flows.publish.report import render_markdown
 from flows.publish.retention import is_outlived
 from flows.publish.run_folder import Published, asked_settings, extend_with_accuracy, publish_run
 from flows.settings.survey_settings import OF_THE_MACHINE
@@ -73,10 +72,7 @@ def add_accuracy(plan: OpenSurvey, run: RunRef, accuracy: StageRef) -> RunRef:
 
 
 def clear_raw(plan: OpenSurvey, run: RunRef) -> RunRef:
-    """Compare and clear the raw lines that the settings do not keep; in a flow as a task.
-
-    The run is published again with the remaining bytes.
-    """
+    """Compare and clear the raw lines that the settings do not keep; in a flow as a task."""
     if plan.run.settings.keep != KEEP_SIGNAL or not plan.products.there(*PASSES):
         return run
     return as_task(_clear_raw, "clear_raw")(plan, run)
@@ -92,8 +88,9 @@ def _clear_raw(plan: OpenSurvey, run: RunRef) -> RunRef:
     if why is not None:
         plan.observer.note(f"raw lines stay: {why}")
         return run
-    cleared = [archive.clear(raw, wait=False) for raw in passes]
-    return recount(plan, run) if any(cleared) else run
+    for raw in passes:
+        archive.clear(raw, wait=False)
+    return run
 
 
 def _kept_by_others(plan: OpenSurvey, stage: str, raw: StageRef) -> str | None:
@@ -103,13 +100,6 @@ def _kept_by_others(plan: OpenSurvey, stage: str, raw: StageRef) -> str | None:
     archive = plan.run.archive
     runs = Catalogue.read(archive.root).named_by(raw.uri)
     return next((f"{one.uri} keeps them" for one in runs if not is_outlived(one, archive.now())), None)
-
-
-def recount(plan: OpenSurvey, run: RunRef) -> RunRef:
-    """Publish a run again with its present bytes, after stores were cleared away."""
-    receipt = recount_bytes(plan.run.archive, run.name, replace_savings)
-    _show_artifact(plan, Published(receipt, run.folder, run.captured_again))
-    return run
 
 
 def _ref(published: Published, *, pending: bool = False) -> RunRef:

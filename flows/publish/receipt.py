@@ -77,7 +77,7 @@ class DataBytes(_Part):
 
     captured: int  # as the camera delivers them, of all passes
     written: int  # stores that were built, including cleared ones, spools, and the run's folder
-    kept: int  # the run's folder, and all stores that it names with their inputs
+    kept: int  # the run's folder, and its stores with their inputs, but for raw lines that ``keep`` drops
     moved_bucket: int  # to and from a bucket, 0 without one
     moved_workers: int | None  # to workers that share no memory, 0 without any; None: not counted
     reference: int

@@ -47,7 +47,6 @@ SHA256 = {
     f"{LEAFLET}/LICENSE": "53e8dc25862014e4324741ca18fbe3611e11d42ef69f59f86ea8c5389647d4cb",
 }
 MAP_SCRIPTS = (f"{LEAFLET}/leaflet.js", "scripts/field_map.js")
-SAVINGS_SECTION = '<section id="savings">'  # of a report
 _MARKDOWN = "\\`*_{}[]<>#|"
 
 
@@ -195,14 +194,6 @@ def product_links(receipt: Receipt) -> dict[str, str]:
 def _run_folder(receipt: Receipt) -> str:
     products: Mapping[str, str] = receipt["products"]
     return next(posixpath.dirname(one) for one in products.values() if one.startswith("runs/"))
-
-
-def replace_savings(page: str, receipt: Receipt) -> str:
-    """Return a report with the savings of a receipt, such as after its bytes were counted again."""
-    head, there, rest = page.partition(SAVINGS_SECTION)
-    template = _environment(markdown=False).get_template("savings.html")
-    section = visible(template.render(_savings(receipt))).rstrip()
-    return f"{head}{section}{rest.partition('</section>')[2]}" if there else page
 
 
 def _savings(receipt: Receipt) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Clear the raw lines that no run keeps any longer, after comparing them with their condensed signal.
 
 The setting ``keep`` of a run is the time for which its raw lines stay. Lines of several runs stay as long as one keeps
-them. A killed process leaves each store complete or cleared; the next one counts the bytes of the runs again.
+them. A killed process leaves each store complete or cleared.
 """
 
 from __future__ import annotations
@@ -10,8 +10,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
-from flows.publish.byte_account import recount_bytes
-from flows.publish.report import replace_savings
 from flows.settings.values import parse_keep, raw_days
 from flows.tasks.stages.condense import SIGNAL, SIGNAL_FINE, camera_of, raw_differs
 from storage.archive.archive import Archive
@@ -45,7 +43,7 @@ class OutlivedLines:
 def clear_raw_lines(
     archive: Archive, *, dry_run: bool = False, progress: Callable[[str, float], None] | None = None
 ) -> RawClearance:
-    """Clear the raw lines that have expired for every run that names them, and update the bytes in receipts.
+    """Clear the raw lines that have expired for every run that names them.
 
     Every line is compared first; lines that differ or cannot be read stay. With ``dry_run`` nothing is compared or
     removed. Raises ArchiveError: the disk refuses.
@@ -68,7 +66,6 @@ def clear_raw_lines(
                 done.kept[raw.uri] = why
             elif archive.clear(raw, wait=False):
                 done.removals.append(_removal(one))
-        _recount(archive)
     return done
 
 
@@ -109,14 +106,3 @@ def is_outlived(run: Run, now: datetime) -> bool:
 
 def _removal(one: OutlivedLines) -> Removal:
     return Removal(one.raw.ref.uri, "files", one.raw.size, one.why)
-
-
-def _recount(archive: Archive) -> None:
-    """Publish runs again whose receipts still count cleared raw lines."""
-    catalogue = Catalogue.read(archive.root)
-    cleared = {uri for uri, store in catalogue.stores.items() if store.cleared}
-    for run in catalogue.runs:
-        account = run.receipt.get("data_bytes")
-        named = any(run.products.get(name) in cleared for name in LINE_PRODUCTS)
-        if named and isinstance(account, dict) and account.get("kept") != archive.kept_bytes(run, catalogue):
-            recount_bytes(archive, run.folder.name, replace_savings)

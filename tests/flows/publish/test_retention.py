@@ -18,8 +18,6 @@ from flows.archive.commands import gc
 from flows.publish.retention import clear_raw_lines
 from flows.terminal.processes import DONE, PARTLY
 from storage.archive.archive import Archive
-from storage.archive.lineage import Catalogue
-from storage.archive.records import read_run
 from storage.arrays import signal_cubes
 from storage.maintenance.garbage import IN_USE
 from tests.conftest import Survey
@@ -77,12 +75,6 @@ def of_gc(capsys: pytest.CaptureFixture[str], root: Path, **flags: Any) -> tuple
     return code, json.loads(capsys.readouterr().out)
 
 
-def is_counted(archive: Archive) -> bool:
-    """Whether the newest receipt tells the bytes that are kept now."""
-    run = read_run(archive.runs()[-1], {})
-    return bool(run.receipt["data_bytes"]["kept"] == archive.kept_bytes(run, Catalogue.read(archive.root)))
-
-
 def test_lines_stay_for_their_time(archive: Archive, capsys: pytest.CaptureFixture[str]) -> None:
     """Within the week nothing goes, and nothing would."""
     there = raw_uris(archive)
@@ -93,18 +85,17 @@ def test_lines_stay_for_their_time(archive: Archive, capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.usefixtures("later")
-def test_outlived_lines_go_and_the_receipt_counts_again(archive: Archive, capsys: pytest.CaptureFixture[str]) -> None:
+def test_outlived_lines_go(archive: Archive, capsys: pytest.CaptureFixture[str]) -> None:
     """A dry run tells them with bytes and reason; then they go, the archive is whole, and lines are read as before."""
     run = spectralzoom.open(archive.root).latest
-    before, there, size = {n: one.values for n, one in run.lines.items()}, raw_uris(archive), kept_size(archive)
+    before, there = {n: one.values for n, one in run.lines.items()}, raw_uris(archive)
     code, planned = of_gc(capsys, archive.root, dry_run=True)
     assert (code, raw_uris(archive)) == (DONE, there)
     assert {row["uri"] for row in planned["removals"]} == there
     assert {row["why"] for row in planned["removals"]} == {"keep = raw 7d, and they were condensed"}
     code, done = of_gc(capsys, archive.root)
     assert (code, done["removals"], raw_uris(archive)) == (DONE, planned["removals"], set())
-    assert size - kept_size(archive) > 0.9 * done["bytes"] > 0
-    assert is_counted(archive)
+    assert done["bytes"] > 0
     assert problems(archive.root) == []
     again = spectralzoom.open(archive.root).latest
     for name, values in before.items():
@@ -112,11 +103,6 @@ def test_outlived_lines_go_and_the_receipt_counts_again(archive: Archive, capsys
     with pytest.raises(spectralzoom.Error, match="`lines` has their signal"):
         _ = again.sweeps
     assert of_gc(capsys, archive.root)[1]["removals"] == []
-
-
-def kept_size(archive: Archive) -> int:
-    """Bytes of the newest run by its receipt."""
-    return int(read_run(archive.runs()[-1], {}).receipt["data_bytes"]["kept"])
 
 
 @pytest.mark.usefixtures("no_effects", "later")
@@ -199,12 +185,11 @@ def test_nothing_goes_while_a_survey_works(archive: Archive) -> None:
     [
         ("storage.archive.archive", "take_its_place", "before", 2),
         ("storage.archive.archive", "take_its_place", "after", 1),
-        ("flows.publish.byte_account", "publish_counted", "after", 0),
     ],
 )
 @pytest.mark.usefixtures("later")
 def test_killed_it_leaves_either(archive: Archive, module: str, name: str, when: str, left: int) -> None:
-    """A store is whole or cleared, and the next gc does the rest, receipt included."""
+    """A store is whole or cleared, and the next gc does the rest."""
     command = [sys.executable, "-c", KILLED, module, name, when, str(archive.root)]
     assert subprocess.run(command, check=False).returncode == -9
     assert len(raw_uris(archive)) == left
@@ -213,5 +198,4 @@ def test_killed_it_leaves_either(archive: Archive, module: str, name: str, when:
     assert problems(archive.root) == []
     clear_raw_lines(again)
     assert raw_uris(again) == set()
-    assert is_counted(again)
     assert problems(archive.root) == []
