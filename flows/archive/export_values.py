@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,13 +17,11 @@ from flows.archive.export_layers import ExportedRun, Layer, Rows, geobox_of, lay
 from flows.archive.product_choice import ProductChoice
 from flows.publish.receipt import hectares_of_classes
 from pipeline.errors import SettingsError
-from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.map_grid import GroundGrid, grid_of_map, image_at, map_blocks
 from pipeline.ground.view import GroundView, RigPose
-from pipeline.products.areas import FractionEstimate, judged_enough, probable_fractions, stratified_fractions
+from pipeline.products.areas import stratified_fractions
 from pipeline.products.indices import SpectralIndex, index_values, pick_bands, white_level
 from storage.archive.whole_files import write_whole
-from storage.arrays.class_maps import ProbabilityStore
 from storage.arrays.georeference import load_geobox
 from storage.arrays.ground_maps import open_image
 from storage.arrays.layout import grid_of, open_group, read_bands
@@ -32,8 +30,8 @@ from storage.export.image_files import CogImage
 
 CSV = "text/csv"
 COLUMNS = (
-    *("class", "pixels", "hectares", "fraction", "mean_confidence", "estimated_fraction"),
-    *("estimated_hectares", "standard_error_fraction", "standard_error_hectares", "estimated_from"),
+    *("class", "pixels", "hectares", "fraction", "mean_confidence"),
+    *("estimated_fraction", "standard_error"),  # by the labels
 )
 DIGITS = 6
 BYTES_AT_ONCE = 1 << 27
@@ -50,17 +48,16 @@ def write_areas(run: ExportedRun, path: Path) -> None:
     areas = hectares_of_classes(run.receipt)
     hectares = None if areas is None else np.array([areas.get(name, 0.0) for name in names], np.float64)
     fraction = pixels / max(pixels.sum(), 1) if hectares is None else hectares / (hectares.sum() or 1.0)
-    estimate, sources = _estimate(run, fraction)
-    total = np.nan if hectares is None else hectares.sum()
     own = np.full(len(names), np.nan) if hectares is None else hectares
-    figures = (own, fraction, confidence, estimate.fractions, estimate.fractions * total, estimate.errors)
+    confusion, estimate = run.receipt.get("accuracy", {}).get("confusion"), (np.full(len(names), np.nan),) * 2
+    if confusion is not None:
+        estimate = stratified_fractions(fraction, confusion)
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(COLUMNS)
     for number, (name, count) in enumerate(zip(names, pixels.tolist(), strict=True)):
-        own_figures = [figure[number] for figure in (*figures, estimate.errors * total)]
-        cells = [f"{value:.{DIGITS}g}" if np.isfinite(value) else "" for value in own_figures]
-        table.writerow([name, count, *cells, sources[number]])
+        figures = [column[number] for column in (own, fraction, confidence, *estimate)]
+        table.writerow([name, count, *(f"{value:.{DIGITS}g}" if np.isfinite(value) else "" for value in figures)])
     write_whole(path, text.getvalue())
 
 
@@ -75,35 +72,6 @@ def _counted(path: Path, count: int) -> tuple[NDArray[np.int64], NDArray[np.floa
         sums += np.bincount(classes[known], sure[known], 256)
         sure_pixels += np.bincount(classes[known], minlength=256)
     return pixels[:count], np.where(sure_pixels > 0, sums / np.maximum(sure_pixels, 1), np.nan)[:count]
-
-
-def _estimate(run: ExportedRun, fraction: NDArray[np.float64]) -> tuple[FractionEstimate, list[str]]:
-    """Return the fractions with errors, and the source of each class: labels, probabilities or none.
-
-    Classes with enough judged pixels use the receipt's confusion matrix, others the probabilities.
-    """
-    count, confusion = len(fraction), run.receipt.get("accuracy", {}).get("confusion")
-    judged = np.zeros(count, np.bool_) if confusion is None else judged_enough(confusion)
-    mapped = (fraction > 0) & ~judged
-    there = run.store("class_probabilities") is not None
-    others = probable_fractions(_probabilities(run, count, np.flatnonzero(mapped)), count) if there else None
-    matrix = np.zeros((count, count)) if confusion is None else confusion
-    source = "probabilities" if there else ""
-    of_labels = ~mapped & (confusion is not None)
-    return stratified_fractions(fraction, matrix, others), ["labels" if one else source for one in of_labels]
-
-
-def _probabilities(run: ExportedRun, count: int, mapped: NDArray[np.intp]) -> Iterator[NDArray[np.float32]]:
-    """Yield (y, x, class) probabilities of the pixels mapped as some classes; NaN elsewhere."""
-    store = ProbabilityStore(run.path("class_probabilities"))
-    for first, drawn in open_image(run.path("class_map"), "classes").rows():
-        values = np.exp(store.read(slice(first, first + len(drawn)))[0])
-        known = values.shape[-1]
-        values = np.pad(values, [(0, 0), (0, 0), (0, count - known)])
-        unknown = (drawn >= known) & (drawn != UNLABELLED)
-        values[unknown] = np.arange(count) == drawn[unknown, None]
-        values[~np.isin(drawn, mapped)] = np.nan
-        yield values
 
 
 @dataclass(frozen=True)

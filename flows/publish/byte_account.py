@@ -32,11 +32,7 @@ def open_account(run: SurveyRun, plan: FinePlan) -> Facts:
         reference = raw_bytes(run.plan.full, run.camera, bands)
     else:
         captured, reference = 0, int(np.prod(run.scene.shape)) * bands * BYTES_PER_SAMPLE
-    return {
-        **{"captured": captured, "written": 0, "kept": 0, "moved_bucket": 0},
-        "moved_workers": 0 if run.settings.pool.shares_memory else None,
-        **{"reference": reference, "reused": {}},
-    }
+    return {**{"captured": captured, "written": 0, "kept": 0, "moved_bucket": 0}, "reference": reference}
 
 
 def publish_counted(
@@ -60,15 +56,12 @@ def publish_counted(
     stores = {uri: size for uri, size in archive.sizes(rests_on).items() if uri not in dropped}
     moved = archive.take_moved()
     before, longest, folder = receipt["data_bytes"], {RECEIPT: 0, REPORT: 0}, 0
-    built = {row["key"] for row in receipt["stages"] if row["state"] == "ran"}
-    reused = {uri: size for uri, size in stores.items() if uri.rpartition("/")[2] not in built}
     while True:
         sent = moved + folder if archive.in_bucket else 0
         told = {
             "written": before["written"] + written + folder,
             "kept": sum(stores.values()) + folder,
             "moved_bucket": before["moved_bucket"] + sent,
-            "reused": reused,
         }
         receipt = check_receipt(receipt | {"data_bytes": before | told})
         for name, text in ((RECEIPT, to_json(receipt)), (REPORT, page_of(receipt))):

@@ -79,9 +79,7 @@ class DataBytes(_Part):
     written: int  # stores that were built, including cleared ones, spools, and the run's folder
     kept: int  # the run's folder, and its stores with their inputs, but for raw lines that ``keep`` drops
     moved_bucket: int  # to and from a bucket, 0 without one
-    moved_workers: int | None  # to workers that share no memory, 0 without any; None: not counted
     reference: int
-    reused: dict[str, int]  # of ``kept``, stores that were found and not built, by address
 
 
 class Score(_Part):

@@ -42,7 +42,6 @@ BYTE_LABELS = {
     "captured": "bytes captured",
     "written": "bytes written",
     "moved_bucket": "bytes to and from the bucket",
-    "moved_workers": "bytes to workers",
 }
 LEADING = ("capture time", "bytes kept", "multiply-adds")  # of the rows, those printed at the end of a survey
 LEAST_REFERENCE = 100_000  # bytes; with a smaller reference, rows are not in MB
@@ -67,14 +66,12 @@ def saving_rows(receipt: Mapping[str, Any]) -> list[dict[str, Any]]:
         if (one := savings.get(name)) is not None
     ]
     full = account["reference"]
-    show_bytes = format_bytes if full is not None and full < LEAST_REFERENCE else format_megabytes
+    show_bytes = format_bytes if full < LEAST_REFERENCE else format_megabytes
     for name, label in BYTE_LABELS.items():
         done = account[name]
-        if done or not name.startswith("moved"):
-            ratio = done / full if done is not None and full else None
+        if done or name != "moved_bucket":
+            ratio = done / full if full else None
             rows.append({"label": label, "done": show_bytes(done), "full": show_bytes(full), "ratio": ratio})
-        elif done is None:
-            rows.append({"label": label, "done": "not counted", "full": show_bytes(full), "ratio": None})
     return sorted(rows, key=lambda row: LEADING.index(row["label"]) if row["label"] in LEADING else len(LEADING))
 
 
@@ -88,14 +85,6 @@ def format_reference(receipt: Mapping[str, Any]) -> str:
         return words
     scan = f"{format_seconds(capture['uniform'])} ({capture['uniform_scan']})"
     return f"{words} The cheapest uniform scan with nearly the best score takes {scan}."
-
-
-def format_reused(receipt: Mapping[str, Any]) -> str:
-    """Return the number and size of stores that were in the archive before; empty where all were built."""
-    reused = receipt["data_bytes"]["reused"]
-    if not reused:
-        return ""
-    return f"Reused stores: {len(reused)}, {format_megabytes(sum(reused.values()))} of the bytes kept."
 
 
 def format_score(receipt: Mapping[str, Any]) -> str:

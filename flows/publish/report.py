@@ -25,15 +25,7 @@ from flows.publish.effects_table import format_change, format_total
 from flows.publish.field_map import ERROR_COLOURS, FieldMap
 from flows.publish.panels import data_address
 from flows.publish.receipt import Receipt
-from flows.publish.receipt_table import (
-    area_rows,
-    finding_rows,
-    format_reference,
-    format_reused,
-    headline,
-    plot_rows,
-    saving_rows,
-)
+from flows.publish.receipt_table import area_rows, finding_rows, format_reference, headline, plot_rows, saving_rows
 from flows.tasks.scores import error_matrix, format_false_classes
 from flows.terminal.figures import format_bytes, format_percent, format_points, format_seconds
 from pipeline.errors import visible
@@ -202,6 +194,5 @@ def _savings(receipt: Receipt) -> dict[str, Any]:
     return {
         "savings": saving_rows(receipt),
         "reference": format_reference(receipt),
-        "reused": format_reused(receipt),
         "fractions": {name: split[name] / split["done"] for name in parts},
     }

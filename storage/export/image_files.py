@@ -17,7 +17,7 @@ from affine import Affine
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
-from pipeline.errors import ArchiveError, ShapeError
+from pipeline.errors import ArchiveError
 from pipeline.rig.camera.camera_texts import DATA_TYPES
 from storage.archive.whole_files import make_folder, write_whole, written_aside
 from storage.arrays.class_maps import ClassNames
@@ -56,7 +56,7 @@ def write_cog(path: Path, image: CogImage, blocks: Blocks) -> None:
     """Write one file atomically from blocks in order; one block at a time is in memory.
 
     Classes get a colour table, and their names as tags of the band and as GDAL's category names in ``NAME.aux.xml``.
-    Raises ShapeError: the blocks do not fill the image; ArchiveError: the disk refuses or changes the numbers.
+    Raises ArchiveError: the disk refuses or changes the numbers.
     """
     try:
         _write_cog(path, image, blocks)
@@ -118,24 +118,9 @@ def _write_plain(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> 
             file.update_tags(1, **flags)
             colours = enumerate(image.legend.colours.tolist())
             file.write_colormap(1, {number: (*colour, 255) for number, colour in colours})
-        for first, values in _in_order(path.name, blocks, (y, x, len(image.bands))):
-            planes = np.moveaxis(values, -1, 0)
+        for first, values in blocks:
+            planes = np.moveaxis(values.reshape(*values.shape[:2], -1), -1, 0)
             file.write(planes.astype(image.dtype, copy=False), window=((first, first + len(values)), (0, x)))
-
-
-def _in_order(name: str, blocks: Blocks, shape: tuple[int, int, int]) -> Iterator[tuple[int, NDArray[Any]]]:
-    """Yield the blocks of a file of (row, x, band) ``shape`` (ShapeError: they do not fill it)."""
-    reached = 0
-    for first, values in blocks:
-        block = values.reshape(*values.shape[:2], -1)
-        if first != reached or block.shape[1:] != shape[1:] or first + len(block) > shape[0]:
-            raise ShapeError(
-                f"{name}: rows from {first} with shape {values.shape} do not follow {reached} of a file of {shape}"
-            )
-        yield first, block
-        reached += len(block)
-    if reached != shape[0]:
-        raise ShapeError(f"{name}: {reached} rows were given, expected {shape[0]}")
 
 
 def _tag_wavelengths(file: Any, image: CogImage) -> None:
@@ -164,7 +149,6 @@ class EnviFile:
     wavelength_nm: NDArray[np.float64] | None = None  # (band,)
     fwhm_nm: NDArray[np.float64] | None = None  # (band,)
     description: str = ""
-    nodata: float | None = None
     ending: str = ".img"  # of the file with the numbers
     more: Mapping[str, str] = field(default_factory=dict)  # further entries of the header
 
@@ -172,14 +156,13 @@ class EnviFile:
 def write_envi(header: Path, file: EnviFile, blocks: Blocks) -> Path:
     """Write ``NAME.hdr`` and the numbers beside it; return the path of the latter.
 
-    Both files replace earlier ones together. Blocks of lines come in order. Raises ShapeError: the blocks do not fill
-    the file; ArchiveError: the disk refuses.
+    Both files replace earlier ones together. Blocks of lines come in order. Raises ArchiveError: the disk refuses.
     """
     data, kind = header.with_suffix(file.ending), np.dtype(file.dtype).newbyteorder("<")
     text = "".join(["ENVI\n", *(f"{key} = {value}\n" for key, value in _header_fields(file, kind))])
     with written_aside(header.parent, [data.name, header.name]) as aside:
         with (aside / data.name).open("wb") as stream:
-            for _, values in _in_order(data.name, blocks, file.shape):
+            for _, values in blocks:
                 stream.write(np.ascontiguousarray(values.transpose(0, 2, 1), kind).data)
         (aside / header.name).write_text(text, encoding="utf-8")
     return data
@@ -194,8 +177,6 @@ def _header_fields(file: EnviFile, kind: np.dtype[Any]) -> Iterator[tuple[str, s
     code = {name: code for code, name in DATA_TYPES.items()}[kind.str[1:]]
     yield from (("header offset", "0"), ("file type", "ENVI Standard"), ("data type", str(code)))
     yield from (("interleave", "bil"), ("byte order", "0"))
-    if file.nodata is not None:
-        yield "data ignore value", f"{file.nodata:.17g}"
     if file.wavelength_nm is not None:
         yield "wavelength units", "Nanometers"
     for key, values in (("wavelength", file.wavelength_nm), ("fwhm", file.fwhm_nm)):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,6 @@ import xarray as xr
 from affine import Affine
 from isoxml.converter.np_grid import to_numpy_array
 from isoxml.util.isoxml_io import isoxml_from_path
-from PIL import Image
 from rich.console import Console
 from scipy import ndimage
 
@@ -33,8 +31,7 @@ from pipeline.ground.view import GroundView, RigPose
 from pipeline.products.indices import find_index
 from storage.arrays.mosaics import open_mosaic
 from storage.readers.scene_files import load_scene_file
-from tests.conftest import Survey
-from tests.prior_work import with_effects, without_effects
+from tests.prior_work import without_effects
 from tests.storage.export.stac_rules import core_problems, extension_problems, is_cog
 from tests.users.test_georeference import SHAPE, TURNED, corners_px, survey, write_geotiff
 
@@ -197,7 +194,7 @@ def test_task_data_hold_what_the_map_says(posed: Products) -> None:
 
 
 def test_a_table_of_areas_adds_up(posed: Products) -> None:
-    """Pixels of the map, hectares of the receipt, fractions of 1, errors said to be by the labels or by probability."""
+    """Pixels of the map, hectares of the receipt, fractions of 1, errors by the labels."""
     with posed.file("areas").open() as text:
         table = list(csv.DictReader(text))
     names = [row["class"] for row in table]
@@ -207,8 +204,7 @@ def test_a_table_of_areas_adds_up(posed: Products) -> None:
     np.testing.assert_allclose([float(row["hectares"]) for row in table], [hectares[name] for name in names], rtol=1e-5)
     for column in ("fraction", "estimated_fraction"):
         assert sum(float(row[column]) for row in table) == pytest.approx(1, abs=1e-4)
-    assert {row["estimated_from"] for row in table} == {"labels"}
-    assert all(float(row["standard_error_fraction"]) >= 0 for row in table)
+    assert all(float(row["standard_error"]) >= 0 for row in table)
     by_labels = np.array(posed.receipt["accuracy"]["confusion"])
     assert by_labels.sum() == posed.receipt["accuracy"]["pixels"]
 
@@ -256,7 +252,6 @@ def test_a_survey_without_a_place_has_what_needs_none(one_picture: Products) -> 
     with one_picture.file("areas").open() as text:
         table = list(csv.DictReader(text))
     assert {row["hectares"] for row in table} == {""}
-    assert {row["estimated_from"] for row in table} == {"labels"}
     assert sum(int(row["pixels"]) for row in table) == pixels
     choice = choose_products(ProductFlags(prescription="class_1=1"))
     with pytest.raises(SettingsError, match=r"metres, and the run has no place .* \[pose\]"):
@@ -327,29 +322,6 @@ def test_cells_of_coarse_pixels_are_the_field(tmp_path: Path, weights: Path, cel
     (grid,) = task_data.tasks[0].grids
     fraction = (to_numpy_array(numbers[grid.filename], grid) > 0).mean()
     assert fraction == pytest.approx(treated / field.area.sum(), rel=0.35)
-
-
-def test_a_class_without_judged_pixels_is_estimated_from_probabilities(
-    one_picture: Products, tmp_path: Path, scene_files: Path, survey_png: Survey
-) -> None:
-    """All other classes keep their estimates from labels: of labels with a hole where the map shows that class."""
-    drawn = one_picture.store("class_map")["classes"].values
-    rarest = int(np.argmin(np.where(np.bincount(drawn.ravel()) > 0, np.bincount(drawn.ravel()), drawn.size)))
-    labels = np.where(drawn == rarest, 255, 0).astype(np.uint8)
-    Image.fromarray(labels).save(tmp_path / "labels.png")
-    (tmp_path / "scene.toml").write_text("unlabelled = 255\n[classes]\nclass_0 = 0\n")
-    scene = shutil.copy(scene_files / "scene.png", tmp_path)
-    with with_effects():
-        receipt = survey_png(tmp_path / "archive", scene=scene, labels=str(tmp_path / "labels.png")).receipt
-    assert np.sum(receipt["accuracy"]["confusion"], axis=0)[rarest] == 0
-    answer = run_export(tmp_path / "archive", None, tmp_path / "maps", False, QUIET)
-    with Products(tmp_path / "archive", receipt, answer, tmp_path / "maps").file("areas").open() as text:
-        table = list(csv.DictReader(text))
-    assert all(row["estimated_fraction"] and row["standard_error_fraction"] for row in table)
-    assert sum(float(row["estimated_fraction"]) for row in table) == pytest.approx(1, abs=1e-4)
-    sources = [row["estimated_from"] for row in table]
-    assert [place for place, source in enumerate(sources) if source == "probabilities"] == [rarest]
-    assert set(sources) == {"labels", "probabilities"}
 
 
 @pytest.fixture(scope="module")

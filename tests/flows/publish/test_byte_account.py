@@ -61,7 +61,7 @@ def published(survey_png: Survey, tmp_path: Path) -> Published:
 def test_the_account_of_a_survey_is_what_lies_in_its_folders(
     spooled: list[int], survey_png: Survey, tmp_path: Path, keep: str
 ) -> None:
-    """Kept and written by walking the archive, captured by the lines; nothing is moved, and nothing reused.
+    """Kept and written by walking the archive, captured by the lines; nothing is moved.
 
     Raw lines that are cleared after the publication are written and not kept.
     """
@@ -75,7 +75,7 @@ def test_the_account_of_a_survey_is_what_lies_in_its_folders(
     assert sum(spooled) > 0
     assert account["written"] >= account["kept"] + sum(spooled)
     assert keep == "signal" or account["written"] == account["kept"] + sum(spooled)
-    assert (account["moved_bucket"], account["moved_workers"], account["reused"]) == (0, 0, {})
+    assert account["moved_bucket"] == 0
     assert account["reference"] >= 96 * 128 * 3 * 2  # a line has all samples of the camera
     assert 0 < account["captured"] < sum(spooled)  # a spool has numbers, times and checksums beside the lines
     assert account["captured"] > 0.9 * sum(spooled)
@@ -90,13 +90,12 @@ def test_an_accuracy_that_is_added_is_in_the_account(survey_png: Survey, tmp_pat
     account = told(survey_png(root).folder)
     assert account["kept"] == walked(root / "stages", root / "runs") - walked(root / "stages" / "capture")
     assert account["written"] > account["kept"]  # the folder was written twice
-    assert account["reused"] == {}
 
 
 def test_what_is_found_counts_as_kept_and_not_as_written(
     published: Published, survey_png: Survey, tmp_path: Path
 ) -> None:
-    """A second run of the same survey writes its folder alone, and names all stores as reused."""
+    """A second run of the same survey writes its folder alone, and keeps the stores of the first."""
     root = tmp_path / "archive"
     again = survey_png(root, accuracy=False)
     assert again.folder != published.folder
@@ -104,9 +103,7 @@ def test_what_is_found_counts_as_kept_and_not_as_written(
     assert account["written"] == walked(again.folder)
     stores = [ref for ref in Archive.open(root).refs() if ref.stage != "capture"]
     assert account["kept"] == walked(*(ref.path for ref in stores), again.folder)
-    assert account["reused"] == {ref.uri: walked(ref.path) for ref in stores}
     assert account["captured"] == first["captured"]  # its passes are the same
-    assert "Reused stores" in (again.folder / "report.html").read_text()
 
 
 def test_a_run_in_a_bucket_counts_its_objects(
@@ -128,7 +125,6 @@ def test_a_run_in_a_bucket_counts_its_objects(
     listed = Objects(parse_place(bucket)).listing(f"runs/{other.folder.name}")
     assert again["kept"] == stores + sum(one.size for one in listed.values())
     assert again["written"] == again["kept"] - stores
-    assert sum(again["reused"].values()) == stores
     assert again["written"] < again["moved_bucket"] < again["written"] + 1.2 * stores
 
 
@@ -154,7 +150,7 @@ def _printed(receipt: Receipt, width: int = 80) -> str:
 
 
 def test_terminal_and_page_show_megabytes_against_one_reference() -> None:
-    """A row each, with its fraction of the reference; the page has the reused stores too."""
+    """A row each, with its fraction of the reference."""
     rows = [row for row in saving_rows(make_receipt()) if row["label"].startswith("bytes")]
     assert [(row["label"], row["done"], row["full"], row["ratio"]) for row in rows] == [
         ("bytes kept", "1.5 MB", "4 MB", 0.375),
@@ -163,7 +159,6 @@ def test_terminal_and_page_show_megabytes_against_one_reference() -> None:
     ]
     page = render_report(make_receipt(), PNG)
     Page(page)
-    assert "Reused stores: 1, 0.25 MB of the bytes kept." in page
     for text in (_printed(make_receipt()), page):
         for figure in ("bytes kept", "1.5 MB", "38 %", "4 MB"):
             assert figure in text, figure

@@ -98,8 +98,8 @@ def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:
         stages=[asdict(one) for one in stages],
         savings=savings,
         data_bytes={
-            **{"captured": 2_000_000, "written": 7_000_000, "kept": 1_500_000, "moved_bucket": 0, "moved_workers": 0},
-            **{"reference": 4_000_000, "reused": {"stages/capture/ab": 250_000}},
+            **{"captured": 2_000_000, "written": 7_000_000, "kept": 1_500_000, "moved_bucket": 0},
+            "reference": 4_000_000,
         },
         products={"quicklook": f"runs/{wall}/quicklook.png"},
         accuracy=accuracy if labels else None,

@@ -15,7 +15,7 @@ import rasterio
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
-from pipeline.errors import ArchiveError, ShapeError
+from pipeline.errors import ArchiveError
 from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.class_maps import ClassNames
 from storage.arrays.layout import AngularGrid
@@ -132,28 +132,6 @@ def test_classes_have_colours_and_names(tmp_path: Path) -> None:
     importlib.import_module("rasterio.shutil").copy(str(tmp_path / "a.tif"), str(tmp_path / "a.vrt"), driver="VRT")
     names = ElementTree.parse(tmp_path / "a.vrt").getroot().findall(".//CategoryNames/Category")
     assert [name.text for name in names] == list(LEGEND.names)
-
-
-@pytest.mark.parametrize(
-    ("rows", "words"),
-    [
-        ([(0, np.zeros((64, 70), "u1"))], "64 rows were given, expected 90"),
-        ([(0, np.zeros((90, 71), "u1"))], "do not follow 0"),
-        ([(64, np.zeros((26, 70), "u1"))], "do not follow 0"),
-        ([(0, np.zeros((90, 70, 2), "u1"))], "do not follow 0"),
-    ],
-)
-def test_blocks_that_do_not_fill_the_image_change_nothing(tmp_path: Path, rows: Any, words: str) -> None:
-    """Missing, shifted or wider blocks are refused; the file of before stays, byte for byte."""
-    for size in ((40, 30), FEW):
-        write_cog(tmp_path / "a.tif", class_image(on_map(size)), rows_of(classes_of(size)))
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.tif", "a.tif.aux.xml"]  # nothing of the first
-    with rasterio.open(tmp_path / "a.tif") as file:
-        assert file.shape == FEW
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    with pytest.raises(ShapeError, match=words):
-        write_cog(tmp_path / "a.tif", class_image(on_map(FEW)), iter(rows))
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 @pytest.mark.parametrize("kept", [0.0, 0.3, 0.9])
