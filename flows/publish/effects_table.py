@@ -21,15 +21,15 @@ def print_effects(effects: Iterable[Row], total: Row, console: Console) -> None:
         [
             escape(row["name"]),
             escape(row["variant"] or "off"),
+            escape(row["why"] or ""),
             format_change(row["bound"], endless=True),
             format_change(row["measured"]),
-            escape(row["why"] or ""),
         ]
         for row in effects
         if row["reason"] != "absent"
     ]
-    columns = ("effect", "computed", "error", "measured", "why")
-    console.print(table(columns, cells, left=2, whole=columns[:4]))
+    columns = ("effect", "computed", "why", "error", "measured")
+    console.print(table(columns, cells, left=3, whole=("effect", "computed", "error", "measured")))
     for sentence in format_total(total):
         console.print(escape(sentence))
 
