@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePath
-from typing import Any
 
 from flows.publish.receipt import is_pending
 from flows.settings.load import load_settings, of_this_version, parse_settings
@@ -13,8 +12,6 @@ from flows.tasks.open_survey import STAGES, versions
 from flows.tasks.survey_model import weights_path
 from models.weights.files import describe_weights
 from pipeline.errors import PipelineError, SettingsError, WeightsError
-from pipeline.simulator.scenes.built_in import LAWS
-from pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
 from storage.archive.keys import canonical_json
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run, Store
@@ -22,11 +19,6 @@ from storage.readers.open_cubes import split_variable
 from storage.readers.recordings import find_raw_cubes, stores_of_lines
 
 OF_THE_SURVEY = ("labels", "weights", "memory", "accuracy", "prior")  # settings that raw cubes do not contain
-# settings that the light of a field depends on; surveys that agree in these are generations of one
-OF_THE_LIGHT = (
-    *("scene", "bands", "wavelengths", "source", "seed", "effects", "size"),
-    *("day", "hour", "interest", "camera", "pointing_px", "pose", "visit", "sweeps", "pointing", "dark", "white"),
-)
 
 
 def called(run: Run) -> str:
@@ -35,11 +27,16 @@ def called(run: Run) -> str:
 
 
 def _generations(catalogue: Catalogue) -> list[list[Run]]:
-    """Return the runs of each field, oldest first; a run with unreadable settings is a field of its own."""
+    """Return the runs of each field, oldest first: those of one name, source, visit and scene, by the scene's key.
+
+    A run without a readable receipt is a field of its own.
+    """
     found: dict[str, list[Run]] = {}
     for run in catalogue.runs:
-        light = _light_of(_recorded_run(catalogue, run)) if run.settings else run.uri
-        found.setdefault(canonical_json([called(run), light]), []).append(run)
+        lit = _recorded_run(catalogue, run)
+        asked = [lit.settings.get(name) for name in ("source", "visit")]
+        field = [called(run), lit.receipt.get("scene", run.uri), *asked]
+        found.setdefault(canonical_json(field), []).append(run)
     return list(found.values())
 
 
@@ -94,17 +91,6 @@ def _is_there(settings: Settings) -> bool:
         return True
     is_file = settings.source == "sim" and settings.scene not in BUILT_IN_SCENES
     return not is_file or split_variable(settings.scene)[0].exists()
-
-
-def _light_of(run: Run) -> dict[str, Any]:
-    """Return the settings that the light of a run depends on, with the law of a farm and its usual moment."""
-    light = {key: run.settings.get(key) for key in OF_THE_LIGHT}
-    sky = run.settings.get("sky")
-    light["sky"] = [sky.get("light", "clear"), sky.get("light_fraction")] if isinstance(sky, dict) else ["clear", None]
-    if light["scene"] in BUILT_IN_SCENES:
-        usual = {"day": USUAL_DAY, "hour": USUAL_HOUR}
-        light |= {"scene": LAWS[light["scene"]]} | {key: value for key, value in usual.items() if light[key] is None}
-    return light
 
 
 def is_called(run: Run, pattern: str) -> bool:

@@ -21,11 +21,19 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from jinja2.utils import htmlsafe_json_dumps
 from markupsafe import Markup
 
-from flows.publish.effects_table import format_change, format_total
 from flows.publish.field_map import ERROR_COLOURS, FieldMap
 from flows.publish.panels import data_address
 from flows.publish.receipt import Receipt
-from flows.publish.receipt_table import area_rows, finding_rows, format_reference, headline, plot_rows, saving_rows
+from flows.publish.receipt_table import (
+    area_rows,
+    finding_rows,
+    format_change,
+    format_reference,
+    format_total,
+    headline,
+    plot_rows,
+    saving_rows,
+)
 from flows.tasks.scores import error_matrix, format_false_classes
 from flows.terminal.figures import format_bytes, format_percent, format_points, format_seconds
 from pipeline.errors import visible

@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
-from flows.publish.effects_table import print_effects
+from flows.publish.receipt_table import print_effects
 from flows.settings.survey_settings import Settings
 from flows.tasks.capture_plan import PassLayout
 from flows.tasks.run import CaptureRun, make_source

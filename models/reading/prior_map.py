@@ -19,7 +19,6 @@ from models.evaluation.metrics import confusion, kappa, overall_accuracy
 from models.network.sizes import CELL_PX
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.lazy import deferred
-from pipeline.products.areas import BLOCK_PX
 
 if TYPE_CHECKING:
     import torch
@@ -35,6 +34,7 @@ FADES_DAYS = 120.0  # in which a prior map without a new capture loses weight by
 SETTLED_DAYS = 1.0  # age from which the reader alone decides pixels that were not captured
 SURE = 0.97  # confidence of the visit that overrules a prior map, without a reader
 CERTAIN = 0.8  # confidence of prior map and map at which a pixel of another class counts as changed
+BLOCK_PX = 16  # a side: differences are taken as equal within a block, and as independent between blocks
 ERRORS_BEYOND = 2.0  # standard errors above the expected difference of two maps of the same ground
 ROWS = 128  # fused at a time
 SEEN_PX = 3  # reach of the reader around a pixel, beside three coarse pixels

@@ -13,8 +13,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from flows.archive.plan_command import plan_content, show_plan
-from flows.archive.plan_estimate import KEPT_FROM, estimated_bytes
+from flows.archive.plan_command import KEPT_FROM, estimated_bytes, plan_content, show_plan
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings

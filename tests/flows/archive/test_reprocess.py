@@ -183,7 +183,12 @@ def test_fields_are_told_apart_by_what_they_asked_for_and_are_called(surveyed: P
     for pattern in ("field1?.png", "fiel?[1]?.png", "Field*"):
         assert not generations.is_called(odd, pattern)
     archive = Archive.open(tmp_path)
-    for asked in ({}, {}, {"seed": 1}, {"seed": 2}, {"seed": 1, "budget": 0.4}):
-        archive.new_run("farm").publish(survey="farm", settings=asked)
+    for scene in (None, None, "farm@2/seed=1", "farm@2/seed=2", "farm@2/seed=1"):
+        with archive.new_run("farm") as draft:
+            if scene is not None:
+                draft.write_file(
+                    "receipt.json", json.dumps({"survey": "farm", "scene": scene, "settings": {"seed": 1}})
+                )
+            draft.publish(survey="farm")
     runs = Catalogue.read(tmp_path).runs
     assert generations.newest_runs(Catalogue.read(tmp_path)) == [runs[n] for n in (0, 1, 3, 4)]

@@ -16,7 +16,7 @@ import pytest
 import xarray as xr
 from rich.console import Console
 
-from flows.publish.effects_table import print_effects
+from flows.publish.receipt_table import print_effects
 from pipeline.simulator.render import EFFECTS
 from pipeline.simulator.scenes.scene import SceneRaster
 from pipeline.simulator.simulated import SimulatedSource
