@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
-from odc.geo import resxy_
+from odc.geo import CRS, resxy_
 from odc.geo.geobox import GeoBox
 
 from flows.archive.export_layers import ExportedRun
@@ -45,7 +45,8 @@ else:
 CELL_M = 3.0  # default of a prescription, if pixels are smaller
 MOST_CELLS = 4_000_000
 DEGREE_M = 111_320.0  # of latitude
-IN_DEGREES = {"proj:code": "EPSG:4326"}
+WGS84 = "EPSG:4326"
+IN_DEGREES = {"proj:code": WGS84}
 Add = Callable[..., None]  # adds a file to the catalogue: key, path, title, media type, roles, STAC fields
 
 
@@ -116,8 +117,10 @@ def _write_prescription(run: ExportedRun, raster: ClassRaster, folder: Path, cho
     cell_m = choice.flags.cell or max(CELL_M, round(pixel_side_m(raster.geobox), 3))  # no smaller than a pixel
     doses = {raster.legend.names.index(name): dose for name, dose in choice.doses.items()}
     text = ", ".join(f"{name} {dose:g} {unit.name}" for name, dose in choice.doses.items())
-    in_metres = crs.projected and set(crs.units) == {"metre"}
-    cells = raster.geobox.to_crs(crs if in_metres else "utm", resolution=cell_m)
+    west, south, east, north = _bounds(raster.geobox, WGS84)
+    longitude, latitude = (west + east) / 2, (south + north) / 2
+    plane = crs if crs.projected and set(crs.units) == {"metre"} else CRS.utm(longitude, latitude)
+    cells = GeoBox.from_bbox(_bounds(raster.geobox, plane), crs=plane, resolution=cell_m)
     dose = dose_cells(raster, doses, cells)
     row, column = np.nonzero(np.isfinite(dose))
     (left, top), step = cells.affine * (0, 0), cells.resolution
@@ -127,7 +130,10 @@ def _write_prescription(run: ExportedRun, raster: ClassRaster, folder: Path, cho
     outlines = shapely.box(x, y + step.y, x + step.x, y)
     write_polygons(path, outlines, columns, str(cells.crs), layer="prescription", when=run.receipt["finished"])
     add("prescription", path, f"Prescription ({text}) in cells of {cell_m:g} m", GEOPACKAGE, ["data"])
-    cells = _cells_in_degrees(raster.geobox, cell_m)
+    metres = DEGREE_M, DEGREE_M * float(np.cos(np.deg2rad(latitude)))
+    down, across = (round(cell_m / one, DEGREE_DIGITS) for one in metres)
+    degrees = resxy_(across, -down)
+    cells = GeoBox.from_bbox((west, south, east, north), crs=WGS84, resolution=degrees)
     box, step = cells.boundingbox, cells.resolution
     task = TaskGrid(box.bottom, box.left, -step.y, step.x, dose_cells(raster, doses, cells)[::-1], unit)
     survey, version = run.receipt["survey"], str(run.receipt["versions"].get("spectralzoom", "unknown"))
@@ -139,12 +145,10 @@ def _write_prescription(run: ExportedRun, raster: ClassRaster, folder: Path, cho
         add(key, file, title, kind, ["data"], **IN_DEGREES)
 
 
-def _cells_in_degrees(geobox: GeoBox, cell_m: float) -> GeoBox:
-    """Return a grid of longitude and latitude over a map, with cells of about ``cell_m`` a side."""
-    around = geobox.extent.to_crs("EPSG:4326").boundingbox
-    latitude = np.deg2rad((around.bottom + around.top) / 2)
-    down, across = (round(cell_m / metres, DEGREE_DIGITS) for metres in (DEGREE_M, DEGREE_M * float(np.cos(latitude))))
-    return GeoBox.from_bbox(around, crs="EPSG:4326", resolution=resxy_(across, -down))
+def _bounds(geobox: GeoBox, crs: object) -> tuple[float, float, float, float]:
+    """Return the box around a map in another CRS: left, bottom, right, top."""
+    found = rasterio_warp.transform_bounds(str(geobox.crs), str(crs), *geobox.boundingbox.bbox)
+    return found[0], found[1], found[2], found[3]
 
 
 def dose_cells(raster: ClassRaster, doses: Mapping[int, float], cells: GeoBox) -> NDArray[np.float64]:
