@@ -114,12 +114,14 @@ def _write_prescription(run: ExportedRun, raster: ClassRaster, folder: Path, cho
     assert raster.geobox is not None
     assert raster.geobox.crs is not None
     crs, unit = raster.geobox.crs, choice.unit
-    cell_m = choice.flags.cell or max(CELL_M, round(pixel_side_m(raster.geobox), 3))  # no smaller than a pixel
     doses = {raster.legend.names.index(name): dose for name, dose in choice.doses.items()}
     text = ", ".join(f"{name} {dose:g} {unit.name}" for name, dose in choice.doses.items())
     west, south, east, north = _bounds(raster.geobox, WGS84)
     longitude, latitude = (west + east) / 2, (south + north) / 2
-    plane = crs if crs.projected and set(crs.units) == {"metre"} else CRS.utm(longitude, latitude)
+    in_metres = crs.projected and set(crs.units) == {"metre"}
+    plane = crs if in_metres else CRS.utm(longitude, latitude)
+    side = abs(raster.geobox.affine.determinant) ** 0.5 if in_metres else pixel_side_m(raster.geobox)
+    cell_m = choice.flags.cell or max(CELL_M, round(side, 3))  # no smaller than a pixel
     cells = GeoBox.from_bbox(_bounds(raster.geobox, plane), crs=plane, resolution=cell_m)
     dose = dose_cells(raster, doses, cells)
     row, column = np.nonzero(np.isfinite(dose))
