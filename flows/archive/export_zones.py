@@ -113,38 +113,33 @@ def _write_prescription(run: ExportedRun, raster: ClassRaster, folder: Path, cho
     """Write cells along the north of the map in metres as polygons, and cells in degrees as task data."""
     assert raster.geobox is not None
     assert raster.geobox.crs is not None
-    crs, unit = raster.geobox.crs, choice.unit
-    doses = {raster.legend.names.index(name): dose for name, dose in choice.doses.items()}
-    text = ", ".join(f"{name} {dose:g} {unit.name}" for name, dose in choice.doses.items())
-    west, south, east, north = _bounds(raster.geobox, WGS84)
-    longitude, latitude = (west + east) / 2, (south + north) / 2
+    crs, unit, (west, south, east, north) = raster.geobox.crs, choice.unit, _bounds(raster.geobox, WGS84)
     in_metres = crs.projected and set(crs.units) == {"metre"}
-    plane = crs if in_metres else CRS.utm(longitude, latitude)
+    plane = crs if in_metres else CRS.utm((west + east) / 2, (south + north) / 2)
     side = abs(raster.geobox.affine.determinant) ** 0.5 if in_metres else pixel_side_m(raster.geobox)
     cell_m = choice.flags.cell or max(CELL_M, round(side, 3))  # no smaller than a pixel
     cells = GeoBox.from_bbox(_bounds(raster.geobox, plane), crs=plane, resolution=cell_m)
-    dose = dose_cells(raster, doses, cells)
+    dose = dose_cells(raster, choice.doses, cells)
     row, column = np.nonzero(np.isfinite(dose))
     (left, top), step = cells.affine * (0, 0), cells.resolution
     x, y = left + column * step.x, top + row * step.y
-    path = folder / "prescription.gpkg"
-    columns = {"dose": dose[row, column], "unit": [unit.name] * len(row)}
     outlines = shapely.box(x, y + step.y, x + step.x, y)
-    write_polygons(path, outlines, columns, str(cells.crs), layer="prescription", when=run.receipt["finished"])
+    columns = {"dose": dose[row, column], "unit": [unit.name] * len(row)}
+    path = folder / "prescription.gpkg"
+    text = ", ".join(f"{name} {one:g} {unit.name}" for name, one in choice.doses.items())
+    write_polygons(path, outlines, columns, str(plane), layer="prescription", when=run.receipt["finished"])
     add("prescription", path, f"Prescription ({text}) in cells of {cell_m:g} m", GEOPACKAGE, ["data"])
-    metres = DEGREE_M, DEGREE_M * float(np.cos(np.deg2rad(latitude)))
+    metres = DEGREE_M, DEGREE_M * float(np.cos(np.deg2rad((south + north) / 2)))
     down, across = (round(cell_m / one, DEGREE_DIGITS) for one in metres)
-    degrees = resxy_(across, -down)
-    cells = GeoBox.from_bbox((west, south, east, north), crs=WGS84, resolution=degrees)
-    box, step = cells.boundingbox, cells.resolution
-    task = TaskGrid(box.bottom, box.left, -step.y, step.x, dose_cells(raster, doses, cells)[::-1], unit)
+    cells = GeoBox.from_bbox((west, south, east, north), crs=WGS84, resolution=resxy_(across, -down))
+    box = cells.boundingbox
+    task = TaskGrid(box.bottom, box.left, down, across, dose_cells(raster, choice.doses, cells)[::-1], unit)
     survey, version = run.receipt["survey"], str(run.receipt["versions"].get("spectralzoom", "unknown"))
     m2 = M2_PER_HECTARE * sum((hectares_of_classes(run.receipt) or {}).values())
     files = write_task_data(folder, task, TaskText(survey, survey, text, version, m2))
-    title = f"Prescription ({text}) as ISOXML task data"
     kinds = (("task_data", "application/xml"), ("task_grid", "application/octet-stream"))
     for (key, kind), file in zip(kinds, files, strict=True):
-        add(key, file, title, kind, ["data"], **IN_DEGREES)
+        add(key, file, f"Prescription ({text}) as ISOXML task data", kind, ["data"], **IN_DEGREES)
 
 
 def _bounds(geobox: GeoBox, crs: object) -> tuple[float, float, float, float]:
@@ -153,10 +148,10 @@ def _bounds(geobox: GeoBox, crs: object) -> tuple[float, float, float, float]:
     return found[0], found[1], found[2], found[3]
 
 
-def dose_cells(raster: ClassRaster, doses: Mapping[int, float], cells: GeoBox) -> NDArray[np.float64]:
+def dose_cells(raster: ClassRaster, doses: Mapping[str, float], cells: GeoBox) -> NDArray[np.float64]:
     """Return the dose of each cell, (row, column): the greatest of the classes in it, NaN without a class.
 
-    ``doses`` are by number of the class; other classes have a dose of 0. Raises SettingsError: too many cells.
+    ``doses`` are by name of the class; other classes have a dose of 0. Raises SettingsError: too many cells.
     """
     assert raster.geobox is not None
     if np.prod(cells.shape) > MOST_CELLS:
@@ -164,8 +159,8 @@ def dose_cells(raster: ClassRaster, doses: Mapping[int, float], cells: GeoBox) -
     levels = np.array([np.nan, *sorted({0.0, *doses.values()})])  # 0 is no class, so that the greatest number wins
     of_class = np.ones(UNLABELLED + 1, np.uint8)
     of_class[UNLABELLED] = 0
-    for number, dose in doses.items():
-        of_class[number] = np.searchsorted(levels[1:], dose) + 1
+    for name, dose in doses.items():
+        of_class[raster.legend.names.index(name)] = np.searchsorted(levels[1:], dose) + 1
     found = np.zeros(cells.shape, np.uint8)
     rasterio_warp.reproject(
         of_class[raster.classes],
