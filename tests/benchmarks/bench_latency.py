@@ -95,7 +95,7 @@ class _AskedError(Exception):
 @contextmanager
 def _watched(moments: Moments) -> Iterator[None]:
     """Take the time of exposures, lines and the first path of a fine sweep."""
-    from pipeline.rig.capture.capture_runner import CaptureRunner
+    from pipeline.rig.capture_runner import CaptureRunner
     from storage.arrays.spool import Spool
 
     append, take = Spool.append, CaptureRunner.take

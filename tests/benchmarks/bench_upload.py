@@ -17,7 +17,7 @@ from measure import Row
 from pipeline.rig.device_settings import MirrorSettings, ReadBack
 from pipeline.rig.emulator.emulated_rig import EmulatedPort
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.mirror.mirror_controller import open_mirror
+from pipeline.rig.mirror_controller import open_mirror
 from pipeline.rig.transports import BITS_PER_BYTE, SYSTEM_CLOCK, Transport
 
 PAIRS = 1500

@@ -17,8 +17,8 @@ from spectral.io import envi
 from pipeline.errors import RigError, SettingsError
 from pipeline.geometry.scan import line_positions
 from pipeline.rig.camera.camera_files import KeptInMemory
-from pipeline.rig.capture.capture_paths import REFERENCES, capture_prefix
-from pipeline.rig.capture.rig_source import RigSource
+from pipeline.rig.capture_paths import REFERENCES, capture_prefix
+from pipeline.rig.rig_source import RigSource
 from pipeline.rig.device_settings import CameraLimits, SurveyRig
 from pipeline.rig.drivers import CameraDriver, RigDevices, open_camera_driver, open_mirror_driver
 from pipeline.rig.emulator.emulated_rig import EmulatedRig

@@ -22,7 +22,7 @@ from rich.console import Console
 from flows.settings.load import load_settings
 from flows.simulate.rig_commands import emulated_settings, run_emulate
 from pipeline.rig.emulator.emulated_rig import FastClock, ServedRig
-from pipeline.rig.mirror.pro_mode import Command
+from pipeline.rig.pro_mode import Command
 from tests.flows.conftest import CommandLine
 from tests.pipeline.rig.camera_faults import FaultyRig
 from tests.pipeline.rig.mirror_faults import make_fault

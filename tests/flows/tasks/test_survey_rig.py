@@ -31,12 +31,12 @@ from pipeline.errors import PoseError, SettingsError
 from pipeline.geometry.mirror import STRAIGHT, Mounting
 from pipeline.geometry.scan import Sweep, exposing
 from pipeline.rig.camera.camera_cubes import mean_frame
-from pipeline.rig.capture.capture_paths import REFERENCES
+from pipeline.rig.capture_paths import REFERENCES
 from pipeline.rig.device_settings import SurveyRig
 from pipeline.rig.drivers import RigDevices
 from pipeline.rig.emulator.emulated_rig import REFERENCE_FRAMES, EmulatedRig, FastClock, SceneView
 from pipeline.rig.emulator.mirror_device import Mode
-from pipeline.rig.mirror.pro_mode import Command
+from pipeline.rig.pro_mode import Command
 from pipeline.rig.transports import SYSTEM_CLOCK, DeviceGone, SerialTransport
 from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
 from pipeline.simulator.simulated import SimulatedSource

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from pipeline.rig.emulator import Chunk
-from pipeline.rig.emulator.mirror_device import MirrorDevice, Mode, Request
-from pipeline.rig.mirror.mirror_requests import END, GO_PRO, GO_PRO_CRC, ID, VERSION, Reply
-from pipeline.rig.mirror.pro_mode import (
+from pipeline.rig.emulator.mirror_device import TURNAROUND_S, MirrorDevice, Mode, Request
+from pipeline.rig.mirror_controller import END, GO_PRO, GO_PRO_CRC, ID, VERSION
+from pipeline.rig.pro_mode import (
     CELL,
     VECTOR_MEMORY,
     Command,
@@ -113,10 +113,12 @@ class FaultyMirror(MirrorDevice):
 
     crc = "either"
 
-    def __init__(self, clock: Any, faults: Sequence[Fault] = (), **given: Any) -> None:
+    def __init__(self, clock: Any, faults: Sequence[Fault] = ()) -> None:
         self.faults: tuple[Fault, ...] = ()
+        self.requests: list[Request] = []  # that were carried out
         self.gone = self.hung = False
-        super().__init__(clock, **given)
+        self.deaf_until_s = -math.inf
+        super().__init__(clock)
         self.have(faults)
 
     def have(self, faults: Sequence[Fault]) -> None:
@@ -140,15 +142,16 @@ class FaultyMirror(MirrorDevice):
                 if instead is not None:
                     return instead
                 data = fault.incoming(self, data)
-            return super().receive(data)
+            return super().receive(data) if self.clock.now() >= self.deaf_until_s else []
 
     def _simple(self, line: str) -> str:
         if self.crc == "absent" and line == GO_PRO_CRC:
-            return Reply.NO
+            return "NO"
         return super()._simple(GO_PRO_CRC if self.crc == "required" and line == GO_PRO else line)
 
     def carry_out(self, request: Request) -> bytes:
         """Do what a request asks for; a firmware without CRCs has none in its reply."""
+        self.requests.append(request)
         reply = super().carry_out(request)
         if self.crc != "absent" or request.mode is Mode.SIMPLE:
             return reply
@@ -164,7 +167,7 @@ class FaultyMirror(MirrorDevice):
             reply = fault.verdict(self, request) if reply is None else reply
         if reply is None:
             reply = self.carry_out(request)
-        chunks = [Chunk(self.unit.turnaround_s, reply)] if reply else []
+        chunks = [Chunk(TURNAROUND_S, reply)] if reply else []
         for fault in self.faults:
             chunks = fault.outgoing(self, request, chunks)
         out += chunks
@@ -317,7 +320,8 @@ class SilentReset(Fault):
         """Restart instead of doing what was asked, and answer nothing."""
         if (self.commands is not None and request.command not in self.commands) or not self.chance.comes():
             return None
-        device.restart(boot_s=self.boot_s)
+        device.restart()
+        device.deaf_until_s = device.clock.now() + self.boot_s
         return b""
 
 
@@ -444,7 +448,7 @@ class Echo(Fault):
     def instead(self, device: FaultyMirror, data: bytes) -> list[Chunk]:
         """Send back all that came."""
         self.chance.struck += 1
-        return [Chunk(device.unit.turnaround_s, data)]
+        return [Chunk(TURNAROUND_S, data)]
 
 
 @dataclass
@@ -464,10 +468,10 @@ class Modem(Fault):
                 self.typed = b""
             else:
                 self.typed = (self.typed + bytes((byte,)))[-64:]
-        return [Chunk(device.unit.turnaround_s, data + b"".join(answers))]
+        return [Chunk(TURNAROUND_S, data + b"".join(answers))]
 
 
-_VALUES = frozenset({Command.GET_VALUE, Command.GET_VALUES, Command.SET_VALUES})
+_VALUES = frozenset({Command.GET_VALUE, Command.SET_VALUES})
 _SETTING = frozenset({Command.SET_VALUES})
 _VECTORS = frozenset({Command.SET_VECTOR, Command.GET_VECTOR})
 _UPLOAD = frozenset({Command.SET_VECTOR})
@@ -479,7 +483,7 @@ def _reply(spoil: Spoil, *, lasting: bool = False) -> tuple[Callable[[Chance], F
     return partial(SpoiltReply, spoil=spoil, lasting=lasting), 64
 
 
-def _line(answer: Reply) -> tuple[Callable[[Chance], Fault], int]:
+def _line(answer: str) -> tuple[Callable[[Chance], Fault], int]:
     return partial(AnswersLine, answer=answer), 6
 
 
@@ -509,10 +513,10 @@ KINDS: dict[str, tuple[Callable[[Chance], Fault], int]] = {
     "no-reply": _reply(lost),
     "mute": _reply(lost, lasting=True),
     "slow-bytes": _reply(slow, lasting=True),
-    "answers-no": _line(Reply.NO),
-    "answers-ol": _line(Reply.BELOW),
-    "answers-ou": _line(Reply.ABOVE),
-    "answers-error": _line(Reply.ERROR),
+    "answers-no": _line("NO"),
+    "answers-ol": _line("OL"),
+    "answers-ou": _line("OU"),
+    "answers-error": _line("ERROR"),
     "error-frame": _code(ErrorCode.FRAME_INVALID),
     "error-length": _code(ErrorCode.LENGTH_MISMATCH),
     "error-crc": _code(ErrorCode.CRC_WRONG),

@@ -14,11 +14,11 @@ import pytest
 from pipeline.errors import RigError
 from pipeline.rig.camera.camera_files import log_in
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
-from pipeline.rig.capture.capture_paths import capture_prefix
+from pipeline.rig.capture_paths import capture_prefix
 from pipeline.rig.device_settings import FileServer, MirrorSettings, Pulses
 from pipeline.rig.emulator.mirror_device import Mode
-from pipeline.rig.mirror.mirror_controller import MirrorController, MotionLog
-from pipeline.rig.mirror.pro_mode import Command, Status
+from pipeline.rig.mirror_controller import MirrorController, MotionLog
+from pipeline.rig.pro_mode import Command, Status
 from pipeline.rig.rig_check import SQUARE, CheckRow, check_camera, check_mirror, check_triggers, failed, works
 from pipeline.rig.transports import Clock, DeviceGone, DeviceRefused
 from tests.pipeline.rig.camera_faults import CameraFault, CameraFaults, FaultyRig

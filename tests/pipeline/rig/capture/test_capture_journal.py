@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.rig.camera.camera_files import KeptInMemory
-from pipeline.rig.capture import JOURNAL
-from pipeline.rig.capture.capture_paths import CaptureRecord, LinePositions
-from pipeline.rig.capture.capture_runner import CaptureJournal
+from pipeline.rig.capture_paths import CaptureRecord, LinePositions
+from pipeline.rig.capture_runner import JOURNAL, CaptureJournal
 from tests.faults.growing_files import flip_journal
 from tests.pipeline.rig.small_rig import COARSE, FINE
 

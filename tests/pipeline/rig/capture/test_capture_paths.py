@@ -11,7 +11,7 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.scan import Sweep
 from pipeline.rig.camera.camera_cubes import CapturedLines
 from pipeline.rig.camera.camera_texts import LineTimes
-from pipeline.rig.capture.capture_paths import (
+from pipeline.rig.capture_paths import (
     REFERENCES,
     Announced,
     CaptureRecord,

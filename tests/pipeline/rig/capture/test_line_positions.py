@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.errors import RigError
 from pipeline.geometry.camera import LineCamera
-from pipeline.rig.capture.capture_paths import (
+from pipeline.rig.capture_paths import (
     FrameTimes,
     LinePositions,
     MirrorScanPath,

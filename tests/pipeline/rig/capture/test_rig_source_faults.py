@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pipeline.errors import RigError
 from pipeline.rig.camera.camera_files import KeptInMemory
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
-from pipeline.rig.capture import JOURNAL
+from pipeline.rig.capture_runner import JOURNAL
 from pipeline.rig.transports import DeviceGone, DeviceRefused, StateUnknown
 from pipeline.source import Line
 from tests.pipeline.rig.camera_faults import CameraFault, CameraFaults

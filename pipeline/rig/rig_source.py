@@ -29,7 +29,7 @@ from pipeline.geometry.mirror import STRAIGHT
 from pipeline.geometry.scan import Sweep, exposing
 from pipeline.rig.camera.camera_cubes import as_references
 from pipeline.rig.camera.camera_files import NOT_LOGGED_IN, Kept
-from pipeline.rig.capture.capture_paths import (
+from pipeline.rig.capture_paths import (
     REFERENCES,
     CaptureRecord,
     UnusableCaptureError,
@@ -38,9 +38,9 @@ from pipeline.rig.capture.capture_paths import (
     next_path,
     path_of,
 )
-from pipeline.rig.capture.capture_runner import CaptureJournal, CaptureRunner, Say, say_nothing
+from pipeline.rig.capture_runner import CaptureJournal, CaptureRunner, Say, say_nothing
 from pipeline.rig.device_settings import SurveyRig
-from pipeline.rig.drivers import FrameClaim, RigDevices
+from pipeline.rig.drivers import RigDevices
 from pipeline.rig.transports import DeviceRefused, StateUnknown
 from pipeline.simulator.simulated import check_binning
 from pipeline.source import Line, References
@@ -203,7 +203,7 @@ class RigSource:
 
     def _whole_references(self, runner: CaptureRunner, folder: str) -> tuple[References, tuple[str, ...]]:
         """Return the dark and white frames of all samples, with notes."""
-        frames = runner.devices.camera.references(folder, self._kept, claim=self._claim(1))
+        frames = runner.devices.camera.references(folder, self._kept)
         missing = [kind for kind in ("dark", "white") if kind not in frames]
         if missing:
             raise RigError(
@@ -221,7 +221,6 @@ class RigSource:
                 taken.folder,
                 self._kept,
                 lambda _, held, size: self._say(f"fetching: {held / 1e6:.1f} of {size / 1e6:.1f} MB"),
-                claim=self._claim(taken.stop - taken.first),
             )
         except RigError as error:
             if type(error) is not RigError:  # a device that is gone, or a full disk: the capture is in order
@@ -229,7 +228,7 @@ class RigSource:
             raise UnusableCaptureError(str(error)) from error
         self._check_size(captured.values.shape[1:], taken.folder)
         path = path_of(taken.sweep, (taken.first, taken.stop), self.camera, triggered=taken.triggered)
-        located = locate_lines(captured, path, taken, self.camera, runner.log_of(taken))
+        located = locate_lines(captured, path, taken, self.camera)
         self._journal.record_positions(taken, located.positions, captured.notes)
         values, sweep = captured.values, path.sweep
         nothing = np.zeros((values.shape[1] // sweep.binning, values.shape[2]), np.uint16)
@@ -253,9 +252,6 @@ class RigSource:
         if known and origin is not None:
             return (stamp_us - origin) * 1e-6 + exposed.mid_exposure_s(0.0)
         return exposed.mid_exposure_s(float(number))
-
-    def _claim(self, frames: int) -> FrameClaim:
-        return FrameClaim(frames, self.camera.samples, len(self.wavelength_nm))
 
     def _check_size(self, found: tuple[int, ...], folder: str) -> None:
         wanted = (self.camera.samples, len(self.wavelength_nm))
