@@ -103,7 +103,7 @@ class SurveyRig:
     )
     retries: int = stated(Patience.retries, "Repetitions of a request that only reads", "", 0, 20)
     quiet_s: float = assumed(Patience.quiet_s, "Silence after which a late answer is given up", "s", 0, 5)
-    with_crc: bool = assumed(False, "Requests carry a CRC; `rig check` tries both")
+    with_crc: bool = assumed(False, "Requests carry a CRC")
     strict_crc: bool = stated(False, "Refuse replies whose CRC does not fit; the default is a warning")
     ends: Ends = assumed("exclusive", "Whether the mirror's index ranges include their end")  # erratum E14
     read_back: ReadBack = stated("sampled", "Part of a path that is read back and compared")

@@ -142,7 +142,7 @@ def _survey(stack: ExitStack, settings: Settings, moments: Moments) -> None:
     line = stack.enter_context(InProcessRig(rig))
 
     def open_devices(told: Settings, *_: object) -> RigDevices:
-        return line.devices(told.rig.mirror(told.cost.vector_pairs))
+        return line.devices(told.rig, told.cost.vector_pairs)
 
     stack.enter_context(patch("flows.tasks.rig_field.open_devices", open_devices))
     try:
