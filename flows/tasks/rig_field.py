@@ -7,7 +7,7 @@ import hashlib
 import os
 import socket
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -87,9 +87,9 @@ def rig_to_oneself(port: str) -> Iterator[None]:
     """
     device = os.path.realpath(port) if port.startswith("/") else port.lower()
     name = f"\0spectralzoom-rig-{hashlib.sha256(device.encode()).hexdigest()[:32]}"
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as lock:
+    with ExitStack() as held:
         try:
-            lock.bind(name.encode())
+            held.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)).bind(name.encode())
         except OSError as error:
             if error.errno == errno.EADDRINUSE:
                 raise RigError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import math
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from random import Random
 from typing import Any
@@ -14,19 +14,8 @@ import numpy as np
 
 from pipeline.rig.emulator import Chunk
 from pipeline.rig.emulator.mirror_device import TURNAROUND_S, MirrorDevice, Mode, Request
-from pipeline.rig.mirror_controller import END, GO_PRO, GO_PRO_CRC, ID, VERSION
-from pipeline.rig.pro_mode import (
-    CELL,
-    VECTOR_MEMORY,
-    Command,
-    ErrorCode,
-    Frame,
-    FrameReader,
-    Status,
-    encode,
-    read_vector,
-    refuse,
-)
+from pipeline.rig.mirror_controller import END, ID, VERSION
+from pipeline.rig.pro_mode import CELL, VECTOR_MEMORY, Command, ErrorCode, Status, encode, read_vector, refuse
 
 LATE_S = 20.0  # beyond any deadline
 SLOW_S = 0.02  # from byte to byte
@@ -105,13 +94,7 @@ class Fault:
 
 
 class FaultyMirror(MirrorDevice):
-    """A controller that fails; ``gone`` and ``hung`` say that no port knows it any more, or that it takes no bytes.
-
-    ``crc`` is its firmware: one checks the CRC of requests after GOPRO as well ("required"), one knows no GOPROCRC and
-    sends 00 00 in the CRC's place ("absent").
-    """
-
-    crc = "either"
+    """A controller that fails; ``gone`` and ``hung`` say that no port knows it any more, or that it takes no bytes."""
 
     def __init__(self, clock: Any, faults: Sequence[Fault] = ()) -> None:
         self.faults: tuple[Fault, ...] = ()
@@ -144,20 +127,10 @@ class FaultyMirror(MirrorDevice):
                 data = fault.incoming(self, data)
             return super().receive(data) if self.clock.now() >= self.deaf_until_s else []
 
-    def _simple(self, line: str) -> str:
-        if self.crc == "absent" and line == GO_PRO_CRC:
-            return "NO"
-        return super()._simple(GO_PRO_CRC if self.crc == "required" and line == GO_PRO else line)
-
     def carry_out(self, request: Request) -> bytes:
-        """Do what a request asks for; a firmware without CRCs has none in its reply."""
+        """Note a request, and do what it asks for."""
         self.requests.append(request)
-        reply = super().carry_out(request)
-        if self.crc != "absent" or request.mode is Mode.SIMPLE:
-            return reply
-        (frame,) = FrameReader().feed(reply)
-        assert isinstance(frame, Frame)
-        return encode(frame, with_crc=False)
+        return super().carry_out(request)
 
     def _answer(self, request: Request, out: list[Chunk]) -> None:
         if self.gone:
@@ -184,11 +157,6 @@ def lose(data: bytes, at: int, random: Random) -> bytes:
 def flip(data: bytes, at: int, random: Random) -> bytes:
     """Turn one bit of a byte."""
     return data[:at] + bytes((data[at] ^ 1 << random.randrange(8),)) + data[at + 1 :]
-
-
-def double(data: bytes, at: int, random: Random) -> bytes:
-    """Have a byte twice."""
-    return data[: at + 1] + data[at:]
 
 
 # what may become of a reply
@@ -326,15 +294,13 @@ class SilentReset(Fault):
 
 
 @dataclass
-class AnswersLine(Fault):
+class AnswersNo(Fault):
     """One line of simple mode gets a refusal and is not carried out."""
-
-    answer: str
 
     def verdict(self, device: FaultyMirror, request: Request) -> bytes | None:
         if request.mode is not Mode.SIMPLE or not self.chance.comes():
             return None
-        return self.answer.encode("ascii") + END
+        return b"NO" + END
 
 
 @dataclass
@@ -408,18 +374,6 @@ class GoneBefore(Fault):
 
 
 @dataclass
-class GoneWithin(Fault):
-    """The device goes away in the middle of a request, of which it took a part."""
-
-    def incoming(self, device: FaultyMirror, data: bytes) -> bytes:
-        for place in range(len(data)):
-            if self.chance.comes():
-                device.gone = True
-                return data[:place]
-        return data
-
-
-@dataclass
 class GoneAfter(Fault):
     """The device carries a request out and goes away before it answers."""
 
@@ -451,27 +405,6 @@ class Echo(Fault):
         return [Chunk(TURNAROUND_S, data)]
 
 
-@dataclass
-class Modem(Fault):
-    """A modem instead of a controller: it shows what is typed, and answers lines as modems do."""
-
-    typed: bytes = field(default=b"", init=False)
-
-    def instead(self, device: FaultyMirror, data: bytes) -> list[Chunk]:
-        """Show what is typed, and at each CR answer OK to a line that begins with AT, ERROR to any other."""
-        self.chance.struck += 1
-        answers = []
-        for byte in data:
-            if byte == 0x0D:
-                good = self.typed.strip().upper().startswith(b"AT")
-                answers.append(b"\r\nOK\r\n" if good else b"\r\nERROR\r\n" if self.typed.strip() else b"")
-                self.typed = b""
-            else:
-                self.typed = (self.typed + bytes((byte,)))[-64:]
-        return [Chunk(TURNAROUND_S, data + b"".join(answers))]
-
-
-_VALUES = frozenset({Command.GET_VALUE, Command.SET_VALUES})
 _SETTING = frozenset({Command.SET_VALUES})
 _VECTORS = frozenset({Command.SET_VECTOR, Command.GET_VECTOR})
 _UPLOAD = frozenset({Command.SET_VECTOR})
@@ -481,10 +414,6 @@ HARMLESS = ("split-replies", "merged-replies", "stale-bytes", "pro-at-connect") 
 
 def _reply(spoil: Spoil, *, lasting: bool = False) -> tuple[Callable[[Chance], Fault], int]:
     return partial(SpoiltReply, spoil=spoil, lasting=lasting), 64
-
-
-def _line(answer: str) -> tuple[Callable[[Chance], Fault], int]:
-    return partial(AnswersLine, answer=answer), 6
 
 
 def _code(code: int, commands: Collection[int] | None = None, span: int = 64) -> tuple[Callable[[Chance], Fault], int]:
@@ -499,10 +428,8 @@ def _bit(bit: Status) -> tuple[Callable[[Chance], Fault], int]:
 KINDS: dict[str, tuple[Callable[[Chance], Fault], int]] = {
     "request-byte-lost": (partial(RequestByte, change=lose), _BYTES),
     "request-bit-flipped": (partial(RequestByte, change=flip), _BYTES),
-    "request-byte-doubled": (partial(RequestByte, change=double), _BYTES),
     "reply-byte-lost": _reply(changed(lose)),
     "reply-bit-flipped": _reply(changed(flip)),
-    "reply-byte-doubled": _reply(changed(double)),
     "split-replies": _reply(split, lasting=True),
     "merged-replies": _reply(merge, lasting=True),
     "stale-bytes": (StaleBytes, 64),
@@ -513,18 +440,9 @@ KINDS: dict[str, tuple[Callable[[Chance], Fault], int]] = {
     "no-reply": _reply(lost),
     "mute": _reply(lost, lasting=True),
     "slow-bytes": _reply(slow, lasting=True),
-    "answers-no": _line("NO"),
-    "answers-ol": _line("OL"),
-    "answers-ou": _line("OU"),
-    "answers-error": _line("ERROR"),
-    "error-frame": _code(ErrorCode.FRAME_INVALID),
-    "error-length": _code(ErrorCode.LENGTH_MISMATCH),
-    "error-crc": _code(ErrorCode.CRC_WRONG),
-    "error-no-register": _code(ErrorCode.NO_REGISTER, _VALUES, 8),
+    "answers-no": (AnswersNo, 6),
     "error-range": _code(ErrorCode.OUT_OF_RANGE, _SETTING, 4),
-    "error-read-only": _code(ErrorCode.READ_ONLY, _SETTING, 4),
     "error-vector-index": _code(ErrorCode.VECTOR_INDEX, _VECTORS),
-    "error-chain": _code(ErrorCode.CHAIN, _SETTING, 4),
     "error-unknown": _code(0xBEEF),
     "wrong-firmware": (OtherFirmware, 64),
     "cell-lost": (CellLost, 16),
@@ -534,15 +452,11 @@ KINDS: dict[str, tuple[Callable[[Chance], Fault], int]] = {
     "never-stable": _bit(Status.NOT_STABLE),
     "trimmed": _bit(Status.TRIMMED),
     "mirror-warm": _bit(Status.MIRROR_WARM),
-    "electronics-warm": _bit(Status.ELECTRONICS_WARM),
     "disconnected": _bit(Status.DISCONNECTED),
-    "eeprom-invalid": _bit(Status.EEPROM_INVALID),
     "gone-before": (GoneBefore, 64),
-    "gone-within": (GoneWithin, _BYTES),
     "gone-after": (GoneAfter, 64),
     "hangs": (PortHangs, 64),
     "echo": (Echo, 64),
-    "modem": (Modem, 64),
 }
 
 

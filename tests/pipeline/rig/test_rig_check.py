@@ -28,11 +28,10 @@ SETS = {Command.SET_VALUES, Command.SET_VECTOR}
 
 
 @contextmanager
-def rig(*faults: str, camera: CameraFaults | None = None, crc: str = "either", **given: Any) -> Iterator[InProcessRig]:
+def rig(*faults: str, camera: CameraFaults | None = None) -> Iterator[InProcessRig]:
     """An emulated rig whose mirror's faults strike at the first occasion."""
     struck = [make_fault(name, at=0) for name in faults]
-    whole = FaultyRig(small_source(), ManualClock(), mirror_faults=struck, camera_faults=camera, **given)
-    whole.mirror.crc = crc
+    whole = FaultyRig(small_source(), ManualClock(), mirror_faults=struck, camera_faults=camera)
     with InProcessRig(whole) as line:
         yield line
 
@@ -88,7 +87,6 @@ def test_square_is_gone_round_and_read_back() -> None:
         ("disconnected", "status", "motions are refused"),
         ("never-stable", "status", "not stable"),  # as a survey would wait
         ("trimmed", "status", "trimmed"),
-        ("modem", "connect", ""),
         ("echo", "connect", ""),
         ("mute", "connect", "is the controller on"),
         ("gone-before", "connect", "cable"),
@@ -147,18 +145,6 @@ def test_camera_out_of_order() -> None:
         with pytest.raises(DeviceRefused, match="password"):
             log_in(other)
         assert log_in(line.files) == "emulated camera"
-
-
-@pytest.mark.parametrize(("crc", "with_crc", "right"), [("required", False, "true"), ("absent", True, "false")])
-def test_a_wrong_crc_setting_fails_with_the_right_one(crc: Any, with_crc: bool, right: str) -> None:
-    """The setting that is answered stands in the row, and the same check passes with it."""
-    with rig(crc=crc) as line:
-        (row,) = mirror_rows(line, with_crc=with_crc)
-        assert (row.asked, row.verdict) == ("connect", "fail")
-        assert f"set with_crc = {right} in [rig]" in row.mend
-        assert not set_anything(line)
-    with rig(crc=crc) as line:
-        assert works(mirror_rows(line, with_crc=not with_crc), "mirror")
 
 
 @dataclass

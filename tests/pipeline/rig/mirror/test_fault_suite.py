@@ -23,7 +23,7 @@ MOST_QUIET = 6  # times the time of silence that is waited for before a request
 EPSILON_S = 1e-6
 STATIC = (X.static_xy, Y.static_xy)
 RUNS = (X.vector(VectorRegister.RUN), Y.vector(VectorRegister.RUN))
-ALWAYS_FATAL = ("mute", "gone-before", "gone-within", "gone-after", "hangs", "echo", "modem", "wrong-firmware")
+ALWAYS_FATAL = ("mute", "gone-before", "gone-after", "hangs", "echo", "wrong-firmware")
 
 
 def moves(data: bytes) -> bool:
