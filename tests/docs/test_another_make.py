@@ -166,7 +166,7 @@ BROKEN = {
     "no function": (f"{MODULE}:open_it", r"cannot be imported \(AttributeError: .*open_it"),
     "no name": ("a name?", r"cannot be imported \(ValueError"),
     "no function of rig and clock": (f"{MODULE}:POLL_S", r"does not open a driver .* the table \[rig\] and a clock"),
-    "of other things": (f"{MODULE}:LineTimes", r"does not open a driver \(.*missing 1 required"),
+    "of other things": (f"{MODULE}:CapturedLines", r"does not open a driver \(.*missing 1 required"),
     "no driver": (f"{MODULE}:FolderCamera", r"gives a FolderCamera without goto, .*method of MirrorDriver in"),
 }
 

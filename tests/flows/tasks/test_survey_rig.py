@@ -200,24 +200,6 @@ def test_a_mounting_that_does_not_reach_the_field_is_refused_first(tmp_path: Pat
 
 
 @pytest.mark.usefixtures("no_effects")
-def test_pulses_of_frames_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, simulated_map: np.ndarray):
-    """One pulse a frame, as cameras give: fine lines are stepped by it, coarse ones lie where the mirror's log says."""
-    told = {"rig.pulses": "frame", "effects": "none", "keep": "raw"}
-    settings = small_settings(tmp_path, source="rig", visit="first", **told)
-    with emulated(settings, {}, monkeypatch):
-        published = run_survey(settings, QUIET)
-    captures = {
-        name: json.loads((tmp_path / published.receipt["products"][name] / "rig.json").read_text())["captures"]
-        for name in ("raw_coarse", "raw_fine")
-    }
-    assert {one["method"] for captured in captures.values() for one in captured} == {"trigger"}
-    assert max(one["residual_px"] for one in captures["raw_coarse"]) < 16  # a coarse line
-    alike = class_map_of(published, tmp_path) == simulated_map
-    assert alike.mean() > 0.9
-    assert {finding.kind for finding in verify_archive(Archive.open(tmp_path))} == {"whole"}
-
-
-@pytest.mark.usefixtures("no_effects")
 def test_a_rig_as_the_defaults_have_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, simulated_map: np.ndarray):
     """No pulses and no CRC: every line lies where the mirror's log measured it, and the map is nearly the simulated."""
     usual = SurveyRig()

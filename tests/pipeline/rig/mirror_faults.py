@@ -19,7 +19,6 @@ from pipeline.rig.pro_mode import CELL, VECTOR_MEMORY, Command, ErrorCode, Statu
 
 LATE_S = 20.0  # beyond any deadline
 SLOW_S = 0.02  # from byte to byte
-TICK_S = 0.005  # at which replies that wait for each other leave
 # the end of a reply with a text, one of a status, and a whole frame: what another program left behind
 _LEFT_BEHIND = (b"R-E-2\r\n", b"00000010\r\n", bytes.fromhex("7e 00 11 04 00 00 00 00 f2 81 7e"))
 _OTHER_TEXTS = {ID: "LENS-DRIVER-4", VERSION: "0.0.1"}
@@ -183,17 +182,6 @@ def split(device: MirrorDevice, chunks: list[Chunk], random: Random) -> list[Chu
     return pieces
 
 
-def merge(device: MirrorDevice, chunks: list[Chunk], random: Random) -> list[Chunk]:
-    """Let it wait for the next tick of a slow clock, with those that wait already."""
-    now = device.clock.now()
-    return [Chunk(math.ceil((now + delay_s) / TICK_S) * TICK_S - now, data) for delay_s, data in chunks]
-
-
-def noise(device: MirrorDevice, chunks: list[Chunk], random: Random) -> list[Chunk]:
-    """Put bytes that mean nothing before it."""
-    return [Chunk(chunks[0].delay_s, random.randbytes(random.randint(1, 12))), *chunks]
-
-
 def late(device: MirrorDevice, chunks: list[Chunk], random: Random) -> list[Chunk]:
     """Hold it back beyond any deadline."""
     return [Chunk(delay_s + LATE_S, data) for delay_s, data in chunks]
@@ -226,21 +214,6 @@ class SpoiltReply(Fault):
         if not chunks or not (self.chance.lasts() if self.lasting else self.chance.comes()):
             return chunks
         return self.spoil(device, chunks, self.chance.random)
-
-
-@dataclass
-class OldReplyAgain(Fault):
-    """The reply before is sent once more, in front of one reply."""
-
-    last: bytes = b""
-
-    def outgoing(self, device: FaultyMirror, request: Request, chunks: list[Chunk]) -> list[Chunk]:
-        whole = b"".join(data for _, data in chunks)
-        if not whole:
-            return chunks
-        again = [Chunk(chunks[0].delay_s, self.last)] if self.chance.comes() and self.last else []
-        self.last = whole
-        return again + chunks
 
 
 @dataclass
@@ -409,7 +382,7 @@ _SETTING = frozenset({Command.SET_VALUES})
 _VECTORS = frozenset({Command.SET_VECTOR, Command.GET_VECTOR})
 _UPLOAD = frozenset({Command.SET_VECTOR})
 _BYTES = 1024  # within so many bytes to the controller
-HARMLESS = ("split-replies", "merged-replies", "stale-bytes", "pro-at-connect")  # a driver copes with them
+HARMLESS = ("split-replies", "stale-bytes", "pro-at-connect")  # a driver copes with them
 
 
 def _reply(spoil: Spoil, *, lasting: bool = False) -> tuple[Callable[[Chance], Fault], int]:
@@ -431,10 +404,7 @@ KINDS: dict[str, tuple[Callable[[Chance], Fault], int]] = {
     "reply-byte-lost": _reply(changed(lose)),
     "reply-bit-flipped": _reply(changed(flip)),
     "split-replies": _reply(split, lasting=True),
-    "merged-replies": _reply(merge, lasting=True),
     "stale-bytes": (StaleBytes, 64),
-    "noise": _reply(noise),
-    "old-reply-again": (OldReplyAgain, 64),
     "late-reply": _reply(late),
     "just-late-reply": _reply(just_late),
     "no-reply": _reply(lost),

@@ -83,20 +83,6 @@ def test_transfer_that_breaks_off_goes_on(monkeypatch: pytest.MonkeyPatch) -> No
         assert not any(device.faults.left.values())
 
 
-def test_what_has_come_is_kept() -> None:
-    """Where the server stays away the part that came is there, and the next call fetches the rest only."""
-    with camera({CameraFault.BREAKS_OFF: 1}, tries=1) as (driver, device, _):
-        driver.capture(100)
-        wait_for(driver, 5.0)
-        (raw,) = [file for file in remote_files(device, "/captured/000000") if file.name.endswith("raw_0")]
-        kept = KeptInMemory()
-        with pytest.raises(DeviceGone, match=rf"{raw.size // 2} bytes of {raw.name} are kept, and a later fetch"):
-            fetch_files(driver.server, [raw], kept)
-        assert kept.size(raw.name) == raw.size // 2
-        fetch_files(driver.server, [raw], kept)
-        assert bytes(kept.files[raw.name]) == device.files()[raw.name]
-
-
 def test_another_file_of_the_same_name() -> None:
     """What is held of another file is never mixed with this one's bytes."""
     with camera() as (driver, device, _):

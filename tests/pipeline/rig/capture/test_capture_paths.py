@@ -71,7 +71,7 @@ TAKEN = CaptureRecord(FINE, 3, 9, "/captured/x", True, (0.0, 0.1), (0.1, 0.2), i
 def frames(numbers: list[int], lost: int = 0, first: int = 0) -> CapturedLines:
     """A capture with these frames, numbers as the index has them, and lines missing at its end."""
     told = np.array(numbers, np.int64)
-    times = LineTimes(told, np.where(told >= 0, 10**15 + told * 100_000, -1), np.full(len(told), np.nan))
+    times = LineTimes(told, np.where(told >= 0, 10**15 + told * 100_000, -1))
     return CapturedLines(np.zeros((len(told), 48, 3), np.uint16), first, times, lost=lost)
 
 

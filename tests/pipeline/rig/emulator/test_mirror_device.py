@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from pipeline.rig.emulator.mirror_device import MirrorDevice, Mode
 from tests.pipeline.rig.in_process import ManualClock
@@ -117,31 +113,3 @@ def test_a_reset_forgets_everything() -> None:
     assert answer(device, b"START\r\n") == b"OK\r\n"
     assert not np.any(device.state.memory)
     np.testing.assert_array_equal(device.positions(device.clock.now()), (0, 0))
-
-
-@given(cuts=st.lists(st.integers(0, 400), max_size=40))
-@settings(deadline=None, max_examples=30)
-def test_any_cutting_of_the_bytes_gives_the_same_answers(cuts: list[int]) -> None:
-    """However a stream of lines and frames is cut, the bytes that come back are the same."""
-    frames = b"".join(bytes.fromhex(PRO[name][0]) for name in STORY)
-    stream = b"start\r\nGETID\r\n" + GO_PRO_CRC + frames + b"START\r\nNONSENSE\r\n"
-    whole = answer(MirrorDevice(ManualClock()), stream)
-    device = MirrorDevice(ManualClock())
-    edges = sorted({0, len(stream), *(cut for cut in cuts if cut < len(stream))})
-    assert b"".join(answer(device, stream[a:b]) for a, b in pairwise(edges)) == whole
-
-
-@given(junk=st.binary(max_size=200))
-@settings(deadline=None, max_examples=50)
-def test_no_bytes_confuse_the_controller_for_long(junk: bytes) -> None:
-    """After any bytes that change no mode, in either mode, it answers the next request rightly."""
-    device = MirrorDevice(ManualClock())
-    answer(device, junk.upper().replace(b"GOPRO", b"") + b"\r\n")
-    if device.mode is Mode.SIMPLE:
-        device.clock.sleep(2.0)
-        assert answer(device, b"\r\nGETID\r\n").endswith(b"MR-E-2\r\n")
-    device = pro_device()
-    answer(device, junk + b"\x7e")
-    request, reply = map(bytes.fromhex, PRO["status"])
-    if device.mode is not Mode.SIMPLE:
-        assert answer(device, request).endswith(reply)

@@ -23,7 +23,6 @@ from pipeline.rig.pro_mode import (
     X,
     Y,
     ask_status,
-    cell_float,
     cell_int,
     encode,
     float_cell,
@@ -92,17 +91,6 @@ def test_how_a_stream_is_cut_changes_nothing(sent: list[Frame], cuts: list[int])
     stream = b"".join(map(encode, sent))
     reader = FrameReader()
     assert [found for part in parts(stream, cuts) for found in reader.feed(part)] == sent
-
-
-@given(st.lists(st.tuples(rubbish, frames), max_size=5), rubbish)
-def test_rubbish_between_frames_costs_no_frame(sent: list[tuple[bytes, Frame]], tail: bytes):
-    """Every frame is found in order, and all bytes of the rubbish are given back or are frames by chance."""
-    stream = b"".join(noise + encode(frame) for noise, frame in sent) + tail
-    found = FrameReader().feed(stream)
-    frames_found = iter([item for item in found if isinstance(item, Frame)])
-    assert all(any(frame == item for item in frames_found) for _, frame in sent)
-    dropped = b"".join(item.data for item in found if isinstance(item, Damaged))
-    assert len(dropped) <= sum(len(noise) for noise, _ in sent) + len(tail)
 
 
 @given(st.binary(max_size=400), st.lists(st.integers(0, 1000), max_size=20))
@@ -213,21 +201,6 @@ def test_registers_come_back(values: dict[int, float | int]):
     """What is set in several registers is what the device reads, in order."""
     cells = {number: int_cell(one) if isinstance(one, int) else float_cell(one) for number, one in values.items()}
     assert read_registers(set_values(values).payload) == cells
-
-
-@given(st.integers(0, 16000), st.lists(a_cell, min_size=1, max_size=10))
-def test_vectors_come_back(start: int, held: list[bytes]):
-    """Cells of a vector are addressed in bytes, and come back."""
-    data = b"".join(held)
-    assert read_vector(set_vector(0x2600, start, data).payload) == (0x2600, 4 * start, 4 * len(held), data)
-    assert read_vector(get_vector(0x2600, start, len(held)).payload) == (0x2600, 4 * start, 4 * len(held), b"")
-
-
-@given(st.floats(width=32, allow_nan=False), st.integers(-(2**31), 2**32 - 1))
-def test_cells_come_back(number: float, whole: int):
-    """A float32 and an integer of 32 bits pass through a cell."""
-    assert cell_float(float_cell(number)) == number
-    assert cell_int(int_cell(whole)) == whole % 2**32
 
 
 @pytest.mark.parametrize(
