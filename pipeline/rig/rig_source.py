@@ -87,7 +87,7 @@ class RigSource:
         self._journal = CaptureJournal(kept)
         self._unknown: list[str] = []  # why the rig's state is unknown; shared by all copies of this source
         self._runner: CaptureRunner | None = None
-        self._whole: dict[str, tuple[References, tuple[str, ...]]] = {}  # of all samples, with notes, by folder
+        self._whole: dict[str, References] = {}  # of all samples, by folder
 
     @property
     def record(self) -> dict[str, Any]:
@@ -97,10 +97,8 @@ class RigSource:
         }
         if self.rig.mounting != STRAIGHT:
             rig["mounting"] = asdict(self.rig.mounting)
-        found = [self._whole[folder][1] for folder in self._journal.references.values() if folder in self._whole]
-        notes = dict.fromkeys(note for some in found for note in some)
         damage = {"journal": self._journal.damage} if self._journal.damage else {}
-        return {"rig": rig, "references": list(notes), "captures": self._journal.captures, **damage}
+        return {"rig": rig, "captures": self._journal.captures, **damage}
 
     def keeping(self, kept: Kept) -> RigSource:
         """Return the same source with its files elsewhere."""
@@ -186,12 +184,12 @@ class RigSource:
                     self._journal.record_references(runner.capture_at_rest(REFERENCES, exposure_ms), exposure_ms)
                     known = self._whole_references(runner, folders[exposure_ms])
                 self._whole[folders[exposure_ms]] = known
-        whole, _ = self._whole[folders[exposure_ms]]
+        whole = self._whole[folders[exposure_ms]]
         bad = None if whole.bad is None or not whole.bad.any() else _sums(whole.bad, sweep.binning) > 0
         dark, white = (_sums(frame, sweep.binning) for frame in (whole.dark, whole.white))
         return References(dark, white, whole.white_reference, bad, by_mirror=self.rig.white_at_rest)
 
-    def _known_references(self, runner: CaptureRunner, folder: str) -> tuple[References, tuple[str, ...]] | None:
+    def _known_references(self, runner: CaptureRunner, folder: str) -> References | None:
         """Return the frames of an earlier session; None where the camera does not have them any more."""
         try:
             return self._whole_references(runner, folder)
@@ -201,8 +199,8 @@ class RigSource:
             LOG.warning("dark and white frames are taken again; %s: %s", folder, error)
             return None
 
-    def _whole_references(self, runner: CaptureRunner, folder: str) -> tuple[References, tuple[str, ...]]:
-        """Return the dark and white frames of all samples, with notes."""
+    def _whole_references(self, runner: CaptureRunner, folder: str) -> References:
+        """Return the dark and white frames of all samples."""
         frames = runner.devices.camera.references(folder, self._kept)
         missing = [kind for kind in ("dark", "white") if kind not in frames]
         if missing:
@@ -210,9 +208,9 @@ class RigSource:
                 f"{folder} on the camera holds no {' and no '.join(missing)} reference; take both with the camera's "
                 "own program, then run again"
             )
-        whole, notes = as_references(frames["dark"], frames["white"], white_reference=self.rig.white_reference)
+        whole = as_references(frames["dark"], frames["white"], white_reference=self.rig.white_reference)
         self._check_size(whole.dark.shape, folder)
-        return whole, notes
+        return whole
 
     def _read(self, runner: CaptureRunner, taken: CaptureRecord, line: int) -> Iterator[Line]:
         """Fetch a capture and yield its lines from ``line`` on; those without data or position are not valid."""

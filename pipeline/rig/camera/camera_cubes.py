@@ -151,7 +151,6 @@ class MeanFrame:
 
     mean: NDArray[np.float32]  # (sample, band) DN
     stuck: NDArray[np.bool_]  # (sample, band) the same number in every frame while the others change
-    notes: tuple[str, ...]
 
 
 def mean_frame(lines: NDArray[np.integer]) -> MeanFrame:
@@ -163,19 +162,14 @@ def mean_frame(lines: NDArray[np.integer]) -> MeanFrame:
         raise ShapeError(f"expected at least one frame (line, sample, band), got {lines.shape}; capture the reference")
     count = len(lines)
     mean = (lines.sum(axis=0, dtype=np.int64) / count).astype(np.float32)
-    stuck = (lines == lines[0]).all(axis=0)
+    stuck = lines.min(axis=0) == lines.max(axis=0)
     if count < FRAMES_FOR_STUCK or stuck.mean() > 0.5:  # most elements have some noise
         stuck = np.zeros(stuck.shape, np.bool_)
-    notes = [f"the mean of {count} frames; {np.count_nonzero(stuck)} of {stuck.size} elements are stuck"]
-    if count < FRAMES_FOR_STUCK:
-        notes.append(f"{count} frames cannot tell stuck elements; take {FRAMES_FOR_STUCK} or more")
-    return MeanFrame(mean, stuck, tuple(notes))
+    return MeanFrame(mean, stuck)
 
 
-def as_references(
-    dark: MeanFrame, white: MeanFrame, *, white_reference: ArrayLike = 1.0
-) -> tuple[References, tuple[str, ...]]:
-    """Join dark and white into the references of a sweep, and return them with notes on what was found.
+def as_references(dark: MeanFrame, white: MeanFrame, *, white_reference: ArrayLike = 1.0) -> References:
+    """Join dark and white into the references of a sweep.
 
     An element is bad where its dark frame is stuck, or `pipeline.signal.calibrate.find_bad_elements` finds it bad.
     ``white_reference`` is the value of the white reference, one or (band,). Raises RigError: the frames are of two
@@ -183,19 +177,11 @@ def as_references(
     """
     if dark.mean.shape != white.mean.shape:
         raise RigError(f"dark is {dark.mean.shape} (sample, band), white {white.mean.shape}; take both anew")
-    values = np.asarray(white_reference, np.float32)
-    if values.shape not in ((), (dark.mean.shape[1],)):
-        raise RigError(f"white_reference has shape {values.shape}, expected one or {dark.mean.shape[1]} values")
     lit = np.count_nonzero(white.mean > dark.mean) / dark.mean.size
     if lit < LEAST_LIT:
         raise RigError(
             f"white is above dark in {100 * lit:.0f} % of the elements; are they swapped, or was the lamp off?"
         )
-    bad = find_bad_elements(dark.mean, white.mean, saturated_dn=None)
-    bad |= dark.stuck
-    notes = (
-        *(f"dark: {note}" for note in dark.notes),
-        *(f"white: {note}" for note in white.notes),
-        f"bad elements: {np.count_nonzero(bad)} of {bad.size}",
-    )
-    return References(dark.mean, white.mean, np.broadcast_to(values, dark.mean.shape[1]).copy(), bad), notes
+    bad = find_bad_elements(dark.mean, white.mean, saturated_dn=None) | dark.stuck
+    values = np.broadcast_to(np.asarray(white_reference, np.float32), dark.mean.shape[1]).copy()
+    return References(dark.mean, white.mean, values, bad)

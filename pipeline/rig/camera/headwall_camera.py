@@ -17,7 +17,7 @@ from typing import Any, Self, TypeVar
 from pipeline.errors import RigError
 from pipeline.rig.camera.camera_cubes import CapturedLines, MeanFrame, Read, mean_frame, read_capture, read_references
 from pipeline.rig.camera.camera_files import Capture, Kept, Progress, RemoteFile, fetch_files
-from pipeline.rig.device_settings import CameraAddress, ControlPatience, FileServer, check_prefix
+from pipeline.rig.device_settings import CameraAddress, ControlPatience, FileServer
 from pipeline.rig.transports import (
     SYSTEM_CLOCK,
     Clock,
@@ -149,9 +149,8 @@ class HeadwallCamera:
         """Begin a capture of ``frames`` lines in one file. The command is sent once.
 
         Raises StateUnknown where no reply comes. Captures and settings are refused from then on, until a person has
-        looked at the camera and connects anew. Raises SettingsError where the prefix cannot be used.
+        looked at the camera and connects anew.
         """
-        check_prefix(prefix)
         with self._lock:
             self._check_known("capture")
             self._open()

@@ -28,7 +28,6 @@ from flows.tasks.run import make_source, open_run
 from flows.tasks.scene import open_scene
 from flows.tasks.stages.effects import chosen_effects
 from pipeline.errors import PoseError, SettingsError
-from pipeline.geometry.mirror import STRAIGHT, Mounting
 from pipeline.geometry.scan import Sweep, exposing
 from pipeline.rig.camera.camera_cubes import mean_frame
 from pipeline.rig.capture_paths import REFERENCES
@@ -73,17 +72,12 @@ def small_settings(out: Path, **changed: Any) -> Settings:
 
 @contextmanager
 def emulated(
-    settings: Settings,
-    effects: Any,
-    patch: pytest.MonkeyPatch,
-    *,
-    scene: RasterScene | None = None,
-    mounting: Mounting = STRAIGHT,
+    settings: Settings, effects: Any, patch: pytest.MonkeyPatch, *, scene: RasterScene | None = None
 ) -> Iterator[FaultyRig]:
-    """Devices of surveys are emulated ones before a scene, the settings' by default, with effects, mounted somehow."""
+    """Devices of surveys are emulated ones before a scene, the settings' by default, with effects."""
     seen = open_scene(settings)[0] if scene is None else scene
     source = replace(make_source(seen, settings), chosen=effects)
-    whole = FaultyRig(source, ManualClock(10.0), wired=settings.rig.pulses, mounting=mounting)
+    whole = FaultyRig(source, ManualClock(10.0), wired=settings.rig.pulses)
     with InProcessRig(whole) as line:
 
         def open_devices(told: Settings, *_: object) -> RigDevices:
@@ -153,39 +147,6 @@ def test_every_line_is_the_simulated_one(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 @pytest.fixture(scope="module")
-def straight(tmp_path_factory: pytest.TempPathFactory) -> tuple[Settings, Published]:
-    """A survey through a rig whose mirror is mounted straight; its raw lines stay."""
-    told = {"visit": "first", "budget": 0.5, "keep": "raw"}
-    settings = small_settings(tmp_path_factory.mktemp("straight"), source="rig", **told)
-    with pytest.MonkeyPatch.context() as patch, emulated(settings, {}, patch):
-        return settings, run_survey(settings, QUIET)
-
-
-@pytest.mark.parametrize("axes", ["y,-x"])
-def test_a_mirror_mounted_otherwise_gives_the_same_survey_once_it_is_told(
-    straight: tuple[Settings, Published], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, axes: str
-) -> None:
-    """Each line and the map are those of a straight rig; untold they are not, and telling it captures anew."""
-    usual, made = straight
-    untold = replace(usual, out=str(tmp_path / "mounted"))
-    told = replace(untold, rig=replace(usual.rig, mirror_axes=axes))
-    with emulated(usual, {}, monkeypatch, mounting=Mounting(axes)) as rig:
-        wrong = run_survey(untold, QUIET)
-        right = run_survey(told, QUIET)
-        assert coarse_captures(rig) == 2
-    expected, found, other = (
-        rows_of(Path(out), one) for out, one in ((usual.out, made), (told.out, right), (told.out, wrong))
-    )
-    assert list(found) == list(expected)
-    for name, rows in expected.items():
-        np.testing.assert_array_equal(found[name], rows, err_msg=name)
-    maps = [class_map_of(one, Path(out)) for one, out in ((made, usual.out), (right, told.out))]
-    np.testing.assert_array_equal(*maps)
-    coarse = "raw_coarse coarse-0"
-    assert (other[coarse] != expected[coarse]).mean() > 0.5
-
-
-@pytest.fixture(scope="module")
 def simulated_map(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray[Any, Any]:
     """The map of the simulated rig without effects."""
     out = tmp_path_factory.mktemp("sim")
@@ -252,6 +213,8 @@ def test_visits_are_captured_and_broken_ones_gone_on_with(tmp_path: Path, monkey
         assert coarse_captures(rig) == 2
         run_survey(replace(settings, name="west"), QUIET)  # another field of the same settings
         assert coarse_captures(rig) == 3
+        run_survey(replace(settings, rig=replace(settings.rig, mirror_axes="-x,-y")), QUIET)  # mounted otherwise
+        assert coarse_captures(rig) == 4
     assert {finding.kind for finding in verify_archive(Archive.open(tmp_path))} == {"whole"}
 
 
@@ -296,14 +259,11 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "unknown key": ({"rig.prot": "/dev/ttyUSB0"}, r"unknown setting .*prot.*did you mean 'rig.port'"),
     "unknown word": ({"rig.pulses": "some"}, r"pulses must be one of position, frame, none; got 'some'"),
     "axes that are none": ({"rig.mirror_axes": "x,x"}, r"mirror.axes must be one of x,y  x,-y .* -y,-x; got 'x,x'"),
-    "clocking as large as a turn": ({"rig.mirror_clocking_deg": 90}, r"clocking.deg must be .* -45 to 45 deg, got 90"),
-    "offset in degrees": ({"rig.mirror_offset_x": 2}, r"mirror.offset.x must be a number from -0.5 to 0.5, got 2"),
     "driver that is not there": (
         {"source": "rig", "rig.camera_driver": "nowhere:open_it"},
         r"rig.camera_driver = 'nowhere:open_it' cannot be imported .*No module named 'nowhere'",
     ),
     "port number": ({"rig.control_port": 0}, r"control.port must be a whole number from 1 to 65535, got 0"),
-    "settling in ms": ({"rig.settle_s": 200}, r"settle.s must be a number from 0.01 to 60 s, got 200"),
     "no such source": ({"source": "rigg"}, r"source must be one of auto, sim, rig, raster, recorded; got 'rigg'"),
     "memory too large": ({"source": "rig", "cost.vector_pairs": 9000}, r"cost.vector_pairs = 9000: .* 2 to 8191 pairs"),
     "field without size": (

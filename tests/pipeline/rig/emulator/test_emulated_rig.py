@@ -107,17 +107,6 @@ def test_a_capture_that_announces_nothing_is_seen_at_its_place() -> None:
         np.testing.assert_array_equal(pair.lines(folder), np.concatenate([at_rest, at_rest]))
 
 
-def test_other_times_are_those_of_the_camera() -> None:
-    """A camera that is told half of the exposure gives the lines of a rig with that camera."""
-    half = replace(CAMERA, exposure_ms=CAMERA.exposure_ms / 2)
-    source = small_source()
-    with connected() as (pair, _):
-        pair.camera.configure(half.exposure_ms, half.frame_ms)
-        folder = pair.play(FINE)
-        told = replace(source, rig=replace(source.rig, camera=half))
-        np.testing.assert_array_equal(pair.lines(folder), planned(FINE, range(FINE.lines), told))
-
-
 def test_frames_that_wait_to_be_looked_at_keep_the_camera_busy() -> None:
     """Behind ports a thread looks; until it has, the capture is not over and its files are not whole."""
     with connected() as (pair, rig):
@@ -161,14 +150,6 @@ def served(speed: float) -> Iterator[tuple[Pair, EmulatedRig]]:
         camera = HeadwallCamera.at(CameraAddress(ports.host, ports.camera_port), files)
         stack.callback(camera.close)
         yield Pair(mirror, camera, SYSTEM_CLOCK), rig
-
-
-def test_same_lines_come_through_ports() -> None:
-    """Through a real pty and real sockets, forty times as fast, by pulses."""
-    with served(40.0) as (pair, _):
-        for sweep in (FINE, COARSE):
-            folder = pair.play(sweep)
-            np.testing.assert_array_equal(pair.lines(folder), planned(sweep, range(sweep.lines)))
 
 
 def test_closing_leaves_nothing() -> None:

@@ -25,7 +25,6 @@ from pipeline.rig.pro_mode import (
     ask_status,
     cell_int,
     encode,
-    float_cell,
     format_error,
     get_value,
     get_vector,
@@ -83,14 +82,6 @@ def test_reading_undoes_writing(frame: Frame):
     found = FrameReader().feed(data)
     assert found == [frame]
     assert found[0].crc_good
-
-
-@given(st.lists(frames, max_size=5), st.lists(st.integers(0, 1000), max_size=20))
-def test_how_a_stream_is_cut_changes_nothing(sent: list[Frame], cuts: list[int]):
-    """Split and merged input give the same frames."""
-    stream = b"".join(map(encode, sent))
-    reader = FrameReader()
-    assert [found for part in parts(stream, cuts) for found in reader.feed(part)] == sent
 
 
 @given(st.binary(max_size=400), st.lists(st.integers(0, 1000), max_size=20))
@@ -190,17 +181,6 @@ def test_forms_are_these_bytes(frame: Frame, data: str):
     """Every request and reply is these bytes, and these bytes are it."""
     assert encode(frame) == bytes.fromhex(data)
     assert FrameReader().feed(bytes.fromhex(data)) == [frame]
-
-
-@given(
-    st.dictionaries(
-        st.integers(0, 0xFFFF), st.one_of(st.floats(width=32), st.integers(0, 2**32 - 1)), min_size=1, max_size=8
-    )
-)
-def test_registers_come_back(values: dict[int, float | int]):
-    """What is set in several registers is what the device reads, in order."""
-    cells = {number: int_cell(one) if isinstance(one, int) else float_cell(one) for number, one in values.items()}
-    assert read_registers(set_values(values).payload) == cells
 
 
 @pytest.mark.parametrize(
