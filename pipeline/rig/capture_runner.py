@@ -164,7 +164,6 @@ class CaptureRunner:
     def __init__(
         self,
         devices: RigDevices,
-        kept: Kept,
         journal: CaptureJournal,
         camera: LineCamera,
         rig: SurveyRig,
@@ -172,8 +171,7 @@ class CaptureRunner:
         say: Say = say_nothing,
     ) -> None:
         self.devices = devices
-        self._kept, self._journal = kept, journal
-        self._camera, self._rig, self._say = camera, rig, say
+        self._journal, self._camera, self._rig, self._say = journal, camera, rig, say
         self._times_ms: tuple[float, float] | None = None  # exposure and frame period that the camera has
 
     def take(self, path: CapturePath) -> CaptureRecord:

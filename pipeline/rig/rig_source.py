@@ -126,7 +126,7 @@ class RigSource:
             raise StateUnknown(f"the rig gets no further command: {self._unknown[0]}; look at it, then run again")
         devices = self._open()
         try:
-            self._runner = CaptureRunner(devices, self._kept, self._journal, self.camera, self.rig, say=self._say)
+            self._runner = CaptureRunner(devices, self._journal, self.camera, self.rig, say=self._say)
             yield self._runner
         except StateUnknown as error:
             self._unknown.append(str(error))
