@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from flows.tasks.prefect_tasks import Observer, current_observer, inside_flow
-from flows.tasks.rig_lock import rig_to_oneself
 from flows.tasks.run import SurveyRun, now
 from flows.tasks.stage import Stage
 from flows.tasks.stages.accuracy import evaluate
@@ -28,8 +27,11 @@ from storage.archive.staging import bytes_below
 
 if TYPE_CHECKING:
     import prefect.concurrency.sync as prefect_concurrency
+
+    import flows.tasks.rig_field as rig_field
 else:
     prefect_concurrency = deferred("prefect.concurrency.sync")
+    rig_field = deferred("flows.tasks.rig_field")
 
 RIG_LIMIT = "rig"  # Prefect's global concurrency limit, where the server has one of that name
 OF_THE_SURVEY = (
@@ -130,7 +132,7 @@ class OpenSurvey:
             if captures and self.run.settings.source == "rig" and self.capture_deployment is None:
                 if inside_flow():
                     held.enter_context(prefect_concurrency.concurrency(RIG_LIMIT, occupy=1, lease_duration=60))
-                held.enter_context(rig_to_oneself(self.run.settings.rig.port, f"a survey of {self.run.name}"))
+                held.enter_context(rig_field.rig_to_oneself(self.run.settings.rig.port))
             held.enter_context(self.run.archive.in_use())
             held.enter_context(self.run.settings.pool.open())
             yield

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import errno
+import hashlib
+import os
+import socket
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from flows.settings.survey_settings import RIG, Settings
 from flows.tasks.scene import FieldSource
+from pipeline.errors import RigError
 from pipeline.geometry.mirror import STRAIGHT
 from pipeline.geometry.scan import Sweep, exposing, sweep_positions
 from pipeline.rig import drivers
 from pipeline.rig.camera.camera_files import KeptInMemory
-from pipeline.rig.capture.rig_source import RigSource
-from pipeline.rig.device_settings import CameraLimits, check_times
+from pipeline.rig.device_settings import check_times
 from pipeline.rig.drivers import RigDevices
+from pipeline.rig.rig_source import RigSource
 from pipeline.rig.transports import SYSTEM_CLOCK, Clock
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.source import Source
@@ -56,7 +61,7 @@ def rig_field(scene: RasterScene, settings: Settings, planned: Sequence[Sweep]) 
     drivers.import_factory(rig, "mirror_driver")
     drivers.import_factory(rig, "camera_driver")
     for exposed in {exposing(camera, sweep) for sweep in planned} | {camera}:
-        check_times(exposed.exposure_ms, exposed.frame_ms, CameraLimits(most_rate_hz=camera.max_rate_hz))
+        check_times(exposed.exposure_ms, exposed.frame_ms, camera.max_rate_hz)
     if rig.mounting != STRAIGHT:
         for sweep in planned:
             rig.mounting.to_device(sweep_positions(sweep, camera))
@@ -72,7 +77,30 @@ def rig_field(scene: RasterScene, settings: Settings, planned: Sequence[Sweep]) 
     return RigField(source)
 
 
+@contextmanager
+def rig_to_oneself(port: str) -> Iterator[None]:
+    """Lock the rig at a port for the block; the same rig for all names of one device.
+
+    The lock is an abstract socket of Linux (unix(7)): it needs no file, is the same for all users of the machine, and
+    the kernel releases it when the process ends. Drivers also lock a serial port itself. Raises RigError: another
+    survey has the lock, or the kernel does not support it.
+    """
+    device = os.path.realpath(port) if port.startswith("/") else port.lower()
+    name = f"\0spectralzoom-rig-{hashlib.sha256(device.encode()).hexdigest()[:32]}"
+    with ExitStack() as held:
+        try:
+            held.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)).bind(name.encode())
+        except OSError as error:
+            if error.errno == errno.EADDRINUSE:
+                raise RigError(
+                    f"the rig at {port} is in use by another survey; wait until that has ended, or end it"
+                ) from error
+            raise RigError(
+                f"cannot lock the rig at {port}: {error.strerror}; surveys of a rig need Linux's abstract sockets"
+            ) from error
+        yield
+
+
 def open_devices(settings: Settings, clock: Clock = SYSTEM_CLOCK) -> RigDevices:
     """Connect to mirror and camera, as `pipeline.rig.drivers.open_devices` does. Nothing moves."""
-    limits = CameraLimits(most_rate_hz=settings.camera.max_rate_hz)
-    return drivers.open_devices(settings.rig, settings.cost.vector_pairs, limits, clock)
+    return drivers.open_devices(settings.rig, settings.cost.vector_pairs, clock)

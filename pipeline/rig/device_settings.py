@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
 import re
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Literal
 
 from pipeline.errors import SettingsError
-from pipeline.geometry.mirror import STRAIGHT, Axes, Mounting
-from pipeline.geometry.scan import CostModel, Ends
-from pipeline.setting_fields import assumed, check_stated, stated
+from pipeline.geometry.mirror import Axes, Mounting
+from pipeline.geometry.scan import Ends
+from pipeline.setting_fields import assumed, stated
 
 ReadBack = Literal["none", "sampled", "all"]
 Pulses = Literal["position", "frame", "none"]
@@ -53,46 +52,27 @@ class FileServer:
         return f"the camera's file server {self.host}:{self.port}"
 
 
-@dataclass(frozen=True)
-class CameraLimits:
-    """Limits of the camera, checked before a command is sent; assumed, from a data sheet."""
-
-    most_rate_hz: float = 350.0
-
-
 LEAST_EXPOSURE_MS, MOST_PERIOD_MS = 0.5, 10_000.0  # assumed, from a data sheet
 
 
-def check_times(exposure_ms: float, frame_period_ms: float, limits: CameraLimits) -> None:
+def check_times(exposure_ms: float, frame_period_ms: float, most_rate_hz: float) -> None:
     """Raise SettingsError for times that are too short (in seconds?), too long, or do not fit each other."""
-    least_period_ms = 1000 / limits.most_rate_hz * (1 - 1e-6)
-    for name, value_ms, least_ms in (
-        ("exposure", exposure_ms, LEAST_EXPOSURE_MS),
-        ("frame period", frame_period_ms, least_period_ms),
-    ):
-        if not math.isfinite(value_ms) or value_ms <= 0:
-            raise SettingsError(f"expected {name} above 0 ms, got {value_ms!r}; correct it")
-        if value_ms < least_ms:
-            raise SettingsError(
-                f"{name} {value_ms:g} ms is below {least_ms:.4g} ms; it is given in ms: {value_ms:g} s would be "
-                f"{value_ms * 1000:g}"
-            )
-        if value_ms > MOST_PERIOD_MS:
-            raise SettingsError(
-                f"{name} {value_ms:g} ms is above {MOST_PERIOD_MS:g} ms; it is given in ms: {value_ms:g} us "
-                f"would be {value_ms / 1000:g}"
-            )
-    if exposure_ms > frame_period_ms:
+    least_ms = 1000 / most_rate_hz * (1 - 1e-6)
+    if not least_ms <= frame_period_ms <= MOST_PERIOD_MS:
         raise SettingsError(
-            f"an exposure of {exposure_ms:g} ms does not fit a frame period of {frame_period_ms:g} ms; "
-            f"take a period of at least {exposure_ms:g} ms"
+            f"frame period {frame_period_ms:g} ms, expected {least_ms:.4g} to {MOST_PERIOD_MS:g} ms; times are in ms"
+        )
+    if not LEAST_EXPOSURE_MS <= exposure_ms <= frame_period_ms:
+        raise SettingsError(
+            f"exposure {exposure_ms:g} ms, expected {LEAST_EXPOSURE_MS:g} ms up to the frame period of "
+            f"{frame_period_ms:g} ms; times are in ms"
         )
 
 
 def check_prefix(prefix: str) -> None:
     """Raise SettingsError for a prefix that cannot be part of a folder's name."""
-    if not re.fullmatch(r"[A-Za-z0-9_-]{0,64}", prefix):
-        raise SettingsError(f"a prefix names a folder: expected up to 64 letters, digits, - and _, got {prefix!r}")
+    if not re.fullmatch(r"[A-Za-z0-9_-]{0,128}", prefix):
+        raise SettingsError(f"a prefix names a folder: expected up to 128 letters, digits, - and _, got {prefix!r}")
 
 
 @dataclass(frozen=True)
@@ -105,8 +85,12 @@ class Patience:
 
 
 @dataclass(frozen=True)
-class MirrorLink:
-    """Settings of the link to the mirror controller."""
+class SurveyRig:
+    """The table [rig] of a survey: both devices, the cable between them, and the white reference.
+
+    The drivers follow the documented protocols and were tested against emulators; they never ran on hardware.
+    ``provenance`` says which of the assumed values are confirmed.
+    """
 
     port: str = stated("/dev/ttyACM0", "Port of the mirror controller; or socket://host:port")
     # public software opens 115200
@@ -119,7 +103,7 @@ class MirrorLink:
     )
     retries: int = stated(Patience.retries, "Repetitions of a request that only reads", "", 0, 20)
     quiet_s: float = assumed(Patience.quiet_s, "Silence after which a late answer is given up", "s", 0, 5)
-    with_crc: bool = assumed(False, "Requests carry a CRC; `rig check` tries both")
+    with_crc: bool = assumed(False, "Requests carry a CRC")
     strict_crc: bool = stated(False, "Refuse replies whose CRC does not fit; the default is a warning")
     ends: Ends = assumed("exclusive", "Whether the mirror's index ranges include their end")  # erratum E14
     read_back: ReadBack = stated("sampled", "Part of a path that is read back and compared")
@@ -127,33 +111,6 @@ class MirrorLink:
         10000.0, "Highest rate of measured positions; without pulses they place the lines", "Hz", 0.1, 10_000
     )
     log_samples: int = assumed(2000, "Samples that the controller's log holds", "", 1, 16_383)  # not published
-
-
-@dataclass(frozen=True)
-class MirrorSettings(MirrorLink):
-    """Settings of the mirror controller and assumptions on it; ``provenance`` names who confirmed them."""
-
-    vector_pairs: int = stated(CostModel.vector_pairs, "Positions that its memory holds", "", 1, MOST_PAIRS)
-    provenance: str = "assumed"
-    mounting: Mounting = STRAIGHT
-
-    def __post_init__(self) -> None:
-        check_stated(self, "mirror")
-
-    @property
-    def patience(self) -> Patience:
-        """Return deadline, retries and quiet time of transactions."""
-        return Patience(self.deadline_s, self.retries, self.quiet_s)
-
-
-@dataclass(frozen=True)
-class SurveyRig(MirrorLink):
-    """The table [rig] of a survey: both devices, the cable between them, and the white reference.
-
-    The drivers follow the documented protocols and were tested against emulators; they never ran on hardware.
-    ``provenance`` says which of the assumed values are confirmed.
-    """
-
     mirror_driver: str = stated(
         "",
         "Driver of a mirror of another make, as module:function; by default that of the MR-E-2",
@@ -193,11 +150,6 @@ class SurveyRig(MirrorLink):
     white_reference: float = stated(1.0, "Value of the white reference", "", 1e-6, 1e6)
     white_at_rest: bool = stated(True, "The white frame was taken through the mirror at 0; 0")
     provenance: str = stated("assumed", "Person who confirmed the assumed values")
-
-    def mirror(self, vector_pairs: int) -> MirrorSettings:
-        """Return the settings of the mirror's driver; SettingsError where they are out of range."""
-        link = {item.name: getattr(self, item.name) for item in fields(MirrorLink)}
-        return MirrorSettings(**link, vector_pairs=vector_pairs, provenance=self.provenance, mounting=self.mounting)
 
     @property
     def mounting(self) -> Mounting:

@@ -7,7 +7,6 @@ import path. Times are those of the clock that a driver was opened with. Every m
 
 from __future__ import annotations
 
-import inspect
 import logging
 import pkgutil
 from collections.abc import Callable
@@ -19,16 +18,14 @@ from numpy.typing import ArrayLike
 
 from pipeline.errors import RigError, SettingsError
 from pipeline.rig.camera.camera_cubes import CapturedLines, MeanFrame
-from pipeline.rig.camera.camera_files import Capture, FrameClaim, Kept
-from pipeline.rig.camera.camera_files import Progress as FetchProgress
+from pipeline.rig.camera.camera_files import Capture, Kept, Progress
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
-from pipeline.rig.device_settings import CameraLimits, SurveyRig
-from pipeline.rig.mirror.mirror_controller import MotionLog, open_mirror
-from pipeline.rig.mirror.mirror_controller import Progress as LoadProgress
-from pipeline.rig.mirror.pro_mode import Trigger
+from pipeline.rig.device_settings import SurveyRig
+from pipeline.rig.mirror_controller import MotionLog, open_mirror
+from pipeline.rig.pro_mode import Trigger
 from pipeline.rig.transports import SYSTEM_CLOCK, Clock
 
-__all__ = ["CameraDriver", "Capture", "FrameClaim", "MirrorDriver", "RigDevices", "open_devices"]
+__all__ = ["CameraDriver", "Capture", "MirrorDriver", "RigDevices", "open_devices"]
 LOG = logging.getLogger(__name__)
 
 
@@ -56,13 +53,8 @@ class MirrorDriver(Protocol):
         RigError : it is not at rest by then, or not where it was sent.
         """
 
-    def load_path(self, positions: ArrayLike, *, progress: LoadProgress | None = None) -> None:
-        """Store positions (position, 2) for `run`. Nothing moves.
-
-        Parameters
-        ----------
-        progress
-            Called with cells done and cells in all; cells are X and Y of each position.
+    def load_path(self, positions: ArrayLike) -> None:
+        """Store positions (position, 2) for `run`. Nothing moves; a path that plays is halted.
 
         Raises
         ------
@@ -70,8 +62,8 @@ class MirrorDriver(Protocol):
         SettingsError : the device holds fewer positions.
         """
 
-    def run(self, first: int, stop: int, rate_hz: float, cycles: int = 1, trigger: Trigger = Trigger.OFF) -> None:
-        """Play the loaded positions ``first`` to ``stop``, half open, ``cycles`` times.
+    def run(self, rate_hz: float, trigger: Trigger = Trigger.OFF) -> None:
+        """Play the loaded positions once.
 
         Parameters
         ----------
@@ -123,7 +115,7 @@ class CameraDriver(Protocol):
         Parameters
         ----------
         prefix
-            Up to 64 letters, digits, - and _ that the capture's name begins with. ``references`` asks for dark and
+            Up to 128 letters, digits, - and _ that the capture's name begins with. ``references`` asks for dark and
             white frames beside it, see `references`.
 
         Raises
@@ -134,12 +126,10 @@ class CameraDriver(Protocol):
     def is_capturing(self) -> bool:
         """Return whether a capture runs, or is still being written."""
 
-    def stop(self) -> bool:
-        """End a capture; return False where none ran."""
+    def stop(self) -> None:
+        """End a capture, if one runs."""
 
-    def fetch(
-        self, folder: str, kept: Kept, progress: FetchProgress | None = None, *, claim: FrameClaim | None = None
-    ) -> CapturedLines:
+    def fetch(self, folder: str, kept: Kept, progress: Progress | None = None) -> CapturedLines:
         """Return a finished capture's lines (line, sample, band) uint16, with their frames' numbers and stamps [us].
 
         Parameters
@@ -150,16 +140,14 @@ class CameraDriver(Protocol):
             Where a driver may keep what it fetches, so that a later call continues.
         progress
             Called with a file's name, bytes held and bytes in all.
-        claim
-            The size that the capture can have.
 
         Raises
         ------
-        RigError : the capture still runs, is damaged, or is larger than ``claim``.
+        RigError : the capture still runs, or is damaged.
         DeviceRefused : the camera does not have it any more.
         """
 
-    def references(self, folder: str, kept: Kept, *, claim: FrameClaim | None = None) -> dict[str, MeanFrame]:
+    def references(self, folder: str, kept: Kept) -> dict[str, MeanFrame]:
         """Return the mean frames (sample, band) beside a capture, by ``dark`` and ``white``; empty without any."""
 
     def close(self) -> None:
@@ -188,7 +176,7 @@ Factory = Callable[[SurveyRig, Clock], Any]
 _PROTOCOLS: dict[Setting, type] = {"mirror_driver": MirrorDriver, "camera_driver": CameraDriver}
 
 
-def open_devices(rig: SurveyRig, vector_pairs: int, limits: CameraLimits, clock: Clock = SYSTEM_CLOCK) -> RigDevices:
+def open_devices(rig: SurveyRig, vector_pairs: int, clock: Clock = SYSTEM_CLOCK) -> RigDevices:
     """Connect to mirror and camera. Nothing moves.
 
     Raises
@@ -199,31 +187,29 @@ def open_devices(rig: SurveyRig, vector_pairs: int, limits: CameraLimits, clock:
     RigError : another device answers.
     """
     with ExitStack() as opened:
-        mirror = open_mirror_driver(rig, vector_pairs, clock, known=True)
+        mirror = open_mirror_driver(rig, vector_pairs, clock)
         opened.callback(mirror.close)
-        camera = open_camera_driver(rig, limits, clock)
+        camera = open_camera_driver(rig, clock)
         opened.callback(camera.close)
         camera.is_capturing()
         opened.pop_all()
     return RigDevices(mirror, camera, clock)
 
 
-def open_mirror_driver(
-    rig: SurveyRig, vector_pairs: int, clock: Clock = SYSTEM_CLOCK, *, known: bool = False
-) -> MirrorDriver:
-    """Connect to the mirror, as `open_devices`; ``known`` refuses models that the shipped driver does not know."""
+def open_mirror_driver(rig: SurveyRig, vector_pairs: int, clock: Clock = SYSTEM_CLOCK) -> MirrorDriver:
+    """Connect to the mirror, as `open_devices`."""
     factory = import_factory(rig, "mirror_driver")
     if factory is None:
-        return open_mirror(rig.mirror(vector_pairs), clock, known=known)
-    return cast("MirrorDriver", _checked(rig, "mirror_driver", factory(rig, clock)))
+        return open_mirror(rig, vector_pairs, clock)
+    return cast("MirrorDriver", _opened(factory, rig, "mirror_driver", clock))
 
 
-def open_camera_driver(rig: SurveyRig, limits: CameraLimits, clock: Clock = SYSTEM_CLOCK) -> CameraDriver:
+def open_camera_driver(rig: SurveyRig, clock: Clock = SYSTEM_CLOCK) -> CameraDriver:
     """Return the camera's driver; raises as `open_devices`. The shipped one connects at its first command."""
     factory = import_factory(rig, "camera_driver")
     if factory is None:
-        return HeadwallCamera.at(rig.camera, rig.files, limits=limits, clock=clock)
-    return cast("CameraDriver", _checked(rig, "camera_driver", factory(rig, clock)))
+        return HeadwallCamera.at(rig.camera, rig.files, clock=clock)
+    return cast("CameraDriver", _opened(factory, rig, "camera_driver", clock))
 
 
 def import_factory(rig: SurveyRig, setting: Setting) -> Factory | None:
@@ -231,36 +217,33 @@ def import_factory(rig: SurveyRig, setting: Setting) -> Factory | None:
 
     Raises
     ------
-    SettingsError : it cannot be imported, or does not take the table [rig] and a clock.
+    SettingsError : it cannot be imported.
     """
     name: str = getattr(rig, setting)
-    if not name:
-        return None
     try:
-        factory = pkgutil.resolve_name(name)
+        return cast("Factory", pkgutil.resolve_name(name)) if name else None
     except Exception as error:  # whatever the module of another make does as it is imported
         raise SettingsError(
             f"rig.{setting} = {name!r} cannot be imported ({type(error).__name__}: {error}). Expected module:function "
             "of a package that is installed or of a file in a folder of PYTHONPATH"
         ) from error
+
+
+def _opened(factory: Factory, rig: SurveyRig, setting: Setting, clock: Clock) -> object:
+    """Return what the function opens, where it has every method of its protocol."""
+    protocol, name = _PROTOCOLS[setting], getattr(rig, setting)
     try:
-        inspect.signature(factory).bind(rig, SYSTEM_CLOCK)
+        device = factory(rig, clock)
     except TypeError as error:
         raise SettingsError(
             f"rig.{setting} = {name!r} does not open a driver ({error}). Expected a function of the table [rig] and a "
             "clock"
         ) from error
-    return cast("Factory", factory)
-
-
-def _checked(rig: SurveyRig, setting: Setting, device: object) -> object:
-    """Return the device where it has every method of its protocol."""
-    protocol = _PROTOCOLS[setting]
-    methods = [name for name in vars(protocol) if not name.startswith("_")]
-    missing = [name for name in methods if not callable(getattr(device, name, None))]
+    methods = [method for method in vars(protocol) if not method.startswith("_")]
+    missing = [method for method in methods if not callable(getattr(device, method, None))]
     if missing:
         raise SettingsError(
-            f"rig.{setting} = {getattr(rig, setting)!r} gives a {type(device).__name__} without {', '.join(missing)}. "
-            f"Expected every method of {protocol.__name__} in {protocol.__module__}"
+            f"rig.{setting} = {name!r} gives a {type(device).__name__} without {', '.join(missing)}. Expected every "
+            f"method of {protocol.__name__} in {protocol.__module__}"
         )
     return device

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import logging
 import math
 import socket
@@ -66,23 +65,15 @@ class DeviceGone(RigError):  # noqa: N818 - the name states the case
 
 
 class DeadlinePassed(RigError):  # noqa: N818 - the name states the case
-    """A device did not answer in time, and nothing can have moved; ``silent``: not a byte came."""
-
-    def __init__(self, message: str, *, silent: bool = False) -> None:
-        super().__init__(message)
-        self.silent = silent
+    """A device did not answer in time, and nothing can have moved."""
 
 
 class DeviceRefused(RigError):  # noqa: N818 - the name states the case
-    """A device refused a request; ``code`` is its error code.
+    """A device refused a request; ``code`` is its error code."""
 
-    ``garbled``: the request arrived damaged, so that one which only reads may be sent again.
-    """
-
-    def __init__(self, message: str, code: int | None = None, *, garbled: bool = False) -> None:
+    def __init__(self, message: str, code: int | None = None) -> None:
         super().__init__(message)
         self.code = code
-        self.garbled = garbled
 
 
 class StateUnknown(RigError):  # noqa: N818 - the name states the case
@@ -93,16 +84,13 @@ class NotKept(RigError):  # noqa: N818 - the name states the case
     """The disk cannot store what a device sent. The device still has it."""
 
 
-USB_ID = (0x0483, 0xA31E)  # vendor and product of the mirror controller
 _SLICE_S = 0.02  # reads wait in slices, so a deadline may be exceeded by one
 _WRITE_S = 0.25  # a frame takes 10 ms at 115200
-_MOST_DRAINED = 1 << 16  # bytes; over TCP 16 times as many
+_MOST_DRAINED = 1 << 20  # bytes
 LOG = logging.getLogger(__name__)
 BITS_PER_BYTE = 10  # a start bit, eight of data, a stop bit
 
-# a greeting is a read that a device in another mode does not answer; another program may have left bytes before it
-Kind = Literal["greeting", "read", "write", "motion"]
-_READS = ("greeting", "read")
+Kind = Literal["read", "write", "motion"]
 Answer = TypeVar("Answer")
 # takes bytes as they come and returns the answer once it is complete
 Receiver = Callable[[bytes], Answer | None]
@@ -136,6 +124,17 @@ def _check_time(left_s: float, data: bytes, port: str) -> None:
         raise DeadlinePassed(f"no time was left to send {len(data)} bytes to {port}; give a longer deadline")
 
 
+@contextmanager
+def _errors(port: str) -> Iterator[None]:
+    """Raise the errors of an open port as DeviceGone."""
+    try:
+        yield
+    except RigError:
+        raise
+    except (SerialException, OSError, TypeError) as error:
+        raise DeviceGone(f"{port} went away ({error}); look at the cable and the power, then run again") from error
+
+
 class SerialTransport:
     """A :class:`Transport` over a serial port, held exclusively, or an address of pyserial (``socket://host:port``).
 
@@ -151,7 +150,11 @@ class SerialTransport:
                 port, baudrate=baud, timeout=_SLICE_S, write_timeout=_WRITE_S, exclusive=True
             )
         except SerialException as error:
-            raise DeviceGone(_why_not(port, error)) from error
+            there = ", ".join(sorted(one.device for one in list_ports.comports())) or "none"
+            raise DeviceGone(
+                f"{port} cannot be opened ({error}), ports of this machine: {there}; is it a serial port, the "
+                "controller on, no other program at it, and this user in its group (mostly dialout)?"
+            ) from error
         except (ValueError, OverflowError) as error:
             raise SettingsError(
                 f"expected a port's name or an address that pyserial knows, and a speed, got {port!r} at {baud!r}: "
@@ -161,7 +164,7 @@ class SerialTransport:
     def write(self, data: bytes, deadline: float) -> None:
         """Send all bytes, in the longest time that a port takes; DeadlinePassed where it takes longer."""
         _check_time(deadline - self._clock.now(), data, self.port)
-        with self._errors():
+        with _errors(self.port):
             try:
                 self._serial.write(data)
             except SerialTimeoutException:
@@ -171,7 +174,7 @@ class SerialTransport:
 
     def read(self, at_most: int, deadline: float) -> bytes:
         """Wait for a first byte until the deadline, and return what is there, ``at_most`` at most."""
-        with self._errors():
+        with _errors(self.port):
             while self._clock.now() < deadline:
                 first: bytes = self._serial.read(1)
                 if first:
@@ -182,7 +185,7 @@ class SerialTransport:
     def drain(self) -> bytes:
         """Return what is there already, at most `_MOST_DRAINED` bytes: a port may never fall silent."""
         drained = b""
-        with self._errors():
+        with _errors(self.port):
             while len(drained) < _MOST_DRAINED and (there := self._serial.in_waiting):
                 drained += self._serial.read(there)
         return drained
@@ -190,55 +193,19 @@ class SerialTransport:
     def close(self) -> None:
         self._serial.close()
 
-    @contextmanager
-    def _errors(self) -> Iterator[None]:
-        """Raise the errors of pyserial as DeviceGone."""
-        try:
-            yield
-        except RigError:
-            raise
-        except (SerialException, OSError, TypeError) as error:
-            raise DeviceGone(
-                f"{self.port} went away ({error}); look at the cable and the power, then connect again"
-            ) from error
-
-
-def _why_not(port: str, error: OSError) -> str:
-    """Return why a port cannot be opened, and what to do."""
-    if error.errno in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
-        ports = list(list_ports.comports())
-        mirrors = [one.device for one in ports if (one.vid, one.pid) == USB_ID]
-        if mirrors:
-            what = f"a mirror controller is at {', '.join(mirrors)}: set the port to that"
-        elif ports:
-            what = f"there are {', '.join(sorted(one.device for one in ports))}; is the controller on?"
-        else:
-            what = "this machine has no serial port: is the controller on, and its cable in?"
-        return f"there is no port {port}; {what}"
-    if error.errno in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK):
-        return f"{port} is in use by another program; close that, since two would mix their motions"
-    if error.errno in (errno.EACCES, errno.EPERM):
-        return f"no permission for {port}; add this user to the port's group (mostly dialout), then log in again"
-    return f"{port} cannot be opened: {error}; is it a serial port, and the device on?"
-
 
 class SocketTransport:
-    """A :class:`Transport` to ``host:port``; SettingsError where that cannot be, DeviceGone where no device answers."""
+    """A :class:`Transport` to ``host:port``; DeviceGone where no device answers."""
 
     def __init__(self, host: str, port: int, clock: Clock = SYSTEM_CLOCK, *, connect_s: float = 3.0) -> None:
-        if not host or not 0 < port < 65536:
-            raise SettingsError(f"expected a host and a port from 1 to 65535, got {host!r} and {port!r}; correct them")
         self.port = f"{host}:{port}"
         self._clock = clock
         try:
             self._socket = socket.create_connection((host, port), timeout=connect_s)
         except (OSError, UnicodeError) as error:
-            timed_out = isinstance(error, TimeoutError)
-            reason = str(getattr(error, "strerror", None) or error).lower()
-            why = f"nothing answered within {connect_s:g} s" if timed_out else reason
             raise DeviceGone(
-                f"no connection to {self.port}: {why}; is the camera on, its network cable in, and this machine's "
-                "address in its network?"
+                f"no connection to {self.port} within {connect_s:g} s ({error}); is the camera on, its network cable "
+                "in, and this machine's address in its network?"
             ) from error
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
@@ -246,7 +213,7 @@ class SocketTransport:
         """Send all bytes before the deadline; DeadlinePassed where the other end did not take them."""
         left_s = deadline - self._clock.now()
         _check_time(left_s, data, self.port)
-        with self._errors():
+        with _errors(self.port):
             self._socket.settimeout(left_s)
             try:
                 self._socket.sendall(data)
@@ -260,7 +227,7 @@ class SocketTransport:
         left_s = deadline - self._clock.now()
         if left_s <= 0:
             return b""
-        with self._errors():
+        with _errors(self.port):
             self._socket.settimeout(max(left_s, 1e-3))
             try:
                 return self._received(at_most)
@@ -272,8 +239,8 @@ class SocketTransport:
         """Return what is there already, a limited number of bytes: a sender may never fall silent."""
         drained = b""
         self._socket.setblocking(False)
-        with self._errors(), suppress(BlockingIOError):
-            while len(drained) < 16 * _MOST_DRAINED:
+        with _errors(self.port), suppress(BlockingIOError):
+            while len(drained) < _MOST_DRAINED:
                 drained += self._received(65536)
         return drained
 
@@ -285,18 +252,6 @@ class SocketTransport:
         if not data:
             raise OSError("closed by the other end")
         return data
-
-    @contextmanager
-    def _errors(self) -> Iterator[None]:
-        """Raise the errors of the socket as DeviceGone."""
-        try:
-            yield
-        except RigError:
-            raise
-        except OSError as error:
-            raise DeviceGone(
-                f"the connection to {self.port} was lost ({error}); look at the cable and the power"
-            ) from error
 
 
 class Wire:
@@ -329,33 +284,30 @@ class Wire:
         with self.lock:
             if kind == "motion":
                 self.check_known(name)
-            self._empty_line(f"before {name}", level=logging.INFO if kind == "greeting" else logging.WARNING)
+            self._empty_line(f"before {name}")
             deadline = self.clock.now() + self.patience.deadline_s
-            left = 1 + (self.patience.retries if kind in _READS else 0)
+            left = 1 + (self.patience.retries if kind == "read" else 0)
             while True:
                 silence_s = (deadline - self.clock.now()) / left
                 try:
                     return self._once(data, name, receiver(), silence_s, deadline)
-                except RigError as error:
+                except BaseException as error:  # an interrupted caller does not know either
                     if kind == "motion" and not isinstance(error, DeviceRefused):
                         self.unknown = f"{name} was sent and not acknowledged"
-                        raise StateUnknown(
-                            f"{name} was sent to {self.port} and may have happened or not: {error}. It is not sent "
-                            "again, and all motions are refused. Look at the mirror, then run again, which connects "
-                            "anew"
-                        ) from error
+                        if isinstance(error, RigError):
+                            raise StateUnknown(
+                                f"{name} was sent to {self.port} and may have happened or not: {error}. It is not sent "
+                                "again, and all motions are refused. Look at the mirror, then run again, which "
+                                "connects anew"
+                            ) from error
                     left -= 1
-                    again = error.garbled if isinstance(error, DeviceRefused) else not isinstance(error, DeviceGone)
+                    again = isinstance(error, RigError) and not isinstance(error, DeviceGone | DeviceRefused)
                     if left == 0 or not again:
                         raise
-                    usual = kind == "greeting" and isinstance(error, DeadlinePassed) and error.silent
-                    LOG.log(logging.INFO if usual else logging.WARNING, "%s; asking again", error)
+                    LOG.info("%s; asking again", error)
                     self._empty_line("before asking again", deadline)
                     if self.clock.now() >= deadline:
                         raise
-                except BaseException:  # an interrupted caller does not know either
-                    self.unknown = f"{name} was interrupted" if kind == "motion" else self.unknown
-                    raise
 
     def _once(self, data: bytes, name: str, receiver: Receiver[Answer], silence_s: float, deadline: float) -> Answer:
         """Send once, and wait until the device has been silent for ``silence_s``, at most to the deadline."""
@@ -379,11 +331,10 @@ class Wire:
         found = f"{len(came)} other bytes came: {came[:32].hex(' ')}" if came else "nothing came"
         raise DeadlinePassed(
             f"no answer to {name} from {self.port} within {self.clock.now() - began:.3g} s ({found}); is the "
-            f"controller on, its cable in, and the port's speed right?",
-            silent=not came,
+            f"controller on, its cable in, and the port's speed right?"
         )
 
-    def _empty_line(self, when: str, latest: float = math.inf, *, level: int = logging.WARNING) -> None:
+    def _empty_line(self, when: str, latest: float = math.inf) -> None:
         """Drop what is on the line. If an answer may still come, wait for silence: it would pass for the next one."""
         stale = self.transport.drain()
         now = self.clock.now()
@@ -394,7 +345,7 @@ class Wire:
             until = min(self.clock.now() + self.patience.quiet_s, latest)
         self._unanswered = 0
         if stale:
-            LOG.log(level, "%s: dropped %d stale bytes %s: %s", self.port, len(stale), when, stale[:64].hex(" "))
+            LOG.info("%s: dropped %d stale bytes %s: %s", self.port, len(stale), when, stale[:64].hex(" "))
 
     def check_known(self, name: str) -> None:
         """Refuse a motion where an earlier one was not acknowledged (StateUnknown)."""

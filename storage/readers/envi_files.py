@@ -252,10 +252,8 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
 
 
 def _timed(lines: LineFacts, times: LineTimes) -> LineFacts:
-    """Add the times of frame indices; their exposures take precedence over those of the headers."""
-    of_header = np.nan if lines.exposure_ms is None else lines.exposure_ms
-    exposure = np.where(np.isnan(times.exposure_ms), of_header, times.exposure_ms)
-    lines = replace(lines, exposure_ms=None if np.isnan(exposure).all() else exposure, frame=times.frame)
+    """Add the times of frame indices."""
+    lines = replace(lines, frame=times.frame)
     known = times.stamp_us >= 0
     if not known.any():
         return lines

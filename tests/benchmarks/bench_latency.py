@@ -95,7 +95,7 @@ class _AskedError(Exception):
 @contextmanager
 def _watched(moments: Moments) -> Iterator[None]:
     """Take the time of exposures, lines and the first path of a fine sweep."""
-    from pipeline.rig.capture.capture_runner import CaptureRunner
+    from pipeline.rig.capture_runner import CaptureRunner
     from storage.arrays.spool import Spool
 
     append, take = Spool.append, CaptureRunner.take
@@ -142,7 +142,7 @@ def _survey(stack: ExitStack, settings: Settings, moments: Moments) -> None:
     line = stack.enter_context(InProcessRig(rig))
 
     def open_devices(told: Settings, *_: object) -> RigDevices:
-        return line.devices(told.rig.mirror(told.cost.vector_pairs))
+        return line.devices(told.rig, told.cost.vector_pairs)
 
     stack.enter_context(patch("flows.tasks.rig_field.open_devices", open_devices))
     try:

@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from measure import Row
 
-from pipeline.rig.device_settings import MirrorSettings, ReadBack
+from pipeline.rig.device_settings import ReadBack, SurveyRig
 from pipeline.rig.emulator.emulated_rig import EmulatedPort
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.mirror.mirror_controller import open_mirror
+from pipeline.rig.mirror_controller import open_mirror
 from pipeline.rig.transports import BITS_PER_BYTE, SYSTEM_CLOCK, Transport
 
 PAIRS = 1500
@@ -33,15 +32,14 @@ def rows() -> Sequence[Row]:
 
 def _row(baud: int, read_back: ReadBack) -> Row:
     taken = [_upload(baud, read_back) for _ in range(ROUNDS)]
-    wall_s, wire_s, cpu_s, told = min(taken)
+    wall_s, wire_s, cpu_s = min(taken)
     ratio = wall_s / wire_s
     return Row(
         f"upload of 2 x {PAIRS} positions at {baud} baud, read back: {read_back}",
         f"{ratio:.3f}x the wire time",
         f"<= {GOAL}x" if read_back == "none" else "",
         ratio <= GOAL if read_back == "none" else None,
-        f"{wall_s:.2f} s for {wire_s:.2f} s of bytes; {cpu_s:.2f} s of processor, the emulator's included; progress "
-        f"told {told} times",
+        f"{wall_s:.2f} s for {wire_s:.2f} s of bytes; {cpu_s:.2f} s of processor, the emulator's included",
     )
 
 
@@ -66,24 +64,21 @@ class Counted:
         return found
 
 
-def _upload(baud: int, read_back: ReadBack) -> tuple[float, float, float, int]:
-    """Wall time, time on the wire, processor time [s] of one upload, and how often its progress was told."""
+def _upload(baud: int, read_back: ReadBack) -> tuple[float, float, float]:
+    """Wall time, time on the wire and processor time [s] of one upload."""
     turn = np.linspace(0, 2 * np.pi, PAIRS)
     positions = 0.9 * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    told: list[tuple[int, int]] = []
     device = MirrorDevice(SYSTEM_CLOCK)
     with (
         EmulatedPort(device, baud=baud) as port,
-        open_mirror(MirrorSettings(port=port.path, baud=baud, vector_pairs=PAIRS)) as mirror,
+        open_mirror(SurveyRig(port=port.path, baud=baud, read_back=read_back), PAIRS) as mirror,
     ):
-        mirror.is_playing()  # as the upload asks first: everything is loaded
+        mirror.halt()  # as the upload does first: everything is loaded
         mirror.wire.transport = counted = Counted(mirror.wire.transport)
         began_s, began_cpu_s = time.perf_counter(), time.process_time()
-        mirror.load_path(positions, read_back, lambda done, total: told.append((done, total)))
+        mirror.load_path(positions)
         wall_s, cpu_s = time.perf_counter() - began_s, time.process_time() - began_cpu_s
         wire_s = counted.bytes * BITS_PER_BYTE / baud
     if not np.array_equal(device.state.memory, positions.T.ravel().astype(np.float32)):
         raise AssertionError("the memory holds something else")
-    if told[-1][0] != told[-1][1] or any(one[0] >= other[0] for one, other in pairwise(told)):
-        raise AssertionError("the progress does not go on to its end")
-    return wall_s, wire_s, cpu_s, len(told)
+    return wall_s, wire_s, cpu_s

@@ -17,12 +17,12 @@ from spectral.io import envi
 from pipeline.errors import RigError, SettingsError
 from pipeline.geometry.scan import line_positions
 from pipeline.rig.camera.camera_files import KeptInMemory
-from pipeline.rig.capture.capture_paths import REFERENCES, capture_prefix
-from pipeline.rig.capture.rig_source import RigSource
-from pipeline.rig.device_settings import CameraLimits, SurveyRig
+from pipeline.rig.capture_paths import REFERENCES, capture_prefix
+from pipeline.rig.device_settings import SurveyRig
 from pipeline.rig.drivers import CameraDriver, RigDevices, open_camera_driver, open_mirror_driver
 from pipeline.rig.emulator.emulated_rig import EmulatedRig
 from pipeline.rig.rig_check import check_camera
+from pipeline.rig.rig_source import RigSource
 from pipeline.rig.transports import StateUnknown
 from tests.docs.pages import DOCS, ROOT, blocks_of
 from tests.pipeline.rig.in_process import InProcessRig, ManualClock
@@ -107,10 +107,10 @@ def folder_rig(folder: Path) -> Iterator[tuple[RigSource, CameraDriver, Program]
     settings = SurveyRig(camera_driver=f"{MODULE}:open_camera", host=str(folder), log_samples=16_000)
     with InProcessRig(EmulatedRig(small_source(), clock, wired="none")) as line:
         clock.program = Program(folder, line)
-        camera = open_camera_driver(settings, CameraLimits(), clock)
+        camera = open_camera_driver(settings, clock)
 
         def devices() -> RigDevices:
-            return RigDevices(line.devices(settings.mirror(1500)).steering, camera, clock)
+            return RigDevices(line.mirror(settings), camera, clock)
 
         seen = small_source()
         source = RigSource(
@@ -166,7 +166,7 @@ BROKEN = {
     "no function": (f"{MODULE}:open_it", r"cannot be imported \(AttributeError: .*open_it"),
     "no name": ("a name?", r"cannot be imported \(ValueError"),
     "no function of rig and clock": (f"{MODULE}:POLL_S", r"does not open a driver .* the table \[rig\] and a clock"),
-    "of other things": (f"{MODULE}:LineTimes", r"does not open a driver \(missing a required argument"),
+    "of other things": (f"{MODULE}:CapturedLines", r"does not open a driver \(.*missing 1 required"),
     "no driver": (f"{MODULE}:FolderCamera", r"gives a FolderCamera without goto, .*method of MirrorDriver in"),
 }
 

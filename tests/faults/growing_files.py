@@ -16,9 +16,8 @@ from typing import Any
 from pipeline.errors import PipelineError
 from pipeline.geometry.scan import Sweep
 from pipeline.rig.camera.camera_files import KeptInMemory
-from pipeline.rig.capture import JOURNAL
-from pipeline.rig.capture.capture_paths import CaptureRecord
-from pipeline.rig.capture.capture_runner import CaptureJournal
+from pipeline.rig.capture_paths import CaptureRecord
+from pipeline.rig.capture_runner import JOURNAL, CaptureJournal
 from storage.arrays.spool import Spool
 from tests.faults.fault_table import Clock, Row, reported_wrong
 from tests.faults.lost_lines import BANDS, HEADER, SAMPLES, fill, line, same

@@ -19,15 +19,6 @@ def frames(samples: int = 12, bands: int = 10) -> References:
     return References(dark, dark + 2000, np.ones(bands, np.float32))
 
 
-def test_saturated_line() -> None:
-    """A line saturated throughout is invalid, its neighbours are not, and the mask stays (line, sample)."""
-    raw = np.full((3, 12, 10), 1000, np.uint16)
-    raw[1] = FULL
-    _, valid = calibrate(raw, frames(), saturated_dn=FULL)
-    assert valid.shape == (3, 12)
-    assert valid.all(axis=1).tolist() == [True, False, True]
-
-
 def test_sum_saturated_in_part() -> None:
     """The two limits of the docstring: n F finds a sum saturated throughout, n (F - 1) + 1 one that must be in part."""
     sums = np.array([4 * FULL, 4 * (FULL - 1) + 1, 4 * (FULL - 1)], np.uint16)
@@ -71,21 +62,6 @@ def test_dead_column(kind: str) -> None:
     values, valid = calibrate(raw, references, saturated_dn=FULL)
     assert np.isnan(values[:, 5]).all()
     assert np.argwhere(~valid).tolist() == [[0, 5], [1, 5]]
-
-
-def test_hot_pixel() -> None:
-    """A hot element, found in the dark frame, is filled: on a smooth scene nothing of it is seen."""
-    references = frames(200)
-    references.dark[70, 4] = 900
-    ramp = (500 + np.arange(200))[None, :, None] * np.ones((1, 1, 10))
-    raw = ramp.astype(np.uint16)
-    raw[0, 70, 4] = FULL
-    found = find_bad_elements(references.dark, references.white)
-    assert np.argwhere(found).tolist() == [[70, 4]]
-    values, valid = calibrate(raw, replace(references, bad=found), saturated_dn=FULL)
-    np.testing.assert_allclose(values[0], (ramp[0] - 60.5) / 2000, rtol=1e-5)
-    assert valid.shape == (1, 200)
-    assert valid.all()
 
 
 @pytest.mark.parametrize("frame", ["dark", "white", "flat"])

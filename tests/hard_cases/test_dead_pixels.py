@@ -17,7 +17,7 @@ from models.evaluation.placement import oracle_gain
 from models.network.sizes import TOKEN_PX
 from models.network.spectral import fill_dead
 from models.policies.policies import score_patches
-from models.reading.inference import read_coarse_pass, read_coarse_prediction, segment
+from models.reading.inference import read_coarse_pass, segment
 from pipeline.geometry.grid import SceneGrid
 from tests.models.conftest import coarse_prediction, plain_weights
 
@@ -44,20 +44,6 @@ def test_17_a_pixel_dead_in_most_of_its_bands_is_dead(dead: int, lives: bool, ba
         assert broken == pytest.approx(whole, abs=0.3)  # the columns are 0.5 from the median; exact where a band lives
 
 
-@pytest.mark.parametrize("more", [0, 1])
-@pytest.mark.parametrize("patch", [8, 64])
-def test_17_a_token_dead_in_most_of_its_coarse_pixels_is_not_read(patch: int, more: int):
-    """With half of its pixels dead a token is read, with one more it is left out: smaller than a patch, or larger."""
-    weights, grid = plain_weights(patch=patch), SceneGrid(128, 128, patch, 2)
-    values = _scene(64, 64)
-    values[:8, :16], values[8, :more] = np.nan, np.nan
-    seen = read_coarse_pass(weights, [values], NM, grid, factor=2)
-    assert np.isfinite(seen.columns).all()
-    assert seen.living is not None
-    assert np.flatnonzero(~seen.living).tolist() == [0] * more
-    assert np.isfinite(read_coarse_prediction(weights, seen).probability).all()
-
-
 @pytest.mark.parametrize("size", [8, 32])
 def test_18_dead_pixels_show_within_a_token_alone_but_for_attention(size: int):
     """A dead patch or token, of a network whose tokens say nothing, changes nothing farther away than a token."""
@@ -73,19 +59,6 @@ def test_18_dead_pixels_show_within_a_token_alone_but_for_attention(size: int):
     beside[64 - TOKEN_PX : 64 + size + TOKEN_PX, : 32 + size + TOKEN_PX] = False
     assert np.abs(dead - whole)[beside].max() <= 1e-5
     assert np.abs(dead - whole)[~beside].max() > 0.01
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_18_a_dead_fine_patch_is_as_if_not_captured(bad: float):
-    """A captured patch that is all dead changes nothing anywhere: the map is that without its patch."""
-    weights = plain_weights()
-    seen = coarse_prediction(weights, _scene(48, 64), NM, SceneGrid(48, 64, 8, 1))
-    patches, patch_index = _patches(5), np.array([3, 40, 11, 12, 30])
-    patches[1] = bad
-    drawn = segment(weights, seen, patches, patch_index)
-    without = segment(weights, seen, np.delete(patches, 1, axis=0), np.delete(patch_index, 1))
-    assert np.abs(drawn.confidence - without.confidence).max() <= 1e-5
-    assert (drawn.classes == without.classes).all()
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])

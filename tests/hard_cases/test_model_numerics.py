@@ -6,7 +6,6 @@ import math
 import re
 import warnings
 from collections.abc import Iterator
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -456,15 +455,6 @@ def test_30_a_checkpoint_reads_other_bands(tmp_path: Path):
     for bands in (1, 3, 200):
         seen = coarse_prediction(loaded, np.full((16, 16, bands), 0.3), np.linspace(500, 900, bands), grid)
         assert np.isfinite(seen.probability).all()
-
-
-def test_30_another_number_of_classes_names_the_tensor(tmp_path: Path):
-    """Tensors of three classes under a description of five are refused by the tensor's name."""
-    weights, path = plain_weights(), tmp_path / "w.safetensors"
-    weights.segmenter.config = replace(weights.config, classes=5)
-    save_weights(replace(weights, class_names=tuple("abcde")), path)
-    with pytest.raises(ValueError, match=r"tensor overview_classes.weight should be \(5, 8, 1, 1\)"):
-        load_weights(path)
 
 
 def test_31_one_and_two_threads_choose_the_same_patches(threads: None):

@@ -13,14 +13,7 @@ from numpy.typing import NDArray
 
 from models.network.spectral import MOST_COLUMN
 from models.policies.policies import score_patches
-from models.reading.inference import (
-    CoarsePrediction,
-    DrawnMap,
-    coarse_prediction_of_columns,
-    decide,
-    read_coarse_pass,
-    segment,
-)
+from models.reading.inference import CoarsePrediction, DrawnMap, coarse_prediction_of_columns, read_coarse_pass, segment
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.readings import MOST_VALUE, beyond_range, find_beyond, readings_alone
@@ -88,15 +81,6 @@ def test_out_of_range_pixels_are_counted() -> None:
     assert read_coarse_pass(WEIGHTS, [VALUES], NM, GRID).out_of_range is None
 
 
-@pytest.mark.parametrize("fraction", [0.2, 1.0])
-def test_a_field_of_out_of_range_values_still_ends(fraction: float) -> None:
-    """A fifth of the pixels, and all of them: as with NaN there, without a warning."""
-    where = np.random.default_rng(2).random(GRID.padded_shape) < fraction
-    out_of_range, hole = VALUES.copy(), VALUES.copy()
-    out_of_range[where], hole[where] = 1e30, np.nan
-    assert _alike(_drawn(out_of_range, FINE), _drawn(hole, FINE))
-
-
 @pytest.mark.parametrize("value", [10 * MOST_COLUMN, 1e18, 1e30, FAR, np.inf, -np.inf])
 def test_columns_that_no_reading_gives_are_dead(value: float) -> None:
     """Given normalised already, to the overview or to the map, they count as NaN does."""
@@ -110,15 +94,6 @@ def test_columns_that_no_reading_gives_are_dead(value: float) -> None:
         found.append((seen, segment(WEIGHTS, seen, fine, np.array([4, 30]))))
     assert _alike(*found)
     assert np.isfinite(found[0][0].probability).all()
-
-
-def test_a_logit_that_is_no_number_is_no_class() -> None:
-    """NaN and +inf are 255 with a confidence of NaN, and nothing beside them changes; -inf is a class ruled out."""
-    logits = torch.tensor([[1.0, np.nan, np.inf, -np.inf, 3.0], [2.0, 0.0, 0.0, 1.0, 4.0]])
-    confidence, classes = decide(logits, dim=0)
-    assert classes.tolist() == [1, UNLABELLED, UNLABELLED, 1, 1]
-    assert torch.isnan(confidence).tolist() == [False, True, True, False, False]
-    assert classes.dtype == torch.uint8
 
 
 def test_weights_that_overflow_draw_no_class() -> None:

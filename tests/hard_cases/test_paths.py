@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.errors import PoseError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_position, scene_to_direction
 from pipeline.geometry.scan import points_of_scan
@@ -152,19 +151,6 @@ def test_one_unusable_line_spoils_only_itself() -> None:
     np.testing.assert_allclose(seen_through(scan_path, values, beside), wave(*beside.T), atol=0.05)
 
 
-def test_equal_and_backward_time_stamps_cost_their_own_lines() -> None:
-    """A frame sent twice and one with a stamp from the past are left out; all others keep time, number and place."""
-    time = np.arange(50.0) * 0.1
-    stamps = np.insert(time, [21, 40], [time[20], time[3] + 0.03])
-    numbers = number_lines(stamps, 0.1)
-    np.testing.assert_array_equal(np.flatnonzero(~numbers.usable), [21, 41])
-    assert (numbers.repeated, numbers.backward, numbers.lost, numbers.late) == (1, 1, 0, 0)
-    position = aim(np.interp(stamps, time, np.arange(50.0)))
-    (scan_path,) = make_scan_paths(position, CAMERA, usable=numbers.usable)
-    assert scan_path.uniform
-    np.testing.assert_array_equal(scan_path.lines, np.flatnonzero(numbers.usable))
-
-
 def test_late_line_is_used_where_the_mirror_was() -> None:
     """A frame 0.4 periods late is used at its own place, not at its number's."""
     stamps = np.arange(60.0)
@@ -210,14 +196,3 @@ def test_uneven_path_shows_the_scene_at_its_own_places() -> None:
     )
     assert error.max() < 5e-3
     assert even.max() > 20 * error.max()
-
-
-def test_path_that_leaves_the_disk_is_refused() -> None:
-    """The first line beyond the rim is named; on the rim itself, and in float32, lines are taken."""
-    position = np.stack([np.linspace(0.8, 1.01, 50), np.zeros(50)], axis=-1)
-    first = int(np.argmax(position[:, 0] > 1))
-    with pytest.raises(PoseError, match=rf"line {first} is at mirror position \(1\.0.*not usable"):
-        make_scan_paths(position, CAMERA)
-    scan_paths = make_scan_paths(position, CAMERA, usable=position[:, 0] <= 1)
-    assert sum(len(scan_path) for scan_path in scan_paths) == first
-    assert len(make_scan_paths(np.array([[0.0, 1.0], [1.0, 0.0]]), CAMERA)) == 1

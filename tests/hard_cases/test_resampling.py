@@ -45,18 +45,6 @@ def test_long_sweeps_are_read_to_their_last_line(kernel: Kernel, lines: int) -> 
     np.testing.assert_array_equal(out[:, 0], 10 * at[:, 0] + at[:, 1])
 
 
-def test_lost_taps_are_made_up_for_by_the_rest() -> None:
-    """NaN taps that are marked leave a constant as it is while at least half of the weight is left, then NaN."""
-    values, valid = np.full((8, 8, 3), 40, np.float32), np.ones((8, 8), bool)
-    values[:, 4], valid[:, 4] = np.nan, False
-    at = np.stack([np.full(21, 3.5), np.linspace(3, 5, 21)], axis=1)
-    out, fraction = resample(values, valid, at, "bilinear")
-    left = 1 - np.maximum(0, 1 - np.abs(at[:, 1] - 4))
-    np.testing.assert_allclose(fraction, np.where(left >= 0.5, left, 0), atol=1e-6)
-    np.testing.assert_allclose(out[left >= 0.5], 40, rtol=1e-6)
-    assert np.isnan(out[left < 0.5]).all()
-
-
 def test_fraction_is_never_above_one() -> None:
     """Where only taps of negative weight are lost, what is left weighs more than all: it counts as all."""
     valid = np.ones((9, 9), bool)
@@ -122,19 +110,6 @@ def test_overshoot_at_a_step_is_kept() -> None:
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_right_and_bottom_border_are_part_of_the_sweep(kernel: Kernel) -> None:
-    """The outermost pixels have values up to half a pixel beyond their centres on all four sides, alike."""
-    values = ramp(7, 9)
-    reach = np.array([-0.49, 0.0, 3.0])
-    at = np.stack(np.meshgrid(reach, reach, indexing="ij"), axis=-1).reshape(-1, 2)
-    near, near_fraction = resample(values, np.ones((7, 9), bool), at, kernel)
-    far, far_fraction = resample(values[::-1, ::-1], np.ones((7, 9), bool), np.array([6, 8]) - at, kernel)
-    np.testing.assert_allclose(near_fraction, far_fraction, atol=1e-6)
-    np.testing.assert_allclose(near, far, atol=2e-3)
-    assert (near_fraction[1:] >= 0.5).all()  # beyond both borders a quarter of the weight is left
-
-
-@pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("kind", [np.float32, np.uint16])
 def test_block_without_any_point(kernel: Kernel, kind: type[np.generic]) -> None:
     """A block of the grid that no line reaches is empty without a warning."""
@@ -180,16 +155,6 @@ def test_fewer_pixels_than_taps(kernel: Kernel, shape: tuple[int, int]) -> None:
     for away in ([1, 0], [0, 1], [-1, -1]):
         beyond = centres + np.multiply(away, shape)
         assert not resample(values, valid, beyond, kernel)[1].any()
-
-
-def test_sweep_without_a_valid_sample() -> None:
-    """Where nothing is valid nothing is read, by sample and by element."""
-    values = np.full((6, 6, 2), np.nan, np.float32)
-    for valid in (np.zeros((6, 6), bool), np.zeros((6, 6, 2), bool)):
-        for kernel in KERNELS:
-            out, fraction = resample(values, valid, np.array([[2.5, 2.5], [0, 0]]), kernel)
-            assert np.isnan(out).all()
-            assert not fraction.any()
 
 
 def test_threads_at_once_do_not_disturb_each_other() -> None:

@@ -17,10 +17,8 @@ from pipeline.simulator.effects.counting import SHOT
 from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.readout import read_out
-from pipeline.simulator.render import EFFECTS, READOUT, expected_light
+from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Detector, Optics, Rig
-from pipeline.simulator.selection.options import ALWAYS_ON
-from pipeline.simulator.selection.survey_probe import probe_scene
 from tests.hard_cases.simulated_scene import (
     CAMERA,
     EVERYTHING,
@@ -154,16 +152,6 @@ def test_zero_width_slit_is_the_limit_of_a_narrow_one() -> None:
         assert change <= counted
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("place", [(0, 0), (59, 79), (31, 39)])
-def test_scene_that_is_not_finite_is_refused_with_its_place(bad: float, place: tuple[int, int]) -> None:
-    """Before anything is decided, and in pixels that no line of the sweep looks at as well."""
-    values = TEXTURE.copy()
-    values[*place, 1] = bad
-    with pytest.raises(SceneError, match=f"is not finite at row {place[0]}, column {place[1]}, component 1"):
-        probe_scene(scene_of(values), RIG, [replace(SWEEP, lines=4)])
-
-
 @pytest.mark.filterwarnings("ignore:invalid value encountered:RuntimeWarning")
 def test_light_that_is_not_finite_is_refused_with_its_place() -> None:
     """Who renders without a probe is told sweep, line, sample and band; lines that do not see the hole are read out."""
@@ -178,28 +166,6 @@ def test_light_that_is_not_finite_is_refused_with_its_place() -> None:
         read_out(light, block, decision.chosen)
     assert band == 1
     read_out(light[:4], block_of(scene, RIG, range(4)), decision.chosen)
-
-
-def test_tolerance_0_computes_everything_exactly() -> None:
-    """All effects of a rig that has them all are on in their exact variants, in the chain's order, and none is off."""
-    finer = replace(EVERYTHING, optics=Optics(fwhm_nm=9.0))  # than this rig's own bands are the scene's
-    coarse = replace(SWEEP, kind="coarse", lines=8, step=4, binning=4)
-    decision = decided(scene_of(TEXTURE), finer, 0.0, coarse)
-    assert list(decision.chosen.items()) == [(one, one.variants[0]) for one in EFFECTS]
-    assert decision.chosen == decision.exact
-    assert decision.error == 0
-    assert decision.cost_ns == decision.exact_cost_ns
-
-
-def test_infinite_tolerance_leaves_out_everything_but_the_converter() -> None:
-    """Only saturation and quantisation stay on; the light is that of straight lines of points."""
-    scene = scene_of(TEXTURE)
-    decision = decided(scene, EVERYTHING, math.inf)
-    assert {one.name for one in decision.chosen} == ALWAYS_ON
-    assert {one.name for one in READOUT} > ALWAYS_ON
-    assert 0 < decision.error < math.inf
-    block = block_of(scene, EVERYTHING)
-    np.testing.assert_array_equal(expected_light(scene, block, decision.chosen), expected_light(scene, block, {}))
 
 
 @pytest.mark.parametrize("tolerance", [5e-324, 1e-300, 1e300])

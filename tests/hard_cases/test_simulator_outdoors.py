@@ -138,14 +138,6 @@ def test_farm_needs_a_sun_that_stands_high_enough() -> None:
             farm_scene(0, (12, 16), bands=2, day=172, hour=hour)
 
 
-@pytest.mark.parametrize("distance_m", [30.0, 1e300, math.inf])
-def test_in_focus_there_is_no_blur(distance_m: float) -> None:
-    """Focused where it looks, at infinity too, defocus is absent and blurs nothing."""
-    rig = replace(RIG, air=Air(distance_m=distance_m), optics=Optics(focus_m=distance_m))
-    assert {one.name: one.reason for one in decided(TEXTURE, rig, 0.0).taken}["defocus"] == "absent"
-    assert not DEFOCUS.moments(rig, TEXTURE.wavelength_nm, "disc").variance.any()
-
-
 @cache
 def seen_from(distance_m: float, focus_m: float) -> tuple[NDArray[np.float32], Decision]:
     """Light with everything on and exact, and what is decided."""

@@ -27,7 +27,6 @@ from tests.faults.nursery import ROOT
 Cable = Literal["mirror", "camera"]
 CONTROL, LINK = "control", "mirror"  # in the rig's folder
 KEY = b"a rig of the soak"
-KEPT_CAPTURES = 8
 NAP_S = 0.01
 
 
@@ -37,7 +36,7 @@ class PulledRig:
     def __init__(self, views: Mapping[str, SimulatedSource], folder: Path, speed: float) -> None:
         self._views = {name: SceneView(source) for name, source in views.items()}
         self._folder, self._address = folder, (0, 0)
-        self.rig = EmulatedRig(next(iter(views.values())), FastClock(speed), kept=KEPT_CAPTURES)
+        self.rig = EmulatedRig(next(iter(views.values())), FastClock(speed))
         self.rig.camera.aside = True
         self._port: EmulatedPort | None = None
         self._server: CameraServer | None = None

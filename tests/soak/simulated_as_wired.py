@@ -36,7 +36,7 @@ def references(self: SimulatedSource, sweep: Sweep) -> References:
         return exact
     frames = SceneView(self).references((self.camera.exposure_ms, self.camera.frame_ms), REFERENCE_FRAMES)
     dark, white = (mean_frame(frames[f"{name}Reference"]) for name in ("dark", "white"))
-    whole, _ = as_references(dark, white, white_reference=exact.white_reference)
+    whole = as_references(dark, white, white_reference=exact.white_reference)
     sums = [
         one.reshape(len(one) // sweep.binning, sweep.binning, -1).sum(axis=1, dtype=np.float32)
         for one in (whole.dark, whole.white)

@@ -20,7 +20,6 @@ from pipeline.rig.camera.camera_texts import (
     LineTimes,
     parse_envi_header,
     parse_frame_index,
-    place_parts,
     times_of_lines,
 )
 from pipeline.signal.calibrate import find_bad_elements
@@ -28,13 +27,10 @@ from pipeline.source import References
 
 _PART = re.compile(r"raw_(\d{1,12})", re.IGNORECASE)
 _REFERENCE = re.compile(r"(dark|white)[A-Za-z_]*", re.IGNORECASE)
-MOST_MISSING = 100_000  # lines between two parts; more means that the names are wrong
-MOST_NUMBERS = 1 << 26  # of a line: a hundred times those of any such camera
 
 Read = Callable[[str], bytes]  # the content of a file by its name
 LEAST_LIT = 0.5  # fraction of the elements whose white is above their dark
 FRAMES_FOR_STUCK = 8  # fewer frames cannot tell an element that never changes from a quiet one
-_BLOCK = 64  # frames summed at a time
 
 
 @dataclass(frozen=True)
@@ -47,19 +43,19 @@ class CubeLines:
 
 @dataclass(frozen=True)
 class CapturedLines:
-    """Lines of a capture, all its files in order. Lines that no file holds are 0 and not valid."""
+    """The whole lines of a capture, in order. ``lost`` further lines are in its header, but not whole in its file."""
 
     values: NDArray[np.uint16]  # (line, sample, band)
-    valid: NDArray[np.bool_]  # (line,)
-    first_frame: int  # number of the first line's frame by the first file's name
+    first_frame: int  # number of the first line's frame by the file's name
     times: LineTimes
-    notes: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+    lost: int = 0
 
 
 def parse_cube_header(text: str, where: str) -> EnviHeader:
     """Read the header of a cube of the camera.
 
-    Raises RigError: it is no whole ENVI header, a size is missing, or the numbers are not 16-bit BIL.
+    Raises RigError: it is no whole ENVI header, or the numbers are not 16-bit BIL.
     """
     try:
         header = parse_envi_header(text, where)
@@ -68,12 +64,6 @@ def parse_cube_header(text: str, where: str) -> EnviHeader:
     kind = header.dtype.str[1:]
     if (header.interleave, kind) != ("bil", "u2"):
         raise RigError(f"{where}: interleave {header.interleave!r} of {kind}; expected bil and u2, as cameras write")
-    if header.lines is None:
-        raise RigError(f"{where} has no field lines; fetch it again")
-    if header.samples * header.bands > MOST_NUMBERS:
-        raise RigError(
-            f"{where}: {header.samples} samples and {header.bands} bands; no camera has so many, fetch it again"
-        )
     return header
 
 
@@ -86,46 +76,22 @@ def cube_lines(header: EnviHeader, data: bytes) -> CubeLines:
 
 
 def read_capture(names: Iterable[str], read: Read) -> CapturedLines:
-    """Join a capture's files, by their names with or without the folder.
+    """Read a capture of one cube from its files, by their names with or without the folder.
 
-    Raises RigError: there is no line, a header is missing, wrong or states less, or the files do not belong together.
+    Raises RigError: there is no line or more than one cube, or the header is missing, wrong or states less.
     """
     by_name = {name.rsplit("/", 1)[-1]: name for name in names}
-    raw = sorted((int(match[1]), name) for name in by_name if (match := _PART.fullmatch(name)))
-    notes: list[str] = []
-    parts = [(first, cube) for first, name in raw if len((cube := _read_cube(by_name, name, read)).values)]
-    if not parts:
-        raise RigError(f"no whole line in {', '.join(sorted(by_name)) or 'an empty folder'}; capture again")
-    sizes = {cube.values.shape[1:] for _, cube in parts}
-    if len(sizes) > 1:
+    parts = [match for name in by_name if (match := _PART.fullmatch(name))]
+    cube = _read_cube(by_name, parts[0][0], read) if len(parts) == 1 else None
+    if cube is None or not len(cube.values):
         raise RigError(
-            f"parts of one capture have frames of {sorted(sizes)} (sample, band); they are of several captures"
+            f"expected one cube with a whole line, got {', '.join(sorted(by_name)) or 'an empty folder'}; capture again"
         )
-    try:
-        starts = place_parts([(f"raw_{first}", first, len(cube.values)) for first, cube in parts], MOST_MISSING, notes)
-    except SceneError as error:
-        raise RigError(str(error)) from error
-    (first, cube), lost = parts[-1], parts[-1][1].lost
-    if lost > MOST_MISSING:
-        notes.append(f"the {lost} lines that raw_{first} lacks are not filled up")
-        lost = 0
-    lines = starts[-1] + len(cube.values) + lost
-    alone = len(parts) == 1 and not lost  # no copy then: a capture may have a gigabyte
-    shape = (lines, *cube.values.shape[1:])
-    values = cube.values.astype(np.uint16, copy=False) if alone else np.zeros(shape, np.uint16)
-    valid, times = np.zeros(lines, np.bool_), LineTimes.unknown(lines)
-    for start, (first, cube) in zip(starts, parts, strict=True):
-        stop = start + len(cube.values)
-        valid[start:stop] = True
-        if not alone:
-            values[start:stop] = cube.values
-        if cube.lost:
-            notes.append(
-                f"raw_{first} is cut off: {len(cube.values)} of {len(cube.values) + cube.lost} lines are whole"
-            )
-        if (own := _times(by_name, first, cube, read, notes)) is not None:
-            times.put(start, own)
-    return CapturedLines(values, valid, parts[0][0], times, tuple(notes))
+    first, held, notes = int(parts[0][1]), len(cube.values), list[str]()
+    if cube.lost:
+        notes.append(f"raw_{first} is cut off: {held} of {held + cube.lost} lines are whole")
+    times = _times(by_name, first, cube, read, notes) or LineTimes.unknown(held)
+    return CapturedLines(cube.values.astype(np.uint16, copy=False), first, times, tuple(notes), cube.lost)
 
 
 def read_references(names: Iterable[str], read: Read) -> dict[str, CubeLines]:
@@ -184,39 +150,26 @@ class MeanFrame:
     """The mean of a reference's frames."""
 
     mean: NDArray[np.float32]  # (sample, band) DN
-    noise: NDArray[np.float32]  # (sample, band) DN, standard deviation of one frame; 0 for a single frame
-    frames: int
     stuck: NDArray[np.bool_]  # (sample, band) the same number in every frame while the others change
-    notes: tuple[str, ...]
 
 
 def mean_frame(lines: NDArray[np.integer]) -> MeanFrame:
-    """Return the mean and noise of frames (line, sample, band); exact sums, so that their order does not matter.
+    """Return the mean of frames (line, sample, band); exact sums, so that their order does not matter.
 
     Raises ShapeError: there is no frame.
     """
     if lines.ndim != 3 or not lines.size:
         raise ShapeError(f"expected at least one frame (line, sample, band), got {lines.shape}; capture the reference")
     count = len(lines)
-    total, squares = np.zeros(lines.shape[1:], np.int64), np.zeros(lines.shape[1:], np.int64)
-    for start in range(0, count, _BLOCK):
-        block = lines[start : start + _BLOCK].astype(np.int64)
-        total += block.sum(axis=0)
-        squares += (block * block).sum(axis=0)
-    spread = count * squares - total * total  # whole numbers: nothing cancels
-    noise = np.sqrt(spread / (count * max(count - 1, 1)))
-    visible = count >= FRAMES_FOR_STUCK and np.median(noise) > 0  # most elements have some noise
-    stuck = noise == 0 if visible else np.zeros(noise.shape, np.bool_)
-    notes = [f"the mean of {count} frames; {np.count_nonzero(stuck)} of {stuck.size} elements are stuck"]
-    if count < FRAMES_FOR_STUCK:
-        notes.append(f"{count} frames cannot tell stuck elements; take {FRAMES_FOR_STUCK} or more")
-    return MeanFrame((total / count).astype(np.float32), noise.astype(np.float32), count, stuck, tuple(notes))
+    mean = (lines.sum(axis=0, dtype=np.int64) / count).astype(np.float32)
+    stuck = lines.min(axis=0) == lines.max(axis=0)
+    if count < FRAMES_FOR_STUCK or stuck.mean() > 0.5:  # most elements have some noise
+        stuck = np.zeros(stuck.shape, np.bool_)
+    return MeanFrame(mean, stuck)
 
 
-def as_references(
-    dark: MeanFrame, white: MeanFrame, *, white_reference: ArrayLike = 1.0
-) -> tuple[References, tuple[str, ...]]:
-    """Join dark and white into the references of a sweep, and return them with notes on what was found.
+def as_references(dark: MeanFrame, white: MeanFrame, *, white_reference: ArrayLike = 1.0) -> References:
+    """Join dark and white into the references of a sweep.
 
     An element is bad where its dark frame is stuck, or `pipeline.signal.calibrate.find_bad_elements` finds it bad.
     ``white_reference`` is the value of the white reference, one or (band,). Raises RigError: the frames are of two
@@ -224,19 +177,11 @@ def as_references(
     """
     if dark.mean.shape != white.mean.shape:
         raise RigError(f"dark is {dark.mean.shape} (sample, band), white {white.mean.shape}; take both anew")
-    values = np.asarray(white_reference, np.float32)
-    if values.shape not in ((), (dark.mean.shape[1],)):
-        raise RigError(f"white_reference has shape {values.shape}, expected one or {dark.mean.shape[1]} values")
     lit = np.count_nonzero(white.mean > dark.mean) / dark.mean.size
     if lit < LEAST_LIT:
         raise RigError(
             f"white is above dark in {100 * lit:.0f} % of the elements; are they swapped, or was the lamp off?"
         )
-    bad = find_bad_elements(dark.mean, white.mean, saturated_dn=None)
-    bad |= dark.stuck
-    notes = (
-        *(f"dark: {note}" for note in dark.notes),
-        *(f"white: {note}" for note in white.notes),
-        f"bad elements: {np.count_nonzero(bad)} of {bad.size}",
-    )
-    return References(dark.mean, white.mean, np.broadcast_to(values, dark.mean.shape[1]).copy(), bad), notes
+    bad = find_bad_elements(dark.mean, white.mean, saturated_dn=None) | dark.stuck
+    values = np.broadcast_to(np.asarray(white_reference, np.float32), dark.mean.shape[1]).copy()
+    return References(dark.mean, white.mean, values, bad)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ftplib
 import logging
-import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -12,13 +11,12 @@ from typing import Protocol
 
 from pipeline.errors import PipelineError, RigError
 from pipeline.rig.device_settings import FileServer
-from pipeline.rig.transports import SYSTEM_CLOCK, Clock, DeadlinePassed, DeviceGone, DeviceRefused
+from pipeline.rig.transports import SYSTEM_CLOCK, Clock, DeviceGone, DeviceRefused
 
 LOG = logging.getLogger(__name__)
 NOT_LOGGED_IN = 530  # of FTP: the user or the password is refused
 OVERLAP = 4096  # last bytes held that are fetched again, to see that it is the same file
 _BLOCK = 1 << 16  # bytes
-_UNFIT = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
 Progress = Callable[[str, int, int], None]  # file, bytes held, bytes in all
 
 
@@ -29,7 +27,6 @@ class RemoteFile:
     name: str  # whole path
     size: int | None  # bytes; None where the camera does not say
     folder: bool
-    most: int | None = None  # bytes that it can have; None where nothing is known
 
     @property
     def base(self) -> str:
@@ -46,29 +43,6 @@ class Capture:
     acknowledged_s: float  # when its reply was complete: exposures began between the two, or soon after
 
 
-@dataclass(frozen=True)
-class FrameClaim:
-    """The size of a capture: frames, in all its files, of ``samples`` x ``bands`` numbers of 16 bits."""
-
-    frames: int
-    samples: int
-    bands: int
-
-    @property
-    def frame_bytes(self) -> int:
-        """Bytes of a frame."""
-        return 2 * self.samples * self.bands
-
-
-def check_remote_name(name: str) -> None:
-    """Raise RigError for a name that cannot stand in a line of text, as the protocols need."""
-    if _UNFIT.search(name):
-        raise RigError(
-            f"the camera names a file {name!r:.200}, expected no line ends or control characters in a name; give it "
-            "another name there"
-        )
-
-
 class Kept(Protocol):
     """Store of fetched bytes: files named as on the camera, of which a part may be there already."""
 
@@ -80,9 +54,6 @@ class Kept(Protocol):
 
     def append(self, name: str, data: bytes) -> None:
         """Add bytes at the end."""
-
-    def drop(self, name: str) -> None:
-        """Hold no byte of a file any more."""
 
 
 @dataclass
@@ -100,16 +71,12 @@ class KeptInMemory:
     def append(self, name: str, data: bytes) -> None:
         self.files.setdefault(name, bytearray()).extend(data)
 
-    def drop(self, name: str) -> None:
-        self.files.pop(name, None)
-
 
 @contextmanager
 def open_session(server: FileServer) -> Iterator[ftplib.FTP]:
     """Yield a session that is logged in; its errors are raised as RigError.
 
-    Raises DeviceRefused where the server refuses, RigError where it speaks no FTP, DeadlinePassed or DeviceGone where
-    it does not answer.
+    Raises DeviceRefused where the server refuses, DeviceGone where it does not answer, or not as an FTP server.
     """
     session = ftplib.FTP(timeout=server.stall_s, encoding="utf-8")
     try:
@@ -119,18 +86,17 @@ def open_session(server: FileServer) -> Iterator[ftplib.FTP]:
         yield session
     except PipelineError:  # RigErrors are OSErrors too
         raise
-    except TimeoutError as error:
-        raise DeadlinePassed(f"{server.where} was silent for {server.stall_s:g} s; is it on?") from error
     except ftplib.error_perm as error:
         code = int(str(error)[:3]) if str(error)[:3].isdigit() else None
         raise DeviceRefused(
             f"{server.where} refused: {error!s:.200}; look at user and password, and whether the file is there", code
         ) from error
-    except (ftplib.error_proto, ftplib.error_reply, ValueError) as error:
-        raise RigError(f"{server.where} answered {str(error)!r:.200}, which is no FTP; check host and port") from error
-    except (ftplib.Error, OSError, EOFError) as error:
-        reason = str(error) or "connection closed"
-        raise DeviceGone(f"{server.where} is not there or went away ({reason}); is it on?") from error
+    except (*ftplib.all_errors, ValueError) as error:
+        reason = str(error)[:200] or "connection closed"
+        raise DeviceGone(
+            f"{server.where} is not there, fell silent or is no FTP server ({reason!r}); is it on, and are host and "
+            "port right?"
+        ) from error
     finally:
         session.close()
 
@@ -152,11 +118,10 @@ def fetch_files(
     """Fetch files one after the other until ``kept`` holds them whole.
 
     A transfer that breaks off is continued, in a later call too. The last bytes held from before are compared with the
-    camera's. Raises RigError where they differ or a file is larger than it can be; DeviceRefused where the server
-    refuses it; DeadlinePassed or DeviceGone where ``server.tries`` tries in a row brought no byte.
+    camera's. Raises RigError where they differ or a file grows; DeviceRefused where the server refuses it; DeviceGone
+    where ``server.tries`` tries in a row brought no byte.
     """
     for file in files:
-        check_remote_name(file.name)
         _fetch(server, file, kept, progress, clock)
 
 
@@ -169,11 +134,11 @@ def _fetch(server: FileServer, file: RemoteFile, kept: Kept, progress: Progress 
             with open_session(server) as session:
                 _transfer(session, file, kept, progress)
             return
-        except (DeadlinePassed, DeviceGone) as error:
+        except DeviceGone as error:
             held = kept.size(file.name)
             failed = 1 if held > before else failed + 1
             if failed >= server.tries:
-                raise type(error)(
+                raise DeviceGone(
                     f"{error}; {held} bytes of {file.name} are kept, and a later fetch continues there"
                 ) from error
             LOG.info("%s; continuing at byte %d of %s", error, held, file.name)
@@ -182,7 +147,9 @@ def _fetch(server: FileServer, file: RemoteFile, kept: Kept, progress: Progress 
 
 def _transfer(session: ftplib.FTP, file: RemoteFile, kept: Kept, progress: Progress | None) -> None:
     """Read once from shortly before the end of the held bytes: compare with those, and add the rest."""
-    name, size, held = file.name, _whole_size(session, file), kept.size(file.name)
+    name, size, held = file.name, session.size(file.name), kept.size(file.name)
+    if size is None or file.size not in (None, size):
+        raise RigError(f"{name} has {size} bytes, {file.size} when it was listed; fetch it when the capture has ended")
     another = RigError(f"the {held} bytes of {name} that are held are of another file; remove them and fetch again")
     if held > size:
         raise another
@@ -205,21 +172,3 @@ def _transfer(session: ftplib.FTP, file: RemoteFile, kept: Kept, progress: Progr
     session.voidresp()
     if at < size:
         raise DeviceGone(f"the transfer of {name} ended at byte {at} of {size}; look at the file there")
-
-
-def _whole_size(session: ftplib.FTP, file: RemoteFile) -> int:
-    """Return the size by the server; RigError where the listing differs, or it is more than the file can have."""
-    stated = session.size(file.name)
-    size = file.size if stated is None else stated
-    if size is None:
-        raise RigError(f"neither the listing nor SIZE gives the size of {file.name}; fetch it by hand")
-    if file.size not in (None, size):
-        raise RigError(
-            f"{file.name} has {size} bytes, {file.size} when it was listed; fetch it when the capture has ended"
-        )
-    if file.most is not None and size > file.most:
-        raise RigError(
-            f"{file.name} has {size} bytes, expected {file.most} at most, and nothing of it is fetched; look at what "
-            "the camera wrote"
-        )
-    return size

@@ -14,7 +14,7 @@ from __future__ import annotations
 import re
 from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +30,6 @@ UNSAID = {"", "unknown"}
 LONGEST_LINE = 1000  # characters; a frame's line has about 25
 _LARGEST = 2**62
 _WHOLE = re.compile(r"-?\d{1,19}")
-_BETWEEN_COLUMNS = re.compile(r"[\t,;]+|\s{2,}")  # of a heading; a name may have a single space
-_MS = {"us": 1e-3, "µs": 1e-3, "μs": 1e-3, "microseconds": 1e-3, "s": 1e3, "sec": 1e3, "seconds": 1e3}
 
 INTERLEAVES = ("bil", "bip", "bsq")
 # data type codes of the format's description
@@ -266,28 +264,26 @@ class FrameIndex:
 
     frame: NDArray[np.int64]  # (entry,)
     stamp_us: NDArray[np.int64]  # (entry,) microseconds, of an origin that the file does not say
-    exposure_ms: NDArray[np.float64] | None  # (entry,) where the heading names such a column
     notes: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class LineTimes:
-    """Times of the lines of one file by its index; -1 or NaN where it has none."""
+    """Times of the lines of one file by its index; -1 where it has none."""
 
     frame: NDArray[np.int64]  # (line,)
     stamp_us: NDArray[np.int64]  # (line,)
-    exposure_ms: NDArray[np.float64]  # (line,)
     notes: tuple[str, ...] = ()
 
     @classmethod
     def unknown(cls, lines: int) -> LineTimes:
         """Return lines without any time."""
-        return cls(np.full(lines, -1), np.full(lines, -1), np.full(lines, np.nan))
+        return cls(np.full(lines, -1), np.full(lines, -1))
 
     def put(self, start: int, own: LineTimes) -> None:
         """Fill in the times of one file, whose first line is line ``start``."""
-        for name in ("frame", "stamp_us", "exposure_ms"):
-            getattr(self, name)[start : start + len(own.frame)] = getattr(own, name)
+        stop = start + len(own.frame)
+        self.frame[start:stop], self.stamp_us[start:stop] = own.frame, own.stamp_us
 
 
 def place_parts(parts: Sequence[tuple[str, int, int]], most: int, notes: list[str]) -> list[int]:
@@ -310,35 +306,32 @@ def place_parts(parts: Sequence[tuple[str, int, int]], most: int, notes: list[st
     return starts
 
 
-@dataclass
-class _Rows:
-    """Lines of an index, in its order."""
-
-    frame: array[int] = field(default_factory=lambda: array("q"))
-    stamp: array[int] = field(default_factory=lambda: array("q"))
-    exposure_ms: array[float] | None = None
-    odd: int = 0  # lines that are no frame
-
-
 def parse_frame_index(lines: Iterable[str], name: str = "the frame index", where: str = "") -> FrameIndex:
     """Read an index's lines; other lines than frames are counted, the second of two equal frames is dropped.
 
     Notes call it ``name``, messages ``where`` or ``name``. Raises SceneError: no line is a frame.
     """
-    rows = _rows(lines)
-    if not rows.frame:
+    frames, stamps, odd = array("q"), array("q"), 0
+    for number, line in enumerate(lines):
+        words = [word for word in re.split(r"[\t ,;]+", line.strip()) if word]
+        whole = [int(word) for word in words[:2] if _WHOLE.fullmatch(word)]
+        if len(whole) == 2 and all(0 <= one < _LARGEST for one in whole):
+            frames.append(whole[0])
+            stamps.append(whole[1])
+        elif words and number:  # the first is the heading
+            odd += 1
+    if not frames:
         raise SceneError(
             f"{where or name} lists no frame, expected lines of number and microseconds; remove or repair it"
         )
-    numbers, first = np.unique(np.array(rows.frame, np.int64), return_index=True)
-    notes = [f"{name}: {rows.odd} lines are no frames"] if rows.odd else []
-    if len(numbers) < len(rows.frame):
-        notes.append(f"{name}: {len(rows.frame) - len(numbers)} frames are listed twice, the first counts")
-    exposures = None if rows.exposure_ms is None else np.array(rows.exposure_ms)[first]
-    stamps = np.array(rows.stamp, np.int64)[first]
-    if (np.diff(stamps) < 0).any():
-        notes.append(f"{name}: time goes back {np.count_nonzero(np.diff(stamps) < 0)} times")
-    return FrameIndex(numbers, stamps, exposures, tuple(notes))
+    numbers, first = np.unique(np.array(frames, np.int64), return_index=True)
+    notes = [f"{name}: {odd} lines are no frames"] if odd else []
+    if len(numbers) < len(frames):
+        notes.append(f"{name}: {len(frames) - len(numbers)} frames are listed twice, the first counts")
+    found = np.array(stamps, np.int64)[first]
+    if (np.diff(found) < 0).any():
+        notes.append(f"{name}: time goes back {np.count_nonzero(np.diff(found) < 0)} times")
+    return FrameIndex(numbers, found, tuple(notes))
 
 
 def times_of_lines(index: FrameIndex, first_frame: int, lines: int, lost: int = 0) -> LineTimes:
@@ -349,52 +342,16 @@ def times_of_lines(index: FrameIndex, first_frame: int, lines: int, lost: int = 
     numbers: the camera dropped the others. An index of a later file that begins at 0 counts from that file's start.
     """
     if len(index.frame) in (lines, lines + lost):
-        exposure = np.full(lines, np.nan) if index.exposure_ms is None else index.exposure_ms[:lines]
         dropped = int(index.frame[-1] - index.frame[0]) + 1 - len(index.frame)
         notes = (f"{dropped} frames between the first and the last were dropped by the camera",) if dropped else ()
-        return LineTimes(index.frame[:lines], index.stamp_us[:lines], exposure, notes)
+        return LineTimes(index.frame[:lines], index.stamp_us[:lines], notes)
     origin = 0 if index.frame[0] == 0 else first_frame
     found = LineTimes.unknown(lines)
     place = index.frame - origin
     inside = (place >= 0) & (place < lines)
     found.frame[place[inside]] = index.frame[inside]
     found.stamp_us[place[inside]] = index.stamp_us[inside]
-    if index.exposure_ms is not None:
-        found.exposure_ms[place[inside]] = index.exposure_ms[inside]
     known, beyond = int(np.count_nonzero(inside)), int(np.count_nonzero(~inside))
     findings: tuple[str, ...] = () if known == lines else (f"the frame index has the time of {known} of {lines} lines",)
     findings += (f"the frame index lists {beyond} frames beyond the lines",) if beyond else ()
     return replace(found, notes=findings)
-
-
-def _rows(lines: Iterable[str]) -> _Rows:
-    """Return the numbers of all lines that are frames, and the number of other lines."""
-    rows = _Rows()
-    column, scale = None, 1.0
-    for number, line in enumerate(lines):
-        words = [word for word in re.split(r"[\t ,;]+", line.strip()) if word]
-        if len(words) >= 2 and all(_WHOLE.fullmatch(word) for word in words[:2]):
-            frame, stamp = int(words[0]), int(words[1])
-            if 0 <= frame < _LARGEST and 0 <= stamp < _LARGEST:
-                rows.frame.append(frame)
-                rows.stamp.append(stamp)
-                if rows.exposure_ms is not None and column is not None:
-                    number_there = finite_number(words[column]) if column < len(words) else None
-                    rows.exposure_ms.append(float("nan") if number_there is None else number_there * scale)
-                continue
-        if number == 0:
-            column, scale = _exposure_column(line.strip().lower())
-            rows.exposure_ms = None if column is None else array("d")
-        elif words:
-            rows.odd += 1
-    return rows
-
-
-def _exposure_column(heading: str) -> tuple[int | None, float]:
-    """Return the column of exposures, and its unit in ms; without a unit they are ms."""
-    titles = [word for word in _BETWEEN_COLUMNS.split(heading) if word]
-    if len(titles) < 2:
-        titles = heading.split()
-    column = next((at for at, word in enumerate(titles) if at > 1 and word.strip().startswith("exposure")), None)
-    unit = "" if column is None else re.sub(r"^exposure[^(\[]*[(\[]?|[)\]\s]+$", "", titles[column].strip())
-    return column, _MS.get(unit, 1.0)

@@ -7,13 +7,13 @@ no document gives them. The files stay in memory; pyftpdlib serves them.
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import logging
 import socket
 import threading
 import warnings
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -28,28 +28,26 @@ from pipeline.rig.transports import Clock, Closing
 Floats = NDArray[Any]  # float64
 Ints = NDArray[np.int64]
 Raw = NDArray[np.uint16]
-Lines = Callable[[Floats, Floats], Raw]  # positions (line, 2), times (line,) of mid exposure -> (line, sample, band)
-Positions = Callable[[Floats], Floats]  # times (line,) -> (line, 2)
+Lines = Callable[[Floats], Raw]  # times (line,) of mid exposure -> (line, sample, band)
 
 _BLOCK = 8  # frames that are made together, while the camera takes no other request
 ROOT = "/captured"
 PROMPT = b"\r\nhpi> "
 MOST_LINE = 4096
+KEPT_CAPTURES = 64  # older ones make room
 STARTED_US = 1_500_000_000_000_000  # by the camera's clock at 0 of the emulator's
-USUAL_FRAMES = 2000  # of a cube, where the command gives 0
 DELAY_S = 0.01  # from the command to the first exposure
 
 
 @dataclass
 class EmulatedCapture:
-    """Frames from ``began_s`` on, one each period, in cubes of ``frames_per_cube``."""
+    """``frames`` frames from ``began_s`` on, one each period, in one cube."""
 
     folder: str
     began_s: float
     exposure_s: float
     period_s: float
-    frames_per_cube: int
-    most_frames: int | None  # None: until it is stopped
+    frames: int
     wavelength_nm: Sequence[float]
     references: dict[str, Raw] = field(default_factory=dict)  # name -> (frame, sample, band)
     _lines: list[Raw] = field(default_factory=list)
@@ -59,17 +57,17 @@ class EmulatedCapture:
     def due(self, now_s: float) -> int:
         """Return how many frames are exposed by now."""
         whole = int(np.floor((now_s - self.began_s - self.exposure_s) / self.period_s + 1e-9)) + 1
-        return max(whole if self.most_frames is None else min(whole, self.most_frames), 0)
+        return max(min(whole, self.frames), 0)
 
     def begins(self, from_s: float, to_s: float) -> Floats:
         """Return when exposures begin (exposure,), from ``from_s`` on and before ``to_s``."""
         bounds = np.ceil((np.array([from_s, to_s]) - self.began_s) / self.period_s - 1e-9).astype(np.int64)
-        first, stop = np.clip(bounds, 0, self.most_frames)
+        first, stop = np.clip(bounds, 0, self.frames)
         return np.asarray(self.began_s + np.arange(first, stop) * self.period_s)
 
     def running(self, now_s: float) -> bool:
         """Return whether frames are still to come."""
-        return self.most_frames is None or self.due(now_s) < self.most_frames
+        return self.due(now_s) < self.frames
 
     def pending(self, now_s: float) -> Ints:
         """Return the numbers of some of the next frames that are exposed and not taken yet."""
@@ -80,10 +78,6 @@ class EmulatedCapture:
         self._lines.append(np.asarray(lines, np.uint16))
         self._taken += len(lines)
 
-    def drop(self) -> None:
-        """Discard the files; the capture is over."""
-        self._lines, self._whole = [], {}
-
     def files(self) -> dict[str, bytes]:
         """Return names, without the folder, and contents of the files taken so far."""
         if self._whole is not None:
@@ -91,15 +85,14 @@ class EmulatedCapture:
         found: dict[str, bytes] = {"imu_gps.txt": b"Roll\tPitch\tYaw\tLat\tLon\tAlt\tTimestamp\n"}
         for name, frames in self.references.items():
             found |= self._cube(name, frames)
-        self._lines = [np.concatenate(self._lines)] if self._lines else []
-        for first in range(0, self._taken, self.frames_per_cube):
-            cube = self._lines[0][first : first + self.frames_per_cube]
-            numbers = np.arange(first, first + len(cube))
+        if self._lines:
+            self._lines = [np.concatenate(self._lines)]
+            numbers = np.arange(self._taken)
             stamps = STARTED_US + np.rint((self.began_s + numbers * self.period_s) * 1e6).astype(np.int64)
             rows = [f"{number}\t{stamp}\n" for number, stamp in zip(numbers, stamps, strict=True)]
-            found |= self._cube(f"raw_{first}", cube)
-            found[f"frameIndex_{first}.txt"] = "".join(["Frame#\tTimestamp\n", *rows]).encode()
-        if self._taken == self.most_frames:
+            found |= self._cube("raw_0", self._lines[0])
+            found["frameIndex_0.txt"] = "".join(["Frame#\tTimestamp\n", *rows]).encode()
+        if self._taken == self.frames:
             self._whole = found
         return found
 
@@ -117,24 +110,17 @@ class EmulatedCapture:
 
 
 class CameraDevice:
-    """One camera. It makes frames when they are asked for, so ``positions`` must answer for past times.
+    """One camera. It makes frames when they are asked for.
 
-    ``lines`` gives lines (line, sample, band) uint16 of mirror positions (line, 2) and times (line,) by ``clock``;
-    ``positions`` gives mirror positions at times. Without it they are 0.
+    ``lines`` gives lines (line, sample, band) uint16 of times (line,) by ``clock``, which may be past.
     """
 
-    def __init__(
-        self,
-        lines: Lines,
-        clock: Clock,
-        *,
-        positions: Positions = lambda times_s: np.zeros((len(times_s), 2)),
-        wavelength_nm: Sequence[float] = (),
-    ) -> None:
+    def __init__(self, lines: Lines, clock: Clock, *, wavelength_nm: Sequence[float] = ()) -> None:
         self.clock, self.wavelength_nm = clock, wavelength_nm
         self.exposure_ms, self.period_ms = 10.0, 10.0
         self.captures: list[EmulatedCapture] = []
-        self._lines, self._positions = lines, positions
+        self._numbers = itertools.count()
+        self._lines = lines
         self._lock = threading.RLock()
 
     def greet(self) -> list[Chunk]:
@@ -170,7 +156,7 @@ class CameraDevice:
         if capture is None:
             return False
         middle_s = capture.began_s + numbers * capture.period_s + capture.exposure_s / 2
-        lines = self._lines(self._positions(middle_s), middle_s)
+        lines = self._lines(middle_s)
         with self._lock:
             capture.put(lines)
         return True
@@ -197,7 +183,7 @@ class CameraDevice:
                 return self.is_capturing()
             case "stopCapture":
                 if runs := self.is_capturing():
-                    self.captures[-1].most_frames = self.captures[-1].due(self.clock.now())
+                    self.captures[-1].frames = self.captures[-1].due(self.clock.now())
                 return runs
         raise RigError(f"unknown command {name}")
 
@@ -213,20 +199,18 @@ class CameraDevice:
     def _capture(self, argument: Any) -> Any:
         if self.is_capturing():
             raise RigError("busy capturing")
-        frames = argument["maxFramesPerCube"] or USUAL_FRAMES
         prefix = f"{argument['prefix']}_" if argument["prefix"] else ""
-        folder = f"{ROOT}/{prefix}{len(self.captures):06d}"
-        self.captures.append(self._begun(folder, frames, argument["maxCubes"]))
-        return {"folder": folder}
+        self.captures.append(self._begun(f"{ROOT}/{prefix}{next(self._numbers):06d}", argument["maxFramesPerCube"]))
+        del self.captures[:-KEPT_CAPTURES]
+        return {"folder": self.captures[-1].folder}
 
-    def _begun(self, folder: str, frames: int, cubes: int) -> EmulatedCapture:
+    def _begun(self, folder: str, frames: int) -> EmulatedCapture:
         return EmulatedCapture(
             folder,
             began_s=self.clock.now() + DELAY_S,
             exposure_s=self.exposure_ms * 1e-3,
             period_s=self.period_ms * 1e-3,
-            frames_per_cube=frames,
-            most_frames=frames * cubes if cubes else None,
+            frames=frames,
             wavelength_nm=self.wavelength_nm,
         )
 
@@ -251,13 +235,14 @@ try:
         from pyftpdlib.authorizers import DummyAuthorizer
         from pyftpdlib.filesystems import AbstractedFS
         from pyftpdlib.handlers import FTPHandler
-        from pyftpdlib.ioloop import IOLoop
+        from pyftpdlib.ioloop import Acceptor, AsyncChat, IOLoop
         from pyftpdlib.servers import FTPServer
 except ImportError as error:
     raise RigError("the emulated camera's files need pyftpdlib; install it: pip install 'pyftpdlib>=2'") from error
 
 LOG = logging.getLogger(__name__)
-_SLICE_S = 0.05  # how soon threads see that they are to end
+_SLICE_S = 0.05  # how soon the thread sees that it is to end
+_MOST_READ = 4096  # bytes
 
 
 class CameraConnection:
@@ -284,6 +269,41 @@ class CameraConnection:
         return chunks, len(self._held) <= MOST_LINE
 
 
+class _Talk(AsyncChat):  # type: ignore[misc]
+    """One connection to the control socket, until it says exit or goes away."""
+
+    def __init__(self, connection: socket.socket, device: CameraDevice, ioloop: Any) -> None:
+        super().__init__(connection, ioloop=ioloop)
+        self._talk = CameraConnection(device)
+        self._say(device.greet())
+
+    def handle_read(self) -> None:
+        chunks, is_open = self._talk.feed(self.recv(_MOST_READ))
+        self._say(chunks)
+        if not is_open:
+            self.close_when_done()
+
+    def handle_close(self) -> None:
+        self.close()
+
+    def _say(self, chunks: list[Chunk]) -> None:
+        for chunk in chunks:
+            self.push(chunk.data)
+
+
+class _ControlPort(Acceptor):  # type: ignore[misc]
+    """The control socket."""
+
+    def __init__(self, device: CameraDevice, address: tuple[str, int], ioloop: Any) -> None:
+        super().__init__(ioloop=ioloop)
+        self.device = device
+        self.bind_af_unspecified(address)
+        self.listen(5)
+
+    def handle_accepted(self, connection: socket.socket, _: Any) -> None:
+        _Talk(connection, self.device, self.ioloop)
+
+
 class CameraServer(Closing):
     """Ports of this machine for a device's control socket and FTP (0: a free one), until ``close``. Also a context."""
 
@@ -293,59 +313,19 @@ class CameraServer(Closing):
     def __init__(self, device: CameraDevice, ports: tuple[int, int] = (0, 0)) -> None:
         self.device = device
         self._ended = threading.Event()
-        self._threads: list[threading.Thread] = []
-        self._listener = socket.create_server((self.host, ports[0]))
         self._files = _file_server(device, (self.host, ports[1]), self.handler or FileHandler)
-        self._listener.settimeout(_SLICE_S)
-        self.port = int(self._listener.getsockname()[1])
+        control = _ControlPort(device, (self.host, ports[0]), self._files.ioloop)
+        self.port = int(control.socket.getsockname()[1])
         self.file_port = int(self._files.socket.getsockname()[1])
-        for serve in (self._serve_control, self._serve_files):
-            self._start(serve)
+        self._thread = threading.Thread(target=self._serve, daemon=True, name="emulated camera")
+        self._thread.start()
 
     def close(self) -> None:
         """Close all connections and both ports."""
         self._ended.set()
-        for thread in self._threads:
-            thread.join(timeout=10)
-        self._listener.close()
+        self._thread.join(timeout=10)
 
-    def _start(self, serve: Any, *arguments: Any) -> None:
-        thread = threading.Thread(target=serve, args=arguments, daemon=True, name="emulated camera")
-        self._threads.append(thread)
-        thread.start()
-
-    def _serve_control(self) -> None:
-        while not self._ended.is_set():
-            with suppress(TimeoutError):
-                self._start(self._talk, self._listener.accept()[0])
-
-    def _talk(self, connection: socket.socket) -> None:
-        """Serve one client until it says exit, goes away, or the server closes."""
-        talk = CameraConnection(self.device)
-        with connection, suppress(OSError):
-            connection.settimeout(_SLICE_S)
-            chunks, is_open = self.device.greet(), True
-            while is_open and not self._ended.is_set():
-                for chunk in chunks:
-                    self._wait(chunk.delay_s)
-                    connection.sendall(chunk.data)
-                chunks = []
-                with suppress(TimeoutError):
-                    data = connection.recv(4096)
-                    if not data:
-                        return
-                    chunks, is_open = talk.feed(data)
-            for chunk in chunks:
-                connection.sendall(chunk.data)
-
-    def _wait(self, seconds: float) -> None:
-        """Wait while the device's time passes, unless the server closes."""
-        clock = self.device.clock
-        until = clock.now() + seconds
-        while not self._ended.is_set() and (left := until - clock.now()) > 0:
-            clock.sleep(min(left, _SLICE_S * getattr(clock, "speed", 1.0)))
-
-    def _serve_files(self) -> None:
+    def _serve(self) -> None:
         while not self._ended.is_set():
             self._files.serve_forever(timeout=_SLICE_S, blocking=False)
         self._files.close_all()

@@ -1,13 +1,13 @@
 """A whole emulated rig: mirror and camera on one clock, pulses at the mirror's trigger input, and a simulated scene.
 
 The simulator derives noise and drifts from a sweep's name and a line's number. The name, with the sweep's geometry, is
-in the capture's prefix (:func:`pipeline.rig.capture.capture_paths.announced`). The number is that of the line whose
+in the capture's prefix (:func:`pipeline.rig.capture_paths.announced`). The number is that of the line whose
 planned position is nearest to the mirror's at mid exposure. That also holds for a path that was loaded in parts, begins
 with a lead-in cell, or lost an edge.
 
 A line is that of the simulated source, bit for bit, where the mirror holds the planned position to the last bit of
-float32. Elsewhere the scene is imaged from where the mirror is. A capture whose prefix announces no sweep has noise of
-its own, by its folder and frame. A capture with the prefix ``references`` has dark and white cubes.
+float32. Elsewhere the scene is imaged from where the mirror is. A capture whose prefix announces no sweep has lines at
+rest. A capture with the prefix ``references`` has dark and white cubes.
 
 The trigger input gets one pulse for each held position of the announced sweep, evenly over the exposure, as a pulse
 generator would give them. It may also get one as each exposure begins, or none. A path that is played by trigger begins
@@ -33,11 +33,11 @@ from numpy.typing import NDArray
 from pipeline.errors import RigError, SettingsError
 from pipeline.geometry.mirror import STRAIGHT, Mounting, direction_to_scene, position_to_direction
 from pipeline.geometry.scan import Sweep, sweep_positions
-from pipeline.rig.capture.capture_paths import REFERENCES, announced
+from pipeline.rig.capture_paths import REFERENCES, Announced, announced
 from pipeline.rig.device_settings import Pulses
 from pipeline.rig.emulator.camera_device import CameraDevice, CameraServer, EmulatedCapture, Floats, Ints, Raw
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.mirror.mirror_controller import wire_positions
+from pipeline.rig.mirror_controller import wire_positions
 from pipeline.rig.transports import BITS_PER_BYTE, SYSTEM_CLOCK, Clock, Closing
 from pipeline.simulator.effects.effect import Aim, Bound, SweepBlock
 from pipeline.simulator.effects.probe import Probe
@@ -97,12 +97,6 @@ class SceneView:
             raw.append(self._render(rig, choice, sweep, lines, started_s))
         return np.concatenate(raw)
 
-    def alone(self, name: str, held: Floats, times_ms: tuple[float, float], started_s: float) -> Raw:
-        """Return one raw line (1, sample, band) along x of a position (2,) of the device that belongs to no sweep."""
-        place = self._place(self.mounting.to_model(held))
-        sweep = Sweep(name, "fine", "x", float(place[0]), float(place[1]), 1)
-        return self._render(self._rig(times_ms), self.source.choice, sweep, range(1), started_s)
-
     def numbers(self, sweep: Sweep, position: Floats) -> Ints:
         """Return the line (line,) of the sweep that each exposure (line, step, 2) is nearest to."""
         scan = self._place(position)[..., 1].mean(axis=1)
@@ -159,19 +153,13 @@ class SceneCamera(CameraDevice):
     ----------
     wired
         Pulses at the mirror's trigger input: one for each ``position``, one for each ``frame``, or ``none``.
-    kept
-        Number of finished captures that keep their files, besides references; 0 is all.
 
     With ``aside`` a thread calls :meth:`keep_looking`; the camera counts as capturing until all frames are made.
     """
 
-    def __init__(
-        self, view: SceneView, mirror: MirrorDevice, clock: Clock, *, wired: Pulses = "position", kept: int = 0
-    ) -> None:
-        super().__init__(
-            self._scene_lines, clock, positions=mirror.positions, wavelength_nm=view.source.wavelength_nm.tolist()
-        )
-        self.view, self.mirror, self.wired, self.kept = view, mirror, wired, kept
+    def __init__(self, view: SceneView, mirror: MirrorDevice, clock: Clock, *, wired: Pulses = "position") -> None:
+        super().__init__(self._scene_lines, clock, wavelength_nm=view.source.wavelength_nm.tolist())
+        self.view, self.mirror, self.wired = view, mirror, wired
         self.aside = False
 
     def pulses(self, from_s: float, to_s: float) -> Floats:
@@ -197,25 +185,17 @@ class SceneCamera(CameraDevice):
         if not self.aside:
             super()._poll()
 
-    def _begun(self, folder: str, frames: int, cubes: int) -> EmulatedCapture:
-        for capture in self.captures[: -self.kept or None] if self.kept else ():
-            if _prefix(capture) != REFERENCES:  # these are asked for again with every sweep
-                capture.drop()
-        capture = super()._begun(folder, frames, cubes)
+    def _begun(self, folder: str, frames: int) -> EmulatedCapture:
+        capture = super()._begun(folder, frames)
         if _prefix(capture) == REFERENCES:
             capture.references = self.view.references((self.exposure_ms, self.period_ms), REFERENCE_FRAMES)
         return capture
 
-    def _scene_lines(self, positions: Floats, middle_s: Floats) -> Raw:
+    def _scene_lines(self, middle_s: Floats) -> Raw:
         """Return the raw lines (line, sample, band) of exposures by their mid times."""
         capture = next(one for one in reversed(self.captures) if one.began_s <= middle_s[0])
         times_ms = capture.exposure_s * 1e3, capture.period_s * 1e3
-        known = announced(_prefix(capture))
-        if known is None:
-            number = ((middle_s - capture.began_s) / capture.period_s).astype(int).tolist()
-            names = [f"{capture.folder}-{one}" for one in number]
-            viewed = zip(names, positions, strict=True)
-            return np.concatenate([self.view.alone(name, place, times_ms, capture.began_s) for name, place in viewed])
+        known = announced(_prefix(capture)) or Announced(AT_REST, 0)
         step = known.sweep.positions  # positions during each exposure
         moments = (np.arange(step) + 0.5) * (capture.exposure_s / step)
         held = self.mirror.positions(middle_s[:, None] - capture.exposure_s / 2 + moments)
@@ -309,8 +289,6 @@ class EmulatedRig:
         Of both devices; a ``FastClock`` for :meth:`serve`.
     wired
         Pulses at the mirror's trigger input: one for each held ``position``, one for each ``frame``, or ``none``.
-    kept
-        Number of finished captures that keep their files; 0 is all.
     mounting
         The mounting of the mirror, whatever drivers assume.
 
@@ -322,18 +300,12 @@ class EmulatedRig:
     server_kind = CameraServer
 
     def __init__(
-        self,
-        source: SimulatedSource,
-        clock: Clock,
-        *,
-        wired: Pulses = "position",
-        kept: int = 0,
-        mounting: Mounting = STRAIGHT,
+        self, source: SimulatedSource, clock: Clock, *, wired: Pulses = "position", mounting: Mounting = STRAIGHT
     ) -> None:
         self.clock = clock
         self.mirror = self.mirror_kind(self.clock)
         view = SceneView(source, mounting)
-        self.camera = self.camera_kind(view, self.mirror, self.clock, wired=wired, kept=kept)
+        self.camera = self.camera_kind(view, self.mirror, self.clock, wired=wired)
         self.mirror.pulses = self.camera.pulses
 
     @property

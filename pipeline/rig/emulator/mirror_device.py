@@ -5,17 +5,16 @@ status bit NOT_STABLE stays on for `SETTLE_S` after each move. Nothing runs by i
 up to the clock's present time, so time may run at any speed.
 
 Assumptions where the documents say nothing: an empty line has no answer. NO answers an unknown line, ERROR one that is
-too long. Bytes that arrive while the controller boots are lost. Bytes in pro mode that form no frame are answered by
-error 0001 at the next boundary. Only GOPROCRC makes the controller check the CRC of requests; replies always carry one.
-The run command plays the first cell, with an external trigger too. Each rising edge then plays one more cell. A unit
-that has finished holds its last cell.
+too long. Bytes in pro mode that form no frame are answered by error 0001 at the next boundary. Only GOPROCRC makes the
+controller check the CRC of requests; replies always carry one. Ranges of cells exclude their end. The run command plays
+the first cell, with an external trigger too. Each rising edge then plays one more cell. A unit that has finished holds
+its last cell.
 """
 
 from __future__ import annotations
 
 import math
 import threading
-from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
@@ -24,34 +23,24 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import ShapeError
-from pipeline.geometry.scan import Ends
+from pipeline.rig import pro_mode as pro
 from pipeline.rig.emulator import Chunk
-from pipeline.rig.mirror import pro_mode as pro
-from pipeline.rig.mirror.mirror_requests import END, GO_PRO, GO_PRO_CRC, ID, MOST_LINE, SERIAL, START, VERSION, Reply
-from pipeline.rig.mirror.pro_mode import ErrorCode, Status, VectorRegister
+from pipeline.rig.mirror_controller import END, GO_PRO, GO_PRO_CRC, ID, MOST_LINE, OK, SERIAL, START, VERSION
+from pipeline.rig.pro_mode import ErrorCode, Status, VectorRegister
 from pipeline.rig.transports import Clock
 
 Floats = NDArray[np.float64]
 Pulses = Callable[[float, float], Floats]  # start and end of a time span -> times of the rising edges in it
 
+# properties of the emulated controller; none of them was read from a real one
+MODEL = "MR-E-2"
+TEXTS = {ID: MODEL, VERSION: "EMULATOR 1.0", SERIAL: "EMUL0001"}
+CELLS = 3000  # of the vector memory, X and Y
+LOG_ROWS = 16_000
+TURNAROUND_S = 2e-4  # from a request's last byte to the reply
 SETTLE_S = 0.1
-RIM_SLACK = 1e-6  # of float32 cells
-KEPT_MOVES = 20_000  # per axis; an older time gets the oldest position that is kept
-KEPT_REQUESTS = 5_000
 HIGHEST_HZ = 10_000.0
-
-
-@dataclass(frozen=True)
-class MirrorUnit:
-    """Properties of one emulated controller. None of them was read from a real one."""
-
-    model: str = "MR-E-2"
-    version: str = "EMULATOR 1.0"
-    serial_number: str = "EMUL0001"
-    vector_pairs: int = 1500  # of X and Y, in one memory
-    ends: Ends = "exclusive"  # whether ranges include their end; not settled (erratum E14)
-    log_rows: int = 16_000
-    turnaround_s: float = 2e-4  # from a request's last byte to the reply
+KEPT_MOVES = 20_000  # per axis; an older time gets the oldest position that is kept
 
 
 class RefusedError(Exception):
@@ -70,43 +59,37 @@ class Register:
     most: float = 0xFFFF
     start: float = 0
     whole: bool = True
-    writable: bool = True
 
     def read(self, cell: bytes) -> float:
-        """Return the value of a cell that is to be written; RefusedError where it is read-only or out of range."""
-        if not self.writable:
-            raise RefusedError(ErrorCode.READ_ONLY)
+        """Return the value of a cell that is to be written; RefusedError where it is out of range."""
         value: float = pro.cell_int(cell) if self.whole else pro.cell_float(cell)
-        if self.whole and self.least < 0 and value >= 2**31:
-            value -= 2**32
         if not self.least <= value <= self.most:  # NaN is in no range
             raise RefusedError(ErrorCode.OUT_OF_RANGE)
         return value
 
 
-def _registers(cells: int) -> dict[int, Register]:
-    """Return the registers of a controller with a vector memory of ``cells``, by id."""
+def _registers() -> dict[int, Register]:
+    """Return the registers of a controller that take a value, by id."""
     found = {pro.log_slot(slot): Register() for slot in range(pro.LOG_SLOTS)} | {
         pro.LOG_RUN: Register(most=1),
         pro.LOG_RATE: Register(1.0, HIGHEST_HZ, HIGHEST_HZ, whole=False),
     }
     for channel in (pro.X, pro.Y):
+        unit = {
+            VectorRegister.UNIT: Register(most=2),
+            VectorRegister.RUN: Register(most=1),
+            VectorRegister.START: Register(most=CELLS),
+            VectorRegister.END: Register(most=CELLS),
+            VectorRegister.FREQUENCY: Register(1e-3, HIGHEST_HZ, HIGHEST_HZ, whole=False),
+            VectorRegister.CYCLES: Register(1, 2**31 - 1, 1),
+            VectorRegister.TRIGGER: Register(most=2),
+        }
+        found |= {channel.vector(name): register for name, register in unit.items()}
         found |= {
             channel.input: Register(most=0xFF, start=channel.static_system),
             channel.control: Register(most=0xFF, start=channel.xy_system),
-            **{channel.static_system << 8 | unit: Register(-1.0, 1.0, whole=False) for unit in pro.Unit},
+            channel.static_xy: Register(-1.0, 1.0, whole=False),
         }
-        unit = {
-            VectorRegister.UNIT: Register(most=2, start=pro.Unit.FEEDBACK),
-            VectorRegister.RUN: Register(most=1),
-            VectorRegister.START: Register(most=cells),
-            VectorRegister.END: Register(most=cells),
-            VectorRegister.FREQUENCY: Register(1e-3, HIGHEST_HZ, HIGHEST_HZ, whole=False),
-            VectorRegister.CYCLES: Register(-1, 2**31 - 1, -1),
-            VectorRegister.TRIGGER: Register(most=2),
-            VectorRegister.INDEX: Register(writable=False),
-        }
-        found |= {channel.vector(name): register for name, register in unit.items()}
     return found
 
 
@@ -135,7 +118,7 @@ class Playback:
 
     start: int = 0
     length: int = 1
-    total: float = 0
+    total: int = 0
     rate_hz: float = 1.0
     triggered: bool = False
     began_s: float = 0.0
@@ -150,12 +133,11 @@ class Playback:
     def due(self, now_s: float) -> Floats:
         """Return the times of the steps up to now that the unit's own clock has not played yet."""
         last = int(min((now_s - self.began_s) * self.rate_hz + 1e-9, self.total))
-        self.steps = max(self.steps, last - KEPT_MOVES)
         return self.began_s + np.arange(self.steps, last + 1) / self.rate_hz
 
     def play(self, steps: int) -> NDArray[np.intp]:
         """Return the next cells; the run is over where fewer than ``steps`` are left."""
-        taken = int(min(steps, self.total - self.steps))
+        taken = min(steps, self.total - self.steps)
         cells = self.start + (self.steps + np.arange(taken)) % self.length
         self.steps += taken
         self.running = taken == steps
@@ -165,15 +147,11 @@ class Playback:
 class MirrorState:
     """Registers, memory and motion of one controller, played up to the clock's time when they are used."""
 
-    def __init__(self, clock: Clock, unit: MirrorUnit) -> None:
-        self.clock, self.unit = clock, unit
+    def __init__(self, clock: Clock) -> None:
+        self.clock = clock
         self.flags = Status(0)  # further status bits
-        self.restart()
-
-    def restart(self) -> None:
-        """Reset to the state after power-on: at rest in the middle, memory and registers empty."""
-        self.memory = np.zeros(2 * self.unit.vector_pairs, np.float32)
-        self.registers = _registers(self.memory.size)
+        self.memory = np.zeros(CELLS, np.float32)
+        self.registers = _registers()
         self.values = {number: register.start for number, register in self.registers.items()}
         self.axes = [Axis(-math.inf), Axis(-math.inf)]
         self.playbacks = [Playback(), Playback()]
@@ -194,39 +172,30 @@ class MirrorState:
                 self._step(number, rises_s)
 
     def positions(self, times_s: ArrayLike) -> Floats:
-        """Return the mirror's positions (..., 2) at times (...) up to now; beyond the rim they are trimmed to it."""
+        """Return the mirror's positions (..., 2) at times (...) up to now."""
         self.advance()
-        places = np.stack([axis.at(times_s) for axis in self.axes], axis=-1)
-        reach = np.hypot(places[..., :1], places[..., 1:])
-        return np.where(reach > 1 + RIM_SLACK, places / np.maximum(reach, 1), places)
+        return np.stack([axis.at(times_s) for axis in self.axes], axis=-1)
 
     def status(self) -> Status:
         """Return the present status bits."""
-        now, flags = self.advance(), self.flags
-        if math.hypot(*(axis.place[-1] for axis in self.axes)) > 1 + RIM_SLACK:
-            flags |= Status.TRIMMED
-        if any(now < axis.time_s[-1] + SETTLE_S for axis in self.axes):
-            flags |= Status.NOT_STABLE
-        return flags
+        now = self.advance()
+        moving = any(now < axis.time_s[-1] + SETTLE_S for axis in self.axes)
+        return self.flags | Status.NOT_STABLE if moving else self.flags
 
     def get(self, number: int) -> bytes:
         """Return a register's cell; RefusedError where there is no such register."""
-        now, register = self.advance(), self._register(number)
-        value = self.values[number]
+        self.advance()
         for channel, playback in zip((pro.X, pro.Y), self.playbacks, strict=True):
-            if number == channel.vector(VectorRegister.RUN):
-                value = playback.running
-            elif number == channel.vector(VectorRegister.INDEX):
-                value = playback.index
-        if number == pro.LOG_RUN:
-            value = self._log_s is not None and now < self._log_s[1] and self._rows() < self.unit.log_rows
-        return pro.int_cell(int(value)) if register.whole else pro.float_cell(value)
+            if number == channel.vector(VectorRegister.INDEX):
+                return pro.int_cell(playback.index)
+        whole = self._register(number).whole
+        return pro.int_cell(int(self.values[number])) if whole else pro.float_cell(self.values[number])
 
     def put(self, cells: Mapping[int, bytes]) -> None:
         """Write registers at one moment; held positions take effect together.
 
-        RefusedError where a register is missing, read-only or out of range; none is written then. A range that is not
-        in the memory is refused after the other registers were written.
+        RefusedError where a register is missing or out of range; none is written then. A range that is not in the
+        memory is refused after the other registers were written.
         """
         values = {number: self._register(number).read(cell) for number, cell in cells.items()}
         for channel in (pro.X, pro.Y):
@@ -248,9 +217,8 @@ class MirrorState:
         elif pro.LOG_RUN in values and self._log_s is not None:
             self._log_s = self._log_s[0], min(self._log_s[1], now)
 
-    def get_cells(self, number: int, offset: int, length: int) -> bytes:
-        """Return cells of the vector memory or of a log's slot (offset and length in bytes); else RefusedError."""
-        start, stop = _cells(offset, length)
+    def get_cells(self, number: int, start: int, stop: int) -> bytes:
+        """Return cells of the vector memory or of a log's slot; else RefusedError."""
         if number == pro.VECTOR_MEMORY:
             _check_within(stop, self.memory.size)
             return self.memory[start:stop].astype(">f4").tobytes()
@@ -262,14 +230,14 @@ class MirrorState:
         logged = self.positions(times_s)[:, channel] if channel in (0, 1) else np.zeros(stop - start)
         return logged.astype(">f4").tobytes()
 
-    def put_cells(self, number: int, offset: int, data: bytes) -> None:
+    def put_cells(self, number: int, start: int, data: bytes) -> None:
         """Write cells of the vector memory (else RefusedError)."""
-        start, stop = _cells(offset, len(data))
+        cells = np.frombuffer(data, ">f4")
         if number != pro.VECTOR_MEMORY:
             raise RefusedError(ErrorCode.NO_REGISTER)
-        _check_within(stop, self.memory.size)
+        _check_within(start + len(cells), self.memory.size)
         self.advance()
-        self.memory[start:stop] = np.frombuffer(data, ">f4")
+        self.memory[start : start + len(cells)] = cells
 
     def _step(self, number: int, times_s: Floats) -> None:
         """Play one cell at each time; the axis follows where its input is the vector unit."""
@@ -283,32 +251,23 @@ class MirrorState:
             int(self.values[channel.vector(name)])
             for name in (VectorRegister.START, VectorRegister.END, VectorRegister.CYCLES, VectorRegister.TRIGGER)
         )
-        length = end - start + (self.unit.ends == "inclusive")
-        if length < 1 or start + length > self.memory.size:
+        length = end - start
+        if length < 1 or end > self.memory.size:
             raise RefusedError(ErrorCode.VECTOR_INDEX)
-        total = math.inf if cycles < 0 else cycles * length
         rate_hz = self.values[channel.vector(VectorRegister.FREQUENCY)]
-        return Playback(start, length, total, rate_hz, trigger != pro.Trigger.OFF, now_s, 0, True)
+        return Playback(start, length, cycles * length, rate_hz, trigger != pro.Trigger.OFF, now_s, 0, True)
 
     def _rows(self) -> int:
         """Return the rows of the log; it stops by itself when it is full."""
         if self._log_s is None:
             return 0
         seconds = min(self._log_s[1], self.clock.now()) - self._log_s[0]
-        return min(int(seconds * self.values[pro.LOG_RATE] + 1e-9) + 1, self.unit.log_rows)
+        return min(int(seconds * self.values[pro.LOG_RATE] + 1e-9) + 1, LOG_ROWS)
 
     def _register(self, number: int) -> Register:
         if number not in self.registers:
             raise RefusedError(ErrorCode.NO_REGISTER)
         return self.registers[number]
-
-
-def _cells(offset: int, length: int) -> tuple[int, int]:
-    if offset % pro.CELL or length % pro.CELL:
-        raise RefusedError(ErrorCode.VECTOR_ALIGNMENT)
-    if not 0 < length <= pro.MOST_PAYLOAD:
-        raise RefusedError(ErrorCode.LENGTH_MISMATCH)
-    return offset // pro.CELL, (offset + length) // pro.CELL
 
 
 def _check_within(stop: int, size: int) -> None:
@@ -342,26 +301,23 @@ class Request:
 class MirrorDevice:
     """One emulated controller with its mirror.
 
-    ``requests`` are the latest `KEPT_REQUESTS` that were carried out. ``pulses`` gives the rising edges at the trigger
-    input. Methods may be called from several threads: that of the port, and that of an emulated camera, which asks for
-    positions.
+    ``pulses`` gives the rising edges at the trigger input. Methods may be called from several threads: that of the
+    port, and that of an emulated camera, which asks for positions.
     """
 
-    def __init__(self, clock: Clock, *, unit: MirrorUnit | None = None) -> None:
-        self.clock, self.unit = clock, MirrorUnit() if unit is None else unit
-        self.requests: deque[Request] = deque(maxlen=KEPT_REQUESTS)
+    def __init__(self, clock: Clock) -> None:
+        self.clock = clock
         self.pulses: Pulses | None = None
         self._pulses_taken_s = clock.now()
         self._lock, self._pulses_lock = threading.RLock(), threading.Lock()
-        self.state = MirrorState(clock, self.unit)
-        self.restart(boot_s=0.0)
+        self.restart()
 
     def receive(self, data: bytes) -> list[Chunk]:
         """Take bytes and return what comes back."""
         self.take_pulses()
         with self._lock:
             out: list[Chunk] = []
-            while data and self.clock.now() >= self._boots_until_s:
+            while data:
                 data = self._take_line(data, out) if self.mode is Mode.SIMPLE else self._take_frame(data, out)
             return out
 
@@ -383,12 +339,11 @@ class MirrorDevice:
         with self._lock:
             return self.state.positions(times_s)
 
-    def restart(self, *, boot_s: float) -> None:
-        """Lose all state and be in simple mode, deaf for ``boot_s``: a reset, or a loss of power."""
+    def restart(self) -> None:
+        """Lose all state and be in simple mode, as after power-on."""
         with self._lock:
-            self.state.restart()
+            self.state = MirrorState(self.clock)
             self.set_mode(Mode.SIMPLE)
-            self._boots_until_s = self.clock.now() + boot_s if boot_s > 0 else -math.inf
 
     def set_mode(self, mode: Mode) -> None:
         """Speak another mode from the next byte on."""
@@ -406,7 +361,7 @@ class MirrorDevice:
 
     def _take_frame(self, data: bytes, out: list[Chunk]) -> bytes:
         """Take bytes up to a boundary, and return those behind it: a frame may change the mode."""
-        taken, end, rest = data.partition(bytes((pro.BOUNDARY,)))
+        taken, end, rest = data.partition(b"\x7e")
         for found in self._reader.feed(taken + end):
             whole, damaged = (found, None) if isinstance(found, pro.Frame) else (None, found)
             self._answer(Request(self.mode, frame=whole, damaged=damaged), out)
@@ -415,11 +370,10 @@ class MirrorDevice:
     def _answer(self, request: Request, out: list[Chunk]) -> None:
         """Carry a request out and add the reply."""
         if reply := self.carry_out(request):
-            out.append(Chunk(self.unit.turnaround_s, reply))
+            out.append(Chunk(TURNAROUND_S, reply))
 
     def carry_out(self, request: Request) -> bytes:
         """Do what a request asks for and return the bytes of the reply."""
-        self.requests.append(request)
         if request.damaged is not None:  # answered to the command that the bytes seem to hold, if any
             command = request.damaged.data[1] if len(request.damaged.data) > 1 else 0
             return _refusal(command, ErrorCode.FRAME_INVALID)
@@ -438,12 +392,11 @@ class MirrorDevice:
     def _simple(self, line: str) -> str:
         """Carry out a line, in capitals and without its end, and return the answer without an end."""
         if len(line) + len(END) > MOST_LINE:
-            return Reply.ERROR
-        texts = {ID: self.unit.model, VERSION: self.unit.version, SERIAL: self.unit.serial_number}
+            return "ERROR"
         modes = {START: Mode.SIMPLE, GO_PRO: Mode.PRO, GO_PRO_CRC: Mode.PRO_CRC}
         if line in modes:
             self.set_mode(modes[line])
-        return Reply.OK if line in modes else texts.get(line, Reply.NO)
+        return OK if line in modes else TEXTS.get(line, "NO")
 
     def _pro(self, command: int, payload: bytes) -> bytes:
         """Carry out a frame and return the payload of the reply; RefusedError or ShapeError where it is refused."""
@@ -456,21 +409,15 @@ class MirrorDevice:
                     raise RefusedError(ErrorCode.OUT_OF_RANGE)
                 self.set_mode(Mode.SIMPLE)
             case pro.Command.GET_VALUE:
-                (number,) = pro.read_registers(b"\x00\x01" + payload, with_cells=False)
-                return state.get(number)
-            case pro.Command.GET_VALUES:
-                numbers = pro.read_registers(payload, with_cells=False)
-                return pro.count_bytes(len(numbers)) + b"".join(map(state.get, numbers))
+                return state.get(int.from_bytes(pro.checked(payload, 2), "big"))
             case pro.Command.SET_VALUES:
-                state.put(pro.read_registers(payload, with_cells=True))
+                state.put(pro.read_registers(payload))
             case pro.Command.GET_VECTOR:
                 register, offset, length, _ = pro.read_vector(payload)
-                return state.get_cells(register, offset, length)
+                return state.get_cells(register, offset // pro.CELL, (offset + length) // pro.CELL)
             case pro.Command.SET_VECTOR:
                 register, offset, length, cells = pro.read_vector(payload)
-                if len(cells) != length:
-                    raise ShapeError(f"{len(cells)} bytes of cells, {length} are stated")
-                state.put_cells(register, offset, cells)
+                state.put_cells(register, offset // pro.CELL, pro.checked(cells, length // pro.CELL * pro.CELL))
             case _:
                 raise RefusedError(ErrorCode.COMMAND_UNKNOWN)
         return b""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -12,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from flows.tasks import rig_lock as rig_locks
-from flows.tasks.rig_lock import lock_name, rig_to_oneself
+from flows.tasks import rig_field
+from flows.tasks.rig_field import rig_to_oneself
 from pipeline.errors import ArchiveError, RigError
 from storage.archive.staging import take_lock
 
@@ -21,9 +20,9 @@ ROOT = Path(__file__).parents[3]
 PORT = f"/dev/ttyTEST{os.getpid()}"  # two runs of these tests on one machine are two rigs
 TAKES = """
 import sys
-from flows.tasks.rig_lock import rig_to_oneself
+from flows.tasks.rig_field import rig_to_oneself
 try:
-    with rig_to_oneself(sys.argv[1], "a survey"):
+    with rig_to_oneself(sys.argv[1]):
         print(True, flush=True)
         sys.stdin.read()
 except OSError:
@@ -57,36 +56,34 @@ def takers(folder: Path, count: int) -> Iterator[list[tuple[subprocess.Popen[str
             process.communicate()
 
 
-def holder(port: str) -> str:
-    """Whoever holds a rig, by the refusal; empty where it is free."""
-    try:
-        with rig_to_oneself(port, "a question"):
-            return ""
-    except RigError as error:
-        return re.sub(r"^the rig is in use by (.*); wait until that survey has ended, or end it$", r"\1", str(error))
+def assert_held(port: str) -> None:
+    """Somebody holds a rig."""
+    with pytest.raises(RigError, match=r"is in use by another survey; wait until that has ended"), rig_to_oneself(port):
+        pass
 
 
 def test_three_users_with_folders_of_their_own(tmp_path: Path) -> None:
     """With another TMPDIR each, one of three has the rig, and it is free once that one is killed."""
     with takers(tmp_path, 3) as tried:
         assert [took for _, took in tried] == [True, False, False]
+        assert_held(PORT)
         first = tried[0][0]
-        assert holder(PORT) == f"a survey (process {first.pid})"
         first.kill()
         first.wait()
-        with rig_to_oneself(PORT, "by hand"):
-            assert holder(PORT) == f"by hand (process {os.getpid()})"
-    assert holder(PORT) == ""
+        with rig_to_oneself(PORT):
+            assert_held(PORT)
 
 
 def test_locks_are_of_the_port(tmp_path: Path) -> None:
     """A link to the device is the device; long addresses are told apart."""
     (tmp_path / "tty").touch()
     (tmp_path / "by-id").symlink_to(tmp_path / "tty")
-    assert lock_name(str(tmp_path / "by-id")) == lock_name(str(tmp_path / "tty"))
+    with rig_to_oneself(str(tmp_path / "tty")):
+        assert_held(str(tmp_path / "by-id"))
     one, other = (f"socket://{'a' * 200}:{port}" for port in (5000, 5001))
-    with rig_to_oneself(one, "a survey"), rig_to_oneself(other, "a survey"):
-        assert holder(one) == holder(other) == f"a survey (process {os.getpid()})"
+    with rig_to_oneself(one), rig_to_oneself(other):
+        assert_held(one)
+        assert_held(other)
 
 
 def test_a_rig_that_cannot_be_locked_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -95,10 +92,10 @@ def test_a_rig_that_cannot_be_locked_is_not_used(monkeypatch: pytest.MonkeyPatch
     def refuse(*_: object) -> None:
         raise PermissionError(1, "Operation not permitted")
 
-    monkeypatch.setattr(rig_locks.socket, "socket", refuse)
+    monkeypatch.setattr(rig_field.socket, "socket", refuse)
     with (
         pytest.raises(RigError, match=r"cannot lock the rig .*: Operation not permitted; .* need Linux"),
-        rig_to_oneself(PORT, "a survey"),
+        rig_to_oneself(PORT),
     ):
         pass
 

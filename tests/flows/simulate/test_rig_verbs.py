@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import errno
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -13,7 +11,6 @@ import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 import serial
@@ -22,7 +19,7 @@ from rich.console import Console
 from flows.settings.load import load_settings
 from flows.simulate.rig_commands import emulated_settings, run_emulate
 from pipeline.rig.emulator.emulated_rig import FastClock, ServedRig
-from pipeline.rig.mirror.pro_mode import Command
+from pipeline.rig.pro_mode import Command
 from tests.flows.conftest import CommandLine
 from tests.pipeline.rig.camera_faults import FaultyRig
 from tests.pipeline.rig.mirror_faults import make_fault
@@ -63,37 +60,16 @@ def test_settings_file_says_where_both_are(command_line: CommandLine, tmp_path: 
         assert ended.code == record["exit_code"] == 0
         assert (record["failed"], record["warned"], record["move"]) == (0, 0, True)
         assert [row["asked"] for row in record["rows"] if row["asked"].startswith("go to")][-1] == "go to 0; 0"
-        assert record["rows"][-1]["came"].startswith("32 edges in 4 frames (/captured/check_")
         assert record["port"] == rig.port
         assert record["camera"] == f"{rig.host}:{rig.camera_port}"
         assert not still(rig)
 
 
-def refused(number: int) -> Any:
-    """An opening of ports that the system refuses."""
-
-    def open_port(*_: Any, **__: Any) -> Any:
-        raise serial.SerialException(number, os.strerror(number))
-
-    return open_port
-
-
-@pytest.mark.parametrize(
-    ("number", "words"),
-    [
-        (errno.ENOENT, "there is no port /dev/ttyACM7"),
-        (errno.EACCES, "no permission for /dev/ttyACM7"),
-        (errno.EBUSY, "/dev/ttyACM7 is in use by another program"),
-    ],
-)
-def test_ports_that_cannot_be_opened(
-    command_line: CommandLine, monkeypatch: pytest.MonkeyPatch, number: int, words: str
-) -> None:
-    """One message each, exit code 1."""
-    monkeypatch.setattr(serial, "serial_for_url", refused(number))
+def test_a_port_that_cannot_be_opened(command_line: CommandLine) -> None:
+    """One message, exit code 1."""
     ended = command_line("rig", "check", "--port", "/dev/ttyACM7")
     assert ended.code == 1
-    assert words in ended.out
+    assert "/dev/ttyACM7 cannot be opened" in ended.out
     assert "Traceback" not in ended.err
 
 
@@ -102,7 +78,7 @@ def test_one_of_two_devices_is_partly(command_line: CommandLine) -> None:
     with served() as rig, serial.Serial(rig.port, exclusive=True):
         ended = command_line("rig", "check", "--port", rig.port)
         assert ended.code == 1
-        assert "in use by another program" in ended.out
+        assert "no other program" in " ".join(ended.out.split())
     with served() as rig:
         ended = command_line("rig", "check", "--port", rig.port, "--camera", NOWHERE, "--json")
         record = json.loads(ended.out)
@@ -142,23 +118,7 @@ def test_rig_in_order(command_line: CommandLine) -> None:
         assert ended.code == 0
         assert "MR-E-2" in ended.out
         assert "nothing to mend" in ended.out
-        assert 'not tried without --move; pulses = "none" is taken on trust' in " ".join(ended.out.split())
         assert still(rig)
-
-
-def test_what_is_not_tried_is_said(command_line: CommandLine) -> None:
-    """Edges need both devices in order: one alone, one that failed, or a path that plays leave the setting on trust."""
-    with served() as rig:
-        for more, why in (((), "without a camera"), (("--camera", NOWHERE), "as not all of the above is in order")):
-            ended = command_line("rig", "check", "--port", rig.port, *more, "--move", "--json")
-            assert json.loads(ended.out)["rows"][-1]["came"].startswith(f"not tried {why}; pulses")
-        playbacks = rig.rig.mirror.state.playbacks
-        for playback in playbacks:
-            playback.running, playback.total = True, float("inf")
-        ended = command_line("rig", "check", "--port", rig.port, "--camera", camera_of(rig), "--move", "--json")
-        assert json.loads(ended.out)["rows"][-1]["came"].startswith(f"not tried {why}; pulses")
-        assert all(playback.running for playback in playbacks)
-        assert not rig.rig.camera.captures
 
 
 def test_a_driver_that_cannot_be_imported_is_refused(command_line: CommandLine, tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import pairwise
@@ -18,7 +17,6 @@ from pipeline.simulator.simulated import SimulatedSource
 from tests.pipeline.rig.mirror_faults import Fault, FaultyMirror
 
 SLOW_S, LATE_S = 1.0, 60.0
-_CUBE = re.compile(r"raw_(\d+)")
 
 
 class CameraFault(StrEnum):
@@ -28,8 +26,6 @@ class CameraFault(StrEnum):
     LATE = "a reply comes after any deadline"
     SILENT = "a command is done and its reply is lost"
     SPLIT = "a reply comes in pieces"
-    MERGED = "a reply comes together with one to a command that was not sent"
-    STALE = "a reply to another command comes before the right one"
     NOT_JSON = "a reply is no JSON"
     HANGS_UP = "a command is done, and the connection closed without a reply"
     FULL = "a capture is refused: the disk is full"
@@ -86,12 +82,6 @@ class FaultyCamera(CameraDevice):
             data = b"".join(data for _, data in said)
             if self.faults.strikes(CameraFault.NOT_JSON):
                 data = f"{line}\r\nSegmentation fault".encode() + PROMPT
-            foreign = b'%b\r\n{"success": true, "response": [], "errorMessage": ""}' + PROMPT  # its echo is another's
-            if self.faults.strikes(CameraFault.STALE):
-                other = b"isCapturing" if line.startswith("listFiles") else b"listFiles"
-                return [Chunk(0.0, foreign % other), Chunk(0.1, data)]
-            if self.faults.strikes(CameraFault.MERGED):
-                return [Chunk(0.0, foreign % b"stopCapture" + data)]
             if self.faults.strikes(CameraFault.LATE):
                 return [Chunk(LATE_S, data)]
             if self.faults.strikes(CameraFault.SLOW):
@@ -102,11 +92,10 @@ class FaultyCamera(CameraDevice):
         """Give the files, with cubes that are cut off."""
         found = super().files()
         for folder in self._cut:
-            cubes = [name for name in found if name.startswith(folder + "/") and _CUBE.fullmatch(name.split("/")[-1])]
-            if cubes:
-                last = max(cubes, key=lambda name: int(name.rpartition("_")[2]))
-                lines = int(found[f"{last}.hdr"].partition(b"lines = ")[2].split()[0])
-                found[last] = found[last][: -3 * len(found[last]) // (2 * lines)]  # a line and a half
+            cube = f"{folder}/raw_0"
+            if cube in found:
+                lines = int(found[f"{cube}.hdr"].partition(b"lines = ")[2].split()[0])
+                found[cube] = found[cube][: -3 * len(found[cube]) // (2 * lines)]  # a line and a half
         return found
 
     def _in_pieces(self, data: bytes) -> list[Chunk]:
@@ -122,11 +111,11 @@ class FaultyCamera(CameraDevice):
                 raise RigError(why)
         return super()._capture(argument)
 
-    def _begun(self, folder: str, frames: int, cubes: int) -> EmulatedCapture:
+    def _begun(self, folder: str, frames: int) -> EmulatedCapture:
         self._cut.discard(folder)
         if self.faults.strikes(CameraFault.CUT_CUBE):
             self._cut.add(folder)
-        return super()._begun(folder, frames, cubes)
+        return super()._begun(folder, frames)
 
 
 class FaultySceneCamera(FaultyCamera, SceneCamera):

@@ -7,15 +7,14 @@ from collections import deque
 from dataclasses import dataclass, field
 from itertools import count
 
-from pipeline.errors import SettingsError
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
-from pipeline.rig.device_settings import FileServer, MirrorSettings
+from pipeline.rig.device_settings import FileServer, SurveyRig
 from pipeline.rig.drivers import RigDevices
 from pipeline.rig.emulator import Chunk
 from pipeline.rig.emulator.camera_device import CameraConnection, CameraDevice
 from pipeline.rig.emulator.emulated_rig import EmulatedRig
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.mirror.mirror_controller import MirrorController
+from pipeline.rig.mirror_controller import MirrorController
 from pipeline.rig.transports import BITS_PER_BYTE, Clock, Closing, DeadlinePassed, DeviceGone
 from tests.pipeline.rig.mirror_faults import FaultyMirror, VanishedError
 
@@ -32,12 +31,6 @@ class ManualClock:
     def sleep(self, seconds: float) -> None:
         if seconds > 0:
             self._now += seconds
-
-    def advance(self, seconds: float) -> None:
-        """Move the clock on by so much; SettingsError where that is below 0. [s]"""
-        if not seconds >= 0:
-            raise SettingsError(f"a clock only goes forward, got {seconds} s; give 0 or more")
-        self._now += seconds
 
 
 @dataclass
@@ -187,11 +180,16 @@ class InProcessRig(Closing):
         """Give a driver that is connected to the camera."""
         return HeadwallCamera(self.camera_line, self.files, clock=self.clock)
 
-    def devices(self, settings: MirrorSettings) -> RigDevices:
-        """Connect drivers to both, the mirror's by a line of its own."""
+    def mirror(self, rig: SurveyRig, vector_pairs: int = 1500) -> MirrorController:
+        """Connect a driver to the mirror, by a line of its own."""
         self.transport = InProcessTransport(self.rig.mirror, self.clock)
-        mirror = MirrorController(self.transport, settings, self.clock)
+        mirror = MirrorController(self.transport, rig, self.clock, vector_pairs=vector_pairs)
         mirror.connect()
+        return mirror
+
+    def devices(self, rig: SurveyRig, vector_pairs: int = 1500) -> RigDevices:
+        """Connect drivers to both."""
+        mirror = self.mirror(rig, vector_pairs)
         return RigDevices(mirror, self.camera(), self.clock)
 
     def close(self) -> None:

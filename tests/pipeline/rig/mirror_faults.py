@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import math
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from random import Random
 from typing import Any
@@ -13,24 +13,12 @@ from typing import Any
 import numpy as np
 
 from pipeline.rig.emulator import Chunk
-from pipeline.rig.emulator.mirror_device import MirrorDevice, Mode, Request
-from pipeline.rig.mirror.mirror_requests import END, GO_PRO, GO_PRO_CRC, ID, VERSION, Reply
-from pipeline.rig.mirror.pro_mode import (
-    CELL,
-    VECTOR_MEMORY,
-    Command,
-    ErrorCode,
-    Frame,
-    FrameReader,
-    Status,
-    encode,
-    read_vector,
-    refuse,
-)
+from pipeline.rig.emulator.mirror_device import TURNAROUND_S, MirrorDevice, Mode, Request
+from pipeline.rig.mirror_controller import END, ID, VERSION
+from pipeline.rig.pro_mode import CELL, VECTOR_MEMORY, Command, ErrorCode, Status, encode, read_vector, refuse
 
 LATE_S = 20.0  # beyond any deadline
 SLOW_S = 0.02  # from byte to byte
-TICK_S = 0.005  # at which replies that wait for each other leave
 # the end of a reply with a text, one of a status, and a whole frame: what another program left behind
 _LEFT_BEHIND = (b"R-E-2\r\n", b"00000010\r\n", bytes.fromhex("7e 00 11 04 00 00 00 00 f2 81 7e"))
 _OTHER_TEXTS = {ID: "LENS-DRIVER-4", VERSION: "0.0.1"}
@@ -105,18 +93,14 @@ class Fault:
 
 
 class FaultyMirror(MirrorDevice):
-    """A controller that fails; ``gone`` and ``hung`` say that no port knows it any more, or that it takes no bytes.
+    """A controller that fails; ``gone`` and ``hung`` say that no port knows it any more, or that it takes no bytes."""
 
-    ``crc`` is its firmware: one checks the CRC of requests after GOPRO as well ("required"), one knows no GOPROCRC and
-    sends 00 00 in the CRC's place ("absent").
-    """
-
-    crc = "either"
-
-    def __init__(self, clock: Any, faults: Sequence[Fault] = (), **given: Any) -> None:
+    def __init__(self, clock: Any, faults: Sequence[Fault] = ()) -> None:
         self.faults: tuple[Fault, ...] = ()
+        self.requests: list[Request] = []  # that were carried out
         self.gone = self.hung = False
-        super().__init__(clock, **given)
+        self.deaf_until_s = -math.inf
+        super().__init__(clock)
         self.have(faults)
 
     def have(self, faults: Sequence[Fault]) -> None:
@@ -140,21 +124,12 @@ class FaultyMirror(MirrorDevice):
                 if instead is not None:
                     return instead
                 data = fault.incoming(self, data)
-            return super().receive(data)
-
-    def _simple(self, line: str) -> str:
-        if self.crc == "absent" and line == GO_PRO_CRC:
-            return Reply.NO
-        return super()._simple(GO_PRO_CRC if self.crc == "required" and line == GO_PRO else line)
+            return super().receive(data) if self.clock.now() >= self.deaf_until_s else []
 
     def carry_out(self, request: Request) -> bytes:
-        """Do what a request asks for; a firmware without CRCs has none in its reply."""
-        reply = super().carry_out(request)
-        if self.crc != "absent" or request.mode is Mode.SIMPLE:
-            return reply
-        (frame,) = FrameReader().feed(reply)
-        assert isinstance(frame, Frame)
-        return encode(frame, with_crc=False)
+        """Note a request, and do what it asks for."""
+        self.requests.append(request)
+        return super().carry_out(request)
 
     def _answer(self, request: Request, out: list[Chunk]) -> None:
         if self.gone:
@@ -164,7 +139,7 @@ class FaultyMirror(MirrorDevice):
             reply = fault.verdict(self, request) if reply is None else reply
         if reply is None:
             reply = self.carry_out(request)
-        chunks = [Chunk(self.unit.turnaround_s, reply)] if reply else []
+        chunks = [Chunk(TURNAROUND_S, reply)] if reply else []
         for fault in self.faults:
             chunks = fault.outgoing(self, request, chunks)
         out += chunks
@@ -181,11 +156,6 @@ def lose(data: bytes, at: int, random: Random) -> bytes:
 def flip(data: bytes, at: int, random: Random) -> bytes:
     """Turn one bit of a byte."""
     return data[:at] + bytes((data[at] ^ 1 << random.randrange(8),)) + data[at + 1 :]
-
-
-def double(data: bytes, at: int, random: Random) -> bytes:
-    """Have a byte twice."""
-    return data[: at + 1] + data[at:]
 
 
 # what may become of a reply
@@ -210,17 +180,6 @@ def split(device: MirrorDevice, chunks: list[Chunk], random: Random) -> list[Chu
             pieces.append(Chunk(delay_s, data[:size]))
             data, delay_s = data[size:], delay_s + 1e-3
     return pieces
-
-
-def merge(device: MirrorDevice, chunks: list[Chunk], random: Random) -> list[Chunk]:
-    """Let it wait for the next tick of a slow clock, with those that wait already."""
-    now = device.clock.now()
-    return [Chunk(math.ceil((now + delay_s) / TICK_S) * TICK_S - now, data) for delay_s, data in chunks]
-
-
-def noise(device: MirrorDevice, chunks: list[Chunk], random: Random) -> list[Chunk]:
-    """Put bytes that mean nothing before it."""
-    return [Chunk(chunks[0].delay_s, random.randbytes(random.randint(1, 12))), *chunks]
 
 
 def late(device: MirrorDevice, chunks: list[Chunk], random: Random) -> list[Chunk]:
@@ -255,21 +214,6 @@ class SpoiltReply(Fault):
         if not chunks or not (self.chance.lasts() if self.lasting else self.chance.comes()):
             return chunks
         return self.spoil(device, chunks, self.chance.random)
-
-
-@dataclass
-class OldReplyAgain(Fault):
-    """The reply before is sent once more, in front of one reply."""
-
-    last: bytes = b""
-
-    def outgoing(self, device: FaultyMirror, request: Request, chunks: list[Chunk]) -> list[Chunk]:
-        whole = b"".join(data for _, data in chunks)
-        if not whole:
-            return chunks
-        again = [Chunk(chunks[0].delay_s, self.last)] if self.chance.comes() and self.last else []
-        self.last = whole
-        return again + chunks
 
 
 @dataclass
@@ -317,20 +261,19 @@ class SilentReset(Fault):
         """Restart instead of doing what was asked, and answer nothing."""
         if (self.commands is not None and request.command not in self.commands) or not self.chance.comes():
             return None
-        device.restart(boot_s=self.boot_s)
+        device.restart()
+        device.deaf_until_s = device.clock.now() + self.boot_s
         return b""
 
 
 @dataclass
-class AnswersLine(Fault):
+class AnswersNo(Fault):
     """One line of simple mode gets a refusal and is not carried out."""
-
-    answer: str
 
     def verdict(self, device: FaultyMirror, request: Request) -> bytes | None:
         if request.mode is not Mode.SIMPLE or not self.chance.comes():
             return None
-        return self.answer.encode("ascii") + END
+        return b"NO" + END
 
 
 @dataclass
@@ -404,18 +347,6 @@ class GoneBefore(Fault):
 
 
 @dataclass
-class GoneWithin(Fault):
-    """The device goes away in the middle of a request, of which it took a part."""
-
-    def incoming(self, device: FaultyMirror, data: bytes) -> bytes:
-        for place in range(len(data)):
-            if self.chance.comes():
-                device.gone = True
-                return data[:place]
-        return data
-
-
-@dataclass
 class GoneAfter(Fault):
     """The device carries a request out and goes away before it answers."""
 
@@ -444,43 +375,18 @@ class Echo(Fault):
     def instead(self, device: FaultyMirror, data: bytes) -> list[Chunk]:
         """Send back all that came."""
         self.chance.struck += 1
-        return [Chunk(device.unit.turnaround_s, data)]
+        return [Chunk(TURNAROUND_S, data)]
 
 
-@dataclass
-class Modem(Fault):
-    """A modem instead of a controller: it shows what is typed, and answers lines as modems do."""
-
-    typed: bytes = field(default=b"", init=False)
-
-    def instead(self, device: FaultyMirror, data: bytes) -> list[Chunk]:
-        """Show what is typed, and at each CR answer OK to a line that begins with AT, ERROR to any other."""
-        self.chance.struck += 1
-        answers = []
-        for byte in data:
-            if byte == 0x0D:
-                good = self.typed.strip().upper().startswith(b"AT")
-                answers.append(b"\r\nOK\r\n" if good else b"\r\nERROR\r\n" if self.typed.strip() else b"")
-                self.typed = b""
-            else:
-                self.typed = (self.typed + bytes((byte,)))[-64:]
-        return [Chunk(device.unit.turnaround_s, data + b"".join(answers))]
-
-
-_VALUES = frozenset({Command.GET_VALUE, Command.GET_VALUES, Command.SET_VALUES})
 _SETTING = frozenset({Command.SET_VALUES})
 _VECTORS = frozenset({Command.SET_VECTOR, Command.GET_VECTOR})
 _UPLOAD = frozenset({Command.SET_VECTOR})
 _BYTES = 1024  # within so many bytes to the controller
-HARMLESS = ("split-replies", "merged-replies", "stale-bytes", "pro-at-connect")  # a driver copes with them
+HARMLESS = ("split-replies", "stale-bytes", "pro-at-connect")  # a driver copes with them
 
 
 def _reply(spoil: Spoil, *, lasting: bool = False) -> tuple[Callable[[Chance], Fault], int]:
     return partial(SpoiltReply, spoil=spoil, lasting=lasting), 64
-
-
-def _line(answer: Reply) -> tuple[Callable[[Chance], Fault], int]:
-    return partial(AnswersLine, answer=answer), 6
 
 
 def _code(code: int, commands: Collection[int] | None = None, span: int = 64) -> tuple[Callable[[Chance], Fault], int]:
@@ -495,32 +401,18 @@ def _bit(bit: Status) -> tuple[Callable[[Chance], Fault], int]:
 KINDS: dict[str, tuple[Callable[[Chance], Fault], int]] = {
     "request-byte-lost": (partial(RequestByte, change=lose), _BYTES),
     "request-bit-flipped": (partial(RequestByte, change=flip), _BYTES),
-    "request-byte-doubled": (partial(RequestByte, change=double), _BYTES),
     "reply-byte-lost": _reply(changed(lose)),
     "reply-bit-flipped": _reply(changed(flip)),
-    "reply-byte-doubled": _reply(changed(double)),
     "split-replies": _reply(split, lasting=True),
-    "merged-replies": _reply(merge, lasting=True),
     "stale-bytes": (StaleBytes, 64),
-    "noise": _reply(noise),
-    "old-reply-again": (OldReplyAgain, 64),
     "late-reply": _reply(late),
     "just-late-reply": _reply(just_late),
     "no-reply": _reply(lost),
     "mute": _reply(lost, lasting=True),
     "slow-bytes": _reply(slow, lasting=True),
-    "answers-no": _line(Reply.NO),
-    "answers-ol": _line(Reply.BELOW),
-    "answers-ou": _line(Reply.ABOVE),
-    "answers-error": _line(Reply.ERROR),
-    "error-frame": _code(ErrorCode.FRAME_INVALID),
-    "error-length": _code(ErrorCode.LENGTH_MISMATCH),
-    "error-crc": _code(ErrorCode.CRC_WRONG),
-    "error-no-register": _code(ErrorCode.NO_REGISTER, _VALUES, 8),
+    "answers-no": (AnswersNo, 6),
     "error-range": _code(ErrorCode.OUT_OF_RANGE, _SETTING, 4),
-    "error-read-only": _code(ErrorCode.READ_ONLY, _SETTING, 4),
     "error-vector-index": _code(ErrorCode.VECTOR_INDEX, _VECTORS),
-    "error-chain": _code(ErrorCode.CHAIN, _SETTING, 4),
     "error-unknown": _code(0xBEEF),
     "wrong-firmware": (OtherFirmware, 64),
     "cell-lost": (CellLost, 16),
@@ -530,15 +422,11 @@ KINDS: dict[str, tuple[Callable[[Chance], Fault], int]] = {
     "never-stable": _bit(Status.NOT_STABLE),
     "trimmed": _bit(Status.TRIMMED),
     "mirror-warm": _bit(Status.MIRROR_WARM),
-    "electronics-warm": _bit(Status.ELECTRONICS_WARM),
     "disconnected": _bit(Status.DISCONNECTED),
-    "eeprom-invalid": _bit(Status.EEPROM_INVALID),
     "gone-before": (GoneBefore, 64),
-    "gone-within": (GoneWithin, _BYTES),
     "gone-after": (GoneAfter, 64),
     "hangs": (PortHangs, 64),
     "echo": (Echo, 64),
-    "modem": (Modem, 64),
 }
 
 

@@ -15,9 +15,9 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import STRAIGHT, Mounting
 from pipeline.geometry.scan import Sweep
 from pipeline.rig.camera.camera_files import Kept, KeptInMemory
-from pipeline.rig.capture.rig_source import RigSource
 from pipeline.rig.device_settings import SurveyRig
 from pipeline.rig.drivers import RigDevices
+from pipeline.rig.rig_source import RigSource
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
@@ -78,7 +78,7 @@ class SmallRig:
     def devices(self) -> RigDevices:
         """Connect to both."""
         self.opened += 1
-        return self.line.devices(self.settings.mirror(self.vector_pairs))
+        return self.line.devices(self.settings, self.vector_pairs)
 
     def source(self, kept: Kept | None = None) -> RigSource:
         """A source that looks through the rig; another call is another process."""

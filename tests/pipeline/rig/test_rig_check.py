@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -14,28 +13,25 @@ import pytest
 from pipeline.errors import RigError
 from pipeline.rig.camera.camera_files import log_in
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
-from pipeline.rig.capture.capture_paths import capture_prefix
-from pipeline.rig.device_settings import FileServer, MirrorSettings, Pulses
-from pipeline.rig.emulator.mirror_device import Mode
-from pipeline.rig.mirror.mirror_controller import MirrorController, MotionLog
-from pipeline.rig.mirror.pro_mode import Command, Status
-from pipeline.rig.rig_check import SQUARE, CheckRow, check_camera, check_mirror, check_triggers, failed, works
+from pipeline.rig.capture_paths import capture_prefix
+from pipeline.rig.device_settings import FileServer, SurveyRig
+from pipeline.rig.mirror_controller import MirrorController, MotionLog
+from pipeline.rig.pro_mode import Command
+from pipeline.rig.rig_check import SQUARE, CheckRow, check_camera, check_mirror, failed, works
 from pipeline.rig.transports import Clock, DeviceGone, DeviceRefused
 from tests.pipeline.rig.camera_faults import CameraFault, CameraFaults, FaultyRig
 from tests.pipeline.rig.in_process import InProcessRig, ManualClock
 from tests.pipeline.rig.mirror_faults import make_fault
-from tests.pipeline.rig.small_rig import CAMERA, FINE, small_source
+from tests.pipeline.rig.small_rig import FINE, small_source
 
-FRAMES = "frames with and without a CRC"
 SETS = {Command.SET_VALUES, Command.SET_VECTOR}
 
 
 @contextmanager
-def rig(*faults: str, camera: CameraFaults | None = None, crc: str = "either", **given: Any) -> Iterator[InProcessRig]:
+def rig(*faults: str, camera: CameraFaults | None = None) -> Iterator[InProcessRig]:
     """An emulated rig whose mirror's faults strike at the first occasion."""
     struck = [make_fault(name, at=0) for name in faults]
-    whole = FaultyRig(small_source(), ManualClock(), mirror_faults=struck, camera_faults=camera, **given)
-    whole.mirror.crc = crc
+    whole = FaultyRig(small_source(), ManualClock(), mirror_faults=struck, camera_faults=camera)
     with InProcessRig(whole) as line:
         yield line
 
@@ -43,12 +39,7 @@ def rig(*faults: str, camera: CameraFaults | None = None, crc: str = "either", *
 def mirror_rows(line: InProcessRig, *, move: bool = False, **settings: Any) -> list[CheckRow]:
     """Check the mirror of a rig."""
 
-    def connect() -> MirrorController:
-        mirror = MirrorController(line.transport, MirrorSettings(**settings), line.clock)
-        mirror.connect()
-        return mirror
-
-    return check_mirror(connect, line.clock, move=move)
+    return check_mirror(lambda: line.mirror(SurveyRig(**settings)), line.clock, move=move)
 
 
 def told(rows: list[CheckRow], verdict: str) -> list[str]:
@@ -58,14 +49,14 @@ def told(rows: list[CheckRow], verdict: str) -> list[str]:
 
 def set_anything(line: InProcessRig) -> bool:
     """Whether the mirror was told anything but its mode."""
-    return any(request.command in SETS or "=" in request.line for request in line.rig.mirror.requests)
+    return any(request.command in SETS for request in line.rig.mirror.requests)
 
 
 def test_mirror_in_order() -> None:
     """Everything that was asked, in order; nothing was set, and the port is let go of."""
     with rig() as line:
         rows = mirror_rows(line)
-        assert [row.asked for row in rows] == ["identity", "status", "path", FRAMES]
+        assert [row.asked for row in rows] == ["connect", "status"]
         assert {row.verdict for row in rows} == {"ok"}
         assert rows[0].came == "MR-E-2, version EMULATOR 1.0, serial EMUL0001"
         assert works(rows, "mirror")
@@ -91,11 +82,11 @@ def test_square_is_gone_round_and_read_back() -> None:
 @pytest.mark.parametrize(
     ("fault", "asked", "mend"),
     [
-        ("wrong-firmware", "identity", "rig.expected_id"),
+        ("wrong-firmware", "connect", "rig.expected_id"),
         ("mirror-warm", "status", "motions are refused"),
         ("disconnected", "status", "motions are refused"),
-        ("never-stable", "status", "would wait in vain"),  # as a survey would wait
-        ("modem", "connect", ""),
+        ("never-stable", "status", "not stable"),  # as a survey would wait
+        ("trimmed", "status", "trimmed"),
         ("echo", "connect", ""),
         ("mute", "connect", "is the controller on"),
         ("gone-before", "connect", "cable"),
@@ -113,41 +104,11 @@ def test_faults_fail_and_nothing_moves(fault: str, asked: str, mend: str) -> Non
             assert "move" in told(rows, "warn")
 
 
-def test_rows_of_what_is_odd() -> None:
-    """Another name is no failure where the settings name it; lost bytes are a warning; a trimmed motion ends it."""
+def test_another_name_is_no_failure_where_the_settings_name_it() -> None:
+    """The id of a controller that documents do not know."""
     with rig("wrong-firmware") as line:
         assert works(mirror_rows(line, expected_id="LENS"), "mirror")
-    with rig() as line:
-        rows = mirror_rows(line, expected_id="MR-9")
-        assert "expected a controller whose id holds 'MR-9'" in rows[0].came
-    with rig("reply-byte-lost") as line:
-        rows = mirror_rows(line)
-        assert told(rows, "warn") == ["bytes on the line"]
-        assert works(rows, "mirror")
-    with rig("trimmed") as line:
-        assert told(mirror_rows(line, move=True), "fail") == ["go to 0.03; 0.03"]
     assert failed("mirror", "connect", RigError("no")) == CheckRow("mirror", "connect", "no", "fail", "")
-
-
-def test_controller_in_pro_mode_is_no_fault() -> None:
-    """As the check before left it: a row says so, and no line is blamed."""
-    with rig() as line:
-        line.rig.mirror.set_mode(Mode.PRO_CRC)
-        rows = mirror_rows(line)
-        assert [row.asked for row in rows] == ["identity", "mode", "status", "path", FRAMES]
-        assert {row.verdict for row in rows} == {"ok"}
-
-
-def test_mirror_that_comes_to_rest_in_time() -> None:
-    """One that still moves as it is asked is asked again, as a survey would."""
-    with rig() as line:
-        left = [Status.NOT_STABLE, Status.NOT_STABLE]
-        real = MirrorController.status
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(MirrorController, "status", lambda mirror: left.pop() if left else real(mirror))
-            rows = mirror_rows(line)
-        assert told(rows, "fail") == told(rows, "warn") == []
-        assert left == []
 
 
 def test_position_that_is_no_number_fails(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -156,17 +117,6 @@ def test_position_that_is_no_number_fails(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(MirrorController, "read_log", lambda *_: log)
     with rig() as line:
         assert "go to 0.03; 0.03" in told(mirror_rows(line, move=True), "fail")
-
-
-def test_path_that_plays_is_left_alone() -> None:
-    """It is reported, other frames are not tried, and no square is begun."""
-    with rig() as line:
-        for playback in line.rig.mirror.state.playbacks:
-            playback.running, playback.total = True, np.inf
-        rows = mirror_rows(line, move=True)
-        assert told(rows, "warn") == ["path", "move"]
-        assert FRAMES not in [row.asked for row in rows]
-        assert not set_anything(line)
 
 
 def test_camera_in_order() -> None:
@@ -195,92 +145,6 @@ def test_camera_out_of_order() -> None:
         with pytest.raises(DeviceRefused, match="password"):
             log_in(other)
         assert log_in(line.files) == "emulated camera"
-
-
-@pytest.mark.parametrize(
-    ("crc", "with_crc", "came"),
-    [
-        ("either", False, "both are answered; with_crc = false is set"),
-        ("either", True, "both are answered; with_crc = true is set"),
-        ("required", True, r"frames with a CRC are answered, frames without one are not: .*the CRC is wrong"),
-        ("absent", False, r"frames without a CRC are answered, frames with one are not: .*answered NO to GOPROCRC"),
-    ],
-)
-def test_frames_with_and_without_a_crc_are_tried(crc: Any, with_crc: bool, came: str) -> None:
-    """Both ways of sending frames are tried on each firmware; nothing is set, and no row fails."""
-    with rig(crc=crc) as line:
-        rows = mirror_rows(line, with_crc=with_crc)
-        assert re.match(came, next(row.came for row in rows if row.asked == FRAMES))
-        assert {row.verdict for row in rows} == {"ok"}
-        assert not set_anything(line)
-
-
-@pytest.mark.parametrize(("crc", "with_crc", "right"), [("required", False, "true"), ("absent", True, "false")])
-def test_a_wrong_crc_setting_fails_with_the_right_one(crc: Any, with_crc: bool, right: str) -> None:
-    """The setting that is answered stands in the row, and the same check passes with it."""
-    with rig(crc=crc) as line:
-        (row,) = mirror_rows(line, with_crc=with_crc)
-        assert (row.asked, row.verdict, row.mend) == ("connect", "fail", f"set with_crc = {right} in [rig]")
-        assert not set_anything(line)
-    with rig(crc=crc) as line:
-        assert works(mirror_rows(line, with_crc=not with_crc), "mirror")
-
-
-def trigger_rows(wired: Pulses, pulses: Pulses) -> list[CheckRow]:
-    """Rows of what steps the paths of a rig with such a cable and such a setting."""
-    with rig(wired=wired) as line:
-        rows = check_triggers(lambda: line.devices(MirrorSettings()), line.clock, pulses, CAMERA)
-        assert np.abs(line.rig.mirror.positions(line.clock.now())).max() == 0  # it never left 0; 0
-        return rows
-
-
-@pytest.mark.parametrize(("wired", "edges"), [("none", 0), ("frame", 4), ("position", 32)])
-def test_edges_of_a_capture_say_how_the_cable_is(wired: Pulses, edges: int) -> None:
-    """The own clock steps a path always; edges are counted, and the setting that fits them is no failure."""
-    clockwork, by_edges = trigger_rows(wired, wired)
-    assert clockwork.came == "10 cells in 0.5 s at 20 Hz"
-    assert by_edges.came.startswith(f"{edges} edges in 4 frames (/captured/check_")
-    assert {clockwork.verdict, by_edges.verdict} == {"ok"}
-
-
-@pytest.mark.parametrize(
-    ("wired", "pulses", "verdict", "words"),
-    [
-        ("none", "position", "fail", 'set pulses = "none" in [rig]; it is "position"'),
-        ("frame", "position", "fail", 'set pulses = "frame" in [rig]; it is "position"'),
-        ("position", "frame", "fail", 'set pulses = "position" in [rig]; it is "frame"'),
-        ("frame", "none", "ok", 'pulses = "frame" would step the mirror by them'),
-    ],
-)
-def test_edges_beside_another_setting(wired: Pulses, pulses: Pulses, verdict: str, words: str) -> None:
-    """A setting that expects other edges fails with the right one; one that expects none works all the same."""
-    row = trigger_rows(wired, pulses)[-1]
-    assert row.verdict == verdict
-    assert words in (row.mend if verdict == "fail" else row.came)
-
-
-def test_edges_that_are_lost_fail() -> None:
-    """Two edges of four frames fit no setting: the cable is to be looked at."""
-    with rig(wired="frame") as line:
-        whole, left = line.rig.camera.pulses, [2]
-
-        def fewer(from_s: float, to_s: float) -> Any:
-            found = whole(from_s, to_s)[: left[0]]
-            left[0] -= len(found)
-            return found
-
-        line.rig.mirror.pulses = fewer
-        row = check_triggers(lambda: line.devices(MirrorSettings()), line.clock, "frame", CAMERA)[-1]
-    assert (row.verdict, row.came[:19]) == ("fail", "2 edges in 4 frames")
-    assert "edges are lost: look at the cable" in row.mend
-
-
-def test_a_capture_that_fails_leaves_nothing_running() -> None:
-    """A camera without room: one row, the path is halted, and the devices are let go of."""
-    with rig(camera=CameraFaults({CameraFault.FULL: 1})) as line:
-        (row,) = check_triggers(lambda: line.devices(MirrorSettings()), line.clock, "none", CAMERA)
-        assert (row.verdict, "full" in row.came) == ("fail", True)
-        assert not any(playback.running for playback in line.rig.mirror.state.playbacks)
 
 
 @dataclass

@@ -26,16 +26,16 @@ def wait_for(camera: HeadwallCamera, at_most_s: float) -> None:
 
 
 class LinesOf:
-    """Lines that only their own time and position have, kept as they were given."""
+    """Lines that only their own time has, kept as they were given."""
 
     def __init__(self, samples: int = 6, bands: int = 4) -> None:
         self.size = (samples, bands)
         self.given: list[NDArray[np.uint16]] = []
 
-    def __call__(self, positions: NDArray[np.float64], times: NDArray[np.float64]) -> NDArray[np.uint16]:
+    def __call__(self, times: NDArray[np.float64]) -> NDArray[np.uint16]:
         """(line, sample, band) uint16."""
         samples, bands = self.size
-        seed = np.rint(times * 1e4).astype(np.int64) * 7919 + np.rint(positions[:, 0] * 1e4).astype(np.int64)
+        seed = np.rint(times * 1e4).astype(np.int64) * 7919
         cell = np.arange(samples * bands).reshape(samples, bands) * 31
         lines = ((seed[:, None, None] + cell) % 4096).astype(np.uint16)
         self.given.append(lines)

@@ -78,45 +78,34 @@ def test_bytes_of_every_command(sent: bytes, received: bytes) -> None:
 def test_frames_pass_with_time() -> None:
     """A capture runs for its frames' time; what is over by then is in the files."""
     device = device_with()
-    clock = device.clock
-    control = control_of(device, clock)  # type: ignore[arg-type]
-    device.command('capture({"prefix": "", "maxCubes": 2, "maxFramesPerCube": 30})')
-    folder = device.captures[0].folder
-    clock.sleep(0.3)
+    control = control_of(device, device.clock)  # type: ignore[arg-type]
+    folder = control.capture(60).folder
+    device.clock.sleep(0.3)
     assert control.is_capturing()
     assert len(device.files()[f"{folder}/raw_0"]) == 29 * 48
-    clock.sleep(0.4)
+    device.clock.sleep(0.4)
     assert not control.is_capturing()
     names = [file.name.rsplit("/", 1)[1] for file in control.list_files(folder)]
-    assert names == [
-        "frameIndex_0.txt",
-        "frameIndex_30.txt",
-        "imu_gps.txt",
-        "raw_0",
-        "raw_0.hdr",
-        "raw_30",
-        "raw_30.hdr",
-    ]
+    assert names == ["frameIndex_0.txt", "imu_gps.txt", "raw_0", "raw_0.hdr"]
 
 
 def test_what_it_sees_is_asked_once() -> None:
-    """Each frame is looked at once, at its own mid exposure, by the mirror's position then; and is one pulse."""
-    seen: list[tuple[float, float]] = []
+    """Each frame is looked at once, at its own mid exposure; and is one pulse."""
+    seen: list[float] = []
 
-    def lines(positions: np.ndarray, times: np.ndarray) -> np.ndarray:
-        seen.extend(zip(positions[:, 0].tolist(), times.tolist(), strict=True))
+    def lines(times: np.ndarray) -> np.ndarray:
+        seen.extend(times.tolist())
         return np.zeros((len(times), 2, 2), np.uint16)
 
     clock = ManualClock()
-    device = CameraDevice(lines, clock, positions=lambda times: np.stack([times / 10, times], axis=-1))
+    device = CameraDevice(lines, clock)
     control = control_of(device, clock)
     control.configure(8, 10)
     control.capture(100)
     for _ in range(20):
         clock.sleep(0.07)
         device.files()
-    assert [time for _, time in seen] == pytest.approx([0.014 + 0.01 * number for number in range(100)])
-    assert [x for x, _ in seen] == pytest.approx([time / 10 for _, time in seen])
+    assert seen == pytest.approx([0.014 + 0.01 * number for number in range(100)])
     (capture,) = device.captures
     begins = np.concatenate([capture.begins(*span) for span in pairwise(np.linspace(0, 2, 38))])
     np.testing.assert_allclose(begins, 0.01 + np.arange(100) * 0.01, atol=1e-12)

@@ -20,7 +20,7 @@ from pipeline.geometry.scan import Sweep
 from pipeline.rig.camera.camera_files import KeptInMemory
 from pipeline.rig.device_settings import ControlPatience
 from pipeline.rig.drivers import RigDevices
-from pipeline.rig.mirror.pro_mode import Status
+from pipeline.rig.pro_mode import Status
 from pipeline.source import Line
 from tests.pipeline.rig.camera_faults import CameraFault, CameraFaults
 from tests.pipeline.rig.mirror.test_fault_suite import moves
@@ -37,7 +37,7 @@ PATIENCE = ControlPatience()
 MOST_ASKED_S = (PATIENCE.retries + 1) * 2 * PATIENCE.deadline_s + PATIENCE.retries * PATIENCE.pause_s
 MOST_CAPTURED_S = 4 * MOST_ASKED_S  # what is there before, the capture, and what it did where its reply is lost
 MOST_TAKEN_S = 300.0  # a sweep, whatever is asked again
-HARMLESS = (CameraFault.SLOW, CameraFault.SPLIT, CameraFault.MERGED, CameraFault.STALE)
+HARMLESS = (CameraFault.SLOW, CameraFault.SPLIT)
 OF_FILES = (CameraFault.BREAKS_OFF, CameraFault.REFUSES_FILES)
 OF_MIRROR = (
     "no-reply",
@@ -107,7 +107,7 @@ class Polls:
         mirror = self.rig.emulated.mirror
         mirror.gone = mirror.hung = False
         mirror.state.flags = Status(0)
-        mirror.restart(boot_s=0.0)
+        mirror.restart()
 
     def go_on(self, kept: KeptInMemory, lines: list[Line]) -> None:
         """Take what is still missing as another process would; the error that ends it is noted."""

@@ -16,7 +16,7 @@ from pipeline.rig.camera.camera_files import KeptInMemory, RemoteFile, fetch_fil
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.device_settings import CameraAddress, ControlPatience, FileServer
 from pipeline.rig.emulator.camera_device import MOST_LINE, CameraConnection, CameraDevice, CameraServer
-from pipeline.rig.transports import SYSTEM_CLOCK, DeadlinePassed, DeviceGone, DeviceRefused, SocketTransport
+from pipeline.rig.transports import SYSTEM_CLOCK, DeviceGone, DeviceRefused, SocketTransport
 from tests.pipeline.rig.camera.camera_line import LinesOf, wait_for
 from tests.pipeline.rig.camera_faults import CameraFault, CameraFaults, FaultyCamera, FaultyServer
 from tests.pipeline.rig.in_process import ManualClock
@@ -54,18 +54,16 @@ def test_whole_loop() -> None:
     dark = np.random.default_rng(1).integers(60, 70, (20, 6, 4)).astype(np.uint16)
     with camera() as (driver, device, lines):
         driver.configure(8.0, 10.0)
-        device.command('capture({"prefix": "field", "maxCubes": 3, "maxFramesPerCube": 60})')
-        folder = "/captured/field_000000"
+        folder = driver.capture(180, prefix="field").folder
         device.captures[0].references["darkReference"] = dark
         wait_for(driver, 5.0)
         seen: list[tuple[str, int, int]] = []
         found = driver.fetch(folder, KeptInMemory(), lambda *step: seen.append(step))
         np.testing.assert_array_equal(found.values, np.concatenate(lines.given))
         assert found.values.shape == (180, 6, 4)
-        assert found.valid.all()
-        assert found.notes == ()
+        assert (found.lost, found.notes) == (0, ())
         assert np.diff(found.times.stamp_us).tolist() == [10000] * 179
-        assert seen[-1] == (f"{folder}/raw_60", 60 * 48, 60 * 48)
+        assert seen[-1] == ("/captured/field_000000/raw_0", 180 * 48, 180 * 48)
         assert device.commands.count("isCapturing") > 2
         (kind,) = (means := driver.references(folder, KeptInMemory()))
         assert kind == "dark"
@@ -83,20 +81,6 @@ def test_transfer_that_breaks_off_goes_on(monkeypatch: pytest.MonkeyPatch) -> No
         np.testing.assert_array_equal(driver.fetch(folder, kept).values, np.concatenate(lines.given))
         assert kept.files == {file.name: device.files()[file.name] for file in remote_files(device, folder)}
         assert not any(device.faults.left.values())
-
-
-def test_what_has_come_is_kept() -> None:
-    """Where the server stays away the part that came is there, and the next call fetches the rest only."""
-    with camera({CameraFault.BREAKS_OFF: 1}, tries=1) as (driver, device, _):
-        driver.capture(100)
-        wait_for(driver, 5.0)
-        (raw,) = [file for file in remote_files(device, "/captured/000000") if file.name.endswith("raw_0")]
-        kept = KeptInMemory()
-        with pytest.raises(DeviceGone, match=rf"{raw.size // 2} bytes of {raw.name} are kept, and a later fetch"):
-            fetch_files(driver.server, [raw], kept)
-        assert kept.size(raw.name) == raw.size // 2
-        fetch_files(driver.server, [raw], kept)
-        assert bytes(kept.files[raw.name]) == device.files()[raw.name]
 
 
 def test_another_file_of_the_same_name() -> None:
@@ -136,30 +120,15 @@ def test_transfer_of_another_length(
         assert type(caught.value) is kind
 
 
-@pytest.mark.parametrize(
-    ("listed", "most", "words"),
-    [(480, 400, "has 480 bytes, expected 400 at most, and nothing of it is fetched"), (481, None, "481 when it was")],
-)
-def test_a_size_that_cannot_be(listed: int, most: int | None, words: str) -> None:
-    """A file that is larger than it can be, or grew since it was listed, is not fetched."""
-    with camera() as (driver, _, _):
-        driver.capture(10)
-        wait_for(driver, 5.0)
-        kept = KeptInMemory()
-        with pytest.raises(RigError, match=words):
-            fetch_files(driver.server, [RemoteFile("/captured/000000/raw_0", listed, False, most)], kept)
-        assert not kept.files
-
-
 def test_a_server_that_falls_silent() -> None:
     """It costs the timeout; what is no FTP is named as such."""
     with socket.create_server(("127.0.0.1", 0)) as silent:
         server = FileServer("127.0.0.1", silent.getsockname()[1], stall_s=0.1, tries=1)
-        with pytest.raises(DeadlinePassed, match=r"was silent for 0.1 s; is it on\?"):
+        with pytest.raises(DeviceGone, match=r"fell silent .*timed out"):
             log_in(server)
     with CameraServer(CameraDevice(LinesOf(), ManualClock())) as served:
         server = FileServer(served.host, served.port, stall_s=2.0)
-        with pytest.raises(RigError, match="which is no FTP; check host and port"):
+        with pytest.raises(DeviceGone, match=r"is no FTP server .*Hyperspec"):
             log_in(server)
 
 
@@ -176,7 +145,7 @@ def test_files_that_are_refused() -> None:
             fetch_files(driver.server, [RemoteFile("/captured/none", 3, False)], KeptInMemory())
         port = driver.server.port
     away = FileServer("127.0.0.1", port, tries=2, pause_s=0.0)
-    with pytest.raises(DeviceGone, match="is not there or went away"):
+    with pytest.raises(DeviceGone, match="is not there, fell silent"):
         fetch_files(away, [index], KeptInMemory())
 
 
@@ -186,11 +155,10 @@ def test_fetch_while_it_captures() -> None:
         folder = driver.capture(1000).folder
         with pytest.raises(RigError, match="a capture still runs"):
             driver.fetch(folder, KeptInMemory())
-        assert driver.stop()
-    with pytest.raises(DeviceGone, match=r"no connection to 127.0.0.1:1: connection refused; is the camera on"):
+        driver.stop()
+        assert not driver.is_capturing()
+    with pytest.raises(DeviceGone, match=r"no connection to 127.0.0.1:1 .*refused.*; is the camera on"):
         SocketTransport("127.0.0.1", 1)
-    with pytest.raises(ValueError, match="from 1 to 65535"):
-        SocketTransport("127.0.0.1", 0)
 
 
 def test_server_closes_cleanly() -> None:
@@ -212,14 +180,3 @@ def test_silence_on_a_real_socket() -> None:
         assert not driver.is_capturing()
         driver.close()
     assert device.commands[:2] == ["isCapturing", "isCapturing"]
-
-
-def test_closing_does_not_wait_for_what_is_late() -> None:
-    """A reply that a fault holds back for a minute holds back nobody who closes the camera."""
-    device = FaultyCamera(LinesOf(), SYSTEM_CLOCK, faults=CameraFaults({CameraFault.LATE: 1}))
-    with CameraServer(device) as served, socket.create_connection((served.host, served.port), timeout=5) as client:
-        client.sendall(b"isCapturing\r")
-        while not device.commands:
-            SYSTEM_CLOCK.sleep(0.01)
-        served.close()
-        assert not any(thread.is_alive() for thread in served._threads)

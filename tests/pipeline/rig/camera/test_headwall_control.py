@@ -9,12 +9,11 @@ import pytest
 
 from pipeline.errors import RigError, SettingsError
 from pipeline.rig.camera import headwall_camera
-from pipeline.rig.camera.camera_files import FrameClaim, RemoteFile
-from pipeline.rig.camera.headwall_camera import HeadwallCamera, ReplyReader, bounded
-from pipeline.rig.device_settings import ControlPatience, FileServer
+from pipeline.rig.camera.headwall_camera import HeadwallCamera, ReplyReader, response_of
+from pipeline.rig.device_settings import ControlPatience, FileServer, check_times
 from pipeline.rig.transports import Clock, DeviceRefused, StateUnknown
 from tests.pipeline.rig.in_process import ManualClock
-from tests.pipeline.rig.scripted import Late, Pair, Reply, ScriptedTransport
+from tests.pipeline.rig.scripted import Pair, Reply, ScriptedTransport
 
 HELLO = b"Hyperspec\r\nhpi> "
 
@@ -70,7 +69,7 @@ def test_every_command(echo: bool) -> None:
         control.configure(10.5, 11)
         assert control.capture(500, prefix="f1").folder == "/captured/f1_0"
         assert control.is_capturing()
-        assert control.stop()
+        control.stop()
         files = [(file.name, file.size, file.folder) for file in control.list_files("/captured/a")]
         assert files == [("/captured/a/b", None, True), ("/captured/a/raw_0", 12, False)]
         control.close()
@@ -82,14 +81,6 @@ def test_greeting_in_pieces() -> None:
     pieces: list[Reply] = [whole[at : at + 1] for at in range(len(whole))]
     with talk([(IS_CAPTURING, pieces)], hello=b"hpi> ") as control:
         assert not control.is_capturing()
-
-
-def test_replies_to_other_commands_are_skipped() -> None:
-    """A reply that names another command is not taken for this one's, in one piece with it neither."""
-    stale = said(b"stopCapture\r", b"true")
-    for replies in ([stale, said(IS_CAPTURING, b"false")], [stale + said(IS_CAPTURING, b"false")]):
-        with talk([(IS_CAPTURING, replies)]) as control:
-            assert not control.is_capturing()
 
 
 def test_late_reply_is_never_the_next_ones() -> None:
@@ -117,23 +108,14 @@ def test_what_is_no_reply_in_the_end(reply: bytes | None, hello: bytes, words: s
         control.is_capturing()
 
 
-@pytest.mark.parametrize(
-    ("why", "remedy"),
-    [
-        (b"disk full", "copy the folders"),
-        (b"busy capturing", "stop it with its own program"),
-        (b"exposure longer than frame period", "not longer than the frame period"),
-        (b"oh", "manual"),
-    ],
-)
-def test_refusals(why: bytes, remedy: str) -> None:
+def test_refusals() -> None:
     """A capture that is refused did not begin: told once, nothing frozen or sent again; to stop none is no failure."""
-    stop = [(b"stopCapture\r", refused(b"stopCapture\r", why)), (IS_CAPTURING, said(IS_CAPTURING, b"false"))]
-    with talk([(CAPTURE, refused(CAPTURE, why)), *stop]) as control:
-        with pytest.raises(DeviceRefused, match=f"refused capture: {why.decode()}; .*{remedy}"):
+    stop = (b"stopCapture\r", refused(b"stopCapture\r", b"oh"))
+    with talk([(CAPTURE, refused(CAPTURE, b"disk full")), stop]) as control:
+        with pytest.raises(DeviceRefused, match="refused capture: 'disk full'; see its manual"):
             control.capture(500, prefix="f1")
         assert control.unknown == ""
-        assert not control.stop()
+        control.stop()
 
 
 def test_capture_without_a_reply() -> None:
@@ -144,7 +126,7 @@ def test_capture_without_a_reply() -> None:
         for refused_now in (lambda: control.capture(500, prefix="f1"), lambda: control.configure(10, 10)):
             with pytest.raises(StateUnknown, match="stop what runs there, then run again, which connects anew"):
                 refused_now()
-        assert control.stop()
+        control.stop()
 
 
 def test_capture_that_is_interrupted() -> None:
@@ -172,69 +154,55 @@ class Interrupting:
 
 def test_stale_bytes_are_dropped(caplog: pytest.LogCaptureFixture) -> None:
     """What lies on the line before a command is thrown away, not taken for its reply."""
-    extra = said(IS_CAPTURING, b"true")
-    torn = said(IS_CAPTURING, b"false") + extra[:20]
+    torn = said(IS_CAPTURING, b"false") + said(IS_CAPTURING, b"true")[:20]
     with talk([(IS_CAPTURING, torn), (IS_CAPTURING, said(IS_CAPTURING, b"false"))]) as control:
         assert not control.is_capturing()
         assert not control.is_capturing()
     assert "scripted: dropped 20 stale bytes" in caplog.text
-    with talk(
-        [(IS_CAPTURING, [said(IS_CAPTURING, b"false"), Late(0.0, extra)]), (IS_CAPTURING, said(IS_CAPTURING, b"false"))]
-    ) as control:
-        assert not control.is_capturing()
-        assert not control.is_capturing()
 
 
 @pytest.mark.parametrize(
     ("exposure", "period", "words"),
     [
-        (0.003, 0.003, r"exposure 0.003 ms is below 0.5 ms; it is given in ms: 0.003 s would be 3"),
-        (3, 0.003, r"frame period 0.003 ms is below 2.857 ms"),
-        (20, 10, r"exposure of 20 ms does not fit a frame period of 10 ms; take a period of at least 20"),
-        (0, 10, "expected exposure above 0 ms, got 0"),
-        (float("nan"), 10, "above 0 ms, got nan"),
-        (100_000, 100_000, "100000 us would be 100"),
+        (0.003, 10, r"exposure 0.003 ms, expected 0.5 ms up to the frame period of 10 ms"),
+        (3, 0.003, r"frame period 0.003 ms, expected 2.857 to 10000 ms"),
+        (20, 10, "up to the frame period of 10 ms"),
+        (float("nan"), 10, "exposure nan"),
+        (100_000, 100_000, "frame period 100000 ms"),
     ],
 )
 def test_times_that_cannot_be_meant(exposure: float, period: float, words: str) -> None:
-    """Seconds for milliseconds and exposures that do not fit are refused before anything is sent."""
-    with talk() as control, pytest.raises(SettingsError, match=words):
-        control.configure(exposure, period)
-
-
-def test_a_prefix_that_cannot_be_a_folder() -> None:
-    """It is refused before anything is sent."""
-    with talk() as control, pytest.raises(SettingsError, match=r"expected up to 64 letters.* got '../x'"):
-        control.capture(1, prefix="../x")
+    """Seconds for milliseconds and exposures that do not fit are refused."""
+    with pytest.raises(SettingsError, match=words):
+        check_times(exposure, period, 350.0)
 
 
 @pytest.mark.parametrize(
     "data",
     [
-        b'{"success": true}\r\nhpi> ',
-        b'capture({"prefix": "a"})\r\n{"success": true}\r\nhpi> ',
-        b'capture({"prefix": "a"})\n{\n  "success":\r\n true\n}\nhpi> ',
-        b'{"success": true}hpi> ',
-        b'\xff\xfd\x18\r\n{"success": true}\0\r\nhpi> ',
+        b'{"success": true, "response": 1}\r\nhpi> ',
+        b'capture({"prefix": "a"})\r\n{"success": true, "response": 1}\r\nhpi> ',
+        b'capture({"prefix": "a"})\n{\n  "success":\r\n true, "response": 1\n}\nhpi> ',
+        b'{"success": true, "response": 1}hpi> ',
+        b'\xff\xfd\x18\r\n{"success": true, "response": 1}\0\r\nhpi> ',
     ],
 )
 def test_forms_of_a_reply(data: bytes) -> None:
     """With and without its command, on one line or several, with a telnet server's bytes."""
     (reply,) = ReplyReader().feed(data)
-    assert reply.content == {"success": True}
+    assert response_of(reply, "it", "here") == 1
 
 
 def test_other_text_before_a_prompt() -> None:
     """A greeting, torn JSON, a prompt within a text, and two replies in pieces of any size."""
-    found = ReplyReader().feed(b'Welcome\r\nhpi> {"success": tr\r\nhpi> ')
-    assert [(reply.content, reply.text) for reply in found] == [(None, "Welcome"), (None, '{"success": tr')]
+    assert ReplyReader().feed(b'Welcome\r\nhpi> {"success": tr\r\nhpi> ') == ["Welcome", '{"success": tr']
     (one,) = ReplyReader().feed(b'{"success": false, "errorMessage": "type after hpi> only"}\r\nhpi> ')
-    assert one.content == {"success": False, "errorMessage": "type after hpi> only"}
-    both = b'stopCapture\r\n{"success": true, "response": 1}\r\nhpi> {"success": true}\r\nhpi> '
+    assert one == '{"success": false, "errorMessage": "type after hpi> only"}'
+    both = b'stopCapture\r\n{"success": true}\r\nhpi> {"success": true}\r\nhpi> '
     for size in (1, 2, 3, 5, 8, 1000):
         reader = ReplyReader()
         found = [reply for at in range(0, len(both), size) for reply in reader.feed(both[at : at + size])]
-        assert [reply.command for reply in found] == ["stopCapture", ""]
+        assert found == ['stopCapture\r\n{"success": true}', '{"success": true}']
         assert reader.held == b""
 
 
@@ -243,26 +211,3 @@ def test_no_end(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(headwall_camera, "LONGEST_REPLY", 100)
     with pytest.raises(RigError, match=r"bytes came without a prompt .* is this the camera's control port"):
         ReplyReader().feed(b"x" * 101)
-
-
-@pytest.mark.parametrize(
-    ("sizes", "named"),
-    [
-        ({"raw_0": 1000, "darkReference": 2048 * 100, "raw_0.hdr": 500, "folder.txt": 1 << 20}, ""),
-        ({"raw_0": 1001 + (1 << 16)}, "raw_0"),
-        ({"raw_0": 1000 + (1 << 16), "raw_9": 1 + (1 << 16)}, "raw_9"),
-        ({"darkReference": 2048 * 100 + (1 << 16) + 1}, "darkReference"),
-        ({"frameIndex_0.txt": (1 << 26) + 1}, "frameIndex_0.txt"),
-    ],
-)
-def test_files_that_are_larger_than_a_capture_can_be(sizes: dict[str, int], named: str) -> None:
-    """A cube, all cubes together, a reference or a text may not exceed 10 frames of 5 x 10 numbers and some slack."""
-    files = [RemoteFile(f"/captured/a/{name}", size, False) for name, size in sizes.items()]
-    claim = FrameClaim(10, 5, 10)
-    if not named:
-        assert [file.size for file in bounded(files, claim)] == list(sizes.values())
-        return
-    with pytest.raises(
-        RigError, match=f"/captured/a/{named}, with the cubes before it, has .* nothing of it is fetched"
-    ):
-        bounded(files, claim)

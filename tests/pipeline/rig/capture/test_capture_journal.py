@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.rig.camera.camera_files import KeptInMemory
-from pipeline.rig.capture import JOURNAL
-from pipeline.rig.capture.capture_paths import CaptureRecord, LinePositions
-from pipeline.rig.capture.capture_runner import CaptureJournal
+from pipeline.rig.capture_paths import CaptureRecord, LinePositions
+from pipeline.rig.capture_runner import JOURNAL, CaptureJournal
+from pipeline.rig.mirror_controller import MotionLog
 from tests.faults.growing_files import flip_journal
 from tests.pipeline.rig.small_rig import COARSE, FINE
 
@@ -49,13 +49,26 @@ def test_folder_whose_name_comes_again_is_the_latest() -> None:
     for told in (journal, CaptureJournal(kept)):
         assert told.holding(FINE, 0) == again
         assert [one["folder"] for one in told.captures] == ["/captured/b", "/captured/a"]
-        assert told.captures[-1]["residual_us"] == 2.0
+        assert told.captures[-1]["residual_px"] == 2.0
         assert "spent" not in told.captures[-1]
 
 
-def tied(residual_us: float) -> LinePositions:
+def tied(residual_px: float) -> LinePositions:
     """How lines were tied, with a residual that tells one from another."""
-    return LinePositions(np.zeros((0, 2)), np.zeros(0, np.bool_), "log", residual_us, 0.1)
+    return LinePositions(np.zeros((0, 2)), np.zeros(0, np.bool_), "log", residual_px)
+
+
+def test_a_log_comes_back() -> None:
+    """Positions that the mirror measured, bit for bit, by another process."""
+    kept, position = KeptInMemory(), np.array([(0.1, -0.2), (0.3, 0.4)], np.float32)
+    journal = CaptureJournal(kept)
+    journal.record_capture(ONE)
+    journal.record_end(replace(ONE, log=MotionLog(position, 1000.0, 0.06, 0.04)))
+    found = CaptureJournal(kept).holding(FINE, 0)
+    assert found is not None
+    assert found.log is not None
+    np.testing.assert_array_equal(found.log.position, position)
+    assert (found.log.rate_hz, found.log.started_s, found.log.start_error_s) == (1000.0, 0.06, 0.04)
 
 
 def test_flipped_bit_of_the_journal_changes_no_capture():

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.errors import RigError
 from pipeline.geometry.camera import LineCamera
-from pipeline.rig.capture.capture_paths import (
+from pipeline.rig.capture_paths import (
     FrameTimes,
     LinePositions,
     MirrorScanPath,
@@ -57,13 +57,12 @@ def check_truth(found: LinePositions, lines: np.ndarray | None = None, atol_s: f
 
 @pytest.mark.parametrize("method", ["log", "command"])
 def test_positions_by_time(method: Literal["log", "command"]) -> None:
-    """The offset is as uncertain as the commands' times: half of what is not known is told, in px too."""
+    """The offset is as uncertain as the commands' times: half of what is not known is told in px."""
     log = scan_path() if method == "log" else played_scan_path(sweep(HELD), 1000.0)
     found = lines_by_time(frames(), CAMERA, log, BEGAN_S, CAPTURE_S, method)
     check_truth(found, atol_s=3e-3)
     assert found.valid.all()
-    assert (found.method, found.offset_s) == (method, pytest.approx(0.736))
-    assert found.residual_us == pytest.approx(2000)
+    assert found.method == method
     assert found.residual_px == pytest.approx(0.002 * 0.11 / CAMERA.ifov_rad, rel=0.5)
     assert any("software timing: a constant line offset" in note for note in found.notes)
 
@@ -77,24 +76,15 @@ def test_a_played_position_is_held() -> None:
     assert found.valid.all()
 
 
-def test_missing_and_repeated_frames() -> None:
-    """Frames that were dropped, numbered or not, and one that is there twice, do not move the others."""
+def test_dropped_frames() -> None:
+    """Frames that were dropped, numbered or not, do not move the others."""
     whole = frames()
-    lines = np.concatenate([np.arange(50), np.arange(53, 200), [199], np.arange(200, 400)])
-    found = by_log(replace(whole, number=whole.number[lines], stamp_us=whole.stamp_us[lines]), scan_path())
-    check_truth(found, lines)
+    kept = np.concatenate([np.arange(50), np.arange(53, LINES)])
+    numbered = replace(whole, number=whole.number[kept], stamp_us=whole.stamp_us[kept])
+    found = by_log(numbered, scan_path())
+    check_truth(found, kept)
     assert "3 frames are missing between the lines" in found.notes
-    assert "1 frames are there twice or out of order" in found.notes
-
-
-def test_frames_dropped_without_a_number() -> None:
-    """Frames that the camera dropped and did not count are seen by their stamps; a trigger's count sees them too."""
-    whole = frames()
-    kept = np.concatenate([np.arange(50), np.arange(51, 200), np.arange(203, LINES)])
-    dropped = replace(whole, number=np.arange(len(kept)), stamp_us=whole.stamp_us[kept])
-    check_truth(by_log(dropped, scan_path()), kept)
-    with pytest.raises(RigError, match="counted 400 triggers, the camera's last frame is number 395"):
-        lines_by_trigger(dropped, sweep(np.arange(LINES) / 100), index_at_end=LINES - 1)
+    check_truth(by_log(replace(numbered, number=np.arange(len(kept))), scan_path()), kept)
 
 
 def test_lines_beyond_a_scan_path() -> None:
@@ -103,27 +93,26 @@ def test_lines_beyond_a_scan_path() -> None:
     check_truth(found)
     assert np.count_nonzero(found.valid) == pytest.approx(226, abs=1)
     assert np.isnan(found.position[~found.valid]).all()
-    assert any("outside of the log's time: " in note for note in found.notes)
+    assert any("or outside of the log's: " in note for note in found.notes)
     short = lines_by_time(frames(), CAMERA, played_scan_path(sweep(HELD[:2000]), 1000.0), BEGAN_S, CAPTURE_S, "command")
     assert 0 < np.count_nonzero(short.valid) < LINES
 
 
-def test_no_stamps_and_no_numbers() -> None:
+def test_no_stamps() -> None:
     """Frames are taken to follow their period then."""
-    found = by_log(FrameTimes(np.full(LINES, -1), np.full(LINES, -1), 8.0, 10.0), scan_path())
+    found = by_log(FrameTimes(np.arange(LINES), np.full(LINES, -1), 8.0, 10.0), scan_path())
     check_truth(found)
     assert "no line has a time stamp: frames are taken to follow their period" in found.notes
 
 
 def test_missing_stamps_and_ones_that_go_back() -> None:
-    """Missing stamps follow their neighbours; a clock that was set back is refused."""
+    """Lines without a stamp or a number are not valid, the others as good; a clock that was set back is refused."""
     whole = frames()
-    stamp = whole.stamp_us.copy()
-    stamp[200:210] = -1
-    found = by_log(replace(whole, stamp_us=stamp), scan_path())
+    stamp, number = whole.stamp_us.copy(), whole.number.copy()
+    stamp[200:210], number[:5] = -1, -1
+    found = by_log(replace(whole, stamp_us=stamp, number=number), scan_path())
     check_truth(found)
-    assert found.valid.all()
-    assert "10 time stamps are missing, and follow their neighbours" in found.notes
+    assert np.flatnonzero(~found.valid).tolist() == [*range(5), *range(200, 210)]
     stamp[300:] -= 1_000_000
     with pytest.raises(RigError, match="the time stamps of its frames go back"):
         by_log(replace(whole, stamp_us=stamp), scan_path())
@@ -145,27 +134,13 @@ def test_commands_count_from_the_logs_own_start() -> None:
 
 
 def test_by_trigger() -> None:
-    """One vector index a frame: numbers count, missing ones too, and the mirror's count must agree."""
-    path = sweep(np.arange(LINES) / 100)
-    whole = frames()
-    kept = np.concatenate([np.arange(10), np.arange(12, LINES)])
-    told = replace(whole, number=whole.number[kept], stamp_us=whole.stamp_us[kept])
-    found = lines_by_trigger(told, path, index_at_end=LINES - 1)
-    np.testing.assert_array_equal(found.position, path[kept])
-    assert (found.method, found.residual_us, found.residual_px) == ("trigger", 0.0, 0.0)
-    assert "2 frames are missing between the lines" in found.notes
-    with pytest.raises(RigError, match=r"counted 399 triggers, the camera's last frame is number 399"):
-        lines_by_trigger(told, path, index_at_end=LINES - 2)
-    unchecked = lines_by_trigger(told, path)
-    assert unchecked.residual_us is None
+    """One position a frame number; frames without one, and those beyond the path, are not valid."""
+    path = sweep(np.arange(8) / 10)
+    told = replace(frames(6), number=np.array([0, 1, -1, 3, 6, 99]))
+    found = lines_by_trigger(told, path, counted=True)
+    np.testing.assert_array_equal(found.position[found.valid], path[[0, 1, 3, 6]])
+    assert found.valid.tolist() == [True, True, False, True, True, False]
+    assert (found.method, found.residual_px) == ("trigger", 0.0)
+    unchecked = lines_by_trigger(told, path, counted=False)
+    assert unchecked.residual_px is None
     assert "positions are those sent, not measured; triggers were not counted" in unchecked.notes
-
-
-def test_by_trigger_without_numbers() -> None:
-    """Gaps that the lines around them explain are filled; others, and lines beyond the path, are not valid."""
-    number = np.array([0, 1, -1, 3, -1, 6, 99])
-    found = lines_by_trigger(replace(frames(7), number=number), sweep(np.arange(8) / 10))
-    assert found.valid.tolist() == [True, True, True, True, False, True, False]
-    assert "1 lines are beyond the 8 positions of the path" in found.notes
-    with pytest.raises(RigError, match="no line has a frame number"):
-        lines_by_trigger(replace(frames(3), number=np.full(3, -1)), sweep(np.arange(8) / 10))

@@ -14,14 +14,15 @@ import pytest
 from pipeline.geometry.scan import Sweep, sweep_positions
 from pipeline.rig.camera.camera_files import KeptInMemory
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
-from pipeline.rig.capture.capture_paths import REFERENCES, capture_prefix
-from pipeline.rig.device_settings import CameraAddress, FileServer, MirrorSettings
+from pipeline.rig.capture_paths import capture_prefix
+from pipeline.rig.device_settings import CameraAddress, FileServer, SurveyRig
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock
-from pipeline.rig.mirror.mirror_controller import MirrorController, open_mirror
-from pipeline.rig.mirror.pro_mode import Trigger
+from pipeline.rig.mirror_controller import MirrorController, open_mirror
+from pipeline.rig.pro_mode import Trigger
 from pipeline.rig.transports import SYSTEM_CLOCK, Clock, DeviceGone, SocketTransport
 from pipeline.simulator.render import QUIET
 from pipeline.simulator.simulated import SimulatedSource
+from pipeline.source import AT_REST
 from tests.pipeline.rig.camera.camera_line import wait_for
 from tests.pipeline.rig.in_process import InProcessRig, ManualClock
 from tests.pipeline.rig.small_rig import CAMERA, COARSE, FINE, small_source
@@ -42,9 +43,8 @@ class Pair:
         cells = np.concatenate([held[:1], held]) if edges else held
         self.mirror.goto(*held[0])
         self.mirror.settle(2.0)
-        self.mirror.load_path(cells, "none")
-        rate_hz = 1000 * sweep.step / CAMERA.frame_ms
-        self.mirror.run(0, len(cells), rate_hz, trigger=Trigger.RISING_EDGE if edges else Trigger.OFF)
+        self.mirror.load_path(cells)
+        self.mirror.run(1000 * sweep.step / CAMERA.frame_ms, Trigger.RISING_EDGE if edges else Trigger.OFF)
         prefix = capture_prefix(sweep if told is None else told, first)
         folder = self.camera.capture(sweep.lines - first, prefix=prefix).folder
         wait_for(self.camera, MOST_S)
@@ -60,9 +60,7 @@ def connected(source: SimulatedSource | None = None, **rig: Any) -> Iterator[tup
     """Drivers of an emulated rig in this process."""
     whole = EmulatedRig(small_source() if source is None else source, ManualClock(), **rig)
     with InProcessRig(whole) as line:
-        mirror = MirrorController(line.transport, MirrorSettings(with_crc=True), line.clock)
-        mirror.connect()
-        yield Pair(mirror, line.camera(), line.clock), whole
+        yield Pair(line.mirror(SurveyRig(with_crc=True)), line.camera(), line.clock), whole
 
 
 def planned(sweep: Sweep, lines: range, source: SimulatedSource | None = None) -> np.ndarray[Any, Any]:
@@ -99,42 +97,14 @@ def test_lines_are_those_where_the_mirror_is() -> None:
     assert np.abs(found - planned(FINE, range(FINE.lines), source)).max() > 1
 
 
-def test_captures_that_announce_nothing_have_streams_of_their_own() -> None:
-    """Two looks at one place differ by their noise alone."""
+def test_a_capture_that_announces_nothing_is_seen_at_its_place() -> None:
+    """Every frame is the line where the mirror is."""
     with connected() as (pair, _):
         pair.mirror.goto(0.0, 0.0)
-        scan_passes = []
-        for _ in range(2):
-            folder = pair.camera.capture(3).folder
-            wait_for(pair.camera, MOST_S)
-            scan_passes.append(pair.lines(folder).astype(int))
-    rest = planned(Sweep("rest", "fine", "x", 0.0, 0.0, 1), range(1), small_source(chosen=QUIET))
-    every = np.concatenate(scan_passes)
-    assert len(np.unique(every.reshape(6, -1), axis=0)) == 6
-    assert np.abs(every - rest).mean() < 20  # of 1700 DN
-
-
-def test_other_times_are_those_of_the_camera() -> None:
-    """A camera that is told half of the exposure gives the lines of a rig with that camera."""
-    half = replace(CAMERA, exposure_ms=CAMERA.exposure_ms / 2)
-    source = small_source()
-    with connected() as (pair, _):
-        pair.camera.configure(half.exposure_ms, half.frame_ms)
-        folder = pair.play(FINE)
-        told = replace(source, rig=replace(source.rig, camera=half))
-        np.testing.assert_array_equal(pair.lines(folder), planned(FINE, range(FINE.lines), told))
-
-
-def test_old_captures_make_room() -> None:
-    """Only the newest finished captures keep their files, and references, which are asked for again; folders stay."""
-    with connected(kept=2) as (pair, rig):
-        for prefix in (REFERENCES, "", "", "", ""):
-            folder = pair.camera.capture(1, prefix=prefix).folder
-            wait_for(pair.camera, MOST_S)
-        names = {name.rsplit("/", 1)[0] for name in rig.camera.files()}
-        references = f"/captured/{REFERENCES}_000000"
-        assert names == {references, "/captured/000002", "/captured/000003", folder}
-        assert set(pair.camera.references(references, KeptInMemory())) == {"dark", "white"}
+        folder = pair.camera.capture(2).folder
+        wait_for(pair.camera, MOST_S)
+        at_rest = planned(AT_REST, range(1))
+        np.testing.assert_array_equal(pair.lines(folder), np.concatenate([at_rest, at_rest]))
 
 
 def test_frames_that_wait_to_be_looked_at_keep_the_camera_busy() -> None:
@@ -175,27 +145,19 @@ def served(speed: float) -> Iterator[tuple[Pair, EmulatedRig]]:
     rig = EmulatedRig(small_source(), FastClock(speed))
     with contextlib.ExitStack() as stack:
         ports = stack.enter_context(rig.serve())
-        mirror = stack.enter_context(open_mirror(MirrorSettings(port=ports.port, deadline_s=5.0)))
+        mirror = stack.enter_context(open_mirror(SurveyRig(port=ports.port, deadline_s=5.0)))
         files = FileServer(ports.host, ports.file_port)
         camera = HeadwallCamera.at(CameraAddress(ports.host, ports.camera_port), files)
         stack.callback(camera.close)
         yield Pair(mirror, camera, SYSTEM_CLOCK), rig
 
 
-def test_same_lines_come_through_ports() -> None:
-    """Through a real pty and real sockets, forty times as fast, by pulses."""
-    with served(40.0) as (pair, _):
-        for sweep in (FINE, COARSE):
-            folder = pair.play(sweep)
-            np.testing.assert_array_equal(pair.lines(folder), planned(sweep, range(sweep.lines)))
-
-
 def test_closing_leaves_nothing() -> None:
     """Both ports are gone, and a device that is used afterwards says so."""
     with served(40.0) as (pair, rig):
-        port = pair.mirror.settings.port
-    with pytest.raises(DeviceGone, match="no port"):
-        open_mirror(MirrorSettings(port=port))
+        port = pair.mirror.rig.port
+    with pytest.raises(DeviceGone, match="cannot be opened"):
+        open_mirror(SurveyRig(port=port))
     assert not rig.camera.is_capturing()
     with rig.serve() as again:
         address = again.host, again.camera_port

@@ -12,22 +12,14 @@ import pytest
 import serial
 
 from pipeline.errors import RigError, SettingsError
-from pipeline.rig.device_settings import MirrorSettings
+from pipeline.rig.device_settings import SurveyRig
 from pipeline.rig.emulator.emulated_rig import EmulatedPort, FastClock
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.mirror.mirror_controller import open_mirror
+from pipeline.rig.mirror_controller import open_mirror
 from pipeline.rig.transports import SYSTEM_CLOCK, DeviceGone
-from tests.pipeline.rig.in_process import InProcessTransport, ManualClock
 from tests.pipeline.rig.mirror_faults import FaultyMirror, make_fault
 
-
-def line(*faults: str, baud: int = 0) -> InProcessTransport:
-    """A line to a controller with faults that strike at once."""
-    clock = ManualClock()
-    return InProcessTransport(FaultyMirror(clock, [make_fault(name, at=0) for name in faults]), clock, baud=baud)
-
-
-ASKED = bytes.fromhex("7e 00 11 02 50 01 59 3c 7e")
+ASKED = bytes.fromhex("7e 00 11 02 68 0a 0b 3b 7e")
 
 
 REPLIED = bytes.fromhex("7e 00 11 04 00 00 00 00 f2 81 7e")
@@ -82,15 +74,15 @@ def test_bytes_keep_to_the_speed() -> None:
 def test_the_driver_drives_it() -> None:
     """The driver connects, moves, loads and lets go, through a real pty; a device that goes is told as such."""
     device = MirrorDevice(SYSTEM_CLOCK)
-    with EmulatedPort(device) as port, open_mirror(MirrorSettings(port=port.path)) as mirror:
-        assert mirror.identity().device == "MR-E-2"
+    with EmulatedPort(device) as port, open_mirror(SurveyRig(port=port.path)) as mirror:
+        assert mirror.identity.device == "MR-E-2"
         mirror.goto(0.1, -0.2)
         mirror.settle(2.0)
         assert device.positions(SYSTEM_CLOCK.now()) == pytest.approx((0.1, -0.2), abs=1e-3)
-        mirror.load_path([(0.0, 0.0), (0.1, 0.1)], "all")
+        mirror.load_path([(0.0, 0.0), (0.1, 0.1)])
     device = FaultyMirror(SYSTEM_CLOCK, [make_fault("gone-before", at=5)])
     with EmulatedPort(device) as port, pytest.raises(DeviceGone, match=f"{port.path} went away"):
-        open_mirror(MirrorSettings(port=port.path)).goto(0.0, 0.0)
+        open_mirror(SurveyRig(port=port.path)).goto(0.0, 0.0)
 
 
 def test_emulated_time_may_run_faster() -> None:

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
-from pipeline.geometry.scan import Ends
-from pipeline.rig.emulator.mirror_device import MirrorDevice, MirrorUnit
-from pipeline.rig.mirror.mirror_controller import hold_values
-from pipeline.rig.mirror.pro_mode import (
+from pipeline.rig.emulator.mirror_device import MirrorDevice
+from pipeline.rig.mirror_controller import hold_values
+from pipeline.rig.pro_mode import (
     FEEDBACK_X,
     FEEDBACK_Y,
     LOG_RATE,
     LOG_RUN,
+    UNIT_XY,
     VECTOR_MEMORY,
     ErrorCode,
     Frame,
     FrameReader,
     Status,
     Trigger,
-    Unit,
     Value,
     VectorRegister,
     X,
@@ -53,20 +51,17 @@ def do(device: MirrorDevice, frame: Frame) -> None:
     assert ask(device, frame) == Frame(frame.command)
 
 
-def running(
-    clock: ManualClock, trigger: Trigger = Trigger.OFF, cycles: int = 1, ends: Ends = "exclusive"
-) -> MirrorDevice:
+def running(clock: ManualClock, trigger: Trigger = Trigger.OFF) -> MirrorDevice:
     """Return a controller that begins to play PATH."""
-    device = MirrorDevice(clock, unit=MirrorUnit(ends=ends))
+    device = MirrorDevice(clock)
     device.receive(b"GOPROCRC\r\n")
     do(device, set_vector(VECTOR_MEMORY, 0, PATH.T.astype(">f4").tobytes()))
     for number, channel in enumerate((X, Y)):
         values: dict[VectorRegister, Value] = {
-            VectorRegister.UNIT: int(Unit.XY),
+            VectorRegister.UNIT: UNIT_XY,
             VectorRegister.START: 4 * number,
-            VectorRegister.END: 4 * number + 4 - (ends == "inclusive"),
+            VectorRegister.END: 4 * number + 4,
             VectorRegister.FREQUENCY: RATE_HZ,
-            VectorRegister.CYCLES: cycles,
             VectorRegister.TRIGGER: int(trigger),
         }
         do(device, set_values({channel.vector(name): value for name, value in values.items()}))
@@ -75,86 +70,68 @@ def running(
     return device
 
 
-def number(device: MirrorDevice, register: VectorRegister) -> int:
-    """Return a register of the vector unit of X."""
-    return cell_int(ask(device, get_value(X.vector(register))).payload)
+def index(device: MirrorDevice) -> int:
+    """Return the cell of X."""
+    return cell_int(ask(device, get_value(X.vector(VectorRegister.INDEX))).payload)
 
 
-def expected(times_s: NDArray[np.float64], began_s: float, cycles: int = 1) -> NDArray[np.float64]:
+def expected(times_s: NDArray[np.float64], began_s: float) -> NDArray[np.float64]:
     """Return where the path is at times from its start on."""
-    step = np.floor((times_s - began_s) * RATE_HZ + 1e-9).astype(int)
-    return PATH[np.minimum(step, 4 * cycles - 1) % 4]
+    return PATH[np.minimum(np.floor((times_s - began_s) * RATE_HZ + 1e-9).astype(int), 3)]
 
 
-@pytest.mark.parametrize("ends", ["exclusive", "inclusive"])
-def test_a_run_moves_the_mirror_along_the_path(ends: Ends) -> None:
-    """Each cell is held for a period, as often as asked, the last one for good; then the run is over."""
+def test_a_run_moves_the_mirror_along_the_path() -> None:
+    """Each cell is held for a period, the last one for good; then the run is over, and halting changes nothing."""
     clock = ManualClock(7.0)
-    device = running(clock, cycles=2, ends=ends)
-    clock.advance(7 / RATE_HZ + 0.001)
-    assert number(device, VectorRegister.RUN) == 1
-    clock.advance(1 / RATE_HZ)
-    assert number(device, VectorRegister.RUN) == 0
-    assert number(device, VectorRegister.INDEX) == 3
-    clock.advance(1.0)
-    times_s = np.linspace(7.0, 8.0, 200)
-    np.testing.assert_allclose(device.positions(times_s), expected(times_s, 7.0, 2), atol=1e-7)
-    np.testing.assert_array_equal(device.positions(6.9), (0.0, 0.0))
-
-
-def test_an_endless_run_after_a_long_silence() -> None:
-    """The cell is that of the time, however long nothing was asked, and halting keeps it."""
-    clock = ManualClock()
-    device = running(clock, cycles=-1)
-    clock.advance(1e6 + 0.05)
-    assert number(device, VectorRegister.INDEX) == 2
+    device = running(clock)
+    clock.sleep(3 / RATE_HZ + 0.001)
+    assert (index(device), device.state.playbacks[0].running) == (3, True)
+    clock.sleep(1 / RATE_HZ)
+    assert (index(device), device.state.playbacks[0].running) == (3, False)
     do(device, set_values({X.vector(VectorRegister.RUN): 0, Y.vector(VectorRegister.RUN): 0}))
-    clock.advance(1.0)
-    np.testing.assert_allclose(device.positions(clock.now()), PATH[2])
+    clock.sleep(1.0)
+    times_s = np.linspace(7.0, 8.0, 200)
+    np.testing.assert_allclose(device.positions(times_s), expected(times_s, 7.0), atol=1e-7)
+    np.testing.assert_array_equal(device.positions(6.9), (0.0, 0.0))
 
 
 def test_pulses_step_through_the_path() -> None:
     """The run command plays the first cell, each pulse the next; pulses beyond the last end the run."""
     clock = ManualClock()
     device = running(clock, Trigger.RISING_EDGE)
-    for pulses, index, runs in ((0, 0, 1), (1, 1, 1), (2, 3, 1), (1, 3, 0)):
-        clock.advance(1.0)
+    for pulses, place, runs in ((0, 0, True), (1, 1, True), (2, 3, True), (1, 3, False)):
+        clock.sleep(1.0)
         device.state.trigger(clock.now() + np.arange(pulses) * 0.01)
-        clock.advance(1.0)
-        np.testing.assert_allclose(device.positions(clock.now()), PATH[index])
-        assert (number(device, VectorRegister.INDEX), number(device, VectorRegister.RUN)) == (index, runs)
+        clock.sleep(1.0)
+        np.testing.assert_allclose(device.positions(clock.now()), PATH[place])
+        assert (index(device), device.state.playbacks[0].running) == (place, runs)
 
 
-def test_status_while_it_moves_and_at_the_rim() -> None:
-    """NOT_STABLE for a short time after each move; a target beyond the rim goes to the rim, with a bit for it."""
+def test_status_while_it_moves() -> None:
+    """NOT_STABLE for a short time after each move."""
     clock = ManualClock()
     device = MirrorDevice(clock)
     device.receive(b"GOPROCRC\r\n")
-    for target, place, bit in (((1.0, 1.0), (np.sqrt(0.5), np.sqrt(0.5)), Status.TRIMMED), ((0, 0), (0, 0), 0)):
-        do(device, set_values(hold_values(*target)))
-        assert device.state.status() == Status(bit) | Status.NOT_STABLE
-        clock.advance(1.0)
-        assert device.state.status() == Status(bit)
-        np.testing.assert_allclose(device.positions(clock.now()), place, atol=1e-7)
+    do(device, set_values(hold_values(0.5, 0.0)))
+    assert device.state.status() == Status.NOT_STABLE
+    clock.sleep(1.0)
+    assert device.state.status() == Status(0)
+    np.testing.assert_allclose(device.positions(clock.now()), (0.5, 0.0), atol=1e-7)
 
 
 def test_the_log_holds_the_positions() -> None:
-    """Rows at the set rate from the run command on; it keeps them when it is stopped, and stops when it is full."""
+    """Rows at the set rate from the run command on; it keeps them when it is stopped."""
     clock = ManualClock(3.0)
     device = running(clock)
     chosen: dict[int, Value] = {log_slot(0): FEEDBACK_X, log_slot(1): FEEDBACK_Y, LOG_RATE: 1000.0}
     do(device, set_values(chosen))
     do(device, set_values({LOG_RUN: 1}))
-    clock.advance(0.0995)
+    clock.sleep(0.0995)
     do(device, set_values({LOG_RUN: 0}))
-    clock.advance(1.0)
+    clock.sleep(1.0)
     rows = [ask(device, get_vector(log_slot(slot), 35, 10)).payload for slot in (0, 1)]
     read = np.stack([np.frombuffer(row, ">f4") for row in rows], axis=-1)
     np.testing.assert_allclose(read, expected(3.0 + np.arange(35, 45) / 1000, 3.0), atol=1e-7)
     assert len(ask(device, get_vector(log_slot(0), 95, 5)).payload) == 20
     beyond = get_vector(log_slot(0), 96, 5)
     assert ask(device, beyond) == refuse(beyond.command, ErrorCode.VECTOR_INDEX)
-    do(device, set_values({LOG_RUN: 1}))
-    assert cell_int(ask(device, get_value(LOG_RUN)).payload) == 1
-    clock.advance(device.unit.log_rows / 1000)
-    assert cell_int(ask(device, get_value(LOG_RUN)).payload) == 0

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from pipeline.rig.device_settings import MirrorSettings
-from pipeline.rig.mirror.mirror_controller import MirrorController
-from pipeline.rig.mirror.pro_mode import Frame, float_cell
+from pipeline.rig.device_settings import SurveyRig
+from pipeline.rig.mirror_controller import MirrorController
+from pipeline.rig.pro_mode import Frame, float_cell
 from tests.pipeline.rig.scripted import Pair, ScriptedTransport
 
 
@@ -30,8 +30,6 @@ WARM = pair("7E 00 02 02 00 00 A0 78 7E", "7E 00 02 04 00 00 00 04 F1 E1 7E")
 UNREST = pair("7E 00 02 02 00 00 A0 78 7E", "7E 00 02 04 00 00 00 10 F1 EE 7E")
 TRIMMED = pair("7E 00 02 02 00 00 A0 78 7E", "7E 00 02 04 00 00 00 80 F1 82 7E")
 CONNECT: list[Pair] = [GREET, *WHO, ENTER, WELL]
-IDLE = pair("7E 00 13 06 00 02 68 01 69 01 FC E9 7E", "7E 00 13 0A 00 02 00 00 00 00 00 00 00 00 FD 43 7E")
-PLAYING = pair("7E 00 13 06 00 02 68 01 69 01 FC E9 7E", "7E 00 13 0A 00 02 00 00 00 01 00 00 00 01 01 43 7E")
 DONE = "7E 00 12 00 0C A0 7E"  # several registers were set
 GOTO = (  # positions 0.5 and -0.25, control C0 and C1, inputs 50 and 51, both units stopped
     "7E 00 12 32 00 08 50 02 51 02 40 02 40 00 40 07 40 05 68 01 69 01 3F 00 00 00 BE 80 00 00 00 00 00 C0"
@@ -47,25 +45,25 @@ READ_BACK = pair(
     "7E 00 15 18 3F 00 00 00 00 00 00 00 3F 80 00 00 BE 80 00 00 00 00 00 00 00 00 00 00 81 75 7E",
 )
 HALT = pair("7E 00 12 0E 00 02 68 01 69 01 00 00 00 00 00 00 00 00 BE 49 7E", DONE)
-# Positions 1 to 3 of 3 at 10 Hz, twice, by rising edges: X from cell 1 up to cell 3, Y from 4 up to 6.
+# All of 3 positions at 10 Hz, by rising edges: X from cell 0 up to cell 3, Y from 3 up to 6.
 SET_X = pair(
     "7E 00 12 26 00 06 68 00 68 02 68 03 68 04 68 07 68 08"
-    " 00 00 00 02 00 00 00 01 00 00 00 03 41 20 00 00 00 00 00 02 00 00 00 02 1A 92 7E",
+    " 00 00 00 02 00 00 00 00 00 00 00 03 41 20 00 00 00 00 00 01 00 00 00 02 0F 02 7E",
     DONE,
 )
 SET_Y = pair(
     "7E 00 12 26 00 06 69 00 69 02 69 03 69 04 69 07 69 08"
-    " 00 00 00 02 00 00 00 04 00 00 00 06 41 20 00 00 00 00 00 02 00 00 00 02 3E 75 7E",
+    " 00 00 00 02 00 00 00 03 00 00 00 06 41 20 00 00 00 00 00 01 00 00 00 02 C8 44 7E",
     DONE,
 )
 SET_X_INCLUSIVE = pair(
     "7E 00 12 26 00 06 68 00 68 02 68 03 68 04 68 07 68 08"
-    " 00 00 00 02 00 00 00 01 00 00 00 02 41 20 00 00 00 00 00 02 00 00 00 02 18 13 7E",
+    " 00 00 00 02 00 00 00 00 00 00 00 02 41 20 00 00 00 00 00 01 00 00 00 02 0D 83 7E",
     DONE,
 )
 SET_Y_INCLUSIVE = pair(
     "7E 00 12 26 00 06 69 00 69 02 69 03 69 04 69 07 69 08"
-    " 00 00 00 02 00 00 00 04 00 00 00 05 41 20 00 00 00 00 00 02 00 00 00 02 3B B6 7E",
+    " 00 00 00 02 00 00 00 03 00 00 00 05 41 20 00 00 00 00 00 01 00 00 00 02 CD 87 7E",
     DONE,
 )
 RUN = (  # control C0 and C1, inputs 68 and 69, both units running
@@ -79,9 +77,9 @@ SET_LOG = pair(  # X feedback into slot 0, Y feedback into slot 1, 1000 Hz
 START_LOG = pair("7E 00 12 08 00 01 24 10 00 00 00 01 D1 B8 7E", DONE)
 
 
-def connected(transport: ScriptedTransport, **settings: Any) -> MirrorController:
+def connected(transport: ScriptedTransport, vector_pairs: int = 1500, **settings: Any) -> MirrorController:
     """A controller that has been connected; the script begins with CONNECT, and CRCs in it have to fit."""
     told = {"with_crc": True, "strict_crc": True, **settings}
-    mirror = MirrorController(transport, MirrorSettings(**told), transport.clock)
+    mirror = MirrorController(transport, SurveyRig(**told), transport.clock, vector_pairs=vector_pairs)
     mirror.connect()
     return mirror

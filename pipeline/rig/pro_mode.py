@@ -14,17 +14,17 @@ does not document the payload of an acknowledgement; it is assumed to be empty.
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
 from functools import cache
 
 from pipeline.errors import ShapeError
 
-BOUNDARY, TURNED = 0x7E, 0x20
+TURNED = 0x20  # the bit that an escape inverts
 MOST_PAYLOAD = 50
 _HEAD, _CRC = 3, 2  # bytes: address, command, size; and the check behind the payload
-_LONGEST = 2 * (_HEAD + MOST_PAYLOAD + _CRC)  # between boundaries, every byte escaped
+_TOO_LONG = 2 * (_HEAD + MOST_PAYLOAD + _CRC) + 1  # bytes between boundaries: a frame has fewer, every byte escaped
 ERROR_FLAG = 0x80  # command of a reply that says no
 
 
@@ -35,45 +35,37 @@ class Command(IntEnum):
     SET_MODE = 0x06
     GET_VALUE = 0x11
     SET_VALUES = 0x12
-    GET_VALUES = 0x13
     SET_VECTOR = 0x14
     GET_VECTOR = 0x15
 
 
 class ErrorCode(IntEnum):
-    """Reasons of the device for refusing a request, with a text for messages."""
+    """Reasons of the device for refusing a request."""
 
-    words: str
-
-    FRAME_INVALID = 0x0001, "the frame is not valid"
-    COMMAND_UNKNOWN = 0x0002, "the command is unknown"
-    LENGTH_MISMATCH = 0x0003, "the length does not fit the command"
-    CRC_WRONG = 0x0004, "the CRC is wrong"
-    NOT_IMPLEMENTED = 0x0005, "the command is not implemented"
-    NO_REGISTER = 0x0101, "there is no such register"
-    WRITE_FAILED = 0x0102, "the register could not be written"
-    OUT_OF_RANGE = 0x0103, "the value is out of the register's range"
-    REGISTER_INVALID = 0x0104, "the register is not valid here"
-    READ_FAILED = 0x0105, "the register could not be read"
-    READ_ONLY = 0x0106, "the register can only be read"
-    VECTOR_INDEX = 0x0107, "the index lies outside the vector"
-    VECTOR_ALIGNMENT = 0x0108, "the index does not begin a cell of the vector"
-    LOCKED = 0x0109, "the register is locked"
-    NOT_READABLE = 0x010A, "the register cannot be read"
-    NO_SYSTEM = 0x0201, "there is no such system"
-    SYSTEM_NOT_SELECTABLE = 0x0202, "the system cannot be chosen here"
-    CHAIN = 0x0203, "the systems do not make a chain from input to output"
-
-    def __new__(cls, code: int, words: str) -> ErrorCode:
-        error = int.__new__(cls, code)
-        error._value_, error.words = code, words
-        return error
+    FRAME_INVALID = 0x0001
+    COMMAND_UNKNOWN = 0x0002
+    LENGTH_MISMATCH = 0x0003
+    CRC_WRONG = 0x0004
+    NOT_IMPLEMENTED = 0x0005
+    NO_REGISTER = 0x0101
+    WRITE_FAILED = 0x0102
+    OUT_OF_RANGE = 0x0103
+    REGISTER_INVALID = 0x0104
+    READ_FAILED = 0x0105
+    READ_ONLY = 0x0106
+    VECTOR_INDEX = 0x0107
+    VECTOR_ALIGNMENT = 0x0108
+    LOCKED = 0x0109
+    NOT_READABLE = 0x010A
+    NO_SYSTEM = 0x0201
+    SYSTEM_NOT_SELECTABLE = 0x0202
+    CHAIN = 0x0203
 
 
 def format_error(code: int) -> str:
-    """Return the text of an error code, with its number."""
-    known = {error.value: error.words for error in ErrorCode}
-    return f"{known.get(code, 'unknown error')} (code {code:04X})"
+    """Return the name of an error code, with its number."""
+    name = next((error.name for error in ErrorCode if error == code), "UNKNOWN_ERROR")
+    return f"{name.lower().replace('_', ' ')} (code {code:04X})"
 
 
 @dataclass(frozen=True)
@@ -88,9 +80,8 @@ class Frame:
 
 @dataclass(frozen=True)
 class Damaged:
-    """Bytes between two boundaries that form no frame, and the reason."""
+    """Bytes between two boundaries that form no frame."""
 
-    reason: str
     data: bytes
 
 
@@ -129,45 +120,25 @@ class FrameReader:
     """
 
     def __init__(self) -> None:
-        self._held = bytearray()
-        self._begun = False  # whether a boundary came before the held bytes
+        self._held = b""  # behind the last boundary
 
     def feed(self, data: bytes) -> list[Frame | Damaged]:
         """Take bytes; return the frames and the damaged frames that they complete."""
-        found: list[Frame | Damaged] = []
-        for byte in data:
-            if byte == BOUNDARY:
-                if self._held:
-                    found.append(self._read())
-                self._begun = True
-            else:
-                self._held.append(byte)
-                if len(self._held) > _LONGEST:
-                    found.append(self._drop(f"more than {_LONGEST} bytes without a boundary"))
-        return found
+        *ended, held = (self._held + data).split(b"\x7e")
+        self._held = held[:_TOO_LONG]
+        return [_read_frame(part[:_TOO_LONG]) for part in ended if part]
 
-    def _read(self) -> Frame | Damaged:
-        if not self._begun:
-            return self._drop("bytes that no boundary begins")
-        first, *rest = bytes(self._held).split(b"\x7d")
-        if any(part[:1] not in (b"\x5d", b"\x5e") for part in rest):
-            return self._drop("an escape that escapes nothing")
-        plain = first + b"".join(bytes((part[0] ^ TURNED,)) + part[1:] for part in rest)
-        if len(plain) < _HEAD + _CRC:
-            return self._drop(f"{len(plain)} bytes, where a frame has at least {_HEAD + _CRC}")
-        if plain[2] != len(plain) - _HEAD - _CRC:
-            return self._drop(f"a size of {plain[2]} over a payload of {len(plain) - _HEAD - _CRC} bytes")
-        if plain[2] > MOST_PAYLOAD:
-            return self._drop(f"a payload of {plain[2]} bytes, above {MOST_PAYLOAD}")
-        self._held.clear()
-        body, check = plain[:-_CRC], int.from_bytes(plain[-_CRC:], "little")
-        return Frame(body[1], body[_HEAD:], body[0], crc_good=crc_arc(body) == check)
 
-    def _drop(self, reason: str) -> Damaged:
-        damaged = Damaged(reason, bytes(self._held))
-        self._held.clear()
-        self._begun = False
-        return damaged
+def _read_frame(data: bytes) -> Frame | Damaged:
+    """Read the bytes between two boundaries."""
+    first, *rest = data.split(b"\x7d")
+    plain = first + b"".join(bytes((part[0] ^ TURNED,)) + part[1:] for part in rest if part)
+    size = len(plain) - _HEAD - _CRC
+    escaped = all(part[:1] in (b"\x5d", b"\x5e") for part in rest)
+    if not escaped or not 0 <= size <= MOST_PAYLOAD or plain[2] != size:
+        return Damaged(data)
+    body, check = plain[:-_CRC], int.from_bytes(plain[-_CRC:], "little")
+    return Frame(body[1], body[_HEAD:], body[0], crc_good=crc_arc(body) == check)
 
 
 CELL = 4  # bytes
@@ -189,12 +160,12 @@ def int_cell(value: int) -> bytes:
 
 def cell_float(cell: bytes) -> float:
     """Read a cell as a float32; ShapeError where it is no cell, here and below."""
-    return float(struct.unpack(">f", _checked(cell, CELL))[0])
+    return float(struct.unpack(">f", checked(cell, CELL))[0])
 
 
 def cell_int(cell: bytes) -> int:
     """Read a cell as an unsigned integer."""
-    return int.from_bytes(_checked(cell, CELL), "big")
+    return int.from_bytes(checked(cell, CELL), "big")
 
 
 def ask_status() -> Frame:
@@ -210,11 +181,6 @@ def go_simple() -> Frame:
 def get_value(register: int) -> Frame:
     """Return a request for a register; the reply is its cell."""
     return Frame(Command.GET_VALUE, count_bytes(register))
-
-
-def get_values(registers: Sequence[int]) -> Frame:
-    """Return a request for 1 to 8 registers; the reply is their count and their cells."""
-    return Frame(Command.GET_VALUES, count_bytes(len(registers)) + b"".join(map(count_bytes, registers)))
 
 
 def set_values(values: Mapping[int, Value]) -> Frame:
@@ -243,20 +209,14 @@ def count_bytes(number: int) -> bytes:
     return number.to_bytes(2, "big")
 
 
-def read_registers(payload: bytes, *, with_cells: bool) -> dict[int, bytes]:
-    """Read the registers of a request, each with its cell, or with no bytes where only ids came."""
+def read_registers(payload: bytes) -> dict[int, bytes]:
+    """Read the registers that a request sets, each with its cell."""
     count = int.from_bytes(payload[:2], "big")
-    _checked(payload, 2 + count * (2 + CELL * with_cells))
-    if not count:
-        raise ShapeError("expected one register or more, got none")
-    ids = [int.from_bytes(payload[at : at + 2], "big") for at in range(2, 2 + 2 * count, 2)]
-    cells = split_cells(payload[2 + 2 * count :]) if with_cells else [b""] * count
-    return dict(zip(ids, cells, strict=True))
-
-
-def read_values(payload: bytes) -> list[bytes]:
-    """Read the cells of a reply with several registers."""
-    return split_cells(_checked(payload, 2 + CELL * int.from_bytes(payload[:2], "big"))[2:])
+    cells = checked(payload, 2 + (2 + CELL) * count)[2 + 2 * count :]
+    return {
+        int.from_bytes(payload[2 + 2 * one : 4 + 2 * one], "big"): cells[CELL * one : CELL * (one + 1)]
+        for one in range(count)
+    }
 
 
 def read_vector(payload: bytes) -> tuple[int, int, int, bytes]:
@@ -267,12 +227,8 @@ def read_vector(payload: bytes) -> tuple[int, int, int, bytes]:
     return register, offset, length, payload[5:]
 
 
-def split_cells(data: bytes) -> list[bytes]:
-    """Cut bytes into cells."""
-    return [_checked(data[at : at + CELL], CELL) for at in range(0, len(data), CELL)]
-
-
-def _checked(data: bytes, size: int) -> bytes:
+def checked(data: bytes, size: int) -> bytes:
+    """Return bytes of that size; ShapeError where they have another."""
     if len(data) != size:
         raise ShapeError(f"expected {size} bytes, got {len(data)}")
     return data
@@ -282,14 +238,7 @@ FEEDBACK_X, FEEDBACK_Y = 0x2302, 0x2303
 LOG_SLOTS = 6
 LOG_RUN, LOG_RATE = 0x2410, 0x2411
 VECTOR_MEMORY = 0x2600  # one vector, shared by the channels
-
-
-class Unit(IntEnum):
-    """Units of an input's numbers."""
-
-    CURRENT = 0
-    FEEDBACK = 1
-    XY = 2
+UNIT_XY = 2  # of an input's numbers: positions on the disk
 
 
 class Trigger(IntEnum):
@@ -300,37 +249,28 @@ class Trigger(IntEnum):
 
 
 class Status(IntFlag):
-    """Status bits with their texts. The ``WAS`` bits stay on until they are acknowledged."""
+    """Status bits. The ``WAS`` bits stay on until they are acknowledged."""
 
-    text: str
-
-    DISCONNECTED = 1 << 0, "the mirror head is not connected"
-    ELECTRONICS_WARM = 1 << 1, "the mirror head's electronics are too warm"
-    MIRROR_WARM = 1 << 2, "the mirror is too warm"
-    EEPROM_INVALID = 1 << 3, "the mirror's own calibration cannot be read"
-    NOT_STABLE = 1 << 4, "the mirror is not at rest"
-    OUTPUT_LIMIT = 1 << 5, "the drive is at its limit"
-    AVERAGE_LIMIT = 1 << 6, "the drive's average is at its limit"
-    TRIMMED = 1 << 7, "a target was beyond the rim, and was trimmed to it"
-    WAS_DISCONNECTED = 1 << 8, "the mirror head was not connected (since the last acknowledgement)"
-    WAS_ELECTRONICS_WARM = 1 << 9, "the mirror head's electronics were too warm (since the last acknowledgement)"
-    WAS_MIRROR_WARM = 1 << 10, "the mirror was too warm (since the last acknowledgement)"
-    WAS_OUTPUT_LIMIT = 1 << 11, "the drive was at its limit (since the last acknowledgement)"
-    WAS_AVERAGE_LIMIT = 1 << 12, "the drive's average was at its limit (since the last acknowledgement)"
-    WAS_TRIMMED = 1 << 13, "a target was trimmed to the rim (since the last acknowledgement)"
-
-    def __new__(cls, bit: int, text: str = "") -> Status:
-        status = int.__new__(cls, bit)
-        status._value_, status.text = bit, text
-        return status
+    DISCONNECTED = 1 << 0  # the mirror head
+    ELECTRONICS_WARM = 1 << 1  # of the mirror head
+    MIRROR_WARM = 1 << 2
+    EEPROM_INVALID = 1 << 3  # the mirror's own calibration
+    NOT_STABLE = 1 << 4  # not at rest
+    OUTPUT_LIMIT = 1 << 5  # of the drive
+    AVERAGE_LIMIT = 1 << 6
+    TRIMMED = 1 << 7  # a target was beyond the rim
+    WAS_DISCONNECTED = 1 << 8
+    WAS_ELECTRONICS_WARM = 1 << 9
+    WAS_MIRROR_WARM = 1 << 10
+    WAS_OUTPUT_LIMIT = 1 << 11
+    WAS_AVERAGE_LIMIT = 1 << 12
+    WAS_TRIMMED = 1 << 13
 
     @property
     def sentence(self) -> str:
-        """The bits and their texts, for messages; unknown bits by their number."""
-        texts = [bit.text for bit in Status if bit in self]
-        rest = int(self) & ~sum(Status)
-        texts += [f"unknown bit {place}" for place in range(32) if rest >> place & 1]
-        return f"status {int(self):08X}: {'; '.join(texts) or 'no error'}"
+        """The number and the names of the known bits, for messages."""
+        names = ", ".join(str(bit.name).lower().replace("_", " ") for bit in Status if bit in self)
+        return f"status {int(self):08X}: {names or 'no known bit'}"
 
     @property
     def stops_motion(self) -> bool:
@@ -361,7 +301,7 @@ class ChannelRegisters:
         self.static_system = 0x50 + channel  # of held positions
         self.vector_system = 0x68 + channel  # plays the vector memory
         self.xy_system = 0xC0 + channel  # controls position
-        self.static_xy = self.static_system << 8 | Unit.XY  # held position, float
+        self.static_xy = self.static_system << 8 | UNIT_XY  # held position, float
         self.input = 0x4000 + 5 * channel  # which system the channel follows
         self.control = 0x4002 + 5 * channel  # which system controls the channel
 

@@ -8,10 +8,8 @@ moved.
 
 from __future__ import annotations
 
-import itertools
 import json
 import logging
-import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
@@ -24,28 +22,19 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, exposing
 from pipeline.json_lines import read_checked, with_check
 from pipeline.rig.camera.camera_files import Kept
-from pipeline.rig.capture import JOURNAL
-from pipeline.rig.capture.capture_paths import (
-    CapturePath,
-    CaptureRecord,
-    LinePositions,
-    LoggedPath,
-    MirrorScanPath,
-    UnusableCaptureError,
-    capture_prefix,
-)
+from pipeline.rig.capture_paths import CapturePath, CaptureRecord, LinePositions, capture_prefix
 from pipeline.rig.device_settings import SurveyRig
 from pipeline.rig.drivers import RigDevices
-from pipeline.rig.mirror.mirror_controller import MotionLog
-from pipeline.rig.mirror.pro_mode import Trigger
+from pipeline.rig.mirror_controller import MotionLog
+from pipeline.rig.pro_mode import Trigger
 from pipeline.source import AT_REST
 
 LOG = logging.getLogger(__name__)
-_HOW = ("method", "residual_us", "residual_px", "offset_s")
+JOURNAL = "captures.jsonl"  # beside the files fetched from the camera
+_HOW = ("method", "residual_px")
 SLACK_S = 5.0  # by which a capture may take longer than its frames
 WRITING_S = 120.0  # that a camera may keep writing what it has after a stop
 POLL_S = 0.05
-_CELL = np.dtype(">f4")
 
 Say = Callable[[str], None]  # takes the present step in a few words
 
@@ -74,8 +63,8 @@ class CaptureJournal:
 
     def record_end(self, taken: CaptureRecord) -> CaptureRecord:
         """Record what was read from the mirror after the capture."""
-        ended = {"folder": taken.folder, "index_at_end": taken.index_at_end}
-        self._write({"what": "end", **ended, "log": None if taken.log is None else asdict(taken.log)})
+        log = None if taken.log is None else {**asdict(taken.log), "position": taken.log.position.tolist()}
+        self._write({"what": "end", "folder": taken.folder, "index_at_end": taken.index_at_end, "log": log})
         return self._taken[taken.folder]
 
     def record_spent(self, taken: CaptureRecord, why: str) -> None:
@@ -148,7 +137,10 @@ class CaptureJournal:
                     tuple(record["capture_s"]),
                 )
             case "end":
-                log = None if record["log"] is None else LoggedPath(**record["log"])
+                log = None
+                if record["log"] is not None:
+                    position = np.array(record["log"]["position"], np.float32).reshape(-1, 2)
+                    log = MotionLog(**{**record["log"], "position": position})
                 found = self._taken[record["folder"]]
                 self._taken[found.folder] = replace(found, index_at_end=record["index_at_end"], log=log)
                 self._ended.add(found.folder)
@@ -172,7 +164,6 @@ class CaptureRunner:
     def __init__(
         self,
         devices: RigDevices,
-        kept: Kept,
         journal: CaptureJournal,
         camera: LineCamera,
         rig: SurveyRig,
@@ -180,8 +171,7 @@ class CaptureRunner:
         say: Say = say_nothing,
     ) -> None:
         self.devices = devices
-        self._kept, self._journal = kept, journal
-        self._camera, self._rig, self._say = camera, rig, say
+        self._journal, self._camera, self._rig, self._say = journal, camera, rig, say
         self._times_ms: tuple[float, float] | None = None  # exposure and frame period that the camera has
 
     def take(self, path: CapturePath) -> CaptureRecord:
@@ -193,7 +183,8 @@ class CaptureRunner:
         steering, prefix = self.devices.steering, capture_prefix(path.sweep, path.first)
         exposed = exposing(self._camera, path.sweep)
         self._configure(exposed)
-        steering.load_path(path.cells, progress=lambda done, total: self._say(f"path: {done} of {total} cells"))
+        self._say(f"path: {len(path.cells)} positions")
+        steering.load_path(path.cells)
         steering.goto(*(float(place) for place in path.cells[0]))
         steering.settle(self._rig.settle_s)
         with self._stopped_on_error():
@@ -212,7 +203,7 @@ class CaptureRunner:
         if taken.triggered:
             taken = replace(taken, index_at_end=steering.index())
         else:
-            taken = replace(taken, log=self._keep_log(taken.folder, steering.read_log()))
+            taken = replace(taken, log=steering.read_log())
         steering.halt()
         return self._journal.record_end(taken)
 
@@ -260,16 +251,6 @@ class CaptureRunner:
             self.wait(CaptureRecord(at_rest, 0, 1, capture.folder, False, at, at))
         return capture.folder
 
-    def log_of(self, taken: CaptureRecord) -> MirrorScanPath | None:
-        """Return the mirror's log of a capture; None without one, UnusableCaptureError where it has changed."""
-        if taken.log is None:
-            return None
-        log = self._kept.read(taken.log.name, 0, self._kept.size(taken.log.name))
-        if zlib.crc32(log) != taken.log.crc32:
-            raise UnusableCaptureError(f"the mirror's log {taken.log.name} has changed (its CRC-32 differs)")
-        position = np.frombuffer(log, _CELL).reshape(-1, 2).astype(np.float64)
-        return MirrorScanPath(np.arange(len(position)) / taken.log.rate_hz, position)
-
     def _configure(self, camera: LineCamera) -> None:
         times_ms = camera.exposure_ms, camera.frame_ms
         if times_ms != self._times_ms:
@@ -280,16 +261,8 @@ class CaptureRunner:
     def _run(self, path: CapturePath) -> tuple[float, float]:
         clock, trigger = self.devices.clock, Trigger.RISING_EDGE if path.triggered else Trigger.OFF
         sent = clock.now()
-        self.devices.steering.run(0, len(path.cells), path.rate_hz, 1, trigger)
+        self.devices.steering.run(path.rate_hz, trigger)
         return sent, clock.now()
-
-    def _keep_log(self, folder: str, log: MotionLog) -> LoggedPath:
-        """Keep a log by a new name, since an emptied camera uses the names of its folders again."""
-        names = (f"{folder}/mirror_log" + (f"-{number}" if number > 1 else "") for number in itertools.count(1))
-        name = next(one for one in names if not self._kept.size(one))
-        position = log.position.astype(_CELL).tobytes()
-        self._kept.append(name, position)
-        return LoggedPath(name, log.rate_hz, log.started_s, log.start_error_s, zlib.crc32(position))
 
     @contextmanager
     def _stopped_on_error(self) -> Iterator[None]:

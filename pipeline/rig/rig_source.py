@@ -29,7 +29,7 @@ from pipeline.geometry.mirror import STRAIGHT
 from pipeline.geometry.scan import Sweep, exposing
 from pipeline.rig.camera.camera_cubes import as_references
 from pipeline.rig.camera.camera_files import NOT_LOGGED_IN, Kept
-from pipeline.rig.capture.capture_paths import (
+from pipeline.rig.capture_paths import (
     REFERENCES,
     CaptureRecord,
     UnusableCaptureError,
@@ -38,9 +38,9 @@ from pipeline.rig.capture.capture_paths import (
     next_path,
     path_of,
 )
-from pipeline.rig.capture.capture_runner import CaptureJournal, CaptureRunner, Say, say_nothing
+from pipeline.rig.capture_runner import CaptureJournal, CaptureRunner, Say, say_nothing
 from pipeline.rig.device_settings import SurveyRig
-from pipeline.rig.drivers import FrameClaim, RigDevices
+from pipeline.rig.drivers import RigDevices
 from pipeline.rig.transports import DeviceRefused, StateUnknown
 from pipeline.simulator.simulated import check_binning
 from pipeline.source import Line, References
@@ -87,7 +87,7 @@ class RigSource:
         self._journal = CaptureJournal(kept)
         self._unknown: list[str] = []  # why the rig's state is unknown; shared by all copies of this source
         self._runner: CaptureRunner | None = None
-        self._whole: dict[str, tuple[References, tuple[str, ...]]] = {}  # of all samples, with notes, by folder
+        self._whole: dict[str, References] = {}  # of all samples, by folder
 
     @property
     def record(self) -> dict[str, Any]:
@@ -97,10 +97,8 @@ class RigSource:
         }
         if self.rig.mounting != STRAIGHT:
             rig["mounting"] = asdict(self.rig.mounting)
-        found = [self._whole[folder][1] for folder in self._journal.references.values() if folder in self._whole]
-        notes = dict.fromkeys(note for some in found for note in some)
         damage = {"journal": self._journal.damage} if self._journal.damage else {}
-        return {"rig": rig, "references": list(notes), "captures": self._journal.captures, **damage}
+        return {"rig": rig, "captures": self._journal.captures, **damage}
 
     def keeping(self, kept: Kept) -> RigSource:
         """Return the same source with its files elsewhere."""
@@ -128,7 +126,7 @@ class RigSource:
             raise StateUnknown(f"the rig gets no further command: {self._unknown[0]}; look at it, then run again")
         devices = self._open()
         try:
-            self._runner = CaptureRunner(devices, self._kept, self._journal, self.camera, self.rig, say=self._say)
+            self._runner = CaptureRunner(devices, self._journal, self.camera, self.rig, say=self._say)
             yield self._runner
         except StateUnknown as error:
             self._unknown.append(str(error))
@@ -186,12 +184,12 @@ class RigSource:
                     self._journal.record_references(runner.capture_at_rest(REFERENCES, exposure_ms), exposure_ms)
                     known = self._whole_references(runner, folders[exposure_ms])
                 self._whole[folders[exposure_ms]] = known
-        whole, _ = self._whole[folders[exposure_ms]]
+        whole = self._whole[folders[exposure_ms]]
         bad = None if whole.bad is None or not whole.bad.any() else _sums(whole.bad, sweep.binning) > 0
         dark, white = (_sums(frame, sweep.binning) for frame in (whole.dark, whole.white))
         return References(dark, white, whole.white_reference, bad, by_mirror=self.rig.white_at_rest)
 
-    def _known_references(self, runner: CaptureRunner, folder: str) -> tuple[References, tuple[str, ...]] | None:
+    def _known_references(self, runner: CaptureRunner, folder: str) -> References | None:
         """Return the frames of an earlier session; None where the camera does not have them any more."""
         try:
             return self._whole_references(runner, folder)
@@ -201,18 +199,18 @@ class RigSource:
             LOG.warning("dark and white frames are taken again; %s: %s", folder, error)
             return None
 
-    def _whole_references(self, runner: CaptureRunner, folder: str) -> tuple[References, tuple[str, ...]]:
-        """Return the dark and white frames of all samples, with notes."""
-        frames = runner.devices.camera.references(folder, self._kept, claim=self._claim(1))
+    def _whole_references(self, runner: CaptureRunner, folder: str) -> References:
+        """Return the dark and white frames of all samples."""
+        frames = runner.devices.camera.references(folder, self._kept)
         missing = [kind for kind in ("dark", "white") if kind not in frames]
         if missing:
             raise RigError(
                 f"{folder} on the camera holds no {' and no '.join(missing)} reference; take both with the camera's "
                 "own program, then run again"
             )
-        whole, notes = as_references(frames["dark"], frames["white"], white_reference=self.rig.white_reference)
+        whole = as_references(frames["dark"], frames["white"], white_reference=self.rig.white_reference)
         self._check_size(whole.dark.shape, folder)
-        return whole, notes
+        return whole
 
     def _read(self, runner: CaptureRunner, taken: CaptureRecord, line: int) -> Iterator[Line]:
         """Fetch a capture and yield its lines from ``line`` on; those without data or position are not valid."""
@@ -221,7 +219,6 @@ class RigSource:
                 taken.folder,
                 self._kept,
                 lambda _, held, size: self._say(f"fetching: {held / 1e6:.1f} of {size / 1e6:.1f} MB"),
-                claim=self._claim(taken.stop - taken.first),
             )
         except RigError as error:
             if type(error) is not RigError:  # a device that is gone, or a full disk: the capture is in order
@@ -229,7 +226,7 @@ class RigSource:
             raise UnusableCaptureError(str(error)) from error
         self._check_size(captured.values.shape[1:], taken.folder)
         path = path_of(taken.sweep, (taken.first, taken.stop), self.camera, triggered=taken.triggered)
-        located = locate_lines(captured, path, taken, self.camera, runner.log_of(taken))
+        located = locate_lines(captured, path, taken, self.camera)
         self._journal.record_positions(taken, located.positions, captured.notes)
         values, sweep = captured.values, path.sweep
         nothing = np.zeros((values.shape[1] // sweep.binning, values.shape[2]), np.uint16)
@@ -253,9 +250,6 @@ class RigSource:
         if known and origin is not None:
             return (stamp_us - origin) * 1e-6 + exposed.mid_exposure_s(0.0)
         return exposed.mid_exposure_s(float(number))
-
-    def _claim(self, frames: int) -> FrameClaim:
-        return FrameClaim(frames, self.camera.samples, len(self.wavelength_nm))
 
     def _check_size(self, found: tuple[int, ...], folder: str) -> None:
         wanted = (self.camera.samples, len(self.wavelength_nm))

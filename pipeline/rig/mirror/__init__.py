@@ -1,1 +1,0 @@
-"""The mirror controller: bytes of its two modes, transactions with it, paths and logs, and its driver."""

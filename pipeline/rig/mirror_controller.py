@@ -1,0 +1,454 @@
+"""The mirror controller's driver: sends a mirror to a position, or along a path.
+
+It follows the documented protocol and was tested against an emulator; it never ran on hardware. Positions are those of
+a mirror mounted straight. The wire carries the device's own positions, by the mounting in the settings.
+
+A controller begins in simple mode: lines of ASCII with CR LF, at most 64 bytes, in either case. The driver reads its
+identity there, and changes to pro mode: frames, see `pro_mode`.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import chain
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pipeline.errors import RigError, SettingsError, ShapeError
+from pipeline.geometry.mirror import STRAIGHT, Mounting, check_reach
+from pipeline.geometry.scan import device_range
+from pipeline.rig import pro_mode as pro
+from pipeline.rig.device_settings import Patience, ReadBack, SurveyRig
+from pipeline.rig.transports import (
+    SYSTEM_CLOCK,
+    Clock,
+    Closing,
+    DeadlinePassed,
+    DeviceRefused,
+    Kind,
+    Receiver,
+    SerialTransport,
+    Transport,
+    Wire,
+)
+
+LOG = logging.getLogger(__name__)
+SAMPLED_EVERY = 10  # frames; "sampled" also reads back the ends of both channels
+KNOWN_MODEL = "MR"  # begins the ids of documented controllers
+_POLL_S = 0.01
+
+END = b"\r\n"
+MOST_LINE = 64  # bytes, with the end
+START = "START"
+ID, VERSION, SERIAL = "GETID", "GETVERSION", "GETSN"
+GO_PRO, GO_PRO_CRC = "GOPRO", "GOPROCRC"
+OK = "OK"
+REFUSALS = ("NO", "OL", "OU", "ERROR")  # unknown or not now; below or above the range; an error on the device
+
+Answer = TypeVar("Answer")
+
+
+def read_done(line: bytes, request: str, port: str) -> bool:
+    """Accept the reply OK; DeviceRefused at another reply of the protocol, RigError at anything else."""
+    text = line.decode("ascii", "backslashreplace").strip()
+    if text.upper() in REFUSALS:
+        raise DeviceRefused(f"the mirror controller on {port} answered {text.upper()} to {request}")
+    if text.upper() != OK:
+        raise RigError(f"expected OK to {request} from {port}, got {text!r}; is this the mirror controller?")
+    return True
+
+
+def read_text(line: bytes, request: str, port: str) -> str:
+    """Read a reply that is a text of the device, such as its id; empty where it does not know the request."""
+    text = line.decode("ascii", "backslashreplace").strip()
+    if not re.fullmatch(r"[ -~]+", text) or "\\x" in text:
+        raise RigError(f"expected text to {request} from {port}, got {line!r}; is the port's speed right?")
+    return "" if text.upper() in REFUSALS else text
+
+
+def ask_line(wire: Wire, request: str, parse: Callable[[bytes, str, str], Answer], kind: Kind = "read") -> Answer:
+    """Send a line of simple mode and return the parsed line that answers it; raises as `Wire.exchange`."""
+
+    def receiver() -> Receiver[Answer]:
+        """Return a receiver that collects a line."""
+        held = b""
+
+        def receive(data: bytes) -> Answer | None:
+            nonlocal held
+            *lines, held = (held + data).split(b"\n")
+            line = next((line for line in (line.rstrip(b"\r") for line in lines) if line), None)
+            return None if line is None else parse(line, request, wire.port)
+
+        return receive
+
+    return wire.exchange(request.encode("ascii") + END, request, kind, receiver)
+
+
+@dataclass(frozen=True)
+class ProLink:
+    """Frames of pro mode over a wire. ``with_crc`` sends and checks CRCs; ``strict_crc`` refuses those that differ.
+
+    Requests raise DeviceRefused, DeadlinePassed or DeviceGone, and one that moves the mirror StateUnknown.
+    """
+
+    wire: Wire
+    with_crc: bool = False
+    strict_crc: bool = False
+
+    def ask(self, frame: pro.Frame, name: str, parse: Callable[[bytes], Answer], kind: Kind = "read") -> Answer:
+        """Send a request that only reads and return the parsed payload; it is sent again where no answer comes."""
+
+        def receiver() -> Receiver[Answer]:
+            reader = pro.FrameReader()
+
+            def receive(data: bytes) -> Answer | None:
+                answers = (self._answer(found, frame, name, parse) for found in reader.feed(data))
+                return next((answer for answer in answers if answer is not None), None)
+
+            return receive
+
+        return self.wire.exchange(pro.encode(frame, with_crc=self.with_crc), name, kind, receiver)
+
+    def set(self, frame: pro.Frame, name: str) -> None:
+        """Send a request once that writes and moves nothing."""
+        self.ask(frame, name, bytes, "write")
+
+    def move(self, frame: pro.Frame, name: str) -> None:
+        """Send a request once that moves the mirror."""
+        self.ask(frame, name, bytes, "motion")
+
+    def _answer(
+        self, found: pro.Frame | pro.Damaged, sent: pro.Frame, name: str, parse: Callable[[bytes], Answer]
+    ) -> Answer | None:
+        """Return the answer in a frame; None, and a line in the log, where it does not answer the request."""
+        port = self.wire.port
+        if isinstance(found, pro.Damaged):
+            LOG.info("%s, while waiting for %s: bytes that form no frame: %s", port, name, found.data.hex(" "))
+            return None
+        if self.with_crc and not found.crc_good:
+            action = "refused" if self.strict_crc else "accepted (set strict_crc to refuse it)"
+            LOG.warning("%s: the CRC of an answer to %s does not fit; %s", port, name, action)
+            if self.strict_crc:
+                return None
+        try:
+            if found.command == sent.command | pro.ERROR_FLAG:
+                code = pro.cell_int(found.payload)
+                raise DeviceRefused(f"the mirror controller on {port} refused {name}: {pro.format_error(code)}", code)
+            if found.command == sent.command:
+                return parse(found.payload)
+        except ShapeError as error:
+            LOG.info("%s, while waiting for %s: an answer that does not fit: %s", port, name, error)
+            return None
+        LOG.info("%s, while waiting for %s: an answer to command %02X", port, name, found.command)
+        return None
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Identity of a controller; a field is empty where it does not know the request."""
+
+    device: str
+    version: str
+    serial: str
+
+    @property
+    def summary(self) -> str:
+        """All fields in one line."""
+        return f"{self.device or 'no id'}, version {self.version or 'unknown'}, serial {self.serial or 'unknown'}"
+
+
+def wire_positions(positions: ArrayLike, mounting: Mounting = STRAIGHT) -> NDArray[np.float32]:
+    """Return positions (position, 2) as float32 for the wire; rounding moves none of them beyond the rim.
+
+    Positions of a mirror mounted straight become those of the device in its ``mounting``. Raises ShapeError: they have
+    another shape, or there is none. Raises PoseError: one is not finite or lies beyond the rim.
+    """
+    exact = np.array(positions)
+    if exact.ndim != 2 or exact.shape[1:] != (2,) or not len(exact):
+        raise ShapeError(f"a path needs positions as (position, 2), at least one, got shape {exact.shape}")
+    exact = check_reach(exact).astype(np.float64)
+    exact /= np.maximum(np.hypot(exact[:, :1], exact[:, 1:]), 1)  # the slack that check_reach allows
+    rounded: NDArray[np.float32] = exact.astype(np.float32)
+    beyond = np.hypot(*rounded.astype(np.float64).T) > 1
+    rounded[beyond] = np.nextafter(rounded[beyond], np.float32(0))
+    return rounded if mounting == STRAIGHT else wire_positions(mounting.to_device(rounded))
+
+
+def upload(link: ProLink, cells: bytes, read_back: ReadBack) -> None:
+    """Write cells, X of all positions and then Y of all, to the vector memory, and compare what it holds then.
+
+    ``read_back`` is "none", "sampled" (every tenth frame and the ends of both channels) or "all". Raises RigError: a
+    cell holds another value.
+    """
+    size = pro.VECTOR_CELLS * pro.CELL
+    frames = [(at // pro.CELL, cells[at : at + size]) for at in range(0, len(cells), size)]
+    for start, sent in frames:
+        stop = start + len(sent) // pro.CELL
+        link.set(pro.set_vector(pro.VECTOR_MEMORY, start, sent), f"writing cells {start} to {stop}")
+    for number in frames_to_check(len(frames), read_back):
+        start, sent = frames[number]
+        held = read_cells(link, pro.VECTOR_MEMORY, start, len(sent) // pro.CELL)
+        if held != sent:
+            raise RigError(
+                f"cells {start} to {start + len(sent) // pro.CELL} of the vector memory on {link.wire.port} hold other "
+                "values than were sent; nothing was moved: load the path again"
+            )
+
+
+def frames_to_check(frames: int, read_back: ReadBack) -> list[int]:
+    """Return the numbers of the frames that are read back."""
+    if read_back == "none":
+        return []
+    if read_back == "all":
+        return list(range(frames))
+    half = frames // 2  # X ends and Y begins here
+    ends = (0, half - 1, half, frames - 1)
+    return sorted({number for number in chain(range(0, frames, SAMPLED_EVERY), ends) if 0 <= number < frames})
+
+
+def read_cells(link: ProLink, register: int, start: int, count: int) -> bytes:
+    """Read cells of a vector, at most as many as one frame takes."""
+
+    return link.ask(
+        pro.get_vector(register, start, count),
+        f"reading cells {start} to {start + count}",
+        lambda payload: pro.checked(payload, count * pro.CELL),
+    )
+
+
+def hold_values(x: float, y: float) -> dict[int, pro.Value]:
+    """Return the registers that send both channels to a position, hold it and end any path; they fill one frame."""
+    follow = {**pro.X.followed(pro.X.static_system), **pro.Y.followed(pro.Y.static_system)}
+    return {pro.X.static_xy: float(x), pro.Y.static_xy: float(y), **follow, **_run_values(0)}
+
+
+def _run_values(run: int) -> dict[int, pro.Value]:
+    """Return the registers that start (1) or halt (0) the vector units of both channels, in one frame."""
+    return {channel.vector(pro.VectorRegister.RUN): run for channel in (pro.X, pro.Y)}
+
+
+@dataclass(frozen=True)
+class MotionLog:
+    """Positions that the controller measured at a steady rate.
+
+    ``started_s`` is the time of the acknowledgement of the start, by the driver's clock. The log began at most
+    ``start_error_s`` earlier, the duration of the request.
+    """
+
+    position: NDArray[np.float32]  # (sample, 2) X and Y
+    rate_hz: float
+    started_s: float
+    start_error_s: float
+
+
+class MirrorController(Closing):
+    """A mirror controller on a port, a `pipeline.rig.drivers.MirrorDriver`. Call :meth:`connect` first.
+
+    Motions (goto, run) are sent once. One that is not acknowledged raises StateUnknown, and so does every later motion
+    of this object; reads and :meth:`halt` still work. Every method that speaks to the device may also raise
+    DeviceRefused, DeadlinePassed or DeviceGone.
+    """
+
+    def __init__(
+        self, transport: Transport, rig: SurveyRig, clock: Clock = SYSTEM_CLOCK, *, vector_pairs: int = 1500
+    ) -> None:
+        self.rig, self.vector_pairs = rig, vector_pairs
+        self.wire = Wire(transport, clock, Patience(rig.deadline_s, rig.retries, rig.quiet_s))
+        self._link = ProLink(self.wire, rig.with_crc, rig.strict_crc)
+        self._logging: tuple[float, float, float] | None = None  # rate; before the request and after its answer
+        self._pairs = 0  # positions in the vector memory
+        self.identity = Identity("", "", "")
+
+    def connect(self) -> None:
+        """Find the controller in either mode, and change it to pro mode. Nothing moves.
+
+        Raises DeadlinePassed or DeviceGone where nothing answers, RigError where another device answers.
+        """
+        with self.wire.lock:
+            try:
+                self._greet()
+            except DeadlinePassed:
+                LOG.info("%s does not answer in simple mode; it may be in pro mode", self.wire.port)
+                self._leave_pro()
+            self.identity = Identity(*(ask_line(self.wire, request, read_text) for request in (ID, VERSION, SERIAL)))
+            self._check_identity()
+            try:
+                self._enter_pro()
+            except (DeadlinePassed, DeviceRefused) as error:
+                own, other = ("with", "without")[:: 1 if self.rig.with_crc else -1]
+                raise RigError(
+                    f"frames {own} a CRC: {error}; if this firmware wants them {other} one, set with_crc = "
+                    f"{str(not self.rig.with_crc).lower()} in [rig]"
+                ) from error
+
+    def _greet(self) -> None:
+        try:
+            ask_line(self.wire, START, read_done)
+        except DeviceRefused:  # the greeting ended a line that was begun before
+            ask_line(self.wire, START, read_done)
+
+    def _leave_pro(self) -> None:
+        """Change to simple mode, by a frame with a CRC: an earlier session may have had them checked."""
+        with suppress(DeadlinePassed):  # it may have changed; the greeting shows
+            ProLink(self.wire, with_crc=True).set(pro.go_simple(), "changing to simple mode")
+        self._greet()
+
+    def _enter_pro(self) -> None:
+        with suppress(DeadlinePassed):  # it may have changed; the status shows
+            ask_line(self.wire, GO_PRO_CRC if self.rig.with_crc else GO_PRO, read_done, "write")
+        self.status()
+
+    def _check_identity(self) -> None:
+        """Raise RigError for another model than the settings expect, or than the documented ones."""
+        found, expected = self.identity, self.rig.expected_id
+        good = expected.lower() in found.device.lower() if expected else found.device.upper().startswith(KNOWN_MODEL)
+        if not good:
+            wanted = f"whose id holds {expected!r}" if expected else f"whose id begins with {KNOWN_MODEL}"
+            raise RigError(
+                f"expected a controller {wanted} on {self.wire.port}, got {found.summary}; is another device at this "
+                "port? If it is the mirror, set rig.expected_id to a part of its id"
+            )
+
+    def status(self) -> pro.Status:
+        """Return the present status bits."""
+        return pro.Status(self._link.ask(pro.ask_status(), "the status", pro.cell_int))
+
+    def goto(self, x: float, y: float) -> None:
+        """Send the mirror to a position and hold it there; return once that is acknowledged, not at rest.
+
+        Raises PoseError: the position is outside the disk; no byte is sent. Raises RigError: the status forbids motion.
+        Raises StateUnknown: it was not acknowledged, or an earlier motion was not.
+        """
+        target = wire_positions([(x, y)], self.rig.mounting)[0]
+        self._move(hold_values(*target), f"going to {target[0]:.6g}; {target[1]:.6g}")
+
+    def settle(self, within_s: float) -> None:
+        """Wait until the mirror is at rest; RigError where it is not, or the device trimmed the target to the rim."""
+        until = self.wire.clock.now() + within_s
+        while pro.Status.NOT_STABLE in (status := self.status()):
+            if self.wire.clock.now() >= until:
+                raise RigError(f"the mirror on {self.wire.port} is not at rest after {within_s:g} s; {status.sentence}")
+            self.wire.clock.sleep(_POLL_S)
+        if pro.Status.TRIMMED in status:
+            raise RigError(f"the mirror on {self.wire.port} is not where it was sent; {status.sentence}")
+
+    def load_path(self, positions: ArrayLike) -> None:
+        """Put positions (position, 2) into the vector memory: X of all, then Y of all, from cell 0 on. Nothing moves.
+
+        A path that plays is halted. Raises PoseError or ShapeError where a position is outside the disk, and
+        SettingsError where there are too many; nothing is sent then. Raises RigError: a cell that was read back, as the
+        settings say, holds another value.
+        """
+        cells = wire_positions(positions, self.rig.mounting)
+        if len(cells) > self.vector_pairs:
+            raise SettingsError(
+                f"the vector memory holds {self.vector_pairs} positions, got {len(cells)}; load in parts"
+            )
+        self.halt()
+        self._pairs = 0
+        upload(self._link, cells.T.astype(">f4").tobytes(), self.rig.read_back)
+        self._pairs = len(cells)
+
+    def run(self, rate_hz: float, trigger: pro.Trigger = pro.Trigger.OFF) -> None:
+        """Play the loaded positions once, at ``rate_hz`` positions a second.
+
+        X plays from cell 0 on, Y from behind the X of all positions. With a ``trigger`` the edges at its input step to
+        the next position instead. Raises SettingsError: no path is loaded. Raises also as :meth:`goto`.
+        """
+        if not self._pairs:
+            raise SettingsError(f"no path is loaded on {self.wire.port}; load one first")
+        with self.wire.lock:
+            self.wire.check_known("running a path")
+            self.halt()
+            for name, begin, channel in (("X", 0, pro.X), ("Y", self._pairs, pro.Y)):
+                start, end = device_range((begin, begin + self._pairs), self.rig.ends)
+                values: dict[pro.VectorRegister, pro.Value] = {
+                    pro.VectorRegister.UNIT: pro.UNIT_XY,
+                    pro.VectorRegister.START: start,
+                    pro.VectorRegister.END: end,
+                    pro.VectorRegister.FREQUENCY: float(rate_hz),
+                    pro.VectorRegister.CYCLES: 1,
+                    pro.VectorRegister.TRIGGER: int(trigger),
+                }
+                frame = pro.set_values({channel.vector(register): value for register, value in values.items()})
+                self._link.set(frame, f"setting up the path's {name}")
+            follow = {**pro.X.followed(pro.X.vector_system), **pro.Y.followed(pro.Y.vector_system)}
+            self._move(follow | _run_values(1), "running the path")  # one frame: both begin together
+
+    def halt(self) -> None:
+        """Stop playing; the mirror stays where it is. Works also where motions are refused."""
+        self._link.set(pro.set_values(_run_values(0)), "halting the path")
+
+    def index(self) -> int:
+        """Return the position of the loaded path that plays now: the cell of X."""
+        register = pro.X.vector(pro.VectorRegister.INDEX)
+        return self._link.ask(pro.get_value(register), "the place in the path", pro.cell_int)
+
+    def start_log(self, rate_hz: float) -> None:
+        """Start to log measured positions ``rate_hz`` times a second: X in slot 0, Y in slot 1."""
+        self._logging = None
+        self._link.set(pro.set_values({pro.LOG_RUN: 0}), "stopping the log")
+        slots = {pro.log_slot(0): pro.FEEDBACK_X, pro.log_slot(1): pro.FEEDBACK_Y}
+        self._link.set(pro.set_values({**slots, pro.LOG_RATE: float(rate_hz)}), "setting up the log")
+        before = self.wire.clock.now()
+        self._link.set(pro.set_values({pro.LOG_RUN: 1}), "starting the log")
+        self._logging = float(rate_hz), before, self.wire.clock.now()
+
+    def read_log(self) -> MotionLog:
+        """End the log and fetch the samples since its start, at most as many as the logger holds.
+
+        A shorter log ends where the device says so. Raises RigError: no log was started.
+        """
+        if self._logging is None:
+            raise RigError(f"no log was started on {self.wire.port}; start one before the path runs")
+        rate_hz, before, after = self._logging
+        samples = min(int((self.wire.clock.now() - after) * rate_hz), self.rig.log_samples)
+        self._link.set(pro.set_values({pro.LOG_RUN: 0}), "stopping the log")
+        self._logging = None
+        columns = [self._logged(slot, samples) for slot in (0, 1)]
+        held = min(map(len, columns)) // pro.CELL
+        measured = np.stack([np.frombuffer(column, ">f4", held) for column in columns], axis=-1).astype(np.float32)
+        position = self.rig.mounting.to_model(measured).astype(np.float32, copy=False)
+        return MotionLog(position, rate_hz, after, after - before)
+
+    def close(self) -> None:
+        """Close the port; the mirror stays where it is."""
+        self.wire.transport.close()
+
+    def _move(self, values: dict[int, pro.Value], name: str) -> None:
+        self.wire.check_known(name)
+        if (status := self.status()).stops_motion:
+            raise RigError(f"{name} is refused on {self.wire.port}; {status.sentence}; mend that first")
+        self._link.move(pro.set_values(values), name)
+
+    def _logged(self, slot: int, samples: int) -> bytes:
+        cells = b""
+        for start in range(0, samples, pro.VECTOR_CELLS):
+            try:
+                cells += read_cells(self._link, pro.log_slot(slot), start, min(pro.VECTOR_CELLS, samples - start))
+            except DeviceRefused as error:
+                if error.code != pro.ErrorCode.VECTOR_INDEX:
+                    raise
+                LOG.warning("the log on %s ends at %d of %d samples", self.wire.port, start, samples)
+                break
+        return cells
+
+
+def open_mirror(rig: SurveyRig, vector_pairs: int = 1500, clock: Clock = SYSTEM_CLOCK) -> MirrorController:
+    """Open the port of the settings and connect to the controller there. Nothing moves.
+
+    Raises as `MirrorController.connect`, and DeviceGone: there is no such port, it is in use, or not permitted.
+    """
+    mirror = MirrorController(SerialTransport(rig.port, rig.baud, clock), rig, clock, vector_pairs=vector_pairs)
+    try:
+        mirror.connect()
+    except BaseException:
+        mirror.close()
+        raise
+    return mirror
