@@ -17,7 +17,7 @@ from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 
 SMALL = (96, 160)
-BYTES, BLOCK, MIOU = STORE.beside  # a spectrum, of means, of the map
+BLOCK, MIOU = "mean of 64² [σ]", "mIoU [%]"  # noqa: RUF001
 STEPS = tuple(f"condensed, step {step:g}" for step in store.STEPS)
 ROUNDED = tuple(f"rounded, {step:g}" for step in store.ROUNDED)
 PRINCIPAL = ("PCA, step 0.5", "PCA, step 3")
@@ -52,7 +52,7 @@ def test_bytes_fall_with_the_step_and_the_error_grows(points: dict[str, Point]) 
     """Condensed spectra, rounded numbers and principal components alike."""
     for family in (STEPS, ROUNDED, PRINCIPAL):
         rows = [points[name] for name in family]
-        sizes, errors = [row.beside[BYTES] for row in rows], [row.error for row in rows]
+        sizes, errors = [row.cost for row in rows], [row.error for row in rows]
         assert sizes == sorted(sizes, reverse=True)
         assert errors == sorted(errors)
         assert len({*sizes}) == len({*errors}) == len(rows)
@@ -63,7 +63,7 @@ def test_raw_lines_err_by_their_noise_and_components_by_little_of_it(points: dic
     assert points["raw"].error == pytest.approx(1, abs=0.01)
     fine = points[STEPS[0]]
     assert fine.error < 0.3
-    assert fine.paid == fine.beside[BYTES] < points["raw"].beside[BYTES] / 10
+    assert fine.cost < points["raw"].cost / 10
     assert points["binned, 17 bands"].beside[BLOCK] > 1 > points["raw"].beside[BLOCK]
 
 
@@ -76,7 +76,7 @@ def test_the_map_is_drawn_of_what_comes_back(points: dict[str, Point]) -> None:
 def test_packed_spectra_take_few_bytes_and_err_by_less_than_noise(points: dict[str, Point]) -> None:
     """Components as JPEG 2000 keep their rate and err by less than the noise; ZFP stays within its tolerance."""
     pca, condensed, zfp = (points[name] for name in PACKED)
-    assert max(pca.beside[BYTES], condensed.beside[BYTES]) < points["raw"].beside[BYTES] / 4
+    assert max(pca.cost, condensed.cost) < points["raw"].cost / 4
     assert condensed.error < 1
     assert zfp.error < 8
 
