@@ -1,13 +1,12 @@
-"""Build the command line: its verbs, shared parameters, parsers of lists, and shell completion."""
+"""Build the command line: its verbs, shared parameters and parsers of lists."""
 
 from __future__ import annotations
 
 import ast
 import importlib.metadata
 import importlib.util
-import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import App, Parameter
 from rich.markup import escape
@@ -36,9 +35,8 @@ VERBS = {  # verb: module of its function, loaded on demand
     "train": "flows.cli.model_verbs",
     "evaluate": "flows.cli.model_verbs",
     "tradeoff": "flows.cli.model_verbs",
-    "completion": "flows.cli.app",
 }
-GOES_ON = ("survey", "train", "evaluate", "export", "reprocess", "simulate", "serve")  # verbs that resume
+GOES_ON = ("survey", "train", "export", "reprocess", "simulate", "serve")  # verbs that resume
 stderr = on_stderr()
 
 ArchiveName = Annotated[str, Parameter(help="The archive's folder, or s3://bucket/prefix.")]
@@ -66,6 +64,7 @@ def build_app(*, listed: bool) -> App:
         group, name = (rig if verb.startswith("rig ") else app), verb.split()[-1]
         summary = {"help": _summary(module, name)} if listed else {}  # replaces all of the verb's own help
         group.command(f"{module}:{name}", name=name, **summary)
+    app.register_install_completion_command(name="completion", add_to_startup=False)
     return app
 
 
@@ -94,7 +93,7 @@ def check_outside(out: Path, root: Path) -> Path:
 
 def split_list(text: str | None) -> tuple[str, ...]:
     """Return the parts of a list with commas."""
-    return tuple(part.strip() for part in text.split(",") if part.strip()) if text else ()
+    return tuple(part.strip() for part in str(text).split(",") if part.strip()) if text else ()
 
 
 def parse_numbers(text: str | None, flag: str) -> list[float] | None:
@@ -111,17 +110,3 @@ def parse_wholes(text: str | None, flag: str) -> list[int] | None:
         return None if text is None else [int(str(one)) for part in split_list(text) for one in numbers_of(part)]
     except ValueError:
         raise SettingsError(f"{flag} expects whole numbers with commas, got {text!r}") from None
-
-
-def completion(shell: Literal["bash", "zsh", "fish"]) -> int:
-    """Print a completion script for SHELL.
-
-    For bash: spectralzoom completion bash > ~/.local/share/bash-completion/completions/spectralzoom
-
-    Parameters
-    ----------
-    shell
-        bash, zsh (save as _spectralzoom in a folder of fpath) or fish (save in ~/.config/fish/completions).
-    """
-    sys.stdout.write(build_app(listed=False).generate_completion(prog_name="spectralzoom", shell=shell))
-    return 0
