@@ -17,9 +17,9 @@ from pipeline.setting_fields import numbers_of
 
 VERBS = {  # verb: module of its function, loaded on demand
     "survey": "flows.cli.survey_verbs",
-    "simulate": "flows.cli.survey_verbs",
-    "rig check": "flows.cli.survey_verbs",
-    "rig emulate": "flows.cli.survey_verbs",
+    "simulate": "flows.cli.simulate_command",
+    "rig check": "flows.cli.rig_commands",
+    "rig emulate": "flows.cli.rig_commands",
     "plan": "flows.archive.plan_command",
     "ls": "flows.archive.commands",
     "explain": "flows.archive.commands",
@@ -29,12 +29,12 @@ VERBS = {  # verb: module of its function, loaded on demand
     "export": "flows.archive.export_command",
     "ingest": "flows.archive.ingest_command",
     "reprocess": "flows.archive.reprocess_command",
-    "serve": "flows.schedule.serve_command",
+    "serve": "flows.cli.serve_command",
     "report": "flows.archive.history",
     "init": "flows.training.init_command",
     "train": "flows.cli.model_verbs",
     "evaluate": "flows.cli.model_verbs",
-    "tradeoff": "flows.cli.model_verbs",
+    "tradeoff": "flows.tradeoff.command",
 }
 GOES_ON = ("survey", "train", "export", "reprocess", "simulate", "serve")  # verbs that resume
 stderr = on_stderr()

@@ -1,4 +1,4 @@
-"""Define the verbs on weights: train, evaluate and tradeoff."""
+"""Define the verbs on weights: train and evaluate."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from flows.cli.app import AsJson, OutFile, OutFolder, parse_numbers, parse_whole
 from flows.evaluate.command import run_evaluate
 from flows.evaluate.frames import FRACTIONS, USUAL, EvaluateRequest
 from flows.terminal.progress import print_json
-from flows.tradeoff.command import run_tradeoff
 from flows.training.fit_ood import OodRequest, run_measure_ood
 from flows.training.train import asked_command, run_train, usual_crop
 from flows.training.train_scenes import TrainRequest
@@ -25,41 +24,6 @@ from models.network.machine import PROCESSOR, Device
 from models.training.temporal import TemporalTraining
 from models.training.train import TrainingSettings
 from pipeline.errors import SettingsError
-
-
-def tradeoff(
-    stage: str | None = None,
-    *,
-    scene: str | None = None,
-    weights: Path | None = None,
-    out: OutFile = Path("tradeoff"),
-    repeats: int | None = None,
-    seed: int = 0,
-    as_json: AsJson = False,
-) -> int:
-    """Measure accuracy against time or bytes, for STAGE or for all stages with a choice.
-
-    Parameters
-    ----------
-    stage
-        rectify, segment, simulate, store or survey. Default: all.
-    scene
-        Labelled scene instead of a farm: a raster for segment, a scene of the simulated rig for survey, a cube of raw
-        numbers for store. Without a stage: segment and survey.
-    weights
-        Weights for the classes of the scene; optional for store, which then draws no map.
-    out
-        Folder of tradeoff.json and tradeoff.png.
-    repeats
-        Rounds that time every setting once. Default: 5, for store 1.
-    seed
-        Random seed of the scenes.
-    """
-
-    content = run_tradeoff(stage, out, repeats, seed, stderr, scene=scene, weights=weights)
-    if as_json:
-        print_json(content)
-    return 0
 
 
 @Parameter(name="*")

@@ -6,17 +6,20 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+from cyclopts import Parameter
+from cyclopts.validators import Number
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from rich.console import Console
 from rich.markup import escape
 
+from flows.cli.app import AsJson, OutFile, stderr
 from flows.publish.panels import GRID, INK, PAPER, save_png
 from flows.terminal.processes import writing
-from flows.terminal.progress import table
+from flows.terminal.progress import print_json, table
 from flows.tradeoff.entries import Point, Result, Setting, Tradeoff, measure_tradeoff
 from flows.tradeoff.stages import SEGMENT, SURVEY, TRADEOFFS, segment_tradeoff, survey_tradeoff
 from flows.tradeoff.store import STORE, store_tradeoff
@@ -31,39 +34,50 @@ OF_SCENES: Mapping[str, Callable[[str, Any], Tradeoff]] = {
 }
 
 
-def run_tradeoff(
-    stage: str | None,
-    out: Path,
-    repeats: int | None,
-    seed: int,
-    console: Console,
+def tradeoff(
+    stage: str | None = None,
     *,
     scene: str | None = None,
     weights: Path | None = None,
-) -> dict[str, Any]:
-    """Measure the trade-off of one stage, or all; write tradeoff.json and .png into ``out`` and print the tables.
+    out: OutFile = Path("tradeoff"),
+    repeats: Annotated[int | None, Parameter(validator=Number(gte=1))] = None,
+    seed: Annotated[int, Parameter(validator=Number(gte=0))] = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Measure accuracy against time or bytes, for STAGE or for all stages with a choice.
 
-    ``scene`` replaces the farm of `segment`, `store` and `survey`; ``weights`` read it. Raises SettingsError: an
-    unknown stage, one that takes no scene, a scene or weights alone; else as the stages.
+    Parameters
+    ----------
+    stage
+        rectify, segment, simulate, store or survey. Default: all.
+    scene
+        Labelled scene instead of a farm: a raster for segment, a scene of the simulated rig for survey, a cube of raw
+        numbers for store. Without a stage: segment and survey.
+    weights
+        Weights for the classes of the scene; optional for store, which then draws no map.
+    out
+        Folder of tradeoff.json and tradeoff.png.
+    repeats
+        Rounds that time every setting once. Default: 5, for store 1.
+    seed
+        Random seed of the scenes.
     """
-    if repeats is not None and repeats < 1:
-        raise SettingsError(f"--repeats must be at least 1, got {repeats}")
-    if seed < 0:
-        raise SettingsError(f"--seed must be 0 or more, got {seed}")
     wanted = choose_tradeoffs(stage, scene, weights)
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)  # fails before minutes are spent
     results = []
-    for tradeoff in wanted:
-        with console.status(f"measuring {tradeoff.stage}: {tradeoff.knob}"):
-            results.append(measure_tradeoff(tradeoff, repeats=repeats, seed=seed))
-        print_tradeoff(results[-1], console)
+    for one in wanted:
+        with stderr.status(f"measuring {one.stage}: {one.knob}"):
+            results.append(measure_tradeoff(one, repeats=repeats, seed=seed))
+        print_tradeoff(results[-1], stderr)
     content = {"tradeoffs": [asdict(result) for result in results]}
     with writing(out):
         (out / "tradeoff.json").write_text(to_json(content), encoding="utf-8")
         save_png(tradeoff_figure(results), out / "tradeoff.png")
-    console.print(f"{out / 'tradeoff.json'}\n{out / 'tradeoff.png'}", soft_wrap=True)
-    return content
+    stderr.print(f"{out / 'tradeoff.json'}\n{out / 'tradeoff.png'}", soft_wrap=True)
+    if as_json:
+        print_json(content)
+    return 0
 
 
 def choose_tradeoffs(stage: str | None, scene: str | None, weights: Path | None) -> list[Tradeoff]:

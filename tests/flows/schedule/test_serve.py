@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
 import signal
-import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from flows.schedule import serve_command
-from flows.schedule.serve_command import load_fields, schedule_of
+from flows.cli import serve_command
+from flows.cli.serve_command import load_fields, schedule_of
 from storage.archive.archive import Archive
 from storage.archive.staging import take_lock
 
@@ -116,26 +114,3 @@ def test_a_field_is_a_deployment_of_the_survey(field_file: Callable[..., Path], 
     assert (schedule.schedule.cron, schedule.schedule.timezone) == ("0 6 * * *", "Europe/Berlin")
     again = deployment(str(tmp_path / "other"))
     assert (again.flow_name, again.name, again.schedules) == ("reprocess", "archive", [])
-
-
-@pytest.mark.parametrize("ending", [asyncio.CancelledError, ConnectionError])
-def test_a_serve_that_is_asked_to_stop_ends_whatever_its_runner_fails_with(
-    monkeypatch: pytest.MonkeyPatch, ending: type[BaseException]
-) -> None:
-    """A runner that fails before that is begun again when the server answers; the schedules are paused at last."""
-    happened: list[str] = []
-
-    async def run(deployments: Sequence[Any], limit: int, asked_to_stop: threading.Event) -> None:
-        happened.append("run")
-        if len(happened) == 1:
-            raise ConnectionError
-        asked_to_stop.set()
-        raise ending
-
-    monkeypatch.setattr(serve_command, "_prepare", lambda fields: None)
-    monkeypatch.setattr(serve_command, "_run", run)
-    monkeypatch.setattr(serve_command, "_wait_for_server", lambda: happened.append("waited"))
-    monkeypatch.setattr(serve_command, "_pause", lambda fields: happened.append("paused"))
-    with pytest.raises(KeyboardInterrupt):
-        serve_command._serve([], None, 1)
-    assert happened == ["run", "waited", "run", "paused"]

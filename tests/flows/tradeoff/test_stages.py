@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import shutil
 from dataclasses import replace
@@ -14,7 +15,7 @@ from rich.console import Console
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from flows.tradeoff import stages
-from flows.tradeoff.command import run_tradeoff
+from flows.tradeoff.command import tradeoff
 from flows.tradeoff.entries import Tradeoff, measure_tradeoff
 from flows.tradeoff.stages import (
     EXACT,
@@ -81,15 +82,13 @@ def test_own_scenes_are_measured_by_their_labels(
     scene = str(tmp_path / "scene.png")
     shutil.copy(scene_files / "scene.png", scene)
     shutil.copy(scene_files / "labels.png", tmp_path / "scene_labels.png")
-    quiet = Console(quiet=True)
-    content = run_tradeoff(None, tmp_path / "out", 1, 0, quiet, scene=scene, weights=weights)
-    parts, scans = content["tradeoffs"]
+    tradeoff(scene=scene, weights=weights, out=tmp_path / "out", repeats=1)
+    parts, scans = json.loads((tmp_path / "out" / "tradeoff.json").read_text())["tradeoffs"]
     assert (parts["stage"], parts["default"]) == ("segment", 1.0)
     assert scans["stage"] == "survey"
     assert all(0 <= point["error"] <= 1 and point["cost"] > 0 for one in (parts, scans) for point in one["points"])
-    whole = run_survey(
-        load_settings(None, {"scene": scene, "weights": str(weights), "out": str(tmp_path / "a")}), quiet
-    )
+    asked = {"scene": scene, "weights": str(weights), "out": str(tmp_path / "a")}
+    whole = run_survey(load_settings(None, asked), Console(quiet=True))
     errors = {point["setting"]: point["error"] for point in parts["points"]}
     assert errors[1.0] == pytest.approx(1 - whole.receipt["accuracy"]["miou"], abs=1e-3)
 

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from flows.tradeoff import store
-from flows.tradeoff.command import run_tradeoff
+from flows.tradeoff.command import tradeoff
 from flows.tradeoff.entries import Point, measure_tradeoff
 from flows.tradeoff.store import STORE, WAYS, ScanLines, block_means_of, scan_farm, scan_raster, store_tradeoff
 from pipeline.errors import SceneError, SettingsError
@@ -92,8 +91,8 @@ def test_lossless_ways_give_raw_lines_back(farm: ScanLines) -> None:
 
 def test_a_raster_is_measured_by_its_own_pixels(tmp_path: Path) -> None:
     """Its raw row has no error, its figures no map without weights, and its noise is estimated."""
-    tradeoff = replace(store_tradeoff(cube_of(tmp_path / "cube.npy"), None), settings=("raw", *STEPS))
-    raw, *condensed = measure_tradeoff(tradeoff, repeats=1).points
+    entry = replace(store_tradeoff(cube_of(tmp_path / "cube.npy"), None), settings=("raw", *STEPS))
+    raw, *condensed = measure_tradeoff(entry, repeats=1).points
     assert raw.error == raw.beside[BLOCK] == 0
     assert np.isnan(raw.beside[MIOU])
     assert all(0.5 < point.error < 1.2 for point in condensed)
@@ -102,7 +101,7 @@ def test_a_raster_is_measured_by_its_own_pixels(tmp_path: Path) -> None:
 
 def test_scenes_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     """Another stage has no scene, one without the other says nothing, and numbers with parts are no raw ones."""
-    quiet, weights = Console(quiet=True), Path("w.safetensors")
+    weights = Path("w.safetensors")
     for stage, scene, read_by in (
         ("rectify", "cube.npy", weights),
         ("survey", "cube.npy", None),
@@ -110,7 +109,7 @@ def test_scenes_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         ("store", None, weights),
     ):
         with pytest.raises(SettingsError, match="--scene FILE and --weights FILE go together, with the stages segment"):
-            run_tradeoff(stage, tmp_path, 1, 0, quiet, scene=scene, weights=read_by)
+            tradeoff(stage, scene=scene, weights=read_by, out=tmp_path)
     with pytest.raises(SceneError, match="numbers other than whole ones from 0 to 65534"):
         scan_raster(cube_of(tmp_path / "cube.npy", offset=0.5), None)
 

@@ -16,7 +16,7 @@ from rich.console import Console
 from flows.publish.panels import save_png
 from flows.tradeoff import command
 from flows.tradeoff import entries as tradeoff_module
-from flows.tradeoff.command import print_tradeoff, run_tradeoff, tradeoff_figure
+from flows.tradeoff.command import print_tradeoff, tradeoff, tradeoff_figure
 from flows.tradeoff.entries import Figures, Point, Result, Tradeoff, mark_pareto, measure_tradeoff
 from pipeline.errors import ArchiveError, SettingsError
 from storage.archive.whole_files import to_json
@@ -197,9 +197,9 @@ def test_a_wrong_stage_or_folder_is_refused_before_anything_is_measured(tmp_path
     monkeypatch.setitem(command.TRADEOFFS, "series", replace(SERIES, prepare=lambda seed: pytest.fail("measured")))
     (tmp_path / "taken").write_text("")
     with pytest.raises(ArchiveError, match=r"cannot write to .*taken: .*; choose another --out"):
-        run_tradeoff("series", tmp_path / "taken", 1, 0, Console(quiet=True))
+        tradeoff("series", out=tmp_path / "taken")
     with pytest.raises(SettingsError, match="no trade-off for stage 'serie'; there are: rectify, segment, simulate"):
-        run_tradeoff("serie", tmp_path, 1, 0, Console(quiet=True))
+        tradeoff("serie", out=tmp_path)
 
 
 @pytest.mark.parametrize("errors", [(0.0, 0.1, 3.0), (0.0, 0.0), (math.inf, 0.5), (math.nan, math.nan)])
