@@ -23,17 +23,16 @@ def stated(
     *,
     source: Source = "",
     example: object = None,
-    why: str = "",
 ) -> Any:
     """Return a dataclass field with the complete description of a setting.
 
     ``default`` is ``dataclasses.MISSING`` for a required setting. A number is finite, unless its default is infinite.
     ``about`` is one line of help, ``ge`` and ``le`` the least and greatest allowed value [unit]. ``source`` says where
     the default comes from: only "measured" ones were measured on a unit. Help shows ``example`` if there is no default,
-    or if the default is written in another way. ``why`` is added to the message of a refusal.
+    or if the default is written in another way.
     """
     known = {"description": about, "ge": ge, "le": le}  # names of pydantic's Field
-    extra = {"unit": unit, "source": source, "example": example, "why": why}
+    extra = {"unit": unit, "source": source, "example": example}
     return field(default=default, metadata={**known, "json_schema_extra": extra})
 
 

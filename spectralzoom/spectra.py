@@ -14,7 +14,6 @@ import xarray
 from numpy.typing import NDArray
 from xarray.backends import BackendArray
 from xarray.core import indexing
-from xarray.core.indexing import IndexSelResult
 
 from storage.arrays.georeference import GRID_MAPPING
 from storage.arrays.layout import open_group
@@ -110,33 +109,14 @@ def _open(path: Path, dims: tuple[str, str, str], places: Sequence[str], restore
     return by_wavelength(with_plain_attributes(xarray.decode_cf(found, mask_and_scale=False)))["spectra"]
 
 
-class BandIndex(xarray.indexes.PandasIndex):
-    """An index that finds the nearest band in any order of bands, as of two overlapping spectrometers."""
-
-    def sel(self, labels: dict[Any, Any], method: str | None = None, tolerance: Any = None) -> IndexSelResult:
-        """Find bands as pandas does; with a method among the bands in ascending order, the first of equal ones."""
-        if method is None:
-            return super().sel(labels, method, tolerance)
-        ascending, place = np.unique(self.index.to_numpy(), return_index=True)
-        found = xarray.indexes.PandasIndex(ascending, self.dim).sel(labels, method, tolerance)
-        return IndexSelResult({self.dim: _renumbered(found.dim_indexers[self.dim], place)})
-
-
-def _renumbered(found: Any, place: NDArray[np.intp]) -> Any:
-    """Return the places of the found bands, in the type of ``found``."""
-    if isinstance(found, xarray.Variable | xarray.DataArray):
-        return found.copy(data=place[found.values])
-    return place[found]
-
-
 def by_wavelength(opened: xarray.Dataset) -> xarray.Dataset:
     """Index by ``band`` and ``wavelength``, as in ``.sel(wavelength=660, method="nearest")``.
 
-    Slices need monotonic wavelengths.
+    Slices and the nearest need ascending or descending wavelengths: ``.sortby("wavelength")`` gives them.
     """
     for name in OF_WAVELENGTHS:
         if name in opened.coords and opened[name].dims == ("band",):
-            opened = opened.drop_indexes(name, errors="ignore").set_xindex(name, BandIndex)
+            opened = opened.drop_indexes(name, errors="ignore").set_xindex(name)
     return opened
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
@@ -18,40 +18,30 @@ if TYPE_CHECKING:
 
     import flows.archive.plan_command as plan_command
     import flows.archive.reprocess_command as reprocess_command
+    import flows.cli.model_verbs as model_verbs
     import flows.evaluate.command as evaluate_command
-    import flows.evaluate.frames as evaluate_frames
     import flows.publish.survey_command as survey_command
     import flows.settings.load as settings_load
     import flows.terminal.processes as processes
     import flows.terminal.progress as terminal_progress
-    import flows.training.train as train_command
-    import flows.training.train_scenes as train_scenes
-    import models.training.train as models_training
     import spectralzoom.opened as opened
     from flows.settings.survey_settings import Settings
 else:
     threadpoolctl = deferred("threadpoolctl")
     plan_command = deferred("flows.archive.plan_command")
     reprocess_command = deferred("flows.archive.reprocess_command")
+    model_verbs = deferred("flows.cli.model_verbs")
     evaluate_command = deferred("flows.evaluate.command")
-    evaluate_frames = deferred("flows.evaluate.frames")
     survey_command = deferred("flows.publish.survey_command")
     settings_load = deferred("flows.settings.load")
     processes = deferred("flows.terminal.processes")
     terminal_progress = deferred("flows.terminal.progress")
-    train_command = deferred("flows.training.train")
-    train_scenes = deferred("flows.training.train_scenes")
-    models_training = deferred("models.training.train")
     opened = deferred("spectralzoom.opened")
 
 Asked = str | Path | Mapping[str, Any] | None  # a settings file, a table of settings, or keywords alone
 Told = Callable[[str, float, float], None]
 USUAL = {"engine": "plain"}  # a Prefect server starts only on request
-TOKENS = ("dim", "layers", "heads", "mlp_ratio")
-MADE_HERE = ("dataset", "choices", "tokens", "settings", "command", "camera")  # of requests
-FILES = ("weights",)
-LISTS = (*FILES, "fractions", "policies", "frames")
-OF_ONE_SCENE = ("labels", "bands", "wavelengths", "train_mask", "mask_classes")
+FILES = ("out", "init", "train_temporal", "fit_ood")
 
 
 def survey(settings: Asked = None, *, progress: Told | None = None, quiet: bool = True, **flags: Any) -> OpenedRun:
@@ -132,18 +122,12 @@ def evaluate(dataset: str | Path | OpenedRun, *, progress: Told | None = None, *
     """
     if isinstance(dataset, OpenedRun):
         return _judge(dataset, progress, **flags)
-    kind, asked = evaluate_frames.EvaluateRequest, {**flags}
-    choices = _taken(asked, OF_ONE_SCENE)
-    _check_known(asked, kind, "evaluate", also=[])
-    if "weights" not in asked:
+    if "weights" not in flags:
         raise SettingsError("evaluate needs weights=FILE to judge them on a data set, or a run to judge its map")
-    for name in LISTS:
-        if name in asked:
-            asked[name] = tuple(Path(one) if name in FILES else one for one in _several(asked[name]))
-    if asked.get("out") is not None:
-        asked["out"] = Path(asked["out"])
+    weights = flags.pop("weights")
+    files = tuple(map(Path, [weights] if isinstance(weights, str | Path) else weights))
+    request = _flags(model_verbs.EvaluateFlags, "evaluate", flags, weights=files).request(str(dataset))
     with _working(progress):
-        request = kind(str(dataset), **asked, choices=choices)
         content: dict[str, Any] = evaluate_command.evaluate_weights(
             request, lambda what, done, words: _tell(progress, what, done)
         )
@@ -173,21 +157,10 @@ def train(
     Error
         A value or a file is not valid.
     """
-    kind, how, asked = train_scenes.TrainRequest, models_training.TrainingSettings, {**flags}
-    command = f"spectralzoom.train({', '.join([repr(Path(dataset).name), *(f'{k}={v!r}' for k, v in asked.items())])})"
-    sizes, choices = _taken(asked, TOKENS), _taken(asked, OF_ONE_SCENE)
-    own = _taken(asked, [one.name for one in fields(how)])
-    own.setdefault("crop", train_command.usual_crop(str(dataset)))
-    if "hold_out" in asked:
-        asked["hold_out"] = tuple(_several(asked["hold_out"]))
-    if asked.get("init") is not None:
-        asked["init"] = Path(asked["init"])
-    _check_known(asked, kind, "train", also=[*(one.name for one in fields(how)), *TOKENS])
-    request = kind(
-        str(dataset), Path(out), **asked, tokens=sizes, choices=choices, settings=how(**own), command=command
-    )
+    words = [repr(Path(dataset).name), *(f"{name}={value!r}" for name, value in flags.items())]
+    asked = _flags(model_verbs.TrainFlags, "train", flags)
     with _working(progress, quiet=quiet) as console:
-        train_command.run_train(request, console)
+        model_verbs.run_training(str(dataset), Path(out), asked, f"spectralzoom.train({', '.join(words)})", console)
     return Path(out)
 
 
@@ -233,19 +206,14 @@ def _tell(progress: Told | None, what: str, done: float) -> None:
         progress(what, done, 1.0)
 
 
-def _several(value: Any) -> Sequence[Any]:
-    """Return a list of one value or of several."""
-    return [value] if isinstance(value, str | Path | float | int) else list(value)
-
-
-def _taken(flags: dict[str, Any], names: Sequence[str]) -> dict[str, Any]:
-    """Remove some keywords and return them."""
-    return {name: flags.pop(name) for name in names if name in flags}
-
-
-def _check_known(flags: Mapping[str, Any], kind: Any, verb: str, *, also: Sequence[str]) -> None:
-    """Raise SettingsError for a keyword that the verb does not have."""
-    own = [one.name for one in fields(kind) if one.name not in MADE_HERE]
-    for name in flags:
-        if name not in own:
-            raise SettingsError(f"{verb} has no {name!r}; it has {', '.join(sorted({*own, *also, *OF_ONE_SCENE}))}")
+def _flags(kind: type[Any], verb: str, given: Mapping[str, Any], **more: Any) -> Any:
+    """Return the flags of a verb from keywords, with lists as text. Raises SettingsError: an unknown keyword."""
+    known = [one.name for one in fields(kind)]
+    for name, value in given.items():
+        if name not in known:
+            raise SettingsError(f"{verb} has no {name!r}; it has {', '.join(sorted(known))}")
+        if isinstance(value, list | tuple):
+            more[name] = ",".join(map(str, value))
+        else:
+            more[name] = Path(value) if name in FILES and value is not None else value
+    return kind(**more)

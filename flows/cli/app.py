@@ -1,13 +1,12 @@
-"""Build the command line: its verbs, shared parameters, parsers of lists, and shell completion."""
+"""Build the command line: its verbs, shared parameters and parsers of lists."""
 
 from __future__ import annotations
 
 import ast
 import importlib.metadata
 import importlib.util
-import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import App, Parameter
 from rich.markup import escape
@@ -18,9 +17,9 @@ from pipeline.setting_fields import numbers_of
 
 VERBS = {  # verb: module of its function, loaded on demand
     "survey": "flows.cli.survey_verbs",
-    "simulate": "flows.cli.survey_verbs",
-    "rig check": "flows.cli.survey_verbs",
-    "rig emulate": "flows.cli.survey_verbs",
+    "simulate": "flows.cli.simulate_command",
+    "rig check": "flows.cli.rig_commands",
+    "rig emulate": "flows.cli.rig_commands",
     "plan": "flows.archive.plan_command",
     "ls": "flows.archive.commands",
     "explain": "flows.archive.commands",
@@ -29,15 +28,14 @@ VERBS = {  # verb: module of its function, loaded on demand
     "export": "flows.archive.export_command",
     "ingest": "flows.archive.ingest_command",
     "reprocess": "flows.archive.reprocess_command",
-    "serve": "flows.schedule.serve_command",
+    "serve": "flows.cli.serve_command",
     "report": "flows.archive.history",
     "init": "flows.training.init_command",
     "train": "flows.cli.model_verbs",
     "evaluate": "flows.cli.model_verbs",
-    "tradeoff": "flows.cli.model_verbs",
-    "completion": "flows.cli.app",
+    "tradeoff": "flows.tradeoff.command",
 }
-GOES_ON = ("survey", "train", "evaluate", "export", "reprocess", "simulate", "serve")  # verbs that resume
+GOES_ON = ("survey", "train", "export", "reprocess", "simulate", "serve")  # verbs that resume
 stderr = on_stderr()
 
 ArchiveName = Annotated[str, Parameter(help="The archive's folder, or s3://bucket/prefix.")]
@@ -65,6 +63,7 @@ def build_app(*, listed: bool) -> App:
         group, name = (rig if verb.startswith("rig ") else app), verb.split()[-1]
         summary = {"help": _summary(module, name)} if listed else {}  # replaces all of the verb's own help
         group.command(f"{module}:{name}", name=name, **summary)
+    app.register_install_completion_command(name="completion", add_to_startup=False)
     return app
 
 
@@ -93,7 +92,7 @@ def check_outside(out: Path, root: Path) -> Path:
 
 def split_list(text: str | None) -> tuple[str, ...]:
     """Return the parts of a list with commas."""
-    return tuple(part.strip() for part in text.split(",") if part.strip()) if text else ()
+    return tuple(part.strip() for part in str(text).split(",") if part.strip()) if text else ()
 
 
 def parse_numbers(text: str | None, flag: str) -> list[float] | None:
@@ -110,17 +109,3 @@ def parse_wholes(text: str | None, flag: str) -> list[int] | None:
         return None if text is None else [int(str(one)) for part in split_list(text) for one in numbers_of(part)]
     except ValueError:
         raise SettingsError(f"{flag} expects whole numbers with commas, got {text!r}") from None
-
-
-def completion(shell: Literal["bash", "zsh", "fish"]) -> int:
-    """Print a completion script for SHELL.
-
-    For bash: spectralzoom completion bash > ~/.local/share/bash-completion/completions/spectralzoom
-
-    Parameters
-    ----------
-    shell
-        bash, zsh (save as _spectralzoom in a folder of fpath) or fish (save in ~/.config/fish/completions).
-    """
-    sys.stdout.write(build_app(listed=False).generate_completion(prog_name="spectralzoom", shell=shell))
-    return 0

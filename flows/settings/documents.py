@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import textwrap
 from collections.abc import Iterator
@@ -31,12 +32,16 @@ def about(one: Declared, *, choices: bool = True) -> str:
 def toml_value(one: Declared) -> str:
     """Return the default of a setting, or an example value, as TOML."""
     default, example = one.item.default, one.about["example"]
-    value = default if example is None else example
+    return as_toml(default if example is None else example)
+
+
+def as_toml(value: object) -> str:
+    """Return a value as TOML."""
     if isinstance(value, bool):
         return str(value).lower()
-    if isinstance(value, tuple):
-        return f"[{', '.join(map(str, value))}]"
-    return f'"{value}"' if isinstance(value, str) else str(value)
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return f"[{', '.join(map(as_toml, value))}]" if isinstance(value, tuple) else str(value)
 
 
 def example_toml() -> str:

@@ -35,9 +35,8 @@ from flows.settings.survey_settings import (
     Settings,
     source_of,
 )
-from flows.settings.values import EXTENT_PART, EXTENT_WHOLE, parse_moment, parse_text, to_whole
+from flows.settings.values import EXTENT_PART, EXTENT_WHOLE, parse_moment, parse_text
 from pipeline.errors import BudgetError, PoseError, SettingsError
-from pipeline.rig.device_settings import MOST_PAIRS
 from pipeline.setting_fields import format_number, span_of
 from pipeline.simulator.scenes.built_in import SCOUTING_NAMES
 from storage.archive.staging import read_toml
@@ -90,25 +89,12 @@ class Declared:
         kind: Any = Annotated[self.kind, PlainValidator(parse_text) if self.kind is str else Field(**known)]
         return TypeAdapter(kind)
 
-    def _from_text(self, text: str) -> object:
-        """Return the number or switch that a text stands for; any other text as it is."""
-        if self.kind is int:
-            return to_whole(text)
-        if self.kind is bool:
-            return {"true": True, "false": False}.get(text.lower(), text)
-        try:
-            return float(text) if self.kind is float else text
-        except ValueError:
-            return text
-
     def read(self, value: object, place: str) -> object:
         """Return the value, from text or TOML. Raises SettingsError, BudgetError: ``place`` has no such value."""
         if self.kind is str and value == self.item.default == "":
             return value
         try:
-            return self._adapter.validate_python(
-                self._from_text(value) if isinstance(value, str) else value, strict=True
-            )
+            return self._adapter.validate_python(value, strict=not isinstance(value, str))  # text may be a number
         except ValidationError as error:
             cause = error.errors()[0].get("ctx", {}).get("error")
         if isinstance(cause, ValueError):  # of its own parser
@@ -194,13 +180,11 @@ def load_settings(
         if isinstance(inner, Mapping):
             table[name] = {**recorded.pop(name, {}), **inner}
     requested = {**(usual or {}), **recorded, **table}
-    for wrong in (
-        *_camera_of_a_map(requested, origin),
-        *_contradictions(stated, origin, zooms=requested.get("zoom") == ALWAYS),
-    ):
+    for wrong in _contradictions(stated, origin, zooms=requested.get("zoom") == ALWAYS):
         raise SettingsError(wrong)
     passes = any(
-        name in stated and not _is_usual(table[name], SURVEY[name], origin.get(name)) for name in OF_TWO_PASSES
+        name in stated and (origin.get(name) == "flag" or table[name] != SURVEY[name].item.default)
+        for name in OF_TWO_PASSES
     )
     passes |= requested.get("zoom") == ALWAYS and requested.get("seconds") is None
     if passes and not _is_map(requested) and not any(requested.get(name) is not None for name in (*UNIFORM, "budget")):
@@ -241,36 +225,9 @@ def _may_choose_a_part(requested: Mapping[str, object]) -> bool:
     )
 
 
-def _is_usual(value: object, declared: Declared | None, origin: str | None) -> bool:
-    """Return whether a file, and no flag, states the default."""
-    return declared is not None and origin != "flag" and declared.read(value, "") == declared.item.default
-
-
-def _scene_of(table: Mapping[str, object]) -> str:
-    return str(table.get("scene") or SURVEY["scene"].item.default)
-
-
 def _is_map(table: Mapping[str, object]) -> bool:
-    return (table.get("source") or source_of(_scene_of(table))) == RASTER
-
-
-def _camera_of_a_map(table: Mapping[str, object], origin: Mapping[str, str]) -> Iterator[str]:
-    """Yield errors: settings of a camera for a raster. Defaults that a file states are allowed."""
-    scene = _scene_of(table)
-    if not _is_map(table):
-        return
-    view = OF_A_VIEW if table.get("pose") is not None else ()
-    for name in OF_A_CAMERA:
-        value = table.get(name)
-        items = value if name in TABLES and isinstance(value, Mapping) else {name: value}
-        declared, head = (TABLES[name], f"{name}.") if name in TABLES else (SURVEY, "")
-        for key, one in items.items():
-            full = key if key == name else head + key
-            if one is not None and full not in view and not _is_usual(one, declared.get(key), origin.get(full)):
-                yield (
-                    f"{place_of(full, origin.get(full))} is of a camera, and the scene {scene} is a raster that no "
-                    "camera captures: leave it out, or give --source sim for a simulated capture of the file"
-                )
+    scene = table.get("scene") or SURVEY["scene"].item.default
+    return (table.get("source") or source_of(str(scene))) == RASTER
 
 
 def parse_settings(table: Mapping[str, object], origin: Mapping[str, str] | None = None) -> Settings:
@@ -284,7 +241,7 @@ def parse_settings(table: Mapping[str, object], origin: Mapping[str, str] | None
     def at(name: str) -> str:
         return place_of(name, origin.get(name))
 
-    for check in (_scene_errors, _rig_errors, _recorded_errors, _extent_errors, _limit_errors):
+    for check in (_camera_errors, _scene_errors, _recorded_errors, _extent_errors, _limit_errors):
         for error in check(settings, at):
             raise SettingsError(error)
     return settings
@@ -371,6 +328,24 @@ def _contradictions(stated: set[str], origin: Mapping[str, str], *, zooms: bool)
         yield f"{by_hand[0]} is for a uniform scan: give --scan-step too (1 for every line), or --coarse-exposure-ms"
 
 
+def _camera_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]:
+    """Yield errors: settings of a camera for a raster. The IFOV is that of its [pose]."""
+    usual, changed = Settings(), list[str]()
+    for name in OF_A_CAMERA:
+        own, other = getattr(settings, name), getattr(usual, name)
+        if name in TABLES:
+            changed += [f"{name}.{key}" for key in TABLES[name] if getattr(own, key) != getattr(other, key)]
+        elif own != other:
+            changed.append(name)
+    view = () if settings.pose is None else OF_A_VIEW
+    for name in changed if settings.is_map else ():
+        if name not in view:
+            yield (
+                f"{at(name)} is of a camera, and the scene {settings.scene} is a raster that no camera captures: leave "
+                "it out, or give --source sim for a simulated capture of the file"
+            )
+
+
 def _scene_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]:
     """Yield errors: settings that the scene cannot have."""
     scene, bands, wavelengths = settings.scene, settings.bands, settings.wavelengths
@@ -391,29 +366,14 @@ def _scene_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]
             yield f"{at(name)} = {value:g} is for built-in scenes, whose crops grow; {scene} has fixed ones"
     if settings.interest is not None and scene not in SCOUTING_NAMES:
         yield (f"{at('interest')} = {settings.interest:g} is for the scene scouting, and the scene is {scene}")
-    if settings.zones.plots_name is not None and settings.zones.plots is None:
-        yield f"{at('zones.plots_name')} = {settings.zones.plots_name!r} names plots: give --plots FILE too"
     if settings.pose is None and settings.map != MapChoice():
         yield "[map] needs to know where the rig stands: give [pose]"
-
-
-def _rig_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]:
-    """Yield errors: parts of the rig that contradict each other."""
-    air, camera = settings.air, settings.camera
+    camera = settings.camera
     if camera.dark_dn >= camera.full_scale_dn:
         yield (
             f"camera.dark_dn = {camera.dark_dn:g} leaves no room below the {camera.full_scale_dn} DN of {camera.bits} "
             "bits; use a smaller dark level"
         )
-    for name in ("nearest_m", "farthest_m"):
-        if getattr(air, name) is not None and air.distance_m is None:
-            yield f"air.{name} = {getattr(air, name):g} needs air.distance_m, the distance of the scene's middle"
-    distances = settings.simulated_rig.distances_m
-    if distances is not None and distances[0] > distances[1]:
-        yield f"air.nearest_m = {distances[0]:g} lies beyond air.farthest_m = {distances[1]:g}"
-    pairs = settings.cost.vector_pairs
-    if settings.source == RIG and not 2 <= pairs <= MOST_PAIRS:
-        yield f"cost.vector_pairs = {pairs}: the mirror's vector memory takes 2 to {MOST_PAIRS} pairs; give its size"
 
 
 def _recorded_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]:

@@ -20,13 +20,11 @@ from flows.settings.values import (
     Bytes,
     Compute,
     Effects,
-    ExpectedError,
     Extent,
     Goal,
     Keep,
     Memory,
     Name,
-    Refresh,
     Scheduler,
     Size,
     Tolerance,
@@ -152,17 +150,21 @@ class Settings:
         "Extent of a uniform scan: whole; part (lines of the highest expected gain; needs --seconds and a prior map;"
         " default for a revisit with --seconds); or lines as SWEEP:FIRST-STOP, such as 0:12-310,1:0-40",
     )
-    max_age: Refresh | None = stated(
+    max_age: float | None = stated(
         None,
-        "With --extent part: maximum age of any place in the prior map, such as 14d or 36h; older places are captured"
-        " first",
+        "With --extent part: maximum age of any place in the prior map; older places are captured first",
         "d",
-        example="14d",
+        0.04,
+        3660,
+        example=14.0,
     )
-    skip_below_error: ExpectedError | None = stated(
+    skip_below_error: float | None = stated(
         None,
         "With --extent part: skip the visit if the prior map's expected error is lower and no place exceeds --max-age",
-        example="2%",
+        "",
+        0.001,
+        0.5,
+        example=0.02,
     )
     scene: str = stated(
         "farm",

@@ -30,7 +30,6 @@ EXTENT_WHOLE, EXTENT_PART = "whole", "part"
 KEEP_SIGNAL, KEEP_RAW = "signal", "raw"
 UNKNOWN_AUTO, UNKNOWN_OFF = "auto", "off"
 LEAST_UNKNOWN, MOST_UNKNOWN = 0.05, 5.0  # percent
-LEAST_EXPECTED_ERROR, MOST_EXPECTED_ERROR = 0.001, 0.5
 _DAYS = {"h": 1 / 24, "d": 1.0, "w": 7.0}  # by unit
 _BYTES = TypeAdapter(ByteSize)
 _DATE = re.compile(r"\d{1,4}([./-])\d{1,2}\1\d{1,4}")
@@ -237,14 +236,6 @@ def format_extent(runs: Iterable[LineRun]) -> str:
     return ",".join(f"{sweep}:{first}-{stop}" for sweep, first, stop in runs)
 
 
-def parse_refresh(value: object) -> float:
-    """Return an age [days], from a number of days or text such as 14d, 36h or 2w."""
-    days = _amount(value, {**_DAYS, "": 1.0})
-    if days is None or not LEAST_DAYS <= days <= MOST_DAYS:
-        raise ValueError(f"must be a time of 1h to {MOST_DAYS:g}d, such as 14d, 36h or 2w; got {value!r}")
-    return days
-
-
 def parse_keep(value: object) -> str:
     """Return ``signal``, ``raw``, or ``raw`` with an age such as raw 7d."""
     word, _, age = str(value).strip().lower().partition(" ")
@@ -276,17 +267,6 @@ def parse_unknown(value: object) -> str:
             f" {value!r}"
         )
     return f"{percent:g}%"
-
-
-def parse_expected_error(value: object) -> float:
-    """Return an expected error, 0..1, from a number or text such as 2%."""
-    fraction = _amount(value, {"%": 0.01, "": 1.0})
-    if fraction is None or not LEAST_EXPECTED_ERROR <= fraction <= MOST_EXPECTED_ERROR:
-        raise ValueError(
-            f"must be an expected error of {LEAST_EXPECTED_ERROR:.1%} to {MOST_EXPECTED_ERROR:.0%}, such as 2%; got"
-            f" {value!r}"
-        )
-    return fraction
 
 
 def _items(value: object) -> list[object]:
@@ -335,7 +315,5 @@ Size = Annotated[tuple[int, int], PlainValidator(parse_size)]
 Effects = Annotated[str, PlainValidator(parse_effects)]
 Bands = Annotated[tuple[int, ...], PlainValidator(parse_bands)]
 Extent = Annotated[str, PlainValidator(parse_extent)]
-Refresh = Annotated[float, PlainValidator(parse_refresh)]
 Keep = Annotated[str, PlainValidator(parse_keep)]
-ExpectedError = Annotated[float, PlainValidator(parse_expected_error)]
 Wavelengths = Annotated[tuple[float, ...], PlainValidator(parse_wavelengths)]

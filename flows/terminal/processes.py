@@ -9,7 +9,6 @@ import pwd
 import resource
 import shutil
 import signal
-import stat
 import tempfile
 import threading
 from collections.abc import Iterator, Mapping, MutableMapping
@@ -91,11 +90,10 @@ OF_LIBRARIES = {  # which need more than XDG_CACHE_HOME
 
 
 def place_caches(environment: MutableMapping[str, str] | None = None) -> Path | None:
-    """Set environment variables to a private cache folder where the usual one cannot be written; return it or None.
+    """Set environment variables to a temporary cache folder where the usual one cannot be written; return it or None.
 
-    The usual one is XDG_CACHE_HOME or ~/.cache, the private one `spectralzoom-UID` in the temporary folder. If another
-    user can write that, a new one is made for this process, since its content is run as code. ``environment`` is
-    this process's own by default. Raises SettingsError: the temporary folder cannot be written either.
+    The usual one is XDG_CACHE_HOME or ~/.cache; the temporary one ends with the process. ``environment`` is this
+    process's own by default. Raises SettingsError: no temporary folder can be written either.
     """
     environment = os.environ if environment is None else environment
     try:
@@ -110,7 +108,14 @@ def place_caches(environment: MutableMapping[str, str] | None = None) -> Path | 
             usual.mkdir(mode=0o700, parents=True, exist_ok=True)
             if os.access(usual, os.W_OK | os.X_OK):
                 return None
-    folder = _private_folder(usual)
+    try:
+        folder = Path(tempfile.mkdtemp(prefix="spectralzoom-"))
+    except OSError as error:
+        raise SettingsError(
+            f"no folder for the caches of libraries: neither {usual or 'a home'} nor a temporary folder can be written "
+            f"({error}); set XDG_CACHE_HOME to a folder that this user can write"
+        ) from None
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     environment["XDG_CACHE_HOME"] = str(folder)
     for name, part in OF_LIBRARIES.items():
         environment.setdefault(name, str(folder / part))
@@ -120,9 +125,8 @@ def place_caches(environment: MutableMapping[str, str] | None = None) -> Path | 
 def place_pages(environment: Mapping[str, str] | None = None) -> dict[str, str]:
     """Return variables that let Prefect's server unpack its pages in the cache folder, if its own is read-only."""
     found = importlib.util.find_spec("prefect")
-    places = [] if found is None else [Path(place) / "server" for place in found.submodule_search_locations or ()]
     folder = _usual_folder(os.environ if environment is None else environment)
-    if folder is None or all(os.access(place, os.W_OK | os.X_OK) for place in places):
+    if folder is None or os.access(Path(str(found and found.origin)).parent / "server", os.W_OK | os.X_OK):
         return {}
     return {"PREFECT_SERVER_UI_STATIC_DIRECTORY": str(folder / "spectralzoom" / "prefect-pages")}
 
@@ -134,21 +138,3 @@ def _usual_folder(environment: Mapping[str, str]) -> Path | None:
         return named
     home = Path(environment.get("HOME") or pwd.getpwuid(os.getuid()).pw_dir)
     return home / ".cache" if home.is_absolute() and home.is_dir() else None
-
-
-def _private_folder(usual: Path | None) -> Path:
-    try:
-        folder = Path(tempfile.gettempdir()) / f"spectralzoom-{os.geteuid()}"
-        with suppress(FileExistsError):
-            folder.mkdir(mode=0o700)
-        found = folder.lstat()  # must be a folder, no link, that only this user may enter
-        if stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid() and not found.st_mode & 0o077:
-            return folder
-        other = Path(tempfile.mkdtemp(prefix="spectralzoom-"))
-    except OSError as error:
-        raise SettingsError(
-            f"no folder for the caches of libraries: neither {usual or 'a home'} nor a temporary folder can be written "
-            f"({error}); set XDG_CACHE_HOME to a folder that this user can write"
-        ) from None
-    atexit.register(shutil.rmtree, other, ignore_errors=True)
-    return other

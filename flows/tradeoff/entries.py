@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 from models.network.machine import one_thread
-from pipeline.errors import SettingsError
 
 Setting = str | float
 
@@ -85,6 +84,15 @@ def mean_load() -> float:
 
 
 @dataclass(frozen=True)
+class Figures:
+    """Error of a setting, its cost where that is not processor time, and further figures by name."""
+
+    error: float
+    cost: float | None = None
+    beside: Mapping[str, float] = field(default_factory=dict, hash=False)
+
+
+@dataclass(frozen=True)
 class Tradeoff:
     """Define the measurement of one stage. Only ``run`` is timed.
 
@@ -94,20 +102,15 @@ class Tradeoff:
     stage: str
     knob: str
     error: str  # with its unit
-    unit: str  # of work, such as px*band: times are given per unit
     reference: str  # that the error is measured against
     settings: tuple[Setting, ...]  # ratios are to the first one
     prepare: Callable[[int], Any]
     run: Callable[[Any, Setting], Any]
-    judge: Callable[[Any, Setting, Any], float]
-    work: Callable[[Any], float]  # units of one run
-    modelled_s: Callable[[Any, Setting, Any], float] | None = None  # price, where this machine does not spend the time
-    level: Callable[[Any], tuple[str, float]] | None = None  # name and size of an error that other errors hide
-    beside: Mapping[str, Callable[[Any, Setting, Any], float]] = field(default_factory=dict, hash=False)
-    paid: str | None = None  # figure of ``beside`` that is the price in place of time
+    judge: Callable[[Any, Setting, Any], Figures]
+    cost: str = "processor time [s]"
+    level: tuple[str, float] | None = None  # name and size of an error that other errors hide
+    default: Setting | None = None  # setting of a survey by its defaults
     repeats: int = 5  # by default
-    settings_of: Callable[[Any], tuple[Setting, ...]] | None = None  # settings that depend on the state
-    default: Callable[[Any], Setting | None] = lambda state: None  # setting of a survey by its defaults
 
 
 @dataclass(frozen=True)
@@ -116,18 +119,11 @@ class Point:
 
     setting: Setting
     error: float
-    price_s: float  # by the model where the stage has one, else the least processor time
-    wall_min_s: float
-    ns_per_unit: float
+    cost: float  # by ``judge``, else the least processor time [s]
+    time_s: float  # least processor time
     ratio: float  # of the cost to the first setting's; of processor time the median over the rounds
     pareto: bool = False
     beside: Mapping[str, float] = field(default_factory=dict, hash=False)
-    paid: float | None = None  # replaces ``price_s``
-
-    @property
-    def cost(self) -> float:
-        """Return the figure that settings are compared by, beside their error."""
-        return self.price_s if self.paid is None else self.paid
 
 
 @dataclass(frozen=True)
@@ -137,50 +133,45 @@ class Result:
     stage: str
     knob: str
     error: str
-    unit: str
+    cost: str
     reference: str
     repeats: int
     seed: int
     machine: Mapping[str, object]
     points: tuple[Point, ...]
-    modelled: bool
     level: tuple[str, float] | None = None
-    paid: str | None = None  # None: time
     default: Setting | None = None
 
 
 def measure_tradeoff(tradeoff: Tradeoff, *, repeats: int | None = None, seed: int = 0) -> Result:
     """Judge every setting by one run, then time ``repeats`` runs of each in turn, on one thread."""
     repeats = tradeoff.repeats if repeats is None else repeats
-    if repeats < 1:
-        raise SettingsError(f"repeats must be at least 1, got {repeats}")
-    state = tradeoff.prepare(seed)
-    settings = tradeoff.settings if tradeoff.settings_of is None else tradeoff.settings_of(state)
+    state, settings = tradeoff.prepare(seed), tradeoff.settings
     with one_thread():
         load_before = mean_load()
-        made = {one: tradeoff.run(state, one) for one in settings}
-        errors = {one: float(tradeoff.judge(state, one, out)) for one, out in made.items()}
+        figures = {one: tradeoff.judge(state, one, tradeoff.run(state, one)) for one in settings}
         clocks = time_in_turn({one: partial(tradeoff.run, state, one) for one in settings}, repeats)
         machine = describe_machine(threads=1) | {"load_before": load_before, "load_after": mean_load()}
     points = list[Point]()
-    for one, out in made.items():
-        price_s, relative = clocks[one].cpu_min_s, ratio(clocks, one, settings[0])
-        beside = {name: float(figure(state, one, out)) for name, figure in tradeoff.beside.items()}
-        paid = None if tradeoff.paid is None else beside[tradeoff.paid]
-        if tradeoff.modelled_s is not None:
-            price_s = tradeoff.modelled_s(state, one, out)
-        if paid is not None or tradeoff.modelled_s is not None:
-            cost = price_s if paid is None else paid
+    for one, judged in figures.items():
+        time_s, cost, relative = clocks[one].cpu_min_s, judged.cost, ratio(clocks, one, settings[0])
+        if cost is not None:
             relative = cost / (points[0].cost if points else cost)
-        ns = 1e9 * price_s / tradeoff.work(state)
-        points.append(Point(one, errors[one], price_s, clocks[one].wall_min_s, ns, relative, beside=beside, paid=paid))
+        points.append(
+            Point(one, judged.error, time_s if cost is None else cost, time_s, relative, beside=judged.beside)
+        )
     return Result(
-        *(tradeoff.stage, tradeoff.knob, tradeoff.error, tradeoff.unit, tradeoff.reference, repeats, seed, machine),
-        points=mark_pareto(points),
-        modelled=tradeoff.modelled_s is not None,
-        level=None if tradeoff.level is None else tradeoff.level(state),
-        paid=tradeoff.paid,
-        default=tradeoff.default(state),
+        tradeoff.stage,
+        tradeoff.knob,
+        tradeoff.error,
+        tradeoff.cost,
+        tradeoff.reference,
+        repeats,
+        seed,
+        machine,
+        mark_pareto(points),
+        tradeoff.level,
+        tradeoff.default,
     )
 
 

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -19,8 +20,7 @@ from flows.settings.survey_settings import RASTER, Settings
 from flows.tasks.patch_budget import PatchBudget, ReadingCosts
 from flows.tasks.run import SurveyRun, open_run
 from flows.tasks.stages.accuracy import columns_of_all_patches, columns_of_raster
-from flows.tasks.survey_model import shipped_weights
-from flows.tradeoff.entries import Setting, Tradeoff
+from flows.tradeoff.entries import Figures, Setting, Tradeoff
 from flows.tradeoff.store import STORE
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.machine import keep_freed_memory
@@ -28,7 +28,7 @@ from models.network.sizes import multiply_adds
 from models.network.spectral import LineSpec
 from models.policies.policies import score_patches
 from models.reading.inference import CoarsePrediction, DrawnMap, coarse_prediction_of_patches, segment
-from models.weights.files import Weights, load_weights
+from models.weights.files import Weights
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
@@ -105,28 +105,25 @@ def scatter_points(seed: int) -> Scattered:
     return Scattered(samples, coordinates, waves.at(coordinates))
 
 
-def noise_level(camera: LineCamera) -> tuple[str, float]:
+def noise_level(camera: LineCamera) -> float:
     """Return a tenth of the noise over the scene's standard deviation."""
     electrons = camera.full_scale_e / 2
-    noise = float(np.sqrt(electrons + camera.read_noise_e**2))
-    return "0.1 σ of noise", 0.1 * noise / (CONTRAST * electrons)  # noqa: RUF001
+    return 0.1 * math.sqrt(electrons + camera.read_noise_e**2) / (CONTRAST * electrons)
 
 
 RECTIFY = Tradeoff(
     stage="rectify",
     knob="resampling",
     error="rmse / standard deviation",
-    unit="px*band",
     reference=f"waves of {PERIODS_PX[0]:g} to {PERIODS_PX[1]:g} px, evaluated at the output pixels",
     settings=("nearest", "bilinear", "catmull-rom"),
-    default=lambda _state: Settings().resampling,
+    default=Settings().resampling,
     prepare=scatter_points,
     run=lambda state, kernel: resample(
         state.samples, np.ones(state.samples.shape[:2], bool), state.coordinates, cast("Kernel", kernel)
     )[0],
-    judge=lambda state, _kernel, out: float(np.sqrt(np.mean((out - state.truth) ** 2)) / np.std(state.truth)),
-    work=lambda state: float(state.truth.size),
-    level=lambda _state: noise_level(LineCamera()),
+    judge=lambda state, _kernel, out: Figures(float(np.sqrt(np.mean((out - state.truth) ** 2)) / np.std(state.truth))),
+    level=("0.1 σ of noise", noise_level(LineCamera())),  # noqa: RUF001
 )
 
 
@@ -150,10 +147,11 @@ class FarmLines:
     exact: Values  # (line, sample, band) [e-], with the dark signal
     noise: Values  # one sigma at each
 
-    def greatest_change(self, setting: Setting, made: tuple[Values, Any]) -> float:
-        """Return the greatest change against all effects at their exact variants, in sigmas of the sample's noise."""
+    def judge(self, setting: Setting, made: tuple[Values, Any]) -> Figures:
+        """Return the greatest change against all exact effects, in sigmas of the sample's noise, and its bound."""
         shown = made[0] + _dark(self.blocks[0], self.decisions[setting].chosen)
-        return float(np.abs((shown - self.exact) / self.noise).max())
+        change = float(np.abs((shown - self.exact) / self.noise).max())
+        return Figures(change, beside={"bound [σ]": self.decisions[setting].error})  # noqa: RUF001
 
 
 def _simulate(
@@ -187,22 +185,19 @@ SIMULATE = Tradeoff(
     stage="simulate",
     knob="tolerance",
     error="greatest change of a sample [σ of its noise]",  # noqa: RUF001
-    unit="px*band",
     reference="all effects of the rig, exact; mean over the noise",
     settings=(EXACT, *TOLERANCES),
-    default=lambda _state: Settings().tol.value,
+    default=Settings().tol.value,
     prepare=decide_for_lines,
     run=lambda state, setting: _simulate(state.scene, state.blocks, state.decisions[setting].chosen),
-    judge=FarmLines.greatest_change,
-    work=lambda state: float(state.exact.size),
-    level=lambda _state: ("0.1 σ of noise", 0.1),  # noqa: RUF001
-    beside={"bound [σ]": lambda state, setting, _made: state.decisions[setting].error},  # noqa: RUF001
+    judge=FarmLines.judge,
+    level=("0.1 σ of noise", 0.1),  # noqa: RUF001
 )
 
 
 # survey: uniform scans and parts of one, by the camera's seconds
 
-SURVEY_SHAPE = (384, 512)
+FARM_SHAPE = (384, 512)
 SCANS = {format_scan(step, ms): (step, ms) for step in (1, 2, 4) for ms in (100.0, 50.0, 25.0, 12.0, 6.0)}
 PART_OF = (1, 25.0)  # step and exposure [ms] of the scan of which parts are read in full
 PARTS = {f"{format_scan(*PART_OF)}, {fraction} of multiply-adds": fraction for fraction in ("50%", "35%", "25%")}
@@ -217,7 +212,7 @@ class PlannedPass:
     patch_index: NDArray[np.intp]
     columns: Values  # (patch, p, p, column)
     weights: Weights
-    seconds: float = 0.0
+    seconds: float | None = None
     bytes_raw: int = 0
 
 
@@ -228,21 +223,20 @@ class PlannedField:
     labels: NDArray[np.uint8]
     bands: int
     passes: Mapping[Setting, PlannedPass]
-    default: Setting | None = None  # the plan of a survey by its defaults
 
     def read(self, plan: Setting) -> DrawnMap:
         """Return the class map of a plan."""
         one = self.passes[plan]
         return segment(one.weights, one.coarse, one.columns, one.patch_index)
 
-    def miss(self, plan: Setting, drawn: DrawnMap) -> float:
-        """Return 1 - mIoU of a map."""
-        return 1 - mean_iou(confusion(self.labels, drawn.classes, self.passes[plan].weights.config.classes))
-
-    def billion_multiply_adds(self, plan: Setting, _drawn: DrawnMap) -> float:
-        """Return the multiply-adds of the network for a plan, in billions."""
+    def judge(self, plan: Setting, drawn: DrawnMap) -> Figures:
+        """Return 1 - mIoU of a map, the seconds of its scan, and the multiply-adds of the network."""
         one = self.passes[plan]
-        return multiply_adds(one.weights.config, one.coarse.grid, len(one.patch_index), self.bands).total / 1e9
+        config = one.weights.config
+        macs = multiply_adds(config, one.coarse.grid, len(one.patch_index), self.bands).total
+        raw = {} if one.seconds is None else {"MB raw": one.bytes_raw / 1e6}
+        error = 1 - mean_iou(confusion(self.labels, drawn.classes, config.classes))
+        return Figures(error, one.seconds, {**raw, "billion multiply-adds": macs / 1e9})
 
 
 def uniform_pass(
@@ -261,7 +255,7 @@ def open_field(seed: int, scene: str | None, weights: Path | None, source: str) 
 
     Raises SceneError: it has no labels; else as `flows.tasks.run.open_run`.
     """
-    farm = {"scene": "farm", "size": "{1}x{0}".format(*SURVEY_SHAPE)}
+    farm = {"scene": "farm", "size": "{1}x{0}".format(*FARM_SHAPE)}
     asked = {**(farm if scene is None else {"scene": scene}), "source": source, "seed": seed, "weights": weights}
     settings = load_settings(None, {name: str(one) for name, one in asked.items() if one is not None})
     with tempfile.TemporaryDirectory(prefix="spectralzoom-tradeoff-") as empty:
@@ -271,23 +265,14 @@ def open_field(seed: int, scene: str | None, weights: Path | None, source: str) 
     return run
 
 
-def default_plan(run: SurveyRun) -> tuple[str, tuple[int, float] | None]:
-    """Return the name of the plan of a survey by its defaults, and its step and exposure [ms] if it is one scan."""
-    if not run.plan.plain:
-        return "every 4th line, then lines between", None
-    scan = run.settings.scan_step or 1, run.settings.scan_exposure_ms or run.camera.exposure_ms
-    return format_scan(*scan), scan
-
-
 def plan_every_way(seed: int, scene: str | None = None, weights: Path | None = None) -> PlannedField:
     """Scan a farm or another scene by every uniform scan, and read parts of one of them."""
     run = open_field(seed, scene, weights, "sim")
     camera, cost, source, bands = run.camera, run.settings.cost, run.simulated, len(run.scene.wavelength_nm)
     grid = SceneGrid(*run.scene.shape, run.described.config.patch, 1)
     along, _, _ = cheapest_full(grid, camera, cost)
-    default, chosen = default_plan(run)
     passes: dict[Setting, PlannedPass] = {}
-    for words, (step, exposure_ms) in (SCANS | ({} if chosen is None else {default: chosen})).items():
+    for words, (step, exposure_ms) in SCANS.items():
         sweeps = uniform_sweeps(grid, camera, along, step=step, exposure_ms=exposure_ms)
         scan = LineSpec(exposure_ms / DEFAULT_EXPOSURE_MS, step)
         passes[words] = uniform_pass(run.weights, source, sweeps, grid, cost, scan)
@@ -298,77 +283,58 @@ def plan_every_way(seed: int, scene: str | None = None, weights: Path | None = N
         columns = whole.columns[np.searchsorted(whole.patch_index, kept)]
         passes[words] = replace(whole, patch_index=kept, columns=columns)
     assert run.labels is not None
-    return PlannedField(run.labels, bands, passes, default)
+    return PlannedField(run.labels, bands, passes)
 
 
 SURVEY = Tradeoff(
     stage="survey",
     knob="plan",
     error="1 - mIoU",
-    unit="scene px",
-    reference=f"labels of a farm of {SURVEY_SHAPE[1]} x {SURVEY_SHAPE[0]} px; parts by expected gain",
-    settings=(),
-    settings_of=lambda field: tuple(field.passes),
-    default=lambda field: field.default,
+    reference=f"labels of a farm of {FARM_SHAPE[1]} x {FARM_SHAPE[0]} px; parts by expected gain",
+    cost="seconds by the cost model",
+    settings=(*SCANS, *PARTS),
     prepare=plan_every_way,
     run=PlannedField.read,
-    judge=PlannedField.miss,
-    work=lambda field: float(field.labels.size),
-    modelled_s=lambda field, plan, _drawn: field.passes[plan].seconds,
-    beside={
-        "MB raw": lambda field, plan, _drawn: field.passes[plan].bytes_raw / 1e6,
-        "billion multiply-adds": PlannedField.billion_multiply_adds,
-    },
+    judge=PlannedField.judge,
 )
 
 
 # segment: fractions of the patches read in full
 
-FARM_SHAPE = (384, 480)
 FRACTIONS = (1.0, 0.35, 0.2, 0.15, 0.1, 0.05, 0.0)
 
 
-def plan_every_fraction(seed: int) -> PlannedField:
-    """Scan a farm by every line, and choose every fraction of its patches by expected gain."""
-    weights, camera = load_weights(shipped_weights()), LineCamera()
-    grid = SceneGrid(*FARM_SHAPE, weights.config.patch, 1)
-    _, full, _ = cheapest_full(grid, camera, CostModel())
-    source = SimulatedSource(farm_scene(seed, FARM_SHAPE), Rig(camera), seed)
-    columns = columns_of_all_patches(source, list(full), grid, weights, memory=MEMORY, resampling="catmull-rom")
-    passes = _fractions_of(weights, columns, grid)
-    return PlannedField(np.asarray(source.scene.labels, np.uint8), len(source.wavelength_nm), passes)
-
-
-def fractions_of_raster(scene: str, weights: Path) -> PlannedField:
-    """Take a raster as it is, and choose every fraction of its patches, as `survey --macs` does."""
-    run = open_field(0, scene, weights, RASTER)
-    assert run.raster is not None
-    assert run.labels is not None
-    columns = columns_of_raster(run.raster, run.weights, run.scene.wavelength_nm, memory=run.settings.memory)
-    passes = _fractions_of(run.weights, columns, run.grid)
-    return PlannedField(run.labels, len(run.scene.wavelength_nm), passes, default=FRACTIONS[0])
-
-
-def _fractions_of(weights: Weights, columns: Values, grid: SceneGrid) -> dict[Setting, PlannedPass]:
-    """Choose every fraction of the patches by expected gain; ``columns`` are of all patches of the padded grid."""
+def plan_every_fraction(seed: int, scene: str | None = None, weights: Path | None = None) -> PlannedField:
+    """Scan a farm by every line, or take a raster as it is; choose every fraction of its patches by expected gain."""
+    run = open_field(seed, scene, weights, "sim" if scene is None else RASTER)
+    grid, memory = SceneGrid(*run.scene.shape, run.described.config.patch, 1), run.settings.memory
+    if run.raster is not None:
+        columns = columns_of_raster(run.raster, run.weights, run.scene.wavelength_nm, memory=memory)
+    else:
+        _, full, _ = cheapest_full(grid, run.camera, run.settings.cost)
+        columns = columns_of_all_patches(
+            run.simulated, list(full), grid, run.weights, memory=memory, resampling="catmull-rom"
+        )
     keep_freed_memory()  # as surveys do
-    coarse = coarse_prediction_of_patches(weights, columns, grid)
+    coarse = coarse_prediction_of_patches(run.weights, columns, grid)
     scores, valid = score_patches(POLICY, coarse), grid.valid_fraction().ravel() > 0
     chosen = {one: frame_patches(scores, one, valid) if one < 1 else np.flatnonzero(valid) for one in FRACTIONS}
-    return {one: PlannedPass(coarse, index, columns[index], weights) for one, index in chosen.items()}
+    assert run.labels is not None
+    passes: dict[Setting, PlannedPass] = {
+        one: PlannedPass(coarse, index, columns[index], run.weights) for one, index in chosen.items()
+    }
+    return PlannedField(run.labels, len(run.scene.wavelength_nm), passes)
 
 
 SEGMENT = Tradeoff(
     stage="segment",
     knob="fraction of patches",
     error="1 - mIoU",
-    unit="scene px",
     reference=f"labels of a farm of {FARM_SHAPE[1]} x {FARM_SHAPE[0]} px; policy {POLICY}, patches scored beforehand",
     settings=FRACTIONS,
     prepare=plan_every_fraction,
     run=PlannedField.read,
-    judge=PlannedField.miss,
-    work=lambda state: float(state.labels.size),
+    judge=PlannedField.judge,
 )
 
 
@@ -382,10 +348,9 @@ def segment_tradeoff(scene: str, weights: Path) -> Tradeoff:
     """Return the trade-off of `segment` on the pixels of a given raster."""
     return replace(
         SEGMENT,
-        prepare=lambda _seed: fractions_of_raster(scene, weights),
-        default=lambda field: field.default,
+        prepare=lambda seed: plan_every_fraction(seed, scene, weights),
+        default=FRACTIONS[0],
         reference=f"labels of {Path(scene).name}; patches by {POLICY}, scored beforehand",
-        beside={"billion multiply-adds": PlannedField.billion_multiply_adds},
     )
 
 

@@ -23,7 +23,7 @@ from flows.tasks.scene import judged_labels
 from flows.tasks.stages.accuracy import columns_of_raster, columns_of_sweeps
 from flows.tasks.stages.condense import with_shared_directions
 from flows.tasks.survey_model import shipped_weights
-from flows.tradeoff.entries import Setting, Tradeoff
+from flows.tradeoff.entries import Figures, Setting, Tradeoff
 from flows.training.data import scene_of_file
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.spectral import LineSpec
@@ -36,7 +36,7 @@ from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.planning.coverage import cheapest_full, uniform_sweeps
 from pipeline.signal.calibrate import calibrate
 from pipeline.signal.components import Components
-from pipeline.signal.condense import CondensedSweep, Condenser, ResidualLaw, calibrated_blocks, score_lines
+from pipeline.signal.condense import CondensedSweep, Condenser, ResidualLaw, calibrated_blocks, score_lines, whole_steps
 from pipeline.signal.subspace import SignalStatistics, find_components
 from pipeline.simulator.effects.probe import noise_electrons
 from pipeline.simulator.readout import dark_frame, read_out
@@ -96,15 +96,6 @@ class HeldLines:
         return calibrate(dn, self.references, saturated_dn=np.inf, position=self.position)[0]
 
 
-@dataclass(frozen=True)
-class Fidelity:
-    """Distance of restored spectra from the truth, in deviations of the noise, and the score of their map."""
-
-    error: float  # root mean square
-    block_mean: float  # largest mean of a band over 64 x 64 spectra
-    miou: float  # in %; NaN without labels
-
-
 @dataclass(frozen=True, eq=False)
 class ScanLines:
     """Raw lines of a scan, their scene values, and the truth about both."""
@@ -116,14 +107,18 @@ class ScanLines:
     truth: Values  # the same without noise; ``values`` where it is unknown
     sigma: Values  # deviation of the noise of a value, as large or (band,)
     noise_dn: NDArray[np.float64]  # (band,) of raw numbers, on average
-    miou: Callable[[Values], float]
-    judged: dict[object, Fidelity]  # by setting
+    miou: Callable[[Values], float]  # NaN without labels
 
-    def fidelity(self, restored: Values) -> Fidelity:
-        """Compare restored scene values, (line, sample, band), with the truth."""
+    def judge(self, _setting: Setting, stored: KeptLines) -> Figures:
+        """Compare restored scene values with the truth: root mean square, means of blocks, and the map."""
+        restored = stored.restore()
         off = (restored - self.truth) / self.sigma
+        beside = {
+            f"mean of {BLOCK_PX}² [σ]": float(np.abs(block_means_of(off, BLOCK_PX)).max()),  # noqa: RUF001
+            "mIoU [%]": 100 * self.miou(restored),
+        }
         error = float(np.sqrt(np.mean(np.square(off), dtype=np.float64)))
-        return Fidelity(error, float(np.abs(block_means_of(off, BLOCK_PX)).max()), 100 * self.miou(restored))
+        return Figures(error, stored.size / off[..., 0].size, beside)
 
 
 def block_means_of(values: Values, side: int) -> NDArray[np.float32]:
@@ -159,7 +154,7 @@ def scan_farm(seed: int, shape: tuple[int, int] = FIELD_SHAPE, camera: LineCamer
     dark = dark_frame(block, source.choice)
     truth, sigma = lines.calibrated(light / per_dn + dark), lines.calibrated(noise_dn + dark)
     mean_dn = np.sqrt(np.mean(np.square(noise_dn), axis=(0, 1), dtype=np.float64))
-    return ScanLines(lines, camera, source.wavelength_nm, lines.calibrated(raw), truth, sigma, mean_dn, miou, {})
+    return ScanLines(lines, camera, source.wavelength_nm, lines.calibrated(raw), truth, sigma, mean_dn, miou)
 
 
 def scan_raster(path: str, weights_path: Path | None) -> ScanLines:
@@ -195,7 +190,7 @@ def scan_raster(path: str, weights_path: Path | None) -> ScanLines:
         return _miou(weights, columns, grid, labels, LineSpec())
 
     sigma = known.astype(np.float32)
-    return ScanLines(lines, LineCamera(bits=16), file.wavelength_nm, values, values, sigma, known, miou, {})
+    return ScanLines(lines, LineCamera(bits=16), file.wavelength_nm, values, values, sigma, known, miou)
 
 
 def _unit_references(shape: tuple[int, ...]) -> References:
@@ -263,25 +258,15 @@ def _raw_blocks(scan: ScanLines) -> Iterator[Block]:
 
 def _condensed(scan: ScanLines, condenser: Condenser, statistics: SignalStatistics) -> tuple[KeptLines, CondensedSweep]:
     """Store the scores of all lines and the residuals of rare spectra."""
-    cube = _new_cube(scan, condenser.components, condenser.step, statistics)
-    done = condenser.sweep(scan.lines, cube.writer.write)
-    return _closed(scan, cube, done.rare, done.residuals), done
-
-
-def _new_cube(scan: ScanLines, components: Components, step: float, statistics: SignalStatistics) -> SignalCubeInMemory:
     assert statistics.origin is not None
-    header = SweepHeader(scan.lines.sweep, scan.lines.references, scan.wavelength_nm)
+    lines, components, (x, y) = scan.lines, condenser.components, scan.lines.position.T
+    header = SweepHeader(lines.sweep, lines.references, scan.wavelength_nm)
     largest = components.largest(statistics.largest + np.abs(statistics.origin - components.mean))
-    return SignalCubeInMemory(header, components, step=step, largest=largest)
-
-
-def _closed(
-    scan: ScanLines, cube: SignalCubeInMemory, rare: NDArray[np.intp], residuals: NDArray[np.int32]
-) -> KeptLines:
-    lines, (x, y) = scan.lines, scan.lines.position.T
+    cube = SignalCubeInMemory(header, components, step=condenser.step, largest=largest)
+    done = condenser.sweep(lines, cube.writer.write)
     exposure_ms = np.full(len(lines.data), scan.camera.exposure_ms)
-    cube.writer.close(LineRows(lines.time_s, x, y, exposure_ms, lines.valid_line), rare, residuals, None)
-    return KeptLines(cube.size, lambda: cube.open().spectra(0, len(lines.data)))
+    cube.writer.close(LineRows(lines.time_s, x, y, exposure_ms, lines.valid_line), done.rare, done.residuals, None)
+    return KeptLines(cube.size, lambda: cube.open().spectra(0, len(lines.data))), done
 
 
 def bin_bands(scan: ScanLines, width: int) -> KeptLines:
@@ -332,25 +317,38 @@ def compress_zfp(scan: ScanLines, tolerance: float) -> KeptLines:
 
 def keep_principal(scan: ScanLines, step: float) -> KeptLines:
     """Store principal components of raw numbers, as many as condensing keeps, without whitening or rare spectra."""
-    statistics = _statistics(_raw_blocks(scan), scan)
-    components = _principal(scan, statistics)
-    cube = _new_cube(scan, components, step, statistics)
-    for first, numbers, valid in _raw_blocks(scan):
-        cube.writer.write(first, score_lines(numbers, valid, components).scores, np.zeros(valid.shape, np.uint8))
-    stored = _closed(scan, cube, np.zeros((0, 2), np.intp), np.zeros((0, components.bands), np.int32))
-    return KeptLines(stored.size, lambda: scan.lines.calibrated(stored.restore()))
+    components, scores = _scored(scan, raw=True)
+    numbers = whole_steps(scores, step).transpose(2, 0, 1)
+    size, array = numbers_in_memory(numbers.astype(np.int16 if np.abs(numbers).max() < 2**15 else np.int32))
+
+    def restore() -> Values:
+        back = np.asarray(array[...], np.float32).transpose(1, 2, 0) * np.float32(step)
+        return scan.lines.calibrated(components.restore(back))
+
+    return KeptLines(size + _law_bytes(components), restore)
 
 
-def _principal(scan: ScanLines, statistics: SignalStatistics) -> Components:
-    """Return the principal components of raw numbers, with the mean noise of all bands as unit of their scores."""
-    assert statistics.origin is not None
-    choice = SignalChoice()
-    condensed = _statistics(calibrated_blocks(scan.lines, scan.camera), scan)
-    rank = len(find_components(condensed, false_alarm=choice.false_alarm, least=choice.least))
-    mean = statistics.total / statistics.count
-    axes = np.linalg.eigh(statistics.single / statistics.count - np.outer(mean, mean))[1][:, ::-1]
-    noise = np.full(statistics.bands, np.sqrt(np.mean(scan.noise_dn**2)))
-    return Components(statistics.origin + mean, axes[:, :rank].T, noise)
+def _scored(scan: ScanLines, *, raw: bool) -> tuple[Components, Values]:
+    """Return components and all scores (line, sample, component): of condensing, or principal ones of raw numbers.
+
+    The unit of principal scores is the mean noise of all bands.
+    """
+    choice, statistics = SignalChoice(), _statistics(calibrated_blocks(scan.lines, scan.camera), scan)
+    components = find_components(statistics, false_alarm=choice.false_alarm, least=choice.least)
+    if raw:
+        rank, statistics = len(components), _statistics(_raw_blocks(scan), scan)
+        assert statistics.origin is not None
+        mean = statistics.total / statistics.count
+        axes = np.linalg.eigh(statistics.single / statistics.count - np.outer(mean, mean))[1][:, ::-1]
+        noise = np.full(statistics.bands, np.sqrt(np.mean(scan.noise_dn**2)))
+        components = Components(statistics.origin + mean, axes[:, :rank].T, noise)
+    blocks = _raw_blocks(scan) if raw else calibrated_blocks(scan.lines, scan.camera)
+    return components, np.concatenate([score_lines(values, valid, components).scores for _, values, valid in blocks])
+
+
+def _law_bytes(components: Components) -> int:
+    """Return the bytes of axes and mean, float32."""
+    return 4 * (len(components) + 1) * components.bands
 
 
 def compress_jpeg2000(scan: ScanLines, rate: float, raw: bool) -> KeptLines:
@@ -358,27 +356,17 @@ def compress_jpeg2000(scan: ScanLines, rate: float, raw: bool) -> KeptLines:
 
     They are the principal components of ``raw`` numbers (Du & Fowler 2007), or the components of condensing.
     """
-    choice = SignalChoice()
-
-    def blocks() -> Iterator[Block]:
-        return _raw_blocks(scan) if raw else calibrated_blocks(scan.lines, scan.camera)
-
-    statistics = _statistics(blocks(), scan)
-    found = None if raw else find_components(statistics, false_alarm=choice.false_alarm, least=choice.least)
-    components = found or _principal(scan, statistics)
-    parts = [score_lines(values, valid, components).scores for _, values, valid in blocks()]
-    scores = np.concatenate(parts).transpose(2, 0, 1)
+    components, scores = _scored(scan, raw=raw)
     step = np.float32(max(JP2_STEP, float(np.abs(scores).max()) / JP2_LARGEST))
-    numbers = (np.rint(scores / step) + JP2_ZERO).astype(np.uint16)
+    numbers = (np.rint(scores.transpose(2, 0, 1) / step) + JP2_ZERO).astype(np.uint16)
     packed = _to_jpeg2000(numbers, 100 * rate / (2 * len(components)))
-    law = 4 * (len(components) + 1) * components.bands  # bytes of axes and mean, float32
 
     def restore() -> Values:
         back = (_from_jpeg2000(packed).astype(np.float32) - JP2_ZERO) * step
         restored = components.restore(back.transpose(1, 2, 0))
         return scan.lines.calibrated(restored) if raw else restored
 
-    return KeptLines(len(packed) + law, restore)
+    return KeptLines(len(packed) + _law_bytes(components), restore)
 
 
 def _to_jpeg2000(numbers: NDArray[np.uint16], percent: float) -> bytes:
@@ -424,30 +412,17 @@ WAYS: Mapping[Setting, Callable[[ScanLines], KeptLines]] = {
 }
 
 
-def judge(scan: ScanLines, setting: Setting, stored: KeptLines) -> float:
-    """Restore the lines, keep their fidelity for the other figures, and return the spectral error."""
-    scan.judged[setting] = scan.fidelity(stored.restore())
-    return scan.judged[setting].error
-
-
 STORE = Tradeoff(
     stage="store",
     knob="kept of lines",
     error="spectral error [σ of the noise]",  # noqa: RUF001
-    unit="spectrum",
     reference=f"light and labels of a farm of {FIELD_SHAPE[1]} x {FIELD_SHAPE[0]} px, every line, {EXPOSURE_MS:g} ms",
+    cost="bytes a spectrum",
     settings=tuple(WAYS),
-    default=lambda _scan: f"condensed, step {SignalChoice().step:g}",
+    default=f"condensed, step {SignalChoice().step:g}",
     prepare=scan_farm,
     run=lambda scan, setting: WAYS[setting](scan),
-    judge=judge,
-    work=lambda scan: float(scan.values[..., 0].size),
-    beside={
-        "bytes a spectrum": lambda scan, _setting, stored: stored.size / scan.values[..., 0].size,
-        f"mean of {BLOCK_PX}² [σ]": lambda scan, setting, _stored: scan.judged[setting].block_mean,  # noqa: RUF001
-        "mIoU [%]": lambda scan, setting, _stored: scan.judged[setting].miou,
-    },
-    paid="bytes a spectrum",
+    judge=ScanLines.judge,
     repeats=1,
 )
 

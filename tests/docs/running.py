@@ -23,7 +23,6 @@ import signal
 import subprocess
 import sys
 import time
-import tomllib
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -204,7 +203,7 @@ def commands_of(block: Block) -> list[str]:
 
 
 def check_words(words: list[str], place: str) -> None:
-    """Refuse a command that cannot be meant: an unknown verb or flag, target, file, benchmark or extra."""
+    """Refuse a command that cannot be meant: an unknown verb or flag, target, file or benchmark."""
     program, *given = [Path(words[0]).name, *words[1:]]
     if program == "spectralzoom":
         build_app(listed=False).parse_args(given, exit_on_error=False, print_error=False)
@@ -214,10 +213,8 @@ def check_words(words: list[str], place: str) -> None:
         assert {word for word in given if "=" not in word} <= set(phony[1].split()), f"{place}: make {given}?"
     elif program in ("python", "pytest"):
         check_python(program, given, place)
-    elif program == "pip":
-        check_install(given, place)
     else:
-        assert program in ("open", "cd", "git"), f"{place}: who knows {program}?"
+        assert program in ("open", "cd", "git", "pip"), f"{place}: who knows {program}?"
 
 
 def check_python(program: str, given: list[str], place: str) -> None:
@@ -230,14 +227,3 @@ def check_python(program: str, given: list[str], place: str) -> None:
         asked = {word for word in given[1:] if not word.startswith("-") and word.islower()}
         there = {path.stem.removeprefix("bench_") for path in (ROOT / given[0]).glob("**/bench_*.py")}
         assert asked <= there, f"{place}: no benchmark {asked - there}"
-
-
-def check_install(given: list[str], place: str) -> None:
-    """Extras that there are, and packages that the project names."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    extras = project["optional-dependencies"]
-    named = {re.split(r"[\[<>=]", one)[0] for part in (project["dependencies"], *extras.values()) for one in part}
-    for word in given[1:]:
-        own = re.fullmatch(r"(?:spectralzoom|\.)\[(.+)\]", word)
-        known = own[1].split(",") if own else []
-        assert set(known) <= set(extras) if own else word in named | {"-e"}, f"{place}: pip install {word}?"

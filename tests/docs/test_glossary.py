@@ -18,7 +18,7 @@ SOURCES = sorted(path for room in ROOMS for path in (ROOT / room).rglob("*.py"))
 OTHERS = {  # words that mean something else in these files
     "track": ("pipeline/simulator/scenes/farm", "pipeline/simulator/optics"),  # the farm's class
     "strips": ("models/reading", "flows/publish", "storage/readers", "flows/tasks"),  # of rows of a picture
-    "panel": ("flows/publish", "flows/simulate"),  # of a picture
+    "panel": ("flows/publish",),  # of a picture
 }
 
 

@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from tests.docs.pages import DOCS, LINKED, PAGES, ROOT, Block, anchors_of, blocks_of, links_of, named_code
+from tests.docs.pages import DOCS, LINKED, PAGES, ROOT, anchors_of, blocks_of, links_of, named_code
 from tests.docs.running import Reader
 from tests.prior_work import with_effects, without_effects
 
@@ -62,30 +62,6 @@ def test_named_paths_are_there(page: Path) -> None:
 def test_readme_is_short() -> None:
     """What takes longer stands in docs."""
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= README_LINES
-
-
-@pytest.mark.parametrize(
-    ("language", "text", "mark", "words"),
-    [
-        ("sh", "spectralzoom survey --no-such-flag\n", "parses", "no-such-flag"),
-        ("sh", "spectralzoom survey\n", "whatever", r"whatever\?"),
-        ("sh", "make no-such-target\n", "parses", "no-such-target"),
-        ("sh", "python tests/benchmarks no_such\n", "parses", "no_such"),
-        ("sh", "pip install 'spectralzoom[no-such]'\n", "parses", "no-such"),
-        ("sh", "make survey\n", "", "only spectralzoom is run"),
-        ("sh", "spectralzoom ls no-such-archive\n", "", "ended with 1"),
-        ("toml", "budjet = 0.5\n", "", "budget"),
-        ("toml", '# scene.toml\nlabel = "labels.png"\n', "", "unknown key label"),
-        ("diff", "--- flows/cli/app.py\n-no such line\n+another\n", "", "no such lines"),
-        ("", "what is this\n", "", "no language"),
-        ("python", "no_such_name\n", "", "no_such_name"),
-    ],
-)
-def test_a_block_that_does_not_work_is_found(language: str, text: str, mark: str, words: str, tmp_path: Path) -> None:
-    """Unknown flags, targets, keys, names and languages: each fails in words that name it."""
-    block = Block(DOCS / "index.md", 1, language, text, mark)
-    with pytest.raises(Exception, match=words):
-        Reader(tmp_path).follow(block)
 
 
 def test_rooms_of_the_table_are_those_of_the_tree() -> None:

@@ -17,8 +17,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
 
+from flows.cli.rig_commands import emulated_source
 from flows.settings.load import load_settings
-from flows.simulate.rig_commands import emulated_source
 from pipeline.rig.emulator.camera_device import CameraServer
 from pipeline.rig.emulator.emulated_rig import EmulatedPort, EmulatedRig, FastClock, SceneView
 from pipeline.simulator.simulated import SimulatedSource

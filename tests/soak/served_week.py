@@ -27,7 +27,7 @@ from zoneinfo import ZoneInfo
 import numpy as np
 from PIL import Image
 
-from flows.schedule.serve_command import ServedField, load_fields, schedule_of
+from flows.cli.serve_command import ServedField, load_fields, schedule_of
 from flows.tasks.local_server import quiet_environment
 from models.weights.files import save_weights
 from storage.archive.archive import Archive

@@ -149,18 +149,12 @@ def test_the_container_takes_every_package() -> None:
     build_app(listed=False).parse_args(words, exit_on_error=False, print_error=False)
 
 
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_the_shell_reads_what_completes_words(shell: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Every verb and its flags are in a script that the shell takes; bash completes by it."""
+def test_the_shell_reads_what_completes_words(tmp_path: Path) -> None:
+    """Every verb and its flags are in a script that bash completes by."""
+    script = tmp_path / "script"
     with pytest.raises(SystemExit) as ended:
-        main(["completion", shell])
-    script = capsys.readouterr().out
+        main(["completion", "--shell", "bash", "--output", str(script)])
     assert not ended.value.code
-    assert all(re.search(rf"\b{verb.split()[-1]}\b", script) for verb in VERBS)
-    assert "budget" in script
-    (tmp_path / "script").write_text(script)
-    if shutil.which(shell):
-        run([shell, "-n", tmp_path / "script"], tmp_path)
-    if shell == "bash":
-        typed = "COMP_WORDS=(spectralzoom survey --budg); COMP_CWORD=2; _spectralzoom; echo ${COMPREPLY[@]}"
-        assert run(["bash", "-c", f"source {tmp_path / 'script'}; {typed}"], tmp_path).split() == ["--budget"]
+    assert all(re.search(rf"\b{verb.split()[-1]}\b", script.read_text()) for verb in VERBS)
+    typed = "COMP_WORDS=(spectralzoom survey --budg); COMP_CWORD=2; _spectralzoom; echo ${COMPREPLY[@]}"
+    assert run(["bash", "-c", f"source {script}; {typed}"], tmp_path).split() == ["--budget"]

@@ -12,12 +12,9 @@ import numpy as np
 import pytest
 import rioxarray  # noqa: F401 - registers the accessor that users have
 import xarray as xr
-from hypothesis import given
-from hypothesis import strategies as st
 
 import spectralzoom
 from spectralzoom.opened import NoRunError, OpenedRun
-from spectralzoom.spectra import by_wavelength
 from storage.archive.archive import Archive
 from storage.arrays.class_maps import load_class_map
 from storage.arrays.ground_maps import load_geobox
@@ -123,22 +120,6 @@ def test_a_band_is_found_by_its_wavelength(run: OpenedRun) -> None:
         red = one.sel(wavelength=660, method="nearest")
         assert float(red.wavelength) == 640
         xr.testing.assert_identical(red, one.isel(band=0))
-
-
-@given(st.lists(st.integers(300, 2500), min_size=1, max_size=8), st.integers(300, 2500))
-def test_the_nearest_band_is_found_in_any_order(wavelengths: list[int], wanted: int) -> None:
-    """Also of two spectrometers that overlap, whose wavelengths rise and fall, or that share one."""
-    values = np.array(wavelengths, float)
-    names = {"wavelength": ("band", values), "band": values}
-    found = by_wavelength(xr.Dataset({"values": ("band", np.arange(len(wavelengths)))}, names))
-    for name in names:
-        chosen = found["values"].sel({name: float(wanted)}, method="nearest")
-        assert abs(float(chosen.wavelength) - wanted) == min(abs(one - wanted) for one in wavelengths)
-        assert float(chosen.wavelength) == wavelengths[int(chosen)]
-        several = found["values"].sel({name: [float(wanted), values[0]]}, method="nearest")
-        assert several.wavelength.values.tolist() == [float(chosen.wavelength), values[0]]
-    assert set(found.indexes) == {"band", "wavelength"}
-    assert int(found.isel(band=slice(1))["values"].sel(band=wanted, method="nearest")) == 0
 
 
 def test_the_map_on_the_ground_has_its_crs(run: OpenedRun) -> None:

@@ -23,7 +23,7 @@ from typing import Any
 import pytest
 import yaml
 
-from flows.schedule.serve_command import _prepare, load_fields, schedule_of
+from flows.cli.serve_command import _prepare, load_fields, schedule_of
 from flows.settings.load import load_settings
 from flows.tasks.local_server import local_server
 from flows.tasks.open_survey import RIG_LIMIT, OpenSurvey

@@ -13,8 +13,8 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
+from flows.cli.serve_command import load_fields
 from flows.publish.survey_command import run_survey
-from flows.schedule.serve_command import load_fields
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
 from flows.tasks.scene import scene_of_visit

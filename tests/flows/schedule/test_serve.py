@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
 import signal
-import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from flows.schedule import serve_command
-from flows.schedule.serve_command import load_fields, schedule_of
+from flows.cli import serve_command
+from flows.cli.serve_command import load_fields, schedule_of
 from storage.archive.archive import Archive
 from storage.archive.staging import take_lock
 
@@ -21,18 +19,17 @@ pytestmark = pytest.mark.usefixtures("no_effects")
 
 BAD = {
     "no fields": ((), "--every 30m", 2, "no fields: give the settings file of one or more"),
-    "cron nonsense": (("north",), "--cron hourly", 2, "--cron 'hourly': expected five fields"),
-    "cron out of range": (("north",), "--cron 0_25_*_*_*", 2, "--cron '0 25 \\* \\* \\*': expected five fields"),
+    "cron out of range": (("north",), "--cron 0_25_*_*_*", 2, "no such schedule: .*Invalid cron string: .0 25"),
     "neither": (("north",), "", 2, "a schedule needs --cron or --every, got neither"),
     "both": (("north",), "--every 1h --cron 0_6_*_*_*", 2, "a schedule needs --cron or --every, got both"),
-    "too often": (("north",), "--every 10s", 2, "--every '10s': expected a number and s, m, h or d, from 1m to 366d"),
-    "no zone": (("north",), "--cron 0_6_*_*_* --timezone Mars/Base", 2, "--timezone 'Mars/Base' is no time zone"),
+    "no interval": (("north",), "--every 0s", 2, "no such schedule: Input should be greater than 0 seconds"),
+    "no zone": (("north",), "--cron 0_6_*_*_* --timezone Mars/Base", 2, "no such schedule: .*Invalid timezone"),
     "no such file": (("nowhere",), "--every 30m", 2, "no settings file .*nowhere.toml"),
     "unknown key": (("typo",), "--every 30m", 2, "unknown setting 'sceene' in .*typo.toml; did you mean 'scene'"),
     "neither scene nor rig": (("blind",), "--every 30m", 2, "blind.toml has neither scene nor source = 'rig'"),
     "scene missing": (("gone",), "--every 30m", 1, "gone.toml: there is no file .*gone.png"),
     "twice": (("north", "north"), "--every 30m", 2, "are both called north"),
-    "limit": (("north",), "--every 30m --limit 0", 2, "--limit 0: expected 1 or more"),
+    "limit": (("north",), "--every 30m --limit 0", 2, "Invalid value .*--limit.* >= 1"),
     "name": (("named",), "--every 30m", 2, "'name' in .*named.toml must be a name of letters, digits"),
     "engine": (("north",), "--every 30m --engine plain", 2, "Unknown option: --engine"),
 }
@@ -97,7 +94,7 @@ def test_sigterm_stops_a_schedule(
         os.kill(os.getpid(), signal.SIGTERM)
         pytest.fail("SIGTERM was not heard")
 
-    monkeypatch.setattr(serve_command, "_server", terminated)
+    monkeypatch.setattr(serve_command, "_start_server", terminated)
     ended = command_line("serve", field_file(), "--every", "30m")
     assert (ended.code, ended.errors) == (0, [])
     assert ended.err.splitlines()[-1] == "stopped: no run starts from now on; the same command serves again"
@@ -117,26 +114,3 @@ def test_a_field_is_a_deployment_of_the_survey(field_file: Callable[..., Path], 
     assert (schedule.schedule.cron, schedule.schedule.timezone) == ("0 6 * * *", "Europe/Berlin")
     again = deployment(str(tmp_path / "other"))
     assert (again.flow_name, again.name, again.schedules) == ("reprocess", "archive", [])
-
-
-@pytest.mark.parametrize("ending", [asyncio.CancelledError, ConnectionError])
-def test_a_serve_that_is_asked_to_stop_ends_whatever_its_runner_fails_with(
-    monkeypatch: pytest.MonkeyPatch, ending: type[BaseException]
-) -> None:
-    """A runner that fails before that is begun again when the server answers; the schedules are paused at last."""
-    happened: list[str] = []
-
-    async def run(deployments: Sequence[Any], limit: int, asked_to_stop: threading.Event) -> None:
-        happened.append("run")
-        if len(happened) == 1:
-            raise ConnectionError
-        asked_to_stop.set()
-        raise ending
-
-    monkeypatch.setattr(serve_command, "_prepare", lambda fields: None)
-    monkeypatch.setattr(serve_command, "_run", run)
-    monkeypatch.setattr(serve_command, "_wait_for_server", lambda: happened.append("waited"))
-    monkeypatch.setattr(serve_command, "_pause", lambda fields: happened.append("paused"))
-    with pytest.raises(KeyboardInterrupt):
-        serve_command._serve([], None, 1)
-    assert happened == ["run", "waited", "run", "paused"]

@@ -102,11 +102,7 @@ def test_documents_have_every_setting_with_its_default():
     [
         ("budgt = 0.5", "'budget'"),
         ("[camera]\nexposure = 100", "'camera.exposure_ms'"),
-        ("[camra]\nbits = 12", "'camera'"),
         ("exposure_ms = 100", "'camera.exposure_ms'"),
-        ("[pose]\nlat = 52.1", "'pose.lat_deg'"),
-        ("height_m = 12", "'pose.height_m'"),
-        ("smile_nm = 0.2", "'optics.smile_nm'"),
     ],
 )
 def test_unknown_key_is_refused_with_the_nearest(toml, line, near):
@@ -124,75 +120,46 @@ def test_budget_out_of_range_is_refused(budget):
     assert str(caught.value).startswith("--budget")
 
 
-def test_budget_in_percent():
-    """50% is 0.5, and 1 is the whole scan."""
-    assert parse_settings({"budget": "50%"}).budget == 0.5
-    assert parse_settings({"budget": 1}).budget == 1.0
-
-
-@pytest.mark.parametrize(
-    ("text", "count"), [("4GiB", 2**32), ("500 MB", 500_000_000), ("1.5gib", 3 * 2**29), (2**30, 2**30)]
-)
-def test_memory_reads_units(text, count):
-    """Binary and decimal units are told apart."""
-    assert parse_settings({"memory": text}).memory == count
+def test_amounts_have_units():
+    """50% of a scan is 0.5, and 1 is all of it; binary and decimal units of bytes are told apart."""
+    found = parse_settings({"budget": "50%", "memory": "1.5gib", "kept_bytes": None})
+    assert (found.budget, found.memory) == (0.5, 3 * 2**29)
+    found = parse_settings({"budget": 1, "memory": "500 MB"})
+    assert (found.budget, found.memory) == (1.0, 500_000_000)
 
 
 @pytest.mark.parametrize(
     ("table", "words"),
     [
-        ({"memory": "four"}, "such as 4GiB"),
         ({"memory": "4"}, "at least 256MiB"),
         ({"scheduler": "dask"}, "'scheduler': .* threads, processes, or the address of a dask scheduler such as tcp:"),
         ({"workers": 0}, "a whole number from 1 to 1024, got 0$"),
         ({"scheduler": ""}, "^'scheduler' must be text that is not empty"),
         ({"seed": -1}, "whole number from 0"),
-        ({"seed": 1.0}, "whole number from 0"),
         ({"policy": "entropi"}, "one of gain, entropy, sobel, random, mask"),
         ({"policy": "mask"}, "needs a mask file"),
         ({"mask": "m.png"}, "policy 'mask' only"),
-        ({"effects": "smear,glare"}, r"'effects': unknown effect 'glare'"),
         ({"effects": "smear,turbulance"}, "did you mean 'turbulence'"),
         ({"effects": "auto,slit"}, "'auto' stands alone, got 'auto,slit'"),
         ({"effects": []}, "no effect is named"),
         ({"tol": -0.1}, "'tol' must be 0 or more, in sigmas of the noise such as 0.1, or in DN .* got -0.1"),
-        ({"tol": True}, "'tol' must be 0 or more"),
         ({"optics": {"aperture_mm": 0.015}}, "from 0.1 to 1000 mm, got 0.015$"),
         ({"optics": {"focus_m": 0}}, "of at least 0.01 m or inf, got 0"),
-        ({"optics": {"fwhm_nm": float("inf")}}, "from 0 to 1000 nm, got inf"),
-        ({"mirror": {"repeatability_urad": -40e-6}}, "from 0 to 100000 urad"),
-        (
-            {"mirror": {"coating": "brass"}},
-            "'mirror.coating' must be one of aluminium, gold, silver, ideal; got 'brass'",
-        ),
         ({"detector": {"noiseless": "maybe"}}, "true or false"),
-        ({"detector": {"temperature_deg_c": 60}}, "from -80 to 50 deg C, got 60"),
-        ({"detector": {"unit": 1.5}}, "whole number from 0"),
-        ({"air": {"distance_m": 0}}, "of at least 0.001 m, got 0"),
         ({"air": {"relief": "hills"}}, "one of flat, step, plane; got 'hills'"),
-        ({"air": {"nearest_m": 3}}, "needs air.distance_m"),
-        ({"air": {"distance_m": 5, "nearest_m": 6, "farthest_m": 4}}, "nearest_m = 6 lies beyond air.farthest_m = 4"),
         ({"sky": {"started": "noon"}}, "must be a date and time with its zone, such as .* got noon"),
         ({"sky": {"started": datetime(2026, 6, 1, 12)}}, "needs a time zone: write 2026-06-01T12:00:00Z for UTC"),
-        ({"sky": {"latitude_deg": 520000000}}, "90 deg, got 520000000$"),
         ({"bands": [0, 0]}, "names a band twice"),
         ({"bands": "0;1"}, "counted from 0"),
         ({"bands": [0, 1], "wavelengths": [660]}, "each of the 2 bands, got 1"),
         ({"size": "1280"}, "WIDTHxHEIGHT"),
         ({"size": "64x64", "scene": "a.png"}, "has its own"),
-        ({"controls": "no"}, "true or false"),
         ({"camera": 3}, "must be a table"),
         ({"camera": {"dark_dn": 5000}}, "leaves no room"),
         ({"out": " "}, "text that is not empty"),
-        ({"resampling": "cubic"}, "one of catmull-rom, bilinear, nearest; got 'cubic'"),
-        ({"pointing_px": -1}, "from 0 to 300 px, got -1"),
         ({"pose": {"lat_deg": 52.1, "tilt_deg": 40}}, r"\[pose\] lacks lon_deg, heading_deg; give every one"),
         ({"pose": POSE | {"range_m": 20}}, r"\[pose\]: .* height_m or range_m, one of the two; got height_m = 12"),
-        ({"pose": POSE | {"height_m": None}}, "needs height_m or range_m, one of the two"),
-        ({"pose": POSE | {"tilt_deg": 91}}, "tilt_deg' must be a number from -90 to 90 deg, got 91"),
-        ({"pose": POSE | {"slope_deg": float("inf")}}, "slope_deg' must be a number from 0 to 80 deg"),
         ({"map": {"epsg": 32632}}, r"\[map\] .* where the rig stands: give \[pose\]"),
-        ({"pose": POSE, "map": {"epsg": "UTM 32"}}, "from 1024 to 32767, got 'UTM 32'$"),
     ],
 )
 def test_wrong_values_are_refused(table, words):
@@ -238,14 +205,11 @@ def test_a_rig_is_read_from_its_tables(toml):
 @pytest.mark.parametrize(
     ("given", "wanted"),
     [
-        (0.1, Tolerance()),
         ("0.1", Tolerance()),
         (0, Tolerance(0.0)),
         ("0.5dn", Tolerance(0.5, "dn")),
-        ("0.5 DN", Tolerance(0.5, "dn")),
         ("2 sigma", Tolerance(2.0)),
         ("inf", Tolerance(float("inf"))),
-        (float("inf"), Tolerance(float("inf"))),
         ("1e-3dn", Tolerance(1e-3, "dn")),
     ],
 )

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
+from flows.cli.simulate_command import open_simulation
 from flows.settings.load import load_settings
-from flows.simulate.command import open_simulation
 from flows.tasks.run import CaptureRun
 from flows.tasks.stages import effects as effect_choice
 from flows.tasks.stages.effects import choose_effects, chosen_effects, load_manifest, source_with

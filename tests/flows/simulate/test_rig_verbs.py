@@ -16,8 +16,8 @@ import pytest
 import serial
 from rich.console import Console
 
+from flows.cli.rig_commands import emulated_settings, run_emulate
 from flows.settings.load import load_settings
-from flows.simulate.rig_commands import emulated_settings, run_emulate
 from pipeline.rig.emulator.emulated_rig import FastClock, ServedRig
 from pipeline.rig.pro_mode import Command
 from tests.flows.conftest import CommandLine

@@ -12,10 +12,8 @@ from typing import Any
 import pytest
 from rich.console import Console
 from rich.markup import escape
-from rich.panel import Panel
 from rich.progress import Progress
 from rich.table import Table
-from rich.tree import Tree
 
 from flows.archive.history import FieldHistory, render_history
 from flows.publish.report import render_markdown
@@ -28,29 +26,15 @@ HOSTILE = "field\x1b]0;owned\x07\x1b[2J\u202egnp.map\x9b31m\u2028\udcff"
 SHOWN = "field\\x1b]0;owned\\x07\\x1b[2J\\u202egnp.map\\x9b31m\\u2028\\udcff"
 
 
-def _table(words: str) -> Table:
-    table = Table("name")
-    table.add_row(escape(words))
-    return table
-
-
-def _tree(words: str) -> Tree:
-    tree = Tree(escape(words))
-    tree.add(escape(words))
-    return tree
-
-
-@pytest.mark.parametrize(
-    "thing",
-    [escape, _table, _tree, lambda words: Panel(escape(words)), lambda words: [words]],
-    ids=["words", "table", "tree", "white_reference", "list"],
-)
-def test_nothing_that_is_printed_steers_the_terminal(thing: Callable[[str], Any]) -> None:
+def test_nothing_that_is_printed_steers_the_terminal() -> None:
     """Styles and borders are the console's own; in the words no control character is left."""
-    file = io.StringIO()
-    Terminal(file=file, width=200, color_system=None).print(thing(HOSTILE))
-    assert all(is_visible(letter) for letter in file.getvalue())
-    assert "\\u202e" in file.getvalue()
+    rows = Table("name")
+    rows.add_row(escape(HOSTILE))
+    for thing in (escape(HOSTILE), rows, [HOSTILE]):
+        file = io.StringIO()
+        Terminal(file=file, width=200, color_system=None).print(thing)
+        assert all(is_visible(letter) for letter in file.getvalue())
+        assert "\\u202e" in file.getvalue()
 
 
 def test_bars_and_json_show_names_as_escapes() -> None:
@@ -172,23 +156,16 @@ def test_words_go_beside_the_stage_that_runs() -> None:
 
 
 def test_time_left_stands_behind_the_words(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a stage that runs, as a training does for long, and no longer of one that has ended."""
+    """Of a stage that runs, as a training does for long, and no longer of one that has ended; in a log as well."""
     monkeypatch.setattr("rich.progress.Task.time_remaining", 75.0)
+    monkeypatch.setattr("flows.terminal.progress.LINE_EVERY_S", -1.0)
+    told = progress_of(lambda one: one.show("rectify", 0.5, "step 28")).splitlines()
+    assert told == ["mosaic: 50% step 28, 75 s left"]
     told = progress_of(lambda one: one.show("training", 0.5, "step 28"), **{**TERMINAL, "width": 120})
     assert "step 28  left 0:01:15" in told
     told = progress_of(lambda one: one.show("training", 0.5, "failed", ended=True), **{**TERMINAL, "width": 120})
     assert "failed" in told
     assert "failed  left" not in told
-
-
-def test_a_line_of_a_log_says_how_long_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a stage that goes on, and no longer once it has ended."""
-    monkeypatch.setattr("rich.progress.Task.time_remaining", 75.0)
-    monkeypatch.setattr("flows.terminal.progress.LINE_EVERY_S", -1.0)
-    assert progress_of(lambda one: one.show("rectify", 0.5, "step 28")).splitlines() == [
-        "mosaic: 50% step 28, 75 s left"
-    ]
-    assert progress_of(lambda one: one.show("rectify", 1.0, "ran", ended=True)).splitlines() == ["mosaic: 100% ran"]
 
 
 def test_a_narrow_terminal_keeps_bars_and_times() -> None:

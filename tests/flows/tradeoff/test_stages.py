@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,7 @@ from rich.console import Console
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from flows.tradeoff import stages
-from flows.tradeoff.command import run_tradeoff
+from flows.tradeoff.command import tradeoff
 from flows.tradeoff.entries import Tradeoff, measure_tradeoff
 from flows.tradeoff.stages import (
     EXACT,
@@ -21,11 +23,10 @@ from flows.tradeoff.stages import (
     RECTIFY,
     SEGMENT,
     SIMULATE,
+    SURVEY,
     TOLERANCES,
-    default_plan,
     draw_waves,
-    fractions_of_raster,
-    open_field,
+    plan_every_fraction,
 )
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
@@ -33,7 +34,7 @@ from pipeline.geometry.camera import LineCamera
 
 def errors(entry: Tradeoff, state: object) -> dict[object, float]:
     """Error of every setting."""
-    return {setting: entry.judge(state, setting, entry.run(state, setting)) for setting in entry.settings}
+    return {setting: entry.judge(state, setting, entry.run(state, setting)).error for setting in entry.settings}
 
 
 def test_waves_and_noise_are_what_they_claim():
@@ -43,7 +44,7 @@ def test_waves_and_noise_are_what_they_claim():
     assert 4 <= period.min() <= period.max() <= 40
     np.testing.assert_array_equal(waves.at(np.ones((1, 2))), draw_waves(3, 64, PERIODS_PX).at(np.ones((1, 2))))
     electrons = LineCamera().full_scale_e / 2
-    assert stages.noise_level(LineCamera())[1] * 2 * electrons == pytest.approx(math.sqrt(electrons + 20**2))
+    assert stages.noise_level(LineCamera()) * 2 * electrons == pytest.approx(math.sqrt(electrons + 20**2))
 
 
 def test_errors_of_kernels_are_those_known():
@@ -58,7 +59,7 @@ def test_what_is_chosen_keeps_its_bound_and_the_bound_its_tolerance(monkeypatch)
     monkeypatch.setattr(stages, "LINES", 1)
     state = SIMULATE.prepare(0)
     found = errors(SIMULATE, state)
-    bounds = {one: SIMULATE.beside["bound [σ]"](state, one, None) for one in SIMULATE.settings}  # noqa: RUF001
+    bounds = {one: state.decisions[one].error for one in SIMULATE.settings}
     assert found[EXACT] == bounds[EXACT] == 0
     assert all(found[one] <= bounds[one] <= one for one in TOLERANCES)
     assert found[TOLERANCES[-1]] > 0
@@ -74,24 +75,20 @@ def test_more_patches_draw_a_better_map(monkeypatch):
 def test_own_scenes_are_measured_by_their_labels(
     scene_files: Path, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A raster by fractions of its patches, and by some scans of the simulated rig; the default of each is marked."""
+    """A raster by fractions of its patches, and by some scans of the simulated rig."""
     few = {name: scan for name, scan in stages.SCANS.items() if scan in ((1, 25.0), (4, 6.0))}
     monkeypatch.setattr(stages, "SCANS", few)
+    monkeypatch.setattr(stages, "SURVEY", replace(SURVEY, settings=(*few, *stages.PARTS)))
     scene = str(tmp_path / "scene.png")
     shutil.copy(scene_files / "scene.png", scene)
     shutil.copy(scene_files / "labels.png", tmp_path / "scene_labels.png")
-    quiet = Console(quiet=True)
-    content = run_tradeoff(None, tmp_path / "out", 1, 0, quiet, scene=scene, weights=weights)
-    parts, scans = content["tradeoffs"]
+    tradeoff(scene=scene, weights=weights, out=tmp_path / "out", repeats=1)
+    parts, scans = json.loads((tmp_path / "out" / "tradeoff.json").read_text())["tradeoffs"]
     assert (parts["stage"], parts["default"]) == ("segment", 1.0)
-    assert (scans["stage"], scans["default"]) == ("survey", default_plan(open_field(0, scene, weights, "sim"))[0])
-    for one in (parts, scans):
-        errors = {point["setting"]: point["error"] for point in one["points"]}
-        assert one["default"] in errors
-        assert all(0 <= error <= 1 for error in errors.values())
-    whole = run_survey(
-        load_settings(None, {"scene": scene, "weights": str(weights), "out": str(tmp_path / "a")}), quiet
-    )
+    assert scans["stage"] == "survey"
+    assert all(0 <= point["error"] <= 1 and point["cost"] > 0 for one in (parts, scans) for point in one["points"])
+    asked = {"scene": scene, "weights": str(weights), "out": str(tmp_path / "a")}
+    whole = run_survey(load_settings(None, asked), Console(quiet=True))
     errors = {point["setting"]: point["error"] for point in parts["points"]}
     assert errors[1.0] == pytest.approx(1 - whole.receipt["accuracy"]["miou"], abs=1e-3)
 
@@ -100,4 +97,4 @@ def test_a_scene_without_labels_has_no_tradeoff(scene_files: Path, weights: Path
     """One message that says what is missing."""
     shutil.copy(scene_files / "scene.png", tmp_path / "bare.png")
     with pytest.raises(SceneError, match="has no labels by which a map could be judged; lay a label file beside it"):
-        fractions_of_raster(str(tmp_path / "bare.png"), weights)
+        plan_every_fraction(0, str(tmp_path / "bare.png"), weights)

@@ -7,17 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from flows.tradeoff import store
-from flows.tradeoff.command import run_tradeoff
+from flows.tradeoff.command import tradeoff
 from flows.tradeoff.entries import Point, measure_tradeoff
 from flows.tradeoff.store import STORE, WAYS, ScanLines, block_means_of, scan_farm, scan_raster, store_tradeoff
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 
 SMALL = (96, 160)
-BYTES, BLOCK, MIOU = STORE.beside  # a spectrum, of means, of the map
+BLOCK, MIOU = "mean of 64² [σ]", "mIoU [%]"  # noqa: RUF001
 STEPS = tuple(f"condensed, step {step:g}" for step in store.STEPS)
 ROUNDED = tuple(f"rounded, {step:g}" for step in store.ROUNDED)
 PRINCIPAL = ("PCA, step 0.5", "PCA, step 3")
@@ -52,7 +51,7 @@ def test_bytes_fall_with_the_step_and_the_error_grows(points: dict[str, Point]) 
     """Condensed spectra, rounded numbers and principal components alike."""
     for family in (STEPS, ROUNDED, PRINCIPAL):
         rows = [points[name] for name in family]
-        sizes, errors = [row.beside[BYTES] for row in rows], [row.error for row in rows]
+        sizes, errors = [row.cost for row in rows], [row.error for row in rows]
         assert sizes == sorted(sizes, reverse=True)
         assert errors == sorted(errors)
         assert len({*sizes}) == len({*errors}) == len(rows)
@@ -63,7 +62,7 @@ def test_raw_lines_err_by_their_noise_and_components_by_little_of_it(points: dic
     assert points["raw"].error == pytest.approx(1, abs=0.01)
     fine = points[STEPS[0]]
     assert fine.error < 0.3
-    assert fine.paid == fine.beside[BYTES] < points["raw"].beside[BYTES] / 10
+    assert fine.cost < points["raw"].cost / 10
     assert points["binned, 17 bands"].beside[BLOCK] > 1 > points["raw"].beside[BLOCK]
 
 
@@ -76,7 +75,7 @@ def test_the_map_is_drawn_of_what_comes_back(points: dict[str, Point]) -> None:
 def test_packed_spectra_take_few_bytes_and_err_by_less_than_noise(points: dict[str, Point]) -> None:
     """Components as JPEG 2000 keep their rate and err by less than the noise; ZFP stays within its tolerance."""
     pca, condensed, zfp = (points[name] for name in PACKED)
-    assert max(pca.beside[BYTES], condensed.beside[BYTES]) < points["raw"].beside[BYTES] / 4
+    assert max(pca.cost, condensed.cost) < points["raw"].cost / 4
     assert condensed.error < 1
     assert zfp.error < 8
 
@@ -92,8 +91,8 @@ def test_lossless_ways_give_raw_lines_back(farm: ScanLines) -> None:
 
 def test_a_raster_is_measured_by_its_own_pixels(tmp_path: Path) -> None:
     """Its raw row has no error, its figures no map without weights, and its noise is estimated."""
-    tradeoff = replace(store_tradeoff(cube_of(tmp_path / "cube.npy"), None), settings=("raw", *STEPS))
-    raw, *condensed = measure_tradeoff(tradeoff, repeats=1).points
+    entry = replace(store_tradeoff(cube_of(tmp_path / "cube.npy"), None), settings=("raw", *STEPS))
+    raw, *condensed = measure_tradeoff(entry, repeats=1).points
     assert raw.error == raw.beside[BLOCK] == 0
     assert np.isnan(raw.beside[MIOU])
     assert all(0.5 < point.error < 1.2 for point in condensed)
@@ -102,7 +101,7 @@ def test_a_raster_is_measured_by_its_own_pixels(tmp_path: Path) -> None:
 
 def test_scenes_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     """Another stage has no scene, one without the other says nothing, and numbers with parts are no raw ones."""
-    quiet, weights = Console(quiet=True), Path("w.safetensors")
+    weights = Path("w.safetensors")
     for stage, scene, read_by in (
         ("rectify", "cube.npy", weights),
         ("survey", "cube.npy", None),
@@ -110,7 +109,7 @@ def test_scenes_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         ("store", None, weights),
     ):
         with pytest.raises(SettingsError, match="--scene FILE and --weights FILE go together, with the stages segment"):
-            run_tradeoff(stage, tmp_path, 1, 0, quiet, scene=scene, weights=read_by)
+            tradeoff(stage, scene=scene, weights=read_by, out=tmp_path)
     with pytest.raises(SceneError, match="numbers other than whole ones from 0 to 65534"):
         scan_raster(cube_of(tmp_path / "cube.npy", offset=0.5), None)
 

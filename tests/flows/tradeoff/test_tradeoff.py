@@ -16,15 +16,15 @@ from rich.console import Console
 from flows.publish.panels import save_png
 from flows.tradeoff import command
 from flows.tradeoff import entries as tradeoff_module
-from flows.tradeoff.command import print_tradeoff, run_tradeoff, tradeoff_figure
-from flows.tradeoff.entries import Point, Result, Tradeoff, mark_pareto, measure_tradeoff
+from flows.tradeoff.command import print_tradeoff, tradeoff, tradeoff_figure
+from flows.tradeoff.entries import Figures, Point, Result, Tradeoff, mark_pareto, measure_tradeoff
 from pipeline.errors import ArchiveError, SettingsError
 from storage.archive.whole_files import to_json
 
 
-def make_point(error: float, price: float) -> Point:
-    """A point of one unit of work."""
-    return Point("s", error, price, price, price * 1e9, 1.0)
+def make_point(error: float, cost: float, setting: str = "s") -> Point:
+    """A point of a setting."""
+    return Point(setting, error, cost, cost, 1.0)
 
 
 class Clock:
@@ -65,40 +65,38 @@ SERIES = Tradeoff(
     stage="series",
     knob="terms",
     error="absolute error",
-    unit="sum",
     reference="pi^2 / 6",
     settings=(4000.0, 16000.0, 64000.0),
     prepare=lambda seed: math.pi**2 / 6,
     run=lambda truth, terms: sum_series(int(terms)),
-    judge=lambda truth, terms, out: abs(out - truth),
-    work=lambda truth: 1.0,
+    judge=lambda truth, terms, out: Figures(abs(out - truth)),
 )
 
 
 def spend(clock, seconds):
     """Let time pass, and give an error of 0."""
     clock.cpu_s += seconds
-    return 0.0
+    return Figures(0.0)
 
 
 def test_every_setting_is_judged_and_runs_in_turn():
-    """A series that stops errs by its remainder; rounds start at another setting each; at least one is needed."""
+    """A series that stops errs by its remainder; rounds start at another setting each."""
     for point in measure_tradeoff(SERIES, repeats=1).points:
         assert point.error == pytest.approx(1 / float(point.setting), rel=1e-3)
-    with pytest.raises(SettingsError, match="at least 1, got 0"):
-        measure_tradeoff(SERIES, repeats=0)
     seen: list[float] = []
     watched = replace(SERIES, settings=(1.0, 2.0, 3.0), run=lambda truth, terms: seen.append(float(terms)) or 0.0)
     measure_tradeoff(watched, repeats=2)
     assert seen == [1, 2, 3, 1, 2, 3, 2, 3, 1]
 
 
-def test_least_times_are_the_price(clock):
-    """A machine that halts for a while does not raise the price."""
+def test_least_times_are_the_cost(clock):
+    """A machine that halts for a while does not raise the cost."""
     turns = iter((1.0, 1.0, 2.0, 4.0, 2.0, 2.0, 3.0, 9.0))  # the second round begins with the second setting
-    halting = replace(SERIES, settings=(1.0, 2.0), run=lambda truth, terms: spend(clock, next(turns)))
+    halting = replace(
+        SERIES, settings=(1.0, 2.0), run=lambda truth, terms: spend(clock, next(turns)), judge=lambda *_: Figures(0.0)
+    )
     second = measure_tradeoff(halting, repeats=3).points[1]
-    assert (second.price_s, second.wall_min_s, second.ratio) == (2, 4, 2)
+    assert (second.cost, second.time_s, second.ratio) == (2, 2, 2)
 
 
 def test_settings_run_on_one_thread():
@@ -106,57 +104,47 @@ def test_settings_run_on_one_thread():
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     try:
-        counted = replace(SERIES, run=lambda truth, terms: torch.get_num_threads(), judge=lambda truth, terms, out: out)
+        counted = replace(
+            SERIES, run=lambda truth, terms: torch.get_num_threads(), judge=lambda truth, terms, out: Figures(out)
+        )
         assert {point.error for point in measure_tradeoff(counted, repeats=1).points} == {1}
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(before)
 
 
-def test_only_run_is_timed_or_its_modelled_seconds(clock):
-    """Preparing, warming up and judging cost nothing; a stage whose time is not spent here is priced by its model."""
-    modelled = replace(
-        SERIES,
-        settings=(1.0, 3.0),
-        modelled_s=lambda truth, terms, out: 60 * terms,
-        run=lambda truth, terms: spend(clock, 0.5),
-    )
-    point = measure_tradeoff(modelled, repeats=1).points[1]
-    assert (point.price_s, point.ratio, point.wall_min_s) == (180, 3, 1)
+def test_only_run_is_timed_unless_another_cost_is_judged(clock):
+    """Preparing and judging take no time; a cost that is judged replaces the time."""
     timed = replace(
         SERIES,
         settings=(1.0, 4.0),
         prepare=lambda seed: spend(clock, 100),
-        work=lambda truth: 5.0,
         run=lambda truth, terms: spend(clock, terms),
         judge=lambda truth, terms, out: spend(clock, 100),
     )
     first, second = measure_tradeoff(timed, repeats=2).points
-    assert (first.price_s, first.wall_min_s, second.price_s, second.wall_min_s) == (1, 2, 4, 8)
-    assert (second.ratio, second.ns_per_unit) == (4, 0.8e9)
+    assert (first.cost, second.cost, second.time_s, second.ratio) == (1, 4, 4, 4)
+    priced = replace(timed, judge=lambda truth, terms, out: Figures(0.0, 60 * terms))
+    point = measure_tradeoff(priced, repeats=1).points[1]
+    assert (point.cost, point.ratio, point.time_s) == (240, 4, 4)
 
 
 @given(st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), min_size=1, max_size=12))
 def test_pareto_points_are_those_that_nobody_beats(pairs):
     """Marked points do not beat each other, and every other point is beaten by a marked one."""
     points = mark_pareto([make_point(error, price) for error, price in pairs])
-    front = {(point.error, point.price_s) for point in points if point.pareto}
+    front = {(point.error, point.cost) for point in points if point.pareto}
     assert front
     for point in points:
-        better = [
-            f for f in front if f[0] <= point.error and f[1] <= point.price_s and f != (point.error, point.price_s)
-        ]
+        better = [f for f in front if f[0] <= point.error and f[1] <= point.cost and f != (point.error, point.cost)]
         assert bool(better) != point.pareto
 
 
 def test_result_is_json_and_names_the_machine():
     """With load, threads and versions; neither NaN nor infinity is in it."""
-    found = json.loads(to_json(asdict(measure_tradeoff(SERIES, repeats=1))))
-    assert {"processor", "cores", "threads", "versions", "load_before"} <= set(found["machine"])
-    assert found["points"][0]["ns_per_unit"] > 0
     points = (make_point(math.nan, 1.0), make_point(math.inf, 1.0), make_point(0.5, 1.0))
-    result = replace(measure_tradeoff(SERIES, repeats=1), points=points)
-    found = json.loads(to_json(asdict(result)))
+    found = json.loads(to_json(asdict(replace(measure_tradeoff(SERIES, repeats=1), points=points))))
+    assert {"processor", "cores", "threads", "versions", "load_before"} <= set(found["machine"])
     assert [point["error"] for point in found["points"]] == [None, None, 0.5]
 
 
@@ -169,19 +157,20 @@ def printed(result: Result, width: int = 140) -> str:
 
 def test_table_goes_from_the_most_exact_setting_down():
     """What errs least comes first; 80 columns cut neither a setting's name nor a further figure."""
-    figured = replace(SERIES, beside={"squared": lambda truth, terms, out: 0.0625, "none": lambda *_: math.nan})
+    figured = replace(
+        SERIES, judge=lambda truth, terms, out: Figures(1 / terms, 2.5, {"squared": 0.0625}), cost="pages of paper"
+    )
     result = measure_tradeoff(figured, repeats=1)
     words = printed(result)
     assert words.index("64000.0") < words.index("16000.0") < words.index(" 4000.0")
     named = replace(result.points[0], setting="a-setting-of-20-lett")
     words = printed(replace(result, points=(named,)), width=80)
-    assert all(one in words for one in (named.setting, "squared", "0.062", "1 repeat in turn"))
-    assert json.loads(to_json(asdict(result)))["points"][0]["beside"] == {"squared": 0.0625, "none": None}
+    assert all(one in words for one in (named.setting, "squared", "0.062", "paper", "2.5", "1 repeat in turn"))
 
 
 def test_the_default_is_marked() -> None:
     """In the table, in the figure and in the JSON, and nothing where no setting is one."""
-    result = measure_tradeoff(replace(SERIES, default=lambda truth: 16000.0), repeats=1)
+    result = measure_tradeoff(replace(SERIES, default=16000.0), repeats=1)
     assert "16000.0 (default)" in printed(result)
     assert printed(result).count("(default)") == 1
     (axes,) = tradeoff_figure([result]).axes
@@ -190,21 +179,15 @@ def test_the_default_is_marked() -> None:
     assert "(default)" not in printed(measure_tradeoff(SERIES, repeats=1))
 
 
-def test_settings_may_follow_from_what_was_prepared() -> None:
-    """Those that are given for what was prepared run, and no others."""
-    found = measure_tradeoff(replace(SERIES, settings=(), settings_of=lambda truth: (10.0, 20.0)), repeats=1)
-    assert [point.setting for point in found.points] == [10.0, 20.0]
-
-
 def test_figure_tells_winners_from_beaten():
     """Winners are filled, the beaten hollow; a family is one line, its members named at their points."""
     told = (("scan, 1 ms", 0.0, 2.0), ("scan, 2 ms", 1e-3, 1.0), ("two passes, half", 0.5, 3.0))
-    points = mark_pareto([replace(make_point(error, price), setting=name) for name, error, price in told])
+    points = mark_pareto([make_point(error, cost, name) for name, error, cost in told])
     figure = tradeoff_figure([replace(measure_tradeoff(SERIES, repeats=1), points=points, level=("half", 0.5))])
     figure.draw_without_rendering()
     (axes,) = figure.axes
     marks = {tuple(line.get_xdata()): line.get_fillstyle() for line in axes.lines if line.get_marker() == "o"}
-    assert marks == {(1000.0,): "full", (2000.0,): "full", (3000.0,): "none"}
+    assert marks == {(1.0,): "full", (2.0,): "full", (3.0,): "none"}
     assert {text.get_text() for text in axes.texts} == {"1 ms", "2 ms", "half"}
     assert [text.get_text() for text in axes.get_legend().get_texts()] == ["scan", "two passes"]
 
@@ -214,9 +197,9 @@ def test_a_wrong_stage_or_folder_is_refused_before_anything_is_measured(tmp_path
     monkeypatch.setitem(command.TRADEOFFS, "series", replace(SERIES, prepare=lambda seed: pytest.fail("measured")))
     (tmp_path / "taken").write_text("")
     with pytest.raises(ArchiveError, match=r"cannot write to .*taken: .*; choose another --out"):
-        run_tradeoff("series", tmp_path / "taken", 1, 0, Console(quiet=True))
+        tradeoff("series", out=tmp_path / "taken")
     with pytest.raises(SettingsError, match="no trade-off for stage 'serie'; there are: rectify, segment, simulate"):
-        run_tradeoff("serie", tmp_path, 1, 0, Console(quiet=True))
+        tradeoff("serie", out=tmp_path)
 
 
 @pytest.mark.parametrize("errors", [(0.0, 0.1, 3.0), (0.0, 0.0), (math.inf, 0.5), (math.nan, math.nan)])

@@ -6,13 +6,16 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-import numpy as np
+from cyclopts import Parameter
 from rich.console import Console
 from rich.markup import escape
 
+from flows.cli.app import AsJson, Switch, stderr
+from flows.cli.survey_verbs import NO_SIMULATION_FLAGS, SimulationFlags, by_setting
 from flows.publish.receipt_table import print_effects
+from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
 from flows.tasks.capture_plan import PassLayout
 from flows.tasks.run import CaptureRun, make_source
@@ -21,33 +24,53 @@ from flows.tasks.stage import Stage, Wanted
 from flows.tasks.stages.capture import capture_coarse
 from flows.tasks.stages.effects import choose_effects, load_manifest
 from flows.terminal.figures import format_bytes, format_seconds
-from flows.terminal.progress import StageProgress
+from flows.terminal.progress import StageProgress, print_json
 from models.network.machine import keep_freed_memory
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
 from storage.archive.keys import StageRef
-from storage.readers.scene_files import load_scene_file
 from storage.remote.opening import open_archive
 
 TITLES = {"effects": "choice of effects", "capture": "scan"}
 PATCH, FACTOR = 16, 4  # of the shipped weights, so that scans are those of their surveys
 
 
-def run_simulate(settings: Settings, console: Console, *, coarse: bool = False) -> dict[str, Any]:
-    """Scan a scene into an archive, with progress on ``console``; return the record that --json prints.
+def simulate(
+    scene: str,
+    *,
+    out: Annotated[str, Parameter(name=("--out", "-o"))],
+    coarse: Switch = False,
+    settings: Path | None = None,
+    flags: SimulationFlags = NO_SIMULATION_FLAGS,
+    as_json: AsJson = False,
+) -> int:
+    """Simulate a full scan of SCENE, and list the effects that were simulated or omitted, with reasons.
 
-    Raises BoundError: the omitted effects change the worst part of the scene by more than their bound. Raises
-    SettingsError, SceneError or ArchiveError: the scan cannot be made.
+    The same command resumes a stopped scan; a finished scan is not repeated.
+
+    Parameters
+    ----------
+    scene
+        `farm` or `scouting` (built in; with a seed: `farm@2`), or an image or cube file: PNG, JPEG, BMP, GeoTIFF,
+        .npy, .npz, .mat, ENVI, Zarr.
+    out
+        Archive for the raw cubes: a folder, or s3://bucket/prefix.
+    coarse
+        Simulate the coarse sweep instead: every fourth line, samples summed by four.
+    settings
+        Settings file (TOML) with the tables [camera], [optics], [mirror], [detector], [air] and [sky]. Flags override
+        it.
     """
+    values = {"scene": scene, "out": out, "source": "sim", **by_setting(flags)}
     keep_freed_memory()
-    with console.status("opening the scene"):
-        run, sweeps, notes = open_simulation(settings, coarse=coarse)
+    with stderr.status("opening the scene"):
+        run, sweeps, notes = open_simulation(load_settings(settings, values), coarse=coarse)
         run = replace(run, planned=tuple(sweeps))  # only these sweeps have to be bounded and checked
         run.archive.reclaim()  # parts that a killed scan left
     for note in notes:
-        console.print(f"[dim]note: {escape(note)}[/]")
-    with run.archive.in_use(), StageProgress(console, TITLES) as progress:
+        stderr.print(f"[dim]note: {escape(note)}[/]")
+    with run.archive.in_use(), StageProgress(stderr, TITLES) as progress:
 
         def watching(name: str) -> CaptureRun:
             progress.show(name, 0.0)
@@ -63,8 +86,10 @@ def run_simulate(settings: Settings, console: Console, *, coarse: bool = False) 
         wanted = run.recorder.wanted(sweeps, [effects], watching("capture").report)
         raw, built = made("capture", capture_coarse, wanted)
         record = _record(run, sweeps, effects, raw, time.process_time() - began if built else None)
-    _print(record, console)
-    return record
+    _print(record, stderr)
+    if as_json:
+        print_json(record)
+    return 0
 
 
 def open_simulation(settings: Settings, *, coarse: bool = False) -> tuple[CaptureRun, list[Sweep], tuple[str, ...]]:
@@ -76,15 +101,9 @@ def open_simulation(settings: Settings, *, coarse: bool = False) -> tuple[Captur
         raise SettingsError(refused)
     scene, notes = open_scene(settings)
     if scene.filled_px:  # a survey skips them; a simulation would have to invent radiance
-        file = load_scene_file(
-            settings.scene, bands=settings.bands, wavelengths=settings.wavelengths, labels_needed=False
-        )
-        missing = ~np.isfinite(file.values)
-        row, column, band = (int(one) for one in np.unravel_index(int(missing.argmax()), missing.shape))
-        number = band if settings.bands is None else settings.bands[band]
         raise SceneError(
-            f"{settings.scene} has no finite value at row {row}, column {column}, band {number} (pixels without:"
-            f" {int(missing.any(axis=2).sum())}), which a simulation needs; fill or crop it, or choose other --bands"
+            f"{settings.scene} has {scene.filled_px} pixels without a finite value, and a simulation needs one "
+            "everywhere; fill or crop it, or choose other --bands"
         )
     _, coarse_pass, full = PassLayout.of(settings, SceneGrid(*scene.shape, PATCH, FACTOR)).sweeps()
     simulated = make_source(scene, settings)

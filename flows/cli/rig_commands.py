@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
-import json
-import signal
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import cast
+from typing import Annotated, cast
 
+from cyclopts import Parameter
+from cyclopts.validators import Number
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from flows.cli.app import AsJson, OutFolder, Switch, stderr
+from flows.cli.simulate_command import open_simulation
+from flows.cli.survey_verbs import NO_RENDERING_FLAGS, RenderingFlags, by_setting
+from flows.settings.documents import as_toml
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
-from flows.simulate.command import open_simulation
 from flows.tasks.stages.effects import choose_effects, source_with
 from flows.terminal.processes import DONE, FAILED, PARTLY
 from flows.terminal.progress import on_stdout, print_json
@@ -37,18 +40,29 @@ from pipeline.simulator.simulated import SimulatedSource
 _COLOURS = {"ok": "green", "warn": "yellow", "fail": "bold red"}
 
 
-def run_check(
-    settings: Path | None,
-    port: str | None,
-    camera: str | None,
-    console: Console,
+def check(
+    settings: Path | None = None,
     *,
-    move: bool = False,
-    as_json: bool = False,
+    port: str | None = None,
+    camera: str | None = None,
+    move: Switch = False,
+    as_json: AsJson = False,
 ) -> int:
-    """Check both devices of the settings, or the given ones, with a table on stdout.
+    """Connect to mirror and camera, read their state, and report problems with remedies. Nothing moves.
 
-    Returns 0 where nothing failed, 3 where one of two works, 1 otherwise. Raises SettingsError: a setting is invalid.
+    Exit code: 0 without problems, 3 if one of two devices works, else 1.
+
+    Parameters
+    ----------
+    settings
+        Settings file (TOML) whose table [rig] has the addresses of both devices. Flags override it.
+    port
+        Port of the mirror controller: /dev/ttyACM0 or COM3. Without a settings file, only named devices are checked.
+    camera
+        Address of the camera: 10.0.65.50, HOST:PORT or HOST:PORT:FILE_PORT.
+    move
+        Also move the mirror along a small square, within 0.05 of the middle of its range, and read its positions back.
+        It stops at 0; 0.
     """
     wanted = load_settings(settings)
     rig = wanted.rig if port is None else replace(wanted.rig, port=port)
@@ -57,10 +71,10 @@ def run_check(
     mirror_asked, camera_asked = both or port is not None, both or camera is not None
     rows: list[CheckRow] = []
     if mirror_asked:
-        with console.status(f"asking the mirror at {rig.port}"):
+        with stderr.status(f"asking the mirror at {rig.port}"):
             rows += check_mirror(partial(open_mirror_driver, rig, wanted.cost.vector_pairs), SYSTEM_CLOCK, move=move)
     if camera_asked:
-        with console.status(f"asking the camera at {rig.host}"):
+        with stderr.status(f"asking the camera at {rig.host}"):
             rows += check_camera(partial(open_camera_driver, rig))
     asked: dict[Device, bool] = {"mirror": mirror_asked, "camera": camera_asked}
     good = [works(rows, device) for device, is_asked in asked.items() if is_asked]
@@ -117,6 +131,40 @@ def emulated_settings(path: Path | None, flags: Mapping[str, object]) -> Setting
     return replace(wanted, size=USUAL_SIZE) if small else wanted
 
 
+def emulate(
+    *,
+    scene: str | None = None,
+    size: str | None = None,
+    flags: RenderingFlags = NO_RENDERING_FLAGS,
+    settings: Path | None = None,
+    baud: Annotated[int, Parameter(validator=Number(gte=0))] = SurveyRig.baud,
+    speed: float = 1.0,
+    out: OutFolder = None,
+    as_json: AsJson = False,
+) -> int:
+    """Emulate a rig in front of a simulated scene, until Ctrl-C: a serial port and the sockets of a camera.
+
+    Both use the documented protocols. The command prints the lines of a settings file that connect to them.
+
+    Parameters
+    ----------
+    scene
+        Scene: `farm` (with a seed: `farm@2`), or an image or cube file. Default: `farm`.
+    size
+        Size of the scene `farm`, width x height [px]. Default: 256x256.
+    settings
+        Settings file (TOML) for camera, optics, light and the mounting of the mirror. Flags override it.
+    baud
+        Speed of the serial port [baud]; 0: no limit, like USB.
+    speed
+        Speed of the rig's clock, as a multiple of real time.
+    out
+        Settings file (TOML) to write, for `survey` and `rig check`.
+    """
+    values = {"scene": scene, "size": size, **by_setting(flags)}
+    return run_emulate(emulated_settings(settings, values), stderr, baud=baud, speed=speed, out=out, as_json=as_json)
+
+
 def run_emulate(
     settings: Settings,
     console: Console,
@@ -129,11 +177,9 @@ def run_emulate(
 ) -> int:
     """Emulate a rig until Ctrl-C, SIGTERM or ``ended``; its addresses go to stdout, its state to ``console``.
 
-    ``out`` is a survey's TOML to write. Raises SettingsError, before the scene is made: speed, baud or file is invalid.
+    ``out`` is a survey's TOML to write. Raises SettingsError, before the scene is made: speed or file is invalid.
     """
     FastClock(speed)  # raises for an invalid speed
-    if baud < 0:
-        raise SettingsError(f"--baud expects bits a second, or 0 for no pace, got {baud}")
     if out is not None and not out.parent.is_dir():
         raise SettingsError(f"--out {out}: there is no folder {out.parent}; make it, or choose another")
     with console.status("drawing the scene"):
@@ -141,7 +187,8 @@ def run_emulate(
     for note in notes:
         console.print(f"[dim]note: {escape(note)}[/]")
     rig = EmulatedRig(source, FastClock(speed), mounting=settings.rig.mounting)
-    with _ending(ended or threading.Event()) as end, rig.serve(baud=baud) as served:
+    end = ended or threading.Event()
+    with rig.serve(baud=baud) as served, suppress(KeyboardInterrupt):
         table = _rig_table(served, settings.rig)
         if out is not None:
             _write_survey(out, settings, table)
@@ -155,7 +202,7 @@ def run_emulate(
         with console.status(escape(rig.state)) as line:
             while not end.wait(EVERY_S):
                 line.update(escape(rig.state))
-        console.print(f"closed: {escape(rig.state)}", soft_wrap=True)
+    console.print(f"closed: {escape(rig.state)}", soft_wrap=True)
     return 0
 
 
@@ -165,14 +212,11 @@ def _write_survey(out: Path, settings: Settings, table: dict[str, object]) -> No
     names = ("scene", "size", "day", "hour", "bands", "wavelengths", "seed", "effects", "tol", "source")
     wanted = {name: getattr(settings, name) for name in names}
     wanted |= {"size": size, "tol": str(settings.tol), "source": "rig"}
-    given = [f"{key} = {_toml_value(value)}" for key, value in wanted.items() if value is not None]
-    changed: dict[str, dict[str, object]] = {}  # other values than the defaults: the survey needs the same camera
-    described, usual = settings.to_dict(), Settings().to_dict()
-    for name in EMULATED:
-        own, other = (cast("dict[str, object]", one[name]) for one in (described, usual))
-        if own != other:
-            changed[name] = {key: value for key, value in own.items() if value != other[key] and value is not None}
-    tables = [_toml_table(name, values) for name, values in {**changed, "rig": table}.items()]
+    given = [f"{key} = {as_toml(value)}" for key, value in wanted.items() if value is not None]
+    described = settings.to_dict()
+    parts = {name: cast("dict[str, object]", described[name]) for name in EMULATED}
+    known = {name: {key: one for key, one in part.items() if one is not None} for name, part in parts.items()}
+    tables = [_toml_table(name, values) for name, values in {**known, "rig": table}.items()]
     text = "\n".join(["# A survey of an emulated rig, for as long as that runs.", *given, "", *tables])
     try:
         out.write_text(text, encoding="utf-8")
@@ -196,28 +240,7 @@ def _rig_table(served: ServedRig, rig: SurveyRig) -> dict[str, object]:
 
 
 def _toml_table(name: str, values: dict[str, object]) -> str:
-    return "\n".join([f"[{name}]", *(f"{key} = {_toml_value(value)}" for key, value in values.items()), ""])
-
-
-def _toml_value(value: object) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    return f"[{', '.join(map(_toml_value, value))}]" if isinstance(value, tuple) else str(value)
-
-
-@contextmanager
-def _ending(event: threading.Event) -> Iterator[threading.Event]:
-    if threading.current_thread() is not threading.main_thread():
-        yield event
-        return
-    before = {number: signal.signal(number, lambda *_: event.set()) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield event
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    return "\n".join([f"[{name}]", *(f"{key} = {as_toml(value)}" for key, value in values.items()), ""])
 
 
 def emulated_source(settings: Settings) -> tuple[SimulatedSource, tuple[str, ...]]:

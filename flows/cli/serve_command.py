@@ -9,20 +9,31 @@ import signal
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
-from zoneinfo import ZoneInfo
+from typing import Annotated, Any
 
 import tzlocal
+from cyclopts import Parameter
+from cyclopts.validators import Number
+from prefect.client.orchestration import get_client
+from prefect.client.schemas import filters
+from prefect.client.schemas.objects import ConcurrencyLimitConfig, ConcurrencyLimitStrategy, StateType
+from prefect.client.schemas.schedules import CronSchedule, IntervalSchedule
+from prefect.runner import Runner
+from prefect.states import Cancelled, Crashed
+from prefect.types.entrypoint import EntrypointType
+from pydantic import ValidationError
 from rich.markup import escape
 
+from flows.archive.reprocess_flow import deployment
 from flows.cli.app import stderr
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
+from flows.survey import survey
 from flows.tasks.local_server import ServerUnavailable, check_answers, local_server, quiet_environment
 from flows.tasks.open_survey import RIG_LIMIT
 from flows.tasks.run import open_run
@@ -30,48 +41,22 @@ from flows.tasks.survey_model import weights_path
 from flows.terminal.processes import DONE, terminable
 from models.weights.files import describe_weights
 from pipeline.errors import ArchiveError, NoSceneYet, NothingToMend, PipelineError, SettingsError
-from pipeline.lazy import deferred
 from storage.archive.staging import read_toml, take_lock
 from storage.remote.object_stores import is_remote
 from storage.remote.opening import open_archive
 
-if TYPE_CHECKING:
-    import prefect.client.orchestration as prefect_client
-    import prefect.client.schemas.filters as prefect_filters
-    import prefect.client.schemas.objects as prefect_objects
-    import prefect.client.schemas.schedules as prefect_schedules
-    import prefect.runner as prefect_runner
-    import prefect.states as prefect_states
-    import prefect.types.entrypoint as prefect_entrypoint
-
-    import flows.archive.reprocess_flow as reprocess_flow
-    import flows.survey as survey_flow
-else:
-    prefect_client = deferred("prefect.client.orchestration")
-    prefect_filters = deferred("prefect.client.schemas.filters")
-    prefect_objects = deferred("prefect.client.schemas.objects")
-    prefect_schedules = deferred("prefect.client.schemas.schedules")
-    prefect_runner = deferred("prefect.runner")
-    prefect_states = deferred("prefect.states")
-    prefect_entrypoint = deferred("prefect.types.entrypoint")
-    reprocess_flow = deferred("flows.archive.reprocess_flow")
-    survey_flow = deferred("flows.survey")
-
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-UNITS_S = {"s": 1, "m": 60, "h": 3600, "d": 86400}
-LEAST, MOST = timedelta(minutes=1), timedelta(days=366)
 STOPPED_AGAIN_S = 15.0  # interval of requests to a runner to stop
-PAUSE_TRIES = 5
 AGAIN_S = 2.0  # between two tries to reach a server
 
 
 def serve(
     *fields: Path,
     cron: str | None = None,
-    every: str | None = None,
+    every: timedelta | None = None,
     timezone: str | None = None,
     out: str | None = None,
-    limit: int | None = None,
+    limit: Annotated[int | None, Parameter(validator=Number(gte=1))] = None,
     port: int = 4200,
 ) -> int:
     """Survey fields on a schedule until stopped, by Prefect: a run of a field is a visit named by its due time.
@@ -93,24 +78,30 @@ def serve(
     port
         Port of Prefect's pages on this machine; a server that PREFECT_API_URL names is used instead.
     """
-    if limit is not None and limit < 1:
-        raise SettingsError(
-            f"--limit {limit}: expected 1 or more surveys at a time; leave it out for one of each field"
-        )
     schedule = schedule_of(cron, every, timezone)
     served = load_fields(fields, out)
     archives = {one.settings.out: open_archive(one.settings.out).root for one in served}
     home = next(iter(archives.values())) / ".prefect"
-    with ExitStack() as held:
-        held.enter_context(_stopped_with_a_sentence())
-        for name, root in archives.items():
-            held.enter_context(_alone_on(name, root))
-        pages = held.enter_context(_server(home, port))
-        held.enter_context(_own_temporary_folder())
-        wanted = cron or f"every {every}"
-        _say(f"serving {', '.join(one.name for one in served)}, {wanted}; Ctrl-C stops it")
-        _say(f"Prefect's pages: {pages}")
-        _serve(served, schedule, limit or len(served) + 1)
+    try:
+        with terminable(), ExitStack() as held:
+            for name, root in archives.items():
+                release = take_lock(root / ".locks" / "serve.lock", wait=False)
+                if release is None:
+                    raise ArchiveError(
+                        f"another serve uses the archive {name}; give all its fields to that one, or stop it"
+                    )
+                held.callback(release)
+            pages = _start_server(home, port, held)
+            # Prefect's runner keeps the code that it starts in /tmp/runner_storage, which its first user could replace
+            tempfile.tempdir = held.enter_context(
+                tempfile.TemporaryDirectory(prefix="spectralzoom-runner-", ignore_cleanup_errors=True)
+            )
+            held.callback(setattr, tempfile, "tempdir", None)
+            _say(f"serving {', '.join(one.name for one in served)}, {cron or f'every {every}'}; Ctrl-C stops it")
+            _say(f"Prefect's pages: {pages}")
+            _serve(served, schedule, limit or len(served) + 1)
+    except KeyboardInterrupt:
+        _say("stopped: no run starts from now on; the same command serves again")
     return DONE
 
 
@@ -124,20 +115,18 @@ class ServedField:
 
     def deployment(self, schedule: Any) -> Any:
         """Return the field's deployment of the flow `survey`; a run that is due during another is cancelled."""
-        return survey_flow.survey.to_deployment(
+        return survey.to_deployment(
             self.name,
             schedule=schedule,
             paused=False,
             parameters={
                 "settings": {"settings_file": str(self.file), "name": self.name, "out": str(self.settings.out)}
             },
-            concurrency_limit=prefect_objects.ConcurrencyLimitConfig(
-                limit=1, collision_strategy=prefect_objects.ConcurrencyLimitStrategy.CANCEL_NEW
-            ),
+            concurrency_limit=ConcurrencyLimitConfig(limit=1, collision_strategy=ConcurrencyLimitStrategy.CANCEL_NEW),
             tags=[self.settings.source, self.name],
             description=f"Surveys of {self.name} by {self.file}.",
             version="1",
-            entrypoint_type=prefect_entrypoint.EntrypointType.MODULE_PATH,
+            entrypoint_type=EntrypointType.MODULE_PATH,
         )
 
 
@@ -173,92 +162,43 @@ def load_fields(files: Sequence[Path], out: str | None = None) -> list[ServedFie
     return list(fields.values())
 
 
-def schedule_of(cron: str | None, every: str | None, timezone: str | None = None) -> Any:
+def schedule_of(cron: str | None, every: timedelta | None, timezone: str | None = None) -> Any:
     """Return Prefect's schedule for a cron line in a time zone, or for an interval; SettingsError for others."""
     if (cron is None) == (every is None):
         got = "neither" if cron is None else "both"
         raise SettingsError(f"a schedule needs --cron or --every, got {got}; such as --every 30m or --cron '0 6 * * *'")
     try:
-        zone = str(ZoneInfo(timezone or tzlocal.get_localzone_name()))
-    except (KeyError, ValueError, OSError):
-        raise SettingsError(f"--timezone {timezone!r} is no time zone; expected such as Europe/Berlin") from None
-    if every is not None:
-        found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([smhd])\s*", every)
-        span = timedelta(seconds=min(float(found[1]) * UNITS_S[found[2]], 1e9)) if found else timedelta()
-        if not LEAST <= span <= MOST:
-            raise SettingsError(f"--every {every!r}: expected a number and s, m, h or d, from 1m to 366d, such as 30m")
-        return prefect_schedules.IntervalSchedule(interval=span, anchor_date=EPOCH, timezone="UTC")
-    try:
-        if len(str(cron).split()) != 5:
-            raise ValueError
-        return prefect_schedules.CronSchedule(cron=str(cron), timezone=zone)
-    except ValueError:
+        if every is not None:
+            return IntervalSchedule(interval=every, anchor_date=EPOCH, timezone="UTC")
+        return CronSchedule(cron=str(cron), timezone=timezone or tzlocal.get_localzone_name())
+    except ValidationError as error:
         raise SettingsError(
-            f"--cron {cron!r}: expected five fields, minute hour day month weekday, such as '0 6 * * *'"
+            f"no such schedule: {error.errors()[0]['msg']}; expected such as --every 30m or --cron '0 6 * * *' "
+            "--timezone Europe/Berlin"
         ) from None
 
 
-@contextmanager
-def _stopped_with_a_sentence() -> Iterator[None]:
-    """End normally on Ctrl-C, and on a service manager's SIGTERM."""
-    try:
-        with terminable():
-            yield
-    except KeyboardInterrupt:
-        _say("stopped: no run starts from now on; the same command serves again")
-
-
-@contextmanager
-def _alone_on(name: str, root: Path) -> Iterator[None]:
-    """Lock an archive against another serve while the block runs (ArchiveError)."""
-    release = take_lock(root / ".locks" / "serve.lock", wait=False)
-    if release is None:
-        raise ArchiveError(f"another serve uses the archive {name}; give all its fields to that one, or stop it")
-    try:
-        yield
-    finally:
-        release()
-
-
-@contextmanager
-def _server(home: Path, port: int) -> Iterator[str]:
-    """Start a server on this machine, or use that of PREFECT_API_URL; yield the address of its pages.
+def _start_server(home: Path, port: int, held: ExitStack) -> str:
+    """Start a server on this machine until ``held`` ends, or use that of PREFECT_API_URL; return its pages' address.
 
     Raises SettingsError: that server does not answer, or the port is in use.
     """
+    held.enter_context(quiet_environment(home))
     try:
-        with quiet_environment(home), ExitStack() as held:
-            if "PREFECT_API_URL" in os.environ:
-                check_answers(os.environ["PREFECT_API_URL"])
-                yield os.environ["PREFECT_API_URL"].rstrip("/").removesuffix("/api")
-            else:
-                api = held.enter_context(local_server(home, port, schedules=True))
-                yield f"{api.removesuffix('/api')}; the password is in {home / 'password'}"
+        if "PREFECT_API_URL" in os.environ:
+            check_answers(os.environ["PREFECT_API_URL"])
+            return os.environ["PREFECT_API_URL"].rstrip("/").removesuffix("/api")
+        api = held.enter_context(local_server(home, port, schedules=True))
+        return f"{api.removesuffix('/api')}; the password is in {home / 'password'}"
     except ServerUnavailable as error:
         raise SettingsError(f"{error}: start it, or unset PREFECT_API_URL and have one started here") from error
-
-
-@contextmanager
-def _own_temporary_folder() -> Iterator[None]:
-    """Keep this process's temporary files in a private folder.
-
-    Prefect's runner keeps the code that it starts in /tmp/runner_storage. That folder belongs to the first user who ran
-    one, who could replace the code, and no other user can run one.
-    """
-    usual = tempfile.tempdir
-    with tempfile.TemporaryDirectory(prefix="spectralzoom-runner-", ignore_cleanup_errors=True) as own:
-        tempfile.tempdir = own
-        try:
-            yield
-        finally:
-            tempfile.tempdir = usual
 
 
 def _serve(fields: Sequence[ServedField], schedule: Any, limit: int) -> None:
     """Serve the fields and the reprocessing of their archives until interrupted, also while the server is away."""
     surveys = [one.deployment(schedule) for one in fields]
     outs = dict.fromkeys(str(one.settings.out) for one in fields)
-    again = [reprocess_flow.deployment(out, number) for number, out in enumerate(outs, 1)]
+    again = [deployment(out, number) for number, out in enumerate(outs, 1)]
     _prepare([one.name for one in fields])
     asked_to_stop = threading.Event()
     try:
@@ -281,7 +221,7 @@ def _serve(fields: Sequence[ServedField], schedule: Any, limit: int) -> None:
 
 async def _run(deployments: Sequence[Any], limit: int, asked_to_stop: threading.Event) -> None:
     """Run due flow runs by Prefect's runner until it is interrupted."""
-    runner = prefect_runner.Runner(pause_on_shutdown=False, limit=limit)
+    runner = Runner(pause_on_shutdown=False, limit=limit)
     for one in deployments:
         await runner.aadd_deployment(one)
     running = asyncio.ensure_future(runner.start())
@@ -298,18 +238,13 @@ async def _run(deployments: Sequence[Any], limit: int, asked_to_stop: threading.
 
 
 def _pause(fields: Sequence[str]) -> None:
-    """Pause the schedules of the fields; report it where the server does not answer after some tries."""
-    for left in reversed(range(PAUSE_TRIES)):
-        try:
-            with prefect_client.get_client(sync_client=True) as client:
-                for name in fields:
-                    client.pause_deployment(client.read_deployment_by_name(f"survey/{name}").id)
-            return
-        except Exception as error:
-            if left == 0:
-                _say(f"the schedules could not be paused ({type(error).__name__}); runs that are due start late")
-            else:
-                time.sleep(AGAIN_S)
+    """Pause the schedules of the fields; report it where the server does not answer."""
+    try:
+        with get_client(sync_client=True) as client:
+            for name in fields:
+                client.pause_deployment(client.read_deployment_by_name(f"survey/{name}").id)
+    except Exception as error:
+        _say(f"the schedules could not be paused ({type(error).__name__}); runs that are due start late")
 
 
 def _prepare(fields: Sequence[str]) -> None:
@@ -317,17 +252,16 @@ def _prepare(fields: Sequence[str]) -> None:
 
     Runs that were due while serve was stopped are cancelled; those that ran at its end have crashed.
     """
-    filters, kind = cast(Any, prefect_filters), prefect_objects.StateType
     named = filters.DeploymentFilter(name=filters.DeploymentFilterName(any_=list(fields)))
+    now: Any = datetime.now(UTC)
+    begun = [StateType.SCHEDULED, StateType.PENDING, StateType.RUNNING]
     left = filters.FlowRunFilter(
-        state=filters.FlowRunFilterState(
-            type=filters.FlowRunFilterStateType(any_=[kind.SCHEDULED, kind.PENDING, kind.RUNNING])
-        ),
-        expected_start_time=filters.FlowRunFilterExpectedStartTime(before_=datetime.now(UTC)),
+        state=filters.FlowRunFilterState(type=filters.FlowRunFilterStateType(any_=begun)),
+        expected_start_time=filters.FlowRunFilterExpectedStartTime(before_=now),
     )
-    missed: Any = prefect_states.Cancelled(message="no serve was running when it was due")
-    crashed: Any = prefect_states.Crashed(message="the process that ran it is gone")
-    with prefect_client.get_client(sync_client=True) as client:
+    missed: Any = Cancelled(message="no serve was running when it was due")
+    crashed: Any = Crashed(message="the process that ran it is gone")
+    with get_client(sync_client=True) as client:
         client.upsert_global_concurrency_limit_by_name(RIG_LIMIT, 1)
         for run in client.read_flow_runs(deployment_filter=named, flow_run_filter=left):
             waited = run.state is not None and run.state.is_scheduled()

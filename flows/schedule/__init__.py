@@ -1,1 +1,0 @@
-"""Fields on a schedule: deployments of the survey, served by Prefect."""

@@ -1,1 +1,0 @@
-"""Scans of a scene without a survey, and emulated rigs."""
