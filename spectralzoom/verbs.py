@@ -182,8 +182,6 @@ def train(
     own.setdefault("crop", train_command.usual_crop(str(dataset)))
     if "hold_out" in asked:
         asked["hold_out"] = tuple(_several(asked["hold_out"]))
-    if asked.get("init") is not None:
-        asked["init"] = Path(asked["init"])
     _check_known(asked, kind, "train", also=[*(one.name for one in fields(how)), *TOKENS])
     request = kind(
         str(dataset), Path(out), **asked, tokens=sizes, choices=choices, settings=how(**own), command=command

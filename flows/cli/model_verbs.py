@@ -75,7 +75,6 @@ def train(
     width: int = 20,
     overview_width: int = 8,
     columns: int = 24,
-    init: Path | None = None,
     train_temporal: Path | None = None,
     fit_ood: Path | None = None,
     dim: int = 64,
@@ -125,8 +124,6 @@ def train(
         Channels of the overview network.
     columns
         Number of spectral features per pixel, for any camera.
-    init
-        Initial weights, from this command. The output and the weights list what was taken from them.
     train_temporal
         Weights to which only a temporal reader is added, for surveys with --prior. It takes --scenes, --steps,
         --minutes, --seed and --validation, and resumes. It needs 4 GB of memory, and half an hour for reading the
@@ -190,7 +187,6 @@ def train(
             width,
             overview_width,
             tokens={"dim": dim, "layers": layers, "heads": heads, "mlp_ratio": mlp_ratio},
-            init=init,
             choices=choices,
             settings=TrainingSettings(
                 steps=steps, minutes=minutes, seed=seed, crop=size, batch=batch, darkest_ms=min_exposure_ms

@@ -133,7 +133,7 @@ def beyond_training(
         return ()
     return (
         f"outside of the training data of {path.name}: {'; '.join(found)}. Expect a poorer map; train on such labelled"
-        f" scenes: spectralzoom train DATASET --init {path.name} -o my.safetensors",
+        f" scenes: spectralzoom train DATASET -o my.safetensors",
     )
 
 

@@ -147,7 +147,7 @@ def measure_ood(request: OodRequest, report: Report = lambda what, done, figure:
 def _data_of(weights: Weights, request: OodRequest) -> TrainingData:
     """Open the data of the training. Raises SettingsError: the data set is another."""
     split = weights.record.get("split") or {}
-    own = [name for name in split.get("train", {}) if ": " not in name]  # others belong to the initial weights
+    own = list(split.get("train", {}))
     scenes = len(own) if built_in_laws(request.dataset) else None
     camera = LineCamera(**weights.record.get("camera", {}))
     held_out = {} if scenes else {"hold_out": tuple(split.get("held_out", ()))}

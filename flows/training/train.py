@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
+from torch import Tensor
 
 from flows.terminal.progress import one_after_the_other, table
-from flows.training.data import Report, TrainingData, alike_notes, either_mask, open_training_data
+from flows.training.data import Report, TrainingData, alike_notes, open_training_data
 from flows.training.figures import judge_baselines, judge_cascade, judge_scans, validate
 from flows.training.fit_ood import SeenScenes, measure_and_add, measured_calibration, trained_on
 from flows.training.train_scenes import About, TrainRequest, as_read, network_config, observe_all
@@ -25,15 +26,14 @@ from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation
 from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
 from models.training.examples import Example, measured_normalisation
-from models.training.start import LabelledPixels, Start, StartFile, better_reading, linear_discriminants
+from models.training.start import LabelledPixels, better_reading, linear_discriminants
 from models.training.train import Progress, train
 from models.weights.checksummed_files import read_checkpoint
 from models.weights.files import CALIBRATION, CASCADE, Weights, save_weights, with_record
 from models.weights.parts import MAP_SCORES, TRAINED_ON
-from pipeline.errors import SceneError, SettingsError, ShapeError
+from pipeline.errors import SceneError, SettingsError
 from pipeline.simulator.scenes.built_in import built_in_laws
 
-Split = dict[str, Any]
 FRAME_CROP, FARM_CROP = 384, 256  # px
 
 
@@ -51,7 +51,6 @@ def train_weights(
     _check_places(request.out, checkpoint)
     read_checkpoint(checkpoint)  # a damaged one fails before minutes are spent
     device = choose_device(request.device)
-    start = open_start(request.init, request.tokens)
     data = open_training_data(
         request.dataset,
         request.validation,
@@ -60,12 +59,11 @@ def train_weights(
         hold_out=request.hold_out,
         **request.choices,
     )
-    refuse_seen(start, data)
     for note in data.notes:
         tell(note)
-    lesson = _lesson(request, data, start, report, tell)
+    lesson = _lesson(request, data, report, tell)
     about = lesson.about
-    split = {  # before validation scenes are added to it
+    split = {  # copied before validation scenes are added
         "train": dict(about.keys),
         "content": list(about.content),
         "validation": list(data.validation),
@@ -81,8 +79,7 @@ def train_weights(
     trained = trained_on(data, whole, about.names)
     beside: dict[str, Any] = {}
     if frames:
-        if lesson.begun is None:
-            weights, beside["readings"] = better_reading(weights, lesson.start, frames)
+        weights, beside["readings"] = better_reading(weights, lesson.start, frames)
         counts = lesson.examples, frames, len(about.names), request.settings.seed
         beside["baselines"] = judge_baselines(*counts, report)
     figures, scores = _figures(weights, frames, lesson.augmentation, request.settings.seed, report)
@@ -90,14 +87,13 @@ def train_weights(
         "command": request.command,
         "data": data.law,
         TRAINED_ON: trained.as_dict(),
-        "split": joined_split(split, start),
+        "split": split,
         "settings": asdict(request.settings),
         "camera": asdict(request.camera),
         "training": summary,
         "device": device,
         **figures,
         **beside,
-        **({} if lesson.begun is None else {"begun_from": lesson.begun.record}),
     }
     save_weights(with_record(weights, **record), request.out)
     checkpoint.unlink(missing_ok=True)
@@ -115,22 +111,16 @@ class Lesson:
     normalisation: Normalisation
     examples: list[Example]
     augmentation: CaptureAugmentation | None  # None: the reference exposure alone
-    begun: Start | None
 
     @cached_property
-    def start(self) -> Mapping[str, Any]:
-        """Return the initial tensors: earlier weights, or the linear discriminants of the scenes."""
-        begun = {} if self.begun is None else self.begun.state
-        if "spectral.weight" in begun:
-            return begun
+    def start(self) -> Mapping[str, Tensor]:
+        """Return the initial tensors: the linear discriminants of the scenes."""
         pixels = LabelledPixels.drawn(self.examples, np.random.default_rng([0x1DA]))
-        return {**begun, **linear_discriminants(pixels, self.config.classes)}
+        return linear_discriminants(pixels, self.config.classes)
 
 
-def _lesson(
-    request: TrainRequest, data: TrainingData, start: StartFile | None, report: Report, tell: Callable[[str], None]
-) -> Lesson:
-    """Image the scenes to train on, and fit the initial tensors to the network."""
+def _lesson(request: TrainRequest, data: TrainingData, report: Report, tell: Callable[[str], None]) -> Lesson:
+    """Image the scenes to train on."""
     seen, about = observe_all(request, data, data.train, "imaging scenes", report)
     notes = alike_notes(about.alike)
     if len(about.alike) == len(about.keys) and len(notes) == 1:
@@ -139,11 +129,9 @@ def _lesson(
         tell(note)
     darkest_ms = request.settings.darkest_ms
     normalisation = measured_normalisation(seen, math.sqrt(darkest_ms * REFERENCE_MS))
-    config, begun = network_config(request, about), None
-    if start is not None:
-        begun = start.begin(config, about.basis, normalisation, about.names)
     augmentation = CaptureAugmentation(normalisation, darkest_ms=darkest_ms) if darkest_ms < REFERENCE_MS else None
-    return Lesson(about, config, normalisation, as_read(seen, normalisation), augmentation, begun)
+    config = network_config(request, about)
+    return Lesson(about, config, normalisation, as_read(seen, normalisation), augmentation)
 
 
 def _learned(
@@ -195,48 +183,6 @@ def _check_places(out: Path, checkpoint: Path) -> None:
             )
 
 
-def open_start(init: Path | None, tokens: Mapping[str, Any]) -> StartFile | None:
-    """Open the initial weights, if any. Raises SettingsError: no file, or another network; WeightsError."""
-    if init is None:
-        return None
-    start = StartFile(init)
-    try:
-        start.check(SegmenterConfig(2, **tokens))
-    except ShapeError as error:
-        raise SettingsError(f"{error}; choose another --dim or --heads") from error
-    return start
-
-
-def refuse_seen(start: StartFile | None, data: TrainingData) -> None:
-    """Raise SettingsError where the initial weights were trained on a validation scene."""
-    earlier: Split = {} if start is None else start.earlier.get("split", {})
-    seen = set(earlier.get("train", {}).values())  # with a mask, too: validation uses all labelled pixels
-    if start is None or not seen:
-        return
-    for name in data.validation:
-        if data.scene(name).key in seen:
-            raise SettingsError(
-                f"--init {start.path} was trained on the scene {name}, which is for validation here; pass"
-                " --validation 0 and judge on other scenes with evaluate"
-            )
-
-
-def joined_split(split: Split, start: StartFile | None) -> Split:
-    """Add the scenes and pixels of the initial weights' training to a split."""
-    earlier: Split = {} if start is None else start.earlier.get("split", {})
-    if start is None or not earlier.get("train"):
-        return split
-    own, parts = split["train"], split["pixels"]
-    before, parts_before = earlier["train"], earlier.get("pixels", {})
-    whole = {key for key in before.values() if key not in parts_before}
-    whole |= {key for key in own.values() if key not in parts}
-    masks = {key: either_mask(parts.get(key), parts_before.get(key)) for key in parts.keys() | parts_before.keys()}
-    more = {f"{start.path.name}: {name}": key for name, key in before.items() if key not in own.values()}
-    pixels = {key: mask for key, mask in masks.items() if key not in whole}
-    content = [*split.get("content", ()), *earlier.get("content", ())]
-    return split | {"train": own | more, "content": content, "pixels": pixels}
-
-
 def usual_crop(dataset: str) -> int:
     """Return the default size of crops [px]."""
     return FARM_CROP if built_in_laws(dataset) else FRAME_CROP
@@ -250,8 +196,6 @@ def run_train(request: TrainRequest, console: Console) -> dict[str, Any]:
         record = train_weights(
             request, report, lambda note: console.print(f"note: {note}", markup=False, soft_wrap=True)
         )
-    if "begun_from" in record:
-        print_start(record["begun_from"], console)
     _print_figures(record, request, console)
     return record
 
@@ -319,15 +263,3 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
         scores = readings["miou"] | (record["baselines"] or {})
         beside = ", ".join(f"{name} {100 * miou:.1f}" for name, miou in scores.items())
         console.print(f"mIoU of the whole scenes by each reading: {beside}; kept: {readings['kept']}", soft_wrap=True)
-
-
-def print_start(begun: Mapping[str, Any], console: Console) -> None:
-    """Print which tensors of the initial weights were used."""
-    skipped: Mapping[str, list[str]] = begun["skipped"]
-    counts = f"{begun['matched']} tensors matched, {len(begun['resized'])} resized"
-    console.print(f"begun from {begun['file']}: {counts}, {sum(map(len, skipped.values()))} skipped")
-    for name, how in begun["resized"].items():
-        console.print(f"  resized {name}: {how}")
-    for why, names in skipped.items():
-        shown = f"{names[0]} and {len(names) - 1} more" if len(names) > 1 else names[0]
-        console.print(f"  skipped {shown}: {why}")

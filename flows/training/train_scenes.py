@@ -47,7 +47,6 @@ class TrainRequest:
     width: int = 20
     overview_width: int = 8
     tokens: dict[str, Any] = field(default_factory=dict)  # dim, layers, heads, mlp_ratio
-    init: Path | None = None  # initial weights
     choices: dict[str, Any] = field(default_factory=dict)  # of load_data_set: labels, bands, wavelengths, masks
     settings: TrainingSettings = field(default_factory=TrainingSettings)
     camera: LineCamera = field(default_factory=LineCamera)

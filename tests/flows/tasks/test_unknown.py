@@ -185,7 +185,7 @@ def test_what_training_did_not_see_is_told_in_one_note(weights: Path, flags: dic
     nm = flags.pop("nm", RGB_NM)
     (note,) = _notes(weights, nm, **flags)
     assert re.search(words, note), note
-    assert "spectralzoom train DATASET --init" in note
+    assert "spectralzoom train DATASET -o" in note
 
 
 def test_a_pixel_of_another_size_is_told(weights: Path) -> None:
