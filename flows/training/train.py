@@ -28,7 +28,7 @@ from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentati
 from models.training.examples import Example, measured_normalisation
 from models.training.start import LabelledPixels, better_reading, linear_discriminants
 from models.training.train import Progress, train
-from models.weights.checksummed_files import read_checkpoint
+from models.weights.checksummed_files import load_checkpoint
 from models.weights.files import CALIBRATION, CASCADE, Weights, save_weights, with_record
 from models.weights.parts import MAP_SCORES, TRAINED_ON
 from pipeline.errors import SceneError, SettingsError
@@ -49,7 +49,7 @@ def train_weights(
     """
     checkpoint = request.out.with_name(request.out.name + ".checkpoint")
     _check_places(request.out, checkpoint)
-    read_checkpoint(checkpoint)  # a damaged one fails before minutes are spent
+    load_checkpoint(checkpoint)  # a damaged one fails before minutes are spent
     device = choose_device(request.device)
     data = open_training_data(
         request.dataset,

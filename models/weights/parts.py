@@ -37,22 +37,9 @@ class TrainedOn:
 
     @staticmethod
     def read(content: Mapping[str, Any]) -> TrainedOn:
-        """Read values of `as_dict`. Raises KeyError, TypeError or ValueError for others."""
-
-        def span(name: str) -> Range:
-            low, high = map(float, content[name])
-            return low, high
-
+        """Read values of `as_dict`. Raises TypeError for other entries."""
         return TrainedOn(
-            int(content["bands"]),
-            span("wavelength_nm"),
-            span("exposure_ms"),
-            int(content["scenes"]),
-            tuple(map(str, content["classes"])),
-            None if content["day"] is None else (int(content["day"][0]), int(content["day"][1])),
-            None if content["sun_elevation_deg"] is None else span("sun_elevation_deg"),
-            None if content["ground_pixel_m"] is None else float(content["ground_pixel_m"]),
-            None if content.get("bands_nm") is None else tuple(map(float, content["bands_nm"])),
+            **{name: tuple(value) if isinstance(value, list) else value for name, value in content.items()}
         )
 
 
@@ -71,7 +58,7 @@ class OodPart:
         """Read an entry of a description. Raises KeyError, TypeError or ValueError for an invalid one."""
         trained_on, steps = TrainedOn.read(about[TRAINED_ON]), tuple(map(int, about["steps"]))
         found = OodPart(key, trained_on, steps, int(about["bands"]), about["record"])
-        _ = found.map_scores
+        _ = found.map_scores  # raises for invalid ones
         return found
 
     @property

@@ -106,7 +106,7 @@ def test_every_flipped_bit_is_told(path: Path, add: Callable[[Path], None], load
         damaged = bytearray(whole)
         damaged[place] ^= 1 << int(rng.integers(8))
         path.write_bytes(damaged)
-        with pytest.raises(WeightsError, match=r"own\.safetensors.*(copy|train|measure)"):
+        with pytest.raises(WeightsError, match=r"cannot read .*own\.safetensors"):
             load(path)
 
 
