@@ -17,11 +17,13 @@ from flows.training.data import Report
 from models.evaluation.cascade import CascadeTable, ReadTwice
 from models.evaluation.expected_scores import Floats, MapScores, ScoredMap, expected_counts
 from models.evaluation.metrics import (
+    JudgedMap,
     agreement,
     calibration_error,
     confidence_counts,
     confusion,
     iou_per_class,
+    judge_confidence,
     mean_iou,
 )
 from models.evaluation.placement import CONTROL_FRACTION, Controls, Counts, run_controls
@@ -76,6 +78,16 @@ def judge_cascade(weights: Weights, examples: Iterable[Example]) -> dict[str, An
         gain = score_patches("gain", seen).reshape(grid.patch_shape)
         scenes.append(ReadTwice(overview, full, gain, labels, grid.patch))
     return asdict(CascadeTable.judged(scenes, weights.config.classes)) if scenes else None
+
+
+def judge_calibration(weights: Weights, examples: Iterable[Example], seed: int) -> dict[str, Any] | None:
+    """Return the calibration of maps of full scans; None without a scene."""
+    maps = []
+    for example in examples:
+        grid, _, labels = _parts(weights, example)
+        _, every_class = map_of_columns(weights, example.columns.astype(np.float32), grid)
+        maps.append(JudgedMap.of(every_class, labels))
+    return judge_confidence(maps, seed) if maps else None
 
 
 SCAN_EXPOSURES = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # of the reference; the darkest of the training is judged, too

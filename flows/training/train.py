@@ -5,27 +5,23 @@ from __future__ import annotations
 import math
 import shlex
 import sys
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.console import Console
-from torch import Tensor
 
 from flows.terminal.progress import one_after_the_other, table
-from flows.training.data import Report, TrainingData, alike_notes, open_training_data
-from flows.training.figures import judge_baselines, judge_cascade, judge_scans, validate
-from flows.training.fit_ood import SeenScenes, measure_and_add, measured_calibration, trained_on
-from flows.training.train_scenes import About, TrainRequest, as_read, network_config, observe_all
-from models.evaluation.expected_scores import MapScores
+from flows.training.data import Report, open_training_data
+from flows.training.figures import judge_baselines, judge_calibration, judge_cascade, judge_scans, validate
+from flows.training.fit_ood import fit_and_add, trained_on
+from flows.training.train_scenes import Scenes, TrainRequest, check_out, network_config, observe_all, training_capture
 from models.network.machine import choose_device
-from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation
-from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
-from models.training.examples import Example, measured_normalisation
+from models.training.capture_augmentation import REFERENCE_MS
+from models.training.examples import measured_normalisation
 from models.training.start import LabelledPixels, better_reading, linear_discriminants
 from models.training.train import Progress, train
 from models.weights.checksummed_files import load_checkpoint
@@ -48,139 +44,84 @@ def train_weights(
     output path, sizes that do not fit, or an unavailable device.
     """
     checkpoint = request.out.with_name(request.out.name + ".checkpoint")
-    _check_places(request.out, checkpoint)
+    check_out(request.out)
     load_checkpoint(checkpoint)  # a damaged one fails before minutes are spent
-    device = choose_device(request.device)
-    data = open_training_data(
-        request.dataset,
-        request.validation,
-        request.scenes,
-        request.camera,
-        hold_out=request.hold_out,
-        **request.choices,
-    )
+    device, settings = choose_device(request.device), request.settings
+    hold_out = {"hold_out": request.hold_out, **request.choices}
+    data = open_training_data(request.dataset, request.validation, request.scenes, request.camera, **hold_out)
     for note in data.notes:
         tell(note)
-    lesson = _lesson(request, data, report, tell)
-    about = lesson.about
-    split = {  # copied before validation scenes are added
-        "train": dict(about.keys),
-        "content": list(about.content),
-        "validation": list(data.validation),
-        "held_out": list(data.held_out),
-        "pixels": dict(about.pixels),
-    }
-    weights, summary = _learned(request, lesson, checkpoint, report)
-    kept, _ = observe_all(request, data, data.validation, "imaging validation scenes", report, about)
-    for note in about.notes(data.validation):
-        tell(note)
-    frames = as_read(kept, lesson.normalisation)
-    whole = SeenScenes(lesson.examples, frames, about.wavelength_nm, request.settings.darkest_ms, request.settings.seed)
-    trained = trained_on(data, whole, about.names)
-    beside: dict[str, Any] = {}
-    if frames:
-        weights, beside["readings"] = better_reading(weights, lesson.start, frames)
-        counts = lesson.examples, frames, len(about.names), request.settings.seed
-        beside["baselines"] = judge_baselines(*counts, report)
-    figures, scores = _figures(weights, frames, lesson.augmentation, request.settings.seed, report)
+    scenes = observe_all(request, data, report, tell)
+    normalisation = measured_normalisation(scenes.train.examples, math.sqrt(settings.darkest_ms * REFERENCE_MS))
+    scenes = scenes.normalised(normalisation)
+    weights, training = _learned(request, scenes, normalisation, checkpoint, report)
+    trained = trained_on(data, scenes, settings.darkest_ms)
     record = {
         "command": request.command,
         "data": data.law,
         TRAINED_ON: trained.as_dict(),
-        "split": split,
-        "settings": asdict(request.settings),
+        "split": {
+            "train": scenes.train.keys,
+            "content": scenes.train.content,
+            "validation": list(data.validation),
+            "held_out": list(data.held_out),
+            "pixels": scenes.train.pixels,
+        },
+        "settings": asdict(settings),
         "camera": asdict(request.camera),
-        "training": summary,
         "device": device,
-        **figures,
-        **beside,
+        **training,
     }
+    scans = judge_scans(
+        with_record(weights, **record),
+        scenes.validation.examples,
+        training_capture(normalisation, settings.darkest_ms),
+        settings.seed,
+        report,
+    )
+    if scans is not None:
+        record["scans"] = scans.record
     save_weights(with_record(weights, **record), request.out)
     checkpoint.unlink(missing_ok=True)
-    ood_record = {"command": request.command, **({} if scores is None else {MAP_SCORES: scores.as_dict()})}
-    why = measure_and_add(weights, request.out, whole, trained, ood_record, report)
-    return record if why is None else {**record, "familiar": why}
-
-
-@dataclass(frozen=True)
-class Lesson:
-    """Normalised scenes, sizes of the network and its initial tensors."""
-
-    about: About
-    config: SegmenterConfig
-    normalisation: Normalisation
-    examples: list[Example]
-    augmentation: CaptureAugmentation | None  # None: the reference exposure alone
-
-    @cached_property
-    def start(self) -> Mapping[str, Tensor]:
-        """Return the initial tensors: the linear discriminants of the scenes."""
-        pixels = LabelledPixels.drawn(self.examples, np.random.default_rng([0x1DA]))
-        return linear_discriminants(pixels, self.config.classes)
-
-
-def _lesson(request: TrainRequest, data: TrainingData, report: Report, tell: Callable[[str], None]) -> Lesson:
-    """Image the scenes to train on."""
-    seen, about = observe_all(request, data, data.train, "imaging scenes", report)
-    notes = alike_notes(about.alike)
-    if len(about.alike) == len(about.keys) and len(notes) == 1:
-        raise SceneError(f"{request.dataset}: training needs two or more classes, and {notes[0]}")
-    for note in (*notes, *about.notes(data.train)):
-        tell(note)
-    darkest_ms = request.settings.darkest_ms
-    normalisation = measured_normalisation(seen, math.sqrt(darkest_ms * REFERENCE_MS))
-    augmentation = CaptureAugmentation(normalisation, darkest_ms=darkest_ms) if darkest_ms < REFERENCE_MS else None
-    config = network_config(request, about)
-    return Lesson(about, config, normalisation, as_read(seen, normalisation), augmentation)
+    about = {"command": request.command, **({} if scans is None else {MAP_SCORES: scans.scores.as_dict()})}
+    try:
+        fit_and_add(weights, (request.out, request.out), scenes, trained, settings.seed, about, report)
+    except SceneError as error:
+        record["familiar"] = f"no pixel will be classified as unknown: {error}"
+    return record
 
 
 def _learned(
-    request: TrainRequest, lesson: Lesson, checkpoint: Path, report: Report
-) -> tuple[Weights, dict[str, float | int]]:
-    """Train the network; return weights and a summary of the training."""
+    request: TrainRequest, scenes: Scenes, normalisation: Normalisation, checkpoint: Path, report: Report
+) -> tuple[Weights, dict[str, Any]]:
+    """Train the network; return weights, and their figures on the validation scenes for the record."""
 
     def progress(now: Progress) -> None:
         report("training", now.done, f"step {now.step}, loss {now.loss:.3f}")
 
+    common, settings, examples = scenes.common, request.settings, scenes.train.examples
+    config, seed = network_config(request, common), settings.seed
+    start = linear_discriminants(LabelledPixels.drawn(examples, np.random.default_rng([0x1DA])), config.classes)
     model, summary = train(
-        lesson.config,
-        lesson.examples,
-        lesson.normalisation.gain_shift,
-        request.settings,
+        config,
+        examples,
+        normalisation.gain_shift,
+        settings,
         progress,
-        start=lesson.start,
-        augmentation=lesson.augmentation,
+        start=start,
+        augmentation=training_capture(normalisation, settings.darkest_ms),
         checkpoint=checkpoint,
         device=choose_device(request.device),
     )
-    about = lesson.about
-    return Weights(model, about.basis, lesson.normalisation, about.names, about.colours), summary
-
-
-def _figures(
-    weights: Weights, frames: list[Example], augmentation: CaptureAugmentation | None, seed: int, report: Report
-) -> tuple[dict[str, Any], MapScores | None]:
-    """Return the figures of validation scenes for the record, and the corrections of expected scores."""
-    figures = {"validation": validate(weights, frames, seed, lambda row: report("validating", 0.0, row))}
-    if (cascade := judge_cascade(weights, frames)) is not None:
-        figures[CASCADE] = cascade
-    if (calibration := measured_calibration(weights, frames, seed)) is not None:
-        figures[CALIBRATION] = calibration
-        weights = with_record(weights, calibration=calibration)
-    scans = judge_scans(weights, frames, augmentation, seed, report)
-    return (figures, None) if scans is None else (figures | {"scans": scans.record}, scans.scores)
-
-
-def _check_places(out: Path, checkpoint: Path) -> None:
-    if not out.parent.is_dir():
-        raise SettingsError(f"-o {out}: the folder {out.parent} does not exist; make it first")
-    if out.is_dir():
-        raise SettingsError(f"-o {out} is a folder, expected a file; name the weights in it")
-    for path in (checkpoint, *(path.with_name(path.name + ".part") for path in (out, checkpoint))):
-        if path.is_dir():
-            raise SettingsError(
-                f"-o {out}: {path} is a folder, and training writes a file of that name; move it, or rename the weights"
-            )
+    weights = Weights(model, common.basis, normalisation, common.names, common.colours)
+    frames, found = scenes.validation.examples, dict[str, Any]()
+    if frames:
+        weights, found["readings"] = better_reading(weights, start, frames)
+        found["baselines"] = judge_baselines(examples, frames, config.classes, seed, report)
+        found[CASCADE] = judge_cascade(weights, frames)
+        found[CALIBRATION] = judge_calibration(weights, frames, seed)
+    found["validation"] = validate(weights, frames, seed, lambda row: report("validating", 0.0, row))
+    return weights, {"training": summary, **found}
 
 
 def usual_crop(dataset: str) -> int:
