@@ -19,7 +19,7 @@ from flows.evaluate.frames import (
     open_frames,
     sort_frames,
 )
-from flows.evaluate.judge import Record, Trial, judge_frame, seeds_of, summarise
+from flows.evaluate.judge import Record, judge_frame, seeds_of, summarise
 from flows.terminal.processes import writing
 from flows.terminal.progress import StageProgress, on_stdout
 from flows.training.data import TrainingData, alike_notes, scene_notes
@@ -66,10 +66,9 @@ def evaluate_weights(request: EvaluateRequest, show: Show = lambda what, done, w
         with writing(request.out):
             request.out.mkdir(parents=True, exist_ok=True)  # fails before minutes are spent
     jobs = sort_frames(request, data, candidates, show)
-    trial = Trial(request.fractions, request.policies, request.seed)
-    runs = _judge_frames(request, data, candidates, jobs.frames, trial, show)
+    runs = _judge_frames(request, data, candidates, jobs.frames, show)
     names = [*jobs.frames, *jobs.left_out]
-    asked = {**asdict(trial), "draws": request.draws, "level": LEVEL}
+    asked = {name: getattr(request, name) for name in ("fractions", "policies", "seed", "draws")}
     content = {
         "dataset": data.law,
         "weights": [
@@ -84,9 +83,9 @@ def evaluate_weights(request: EvaluateRequest, show: Show = lambda what, done, w
         ],
         "frames": list(jobs.frames),
         "left_out": jobs.left_out,
-        "settings": {**asked, "camera": asdict(candidates[0].camera)},
+        "settings": {**asked, "level": LEVEL, "camera": asdict(candidates[0].camera)},
         "seeds": [[candidates[number].path.name for number in one] for one in seeds_of(runs)],
-        **summarise(runs, candidates[0].described.class_names, trial, request.draws),
+        **summarise(runs, candidates[0].described.class_names, request),
         "data_notes": [*data.notes, *alike_notes(jobs.alike), *scene_notes(jobs.empty, jobs.regridded)],
         "files": [],
     }
@@ -103,7 +102,6 @@ def _judge_frames(
     data: TrainingData,
     candidates: Sequence[Candidate],
     frames: dict[str, tuple[int, ...]],
-    trial: Trial,
     show: Show,
 ) -> list[list[Record]]:
     """Judge every frame by its weights; return the records of each of the weights."""
@@ -117,6 +115,6 @@ def _judge_frames(
             if index not in loaded:
                 loaded[index] = load_weights(one.path).on(device)
             observed = observe_frame(scene, name, loaded[index], one.camera, request.seed)
-            runs[index].append(judge_frame(trial, observed, loaded[index]))
+            runs[index].append(judge_frame(request, observed, loaded[index]))
     show("judging frames", 1.0, f"{len(frames)} frames")
     return runs

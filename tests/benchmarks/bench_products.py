@@ -1,30 +1,20 @@
-"""Polygons of a map of 10 million pixels: time, memory, areas, gaps; beside GDAL's outlines simplified one by one.
-
-Run alone, python tests/benchmarks/bench_products.py FOLDER PICTURE, it draws the prescription of an export's folder.
-"""
+"""Polygons of a map of 10 million pixels: time, memory, areas, gaps; beside GDAL's outlines simplified one by one."""
 
 from __future__ import annotations
 
-import multiprocessing
-import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 
-import geopandas
-import matplotlib.pyplot as plt
 import numpy as np
 import rasterio.features
 import rasterio.plot
 import shapely
-from measure import Row, peak_bytes
+from measure import Row, alone, peak_bytes
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.products.regions import class_polygons, merge_small
-from storage.export.map_files import REDS, ramp_colour
 
 SIDES = (3000, 3400)
 LEAST_PX = {"regions of 8 px and more": 8, "every region": 1}
@@ -89,7 +79,7 @@ def rows() -> list[Row]:
     """Processor time and memory of both maps, their areas, and whether borders are closed."""
     found = []
     for words, least in LEAST_PX.items():
-        own, peer = (_apart(least, ours) for ours in (True, False))
+        own, peer = (alone(draw, least, ours) for ours in (True, False))
         name = f"polygons of 10 Mpx, {words}"
         size = f"{own.polygons} polygons, {own.vertices} vertices"
         beside = f"rasterio.features.shapes, shapely.simplify: {peer.seconds:.1f} s, {peer.gib:.2f} GiB"
@@ -105,32 +95,3 @@ def rows() -> list[Row]:
             met = own.is_coverage and own.misfit_px < 1
             found.append(Row(f"{name}: shown twice or not at all", figure, "< 1 px, valid", met, theirs))
     return found
-
-
-def _apart(least_px: int, ours: bool) -> Drawn:
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
-        return process.submit(draw, least_px, ours).result()
-
-
-def draw_prescription(folder: Path, picture: Path) -> None:
-    """Draw the prescription of an export's folder over the field in its colours."""
-    cells = geopandas.read_file(folder / "prescription.shp")
-    with rasterio.open(folder / "rgb.tif") as file:
-        field, extent = np.moveaxis(file.read(), 0, -1), rasterio.plot.plotting_extent(file)
-    seen = np.dstack([field, np.where(field.any(axis=2), 255, 0).astype(np.uint8)])
-    figure, axes = plt.subplots(figsize=(9, 7), layout="constrained")
-    axes.imshow(seen, extent=extent)
-    cells[cells.dose == 0].boundary.plot(ax=axes, color="white", linewidth=0.2, alpha=0.5)
-    most = cells.dose.max() or 1.0
-    for dose, some in cells[cells.dose > 0].groupby("dose"):
-        colour = [level / 255 for level in ramp_colour(dose / most, REDS)]
-        label = f"{dose:g} {some.unit.iloc[0]}: {len(some)} of {len(cells)} cells"
-        some.plot(ax=axes, color=colour, alpha=0.75, edgecolor="black", linewidth=0.3, label=label)
-    axes.set(xlabel=f"east [m], EPSG:{cells.crs.to_epsg()}", ylabel="north [m]", title="Prescription over the field")
-    axes.ticklabel_format(useOffset=False, style="plain")
-    axes.legend(loc="lower left")
-    figure.savefig(picture, dpi=110)
-
-
-if __name__ == "__main__":
-    draw_prescription(Path(sys.argv[1]), Path(sys.argv[2]))

@@ -1,26 +1,15 @@
-"""Rectification and mosaic from disk to disk: against the codec alone, with the field's size, and its memory.
-
-Run alone, python tests/benchmarks/bench_tiles.py FOLDER, it takes the paper's scene with its bands cut to fit: writes
-raw sweeps of a whole field (all strips that cover it, some 30 degrees from the axis at the corners) into FOLDER,
-rectifies and blends them, and prints what that took beside a smaller field in the same run. What it wrote is removed.
-10240 px with 32 bands take some 14 GB of disk.
-"""
+"""Rectification and mosaic from disk to disk: against the codec alone, with the field's size, and its memory."""
 
 from __future__ import annotations
 
-import argparse
-import multiprocessing
 import shutil
 import tempfile
 import time
-from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
-from measure import Row, peak_bytes, ratio, time_in_turn
+from measure import Row, alone, peak_bytes, ratio, time_in_turn
 from numpy.typing import NDArray
 
 from flows.tasks.mosaic_work import MosaicRecipe, write_mosaic
@@ -41,13 +30,10 @@ CAMERA = LineCamera()
 PATTERN_LINES = 512
 BANDS, SHAPE = 270, (128, 1200)
 FEW_BANDS, SIDES = 16, (1280, 2560)
-SMALL_PX = 2560  # at most, of the field beside the paper's
 MEMORY = 4 * 2**30
 MOST_MEMORY_GIB = 4.0
 MOST_GROWTH = 1.2
 ROUNDS = 3
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -55,7 +41,6 @@ class Spent:
     """What one run took."""
 
     cpu_s: float
-    wall_s: float
     peak_bytes: int
     values: int
 
@@ -72,12 +57,6 @@ def rows() -> list[Row]:
         return [alone(_against_codec, folder), *_with_size(folder)]
 
 
-def alone(call: Callable[..., T], *given: object) -> T:
-    """Call in a process of its own, whose memory and settings are not those of other benchmarks."""
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        return pool.submit(call, *given).result()
-
-
 def _against_codec(folder: Path) -> Row:
     """Two sweeps of all bands into one mosaic, beside reading these sweeps and writing this mosaic, nothing between."""
     keep_freed_memory()
@@ -85,12 +64,12 @@ def _against_codec(folder: Path) -> Row:
     scene = SceneGrid(*SHAPE, 32, 4)
     grid, out = PixelGrid.of_scene(scene, 1), folder / "mosaic.zarr"
     paths = write_raw(folder, full_sweeps(scene, CAMERA, "x"), BANDS)
-    rectify(paths, out, grid, MEMORY, 1)
+    rectify(paths, out, grid)
     stored = load_mosaic(out)
 
     def stage() -> None:
         shutil.rmtree(out, ignore_errors=True)
-        rectify(paths, out, grid, MEMORY, 1)
+        rectify(paths, out, grid)
 
     def read() -> None:
         for path in paths:
@@ -138,7 +117,7 @@ def _with_size(folder: Path) -> list[Row]:
             f"{growth:.2f}, {large.cpu_ns:.0f} ns",
             f"<= {MOST_GROWTH:.2f}",
             growth <= MOST_GROWTH,
-            f"{SIDES[0]} px: {small.cpu_ns:.0f} ns; 10240 px by bench_tiles.py alone",
+            f"{SIDES[0]} px: {small.cpu_ns:.0f} ns",
         ),
         Row(
             f"peak memory of the {SIDES[1]} px field",
@@ -150,25 +129,15 @@ def _with_size(folder: Path) -> list[Row]:
     ]
 
 
-def _field(folder: Path, side: int, bands: int, workers: int | None = 1) -> Spent:
+def _field(folder: Path, side: int, bands: int) -> Spent:
     """Write one field's sweeps, measure the stage in a fresh process, remove both."""
     scene = SceneGrid(side, side, 32, 4)
     place_of = folder / f"field-{side}"
     try:
         paths = write_raw(place_of, full_sweeps(scene, CAMERA, "x"), bands)
-        return alone(measured, paths, place_of / "mosaic.zarr", PixelGrid.of_scene(scene, 1), MEMORY, workers)
+        return alone(measured, paths, place_of / "mosaic.zarr", PixelGrid.of_scene(scene, 1))
     finally:
         shutil.rmtree(place_of, ignore_errors=True)
-
-
-def _told_field(folder: Path, side: int, bands: int, workers: int | None) -> Spent:
-    spent = _field(folder, side, bands, workers)
-    print(
-        f"{side} px, {bands} bands: processor {spent.cpu_s:.1f} s, wall {spent.wall_s:.1f} s, {spent.cpu_ns:.1f} ns a "
-        f"pixel and band, peak memory {spent.peak_bytes / 2**30:.2f} GiB",
-        flush=True,
-    )
-    return spent
 
 
 def pattern(bands: int, seed: int = 0) -> NDArray[np.uint16]:
@@ -203,42 +172,18 @@ def write_raw(folder: Path, sweeps: list[Sweep], bands: int) -> list[Path]:
     return paths
 
 
-def rectify(paths: list[Path], out: Path, grid: PixelGrid, memory: int, workers: int | None) -> None:
+def rectify(paths: list[Path], out: Path, grid: PixelGrid) -> None:
     """The stage: cubes opened, placed, made into one mosaic on disk."""
     wavelength_nm = open_raw_cube(paths[0]).wavelength_nm
     writer = MosaicWriter(out, grid.shape, wavelength_nm)
-    write_mosaic(MosaicRecipe(paths[0].parent, CAMERA, grid), writer, memory=memory, pool=WorkerPool(workers=workers))
+    write_mosaic(MosaicRecipe(paths[0].parent, CAMERA, grid), writer, memory=MEMORY, pool=WorkerPool(workers=1))
 
 
-def measured(paths: list[Path], out: Path, grid: PixelGrid, memory: int, workers: int | None) -> Spent:
+def measured(paths: list[Path], out: Path, grid: PixelGrid) -> Spent:
     """Run the stage and tell what this process has spent on it, start-up left out of the time."""
     keep_freed_memory()
     use_one_thread()
-    cpu, wall = time.process_time(), time.perf_counter()
-    rectify(paths, out, grid, memory, workers)
+    cpu = time.process_time()
+    rectify(paths, out, grid)
     bands = len(open_raw_cube(paths[0]).wavelength_nm)
-    spent = time.process_time() - cpu, time.perf_counter() - wall
-    return Spent(*spent, peak_bytes(), grid.shape[0] * grid.shape[1] * bands)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("folder", type=Path, help="on a disk with enough room")
-    parser.add_argument("--side", type=int, default=10240, help="of the field [px]")
-    parser.add_argument("--bands", type=int, default=32)
-    parser.add_argument("--workers", type=int, default=1, help="tiles made at a time; 0: one a core")
-    given = parser.parse_args()
-    small, large = (
-        _told_field(given.folder, side, given.bands, given.workers or None)
-        for side in (min(SMALL_PX, given.side // 2), given.side)
-    )
-    growth = large.cpu_ns / small.cpu_ns
-    met = growth <= MOST_GROWTH and large.peak_bytes <= MOST_MEMORY_GIB * 2**30
-    print(
-        f"processor time a pixel and band against the smaller field: {growth:.2f} (goal <= {MOST_GROWTH}); peak "
-        f"{large.peak_bytes / 2**30:.2f} GiB (goal <= {MOST_MEMORY_GIB:g}); {'met' if met else 'missed'}"
-    )
-
-
-if __name__ == "__main__":
-    main()
+    return Spent(time.process_time() - cpu, peak_bytes(), grid.shape[0] * grid.shape[1] * bands)

@@ -14,7 +14,7 @@ from rich.console import Console
 from flows.cli.main import main
 from flows.evaluate.command import evaluate_weights, run_evaluate
 from flows.evaluate.frames import EvaluateRequest, open_candidates
-from flows.evaluate.judge import ORACLE, Trial, collect_row, difference, judge_frame, seeds_of, summarise
+from flows.evaluate.judge import ORACLE, collect_row, difference, judge_frame, seeds_of, summarise
 from flows.evaluate.table import print_evaluation
 from flows.training.data import farm_test_data, pack_mask
 from flows.training.train import train_weights
@@ -35,7 +35,7 @@ def _row(content: dict[str, Any], policy: str, fraction: float) -> dict[str, Any
     return next(row for row in content["rows"] if (row["policy"], row["fraction"]) == (policy, fraction))
 
 
-TRIAL = Trial((0.5,), ())
+TRIAL = EvaluateRequest("field", (), fractions=(0.5,), policies=(), draws=10)
 
 
 def test_every_row_is_there(judged: Judged):
@@ -195,10 +195,9 @@ def test_records_count_by_their_pixels():
     """In any order."""
     rng = np.random.default_rng(0)
     records = [_record(f"{number:03d}", rng) for number in range(4)]
-    there, back = (summarise([order], ("a", "b"), TRIAL, 10) for order in (records, records[::-1]))
+    there, back = (summarise([order], ("a", "b"), TRIAL) for order in (records, records[::-1]))
     assert json.dumps(there["rows"][0], sort_keys=True) == json.dumps(back["rows"][0], sort_keys=True)
     whole = collect_row([records], "none", 0.0)
-    assert whole is not None
     assert there["rows"][0]["miou"] == mean_iou(whole.counts.sum(axis=(0, 1)))
 
 
@@ -209,7 +208,7 @@ def test_a_class_that_no_label_has_is_told_apart(judged: Judged, capsys: pytest.
     for record, one in zip(records, counts, strict=True):
         for row in record["rows"]:
             row |= {"counts": one}
-    found = summarise([records], ("soil", "crop", "weed"), TRIAL, 10)
+    found = summarise([records], ("soil", "crop", "weed"), TRIAL)
     row = found["rows"][0]
     assert row["miou"] == pytest.approx(np.mean([15 / 21, 19 / 23]))
     assert row["false_classes"] == {"weed": 2}
@@ -234,11 +233,9 @@ def test_weights_without_a_common_frame_are_one_seed() -> None:
     assert seeds_of(runs) == [[0, 1], [2]]
     joined, part = [*runs[0], *runs[1]], runs[2][:2]
     row, less = collect_row([joined], "none", 0.0), collect_row([joined, part], "none", 0.0)
-    assert row is not None
-    assert less is not None
     assert less.counts.shape == (2, 3, 2, 2)
     assert not less.counts[1, 2].any()
-    found = difference(row, less, TRIAL, 10)
+    found = difference(row, less, TRIAL)
     assert found is not None
     wanted = row.over_runs(mean_iou).mean() - less.over_runs(mean_iou).mean()
     assert (found["difference"], found["frames"]) == (pytest.approx(wanted), 3)

@@ -112,20 +112,12 @@ def test_a_region_is_drawn_as_training_saw_crops(tiny: Maker, patch: int, origin
     assert (drawn.confidence == here.confidence).all() == (origin == (0, 0))
 
 
-def test_a_kept_overview_counts_for_what_it_is_of_only(tiny: Maker, monkeypatch: pytest.MonkeyPatch):
-    """A scene is read again where pixels, place, living tokens, capture or weights are not those of the prediction."""
-    weights, other, again = tiny(0), tiny(1), list[int]()
+def test_a_prediction_keeps_its_overview(tiny: Maker, monkeypatch: pytest.MonkeyPatch):
+    """A map of a prediction does not read the scene again."""
+    weights = tiny()
     seen, fine = _seen(weights)
-    for network in (weights.segmenter, other.segmenter):
-        read = network.read_overview
-        monkeypatch.setattr(network, "read_overview", lambda *given, read=read: again.append(1) or read(*given))
+    monkeypatch.setattr(weights.segmenter, "read_overview", lambda *given: pytest.fail("read"))
     segment(weights, seen, fine[:1], np.array([0]))
-    assert not again
-    changes = {"columns": seen.columns + 1, "origin": (4, 4), "living": np.array([True, False]), "capture": DARK}
-    changed = [(weights, replace(seen, **{name: value})) for name, value in changes.items()]
-    for count, (who, what) in enumerate([*changed, (other, seen)], 1):
-        segment(who, what, fine[:1], np.array([0]))
-        assert len(again) == count
 
 
 @pytest.mark.parametrize(
