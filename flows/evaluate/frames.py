@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.tasks.scene import check_labels, judged_labels
+from flows.tasks.scene import check_labels, judged_labels, seen_in_training
 from flows.training.data import TrainingData, farm_test_data, only_class, open_training_data
 from flows.training.observed_scenes import observe_scene
 from models.evaluation.metrics import DRAWS
@@ -76,17 +76,15 @@ FARM_TEST_SCENES = 4
 
 @dataclass(frozen=True)
 class Candidate:
-    """Weights to judge: their file, its description and hash."""
+    """Weights to judge: their file and its description."""
 
     path: Path
     described: Description
-    key: str
 
-    @staticmethod
-    def of(path: Path) -> Candidate:
-        """Read the description of a file. Raises WeightsError."""
-        described = describe_weights(path)
-        return Candidate(path, described, described.key[:16])
+    @property
+    def key(self) -> str:
+        """Return the hash of the weights, shortened."""
+        return self.described.key[:16]
 
     @property
     def camera(self) -> LineCamera:
@@ -96,27 +94,10 @@ class Candidate:
         except (TypeError, PipelineError) as error:
             raise WeightsError(f"{self.path}: its camera is damaged ({error}); copy or train the file again") from error
 
-    def trained_on(self, scene: RasterScene, name: str, law: str, *, bands_chosen: bool = False) -> bool:
-        """Return whether these weights were trained on all labels of the scene.
-
-        The key of a scene depends on its bands. If bands or wavelengths were chosen, here or in the training, a frame
-        of the data set ``law`` is also recognised by its name.
-        """
-        train, record = self.split.get("train", {}), self.described.record
-        if scene.key in train.values():
-            return self.pixels_of(scene) is None
-        chosen = bands_chosen or any(flag in record.get("command", "") for flag in ("--bands", "--wavelengths"))
-        return chosen and record.get("data") == law and name in train
-
     def pixels_of(self, scene: RasterScene) -> str | None:
         """Return the packed mask of a scene's training pixels; None for all pixels."""
         pixels: str | None = self.split.get("pixels", {}).get(scene.key)
         return pixels
-
-    @property
-    def held_out(self) -> tuple[str, ...]:
-        """Return the frames held out of the training."""
-        return tuple(self.split.get("held_out", ()))
 
     @property
     def split(self) -> dict[str, Any]:
@@ -144,7 +125,7 @@ def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
     """
     if not paths:
         raise SettingsError("evaluate needs --weights FILE; train some with: spectralzoom train DATASET -o FILE")
-    found = [Candidate.of(path) for path in paths]
+    found = [Candidate(path, describe_weights(path)) for path in paths]
     first = found[0].described
     for other in found[1:]:
         if other.camera != found[0].camera:
@@ -220,8 +201,7 @@ def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[
     SettingsError: weights were trained on different pixels of a frame.
     """
     jobs, labelled = Jobs(), False
-    chosen = any(request.choices.get(what) is not None for what in ("bands", "wavelengths"))
-    in_turn = len({one.held_out for one in weights}) > 1
+    in_turn = len({tuple(one.split.get("held_out", ())) for one in weights}) > 1
     for number, name in enumerate(data.train):
         show("looking for frames", number / len(data.train), name)
         try:
@@ -240,7 +220,7 @@ def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[
         fit = [
             at
             for at, one in enumerate(weights)
-            if not one.trained_on(scene, name, data.law, bands_chosen=chosen)
+            if seen_in_training(scene, one.described) != "all"
             and not (
                 in_turn and one.described.record.get("data") == data.law and name in one.split.get("validation", ())
             )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,7 @@ from models.evaluation.metrics import (
     judge_confidence,
     mean_iou,
 )
-from models.evaluation.placement import CONTROL_FRACTION, Controls, Counts, run_controls
+from models.evaluation.placement import CONTROL_FRACTION, placement_figures, run_controls
 from models.network.sizes import PLANES
 from models.network.spectral import LineSpec, patches_of
 from models.policies.policies import score_patches
@@ -50,20 +50,15 @@ def validate(weights: Weights, examples: Iterable[Example], seed: int, show: Sho
         rows.append(run_controls(weights, seen, cells, labels, fraction=CONTROL_FRACTION, seed=seed, report=show))
     if not rows:
         return None
-    whole = Controls(
-        rows[0].fraction,
-        sum(row.patch_index for row in rows),
-        _added([row.none for row in rows]),
-        _added([row.every for row in rows]),
-        {name: _added([row.policies[name] for row in rows]) for name in rows[0].policies},
-        [_added(list(draws)) for draws in zip(*(row.random for row in rows), strict=True)],
-    )
+    whole = {
+        name: [np.sum(draws, axis=0) for draws in zip(*(row[name] for row in rows), strict=True)] for name in rows[0]
+    }
     return {
         "scenes": len(rows),
-        "share_of_seats": whole.fraction,
-        "none": agreement(whole.none),
-        "all": agreement(whole.every),
-        **whole.as_dict(),
+        "share_of_seats": CONTROL_FRACTION,
+        "none": agreement(whole["none"][0]),
+        "all": agreement(whole["all"][0]),
+        **placement_figures(whole),
     }
 
 
@@ -93,31 +88,14 @@ def judge_calibration(weights: Weights, examples: Iterable[Example], seed: int) 
 SCAN_EXPOSURES = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # of the reference; the darkest of the training is judged, too
 
 
-@dataclass(frozen=True)
-class ScanFigures:
-    """Figures of uniform scans on validation scenes."""
-
-    record: dict[str, Any]  # their scores, for the record of the weights
-    scores: MapScores  # corrections of expected scores
-
-
-@dataclass(frozen=True)
-class _JudgedScan:
-    """Counts of the map of a uniform scan, read in full."""
-
-    counts: Counts
-    sure: NDArray[np.float64]  # `confidence_counts`
-    expected: Floats  # `expected_counts`
-
-
 def judge_scans(
     weights: Weights,
     examples: Sequence[Example],
     augmentation: CaptureAugmentation | None,
     seed: int,
     report: Report = lambda what, done, figure: None,
-) -> ScanFigures | None:
-    """Return the scores of uniform scans, read in full, by line spacing and exposure.
+) -> tuple[dict[str, Any], MapScores] | None:
+    """Return the scores of uniform scans, read in full, for a record, and corrections of expected scores.
 
     None without a scene, or without an ``augmentation``: the training then had the reference exposure alone. In the
     record ``miou`` and the IoU of each class are tables (step, exposure) of means over the scenes. ``spread`` is the
@@ -139,13 +117,13 @@ def judge_scans(
         for j, exposure_ms in enumerate(exposures):
             rng = np.random.default_rng([seed, 0x5CA, i, j])
             judged = [_scanned(weights, one, augmentation, step, exposure_ms / REFERENCE_MS, rng) for one in known]
-            counts = [one.counts for one in judged]
-            calibration[i, j] = calibration_error(np.sum([one.sure for one in judged], axis=0))
+            counts = [one.counts for one, _ in judged]
+            calibration[i, j] = calibration_error(np.sum([sure for _, sure in judged], axis=0))
             own = [mean_iou(one) for one in counts]
             miou[i, j], spread[i, j] = np.nanmean(own), np.nanstd(own, ddof=1) if len(own) > 1 else np.nan
             with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of an absent class
                 of_classes[:, i, j] = np.nanmean([iou_per_class(one) for one in counts], axis=0)
-            maps[step, exposure_ms] = [ScoredMap(one.counts, one.expected) for one in judged]
+            maps[step, exposure_ms] = [one for one, _ in judged]
             figure = f"lines {step} px apart, {exposure_ms:g} ms: {100 * miou[i, j]:.1f}"
             report("judging scans", len(maps) / miou.size, figure)
     record = {
@@ -161,7 +139,7 @@ def judge_scans(
             if np.isfinite(iou).all()
         },
     }
-    return ScanFigures(record, MapScores.fitted(maps))
+    return record, MapScores.fitted(maps)
 
 
 def _scanned(
@@ -171,8 +149,8 @@ def _scanned(
     step: int,
     light: float,
     rng: np.random.Generator,
-) -> _JudgedScan:
-    """Simulate a uniform scan of a scene, segment it in full and compare the map with the labels."""
+) -> tuple[ScoredMap, Floats]:
+    """Simulate a uniform scan of a scene and segment it in full; return counts of the map and its confidence."""
     assert example.noise is not None
     grid, _, labels = _parts(weights, example)
     plain, classes = example.columns.astype(np.float32), weights.config.classes
@@ -181,17 +159,12 @@ def _scanned(
     valid = (labels != UNLABELLED) & np.isfinite(drawn.confidence)
     sure = confidence_counts(drawn.confidence[valid], drawn.classes[valid] == labels[valid])
     expected = expected_counts([every_class[valid]], classes)
-    return _JudgedScan(confusion(labels, drawn.classes, classes), sure, expected)
+    return ScoredMap(confusion(labels, drawn.classes, classes), expected), sure
 
 
 def _parts(weights: Weights, example: Example) -> tuple[SceneGrid, Patches, NDArray[np.uint8]]:
     grid = SceneGrid(*example.shape, weights.config.patch, 1)
     return grid, patches_of(example.columns, grid.patch).astype(np.float32), example.labels[: grid.height, : grid.width]
-
-
-def _added(parts: list[Counts]) -> Counts:
-    counts: Counts = np.sum(parts, axis=0)
-    return counts
 
 
 def judge_baselines(

@@ -110,7 +110,7 @@ def measure_ood(request: OodRequest, report: Report = lambda what, done, figure:
         "scenes": len(scenes.train.examples),
         "validation": len(frames),
         CALIBRATION: judge_calibration(weights, frames, seed),
-        **({} if scans is None else {MAP_SCORES: scans.scores.as_dict()}),
+        **({} if scans is None else {MAP_SCORES: scans[1].as_dict()}),
     }
     files, trained = (request.weights, request.out), trained_on(data, scenes, darkest_ms)
     try:

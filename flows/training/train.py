@@ -80,10 +80,10 @@ def train_weights(
         report,
     )
     if scans is not None:
-        record["scans"] = scans.record
+        record["scans"] = scans[0]
     save_weights(with_record(weights, **record), request.out)
     checkpoint.unlink(missing_ok=True)
-    about = {"command": request.command, **({} if scans is None else {MAP_SCORES: scans.scores.as_dict()})}
+    about = {"command": request.command, **({} if scans is None else {MAP_SCORES: scans[1].as_dict()})}
     try:
         fit_and_add(weights, (request.out, request.out), scenes, trained, settings.seed, about, report)
     except SceneError as error:

@@ -6,7 +6,6 @@ This is evaluation only: it needs labels and the whole scene at full resolution.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -80,27 +79,21 @@ def captured_gain(bought: float, best: float) -> float | None:
     return bought / best if best > 0 else None
 
 
-@dataclass(frozen=True)
-class Controls:
-    """Confusion counts of each placement at one fraction of the patches (mode ``frame``)."""
+Placements = dict[str, list[Counts]]  # row -> confusion counts of its map; of ``random`` several
 
-    fraction: float
-    patch_index: int
-    none: Counts
-    every: Counts
-    policies: dict[str, Counts]
-    random: list[Counts]
 
-    def as_dict(self) -> dict[str, dict[str, Any]]:
-        """Return `agreement` and the fraction of the gap closed of every row; mean and spread of the random ones."""
-        none, every = mean_iou(self.none), mean_iou(self.every)
-        rows: dict[str, dict[str, Any]] = {}
-        for policy, draws in {**{name: [one] for name, one in self.policies.items()}, "random": self.random}.items():
-            each = [agreement(counts) for counts in draws]
-            means = {name: float(np.mean([one[name] for one in each])) for name in each[0]}
-            spread = float(np.std([one["miou"] for one in each], ddof=1)) if len(each) > 1 else None
-            rows[policy] = {**means, "spread": spread, "gap_closed": gap_closed(means["miou"], none, every)}
-        return rows
+def placement_figures(rows: Placements) -> dict[str, dict[str, Any]]:
+    """Return `agreement` and the fraction of the gap closed of every policy; mean and spread of the random one."""
+    none, every = (mean_iou(rows[name][0]) for name in ("none", "all"))
+    found: dict[str, dict[str, Any]] = {}
+    for policy, draws in rows.items():
+        if policy in ("none", "all"):
+            continue
+        each = [agreement(counts) for counts in draws]
+        means = {name: float(np.mean([one[name] for one in each])) for name in each[0]}
+        spread = float(np.std([one["miou"] for one in each], ddof=1)) if len(each) > 1 else None
+        found[policy] = {**means, "spread": spread, "gap_closed": gap_closed(means["miou"], none, every)}
+    return found
 
 
 def run_controls(
@@ -115,7 +108,7 @@ def run_controls(
     policies: tuple[str, ...] = ("gain", "entropy", "sobel"),
     among: NDArray[np.bool_] | None = None,
     report: Callable[[str], None] = lambda row: None,
-) -> Controls:
+) -> Placements:
     """Segment with no patch, every patch, and ``fraction`` of the valid patches by each policy and at random.
 
     ``fine`` (patch, p, p, column) are normalised columns of every patch of the padded grid, ``labels`` (y, x) class
@@ -133,11 +126,9 @@ def run_controls(
     def placed(policy: str, number: int = 0) -> NDArray[np.integer]:
         return frame_patches(score_patches(policy, seen, seed=seed + number), fraction, valid)
 
-    return Controls(
-        fraction,
-        len(placed("random")),
-        counts("none", np.empty(0, np.int64)),
-        counts("all", np.flatnonzero(valid)),
-        {policy: counts(policy, placed(policy)) for policy in policies},
-        [counts("random", placed("random", 1000 * (draw + 1))) for draw in range(RANDOM_DRAWS)],
-    )
+    return {
+        "none": [counts("none", np.empty(0, np.int64))],
+        "all": [counts("all", np.flatnonzero(valid))],
+        **{policy: [counts(policy, placed(policy))] for policy in policies},
+        "random": [counts("random", placed("random", 1000 * (draw + 1))) for draw in range(RANDOM_DRAWS)],
+    }
