@@ -22,7 +22,7 @@ from flows.evaluate.frames import (
 from flows.evaluate.judge import Record, judge_frame, seeds_of, summarise
 from flows.terminal.processes import writing
 from flows.terminal.progress import StageProgress, on_stdout
-from flows.training.data import TrainingData, alike_notes, scene_notes
+from flows.training.data import TrainingData
 from models.evaluation.metrics import LEVEL
 from models.network.machine import choose_device, keep_freed_memory
 from models.weights.files import Weights, load_weights
@@ -86,7 +86,7 @@ def evaluate_weights(request: EvaluateRequest, show: Show = lambda what, done, w
         "settings": {**asked, "level": LEVEL, "camera": asdict(candidates[0].camera)},
         "seeds": [[candidates[number].path.name for number in one] for one in seeds_of(runs)],
         **summarise(runs, candidates[0].described.class_names, request),
-        "data_notes": [*data.notes, *alike_notes(jobs.alike), *scene_notes(jobs.empty, jobs.regridded)],
+        "data_notes": [*data.notes, *jobs.notes],
         "files": [],
     }
     if request.out is not None:

@@ -13,8 +13,17 @@ from numpy.typing import NDArray
 from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
 from flows.settings.values import UNKNOWN_AUTO, UNKNOWN_OFF
 from models.network.machine import choose_device
-from models.weights.files import Description, Weights, describe_weights, load_ood, load_reader, load_weights
-from models.weights.parts import TRAINED_ON, OodPart, TrainedOn
+from models.weights.files import (
+    TRAINED_ON,
+    Description,
+    OodPart,
+    TrainedOn,
+    Weights,
+    describe_weights,
+    load_ood,
+    load_reader,
+    load_weights,
+)
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.ground.map_grid import median_footprint_m
 from pipeline.ground.view import GroundView

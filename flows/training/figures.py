@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,9 @@ from numpy.typing import NDArray
 from sklearn.ensemble import RandomForestClassifier
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.linear_model import LogisticRegression
+from torch import Tensor, nn
 
 from flows.training.data import Report
-from models.evaluation.cascade import CascadeTable, ReadTwice
 from models.evaluation.expected_scores import Floats, MapScores, ScoredMap, expected_counts
 from models.evaluation.metrics import (
     JudgedMap,
@@ -26,14 +27,14 @@ from models.evaluation.metrics import (
     judge_confidence,
     mean_iou,
 )
-from models.evaluation.placement import CONTROL_FRACTION, placement_figures, run_controls
+from models.evaluation.placement import CONTROL_FRACTION, CascadeTable, ReadTwice, placement_figures, run_controls
 from models.network.sizes import PLANES
 from models.network.spectral import LineSpec, patches_of
 from models.policies.policies import score_patches
 from models.reading.inference import coarse_prediction_of_columns, map_of_columns, segment
 from models.training.capture_augmentation import REFERENCE_MS, STEPS, CaptureAugmentation
 from models.training.examples import Example
-from models.training.start import LabelledPixels
+from models.training.train import LabelledPixels
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 
@@ -165,6 +166,34 @@ def _scanned(
 def _parts(weights: Weights, example: Example) -> tuple[SceneGrid, Patches, NDArray[np.uint8]]:
     grid = SceneGrid(*example.shape, weights.config.patch, 1)
     return grid, patches_of(example.columns, grid.patch).astype(np.float32), example.labels[: grid.height, : grid.width]
+
+
+def better_reading(
+    weights: Weights, start: Mapping[str, Tensor], validation: Sequence[Example]
+) -> tuple[Weights, dict[str, Any]]:
+    """Choose the better of the trained network and its initial linear discriminants, by mIoU of validation scenes.
+
+    Returns the better weights, and both scores.
+    """
+    plain = copy.deepcopy(weights.segmenter)
+    plain.load_state_dict(dict(start), strict=False)
+    for last in (plain.overview_classes, plain.full_classes):
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)  # type: ignore[arg-type]
+    readings = {"network": weights, "linear discriminants": replace(weights, segmenter=plain)}
+    scores = {name: _miou(one, validation) for name, one in readings.items()}
+    kept = max(scores, key=lambda name: scores[name])  # the network on a tie
+    return readings[kept], {"miou": scores, "kept": kept}
+
+
+def _miou(weights: Weights, examples: Sequence[Example]) -> float:
+    """Return the mIoU of all scenes together, by every line at the reference exposure."""
+    counts = np.zeros((weights.config.classes,) * 2, np.int64)
+    for example in examples:
+        grid, _, labels = _parts(weights, example)
+        drawn, _ = map_of_columns(weights, example.columns.astype(np.float32), grid)
+        counts += confusion(labels, drawn.classes, weights.config.classes)
+    return mean_iou(counts)
 
 
 def judge_baselines(

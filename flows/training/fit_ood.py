@@ -19,8 +19,7 @@ from flows.training.train_scenes import Scenes, TrainRequest, check_out, observe
 from models.training.capture_augmentation import REFERENCE_MS
 from models.training.ood_fit import fit_ood
 from models.training.train import TrainingSettings
-from models.weights.files import CALIBRATION, Weights, add_ood, load_weights
-from models.weights.parts import MAP_SCORES, TrainedOn
+from models.weights.files import CALIBRATION, MAP_SCORES, TrainedOn, Weights, add_ood, load_weights
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.scenes.built_in import built_in_laws

@@ -15,18 +15,23 @@ from rich.console import Console
 
 from flows.terminal.progress import one_after_the_other, table
 from flows.training.data import Report, open_training_data
-from flows.training.figures import judge_baselines, judge_calibration, judge_cascade, judge_scans, validate
+from flows.training.figures import (
+    better_reading,
+    judge_baselines,
+    judge_calibration,
+    judge_cascade,
+    judge_scans,
+    validate,
+)
 from flows.training.fit_ood import fit_and_add, trained_on
 from flows.training.train_scenes import Scenes, TrainRequest, check_out, network_config, observe_all, training_capture
 from models.network.machine import choose_device
 from models.network.spectral import Normalisation
 from models.training.capture_augmentation import REFERENCE_MS
 from models.training.examples import measured_normalisation
-from models.training.start import LabelledPixels, better_reading, linear_discriminants
-from models.training.train import Progress, train
+from models.training.train import LabelledPixels, Progress, linear_discriminants, train
 from models.weights.checksummed_files import load_checkpoint
-from models.weights.files import CALIBRATION, CASCADE, Weights, save_weights, with_record
-from models.weights.parts import MAP_SCORES, TRAINED_ON
+from models.weights.files import CALIBRATION, CASCADE, MAP_SCORES, TRAINED_ON, Weights, save_weights, with_record
 from pipeline.errors import SceneError, SettingsError
 from pipeline.simulator.scenes.built_in import built_in_laws
 

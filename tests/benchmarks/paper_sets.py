@@ -21,8 +21,7 @@ from models.network.sizes import SegmenterConfig
 from models.network.spectral import LineSpec, SpectralBasis, with_planes
 from models.training.capture_augmentation import CaptureAugmentation, ColumnNoise
 from models.training.examples import measured_normalisation, normalised, observe
-from models.training.start import LabelledPixels, linear_discriminants
-from models.training.train import Progress, TrainingSettings, train
+from models.training.train import LabelledPixels, Progress, TrainingSettings, linear_discriminants, train
 from models.weights.files import Weights, load_weights, save_weights
 from pipeline.errors import SceneError, WeightsError
 from pipeline.geometry.camera import LineCamera

@@ -80,9 +80,9 @@ def test_frames_trained_on_are_left_out(data: Path, tmp_path: Path):
     assert content["weights"][0]["left_out"] == sorted(split["train"])
     assert content["frames"] == sorted({"003", *split["validation"]})
     assert content["left_out"] == sorted(split["train"])
-    with pytest.raises(SceneError, match=r"was trained on all 1 frames .* frames trained on are refused"):
+    with pytest.raises(SceneError, match="frames trained on are refused"):
         evaluate_weights(EvaluateRequest(str(data), (out,), frames=tuple(split["train"])))
-    with pytest.raises(SceneError, match=rf"no weights are left for {next(iter(split['train']))} of --frames"):
+    with pytest.raises(SceneError, match=rf"no weights are left for {next(iter(split['train']))}: "):
         evaluate_weights(EvaluateRequest(str(data), (out,), frames=FRAMES))
 
 
@@ -156,13 +156,13 @@ def test_frames_without_a_label_are_refused(data: Path, tmp_path: Path):
 def test_weights_that_cannot_be_judged_together_are_refused(tmp_path: Path):
     """A record that is none of a camera, the same file twice, and other classes."""
     (one,) = open_candidates((write_weights(tmp_path / "w.safetensors", camera={"lens": 1}),))
-    with pytest.raises(WeightsError, match="its camera is damaged"):
+    with pytest.raises(WeightsError, match=r"cannot read .*lens"):
         _ = one.camera
     first, again = write_weights(tmp_path / "a.safetensors"), write_weights(tmp_path / "b.safetensors")
     with pytest.raises(SettingsError, match="the same weights are given twice"):
         open_candidates((first, again))
     save_weights(make_weights(1, classes=3, columns=3), again)
-    with pytest.raises(SettingsError, match=r"differs from .* in sizes or classes"):
+    with pytest.raises(SettingsError, match=r"differs from .* in camera, sizes or classes"):
         open_candidates((first, again))
 
 

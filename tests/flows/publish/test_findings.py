@@ -15,8 +15,7 @@ from flows.publish.findings import changed_hectares, older_hectares
 from flows.publish.receipt_table import finding_rows
 from models.evaluation.expected_scores import MapScores, expected_counts, expected_score
 from models.reading.ood import Limits, OodDetector
-from models.weights.files import add_ood
-from models.weights.parts import MAP_SCORES, TrainedOn
+from models.weights.files import MAP_SCORES, TrainedOn, add_ood
 from pipeline.errors import WeightsError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.field_places import NoPlace

@@ -25,8 +25,7 @@ from models.evaluation.expected_scores import MapScores
 from models.evaluation.metrics import mean_iou
 from models.training.examples import Example
 from models.training.train import TrainingSettings
-from models.weights.files import describe_weights, load_ood, load_weights
-from models.weights.parts import TrainedOn
+from models.weights.files import TrainedOn, describe_weights, load_ood, load_weights
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.scenes.scene import RasterScene

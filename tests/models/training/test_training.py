@@ -15,8 +15,7 @@ from models.reading.inference import map_of_columns
 from models.training import train as training
 from models.training.examples import CropSampler
 from models.training.objective import batch_loss, class_weights, draw_patches, map_loss, phase_at, pixel_losses
-from models.training.start import LabelledPixels, linear_discriminants
-from models.training.train import Progress, TrainingSettings, rate_at, train
+from models.training.train import LabelledPixels, Progress, TrainingSettings, linear_discriminants, rate_at, train
 from pipeline.geometry.grid import SceneGrid
 from tests.models.conftest import Maker, block_example
 
