@@ -235,7 +235,7 @@ def evaluate(
         Weights; repeat the flag for several seeds or folds. Each frame is evaluated by the weights that were not
         trained on it.
     out
-        Folder of evaluation.json and evaluation.png.
+        Folder of evaluation.json.
     fractions
         Fractions of the patches to read at full resolution, with commas. Default: 0.05,0.1,0.15,0.2,0.35; none and all
         are always included.

@@ -12,10 +12,9 @@ import pytest
 from rich.console import Console
 
 from flows.cli.main import main
-from flows.evaluate.command import evaluate_weights, run_evaluate
+from flows.evaluate.command import evaluate_weights, print_evaluation, run_evaluate
 from flows.evaluate.frames import EvaluateRequest, open_candidates
 from flows.evaluate.judge import ORACLE, collect_row, difference, judge_frame, seeds_of, summarise
-from flows.evaluate.table import print_evaluation
 from flows.training.data import farm_test_data, pack_mask
 from flows.training.train import train_weights
 from flows.training.train_scenes import TrainRequest
@@ -48,7 +47,7 @@ def test_every_row_is_there(judged: Judged):
     assert keys == [("none", 0.0), *policies, ("all", 1.0)]
     assert content["frames"] == list(FRAMES)
     assert [one["frames"] for one in content["weights"]] == [3, 3]
-    assert {path.name for path in folder.iterdir()} == {"evaluation.json", "evaluation.png"}
+    assert {path.name for path in folder.iterdir()} == {"evaluation.json"}
     kept = json.loads((folder / "evaluation.json").read_text())
     assert kept["rows"][1]["miou"] == content["rows"][1]["miou"]
     row = _row(content, "entropy", 0.25)
