@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from models.evaluation.metrics import agreement, confusion, gap_closed, mean_iou
 from models.network.sizes import MOST_GAIN
-from models.network.spectral import LineSpec, patches_of
+from models.network.spectral import patches_of
 from models.policies.policies import score_patches
 from models.reading.inference import CoarsePrediction, captured, overview_of, patch_logits, segment
 from models.weights.files import Weights
@@ -30,6 +30,7 @@ else:
 
 Values = NDArray[np.floating]
 RANDOM_DRAWS = 5
+COMPARED = ("gain", "entropy", "sobel")  # policies beside the random one
 LEAST_GAINS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2)  # thresholds [nat per px]
 CONTROL_FRACTION = 0.35  # of the valid patches: K = 35 % of surveys' receipts and of the weights' records
 Counts = NDArray[np.int64]
@@ -106,23 +107,20 @@ def run_controls(
     *,
     fraction: float,
     seed: int,
-    capture: LineSpec | None = None,
-    policies: tuple[str, ...] = ("gain", "entropy", "sobel"),
     among: NDArray[np.bool_] | None = None,
     report: Callable[[str], None] = lambda row: None,
 ) -> Placements:
     """Segment with no patch, every patch, and ``fraction`` of the valid patches by each policy and at random.
 
     ``fine`` (patch, p, p, column) are normalised columns of every patch of the padded grid, ``labels`` (y, x) class
-    indices, 255 unlabelled. ``capture`` describes their capture (None: that of the overview), ``among``
-    (patch,) which of them may be chosen (None: all).
+    indices, 255 unlabelled. ``among`` (patch,) says which patches may be chosen (None: all).
     """
     valid = seen.grid.valid_fraction().ravel() > 0
     valid = valid if among is None else valid & among
 
     def counts(row: str, patch_index: NDArray[np.integer]) -> Counts:
         report(row)
-        drawn = segment(weights, seen, fine[patch_index], patch_index, capture=capture)
+        drawn = segment(weights, seen, fine[patch_index], patch_index)
         return confusion(labels, drawn.classes, weights.config.classes)
 
     def placed(policy: str, number: int = 0) -> NDArray[np.integer]:
@@ -131,7 +129,7 @@ def run_controls(
     return {
         "none": [counts("none", np.empty(0, np.int64))],
         "all": [counts("all", np.flatnonzero(valid))],
-        **{policy: [counts(policy, placed(policy))] for policy in policies},
+        **{policy: [counts(policy, placed(policy))] for policy in COMPARED},
         "random": [counts("random", placed("random", 1000 * (draw + 1))) for draw in range(RANDOM_DRAWS)],
     }
 

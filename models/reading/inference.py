@@ -94,19 +94,17 @@ def read_coarse_pass(
     grid: SceneGrid,
     *,
     capture: Capture = LineSpec(),  # noqa: B008 - a value
-    factor: int = 1,
     origin: tuple[int, int] = (0, 0),
     components: Components | None = None,
 ) -> CoarsePass:
-    """Project a mosaic onto the spectral columns of the weights, some rows at a time; coarse pixels are repeated.
+    """Project a mosaic onto the spectral columns of the weights, some rows at a time.
 
     ``strips`` are parts of the mosaic from the top down: values (y, x, band), or scores (y, x, component) of
-    ``components``. A pixel is ``factor`` fine ones a side. ``origin`` is the row and column of the grid's first patch
-    in a larger field. A value beyond `Normalisation.most_value` counts as NaN.
+    ``components``. ``origin`` is the row and column of the grid's first patch in a larger field. A value beyond
+    `Normalisation.most_value` counts as NaN.
     """
-    s, (rows, width) = factor, (-(-grid.height // factor), -(-grid.width // factor))
-    columns, filled = np.empty((rows, width, weights.config.columns), np.float32), 0
-    known = np.zeros((rows, width), np.bool_)
+    shape, filled = (grid.height, grid.width), 0
+    columns, known = np.empty((*shape, weights.config.columns), np.float32), np.zeros(shape, np.bool_)
     for strip in strips:
         last = filled + len(strip)
         if components is None:
@@ -115,9 +113,8 @@ def read_coarse_pass(
             columns[filled:last] = weights.columns_of_scores(strip, components, wavelength_nm)
         known[filled:last] = ~np.isnan(strip).all(axis=-1)
         filled = last
-    wild = (dead_pixels(columns) & known).repeat(s, 0).repeat(s, 1)[: grid.height, : grid.width]
-    fine = columns.repeat(s, 0).repeat(s, 1)[: grid.height, : grid.width] if s > 1 else columns
-    columns = np.ascontiguousarray(pad_by_reflection(fine, grid.padded_shape), np.float32)
+    wild = dead_pixels(columns) & known
+    columns = np.ascontiguousarray(pad_by_reflection(columns, grid.padded_shape), np.float32)
     dead = dead_pixels(columns)
     return CoarsePass(
         grid,

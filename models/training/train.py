@@ -209,10 +209,10 @@ class LabelledPixels:
     labels: NDArray[np.uint8]  # (pixel,)
 
     @staticmethod
-    def drawn(examples: Sequence[Example], rng: np.random.Generator, most: int = PIXELS) -> LabelledPixels:
-        """Draw labelled pixels at random, ``most`` together, from each scene in proportion to its number."""
+    def drawn(examples: Sequence[Example], rng: np.random.Generator) -> LabelledPixels:
+        """Draw labelled pixels at random, at most `PIXELS`, from each scene in proportion to its number."""
         counts = [int(np.count_nonzero(one.labels != UNLABELLED)) for one in examples]
-        fraction = min(1.0, most / max(sum(counts), 1))
+        fraction = min(1.0, PIXELS / max(sum(counts), 1))
         features, labels = [], []
         for example, count in zip(examples, counts, strict=True):
             places = np.flatnonzero(example.labels != UNLABELLED)

@@ -51,7 +51,7 @@ def test_17_a_token_dead_in_most_of_its_coarse_pixels_is_not_read(patch: int, mo
     weights, grid = plain_weights(patch=patch), SceneGrid(128, 128, patch, 2)
     values = _scene(64, 64)
     values[:8, :16], values[8, :more] = np.nan, np.nan
-    seen = read_coarse_pass(weights, [values], NM, grid, factor=2)
+    seen = read_coarse_pass(weights, [values.repeat(2, 0).repeat(2, 1)], NM, grid)
     assert np.isfinite(seen.columns).all()
     assert seen.living is not None
     assert np.flatnonzero(~seen.living).tolist() == [0] * more
