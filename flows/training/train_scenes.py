@@ -68,7 +68,7 @@ class Common:
 
 @dataclass(frozen=True)
 class Imaged:
-    """Imaged scenes, with what a record says of them."""
+    """Imaged scenes, and entries of the record of weights about them."""
 
     examples: list[Example] = field(default_factory=list)
     keys: dict[str, str] = field(default_factory=dict)  # scene -> identity of its light

@@ -295,13 +295,13 @@ def load_weights(path: Path) -> Weights:
         _check_numbers(tensors)
         normalisation = Normalisation(*(tensors.pop(f"normalisation.{name}").numpy() for name in NORMALISATION))
         colours = tensors.pop(COLOURS).numpy()
+        network.load_state_dict(tensors, assign=True)
         own, of_columns = normalisation, (config.columns,)
         shapes = [one.shape for one in (own.centre, own.spread, own.whitening, colours)]
         if shapes != [of_columns, of_columns, of_columns * 2, (config.classes, 3)]:
             raise ValueError(f"normalisation and colours {shapes} do not fit {config.columns} columns")
         if not (normalisation.spread > 0).all():
             raise ValueError("normalisation.spread has a value that is not above 0")
-        network.load_state_dict(tensors, assign=True)
     return Weights(network.eval(), described.basis, normalisation, described.class_names, colours, described.record)
 
 

@@ -463,7 +463,7 @@ def test_30_another_number_of_classes_names_the_tensor(tmp_path: Path):
     weights, path = plain_weights(), tmp_path / "w.safetensors"
     weights.segmenter.config = replace(weights.config, classes=5)
     save_weights(replace(weights, class_names=tuple("abcde")), path)
-    with pytest.raises(ValueError, match=r"tensor overview_classes.weight should be \(5, 8, 1, 1\)"):
+    with pytest.raises(ValueError, match=r"size mismatch for overview_classes\.weight"):
         load_weights(path)
 
 

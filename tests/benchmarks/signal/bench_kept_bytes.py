@@ -17,7 +17,7 @@ from measure import Row
 from numpy.typing import NDArray
 
 from flows.settings.survey_settings import SignalChoice
-from flows.tradeoff import scan_lines
+from flows.tradeoff import store
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.machine import one_thread
 from models.network.spectral import LineSpec
@@ -40,7 +40,7 @@ Floats = NDArray[np.floating]
 class Farm:
     """The scores of a farm's lines, and how its map is drawn."""
 
-    scan: scan_lines.ScanLines
+    scan: store.ScanLines
     components: Components
     scores: NDArray[np.float32]  # (line, sample, component)
     maps: list[tuple[DrawnMap, SceneGrid, NDArray[np.uint8], float]]  # the last one drawn: grid, labels and mIoU
@@ -79,8 +79,8 @@ def _farm(seed: int) -> Farm:
         maps.append((drawn, grid, labels, 100 * score))
         return score
 
-    scan_lines._miou = judge
-    scan, choice = scan_lines.scan_farm(seed), SignalChoice()
+    store._miou = judge
+    scan, choice = store.scan_farm(seed), SignalChoice()
     found = SignalStatistics(scan.values.shape[2], scan.values[..., 0].size)
     blocks = list(calibrated_blocks(scan.lines, scan.camera))
     for _, values, valid in blocks:
@@ -131,7 +131,7 @@ def _blocks(farm: Farm, grid: SceneGrid) -> tuple[NDArray[np.int64], tuple[int, 
     """Block of lines and samples that shows each pixel (y, x) of the field, and how many there are."""
     lines, samples = farm.scores.shape[:2]
     places = np.stack(np.meshgrid(np.arange(lines), np.arange(samples), indexing="ij"), -1).astype(np.float32)
-    plain = replace(farm.scan.lines, references=scan_lines._as_they_are(places.shape), data=places)
+    plain = replace(farm.scan.lines, references=store._unit_references(places.shape), data=places)
     index = grid.valid_patches()
     values, _ = read_patches([plain], farm.scan.camera, grid, index, "nearest")
     image = np.zeros((*grid.padded_shape, 2), np.float32)
