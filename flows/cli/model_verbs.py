@@ -83,8 +83,6 @@ class TrainFlags(SceneFlags):
         Channels of the overview network.
     columns
         Number of spectral features per pixel, for any camera.
-    init
-        Initial weights, from this command. The output and the weights list what was taken from them.
     train_temporal
         Weights to which only a temporal reader is added, for surveys with --prior. It takes --scenes, --steps,
         --minutes, --seed and --validation, and resumes. It needs 4 GB of memory, and half an hour for reading the
@@ -121,7 +119,6 @@ class TrainFlags(SceneFlags):
     width: int = TrainRequest.width
     overview_width: int = TrainRequest.overview_width
     columns: int = TrainRequest.columns
-    init: Path | None = None
     train_temporal: Path | None = None
     fit_ood: Path | None = None
     dim: int = 64
@@ -160,7 +157,6 @@ class TrainFlags(SceneFlags):
             self.width,
             self.overview_width,
             tokens={"dim": self.dim, "layers": self.layers, "heads": self.heads, "mlp_ratio": self.mlp_ratio},
-            init=self.init,
             choices=self.choices(),
             settings=settings,
             command=command,
@@ -178,7 +174,7 @@ class EvaluateFlags(SceneFlags):
         Weights; repeat the flag for several seeds or folds. Each frame is evaluated by the weights that were not
         trained on it.
     out
-        Folder of evaluation.json and evaluation.png.
+        Folder of evaluation.json.
     fractions
         Fractions of the patches to read at full resolution, with commas; none and all are always included.
     policies

@@ -1,1 +1,1 @@
-"""Weights judged on frames that they never saw: figures with intervals, costs, plots."""
+"""Weights judged on frames that they never saw: figures with intervals, and costs."""

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.tasks.scene import check_labels, judged_labels
-from flows.training.data import TrainingData, farm_test_data, only_class, open_training_data
+from flows.tasks.scene import check_labels, judged_labels, seen_in_training
+from flows.training.data import TrainingData, alike_notes, farm_test_data, only_class, open_training_data, scene_notes
 from flows.training.observed_scenes import observe_scene
 from models.evaluation.metrics import DRAWS
 from models.network.machine import PROCESSOR
@@ -24,8 +24,9 @@ from models.network.spectral import patches_of
 from models.policies.policies import POLICIES
 from models.reading.inference import CoarsePrediction, coarse_prediction_of_columns
 from models.training.examples import normalised
+from models.weights.checksummed_files import refusing
 from models.weights.files import Description, Weights, describe_weights
-from pipeline.errors import EmptySceneError, PipelineError, SceneError, SettingsError, WeightsError
+from pipeline.errors import EmptySceneError, SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.simulator.scenes.built_in import built_in_laws
@@ -76,47 +77,26 @@ FARM_TEST_SCENES = 4
 
 @dataclass(frozen=True)
 class Candidate:
-    """Weights to judge: their file, its description and hash."""
+    """Weights to judge: their file and its description."""
 
     path: Path
     described: Description
-    key: str
 
-    @staticmethod
-    def of(path: Path) -> Candidate:
-        """Read the description of a file. Raises WeightsError."""
-        described = describe_weights(path)
-        return Candidate(path, described, described.key[:16])
+    @property
+    def key(self) -> str:
+        """Return the hash of the weights, shortened."""
+        return self.described.key[:16]
 
     @property
     def camera(self) -> LineCamera:
-        known = self.described.record.get("camera")
-        try:
-            return LineCamera(**known) if isinstance(known, dict) else LineCamera()
-        except (TypeError, PipelineError) as error:
-            raise WeightsError(f"{self.path}: its camera is damaged ({error}); copy or train the file again") from error
-
-    def trained_on(self, scene: RasterScene, name: str, law: str, *, bands_chosen: bool = False) -> bool:
-        """Return whether these weights were trained on all labels of the scene.
-
-        The key of a scene depends on its bands. If bands or wavelengths were chosen, here or in the training, a frame
-        of the data set ``law`` is also recognised by its name.
-        """
-        train, record = self.split.get("train", {}), self.described.record
-        if scene.key in train.values():
-            return self.pixels_of(scene) is None
-        chosen = bands_chosen or any(flag in record.get("command", "") for flag in ("--bands", "--wavelengths"))
-        return chosen and record.get("data") == law and name in train
+        """Return the camera model of the training. Raises WeightsError: its record is damaged."""
+        with refusing(self.path):
+            return LineCamera(**self.described.record.get("camera", {}))
 
     def pixels_of(self, scene: RasterScene) -> str | None:
         """Return the packed mask of a scene's training pixels; None for all pixels."""
         pixels: str | None = self.split.get("pixels", {}).get(scene.key)
         return pixels
-
-    @property
-    def held_out(self) -> tuple[str, ...]:
-        """Return the frames held out of the training."""
-        return tuple(self.split.get("held_out", ()))
 
     @property
     def split(self) -> dict[str, Any]:
@@ -144,18 +124,14 @@ def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
     """
     if not paths:
         raise SettingsError("evaluate needs --weights FILE; train some with: spectralzoom train DATASET -o FILE")
-    found = [Candidate.of(path) for path in paths]
-    first = found[0].described
-    for other in found[1:]:
-        if other.camera != found[0].camera:
+    found = [Candidate(path, describe_weights(path)) for path in paths]
+    first = found[0]
+    for one in found[1:]:
+        alike = one.described.config == first.described.config and one.camera == first.camera
+        if not alike or one.described.class_names != first.described.class_names:
             raise SettingsError(
-                f"{other.path} and {found[0].path} were trained with different camera models; evaluate them separately"
-            )
-        described = other.described
-        if (described.config, described.class_names) != (first.config, first.class_names):
-            raise SettingsError(
-                f"{other.path} differs from {found[0].path} in sizes or classes; several --weights are seeds of one "
-                "training: evaluate different ones separately"
+                f"{one.path} differs from {first.path} in camera, sizes or classes; several --weights are seeds of one"
+                " training: evaluate different ones separately"
             )
     if len({one.key for one in found}) < len(found):
         raise SettingsError("the same weights are given twice in --weights, which would count as two seeds")
@@ -204,9 +180,7 @@ class Jobs:
 
     frames: dict[str, tuple[int, ...]] = field(default_factory=dict)
     left_out: list[str] = field(default_factory=list)
-    alike: dict[str, str] = field(default_factory=dict)  # frame -> class, for frames with a single class
-    empty: list[str] = field(default_factory=list)  # frames without any value, left out
-    regridded: list[str] = field(default_factory=list)  # frames whose labels came on another grid
+    notes: tuple[str, ...] = ()  # on frames with a single class, without any value, or with labels of another grid
 
     def covered(self, number: int) -> list[str]:
         """Return the frames that these weights judge."""
@@ -219,34 +193,34 @@ def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[
     Raises SceneError: no frame or labelled pixel is left, a named frame has no weights left, or a frame has no labels;
     SettingsError: weights were trained on different pixels of a frame.
     """
-    jobs, labelled = Jobs(), False
-    chosen = any(request.choices.get(what) is not None for what in ("bands", "wavelengths"))
-    in_turn = len({one.held_out for one in weights}) > 1
+    frames, left_out, labelled = dict[str, tuple[int, ...]](), list[str](), False
+    alike, empty, regridded = dict[str, str](), list[str](), list[str]()
+    in_turn = len({tuple(one.split.get("held_out", ())) for one in weights}) > 1
     for number, name in enumerate(data.train):
         show("looking for frames", number / len(data.train), name)
         try:
             scene = data.scene(name)
         except EmptySceneError:
-            jobs.empty.append(name)
+            empty.append(name)
             continue
         if scene.labels is None:
             raise SceneError(
                 f"frame {scene.name} has no labels, which a map is judged by; give --labels or a scene.toml"
             )
         if (alone := only_class(scene)) is not None:
-            jobs.alike[name] = alone
+            alike[name] = alone
         for one in weights:
             check_labels(scene, one.described)
         fit = [
             at
             for at, one in enumerate(weights)
-            if not one.trained_on(scene, name, data.law, bands_chosen=chosen)
+            if seen_in_training(scene, one.described) != "all"
             and not (
                 in_turn and one.described.record.get("data") == data.law and name in one.split.get("validation", ())
             )
         ]
         if not fit:
-            jobs.left_out.append(name)
+            left_out.append(name)
             continue
         first = weights[fit[0]]
         for one in (weights[at] for at in fit[1:]):
@@ -255,24 +229,18 @@ def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[
                     f"{one.path} and {first.path} were trained on different pixels of {scene.name}; evaluate them "
                     "separately"
                 )
-        jobs.frames[name] = tuple(fit)
+        frames[name] = tuple(fit)
         if scene.regridded:
-            jobs.regridded.append(name)
+            regridded.append(name)
         labels = judged_labels(scene, first.described)
         labelled = labelled or (labels is not None and bool((labels != UNLABELLED).any()))
-    show("looking for frames", 1.0, f"{len(jobs.frames)} of {len(data.train)}")
-    files, left = ", ".join(str(one.path) for one in weights), ", ".join(jobs.left_out)
-    how = "judge by others, or train with some held out: spectralzoom train ... --hold-out NAMES"
-    if not jobs.frames:
+    show("looking for frames", 1.0, f"{len(frames)} of {len(data.train)}")
+    if left_out and (request.frames or not frames):
         raise SceneError(
-            f"{files} was trained on all {len(jobs.left_out)} frames of {request.dataset}, and frames trained on are "
-            f"refused: {how}"
-        )
-    if request.frames and jobs.left_out:
-        raise SceneError(
-            f"no weights are left for {left} of --frames: {files} was trained on it, and frames trained on are "
-            f"refused: {how}"
+            f"no weights are left for {', '.join(left_out)}: {', '.join(str(one.path) for one in weights)} was trained"
+            " on it, and frames trained on are refused: judge by others, or train with some held out: spectralzoom"
+            " train ... --hold-out NAMES"
         )
     if not labelled:
-        raise SceneError(f"no labelled pixel is left on the {len(jobs.frames)} frames of {request.dataset} to judge by")
-    return jobs
+        raise SceneError(f"no labelled pixel is left on the {len(frames)} frames of {request.dataset} to judge by")
+    return Jobs(frames, left_out, (*alike_notes(alike), *scene_notes(empty, regridded)))

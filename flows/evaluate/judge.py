@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.evaluate.frames import ObservedFrame
+from flows.evaluate.frames import EvaluateRequest, ObservedFrame
 from models.evaluation.metrics import (
     average_accuracy,
     confusion,
@@ -38,24 +38,12 @@ Record = dict[str, Any]
 PatchIndex = NDArray[np.intp]
 
 
-@dataclass(frozen=True)
-class Trial:
-    """Fractions of the patches and policies to judge, beside no patch, all patches and the oracle.
-
-    The oracle chooses by the labels.
-    """
-
-    fractions: tuple[float, ...]  # of the valid patches, above 0 and below 1
-    policies: tuple[str, ...]
-    seed: int = 0
-
-
-def judge_frame(trial: Trial, frame: ObservedFrame, weights: Weights) -> Record:
+def judge_frame(request: EvaluateRequest, frame: ObservedFrame, weights: Weights) -> Record:
     """Return the confusion counts, gain and multiply-adds of every policy and fraction."""
     grid = frame.seen.grid
     gain = oracle_gain(weights, frame.seen, frame.fine, frame.labels)
     rows = []
-    for policy, draw, fraction, patch_index in _rows(trial, frame, gain):
+    for policy, draw, fraction, patch_index in _rows(request, frame, gain):
         scored = 0 if policy in (*ENDS, ORACLE) else score_multiply_adds(policy, weights.config, grid)
         bought, best = gain_sums(gain, patch_index, grid.valid_patches())
         drawn = segment(weights, frame.seen, frame.fine[patch_index], patch_index).classes
@@ -74,17 +62,17 @@ def judge_frame(trial: Trial, frame: ObservedFrame, weights: Weights) -> Record:
 
 
 def _rows(
-    trial: Trial, frame: ObservedFrame, gain: NDArray[np.float64]
+    request: EvaluateRequest, frame: ObservedFrame, gain: NDArray[np.float64]
 ) -> Iterator[tuple[str, int, float, PatchIndex]]:
     """Yield policy, draw, fraction and patches of each row; the random policy has several draws."""
     allowed = frame.seen.grid.valid_fraction().ravel() > 0
     yield "none", 0, 0.0, np.empty(0, np.intp)
     yield "all", 0, 1.0, np.flatnonzero(allowed)
-    for policy in (*trial.policies, ORACLE):
+    for policy in (*request.policies, ORACLE):
         for draw in range(RANDOM_DRAWS if policy == "random" else 1):
-            seed = trial.seed + 1000 * (draw + 1)
+            seed = request.seed + 1000 * (draw + 1)
             scores = gain if policy == ORACLE else score_patches(policy, frame.seen, seed=seed)
-            for fraction in trial.fractions:
+            for fraction in request.fractions:
                 yield policy, draw, fraction, frame_patches(scores, fraction, allowed)
 
 
@@ -96,8 +84,6 @@ COSTS = ("patches", "multiply_adds")
 class Row:
     """Counts of one policy and fraction; a run is a seed and a draw. Frames that a run did not judge are zeros."""
 
-    policy: str
-    fraction: float
     counts: NDArray[np.int64]  # (run, frame, class, class)
     of_seed: NDArray[np.intp]  # (run,)
     parts: list[Record]  # rows of the records
@@ -105,12 +91,6 @@ class Row:
     def over_runs(self, figure: Callable[[Any], Any]) -> NDArray[np.float64]:
         """Return a figure of the summed counts of each run, (run,) or (run, class)."""
         return np.array([figure(run.sum(axis=0)) for run in self.counts])
-
-    @property
-    def judged(self) -> NDArray[np.bool_]:
-        """Return which frames any run has judged, (frame,)."""
-        found: NDArray[np.bool_] = self.counts.sum(axis=(0, 2, 3)) > 0
-        return found
 
 
 def seeds_of(runs: Runs) -> list[list[int]]:
@@ -130,62 +110,53 @@ def seeds_of(runs: Runs) -> list[list[int]]:
     return [members for _, members in seeds]
 
 
-def collect_row(seeds: Runs, policy: str, fraction: float) -> Row | None:
-    """Collect the counts of one row from the records of all seeds; None without a record."""
-    order = sorted({record["frame"] for records in seeds for record in records})
+def collect_row(seeds: Runs, policy: str, fraction: float) -> Row:
+    """Collect the counts of one row from the records of all seeds; frames without a labelled pixel are left out."""
     found = [
-        (number, order.index(record["frame"]), row)
+        (number, record["frame"], row)
         for number, records in enumerate(seeds)
         for record in records
         for row in record["rows"]
         if (row["policy"], row["fraction"]) == (policy, fraction)
     ]
-    if not found:
-        return None
+    order = sorted({frame for _, frame, row in found if np.any(row["counts"])})
     draws = 1 + max(row["draw"] for _, _, row in found)
     classes = len(found[0][2]["counts"])
     counts = np.zeros((len(seeds) * draws, len(order), classes, classes), np.int64)
-    for number, at, row in found:
-        counts[number * draws + row["draw"], at] = row["counts"]
-    return Row(policy, fraction, counts, np.repeat(np.arange(len(seeds)), draws), [row for _, _, row in found])
+    for number, frame, row in found:
+        if frame in order:
+            counts[number * draws + row["draw"], order.index(frame)] = row["counts"]
+    return Row(counts, np.repeat(np.arange(len(seeds)), draws), [row for _, _, row in found])
 
 
-def difference(row: Row, other: Row | None, trial: Trial, draws: int) -> Record | None:
-    """Return the paired interval of one row minus another, over their common frames; None without another."""
+def difference(row: Row, other: Row | None, request: EvaluateRequest) -> Record | None:
+    """Return the paired interval of one row minus another, over their frames; None without another."""
     if other is None or other is row:
         return None
-    both = row.judged & other.judged
-    if not both.any():
-        return {"difference": None, "low": None, "high": None, "frames": 0}
-    counts, seeds = (row.counts[:, both], other.counts[:, both]), (row.of_seed, other.of_seed)
-    found = paired_interval(*counts, seeds=seeds, draws=draws, seed=trial.seed)
-    return {**asdict(found), "frames": int(both.sum())}
+    seeds = row.of_seed, other.of_seed
+    found = paired_interval(row.counts, other.counts, seeds=seeds, draws=request.draws, seed=request.seed)
+    return {**asdict(found), "frames": row.counts.shape[1]}
 
 
-def summarise(runs: Runs, class_names: Sequence[str], trial: Trial, draws: int) -> Record:
+def summarise(runs: Runs, class_names: Sequence[str], request: EvaluateRequest) -> Record:
     """Return the figures of every row, compared with all patches and with the random policy.
 
-    ``runs`` are the records of `judge_frame` of each of the weights, ``draws`` those of the bootstrap.
+    ``runs`` are the records of `judge_frame` of each of the weights.
     """
     seeds = [[record for number in members for record in runs[number]] for members in seeds_of(runs)]
-    shared = [(policy, fraction) for policy in (*trial.policies, ORACLE) for fraction in trial.fractions]
-    keys = [("none", 0.0), *shared, ("all", 1.0)]
-    rows = {key: row for key in keys if (row := collect_row(seeds, *key)) is not None}
+    shared = [(policy, fraction) for policy in (*request.policies, ORACLE) for fraction in request.fractions]
+    rows = {key: collect_row(seeds, *key) for key in (("none", 0.0), *shared, ("all", 1.0))}
     whole, none = rows["all", 1.0], rows["none", 0.0]
     ends = [_mean(row.over_runs(mean_iou)) for row in (none, whole)]
     support = whole.counts.sum(axis=3).max(axis=0).sum(axis=0)  # labelled pixels of each class, each frame once
     table = []
     for (policy, fraction), row in rows.items():
-        figures = {
-            "policy": policy,
-            "fraction": fraction,
-            "uses_labels": policy == ORACLE,
-            **_accuracy(row, class_names),
-        }
+        figures = {"policy": policy, "fraction": fraction, "uses_labels": policy == ORACLE}
+        figures |= _accuracy(row, class_names)
         figures["gap_closed"] = None if policy in ENDS else gap_closed(figures["miou"], *ends)
         figures["captured_gain"] = captured_gain(*(sum(p[name] for p in row.parts) for name in ("gain", "best_gain")))
-        figures["against_all"] = difference(row, whole, trial, draws)
-        figures["against_random"] = difference(row, rows.get(("random", fraction)), trial, draws)
+        figures["against_all"] = difference(row, whole, request)
+        figures["against_random"] = difference(row, rows.get(("random", fraction)), request)
         table.append(figures | {"cost": _cost(row, whole)})
     named = dict(zip(class_names, support.tolist(), strict=True))
     return {"rows": table, "support": named}
@@ -198,7 +169,7 @@ def _accuracy(row: Row, class_names: Sequence[str]) -> Record:
     classes = row.over_runs(iou_per_class)
     false = row.over_runs(false_pixels).mean(axis=0).tolist()  # of a run
     return {
-        "frames": int(row.judged.sum()),
+        "frames": row.counts.shape[1],
         "miou": _mean(each),
         "spread": float(seeds.std(ddof=1)) if len(seeds) > 1 else None,
         "draws_spread": _mean([some.std(ddof=1) for some in drawn]) if len(drawn[0]) > 1 else None,

@@ -39,15 +39,14 @@ from flows.tasks.stage import FieldFrame, Report
 from flows.tasks.stages.capture import SweepRecorder
 from flows.tasks.survey_model import SurveyModel, beyond_training, weights_path
 from flows.tasks.zones import SurveyZones, open_zones, place_of_field
-from models.evaluation.cascade import CascadeTable
 from models.evaluation.expected_scores import MapScores
+from models.evaluation.placement import CascadeTable
 from models.network.machine import PROCESSOR, choose_device
 from models.network.sizes import MultiplyAdds
 from models.network.spectral import LineSpec
 from models.reading.regions import plan_regions
 from models.weights.checksummed_files import SEAL
-from models.weights.files import CASCADE, Description, Weights
-from models.weights.parts import OodPart, ReaderPart
+from models.weights.files import CASCADE, Description, OodPart, ReaderPart, Weights
 from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera

@@ -13,8 +13,17 @@ from numpy.typing import NDArray
 from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
 from flows.settings.values import UNKNOWN_AUTO, UNKNOWN_OFF
 from models.network.machine import choose_device
-from models.weights.files import Description, Weights, describe_weights, load_ood, load_reader, load_weights
-from models.weights.parts import TRAINED_ON, OodPart, TrainedOn
+from models.weights.files import (
+    TRAINED_ON,
+    Description,
+    OodPart,
+    TrainedOn,
+    Weights,
+    describe_weights,
+    load_ood,
+    load_reader,
+    load_weights,
+)
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.ground.map_grid import median_footprint_m
 from pipeline.ground.view import GroundView
@@ -133,7 +142,7 @@ def beyond_training(
         return ()
     return (
         f"outside of the training data of {path.name}: {'; '.join(found)}. Expect a poorer map; train on such labelled"
-        f" scenes: spectralzoom train DATASET --init {path.name} -o my.safetensors",
+        f" scenes: spectralzoom train DATASET -o my.safetensors",
     )
 
 

@@ -175,12 +175,6 @@ def unpack_mask(text: str, shape: tuple[int, int]) -> NDArray[np.bool_]:
     return np.unpackbits(bits, count=shape[0] * shape[1]).reshape(shape).astype(bool)
 
 
-def either_mask(one: str | None, other: str | None) -> str:
-    """Return the union of two packed masks of one scene; None is empty."""
-    bits = [np.frombuffer(zlib.decompress(base64.b64decode(mask)), np.uint8) for mask in (one, other) if mask]
-    return base64.b64encode(zlib.compress(np.bitwise_or.reduce(bits).tobytes(), 9)).decode("ascii")
-
-
 def only_class(scene: RasterScene) -> str | None:
     """Return the class of all labels of a scene; None for several classes, or no label."""
     if scene.labels is None:

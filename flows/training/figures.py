@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -12,26 +13,28 @@ from numpy.typing import NDArray
 from sklearn.ensemble import RandomForestClassifier
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.linear_model import LogisticRegression
+from torch import Tensor, nn
 
 from flows.training.data import Report
-from models.evaluation.cascade import CascadeTable, ReadTwice
 from models.evaluation.expected_scores import Floats, MapScores, ScoredMap, expected_counts
 from models.evaluation.metrics import (
+    JudgedMap,
     agreement,
     calibration_error,
     confidence_counts,
     confusion,
     iou_per_class,
+    judge_confidence,
     mean_iou,
 )
-from models.evaluation.placement import CONTROL_FRACTION, Controls, Counts, run_controls
+from models.evaluation.placement import CONTROL_FRACTION, CascadeTable, ReadTwice, placement_figures, run_controls
 from models.network.sizes import PLANES
 from models.network.spectral import LineSpec, patches_of
 from models.policies.policies import score_patches
 from models.reading.inference import coarse_prediction_of_columns, map_of_columns, segment
 from models.training.capture_augmentation import REFERENCE_MS, STEPS, CaptureAugmentation
 from models.training.examples import Example
-from models.training.start import LabelledPixels
+from models.training.train import LabelledPixels
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 
@@ -48,20 +51,15 @@ def validate(weights: Weights, examples: Iterable[Example], seed: int, show: Sho
         rows.append(run_controls(weights, seen, cells, labels, fraction=CONTROL_FRACTION, seed=seed, report=show))
     if not rows:
         return None
-    whole = Controls(
-        rows[0].fraction,
-        sum(row.patch_index for row in rows),
-        _added([row.none for row in rows]),
-        _added([row.every for row in rows]),
-        {name: _added([row.policies[name] for row in rows]) for name in rows[0].policies},
-        [_added(list(draws)) for draws in zip(*(row.random for row in rows), strict=True)],
-    )
+    whole = {
+        name: [np.sum(draws, axis=0) for draws in zip(*(row[name] for row in rows), strict=True)] for name in rows[0]
+    }
     return {
         "scenes": len(rows),
-        "share_of_seats": whole.fraction,
-        "none": agreement(whole.none),
-        "all": agreement(whole.every),
-        **whole.as_dict(),
+        "share_of_seats": CONTROL_FRACTION,
+        "none": agreement(whole["none"][0]),
+        "all": agreement(whole["all"][0]),
+        **placement_figures(whole),
     }
 
 
@@ -78,24 +76,17 @@ def judge_cascade(weights: Weights, examples: Iterable[Example]) -> dict[str, An
     return asdict(CascadeTable.judged(scenes, weights.config.classes)) if scenes else None
 
 
+def judge_calibration(weights: Weights, examples: Iterable[Example], seed: int) -> dict[str, Any] | None:
+    """Return the calibration of maps of full scans; None without a scene."""
+    maps = []
+    for example in examples:
+        grid, _, labels = _parts(weights, example)
+        _, every_class = map_of_columns(weights, example.columns.astype(np.float32), grid)
+        maps.append(JudgedMap.of(every_class, labels))
+    return judge_confidence(maps, seed) if maps else None
+
+
 SCAN_EXPOSURES = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # of the reference; the darkest of the training is judged, too
-
-
-@dataclass(frozen=True)
-class ScanFigures:
-    """Figures of uniform scans on validation scenes."""
-
-    record: dict[str, Any]  # their scores, for the record of the weights
-    scores: MapScores  # corrections of expected scores
-
-
-@dataclass(frozen=True)
-class _JudgedScan:
-    """Counts of the map of a uniform scan, read in full."""
-
-    counts: Counts
-    sure: NDArray[np.float64]  # `confidence_counts`
-    expected: Floats  # `expected_counts`
 
 
 def judge_scans(
@@ -104,8 +95,8 @@ def judge_scans(
     augmentation: CaptureAugmentation | None,
     seed: int,
     report: Report = lambda what, done, figure: None,
-) -> ScanFigures | None:
-    """Return the scores of uniform scans, read in full, by line spacing and exposure.
+) -> tuple[dict[str, Any], MapScores] | None:
+    """Return the scores of uniform scans, read in full, for a record, and corrections of expected scores.
 
     None without a scene, or without an ``augmentation``: the training then had the reference exposure alone. In the
     record ``miou`` and the IoU of each class are tables (step, exposure) of means over the scenes. ``spread`` is the
@@ -127,13 +118,13 @@ def judge_scans(
         for j, exposure_ms in enumerate(exposures):
             rng = np.random.default_rng([seed, 0x5CA, i, j])
             judged = [_scanned(weights, one, augmentation, step, exposure_ms / REFERENCE_MS, rng) for one in known]
-            counts = [one.counts for one in judged]
-            calibration[i, j] = calibration_error(np.sum([one.sure for one in judged], axis=0))
+            counts = [one.counts for one, _ in judged]
+            calibration[i, j] = calibration_error(np.sum([sure for _, sure in judged], axis=0))
             own = [mean_iou(one) for one in counts]
             miou[i, j], spread[i, j] = np.nanmean(own), np.nanstd(own, ddof=1) if len(own) > 1 else np.nan
             with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of an absent class
                 of_classes[:, i, j] = np.nanmean([iou_per_class(one) for one in counts], axis=0)
-            maps[step, exposure_ms] = [ScoredMap(one.counts, one.expected) for one in judged]
+            maps[step, exposure_ms] = [one for one, _ in judged]
             figure = f"lines {step} px apart, {exposure_ms:g} ms: {100 * miou[i, j]:.1f}"
             report("judging scans", len(maps) / miou.size, figure)
     record = {
@@ -149,7 +140,7 @@ def judge_scans(
             if np.isfinite(iou).all()
         },
     }
-    return ScanFigures(record, MapScores.fitted(maps))
+    return record, MapScores.fitted(maps)
 
 
 def _scanned(
@@ -159,8 +150,8 @@ def _scanned(
     step: int,
     light: float,
     rng: np.random.Generator,
-) -> _JudgedScan:
-    """Simulate a uniform scan of a scene, segment it in full and compare the map with the labels."""
+) -> tuple[ScoredMap, Floats]:
+    """Simulate a uniform scan of a scene and segment it in full; return counts of the map and its confidence."""
     assert example.noise is not None
     grid, _, labels = _parts(weights, example)
     plain, classes = example.columns.astype(np.float32), weights.config.classes
@@ -169,7 +160,7 @@ def _scanned(
     valid = (labels != UNLABELLED) & np.isfinite(drawn.confidence)
     sure = confidence_counts(drawn.confidence[valid], drawn.classes[valid] == labels[valid])
     expected = expected_counts([every_class[valid]], classes)
-    return _JudgedScan(confusion(labels, drawn.classes, classes), sure, expected)
+    return ScoredMap(confusion(labels, drawn.classes, classes), expected), sure
 
 
 def _parts(weights: Weights, example: Example) -> tuple[SceneGrid, Patches, NDArray[np.uint8]]:
@@ -177,9 +168,32 @@ def _parts(weights: Weights, example: Example) -> tuple[SceneGrid, Patches, NDAr
     return grid, patches_of(example.columns, grid.patch).astype(np.float32), example.labels[: grid.height, : grid.width]
 
 
-def _added(parts: list[Counts]) -> Counts:
-    counts: Counts = np.sum(parts, axis=0)
-    return counts
+def better_reading(
+    weights: Weights, start: Mapping[str, Tensor], validation: Sequence[Example]
+) -> tuple[Weights, dict[str, Any]]:
+    """Choose the better of the trained network and its initial linear discriminants, by mIoU of validation scenes.
+
+    Returns the better weights, and both scores.
+    """
+    plain = copy.deepcopy(weights.segmenter)
+    plain.load_state_dict(dict(start), strict=False)
+    for last in (plain.overview_classes, plain.full_classes):
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)  # type: ignore[arg-type]
+    readings = {"network": weights, "linear discriminants": replace(weights, segmenter=plain)}
+    scores = {name: _miou(one, validation) for name, one in readings.items()}
+    kept = max(scores, key=lambda name: scores[name])  # the network on a tie
+    return readings[kept], {"miou": scores, "kept": kept}
+
+
+def _miou(weights: Weights, examples: Sequence[Example]) -> float:
+    """Return the mIoU of all scenes together, by every line at the reference exposure."""
+    counts = np.zeros((weights.config.classes,) * 2, np.int64)
+    for example in examples:
+        grid, _, labels = _parts(weights, example)
+        drawn, _ = map_of_columns(weights, example.columns.astype(np.float32), grid)
+        counts += confusion(labels, drawn.classes, weights.config.classes)
+    return mean_iou(counts)
 
 
 def judge_baselines(

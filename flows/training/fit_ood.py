@@ -1,4 +1,4 @@
-"""Describe the training data of weights, fit their out-of-distribution detector and measure their calibration.
+"""Describe the training data of weights, and fit their out-of-distribution detector.
 
 `spectralzoom train --fit-ood` does so for existing weights: it images the scenes of their training again and adds the
 detector to their file. The weights themselves do not change.
@@ -6,52 +6,33 @@ detector to their file. The weights themselves do not change.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 
 from flows.terminal.progress import one_after_the_other
 from flows.training.data import Report, TrainingData, open_training_data, read_farm_name
-from flows.training.figures import judge_scans
-from flows.training.train_scenes import TrainRequest, as_read, observe_all
-from models.evaluation.metrics import JudgedMap, judge_confidence
-from models.reading.inference import map_of_columns
-from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
-from models.training.examples import Example
+from flows.training.figures import judge_calibration, judge_scans
+from flows.training.train_scenes import Scenes, TrainRequest, check_out, observe_all, training_capture
+from models.training.capture_augmentation import REFERENCE_MS
 from models.training.ood_fit import fit_ood
 from models.training.train import TrainingSettings
-from models.weights.files import CALIBRATION, Weights, add_ood, load_weights
-from models.weights.parts import MAP_SCORES, TrainedOn
+from models.weights.files import CALIBRATION, MAP_SCORES, TrainedOn, Weights, add_ood, load_weights
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
 from pipeline.simulator.scenes.built_in import built_in_laws
 from pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M
 from pipeline.simulator.scenes.farm.land import sun_over_farm
 
 
-@dataclass(frozen=True)
-class SeenScenes:
-    """Training and validation scenes, with their bands and exposures."""
-
-    train: Sequence[Example]
-    validation: Sequence[Example]
-    wavelength_nm: NDArray[np.float64]
-    darkest_ms: float
-    seed: int
-
-
-def trained_on(data: TrainingData, seen: SeenScenes, classes: tuple[str, ...]) -> TrainedOn:
+def trained_on(data: TrainingData, scenes: Scenes, darkest_ms: float) -> TrainedOn:
     """Return the ranges of the training data; season, sun and scale are known for built-in farms alone."""
-    low, high = float(seen.wavelength_nm.min()), float(seen.wavelength_nm.max())
-    exposures = (seen.darkest_ms, max(seen.darkest_ms, data.camera.exposure_ms))
-    bands_nm = tuple(seen.wavelength_nm.tolist())
-    trained = TrainedOn(len(bands_nm), (low, high), exposures, len(data.train), classes, bands_nm=bands_nm)
+    nm = scenes.common.wavelength_nm
+    exposures = (darkest_ms, max(darkest_ms, data.camera.exposure_ms))
+    span, bands_nm = (float(nm.min()), float(nm.max())), tuple(nm.tolist())
+    trained = TrainedOn(len(nm), span, exposures, len(data.train), scenes.common.names, bands_nm=bands_nm)
     if data.files is not None:
         return trained
     moments = [read_farm_name(name)[1:] for name in data.train]
@@ -61,44 +42,29 @@ def trained_on(data: TrainingData, seen: SeenScenes, classes: tuple[str, ...]) -
     )
 
 
-def measured_calibration(weights: Weights, frames: Sequence[Example], seed: int) -> dict[str, Any] | None:
-    """Return the calibration of maps of full scans on validation scenes; None without one."""
-    maps = []
-    for frame in frames:
-        grid = SceneGrid(*frame.shape, weights.config.patch, 1)
-        _, every_class = map_of_columns(weights, frame.columns.astype(np.float32), grid)
-        maps.append(JudgedMap.of(every_class, frame.labels[: grid.height, : grid.width]))
-    return judge_confidence(maps, seed) if maps else None
-
-
-def measure_and_add(
+def fit_and_add(
     weights: Weights,
-    path: Path,
-    seen: SeenScenes,
+    files: tuple[Path, Path],
+    scenes: Scenes,
     trained: TrainedOn,
+    seed: int,
     record: dict[str, Any],
     report: Report,
-    *,
-    out: Path | None = None,
-) -> str | None:
-    """Fit the out-of-distribution detector of the weights in ``path``, and add it there, or in a copy at ``out``.
+) -> None:
+    """Fit the out-of-distribution detector of the weights in the first of ``files``, and write both into the second.
 
-    Returns a message where it cannot be fitted, else None.
+    Raises SceneError: it cannot be fitted.
     """
-    try:
-        ood_detector = fit_ood(
-            seen.train,
-            seen.validation,
-            weights.normalisation,
-            darkest_ms=seen.darkest_ms,
-            bands=len(seen.wavelength_nm),
-            seed=seen.seed,
-            report=lambda done: report("fitting the out-of-distribution detector", done, ""),
-        )
-    except SceneError as error:
-        return f"no pixel will be classified as unknown: {error}"
-    add_ood(path, out or path, ood_detector, trained, record)
-    return None
+    ood_detector = fit_ood(
+        scenes.train.examples,
+        scenes.validation.examples,
+        weights.normalisation,
+        darkest_ms=trained.exposure_ms[0],
+        bands=trained.bands,
+        seed=seed,
+        report=lambda done: report("fitting the out-of-distribution detector", done, ""),
+    )
+    add_ood(*files, ood_detector, trained, record)
 
 
 @dataclass(frozen=True)
@@ -118,53 +84,9 @@ def measure_ood(request: OodRequest, report: Report = lambda what, done, figure:
     Raises SettingsError: an invalid output path, other data than those of the training, or no validation scene;
     WeightsError: the weights cannot be read.
     """
-    if not request.out.parent.is_dir() or request.out.is_dir():
-        raise SettingsError(f"-o {request.out}: expected the name of a file in a folder that exists")
+    check_out(request.out)
     weights = load_weights(request.weights)
-    data = _data_of(weights, request)
-    seen = _observed(weights, data, request, report)
-    report("segmenting validation scenes", 0.0, "")
-    trained = trained_on(data, seen, weights.class_names)
-    augmentation = (
-        CaptureAugmentation(weights.normalisation, darkest_ms=seen.darkest_ms)
-        if seen.darkest_ms < REFERENCE_MS
-        else None
-    )
-    scans = judge_scans(weights, seen.validation, augmentation, seen.seed, report)
-    record = {
-        "command": request.command,
-        "scenes": len(seen.train),
-        "validation": len(seen.validation),
-        CALIBRATION: measured_calibration(weights, seen.validation, seen.seed),
-        **({} if scans is None else {MAP_SCORES: scans.scores.as_dict()}),
-    }
-    why = measure_and_add(weights, request.weights, seen, trained, record, report, out=request.out)
-    if why is not None:
-        raise SettingsError(f"--fit-ood {request.weights}: {why}")
-    return record
-
-
-def _data_of(weights: Weights, request: OodRequest) -> TrainingData:
-    """Open the data of the training. Raises SettingsError: the data set is another."""
-    split = weights.record.get("split") or {}
-    own = [name for name in split.get("train", {}) if ": " not in name]  # others belong to the initial weights
-    scenes = len(own) if built_in_laws(request.dataset) else None
-    camera = LineCamera(**weights.record.get("camera", {}))
-    held_out = {} if scenes else {"hold_out": tuple(split.get("held_out", ()))}
-    data = open_training_data(
-        request.dataset, len(split.get("validation", ())), scenes, camera, **held_out, **request.choices
-    )
-    if list(data.train) != own or list(data.validation) != list(split.get("validation", ())):
-        raise SettingsError(
-            f"--fit-ood {request.weights}: these weights were trained on {weights.record.get('data', 'other data')},"
-            f" {len(own)} scenes{f', the first {own[0]}' if own else ''}; {request.dataset} has others: give the data"
-            " set of their training"
-        )
-    return data
-
-
-def _observed(weights: Weights, data: TrainingData, request: OodRequest, report: Report) -> SeenScenes:
-    settings, config = weights.record.get("settings", {}), weights.config
+    data, config, settings = _data_of(weights, request), weights.config, weights.record.get("settings", {})
     seed, darkest_ms = int(settings.get("seed", 0)), float(settings.get("darkest_ms", REFERENCE_MS))
     how = TrainRequest(
         request.dataset,
@@ -175,20 +97,43 @@ def _observed(weights: Weights, data: TrainingData, request: OodRequest, report:
         settings=TrainingSettings(seed=seed),
         camera=data.camera,
     )
-    examples: list[list[Example]] = []
-    about = None
-    for what, names in (("imaging scenes", data.train), ("imaging validation scenes", data.validation)):
-        if not names:
-            raise SettingsError(
-                f"--fit-ood {request.weights}: no scene was kept for validation when these weights were trained, which"
-                " the false-alarm rate needs; train them with --validation 1 or more"
-            )
-        found, about = observe_all(how, data, names, what, report, about)
-        examples.append(as_read(found, weights.normalisation))
-        if (about.basis, about.names) != (weights.basis, weights.class_names):
-            raise SettingsError(f"{request.dataset} has other bands or classes than {request.weights} was trained on")
-    assert about is not None
-    return SeenScenes(examples[0], examples[1], about.wavelength_nm, darkest_ms, seed)
+    scenes = observe_all(how, data, report)
+    if (scenes.common.basis, scenes.common.names) != (weights.basis, weights.class_names):
+        raise SettingsError(f"{request.dataset} has other bands or classes than {request.weights} was trained on")
+    scenes = scenes.normalised(weights.normalisation)
+    report("segmenting validation scenes", 0.0, "")
+    frames = scenes.validation.examples
+    scans = judge_scans(weights, frames, training_capture(weights.normalisation, darkest_ms), seed, report)
+    record = {
+        "command": request.command,
+        "scenes": len(scenes.train.examples),
+        "validation": len(frames),
+        CALIBRATION: judge_calibration(weights, frames, seed),
+        **({} if scans is None else {MAP_SCORES: scans[1].as_dict()}),
+    }
+    files, trained = (request.weights, request.out), trained_on(data, scenes, darkest_ms)
+    try:
+        fit_and_add(weights, files, scenes, trained, seed, record, report)
+    except SceneError as error:
+        raise SettingsError(f"--fit-ood {request.weights}: {error}") from error
+    return record
+
+
+def _data_of(weights: Weights, request: OodRequest) -> TrainingData:
+    """Open the data of the training. Raises SettingsError: the data set is another."""
+    split = weights.record.get("split") or {}
+    own, kept = list(split.get("train", {})), list(split.get("validation", ()))
+    scenes = len(own) if built_in_laws(request.dataset) else None
+    camera = LineCamera(**weights.record.get("camera", {}))
+    held_out = {} if scenes else {"hold_out": tuple(split.get("held_out", ()))}
+    data = open_training_data(request.dataset, len(kept), scenes, camera, **held_out, **request.choices)
+    if (list(data.train), list(data.validation)) != (own, kept):
+        raise SettingsError(
+            f"--fit-ood {request.weights}: these weights were trained on {weights.record.get('data', 'other data')},"
+            f" {len(own)} scenes{f', the first {own[0]}' if own else ''}; {request.dataset} has others: give the data"
+            " set of their training"
+        )
+    return data
 
 
 def run_measure_ood(request: OodRequest, console: Console) -> dict[str, Any]:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 import shlex
 import sys
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,25 +14,27 @@ import numpy as np
 from rich.console import Console
 
 from flows.terminal.progress import one_after_the_other, table
-from flows.training.data import Report, TrainingData, alike_notes, either_mask, open_training_data
-from flows.training.figures import judge_baselines, judge_cascade, judge_scans, validate
-from flows.training.fit_ood import SeenScenes, measure_and_add, measured_calibration, trained_on
-from flows.training.train_scenes import About, TrainRequest, as_read, network_config, observe_all
-from models.evaluation.expected_scores import MapScores
+from flows.training.data import Report, open_training_data
+from flows.training.figures import (
+    better_reading,
+    judge_baselines,
+    judge_calibration,
+    judge_cascade,
+    judge_scans,
+    validate,
+)
+from flows.training.fit_ood import fit_and_add, trained_on
+from flows.training.train_scenes import Scenes, TrainRequest, check_out, network_config, observe_all, training_capture
 from models.network.machine import choose_device
-from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation
-from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
-from models.training.examples import Example, measured_normalisation
-from models.training.start import LabelledPixels, Start, StartFile, better_reading, linear_discriminants
-from models.training.train import Progress, train
-from models.weights.checksummed_files import read_checkpoint
-from models.weights.files import CALIBRATION, CASCADE, Weights, save_weights, with_record
-from models.weights.parts import MAP_SCORES, TRAINED_ON
-from pipeline.errors import SceneError, SettingsError, ShapeError
+from models.training.capture_augmentation import REFERENCE_MS
+from models.training.examples import measured_normalisation
+from models.training.train import LabelledPixels, Progress, linear_discriminants, train
+from models.weights.checksummed_files import load_checkpoint
+from models.weights.files import CALIBRATION, CASCADE, MAP_SCORES, TRAINED_ON, Weights, save_weights, with_record
+from pipeline.errors import SceneError, SettingsError
 from pipeline.simulator.scenes.built_in import built_in_laws
 
-Split = dict[str, Any]
 FRAME_CROP, FARM_CROP = 384, 256  # px
 
 
@@ -48,193 +49,84 @@ def train_weights(
     output path, sizes that do not fit, or an unavailable device.
     """
     checkpoint = request.out.with_name(request.out.name + ".checkpoint")
-    _check_places(request.out, checkpoint)
-    read_checkpoint(checkpoint)  # a damaged one fails before minutes are spent
-    device = choose_device(request.device)
-    start = open_start(request.init, request.tokens)
-    data = open_training_data(
-        request.dataset,
-        request.validation,
-        request.scenes,
-        request.camera,
-        hold_out=request.hold_out,
-        **request.choices,
-    )
-    refuse_seen(start, data)
+    check_out(request.out)
+    load_checkpoint(checkpoint)  # a damaged one fails before minutes are spent
+    device, settings = choose_device(request.device), request.settings
+    hold_out = {"hold_out": request.hold_out, **request.choices}
+    data = open_training_data(request.dataset, request.validation, request.scenes, request.camera, **hold_out)
     for note in data.notes:
         tell(note)
-    lesson = _lesson(request, data, start, report, tell)
-    about = lesson.about
-    split = {  # before validation scenes are added to it
-        "train": dict(about.keys),
-        "content": list(about.content),
-        "validation": list(data.validation),
-        "held_out": list(data.held_out),
-        "pixels": dict(about.pixels),
-    }
-    weights, summary = _learned(request, lesson, checkpoint, report)
-    kept, _ = observe_all(request, data, data.validation, "imaging validation scenes", report, about)
-    for note in about.notes(data.validation):
-        tell(note)
-    frames = as_read(kept, lesson.normalisation)
-    whole = SeenScenes(lesson.examples, frames, about.wavelength_nm, request.settings.darkest_ms, request.settings.seed)
-    trained = trained_on(data, whole, about.names)
-    beside: dict[str, Any] = {}
-    if frames:
-        if lesson.begun is None:
-            weights, beside["readings"] = better_reading(weights, lesson.start, frames)
-        counts = lesson.examples, frames, len(about.names), request.settings.seed
-        beside["baselines"] = judge_baselines(*counts, report)
-    figures, scores = _figures(weights, frames, lesson.augmentation, request.settings.seed, report)
+    scenes = observe_all(request, data, report, tell)
+    normalisation = measured_normalisation(scenes.train.examples, math.sqrt(settings.darkest_ms * REFERENCE_MS))
+    scenes = scenes.normalised(normalisation)
+    weights, training = _learned(request, scenes, normalisation, checkpoint, report)
+    trained = trained_on(data, scenes, settings.darkest_ms)
     record = {
         "command": request.command,
         "data": data.law,
         TRAINED_ON: trained.as_dict(),
-        "split": joined_split(split, start),
-        "settings": asdict(request.settings),
+        "split": {
+            "train": scenes.train.keys,
+            "content": scenes.train.content,
+            "validation": list(data.validation),
+            "held_out": list(data.held_out),
+            "pixels": scenes.train.pixels,
+        },
+        "settings": asdict(settings),
         "camera": asdict(request.camera),
-        "training": summary,
         "device": device,
-        **figures,
-        **beside,
-        **({} if lesson.begun is None else {"begun_from": lesson.begun.record}),
+        **training,
     }
+    scans = judge_scans(
+        with_record(weights, **record),
+        scenes.validation.examples,
+        training_capture(normalisation, settings.darkest_ms),
+        settings.seed,
+        report,
+    )
+    if scans is not None:
+        record["scans"] = scans[0]
     save_weights(with_record(weights, **record), request.out)
     checkpoint.unlink(missing_ok=True)
-    ood_record = {"command": request.command, **({} if scores is None else {MAP_SCORES: scores.as_dict()})}
-    why = measure_and_add(weights, request.out, whole, trained, ood_record, report)
-    return record if why is None else {**record, "familiar": why}
-
-
-@dataclass(frozen=True)
-class Lesson:
-    """Normalised scenes, sizes of the network and its initial tensors."""
-
-    about: About
-    config: SegmenterConfig
-    normalisation: Normalisation
-    examples: list[Example]
-    augmentation: CaptureAugmentation | None  # None: the reference exposure alone
-    begun: Start | None
-
-    @cached_property
-    def start(self) -> Mapping[str, Any]:
-        """Return the initial tensors: earlier weights, or the linear discriminants of the scenes."""
-        begun = {} if self.begun is None else self.begun.state
-        if "spectral.weight" in begun:
-            return begun
-        pixels = LabelledPixels.drawn(self.examples, np.random.default_rng([0x1DA]))
-        return {**begun, **linear_discriminants(pixels, self.config.classes)}
-
-
-def _lesson(
-    request: TrainRequest, data: TrainingData, start: StartFile | None, report: Report, tell: Callable[[str], None]
-) -> Lesson:
-    """Image the scenes to train on, and fit the initial tensors to the network."""
-    seen, about = observe_all(request, data, data.train, "imaging scenes", report)
-    notes = alike_notes(about.alike)
-    if len(about.alike) == len(about.keys) and len(notes) == 1:
-        raise SceneError(f"{request.dataset}: training needs two or more classes, and {notes[0]}")
-    for note in (*notes, *about.notes(data.train)):
-        tell(note)
-    darkest_ms = request.settings.darkest_ms
-    normalisation = measured_normalisation(seen, math.sqrt(darkest_ms * REFERENCE_MS))
-    config, begun = network_config(request, about), None
-    if start is not None:
-        begun = start.begin(config, about.basis, normalisation, about.names)
-    augmentation = CaptureAugmentation(normalisation, darkest_ms=darkest_ms) if darkest_ms < REFERENCE_MS else None
-    return Lesson(about, config, normalisation, as_read(seen, normalisation), augmentation, begun)
+    about = {"command": request.command, **({} if scans is None else {MAP_SCORES: scans[1].as_dict()})}
+    try:
+        fit_and_add(weights, (request.out, request.out), scenes, trained, settings.seed, about, report)
+    except SceneError as error:
+        record["familiar"] = f"no pixel will be classified as unknown: {error}"
+    return record
 
 
 def _learned(
-    request: TrainRequest, lesson: Lesson, checkpoint: Path, report: Report
-) -> tuple[Weights, dict[str, float | int]]:
-    """Train the network; return weights and a summary of the training."""
+    request: TrainRequest, scenes: Scenes, normalisation: Normalisation, checkpoint: Path, report: Report
+) -> tuple[Weights, dict[str, Any]]:
+    """Train the network; return weights, and their figures on the validation scenes for the record."""
 
     def progress(now: Progress) -> None:
         report("training", now.done, f"step {now.step}, loss {now.loss:.3f}")
 
+    common, settings, examples = scenes.common, request.settings, scenes.train.examples
+    config, seed = network_config(request, common), settings.seed
+    start = linear_discriminants(LabelledPixels.drawn(examples, np.random.default_rng([0x1DA])), config.classes)
     model, summary = train(
-        lesson.config,
-        lesson.examples,
-        lesson.normalisation.gain_shift,
-        request.settings,
+        config,
+        examples,
+        normalisation.gain_shift,
+        settings,
         progress,
-        start=lesson.start,
-        augmentation=lesson.augmentation,
+        start=start,
+        augmentation=training_capture(normalisation, settings.darkest_ms),
         checkpoint=checkpoint,
         device=choose_device(request.device),
     )
-    about = lesson.about
-    return Weights(model, about.basis, lesson.normalisation, about.names, about.colours), summary
-
-
-def _figures(
-    weights: Weights, frames: list[Example], augmentation: CaptureAugmentation | None, seed: int, report: Report
-) -> tuple[dict[str, Any], MapScores | None]:
-    """Return the figures of validation scenes for the record, and the corrections of expected scores."""
-    figures = {"validation": validate(weights, frames, seed, lambda row: report("validating", 0.0, row))}
-    if (cascade := judge_cascade(weights, frames)) is not None:
-        figures[CASCADE] = cascade
-    if (calibration := measured_calibration(weights, frames, seed)) is not None:
-        figures[CALIBRATION] = calibration
-        weights = with_record(weights, calibration=calibration)
-    scans = judge_scans(weights, frames, augmentation, seed, report)
-    return (figures, None) if scans is None else (figures | {"scans": scans.record}, scans.scores)
-
-
-def _check_places(out: Path, checkpoint: Path) -> None:
-    if not out.parent.is_dir():
-        raise SettingsError(f"-o {out}: the folder {out.parent} does not exist; make it first")
-    if out.is_dir():
-        raise SettingsError(f"-o {out} is a folder, expected a file; name the weights in it")
-    for path in (checkpoint, *(path.with_name(path.name + ".part") for path in (out, checkpoint))):
-        if path.is_dir():
-            raise SettingsError(
-                f"-o {out}: {path} is a folder, and training writes a file of that name; move it, or rename the weights"
-            )
-
-
-def open_start(init: Path | None, tokens: Mapping[str, Any]) -> StartFile | None:
-    """Open the initial weights, if any. Raises SettingsError: no file, or another network; WeightsError."""
-    if init is None:
-        return None
-    start = StartFile(init)
-    try:
-        start.check(SegmenterConfig(2, **tokens))
-    except ShapeError as error:
-        raise SettingsError(f"{error}; choose another --dim or --heads") from error
-    return start
-
-
-def refuse_seen(start: StartFile | None, data: TrainingData) -> None:
-    """Raise SettingsError where the initial weights were trained on a validation scene."""
-    earlier: Split = {} if start is None else start.earlier.get("split", {})
-    seen = set(earlier.get("train", {}).values())  # with a mask, too: validation uses all labelled pixels
-    if start is None or not seen:
-        return
-    for name in data.validation:
-        if data.scene(name).key in seen:
-            raise SettingsError(
-                f"--init {start.path} was trained on the scene {name}, which is for validation here; pass"
-                " --validation 0 and judge on other scenes with evaluate"
-            )
-
-
-def joined_split(split: Split, start: StartFile | None) -> Split:
-    """Add the scenes and pixels of the initial weights' training to a split."""
-    earlier: Split = {} if start is None else start.earlier.get("split", {})
-    if start is None or not earlier.get("train"):
-        return split
-    own, parts = split["train"], split["pixels"]
-    before, parts_before = earlier["train"], earlier.get("pixels", {})
-    whole = {key for key in before.values() if key not in parts_before}
-    whole |= {key for key in own.values() if key not in parts}
-    masks = {key: either_mask(parts.get(key), parts_before.get(key)) for key in parts.keys() | parts_before.keys()}
-    more = {f"{start.path.name}: {name}": key for name, key in before.items() if key not in own.values()}
-    pixels = {key: mask for key, mask in masks.items() if key not in whole}
-    content = [*split.get("content", ()), *earlier.get("content", ())]
-    return split | {"train": own | more, "content": content, "pixels": pixels}
+    weights = Weights(model, common.basis, normalisation, common.names, common.colours)
+    frames, found = scenes.validation.examples, dict[str, Any]()
+    if frames:
+        weights, found["readings"] = better_reading(weights, start, frames)
+        found["baselines"] = judge_baselines(examples, frames, config.classes, seed, report)
+        found[CASCADE] = judge_cascade(weights, frames)
+        found[CALIBRATION] = judge_calibration(weights, frames, seed)
+    found["validation"] = validate(weights, frames, seed, lambda row: report("validating", 0.0, row))
+    return weights, {"training": summary, **found}
 
 
 def usual_crop(dataset: str) -> int:
@@ -250,8 +142,6 @@ def run_train(request: TrainRequest, console: Console) -> dict[str, Any]:
         record = train_weights(
             request, report, lambda note: console.print(f"note: {note}", markup=False, soft_wrap=True)
         )
-    if "begun_from" in record:
-        print_start(record["begun_from"], console)
     _print_figures(record, request, console)
     return record
 
@@ -319,15 +209,3 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
         scores = readings["miou"] | (record["baselines"] or {})
         beside = ", ".join(f"{name} {100 * miou:.1f}" for name, miou in scores.items())
         console.print(f"mIoU of the whole scenes by each reading: {beside}; kept: {readings['kept']}", soft_wrap=True)
-
-
-def print_start(begun: Mapping[str, Any], console: Console) -> None:
-    """Print which tensors of the initial weights were used."""
-    skipped: Mapping[str, list[str]] = begun["skipped"]
-    counts = f"{begun['matched']} tensors matched, {len(begun['resized'])} resized"
-    console.print(f"begun from {begun['file']}: {counts}, {sum(map(len, skipped.values()))} skipped")
-    for name, how in begun["resized"].items():
-        console.print(f"  resized {name}: {how}")
-    for why, names in skipped.items():
-        shown = f"{names[0]} and {len(names) - 1} more" if len(names) > 1 else names[0]
-        console.print(f"  skipped {shown}: {why}")

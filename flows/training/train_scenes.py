@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from flows.training.observed_scenes import observe_scene
 from models.network.machine import PROCESSOR
 from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
+from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
 from models.training.examples import Example, normalised
 from models.training.train import TrainingSettings
 from pipeline.errors import EmptySceneError, SceneError, SettingsError
@@ -47,7 +48,6 @@ class TrainRequest:
     width: int = 20
     overview_width: int = 8
     tokens: dict[str, Any] = field(default_factory=dict)  # dim, layers, heads, mlp_ratio
-    init: Path | None = None  # initial weights
     choices: dict[str, Any] = field(default_factory=dict)  # of load_data_set: labels, bands, wavelengths, masks
     settings: TrainingSettings = field(default_factory=TrainingSettings)
     camera: LineCamera = field(default_factory=LineCamera)
@@ -55,38 +55,69 @@ class TrainRequest:
     device: str = PROCESSOR  # or auto
 
 
-@dataclass
-class About:
-    """Properties of all scenes of a data set, and the training pixels of each."""
+@dataclass(frozen=True)
+class Common:
+    """Properties that all scenes of a data set share."""
 
     basis: SpectralBasis
     names: tuple[str, ...]
     colours: NDArray[np.uint8]
     patch: int
     wavelength_nm: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Imaged:
+    """Imaged scenes, and entries of the record of weights about them."""
+
+    examples: list[Example] = field(default_factory=list)
     keys: dict[str, str] = field(default_factory=dict)  # scene -> identity of its light
     content: list[str] = field(default_factory=list)  # hashes of the scenes' files
     pixels: dict[str, str] = field(default_factory=dict)  # identity -> trained pixels, where not all labelled ones
-    alike: dict[str, str] = field(default_factory=dict)  # scene -> class, where all its labels are one
-    empty: list[str] = field(default_factory=list)  # scenes left out, which have no value anywhere
-    regridded: list[str] = field(default_factory=list)  # scenes whose labels came on another grid
 
-    def notes(self, names: Sequence[str]) -> tuple[str, ...]:
-        """Return `scene_notes` of some scenes."""
-        empty, regridded = ([one for one in of if one in names] for of in (self.empty, self.regridded))
-        return scene_notes(empty, regridded)
+
+@dataclass(frozen=True)
+class Scenes:
+    """Training and validation scenes."""
+
+    common: Common
+    train: Imaged
+    validation: Imaged
+
+    def normalised(self, normalisation: Normalisation) -> Scenes:
+        """Normalise the scenes; their basis spans their bands and reaches every column."""
+        reached = np.ones(len(normalisation.centre), np.bool_)
+        train, validation = (
+            replace(one, examples=[normalised(example, normalisation, reached) for example in one.examples])
+            for one in (self.train, self.validation)
+        )
+        return Scenes(self.common, train, validation)
 
 
 def observe_all(
+    request: TrainRequest, data: TrainingData, report: Report, tell: Callable[[str], None] = lambda note: None
+) -> Scenes:
+    """Image training and validation scenes. Raises SceneError: none, a single class, or other bands or classes."""
+    common, train = _imaged(request, data, data.train, "imaging scenes", report, tell)
+    if common is None:
+        raise SceneError(
+            f"{request.dataset} has no scene to train on: no value anywhere in {listed_scenes(data.train)}"
+        )
+    _, validation = _imaged(request, data, data.validation, "imaging validation scenes", report, tell, common)
+    return Scenes(common, train, validation)
+
+
+def _imaged(
     request: TrainRequest,
     data: TrainingData,
     names: tuple[str, ...],
     what: str,
     report: Report,
-    about: About | None = None,
-) -> tuple[list[Example], About]:
+    tell: Callable[[str], None],
+    common: Common | None = None,
+) -> tuple[Common | None, Imaged]:
     """Image named scenes, and check that they have the bands and classes of earlier ones. Raises SceneError."""
-    seen, empty = [], list[str]()
+    found, empty, regridded, alike = Imaged(), list[str](), list[str](), dict[str, str]()
     for number, name in enumerate(names):
         report(what, number / len(names), name)
         try:
@@ -94,49 +125,42 @@ def observe_all(
         except EmptySceneError:
             empty.append(name)
             continue
-        known = about or _common(request, scene)
-        if scene.class_names != known.names:
-            raise SceneError(f"scene {scene.name} has classes {scene.class_names}, the scenes before it {known.names}")
-        if not np.array_equal(scene.wavelength_nm, known.wavelength_nm):
+        mask = trained_pixels(scene)  # raises for a scene without labels
+        common = common or _common(request, scene)
+        if scene.class_names != common.names:
+            raise SceneError(f"scene {scene.name} has classes {scene.class_names}, the scenes before it {common.names}")
+        if not np.array_equal(scene.wavelength_nm, common.wavelength_nm):
             raise SceneError(
                 f"scene {scene.name} has other bands than the scenes before it; train on scenes of one camera"
             )
-        known.keys[name] = scene.key
-        known.content += scene.content
-        mask = trained_pixels(scene)
+        found.keys[name] = scene.key
+        found.content.extend(scene.content)
         if request.choices.get("train_mask") is not None:
-            known.pixels[scene.key] = pack_mask(mask)
-        about = known
+            found.pixels[scene.key] = pack_mask(mask)
         if (alone := only_class(scene)) is not None:
-            known.alike[name] = alone
+            alike[name] = alone
         if scene.regridded:
-            known.regridded.append(name)
-        grid = SceneGrid(*scene.shape, known.patch, 1)
+            regridded.append(name)
+        grid = SceneGrid(*scene.shape, common.patch, 1)
         rng = np.random.default_rng([request.settings.seed, 0x0B5, number])
-        seen.append(observe_scene(scene, request.camera, grid, known.basis, rng))
-    if about is None:
-        why = f": no value anywhere in {listed_scenes(empty)}" if empty else ""
-        raise SceneError(f"{request.dataset} has no scene to train on{why}")
-    about.empty += empty
-    return seen, about
+        found.examples.append(observe_scene(scene, request.camera, grid, common.basis, rng))
+    notes = alike_notes(alike)
+    if names == data.train and len(alike) == len(found.keys) and len(notes) == 1:
+        raise SceneError(f"{request.dataset}: training needs two or more classes, and {notes[0]}")
+    for note in (*notes, *scene_notes(empty, regridded)):
+        tell(note)
+    return common, found
 
 
-def as_read(seen: Sequence[Example], normalisation: Normalisation) -> list[Example]:
-    """Normalise the scenes; their basis spans their bands and reaches every column."""
-    reached = np.ones(len(normalisation.centre), np.bool_)
-    return [normalised(one, normalisation, reached) for one in seen]
-
-
-def _common(request: TrainRequest, scene: RasterScene) -> About:
-    trained_pixels(scene)  # raises for a scene without labels
+def _common(request: TrainRequest, scene: RasterScene) -> Common:
     if len(scene.class_names) < 2:
         notes = alike_notes({scene.name: scene.class_names[0]})
         raise SceneError(f"{request.dataset}: training needs two or more classes, and {notes[0]}")
     basis = SpectralBasis.spanning(scene.wavelength_nm, request.columns)
     patch = request.patch or suggested_patch(scene.shape, built_in=bool(built_in_laws(request.dataset)))
-    about = About(basis, scene.class_names, scene.class_colours, patch, scene.wavelength_nm)
-    network_config(request, about)  # raises for invalid sizes before the first scene is imaged
-    return about
+    common = Common(basis, scene.class_names, scene.class_colours, patch, scene.wavelength_nm)
+    network_config(request, common)  # raises for invalid sizes before the first scene is imaged
+    return common
 
 
 def suggested_patch(shape: tuple[int, int], *, built_in: bool) -> int:
@@ -146,16 +170,27 @@ def suggested_patch(shape: tuple[int, int], *, built_in: bool) -> int:
     return 32 if min(shape) >= 512 else 16 if min(shape) >= 256 else 8
 
 
-def network_config(request: TrainRequest, about: About) -> SegmenterConfig:
+def network_config(request: TrainRequest, common: Common) -> SegmenterConfig:
     """Return the sizes of the network. Raises SettingsError where they do not fit each other."""
     try:
         return SegmenterConfig(
-            classes=len(about.names),
-            columns=about.basis.columns,
-            patch=about.patch,
+            classes=len(common.names),
+            columns=common.basis.columns,
+            patch=common.patch,
             width=request.width,
             overview_width=request.overview_width,
             **request.tokens,
         )
     except ValueError as error:
         raise SettingsError(f"{error}; choose another --patch, --dim or --heads") from error
+
+
+def check_out(out: Path) -> None:
+    """Raise SettingsError where a file of this name cannot be written."""
+    if not out.parent.is_dir() or out.is_dir():
+        raise SettingsError(f"-o {out}: expected the name of a file in a folder that exists")
+
+
+def training_capture(normalisation: Normalisation, darkest_ms: float) -> CaptureAugmentation | None:
+    """Return the simulation of shorter exposures and wider spacings; None for the reference exposure alone."""
+    return CaptureAugmentation(normalisation, darkest_ms=darkest_ms) if darkest_ms < REFERENCE_MS else None

@@ -134,14 +134,8 @@ def paired_interval(
     the mean over its runs of the mIoU of all frames together. A frame that a run did not judge is all zeros. ``seeds``
     number the training of each run, (run,) from 0. Frames and trainings are drawn with replacement, the same for both
     rows; without ``seeds`` all runs count alike.
-
-    Raises ShapeError where the rows differ in frames or classes, or a run has no seed.
     """
-    if first.shape[1:] != second.shape[1:] or first.ndim != 4:
-        raise ShapeError(f"expected two rows of the same frames and classes, got {first.shape} and {second.shape}")
     of_runs = (np.zeros(len(first), np.intp), np.zeros(len(second), np.intp)) if seeds is None else seeds
-    if (len(of_runs[0]), len(of_runs[1])) != (len(first), len(second)):
-        raise ShapeError(f"expected a seed for each of {len(first)} and {len(second)} runs, got {len(of_runs[0])}")
     frames = first.shape[1]
     once = np.ones((1, frames), np.int64)
     difference = float((_means(first, once) - _means(second, once))[0])

@@ -1,11 +1,11 @@
-"""Compare placements of patches with the ideal one and with other policies.
+"""Compare placements of patches with the ideal one and with other policies, and measure what a part of them loses.
 
 This is evaluation only: it needs labels and the whole scene at full resolution.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from models.evaluation.metrics import agreement, confusion, gap_closed, mean_iou
 from models.network.sizes import MOST_GAIN
-from models.network.spectral import LineSpec, patches_of
+from models.network.spectral import patches_of
 from models.policies.policies import score_patches
 from models.reading.inference import CoarsePrediction, captured, overview_of, patch_logits, segment
 from models.weights.files import Weights
@@ -30,6 +30,8 @@ else:
 
 Values = NDArray[np.floating]
 RANDOM_DRAWS = 5
+COMPARED = ("gain", "entropy", "sobel")  # policies beside the random one
+LEAST_GAINS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2)  # thresholds [nat per px]
 CONTROL_FRACTION = 0.35  # of the valid patches: K = 35 % of surveys' receipts and of the weights' records
 Counts = NDArray[np.int64]
 
@@ -80,27 +82,21 @@ def captured_gain(bought: float, best: float) -> float | None:
     return bought / best if best > 0 else None
 
 
-@dataclass(frozen=True)
-class Controls:
-    """Confusion counts of each placement at one fraction of the patches (mode ``frame``)."""
+Placements = dict[str, list[Counts]]  # row -> confusion counts of its map; of ``random`` several
 
-    fraction: float
-    patch_index: int
-    none: Counts
-    every: Counts
-    policies: dict[str, Counts]
-    random: list[Counts]
 
-    def as_dict(self) -> dict[str, dict[str, Any]]:
-        """Return `agreement` and the fraction of the gap closed of every row; mean and spread of the random ones."""
-        none, every = mean_iou(self.none), mean_iou(self.every)
-        rows: dict[str, dict[str, Any]] = {}
-        for policy, draws in {**{name: [one] for name, one in self.policies.items()}, "random": self.random}.items():
-            each = [agreement(counts) for counts in draws]
-            means = {name: float(np.mean([one[name] for one in each])) for name in each[0]}
-            spread = float(np.std([one["miou"] for one in each], ddof=1)) if len(each) > 1 else None
-            rows[policy] = {**means, "spread": spread, "gap_closed": gap_closed(means["miou"], none, every)}
-        return rows
+def placement_figures(rows: Placements) -> dict[str, dict[str, Any]]:
+    """Return `agreement` and the fraction of the gap closed of every policy; mean and spread of the random one."""
+    none, every = (mean_iou(rows[name][0]) for name in ("none", "all"))
+    found: dict[str, dict[str, Any]] = {}
+    for policy, draws in rows.items():
+        if policy in ("none", "all"):
+            continue
+        each = [agreement(counts) for counts in draws]
+        means = {name: float(np.mean([one[name] for one in each])) for name in each[0]}
+        spread = float(np.std([one["miou"] for one in each], ddof=1)) if len(each) > 1 else None
+        found[policy] = {**means, "spread": spread, "gap_closed": gap_closed(means["miou"], none, every)}
+    return found
 
 
 def run_controls(
@@ -111,33 +107,86 @@ def run_controls(
     *,
     fraction: float,
     seed: int,
-    capture: LineSpec | None = None,
-    policies: tuple[str, ...] = ("gain", "entropy", "sobel"),
     among: NDArray[np.bool_] | None = None,
     report: Callable[[str], None] = lambda row: None,
-) -> Controls:
+) -> Placements:
     """Segment with no patch, every patch, and ``fraction`` of the valid patches by each policy and at random.
 
     ``fine`` (patch, p, p, column) are normalised columns of every patch of the padded grid, ``labels`` (y, x) class
-    indices, 255 unlabelled. ``capture`` describes their capture (None: that of the overview), ``among``
-    (patch,) which of them may be chosen (None: all).
+    indices, 255 unlabelled. ``among`` (patch,) says which patches may be chosen (None: all).
     """
     valid = seen.grid.valid_fraction().ravel() > 0
     valid = valid if among is None else valid & among
 
     def counts(row: str, patch_index: NDArray[np.integer]) -> Counts:
         report(row)
-        drawn = segment(weights, seen, fine[patch_index], patch_index, capture=capture)
+        drawn = segment(weights, seen, fine[patch_index], patch_index)
         return confusion(labels, drawn.classes, weights.config.classes)
 
     def placed(policy: str, number: int = 0) -> NDArray[np.integer]:
         return frame_patches(score_patches(policy, seen, seed=seed + number), fraction, valid)
 
-    return Controls(
-        fraction,
-        len(placed("random")),
-        counts("none", np.empty(0, np.int64)),
-        counts("all", np.flatnonzero(valid)),
-        {policy: counts(policy, placed(policy)) for policy in policies},
-        [counts("random", placed("random", 1000 * (draw + 1))) for draw in range(RANDOM_DRAWS)],
-    )
+    return {
+        "none": [counts("none", np.empty(0, np.int64))],
+        "all": [counts("all", np.flatnonzero(valid))],
+        **{policy: [counts(policy, placed(policy))] for policy in COMPARED},
+        "random": [counts("random", placed("random", 1000 * (draw + 1))) for draw in range(RANDOM_DRAWS)],
+    }
+
+
+@dataclass(frozen=True)
+class CascadeTable:
+    """Losses on validation scenes, for each threshold of the expected gain."""
+
+    least_gain: tuple[float, ...]  # ascending [nat per px]
+    loss: tuple[float, ...]  # mIoU of the map read in full minus that of the part
+    fraction: tuple[float, ...]  # of the patches that are read in full
+
+    @staticmethod
+    def read(content: Mapping[str, Any]) -> CascadeTable:
+        """Read what `dataclasses.asdict` gave for a record."""
+        return CascadeTable(*(tuple(map(float, content[name])) for name in ("least_gain", "loss", "fraction")))
+
+    @staticmethod
+    def judged(scenes: Sequence[ReadTwice], classes: int) -> CascadeTable:
+        """Judge the maps of all scenes together."""
+        whole = mean_iou(np.sum([one.counts(0.0, classes)[0] for one in scenes], axis=0))
+        losses, fractions = [], []
+        for least in LEAST_GAINS:
+            counts, read = zip(*(one.counts(least, classes) for one in scenes), strict=True)
+            losses.append(whole - mean_iou(np.sum(counts, axis=0)))
+            fractions.append(sum(read) / sum(one.gain.size for one in scenes))
+        return CascadeTable(LEAST_GAINS, tuple(losses), tuple(fractions))
+
+    def within(self, loss: float) -> tuple[float, float] | None:
+        """Return the highest threshold within a loss, and the fraction of patches read by it; None where all lose more.
+
+        Between the last row within the loss and the first beyond it, logarithms of the gain are interpolated.
+        """
+        rows = int(np.cumprod(np.asarray(self.loss) <= loss).sum())
+        if rows == 0:
+            return None
+        ends = slice(rows - 1, rows + 1)
+        gain = np.interp(loss, self.loss[ends], np.log(self.least_gain[ends]))
+        return float(np.exp(gain)), float(np.interp(loss, self.loss[ends], self.fraction[ends]))
+
+
+@dataclass(frozen=True)
+class ReadTwice:
+    """The map of a scene by the overview, and by the full network everywhere."""
+
+    overview: NDArray[np.uint8]  # (y, x) classes
+    full: NDArray[np.uint8]  # (y, x)
+    gain: NDArray[np.float64]  # (patch_y, patch_x) expected [nat per px]
+    labels: NDArray[np.uint8]  # (y, x)
+    patch: int
+
+    def counts(self, least_gain: float, classes: int) -> tuple[NDArray[np.int64], int]:
+        """Return the confusion of the map with patches of at least this gain read in full, and their number.
+
+        A threshold of 0 reads all of them.
+        """
+        chosen = (self.gain >= least_gain) | (least_gain == 0)
+        y, x = self.labels.shape
+        pixels = chosen.repeat(self.patch, 0).repeat(self.patch, 1)[:y, :x]
+        return confusion(self.labels, np.where(pixels, self.full, self.overview), classes), int(chosen.sum())

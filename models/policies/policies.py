@@ -13,13 +13,12 @@ from models.network.sizes import SCORER_WIDTH, SegmenterConfig, scorer_inputs
 from models.network.spectral import patches_of
 from models.reading.inference import CoarsePrediction
 from pipeline.errors import SettingsError
-from pipeline.geometry.grid import SceneGrid, patch_pixels
+from pipeline.geometry.grid import SceneGrid
 
 Pixels = NDArray[np.float64]
 Scores = NDArray[np.float64]
 Policy = Literal["gain", "entropy", "sobel", "random", "mask"]
 POLICIES: tuple[Policy, ...] = get_args(Policy)
-MOST_SUMMED = 1e280  # of a mask: larger values are scaled so that sums stay finite
 
 
 def score_patches(
@@ -116,8 +115,6 @@ def _mask_scores(seen: CoarsePrediction, mask: NDArray[np.generic] | None) -> Sc
     if mask is None:
         raise SettingsError("the policy 'mask' needs --mask FILE, an image of the scene's size")
     flat = mask.reshape(grid.height, grid.width, -1).astype(np.float64).mean(axis=-1)
-    flat = np.where(np.isnan(flat), 0.0, flat)
-    unit = 2.0**-100 if np.abs(flat).max() > MOST_SUMMED else 1.0  # else sums overflow
-    total, fraction = patch_pixels(grid, flat * unit).sum(axis=(1, 2)), grid.valid_fraction().ravel() * grid.patch**2
-    means: Scores = np.divide(total, fraction, out=np.zeros(fraction.shape), where=fraction > 0) / unit
-    return means.reshape(grid.patch_shape)
+    image = np.zeros(grid.padded_shape)
+    image[: grid.height, : grid.width] = np.nan_to_num(flat)
+    return _patch_means(image, seen)

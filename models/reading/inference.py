@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-    from models.network.segmenter import Overview, Segmenter
+    from models.network.segmenter import Overview
 else:
     torch = deferred("torch")
 
@@ -64,27 +64,12 @@ class CoarsePass:
 
 
 @dataclass(frozen=True)
-class Read:
-    """An overview with its network and input."""
-
-    by: Segmenter
-    of: CoarsePass
-    overview: Overview
-
-    def counts_for(self, weights: Weights, coarse_pass: CoarsePass) -> bool:
-        """Return whether it is the overview of this coarse pass by these weights."""
-        arrays = self.of.columns is coarse_pass.columns and self.of.living is coarse_pass.living
-        values = self.of.origin == coarse_pass.origin and self.of.capture == coarse_pass.capture
-        return self.by is weights.segmenter and arrays and values
-
-
-@dataclass(frozen=True)
 class CoarsePrediction(CoarsePass):
     """Prediction of the overview for a scene, on the padded grid."""
 
     probability: NDArray[np.float32]  # (y, x, class)
     gain: NDArray[np.float32] | None = field(default=None, kw_only=True)  # (patch_y, patch_x) expected [nat per px]
-    read: Read | None = field(default=None, kw_only=True, repr=False, compare=False)
+    overview: Overview | None = field(default=None, kw_only=True, repr=False, compare=False)  # by the same weights
 
 
 @dataclass(frozen=True)
@@ -109,19 +94,17 @@ def read_coarse_pass(
     grid: SceneGrid,
     *,
     capture: Capture = LineSpec(),  # noqa: B008 - a value
-    factor: int = 1,
     origin: tuple[int, int] = (0, 0),
     components: Components | None = None,
 ) -> CoarsePass:
-    """Project a mosaic onto the spectral columns of the weights, some rows at a time; coarse pixels are repeated.
+    """Project a mosaic onto the spectral columns of the weights, some rows at a time.
 
     ``strips`` are parts of the mosaic from the top down: values (y, x, band), or scores (y, x, component) of
-    ``components``. A pixel is ``factor`` fine ones a side. ``origin`` is the row and column of the grid's first patch
-    in a larger field. A value beyond `Normalisation.most_value` counts as NaN.
+    ``components``. ``origin`` is the row and column of the grid's first patch in a larger field. A value beyond
+    `Normalisation.most_value` counts as NaN.
     """
-    s, (rows, width) = factor, (-(-grid.height // factor), -(-grid.width // factor))
-    columns, filled = np.empty((rows, width, weights.config.columns), np.float32), 0
-    known = np.zeros((rows, width), np.bool_)
+    shape, filled = (grid.height, grid.width), 0
+    columns, known = np.empty((*shape, weights.config.columns), np.float32), np.zeros(shape, np.bool_)
     for strip in strips:
         last = filled + len(strip)
         if components is None:
@@ -130,9 +113,8 @@ def read_coarse_pass(
             columns[filled:last] = weights.columns_of_scores(strip, components, wavelength_nm)
         known[filled:last] = ~np.isnan(strip).all(axis=-1)
         filled = last
-    wild = (dead_pixels(columns) & known).repeat(s, 0).repeat(s, 1)[: grid.height, : grid.width]
-    fine = columns.repeat(s, 0).repeat(s, 1)[: grid.height, : grid.width] if s > 1 else columns
-    columns = np.ascontiguousarray(pad_by_reflection(fine, grid.padded_shape), np.float32)
+    wild = dead_pixels(columns) & known
+    columns = np.ascontiguousarray(pad_by_reflection(columns, grid.padded_shape), np.float32)
     dead = dead_pixels(columns)
     return CoarsePass(
         grid,
@@ -188,16 +170,10 @@ def read_coarse_prediction(weights: Weights, coarse_pass: CoarsePass) -> CoarseP
     with torch.inference_mode():
         overview = overview_of(weights, coarse_pass)
         return CoarsePrediction(
-            coarse_pass.grid,
-            coarse_pass.columns,
-            np.ascontiguousarray(overview.logits[0].softmax(dim=0).permute(1, 2, 0).cpu().numpy()),
-            capture=coarse_pass.capture,
-            origin=coarse_pass.origin,
-            living=coarse_pass.living,
-            out_of_range=coarse_pass.out_of_range,
-            filled=coarse_pass.filled,
+            **vars(coarse_pass),
+            probability=np.ascontiguousarray(overview.logits[0].softmax(dim=0).permute(1, 2, 0).cpu().numpy()),
             gain=weights.segmenter.score(overview)[0].cpu().numpy(),
-            read=Read(weights.segmenter, coarse_pass, overview),
+            overview=overview,
         )
 
 
@@ -297,9 +273,8 @@ def check_patch_index(patch_index: NDArray[np.int64], grid: SceneGrid) -> None:
 
 def overview_of(weights: Weights, coarse_pass: CoarsePass) -> Overview:
     """Return the overview of a coarse pass; a coarse prediction has it already."""
-    kept = coarse_pass.read if isinstance(coarse_pass, CoarsePrediction) else None
-    if kept is not None and kept.counts_for(weights, coarse_pass):
-        return kept.overview
+    if isinstance(coarse_pass, CoarsePrediction) and coarse_pass.overview is not None:
+        return coarse_pass.overview
     network = weights.segmenter.eval()
     image = torch.from_numpy(with_planes(coarse_pass.columns, coarse_pass.capture)).permute(2, 0, 1)[None]
     living = None if coarse_pass.living is None else torch.from_numpy(coarse_pass.living).to(network.device)

@@ -54,9 +54,9 @@ class ColumnNoise:
         variance: NDArray[np.floating] = np.maximum(columns, 0) * (self.shot / light).astype(columns.dtype) + read
         return variance
 
-    def covariance(self, columns: NDArray[np.floating], light: float, samples: float = 1.0) -> Matrix:
-        """Return the covariance (column, column) of the mean of ``samples`` samples of a spectrum (column,)."""
-        size = np.sqrt(self.variance(columns.astype(np.float64), light) / samples)
+    def covariance(self, columns: NDArray[np.floating], light: float) -> Matrix:
+        """Return the covariance (column, column) of a spectrum (column,)."""
+        size = np.sqrt(self.variance(columns.astype(np.float64), light))
         covariance: Matrix = self.correlation() * np.outer(size, size)
         return covariance
 

@@ -1,4 +1,4 @@
-"""Train the segmenter on crops, with averaged weights and checkpoints."""
+"""Train the segmenter on crops, from linear discriminants of mean spectra, with averaged weights and checkpoints."""
 
 from __future__ import annotations
 
@@ -7,26 +7,30 @@ import hashlib
 import json
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+import scipy
 import torch
 from numpy.typing import NDArray
+from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from torch import Tensor, nn
 
 from models.network.machine import PROCESSOR, keep_freed_memory
 from models.network.segmenter import Segmenter
-from models.network.sizes import SegmenterConfig
+from models.network.sizes import AROUND_PX, SegmenterConfig
 from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
 from models.training.examples import CropSampler, Example
 from models.training.objective import PHASES, batch_loss, class_weights, phase_at
 from models.weights.checksummed_files import load_checkpoint, save_checkpoint
-from pipeline.errors import PipelineError, WeightsError
+from pipeline.errors import PipelineError
 from pipeline.geometry.grid import UNLABELLED
 
 KEEP_EVERY_S = 120.0  # between checkpoints
+PIXELS = 60_000  # to fit classifiers to, of all scenes together
+ABSENT = -20.0  # logit of a class without a pixel
 
 
 @dataclass(frozen=True)
@@ -92,9 +96,7 @@ class Trainer:
             torch.manual_seed(settings.seed)
             self.model = Segmenter(config)
         if start is not None:
-            unexpected = self.model.load_state_dict(start, strict=False).unexpected_keys
-            if unexpected:
-                raise WeightsError(f"the network has no place for {len(unexpected)} tensors, the first {unexpected[0]}")
+            self.model.load_state_dict(start, strict=False)
         self.model.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.averaged = copy.deepcopy(self.model).eval()
         parameters = list(self.model.parameters())  # matrices and kernels decay, gains and shifts do not
@@ -199,6 +201,50 @@ class Trainer:
         }
 
 
+@dataclass(frozen=True)
+class LabelledPixels:
+    """Features of labelled pixels and their classes."""
+
+    features: NDArray[np.float32]  # (pixel, column) means of `AROUND_PX` x `AROUND_PX` px
+    labels: NDArray[np.uint8]  # (pixel,)
+
+    @staticmethod
+    def drawn(examples: Sequence[Example], rng: np.random.Generator) -> LabelledPixels:
+        """Draw labelled pixels at random, at most `PIXELS`, from each scene in proportion to its number."""
+        counts = [int(np.count_nonzero(one.labels != UNLABELLED)) for one in examples]
+        fraction = min(1.0, PIXELS / max(sum(counts), 1))
+        features, labels = [], []
+        for example, count in zip(examples, counts, strict=True):
+            places = np.flatnonzero(example.labels != UNLABELLED)
+            places = np.sort(rng.choice(places, min(count, math.ceil(count * fraction)), replace=False))
+            size = (AROUND_PX, AROUND_PX, 1)
+            means = scipy.ndimage.uniform_filter(example.columns.astype(np.float32), size, mode="nearest")
+            features.append(means.reshape(-1, means.shape[-1])[places])
+            labels.append(example.labels.ravel()[places])
+        return LabelledPixels(np.concatenate(features), np.concatenate(labels))
+
+
+def linear_discriminants(pixels: LabelledPixels, classes: int) -> dict[str, Tensor]:
+    """Fit linear discriminants with shrinkage; return them as tensors of the segmenter's ``spectral`` layer.
+
+    A class without a pixel gets the logit `ABSENT`. With pixels of a single class all classes are equally likely.
+    """
+    weight, bias = np.zeros((classes, pixels.features.shape[1])), np.full(classes, ABSENT)
+    known = np.unique(pixels.labels)
+    if len(known) > 1:
+        fitted = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto").fit(pixels.features, pixels.labels)
+        slope, offset = fitted.coef_, fitted.intercept_
+        if len(known) == 2:  # one function separates both
+            slope, offset = np.concatenate([0 * slope, slope]), np.concatenate([0 * offset, offset])
+        weight[known], bias[known] = slope, offset
+    else:
+        bias[...] = 0.0
+    return {
+        "spectral.weight": torch.from_numpy(weight.astype(np.float32))[:, :, None, None],
+        "spectral.bias": torch.from_numpy(bias.astype(np.float32)),
+    }
+
+
 def train(
     config: SegmenterConfig,
     examples: list[Example],
@@ -220,8 +266,7 @@ def train(
     ``start`` are named initial tensors; others are random. ``checkpoint`` is a file of the state, from which a killed
     run of the same settings and examples continues. ``device`` is one of `models.network.machine.choose_device`.
 
-    Raises TrainingError: the loss or its gradient was not finite three steps in a row; WeightsError: a tensor of
-    ``start`` is not one of the network's.
+    Raises TrainingError: the loss or its gradient was not finite three steps in a row.
     """
     keep_freed_memory()
     trainer = Trainer(config, examples, gain_shift, settings, start, augmentation, device)

@@ -6,8 +6,7 @@ own, and does not change the key of the weights.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,12 +14,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from models.network.sizes import SegmenterConfig
+from models.evaluation.expected_scores import MapScores
+from models.network.sizes import SegmenterConfig, TemporalSizes
 from models.network.spectral import Normalisation, SpectralBasis, check_basis, project
 from models.reading.ood import Limits, OodDetector
-from models.weights import checksummed_files
-from models.weights.checksummed_files import NotChecksummedError, key_of, read_about, write_checksummed
-from models.weights.parts import OOD, READER, OodPart, ReaderPart, TrainedOn
+from models.weights.checksummed_files import key_of, read_about, read_tensors, refusing, write_checksummed
 from pipeline.errors import WeightsError
 from pipeline.lazy import deferred
 from pipeline.readings import readings_alone
@@ -42,9 +40,85 @@ NORMALISATION = ("centre", "spread", "whitening")
 FORMAT = "spectralzoom-weights/4"
 OF_COMPONENTS = ("centres", "covariance", "shot", "read")
 OF_LIMITS = ("rates", "light", "fine")
-SPREAD = "normalisation.spread"
+COLOURS = "class_colours"
 CASCADE = "cascade"  # of a record: loss of reading some patches in full
 CALIBRATION = "calibration"  # of a record: calibration error and temperature
+OOD, READER = "familiar", "memory"  # entries in the description, prefixes of tensor names
+TRAINED_ON = "trained_on"  # entry in a record
+MAP_SCORES = "map_scores"  # of a record: corrections of expected scores
+MOST_WIDTH = 1024
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class TrainedOn:
+    """Ranges of the training data; None where unknown."""
+
+    bands: int
+    wavelength_nm: Range
+    exposure_ms: Range
+    scenes: int
+    classes: tuple[str, ...]
+    day: tuple[int, int] | None = None  # of the year
+    sun_elevation_deg: Range | None = None
+    ground_pixel_m: float | None = None
+    bands_nm: tuple[float, ...] | None = None  # centre of each band
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values for a record."""
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
+
+    @staticmethod
+    def read(content: Mapping[str, Any]) -> TrainedOn:
+        """Read values of `as_dict`. Raises TypeError for other entries."""
+        return TrainedOn(
+            **{name: tuple(value) if isinstance(value, list) else value for name, value in content.items()}
+        )
+
+
+@dataclass(frozen=True)
+class OodPart:
+    """Description of the out-of-distribution detector."""
+
+    key: str  # hash
+    trained_on: TrainedOn
+    steps: tuple[int, ...]
+    bands: int
+    record: Mapping[str, Any]  # command, scenes, calibration, map scores
+
+    @staticmethod
+    def read(key: str, about: Mapping[str, Any]) -> OodPart:
+        """Read an entry of a description. Raises KeyError, TypeError or ValueError for an invalid one."""
+        trained_on, steps = TrainedOn.read(about[TRAINED_ON]), tuple(map(int, about["steps"]))
+        found = OodPart(key, trained_on, steps, int(about["bands"]), about["record"])
+        _ = found.map_scores  # raises for invalid ones
+        return found
+
+    @property
+    def map_scores(self) -> MapScores | None:
+        """Return the corrections of expected scores; None for weights of a single exposure."""
+        scores = self.record.get(MAP_SCORES)
+        return None if scores is None else MapScores.read(scores)
+
+
+@dataclass(frozen=True)
+class ReaderPart:
+    """Description of the temporal reader."""
+
+    key: str
+    sizes: TemporalSizes
+    record: Mapping[str, Any]
+
+    @staticmethod
+    def read(key: str, about: Mapping[str, Any], config: SegmenterConfig) -> ReaderPart:
+        """Read an entry of a description. KeyError, TypeError, ValueError: invalid, or for another network."""
+        sizes = TemporalSizes(**about["sizes"])
+        if (sizes.classes, sizes.columns) != (config.classes, config.columns):
+            raise ValueError(f"its temporal reader is for another network: {sizes}")
+        if not 0 < sizes.width <= MOST_WIDTH or not 0 < sizes.coarse_width <= MOST_WIDTH:
+            raise ValueError(f"its temporal reader is {sizes.width} and {sizes.coarse_width} wide")
+        return ReaderPart(key, sizes, about["record"])
 
 
 @dataclass(frozen=True)
@@ -124,7 +198,7 @@ def save_weights(weights: Weights, path: Path) -> None:
     tensors = dict(weights.segmenter.state_dict())
     for name in NORMALISATION:
         tensors[f"normalisation.{name}"] = torch.from_numpy(getattr(weights.normalisation, name).copy())
-    tensors["class_colours"] = torch.from_numpy(weights.class_colours.copy())
+    tensors[COLOURS] = torch.from_numpy(weights.class_colours.copy())
     about = {
         "config": asdict(weights.config),
         "basis": asdict(weights.basis),
@@ -132,14 +206,7 @@ def save_weights(weights: Weights, path: Path) -> None:
         "record": weights.record,
     }
     keys = {"weights": key_of(about, tensors)}
-    _write(path, {**about, "format": FORMAT, "keys": keys}, tensors)
-
-
-def _write(path: Path, about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
-    try:
-        write_checksummed(path, about, tensors)
-    except OSError as error:
-        raise WeightsError(f"cannot write weights to {path}: {error.strerror}; choose another -o") from error
+    write_checksummed(path, {**about, "format": FORMAT, "keys": keys}, tensors)
 
 
 def add_ood(
@@ -165,32 +232,26 @@ def add_reader(weights: Path, out: Path, reader: TemporalReader, record: Mapping
 
 def _add_part(source: Path, out: Path, part: str, about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
     described = describe_weights(source)
-    with _weights_error(source):
-        whole = checksummed_files.read_tensors(source, described.about)
-    kept = {name: tensor for name, tensor in whole.items() if not name.startswith(f"{part}.")}
+    kept = read_tensors(source, described.about, lambda name: not name.startswith(f"{part}."))
     added = {f"{part}.{name}": tensor for name, tensor in tensors.items()}
     keys = {**described.about["keys"], part: key_of(about, tensors)}
-    _write(out, {**described.about, "keys": keys, part: about}, kept | added)
+    write_checksummed(out, {**described.about, "keys": keys, part: about}, kept | added)
 
 
 def load_ood(weights: Path) -> OodDetector:
     """Read the out-of-distribution detector of weights. WeightsError: their file has none, or it is damaged."""
     described = describe_weights(weights)
-    if described.ood_detector is None:
+    if (about := described.ood_detector) is None:
         raise WeightsError(
             f"{weights} has no out-of-distribution detector; fit one with: spectralzoom train DATASET"
             f" --fit-ood {weights} -o {weights}"
         )
-    tensors, about = _read_part(weights, described, OOD, spreads=("light", "rates")), described.ood_detector
-    try:
+    tensors = _read_part(weights, described, OOD)
+    with refusing(weights):
         arrays = {name: tensors[name].double().numpy() for name in (*OF_COMPONENTS, *OF_LIMITS)}
         limits = Limits(arrays["rates"], arrays["light"], about.steps, arrays["fine"])
         found = OodDetector(**{name: arrays[name] for name in OF_COMPONENTS}, limits=limits, bands=about.bands)
         found.lit(float(limits.light[0]))  # raises for an invalid covariance
-    except (KeyError, ValueError) as error:
-        raise WeightsError(
-            f"{weights} is damaged: its out-of-distribution detector: {error}; copy or measure it again"
-        ) from error
     return found
 
 
@@ -202,34 +263,20 @@ def load_reader(weights: Path) -> TemporalReader:
             f"{weights} has no temporal reader; train one with: spectralzoom train DATASET --train-temporal "
             f"{weights} -o {weights}"
         )
-    tensors = _read_part(weights, described, READER)
     with torch.device("meta"):
         reader = temporal_reader.TemporalReader(described.reader.sizes)
-    try:
+    tensors = _read_part(weights, described, READER)
+    with refusing(weights):
         reader.load_state_dict(tensors, assign=True)
-    except RuntimeError as error:
-        why = str(error).splitlines()[-1].strip()
-        raise WeightsError(f"{weights} is damaged: its temporal reader: {why}; train it again") from error
     return reader.eval()
 
 
-def _read_part(path: Path, described: Description, part: str, spreads: Sequence[str] = ()) -> dict[str, Tensor]:
+def _read_part(path: Path, described: Description, part: str) -> dict[str, Tensor]:
     """Read the tensors of a part by their own names. Raises WeightsError for a damaged one."""
-    start = f"{part}."
-    with _weights_error(path):
-        tensors = checksummed_files.read_tensors(path, described.about, lambda name: name.startswith(start))
-        own = {name.removeprefix(start): tensor for name, tensor in tensors.items()}
-        check_numbers(own, spreads)
-    return own
-
-
-@contextmanager
-def _weights_error(path: Path) -> Iterator[None]:
-    """Turn NotChecksummedError into WeightsError with the file's name and the remedy."""
-    try:
-        yield
-    except NotChecksummedError as error:
-        raise WeightsError(f"{path} {error}; copy or train the file again") from error
+    tensors = read_tensors(path, described.about, lambda name: name.startswith(f"{part}."))
+    with refusing(path):
+        _check_numbers(tensors)
+    return {name.removeprefix(f"{part}."): tensor for name, tensor in tensors.items()}
 
 
 def load_weights(path: Path) -> Weights:
@@ -239,28 +286,23 @@ def load_weights(path: Path) -> Weights:
     value that is not finite.
     """
     described = describe_weights(path)
-    tensors = read_tensors(path, described)
-    network = segmenter.Segmenter(described.config)
-    network.load_state_dict({name: tensors[name] for name in network.state_dict()})
-    normalisation = Normalisation(*(tensors[f"normalisation.{name}"].numpy() for name in NORMALISATION))
-    return Weights(
-        network.eval(),
-        described.basis,
-        normalisation,
-        described.class_names,
-        tensors["class_colours"].numpy(),
-        described.record,
-    )
-
-
-def read_tensors(path: Path, described: Description) -> dict[str, Tensor]:
-    """Read the tensors of the network and its normalisation. Raises WeightsError as `load_weights`."""
+    config = described.config
+    with torch.device("meta"):
+        network = segmenter.Segmenter(config)
     parts = (f"{OOD}.", f"{READER}.")
-    with _weights_error(path):
-        tensors = checksummed_files.read_tensors(path, described.about, lambda name: not name.startswith(parts))
-        check_shapes(described.config, tensors)
-        check_numbers(tensors, (SPREAD,))
-    return tensors
+    tensors = read_tensors(path, described.about, lambda name: not name.startswith(parts))
+    with refusing(path):
+        _check_numbers(tensors)
+        normalisation = Normalisation(*(tensors.pop(f"normalisation.{name}").numpy() for name in NORMALISATION))
+        colours = tensors.pop(COLOURS).numpy()
+        network.load_state_dict(tensors, assign=True)
+        own, of_columns = normalisation, (config.columns,)
+        shapes = [one.shape for one in (own.centre, own.spread, own.whitening, colours)]
+        if shapes != [of_columns, of_columns, of_columns * 2, (config.classes, 3)]:
+            raise ValueError(f"normalisation and colours {shapes} do not fit {config.columns} columns")
+        if not (normalisation.spread > 0).all():
+            raise ValueError("normalisation.spread has a value that is not above 0")
+    return Weights(network.eval(), described.basis, normalisation, described.class_names, colours, described.record)
 
 
 def describe_weights(path: Path) -> Description:
@@ -270,21 +312,17 @@ def describe_weights(path: Path) -> Description:
     """
     if not path.is_file():
         raise WeightsError(f"no weights at {path}; train some with: spectralzoom train DATASET -o {path.name}")
-    with _weights_error(path):
-        about = read_about(path, FORMAT)
-    try:
+    about = read_about(path, FORMAT)
+    with refusing(path):
         config, basis = SegmenterConfig(**about["config"]), SpectralBasis(**about["basis"])
         names, record = tuple(map(str, about["class_names"])), dict(about["record"])
         check_basis(basis, config.columns)
         keys = about["keys"]
         ood_detector = OodPart.read(keys[OOD], about[OOD]) if OOD in about else None
         reader = ReaderPart.read(keys[READER], about[READER], config) if READER in about else None
-        key = str(keys["weights"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise WeightsError(f"{path}: its description is damaged ({error}); copy or train the file again") from error
-    if len(names) != config.classes:
-        raise WeightsError(f"{path} names {len(names)} classes, its segmenter has {config.classes}")
-    return Description(config, basis, names, record, key, ood_detector, reader, about)
+        if len(names) != config.classes:
+            raise ValueError(f"it names {len(names)} classes, its segmenter has {config.classes}")
+        return Description(config, basis, names, record, str(keys["weights"]), ood_detector, reader, about)
 
 
 def with_record(weights: Weights, **entries: Any) -> Weights:
@@ -292,29 +330,11 @@ def with_record(weights: Weights, **entries: Any) -> Weights:
     return replace(weights, record={**weights.record, **entries})
 
 
-def check_shapes(config: SegmenterConfig, tensors: Mapping[str, Tensor]) -> None:
-    """Raise NotChecksummedError for a tensor that does not fit the config, by the network on torch's meta device."""
-    one = (config.columns,)
-    with torch.device("meta"):
-        network = segmenter.Segmenter(config)
-    wanted = {name: (tuple(value.shape), torch.float32) for name, value in network.state_dict().items()}
-    wanted |= {"normalisation.centre": (one, torch.float32), SPREAD: (one, torch.float32)}
-    wanted |= {"normalisation.whitening": (one * 2, torch.float32), "class_colours": ((config.classes, 3), torch.uint8)}
-    for name, (shape, kind) in wanted.items():
-        found = tuple(tensors[name].shape) if name in tensors else "nothing"
-        if found != shape:
-            raise NotChecksummedError(f"does not fit: tensor {name} should be {shape}, the file has {found}")
-        if tensors[name].dtype != kind:
-            found_kind = tensors[name].dtype
-            raise NotChecksummedError(f"does not fit: tensor {name} should be of {kind}, the file has {found_kind}")
-
-
-def check_numbers(tensors: Mapping[str, Tensor], spreads: Sequence[str]) -> None:
-    """Raise NotChecksummedError for values that are not finite, or a tensor of ``spreads`` that is not above 0."""
+def _check_numbers(tensors: Mapping[str, Tensor]) -> None:
+    """Raise ValueError for tensors that are not of float32 (colours: uint8), or not finite."""
     for name, value in tensors.items():
-        if value.is_floating_point() and not bool(torch.isfinite(value).all()):
-            count = int((~torch.isfinite(value)).sum())
-            raise NotChecksummedError(f"is damaged: {count} of {value.numel()} numbers of tensor {name} are not finite")
-    for name in spreads:
-        if not bool((tensors[name] > 0).all()):
-            raise NotChecksummedError(f"is damaged: tensor {name} holds a spread that is not above 0")
+        kind = torch.uint8 if name == COLOURS else torch.float32
+        if value.dtype != kind:
+            raise ValueError(f"tensor {name} is of {value.dtype}, expected {kind}")
+        if not bool(torch.isfinite(value).all()):
+            raise ValueError(f"tensor {name} has numbers that are not finite")

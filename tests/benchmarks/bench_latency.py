@@ -1,30 +1,16 @@
-"""How long a rig waits between its last coarse line and the first position of the fine pass, on one emulated here.
-
-Run alone, python tests/benchmarks/bench_latency.py [--px 2560] prints where the time goes.
-"""
+"""How long a rig waits between its last coarse line and the first position of the fine pass, on one emulated here."""
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
 
-if __name__ == "__main__":  # as a command of its own; one thread, as the figures are meant
-    for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(_name, "1")
-    sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-
-from measure import Row
+from measure import Row, alone
 
 if TYPE_CHECKING:
     from flows.settings.survey_settings import Settings
@@ -35,12 +21,11 @@ PX, MOST_S = 2560, 5.0
 
 @dataclass
 class Moments:
-    """When what happened, by the wall clock; ``stages`` are wall seconds of each."""
+    """When what happened, by the wall clock."""
 
     last_exposure: float = 0.0
     last_line: float = 0.0
     first_request: float = 0.0
-    stages: dict[str, float] = field(default_factory=dict)
     coarse_s: float = 0.0
 
     @property
@@ -55,9 +40,7 @@ class Moments:
 
 
 def rows() -> list[Row]:
-    words = [sys.executable, __file__, "--json"]
-    done = subprocess.run(words, capture_output=True, text=True, check=True)
-    found = Moments(**json.loads(done.stdout.splitlines()[-1]))
+    found = alone(measure, PX)
     what = f"rig, {PX} x {PX} x 270: last coarse line to first patch request"
     fraction = f"{found.waited_s / found.coarse_s:.1%} of the coarse pass's {found.coarse_s:.0f} s"
     return [
@@ -119,7 +102,6 @@ def _watched(moments: Moments) -> Iterator[None]:
 def _survey(stack: ExitStack, settings: Settings, moments: Moments) -> None:
     from flows.survey import draw_class_map
     from flows.tasks.open_survey import OpenSurvey
-    from flows.tasks.prefect_tasks import Observer
     from flows.tasks.run import make_source, open_run
     from flows.tasks.stages.effects import chosen_effects
     from pipeline.rig.emulator.emulated_rig import EmulatedRig
@@ -127,15 +109,7 @@ def _survey(stack: ExitStack, settings: Settings, moments: Moments) -> None:
 
     run = open_run(settings)
     moments.coarse_s = run.plan.coarse_s
-    begun: dict[str, float] = {}
-
-    def watch(stage: str, state: str, done: float) -> None:
-        now = time.perf_counter()
-        begun.setdefault(stage, now)
-        if state != "running":
-            moments.stages[stage] = now - begun[stage]
-
-    survey = OpenSurvey(run, Observer(watch))
+    survey = OpenSurvey(run)
     effects = survey("choose_effects")
     source = make_source(run.scene, settings)
     rig = EmulatedRig(replace(source, chosen=chosen_effects(effects)), ManualClock(10.0))
@@ -149,23 +123,3 @@ def _survey(stack: ExitStack, settings: Settings, moments: Moments) -> None:
         draw_class_map(survey)
     except _AskedError:
         return
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(description="The wait between the coarse and the fine pass.")
-    parser.add_argument("--px", type=int, default=PX)
-    parser.add_argument("--json", action="store_true", help="one line of JSON")
-    asked = parser.parse_args()
-    found = measure(asked.px)
-    if asked.json:
-        print(json.dumps(asdict(found)))
-        return 0
-    for stage, seconds in found.stages.items():
-        print(f"{stage:18} {seconds:8.2f} s")
-    print(f"last exposure to last line {found.read_s:.2f} s")
-    print(f"last line to first patch request {found.waited_s:.2f} s, {found.waited_s / found.coarse_s:.2%} of the pass")
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

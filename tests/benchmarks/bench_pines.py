@@ -230,8 +230,7 @@ def _of_the_file(folder: Path, split: Split) -> list[Result]:
     from models.network.spectral import SpectralBasis, patches_of
     from models.reading.inference import coarse_prediction_of_columns
     from models.training.examples import Example, measured_normalisation, normalised
-    from models.training.start import LabelledPixels, linear_discriminants
-    from models.training.train import train
+    from models.training.train import LabelledPixels, linear_discriminants, train
     from models.weights.files import Weights
     from pipeline.geometry.grid import SceneGrid, pad_by_reflection
 

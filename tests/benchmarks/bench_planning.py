@@ -1,4 +1,4 @@
-"""Capture planning: free strip offsets against fixed strips and one sweep per patch."""
+"""Capture planning: free strip offsets against fixed strips, and its time."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, CostModel
-from pipeline.planning.budget_search import _completed, _least_rate, covers, spend
+from pipeline.planning.budget_search import spend
 from pipeline.planning.coverage import cheapest_full, full_sweeps
 from pipeline.planning.fine_pass import plan_fine
 from pipeline.planning.partial_scans import every_nth
 from pipeline.planning.prices import ScanPrices, check_budget, prices_of
-from pipeline.planning.scan_runs import Cover, Field, best_cover
+from pipeline.planning.scan_runs import Field
 from pipeline.planning.swaths import Views, edges_from, swaths_at_patches
 
 CAMERA, COST = LineCamera(), CostModel()
@@ -24,7 +24,7 @@ ExpectedGain = NDArray[np.float64]
 
 
 def rows() -> list[Row]:
-    return [*_patches(), *_farm(), *_speed()]
+    return [*_farm(), *_speed()]
 
 
 def _real_field(grid: SceneGrid, along: Axis, expected_gain: ExpectedGain, prices: ScanPrices) -> Field:
@@ -35,22 +35,6 @@ def _real_field(grid: SceneGrid, along: Axis, expected_gain: ExpectedGain, price
 def _columns(grid: SceneGrid, along: Axis) -> NDArray[np.intp]:
     row, column = np.divmod(np.arange(int(np.prod(grid.patch_shape))), grid.patch_shape[1])
     return column if along == "x" else row
-
-
-def _cheapest_cover(field: Field) -> Cover:
-    """The fewest seconds found that show all patches: from side by side, from each patch, and by falling prices."""
-    rate, starts = _least_rate(field), ((), tuple(_completed(field, ())))
-    *_, (last, _) = covers(field)
-    ends = [best_cover(field, start, rate) for start in starts]
-    found = [field.cover(_completed(field, cover.runs)) for cover in (last, *ends, field.cover(starts[1]))]
-    return min(found, key=lambda cover: cover.seconds(field.prices))
-
-
-def _lines_showing(grid: SceneGrid, patch_index: NDArray[np.integer]) -> int:
-    """Lines of the cheapest runs found that show these patches."""
-    expected_gain = np.zeros(int(np.prod(grid.patch_shape)))
-    expected_gain[patch_index] = 1
-    return _cheapest_cover(_real_field(grid, "x", expected_gain, prices_of(CAMERA, COST))).lines
 
 
 def _fixed(field: Field) -> Field:
@@ -68,50 +52,6 @@ def _fixed(field: Field) -> Field:
     edges = np.cumsum([0, *map(len, parts)])
     few = Views(sweeps, views.lines, edges, views.patch_number[kept], views.first[kept], views.stop[kept])
     return Field(few, field.expected_gain, field.column, field.prices)
-
-
-def _patches() -> list[Row]:
-    grid = SceneGrid(10_240, 10_240, 320, 4)
-    full = sum(sweep.lines for sweep in full_sweeps(grid, CAMERA, "x"))
-    coarse = sum(sweep.lines for sweep in every_nth(full_sweeps(grid, CAMERA, "x")))
-    patch_index = np.random.default_rng(0).choice(1024, 100, replace=False)
-    began = time.process_time()
-    lines = _lines_showing(grid, patch_index)
-    took = time.process_time() - began
-    expected_gain = np.zeros(1024)
-    expected_gain[patch_index] = 1
-    field = _real_field(grid, "x", expected_gain, prices_of(CAMERA, COST))
-    need = field.views.stop - field.views.first
-    single = sum(int(need[field.views.patch_number == patch_number].min()) for patch_number in patch_index)
-    swaths = _cheapest_cover(_fixed(field))
-    fraction, alone, fixed = ((coarse + count) / full for count in (lines, single, swaths.lines))
-    met = fraction <= min(alone, 0.498, 1.0) and lines <= 1.02 * swaths.lines
-    text = f"{fraction:.1%} of {full} lines with the coarse pass ({lines} fine), {took:.1f} s"
-    goal = "<= one sweep per patch (49.8 %), <= exact per-strip optimum + 2 %, <= 100 %"
-    peers = f"one sweep per patch {alone:.1%} ({single}); exact per-strip optimum {fixed:.1%} ({swaths.lines})"
-    what = "100 patches of 320 px, seed 0, s = 4, rotated footprints"
-    return [Row(what, text, goal, met, peers), *_many_patches(grid, coarse, full)]
-
-
-def _many_patches(grid: SceneGrid, coarse: int, full: int) -> list[Row]:
-    """Where one sweep per patch costs more than scanning everything, and where runs of lines do too."""
-    patch_index = np.random.default_rng(0).choice(1024, 400, replace=False)
-    expected_gain = np.zeros(1024)
-    expected_gain[patch_index] = 1
-    views = _real_field(grid, "x", expected_gain, prices_of(CAMERA, COST)).views
-    alone = sum(
-        int((views.stop - views.first)[views.patch_number == patch_number].min()) for patch_number in patch_index
-    )
-    fraction = (coarse + _lines_showing(grid, patch_index)) / full
-    return [
-        Row(
-            "400 patches of 320 px, with the coarse pass",
-            f"{fraction:.1%} of the full scan's lines",
-            "<= 100 %",
-            fraction <= 1,
-            f"one sweep per patch {(coarse + alone) / full:.1%}",
-        )
-    ]
 
 
 def _smooth(shape: tuple[int, int], *, seed: int, sigma: float) -> ExpectedGain:

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
+from typing import TypeVar
 
 from flows.tradeoff.entries import Timing, ratio
 from flows.tradeoff.entries import time_in_turn as in_turn
 
 __all__ = ["Timing", "ratio"]
 ROOT = Path(__file__).resolve().parents[2]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,12 @@ def time_in_turn(calls: Mapping[str, Callable[[], object]], rounds: int = 5) -> 
     for call in calls.values():
         call()
     return in_turn(calls, rounds)
+
+
+def alone(call: Callable[..., T], *given: object) -> T:
+    """Call in a process of its own, whose memory and settings are not those of other benchmarks."""
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(call, *given).result()
 
 
 def peak_bytes() -> int:

@@ -17,13 +17,11 @@ from measure import ROOT
 from numpy.typing import NDArray
 
 from flows.training.data import FARM_SHAPE, FARM_TRAIN_SEED, farm_days, read_farm_name, scene_of_file
-from flows.training.train_scenes import as_read
 from models.network.sizes import SegmenterConfig
 from models.network.spectral import LineSpec, SpectralBasis, with_planes
 from models.training.capture_augmentation import CaptureAugmentation, ColumnNoise
-from models.training.examples import measured_normalisation, observe
-from models.training.start import LabelledPixels, linear_discriminants
-from models.training.train import Progress, TrainingSettings, train
+from models.training.examples import measured_normalisation, normalised, observe
+from models.training.train import LabelledPixels, Progress, TrainingSettings, linear_discriminants, train
 from models.weights.files import Weights, load_weights, save_weights
 from pipeline.errors import SceneError, WeightsError
 from pipeline.geometry.camera import LineCamera
@@ -78,7 +76,7 @@ def trained(name: str, scenes: Mapping[str, Callable[[], RasterScene]], patch: i
     basis = SpectralBasis.spanning(first.wavelength_nm)
     seen = [observe(scene, CAMERA, SceneGrid(*scene.shape, patch, 1), basis, rng) for scene in made]
     normalisation = measured_normalisation(seen)
-    examples = as_read(seen, normalisation)
+    examples = [normalised(one, normalisation, np.ones(basis.columns, np.bool_)) for one in seen]
     config = SegmenterConfig(len(first.class_names), basis.columns, patch)
     start = linear_discriminants(LabelledPixels.drawn(examples, rng), config.classes)
 

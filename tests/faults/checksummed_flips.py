@@ -17,7 +17,6 @@ from typing import Any
 
 import torch
 
-from models.training.start import StartFile
 from models.weights.checksummed_files import load_checkpoint, save_checkpoint
 from models.weights.files import describe_weights, load_weights, save_weights
 from pipeline.errors import WeightsError
@@ -39,18 +38,13 @@ def _weights(path: Path) -> Content:
     return (found.config, found.basis, found.class_names, found.record, describe_weights(path).key), tensors
 
 
-def _start(path: Path) -> Content:
-    start = StartFile(path)
-    return (start.described.config, start.earlier), start.tensors
-
-
 def _state(path: Path) -> Content:
     found = load_checkpoint(path, RUN)
     assert found is not None, "a checkpoint that is there counts as none"
     return found
 
 
-READERS: dict[str, Read] = {"weights": _weights, "start": _start, "checkpoint": _state}
+READERS: dict[str, Read] = {"weights": _weights, "checkpoint": _state}
 
 
 @dataclass
@@ -114,7 +108,7 @@ def _written(folder: Path) -> dict[str, Path]:
     tensors = {f"model.{name}": torch.randn(7, 5, generator=numbers) for name in "abc"}
     tensors["optimiser.0.step"] = torch.tensor(12.0)
     save_checkpoint(state, RUN, {"course": {"step": 12, "seconds": 3.5}, "rng": {"state": 2**100}}, tensors)
-    return {"weights": weights, "start": weights, "checkpoint": state}
+    return {"weights": weights, "checkpoint": state}
 
 
 def weight_rows(quick: bool) -> Sequence[Row]:

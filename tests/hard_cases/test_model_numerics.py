@@ -323,8 +323,8 @@ def test_20_numbers_that_are_no_class_are_refused(label: int, guess: int):
 def test_21_any_size_gives_its_own_map(size: tuple[int, int]):
     """Scenes that do not divide are padded and cropped back, from one pixel on; no patch of the pad is bought."""
     weights, grid = plain_weights(), SceneGrid(*size, 8, 4)
-    values = np.random.default_rng(0).uniform(0.1, 0.5, (*grid.coarse_shape, 5))
-    seen = coarse_prediction(weights, values, np.linspace(450, 950, 5), grid, factor=4)
+    values = np.random.default_rng(0).uniform(0.1, 0.5, (*size, 5))
+    seen = coarse_prediction(weights, values, np.linspace(450, 950, 5), grid)
     valid = grid.valid_fraction().ravel() > 0
     patch_index = frame_patches(score_patches("gain", seen), 0.5, valid)
     assert valid[patch_index].all()

@@ -40,10 +40,9 @@ def coarse_prediction(
     grid: SceneGrid,
     *,
     capture: Capture = LineSpec(),  # noqa: B008 - a value
-    factor: int = 1,
 ) -> CoarsePrediction:
-    """Predict from scene values (y, x, band), in pixels of ``factor`` fine ones; NaN is no data."""
-    coarse = read_coarse_pass(weights, [values], wavelength_nm, grid, capture=capture, factor=factor)
+    """Predict from scene values (y, x, band); NaN is no data."""
+    coarse = read_coarse_pass(weights, [values], wavelength_nm, grid, capture=capture)
     return read_coarse_prediction(weights, coarse)
 
 

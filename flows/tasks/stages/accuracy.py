@@ -29,7 +29,7 @@ from models.evaluation.metrics import (
     iou_per_class,
     kappa,
 )
-from models.evaluation.placement import CONTROL_FRACTION, run_controls
+from models.evaluation.placement import CONTROL_FRACTION, placement_figures, run_controls
 from models.network.spectral import LineSpec
 from models.reading.inference import read_coarse_prediction, segment
 from models.reading.regions import plan_regions, whole_field
@@ -109,9 +109,9 @@ def evaluate(
                 among=among,
                 report=lambda row: report(0.09 * next(rows)),
             )
-            figures = map_figures(names, found.every)
+            figures = map_figures(names, found["all"][0])
             gap = gap_closed(result["miou"], result["none"]["miou"], figures["miou"])
-            compared = {"controls": found.as_dict(), "controls_fraction": found.fraction}
+            compared = {"controls": placement_figures(found), "controls_fraction": fraction}
             result |= {"all": figures, "gap_closed": gap, **compared}
         (path / RECORD).write_text(to_json(result), encoding="utf-8")  # JSON without NaN
 

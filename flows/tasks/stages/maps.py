@@ -20,7 +20,7 @@ from flows.tasks.stages.attention import READING
 from flows.tasks.zones import SurveyZones
 from models.network.spectral import LineSpec
 from models.reading.prior_map import TemporalAgreement, changed_fractions
-from models.weights.parts import OodPart, ReaderPart
+from models.weights.files import OodPart, ReaderPart
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.ground.field_places import PosedField, areas_by_number
 from pipeline.ground.map_grid import GroundGrid, image_at, map_blocks, nearest_at

@@ -20,8 +20,7 @@ from flows.publish.receipt_table import finding_rows
 from flows.settings.load import load_settings
 from flows.tasks.survey_model import beyond_training
 from models.reading.ood import Limits, OodDetector
-from models.weights.files import add_ood, describe_weights
-from models.weights.parts import TrainedOn
+from models.weights.files import TrainedOn, add_ood, describe_weights
 from pipeline.errors import WeightsError
 from pipeline.geometry.grid import UNLABELLED
 from tests.conftest import CLASSES, RGB_NM, Survey
@@ -185,7 +184,7 @@ def test_what_training_did_not_see_is_told_in_one_note(weights: Path, flags: dic
     nm = flags.pop("nm", RGB_NM)
     (note,) = _notes(weights, nm, **flags)
     assert re.search(words, note), note
-    assert "spectralzoom train DATASET --init" in note
+    assert "spectralzoom train DATASET -o" in note
 
 
 def test_a_pixel_of_another_size_is_told(weights: Path) -> None:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from models.evaluation.metrics import mean_iou, paired_interval
-from pipeline.errors import ShapeError
 
 
 def _frames(runs: int, frames: int, seed: int = 0) -> np.ndarray:
@@ -70,15 +69,6 @@ def test_seeds_that_differ_widen_the_interval():
     assert wide.high == pytest.approx(0)
     same = paired_interval(first, first, seeds=(two, two), draws=50)
     assert (same.low, same.high) == (0, 0)
-
-
-def test_rows_that_do_not_go_together_are_refused():
-    """The messages name both shapes, or how many seeds there are."""
-    row = _frames(2, 3)
-    with pytest.raises(ShapeError, match="a seed for each of 2 and 2 runs"):
-        paired_interval(row, row, seeds=(np.arange(1), np.arange(2)))
-    with pytest.raises(ShapeError, match="the same frames and classes"):
-        paired_interval(_frames(1, 3), _frames(1, 4))
 
 
 def test_one_frame_has_no_interval():

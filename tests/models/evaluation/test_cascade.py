@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from models.evaluation.cascade import LEAST_GAINS, CascadeTable, ReadTwice
+from models.evaluation.placement import LEAST_GAINS, CascadeTable, ReadTwice
 
 FOUR = np.array([[0.3, 0.03], [0.003, 0.0]])
 

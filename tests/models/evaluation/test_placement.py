@@ -8,7 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from models.evaluation.metrics import agreement, mean_iou
-from models.evaluation.placement import RANDOM_DRAWS, Controls, captured_gain, gain_sums, oracle_gain, run_controls
+from models.evaluation.placement import (
+    RANDOM_DRAWS,
+    Placements,
+    captured_gain,
+    gain_sums,
+    oracle_gain,
+    placement_figures,
+    run_controls,
+)
 from models.reading.inference import CoarsePrediction, coarse_prediction_of_columns, segment
 from models.weights.files import Weights
 from tests.models.conftest import Maker, scene_columns
@@ -75,24 +83,22 @@ def _scene(weights: Weights) -> tuple[CoarsePrediction, np.ndarray, np.ndarray]:
     return coarse_prediction_of_columns(weights, coarse_pass.columns, coarse_pass.grid), fine, labels
 
 
-def _run(weights: Weights, fraction: float = 0.35, seed: int = 0) -> Controls:
+def _run(weights: Weights, fraction: float = 0.35, seed: int = 0) -> Placements:
     return run_controls(weights, *_scene(weights), fraction=fraction, seed=seed)
 
 
 def test_every_row_counts_every_labelled_pixel(tiny: Maker):
     """Each placement draws the whole scene, with as many patches as the fraction of the valid ones says."""
-    controls = _run(tiny())
-    rows = [controls.none, controls.every, *controls.policies.values(), *controls.random]
-    assert {int(row.sum()) for row in rows} == {27 * 45}
-    assert controls.patch_index == round(0.35 * 4 * 6)
-    assert list(controls.policies) == ["gain", "entropy", "sobel"]
-    assert len(controls.random) == RANDOM_DRAWS
+    rows = _run(tiny())
+    assert {int(counts.sum()) for draws in rows.values() for counts in draws} == {27 * 45}
+    assert list(rows) == ["none", "all", "gain", "entropy", "sobel", "random"]
+    assert len(rows["random"]) == RANDOM_DRAWS
 
 
 def test_random_rows_follow_the_seed(tiny: Maker):
     """Equal seeds draw equal placements, other seeds others, and the draws of one run differ."""
     weights = tiny()
-    first, same, other = (np.array(_run(weights, seed=seed).random) for seed in (1, 1, 2))
+    first, same, other = (np.array(_run(weights, seed=seed)["random"]) for seed in (1, 1, 2))
     assert (first == same).all()
     assert (first != other).any()
     assert (first[0] != first[1]).any()
@@ -104,21 +110,20 @@ def _counts(right: int) -> np.ndarray:
 
 def test_figures_of_a_worked_case():
     """Both means and the pixels' accuracy, the fraction of the gap, and mean and spread of the random placements."""
-    controls = Controls(
-        0.35, 10, _counts(60), _counts(90), {"entropy": _counts(80)}, [_counts(62), _counts(66), _counts(64)]
-    )
-    rows = controls.as_dict()
+    draws = [_counts(62), _counts(66), _counts(64)]
+    rows = placement_figures({"none": [_counts(60)], "all": [_counts(90)], "entropy": [_counts(80)], "random": draws})
     none, every, entropy = (mean_iou(_counts(right)) for right in (60, 90, 80))
     closed = (entropy - none) / (every - none)
     assert rows["entropy"] == {**agreement(_counts(80)), "spread": None, "gap_closed": closed}
-    draws = [mean_iou(_counts(right)) for right in (62, 66, 64)]
-    figures = {"miou": np.mean(draws), "overall_accuracy": 0.64}
-    closed = (np.mean(draws) - none) / (every - none)
-    assert rows["random"] == pytest.approx({**figures, "spread": np.std(draws, ddof=1), "gap_closed": closed})
+    drawn = [mean_iou(one) for one in draws]
+    figures = {"miou": np.mean(drawn), "overall_accuracy": 0.64}
+    closed = (np.mean(drawn) - none) / (every - none)
+    assert rows["random"] == pytest.approx({**figures, "spread": np.std(drawn, ddof=1), "gap_closed": closed})
 
 
 def test_one_draw_has_no_spread_and_a_small_gap_no_fraction():
     """What cannot be said is None."""
-    rows = Controls(0.35, 10, _counts(60), _counts(60), {"sobel": _counts(61)}, [_counts(60)]).as_dict()
+    one = [_counts(60)]
+    rows = placement_figures({"none": one, "all": one, "sobel": [_counts(61)], "random": one})
     assert rows["random"] == {**agreement(_counts(60)), "spread": None, "gap_closed": None}
     assert rows["sobel"] == {**agreement(_counts(61)), "spread": None, "gap_closed": None}

@@ -130,8 +130,8 @@ def test_patches_without_a_label_have_no_say():
 
 def test_an_overview_tells_gains_and_the_policy_takes_them(tiny: Maker):
     """Scores of the policy are the gains expected, by the fraction of each patch that lies on the scene."""
-    grid, values = SceneGrid(27, 40, 8, 2), np.random.default_rng(0).random((14, 20, 4))
-    seen = coarse_prediction(tiny(), values, np.linspace(500, 900, 4), grid, factor=2)
+    grid, values = SceneGrid(27, 40, 8, 1), np.random.default_rng(0).random((27, 40, 4))
+    seen = coarse_prediction(tiny(), values, np.linspace(500, 900, 4), grid)
     assert seen.gain is not None
     assert seen.gain.shape == grid.patch_shape
     assert score_patches("gain", seen) == pytest.approx((seen.gain * grid.valid_fraction()).ravel())

@@ -112,20 +112,12 @@ def test_a_region_is_drawn_as_training_saw_crops(tiny: Maker, patch: int, origin
     assert (drawn.confidence == here.confidence).all() == (origin == (0, 0))
 
 
-def test_a_kept_overview_counts_for_what_it_is_of_only(tiny: Maker, monkeypatch: pytest.MonkeyPatch):
-    """A scene is read again where pixels, place, living tokens, capture or weights are not those of the prediction."""
-    weights, other, again = tiny(0), tiny(1), list[int]()
+def test_a_prediction_keeps_its_overview(tiny: Maker, monkeypatch: pytest.MonkeyPatch):
+    """A map of a prediction does not read the scene again."""
+    weights = tiny()
     seen, fine = _seen(weights)
-    for network in (weights.segmenter, other.segmenter):
-        read = network.read_overview
-        monkeypatch.setattr(network, "read_overview", lambda *given, read=read: again.append(1) or read(*given))
+    monkeypatch.setattr(weights.segmenter, "read_overview", lambda *given: pytest.fail("read"))
     segment(weights, seen, fine[:1], np.array([0]))
-    assert not again
-    changes = {"columns": seen.columns + 1, "origin": (4, 4), "living": np.array([True, False]), "capture": DARK}
-    changed = [(weights, replace(seen, **{name: value})) for name, value in changes.items()]
-    for count, (who, what) in enumerate([*changed, (other, seen)], 1):
-        segment(who, what, fine[:1], np.array([0]))
-        assert len(again) == count
 
 
 @pytest.mark.parametrize(
@@ -148,16 +140,14 @@ def test_a_patch_that_cannot_be_is_refused_before_anything_is_read(
 
 
 @pytest.mark.parametrize("bands", [NM, NM[:3]])
-@pytest.mark.parametrize("factor", [1, 2])
-def test_a_look_in_swaths_is_the_look_at_once(tiny: Maker, bands: np.ndarray, factor: int):
+def test_a_look_in_swaths_is_the_look_at_once(tiny: Maker, bands: np.ndarray):
     """Rows of the mosaic that come some at a time give the very same columns, with bands for all of them or not."""
-    weights, grid = tiny(), SceneGrid(37, 53, 8, factor)
-    values = _values(*grid.coarse_shape, len(bands))
-    whole = read_coarse_pass(weights, [values], bands, grid, factor=factor)
-    parts = read_coarse_pass(weights, np.split(values, [1, 9]), bands, grid, factor=factor)
+    weights, grid = tiny(), SceneGrid(37, 53, 8, 1)
+    values = _values(37, 53, len(bands))
+    whole = read_coarse_pass(weights, [values], bands, grid)
+    parts = read_coarse_pass(weights, np.split(values, [1, 9]), bands, grid)
     assert (parts.columns == whole.columns).all()
-    inner = weights.columns(values, bands).repeat(factor, 0).repeat(factor, 1)[:37, :53]
-    assert whole.columns[:37, :53] == pytest.approx(inner, abs=1e-6)  # each coarse pixel stands for several
+    assert whole.columns[:37, :53] == pytest.approx(weights.columns(values, bands), abs=1e-6)
     added = len(whole.columns) - 37
     assert (whole.columns[37:] == whole.columns[35 : 35 - added : -1]).all()  # the pad is a mirror image
 

@@ -37,13 +37,12 @@ def test_variance_is_that_of_the_camera(light: float) -> None:
     np.testing.assert_allclose(drawn / np.outer(size, size), _noise().correlation(), atol=0.05)
 
 
-@given(light=st.floats(1e-3, 1.0), samples=st.integers(1, 64))
-def test_more_light_and_more_samples_are_less_noise(light: float, samples: int) -> None:
-    """Twice the light is better than the mean of two samples, which is just half the variance."""
+@given(light=st.floats(1e-3, 1.0))
+def test_more_light_is_less_noise(light: float) -> None:
+    """Twice the light is better than the mean of two samples, which has half the variance."""
     noise, spectrum = _noise(), np.full(12, 0.2)
-    one = np.diag(noise.covariance(spectrum, light, samples))
-    np.testing.assert_allclose(np.diag(noise.covariance(spectrum, light, 2 * samples)), one / 2, rtol=1e-12)
-    assert (np.diag(noise.covariance(spectrum, 2 * light, samples)) < one / 2).all()
+    one, two = (np.diag(noise.covariance(spectrum, n * light)) for n in (1, 2))
+    assert (two < one / 2).all()
 
 
 def test_whitening_leaves_alone_what_noise_hides() -> None:

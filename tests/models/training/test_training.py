@@ -15,7 +15,7 @@ from models.reading.inference import map_of_columns
 from models.training import train as training
 from models.training.examples import CropSampler
 from models.training.objective import batch_loss, class_weights, draw_patches, map_loss, phase_at, pixel_losses
-from models.training.train import Progress, TrainingSettings, rate_at, train
+from models.training.train import LabelledPixels, Progress, TrainingSettings, linear_discriminants, rate_at, train
 from pipeline.geometry.grid import SceneGrid
 from tests.models.conftest import Maker, block_example
 
@@ -161,3 +161,13 @@ def test_unlabelled_pixels_have_no_say():
     assert map_loss(other, pixel_losses(other, labels), labels, torch.ones(3), soft_dice=True).item() == pytest.approx(
         loss.item(), abs=1e-6
     )
+
+
+def test_discriminants_of_absent_classes_are_out_of_reach():
+    """Two of three classes have pixels: each is told by its own channel, and the third is never the likeliest."""
+    rng, labels = np.random.default_rng(0), np.repeat(np.array([0, 2], np.uint8), 50)
+    features = (rng.normal(0, 1, (100, 4)) + 5 * labels[:, None]).astype(np.float32)
+    found = linear_discriminants(LabelledPixels(features, labels), 3)
+    logits = features @ found["spectral.weight"][:, :, 0, 0].numpy().T + found["spectral.bias"].numpy()
+    assert (logits.argmax(axis=1) == labels).all()
+    assert (logits[:, 1] == -20).all()
