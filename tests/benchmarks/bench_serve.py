@@ -11,13 +11,19 @@ import tempfile
 import time
 from pathlib import Path
 
+import numpy as np
 from measure import Row
+from PIL import Image
 
-from tests.soak.served_week import free_port, small_fields
+from models.weights.files import save_weights
+from tests.conftest import CLASSES, RGB_NM, patchy_scene, random_weights
+from tests.flows.schedule.prefect_server import free_port
 
 ROOT = Path(__file__).resolve().parents[2]
 SETTLES_S, REST_S = 30.0, 60.0
 WAIT_S = 300.0
+SCENE = 'source = "sim"\nscene = "scene.png"\nweights = "weights.safetensors"\n'
+SETTINGS = f'{SCENE}budget = 0.8\neffects = "none"\ncontrols = false\n'
 TICKS = os.sysconf("SC_CLK_TCK")
 
 
@@ -25,15 +31,25 @@ def rows() -> list[Row]:
     """Serve one field, leave it alone, ask for runs of it, and survey the same by hand."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        (field, _) = small_fields(folder)
-        idle_s, run_s = _served(folder, field.file)
-        uniform_s = _plain(folder, field.file)
+        file = small_field(folder)
+        idle_s, run_s = _served(folder, file)
+        uniform_s = _plain(folder, file)
     load = f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}"
     return [
         Row("serve at rest, server and runner", f"{idle_s:.1f} s a minute", "", None, f"processor time; {load}"),
         Row("a scheduled run, all of it", f"{run_s:.1f} s", "", None, f"of its process, and what serve adds; {load}"),
         Row("the same by survey --engine plain", f"{uniform_s:.1f} s", "", None, f"of its process; {load}"),
     ]
+
+
+def small_field(folder: Path) -> Path:
+    """Write a small picture, small weights and the settings of a field, and return its file."""
+    values, _ = patchy_scene((48, 64), 3, seed=1)
+    Image.fromarray(values.astype(np.uint8)).save(folder / "scene.png")
+    save_weights(random_weights(RGB_NM, CLASSES), folder / "weights.safetensors")
+    file = folder / "hourly.toml"
+    file.write_text(SETTINGS)
+    return file
 
 
 def _served(folder: Path, file: Path) -> tuple[float, float]:

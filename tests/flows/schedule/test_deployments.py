@@ -30,7 +30,7 @@ from flows.tasks.open_survey import RIG_LIMIT, OpenSurvey
 from storage.archive.archive import Archive
 from storage.archive.records import read_run
 from storage.parallel.pool import THREADS
-from tests.soak.served_week import free_port, server_process
+from tests.flows.schedule.prefect_server import free_port, server_process
 
 ROOT = Path(__file__).parents[3]
 PATIENCE_S = 300.0
