@@ -198,7 +198,7 @@ def _run_state(catalogue: Catalogue, run: Run) -> str:
     """Return the state of a run by its manifests alone."""
     if run.problem is not None:
         return "damaged"
-    stores = [catalogue.stores.get(uri) for uri in catalogue.named_and_below[run.uri]]
+    stores = [catalogue.stores.get(uri) for uri in run.names]
     damaged = sum(store is not None and store.problem is not None for store in stores)
     counts = ((stores.count(None), "missing"), (damaged, "damaged"))
     return " and ".join(f"{count} {word}" for count, word in counts if count) or "there"
@@ -221,7 +221,7 @@ def explanation(archive: Archive, product: str) -> dict[str, Any]:
     if isinstance(found, Run):
         below = set[str]().union(*(catalogue.ancestors([uri]) for uri in found.names))
         shown = set[str]()
-        row = _run_row(catalogue, found, archive.kept_bytes(found, catalogue))
+        row = _run_row(catalogue, found, archive.kept_bytes(found))
         row |= {"problem": found.problem, "command": command(found.settings, archive.name)}
         trees = [_tree(catalogue, uri, shown) for uri in sorted(found.names - below)]
         return {"archive": archive.name, "product": found.uri, "run": row, "lineage": trees}

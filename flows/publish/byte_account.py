@@ -92,14 +92,14 @@ def recount_bytes(archive: Archive, run: str, replace_rows: Callable[[str, Recei
     assert draft is not None
     with draft:
         place = archive.locate(f"runs/{run}")
-        found = read_run(place, {})
+        found = read_run(place)
         if found.problem is not None:
             raise IncompleteStoreError(f"{found.uri}: {found.problem}; run verify --repair on the archive")
         for path in place.iterdir():
             if path.name not in (RECEIPT, REPORT, MANIFEST_NAME):  # written below
                 shutil.copyfile(path, draft.folder / path.name)
         page = (place / REPORT).read_text(encoding="utf-8")
-        there = [uri.split("/")[1:] for uri in found.recorded if (archive.root / uri / MANIFEST_NAME).is_file()]
+        there = [uri.split("/")[1:] for uri in found.names if (archive.root / uri / MANIFEST_NAME).is_file()]
         rests_on = archive.manifest_hashes(store_at(archive.root, stage, key) for stage, key in there)
         return publish_counted(
             archive, draft, dict(found.receipt), lambda receipt: replace_rows(page, receipt), rests_on=rests_on

@@ -118,5 +118,5 @@ def _recount(archive: Archive) -> None:
     for run in catalogue.runs:
         account = run.receipt.get("data_bytes")
         named = any(run.products.get(name) in cleared for name in LINE_PRODUCTS)
-        if named and isinstance(account, dict) and account.get("kept") != archive.kept_bytes(run, catalogue):
+        if named and isinstance(account, dict) and account.get("kept") != archive.kept_bytes(run):
             recount_bytes(archive, run.folder.name, replace_savings)

@@ -13,7 +13,6 @@ archive in a bucket (`storage.remote.object_archive`) has the same addresses.
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -32,7 +31,6 @@ from storage.archive.keys import (
     published_stores,
     stage_key,
     store_at,
-    without_manifest,
 )
 from storage.archive.lineage import Catalogue, rests_on
 from storage.archive.manifests import (
@@ -111,8 +109,7 @@ class Archive:
     def locate(self, address: str) -> Path:
         """Return the path on this machine of a product, by its address in a receipt.
 
-        Raises IncompleteStoreError: the store is missing or was cleared, or a file is missing, cut short or no plain
-        file.
+        Raises IncompleteStoreError: the store is missing or was cleared, or a file is missing or cut short.
         """
         uri = in_text(address)
         if uri is not None:
@@ -131,7 +128,7 @@ class Archive:
         or a file is missing, or has another size.
         """
         ref = store_at(self.root, stage, key)
-        if not os.path.lexists(ref.path):
+        if not ref.path.exists():
             return None
         check_files(ref.path, hashes=False)
         return None if is_cleared(read_manifest(ref.path)) else ref
@@ -293,24 +290,19 @@ class Archive:
         """Return the sizes of stores and runs, as `size_of` counts them, by address."""
         return {uri: self.size_of(uri) for uri in uris}
 
-    def kept_bytes(self, run: Run, catalogue: Catalogue) -> int:
+    def kept_bytes(self, run: Run) -> int:
         """Return the bytes kept for a run: its folder, the stores that it names, and their inputs, with manifests."""
-        return sum(self.sizes([run.uri, *catalogue.named_and_below[run.uri]]).values())
+        return sum(self.sizes([run.uri, *run.names]).values())
 
     def all_sizes(self, catalogue: Catalogue) -> dict[str, int]:
         """Return the bytes of every store and run, by address; missing stores that a run names are included."""
-        below = catalogue.named_and_below
-        return self.sizes(sorted({*catalogue.stores, *below, *(uri for uris in below.values() for uri in uris)}))
+        return self.sizes(
+            sorted({*catalogue.stores, *(uri for run in catalogue.runs for uri in (run.uri, *run.names))})
+        )
 
     def take_moved(self) -> int:
         """Return the bytes transferred to and from a bucket since the last call."""
         return 0
-
-    def lost_runs(self) -> list[str]:
-        """Return the addresses of runs without a manifest, whose stores are unknown."""
-        return [
-            f"runs/{path.name}" for path in without_manifest(self.root) if path.parent.name == "runs" and path.is_dir()
-        ]
 
     def leftovers(self, keep_days: float) -> dict[str, int]:
         """Return addresses and bytes of incomplete uploads in a bucket that are older than ``keep_days``."""

@@ -7,9 +7,10 @@ problem, a missing input a bare key.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -33,12 +34,7 @@ class Catalogue:
     def read(cls, root: Path) -> Catalogue:
         """Read every manifest and receipt of an archive; damaged ones have a ``problem``."""
         stores = {ref.uri: read_store(ref) for ref in published_stores(root)}
-        by_key: dict[str, list[str]] = {}
-        for store in stores.values():
-            by_key.setdefault(store.ref.key, []).append(store.ref.uri)
-        runs = sorted(
-            (read_run(path, by_key) for path in published_runs(root)), key=lambda run: (run.created, run.folder.name)
-        )
+        runs = sorted((read_run(path) for path in published_runs(root)), key=lambda run: (run.created, run.folder.name))
         lost = (path.relative_to(root).as_posix() for path in without_manifest(root))
         return cls(stores, runs, tuple(uri for uri in lost if in_text(uri) == uri))
 
@@ -55,7 +51,7 @@ class Catalogue:
         store = self.stores.get(uri)
         if store is None:
             return []
-        return [(self.by_key.get(given) or [in_text(given) or given])[0] for given in store.inputs]
+        return [self.by_key.get(given, [given])[0] for given in store.inputs]
 
     @cached_property
     def _made_of_it(self) -> dict[str, list[str]]:
@@ -75,41 +71,25 @@ class Catalogue:
 
     def inputs_first(self, uris: Iterable[str]) -> list[str]:
         """Return these stores with inputs before the stores made of them."""
-        wanted, done, ordered = set(uris), set[str](), list[str]()
-        for start in sorted(wanted):
-            waiting: list[tuple[str, Iterator[str]]] = [] if start in done else [(start, iter(self.inputs_of(start)))]
-            done.add(start)
-            while waiting:
-                uri, rest = waiting[-1]
-                following = next((given for given in rest if given not in done and given in self.stores), None)
-                if following is None:
-                    ordered += [uri] if uri in wanted else []
-                    waiting.pop()
-                else:
-                    done.add(following)
-                    waiting.append((following, iter(self.inputs_of(following))))
-        return ordered
+        wanted = set(uris)
+        graph = {uri: self.inputs_of(uri) for uri in sorted({*wanted, *self.ancestors(wanted)})}
+        return [uri for uri in TopologicalSorter(graph).static_order() if uri in wanted]
 
     def named_by(self, uri: str) -> list[Run]:
-        """Return the runs that name a store or one made of it."""
+        """Return the runs that rest on a store."""
         return self._namers.get(uri, [])
 
     @cached_property
     def _namers(self) -> dict[str, list[Run]]:
         found: dict[str, list[Run]] = {}
         for run in self.runs:
-            for uri in self.named_and_below[run.uri]:
+            for uri in run.names:
                 found.setdefault(uri, []).append(run)
         return found
 
-    @cached_property
-    def named_and_below(self) -> dict[str, set[str]]:
-        """Return for each run the stores that it names, and all their inputs."""
-        return {run.uri: set(run.names) | self.ancestors(run.names) for run in self.runs}
-
     def kept_by_runs(self, sizes: Mapping[str, int]) -> dict[str, int]:
         """Return `Archive.kept_bytes` of all runs, by address; ``sizes`` are of `Archive.all_sizes`."""
-        return {run: sum(sizes[uri] for uri in (run, *uris)) for run, uris in self.named_and_below.items()}
+        return {run.uri: sum(sizes[uri] for uri in (run.uri, *run.names)) for run in self.runs}
 
     def own_by_runs(self, sizes: Mapping[str, int]) -> dict[str, int]:
         """Return the bytes that would go with each run: its folder, and the stores that no other run needs.
@@ -117,8 +97,8 @@ class Catalogue:
         ``sizes`` are of `Archive.all_sizes`.
         """
         return {
-            run: sizes[run] + sum(sizes[uri] for uri in uris if len(self.named_by(uri)) == 1)
-            for run, uris in self.named_and_below.items()
+            run.uri: sizes[run.uri] + sum(sizes[uri] for uri in run.names if len(self.named_by(uri)) == 1)
+            for run in self.runs
         }
 
     def roles(self, uri: str) -> set[str]:

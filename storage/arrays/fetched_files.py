@@ -19,24 +19,16 @@ import logging
 import os
 import struct
 import zlib
+from contextlib import suppress
 from pathlib import Path
 from urllib.parse import quote
 
 from pipeline.rig.transports import NotKept
-from storage.archive.staging import (
-    format_disk_error,
-    open_plain,
-    plain_reader,
-    plain_size,
-    read_plain,
-    sync_path,
-    write_all,
-)
+from storage.archive.staging import format_disk_error, sync_path, write_all
 
 SYNC_BYTES = 1 << 24
 SUMS = "%sums"  # no quoted name ends with it
 LOG = logging.getLogger(__name__)
-_APPEND = os.O_WRONLY | os.O_APPEND | os.O_CREAT
 _SUM = struct.Struct("<QI")
 _BLOCK = 1 << 20
 _LONGEST = 240  # of a file's name, in most file systems 255
@@ -58,7 +50,7 @@ class FetchedFiles:
         path = self._path(name)
         try:
             self._compare(name, path)
-            return plain_size(path)
+            return path.stat().st_size
         except FileNotFoundError:
             return 0
         except OSError as error:
@@ -69,7 +61,7 @@ class FetchedFiles:
         path = self._path(name)
         try:
             self._compare(name, path)
-            with plain_reader(path) as file:
+            with path.open("rb") as file:
                 file.seek(start)
                 return file.read(max(stop - start, 0))
         except FileNotFoundError:
@@ -84,7 +76,7 @@ class FetchedFiles:
         try:
             if not before:
                 self.folder.mkdir(parents=True, exist_ok=True)
-            with os.fdopen(open_plain(path, _APPEND), "ab", buffering=0) as file:
+            with path.open("ab", buffering=0) as file:
                 write_all(file.fileno(), data)
                 waiting = self._unsynced.get(name, 0) + len(data)
                 if _is_note(name) or waiting >= SYNC_BYTES:
@@ -93,14 +85,15 @@ class FetchedFiles:
                 self._unsynced[name] = waiting
             if data and not _is_note(name):
                 crc32 = zlib.crc32(data, self._crc32[name])
-                with os.fdopen(open_plain(_sums_of(path), _APPEND), "ab", buffering=0) as file:
+                with _sums_of(path).open("ab", buffering=0) as file:
                     write_all(file.fileno(), _SUM.pack(before + len(data), crc32))
                 self._crc32[name] = crc32
             if not before:
                 sync_path(self.folder)
         except OSError as error:
             self._crc32.pop(name, None)  # what the disk took of it is compared next time
-            _cut(path, before)
+            with suppress(OSError):
+                os.truncate(path, before)
             raise NotKept(
                 f"cannot keep byte {before} of {name} in {self.folder}: {format_disk_error(error)}; the {before} bytes "
                 "before it are kept, and the camera still has the file"
@@ -124,11 +117,11 @@ class FetchedFiles:
         if name in self._crc32 or _is_note(name):
             return
         reached, crc32, count = _agreeing(path)
-        if os.path.lexists(path) and plain_size(path) > reached:
+        if path.exists() and path.stat().st_size > reached:
             LOG.warning("%s: cut off at byte %d: the rest is damaged or was not synced", path, reached)
-            _cut(path, reached)
-        if os.path.lexists(_sums_of(path)):
-            _cut(_sums_of(path), count * _SUM.size)
+            os.truncate(path, reached)
+        if _sums_of(path).exists():
+            os.truncate(_sums_of(path), count * _SUM.size)
         self._crc32[name] = crc32
 
     def _path(self, name: str) -> Path:
@@ -150,8 +143,8 @@ def _agreeing(path: Path) -> tuple[int, int, int]:
     """Return up to which byte a file agrees with its sums, the CRC-32 of these bytes, and the number of such sums."""
     reached, crc32, count = 0, 0, 0
     try:
-        sums = read_plain(_sums_of(path))
-        with plain_reader(path) as file:
+        sums = _sums_of(path).read_bytes()
+        with path.open("rb") as file:
             for to, expected in _SUM.iter_unpack(sums[: len(sums) // _SUM.size * _SUM.size]):
                 at, found = reached, crc32
                 while at < to and (data := file.read(min(to - at, _BLOCK))):
@@ -168,10 +161,3 @@ def _unread(path: Path, error: OSError) -> NotKept:
     return NotKept(
         f"cannot read {path}: {error.strerror or error}; mend the disk and run again: the camera still has it"
     )
-
-
-def _cut(path: Path, size: int) -> None:
-    try:
-        os.truncate(path, size)
-    except OSError:
-        return  # what is held is compared when the transfer continues

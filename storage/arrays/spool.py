@@ -26,7 +26,7 @@ import numpy as np
 from pipeline.errors import RigError
 from pipeline.source import Line
 from storage.archive.keys import plain
-from storage.archive.staging import format_disk_error, open_plain, plain_reader, sync_path, write_all
+from storage.archive.staging import format_disk_error, sync_path, write_all
 
 SYNC_LINES = 64
 MOST_NAMED = 8
@@ -50,16 +50,14 @@ class Spool:
     def open(cls, folder: Path, samples: int, bands: int, *, header: Mapping[str, Any], name: str = "lines") -> Spool:
         """Open the spool in ``folder``, or begin it; lines of an earlier, interrupted capture are kept and counted.
 
-        ``header`` describes the capture (the sweep, the source, the seed). Raises RigError: the spool holds lines of
-        another capture, or the disk refuses.
+        ``header`` describes the capture (the sweep, the source, the seed). Raises RigError: the disk refuses.
         """
         facts = {"samples": samples, "bands": bands, "header": plain(dict(header))}
         spool = cls(folder / f"{name}.lines", json.dumps(facts).encode() + b"\n", (samples, bands))
         with _refusals(spool.path, 0):
             folder.mkdir(parents=True, exist_ok=True)
-            if not os.path.lexists(spool.path):
-                with os.fdopen(open_plain(spool.path, os.O_WRONLY | os.O_CREAT), "wb") as file:
-                    file.write(spool._head)
+            if not spool.path.exists():
+                spool.path.write_bytes(spool._head)
                 for named in (spool.path, folder, folder.parent, folder.parent.parent):  # lines need their file's name
                     sync_path(named)
             spool._recover()
@@ -91,7 +89,7 @@ class Spool:
         data = np.ascontiguousarray(line.data, "<u2").tobytes()
         with _refusals(self.path, self.count):
             if self._file is None:
-                self._file = os.fdopen(open_plain(self.path, os.O_WRONLY | os.O_APPEND), "wb", buffering=0)
+                self._file = self.path.open("ab", buffering=0)
             try:
                 write_all(self._file.fileno(), facts + self._crc(facts, data) + data)
             except OSError:
@@ -109,7 +107,7 @@ class Spool:
 
     def blocks(self, size: int = SYNC_LINES) -> Iterator[list[Line]]:
         """Yield the lines in blocks of ``size``; the last may be shorter. A damaged line is not valid."""
-        with plain_reader(self.path) as file:
+        with self.path.open("rb") as file:
             file.seek(len(self._head))
             for first in range(0, self.count, size):
                 numbers = range(first, min(first + size, self.count))
@@ -126,18 +124,16 @@ class Spool:
 
     def _recover(self) -> None:
         """Count the lines, and cut off the first damaged one behind the last sync with all that follows it."""
-        with plain_reader(self.path) as file:
+        with self.path.open("rb") as file:
             head = file.readline(_LONGEST_HEADER)
             file.seek(len(self._head))
             records = enumerate(iter(lambda: file.read(self._size), b""))
             whole = [self._line(number, record) is not None for number, record in records]
-        if head != self._head and not any(whole) and _is_header(head):
-            raise RigError(
-                f"{self.path} holds lines of another capture. Finish that capture, or remove the folder to start anew"
-            )
         if head != self._head:
-            with os.fdopen(open_plain(self.path, os.O_WRONLY), "wb", buffering=0) as file:
+            with self.path.open("r+b", buffering=0) as file:
                 write_all(file.fileno(), self._head)
+        if not any(whole):  # a header that was begun, and nothing that belongs to it
+            whole = []
         damaged = [number for number, good in enumerate(whole) if not good]
         synced = max(len(whole) - 1, 0) // SYNC_LINES * SYNC_LINES
         self.count = next((number for number in damaged if number >= synced), len(whole))
@@ -168,16 +164,7 @@ class Spool:
         if self._file is not None:
             self._file.close()
             self._file = None
-        with os.fdopen(open_plain(self.path, os.O_WRONLY), "wb", buffering=0) as file:
-            file.truncate(len(self._head) + self.count * self._size)
-
-
-def _is_header(head: bytes) -> bool:
-    """Return whether a file begins with the header of a capture, and not with what a crash left of one."""
-    try:
-        return isinstance(json.loads(head), dict)
-    except ValueError:
-        return False
+        os.truncate(self.path, len(self._head) + self.count * self._size)
 
 
 def line_values(numbers: Sequence[int]) -> str:

@@ -6,15 +6,15 @@ Stores are removed before their inputs, each in one step, so that the archive st
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import Literal
 
 from pipeline.errors import SettingsError
 from storage.archive.archive import Archive
-from storage.archive.keys import StageRef
+from storage.archive.keys import StageRef, without_manifest
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Store
 from storage.archive.run_folders import unfinished_extensions
@@ -102,12 +102,11 @@ def plan_clearance(archive: Archive, *, keep_days: float = 1.0, raw_too: bool = 
     if not (math.isfinite(keep_days) and keep_days >= 0):
         raise SettingsError(f"--keep-days {keep_days}: expected a number of days, 0 or more")
     catalogue = Catalogue.read(archive.root)
-    named = set[str]().union(*(catalogue.named_and_below[run.uri] for run in catalogue.runs))
-    moment = archive.now()
-    spared = _spared(catalogue, named, keep_days, raw_too, moment)
+    named = set[str]().union(*(run.names for run in catalogue.runs))
+    spared = _spared(catalogue, named, keep_days, raw_too, archive.now())
     below = catalogue.ancestors(spared) & set(catalogue.stores) - named
     kept = dict.fromkeys(below, "an input of a store that stays") | spared
-    obstacle = _obstacle(archive, catalogue, named | set(kept))
+    obstacle = _obstacle(archive, catalogue, kept)
     gone = [] if obstacle else [uri for uri in catalogue.stores if uri not in named and uri not in kept]
     removals = [
         Removal(uri, "store", archive.size_of(uri), "no run names it") for uri in reversed(catalogue.inputs_first(gone))
@@ -134,36 +133,24 @@ def _spared(catalogue: Catalogue, named: set[str], keep_days: float, raw_too: bo
             kept[uri] = f"younger than {keep_days:g} days"
         elif not raw_too and catalogue.is_only_copy(uri):
             kept[uri] = "raw lines that cannot be had again; --raw-too removes them"
-    # A store made of a young one is young too: its date is older only where the clock was set back.
-    younger = [uri for uri, store in catalogue.stores.items() if _age_days(store, now) < keep_days]
-    for uri in catalogue.dependents(younger) - named:
-        kept.setdefault(uri, f"made of a store younger than {keep_days:g} days")
     return kept
 
 
 def _age_days(store: Store, now: datetime) -> float:
-    """Return the days since a store was made or copied, whichever is later."""
-    made = (store.ref.path / MANIFEST_NAME).lstat().st_mtime
-    try:
-        created = datetime.fromisoformat(store.created)
-        made = max(made, (created if created.tzinfo else created.replace(tzinfo=UTC)).timestamp())
-    except (ValueError, OverflowError):
-        pass  # damaged: the date of the file counts
-    return (now.timestamp() - made) / DAY_S
+    """Return the days since a store was published, or copied here."""
+    return (now.timestamp() - (store.ref.path / MANIFEST_NAME).stat().st_mtime) / DAY_S
 
 
-def _obstacle(archive: Archive, catalogue: Catalogue, staying: set[str]) -> str | None:
-    """Return why no store may be removed: a damaged receipt or manifest may name stores to keep; else None."""
-    for uri in archive.lost_runs():
-        return f"no store is removed: {uri} has lost its {MANIFEST_NAME}, so that its stores are not known"
+def _obstacle(archive: Archive, catalogue: Catalogue, kept: Iterable[str]) -> str | None:
+    """Return why no store may be removed: a damaged manifest may name stores to keep; else None."""
+    for path in without_manifest(archive.root):
+        if path.parent.name == "runs" and path.is_dir():
+            return f"no store is removed: runs/{path.name} has lost its {MANIFEST_NAME}; its stores are not known"
     for run in catalogue.runs:
-        if run.problem is not None and not run.recorded:
+        if run.problem is not None and not run.names:
             return f"no store is removed: the stores of {run.uri} are not known ({run.problem})"
-    told = set[str]().union(*(run.recorded for run in catalogue.runs))  # with all that these were made of
-    for uri in sorted(staying - told):
-        store = catalogue.stores.get(uri)
-        problem = "it is not there" if store is None else store.problem
-        if problem is not None:
+    for uri in sorted(kept):
+        if (problem := catalogue.stores[uri].problem) is not None:
             return f"no store is removed: the inputs of {uri} are not known ({problem}); run verify --repair"
     return None
 

@@ -44,9 +44,7 @@ class Repaired:
         return not (self.plan.hopeless or self.failed)
 
 
-def plan_repair(
-    archive: Archive, findings: Iterable[Finding], *, versions: Mapping[str, int | str] | None = None
-) -> RepairPlan:
+def plan_repair(archive: Archive, findings: Iterable[Finding], *, versions: Mapping[str, int | str]) -> RepairPlan:
     """Return the repairs for these findings; ``versions`` are the present ones of the stages."""
     catalogue = Catalogue.read(archive.root)
     bad = [one.uri for one in findings if one.kind in ("broken", "missing")]
@@ -58,13 +56,13 @@ def plan_repair(
     ordered += sorted(broken - set(ordered))
     runs = {run.uri: _settings_text(run) for run in catalogue.runs if run.uri in bad}
     runs |= {uri: "" for uri in bad if uri.startswith("runs/") and uri not in runs}
-    affected = [run for run in catalogue.runs if run.uri in runs or catalogue.named_and_below[run.uri] & broken]
+    affected = [run for run in catalogue.runs if run.uri in runs or run.names & broken]
     surveys = {text: run for run in affected if (text := _settings_text(run))}
     return RepairPlan(tuple(ordered), hopeless, tuple((run, run.settings) for run in surveys.values()), runs)
 
 
 def repair(
-    archive: Archive, findings: Iterable[Finding], rerun: Rerun, *, versions: Mapping[str, int | str] | None = None
+    archive: Archive, findings: Iterable[Finding], rerun: Rerun, *, versions: Mapping[str, int | str]
 ) -> Repaired:
     """Remove the damaged stores, and run the surveys again that name them.
 
@@ -104,17 +102,16 @@ def repair(
     return done
 
 
-def _hopeless(catalogue: Catalogue, uri: str, versions: Mapping[str, int | str] | None) -> str:
+def _hopeless(catalogue: Catalogue, uri: str, versions: Mapping[str, int | str]) -> str:
     """Return why a store cannot be built again; empty where it can."""
     store, stage = catalogue.stores.get(uri), uri.split("/")[1]
     if catalogue.is_only_copy(uri):
         return "raw lines cannot be captured again: restore them from a copy. Undamaged lines can still be read"
-    if uri in catalogue.lost and versions is not None and stage not in versions:
+    if stage not in versions:
         return f"there is no stage {stage}: take it out of the archive"
-    made = "" if store is None else store.version
-    if versions is not None and made and str(versions.get(stage)) != made:
-        now = versions.get(stage, "none")
-        return f"made by version {made} of the stage {stage}, which is now {now}: reprocess builds it again"
+    if store is not None and store.version and store.version != str(versions[stage]):
+        now = versions[stage]
+        return f"made by version {store.version} of the stage {stage}, which is now {now}: reprocess builds it again"
     runs = catalogue.named_by(uri)
     if runs and not any(run.settings for run in runs):
         return f"the settings of {runs[-1].uri}, which names it, cannot be read: run that survey again by hand"

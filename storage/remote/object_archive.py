@@ -16,9 +16,8 @@ import os
 import re
 import secrets
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -39,7 +38,7 @@ from storage.archive.manifests import (
 from storage.archive.records import RECEIPT, read_run
 from storage.archive.run_folders import RunDraft
 from storage.archive.staging import MANIFEST_NAME, is_name, refusals, remove_tree, rename_into_place, retire, sync_path
-from storage.maintenance.verification import Finding, Progress, name_damage, verify_everything
+from storage.maintenance.verification import Finding, Progress, verify_everything
 from storage.remote.object_stores import Listed, Objects, parse_place, some_at_a_time
 
 MARK = "archive.json"  # marks a prefix as an archive
@@ -47,7 +46,6 @@ MARK_TEXT = b'{"archive": "spectralzoom", "layout": 1}\n'
 ATTEMPT = re.compile(r"((?:stages/[^/]+|runs)/[^/]+)/([0-9a-f]{16})/.+")  # a file's address, and its upload
 ASIDE = ".fetch-"  # prefix of folders of the working copy for incomplete files
 DAY_S = 86400.0
-UPLOAD_S = 3600.0  # after which a run without a manifest is no running upload
 
 
 class ObjectArchive(Archive):
@@ -75,7 +73,7 @@ class ObjectArchive(Archive):
 
     def ref(self, stage: str, key: str) -> StageRef:
         """Return the address of a store, whether it exists or not; its path fetches the store."""
-        return RemoteRef(stage, key, store_at(self.root, stage, key).path, self._fetch)
+        return StageRef(stage, key, store_at(self.root, stage, key).folder, self._fetch)
 
     def find(self, stage: str, key: str) -> StageRef | None:
         """Return the published store, None without one or where it was cleared; upload it if it is only here.
@@ -120,7 +118,7 @@ class ObjectArchive(Archive):
         self.objects.remove([manifest])
         if unnamed:
             self._mirror_runs()
-            if any(ref.uri in read_run(folder, {}).recorded for folder in self._later_runs):
+            if any(ref.uri in read_run(folder).names for folder in self._later_runs):
                 if standing is not None:
                     self.objects.create(manifest, standing)
                 return False
@@ -159,9 +157,9 @@ class ObjectArchive(Archive):
 
         def send(uri: str) -> None:
             self._upload(uri, first=draft is not None and not draft.extends)
-            recorded = read_run(self.root / uri, {}).recorded
-            self._standing = {one: text for one, text in self._standing.items() if one not in recorded}
-            self._ensure(recorded)
+            names = read_run(self.root / uri).names
+            self._standing = {one: text for one, text in self._standing.items() if one not in names}
+            self._ensure(names)
 
         if draft is not None:
             draft.send = send
@@ -172,7 +170,7 @@ class ObjectArchive(Archive):
         there = _manifests(self.objects.listing("runs"))
         for uri in (f"runs/{folder.name}" for folder in self.runs() if try_manifest(folder)[1] is None):
             if uri not in there:
-                self._ensure(read_run(self.root / uri, {}).recorded)
+                self._ensure(read_run(self.root / uri).names)
                 self._upload(uri, first=True)
             elif not self._is_dated(uri, there[uri]):
                 standing = hashlib.sha256(self.objects.read(f"{uri}/{MANIFEST_NAME}") or b"").hexdigest()
@@ -223,18 +221,13 @@ class ObjectArchive(Archive):
         """Return the bytes of objects sent and received since the last call."""
         return self.objects.take_moved()
 
-    def lost_runs(self) -> list[str]:
-        """Return the addresses of runs that have files in the bucket, but no manifest there or here."""
-        here = {f"runs/{folder.name}" for folder in self.runs()}
-        return [uri for uri in _lost_runs(self.objects.listing("runs")) if uri not in here]
-
     def leftovers(self, keep_days: float) -> dict[str, int]:
         """Return addresses and bytes of incomplete uploads that are older than ``keep_days``."""
         there = self.objects.listing()
         latest = max((one.changed for one in there.values()), default=None)
         uploads: dict[str, list[Listed]] = {}
         for path, one in there.items():
-            if (found := ATTEMPT.fullmatch(path)) and found[1] not in _lost_runs(there):
+            if found := ATTEMPT.fullmatch(path):
                 uploads.setdefault(f"{found[1]}/{found[2]}", []).append(one)
         old: dict[str, int] = {}
         for folder, files in sorted(uploads.items()):
@@ -264,9 +257,7 @@ class ObjectArchive(Archive):
                 if found and self.objects.read(f"{uri}/{MANIFEST_NAME}") == text:  # else it has gone, or was made anew
                     yield from found
 
-            found = verify_everything(root, progress, problems)
-        words = f"{MANIFEST_NAME} is missing, or its upload was broken off"
-        return [*found, *(Finding(uri, words, "broken") for uri in _lost_runs(there))]
+            return verify_everything(root, progress, problems)
 
     # --- the working copy ---------------------------------------------------------------------------------------------
 
@@ -440,14 +431,6 @@ def _manifests(there: Mapping[str, Listed]) -> dict[str, Listed]:
     return {uri: one for uri, one in named.items() if depths.get(uri.split("/")[0]) == uri.count("/") + 2}
 
 
-def _lost_runs(there: Mapping[str, Listed]) -> list[str]:
-    """Return the runs that have files but no manifest, and that are not being uploaded."""
-    files = {path: found[1] for path in there if path.startswith("runs/") and (found := ATTEMPT.fullmatch(path))}
-    latest = max((one.changed for one in there.values()), default=None)
-    old = {uri for path, uri in files.items() if latest and (latest - there[path].changed).total_seconds() >= UPLOAD_S}
-    return sorted(uri for uri in old if f"{uri}/{MANIFEST_NAME}" not in there and _is_address(uri))
-
-
 def _lay_out(objects: Objects, root: Path, uri: str) -> None:
     """Write the manifest at an address into a folder, and of a run the receipt, damaged or not."""
     text = objects.read(f"{uri}/{MANIFEST_NAME}")
@@ -465,18 +448,14 @@ def _problems(objects: Objects, there: Mapping[str, Listed], folder: Path, place
     if problem is not None:
         yield f"{MANIFEST_NAME} is damaged: {problem}"
         return
-    broken: dict[str, str] = {}
     for name, entry in manifest["files"].items():
         file = folder / name
-        try:
+        file.unlink(missing_ok=True)
+        with suppress(FileNotFoundError):
             objects.save(f"{place}/{name}", file)
-        except FileNotFoundError:
-            file.unlink(missing_ok=True)
         if (problem := file_problem(file, entry, hashes=True)) is not None:
-            broken[name] = problem
-        elif file.name != "zarr.json":  # it tells the part of an array in a damaged file
-            file.unlink()
-    yield from (f"{name} {problem}{name_damage(folder, name)}" for name, problem in broken.items())
+            yield f"{name} {problem}"
+        file.unlink(missing_ok=True)
     extra = {path.removeprefix(f"{place}/") for path in there if path.startswith(f"{place}/")} - set(manifest["files"])
     yield from (f"{name} is not in the manifest: take it out of the archive" for name in sorted(extra))
 
@@ -524,24 +503,3 @@ def _find_mark(objects: Objects, *, create: bool) -> None:
         raise ArchiveError(f"{name} is not there; check the name, or make an archive with survey --out")
     if found != MARK_TEXT:
         raise ArchiveError(f"{name}/{MARK} is not as expected: this is no archive, or one of a later version")
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class RemoteRef(StageRef):
-    """A store that may not be on this machine: reading its path fetches it."""
-
-    fetch: Callable[[str], None]
-
-    def __getattribute__(self, name: str) -> Any:
-        if name == "path":
-            object.__getattribute__(self, "fetch")(self.uri)
-        return object.__getattribute__(self, name)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, StageRef) and (self.stage, self.key) == (other.stage, other.key)
-
-    def __hash__(self) -> int:
-        return hash((self.stage, self.key))
-
-    def __repr__(self) -> str:
-        return f"RemoteRef({self.uri!r})"

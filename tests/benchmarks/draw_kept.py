@@ -55,7 +55,7 @@ class PlantedCube(RawCube):
 def compared(root: Path) -> tuple[SignalCube, Compared, Compared]:
     """Return a condensed sweep of the latest run, a median spectrum of it, and one with a planted emission line."""
     archive = Archive.open(root, create=False, write=False)
-    products = read_run(archive.runs()[-1], {}).products
+    products = read_run(archive.runs()[-1]).products
     raw, signal = (archive.ref(*products[name].split("/")[1:3]) for name in ("raw_coarse", "signal_coarse"))
     cube, stored = open_raw_cubes(raw.path)[0], open_signal_cubes(signal.path)[0]
     params = read_store(signal).params

@@ -22,7 +22,6 @@ from flows.publish.run_folder import Published
 from flows.terminal.figures import format_megabytes
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
-from storage.archive.lineage import Catalogue
 from storage.archive.records import read_run
 from tests.conftest import Survey
 from tests.flows.conftest import Page, problems
@@ -106,8 +105,8 @@ def test_the_account_of_a_survey_is_what_lies_in_its_folders(
     assert account["reference"] >= 96 * 128 * 3 * 2  # a line has all samples of the camera
     assert 0 < account["captured"] < sum(spooled)  # a spool has numbers, times and checksums beside the lines
     assert account["captured"] > 0.9 * sum(spooled)
-    run = read_run(published.folder, {})
-    assert Archive.open(root).kept_bytes(run, Catalogue.read(root)) == account["kept"]
+    run = read_run(published.folder)
+    assert Archive.open(root).kept_bytes(run) == account["kept"]
     (listed,) = contents(Archive.open(root))["runs"]
     assert listed["bytes"] == account["kept"]
     (row,) = read_history(Archive.open(root)).runs

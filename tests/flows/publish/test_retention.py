@@ -18,7 +18,6 @@ from flows.archive.commands import gc
 from flows.publish.retention import clear_raw_lines
 from flows.terminal.processes import DONE, PARTLY
 from storage.archive.archive import Archive
-from storage.archive.lineage import Catalogue
 from storage.archive.records import read_run
 from storage.arrays import signal_cubes
 from storage.maintenance.garbage import IN_USE
@@ -79,8 +78,8 @@ def of_gc(capsys: pytest.CaptureFixture[str], root: Path, **flags: Any) -> tuple
 
 def is_counted(archive: Archive) -> bool:
     """Whether the newest receipt tells the bytes that are kept now."""
-    run = read_run(archive.runs()[-1], {})
-    return bool(run.receipt["data_bytes"]["kept"] == archive.kept_bytes(run, Catalogue.read(archive.root)))
+    run = read_run(archive.runs()[-1])
+    return bool(run.receipt["data_bytes"]["kept"] == archive.kept_bytes(run))
 
 
 def test_lines_stay_for_their_time(archive: Archive, capsys: pytest.CaptureFixture[str]) -> None:
@@ -116,7 +115,7 @@ def test_outlived_lines_go_and_the_receipt_counts_again(archive: Archive, capsys
 
 def kept_size(archive: Archive) -> int:
     """Bytes of the newest run by its receipt."""
-    return int(read_run(archive.runs()[-1], {}).receipt["data_bytes"]["kept"])
+    return int(read_run(archive.runs()[-1]).receipt["data_bytes"]["kept"])
 
 
 @pytest.mark.usefixtures("no_effects", "later")

@@ -66,7 +66,7 @@ def test_any_manifest_can_be_read_or_is_told_damaged(tmp_path: Path, archive: Ar
 
 @pytest.mark.parametrize("inputs", [7, "abc", [3, None], {"a": 5}, ["nowhere", "stages/rectify/nowhere"]])
 def test_odd_inputs_are_borne(tmp_path: Path, archive: Archive, inputs: object) -> None:
-    """Whatever a manifest says of what is no file of it, nothing ends in a traceback."""
+    """Whatever a manifest says of its inputs, nothing ends in a traceback."""
     small = small_survey(archive)
     odd = {"inputs": inputs, "params": 3, "created": None, "libraries": []}
     rewrite(small.map.path / "manifest.json", **odd)
@@ -122,10 +122,11 @@ def test_raw_lines_of_which_nobody_says_where_they_come_from_are_the_only_copy(
         return [uri.rpartition("/")[2] for uri in catalogue.stores if catalogue.is_only_copy(uri)]
 
     assert only() == ["bare", "rig"]
-    archive.new_run("a").publish(settings={"source": "sim"}, products=["stages/capture/bare", "stages/capture/light"])
+    named = archive.manifest_hashes(archive.ref("capture", key) for key in ("bare", "light"))
+    archive.new_run("a").publish(settings={"source": "sim"}, rests_on=named)
     assert only() == ["rig"]
-    archive.new_run("b").publish(settings={"source": "rig"}, products=["stages/capture/bare"])
-    assert only() == ["bare", "rig"]
+    archive.new_run("b").publish(settings={"source": "rig"}, rests_on=named)
+    assert only() == ["bare", "light", "rig"]
 
 
 def test_nested_parameters_have_dotted_names() -> None:
@@ -235,16 +236,6 @@ def test_a_damaged_receipt_names_what_its_manifest_recorded(tmp_path: Path, arch
     assert (run.receipt, run.settings) == ({}, {})
     assert "receipt.json has changed since it was published" in str(run.problem)
     assert run.names == {small.raw.uri, small.mosaic.uri, small.map.uri}
-
-
-def test_a_run_names_the_stores_of_its_stages(tmp_path: Path, archive: Archive) -> None:
-    """Receipts of before name some by their keys alone."""
-    small = small_survey(archive, named=False)
-    with archive.new_run("farm") as draft:
-        draft.write_file("receipt.json", json.dumps({"stages": [{"name": "segment", "key": small.map.key}]}))
-    catalogue = Catalogue.read(tmp_path)
-    assert catalogue.runs[0].names == {small.map.uri}
-    assert [run.uri for run in catalogue.named_by(small.raw.uri)] == [catalogue.runs[0].uri]
 
 
 def test_settings_are_those_of_the_manifest_where_it_has_any(tmp_path: Path, archive: Archive) -> None:

@@ -86,7 +86,7 @@ def extend(archive: Archive, name: str, figure: float = 0.75) -> Path:
 
 def figure_of(archive: Archive) -> float | None:
     """The accuracy in the receipt of the one run, None where there is none yet."""
-    found = read_run(archive.root / "runs" / run_id(archive), {})
+    found = read_run(archive.root / "runs" / run_id(archive))
     assert found.problem is None
     return found.receipt.get("accuracy", {}).get("miou")
 
@@ -107,7 +107,7 @@ def test_a_run_keeps_its_name_and_date(archive: Archive) -> None:
     assert [path.name for path in (archive.root / "runs").iterdir()] == [name] == [folder.name]
     (run,) = Catalogue.read(archive.root).runs
     assert (run.created, figure_of(archive)) == (created, 0.75)
-    assert any(uri.startswith("stages/evaluate/") for uri in run.recorded)
+    assert any(uri.startswith("stages/evaluate/") for uri in run.names)
     assert problems(archive) == []
     assert not [*(archive.root / ".locks").glob("runs-*")]
 
@@ -195,22 +195,6 @@ def test_killed_between_two_renames_verify_and_gc_know(archive: Archive) -> None
     assert "unfinished" not in {removal.what for removal in clear_up(archive, keep_days=9, dry_run=True).removals}
     opened = Archive.open(archive.root, create=False)
     assert (figure_of(opened), problems(opened)) == (0.75, [])
-
-
-def test_verify_under_way_takes_an_extension_for_no_damage(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The manifest was read before, the files after."""
-    from storage.maintenance import verification
-
-    name, broken = run_id(archive), verification.broken_files
-
-    def extended_meanwhile(folder: Path, manifest: Any, *, hashes: bool) -> Any:
-        if folder.name == name and "extended" not in manifest:
-            extend(archive, name)
-        return broken(folder, manifest, hashes=hashes)
-
-    monkeypatch.setattr(verification, "broken_files", extended_meanwhile)
-    assert [one for one in problems(archive) if one.startswith("runs/")] == []
-    assert figure_of(archive) == 0.75
 
 
 # --- in a bucket ------------------------------------------------------------------------------------------------------

@@ -96,20 +96,6 @@ def test_a_store_that_goes_while_the_archive_is_open_is_told_of(machine: Machine
     assert make(other)[1]
 
 
-def test_a_run_that_lost_its_manifest_keeps_its_stores(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
-    """verify names it, gc removes no store and nothing of the run; where the run is known, verify --repair cures it."""
-    archive = machine(FIRST)
-    small = small_survey(archive)
-    monkeypatch.setattr(object_archive, "UPLOAD_S", 0.0)
-    archive.objects.remove([f"runs/{small.run.name}/manifest.json"])
-    other = machine(SECOND, create=False)
-    (found,) = problems(other)
-    assert found == f"runs/{small.run.name} manifest.json is missing, or its upload was broken off"
-    done = clear_up(other, keep_days=0)
-    assert done.removals == ()
-    assert "has lost its manifest.json" in str(done.obstacle)
-
-
 def test_ages_are_counted_by_the_clock_of_the_bucket(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     """A machine whose clock is days ahead removes no fresh store."""
     small_survey(machine(FIRST), named=False)
@@ -190,17 +176,6 @@ def _writing(content: bytes) -> Callable[[Path], None]:
         (path / "a.bin").write_bytes(content)
 
     return build
-
-
-def test_a_run_on_its_way_is_no_lost_one(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
-    """For an hour a run's files may be there before its manifest."""
-    archive = machine(FIRST)
-    archive.objects.write("runs/20261120T101010-farm/0123456789abcdef/receipt.json", b"{}")
-    assert problems(machine(SECOND)) == []
-    monkeypatch.setattr(object_archive, "UPLOAD_S", 0.0)
-    assert problems(machine(SECOND)) == [
-        "runs/20261120T101010-farm manifest.json is missing, or its upload was broken off"
-    ]
 
 
 def test_what_one_machine_cleared_another_makes_again(machine: Machine) -> None:
