@@ -150,7 +150,6 @@ def reach(starts: Iterable[str], following: Callable[[str], Iterable[str]]) -> s
     return found - begun
 
 
-SHORTEST = 4  # letters of a key
 LATEST = "latest"  # the newest run
 
 
@@ -162,50 +161,28 @@ def find_product(catalogue: Catalogue, text: str) -> str | Run:
     parts = text.rstrip("/").split("/")
     for part in parts:
         check_name(part)
-    if parts[0] == "stages" and len(parts) > 2:
-        return _store(catalogue, "/".join(parts[:3]))
-    if parts[0] == "runs" and len(parts) > 1:
-        for run in catalogue.runs:
-            if run.folder.name == parts[1]:
-                return run
+    name = parts[1] if parts[0] == "runs" and len(parts) > 1 else text
+    runs = [run for run in catalogue.runs if name in (run.folder.name, LATEST)]
+    if runs:
+        return runs[-1]
+    if name != text:
         there = [run.uri for run in reversed(catalogue.runs)]
-        hint = f"there is {_some(there)}" if there else "see ls"
-        raise ArchiveError(f"there is no run {parts[1]} in this archive; {hint}")
-    if len(parts) == 2 and any(uri.startswith(f"stages/{parts[0]}/") for uri in catalogue.stores):
-        return _store(catalogue, "/".join(("stages", *parts)))
-    runs = [run for run in catalogue.runs if text in (run.folder.name, LATEST)]
-    return runs[-1] if runs else _named(catalogue, text)
-
-
-def _store(catalogue: Catalogue, uri: str) -> str:
-    if uri in catalogue.stores:
-        return uri
-    _, stage, key = uri.split("/")
-    begun = [one for one in catalogue.stores if len(key) >= SHORTEST and one.startswith(uri)]
-    if len(begun) == 1:
-        return begun[0]
-    there = sorted(begun or (one for one in catalogue.stores if one.startswith(f"stages/{stage}/")))
-    hint = f"there is {_some(there)}" if there else "there is no store of this stage; see ls"
-    lost = " (its folder is there, but has lost its manifest: run verify)" if uri in catalogue.lost else ""
-    raise ArchiveError(f"there is no store {uri} in this archive{lost}; {hint}")
-
-
-def _named(catalogue: Catalogue, text: str) -> str:
-    """Return a product of the newest run that can be read, or a store by the beginning of its key."""
+        raise ArchiveError(f"there is no run {name} in this archive; there is {_some(there) or 'none'}")
     newest = next((run for run in reversed(catalogue.runs) if run.products), None)
     products = {} if newest is None else newest.products
-    if text in products:
-        uri = in_text(products[text])
-        if newest is not None and uri is None:
-            raise ArchiveError(
-                f"{text} is no store but a file of {newest.uri}; explain {newest.uri} describes that run"
-            )
-        return _store(catalogue, uri or text)
-    keys = [uri for uri in catalogue.stores if len(text) >= SHORTEST and uri.rpartition("/")[2].startswith(text)]
-    if len(keys) == 1:
-        return keys[0]
-    if keys:
-        raise ArchiveError(f"{text} begins {len(keys)} keys: {_some(keys)}; give more of it")
+    address = products.get(text, text)
+    if newest is not None and address.startswith("runs/"):
+        return newest
+    wanted = in_text(address) or f"stages/{address}"
+    if wanted in catalogue.stores:
+        return wanted
+    found = [
+        uri for uri in sorted(catalogue.stores) if uri.startswith(wanted) or uri.rpartition("/")[2].startswith(address)
+    ]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise ArchiveError(f"{text} begins {len(found)} stores: {_some(found)}; give more of it")
     near = difflib.get_close_matches(text, products, n=1)
     if near:
         known = f"did you mean {near[0]}?"
@@ -213,7 +190,7 @@ def _named(catalogue: Catalogue, text: str) -> str:
         known = f"products of the newest run: {', '.join(products)}"
     else:
         known = f"no run has products; there is {_some(sorted(catalogue.stores)) or 'nothing in it'}"
-    raise ArchiveError(f"{text!r} is no product, key or run of this archive; {known}")
+    raise ArchiveError(f"{text!r} is no product, store or run of this archive; {known}")
 
 
 def _some(names: list[str]) -> str:

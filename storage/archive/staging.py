@@ -12,7 +12,7 @@ import secrets
 import shutil
 import tomllib
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -153,37 +153,19 @@ def file_hash(path: Path) -> str:
 def take_lock(path: Path, *, wait: bool = True, shared: bool = False) -> Callable[[], None] | None:
     """Hold ``path`` against other processes and threads until the function returned is called, or the process dies.
 
-    None where another holds it and ``wait`` is false. A ``shared`` lock excludes only exclusive ones. An exclusive
-    lock's file is removed on release; a second release does nothing.
+    None where another holds it and ``wait`` is false. A ``shared`` lock excludes only exclusive ones. The file stays; a
+    second release does nothing.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    while True:
-        with ExitStack() as held:
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
-            held.callback(os.close, descriptor)
-            kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
-            try:
-                fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
-            except BlockingIOError:
-                if not wait:
-                    return None
-                log.info("waiting for another run that holds %s", path.stem)
-                fcntl.flock(descriptor, kind)
-            if _is_still(descriptor, path):
-                if not shared:  # else another may hold it yet
-                    held.callback(_drop_name, path)  # called before the lock is let go
-                return held.pop_all().close
-
-
-def _drop_name(path: Path) -> None:
-    """Remove a lock's file; if the disk refuses, it stays and blocks no process."""
-    with suppress(OSError):
-        path.unlink()
-
-
-def _is_still(descriptor: int, path: Path) -> bool:
-    """Return whether an open file still has its name, which the last holder of the lock may have removed."""
-    try:
-        return os.path.samestat(path.lstat(), os.fstat(descriptor))
-    except FileNotFoundError:
-        return False
+    with ExitStack() as held:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
+        held.callback(os.close, descriptor)
+        kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
+        try:
+            fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if not wait:
+                return None
+            log.info("waiting for another run that holds %s", path.stem)
+            fcntl.flock(descriptor, kind)
+        return held.pop_all().close

@@ -12,7 +12,6 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from pipeline.errors import ShapeError
 from pipeline.geometry.grid import block_means
 from pipeline.signal.components import Components, broad_weights
 from storage.arrays.georeference import create_placed_group
@@ -103,15 +102,11 @@ class MosaicWriter:
     ) -> None:
         """Store (y, x, component) scores, NaN where nothing was seen, and (y, x) coverage of whole shards.
 
-        Threads may write different tiles at once. Raises ChunkError: the tile splits a shard. ShapeError: scores and
-        coverage are not of one tile.
+        Threads may write different tiles at once.
         """
-        count = self._scores.shape[0]
-        if scores.shape != (*coverage.shape, count):  # Zarr would broadcast a smaller tile
-            raise ShapeError(f"a tile of the mosaic has the shape {scores.shape}, expected {(*coverage.shape, count)}")
-        rows, columns = tile_place("the mosaic", (first_row, first_column), coverage.shape, self._coverage)
+        rows, columns = tile_place((first_row, first_column), coverage.shape)
         seen = coverage > 0
-        if count:
+        if self._scores.shape[0]:
             steps = steps_within(scores, self._step, self._scores.dtype)
             seen = seen & np.isfinite(scores).all(axis=2)
             steps = np.where(seen[..., None], steps, np.float32(_unseen(self._scores.dtype.str)))
@@ -247,11 +242,6 @@ class Mosaic:
     def spectra(self, scores: NDArray[np.float32], bands: Sequence[int] | None = None) -> NDArray[np.float32]:
         """Return the scene values (..., band) of some bands of scores (..., component)."""
         return (self.components if bands is None else self.components.of_bands(bands)).restore(scores)
-
-    def rows(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
-        """Yield the number of the first row and the scene values (y, x, band) of each row of shards."""
-        for first in range(0, self.shape[0], SHARD_ROWS):
-            yield first, self.values(slice(first, min(first + SHARD_ROWS, self.shape[0])))
 
     def thinned(self, step: int, bands: Sequence[int]) -> NDArray[np.float32]:
         """Return the scene values of every ``step``-th pixel in some bands, (y, x, band).

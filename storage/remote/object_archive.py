@@ -450,9 +450,10 @@ def _problems(objects: Objects, there: Mapping[str, Listed], folder: Path, place
         return
     for name, entry in manifest["files"].items():
         file = folder / name
-        file.unlink(missing_ok=True)
-        with suppress(FileNotFoundError):
+        try:
             objects.save(f"{place}/{name}", file)
+        except FileNotFoundError:
+            file.unlink()
         if (problem := file_problem(file, entry, hashes=True)) is not None:
             yield f"{name} {problem}"
         file.unlink(missing_ok=True)

@@ -162,15 +162,10 @@ def test_a_stage_narrows_the_beginning_of_a_key(tmp_path: Path, archive: Archive
     for text in ("rectify/abcd", "stages/rectify/abcd", "stages/rectify/abcd1"):
         assert find_product(catalogue, text) == "stages/rectify/abcd1"
     assert find_product(catalogue, "abce") == "stages/segment/abce3"
-    with pytest.raises(ArchiveError, match=r"no store stages/segment/abcd .*there is .*abcd1, stages/segment/abcd2$"):
+    with pytest.raises(ArchiveError, match=r"segment/abcd begins 2 stores: .*abcd1, stages/segment/abcd2; give more"):
         find_product(catalogue, "segment/abcd")
-    with pytest.raises(ArchiveError, match="abcd begins 3 keys"):
+    with pytest.raises(ArchiveError, match="abcd begins 3 stores"):
         find_product(catalogue, "abcd")
-    with pytest.raises(ArchiveError, match="no store stages/rectify/abc "):
-        find_product(catalogue, "rectify/abc")
-    archive.discard(catalogue.stores["stages/rectify/abcd1"].ref)
-    with pytest.raises(ArchiveError, match="'abc' is no product, key or run"):
-        find_product(Catalogue.read(tmp_path), "abc")
 
 
 def test_a_products_name_is_of_the_newest_run_that_can_be_read(tmp_path: Path, archive: Archive) -> None:
@@ -209,8 +204,7 @@ def test_a_version_before_is_of_the_same_scene_and_can_be_read(tmp_path: Path, a
         ("stages/../../etc", "cannot be a name"),
         ("/etc/passwd", "cannot be a name"),
         ("", "cannot be a name"),
-        ("stages/segment/none", "no store stages/segment/none in this archive; there is"),
-        ("stages/nothing/none", "no store of this stage"),
+        ("stages/segment/none", "is no product, store or run"),
         ("runs/none", "there is no run none"),
         ("class_mop", "did you mean class_map"),
         ("xyz", "products of the newest run: class_map, mosaic"),
