@@ -29,8 +29,7 @@ from storage.archive.keys import in_text
 from storage.archive.lineage import Catalogue, changes_between, find_product, version_before
 from storage.archive.records import Run
 from storage.maintenance.garbage import clear_up
-from storage.maintenance.repair import plan_repair, repair
-from storage.maintenance.verification import Finding
+from storage.maintenance.verification import Finding, plan_repair, repair
 from storage.remote.opening import open_archive, verify_archive
 
 if TYPE_CHECKING:

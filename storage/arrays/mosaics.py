@@ -12,6 +12,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
+from pipeline.errors import ShapeError
 from pipeline.geometry.grid import block_means
 from pipeline.signal.components import Components, broad_weights
 from storage.arrays.georeference import create_placed_group
@@ -102,11 +103,14 @@ class MosaicWriter:
     ) -> None:
         """Store (y, x, component) scores, NaN where nothing was seen, and (y, x) coverage of whole shards.
 
-        Threads may write different tiles at once.
+        Threads may write different tiles at once. Raises ShapeError: scores and coverage are not of one tile.
         """
+        count = self._scores.shape[0]
+        if scores.shape != (*coverage.shape, count):  # Zarr would broadcast a smaller tile
+            raise ShapeError(f"a tile of the mosaic has the shape {scores.shape}, expected {(*coverage.shape, count)}")
         rows, columns = tile_place((first_row, first_column), coverage.shape)
         seen = coverage > 0
-        if self._scores.shape[0]:
+        if count:
             steps = steps_within(scores, self._step, self._scores.dtype)
             seen = seen & np.isfinite(scores).all(axis=2)
             steps = np.where(seen[..., None], steps, np.float32(_unseen(self._scores.dtype.str)))

@@ -329,20 +329,10 @@ class ObjectArchive(Archive):
     def _fetch(self, uri: str) -> None:
         """Fetch a store or run whose manifest is here.
 
-        Raises IncompleteStoreError: an object of it is missing or has changed, or it was removed meanwhile.
+        Raises IncompleteStoreError: an object of it is missing or has changed.
         """
-        if not (self.root / uri / MANIFEST_NAME).is_file() or not self._lacks(uri, read_manifest(self.root / uri)):
-            return
-        try:
+        if (self.root / uri / MANIFEST_NAME).is_file() and self._lacks(uri, read_manifest(self.root / uri)):
             self._fetch_files(uri)
-        except IncompleteStoreError:
-            ours = (self.root / uri / MANIFEST_NAME).read_bytes()
-            if not self._find(uri):
-                self._standing.pop(uri, None)
-                raise self._removed(uri) from None
-            if (self.root / uri / MANIFEST_NAME).read_bytes() == ours:
-                raise
-            self._fetch_files(uri)  # cleared away, and made again since
 
     def _fetch_files(self, uri: str, only: Iterable[str] | None = None) -> None:
         """Fetch the missing files (``only`` these names), each checked by its hash."""

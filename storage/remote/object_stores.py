@@ -248,7 +248,7 @@ class Objects:
 
         Raises IncompleteStoreError: it is missing or has changed; ``path`` is not written.
         """
-        advice = f"restore it from a copy, or run verify on {self.place.url}"
+        advice = f"run again; if that does not help, run verify on {self.place.url}"
         try:
             try:
                 found = self.save(name, aside)

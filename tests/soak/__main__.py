@@ -20,10 +20,7 @@ os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), os.environ.g
 
 from tests.faults.fault_table import rows_of, run_table  # noqa: E402
 
-PARTS = {
-    "kills": rows_of("tests.faults.stopped_surveys:kill_rows"),
-    "survey-rig": rows_of("tests.soak.rig_beside_simulation"),
-}
+PARTS = {"kills": rows_of("tests.soak.killed_surveys"), "survey-rig": rows_of("tests.soak.rig_beside_simulation")}
 HEADINGS = ("what", "how", "times", "demanded", "found", "met", "s")
 
 
