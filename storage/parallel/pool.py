@@ -14,6 +14,7 @@ import platform
 import re
 import signal
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
@@ -105,44 +106,29 @@ class WorkerPool:
         The first `run_blocks` starts them.
         """
         with _guard:
-            held = _open.setdefault(self, _Open())
-            held.users += 1
+            _users[self] += 1
         try:
             yield self
-        except Exception:
-            raise
-        except BaseException:  # running blocks are abandoned
-            held.dismiss()
-            raise
         finally:
             with _guard:
-                held.users -= 1
-                last = held.users == 0
-                if last:
-                    del _open[self]
-            if last:
-                held.dismiss()
+                _users[self] -= 1
+                if not _users[self]:
+                    _dismiss(self)
 
 
 THREADS = WorkerPool()
 
 
-@dataclass
-class _Open:
-    """The workers of an open pool, once they are started."""
-
-    users: int = 0
-    team: Cluster | None = None
-
-    def dismiss(self) -> None:
-        """Abandon the workers; the next use starts others."""
-        team, self.team = self.team, None
-        if team is not None:
-            team.shutdown()
-
-
 _guard = threading.RLock()
-_open: dict[WorkerPool, _Open] = {}
+_users: Counter[WorkerPool] = Counter()  # blocks that keep a pool open
+_teams: dict[WorkerPool, Cluster] = {}  # the workers of open pools, once they are started
+
+
+def _dismiss(pool: WorkerPool) -> None:
+    """Abandon the workers of a pool; the next use starts others."""
+    team = _teams.pop(pool, None)
+    if team is not None:
+        team.shutdown()
 
 
 def run_blocks(
@@ -195,15 +181,13 @@ def _send_away(
     ended: Callable[[int, Any], None],
 ) -> None:
     """Run blocks in processes; dask runs blocks whose worker died again on others."""
-    held = _open[pool]
     with _guard:
-        if held.team is None:
-            held.team = Cluster(pool)
-    team = held.team
+        team = _teams.get(pool) or Cluster(pool)
+        _teams[pool] = team
     try:
         _send(team, make, items, AHEAD * team.check(paths), ended)
     except (WorkerError, CancelledError, dask_distributed.KilledWorker) as error:
-        held.dismiss()
+        _dismiss(pool)
         if isinstance(error, WorkerError):
             raise
         if isinstance(error, CancelledError):

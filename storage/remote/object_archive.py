@@ -81,9 +81,8 @@ class ObjectArchive(Archive):
         Raises IncompleteStoreError: its manifest in the bucket is damaged.
         """
         ref = self.ref(stage, key)
-        whole = self._is_whole(ref.uri)
-        if ref.uri not in self._standing and not self._find(ref.uri, keep=whole):
-            if not whole:
+        if ref.uri not in self._standing and not self._find(ref.uri):
+            if not self._is_whole(ref.uri):
                 return None
             if self.writes:
                 self._send(ref.uri)
@@ -284,13 +283,10 @@ class ObjectArchive(Archive):
         path = self.root / uri / MANIFEST_NAME
         return _size(path) == listed.size and int(path.stat().st_mtime) == int(listed.changed.timestamp())
 
-    def _find(self, uri: str, *, keep: bool = False) -> bool:
-        """Fetch a manifest from the bucket; False without one, or where it is cleared and ``keep`` is true.
-
-        Raises IncompleteStoreError: it is damaged.
-        """
+    def _find(self, uri: str) -> bool:
+        """Fetch a manifest from the bucket; False without one. Raises IncompleteStoreError: it is damaged."""
         dated = self.objects.read_dated(f"{uri}/{MANIFEST_NAME}")
-        if dated is None or (keep and is_cleared(parse_manifest(dated[0])[0])):
+        if dated is None:
             return False
         if parse_manifest(dated[0])[1] is None or try_manifest(self.root / uri)[1] is not None:
             self._lay(uri, *dated)  # a damaged one does not replace a valid one
@@ -387,17 +383,12 @@ class ObjectArchive(Archive):
         """
 
         def ensure(uri: str) -> None:
-            whole = self._is_whole(uri)
-            if uri in self._standing or self._find(uri, keep=whole):
-                return
-            if not whole:
-                raise self._removed(uri)
-            self._send(uri)
+            if uri not in self._standing and not self._find(uri):
+                if not self._is_whole(uri):
+                    raise IncompleteStoreError(f"{self.name}/{uri} was removed meanwhile. Run again: it is built again")
+                self._send(uri)
 
         some_at_a_time(ensure, list(uris))
-
-    def _removed(self, uri: str) -> IncompleteStoreError:
-        return IncompleteStoreError(f"{self.name}/{uri} was removed meanwhile. Run again: it is built again")
 
 
 def _is_address(uri: str) -> bool:
