@@ -43,7 +43,7 @@ from storage.archive.manifests import (
     write_manifest,
 )
 from storage.archive.records import Run
-from storage.archive.run_folders import RunDraft, finish_extensions, take_its_place
+from storage.archive.run_folders import RunDraft, take_its_place
 from storage.archive.staging import (
     PART_SUFFIX,
     bytes_below,
@@ -85,9 +85,6 @@ class Archive:
         """
         path = Path(root).absolute()
         open_folder(path, create=create, write=write)
-        if write:
-            with refusals(path, "write to the archive"):
-                finish_extensions(path)
         return cls(path, writes=write)
 
     @property
@@ -269,7 +266,6 @@ class Archive:
         """Remove unfinished folders that no process holds; return their addresses."""
         removed: list[str] = []
         with refusals(self.root, "clear up the archive"):
-            finish_extensions(self.root)
             for part in sorted((*self.root.glob(f"stages/*/*{PART_SUFFIX}"), *self.root.glob(f"runs/*{PART_SUFFIX}"))):
                 release = take_lock(self._lock_path(f"{part.parent.name}-{part.stem}"), wait=False)
                 if release is not None:

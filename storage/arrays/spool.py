@@ -1,4 +1,4 @@
-"""Store the lines of a capture, and the files of its camera, while it runs, so that a crash loses at most the lines since the last sync.
+"""Store the lines of a capture and the files of its camera while it runs; a crash loses the lines since the last sync.
 
 ``<name>.lines`` begins with one line of JSON that describes the sweep. Records of one size follow, one for each line.
 A record has number, mirror X and Y, time, exposure, valid, a CRC-32, and the raw numbers (sample, band) uint16. The CRC
@@ -8,8 +8,8 @@ A torn tail is cut off, and the capture continues there. A line that was damaged
 is named in the log, and comes back as an invalid line.
 
 Files of a camera lie in a folder while they are fetched, so that the next transfer continues there. A file is named by
-its whole path on the camera, notes about the files by a name alone. Bytes are only appended; a file that came damaged is
-dropped as a whole. Notes are on the disk when ``append`` returns; of a file the camera still has what is not.
+its whole path on the camera, notes about the files by a name alone. Bytes are only appended; a damaged file is dropped
+as a whole. Notes are on the disk when ``append`` returns; of a file the camera still has what is not.
 
 ::
 

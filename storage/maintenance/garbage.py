@@ -17,7 +17,6 @@ from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, without_manifest
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Store
-from storage.archive.run_folders import unfinished_extensions
 from storage.archive.staging import (
     MANIFEST_NAME,
     PART_SUFFIX,
@@ -158,7 +157,7 @@ def _obstacle(archive: Archive, catalogue: Catalogue, kept: Iterable[str]) -> st
 def _unfinished(root: Path) -> list[Removal]:
     parts = {*root.glob(f"stages/*/*{PART_SUFFIX}"), *root.glob(f"runs/*{PART_SUFFIX}")}
     found: list[Removal] = []
-    for path in sorted(parts - set(unfinished_extensions(root))):
+    for path in sorted(parts):
         uri, free = path.relative_to(root).as_posix(), True
         if (lock := _lock_of(root, uri, "unfinished")).exists():
             release = take_lock(lock, wait=False)

@@ -17,7 +17,6 @@ from storage.archive.keys import canonical_json, without_manifest
 from storage.archive.lineage import Catalogue
 from storage.archive.manifests import broken_files, listed_bytes, try_manifest
 from storage.archive.records import RECEIPT, Run
-from storage.archive.run_folders import unfinished_extensions
 from storage.archive.staging import MANIFEST_NAME
 
 Kind = Literal["whole", "broken", "missing", "stray"]
@@ -59,10 +58,7 @@ def verify_everything(
         found += [Finding(uri, problem, "broken") for problem in problems]
         if not problems:
             found.append(Finding(uri, None))
-    found += [*_without_manifest(root), *_missing(catalogue)]
-    words = "its extension is not finished; any command that writes into the archive finishes it"
-    found += [Finding(f"runs/{part.stem}", words, "stray") for part in unfinished_extensions(root)]
-    return found
+    return [*found, *_without_manifest(root), *_missing(catalogue)]
 
 
 def _problems(folder: Path) -> Iterator[str]:
