@@ -7,7 +7,7 @@ problem, a missing input a bare key.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from graphlib import TopologicalSorter
@@ -53,21 +53,15 @@ class Catalogue:
             return []
         return [self.by_key.get(given, [given])[0] for given in store.inputs]
 
-    @cached_property
-    def _made_of_it(self) -> dict[str, list[str]]:
-        found: dict[str, list[str]] = {}
-        for uri in self.stores:
-            for given in self.inputs_of(uri):
-                found.setdefault(given, []).append(uri)
-        return found
-
     def ancestors(self, uris: Iterable[str]) -> set[str]:
         """Return all inputs of these stores, direct and indirect, without themselves; missing ones as bare keys."""
-        return reach(uris, self.inputs_of)
-
-    def dependents(self, uris: Iterable[str]) -> set[str]:
-        """Return all stores made of these, directly or indirectly, without themselves."""
-        return reach(uris, lambda uri: self._made_of_it.get(uri, []))
+        begun = set(uris)
+        found, waiting = set(begun), list(begun)
+        while waiting:
+            new = set(self.inputs_of(waiting.pop())) - found
+            found |= new
+            waiting += new
+        return found - begun
 
     def inputs_first(self, uris: Iterable[str]) -> list[str]:
         """Return these stores with inputs before the stores made of them."""
@@ -137,17 +131,6 @@ def rests_on(root: Path, refs: Iterable[StageRef]) -> list[StageRef]:
             paths = (stage / key for key in read_store(ref).inputs if "/" not in key for stage in stages)
             waiting += [StageRef(p.parent.name, p.name, p) for p in paths if (p / MANIFEST_NAME).is_file()]
     return [found[uri] for uri in sorted(found)]
-
-
-def reach(starts: Iterable[str], following: Callable[[str], Iterable[str]]) -> set[str]:
-    """Return everything that can be reached from the starts, without the starts."""
-    begun = set(starts)
-    found, waiting = set(begun), list(begun)
-    while waiting:
-        new = set(following(waiting.pop())) - found
-        found |= new
-        waiting += new
-    return found - begun
 
 
 LATEST = "latest"  # the newest run

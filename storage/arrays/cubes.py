@@ -74,8 +74,13 @@ class RawCubeWriter:
         self._dn = create_array(self._group, "dn", spec, about, packing=RAW_PACKING)
         known = header.references
         write_references(self._group, known)
-        frames = {"dark": known.dark, "white": known.white, "white_reference": known.white_reference}
-        self._seen = LineThumbnail(header.shape, header.wavelength_nm, **frames)
+        self._seen = LineThumbnail(
+            header.shape,
+            header.wavelength_nm,
+            dark=known.dark,
+            white=known.white,
+            white_reference=known.white_reference,
+        )
         self._waiting: list[Line] = []
         self._facts: list[tuple[float, float, float, float, bool]] = []
 
