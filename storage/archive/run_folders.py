@@ -117,8 +117,8 @@ class RunDraft:
 def take_its_place(part: Path, final: Path) -> None:
     """Replace a folder by a complete one, and remove it.
 
-    Where the file system cannot exchange two folders, the files are replaced one by one, the manifest last: if the
-    process is killed then, the folder counts as damaged.
+    If the file system cannot exchange two folders, the files are replaced one by one, the manifest last. A folder
+    counts as damaged if the process is killed meanwhile.
     """
     sync_path(final.parent)
     if not try_exchange(part, final):
