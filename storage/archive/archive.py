@@ -40,6 +40,7 @@ from storage.archive.manifests import (
     made_bytes,
     manifest_sha256,
     read_manifest,
+    try_manifest,
     write_manifest,
 )
 from storage.archive.records import Run
@@ -263,16 +264,40 @@ class Archive:
     # --- verification and clearing up ---------------------------------------------------------------------------------
 
     def reclaim(self) -> list[str]:
-        """Remove unfinished folders that no process holds; return their addresses."""
-        removed: list[str] = []
-        with refusals(self.root, "clear up the archive"):
-            for part in sorted((*self.root.glob(f"stages/*/*{PART_SUFFIX}"), *self.root.glob(f"runs/*{PART_SUFFIX}"))):
-                release = take_lock(self._lock_path(f"{part.parent.name}-{part.stem}"), wait=False)
-                if release is not None:
-                    remove_tree(part)
-                    removed.append(part.relative_to(self.root).as_posix())
-                    release()
-        return removed
+        """Remove what killed processes left in this folder; return the addresses."""
+        return [uri for uri in Archive.leftovers(self, 0.0) if Archive.drop_leftover(self, uri)]
+
+    def leftovers(self, keep_days: float) -> dict[str, int]:
+        """Return addresses and bytes of what killed processes left: unfinished folders, spools of published captures.
+
+        In a bucket also incomplete uploads that are older than ``keep_days``.
+        """
+        spools = [path for path in self.root.glob("spool/*") if self._is_published(path.name)]
+        parts = [*self.root.glob(f"stages/*/*{PART_SUFFIX}"), *self.root.glob(f"runs/*{PART_SUFFIX}")]
+        found: dict[str, int] = {}
+        for path in sorted((*parts, *spools)):
+            lock = self._lock_of(path)
+            release = take_lock(lock, wait=False) if lock.exists() else lambda: None
+            if release is not None:
+                release()
+                found[path.relative_to(self.root).as_posix()] = bytes_below(path)
+        return found
+
+    def drop_leftover(self, uri: str) -> bool:
+        """Remove one of `leftovers`; False where a process holds it, or the disk refuses."""
+        path = self.root / uri
+        release = take_lock(self._lock_of(path), wait=False)
+        if release is not None:
+            remove_tree(path)
+            release()
+        return not path.exists()
+
+    def _is_published(self, key: str) -> bool:
+        return any(try_manifest(store)[1] is None for store in self.root.glob(f"stages/*/{key}"))
+
+    def _lock_of(self, path: Path) -> Path:
+        kind = "capture" if path.parent.name == "spool" else path.parent.name
+        return self._lock_path(f"{kind}-{path.name.removesuffix(PART_SUFFIX)}")
 
     def now(self) -> datetime:
         """Return the time from which the age of stores is counted."""
@@ -299,13 +324,6 @@ class Archive:
     def take_moved(self) -> int:
         """Return the bytes transferred to and from a bucket since the last call."""
         return 0
-
-    def leftovers(self, keep_days: float) -> dict[str, int]:
-        """Return addresses and bytes of incomplete uploads in a bucket that are older than ``keep_days``."""
-        return {}
-
-    def drop_leftover(self, uri: str) -> None:
-        """Remove one of `leftovers`."""
 
     def drop_run(self, uri: str) -> None:
         """Remove a damaged run."""

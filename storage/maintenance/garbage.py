@@ -9,7 +9,6 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import datetime
-from pathlib import Path
 from typing import Literal
 
 from pipeline.errors import SettingsError
@@ -17,21 +16,11 @@ from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, without_manifest
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Store
-from storage.archive.staging import (
-    MANIFEST_NAME,
-    PART_SUFFIX,
-    bytes_below,
-    check_name,
-    refusals,
-    remove_tree,
-    take_lock,
-)
+from storage.archive.staging import MANIFEST_NAME, refusals
 
 DAY_S = 86400.0
 IN_USE = "the archive is in use: run gc again when it is free"
-What = Literal[
-    "store", "files", "spool", "unfinished", "upload"
-]  # files: raw lines that the setting `keep` of a run does not keep
+What = Literal["store", "files", "leftover"]  # files: raw lines that the setting `keep` of a run does not keep
 
 
 @dataclass(frozen=True)
@@ -70,29 +59,24 @@ def clear_up(
 
     Raises ArchiveError: the disk refuses.
     """
-
-    def plan_now() -> Clearance:
-        return plan_clearance(archive, keep_days=keep_days, raw_too=raw_too)
-
-    if dry_run:
-        with refusals(archive.root, "clear up the archive"):
-            return plan_now()
-    with archive.in_use(alone=True) as alone, refusals(archive.root, "clear up the archive"):
-        plan = plan_now()
-        obstacle = plan.obstacle if alone else IN_USE
-        gone: list[Removal] = []
-        for number, removal in enumerate(plan.removals):
-            if progress is not None:
-                progress(removal, number / len(plan.removals))
-            in_archive = removal.what == "store"
-            held = (in_archive and obstacle is not None) or (removal.what == "upload" and not alone)
-            if not held and _remove(archive, removal):
-                gone.append(removal)
-    return Clearance(tuple(gone), plan.kept, obstacle)
+    with refusals(archive.root, "clear up the archive"):
+        if dry_run:
+            return plan_clearance(archive, keep_days=keep_days, raw_too=raw_too)
+        with archive.in_use(alone=True) as alone:
+            plan = plan_clearance(archive, keep_days=keep_days, raw_too=raw_too)
+            if not alone:
+                return Clearance((), plan.kept, IN_USE)
+            gone: list[Removal] = []
+            for number, removal in enumerate(plan.removals):
+                if progress is not None:
+                    progress(removal, number / len(plan.removals))
+                if _remove(archive, removal):
+                    gone.append(removal)
+    return Clearance(tuple(gone), plan.kept, plan.obstacle)
 
 
 def plan_clearance(archive: Archive, *, keep_days: float = 1.0, raw_too: bool = False) -> Clearance:
-    """Find stores that no run names, spools of published captures, and leftovers of dead processes.
+    """Find stores that no run names, and leftovers of dead processes.
 
     Stores younger than ``keep_days`` stay with their inputs: a running survey may name them. ``raw_too`` also takes raw
     lines of a rig or ingested ones that no run names; they cannot be captured again.
@@ -110,16 +94,10 @@ def plan_clearance(archive: Archive, *, keep_days: float = 1.0, raw_too: bool = 
     removals = [
         Removal(uri, "store", archive.size_of(uri), "no run names it") for uri in reversed(catalogue.inputs_first(gone))
     ]
-    uploads = [
-        Removal(uri, "upload", size, "it was never published") for uri, size in archive.leftovers(keep_days).items()
+    left = [
+        Removal(uri, "leftover", size, "its process has ended") for uri, size in archive.leftovers(keep_days).items()
     ]
-    published = {store.ref.key for store in catalogue.stores.values() if store.problem is None}
-    spools = [
-        Removal(f"spool/{path.name}", "spool", bytes_below(path), "its lines are published")
-        for path in sorted((archive.root / "spool").glob("*"))
-        if path.name in published
-    ]
-    return Clearance((*removals, *uploads, *spools, *_unfinished(archive.root)), kept, obstacle)
+    return Clearance((*removals, *left), kept, obstacle)
 
 
 def _spared(catalogue: Catalogue, named: set[str], keep_days: float, raw_too: bool, now: datetime) -> dict[str, str]:
@@ -154,41 +132,9 @@ def _obstacle(archive: Archive, catalogue: Catalogue, kept: Iterable[str]) -> st
     return None
 
 
-def _unfinished(root: Path) -> list[Removal]:
-    parts = {*root.glob(f"stages/*/*{PART_SUFFIX}"), *root.glob(f"runs/*{PART_SUFFIX}")}
-    found: list[Removal] = []
-    for path in sorted(parts):
-        uri, free = path.relative_to(root).as_posix(), True
-        if (lock := _lock_of(root, uri, "unfinished")).exists():
-            release = take_lock(lock, wait=False)
-            if free := release is not None:
-                release()
-        if free:
-            found.append(Removal(uri, "unfinished", bytes_below(path), "its process has ended"))
-    return found
-
-
-def _lock_of(root: Path, uri: str, what: What) -> Path:
-    path = Path(uri)
-    name = f"capture-{path.name}" if what == "spool" else f"{path.parent.name}-{path.stem}"
-    return root / ".locks" / f"{name}.lock"
-
-
 def _remove(archive: Archive, removal: Removal) -> bool:
     """Remove one thing; False where another process holds it."""
-    path = archive.root / removal.uri
     if removal.what == "store":
+        path = archive.root / removal.uri
         return archive.discard(StageRef(path.parent.name, path.name, path), wait=False, unnamed=True)
-    if removal.what == "upload":
-        archive.drop_leftover(removal.uri)
-        return True
-    if removal.what == "spool":
-        check_name(path.name)
-    release = take_lock(_lock_of(archive.root, removal.uri, removal.what), wait=False)
-    if release is None:
-        return False
-    try:
-        remove_tree(path)
-    finally:
-        release()
-    return not path.exists()  # the disk may have refused
+    return archive.drop_leftover(removal.uri)

@@ -221,14 +221,14 @@ class ObjectArchive(Archive):
         return self.objects.take_moved()
 
     def leftovers(self, keep_days: float) -> dict[str, int]:
-        """Return addresses and bytes of incomplete uploads that are older than ``keep_days``."""
+        """Return what killed processes left here, and incomplete uploads that are older than ``keep_days``."""
         there = self.objects.listing()
         latest = max((one.changed for one in there.values()), default=None)
         uploads: dict[str, list[Listed]] = {}
         for path, one in there.items():
             if found := ATTEMPT.fullmatch(path):
                 uploads.setdefault(f"{found[1]}/{found[2]}", []).append(one)
-        old: dict[str, int] = {}
+        old = super().leftovers(keep_days)
         for folder, files in sorted(uploads.items()):
             assert latest is not None
             if (latest - max(one.changed for one in files)).total_seconds() >= keep_days * DAY_S:
@@ -238,9 +238,12 @@ class ObjectArchive(Archive):
                     old[folder] = sum(one.size for one in files)
         return old
 
-    def drop_leftover(self, uri: str) -> None:
-        """Remove one of `leftovers`."""
+    def drop_leftover(self, uri: str) -> bool:
+        """Remove one of `leftovers`; False where a process holds it, or the disk refuses."""
+        if not ATTEMPT.fullmatch(f"{uri}/-"):
+            return super().drop_leftover(uri)
         self.objects.remove(self.objects.listing(uri))
+        return True
 
     def verify_everything(self, progress: Progress | None = None) -> list[Finding]:
         """Check every store and run in the bucket, not in the working copy."""

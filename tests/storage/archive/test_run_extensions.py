@@ -213,7 +213,7 @@ def test_killed_before_the_files_of_before_go(machine: Machine, monkeypatch: pyt
     other = machine(SECOND, create=False)
     assert (figure_of(other), problems(other)) == (0.75, [])
     (gone,) = clear_up(other, keep_days=0).removals
-    assert gone.what == "upload"
+    assert gone.what == "leftover"
     assert (figure_of(machine(SECOND, create=False)), problems(machine(FIRST))) == (0.75, [])
 
 

@@ -71,8 +71,8 @@ def test_spools_of_published_captures_and_dead_parts_go(tmp_path: Path, archive:
         assert planned == found
         assert staged.path.is_dir()
     assert {(one.uri, one.what, one.size) for one in found.removals} == {
-        (f"spool/{small.raw.key}", "spool", 100),
-        ("stages/rectify/dead.part", "unfinished", 10),
+        (f"spool/{small.raw.key}", "leftover", 100),
+        ("stages/rectify/dead.part", "leftover", 10),
     }
     assert [path.name for path in (tmp_path / "spool").iterdir()] == ["underway"]
     assert not (tmp_path / "stages" / "rectify" / "dead.part").exists()
@@ -97,7 +97,7 @@ def test_a_spool_stays_while_its_capture_may_be_in_need_of_it(archive: Archive) 
     flip(small.raw.path / "manifest.json", at=30)
     assert clear_up(archive).removals == ()
     (small.raw.path / "manifest.json").write_bytes(manifest)
-    assert [removal.what for removal in clear_up(archive).removals] == ["spool"]
+    assert [removal.what for removal in clear_up(archive).removals] == ["leftover"]
 
 
 def test_what_does_not_let_itself_be_removed_is_not_told_as_gone(
@@ -106,7 +106,7 @@ def test_what_does_not_let_itself_be_removed_is_not_told_as_gone(
     """The disk refuses: the next gc tries again."""
     (tmp_path / "stages/segment/aaaa.part").mkdir(parents=True)
     with monkeypatch.context() as broken:
-        broken.setattr("storage.maintenance.garbage.remove_tree", lambda path: None)
+        broken.setattr("storage.archive.archive.remove_tree", lambda path: None)
         assert clear_up(archive).removals == ()
     assert [removal.uri for removal in clear_up(archive).removals] == ["stages/segment/aaaa.part"]
 
