@@ -175,7 +175,6 @@ def contents(archive: Archive, now: datetime | None = None) -> dict[str, Any]:
         "stages": stages,
         "bytes": sum(sizes.values()),
         "shared_bytes": sum(size for uri, size in sizes.items() if len(catalogue.named_by(uri)) > 1),
-        "lost": list(catalogue.lost),
     }
 
 
@@ -310,8 +309,6 @@ def show_contents(content: dict[str, Any], console: Console) -> None:
     rows = [row for stage, stores in content["stages"].items() for row in _shown_stores(stage, stores)]
     columns = ("stage", "key", "version", "size", "age", "named by")
     console.print(table(columns, rows, title="Stores", left=3, whole=WHOLE) if rows else "no stores")
-    for uri in content["lost"]:
-        console.print(f"[bold red]{escape(uri)} has lost its manifest; run verify[/]", soft_wrap=True)
     count = counted(sum(map(len, content["stages"].values())), "store")
     shared = f", {format_bytes(content['shared_bytes'])} shared by several runs" if content["shared_bytes"] else ""
     _say(console, f"{counted(len(content['runs']), 'run')}, {count}, {format_bytes(content['bytes'])}{shared}")

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pipeline.errors import ArchiveError
-from storage.archive.keys import StageRef, in_text, published_runs, published_stores, without_manifest
+from storage.archive.keys import StageRef, in_text, published_runs, published_stores
 from storage.archive.records import Run, Store, read_run, read_store
 from storage.archive.staging import MANIFEST_NAME, check_name
 
@@ -24,25 +24,23 @@ RAW_STAGES = ("capture", "ingest")
 
 @dataclass(frozen=True)
 class Catalogue:
-    """All stores by address, and all runs, oldest first; ``lost`` are the addresses of stores without a manifest."""
+    """All stores by address, and all runs, oldest first."""
 
     stores: dict[str, Store]
     runs: list[Run]
-    lost: tuple[str, ...] = ()
 
     @classmethod
     def read(cls, root: Path) -> Catalogue:
         """Read every manifest and receipt of an archive; damaged ones have a ``problem``."""
         stores = {ref.uri: read_store(ref) for ref in published_stores(root)}
         runs = sorted((read_run(path) for path in published_runs(root)), key=lambda run: (run.created, run.folder.name))
-        lost = (path.relative_to(root).as_posix() for path in without_manifest(root))
-        return cls(stores, runs, tuple(uri for uri in lost if in_text(uri) == uri))
+        return cls(stores, runs)
 
     @cached_property
     def by_key(self) -> dict[str, list[str]]:
         """Return addresses of stores by key, also of missing ones that a run names."""
         found: dict[str, list[str]] = {}
-        for uri in dict.fromkeys((*self.stores, *self.lost, *(uri for run in self.runs for uri in sorted(run.names)))):
+        for uri in dict.fromkeys((*self.stores, *(uri for run in self.runs for uri in sorted(run.names)))):
             found.setdefault(uri.rpartition("/")[2], []).append(uri)
         return found
 

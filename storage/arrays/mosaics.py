@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -157,24 +157,17 @@ def write_tiles(
 
     Every worker gives the same bytes. Raises as `run_blocks`.
     """
-    task = _TileTask(make, writer.path.absolute())
+    out = writer.path.absolute()
     if pool.shares_memory:
-        _reopened(task.out)  # before several threads ask for it
-    run_blocks(task, places, pool, report=report, paths=[*paths, task.out])
+        _reopened(out)  # before several threads ask for it
+    run_blocks(partial(_write_tile, make, out), places, pool, report=report, paths=[*paths, out])
     _reopened.cache_clear()
 
 
-@dataclass(frozen=True)
-class _TileTask:
-    """Make and store a tile in any process; a shard's files are written by one task alone."""
-
-    make: MakeTile
-    out: Path  # the mosaic, begun
-
-    def __call__(self, place: tuple[slice, slice]) -> None:
-        """Make and write the tile of some rows and columns."""
-        scores, coverage = self.make(*place)
-        _reopened(self.out).write_tile(place[0].start, place[1].start, scores, coverage)
+def _write_tile(make: MakeTile, out: Path, place: tuple[slice, slice]) -> None:
+    """Make and store the tile of some rows and columns of a mosaic that was begun, in any process."""
+    scores, coverage = make(*place)
+    _reopened(out).write_tile(place[0].start, place[1].start, scores, coverage)
 
 
 @lru_cache(maxsize=1)
