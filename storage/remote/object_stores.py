@@ -250,11 +250,7 @@ class Objects:
         """
         advice = f"run again; if that does not help, run verify on {self.place.url}"
         try:
-            try:
-                found = self.save(name, aside)
-            except FileNotFoundError:
-                raise IncompleteStoreError(f"{self.place.url}/{name} is missing; {advice}") from None
-            if found != sha256:
+            if self.save(name, aside) != sha256:
                 raise IncompleteStoreError(
                     f"{self.place.url}/{name} has changed since it was published (its SHA-256 differs); {advice}"
                 )
@@ -262,6 +258,8 @@ class Objects:
             path.parent.mkdir(parents=True, exist_ok=True)
             aside.replace(path)
             sync_path(path.parent)
+        except FileNotFoundError:
+            raise IncompleteStoreError(f"{self.place.url}/{name} is missing; {advice}") from None
         finally:
             with suppress(OSError):
                 aside.unlink(missing_ok=True)
