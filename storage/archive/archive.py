@@ -265,7 +265,8 @@ class Archive:
 
     def reclaim(self) -> list[str]:
         """Remove what killed processes left in this folder; return the addresses."""
-        return [uri for uri in Archive.leftovers(self, 0.0) if Archive.drop_leftover(self, uri)]
+        with refusals(self.root, "clear up the archive"):
+            return [uri for uri in Archive.leftovers(self, 0.0) if Archive.drop_leftover(self, uri)]
 
     def leftovers(self, keep_days: float) -> dict[str, int]:
         """Return addresses and bytes of what killed processes left: unfinished folders, spools of published captures.
