@@ -82,8 +82,7 @@ faults: $(BIN)/.ok-dev
 
 SOAK ?=
 
-# Runs a day of 72 surveys with kills, unplugged cables and full disks, and a week of Prefect schedules
-# (SOAK="day --quick"). Under an hour.
+# Runs surveys that are killed at random moments and run again, which must end in the same maps (SOAK="--quick").
 soak: $(BIN)/.ok-dev
 	OMP_NUM_THREADS=1 $(BIN)/python tests/soak $(SOAK)
 

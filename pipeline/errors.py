@@ -117,10 +117,6 @@ class ArchiveError(PipelineError, OSError):
     """The archive cannot be read or written."""
 
 
-class ChunkError(PipelineError, ValueError):
-    """A region does not end at chunk borders."""
-
-
 class IncompleteStoreError(PipelineError, LookupError):
     """A store has no valid manifest, or its content does not match it."""
 

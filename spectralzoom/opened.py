@@ -126,7 +126,7 @@ class OpenedRun:
 
         Raises IncompleteStoreError: it is damaged.
         """
-        found: Run = read_run(self.folder, {})
+        found: Run = read_run(self.folder)
         if found.problem is not None:
             raise IncompleteStoreError(f"{found.uri} of {self._archive.name}: {found.problem}; run verify --repair")
         return found.receipt

@@ -29,8 +29,7 @@ from storage.archive.keys import in_text
 from storage.archive.lineage import Catalogue, changes_between, find_product, version_before
 from storage.archive.records import Run
 from storage.maintenance.garbage import clear_up
-from storage.maintenance.repair import plan_repair, repair
-from storage.maintenance.verification import Finding
+from storage.maintenance.verification import Finding, plan_repair, repair
 from storage.remote.opening import open_archive, verify_archive
 
 if TYPE_CHECKING:
@@ -176,7 +175,6 @@ def contents(archive: Archive, now: datetime | None = None) -> dict[str, Any]:
         "stages": stages,
         "bytes": sum(sizes.values()),
         "shared_bytes": sum(size for uri, size in sizes.items() if len(catalogue.named_by(uri)) > 1),
-        "lost": list(catalogue.lost),
     }
 
 
@@ -198,7 +196,7 @@ def _run_state(catalogue: Catalogue, run: Run) -> str:
     """Return the state of a run by its manifests alone."""
     if run.problem is not None:
         return "damaged"
-    stores = [catalogue.stores.get(uri) for uri in catalogue.named_and_below[run.uri]]
+    stores = [catalogue.stores.get(uri) for uri in run.names]
     damaged = sum(store is not None and store.problem is not None for store in stores)
     counts = ((stores.count(None), "missing"), (damaged, "damaged"))
     return " and ".join(f"{count} {word}" for count, word in counts if count) or "there"
@@ -221,7 +219,7 @@ def explanation(archive: Archive, product: str) -> dict[str, Any]:
     if isinstance(found, Run):
         below = set[str]().union(*(catalogue.ancestors([uri]) for uri in found.names))
         shown = set[str]()
-        row = _run_row(catalogue, found, archive.kept_bytes(found, catalogue))
+        row = _run_row(catalogue, found, archive.kept_bytes(found))
         row |= {"problem": found.problem, "command": command(found.settings, archive.name)}
         trees = [_tree(catalogue, uri, shown) for uri in sorted(found.names - below)]
         return {"archive": archive.name, "product": found.uri, "run": row, "lineage": trees}
@@ -311,8 +309,6 @@ def show_contents(content: dict[str, Any], console: Console) -> None:
     rows = [row for stage, stores in content["stages"].items() for row in _shown_stores(stage, stores)]
     columns = ("stage", "key", "version", "size", "age", "named by")
     console.print(table(columns, rows, title="Stores", left=3, whole=WHOLE) if rows else "no stores")
-    for uri in content["lost"]:
-        console.print(f"[bold red]{escape(uri)} has lost its manifest; run verify[/]", soft_wrap=True)
     count = counted(sum(map(len, content["stages"].values())), "store")
     shared = f", {format_bytes(content['shared_bytes'])} shared by several runs" if content["shared_bytes"] else ""
     _say(console, f"{counted(len(content['runs']), 'run')}, {count}, {format_bytes(content['bytes'])}{shared}")

@@ -100,7 +100,7 @@ def open_exported(archive: Archive, name: str | None) -> ExportedRun:
     if folder is None:
         known = ", ".join(run.name for run in runs[-5:])
         raise SettingsError(f"{archive.name} has no run {name!r}; its latest are {known}")
-    run = read_run(folder, {})
+    run = read_run(folder)
     if run.problem is not None:
         raise IncompleteStoreError(f"{folder} is damaged: {run.problem}; run verify on the archive")
     try:

@@ -117,7 +117,7 @@ def reprocess_fields(
                     row |= {"state": "would run"}
                 else:
                     folder = (survey or _survey)(settings, console)
-                    row |= {"new": folder.name, "state": "ran", **_scores(read_run(folder, {}).receipt, "after")}
+                    row |= {"new": folder.name, "state": "ran", **_scores(read_run(folder).receipt, "after")}
                     renewed[old] = folder.name
             except PipelineError as error:
                 row |= {"message": str(error)}

@@ -130,8 +130,4 @@ def is_current(catalogue: Catalogue, run: Run, settings: Settings) -> bool:
     except (OSError, SettingsError, WeightsError):
         weights = None
     complete = run.problem is None and all(row.get("state") != "failed" for row in run.stages)
-    return (
-        complete
-        and not is_pending(run.receipt)
-        and not stale_stores(catalogue, catalogue.named_and_below[run.uri], weights)
-    )
+    return complete and not is_pending(run.receipt) and not stale_stores(catalogue, set(run.names), weights)

@@ -117,12 +117,12 @@ def _accuracy_is_stored(plan: OpenSurvey) -> bool:
 def _stopped_run(plan: OpenSurvey) -> RunRef | None:
     """Return the run that the same survey published before it was stopped; None without one, or if it is locked."""
     for folder in reversed(plan.run.archive.runs()):
-        if not _is_stopped(plan, read_run(folder, {})):
+        if not _is_stopped(plan, read_run(folder)):
             continue
         draft = plan.run.archive.extend_run(folder.name, wait=False)
         if draft is not None:
             draft.abandon()  # it was free
-            if _is_stopped(plan, read_run(folder, {})):  # and not judged since
+            if _is_stopped(plan, read_run(folder)):  # and not judged since
                 return RunRef(f"runs/{folder.name}", folder, pending=True)
     return None
 

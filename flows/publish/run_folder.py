@@ -92,7 +92,7 @@ def extend_with_accuracy(survey: OpenSurvey, draft: RunDraft, accuracy: StageRef
 
 def load_receipt(folder: Path) -> Receipt:
     """Return the receipt of a published run (IncompleteStoreError: it has changed; ShapeError: it is not valid)."""
-    found = read_run(folder, {})
+    found = read_run(folder)
     if found.problem is not None:
         raise IncompleteStoreError(f"{found.uri}: {found.problem}; run verify --repair on the archive")
     return check_receipt(found.receipt)

@@ -68,7 +68,7 @@ def find_prior(
         folder = archive.root / "runs" / Path(settings.prior).name
         why = "there is no such run in the archive"
         if folder.is_dir():
-            found = _usable(archive, read_run(folder, {}), settings, grid, class_names)
+            found = _usable(archive, read_run(folder), settings, grid, class_names)
             if isinstance(found, Prior):
                 return found, ()
             why = found
@@ -92,7 +92,7 @@ def _before(archive: Archive, settings: Settings, name: str) -> Iterator[Run]:
     for number, folder in enumerate(reversed(published_runs(archive.root))):
         if part not in folder.name:  # no receipt has to be read for that
             continue
-        run = read_run(folder, {})
+        run = read_run(folder)
         if run.receipt.get("survey") == name and PROBABILITIES in run.products:
             before = {"extent": EXTENT_WHOLE, **run.settings}
             if all(before.get(key) == asked[key] for key in light):
@@ -166,7 +166,7 @@ def _earlier_runs(archive: Archive, run: Run, grid: SceneGrid) -> Iterator[Earli
         ):
             return
         down, across = (sum(both) for both in zip((down, across), memory["shift_px"], strict=True))
-        run = read_run(archive.root / "runs" / memory["run"], {})
+        run = read_run(archive.root / "runs" / memory["run"])
         parts = run.products.get("mosaic", "").split("/")
         if run.problem is not None or len(parts) < 3:
             return

@@ -25,7 +25,7 @@ from pipeline.rig.rig_source import RigSource
 from pipeline.rig.transports import SYSTEM_CLOCK, Clock
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.source import Source
-from storage.arrays.fetched_files import FetchedFiles
+from storage.arrays.spool import FetchedFiles
 
 FETCHED = "camera"  # folder within a capture's spool
 

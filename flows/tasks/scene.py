@@ -71,7 +71,7 @@ def _newest_unseen(settings: Settings, pattern: str) -> str:
     seen = dict[str, str]()
     if is_archive(settings.out):
         runs = published_runs(open_archive(settings.out, create=False, write=False).root)
-        seen = {str(read_run(folder, {}).settings.get("scene")): folder.name for folder in runs}
+        seen = {str(read_run(folder).settings.get("scene")): folder.name for folder in runs}
     left = [one for one in there if str(one.absolute()) not in seen]
     newest = max(left or there, key=lambda one: (one.stat().st_mtime, one.name))
     if not left:

@@ -1,9 +1,9 @@
 """Captures on a rig, one after the other, and the journal of what the rig has acknowledged.
 
-The journal has one JSON object per line, with a checksum, beside the files fetched from the camera. After a killed
-process the next one reads there which folder on the camera holds which lines, and does not capture those again. A torn
-or changed line counts as not written. A capture whose end is missing then is not continued, since the mirror may have
-moved.
+The journal has one record per line, a CRC-32 and a JSON object, beside the files fetched from the camera. Each line
+begins with a line end of its own, so that a damaged line takes no other with it. After a killed process the next one
+reads there which folder on the camera holds which lines, and does not capture those again. A torn or changed line
+counts as not written. A capture whose end is missing then is not continued, since the mirror may have moved.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ import numpy as np
 from pipeline.errors import RigError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, exposing
-from pipeline.json_lines import read_checked, with_check
 from pipeline.rig.camera.camera_files import Kept
 from pipeline.rig.capture_paths import CapturePath, CaptureRecord, LinePositions, capture_prefix
 from pipeline.rig.device_settings import SurveyRig
@@ -99,16 +98,17 @@ class CaptureJournal:
         return self._origins.get(sweep.name)
 
     def _read(self) -> None:
-        for line in read_checked(self._kept.read(JOURNAL, 0, self._kept.size(JOURNAL))):
-            if line.state == "torn":
-                continue
-            if line.content is None:
-                self.damage.append(f"line {line.number} of {JOURNAL} is ignored: it has changed since it was written")
+        lines = filter(None, self._kept.read(JOURNAL, 0, self._kept.size(JOURNAL)).split(b"\n"))
+        for number, line in enumerate(lines, 1):
+            check, _, text = line.partition(b" ")
+            if check != _crc32(text):
+                if (line[-1] ^ ord("}")).bit_count() < 2:  # else the end of a write that a power cut broke off
+                    self.damage.append(f"record {number} of {JOURNAL} is ignored: it has changed since it was written")
                 continue
             try:
-                self._follow(line.content)
-            except (LookupError, TypeError, ValueError):
-                self.damage.append(f"line {line.number} of {JOURNAL} is ignored: the line that it refers to is missing")
+                self._follow(json.loads(text))
+            except LookupError:
+                self.damage.append(f"record {number} of {JOURNAL} is ignored: the one that it refers to is missing")
         if self.damage:
             LOG.warning("%s", "; ".join(self.damage))
             for folder in self._taken.keys() - self._ended:
@@ -116,9 +116,7 @@ class CaptureJournal:
 
     def _write(self, record: dict[str, Any]) -> None:
         text = json.dumps(record).encode()
-        size = self._kept.size(JOURNAL)
-        torn = size > 0 and self._kept.read(JOURNAL, size - 1, size) != b"\n"
-        self._kept.append(JOURNAL, (b"\n" if torn else b"") + with_check(text))
+        self._kept.append(JOURNAL, b"\n%s %s\n" % (_crc32(text), text))
         self._follow(json.loads(text))
 
     def _follow(self, record: dict[str, Any]) -> None:
@@ -152,6 +150,10 @@ class CaptureJournal:
                 self.references[record.get("exposure_ms")] = record["folder"]
             case "origin":
                 self._origins[record["sweep"]] = record["stamp_us"]
+
+
+def _crc32(text: bytes) -> bytes:
+    return b"%08x" % zlib.crc32(text)
 
 
 def say_nothing(words: str) -> None:

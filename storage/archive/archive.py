@@ -13,7 +13,6 @@ archive in a bucket (`storage.remote.object_archive`) has the same addresses.
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -32,7 +31,6 @@ from storage.archive.keys import (
     published_stores,
     stage_key,
     store_at,
-    without_manifest,
 )
 from storage.archive.lineage import Catalogue, rests_on
 from storage.archive.manifests import (
@@ -42,10 +40,11 @@ from storage.archive.manifests import (
     made_bytes,
     manifest_sha256,
     read_manifest,
+    try_manifest,
     write_manifest,
 )
 from storage.archive.records import Run
-from storage.archive.run_folders import RunDraft, finish_extensions, take_its_place
+from storage.archive.run_folders import RunDraft, take_its_place
 from storage.archive.staging import (
     PART_SUFFIX,
     bytes_below,
@@ -87,9 +86,6 @@ class Archive:
         """
         path = Path(root).absolute()
         open_folder(path, create=create, write=write)
-        if write:
-            with refusals(path, "write to the archive"):
-                finish_extensions(path)
         return cls(path, writes=write)
 
     @property
@@ -106,8 +102,7 @@ class Archive:
     def locate(self, address: str) -> Path:
         """Return the path on this machine of a product, by its address in a receipt.
 
-        Raises IncompleteStoreError: the store is missing or was cleared, or a file is missing, cut short or no plain
-        file.
+        Raises IncompleteStoreError: the store is missing or was cleared, or a file is missing or cut short.
         """
         uri = in_text(address)
         if uri is not None:
@@ -126,7 +121,7 @@ class Archive:
         or a file is missing, or has another size.
         """
         ref = store_at(self.root, stage, key)
-        if not os.path.lexists(ref.path):
+        if not ref.path.exists():
             return None
         check_files(ref.path, hashes=False)
         return None if is_cleared(read_manifest(ref.path)) else ref
@@ -264,17 +259,41 @@ class Archive:
     # --- verification and clearing up ---------------------------------------------------------------------------------
 
     def reclaim(self) -> list[str]:
-        """Remove unfinished folders that no process holds; return their addresses."""
-        removed: list[str] = []
+        """Remove what killed processes left in this folder; return the addresses."""
         with refusals(self.root, "clear up the archive"):
-            finish_extensions(self.root)
-            for part in sorted((*self.root.glob(f"stages/*/*{PART_SUFFIX}"), *self.root.glob(f"runs/*{PART_SUFFIX}"))):
-                release = take_lock(self._lock_path(f"{part.parent.name}-{part.stem}"), wait=False)
-                if release is not None:
-                    remove_tree(part)
-                    removed.append(part.relative_to(self.root).as_posix())
-                    release()
-        return removed
+            return [uri for uri in Archive.leftovers(self, 0.0) if Archive.drop_leftover(self, uri)]
+
+    def leftovers(self, keep_days: float) -> dict[str, int]:
+        """Return addresses and bytes of what killed processes left: unfinished folders, spools of published captures.
+
+        In a bucket also incomplete uploads that are older than ``keep_days``.
+        """
+        spools = [path for path in self.root.glob("spool/*") if self._is_published(path.name)]
+        parts = [*self.root.glob(f"stages/*/*{PART_SUFFIX}"), *self.root.glob(f"runs/*{PART_SUFFIX}")]
+        found: dict[str, int] = {}
+        for path in sorted((*parts, *spools)):
+            lock = self._lock_of(path)
+            release = take_lock(lock, wait=False) if lock.exists() else lambda: None
+            if release is not None:
+                release()
+                found[path.relative_to(self.root).as_posix()] = bytes_below(path)
+        return found
+
+    def drop_leftover(self, uri: str) -> bool:
+        """Remove one of `leftovers`; False where a process holds it, or the disk refuses."""
+        path = self.root / uri
+        release = take_lock(self._lock_of(path), wait=False)
+        if release is not None:
+            remove_tree(path)
+            release()
+        return not path.exists()
+
+    def _is_published(self, key: str) -> bool:
+        return any(try_manifest(store)[1] is None for store in self.root.glob(f"stages/*/{key}"))
+
+    def _lock_of(self, path: Path) -> Path:
+        kind = "capture" if path.parent.name == "spool" else path.parent.name
+        return self._lock_path(f"{kind}-{path.name.removesuffix(PART_SUFFIX)}")
 
     def now(self) -> datetime:
         """Return the time from which the age of stores is counted."""
@@ -288,31 +307,19 @@ class Archive:
         """Return the sizes of stores and runs, as `size_of` counts them, by address."""
         return {uri: self.size_of(uri) for uri in uris}
 
-    def kept_bytes(self, run: Run, catalogue: Catalogue) -> int:
+    def kept_bytes(self, run: Run) -> int:
         """Return the bytes kept for a run: its folder, the stores that it names, and their inputs, with manifests."""
-        return sum(self.sizes([run.uri, *catalogue.named_and_below[run.uri]]).values())
+        return sum(self.sizes([run.uri, *run.names]).values())
 
     def all_sizes(self, catalogue: Catalogue) -> dict[str, int]:
         """Return the bytes of every store and run, by address; missing stores that a run names are included."""
-        below = catalogue.named_and_below
-        return self.sizes(sorted({*catalogue.stores, *below, *(uri for uris in below.values() for uri in uris)}))
+        return self.sizes(
+            sorted({*catalogue.stores, *(uri for run in catalogue.runs for uri in (run.uri, *run.names))})
+        )
 
     def take_moved(self) -> int:
         """Return the bytes transferred to and from a bucket since the last call."""
         return 0
-
-    def lost_runs(self) -> list[str]:
-        """Return the addresses of runs without a manifest, whose stores are unknown."""
-        return [
-            f"runs/{path.name}" for path in without_manifest(self.root) if path.parent.name == "runs" and path.is_dir()
-        ]
-
-    def leftovers(self, keep_days: float) -> dict[str, int]:
-        """Return addresses and bytes of incomplete uploads in a bucket that are older than ``keep_days``."""
-        return {}
-
-    def drop_leftover(self, uri: str) -> None:
-        """Remove one of `leftovers`."""
 
     def drop_run(self, uri: str) -> None:
         """Remove a damaged run."""

@@ -12,9 +12,9 @@ import math
 import os
 import re
 import secrets
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path, PurePath
 from typing import Any
@@ -69,7 +69,7 @@ def plain(value: object) -> Any:
         content = hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
         return {"dtype": value.dtype.str, "shape": list(value.shape), "sha256": content}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+        return {one.name: plain(getattr(value, one.name)) for one in dataclasses.fields(value)}
     if isinstance(value, Mapping):
         return {str(name): plain(entry) for name, entry in value.items()}
     if isinstance(value, set | frozenset):
@@ -94,7 +94,15 @@ class StageRef:
 
     stage: str
     key: str
-    path: Path
+    folder: Path = field(compare=False)
+    fetch: Callable[[str], None] | None = field(default=None, compare=False, repr=False)
+
+    @property
+    def path(self) -> Path:
+        """Folder of the store on this machine; a store in a bucket is fetched."""
+        if self.fetch is not None:
+            self.fetch(self.uri)
+        return self.folder
 
     @property
     def uri(self) -> str:
@@ -126,8 +134,8 @@ def published_runs(root: Path) -> list[Path]:
 
 
 def _is_published(folder: Path) -> bool:
-    """Return whether a folder has a manifest, even a damaged one or a link."""
-    return not folder.name.endswith(PART_SUFFIX) and os.path.lexists(folder / MANIFEST_NAME)
+    """Return whether a folder has a manifest, even a damaged one."""
+    return not folder.name.endswith(PART_SUFFIX) and (folder / MANIFEST_NAME).exists()
 
 
 def without_manifest(root: Path) -> list[Path]:
@@ -145,9 +153,6 @@ def in_text(text: str) -> str | None:
     return found.group(0)
 
 
-PARTS = ("stages", "runs", "spool", ".locks")
-
-
 def open_folder(path: Path, *, create: bool, write: bool) -> None:
     """Create an archive's folder with ``create``, and check that it can be used.
 
@@ -158,10 +163,6 @@ def open_folder(path: Path, *, create: bool, write: bool) -> None:
             _open_folder(path, create=create, write=write)
     except ArchiveError:
         raise
-    except (FileExistsError, NotADirectoryError) as error:
-        raise ArchiveError(
-            f"{error.filename} is or lies below a file, expected a folder; choose another --out"
-        ) from error
     except OSError as error:  # at the door whatever the system answers means that this is no place for an archive
         raise ArchiveError(f"cannot use {path} as an archive: {error.strerror}; choose another --out") from error
 
@@ -170,16 +171,10 @@ def _open_folder(path: Path, *, create: bool, write: bool) -> None:
     if path.exists() and not path.is_dir():
         cure = "choose another --out" if create else "check the name"
         raise ArchiveError(f"{path} is a file, expected a folder for the archive; {cure}")
-    if not create and not (path / "stages").is_dir():
-        state = "is a folder but no archive (it has no folder stages)" if path.is_dir() else "is not there"
-        raise ArchiveError(f"{path} {state}; check the name, or make an archive with survey --out")
-    for part in (*(path / name for name in PARTS), *(path / "stages").glob("*")):  # the archive's name may be a link
-        if part.is_symlink():
-            raise ArchiveError(
-                f"{part} is a link, which is not followed; put the folder that it leads to in its place, or "
-                f"mount it there"
-            )
-    if create and not (path / "stages").is_dir():
+    if not (path / "stages").is_dir():
+        if not create:
+            state = "is a folder but no archive (it has no folder stages)" if path.is_dir() else "is not there"
+            raise ArchiveError(f"{path} {state}; check the name, or make an archive with survey --out")
         (path / "stages").mkdir(parents=True, exist_ok=True)
         for named in (path, path.parent):
             sync_path(named)
@@ -190,5 +185,3 @@ def _open_folder(path: Path, *, create: bool, write: bool) -> None:
         finally:
             with suppress(OSError):
                 probe.unlink(missing_ok=True)
-    if not os.access(path, os.R_OK | os.X_OK):
-        raise ArchiveError(f"cannot read the archive {path}: permission is denied; change the folder's rights")

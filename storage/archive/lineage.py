@@ -7,14 +7,15 @@ problem, a missing input a bare key.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Any, Literal
 
 from pipeline.errors import ArchiveError
-from storage.archive.keys import StageRef, in_text, published_runs, published_stores, without_manifest
+from storage.archive.keys import StageRef, in_text, published_runs, published_stores
 from storage.archive.records import Run, Store, read_run, read_store
 from storage.archive.staging import MANIFEST_NAME, check_name
 
@@ -23,30 +24,23 @@ RAW_STAGES = ("capture", "ingest")
 
 @dataclass(frozen=True)
 class Catalogue:
-    """All stores by address, and all runs, oldest first; ``lost`` are the addresses of stores without a manifest."""
+    """All stores by address, and all runs, oldest first."""
 
     stores: dict[str, Store]
     runs: list[Run]
-    lost: tuple[str, ...] = ()
 
     @classmethod
     def read(cls, root: Path) -> Catalogue:
         """Read every manifest and receipt of an archive; damaged ones have a ``problem``."""
         stores = {ref.uri: read_store(ref) for ref in published_stores(root)}
-        by_key: dict[str, list[str]] = {}
-        for store in stores.values():
-            by_key.setdefault(store.ref.key, []).append(store.ref.uri)
-        runs = sorted(
-            (read_run(path, by_key) for path in published_runs(root)), key=lambda run: (run.created, run.folder.name)
-        )
-        lost = (path.relative_to(root).as_posix() for path in without_manifest(root))
-        return cls(stores, runs, tuple(uri for uri in lost if in_text(uri) == uri))
+        runs = sorted((read_run(path) for path in published_runs(root)), key=lambda run: (run.created, run.folder.name))
+        return cls(stores, runs)
 
     @cached_property
     def by_key(self) -> dict[str, list[str]]:
         """Return addresses of stores by key, also of missing ones that a run names."""
         found: dict[str, list[str]] = {}
-        for uri in dict.fromkeys((*self.stores, *self.lost, *(uri for run in self.runs for uri in sorted(run.names)))):
+        for uri in dict.fromkeys((*self.stores, *(uri for run in self.runs for uri in sorted(run.names)))):
             found.setdefault(uri.rpartition("/")[2], []).append(uri)
         return found
 
@@ -55,61 +49,39 @@ class Catalogue:
         store = self.stores.get(uri)
         if store is None:
             return []
-        return [(self.by_key.get(given) or [in_text(given) or given])[0] for given in store.inputs]
-
-    @cached_property
-    def _made_of_it(self) -> dict[str, list[str]]:
-        found: dict[str, list[str]] = {}
-        for uri in self.stores:
-            for given in self.inputs_of(uri):
-                found.setdefault(given, []).append(uri)
-        return found
+        return [self.by_key.get(given, [given])[0] for given in store.inputs]
 
     def ancestors(self, uris: Iterable[str]) -> set[str]:
         """Return all inputs of these stores, direct and indirect, without themselves; missing ones as bare keys."""
-        return reach(uris, self.inputs_of)
-
-    def dependents(self, uris: Iterable[str]) -> set[str]:
-        """Return all stores made of these, directly or indirectly, without themselves."""
-        return reach(uris, lambda uri: self._made_of_it.get(uri, []))
+        begun = set(uris)
+        found, waiting = set(begun), list(begun)
+        while waiting:
+            new = set(self.inputs_of(waiting.pop())) - found
+            found |= new
+            waiting += new
+        return found - begun
 
     def inputs_first(self, uris: Iterable[str]) -> list[str]:
         """Return these stores with inputs before the stores made of them."""
-        wanted, done, ordered = set(uris), set[str](), list[str]()
-        for start in sorted(wanted):
-            waiting: list[tuple[str, Iterator[str]]] = [] if start in done else [(start, iter(self.inputs_of(start)))]
-            done.add(start)
-            while waiting:
-                uri, rest = waiting[-1]
-                following = next((given for given in rest if given not in done and given in self.stores), None)
-                if following is None:
-                    ordered += [uri] if uri in wanted else []
-                    waiting.pop()
-                else:
-                    done.add(following)
-                    waiting.append((following, iter(self.inputs_of(following))))
-        return ordered
+        wanted = set(uris)
+        graph = {uri: self.inputs_of(uri) for uri in sorted({*wanted, *self.ancestors(wanted)})}
+        return [uri for uri in TopologicalSorter(graph).static_order() if uri in wanted]
 
     def named_by(self, uri: str) -> list[Run]:
-        """Return the runs that name a store or one made of it."""
+        """Return the runs that rest on a store."""
         return self._namers.get(uri, [])
 
     @cached_property
     def _namers(self) -> dict[str, list[Run]]:
         found: dict[str, list[Run]] = {}
         for run in self.runs:
-            for uri in self.named_and_below[run.uri]:
+            for uri in run.names:
                 found.setdefault(uri, []).append(run)
         return found
 
-    @cached_property
-    def named_and_below(self) -> dict[str, set[str]]:
-        """Return for each run the stores that it names, and all their inputs."""
-        return {run.uri: set(run.names) | self.ancestors(run.names) for run in self.runs}
-
     def kept_by_runs(self, sizes: Mapping[str, int]) -> dict[str, int]:
         """Return `Archive.kept_bytes` of all runs, by address; ``sizes`` are of `Archive.all_sizes`."""
-        return {run: sum(sizes[uri] for uri in (run, *uris)) for run, uris in self.named_and_below.items()}
+        return {run.uri: sum(sizes[uri] for uri in (run.uri, *run.names)) for run in self.runs}
 
     def own_by_runs(self, sizes: Mapping[str, int]) -> dict[str, int]:
         """Return the bytes that would go with each run: its folder, and the stores that no other run needs.
@@ -117,8 +89,8 @@ class Catalogue:
         ``sizes`` are of `Archive.all_sizes`.
         """
         return {
-            run: sizes[run] + sum(sizes[uri] for uri in uris if len(self.named_by(uri)) == 1)
-            for run, uris in self.named_and_below.items()
+            run.uri: sizes[run.uri] + sum(sizes[uri] for uri in run.names if len(self.named_by(uri)) == 1)
+            for run in self.runs
         }
 
     def roles(self, uri: str) -> set[str]:
@@ -159,18 +131,6 @@ def rests_on(root: Path, refs: Iterable[StageRef]) -> list[StageRef]:
     return [found[uri] for uri in sorted(found)]
 
 
-def reach(starts: Iterable[str], following: Callable[[str], Iterable[str]]) -> set[str]:
-    """Return everything that can be reached from the starts, without the starts."""
-    begun = set(starts)
-    found, waiting = set(begun), list(begun)
-    while waiting:
-        new = set(following(waiting.pop())) - found
-        found |= new
-        waiting += new
-    return found - begun
-
-
-SHORTEST = 4  # letters of a key
 LATEST = "latest"  # the newest run
 
 
@@ -182,50 +142,28 @@ def find_product(catalogue: Catalogue, text: str) -> str | Run:
     parts = text.rstrip("/").split("/")
     for part in parts:
         check_name(part)
-    if parts[0] == "stages" and len(parts) > 2:
-        return _store(catalogue, "/".join(parts[:3]))
-    if parts[0] == "runs" and len(parts) > 1:
-        for run in catalogue.runs:
-            if run.folder.name == parts[1]:
-                return run
+    name = parts[1] if parts[0] == "runs" and len(parts) > 1 else text
+    runs = [run for run in catalogue.runs if name in (run.folder.name, LATEST)]
+    if runs:
+        return runs[-1]
+    if name != text:
         there = [run.uri for run in reversed(catalogue.runs)]
-        hint = f"there is {_some(there)}" if there else "see ls"
-        raise ArchiveError(f"there is no run {parts[1]} in this archive; {hint}")
-    if len(parts) == 2 and any(uri.startswith(f"stages/{parts[0]}/") for uri in catalogue.stores):
-        return _store(catalogue, "/".join(("stages", *parts)))
-    runs = [run for run in catalogue.runs if text in (run.folder.name, LATEST)]
-    return runs[-1] if runs else _named(catalogue, text)
-
-
-def _store(catalogue: Catalogue, uri: str) -> str:
-    if uri in catalogue.stores:
-        return uri
-    _, stage, key = uri.split("/")
-    begun = [one for one in catalogue.stores if len(key) >= SHORTEST and one.startswith(uri)]
-    if len(begun) == 1:
-        return begun[0]
-    there = sorted(begun or (one for one in catalogue.stores if one.startswith(f"stages/{stage}/")))
-    hint = f"there is {_some(there)}" if there else "there is no store of this stage; see ls"
-    lost = " (its folder is there, but has lost its manifest: run verify)" if uri in catalogue.lost else ""
-    raise ArchiveError(f"there is no store {uri} in this archive{lost}; {hint}")
-
-
-def _named(catalogue: Catalogue, text: str) -> str:
-    """Return a product of the newest run that can be read, or a store by the beginning of its key."""
+        raise ArchiveError(f"there is no run {name} in this archive; there is {_some(there) or 'none'}")
     newest = next((run for run in reversed(catalogue.runs) if run.products), None)
     products = {} if newest is None else newest.products
-    if text in products:
-        uri = in_text(products[text])
-        if newest is not None and uri is None:
-            raise ArchiveError(
-                f"{text} is no store but a file of {newest.uri}; explain {newest.uri} describes that run"
-            )
-        return _store(catalogue, uri or text)
-    keys = [uri for uri in catalogue.stores if len(text) >= SHORTEST and uri.rpartition("/")[2].startswith(text)]
-    if len(keys) == 1:
-        return keys[0]
-    if keys:
-        raise ArchiveError(f"{text} begins {len(keys)} keys: {_some(keys)}; give more of it")
+    address = products.get(text, text)
+    if newest is not None and address.startswith("runs/"):
+        return newest
+    wanted = in_text(address) or f"stages/{address}"
+    if wanted in catalogue.stores:
+        return wanted
+    found = [
+        uri for uri in sorted(catalogue.stores) if uri.startswith(wanted) or uri.rpartition("/")[2].startswith(address)
+    ]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise ArchiveError(f"{text} begins {len(found)} stores: {_some(found)}; give more of it")
     near = difflib.get_close_matches(text, products, n=1)
     if near:
         known = f"did you mean {near[0]}?"
@@ -233,7 +171,7 @@ def _named(catalogue: Catalogue, text: str) -> str:
         known = f"products of the newest run: {', '.join(products)}"
     else:
         known = f"no run has products; there is {_some(sorted(catalogue.stores)) or 'nothing in it'}"
-    raise ArchiveError(f"{text!r} is no product, key or run of this archive; {known}")
+    raise ArchiveError(f"{text!r} is no product, store or run of this archive; {known}")
 
 
 def _some(names: list[str]) -> str:

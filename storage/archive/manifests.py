@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import json
-import os
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -17,16 +16,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from pipeline.errors import IncompleteStoreError
-from storage.archive.staging import (
-    MANIFEST_NAME,
-    NotPlainError,
-    file_hash,
-    files_below,
-    kind_of,
-    plain_size,
-    read_plain,
-    sync_path,
-)
+from storage.archive.staging import MANIFEST_NAME, file_hash, files_below, sync_path
 
 FORMAT = 2
 CLEARED = "cleared"  # in a manifest: when the files of a store were cleared away, and their size
@@ -67,10 +57,8 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 def try_manifest(folder: Path) -> tuple[dict[str, Any], str | None]:
     """Return the content of a published folder's manifest and None, or an empty table and the problem."""
-    if folder.is_symlink():
-        return {}, f"{folder.name} is a link, which is not followed: put there what it leads to"
     try:
-        return parse_manifest(read_plain(folder / MANIFEST_NAME))
+        return parse_manifest((folder / MANIFEST_NAME).read_bytes())
     except FileNotFoundError:
         return {}, "it is missing"
     except OSError as error:
@@ -91,8 +79,7 @@ def parse_manifest(written: bytes) -> tuple[dict[str, Any], str | None]:
             parts = PurePosixPath(name).parts
             if not parts or name.startswith("/") or ".." in parts or "\0" in name:
                 raise ValueError(f"it lists {name!r}, which is no file of this folder")
-            size, digest = (entry.get("size"), entry.get("sha256")) if isinstance(entry, dict) else (None, None)
-            if isinstance(size, bool) or not isinstance(size, int) or not isinstance(digest, str):
+            if not isinstance(entry, dict) or entry.keys() != {"sha256", "size"}:
                 raise ValueError(f"it gives no size and hash of {name!r}")
     except RecursionError:
         return {}, "it is nested too deeply"
@@ -166,38 +153,25 @@ def check_files(folder: Path, *, hashes: bool) -> None:
 
 def broken_files(folder: Path, manifest: Mapping[str, Any], *, hashes: bool) -> Iterator[tuple[str, str]]:
     """Yield name and problem of every file that differs from the manifest; with ``hashes`` also of extra files."""
-    listed = manifest["files"]
-    inner = {parent for name in listed for parent in PurePosixPath(name).parents}
-    links = sorted(one for one in inner if (folder / one).is_symlink())  # the outer ones first
-    for name, entry in listed.items():
-        link = next((one for one in links if one in PurePosixPath(name).parents), None)
-        if link is not None:
-            yield name, f"cannot be read: {link if link.parts else 'its store'} is a link, which is not followed"
-        elif (problem := file_problem(folder / name, entry, hashes=hashes)) is not None:
+    for name, entry in manifest["files"].items():
+        if (problem := file_problem(folder / name, entry, hashes=hashes)) is not None:
             yield name, problem
-    if not hashes:
-        return
-    found = set[str]()
-    for place, folders, files in os.walk(folder):  # which follows no link
-        found_links = [name for name in folders if Path(place, name).is_symlink()]
-        found.update(Path(place, name).relative_to(folder).as_posix() for name in (*found_links, *files))
-    for name in sorted(found - set(listed) - {MANIFEST_NAME}):
-        kind = kind_of(folder / name)
-        yield name, f"is {kind if kind != 'a file' else 'not in the manifest'}: take it out of the archive"
+    if hashes:
+        found = {path.relative_to(folder).as_posix() for path in files_below(folder)}
+        for name in sorted(found - set(manifest["files"])):
+            yield name, "is not in the manifest: take it out of the archive"
 
 
 def file_problem(path: Path, entry: Mapping[str, Any], *, hashes: bool) -> str | None:
     """Return the difference of a file from its ``entry`` in the manifest, as text behind its name; None without one."""
     try:
-        size = plain_size(path)
+        size = path.stat().st_size
         if size != entry["size"]:
             return f"has {size} bytes, expected {entry['size']}"
         if hashes and file_hash(path) != entry["sha256"]:
             return "has changed since it was published (its SHA-256 differs)"
     except FileNotFoundError:
         return "cannot be read: it is missing"
-    except NotPlainError as error:
-        return str(error.strerror).removeprefix("it ")
     except OSError as error:
         return f"cannot be read: {error.strerror}"
     return None
@@ -230,7 +204,7 @@ def read_table(path: Path) -> dict[str, Any]:
     problem = "is in no manifest" if entry is None else file_problem(path, entry, hashes=True)
     if problem is not None:
         raise IncompleteStoreError(f"{path} {problem}; {CURE}")
-    table: dict[str, Any] = json.loads(read_plain(path))
+    table: dict[str, Any] = json.loads(path.read_bytes())
     return table
 
 

@@ -6,19 +6,19 @@ A damaged manifest gives a record with a ``problem``; values of another type tha
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
 from storage.archive.keys import StageRef, in_text
 from storage.archive.manifests import is_cleared, listed_bytes, try_manifest
-from storage.archive.staging import MANIFEST_NAME, file_hash, read_plain
+from storage.archive.staging import MANIFEST_NAME, file_hash
 
 RECEIPT = "receipt.json"
-MANIFEST_HASH = "manifest_sha256"  # in a receipt's stages: SHA-256 of the manifest.json of the store that each left
 State = Literal["ran", "cached", "skipped", "failed"]  # of a stage of a run
-RESTS_ON = "rests_on"  # in a run's manifest: address of a store -> SHA-256 of its manifest.json
+RESTS_ON = "rests_on"  # in a run's manifest: address of a store or of an input of it -> SHA-256 of its manifest.json
 
 
 @dataclass(frozen=True)
@@ -83,26 +83,22 @@ class Store:
 
 @dataclass(frozen=True)
 class Run:
-    """One run; a damaged ``receipt`` is empty, ``names`` are the stores that receipt and manifest name."""
+    """One run; a damaged ``receipt`` is empty."""
 
     folder: Path
     facts: Mapping[str, Any]  # of its manifest
     receipt: Mapping[str, Any]
     problem: str | None
-    names: frozenset[str]
 
     @property
     def uri(self) -> str:
         """Address relative to the archive."""
         return f"runs/{self.folder.name}"
 
-    @property
-    def recorded(self) -> dict[str, str]:
-        """Return the SHA-256 of the manifests of its stores at publication, by address."""
-        told = {_text(row.get("key")): row.get(MANIFEST_HASH) for row in self.stages}
-        by_stage = {uri: told[key] for uri in self.names if (key := uri.rpartition("/")[2]) in told}
-        found = {**by_stage, **_table(self.receipt.get(RESTS_ON)), **_table(self.facts.get(RESTS_ON))}
-        return {uri: value for uri, value in found.items() if isinstance(value, str) and in_text(uri) == uri}
+    @cached_property
+    def names(self) -> frozenset[str]:
+        """Return the addresses of its stores and of all their inputs; empty where its manifest is damaged."""
+        return frozenset(uri for uri in _table(self.facts.get(RESTS_ON)) if in_text(uri) == uri)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -137,21 +133,16 @@ def read_store(ref: StageRef) -> Store:
     return Store(ref, facts, problem and f"{MANIFEST_NAME} is damaged: {problem}")
 
 
-def read_run(folder: Path, by_key: Mapping[str, list[str]]) -> Run:
-    """Return one run by its manifest and receipt, damaged or not; ``by_key`` are the addresses of stores by key."""
+def read_run(folder: Path) -> Run:
+    """Return one run by its manifest and receipt, damaged or not."""
     facts, broken = try_manifest(folder)
     problem = broken and f"{MANIFEST_NAME} is damaged: {broken}"
     receipt: dict[str, Any] = {}
     if broken is None:
         receipt, problem = _receipt(folder, facts)
         if problem is not None and try_manifest(folder)[0] not in ({}, facts):  # something was added to it meanwhile
-            return read_run(folder, by_key)
-    texts = list(_texts([receipt, {name: facts[name] for name in facts if name != "files"}]))
-    names = {uri for text in texts if (uri := in_text(text)) is not None}
-    stages = receipt.get("stages")
-    for row in stages if isinstance(stages, list) else []:
-        names.update(by_key.get(_text(row.get("key")), []) if isinstance(row, dict) else [])
-    return Run(folder, facts, receipt, problem, frozenset(names))
+            return read_run(folder)
+    return Run(folder, facts, receipt, problem)
 
 
 def _receipt(folder: Path, facts: Mapping[str, Any]) -> tuple[dict[str, Any], str | None]:
@@ -163,23 +154,10 @@ def _receipt(folder: Path, facts: Mapping[str, Any]) -> tuple[dict[str, Any], st
     try:
         if file_hash(path) != entry["sha256"]:
             return {}, f"{RECEIPT} has changed since it was published (its SHA-256 differs)"
-        return _table(json.loads(read_plain(path))), None
+        return _table(json.loads(path.read_bytes())), None
     except (OSError, ValueError, RecursionError) as error:
         words = error.strerror if isinstance(error, OSError) else error
         return {}, f"{RECEIPT} cannot be read: {words}"
-
-
-def _texts(value: object) -> Iterator[str]:
-    """Yield every text in nested lists and tables, names of tables included."""
-    waiting = [value]
-    while waiting:
-        one = waiting.pop()
-        if isinstance(one, str):
-            yield one
-        elif isinstance(one, Mapping):
-            waiting += [*one.keys(), *one.values()]
-        elif isinstance(one, list):
-            waiting += one
 
 
 def _table(value: object) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Publish the folder of one run: receipt, report and pictures; and replace it as a whole when something is added.
 
 When the accuracy is known, a new folder replaces the old one in one step, under the same name and date. Its manifest
-names the earlier one. Wherever the process is killed, one of the two is there and complete.
+names the earlier one.
 """
 
 from __future__ import annotations
@@ -9,30 +9,22 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
-import secrets
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from storage.archive.keys import plain
-from storage.archive.manifests import (
-    extended_facts,
-    manifest_sha256,
-    manifests_before,
-    read_manifest,
-    try_manifest,
-    write_manifest,
-)
+from storage.archive.manifests import extended_facts, manifest_sha256, read_manifest, write_manifest
 from storage.archive.staging import (
-    PART_SUFFIX,
+    MANIFEST_NAME,
     bytes_below,
     check_name,
+    files_below,
     refusals,
     remove_tree,
     rename_into_place,
     sync_path,
-    take_lock,
 )
 
 _AT_FDCWD = -100  # names are absolute, or of the working folder
@@ -125,22 +117,21 @@ class RunDraft:
 def take_its_place(part: Path, final: Path) -> None:
     """Replace a folder by a complete one, and remove it.
 
-    Some file systems cannot exchange two folders: there the run has its unfinished name for a moment. If the process is
-    killed then, `finish_extensions` completes the exchange.
+    If the file system cannot exchange two folders, the files are replaced one by one, the manifest last. A folder
+    counts as damaged if the process is killed meanwhile.
     """
     sync_path(final.parent)
-    away = part
     if not try_exchange(part, final):
-        away = final.with_name(f"{final.name}-{secrets.token_hex(4)}{PART_SUFFIX}")
-        try:
-            final.rename(away)
-            part.rename(final)
-        except BaseException:
-            if not final.exists():
-                away.rename(final)
-            raise
-        sync_path(final.parent)
-    remove_tree(away)
+        old = set(files_below(final))
+        for path in (*files_below(part), part / MANIFEST_NAME):
+            new = final / path.relative_to(part)
+            new.parent.mkdir(parents=True, exist_ok=True)
+            path.replace(new)
+            old.discard(new)
+        for path in old:
+            path.unlink()
+        sync_path(final)
+    remove_tree(part)
 
 
 def try_exchange(one: Path, other: Path) -> bool:
@@ -161,25 +152,3 @@ def try_exchange(one: Path, other: Path) -> bool:
     for parent in {one.parent, other.parent}:
         sync_path(parent)
     return True
-
-
-def unfinished_extensions(root: Path) -> Iterator[Path]:
-    """Yield complete folders that were about to replace a run, and whose run has no name."""
-    for part in sorted((root / "runs").glob(f"*{PART_SUFFIX}")):
-        facts, problem = try_manifest(part)
-        named = part.name.removesuffix(PART_SUFFIX)
-        whole = problem is None and bool(manifests_before(facts)) and facts.get("run") == named
-        if whole and not (root / "runs" / named).exists():
-            yield part
-
-
-def finish_extensions(root: Path) -> None:
-    """Give the runs of `unfinished_extensions` their names, unless a running process does."""
-    for part in unfinished_extensions(root):
-        release = take_lock(root / ".locks" / f"runs-{part.stem}.lock", wait=False)
-        if release is not None:
-            try:
-                if part.exists() and not part.with_suffix("").exists():
-                    rename_into_place(part, part.with_suffix(""))
-            finally:
-                release()

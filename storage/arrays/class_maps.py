@@ -104,15 +104,15 @@ def write_class_tile(
 ) -> None:
     """Store (y, x) classes and confidence of whole shards; ``origin`` is their first row and column.
 
-    Threads and processes may write different tiles at once. Raises ShapeError: a class has no name; ChunkError: the
-    tile splits a shard; IncompleteStoreError: there is no map.
+    Threads and processes may write different tiles at once. Raises ShapeError: a class has no name;
+    IncompleteStoreError: there is no map.
     """
     group = open_group(path, "r+")
     check_named(classes, len(legend_of(group).names))
     rounded = np.rint(np.asarray(confidence) / CONFIDENCE_STEP) * CONFIDENCE_STEP
     for name, values in (("classes", classes), ("confidence", rounded)):
         array = array_of(group, name)
-        array[tile_place("the class map", origin, classes.shape, array)] = np.asarray(values, array.dtype)
+        array[tile_place(origin, classes.shape)] = np.asarray(values, array.dtype)
 
 
 def check_named(classes: NDArray[np.integer], count: int) -> None:
@@ -188,11 +188,11 @@ def write_probabilities_tile(
 
     NaN stands for unknown; values below `LEAST` become `UNLIKELY`.
 
-    Raises ChunkError: the tile splits a shard; IncompleteStoreError: there is no store.
+    Raises IncompleteStoreError: there is no store.
     """
     group = open_group(path, "r+")
     likelihood, ages, octave = (array_of(group, name) for name in ("log_probability", "age", "log2_light"))
-    place = tile_place("the class probabilities", origin, age_days.shape, ages)
+    place = tile_place(origin, age_days.shape)
     for top in range(
         0, len(age_days), SHARD_ROWS
     ):  # so that the packed values of all rows are never in memory together
@@ -211,10 +211,10 @@ def write_probabilities_tile(
 def write_changes_tile(path: Path, origin: tuple[int, int], old_class: NDArray[np.uint8]) -> None:
     """Store the previous (y, x) classes, 255 where unchanged, of whole shards, the first pixel at ``origin``.
 
-    Raises ChunkError: the tile splits a shard; IncompleteStoreError: the store is missing, or is of a first visit.
+    Raises IncompleteStoreError: the store is missing, or is of a first visit.
     """
     array = array_of(open_group(path, "r+"), OLD_CLASS)
-    array[tile_place("the class probabilities", origin, old_class.shape, array)] = old_class
+    array[tile_place(origin, old_class.shape)] = old_class
 
 
 def drop_changes(path: Path) -> None:

@@ -51,17 +51,21 @@ class SweepHeader:
         """(line, sample, band) of the cube."""
         return self.sweep.lines, self.references.dark.shape[0], len(self.wavelength_nm)
 
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """Facts that a store of the sweep has as attributes."""
+        facts: dict[str, Any] = {"sweep": asdict(self.sweep), "source": self.source}
+        facts |= {} if self.started is None else {"started": self.started}
+        facts |= {"by_mirror": True} if self.references.by_mirror else {}
+        return facts | ({} if self.simulation is None else {"simulation": dict(self.simulation)})
+
 
 class RawCubeWriter:
     """Write a sweep's lines as they come, 64 at a time, each into one shard. Use as a context manager."""
 
     def __init__(self, path: Path, header: SweepHeader) -> None:
         self._header = header
-        facts: dict[str, Any] = {"sweep": asdict(header.sweep), "source": header.source}
-        facts |= {} if header.started is None else {"started": header.started}
-        facts |= {"by_mirror": True} if header.references.by_mirror else {}
-        facts |= {} if header.simulation is None else {"simulation": dict(header.simulation)}
-        self._group = create_group(path, f"raw sweep {header.sweep.name}", facts)
+        self._group = create_group(path, f"raw sweep {header.sweep.name}", header.attributes)
         bands = write_bands(self._group, header.wavelength_nm, header.fwhm_nm)
         about = {"long_name": "raw numbers of the camera", "units": "1", "coordinates": f"{bands} {_LINE_COORDINATES}"}
         write_counts(self._group, line=header.shape[0], sample=header.shape[1])

@@ -11,7 +11,6 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from pipeline.errors import IncompleteStoreError
 from pipeline.rectify.placed import TieTable
 from pipeline.rectify.scan_paths import ScanPath
 from storage.archive.keys import KEY_LENGTH
@@ -52,14 +51,12 @@ def write_geolocation(path: Path, tables: Tables, facts: Mapping[str, Any] | Non
 def open_geolocation(path: Path) -> dict[str, tuple[tuple[ScanPath, TieTable], ...]]:
     """Read scan paths and tie tables of all sweeps, by name (IncompleteStoreError: the store is missing or damaged)."""
     root = open_group(path)
+    tables: dict[str, tuple[tuple[ScanPath, TieTable], ...]] = {}
     with damage_named(str(path)):
-        names = [str(name) for name in root.attrs["sweeps"]]  # type: ignore[union-attr]
-    tables = {}
-    for number, name in enumerate(names):
-        sweep = _member(root, f"sweep_{number}")
-        with damage_named(str(sweep.store_path)):
-            count = int(sweep.attrs["scan_paths"])  # type: ignore[arg-type]
-        tables[name] = tuple(_read_scan_path(_member(sweep, f"scan_path_{at}")) for at in range(count))
+        for number, name in enumerate(root.attrs["sweeps"]):  # type: ignore[arg-type]
+            sweep: Any = root[f"sweep_{number}"]
+            count = int(sweep.attrs["scan_paths"])
+            tables[str(name)] = tuple(_read_scan_path(sweep[f"scan_path_{at}"]) for at in range(count))
     return tables
 
 
@@ -90,20 +87,11 @@ def _write_scan_path(sweep: zarr.Group, name: str, scan_path: ScanPath, table: T
 
 
 def _read_scan_path(group: zarr.Group) -> tuple[ScanPath, TieTable]:
-    with damage_named(str(group.store_path)):
-        about: dict[str, Any] = dict(group.attrs)
-        width, bound = float(about["width"]), float(about["bound_px"])
-        spacing, samples = int(about["spacing"]), int(about["samples"])
-        shape, corner, kept = ((int(about[name][0]), int(about[name][1])) for name in ("shape", "corner", "kept"))
+    about: dict[str, Any] = dict(group.attrs)
+    width, bound = float(about["width"]), float(about["bound_px"])
+    spacing, samples = int(about["spacing"]), int(about["samples"])
+    shape, corner, kept = ((int(about[name][0]), int(about[name][1])) for name in ("shape", "corner", "kept"))
     seen = read_array(group, "seen")
     lines, starts = (read_array(group, name).astype(np.intp) for name in ("lines", "starts"))
     scan_path = ScanPath(read_array(group, "scan"), read_array(group, "across"), lines, starts, seen, width)
     return scan_path, TieTable(read_array(group, "tie_points"), spacing, shape, bound, seen, samples, corner, kept)
-
-
-def _member(group: zarr.Group, name: str) -> zarr.Group:
-    with damage_named(f"{group.store_path}/{name}"):
-        found = group[name]
-    if not isinstance(found, zarr.Group):
-        raise IncompleteStoreError(f"{group.store_path}/{name} is no group; run verify on the archive")
-    return found

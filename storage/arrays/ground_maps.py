@@ -33,7 +33,6 @@ from storage.arrays.layout import (
     image_spec,
     open_group,
     read_array,
-    tile_place,
 )
 
 if TYPE_CHECKING:
@@ -123,12 +122,10 @@ class GroundMapWriter:
     def write_block(self, rows: slice, columns: slice, images: Mapping[str, NDArray[np.generic]]) -> None:
         """Store one block of all images, by name.
 
-        Raises ShapeError: an image lacks, or a class has no name. ChunkError: the block splits a shard.
+        Raises ShapeError: an image lacks, or a class has no name.
         """
         if set(images) != set(self._images):
             raise ShapeError(f"a block got {', '.join(images)}; give {', '.join(self._images)}, one value a pixel")
-        size = (rows.stop - rows.start, columns.stop - columns.start)
-        tile_place("the map", (rows.start, columns.start), size, self._images["classes"])
         for name in NUMBERED & set(images):
             check_named(np.asarray(images[name], np.uint8), len(self._legend.names))
         for name, image in images.items():

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec, TransposeCodec
 from zarr.storage import MemoryStore
 
-from pipeline.errors import ChunkError, IncompleteStoreError
+from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.grid import UNLABELLED
 
 if TYPE_CHECKING:
@@ -122,21 +122,9 @@ def _whole_chunks(size: int, chunk: int) -> int:
     return -(-size // chunk) * chunk
 
 
-def tile_place(what: str, origin: Sequence[int], size: Sequence[int], array: zarr.Array[Any]) -> tuple[slice, slice]:
-    """Return the rows and columns of a tile of (y, x) ``size`` at ``origin`` of an image.
-
-    Raises ChunkError: they split a shard of the image, or reach beyond it.
-    """
-    rows, columns = (slice(first, first + count) for first, count in zip(origin, size, strict=True))
-    for word, part, side, shard in zip(
-        ("rows", "columns"), (rows, columns), array.shape, array.shards or (), strict=False
-    ):
-        if part.start % shard or (part.stop != side and (part.stop % shard or part.stop > side)):
-            raise ChunkError(
-                f"{word} {part.start}:{part.stop} split {what}'s shards of {shard} {word}; start and end at multiples "
-                f"of {shard}"
-            )
-    return rows, columns
+def tile_place(origin: Sequence[int], size: Sequence[int]) -> tuple[slice, slice]:
+    """Return the rows and columns of a tile of (y, x) ``size`` at ``origin``."""
+    return slice(origin[0], origin[0] + size[0]), slice(origin[1], origin[1] + size[1])
 
 
 def create_array(

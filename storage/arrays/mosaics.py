@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -103,13 +103,12 @@ class MosaicWriter:
     ) -> None:
         """Store (y, x, component) scores, NaN where nothing was seen, and (y, x) coverage of whole shards.
 
-        Threads may write different tiles at once. Raises ChunkError: the tile splits a shard. ShapeError: scores and
-        coverage are not of one tile.
+        Threads may write different tiles at once. Raises ShapeError: scores and coverage are not of one tile.
         """
         count = self._scores.shape[0]
         if scores.shape != (*coverage.shape, count):  # Zarr would broadcast a smaller tile
             raise ShapeError(f"a tile of the mosaic has the shape {scores.shape}, expected {(*coverage.shape, count)}")
-        rows, columns = tile_place("the mosaic", (first_row, first_column), coverage.shape, self._coverage)
+        rows, columns = tile_place((first_row, first_column), coverage.shape)
         seen = coverage > 0
         if count:
             steps = steps_within(scores, self._step, self._scores.dtype)
@@ -158,24 +157,17 @@ def write_tiles(
 
     Every worker gives the same bytes. Raises as `run_blocks`.
     """
-    task = _TileTask(make, writer.path.absolute())
+    out = writer.path.absolute()
     if pool.shares_memory:
-        _reopened(task.out)  # before several threads ask for it
-    run_blocks(task, places, pool, report=report, paths=[*paths, task.out])
+        _reopened(out)  # before several threads ask for it
+    run_blocks(partial(_write_tile, make, out), places, pool, report=report, paths=[*paths, out])
     _reopened.cache_clear()
 
 
-@dataclass(frozen=True)
-class _TileTask:
-    """Make and store a tile in any process; a shard's files are written by one task alone."""
-
-    make: MakeTile
-    out: Path  # the mosaic, begun
-
-    def __call__(self, place: tuple[slice, slice]) -> None:
-        """Make and write the tile of some rows and columns."""
-        scores, coverage = self.make(*place)
-        _reopened(self.out).write_tile(place[0].start, place[1].start, scores, coverage)
+def _write_tile(make: MakeTile, out: Path, place: tuple[slice, slice]) -> None:
+    """Make and store the tile of some rows and columns of a mosaic that was begun, in any process."""
+    scores, coverage = make(*place)
+    _reopened(out).write_tile(place[0].start, place[1].start, scores, coverage)
 
 
 @lru_cache(maxsize=1)
@@ -247,11 +239,6 @@ class Mosaic:
     def spectra(self, scores: NDArray[np.float32], bands: Sequence[int] | None = None) -> NDArray[np.float32]:
         """Return the scene values (..., band) of some bands of scores (..., component)."""
         return (self.components if bands is None else self.components.of_bands(bands)).restore(scores)
-
-    def rows(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
-        """Yield the number of the first row and the scene values (y, x, band) of each row of shards."""
-        for first in range(0, self.shape[0], SHARD_ROWS):
-            yield first, self.values(slice(first, min(first + SHARD_ROWS, self.shape[0])))
 
     def thinned(self, step: int, bands: Sequence[int]) -> NDArray[np.float32]:
         """Return the scene values of every ``step``-th pixel in some bands, (y, x, band).

@@ -11,7 +11,7 @@ white frames of the sweep are stored for a later calibration.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -137,12 +137,8 @@ class SignalCubeWriter:
         """Create a sweep; ``largest`` is the greatest absolute score, ``frames_of`` a sweep with the same frames."""
         lines, samples, _ = header.shape
         self._header, self._step = header, step
-        facts: dict[str, Any] = {"sweep": asdict(header.sweep), "source": header.source}
-        facts |= {} if header.started is None else {"started": header.started}
-        facts |= {} if frames_of is None else {FRAMES_OF: frames_of}
-        facts |= {"by_mirror": True} if header.references.by_mirror else {}
-        facts |= {} if header.simulation is None else {"simulation": dict(header.simulation)}
-        self.group = create_group(path, f"condensed sweep {header.sweep.name}", facts)
+        shared = {} if frames_of is None else {FRAMES_OF: frames_of}
+        self.group = create_group(path, f"condensed sweep {header.sweep.name}", header.attributes | shared)
         write_bands(self.group, header.wavelength_nm, header.fwhm_nm)
         write_counts(self.group, line=lines, sample=samples, component=len(components))
         write_components(self.group, components)

@@ -1,4 +1,4 @@
-"""Store the lines of a capture while it runs, so that a crash loses at most the lines since the last sync.
+"""Store the lines of a capture and the files of its camera while it runs; a crash loses the lines since the last sync.
 
 ``<name>.lines`` begins with one line of JSON that describes the sweep. Records of one size follow, one for each line.
 A record has number, mirror X and Y, time, exposure, valid, a CRC-32, and the raw numbers (sample, band) uint16. The CRC
@@ -6,6 +6,18 @@ continues that of the header, so that a record belongs to one sweep alone.
 
 A torn tail is cut off, and the capture continues there. A line that was damaged after it was synced is lost alone: it
 is named in the log, and comes back as an invalid line.
+
+Files of a camera lie in a folder while they are fetched, so that the next transfer continues there. A file is named by
+its whole path on the camera, notes about the files by a name alone. Bytes are only appended; a damaged file is dropped
+as a whole. Notes are on the disk when ``append`` returns; of a file the camera still has what is not.
+
+::
+
+    <name>          the bytes of a file of the camera, or of notes, which have checksums of their own
+    <name>%sums     for each part of it: how far the file reached, and the CRC-32 of its bytes up to there
+
+Each process compares a file that it finds with its sums once, and cuts it off behind the last sum that agrees. The
+camera is asked for the rest again.
 """
 
 from __future__ import annotations
@@ -16,17 +28,19 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO
+from urllib.parse import quote
 
 import numpy as np
 
 from pipeline.errors import RigError
+from pipeline.rig.transports import NotKept
 from pipeline.source import Line
 from storage.archive.keys import plain
-from storage.archive.staging import format_disk_error, open_plain, plain_reader, sync_path, write_all
+from storage.archive.staging import format_disk_error, sync_path, write_all
 
 SYNC_LINES = 64
 MOST_NAMED = 8
@@ -50,16 +64,14 @@ class Spool:
     def open(cls, folder: Path, samples: int, bands: int, *, header: Mapping[str, Any], name: str = "lines") -> Spool:
         """Open the spool in ``folder``, or begin it; lines of an earlier, interrupted capture are kept and counted.
 
-        ``header`` describes the capture (the sweep, the source, the seed). Raises RigError: the spool holds lines of
-        another capture, or the disk refuses.
+        ``header`` describes the capture (the sweep, the source, the seed). Raises RigError: the disk refuses.
         """
         facts = {"samples": samples, "bands": bands, "header": plain(dict(header))}
         spool = cls(folder / f"{name}.lines", json.dumps(facts).encode() + b"\n", (samples, bands))
         with _refusals(spool.path, 0):
             folder.mkdir(parents=True, exist_ok=True)
-            if not os.path.lexists(spool.path):
-                with os.fdopen(open_plain(spool.path, os.O_WRONLY | os.O_CREAT), "wb") as file:
-                    file.write(spool._head)
+            if not spool.path.exists():
+                spool.path.write_bytes(spool._head)
                 for named in (spool.path, folder, folder.parent, folder.parent.parent):  # lines need their file's name
                     sync_path(named)
             spool._recover()
@@ -91,7 +103,7 @@ class Spool:
         data = np.ascontiguousarray(line.data, "<u2").tobytes()
         with _refusals(self.path, self.count):
             if self._file is None:
-                self._file = os.fdopen(open_plain(self.path, os.O_WRONLY | os.O_APPEND), "wb", buffering=0)
+                self._file = self.path.open("ab", buffering=0)
             try:
                 write_all(self._file.fileno(), facts + self._crc(facts, data) + data)
             except OSError:
@@ -109,7 +121,7 @@ class Spool:
 
     def blocks(self, size: int = SYNC_LINES) -> Iterator[list[Line]]:
         """Yield the lines in blocks of ``size``; the last may be shorter. A damaged line is not valid."""
-        with plain_reader(self.path) as file:
+        with self.path.open("rb") as file:
             file.seek(len(self._head))
             for first in range(0, self.count, size):
                 numbers = range(first, min(first + size, self.count))
@@ -126,18 +138,16 @@ class Spool:
 
     def _recover(self) -> None:
         """Count the lines, and cut off the first damaged one behind the last sync with all that follows it."""
-        with plain_reader(self.path) as file:
+        with self.path.open("rb") as file:
             head = file.readline(_LONGEST_HEADER)
             file.seek(len(self._head))
             records = enumerate(iter(lambda: file.read(self._size), b""))
             whole = [self._line(number, record) is not None for number, record in records]
-        if head != self._head and not any(whole) and _is_header(head):
-            raise RigError(
-                f"{self.path} holds lines of another capture. Finish that capture, or remove the folder to start anew"
-            )
         if head != self._head:
-            with os.fdopen(open_plain(self.path, os.O_WRONLY), "wb", buffering=0) as file:
+            with self.path.open("r+b", buffering=0) as file:
                 write_all(file.fileno(), self._head)
+        if not any(whole):  # a header that was begun, and nothing that belongs to it
+            whole = []
         damaged = [number for number, good in enumerate(whole) if not good]
         synced = max(len(whole) - 1, 0) // SYNC_LINES * SYNC_LINES
         self.count = next((number for number in damaged if number >= synced), len(whole))
@@ -168,16 +178,7 @@ class Spool:
         if self._file is not None:
             self._file.close()
             self._file = None
-        with os.fdopen(open_plain(self.path, os.O_WRONLY), "wb", buffering=0) as file:
-            file.truncate(len(self._head) + self.count * self._size)
-
-
-def _is_header(head: bytes) -> bool:
-    """Return whether a file begins with the header of a capture, and not with what a crash left of one."""
-    try:
-        return isinstance(json.loads(head), dict)
-    except ValueError:
-        return False
+        os.truncate(self.path, len(self._head) + self.count * self._size)
 
 
 def line_values(numbers: Sequence[int]) -> str:
@@ -197,4 +198,127 @@ def _refusals(path: Path, lines: int) -> Iterator[None]:
     except OSError as error:
         raise RigError(
             f"cannot write line {lines} to {path}: {format_disk_error(error)}; the {lines} lines before it are kept"
+        ) from error
+
+
+SUMS = "%sums"  # no quoted name ends with it
+_SUM = struct.Struct("<QI")
+_BLOCK = 1 << 20
+_LONGEST = 240  # of a file's name, in most file systems 255
+
+
+class FetchedFiles:
+    """A :class:`pipeline.rig.camera.camera_files.Kept` in a folder, which is made when the first bytes come."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._crc32: dict[str, int] = {}  # of all bytes of the files that were compared
+
+    def size(self, name: str) -> int:
+        """Return the number of bytes held of a file; 0 of one that is not there.
+
+        Raises NotKept: the disk does not give them, here or in other calls.
+        """
+        path = self._path(name)
+        with _unread(path):
+            self._compare(name, path)
+            return path.stat().st_size if path.exists() else 0
+
+    def read(self, name: str, start: int, stop: int) -> bytes:
+        """Return some of the bytes held."""
+        path = self._path(name)
+        if not self.size(name):
+            return b""
+        with _unread(path), path.open("rb") as file:
+            file.seek(start)
+            return file.read(max(stop - start, 0))
+
+    def append(self, name: str, data: bytes) -> None:
+        """Add bytes at the end. Raises NotKept: the disk refuses; a part that was written is removed again."""
+        path = self._path(name)
+        before = self.size(name)
+        try:
+            if not before:
+                self.folder.mkdir(parents=True, exist_ok=True)
+            with path.open("ab", buffering=0) as file:
+                write_all(file.fileno(), data)
+                if _is_note(name):
+                    os.fdatasync(file.fileno())
+            if data and not _is_note(name):
+                crc32 = zlib.crc32(data, self._crc32[name])
+                with _sums_of(path).open("ab", buffering=0) as file:
+                    write_all(file.fileno(), _SUM.pack(before + len(data), crc32))
+                self._crc32[name] = crc32
+            if not before:
+                sync_path(self.folder)
+        except OSError as error:
+            self._crc32.pop(name, None)  # what the disk took of it is compared next time
+            with suppress(OSError):
+                os.truncate(path, before)
+            raise NotKept(
+                f"cannot keep byte {before} of {name} in {self.folder}: {format_disk_error(error)}; the {before} bytes "
+                "before it are kept, and the camera still has the file"
+            ) from error
+
+    def drop(self, name: str) -> None:
+        """Remove all bytes of a file (NotKept: the disk refuses)."""
+        path = self._path(name)
+        with _unread(path):
+            path.unlink(missing_ok=True)
+            _sums_of(path).unlink(missing_ok=True)
+            self._crc32.pop(name, None)
+
+    def _compare(self, name: str, path: Path) -> None:
+        """Cut off the bytes that no sum covers, once for each file; notes have checksums of their own."""
+        if name in self._crc32 or _is_note(name):
+            return
+        reached, crc32, count = _agreeing(path)
+        if path.exists() and path.stat().st_size > reached:
+            LOG.warning("%s: cut off at byte %d: the rest is damaged or was not synced", path, reached)
+            os.truncate(path, reached)
+        if _sums_of(path).exists():
+            os.truncate(_sums_of(path), count * _SUM.size)
+        self._crc32[name] = crc32
+
+    def _path(self, name: str) -> Path:
+        named = quote(name.strip("/"), safe="")
+        if not named or len(named) > _LONGEST:
+            raise NotKept(f"the camera's file {name!r:.300} cannot be kept under its name; use a shorter prefix")
+        return self.folder / ("%2E" + named[1:] if named.startswith(".") else named)
+
+
+def _is_note(name: str) -> bool:
+    return "/" not in name
+
+
+def _sums_of(path: Path) -> Path:
+    return path.with_name(path.name + SUMS)
+
+
+def _agreeing(path: Path) -> tuple[int, int, int]:
+    """Return up to which byte a file agrees with its sums, the CRC-32 of these bytes, and the number of such sums."""
+    reached, crc32, count = 0, 0, 0
+    try:
+        sums = _sums_of(path).read_bytes()
+        with path.open("rb") as file:
+            for to, expected in _SUM.iter_unpack(sums[: len(sums) // _SUM.size * _SUM.size]):
+                at, found = reached, crc32
+                while at < to and (data := file.read(min(to - at, _BLOCK))):
+                    at, found = at + len(data), zlib.crc32(data, found)
+                if (at, found) != (to, expected):
+                    break
+                reached, crc32, count = at, found, count + 1
+    except FileNotFoundError:
+        pass
+    return reached, crc32, count
+
+
+@contextmanager
+def _unread(path: Path) -> Iterator[None]:
+    """Turn a disk's refusal into a NotKept error."""
+    try:
+        yield
+    except OSError as error:
+        raise NotKept(
+            f"cannot use {path}: {error.strerror or error}; mend the disk and run again: the camera still has it"
         ) from error

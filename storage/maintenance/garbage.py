@@ -6,33 +6,21 @@ Stores are removed before their inputs, each in one step, so that the archive st
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from pathlib import Path
+from datetime import datetime
 from typing import Literal
 
 from pipeline.errors import SettingsError
 from storage.archive.archive import Archive
-from storage.archive.keys import StageRef
+from storage.archive.keys import StageRef, without_manifest
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Store
-from storage.archive.run_folders import unfinished_extensions
-from storage.archive.staging import (
-    MANIFEST_NAME,
-    PART_SUFFIX,
-    bytes_below,
-    check_name,
-    refusals,
-    remove_tree,
-    take_lock,
-)
+from storage.archive.staging import MANIFEST_NAME, refusals
 
 DAY_S = 86400.0
 IN_USE = "the archive is in use: run gc again when it is free"
-What = Literal[
-    "store", "files", "spool", "unfinished", "upload"
-]  # files: raw lines that the setting `keep` of a run does not keep
+What = Literal["store", "files", "leftover"]  # files: raw lines that the setting `keep` of a run does not keep
 
 
 @dataclass(frozen=True)
@@ -71,29 +59,24 @@ def clear_up(
 
     Raises ArchiveError: the disk refuses.
     """
-
-    def plan_now() -> Clearance:
-        return plan_clearance(archive, keep_days=keep_days, raw_too=raw_too)
-
-    if dry_run:
-        with refusals(archive.root, "clear up the archive"):
-            return plan_now()
-    with archive.in_use(alone=True) as alone, refusals(archive.root, "clear up the archive"):
-        plan = plan_now()
-        obstacle = plan.obstacle if alone else IN_USE
-        gone: list[Removal] = []
-        for number, removal in enumerate(plan.removals):
-            if progress is not None:
-                progress(removal, number / len(plan.removals))
-            in_archive = removal.what == "store"
-            held = (in_archive and obstacle is not None) or (removal.what == "upload" and not alone)
-            if not held and _remove(archive, removal):
-                gone.append(removal)
-    return Clearance(tuple(gone), plan.kept, obstacle)
+    with refusals(archive.root, "clear up the archive"):
+        if dry_run:
+            return plan_clearance(archive, keep_days=keep_days, raw_too=raw_too)
+        with archive.in_use(alone=True) as alone:
+            plan = plan_clearance(archive, keep_days=keep_days, raw_too=raw_too)
+            if not alone:
+                return Clearance((), plan.kept, IN_USE)
+            gone: list[Removal] = []
+            for number, removal in enumerate(plan.removals):
+                if progress is not None:
+                    progress(removal, number / len(plan.removals))
+                if _remove(archive, removal):
+                    gone.append(removal)
+    return Clearance(tuple(gone), plan.kept, plan.obstacle)
 
 
 def plan_clearance(archive: Archive, *, keep_days: float = 1.0, raw_too: bool = False) -> Clearance:
-    """Find stores that no run names, spools of published captures, and leftovers of dead processes.
+    """Find stores that no run names, and leftovers of dead processes.
 
     Stores younger than ``keep_days`` stay with their inputs: a running survey may name them. ``raw_too`` also takes raw
     lines of a rig or ingested ones that no run names; they cannot be captured again.
@@ -102,26 +85,19 @@ def plan_clearance(archive: Archive, *, keep_days: float = 1.0, raw_too: bool = 
     if not (math.isfinite(keep_days) and keep_days >= 0):
         raise SettingsError(f"--keep-days {keep_days}: expected a number of days, 0 or more")
     catalogue = Catalogue.read(archive.root)
-    named = set[str]().union(*(catalogue.named_and_below[run.uri] for run in catalogue.runs))
-    moment = archive.now()
-    spared = _spared(catalogue, named, keep_days, raw_too, moment)
+    named = set[str]().union(*(run.names for run in catalogue.runs))
+    spared = _spared(catalogue, named, keep_days, raw_too, archive.now())
     below = catalogue.ancestors(spared) & set(catalogue.stores) - named
     kept = dict.fromkeys(below, "an input of a store that stays") | spared
-    obstacle = _obstacle(archive, catalogue, named | set(kept))
+    obstacle = _obstacle(archive, catalogue, kept)
     gone = [] if obstacle else [uri for uri in catalogue.stores if uri not in named and uri not in kept]
     removals = [
         Removal(uri, "store", archive.size_of(uri), "no run names it") for uri in reversed(catalogue.inputs_first(gone))
     ]
-    uploads = [
-        Removal(uri, "upload", size, "it was never published") for uri, size in archive.leftovers(keep_days).items()
+    left = [
+        Removal(uri, "leftover", size, "its process has ended") for uri, size in archive.leftovers(keep_days).items()
     ]
-    published = {store.ref.key for store in catalogue.stores.values() if store.problem is None}
-    spools = [
-        Removal(f"spool/{path.name}", "spool", bytes_below(path), "its lines are published")
-        for path in sorted((archive.root / "spool").glob("*"))
-        if path.name in published
-    ]
-    return Clearance((*removals, *uploads, *spools, *_unfinished(archive.root)), kept, obstacle)
+    return Clearance((*removals, *left), kept, obstacle)
 
 
 def _spared(catalogue: Catalogue, named: set[str], keep_days: float, raw_too: bool, now: datetime) -> dict[str, str]:
@@ -134,75 +110,31 @@ def _spared(catalogue: Catalogue, named: set[str], keep_days: float, raw_too: bo
             kept[uri] = f"younger than {keep_days:g} days"
         elif not raw_too and catalogue.is_only_copy(uri):
             kept[uri] = "raw lines that cannot be had again; --raw-too removes them"
-    # A store made of a young one is young too: its date is older only where the clock was set back.
-    younger = [uri for uri, store in catalogue.stores.items() if _age_days(store, now) < keep_days]
-    for uri in catalogue.dependents(younger) - named:
-        kept.setdefault(uri, f"made of a store younger than {keep_days:g} days")
     return kept
 
 
 def _age_days(store: Store, now: datetime) -> float:
-    """Return the days since a store was made or copied, whichever is later."""
-    made = (store.ref.path / MANIFEST_NAME).lstat().st_mtime
-    try:
-        created = datetime.fromisoformat(store.created)
-        made = max(made, (created if created.tzinfo else created.replace(tzinfo=UTC)).timestamp())
-    except (ValueError, OverflowError):
-        pass  # damaged: the date of the file counts
-    return (now.timestamp() - made) / DAY_S
+    """Return the days since a store was published, or copied here."""
+    return (now.timestamp() - (store.ref.path / MANIFEST_NAME).stat().st_mtime) / DAY_S
 
 
-def _obstacle(archive: Archive, catalogue: Catalogue, staying: set[str]) -> str | None:
-    """Return why no store may be removed: a damaged receipt or manifest may name stores to keep; else None."""
-    for uri in archive.lost_runs():
-        return f"no store is removed: {uri} has lost its {MANIFEST_NAME}, so that its stores are not known"
+def _obstacle(archive: Archive, catalogue: Catalogue, kept: Iterable[str]) -> str | None:
+    """Return why no store may be removed: a damaged manifest may name stores to keep; else None."""
+    for path in without_manifest(archive.root):
+        if path.parent.name == "runs" and path.is_dir():
+            return f"no store is removed: runs/{path.name} has lost its {MANIFEST_NAME}; its stores are not known"
     for run in catalogue.runs:
-        if run.problem is not None and not run.recorded:
+        if run.problem is not None and not run.names:
             return f"no store is removed: the stores of {run.uri} are not known ({run.problem})"
-    told = set[str]().union(*(run.recorded for run in catalogue.runs))  # with all that these were made of
-    for uri in sorted(staying - told):
-        store = catalogue.stores.get(uri)
-        problem = "it is not there" if store is None else store.problem
-        if problem is not None:
+    for uri in sorted(kept):
+        if (problem := catalogue.stores[uri].problem) is not None:
             return f"no store is removed: the inputs of {uri} are not known ({problem}); run verify --repair"
     return None
 
 
-def _unfinished(root: Path) -> list[Removal]:
-    parts = {*root.glob(f"stages/*/*{PART_SUFFIX}"), *root.glob(f"runs/*{PART_SUFFIX}")}
-    found: list[Removal] = []
-    for path in sorted(parts - set(unfinished_extensions(root))):
-        uri, free = path.relative_to(root).as_posix(), True
-        if (lock := _lock_of(root, uri, "unfinished")).exists():
-            release = take_lock(lock, wait=False)
-            if free := release is not None:
-                release()
-        if free:
-            found.append(Removal(uri, "unfinished", bytes_below(path), "its process has ended"))
-    return found
-
-
-def _lock_of(root: Path, uri: str, what: What) -> Path:
-    path = Path(uri)
-    name = f"capture-{path.name}" if what == "spool" else f"{path.parent.name}-{path.stem}"
-    return root / ".locks" / f"{name}.lock"
-
-
 def _remove(archive: Archive, removal: Removal) -> bool:
     """Remove one thing; False where another process holds it."""
-    path = archive.root / removal.uri
     if removal.what == "store":
+        path = archive.root / removal.uri
         return archive.discard(StageRef(path.parent.name, path.name, path), wait=False, unnamed=True)
-    if removal.what == "upload":
-        archive.drop_leftover(removal.uri)
-        return True
-    if removal.what == "spool":
-        check_name(path.name)
-    release = take_lock(_lock_of(archive.root, removal.uri, removal.what), wait=False)
-    if release is None:
-        return False
-    try:
-        remove_tree(path)
-    finally:
-        release()
-    return not path.exists()  # the disk may have refused
+    return archive.drop_leftover(removal.uri)

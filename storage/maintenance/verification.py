@@ -1,54 +1,23 @@
-"""Verify an archive: compare every byte with its manifest, and every manifest with its seal and its address.
+"""Verify an archive: compare every byte with its manifest, and every manifest with its seal; and repair it.
 
-A link or a pipe instead of a file is reported and never opened. The finding on a damaged file of an array names its
-rows and columns.
+A repair removes damaged stores, and runs the surveys again that name them. Raw lines of a rig cannot be made again, nor
+can stores of another version of a stage: they stay.
 """
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import zarr
-
-from storage.archive.keys import without_manifest
+from pipeline.errors import ArchiveError, PipelineError
+from storage.archive.archive import Archive
+from storage.archive.keys import canonical_json, without_manifest
 from storage.archive.lineage import Catalogue
-from storage.archive.manifests import broken_files, listed_bytes, manifests_before, try_manifest
-from storage.archive.run_folders import unfinished_extensions
-from storage.archive.staging import MANIFEST_NAME, kind_of
-
-WORDS = {"y": "rows", "x": "columns", "line": "lines", "sample": "samples", "band": "bands", "patch": "patches"}
-_NO_ARRAY = (OSError, ValueError, KeyError, TypeError, IndexError, RecursionError)
-
-
-def name_damage(store: Path, name: str) -> str:
-    """Return the part of an array in a damaged file, as text behind its name; empty where it belongs to no array.
-
-    For example ``(values: rows 0 to 63, columns 0 to 639)``; dimensions that the file covers are left out.
-    """
-    file = store / name
-    inner = [path for path in file.parents if path.is_relative_to(store)]
-    folder = next((path for path in inner if path != store and kind_of(path / "zarr.json") == "a file"), None)
-    if folder is None or any(path.is_symlink() for path in inner):
-        return ""
-    try:
-        array: zarr.Array[Any] = zarr.open_array(folder, mode="r", zarr_format=3)
-        numbers = [int(part) for part in file.relative_to(folder).parts[1:]]  # of c/0/3/0
-        sizes = zip(numbers, array.shards or array.chunks, array.shape, strict=True)
-        box = [slice(number * size, min((number + 1) * size, whole)) for number, size, whole in sizes]
-    except _NO_ARRAY:  # such as a store's own description
-        return ""
-    dims = getattr(array.metadata, "dimension_names", None) or [f"axis {axis}" for axis in range(array.ndim)]
-    ranges = [
-        f"{WORDS.get(dim, dim)} {part.start} to {part.stop - 1}"
-        for dim, size, part in zip(dims, array.shape, box, strict=True)
-        if part.stop - part.start < size
-    ]
-    return f" ({folder.relative_to(store).as_posix()}: {', '.join(ranges) or 'all of it'})"
-
+from storage.archive.manifests import broken_files, listed_bytes, try_manifest
+from storage.archive.records import RECEIPT, Run
+from storage.archive.staging import MANIFEST_NAME
 
 Kind = Literal["whole", "broken", "missing", "stray"]
 Progress = Callable[[str, float], None]  # address being read, fraction of all bytes
@@ -83,27 +52,13 @@ def verify_everything(
         if progress is not None:
             progress(uri, done / total)
         done += size
-        if not os.path.lexists(path) and not catalogue.named_by(uri):
+        if not path.exists() and not catalogue.named_by(uri):
             continue  # gc or a repair has cleared it away since
-        problems = list(read_again(path)) + list(_identity_problems(catalogue, uri))
-        if problems and _changed_since(catalogue, uri):  # its files and its manifest changed together
-            catalogue = Catalogue.read(root)
-            problems = list(read_again(path)) + list(_identity_problems(catalogue, uri))
+        problems = list(read_again(path))
         found += [Finding(uri, problem, "broken") for problem in problems]
         if not problems:
             found.append(Finding(uri, None))
-    found += [*_misplaced(catalogue, root), *_missing(catalogue)]
-    words = "its extension is not finished; any command that writes into the archive finishes it"
-    found += [Finding(f"runs/{part.stem}", words, "stray") for part in unfinished_extensions(root)]
-    return found
-
-
-def _changed_since(catalogue: Catalogue, uri: str) -> bool:
-    """Return whether something was added to a run after the catalogue was read."""
-    run = None if uri in catalogue.stores else next((run for run in catalogue.runs if run.uri == uri), None)
-    if run is None:
-        return False
-    return manifests_before(try_manifest(run.folder)[0]) != manifests_before(run.facts)
+    return [*found, *_without_manifest(root), *_missing(catalogue)]
 
 
 def _problems(folder: Path) -> Iterator[str]:
@@ -113,33 +68,16 @@ def _problems(folder: Path) -> Iterator[str]:
         yield f"{MANIFEST_NAME} is damaged: {problem}"
         return
     for name, problem in broken_files(folder, manifest, hashes=True):
-        yield f"{name} {problem}{name_damage(folder, name) if name in manifest['files'] else ''}"
+        yield f"{name} {problem}"
 
 
-def _identity_problems(catalogue: Catalogue, uri: str) -> Iterator[str]:
-    """Yield whether the manifest of a store is that of another address."""
-    store = catalogue.stores.get(uri)
-    if store is None or store.problem is not None or kind_of(store.ref.path / MANIFEST_NAME) != "a file":
-        return  # which is reported already
-    stated = f"stages/{store.facts.get('stage')}/{store.facts.get('key')}"
-    if stated != uri:
-        yield f"its {MANIFEST_NAME} is that of {stated}; move it back, or take it out of the archive"
-
-
-def _misplaced(catalogue: Catalogue, root: Path) -> Iterator[Finding]:
-    """Yield findings on runs with another run's name (copies, or renamed), and on folders without a manifest."""
-    there = {run.folder.name for run in catalogue.runs}
-    for run in catalogue.runs:
-        stated = run.facts.get("run", run.folder.name)
-        if stated != run.folder.name:
-            do = "it is a copy: take it out of the archive" if stated in there else "give it its name back"
-            yield Finding(run.uri, f"its {MANIFEST_NAME} is that of runs/{stated}; {do}", "stray")
+def _without_manifest(root: Path) -> Iterator[Finding]:
     for path in without_manifest(root):
-        uri, kind = path.relative_to(root).as_posix(), kind_of(path)
-        if kind != "a folder" or uri.count("/") < 1:
-            yield Finding(uri, f"is {kind}, expected a folder with a manifest; take it out of the archive", "stray")
-        else:
+        uri = path.relative_to(root).as_posix()
+        if path.is_dir():
             yield Finding(uri, f"{MANIFEST_NAME} is missing", "broken")
+        else:
+            yield Finding(uri, "expected a folder with a manifest; take it out of the archive", "stray")
 
 
 def _missing(catalogue: Catalogue) -> Iterator[Finding]:
@@ -154,3 +92,111 @@ def _missing(catalogue: Catalogue) -> Iterator[Finding]:
             if given not in there | told:
                 told.add(given)
                 yield Finding(given, f"is not there, but {uri} was made of it", "missing")
+
+
+Rerun = Callable[[dict[str, Any]], None]  # settings of a survey: runs and publishes it; PipelineError where it cannot
+
+
+@dataclass(frozen=True)
+class RepairPlan:
+    """Steps of a repair, with addresses relative to the archive; inputs come after the stores made of them."""
+
+    remade: tuple[str, ...]  # damaged or missing stores
+    hopeless: dict[str, str]  # damaged stores that stay, with the reason
+    surveys: tuple[tuple[Run, dict[str, Any]], ...]  # a run for each different settings, and the settings
+    broken_runs: dict[str, str]  # run folders that are damaged -> canonical settings, empty where not known
+
+
+@dataclass
+class Repaired:
+    """Result of a repair."""
+
+    plan: RepairPlan
+    remade: list[str] = field(default_factory=list)
+    dropped: list[str] = field(default_factory=list)  # damaged stores that no run named
+    failed: dict[str, str] = field(default_factory=dict)  # run or store that was not made again -> message
+
+    @property
+    def complete(self) -> bool:
+        """Return whether no damage is left."""
+        return not (self.plan.hopeless or self.failed)
+
+
+def plan_repair(archive: Archive, findings: Iterable[Finding], *, versions: Mapping[str, int | str]) -> RepairPlan:
+    """Return the repairs for these findings; ``versions`` are the present ones of the stages."""
+    catalogue = Catalogue.read(archive.root)
+    bad = [one.uri for one in findings if one.kind in ("broken", "missing")]
+    stores = [uri for uri in bad if uri.startswith("stages/") and uri.count("/") == 2]
+    hopeless = dict.fromkeys((uri for uri in bad if "/" not in uri), "its stage and settings are not known")
+    hopeless |= {uri: why for uri in stores if (why := _hopeless(catalogue, uri, versions))}
+    broken = set(stores) - set(hopeless)
+    ordered = [uri for uri in reversed(catalogue.inputs_first(broken)) if uri in catalogue.stores]
+    ordered += sorted(broken - set(ordered))
+    runs = {run.uri: _settings_text(run) for run in catalogue.runs if run.uri in bad}
+    runs |= {uri: "" for uri in bad if uri.startswith("runs/") and uri not in runs}
+    affected = [run for run in catalogue.runs if run.uri in runs or run.names & broken]
+    surveys = {text: run for run in affected if (text := _settings_text(run))}
+    return RepairPlan(tuple(ordered), hopeless, tuple((run, run.settings) for run in surveys.values()), runs)
+
+
+def repair(
+    archive: Archive, findings: Iterable[Finding], rerun: Rerun, *, versions: Mapping[str, int | str]
+) -> Repaired:
+    """Remove the damaged stores, and run the surveys again that name them.
+
+    ``findings`` are those of `verify_archive`. ``rerun`` runs a survey into this archive by its settings.
+    ``versions`` are the present ones of the stages; stores of other versions stay. Raises ArchiveError: another process
+    uses the archive, or the disk or bucket refuses.
+    """
+    with archive.in_use(alone=True) as alone:
+        if not alone:
+            raise ArchiveError(f"{archive.name} is in use; run verify --repair again when the survey there has ended")
+        plan = plan_repair(archive, findings, versions=versions)
+        done = Repaired(plan)
+        for uri in plan.remade:
+            archive.discard(archive.ref(*uri.split("/")[1:]))
+    succeeded: set[str] = set()
+    for run, settings in plan.surveys:
+        try:
+            rerun({name: value for name, value in settings.items() if name != "notes"})
+            succeeded.add(_settings_text(run))
+        except PipelineError as error:
+            done.failed[run.uri] = str(error)
+    catalogue = Catalogue.read(archive.root)
+    for uri in plan.remade:
+        if uri in catalogue.stores:
+            done.remade.append(uri)
+        elif not catalogue.named_by(uri):
+            done.dropped.append(uri)
+        else:
+            done.failed[uri] = "; ".join(done.failed.values()) or "its survey ran again without building it"
+    for uri, text in plan.broken_runs.items():
+        if text in succeeded:  # its survey has run again, into a folder of its own
+            archive.drop_run(uri)
+            done.remade.append(uri)
+        else:
+            words = f"its {RECEIPT} or the settings in it cannot be read: run that survey again by hand"
+            done.failed.setdefault(uri, words)
+    return done
+
+
+def _hopeless(catalogue: Catalogue, uri: str, versions: Mapping[str, int | str]) -> str:
+    """Return why a store cannot be built again; empty where it can."""
+    store, stage = catalogue.stores.get(uri), uri.split("/")[1]
+    if catalogue.is_only_copy(uri):
+        return "raw lines cannot be captured again: restore them from a copy. Undamaged lines can still be read"
+    if stage not in versions:
+        return f"there is no stage {stage}: take it out of the archive"
+    if store is not None and store.version and store.version != str(versions[stage]):
+        now = versions[stage]
+        return f"made by version {store.version} of the stage {stage}, which is now {now}: reprocess builds it again"
+    runs = catalogue.named_by(uri)
+    if runs and not any(run.settings for run in runs):
+        return f"the settings of {runs[-1].uri}, which names it, cannot be read: run that survey again by hand"
+    return ""
+
+
+def _settings_text(run: Run) -> str:
+    """Return the settings as canonical text, without the archive's place and the notes."""
+    asked = {name: value for name, value in run.settings.items() if name not in ("notes", "out")}
+    return canonical_json(asked) if asked else ""

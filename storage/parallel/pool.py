@@ -1,31 +1,22 @@
 """Map a function over blocks, one task for each, on threads, on processes, or on the workers of a dask scheduler.
 
-All three are executors of `concurrent.futures`. A block is a whole shard, so that no two tasks write the same file. The
-results are the same bytes everywhere if code, files and the number of arithmetic threads are the same.
+Threads are those of `concurrent.futures`; processes are a dask cluster of this machine. A block is a whole shard, so
+that no two tasks write the same file. The results are the same bytes everywhere if code, files and the number of
+arithmetic threads are the same.
 """
 
 from __future__ import annotations
 
 import hashlib
 import logging
-import multiprocessing
 import os
 import platform
 import re
 import signal
 import threading
-import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    BrokenExecutor,
-    CancelledError,
-    Executor,
-    Future,
-    ProcessPoolExecutor,
-    ThreadPoolExecutor,
-    wait,
-)
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -45,7 +36,6 @@ else:
 
 ANSWER_S = 5.0  # time limit of a scheduler's answer
 AHEAD = 2  # blocks sent to a worker: one running, one waiting
-TRIES = 3  # of a block whose worker dies
 ROOMS = ("pipeline", "models", "storage", "flows")  # blocks of regions are made in flows
 LIBRARIES = ("numpy", "zarr", "numcodecs", "torch", "distributed")
 THREADS_OF = "OMP_NUM_THREADS"
@@ -116,47 +106,29 @@ class WorkerPool:
         The first `run_blocks` starts them.
         """
         with _guard:
-            held = _open.setdefault(self, _Open())
-            held.users += 1
+            _users[self] += 1
         try:
             yield self
-        except Exception:
-            raise
-        except BaseException:  # running blocks are abandoned
-            held.dismiss()
-            raise
         finally:
             with _guard:
-                held.users -= 1
-                last = held.users == 0
-                if last:
-                    del _open[self]
-            if last and held.team is not None:
-                held.team.shutdown()
+                _users[self] -= 1
+                if not _users[self]:
+                    _dismiss(self)
 
 
 THREADS = WorkerPool()
 
 
-@dataclass
-class _Open:
-    """The workers of an open pool, once they are started."""
-
-    users: int = 0
-    team: Executor | None = None
-
-    def dismiss(self) -> None:
-        """Kill the workers; the next use starts others."""
-        team, self.team = self.team, None
-        if isinstance(team, ProcessPoolExecutor):
-            for process in list((team._processes or {}).values()):
-                process.kill()
-        if team is not None:
-            team.shutdown(wait=False, cancel_futures=True)
-
-
 _guard = threading.RLock()
-_open: dict[WorkerPool, _Open] = {}
+_users: Counter[WorkerPool] = Counter()  # blocks that keep a pool open
+_teams: dict[WorkerPool, Cluster] = {}  # the workers of open pools, once they are started
+
+
+def _dismiss(pool: WorkerPool) -> None:
+    """Abandon the workers of a pool; the next use starts others."""
+    team = _teams.pop(pool, None)
+    if team is not None:
+        team.shutdown()
 
 
 def run_blocks(
@@ -190,7 +162,7 @@ def run_blocks(
             ended(number, make(item))
     elif pool.shares_memory:
         with ThreadPoolExecutor(workers) as team:
-            _send(team, make, items, range(len(items)), workers, ended)
+            _send(team, make, items, workers, ended)
     elif items:
         with pool.open():
             _send_away(pool, make, items, paths, ended)
@@ -208,46 +180,28 @@ def _send_away(
     paths: Sequence[Path],
     ended: Callable[[int, Any], None],
 ) -> None:
-    """Run blocks in processes; blocks whose worker died are run again by others."""
-    left, held, deaths = dict.fromkeys(range(len(items))), _open[pool], 0
-
-    def tick(number: int, result: Any) -> None:
-        nonlocal deaths
-        del left[number]
-        deaths = 0
-        ended(number, result)
-
-    while left:
-        with _guard:
-            if held.team is None:
-                held.team = Cluster(pool.scheduler) if pool.elsewhere else start(pool.count)
-        team = held.team
-        try:
-            workers = team.check(paths) if isinstance(team, Cluster) else pool.count
-            _send(team, make, items, list(left), AHEAD * workers, tick)
-        except (BrokenExecutor, WorkerError, CancelledError, dask_distributed.KilledWorker) as error:
-            held.dismiss()
-            deaths += 1
-            if pool.elsewhere and isinstance(error, CancelledError):
-                gone = f"--scheduler {pool.scheduler}: the scheduler is gone"
-                raise WorkerError(f"{gone}. Start it again and repeat the command: finished blocks are kept") from None
-            if isinstance(error, WorkerError | CancelledError):
-                raise
-            if deaths == TRIES or pool.elsewhere:
-                who = f"--scheduler {pool.scheduler}" if pool.elsewhere else f"{pool.count} worker processes"
-                raise WorkerError(
-                    f"{who}: workers died several times in the same block, perhaps out of memory. Use "
-                    "fewer --workers, or --scheduler threads"
-                ) from None
+    """Run blocks in processes; dask runs blocks whose worker died again on others."""
+    with _guard:
+        team = _teams.get(pool) or Cluster(pool)
+        _teams[pool] = team
+    try:
+        _send(team, make, items, AHEAD * team.check(paths), ended)
+    except (WorkerError, CancelledError, dask_distributed.KilledWorker) as error:
+        _dismiss(pool)
+        if isinstance(error, WorkerError):
+            raise
+        if isinstance(error, CancelledError):
+            words = "the scheduler is gone. Start it again and repeat the command: finished blocks are kept"
+        else:
+            words = (
+                "workers died several times in the same block, perhaps out of memory. Use fewer --workers, or "
+                "--scheduler threads"
+            )
+        raise WorkerError(f"{team.name}: {words}") from None
 
 
 def _send(
-    team: Executor,
-    make: Callable[[Any], Any],
-    items: Sequence[Any],
-    numbers: Sequence[int],
-    window: int,
-    ended: Callable[[int, Any], None],
+    team: Executor, make: Callable[[Any], Any], items: Sequence[Any], window: int, ended: Callable[[int, Any], None]
 ) -> None:
     """Send blocks in order, fewer than ``window`` ahead of the oldest unfinished one; ``ended`` takes each result.
 
@@ -256,80 +210,39 @@ def _send(
     running: dict[Future[Any], int] = {}
     sent = 0
     try:
-        while running or sent < len(numbers):
-            while sent < len(numbers) and sent - min(running.values(), default=sent) < window:
-                running[team.submit(make, items[numbers[sent]])] = sent
+        while running or sent < len(items):
+            while sent < len(items) and sent - min(running.values(), default=sent) < window:
+                running[team.submit(make, items[sent])] = sent
                 sent += 1
             done = wait(running, timeout=ANSWER_S, return_when=FIRST_COMPLETED).done
             if not done and isinstance(team, Cluster):
                 team.count()  # raises where no worker is left
             for future in sorted(done, key=running.__getitem__):
-                ended(numbers[running[future]], future.result())
+                ended(running[future], future.result())
                 del running[future]
     except Exception:
         wait(running)
         raise
 
 
-# --- processes of this machine ----------------------------------------------------------------------------------------
-
-
-def start(workers: int) -> ProcessPoolExecutor:
-    """Start processes with one arithmetic thread each (WorkerError: they do not start)."""
-    try:
-        with _inherited():
-            team = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _end_with_parent)
-            for _ in range(workers):
-                team.submit(time.monotonic)  # a process begins with the first task that finds none idle
-    except (OSError, RuntimeError) as error:
-        raise WorkerError(f"{workers} worker processes do not start: {error}; use --scheduler threads") from error
-    return team
-
-
-def _end_with_parent() -> None:
-    """End this process when its parent has ended."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def watch() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
-@contextmanager
-def _inherited() -> Iterator[None]:
-    """Set the environment of workers while the block starts them, and block Ctrl-C in them."""
-    before = {name: os.environ.get(name) for name in _ENVIRONMENT}
-    resource_tracker.ensure_running()  # started later it would unblock signals
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    os.environ.update(_ENVIRONMENT)
-    try:
-        yield
-    finally:
-        for name in _ENVIRONMENT:
-            del os.environ[name]
-        os.environ.update({name: value for name, value in before.items() if value is not None})
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-
-
-# --- workers elsewhere ------------------------------------------------------------------------------------------------
-
-
 class Cluster(Executor):
-    """The workers of a dask scheduler as an executor (SettingsError: none answers at the address)."""
+    """The workers of a dask scheduler as an executor, on this machine or elsewhere."""
 
-    def __init__(self, scheduler: str) -> None:
-        self.name = f"--scheduler {scheduler}"
+    def __init__(self, pool: WorkerPool) -> None:
+        """Connect to the scheduler, or start processes (SettingsError: none answers, or none start)."""
+        self.name = f"--scheduler {pool.scheduler}"
+        self._own: Any = None
         for name in ("distributed", "distributed.client"):  # an error reports lost connections once
             logging.getLogger(name).setLevel(logging.CRITICAL)
         try:
-            self.client: Any = dask_distributed.Client(scheduler, timeout=ANSWER_S, set_as_default=False)  # type: ignore[no-untyped-call]
-        except (OSError, TimeoutError, ValueError) as error:
+            if not pool.elsewhere:
+                self._own = start(pool.count)
+            place = pool.scheduler if pool.elsewhere else self._own
+            self.client: Any = dask_distributed.Client(place, timeout=ANSWER_S, set_as_default=False)  # type: ignore[no-untyped-call]
+        except (OSError, TimeoutError, ValueError, RuntimeError) as error:
+            expected = "expected a dask scheduler there, none answered" if pool.elsewhere else "no processes start"
             raise SettingsError(
-                f"{self.name}: expected a dask scheduler there, none answered within {ANSWER_S:g} s "
-                f"({type(error).__name__}); start `dask scheduler`, or use --scheduler processes"
+                f"{self.name}: {expected} ({type(error).__name__}); start `dask scheduler`, or use --scheduler threads"
             ) from None
         self._tasks: Any = self.client.get_executor(pure=False)  # type: ignore[no-untyped-call]
 
@@ -339,8 +252,10 @@ class Cluster(Executor):
         return sent
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Disconnect from the workers, which keep running."""
+        """Disconnect from the workers; those elsewhere keep running."""
         self.client.close()
+        if self._own is not None:
+            self._own.close()
 
     def count(self) -> int:
         """Return the number of blocks at a time. Raises WorkerError: there are no workers."""
@@ -379,6 +294,26 @@ class Cluster(Executor):
                         f"the same there, mount the archive under the same path and set {THREADS_OF}=1"
                     )
         return count
+
+
+def start(workers: int) -> Any:
+    """Start a dask cluster of processes of this machine, with one arithmetic thread each, deaf to Ctrl-C."""
+    import dask
+
+    resource_tracker.ensure_running()  # started later it would unblock signals
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        with dask.config.set({"distributed.nanny.pre-spawn-environ": _ENVIRONMENT}):
+            return dask_distributed.LocalCluster(  # type: ignore[no-untyped-call]
+                n_workers=workers,
+                threads_per_worker=1,
+                memory_limit=None,
+                dashboard_address="127.0.0.1:0",
+                security=True,  # other users of this machine may not send work
+                silence_logs=logging.CRITICAL,
+            )
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 def about_here(folders: Sequence[str]) -> dict[str, str]:

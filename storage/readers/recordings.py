@@ -420,7 +420,7 @@ def _run_with_cubes(address: str, name: str | None) -> tuple[Archive, Run, list[
         raise ArchiveError(f"{archive.name} has no run {name!r}; its latest are {known}")
     for folder in reversed(folders):
         if name in (None, folder.name):
-            run = read_run(folder, {})
+            run = read_run(folder)
             stores = [archive.locate(uri) for uri in stores_of_lines(run.products, archive.is_there)]
             cubes = [path for store in stores for path in sorted(store.glob("*.zarr"))]
             if cubes:

@@ -16,9 +16,8 @@ import os
 import re
 import secrets
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -39,7 +38,7 @@ from storage.archive.manifests import (
 from storage.archive.records import RECEIPT, read_run
 from storage.archive.run_folders import RunDraft
 from storage.archive.staging import MANIFEST_NAME, is_name, refusals, remove_tree, rename_into_place, retire, sync_path
-from storage.maintenance.verification import Finding, Progress, name_damage, verify_everything
+from storage.maintenance.verification import Finding, Progress, verify_everything
 from storage.remote.object_stores import Listed, Objects, parse_place, some_at_a_time
 
 MARK = "archive.json"  # marks a prefix as an archive
@@ -47,7 +46,6 @@ MARK_TEXT = b'{"archive": "spectralzoom", "layout": 1}\n'
 ATTEMPT = re.compile(r"((?:stages/[^/]+|runs)/[^/]+)/([0-9a-f]{16})/.+")  # a file's address, and its upload
 ASIDE = ".fetch-"  # prefix of folders of the working copy for incomplete files
 DAY_S = 86400.0
-UPLOAD_S = 3600.0  # after which a run without a manifest is no running upload
 
 
 class ObjectArchive(Archive):
@@ -70,7 +68,7 @@ class ObjectArchive(Archive):
 
     def ref(self, stage: str, key: str) -> StageRef:
         """Return the address of a store, whether it exists or not; its path fetches the store."""
-        return RemoteRef(stage, key, store_at(self.root, stage, key).path, self._fetch)
+        return StageRef(stage, key, store_at(self.root, stage, key).folder, self._fetch)
 
     def find(self, stage: str, key: str) -> StageRef | None:
         """Return the published store, None without one or where it was cleared; upload it if it is only here.
@@ -78,9 +76,8 @@ class ObjectArchive(Archive):
         Raises IncompleteStoreError: its manifest in the bucket is damaged.
         """
         ref = self.ref(stage, key)
-        whole = self._is_whole(ref.uri)
-        if ref.uri not in self._standing and not self._find(ref.uri, keep=whole):
-            if not whole:
+        if ref.uri not in self._standing and not self._find(ref.uri):
+            if not self._is_whole(ref.uri):
                 return None
             if self.writes:
                 self._send(ref.uri)
@@ -115,7 +112,7 @@ class ObjectArchive(Archive):
         self.objects.remove([manifest])
         if unnamed:
             self._mirror_runs()
-            if any(ref.uri in read_run(folder, {}).recorded for folder in self._later_runs):
+            if any(ref.uri in read_run(folder).names for folder in self._later_runs):
                 if standing is not None:
                     self.objects.create(manifest, standing)
                 return False
@@ -154,9 +151,9 @@ class ObjectArchive(Archive):
 
         def send(uri: str) -> None:
             self._upload(uri, first=draft is not None and not draft.extends)
-            recorded = read_run(self.root / uri, {}).recorded
-            self._standing = {one: text for one, text in self._standing.items() if one not in recorded}
-            self._ensure(recorded)
+            names = read_run(self.root / uri).names
+            self._standing = {one: text for one, text in self._standing.items() if one not in names}
+            self._ensure(names)
 
         if draft is not None:
             draft.send = send
@@ -167,7 +164,7 @@ class ObjectArchive(Archive):
         there = _manifests(self.objects.listing("runs"))
         for uri in (f"runs/{folder.name}" for folder in self.runs() if try_manifest(folder)[1] is None):
             if uri not in there:
-                self._ensure(read_run(self.root / uri, {}).recorded)
+                self._ensure(read_run(self.root / uri).names)
                 self._upload(uri, first=True)
             elif not self._is_dated(uri, there[uri]):
                 standing = hashlib.sha256(self.objects.read(f"{uri}/{MANIFEST_NAME}") or b"").hexdigest()
@@ -218,20 +215,15 @@ class ObjectArchive(Archive):
         """Return the bytes of objects sent and received since the last call."""
         return self.objects.take_moved()
 
-    def lost_runs(self) -> list[str]:
-        """Return the addresses of runs that have files in the bucket, but no manifest there or here."""
-        here = {f"runs/{folder.name}" for folder in self.runs()}
-        return [uri for uri in _lost_runs(self.objects.listing("runs")) if uri not in here]
-
     def leftovers(self, keep_days: float) -> dict[str, int]:
-        """Return addresses and bytes of incomplete uploads that are older than ``keep_days``."""
+        """Return what killed processes left here, and incomplete uploads that are older than ``keep_days``."""
         there = self.objects.listing()
         latest = max((one.changed for one in there.values()), default=None)
         uploads: dict[str, list[Listed]] = {}
         for path, one in there.items():
-            if (found := ATTEMPT.fullmatch(path)) and found[1] not in _lost_runs(there):
+            if found := ATTEMPT.fullmatch(path):
                 uploads.setdefault(f"{found[1]}/{found[2]}", []).append(one)
-        old: dict[str, int] = {}
+        old = super().leftovers(keep_days)
         for folder, files in sorted(uploads.items()):
             assert latest is not None
             if (latest - max(one.changed for one in files)).total_seconds() >= keep_days * DAY_S:
@@ -241,9 +233,12 @@ class ObjectArchive(Archive):
                     old[folder] = sum(one.size for one in files)
         return old
 
-    def drop_leftover(self, uri: str) -> None:
-        """Remove one of `leftovers`."""
+    def drop_leftover(self, uri: str) -> bool:
+        """Remove one of `leftovers`; False where a process holds it, or the disk refuses."""
+        if not ATTEMPT.fullmatch(f"{uri}/-"):
+            return super().drop_leftover(uri)
         self.objects.remove(self.objects.listing(uri))
+        return True
 
     def verify_everything(self, progress: Progress | None = None) -> list[Finding]:
         """Check every store and run in the bucket, not in the working copy."""
@@ -259,9 +254,7 @@ class ObjectArchive(Archive):
                 if found and self.objects.read(f"{uri}/{MANIFEST_NAME}") == text:  # else it has gone, or was made anew
                     yield from found
 
-            found = verify_everything(root, progress, problems)
-        words = f"{MANIFEST_NAME} is missing, or its upload was broken off"
-        return [*found, *(Finding(uri, words, "broken") for uri in _lost_runs(there))]
+            return verify_everything(root, progress, problems)
 
     # --- the working copy ---------------------------------------------------------------------------------------------
 
@@ -288,13 +281,10 @@ class ObjectArchive(Archive):
         path = self.root / uri / MANIFEST_NAME
         return _size(path) == listed.size and int(path.stat().st_mtime) == int(listed.changed.timestamp())
 
-    def _find(self, uri: str, *, keep: bool = False) -> bool:
-        """Fetch a manifest from the bucket; False without one, or where it is cleared and ``keep`` is true.
-
-        Raises IncompleteStoreError: it is damaged.
-        """
+    def _find(self, uri: str) -> bool:
+        """Fetch a manifest from the bucket; False without one. Raises IncompleteStoreError: it is damaged."""
         dated = self.objects.read_dated(f"{uri}/{MANIFEST_NAME}")
-        if dated is None or (keep and is_cleared(parse_manifest(dated[0])[0])):
+        if dated is None:
             return False
         if parse_manifest(dated[0])[1] is None or try_manifest(self.root / uri)[1] is not None:
             self._lay(uri, *dated)  # a damaged one does not replace a valid one
@@ -333,20 +323,10 @@ class ObjectArchive(Archive):
     def _fetch(self, uri: str) -> None:
         """Fetch a store or run whose manifest is here.
 
-        Raises IncompleteStoreError: an object of it is missing or has changed, or it was removed meanwhile.
+        Raises IncompleteStoreError: an object of it is missing or has changed.
         """
-        if not (self.root / uri / MANIFEST_NAME).is_file() or not self._lacks(uri, read_manifest(self.root / uri)):
-            return
-        try:
+        if (self.root / uri / MANIFEST_NAME).is_file() and self._lacks(uri, read_manifest(self.root / uri)):
             self._fetch_files(uri)
-        except IncompleteStoreError:
-            ours = (self.root / uri / MANIFEST_NAME).read_bytes()
-            if not self._find(uri):
-                self._standing.pop(uri, None)
-                raise self._removed(uri) from None
-            if (self.root / uri / MANIFEST_NAME).read_bytes() == ours:
-                raise
-            self._fetch_files(uri)  # cleared away, and made again since
 
     def _fetch_files(self, uri: str, only: Iterable[str] | None = None) -> None:
         """Fetch the missing files (``only`` these names), each checked by its hash."""
@@ -401,17 +381,12 @@ class ObjectArchive(Archive):
         """
 
         def ensure(uri: str) -> None:
-            whole = self._is_whole(uri)
-            if uri in self._standing or self._find(uri, keep=whole):
-                return
-            if not whole:
-                raise self._removed(uri)
-            self._send(uri)
+            if uri not in self._standing and not self._find(uri):
+                if not self._is_whole(uri):
+                    raise IncompleteStoreError(f"{self.name}/{uri} was removed meanwhile. Run again: it is built again")
+                self._send(uri)
 
         some_at_a_time(ensure, list(uris))
-
-    def _removed(self, uri: str) -> IncompleteStoreError:
-        return IncompleteStoreError(f"{self.name}/{uri} was removed meanwhile. Run again: it is built again")
 
 
 def _is_address(uri: str) -> bool:
@@ -435,14 +410,6 @@ def _manifests(there: Mapping[str, Listed]) -> dict[str, Listed]:
     return {uri: one for uri, one in named.items() if depths.get(uri.split("/")[0]) == uri.count("/") + 2}
 
 
-def _lost_runs(there: Mapping[str, Listed]) -> list[str]:
-    """Return the runs that have files but no manifest, and that are not being uploaded."""
-    files = {path: found[1] for path in there if path.startswith("runs/") and (found := ATTEMPT.fullmatch(path))}
-    latest = max((one.changed for one in there.values()), default=None)
-    old = {uri for path, uri in files.items() if latest and (latest - there[path].changed).total_seconds() >= UPLOAD_S}
-    return sorted(uri for uri in old if f"{uri}/{MANIFEST_NAME}" not in there and _is_address(uri))
-
-
 def _lay_out(objects: Objects, root: Path, uri: str) -> None:
     """Write the manifest at an address into a folder, and of a run the receipt, damaged or not."""
     text = objects.read(f"{uri}/{MANIFEST_NAME}")
@@ -460,18 +427,15 @@ def _problems(objects: Objects, there: Mapping[str, Listed], folder: Path, place
     if problem is not None:
         yield f"{MANIFEST_NAME} is damaged: {problem}"
         return
-    broken: dict[str, str] = {}
     for name, entry in manifest["files"].items():
         file = folder / name
         try:
             objects.save(f"{place}/{name}", file)
         except FileNotFoundError:
-            file.unlink(missing_ok=True)
-        if (problem := file_problem(file, entry, hashes=True)) is not None:
-            broken[name] = problem
-        elif file.name != "zarr.json":  # it tells the part of an array in a damaged file
             file.unlink()
-    yield from (f"{name} {problem}{name_damage(folder, name)}" for name, problem in broken.items())
+        if (problem := file_problem(file, entry, hashes=True)) is not None:
+            yield f"{name} {problem}"
+        file.unlink(missing_ok=True)
     extra = {path.removeprefix(f"{place}/") for path in there if path.startswith(f"{place}/")} - set(manifest["files"])
     yield from (f"{name} is not in the manifest: take it out of the archive" for name in sorted(extra))
 
@@ -519,24 +483,3 @@ def _find_mark(objects: Objects, *, create: bool) -> None:
         raise ArchiveError(f"{name} is not there; check the name, or make an archive with survey --out")
     if found != MARK_TEXT:
         raise ArchiveError(f"{name}/{MARK} is not as expected: this is no archive, or one of a later version")
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class RemoteRef(StageRef):
-    """A store that may not be on this machine: reading its path fetches it."""
-
-    fetch: Callable[[str], None]
-
-    def __getattribute__(self, name: str) -> Any:
-        if name == "path":
-            object.__getattribute__(self, "fetch")(self.uri)
-        return object.__getattribute__(self, name)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, StageRef) and (self.stage, self.key) == (other.stage, other.key)
-
-    def __hash__(self) -> int:
-        return hash((self.stage, self.key))
-
-    def __repr__(self) -> str:
-        return f"RemoteRef({self.uri!r})"

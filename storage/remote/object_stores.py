@@ -23,35 +23,30 @@ from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from storage.archive.staging import sync_path
 
 if TYPE_CHECKING:
-    from obstore.store import BackoffConfig, ClientConfig, RetryConfig, S3Config, S3Store
+    from obstore.store import ClientConfig, RetryConfig, S3Config, S3Store
 
 AT_ONCE = 8  # transfers in parallel
 PART_BYTES = 8 << 20  # of the parts of a large object
 RETRIES = 6  # of one request, in about ten seconds
-BACKOFF: BackoffConfig = {"init_backoff": timedelta(seconds=0.5), "max_backoff": timedelta(seconds=8), "base": 3}
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 _ADDRESS = re.compile(r"s3:/+([^/]*)/*(.*)")  # also as a path has it, which makes one slash of two
-_BUCKET = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")
 _PART = re.compile(r"[A-Za-z0-9_.=+-]+")
-_MEANINGS = {  # part of a store's answer: its meaning and what to do
-    "NoSuchBucket": "there is no such bucket: create it, or check its name, AWS_REGION and AWS_ENDPOINT_URL",
-    "169.254.16": "there are no credentials: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY",
-    "SignatureDoesNotMatch": "the credentials are refused: check AWS_SECRET_ACCESS_KEY",
-    "InvalidAccessKeyId": "the credentials are refused: check AWS_ACCESS_KEY_ID",
-    "ExpiredToken": "the credentials have expired: renew them, and AWS_SESSION_TOKEN",
-    "AuthorizationHeaderMalformed": "the bucket is in another region: set AWS_REGION",
-    "PermanentRedirect": "the bucket is in another region: set AWS_REGION",
-    "301 Moved": "the bucket is in another region: set AWS_REGION",
-    "redirect without LOCATION": "the bucket is in another region: set AWS_REGION",
-    "AccessDenied": "access is denied: check the credentials and the bucket's policy (get, put, list, delete)",
-    "403 Forbidden": "access is denied: check the credentials and the bucket's policy (get, put, list, delete)",
-    "401 Unauthorized": "access is denied: check the credentials",
-    "error sending request": "it cannot be reached: check the network and AWS_ENDPOINT_URL",
-    "timed out": "it does not answer in time: check the network and AWS_ENDPOINT_URL",
-    "response body error": "its answer was broken off: check the network",
-    "501 Not Implemented": "it has no conditional puts or listing, which an archive needs: use another store",
-    "status code: 5": "it has an internal error or too many requests: run again later",
-}
+_MEANINGS = (  # parts of a store's answers: their meaning and what to do
+    (("NoSuchBucket",), "there is no such bucket: create it, or check its name, AWS_REGION and AWS_ENDPOINT_URL"),
+    (("169.254.16",), "there are no credentials: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"),
+    (
+        ("HeaderMalformed", "PermanentRedirect", "301 Moved", "redirect without LOCATION"),
+        "the bucket is in another region: set AWS_REGION",
+    ),
+    (
+        ("SignatureDoesNotMatch", "InvalidAccessKeyId", "ExpiredToken", "AccessDenied", "403 Forbidden", "401 Unauth"),
+        "access is denied: check the credentials and the bucket's policy (get, put, list, delete)",
+    ),
+    (
+        ("error sending request", "timed out", "response body error"),
+        "it does not answer: check the network and AWS_ENDPOINT_URL",
+    ),
+)
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -99,13 +94,10 @@ def parse_place(text: str | Path) -> ObjectPlace:
     found = _ADDRESS.fullmatch(str(text))
     bucket, prefix = ("", "") if found is None else (found[1], found[2].strip("/"))
     parts = prefix.split("/") if prefix else []
-    if not _BUCKET.fullmatch(bucket) or not all(_PART.fullmatch(part) and part.strip(".") for part in parts):
+    if not all(_PART.fullmatch(part) and part.strip(".") for part in (bucket, *parts)):
         raise SettingsError(
-            f"{str(text)!r} is no archive on S3; expected s3://bucket/prefix, the bucket in small letters, digits, '-' "
-            "and '.', the prefix in letters, digits and '_.=+-'"
+            f"{str(text)!r} is no archive on S3; expected s3://bucket/prefix in letters, digits and '_.=+-'"
         )
-    if "stages" in parts:
-        raise SettingsError(f"{str(text)!r} lies in an archive's folder stages, where nothing else belongs")
     return ObjectPlace(bucket, prefix, _endpoint())
 
 
@@ -115,10 +107,9 @@ def _endpoint() -> str | None:
         return None
     try:
         parts = urlsplit(text)
-        good = parts.scheme in ("http", "https") and bool(parts.hostname) and (parts.port or 1) > 0
     except ValueError:
-        good = False
-    if not good:
+        parts = urlsplit("")
+    if parts.scheme not in ("http", "https") or not parts.hostname:
         raise SettingsError(f"AWS_ENDPOINT_URL={text!r} is no address; expected https://HOST, or http://127.0.0.1:PORT")
     allowed = os.environ.get("AWS_ALLOW_HTTP", "").lower() in ("1", "true", "yes")
     if parts.scheme == "http" and parts.hostname not in LOOPBACK and not allowed:
@@ -143,7 +134,7 @@ def connect(place: ObjectPlace) -> S3Store:
         ) from error
     http = place.endpoint is not None and place.endpoint.startswith("http://")
     client: ClientConfig = {"allow_http": http, "connect_timeout": "5s", "read_timeout": "30s", "timeout": "15min"}
-    retry: RetryConfig = {"max_retries": RETRIES, "retry_timeout": timedelta(minutes=2), "backoff": BACKOFF}
+    retry: RetryConfig = {"max_retries": RETRIES, "retry_timeout": timedelta(minutes=2)}
     config: S3Config = {} if place.endpoint is None else {"endpoint": place.endpoint}
     try:
         return S3Store(
@@ -164,9 +155,8 @@ def answers_of(place: ObjectPlace) -> Iterator[None]:
         if isinstance(error, FileNotFoundError) and "NoSuchBucket" not in str(error):
             raise
         text = str(error)
-        meaning = next((words for sign, words in _MEANINGS.items() if sign in text), _first_line(error))
-        if "invalid path" in text:
-            meaning += "; take it out of the bucket: no object of an archive has such a name"
+        known = (words for signs, words in _MEANINGS if any(sign in text for sign in signs))
+        meaning = next(known, _first_line(error))
         at = "" if place.endpoint is None else f" at {place.endpoint}"
         raise UnreachableError(f"{place.url}{at}: {meaning}") from error
 
@@ -242,20 +232,13 @@ class Objects:
             self.store.put(name, source, chunk_size=PART_BYTES, max_concurrency=2)
         self._count(len(source) if isinstance(source, bytes) else source.stat().st_size)
 
-    def blocks(self, name: str) -> Iterator[memoryview]:
-        """Yield the content of an object, some MB at a time. Raises FileNotFoundError: there is none."""
-        with answers_of(self.place):
-            for block in self.store.get(name).stream(PART_BYTES):
-                found = memoryview(block)
-                self._count(len(found))
-                yield found
-
     def save(self, name: str, path: Path) -> str:
         """Write an object into a new file and return its SHA-256 (FileNotFoundError: there is none)."""
         digest = hashlib.sha256()
         path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("wb") as file:
-            for block in self.blocks(name):
+        with path.open("wb") as file, answers_of(self.place):
+            for block in self.store.get(name).stream(PART_BYTES):
+                self._count(len(block))
                 digest.update(block)
                 file.write(block)
         return digest.hexdigest()
@@ -265,13 +248,9 @@ class Objects:
 
         Raises IncompleteStoreError: it is missing or has changed; ``path`` is not written.
         """
-        advice = f"restore it from a copy, or run verify on {self.place.url}"
+        advice = f"run again; if that does not help, run verify on {self.place.url}"
         try:
-            try:
-                found = self.save(name, aside)
-            except FileNotFoundError:
-                raise IncompleteStoreError(f"{self.place.url}/{name} is missing; {advice}") from None
-            if found != sha256:
+            if self.save(name, aside) != sha256:
                 raise IncompleteStoreError(
                     f"{self.place.url}/{name} has changed since it was published (its SHA-256 differs); {advice}"
                 )
@@ -279,6 +258,8 @@ class Objects:
             path.parent.mkdir(parents=True, exist_ok=True)
             aside.replace(path)
             sync_path(path.parent)
+        except FileNotFoundError:
+            raise IncompleteStoreError(f"{self.place.url}/{name} is missing; {advice}") from None
         finally:
             with suppress(OSError):
                 aside.unlink(missing_ok=True)

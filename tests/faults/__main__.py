@@ -19,8 +19,6 @@ sys.path[0] = str(Path(__file__).resolve().parents[2])  # not this folder: its m
 from tests.faults.fault_table import HEADINGS, rows_of, run_table  # noqa: E402
 
 PLACES = {
-    "kills": "stopped_surveys:kill_rows",
-    "terminations": "stopped_surveys:termination_rows",
     "flips": "checksummed_flips:archive_rows",
     "headers": "mutated_files:header_rows",
     "files": "mutated_files:file_rows",

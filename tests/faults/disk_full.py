@@ -1,8 +1,7 @@
 """Let the disk run full under a survey, or refuse it calls: ``python tests/faults disk_full refused_writes``.
 
-The archive lies on a small tmpfs. Either it is made so small that the survey does not fit, or it is filled up at a
-chosen place; then it grows, and the same command runs again. Where no tmpfs can be mounted, not even in a namespace of
-its own, the calls are refused from the inside instead, and the table says so.
+The archive lies on a small tmpfs, which is filled up at a chosen place; then it grows, and the same command runs again.
+Where no tmpfs can be mounted, the calls are refused from the inside instead, and the table says so.
 
 Rights do not hinder root, so other refusals are of calls, from the inside: whatever changes something in the archive,
 by whichever library, counts as a place. Places are drawn at random over a whole survey, each with a random error.
@@ -10,34 +9,28 @@ by whichever library, counts as a place. Places are drawn at random over a whole
 
 from __future__ import annotations
 
-import json
 import os
 import random
 import shutil
 import subprocess
-import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from tests.faults.fault_table import Clock, Row, reported_wrong
 from tests.faults.injection import ERRORS, label, logged_calls
-from tests.faults.nursery import ROOT, Ended, Nursery
+from tests.faults.nursery import Ended, Nursery
 from tests.faults.small_survey import Subject, prepare, words, wrong_after_fault, wrong_after_rerun
 
-SIZES, EACH, PLACES = 30, 2, 150
+EACH, PLACES = 5, 150
 LARGE = 64 << 20  # bytes: more than a survey takes
-PAGE = 4096
-IN_NAMESPACE = "SPECTRALZOOM_FAULTS_IN_NAMESPACE"
-QUICK = ("spool", "segment manifest", "run")  # kinds for the quick part
+KINDS = ("spool", "segment", "segment manifest", "run")  # of files that are written
 FULL = "disk is full"
 # Functions of ours that a full disk is met in.
 WHERE = {"spool": "capture._capture", "manifest": "manifests.write_manifest", "run": "run_folder.publish_run"}
-STAGES = ("capture", "locate", "rectify", "score", "patches", "segment")
-EVERYWHERE = {"spool", "run", "run manifest", *STAGES, *(f"{stage} manifest" for stage in STAGES)}
 
 
 @dataclass
@@ -81,16 +74,12 @@ def small_disk(folder: Path, size: int) -> Iterator[Path]:
         folder.rmdir()
 
 
-def fill_at_places(
-    subject: Subject, each: int, *, mounted: bool, some: tuple[str, ...] = (), seed: int = 0
-) -> Refusals:
-    """Fill the disk ``each`` times while each kind (or some) is written, and run again on a larger one."""
+def fill_at_places(subject: Subject, each: int, *, mounted: bool, seed: int = 0) -> Refusals:
+    """Fill the disk ``each`` times while each kind of file is written, and run again on a larger one."""
     found, chance = Refusals(), random.Random(seed)
-    labels = (label(path) for _, call, path in subject.changing_calls if call == "open")
-    for name, count in Counter(one for one in labels if one is not None).items():
-        if some and name not in some:
-            continue
-        for at in sorted(chance.sample(range(1, count + 1), min(each, count))):
+    counts = Counter(label(path) for _, call, path in subject.changing_calls if call == "open")
+    for name in KINDS:
+        for at in sorted(chance.sample(range(1, counts[name] + 1), min(each, counts[name]))):
             disk = subject.folder / f"disk-{name}-{at}".replace(" ", "-")
             place = {"root": str(disk / "a"), "at": at, "kind": name}
             if mounted:
@@ -105,74 +94,30 @@ def fill_at_places(
     return found
 
 
-def try_sizes(subject: Subject, count: int, found: Refusals) -> None:
-    """Survey on disks from nearly nothing to what the survey takes, and run again on a larger one."""
-    with small_disk(subject.folder / "large", LARGE) as disk:
-        assert subject.nursery.run(words(disk / "a")).code == 0
-        state = os.statvfs(disk)
-        taken = (state.f_blocks - state.f_bfree) * state.f_frsize
-    for part in range(count):
-        pages = max(1, round(taken * (part + 0.5) / count / PAGE))
-        with small_disk(subject.folder / f"disk-of-{pages}", pages * PAGE) as disk:
-            ended = subject.nursery.run(words(disk / "a"))
-            _judge(subject, disk / "a", ended, None, found)
-
-
-def _judge(subject: Subject, out: Path, ended: Ended, name: str | None, found: Refusals) -> None:
+def _judge(subject: Subject, out: Path, ended: Ended, name: str, found: Refusals) -> None:
     """Look at the archive after the survey failed, let the disk grow, and look again after the rerun."""
     wrong = wrong_after_fault(subject, out)
-    if ended.code == 0 and name is None:
-        found.done += 1
-    elif not (ended.told and FULL in ended.message):
+    if not (ended.told and FULL in ended.message):
         wrong.append(f"exit {ended.code}, {ended.message[-200:]}")
-    else:
-        found.told += 1
-    found.met_at[name or _met_at(ended)] += 1
-    wrong += [
-        f"met at {ended.place}" for word, where in WHERE.items() if word in (name or "") and where not in ended.place
-    ]
+    found.told += ended.told
+    found.met_at[name] += 1
+    wrong += [f"met at {ended.place}" for word, where in WHERE.items() if word in name and where not in ended.place]
     if os.path.ismount(out.parent):
         subprocess.run(["mount", "-o", f"remount,size={LARGE}", str(out.parent)], check=True)
     wrong += wrong_after_rerun(subject, out, subject.nursery.run(words(out)))
-    found.wrong += [f"{name or out.parent.name}: {one}" for one in wrong]
-
-
-def _met_at(ended: Ended) -> str:
-    """What was being written, by the stage that failed and our functions that the error came through."""
-    if ended.code == 0:
-        return "nothing"
-    failed = [line.split(":")[0] for line in ended.text.splitlines() if line.endswith("failed")]
-    words = next((word for word, where in WHERE.items() if where in ended.place), "store")
-    return f"{failed[0]} {words}" if failed and words != "run" else words if words == "run" else "archive's folder"
+    found.wrong += [f"{name}: {one}" for one in wrong]
 
 
 def full_rows(quick: bool = False) -> list[Row]:
-    if can_mount():
-        return [_full_row(quick, "a tmpfs")]
-    unshare = ["unshare", "-rm"]
-    allowed = IN_NAMESPACE not in os.environ and shutil.which("unshare") is not None
-    if allowed and subprocess.run([*unshare, "true"], capture_output=True, check=False).returncode == 0:
-        command = [*unshare, sys.executable, "-m", "tests.faults.disk_full", *(["--quick"] if quick else [])]
-        environment = {**os.environ, IN_NAMESPACE: "1"}
-        said = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
-        return [Row(**row) for row in json.loads(said.stdout)]
-    return [_full_row(quick, "")]
-
-
-def _full_row(quick: bool, kind: str) -> Row:
-    clock = Clock()
+    clock, mounted = Clock(), can_mount()
     with tempfile.TemporaryDirectory(prefix="full-") as name, Nursery(Path(name)) as nursery:
-        subject = prepare(nursery)
-        found = fill_at_places(subject, 1 if quick else EACH, mounted=bool(kind), some=QUICK if quick else ())
-        if kind:
-            try_sizes(subject, 1 if quick else SIZES, found)
-    where = f"{kind}{' in a namespace of its own' if IN_NAMESPACE in os.environ else ''}"
-    injected = f"{where} too small, or filled up while each kind of file is written; then it grows"
-    if not kind:
+        found = fill_at_places(prepare(nursery), 1 if quick else EACH, mounted=mounted)
+    injected = "a tmpfs filled up while each kind of file is written; then it grows"
+    if not mounted:
         injected = "ENOSPC refused from the inside (no tmpfs can be mounted here), from each kind of file on"
     demanded = "one message and exit 1, archive verifies, nothing published is lost, rerun bit-identical"
-    met = not found.wrong and (quick or set(found.met_at) >= EVERYWHERE)
-    return Row("disk full", injected, found.told + found.done, demanded, found.words(), met, clock.seconds)
+    met = not found.wrong and set(found.met_at) == set(KINDS)
+    return [Row("disk full", injected, found.told, demanded, found.words(), met, clock.seconds)]
 
 
 # --- calls that are refused -------------------------------------------------------------------------------------------
@@ -216,7 +161,3 @@ def refused_rows(quick: bool = False) -> list[Row]:
     demanded = "one message and exit 1, archive verifies, rerun bit-identical"
     met = not found.wrong and found.told > count // 2
     return [Row("writes refused", injected, count, demanded, found.words(), met, clock.seconds)]
-
-
-if __name__ == "__main__":  # in a namespace of its own
-    print(json.dumps([asdict(row) for row in full_rows("--quick" in sys.argv)]))

@@ -20,18 +20,13 @@ os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), os.environ.g
 
 from tests.faults.fault_table import rows_of, run_table  # noqa: E402
 
-PARTS = {
-    "survey-rig": rows_of("tests.soak.rig_beside_simulation"),
-    "day": rows_of("tests.soak.day_of_surveys"),
-    "schedule": rows_of("tests.soak.served_week"),
-}
-SOAK = ("day", "schedule")  # where no part is named
+PARTS = {"kills": rows_of("tests.soak.killed_surveys"), "survey-rig": rows_of("tests.soak.rig_beside_simulation")}
 HEADINGS = ("what", "how", "times", "demanded", "found", "met", "s")
 
 
 def main(arguments: Sequence[str]) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that processes and disks are cleared up then, too
-    return run_table(arguments, "python tests/soak", "part", PARTS, SOAK, HEADINGS)
+    return run_table(arguments, "python tests/soak", "part", PARTS, ["kills"], HEADINGS)
 
 
 if __name__ == "__main__":

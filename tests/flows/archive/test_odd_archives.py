@@ -15,7 +15,6 @@ from flows.tasks.local_server import ServerUnavailable
 from storage.archive.archive import Archive
 from storage.archive.manifests import _seal, _text
 from storage.archive.staging import file_hash
-from tests.storage.archive.test_no_files import CASES, Case, put
 from tests.storage.small_archive import Small, small_survey
 
 pytestmark = pytest.mark.usefixtures("no_effects")
@@ -105,25 +104,3 @@ def test_no_verb_leaves_the_archive(
         assert SECRET.decode() not in shown.err + shown.out
         assert secrets[0].read_bytes() == SECRET, verb
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["archive", "secret"]
-
-
-@pytest.mark.parametrize("case", CASES[::2])
-def test_no_verb_waits_or_follows(case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Pipes and links where files and folders should be: each verb ends, verify with 1, and no defect is met."""
-    root, out = tmp_path / "archive", str(tmp_path / "out")
-    uri = put(small_survey(Archive.open(root)), case)
-    for verb, *more in (
-        ("ls",),
-        ("explain", "class_map"),
-        ("report", "--out", f"{out}.html"),
-        ("export", "--out", out),
-        ("gc", "--dry-run"),
-        ("verify",),
-    ):
-        with pytest.raises(SystemExit) as ended:
-            main([verb, str(root), *more])
-        shown = capsys.readouterr()
-        assert ended.value.code in (0, 1, 2, 3), (verb, shown.err)
-        assert "defect" not in shown.err + shown.out, (verb, shown.err)
-    assert ended.value.code == 1
-    assert uri in shown.out

@@ -30,7 +30,7 @@ from flows.tasks.open_survey import RIG_LIMIT, OpenSurvey
 from storage.archive.archive import Archive
 from storage.archive.records import read_run
 from storage.parallel.pool import THREADS
-from tests.soak.served_week import free_port, server_process
+from tests.flows.schedule.prefect_server import free_port, server_process
 
 ROOT = Path(__file__).parents[3]
 PATIENCE_S = 300.0
@@ -95,7 +95,7 @@ def run_here(run: Any) -> Any:
 
 def settings_of(out: Path) -> list[dict[str, Any]]:
     """The settings that an archive's runs were asked for, oldest first."""
-    return [dict(read_run(folder, {}).settings) for folder in Archive.open(out).runs()]
+    return [dict(read_run(folder).settings) for folder in Archive.open(out).runs()]
 
 
 def test_a_wrong_parameter_ends_a_run_with_the_message_of_the_command_line(north: Any) -> None:
@@ -134,7 +134,7 @@ def test_a_run_is_a_visit_of_its_due_time_and_goes_on_from_the_newest(north: Any
     assert [state.name for state in states] == ["Completed", "Completed"]
     asked = settings_of(Path(north.settings.out))
     assert [one["visit"] for one in asked] == ["2026-06-01T04:00:00Z", "2026-06-02T04:00:00Z"]
-    memories = [read_run(folder, {}).receipt.get("memory") for folder in Archive.open(north.settings.out).runs()]
+    memories = [read_run(folder).receipt.get("memory") for folder in Archive.open(north.settings.out).runs()]
     assert [memory is None for memory in memories] == [True, False]
 
 
@@ -257,10 +257,10 @@ def test_the_rig_and_the_reading_machine_are_two_deployments(
         sweeps = [run.parameters["sweeps"] for run in asked.read_flow_runs() if run.name == "capture-north"]
     assert sorted(sweeps) == ["coarse", "fine"]
     plain = survey.fn(SurveySettings(**given, out=str(tmp_path / "plain")))
-    (run,) = (read_run(folder, {}) for folder in Archive.open(tmp_path / "archive").runs())
+    (run,) = (read_run(folder) for folder in Archive.open(tmp_path / "archive").runs())
     stores, others = (
         {name: address for name, address in one.products.items() if address.startswith("stages/")}
-        for one in (run, read_run(plain.folder, {}))
+        for one in (run, read_run(plain.folder))
     )
     assert "class_map" in stores
     assert stores == others

@@ -13,8 +13,7 @@ import pytest
 
 from flows.tasks import rig_field
 from flows.tasks.rig_field import rig_to_oneself
-from pipeline.errors import ArchiveError, RigError
-from storage.archive.staging import take_lock
+from pipeline.errors import RigError
 
 ROOT = Path(__file__).parents[3]
 PORT = f"/dev/ttyTEST{os.getpid()}"  # two runs of these tests on one machine are two rigs
@@ -98,19 +97,3 @@ def test_a_rig_that_cannot_be_locked_is_not_used(monkeypatch: pytest.MonkeyPatch
         rig_to_oneself(PORT),
     ):
         pass
-
-
-def test_locks_of_an_archive_follow_no_link(tmp_path: Path) -> None:
-    """Neither a lock nor the folder of locks is used through a link; a FIFO is no lock file."""
-    elsewhere = tmp_path / "elsewhere"
-    elsewhere.mkdir()
-    for name in ("linked", "piped"):
-        (tmp_path / name).mkdir()
-    (tmp_path / "linked" / ".locks").symlink_to(elsewhere)
-    (tmp_path / "piped" / ".locks").mkdir()
-    os.mkfifo(tmp_path / "piped" / ".locks" / "use.lock")
-    with pytest.raises(ArchiveError, match=r"\.locks is a link, expected a folder of its own"):
-        take_lock(tmp_path / "linked" / ".locks" / "use.lock")
-    with pytest.raises(ArchiveError, match=r"use\.lock is no file, expected a lock file"):
-        take_lock(tmp_path / "piped" / ".locks" / "use.lock")
-    assert list(elsewhere.iterdir()) == []

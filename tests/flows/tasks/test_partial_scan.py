@@ -115,7 +115,7 @@ def test_the_same_visit_finds_its_own_lines(visited: Path, visits: Any, survey_p
 def test_better_weights_read_the_lines_that_were_taken(visited: Path, visits: Any, make_weights: WeightsMaker) -> None:
     """Reprocessing makes both visits again, of the light that there is, whatever these weights would have looked at."""
     run_reprocess(visited, Console(quiet=True), weights=make_weights(scans=RECORD, width=4))
-    runs = [read_run(path, {}) for path in sorted(visited.glob("runs/*"))]
+    runs = [read_run(path) for path in sorted(visited.glob("runs/*"))]
     before, again = (run for run in runs if run.settings["extent"] == visits[2].receipt["settings"]["extent"])
     assert again.receipt["products"]["class_map"] != before.receipt["products"]["class_map"]
     assert again.receipt["products"]["raw_coarse"] == before.receipt["products"]["raw_coarse"]

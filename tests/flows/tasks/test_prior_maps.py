@@ -195,7 +195,7 @@ def test_visits_are_reprocessed_in_order(visited: Path, twice: Any, make_weights
     weights = make_weights(width=4)
     told = io.StringIO()
     run_reprocess(visited, Console(file=told, width=300), weights=weights)
-    runs = [read_run(path, {}) for path in sorted(visited.glob("runs/*"))]
+    runs = [read_run(path) for path in sorted(visited.glob("runs/*"))]
     again = [run for run in runs if run.folder.name not in (twice[1].folder.name, twice[2].folder.name)]
     assert [run.settings["prior"] for run in again] == ["none", again[0].folder.name]
     assert again[1].receipt["memory"]["run"] == again[0].folder.name
@@ -297,9 +297,9 @@ def test_a_thousand_visits_cost_as_much_as_sixty(visited: Path, twice: Any, monk
             shutil.copytree(visited / "runs" / source.folder.name, copy)
     read: list[str] = []
 
-    def counted(folder: Path, stores: Any) -> Any:
+    def counted(folder: Path) -> Any:
         read.append(folder.name)
-        return read_run(folder, stores)
+        return read_run(folder)
 
     monkeypatch.setattr(memory, "read_run", counted)
     settings = load_settings(None, {"prior": "latest", "visit": "2026-06-20T10:00:00Z"})

@@ -29,15 +29,11 @@ ROOT = Path(__file__).parents[3]
 KILL_EVERYWHERE = """
 import os, shutil, sys
 from pathlib import Path
-from storage.archive import manifests
-from storage.archive import run_folders
 from storage.archive.archive import Archive
 from tests.faults.injection import end_at, logged_calls
 from tests.storage.archive.test_run_extensions import extend, run_id
 
-base, folder, way = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3]
-if way == "by two renames":
-    run_folders.try_exchange = lambda one, other: False
+base, folder = Path(sys.argv[1]), Path(sys.argv[2])
 
 def end(at):
     shutil.copytree(base, folder / f"{at}")
@@ -86,7 +82,7 @@ def extend(archive: Archive, name: str, figure: float = 0.75) -> Path:
 
 def figure_of(archive: Archive) -> float | None:
     """The accuracy in the receipt of the one run, None where there is none yet."""
-    found = read_run(archive.root / "runs" / run_id(archive), {})
+    found = read_run(archive.root / "runs" / run_id(archive))
     assert found.problem is None
     return found.receipt.get("accuracy", {}).get("miou")
 
@@ -107,9 +103,8 @@ def test_a_run_keeps_its_name_and_date(archive: Archive) -> None:
     assert [path.name for path in (archive.root / "runs").iterdir()] == [name] == [folder.name]
     (run,) = Catalogue.read(archive.root).runs
     assert (run.created, figure_of(archive)) == (created, 0.75)
-    assert any(uri.startswith("stages/evaluate/") for uri in run.recorded)
+    assert any(uri.startswith("stages/evaluate/") for uri in run.names)
     assert problems(archive) == []
-    assert not [*(archive.root / ".locks").glob("runs-*")]
 
 
 def test_an_old_run_does_not_become_the_newest(archive: Archive) -> None:
@@ -148,19 +143,16 @@ def test_one_at_a_time(archive: Archive) -> None:
         archive.extend_run("20261120T101701-gone")
 
 
-@pytest.mark.parametrize("way", ["exchange", "by two renames"])
-def test_killed_at_every_call_of_the_system(archive: Archive, tmp_path: Path, way: str) -> None:
+def test_killed_at_every_call_of_the_system(archive: Archive, tmp_path: Path) -> None:
     """The run is there, whole, without what is added or with it; the next time it is added."""
-    command = [sys.executable, "-c", KILL_EVERYWHERE, str(archive.root), str(tmp_path), way]
+    command = [sys.executable, "-c", KILL_EVERYWHERE, str(archive.root), str(tmp_path)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     calls = int(subprocess.run(command, cwd=ROOT, env=environment, check=True, capture_output=True).stdout)
     assert calls > 30
     seen = set()
     for at in range(1, calls + 1):
         out = tmp_path / f"{at}"
-        if way == "exchange":
-            assert problems(Archive(out)) == []
-        opened = Archive.open(out)  # a verb that writes; it does what two renames may have left to do
+        opened = Archive.open(out)
         assert problems(opened) == []
         seen.add(figure_of(opened))
         extend(opened, run_id(opened))
@@ -170,47 +162,23 @@ def test_killed_at_every_call_of_the_system(archive: Archive, tmp_path: Path, wa
     assert seen == {None, 0.75}
 
 
-def test_broken_off_between_two_renames_it_is_put_back(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where folders cannot be exchanged and the second rename fails, the run has its name again, as it was."""
+def test_where_folders_cannot_be_exchanged_files_are(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The run is whole with what is added; killed before its manifest is there it is damaged, and named."""
     monkeypatch.setattr(run_folders, "try_exchange", lambda one, other: False)
-    name, rename = run_id(archive), Path.rename
+    name, replace = run_id(archive), Path.replace
 
     def refuse(self: Path, to: Path) -> Path:
-        if to.name == name and self.name == name + PART_SUFFIX:
+        if to.name == "manifest.json":
             raise KeyboardInterrupt
-        return rename(self, to)
+        return replace(self, to)
 
-    monkeypatch.setattr(Path, "rename", refuse)
-    with pytest.raises(KeyboardInterrupt):
-        extend(archive, name)
-    assert (figure_of(archive), problems(archive)) == (None, [])
-
-
-def test_killed_between_two_renames_verify_and_gc_know(archive: Archive) -> None:
-    """verify tells of it by name, gc keeps its stores, and the next verb that writes gives the run its name."""
-    name = run_id(archive)
-    extend(archive, name)
-    (archive.root / "runs" / name).rename(archive.root / "runs" / (name + PART_SUFFIX))
-    assert any(one.startswith(f"runs/{name} its extension is not finished") for one in problems(archive))
-    assert "unfinished" not in {removal.what for removal in clear_up(archive, keep_days=9, dry_run=True).removals}
-    opened = Archive.open(archive.root, create=False)
-    assert (figure_of(opened), problems(opened)) == (0.75, [])
-
-
-def test_verify_under_way_takes_an_extension_for_no_damage(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The manifest was read before, the files after."""
-    from storage.maintenance import verification
-
-    name, broken = run_id(archive), verification.broken_files
-
-    def extended_meanwhile(folder: Path, manifest: Any, *, hashes: bool) -> Any:
-        if folder.name == name and "extended" not in manifest:
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", refuse)
+        with pytest.raises(KeyboardInterrupt):
             extend(archive, name)
-        return broken(folder, manifest, hashes=hashes)
-
-    monkeypatch.setattr(verification, "broken_files", extended_meanwhile)
-    assert [one for one in problems(archive) if one.startswith("runs/")] == []
-    assert figure_of(archive) == 0.75
+    (found,) = problems(archive)
+    assert found.startswith(f"runs/{name} receipt.json has")
+    assert clear_up(archive, keep_days=9, dry_run=True).obstacle is None
 
 
 # --- in a bucket ------------------------------------------------------------------------------------------------------
@@ -245,7 +213,7 @@ def test_killed_before_the_files_of_before_go(machine: Machine, monkeypatch: pyt
     other = machine(SECOND, create=False)
     assert (figure_of(other), problems(other)) == (0.75, [])
     (gone,) = clear_up(other, keep_days=0).removals
-    assert gone.what == "upload"
+    assert gone.what == "leftover"
     assert (figure_of(machine(SECOND, create=False)), problems(machine(FIRST))) == (0.75, [])
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.rig.transports import NotKept
-from storage.arrays.fetched_files import SUMS, FetchedFiles
+from storage.arrays.spool import SUMS, FetchedFiles
 from tests.storage.small_archive import flip
 
 
@@ -67,7 +67,7 @@ def test_full_disk_keeps_what_there_was(tmp_path: Path, monkeypatch: pytest.Monk
             return write(file, bytes(data)[:2])
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("storage.arrays.fetched_files.os.write", full)
+    monkeypatch.setattr("storage.arrays.spool.os.write", full)
     with pytest.raises(NotKept, match=r"cannot keep byte 5 of /a/raw_0 .*the disk is full.*the 5 bytes before"):
         kept.append("/a/raw_0", b"torn")
     assert kept.read("/a/raw_0", 0, 99) == b"whole"

@@ -12,7 +12,7 @@ from affine import Affine
 from odc.geo.geobox import GeoBox
 from pyproj import CRS
 
-from pipeline.errors import ChunkError, IncompleteStoreError, PoseError, ShapeError
+from pipeline.errors import IncompleteStoreError, PoseError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.class_maps import (
     CONFIDENCE_STEP,
@@ -121,17 +121,6 @@ def test_a_block_has_the_images_of_its_map(tmp_path: Path, goes_on: bool) -> Non
     writer = begin(tmp_path / "a.zarr", goes_on=goes_on)
     with pytest.raises(ShapeError, match="give classes, confidence, picture, age" + (", changed" if goes_on else "")):
         writer.write_block(slice(0, 64), slice(0, 90), block((64, 90), goes_on=not goes_on))
-
-
-@pytest.mark.parametrize(
-    ("rows", "words"), [((10, 74), "rows 10:74"), ((0, 40), "rows 0:40"), ((64, 128), "64:128"), ((32, 64), "32:64")]
-)
-def test_blocks_that_split_shards_are_refused(tmp_path: Path, rows: tuple[int, int], words: str) -> None:
-    """A shard written twice by halves would lose one; the message says where to start and end."""
-    writer = begin(tmp_path / "a.zarr")
-    size = (rows[1] - rows[0], 90)
-    with pytest.raises(ChunkError, match=f"{words}.* multiples of {SHARD_ROWS}"):
-        writer.write_block(slice(*rows), slice(0, 90), block(size))
 
 
 def test_the_usual_block_is_whole_shards() -> None:
@@ -273,23 +262,6 @@ def test_tiles_in_any_order_are_the_map_at_once(tmp_path: Path) -> None:
         part = np.s_[slice(*rows), slice(*columns)]
         write_class_tile(tmp_path / "tiles.zarr", (rows[0], columns[0]), classes[part], confidence[part])
     assert _contents(tmp_path / "one.zarr") == _contents(tmp_path / "tiles.zarr")
-
-
-@pytest.mark.parametrize(
-    ("origin", "shape", "error", "words"),
-    [
-        ((32, 0), (64, 700), ChunkError, "rows 32:96 split the class map's shards of 64 rows"),
-        ((0, 0), (64, 320), ChunkError, "columns 0:320 split the class map's shards of 640 columns"),
-        ((128, 0), (64, 640), ChunkError, "rows 128:192 split the class map's shards of 64 rows"),
-    ],
-)
-def test_tiles_that_do_not_fit_are_refused(
-    tmp_path: Path, origin: tuple[int, int], shape: tuple[int, int], error: type[Exception], words: str
-) -> None:
-    """The message names the rows or columns."""
-    create_class_map(tmp_path / "c.zarr", SHAPE, LEGEND)
-    with pytest.raises(error, match=words):
-        write_class_tile(tmp_path / "c.zarr", origin, np.zeros(shape, np.uint8), np.zeros(shape, np.float32))
 
 
 def test_what_a_tile_lacks_is_told(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeline.errors import ChunkError, IncompleteStoreError, ShapeError
+from pipeline.errors import IncompleteStoreError
 from storage.arrays.layout import AngularGrid
 from storage.arrays.mosaics import MosaicWriter, open_mosaic
 from tests.storage.plain_mosaic import plain_writer, write_values
@@ -40,30 +40,6 @@ def test_tiles_and_rows_store_the_same(tmp_path: Path) -> None:
     np.testing.assert_array_equal(other.coverage(), coverage)
     np.testing.assert_allclose(other.values()[coverage > 0], values[coverage > 0], atol=2**-13)
     assert np.isnan(other.values()[coverage == 0]).all()
-
-
-@pytest.mark.parametrize(
-    ("at", "size", "words"),
-    [
-        ((32, 0), (32, 640), "rows 32:64 split the mosaic's shards of 64 rows"),
-        ((0, 0), (64, 600), "columns 0:600 split the mosaic's shards of 640 columns"),
-        ((0, 640), (63, 640), "rows 0:63 split"),
-    ],
-)
-def test_a_tile_that_splits_shards_is_refused(
-    tmp_path: Path, at: tuple[int, int], size: tuple[int, int], words: str
-) -> None:
-    """Two writers of one shard would lose each other's part, so only whole ones are taken."""
-    with pytest.raises(ChunkError, match=words):
-        writer(tmp_path / "m.zarr").write_tile(*at, np.zeros((*size, 2), np.float32), np.zeros(size, np.intp))
-
-
-def test_a_tile_that_does_not_fit_is_refused(tmp_path: Path) -> None:
-    """With other components, or with a coverage of another shape."""
-    mosaic = writer(tmp_path / "m.zarr")
-    for shape, coverage in (((64, 640, 3), (64, 640)), ((64, 640, 2), (64, 639))):
-        with pytest.raises(ShapeError, match="a tile of the mosaic has the shape"):
-            mosaic.write_tile(0, 0, np.zeros(shape, np.float32), np.zeros(coverage, np.intp))
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from models.reading.prior_map import FAINTEST as FAINTEST_BELIEVED
-from pipeline.errors import ChunkError, IncompleteStoreError
+from pipeline.errors import IncompleteStoreError
 from storage.arrays.class_maps import (
     DAY_STEP,
     FAINTEST,
@@ -146,19 +146,8 @@ def test_a_first_probabilities_has_nothing_that_pixels_were(tmp_path: Path) -> N
     assert not list(dropped.rglob("*changed_from*"))
 
 
-def test_tiles_of_changes_that_split_a_shard_are_refused(tmp_path: Path) -> None:
-    """As those of probabilities."""
-    path, old = gone_on(tmp_path / "class_probabilities.zarr")
-    with pytest.raises(ChunkError, match="split the class probabilities's shards"):
-        write_changes_tile(path, (8, 0), old[:8])
-
-
-def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
-    """Tiles that split a shard, and a store that is not there."""
-    path = stored(tmp_path / "class_probabilities.zarr")
-    values, ages, light = drawn(0)
-    with pytest.raises(ChunkError, match="split the class probabilities's shards"):
-        write_probabilities_tile(path, (8, 0), values[:8], ages[:8], light[:8])
+def test_a_store_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    """By its place."""
     with pytest.raises(IncompleteStoreError, match="cannot be read"):
         ProbabilityStore(tmp_path / "none.zarr")
 

@@ -88,12 +88,3 @@ def test_broken_off_it_leaves_the_store_whole(
     assert problems(archive) == []
     assert cleared(archive) == [small.mosaic.uri]
     assert content(small_survey(archive, named=False).mosaic) == before
-
-
-def test_a_manifest_that_says_so_falsely_is_found(archive: Archive) -> None:
-    """The manifest of another store is named."""
-    small = small_survey(archive)
-    other = small_survey(archive, kernel="nearest")
-    cleared(archive)
-    (small.mosaic.path / "manifest.json").write_bytes((other.mosaic.path / "manifest.json").read_bytes())
-    assert any("is that of" in problem for problem in problems(archive))

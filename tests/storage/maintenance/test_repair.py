@@ -11,7 +11,7 @@ import pytest
 
 from pipeline.errors import ArchiveError, SceneError
 from storage.archive.archive import Archive
-from storage.maintenance.repair import Repaired, plan_repair, repair
+from storage.maintenance.verification import Repaired, plan_repair, repair
 from storage.remote.opening import verify_archive
 from tests.storage.small_archive import Small, flip, small_survey
 

@@ -127,7 +127,7 @@ def test_a_block_that_kills_its_workers_is_one_error() -> None:
     with WorkerPool("processes", 1).open() as pool:
         (before, _), *_ = run_blocks(threads_here, [0], pool)
         with pytest.raises(
-            WorkerError, match=r"1 worker processes: workers died .* in the same block.*--scheduler threads"
+            WorkerError, match=r"--scheduler processes: workers died .* in the same block.*--scheduler threads"
         ):
             run_blocks(die, range(3), pool)
         (after, _), *_ = run_blocks(threads_here, [0], pool)

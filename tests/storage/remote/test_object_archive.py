@@ -147,22 +147,6 @@ def test_missing_and_foreign_objects_are_found(machine: Machine) -> None:
     }
 
 
-def test_a_broken_chunk_is_named(machine: Machine) -> None:
-    """Of a broken shard verify tells the rows, as in a folder."""
-    archive = machine(FIRST)
-
-    def build(path: Path) -> None:
-        group = create_group(path / "m.zarr", "m", {})
-        image = np.arange(128 * 64 * 2, dtype=np.uint16).reshape(128, 64, 2)
-        write_image(group, "values", ("y", "x", "band"), image, {})
-
-    ref, _ = archive.produce("rectify", build, version=1, params={})
-    rot(archive, object_of(archive, ref, "m.zarr/values/c/1/0/0"), at=50)
-    (found,) = problems(archive)
-    assert "values: rows 64 to 127" in found
-    assert "rows 64 to 127" in found
-
-
 def test_a_run_is_seen_elsewhere_with_all_it_rests_on(machine: Machine) -> None:
     """ls of another machine has runs, receipts and stores; a rerun here sends no store again."""
     small = small_survey(machine(FIRST))
@@ -290,9 +274,9 @@ def test_a_published_store_opens_with_plain_zarr(bucket: str, machine: Machine) 
     np.testing.assert_array_equal(group["values"][:], np.eye(40))
 
 
-@pytest.mark.parametrize("text", ["s3://", "s3://Upper/x", "s3://ok/../x", "s3://bucket/a//b", "s3://bucket/a b"])
+@pytest.mark.parametrize("text", ["s3://", "s3://ok/../x", "s3://bucket/a//b", "s3://bucket/a b"])
 def test_addresses_that_are_none_are_refused(text: str) -> None:
-    """A bucket's name is S3's, a prefix is of plain letters and cannot climb."""
+    """A prefix is of plain letters and cannot climb."""
     assert is_remote(text)
     with pytest.raises(SettingsError, match=r"expected s3://bucket/prefix"):
         parse_place(text)
@@ -337,12 +321,10 @@ def test_addresses_of_other_kinds_are_no_folders(text: str, tmp_path: Path, monk
 @pytest.mark.parametrize(
     ("answer", "words"),
     [
-        ("Server returned non-2xx status code: 503 Service Unavailable: SlowDown", "run again later"),
-        ("HTTP error: request or response body error", "broken off"),
-        ("Server returned non-2xx status code: 501 Not Implemented: ", "has no conditional puts"),
+        ("Server returned non-2xx status code: 503 Service Unavailable: SlowDown", "503 Service Unavailable"),
+        ("HTTP error: request or response body error", "check the network"),
         ("Received redirect without LOCATION", "set AWS_REGION"),
-        ('Encountered object with invalid path: Path "x//y"', 'Path "x//y"; take it out of the bucket'),
-        ("The AWS Access Key Id does not exist: InvalidAccessKeyId", "check AWS_ACCESS_KEY_ID"),
+        ("The AWS Access Key Id does not exist: InvalidAccessKeyId", "check the credentials"),
     ],
 )
 def test_what_a_store_answers_is_told_in_words(bucket: str, answer: str, words: str) -> None:
@@ -359,9 +341,3 @@ def test_what_has_another_mark_is_no_archive(bucket: str, machine: Machine, crea
     machine(FIRST).objects.write("archive.json", b"<html>welcome</html>")
     with pytest.raises(ArchiveError, match=r"archive\.json is not as expected"):
         open_archive(bucket, create=create)
-
-
-def test_no_archive_is_made_among_the_stores_of_another(bucket: str) -> None:
-    """What lies there would be taken for the other's, and cleared away."""
-    with pytest.raises(SettingsError, match="lies in an archive's folder stages"):
-        open_archive(f"{bucket}/stages")
