@@ -8,15 +8,12 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from flows.terminal.figures import DASH, format_seconds
+from flows.terminal.figures import format_seconds
 from flows.terminal.progress import table
 from pipeline.simulator.selection.choice import UNIT_NAMES
 
 COLOURS = {"on": "green", "off": "dim"}
-_KEY = (
-    "left out: largest change of a stored number without the effect [{unit}]; error: largest change by the chosen"
-    " variant; measured: the same on the worst lines of the scene."
-)
+_KEY = "left out: largest change of a stored number without the effect [{unit}]; error: that by the chosen variant."
 Row = Mapping[str, Any]
 
 
@@ -24,7 +21,7 @@ def print_effects(effects: Iterable[Row], total: Row, console: Console) -> None:
     """Print a row for every effect of the rig, their magnitudes and reasons, and the totals."""
     rows = list(effects)
     there = [row for row in rows if row["reason"] != "absent"]
-    columns = ("effect", "computed", "left out", "error", "measured", "CPU")
+    columns = ("effect", "computed", "left out", "error", "CPU")
     console.print(table(columns, (_figures(row, total) for row in there), left=2, whole=columns))
     console.print(escape(_KEY.format(unit=UNIT_NAMES[total["unit"]])), style="dim")
     for row in there:
@@ -37,16 +34,15 @@ def print_effects(effects: Iterable[Row], total: Row, console: Console) -> None:
 
 
 def _figures(row: Row, total: Row) -> list[str]:
-    """Return the cells of a row: name, variant, change without it, error bound, measured, seconds."""
+    """Return the cells of a row: name, variant, change without it, error bound, seconds."""
     most, bound = total["tolerance"], row["bound"]
     beyond = row["state"] == "off" and most is not None and (bound is None or bound > most)
     colour = "yellow" if beyond else COLOURS[row["state"]]
     return [
         escape(row["name"]),
         f"[{colour}]{escape(row['variant'] or 'off')}[/]",
-        format_change(row["left_out"], endless=True),
-        format_change(row["bound"], endless=True),
-        "" if row["measured"] is None else format_change(row["measured"]),
+        format_change(row["left_out"]),
+        format_change(row["bound"]),
         "" if not row["cost_s"] else "< 0.01 s" if row["cost_s"] < 0.01 else format_seconds(row["cost_s"]),
     ]
 
@@ -67,11 +63,9 @@ def _format_row(row: Row) -> str:
     return said + magnitude.removeprefix(f"{row['name']}: ")
 
 
-def format_change(value: float | None, *, endless: bool = False) -> str:
-    """Return a change in units of the tolerance; None is a dash, or 'none' where ``endless``: there is no bound."""
-    if value is None:
-        return "none" if endless else DASH
-    return f"{value:.2g}"
+def format_change(value: float | None) -> str:
+    """Return a change in units of the tolerance; None, a change without a bound, is 'none'."""
+    return "none" if value is None else f"{value:.2g}"
 
 
 def format_total(total: Mapping[str, Any]) -> Sequence[str]:
@@ -82,10 +76,7 @@ def format_total(total: Mapping[str, Any]) -> Sequence[str]:
     if total["bound"] is None:
         words.append("The error of the omitted effects has no bound.")
     else:
-        measured = "" if total["measured"] is None else f", measured on the worst lines {total['measured']:.2g}"
-        words.append(
-            f"Omitted and simplified effects change a stored number by at most {total['bound']:.2g} {unit}{measured}."
-        )
+        words.append(f"Omitted and simplified effects change a stored number by at most {total['bound']:.2g} {unit}.")
     exact = format_seconds(max(total["saved_s"], 0.0))
     words.append(f"Saved processor time against all effects in full: about {exact}.")
     return words

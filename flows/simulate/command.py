@@ -37,8 +37,7 @@ PATCH, FACTOR = 16, 4  # of the shipped weights, so that scans are those of thei
 def run_simulate(settings: Settings, console: Console, *, coarse: bool = False) -> dict[str, Any]:
     """Scan a scene into an archive, with progress on ``console``; return the record that --json prints.
 
-    Raises BoundError: the omitted effects change the worst part of the scene by more than their bound. Raises
-    SettingsError, SceneError or ArchiveError: the scan cannot be made.
+    Raises SettingsError, SceneError or ArchiveError: the scan cannot be made.
     """
     keep_freed_memory()
     with console.status("opening the scene"):

@@ -18,7 +18,6 @@ from pipeline.simulator.rig_model import Coating, Rig
 from pipeline.simulator.scenes.daylight import knots_within, relative_daylight, sun_elevation_deg
 
 Floats = NDArray[np.float64]
-_KNOTS_AT_ONCE = 512
 EDGE_FRACTION = 0.1  # width of a shadow's edge, over the shadow's size (assumed)
 HOT_SPOT_RAD = float(np.deg2rad(2.0))  # from its peak to 1/e (assumed)
 _PROBES = 65  # lines of a sweep, samples of a line, and incidences that bounds are taken at
@@ -43,11 +42,8 @@ class Drift(Gain):
         if rig.sky.started is None:
             return Bound(0.0, "the survey has no time of day")
         seconds = probe.seconds + rig.camera.frame_ms * 1e-3  # to the end of the last line
-        worst = np.zeros(len(probe.wavelength_nm))
-        times = knots_within(rig.sky, seconds)
-        for some in np.array_split(times, len(times) // _KNOTS_AT_ONCE + 1):
-            change = relative_daylight(rig.sky, probe.wavelength_nm, some) - 1
-            worst = np.maximum(worst, np.abs(change).max(axis=0))
+        light = relative_daylight(rig.sky, probe.wavelength_nm, knots_within(rig.sky, seconds))
+        worst = np.abs(light - 1).max(axis=0)
         low, high = sun_elevation_deg(rig.sky, np.array([0.0, seconds]))
         duration = f"{seconds / 3600:.1f} h" if seconds >= 3600 else f"{seconds:.0f} s"
         course = f"with the sun from {low:.1f} to {high:.1f} deg in {duration}"
@@ -59,7 +55,7 @@ class Drift(Gain):
             return GainRange.between(1.0, 1.0, len(nm))
         times = knots_within(rig.sky, probe.seconds + rig.camera.frame_ms * 1e-3)
         light = relative_daylight(rig.sky, nm, times)
-        return GainRange.of(light, nm, uneven=float(np.ptp(light, axis=1).max(initial=0.0)))
+        return GainRange.of(light, uneven=float(np.ptp(light, axis=1).max(initial=0.0)))
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
         sky = block.rig.sky
@@ -287,7 +283,7 @@ class Polarisation(Gain):
         incidence, nm = _incidence(sweep_ends(probe, rig.camera)), np.asarray(probe.wavelength_nm, np.float64)
         if not incidence.size:
             return GainRange.between(1.0, 1.0, len(nm))
-        return GainRange.of(_factors_between(incidence, rig, nm), nm, uneven=0.0)
+        return GainRange.of(_factors_between(incidence, rig, nm), uneven=0.0)
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
         probes = ahead(block.sweep.swath_px, block.scan_px, block.rig.camera)

@@ -26,9 +26,6 @@ from pipeline.simulator.rig_model import MirrorMotion, Rig
 Floats = NDArray[np.float64]
 EXCEEDED = 1e-3  # probability that any line of a survey lies beyond the bound
 _MODES = 6
-ACCURACY_PX = 50.0  # 0.15 deg mechanical, as quoted by the vendor: systematic, unknown before registration
-REPEATABILITY_PX = 0.8  # 40 urad mechanical: anew for every line
-_MOST_DEVIATES = 6.0  # beyond, one line in 5e8 lies
 
 
 def end_gains(sweep: Sweep, camera: LineCamera) -> Floats:
@@ -200,47 +197,34 @@ class PointingErrors(Aim):
     """An aim of the chain, on wherever there is one: the mirror looks beside the places that it reports.
 
     Errors are in px of the scene along the line and the scan. Every sweep has an offset drawn evenly from
-    ``-offset_px`` to ``offset_px`` in either axis, and every line a normal deviate of ``jitter_px`` rms in either. Each
-    is drawn from a stream of its own, keyed (seed, sweep name) and (seed, sweep name, line number). So no line's error
-    depends on which others are computed.
+    ``-offset_px`` to ``offset_px`` in either axis, from a stream of its own, keyed (seed, sweep name).
     """
 
-    offset_px: float = ACCURACY_PX
-    jitter_px: float = REPEATABILITY_PX
+    offset_px: float
     seed: int = 0
     name = "pointing"
     cost_ns = MappingProxyType({"exact": 0.2})
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
-        return self.of_lines(block.sweep.name, block.lines)[:, None]
+        return np.tile(self.offset(block.sweep.name), (len(block.lines), 1, 1))
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound by slope times the greatest error in either axis: the offset, and six deviates of jitter."""
-        most = self.offset_px + _MOST_DEVIATES * self.jitter_px
+        """Bound by slope times the greatest error in either axis."""
+        most = self.offset_px
         why = f"the mirror looks up to {most:.2g} px beside along the line and {most:.2g} px along the scan"
         return Bound(probe.moved(*at_line_ends(probe.sweeps, rig.camera, most, most)), why)
 
     def offset(self, sweep_name: str) -> Floats:
         """Return the systematic error of a sweep, (2,) along the line and the scan [px]."""
-        return self._stream(sweep_name).uniform(-self.offset_px, self.offset_px, 2)
-
-    def of_lines(self, sweep_name: str, lines: range) -> Floats:
-        """Return the whole error of some lines of a sweep, (line, 2) along the line and the scan [px]."""
-        jitter = np.array([self._stream(sweep_name, number).standard_normal(2) for number in lines]).reshape(-1, 2)
-        return self.offset(sweep_name) + self.jitter_px * jitter
-
-    def _stream(self, sweep_name: str, *line: int) -> np.random.Generator:
-        key = np.random.SeedSequence(entropy=self.seed, spawn_key=(zlib.crc32(sweep_name.encode()), *line))
-        return np.random.Generator(np.random.Philox(key))
+        key = np.random.SeedSequence(entropy=self.seed, spawn_key=(zlib.crc32(sweep_name.encode()),))
+        return np.random.Generator(np.random.Philox(key)).uniform(-self.offset_px, self.offset_px, 2)
 
 
 JITTER, HYSTERESIS, THERMAL_DRIFT = Jitter(), Hysteresis(), ThermalDrift()
 
 
-EXACT, CENTRES = "exact", "centres"
+EXACT = "exact"
 MOST_PARTS = 8  # of an exposure; a jump of h px within a part goes unseen as a blur of at most h^2/32 px^2
-_SERIES_BELOW = 0.5  # of (1 + 2 zeta) tau; 20 terms then leave less than 1e-20
-_TERMS = 20
 _RAMP = 64  # steps of a line that are as good as a ramp
 
 
@@ -249,16 +233,16 @@ class Staircase(Aim):
     """Sample and hold with any number of positions per px of path. Off, each px of the path has its one position.
 
     The memory is played at a steady rate while lines are exposed, timed so that in the long run lines lie where they
-    are planned. ``exact`` gives the mean position in equal parts of the exposure: so many that no position changes
-    within a part, at most :data:`MOST_PARTS`. ``centres`` gives that of the whole exposure, or of each px of path.
+    are planned. It is the mean position in equal parts of the exposure: so many that no position changes within a part,
+    at most :data:`MOST_PARTS`.
     """
 
     name = "staircase"
-    cost_ns = MappingProxyType({EXACT: 27.0, CENTRES: 0.01})  # exact: five positions a line instead of one
+    cost_ns = MappingProxyType({EXACT: 27.0})  # five positions a line instead of one
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
         positions, held = block.rig.mirror.positions_per_line, block.sweep.positions
-        scan = beside_plan(positions, held, block.numbers, _parts(positions, held, variant))
+        scan = beside_plan(positions, held, block.numbers, _parts(positions, held))
         return np.stack([np.zeros_like(scan), scan], axis=-1)
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
@@ -266,7 +250,7 @@ class Staircase(Aim):
         positions = rig.mirror.positions_per_line
         if positions == 1 or not probe.sweeps:
             return Bound(0.0, "each px of the path has its one position")
-        mean, size, square = _moments(positions, probe.sweeps, variant)
+        mean, size, square = _moments(positions, probe.sweeps)
         both = np.zeros(probe.slope.shape)
         ends = [at_line_ends(probe.sweeps, rig.camera, 0.0, way) for way in (size, mean, square**0.5)]
         both[:] = np.square(ends[2])[:, None]
@@ -291,21 +275,19 @@ def beside_plan(positions: float, step: int, numbers: NDArray[np.int64], parts: 
     return middle + (0.5 - lag) / positions
 
 
-def _parts(positions: float, step: int, variant: str) -> int:
+def _parts(positions: float, step: int) -> int:
     """Return how many equal parts an exposure has; positions a / b change at multiples of 1 / a of it."""
-    if variant == CENTRES or step > 1:
+    if step > 1:
         return 1
     ratio = Fraction(positions).limit_denominator(1000)
     return min(ratio.numerator, MOST_PARTS) if abs(ratio - Fraction(positions)) < 1e-9 else MOST_PARTS
 
 
-def _moments(positions: float, sweeps: tuple[Sweep, ...], variant: str) -> tuple[float, float, float]:
+def _moments(positions: float, sweeps: tuple[Sweep, ...]) -> tuple[float, float, float]:
     worst = np.zeros(3)
     for step in {sweep.positions for sweep in sweeps}:
         numbers = np.arange(max(sweep.lines for sweep in sweeps if sweep.positions == step))
-        ways = beside_plan(positions, step, numbers, _parts(positions, step, EXACT))
-        if variant == CENTRES:
-            ways = ways - (ways.mean(axis=1, keepdims=True) if step == 1 else ways)
+        ways = beside_plan(positions, step, numbers, _parts(positions, step))
         size = np.abs(ways).mean(axis=1)
         # Ways of the several px of a line meet slopes of their own: they do not cancel.
         mean = np.abs(ways.mean(axis=1)) if step == 1 else size
@@ -369,8 +351,8 @@ def responses(time: Floats, damping: float) -> tuple[Floats, Floats]:
     """Return the responses to a unit impulse and to a unit step, of a system with natural frequency 1 rad/s.
 
     ``time`` (...) is times that frequency, from 0 on [rad]. With g the first and h the second, the matrix exponential
-    of the free system is [[1 - h, g], [-g, 1 - h - 2 zeta g]]. Computed by expm1 and sinc, it is accurate below, at and
-    above damping 1.
+    of the free system is [[1 - h, g], [-g, 1 - h - 2 zeta g]]. Computed by expm1 and sinc, it is right to 1e-15 below,
+    at and above damping 1.
     """
     with np.errstate(under="ignore"):
         if damping <= 1:
@@ -383,18 +365,7 @@ def responses(time: Floats, damping: float) -> tuple[Floats, Floats]:
             apart, decay = 2 * root * time, np.exp(-slow * time)
             impulse = decay * time * np.where(apart > 0, -np.expm1(-apart) / np.where(apart > 0, apart, 1.0), 1.0)
             rest = decay + slow * impulse
-    early = time * (1 + 2 * damping) < _SERIES_BELOW
-    return impulse, np.where(early, _early_rise(np.where(early, time, 0.0), damping), 1 - rest)
-
-
-def _early_rise(time: Floats, damping: float) -> Floats:
-    """Return the step response by its Taylor series, from h'' + 2 zeta h' + h = 1, where 1 - rest would cancel."""
-    before, term = np.zeros_like(time), time**2 / 2
-    total = term.copy()
-    for order in range(3, _TERMS):
-        before, term = term, -(2 * damping * time * term + time**2 / (order - 1) * before) / order
-        total += term
-    return total
+    return impulse, 1 - rest
 
 
 def _at_start(mirror: MirrorMotion, sweep: Sweep, period: float, held: float) -> Floats:

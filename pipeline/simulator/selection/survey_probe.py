@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_normal, scene_to_direction
-from pipeline.geometry.scan import CostModel, Sweep, exposing, points_of_scan, scene_to_sweep
+from pipeline.geometry.scan import CostModel, Sweep, exposing, scene_to_sweep
 from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.effect import OFF
 from pipeline.simulator.effects.line import BOXES, SLIT, UPRIGHT, box_of
@@ -38,9 +38,7 @@ _LEAST_SUMS = 16  # of a line
 _LEAST_OF_SWEEP = 50
 _LEAST_PLACES = 24  # where samples are summed, however many samples that takes
 _BESIDE = 2  # samples to either side of a place; of sums, one
-_LINES_AT_ONCE = 256
 _PROBE, _CLOSE = (2, 1), (3, 1)  # boxes of the probe, and boxes that find where variants differ
-_ALIKE = 0.02  # fraction by which blurs may differ and count as one
 _ROUNDING = 2e-6  # of the level: less is rounding of float32
 _NEAR, _FAR = 0.25, 0.5  # px by which the footprint is shifted
 _STILL: Way = (0.0, 0.0)
@@ -93,7 +91,7 @@ def probe_scene(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Uni
     views = joined([lines, views_of_places(places, scene, camera, taken)])
     seen = light_seen(scene, camera, views, _footprint(SLIT.variants[0], rig, _PROBE, None, scene), SHIFTS)
     found = replace(
-        sum_up_light(seen, scene, rig, taken, unit, line_means(scene, camera, taken)),
+        sum_up_light(seen, scene, rig, taken, unit),
         places=places,
         slit_errors=_slit_errors(scene, rig, views, taken, unit),
     )
@@ -270,40 +268,8 @@ def _rays_of(views: SampleViews, camera: LineCamera, turned: Way) -> RayViews:
     return exact_views(normal, turned[1] * ifov, views.slope + turned[0] * ifov)
 
 
-def line_means(scene: RasterScene, camera: LineCamera, sweeps: Sequence[Sweep]) -> Radiance:
-    """Return the mean over samples and bands of lines in the sweeps' strips, over all of the scene, (position,) [e-].
-
-    Means are those of the pixels that middle rays meet. A slit, and positions that one line holds, give means between
-    these. Positions continue beyond a sweep's ends, and beyond the scene, as far as the slit reaches.
-    """
-    spectra = scene.electrons * np.float32(camera.exposure_ms / DEFAULT_EXPOSURE_MS)
-    mean = spectra / spectra.shape[0] if spectra.ndim == 1 else spectra.mean(axis=1)
-    grey = (scene.planes.reshape(-1, scene.planes.shape[2]) @ mean.astype(np.float32)).reshape(scene.shape)
-    beyond, found = np.ceil(camera.slit_px / 2 + 1), []
-    for along_y, swath, start, stop in sorted({_held_range(sweep, scene.shape) for sweep in sweeps if sweep.lines}):
-        pixels, middle = (grey.T if along_y else grey), (np.array(scene.shape) - 1) / 2
-        down, right = middle[::-1] if along_y else middle
-        held = np.arange(start - beyond, stop + beyond)
-        for first in range(0, len(held), _LINES_AT_ONCE):
-            some = held[first : first + _LINES_AT_ONCE]
-            along, scan = points_of_scan(swath, camera, some[:, None], camera.pixel_slopes())
-            row = np.rint(scan + down).clip(0, pixels.shape[0] - 1).astype(np.intp)
-            column = np.rint(along + right).clip(0, pixels.shape[1] - 1).astype(np.intp)
-            found.append(pixels[row, column].mean(axis=1))
-    return np.concatenate(found)
-
-
-def _held_range(sweep: Sweep, shape: tuple[int, int]) -> tuple[bool, float, float, float]:
-    """Return orientation, swath, and the held positions from start to stop, extended to the scene's ends [px]."""
-    half, stop = shape[1 if sweep.along == "y" else 0] / 2, sweep.start_px + sweep.lines * sweep.step
-    before, after = max(np.ceil(sweep.start_px + half), 0.0), max(np.ceil(half - stop), 0.0)
-    return sweep.along == "y", sweep.swath_px, sweep.start_px - before, stop + after
-
-
-def sum_up_light(
-    seen: Radiance, scene: RasterScene, rig: Rig, sweeps: tuple[Sweep, ...], unit: Unit, means: Radiance
-) -> Probe:
-    """Return the maxima of light (shift, view, band) [e-]; ``means`` (line,) are the means of lines [e-]."""
+def sum_up_light(seen: Radiance, scene: RasterScene, rig: Rig, sweeps: tuple[Sweep, ...], unit: Unit) -> Probe:
+    """Return the maxima of light (shift, view, band) [e-]; means of lines lie between the least and the greatest."""
     camera, binning, nm = rig.camera, sweeps[0].binning, np.asarray(scene.wavelength_nm, np.float64)
     least, most = seen.min(axis=0), seen.max(axis=0)
     darkest, brightest = stored_mean(least, binning), stored_mean(most, binning)
@@ -329,7 +295,7 @@ def sum_up_light(
         wavelength_nm=scene.wavelength_nm,
         fwhm_nm=scene.fwhm_nm,
         level=_greatest(level),
-        spread=greatest(np.maximum(most - means.min(), means.max() - least), high),
+        spread=greatest(np.maximum(most - low.min(), high.max() - least), high),
         span=greatest(np.maximum(most - low, high - least), np.maximum(np.abs(low), np.abs(high))),
         slope=slope,
         curvature=curvature,
@@ -341,7 +307,6 @@ def sum_up_light(
         lines=sum(sweep.lines for sweep in sweeps),
         seconds=CostModel().seconds(list(sweeps), camera),
         white_e=scene.white_reference_electrons.astype(np.float64) * (camera.exposure_ms / DEFAULT_EXPOSURE_MS),
-        own_e=np.stack([low, high]).astype(np.float64),
         binning=binning,
     )
 
@@ -373,11 +338,7 @@ def _greatest(values: NDArray[np.floating]) -> Floats:
 
 
 def worst_of_groups(probe: Probe) -> Probe:
-    """Return the probe with the worst of each group of neighbouring bands in all of them: one was looked at for each.
-
-    Lights of the groups are the least and the greatest of any of their bands. A level of one band and the span of
-    another do not give the least light of a third.
-    """
+    """Return the probe with the worst of each group of neighbouring bands in all of them."""
     groups = band_groups(len(probe.wavelength_nm))
 
     def worst(values: Floats) -> Floats:
@@ -385,8 +346,7 @@ def worst_of_groups(probe: Probe) -> Probe:
         return np.concatenate([np.broadcast_to(one.max(axis=-1, keepdims=True), one.shape) for one in parts], axis=-1)
 
     values: dict[str, Any] = {name: worst(getattr(probe, name)) for name in _BY_BAND}
-    assert probe.own_e is not None
-    return replace(probe, **values, own_e=np.stack([-worst(-probe.own_e[0]), worst(probe.own_e[1])]))
+    return replace(probe, **values)
 
 
 def _slit_errors(
@@ -394,23 +354,16 @@ def _slit_errors(
 ) -> dict[str, float]:
     """Return the greatest change by every variant of the slit, and by leaving it out, over the unit.
 
-    It is against the finest variant, with all of the rig's blurs.
+    It is against the finest variant, with the rig's blurs.
     """
     rough = _roughest(scene, rig, views, unit)
     views = views.chosen((rough[:, None] * views.binning + np.arange(views.binning)).ravel())
-    errors = dict.fromkeys((*SLIT.variants[1:], OFF), 0.0)
-    for moments in _blurs(rig, scene.wavelength_nm, sweeps):
-        boxes = {variant: _footprint(variant, rig, BOXES[variant], moments, scene) for variant in SLIT.variants}
-        parted, alike = boxes[SLIT.variants[0]].by_parts()
-        sharp = light_seen(scene, rig.camera, views, parted, _PHASES)
-        finest = sharp if alike is None else sharp + light_seen(scene, rig.camera, views, alike, _PHASES)
-        scale = unit_at(_stored(finest, views), rig, unit, views.binning)
-        for variant in SLIT.variants[1:]:
-            change = _changes(scene, rig, views, boxes[variant].by_parts()[0], sharp, scale)
-            errors[variant] = max(errors[variant], float(change.max(initial=0.0)))
-        off = _changes(scene, rig, views, _footprint(OFF, rig, (1, 1), moments, scene), finest, scale)
-        errors[OFF] = max(errors[OFF], float(off.max(initial=0.0)))
-    return errors
+    moments = _least_blurs(rig, scene.wavelength_nm, sweeps)
+    boxes = {one: _footprint(one, rig, BOXES.get(one, (1, 1)), moments, scene) for one in (*SLIT.variants, OFF)}
+    finest = light_seen(scene, rig.camera, views, boxes.pop(SLIT.variants[0]), _PHASES)
+    scale = unit_at(_stored(finest, views), rig, unit, views.binning)
+    changes = {one: _changes(scene, rig, views, box, finest, scale) for one, box in boxes.items()}
+    return {one: float(change.max(initial=0.0)) for one, change in changes.items()}
 
 
 def _roughest(scene: RasterScene, rig: Rig, views: SampleViews, unit: Unit) -> NDArray[np.intp]:
@@ -444,18 +397,14 @@ def _footprint(
     return fold(box_of(variant, rig), parts, 1, blurs)
 
 
-def _blurs(rig: Rig, wavelength_nm: Floats, sweeps: Sequence[Sweep]) -> list[Moments]:
-    """Return all blurs and shifts of the rig's optics in the sweeps where they are least and most.
-
-    One where both agree.
-    """
-    normals = [middle_normal(sweep, rig.camera) for sweep in sweeps]
-    all_blurs = [[blur.moments(rig, wavelength_nm, blur.variants[0], one) for blur in _OPTICS] for one in normals]
-    found = [Moments.together(blurs, len(wavelength_nm)) for blurs in all_blurs]
-    sizes = [one.spread if one.waves is None else one.spread + one.waves**2 for one in found]
-    order = sorted(range(len(found)), key=lambda number: float(sizes[number].sum()))
-    least, most = order[0], order[-1]
-    return [found[least]] if np.allclose(sizes[least], sizes[most], rtol=_ALIKE) else [found[least], found[most]]
+def _least_blurs(rig: Rig, wavelength_nm: Floats, sweeps: Sequence[Sweep]) -> Moments:
+    """Return all blurs and shifts of the rig's optics in the sweep where they are least: others hide more."""
+    found = []
+    for sweep in sweeps:
+        normal = middle_normal(sweep, rig.camera)
+        blurs = [blur.moments(rig, wavelength_nm, blur.variants[0], normal) for blur in _OPTICS]
+        found.append(Moments.together(blurs, len(wavelength_nm)))
+    return min(found, key=lambda one: float((one.spread + (0.0 if one.waves is None else one.waves**2)).sum()))
 
 
 def _stored(values: Radiance, views: SampleViews) -> Radiance:
