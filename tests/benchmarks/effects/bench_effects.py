@@ -14,8 +14,7 @@ from measure import Row, Timing, ratio, time_in_turn
 
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.effect import Effect, Radiance, SweepBlock
-from pipeline.simulator.effects.line import ROTATION, SLIT
-from pipeline.simulator.effects.probe import Probe, noise_electrons
+from pipeline.simulator.effects.probe import noise_electrons
 from pipeline.simulator.readout import read_out
 from pipeline.simulator.render import EFFECTS, expected_light
 from pipeline.simulator.rig_model import Air, Rig
@@ -23,7 +22,6 @@ from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from pipeline.simulator.selection.choice import Decision, decide
 from pipeline.simulator.selection.survey_probe import probe_scene
-from pipeline.simulator.selection.verification import candidate_blocks, verify, worst_blocks
 from tests.benchmarks.effects.bench_simulator import cheap_effects
 from tests.pipeline.simulator.bound_trials import DRAWN, Trial, trials
 from tests.pipeline.simulator.pupil_reference import distances, random_tile
@@ -37,7 +35,6 @@ MOST_LOOSE = 6.0  # median of bound over measured change
 MOST_BINNING = 8  # every case is stored as samples, and in sums of 2 to so many
 TOLERANCE = 0.1
 LEAST_SAVED = 3.0
-FOOTPRINT = {ROTATION: ROTATION.variants[0], SLIT: SLIT.variants[1]}
 LINES = range(504, 520)  # of the farm's sweeps that are timed
 RIGS = {"rig at rest": Rig(), "rig 30 m away": Rig(air=Air(distance_m=30.0))}
 
@@ -125,7 +122,7 @@ def _of_rig(scene: RasterScene, name: str, rig: Rig, sweeps: tuple[Sweep, ...]) 
         _tolerance_row(name, apart, decision),
         _cpu_row(name, "cheap", clocks, apart["cheap"]),
         _cpu_row(name, "exact", clocks, 0.0),
-        _verified(scene, name, decision, probe, f"probe {probed:.1f} s, choice {decided:.2f} s"),
+        Row(f"farm, {name}: probe and choice of effects, processor time", f"{probed:.1f} s and {decided:.2f} s"),
         Row(f"farm, {name}: on", ", ".join(f"{one.name}" for one in decision.taken if one.is_on)),
     ]
 
@@ -165,25 +162,4 @@ def _cpu_row(name: str, against: str, clocks: Mapping[str, Timing], apart: float
         f">= {LEAST_SAVED:g} times less" if goal else "",
         ratio(clocks, against, "auto") >= LEAST_SAVED if goal else None,
         f"auto {ns['auto']:.1f}, everything {ns[against]:.1f} ns/px*band, readout included",
-    )
-
-
-def _verified(scene: RasterScene, name: str, decision: Decision, probe: Probe, before: str) -> Row:
-    rig, clock = RIGS[name], time.process_time()
-
-    def units(light: Radiance, binning: int) -> Radiance:
-        return noise_electrons(light, rig, binning)
-
-    whole = [_block(scene, rig, sweep, range(sweep.lines)) for sweep in probe.sweeps]
-    chips = worst_blocks(
-        candidate_blocks(whole, probe.places), lambda chip: expected_light(scene, chip, FOOTPRINT), units
-    )
-    range_e = probe.brightest_e - probe.darkest_e
-    measured = verify(decision, lambda chip, chosen: expected_light(scene, chip, chosen), chips, units, range_e)
-    spent = time.process_time() - clock
-    worst = max(measured.values())
-    return Row(
-        f"farm, {name}: verification of the choice, processor time",
-        f"{spent:.1f} s, {worst:.2g} sigma",
-        peers=f"{before}; {len({(chip.sweep.name, chip.lines) for chip in chips.values()})} chips",
     )

@@ -181,9 +181,9 @@ def test_no_scan_waits_for_torch(tmp_path: Path) -> None:
     assert ended.returncode == 0, ended.stderr
 
 
-ROW = {"name": "smile", "state": "on", "variant": "cubic", "bound": 0.0, "measured": None, "cost_s": 0.004, "why": ""}
+ROW = {"name": "smile", "state": "on", "variant": "cubic", "bound": 0.0, "cost_s": 0.004}
 ROW |= {"reason": "needed", "left_out": 1.4, "magnitude": "smile: 0.3 nm", "unit": "sigma"}
-TOTAL = {"asked": "auto", "tolerance": 0.1, "unit": "sigma", "bound": 0.0, "measured": 0.0, "within": True}
+TOTAL = {"asked": "auto", "tolerance": 0.1, "unit": "sigma", "bound": 0.0, "within": True}
 TOTAL |= {"on": 1, "off": 1, "saved_s": 1.0}
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.effect import OFF, Bound, Radiance, SweepBlock
-from pipeline.simulator.effects.probe import Probe
+from pipeline.simulator.effects.probe import GainRange, Probe
 from pipeline.simulator.rig_model import Rig
 
 SWEEP = Sweep("fine-0", "fine", "x", 0.0, -50.0, 100)
@@ -43,6 +43,9 @@ class Brightening(MadeUp):
     """Light times 1 + ``fraction``; ``left_out`` is what its bound says, right or not."""
 
     fraction: float = 0.0
+
+    def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
+        return GainRange.between(1 - self.left_out, 1 + self.left_out, len(probe.wavelength_nm))
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
         return np.full((1, 1, 1), 1 + self.fraction, np.float32)

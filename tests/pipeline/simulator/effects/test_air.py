@@ -16,9 +16,9 @@ from pipeline.simulator.effects.air import PARALLAX, TURBULENCE, WIND, closeness
 from pipeline.simulator.effects.effect import SweepBlock, survey_stream
 from pipeline.simulator.rig_model import Air, Rig
 from tests.pipeline.geometry.test_second_order import relief_error
-from tests.pipeline.simulator.fine_image import IMAGES, SWEEP, change, probe_of, shifted
+from tests.pipeline.simulator.made_up_effects import steep_probe
 
-LONG = replace(SWEEP, lines=3000, start_px=-1500.0)
+LONG = Sweep("long", "fine", "x", 0.0, -1500.0, 3000)
 
 
 def rig_at(distance_m: float | None, **air: float) -> Rig:
@@ -56,7 +56,7 @@ def test_size_by_the_structure_function():
 
 def test_strong_turbulence_is_said():
     """The law is of weak turbulence: where it is strong the manifest calls it a guess. 0.5 1e-12 k^(7/6) 300^(11/6)."""
-    probe, strong = probe_of(IMAGES["edges"]()), rig_at(300.0, turbulence_cn2=1e-12)
+    probe, strong = steep_probe((1.0, 1.0)), rig_at(300.0, turbulence_cn2=1e-12)
     k = 2 * np.pi / 550e-9
     assert rytov_variance(strong, 550.0) == pytest.approx(0.5e-12 * k ** (7 / 6) * 300 ** (11 / 6))
     assert "beyond weak turbulence (Rytov variance" in TURBULENCE.bound(probe, strong).why
@@ -72,22 +72,11 @@ def test_statistics():
     assert np.abs(np.corrcoef(both.T) - np.eye(4)).max() < 0.06
 
 
-def test_bound_holds_and_is_near():
-    """The line that strays farthest in each of 20 surveys changes no number by more than the bound, nor far less."""
-    image, rig = IMAGES["both"](), rig_at(300.0)
-    bound = TURBULENCE.bound(probe_of(image, lines=100), rig).value
-    surveys = [drawn(range(100), seed) for seed in range(20)]
-    worst = [jitter[np.argmax(np.hypot(*jitter.T))] for jitter in surveys]
-    measured = [change(image, shifted(*way)) for way in worst]
-    assert max(measured) <= bound
-    assert bound / 6 < np.median(measured)
-
-
 def test_risk_of_the_bound():
     """Of 20,000 surveys of 50 lines, about 20 have a line beyond the way that the bound allows."""
     rng = np.random.default_rng(3)
     ways = np.hypot(*rng.standard_normal((2, 20_000, 50))).max(axis=1)
-    ramp = replace(probe_of(IMAGES["edges"](), lines=50), slope=np.array([[0.0], [1.0]]), span=np.array([np.inf]))
+    ramp = steep_probe((0.0, 1.0), span=np.inf, lines=50)
     allowed = TURBULENCE.bound(ramp, rig_at(300.0)).value / turbulence_px(rig_at(300.0))
     assert 8 <= np.count_nonzero(ways > allowed) <= 34
 
