@@ -20,7 +20,6 @@ from pipeline.simulator.effects.counting import (
     READ_NOISE,
     SATURATION,
     SHOT,
-    dark_electrons,
     dead_elements,
     divergence,
     hot_electrons,
@@ -145,12 +144,6 @@ def test_quantisation_is_half_a_dn() -> None:
 def test_warmth_by_hand(deg_c: float, factor: float) -> None:
     """Worked with a pocket calculator: at -80 deg C (193.15 / 298.15)^1.5 exp(21.629 - 34.114) = 1.97e-6."""
     assert warmth(deg_c) == pytest.approx(factor, rel=3e-3)
-
-
-def test_the_stated_rate_is_that_of_25_deg_c() -> None:
-    """200 e-/s there: 20 e- in 100 ms, exactly; at 33.4 deg C twice as many."""
-    assert dark_electrons(Rig()) == 20.0
-    assert dark_electrons(Rig(detector=Detector(temperature_deg_c=33.4))) == pytest.approx(40, rel=0.02)
 
 
 @pytest.mark.parametrize("deg_c", [-80.5, 51.0])

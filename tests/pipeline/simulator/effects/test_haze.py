@@ -47,15 +47,6 @@ def test_an_object_at_the_visibility_keeps_2_percent_of_its_contrast(visibility_
     assert math.exp(-beta * visibility_km * 1e3) == pytest.approx(0.02, rel=3e-4)
 
 
-@given(st.floats(0.05, 1e4), st.floats(1.0, 2.0))
-def test_clearer_air_takes_no_more(visibility_km: float, times: float) -> None:
-    """At any wavelength, and never less than its molecules; it falls with wavelength."""
-    hazy, clear = (extinction_per_m(Air(visibility_km=km), WAVELENGTH) for km in (visibility_km, visibility_km * times))
-    assert (clear <= hazy * (1 + 1e-12)).all()
-    assert (clear >= rayleigh_per_m(WAVELENGTH)).all()
-    assert (np.diff(hazy) < 0).all()
-
-
 def test_endless_air_is_the_horizon() -> None:
     """At infinity every scene is the horizon: 0.3 of the white reference."""
     rig = rig_with(Air(math.inf))
@@ -123,16 +114,6 @@ def test_oxygen_is_spectrl2s() -> None:
     scattered = np.exp(-1 / (micron**4 * (115.6406 - 1.3366 / micron**2)))  # Rayleigh, Eq. 2-4
     passed = transmission(np.array([AIR_MASS_M]), replace(SHARP, air=Air(vapour_g_per_m3=0.0)), nm[known])[0]
     np.testing.assert_allclose(passed, through[known] / scattered, rtol=2e-3)
-
-
-def test_bands_smooth_the_line() -> None:
-    """The wider the band, the less of oxygen's depth it sees at 762.5 nm; the window at 870 nm passes all."""
-    depth = [
-        1 - transmission(np.array([300.0]), Rig(optics=Optics(fwhm_nm=fwhm)), np.array([762.5, 870.0]))[0]
-        for fwhm in (0.0, 6.0, 40.0)
-    ]
-    assert depth[0][0] > depth[1][0] > depth[2][0] > 0
-    assert max(one[1] for one in depth[:2]) < 1e-3
 
 
 def test_limits() -> None:

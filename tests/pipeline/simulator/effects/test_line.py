@@ -11,7 +11,7 @@ from pipeline.geometry.camera import LineCamera, footprint_kernel
 from pipeline.geometry.mirror import line_rotation, position_to_direction
 from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.simulator.effects.effect import SweepBlock
-from pipeline.simulator.effects.line import BOXES, ROTATION, SLIT, SMEAR, box_of, folded_positions, smeared_positions
+from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR, smeared_positions
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.selection.survey_probe import probe_scene
@@ -21,13 +21,6 @@ from tests.pipeline.simulator.small_scenes import image_scene
 
 RIG = Rig(camera=LineCamera(samples=64))
 SWEEP = Sweep("s", "fine", "x", swath_px=0.0, start_px=-14.5, lines=30)
-
-
-def test_every_variant_of_the_slit_has_its_boxes() -> None:
-    """The exact variant has 27 boxes, off is one without any width."""
-    assert BOXES == {"9x3": (9, 3), "5x2": (5, 2), "3x1": (3, 1), "1x1": (1, 1)}
-    assert tuple(BOXES) == SLIT.variants
-    assert box_of("off", RIG) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("variant", SLIT.variants)
@@ -55,16 +48,6 @@ def test_slit_of_no_width_sees_what_a_pixel_sees() -> None:
     block = SweepBlock(narrow, SWEEP, range(30), scene.wavelength_nm, scene.shape)
     lights = [expected_light(scene, block, {SLIT: variant}) for variant in SLIT.variants]
     np.testing.assert_allclose(lights, [lights[0]] * len(lights), atol=1e-3 * np.ptp(lights[0]))
-
-
-@pytest.mark.parametrize("step", [1, 2, 8])
-def test_positions_are_held_by_the_mirror_or_the_footprint(step: int) -> None:
-    """All positions of an exposure stand for it, or one in whose footprint they are."""
-    sweep = Sweep("s", "coarse", "x", swath_px=0.0, start_px=0.0, lines=4, step=step)
-    block = SweepBlock(RIG, sweep, range(4), np.array([550.0]), (30, 60))
-    found = {variant: smeared_positions(block, variant).shape[1] for variant in ("off", *SMEAR.variants)}
-    assert found == {"off": 1, "positions": step, "folded": 1}
-    assert [folded_positions(sweep, variant) for variant in ("off", "positions", "folded")] == [1, 1, step]
 
 
 def test_no_smear_where_every_line_has_one_position() -> None:

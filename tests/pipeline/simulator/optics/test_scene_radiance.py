@@ -146,12 +146,3 @@ def test_rows_are_mixed_alike_wherever_they_stand(nodes: int, bands: int) -> Non
     np.testing.assert_array_equal(light, np.broadcast_to(light[:1], light.shape))
     wanted = np.einsum("jk,kc,jb,cb->b", fractions, one[:, 0], between, spectra)
     np.testing.assert_allclose(light[0], wanted, rtol=1e-5)
-
-
-def test_bands_between_other_nodes_are_left_out_of_products() -> None:
-    """Where bands follow their nodes each product takes two of these, and no band is made twice."""
-    place = np.linspace(0, 4, 200)
-    between = np.stack([np.interp(place, np.arange(5), one) for one in np.eye(5)])
-    products = _Mixing.of(np.eye(5, dtype=np.float32), between, np.ones((3, 200), np.float32)).products
-    assert [one.nodes for one in products] == [slice(first, first + 2) for first in range(4)]
-    assert [one.bands.stop for one in products] == [*(one.bands.start for one in products[1:]), 200]
