@@ -67,12 +67,10 @@ class Turbulence(Aim):
         farthest = sigma * math.sqrt(2 * math.log(max(probe.lines, 1) / RISK))
         steep = np.hypot(*probe.slope)
         change = float(np.minimum(steep * farthest, probe.span).max(initial=0.0))
-        strength = rytov_variance(rig, float(np.min(probe.wavelength_nm, initial=np.inf)))
-        beyond = f"; a guess, beyond weak turbulence (Rytov variance {strength:.2g})" if strength > 1 else ""
         return Bound(
             change,
             f"{sigma:.2g} px (sd) per line, at most {farthest:.2g} px in {probe.lines} lines,"
-            f" on edges of at most {steep.max(initial=0.0):.3g} {UNITS[probe.unit]}/px{beyond}",
+            f" on edges of at most {steep.max(initial=0.0):.3g} {UNITS[probe.unit]}/px",
         )
 
 
@@ -82,19 +80,13 @@ def turbulence_px(rig: Rig) -> float:
     In spherical waves air near the point tilts them less than air near the aperture, by (z / d)^(5/3) a length of way.
     So 3/8 of a plane wave's 2.91 are left [1]. D is the aperture as seen at rest, 10.6 mm of 15. It is valid for
     Kolmogorov's spectrum with one Cn2 all along the way, and D between inner and outer scale. The Fresnel width
-    sqrt(lambda d) must not be much wider than D. Turbulence must be weak (`rytov_variance` up to 1). Returns 0 without
+    sqrt(lambda d) must not be much wider than D. Turbulence must be weak. Returns 0 without
     a distance; no way is longer than `FARTHEST_M`.
     """
     metres = _way_m(rig)
     aperture_m = rig.optics.aperture_mm * 1e-3 * _REST
     angle = math.sqrt(NEAR_POINTS * PLANE * rig.air.turbulence_cn2 * metres * aperture_m ** (-1 / 3))
     return angle / rig.camera.ifov_rad
-
-
-def rytov_variance(rig: Rig, wavelength_nm: float) -> float:
-    """Return the variance of the light's logarithm in spherical waves by turbulence, 0.5 Cn2 k^(7/6) d^(11/6) [1]."""
-    waves_per_m = 2 * math.pi / (wavelength_nm * 1e-9)
-    return float(0.5 * rig.air.turbulence_cn2 * waves_per_m ** (7 / 6) * _way_m(rig) ** (11 / 6))
 
 
 def _way_m(rig: Rig) -> float:

@@ -20,7 +20,7 @@ from pipeline.simulator.scenes.daylight import knots_within, relative_daylight, 
 Floats = NDArray[np.float64]
 EDGE_FRACTION = 0.1  # width of a shadow's edge, over the shadow's size (assumed)
 HOT_SPOT_RAD = float(np.deg2rad(2.0))  # from its peak to 1/e (assumed)
-_PROBES = 65  # lines of a sweep, samples of a line, and incidences that bounds are taken at
+_PROBES = 65  # incidences that bounds are taken at
 
 
 @dataclass(frozen=True)
@@ -123,22 +123,20 @@ class Brdf(Gain):
     cost_ns = MappingProxyType({"angles": 0.2})
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound by level times the greatest change: the slope at the largest angle, the hot spot at the least phase."""
+        """Bound by level times the greatest change: the slope at the largest angle, and the hot spot's peak."""
         slope, hot = rig.sky.brdf_per_rad, rig.sky.hot_spot
         if slope == 0 and hot == 0:
             return Bound(0.0, "the scene reflects alike in all directions")
-        angle, phase = _extremes(probe.sweeps, rig.camera)
-        fraction = slope * angle + hot * float(np.exp(-phase / HOT_SPOT_RAD))
+        angle = _greatest_angle(probe.sweeps, rig.camera)
+        fraction = slope * angle + hot
         peak = f" and a hot spot of {hot:.2g}" if hot else ""
         why = f"reflectance changes by at most {fraction:.2%}: {slope:.2g}/rad up to {np.rad2deg(angle):.2f} deg{peak}"
         return Bound(probe.scaled(fraction), why)
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
-        slope, bands = rig.sky.brdf_per_rad, len(probe.wavelength_nm)
-        angle, phase = _extremes(probe.sweeps, rig.camera)
-        least = max(1 - slope * angle, 0.0)
-        greatest = 1 + slope * angle + rig.sky.hot_spot * float(np.exp(-phase / HOT_SPOT_RAD))
-        return GainRange.between(least, greatest, bands, uneven=greatest - least)
+        change = rig.sky.brdf_per_rad * _greatest_angle(probe.sweeps, rig.camera)
+        least, greatest = max(1 - change, 0.0), 1 + change + rig.sky.hot_spot
+        return GainRange.between(least, greatest, len(probe.wavelength_nm), uneven=greatest - least)
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
         """Return 1 + b a + h exp(-phase / 2 deg) of each sample's direction, (line, sample, 1), at least 0."""
@@ -154,17 +152,14 @@ def _angles(sweep: Sweep, camera: LineCamera, scan_px: Floats, slopes: Floats) -
     return np.arctan(x * camera.ifov_rad), np.arctan(np.hypot(along, scan) * camera.ifov_rad)
 
 
-def _extremes(sweeps: tuple[Sweep, ...], camera: LineCamera) -> tuple[float, float]:
-    """Return the greatest angle from the undeflected direction and least phase within the sweeps [rad]."""
-    greatest, least = 0.0, np.inf
-    for sweep in (sweep for sweep in sweeps if sweep.lines):
-        ends = [np.linspace(0, count - 1, _PROBES).round().astype(int) for count in (sweep.lines, camera.samples)]
-        lines, samples = map(np.unique, ends)
-        angle, phase = _angles(sweep, camera, sweep.line_px()[lines], camera.pixel_slopes()[samples])
-        steps = [np.abs(np.diff(phase, axis=axis)).max(initial=0.0) for axis in (0, 1)]
-        greatest = max(greatest, float(np.abs(angle).max()))
-        least = min(least, float(phase.min() - sum(steps) / 2))  # no point is further from one looked at
-    return greatest, max(least, 0.0)
+def _greatest_angle(sweeps: tuple[Sweep, ...], camera: LineCamera) -> float:
+    """Return the greatest angle of view along the scene's x axis at the ends of lines within the sweeps [rad]."""
+    angles = [
+        np.abs(_angles(sweep, camera, sweep.line_px(), camera.pixel_slopes()[[0, -1]])[0]).max()
+        for sweep in sweeps
+        if sweep.lines
+    ]
+    return float(max(angles, default=0.0))
 
 
 DRIFT, CLOUD, BRDF = Drift(), Cloud(), Brdf()

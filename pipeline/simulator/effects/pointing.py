@@ -80,20 +80,16 @@ class Jitter(Aim):
         sigma, lines = _sigma_px(rig), probe.lines
         if sigma == 0 or lines == 0:
             return Bound(0.0, "the mirror comes back to the same tilt")
-        worst = np.zeros(3)
+        worst = np.zeros(2)
         for sweep in probe.sweeps:
             if sweep.lines:
                 tilt = tilt_to_scene(position_to_normal(line_positions(sweep, rig.camera)))
                 gain = end_gains(sweep, rig.camera) @ tilt[:, None]
-                size = np.sqrt((gain**2).sum(axis=-1))
-                common = np.abs((gain[..., 0, :] * gain[..., 1, :]).sum(axis=-1)) / size.prod(axis=-1)
-                worst = np.maximum(worst, [size[..., 0].max(), size[..., 1].max(), common.max()])
-        along, scan, common = float(worst[0]), float(worst[1]), float(worst[2])
+                worst = np.maximum(worst, np.sqrt((gain**2).sum(axis=-1)).max(axis=(0, 1)))
+        along, scan = (sigma * worst).tolist()
         most = math.sqrt(2 * math.log(lines / EXCEEDED))
-        g, h = probe.slope[0] * along, probe.slope[1] * scan
-        value = np.minimum(most * sigma * np.sqrt(g * g + h * h + 2 * common * g * h), probe.span).max(initial=0.0)
-        why = f"lines jump by {sigma * scan:.2f} px rms along the scan and {sigma * along:.2f} along the line"
-        return Bound(float(value), f"{why}, one of {lines} by {most:.1f} times that")
+        why = f"lines jump by {scan:.2f} px rms along the scan and {along:.2f} along the line"
+        return Bound(probe.moved(most * along, most * scan), f"{why}, one of {lines} by {most:.1f} times that")
 
 
 def tilt_to_scene(normals: Floats) -> Floats:
@@ -246,16 +242,17 @@ class Staircase(Aim):
         return np.stack([np.zeros_like(scan), scan], axis=-1)
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound by what a shift of the mean and a blur of the second moment change, or slope times the mean way."""
+        """Bound by slope times the mean way of the held positions beside their plan."""
         positions = rig.mirror.positions_per_line
         if positions == 1 or not probe.sweeps:
             return Bound(0.0, "each px of the path has its one position")
-        mean, size, square = _moments(positions, probe.sweeps)
-        both = np.zeros(probe.slope.shape)
-        ends = [at_line_ends(probe.sweeps, rig.camera, 0.0, way) for way in (size, mean, square**0.5)]
-        both[:] = np.square(ends[2])[:, None]
-        value = min(probe.moved(*ends[0]), probe.moved(*ends[1]) + probe.blurred(both))
-        return Bound(value, f"lines lie up to {mean:.3f} px off, held positions {square**0.5:.2f} px rms")
+        size = 0.0
+        for step in {sweep.positions for sweep in probe.sweeps}:
+            numbers = np.arange(max(sweep.lines for sweep in probe.sweeps if sweep.positions == step))
+            ways = beside_plan(positions, step, numbers, _parts(positions, step))
+            size = max(size, float(np.abs(ways).mean(axis=1).max(initial=0.0)))
+        moved = probe.moved(*at_line_ends(probe.sweeps, rig.camera, 0.0, size))
+        return Bound(moved, f"held positions lie {size:.3f} px off on average, in the worst line")
 
 
 def beside_plan(positions: float, step: int, numbers: NDArray[np.int64], parts: int = 1) -> Floats:
@@ -281,18 +278,6 @@ def _parts(positions: float, step: int) -> int:
         return 1
     ratio = Fraction(positions).limit_denominator(1000)
     return min(ratio.numerator, MOST_PARTS) if abs(ratio - Fraction(positions)) < 1e-9 else MOST_PARTS
-
-
-def _moments(positions: float, sweeps: tuple[Sweep, ...]) -> tuple[float, float, float]:
-    worst = np.zeros(3)
-    for step in {sweep.positions for sweep in sweeps}:
-        numbers = np.arange(max(sweep.lines for sweep in sweeps if sweep.positions == step))
-        ways = beside_plan(positions, step, numbers, _parts(positions, step))
-        size = np.abs(ways).mean(axis=1)
-        # Ways of the several px of a line meet slopes of their own: they do not cancel.
-        mean = np.abs(ways.mean(axis=1)) if step == 1 else size
-        worst = np.maximum(worst, [one.max(initial=0.0) for one in (mean, size, (ways**2).mean(axis=1))])
-    return float(worst[0]), float(worst[1]), float(worst[2])
 
 
 @dataclass(frozen=True)

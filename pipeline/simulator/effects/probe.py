@@ -45,7 +45,6 @@ class Probe:
     slope: Floats  # (2, band) greatest first derivative [1/px]
     curvature: Floats  # (2, band) greatest second derivative [1/px^2]
     spectral_slope: Floats  # (band,) greatest divided difference to a neighbouring band [1/nm]
-    spectral_curvature: Floats  # (band,) greatest second one, twice, 0 at either end [1/nm^2]
     brightest_e: float  # expected electrons of the brightest sample
     darkest_e: float
     unit_least_dn: float  # the smallest unit met, in DN of a sample: turns electrons into the unit, on the safe side
@@ -53,7 +52,6 @@ class Probe:
     seconds: float  # from the first line to the last
     white_e: Floats | None = None  # (band,) electrons of the white reference in one exposure; None where not known
     slit_errors: Mapping[str, float] = field(default_factory=dict)  # measured change by variant of the slit, or off
-    places: Floats = field(default_factory=lambda: np.zeros((0, 2)))  # of the maxima, rows and columns, worst first
     binning: int = 1  # samples that a stored number sums, the same in all of the sweeps
 
     def moved(self, along_px: float, scan_px: float) -> float:
@@ -179,15 +177,6 @@ def difference_rates(wavelength_nm: Floats) -> Floats:
     before, after = gaps[inner - 1], gaps[inner]
     rates[:, inner] = 2 / (before + after) / np.stack([before, after])
     return rates
-
-
-def second_difference(spectra: NDArray[Real], wavelength_nm: Floats) -> NDArray[Real]:
-    """Return D I of spectra (..., band), as :func:`difference_rates` defines it. [1/nm^2]"""
-    down, up = difference_rates(wavelength_nm).astype(spectra.dtype)
-    steps, out = np.diff(spectra, axis=-1), np.zeros_like(spectra)
-    out[..., :-1] = up[:-1] * steps
-    out[..., 1:] -= down[1:] * steps
-    return out
 
 
 def steepest_difference(spectra: NDArray[Real], wavelength_nm: Floats) -> NDArray[Real]:

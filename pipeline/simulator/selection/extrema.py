@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera, footprint_kernel
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.effects.probe import second_difference, steepest_difference
+from pipeline.simulator.effects.probe import steepest_difference
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, to_bands
 
 Radiance = NDArray[np.float32]
@@ -28,7 +28,7 @@ BAND_GROUPS = 8
 CHOSEN_BANDS = 4
 _LEAST_WEIGHT = 1e-3  # of a kernel's tap: enough to find places
 _MEAN_PX = 4  # side of the squares whose means are compared: a slit is wider than a pixel
-_SPECTRAL = 100  # number of the first measure over wavelength
+_SPECTRAL = 100  # number of the measure over wavelength
 _TILES = 8192  # about the most; each offers its best place
 _TILES_HIGH = 3  # strips: what is made of one stays in the processor's cache
 
@@ -92,9 +92,8 @@ def telling_bands(
         steps += [np.abs(means[:, 1:] - means[:, :-1]) / optics.noise(means[:, 1:])]
         for number, values in enumerate((inner, -inner, *steps)):
             worst[number] = np.maximum(worst[number], values.max(axis=(0, 1), initial=-np.inf))
-        for number, spectral in enumerate((steepest_difference(inner, nm), np.abs(second_difference(inner, nm)))):
-            in_groups = np.maximum.reduceat(spectral / noise, starts, axis=2)
-            _offer(ranking, _SPECTRAL + number, in_groups, first, tile, range(len(groups)))
+        in_groups = np.maximum.reduceat(steepest_difference(inner, nm) / noise, starts, axis=2)
+        _offer(ranking, _SPECTRAL, in_groups, first, tile, range(len(groups)))
     return np.unique([one.start + values[one].argmax() for one in groups for values in worst])
 
 

@@ -23,14 +23,7 @@ import numpy as np
 
 from pipeline.errors import SettingsError
 from pipeline.simulator.effects.effect import OFF, Effect
-from pipeline.simulator.effects.probe import (
-    GainRange,
-    Probe,
-    difference_rates,
-    fixed_variance,
-    rising_gaps,
-    unit_electrons,
-)
+from pipeline.simulator.effects.probe import GainRange, Probe, fixed_variance, rising_gaps, unit_electrons
 from pipeline.simulator.rig_model import Rig
 
 SAFETY = 1.2  # maxima are read off a sample of the scene, derivatives off differences
@@ -141,7 +134,7 @@ def _is_present(effect: Effect, probe: Probe, rig: Rig) -> bool:
     bright = max(probe.brightest_e, rig.camera.full_scale_e)
     ones, both = np.ones(len(probe.wavelength_nm)), np.ones((2, len(probe.wavelength_nm)))
     loud = replace(probe, level=ones, spread=ones, span=ones, slope=both, curvature=both)
-    loud = replace(loud, spectral_slope=ones, spectral_curvature=ones, brightest_e=bright, slit_errors={})
+    loud = replace(loud, spectral_slope=ones, brightest_e=bright, slit_errors={})
     greatest = max(effect.bound(loud, rig, OFF).value, effect.bound(probe, rig, OFF).value)
     return effect.name in ALWAYS_ON or greatest > 0
 
@@ -192,7 +185,6 @@ def light_after(probe: Probe, rig: Rig, gains: Iterable[GainRange], blurred: flo
         probe,
         level=probe.level + added / (unit_electrons(added, probe, rig) if follows else unit_e),
         spectral_slope=probe.spectral_slope + (apart / gaps.min() if gaps.size else 0.0),
-        spectral_curvature=probe.spectral_curvature + apart * difference_rates(probe.wavelength_nm).sum(axis=0),
         spread=probe.spread + min(uneven, 1.0) * ratio * (probe.level + probe.spread) + added / unit_e,
         brightest_e=probe.brightest_e + float(added.max(initial=0.0)),
         darkest_e=probe.darkest_e * max(1 - uneven, 0.0),

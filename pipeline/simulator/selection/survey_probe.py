@@ -1,4 +1,4 @@
-"""Probe a scene for a survey: a close look at its extrema and along lines, and the maxima that effects are bounded by.
+"""Probe a scene for a survey: a close look at its extrema, and the maxima that effects are bounded by.
 
 The whole scene is probed, whatever part of it the sweeps see: blurs and shifts bring light from beside them.
 """
@@ -19,7 +19,7 @@ from pipeline.geometry.scan import CostModel, Sweep, exposing, scene_to_sweep
 from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.effect import OFF
 from pipeline.simulator.effects.line import BOXES, SLIT, UPRIGHT, box_of
-from pipeline.simulator.effects.probe import Probe, Unit, second_difference, steepest_difference, stored_mean, unit_at
+from pipeline.simulator.effects.probe import Probe, Unit, steepest_difference, stored_mean, unit_at
 from pipeline.simulator.optics.kernel_fit import Footprint, Moments, fold
 from pipeline.simulator.optics.rays import RayViews, exact_views, middle_normal
 from pipeline.simulator.optics.scene_radiance import SceneSampler
@@ -33,8 +33,6 @@ Way = tuple[float, float]  # along the line and the scan [px]
 MOST_VALUES = 1_000_000  # samples times bands; each is seen a few times over, a fraction of a px apart
 MOST_SAMPLES = 6_000
 FINEST_SAMPLES = 1000  # at which variants of the slit are compared with the finest
-LINE_SAMPLES = 64  # of a line, evenly from end to end, in sums where samples are summed
-_LEAST_SUMS = 16  # of a line
 _LEAST_OF_SWEEP = 50
 _LEAST_PLACES = 24  # where samples are summed, however many samples that takes
 _BESIDE = 2  # samples to either side of a place; of sums, one
@@ -44,7 +42,7 @@ _NEAR, _FAR = 0.25, 0.5  # px by which the footprint is shifted
 _STILL: Way = (0.0, 0.0)
 _PHASES = tuple(((along, scan), _STILL) for along in (0.0, 0.5) for scan in (0.0, 0.5))  # at which boxes are compared
 _OPTICS = (DIFFRACTION, DEFOCUS, ABERRATION, KEYSTONE)
-_BY_BAND = ("level", "spread", "span", "slope", "curvature", "spectral_slope", "spectral_curvature")  # of a probe
+_BY_BAND = ("level", "spread", "span", "slope", "curvature", "spectral_slope")  # of a probe
 
 
 def _shifts() -> list[tuple[Way, Way]]:
@@ -75,9 +73,9 @@ def probe_survey(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Un
 
 
 def probe_scene(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "sigma") -> Probe:
-    """Return the maxima of the scene through slit and pixel: at its extrema, and along some lines of the sweeps.
+    """Return the maxima of the scene through slit and pixel, at its extrema.
 
-    Extrema are found on the scene's own pixels, so that the maxima hold for the whole image. Sweeps are of one binning
+    They are found on the scene's own pixels, so that the maxima hold for the whole image. Sweeps are of one binning
     and exposure. Raises SceneError: the scene holds a number that is not finite; SettingsError: no line to take;
     PoseError: a sweep is out of the mirror's reach.
     """
@@ -85,15 +83,12 @@ def probe_scene(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Uni
     rig = rig.taking(taken[0])
     binning, camera, bands = taken[0].binning, rig.camera, len(scene.wavelength_nm)
     room = max(min(MOST_VALUES // bands, MOST_SAMPLES), 64)
-    lines = views_of_lines(taken, camera, room // 3)
-    most = (room - room // 3) // (len(_patch_steps(binning)) * binning * len({sweep.along for sweep in taken}))
+    most = room // (len(_patch_steps(binning)) * binning * len({sweep.along for sweep in taken}))
     places = find_extrema(scene, camera, taken, max(most, 1 if binning == 1 else _LEAST_PLACES))
-    views = joined([lines, views_of_places(places, scene, camera, taken)])
+    views = views_of_places(places, scene, camera, taken)
     seen = light_seen(scene, camera, views, _footprint(SLIT.variants[0], rig, _PROBE, None, scene), SHIFTS)
     found = replace(
-        sum_up_light(seen, scene, rig, taken, unit),
-        places=places,
-        slit_errors=_slit_errors(scene, rig, views, taken, unit),
+        sum_up_light(seen, scene, rig, taken, unit), slit_errors=_slit_errors(scene, rig, views, taken, unit)
     )
     return worst_of_groups(found) if scene.electrons.ndim == 1 and bands > CHOSEN_BANDS else found
 
@@ -131,34 +126,6 @@ def joined(parts: list[SampleViews]) -> SampleViews:
     """Return views of one binning, one part after the other."""
     every: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in parts]) for name in _OF_A_VIEW}
     return replace(parts[0], **every)
-
-
-def views_of_lines(sweeps: tuple[Sweep, ...], camera: LineCamera, room: int) -> SampleViews:
-    """Return lines spread over all sweeps, the most oblique included, with samples evenly from end to end.
-
-    All sweeps sum as many samples to a number.
-    """
-    order = {id(sweep): place for place, sweep in enumerate(sweeps)}
-    binning = sweeps[0].binning
-    per_line = min(camera.samples // binning, max(LINE_SAMPLES // binning, _LEAST_SUMS))
-    numbers = [(sweep, number) for sweep in sweeps for number in {0, sweep.lines // 2, sweep.lines - 1}]
-    numbers.sort(key=lambda one: -float(np.hypot(one[0].swath_px, one[0].line_px()[one[1]])))
-    most = max(room // (per_line * binning), 1)
-    kept = numbers[: most // 2 or 1]
-    rest = [(sweep, round(fraction * (sweep.lines - 1))) for sweep in sweeps for fraction in (0.25, 0.75)]
-    rest += numbers[len(kept) :]
-    kept += [rest[round(at)] for at in np.linspace(0, len(rest) - 1, most - len(kept))] if most > len(kept) else []
-    sums = np.linspace(0, camera.samples // binning - 1, per_line).round().astype(np.intp)
-    slopes = camera.pixel_slopes()[_samples_of(sums, binning)]
-    count = len(slopes)
-    return SampleViews(
-        np.repeat([sweep.swath_px for sweep, _ in kept], count).astype(np.float64),
-        np.repeat([sweep.line_px()[number] for sweep, number in kept], count),
-        np.tile(slopes, len(kept)),
-        np.repeat([sweep.along == "y" for sweep, _ in kept], count),
-        np.repeat([order[id(sweep)] for sweep, _ in kept], count),
-        binning,
-    )
 
 
 def views_of_places(places: Floats, scene: RasterScene, camera: LineCamera, sweeps: tuple[Sweep, ...]) -> SampleViews:
@@ -285,10 +252,9 @@ def sum_up_light(seen: Radiance, scene: RasterScene, rig: Rig, sweeps: tuple[Swe
         return _greatest(stored_mean(shown, binning) / scale)
 
     slope, curvature = _derivatives(seen, scale, binning)
-    spectral = np.zeros((2, len(nm)))
+    spectral = np.zeros(len(nm))
     if len(nm) > 1:
-        differences = steepest_difference(seen[0], nm), np.abs(second_difference(seen[0], nm))
-        spectral = np.stack([_greatest(stored_mean(one, binning) / scale) for one in differences])
+        spectral = _greatest(stored_mean(steepest_difference(seen[0], nm), binning) / scale)
     return Probe(
         unit=unit,
         sweeps=sweeps,
@@ -299,8 +265,7 @@ def sum_up_light(seen: Radiance, scene: RasterScene, rig: Rig, sweeps: tuple[Swe
         span=greatest(np.maximum(most - low, high - least), np.maximum(np.abs(low), np.abs(high))),
         slope=slope,
         curvature=curvature,
-        spectral_slope=spectral[0],
-        spectral_curvature=spectral[1],
+        spectral_slope=spectral,
         brightest_e=float(most.max()),
         darkest_e=float(least.min()),
         unit_least_dn=float(scale.min()) / camera.electrons_per_dn,

@@ -74,7 +74,6 @@ def even_probe(**values: object) -> Probe:
         slope=np.zeros((2, 1)),
         curvature=np.zeros((2, 1)),
         spectral_slope=zeros,
-        spectral_curvature=zeros,
         brightest_e=1e4,
         darkest_e=1e2,
         unit_least_dn=20.0,

@@ -18,7 +18,6 @@ from pipeline.simulator.effects.probe import (
     noise_electrons,
     rising_gaps,
     rising_runs,
-    second_difference,
     steepest_difference,
     stored_mean,
     unit_at,
@@ -39,7 +38,6 @@ def spectra_probe(spectra: np.ndarray, unit_e: float):
         level=spectra.max(axis=0) / unit_e,
         spread=np.ptp(spectra, axis=0) / unit_e,
         spectral_slope=steepest_difference(spectra, NM).max(axis=0) / unit_e,
-        spectral_curvature=np.abs(second_difference(spectra, NM)).max(axis=0) / unit_e,
         unit_least_dn=unit_e / RIG.camera.electrons_per_dn,
     )
 
@@ -55,9 +53,7 @@ def test_spectra_behind_gains_are_no_steeper_than_said(seed: int):
     greatest = np.maximum(first.max(axis=0), 1).max()
     for way in range(3):
         light = spectra * first[way] * second[way] + added[way]
-        slope, bend = steepest_difference(light, NM) / 5, np.abs(second_difference(light, NM)) / 5
-        assert (slope <= greatest * after.spectral_slope + 1e-9).all()
-        assert (bend <= greatest * after.spectral_curvature + 1e-9).all()
+        assert (steepest_difference(light, NM) / 5 <= greatest * after.spectral_slope + 1e-9).all()
 
 
 def test_even_gains_leave_spectra_as_they_are():
@@ -84,12 +80,6 @@ def test_what_a_shadow_takes_counts_by_the_noise_within_it():
     assert lost == pytest.approx(5e3 / np.sqrt(5e3 + fixed_variance(rig)))
 
 
-def test_second_difference_is_exact_on_parabolas():
-    """3 x^2 has a second derivative of 6 on uneven bands; both ends, which have one neighbour, give 0."""
-    x = np.array([0.0, 1.0, 1.5, 4.0, 4.25])
-    np.testing.assert_allclose(second_difference(3 * x**2 + 5 * x - 1, x), [0, 6, 6, 6, 0], atol=1e-12)
-
-
 def test_steeper_neighbour_counts():
     """Steps of 2 over 1 nm and 9 over 3 nm: slopes 2 and 3, the middle band takes the greater."""
     found = steepest_difference(np.array([[0.0, 2.0, 11.0]]), np.array([400.0, 401.0, 404.0]))
@@ -103,7 +93,6 @@ def test_bands_of_two_detectors_are_not_neighbours():
     assert rising_runs(nm) == [slice(0, 3), slice(3, 5), slice(5, 6)]
     np.testing.assert_array_equal(rising_gaps(nm), [2, 2, 2])
     np.testing.assert_allclose(steepest_difference(spectrum, nm), [1, 1, 1, 1, 1, 0])
-    np.testing.assert_allclose(second_difference(spectrum, nm), [0, -1, 0, 0, 0, 0])
 
 
 def test_one_band_has_no_neighbours():
@@ -112,7 +101,6 @@ def test_one_band_has_no_neighbours():
     assert not steepest_difference(np.ones((3, 1), np.float32), one).any()
     assert not difference_rates(one).any()
     assert not difference_rates(two).any()
-    assert second_difference(np.ones((3, 2), np.float32), two).dtype == np.float32
 
 
 COLOURED_RIG = Rig(optics=Optics(keystone_px=0.6))
@@ -125,13 +113,12 @@ def test_waves_are_no_more_coloured_than_said(px: float):
     grey = even_probe(
         unit="dn", wavelength_nm=NM, level=bands, spread=bands, span=2 * bands, slope=k * np.ones((2, 25))
     )
-    grey = replace(grey, spectral_slope=0 * bands, spectral_curvature=0 * bands, curvature=k**2 * np.ones((2, 25)))
+    grey = replace(grey, spectral_slope=0 * bands, curvature=k**2 * np.ones((2, 25)))
     diffraction, keystone = (blur.moments(COLOURED_RIG, NM, blur.variants[0]) for blur in (DIFFRACTION, KEYSTONE))
     light = np.sin(k * (x[:, None] + keystone.shift[0])) * pupil_contrast(diffraction.waves[0] / px)
     blurred = sum(blur.bound(grey, COLOURED_RIG).value for blur in (DIFFRACTION, KEYSTONE))
     said = light_after(grey, RIG, [], blurred)
     assert (steepest_difference(light, NM).max(axis=0) <= said.spectral_slope).all()
-    assert (np.abs(second_difference(light, NM)).max(axis=0) <= said.spectral_curvature + 1e-12).all()
 
 
 STORED_LIGHT_RIG = Rig()

