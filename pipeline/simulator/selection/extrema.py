@@ -1,8 +1,8 @@
 """Extrema of a scene: the pixels where it is steepest, most curved, brightest and darkest.
 
 The search works on the scene's own pixels, strip by strip, with the slit's box along the scan. It is right to a pixel;
-a closer look at these places gives the exact numbers. A few bands stand for all where planes are components. Of bands
-with planes of their own, those of each group that are brightest, darkest and steepest do: see `telling_bands`.
+a closer look at these places gives the exact numbers. A few bands stand for all where planes are components. Bands
+with planes of their own come in groups. The brightest, darkest and steepest of each stand for it: see `telling_bands`.
 """
 
 from __future__ import annotations

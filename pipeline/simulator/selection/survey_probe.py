@@ -33,7 +33,6 @@ Way = tuple[float, float]  # along the line and the scan [px]
 MOST_VALUES = 1_000_000  # samples times bands; each is seen a few times over, a fraction of a px apart
 MOST_SAMPLES = 6_000
 FINEST_SAMPLES = 1000  # at which variants of the slit are compared with the finest
-_LEAST_OF_SWEEP = 50
 _LEAST_PLACES = 24  # where samples are summed, however many samples that takes
 _BESIDE = 2  # samples to either side of a place; of sums, one
 _PROBE, _CLOSE = (2, 1), (3, 1)  # boxes of the probe, and boxes that find where variants differ
@@ -111,7 +110,6 @@ class SampleViews:
     scan_px: Floats
     slope: Floats
     along_y: NDArray[np.bool_]
-    sweep: NDArray[np.intp]  # number of the sweep
     binning: int = 1
 
     def chosen(self, which: NDArray[np.intp]) -> SampleViews:
@@ -129,26 +127,23 @@ def joined(parts: list[SampleViews]) -> SampleViews:
 
 
 def views_of_places(places: Floats, scene: RasterScene, camera: LineCamera, sweeps: tuple[Sweep, ...]) -> SampleViews:
-    """Return patches about places, in the view of the finest and the most oblique sweep of each orientation.
+    """Return patches about places, in the view of the most oblique sweep of each orientation that sees them.
 
-    A place that no sweep sees is looked at as if the lines and samples of the finest continued. All sweeps sum as many
-    samples to a number.
+    A place that no sweep sees is looked at as if the lines and samples of the least oblique continued. All sweeps sum
+    as many samples to a number.
     """
     centred = places - (np.array(scene.shape) - 1) / 2
     found = []
     for along_y in (False, True):
         numbers = [number for number, sweep in enumerate(sweeps) if (sweep.along == "y") == along_y]
-        finest = sorted(numbers, key=lambda number: sweeps[number].step)
         oblique = sorted(numbers, key=lambda number: -abs(sweeps[number].swath_px))
         along, scan = (centred if along_y else centred[:, ::-1]).T
-        seen = [_first_seeing(order, sweeps, camera, along, scan) for order in (finest, oblique)]
+        seen = _first_seeing(oblique, sweeps, camera, along, scan)
         for number in numbers:
-            which = (seen[0] == number) | (seen[1] == number)
-            if number == finest[0]:
-                which |= seen[0] < 0
+            which = (seen == number) | ((seen < 0) if number == oblique[-1] else False)
             line, sample = scene_to_sweep(_held(sweeps[number]), camera, along[which], scan[which]).T
             reached = np.isfinite(line) & np.isfinite(sample)
-            found.append(_patches(sweeps[number], number, camera, line[reached], sample[reached]))
+            found.append(_patches(sweeps[number], camera, line[reached], sample[reached]))
     return joined(found)
 
 
@@ -177,26 +172,21 @@ def _patch_steps(binning: int) -> Floats:
     return np.stack(np.meshgrid(np.arange(-beside, beside + 1.0), np.arange(-1.0, 2.0)), axis=-1).reshape(-1, 2)
 
 
-def _patches(sweep: Sweep, number: int, camera: LineCamera, line: Floats, sample: Floats) -> SampleViews:
+def _patches(sweep: Sweep, camera: LineCamera, line: Floats, sample: Floats) -> SampleViews:
     patch, binning = _patch_steps(sweep.binning), sweep.binning
     middle = sample if binning == 1 else (sample + 0.5) / binning - 0.5
     sums = np.rint(middle[:, None] + patch[:, 0]).ravel()
     lines = (line[:, None] + patch[:, 1]).ravel()
-    number_of = _samples_of(sums.astype(np.intp), binning).astype(np.float64)
-    slopes = (number_of - (camera.samples - 1) / 2) * camera.ifov_rad
+    numbers = (sums[:, None] * binning + np.arange(binning)).ravel()
+    slopes = (numbers - (camera.samples - 1) / 2) * camera.ifov_rad
     count = len(slopes)
     return SampleViews(
         np.full(count, sweep.swath_px),
         sweep.start_px + np.repeat(lines, binning),
         slopes,
         np.full(count, sweep.along == "y"),
-        np.full(count, number, np.intp),
         binning,
     )
-
-
-def _samples_of(sums: NDArray[np.intp], binning: int) -> NDArray[np.intp]:
-    return (sums[:, None] * binning + np.arange(binning)).ravel()
 
 
 def light_seen(
@@ -332,18 +322,13 @@ def _slit_errors(
 
 
 def _roughest(scene: RasterScene, rig: Rig, views: SampleViews, unit: Unit) -> NDArray[np.intp]:
-    """Return the stored numbers that the slit, or one upright box in its place, changes most: of all, of each sweep."""
+    """Return the stored numbers that the slit, or one upright box in its place, changes most."""
     boxes = _footprint(SLIT.variants[0], rig, _CLOSE, None, scene)
     close = light_seen(scene, rig.camera, views, boxes, _PHASES)
-    scale, found = unit_at(_stored(close, views), rig, unit, views.binning), []
-    sweep_of, count = views.sweep[:: views.binning], max(FINEST_SAMPLES // views.binning, 2 * _LEAST_OF_SWEEP)
-    numbers = np.unique(sweep_of)
-    each = max(count // 2 // len(numbers), _LEAST_OF_SWEEP)
-    for variant in (OFF, UPRIGHT):
-        other = _footprint(variant, rig, (1, 1), None, scene)
-        order = np.argsort(-_changes(scene, rig, views, other, close, scale), kind="stable")
-        found += [order[: count // 2], *(order[sweep_of[order] == number][:each] for number in numbers)]
-    return np.unique(np.concatenate(found))
+    scale, most = unit_at(_stored(close, views), rig, unit, views.binning), max(FINEST_SAMPLES // views.binning, 50)
+    others = [_footprint(variant, rig, (1, 1), None, scene) for variant in (OFF, UPRIGHT)]
+    changes = [_changes(scene, rig, views, other, close, scale) for other in others]
+    return np.unique([np.argsort(-change, kind="stable")[:most] for change in changes])
 
 
 def _changes(
