@@ -165,8 +165,8 @@ def light_after(probe: Probe, rig: Rig, gains: Iterable[GainRange], blurred: flo
     """Return the probe of light after some gains, their greatest factors taken off: those are for `error_growth`.
 
     Light that the factor does not reduce counts by the unit of the darkest. ``blurred`` is the most that blurs changed
-    in any band before. Differences over wavelength grow by what two bands may be changed apart. Blurs do so, factors that
-    are not the same in all bands, and added light.
+    in any band before. Differences over wavelength grow by what two bands may be changed apart. Blurs do so, and added
+    light, and factors that are not the same in all bands.
     """
     bands = len(probe.wavelength_nm)
     least, kept, added, uneven = np.ones(bands), 1.0, np.zeros(bands), 0.0
