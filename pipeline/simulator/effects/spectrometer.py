@@ -51,6 +51,8 @@ class Response(LightChange):
         """Bound it by I' sqrt(v); 0 where the scene's bands are as wide."""
         wavelength = np.asarray(probe.wavelength_nm, np.float64)
         variance = missing_variance(rig.optics.fwhm_nm, probe.fwhm_nm, len(wavelength))
+        if not difference_rates(wavelength).any():
+            return Bound(0.0, "no band has a neighbour on either side")
         if not variance.any():
             if probe.fwhm_nm is None or not np.isfinite(probe.fwhm_nm).any():
                 return Bound(0.0, "the width of the scene's bands is not known; they are taken as they are")

@@ -87,7 +87,7 @@ def telling_bands(
         steps = [np.abs(beside - inner) / noise for beside in (light[2:, 1:-1], light[1:-1, 2:])]
         rows, columns = (size // _MEAN_PX for size in inner.shape[:2])
         some = inner[: rows * _MEAN_PX, : columns * _MEAN_PX]
-        means = some.reshape(rows, _MEAN_PX, columns, _MEAN_PX, -1).mean(axis=(1, 3))
+        means = some.reshape(rows, _MEAN_PX, columns, _MEAN_PX, len(spectra)).mean(axis=(1, 3))
         steps += [np.abs(means[1:] - means[:-1]) / optics.noise(means[1:])]
         steps += [np.abs(means[:, 1:] - means[:, :-1]) / optics.noise(means[:, 1:])]
         for number, values in enumerate((inner, -inner, *steps)):
