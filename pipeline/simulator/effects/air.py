@@ -66,9 +66,8 @@ class Turbulence(Aim):
             return Bound(0.0, "no distance or no turbulence")
         farthest = sigma * math.sqrt(2 * math.log(max(probe.lines, 1) / RISK))
         steep = np.hypot(*probe.slope)
-        change = float(np.minimum(steep * farthest, probe.span).max(initial=0.0))
         return Bound(
-            change,
+            probe.moved(farthest, farthest),
             f"{sigma:.2g} px (sd) per line, at most {farthest:.2g} px in {probe.lines} lines,"
             f" on edges of at most {steep.max(initial=0.0):.3g} {UNITS[probe.unit]}/px",
         )
@@ -122,13 +121,11 @@ class Wind(Displacement):
         return (right, down) if block.sweep.along == "x" else (down, right)
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound by the amplitude times the length of the steepest gradient, whichever way the wind blows."""
+        """Bound by the amplitude times the slope, whichever way the wind blows."""
         sway = sway_px(rig)
         if sway == 0:
             return Bound(0.0, "the air is calm")
-        steep = sway * np.hypot(*probe.slope)
-        change = float(np.minimum(steep, probe.span).max(initial=0.0))
-        return Bound(change, f"the crop sways by {sway:.2g} px, {rig.air.wind_hz:g} times a second")
+        return Bound(probe.moved(sway, sway), f"the crop sways by {sway:.2g} px, {rig.air.wind_hz:g} times a second")
 
 
 def sway_px(rig: Rig) -> float:

@@ -256,16 +256,12 @@ class Polarisation(Gain):
     cost_ns = MappingProxyType({"exact": 0.2})
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound by level times the factor furthest from 1 in each band, over all incidences that the sweeps have.
-
-        Factors are taken at some incidences, and what a chord between two of them may miss is added.
-        """
+        """Bound by level times the factor furthest from 1 in each band, over all incidences that the sweeps have."""
         incidence = _incidence(sweep_ends(probe, rig.camera))
         if rig.mirror.coating == "ideal" or not incidence.size:
             return Bound(0.0, "the mirror reflects everything" if incidence.size else "no line is taken")
         factors = _factors_between(incidence, rig, probe.wavelength_nm)
-        between = np.abs(np.diff(factors, 2, axis=0)).max(axis=0) / 8  # most that a chord misses of what it cuts off
-        most = np.abs(factors - 1).max(axis=0) + between
+        most = np.abs(factors - 1).max(axis=0)
         least_deg, most_deg = np.degrees(incidence.min()), np.degrees(incidence.max())
         where = f" at {probe.wavelength_nm[int(most.argmax())]:.0f} nm" if most.size else ""
         why = (

@@ -40,7 +40,6 @@ class Probe:
     wavelength_nm: Floats  # (band,)
     fwhm_nm: Floats | None  # (band,) of the scene's own bands; None where not known
     level: Floats  # (band,) greatest signal
-    spread: Floats  # (band,) greatest difference of a signal from the mean of any line, all bands
     span: Floats  # (band,) greatest difference of two signals
     slope: Floats  # (2, band) greatest first derivative [1/px]
     curvature: Floats  # (2, band) greatest second derivative [1/px^2]

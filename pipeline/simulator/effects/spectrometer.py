@@ -308,11 +308,11 @@ class StrayLight(LightChange):
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound it by f (S - H): what is scattered to a sample is between the least and the greatest light."""
-        fraction, spread = rig.optics.stray_fraction, float(np.max(probe.spread, initial=0))
+        fraction, range_e = rig.optics.stray_fraction, max(probe.brightest_e - probe.darkest_e, 0.0)
         if fraction == 0:
             return Bound(0.0, "no light is scattered")
-        why = f"{fraction:.2g} times a line's light, signals up to {spread:.3g} {probe.unit} from others"
-        return Bound(fraction * spread, why)
+        why = f"{fraction:.2g} times a line's light, signals up to {range_e:.3g} e- from others"
+        return Bound(probe.added(fraction * range_e, rig.camera.electrons_per_dn), why)
 
     def change(self, light: Radiance, block: SweepBlock, variant: str) -> Radiance:
         """Return the light after scattering; works in place."""

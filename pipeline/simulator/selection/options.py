@@ -133,7 +133,7 @@ def _menu(effect: Effect, probe: Probe, rig: Rig, present: bool, gain: float) ->
 def _is_present(effect: Effect, probe: Probe, rig: Rig) -> bool:
     bright = max(probe.brightest_e, rig.camera.full_scale_e)
     ones, both = np.ones(len(probe.wavelength_nm)), np.ones((2, len(probe.wavelength_nm)))
-    loud = replace(probe, level=ones, spread=ones, span=ones, slope=both, curvature=both)
+    loud = replace(probe, level=ones, span=ones, slope=both, curvature=both)
     loud = replace(loud, spectral_slope=ones, brightest_e=bright, slit_errors={})
     greatest = max(effect.bound(loud, rig, OFF).value, effect.bound(probe, rig, OFF).value)
     return effect.name in ALWAYS_ON or greatest > 0
@@ -185,7 +185,6 @@ def light_after(probe: Probe, rig: Rig, gains: Iterable[GainRange], blurred: flo
         probe,
         level=probe.level + added / (unit_electrons(added, probe, rig) if follows else unit_e),
         spectral_slope=probe.spectral_slope + (apart / gaps.min() if gaps.size else 0.0),
-        spread=probe.spread + min(uneven, 1.0) * ratio * (probe.level + probe.spread) + added / unit_e,
         brightest_e=probe.brightest_e + float(added.max(initial=0.0)),
         darkest_e=probe.darkest_e * max(1 - uneven, 0.0),
         unit_least_dn=probe.unit_least_dn / ratio,

@@ -41,7 +41,7 @@ _NEAR, _FAR = 0.25, 0.5  # px by which the footprint is shifted
 _STILL: Way = (0.0, 0.0)
 _PHASES = tuple(((along, scan), _STILL) for along in (0.0, 0.5) for scan in (0.0, 0.5))  # at which boxes are compared
 _OPTICS = (DIFFRACTION, DEFOCUS, ABERRATION, KEYSTONE)
-_BY_BAND = ("level", "spread", "span", "slope", "curvature", "spectral_slope")  # of a probe
+_BY_BAND = ("level", "span", "slope", "curvature", "spectral_slope")  # of a probe
 
 
 def _shifts() -> list[tuple[Way, Way]]:
@@ -226,7 +226,7 @@ def _rays_of(views: SampleViews, camera: LineCamera, turned: Way) -> RayViews:
 
 
 def sum_up_light(seen: Radiance, scene: RasterScene, rig: Rig, sweeps: tuple[Sweep, ...], unit: Unit) -> Probe:
-    """Return the maxima of light (shift, view, band) [e-]; means of lines lie between the least and the greatest."""
+    """Return the maxima of light (shift, view, band) [e-]."""
     camera, binning, nm = rig.camera, sweeps[0].binning, np.asarray(scene.wavelength_nm, np.float64)
     least, most = seen.min(axis=0), seen.max(axis=0)
     darkest, brightest = stored_mean(least, binning), stored_mean(most, binning)
@@ -235,12 +235,8 @@ def sum_up_light(seen: Radiance, scene: RasterScene, rig: Rig, sweeps: tuple[Swe
         np.abs(brightest) / unit_at(np.asarray(brightest, np.float32), rig, unit, binning), np.abs(darkest) / scale
     )
     low, high = least.min(axis=0), most.max(axis=0)
-
-    def greatest(difference: Radiance, beside: Radiance) -> Floats:
-        """Return the greatest difference over the unit, (band,); differences that may be rounding count as 0."""
-        shown = np.where(difference > _ROUNDING * np.abs(beside), difference, np.float32(0))
-        return _greatest(stored_mean(shown, binning) / scale)
-
+    span = np.maximum(most - low, high - least)
+    span[span <= _ROUNDING * np.maximum(np.abs(low), np.abs(high))] = 0  # may be rounding
     slope, curvature = _derivatives(seen, scale, binning)
     spectral = np.zeros(len(nm))
     if len(nm) > 1:
@@ -251,8 +247,7 @@ def sum_up_light(seen: Radiance, scene: RasterScene, rig: Rig, sweeps: tuple[Swe
         wavelength_nm=scene.wavelength_nm,
         fwhm_nm=scene.fwhm_nm,
         level=_greatest(level),
-        spread=greatest(np.maximum(most - low.min(), high.max() - least), high),
-        span=greatest(np.maximum(most - low, high - least), np.maximum(np.abs(low), np.abs(high))),
+        span=_greatest(stored_mean(span, binning) / scale),
         slope=slope,
         curvature=curvature,
         spectral_slope=spectral,

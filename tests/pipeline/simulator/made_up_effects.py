@@ -69,7 +69,6 @@ def even_probe(**values: object) -> Probe:
         wavelength_nm=np.array([550.0]),
         fwhm_nm=None,
         level=ones,
-        spread=ones,
         span=ones,
         slope=np.zeros((2, 1)),
         curvature=np.zeros((2, 1)),

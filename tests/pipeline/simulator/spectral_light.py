@@ -72,7 +72,6 @@ def probe_of(
     """Summary of all samples of some lines."""
     signal, one = np.asarray(light, np.float64), units(light, unit)
     most = tuple(range(light.ndim - 1))
-    means = signal.mean(axis=(1, 2), keepdims=True)
     none = np.zeros((2, len(wavelength_nm)))
     return Probe(
         unit=unit,
@@ -80,7 +79,6 @@ def probe_of(
         wavelength_nm=wavelength_nm,
         fwhm_nm=fwhm_nm,
         level=(signal / one).max(axis=most),
-        spread=(np.abs(signal - means) / one).max(axis=most),
         span=np.ptp(signal / one, axis=most),
         slope=none,
         curvature=none,

@@ -36,7 +36,6 @@ def spectra_probe(spectra: np.ndarray, unit_e: float):
         unit="dn",
         wavelength_nm=NM,
         level=spectra.max(axis=0) / unit_e,
-        spread=np.ptp(spectra, axis=0) / unit_e,
         spectral_slope=steepest_difference(spectra, NM).max(axis=0) / unit_e,
         unit_least_dn=unit_e / RIG.camera.electrons_per_dn,
     )
@@ -61,7 +60,6 @@ def test_even_gains_leave_spectra_as_they_are():
     probe = even_probe(spectral_slope=np.full(1, 0.3))
     after = light_after(probe, RIG, [GainRange.between(1.0, 2.0, 1)])
     assert after.spectral_slope == probe.spectral_slope
-    assert after.spread == probe.spread
 
 
 def test_errors_grow_with_the_light_over_its_noise():
@@ -110,9 +108,7 @@ COLOURED_RIG = Rig(optics=Optics(keystone_px=0.6))
 def test_waves_are_no_more_coloured_than_said(px: float):
     """A grey wave through a pupil and shifts that differ from band to band, in closed form."""
     k, x, bands = 2 * np.pi / px, np.linspace(0, px, 200), np.ones(len(NM))
-    grey = even_probe(
-        unit="dn", wavelength_nm=NM, level=bands, spread=bands, span=2 * bands, slope=k * np.ones((2, 25))
-    )
+    grey = even_probe(unit="dn", wavelength_nm=NM, level=bands, span=2 * bands, slope=k * np.ones((2, 25)))
     grey = replace(grey, spectral_slope=0 * bands, curvature=k**2 * np.ones((2, 25)))
     diffraction, keystone = (blur.moments(COLOURED_RIG, NM, blur.variants[0]) for blur in (DIFFRACTION, KEYSTONE))
     light = np.sin(k * (x[:, None] + keystone.shift[0])) * pupil_contrast(diffraction.waves[0] / px)
