@@ -83,3 +83,15 @@ def _local_scale(swath_px: float, scan_px: NDArray[np.float64], camera: LineCame
     xi0, e = swath_px * camera.ifov_rad, scan_px[:, None] * camera.ifov_rad
     size = np.sqrt(1 + xi0**2 + e**2)
     return size * np.hypot(1.0, xi0 / (size - e))
+
+
+def paper_numbers(yx: NDArray[np.float64], *, fine: bool, columns: int, factor: int) -> NDArray[np.float64]:
+    """One-dimensional positions of the paper: patch n at P = n(m + 1) + 1, its patches at P + 1 ... P + m.
+
+    ``yx`` (..., 2) are middles in patches. ``columns`` counts the coarse patches of a row, m = factor^2; patches run
+    row by row inside their patch. The text says jumps of four; its formula and its example 21 -> 26 say m + 1 = 5.
+    """
+    cell = np.floor(yx / factor)
+    number = (cell[..., 0] * columns + cell[..., 1]) * (factor**2 + 1) + 1
+    inside = np.floor(yx - cell * factor)
+    return number + inside[..., 0] * factor + inside[..., 1] + 1 if fine else number

@@ -22,6 +22,7 @@ from pipeline.geometry.scan import CostModel, Sweep, device_range, memory_loads
 from tests.pipeline.geometry.paper_equations import (
     LINE_MODELS,
     line_points,
+    paper_numbers,
     straight_slope_rotation,
     unlimited_position,
 )
@@ -41,6 +42,22 @@ def slope_rotation(position: np.ndarray) -> np.ndarray:
     step = np.diff(position, axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         return -np.arctan(step[:, 1] / step[:, 0])
+
+
+def paper_normal(direction: np.ndarray) -> np.ndarray:
+    """Equation (4), in the paper's frame [E7]: c = sqrt((o_z + 1) / 2), a = o_x / 2c, b = o_y / 2c."""
+    c = np.sqrt((direction[..., 2] + 1) / 2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.stack([direction[..., 0] / (2 * c), direction[..., 1] / (2 * c), c], axis=-1)
+
+
+def stable_normal(direction: np.ndarray) -> np.ndarray:
+    """The same as (o_x, o_y, 1 + o_z) / |.|, 1 + o_z taken without cancellation [E7]."""
+    o = direction.copy()
+    z = o[..., 2]
+    o[..., 2] = np.where(z < 0, (o[..., 0] ** 2 + o[..., 1] ** 2) / (1 - np.minimum(z, 0)), 1 + z)
+    o /= np.abs(o).max(axis=-1, keepdims=True)
+    return o / np.sqrt(np.sum(o**2, axis=-1, keepdims=True))
 
 
 def tilted(tilt_deg: float) -> np.ndarray:
@@ -63,6 +80,11 @@ def aim(xi_px: object, eta_px: object) -> np.ndarray:
 def viewed(position: np.ndarray) -> np.ndarray:
     """Scene points (xi, eta) that positions look at. [px]"""
     return direction_to_scene(position_to_direction(position)) / IFOV
+
+
+def sweep_of_1450(xi_px: float) -> np.ndarray:
+    """Positions of 1450 lines over 1280 px of the scan, straight in the scene."""
+    return aim(xi_px, np.linspace(-640, 640, 1450))
 
 
 def turn_of(position: np.ndarray) -> np.ndarray:
@@ -117,6 +139,35 @@ def test_e3_the_corner_of_the_field_is_out_of_reach():
     assert np.mean(radius > 1) == pytest.approx(6e-4, abs=1e-4)
 
 
+def test_e4_the_papers_matrix_turns_the_ray_round():
+    """With the normal of equation (4), R i = -o: i and o point from the mirror, and o = (2 n n^T - I) i."""
+    o = scene_to_direction([[0.2, -0.4], [0.0, 0.0], [-0.5, 0.6]])
+    n = paper_normal(o)
+    turned = (np.eye(3) - 2 * n[..., :, None] * n[..., None, :]) @ [0.0, 0.0, 1.0]
+    assert turned == pytest.approx(-o, abs=1e-15)
+
+
+def test_e5_the_turn_by_45_degrees_fits_one_side_only():
+    """The rest normal goes to (0, 0, 1) only with the scene on the -x side; for +x it becomes (1, 0, 0)."""
+    half = np.sqrt(0.5)
+    turn = np.array([[half, 0.0, half], [0.0, 1.0, 0.0], [-half, 0.0, half]])
+    assert turn @ [-half, 0, half] == pytest.approx([0, 0, 1], abs=1e-15)
+    assert turn @ [half, 0, half] == pytest.approx([1, 0, 0], abs=1e-15)
+
+
+@pytest.mark.parametrize(("grazing", "view_px"), [(1e-2, 1.65), (1e-3, 454.0), (1e-4, np.inf)])
+def test_e7_equation_4_loses_its_digits_at_grazing(grazing: float, view_px: float):
+    """float32: the view is 1.6 px off at 10 mrad, 454 px at 1 mrad, not finite at 0.1 mrad; the stable form holds."""
+    turn = np.linspace(0, 2 * np.pi, 500)
+    o = np.stack([np.sin(grazing) * np.cos(turn), np.sin(grazing) * np.sin(turn), np.full(500, -np.cos(grazing))], -1)
+    single, exact = o.astype(np.float32), stable_normal(o.astype(np.float32).astype(np.longdouble))
+    off = 2 * np.linalg.norm((paper_normal(single) - exact).astype(np.float64), axis=-1).max() / IFOV
+    assert np.nan_to_num(off, nan=np.inf, posinf=np.inf) == pytest.approx(view_px, rel=0.01)
+    assert np.linalg.norm(stable_normal(single) - exact, axis=-1).max() < 1.6e-7
+    double, exact = paper_normal(o), stable_normal(o.astype(np.longdouble))
+    assert 2 * np.linalg.norm((double - exact).astype(np.float64), axis=-1).max() / IFOV < 6e-5
+
+
 @pytest.mark.parametrize(
     ("position", "psi_deg", "seed_deg"),
     [
@@ -149,12 +200,46 @@ def test_e8_the_slope_is_wrong_by_up_to_twelve_and_a_half_degrees():
     assert near == pytest.approx(0.7071, abs=1e-4)
 
 
+def test_e8_the_slope_is_ill_conditioned():
+    """40 urad of noise: 47 deg rms by slope, 1.8e-2 px by position; %.6f: 1.6 px by slope, 7.5e-5 px by position."""
+    exact = sweep_of_1450(1000.0)
+    normal = direction_to_normal(position_to_direction(exact))
+    shaken = normal + np.random.default_rng(0).normal(0, 40e-6, normal.shape)
+    noisy = normal_to_position(shaken / np.linalg.norm(shaken, axis=-1, keepdims=True))
+
+    def rms(of: np.ndarray) -> float:
+        return float(np.sqrt(np.mean(of**2)))
+
+    def by_slope(path: np.ndarray) -> float:
+        return rms(slope_rotation(path) - slope_rotation(exact))
+
+    def by_pose(path: np.ndarray) -> float:
+        return 320 * rms(turn_of(path) - turn_of(exact))
+
+    rounded = np.round(exact, 6)
+    assert np.rad2deg(by_slope(noisy)) == pytest.approx(47, abs=2)
+    assert np.rad2deg(by_slope(rounded)) == pytest.approx(0.29, abs=0.02)
+    assert 320 * by_slope(rounded) == pytest.approx(1.6, abs=0.1)
+    assert by_pose(noisy) == pytest.approx(1.8e-2, abs=2e-3)
+    assert by_pose(rounded) == pytest.approx(7.5e-5, abs=5e-6)
+
+
 @pytest.mark.parametrize(("xi_px", "seed_deg", "psi_deg"), [(0, 90.0, 0.0), (500, 87.9, 3.0), (2365, 79.7, 13.6)])
 def test_e9_the_slope_is_vertical_on_the_rigs_own_path(xi_px: float, seed_deg: float, psi_deg: float):
     """With the axes of code seen in public the scan runs along Y: -atan(dY/dX) is near 90 deg, lines hardly turn."""
     mounted = Mounting(axes="y,-x").to_device(aim(xi_px, np.array([-0.5, 0.5])))
     assert np.abs(np.rad2deg(slope_rotation(mounted))) == pytest.approx(seed_deg, abs=0.06)
     assert np.rad2deg(turn_of(aim(xi_px, 0.0))) == pytest.approx(psi_deg, abs=0.06)
+
+
+def test_e9_repeated_positions_have_no_slope():
+    """At four decimals 313 of 1450 positions repeat the one before: 0/0, or a silent 0 from atan2."""
+    path = np.round(sweep_of_1450(0.0), 4)
+    step = np.diff(path, axis=0) + 0.0  # no negative zeros
+    angle = slope_rotation(path)
+    assert int(np.isnan(angle).sum()) == int((step == 0).all(axis=1).sum()) == 313
+    assert (np.arctan2(step[:, 1], step[:, 0])[np.isnan(angle)] == 0).all()
+    assert np.isfinite(turn_of(path)).all()
 
 
 def test_e11_speed_needs_the_pitch_and_the_frame_period():
@@ -166,6 +251,14 @@ def test_e11_speed_needs_the_pitch_and_the_frame_period():
     for tilt, axis in ((IFOV / 2 * E1, 1), (IFOV / np.sqrt(2) * np.array([0.0, 1, 0]), 0)):
         moved = position_to_direction(normal_to_position((E3 + tilt) / np.linalg.norm(E3 + tilt)))
         assert np.abs(direction_to_scene(moved) / IFOV)[axis] == pytest.approx(1, abs=1e-6)
+
+
+def test_e12_e13_rates_are_in_hertz_and_times_have_overheads():
+    """m / t_img in ms is 1000 times too small for Hz; 640 x 600 at 100 ms takes 60 s, and readout comes on top."""
+    imaging_ms = 600 * CAMERA.exposure_ms  # equation (10)
+    assert imaging_ms == 60_000 == 1e3 * CAMERA.scan_seconds(600)
+    assert (1500 / CAMERA.scan_seconds(600)) / (1500 / imaging_ms) == pytest.approx(1000)  # Hz over equation (9)
+    assert 1e3 * LineCamera(exposure_ms=100, readout_ms=5).scan_seconds(600) - imaging_ms == pytest.approx(3000)
 
 
 def test_e14_vector_memory_is_half_open():
@@ -181,6 +274,11 @@ def test_e14_vector_memory_is_half_open():
     assert device_range(ours_y, "exclusive") == (1450, 2900)
 
 
+def test_e15_the_slit_spans_lines():
+    """A slit of 20 um is 2.70 px along the scan: lines 1 px apart overlap 2.7 times."""
+    assert CAMERA.slit_px == pytest.approx(2.70, abs=0.005)
+
+
 def test_e17_the_full_scan_takes_hours():
     """163 840 lines: 4.55 h at 100 ms and 27 min at 10 ms, 56.6 GB at 270 bands, 110 loads of 1500 positions."""
     lines = 16 * 10240
@@ -191,6 +289,14 @@ def test_e17_the_full_scan_takes_hours():
     assert lines * CAMERA.samples * 270 * 2 / 1e9 == pytest.approx(56.6, abs=0.05)
     assert -(-lines // CostModel().vector_pairs) == 110
     assert CAMERA.scan_seconds(lines) / CAMERA.scan_seconds(lines // 4) == 4
+
+
+def test_e18_counts_of_the_table_and_jumps_of_the_encoding():
+    """256 coarse patches and 100 to 500 fine ones are 356 to 756; patches of 4 patches are 5 numbers apart: 21, 26."""
+    assert [(512 // 32) ** 2 + fine for fine in (100, 200, 300, 400, 500)] == [356, 456, 556, 656, 756]
+    # 4 columns of coarse patches of 2 x 2 patches; patches 4 and 5 are the first two of the second row.
+    coarse = np.array([[2.0, 0.0], [2.0, 2.0]]) + 1.0
+    assert paper_numbers(coarse, fine=False, columns=4, factor=2).tolist() == [21, 26]
 
 
 def greatest_errors(field_deg: float) -> list[float]:
