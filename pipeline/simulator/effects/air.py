@@ -134,11 +134,6 @@ def sway_px(rig: Rig) -> float:
     return 0.0 if air.distance_m is None else air.wind_amplitude_m / (air.distance_m * rig.camera.ifov_rad)
 
 
-def sway_gradient(rig: Rig) -> float:
-    """Return by how much the sway differs from one px to the next at most, 2 pi A over the length of a gust."""
-    return 2 * math.pi * rig.air.wind_amplitude_m / GUST_M if sway_px(rig) else 0.0
-
-
 @dataclass(frozen=True)
 class Parallax(Displacement):
     """Displacement of what is not at the scene's distance, for which scale and geometry are right.
