@@ -125,10 +125,6 @@ class WorkerError(PipelineError, RuntimeError):
     """Worker processes died, or the connection to their scheduler was lost."""
 
 
-class BoundError(PipelineError, ArithmeticError):
-    """A simulated effect that was left out or simplified changes the signal by more than its bound."""
-
-
 class NothingToMend(Exception):  # noqa: N818 - no error: a survey that ends without a capture
     """The prior map of a field is certain enough, and no capture is needed; ``run`` is the run of that map."""
 

@@ -1,7 +1,7 @@
 """What takes most of a small survey's time and is the same for the same question, remembered.
 
-Only what is pure is kept: the look at the scene that a choice of effects rests on, the choice, which each process
-remembers by itself, and the changes that were measured. Of pictures one of each kind is drawn and packed, and stands
+Only what is pure is kept: the look at the scene that a choice of effects rests on, and the choice, which each process
+remembers by itself. Of pictures one of each kind is drawn and packed, and stands
 for all of that kind. Stores, receipt and run are made each time. Tests that surveys repeat themselves put `WORKED_OUT`
 back; those that ask nothing of effects have no scene looked at: `without_effects`.
 """
@@ -30,7 +30,7 @@ from pipeline.planning.coverage import uniform_sweeps
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import raster_from_values
 
-PURE = {effect_choice: ("probe_survey", "decide", "_verified"), run_folder: ("draw_quicklook", "webp")}
+PURE = {effect_choice: ("probe_survey", "decide"), run_folder: ("draw_quicklook", "webp")}
 WORKED_OUT: dict[str, tuple[ModuleType, Any]] = {
     name: (module, getattr(module, name)) for module, names in PURE.items() for name in names
 }
@@ -62,12 +62,6 @@ def remember(folder: Path, put: Callable[[object, str, Any], None] = setattr) ->
             decisions[question] = WORKED_OUT["decide"][1](probes, rig, effects, *given)
         return decisions[question]
 
-    def verified(scene: Any, rig: Any, decision: Any, probes: Any, whole: Any, report: Any) -> Any:
-        sweeps = [(block.sweep, block.seed, block.started_s) for block in whole]
-        asked = decision.asked, decision.tolerance, decision.unit
-        question = scene.key, rig, sweeps, *asked
-        return known(question, lambda: WORKED_OUT["_verified"][1](scene, rig, decision, probes, whole, report))
-
     def drawn(path: Path, panels: Any) -> None:
         fresh: list[bytes] = []
 
@@ -84,7 +78,7 @@ def remember(folder: Path, put: Callable[[object, str, Any], None] = setattr) ->
         question = "packed", picture.size, hashlib.blake2b(picture.tobytes()).hexdigest(), choices
         return known(question, lambda: WORKED_OUT["webp"][1](picture, **choices))
 
-    each = {"probe_survey": probed, "decide": decided, "_verified": verified, "draw_quicklook": drawn, "webp": packed}
+    each = {"probe_survey": probed, "decide": decided, "draw_quicklook": drawn, "webp": packed}
     for name, remembering in each.items():
         REMEMBERING[name] = (WORKED_OUT[name][0], remembering)
         put(WORKED_OUT[name][0], name, remembering)
@@ -108,7 +102,6 @@ def without_effects() -> Iterator[None]:
             "decide",
             lambda *told: REMEMBERING["decide"][1](*told[:-1], "none" if told[-1] == "auto" else told[-1]),
         )
-        patch.setattr(effect_choice, "_verified", lambda *given: {})
         yield
 
 

@@ -138,7 +138,7 @@ class ReceiptFields(_Part):
     kept: Facts | None = None  # of a uniform scan that is kept and read in part: patches, costs of all
     memory: Facts | None = None  # what became of the prior map
     pointing: Facts | None = None  # where the mirror may look beside the plan
-    lines: Facts | None = None  # sweeps with lines lost, repeated, out of order, late or invalid
+    lines: Facts | None = None  # sweeps with lines lost, repeated, out of order or invalid
     areas: dict[str, dict[str, float]] | None = None  # px of each class; ha where something says how large a pixel is
     ground: Facts | None = None  # with a pose or a placed scene: grid, what changed, what is old
     zones: Facts | None = None  # where zones leave something out: what is kept

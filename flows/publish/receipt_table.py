@@ -152,24 +152,20 @@ def print_effects(effects: Iterable[Mapping[str, Any]], total: Mapping[str, Any]
         [
             escape(row["name"]),
             escape(row["variant"] or "off"),
-            escape(row["why"] or ""),
-            format_change(row["bound"], endless=True),
-            format_change(row["measured"]),
+            escape(f"{row['reason']}, {row['magnitude'].removeprefix(row['name'] + ': ')}"),
+            format_change(row["bound"]),
         ]
         for row in effects
         if row["reason"] != "absent"
     ]
-    columns = ("effect", "computed", "why", "error", "measured")
-    console.print(table(columns, cells, left=3, whole=("effect", "computed", "error", "measured")))
+    console.print(table(("effect", "computed", "why", "error"), cells, left=3, whole=("effect", "computed", "error")))
     for sentence in format_total(total):
         console.print(escape(sentence))
 
 
-def format_change(value: float | None, *, endless: bool = False) -> str:
-    """Return a change in units of the tolerance; None is a dash, or 'none' where ``endless``: there is no bound."""
-    if value is None:
-        return "none" if endless else DASH
-    return f"{value:.2g}"
+def format_change(value: float | None) -> str:
+    """Return a change in units of the tolerance; None, a change without a bound, is 'none'."""
+    return "none" if value is None else f"{value:.2g}"
 
 
 def format_total(total: Mapping[str, Any]) -> Sequence[str]:
@@ -180,10 +176,7 @@ def format_total(total: Mapping[str, Any]) -> Sequence[str]:
     if total["bound"] is None:
         words.append("The error of the omitted effects has no bound.")
     else:
-        measured = "" if total["measured"] is None else f", measured on the worst lines {total['measured']:.2g}"
-        words.append(
-            f"Omitted and simplified effects change a stored number by at most {total['bound']:.2g} {unit}{measured}."
-        )
+        words.append(f"Omitted and simplified effects change a stored number by at most {total['bound']:.2g} {unit}.")
     exact = format_seconds(max(total["saved_s"], 0.0))
     words.append(f"Saved processor time against all effects in full: about {exact}.")
     return words

@@ -499,7 +499,7 @@ def make_source(scene: RasterScene, settings: Settings) -> SimulatedSource:
     """Return the simulated rig in front of a scene, without effects."""
     pointing = None
     if settings.source == "sim" and settings.pointing_px:
-        pointing = PointingErrors(offset_px=settings.pointing_px, jitter_px=0.0, seed=settings.seed)
+        pointing = PointingErrors(offset_px=settings.pointing_px, seed=settings.seed)
     return SimulatedSource(scene, settings.simulated_rig, settings.seed, {}, name=settings.source, pointing=pointing)
 
 

@@ -21,10 +21,8 @@ DWELL_STEPS = 0.25  # lines closer than this show the same place
 GAP_STEPS = 1.5  # a wider distance misses a line; a smaller step back is noise
 NOISE_SIGMAS = 6.0  # a step back of less than this much of the path's own noise is no turn
 EVEN_STEPS = 1e-7  # a path this straight and even has a closed form
-LATE_FRAMES = 0.25
-LEAST_FRAMES = 3  # fewer cannot show which one is late
+LEAST_FRAMES = 3  # fewer cannot show which stamp is wild
 WILD_FRAMES = 1000  # a first or last stamp this far off the others is wrong, if they lie nearer to each other
-FITS = 2  # the second without the frames that are late by the first
 
 Floats = NDArray[np.float64]
 
@@ -205,7 +203,6 @@ class LineNumbers:
     lost: int  # lines between the first and the last without a frame
     repeated: int  # frames with a stamp that came before
     backward: int  # frames whose stamp goes back, lies far off all others, or is not finite
-    late: int  # usable frames more than a quarter period from their place
 
 
 def number_lines(time_s: Floats, frame_s: float) -> LineNumbers:
@@ -214,8 +211,7 @@ def number_lines(time_s: Floats, frame_s: float) -> LineNumbers:
     A gap of more than 1.5 periods skips line numbers. The first of frames with equal stamps is used. Stamps that go
     back are not trusted: the longest ascending row of stamps is, the one with the earlier frames if several are equally
     long. So one wild stamp costs one line, also at either end. A late frame is used, with the position at its own time.
-    ``frame_s`` is the planned frame period. The true period is estimated from the stamps, so that a slow clock makes no
-    frame late.
+    ``frame_s`` is the planned frame period.
     """
     known = np.isfinite(time_s)
     first = np.zeros(len(time_s), np.bool_)
@@ -237,7 +233,6 @@ def number_lines(time_s: Floats, frame_s: float) -> LineNumbers:
         lost=int(count[-1]) + 1 - len(count) if len(count) else 0,
         repeated=repeated,
         backward=int((~usable).sum()) - repeated,
-        late=_count_late(time_s[usable], count, frame_s),
     )
 
 
@@ -277,14 +272,3 @@ def _numbers(time_s: Floats, frame_s: float) -> NDArray[np.intp]:
     order = np.arange(len(count))
     count = order + np.minimum.accumulate((count - order)[::-1])[::-1]
     return count - count[:1]
-
-
-def _count_late(time_s: Floats, count: NDArray[np.intp], frame_s: float) -> int:
-    """Count frames more than a quarter period from the even clock that fits them best."""
-    near = np.ones(len(time_s), np.bool_)
-    for _ in range(FITS):
-        if near.sum() < LEAST_FRAMES:
-            break
-        period, start = np.polyfit(count[near], time_s[near], 1)
-        near = np.abs(time_s - start - period * count) <= LATE_FRAMES * frame_s
-    return int((~near).sum())

@@ -56,8 +56,8 @@ class SweepPath:
         return place(self.lines, camera, grid=grid, usable=self.usable, shift_px=self.shift_px, gain=self.gain)
 
     def facts(self) -> dict[str, int]:
-        """Count lines that were lost, sent twice, out of order or late."""
-        counts = {name: getattr(self.numbers, name) for name in ("lost", "repeated", "backward", "late")}
+        """Count lines that were lost, sent twice or out of order."""
+        counts = {name: getattr(self.numbers, name) for name in ("lost", "repeated", "backward")}
         return counts | {"invalid": int(np.count_nonzero(~self.lines.valid_line))}
 
 

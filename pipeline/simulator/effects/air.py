@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.scan import points_of_scan
 from pipeline.simulator.effects.effect import (
-    OFF,
     Aim,
     Bound,
     Displacement,
@@ -29,8 +28,8 @@ from pipeline.simulator.effects.effect import (
     SweepBlock,
     survey_stream,
 )
-from pipeline.simulator.effects.lighting import BRDF, CLOUD, DRIFT
-from pipeline.simulator.effects.probe import UNITS, GainRange, Probe, lights_within, unit_electrons
+from pipeline.simulator.effects.lighting import DRIFT
+from pipeline.simulator.effects.probe import UNITS, GainRange, Probe
 from pipeline.simulator.rig_model import Air, Rig
 from pipeline.simulator.scenes.daylight import relative_daylight
 
@@ -67,13 +66,10 @@ class Turbulence(Aim):
             return Bound(0.0, "no distance or no turbulence")
         farthest = sigma * math.sqrt(2 * math.log(max(probe.lines, 1) / RISK))
         steep = np.hypot(*probe.slope)
-        change = float(np.minimum(steep * farthest, probe.span).max(initial=0.0))
-        strength = rytov_variance(rig, float(np.min(probe.wavelength_nm, initial=np.inf)))
-        beyond = f"; a guess, beyond weak turbulence (Rytov variance {strength:.2g})" if strength > 1 else ""
         return Bound(
-            change,
+            probe.moved(farthest, farthest),
             f"{sigma:.2g} px (sd) per line, at most {farthest:.2g} px in {probe.lines} lines,"
-            f" on edges of at most {steep.max(initial=0.0):.3g} {UNITS[probe.unit]}/px{beyond}",
+            f" on edges of at most {steep.max(initial=0.0):.3g} {UNITS[probe.unit]}/px",
         )
 
 
@@ -83,19 +79,13 @@ def turbulence_px(rig: Rig) -> float:
     In spherical waves air near the point tilts them less than air near the aperture, by (z / d)^(5/3) a length of way.
     So 3/8 of a plane wave's 2.91 are left [1]. D is the aperture as seen at rest, 10.6 mm of 15. It is valid for
     Kolmogorov's spectrum with one Cn2 all along the way, and D between inner and outer scale. The Fresnel width
-    sqrt(lambda d) must not be much wider than D. Turbulence must be weak (`rytov_variance` up to 1). Returns 0 without
+    sqrt(lambda d) must not be much wider than D. Turbulence must be weak. Returns 0 without
     a distance; no way is longer than `FARTHEST_M`.
     """
     metres = _way_m(rig)
     aperture_m = rig.optics.aperture_mm * 1e-3 * _REST
     angle = math.sqrt(NEAR_POINTS * PLANE * rig.air.turbulence_cn2 * metres * aperture_m ** (-1 / 3))
     return angle / rig.camera.ifov_rad
-
-
-def rytov_variance(rig: Rig, wavelength_nm: float) -> float:
-    """Return the variance of the light's logarithm in spherical waves by turbulence, 0.5 Cn2 k^(7/6) d^(11/6) [1]."""
-    waves_per_m = 2 * math.pi / (wavelength_nm * 1e-9)
-    return float(0.5 * rig.air.turbulence_cn2 * waves_per_m ** (7 / 6) * _way_m(rig) ** (11 / 6))
 
 
 def _way_m(rig: Rig) -> float:
@@ -131,24 +121,17 @@ class Wind(Displacement):
         return (right, down) if block.sweep.along == "x" else (down, right)
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound by the amplitude times the length of the steepest gradient, whichever way the wind blows."""
+        """Bound by the amplitude times the slope, whichever way the wind blows."""
         sway = sway_px(rig)
         if sway == 0:
             return Bound(0.0, "the air is calm")
-        steep = sway * np.hypot(*probe.slope)
-        change = float(np.minimum(steep, probe.span).max(initial=0.0))
-        return Bound(change, f"the crop sways by {sway:.2g} px, {rig.air.wind_hz:g} times a second")
+        return Bound(probe.moved(sway, sway), f"the crop sways by {sway:.2g} px, {rig.air.wind_hz:g} times a second")
 
 
 def sway_px(rig: Rig) -> float:
     """Return the amplitude of the canopy's sway, A / (d IFOV); 0 for a scene without a distance. [px]"""
     air = rig.air
     return 0.0 if air.distance_m is None else air.wind_amplitude_m / (air.distance_m * rig.camera.ifov_rad)
-
-
-def sway_gradient(rig: Rig) -> float:
-    """Return by how much the sway differs from one px to the next at most, 2 pi A over the length of a gust."""
-    return 2 * math.pi * rig.air.wind_amplitude_m / GUST_M if sway_px(rig) else 0.0
 
 
 @dataclass(frozen=True)
@@ -244,7 +227,7 @@ def format_reach(ends: tuple[float, float]) -> str:
 TURBULENCE, WIND, PARALLAX = Turbulence(), Wind(), Parallax()
 
 
-RANGE, UNIFORM = "range", "uniform"
+RANGE = "range"
 # Rows: wavelength [nm], coefficient of [4]; straight between, 0 outside. About 5 nm fine at oxygen A, 10 nm elsewhere.
 WATER = np.array([
     (570.0, 0.0), (593.0, 0.075), (610.0, 0.0), (667.6, 0.0), (690.0, 0.016), (710.0, 0.0125), (718.0, 1.8),
@@ -256,7 +239,6 @@ OXYGEN = np.array([
     (667.6, 0.0), (690.0, 0.15), (710.0, 0.0), (757.5, 0.0), (762.5, 4.0), (767.5, 0.35), (780.0, 0.0),
 ])  # fmt: skip
 AIR_MASS_M = 8434.0  # air at the ground that holds as much as the whole atmosphere above it: standard, 15 deg C
-_PROBES = 9  # distances at which the spectrum's course is taken for the bounds of others: it is smooth
 _KNOTS = 65  # distances, evenly in the logarithm, between which the transmission is taken as straight in it
 _QUADRATURE = np.linspace(-2.0, 2.0, 33)  # over a band, in standard deviations of its Gaussian
 KOSCHMIEDER = 3.912  # -ln 0.02 [3]
@@ -270,35 +252,28 @@ class Absorption(Gain):
     """Fraction of the light that gases leave over a distance, averaged over the width of a band.
 
     It has water vapour about 720, 820 and 940 nm, and oxygen at 690 and 760 nm. The band model of [4] for whole
-    atmospheres is taken to paths of metres (assumed). ``range`` takes each sample's own distance, ``uniform`` the
-    middle.
+    atmospheres is taken to paths of metres (assumed). Each sample has its own distance.
     """
 
     name = "absorption"
-    cost_ns = MappingProxyType({RANGE: 2.7, UNIFORM: 0.2})  # of a scene with relief
+    cost_ns = MappingProxyType({RANGE: 2.7})  # of a scene with relief
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound by level times the fraction that gases take, or that a variant misses."""
+        """Bound by level times the fraction that gases take."""
         reach = reach_m(rig)
         if reach is None:
             return Bound(0.0, "the scene has no distance")
-        if variant == UNIFORM and reach[0] == reach[1]:
-            return Bound(0.0, "every sample at its own distance")
-        near, middle, far = transmission(np.array([reach[0], sum(reach) / 2, reach[1]]), rig, probe.wavelength_nm)
-        fraction = 1 - far if variant == OFF else np.maximum(near - middle, middle - far)
-        verb = "take" if variant == OFF else "at one distance for all are wrong by"
+        fraction = 1 - transmission(np.array([reach[1]]), rig, probe.wavelength_nm)[0]
         where = f" at {probe.wavelength_nm[int(fraction.argmax())]:.0f} nm" if fraction.size else ""
-        why = (
-            f"oxygen and water vapour {verb} at most {fraction.max(initial=0.0):.2%}{where} over {format_reach(reach)}"
-        )
-        return Bound(probe.scaled(fraction), why)
+        most = f"{fraction.max(initial=0.0):.2%}{where}"
+        return Bound(probe.scaled(fraction), f"oxygen and water vapour take at most {most} over {format_reach(reach)}")
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
         reach, nm = reach_m(rig), np.asarray(probe.wavelength_nm, np.float64)
         if reach is None:
             return GainRange.between(1.0, 1.0, len(nm))
-        passed = transmission(np.geomspace(*reach, _PROBES), rig, nm)
-        return GainRange.of(passed, nm, uneven=float(passed.max(initial=0.0) - passed.min(initial=1.0)))
+        passed = transmission(np.array(reach), rig, nm)
+        return GainRange.of(passed, uneven=float(passed.max(initial=0.0) - passed.min(initial=1.0)))
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
         """Return the fraction that passes, (line, sample, band), or (1, 1, band) where one distance stands for all.
@@ -308,8 +283,8 @@ class Absorption(Gain):
         rig, reach = block.rig, reach_m(block.rig)
         if reach is None:
             return np.ones((1, 1, 1), np.float32)
-        if variant == UNIFORM or reach[0] == reach[1]:
-            return transmission(np.array([sum(reach) / 2]), rig, block.wavelength_nm)[:, None].astype(np.float32)
+        if reach[0] == reach[1]:
+            return transmission(np.array(reach[:1]), rig, block.wavelength_nm)[:, None].astype(np.float32)
         knots = np.geomspace(*reach, _KNOTS)
         table = transmission(knots, rig, block.wavelength_nm).astype(np.float32)
         place = np.log(sample_distances(block) / reach[0]) / np.log(reach[1] / reach[0]) * (_KNOTS - 1)
@@ -341,32 +316,21 @@ class PathRadiance(LightChange):
     """Light L at a distance d arrives as L exp(-beta d) + H (1 - exp(-beta d)), beta of ``extinction_per_m``.
 
     H, the light of endless air, is ``air.airlight_fraction`` of the white reference's and follows the daylight. None is
-    added where the white reference's light is not known. ``range`` takes each sample's own distance, ``uniform`` the
-    middle.
+    added where the white reference's light is not known. Each sample has its own distance.
     """
 
     name = "path-radiance"
-    cost_ns = MappingProxyType({RANGE: 3.1, UNIFORM: 0.5})  # of a scene with relief
+    cost_ns = MappingProxyType({RANGE: 3.1})  # of a scene with relief
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound by the fraction that is lost, or that a variant misses, times the greatest difference of signal and H.
-
-        Over the noise of the signal that difference is greatest where the signal is greatest, or least.
-        """
+        """Bound by the fraction that is lost times the greatest difference of signal and H."""
         reach = reach_m(rig)
         if reach is None:
             return Bound(0.0, "the scene has no distance")
-        if variant == UNIFORM and reach[0] == reach[1]:
-            return Bound(0.0, "every sample at its own distance")
-        depth = extinction_per_m(rig.air, probe.wavelength_nm)
-        lost = -np.expm1(-depth * reach[1])
-        if variant == UNIFORM:
-            middle = depth * sum(reach) / 2
-            lost = np.maximum(_between(depth * reach[0], middle), _between(middle, depth * reach[1]))
+        lost = -np.expm1(-extinction_per_m(rig.air, probe.wavelength_nm) * reach[1])
         worst = float((_contrast(probe, rig) * lost).max(initial=0.0))
-        verb = "takes" if variant == OFF else "at one distance for all is wrong by"
         most = f"at most {lost.max(initial=0.0):.2%} of the light"
-        return Bound(worst, f"air {verb} {most} and adds its own, over {format_reach(reach)}")
+        return Bound(worst, f"air takes {most} and adds its own, over {format_reach(reach)}")
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
         """Return what passes between the nearest and the farthest sample, and the greatest light that air adds. [e-]
@@ -377,28 +341,21 @@ class PathRadiance(LightChange):
         reach, nm = reach_m(rig), np.asarray(probe.wavelength_nm, np.float64)
         if reach is None:
             return GainRange.between(1.0, 1.0, len(nm))
-        passed = np.exp(-np.geomspace(*reach, _PROBES)[:, None] * extinction_per_m(rig.air, nm))
+        passed = np.exp(-np.array(reach)[:, None] * extinction_per_m(rig.air, nm))
         uneven = float(passed.max(initial=0.0) - passed.min(initial=1.0))
+        alone = GainRange.of(passed, uneven=uneven)
         if probe.white_e is None:
-            return GainRange.of(passed, nm, uneven=uneven)
-        sun = DRIFT.gain_range(probe, rig)
-        still = rig.air.airlight_fraction * probe.white_e * (1 - passed)
-        alone = GainRange.of(passed, nm, uneven=uneven, added_e=still)
-        most = sun.greatest.max(initial=1.0)
-        return replace(
-            alone,
-            added_e=alone.added_e * most,
-            added_steepest=alone.added_steepest * most + alone.added_e * sun.steepest,
-            added_bend=alone.added_bend * most + 2 * alone.added_steepest * sun.steepest + alone.added_e * sun.bend,
-        )
+            return alone
+        most = DRIFT.gain_range(probe, rig).greatest.max(initial=1.0)
+        return replace(alone, added_e=rig.air.airlight_fraction * probe.white_e * (1 - passed[1]) * most)
 
     def change(self, light: Radiance, block: SweepBlock, variant: str) -> Radiance:
         """Return light (line, sample, band) [e-] with what air takes of it and adds; changed in place."""
         reach = reach_m(block.rig)
         if reach is None:
             return light
-        metres = np.full((1, 1), sum(reach) / 2) if variant == UNIFORM else sample_distances(block)
-        depth = (extinction_per_m(block.rig.air, block.wavelength_nm) * metres[..., None]).astype(np.float32)
+        metres = sample_distances(block)[..., None]
+        depth = (extinction_per_m(block.rig.air, block.wavelength_nm) * metres).astype(np.float32)
         lost = -np.expm1(-depth)
         light *= 1 - lost
         if block.white_e is not None:
@@ -433,32 +390,11 @@ def rayleigh_per_m(wavelength_nm: Floats) -> Floats:
 
 
 def _contrast(probe: Probe, rig: Rig) -> Floats:
-    """Return the greatest difference of a signal from the light of endless air, over the signal's unit, (band,).
-
-    Daylight multiplies both; clouds and the angle of view change the signal alone. So H counts over their greatest
-    factor, and the darkest signal after their least.
-    """
+    """Bound the difference of a signal and the light of endless air by the greater of both, over the unit, (band,)."""
     if probe.white_e is None:
         return probe.level
-    horizon, (low, high) = rig.air.airlight_fraction * probe.white_e, lights_within(probe, rig)
-    cloud, view = CLOUD.gain_range(probe, rig), BRDF.gain_range(probe, rig)
-    lit, shaded = np.maximum(cloud.greatest * view.greatest, 1.0), cloud.least * view.least
-    brightest = lit * high
-    fraction = np.divide(
-        horizon, brightest, out=np.ones_like(brightest), where=brightest > horizon
-    )  # a band may be black
-    above = probe.level * np.clip(1 - fraction, 0.0, 1.0)
-    sun = DRIFT.gain_range(probe, rig)
-    below = np.maximum(horizon - shaded * low, 0.0) * np.maximum(sun.greatest, 1.0)
-    return np.asarray(np.maximum(above, below / unit_electrons(shaded * np.minimum(sun.least, 1.0) * low, probe, rig)))
-
-
-def _between(near: Floats, far: Floats) -> Floats:
-    """Return the fraction of light lost between two optical depths, exp(-near) - exp(-far).
-
-    It is accurate however close they are.
-    """
-    return -np.exp(-near) * np.expm1(near - far)
+    horizon = rig.air.airlight_fraction * probe.white_e * np.maximum(DRIFT.gain_range(probe, rig).greatest, 1.0)
+    return np.maximum(probe.level, horizon / (probe.unit_least_dn * rig.camera.electrons_per_dn))
 
 
 ABSORPTION, PATH_RADIANCE = Absorption(), PathRadiance()

@@ -291,13 +291,7 @@ class Saturation(Effect):
         if over == 0:
             return Bound(0.0, f"{expected:.3g} e- and 6 x {sd:.3g} e- of noise stay below {limit:.3g} e-")
         why = f"{expected:.3g} e- and 6 x {sd:.3g} e- of noise reach {over:.3g} e- above the limit of {limit:.3g} e-"
-        unit_dn = probe.unit_least_dn
-        if (
-            probe.unit == "sigma" and sd > 0 and not rig.detector.hot_fraction
-        ):  # what is lost, is lost where it is bright
-            of_sample = float(np.hypot(np.sqrt(brightest), camera.read_noise_e)) / camera.electrons_per_dn
-            unit_dn = of_sample / np.sqrt(probe.binning)
-        return Bound(over / camera.electrons_per_dn / unit_dn, why)
+        return Bound(probe.added(over, camera.electrons_per_dn), why)
 
 
 def well_reached(rig: Rig, read_noise_e: float) -> bool:

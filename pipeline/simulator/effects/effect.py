@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.mirror import position_to_normal
 from pipeline.geometry.scan import Sweep, line_positions, sweep_positions
-from pipeline.simulator.effects.probe import Probe
+from pipeline.simulator.effects.probe import GainRange, Probe
 from pipeline.simulator.optics.kernel_fit import Moments
 from pipeline.simulator.rig_model import Rig
 
@@ -85,6 +85,9 @@ class Blur(Effect, Protocol):
 
 class Gain(Effect, Protocol):
     """Light is multiplied."""
+
+    def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
+        """Return the factors that it has anywhere in the survey: they multiply the errors of other effects."""
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
         """Return the factor, an array that broadcasts to (line, sample, band)."""

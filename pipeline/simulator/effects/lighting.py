@@ -18,10 +18,9 @@ from pipeline.simulator.rig_model import Coating, Rig
 from pipeline.simulator.scenes.daylight import knots_within, relative_daylight, sun_elevation_deg
 
 Floats = NDArray[np.float64]
-_KNOTS_AT_ONCE = 512
 EDGE_FRACTION = 0.1  # width of a shadow's edge, over the shadow's size (assumed)
 HOT_SPOT_RAD = float(np.deg2rad(2.0))  # from its peak to 1/e (assumed)
-_PROBES = 65  # lines of a sweep, samples of a line, and incidences that bounds are taken at
+_PROBES = 65  # incidences that bounds are taken at
 
 
 @dataclass(frozen=True)
@@ -43,11 +42,8 @@ class Drift(Gain):
         if rig.sky.started is None:
             return Bound(0.0, "the survey has no time of day")
         seconds = probe.seconds + rig.camera.frame_ms * 1e-3  # to the end of the last line
-        worst = np.zeros(len(probe.wavelength_nm))
-        times = knots_within(rig.sky, seconds)
-        for some in np.array_split(times, len(times) // _KNOTS_AT_ONCE + 1):
-            change = relative_daylight(rig.sky, probe.wavelength_nm, some) - 1
-            worst = np.maximum(worst, np.abs(change).max(axis=0))
+        light = relative_daylight(rig.sky, probe.wavelength_nm, knots_within(rig.sky, seconds))
+        worst = np.abs(light - 1).max(axis=0)
         low, high = sun_elevation_deg(rig.sky, np.array([0.0, seconds]))
         duration = f"{seconds / 3600:.1f} h" if seconds >= 3600 else f"{seconds:.0f} s"
         course = f"with the sun from {low:.1f} to {high:.1f} deg in {duration}"
@@ -59,7 +55,7 @@ class Drift(Gain):
             return GainRange.between(1.0, 1.0, len(nm))
         times = knots_within(rig.sky, probe.seconds + rig.camera.frame_ms * 1e-3)
         light = relative_daylight(rig.sky, nm, times)
-        return GainRange.of(light, nm, uneven=float(np.ptp(light, axis=1).max(initial=0.0)))
+        return GainRange.of(light, uneven=float(np.ptp(light, axis=1).max(initial=0.0)))
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
         sky = block.rig.sky
@@ -127,22 +123,20 @@ class Brdf(Gain):
     cost_ns = MappingProxyType({"angles": 0.2})
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound by level times the greatest change: the slope at the largest angle, the hot spot at the least phase."""
+        """Bound by level times the greatest change: the slope at the largest angle, and the hot spot's peak."""
         slope, hot = rig.sky.brdf_per_rad, rig.sky.hot_spot
         if slope == 0 and hot == 0:
             return Bound(0.0, "the scene reflects alike in all directions")
-        angle, phase = _extremes(probe.sweeps, rig.camera)
-        fraction = slope * angle + hot * float(np.exp(-phase / HOT_SPOT_RAD))
+        angle = _greatest_angle(probe.sweeps, rig.camera)
+        fraction = slope * angle + hot
         peak = f" and a hot spot of {hot:.2g}" if hot else ""
         why = f"reflectance changes by at most {fraction:.2%}: {slope:.2g}/rad up to {np.rad2deg(angle):.2f} deg{peak}"
         return Bound(probe.scaled(fraction), why)
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
-        slope, bands = rig.sky.brdf_per_rad, len(probe.wavelength_nm)
-        angle, phase = _extremes(probe.sweeps, rig.camera)
-        least = max(1 - slope * angle, 0.0)
-        greatest = 1 + slope * angle + rig.sky.hot_spot * float(np.exp(-phase / HOT_SPOT_RAD))
-        return GainRange.between(least, greatest, bands, uneven=greatest - least)
+        change = rig.sky.brdf_per_rad * _greatest_angle(probe.sweeps, rig.camera)
+        least, greatest = max(1 - change, 0.0), 1 + change + rig.sky.hot_spot
+        return GainRange.between(least, greatest, len(probe.wavelength_nm), uneven=greatest - least)
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
         """Return 1 + b a + h exp(-phase / 2 deg) of each sample's direction, (line, sample, 1), at least 0."""
@@ -158,17 +152,14 @@ def _angles(sweep: Sweep, camera: LineCamera, scan_px: Floats, slopes: Floats) -
     return np.arctan(x * camera.ifov_rad), np.arctan(np.hypot(along, scan) * camera.ifov_rad)
 
 
-def _extremes(sweeps: tuple[Sweep, ...], camera: LineCamera) -> tuple[float, float]:
-    """Return the greatest angle from the undeflected direction and least phase within the sweeps [rad]."""
-    greatest, least = 0.0, np.inf
-    for sweep in (sweep for sweep in sweeps if sweep.lines):
-        ends = [np.linspace(0, count - 1, _PROBES).round().astype(int) for count in (sweep.lines, camera.samples)]
-        lines, samples = map(np.unique, ends)
-        angle, phase = _angles(sweep, camera, sweep.line_px()[lines], camera.pixel_slopes()[samples])
-        steps = [np.abs(np.diff(phase, axis=axis)).max(initial=0.0) for axis in (0, 1)]
-        greatest = max(greatest, float(np.abs(angle).max()))
-        least = min(least, float(phase.min() - sum(steps) / 2))  # no point is further from one looked at
-    return greatest, max(least, 0.0)
+def _greatest_angle(sweeps: tuple[Sweep, ...], camera: LineCamera) -> float:
+    """Return the greatest angle of view along the scene's x axis at the ends of lines within the sweeps [rad]."""
+    angles = [
+        np.abs(_angles(sweep, camera, sweep.line_px(), camera.pixel_slopes()[[0, -1]])[0]).max()
+        for sweep in sweeps
+        if sweep.lines
+    ]
+    return float(max(angles, default=0.0))
 
 
 DRIFT, CLOUD, BRDF = Drift(), Cloud(), Brdf()
@@ -265,16 +256,12 @@ class Polarisation(Gain):
     cost_ns = MappingProxyType({"exact": 0.2})
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound by level times the factor furthest from 1 in each band, over all incidences that the sweeps have.
-
-        Factors are taken at some incidences, and what a chord between two of them may miss is added.
-        """
+        """Bound by level times the factor furthest from 1 in each band, over all incidences that the sweeps have."""
         incidence = _incidence(sweep_ends(probe, rig.camera))
         if rig.mirror.coating == "ideal" or not incidence.size:
             return Bound(0.0, "the mirror reflects everything" if incidence.size else "no line is taken")
         factors = _factors_between(incidence, rig, probe.wavelength_nm)
-        between = np.abs(np.diff(factors, 2, axis=0)).max(axis=0) / 8  # most that a chord misses of what it cuts off
-        most = np.abs(factors - 1).max(axis=0) + between
+        most = np.abs(factors - 1).max(axis=0)
         least_deg, most_deg = np.degrees(incidence.min()), np.degrees(incidence.max())
         where = f" at {probe.wavelength_nm[int(most.argmax())]:.0f} nm" if most.size else ""
         why = (
@@ -287,7 +274,7 @@ class Polarisation(Gain):
         incidence, nm = _incidence(sweep_ends(probe, rig.camera)), np.asarray(probe.wavelength_nm, np.float64)
         if not incidence.size:
             return GainRange.between(1.0, 1.0, len(nm))
-        return GainRange.of(_factors_between(incidence, rig, nm), nm, uneven=0.0)
+        return GainRange.of(_factors_between(incidence, rig, nm), uneven=0.0)
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
         probes = ahead(block.sweep.swath_px, block.scan_px, block.rig.camera)

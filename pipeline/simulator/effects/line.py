@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, points_of_scan
-from pipeline.simulator.effects.air import PARALLAX, greatest_fraction, sway_gradient, turbulence_px
+from pipeline.simulator.effects.air import turbulence_px
 from pipeline.simulator.effects.effect import OFF, Bound, Effect, SweepBlock
-from pipeline.simulator.effects.pointing import at_line_ends, beside_plan, end_gains, greatest_lag_px, transient
+from pipeline.simulator.effects.pointing import beside_plan, greatest_lag_px, transient
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.optics.kernel_fit import BETWEEN_ROWS, SCALE_STEP
 from pipeline.simulator.optics.scene_radiance import TABULATED
@@ -128,29 +128,18 @@ class Smear(Effect):
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound what a blur of the positions' variance changes; 0 where every line has one position.
 
-        They vary as the mirror runs: without them its course within an exposure is left out as well.
+        They vary as the mirror runs: without them its course within an exposure is left out as well. A fold differs
+        from the mirror's positions by no more than both differ from the one at mid exposure.
         """
         most = max((sweep.positions for sweep in probe.sweeps), default=1)
         variance = (most**2 - 1) / 12  # of positions 1 px apart
         if variance == 0:
             return Bound(0.0, "the mirror stands still while a line is exposed")
-        if variant == FOLDED:
-            along, scan = _beside(probe.sweeps, rig)
-            along, scan = along + sway_gradient(rig), scan + sway_gradient(rig) + greatest_fraction(rig.air)
-            way, area = np.abs(np.arange(most) - (most - 1) / 2).mean(), 2 * variance
-            by_scan = np.minimum(probe.slope[1] * way, probe.curvature[1] * area) * scan
-            beside = (ways - ways.mean(axis=1, keepdims=True) for ways in _courses(probe.sweeps, rig))
-            uneven = max((float(np.abs(one).mean(axis=1).max()) for one in beside), default=0.0)
-            course = at_line_ends(probe.sweeps, rig.camera, 0.0, uneven)
-            by_course = probe.slope[0] * course[0] + probe.slope[1] * course[1]
-            change = np.minimum(probe.slope[0] * way * along + by_scan + by_course, probe.span)
-            # at a step of the relief up to half of the positions see the other depth, at most twice as far off
-            step = PARALLAX.bound(probe, rig).value if rig.air.relief == "step" else 0.0
-            return Bound(float(change.max(initial=0.0)) + step, f"lines of an exposure lie as one, {most} px")
         both = np.zeros(probe.slope.shape)
         held = ((ways + np.arange(ways.shape[1])).var(axis=1) for ways in _courses(probe.sweeps, rig))
         both[1] = max(variance, max((float(one.max()) for one in held), default=0.0))
-        return Bound(probe.blurred(both), f"the mirror moves {most} px in an exposure")
+        ways = 2 if variant == FOLDED else 1
+        return Bound(ways * probe.blurred(both), f"the mirror moves {most} px in an exposure")
 
 
 def _courses(sweeps: tuple[Sweep, ...], rig: Rig) -> Iterator[Floats]:
@@ -173,15 +162,6 @@ def smeared_positions(block: SweepBlock, variant: str) -> Floats:
 def folded_positions(sweep: Sweep, variant: str) -> int:
     """Return the number of held positions that the footprint itself holds, 1 px apart along the scan."""
     return sweep.positions if variant == FOLDED else 1
-
-
-def _beside(sweeps: tuple[Sweep, ...], rig: Rig) -> tuple[float, float]:
-    found = np.zeros(2)
-    for sweep in sweeps:
-        if sweep.lines and sweep.positions > 1:
-            moved = end_gains(sweep, rig.camera)[..., 1] - [0.0, 1.0]
-            found = np.maximum(found, np.abs(moved).max(axis=(0, 1)))
-    return float(found[0]), float(found[1])
 
 
 ROTATION, SLIT, SMEAR = Rotation(), SlitBox(), Smear()

@@ -26,9 +26,6 @@ from pipeline.simulator.rig_model import MirrorMotion, Rig
 Floats = NDArray[np.float64]
 EXCEEDED = 1e-3  # probability that any line of a survey lies beyond the bound
 _MODES = 6
-ACCURACY_PX = 50.0  # 0.15 deg mechanical, as quoted by the vendor: systematic, unknown before registration
-REPEATABILITY_PX = 0.8  # 40 urad mechanical: anew for every line
-_MOST_DEVIATES = 6.0  # beyond, one line in 5e8 lies
 
 
 def end_gains(sweep: Sweep, camera: LineCamera) -> Floats:
@@ -83,20 +80,16 @@ class Jitter(Aim):
         sigma, lines = _sigma_px(rig), probe.lines
         if sigma == 0 or lines == 0:
             return Bound(0.0, "the mirror comes back to the same tilt")
-        worst = np.zeros(3)
+        worst = np.zeros(2)
         for sweep in probe.sweeps:
             if sweep.lines:
                 tilt = tilt_to_scene(position_to_normal(line_positions(sweep, rig.camera)))
                 gain = end_gains(sweep, rig.camera) @ tilt[:, None]
-                size = np.sqrt((gain**2).sum(axis=-1))
-                common = np.abs((gain[..., 0, :] * gain[..., 1, :]).sum(axis=-1)) / size.prod(axis=-1)
-                worst = np.maximum(worst, [size[..., 0].max(), size[..., 1].max(), common.max()])
-        along, scan, common = float(worst[0]), float(worst[1]), float(worst[2])
+                worst = np.maximum(worst, np.sqrt((gain**2).sum(axis=-1)).max(axis=(0, 1)))
+        along, scan = (sigma * worst).tolist()
         most = math.sqrt(2 * math.log(lines / EXCEEDED))
-        g, h = probe.slope[0] * along, probe.slope[1] * scan
-        value = np.minimum(most * sigma * np.sqrt(g * g + h * h + 2 * common * g * h), probe.span).max(initial=0.0)
-        why = f"lines jump by {sigma * scan:.2f} px rms along the scan and {sigma * along:.2f} along the line"
-        return Bound(float(value), f"{why}, one of {lines} by {most:.1f} times that")
+        why = f"lines jump by {scan:.2f} px rms along the scan and {along:.2f} along the line"
+        return Bound(probe.moved(most * along, most * scan), f"{why}, one of {lines} by {most:.1f} times that")
 
 
 def tilt_to_scene(normals: Floats) -> Floats:
@@ -200,47 +193,34 @@ class PointingErrors(Aim):
     """An aim of the chain, on wherever there is one: the mirror looks beside the places that it reports.
 
     Errors are in px of the scene along the line and the scan. Every sweep has an offset drawn evenly from
-    ``-offset_px`` to ``offset_px`` in either axis, and every line a normal deviate of ``jitter_px`` rms in either. Each
-    is drawn from a stream of its own, keyed (seed, sweep name) and (seed, sweep name, line number). So no line's error
-    depends on which others are computed.
+    ``-offset_px`` to ``offset_px`` in either axis, from a stream of its own, keyed (seed, sweep name).
     """
 
-    offset_px: float = ACCURACY_PX
-    jitter_px: float = REPEATABILITY_PX
+    offset_px: float
     seed: int = 0
     name = "pointing"
     cost_ns = MappingProxyType({"exact": 0.2})
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
-        return self.of_lines(block.sweep.name, block.lines)[:, None]
+        return np.tile(self.offset(block.sweep.name), (len(block.lines), 1, 1))
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound by slope times the greatest error in either axis: the offset, and six deviates of jitter."""
-        most = self.offset_px + _MOST_DEVIATES * self.jitter_px
+        """Bound by slope times the greatest error in either axis."""
+        most = self.offset_px
         why = f"the mirror looks up to {most:.2g} px beside along the line and {most:.2g} px along the scan"
         return Bound(probe.moved(*at_line_ends(probe.sweeps, rig.camera, most, most)), why)
 
     def offset(self, sweep_name: str) -> Floats:
         """Return the systematic error of a sweep, (2,) along the line and the scan [px]."""
-        return self._stream(sweep_name).uniform(-self.offset_px, self.offset_px, 2)
-
-    def of_lines(self, sweep_name: str, lines: range) -> Floats:
-        """Return the whole error of some lines of a sweep, (line, 2) along the line and the scan [px]."""
-        jitter = np.array([self._stream(sweep_name, number).standard_normal(2) for number in lines]).reshape(-1, 2)
-        return self.offset(sweep_name) + self.jitter_px * jitter
-
-    def _stream(self, sweep_name: str, *line: int) -> np.random.Generator:
-        key = np.random.SeedSequence(entropy=self.seed, spawn_key=(zlib.crc32(sweep_name.encode()), *line))
-        return np.random.Generator(np.random.Philox(key))
+        key = np.random.SeedSequence(entropy=self.seed, spawn_key=(zlib.crc32(sweep_name.encode()),))
+        return np.random.Generator(np.random.Philox(key)).uniform(-self.offset_px, self.offset_px, 2)
 
 
 JITTER, HYSTERESIS, THERMAL_DRIFT = Jitter(), Hysteresis(), ThermalDrift()
 
 
-EXACT, CENTRES = "exact", "centres"
+EXACT = "exact"
 MOST_PARTS = 8  # of an exposure; a jump of h px within a part goes unseen as a blur of at most h^2/32 px^2
-_SERIES_BELOW = 0.5  # of (1 + 2 zeta) tau; 20 terms then leave less than 1e-20
-_TERMS = 20
 _RAMP = 64  # steps of a line that are as good as a ramp
 
 
@@ -249,29 +229,30 @@ class Staircase(Aim):
     """Sample and hold with any number of positions per px of path. Off, each px of the path has its one position.
 
     The memory is played at a steady rate while lines are exposed, timed so that in the long run lines lie where they
-    are planned. ``exact`` gives the mean position in equal parts of the exposure: so many that no position changes
-    within a part, at most :data:`MOST_PARTS`. ``centres`` gives that of the whole exposure, or of each px of path.
+    are planned. It is the mean position in equal parts of the exposure: so many that no position changes within a part,
+    at most :data:`MOST_PARTS`.
     """
 
     name = "staircase"
-    cost_ns = MappingProxyType({EXACT: 27.0, CENTRES: 0.01})  # exact: five positions a line instead of one
+    cost_ns = MappingProxyType({EXACT: 27.0})  # five positions a line instead of one
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
         positions, held = block.rig.mirror.positions_per_line, block.sweep.positions
-        scan = beside_plan(positions, held, block.numbers, _parts(positions, held, variant))
+        scan = beside_plan(positions, held, block.numbers, _parts(positions, held))
         return np.stack([np.zeros_like(scan), scan], axis=-1)
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound by what a shift of the mean and a blur of the second moment change, or slope times the mean way."""
+        """Bound by slope times the mean way of the held positions beside their plan."""
         positions = rig.mirror.positions_per_line
         if positions == 1 or not probe.sweeps:
             return Bound(0.0, "each px of the path has its one position")
-        mean, size, square = _moments(positions, probe.sweeps, variant)
-        both = np.zeros(probe.slope.shape)
-        ends = [at_line_ends(probe.sweeps, rig.camera, 0.0, way) for way in (size, mean, square**0.5)]
-        both[:] = np.square(ends[2])[:, None]
-        value = min(probe.moved(*ends[0]), probe.moved(*ends[1]) + probe.blurred(both))
-        return Bound(value, f"lines lie up to {mean:.3f} px off, held positions {square**0.5:.2f} px rms")
+        size = 0.0
+        for step in {sweep.positions for sweep in probe.sweeps}:
+            numbers = np.arange(max(sweep.lines for sweep in probe.sweeps if sweep.positions == step))
+            ways = beside_plan(positions, step, numbers, _parts(positions, step))
+            size = max(size, float(np.abs(ways).mean(axis=1).max(initial=0.0)))
+        moved = probe.moved(*at_line_ends(probe.sweeps, rig.camera, 0.0, size))
+        return Bound(moved, f"held positions lie {size:.3f} px off on average, in the worst line")
 
 
 def beside_plan(positions: float, step: int, numbers: NDArray[np.int64], parts: int = 1) -> Floats:
@@ -291,26 +272,12 @@ def beside_plan(positions: float, step: int, numbers: NDArray[np.int64], parts: 
     return middle + (0.5 - lag) / positions
 
 
-def _parts(positions: float, step: int, variant: str) -> int:
+def _parts(positions: float, step: int) -> int:
     """Return how many equal parts an exposure has; positions a / b change at multiples of 1 / a of it."""
-    if variant == CENTRES or step > 1:
+    if step > 1:
         return 1
     ratio = Fraction(positions).limit_denominator(1000)
     return min(ratio.numerator, MOST_PARTS) if abs(ratio - Fraction(positions)) < 1e-9 else MOST_PARTS
-
-
-def _moments(positions: float, sweeps: tuple[Sweep, ...], variant: str) -> tuple[float, float, float]:
-    worst = np.zeros(3)
-    for step in {sweep.positions for sweep in sweeps}:
-        numbers = np.arange(max(sweep.lines for sweep in sweeps if sweep.positions == step))
-        ways = beside_plan(positions, step, numbers, _parts(positions, step, EXACT))
-        if variant == CENTRES:
-            ways = ways - (ways.mean(axis=1, keepdims=True) if step == 1 else ways)
-        size = np.abs(ways).mean(axis=1)
-        # Ways of the several px of a line meet slopes of their own: they do not cancel.
-        mean = np.abs(ways.mean(axis=1)) if step == 1 else size
-        worst = np.maximum(worst, [one.max(initial=0.0) for one in (mean, size, (ways**2).mean(axis=1))])
-    return float(worst[0]), float(worst[1]), float(worst[2])
 
 
 @dataclass(frozen=True)
@@ -369,8 +336,8 @@ def responses(time: Floats, damping: float) -> tuple[Floats, Floats]:
     """Return the responses to a unit impulse and to a unit step, of a system with natural frequency 1 rad/s.
 
     ``time`` (...) is times that frequency, from 0 on [rad]. With g the first and h the second, the matrix exponential
-    of the free system is [[1 - h, g], [-g, 1 - h - 2 zeta g]]. Computed by expm1 and sinc, it is accurate below, at and
-    above damping 1.
+    of the free system is [[1 - h, g], [-g, 1 - h - 2 zeta g]]. Computed by expm1 and sinc, it is right to 1e-15 below,
+    at and above damping 1.
     """
     with np.errstate(under="ignore"):
         if damping <= 1:
@@ -383,18 +350,7 @@ def responses(time: Floats, damping: float) -> tuple[Floats, Floats]:
             apart, decay = 2 * root * time, np.exp(-slow * time)
             impulse = decay * time * np.where(apart > 0, -np.expm1(-apart) / np.where(apart > 0, apart, 1.0), 1.0)
             rest = decay + slow * impulse
-    early = time * (1 + 2 * damping) < _SERIES_BELOW
-    return impulse, np.where(early, _early_rise(np.where(early, time, 0.0), damping), 1 - rest)
-
-
-def _early_rise(time: Floats, damping: float) -> Floats:
-    """Return the step response by its Taylor series, from h'' + 2 zeta h' + h = 1, where 1 - rest would cancel."""
-    before, term = np.zeros_like(time), time**2 / 2
-    total = term.copy()
-    for order in range(3, _TERMS):
-        before, term = term, -(2 * damping * time * term + time**2 / (order - 1) * before) / order
-        total += term
-    return total
+    return impulse, 1 - rest
 
 
 def _at_start(mirror: MirrorMotion, sweep: Sweep, period: float, held: float) -> Floats:

@@ -40,12 +40,10 @@ class Probe:
     wavelength_nm: Floats  # (band,)
     fwhm_nm: Floats | None  # (band,) of the scene's own bands; None where not known
     level: Floats  # (band,) greatest signal
-    spread: Floats  # (band,) greatest difference of a signal from the mean of its line, all bands
     span: Floats  # (band,) greatest difference of two signals
     slope: Floats  # (2, band) greatest first derivative [1/px]
     curvature: Floats  # (2, band) greatest second derivative [1/px^2]
     spectral_slope: Floats  # (band,) greatest divided difference to a neighbouring band [1/nm]
-    spectral_curvature: Floats  # (band,) greatest second one, twice, 0 at either end [1/nm^2]
     brightest_e: float  # expected electrons of the brightest sample
     darkest_e: float
     unit_least_dn: float  # the smallest unit met, in DN of a sample: turns electrons into the unit, on the safe side
@@ -53,9 +51,7 @@ class Probe:
     seconds: float  # from the first line to the last
     white_e: Floats | None = None  # (band,) electrons of the white reference in one exposure; None where not known
     slit_errors: Mapping[str, float] = field(default_factory=dict)  # measured change by variant of the slit, or off
-    places: Floats = field(default_factory=lambda: np.zeros((0, 2)))  # of the maxima, rows and columns, worst first
     binning: int = 1  # samples that a stored number sums, the same in all of the sweeps
-    own_e: Floats | None = None  # (2, band) least and greatest light; None: it follows from level and span [e-]
 
     def moved(self, along_px: float, scan_px: float) -> float:
         """Bound what a shift of the image by at most so much changes: slope times way, never more than the span."""
@@ -133,61 +129,27 @@ def unit_electrons(light_e: Floats, probe: Probe, rig: Rig) -> Floats:
     return np.full_like(light_e, probe.unit_least_dn * rig.camera.electrons_per_dn)
 
 
-def lights_within(probe: Probe, rig: Rig) -> tuple[Floats, Floats]:
-    """Return least and greatest light of every band, (band,) each [e-]: where level and span have their units from.
-
-    If the probe has none, they are solved from level and span. The unit of means of m samples is U(S)^2 = (S + n) / m.
-    The greatest S has level S / U(S); the least differs from it by span U or less.
-    """
-    if probe.own_e is not None:
-        return probe.own_e[0], probe.own_e[1]
-    if probe.unit != "sigma" or rig.detector.noiseless:
-        unit = unit_electrons(probe.level, probe, rig)
-        high, way = probe.level * unit, probe.span * unit
-    else:
-        fixed, level, span = fixed_variance(rig), probe.level**2 / probe.binning, probe.span**2 / probe.binning
-        high = (level + np.sqrt(level * (level + 4 * fixed))) / 2
-        way = (np.sqrt(span * (span + 4 * (high + fixed))) - span) / 2
-    return np.maximum(high - way, probe.darkest_e), high
-
-
 @dataclass(frozen=True)
 class GainRange:
     """Factors of light that a gain has anywhere in a survey, (band,) each.
 
-    ``uneven`` is the greatest difference of two factors within one line. ``steepest`` and ``bend`` are the greatest
-    first and second differences of the factor over wavelength. ``added_e`` is light that is added, with differences of
-    its own.
+    ``uneven`` is the greatest difference of two factors within one line. ``added_e`` is light that is added.
     """
 
     least: Floats
     greatest: Floats
     uneven: float
-    steepest: Floats  # [1/nm]
-    bend: Floats  # [1/nm^2]
     added_e: Floats
-    added_steepest: Floats  # [e-/nm]
-    added_bend: Floats  # [e-/nm^2]
 
     @staticmethod
     def between(least: float, greatest: float, bands: int, *, uneven: float = 0.0) -> GainRange:
         """Return the range from ``least`` to ``greatest``, the same in all bands."""
-        no = np.zeros(bands)
-        return GainRange(np.full(bands, least), np.full(bands, greatest), uneven, no, no, no, no, no)
+        return GainRange(np.full(bands, least), np.full(bands, greatest), uneven, np.zeros(bands))
 
     @staticmethod
-    def of(factors: Floats, wavelength_nm: Floats, *, uneven: float, added_e: Floats | None = None) -> GainRange:
-        """Summarise (state, band) factors by their extremes and differences, with (state, band) light added."""
-        added = np.zeros((1, factors.shape[1])) if added_e is None else added_e
-        own, of_added = _differences(factors, wavelength_nm), _differences(added, wavelength_nm)
-        return GainRange(factors.min(axis=0), factors.max(axis=0), uneven, *own, added.max(axis=0), *of_added)
-
-
-def _differences(factors: Floats, wavelength_nm: Floats) -> tuple[Floats, Floats]:
-    nm = np.asarray(wavelength_nm, np.float64)
-    if len(nm) < 2:
-        return np.zeros(len(nm)), np.zeros(len(nm))
-    return steepest_difference(factors, nm).max(axis=0), np.abs(second_difference(factors, nm)).max(axis=0)
+    def of(factors: Floats, *, uneven: float) -> GainRange:
+        """Summarise (state, band) factors by their extremes."""
+        return GainRange(factors.min(axis=0), factors.max(axis=0), uneven, np.zeros(factors.shape[1]))
 
 
 def rising_runs(wavelength_nm: Floats) -> list[slice]:
@@ -214,15 +176,6 @@ def difference_rates(wavelength_nm: Floats) -> Floats:
     before, after = gaps[inner - 1], gaps[inner]
     rates[:, inner] = 2 / (before + after) / np.stack([before, after])
     return rates
-
-
-def second_difference(spectra: NDArray[Real], wavelength_nm: Floats) -> NDArray[Real]:
-    """Return D I of spectra (..., band), as :func:`difference_rates` defines it. [1/nm^2]"""
-    down, up = difference_rates(wavelength_nm).astype(spectra.dtype)
-    steps, out = np.diff(spectra, axis=-1), np.zeros_like(spectra)
-    out[..., :-1] = up[:-1] * steps
-    out[..., 1:] -= down[1:] * steps
-    return out
 
 
 def steepest_difference(spectra: NDArray[Real], wavelength_nm: Floats) -> NDArray[Real]:

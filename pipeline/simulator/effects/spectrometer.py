@@ -48,23 +48,20 @@ class Response(LightChange):
     cost_ns = MappingProxyType({EXACT: 2.2})
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound it by I'' v / 2, or by I' sqrt(v) where that is less; 0 where the scene's bands are as wide.
-
-        The kernel solves a heat equation. The change is the mean of D I over the time v / 2, so the bound holds on any
-        spectrum.
-        """
+        """Bound it by I' sqrt(v); 0 where the scene's bands are as wide."""
         wavelength = np.asarray(probe.wavelength_nm, np.float64)
         variance = missing_variance(rig.optics.fwhm_nm, probe.fwhm_nm, len(wavelength))
+        if not difference_rates(wavelength).any():
+            return Bound(0.0, "no band has a neighbour on either side")
         if not variance.any():
             if probe.fwhm_nm is None or not np.isfinite(probe.fwhm_nm).any():
                 return Bound(0.0, "the width of the scene's bands is not known; they are taken as they are")
             return Bound(0.0, f"the scene's bands are {rig.optics.fwhm_nm:g} nm wide already, or wider")
         near = np.abs(wavelength[:, None] - wavelength) <= REACH_SD * np.sqrt(variance)[:, None]
-        curved = np.where(near, probe.spectral_curvature, 0).max(axis=1) * variance / 2
         steep = np.where(near, probe.spectral_slope, 0).max(axis=1) * np.sqrt(variance)
         sd, known = float(np.sqrt(variance.max())), probe.fwhm_nm
         why = f"bands widen from {0.0 if known is None else np.nanmin(known):.3g} to {rig.optics.fwhm_nm:.3g} nm"
-        return Bound(float(np.minimum(curved, steep).max()), f"{why}: {sd:.2g} nm sd more")
+        return Bound(float(steep.max()), f"{why}: {sd:.2g} nm sd more")
 
     def change(self, light: Radiance, block: SweepBlock, variant: str) -> Radiance:
         return widen_bands(light, block.wavelength_nm, block.fwhm_nm, block.rig.optics.fwhm_nm)
@@ -149,26 +146,15 @@ class Smile(LightChange):
     cost_ns = MappingProxyType({"cubic": 0.9})
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound it by I' s, and a cubic beside its chord by I'' s (h - s) / 2 in a gap h between bands."""
-        wavelength = np.asarray(probe.wavelength_nm, np.float64)
+        """Bound it by 1.5 I' s: a cubic lies beside its chord by at most half as much as the chord rises."""
         shift = abs(rig.optics.smile_nm)
         if shift == 0:
             return Bound(0.0, "the slit's image is straight")
-        gaps = rising_gaps(wavelength)
-        if not gaps.size:
+        if not rising_gaps(probe.wavelength_nm).size:
             return Bound(0.0, "no two bands of rising wavelength: a shift of wavelengths shows on no single band")
-        between = np.diff(wavelength)
-        up = between > 0
-        way = np.minimum(shift, between / 2)
-        beside = np.maximum(probe.spectral_curvature[:-1], probe.spectral_curvature[1:])
-        if shift > between[up].min():  # bands see gaps that are not next to them
-            beside = np.full_like(beside, probe.spectral_curvature.max())
-        bent = float((way * (between - way) * beside)[up].max()) / 2
         steep = float(np.max(probe.spectral_slope, initial=0))
         why = f"{shift:.3g} nm at a line's ends, on spectra of at most {steep:.3g} {probe.unit}/nm"
-        # No slope of the cubic at a band is above the steepest: it adds at most 2 t (1 - t) to the way, t = s / h.
-        part = min(shift / float(gaps.min()), 0.5)
-        return Bound(steep * shift + min(bent, steep * shift * 2 * part * (1 - part)), why)
+        return Bound(1.5 * steep * shift, why)
 
     def change(self, light: Radiance, block: SweepBlock, variant: str) -> Radiance:
         """Return light (line, sample, band) [e-] at the wavelengths that each sample sees."""
@@ -321,14 +307,12 @@ class StrayLight(LightChange):
     cost_ns = MappingProxyType({"halo": 1.2})
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound it by f (S - mean), were all to fall evenly, and what the halo differs from that."""
-        optics = rig.optics
-        if optics.stray_fraction == 0:
+        """Bound it by f (S - H): what is scattered to a sample is between the least and the greatest light."""
+        fraction, range_e = rig.optics.stray_fraction, max(probe.brightest_e - probe.darkest_e, 0.0)
+        if fraction == 0:
             return Bound(0.0, "no light is scattered")
-        spread = float(np.max(probe.spread, initial=0))
-        halo = optics.stray_fraction * (1 - optics.stray_even) * _most_halo(probe, rig, spread)
-        why = f"{optics.stray_fraction:.2g} times a line's light, signals up to {spread:.3g} {probe.unit} from its mean"
-        return Bound(optics.stray_fraction * spread + halo, why)
+        why = f"{fraction:.2g} times a line's light, signals up to {range_e:.3g} e- from others"
+        return Bound(probe.added(fraction * range_e, rig.camera.electrons_per_dn), why)
 
     def change(self, light: Radiance, block: SweepBlock, variant: str) -> Radiance:
         """Return the light after scattering; works in place."""
@@ -343,31 +327,6 @@ class StrayLight(LightChange):
             line *= np.float32(1 - optics.stray_fraction)
             line += (along.T @ modes) @ across
         return light
-
-
-def _most_halo(probe: Probe, rig: Rig, spread: float) -> float:
-    """Bound |H - mean| over the unit at any sample, H the halo's own light.
-
-    It is at most the light that the kernel takes elsewhere than an even one would, times the range of signals
-    (brightest less darkest). It is never more than twice the greatest way from the mean. That is ``spread`` units, each
-    at most the unit at the brightest sample.
-    """
-    elsewhere = _uneven_fraction((rig.camera.samples, len(probe.wavelength_nm)), rig.optics.stray_halo_px)
-    per_dn = rig.camera.electrons_per_dn
-    range_e, least_e = max(probe.brightest_e - probe.darkest_e, 0.0), probe.unit_least_dn * per_dn
-    most = math.sqrt(1 + range_e / (probe.binning * least_e**2)) if probe.unit == "sigma" else 1.0
-    return min(elsewhere * probe.added(range_e, per_dn), min(2 * elsewhere, 1) * spread * most)
-
-
-@lru_cache(maxsize=16)
-def _uneven_fraction(counts: tuple[int, ...], sd_px: float) -> float:
-    """Return the greatest fraction of a sample's halo that differs from an even one: 1 narrow, 0 endless."""
-    even = 1.0
-    for count in counts:
-        waves, passed = _cosines(count, sd_px)
-        kernel = (waves.T * passed) @ waves
-        even *= 1 - float(np.abs(kernel - 1 / count).sum(axis=1).max()) / 2
-    return 1 - even
 
 
 @lru_cache(maxsize=16)

@@ -330,15 +330,6 @@ class Footprint:
                 there, width = there[~alike], width[~alike]
         return found
 
-    def by_parts(self) -> tuple[Footprint, Footprint | None]:
-        """Return the kernels whose box is parted, and those of pixels left out, which lie upright; None without any."""
-        fine = self.level == 1
-        return self._some(fine), None if fine.all() else self._some(~fine)
-
-    def _some(self, which: NDArray[np.bool_]) -> Footprint:
-        shift, variance, fractions = self.shift[:, which], self.variance[:, which], self.fractions[which]
-        return replace(self, shift=shift, variance=variance, fractions=fractions, level=self.level[which])
-
     def part(self, level: int, which: NDArray[np.intp]) -> Footprint:
         """Return some kernels of a level, in its px. Beyond level 1 boxes lie upright: they are small beside Gaussians.
 

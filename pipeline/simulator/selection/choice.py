@@ -25,7 +25,6 @@ from pipeline.simulator.selection.options import ALWAYS_ON, Menu, Option, list_o
 
 Reason = Literal["absent", "unseen", "small", "needed", "spent", "exact", "asked", "unasked", "always"]
 UNIT_NAMES: dict[Unit, str] = {"sigma": "sigma of the noise", "dn": "DN"}
-TOTAL = "all effects"
 
 
 @dataclass(frozen=True)
@@ -202,13 +201,12 @@ def _reason(menu: Menu, option: Option, tolerance: float, named: frozenset[str] 
     return "needed" if menu.off.error > tolerance else "spent"
 
 
-def list_effects(decision: Decision, measured: Mapping[str, float] | None = None) -> list[dict[str, Any]]:
-    """Return one plain row for every effect, in the order of the chain; ``measured`` is what `verify` found, by name.
+def list_effects(decision: Decision) -> list[dict[str, Any]]:
+    """Return one plain row for every effect, in the order of the chain.
 
     ``bound`` is on the change of any stored number, at the worst binning, with the factor of safety, in ``unit``. It is
-    0 where exact or absent, None where there is none. ``cost_s`` are estimated CPU seconds of all sweeps. ``why`` is a
-    sentence. Its parts are ``reason`` (see `Treatment`), ``left_out``, the bound on leaving it out, and ``magnitude``,
-    the words of that bound.
+    0 where exact or absent, None where there is none. ``cost_s`` are estimated CPU seconds of all sweeps. ``reason`` is
+    that of `Treatment`. ``left_out`` is the bound on leaving it out, and ``magnitude`` the words of that bound.
     """
     return [
         {
@@ -216,9 +214,7 @@ def list_effects(decision: Decision, measured: Mapping[str, float] | None = None
             "state": "on" if one.is_on else "off",
             "variant": one.option.variant if one.is_on else None,
             "bound": _finite(one.option.error),
-            "measured": None if measured is None else measured.get(one.name),
             "cost_s": one.option.cost_ns * 1e-9 * decision.px_bands,
-            "why": explain(one, decision),
             "reason": one.reason,
             "left_out": _finite(one.menu.off.error),
             "magnitude": one.menu.off.why,
@@ -228,7 +224,7 @@ def list_effects(decision: Decision, measured: Mapping[str, float] | None = None
     ]
 
 
-def sum_up(decision: Decision, measured: Mapping[str, float] | None = None) -> dict[str, Any]:
+def sum_up(decision: Decision) -> dict[str, Any]:
     """Return the totals: bound beside tolerance, and the CPU seconds that were saved against everything exact.
 
     They are without the rays through the footprint that every simulation takes.
@@ -239,7 +235,6 @@ def sum_up(decision: Decision, measured: Mapping[str, float] | None = None) -> d
         "tolerance": _finite(decision.tolerance),
         "unit": decision.unit,
         "bound": _finite(decision.error),
-        "measured": None if measured is None else measured.get(TOTAL),
         "within": decision.error <= decision.tolerance,
         "on": sum(one.is_on for one in decision.taken),
         "off": sum(not one.is_on for one in decision.taken),
@@ -247,33 +242,6 @@ def sum_up(decision: Decision, measured: Mapping[str, float] | None = None) -> d
         "exact_cost_s": exact,
         "saved_s": exact - cost,
     }
-
-
-def explain(one: Treatment, decision: Decision) -> str:
-    """Return why an effect is on or off, with the magnitude that its own bound states."""
-    unit, tolerance = UNIT_NAMES[decision.unit], _number(decision.tolerance)
-    left_out = f"left out it could change a stored number by {_number(one.menu.off.error)} {unit}"
-    asked = one.name in [word.strip() for word in decision.asked.split(",")]
-    reasons = {
-        "absent": ("asked for, but " if asked else "") + "the rig has none of it",
-        "unseen": "the scene shows nothing of it",
-        "small": f"left out it changes a stored number by at most {_number(one.option.error)} {unit}",
-        "needed": f"{left_out}, more than the tolerance of {tolerance}",
-        "spent": f"{left_out}, and the tolerance of {tolerance} is spent where it saves more",
-        "exact": "the tolerance is 0, so everything is computed",
-        "asked": "asked for",
-        "unasked": f"not asked for; {left_out}",
-        "always": "always there, for raw lines are whole numbers of limited size",
-    }
-    why = f"{reasons[one.reason]}: {one.menu.off.why}"
-    if one.is_on and one.option is not one.menu.exact:
-        off_by = f"{_number(one.option.error)} {unit}"
-        why += f"; {one.option.variant} differs from exact by at most {off_by}: {one.option.why}"
-    return why
-
-
-def _number(value: float) -> str:
-    return f"{value:.2g}" if math.isfinite(value) else "any number of"
 
 
 def _finite(value: float) -> float | None:

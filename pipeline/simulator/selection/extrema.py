@@ -1,14 +1,14 @@
 """Extrema of a scene: the pixels where it is steepest, most curved, brightest and darkest.
 
 The search works on the scene's own pixels, strip by strip, with the slit's box along the scan. It is right to a pixel;
-a closer look at these places gives the exact numbers. A few bands stand for all where planes are components. Bands with
-planes of their own are all searched, tile by tile: see `BandTiles`.
+a closer look at these places gives the exact numbers. A few bands stand for all where planes are components. Bands
+with planes of their own come in groups. The brightest, darkest and steepest of each stand for it: see `telling_bands`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, zip_longest
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera, footprint_kernel
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.effects.probe import second_difference, steepest_difference
+from pipeline.simulator.effects.probe import steepest_difference
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, to_bands
 
 Radiance = NDArray[np.float32]
@@ -27,7 +27,8 @@ Kind = tuple[int, int]  # measure, and band or group of bands
 BAND_GROUPS = 8
 CHOSEN_BANDS = 4
 _LEAST_WEIGHT = 1e-3  # of a kernel's tap: enough to find places
-_WINDOWS = 5  # tiles of each measure and group that are measured closely
+_MEAN_PX = 4  # side of the squares whose means are compared: a slit is wider than a pixel
+_SPECTRAL = 100  # number of the measure over wavelength
 _TILES = 8192  # about the most; each offers its best place
 _TILES_HIGH = 3  # strips: what is made of one stays in the processor's cache
 
@@ -45,32 +46,55 @@ def find_extrema(scene: RasterScene, camera: LineCamera, sweeps: Sequence[Sweep]
     ranking = Ranking()
     own_planes = spectra.ndim == 1
     if own_planes and len(spectra) > CHOSEN_BANDS:
-        tiles = BandTiles(scene, spectra, optics, tile)
-        for first, planes in _row_blocks(scene, tile, optics.halo):
-            tiles.add(first, planes)
-        tiles.rank(ranking)
-        return ranking.best(most)
-    bands = chosen_bands(spectra)
+        bands = telling_bands(scene, spectra, optics, tile, ranking)
+        kinds = np.searchsorted([one.stop for one in band_groups(len(spectra))], bands, side="right").tolist()
+    else:
+        bands = chosen_bands(spectra)
+        kinds = list(range(len(bands)))
     some = spectra[bands] if own_planes else np.ascontiguousarray(spectra[:, bands])
     for first, planes in _row_blocks(scene, _TILES_HIGH * tile, optics.halo):
         light = to_bands(planes[..., bands] if own_planes else planes, some)
         for measure, values in enumerate(optics.measures(light)):
-            _offer(ranking, measure, values, first, tile)
+            _offer(ranking, measure, values, first, tile, kinds)
     return ranking.best(most)
 
 
 def chosen_bands(spectra: Radiance) -> NDArray[np.intp]:
-    """Return the brightest band and those least like the ones chosen, at most ``CHOSEN_BANDS``.
-
-    Bands with planes of their own are chosen evenly, and as many: they do not predict each other.
-    """
+    """Return the brightest band and those least like the ones chosen, at most ``CHOSEN_BANDS``."""
     if spectra.ndim == 1:
-        return np.unique(np.linspace(0, len(spectra) - 1, CHOSEN_BANDS).round().astype(np.intp))
+        return np.arange(len(spectra))
     chosen = [int(spectra.max(axis=0).argmax())]
     for _ in range(min(CHOSEN_BANDS, spectra.shape[1]) - 1):
         gap = np.min([np.abs(spectra - spectra[:, [one]]).max(axis=0) for one in chosen], axis=0)
         chosen.append(int(gap.argmax()))
     return np.unique(chosen)
+
+
+def telling_bands(
+    scene: RasterScene, spectra: Radiance, optics: PixelOptics, tile: int, ranking: Ranking
+) -> NDArray[np.intp]:
+    """Return of each group of bands the brightest, the darkest and the steepest, of a scene with a plane for each.
+
+    They are the steepest from pixel to pixel, and from one mean of some pixels to the next. Places where light differs
+    most from band to band are offered as they are found.
+    """
+    groups, nm = band_groups(len(spectra)), np.asarray(scene.wavelength_nm, np.float64)
+    starts, worst = [one.start for one in groups], np.full((6, len(spectra)), -np.inf)
+    for first, planes in _row_blocks(scene, tile, 1):
+        light = planes * spectra
+        inner = light[1:-1, 1:-1]
+        noise = optics.noise(inner)
+        steps = [np.abs(beside - inner) / noise for beside in (light[2:, 1:-1], light[1:-1, 2:])]
+        rows, columns = (size // _MEAN_PX for size in inner.shape[:2])
+        some = inner[: rows * _MEAN_PX, : columns * _MEAN_PX]
+        means = some.reshape(rows, _MEAN_PX, columns, _MEAN_PX, len(spectra)).mean(axis=(1, 3))
+        steps += [np.abs(means[1:] - means[:-1]) / optics.noise(means[1:])]
+        steps += [np.abs(means[:, 1:] - means[:, :-1]) / optics.noise(means[:, 1:])]
+        for number, values in enumerate((inner, -inner, *steps)):
+            worst[number] = np.maximum(worst[number], values.max(axis=(0, 1), initial=-np.inf))
+        in_groups = np.maximum.reduceat(steepest_difference(inner, nm) / noise, starts, axis=2)
+        _offer(ranking, _SPECTRAL, in_groups, first, tile, range(len(groups)))
+    return np.unique([one.start + values[one].argmax() for one in groups for values in worst])
 
 
 def _row_blocks(scene: RasterScene, high: int, halo: int) -> Iterator[tuple[int, Radiance]]:
@@ -97,8 +121,11 @@ def _check_finite(scene: RasterScene, planes: Radiance, first: int) -> None:
     )
 
 
-def _offer(ranking: Ranking, measure: int, values: Radiance, first: int, tile: int) -> None:
-    """Offer the greatest of every tile and band; ``values`` (row, column, band) of the strip that begins at a row."""
+def _offer(ranking: Ranking, measure: int, values: Radiance, first: int, tile: int, kinds: Sequence[int]) -> None:
+    """Offer the greatest of every tile and band; ``values`` (row, column, band) of the strip that begins at a row.
+
+    ``kinds`` (band,) say with which other bands each is ranked.
+    """
     rows, columns, bands = values.shape
     padded = np.pad(values, [(0, -rows % tile), (0, -columns % tile), (0, 0)], constant_values=-np.inf)
     tall = padded.reshape(-1, tile, padded.shape[1], bands)  # (row of tiles, row, column, band)
@@ -108,8 +135,8 @@ def _offer(ranking: Ranking, measure: int, values: Radiance, first: int, tile: i
     column = within + np.arange(ridge.shape[1])[:, None] * tile
     high = np.arange(len(tall))[:, None, None]
     row = first + high * tile + tall[high, :, column, np.arange(bands)].argmax(axis=-1)
-    for band in range(bands):
-        ranking.offer((measure, band), *(one[..., band].ravel() for one in (greatest, row, column)))
+    for band, kind in enumerate(kinds):
+        ranking.offer((measure, kind), *(one[..., band].ravel() for one in (greatest, row, column)))
 
 
 class Ranking:
@@ -216,109 +243,3 @@ def band_groups(bands: int) -> list[slice]:
     """Return the groups of neighbouring bands whose worst stands for each of them."""
     edges = np.linspace(0, bands, min(bands, BAND_GROUPS) + 1).round().astype(int).tolist()
     return [slice(first, last) for first, last in pairwise(edges)]
-
-
-class BandTiles:
-    """Extremes of every band in the tiles of a scene whose bands have planes of their own."""
-
-    def __init__(self, scene: RasterScene, spectra: Radiance, optics: PixelOptics, tile: int) -> None:
-        self._scene, self._spectra, self._optics, self._tile = scene, spectra, optics, tile
-        self._groups = band_groups(len(spectra))
-        self._wavelength_nm = np.asarray(scene.wavelength_nm, np.float64)
-        self._found: dict[
-            int, list[Floats]
-        ] = {}  # by measure: worth, row, column, band, (4, group, tile) of each strip
-
-    def add(self, first: int, planes: Radiance) -> None:
-        """Take the extremes of a strip of tiles: planes (row, column, band) with the optics' halo about them."""
-        halo = self._optics.halo
-        light = planes[halo - 1 : 1 - halo, halo - 1 : 1 - halo] * self._spectra
-        for number, values in enumerate(self._measures(light)):
-            bands = np.stack([values[:, some].argmax(axis=1) + some.start for some in self._groups])
-            greatest = np.take_along_axis(values.T, bands, axis=0)  # (group, tile)
-            tiles = np.argsort(greatest, axis=1, kind="stable")[:, -_WINDOWS:]
-            worst, of_bands = (np.take_along_axis(one, tiles, axis=1) for one in (greatest, bands))
-            places = np.full(tiles.shape, first), tiles * self._tile
-            self._found.setdefault(number, []).append(np.stack([worst, *places, of_bands]))
-
-    def rank(self, ranking: Ranking) -> None:
-        """Measure the worst tiles of every measure and group closely, and offer their best places."""
-        every = [np.concatenate(some, axis=2) for some in self._found.values()]
-        worst = [_worst_first(one, _WINDOWS)[1:] for some in every for one in some.swapaxes(0, 1)]
-        windows = sorted({(row, column, band) for row, column, band in np.hstack(worst).T.astype(int).tolist()})
-        light = np.stack([self._window(*one) for one in windows], axis=2)
-        halo = self._optics.halo
-        inner = light[halo:-halo, halo:-halo]
-        noise = self._optics.noise(inner[..., 1])
-        step = np.abs(np.diff(inner, axis=-1)).max(axis=-1) / noise
-        bend = np.abs(inner[..., 0] + inner[..., 2] - 2 * inner[..., 1]) / noise
-        rows, columns, bands = np.array(windows).T
-        group = np.searchsorted([some.stop for some in self._groups], bands, side="right")
-        place = np.arange(self._tile)
-        within = ((rows + place[:, None]) < self._scene.shape[0])[:, None] & (
-            (columns + place[:, None]) < self._scene.shape[1]
-        )
-        middle = np.ascontiguousarray(light[..., 1])
-        for measure, values in enumerate((*self._optics.measures(middle), step, bend)):
-            shown = np.where(within, values, -np.inf).reshape(-1, len(windows))
-            best = shown.argmax(axis=0)
-            down, right = np.divmod(best, self._tile)
-            offered = shown[best, np.arange(len(windows))], rows + down, columns + right
-            for number in np.unique(group).tolist():
-                ranking.offer((measure, number), *(one[group == number] for one in offered))
-
-    def _window(self, row: int, column: int, band: int) -> Radiance:
-        """Return the light about a tile in a band and its neighbours, (row, column, 3).
-
-        The scene's edge is repeated.
-        """
-        halo, (rows, columns) = self._optics.halo, self._scene.shape
-        down = np.arange(row - halo, row + self._tile + halo).clip(0, rows - 1)
-        right = np.arange(column - halo, column + self._tile + halo).clip(0, columns - 1)
-        bands = np.arange(band - 1, band + 2).clip(0, len(self._spectra) - 1)
-        found: Radiance = self._scene.planes[down[:, None, None], right[:, None], bands] * self._spectra[bands]
-        return found
-
-    def _measures(self, light: Radiance) -> list[Radiance]:
-        """Return every measure of every tile of a strip, (tile, band) each; the strip has one pixel of margin."""
-        inner = light[1:-1, 1:-1]
-
-        def greatest(values: Radiance) -> Radiance:
-            ridge = values.max(axis=0)
-            if short := -len(ridge) % self._tile:
-                ridge = np.pad(ridge, [(0, short), (0, 0)], mode="edge")
-            most: Radiance = ridge.reshape(-1, self._tile, ridge.shape[1]).max(axis=1)
-            return most
-
-        high, low = greatest(inner), -greatest(-inner)
-        noise = self._optics.noise(low)
-        steps = np.abs(np.diff(light[:, 1:-1], axis=0))[1:], np.abs(np.diff(light[1:-1], axis=1))[:, 1:]
-        found = [high, -low, *(greatest(one) / noise for one in steps), *self._wide_steps(light, greatest, noise)]
-        if inner.shape[2] > 1:
-            nm = self._wavelength_nm
-            spectral = steepest_difference(inner, nm), np.abs(second_difference(inner, nm))
-            found += [greatest(one) / noise for one in spectral]
-        return found
-
-    def _wide_steps(self, light: Radiance, greatest: Callable[[Radiance], Radiance], noise: Radiance) -> list[Radiance]:
-        """Return the steps between means of half tiles, and between any two pixels, for slits wider than a pixel."""
-        starts = np.arange(0, light.shape[1] - 2, self._tile)
-        high, low = light.max(axis=0)[1:-1], light.min(axis=0)[1:-1]
-        span: Radiance = greatest(high[None]) + greatest(-low[None])
-        rows, columns = (_halves(size, self._tile) for size in light.shape[:2])
-        sums = [light[first:last].sum(axis=0) for first, last in pairwise([*rows.tolist(), len(light)])]
-        counts = np.diff(rows, append=light.shape[0])[:, None] * np.diff(columns, append=light.shape[1])
-        means = np.add.reduceat(np.stack(sums), columns, axis=1) / counts[..., None].astype(np.float32)
-        ahead = np.abs(np.diff(means, axis=0, append=means[-1:])).max(axis=0)
-        aside = np.abs(np.diff(means, axis=1, append=means[:, -1:])).max(axis=0)
-        firsts = np.searchsorted(columns, starts + 1, side="right") - 1
-        return [span / noise, *(np.maximum.reduceat(step, firsts, axis=0) / noise for step in (ahead, aside))]
-
-
-def _halves(size: int, tile: int) -> NDArray[np.intp]:
-    """Return the first pixels of half tiles, for a row with a pixel of margin on either side."""
-    firsts = np.arange(1, size - 1, tile)
-    both = np.unique(np.concatenate([firsts, firsts + tile // 2]))
-    found: NDArray[np.intp] = both[both < size - 1]
-    found[0] = 0
-    return found

@@ -1,4 +1,4 @@
-"""Probe a scene for a survey: a close look at its extrema and along lines, and the maxima that effects are bounded by.
+"""Probe a scene for a survey: a close look at its extrema, and the maxima that effects are bounded by.
 
 The whole scene is probed, whatever part of it the sweeps see: blurs and shifts bring light from beside them.
 """
@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_normal, scene_to_direction
-from pipeline.geometry.scan import CostModel, Sweep, exposing, points_of_scan, scene_to_sweep
+from pipeline.geometry.scan import CostModel, Sweep, exposing, scene_to_sweep
 from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.effect import OFF
 from pipeline.simulator.effects.line import BOXES, SLIT, UPRIGHT, box_of
-from pipeline.simulator.effects.probe import Probe, Unit, second_difference, steepest_difference, stored_mean, unit_at
+from pipeline.simulator.effects.probe import Probe, Unit, steepest_difference, stored_mean, unit_at
 from pipeline.simulator.optics.kernel_fit import Footprint, Moments, fold
 from pipeline.simulator.optics.rays import RayViews, exact_views, middle_normal
 from pipeline.simulator.optics.scene_radiance import SceneSampler
@@ -33,20 +33,15 @@ Way = tuple[float, float]  # along the line and the scan [px]
 MOST_VALUES = 1_000_000  # samples times bands; each is seen a few times over, a fraction of a px apart
 MOST_SAMPLES = 6_000
 FINEST_SAMPLES = 1000  # at which variants of the slit are compared with the finest
-LINE_SAMPLES = 64  # of a line, evenly from end to end, in sums where samples are summed
-_LEAST_SUMS = 16  # of a line
-_LEAST_OF_SWEEP = 50
 _LEAST_PLACES = 24  # where samples are summed, however many samples that takes
 _BESIDE = 2  # samples to either side of a place; of sums, one
-_LINES_AT_ONCE = 256
 _PROBE, _CLOSE = (2, 1), (3, 1)  # boxes of the probe, and boxes that find where variants differ
-_ALIKE = 0.02  # fraction by which blurs may differ and count as one
 _ROUNDING = 2e-6  # of the level: less is rounding of float32
 _NEAR, _FAR = 0.25, 0.5  # px by which the footprint is shifted
 _STILL: Way = (0.0, 0.0)
 _PHASES = tuple(((along, scan), _STILL) for along in (0.0, 0.5) for scan in (0.0, 0.5))  # at which boxes are compared
 _OPTICS = (DIFFRACTION, DEFOCUS, ABERRATION, KEYSTONE)
-_BY_BAND = ("level", "spread", "span", "slope", "curvature", "spectral_slope", "spectral_curvature")  # of a probe
+_BY_BAND = ("level", "span", "slope", "curvature", "spectral_slope")  # of a probe
 
 
 def _shifts() -> list[tuple[Way, Way]]:
@@ -77,9 +72,9 @@ def probe_survey(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Un
 
 
 def probe_scene(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "sigma") -> Probe:
-    """Return the maxima of the scene through slit and pixel: at its extrema, and along some lines of the sweeps.
+    """Return the maxima of the scene through slit and pixel, at its extrema.
 
-    Extrema are found on the scene's own pixels, so that the maxima hold for the whole image. Sweeps are of one binning
+    They are found on the scene's own pixels, so that the maxima hold for the whole image. Sweeps are of one binning
     and exposure. Raises SceneError: the scene holds a number that is not finite; SettingsError: no line to take;
     PoseError: a sweep is out of the mirror's reach.
     """
@@ -87,15 +82,12 @@ def probe_scene(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Uni
     rig = rig.taking(taken[0])
     binning, camera, bands = taken[0].binning, rig.camera, len(scene.wavelength_nm)
     room = max(min(MOST_VALUES // bands, MOST_SAMPLES), 64)
-    lines = views_of_lines(taken, camera, room // 3)
-    most = (room - room // 3) // (len(_patch_steps(binning)) * binning * len({sweep.along for sweep in taken}))
+    most = room // (len(_patch_steps(binning)) * binning * len({sweep.along for sweep in taken}))
     places = find_extrema(scene, camera, taken, max(most, 1 if binning == 1 else _LEAST_PLACES))
-    views = joined([lines, views_of_places(places, scene, camera, taken)])
+    views = views_of_places(places, scene, camera, taken)
     seen = light_seen(scene, camera, views, _footprint(SLIT.variants[0], rig, _PROBE, None, scene), SHIFTS)
     found = replace(
-        sum_up_light(seen, scene, rig, taken, unit, line_means(scene, camera, taken)),
-        places=places,
-        slit_errors=_slit_errors(scene, rig, views, taken, unit),
+        sum_up_light(seen, scene, rig, taken, unit), slit_errors=_slit_errors(scene, rig, views, taken, unit)
     )
     return worst_of_groups(found) if scene.electrons.ndim == 1 and bands > CHOSEN_BANDS else found
 
@@ -118,7 +110,6 @@ class SampleViews:
     scan_px: Floats
     slope: Floats
     along_y: NDArray[np.bool_]
-    sweep: NDArray[np.intp]  # number of the sweep
     binning: int = 1
 
     def chosen(self, which: NDArray[np.intp]) -> SampleViews:
@@ -135,55 +126,24 @@ def joined(parts: list[SampleViews]) -> SampleViews:
     return replace(parts[0], **every)
 
 
-def views_of_lines(sweeps: tuple[Sweep, ...], camera: LineCamera, room: int) -> SampleViews:
-    """Return lines spread over all sweeps, the most oblique included, with samples evenly from end to end.
-
-    All sweeps sum as many samples to a number.
-    """
-    order = {id(sweep): place for place, sweep in enumerate(sweeps)}
-    binning = sweeps[0].binning
-    per_line = min(camera.samples // binning, max(LINE_SAMPLES // binning, _LEAST_SUMS))
-    numbers = [(sweep, number) for sweep in sweeps for number in {0, sweep.lines // 2, sweep.lines - 1}]
-    numbers.sort(key=lambda one: -float(np.hypot(one[0].swath_px, one[0].line_px()[one[1]])))
-    most = max(room // (per_line * binning), 1)
-    kept = numbers[: most // 2 or 1]
-    rest = [(sweep, round(fraction * (sweep.lines - 1))) for sweep in sweeps for fraction in (0.25, 0.75)]
-    rest += numbers[len(kept) :]
-    kept += [rest[round(at)] for at in np.linspace(0, len(rest) - 1, most - len(kept))] if most > len(kept) else []
-    sums = np.linspace(0, camera.samples // binning - 1, per_line).round().astype(np.intp)
-    slopes = camera.pixel_slopes()[_samples_of(sums, binning)]
-    count = len(slopes)
-    return SampleViews(
-        np.repeat([sweep.swath_px for sweep, _ in kept], count).astype(np.float64),
-        np.repeat([sweep.line_px()[number] for sweep, number in kept], count),
-        np.tile(slopes, len(kept)),
-        np.repeat([sweep.along == "y" for sweep, _ in kept], count),
-        np.repeat([order[id(sweep)] for sweep, _ in kept], count),
-        binning,
-    )
-
-
 def views_of_places(places: Floats, scene: RasterScene, camera: LineCamera, sweeps: tuple[Sweep, ...]) -> SampleViews:
-    """Return patches about places, in the view of the finest and the most oblique sweep of each orientation.
+    """Return patches about places, in the view of the most oblique sweep of each orientation that sees them.
 
-    A place that no sweep sees is looked at as if the lines and samples of the finest continued. All sweeps sum as many
-    samples to a number.
+    A place that no sweep sees is looked at as if the lines and samples of the least oblique continued. All sweeps sum
+    as many samples to a number.
     """
     centred = places - (np.array(scene.shape) - 1) / 2
     found = []
     for along_y in (False, True):
         numbers = [number for number, sweep in enumerate(sweeps) if (sweep.along == "y") == along_y]
-        finest = sorted(numbers, key=lambda number: sweeps[number].step)
         oblique = sorted(numbers, key=lambda number: -abs(sweeps[number].swath_px))
         along, scan = (centred if along_y else centred[:, ::-1]).T
-        seen = [_first_seeing(order, sweeps, camera, along, scan) for order in (finest, oblique)]
+        seen = _first_seeing(oblique, sweeps, camera, along, scan)
         for number in numbers:
-            which = (seen[0] == number) | (seen[1] == number)
-            if number == finest[0]:
-                which |= seen[0] < 0
+            which = (seen == number) | ((seen < 0) if number == oblique[-1] else False)
             line, sample = scene_to_sweep(_held(sweeps[number]), camera, along[which], scan[which]).T
             reached = np.isfinite(line) & np.isfinite(sample)
-            found.append(_patches(sweeps[number], number, camera, line[reached], sample[reached]))
+            found.append(_patches(sweeps[number], camera, line[reached], sample[reached]))
     return joined(found)
 
 
@@ -212,26 +172,21 @@ def _patch_steps(binning: int) -> Floats:
     return np.stack(np.meshgrid(np.arange(-beside, beside + 1.0), np.arange(-1.0, 2.0)), axis=-1).reshape(-1, 2)
 
 
-def _patches(sweep: Sweep, number: int, camera: LineCamera, line: Floats, sample: Floats) -> SampleViews:
+def _patches(sweep: Sweep, camera: LineCamera, line: Floats, sample: Floats) -> SampleViews:
     patch, binning = _patch_steps(sweep.binning), sweep.binning
     middle = sample if binning == 1 else (sample + 0.5) / binning - 0.5
     sums = np.rint(middle[:, None] + patch[:, 0]).ravel()
     lines = (line[:, None] + patch[:, 1]).ravel()
-    number_of = _samples_of(sums.astype(np.intp), binning).astype(np.float64)
-    slopes = (number_of - (camera.samples - 1) / 2) * camera.ifov_rad
+    numbers = (sums[:, None] * binning + np.arange(binning)).ravel()
+    slopes = (numbers - (camera.samples - 1) / 2) * camera.ifov_rad
     count = len(slopes)
     return SampleViews(
         np.full(count, sweep.swath_px),
         sweep.start_px + np.repeat(lines, binning),
         slopes,
         np.full(count, sweep.along == "y"),
-        np.full(count, number, np.intp),
         binning,
     )
-
-
-def _samples_of(sums: NDArray[np.intp], binning: int) -> NDArray[np.intp]:
-    return (sums[:, None] * binning + np.arange(binning)).ravel()
 
 
 def light_seen(
@@ -270,40 +225,8 @@ def _rays_of(views: SampleViews, camera: LineCamera, turned: Way) -> RayViews:
     return exact_views(normal, turned[1] * ifov, views.slope + turned[0] * ifov)
 
 
-def line_means(scene: RasterScene, camera: LineCamera, sweeps: Sequence[Sweep]) -> Radiance:
-    """Return the mean over samples and bands of lines in the sweeps' strips, over all of the scene, (position,) [e-].
-
-    Means are those of the pixels that middle rays meet. A slit, and positions that one line holds, give means between
-    these. Positions continue beyond a sweep's ends, and beyond the scene, as far as the slit reaches.
-    """
-    spectra = scene.electrons * np.float32(camera.exposure_ms / DEFAULT_EXPOSURE_MS)
-    mean = spectra / spectra.shape[0] if spectra.ndim == 1 else spectra.mean(axis=1)
-    grey = (scene.planes.reshape(-1, scene.planes.shape[2]) @ mean.astype(np.float32)).reshape(scene.shape)
-    beyond, found = np.ceil(camera.slit_px / 2 + 1), []
-    for along_y, swath, start, stop in sorted({_held_range(sweep, scene.shape) for sweep in sweeps if sweep.lines}):
-        pixels, middle = (grey.T if along_y else grey), (np.array(scene.shape) - 1) / 2
-        down, right = middle[::-1] if along_y else middle
-        held = np.arange(start - beyond, stop + beyond)
-        for first in range(0, len(held), _LINES_AT_ONCE):
-            some = held[first : first + _LINES_AT_ONCE]
-            along, scan = points_of_scan(swath, camera, some[:, None], camera.pixel_slopes())
-            row = np.rint(scan + down).clip(0, pixels.shape[0] - 1).astype(np.intp)
-            column = np.rint(along + right).clip(0, pixels.shape[1] - 1).astype(np.intp)
-            found.append(pixels[row, column].mean(axis=1))
-    return np.concatenate(found)
-
-
-def _held_range(sweep: Sweep, shape: tuple[int, int]) -> tuple[bool, float, float, float]:
-    """Return orientation, swath, and the held positions from start to stop, extended to the scene's ends [px]."""
-    half, stop = shape[1 if sweep.along == "y" else 0] / 2, sweep.start_px + sweep.lines * sweep.step
-    before, after = max(np.ceil(sweep.start_px + half), 0.0), max(np.ceil(half - stop), 0.0)
-    return sweep.along == "y", sweep.swath_px, sweep.start_px - before, stop + after
-
-
-def sum_up_light(
-    seen: Radiance, scene: RasterScene, rig: Rig, sweeps: tuple[Sweep, ...], unit: Unit, means: Radiance
-) -> Probe:
-    """Return the maxima of light (shift, view, band) [e-]; ``means`` (line,) are the means of lines [e-]."""
+def sum_up_light(seen: Radiance, scene: RasterScene, rig: Rig, sweeps: tuple[Sweep, ...], unit: Unit) -> Probe:
+    """Return the maxima of light (shift, view, band) [e-]."""
     camera, binning, nm = rig.camera, sweeps[0].binning, np.asarray(scene.wavelength_nm, np.float64)
     least, most = seen.min(axis=0), seen.max(axis=0)
     darkest, brightest = stored_mean(least, binning), stored_mean(most, binning)
@@ -312,36 +235,28 @@ def sum_up_light(
         np.abs(brightest) / unit_at(np.asarray(brightest, np.float32), rig, unit, binning), np.abs(darkest) / scale
     )
     low, high = least.min(axis=0), most.max(axis=0)
-
-    def greatest(difference: Radiance, beside: Radiance) -> Floats:
-        """Return the greatest difference over the unit, (band,); differences that may be rounding count as 0."""
-        shown = np.where(difference > _ROUNDING * np.abs(beside), difference, np.float32(0))
-        return _greatest(stored_mean(shown, binning) / scale)
-
+    span = np.maximum(most - low, high - least)
+    span[span <= _ROUNDING * np.maximum(np.abs(low), np.abs(high))] = 0  # may be rounding
     slope, curvature = _derivatives(seen, scale, binning)
-    spectral = np.zeros((2, len(nm)))
+    spectral = np.zeros(len(nm))
     if len(nm) > 1:
-        differences = steepest_difference(seen[0], nm), np.abs(second_difference(seen[0], nm))
-        spectral = np.stack([_greatest(stored_mean(one, binning) / scale) for one in differences])
+        spectral = _greatest(stored_mean(steepest_difference(seen[0], nm), binning) / scale)
     return Probe(
         unit=unit,
         sweeps=sweeps,
         wavelength_nm=scene.wavelength_nm,
         fwhm_nm=scene.fwhm_nm,
         level=_greatest(level),
-        spread=greatest(np.maximum(most - means.min(), means.max() - least), high),
-        span=greatest(np.maximum(most - low, high - least), np.maximum(np.abs(low), np.abs(high))),
+        span=_greatest(stored_mean(span, binning) / scale),
         slope=slope,
         curvature=curvature,
-        spectral_slope=spectral[0],
-        spectral_curvature=spectral[1],
+        spectral_slope=spectral,
         brightest_e=float(most.max()),
         darkest_e=float(least.min()),
         unit_least_dn=float(scale.min()) / camera.electrons_per_dn,
         lines=sum(sweep.lines for sweep in sweeps),
         seconds=CostModel().seconds(list(sweeps), camera),
         white_e=scene.white_reference_electrons.astype(np.float64) * (camera.exposure_ms / DEFAULT_EXPOSURE_MS),
-        own_e=np.stack([low, high]).astype(np.float64),
         binning=binning,
     )
 
@@ -373,11 +288,7 @@ def _greatest(values: NDArray[np.floating]) -> Floats:
 
 
 def worst_of_groups(probe: Probe) -> Probe:
-    """Return the probe with the worst of each group of neighbouring bands in all of them: one was looked at for each.
-
-    Lights of the groups are the least and the greatest of any of their bands. A level of one band and the span of
-    another do not give the least light of a third.
-    """
+    """Return the probe with the worst of each group of neighbouring bands in all of them."""
     groups = band_groups(len(probe.wavelength_nm))
 
     def worst(values: Floats) -> Floats:
@@ -385,8 +296,7 @@ def worst_of_groups(probe: Probe) -> Probe:
         return np.concatenate([np.broadcast_to(one.max(axis=-1, keepdims=True), one.shape) for one in parts], axis=-1)
 
     values: dict[str, Any] = {name: worst(getattr(probe, name)) for name in _BY_BAND}
-    assert probe.own_e is not None
-    return replace(probe, **values, own_e=np.stack([-worst(-probe.own_e[0]), worst(probe.own_e[1])]))
+    return replace(probe, **values)
 
 
 def _slit_errors(
@@ -394,38 +304,26 @@ def _slit_errors(
 ) -> dict[str, float]:
     """Return the greatest change by every variant of the slit, and by leaving it out, over the unit.
 
-    It is against the finest variant, with all of the rig's blurs.
+    It is against the finest variant, with the rig's blurs.
     """
     rough = _roughest(scene, rig, views, unit)
     views = views.chosen((rough[:, None] * views.binning + np.arange(views.binning)).ravel())
-    errors = dict.fromkeys((*SLIT.variants[1:], OFF), 0.0)
-    for moments in _blurs(rig, scene.wavelength_nm, sweeps):
-        boxes = {variant: _footprint(variant, rig, BOXES[variant], moments, scene) for variant in SLIT.variants}
-        parted, alike = boxes[SLIT.variants[0]].by_parts()
-        sharp = light_seen(scene, rig.camera, views, parted, _PHASES)
-        finest = sharp if alike is None else sharp + light_seen(scene, rig.camera, views, alike, _PHASES)
-        scale = unit_at(_stored(finest, views), rig, unit, views.binning)
-        for variant in SLIT.variants[1:]:
-            change = _changes(scene, rig, views, boxes[variant].by_parts()[0], sharp, scale)
-            errors[variant] = max(errors[variant], float(change.max(initial=0.0)))
-        off = _changes(scene, rig, views, _footprint(OFF, rig, (1, 1), moments, scene), finest, scale)
-        errors[OFF] = max(errors[OFF], float(off.max(initial=0.0)))
-    return errors
+    moments = _least_blurs(rig, scene.wavelength_nm, sweeps)
+    boxes = {one: _footprint(one, rig, BOXES.get(one, (1, 1)), moments, scene) for one in (*SLIT.variants, OFF)}
+    finest = light_seen(scene, rig.camera, views, boxes.pop(SLIT.variants[0]), _PHASES)
+    scale = unit_at(_stored(finest, views), rig, unit, views.binning)
+    changes = {one: _changes(scene, rig, views, box, finest, scale) for one, box in boxes.items()}
+    return {one: float(change.max(initial=0.0)) for one, change in changes.items()}
 
 
 def _roughest(scene: RasterScene, rig: Rig, views: SampleViews, unit: Unit) -> NDArray[np.intp]:
-    """Return the stored numbers that the slit, or one upright box in its place, changes most: of all, of each sweep."""
+    """Return the stored numbers that the slit, or one upright box in its place, changes most."""
     boxes = _footprint(SLIT.variants[0], rig, _CLOSE, None, scene)
     close = light_seen(scene, rig.camera, views, boxes, _PHASES)
-    scale, found = unit_at(_stored(close, views), rig, unit, views.binning), []
-    sweep_of, count = views.sweep[:: views.binning], max(FINEST_SAMPLES // views.binning, 2 * _LEAST_OF_SWEEP)
-    numbers = np.unique(sweep_of)
-    each = max(count // 2 // len(numbers), _LEAST_OF_SWEEP)
-    for variant in (OFF, UPRIGHT):
-        other = _footprint(variant, rig, (1, 1), None, scene)
-        order = np.argsort(-_changes(scene, rig, views, other, close, scale), kind="stable")
-        found += [order[: count // 2], *(order[sweep_of[order] == number][:each] for number in numbers)]
-    return np.unique(np.concatenate(found))
+    scale, most = unit_at(_stored(close, views), rig, unit, views.binning), max(FINEST_SAMPLES // views.binning, 50)
+    others = [_footprint(variant, rig, (1, 1), None, scene) for variant in (OFF, UPRIGHT)]
+    changes = [_changes(scene, rig, views, other, close, scale) for other in others]
+    return np.unique([np.argsort(-change, kind="stable")[:most] for change in changes])
 
 
 def _changes(
@@ -444,18 +342,14 @@ def _footprint(
     return fold(box_of(variant, rig), parts, 1, blurs)
 
 
-def _blurs(rig: Rig, wavelength_nm: Floats, sweeps: Sequence[Sweep]) -> list[Moments]:
-    """Return all blurs and shifts of the rig's optics in the sweeps where they are least and most.
-
-    One where both agree.
-    """
-    normals = [middle_normal(sweep, rig.camera) for sweep in sweeps]
-    all_blurs = [[blur.moments(rig, wavelength_nm, blur.variants[0], one) for blur in _OPTICS] for one in normals]
-    found = [Moments.together(blurs, len(wavelength_nm)) for blurs in all_blurs]
-    sizes = [one.spread if one.waves is None else one.spread + one.waves**2 for one in found]
-    order = sorted(range(len(found)), key=lambda number: float(sizes[number].sum()))
-    least, most = order[0], order[-1]
-    return [found[least]] if np.allclose(sizes[least], sizes[most], rtol=_ALIKE) else [found[least], found[most]]
+def _least_blurs(rig: Rig, wavelength_nm: Floats, sweeps: Sequence[Sweep]) -> Moments:
+    """Return all blurs and shifts of the rig's optics in the sweep where they are least: others hide more."""
+    found = []
+    for sweep in sweeps:
+        normal = middle_normal(sweep, rig.camera)
+        blurs = [blur.moments(rig, wavelength_nm, blur.variants[0], normal) for blur in _OPTICS]
+        found.append(Moments.together(blurs, len(wavelength_nm)))
+    return min(found, key=lambda one: float((one.spread + (0.0 if one.waves is None else one.waves**2)).sum()))
 
 
 def _stored(values: Radiance, views: SampleViews) -> Radiance:

@@ -1,4 +1,4 @@
-"""Effects: bounds against measured changes over random scenes and rigs, and the error of the effects chosen."""
+"""Effects: bounds against measured changes over random scenes and rigs, and what the choice of effects saves."""
 
 from __future__ import annotations
 
@@ -7,18 +7,20 @@ import statistics
 import time
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
-from measure import Row
+from measure import Row, Timing, ratio, time_in_turn
 
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.effects.effect import Radiance, SweepBlock
+from pipeline.simulator.effects.effect import Effect, Radiance, SweepBlock
 from pipeline.simulator.effects.probe import noise_electrons
+from pipeline.simulator.readout import read_out
 from pipeline.simulator.render import EFFECTS, expected_light
 from pipeline.simulator.rig_model import Air, Rig
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
-from pipeline.simulator.selection.choice import decide
+from pipeline.simulator.selection.choice import Decision, decide
 from pipeline.simulator.selection.survey_probe import probe_scene
 from tests.benchmarks.effects.bench_simulator import cheap_effects
 from tests.pipeline.simulator.bound_trials import DRAWN, Trial, trials
@@ -32,12 +34,13 @@ TILES = 100
 MOST_LOOSE = 6.0  # median of bound over measured change
 MOST_BINNING = 8  # every case is stored as samples, and in sums of 2 to so many
 TOLERANCE = 0.1
+LEAST_SAVED = 3.0
 LINES = range(504, 520)  # of the farm's sweeps that are timed
 RIGS = {"rig at rest": Rig(), "rig 30 m away": Rig(air=Air(distance_m=30.0))}
 
 
 def rows() -> list[Row]:
-    """Bounds by effect and variant, then the pupil's integral and the farm."""
+    """Bounds by effect and variant, then tolerance and processor time of the farm."""
     sparse = _bounds({number: sparse_case(number) for number in SPARSE_CASES}, "scenes of which looks see little")
     return [
         *_bounds({number: random_case(number) for number in CASES}, "random scenes and rigs"),
@@ -101,16 +104,44 @@ def _of_effect(name: str, variant: str, cases: list[tuple[int, Trial]], what: st
 def _farm() -> list[Row]:
     scene = farm_scene(1, (1024, 1280))
     sweeps = tuple(Sweep(f"strip {swath:g}", "fine", "x", swath, -512.0, 1024) for swath in (-320.0, 320.0))
-    return [_of_rig(scene, name, rig, sweeps) for name, rig in RIGS.items()]
+    return [row for name, rig in RIGS.items() for row in _of_rig(scene, name, rig, sweeps)]
 
 
-def _of_rig(scene: RasterScene, name: str, rig: Rig, sweeps: tuple[Sweep, ...]) -> Row:
-    """How far the light that was chosen lies from the exact one."""
-    decision = decide(probe_scene(scene, rig, sweeps), rig, EFFECTS, TOLERANCE)
+def _of_rig(scene: RasterScene, name: str, rig: Rig, sweeps: tuple[Sweep, ...]) -> list[Row]:
+    clock = time.process_time()
+    probe = probe_scene(scene, rig, sweeps)
+    probed = time.process_time() - clock
+    decision = decide(probe, rig, EFFECTS, TOLERANCE)
+    decided = time.process_time() - clock - probed
     blocks = [_block(scene, rig, sweep, LINES) for sweep in sweeps]
     ways = {"auto": decision.chosen, "exact": decision.exact, "cheap": cheap_effects(decision)}
     light = {way: [expected_light(scene, block, chosen) for block in blocks] for way, chosen in ways.items()}
     apart = {way: _apart(light[way], light["exact"], rig) for way in ("auto", "cheap")}
+    clocks = time_in_turn({way: partial(_image, scene, blocks[0], chosen) for way, chosen in ways.items()}, rounds=3)
+    return [
+        _tolerance_row(name, apart, decision),
+        _cpu_row(name, "cheap", clocks, apart["cheap"]),
+        _cpu_row(name, "exact", clocks, 0.0),
+        Row(f"farm, {name}: probe and choice of effects, processor time", f"{probed:.1f} s and {decided:.2f} s"),
+        Row(f"farm, {name}: on", ", ".join(f"{one.name}" for one in decision.taken if one.is_on)),
+    ]
+
+
+def _block(scene: RasterScene, rig: Rig, sweep: Sweep, lines: range) -> SweepBlock:
+    white = scene.white_reference_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
+    return SweepBlock(rig, sweep, lines, scene.wavelength_nm, scene.shape, fwhm_nm=scene.fwhm_nm, white_e=white)
+
+
+def _image(scene: RasterScene, block: SweepBlock, chosen: Mapping[Effect, str]) -> None:
+    read_out(expected_light(scene, block, chosen), block, chosen)
+
+
+def _apart(light: Sequence[Radiance], exact: Sequence[Radiance], rig: Rig) -> float:
+    pairs = zip(light, exact, strict=True)
+    return max(float((np.abs(one - other) / noise_electrons(other, rig)).max()) for one, other in pairs)
+
+
+def _tolerance_row(name: str, apart: Mapping[str, float], decision: Decision) -> Row:
     return Row(
         f"farm 1024 x 1280 x 270, {name}, auto at {TOLERANCE} sigma: greatest change of light",
         f"{apart['auto']:.3g} sigma, bound {decision.error:.3g}",
@@ -120,11 +151,15 @@ def _of_rig(scene: RasterScene, name: str, rig: Rig, sweeps: tuple[Sweep, ...]) 
     )
 
 
-def _block(scene: RasterScene, rig: Rig, sweep: Sweep, lines: range) -> SweepBlock:
-    white = scene.white_reference_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
-    return SweepBlock(rig, sweep, lines, scene.wavelength_nm, scene.shape, fwhm_nm=scene.fwhm_nm, white_e=white)
-
-
-def _apart(light: Sequence[Radiance], exact: Sequence[Radiance], rig: Rig) -> float:
-    pairs = zip(light, exact, strict=True)
-    return max(float((np.abs(one - other) / noise_electrons(other, rig)).max()) for one, other in pairs)
+def _cpu_row(name: str, against: str, clocks: Mapping[str, Timing], apart: float) -> Row:
+    numbers = len(LINES) * 640 * 270
+    ns = {way: 1e9 * clock.cpu_min_s / numbers for way, clock in clocks.items()}
+    goal = against == "cheap" and RIGS[name] == Rig()
+    what = "each as cheap as a tenth of the tolerance lets it be" if against == "cheap" else "exact"
+    return Row(
+        f"farm, {name}, auto: processor time against everything on, {what}",
+        f"1/{ratio(clocks, against, 'auto'):.2f}",
+        f">= {LEAST_SAVED:g} times less" if goal else "",
+        ratio(clocks, against, "auto") >= LEAST_SAVED if goal else None,
+        f"auto {ns['auto']:.1f}, everything {ns[against]:.1f} ns/px*band, readout included",
+    )

@@ -61,9 +61,7 @@ def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:
         "state": "on",
         "variant": "exact",
         "bound": 0.0,
-        "measured": None,
         "cost_s": 1.5,
-        "why": "asked for",
         "reason": "asked",
         "left_out": 0.5,
         "magnitude": "shot noise",
@@ -74,7 +72,6 @@ def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:
         "tolerance": 0.1,
         "unit": "sigma",
         "bound": 0.08,
-        "measured": 0.03,
         "within": True,
         "on": 1,
         "off": 0,
@@ -279,7 +276,7 @@ def test_words_are_escaped():
     receipt["accuracy"]["per_class_iou"] = {bad: 0.5}
     receipt["accuracy"]["false_classes"] = {bad: 1}
     receipt["accuracy"]["controls"] = {bad: {"miou": 0.5, "spread": None}}
-    receipt["effects"][0]["why"] = bad
+    receipt["effects"][0]["magnitude"] = bad
     page = render_report(receipt, PNG, [Picture(PNG, bad + '" onload="x')])
     Page(page)
     assert '" onload="' not in page

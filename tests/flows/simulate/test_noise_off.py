@@ -12,7 +12,6 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import convolve1d
 
-from flows.tasks.stages import effects as effect_choice
 from pipeline.geometry.camera import LineCamera, footprint_kernel
 from storage.arrays.mosaics import Mosaic, open_mosaic
 from storage.arrays.signal_cubes import open_signal_cubes
@@ -75,14 +74,8 @@ class Stored:
 
 
 @pytest.fixture
-def surveyed(
-    survey_png: Any, make_weights: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Callable[[Waves], Stored]:
-    """Survey waves from a .npy file by every line, camera's footprint on and noise off.
-
-    What is left out is not measured: that none of it is in the light is what is tested here.
-    """
-    monkeypatch.setattr(effect_choice, "_verified", lambda *given: {})
+def surveyed(survey_png: Any, make_weights: Any, tmp_path: Path) -> Callable[[Waves], Stored]:
+    """Survey waves from a .npy file by every line, camera's footprint on and noise off."""
 
     def survey(scene: Waves) -> Stored:
         np.save(tmp_path / "waves.npy", scene.raster())

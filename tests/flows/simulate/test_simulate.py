@@ -181,17 +181,9 @@ def test_no_scan_waits_for_torch(tmp_path: Path) -> None:
     assert ended.returncode == 0, ended.stderr
 
 
-ROW = {
-    "name": "smile",
-    "state": "on",
-    "variant": "cubic",
-    "bound": 0.0,
-    "measured": None,
-    "cost_s": 0.004,
-    "why": "needed",
-}
+ROW = {"name": "smile", "state": "on", "variant": "cubic", "bound": 0.0, "cost_s": 0.004}
 ROW |= {"reason": "needed", "left_out": 1.4, "magnitude": "smile: 0.3 nm", "unit": "sigma"}
-TOTAL = {"asked": "auto", "tolerance": 0.1, "unit": "sigma", "bound": 0.0, "measured": 0.0, "within": True}
+TOTAL = {"asked": "auto", "tolerance": 0.1, "unit": "sigma", "bound": 0.0, "within": True}
 TOTAL |= {"on": 1, "off": 1, "saved_s": 1.0}
 
 
@@ -200,10 +192,10 @@ def test_the_table_fits_the_terminal(width: int) -> None:
     """Figures are never broken; effects that are absent have no row."""
     said = io.StringIO()
     absent = ROW | {"name": "wind", "state": "off", "reason": "absent", "magnitude": "the air is calm"}
-    long = ROW | {"name": "thermal-drift", "variant": "positions", "why": "a way of words " * 12}
+    long = ROW | {"name": "thermal-drift", "variant": "positions", "magnitude": "a way of words " * 12}
     print_effects([ROW, long, absent], TOTAL, Console(file=said, width=width))
     lines = said.getvalue().splitlines()
     assert max(map(len, lines)) <= width
     (row,) = [line for line in lines if line.split()[:2] == ["smile", "cubic"]]
-    assert row.split()[2:] == ["needed", "0", "–"]  # noqa: RUF001
+    assert row.split()[2:] == ["needed,", "0.3", "nm", "0"]
     assert "wind" not in said.getvalue()

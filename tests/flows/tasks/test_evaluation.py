@@ -62,7 +62,7 @@ def _registration(archive: Path, record: dict[str, Any]) -> StageRef:
 def test_labels_are_moved_as_the_map_lies(tmp_path: Path) -> None:
     """The offset is that of the sweep which registration held."""
     scene = raster_from_values(np.ones((8, 8, 1)), LineCamera(), name="t", wavelength_nm=np.array([500.0]))
-    errors = PointingErrors(9.0, 0.0, 4)
+    errors = PointingErrors(9.0, 4)
     source = SimulatedSource(scene, Rig(), pointing=errors)
     off = evaluation.map_offset(source, [_registration(tmp_path, {"reference": "coarse-3"})])
     np.testing.assert_array_equal(off, errors.offset("coarse-3"))

@@ -51,7 +51,7 @@ def surveyed(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], 
 
 def test_sweeps_are_put_right_by_seams_and_on_the_mosaic(surveyed: tuple[dict[str, Any], Path]) -> None:
     """What registration finds beside the sweep it held is what the simulator got wrong, within half a pixel."""
-    pointing, errors = surveyed[0]["pointing"], PointingErrors(OFF_PX, 0.0, SEED)
+    pointing, errors = surveyed[0]["pointing"], PointingErrors(OFF_PX, SEED)
     coarse = pointing["coarse"]
     assert len(coarse["sweeps"]) > 1
     for name, offset in coarse["sweeps"].items():

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.polynomial.legendre import leggauss
 
 from pipeline.errors import ShapeError
 from pipeline.geometry.camera import LineCamera, bin_samples, digitise, expose, footprint, footprint_kernel
@@ -59,20 +58,6 @@ def test_footprint_is_a_box_over_linear_interpolation(width: float):
     assert kernel == pytest.approx(kernel[::-1], abs=1e-12)
     assert kernel.min() >= 0
     assert width**2 / 12 <= (kernel * place**2).sum() <= width**2 / 12 + 0.25
-
-
-@pytest.mark.parametrize("width", [1.0, 2.7027027, 5.5])
-def test_footprint_equals_quadrature(width: float):
-    """Each weight is the mean of the linear kernel over the box, integrated piece by piece."""
-    kernel = footprint_kernel(width)
-    nodes, weights = leggauss(4)
-    for place, weight in zip(np.arange(len(kernel)) - len(kernel) // 2, kernel, strict=True):
-        low, high = place - width / 2, place + width / 2
-        cuts = np.unique(np.clip([low, -1, 0, 1, high], low, high))
-        middle, half = (cuts[1:] + cuts[:-1]) / 2, np.diff(cuts) / 2
-        t = np.abs(middle[:, None] + half[:, None] * nodes)
-        value = np.maximum(1 - t, 0)
-        assert weight == pytest.approx((half[:, None] * weights * value).sum() / width, abs=1e-12)
 
 
 @pytest.mark.parametrize("read_noise", [20.0, 3.0])

@@ -16,7 +16,6 @@ from pipeline.geometry.mirror import direction_to_scene, position_to_normal, ref
 from pipeline.geometry.scan import (
     CostModel,
     Sweep,
-    device_range,
     exposing,
     line_positions,
     memory_loads,
@@ -86,11 +85,6 @@ def test_lines_stand_in_the_middle_of_their_held_positions():
     assert line_positions(sweep(), CAMERA) == pytest.approx(sweep_positions(sweep(), CAMERA)[:, 0])
 
 
-def test_the_turned_rig_has_the_same_positions():
-    """``along`` names the scene's axis; the mirror does the same either way."""
-    assert line_positions(sweep(along="y"), CAMERA) == pytest.approx(line_positions(sweep(), CAMERA))
-
-
 def test_sweeps_out_of_reach_are_refused():
     """A line beyond the mirror's disk raises instead of being clamped to the rim."""
     with pytest.raises(PoseError, match="beyond the rim"):
@@ -116,9 +110,6 @@ def test_sweeps_of_other_exposures_cost_their_own_frames():
     assert cost.seconds([slow, fast], CAMERA) == pytest.approx(sum(parts) - 1.6)
     own = replace(slow, exposure_ms=CAMERA.exposure_ms)
     assert cost.seconds([own, fast], CAMERA) == cost.seconds([slow, fast], CAMERA)
-
-
-COST = CostModel()
 
 
 def held(lines: int, step: int = 1, name: str = "a") -> Sweep:
@@ -151,19 +142,6 @@ def test_loads_are_full(given_sweeps: list[Sweep], capacity: int):
     loads = memory_loads(given_sweeps, capacity)
     for load, after in pairwise(loads):
         assert load.pairs + given_sweeps[after.parts[0].sweep].step > capacity
-
-
-def test_channels_lie_one_behind_the_other():
-    """X and Y of a part have as many cells, Y behind all X of the load."""
-    (load,) = memory_loads([held(10), held(5)], 1500)
-    assert load.channels(load.parts[0]) == ((0, 10), (15, 25))
-    assert load.channels(load.parts[1]) == ((10, 15), (25, 30))
-
-
-@pytest.mark.parametrize(("ends", "expected"), [("exclusive", (0, 1450)), ("inclusive", (0, 1449))])
-def test_ends_are_converted_in_one_place(ends: str, expected: tuple[int, int]):
-    """Erratum E14: 1450 cells end at 1450 or at 1449, whichever the device means."""
-    assert device_range((0, 1450), ends) == expected
 
 
 def test_a_line_that_no_load_holds_is_refused():

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.geometry.scan import Sweep, line_positions, points_of_scan, scene_to_sweep
-from pipeline.rectify.geolocation import KnotCurve, path_geolocation
+from pipeline.rectify.geolocation import path_geolocation
 from pipeline.rectify.placed import tie_table
 from pipeline.rectify.resample import resample
 from pipeline.rectify.scan_paths import ScanPath, make_scan_paths
@@ -121,23 +121,6 @@ def test_linear_scene_comes_back_from_any_path(seed: int, amount: float, swath: 
     found, _ = resample(values, np.ones(y.shape, np.bool_), at[whole])
     np.testing.assert_allclose(found, points[whole] - [60, swath], atol=2e-4)
     assert whole.sum() > 500
-
-
-@given(st.integers(0, 999), st.floats(0, 0.45))
-@settings(max_examples=15, deadline=None)
-def test_knots_are_found_at_their_own_points(seed: int, amount: float) -> None:
-    """A point that a line itself saw is found at this line or at another that saw it as well, on any path."""
-    scan_path = wandering_scan_path(seed, amount)
-    rng = np.random.default_rng(seed)
-    knot, sample = rng.integers(3, len(scan_path) - 3, 300), rng.integers(5, 635, 300)
-    y, x = seen_by(scan_path)
-    at = path_geolocation(scan_path, CAMERA, np.stack([y, x], axis=-1)[knot, sample], along="x")
-    on = np.isfinite(at[:, 0])
-    scan, _, across, _ = KnotCurve(scan_path).at(at[on, 0])
-    slope = (at[on, 1] + 0.5 - CAMERA.samples / 2) * CAMERA.ifov_rad
-    along, down = points_of_scan(across / CAMERA.ifov_rad, CAMERA, scan / CAMERA.ifov_rad, slope)
-    np.testing.assert_allclose(np.stack([down, along], axis=-1), np.stack([y, x], -1)[knot, sample][on], atol=1e-6)
-    assert (on | ~scan_path.seen[knot]).all()
 
 
 def test_evenness_changes_nothing_but_the_way() -> None:

@@ -124,17 +124,6 @@ def test_drift_between_captured_sweeps_is_taken_out():
     np.testing.assert_allclose(means[0], means[1], rtol=5e-3)
 
 
-def test_error_is_the_scatter_of_the_ratio():
-    """Over draws of the noise the stated error is the scatter found, to a fifth; four groups are too few to tell."""
-    rng = np.random.default_rng(6)
-    ground = np.ones((100, 30, 2))
-    found = [light_ratio(ground, ground + rng.normal(0, 0.2, ground.shape), pair=(0, 1)) for _ in range(100)]
-    scatter = np.std([each.log_ratio for each in found])
-    assert np.mean([each.error for each in found]) == pytest.approx(scatter, rel=0.2)
-    assert np.isfinite(light_ratio(ground[:5], ground[:5], pair=(0, 1)).log_ratio).all()
-    assert np.isnan(light_ratio(ground[:4], ground[:4], pair=(0, 1)).log_ratio).all()
-
-
 @pytest.mark.parametrize("period", [4.0, 8.0, 12.37])
 @pytest.mark.parametrize("along", ["x", "y"])
 def test_crop_rows_are_not_taken_for_light(period: float, along: Axis):

@@ -55,8 +55,8 @@ def registered(pointing: PointingErrors, along: Axis, **options: Any) -> tuple[l
 
 @pytest.mark.parametrize("along", ["x", "y"])
 def test_pass_is_registered_to_a_tenth(along: Axis):
-    """Sweeps that look up to 10 px beside the plan, and jitter, are brought together to 0.2 px."""
-    pointing = PointingErrors(offset_px=10, jitter_px=0.3, seed=2)
+    """Sweeps that look up to 10 px beside the plan are brought together to 0.2 px."""
+    pointing = PointingErrors(offset_px=10, seed=2)
     sweeps, found = registered(pointing, along)
     assert len(sweeps) == 4
     assert (found.untied, found.narrow) == ((), ())
@@ -69,7 +69,7 @@ def test_pass_is_registered_to_a_tenth(along: Axis):
 
 def test_narrow_overlaps_are_reported():
     """Overlaps below 64 px beyond the prior are named with their width, and nothing is moved."""
-    sweeps, found = registered(PointingErrors(5, 0), "x", prior_px=15)
+    sweeps, found = registered(PointingErrors(5), "x", prior_px=15)
     narrow = {(one.reference, one.moving): one for one in found.narrow}
     for one, other in pairwise(sweeps):
         assert 80 < narrow[one.name, other.name].width_px < narrow[one.name, other.name].needed_px == 94
@@ -79,7 +79,7 @@ def test_narrow_overlaps_are_reported():
 
 def test_coarse_pass_is_registered_in_scene_pixels():
     """Lines 2 px apart of binned samples give corrections in px of the scene, as fine ones do."""
-    pointing = PointingErrors(offset_px=6, jitter_px=0, seed=5)
+    pointing = PointingErrors(offset_px=6, seed=5)
     scan = uniform_sweeps(GRID, CAMERA, "x", step=2, overlap_px=84)
     sweeps = [replace(sweep, binning=2) for sweep in scan]
     source = source_of(pointing)

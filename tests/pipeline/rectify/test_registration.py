@@ -11,9 +11,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, gaussian_filter1d, rotate
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import direction_to_scene, position_to_direction
-from pipeline.geometry.scan import Sweep, line_positions, shifted_position
 from pipeline.rectify.registration.alignment import FieldShift, SweepShift, WindowShift, field_shift, solve_sweeps
 from pipeline.rectify.registration.shifts import pair_shift
 
@@ -211,25 +208,6 @@ def test_one_window_gives_an_offset_and_no_drift():
     window = WindowShift(0, 1, (499.5, 499.5), np.stack([np.eye(2)] * 2), np.array([7.0, -3.0]), np.full(2, 0.02))
     found = solve_sweeps([window], ("a", "b"), (1000, 1000), reference=0)
     np.testing.assert_allclose(found.shifts[1].of_lines(1000), [[7.0, -3.0]] * 1000, atol=1e-3)
-
-
-def test_drift_leaves_the_middle_of_a_sweep():
-    """Of an even or odd number of lines, those either side of the middle drift by as much, the other way."""
-    shift = SweepShift("a", np.array([1.0, -2.0]), np.array([0.5, 0.25]))
-    np.testing.assert_array_equal(shift.of_lines(2), [[0.75, -2.125], [1.25, -1.875]])
-    np.testing.assert_array_equal(shift.of_lines(3), [[0.5, -2.25], [1.0, -2.0], [1.5, -1.75]])
-
-
-def test_positions_shift_as_the_scene_does():
-    """Line centres of shifted positions lie beside the old ones by the shift."""
-    camera = LineCamera()
-    position = line_positions(Sweep("s", "fine", "x", 2000.0, -1500.0, 50), camera)
-    shift = np.random.default_rng(3).uniform(-50, 50, (50, 2))
-    before, after = (
-        direction_to_scene(position_to_direction(p)) / camera.ifov_rad
-        for p in (position, shifted_position(position, shift, camera))
-    )
-    np.testing.assert_allclose(after - before, shift, atol=1e-8)
 
 
 def textured(seed: int, shape: tuple[int, int] = (180, 210)) -> NDArray[np.float64]:

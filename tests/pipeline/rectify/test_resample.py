@@ -14,12 +14,6 @@ from pipeline.rectify.resample import BLOCK_PX, merge_lines, resample
 KERNELS: tuple[Kernel, ...] = ("catmull-rom", "bilinear", "nearest")
 
 
-def everywhere(lines: int, samples: int, shift: float = 0.0) -> np.ndarray:
-    """All pixel centres of a sweep, shifted, as (n, 2) coordinates."""
-    grid = np.meshgrid(np.arange(lines) + shift, np.arange(samples) + shift, indexing="ij")
-    return np.stack(grid, axis=-1).reshape(-1, 2)
-
-
 def by_hand(values: np.ndarray, valid: np.ndarray, at: np.ndarray, kernel: Kernel) -> tuple[np.ndarray, np.ndarray]:
     """Weighted sums in float64, point by point and band by band, and the weight that was valid in each band."""
     usable = np.broadcast_to(valid if valid.ndim == 3 else valid[..., None], values.shape)
@@ -67,15 +61,6 @@ def test_constant_stays_constant_under_any_mask(valid: np.ndarray, line: float, 
     assert fraction[0] == 0 or (fraction[0] >= 0.5 and np.allclose(out, 3.5, rtol=1e-5))
 
 
-def test_pixel_centres_come_back_unchanged() -> None:
-    """At pixel centres resampling is the identity."""
-    values = np.random.default_rng(1).random((7, 9, 3), np.float32)
-    for kernel in KERNELS:
-        out, fraction = resample(values, np.ones((7, 9), bool), everywhere(7, 9), kernel)
-        np.testing.assert_array_equal(out.reshape(values.shape), values)
-        assert (fraction == 1).all()
-
-
 def test_catmull_rom_keeps_parabolas() -> None:
     """Third-order accuracy: a parabola inside the sweep is met exactly."""
     y, x = np.mgrid[:12, :12].astype(np.float32)
@@ -113,18 +98,6 @@ def test_dwell_is_the_mean_of_its_valid_lines() -> None:
     np.testing.assert_allclose(merged[1, 1], values[[1, 3], 1].mean(axis=0), rtol=1e-6)
     assert np.isnan(merged[2, 0]).all()
     assert known.tolist() == [[True] * 3, [True] * 3, [False, True, True]]
-
-
-def test_dwell_by_element() -> None:
-    """With a mask by element each band has its own mean; sums of uint16 do not wrap."""
-    values = np.full((4, 1, 2), 65_535, np.uint16)
-    values[1, 0] = 1
-    valid = np.ones((4, 1, 2), bool)
-    valid[1, 0, 1] = False
-    merged, known = merge_lines(values, valid, np.array([0]))
-    np.testing.assert_allclose(merged, [[[(3 * 65_535 + 1) / 4, 65_535]]], rtol=1e-7)
-    assert known.shape == (1, 1, 2)
-    assert known.all()
 
 
 @pytest.mark.parametrize("kernel", KERNELS)

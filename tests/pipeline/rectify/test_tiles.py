@@ -196,31 +196,6 @@ def test_turned_lines_are_cut_into_short_runs() -> None:
         assert np.concatenate([np.arange(20)[cut] for cut in cuts]).tolist() == list(range(20))
 
 
-def test_a_cut_that_gains_nothing_by_itself_leads_to_those_that_do() -> None:
-    """Two turned sweeps side by side are cut where they meet, for the sake of the shorter runs of each."""
-    y, x = np.mgrid[:16, :1280]
-    both = np.stack([y + 0.035 * x, x - 0.035 * y], axis=-1)
-    left, right = (np.where((first <= x) & (x < first + 640), 1.0, np.nan)[..., None] * both for first in (0, 640))
-    cuts = cut_runs([part.reshape(16, 40, 32, 2).swapaxes(0, 1) for part in (left, right)], 270)
-    assert len(cuts) >= 4
-    assert 20 in [cut.start for cut in cuts]
-
-
-def test_nearest_gives_raw_spectra() -> None:
-    """With references of one, the nearest kernel gives the very numbers that the camera gave."""
-    lines = taken(TURNED)
-    placed = [place(lines, CAMERA)]
-    grid = PixelGrid(CORNER, 1, (60, 90))
-    at = placed[0].coordinates(0, CAMERA, grid, slice(0, 60), slice(0, 90))
-    rows, columns = slice(0, 60), slice(0, 90)
-    values, coverage = mosaic_tile(placed, CAMERA, grid, rows, columns, kernel="nearest")
-    on = np.isfinite(at[..., 0])
-    line, sample = np.floor(at[on] + 0.5).astype(int).T
-    np.testing.assert_array_equal(values[on], lines.raw[line, sample])
-    assert (coverage == on).all()
-    assert on.any()
-
-
 @pytest.mark.parametrize("beside", [True, False])
 def test_where_no_line_shows_anything_all_is_empty(beside: bool) -> None:
     """Beside the swath, and where all lines are dead, pixels are NaN with a coverage of 0, and nothing is read."""
@@ -296,11 +271,3 @@ def test_a_sweep_that_turns_is_two_sweeps() -> None:
     for shape in ((64, 640), (7, 33)):
         for one, other in zip(in_tiles([placed], grid, shape), expected, strict=True):
             np.testing.assert_array_equal(one, other)
-
-
-def test_gain_multiplies_a_sweeps_values() -> None:
-    """An illumination correction is a factor for each band."""
-    lines, grid = taken(TURNED), PixelGrid(CORNER, 1, (30, 40))
-    gain = np.array([2.0, 1.0, 0.5], np.float32)
-    plain, scaled = (in_tiles([place(lines, CAMERA, gain=g)], grid, (64, 640))[0] for g in (None, gain))
-    np.testing.assert_allclose(scaled, plain * gain, rtol=1e-6)

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import scipy
 
 from pipeline.simulator.effects.effect import OFF, Effect, Radiance, SweepBlock
+from pipeline.simulator.effects.line import SLIT, SMEAR
 from pipeline.simulator.effects.probe import noise_electrons
+from pipeline.simulator.optics.scene_radiance import TABULATED
 from pipeline.simulator.render import EFFECTS, READOUT, expected_light
 from pipeline.simulator.selection.options import SAFETY, Menu, list_options
-from pipeline.simulator.selection.verification import ROUNDING, misplaced_fraction
 from tests.pipeline.simulator.random_cases import Case
 
+ROUNDING = 4e-6  # of the brightest light of some lines: float32 sums
+KERNELS = 4e-3  # of the light's range, by which two sets of kernels that are fitted to the same blurs may differ
 REACH_PX = 16  # along a line, within which arithmetic may put light elsewhere
 DRAWN = frozenset({"jitter", "turbulence"})  # one survey of 1000 may go beyond their bounds
 IN_THE_LIGHT: tuple[Effect, ...] = tuple(effect for effect in EFFECTS if effect not in READOUT)
@@ -121,3 +124,17 @@ def _error(menus: tuple[Menu, ...], name: str, variant: str) -> float:
 
 def _light(case: Case, block: SweepBlock, chosen: dict[Effect, str]) -> Radiance:
     return expected_light(case.scene, block, {effect: way for effect, way in chosen.items() if way != OFF})
+
+
+def misplaced_fraction(exact: Mapping[Effect, str], chosen: Mapping[Effect, str]) -> float:
+    """The fraction of the light's range by which arithmetic may make two ways to render it differ.
+
+    Tables of weights misplace up to `TABULATED` along either axis, in either image. Kernels that stand for those of all
+    bands differ, too, where blurs or held positions do.
+    """
+    return 2 * TABULATED + (0.0 if _folded(exact) == _folded(chosen) else KERNELS)
+
+
+def _folded(ways: Mapping[Effect, str]) -> dict[str, str]:
+    blurs = {one.name: way for one, way in ways.items() if hasattr(one, "moments") or one.name == SMEAR.name}
+    return blurs | {one.name: "box" for one in ways if one.name == SLIT.name}

@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.effect import OFF, Bound, Radiance, SweepBlock
-from pipeline.simulator.effects.probe import Probe
+from pipeline.simulator.effects.probe import GainRange, Probe
 from pipeline.simulator.rig_model import Rig
 
 SWEEP = Sweep("fine-0", "fine", "x", 0.0, -50.0, 100)
@@ -44,6 +44,9 @@ class Brightening(MadeUp):
 
     fraction: float = 0.0
 
+    def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
+        return GainRange.between(1 - self.left_out, 1 + self.left_out, len(probe.wavelength_nm))
+
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
         return np.full((1, 1, 1), 1 + self.fraction, np.float32)
 
@@ -66,12 +69,10 @@ def even_probe(**values: object) -> Probe:
         wavelength_nm=np.array([550.0]),
         fwhm_nm=None,
         level=ones,
-        spread=ones,
         span=ones,
         slope=np.zeros((2, 1)),
         curvature=np.zeros((2, 1)),
         spectral_slope=zeros,
-        spectral_curvature=zeros,
         brightest_e=1e4,
         darkest_e=1e2,
         unit_least_dn=20.0,

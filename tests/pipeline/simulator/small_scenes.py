@@ -49,8 +49,8 @@ def effects_on(*names: str) -> Choice:
 class CommonOffset(PointingErrors):
     """A mirror that looks beside every reported place by the same (along, scan) px."""
 
+    offset_px: float = 0.0
     way_px: tuple[float, float] = (0.0, 0.0)
-    jitter_px: float = 0.0
 
     def offset(self, sweep_name: str) -> NDArray[np.float64]:
         """Give the same error for every sweep."""

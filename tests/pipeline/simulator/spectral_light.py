@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.effect import SweepBlock
-from pipeline.simulator.effects.probe import Probe, Unit, second_difference, steepest_difference
+from pipeline.simulator.effects.probe import Probe, Unit, steepest_difference
 from pipeline.simulator.rig_model import Optics, Rig
 from pipeline.simulator.scenes.scene import RasterScene
 from tests.pipeline.simulator.small_scenes import made_scene
@@ -72,7 +72,6 @@ def probe_of(
     """Summary of all samples of some lines."""
     signal, one = np.asarray(light, np.float64), units(light, unit)
     most = tuple(range(light.ndim - 1))
-    means = signal.mean(axis=(1, 2), keepdims=True)
     none = np.zeros((2, len(wavelength_nm)))
     return Probe(
         unit=unit,
@@ -80,12 +79,10 @@ def probe_of(
         wavelength_nm=wavelength_nm,
         fwhm_nm=fwhm_nm,
         level=(signal / one).max(axis=most),
-        spread=(np.abs(signal - means) / one).max(axis=most),
         span=np.ptp(signal / one, axis=most),
         slope=none,
         curvature=none,
         spectral_slope=(steepest_difference(signal, wavelength_nm) / one).max(axis=most),
-        spectral_curvature=(np.abs(second_difference(signal, wavelength_nm)) / one).max(axis=most),
         brightest_e=float(signal.max()),
         darkest_e=float(signal.min()),
         unit_least_dn=float(one.min()) / LineCamera().electrons_per_dn,

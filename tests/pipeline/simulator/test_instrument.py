@@ -17,7 +17,7 @@ from pipeline.simulator.render import EFFECTS, USUAL, Choice, expected_light
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Rig, Sky
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import render_lines, sweep_block
-from tests.pipeline.simulator.small_scenes import CommonOffset, effects_on, image_scene, made_scene, seen_at
+from tests.pipeline.simulator.small_scenes import effects_on, image_scene, made_scene, seen_at
 
 CAMERA = LineCamera()
 OPTICS = effects_on("rotation", "slit", "smear")
@@ -57,16 +57,6 @@ def test_flat_scene_gives_flat_lines() -> None:
     np.testing.assert_allclose(longer, 2.5 * expected, rtol=1e-5)
 
 
-def test_shifted_lines_see_the_shifted_place() -> None:
-    """A line looked at beside its plan is the line planned there."""
-    scene = scene_of(smooth((200, 700, 1)))
-    sweep = Sweep("s", "fine", "x", swath_px=10.0, start_px=-50.0, lines=20, step=2)
-    moved = replace(sweep, swath_px=17.0, start_px=-38.5)
-    beside = Choice(((CommonOffset(way_px=(7.0, 11.5)), "exact"), *OPTICS.effects))
-    shifted = light_of(scene, sweep, range(3, 9), beside)
-    np.testing.assert_allclose(shifted, light_of(scene, moved, range(3, 9)), rtol=1e-5)
-
-
 @pytest.mark.parametrize("step", [1, 4])
 def test_undeflected_sweep_is_the_operator_on_the_grid(step: int) -> None:
     """Around the undeflected direction lines equal the closed-form operator that training uses, slit and smear."""
@@ -91,24 +81,6 @@ def test_rays_are_those_of_the_mirror() -> None:
     x, y = direction_to_scene(reflect(ray, normal)).T / CAMERA.ifov_rad
     expected = seen_at(scene, y + 99.5, x + 349.5)[:, 0] * scene.electrons[0]
     np.testing.assert_allclose(line, expected, rtol=1e-4)
-
-
-def test_turned_rig_sees_the_turned_scene() -> None:
-    """A line along y over a scene is the line along x over the scene with its axes swapped."""
-    values = np.random.default_rng(3).random((90, 60, 2))
-    turned = light_of(scene_of(values), replace(SWEEP, along="y"), range(5))
-    straight = light_of(scene_of(values.swapaxes(0, 1)), SWEEP, range(5))
-    np.testing.assert_allclose(turned, straight, rtol=1e-5)
-
-
-def test_samples_off_the_scene_see_its_edge() -> None:
-    """A scene smaller than the line fills it with its edge pixels."""
-    values = np.ones((40, 100, 1))
-    values[:, :50] = 3
-    scene = scene_of(values)
-    middle = light_of(scene, SWEEP, range(20, 21))[0, :, 0] / scene.electrons[0]
-    np.testing.assert_allclose(middle[:260], 3, rtol=1e-5)
-    np.testing.assert_allclose(middle[380:], 1, rtol=1e-5)
 
 
 # What a rig may have, all at once, and every effect exact: nothing may depend on the block. Two kinds of scene.

@@ -213,15 +213,6 @@ def values_of(source: SimulatedSource, sweep: Sweep = WHITE_REFERENCE_SWEEP) -> 
     return values
 
 
-def test_plain_frames_are_the_white_reference_over_the_dark_level() -> None:
-    """Without effects the dark frame is the camera's level, and the white one the white reference's light above it."""
-    found = white_reference_source_of().references(WHITE_REFERENCE_SWEEP)
-    np.testing.assert_array_equal(found.dark, np.full((64, BANDS), 64, np.float32))
-    np.testing.assert_allclose(found.white - 64, np.tile(even_scene().white_reference_electrons, (64, 1)), rtol=1e-6)
-    assert (found.bad, found.flat, found.by_mirror) == (None, None, False)
-    assert (found.dark.dtype, found.white.dtype, found.white_reference.dtype) == (np.float32,) * 3
-
-
 @pytest.mark.parametrize(
     "names",
     [
@@ -332,10 +323,3 @@ def test_numbers_beyond_their_range_are_refused_with_it():
         with_number("optics", "aperture_mm", 0.0)
     with pytest.raises(SettingsError, match=r"optics\.stray_fraction must be a number from 0 to 0\.5, got 0\.6"):
         with_number("optics", "stray_fraction", 0.6)
-
-
-def test_a_distance_may_be_endless_but_not_nothing():
-    """None is light at the aperture, infinity the limit of no parallax."""
-    assert with_number("air", "distance_m", math.inf).distances_m == (math.inf, math.inf)
-    with pytest.raises(SettingsError, match=r"air\.distance_m must be a number of at least 0\.001 m or inf, got nan"):
-        with_number("air", "distance_m", math.nan)

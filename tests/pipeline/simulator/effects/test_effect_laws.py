@@ -21,13 +21,13 @@ from pipeline.simulator.effects.effect import OFF, Bound, Effect
 from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.readout import read_out
-from pipeline.simulator.render import AIMS, BY_NAME, EFFECTS, FOOTPRINT, LIGHT, RAYS, READOUT, expected_light
+from pipeline.simulator.render import AIMS, BY_NAME, EFFECTS, FOOTPRINT, RAYS, expected_light
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.selection.choice import decide, list_effects
 from pipeline.simulator.selection.survey_probe import probe_scene
 from pipeline.simulator.simulated import sweep_block
-from tests.pipeline.simulator.bound_trials import IN_THE_LIGHT, trials
+from tests.pipeline.simulator.bound_trials import trials
 from tests.pipeline.simulator.made_up_effects import even_probe
 from tests.pipeline.simulator.random_cases import random_case
 from tests.pipeline.simulator.small_scenes import made_scene
@@ -232,16 +232,3 @@ def test_every_effect_of_every_module_is_registered_once():
     ]
     assert {type(one) for one in there} == {type(one) for one in EFFECTS}
     assert len(EFFECTS) == len({type(one) for one in EFFECTS}) == len(there)
-
-
-@pytest.mark.parametrize(
-    ("part", "actions"),
-    [(AIMS, {"aim"}), (RAYS, {"displaced"}), (FOOTPRINT, {"moments"}), (LIGHT, {"gain", "change"}), (READOUT, set())],
-)
-def test_effects_stand_where_they_act(part: tuple[Effect, ...], actions: set[str]):
-    """Each has one action of its part of the chain; the renderer and the readout do the rest themselves."""
-    for effect in part:
-        has = {action for action in ("aim", "displaced", "moments", "gain", "change") if hasattr(effect, action)}
-        assert has <= actions
-        assert len(has) == (0 if effect.name in ("rotation", "slit", "smear") or part is READOUT else 1)
-    assert set(IN_THE_LIGHT).isdisjoint(READOUT)

@@ -21,20 +21,9 @@ from pipeline.simulator.effects.air import (
     rayleigh_per_m,
     transmission,
 )
-from pipeline.simulator.effects.effect import OFF
-from pipeline.simulator.effects.probe import fixed_variance
 from pipeline.simulator.rig_model import Air, Optics, Rig, Sky
 from pipeline.simulator.selection import survey_probe
-from tests.pipeline.simulator.outdoors import (
-    BANDS,
-    MORNING,
-    WAVELENGTH,
-    block_of,
-    measured,
-    probe_of,
-    rig_with,
-    white_e,
-)
+from tests.pipeline.simulator.outdoors import BANDS, WAVELENGTH, block_of, rig_with, white_e
 from tests.pipeline.simulator.small_scenes import image_scene
 
 CLEAR_30_M, HAZY_300_M = Air(30.0, visibility_km=23.0), Air(300.0, visibility_km=5.0)
@@ -56,15 +45,6 @@ def test_an_object_at_the_visibility_keeps_2_percent_of_its_contrast(visibility_
     """Koschmieder's definition, in any air that holds aerosol, at 550 nm."""
     beta = extinction_per_m(Air(visibility_km=visibility_km), np.array([550.0]))[0]
     assert math.exp(-beta * visibility_km * 1e3) == pytest.approx(0.02, rel=3e-4)
-
-
-@given(st.floats(0.05, 1e4), st.floats(1.0, 2.0))
-def test_clearer_air_takes_no_more(visibility_km: float, times: float) -> None:
-    """At any wavelength, and never less than its molecules; it falls with wavelength."""
-    hazy, clear = (extinction_per_m(Air(visibility_km=km), WAVELENGTH) for km in (visibility_km, visibility_km * times))
-    assert (clear <= hazy * (1 + 1e-12)).all()
-    assert (clear >= rayleigh_per_m(WAVELENGTH)).all()
-    assert (np.diff(hazy) < 0).all()
 
 
 def test_endless_air_is_the_horizon() -> None:
@@ -89,40 +69,6 @@ def test_without_the_panels_light_none_is_added() -> None:
     np.testing.assert_allclose(seen, np.broadcast_to(passed, seen.shape), rtol=1e-5)
 
 
-@pytest.mark.parametrize("exposure", [3.0, 100.0])
-@pytest.mark.parametrize("air", [CLEAR_30_M, HAZY_300_M, Air(300.0), SLOPING, Air(math.inf)])
-def test_bound_holds_and_is_near(air: Air, exposure: float) -> None:
-    """The change of any material is within the bound, and the bound within 6 times of it."""
-    rig = rig_with(air, exposure)
-    bound, seen = PATH_RADIANCE.bound(probe_of(rig), rig).value, measured(PATH_RADIANCE, rig)
-    assert seen <= 1.2 * bound
-    assert seen > bound / 6
-
-
-def test_air_as_bright_as_the_scene_is_not_seen() -> None:
-    """The bound is on what differs: of a scene that is all like the horizon, nothing; under clouds, their shade."""
-    rig = rig_with(HAZY_300_M, brdf_per_rad=0.0)
-    light = 0.3 * white_e()
-    probe = replace(
-        probe_of(rig),
-        level=light / np.sqrt(light + fixed_variance(rig)),
-        span=0 * light,
-        darkest_e=float(light.min()),
-        brightest_e=float(light.max()),
-    )
-    assert PATH_RADIANCE.bound(probe, rig).value == pytest.approx(0, abs=1e-6)
-    shaded = rig_with(HAZY_300_M, cloud_fraction=0.5)
-    assert PATH_RADIANCE.bound(probe, shaded).value > 1
-
-
-def test_bound_with_the_sun_rising() -> None:
-    """The air's own light rises with the sun, and the bound with it."""
-    rig = rig_with(HAZY_300_M, started=MORNING)
-    seen = measured(PATH_RADIANCE, rig, started_s=14400.0)
-    assert measured(PATH_RADIANCE, rig_with(HAZY_300_M)) < seen
-    assert seen <= 1.2 * PATH_RADIANCE.bound(probe_of(rig, seconds=14406.0), rig).value
-
-
 @pytest.mark.parametrize("air", [CLEAR_30_M, HAZY_300_M, Air(math.inf), SLOPING])
 @pytest.mark.parametrize("black", [slice(1, 2), slice(None)], ids=["one band", "all bands"])
 def test_bands_without_light_have_a_finite_bound(air: Air, black: slice, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -133,9 +79,7 @@ def test_bands_without_light_have_a_finite_bound(air: Air, black: slice, monkeyp
     scene = image_scene(values, LineCamera(samples=32), [640.0, 550.0, 460.0])
     rig = Rig(LineCamera(samples=32), air=air, sky=Sky(brdf_per_rad=0.3, hot_spot=0.2))
     probe = survey_probe.probe_scene(scene, rig, full_sweeps(SceneGrid(24, 32, 8, 4), rig.camera, "x"))
-    found = [PATH_RADIANCE.bound(probe, rig, variant).value for variant in (OFF, *PATH_RADIANCE.variants)]
-    assert np.isfinite(found).all()
-    assert found[0] > 0
+    assert 0 < PATH_RADIANCE.bound(probe, rig).value < np.inf
 
 
 SHARP = Rig(optics=Optics(fwhm_nm=0.0))
@@ -172,32 +116,12 @@ def test_oxygen_is_spectrl2s() -> None:
     np.testing.assert_allclose(passed, through[known] / scattered, rtol=2e-3)
 
 
-def test_bands_smooth_the_line() -> None:
-    """The wider the band, the less of oxygen's depth it sees at 762.5 nm; the window at 870 nm passes all."""
-    depth = [
-        1 - transmission(np.array([300.0]), Rig(optics=Optics(fwhm_nm=fwhm)), np.array([762.5, 870.0]))[0]
-        for fwhm in (0.0, 6.0, 40.0)
-    ]
-    assert depth[0][0] > depth[1][0] > depth[2][0] > 0
-    assert max(one[1] for one in depth[:2]) < 1e-3
-
-
 def test_limits() -> None:
     """No way passes all; an endless one nothing in the bands; more way never passes more."""
     passed = transmission(np.array([0.0, 1.0, 30.0, 300.0, 1e7]), Rig(), WAVELENGTH)
     assert (passed[0] == 1).all()
     assert (np.diff(passed, axis=0) <= 1e-12).all()
     assert passed[-1].min() < 1e-3
-
-
-@pytest.mark.parametrize("variant", ["off", "uniform"])
-@pytest.mark.parametrize("air", [Air(30.0), Air(300.0), SLOPING, Air(30.0, "step", 5.0, 60.0), Air(math.inf)])
-def test_absorption_bound_holds_and_is_near(air: Air, variant: str) -> None:
-    """The change of any material is within the bound, and the bound within 6 times of it."""
-    rig = rig_with(air)
-    bound, seen = ABSORPTION.bound(probe_of(rig), rig, variant).value, measured(ABSORPTION, rig, variant)
-    assert seen <= 1.2 * bound
-    assert seen >= bound / 6
 
 
 def test_relief_between_knots() -> None:

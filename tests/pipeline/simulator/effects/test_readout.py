@@ -58,29 +58,6 @@ def light_of(lines: range, seed: int = 0) -> NDArray[np.float32]:
     return (whole * np.linspace(0, 1, BANDS))[list(lines)].astype(np.float32)
 
 
-@pytest.mark.parametrize("variant", ["exact", "gaussian"])
-@pytest.mark.parametrize("level", [1.0, 100.0, 10_000.0])
-def test_mean_and_variance_follow_the_photon_law(level: float, variant: str) -> None:
-    """2e5 draws: the variance is the mean's and the mean the light's, within 1 % or 3 sigma."""
-    counts = read_out(even(level), block_of(Rig(camera=COUNTING), seed=3), {SHOT: variant}).astype(np.float64)
-    draws = counts.size
-    assert draws >= 200_000
-    assert abs(counts.mean() / level - 1) < 3 / np.sqrt(draws * level)
-    assert abs(counts.var() / level - 1) < max(0.01, 3 * np.sqrt((2 + 1 / level) / draws))
-
-
-@pytest.mark.parametrize("variant", ["exact", "gaussian"])
-@pytest.mark.parametrize("level", [0.0, 400.0])
-def test_read_noise_adds_its_variance(level: float, variant: str) -> None:
-    """20 e- in quadrature, and 1/12 of a DN by rounding, whether in one draw with the shot noise or its own."""
-    camera = LineCamera(electrons_per_dn=2.0, bits=16, dark_dn=200.0)
-    raw = read_out(even(level), block_of(Rig(camera=camera)), {SHOT: variant, READ_NOISE: "exact"})
-    electrons = (raw.astype(np.float64) - 200) * 2
-    variance = level + 400 + 4 / 12
-    assert abs(electrons.mean() - level) < 4 * np.sqrt(variance / electrons.size)
-    assert abs(electrons.var() / variance - 1) < 4 * np.sqrt(2 / electrons.size)
-
-
 def test_read_noise_alone() -> None:
     """Without shot noise it is normal about the light, below zero light too."""
     camera = LineCamera(electrons_per_dn=1.0, dark_dn=500.0)

@@ -15,7 +15,6 @@ from pipeline.geometry.scan import Sweep
 from pipeline.simulator.optics.kernel_fit import Footprint, Moments, box_weight, fold
 from pipeline.simulator.optics.rays import REST_NORMAL, extreme_normals, middle_normal, spread_of_rays, spread_of_waves
 from pipeline.simulator.rig_model import Rig
-from tests.pipeline.simulator.fine_image import FLAT, SWEEP, probe_of
 
 PLAIN = ((2.7, 1.0), (1, 1), 1)
 
@@ -63,7 +62,7 @@ def test_no_box_and_no_blur_is_linear() -> None:
 
 
 RIG = Rig()
-PROBE = probe_of(FLAT)
+SWEEP = Sweep("fine", "fine", "x", swath_px=0.0, start_px=-11.5, lines=24)
 TANGENTS = arrays(np.float64, 2, elements=st.floats(-0.5, 0.5))
 
 
@@ -89,11 +88,10 @@ def test_waves_spread_as_the_inverse_of_the_pupil(tangents: np.ndarray):
 def test_ends_of_a_sweep_hold_the_extremes(swath: float, start: float, lines: int, step: int):
     """No held position between has a wider or narrower pupil than the ends."""
     sweep = Sweep("s", "fine", "x", swath, start, max(lines // step, 1), step)
-    probe = replace(PROBE, sweeps=(sweep,))
     held = sweep.held_px().ravel()
     tangents = np.stack([np.full_like(held, swath), held], axis=-1) * RIG.camera.ifov_rad
     normals = direction_to_normal(scene_to_direction(tangents))
-    ends = extreme_normals(probe.sweeps, RIG.camera)[1:]
+    ends = extreme_normals((sweep,), RIG.camera)[1:]
     for spread in (spread_of_rays, spread_of_waves):
         assert (spread(normals) <= spread(ends).max(axis=0) * (1 + 1e-12)).all()
         assert (spread(normals) >= spread(ends).min(axis=0) * (1 - 1e-12)).all()
@@ -103,4 +101,4 @@ def test_no_sweep_leaves_the_rest_position():
     """A probe without lines is judged at rest; the middle of a sweep round the axis is the rest position."""
     for sweeps in ((), (replace(SWEEP, lines=0),)):
         assert extreme_normals(sweeps, RIG.camera) == pytest.approx(REST_NORMAL[None])
-    assert middle_normal(replace(SWEEP, start_px=-11.5), RIG.camera) == pytest.approx(REST_NORMAL)
+    assert middle_normal(SWEEP, RIG.camera) == pytest.approx(REST_NORMAL)

@@ -69,24 +69,6 @@ def test_light_of_a_sample_does_not_depend_on_the_others(kind: str, along_y: boo
     np.testing.assert_array_equal(np.concatenate(found), whole)
 
 
-@pytest.mark.parametrize("kind", ["materials", "own planes"])
-def test_kernels_alike_whatever_the_boxes_are_looked_through_once(kind: str) -> None:
-    """Kernels of parted boxes and of pixels left out give all of the light; the latter do not ask how many boxes."""
-    scene, views = scene_of(kind), views_of(COUNT)
-    three = footprint_of(scene)
-    one = replace(three, parts=(1, 1))
-    parted, alike = three.by_parts()
-    assert alike is not None
-    assert set(parted.level.tolist()) == {1}
-
-    def seen(footprint: Footprint) -> np.ndarray:
-        return SceneSampler(footprint, views).scan_pass(scene, [views], along_y=False, exposure_ratio=1.0)
-
-    np.testing.assert_allclose(seen(parted) + seen(alike), seen(three), rtol=2e-6)
-    np.testing.assert_array_equal(seen(alike), seen(one.by_parts()[1]))
-    assert np.abs(seen(one) - seen(three)).max() > 1.0
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_lines_along_y_see_the_turned_scene(kind: str) -> None:
     """A line along y over a scene is one along x over its transpose."""
@@ -164,12 +146,3 @@ def test_rows_are_mixed_alike_wherever_they_stand(nodes: int, bands: int) -> Non
     np.testing.assert_array_equal(light, np.broadcast_to(light[:1], light.shape))
     wanted = np.einsum("jk,kc,jb,cb->b", fractions, one[:, 0], between, spectra)
     np.testing.assert_allclose(light[0], wanted, rtol=1e-5)
-
-
-def test_bands_between_other_nodes_are_left_out_of_products() -> None:
-    """Where bands follow their nodes each product takes two of these, and no band is made twice."""
-    place = np.linspace(0, 4, 200)
-    between = np.stack([np.interp(place, np.arange(5), one) for one in np.eye(5)])
-    products = _Mixing.of(np.eye(5, dtype=np.float32), between, np.ones((3, 200), np.float32)).products
-    assert [one.nodes for one in products] == [slice(first, first + 2) for first in range(4)]
-    assert [one.bands.stop for one in products] == [*(one.bands.start for one in products[1:]), 200]

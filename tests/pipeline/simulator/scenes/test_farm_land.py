@@ -11,13 +11,6 @@ from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.farm.land import Parcel, clip_polygon, divide_land, parcel_pixels, polygon_area, stream
 
 
-def test_bands_do_not_move_the_farm() -> None:
-    """The layout does not depend on the bands."""
-    few, many = farm_scene(3, (90, 70), bands=2), farm_scene(3, (90, 70), bands=31)
-    np.testing.assert_array_equal(few.planes, many.planes)
-    assert many.electrons.shape == (many.planes.shape[2], 31)
-
-
 def test_parcels_fraction_the_land() -> None:
     """The parcels' coverages sum to 1 in every pixel, and their areas to the land's."""
     parcels, _ = divide_land(stream(4, "land"), (700, 640), 20_000)

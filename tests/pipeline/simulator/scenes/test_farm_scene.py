@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError, WavelengthError
 from pipeline.geometry.camera import LineCamera
-from pipeline.simulator.scenes.built_in import is_built_in_key
 from pipeline.simulator.scenes.farm.farm_plan import CLASSES, farm_plan
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, farm_scene
 from pipeline.simulator.scenes.farm.spectra import MATERIALS
@@ -60,16 +59,6 @@ def test_abundances_are_fractions(seed: int, height: int, width: int, day: int) 
     assert labels_of(scene).max() < len(CLASSES)
 
 
-def test_equal_arguments_give_equal_farms() -> None:
-    """One seed and day give one scene, bit for bit; the global generator plays no part."""
-    first = farm_scene(11, (120, 150), bands=5, day=190)
-    np.random.seed(1)  # noqa: NPY002 - the point of the test
-    second = farm_scene(11, (120, 150), bands=5, day=190)
-    assert first.key == second.key
-    np.testing.assert_array_equal(first.planes, second.planes)
-    np.testing.assert_array_equal(first.labels, second.labels)
-
-
 def test_key_tells_the_law_and_the_day() -> None:
     """The key names law, seed, day, shape, hour, bands and what the camera changes."""
     key = farm_scene(42, (20, 30), bands=7, day=99).key
@@ -102,13 +91,6 @@ def test_planes_are_the_plans_materials() -> None:
     assert list(plan.materials) == sorted(plan.materials, key=MATERIALS.index)
     assert not any(name.startswith("wheat") for name in plan.materials)
     assert farm_scene(0, bands=3, day=225).electrons.shape == (len(plan.materials), 3)
-
-
-def test_a_key_tells_a_built_in_scene() -> None:
-    """By the law that it begins with; a file's tells none."""
-    assert FARM_LAW == "farm@2"
-    assert is_built_in_key(farm_scene(0, (8, 8)).key)
-    assert not is_built_in_key("3f2a")
 
 
 @pytest.mark.parametrize(
