@@ -14,7 +14,6 @@ from flows.publish.receipt import Receipt, hectares_of_classes, is_pending
 from flows.tasks.scene import TRAINING_SCENE
 from flows.tasks.scores import format_prediction, format_worst_class
 from flows.terminal.figures import (
-    DASH,
     counted,
     format_area,
     format_bytes,
