@@ -279,13 +279,7 @@ def _calibrated(run: SurveyRun, cube: SignalCube, bands: list[int]) -> NDArray[n
 def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     """Return the findings of a run by their names in the receipt."""
     plan = load_plan(products["score"])
-    figures: dict[str, Any] = {
-        "kind": plan.kind,
-        "reason": plan.reason,
-        "lines": plan.lines,
-        "seconds": plan.seconds,
-        "out_of_reach": plan.out_of_reach,
-    }
+    figures: dict[str, Any] = {"kind": plan.kind, "reason": plan.reason, "lines": plan.lines, "seconds": plan.seconds}
     found: dict[str, Any] = {"field": field_figures(run, plan), "plan": figures}
     if run.recorded is not None:
         found["recording"] = _recording(run, run.recorded, plan)

@@ -20,7 +20,8 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, CostModel, Sweep
 from pipeline.planning.coverage import cheapest_full, full_sweeps, sweeps_over, uniform_sweeps, with_margin
-from pipeline.planning.partial_scans import FIRST_STEP, FIRST_STEPS, every_nth, lines_between, merged_ms, sweeps_of_runs
+from pipeline.planning.fine_pass import FIRST_STEP, FIRST_STEPS, every_nth, lines_between, merged_ms
+from pipeline.planning.partial_scans import sweeps_of_runs
 from pipeline.planning.prices import check_budget
 from pipeline.planning.uniform_scans import (
     LOSS,
@@ -49,7 +50,6 @@ class CapturePlan:
     coarse_s: float
     full_s: float
     fine_s: float  # left for the second pass
-    overlap_px: float  # least overlap of neighbouring coarse swaths
     margin_px: float  # extension of sweeps at both ends
     plain: bool = False  # one uniform scan, or a raster
     by_record: bool = False  # scan performance chooses the lines of the second pass
@@ -57,7 +57,7 @@ class CapturePlan:
     @staticmethod
     def of_map() -> CapturePlan:
         """Return the plan of a raster, without sweeps."""
-        return CapturePlan("x", [], [], 0.0, 0.0, 0.0, 0.0, 0.0, plain=True)
+        return CapturePlan("x", [], [], 0.0, 0.0, 0.0, 0.0, plain=True)
 
 
 @dataclass(frozen=True)
@@ -123,12 +123,8 @@ class PassLayout:
                     f"{coarse_s:.1f} s; give more, a shorter --coarse-exposure-ms, or --zoom never"
                 )
             fine_s = seconds - coarse_s
-        overlap = self._overlap(self.step or self.first_step)
-        margin = 2 * self.pointing_px
-        plain = budget is None and seconds is None
-        return CapturePlan(
-            along, coarse, full, coarse_s, full_s, fine_s, overlap, margin, plain=plain, by_record=by_record
-        )
+        margin, plain = 2 * self.pointing_px, budget is None and seconds is None
+        return CapturePlan(along, coarse, full, coarse_s, full_s, fine_s, margin, plain=plain, by_record=by_record)
 
     def sweeps(self) -> tuple[Axis, list[Sweep], list[Sweep]]:
         """Return the axis of the lines, the sweeps of the first pass or uniform scan, and those of the full scan.

@@ -22,45 +22,6 @@ ROUNDING = 1e-9
 GOLDEN = (5**0.5 - 1) / 2
 
 
-@dataclass(frozen=True)
-class ScanPrices:
-    """Seconds of a line, of the set-up of a run, and of a reload after every ``lines_per_reload`` lines."""
-
-    line_s: float
-    run_s: float
-    reload_s: float
-    lines_per_reload: int
-
-    @property
-    def even_line_s(self) -> float:
-        """Return the time of a line with its part of a reload: additive, and too low by less than a reload in all."""
-        return self.line_s + self.reload_s / self.lines_per_reload
-
-    def seconds(self, lines: int, runs: int) -> float:
-        """Return the exact time of so many lines in so many runs [s]."""
-        return lines * self.line_s + runs * self.run_s + -(-lines // self.lines_per_reload) * self.reload_s
-
-    def even_seconds(self, lines: int, runs: int) -> float:
-        """Return the additive time [s]."""
-        return lines * self.even_line_s + runs * self.run_s
-
-    def most_lines(self, seconds: float, runs: int) -> int:
-        """Return the most lines that so many runs can have in ``seconds``; negative if the runs alone take longer."""
-        left = seconds - runs * self.run_s
-        load = self.lines_per_reload * self.line_s + self.reload_s
-        loads = int(left // load)
-        rest = max(int((left - loads * load - self.reload_s) / self.line_s), 0)
-        lines = loads * self.lines_per_reload + rest
-        while lines >= 0 and self.seconds(lines, runs) > seconds:  # rounding
-            lines -= 1
-        return lines
-
-
-def prices_of(camera: LineCamera, cost: CostModel) -> ScanPrices:
-    """Return the cost model's prices of fine lines (one held position each) and runs."""
-    return ScanPrices(camera.frame_ms * 1e-3, cost.setup_seconds(camera), cost.reload_s, cost.vector_pairs)
-
-
 def check_budget(budget: float, coarse_seconds: float, full_seconds: float) -> float:
     """Return the seconds that ``budget`` leaves for the fine pass.
 
