@@ -293,7 +293,7 @@ class SurveyRun(CaptureRun):
         rate = self.settings.unknown_rate
         if self.ood_detector is None or rate is None:
             return None
-        return UnknownRule(self.described.config.classes, rate)
+        return UnknownRule(self.described.config.classes, rate, self.ood_detector.key)
 
     @property
     def ground_grid(self) -> GroundGrid:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import ceil, isfinite
 from typing import Literal
 
 import numpy as np
@@ -17,34 +16,7 @@ from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.planning.coverage import on_scene
 
 BYTES_PER_SAMPLE = 2  # raw samples are uint16
-LEAST_DIGITS = 4  # of the least budget in a message
-ROUNDING = 1e-9
 GOLDEN = (5**0.5 - 1) / 2
-
-
-def check_budget(budget: float, coarse_seconds: float, full_seconds: float) -> float:
-    """Return the seconds that ``budget`` leaves for the fine pass.
-
-    The budget is the time of coarse and fine capture over that of the full scan, above 0 and at most 1.
-
-    Raises BudgetError: the budget is out of that range, or does not pay for the coarse pass; names the least.
-    """
-    if not isfinite(budget) or not 0 < budget <= 1:
-        raise BudgetError(f"--budget must be a fraction of the full scan's time above 0 and at most 1, got {budget}")
-    if coarse_seconds > full_seconds:
-        raise BudgetError(
-            f"the coarse pass alone ({coarse_seconds:.1f} s) takes longer than the full scan ({full_seconds:.1f} s), "
-            f"so no budget can be met, got {budget}; scan in full, or take a larger coarse factor"
-        )
-    left = budget * full_seconds - coarse_seconds
-    if left < -ROUNDING * full_seconds:
-        least = ceil(coarse_seconds / full_seconds * 10.0**LEAST_DIGITS - ROUNDING) / 10.0**LEAST_DIGITS
-        raise BudgetError(
-            f"--budget {budget} gives {budget * full_seconds:.1f} s, but the coarse pass alone takes "
-            f"{coarse_seconds:.1f} of the full scan's {full_seconds:.1f} s; "
-            f"the least possible is {least}, or less with a shorter --coarse-exposure-ms"
-        )
-    return max(left, 0.0)
 
 
 def select_patches(score: NDArray[np.floating], count: int, valid: NDArray[np.bool_] | None = None) -> NDArray[np.intp]:
