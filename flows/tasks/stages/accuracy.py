@@ -36,12 +36,11 @@ from models.reading.regions import plan_regions, whole_field
 from models.weights.files import Weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
-from pipeline.geometry.scan import Axis, Sweep
+from pipeline.geometry.scan import Axis
 from pipeline.lazy import Once
-from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.region import read_patches
 from pipeline.simulator.effects.pointing import PointingErrors
-from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import SweepLines
 from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table
@@ -174,12 +173,7 @@ def load_accuracy(evaluated: StageRef) -> dict[str, Any]:
 
 
 def columns_of_raster(
-    raster: RasterPixels,
-    weights: Weights,
-    wavelength_nm: NDArray[np.floating],
-    *,
-    memory: int,
-    report: Report = lambda done: None,
+    raster: RasterPixels, weights: Weights, wavelength_nm: NDArray[np.floating], *, memory: int
 ) -> NDArray[np.float32]:
     """Return the normalised spectral features of all pixels of a raster, read in blocks of rows.
 
@@ -191,33 +185,10 @@ def columns_of_raster(
         patch_index = valid[done : done + len(values)]
         columns[patch_index] = np.nan_to_num(weights.columns(values, wavelength_nm), nan=0.0)
         done += len(values)
-        report(done / len(valid))
     return columns
 
 
 MEMORY_FRACTION = 32  # of the memory for a band of patches
-
-
-def columns_of_all_patches(
-    source: SimulatedSource,
-    full: Sequence[Sweep],
-    grid: SceneGrid,
-    weights: Weights,
-    *,
-    memory: int,
-    resampling: Kernel,
-    report: Report = lambda done: None,
-) -> NDArray[np.float32]:
-    """Return the normalised spectral features of a full scan, computed in bands of patches.
-
-    The shape is (patch, p, p, column), float32, of the padded grid; patches beyond the scene are 0. ``memory`` is in
-    bytes.
-    """
-    sweeps = [SimulatedSweep(source, sweep) for sweep in full]
-    bands = source.wavelength_nm
-    return columns_of_sweeps(
-        sweeps, source.camera, bands, grid, weights, memory=memory, resampling=resampling, report=report
-    )
 
 
 def columns_of_sweeps(
@@ -228,21 +199,20 @@ def columns_of_sweeps(
     weights: Weights,
     *,
     memory: int,
-    resampling: Kernel,
-    report: Report = lambda done: None,
 ) -> NDArray[np.float32]:
-    """Return the normalised spectral features of sweeps over a whole scene; see `columns_of_all_patches`."""
+    """Return the normalised spectral features of sweeps over a whole scene, computed in bands of patches.
+
+    The shape is (patch, p, p, column), float32, of the padded grid; patches beyond the scene are 0. ``memory`` is in
+    bytes.
+    """
     p, valid = grid.patch, grid.valid_patches()
     columns = np.zeros((int(np.prod(grid.patch_shape)), p, p, weights.basis.columns), np.float32)
     row, column = np.divmod(valid, grid.patch_shape[1])
     place = row if sweeps[0].sweep.along == "x" else column
     one = int(np.count_nonzero(place == 0)) * p**2 * len(wavelength_nm) * 4
     deep = max(1, memory // MEMORY_FRACTION // one)
-    done = 0
     for band in range(int(place.max()) // deep + 1):
         patch_index = valid[place // deep == band]
-        values, _ = read_patches(sweeps, camera, grid, patch_index, resampling)
+        values, _ = read_patches(sweeps, camera, grid, patch_index)
         columns[patch_index] = weights.columns(values, wavelength_nm)
-        done += len(patch_index)
-        report(done / len(valid))
     return columns
