@@ -28,7 +28,7 @@ from pipeline.errors import WeightsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.rectify.region import free_tiles
 from storage.arrays.mosaics import open_mosaic
-from storage.parallel.pool import RESERVED_BYTES, WorkerPool, memory_refusal, mib
+from storage.parallel.pool import RESERVED_BYTES, WorkerPool, memory_refusal, mib, run_blocks
 
 if TYPE_CHECKING:
     from models.network.temporal_reader import TemporalReader
@@ -108,7 +108,9 @@ class ExpectedErrors:
             sure = np.log(coarse.probability[: region.grid.height, : region.grid.width])
         ages = np.zeros(sure.shape[:2], np.float32)
         found = PatchExpectedErrors.of([(sure, ages)], region.grid, len(weights.class_names))
-        return region.crop_patches(found.pixels.reshape(*region.grid.patch_shape, *found.pixels.shape[1:]))
+        pixels = found.pixels.reshape(*region.grid.patch_shape, *found.pixels.shape[1:])
+        (top, left), kept = region.origin, region.kept_patches
+        return pixels[kept.top - top : kept.bottom - top, kept.left - left : kept.right - left]
 
 
 def coarse_region(weights: Weights, mosaic: Path, region: Region, capture: LineSpec) -> CoarsePass:

@@ -89,8 +89,12 @@ class SecondPass:
 
     @cached_property
     def rows(self) -> PatchRows:
-        """Return the rows of patches of the field in these sweeps."""
-        return PatchRows.of(self.swaths, self.grid, self.camera)
+        """Return the rows of patches of the field in these sweeps: with the margin, from old line to old line."""
+        found, margin, apart = PatchRows.of(self.swaths, self.grid, self.camera), math.ceil(self.margin_px), self._apart
+        lines = np.array([sweep.lines for sweep in self.swaths])[:, None]
+        first = np.maximum(found.first - margin, 0) // apart * apart
+        stop = np.minimum(-(-(found.stop + margin - 1) // apart) * apart + 1, lines)
+        return replace(found, first=np.where(found.there, first, 0), stop=np.where(found.there, stop, 0))
 
     def plan(self, gain: Floats, *, step: int = 1, exposure_ms: float | None = None) -> FinePlan:
         """Return the runs of lines ``step`` px apart that have the highest sum of (patch,) ``gain`` in the time.
@@ -99,12 +103,12 @@ class SecondPass:
         """
 
         def sweeps_of(runs: Sequence[LineRun]) -> list[Sweep]:
-            found = [self._run(*run) for run in sorted(runs)]
+            found = [self._run(*run) for run in sorted(runs)]  # in the order of their names
             return lines_between(found, self._between, step=step, exposure_ms=exposure_ms)
 
         exposed = self.camera if exposure_ms is None else replace(self.camera, exposure_ms=exposure_ms)
-        apart = self.first_pass[0].step if self.interlaces else math.inf
-        new, sweeps_a_run = 1 / step - 1 / apart, math.log2(apart / step) if self.interlaces else 1.0
+        new = 1 / step - (1 / self._apart if self.interlaces else 0)
+        sweeps_a_run = math.log2(self._apart / step) if self.interlaces else 1
         times = RunTimes(
             exposed.frame_ms * 1e-3 * new,
             self.cost.setup_seconds(exposed) * sweeps_a_run,
@@ -149,11 +153,14 @@ class SecondPass:
         """Return the sweeps whose lines are not captured again."""
         return self.first_pass if self.interlaces else []
 
+    @property
+    def _apart(self) -> int:
+        """Return the distance of the lines that new ones lie between; 1 with pointing errors."""
+        return self.first_pass[0].step if self.interlaces else 1
+
     def _run(self, number: int, first: int, stop: int) -> Sweep:
-        """Return some lines of a sweep, with the margin; a name holds sweep and line, so that names sort alike."""
-        swath, margin = self.swaths[number], math.ceil(self.margin_px)
-        first = max(first - margin, 0)
-        return replace(some_lines(swath, first, min(stop + margin, swath.lines)), name=f"{swath.name}-{first:05d}")
+        swath = self.swaths[number]
+        return replace(some_lines(swath, first, stop), name=f"{swath.name}-{first:05d}")
 
 
 def merged_ms(first_ms: float, later_ms: float, first_fraction: float) -> float:

@@ -191,8 +191,9 @@ def _filled(rows: PatchRows, values: Floats, times: RunTimes, seconds: float, sc
             continue
         runs = tuple(sorted([*beside, (number, *run)]))
         gain = float(values[rows.within(runs)].sum())
-        if gain > best.expected_gain:
-            best = PartialScan(runs, times.seconds(runs), gain)
+        taken_s = times.seconds(runs)
+        if gain > best.expected_gain and taken_s <= seconds:
+            best = PartialScan(runs, taken_s, gain)
     return best
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,25 +15,17 @@ from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.planning.coverage import on_scene
 
 BYTES_PER_SAMPLE = 2  # raw samples are uint16
-GOLDEN = (5**0.5 - 1) / 2
 
 
 def select_patches(score: NDArray[np.floating], count: int, valid: NDArray[np.bool_] | None = None) -> NDArray[np.intp]:
     """Return the ``count`` valid patches with the highest ``score`` (patch,), best first.
 
     Equal scores go to the lowest number, +inf comes first, NaN and -inf last. A smaller count gives the first patches
-    of a larger one. If no score is a number, patches are spread evenly over the valid ones.
-
-    Raises BudgetError: ``count`` is not a whole number from 0 to the number of valid patches.
+    of a larger one.
     """
     allowed = np.arange(len(score)) if valid is None else np.flatnonzero(valid)
-    if count not in range(len(allowed) + 1):
-        raise BudgetError(f"expected a whole number of patches to buy from 0 to {len(allowed)}, got {count!r}")
     given = np.asarray(score, np.float64)[allowed]
     order = np.argsort(np.where(np.isnan(given), np.inf, -given), kind="stable")
-    if not np.any(given > -np.inf):
-        # multiples of the golden ratio leave gaps of at most three sizes, for every count and any row length
-        order = np.argsort((np.arange(len(given)) * GOLDEN) % 1.0, kind="stable")
     return allowed[order[:count]]
 
 
@@ -53,11 +44,10 @@ def frame_patches(
 
 @dataclass(frozen=True)
 class SavingEntry:
-    """One line of the receipt's savings: the capture's value, that of full resolution, and how the latter is known."""
+    """One line of the receipt's savings: the capture's value, and the predicted one of full resolution."""
 
     done: float
     full: float
-    full_is: Literal["measured", "predicted"] = "predicted"
 
     @property
     def ratio(self) -> float | None:
@@ -66,7 +56,7 @@ class SavingEntry:
 
     def as_dict(self) -> dict[str, float | str | None]:
         """Return the entry in the receipt's form."""
-        return {"done": self.done, "full": self.full, "ratio": self.ratio, "full_is": self.full_is}
+        return {"done": self.done, "full": self.full, "ratio": self.ratio, "full_is": "predicted"}
 
 
 def count_samples(sweeps: Sequence[Sweep], camera: LineCamera, grid: SceneGrid) -> int:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tests.pipeline.planning.fields import planned
 from torch import nn
 
 from models.evaluation.metrics import mean_iou
@@ -24,7 +25,6 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.geometry.scan import CostModel
 from tests.models.conftest import SMALL
-from tests.pipeline.planning.fields import planned
 
 SIZES: dict[str, Any] = SMALL | {"classes": 2}
 SETTINGS = TrainingSettings(steps=4, batch=1, crop=16)
