@@ -183,7 +183,7 @@ def _step(out: Path) -> float:
 def test_scores_keep_to_a_limit_of_bytes(
     scanned: tuple[Path, Any], survey_png: Survey, recorded: Path, tmp_path: Path
 ) -> None:
-    """Coarser steps are taken, as few as suffice; each raw line is compared with them and cleared."""
+    """Coarser steps are taken, as few as suffice; raw lines are cleared."""
     every = _scores_bytes(scanned[0])
     flags = {**BY_HAND, "weights": str(recorded)}
     with with_effects():  # as the other has them

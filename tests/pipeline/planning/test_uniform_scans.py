@@ -136,7 +136,7 @@ def test_goals_out_of_reach_name_the_best_there_is() -> None:
         choose_scan(SCANS, CHEAPEST, {MIOU: 0.93})
     scores = {MIOU: RECORD.scores[MIOU], "weed": RECORD.scores[MIOU][::-1]}
     torn = uniform_scans(replace(RECORD, scores=scores), SWEEPS, CAMERA, COST, 270)
-    with pytest.raises(BudgetError, match="no scan of these weights reaches --goal 93, .* and weed=93, where"):
+    with pytest.raises(BudgetError, match=r"no scan of these weights reaches --goal 93, .* and weed=93, where"):
         choose_scan(torn, goals={MIOU: 0.93, "weed": 0.93})
 
 
