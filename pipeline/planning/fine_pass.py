@@ -20,7 +20,7 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel, Sweep, exposing
 from pipeline.planning.coverage import some_lines
 from pipeline.planning.partial_scans import LineRun, PatchRows, RunTimes, choose_runs
-from pipeline.planning.uniform_scans import ScanPerformance, format_scan, longest_exposure
+from pipeline.planning.uniform_scans import MIOU, ScanPerformance, format_scan, longest_exposure
 
 FIRST_STEP = 4  # positions of the full scan from line to line of the first pass
 FIRST_STEPS = (4, 8)  # allowed values
@@ -134,18 +134,24 @@ class SecondPass:
         """
         first, (shortest, longest) = self.first_pass[0], record.offered_ms(self.camera)
         first_ms, plans = exposing(self.camera, first).exposure_ms, list[FinePlan]()
+        known = (
+            first.step in record.steps
+        )  # lines that score less than those of the first pass would replace better ones
+        least = record.expected(first.step, float(np.clip(first_ms, shortest, longest)))[MIOU] if known else 0.0
         for step in (step for step in record.steps if step < first.step):
             every = lines_between(self.full, self._between, step=step)
             last = longest_exposure(self.seconds, every, self.camera, self.cost, shortest, longest)
             tried = np.geomspace(shortest, longest, EXPOSURES).round(1).tolist()
             for exposure_ms in sorted({*tried, *([] if last is None else [last])}):
                 mean_ms = merged_ms(first_ms, exposure_ms, step / first.step if self.interlaces else 0.0)
-                gain = gain_of(step, float(np.clip(mean_ms, shortest, longest)))
-                plans.append(self.plan(gain, step=step, exposure_ms=exposure_ms))
-        plan = max(plans, key=lambda made: (made.expected_gain, -made.seconds))
-        if plan.expected_gain < LEAST_GAIN:
-            reason = f"no second pass: its expected gain is {100 * plan.expected_gain:.2f} points"
-            return FinePlan([], np.empty(0, np.intp), 0.0, plan.expected_gain, reason=reason)
+                mean_ms = float(np.clip(mean_ms, shortest, longest))
+                if record.expected(step, mean_ms)[MIOU] >= least:
+                    plans.append(self.plan(gain_of(step, mean_ms), step=step, exposure_ms=exposure_ms))
+        plan = max(plans, key=lambda made: (made.expected_gain, -made.seconds), default=None)
+        if plan is None or plan.expected_gain < LEAST_GAIN:
+            gain = 0.0 if plan is None else plan.expected_gain
+            reason = f"no second pass: its expected gain is {100 * gain:.2f} points"
+            return FinePlan([], np.empty(0, np.intp), 0.0, gain, reason=reason)
         return plan
 
     @property

@@ -79,7 +79,11 @@ REFUSED = {
         r"class 'class_0', .* table \[classes\] of the scene.toml beside the scene's file: soil = 0$",
     ),
     "budget -1": (2, "--budget -1", "above 0 and at most 1, got '-1'"),
-    "budget below the coarse pass": (2, "--budget 0.1", r"--budget 0.1 gives \d.*below the time of the first pass of every 4th line"),
+    "budget below the coarse pass": (
+        2,
+        "--budget 0.1",
+        r"--budget 0.1 gives \d.*below the time of the first pass of every 4th line",
+    ),
     "scene smaller than a patch": (
         2,
         "--scene tiny.png --budget 0.5",
