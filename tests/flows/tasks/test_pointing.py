@@ -19,7 +19,7 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.grid import SceneGrid, patch_pixels
 from pipeline.geometry.scan import Sweep
 from pipeline.planning.coverage import full_sweeps, reach_px
-from pipeline.planning.partial_scans import every_nth
+from pipeline.planning.fine_pass import every_nth
 from pipeline.simulator.effects.pointing import PointingErrors
 from storage.arrays.mosaics import open_mosaic
 from tests.flows.conftest import FEW_BANDS

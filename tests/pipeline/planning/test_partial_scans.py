@@ -186,16 +186,6 @@ def test_more_seconds_are_worth_no_less(expected_gain: np.ndarray) -> None:
     assert found[-1] == pytest.approx(ROWS.sums(expected_gain).sum())
 
 
-def test_what_is_worth_much_is_looked_at_first() -> None:
-    """Of a field known but for one block, a look of few seconds is at the lines that show that block."""
-    expected_gain = np.zeros(GRID.patch_shape)
-    expected_gain[5:8, 3:6] = 1.0
-    scan_pass = partial_scan(expected_gain.ravel(), 2.5)
-    assert scan_pass is not None
-    assert patches_shown(sweeps_of_runs(ROWS.sweeps, scan_pass.runs), GRID, CAMERA)[expected_gain.ravel() > 0].all()
-    assert len(scan_pass.runs) == 1
-
-
 @pytest.mark.parametrize(
     ("runs", "told"),
     [
