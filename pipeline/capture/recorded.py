@@ -281,17 +281,12 @@ class RecordedSource:
                 f"sweeps along {axes}"
             )
         missing = int(np.argmax(place < 0))
-        planned = np.array([sweep.swath_px, sweep.line_px()[missing]])
-        apart = [np.hypot(*(one.tangents / self.camera.ifov_rad - planned).T) for one in alike]
-        which = int(np.argmin([np.nanmin(distance) for distance in apart]))
-        number = int(np.nanargmin(apart[which]))
-        recorded = alike[which].sweep
-        swath_px, scan_px = alike[which].tangents[number] / self.camera.ifov_rad
+        near = min((one.sweep for one in alike), key=lambda one: abs(one.swath_px - sweep.swath_px))
         raise NotRecordedError(
-            f"line {missing} of sweep {sweep.name} was never captured: it lies at {planned[1]:g} px of the scan on the "
-            f"swath at {planned[0]:g} px (binning {sweep.binning}, step {sweep.step}), the nearest recorded line, "
-            f"{number} of {recorded.name}, at {scan_px:.6g} px on {swath_px:.6g} px (binning {recorded.binning}, step "
-            f"{recorded.step}). Ask for lines on the recording's own swaths, no finer than they were recorded"
+            f"line {missing} of sweep {sweep.name} was never captured: it lies at {sweep.line_px()[missing]:g} px of "
+            f"the scan on the swath at {sweep.swath_px:g} px (binning {sweep.binning}, step {sweep.step}), and sweep "
+            f"{near.name} from {near.line_px()[0]:g} to {near.line_px()[-1]:g} px on {near.swath_px:.6g} px (binning "
+            f"{near.binning}, step {near.step}). Ask for lines on the recording's swaths, no finer than recorded"
         )
 
     def _lines_of(self, sweep: Sweep, picked: PickedLines, numbers: Numbers) -> Iterator[Line]:

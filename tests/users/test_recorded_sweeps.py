@@ -292,7 +292,7 @@ BAD: dict[str, tuple[Fault, list[str], str]] = {
     "lines that were never taken": (
         few_lines,
         ["--scan-step", "1"],
-        "line 0 of sweep scan-0 was never captured: .*no finer than they were recorded",
+        "line 0 of sweep scan-0 was never captured: .*no finer than recorded",
     ),
     "lines too far apart": (
         lambda at: table(at, "position_px", [str(9 * line) for line in range(96)]),

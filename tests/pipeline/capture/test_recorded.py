@@ -152,7 +152,7 @@ def _lines_apart(distance_px: float) -> RecordedSweep:
         (
             Sweep("fine-0", "fine", "x", 0.0, 35.5, 8),
             r"line 5 of sweep fine-0 was never captured: it lies at 40.5 px of the scan on the swath at 0 px "
-            r"\(binning 1, step 1\), the nearest recorded line, 79 of scan-0, at 39.5 px on 0 px",
+            r"\(binning 1, step 1\), and sweep scan-0 from -39.5 to 39.5 px on 0 px",
         ),
         (Sweep("fine-0", "fine", "x", 20.0, -9.5, 4), r"line 0 of sweep fine-0 was never captured: .* swath at 20 px"),
         (
@@ -209,7 +209,7 @@ def test_finer_lines_than_were_recorded_are_refused() -> None:
     coarse = Sweep("coarse-0", "coarse", "x", 0.0, -39.5, 20, step=4, binning=4)
     stepped = Sweep("stepped", "coarse", "x", 0.0, -39.5, 20, step=4)
     for one in (coarse, stepped):
-        with pytest.raises(NotRecordedError, match="no finer than they were recorded"):
+        with pytest.raises(NotRecordedError, match="no finer than recorded"):
             recorded_source(source, [record(source, one)]).pick(Sweep("fine-0", "fine", "x", 0.0, -9.5, 4))
 
 
