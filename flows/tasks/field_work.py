@@ -167,21 +167,25 @@ class FieldWork:
 
         Raises SettingsError: one region does not fit the memory.
         """
-        return self._gathered(Scoring(self.weights, mosaic.resolve(), policy, capture), report)
+        mosaic = mosaic.resolve()
+        return self._gathered(Scoring(self.weights, mosaic, policy, capture), mosaic, report)
 
     def expected_errors(self, mosaic: Path, capture: LineSpec, report: Callable[[float], None]) -> PatchExpectedErrors:
         """Return the expected errors of the overview of a mosaic, by patch.
 
         Raises SettingsError: one region does not fit the memory.
         """
-        pixels = self._gathered(ExpectedErrors(self.weights, mosaic.resolve(), capture), report)
+        mosaic = mosaic.resolve()
+        pixels = self._gathered(ExpectedErrors(self.weights, mosaic, capture), mosaic, report)
         steps, ages = np.geomspace(LEAST_EXPECTED_ERROR, 1.0, STEPS), np.zeros(pixels[..., 0, 0].size)
         return PatchExpectedErrors(pixels.reshape(-1, *pixels.shape[2:]), steps, ages)
 
-    def _gathered(self, worker: Scoring | ExpectedErrors, report: Callable[[float], None]) -> NDArray[Any]:
+    def _gathered(
+        self, worker: Callable[[Region], NDArray[Any]], mosaic: Path, report: Callable[[float], None]
+    ) -> NDArray[Any]:
         """Return what a worker computes of all patches of the padded grid, (patch_y, patch_x, ...)."""
-        pool = self.pool_for(np.empty(0, np.int64), len(open_mosaic(worker.mosaic).components))
-        parts = run_blocks(worker, self.regions, pool, report=report, paths=[worker.mosaic])
+        pool = self.pool_for(np.empty(0, np.int64), len(open_mosaic(mosaic).components))
+        parts = run_blocks(worker, self.regions, pool, report=report, paths=[mosaic])
         whole = np.zeros((*self.regions[0].field.patch_shape, *parts[0].shape[2:]), parts[0].dtype)
         for region, part in zip(self.regions, parts, strict=True):
             whole[region.kept_patches.rows, region.kept_patches.columns] = part

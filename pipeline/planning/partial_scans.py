@@ -229,9 +229,10 @@ def _best_runs(
     ``spans`` are gain, first line and line after the last of each row, ascending. Two candidates are kept from row to
     row: the best runs so far, and the best of those that end with this row.
     """
-    best, ending = (0.0, ()), (-math.inf, ())
+    nothing: tuple[tuple[int, int], ...] = ()
+    best, ending = (0.0, nothing), (-math.inf, nothing)
     for gain, first, stop in spans:
-        net, runs = best if several else (0.0, ())
+        net, runs = best if several else (0.0, nothing)
         begun = net + gain - line_price * (stop - first) - run_price, (*runs, (first, stop))
         net, runs = ending
         if runs:
