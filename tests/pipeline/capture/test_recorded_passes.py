@@ -52,7 +52,7 @@ def test_lines_that_serve_twice_count_once() -> None:
 def test_a_line_that_is_missing_is_named() -> None:
     """A strip that lies elsewhere and lines that are finer than the recorded ones are refused with their place."""
     sparse = Sweep("scan-0", "coarse", "x", 0.0, -39.5, 20, step=4)
-    with pytest.raises(NotRecordedError, match=r"line \d+ of sweep scan-0 was never captured.*no finer than they were"):
+    with pytest.raises(NotRecordedError, match=r"line \d+ of sweep scan-0 was never captured.*no finer than recorded"):
         passes_over(sparse).first_pass([FULL])
     gap = replace(FULL, lines=20), replace(FULL, name="rest", start_px=10.5, lines=30)
     with pytest.raises(NotRecordedError, match=r"line \d+ of sweep fine was never captured"):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -11,7 +9,7 @@ from hypothesis import strategies as st
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel, Sweep
-from pipeline.planning.coverage import full_sweeps, uniform_sweeps
+from pipeline.planning.coverage import full_sweeps
 from pipeline.planning.prices import (
     SavingEntry,
     capture_savings,
@@ -47,16 +45,6 @@ def test_a_full_scan_near_the_axis_samples_every_pixel_once(scan: int, half: int
     height, width = (scan, 2 * half) if along == "x" else (2 * half, scan)
     grid = SceneGrid(height, width, 8, 2)
     assert count_samples(full_sweeps(grid, CAMERA, along), CAMERA, grid) == height * width
-
-
-def test_binned_lines_have_fewer_samples_and_bytes():
-    """A coarse line holds 640 // s samples: 4 x 4 coarser is a sixteenth of the samples and bytes of as much scene."""
-    grid = SceneGrid(400, 640, 16, 4)
-    full = full_sweeps(grid, CAMERA, "x")
-    coarse = [replace(sweep, binning=4) for sweep in uniform_sweeps(grid, CAMERA, "x", step=4)]
-    assert count_samples(coarse, CAMERA, grid) * 16 == count_samples(full, CAMERA, grid) == 400 * 640
-    assert raw_bytes(coarse, CAMERA, 270) == sum(one.lines for one in coarse) * 160 * 270 * 2
-    assert raw_bytes(full, CAMERA, 270) == 403 * 640 * 270 * 2
 
 
 def test_the_ledger_compares_like_with_like():
