@@ -265,19 +265,6 @@ def test_a_band_that_lights_up_late_counts_from_then() -> None:
     assert np.isfinite(components.noise).all()
 
 
-def test_a_dark_frame_that_drifts_is_one_more_component() -> None:
-    """Drift by 3 deviations that all elements of a band share is held as a component, and nothing is rare."""
-    made = field_of(9)
-    drift = 3 * np.linspace(0, 1, 96)[:, None, None] * np.random.default_rng(1).normal(size=40) * made.noise
-    values = with_noise(made.clean + drift, made.noise, 9)
-    found = statistics_of(values)
-    components = find_components(found, least=1)
-    assert len(components) == 4
-    assert not marked(values, found, components).any()
-    left = (values - components.restore(scored(values, components).scores)) / made.noise
-    assert np.abs(left[-16:].mean(axis=(0, 1))).max() < 0.15
-
-
 def test_a_clouds_edge_adds_one_component() -> None:
     """Light that falls to a third within some lines: mixtures times a gain, and no spectrum of the edge is rare."""
     made = field_of(9)
