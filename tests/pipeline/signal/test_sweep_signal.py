@@ -1,4 +1,4 @@
-"""A sweep, block by block: what lines tell as they arrive, what is stored of them, and which stored lines differ."""
+"""A sweep, block by block: what lines tell as they arrive, and what is stored of them."""
 
 from __future__ import annotations
 
@@ -35,19 +35,10 @@ class Stored:
     scores: NDArray[np.int32]
     quality: NDArray[np.uint8]
 
-    @property
-    def usable(self) -> NDArray[np.bool_]:
-        """Spectra that may be used."""
-        return self.quality != UNUSABLE
-
     def write(self, first: int, scores: NDArray[np.float32], quality: NDArray[np.uint8]) -> None:
         """Take some lines."""
         part = slice(first, first + len(scores))
         self.scores[part], self.quality[part] = whole_steps(scores, self.step), quality
-
-    def read(self, start: int, stop: int) -> NDArray[np.int32]:
-        """Scores of some lines in steps."""
-        return self.scores[start:stop]
 
     def restored(self, done: CondensedSweep) -> NDArray[np.float32]:
         """Scene values of all lines."""
@@ -194,13 +185,3 @@ def test_a_dark_frame_that_drifts_apart_in_every_element_makes_raw_lines_stay() 
     assert len(done.rare) > 0.05 * done.known
     off = ((stored.restored(done) - values_of(lines)) / stored.components.noise)[tuple(done.rare.T)]
     assert np.abs(off).max() <= RESIDUAL_STEP / 2 + 1e-3
-
-
-def test_progress_ends_at_one() -> None:
-    """Every block is told, the last one as all of it."""
-    lines, told = made_lines(), []
-    found = statistics_of_lines(lines)
-    components = find_components(found)
-    condenser = Condenser(components, ResidualLaw.learned(found.spectra, components), CAMERA, 1.0)
-    condenser.sweep(lines, lambda first, scores, quality: scores, told.append)
-    assert told == [64 / 150, 128 / 150, 1.0]
