@@ -19,7 +19,7 @@ from flows.settings.load import load_settings
 from flows.settings.survey_settings import RASTER, Settings
 from flows.tasks.patch_budget import PatchBudget, ReadingCosts
 from flows.tasks.run import SurveyRun, open_run
-from flows.tasks.stages.accuracy import columns_of_all_patches, columns_of_raster
+from flows.tasks.stages.accuracy import columns_of_raster, columns_of_sweeps
 from flows.tradeoff.entries import Figures, Setting, Tradeoff
 from flows.tradeoff.store import STORE
 from models.evaluation.metrics import confusion, mean_iou
@@ -47,7 +47,7 @@ from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from pipeline.simulator.selection.choice import Decision, decide
 from pipeline.simulator.selection.survey_probe import probe_scene
-from pipeline.simulator.simulated import SimulatedSource, sweep_block
+from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_block
 from storage.archive.archive import Archive
 
 Values = NDArray[np.float32]
@@ -243,7 +243,8 @@ def uniform_pass(
     weights: Weights, source: SimulatedSource, sweeps: list[Sweep], grid: SceneGrid, cost: CostModel, capture: LineSpec
 ) -> PlannedPass:
     """Plan to read all patches of a uniform scan."""
-    columns = columns_of_all_patches(source, sweeps, grid, weights, memory=MEMORY, resampling="catmull-rom")
+    seen = [SimulatedSweep(source, sweep) for sweep in sweeps]
+    columns = columns_of_sweeps(seen, source.camera, source.wavelength_nm, grid, weights, memory=MEMORY)
     patch_index, size = grid.valid_patches(), raw_bytes(sweeps, source.camera, len(source.wavelength_nm))
     seconds = cost.seconds(sweeps, source.camera)
     coarse = coarse_prediction_of_patches(weights, columns, grid, capture)
@@ -312,9 +313,8 @@ def plan_every_fraction(seed: int, scene: str | None = None, weights: Path | Non
         columns = columns_of_raster(run.raster, run.weights, run.scene.wavelength_nm, memory=memory)
     else:
         _, full, _ = cheapest_full(grid, run.camera, run.settings.cost)
-        columns = columns_of_all_patches(
-            run.simulated, list(full), grid, run.weights, memory=memory, resampling="catmull-rom"
-        )
+        seen = [SimulatedSweep(run.simulated, sweep) for sweep in full]
+        columns = columns_of_sweeps(seen, run.camera, run.scene.wavelength_nm, grid, run.weights, memory=memory)
     keep_freed_memory()  # as surveys do
     coarse = coarse_prediction_of_patches(run.weights, columns, grid)
     scores, valid = score_patches(POLICY, coarse), grid.valid_fraction().ravel() > 0

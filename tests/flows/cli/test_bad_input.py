@@ -78,7 +78,11 @@ REFUSED = {
         "--labels labels.png --weights named.safetensors",
         r"class 'class_0', .* table \[classes\] of the scene.toml beside the scene's file: soil = 0$",
     ),
-    "budget below the coarse pass": (2, "--budget 0.1", "the coarse pass alone takes.* least possible is 0.3892"),
+    "budget below the coarse pass": (
+        2,
+        "--budget 0.1",
+        r"--budget 0.1 gives \d.*below the time of the first pass of every 4th line",
+    ),
     "weights corrupt": (1, "--weights corrupt.safetensors", "corrupt.safetensors is not a readable safetensors file"),
     "weights missing": (1, "--weights none.safetensors", "no weights at none.safetensors; train some"),
     "weights of other wavelengths": (1, "--weights infrared.safetensors", "for 1500-2000 nm; .* at 460-640 nm"),

@@ -19,24 +19,15 @@ from flows.settings.load import load_settings, parse_settings
 from flows.tasks.patch_budget import PatchBudget, ReadingCosts
 from models.network.sizes import SegmenterConfig, multiply_adds
 from models.policies.policies import score_multiply_adds
-from models.weights.files import save_weights
 from pipeline.errors import BudgetError, SettingsError
 from pipeline.geometry.grid import SceneGrid
-from tests.conftest import RGB_NM, Survey, random_weights
+from tests.conftest import Survey
 
 COSTS = ReadingCosts(SegmenterConfig(classes=5), SceneGrid(192, 256, 16, 1), 30)
 PATCHES = 12 * 16
 SCAN: dict[str, Any] = {"budget": None, "scan_step": "2", "scan_exposure_ms": "25"}
 fractions = st.floats(5, 100).map(lambda percent: f"{percent!r}%")
 scores = st.integers(0, 2**32 - 1).map(lambda seed: np.random.default_rng(seed).normal(0.1, 0.1, PATCHES))
-
-
-@pytest.fixture(scope="module")
-def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Tiny weights."""
-    path = tmp_path_factory.mktemp("weights") / "weights.safetensors"
-    save_weights(random_weights(RGB_NM), path)
-    return path
 
 
 def _asked(shown: NDArray[np.bool_] | None = None, **limits: object) -> PatchBudget | None:

@@ -123,7 +123,7 @@ def test_a_plan_tells_the_scan_of_a_goal(scene_files: Path, recorded: Path, tmp_
     ("given", "error", "words"),
     [
         ({"seconds": "0.5"}, BudgetError, r"--seconds 0\.5; the least is \d"),
-        ({"goal": "99"}, BudgetError, r"--goal 99: the most that these weights' scans reached is 94\.0"),
+        ({"goal": "99"}, BudgetError, r"reaches --goal 99, where the best scan has 94\.0"),
         ({"goal": "weed=50"}, SettingsError, r"--goal weed=50: no class of the weights; give one of class_1"),
         ({"goal": "many"}, SettingsError, r"--goal must be the least mIoU of the map in percent"),
         ({"goal": "0"}, SettingsError, r"above 0 and at most 100"),
@@ -179,7 +179,7 @@ def _step(out: Path) -> float:
 def test_scores_keep_to_a_limit_of_bytes(
     scanned: tuple[Path, Any], survey_png: Survey, recorded: Path, tmp_path: Path
 ) -> None:
-    """Coarser steps are taken, as few as suffice; each raw line is compared with them and cleared."""
+    """Coarser steps are taken, as few as suffice; raw lines are cleared."""
     every = _scores_bytes(scanned[0])
     flags = {**BY_HAND, "weights": str(recorded)}
     with with_effects():  # as the other has them
