@@ -69,7 +69,7 @@ PALE = 0.8  # of patches that did not change
 SAVINGS = {"capture_s": "capture time", "lines": "lines", "bytes_kept": "bytes kept", "multiply_adds": "model"}
 HECTARES = "Hectares of each class"
 SCORES = {"miou": "mIoU", "overall_accuracy": "overall"}
-TRAINING_MARKS = {"all": "*", "tiles": "**", "other pixels": "***"}  # behind scores, by `TRAINING_SCENE`
+TRAINING_MARKS = {"all": "*", "other pixels": "**"}  # behind scores, by `TRAINING_SCENE`
 Row = Mapping[str, Any]
 Points = Mapping[str, Sequence[tuple[datetime, float]]]  # of a series by its name
 

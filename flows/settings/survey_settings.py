@@ -167,8 +167,7 @@ class Settings:
     scene: str = stated(
         "farm",
         "Scene: farm or scouting (built in; with a seed: farm@2), or a file: PNG, JPEG, BMP, GeoTIFF, .npy, .npz, .mat,"
-        " ENVI, Zarr; for source raster also a folder or glob of georeferenced tiles. Patterns for repeated visits:"
-        " {date:%Y-%m-%d}.tif, {new}.tif (newest file that was not surveyed)",
+        " ENVI, Zarr. Patterns for repeated visits: {date:%Y-%m-%d}.tif, {new}.tif (newest file that was not surveyed)",
     )
     labels: str | None = stated(
         None, "Label image on the scene's pixels (class colours or numbers); enables accuracy", example="labels.png"

@@ -34,7 +34,7 @@ from pipeline.rig.camera.camera_texts import (
     place_parts,
     times_of_lines,
 )
-from storage.readers.cube_sources import MOST_MISSING, Bands, CubeSource, LineFacts
+from storage.readers.cube_sources import MOST_MISSING, ONE_FILE, Bands, CubeSource, LineFacts
 from storage.readers.image_files import bad_bands, place_of_envi, rescaled
 
 # where a data file's name may differ from its header's
@@ -168,7 +168,7 @@ def open_headwall_cube(folder: Path) -> CubeSource:
     if not headers:
         raise SceneError(
             f"{folder} is a folder, expected a file, a Zarr store, or a folder with raw_<frame> files of a Headwall "
-            "camera; name one of the files in it"
+            f"camera; name one of the files in it, or {ONE_FILE}"
         )
     for number, header in headers.items():
         data = find_envi_pair(header)[1]

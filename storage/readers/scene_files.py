@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import EmptySceneError, SceneError
-from pipeline.geometry.grid import UNLABELLED
+from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.readings import MOST_VALUE, beyond_range, find_beyond
 from storage.archive.staging import file_hash
+from storage.parallel.pool import RESERVED_BYTES, memory_refusal
 from storage.readers.cube_sources import BLOCK_LINES, Bands, CubeSource, check_memory, scene_lines, unpacked
 from storage.readers.label_files import label_file, read_labels
 from storage.readers.labels import Labels
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 
 ReadRows = Callable[[int, int], NDArray[np.float32]]
 USUAL_NODATA = -9999.0  # assumed where no file states another
+COPIES = 6  # of a block in memory while it is read and processed
+FRACTION = 4  # of the free memory for a block: larger ones are no faster
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -424,3 +427,29 @@ def bands_text(bands: Sequence[int]) -> str:
     """Return the band numbers as ``--bands`` takes them: ``0-3,7``."""
     runs = np.split(np.array(bands, int), np.flatnonzero(np.diff(bands) != 1) + 1) if bands else []
     return ",".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)
+
+
+@dataclass(frozen=True)
+class RasterPixels:
+    """The pixels of a raster: ``read`` returns rows (y, x, band) in float32, NaN without a value."""
+
+    read: Callable[[int, int], NDArray[np.float32]]
+    missing: NDArray[np.bool_]  # (y, x) without a value
+    bands: int
+    grid: SceneGrid
+
+    def rows(self, start: int, stop: int) -> NDArray[np.float32]:
+        """Read rows of the raster, NaN in every band of the missing pixels."""
+        values = self.read(start, stop)
+        values[self.missing[start:stop]] = np.nan
+        return values
+
+    def rows_at_once(self, memory: int) -> int:
+        """Return the rows to read at a time: whole rows of patches (SettingsError: one does not fit the memory)."""
+        grid = self.grid
+        deep, row = grid.patch * grid.factor, COPIES * grid.width * self.bands * 4
+        least = RESERVED_BYTES + deep * row
+        if least > memory:
+            why = f"{deep} rows of a raster of {grid.width} px and {self.bands} bands are read at a time"
+            raise memory_refusal(least, memory, why)
+        return deep * max(1, (memory - RESERVED_BYTES) // FRACTION // (deep * row))

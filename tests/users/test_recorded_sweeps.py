@@ -374,28 +374,6 @@ def test_what_is_missing_is_assumed_and_said(
         assert words in notes
 
 
-def test_init_drafts_what_the_files_do_not_say(
-    command_line: CommandLine, tmp_path: Path, pushbroom: tuple[Path, NDArray[np.uint16]], weights: Path
-) -> None:
-    """A folder of sweeps gives a survey.toml that says what is missing, and its next command surveys it."""
-    folder, _ = pushbroom
-    ended = command_line("init", folder, "--json")
-    assert ended.code == 0, ended.err
-    told = json.loads(ended.out)
-    assert (told["sweeps"], told["lines"], told["bands"]) == (["scan.hdr"], 96, 3)
-    text = (folder / "survey.toml").read_text()
-    assert '# pointing = "pointing.csv"   # where each line looked, a row a line; without it one straight' in text
-    assert "# the dark frame is here" in text
-    words = shlex.split(told["next"])[1:]
-    words[words.index("WEIGHTS.safetensors")] = str(weights)
-    surveyed = command_line(*words, "--engine", "plain", "--out", tmp_path / "a", "--json")
-    assert surveyed.code == 0, surveyed.err
-    assert json.loads(surveyed.out)["recording"]["lines_read"] == 96
-    command_line("init", folder).refused(2, r"survey\.toml exists; .*--force")
-    assert command_line("init", folder, "--force").code == 0
-    assert (folder / "survey.toml.old").read_text() == text
-
-
 def test_ingest_names_the_survey_as_the_next_step(
     command_line: CommandLine, tmp_path: Path, pushbroom: tuple[Path, NDArray[np.uint16]], weights: Path
 ) -> None:

@@ -30,7 +30,7 @@ from pipeline.planning.uniform_scans import MIOU, ScanPerformance, format_scan, 
 from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table, write_table
 from storage.arrays.mosaics import Attention, chosen_patches, open_mosaic, write_attention
-from storage.readers.raster_fields import RasterPixels
+from storage.readers.scene_files import RasterPixels
 
 READING = "attention.zarr"  # beside a class map whose drawing chose the patches
 ATTENTION = Product("score", version=10, files=("attention.zarr", "plan.json"), by_weights=True)

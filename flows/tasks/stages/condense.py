@@ -43,7 +43,7 @@ from storage.arrays.layout import SHARD_ROWS, numbers_in_memory
 from storage.arrays.mosaics import MosaicWriter
 from storage.arrays.signal_cubes import LineRows, SignalCubeWriter, open_signal_cubes
 from storage.arrays.spool import line_values
-from storage.readers.raster_fields import RasterPixels
+from storage.readers.scene_files import RasterPixels
 
 SIGNAL = Product("condense", version=1)
 SIGNAL_FINE = Product("condense_fine", version=2)

@@ -88,7 +88,7 @@ def test_scores_on_a_scene_of_the_training_are_marked() -> None:
     assert "judged on" not in pages[None]
     assert ">50.0*</td>" in pages["all"]
     assert "* judged on a training scene (not valid for other fields)." in pages["all"]
-    assert ">50.0***</td>" in pages["other pixels"]
+    assert ">50.0**</td>" in pages["other pixels"]
     (chart,), (other,) = (re.findall(r'class="chart" src="([^"]+)"', pages[seen]) for seen in (None, "all"))
     assert chart != other
 
