@@ -61,7 +61,7 @@ CASES = {
     "text as picture": (1, SURVEY + "text.png", "text.png cannot be read as .png.*save it as PNG"),
     "empty file": (1, SURVEY + "empty.png", "empty.png cannot be read as .png"),
     "cut off array": (1, SURVEY + "cut.npy" + BANDS, "cut.npy cannot be read as .npy"),
-    "cut off MATLAB": (1, SURVEY + "cut.mat" + BANDS, "cut.mat cannot be read as .mat.*write it again"),
+    "cut off MATLAB": (1, SURVEY + "cut.mat" + BANDS, "cut.mat cannot be read as .mat.*copy it again"),
     "objects": (1, SURVEY + "objects.npy" + BANDS, "Python objects"),
     "words": (1, SURVEY + "words.npy --wavelengths 550", "expected whole or floating numbers"),
     "complex": (1, SURVEY + "complex.npy" + BANDS, "complex numbers; store their magnitude"),
