@@ -7,14 +7,13 @@ import os
 import re
 import shlex
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
 
@@ -24,7 +23,6 @@ from flows.terminal.processes import DONE, writing
 from flows.terminal.progress import StageProgress, put_out
 from pipeline.errors import PipelineError, SceneError, SeriesError, SettingsError
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.readings import MOST_VALUE, edge_fill
 from storage.archive.whole_files import write_whole
 from storage.readers.cube_sources import CubeSource
 from storage.readers.label_files import (
@@ -48,9 +46,7 @@ from storage.readers.polygons import is_polygon_file
 from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings
 
 TITLES = {"extent": "reading labels"}
-NO_READING = -999.0  # at and below it an edge is nodata
 Report = Callable[[float, str], None]  # progress, 0..1, and the name of the file
-_ROWS_OF_EDGE = 32  # whose first and last pixels are read
 
 
 def init(source: str, *, force: Switch = False, as_json: AsJson = False) -> int:
@@ -157,16 +153,12 @@ def _wavelength_lines(draft: SceneDraft) -> list[str]:
 
 
 def _value_lines(draft: SceneDraft) -> list[str]:
-    lines = []
-    if draft.missing:
-        lines.append(f"# NaN counts as missing: {draft.missing:.1%} of the inspected values")
-    if draft.cube.nodata is not None:
-        lines.append(f"# the file states that {draft.cube.nodata:g} is nodata")
-    elif draft.edge is not None:
-        value, fraction = draft.edge
-        sure = value <= NO_READING or value > MOST_VALUE
-        parts = f"nodata = {value!r}   # {fraction:.0%} of the first image's edge"
-        lines.append(parts if sure else f"# {parts}; if it means nodata, remove the first #")
+    void = draft.cube.nodata
+    lines = [
+        "# nodata = 0   # if that value means no data: remove the first #"
+        if void is None
+        else f"# the file states that {void:g} is nodata"
+    ]
     if draft.cube.dtype.itemsize == 2:
         lines.append("# scale = 0.0001   # if these numbers are reflectance times 10000")
     if draft.cube.geobox is None:
@@ -282,8 +274,6 @@ class SceneDraft:
     first: str  # address of the scene that was read
     cube: CubeSource  # that scene
     pattern: str | None  # of all label files by their images' names, relative to the folder of scene.toml
-    edge: tuple[float, float] | None  # value that fills the edge, and its fraction of it
-    missing: float  # fraction of NaN among the sampled values
     classes: tuple[FoundClass, ...]
     notes: tuple[str, ...]  # on the first image
     unseen: tuple[str, ...]  # on files that cannot be read or do not fit
@@ -313,14 +303,11 @@ def draft_scene(address: str | Path, report: Report = lambda done, name: None) -
     source = with_wavelengths(open_cube(first), first, None)
     found, unseen = _shared_labels(found, source.shape[:2]), list[str]()
     classes = _classes(found, source.shape[2], unseen, report)
-    edge, missing = _check_edge(source)
     return SceneDraft(
         files=found,
         first=str(first),
         cube=source,
         pattern=_pattern(found, folder),
-        edge=edge,
-        missing=missing,
         classes=classes,
         notes=(*series, *source.notes),
         unseen=tuple(unseen),
@@ -387,20 +374,4 @@ def _classes(found: MatchedFiles, bands: int, unseen: list[str], report: Report)
         counts.update(dict(zip(labels.names, pixels.tolist(), strict=True)))
     report(1.0, "")
     values = classes_of_files(used, settings) if used else {}
-    # a grey file has class_7 where others have colour_070707
-    own = {name: counts[name] + _count_of_grey(counts, value) for name, value in values.items()}
-    return tuple(FoundClass(name, value, own[name] / counts.total()) for name, value in values.items())
-
-
-def _count_of_grey(counts: Counter[str], value: ClassValue) -> int:
-    return counts[f"class_{value[0]}"] if isinstance(value, tuple) and len(set(value)) == 1 else 0
-
-
-def _check_edge(source: CubeSource) -> tuple[tuple[float, float] | None, float]:
-    """Return the value that fills the edge of a cube with its fraction, and the fraction of NaN in some rows."""
-    height = source.shape[0]
-    starts = sorted({round(at) for at in np.linspace(0, height - 1, min(_ROWS_OF_EDGE, height))})
-    rows: Sequence[NDArray[np.generic]] = [source.read(start, start + 1) for start in starts]
-    edge = np.concatenate([rows[0][0], rows[-1][0], *(row[0][[0, -1]] for row in rows)])
-    missing = float(np.mean([np.isnan(row).mean() for row in rows])) if source.dtype.kind == "f" else 0.0
-    return edge_fill(edge), missing
+    return tuple(FoundClass(name, value, counts[name] / counts.total()) for name, value in values.items())

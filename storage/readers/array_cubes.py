@@ -55,6 +55,7 @@ class FileArray:
     ``_ARRAY_DIMENSIONS`` in its attributes are the names of its axes, if they have names.
     """
 
+    where: str  # address, for messages
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     attrs: Mapping[str, Any]
@@ -74,16 +75,18 @@ class FileArray:
         return ["" if name is None else str(name) for name in named] if isinstance(named, list | tuple) else []
 
     def __getitem__(self, part: Any) -> NDArray[Any]:
+        if part is ...:
+            self.check(self.shape)
         return self.get(part)
 
-    def check(self, where: object, part: Sequence[int]) -> None:
+    def check(self, part: Sequence[int]) -> None:
         """Refuse an array that its file, or a ``part`` of it that the memory, cannot hold (SceneError)."""
         claimed = max(math.prod(self.shape), math.prod(self.chunks)) * self.dtype.itemsize
-        check_claim(where, claimed, self.stored, self.ratio)
+        check_claim(self.where, claimed, self.stored, self.ratio)
         needed = self.dtype.itemsize
         for size, chunk, wanted in zip(self.shape, self.chunks, part, strict=True):
             needed *= min(-(-wanted // chunk) + 1, -(-size // chunk)) * chunk
-        check_memory(where, needed)
+        check_memory(self.where, needed)
 
 
 Arrays = Mapping[str, FileArray]  # by name, or by path within a file
@@ -120,11 +123,6 @@ def find_cube(arrays: Arrays, variable: str | None, path: Path, *, labels: bool 
     return ArrayCube(name, arrays[name], order, moment, (*notes, *more))
 
 
-def names_beside(arrays: Arrays) -> set[str]:
-    """Return names of the arrays that may have wavelengths or widths."""
-    return {name for name in arrays if _word(name) in (*WAVELENGTHS, "fwhm")}
-
-
 def cube_source(
     path: Path,
     cube: ArrayCube,
@@ -141,7 +139,7 @@ def cube_source(
     part = [BLOCK_LINES if axis == order[0] else size for axis, size in enumerate(array.shape)]
     if moment is not None:
         part[moment[0]] = 1
-    array.check(f"{path}:{cube.name}" if cube.name else path, part)
+    array.check(part)
     scale, offset = (_number(array.attrs.get(name)) for name in ("scale_factor", "add_offset"))
     plain = scale in (None, 1.0) and offset in (None, 0.0)
     fill = _number(array.attrs.get("_FillValue", array.attrs.get("missing_value")))

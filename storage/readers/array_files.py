@@ -58,7 +58,7 @@ def list_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
     if ending == ".npy":
         values = load_npy(path)
         each = (1,) * values.ndim
-        return {"": FileArray(values.shape, values.dtype, {}, values.__getitem__, each, values.nbytes)}, {}
+        return {"": FileArray(str(path), values.shape, values.dtype, {}, values.__getitem__, each, values.nbytes)}, {}
     if ending == ".npz":
         return _npz_arrays(path), {}
     if not h5py.is_hdf5(path):
@@ -80,11 +80,11 @@ def load_npy(path: Path) -> NDArray[Any]:
 
 
 def _whole(
-    shape: tuple[int, ...], kind: np.dtype[Any], load: Callable[[], NDArray[Any]], stored: int, ratio: int
+    where: str, shape: tuple[int, ...], kind: np.dtype[Any], load: Callable[[], NDArray[Any]], stored: int, ratio: int
 ) -> FileArray:
     """Return an array that is always read whole."""
     chunks = tuple(max(size, 1) for size in shape)
-    return FileArray(shape, kind, {}, lambda part: load()[part], chunks, stored, ratio)
+    return FileArray(where, shape, kind, {}, lambda part: load()[part], chunks, stored, ratio)
 
 
 def _npz_arrays(path: Path) -> dict[str, FileArray]:
@@ -104,7 +104,8 @@ def _npz_arrays(path: Path) -> dict[str, FileArray]:
                     shape, _, kind = (formats.read_array_header_1_0 if old else formats.read_array_header_2_0)(stream)
                 if not kind.hasobject:
                     ratio = 1 if member.compress_type == zipfile.ZIP_STORED else DEFLATE_RATIO
-                    one = _whole(shape, kind, partial(load, member), member.compress_size, ratio)
+                    where, load_it = f"{path}:{member.filename}", partial(load, member)
+                    one = _whole(where, shape, kind, load_it, member.compress_size, ratio)
                     found[member.filename.removesuffix(".npy")] = one
     return found
 
@@ -122,7 +123,7 @@ def _mat_arrays(path: Path) -> dict[str, FileArray]:
         listed = scipy_io.whosmat(content)
     size, ratio = path.stat().st_size, 8 * DEFLATE_RATIO  # a double may be one byte
     return {
-        name: _whole(shape, np.dtype(_MATLAB[kind]), partial(load, name), size, ratio)
+        name: _whole(f"{path}:{name}", shape, np.dtype(_MATLAB[kind]), partial(load, name), size, ratio)
         for name, shape, kind in listed
         if kind in _MATLAB
     }
@@ -142,7 +143,7 @@ def _is_matlab_array(name: str, one: FileArray) -> bool:
 
 def _transposed(one: FileArray) -> FileArray:
     """Return an array of a .mat file of version 7.3 with the axes in MATLAB's order."""
-    return _whole(one.shape[::-1], one.dtype, lambda: one[...].T, one.stored, one.ratio)
+    return _whole(one.where, one.shape[::-1], one.dtype, lambda: one[...].T, one.stored, one.ratio)
 
 
 def check_picture(shape: tuple[int, ...], where: object) -> None:
@@ -173,7 +174,8 @@ def _hdf_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
         is_text = item.dtype.kind in "SO" and not item.ndim
         if (item.dtype.kind in "buif" or is_text) and not str(about.get("NAME", "")).startswith(_ONLY_A_DIMENSION):
             attributes, chunks = {**about, **_as_cf(about, item)}, item.chunks or (1,) * item.ndim
-            arrays[name] = FileArray(item.shape, item.dtype, attributes, partial(_read, path, name), chunks, stored)
+            where, read = f"{path}:{name}", partial(_read, path, name)
+            arrays[name] = FileArray(where, item.shape, item.dtype, attributes, read, chunks, stored)
 
     with h5py.File(path, "r") as file:
         file.visititems(visit)  # follows hard links alone
@@ -295,8 +297,8 @@ def prisma_cube(
         )
     lows, highs = ([float(about[f"L2Scale{part}{end}"]) for part, _ in parts] for end in ("Min", "Max"))
     scales = [(high - low) / _PRISMA_TOP for low, high in zip(lows, highs, strict=True)]
-    for part, array in parts:
-        array.check(f"{path}:{part}_Cube", (BLOCK_LINES, *array.shape[1:]))
+    for _, array in parts:
+        array.check((BLOCK_LINES, *array.shape[1:]))
     centres, widths = np.concatenate(known, axis=1).astype(np.float64)
     used = np.flatnonzero(centres > 0)
     order = used[np.argsort(centres[used], kind="stable")]

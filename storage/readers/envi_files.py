@@ -138,11 +138,6 @@ def load_envi_header(path: Path) -> EnviHeader:
 # --- cubes of one file or several -------------------------------------------------------------------------------------
 
 
-def is_headwall_folder(folder: Path) -> bool:
-    """Return whether a folder has files ``raw_<frame>`` of a Headwall camera."""
-    return any(_PART.fullmatch(entry.name) is not None for entry in folder.iterdir())
-
-
 def open_envi_source(path: Path, *, scaled: bool = True) -> CubeSource:
     """Open one ENVI cube by its header or data file (SceneError as `open_envi_cube`).
 
@@ -282,20 +277,9 @@ def load_frame_index(path: Path) -> FrameIndex:
 
 
 def _headers(folder: Path) -> dict[int, Path]:
-    """Return the header of each part by its first frame, sorted (SceneError: a part has no or several headers)."""
-    found: dict[int, list[Path]] = {}
-    for entry in folder.iterdir():
-        match = _PART.fullmatch(entry.name)
-        if match is not None and entry.is_file():
-            found.setdefault(int(match[1]), []).append(entry)
-    headers: dict[int, Path] = {}
-    for number, files in sorted(found.items()):
-        named = [file for file in files if file.suffix.lower() == ".hdr"]
-        if len(named) != 1:
-            listed = ", ".join(sorted(file.name for file in files))
-            raise SceneError(f"frame {number} of {folder}: expected one header raw_{number}.hdr, found {listed}")
-        headers[number] = named[0]
-    return headers
+    """Return the header of each part by its first frame, sorted."""
+    files = ((_PART.fullmatch(entry.name), entry) for entry in folder.iterdir() if entry.suffix.lower() == ".hdr")
+    return dict(sorted((int(match[1]), entry) for match, entry in files if match is not None and entry.is_file()))
 
 
 def _check_alike(cubes: Sequence[EnviCube]) -> None:
@@ -307,6 +291,3 @@ def _check_alike(cubes: Sequence[EnviCube]) -> None:
                 f"{cube.path} has frames of {cube.frames} (sample, band), {first.path.name} of {first.frames}; ingest"
                 " them by themselves"
             )
-        ours, theirs = first.header.wavelength_nm, cube.header.wavelength_nm
-        if ours is not None and theirs is not None and not np.array_equal(ours, theirs):
-            raise SceneError(f"{cube.path} has other wavelengths than {first.path.name}; ingest them by themselves")

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from storage.readers.array_cubes import UNNAMED, cube_source, find_cube, names_beside
+from storage.readers.array_cubes import UNNAMED, cube_source, find_cube
 from storage.readers.array_files import (
     ARRAY_ENDINGS,
     HDF_ENDINGS,
@@ -146,9 +146,6 @@ def _open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSourc
             return prisma
         cube = find_cube(arrays, variable, path, labels=labels)
         near = in_scope(arrays, cube.name)
-        for name in {*names_beside(arrays), *({*cube.dims} & set(near))}:
-            one = (arrays | near)[name]
-            one.check(f"{path}:{name}", one.shape)
         source = cube_source(path, cube, near, {**about, **cube.array.attrs}, guard)
         unit = str(cube.array.attrs.get("units", "")).strip()
         notes = () if unit.lower() in NO_UNIT else (f"values are in {unit}",)

@@ -21,9 +21,7 @@ from storage.readers.open_cubes import load_frame, open_cube, reader_of, with_wa
 from storage.readers.zarr_files import find_zarr_store
 
 FRAMES = ("dark", "white", "bad", "flat")  # behind the name of a cube in those of its frames
-SAMPLED_LINES = 16  # for byte order and bits
-MOST_LINES_OVER = 0.5  # fraction above full scale from which the byte order is wrong, if swapped numbers fit
-SWAPPED_OVER = 0.01
+SAMPLED_LINES = 16  # for bits
 
 
 @dataclass(frozen=True)
@@ -85,35 +83,20 @@ def open_recorded_cube(path: Path, wavelengths: Sequence[float] | None) -> Recor
 
 
 def with_bits(camera: LineCamera, cubes: Sequence[RecordedFile], notes: list[str]) -> LineCamera:
-    """Return the camera with as many bits as some lines of each cube need.
-
-    Raises SceneError: the byte order is wrong, or numbers are below 0.
-    """
+    """Return the camera with as many bits as some lines of each cube need."""
     bits = camera.bits
     for cube in cubes:
         valid = np.flatnonzero(cube.source.valid)
         chosen = valid[:: max(len(valid) // SAMPLED_LINES, 1)][:SAMPLED_LINES]
-        values = np.concatenate([cube.source.read(int(line), int(line) + 1) for line in chosen])
+        most = max(int(cube.source.read(int(line), int(line) + 1).max()) for line in chosen)
         full = camera.full_scale_dn * max(camera.samples // cube.source.shape[1], 1)
-        plain = np.ascontiguousarray(values).astype(np.uint16)
-        other = plain if values.dtype.itemsize == 1 else plain.byteswap()
-        over, swapped = (float((numbers > full).mean()) for numbers in (plain, other))
-        if over > MOST_LINES_OVER and swapped < SWAPPED_OVER:
-            raise SceneError(
-                f"{cube.source.files[0]} has the wrong byte order: {over:.0%} of its numbers are above the camera's "
-                f"full scale of {full}, and {swapped:.0%} are with their bytes swapped. Write the other byte order (0 "
-                "or 1) into the header"
+        needed = (most * camera.full_scale_dn // full).bit_length()
+        if most > full and needed > bits:
+            bits = needed
+            notes.append(
+                f"{cube.name}: numbers reach {most}, so {bits} bits are taken for camera.bits; if the camera has"
+                " fewer, correct the byte order in the header"
             )
-        if values.min() < 0:
-            raise SceneError(
-                f"{cube.path} holds the number {values.min()}, expected a camera's own numbers from 0; write data type "
-                "12 (unsigned) into the header if they are unsigned"
-            )
-        if values.max() > full:
-            needed = (int(values.max()) * camera.full_scale_dn // full).bit_length()
-            if needed > bits:
-                bits = needed
-                notes.append(f"{cube.name}: numbers reach {values.max()}, so {bits} bits are taken for camera.bits")
     return replace(camera, bits=bits)
 
 

@@ -92,7 +92,7 @@ def _file_array(path: Path, array: zarr.Array[Any]) -> FileArray:
     if named is not None:
         attributes["_ARRAY_DIMENSIONS"] = list(named)
     stored = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
-    return FileArray(array.shape, array.dtype, attributes, array.__getitem__, array.chunks, stored)
+    return FileArray(str(path), array.shape, array.dtype, attributes, array.__getitem__, array.chunks, stored)
 
 
 def with_ingested(source: CubeSource, arrays: Arrays, attributes: Mapping[str, Any]) -> CubeSource:
@@ -100,10 +100,7 @@ def with_ingested(source: CubeSource, arrays: Arrays, attributes: Mapping[str, A
     lines, samples, bands = source.shape
 
     def known(name: str, *shape: int) -> NDArray[Any] | None:
-        if name not in arrays or arrays[name].shape != shape:
-            return None
-        arrays[name].check(f"{source.name}:{name}", shape)
-        return np.asarray(arrays[name][...])
+        return np.asarray(arrays[name][...]) if name in arrays and arrays[name].shape == shape else None
 
     valid = known("valid_line", lines)
     valid = None if valid is None else valid.astype(np.bool_)
