@@ -15,7 +15,6 @@ from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numcodecs.errors import UnknownCodecError  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
@@ -67,13 +66,6 @@ def reading(path: Path, kind: str, cure: str = "copy it again") -> Iterator[None
         yield
     except SceneError:
         raise
-    except UnknownCodecError as error:
-        name = error.codec_id.strip("'")
-        raise SceneError(
-            f"{path} is packed with {name}, which is not installed; pip install {name} (nothing is damaged)"
-        ) from error
-    except KeyError as error:
-        raise SceneError(f"{path} lacks what files of its kind have: {error}; copy it again") from error
     except Exception as error:
         why = error.__cause__ or error  # of rasterio, whose own says only that it failed
         raise SceneError(

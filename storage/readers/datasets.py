@@ -198,12 +198,7 @@ def _scenes(
 def _match_by_settings(folder: Path, settings: SceneSettings) -> MatchedFiles:
     """Return the images of a folder and their labels by ``labels`` in scene.toml."""
     entries = scene_entries(folder)
-    by_number = "{number}" in str(settings.labels)  # a scene without a number is refused when it is read
-    matched = {
-        entry: address
-        for entry in entries
-        if not (by_number and scene_number(entry) is None) and (address := label_file(entry, settings)[0]) is not None
-    }
+    matched = {entry: address for entry in entries if (address := label_file(entry, settings)[0]) is not None}
     labels = {split_variable(address)[0].resolve() for address in matched.values()}
     others = [entry for entry in entries if entry.resolve() not in labels]
     images = tuple(entry for entry in others if not is_label_name(entry)) or tuple(others)

@@ -34,7 +34,7 @@ from storage.readers.envi_files import (
     open_envi_source,
     open_headwall_cube,
 )
-from storage.readers.image_files import IMAGE_ENDINGS, JPEG2000_ENDINGS, open_image
+from storage.readers.image_files import IMAGE_ENDINGS, open_image
 from storage.readers.scene_toml import SceneSettings, find_scene_settings, settle_wavelengths
 from storage.readers.zarr_files import INGESTED, find_zarr_store, with_ingested, zarr_arrays
 
@@ -46,18 +46,6 @@ _WITH_VARIABLE = re.compile(
     r"|^(?P<path2>.+\.(?:nc4?|h5|hdf5|he5)):(?P<variable2>[^:]+(?::\d+)?)$",
     re.IGNORECASE | re.DOTALL,
 )
-_BEGINNINGS = {  # of files, and their endings
-    b"\x89PNG": (".png",),
-    b"\xff\xd8\xff": (".jpg", ".jpeg"),
-    b"II*\0": (".tif", ".tiff"),
-    b"MM\0*": (".tif", ".tiff"),
-    b"\0\0\0\x0cjP": JPEG2000_ENDINGS,
-    b"\xff\x4f\xff\x51": JPEG2000_ENDINGS,
-    b"\x93NUMPY": (".npy",),
-    b"PK\x03\x04": (".npz",),
-    b"\x89HDF": (".mat", *HDF_ENDINGS),
-    b"MATLAB": (".mat",),
-}
 
 
 def split_variable(address: str | Path) -> tuple[Path, str | None]:
@@ -91,7 +79,7 @@ def reader_of(address: str | Path) -> Reader:
 def open_cube(
     address: str | Path, *, dark: str | Path | None = None, white: str | Path | None = None, labels: bool = False
 ) -> CubeSource:
-    """Open a cube; pictures, .mat and .npz are read whole, of others only headers.
+    """Open a cube; only headers, and coordinates of arrays, are read.
 
     ``address`` may name an array and a step of time: ``STORE:ARRAY:3``. ``dark`` and ``white`` are ENVI or .npy files
     of reference frames, averaged over their lines; they replace those in a Headwall folder. ``labels`` are read without
@@ -109,10 +97,8 @@ def open_cube(
         case "envi":
             source = open_envi_source(path, scaled=not labels and dark is None and white is None)
         case "image":
-            _check_content(path)
             source = open_image(path, scaled=not labels)
         case "array":
-            _check_content(path)
             source = _open_arrays(path, variable, labels=labels)
             if path.suffix.lower() in ARRAY_ENDINGS and source.shape[2] == 1 and not labels and min(source.shape):
                 check_picture(source.shape[:2], address)
@@ -164,7 +150,6 @@ def open_labels(address: str | Path, *, by_number: bool = False) -> CubeSource:
     """Open a file of labels or a mask without its scale; ``by_number`` keeps the numbers of a palette (SceneError)."""
     path, _ = split_variable(address)
     if reader_of(address) == "image":
-        _check_content(path)
         return open_image(path, scaled=False, palette=by_number)
     return open_cube(address, labels=True)
 
@@ -213,18 +198,6 @@ def with_wavelengths(source: CubeSource, address: str | Path, stated: Sequence[f
     found = settle_wavelengths(path, range(count), count, stated=stated, settings=settings, known=Bands())
     folder = "" if settings.path is None else f"{settings.path.parent}/"
     return replace(source, bands=replace(found, origin=found.origin.replace(folder, "")))
-
-
-def _check_content(path: Path) -> None:
-    """Refuse a file that begins like a file of another ending (SceneError)."""
-    with path.open("rb") as file:
-        head = file.read(8)
-    for begins, endings in _BEGINNINGS.items():
-        if head.startswith(begins) and path.suffix.lower() not in endings:
-            ending = path.suffix.lower()
-            raise SceneError(
-                f"{path} cannot be read as {ending}: it begins as a {endings[0]} file does; give it that ending"
-            )
 
 
 def _refusal(path: Path) -> SceneError:

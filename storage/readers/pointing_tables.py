@@ -32,6 +32,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from pipeline.capture.straight_scans import PlayedVector, angles_to_positions, split_vector
 from pipeline.errors import PoseError, SceneError
@@ -262,6 +263,16 @@ def _parquet_cells(path: Path) -> tuple[list[str], list[list[object]]]:
     return [name.lower() for name in columns], [list(row) for row in zip(*columns.values(), strict=True)]
 
 
+class _Recipe(BaseModel):
+    """TOML file of a played vector."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    vector: str
+    rate_hz: float = Field(gt=0, allow_inf_nan=False)
+    start_s: float = Field(0.0, allow_inf_nan=False)
+
+
 def load_played_vector(path: Path, mounting: Mounting = STRAIGHT) -> PlayedVector:
     """Read the TOML file of a played vector, and the file of positions that it names.
 
@@ -269,19 +280,15 @@ def load_played_vector(path: Path, mounting: Mounting = STRAIGHT) -> PlayedVecto
     position is beyond the mirror.
     """
     try:
-        stated = tomllib.loads(_text(path))
+        stated = _Recipe.model_validate(tomllib.loads(_text(path)))
     except tomllib.TOMLDecodeError as error:
         raise SceneError(f"{path} cannot be read as TOML: {error}; write vector, rate_hz and start_s") from error
-    if unknown := sorted(set(stated) - {"vector", "rate_hz", "start_s"}):
-        raise SceneError(f"{path} has the entry {unknown[0]!r}; accepted are vector, rate_hz, start_s")
-    if not isinstance(stated.get("vector"), str):
-        raise SceneError(f'{path} names no vector; add the line vector = "positions.csv"')
-    rate_hz, start_s = stated.get("rate_hz"), stated.get("start_s", 0.0)
-    for name, value, least in (("rate_hz", rate_hz, 0.0), ("start_s", start_s, -math.inf)):
-        if isinstance(value, bool) or not isinstance(value, int | float) or not least < value < math.inf:
-            above = " above 0" if least == 0 else ""
-            raise SceneError(f"{path}: {name} = {value!r}, expected a number{above}; correct it")
-    file = path.parent / stated["vector"]
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise SceneError(
+            f'{path}: {first["loc"][0]}: {first["msg"]}; write vector = "positions.csv", rate_hz above 0 and start_s'
+        ) from None
+    file = path.parent / stated.vector
     try:
         if file.suffix == ".npy":
             values = np.load(file, allow_pickle=False)
@@ -297,7 +304,7 @@ def load_played_vector(path: Path, mounting: Mounting = STRAIGHT) -> PlayedVecto
         raise SceneError(f"{file}: {error}") from error
     except (OSError, ValueError, EOFError) as error:
         raise SceneError(f"{file} cannot be read as a vector: {error}; give CSV or .npy with numbers") from error
-    return PlayedVector(positions, float(rate_hz), float(start_s))  # type: ignore[arg-type]
+    return PlayedVector(positions, stated.rate_hz, stated.start_s)
 
 
 def follow_vector(vector: PlayedVector, middle_s: Floats, where: str) -> LinePointing:

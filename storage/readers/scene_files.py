@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import EmptySceneError, SceneError
-from pipeline.geometry.grid import UNLABELLED, SceneGrid
+from pipeline.geometry.grid import SceneGrid
 from pipeline.readings import MOST_VALUE, beyond_range, find_beyond
 from storage.archive.staging import file_hash
 from storage.parallel.pool import RESERVED_BYTES, memory_refusal
@@ -77,27 +78,6 @@ class SceneFile:
         )
 
 
-def load_scene_file(
-    path: str | Path,
-    *,
-    labels: str | Path | None = None,
-    bands: Sequence[int] | None = None,
-    wavelengths: Sequence[float] | None = None,
-    classes: Mapping[str, ClassValue] | None = None,
-    labels_needed: bool = True,
-) -> SceneFile:
-    """Open a scene as `open_scene_file` does, and keep all values in memory."""
-    return open_scene_file(
-        path,
-        labels=labels,
-        bands=bands,
-        wavelengths=wavelengths,
-        classes=classes,
-        labels_needed=labels_needed,
-        keep=True,
-    )
-
-
 def open_scene_file(
     address: str | Path,
     *,
@@ -123,7 +103,6 @@ def open_scene_file(
     source, settings = open_cube(address), find_scene_settings(file)
     height, width, count = source.shape
     chosen, bad_note = _chosen_bands(bands, settings, count, file, source.bad_bands)
-    _refuse_bands_first(file, source.shape, wavelengths or settings.wavelengths_nm)
     light = settle_wavelengths(file, chosen, count, stated=wavelengths, settings=settings, known=source.bands)
     assert light.wavelength_nm is not None
     values = FileValues.of(source, chosen, settings)
@@ -156,9 +135,8 @@ def open_scene_file(
     return scene.labelled(found, by_name=by_name)
 
 
-def _stated_scaling(scale: float, offset: float) -> str:
-    """Return scene.toml's scaling as a text for hashes; empty without one."""
-    return "" if (scale, offset) == (1.0, 0.0) else f"{SETTINGS_NAME} scale {scale!r} offset {offset!r}"
+# As `open_scene_file`, with all values in memory.
+load_scene_file = partial(open_scene_file, labels_needed=True, keep=True)
 
 
 def with_stated_values(source: CubeSource, address: str | Path) -> CubeSource:
@@ -167,25 +145,19 @@ def with_stated_values(source: CubeSource, address: str | Path) -> CubeSource:
     Scaled numbers are float32, NaN without data. Raises SceneError: the cube has dark or white frames and a scale.
     """
     settings = find_scene_settings(split_variable(address)[0])
-    scaling = _stated_scaling(settings.scale, settings.offset)
+    values = FileValues.of(source, list(range(source.shape[2])), settings)
     stated = () if settings.nodata is None else (f"{SETTINGS_NAME} nodata {settings.nodata!r}",)
     nodata = source.nodata if settings.nodata is None else settings.nodata
-    source = replace(source, nodata=nodata, scaling=" ".join(filter(None, (source.scaling, *stated, scaling))))
-    if not scaling:
-        return source
+    scaling = " ".join(filter(None, (source.scaling, *stated, values.scaling)))
+    if not values.scaling:
+        return replace(source, nodata=nodata, scaling=scaling)
     if source.dark is not None or source.white is not None:
         raise SceneError(
             f"{settings.path} has a scale or offset, and {address} dark or white frames, so its numbers are stored as "
             "they are; remove scale and offset from the scene.toml"
         )
-    note = f"values are the file's times {settings.scale:g} plus {settings.offset:g}, as {SETTINGS_NAME} says"
-    nodata, plain = USUAL_NODATA if nodata is None and source.dtype.kind in "if" else nodata, source.read
-
-    def read(start: int, stop: int) -> NDArray[np.float32]:
-        """Return some lines (line, sample, band), NaN where the file has no value."""
-        return unpacked(plain(start, stop), settings.scale, settings.offset, nodata)
-
-    return replace(source, read=read, dtype=np.dtype(np.float32), nodata=None, notes=(*source.notes, note))
+    kind, notes = np.dtype(np.float32), (*source.notes, *values.notes(Path(SETTINGS_NAME))[0])
+    return replace(source, read=values.read, dtype=kind, nodata=None, scaling=scaling, notes=notes)
 
 
 def _light_hash(
@@ -202,16 +174,6 @@ def _light_hash(
     more += [] if void is None else [f"void {hashlib.sha256(np.packbits(void).tobytes()).hexdigest()}"]
     more += [one for one in (values.source.scaling, values.scaling) if one]
     return _digest(content, variable, values.bands, light.wavelength_nm.tolist(), widths, *more)
-
-
-def _refuse_bands_first(path: Path, shape: tuple[int, ...], wavelengths: Sequence[float] | None) -> None:
-    """Refuse a cube with as many rows, instead of bands, as wavelengths (SceneError)."""
-    count = 0 if wavelengths is None else len(wavelengths)
-    if count > 1 and shape[0] == count != shape[2] and shape[1] != shape[2]:
-        raise SceneError(
-            f"{path} has the axes {shape}, read as (y, x, band), and there are {count} wavelengths: its bands come"
-            " first; store it with the bands last, np.moveaxis(values, 0, -1)"
-        )
 
 
 def _content_hash(file: Path, files: tuple[Path, ...]) -> str:
@@ -270,7 +232,7 @@ def _labels_of(
         return None, (f"the labels beside the scene are left out: {error}",), by_name
     how = f"classes from {settings.path}" if settings.classes else f"{len(found.names)} classes as found in the file"
     note = f"labels from {address}{', found by its name' if by_name else ''}, {how}"
-    return found, (note, *found.notes, *_one_class_note(found)), by_name
+    return found, (note, *found.notes), by_name
 
 
 def load_field_labels(address: str | Path, shape: tuple[int, int]) -> tuple[Labels, tuple[str, ...]]:
@@ -279,19 +241,6 @@ def load_field_labels(address: str | Path, shape: tuple[int, int]) -> tuple[Labe
     found, notes, _ = _labels_of(file, shape, None, address, find_scene_settings(file), {}, True)
     assert found is not None
     return found, notes
-
-
-def _one_class_note(found: Labels) -> tuple[str, ...]:
-    """Return a note on labels of a single class: its value may mean unlabelled."""
-    there = np.unique(found.index[found.index != UNLABELLED])
-    if len(there) != 1:
-        return ()
-    value = found.values[there[0]]
-    text = value if isinstance(value, int) else list(value)
-    return (
-        f"all labels are {found.names[there[0]]}: if {text} in the label file means no class, write unlabelled = {text}"
-        f" into a {SETTINGS_NAME}",
-    )
 
 
 def _digest(*parts: object) -> str:
@@ -324,8 +273,9 @@ class FileValues:
 
     @property
     def scaling(self) -> str:
-        """Return scene.toml's scaling as a text for hashes."""
-        return _stated_scaling(self.scale, self.offset)
+        """Return scene.toml's scaling as a text for hashes; empty without one."""
+        plain = (self.scale, self.offset) == (1.0, 0.0)
+        return "" if plain else f"{SETTINGS_NAME} scale {self.scale!r} offset {self.offset!r}"
 
     def notes(self, settings: Path | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Return notes on scaling, by the scene.toml ``settings``, and notes on the mask."""

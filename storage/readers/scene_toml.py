@@ -183,7 +183,10 @@ def _fit(
     belongs = own if len(values) == len(own) else list(range(file_bands))
     if len(values) != len(belongs):
         ways = f"{len(own)} or {file_bands}" if len(own) != file_bands else f"{file_bands}"
-        raise WavelengthError(f"{where}: expected {ways} wavelengths, one a band, got {len(values)}; correct the list")
+        raise WavelengthError(
+            f"{where}: expected {ways} wavelengths, one a band, got {len(values)}; correct the list (axes are y, x,"
+            " band)"
+        )
     known = dict(zip(belongs, values.tolist(), strict=True))
     missing = [band for band in chosen if band not in known]
     if missing:

@@ -5,7 +5,7 @@ refused, so that reading never runs code of the store. A cube of files is ingest
 
 ::
 
-    cube.zarr/values          (line, sample, band): whole numbers as uint8 or uint16 if they fit, else float32
+    cube.zarr/values          (line, sample, band): uint8, uint16 and int16 as in the file, else float32
     cube.zarr/wavelength      (band,) nm, fwhm beside it, if known
     cube.zarr/valid_line      (line,) false for lines that no file holds whole; time, exposure_ms, frame if known
     cube.zarr/dark, white     (sample, band) reference frames, if there are some
@@ -169,9 +169,7 @@ def write_ingested_cube(
 
     ``report`` is called with the progress, 0..1. Raises SceneError: lines cannot be read.
     """
-    kind = stored_dtype(source, lambda done: report(0.3 * done))
-    sampled = source.dtype.kind in "ui" and source.dtype not in (np.uint8, np.uint16)
-    begin = 0.3 if sampled else 0.0
+    kind = source.dtype if source.dtype in (np.uint8, np.uint16, np.int16) else np.dtype(np.float32)
     group = create_group(folder / "cube.zarr", f"{INGESTED} {name}", _attributes(source, files, name))
     about: dict[str, Any] = {"long_name": "numbers of the file", "units": "1", **_write_coordinates(group, source)}
     array = create_array(group, "values", image_spec(("line", "sample", "band"), source.shape, kind.str), about)
@@ -185,25 +183,10 @@ def write_ingested_cube(
             block[~valid] = np.nan if kind.kind == "f" else 0
         array[start:stop] = block
         thumbnail.add(start, lines, valid)
-        report(begin + (1 - begin) * stop / source.shape[0])
+        report(stop / source.shape[0])
     picture = thumbnail.finish()
     write_quicklook(group, picture)
     Image.fromarray(picture.image).save(folder / "quicklook.png")
-
-
-def stored_dtype(source: CubeSource, report: Report = lambda done: None) -> np.dtype[Any]:
-    """Return the type of the store: uint8 or uint16 if all values are such whole numbers, else float32."""
-    if source.dtype in (np.bool_, np.uint8):
-        return np.dtype(np.uint8)
-    if source.dtype == np.uint16 or source.dtype.kind == "f":
-        return np.dtype(np.uint16 if source.dtype == np.uint16 else np.float32)
-    for start in range(0, source.shape[0], BLOCK_LINES):
-        stop = min(start + BLOCK_LINES, source.shape[0])
-        lines = source.read(start, stop)
-        if lines.min() < 0 or lines.max() > np.iinfo(np.uint16).max:
-            return np.dtype(np.float32)
-        report(stop / source.shape[0])
-    return np.dtype(np.uint16)
 
 
 def _attributes(source: CubeSource, files: Sequence[SourceFile], name: str) -> dict[str, Any]:

@@ -53,7 +53,6 @@ def _pictures(here: Path, picture: np.ndarray) -> None:
         "small_labels.png": labels[:20],
         "rgba_labels.png": np.dstack([labels * 255] * 3 + [np.full_like(labels, 255)]),
         "two_classes.png": labels,
-        "black.png": np.zeros_like(labels),
         "strange_colour.png": np.dstack([labels * 255, labels * 0, labels * 0]),
         "soft.png": picture,
     }.items():

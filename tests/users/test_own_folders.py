@@ -153,12 +153,3 @@ def test_frames_of_one_class_are_told_when_weights_are_judged(made: Path, weight
     data = open_frames(str(made / "soil"), (), None, LineCamera(), choices)
     jobs = sort_frames(EvaluateRequest(str(made / "soil"), (weights,)), data, candidates, lambda *words: None)
     assert alike_notes(jobs.alike)[0].startswith("all labels are class_0 in 001, 002; if its value")
-
-
-def test_labels_that_are_all_alike_are_questioned(made: Path) -> None:
-    """One value may be what nobody labelled: the scene says so, and what to write."""
-    scene = load_scene_file(made / "field.png", labels=made / "black.png")
-    assert any("all labels are class_0: if 0 in the label file" in note for note in scene.provenance)
-    assert not any(
-        "all labels" in note for note in load_scene_file(made / "field.png", labels=made / "two_classes.png").provenance
-    )

@@ -258,7 +258,7 @@ def linked_outside(path: Path) -> None:
         (no_wavelengths, "has 5 bands and nothing says their wavelengths; give --wavelengths"),
         (wrong_axes, r"has dims level, lat, lon; expected y, x, band \(or band, y, x\); rename them"),
         (no_cube, "has no array of numbers with the axes y, x and band; it has none"),
-        (lost_attribute, "lacks what files of its kind have: .*L2ScaleSwirMax"),
+        (lost_attribute, "cannot be read as NetCDF or HDF5: KeyError: .*L2ScaleSwirMax"),
         (short_list, r"expected one size \(y, x\) and \[3, 3\] bands, as it has wavelengths"),
         (level_1, "is no PRISMA product of level 2B, 2C or 2D"),
         (linked_outside, "has no array of numbers with the axes y, x and band; it has none"),

@@ -178,11 +178,10 @@ def test_a_played_vector_places_lines_by_its_clock(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("recipe", "message"),
     [
-        ("rate_hz = 10\n", 'names no vector; add the line vector = "positions.csv"'),
-        ('vector = "path.csv"\n', "rate_hz = None, expected a number above 0"),
-        ('vector = "path.csv"\nrate_hz = 0\n', "rate_hz = 0, expected a number above 0"),
-        ('vector = "path.csv"\nrate_hz = 1\nstart_s = "x"\n', "start_s = 'x', expected a number; correct it"),
-        ('vector = "path.csv"\nrate = 1\n', "has the entry 'rate'; accepted are vector, rate_hz, start_s"),
+        ("rate_hz = 10\n", 'vector: Field required; write vector = "positions.csv", rate_hz above 0 and start_s'),
+        ('vector = "path.csv"\nrate_hz = 0\n', "rate_hz: Input should be greater than 0"),
+        ('vector = "path.csv"\nrate_hz = 1\nstart_s = "x"\n', "start_s: Input should be a valid number"),
+        ('vector = "path.csv"\nrate_hz = 1\nrate = 1\n', "rate: Extra inputs are not permitted"),
         ('vector = "none.csv"\nrate_hz = 1\n', "none.csv"),
         ('vector = "far.csv"\nrate_hz = 1\n', "lies outside the unit disk that the mirror reaches"),
         ('vector = "words.csv"\nrate_hz = 1\n', "cannot be read as a vector"),
