@@ -36,7 +36,6 @@ def _pictures(here: Path, picture: np.ndarray) -> None:
     shutil.copy(here / "field.png", here / "FIELD_2.PNG")
     for name in ("a field.png", "Rüben.png", "two\nlines.png"):
         shutil.copy(here / "field.png", here / name)
-    Image.fromarray(np.dstack([picture, picture[..., :1]])).save(here / "transparent.png")
     Image.fromarray(picture[:1, :1]).save(here / "one_px.png")
     Image.fromarray(np.full_like(picture, 90)).save(here / "constant.png")
     (here / "cut.png").write_bytes((here / "field.png").read_bytes()[:200])
@@ -53,8 +52,6 @@ def _pictures(here: Path, picture: np.ndarray) -> None:
         "small_labels.png": labels[:20],
         "rgba_labels.png": np.dstack([labels * 255] * 3 + [np.full_like(labels, 255)]),
         "two_classes.png": labels,
-        "strange_colour.png": np.dstack([labels * 255, labels * 0, labels * 0]),
-        "soft.png": picture,
     }.items():
         Image.fromarray(values).save(here / name)
     Image.fromarray(np.dstack([labels * 255, labels * 90, labels * 0])).resize((32, 24)).save(here / "labels.jpg")
@@ -67,7 +64,6 @@ def _arrays(here: Path, cube: np.ndarray) -> None:
         "cube": cube,
         "band_first": np.moveaxis(cube, 2, 0),
         "float_labels": np.full(CUBE[:2], 0.5),
-        "whole_float_labels": np.round(cube[..., 0]),
         "negative": cube - 0.5,
         "percent": cube * 100,
         "scaled": (cube * 10000).astype(np.uint16),
