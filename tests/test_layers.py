@@ -224,7 +224,7 @@ def test_what_is_imported_is_declared() -> None:
     """Every package from outside that the source imports stands in pyproject.toml."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
-    wanted = project["dependencies"] + extras["s3"] + extras["parquet"]
+    wanted = project["dependencies"] + extras["s3"]
     declared = {re.split(r"[\[<>=~! ]", item, maxsplit=1)[0].lower() for item in wanted}
     outside = {name.split(".")[0] for tree in source().values() for name in imported(tree)}
     outside -= {*ROOMS, *sys.stdlib_module_names}

@@ -190,8 +190,8 @@ class Settings:
     )
     pointing: str | None = stated(
         None,
-        "Pointing of the recorded lines: a table with one row per line (CSV, Parquet), a TOML file of the mirror's"
-        " position vector, or a folder with one file per cube; default: NAME.pointing.csv beside each cube",
+        "Pointing of the recorded lines: a table with one row per line (CSV), or a folder with one table per cube;"
+        " default: NAME.pointing.csv beside each cube",
         example="pointing.csv",
     )
     dark: str | None = stated(

@@ -29,7 +29,6 @@ from storage.readers.label_files import (
     LABEL_WORDS,
     MatchedFiles,
     classes_of_files,
-    filled,
     find_label,
     folders_within,
     image_folder,
@@ -38,7 +37,6 @@ from storage.readers.label_files import (
     listed_names,
     match_folder,
     read_labels,
-    scene_number,
 )
 from storage.readers.labels import MixedLabelsError
 from storage.readers.open_cubes import open_cube, open_labels, split_variable, with_wavelengths
@@ -92,7 +90,7 @@ def run_init(source: str, console: Console, *, force: bool = False) -> dict[str,
         "file": str(path),
         "images": len(found.images),
         "labelled": len(found.labels),
-        "labels": draft.pattern,
+        "labels": draft.only_label,
         "shape": list(draft.cube.shape),
         "wavelengths_nm": None if bands.wavelength_nm is None else bands.wavelength_nm.tolist(),
         "wavelength_origin": bands.origin,
@@ -128,13 +126,13 @@ def _label_lines(draft: SceneDraft) -> list[str]:
     images, labels = draft.files.images, draft.files.labels
     if not labels:
         return ['# labels = "labels/{name}.png"   # no label files were found: {name} is an image\'s name']
-    if draft.pattern is None:
+    if draft.only_label is None:
         pair = next(iter(labels.items()))
         return [
             f"# labels of {len(labels)} of {len(images)} images were found by their names: {_printable(pair[0].name)}"
             f" has {_printable(pair[1].name)}"
         ]
-    return [f"labels = {_quoted(draft.pattern)}   # of {len(labels)} of {len(images)} images"]
+    return [f"labels = {_quoted(draft.only_label)}   # of all images"]
 
 
 def _wavelength_lines(draft: SceneDraft) -> list[str]:
@@ -273,7 +271,7 @@ class SceneDraft:
     files: MatchedFiles
     first: str  # address of the scene that was read
     cube: CubeSource  # that scene
-    pattern: str | None  # of all label files by their images' names, relative to the folder of scene.toml
+    only_label: str | None  # file with the labels of all images, relative to the folder of scene.toml
     classes: tuple[FoundClass, ...]
     notes: tuple[str, ...]  # on the first image
     unseen: tuple[str, ...]  # on files that cannot be read or do not fit
@@ -307,7 +305,7 @@ def draft_scene(address: str | Path, report: Report = lambda done, name: None) -
         files=found,
         first=str(first),
         cube=source,
-        pattern=_pattern(found, folder),
+        only_label=_only_label(found, folder),
         classes=classes,
         notes=(*series, *source.notes),
         unseen=tuple(unseen),
@@ -335,21 +333,11 @@ def _shared_labels(found: MatchedFiles, shape: tuple[int, ...]) -> MatchedFiles:
     return found
 
 
-def _pattern(found: MatchedFiles, folder: Path) -> str | None:
-    """Return the ``labels`` of a scene.toml that gives each image its own file; None if no pattern does."""
-    for image, label in list(found.labels.items())[:1]:
-        place = os.path.relpath(label.parent, folder)
-        number = scene_number(image)
-        tried = [label.name.replace(image.stem, "{name}", 1)] if image.stem in label.name else []
-        tried += [label.name.replace(number, "{number}", 1)] if number and number in label.name else []
-        tried += [label.name] if len(found.images) == 1 or len(set(found.labels.values())) == 1 else []
-        for name in tried:
-            pattern = Path(place, name).as_posix()
-            places = {one: (folder / filled(pattern, one)).resolve() for one in found.images}
-            fits = all(places[one] == own.resolve() for one, own in found.labels.items())
-            if fits and pattern.isprintable() and not any(places[one].exists() for one in found.bare):
-                return pattern
-    return None
+def _only_label(found: MatchedFiles, folder: Path) -> str | None:
+    """Return the ``labels`` of a scene.toml if one file has the labels of all images; None if names find them."""
+    files = set(found.labels.values())
+    path = os.path.relpath(files.pop(), folder) if len(files) == 1 and not found.bare else ""
+    return Path(path).as_posix() if path and path.isprintable() else None
 
 
 def _classes(found: MatchedFiles, bands: int, unseen: list[str], report: Report) -> tuple[FoundClass, ...]:

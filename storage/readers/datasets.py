@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,9 +39,7 @@ class DataSet:
     path: Path
     files: dict[str, str]  # name -> file (or FILE:ARRAY)
     held_out: tuple[str, ...] = ()
-    labels: str | Path | None = None
-    bands: tuple[int, ...] | None = None
-    wavelengths: tuple[float, ...] | None = None
+    choices: Mapping[str, Any] = field(default_factory=dict)  # of `load_scene_file`
     train_mask: str | Path | None = None
     mask_classes: tuple[int, ...] | None = None
     label_files: Mapping[str, Path] = field(default_factory=dict)  # by name of the scene
@@ -87,13 +85,8 @@ class DataSet:
         """
         if name not in self.files:
             raise SceneError(f"{self.path} has no scene {name}; it has {', '.join(self.files)}")
-        scene = load_scene_file(
-            self.files[name],
-            labels=self.labels or self.label_files.get(name),
-            bands=self.bands,
-            wavelengths=self.wavelengths,
-            classes=self.classes,
-        )
+        labels = {"labels": self.label_files.get(name), **self.choices}
+        scene = load_scene_file(self.files[name], classes=self.classes, **labels)
         if part is None or self.train_mask is None:
             return scene
         train, rest = split_labels(scene, self.train_mask, self.mask_classes)
@@ -108,20 +101,22 @@ def load_data_set(
     path: str | Path,
     *,
     hold_out: Sequence[str] = (),
-    labels: str | Path | None = None,
-    bands: Sequence[int] | None = None,
-    wavelengths: Sequence[float] | None = None,
     train_mask: str | Path | None = None,
     mask_classes: Sequence[int] | None = None,
+    **choices: Any,
 ) -> DataSet:
-    """List the scenes of a folder (``images/`` in it, or the files themselves) or of one file, without reading them."""
+    """List the scenes of a folder (``images/`` in it, or the files themselves) or of one file, without reading them.
+
+    ``choices`` are labels, bands and wavelengths of `load_scene_file`; None is no choice.
+    """
+    choices = {name: value for name, value in choices.items() if value is not None}
     files, label_files, alone = _scenes(path, train_mask)
     unknown = [name for name in hold_out if name not in files]
     if unknown:
         raise SceneError(f"{path} has no scene {', '.join(unknown)} to hold out; it has {', '.join(files)}")
     if len(set(hold_out)) == len(files):
         raise SceneError(f"{path}: all {len(files)} scenes are held out, which leaves none to train on; hold out fewer")
-    if len(files) > 1 and (train_mask is not None or labels is not None):
+    if len(files) > 1 and (train_mask is not None or "labels" in choices):
         raise SceneError(f"{path} has {len(files)} scenes; one file of labels or one mask fits a single scene only")
     if mask_classes is not None and train_mask is None:
         raise SceneError("mask classes are given without a training mask; give both or neither")
@@ -129,12 +124,10 @@ def load_data_set(
         path=Path(path),
         files=files,
         held_out=tuple(name for name in files if name in set(hold_out)),
-        labels=labels,
-        bands=None if bands is None else tuple(bands),
-        wavelengths=None if wavelengths is None else tuple(wavelengths),
+        choices=choices,
         train_mask=train_mask,
         mask_classes=None if mask_classes is None else tuple(mask_classes),
-        label_files={} if labels is not None else label_files,
+        label_files={} if "labels" in choices else label_files,
         alone=alone,
     )
 
@@ -200,12 +193,8 @@ def _match_by_settings(folder: Path, settings: SceneSettings) -> MatchedFiles:
     entries = scene_entries(folder)
     matched = {entry: address for entry in entries if (address := label_file(entry, settings)[0]) is not None}
     labels = {split_variable(address)[0].resolve() for address in matched.values()}
-    others = [entry for entry in entries if entry.resolve() not in labels]
-    images = tuple(entry for entry in others if not is_label_name(entry)) or tuple(others)
-    apart = {address.parent for address in matched.values()} - {folder}
-    beside = [entry for place in sorted(apart) if place.is_dir() for entry in scene_entries(place)]
-    alone = tuple(one for one in (*others, *beside) if one not in images and one.resolve() not in labels)
-    return MatchedFiles(images, {image: matched[image] for image in images if image in matched}, alone)
+    images = tuple(entry for entry in entries if entry.resolve() not in labels and not is_label_name(entry))
+    return MatchedFiles(images, {image: matched[image] for image in images if image in matched}, ())
 
 
 def _names(images: Sequence[Path]) -> dict[str, Path]:

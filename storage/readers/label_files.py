@@ -204,15 +204,11 @@ def label_file(scene: Path, settings: SceneSettings) -> tuple[Path | None, str]:
         return find_label(scene), ""
     if not settings.labels:
         return None, ""
-    address = settings.path.parent / filled(settings.labels, scene)
+    name = settings.labels.replace("{number}", scene_number(scene) or "").replace("{name}", scene.stem)
+    address = settings.path.parent / name
     if address != settings.path.parent / settings.labels and not split_layer(address)[0].is_file():
         return None, f"no labels: there is no {address}"
     return address, ""
-
-
-def filled(pattern: str, scene: Path) -> str:
-    """Return the ``labels`` of a scene.toml for one scene."""
-    return pattern.replace("{number}", scene_number(scene) or "").replace("{name}", scene.stem)
 
 
 def scene_number(path: Path) -> str | None:

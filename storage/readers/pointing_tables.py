@@ -1,6 +1,6 @@
-"""Read the pointing of recorded lines: a table with a row for each line, or a vector that the mirror played.
+"""Read the pointing of recorded lines: a table with a row for each line.
 
-A table is CSV (commas, semicolons or tabs) or Parquet. Optional columns are ``line`` (from 0), ``sweep``,
+A table is CSV (commas, semicolons or tabs). Optional columns are ``line`` (from 0), ``sweep``,
 ``time`` (of mid exposure since the start of the sweep) [s], ``exposure_ms`` and ``valid`` (0 or 1). A table has exactly
 one of these kinds of pointing:
 
@@ -11,38 +11,23 @@ one of these kinds of pointing:
     angle_deg                  viewing angle along the scan, of a scan through the undeflected direction
     position_px                place along a straight scan without a mirror: stage, conveyor, drone
     position_m                 the same in metres
-
-A vector is a TOML file, for a path that the mirror played by its own clock::
-
-    vector = "positions.csv"   # CSV or .npy: two columns X and Y, or all X before all Y in one
-    rate_hz = 14.5             # cells a second
-    start_s = 0.0              # time of the path at the first line's exposure; 0 by default
 """
 
 from __future__ import annotations
 
 import csv
 import math
-import re
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from pipeline.capture.straight_scans import PlayedVector, angles_to_positions, split_vector
-from pipeline.errors import PoseError, SceneError
-from pipeline.geometry.mirror import RIM_SLACK, STRAIGHT, Mounting, check_reach
-from pipeline.lazy import deferred
-
-if TYPE_CHECKING:
-    from pyarrow import parquet  # type: ignore[import-untyped]
-else:
-    parquet = deferred("pyarrow.parquet")
+from pipeline.capture.straight_scans import angles_to_positions
+from pipeline.errors import SceneError
+from pipeline.geometry.mirror import RIM_SLACK, STRAIGHT, Mounting
 
 Floats = NDArray[np.float64]
 Kind = Literal["mirror", "angles", "angle", "px", "m"]
@@ -56,8 +41,8 @@ KINDS: Mapping[Kind, tuple[str, ...]] = {
 WITHOUT_MIRROR: tuple[Kind, ...] = ("px", "m")
 BESIDE = ("line", "sweep", "time", "exposure_ms", "valid")
 ACCEPTED = (*BESIDE, *(name for names in KINDS.values() for name in names))
-TABLE_ENDINGS = (".csv", ".tsv", ".txt", ".parquet")
-ENDINGS = (*TABLE_ENDINGS, ".toml")
+FIRST_ROW = 2  # the header is row 1
+ENDINGS = (".csv", ".tsv", ".txt")
 WORDS = {"": math.nan, "none": math.nan, "true": 1.0, "false": 0.0}
 
 
@@ -71,7 +56,6 @@ class LinePointing:
     time_s: Floats | None = None  # (line,) of mid exposure
     exposure_ms: Floats | None = None  # (line,)
     part: tuple[str, ...] | None = None  # (line,) names of the sweeps, if a table cuts one cube into several
-    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -82,7 +66,6 @@ class PointingTable:
     kind: Kind
     columns: Mapping[str, Floats]  # (row,) each
     sweep: tuple[str, ...] | None  # (row,)
-    first_row: int  # number of the first row in the file, as an editor counts them
 
     def of_cube(self, name: str, lines: int, mounting: Mounting = STRAIGHT, *, alone: bool = False) -> LinePointing:
         """Return the pointing of a cube: the rows whose ``sweep`` is its name, or all without that column.
@@ -164,8 +147,9 @@ class PointingTable:
         more = "" if count == 1 else f" (the first of {count} such rows)"
         known = {name: self.columns[name][np.isfinite(self.columns[name])] for name in names}
         spans = [f"{name} goes from {one.min():.6g} to {one.max():.6g}" for name, one in known.items() if len(one)]
-        row = first + self.first_row
-        raise SceneError(f"{self.path}, row {row}: {came}{more}, {expected}. {'; '.join(spans)}; correct the table")
+        raise SceneError(
+            f"{self.path}, row {first + FIRST_ROW}: {came}{more}, {expected}. {'; '.join(spans)}; correct the table"
+        )
 
 
 def _filled(values: Floats, valid: NDArray[np.bool_]) -> Floats:
@@ -181,12 +165,7 @@ def load_pointing_table(path: Path) -> PointingTable:
     Raises SceneError: it cannot be read, has no row, an unknown column, a cell that is no number, or not exactly one
     kind of pointing.
     """
-    header: list[str]
-    cells: Sequence[Sequence[object]]
-    if path.suffix.lower() == ".parquet":
-        header, cells, first_row = *_parquet_cells(path), 1
-    else:
-        header, cells, first_row = *_csv_cells(path), 2  # the header is row 1
+    header, cells = _csv_cells(path)
     unknown = [name for name in header if name not in ACCEPTED]
     if unknown or len(set(header)) < len(header):
         twice = next((name for name in header if header.count(name) > 1), None)
@@ -201,33 +180,32 @@ def load_pointing_table(path: Path) -> PointingTable:
     if not cells:
         raise SceneError(f"{path} has no row below its header; give a row for each line")
     columns = {
-        name: _numbers(path, name, [row[at] for row in cells], first_row)
-        for at, name in enumerate(header)
-        if name != "sweep"
+        name: _numbers(path, name, [row[at] for row in cells]) for at, name in enumerate(header) if name != "sweep"
     }
-    sweep = tuple(str(row[header.index("sweep")]).strip() for row in cells) if "sweep" in header else None
-    return PointingTable(path, kinds[0], columns, sweep, first_row)
+    sweep = tuple(row[header.index("sweep")] for row in cells) if "sweep" in header else None
+    return PointingTable(path, kinds[0], columns, sweep)
 
 
-def _numbers(path: Path, name: str, cells: Sequence[object], first_row: int) -> Floats:
+def _numbers(path: Path, name: str, cells: Sequence[str]) -> Floats:
     """Return the cells of a column as numbers, NaN for empty ones, 1 for True."""
     values = np.empty(len(cells))
     for number, cell in enumerate(cells):
-        text = str(cell).strip().lower()
         try:
-            values[number] = WORDS[text] if text in WORDS else float(text)
+            values[number] = WORDS[cell.lower()] if cell.lower() in WORDS else float(cell)
         except ValueError:
             raise SceneError(
-                f"{path}, row {number + first_row}: {name} = {str(cell)[:40]!r} is no number; write numbers with a "
-                "decimal point"
+                f"{path}, row {number + FIRST_ROW}: {name} = {cell[:40]!r} is no number; write numbers with a decimal"
+                " point"
             ) from None
     return values
 
 
 def _csv_cells(path: Path) -> tuple[list[str], list[list[str]]]:
     """Return the names of the columns and the cells of all rows, by the delimiter of the header."""
-    text = _text(path)
-    lines = text.splitlines()
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise SceneError(f"{path} cannot be read as a pointing table: {error}; name a text file (CSV)") from error
     header = lines[0] if lines else ""
     delimiter = max((",", ";", "\t"), key=header.count)
     rows = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=delimiter)]
@@ -243,93 +221,7 @@ def _csv_cells(path: Path) -> tuple[list[str], list[list[str]]]:
     return names, cells
 
 
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise SceneError(f"{path} cannot be read as a pointing table: {error}; name a text file (CSV)") from error
-
-
-def _parquet_cells(path: Path) -> tuple[list[str], list[list[object]]]:
-    try:
-        table = parquet.read_table(path)
-    except ImportError as error:
-        raise SceneError(
-            f"{path} is Parquet, and pyarrow is not installed; install spectralzoom[parquet], or write the table as CSV"
-        ) from error
-    except (OSError, ValueError) as error:  # pyarrow's errors are of these
-        raise SceneError(f"{path} cannot be read as Parquet: {error}; write the table anew, or as CSV") from error
-    columns = table.to_pydict()
-    return [name.lower() for name in columns], [list(row) for row in zip(*columns.values(), strict=True)]
-
-
-class _Recipe(BaseModel):
-    """TOML file of a played vector."""
-
-    model_config = ConfigDict(extra="forbid", strict=True)
-
-    vector: str
-    rate_hz: float = Field(gt=0, allow_inf_nan=False)
-    start_s: float = Field(0.0, allow_inf_nan=False)
-
-
-def load_played_vector(path: Path, mounting: Mounting = STRAIGHT) -> PlayedVector:
-    """Read the TOML file of a played vector, and the file of positions that it names.
-
-    Raises SceneError: either cannot be read, the TOML file has other keys than vector, rate_hz and start_s, or a
-    position is beyond the mirror.
-    """
-    try:
-        stated = _Recipe.model_validate(tomllib.loads(_text(path)))
-    except tomllib.TOMLDecodeError as error:
-        raise SceneError(f"{path} cannot be read as TOML: {error}; write vector, rate_hz and start_s") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise SceneError(
-            f'{path}: {first["loc"][0]}: {first["msg"]}; write vector = "positions.csv", rate_hz above 0 and start_s'
-        ) from None
-    file = path.parent / stated.vector
-    try:
-        if file.suffix == ".npy":
-            values = np.load(file, allow_pickle=False)
-        else:  # without a header, (row, column)
-            values = np.loadtxt(re.sub(r"[;\t]", ",", _text(file)).splitlines(), delimiter=",", ndmin=2)
-        if values.dtype.kind not in "iuf":
-            raise ValueError(f"it holds {values.dtype}")
-        positions = mounting.to_model(split_vector(values.astype(np.float64), str(file)))
-        check_reach(positions)
-    except SceneError:
-        raise
-    except PoseError as error:
-        raise SceneError(f"{file}: {error}") from error
-    except (OSError, ValueError, EOFError) as error:
-        raise SceneError(f"{file} cannot be read as a vector: {error}; give CSV or .npy with numbers") from error
-    return PlayedVector(positions, stated.rate_hz, stated.start_s)
-
-
-def follow_vector(vector: PlayedVector, middle_s: Floats, where: str) -> LinePointing:
-    """Return the pointing of lines by a played vector and the times of their mid exposures (line,) [s].
-
-    Times count from the start of the first exposure. Lines without a time, or outside of the path's time, are not
-    valid. Raises SceneError: no line lies within the path's time.
-    """
-    known = np.isfinite(middle_s)
-    position, played = vector.at(np.where(known, middle_s, 0.0))
-    valid = known & played
-    if not valid.any():
-        seconds = len(vector.position) / vector.rate_hz
-        raise SceneError(
-            f"{where}: no line was taken while the path of {seconds:g} s was played; correct start_s or rate_hz"
-        )
-    note = (
-        "positions are those of the played vector, by the clocks of camera and mirror; an error of start_s shifts all"
-    )
-    lost = int(np.count_nonzero(~valid))
-    outside = (f"{lost} lines lie outside of the path's time and are not valid",) if lost else ()
-    return LinePointing("mirror", position, valid, middle_s, notes=(note, *outside))
-
-
 def find_pointing(folder: Path, stem: str) -> Path | None:
-    """Return the file ``STEM.pointing.csv``, ``.parquet`` or ``.toml`` of a cube in a folder."""
+    """Return the file ``STEM.pointing.csv`` (or .tsv, .txt) of a cube in a folder."""
     names = [f"{stem}.pointing{ending}" for ending in ENDINGS]
     return next((folder / name for name in names if (folder / name).is_file()), None)

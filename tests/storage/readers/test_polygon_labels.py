@@ -155,7 +155,6 @@ def test_a_folder_of_scenes(tmp_path: Path) -> None:
         "oats": (2, 30),
         "wheat": (3, 40),
     }
-    assert draft.pattern == "{name}.gpkg"
     with rasterio.open(tmp_path / "c_mask.tif", "w", "GTiff", SHAPE[1], SHAPE[0], 1, dtype="uint8") as file:
         file.write(np.ones((1, *SHAPE), np.uint8))
     scene(tmp_path, "c.tif")

@@ -172,18 +172,6 @@ def test_a_table_cuts_one_cube_into_sweeps(files: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(back.read(0, 38), cube.read(42, 80))
 
 
-def test_a_played_vector_beside_a_cube(files: Path) -> None:
-    """80 cells at the camera's rate place each line in its own cell."""
-    table = (files / "scan-0.pointing.csv").read_text().splitlines()[1:]
-    cells = [[float(word) for word in row.split(",")[2:4]] for row in table]
-    (files / "scan-0.pointing.csv").unlink()
-    np.savetxt(files / "path.csv", np.array(cells), delimiter=",", fmt="%.17g")
-    (files / "scan-0.pointing.toml").write_text('vector = "path.csv"\nrate_hz = 10\n')
-    recording = open_recording(files, CAMERA)
-    np.testing.assert_array_equal(recording.sweeps[0].position, cells)
-    assert recording.sweeps[0].valid_line.all()
-
-
 def write_envi_cube(stem: Path, values: NDArray[Any], ending: str = "", **fields: object) -> None:
     """An ENVI cube in BIL with a header of given fields."""
     lines, samples, bands = values.shape
