@@ -13,7 +13,7 @@ references of a real MV.X.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -53,11 +53,6 @@ class EnviCube:
     values: NDArray[Any]
     lost_lines: int  # in the header and not whole in the file
     notes: tuple[str, ...]
-
-    @property
-    def frames(self) -> tuple[Any, ...]:
-        """Return the size and type of a frame."""
-        return self.values.shape[1:], self.values.dtype
 
 
 def open_envi_cube(path: str | Path) -> EnviCube:
@@ -173,7 +168,11 @@ def open_headwall_cube(folder: Path) -> CubeSource:
             opened[number] = open_envi_cube(header)
     if not opened:
         raise SceneError(f"every part of {folder} is empty; copy the folder again")
-    _check_alike(list(opened.values()))
+    frames = {(cube.values.shape[1:], str(cube.values.dtype)) for cube in opened.values()}
+    if len(frames) > 1:
+        raise SceneError(
+            f"the parts of {folder} have frames of {sorted(frames)} (sample, band); ingest them one by one"
+        )
     parts = [(cube.path.name, number, len(cube.values)) for number, cube in opened.items()]
     starts = place_parts(parts, MOST_MISSING, notes)
     notes += [note for cube in opened.values() for note in cube.notes]
@@ -280,14 +279,3 @@ def _headers(folder: Path) -> dict[int, Path]:
     """Return the header of each part by its first frame, sorted."""
     files = ((_PART.fullmatch(entry.name), entry) for entry in folder.iterdir() if entry.suffix.lower() == ".hdr")
     return dict(sorted((int(match[1]), entry) for match, entry in files if match is not None and entry.is_file()))
-
-
-def _check_alike(cubes: Sequence[EnviCube]) -> None:
-    """Refuse parts of several cubes (SceneError)."""
-    first = cubes[0]
-    for cube in cubes[1:]:
-        if cube.frames != first.frames:
-            raise SceneError(
-                f"{cube.path} has frames of {cube.frames} (sample, band), {first.path.name} of {first.frames}; ingest"
-                " them by themselves"
-            )

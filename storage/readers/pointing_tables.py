@@ -137,7 +137,7 @@ class PointingTable:
     def _refuse(
         self, rows: NDArray[np.intp], wrong: NDArray[np.bool_], columns: str | Sequence[str], expected: str
     ) -> None:
-        """Raise SceneError for the first wrong row, with its number in the file and the range of the column."""
+        """Raise SceneError for the first wrong row, with its number in the file."""
         if not wrong.any():
             return
         names = (columns,) if isinstance(columns, str) else tuple(columns)
@@ -145,11 +145,7 @@ class PointingTable:
         came = ", ".join(f"{name} = {self.columns[name][first]:.10g}" for name in names)
         count = int(np.count_nonzero(wrong))
         more = "" if count == 1 else f" (the first of {count} such rows)"
-        known = {name: self.columns[name][np.isfinite(self.columns[name])] for name in names}
-        spans = [f"{name} goes from {one.min():.6g} to {one.max():.6g}" for name, one in known.items() if len(one)]
-        raise SceneError(
-            f"{self.path}, row {first + FIRST_ROW}: {came}{more}, {expected}. {'; '.join(spans)}; correct the table"
-        )
+        raise SceneError(f"{self.path}, row {first + FIRST_ROW}: {came}{more}, {expected}; correct the table")
 
 
 def _filled(values: Floats, valid: NDArray[np.bool_]) -> Floats:

@@ -69,9 +69,7 @@ def _arrays(here: Path, cube: np.ndarray) -> None:
         "scaled": (cube * 10000).astype(np.uint16),
         "holes": holes,
         "nothing": np.full(CUBE, np.nan),
-        "infinite": np.full(CUBE, np.inf),
         "filled": np.where(cube > 0.9, 1e30, cube),
-        "row": cube[0, 0],
         "plane": cube[..., 0],
         "table": np.ones((198, 10000), np.float32),
         "five_axes": np.ones((2, 2, 3, 3, 2)),
@@ -90,9 +88,7 @@ def _arrays(here: Path, cube: np.ndarray) -> None:
 def _containers(here: Path, cube: np.ndarray) -> None:
     with h5py.File(here / "bare.h5", "w") as file:
         file["cube"] = cube
-    with h5py.File(here / "two.h5", "w") as file:
-        file["one"] = file["two"] = cube
-    (here / "cut.nc").write_bytes((here / "two.h5").read_bytes()[:900])
+    (here / "cut.nc").write_bytes((here / "bare.h5").read_bytes()[:900])
     scipy.io.savemat(here / "one_cube.mat", {"cube": cube, "wl": np.arange(5.0), "day": 130})
     scipy.io.savemat(here / "with_nm.mat", {"cube": cube, "wavelengths": [0.46, 0.55, 0.64, 0.7, 0.8]})
     scipy.io.savemat(here / "table.mat", {"X": np.ones((198, 10000), np.float32), "y": np.arange(198.0)})

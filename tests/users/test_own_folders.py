@@ -16,10 +16,9 @@ from PIL import Image
 from flows.evaluate.frames import EvaluateRequest, open_candidates, open_frames, sort_frames
 from flows.settings.load import load_settings
 from flows.tasks.scene import open_scene
-from flows.training.data import alike_notes, open_training_data
+from flows.training.data import alike_notes, load_data_set, open_training_data
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
-from storage.readers.datasets import load_data_set
 from storage.readers.scene_files import load_scene_file
 from storage.readers.scene_toml import load_scene_settings
 from tests.flows.conftest import command_line

@@ -146,34 +146,10 @@ def full_scan(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) -> t
     return folder / "sim", published, write_sweeps(folder / "sim", published, folder / "sweeps")
 
 
-def test_raw_cubes_of_a_simulated_survey_give_its_map(tmp_path: Path, full_scan: tuple[Path, Published, Path]) -> None:
-    """An archive of a simulated survey is a recording like another, and its run says how it was planned."""
-    archive, published, _ = full_scan
-    again = survey_sweeps(tmp_path / "again", f"{archive}/runs/{published.folder.name}")
-    assert digest_of_map(tmp_path / "again", again.receipt) == digest_of_map(archive, published.receipt)
-    assert again.receipt["survey"] == published.receipt["survey"]
-
-
-@pytest.fixture(scope="module")
-def two_passes(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) -> tuple[Path, Published]:
-    """A simulated survey that zooms: its archive and its run."""
-    out = tmp_path_factory.mktemp("two_passes") / "sim"
-    with without_effects():
-        return out, survey_png(out, budget=0.8, policy="entropy", keep="raw", **NARROW)
-
-
-def test_two_simulated_passes_give_their_map(tmp_path: Path, two_passes: tuple[Path, Published]) -> None:
-    """Raw cubes of both passes, out of the archive itself."""
-    archive, published = two_passes
-    again = survey_sweeps(tmp_path / "again", f"{archive}/runs/{published.folder.name}")
-    assert "raw_fine" in again.receipt["products"]
-    assert digest_of_map(tmp_path / "again", again.receipt) == digest_of_map(archive, published.receipt)
-
-
-def test_binned_lines_alone_are_surveyed(tmp_path: Path, two_passes: tuple[Path, Published], weights: Path) -> None:
+def test_binned_lines_alone_are_surveyed(tmp_path: Path, survey_png: Survey, weights: Path) -> None:
     """A recording that has the binned first pass alone is one uniform scan of that binning, of the whole field."""
-    archive, published = two_passes
-    folder = tmp_path / "sweeps"
+    archive, folder = tmp_path / "sim", tmp_path / "sweeps"
+    published = survey_png(archive, budget=0.8, policy="entropy", keep="raw", **NARROW)
     for path in sorted((archive / published.receipt["products"]["raw_coarse"]).glob("*.zarr")):
         write_recorded_files(open_raw_cube(path), folder)
     again = survey_sweeps(tmp_path / "again", folder, weights=str(weights), size=f"{SIZE[0]}x{SIZE[1]}")
@@ -350,28 +326,6 @@ def test_source_without_sweeps(command_line: CommandLine, tmp_path: Path) -> Non
     command_line("survey", "--source", "recorded", "--scene", "field", "--out", tmp_path / "a").refused(
         2, "source = 'recorded' reads sweeps that were taken before; give --sweeps"
     )
-
-
-def test_what_is_missing_is_assumed_and_said(
-    command_line: CommandLine, tmp_path: Path, pushbroom: tuple[Path, NDArray[np.uint16]], weights: Path
-) -> None:
-    """Without dark and white frames, and cut off after two thirds, a cube is surveyed; notes say what was taken for."""
-    folder, _ = pushbroom
-    for frame in ("dark", "white"):
-        (folder / f"scan.{frame}.hdr").unlink()
-    content = (folder / "scan.img").read_bytes()
-    (folder / "scan.img").write_bytes(content[: len(content) * 2 // 3])
-    flags = ("--weights", weights, "--engine", "plain", "--out", tmp_path / "a", "--json")
-    ended = command_line("survey", "--sweeps", folder / "scan.hdr", *flags)
-    assert ended.code == 0, ended.err
-    notes = " ".join(json.loads(ended.out)["settings"]["notes"])
-    for words in (
-        "is cut off: 64 of 96 lines are whole",
-        "a dark level of 0 is assumed; give --dark",
-        "full scale (4095 DN) is assumed to be white",
-        "nothing says the exposure: 100 ms is assumed",
-    ):
-        assert words in notes
 
 
 def test_ingest_names_the_survey_as_the_next_step(

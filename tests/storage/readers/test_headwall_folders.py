@@ -109,7 +109,7 @@ def test_parts_that_do_not_fit(tmp_path: Path, lines: NDArray[np.uint16]) -> Non
     write_part(tmp_path / "size", "raw_30", lines[:, :3])
     write_part(tmp_path / "far", "raw_0", lines)
     write_part(tmp_path / "far", "raw_99999999999", lines)
-    for name, words in (("size", "has frames of"), ("far", "are in no file, more than")):
+    for name, words in (("size", "have frames of"), ("far", "are in no file, more than")):
         with pytest.raises(SceneError, match=words):
             open_cube(tmp_path / name)
 

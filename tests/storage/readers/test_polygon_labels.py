@@ -13,9 +13,9 @@ import rasterio
 import shapely
 from affine import Affine
 
+from flows.training.data import load_data_set
 from flows.training.init_command import draft_scene
 from pipeline.errors import SceneError
-from storage.readers.datasets import load_data_set
 from storage.readers.scene_files import load_scene_file
 
 pytestmark = pytest.mark.filterwarnings(
