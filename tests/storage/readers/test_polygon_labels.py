@@ -94,10 +94,6 @@ def test_a_layer_is_named(tmp_path: Path) -> None:
     written(path, layer="soil", soil=["clay", "sand"])
     image = scene(tmp_path)
     np.testing.assert_array_equal(load_scene_file(image, labels=f"{path}:crops").labels, TRUTH)
-    with pytest.raises(SceneError, match=r"has several layers; name one of crops, soil"):
-        load_scene_file(image, labels=path)
-    with pytest.raises(SceneError, match=r"has no layer 'trees'; name one of crops, soil"):
-        load_scene_file(image, labels=f"{path}:trees")
     (tmp_path / "scene.toml").write_text('labels = "farm.gpkg:soil"\nclass_attribute = "soil"\n')
     assert load_scene_file(image).class_names == ("clay", "sand")
 
