@@ -21,6 +21,7 @@ IMAGE_FOLDERS = ("images", "image", "imgs", "img", "pictures", "photos")  # scen
 Colour = tuple[int, int, int]
 ClassValue = int | Colour
 _Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+_Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0)]
 _Channel = Annotated[int, Field(strict=True, ge=0, le=255)]
 _Value = StrictInt | tuple[_Channel, _Channel, _Channel]
 
@@ -41,10 +42,10 @@ class SceneSettings(BaseModel):
     dropped_bands: tuple[StrictInt, ...] = ()
     nodata: Annotated[float, Field(strict=True)] | None = None
     # values = file's * scale + offset
-    scale: _Number = Field(1.0, gt=0)
+    scale: _Positive = 1.0
     offset: _Number = 0.0
     # side of a pixel on the ground
-    pixel_m: _Number | None = Field(None, gt=0)
+    pixel_m: _Positive | None = None
     # relative to scene.toml, with {number} or {name}; "" if there are none
     labels: StrictStr | None = None
     unlabelled: _Value | None = None

@@ -92,7 +92,9 @@ def _file_array(path: Path, array: zarr.Array[Any]) -> FileArray:
     if named is not None:
         attributes["_ARRAY_DIMENSIONS"] = list(named)
     stored = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
-    return FileArray(str(path), array.shape, array.dtype, attributes, array.__getitem__, array.chunks, stored)
+    return FileArray(
+        str(path), array.shape, array.dtype, attributes, lambda part: np.asarray(array[part]), array.chunks, stored
+    )
 
 
 def with_ingested(source: CubeSource, arrays: Arrays, attributes: Mapping[str, Any]) -> CubeSource:
