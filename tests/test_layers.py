@@ -115,7 +115,7 @@ def test_storage_stores() -> None:
         "storage/arrays/signal_cubes.py": {f"pipeline.signal.{one}" for one in ("calibrate", "components", "condense")},
         "storage/arrays/cubes.py": {"pipeline.signal.subspace"},
         "storage/readers/cube_sources.py": {"pipeline.signal.calibrate"},
-        "storage/readers/recorded_cubes.py": {"pipeline.signal.calibrate"},
+        "storage/readers/recorded_files.py": {"pipeline.signal.calibrate"},
     }
     found = {
         path.as_posix(): names

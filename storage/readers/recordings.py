@@ -41,8 +41,18 @@ from storage.arrays.signal_cubes import open_lines
 from storage.readers.cube_sources import CubeSource
 from storage.readers.envi_files import find_envi_pair, load_envi_header
 from storage.readers.open_cubes import reader_of
-from storage.readers.pointing_tables import ENDINGS, WITHOUT_MIRROR, LinePointing, find_pointing, load_pointing_table
-from storage.readers.recorded_cubes import RecordedFile, find_cubes, find_references, open_recorded_cube, with_bits
+from storage.readers.recorded_files import (
+    ENDINGS,
+    WITHOUT_MIRROR,
+    LinePointing,
+    RecordedFile,
+    find_cubes,
+    find_pointing,
+    find_references,
+    load_pointing_table,
+    open_recorded_cube,
+    with_bits,
+)
 from storage.remote.object_stores import is_remote
 from storage.remote.opening import is_archive, open_archive
 

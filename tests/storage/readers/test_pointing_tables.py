@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.errors import SceneError
 from pipeline.geometry.mirror import REST_TANGENT, direction_to_scene, position_to_direction
-from storage.readers.pointing_tables import ACCEPTED, find_pointing, load_pointing_table
+from storage.readers.recorded_files import ACCEPTED, find_pointing, load_pointing_table
 
 MIRROR = "line,time,mirror_x,mirror_y\n0,0.05,0.1,0\n1,0.15,0.2,0\n2,0.25,0.3,0\n"
 
