@@ -253,8 +253,6 @@ def other_place(arrays: Arrays, cube: ArrayCube, shape: tuple[int, int, int]) ->
             "its pixels are in the sensor's own geometry and have no map grid; for a place on the earth, write it"
             " orthorectified by its geolocation grids (glt_x, glt_y) first",
         )
-    if {"lat", "latitude"} & names:
-        return None, ("its place is given by a latitude and longitude of each pixel, which are not read",)
     return None, ()
 
 

@@ -134,10 +134,8 @@ class CubeSource:
 def check_cube_source(source: CubeSource) -> None:
     """Refuse a cube without real numbers, without pixels, or with frames of another size (SceneError)."""
     where = source.name
-    if source.dtype.kind == "c":
-        raise SceneError(f"{where} holds complex numbers; store their magnitude")
     if source.dtype.kind not in "buif":
-        raise SceneError(f"{where} holds {source.dtype}, expected whole or floating numbers")
+        raise SceneError(f"{where} holds {source.dtype}, expected whole or floating numbers; store numbers of these")
     if min(source.shape) < 1:
         raise SceneError(f"{where} holds an empty cube of shape {source.shape}")
     for name, frame in (("dark", source.dark), ("white", source.white)):

@@ -76,7 +76,6 @@ def _arrays(here: Path, cube: np.ndarray) -> None:
         "complex": cube.astype(np.complex64),
         "series": np.stack([cube, cube + 1, cube + 2]),
         "empty": np.ones((0, 16, 5)),
-        "words": np.array([["soil", "crop"]]),
     }.items():
         np.save(here / f"{name}.npy", values)
     np.save(here / "objects.npy", np.array([{"soil": 1}], object), allow_pickle=True)
