@@ -39,6 +39,7 @@ from tests.conftest import Survey, WeightsMaker, patchy_scene, random_weights
 from tests.flows.conftest import CommandLine, be_version, command_line
 from tests.flows.tasks.test_survey_rig import emulated
 from tests.prior_work import without_effects
+from tests.storage.readers.test_recordings import write_envi_cube
 
 __all__ = ["command_line"]
 pytestmark = pytest.mark.usefixtures("no_effects")
@@ -194,18 +195,10 @@ def raw_cubes(full_scan: tuple[Path, Published, Path]) -> list[Path]:
 
 def write_pushbroom(folder: Path, values: NDArray[np.uint16]) -> Path:
     """A cube (line, sample, band) of a straight scan as ENVI, with dark and white frames and no pointing."""
-    _, samples, bands = values.shape
     folder.mkdir()
-    fields = f"bands = {bands}\ninterleave = bil\nbyte order = 0\nwavelength units = nm\n"
-    fields += "wavelength = {640, 550, 460}\n"
-    for name, frame in (
-        ("scan", values),
-        ("scan.dark", np.full((1, samples, bands), 60, np.uint16)),
-        ("scan.white", np.full((1, samples, bands), 3500, np.uint16)),
-    ):
-        head = f"ENVI\nsamples = {samples}\nlines = {len(frame)}\ndata type = 12\n{fields}"
-        (folder / f"{name}.hdr").write_text(head)
-        (folder / f"{name}.img").write_bytes(frame.astype("<u2").transpose(0, 2, 1).tobytes())
+    dark, white = (np.full((1, *values.shape[1:]), level, np.uint16) for level in (60, 3500))
+    for name, numbers in (("scan", values), ("scan.dark", dark), ("scan.white", white)):
+        write_envi_cube(folder / name, numbers, ".img", wavelength="{640, 550, 460}")
     return folder
 
 
