@@ -86,6 +86,8 @@ def run_init(source: str, console: Console, *, force: bool = False) -> dict[str,
         ]
         write_whole(path, ("\n\n".join("\n".join(lines) for lines in parts if lines) + "\n"))
     found, bands = draft.files, draft.cube.bands
+    count = draft.cube.shape[2]
+    first = f"write the {count} wavelengths into {path}: wavelengths_nm or wavelengths_file, as its lines say"
     return {
         "file": str(path),
         "images": len(found.images),
@@ -97,7 +99,7 @@ def run_init(source: str, console: Console, *, force: bool = False) -> dict[str,
         "classes": [{"name": one.name, "value": one.value, "fraction": one.fraction} for one in draft.classes],
         "notes": list(draft.notes),
         "unseen": _unseen(draft),
-        "first": _first(path, draft),
+        "first": None if bands.wavelength_nm is not None else first,
         "next": _next(source, draft),
     }
 
@@ -206,15 +208,6 @@ def _unseen(draft: SceneDraft) -> list[str]:
     if len(draft.classes) == 1:
         parts.append(f"a second class: all labels are {draft.classes[0].name}")
     return [*parts, *draft.unseen]
-
-
-def _first(path: Path, draft: SceneDraft) -> str | None:
-    """Return what has to be written before the next command; None if nothing."""
-    if draft.cube.bands.wavelength_nm is not None:
-        return None
-    return (
-        f"write the {draft.cube.shape[2]} wavelengths into {path}: wavelengths_nm or wavelengths_file, as its lines say"
-    )
 
 
 def _next(source: str, draft: SceneDraft) -> str:

@@ -70,7 +70,9 @@ def list_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
         )
     arrays, attributes = _hdf_arrays(path)
     if ending == ".mat":
-        return {name: _transposed(one) for name, one in arrays.items() if _is_matlab_array(name, one)}, {}
+        numbers = {name: one for name, one in arrays.items() if "/" not in name and one.dtype.kind in "buif"}
+        is_text = {name for name, one in numbers.items() if one.attrs.get("MATLAB_class") == "char"}
+        return {name: _transposed(one) for name, one in numbers.items() if name not in is_text}, {}
     return arrays, attributes
 
 
@@ -134,11 +136,6 @@ def _mapped(path: Path) -> Iterator[mmap.mmap]:
     """Open a file as a map of memory, which never gives more bytes than the file has."""
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
         yield content
-
-
-def _is_matlab_array(name: str, one: FileArray) -> bool:
-    """Return whether an array of a .mat file of version 7.3 holds numbers, and no text or cells."""
-    return "/" not in name and one.dtype.kind in "buif" and one.attrs.get("MATLAB_class") != "char"
 
 
 def _transposed(one: FileArray) -> FileArray:

@@ -102,8 +102,11 @@ def open_cube(
             source = _open_arrays(path, variable, labels=labels)
             if path.suffix.lower() in ARRAY_ENDINGS and source.shape[2] == 1 and not labels and min(source.shape):
                 check_picture(source.shape[:2], address)
+        case "none" if not path.exists():
+            raise SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
         case "none":
-            raise _refusal(path)
+            ending = path.suffix.lower() or "nothing"
+            raise SceneError(f"{path} ends in {ending}, which is not read; use {', '.join(CUBE_ENDINGS)}")
     for kind, named in frames:
         if named is not None:
             values, more = load_frame(named)
@@ -198,10 +201,3 @@ def with_wavelengths(source: CubeSource, address: str | Path, stated: Sequence[f
     found = settle_wavelengths(path, range(count), count, stated=stated, settings=settings, known=Bands())
     folder = "" if settings.path is None else f"{settings.path.parent}/"
     return replace(source, bands=replace(found, origin=found.origin.replace(folder, "")))
-
-
-def _refusal(path: Path) -> SceneError:
-    if not path.exists():
-        return SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
-    ending = path.suffix.lower()
-    return SceneError(f"{path} ends in {ending or 'nothing'}, which is not read; use {', '.join(CUBE_ENDINGS)}")

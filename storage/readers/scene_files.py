@@ -63,20 +63,6 @@ class SceneFile:
         """Return all values (y, x, band), NaN where the file has none."""
         return self.read(0, self.shape[0]) if self.kept is None else self.kept
 
-    def labelled(self, found: Labels | None, *, by_name: bool) -> SceneFile:
-        """Return the scene with labels and their classes."""
-        if found is None:
-            return self
-        return replace(
-            self,
-            labels=found.index,
-            class_names=found.names,
-            class_values=found.values,
-            class_colours=found.colours,
-            labels_found=by_name,
-            regridded=found.regridded,
-        )
-
 
 def open_scene_file(
     address: str | Path,
@@ -132,7 +118,17 @@ def open_scene_file(
         pixel_m=None if source.geobox is not None else settings.pixel_m,
         kept=kept,
     )
-    return scene.labelled(found, by_name=by_name)
+    if found is None:
+        return scene
+    return replace(
+        scene,
+        labels=found.index,
+        class_names=found.names,
+        class_values=found.values,
+        class_colours=found.colours,
+        labels_found=by_name,
+        regridded=found.regridded,
+    )
 
 
 # As `open_scene_file`, with all values in memory.
