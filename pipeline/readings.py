@@ -15,7 +15,6 @@ SIGMA_OF_MEDIAN = 1.4826  # standard deviation of a normal law over its median a
 
 MOST_VALUE = 1e9  # in any unit of scenes; larger values need a larger unit
 MOST_STEPS = 65535  # of a camera: raw lines hold 16 bits
-MOST_EDGE = 0.1  # fraction of a picture's edge with one value; less occurs by chance
 
 
 @dataclass(frozen=True)
@@ -60,20 +59,3 @@ def readings_alone(values: NDArray[np.floating], most: float) -> NDArray[np.floa
     """Return values with NaN for out-of-range ones; the same array if there is none."""
     found = beyond_range(values, most)
     return values if found is None else np.where(found, values.dtype.type(np.nan), values)
-
-
-def edge_fill(edge: NDArray[Any]) -> tuple[float, float] | None:
-    """Return the value that may fill a picture's edge, and its fraction of the edge; None if nothing suggests one.
-
-    ``edge`` is (pixel, band), NaN where unknown. The candidate is the most frequent value that all bands of a pixel
-    share. It is returned if it is 0 or less, the largest of its integer type, or out of range.
-    """
-    alike = edge[(edge == edge[:, :1]).all(axis=1), 0]
-    if not alike.size:
-        return None
-    values, counts = np.unique(alike, return_counts=True)
-    value, fraction = values[counts.argmax()], float(counts.max()) / len(edge)
-    ends = edge.dtype.kind in "iu" and value == np.iinfo(edge.dtype).max
-    if fraction < MOST_EDGE or not (value <= 0 or ends or value > MOST_VALUE):
-        return None
-    return float(value), fraction

@@ -115,7 +115,7 @@ def test_storage_stores() -> None:
         "storage/arrays/signal_cubes.py": {f"pipeline.signal.{one}" for one in ("calibrate", "components", "condense")},
         "storage/arrays/cubes.py": {"pipeline.signal.subspace"},
         "storage/readers/cube_sources.py": {"pipeline.signal.calibrate"},
-        "storage/readers/recorded_cubes.py": {"pipeline.signal.calibrate"},
+        "storage/readers/recorded_files.py": {"pipeline.signal.calibrate"},
     }
     found = {
         path.as_posix(): names
@@ -224,7 +224,7 @@ def test_what_is_imported_is_declared() -> None:
     """Every package from outside that the source imports stands in pyproject.toml."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
-    wanted = project["dependencies"] + extras["s3"] + extras["parquet"]
+    wanted = project["dependencies"] + extras["s3"]
     declared = {re.split(r"[\[<>=~! ]", item, maxsplit=1)[0].lower() for item in wanted}
     outside = {name.split(".")[0] for tree in source().values() for name in imported(tree)}
     outside -= {*ROOMS, *sys.stdlib_module_names}

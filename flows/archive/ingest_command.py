@@ -21,7 +21,7 @@ from storage.archive.keys import StageRef
 from storage.archive.staging import check_name, file_hash
 from storage.readers.cube_sources import CubeSource
 from storage.readers.open_cubes import open_cube, with_wavelengths
-from storage.readers.pointing_tables import find_pointing
+from storage.readers.recorded_files import find_pointing
 from storage.readers.scene_files import with_stated_values
 from storage.readers.zarr_files import Report, SourceFile, write_ingested_cube
 from storage.remote.opening import open_archive

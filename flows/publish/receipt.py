@@ -127,7 +127,7 @@ class ReceiptFields(_Part):
     accuracy_is: AccuracyIs | None = None
     judged: str | None = None  # when accuracy was added
     accuracy: Accuracy | None = None
-    training_scene: Literal["all", "tiles", "other pixels"] | None = None  # what of the scene the weights learned from
+    training_scene: Literal["all", "other pixels"] | None = None  # what of the scene the weights learned from
     effects: list[Facts] | None = None  # of a simulated source, with their bounds
     effects_total: Facts | None = None  # sum of the bounds beside the tolerance, and seconds saved
     field: Facts | None = None  # its size, field of view, ground pixel and range, hectares an hour

@@ -169,8 +169,7 @@ class Settings:
     scene: str = stated(
         "farm",
         "Scene: farm or scouting (built in; with a seed: farm@2), or a file: PNG, JPEG, BMP, GeoTIFF, .npy, .npz, .mat,"
-        " ENVI, Zarr; for source raster also a folder or glob of georeferenced tiles. Patterns for repeated visits:"
-        " {date:%Y-%m-%d}.tif, {new}.tif (newest file that was not surveyed)",
+        " ENVI, Zarr. Patterns for repeated visits: {date:%Y-%m-%d}.tif, {new}.tif (newest file that was not surveyed)",
     )
     labels: str | None = stated(
         None, "Label image on the scene's pixels (class colours or numbers); enables accuracy", example="labels.png"
@@ -193,8 +192,8 @@ class Settings:
     )
     pointing: str | None = stated(
         None,
-        "Pointing of the recorded lines: a table with one row per line (CSV, Parquet), a TOML file of the mirror's"
-        " position vector, or a folder with one file per cube; default: NAME.pointing.csv beside each cube",
+        "Pointing of the recorded lines: a table with one row per line (CSV), or a folder with one table per cube;"
+        " default: NAME.pointing.csv beside each cube",
         example="pointing.csv",
     )
     dark: str | None = stated(

@@ -69,8 +69,7 @@ from storage.archive.archive import Archive
 from storage.arrays.layout import image_spec
 from storage.parallel.pool import WorkerPool
 from storage.readers.open_cubes import load_labels_array
-from storage.readers.raster_fields import RasterPixels
-from storage.readers.scene_files import SceneFile
+from storage.readers.scene_files import RasterPixels, SceneFile
 from storage.remote.opening import is_archive, open_archive
 
 if TYPE_CHECKING:
@@ -347,7 +346,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     error of the prior map is low enough.
     """
     settings = scene_of_visit(for_rig(settings), datetime.now().astimezone())
-    check_scene_there(settings.scene, is_map=settings.is_map)
+    check_scene_there(settings.scene)
     recorded = open_recorded(settings) if settings.source == RECORDED else None
     settings = settings if recorded is None else recorded.settings
     settings = replace(settings, device=choose_device(settings.device))

@@ -28,11 +28,10 @@ from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Source
 from storage.archive.keys import published_runs
 from storage.archive.records import read_run
-from storage.readers.cube_sources import machine_bytes
+from storage.readers.cube_sources import ONE_FILE, machine_bytes
 from storage.readers.label_files import is_label_name
 from storage.readers.open_cubes import reader_of, split_variable
-from storage.readers.raster_fields import is_glob, open_raster
-from storage.readers.scene_files import SceneFile, load_scene_file
+from storage.readers.scene_files import SceneFile, load_scene_file, open_scene_file
 from storage.remote.opening import is_archive, open_archive
 
 # Peak of a survey of the farm without controls: 1.69 GB for 1280 x 1024 px, 3.10 GB for 2560 x 2560 px
@@ -57,7 +56,7 @@ def scene_of_visit(settings: Settings, moment: datetime) -> Settings:
             f"--scene {settings.scene}: {error} is not allowed; braces are {{date:%Y-%m-%d}} or {NEW}"
         ) from None
     found = _newest_unseen(settings, named) if NEW in named else named
-    if not is_glob(found) and not split_variable(found)[0].exists():
+    if not split_variable(found)[0].exists():
         raise NoSceneYet(f"there is no file {found} yet, which --scene {settings.scene} stands for")
     return replace(settings, scene=found)
 
@@ -80,17 +79,18 @@ def _newest_unseen(settings: Settings, pattern: str) -> str:
     return str(newest)
 
 
-def check_scene_there(scene: str, *, is_map: bool) -> None:
+def check_scene_there(scene: str) -> None:
     """Check that the file of a scene exists. Raises SceneError: it does not."""
     path, _ = split_variable(scene)
-    if scene in (RIG_FIELD, *BUILT_IN_SCENES) or (is_map and is_glob(scene)):
+    if scene in (RIG_FIELD, *BUILT_IN_SCENES):
         return
     try:
         there, what = path.exists(), "a link that leads nowhere," if path.is_symlink() else "no file"
     except OSError as error:  # such as a name longer than any
         raise SceneError(f"--scene {scene} cannot be the name of a file: {error.strerror}") from error
     if not there:
-        raise SceneError(f"there is {what} {path}; check the name of --scene (seen from {Path.cwd()})")
+        many = f"; --scene takes no pattern, {ONE_FILE}" if "*" in scene else ""
+        raise SceneError(f"there is {what} {path}; check the name of --scene (seen from {Path.cwd()}){many}")
 
 
 def open_scene(settings: Settings, known: Sequence[str] | None = None) -> tuple[RasterScene, tuple[str, ...]]:
@@ -133,7 +133,9 @@ def open_map(settings: Settings, known: Sequence[str] | None = None) -> tuple[Sc
 
     Raises SceneError, WavelengthError: a file is not valid.
     """
-    file = open_raster(settings.scene, labels=settings.labels, bands=settings.bands, wavelengths=settings.wavelengths)
+    file = open_scene_file(
+        settings.scene, labels=settings.labels, bands=settings.bands, wavelengths=settings.wavelengths
+    )
     file = _judged_by_known(file, known)
     missing = file.missing if file.missing.any() else None
     labels, bands = file.labels, len(file.wavelength_nm)
@@ -261,7 +263,6 @@ def check_labels(scene: RasterScene, weights: Description) -> tuple[str, ...]:
 
 TRAINING_SCENE = {
     "all": "a training scene (not valid for other fields)",
-    "tiles": "a field with tiles of the training (may not be valid for other fields)",
     "other pixels": "pixels of a training scene whose labels were not used in training",
 }
 
@@ -274,10 +275,8 @@ def seen_in_training(scene: RasterScene, weights: Description) -> str | None:
     split = weights.record.get("split", {})
     if scene.clear_key in split.get("pixels", {}):
         return "other pixels"
-    tiles = [one in split.get("content", ()) for one in scene.content]
-    if scene.clear_key in split.get("train", {}).values() or (tiles and all(tiles)):
-        return "all"
-    return "tiles" if any(tiles) else None
+    known = scene.clear_key in split.get("train", {}).values() or bool({*scene.content} & {*split.get("content", ())})
+    return "all" if known else None
 
 
 def judged_labels(scene: RasterScene, weights: Description) -> NDArray[np.uint8] | None:

@@ -49,8 +49,7 @@ from pipeline.source import References
 from storage.arrays.cubes import SweepHeader
 from storage.arrays.layout import numbers_in_memory
 from storage.arrays.signal_cubes import LineRows, SignalCubeInMemory
-from storage.readers.raster_fields import RasterPixels
-from storage.readers.scene_files import load_scene_file
+from storage.readers.scene_files import RasterPixels, load_scene_file
 
 Values = NDArray[np.float32]
 FIELD_SHAPE = (256, 600)  # one swath

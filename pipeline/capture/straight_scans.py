@@ -49,47 +49,6 @@ def angles_to_positions(angles_deg: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     return positions, reached
 
 
-@dataclass(frozen=True)
-class PlayedVector:
-    """A vector of positions that the mirror played by its own clock while the camera took lines by its own.
-
-    The mirror holds cell k from k / ``rate_hz`` to (k + 1) / ``rate_hz`` seconds after its start. It started
-    ``start_s`` before the first line's exposure (negative: after it).
-    """
-
-    position: Floats  # (cell, 2) device X and Y
-    rate_hz: float
-    start_s: float = 0.0
-
-    def at(self, time_s: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """Return the position at mid exposure of lines (line, 2), and whether it was played then (line,).
-
-        ``time_s`` (line,) is that of mid exposure since the first line's exposure began. The cell of a line is
-        floor((time_s + start_s) * rate_hz), limited to the first and the last cell.
-        """
-        cell = np.floor((time_s + self.start_s) * self.rate_hz)
-        played = (cell >= 0) & (cell < len(self.position))
-        return self.position[np.clip(cell, 0, len(self.position) - 1).astype(np.intp)], played
-
-
-def split_vector(values: Floats, where: str) -> Floats:
-    """Return (cell, 2) positions of a vector: two columns X and Y, or one column or row with all X before all Y.
-
-    The mirror's controller uses the second form: X in the cells 0 to n - 1, and Y in n to 2 n - 1.
-
-    Raises SceneError: the numbers are no such vector.
-    """
-    flat = values.reshape(-1) if values.ndim == 2 and 1 in values.shape else values
-    if flat.ndim == 2 and flat.shape[1] == 2:
-        return flat
-    if flat.ndim != 1 or len(flat) % 2 or not len(flat):
-        raise SceneError(
-            f"{where} holds numbers of shape {values.shape}, expected two columns X and Y, or one column with all X "
-            "before all Y; write as many Y as X"
-        )
-    return np.stack(np.split(flat, 2), axis=-1)
-
-
 MOST_BEND = 1 / 16  # largest distance of line centres from their swath, as a fraction of a line's length
 MOST_BACK = 8.0  # line spacings that a scan may go back before it counts as turned
 STANDING_PX = 1e-3  # a scan that moves less from line to line stands still

@@ -157,7 +157,7 @@ def geobox_of_group(group: zarr.Group) -> GeoBox | None:
 
 
 def find_geobox(
-    attributes: Mapping[str, Any], arrays: Mapping[str, zarr.Array[Any]], shape: tuple[int, int], dims: tuple[str, str]
+    attributes: Mapping[str, Any], arrays: Mapping[str, Any], shape: tuple[int, int], dims: tuple[str, str]
 ) -> GeoBox | None:
     """Return the grid on the earth of an image of (y, x) ``shape``, by its store; None without CRS and grid.
 
@@ -179,7 +179,7 @@ def find_geobox(
     return None if transform is None else odc_geobox.GeoBox(shape, transform, crs)
 
 
-def _mapping(attributes: Mapping[str, Any], arrays: Mapping[str, zarr.Array[Any]]) -> dict[str, Any]:
+def _mapping(attributes: Mapping[str, Any], arrays: Mapping[str, Any]) -> dict[str, Any]:
     """Return the attributes of the grid mapping that the image names, else of the only array that is one."""
     named = str(attributes.get("grid_mapping", "")).split(":")[0].split(" ")[0]
     if named in arrays:
@@ -189,7 +189,7 @@ def _mapping(attributes: Mapping[str, Any], arrays: Mapping[str, zarr.Array[Any]
     return found[0] if len(found) == 1 else {}
 
 
-def _transform_of_axes(arrays: Mapping[str, zarr.Array[Any]], dims: tuple[str, str]) -> Affine | None:
+def _transform_of_axes(arrays: Mapping[str, Any], dims: tuple[str, str]) -> Affine | None:
     """Return the transform by coordinates of pixel centres; None where they are missing or not evenly spaced."""
     if not all(name in arrays and arrays[name].ndim == 1 and arrays[name].shape[0] > 1 for name in dims):
         return None

@@ -1,4 +1,4 @@
-"""Build cubes from named arrays: Zarr stores, NetCDF and HDF5 files, packs of arrays.
+"""Build cubes from named arrays: Zarr stores, NetCDF and HDF5 files, .npy, .npz and .mat.
 
 Axes are found by their names, else by the number of wavelengths. Values follow from scale, offset and fill value, the
 place on the earth from a grid mapping.
@@ -6,9 +6,7 @@ place on the earth from a grid mapping.
 
 from __future__ import annotations
 
-import base64
 import math
-import struct
 from collections.abc import Callable, Container, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -21,7 +19,16 @@ from numpy.typing import NDArray
 from pipeline.errors import SceneError, SeriesError
 from pipeline.rig.camera.camera_texts import MICROMETRES, NANOMETRES, UNSAID
 from storage.arrays.georeference import find_geobox
-from storage.readers.cube_sources import Bands, CubeSource, unpacked
+from storage.readers.cube_sources import (
+    BLOCK_LINES,
+    MOST_RATIO,
+    Bands,
+    CubeSource,
+    check_claim,
+    check_memory,
+    read_by_chunks,
+    unpacked,
+)
 
 if TYPE_CHECKING:
     from odc.geo.geobox import GeoBox
@@ -37,27 +44,52 @@ WAVELENGTHS = (
 )
 METRES = {"m", "meter", "meters", "metre", "metres"}
 
-Arrays = Mapping[str, Any]  # by name, or by path within a file; each has shape, ndim, dtype, attrs and [...]
 UNNAMED = "dims have no names, read as y, x, band"
 _SHOWN = 5  # arrays in a note
 
 
 @dataclass(frozen=True)
 class FileArray:
-    """One array of a file: its axes, attributes, and the function that reads a part of it."""
+    """One array of a file: its axes, attributes, and the function that reads a part of it.
 
+    ``_ARRAY_DIMENSIONS`` in its attributes are the names of its axes, if they have names.
+    """
+
+    where: str  # address, for messages
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     attrs: Mapping[str, Any]
     get: Callable[[Any], NDArray[Any]] = field(repr=False)
-    chunks: tuple[int, ...] | None = None
+    chunks: tuple[int, ...]  # numbers along each axis that are read at a time
+    stored: int  # bytes on the disk that it may take
+    ratio: int = MOST_RATIO  # bytes of numbers that one of them can be
 
     @property
     def ndim(self) -> int:
         return len(self.shape)
 
+    @property
+    def dims(self) -> list[str]:
+        """Return the names of the axes; empty if there are none."""
+        named = self.attrs.get("_ARRAY_DIMENSIONS")
+        return ["" if name is None else str(name) for name in named] if isinstance(named, list | tuple) else []
+
     def __getitem__(self, part: Any) -> NDArray[Any]:
+        if part is ...:
+            self.check(self.shape)
         return self.get(part)
+
+    def check(self, part: Sequence[int]) -> None:
+        """Refuse an array that its file, or a ``part`` of it that the memory, cannot hold (SceneError)."""
+        claimed = max(math.prod(self.shape), math.prod(self.chunks)) * self.dtype.itemsize
+        check_claim(self.where, claimed, self.stored, self.ratio)
+        needed = self.dtype.itemsize
+        for size, chunk, wanted in zip(self.shape, self.chunks, part, strict=True):
+            needed *= min(-(-wanted // chunk) + 1, -(-size // chunk)) * chunk
+        check_memory(self.where, needed)
+
+
+Arrays = Mapping[str, FileArray]  # by name, or by path within a file
 
 
 @dataclass(frozen=True)
@@ -65,7 +97,7 @@ class ArrayCube:
     """An array that is a cube, with its axes of rows, columns and (if there are some) bands."""
 
     name: str
-    array: Any
+    array: FileArray
     order: tuple[int, ...]
     moment: tuple[int, int] | None  # axis of time, and the step on it
     notes: tuple[str, ...] = ()
@@ -73,7 +105,7 @@ class ArrayCube:
     @property
     def dims(self) -> list[str]:
         """Return names of all axes, or those of their order if they have none."""
-        return dims_of(self.array) or (["y", "x", "band"] if self.moment is None else ["time", "y", "x", "band"])
+        return self.array.dims or (["y", "x", "band"] if self.moment is None else ["time", "y", "x", "band"])
 
 
 def find_cube(arrays: Arrays, variable: str | None, path: Path, *, labels: bool = False) -> ArrayCube:
@@ -91,17 +123,6 @@ def find_cube(arrays: Arrays, variable: str | None, path: Path, *, labels: bool 
     return ArrayCube(name, arrays[name], order, moment, (*notes, *more))
 
 
-def names_beside(arrays: Arrays) -> set[str]:
-    """Return names of the arrays that may have wavelengths or widths."""
-    return {name for name in arrays if _word(name) in (*WAVELENGTHS, "fwhm")}
-
-
-def dims_of(array: Any) -> list[str]:
-    """Return names of an array's axes as Zarr v3, or xarray in v2, stores them; empty if there are none."""
-    named = getattr(getattr(array, "metadata", None), "dimension_names", None) or array.attrs.get("_ARRAY_DIMENSIONS")
-    return ["" if name is None else str(name) for name in named] if isinstance(named, list | tuple) else []
-
-
 def cube_source(
     path: Path,
     cube: ArrayCube,
@@ -111,12 +132,18 @@ def cube_source(
 ) -> CubeSource:
     """Return the cube with its lines, bands and place; ``guard`` turns errors of reading into SceneError.
 
-    Lines of an array with scale or offset are float32, NaN where there is no value.
+    Lines of an array with scale or offset are float32, NaN where there is no value. Raises SceneError: the cube claims
+    more than its file or the memory can hold.
     """
     array, order, moment = cube.array, cube.order, cube.moment
+    part = [BLOCK_LINES if axis == order[0] else size for axis, size in enumerate(array.shape)]
+    if moment is not None:
+        part[moment[0]] = 1
+    array.check(part)
     scale, offset = (_number(array.attrs.get(name)) for name in ("scale_factor", "add_offset"))
     plain = scale in (None, 1.0) and offset in (None, 0.0)
-    fill, sizes = _fill(array), [int(array.shape[axis]) for axis in order]
+    fill = _number(array.attrs.get("_FillValue", array.attrs.get("missing_value")))
+    sizes = [int(array.shape[axis]) for axis in order]
 
     def read(start: int, stop: int) -> NDArray[Any]:
         """Return some lines (line, sample, band)."""
@@ -138,7 +165,7 @@ def cube_source(
         name=path.name,
         shape=(sizes[0], sizes[1], sizes[2] if len(sizes) == 3 else 1),
         dtype=np.dtype(array.dtype.newbyteorder("=") if plain else np.float32),
-        read=read,
+        read=read_by_chunks(read, sizes[0], array.chunks[order[0]]),
         files=(path,),
         bands=_bands_of(cube, arrays, sizes[2] if len(sizes) == 3 else 1),
         nodata=fill if plain else None,
@@ -155,17 +182,6 @@ def place_or_note(find: Callable[[], GeoBox | None]) -> tuple[GeoBox | None, tup
         return None, (f"its place on the earth cannot be read: {type(error).__name__}: {error}",)
 
 
-def _fill(array: Any) -> float | None:
-    """Return the number of pixels without a value, as CF, xarray or Zarr has it; Zarr v3 has floats in base64."""
-    stated = array.attrs.get("_FillValue", array.attrs.get("missing_value"))
-    if isinstance(stated, str) and array.dtype.kind == "f":
-        return float(struct.unpack("<d", base64.standard_b64decode(stated))[0])
-    of_zarr = getattr(array, "fill_value", None)
-    if stated is None and array.dtype.kind in "buif" and of_zarr is not None:
-        return float(of_zarr) if "_ARRAY_DIMENSIONS" in array.attrs else None  # all of v2
-    return _number(stated)
-
-
 def _bands_of(cube: ArrayCube, arrays: Arrays, count: int) -> Bands:
     """Return wavelengths and widths in nm; none if their unit is no length."""
     axis = cube.dims[cube.order[2]] if len(cube.order) == 3 and len(cube.dims) == cube.array.ndim else ""
@@ -180,13 +196,9 @@ def _bands_of(cube: ArrayCube, arrays: Arrays, count: int) -> Bands:
     if scale is None or not (np.isfinite(centres) & (centres > 0)).all():
         return Bands()
     source = f"in {unit}" if unit not in UNSAID else "without a unit, read by their size"
-    beside, widths = _vector(arrays, ("fwhm",), count), None
-    if beside is not None:
-        own = _unit(arrays[beside].attrs)
-        widths = np.asarray(arrays[beside][...], np.float64).ravel() * (
-            scale if own in UNSAID else _scale(own, 0.0) or np.nan
-        )
-        widths = widths if (widths > 0).all() else None
+    beside = _vector(arrays, ("fwhm",), count)
+    widths = None if beside is None else np.asarray(arrays[beside][...], np.float64).ravel() * scale
+    widths = None if widths is None or not (widths > 0).all() else widths
     return Bands(centres * scale, widths, f"wavelengths from the array {found}, {source}")
 
 
@@ -230,12 +242,12 @@ def _chosen(arrays: Arrays, variable: str | None, path: Path, axes: Sequence[int
     raise SceneError(f"{path} has no array of numbers with the axes y, x and band; {listing}")
 
 
-def _moment(array: Any, step: int | None, address: str, *, unnamed: bool) -> tuple[int, int] | None:
+def _moment(array: FileArray, step: int | None, address: str, *, unnamed: bool) -> tuple[int, int] | None:
     """Return axis and step of an array with an axis of time; the first of ``unnamed`` axes is time.
 
     Raises SceneError: the array has several steps and none is named, or it lacks the step or the axis.
     """
-    words = [_word(dim) for dim in dims_of(array)]
+    words = [_word(dim) for dim in array.dims]
     known = set(words) & set(ROWS) and set(words) & set(COLUMNS)
     first = 0 if unnamed and not any(words) else None
     axis = next((at for at, word in enumerate(words) if known and word in TIMES), first)
@@ -260,7 +272,7 @@ def _axes(
 ) -> tuple[tuple[int, ...], tuple[str, ...]]:
     """Return the axes of rows, columns and (if there are some) bands; and notes."""
     array = arrays[name]
-    named, own = dims_of(array), [axis for axis in range(array.ndim) if moment is None or axis != moment[0]]
+    named, own = array.dims, [axis for axis in range(array.ndim) if moment is None or axis != moment[0]]
     if len(own) not in (2, 3):
         raise SceneError(
             f"{path} holds shape {array.shape}; expected (y, x, band), or (y, x) for one band; store one time or level"
@@ -279,15 +291,15 @@ def _axes(
     return tuple(places[0] for places in found[: len(own)]), ()
 
 
-def _spectral_axes(arrays: Arrays, array: Any) -> list[int]:
+def _spectral_axes(arrays: Arrays, array: FileArray) -> list[int]:
     """Return the axes that are named by a spectral coordinate, else those as long as the wavelengths."""
     known = [arrays[name].shape for name in arrays if _word(name) in WAVELENGTHS]
     lengths = {max(shape) for shape in known if shape and max(shape) == math.prod(shape)}
-    by_name = [axis for axis, dim in enumerate(dims_of(array)) if _is_spectral(arrays.get(dim))]
+    by_name = [axis for axis, dim in enumerate(array.dims) if _is_spectral(arrays.get(dim))]
     return by_name or [axis for axis, size in enumerate(array.shape) if size in lengths]
 
 
-def _is_spectral(coordinate: Any) -> bool:
+def _is_spectral(coordinate: FileArray | None) -> bool:
     """Return whether a coordinate has wavelengths, by its standard name or unit."""
     if coordinate is None or coordinate.ndim != 1:
         return False

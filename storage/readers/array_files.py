@@ -1,74 +1,79 @@
-"""Read cubes from files of named arrays: .npy, .npz and .mat.
+"""List the arrays of .npy, .npz, .mat, NetCDF and HDF5 files, with the products of EMIT, PRISMA and NEON.
 
-Files are listed by their headers, and only the array wanted is read. Python objects, cells and structures are not read.
-A table of spectra is read as a cube if the file has the rows and columns of its picture.
+Files are listed by their headers, and only the array wanted is read. Python objects, cells and structures are not read,
+nor links and virtual arrays of HDF5, which may lead to any file.
+
+EMIT's files follow CF, except for wavelengths and good bands, which lie in a group of their own. NEON has its own names
+for scale, no-data value and place. PRISMA has a cube for each of its two spectrometers, and scale, wavelengths and
+place as attributes of the file. The layouts are those that the providers publish; no such file was at hand.
 """
 
 from __future__ import annotations
 
 import importlib
-import math
 import mmap
-import re
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from affine import Affine
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.lazy import deferred
-from storage.readers.array_cubes import UNNAMED, FileArray, cube_source, find_cube
-from storage.readers.cube_sources import DEFLATE_RATIO, CubeSource, check_claim, check_memory, reading
-from storage.readers.hdf_files import check_array, hdf_arrays
+from storage.readers.array_cubes import ArrayCube, Arrays, FileArray, place_or_note
+from storage.readers.cube_sources import BLOCK_LINES, DEFLATE_RATIO, Bands, CubeSource, read_by_chunks, unpacked
 
 if TYPE_CHECKING:
     import h5py
+    import odc.geo.geobox as odc_geobox
+    from odc.geo.geobox import GeoBox
 else:
     h5py = deferred("h5py")
+    odc_geobox = deferred("odc.geo.geobox")
 
 ARRAY_ENDINGS = (".npy", ".npz", ".mat")
+HDF_ENDINGS = (".nc", ".nc4", ".h5", ".hdf5", ".he5")
+GOOD_BANDS = ("good_wavelengths", "good_bands", "bbl")  # 0 marks a bad band
+MOST_UNEVEN = 16  # times that a picture is longer than wide
 _MATLAB = {"double": "f8", "single": "f4", "logical": "?"} | {
     f"{u}int{8 * n}": f"{u or 'i'}{n}" for n in (1, 2, 4, 8) for u in ("", "u")
 }
-MOST_UNEVEN = 16  # times that a picture is longer than wide
-SIZES = (("nrow", "ncol"), ("nrows", "ncols"), ("rows", "cols"), ("height", "width"), ("lines", "samples"), ("h", "w"))
+_ONLY_A_DIMENSION = "This is a netCDF dimension but not a netCDF variable"
+_PRISMA = "HDFEOS/SWATHS/PRS_L2{}_HCO/Data Fields/{}_Cube"
+_PRISMA_TOP = 65535  # the number of the greatest value
 
 
-def open_array_file(path: Path, variable: str | None = None, *, labels: bool = False) -> CubeSource:
-    """Open the array named, or the only one with three axes (for ``labels``: with two); a .npy file is read lazily.
+def list_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
+    """Return the arrays of a file by their names or paths, and the attributes of the file.
 
-    Raises SceneError: there is no such array, or several; it is no table of numbers; or it claims more than the file or
-    the machine can hold.
+    Raises SceneError: it is a NetCDF file of version 3; other errors are those of the libraries.
     """
-    guard = partial(reading_array, path)
-    with guard():
-        order: Literal["C", "F"] = "F"  # of pixels in tables, as MATLAB counts them
-        if path.suffix.lower() == ".npy":
-            values = load_npy(path)
-            arrays = {"": FileArray(values.shape, values.dtype, {}, values.__getitem__)}
-        elif path.suffix.lower() == ".npz":
-            arrays, order = _npz_arrays(path), "C"
-        else:
-            arrays = _mat73_arrays(path) if h5py.is_hdf5(path) else _mat_arrays(path)
-        pictures, note = _pictures_of_tables(arrays, order)
-        cube = find_cube(arrays | pictures, variable, path, labels=labels)
-        notes = tuple(one for one in cube.notes if one != UNNAMED)  # these formats never name axes
-        values = cube.array[...]
-        whole = FileArray(values.shape, values.dtype, {}, values.__getitem__)
-        notes = (*notes, note) if cube.name in pictures else notes
-        return cube_source(path, replace(cube, array=whole, notes=notes), arrays, {}, guard)
-
-
-def reading_array(path: Path) -> AbstractContextManager[None]:
-    """Return a context that turns a decoder's errors into a SceneError with the file's name."""
-    return reading(path, path.suffix, "write it again as plain numbers")
+    ending = path.suffix.lower()
+    if ending == ".npy":
+        values = load_npy(path)
+        each = (1,) * values.ndim
+        return {"": FileArray(str(path), values.shape, values.dtype, {}, values.__getitem__, each, values.nbytes)}, {}
+    if ending == ".npz":
+        return _npz_arrays(path), {}
+    if not h5py.is_hdf5(path):
+        if ending == ".mat":
+            return _mat_arrays(path), {}
+        raise SceneError(
+            f"{path} cannot be read as NetCDF or HDF5: it does not begin as HDF5; copy it again, or if it is NetCDF 3, "
+            "write it as NetCDF 4 (nccopy -k nc4)"
+        )
+    arrays, attributes = _hdf_arrays(path)
+    if ending == ".mat":
+        numbers = {name: one for name, one in arrays.items() if "/" not in name and one.dtype.kind in "buif"}
+        is_text = {name for name, one in numbers.items() if one.attrs.get("MATLAB_class") == "char"}
+        return {name: _transposed(one) for name, one in numbers.items() if name not in is_text}, {}
+    return arrays, attributes
 
 
 def load_npy(path: Path) -> NDArray[Any]:
@@ -76,13 +81,21 @@ def load_npy(path: Path) -> NDArray[Any]:
     return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
 
 
-def _lazy(shape: tuple[int, ...], kind: np.dtype[Any], load: Callable[[], NDArray[Any]]) -> FileArray:
+def _whole(
+    where: str, shape: tuple[int, ...], kind: np.dtype[Any], load: Callable[[], NDArray[Any]], stored: int, ratio: int
+) -> FileArray:
     """Return an array that is always read whole."""
-    return FileArray(shape, kind, {}, lambda part: load()[part])
+    chunks = tuple(max(size, 1) for size in shape)
+    return FileArray(where, shape, kind, {}, lambda part: load()[part], chunks, stored, ratio)
 
 
 def _npz_arrays(path: Path) -> dict[str, FileArray]:
     """List the arrays of numbers in a pack."""
+
+    def load(member: zipfile.ZipInfo) -> NDArray[Any]:
+        with zipfile.ZipFile(path) as pack, pack.open(member) as stream:
+            return np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
+
     found: dict[str, FileArray] = {}
     with zipfile.ZipFile(path) as pack:
         for member in pack.infolist():
@@ -92,40 +105,29 @@ def _npz_arrays(path: Path) -> dict[str, FileArray]:
                     old = formats.read_magic(stream) == (1, 0)
                     shape, _, kind = (formats.read_array_header_1_0 if old else formats.read_array_header_2_0)(stream)
                 if not kind.hasobject:
-                    load = partial(_member, path, member, math.prod(shape) * kind.itemsize)
-                    found[member.filename.removesuffix(".npy")] = _lazy(shape, kind, load)
+                    ratio = 1 if member.compress_type == zipfile.ZIP_STORED else DEFLATE_RATIO
+                    where, load_it = f"{path}:{member.filename}", partial(load, member)
+                    one = _whole(where, shape, kind, load_it, member.compress_size, ratio)
+                    found[member.filename.removesuffix(".npy")] = one
     return found
-
-
-def _member(path: Path, member: zipfile.ZipInfo, claimed: int) -> NDArray[Any]:
-    """Read an array of a pack, once its claimed size was checked."""
-    where, packed = f"{path}:{member.filename}", member.compress_type != zipfile.ZIP_STORED
-    check_claim(where, member.file_size, member.compress_size, DEFLATE_RATIO if packed else 1)
-    check_claim(where, claimed, member.file_size, 1)
-    check_memory(where, member.file_size)
-    with zipfile.ZipFile(path) as pack, pack.open(member) as stream:
-        return np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
 
 
 def _mat_arrays(path: Path) -> dict[str, FileArray]:
     """List the arrays of numbers of a .mat file of versions 4 to 7."""
     scipy_io = importlib.import_module("scipy.io")
 
-    def load(name: str, claimed: int) -> NDArray[Any]:
-        """Read one array, once its claimed size was checked."""
-        check_claim(f"{path}:{name}", claimed, path.stat().st_size, 8 * DEFLATE_RATIO)  # a double may be one byte
-        check_memory(path, 2 * claimed)
+    def load(name: str) -> NDArray[Any]:
         with _mapped(path) as content:
             return np.asarray(scipy_io.loadmat(content, variable_names=[name])[name])
 
     with warnings.catch_warnings(), _mapped(path) as content:
         warnings.simplefilter("ignore")  # of repeated names
-        kinds = {
-            name: (shape, np.dtype(_MATLAB[kind])) for name, shape, kind in scipy_io.whosmat(content) if kind in _MATLAB
-        }
+        listed = scipy_io.whosmat(content)
+    size, ratio = path.stat().st_size, 8 * DEFLATE_RATIO  # a double may be one byte
     return {
-        name: _lazy(shape, kind, partial(load, name, math.prod(shape) * kind.itemsize))
-        for name, (shape, kind) in kinds.items()
+        name: _whole(f"{path}:{name}", shape, np.dtype(_MATLAB[kind]), partial(load, name), size, ratio)
+        for name, shape, kind in listed
+        if kind in _MATLAB
     }
 
 
@@ -136,51 +138,9 @@ def _mapped(path: Path) -> Iterator[mmap.mmap]:
         yield content
 
 
-def _mat73_arrays(path: Path) -> dict[str, FileArray]:
-    """List the arrays of numbers of a .mat file of version 7.3, with the axes in MATLAB's order."""
-
-    def load(name: str, array: FileArray) -> NDArray[Any]:
-        """Read one array, once its claimed size was checked."""
-        check_array(path, name, array)
-        return array[...].T
-
-    return {
-        name: _lazy(one.shape[::-1], one.dtype, partial(load, name, one))
-        for name, one in hdf_arrays(path)[0].items()
-        if "/" not in name and one.dtype.kind in "buif" and one.attrs.get("MATLAB_class") != "char"
-    }
-
-
-# --- tables of spectra ------------------------------------------------------------------------------------------------
-
-
-def _pictures_of_tables(arrays: Mapping[str, FileArray], order: Literal["C", "F"]) -> tuple[dict[str, FileArray], str]:
-    """Return the tables of pixels as (y, x, band), if the file has the size of its picture, and a note of their order.
-
-    ``order`` is that of the pixels: F down the columns of the picture, C along its rows.
-    """
-    single = {name: one for name, one in arrays.items() if math.prod(one.shape) == 1 and one.dtype.kind in "uif"}
-    known = {re.sub("[^a-z]", "", name.lower()): name for name in reversed(single)}
-    names = next(((known[one], known[two]) for one, two in SIZES if one in known and two in known), None)
-    if names is None:
-        return {}, ""
-    rows, columns = (int(single[name][...].item()) for name in names)
-
-    def fold(one: FileArray, axis: int) -> NDArray[Any]:
-        """Return (y, x, band), or (y, x) for one band."""
-        spectra = np.moveaxis(one[...], axis, 0).reshape(rows * columns, -1)
-        cube = spectra.reshape((rows, columns, -1), order=order)
-        return cube[..., 0] if cube.shape[2] == 1 else cube
-
-    found = {}
-    for name, one in arrays.items():
-        axes = [axis for axis, size in enumerate(one.shape) if size == rows * columns]
-        if one.ndim in (1, 2) and len(axes) == 1 and name not in single and one.dtype.kind in "buif":
-            bands = [size for axis, size in enumerate(one.shape) if axis != axes[0] and size > 1]
-            found[name] = _lazy((rows, columns, *bands), one.dtype, partial(fold, one, axes[0]))
-    way = "down the columns" if order == "F" else "along the rows"
-    note = f"a table of {rows * columns} pixels is read as {rows} x {columns} px (y x x), {way} of the picture"
-    return found, f"{note}; if the map is scrambled or mirrored, store a cube (y, x, band)"
+def _transposed(one: FileArray) -> FileArray:
+    """Return an array of a .mat file of version 7.3 with the axes in MATLAB's order."""
+    return _whole(one.where, one.shape[::-1], one.dtype, lambda: one[...].T, one.stored, one.ratio)
 
 
 def check_picture(shape: tuple[int, ...], where: object) -> None:
@@ -190,6 +150,184 @@ def check_picture(shape: tuple[int, ...], where: object) -> None:
     bands, turned = min(shape), ".T" if shape[0] < shape[1] else ""
     raise SceneError(
         f"{where} is a table of {shape[0]} x {shape[1]} numbers, expected a picture (y, x) or a cube (y, x, band)."
-        f" If its {'columns' if turned else 'rows'} are spectra, store variables nRow and nCol beside it, or a cube: "
+        f" If its {'columns' if turned else 'rows'} are spectra, store a cube: "
         f"numpy.reshape(values{turned}, (height, width, {bands}), order='F'), or order='C' if pixels go along the rows"
     )
+
+
+# --- NetCDF and HDF5 --------------------------------------------------------------------------------------------------
+
+
+def _hdf_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
+    """Return the arrays of an HDF5 file by their paths, and the attributes of its root."""
+    arrays: dict[str, FileArray] = {}
+    stored = path.stat().st_size
+
+    def visit(name: str, item: Any) -> None:
+        """Add an array of numbers, or a single text such as NEON's map info."""
+        if not isinstance(item, h5py.Dataset) or item.external or item.is_virtual or item.shape is None:
+            return
+        about = _plain(item.attrs)
+        is_text = item.dtype.kind in "SO" and not item.ndim
+        if (item.dtype.kind in "buif" or is_text) and not str(about.get("NAME", "")).startswith(_ONLY_A_DIMENSION):
+            attributes, chunks = {**about, **_as_cf(about, item)}, item.chunks or (1,) * item.ndim
+            where, read = f"{path}:{name}", partial(_read, path, name)
+            arrays[name] = FileArray(where, item.shape, item.dtype, attributes, read, chunks, stored)
+
+    with h5py.File(path, "r") as file:
+        file.visititems(visit)  # follows hard links alone
+        return arrays, _plain(file.attrs)
+
+
+def _read(path: Path, name: str, part: Any) -> NDArray[Any]:
+    with h5py.File(path, "r") as file:
+        return np.asarray(file[name][part])
+
+
+def _as_cf(about: Mapping[str, Any], item: Any) -> dict[str, Any]:
+    """Return names of axes, and NEON's scale, no-data value and unit, as attributes of CF."""
+    dims = [dim[0].name.removeprefix("/") if len(dim) else dim.label for dim in item.dims]
+    scale = about.get("Scale_Factor") or about.get("Scale Factor")  # a divisor, unlike CF's scale_factor
+    void = about.get("Data_Ignore_Value", about.get("data ignore value"))
+    known = {
+        "_ARRAY_DIMENSIONS": dims if any(dims) else None,
+        "scale_factor": None if scale is None else 1 / float(scale),
+        "_FillValue": None if void is None else float(void),
+        "units": about.get("units", about.get("Units")),
+    }
+    return {name: value for name, value in known.items() if value is not None}
+
+
+def _plain(attributes: Any) -> dict[str, Any]:
+    """Return the attributes that can be read as Python's own texts and numbers, lists as arrays."""
+    found = {}
+    for name in attributes:
+        try:
+            value = attributes[name]
+        except Exception:  # of a type that h5py does not know
+            continue
+        if isinstance(value, np.ndarray | np.generic) and value.size == 1:
+            value = np.asarray(value).reshape(-1)[0]
+            value = value.item() if isinstance(value, np.generic) else value
+        found[str(name)] = value.decode("utf-8", "replace") if isinstance(value, bytes) else value
+    return found
+
+
+def in_scope(arrays: Arrays, name: str) -> dict[str, FileArray]:
+    """Return all arrays by their paths; those of the array's group, and of groups above it, by their names alone."""
+    groups = name.split("/")[:-1]
+    heads = ["".join(f"{group}/" for group in groups[:depth]) for depth in range(len(groups) + 1)]
+    near = {
+        path.removeprefix(head): array
+        for head in heads
+        for path, array in arrays.items()
+        if path.startswith(head) and "/" not in path.removeprefix(head)
+    }
+    return near | {path: array for path, array in arrays.items() if "/" in path}
+
+
+# --- EMIT, NEON and PRISMA --------------------------------------------------------------------------------------------
+
+
+def marked_bands(arrays: Arrays, count: int) -> tuple[int, ...]:
+    """Return the bands (from 0) that a list of good bands marks by 0."""
+    for name, array in arrays.items():
+        if name.rpartition("/")[2].lower() in GOOD_BANDS and array.shape == (count,):
+            return tuple(np.flatnonzero(array[...] == 0).tolist())
+    return ()
+
+
+def other_place(arrays: Arrays, cube: ArrayCube, shape: tuple[int, int, int]) -> tuple[GeoBox | None, tuple[str, ...]]:
+    """Return the grid by NEON's map info and EPSG code, else a note on a place that is not read."""
+    folder = f"{cube.name.rpartition('/')[0]}/Metadata/Coordinate_System"
+    if f"{folder}/Map_Info" in arrays and f"{folder}/EPSG Code" in arrays:
+        texts = [arrays[f"{folder}/{name}"][()] for name in ("Map_Info", "EPSG Code")]
+        info, code = (str(np.asarray(text).astype(np.str_).reshape(-1)[0]) for text in texts)
+        return place_or_note(lambda: _place_of_neon(info, code, shape[:2]))
+    names = {name.rpartition("/")[2].lower() for name, array in arrays.items() if array.ndim == 2}
+    if "glt_x" in names:
+        return None, (
+            "its pixels are in the sensor's own geometry and have no map grid; for a place on the earth, write it"
+            " orthorectified by its geolocation grids (glt_x, glt_y) first",
+        )
+    return None, ()
+
+
+def _place_of_neon(info: str, code: str, shape: tuple[int, int]) -> GeoBox:
+    fields = [field.strip() for field in info.split(",")]
+    x, y, east, north, wide, high = map(float, fields[1:7])
+    if any(field.lower().startswith("rotation") and float(field.partition("=")[2]) for field in fields):
+        raise ValueError(f"map info {info!r} is turned")
+    corner = Affine(wide, 0, east - (x - 1) * wide, 0, -high, north + (y - 1) * high)
+    return odc_geobox.GeoBox(shape, corner, f"EPSG:{int(code)}")
+
+
+def prisma_cube(
+    path: Path,
+    arrays: Arrays,
+    about: Mapping[str, Any],
+    variable: str | None,
+    guard: Callable[[], AbstractContextManager[None]],
+) -> CubeSource | None:
+    """Return both cubes (y, band, x) of a PRISMA product as one, its used bands by ascending wavelength.
+
+    Pixels that are 0 in every band lie outside the swath. None if the file is of another kind. Raises SceneError: the
+    product has another level, or one of its arrays was named.
+    """
+    if not any(name.startswith("HDFEOS/SWATHS/PRS_") for name in arrays):
+        return None
+    level = next((one for one in "DCB" if _PRISMA.format(one, "VNIR") in arrays), None)
+    if level is None or variable is not None:
+        raise SceneError(
+            f"{path} is no PRISMA product of level 2B, 2C or 2D, or one of its arrays was named; give such a product by"
+            " its name alone, and --bands for some of its bands"
+        )
+    parts = [(part, arrays[_PRISMA.format(level, part.upper())]) for part in ("Vnir", "Swir")]
+    lines, _, samples = parts[0][1].shape
+    known = [np.stack([np.ravel(about[f"List_{kind}_{part}"]) for kind in ("Cw", "Fwhm")]) for part, _ in parts]
+    if any(array.shape != (lines, nm.shape[1], samples) for (_, array), nm in zip(parts, known, strict=True)):
+        raise SceneError(
+            f"{path} has cubes {[array.shape for _, array in parts]} (y, band, x), expected one size (y, x) and "
+            f"{[len(nm[0]) for nm in known]} bands, as it has wavelengths; copy the file again"
+        )
+    lows, highs = ([float(about[f"L2Scale{part}{end}"]) for part, _ in parts] for end in ("Min", "Max"))
+    scales = [(high - low) / _PRISMA_TOP for low, high in zip(lows, highs, strict=True)]
+    for _, array in parts:
+        array.check((BLOCK_LINES, *array.shape[1:]))
+    centres, widths = np.concatenate(known, axis=1).astype(np.float64)
+    used = np.flatnonzero(centres > 0)
+    order = used[np.argsort(centres[used], kind="stable")]
+
+    def read(start: int, stop: int) -> NDArray[Any]:
+        """Return some lines (line, sample, band)."""
+        with guard():
+            raw = [np.moveaxis(array[start:stop], 1, 2) for _, array in parts]
+        values = [unpacked(block, scale, low, None) for block, scale, low in zip(raw, scales, lows, strict=True)]
+        found = np.concatenate(values, axis=2)[..., order]
+        found[np.logical_and.reduce([(block == 0).all(axis=2) for block in raw])] = np.nan
+        return found
+
+    geobox, notes = None, tuple[str, ...](["it has no map grid"])
+    if level == "D":
+        geobox, notes = place_or_note(lambda: _place_of_prisma(about, (lines, samples)))
+    unused = len(centres) - len(order)
+    return CubeSource(
+        name=path.name,
+        shape=(lines, samples, len(order)),
+        dtype=np.dtype(np.float32),
+        read=read_by_chunks(read, lines, max(array.chunks[0] for _, array in parts)),
+        files=(path,),
+        bands=Bands(centres[order], widths[order], "wavelengths from List_Cw of the file"),
+        geobox=geobox,
+        notes=(f"a PRISMA product of level 2{level}; {unused} bands without a wavelength are left out", *notes),
+    )
+
+
+def _place_of_prisma(about: Mapping[str, Any], shape: tuple[int, int]) -> GeoBox:
+    """Return the grid between the centres of the upper left and the lower right pixel."""
+    (west, north), (east, south) = (
+        [float(about[f"Product_{corner}corner_{axis}"]) for axis in ("easting", "northing")] for corner in ("UL", "LR")
+    )
+    wide, high = (east - west) / (shape[1] - 1), (north - south) / (shape[0] - 1)
+    corner = Affine(wide, 0, west - wide / 2, 0, -high, north + high / 2)
+    return odc_geobox.GeoBox(shape, corner, f"EPSG:{int(about['Epsg_Code'])}")

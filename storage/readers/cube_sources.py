@@ -15,7 +15,6 @@ from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numcodecs.errors import UnknownCodecError  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
@@ -27,6 +26,7 @@ if TYPE_CHECKING:
 
 DEFLATE_RATIO = 1100  # bytes that one byte of zlib's can stand for, rounded up: it is 1032
 MOST_RATIO = 10_000  # by which any packed numbers may exceed their bytes
+ONE_FILE = "of georeferenced tiles make one file first: rio merge tiles/*.tif field.tif"
 SPARE_BYTES = 1 << 20  # that a file may claim whatever its size: numbers that are all alike take none
 _GROUP_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
 
@@ -66,13 +66,6 @@ def reading(path: Path, kind: str, cure: str = "copy it again") -> Iterator[None
         yield
     except SceneError:
         raise
-    except UnknownCodecError as error:
-        name = error.codec_id.strip("'")
-        raise SceneError(
-            f"{path} is packed with {name}, which is not installed; pip install {name} (nothing is damaged)"
-        ) from error
-    except KeyError as error:
-        raise SceneError(f"{path} lacks what files of its kind have: {error}; copy it again") from error
     except Exception as error:
         why = error.__cause__ or error  # of rasterio, whose own says only that it failed
         raise SceneError(
@@ -141,10 +134,8 @@ class CubeSource:
 def check_cube_source(source: CubeSource) -> None:
     """Refuse a cube without real numbers, without pixels, or with frames of another size (SceneError)."""
     where = source.name
-    if source.dtype.kind == "c":
-        raise SceneError(f"{where} holds complex numbers; store their magnitude")
     if source.dtype.kind not in "buif":
-        raise SceneError(f"{where} holds {source.dtype}, expected whole or floating numbers")
+        raise SceneError(f"{where} holds {source.dtype}, expected whole or floating numbers; store numbers of these")
     if min(source.shape) < 1:
         raise SceneError(f"{where} holds an empty cube of shape {source.shape}")
     for name, frame in (("dark", source.dark), ("white", source.white)):

@@ -13,7 +13,7 @@ references of a real MV.X.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,7 @@ from pipeline.rig.camera.camera_texts import (
     place_parts,
     times_of_lines,
 )
-from storage.readers.cube_sources import MOST_MISSING, Bands, CubeSource, LineFacts
+from storage.readers.cube_sources import MOST_MISSING, ONE_FILE, Bands, CubeSource, LineFacts
 from storage.readers.image_files import bad_bands, place_of_envi, rescaled
 
 # where a data file's name may differ from its header's
@@ -53,11 +53,6 @@ class EnviCube:
     values: NDArray[Any]
     lost_lines: int  # in the header and not whole in the file
     notes: tuple[str, ...]
-
-    @property
-    def frames(self) -> tuple[Any, ...]:
-        """Return the size and type of a frame."""
-        return self.values.shape[1:], self.values.dtype
 
 
 def open_envi_cube(path: str | Path) -> EnviCube:
@@ -138,11 +133,6 @@ def load_envi_header(path: Path) -> EnviHeader:
 # --- cubes of one file or several -------------------------------------------------------------------------------------
 
 
-def is_headwall_folder(folder: Path) -> bool:
-    """Return whether a folder has files ``raw_<frame>`` of a Headwall camera."""
-    return any(_PART.fullmatch(entry.name) is not None for entry in folder.iterdir())
-
-
 def open_envi_source(path: Path, *, scaled: bool = True) -> CubeSource:
     """Open one ENVI cube by its header or data file (SceneError as `open_envi_cube`).
 
@@ -168,7 +158,7 @@ def open_headwall_cube(folder: Path) -> CubeSource:
     if not headers:
         raise SceneError(
             f"{folder} is a folder, expected a file, a Zarr store, or a folder with raw_<frame> files of a Headwall "
-            "camera; name one of the files in it"
+            f"camera; name one of the files in it, or {ONE_FILE}"
         )
     for number, header in headers.items():
         data = find_envi_pair(header)[1]
@@ -178,7 +168,11 @@ def open_headwall_cube(folder: Path) -> CubeSource:
             opened[number] = open_envi_cube(header)
     if not opened:
         raise SceneError(f"every part of {folder} is empty; copy the folder again")
-    _check_alike(list(opened.values()))
+    frames = {(cube.values.shape[1:], str(cube.values.dtype)) for cube in opened.values()}
+    if len(frames) > 1:
+        raise SceneError(
+            f"the parts of {folder} have frames of {sorted(frames)} (sample, band); ingest them one by one"
+        )
     parts = [(cube.path.name, number, len(cube.values)) for number, cube in opened.items()]
     starts = place_parts(parts, MOST_MISSING, notes)
     notes += [note for cube in opened.values() for note in cube.notes]
@@ -280,31 +274,6 @@ def load_frame_index(path: Path) -> FrameIndex:
 
 
 def _headers(folder: Path) -> dict[int, Path]:
-    """Return the header of each part by its first frame, sorted (SceneError: a part has no or several headers)."""
-    found: dict[int, list[Path]] = {}
-    for entry in folder.iterdir():
-        match = _PART.fullmatch(entry.name)
-        if match is not None and entry.is_file():
-            found.setdefault(int(match[1]), []).append(entry)
-    headers: dict[int, Path] = {}
-    for number, files in sorted(found.items()):
-        named = [file for file in files if file.suffix.lower() == ".hdr"]
-        if len(named) != 1:
-            listed = ", ".join(sorted(file.name for file in files))
-            raise SceneError(f"frame {number} of {folder}: expected one header raw_{number}.hdr, found {listed}")
-        headers[number] = named[0]
-    return headers
-
-
-def _check_alike(cubes: Sequence[EnviCube]) -> None:
-    """Refuse parts of several cubes (SceneError)."""
-    first = cubes[0]
-    for cube in cubes[1:]:
-        if cube.frames != first.frames:
-            raise SceneError(
-                f"{cube.path} has frames of {cube.frames} (sample, band), {first.path.name} of {first.frames}; ingest"
-                " them by themselves"
-            )
-        ours, theirs = first.header.wavelength_nm, cube.header.wavelength_nm
-        if ours is not None and theirs is not None and not np.array_equal(ours, theirs):
-            raise SceneError(f"{cube.path} has other wavelengths than {first.path.name}; ingest them by themselves")
+    """Return the header of each part by its first frame, sorted."""
+    files = ((_PART.fullmatch(entry.name), entry) for entry in folder.iterdir() if entry.suffix.lower() == ".hdr")
+    return dict(sorted((int(match[1]), entry) for match, entry in files if match is not None and entry.is_file()))

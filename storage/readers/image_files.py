@@ -254,8 +254,7 @@ def place_of_envi(
 
 # --- bands ------------------------------------------------------------------------------------------------------------
 
-_CENTRES = ("wavelength", "wavelength_nm", "center_wavelength", "centre_wavelength", "central_wavelength")
-_UNITS = ("wavelength_units", "wavelengthunits", "wavelength_unit", "units")
+_UNIT = "wavelength_units"
 _LENGTHS = r"nm|nanomet(?:er|re)s?|µm|um|micromet(?:er|re)s?"
 _DESCRIBED = re.compile(rf"(?<![\w.])(\d+(?:\.\d+)?)\s*({_LENGTHS})\b", re.IGNORECASE)  # Band 12 (660.5 Nanometers)
 
@@ -268,17 +267,15 @@ def _of_colours(colours_nm: Sequence[float]) -> Bands:
 def _bands_of(file: Any, keep: Sequence[int], kinds: Sequence[str], path: Path) -> tuple[Bands, tuple[str, ...]]:
     """Return wavelengths and widths by the tags of an open file, else its band names, else its colours; and notes."""
     notes: list[str] = []
-    of_file, of_bands = _lower(file.tags()) | _lower(file.tags(ns="ENVI")), [_band_tags(file, band) for band in keep]
-    fields = {}
-    for key, names in (("wavelength", _CENTRES), ("fwhm", ("fwhm", "fwhm_nm"))):
-        values = [_first(tags, names) for tags in of_bands]
+    of_file, of_bands = _file_tags(file), [_band_tags(file, band) for band in keep]
+    fields = {"wavelength units": next(iter(of_bands), {}).get(_UNIT) or of_file.get(_UNIT, "")}
+    for key in ("wavelength", "fwhm"):
+        values = [tags.get(key, "") for tags in of_bands]
         if all(values):
-            fields[key] = ", ".join(str(value) for value in values)
-        elif (listed := _first(of_file, names)) is not None:
-            words = [word for word in re.split(r"[,\s{}]+", listed) if word]
+            fields[key] = ", ".join(values)
+        elif key in of_file:
+            words = [word for word in re.split(r"[,\s{}]+", of_file[key]) if word]
             fields[key] = ", ".join([words[band] for band in keep] if len(words) == file.count else words)
-    unit = _first(of_bands[0], _UNITS) or _first(of_file, _UNITS) if keep else None
-    fields["wavelength units"] = unit or ("nm" if any("wavelength_nm" in tags for tags in of_bands) else "")
     centres, scale = wavelengths_nm(fields, len(keep), notes)
     if centres is not None:
         widths = [finite_number(word) for word in re.split(r"[,\s]+", fields.get("fwhm", "")) if word]
@@ -301,24 +298,22 @@ def bad_bands(listed: str | None, count: int) -> tuple[int, ...]:
 
 def _bad_bands_of(file: Any, keep: Sequence[int]) -> tuple[int, ...]:
     """Return the bands of an open file that it marks as bad, by their index in ``keep``."""
-    listed = _first(_lower(file.tags(ns="ENVI")) | _lower(file.tags()), ("bbl", "bad_bands", "bad_band_list"))
-    bad = set(bad_bands(listed, file.count))
-    bad |= {band for band in keep if _first(_band_tags(file, band), ("bbl", "bad_band")) in ("0", "0.0")}
+    bad = set(bad_bands(_file_tags(file).get("bbl"), file.count))
     return tuple(place for place, band in enumerate(keep) if band in bad)
+
+
+def _file_tags(file: Any) -> dict[str, str]:
+    return _lower(file.tags()) | _lower(file.tags(ns="ENVI"))
 
 
 def _band_tags(file: Any, band: int) -> dict[str, str]:
     """Return the tags of one band, counted from 0; GDAL's own take precedence."""
     tags, imagery = _lower(file.tags(band + 1)), file.tags(band + 1, ns="IMAGERY")
     if "CENTRAL_WAVELENGTH_UM" in imagery:
-        tags |= {"wavelength": imagery["CENTRAL_WAVELENGTH_UM"], "wavelength_units": "um"}
+        tags |= {"wavelength": imagery["CENTRAL_WAVELENGTH_UM"], _UNIT: "um"}
         tags |= {"fwhm": imagery["FWHM_UM"]} if "FWHM_UM" in imagery else {}
     return tags
 
 
 def _lower(tags: Mapping[str, str]) -> dict[str, str]:
     return {"_".join(name.lower().split()): value for name, value in tags.items()}
-
-
-def _first(tags: Mapping[str, str], names: Sequence[str]) -> str | None:
-    return next((tags[name] for name in names if tags.get(name)), None)

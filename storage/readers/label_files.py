@@ -8,7 +8,6 @@ and lower case are alike.
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -187,11 +186,9 @@ def _label_of(image: Path, candidates: Sequence[Path]) -> Path | None:
         found = [one for one, both in stems.items() if wanted in [word.sub("", stem) for stem in both]]
         if len(found) > 1:
             names = " and ".join(str(one) for one in found[:SHOWN])
-            home = image.parent.parent if is_image_folder(image.parent) else image.parent
-            pattern = Path(os.path.relpath(found[0].parent, home), found[0].name.replace(image.stem, "{name}", 1))
             raise SceneError(
-                f"{image} has several files of labels by their names: {names}; keep one, or say which in a"
-                f' {SETTINGS_NAME}: labels = "{pattern.as_posix()}"'
+                f"{image} has several files of labels by their names: {names}; keep one, or name it with labels in a"
+                f" {SETTINGS_NAME}"
             )
         if found:
             return found[0]
@@ -201,27 +198,17 @@ def _label_of(image: Path, candidates: Sequence[Path]) -> Path | None:
 def label_file(scene: Path, settings: SceneSettings) -> tuple[Path | None, str]:
     """Return the label file of a scene by scene.toml, else by its name; and a note if scene.toml names a missing one.
 
-    Raises SceneError: the pattern in scene.toml needs a number that the scene's name lacks, or several files fit.
+    Raises SceneError: several files fit by their names.
     """
     if settings.labels is None or settings.path is None:
         return find_label(scene), ""
     if not settings.labels:
         return None, ""
-    number = scene_number(scene)
-    if "{number}" in settings.labels and number is None:
-        raise SceneError(
-            f"{scene} has no number in its name, which labels = {settings.labels!r} in scene.toml asks for; write"
-            " {name} for the whole name"
-        )
-    address = settings.path.parent / filled(settings.labels, scene)
+    name = settings.labels.replace("{number}", scene_number(scene) or "").replace("{name}", scene.stem)
+    address = settings.path.parent / name
     if address != settings.path.parent / settings.labels and not split_layer(address)[0].is_file():
         return None, f"no labels: there is no {address}"
     return address, ""
-
-
-def filled(pattern: str, scene: Path) -> str:
-    """Return the ``labels`` of a scene.toml for one scene."""
-    return pattern.replace("{number}", scene_number(scene) or "").replace("{name}", scene.stem)
 
 
 def scene_number(path: Path) -> str | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -12,8 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from storage.readers.array_files import ARRAY_ENDINGS, check_picture, load_npy, open_array_file, reading_array
-from storage.readers.cube_sources import Bands, CubeSource, check_cube_source
+from storage.readers.array_cubes import UNNAMED, cube_source, find_cube
+from storage.readers.array_files import (
+    ARRAY_ENDINGS,
+    HDF_ENDINGS,
+    check_picture,
+    in_scope,
+    list_arrays,
+    load_npy,
+    marked_bands,
+    other_place,
+    prisma_cube,
+)
+from storage.readers.cube_sources import Bands, CubeSource, check_cube_source, reading
 from storage.readers.envi_files import (
     DATA_ENDINGS,
     find_envi_pair,
@@ -22,30 +34,18 @@ from storage.readers.envi_files import (
     open_envi_source,
     open_headwall_cube,
 )
-from storage.readers.hdf_files import HDF_ENDINGS, open_hdf_cube
-from storage.readers.image_files import IMAGE_ENDINGS, JPEG2000_ENDINGS, open_image
+from storage.readers.image_files import IMAGE_ENDINGS, open_image
 from storage.readers.scene_toml import SceneSettings, find_scene_settings, settle_wavelengths
-from storage.readers.zarr_files import find_zarr_store, open_zarr_cube
+from storage.readers.zarr_files import INGESTED, find_zarr_store, with_ingested, zarr_arrays
 
-Reader = Literal["zarr", "headwall", "envi", "hdf", "image", "array", "none"]
+Reader = Literal["zarr", "headwall", "envi", "image", "array", "none"]
 CUBE_ENDINGS = (*IMAGE_ENDINGS, *ARRAY_ENDINGS, ".hdr", *HDF_ENDINGS)
+NO_UNIT = ("", "1", "unitless", "none", "dimensionless")
 _WITH_VARIABLE = re.compile(
     r"^(?P<path>.+\.(?:mat|npz|zarr|npy)):(?P<variable>[^/\\:]+(?::\d+)?)$"
     r"|^(?P<path2>.+\.(?:nc4?|h5|hdf5|he5)):(?P<variable2>[^:]+(?::\d+)?)$",
     re.IGNORECASE | re.DOTALL,
 )
-_BEGINNINGS = {  # of files, and their endings
-    b"\x89PNG": (".png",),
-    b"\xff\xd8\xff": (".jpg", ".jpeg"),
-    b"II*\0": (".tif", ".tiff"),
-    b"MM\0*": (".tif", ".tiff"),
-    b"\0\0\0\x0cjP": JPEG2000_ENDINGS,
-    b"\xff\x4f\xff\x51": JPEG2000_ENDINGS,
-    b"\x93NUMPY": (".npy",),
-    b"PK\x03\x04": (".npz",),
-    b"\x89HDF": (".mat", *HDF_ENDINGS),
-    b"MATLAB": (".mat",),
-}
 
 
 def split_variable(address: str | Path) -> tuple[Path, str | None]:
@@ -70,7 +70,7 @@ def reader_of(address: str | Path) -> Reader:
     if not path.is_file():
         return "none"
     if ending in CUBE_ENDINGS:
-        return "hdf" if ending in HDF_ENDINGS else "image" if ending in IMAGE_ENDINGS else "array"
+        return "image" if ending in IMAGE_ENDINGS else "array"
     beside = {path.with_name(path.name + ".hdr").name.lower(), path.with_suffix(".hdr").name.lower()}
     of_envi = ending in DATA_ENDINGS or any(one.name.lower() in beside for one in path.parent.iterdir())
     return "envi" if of_envi else "none"
@@ -79,7 +79,7 @@ def reader_of(address: str | Path) -> Reader:
 def open_cube(
     address: str | Path, *, dark: str | Path | None = None, white: str | Path | None = None, labels: bool = False
 ) -> CubeSource:
-    """Open a cube; pictures, .mat and .npz are read whole, of others only headers.
+    """Open a cube; only headers, and coordinates of arrays, are read.
 
     ``address`` may name an array and a step of time: ``STORE:ARRAY:3``. ``dark`` and ``white`` are ENVI or .npy files
     of reference frames, averaged over their lines; they replace those in a Headwall folder. ``labels`` are read without
@@ -90,24 +90,23 @@ def open_cube(
     frames: list[tuple[str, str | Path | None]] = [("dark", dark), ("white", white)]
     match reader_of(address):
         case "zarr":
-            source = open_zarr_cube(path, variable, labels=labels)
+            source = _open_arrays(find_zarr_store(path) or path, variable, labels=labels)
         case "headwall":
             source = open_headwall_cube(path)
             frames = [(kind, frame or find_reference(path, kind)) for kind, frame in frames]
         case "envi":
             source = open_envi_source(path, scaled=not labels and dark is None and white is None)
-        case "hdf":
-            source = open_hdf_cube(path, variable, labels=labels)
         case "image":
-            _check_content(path)
             source = open_image(path, scaled=not labels)
         case "array":
-            _check_content(path)
-            source = open_array_file(path, variable, labels=labels)
-            if source.shape[2] == 1 and not labels and min(source.shape):
+            source = _open_arrays(path, variable, labels=labels)
+            if path.suffix.lower() in ARRAY_ENDINGS and source.shape[2] == 1 and not labels and min(source.shape):
                 check_picture(source.shape[:2], address)
+        case "none" if not path.exists():
+            raise SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
         case "none":
-            raise _refusal(path)
+            ending = path.suffix.lower() or "nothing"
+            raise SceneError(f"{path} ends in {ending}, which is not read; use {', '.join(CUBE_ENDINGS)}")
     for kind, named in frames:
         if named is not None:
             values, more = load_frame(named)
@@ -117,11 +116,43 @@ def open_cube(
     return source
 
 
+def _open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSource:
+    """Open an array of a file or Zarr store as a cube; only attributes and coordinates are read.
+
+    ``variable`` is its name, alone or with its groups (``SERC/Reflectance/Reflectance_Data``), and may end in a step of
+    time (``values:3`` or ``3``). Raises SceneError: the file is damaged, or claims far more than it can hold; it has no
+    such array or several; or the axes are not y, x and band.
+    """
+    ending = path.suffix.lower()
+    kind = "Zarr" if path.is_dir() else "NetCDF or HDF5" if ending in HDF_ENDINGS else ending
+
+    def guard() -> AbstractContextManager[None]:
+        return reading(path, kind)
+
+    with guard():
+        arrays, about = zarr_arrays(path) if path.is_dir() else list_arrays(path)
+        if (prisma := prisma_cube(path, arrays, about, variable, guard)) is not None:
+            return prisma
+        cube = find_cube(arrays, variable, path, labels=labels)
+        near = in_scope(arrays, cube.name)
+        source = cube_source(path, cube, near, {**about, **cube.array.attrs}, guard)
+        unit = str(cube.array.attrs.get("units", "")).strip()
+        notes = () if unit.lower() in NO_UNIT else (f"values are in {unit}",)
+        geobox, where = (source.geobox, ()) if source.geobox is not None else other_place(near, cube, source.shape)
+        plain = tuple(note for note in source.notes if ending not in ARRAY_ENDINGS or note != UNNAMED)
+        source = replace(
+            source, bad_bands=marked_bands(near, source.shape[2]), geobox=geobox, notes=(*notes, *plain, *where)
+        )
+        if path.is_dir():
+            files = tuple(sorted(file for file in path.rglob("*") if file.is_file()))
+            source = replace(source, root=path, files=files)
+        return with_ingested(source, arrays, about) if about.get("kind") == INGESTED else source
+
+
 def open_labels(address: str | Path, *, by_number: bool = False) -> CubeSource:
     """Open a file of labels or a mask without its scale; ``by_number`` keeps the numbers of a palette (SceneError)."""
     path, _ = split_variable(address)
     if reader_of(address) == "image":
-        _check_content(path)
         return open_image(path, scaled=False, palette=by_number)
     return open_cube(address, labels=True)
 
@@ -143,7 +174,7 @@ def load_frame(address: str | Path) -> tuple[NDArray[np.float32], tuple[Path, ..
         raise SceneError(f"{path} is a folder, expected a reference frame (ENVI or .npy); name the file")
     files: tuple[Path, ...] = (path,)
     if path.suffix.lower() == ".npy":
-        with reading_array(path):
+        with reading(path, ".npy"):
             values = load_npy(path)
     elif kind == "envi":
         files, values = find_envi_pair(path), open_envi_cube(path).values
@@ -170,22 +201,3 @@ def with_wavelengths(source: CubeSource, address: str | Path, stated: Sequence[f
     found = settle_wavelengths(path, range(count), count, stated=stated, settings=settings, known=Bands())
     folder = "" if settings.path is None else f"{settings.path.parent}/"
     return replace(source, bands=replace(found, origin=found.origin.replace(folder, "")))
-
-
-def _check_content(path: Path) -> None:
-    """Refuse a file that begins like a file of another ending (SceneError)."""
-    with path.open("rb") as file:
-        head = file.read(8)
-    for begins, endings in _BEGINNINGS.items():
-        if head.startswith(begins) and path.suffix.lower() not in endings:
-            ending = path.suffix.lower()
-            raise SceneError(
-                f"{path} cannot be read as {ending}: it begins as a {endings[0]} file does; give it that ending"
-            )
-
-
-def _refusal(path: Path) -> SceneError:
-    if not path.exists():
-        return SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
-    ending = path.suffix.lower()
-    return SceneError(f"{path} ends in {ending or 'nothing'}, which is not read; use {', '.join(CUBE_ENDINGS)}")

@@ -8,7 +8,7 @@
     a folder with raw_<frame> files       a Headwall camera's capture
     NAME.zarr                             any Zarr cube
 
-Files beside a cube ``NAME`` are used if no flag names others: ``NAME.pointing.csv`` (.parquet, .toml),
+Files beside a cube ``NAME`` are used if no flag names others: ``NAME.pointing.csv``,
 ``NAME.dark.hdr``, ``NAME.white.hdr``, ``NAME.bad.hdr`` and ``NAME.flat.hdr``. Frames for all cubes of the folder are
 ``dark*.hdr`` and ``white*.hdr``. The header of an ENVI cube may have ``line axis = y``: lines lie along y of the field,
 and the scan goes along x. The header of a white frame may have ``white_reference = {...}``, the value of the white
@@ -41,16 +41,18 @@ from storage.arrays.signal_cubes import open_lines
 from storage.readers.cube_sources import CubeSource
 from storage.readers.envi_files import find_envi_pair, load_envi_header
 from storage.readers.open_cubes import reader_of
-from storage.readers.pointing_tables import (
+from storage.readers.recorded_files import (
     ENDINGS,
     WITHOUT_MIRROR,
     LinePointing,
+    RecordedFile,
+    find_cubes,
     find_pointing,
-    follow_vector,
-    load_played_vector,
+    find_references,
     load_pointing_table,
+    open_recorded_cube,
+    with_bits,
 )
-from storage.readers.recorded_cubes import RecordedFile, find_cubes, find_references, open_recorded_cube, with_bits
 from storage.remote.object_stores import is_remote
 from storage.remote.opening import is_archive, open_archive
 
@@ -114,7 +116,7 @@ class Recording:
 class RecordedWith:
     """Flags on the files of a recording; None is looked for beside them, or assumed with a note."""
 
-    pointing: Path | None = None  # a table or vector, or a folder with one for each cube
+    pointing: Path | None = None  # a table, or a folder with one for each cube
     dark: Path | None = None
     white: Path | None = None
     wavelengths: Sequence[float] | None = None  # of all bands [nm]
@@ -176,7 +178,7 @@ def _open_files(path: Path, camera: LineCamera, given: RecordedWith) -> Recordin
     notes = [note for cube in cubes for note in (*cube.source.notes, cube.source.bands.origin) if note]
     samples = max(cube.source.shape[1] for cube in cubes)  # the widest are not binned
     camera = with_bits(replace(camera, samples=samples), cubes, notes)
-    pointing = [_point(cube, camera, given, notes, alone=len(cubes) == 1) for cube in cubes]
+    pointing = [_point(cube, given, notes, alone=len(cubes) == 1) for cube in cubes]
     without = [one is None or one.kind in WITHOUT_MIRROR for one in pointing]
     if any(without) and len(cubes) > 1:
         cube = cubes[without.index(True)]
@@ -199,9 +201,7 @@ def _open_files(path: Path, camera: LineCamera, given: RecordedWith) -> Recordin
     return Recording(str(path), tuple(sweeps), bands.wavelength_nm, bands.fwhm_nm, camera, unique, light)
 
 
-def _point(
-    cube: RecordedFile, camera: LineCamera, given: RecordedWith, notes: list[str], *, alone: bool
-) -> LinePointing | None:
+def _point(cube: RecordedFile, given: RecordedWith, notes: list[str], *, alone: bool) -> LinePointing | None:
     """Return the pointing of a cube by the file given, else by one with the cube's name, else None."""
     file, lines = given.pointing, cube.source.shape[0]
     if file is not None and file.is_dir():
@@ -216,13 +216,7 @@ def _point(
     if not file.is_file():
         raise SceneError(f"there is no pointing table {file}; check the name (seen from {Path.cwd()})")
     notes.append(f"{cube.name}: pointing from {file.name}")
-    if file.suffix.lower() == ".toml":
-        middle_s = _middle_s(cube.source, None, camera, [])
-        found = follow_vector(load_played_vector(file, given.mounting), middle_s, str(file))
-    else:
-        found = load_pointing_table(file).of_cube(cube.name, lines, given.mounting, alone=alone)
-    notes.extend(f"{cube.name}: {note}" for note in found.notes)
-    return found
+    return load_pointing_table(file).of_cube(cube.name, lines, given.mounting, alone=alone)
 
 
 def _without_mirror(

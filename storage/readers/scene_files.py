@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import EmptySceneError, SceneError
-from pipeline.geometry.grid import UNLABELLED
+from pipeline.geometry.grid import SceneGrid
 from pipeline.readings import MOST_VALUE, beyond_range, find_beyond
 from storage.archive.staging import file_hash
+from storage.parallel.pool import RESERVED_BYTES, memory_refusal
 from storage.readers.cube_sources import BLOCK_LINES, Bands, CubeSource, check_memory, scene_lines, unpacked
 from storage.readers.label_files import label_file, read_labels
 from storage.readers.labels import Labels
@@ -27,6 +29,8 @@ if TYPE_CHECKING:
 
 ReadRows = Callable[[int, int], NDArray[np.float32]]
 USUAL_NODATA = -9999.0  # assumed where no file states another
+COPIES = 6  # of a block in memory while it is read and processed
+FRACTION = 4  # of the free memory for a block: larger ones are no faster
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,41 +63,6 @@ class SceneFile:
         """Return all values (y, x, band), NaN where the file has none."""
         return self.read(0, self.shape[0]) if self.kept is None else self.kept
 
-    def labelled(self, found: Labels | None, *, by_name: bool) -> SceneFile:
-        """Return the scene with labels and their classes."""
-        if found is None:
-            return self
-        return replace(
-            self,
-            labels=found.index,
-            class_names=found.names,
-            class_values=found.values,
-            class_colours=found.colours,
-            labels_found=by_name,
-            regridded=found.regridded,
-        )
-
-
-def load_scene_file(
-    path: str | Path,
-    *,
-    labels: str | Path | None = None,
-    bands: Sequence[int] | None = None,
-    wavelengths: Sequence[float] | None = None,
-    classes: Mapping[str, ClassValue] | None = None,
-    labels_needed: bool = True,
-) -> SceneFile:
-    """Open a scene as `open_scene_file` does, and keep all values in memory."""
-    return open_scene_file(
-        path,
-        labels=labels,
-        bands=bands,
-        wavelengths=wavelengths,
-        classes=classes,
-        labels_needed=labels_needed,
-        keep=True,
-    )
-
 
 def open_scene_file(
     address: str | Path,
@@ -120,7 +89,6 @@ def open_scene_file(
     source, settings = open_cube(address), find_scene_settings(file)
     height, width, count = source.shape
     chosen, bad_note = _chosen_bands(bands, settings, count, file, source.bad_bands)
-    _refuse_bands_first(file, source.shape, wavelengths or settings.wavelengths_nm)
     light = settle_wavelengths(file, chosen, count, stated=wavelengths, settings=settings, known=source.bands)
     assert light.wavelength_nm is not None
     values = FileValues.of(source, chosen, settings)
@@ -150,12 +118,21 @@ def open_scene_file(
         pixel_m=None if source.geobox is not None else settings.pixel_m,
         kept=kept,
     )
-    return scene.labelled(found, by_name=by_name)
+    if found is None:
+        return scene
+    return replace(
+        scene,
+        labels=found.index,
+        class_names=found.names,
+        class_values=found.values,
+        class_colours=found.colours,
+        labels_found=by_name,
+        regridded=found.regridded,
+    )
 
 
-def _stated_scaling(scale: float, offset: float) -> str:
-    """Return scene.toml's scaling as a text for hashes; empty without one."""
-    return "" if (scale, offset) == (1.0, 0.0) else f"{SETTINGS_NAME} scale {scale!r} offset {offset!r}"
+# As `open_scene_file`, with all values in memory.
+load_scene_file = partial(open_scene_file, labels_needed=True, keep=True)
 
 
 def with_stated_values(source: CubeSource, address: str | Path) -> CubeSource:
@@ -164,25 +141,19 @@ def with_stated_values(source: CubeSource, address: str | Path) -> CubeSource:
     Scaled numbers are float32, NaN without data. Raises SceneError: the cube has dark or white frames and a scale.
     """
     settings = find_scene_settings(split_variable(address)[0])
-    scaling = _stated_scaling(settings.scale, settings.offset)
+    values = FileValues.of(source, list(range(source.shape[2])), settings)
     stated = () if settings.nodata is None else (f"{SETTINGS_NAME} nodata {settings.nodata!r}",)
     nodata = source.nodata if settings.nodata is None else settings.nodata
-    source = replace(source, nodata=nodata, scaling=" ".join(filter(None, (source.scaling, *stated, scaling))))
-    if not scaling:
-        return source
+    scaling = " ".join(filter(None, (source.scaling, *stated, values.scaling)))
+    if not values.scaling:
+        return replace(source, nodata=nodata, scaling=scaling)
     if source.dark is not None or source.white is not None:
         raise SceneError(
             f"{settings.path} has a scale or offset, and {address} dark or white frames, so its numbers are stored as "
             "they are; remove scale and offset from the scene.toml"
         )
-    note = f"values are the file's times {settings.scale:g} plus {settings.offset:g}, as {SETTINGS_NAME} says"
-    nodata, plain = USUAL_NODATA if nodata is None and source.dtype.kind in "if" else nodata, source.read
-
-    def read(start: int, stop: int) -> NDArray[np.float32]:
-        """Return some lines (line, sample, band), NaN where the file has no value."""
-        return unpacked(plain(start, stop), settings.scale, settings.offset, nodata)
-
-    return replace(source, read=read, dtype=np.dtype(np.float32), nodata=None, notes=(*source.notes, note))
+    kind, notes = np.dtype(np.float32), (*source.notes, *values.notes(Path(SETTINGS_NAME))[0])
+    return replace(source, read=values.read, dtype=kind, nodata=None, scaling=scaling, notes=notes)
 
 
 def _light_hash(
@@ -199,16 +170,6 @@ def _light_hash(
     more += [] if void is None else [f"void {hashlib.sha256(np.packbits(void).tobytes()).hexdigest()}"]
     more += [one for one in (values.source.scaling, values.scaling) if one]
     return _digest(content, variable, values.bands, light.wavelength_nm.tolist(), widths, *more)
-
-
-def _refuse_bands_first(path: Path, shape: tuple[int, ...], wavelengths: Sequence[float] | None) -> None:
-    """Refuse a cube with as many rows, instead of bands, as wavelengths (SceneError)."""
-    count = 0 if wavelengths is None else len(wavelengths)
-    if count > 1 and shape[0] == count != shape[2] and shape[1] != shape[2]:
-        raise SceneError(
-            f"{path} has the axes {shape}, read as (y, x, band), and there are {count} wavelengths: its bands come"
-            " first; store it with the bands last, np.moveaxis(values, 0, -1)"
-        )
 
 
 def _content_hash(file: Path, files: tuple[Path, ...]) -> str:
@@ -267,7 +228,7 @@ def _labels_of(
         return None, (f"the labels beside the scene are left out: {error}",), by_name
     how = f"classes from {settings.path}" if settings.classes else f"{len(found.names)} classes as found in the file"
     note = f"labels from {address}{', found by its name' if by_name else ''}, {how}"
-    return found, (note, *found.notes, *_one_class_note(found)), by_name
+    return found, (note, *found.notes), by_name
 
 
 def load_field_labels(address: str | Path, shape: tuple[int, int]) -> tuple[Labels, tuple[str, ...]]:
@@ -276,19 +237,6 @@ def load_field_labels(address: str | Path, shape: tuple[int, int]) -> tuple[Labe
     found, notes, _ = _labels_of(file, shape, None, address, find_scene_settings(file), {}, True)
     assert found is not None
     return found, notes
-
-
-def _one_class_note(found: Labels) -> tuple[str, ...]:
-    """Return a note on labels of a single class: its value may mean unlabelled."""
-    there = np.unique(found.index[found.index != UNLABELLED])
-    if len(there) != 1:
-        return ()
-    value = found.values[there[0]]
-    text = value if isinstance(value, int) else list(value)
-    return (
-        f"all labels are {found.names[there[0]]}: if {text} in the label file means no class, write unlabelled = {text}"
-        f" into a {SETTINGS_NAME}",
-    )
 
 
 def _digest(*parts: object) -> str:
@@ -321,8 +269,9 @@ class FileValues:
 
     @property
     def scaling(self) -> str:
-        """Return scene.toml's scaling as a text for hashes."""
-        return _stated_scaling(self.scale, self.offset)
+        """Return scene.toml's scaling as a text for hashes; empty without one."""
+        plain = (self.scale, self.offset) == (1.0, 0.0)
+        return "" if plain else f"{SETTINGS_NAME} scale {self.scale!r} offset {self.offset!r}"
 
     def notes(self, settings: Path | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Return notes on scaling, by the scene.toml ``settings``, and notes on the mask."""
@@ -424,3 +373,29 @@ def bands_text(bands: Sequence[int]) -> str:
     """Return the band numbers as ``--bands`` takes them: ``0-3,7``."""
     runs = np.split(np.array(bands, int), np.flatnonzero(np.diff(bands) != 1) + 1) if bands else []
     return ",".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)
+
+
+@dataclass(frozen=True)
+class RasterPixels:
+    """The pixels of a raster: ``read`` returns rows (y, x, band) in float32, NaN without a value."""
+
+    read: Callable[[int, int], NDArray[np.float32]]
+    missing: NDArray[np.bool_]  # (y, x) without a value
+    bands: int
+    grid: SceneGrid
+
+    def rows(self, start: int, stop: int) -> NDArray[np.float32]:
+        """Read rows of the raster, NaN in every band of the missing pixels."""
+        values = self.read(start, stop)
+        values[self.missing[start:stop]] = np.nan
+        return values
+
+    def rows_at_once(self, memory: int) -> int:
+        """Return the rows to read at a time: whole rows of patches (SettingsError: one does not fit the memory)."""
+        grid = self.grid
+        deep, row = grid.patch * grid.factor, COPIES * grid.width * self.bands * 4
+        least = RESERVED_BYTES + deep * row
+        if least > memory:
+            why = f"{deep} rows of a raster of {grid.width} px and {self.bands} bands are read at a time"
+            raise memory_refusal(least, memory, why)
+        return deep * max(1, (memory - RESERVED_BYTES) // FRACTION // (deep * row))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,15 +21,9 @@ IMAGE_FOLDERS = ("images", "image", "imgs", "img", "pictures", "photos")  # scen
 Colour = tuple[int, int, int]
 ClassValue = int | Colour
 _Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+_Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0)]
 _Channel = Annotated[int, Field(strict=True, ge=0, le=255)]
 _Value = StrictInt | tuple[_Channel, _Channel, _Channel]
-_WHOLE, _FILE = "a list of whole numbers such as [0, 1]", "a file name in quotes"
-_A_CLASS = "a whole number or a colour [r, g, b] in 0..255"
-
-
-def _key(default: Any, expected: str, **limits: Any) -> Any:
-    """Return a field whose description is the value that messages ask for."""
-    return Field(default, description=expected, **limits)
 
 
 class SceneSettings(BaseModel):
@@ -39,29 +33,28 @@ class SceneSettings(BaseModel):
 
     path: Path | None = None
     # of the file, counted from 0
-    bands: tuple[StrictInt, ...] | None = _key(None, _WHOLE)
+    bands: tuple[StrictInt, ...] | None = None
     # of ``bands``, or of all bands of the file
-    wavelengths_nm: tuple[Annotated[float, Field(strict=True)], ...] | None = _key(
-        None, "a list of numbers such as [660.0, 800.0]"
-    )
+    wavelengths_nm: tuple[Annotated[float, Field(strict=True)], ...] | None = None
     # rows of nm and FWHM, of all bands of the file and the dropped ones
-    wavelengths_file: StrictStr | None = _key(None, _FILE)
+    wavelengths_file: StrictStr | None = None
     # rows of wavelengths_file that the file lacks, counted from 1
-    dropped_bands: tuple[StrictInt, ...] = _key((), _WHOLE)
-    nodata: Annotated[float, Field(strict=True)] | None = _key(None, "a number such as -9999 or 1e30")
+    dropped_bands: tuple[StrictInt, ...] = ()
+    nodata: Annotated[float, Field(strict=True)] | None = None
     # values = file's * scale + offset
-    scale: _Number = _key(1.0, "a number above 0 such as 0.0001", gt=0)
-    offset: _Number = _key(0.0, "a number such as -0.1")
+    scale: _Positive = 1.0
+    offset: _Number = 0.0
     # side of a pixel on the ground
-    pixel_m: _Number | None = _key(None, "a number of metres above 0 such as 0.05", gt=0)
+    pixel_m: _Positive | None = None
     # relative to scene.toml, with {number} or {name}; "" if there are none
-    labels: StrictStr | None = _key(None, _FILE)
-    unlabelled: _Value | None = _key(None, _A_CLASS)
+    labels: StrictStr | None = None
+    unlabelled: _Value | None = None
     # attribute of polygons with their class
-    class_attribute: StrictStr | None = _key(None, "the name of an attribute in quotes")
-    classes: dict[str, _Value] = _key({}, "a table of name = number or name = [r, g, b] in 0..255")
+    class_attribute: StrictStr | None = None
+    # number or colour of each
+    classes: dict[str, _Value] = {}
     # of classes on maps
-    colours: dict[str, tuple[_Channel, _Channel, _Channel]] = _key({}, "a table of name = [r, g, b] in 0..255")
+    colours: dict[str, tuple[_Channel, _Channel, _Channel]] = {}
 
     @model_validator(mode="after")
     def _agree(self) -> Self:
@@ -106,13 +99,8 @@ def load_scene_settings(path: Path) -> SceneSettings:
         return SceneSettings.model_validate({**content, "path": path})
     except ValidationError as error:
         first = error.errors()[0]
-    if not first["loc"]:
-        raise SceneError(f"{path} {first['msg'].removeprefix('Value error, ')}")
-    name = str(first["loc"][0])
-    value, expected = content[name], SceneSettings.model_fields[name].description
-    if name == "classes" and len(first["loc"]) > 1:
-        value, name, expected = value[first["loc"][1]], f"class {first['loc'][1]}", _A_CLASS
-    raise SceneError(f"{path}: {name} must be {expected}, got {value!r}")
+    key, why = ".".join(map(str, first["loc"][:2])), first["msg"].removeprefix("Value error, ")
+    raise SceneError(f"{path}: {key}: {why}, got {first['input']!r}; correct it" if key else f"{path} {why}")
 
 
 RANGE_NM = (200.0, 3000.0)
@@ -183,7 +171,10 @@ def _fit(
     belongs = own if len(values) == len(own) else list(range(file_bands))
     if len(values) != len(belongs):
         ways = f"{len(own)} or {file_bands}" if len(own) != file_bands else f"{file_bands}"
-        raise WavelengthError(f"{where}: expected {ways} wavelengths, one a band, got {len(values)}; correct the list")
+        raise WavelengthError(
+            f"{where}: expected {ways} wavelengths, one a band, got {len(values)}; correct the list (axes are y, x,"
+            " band)"
+        )
     known = dict(zip(belongs, values.tolist(), strict=True))
     missing = [band for band in chosen if band not in known]
     if missing:

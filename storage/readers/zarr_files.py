@@ -1,11 +1,11 @@
-"""Read cubes from Zarr stores: those of this project, and any array with dims y, x and band.
+"""List the arrays of Zarr stores, and ingest cubes as such stores.
 
 A store is checked before it is opened. Links out of it and codecs other than those of numbers (such as ``pickle``) are
 refused, so that reading never runs code of the store. A cube of files is ingested as one immutable store:
 
 ::
 
-    cube.zarr/values          (line, sample, band): whole numbers as uint8 or uint16 if they fit, else float32
+    cube.zarr/values          (line, sample, band): uint8, uint16 and int16 as in the file, else float32
     cube.zarr/wavelength      (band,) nm, fwhm beside it, if known
     cube.zarr/valid_line      (line,) false for lines that no file holds whole; time, exposure_ms, frame if known
     cube.zarr/dark, white     (sample, band) reference frames, if there are some
@@ -15,9 +15,10 @@ Attributes have file names without folders, sizes, SHA-256, header texts and not
 
 from __future__ import annotations
 
+import base64
 import json
-import math
 import os
+import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -30,12 +31,10 @@ from numpy.typing import NDArray
 from pipeline.errors import SceneError
 from storage.arrays.georeference import ON_THE_MAP, map_attributes, write_grid_mapping
 from storage.arrays.layout import create_array, create_group, image_spec, write_bands, write_counts, write_small
-from storage.readers.array_cubes import cube_source, dims_of, find_cube, names_beside
-from storage.readers.cube_sources import BLOCK_LINES, CubeSource, LineFacts, check_claim, check_memory, reading
+from storage.readers.array_cubes import Arrays, FileArray
+from storage.readers.cube_sources import BLOCK_LINES, CubeSource, LineFacts
 
-KIND = "ingested cube"  # of this project
-FRAMES = ("dark", "white")
-OF_LINES = ("valid_line", "time", "exposure_ms", "frame")
+INGESTED = "ingested cube"  # of this project
 METADATA = ("zarr.json", ".zarray", ".zgroup")
 _CHECKSUMS = {"crc32", "crc32c", "adler32", "fletcher32", "jenkins_lookup3"}
 _PACKERS = {"blosc", "zstd", "gzip", "zlib", "bz2", "lzma", "lz4", "pcodec", "zfpy", "packbits"}
@@ -55,53 +54,48 @@ def find_zarr_store(path: Path) -> Path | None:
     return None
 
 
-def open_zarr_cube(path: Path, variable: str | None = None, *, labels: bool = False) -> CubeSource:
-    """Open the only array with three axes, or the one that is named, as a cube.
+def zarr_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
+    """Return the arrays of a store by their names, and its attributes.
 
-    ``variable`` may end in a step of time (``values:3`` or ``3``). Wavelengths come from a coordinate of that name, or
-    from that of the band axis. Raises SceneError: the store is damaged, has no such array, unknown dims or a codec that
-    is not allowed, or claims far more than lies on the disk.
+    Raises SceneError: the store has a codec that is not allowed, links out of it, or is a survey's own product.
     """
-    path = find_zarr_store(path) or path
-    with reading(path, "Zarr"):
-        _check_store(path)
-        # consolidated metadata of a group are not used: only those of its members were checked
-        is_group = (path / ".zgroup").is_file() or (
-            (path / "zarr.json").is_file() and _read_json(path / "zarr.json").get("node_type") == "group"
+    _check_store(path)
+    # consolidated metadata of a group are not used: only those of its members were checked
+    is_group = (path / ".zgroup").is_file() or (
+        (path / "zarr.json").is_file() and _read_json(path / "zarr.json").get("node_type") == "group"
+    )
+    options: dict[str, Any] = {"use_consolidated": False} if is_group else {}
+    node = zarr.open(path, mode="r", **options)
+    if not isinstance(node, zarr.Group):
+        return {"": _file_array(path, node)}, {}
+    if "sweep" in node.attrs:
+        raise SceneError(f"{path} holds raw lines of a survey, which are on no map yet; survey them as --sweeps {path}")
+    if {"scores", "axes"} <= set(node.array_keys()):
+        raise SceneError(
+            f"{path} holds components of spectra; `spectralzoom export` writes its reflectance as an image, and "
+            "spectralzoom.open(ARCHIVE).latest.cube opens it in Python"
         )
-        options: dict[str, Any] = {"use_consolidated": False} if is_group else {}
-        node = zarr.open(path, mode="r", **options)
-        attributes = dict(node.attrs) if isinstance(node, zarr.Group) else {}
-        if "sweep" in attributes:
-            raise SceneError(
-                f"{path} holds raw lines of a survey, which are on no map yet; survey them as --sweeps {path}"
-            )
-        if isinstance(node, zarr.Group) and {"scores", "axes"} <= set(node.array_keys()):
-            raise SceneError(
-                f"{path} holds components of spectra; `spectralzoom export` writes its reflectance as an image, and "
-                "spectralzoom.open(ARCHIVE).latest.cube opens it in Python"
-            )
-        arrays: dict[str, Any] = dict(node.arrays()) if isinstance(node, zarr.Group) else {"": node}
-        cube = find_cube(arrays, variable, path, labels=labels)
-        for used in {cube.name, *names_beside(arrays), *({*FRAMES, *OF_LINES, *dims_of(cube.array)} & set(arrays))}:
-            one, stored = arrays[used], sum(file.stat().st_size for file in (path / used).rglob("*") if file.is_file())
-            check_claim(path / used, one.dtype.itemsize * max(math.prod(one.shape), math.prod(one.chunks)), stored)
-        parts = [BLOCK_LINES if axis == cube.order[0] else size for axis, size in enumerate(cube.array.shape)]
-        if cube.moment is not None:
-            parts[cube.moment[0]] = 1
-        numbers = 1
-        for size, chunk, part in zip(cube.array.shape, cube.array.chunks, parts, strict=True):
-            numbers *= min(-(-part // chunk) + 1, -(-size // chunk)) * chunk
-        check_memory(path, numbers * cube.array.dtype.itemsize)
-        source = cube_source(
-            path, cube, arrays, {**attributes, **dict(cube.array.attrs)}, lambda: reading(path, "Zarr")
-        )
-        source = replace(source, root=path, files=tuple(sorted(file for file in path.rglob("*") if file.is_file())))
-        return _with_own(source, arrays, attributes) if attributes.get("kind") == KIND else source
+    return {name: _file_array(path / name, array) for name, array in node.arrays()}, dict(node.attrs)
 
 
-def _with_own(source: CubeSource, arrays: dict[str, Any], attributes: dict[str, Any]) -> CubeSource:
-    """Add the lines, reference frames and bad bands of an ingested cube."""
+def _file_array(path: Path, array: zarr.Array[Any]) -> FileArray:
+    """Return an array of a store, with its no-data value as CF, xarray or Zarr has it."""
+    attributes = dict(array.attrs)
+    named, fill, kind = getattr(array.metadata, "dimension_names", None), attributes.get("_FillValue"), array.dtype.kind
+    if isinstance(fill, str) and kind == "f":  # of Zarr v3
+        attributes["_FillValue"] = float(struct.unpack("<d", base64.standard_b64decode(fill))[0])
+    elif fill is None and "_ARRAY_DIMENSIONS" in attributes and kind in "buif" and array.fill_value is not None:
+        attributes["_FillValue"] = float(array.fill_value)  # xarray's of v2
+    if named is not None:
+        attributes["_ARRAY_DIMENSIONS"] = list(named)
+    stored = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
+    return FileArray(
+        str(path), array.shape, array.dtype, attributes, lambda part: np.asarray(array[part]), array.chunks, stored
+    )
+
+
+def with_ingested(source: CubeSource, arrays: Arrays, attributes: Mapping[str, Any]) -> CubeSource:
+    """Return a cube with the lines, reference frames and bad bands of an ingested one."""
     lines, samples, bands = source.shape
 
     def known(name: str, *shape: int) -> NDArray[Any] | None:
@@ -174,10 +168,8 @@ def write_ingested_cube(
 
     ``report`` is called with the progress, 0..1. Raises SceneError: lines cannot be read.
     """
-    kind = stored_dtype(source, lambda done: report(0.3 * done))
-    sampled = source.dtype.kind in "ui" and source.dtype not in (np.uint8, np.uint16)
-    begin = 0.3 if sampled else 0.0
-    group = create_group(folder / "cube.zarr", f"{KIND} {name}", _attributes(source, files, name))
+    kind = source.dtype if source.dtype in (np.uint8, np.uint16, np.int16) else np.dtype(np.float32)
+    group = create_group(folder / "cube.zarr", f"{INGESTED} {name}", _attributes(source, files, name))
     about: dict[str, Any] = {"long_name": "numbers of the file", "units": "1", **_write_coordinates(group, source)}
     array = create_array(group, "values", image_spec(("line", "sample", "band"), source.shape, kind.str), about)
     for start in range(0, source.shape[0], BLOCK_LINES):
@@ -188,27 +180,12 @@ def write_ingested_cube(
         if not valid.all():
             block[~valid] = np.nan if kind.kind == "f" else 0
         array[start:stop] = block
-        report(begin + (1 - begin) * stop / source.shape[0])
-
-
-def stored_dtype(source: CubeSource, report: Report = lambda done: None) -> np.dtype[Any]:
-    """Return the type of the store: uint8 or uint16 if all values are such whole numbers, else float32."""
-    if source.dtype in (np.bool_, np.uint8):
-        return np.dtype(np.uint8)
-    if source.dtype == np.uint16 or source.dtype.kind == "f":
-        return np.dtype(np.uint16 if source.dtype == np.uint16 else np.float32)
-    for start in range(0, source.shape[0], BLOCK_LINES):
-        stop = min(start + BLOCK_LINES, source.shape[0])
-        lines = source.read(start, stop)
-        if lines.min() < 0 or lines.max() > np.iinfo(np.uint16).max:
-            return np.dtype(np.float32)
         report(stop / source.shape[0])
-    return np.dtype(np.uint16)
 
 
 def _attributes(source: CubeSource, files: Sequence[SourceFile], name: str) -> dict[str, Any]:
     facts: dict[str, Any] = {
-        "kind": KIND,
+        "kind": INGESTED,
         "name": name,
         "files": [asdict(file) for file in files],
         "headers": {file: text[:LONGEST_HEADER] for file, text in source.headers.items()},

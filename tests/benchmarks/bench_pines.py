@@ -108,7 +108,7 @@ def _choices(folder: Path) -> dict[str, Any]:
 
 
 def _open(folder: Path) -> Split:
-    from storage.readers.datasets import load_data_set
+    from flows.training.data import load_data_set
 
     files = load_data_set(folder / SCENE, **_choices(folder))
     train, test = files.load(Path(SCENE).stem, "train"), files.load(Path(SCENE).stem, "test")
@@ -193,9 +193,8 @@ def _settings() -> TrainingSettings:
 
 
 def _scene(folder: Path) -> RasterScene:
-    from flows.training.data import scene_of_file
+    from flows.training.data import load_data_set, scene_of_file
     from pipeline.geometry.camera import LineCamera
-    from storage.readers.datasets import load_data_set
 
     return scene_of_file(load_data_set(folder / SCENE).load(Path(SCENE).stem), LineCamera())
 

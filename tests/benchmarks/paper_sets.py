@@ -16,7 +16,7 @@ import numpy as np
 from measure import ROOT
 from numpy.typing import NDArray
 
-from flows.training.data import FARM_SHAPE, FARM_TRAIN_SEED, farm_days, read_farm_name, scene_of_file
+from flows.training.data import FARM_SHAPE, FARM_TRAIN_SEED, farm_days, load_data_set, read_farm_name, scene_of_file
 from models.network.sizes import SegmenterConfig
 from models.network.spectral import LineSpec, SpectralBasis, with_planes
 from models.training.capture_augmentation import CaptureAugmentation, ColumnNoise
@@ -29,7 +29,6 @@ from pipeline.geometry.grid import SceneGrid, block_means
 from pipeline.lazy import Once
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance
-from storage.readers.datasets import load_data_set
 
 SIDE, INPUTS = 1024, (4, 2)  # px; fine pixels a side of a coarse one
 FARM_SEEDS, TAUGHT_FARMS = (51, 52, 53), 12

@@ -119,13 +119,13 @@ def _zarr(folder: Path, version: int) -> str:
     return "a.zarr"
 
 
-def _netcdf(folder: Path, engine: Any) -> str:
+def _netcdf(folder: Path) -> str:
     import xarray as xr
 
     cube = xr.DataArray(_cube(), dims=("y", "x", "wl"), name="cube").astype("i4").to_dataset()
-    packing = {"cube": {"zlib": True, "chunksizes": (10, 6, 5)}} if engine == "h5netcdf" else {}
+    packing = {"cube": {"zlib": True, "chunksizes": (10, 6, 5)}}
     cube = cube.assign_coords(wl=("wl", np.linspace(400, 800, SHAPE[2]), {"units": "nm"}))
-    cube.to_netcdf(folder / "a.nc", engine=engine, encoding=packing)
+    cube.to_netcdf(folder / "a.nc", engine="h5netcdf", encoding=packing)
     return "a.nc"
 
 
@@ -157,8 +157,7 @@ FORMATS: dict[str, Callable[[Path], str]] = {
     "TIFF pages": _pages,
     "Zarr v2": lambda folder: _zarr(folder, 2),
     "Zarr v3": lambda folder: _zarr(folder, 3),
-    "NetCDF 4": lambda folder: _netcdf(folder, "h5netcdf"),
-    "NetCDF 3": lambda folder: _netcdf(folder, "scipy"),
+    "NetCDF 4": _netcdf,
     "JPEG 2000": _jpeg_2000,
 }
 

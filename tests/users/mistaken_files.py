@@ -36,7 +36,6 @@ def _pictures(here: Path, picture: np.ndarray) -> None:
     shutil.copy(here / "field.png", here / "FIELD_2.PNG")
     for name in ("a field.png", "Rüben.png", "two\nlines.png"):
         shutil.copy(here / "field.png", here / name)
-    Image.fromarray(np.dstack([picture, picture[..., :1]])).save(here / "transparent.png")
     Image.fromarray(picture[:1, :1]).save(here / "one_px.png")
     Image.fromarray(np.full_like(picture, 90)).save(here / "constant.png")
     (here / "cut.png").write_bytes((here / "field.png").read_bytes()[:200])
@@ -53,9 +52,6 @@ def _pictures(here: Path, picture: np.ndarray) -> None:
         "small_labels.png": labels[:20],
         "rgba_labels.png": np.dstack([labels * 255] * 3 + [np.full_like(labels, 255)]),
         "two_classes.png": labels,
-        "black.png": np.zeros_like(labels),
-        "strange_colour.png": np.dstack([labels * 255, labels * 0, labels * 0]),
-        "soft.png": picture,
     }.items():
         Image.fromarray(values).save(here / name)
     Image.fromarray(np.dstack([labels * 255, labels * 90, labels * 0])).resize((32, 24)).save(here / "labels.jpg")
@@ -68,22 +64,18 @@ def _arrays(here: Path, cube: np.ndarray) -> None:
         "cube": cube,
         "band_first": np.moveaxis(cube, 2, 0),
         "float_labels": np.full(CUBE[:2], 0.5),
-        "whole_float_labels": np.round(cube[..., 0]),
         "negative": cube - 0.5,
         "percent": cube * 100,
         "scaled": (cube * 10000).astype(np.uint16),
         "holes": holes,
         "nothing": np.full(CUBE, np.nan),
-        "infinite": np.full(CUBE, np.inf),
         "filled": np.where(cube > 0.9, 1e30, cube),
-        "row": cube[0, 0],
         "plane": cube[..., 0],
         "table": np.ones((198, 10000), np.float32),
         "five_axes": np.ones((2, 2, 3, 3, 2)),
         "complex": cube.astype(np.complex64),
         "series": np.stack([cube, cube + 1, cube + 2]),
         "empty": np.ones((0, 16, 5)),
-        "words": np.array([["soil", "crop"]]),
     }.items():
         np.save(here / f"{name}.npy", values)
     np.save(here / "objects.npy", np.array([{"soil": 1}], object), allow_pickle=True)
@@ -95,9 +87,7 @@ def _arrays(here: Path, cube: np.ndarray) -> None:
 def _containers(here: Path, cube: np.ndarray) -> None:
     with h5py.File(here / "bare.h5", "w") as file:
         file["cube"] = cube
-    with h5py.File(here / "two.h5", "w") as file:
-        file["one"] = file["two"] = cube
-    (here / "cut.nc").write_bytes((here / "two.h5").read_bytes()[:900])
+    (here / "cut.nc").write_bytes((here / "bare.h5").read_bytes()[:900])
     scipy.io.savemat(here / "one_cube.mat", {"cube": cube, "wl": np.arange(5.0), "day": 130})
     scipy.io.savemat(here / "with_nm.mat", {"cube": cube, "wavelengths": [0.46, 0.55, 0.64, 0.7, 0.8]})
     scipy.io.savemat(here / "table.mat", {"X": np.ones((198, 10000), np.float32), "y": np.arange(198.0)})

@@ -138,10 +138,6 @@ def test_init_sees_the_dates_of_a_series(tmp_path: Path, command_line: Any) -> N
     series = tmp_path / "series.npy"
     assert f"note: {series} has 5 steps of time; each is a scene, {series}:0 to {series}:4" in ended.out
     assert f"then: spectralzoom train {series}:0 " in ended.out
-    toml = (tmp_path / "scene.toml").read_text()
-    (tmp_path / "scene.toml").write_text("wavelengths_nm = [460, 550, 640]\n" + toml)
-    trained = command_line("train", f"{series}:0", "-o", tmp_path / "w.safetensors", *SMALL)
-    assert trained.code == 0, trained.err
 
 
 @pytest.mark.parametrize("way", ["list", "file"])
@@ -163,16 +159,6 @@ def test_init_names_the_wavelengths_that_its_next_command_needs(
     (tmp_path / "bands.txt").write_text("460 10\n550 10\n640 10\n")
     trained = command_line(*shlex.split(told["next"])[1:], *SMALL)
     assert trained.code == 0, trained.err
-
-
-def test_init_asks_nothing_before_a_command_that_runs(tmp_path: Path, command_line: Any) -> None:
-    """Pictures have the wavelengths of their colours: what comes next is the training."""
-    for number in (1, 2):
-        Image.fromarray(image().astype(np.uint8)).save(tmp_path / f"{number}.png")
-        Image.fromarray(CLASSES).save(tmp_path / f"{number}_mask.png")
-    ended = command_line("init", tmp_path)
-    assert f"next: spectralzoom train {tmp_path} " in ended.out
-    assert "first:" not in ended.out
 
 
 @pytest.mark.parametrize("there", [False, True])

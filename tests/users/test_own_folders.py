@@ -11,18 +11,14 @@ import numpy as np
 import pytest
 import rasterio
 from affine import Affine
-from hypothesis import given
-from hypothesis import strategies as st
 from PIL import Image
 
 from flows.evaluate.frames import EvaluateRequest, open_candidates, open_frames, sort_frames
 from flows.settings.load import load_settings
 from flows.tasks.scene import open_scene
-from flows.training.data import alike_notes, open_training_data
+from flows.training.data import alike_notes, load_data_set, open_training_data
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
-from pipeline.readings import edge_fill
-from storage.readers.datasets import load_data_set
 from storage.readers.scene_files import load_scene_file
 from storage.readers.scene_toml import load_scene_settings
 from tests.flows.conftest import command_line
@@ -73,19 +69,6 @@ def test_init_keeps_what_is_there(made: Path, command_line: Any) -> None:
     assert (made / "soft" / "scene.toml").read_text() == "nodata = 0\n"
 
 
-def test_init_says_what_fills_the_edge(tmp_path: Path, command_line: Any) -> None:
-    """A number that no reading is becomes nodata; black at the edge is a question, and stays a comment."""
-    cube = np.random.default_rng(0).uniform(0.1, 1, (20, 20, 3)).astype(np.float32)
-    cube[:6] = -9999
-    np.save(tmp_path / "a.npy", cube)
-    command_line("init", tmp_path / "a.npy")
-    assert load_scene_settings(tmp_path / "scene.toml").nodata == -9999
-    np.save(tmp_path / "a.npy", np.where(cube < 0, 0, cube))
-    command_line("init", tmp_path / "a.npy", "--force")
-    assert load_scene_settings(tmp_path / "scene.toml").nodata is None
-    assert "# nodata = 0.0" in (tmp_path / "scene.toml").read_text()
-
-
 def test_init_tells_what_it_could_not_see(made: Path, command_line: Any) -> None:
     """Images without labels, labels without images, other sizes and bands, one class, and unknown wavelengths."""
     for folder, words in {
@@ -100,15 +83,6 @@ def test_init_tells_what_it_could_not_see(made: Path, command_line: Any) -> None
     told = json.loads(command_line("init", made / "cube.npy", "--json", "--force").out)["unseen"]
     assert "the wavelengths of 5 bands" in told
     (made / "scene.toml").unlink()
-
-
-@given(st.integers(0, 40), st.sampled_from([0.0, -9999.0, 1e30]))
-def test_what_fills_a_tenth_of_the_edge_is_told(filled: int, value: float) -> None:
-    """Values of all bands count, and no others; below a tenth nothing is told."""
-    edge = np.random.default_rng(1).uniform(1, 2, (40, 3))
-    edge[:filled] = value
-    edge[filled:, 0] = value  # of one band alone
-    assert edge_fill(edge) == (None if filled < 4 else (value, filled / 40))
 
 
 def test_training_leaves_out_and_says_so(made: Path, tmp_path: Path, command_line: Any) -> None:
@@ -178,12 +152,3 @@ def test_frames_of_one_class_are_told_when_weights_are_judged(made: Path, weight
     data = open_frames(str(made / "soil"), (), None, LineCamera(), choices)
     jobs = sort_frames(EvaluateRequest(str(made / "soil"), (weights,)), data, candidates, lambda *words: None)
     assert alike_notes(jobs.alike)[0].startswith("all labels are class_0 in 001, 002; if its value")
-
-
-def test_labels_that_are_all_alike_are_questioned(made: Path) -> None:
-    """One value may be what nobody labelled: the scene says so, and what to write."""
-    scene = load_scene_file(made / "field.png", labels=made / "black.png")
-    assert any("all labels are class_0: if 0 in the label file" in note for note in scene.provenance)
-    assert not any(
-        "all labels" in note for note in load_scene_file(made / "field.png", labels=made / "two_classes.png").provenance
-    )

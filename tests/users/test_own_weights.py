@@ -91,15 +91,6 @@ def test_a_score_on_a_scene_of_the_training_says_so_in_its_sentence(
     assert "*" not in command_line("ls", tmp_path / "b").out
 
 
-def test_a_field_of_tiles_tells_that_some_are_scenes_of_the_training(
-    made: Path, tmp_path: Path, command_line: Any
-) -> None:
-    """Three of the four tiles taught the weights."""
-    said, receipt = survey(command_line, made, made / "field" / "images", tmp_path / "a")
-    assert "against the labels on a field with tiles of the training" in said
-    assert receipt["training_scene"] == "tiles"
-
-
 def test_what_training_writes_of_13_bands_opens(made: Path) -> None:
     """No band reaches a column between 1610 and 2190 nm, so that its variance is 0; it is familiar all the same."""
     familiar = load_ood(made / "w.safetensors")

@@ -39,6 +39,7 @@ from tests.conftest import Survey, WeightsMaker, patchy_scene, random_weights
 from tests.flows.conftest import CommandLine, be_version, command_line
 from tests.flows.tasks.test_survey_rig import emulated
 from tests.prior_work import without_effects
+from tests.storage.readers.test_recordings import write_envi_cube
 
 __all__ = ["command_line"]
 pytestmark = pytest.mark.usefixtures("no_effects")
@@ -205,18 +206,10 @@ def raw_cubes(full_scan: tuple[Path, Published, Path]) -> list[Path]:
 
 def write_pushbroom(folder: Path, values: NDArray[np.uint16]) -> Path:
     """A cube (line, sample, band) of a straight scan as ENVI, with dark and white frames and no pointing."""
-    _, samples, bands = values.shape
     folder.mkdir()
-    fields = f"bands = {bands}\ninterleave = bil\nbyte order = 0\nwavelength units = nm\n"
-    fields += "wavelength = {640, 550, 460}\n"
-    for name, frame in (
-        ("scan", values),
-        ("scan.dark", np.full((1, samples, bands), 60, np.uint16)),
-        ("scan.white", np.full((1, samples, bands), 3500, np.uint16)),
-    ):
-        head = f"ENVI\nsamples = {samples}\nlines = {len(frame)}\ndata type = 12\n{fields}"
-        (folder / f"{name}.hdr").write_text(head)
-        (folder / f"{name}.img").write_bytes(frame.astype("<u2").transpose(0, 2, 1).tobytes())
+    dark, white = (np.full((1, *values.shape[1:]), level, np.uint16) for level in (60, 3500))
+    for name, numbers in (("scan", values), ("scan.dark", dark), ("scan.white", white)):
+        write_envi_cube(folder / name, numbers, ".img", wavelength="{640, 550, 460}")
     return folder
 
 
@@ -337,50 +330,6 @@ def test_source_without_sweeps(command_line: CommandLine, tmp_path: Path) -> Non
     command_line("survey", "--source", "recorded", "--scene", "field", "--out", tmp_path / "a").refused(
         2, "source = 'recorded' reads sweeps that were taken before; give --sweeps"
     )
-
-
-def test_what_is_missing_is_assumed_and_said(
-    command_line: CommandLine, tmp_path: Path, pushbroom: tuple[Path, NDArray[np.uint16]], weights: Path
-) -> None:
-    """Without dark and white frames, and cut off after two thirds, a cube is surveyed; notes say what was taken for."""
-    folder, _ = pushbroom
-    for frame in ("dark", "white"):
-        (folder / f"scan.{frame}.hdr").unlink()
-    content = (folder / "scan.img").read_bytes()
-    (folder / "scan.img").write_bytes(content[: len(content) * 2 // 3])
-    flags = ("--weights", weights, "--engine", "plain", "--out", tmp_path / "a", "--json")
-    ended = command_line("survey", "--sweeps", folder / "scan.hdr", *flags)
-    assert ended.code == 0, ended.err
-    notes = " ".join(json.loads(ended.out)["settings"]["notes"])
-    for words in (
-        "is cut off: 64 of 96 lines are whole",
-        "a dark level of 0 is assumed; give --dark",
-        "full scale (4095 DN) is assumed to be white",
-        "nothing says the exposure: 100 ms is assumed",
-    ):
-        assert words in notes
-
-
-def test_init_drafts_what_the_files_do_not_say(
-    command_line: CommandLine, tmp_path: Path, pushbroom: tuple[Path, NDArray[np.uint16]], weights: Path
-) -> None:
-    """A folder of sweeps gives a survey.toml that says what is missing, and its next command surveys it."""
-    folder, _ = pushbroom
-    ended = command_line("init", folder, "--json")
-    assert ended.code == 0, ended.err
-    told = json.loads(ended.out)
-    assert (told["sweeps"], told["lines"], told["bands"]) == (["scan.hdr"], 96, 3)
-    text = (folder / "survey.toml").read_text()
-    assert '# pointing = "pointing.csv"   # where each line looked, a row a line; without it one straight' in text
-    assert "# the dark frame is here" in text
-    words = shlex.split(told["next"])[1:]
-    words[words.index("WEIGHTS.safetensors")] = str(weights)
-    surveyed = command_line(*words, "--engine", "plain", "--out", tmp_path / "a", "--json")
-    assert surveyed.code == 0, surveyed.err
-    assert json.loads(surveyed.out)["recording"]["lines_read"] == 96
-    command_line("init", folder).refused(2, r"survey\.toml exists; .*--force")
-    assert command_line("init", folder, "--force").code == 0
-    assert (folder / "survey.toml.old").read_text() == text
 
 
 def test_ingest_names_the_survey_as_the_next_step(

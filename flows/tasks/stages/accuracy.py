@@ -43,7 +43,7 @@ from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table
 from storage.archive.whole_files import to_json
 from storage.arrays.class_maps import load_class_map
-from storage.readers.raster_fields import RasterPixels, patches_of
+from storage.readers.scene_files import RasterPixels
 
 RECORD = "accuracy.json"
 ACCURACY = Product("evaluate", version=12, files=(RECORD,), by_weights=True)
@@ -183,12 +183,19 @@ def columns_of_raster(
 
     The shape is (patch, p, p, column), float32, of the padded grid; nodata is 0. ``memory`` is in bytes.
     """
-    p, valid, done = raster.grid.patch, raster.grid.valid_patches(), 0
-    columns = np.zeros((int(np.prod(raster.grid.patch_shape)), p, p, weights.basis.columns), np.float32)
-    for values, _ in patches_of(raster, valid, memory=memory):
-        patch_index = valid[done : done + len(values)]
-        columns[patch_index] = np.nan_to_num(weights.columns(values, wavelength_nm), nan=0.0)
-        done += len(values)
+    grid = raster.grid
+    p, (down, across), valid = grid.patch, grid.patch_shape, grid.valid_patches()
+    row, column = np.divmod(valid, across)
+    columns = np.zeros((down * across, p, p, weights.basis.columns), np.float32)
+    deep = raster.rows_at_once(memory) // p
+    for first in range(0, down, deep):
+        here = (row >= first) & (row < first + deep)
+        if here.any():
+            pixels = raster.rows(first * p, min((int(row[here].max()) + 1) * p, grid.height))
+            beyond = [(0, -len(pixels) % p), (0, across * p - grid.width), (0, 0)]
+            cut = np.pad(pixels, beyond, mode="edge").reshape(-1, p, across, p, raster.bands).swapaxes(1, 2)
+            values = cut[row[here] - first, column[here]]
+            columns[valid[here]] = np.nan_to_num(weights.columns(values, wavelength_nm), nan=0.0)
     return columns
 
 

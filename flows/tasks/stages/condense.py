@@ -41,7 +41,7 @@ from storage.arrays.cubes import RawCube, SweepHeader, open_raw_cubes, read_stat
 from storage.arrays.layout import SHARD_ROWS, numbers_in_memory
 from storage.arrays.mosaics import MosaicWriter
 from storage.arrays.signal_cubes import LineRows, SignalCubeWriter
-from storage.readers.raster_fields import RasterPixels
+from storage.readers.scene_files import RasterPixels
 
 SIGNAL = Product("condense", version=1)
 SIGNAL_FINE = Product("condense_fine", version=2)

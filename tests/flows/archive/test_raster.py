@@ -23,10 +23,9 @@ from flows.archive.product_choice import ProductFlags, choose_products
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from flows.terminal.figures import format_area, format_count
-from pipeline.errors import PipelineError, SceneError, SettingsError
+from pipeline.errors import SceneError, SettingsError
 from storage.archive.archive import Archive
 from storage.arrays.mosaics import open_mosaic
-from storage.readers.raster_fields import open_raster
 from storage.remote.opening import verify_archive
 from tests.conftest import RGB_NM, patchy_scene
 
@@ -231,83 +230,10 @@ def test_a_raster_larger_than_its_memory(surveyed: Raster, tmp_path: Path) -> No
         surveyed(tmp_path / "wide.tif", wavelengths="640,550,460", memory="512MiB")
 
 
-def tiles_in(folder: Path, values: NDArray[Any], cut: int = 30, **about: Any) -> Path:
-    """Cut a raster into a left and a right tile, which overlap by 4 px."""
-    folder.mkdir()
-    write_tif(folder / "a.tif", values[:, :cut], **about)
-    write_tif(folder / "b.tif", values[:, cut - 4 :], CORNER * Affine.translation(cut - 4, 0), **about)
-    return folder
-
-
-@pytest.mark.parametrize("pattern", ["tiles", "tiles/*.tif"])
-def test_tiles_side_by_side_are_one_field(surveyed: Raster, tmp_path: Path, pattern: str) -> None:
-    """A folder or a glob of tiles gives the map of the whole raster, on its grid."""
-    values = patchy_scene((40, 64), 3, seed=6)[0]
-    tiles_in(tmp_path / "tiles", values)
-    published = surveyed(tmp_path / pattern, wavelengths="640,550,460")
-    np.testing.assert_allclose(whole(published, tmp_path / "archive")[0], values, atol=rounding(values))
-    assert published.receipt["survey"] == "tiles"
-    notes = " ".join(published.receipt["settings"]["notes"])
-    assert "2 tiles of one grid are one field: a.tif, b.tif" in notes
-    assert "of 160 pixels that several tiles show, the first by name wins" in notes
-    store = xarray.open_zarr(tmp_path / "archive" / published.receipt["products"]["class_map"], consolidated=False)
-    assert (float(store["x"][0]), float(store["y"][0])) == (500_000.25, 5_399_999.75)
-
-
-def test_a_tiles_gap_shows_the_tile_below_and_what_no_tile_shows_is_missing(surveyed: Raster, tmp_path: Path) -> None:
-    """The first tile wins where it has a value; between tiles there is no class."""
-    values = patchy_scene((40, 64), 3, seed=6)[0]
-    first = values[:, :30].copy()
-    first[:, 26:] = -1  # no data where the second shows the ground
+@pytest.mark.parametrize("address", ["tiles", "tiles/*.tif"])
+def test_tiles_have_to_be_one_file(surveyed: Raster, tmp_path: Path, address: str) -> None:
+    """A folder or a pattern is refused; what the message says makes one file of them."""
     (tmp_path / "tiles").mkdir()
-    write_tif(tmp_path / "tiles" / "a.tif", first[:20], nodata=-1)
-    write_tif(tmp_path / "tiles" / "b.tif", values[:, 26:], CORNER * Affine.translation(26, 0))
-    image = whole(surveyed(tmp_path / "tiles", wavelengths="640,550,460"), tmp_path / "archive")[0]
-    expected = values.copy()
-    expected[20:, :26] = np.nan
-    np.testing.assert_allclose(image, expected, atol=rounding(values))
-
-
-def _other_crs(folder: Path, values: NDArray[Any]) -> None:
-    with rasterio.open(
-        folder / "b.tif",
-        "w",
-        driver="GTiff",
-        height=8,
-        width=8,
-        count=3,
-        dtype="float32",
-        transform=CORNER,
-        crs="EPSG:32633",
-    ) as file:
-        file.write(np.moveaxis(values[:8, :8], -1, 0))
-
-
-@pytest.mark.parametrize(
-    ("spoil", "match"),
-    [
-        (_other_crs, r"lie in EPSG:32632 and EPSG:32633: tiles of one field have one CRS"),
-        (lambda at, v: write_tif(at / "b.tif", v, CORNER * Affine.scale(2)), r"have pixels of 0.5 x 0.5 and 1 x 1"),
-        (lambda at, v: write_tif(at / "b.tif", v, CORNER * Affine.translation(8.4, 0)), r"lie 0.40 and 0.00 px"),
-        (lambda at, v: write_tif(at / "b.tif", v, None), r"b.tif has none: survey them one by one"),
-    ],
-)
-def test_tiles_that_are_no_field_are_refused(
-    surveyed: Raster, tmp_path: Path, spoil: Callable[[Path, NDArray[Any]], object], match: str
-) -> None:
-    """Another CRS, pixel, grid or band, or no place: one message names the tiles and what to do."""
-    values = patchy_scene((16, 16), 3, seed=1)[0]
-    (tmp_path / "tiles").mkdir()
-    write_tif(tmp_path / "tiles" / "a.tif", values)
-    spoil(tmp_path / "tiles", values)
-    with pytest.raises(PipelineError, match=match):
-        surveyed(tmp_path / "tiles", wavelengths="640,550,460")
-
-
-def test_tiles_of_other_bands_are_refused(tmp_path: Path) -> None:
-    """A colour picture and a grey one are no field; the message names both."""
-    values = patchy_scene((16, 16), 3, seed=1)[0].astype(np.uint8)
-    write_tif(tmp_path / "a.tif", values, photometric="RGB")
-    write_tif(tmp_path / "b.tif", values[..., :1])
-    with pytest.raises(SceneError, match=r"a.tif and .*b.tif have other bands, 3 from 640.0 nm on and 1 from 550.0 nm"):
-        open_raster(tmp_path)
+    write_tif(tmp_path / "tiles" / "a.tif", patchy_scene((16, 16), 3, seed=1)[0])
+    with pytest.raises(SceneError, match=r"make one file first: rio merge tiles/\*\.tif field\.tif"):
+        surveyed(tmp_path / address, wavelengths="640,550,460")

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
-from pipeline.capture.straight_scans import PlayedVector, angles_to_positions, split_vector
-from pipeline.errors import SceneError
+from pipeline.capture.straight_scans import angles_to_positions
 from pipeline.geometry.mirror import REST_TANGENT, direction_to_scene, position_to_direction
 
 
@@ -33,27 +31,3 @@ def test_angles_beyond_the_mirror_are_told() -> None:
     positions, reached = angles_to_positions(angles)
     assert reached.tolist() == [False, True, False, False, False]
     assert np.isnan(positions[~reached]).all()
-
-
-def test_a_played_vector_holds_each_cell_for_its_time() -> None:
-    """At 10 cells a second and a start 0.05 s before: 0.04 s is still cell 0, 0.06 s cell 1; outside the ends stand."""
-    vector = PlayedVector(np.array([[0.0, 0.1], [0.2, 0.3], [0.4, 0.5]]), 10.0, 0.05)
-    position, played = vector.at(np.array([-0.06, 0.04, 0.06, 0.24, 0.26]))
-    assert played.tolist() == [False, True, True, True, False]
-    np.testing.assert_array_equal(position[:, 0], [0.0, 0.0, 0.2, 0.4, 0.4])
-
-
-def test_a_vector_in_one_memory_has_x_before_y() -> None:
-    """1450 cells of X, then 1450 of Y; two columns are X and Y; a row is read as a column."""
-    x, y = np.linspace(-0.2, 0.2, 1450), np.linspace(0, 0.1, 1450)
-    expected = np.stack([x, y], axis=-1)
-    one = np.concatenate([x, y])
-    for values in (one, one[None], one[:, None], expected):
-        np.testing.assert_array_equal(split_vector(values, "file"), expected)
-
-
-@pytest.mark.parametrize("values", [np.zeros(3), np.zeros((4, 3)), np.zeros(0)])
-def test_numbers_that_are_no_vector_are_refused(values: np.ndarray) -> None:
-    """An odd number of cells, three columns, and nothing at all."""
-    with pytest.raises(SceneError, match="expected two columns X and Y, or one column with all X before all Y"):
-        split_vector(values, "file")

@@ -12,10 +12,9 @@ from affine import Affine
 from numpy.typing import NDArray
 from pyproj import Transformer
 
+from flows.training.data import load_data_set
+from flows.training.init_command import draft_scene
 from pipeline.errors import SceneError
-from storage.readers.datasets import load_data_set
-from storage.readers.raster_fields import open_raster
-from storage.readers.scene_drafts import draft_scene
 from storage.readers.scene_files import load_scene_file, open_scene_file
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")
@@ -116,8 +115,8 @@ def test_labels_of_another_place(tmp_path: Path) -> None:
     assert any("left out" in note and "do not lie on the scene" in note for note in scene.provenance)
 
 
-def test_labels_of_tiles_and_a_training_mask(tmp_path: Path) -> None:
-    """Labels of a field of tiles, and a mask of where to train, are brought to the scene's pixels as well."""
+def test_a_training_mask_on_another_grid(tmp_path: Path) -> None:
+    """A mask of where to train is brought to the scene's pixels as well."""
     path = image(tmp_path)
     south_up = Affine(1, 0, WEST, 0, 1, NORTH - SIDE)
     labels = write(tmp_path / "truth.tif", np.ascontiguousarray(CLASSES[::-1]), south_up)
@@ -126,14 +125,6 @@ def test_labels_of_tiles_and_a_training_mask(tmp_path: Path) -> None:
     train = data.load("field", "train").labels
     assert train is not None
     np.testing.assert_array_equal(train != 255, CLASSES == 1)
-    (tiles := tmp_path / "tiles").mkdir()
-    (tiles / "scene.toml").write_text("wavelengths_nm = [800]\n")
-    for number, left in enumerate((0, 30)):
-        part = np.ascontiguousarray(CLASSES[:, left : left + 30] * np.uint8(10) + np.uint8(5))
-        write(tiles / f"{number}.tif", part, NORTH_UP * Affine.translation(left, 0))
-    field = open_raster(tiles, labels=labels)
-    assert agree(field) == 1.0
-    assert any("other or turned pixels" in note for note in field.provenance)
 
 
 @pytest.mark.parametrize("turned", [False, True])

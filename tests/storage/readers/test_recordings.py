@@ -172,18 +172,6 @@ def test_a_table_cuts_one_cube_into_sweeps(files: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(back.read(0, 38), cube.read(42, 80))
 
 
-def test_a_played_vector_beside_a_cube(files: Path) -> None:
-    """80 cells at the camera's rate place each line in its own cell."""
-    table = (files / "scan-0.pointing.csv").read_text().splitlines()[1:]
-    cells = [[float(word) for word in row.split(",")[2:4]] for row in table]
-    (files / "scan-0.pointing.csv").unlink()
-    np.savetxt(files / "path.csv", np.array(cells), delimiter=",", fmt="%.17g")
-    (files / "scan-0.pointing.toml").write_text('vector = "path.csv"\nrate_hz = 10\n')
-    recording = open_recording(files, CAMERA)
-    np.testing.assert_array_equal(recording.sweeps[0].position, cells)
-    assert recording.sweeps[0].valid_line.all()
-
-
 def write_envi_cube(stem: Path, values: NDArray[Any], ending: str = "", **fields: object) -> None:
     """An ENVI cube in BIL with a header of given fields."""
     lines, samples, bands = values.shape
@@ -212,7 +200,6 @@ VALUES = np.random.default_rng(0).integers(100, 4000, (6, 16, 3)).astype("<u2")
     [
         (lambda stem: write_envi_cube(stem, VALUES, interleave=None), SceneError, "no interleave, expected one of bil"),
         (lambda stem: write_envi_cube(stem, VALUES, interleave="bpl"), SceneError, "interleave = 'bpl', expected one"),
-        (lambda stem: write_envi_cube(stem, VALUES, byte_order=1), SceneError, "has the wrong byte order: 9"),
         (
             lambda stem: write_envi_cube(stem, VALUES, wavelength=None),
             WavelengthError,
@@ -233,10 +220,10 @@ VALUES = np.random.default_rng(0).integers(100, 4000, (6, 16, 3)).astype("<u2")
 def test_a_cube_that_cannot_be_used_says_why(
     tmp_path: Path, write: Callable[[Path], None], error: type[PipelineError], message: str
 ) -> None:
-    """Interleave, byte order, wavelengths and types: each fault has its own message."""
+    """Interleave, wavelengths and types: each fault has its own message."""
     write(tmp_path / "cube")
     with pytest.raises(error) as caught:
-        open_recording(tmp_path / "cube.hdr")
+        open_recording(tmp_path / "cube.hdr").sweeps[0].read_lines(np.arange(6))
     assert message in str(caught.value)
 
 

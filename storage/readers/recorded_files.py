@@ -1,8 +1,8 @@
-"""Read the pointing of recorded lines: a table with a row for each line, or a vector that the mirror played.
+"""Find the cubes of recordings, their dark and white frames, and the pointing of their lines.
 
-A table is CSV (commas, semicolons or tabs) or Parquet. Optional columns are ``line`` (from 0), ``sweep``,
-``time`` (of mid exposure since the start of the sweep) [s], ``exposure_ms`` and ``valid`` (0 or 1). A table has exactly
-one of these kinds of pointing:
+Pointing is a table with a row for each line: CSV (commas, semicolons or tabs). Optional columns are ``line`` (from 0),
+``sweep``, ``time`` (of mid exposure since the start of the sweep) [s], ``exposure_ms`` and ``valid`` (0 or 1). A table
+has exactly one of these kinds of pointing:
 
 ::
 
@@ -11,37 +11,174 @@ one of these kinds of pointing:
     angle_deg                  viewing angle along the scan, of a scan through the undeflected direction
     position_px                place along a straight scan without a mirror: stage, conveyor, drone
     position_m                 the same in metres
-
-A vector is a TOML file, for a path that the mirror played by its own clock::
-
-    vector = "positions.csv"   # CSV or .npy: two columns X and Y, or all X before all Y in one
-    rate_hz = 14.5             # cells a second
-    start_s = 0.0              # time of the path at the first line's exposure; 0 by default
 """
 
 from __future__ import annotations
 
 import csv
 import math
-import re
-import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.capture.straight_scans import PlayedVector, angles_to_positions, split_vector
-from pipeline.errors import PoseError, SceneError
-from pipeline.geometry.mirror import RIM_SLACK, STRAIGHT, Mounting, check_reach
-from pipeline.lazy import deferred
+from pipeline.capture.straight_scans import angles_to_positions
+from pipeline.errors import SceneError, WavelengthError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import RIM_SLACK, STRAIGHT, Mounting
+from pipeline.rig.camera.camera_texts import listed_numbers
+from pipeline.signal.calibrate import find_bad_elements
+from pipeline.source import References
+from storage.readers.cube_sources import CubeSource
+from storage.readers.envi_files import DATA_ENDINGS, find_envi_pair, find_reference, load_envi_header
+from storage.readers.open_cubes import load_frame, open_cube, reader_of, with_wavelengths
+from storage.readers.zarr_files import find_zarr_store
 
-if TYPE_CHECKING:
-    from pyarrow import parquet  # type: ignore[import-untyped]
-else:
-    parquet = deferred("pyarrow.parquet")
+FRAMES = ("dark", "white", "bad", "flat")  # behind the name of a cube in those of its frames
+SAMPLED_LINES = 16  # for bits
+
+
+@dataclass(frozen=True)
+class RecordedFile:
+    """One cube of a recording."""
+
+    name: str
+    path: Path
+    source: CubeSource
+
+    @property
+    def folder(self) -> Path:
+        """Return the folder of its pointing and frames."""
+        return self.path if self.path.is_dir() and find_zarr_store(self.path) is None else self.path.parent
+
+
+def find_cubes(path: Path) -> list[Path]:
+    """Return the cubes of an address: itself, or the ENVI cubes or Zarr stores of a folder (SceneError: none)."""
+    if not path.is_dir() or find_zarr_store(path) is not None:
+        return [path]
+    headers = sorted(entry for entry in path.iterdir() if entry.suffix.lower() == ".hdr" and entry.is_file())
+    if any(entry.name.lower().startswith("raw_") for entry in headers):
+        return [path]  # parts of a Headwall camera's cube
+    stems = [(entry, _stem(entry).lower()) for entry in headers]
+    cubes = [
+        entry
+        for entry, stem in stems
+        if not stem.startswith(("dark", "white")) and stem.rpartition(".")[2] not in FRAMES
+    ]
+    stores = sorted(entry for entry in path.iterdir() if entry.is_dir() and find_zarr_store(entry) == entry)
+    if not cubes and not stores:
+        raise SceneError(f"{path} holds no cube; expected ENVI headers (.hdr), raw_<frame> files or Zarr stores in it")
+    return cubes or stores
+
+
+def _stem(path: Path) -> str:
+    """Return the name of a cube without the endings of its files."""
+    stem = path.name.removesuffix(path.suffix) if path.suffix.lower() == ".hdr" else path.name
+    ending = Path(stem).suffix
+    return stem.removesuffix(ending) if ending.lower() in (*filter(None, DATA_ENDINGS), ".zarr") else stem
+
+
+def open_recorded_cube(path: Path, wavelengths: Sequence[float] | None) -> RecordedFile:
+    """Open one cube of whole numbers with wavelengths."""
+    source = open_cube(path)
+    if source.dtype not in (np.uint8, np.uint16, np.int16):
+        raise SceneError(
+            f"{path} holds {source.dtype}, expected a camera's own numbers (whole, 8 or 16 bits); a cube of "
+            "reflectance or radiance is no recording: give it as --scene"
+        )
+    if wavelengths is not None:
+        source = with_wavelengths(source, path, wavelengths)
+    if source.bands.wavelength_nm is None:
+        raise WavelengthError(
+            f"{path} has {source.shape[2]} bands and nothing says their wavelengths; give --wavelengths in nm, or "
+            "write a list 'wavelength' into its header"
+        )
+    return RecordedFile(_stem(path), path, source)
+
+
+def with_bits(camera: LineCamera, cubes: Sequence[RecordedFile], notes: list[str]) -> LineCamera:
+    """Return the camera with as many bits as some lines of each cube need."""
+    bits = camera.bits
+    for cube in cubes:
+        valid = np.flatnonzero(cube.source.valid)
+        chosen = valid[:: max(len(valid) // SAMPLED_LINES, 1)][:SAMPLED_LINES]
+        most = max(int(cube.source.read(int(line), int(line) + 1).max()) for line in chosen)
+        full = camera.full_scale_dn * max(camera.samples // cube.source.shape[1], 1)
+        needed = (most * camera.full_scale_dn // full).bit_length()
+        if most > full and needed > bits:
+            bits = needed
+            notes.append(
+                f"{cube.name}: numbers reach {most}, so {bits} bits are taken for camera.bits; if the camera has"
+                " fewer, correct the byte order in the header"
+            )
+    return replace(camera, bits=bits)
+
+
+def find_references(
+    source: CubeSource,
+    stem: Path,
+    camera: LineCamera,
+    notes: list[str],
+    *,
+    stated: dict[str, Path | None],
+    white_reference: NDArray[np.float32],
+) -> References:
+    """Return the reference frames of a cube: ``stated``, else ``stem.dark.hdr`` etc., else those of the folder.
+
+    ``white_reference`` is the default value of the white reference, one or (band,). Raises SceneError: a frame has
+    other samples or bands than the cube.
+    """
+    name, frame = stem.name, source.shape[1:]
+    white_dn = camera.full_scale_dn * max(camera.samples // frame[0], 1)
+    files: dict[str, Path | None] = {}
+    for kind in FRAMES:
+        beside = [stem.with_name(f"{name}.{kind}{ending}") for ending in (".hdr", ".npy")]
+        file = stated.get(kind) or next((one for one in beside if one.is_file()), None)
+        files[kind] = find_reference(stem.parent, kind) if file is None and kind in ("dark", "white") else file
+    found: dict[str, NDArray[np.float32]] = {}
+    for kind, file in files.items():
+        if file is not None:
+            found[kind] = load_frame(file)[0]
+            notes.append(f"{kind} frame from {file.name}")
+            if found[kind].shape != frame:
+                raise SceneError(
+                    f"the {kind} frame {file} is {found[kind].shape} (sample, band), the cube {frame}; give one taken "
+                    "with the cube's own samples and bands"
+                )
+    dark, white = found.get("dark", source.dark), found.get("white", source.white)
+    measured = dark is not None and white is not None
+    if dark is None:
+        dark = np.zeros(frame, np.float32)
+        notes.append(f"{name} has no dark frame: a dark level of 0 is assumed; give --dark")
+    if white is None:
+        white = np.full(frame, white_dn, np.float32)
+        notes.append(
+            f"{name} has no white frame: full scale ({white_dn} DN) is assumed to be white, and values are relative; "
+            "give --white"
+        )
+    bad: NDArray[Any] | None = found.get("bad")
+    if bad is None and measured and files["bad"] is None:
+        bad = find_bad_elements(dark, white)
+    bands = frame[1]
+    if white_reference.shape not in ((), (bands,)):
+        raise SceneError(
+            f"the white reference has {white_reference.shape} values, the cube {bands} bands; give one or one a band"
+        )
+    by_mirror, file = False, files["white"]
+    if file is not None and reader_of(file) == "envi":
+        fields = load_envi_header(find_envi_pair(file)[0]).fields
+        listed = listed_numbers(fields, "white_reference", bands, [])
+        white_reference = white_reference if listed is None else listed.astype(np.float32)
+        by_mirror = fields.get("mirror at rest", "0").strip() == "1"
+    bad = None if bad is None or not np.any(bad) else np.asarray(bad, np.bool_)
+    white_reference = np.broadcast_to(white_reference, bands).copy()
+    return References(dark, white, white_reference, bad, found.get("flat"), by_mirror)
+
+
+# --- pointing ---------------------------------------------------------------------------------------------------------
 
 Floats = NDArray[np.float64]
 Kind = Literal["mirror", "angles", "angle", "px", "m"]
@@ -55,8 +192,8 @@ KINDS: Mapping[Kind, tuple[str, ...]] = {
 WITHOUT_MIRROR: tuple[Kind, ...] = ("px", "m")
 BESIDE = ("line", "sweep", "time", "exposure_ms", "valid")
 ACCEPTED = (*BESIDE, *(name for names in KINDS.values() for name in names))
-TABLE_ENDINGS = (".csv", ".tsv", ".txt", ".parquet")
-ENDINGS = (*TABLE_ENDINGS, ".toml")
+FIRST_ROW = 2  # the header is row 1
+ENDINGS = (".csv", ".tsv", ".txt")
 WORDS = {"": math.nan, "none": math.nan, "true": 1.0, "false": 0.0}
 
 
@@ -70,7 +207,6 @@ class LinePointing:
     time_s: Floats | None = None  # (line,) of mid exposure
     exposure_ms: Floats | None = None  # (line,)
     part: tuple[str, ...] | None = None  # (line,) names of the sweeps, if a table cuts one cube into several
-    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -81,7 +217,6 @@ class PointingTable:
     kind: Kind
     columns: Mapping[str, Floats]  # (row,) each
     sweep: tuple[str, ...] | None  # (row,)
-    first_row: int  # number of the first row in the file, as an editor counts them
 
     def of_cube(self, name: str, lines: int, mounting: Mounting = STRAIGHT, *, alone: bool = False) -> LinePointing:
         """Return the pointing of a cube: the rows whose ``sweep`` is its name, or all without that column.
@@ -153,7 +288,7 @@ class PointingTable:
     def _refuse(
         self, rows: NDArray[np.intp], wrong: NDArray[np.bool_], columns: str | Sequence[str], expected: str
     ) -> None:
-        """Raise SceneError for the first wrong row, with its number in the file and the range of the column."""
+        """Raise SceneError for the first wrong row, with its number in the file."""
         if not wrong.any():
             return
         names = (columns,) if isinstance(columns, str) else tuple(columns)
@@ -161,10 +296,7 @@ class PointingTable:
         came = ", ".join(f"{name} = {self.columns[name][first]:.10g}" for name in names)
         count = int(np.count_nonzero(wrong))
         more = "" if count == 1 else f" (the first of {count} such rows)"
-        known = {name: self.columns[name][np.isfinite(self.columns[name])] for name in names}
-        spans = [f"{name} goes from {one.min():.6g} to {one.max():.6g}" for name, one in known.items() if len(one)]
-        row = first + self.first_row
-        raise SceneError(f"{self.path}, row {row}: {came}{more}, {expected}. {'; '.join(spans)}; correct the table")
+        raise SceneError(f"{self.path}, row {first + FIRST_ROW}: {came}{more}, {expected}; correct the table")
 
 
 def _filled(values: Floats, valid: NDArray[np.bool_]) -> Floats:
@@ -180,12 +312,7 @@ def load_pointing_table(path: Path) -> PointingTable:
     Raises SceneError: it cannot be read, has no row, an unknown column, a cell that is no number, or not exactly one
     kind of pointing.
     """
-    header: list[str]
-    cells: Sequence[Sequence[object]]
-    if path.suffix.lower() == ".parquet":
-        header, cells, first_row = *_parquet_cells(path), 1
-    else:
-        header, cells, first_row = *_csv_cells(path), 2  # the header is row 1
+    header, cells = _csv_cells(path)
     unknown = [name for name in header if name not in ACCEPTED]
     if unknown or len(set(header)) < len(header):
         twice = next((name for name in header if header.count(name) > 1), None)
@@ -200,33 +327,32 @@ def load_pointing_table(path: Path) -> PointingTable:
     if not cells:
         raise SceneError(f"{path} has no row below its header; give a row for each line")
     columns = {
-        name: _numbers(path, name, [row[at] for row in cells], first_row)
-        for at, name in enumerate(header)
-        if name != "sweep"
+        name: _numbers(path, name, [row[at] for row in cells]) for at, name in enumerate(header) if name != "sweep"
     }
-    sweep = tuple(str(row[header.index("sweep")]).strip() for row in cells) if "sweep" in header else None
-    return PointingTable(path, kinds[0], columns, sweep, first_row)
+    sweep = tuple(row[header.index("sweep")] for row in cells) if "sweep" in header else None
+    return PointingTable(path, kinds[0], columns, sweep)
 
 
-def _numbers(path: Path, name: str, cells: Sequence[object], first_row: int) -> Floats:
+def _numbers(path: Path, name: str, cells: Sequence[str]) -> Floats:
     """Return the cells of a column as numbers, NaN for empty ones, 1 for True."""
     values = np.empty(len(cells))
     for number, cell in enumerate(cells):
-        text = str(cell).strip().lower()
         try:
-            values[number] = WORDS[text] if text in WORDS else float(text)
+            values[number] = WORDS[cell.lower()] if cell.lower() in WORDS else float(cell)
         except ValueError:
             raise SceneError(
-                f"{path}, row {number + first_row}: {name} = {str(cell)[:40]!r} is no number; write numbers with a "
-                "decimal point"
+                f"{path}, row {number + FIRST_ROW}: {name} = {cell[:40]!r} is no number; write numbers with a decimal"
+                " point"
             ) from None
     return values
 
 
 def _csv_cells(path: Path) -> tuple[list[str], list[list[str]]]:
     """Return the names of the columns and the cells of all rows, by the delimiter of the header."""
-    text = _text(path)
-    lines = text.splitlines()
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise SceneError(f"{path} cannot be read as a pointing table: {error}; name a text file (CSV)") from error
     header = lines[0] if lines else ""
     delimiter = max((",", ";", "\t"), key=header.count)
     rows = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=delimiter)]
@@ -242,87 +368,7 @@ def _csv_cells(path: Path) -> tuple[list[str], list[list[str]]]:
     return names, cells
 
 
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise SceneError(f"{path} cannot be read as a pointing table: {error}; name a text file (CSV)") from error
-
-
-def _parquet_cells(path: Path) -> tuple[list[str], list[list[object]]]:
-    try:
-        table = parquet.read_table(path)
-    except ImportError as error:
-        raise SceneError(
-            f"{path} is Parquet, and pyarrow is not installed; install spectralzoom[parquet], or write the table as CSV"
-        ) from error
-    except (OSError, ValueError) as error:  # pyarrow's errors are of these
-        raise SceneError(f"{path} cannot be read as Parquet: {error}; write the table anew, or as CSV") from error
-    columns = table.to_pydict()
-    return [name.lower() for name in columns], [list(row) for row in zip(*columns.values(), strict=True)]
-
-
-def load_played_vector(path: Path, mounting: Mounting = STRAIGHT) -> PlayedVector:
-    """Read the TOML file of a played vector, and the file of positions that it names.
-
-    Raises SceneError: either cannot be read, the TOML file has other keys than vector, rate_hz and start_s, or a
-    position is beyond the mirror.
-    """
-    try:
-        stated = tomllib.loads(_text(path))
-    except tomllib.TOMLDecodeError as error:
-        raise SceneError(f"{path} cannot be read as TOML: {error}; write vector, rate_hz and start_s") from error
-    if unknown := sorted(set(stated) - {"vector", "rate_hz", "start_s"}):
-        raise SceneError(f"{path} has the entry {unknown[0]!r}; accepted are vector, rate_hz, start_s")
-    if not isinstance(stated.get("vector"), str):
-        raise SceneError(f'{path} names no vector; add the line vector = "positions.csv"')
-    rate_hz, start_s = stated.get("rate_hz"), stated.get("start_s", 0.0)
-    for name, value, least in (("rate_hz", rate_hz, 0.0), ("start_s", start_s, -math.inf)):
-        if isinstance(value, bool) or not isinstance(value, int | float) or not least < value < math.inf:
-            above = " above 0" if least == 0 else ""
-            raise SceneError(f"{path}: {name} = {value!r}, expected a number{above}; correct it")
-    file = path.parent / stated["vector"]
-    try:
-        if file.suffix == ".npy":
-            values = np.load(file, allow_pickle=False)
-        else:  # without a header, (row, column)
-            values = np.loadtxt(re.sub(r"[;\t]", ",", _text(file)).splitlines(), delimiter=",", ndmin=2)
-        if values.dtype.kind not in "iuf":
-            raise ValueError(f"it holds {values.dtype}")
-        positions = mounting.to_model(split_vector(values.astype(np.float64), str(file)))
-        check_reach(positions)
-    except SceneError:
-        raise
-    except PoseError as error:
-        raise SceneError(f"{file}: {error}") from error
-    except (OSError, ValueError, EOFError) as error:
-        raise SceneError(f"{file} cannot be read as a vector: {error}; give CSV or .npy with numbers") from error
-    return PlayedVector(positions, float(rate_hz), float(start_s))  # type: ignore[arg-type]
-
-
-def follow_vector(vector: PlayedVector, middle_s: Floats, where: str) -> LinePointing:
-    """Return the pointing of lines by a played vector and the times of their mid exposures (line,) [s].
-
-    Times count from the start of the first exposure. Lines without a time, or outside of the path's time, are not
-    valid. Raises SceneError: no line lies within the path's time.
-    """
-    known = np.isfinite(middle_s)
-    position, played = vector.at(np.where(known, middle_s, 0.0))
-    valid = known & played
-    if not valid.any():
-        seconds = len(vector.position) / vector.rate_hz
-        raise SceneError(
-            f"{where}: no line was taken while the path of {seconds:g} s was played; correct start_s or rate_hz"
-        )
-    note = (
-        "positions are those of the played vector, by the clocks of camera and mirror; an error of start_s shifts all"
-    )
-    lost = int(np.count_nonzero(~valid))
-    outside = (f"{lost} lines lie outside of the path's time and are not valid",) if lost else ()
-    return LinePointing("mirror", position, valid, middle_s, notes=(note, *outside))
-
-
 def find_pointing(folder: Path, stem: str) -> Path | None:
-    """Return the file ``STEM.pointing.csv``, ``.parquet`` or ``.toml`` of a cube in a folder."""
+    """Return the file ``STEM.pointing.csv`` (or .tsv, .txt) of a cube in a folder."""
     names = [f"{stem}.pointing{ending}" for ending in ENDINGS]
     return next((folder / name for name in names if (folder / name).is_file()), None)
