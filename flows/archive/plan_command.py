@@ -35,7 +35,8 @@ from flows.terminal.progress import put_out, table
 from pipeline.errors import IncompleteStoreError, PipelineError
 from pipeline.lazy import deferred
 from pipeline.planning.fine_pass import FinePlan
-from pipeline.planning.prices import BYTES_PER_SAMPLE, prices_of, raw_bytes
+from pipeline.planning.prices import BYTES_PER_SAMPLE, raw_bytes
+from pipeline.planning.uniform_scans import format_scan, frontier
 from pipeline.signal.subspace import SMALL_FIELD
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, store_at
@@ -82,7 +83,7 @@ class _WaitsError(IncompleteStoreError):
 class _Awaited(StageRef):
     """Address of a store that is still to be made: reading its path, or an unknown key, raises _WaitsError."""
 
-    made_by: str
+    made_by: str = ""
 
     def __getattribute__(self, name: str) -> Any:
         value = object.__getattribute__(self, name)
@@ -105,7 +106,7 @@ class Planner(OpenSurvey):
         except (PipelineError, OSError) as error:  # the survey would stop here
             why = f"waits for {error}" if isinstance(error, _WaitsError) else str(error)
             row = StageForecast(stage, "blocked", None, why)
-            ref = _Awaited(STAGES[stage].product.name, "", Path(), stage)
+            ref = _Awaited(STAGES[stage].product.name, "", Path(), made_by=stage)
         if row not in self.rows:  # the later of two passes asks for lines of the first again
             self.rows.append(row)
         self.products[stage] = ref
@@ -128,9 +129,10 @@ class Planner(OpenSurvey):
         if found is not None:
             return StageForecast(stage.name, "cached", key), found
         ref = store_at(self.run.archive.root, stage.product.name, key)
-        return StageForecast(stage.name, "to run", key), _Awaited(ref.stage, key, ref.path, stage.name)
+        return StageForecast(stage.name, "to run", key), _Awaited(ref.stage, key, ref.folder, made_by=stage.name)
 
 
+MOST_SCANS = 8  # in the table
 MOST_LETTERS = 250  # of a reason
 COLOURS = {"cached": "green", "to run": "bold", "blocked": "yellow"}
 
@@ -160,7 +162,11 @@ def plan_content(settings: Settings) -> dict[str, Any]:
         "stages": [asdict(row) for row in planner.rows],
         "to_make": sum(row.state != "cached" for row in planner.rows),
         "refused": run.refused,  # why this machine would refuse the survey
-        "scans": {"taken": as_figures(run.scans.chosen), "reference": as_figures(run.scans.reference)},
+        "scans": {
+            "taken": as_figures(run.scans.chosen),
+            "reference": as_figures(run.scans.reference),
+            "candidates": [as_figures(one) for one in frontier(run.scans.offered)],
+        },
         "field": figures,
         "estimate": {name: asdict(one) for name, one in estimate_survey(run, fine).items()},
     }
@@ -182,8 +188,29 @@ def show_plan(content: dict[str, Any], console: Console) -> None:
         console.print(estimate_table(content["estimate"]))
     else:
         console.print("everything is stored: it would be published")
+    if content["scans"]["candidates"]:
+        console.print(scan_table(content["scans"]))
     if content["refused"] is not None:
         console.print(f"[yellow]refused here[/]: {escape(content['refused'])}", soft_wrap=True)
+
+
+def scan_table(scans: Mapping[str, Any]) -> Table:
+    """Return the best uniform scans of other time budgets as a table: seconds, raw bytes and expected score."""
+    named = {"this survey": scans["taken"], "reference": scans["reference"]}
+    every = scans["candidates"][:: math.ceil(len(scans["candidates"]) / MOST_SCANS)]
+    rows = {one["seconds"]: one for one in (*every, *named.values()) if one is not None}
+    cells = [
+        [
+            format_scan(one["step"], one["exposure_ms"]),
+            ", ".join(name for name, marked in named.items() if marked == one),
+            format_seconds(seconds),
+            format_bytes(one["bytes_raw"]),
+            format_prediction(one["expected_miou"], one["expected_spread"]) or DASH,
+        ]
+        for seconds, one in sorted(rows.items())
+    ]
+    columns = ("uniform scan", "", "capture time", "bytes captured", "mIoU, about")
+    return table(columns, cells, left=2, whole=columns)
 
 
 def format_field(figures: Mapping[str, Any]) -> str:
@@ -246,8 +273,7 @@ def _of_camera(run: SurveyRun, fine: FinePlan | None) -> dict[str, Estimate]:
     open_end = fine is None and not plan.plain
     captured = raw_bytes([*plan.coarse, *(fine.sweeps if fine else ())], camera, bands)
     if open_end:
-        lines = max(prices_of(camera, run.settings.cost).most_lines(plan.fine_s, 1), 0)
-        captured += lines * camera.samples * bands * BYTES_PER_SAMPLE
+        captured += int(plan.fine_s / (camera.frame_ms * 1e-3)) * camera.samples * bands * BYTES_PER_SAMPLE
     seconds = plan.coarse_s + (plan.fine_s if fine is None else fine.seconds)
     return {
         "capture_s": Estimate(seconds, "the cost model of mirror and camera", open_end),

@@ -81,8 +81,8 @@ def rig_field(scene: RasterScene, settings: Settings, planned: Sequence[Sweep]) 
 def rig_to_oneself(port: str) -> Iterator[None]:
     """Lock the rig at a port for the block; the same rig for all names of one device.
 
-    The lock is an abstract socket of Linux (unix(7)): it needs no file, is the same for all users of the machine, and
-    the kernel releases it when the process ends. Drivers also lock a serial port itself. Raises RigError: another
+    The lock is an abstract socket of Linux (unix(7)), without a file. All users of the machine see it, and the kernel
+    releases it when the process ends. Drivers also lock a serial port itself. Raises RigError: another
     survey has the lock, or the kernel does not support it.
     """
     device = os.path.realpath(port) if port.startswith("/") else port.lower()

@@ -263,7 +263,7 @@ def _condensed(scan: ScanLines, condenser: Condenser, statistics: SignalStatisti
     cube = SignalCubeInMemory(header, components, step=condenser.step, largest=largest)
     done = condenser.sweep(lines, cube.writer.write)
     exposure_ms = np.full(len(lines.data), scan.camera.exposure_ms)
-    cube.writer.close(LineRows(lines.time_s, x, y, exposure_ms, lines.valid_line), done.rare, done.residuals, None)
+    cube.writer.close(LineRows(lines.time_s, x, y, exposure_ms, lines.valid_line), done.rare, done.residuals)
     return KeptLines(cube.size, lambda: cube.open().spectra(0, len(lines.data))), done
 
 

@@ -72,9 +72,10 @@ class TrainedOn:
     @staticmethod
     def read(content: Mapping[str, Any]) -> TrainedOn:
         """Read values of `as_dict`. Raises TypeError for other entries."""
-        return TrainedOn(
-            **{name: tuple(value) if isinstance(value, list) else value for name, value in content.items()}
-        )
+        values: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value for name, value in content.items()
+        }
+        return TrainedOn(**values)
 
 
 @dataclass(frozen=True)

@@ -178,7 +178,7 @@ def _patches(sweep: Sweep, camera: LineCamera, line: Floats, sample: Floats) -> 
     sums = np.rint(middle[:, None] + patch[:, 0]).ravel()
     lines = (line[:, None] + patch[:, 1]).ravel()
     numbers = (sums[:, None] * binning + np.arange(binning)).ravel()
-    slopes = (numbers - (camera.samples - 1) / 2) * camera.ifov_rad
+    slopes = np.asarray((numbers - (camera.samples - 1) / 2) * camera.ifov_rad, np.float64)
     count = len(slopes)
     return SampleViews(
         np.full(count, sweep.swath_px),

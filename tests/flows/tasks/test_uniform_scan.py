@@ -250,3 +250,6 @@ def test_candidates_are_those_of_the_weights_that_would_read_them(tmp_path: Path
     told = [plan_content(load_settings(None, farm | more))["scans"] for more in asked]
     assert [one["reference"] for one in told] == [told[0]["reference"]] * len(asked)
     assert told[0]["taken"] == told[0]["reference"]
+    scores = [one["expected_miou"] for one in told[0]["candidates"]]
+    assert len(scores) > 4
+    assert scores == sorted(scores)  # by ascending seconds
