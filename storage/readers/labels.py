@@ -165,9 +165,9 @@ def load_codes(
         if void.any() and codes[void][0] not in map(_code, classes):
             codes[void] = NO_VALUE
             notes.append(f"{void.sum()} px have the label file's no-data value {source.nodata:g}: unlabelled")
-    if geobox is not None and own is not None and (difference := _grid_difference(own, geobox)):
+    if geobox is not None and own is not None and not _is_same_grid(own, geobox):
         codes, regridded = _on_grid(codes, own, geobox, address), True
-        notes.append(f"labels {address} {difference}: they are resampled to its pixels by nearest neighbour")
+        notes.append(f"labels {address} have another grid than the scene: they are resampled by nearest neighbour")
     return LabelCodes(codes, of_colours, tuple(notes), regridded)
 
 
@@ -192,16 +192,9 @@ def _whole_numbers(values: NDArray[Any], address: str | Path, *, by_number: bool
     )
 
 
-def _grid_difference(own: GeoBox, scene: GeoBox) -> str:
-    """Return the difference between the grids of labels and scene in words; empty if they are equal."""
-    if own.crs != scene.crs:
-        return f"are in {crs_name(own)}, the scene in {crs_name(scene)}"
-    shift = shift_px(scene, own)
-    if shift is None:
-        return "have other or turned pixels than the scene"
-    if max(map(abs, shift)) > OFF_GRID_PX:
-        return f"begin {shift[0]:.4g} px right of and {shift[1]:.4g} px below the scene's corner"
-    return "" if own.shape == scene.shape else "have another size than the scene"
+def _is_same_grid(own: GeoBox, scene: GeoBox) -> bool:
+    shift = shift_px(scene, own) if own.crs == scene.crs else None
+    return shift is not None and max(map(abs, shift)) <= OFF_GRID_PX and own.shape == scene.shape
 
 
 def _on_grid(codes: NDArray[np.int64], own: GeoBox, grid: GeoBox, address: str | Path) -> NDArray[np.int64]:

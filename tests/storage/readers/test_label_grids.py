@@ -58,7 +58,7 @@ def test_labels_seven_metres_beside_the_image(tmp_path: Path) -> None:
     assert agree(scene) == 1.0
     assert (scene.labels[:, :7] == 255).all()
     assert (scene.labels[:, 7:] != 255).all()
-    assert [note for note in scene.provenance if "begin 7 px right of and 0 px below the scene's corner" in note]
+    assert any("have another grid than the scene" in note for note in scene.provenance)
     assert agree(load_scene_file(path, labels=tmp_path / "pixel_by_pixel.tif")) < 0.8  # so they were laid before
 
 
@@ -77,7 +77,6 @@ def test_labels_in_another_crs(tmp_path: Path) -> None:
     assert scene.labels is not None
     assert (scene.labels != 255).all()
     assert agree(scene) > 0.98
-    assert any("are in EPSG:4326, the scene in EPSG:32632" in note for note in scene.provenance)
 
 
 @pytest.mark.parametrize("turned", ["labels", "image"])
@@ -91,7 +90,6 @@ def test_north_up_beside_south_up(tmp_path: Path, turned: str) -> None:
     scene = load_scene_file(path)
     assert agree(scene) == 1.0
     assert (scene.labels != 255).all()
-    assert any("other or turned pixels" in note for note in scene.provenance)
 
 
 def test_labels_of_one_grid_are_as_they_were(tmp_path: Path) -> None:
