@@ -56,31 +56,20 @@ def _span(places: NDArray[np.intp]) -> tuple[slice, slice | NDArray[np.intp]]:
 
 
 @dataclass(frozen=True)
-class _MosaicSpectra:
-    """Restore pixels of a mosaic, which is opened at the first call."""
+class _StoredSpectra:
+    """Restore spectra of a mosaic or a condensed sweep, which is opened at the first call."""
 
     path: Path
+    open: Callable[[Path], Mosaic | SignalCube]
 
     @cached_property
-    def mosaic(self) -> Mosaic:
-        return open_mosaic(self.path)
+    def store(self) -> Mosaic | SignalCube:
+        return self.open(self.path)
 
     def __call__(self, rows: slice, columns: slice, bands: Sequence[int]) -> NDArray[np.float32]:
-        return self.mosaic.values(rows, columns, bands)
-
-
-@dataclass(frozen=True)
-class _LineSpectra:
-    """Restore lines of a condensed sweep, which is opened at the first call."""
-
-    path: Path
-
-    @cached_property
-    def cube(self) -> SignalCube:
-        return open_signal_cube(self.path)
-
-    def __call__(self, lines: slice, samples: slice, bands: Sequence[int]) -> NDArray[np.float32]:
-        return self.cube.spectra(lines.start, lines.stop, samples, bands)
+        if isinstance(self.store, Mosaic):
+            return self.store.values(rows, columns, bands)
+        return self.store.spectra(rows.start, rows.stop, columns, bands)
 
 
 def open_lazy_mosaic(path: Path) -> xarray.DataArray:
@@ -88,12 +77,12 @@ def open_lazy_mosaic(path: Path) -> xarray.DataArray:
 
     Raises IncompleteStoreError: it is missing or damaged.
     """
-    return _open(path, ("y", "x", "band"), OF_PLACES, _MosaicSpectra(path))
+    return _open(path, ("y", "x", "band"), OF_PLACES, _StoredSpectra(path, open_mosaic))
 
 
 def open_lazy_lines(path: Path) -> xarray.DataArray:
     """Open a condensed sweep as (line, sample, band) scene values, rare spectra too; otherwise `open_lazy_mosaic`."""
-    return _open(path, ("line", "sample", "band"), OF_LINES, _LineSpectra(path))
+    return _open(path, ("line", "sample", "band"), OF_LINES, _StoredSpectra(path, open_signal_cube))
 
 
 def _open(path: Path, dims: tuple[str, str, str], places: Sequence[str], restore: Restore) -> xarray.DataArray:

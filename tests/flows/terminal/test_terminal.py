@@ -159,8 +159,8 @@ def test_time_left_stands_behind_the_words(monkeypatch: pytest.MonkeyPatch) -> N
     """Of a stage that runs, as a training does for long, and no longer of one that has ended; in a log as well."""
     monkeypatch.setattr("rich.progress.Task.time_remaining", 75.0)
     monkeypatch.setattr("flows.terminal.progress.LINE_EVERY_S", -1.0)
-    told = progress_of(lambda one: one.show("rectify", 0.5, "step 28")).splitlines()
-    assert told == ["mosaic: 50% step 28, 75 s left"]
+    log = progress_of(lambda one: one.show("rectify", 0.5, "step 28"))
+    assert log.splitlines() == ["mosaic: 50% step 28, 75 s left"]
     told = progress_of(lambda one: one.show("training", 0.5, "step 28"), **{**TERMINAL, "width": 120})
     assert "step 28  left 0:01:15" in told
     told = progress_of(lambda one: one.show("training", 0.5, "failed", ended=True), **{**TERMINAL, "width": 120})
