@@ -156,6 +156,13 @@ def test_6_every_policy_buys_every_patch_once():
         assert sorted(patch_index.tolist()) == seen.grid.valid_patches().tolist()
 
 
+@pytest.mark.parametrize("fraction", [-0.01, 1.01, float("nan")])
+def test_7_fractions_of_patches_that_cannot_be_are_refused(fraction: float):
+    """The message names the fraction and the patches that there are."""
+    with pytest.raises(ValueError, match=rf"from 0 to 1, got {fraction} \(of 24 patches\)"):
+        frame_patches(np.zeros(24), fraction)
+
+
 def test_8_ties_go_to_the_lowest_patch():
     """Equal scores keep the order of the patches, and a larger choice begins with the smaller one."""
     assert select_patches(np.zeros(256), 5).tolist() == [0, 1, 2, 3, 4]

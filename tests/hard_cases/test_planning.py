@@ -86,3 +86,15 @@ def test_a_field_of_another_shape_than_the_line():
     plan = planned(grid, even(grid), 1e3)
     assert [sweep.swath_px for sweep in plan.sweeps] == [0.0]
     assert plan.patch_index.tolist() == grid.valid_patches().tolist()
+
+
+def test_28_negative_gains_are_never_bought():
+    """No run is bought for a negative score, nor for one that is no number; all is left unspent."""
+    grid, score = SceneGrid(256, 256, 16, 4), np.full(256, -0.3)
+    score[[3, 70, 200]] = -5.0, np.nan, -np.inf
+    plan = planned(grid, score, 10.0)
+    assert (plan.patch_index.tolist(), plan.sweeps, plan.expected_gain) == ([], [], 0.0)
+    score[100] = 5.0
+    plan = planned(grid, score, 10.0)
+    assert 100 in plan.patch_index
+    assert plan.expected_gain == pytest.approx(5.0)

@@ -96,9 +96,9 @@ def score(
 
     Without a second pass, ``scanned`` is the plan, and ``budget`` limits its patches.
     """
-    seen, grid = mosaic.path / "mosaic.zarr", gains.frame.grid
+    grid = gains.frame.grid
 
-    def planned() -> tuple[Scores, FinePlan]:
+    def planned(seen: Path) -> tuple[Scores, FinePlan]:
         """Return the scores, and the plan of the second pass."""
         if second_pass is None and budget is None:
             return np.zeros(int(np.prod(grid.patch_shape))), scanned
@@ -112,7 +112,8 @@ def score(
 
     def build(path: Path) -> None:
         """Write score and rank of every patch, and the plan."""
-        scores, found = planned()
+        seen = mosaic.path / "mosaic.zarr"
+        scores, found = planned(seen)
         found = replace(found, patch_index=gains.kept(found.patch_index))
         read = found.patch_index
         if second_pass is not None and (least_gain is not None or found.kind == "full" or not found.sweeps):

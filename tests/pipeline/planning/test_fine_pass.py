@@ -103,13 +103,6 @@ def test_more_seconds_gain_no_less() -> None:
     assert "the whole field, every line, 100 ms" in whole.reason
 
 
-@pytest.mark.parametrize("value", [np.nan, -np.inf, -1.0, 0.0])
-def test_without_a_gain_nothing_is_captured(value: float) -> None:
-    """At any time, and no whole field either."""
-    plan = second_pass(10 * FULL_S).plan(np.full(int(np.prod(GRID.patch_shape)), value))
-    assert (plan.sweeps, plan.seconds, plan.expected_gain, len(plan.patch_index)) == ([], 0.0, 0.0, 0)
-
-
 def test_equal_gains_fill_the_time() -> None:
     """Where no price of a second tells patches apart, less than a row of patches is left over."""
     plan = second_pass(0.5 * FULL_S).plan(np.ones(int(np.prod(GRID.patch_shape))))
