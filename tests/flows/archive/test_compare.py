@@ -138,7 +138,7 @@ def test_classes_are_matched_by_name() -> None:
 def test_hectares_are_told_where_both_runs_have_them() -> None:
     """One map on the ground alone has nothing beside it; pixels are counted class by class."""
     alike = _by_one_list([_map(np.zeros((2, 2)), ("a",)) for _ in range(2)])
-    posed, bare = (Run(Path("x"), {}, receipt, None, frozenset()) for receipt in ({"areas": {"ha": {"a": 2.5}}}, {}))
+    posed, bare = (Run(Path("x"), {}, receipt, None) for receipt in ({"areas": {"ha": {"a": 2.5}}}, {}))
     for runs in ((posed, bare), (bare, posed), (bare, bare)):
         assert not any("ha" in row for row in _comparison(runs, alike)["classes"])
     half = _by_one_list([_map(np.zeros((2, 2)), ("a", "b")), _map(np.eye(2), ("a", "b"))])
