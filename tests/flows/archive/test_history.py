@@ -125,7 +125,7 @@ def test_a_report_that_cannot_be_written(
 def test_a_look_has_the_date_of_the_look(settings: dict[str, Any], observation: str) -> None:
     """By its visit's name, by the farm's day; the clock is asked last, when the survey began."""
     receipt = {"settings": settings, "started": "2026-11-22T08:00:00Z"}
-    run = Run(Path("x"), {"created": "2026-11-23T00:00:00Z"}, receipt, None, frozenset())
+    run = Run(Path("x"), {"created": "2026-11-23T00:00:00Z"}, receipt, None)
     found = time_of_visit(run)
     assert found is not None
     assert f"{found:%Y-%m-%d %H:%M}" == observation
