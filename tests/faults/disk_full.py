@@ -30,7 +30,7 @@ LARGE = 64 << 20  # bytes: more than a survey takes
 KINDS = ("spool", "segment", "segment manifest", "run")  # of files that are written
 FULL = "disk is full"
 # Functions of ours that a full disk is met in.
-WHERE = {"spool": "capture._capture", "manifest": "manifests.write_manifest", "run": "run_folder.publish_run"}
+WHERE = {"spool": "capture._capture", "manifest": "manifests.write_manifest"}
 
 
 @dataclass
