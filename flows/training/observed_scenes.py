@@ -80,7 +80,7 @@ def observe_finely(
 
 
 def chosen_effects(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep]) -> Choice:
-    """Choose effects as a survey of these sweeps does, without its check of the worst lines."""
+    """Choose effects as a survey of these sweeps does."""
     return Choice.of(decide(probe_survey(scene, rig, sweeps, "sigma"), rig, EFFECTS, TOLERANCE_SIGMA).chosen)
 
 
