@@ -91,7 +91,7 @@ def open_session(server: FileServer) -> Iterator[ftplib.FTP]:
         raise DeviceRefused(
             f"{server.where} refused: {error!s:.200}; look at user and password, and whether the file is there", code
         ) from error
-    except (OSError, EOFError, ftplib.Error, ValueError) as error:
+    except (ftplib.Error, OSError, EOFError, ValueError) as error:
         reason = str(error)[:200] or "connection closed"
         raise DeviceGone(
             f"{server.where} is not there, fell silent or is no FTP server ({reason!r}); is it on, and are host and "
