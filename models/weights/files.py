@@ -72,9 +72,8 @@ class TrainedOn:
     @staticmethod
     def read(content: Mapping[str, Any]) -> TrainedOn:
         """Read values of `as_dict`. Raises TypeError for other entries."""
-        return TrainedOn(
-            **{name: tuple(value) if isinstance(value, list) else value for name, value in content.items()}
-        )
+        plain: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in content.items()}
+        return TrainedOn(**plain)
 
 
 @dataclass(frozen=True)
