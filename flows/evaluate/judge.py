@@ -151,11 +151,7 @@ def summarise(runs: Runs, class_names: Sequence[str], request: EvaluateRequest) 
     support = whole.counts.sum(axis=3).max(axis=0).sum(axis=0)  # labelled pixels of each class, each frame once
     table = []
     for (policy, fraction), row in rows.items():
-<<<<<<< HEAD
-        figures: dict[str, Any] = {"policy": policy, "fraction": fraction, "uses_labels": policy == ORACLE}
-=======
         figures: Record = {"policy": policy, "fraction": fraction, "uses_labels": policy == ORACLE}
->>>>>>> cut-models
         figures |= _accuracy(row, class_names)
         figures["gap_closed"] = None if policy in ENDS else gap_closed(figures["miou"], *ends)
         figures["captured_gain"] = captured_gain(*(sum(p[name] for p in row.parts) for name in ("gain", "best_gain")))

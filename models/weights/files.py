@@ -72,15 +72,8 @@ class TrainedOn:
     @staticmethod
     def read(content: Mapping[str, Any]) -> TrainedOn:
         """Read values of `as_dict`. Raises TypeError for other entries."""
-<<<<<<< HEAD
-        values: dict[str, Any] = {
-            name: tuple(value) if isinstance(value, list) else value for name, value in content.items()
-        }
-        return TrainedOn(**values)
-=======
         plain: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in content.items()}
         return TrainedOn(**plain)
->>>>>>> cut-models
 
 
 @dataclass(frozen=True)
