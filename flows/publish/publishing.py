@@ -23,7 +23,7 @@ from flows.tasks.open_survey import STAGES, OpenSurvey, RunRef
 from flows.tasks.prefect_tasks import as_task, inside_flow
 from flows.tasks.stages.accuracy import evaluate
 from flows.tasks.stages.capture import capture_coarse, capture_fine
-from flows.tasks.stages.condense import why_raw_stays
+from flows.tasks.stages.condense import raw_differs
 from pipeline.lazy import deferred
 from storage.archive.keys import StageRef, canonical_json
 from storage.archive.lineage import Catalogue
@@ -72,7 +72,7 @@ def add_accuracy(plan: OpenSurvey, run: RunRef, accuracy: StageRef) -> RunRef:
 
 
 def clear_raw(plan: OpenSurvey, run: RunRef) -> RunRef:
-    """Verify the signal, and clear the raw lines that the settings do not keep; in a flow as a task."""
+    """Compare and clear the raw lines that the settings do not keep; in a flow as a task."""
     if plan.run.settings.keep != KEEP_SIGNAL or not plan.products.there(*PASSES):
         return run
     return as_task(_clear_raw, "clear_raw")(plan, run)
@@ -84,7 +84,7 @@ def _clear_raw(plan: OpenSurvey, run: RunRef) -> RunRef:
     if not plan.products.signals or any(archive.find(raw.stage, raw.key) is None for raw in passes):
         return run  # cleared before
     others = (_kept_by_others(plan, name, raw) for name, raw in zip(there, passes, strict=True))
-    why = next(filter(None, others), None) or why_raw_stays(plan.products.signals[0])
+    why = next(filter(None, others), None) or raw_differs(passes, plan.products.signals[0], plan.run.camera)
     if why is not None:
         plan.observer.note(f"raw lines stay: {why}")
         return run
