@@ -61,10 +61,6 @@ class BudgetError(PipelineError, ValueError):
     exit_code = 2
 
 
-class NoScanPaidFor(BudgetError):  # noqa: N818 - named for what is missing
-    """No uniform scan that these weights can read is within the limits; other weights may read fewer lines."""
-
-
 class SceneError(PipelineError, ValueError):
     """A scene, label or mask file cannot be used."""
 

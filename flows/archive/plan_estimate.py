@@ -16,7 +16,7 @@ from flows.tasks.scores import MOST_ERROR, format_prediction
 from flows.terminal.figures import DASH, counted, format_bytes, format_count, format_seconds, known_number
 from flows.terminal.progress import table
 from pipeline.planning.fine_pass import FinePlan
-from pipeline.planning.prices import BYTES_PER_SAMPLE, prices_of, raw_bytes
+from pipeline.planning.prices import BYTES_PER_SAMPLE, raw_bytes
 from pipeline.signal.subspace import SMALL_FIELD
 
 TITLE = "Estimates: nothing of this has run"
@@ -66,8 +66,7 @@ def _of_camera(run: SurveyRun, fine: FinePlan | None) -> dict[str, Estimate]:
     open_end = fine is None and not plan.plain
     captured = raw_bytes([*plan.coarse, *(fine.sweeps if fine else ())], camera, bands)
     if open_end:
-        lines = max(prices_of(camera, run.settings.cost).most_lines(plan.fine_s, 1), 0)
-        captured += lines * camera.samples * bands * BYTES_PER_SAMPLE
+        captured += int(plan.fine_s / (camera.frame_ms * 1e-3)) * camera.samples * bands * BYTES_PER_SAMPLE
     seconds = plan.coarse_s + (plan.fine_s if fine is None else fine.seconds)
     return {
         "capture_s": Estimate(seconds, "the cost model of mirror and camera", open_end),

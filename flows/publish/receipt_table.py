@@ -291,7 +291,7 @@ def _multiply_adds(cost: Mapping[str, float]) -> str:
 # parts of a receipt: their label, and the figures that are shown, in order
 _SHOWN: Mapping[str, tuple[str, Sequence[str]]] = {
     "field": ("field", ("view_deg", "range_m", "hectares", "ground_pixel_m", "hectares_per_hour")),
-    "plan": ("plan", ("reason", "lines", "out_of_reach")),
+    "plan": ("plan", ("reason", "lines")),
     "recording": ("recording", ("lines_read", "lines_recorded", "passes_s", "full_scan_s")),
     "extent": ("captured", ("lines", "fraction", "expected_wrong", "due_left")),
     "kept": ("at full resolution", ("patches", "multiply_adds")),

@@ -185,7 +185,7 @@ def _savings(run: SurveyRun, plan: FinePlan, read: NDArray[np.intp]) -> dict[str
         return _model_savings(run, read)
     done = [*run.plan.coarse, *plan.sweeps]
     entries = capture_savings(done, run.plan.full, run.camera, run.grid, cost=run.settings.cost)
-    capture = SavingEntry(run.plan.coarse_s + plan.seconds, run.plan.full_s, "predicted").as_dict()
+    capture = SavingEntry(run.plan.coarse_s + plan.seconds, run.plan.full_s).as_dict()
     if (uniform := run.scans.reference) is not None:  # the cheapest scan with nearly the best score
         capture |= {"uniform": uniform.seconds, "uniform_scan": uniform.words}
     return {
@@ -199,8 +199,8 @@ def _model_savings(run: SurveyRun, read: NDArray[np.intp]) -> dict[str, Any]:
     """Return the patches segmented at full resolution and the multiply-adds, against those of every patch."""
     did, scan = run.work_done(read), run.costs.of_map(run.grid.valid_patches())
     return {
-        "patches": SavingEntry(len(read), len(run.grid.valid_patches()), "predicted").as_dict(),
-        "multiply_adds": {**SavingEntry(did.total, scan.total, "predicted").as_dict(), **asdict(did)},
+        "patches": SavingEntry(len(read), len(run.grid.valid_patches())).as_dict(),
+        "multiply_adds": {**SavingEntry(did.total, scan.total).as_dict(), **asdict(did)},
     }
 
 
@@ -279,13 +279,7 @@ def _calibrated(run: SurveyRun, cube: SignalCube, bands: list[int]) -> NDArray[n
 def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     """Return the findings of a run by their names in the receipt."""
     plan = load_plan(products["score"])
-    figures: dict[str, Any] = {
-        "kind": plan.kind,
-        "reason": plan.reason,
-        "lines": plan.lines,
-        "seconds": plan.seconds,
-        "out_of_reach": plan.out_of_reach,
-    }
+    figures: dict[str, Any] = {"kind": plan.kind, "reason": plan.reason, "lines": plan.lines, "seconds": plan.seconds}
     found: dict[str, Any] = {"field": field_figures(run, plan), "plan": figures}
     if run.recorded is not None:
         found["recording"] = _recording(run, run.recorded, plan)

@@ -20,12 +20,11 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, CostModel, Sweep
 from pipeline.planning.coverage import cheapest_full, full_sweeps, sweeps_over, uniform_sweeps, with_margin
-from pipeline.planning.partial_scans import FIRST_STEP, FIRST_STEPS, every_nth, lines_between, merged_ms, sweeps_of_runs
-from pipeline.planning.prices import check_budget
+from pipeline.planning.fine_pass import FIRST_STEP, FIRST_STEPS, every_nth, lines_between, merged_ms
+from pipeline.planning.partial_scans import sweeps_of_runs
 from pipeline.planning.uniform_scans import (
     LOSS,
     MIOU,
-    ScanLimits,
     ScanPerformance,
     UniformScan,
     choose_scan,
@@ -49,7 +48,6 @@ class CapturePlan:
     coarse_s: float
     full_s: float
     fine_s: float  # left for the second pass
-    overlap_px: float  # least overlap of neighbouring coarse swaths
     margin_px: float  # extension of sweeps at both ends
     plain: bool = False  # one uniform scan, or a raster
     by_record: bool = False  # scan performance chooses the lines of the second pass
@@ -57,7 +55,7 @@ class CapturePlan:
     @staticmethod
     def of_map() -> CapturePlan:
         """Return the plan of a raster, without sweeps."""
-        return CapturePlan("x", [], [], 0.0, 0.0, 0.0, 0.0, 0.0, plain=True)
+        return CapturePlan("x", [], [], 0.0, 0.0, 0.0, 0.0, plain=True)
 
 
 @dataclass(frozen=True)
@@ -114,21 +112,19 @@ class PassLayout:
         along, coarse, full = self.sweeps()
         full_s, coarse_s = self.cost.seconds(full, self.camera), self.cost.seconds(coarse, self.camera)
         fine_s, by_record = 0.0, budget is None and seconds is not None
-        if budget is not None:
-            fine_s = check_budget(budget, coarse_s, full_s)
-        elif seconds is not None:
-            if seconds < coarse_s:
-                raise BudgetError(
-                    f"--seconds {seconds:g} is below the time of the first pass of every {self.first_step}th line, "
-                    f"{coarse_s:.1f} s; give more, a shorter --coarse-exposure-ms, or --zoom never"
+        limit_s = seconds if budget is None else budget * full_s
+        if limit_s is not None:
+            fine_s = limit_s - coarse_s
+            if fine_s < 0:
+                asked = (
+                    f"--seconds {seconds:g}" if budget is None else f"--budget {budget:g} gives {limit_s:.1f} s, which"
                 )
-            fine_s = seconds - coarse_s
-        overlap = self._overlap(self.step or self.first_step)
-        margin = 2 * self.pointing_px
-        plain = budget is None and seconds is None
-        return CapturePlan(
-            along, coarse, full, coarse_s, full_s, fine_s, overlap, margin, plain=plain, by_record=by_record
-        )
+                raise BudgetError(
+                    f"{asked} is below the time of the first pass of every {self.first_step}th line, {coarse_s:.1f} s "
+                    f"of the full scan's {full_s:.1f} s; give more, a shorter --coarse-exposure-ms, or --zoom never"
+                )
+        margin, plain = 2 * self.pointing_px, budget is None and seconds is None
+        return CapturePlan(along, coarse, full, coarse_s, full_s, fine_s, margin, plain=plain, by_record=by_record)
 
     def sweeps(self) -> tuple[Axis, list[Sweep], list[Sweep]]:
         """Return the axis of the lines, the sweeps of the first pass or uniform scan, and those of the full scan.
@@ -185,7 +181,7 @@ class ScanChoice:
     def best_within(self, seconds: float) -> UniformScan | None:
         """Return the scan with the highest expected mIoU within a time; None where there is none."""
         try:
-            return choose_scan(self.offered, ScanLimits(seconds)) if self.offered else None
+            return choose_scan(self.offered, seconds) if self.offered else None
         except BudgetError:
             return None
 
@@ -211,7 +207,7 @@ def choose_uniform_scan(
     SettingsError: the weights lack the class of a goal, or the table starts at longer exposures than the camera's;
     PoseError: the field exceeds the mirror's range.
     """
-    plain, limits = settings.plain, ScanLimits(settings.seconds)
+    plain = settings.plain
     content = weights.record.get("scans")
     if content is None:
         if layout.step is None and plain:
@@ -232,7 +228,7 @@ def choose_uniform_scan(
     for step in record.steps:
         with nullcontext() if layout.recorded is None else suppress(NotRecordedError):
             sweeps[step] = layout.uniform(step, layout.exposure_ms).sweeps()[1]
-    scans = uniform_scans(record, sweeps, camera, cost, bands, seconds=limits.seconds, exposures_ms=taken_ms)
+    scans = uniform_scans(record, sweeps, camera, cost, bands, seconds=settings.seconds, exposures_ms=taken_ms)
     chosen, exposure_ms = None, layout.exposure_ms or camera.exposure_ms
     if layout.extent != EXTENT_WHOLE:  # the table is for whole fields
         pass
@@ -244,7 +240,7 @@ def choose_uniform_scan(
                 f"camera.exposure_ms = {camera.exposure_ms:g}: the scan performance of the weights starts at "
                 f"{record.exposures_ms[0]:g} ms; choose the scan with --scan-step"
             )
-        chosen = choose_scan(scans, replace(limits, goals=goals))
+        chosen = choose_scan(scans, settings.seconds, goals)
     elif settings.undecided and scans and not settings.zooms:
         chosen = reference_scan(scans)
     return ScanChoice(tuple(scans), chosen)

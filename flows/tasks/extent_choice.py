@@ -18,7 +18,14 @@ from models.weights.files import Description, load_reader
 from pipeline.errors import BudgetError, NothingToMend, SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.coverage import patches_shown
-from pipeline.planning.partial_scans import PartialScan, PatchRows, cheapest_row_seconds, partial_scan, sweeps_of_runs
+from pipeline.planning.partial_scans import (
+    PartialScan,
+    PatchRows,
+    RunTimes,
+    cheapest_row_seconds,
+    choose_runs,
+    sweeps_of_runs,
+)
 from pipeline.planning.uniform_scans import LOSS, MIOU, ScanPerformance, exposures_between, format_scan
 from storage.arrays.class_maps import ProbabilityStore
 
@@ -146,7 +153,8 @@ def _best_extent(layout: PassLayout, extent_gains: ExtentGains, seconds: float) 
             if record.expected(step, exposure_ms)[MIOU] < enough:
                 continue
             expected_gain = extent_gains.expected_gain(extent_gains.gains(step, exposure_ms))
-            extent = partial_scan(rows, expected_gain, camera, cost, exposure_ms=exposure_ms, seconds=seconds)
+            times = RunTimes.of_scan(rows.sweeps, camera, cost, exposure_ms)
+            extent = choose_runs(rows, expected_gain, times, seconds=seconds)
             found += [] if extent is None else [(step, exposure_ms, extent)]
             least.append(cheapest_row_seconds(rows, camera, cost, exposure_ms))
     if not least:

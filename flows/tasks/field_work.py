@@ -18,7 +18,7 @@ from flows.tasks.patch_budget import SHARD
 from models.network.machine import PROCESSOR
 from models.network.spectral import Capture, CaptureMap, LineSpec, patches_of
 from models.policies.policies import GLANCING_POLICIES, score_patches
-from models.reading.expected_errors import PatchExpectedErrors
+from models.reading.expected_errors import LEAST_EXPECTED_ERROR, STEPS, PatchExpectedErrors
 from models.reading.inference import CoarsePass, CoarsePrediction, read_coarse_pass, read_coarse_prediction
 from models.reading.ood import OodDetector
 from models.reading.regions import HALO_PX, REGION_PX, Region, most_bytes, plan_regions
@@ -99,8 +99,8 @@ class ExpectedErrors:
     mosaic: Path
     capture: LineSpec
 
-    def __call__(self, region: Region) -> PatchExpectedErrors:
-        """Return the errors of the region's own patches."""
+    def __call__(self, region: Region) -> NDArray[np.float32]:
+        """Return the counted pixels of the region's own patches, (patch_y, patch_x, class, step)."""
         free_tiles()
         weights = self.weights.load()
         coarse = read_coarse_prediction(weights, coarse_region(weights, self.mosaic, region, self.capture))
@@ -110,8 +110,7 @@ class ExpectedErrors:
         found = PatchExpectedErrors.of([(sure, ages)], region.grid, len(weights.class_names))
         pixels = found.pixels.reshape(*region.grid.patch_shape, *found.pixels.shape[1:])
         (top, left), kept = region.origin, region.kept_patches
-        pixels = pixels[kept.top - top : kept.bottom - top, kept.left - left : kept.right - left]
-        return PatchExpectedErrors(pixels.reshape(-1, *pixels.shape[2:]), found.expected_error, found.age_days[:0])
+        return pixels[kept.top - top : kept.bottom - top, kept.left - left : kept.right - left]
 
 
 def coarse_region(weights: Weights, mosaic: Path, region: Region, capture: LineSpec) -> CoarsePass:
@@ -168,30 +167,29 @@ class FieldWork:
 
         Raises SettingsError: one region does not fit the memory.
         """
-        pool = self.pool_for(np.empty(0, np.int64), len(open_mosaic(mosaic).components))
-        path = mosaic.resolve()
-        parts = run_blocks(
-            Scoring(self.weights, path, policy, capture), self.regions, pool, report=report, paths=[path]
-        )
-        scores = np.zeros(self.regions[0].field.patch_shape)
-        for region, part in zip(self.regions, parts, strict=True):
-            scores[region.kept_patches.rows, region.kept_patches.columns] = part
-        return scores
+        mosaic = mosaic.resolve()
+        return self._gathered(Scoring(self.weights, mosaic, policy, capture), mosaic, report)
 
     def expected_errors(self, mosaic: Path, capture: LineSpec, report: Callable[[float], None]) -> PatchExpectedErrors:
         """Return the expected errors of the overview of a mosaic, by patch.
 
         Raises SettingsError: one region does not fit the memory.
         """
+        mosaic = mosaic.resolve()
+        pixels = self._gathered(ExpectedErrors(self.weights, mosaic, capture), mosaic, report)
+        steps, ages = np.geomspace(LEAST_EXPECTED_ERROR, 1.0, STEPS), np.zeros(pixels[..., 0, 0].size)
+        return PatchExpectedErrors(pixels.reshape(-1, *pixels.shape[2:]), steps, ages)
+
+    def _gathered(
+        self, worker: Callable[[Region], NDArray[Any]], mosaic: Path, report: Callable[[float], None]
+    ) -> NDArray[Any]:
+        """Return what a worker computes of all patches of the padded grid, (patch_y, patch_x, ...)."""
         pool = self.pool_for(np.empty(0, np.int64), len(open_mosaic(mosaic).components))
-        path, field = mosaic.resolve(), self.regions[0].field
-        parts = run_blocks(ExpectedErrors(self.weights, path, capture), self.regions, pool, report=report, paths=[path])
-        pixels = np.zeros((*field.patch_shape, *parts[0].pixels.shape[1:]), np.float32)
+        parts = run_blocks(worker, self.regions, pool, report=report, paths=[mosaic])
+        whole = np.zeros((*self.regions[0].field.patch_shape, *parts[0].shape[2:]), parts[0].dtype)
         for region, part in zip(self.regions, parts, strict=True):
-            kept = region.kept_patches
-            pixels[kept.rows, kept.columns] = part.pixels.reshape(*kept.shape, *part.pixels.shape[1:])
-        nothing_older = np.zeros(int(np.prod(field.patch_shape)))
-        return PatchExpectedErrors(pixels.reshape(-1, *pixels.shape[2:]), parts[0].expected_error, nothing_older)
+            whole[region.kept_patches.rows, region.kept_patches.columns] = part
+        return whole
 
     def pool_for(self, patch_index: NDArray[np.integer], bands: int) -> WorkerPool:
         """Return the worker pool, limited by the memory of regions with these fine patches.

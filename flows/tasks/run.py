@@ -36,6 +36,7 @@ from flows.tasks.scene import (
     scene_of_visit,
 )
 from flows.tasks.stage import FieldFrame, Report
+from flows.tasks.stages.attention import PatchGains, all_seen
 from flows.tasks.stages.capture import SweepRecorder
 from flows.tasks.survey_model import SurveyModel, beyond_training, weights_path
 from flows.tasks.zones import SurveyZones, open_zones, place_of_field
@@ -56,6 +57,7 @@ from pipeline.geometry.scan import Sweep
 from pipeline.ground.field_places import PosedField
 from pipeline.ground.map_grid import GroundGrid
 from pipeline.lazy import Once, deferred
+from pipeline.planning.fine_pass import FinePlan, SecondPass
 from pipeline.planning.uniform_scans import ScanPerformance
 from pipeline.rectify.placed import PixelGrid, place
 from pipeline.rectify.region import MosaicWork, plan_tiles
@@ -226,11 +228,6 @@ class SurveyRun(CaptureRun):
         """Return labels (y, x) in the classes of the weights, without pixels of their training. Draws the scene."""
         return judged_labels(self.scene, self.described)
 
-    @cached_property
-    def mask(self) -> NDArray[np.generic] | None:
-        """Return the mask of policy ``mask``, (y, x) or (y, x, channel)."""
-        return None if self.settings.mask is None else load_labels_array(self.settings.mask)
-
     @property
     def frame(self) -> FieldFrame:
         """Return the frame of all images of the survey."""
@@ -264,10 +261,31 @@ class SurveyRun(CaptureRun):
         return LineSpec(self.camera.exposure_ms * self.scene.light_fraction / DEFAULT_EXPOSURE_MS)
 
     @property
+    def gains(self) -> PatchGains:
+        """Return the expected gain of patches by the policy of the settings."""
+        settings, mask = self.settings, None if self.settings.mask is None else load_labels_array(self.settings.mask)
+        return PatchGains(self.frame, self.zones, self.work, self.capture, settings.policy, settings.seed, mask)
+
+    @property
+    def second_pass(self) -> SecondPass | None:
+        """Return the planner of the second pass; None for a uniform scan or a raster."""
+        plan, cut = self.plan, None if self.recorded is None else self.recorded.fine_pass
+        if plan.plain:
+            return None
+        field = self.grid, self.camera, self.settings.cost
+        return SecondPass(*field, plan.coarse, plan.full, plan.fine_s, plan.margin_px, cut)
+
+    @property
     def scan_record(self) -> ScanPerformance | None:
-        """Return the scan performance table of the weights; None where they have none."""
+        """Return the scan performance table by which a second pass is chosen; None without one."""
         content = self.described.record.get("scans")
-        return None if content is None else ScanPerformance.read(content, self.scene.light_fraction)
+        chosen = content is not None and self.plan.by_record and self.settings.policy == "gain"
+        return ScanPerformance.read(content, self.scene.light_fraction) if chosen else None
+
+    @property
+    def scanned(self) -> FinePlan:
+        """Return the plan of a uniform scan, or of a raster, which has no second pass."""
+        return all_seen(self.grid, self.plan.coarse if self.plan.plain else (), self.camera, part=self.part)
 
     @property
     def unknown(self) -> UnknownRule | None:
@@ -275,7 +293,7 @@ class SurveyRun(CaptureRun):
         rate = self.settings.unknown_rate
         if self.ood_detector is None or rate is None:
             return None
-        return UnknownRule(self.described.config.classes, rate)
+        return UnknownRule(self.described.config.classes, rate, self.ood_detector.key)
 
     @property
     def ground_grid(self) -> GroundGrid:

@@ -18,7 +18,7 @@ from flows.settings.load import load_settings
 from flows.settings.survey_settings import RASTER, Settings
 from flows.tasks.patch_budget import PatchBudget, ReadingCosts
 from flows.tasks.run import SurveyRun, open_run
-from flows.tasks.stages.accuracy import columns_of_all_patches, columns_of_raster
+from flows.tasks.stages.accuracy import columns_of_raster, columns_of_sweeps
 from flows.tasks.survey_model import shipped_weights
 from flows.tradeoff.entries import Setting, Tradeoff
 from flows.tradeoff.store import STORE
@@ -47,7 +47,7 @@ from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from pipeline.simulator.selection.choice import Decision, decide
 from pipeline.simulator.selection.survey_probe import probe_scene
-from pipeline.simulator.simulated import SimulatedSource, sweep_block
+from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_block
 from storage.archive.archive import Archive
 
 Values = NDArray[np.float32]
@@ -249,7 +249,8 @@ def uniform_pass(
     weights: Weights, source: SimulatedSource, sweeps: list[Sweep], grid: SceneGrid, cost: CostModel, capture: LineSpec
 ) -> PlannedPass:
     """Plan to read all patches of a uniform scan."""
-    columns = columns_of_all_patches(source, sweeps, grid, weights, memory=MEMORY, resampling="catmull-rom")
+    seen = [SimulatedSweep(source, sweep) for sweep in sweeps]
+    columns = columns_of_sweeps(seen, source.camera, source.wavelength_nm, grid, weights, memory=MEMORY)
     patch_index, size = grid.valid_patches(), raw_bytes(sweeps, source.camera, len(source.wavelength_nm))
     seconds = cost.seconds(sweeps, source.camera)
     coarse = coarse_prediction_of_patches(weights, columns, grid, capture)
@@ -334,7 +335,8 @@ def plan_every_fraction(seed: int) -> PlannedField:
     grid = SceneGrid(*FARM_SHAPE, weights.config.patch, 1)
     _, full, _ = cheapest_full(grid, camera, CostModel())
     source = SimulatedSource(farm_scene(seed, FARM_SHAPE), Rig(camera), seed)
-    columns = columns_of_all_patches(source, list(full), grid, weights, memory=MEMORY, resampling="catmull-rom")
+    seen = [SimulatedSweep(source, sweep) for sweep in full]
+    columns = columns_of_sweeps(seen, camera, source.wavelength_nm, grid, weights, memory=MEMORY)
     passes = _fractions_of(weights, columns, grid)
     return PlannedField(np.asarray(source.scene.labels, np.uint8), len(source.wavelength_nm), passes)
 

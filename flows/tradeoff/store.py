@@ -152,8 +152,7 @@ def scan_farm(seed: int, shape: tuple[int, int] = FIELD_SHAPE, camera: LineCamer
     def miou(values: Values) -> float:
         """Rectify scene values and read them, as a survey does."""
         plain = replace(lines, references=_unit_references(values.shape), data=values)
-        nm, options = source.wavelength_nm, {"memory": MEMORY, "resampling": "catmull-rom"}
-        columns = columns_of_sweeps([plain], camera, nm, grid, weights, **options)  # type: ignore[arg-type]
+        columns = columns_of_sweeps([plain], camera, source.wavelength_nm, grid, weights, memory=MEMORY)
         return _miou(weights, columns, grid, labels, LineSpec(EXPOSURE_MS / DEFAULT_EXPOSURE_MS))
 
     dark = dark_frame(block, source.choice)

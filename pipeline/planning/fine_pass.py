@@ -1,34 +1,40 @@
-"""Plan the fine pass: the runs of lines that show the patches of most expected gain within a budget of seconds."""
+"""Lay the two passes of a zoomed survey, and choose the lines of the second one by expected gain.
+
+Lines of the second pass never repeat a line of the first one. For both the mirror holds one position a line, and line
+numbers count the positions of the full scan, 1 px apart.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import partial
-from typing import Literal
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import PoseError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import Axis, CostModel, Sweep
-from pipeline.planning.budget_search import spend
-from pipeline.planning.coverage import check_reach
-from pipeline.planning.prices import prices_of
-from pipeline.planning.scan_runs import NEGLIGIBLE, Field
-from pipeline.planning.swaths import covered_patches, edges_from, swaths_at_patches
+from pipeline.geometry.scan import CostModel, Sweep, exposing
+from pipeline.planning.coverage import some_lines
+from pipeline.planning.partial_scans import LineRun, PatchRows, RunTimes, choose_runs
+from pipeline.planning.uniform_scans import MIOU, ScanPerformance, format_scan, longest_exposure
+
+FIRST_STEP = 4  # positions of the full scan from line to line of the first pass
+FIRST_STEPS = (4, 8)  # allowed values
+LEAST_GAIN = 1e-3  # of mIoU; below it there is no second pass
+EXPOSURES = 7  # that are tried, equally spaced by logarithm
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class FinePlan:
-    """Sweeps of the fine pass, the valid patches that they show, and their capture time.
+    """Sweeps of the second pass, the patches that they show, and their capture time.
 
-    ``patch_index`` also has patches that a sweep shows without being planned for them; ``expected_gain`` may not count
-    these. ``kind`` is "lines" for runs of lines, each patch wholly in one of them, and "full" for the full scan where
-    that costs no more. After a uniform scan it is "scan", and "raster" if all pixels were given. ``reason`` says it in
-    a sentence.
+    ``kind`` is "lines" for runs of lines, and "full" for the whole field. After a uniform scan it is "scan", and
+    "raster" if all pixels were given. ``reason`` says it in a sentence.
     """
 
     sweeps: list[Sweep]
@@ -37,99 +43,175 @@ class FinePlan:
     expected_gain: float
     kind: Literal["lines", "full", "scan", "raster"] = "lines"
     reason: str = ""
-    wanted_gain: float = 0.0  # of all patches that a line within the mirror's range shows
-    full_seconds: float | None = None  # of the full scan with lines along the same axis
-    out_of_reach: int = 0  # patches with a gain that no line within the mirror's range shows
 
     @property
     def lines(self) -> int:
         """Return the number of lines of all sweeps."""
         return sum(sweep.lines for sweep in self.sweeps)
 
-    @property
-    def gain_per_second(self) -> float | None:
-        """Return the expected gain per second of the fine pass; None without a sweep."""
-        return self.expected_gain / self.seconds if self.seconds else None
 
+@dataclass(frozen=True)
+class SecondPass:
+    """Planner of the second pass in the time that the first one leaves.
 
-def plan_fine(
-    grid: SceneGrid,
-    camera: LineCamera,
-    cost: CostModel,
-    along: Axis,
-    scores: NDArray[np.floating],
-    *,
-    budget_s: float,
-    full: Sequence[Sweep],
-    margin_px: float = 0.0,
-    swaths: Sequence[Sweep] | None = None,
-) -> FinePlan:
-    """Choose the line runs that show the most expected gain in at most ``budget_s`` seconds.
-
-    The price counts lines, a set-up for each run and reloads of the vector memory, and never exceeds the budget. With
-    the same scores a larger budget never has less ``expected_gain``. The full scan is taken if the budget pays for it
-    and no cheaper runs show all patches with a gain.
-
-    Parameters
-    ----------
-    scores
-        (patch,) expected gain of each patch of ``grid``; NaN and negative ones count as 0.
-    full
-        Sweeps of the full scan.
-    margin_px
-        Distance beside the plan that the mirror may look: every run shows its patches even then. [px]
-    swaths
-        Swaths that runs may lie on, ascending along the line, from the field's first row on and without lines; None
-        takes all that `swaths_at_patches` gives.
-
-    Raises
-    ------
-    SettingsError : a patch is wider than a line.
-    PoseError : no line within the mirror's range shows any of the patches with a gain.
+    New lines lie between those of the first pass. With pointing errors, ``margin_px`` above 0, they are all lines of
+    runs of the full scan, which are so much longer at either end.
     """
-    given = np.asarray(scores, np.float64)
-    expected_gain = np.where((given > 0) & (grid.valid_fraction().ravel() > 0), given, 0.0)
-    field = _field(grid, camera, cost, along, expected_gain, margin_px, swaths)
-    missed = int(np.count_nonzero(expected_gain)) - len(np.unique(field.views.patch_number))
-    full_s = cost.seconds(list(full), camera)
-    cover = spend(field, min(budget_s, float(np.nextafter(full_s, 0.0))))
-    planned = partial(FinePlan, wanted_gain=field.total, full_seconds=full_s, out_of_reach=missed)
-    if full_s <= budget_s and cover.expected_gain < field.total * (1 - NEGLIGIBLE):
-        reason = (
-            f"to show every place worth a second pass takes no less time than to scan everything in detail, "
-            f"{full_s:.1f} s; the full scan is taken, which shows all of the field"
+
+    grid: SceneGrid
+    camera: LineCamera
+    cost: CostModel
+    first_pass: Sequence[Sweep]
+    full: Sequence[Sweep]
+    seconds: float
+    margin_px: float = 0.0
+    recorded: Callable[[list[Sweep]], list[Sweep]] | None = None  # cuts sweeps to the lines of a recording
+
+    @property
+    def key(self) -> dict[str, Any]:
+        """Return the parameters of the planner, without the first pass."""
+        full = [asdict(sweep) for sweep in self.full]
+        known = {"fine_s": self.seconds, "margin_px": self.margin_px, "full": full}
+        return {**known, "camera": asdict(self.camera), "cost": asdict(self.cost)}
+
+    @property
+    def interlaces(self) -> bool:
+        """Return whether new lines lie between those of the first pass."""
+        return not self.margin_px
+
+    @cached_property
+    def swaths(self) -> list[Sweep]:
+        """Return the sweeps of every line that runs are parts of."""
+        found = self.full
+        if self.interlaces:
+            found = [replace(one, step=1, held=None, lines=(one.lines - 1) * one.step + 1) for one in self.first_pass]
+        return [replace(one, name=f"fine-{number:03d}", kind="fine") for number, one in enumerate(found)]
+
+    @cached_property
+    def rows(self) -> PatchRows:
+        """Return the rows of patches of the field in these sweeps: with the margin, from old line to old line."""
+        found, margin, apart = PatchRows.of(self.swaths, self.grid, self.camera), math.ceil(self.margin_px), self._apart
+        lines = np.array([sweep.lines for sweep in self.swaths])[:, None]
+        first = np.maximum(found.first - margin, 0) // apart * apart
+        stop = np.minimum(-(-(found.stop + margin - 1) // apart) * apart + 1, lines)
+        return replace(found, first=np.where(found.there, first, 0), stop=np.where(found.there, stop, 0))
+
+    def plan(self, gain: Floats, *, step: int = 1, exposure_ms: float | None = None) -> FinePlan:
+        """Return the runs of lines ``step`` px apart that have the highest sum of (patch,) ``gain`` in the time.
+
+        NaN and negative gains count as 0.
+        """
+
+        def sweeps_of(runs: Sequence[LineRun]) -> list[Sweep]:
+            found = [self._run(*run) for run in sorted(runs)]  # in the order of their names
+            return lines_between(found, self._between, step=step, exposure_ms=exposure_ms)
+
+        exposed = self.camera if exposure_ms is None else replace(self.camera, exposure_ms=exposure_ms)
+        new = 1 / step - (1 / self._apart if self.interlaces else 0)
+        sweeps_a_run = math.log2(self._apart / step) if self.interlaces else 1
+        times = RunTimes(
+            exposed.frame_ms * 1e-3 * new,
+            self.cost.setup_seconds(exposed) * sweeps_a_run,
+            lambda runs: self.cost.seconds(sweeps_of(runs), self.camera),
         )
-        return planned(list(full), grid.valid_patches(), full_s, field.total, "full", reason)
-    sweeps = []
-    for run in sorted(cover.runs):  # a name holds swath and first line, so that names sort in the same order
-        swath = field.views.swaths[run.swath]
-        name, first = f"{swath.name}-{run.first:05d}", swath.start_px + run.first
-        sweeps.append(replace(swath, name=name, start_px=first, lines=run.stop - run.first))
-    check_reach(sweeps, camera)
-    seconds = cost.seconds(sweeps, camera)
-    reason = f"runs of lines take {seconds:.1f} s, less than the full scan's {full_s:.1f} s"
-    patch_index = covered_patches(grid, camera, sweeps, margin_px=margin_px)
-    return planned(sweeps, patch_index, seconds, cover.expected_gain, "lines", reason)
+        wanted = np.where(gain > 0, gain, 0.0)
+        chosen = choose_runs(self.rows, wanted, times, seconds=self.seconds, several=True)
+        if chosen is None:
+            return FinePlan([], np.empty(0, np.intp), 0.0, 0.0, reason="no run of lines with a gain fits the time")
+        sweeps, patch_index = sweeps_of(chosen.runs), self.rows.patches(chosen.runs)
+        if self.recorded is not None:
+            sweeps = self.recorded(sweeps)
+        whole = len(patch_index) == np.count_nonzero(self.rows.row >= 0)
+        what = "the whole field" if whole else f"{len(patch_index)} patches"
+        reason = f"captured again: {what}, {format_scan(step, exposed.exposure_ms)}"
+        seconds = self.cost.seconds(sweeps, self.camera)
+        return FinePlan(sweeps, patch_index, seconds, chosen.expected_gain, "full" if whole else "lines", reason)
+
+    def best(self, record: ScanPerformance, gain_of: Callable[[int, float], Floats]) -> FinePlan:
+        """Return the plan with the highest expected gain in mIoU, over line spacings and exposures.
+
+        ``gain_of`` returns the (patch,) gains of lines of a spacing, for the mean exposure [ms] of old and new lines.
+        """
+        first, (shortest, longest) = self.first_pass[0], record.offered_ms(self.camera)
+        first_ms, plans = exposing(self.camera, first).exposure_ms, list[FinePlan]()
+        known = (
+            first.step in record.steps
+        )  # lines that score less than those of the first pass would replace better ones
+        least = record.expected(first.step, float(np.clip(first_ms, shortest, longest)))[MIOU] if known else 0.0
+        for step in (step for step in record.steps if step < first.step):
+            every = lines_between(self.full, self._between, step=step)
+            last = longest_exposure(self.seconds, every, self.camera, self.cost, shortest, longest)
+            tried = np.geomspace(shortest, longest, EXPOSURES).round(1).tolist()
+            for exposure_ms in sorted({*tried, *([] if last is None else [last])}):
+                mean_ms = merged_ms(first_ms, exposure_ms, step / first.step if self.interlaces else 0.0)
+                mean_ms = float(np.clip(mean_ms, shortest, longest))
+                if record.expected(step, mean_ms)[MIOU] >= least:
+                    plans.append(self.plan(gain_of(step, mean_ms), step=step, exposure_ms=exposure_ms))
+        plan = max(plans, key=lambda made: (made.expected_gain, -made.seconds), default=None)
+        if plan is None or plan.expected_gain < LEAST_GAIN:
+            gain = 0.0 if plan is None else plan.expected_gain
+            reason = f"no second pass: its expected gain is {100 * gain:.2f} points"
+            return FinePlan([], np.empty(0, np.intp), 0.0, gain, reason=reason)
+        return plan
+
+    @property
+    def _between(self) -> Sequence[Sweep]:
+        """Return the sweeps whose lines are not captured again."""
+        return self.first_pass if self.interlaces else []
+
+    @property
+    def _apart(self) -> int:
+        """Return the distance of the lines that new ones lie between; 1 with pointing errors."""
+        return self.first_pass[0].step if self.interlaces else 1
+
+    def _run(self, number: int, first: int, stop: int) -> Sweep:
+        swath = self.swaths[number]
+        return replace(some_lines(swath, first, stop), name=f"{swath.name}-{first:05d}")
 
 
-def _field(
-    grid: SceneGrid,
-    camera: LineCamera,
-    cost: CostModel,
-    along: Axis,
-    expected_gain: NDArray[np.float64],
-    margin_px: float,
-    swaths: Sequence[Sweep] | None,
-) -> Field:
-    """Return which patches with a gain the swaths show: those given, or one at every offset."""
-    if swaths is None:
-        swaths = swaths_at_patches(grid, camera, along, margin_px=margin_px)
-    views = edges_from(grid, camera, swaths, expected_gain > 0, margin_px=margin_px)
-    if np.any(expected_gain > 0) and not len(views.patch_number):
-        first = int(np.flatnonzero(expected_gain > 0)[0])
-        raise PoseError(
-            f"no line within the mirror's range shows any of the {np.count_nonzero(expected_gain > 0)} patches with an "
-            f"expected gain (the first is {first}); use a smaller scene or a smaller angle per pixel"
-        )
-    row, column = np.divmod(np.arange(len(expected_gain)), grid.patch_shape[1])
-    return Field(views, expected_gain, column if along == "x" else row, prices_of(camera, cost))
+def merged_ms(first_ms: float, later_ms: float, first_fraction: float) -> float:
+    """Return the exposure [ms] whose noise is the mean of that of lines of two exposures."""
+    return 1 / (first_fraction / first_ms + (1 - first_fraction) / later_ms)
+
+
+def every_nth(full: Sequence[Sweep], step: int = FIRST_STEP, exposure_ms: float | None = None) -> list[Sweep]:
+    """Return the first pass: every ``step``-th line of the sweeps of a full scan, to its last line or just beyond."""
+    found = []
+    for number, sweep in enumerate(full):
+        name, lines = f"coarse-{number}", -(-(sweep.lines - 1) // step) + 1
+        found.append(replace(sweep, name=name, kind="coarse", step=step, held=1, lines=lines, exposure_ms=exposure_ms))
+    return found
+
+
+def lines_between(
+    runs: Sequence[Sweep], first_pass: Sequence[Sweep], *, step: int = 1, exposure_ms: float | None = None
+) -> list[Sweep]:
+    """Return the sweeps that complete runs of a full scan's lines to a distance of ``step``.
+
+    A run on the swath of a sweep of the first pass begins and ends at lines of that sweep, and takes the lines between.
+    After a first pass of every fourth line these are the lines halfway, then the odd ones. Any other run takes all of
+    its own lines.
+    """
+    taken = {(sweep.along, sweep.swath_px): sweep for sweep in first_pass}
+    found: list[Sweep] = []
+    for run in runs:
+        coarse = taken.get((run.along, run.swath_px))
+        if coarse is None:
+            held = None if step == 1 else 1
+            found.append(replace(run, lines=-(-run.lines // step), step=step, held=held, exposure_ms=exposure_ms))
+        else:
+            found += _filling(run, coarse, step, exposure_ms)
+    return found
+
+
+def _filling(run: Sweep, coarse: Sweep, step: int, exposure_ms: float | None) -> Iterator[Sweep]:
+    """Yield the sweeps that halve the distance of a pass's lines along a run until it is ``step``."""
+    low = round(run.start_px - coarse.start_px)
+    first = max(low // coarse.step, 0)
+    stop = min(-(-(low + run.lines - 1) // coarse.step), coarse.lines - 1)  # the coarse line that the run ends at
+    apart, spaces = coarse.step, stop - first
+    while apart > step and spaces > 0:
+        start = coarse.start_px + first * coarse.step + apart / 2
+        name = f"{run.name}-{apart // 2}"
+        yield replace(run, name=name, start_px=start, lines=spaces, step=apart, held=1, exposure_ms=exposure_ms)
+        apart, spaces = apart // 2, 2 * spaces

@@ -1,18 +1,15 @@
-"""Choose the lines of partial scans, and lay the later passes between the lines of a first one.
+"""Choose runs of lines for a limited time: those of a partial scan, or of a second pass.
 
-The patches of a field lie in rows along the lines of the sweeps that show them. A partial scan takes at most one run
-of lines of each sweep. At a price of a second each sweep has a best run in closed form (the largest sum of
-neighbours). Bisection finds the lowest price at which all of them together end in time. One more sweep gets the
-remaining seconds: rows of equal gain cannot be separated by a price.
-
-Lines of a later pass never repeat a line of the first one. For them the mirror holds one position a line, and line
-numbers count the positions of the full scan, 1 px apart.
+The patches of a field lie in rows along the lines of the sweeps that show them. A run takes the lines of some rows one
+after the other. At a price of a second, each sweep has its best runs in closed form. Bisection finds the lowest price
+at which all of them together end in time. Single runs then fill the remaining seconds: rows of equal gain cannot be
+separated by a price.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -24,11 +21,8 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel, Sweep, exposing, scene_to_sweep
-from pipeline.planning.coverage import field_px, lines_showing, some_lines
-from pipeline.planning.prices import prices_of
+from pipeline.planning.coverage import lines_showing, some_lines
 
-FIRST_STEP = 4  # positions of the full scan from line to line of the first pass
-FIRST_STEPS = (4, 8)  # allowed values
 LEAST_PRICE, MOST_PRICE = 1e-9, 1e6  # of a second, in fractions of the total gain: all runs pay, or none
 HALVINGS = 48  # of the logarithm of the interval between them
 Floats = NDArray[np.float64]
@@ -79,6 +73,17 @@ class PatchRows:
         """Return (sweep, row) whether lines show a row."""
         return np.asarray(self.stop > self.first)
 
+    def within(self, runs: Sequence[LineRun]) -> NDArray[np.bool_]:
+        """Return (sweep, row) whether runs have all lines of a row."""
+        found = np.zeros(self.first.shape, np.bool_)
+        for number, first, stop in runs:
+            found[number] |= (self.first[number] >= first) & (self.stop[number] <= stop)
+        return found & self.there
+
+    def patches(self, runs: Sequence[LineRun]) -> NDArray[np.intp]:
+        """Return the patches of the rows within runs, ascending."""
+        return np.flatnonzero((self.row >= 0) & self.within(runs).ravel()[self.row])
+
     def sums(self, expected_gain: Floats) -> Floats:
         """Return the sum of the gains (patch,) of each row of patches, (sweep, row)."""
         shown = self.row >= 0
@@ -123,37 +128,55 @@ def sweeps_of_runs(sweeps: Sequence[Sweep], runs: Sequence[LineRun]) -> list[Swe
     return [taken[number] for number in sorted(taken)]
 
 
-def partial_scan(
-    rows: PatchRows, expected_gain: Floats, camera: LineCamera, cost: CostModel, *, exposure_ms: float, seconds: float
+@dataclass(frozen=True)
+class RunTimes:
+    """Time of runs of lines: that of a line and of a run, which add up nearly, and the exact one."""
+
+    line_s: float
+    run_s: float
+    seconds: Callable[[Sequence[LineRun]], float]
+
+    @staticmethod
+    def of_scan(sweeps: Sequence[Sweep], camera: LineCamera, cost: CostModel, exposure_ms: float) -> RunTimes:
+        """Return the times of runs of a scan's lines in an exposure."""
+        exposed = [replace(sweep, exposure_ms=exposure_ms) for sweep in sweeps]
+        shown = exposing(camera, exposed[0])
+        return RunTimes(
+            shown.frame_ms * 1e-3,
+            cost.setup_seconds(shown),
+            lambda runs: cost.seconds(sweeps_of_runs(exposed, runs), camera),
+        )
+
+
+def choose_runs(
+    rows: PatchRows, expected_gain: Floats, times: RunTimes, *, seconds: float, several: bool = False
 ) -> PartialScan | None:
     """Choose the runs of lines with the most gain that end in time; None if no run does.
 
-    ``expected_gain`` (patch,) is that of capturing each patch; none is below 0.
+    ``expected_gain`` (patch,) is that of capturing each patch; none is below 0. A sweep has one run, or ``several``.
     """
-    exposed = replace(rows, sweeps=tuple(replace(sweep, exposure_ms=exposure_ms) for sweep in rows.sweeps))
     values = rows.sums(expected_gain)
     total = float(values.sum())
     if not total > 0:
         return None
-    high, low = MOST_PRICE * total / exposing(camera, exposed.sweeps[0]).frame_ms, LEAST_PRICE * total
-    everything = _scan_at_price(exposed, values, camera, cost, low)
+    high, low = MOST_PRICE * total / times.line_s, LEAST_PRICE * total
+    everything = _runs_at_price(rows, values, times, low, several=several)
     if everything.seconds <= seconds:
         return everything
     best = PartialScan((), 0.0, 0.0)
     for _ in range(HALVINGS):  # a lower price never takes fewer lines
         price = math.sqrt(high * low)
-        scan = _scan_at_price(exposed, values, camera, cost, price)
+        scan = _runs_at_price(rows, values, times, price, several=several)
         if scan.seconds > seconds:
             low = price
         else:
             high, best = price, scan
-    filled = _filled(exposed, values, camera, cost, seconds, best)
-    return filled if filled.runs else None
+    while (filled := _filled(rows, values, times, seconds, best)).expected_gain > best.expected_gain:
+        best = filled
+    return best if best.runs else None
 
 
-def _filled(
-    rows: PatchRows, values: Floats, camera: LineCamera, cost: CostModel, seconds: float, scan: PartialScan
-) -> PartialScan:
+def _filled(rows: PatchRows, values: Floats, times: RunTimes, seconds: float, scan: PartialScan) -> PartialScan:
     """Return the best of: the scan; one sweep's run changed to fill the time beside the others; that run alone."""
     best = scan
     for number, others in product(range(len(values)), {scan.runs, ()}):
@@ -162,15 +185,15 @@ def _filled(
         low, high = 0, int(stop.max())
         while low < high:  # the most lines that end in time
             lines = (low + high + 1) // 2
-            taken_s = cost.seconds(sweeps_of_runs(rows.sweeps, [*beside, (number, 0, lines)]), camera)
-            low, high = (lines, high) if taken_s <= seconds else (low, lines - 1)
+            low, high = (lines, high) if times.seconds([*beside, (number, 0, lines)]) <= seconds else (low, lines - 1)
         run = _longest_run(values[number], first, stop, low)
         if run is None:
             continue
         runs = tuple(sorted([*beside, (number, *run)]))
-        gain = sum(float(values[one][(rows.first[one] >= a) & (rows.stop[one] <= b)].sum()) for one, a, b in runs)
-        if gain > best.expected_gain:
-            best = PartialScan(runs, cost.seconds(sweeps_of_runs(rows.sweeps, runs), camera), gain)
+        gain = float(values[rows.within(runs)].sum())
+        taken_s = times.seconds(runs)
+        if gain > best.expected_gain and taken_s <= seconds:
+            best = PartialScan(runs, taken_s, gain)
     return best
 
 
@@ -189,35 +212,34 @@ def _longest_run(values: Floats, first: NDArray[np.intp], stop: NDArray[np.intp]
     return int(first[there[begin + some[0]]]), int(stop[there[begin + some[-1]]])
 
 
-def _scan_at_price(rows: PatchRows, values: Floats, camera: LineCamera, cost: CostModel, price: float) -> PartialScan:
-    """Return the best run of each sweep, if it has one, at a price of a second in the unit of ``values``."""
-    exposed = exposing(camera, rows.sweeps[0])
-    line_price, setup_price = price * exposed.frame_ms * 1e-3, price * cost.setup_seconds(exposed)
-    runs, gain = [], 0.0
-    for number, (row, first, stop) in enumerate(zip(values, rows.first, rows.stop, strict=True)):
-        run = _best_run(row, first, stop, line_price, setup_price)
-        if run is not None:
-            runs.append((number, *run))
-            gain += float(row[(first >= run[0]) & (stop <= run[1])].sum())
-    return PartialScan(tuple(runs), cost.seconds(sweeps_of_runs(rows.sweeps, runs), camera), gain)
+def _runs_at_price(rows: PatchRows, values: Floats, times: RunTimes, price: float, *, several: bool) -> PartialScan:
+    """Return the best runs of each sweep at a price of a second in the unit of ``values``."""
+    line_price, run_price, runs = price * times.line_s, price * times.run_s, list[LineRun]()
+    for number, (row, first, stop, there) in enumerate(zip(values, rows.first, rows.stop, rows.there, strict=True)):
+        spans = zip(row[there].tolist(), first[there].tolist(), stop[there].tolist(), strict=True)
+        runs += [(number, *run) for run in _best_runs(spans, line_price, run_price, several=several)]
+    return PartialScan(tuple(runs), times.seconds(runs), float(values[rows.within(runs)].sum()))
 
 
-def _best_run(
-    values: Floats, first: NDArray[np.intp], stop: NDArray[np.intp], line_price: float, setup_price: float
-) -> tuple[int, int] | None:
-    """Return the run with the most gain less price: first line and the one after the last; None if none pays."""
-    there = np.flatnonzero(stop > first)
-    if not there.size:
-        return None
-    summed = np.concatenate([[0.0], np.cumsum(values[there])])
-    begins = summed[:-1] - line_price * first[there]
-    ends = summed[1:] - line_price * stop[there]
-    least = np.minimum.accumulate(begins)
-    last = int((ends - least).argmax())
-    if ends[last] - least[last] <= setup_price:
-        return None
-    begin = int(np.flatnonzero(begins[: last + 1] == least[last])[0])
-    return int(first[there[begin]]), int(stop[there[last]])
+def _best_runs(
+    spans: Iterable[tuple[float, int, int]], line_price: float, run_price: float, *, several: bool
+) -> tuple[tuple[int, int], ...]:
+    """Return the runs of one sweep with the most gain less price, as first line and the one after the last.
+
+    ``spans`` are gain, first line and line after the last of each row, ascending. Two candidates are kept from row to
+    row: the best runs so far, and the best of those that end with this row.
+    """
+    nothing: tuple[tuple[int, int], ...] = ()
+    best, ending = (0.0, nothing), (-math.inf, nothing)
+    for gain, first, stop in spans:
+        net, runs = best if several else (0.0, nothing)
+        begun = net + gain - line_price * (stop - first) - run_price, (*runs, (first, stop))
+        net, runs = ending
+        if runs:
+            ending = net + gain - line_price * (stop - runs[-1][1]), (*runs[:-1], (runs[-1][0], stop))
+        ending = ending if ending[0] >= begun[0] else begun
+        best = ending if ending[0] > best[0] else best
+    return best[1]
 
 
 def cheapest_row_seconds(rows: PatchRows, camera: LineCamera, cost: CostModel, exposure_ms: float) -> float:
@@ -228,79 +250,3 @@ def cheapest_row_seconds(rows: PatchRows, camera: LineCamera, cost: CostModel, e
         if there.any()
     ]
     return min(prices, default=math.inf)
-
-
-def merged_ms(first_ms: float, later_ms: float, first_fraction: float) -> float:
-    """Return the exposure [ms] whose noise is the mean of that of lines of two exposures."""
-    return 1 / (first_fraction / first_ms + (1 - first_fraction) / later_ms)
-
-
-def every_nth(full: Sequence[Sweep], step: int = FIRST_STEP, exposure_ms: float | None = None) -> list[Sweep]:
-    """Return the first pass: every ``step``-th line of the sweeps of a full scan, to its last line or just beyond."""
-    found = []
-    for number, sweep in enumerate(full):
-        name, lines = f"coarse-{number}", -(-(sweep.lines - 1) // step) + 1
-        found.append(replace(sweep, name=name, kind="coarse", step=step, held=1, lines=lines, exposure_ms=exposure_ms))
-    return found
-
-
-def lines_between(
-    runs: Sequence[Sweep], first_pass: Sequence[Sweep], *, step: int = 1, exposure_ms: float | None = None
-) -> list[Sweep]:
-    """Return the sweeps that complete runs of a full scan's lines to a distance of ``step``.
-
-    A run on the swath of a sweep of the first pass begins and ends at lines of that sweep, and takes the lines between.
-    After a first pass of every fourth line these are the lines halfway, then the odd ones. Any other run takes all of
-    its own lines.
-    """
-    taken = {(sweep.along, sweep.swath_px): sweep for sweep in first_pass}
-    found: list[Sweep] = []
-    for run in runs:
-        coarse = taken.get((run.along, run.swath_px))
-        if coarse is None:
-            held = None if step == 1 else 1
-            found.append(replace(run, lines=-(-run.lines // step), step=step, held=held, exposure_ms=exposure_ms))
-        else:
-            found += _filling(run, coarse, step, exposure_ms)
-    return found
-
-
-def _filling(run: Sweep, coarse: Sweep, step: int, exposure_ms: float | None) -> Iterator[Sweep]:
-    """Yield the sweeps that halve the distance of a pass's lines along a run until it is ``step``."""
-    low = round(run.start_px - coarse.start_px)
-    first = max(low // coarse.step, 0)
-    stop = min(-(-(low + run.lines - 1) // coarse.step), coarse.lines - 1)  # the coarse line that the run ends at
-    apart, spaces = coarse.step, stop - first
-    while apart > step and spaces > 0:
-        start = coarse.start_px + first * coarse.step + apart / 2
-        name = f"{run.name}-{apart // 2}"
-        yield replace(run, name=name, start_px=start, lines=spaces, step=apart, held=1, exposure_ms=exposure_ms)
-        apart, spaces = apart // 2, 2 * spaces
-
-
-def most_within(
-    seconds: float,
-    values: NDArray[np.floating],
-    grid: SceneGrid,
-    first_pass: Sequence[Sweep],
-    camera: LineCamera,
-    cost: CostModel,
-    *,
-    step: int,
-    exposure_ms: float,
-    interlaced: bool = True,
-) -> float:
-    """Return an upper bound of the (patch,) values that lines ``step`` px apart show in so many ``seconds``.
-
-    Rows of patches along the lines are taken freely, without the set-ups of runs.
-    """
-    along, apart = first_pass[0].along, first_pass[0].step
-    lines = grid.patch * (1 / step - (1 / apart if interlaced else 0.0))
-    price = lines * prices_of(replace(camera, exposure_ms=exposure_ms), cost).even_line_s
-    row, column = np.divmod(np.arange(len(values)), grid.patch_shape[1])
-    across, down = (column, row) if along == "x" else (row, column)
-    middle = (across + 0.5) * grid.patch - field_px(grid, along)[0] / 2
-    centres = np.array(sorted({sweep.swath_px for sweep in first_pass}))
-    swath = np.abs(middle[:, None] - centres).argmin(axis=1)
-    rows = np.bincount(swath * (int(down.max()) + 1) + down, np.maximum(values, 0.0))
-    return float(np.sort(rows)[::-1][: int(seconds / price)].sum())

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import ceil, isfinite
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,91 +15,17 @@ from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.planning.coverage import on_scene
 
 BYTES_PER_SAMPLE = 2  # raw samples are uint16
-LEAST_DIGITS = 4  # of the least budget in a message
-ROUNDING = 1e-9
-GOLDEN = (5**0.5 - 1) / 2
-
-
-@dataclass(frozen=True)
-class ScanPrices:
-    """Seconds of a line, of the set-up of a run, and of a reload after every ``lines_per_reload`` lines."""
-
-    line_s: float
-    run_s: float
-    reload_s: float
-    lines_per_reload: int
-
-    @property
-    def even_line_s(self) -> float:
-        """Return the time of a line with its part of a reload: additive, and too low by less than a reload in all."""
-        return self.line_s + self.reload_s / self.lines_per_reload
-
-    def seconds(self, lines: int, runs: int) -> float:
-        """Return the exact time of so many lines in so many runs [s]."""
-        return lines * self.line_s + runs * self.run_s + -(-lines // self.lines_per_reload) * self.reload_s
-
-    def even_seconds(self, lines: int, runs: int) -> float:
-        """Return the additive time [s]."""
-        return lines * self.even_line_s + runs * self.run_s
-
-    def most_lines(self, seconds: float, runs: int) -> int:
-        """Return the most lines that so many runs can have in ``seconds``; negative if the runs alone take longer."""
-        left = seconds - runs * self.run_s
-        load = self.lines_per_reload * self.line_s + self.reload_s
-        loads = int(left // load)
-        rest = max(int((left - loads * load - self.reload_s) / self.line_s), 0)
-        lines = loads * self.lines_per_reload + rest
-        while lines >= 0 and self.seconds(lines, runs) > seconds:  # rounding
-            lines -= 1
-        return lines
-
-
-def prices_of(camera: LineCamera, cost: CostModel) -> ScanPrices:
-    """Return the cost model's prices of fine lines (one held position each) and runs."""
-    return ScanPrices(camera.frame_ms * 1e-3, cost.setup_seconds(camera), cost.reload_s, cost.vector_pairs)
-
-
-def check_budget(budget: float, coarse_seconds: float, full_seconds: float) -> float:
-    """Return the seconds that ``budget`` leaves for the fine pass.
-
-    The budget is the time of coarse and fine capture over that of the full scan, above 0 and at most 1.
-
-    Raises BudgetError: the budget is out of that range, or does not pay for the coarse pass; names the least.
-    """
-    if not isfinite(budget) or not 0 < budget <= 1:
-        raise BudgetError(f"--budget must be a fraction of the full scan's time above 0 and at most 1, got {budget}")
-    if coarse_seconds > full_seconds:
-        raise BudgetError(
-            f"the coarse pass alone ({coarse_seconds:.1f} s) takes longer than the full scan ({full_seconds:.1f} s), "
-            f"so no budget can be met, got {budget}; scan in full, or take a larger coarse factor"
-        )
-    left = budget * full_seconds - coarse_seconds
-    if left < -ROUNDING * full_seconds:
-        least = ceil(coarse_seconds / full_seconds * 10.0**LEAST_DIGITS - ROUNDING) / 10.0**LEAST_DIGITS
-        raise BudgetError(
-            f"--budget {budget} gives {budget * full_seconds:.1f} s, but the coarse pass alone takes "
-            f"{coarse_seconds:.1f} of the full scan's {full_seconds:.1f} s; "
-            f"the least possible is {least}, or less with a shorter --coarse-exposure-ms"
-        )
-    return max(left, 0.0)
 
 
 def select_patches(score: NDArray[np.floating], count: int, valid: NDArray[np.bool_] | None = None) -> NDArray[np.intp]:
     """Return the ``count`` valid patches with the highest ``score`` (patch,), best first.
 
     Equal scores go to the lowest number, +inf comes first, NaN and -inf last. A smaller count gives the first patches
-    of a larger one. If no score is a number, patches are spread evenly over the valid ones.
-
-    Raises BudgetError: ``count`` is not a whole number from 0 to the number of valid patches.
+    of a larger one.
     """
     allowed = np.arange(len(score)) if valid is None else np.flatnonzero(valid)
-    if count not in range(len(allowed) + 1):
-        raise BudgetError(f"expected a whole number of patches to buy from 0 to {len(allowed)}, got {count!r}")
     given = np.asarray(score, np.float64)[allowed]
     order = np.argsort(np.where(np.isnan(given), np.inf, -given), kind="stable")
-    if not np.any(given > -np.inf):
-        # multiples of the golden ratio leave gaps of at most three sizes, for every count and any row length
-        order = np.argsort((np.arange(len(given)) * GOLDEN) % 1.0, kind="stable")
     return allowed[order[:count]]
 
 
@@ -120,11 +44,10 @@ def frame_patches(
 
 @dataclass(frozen=True)
 class SavingEntry:
-    """One line of the receipt's savings: the capture's value, that of full resolution, and how the latter is known."""
+    """One line of the receipt's savings: the capture's value, and the predicted one of full resolution."""
 
     done: float
     full: float
-    full_is: Literal["measured", "predicted"] = "predicted"
 
     @property
     def ratio(self) -> float | None:
@@ -133,7 +56,7 @@ class SavingEntry:
 
     def as_dict(self) -> dict[str, float | str | None]:
         """Return the entry in the receipt's form."""
-        return {"done": self.done, "full": self.full, "ratio": self.ratio, "full_is": self.full_is}
+        return {"done": self.done, "full": self.full, "ratio": self.ratio, "full_is": "predicted"}
 
 
 def count_samples(sweeps: Sequence[Sweep], camera: LineCamera, grid: SceneGrid) -> int:

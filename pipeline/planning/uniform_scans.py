@@ -1,4 +1,4 @@
-"""Choose a uniform scan: one pass over the field by line spacing and exposure, within limits of time and data.
+"""Choose a uniform scan: one pass over the field by line spacing and exposure, within a time.
 
 The expected scores come from the scan performance that was measured with the weights: a table by step and exposure.
 Between two exposures interpolation is linear in the logarithm; beyond the table there is no score.
@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import BudgetError, NoScanPaidFor
+from pipeline.errors import BudgetError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.planning.prices import raw_bytes
@@ -100,25 +100,6 @@ class ScanPerformance:
         return float(np.interp(math.log(exposure_ms), np.log(self.exposures_ms), table[self.steps.index(step)]))
 
 
-@dataclass(frozen=True)
-class ScanLimits:
-    """Limits of a scan's costs, and goals of its scores; None and {} set no limit."""
-
-    seconds: float | None = None
-    bytes_raw: float | None = None
-    goals: Mapping[str, float] = field(default_factory=dict)  # by name, 0..1
-
-    def afford(self, scan: UniformScan) -> bool:
-        """Return whether a scan is within the limits of its costs."""
-        return (self.seconds is None or scan.seconds <= self.seconds) and (
-            self.bytes_raw is None or scan.bytes_raw <= self.bytes_raw
-        )
-
-    def reached_by(self, scan: UniformScan) -> bool:
-        """Return whether a scan is expected to reach the goals."""
-        return all(scan.expected[name] >= least for name, least in self.goals.items())
-
-
 def uniform_scans(
     record: ScanPerformance,
     sweeps: Mapping[int, Sequence[Sweep]],
@@ -188,25 +169,40 @@ def longest_exposure(
     return low / scale
 
 
-def choose_scan(scans: Sequence[UniformScan], limits: ScanLimits) -> UniformScan:
-    """Return the scan within the limits with the highest expected mIoU; with goals the cheapest that reaches them.
+def choose_scan(
+    scans: Sequence[UniformScan], seconds: float | None = None, goals: Mapping[str, float] | None = None
+) -> UniformScan:
+    """Return the scan with the highest expected mIoU in the time; with goals the cheapest that reaches them.
 
-    Scans within `LOSS` of the best count as equal, and the cheapest of them is taken. Ties go to the higher mIoU, then
-    to the first.
+    ``goals`` are scores by name, 0..1. Scans within `LOSS` of the best count as equal, and the cheapest of them is
+    taken. Ties go to the higher mIoU, then to the first.
 
-    Raises NoScanPaidFor: no scan is within the limits; names the least costs.
-    Raises BudgetError: no scan reaches the goals; names the best.
+    Raises BudgetError: no scan ends in time; names the least time. Or no scan reaches the goals; names the best.
     """
-    paid = [scan for scan in scans if limits.afford(scan)]
+    paid = [scan for scan in scans if seconds is None or scan.seconds <= seconds]
     if not paid:
-        raise NoScanPaidFor(_too_little(scans, limits))
-    reaching = [scan for scan in paid if limits.reached_by(scan)]
+        fastest = min(scans, key=lambda scan: scan.seconds)
+        raise BudgetError(
+            f"no uniform scan that the weights know ends within --seconds {seconds:g}; the least is "
+            f"{fastest.seconds:.1f} s ({fastest.words})"
+        )
+    if not goals:
+        best = max(scan.expected[MIOU] for scan in paid)
+        return min((scan for scan in paid if scan.expected[MIOU] >= best - LOSS), key=lambda scan: scan.price)
+    reaching = [scan for scan in scans if all(scan.expected[name] >= least for name, least in goals.items())]
     if not reaching:
-        raise BudgetError(_too_much(scans, limits))
-    if limits.goals:
-        return min(reaching, key=lambda scan: scan.price)
-    best = max(scan.expected[MIOU] for scan in reaching)
-    return min((scan for scan in reaching if scan.expected[MIOU] >= best - LOSS), key=lambda scan: scan.price)
+        told = " and ".join(
+            f"{'' if name == MIOU else f'{name}='}{100 * least:g}, where the best scan has "
+            f"{100 * max(scan.expected[name] for scan in scans):.1f}"
+            for name, least in goals.items()
+        )
+        raise BudgetError(f"no scan of these weights reaches --goal {told}; ask for less")
+    cheapest = min(reaching, key=lambda scan: scan.price)
+    if seconds is not None and cheapest.seconds > seconds:
+        raise BudgetError(
+            f"--goal takes {cheapest.seconds:.1f} s ({cheapest.words}), --seconds is {seconds:g}; give more"
+        )
+    return cheapest
 
 
 def reference_scan(scans: Sequence[UniformScan]) -> UniformScan:
@@ -222,37 +218,3 @@ def frontier(scans: Sequence[UniformScan]) -> list[UniformScan]:
         if not kept or scan.expected[MIOU] > kept[-1].expected[MIOU]:
             kept.append(scan)
     return kept
-
-
-def _too_little(scans: Sequence[UniformScan], limits: ScanLimits) -> str:
-    """Return a message that names the limits and the least costs of a scan."""
-    fastest, smallest = min(scans, key=lambda scan: scan.seconds), min(scans, key=lambda scan: scan.bytes_raw)
-    asked, least = [], []
-    if limits.seconds is not None:
-        asked.append(f"--seconds {limits.seconds:g}")
-        least.append(f"{fastest.seconds:.1f} s ({fastest.words})")
-    if limits.bytes_raw is not None:
-        asked.append(f"--bytes-raw {limits.bytes_raw:g}")
-        least.append(f"{smallest.bytes_raw:.4g} bytes ({smallest.words})")
-    return f"no uniform scan that the weights know pays with {' and '.join(asked)}; the least is {', '.join(least)}"
-
-
-def _too_much(scans: Sequence[UniformScan], limits: ScanLimits) -> str:
-    """Return a message that names the goal beyond the weights' record, or beyond the limits."""
-    for name, least in limits.goals.items():
-        best = max(scan.expected[name] for scan in scans)
-        if best < least:
-            return f"--goal {_goal(name, least)}: the most that these weights' scans reached is {100 * best:.1f}"
-    able = [scan for scan in scans if limits.reached_by(scan)]
-    goals = " and ".join(_goal(name, least) for name, least in limits.goals.items())
-    if not able:
-        return f"--goal {goals}: no one scan of these weights reaches all of them; ask for less"
-    cheapest = min(able, key=lambda scan: scan.seconds)
-    return (
-        f"--goal {goals} is not reached within --seconds and --bytes-raw; the cheapest scan that does takes"
-        f" {cheapest.seconds:.1f} s and {cheapest.bytes_raw:.4g} bytes ({cheapest.words})"
-    )
-
-
-def _goal(name: str, least: float) -> str:
-    return f"{100 * least:g}" if name == MIOU else f"{name}={100 * least:g}"

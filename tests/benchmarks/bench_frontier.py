@@ -37,15 +37,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel
 from pipeline.planning.coverage import cheapest_full, uniform_sweeps
-from pipeline.planning.uniform_scans import (
-    MIOU,
-    ScanLimits,
-    ScanPerformance,
-    UniformScan,
-    choose_scan,
-    format_scan,
-    uniform_scans,
-)
+from pipeline.planning.uniform_scans import MIOU, ScanPerformance, UniformScan, choose_scan, format_scan, uniform_scans
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import RasterScene
@@ -139,7 +131,7 @@ def chosen_scan(shape: tuple[int, int], seconds: float, weights: Weights | None 
     record = ScanPerformance.read(weights.record["scans"])
     sweeps = {step: uniform_sweeps(grid, CAMERA, along, step=step) for step in record.steps}
     scans = uniform_scans(record, sweeps, CAMERA, COST, BANDS, seconds=seconds)
-    return choose_scan(scans, ScanLimits(seconds))
+    return choose_scan(scans, seconds)
 
 
 def _promise(scan: UniformScan) -> str:

@@ -23,9 +23,8 @@ from rich.console import Console
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from flows.tasks import scene as scenes
-from flows.tasks.stages.attention import LaterPasses
 from pipeline.geometry.grid import patch_pixels
-from pipeline.planning.fine_pass import FinePlan
+from pipeline.planning.fine_pass import FinePlan, SecondPass
 from pipeline.simulator.scenes.farm.farm_plan import CLASSES
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.farm.land import smooth_noise, stream
@@ -66,16 +65,16 @@ def land(seed: int, shape: tuple[int, int], share: float, **given: Any) -> tuple
 def known(inside: NDArray[np.bool_]) -> Iterator[None]:
     """Have later lines follow the pixels that a survey is after, in the longest exposure that shows all of them."""
 
-    def best(self: LaterPasses, errors: Any, record: Any, class_names: Any, worth: Any) -> FinePlan:
+    def best(self: SecondPass, record: Any, gain_of: Any) -> FinePlan:
         gain = patch_pixels(self.grid, inside.astype(np.float64)).mean(axis=(1, 2))
         plans = []
         for exposure_ms in np.geomspace(*record.offered_ms(self.camera), 12)[::-1].round(1).tolist():
-            plans.append(self.within(gain, exposure_ms=exposure_ms))
+            plans.append(self.plan(gain, exposure_ms=exposure_ms))
             if plans[-1].expected_gain >= 0.98 * gain.sum():
                 return plans[-1]
         return max(plans, key=lambda plan: plan.expected_gain)
 
-    with mock.patch.object(LaterPasses, "best", best):
+    with mock.patch.object(SecondPass, "best", best):
         yield
 
 

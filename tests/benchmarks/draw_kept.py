@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from flows.tasks.stages.condense import camera_of
+from pipeline.geometry.camera import LineCamera
 from pipeline.signal.calibrate import judge_elements
 from pipeline.signal.condense import RESIDUAL_STEP, Condenser, ResidualLaw, calibrated_blocks
 from storage.archive.archive import Archive
@@ -59,7 +59,7 @@ def compared(root: Path) -> tuple[SignalCube, Compared, Compared]:
     raw, signal = (archive.ref(*products[name].split("/")[1:3]) for name in ("raw_coarse", "signal_coarse"))
     cube, stored = open_raw_cubes(raw.path)[0], open_signal_cubes(signal.path)[0]
     params = read_store(signal).params
-    camera, law = camera_of(params), stored.components
+    camera, law = LineCamera(**params["camera"]), stored.components
     values = np.concatenate([part for _, part, _ in calibrated_blocks(cube, camera)])
     kept = stored.spectra(0, len(values))
     brightness = np.where(stored.usable, np.nanmean(kept, axis=2), np.nan)

@@ -19,37 +19,12 @@ def frames(samples: int = 12, bands: int = 10) -> References:
     return References(dark, dark + 2000, np.ones(bands, np.float32))
 
 
-def test_saturated_line() -> None:
-    """A line saturated throughout is invalid, its neighbours are not, and the mask stays (line, sample)."""
-    raw = np.full((3, 12, 10), 1000, np.uint16)
-    raw[1] = FULL
-    _, valid = calibrate(raw, frames(), saturated_dn=FULL)
-    assert valid.shape == (3, 12)
-    assert valid.all(axis=1).tolist() == [True, False, True]
-
-
 def test_sum_saturated_in_part() -> None:
     """The two limits of the docstring: n F finds a sum saturated throughout, n (F - 1) + 1 one that must be in part."""
     sums = np.array([4 * FULL, 4 * (FULL - 1) + 1, 4 * (FULL - 1)], np.uint16)
     raw = np.broadcast_to(sums[None, :, None], (1, 3, 2))
     assert calibrate(raw, frames(3, 2), saturated_dn=4 * FULL)[1].tolist() == [[False, True, True]]
     assert calibrate(raw, frames(3, 2), saturated_dn=4 * (FULL - 1) + 1)[1].tolist() == [[False, False, True]]
-
-
-def test_below_dark_stays_negative() -> None:
-    """DN just below the dark level are small negative values, not 32-bit wraps, not zero; 0 DN is the most negative."""
-    raw = np.broadcast_to(np.array([0, 60, 61], np.uint16)[None, :, None], (2, 3, 10))
-    values, valid = calibrate(raw, frames(3), saturated_dn=FULL)
-    np.testing.assert_allclose(values[0, :, 0], np.array([-60.5, -0.5, 0.5]) / 2000, rtol=1e-6)
-    assert valid.all()
-
-
-def test_all_dark_line() -> None:
-    """A line without light is zero on average and valid."""
-    dark = np.full((1, 12, 10), 60, np.uint16)
-    values, valid = calibrate(np.concatenate([dark, dark + 1]), frames(), saturated_dn=FULL)
-    assert values.mean() == pytest.approx(0, abs=1e-8)
-    assert valid.all()
 
 
 def test_white_equal_to_dark_everywhere() -> None:

@@ -20,11 +20,8 @@ from models.training.examples import Example
 from models.training.objective import map_loss, pixel_losses, scoring_loss
 from models.training.train import Trainer, TrainingSettings, train
 from models.weights.files import Weights
-from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
-from pipeline.geometry.scan import CostModel
 from tests.models.conftest import SMALL
-from tests.pipeline.planning.fields import planned
 
 SIZES: dict[str, Any] = SMALL | {"classes": 2}
 SETTINGS = TrainingSettings(steps=4, batch=1, crop=16)
@@ -159,18 +156,6 @@ def test_28_patches_that_mislead_have_negative_gain():
     bought, best = gain_sums(gain, np.array([0, 1]), np.arange(16))
     assert bought < 0
     assert captured_gain(bought, best) is None
-
-
-def test_28_negative_gains_are_never_bought():
-    """No run is bought for a negative score, nor for one that is no number; all is left unspent."""
-    grid, score = SceneGrid(256, 256, 16, 4), np.full(256, -0.3)
-    score[[3, 70, 200]] = -5.0, np.nan, -np.inf
-    plan = planned(grid, LineCamera(), CostModel(), "x", score, budget_s=10.0)
-    assert (plan.patch_index.tolist(), plan.sweeps, plan.expected_gain) == ([], [], 0.0)
-    score[100] = 5.0
-    plan = planned(grid, LineCamera(), CostModel(), "x", score, budget_s=10.0)
-    assert 100 in plan.patch_index
-    assert plan.expected_gain == pytest.approx(5.0)
 
 
 def test_29_a_loss_that_stays_infinite_ends_a_run(monkeypatch: pytest.MonkeyPatch):

@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from flows.tasks.capture_plan import CapturePlan
 from flows.tasks.field_work import coarse_region
 from flows.tasks.patch_budget import SHARD
-from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
-from flows.tasks.stages.attention import read_in_full
+from flows.tasks.stage import Product, Report, Wanted, stage
+from flows.tasks.stages.attention import PatchGains, read_in_full
 from flows.tasks.stages.placement import load_registration
-from flows.tasks.zones import SurveyZones
 from models.evaluation.metrics import (
     agreement,
     average_accuracy,
@@ -29,19 +28,16 @@ from models.evaluation.metrics import (
     iou_per_class,
     kappa,
 )
-from models.evaluation.placement import CONTROL_FRACTION, run_controls
-from models.network.spectral import LineSpec
+from models.evaluation.placement import CONTROL_FRACTION, Controls, run_controls
 from models.reading.inference import read_coarse_prediction, segment
 from models.reading.regions import plan_regions, whole_field
 from models.weights.files import Weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
-from pipeline.geometry.scan import Axis, Sweep
-from pipeline.lazy import Once
-from pipeline.rectify.kernels import Kernel
+from pipeline.geometry.scan import Axis
 from pipeline.rectify.region import read_patches
 from pipeline.simulator.effects.pointing import PointingErrors
-from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import SweepLines
 from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table
@@ -59,15 +55,12 @@ def evaluate(
     attention: StageRef,
     class_map: StageRef,
     *sources: StageRef,
-    frame: FieldFrame,
+    gains: PatchGains,
     plan: CapturePlan,
-    zones: SurveyZones,
     chooses: bool,
-    capture: LineSpec,
     simulated: SimulatedSource,
     source_key: Mapping[str, Any],
     labels: NDArray[np.uint8],
-    load: Once[Weights],
     model_key: Mapping[str, Any],
     controls: bool,
     seed: int,
@@ -82,33 +75,16 @@ def evaluate(
 
     def build(path: Path) -> None:
         """Write the figures of the map, of the overview alone and, with controls, of other placements."""
-        weights, grid, drawn = load(), frame.grid, load_class_map(class_map.path / "class_map.zarr")
-        names, classes = weights.class_names, drawn.classes
-        judged = np.where(classes == UNLABELLED, np.uint8(UNLABELLED), labels)  # only pixels with a class
-        counts = confusion(judged, classes, len(drawn.names))  # includes the class unknown
+        drawn, image = load_class_map(class_map.path / "class_map.zarr"), mosaic.path / "mosaic.zarr"
+        names = gains.work.weights.load().class_names
+        judged = np.where(drawn.classes == UNLABELLED, np.uint8(UNLABELLED), labels)  # only pixels with a class
+        counts = confusion(judged, drawn.classes, len(drawn.names))  # includes the class unknown
         result: dict[str, Any] = map_figures(names, counts) | {"confusion": counts.tolist()}
-        image = mosaic.path / "mosaic.zarr"
-        result["none"] = map_figures(names, _confusion_of_overview(weights, image, grid, capture, judged))
+        result["none"] = map_figures(names, _confusion_of_overview(gains, image, judged))
         result |= {"all": {"miou": None, "per_class_iou": {}}, "gap_closed": None, "controls": {}}
         if controls:
-            coarse = coarse_region(weights, image, whole_field(grid), capture)
-            columns = coarse.patches(np.arange(int(np.prod(grid.patch_shape))))
-            fraction, valid = CONTROL_FRACTION, grid.valid_fraction().ravel() > 0
-            among = valid if zones.fractions is None else valid & (zones.fractions > 0)
-            if chooses:
-                read = len(read_in_full(attention, class_map))
-                fraction = read / max(int(among.sum()), 1)
-            rows = count(1)
-            found = run_controls(
-                weights,
-                read_coarse_prediction(weights, coarse),
-                columns,
-                judged,
-                fraction=fraction,
-                seed=seed,
-                among=among,
-                report=lambda row: report(0.09 * next(rows)),
-            )
+            patches = read_in_full(attention, class_map) if chooses else None
+            found = control_placements(gains, image, judged, patches, seed=seed, report=report)
             figures = map_figures(names, found.every)
             gap = gap_closed(result["miou"], result["none"]["miou"], figures["miou"])
             compared = {"controls": found.as_dict(), "controls_fraction": found.fraction}
@@ -119,14 +95,41 @@ def evaluate(
     return Wanted(build, params, [mosaic, attention, class_map, *sources])
 
 
-def _confusion_of_overview(
-    weights: Weights, mosaic: Path, grid: SceneGrid, capture: LineSpec, labels: NDArray[np.uint8]
-) -> NDArray[np.int64]:
+def control_placements(
+    gains: PatchGains,
+    mosaic: Path,
+    labels: NDArray[np.uint8],
+    patch_index: NDArray[np.intp] | None,
+    *,
+    seed: int,
+    report: Report,
+) -> Controls:
+    """Judge other placements of as many fine patches as the map has, or of the usual fraction; every patch as well."""
+    grid, fractions, weights = gains.frame.grid, gains.zones.fractions, gains.work.weights.load()
+    coarse = coarse_region(weights, mosaic, whole_field(grid), gains.capture)
+    valid = grid.valid_fraction().ravel() > 0
+    among = valid if fractions is None else valid & (fractions > 0)
+    fraction = CONTROL_FRACTION if patch_index is None else len(patch_index) / max(int(among.sum()), 1)
+    rows = count(1)
+    return run_controls(
+        weights,
+        read_coarse_prediction(weights, coarse),
+        coarse.patches(np.arange(int(np.prod(grid.patch_shape)))),
+        labels,
+        fraction=fraction,
+        seed=seed,
+        among=among,
+        report=lambda row: report(0.09 * next(rows)),
+    )
+
+
+def _confusion_of_overview(gains: PatchGains, mosaic: Path, labels: NDArray[np.uint8]) -> NDArray[np.int64]:
     """Return the confusion matrix (class, class) of the overview alone, region by region as in surveys."""
+    weights, grid = gains.work.weights.load(), gains.frame.grid
     empty = np.empty((0, grid.patch, grid.patch, weights.basis.columns), np.float32)
     counts = np.zeros((weights.config.classes,) * 2, np.int64)
     for region in plan_regions(grid, SHARD):
-        drawn = segment(weights, coarse_region(weights, mosaic, region, capture), empty, np.empty(0, np.int64))
+        drawn = segment(weights, coarse_region(weights, mosaic, region, gains.capture), empty, np.empty(0, np.int64))
         inside = labels[region.kept.rows, region.kept.columns]
         counts += confusion(inside, region.crop(drawn.classes), weights.config.classes)
     return counts
@@ -174,12 +177,7 @@ def load_accuracy(evaluated: StageRef) -> dict[str, Any]:
 
 
 def columns_of_raster(
-    raster: RasterPixels,
-    weights: Weights,
-    wavelength_nm: NDArray[np.floating],
-    *,
-    memory: int,
-    report: Report = lambda done: None,
+    raster: RasterPixels, weights: Weights, wavelength_nm: NDArray[np.floating], *, memory: int
 ) -> NDArray[np.float32]:
     """Return the normalised spectral features of all pixels of a raster, read in blocks of rows.
 
@@ -191,33 +189,10 @@ def columns_of_raster(
         patch_index = valid[done : done + len(values)]
         columns[patch_index] = np.nan_to_num(weights.columns(values, wavelength_nm), nan=0.0)
         done += len(values)
-        report(done / len(valid))
     return columns
 
 
 MEMORY_FRACTION = 32  # of the memory for a band of patches
-
-
-def columns_of_all_patches(
-    source: SimulatedSource,
-    full: Sequence[Sweep],
-    grid: SceneGrid,
-    weights: Weights,
-    *,
-    memory: int,
-    resampling: Kernel,
-    report: Report = lambda done: None,
-) -> NDArray[np.float32]:
-    """Return the normalised spectral features of a full scan, computed in bands of patches.
-
-    The shape is (patch, p, p, column), float32, of the padded grid; patches beyond the scene are 0. ``memory`` is in
-    bytes.
-    """
-    sweeps = [SimulatedSweep(source, sweep) for sweep in full]
-    bands = source.wavelength_nm
-    return columns_of_sweeps(
-        sweeps, source.camera, bands, grid, weights, memory=memory, resampling=resampling, report=report
-    )
 
 
 def columns_of_sweeps(
@@ -228,21 +203,20 @@ def columns_of_sweeps(
     weights: Weights,
     *,
     memory: int,
-    resampling: Kernel,
-    report: Report = lambda done: None,
 ) -> NDArray[np.float32]:
-    """Return the normalised spectral features of sweeps over a whole scene; see `columns_of_all_patches`."""
+    """Return the normalised spectral features of sweeps over a whole scene, computed in bands of patches.
+
+    The shape is (patch, p, p, column), float32, of the padded grid; patches beyond the scene are 0. ``memory`` is in
+    bytes.
+    """
     p, valid = grid.patch, grid.valid_patches()
     columns = np.zeros((int(np.prod(grid.patch_shape)), p, p, weights.basis.columns), np.float32)
     row, column = np.divmod(valid, grid.patch_shape[1])
     place = row if sweeps[0].sweep.along == "x" else column
     one = int(np.count_nonzero(place == 0)) * p**2 * len(wavelength_nm) * 4
     deep = max(1, memory // MEMORY_FRACTION // one)
-    done = 0
     for band in range(int(place.max()) // deep + 1):
         patch_index = valid[place // deep == band]
-        values, _ = read_patches(sweeps, camera, grid, patch_index, resampling)
+        values, _ = read_patches(sweeps, camera, grid, patch_index)
         columns[patch_index] = weights.columns(values, wavelength_nm)
-        done += len(patch_index)
-        report(done / len(valid))
     return columns

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,134 +10,143 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.tasks.capture_plan import CapturePlan
 from flows.tasks.field_work import FieldWork, region_params
 from flows.tasks.patch_budget import PatchBudget
 from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
 from flows.tasks.zones import SurveyZones
 from models.network.spectral import LineSpec
 from models.policies.policies import SEEING_POLICIES, score_patches
-from models.reading.expected_errors import PatchExpectedErrors
 from models.reading.inference import CoarsePrediction
-from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid, patch_pixels
-from pipeline.geometry.scan import CostModel, Sweep, exposing
-from pipeline.planning.coverage import field_px, patches_shown
-from pipeline.planning.fine_pass import FinePlan, plan_fine
-from pipeline.planning.partial_scans import lines_between, merged_ms, most_within
-from pipeline.planning.uniform_scans import MIOU, ScanPerformance, format_scan, longest_exposure
+from pipeline.geometry.scan import Sweep, exposing
+from pipeline.planning.coverage import patches_shown
+from pipeline.planning.fine_pass import FinePlan, SecondPass
+from pipeline.planning.uniform_scans import MIOU, ScanPerformance, format_scan
 from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table, write_table
 from storage.arrays.mosaics import Attention, chosen_patches, open_mosaic, write_attention
-from storage.readers.raster_fields import RasterPixels
 
 READING = "attention.zarr"  # beside a class map whose drawing chose the patches
-ATTENTION = Product("score", version=10, files=("attention.zarr", "plan.json"), by_weights=True)
+ATTENTION = Product("score", version=11, files=("attention.zarr", "plan.json"), by_weights=True)
 Scores = NDArray[np.float64]
-LEAST_GAIN = 1e-3  # of mIoU; below it there is no second pass
-EXPOSURES = 7  # that are tried, equally spaced by logarithm
-PLANNED = 2  # spacings and exposures with the highest bound of gain, of which plans are made
-TRIES = 5  # to fit runs into the time
+
+
+@dataclass(frozen=True)
+class PatchGains:
+    """Expected gain of the patches of a field by one policy, within its zones."""
+
+    frame: FieldFrame
+    zones: SurveyZones
+    work: FieldWork
+    capture: LineSpec
+    policy: str
+    seed: int
+    mask: NDArray[np.generic] | None  # (y, x) or (y, x, channel) of policy ``mask``
+
+    @property
+    def key(self) -> dict[str, Any]:
+        """Return the parameters of the gains."""
+        grid, sees = self.frame.grid, self.policy in SEEING_POLICIES
+        return {
+            "grid": asdict(grid),
+            "policy": self.policy,
+            "seed": self.seed if self.policy == "random" else None,
+            "mask": None if self.mask is None else array_digest(self.mask),
+            **(region_params(grid) | {"capture": list(self.capture)} if sees else {}),
+            **self.zones.key,
+        }
+
+    def by_policy(self, mosaic: Path, report: Report) -> Scores:
+        """Return the (patch,) expected gain by the policy."""
+        if self.policy in SEEING_POLICIES:
+            return self.within_zones(self.work.score(self.policy, mosaic, self.capture, report).ravel())
+        nothing = np.empty((0, 0, 0), np.float32)
+        unseen = CoarsePrediction(self.frame.grid, nothing, nothing)
+        return self.within_zones(score_patches(self.policy, unseen, seed=self.seed, mask=self.mask))
+
+    def within_zones(self, scores: Scores) -> Scores:
+        """Return (patch,) scores times the fraction of each patch that zones leave; 0 outside of the scene."""
+        grid, fractions = self.frame.grid, self.zones.fractions
+        if self.frame.missing is not None:
+            void = patch_pixels(grid, self.frame.missing).mean(axis=(1, 2)) >= grid.valid_fraction().ravel()
+            scores = np.where(void, 0.0, scores)
+        return scores if fractions is None else np.where(fractions > 0, scores, 0.0) * fractions
+
+    def kept(self, patch_index: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Return those patches that zones leave."""
+        fractions = self.zones.fractions
+        return patch_index if fractions is None else patch_index[fractions[patch_index] > 0]
 
 
 @stage("score", "patch scores", ATTENTION)
 def score(
     mosaic: StageRef,
     *,
-    frame: FieldFrame,
-    plan: CapturePlan,
-    work: FieldWork,
-    zones: SurveyZones,
-    budget: PatchBudget | None,
-    raster: RasterPixels | None,
-    recorded: RecordedPasses | None,
-    camera: LineCamera,
-    cost: CostModel,
-    policy: str,
-    seed: int,
-    mask: NDArray[np.generic] | None,
-    part: bool,
-    capture: LineSpec,
+    gains: PatchGains,
+    second_pass: SecondPass | None,
     scan_record: ScanPerformance | None,
+    scanned: FinePlan,
+    budget: PatchBudget | None,
     least_gain: float | None,
     model_key: dict[str, Any],
     report: Report,
 ) -> Wanted:
-    """Score every patch by the coarse mosaic, and plan the sweeps with the highest total score in the time left."""
-    grid, fractions = frame.grid, zones.fractions
+    """Score every patch by the coarse mosaic, and plan the sweeps with the highest total score in the time left.
 
-    def expected_gain() -> Scores:
-        """Return the (patch,) expected gain by the policy."""
-        if policy in SEEING_POLICIES:
-            scores = work.score(policy, mosaic.path / "mosaic.zarr", capture, lambda done: report(0.5 * done)).ravel()
-        else:
-            nothing = np.empty((0, 0, 0), np.float32)
-            scores = score_patches(policy, CoarsePrediction(grid, nothing, nothing), seed=seed, mask=mask)
-        return value(scores)
+    Without a second pass, ``scanned`` is the plan, and ``budget`` limits its patches.
+    """
+    grid = gains.frame.grid
 
-    def value(scores: Scores) -> Scores:
-        """Return scores times the fraction of each patch that zones leave; 0 outside of the scene."""
-        if frame.missing is not None:
-            void = patch_pixels(grid, frame.missing).mean(axis=(1, 2)) >= grid.valid_fraction().ravel()
-            scores = np.where(void, 0.0, scores)
-        return scores if fractions is None else np.where(fractions > 0, scores, 0.0) * fractions
-
-    def planned() -> tuple[Scores, FinePlan]:
+    def planned(seen: Path) -> tuple[Scores, FinePlan]:
         """Return the scores, and the plan of the second pass."""
-        if not plan.plain:
-            later = LaterPasses(grid, camera, cost, plan, recorded)
-            if scan_record is None or policy != "gain" or not plan.by_record:
-                scores = expected_gain()
-                return scores, later.within(scores)
-            errors = work.expected_errors(mosaic.path / "mosaic.zarr", capture, lambda done: report(0.5 * done))
-            found = later.best(errors, scan_record, work.weights.load().class_names, value)
-            return errors.expected_wrong_pixels(), found
-        scan_plan = all_seen(grid, () if raster is not None else plan.coarse, camera, part=part)
-        if budget is None:
-            return np.zeros(int(np.prod(grid.patch_shape))), scan_plan
-        scores = expected_gain()
-        return scores, kept_within(budget, scores, scan_plan)
+        if second_pass is None and budget is None:
+            return np.zeros(int(np.prod(grid.patch_shape))), scanned
+        if second_pass is not None and scan_record is not None:
+            return gain_by_record(gains, seen, second_pass, scan_record, lambda done: report(0.5 * done))
+        scores = gains.by_policy(seen, lambda done: report(0.5 * done))
+        if second_pass is not None:
+            return scores, second_pass.plan(scores)
+        assert budget is not None
+        return scores, kept_within(budget, scores, scanned)
 
     def build(path: Path) -> None:
         """Write score and rank of every patch, and the plan."""
-        scores, found = planned()
-        if fractions is not None:
-            found = replace(found, patch_index=found.patch_index[fractions[found.patch_index] > 0])
+        seen = mosaic.path / "mosaic.zarr"
+        scores, found = planned(seen)
+        found = replace(found, patch_index=gains.kept(found.patch_index))
         read = found.patch_index
-        if not plan.plain and (least_gain is not None or found.kind == "full" or not found.sweeps):
-            read = grid.valid_patches()  # the segmentation chooses among them
-            read = read if fractions is None else read[fractions[read] > 0]
+        if second_pass is not None and (least_gain is not None or found.kind == "full" or not found.sweeps):
+            read = gains.kept(grid.valid_patches())  # the segmentation chooses among them
         # raises an error before the second pass where the map will not fit the memory
-        work.pool_for(read, len(open_mosaic(mosaic.path / "mosaic.zarr").components))
+        gains.work.pool_for(read, len(open_mosaic(seen).components))
         rank = np.full(scores.shape, -1, np.int32)
         rank[read[np.argsort(-scores[read], kind="stable")]] = np.arange(len(read))
         shape = grid.patch_shape
-        write_attention(path / "attention.zarr", Attention(scores.reshape(shape), rank.reshape(shape), policy))
-        content = asdict(found) | {"patch_index": found.patch_index.tolist(), "read": read.tolist()}
-        write_table(path / "plan.json", content)
+        write_attention(path / "attention.zarr", Attention(scores.reshape(shape), rank.reshape(shape), gains.policy))
+        write_table(path / "plan.json", asdict(found) | {"patch_index": found.patch_index.tolist()})
 
-    captures = {
-        "fine_s": plan.fine_s,
-        "overlap_px": plan.overlap_px,
-        "margin_px": plan.margin_px,
-        "along": plan.along,
-        "camera": asdict(camera),
-        "cost": asdict(cost),
-    }
-    params = {
-        **model_key,
-        "grid": asdict(grid),
-        "policy": policy,
-        "seed": seed if policy == "random" else None,
-        "mask": None if mask is None else array_digest(mask),
-        **(captures if raster is None else {}),
-        **(region_params(grid) | {"capture": list(capture)} if policy in SEEING_POLICIES else {}),
-        **({"plain": True} if plan.plain else {"by_record": plan.by_record, "least_gain": least_gain}),
-        **({} if budget is None else {"macs": budget.macs}),
-        **zones.key,
-    }
-    return Wanted(build, params, [mosaic], shown=not plan.plain or budget is not None)
+    params = {**model_key, **gains.key}
+    if second_pass is not None:
+        params |= second_pass.key | {"by_record": scan_record is not None, "least_gain": least_gain}
+    if budget is not None:
+        params["macs"] = budget.macs
+    return Wanted(build, params, [mosaic], shown=second_pass is not None or budget is not None)
+
+
+def gain_by_record(
+    gains: PatchGains, mosaic: Path, second_pass: SecondPass, record: ScanPerformance, report: Report
+) -> tuple[Scores, FinePlan]:
+    """Return the expected errors of the first pass, and the second pass with the most gain by the table of scans."""
+    errors = gains.work.expected_errors(mosaic, gains.capture, report)
+    class_names = gains.work.weights.load().class_names
+
+    def gain_of(step: int, exposure_ms: float) -> Scores:
+        expected = record.expected(step, exposure_ms)
+        iou = np.array([expected.get(name, expected[MIOU]) for name in class_names])
+        return gains.within_zones(errors.expected_gain((1 - iou) / (1 + iou)))
+
+    return errors.expected_wrong_pixels(), second_pass.best(record, gain_of)
 
 
 def all_seen(grid: SceneGrid, sweeps: Sequence[Sweep], camera: LineCamera, *, part: bool) -> FinePlan:
@@ -157,16 +166,12 @@ def kept_within(budget: PatchBudget, scores: Scores, scan_plan: FinePlan) -> Fin
     chosen = budget.choose(scores)
     reason = f"{scan_plan.reason}; the full network reads {len(chosen)} of {len(budget.patch_index)} patches"
     finite = np.where(np.isfinite(scores), scores, 0.0)
-    expected_gain, wanted = float(finite[chosen].sum()), float(np.maximum(finite, 0.0).sum())
-    return replace(
-        scan_plan, patch_index=np.sort(chosen), reason=reason, expected_gain=expected_gain, wanted_gain=wanted
-    )
+    return replace(scan_plan, patch_index=np.sort(chosen), reason=reason, expected_gain=float(finite[chosen].sum()))
 
 
 def load_plan(attention: StageRef) -> FinePlan:
     """Read the plan of the second pass: sweeps, and the patches that they cover."""
     plan = read_table(attention.path / "plan.json")
-    plan.pop("read", None)
     sweeps = [Sweep(**sweep) for sweep in plan.pop("sweeps")]
     return FinePlan(sweeps, np.array(plan.pop("patch_index"), np.intp), **plan)
 
@@ -175,114 +180,3 @@ def read_in_full(attention: StageRef, class_map: StageRef) -> NDArray[np.intp]:
     """Return the patches (patch,) that the full network read, chosen before or during segmentation."""
     store = class_map.path / READING
     return chosen_patches(store if store.exists() else attention.path / "attention.zarr")
-
-
-@dataclass(frozen=True)
-class LaterPasses:
-    """Planner of the second pass within the time that the first leaves."""
-
-    grid: SceneGrid
-    camera: LineCamera
-    cost: CostModel
-    plan: CapturePlan
-    recorded: RecordedPasses | None = None
-
-    @property
-    def interlaces(self) -> bool:
-        """Return whether new lines lie between those of the first pass: not with pointing errors."""
-        return not self.plan.margin_px
-
-    @property
-    def _apart(self) -> int:
-        """Return the line spacing of the first pass [px]."""
-        return self.plan.coarse[0].step
-
-    def _exposures(self, record: ScanPerformance, step: int) -> list[float]:
-        """Return the exposures to try [ms], including the longest one for which the whole field fits the time."""
-        shortest, longest = record.offered_ms(self.camera)
-        tried = np.geomspace(shortest, longest, EXPOSURES).round(1).tolist()
-        between = lines_between(self.plan.full, self.plan.coarse if self.interlaces else [], step=step)
-        last = longest_exposure(self.plan.fine_s, between, self.camera, self.cost, shortest, longest)
-        return sorted({*tried, *([] if last is None else [last])})
-
-    def _most_gain(self, gain: Scores, step: int, exposure_ms: float) -> float:
-        """Return an upper bound of the gain of a line spacing and an exposure."""
-        field = self.grid, self.plan.coarse, self.camera, self.cost
-        return most_within(
-            self.plan.fine_s, gain, *field, step=step, exposure_ms=exposure_ms, interlaced=self.interlaces
-        )
-
-    def within(
-        self, gain: Scores, *, step: int = 1, exposure_ms: float | None = None, own_swaths: bool = True
-    ) -> FinePlan:
-        """Return the runs of lines with a spacing of ``step`` px that have the highest sum of (patch,) ``gain``.
-
-        With ``own_swaths``, runs lie on the swaths of the first pass and consist of the lines between. Otherwise swaths
-        are free, and runs consist of all lines.
-        """
-        plan, interlaced = self.plan, own_swaths and self.interlaces
-        exposed = self.camera if exposure_ms is None else replace(self.camera, exposure_ms=exposure_ms)
-        start = -(field_px(self.grid, plan.along)[1] - 1) / 2
-        first_pass = plan.coarse if interlaced else []
-        swaths = [
-            Sweep(f"fine-{number:03d}", "fine", plan.along, place, start, 0)
-            for number, place in enumerate(sorted({sweep.swath_px for sweep in first_pass}))
-        ]
-        missing = 1 / step - 1 / first_pass[0].step if first_pass else 1 / step  # new lines per line of the full scan
-        budget_s, found = plan.fine_s / missing, None
-        for _ in range(TRIES):
-            found = plan_fine(
-                self.grid,
-                exposed,
-                self.cost,
-                plan.along,
-                gain,
-                budget_s=budget_s,
-                margin_px=plan.margin_px,
-                full=plan.full,
-                swaths=swaths or None,
-            )
-            sweeps = lines_between(found.sweeps, first_pass, step=step, exposure_ms=exposure_ms)
-            seconds = self.cost.seconds(sweeps, self.camera)
-            if seconds <= plan.fine_s:
-                if self.recorded is not None:  # only its lines exist
-                    sweeps = self.recorded.fine_pass(sweeps)
-                    seconds = self.cost.seconds(sweeps, self.camera)
-                return replace(found, sweeps=sweeps, seconds=seconds)
-            budget_s *= 0.98 * plan.fine_s / seconds
-        assert found is not None
-        return replace(found, sweeps=[], patch_index=np.empty(0, np.intp), seconds=0.0, expected_gain=0.0)
-
-    def best(
-        self,
-        errors: PatchExpectedErrors,
-        record: ScanPerformance,
-        class_names: tuple[str, ...],
-        value: Callable[[Scores], Scores],
-    ) -> FinePlan:
-        """Return the plan with the highest expected gain in mIoU, by the scan performance table.
-
-        ``errors`` are the expected errors after the first pass; ``value`` weights (patch,) gains by zones.
-        """
-        first, steps = exposing(self.camera, self.plan.coarse[0]), [one for one in record.steps if one < self._apart]
-        gains: dict[tuple[int, float], Scores] = {}
-        for step in steps:
-            for exposure_ms in self._exposures(record, step):
-                again = step / self._apart if self.interlaces else 0.0
-                mean_ms = merged_ms(first.exposure_ms, exposure_ms, again)  # mean exposure of old and new lines
-                expected = record.expected(step, float(np.clip(mean_ms, *record.offered_ms(self.camera))))
-                iou = np.array([expected.get(name, expected[MIOU]) for name in class_names])
-                gains[step, exposure_ms] = value(errors.expected_gain((1 - iou) / (1 + iou)))
-        ranked = sorted(gains, key=lambda one: -self._most_gain(gains[one], *one))
-        plans: list[tuple[tuple[int, float], FinePlan]] = []
-        for one in ranked[:PLANNED]:
-            plans.append((one, self.within(gains[one], step=one[0], exposure_ms=one[1])))
-        if self.recorded is None and ranked and plans[0][1].kind != "full":
-            one = max(plans, key=lambda made: made[1].expected_gain)[0]
-            plans.append((one, self.within(gains[one], step=one[0], exposure_ms=one[1], own_swaths=False)))
-        (step, exposure_ms), plan = max(plans, key=lambda made: (made[1].expected_gain, -made[1].seconds))
-        if plan.expected_gain < LEAST_GAIN:
-            nothing = f"no second pass: its expected gain is {100 * plan.expected_gain:.2f} points"
-            return replace(plan, sweeps=[], patch_index=np.empty(0, np.intp), seconds=0.0, reason=nothing)
-        what = "the whole field" if plan.kind == "full" else f"{len(plan.patch_index)} patches"
-        return replace(plan, reason=f"captured again: {what}, {format_scan(step, exposure_ms)}")

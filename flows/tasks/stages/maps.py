@@ -11,16 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.settings.survey_settings import MapChoice
-from flows.tasks.drawing import Drawing, UnknownRule, draw_field
+from flows.tasks.drawing import Drawing, FullReading, UnknownRule, draw_field
 from flows.tasks.field_prior_map import FieldPriorMap, prior_map_lies, whole_pixels
-from flows.tasks.field_work import FieldWork, region_params
+from flows.tasks.field_work import region_params
 from flows.tasks.prior_maps import MEMORY, Prior
-from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
-from flows.tasks.stages.attention import READING
-from flows.tasks.zones import SurveyZones
-from models.network.spectral import LineSpec
+from flows.tasks.stage import Product, Report, Wanted, stage
+from flows.tasks.stages.attention import READING, PatchGains
 from models.reading.prior_map import TemporalAgreement, changed_fractions
-from models.weights.parts import OodPart, ReaderPart
+from models.weights.parts import ReaderPart
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.ground.field_places import PosedField, areas_by_number
 from pipeline.ground.map_grid import GroundGrid, image_at, map_blocks, nearest_at
@@ -44,7 +42,8 @@ from storage.arrays.layout import NO_CLASS, blank_pixels
 from storage.arrays.mosaics import Attention, open_mosaic, write_attention
 from storage.arrays.quicklooks import choose_bands, develop, stretch
 
-CLASS_MAP = Product("segment", version=14, files=("class_map.zarr", "class_probabilities.zarr"), by_weights=True)
+MAP, PROBABILITIES = "class_map.zarr", "class_probabilities.zarr"
+CLASS_MAP = Product("segment", version=14, files=(MAP, PROBABILITIES), by_weights=True)
 OUT_OF_RANGE = "out_of_range.json"  # beside a map with values out of range
 LEFT_OUT = "left_out.npy"  # pixels outside of zones, while the map is drawn
 MOST_TURN_PX = 12.0  # greatest offset of the corners by rotation, at which a prior map is used
@@ -55,95 +54,98 @@ def segment(
     mosaic: StageRef,
     attention: StageRef,
     *,
-    frame: FieldFrame,
-    work: FieldWork,
-    zones: SurveyZones,
+    gains: PatchGains,
     prior: Prior | None,
     reader: ReaderPart | None,
-    ood_detector: OodPart | None,
     unknown: UnknownRule | None,
-    capture: LineSpec,
     part: bool,
     least_gain: float | None,
-    policy: str,
     model_key: dict[str, Any],
     report: Report,
 ) -> Wanted:
     """Segment the mosaic region by region, at full resolution where patches were chosen; nodata pixels have no class.
 
-    ``capture`` is the capture of pixels for which the mosaic has none. With ``least_gain``, patches are chosen here,
-    by their expected gain.
+    With ``least_gain``, patches are chosen here, by their expected gain.
     """
-    grid, left_out, inputs = frame.grid, zones.left_out, [mosaic, attention]
+    grid, left_out, work = gains.frame.grid, gains.zones.left_out, gains.work
 
     def build(path: Path) -> None:
         """Write class map and class probabilities; again without the prior map if it does not agree."""
-        out, probabilities = path / "class_map.zarr", path / "class_probabilities.zarr"
-        lies = FieldShift() if prior is None else prior_map_lies(prior.scan_passes, mosaic.path / "mosaic.zarr")
-        memory = None if prior is None else memory_of(prior, lies, grid)
-        if left_out is not None:
-            np.save(path / LEFT_OUT, left_out)
-        weights = work.weights.load()
-        legend, shape = ClassNames(weights.class_names, weights.class_colours), (grid.height, grid.width)
-        create_class_map(out, shape, legend if unknown is None else with_unknown(legend), grid=frame.angular_grid())
-        create_probabilities(probabilities, shape, legend, grid=frame.angular_grid(), goes_on=memory is not None)
         seen = (mosaic.path / "mosaic.zarr").resolve()
-        chosen = (attention.path / "attention.zarr").resolve()
-        away = None if left_out is None else (path / LEFT_OUT).resolve()
+        lies = FieldShift() if prior is None else prior_map_lies(prior.scan_passes, seen)
+        memory = None if prior is None else memory_of(prior, lies, grid)
+        names = create_maps(path, gains, unknown, goes_on=memory is not None)
         drawing = Drawing(
             work.weights,
             seen,
-            chosen,
-            out.resolve(),
-            probabilities.resolve(),
-            capture,
+            (attention.path / "attention.zarr").resolve(),
+            (path / MAP).resolve(),
+            (path / PROBABILITIES).resolve(),
+            gains.capture,
             memory,
-            away,
+            None if left_out is None else (path / LEFT_OUT).resolve(),
             unknown,
             part,
             least_gain,
-            policy,
+            gains.policy,
         )
         drawn = draw_field(work, drawing, report)
         if prior is not None:
-            figures = _prior_map_figures(prior, reader, legend.names, lies, drawn.comparison)
+            figures = _prior_map_figures(prior, reader, names, lies, drawn.comparison)
             write_table(path / MEMORY, figures)
             if figures["put_aside"] is not None and drawn.comparison is not None:
-                drop_changes(probabilities)
+                drop_changes(path / PROBABILITIES)
                 drawn = draw_field(work, replace(drawing, memory=None), report)
-        if (full := drawn.reading) is not None:
-            rank = np.full(full.gain.size, -1, np.int32)
-            best = np.argsort(np.where(full.read, -full.gain, np.inf).ravel(), kind="stable")
-            rank[best[: np.count_nonzero(full.read)]] = np.arange(np.count_nonzero(full.read))
-            found = Attention(full.gain, rank.reshape(full.gain.shape), policy, full.changed)
-            write_attention(path / READING, found)
+        if drawn.reading is not None:
+            write_attention(path / READING, attention_of(drawn.reading, gains.policy))
         if drawn.unread_px:
             write_table(path / OUT_OF_RANGE, {"px": drawn.unread_px})
-        if frame.missing is not None:
-            blank_pixels(out, frame.missing, NO_CLASS)
-            changes = {} if drawn.comparison is None else {OLD_CLASS: UNLABELLED}
-            blank_pixels(probabilities, frame.missing, NOT_BELIEVED | changes)
-        if left_out is not None:
-            blank_pixels(out, left_out, NO_CLASS)
-        if (old_class := ProbabilityStore(probabilities).old_class()) is not None:
-            write_changes(probabilities, changed_fractions(old_class, grid.patch), grid.patch)
-        (path / LEFT_OUT).unlink(missing_ok=True)
+        finish_maps(path, gains, compared=drawn.comparison is not None)
 
-    params = {**model_key, "grid": asdict(grid), **region_params(grid), **frame.key, **zones.key}
-    params["capture"] = list(capture)
-    if ood_detector is not None and unknown is not None:
-        params["unknown"] = {"familiar": ood_detector.key, **asdict(unknown)}
-    if part:
-        params["part"] = True
-    if least_gain is not None:
-        params["least_gain"] = [least_gain, policy]
+    params = {**model_key, "grid": asdict(grid), **region_params(grid), **gains.frame.key, **gains.zones.key}
+    params |= {"capture": list(gains.capture), "part": part, "unknown": None if unknown is None else asdict(unknown)}
+    params["least_gain"] = None if least_gain is None else [least_gain, gains.policy]
     if prior is None:
-        return Wanted(build, params, inputs)
-    key = None if reader is None else reader.key
-    params |= {"days": prior.days, "classes": list(prior.classes), "reader": key}
-    if len(prior.scan_passes) > 1:
-        params["shifts"] = [list(scan_pass.shift_px) for scan_pass in prior.scan_passes]
-    return Wanted(build, params, [*inputs, prior.probabilities, *(one.mosaic for one in prior.scan_passes)])
+        return Wanted(build, params, [mosaic, attention])
+    shifts = [list(scan_pass.shift_px) for scan_pass in prior.scan_passes]
+    known = {"days": prior.days, "classes": list(prior.classes), "reader": None if reader is None else reader.key}
+    earlier = [prior.probabilities, *(one.mosaic for one in prior.scan_passes)]
+    return Wanted(build, {**params, **known, "shifts": shifts}, [mosaic, attention, *earlier])
+
+
+def create_maps(path: Path, gains: PatchGains, unknown: UnknownRule | None, *, goes_on: bool) -> tuple[str, ...]:
+    """Create empty stores of class map and class probabilities; return the names of the classes."""
+    frame, weights = gains.frame, gains.work.weights.load()
+    legend, shape = ClassNames(weights.class_names, weights.class_colours), (frame.grid.height, frame.grid.width)
+    shown = legend if unknown is None else with_unknown(legend)
+    create_class_map(path / MAP, shape, shown, grid=frame.angular_grid())
+    create_probabilities(path / PROBABILITIES, shape, legend, grid=frame.angular_grid(), goes_on=goes_on)
+    if gains.zones.left_out is not None:
+        np.save(path / LEFT_OUT, gains.zones.left_out)
+    return legend.names
+
+
+def finish_maps(path: Path, gains: PatchGains, *, compared: bool) -> None:
+    """Blank nodata and pixels outside of zones, and write the fraction of each patch that changed."""
+    missing, left_out, probabilities = gains.frame.missing, gains.zones.left_out, path / PROBABILITIES
+    if missing is not None:
+        blank_pixels(path / MAP, missing, NO_CLASS)
+        blank_pixels(probabilities, missing, NOT_BELIEVED | ({OLD_CLASS: UNLABELLED} if compared else {}))
+    if left_out is not None:
+        blank_pixels(path / MAP, left_out, NO_CLASS)
+        (path / LEFT_OUT).unlink()
+    if (old_class := ProbabilityStore(probabilities).old_class()) is not None:
+        patch = gains.frame.grid.patch
+        write_changes(probabilities, changed_fractions(old_class, patch), patch)
+
+
+def attention_of(reading: FullReading, policy: str) -> Attention:
+    """Return expected gain, rank and change of the patches that the full network read during segmentation."""
+    count = int(np.count_nonzero(reading.read))
+    best = np.argsort(np.where(reading.read, -reading.gain, np.inf).ravel(), kind="stable")
+    rank = np.full(reading.gain.size, -1, np.int32)
+    rank[best[:count]] = np.arange(count)
+    return Attention(reading.gain, rank.reshape(reading.gain.shape), policy, reading.changed)
 
 
 def memory_of(prior: Prior, lies: FieldShift, grid: SceneGrid) -> FieldPriorMap | None:

@@ -79,11 +79,15 @@ REFUSED = {
         r"class 'class_0', .* table \[classes\] of the scene.toml beside the scene's file: soil = 0$",
     ),
     "budget -1": (2, "--budget -1", "above 0 and at most 1, got '-1'"),
-    "budget below the coarse pass": (2, "--budget 0.1", "the coarse pass alone takes.* least possible is 0.3892"),
+    "budget below the coarse pass": (
+        2,
+        "--budget 0.1",
+        r"--budget 0.1 gives \d.*below the time of the first pass of every 4th line",
+    ),
     "scene smaller than a patch": (
         2,
         "--scene tiny.png --budget 0.5",
-        "the coarse pass alone takes.* least possible is 0.8246",
+        r"--budget 0.5 gives \d.*below the time of the first pass of every 4th line",
     ),
     "weights corrupt": (1, "--weights corrupt.safetensors", "corrupt.safetensors is not a readable safetensors file"),
     "weights missing": (1, "--weights none.safetensors", "no weights at none.safetensors; train some"),

@@ -79,14 +79,6 @@ def receipt_weights(receipt: Any) -> str:
     return str(receipt["settings"]["weights"])
 
 
-def test_the_overview_is_paid_for_once(cascade: tuple[Path, Any]) -> None:
-    """Its multiply-adds, the scores' and those of the patches read; everything is counted without scores."""
-    _, receipt = cascade
-    costs, patches = receipt["savings"]["multiply_adds"], receipt["savings"]["patches"]
-    assert costs["done"] == costs["overview"] + costs["score"] + costs["detail"]
-    assert costs["detail"] / patches["done"] == pytest.approx((costs["full"] - costs["overview"]) / patches["full"])
-
-
 def test_a_survey_is_told_beside_the_best_uniform_reading(judged: Path, survey_png: Survey, tmp_path: Path) -> None:
     """With controls, random patches stand beside those chosen, as many of them."""
     receipt = survey_png(tmp_path, **SCAN, weights=str(judged), controls=True).receipt

@@ -49,7 +49,6 @@ class Run:
 
     archive: Archive
     settings: Settings = field(default_factory=lambda: Settings(pose=POSE))
-    factor: int = 4
     report: Callable[[float], None] = lambda done: None
 
     @property
@@ -150,8 +149,6 @@ def test_map_and_picture_lie_where_the_rays_end(run: Run, stores: tuple[StageRef
     sure = found.confidence[row, column]
     np.testing.assert_array_equal(np.isnan(sure), wanted == UNLABELLED)
     assert sure[wanted == 1] == pytest.approx(0.75)
-    ref = draw(run, stores)
-    found = load_ground_map(ref.path / STORE)
     tones = coarse_colours(stores[1], None)
     assert np.nanmin(tones) >= 1
     assert np.isnan(tones[:20, :20]).all()

@@ -92,15 +92,6 @@ def digest_of(folder: Path) -> str:
     ).hexdigest()
 
 
-def test_progress_is_told(tmp_path: Path, cubes: list[SignalCube]) -> None:
-    """The fraction done rises to 1 with every tile."""
-    fractions: list[float] = []
-    write_mosaic(recipe_of(cubes), mosaic_at(tmp_path / "m.zarr"), memory=PLENTY, pool=TWO, report=fractions.append)
-    assert len(fractions) == 6
-    assert fractions == sorted(fractions)
-    assert fractions[-1] == 1
-
-
 def test_memory_says_how_many_tiles_at_a_time(tmp_path: Path, cubes: list[SignalCube]) -> None:
     """With memory for one tile only one is made at a time, whatever is allowed; a byte less and none is."""
     work = recipe_of(cubes)
@@ -139,17 +130,6 @@ def test_a_worker_killed_between_tiles_changes_nothing(
     write_mosaic(recipe_of(cubes), mosaic_at(folder / "m.zarr"), memory=PLENTY, pool=processes)
     assert (folder / "killed").exists()
     assert digest_of(folder / "m.zarr") == digest_of(tmp_path / "a.zarr")
-
-
-def test_each_process_keeps_the_lines_of_one_tile(cubes: list[SignalCube]) -> None:
-    """Two processes keep each what one thread keeps; two threads share what both need."""
-    work = work_of(cubes)
-    tiles = plan_tiles(work.placed, CAMERA, GRID, (64, 640))
-    kept = [
-        tile_budget(work, tiles, (64, 640), memory=PLENTY, pool=pool).cache
-        for pool in (ONE, TWO, WorkerPool("processes", 2))
-    ]
-    assert kept[2] == kept[0] < kept[1]
 
 
 def test_a_worker_lets_tiles_go(cubes: list[SignalCube]) -> None:

@@ -14,29 +14,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from flows.archive.plan_command import format_kept, plan_content
-from flows.settings.load import load_settings, parse_settings
+from flows.settings.load import parse_settings
 from flows.tasks.patch_budget import PatchBudget, ReadingCosts
 from models.network.sizes import SegmenterConfig, multiply_adds
 from models.policies.policies import score_multiply_adds
-from models.weights.files import save_weights
 from pipeline.errors import BudgetError, SettingsError
 from pipeline.geometry.grid import SceneGrid
-from tests.conftest import RGB_NM, Survey, random_weights
+from tests.conftest import Survey
 
 COSTS = ReadingCosts(SegmenterConfig(classes=5), SceneGrid(192, 256, 16, 1), 30)
 PATCHES = 12 * 16
 SCAN: dict[str, Any] = {"budget": None, "scan_step": "2", "scan_exposure_ms": "25"}
 fractions = st.floats(5, 100).map(lambda percent: f"{percent!r}%")
 scores = st.integers(0, 2**32 - 1).map(lambda seed: np.random.default_rng(seed).normal(0.1, 0.1, PATCHES))
-
-
-@pytest.fixture(scope="module")
-def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Tiny weights."""
-    path = tmp_path_factory.mktemp("weights") / "weights.safetensors"
-    save_weights(random_weights(RGB_NM), path)
-    return path
 
 
 def _asked(shown: NDArray[np.bool_] | None = None, **limits: object) -> PatchBudget | None:
@@ -159,20 +149,6 @@ def test_a_part_of_the_scan_is_read_in_detail(survey_png: Survey, tmp_path: Path
     assert "at full resolution" in page
     assert f"patches {len(patch_index)}; multiply-adds" in page
     assert "captured again" not in page
-
-
-def test_a_plan_tells_what_the_budgets_pay_for(scene_files: Path, tiny: Path, tmp_path: Path) -> None:
-    """Before the first line: the most patches, and what they take."""
-    given_settings = {
-        "scene": str(scene_files / "scene.png"),
-        "source": "sim",
-        "weights": str(tiny),
-        "out": str(tmp_path),
-    }
-    content = plan_content(load_settings(None, {**given_settings, "scan_step": "1", "macs": "80%"}))
-    costs = content["kept"]["multiply_adds"]
-    assert 0.75 < costs["done"] / costs["everything"] <= 0.8
-    assert f"full reading: likely {content['kept']['patches']} of 192 patches" in format_kept(content["kept"])
 
 
 def test_a_large_field_is_counted_region_by_region() -> None:

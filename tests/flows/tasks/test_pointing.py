@@ -19,7 +19,7 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.grid import SceneGrid, patch_pixels
 from pipeline.geometry.scan import Sweep
 from pipeline.planning.coverage import full_sweeps, reach_px
-from pipeline.planning.partial_scans import every_nth
+from pipeline.planning.fine_pass import every_nth
 from pipeline.simulator.effects.pointing import PointingErrors
 from storage.arrays.mosaics import open_mosaic
 from tests.flows.conftest import FEW_BANDS
@@ -131,8 +131,8 @@ def test_either_pass_overlaps_and_reaches_by_what_it_needs() -> None:
     """Neighbours that look as far apart as they can share 64 px, and both ends of the field are seen."""
     plan = PassLayout.of(parse_settings({"pointing_px": OFF, "budget": 1.0}), GRID).plan(1.0)
     assert plan.along == "x"
-    assert (plan.overlap_px, plan.margin_px) == (2 * OFF + 64 * 4, 2 * OFF)
-    assert shared_px(plan.coarse) >= plan.overlap_px - 1e-3
+    assert plan.margin_px == 2 * OFF
+    assert shared_px(plan.coarse) >= 2 * OFF + 64 * 4 - 1e-3
     assert shared_px(plan.full) >= 2 * OFF + 64 - 1e-3
     assert len(plan.full) == int(np.ceil(1500 / (640 - 2 * OFF - 64)))
     for sweep in (*plan.coarse, *plan.full):
@@ -145,7 +145,6 @@ def test_a_mirror_that_is_believed_costs_nothing() -> None:
     """Neither overlaps nor margins nor words; overlaps of a whole line are refused with what could be put right."""
     settings = parse_settings({"budget": 1.0})
     plan = PassLayout.of(settings, GRID).plan(None if settings.plain else settings.budget)
-    assert plan.overlap_px == 0
     assert plan.full == full_sweeps(GRID, settings.camera, plan.along)
     assert plan.coarse == every_nth(full_sweeps(GRID, settings.camera, plan.along))
     with pytest.raises(SettingsError, match=r"^--pointing-px 192: .* overlap by 640 px .* give less than 192$"):

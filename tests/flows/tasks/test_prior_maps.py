@@ -19,7 +19,6 @@ from rich.console import Console
 from scipy.ndimage import gaussian_filter, rotate
 
 import flows.tasks.prior_maps as memory
-from flows.archive.plan_command import plan_content
 from flows.archive.reprocess_command import run_reprocess
 from flows.settings.load import load_settings
 from models.network.sizes import TemporalSizes
@@ -202,22 +201,6 @@ def test_visits_are_reprocessed_in_order(visited: Path, twice: Any, make_weights
     content = io.StringIO()
     run_reprocess(visited, Console(file=content, width=300), weights=weights)
     assert len(list(visited.glob("runs/*"))) == 4  # nothing is left to be done
-
-
-def test_a_plan_knows_what_is_remembered(visited: Path, scene_files: Path, weights: Path) -> None:
-    """It is what the survey would do, and writes nothing."""
-    given = {
-        "scene": str(scene_files / "scene.png"),
-        "source": "sim",
-        "weights": str(weights),
-        "out": str(visited),
-        "scan_step": "2",
-    }
-    before = sorted(visited.rglob("*"))
-    content = plan_content(load_settings(None, {**given, "name": "north", "visit": LATER, "prior": "latest"}))
-    rows = {row["stage"]: row for row in content["stages"]}
-    assert rows["segment"]["state"] in ("to run", "cached", "blocked")
-    assert sorted(visited.rglob("*")) == before
 
 
 def test_a_reader_in_the_weights_is_used(visited: Path, survey_png: Survey, weights: Path, tmp_path: Path) -> None:

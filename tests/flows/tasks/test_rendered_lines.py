@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +19,6 @@ from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Line
-from storage.arrays.spool import Spool
 from storage.parallel.pool import WorkerPool
 from tests.pipeline.simulator.small_scenes import effects_on
 
@@ -79,15 +77,6 @@ def test_a_capture_goes_on_from_any_line(expected: list[Line], first: int) -> No
     assert_same(taken(source_of(), TWO, first), expected[first:])
 
 
-def test_the_spool_gets_the_same_bytes(tmp_path: Path) -> None:
-    """The files of one worker's capture and of three workers' are the same."""
-    source = source_of("rotation", "shot")
-    for workers in (1, 3):
-        with Spool.open(tmp_path / str(workers), 48, 3, header={}) as spool:
-            take_lines(source, SWEEP, spool.append, WorkerPool("threads", workers))
-    assert (tmp_path / "1" / "lines.lines").read_bytes() == (tmp_path / "3" / "lines.lines").read_bytes()
-
-
 def test_blocks_wait_for_earlier_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first ends last of those begun: the others wait for it, and only one more is begun than there are workers."""
     real, others, begun = SimulatedSource.lines_of, threading.Semaphore(0), []
@@ -105,34 +94,6 @@ def test_blocks_wait_for_earlier_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(SimulatedSource, "lines_of", unfair)
     lines = taken(source_of("rotation"), WorkerPool("threads", 3), at_once=7)
     assert [line.number for line in lines] == list(range(70))
-
-
-@pytest.mark.parametrize("workers", [2, 4])
-def test_few_blocks_are_held(monkeypatch: pytest.MonkeyPatch, workers: int) -> None:
-    """One a worker is rendered at a time, and one more waits at most to be taken, however slowly lines are."""
-    real, guard, begun, count = SimulatedSource.lines_of, threading.Lock(), [], 0
-    now = held = most = 0
-
-    def counted(self: SimulatedSource, sweep: Sweep, numbers: range) -> list[Line]:
-        nonlocal now, most
-        with guard:
-            begun.append(numbers)
-            now, most = now + 1, max(most, now + 1)
-        lines = real(self, sweep, numbers)
-        with guard:
-            now -= 1
-        return lines
-
-    def take(line: Line) -> None:
-        nonlocal held, count
-        held = max(held, len(begun) - count // 2)
-        count += 1
-
-    monkeypatch.setattr(SimulatedSource, "lines_of", counted)
-    take_lines(source_of("rotation"), SWEEP, take, WorkerPool("threads", workers), at_once=2)
-    assert (count, len(begun)) == (70, 35)
-    assert 1 <= most <= workers
-    assert held <= workers + 1
 
 
 @pytest.mark.parametrize("workers", [2, 4])

@@ -9,7 +9,7 @@ import pytest
 
 from flows.settings.load import load_settings
 from flows.tasks.run import open_run
-from flows.tasks.stages.accuracy import columns_of_all_patches
+from flows.tasks.stages.accuracy import columns_of_sweeps
 from flows.tasks.survey_model import shipped_weights, weights_path
 from models.evaluation.metrics import mean_iou
 from models.evaluation.placement import Controls, run_controls
@@ -23,7 +23,7 @@ from pipeline.planning.uniform_scans import ScanPerformance
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_plan import CLASSES
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, farm_scene
-from pipeline.simulator.simulated import SimulatedSource
+from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 
 PATH = shipped_weights()
 SHAPE = (512, 640)  # smaller farms hold too few pixels of rare classes to rank placements by them
@@ -41,9 +41,8 @@ def controls(weights: Weights) -> Controls:
     camera, scene = LineCamera(), farm_scene(41, SHAPE)
     grid = SceneGrid(*SHAPE, weights.config.patch, 1)
     source = SimulatedSource(scene, Rig(camera), 41)
-    columns = columns_of_all_patches(
-        source, full_sweeps(grid, camera, "x"), grid, weights, memory=2**30, resampling="catmull-rom"
-    )
+    sweeps = [SimulatedSweep(source, sweep) for sweep in full_sweeps(grid, camera, "x")]
+    columns = columns_of_sweeps(sweeps, camera, source.wavelength_nm, grid, weights, memory=2**30)
     seen = coarse_prediction_of_patches(weights, columns, grid)
     return run_controls(weights, seen, columns, np.asarray(scene.labels), fraction=0.35, seed=41)
 

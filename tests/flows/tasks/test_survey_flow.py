@@ -226,8 +226,7 @@ def test_prefect_makes_the_stores_that_plain_makes(
     assert edges(tasks, "rectify_fine") == {"plan_capture", "condense_fine"}
     assert edges(tasks, "add_accuracy") == {"plan_capture", "publish", "evaluate"}
     assert any(words.startswith("mosaic: ") and "stages/rectify/" in words for words in log)
-    assert set(artifacts) == {None, "survey-scene", "savings-scene", "report-scene"}
-    assert artifacts[None].data == 100.0
+    assert set(artifacts) == {"survey-scene", "savings-scene", "report-scene"}
     assert "data:image/jpeg;base64," in artifacts["survey-scene"].data
     assert "report.html" in artifacts["report-scene"].data
     assert len(json.loads(artifacts["savings-scene"].data)) > 4

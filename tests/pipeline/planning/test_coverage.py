@@ -17,7 +17,6 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.geometry.scan import CostModel, Sweep, line_positions, scene_to_sweep
 from pipeline.planning.coverage import cheapest_full, full_sweeps, on_scene, reach_px, uniform_sweeps, with_margin
-from pipeline.planning.swaths import covered_patches, edges_from, patch_lines, patches_near, swaths_at_patches
 
 CAMERA, COST = LineCamera(), CostModel()
 
@@ -116,72 +115,3 @@ def test_margins_are_whole_lines_at_both_ends(margin_px: float, lines: int):
         assert grown == replace(sweep, start_px=sweep.start_px - 4 * lines, lines=sweep.lines + 2 * lines)
         assert sweep.held_px()[0, 0] - grown.held_px()[0, 0] >= margin_px
         assert grown.held_px()[-1, -1] - sweep.held_px()[-1, -1] >= margin_px
-
-
-GRID = SceneGrid(200, 900, 32, 4)
-
-
-def everywhere(grid: SceneGrid) -> np.ndarray:
-    """All patches wanted."""
-    return grid.valid_fraction().ravel() > 0
-
-
-@pytest.mark.parametrize("along", ["x", "y"])
-def test_patch_lines_hold_every_pixel_with_its_taps(along: str):
-    """The interval is the least that holds the kernel's lines of every pixel on the scene."""
-    grid = SceneGrid(100, 150, 32, 2)
-    path = Sweep("a", "fine", along, 1500.0, -900.0, 1800)
-    patch_index = grid.valid_patches()
-    lines, reached = patch_lines(grid, CAMERA, path, patch_index)
-    assert not reached.any()
-    for (y, x), (first, stop) in zip(grid.patch_origin(patch_index), lines, strict=True):
-        rows, columns = np.mgrid[y : min(y + 32, 100), x : min(x + 32, 150)]
-        points = (columns - 149 / 2, rows - 99 / 2) if along == "x" else (rows - 99 / 2, columns - 149 / 2)
-        at = np.floor(scene_to_sweep(path, CAMERA, *points)[..., 0] + 1e-6)
-        assert (first, stop) == (at.min() - 1, at.max() + 3)
-
-
-def test_patches_beyond_the_samples_are_not_reached():
-    """Of a 900 px scene one strip reaches the patches whose pixels all fall on its samples."""
-    (low, high) = full_sweeps(GRID, CAMERA, "x")
-    patch_index = GRID.valid_patches()
-    reached = np.stack([patch_lines(GRID, CAMERA, path, patch_index)[1] for path in (low, high)])
-    assert reached.any(axis=0).all()
-    assert 0 < reached[0].sum() < len(patch_index)
-    padding = np.setdiff1d(np.arange(np.prod(GRID.patch_shape)), patch_index)
-    assert not patch_lines(GRID, CAMERA, low, padding)[1].any()
-
-
-@settings(max_examples=20, deadline=None)
-@given(st.integers(-4000, 4000), st.integers(-4000, 4000), st.integers(1, 900), st.sampled_from(["x", "y"]))
-def test_no_shown_patch_lies_beyond_the_rectangle(swath: int, start: int, lines: int, along: str):
-    """Patches shown by a sweep anywhere in a wide field are among those near its footprint."""
-    grid = SceneGrid(8000, 7000, 100, 1)
-    sweep = Sweep("a", "fine", along, float(swath), float(start), lines)
-    patch_index = grid.valid_patches()
-    needs, reached = patch_lines(grid, CAMERA, sweep, patch_index)
-    shown = patch_index[reached & (needs[:, 0] >= 0) & (needs[:, 1] <= lines)]
-    assert np.isin(shown, patches_near(grid, CAMERA, sweep)).all()
-    assert covered_patches(grid, CAMERA, [sweep]).tolist() == shown.tolist()
-
-
-@pytest.mark.parametrize("width", [30, 600, 640, 641, 900, 1280, 1296])
-def test_swaths_begin_at_patch_edges_and_end_with_the_field(width: int):
-    """One strip where a line holds the field, else one for each column that is not the last strip's."""
-    grid = SceneGrid(100, width, 32, 2)
-    swaths = swaths_at_patches(grid, CAMERA, "x")
-    views = edges_from(grid, CAMERA, swaths, everywhere(grid))
-    assert np.unique(views.patch_number).tolist() == grid.valid_patches().tolist()
-    assert len(swaths) == (1 if width <= 640 else -(-(width - 640) // 32) + 1)
-    assert np.all(np.diff([swath.swath_px for swath in swaths]) > 0)
-
-
-def test_views_agree_with_sweeps_cut_from_the_swaths():
-    """A run of a strip's lines shows exactly the patches whose views lie in it."""
-    views = edges_from(GRID, CAMERA, swaths_at_patches(GRID, CAMERA, "x"), everywhere(GRID))
-    swath = views.swaths[3]
-    cut = replace(swath, start_px=swath.start_px + 20, lines=90)
-    inside = (views.swath == 3) & (views.first >= 20) & (views.stop <= 110)
-    assert sorted(views.patch_number[inside].tolist()) == covered_patches(GRID, CAMERA, [cut]).tolist()
-    assert views.first.min() == 0
-    assert views.stop.max() == views.lines

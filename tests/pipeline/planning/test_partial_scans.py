@@ -14,7 +14,14 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, CostModel, exposing
 from pipeline.planning.coverage import patches_shown, uniform_sweeps
-from pipeline.planning.partial_scans import PatchRows, cheapest_row_seconds, partial_scan, sweeps_of_runs
+from pipeline.planning.partial_scans import (
+    PartialScan,
+    PatchRows,
+    RunTimes,
+    cheapest_row_seconds,
+    choose_runs,
+    sweeps_of_runs,
+)
 
 GRID, CAMERA, COST = SceneGrid(320, 416, 16, 4), LineCamera(samples=160), CostModel()
 WIDER = LineCamera(samples=240)
@@ -39,6 +46,18 @@ def _patchy(rng: np.random.Generator) -> np.ndarray:
     return np.asarray(expected_gain.ravel())
 
 
+def partial_scan(
+    expected_gain: np.ndarray,
+    seconds: float,
+    rows: PatchRows = ROWS,
+    camera: LineCamera = CAMERA,
+    cost: CostModel = COST,
+) -> PartialScan | None:
+    """The runs of a scan in so many seconds, one for each sweep."""
+    times = RunTimes.of_scan(rows.sweeps, camera, cost, EXPOSURE_MS)
+    return choose_runs(rows, expected_gain, times, seconds=seconds)
+
+
 @pytest.mark.parametrize("along", ["x", "y"])
 @pytest.mark.parametrize("step", [1, 2, 4])
 def test_every_patch_is_in_a_row_whose_lines_show_it(along: Axis, step: int) -> None:
@@ -55,7 +74,7 @@ def test_every_patch_is_in_a_row_whose_lines_show_it(along: Axis, step: int) -> 
 @given(worths, st.floats(0.02, 1.2))
 def test_no_run_of_the_same_sweep_is_worth_more_in_its_seconds(expected_gain: np.ndarray, fraction: float) -> None:
     """Each chosen run is worth most of all runs of its sweep that have as many lines or fewer."""
-    scan_pass = partial_scan(ROWS, expected_gain, CAMERA, COST, exposure_ms=EXPOSURE_MS, seconds=fraction * WHOLE_S)
+    scan_pass = partial_scan(expected_gain, fraction * WHOLE_S)
     sums = ROWS.sums(expected_gain)
     for number, first, stop in () if scan_pass is None else scan_pass.runs:
         firsts, stops, values = ROWS.first[number], ROWS.stop[number], sums[number]
@@ -72,7 +91,7 @@ def test_no_run_of_one_swath_that_ends_in_time_is_worth_more(
 ) -> None:
     """Whatever the strip: also where rows are worth the same, and no price of a second divides them."""
     seconds = fraction * WHOLE_S
-    scan_pass = partial_scan(ROWS, expected_gain**power, CAMERA, COST, exposure_ms=EXPOSURE_MS, seconds=seconds)
+    scan_pass = partial_scan(expected_gain**power, seconds)
     found = 0.0 if scan_pass is None else scan_pass.expected_gain
     for number, values in enumerate(ROWS.sums(expected_gain**power)):
         for begin, end in combinations(range(len(values) + 1), 2):
@@ -92,7 +111,7 @@ def test_hardly_any_runs_of_two_swaths_are_worth_more(seed: int, fraction: float
     rows = PatchRows.of(uniform_sweeps(GRID, WIDER, "x", step=4, exposure_ms=EXPOSURE_MS), GRID, WIDER)
     assert len(rows.sweeps) == 2
     given_s = fraction * cost.seconds(list(rows.sweeps), WIDER)
-    scan_pass = partial_scan(rows, expected_gain, WIDER, cost, exposure_ms=EXPOSURE_MS, seconds=given_s)
+    scan_pass = partial_scan(expected_gain, given_s, rows, WIDER, cost)
     assert scan_pass is not None
     sums, setup_s = rows.sums(expected_gain), cost.setup_seconds(exposing(WIDER, rows.sweeps[0]))
     line_s = exposing(WIDER, rows.sweeps[0]).frame_ms * 1e-3
@@ -113,7 +132,7 @@ def test_a_swath_that_does_not_pay_its_set_up_is_left_out() -> None:
         expected_gain[ROWS.row == number * count + 5] = 1.0
     wanted = tuple((number, int(ROWS.first[number, 5]), int(ROWS.stop[number, 5])) for number in (0, 2))
     seconds = COST.seconds(sweeps_of_runs(ROWS.sweeps, wanted), CAMERA) + 0.01
-    found = partial_scan(ROWS, expected_gain, CAMERA, COST, exposure_ms=EXPOSURE_MS, seconds=seconds)
+    found = partial_scan(expected_gain, seconds)
     assert found is not None
     assert found.runs == wanted
 
@@ -122,7 +141,7 @@ def test_rows_worth_the_same_are_looked_at_as_far_as_time_goes() -> None:
     """Of a block that the seconds do not pay for as much as they do, and no lines beside it."""
     expected_gain = np.zeros(GRID.patch_shape)
     expected_gain[4:16, 3:6] = 1.0
-    scan_pass = partial_scan(ROWS, expected_gain.ravel(), CAMERA, COST, exposure_ms=EXPOSURE_MS, seconds=2.2)
+    scan_pass = partial_scan(expected_gain.ravel(), 2.2)
     assert scan_pass is not None
     shown = patches_shown(sweeps_of_runs(ROWS.sweeps, scan_pass.runs), GRID, CAMERA).reshape(GRID.patch_shape)
     assert np.count_nonzero(shown[4:16, 3:6].all(axis=1)) >= 4
@@ -147,7 +166,7 @@ def test_a_patch_that_two_swaths_show_is_of_the_nearer(along: Axis) -> None:
 @given(worths, st.floats(0.02, 1.2))
 def test_looks_end_in_time_and_are_worth_what_they_show(expected_gain: np.ndarray, fraction: float) -> None:
     """Seconds are those of the cost model, at most those given; the worth is that of the rows the lines show."""
-    scan_pass = partial_scan(ROWS, expected_gain, CAMERA, COST, exposure_ms=EXPOSURE_MS, seconds=fraction * WHOLE_S)
+    scan_pass = partial_scan(expected_gain, fraction * WHOLE_S)
     if scan_pass is None:
         assert cheapest_row_seconds(ROWS, CAMERA, COST, EXPOSURE_MS) > fraction * WHOLE_S
         return
@@ -161,23 +180,10 @@ def test_looks_end_in_time_and_are_worth_what_they_show(expected_gain: np.ndarra
 def test_more_seconds_are_worth_no_less(expected_gain: np.ndarray) -> None:
     """And all the seconds of the whole scan buy all that a scan is worth."""
     fractions = (0.3, 0.5, 0.7, 0.9, 1.0)
-    scan_passes = [
-        partial_scan(ROWS, expected_gain, CAMERA, COST, exposure_ms=EXPOSURE_MS, seconds=one * WHOLE_S)
-        for one in fractions
-    ]
+    scan_passes = [partial_scan(expected_gain, one * WHOLE_S) for one in fractions]
     found = [0.0 if scan_pass is None else scan_pass.expected_gain for scan_pass in scan_passes]
     assert found == sorted(found)
     assert found[-1] == pytest.approx(ROWS.sums(expected_gain).sum())
-
-
-def test_what_is_worth_much_is_looked_at_first() -> None:
-    """Of a field known but for one block, a look of few seconds is at the lines that show that block."""
-    expected_gain = np.zeros(GRID.patch_shape)
-    expected_gain[5:8, 3:6] = 1.0
-    scan_pass = partial_scan(ROWS, expected_gain.ravel(), CAMERA, COST, exposure_ms=EXPOSURE_MS, seconds=2.5)
-    assert scan_pass is not None
-    assert patches_shown(sweeps_of_runs(ROWS.sweeps, scan_pass.runs), GRID, CAMERA)[expected_gain.ravel() > 0].all()
-    assert len(scan_pass.runs) == 1
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,6 @@ from pipeline.planning.uniform_scans import (
     LOSS,
     MIOU,
     REFERENCE_LOSS,
-    ScanLimits,
     ScanPerformance,
     UniformScan,
     choose_scan,
@@ -77,7 +76,7 @@ def test_in_less_light_longer_exposures_score_the_same(light: float) -> None:
     assert max(scan.exposure_ms for scan in scans) == pytest.approx(100 / light, abs=0.1)
     assert all(dim.knows(scan.exposure_ms) for scan in scans)
     for seconds in (10.0, 20.0):
-        clear, dim_scan = (choose_scan(some, ScanLimits(seconds)) for some in (SCANS, scans))
+        clear, dim_scan = (choose_scan(some, seconds) for some in (SCANS, scans))
         assert dim_scan.expected[MIOU] <= clear.expected[MIOU]
         assert (dim_scan.step, dim_scan.exposure_ms) > (clear.step, clear.exposure_ms)
 
@@ -94,18 +93,18 @@ def test_a_scan_ends_in_time_and_no_longer_exposure_would(seconds: float) -> Non
             assert longer.seconds > seconds
     if seconds < CHEAPEST:
         with pytest.raises(BudgetError, match=rf"--seconds .*the least is {CHEAPEST:.1f} s"):
-            choose_scan(offered, ScanLimits(seconds))
+            choose_scan(offered, seconds)
         return
-    chosen = choose_scan(offered, ScanLimits(seconds))
+    chosen = choose_scan(offered, seconds)
     assert chosen.seconds <= seconds
     more = uniform_scans(RECORD, SWEEPS, CAMERA, COST, 270, seconds=2 * seconds)
-    assert choose_scan(more, ScanLimits(2 * seconds)).expected[MIOU] >= chosen.expected[MIOU] - LOSS
+    assert choose_scan(more, 2 * seconds).expected[MIOU] >= chosen.expected[MIOU] - LOSS
 
 
 def test_nothing_is_spent_that_does_not_pay() -> None:
     """Where a record no longer grows with the exposure, the shortest of those as good is taken."""
     flat = replace(RECORD, scores={MIOU: np.array([[0.9, 0.94, 0.9405], [0.8, 0.8, 0.8], [0.7, 0.7, 0.7]])})
-    chosen = choose_scan(uniform_scans(flat, SWEEPS, CAMERA, COST, 270), ScanLimits())
+    chosen = choose_scan(uniform_scans(flat, SWEEPS, CAMERA, COST, 270))
     assert (chosen.step, chosen.exposure_ms) == (1, 25.0)
 
 
@@ -117,37 +116,28 @@ def test_the_camera_bounds_exposures_and_its_rate_the_seconds() -> None:
     slow = replace(CAMERA, max_rate_hz=20.0)  # frames of 50 ms at least
     scans = uniform_scans(RECORD, SWEEPS, slow, COST, 270)
     fastest = min(scan.seconds for scan in scans if scan.step == 1)
-    assert choose_scan(scans, ScanLimits(fastest)).exposure_ms > 45
-
-
-def test_raw_bytes_bound_the_lines_and_not_the_exposure() -> None:
-    """Half of the bytes is every second line, exposed as long as it pays."""
-    chosen = choose_scan(SCANS, ScanLimits(bytes_raw=0.6 * max(scan.bytes_raw for scan in SCANS)))
-    assert chosen.step == 2
-    assert chosen.expected[MIOU] >= 0.92 - LOSS
-    with pytest.raises(BudgetError, match=r"--bytes-raw 1000; the least is .* bytes \(every 4th line"):
-        choose_scan(SCANS, ScanLimits(bytes_raw=1000))
+    assert choose_scan(scans, fastest).exposure_ms > 45
 
 
 @pytest.mark.parametrize("goals", [{MIOU: 0.85}, {"weed": 0.55}, {MIOU: 0.9, "weed": 0.7}])
 def test_a_goal_is_reached_as_cheaply_as_it_can_be(goals: dict[str, float]) -> None:
     """The choice reaches it, and no cheaper scan does."""
-    chosen = choose_scan(SCANS, ScanLimits(goals=goals))
+    chosen = choose_scan(SCANS, goals=goals)
     assert all(chosen.expected[name] >= least for name, least in goals.items())
     cheaper = [scan for scan in SCANS if scan.seconds < chosen.seconds]
     assert all(any(scan.expected[name] < least for name, least in goals.items()) for scan in cheaper)
 
 
 def test_goals_out_of_reach_name_the_best_there_is() -> None:
-    """Beyond the record: its best; beyond what is paid for: what it takes; of two goals that no one scan has: so."""
-    with pytest.raises(BudgetError, match=r"--goal 95: the most that these weights' scans reached is 94\.0"):
-        choose_scan(SCANS, ScanLimits(goals={MIOU: 0.95}))
-    with pytest.raises(BudgetError, match=r"--goal 93 is not reached within --seconds .* takes \d+\.\d s"):
-        choose_scan(SCANS, ScanLimits(CHEAPEST, goals={MIOU: 0.93}))
+    """Beyond the record, or of two goals that no one scan has: the best; beyond the time: what it takes."""
+    with pytest.raises(BudgetError, match=r"reaches --goal 95, where the best scan has 94\.0; ask for less"):
+        choose_scan(SCANS, goals={MIOU: 0.95})
+    with pytest.raises(BudgetError, match=r"--goal takes \d+\.\d s .*, --seconds is"):
+        choose_scan(SCANS, CHEAPEST, {MIOU: 0.93})
     scores = {MIOU: RECORD.scores[MIOU], "weed": RECORD.scores[MIOU][::-1]}
     torn = uniform_scans(replace(RECORD, scores=scores), SWEEPS, CAMERA, COST, 270)
-    with pytest.raises(BudgetError, match="no one scan of these weights reaches all of them"):
-        choose_scan(torn, ScanLimits(goals={MIOU: 0.93, "weed": 0.93}))
+    with pytest.raises(BudgetError, match=r"no scan of these weights reaches --goal 93, .* and weed=93, where"):
+        choose_scan(torn, goals={MIOU: 0.93, "weed": 0.93})
 
 
 def test_the_frontier_holds_every_best_scan_of_its_seconds() -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, line_positions
-from pipeline.planning.partial_scans import every_nth, lines_between
+from pipeline.planning.fine_pass import every_nth, lines_between
 from pipeline.rectify.placed import PixelGrid
 from pipeline.rectify.sweep_paths import capture_numbers, interlaced_paths, sweep_paths
 from pipeline.signal.components import Components

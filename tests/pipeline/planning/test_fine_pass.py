@@ -1,0 +1,154 @@
+"""The second pass: laws of its time, lines that are not captured twice, and the choice of spacing and exposure."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import CostModel, Sweep
+from pipeline.planning.coverage import full_sweeps, patches_shown
+from pipeline.planning.fine_pass import FIRST_STEPS, LEAST_GAIN, SecondPass, every_nth
+from pipeline.planning.uniform_scans import MIOU, ScanPerformance
+
+CAMERA, COST, GRID = LineCamera(samples=320), CostModel(), SceneGrid(256, 600, 16, 1)
+FULL = full_sweeps(GRID, CAMERA, "x")
+FULL_S = COST.seconds(FULL, CAMERA)
+RECORD = ScanPerformance((1, 2, 4), (5.0, 100.0), {MIOU: np.array([[0.9, 0.95], [0.85, 0.92], [0.7, 0.8]])}, 3)
+
+
+def second_pass(seconds: float, *, step: int = 4, margin_px: float = 0.0) -> SecondPass:
+    """Plans after a first pass of every 4th line, or with a margin, beside it."""
+    return SecondPass(GRID, CAMERA, COST, every_nth(FULL, step), FULL, seconds, margin_px)
+
+
+def drawn(seed: int) -> np.ndarray:
+    """Gains with a few strong patches, some of them none."""
+    rng = np.random.default_rng(seed)
+    gain = rng.exponential(size=int(np.prod(GRID.patch_shape))) ** 3
+    return np.where(rng.random(gain.size) > 0.25, gain, 0.0)
+
+
+def positions(sweeps: list[Sweep]) -> list[tuple[float, float]]:
+    """Swath and place of all lines."""
+    return [(sweep.swath_px, float(place)) for sweep in sweeps for place in sweep.line_px()]
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    st.floats(0, 1.1),
+    st.integers(0, 99),
+    st.sampled_from([1, 2]),
+    st.sampled_from([0.0, 6.0]),
+    st.sampled_from([5.0, None]),
+)
+def test_a_plan_ends_in_time_and_captures_its_patches(
+    fraction: float, seed: int, step: int, margin_px: float, exposure_ms: float | None
+) -> None:
+    """The time is the cost model's, the gain that of the captured patches, and names sort as the lines do."""
+    gain, planner = drawn(seed), second_pass(fraction * FULL_S, margin_px=margin_px)
+    plan = planner.plan(gain, step=step, exposure_ms=exposure_ms)
+    assert plan.seconds == COST.seconds(plan.sweeps, CAMERA) <= fraction * FULL_S
+    assert plan.expected_gain == pytest.approx(gain[plan.patch_index].sum())
+    assert {sweep.exposure_ms for sweep in plan.sweeps} <= {exposure_ms}
+    assert patches_shown([*planner.first_pass, *plan.sweeps], GRID, CAMERA)[plan.patch_index].all()
+    names = [sweep.name for sweep in plan.sweeps]
+    assert len(set(names)) == len(names)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.floats(0.05, 1), st.integers(0, 99))
+def test_no_line_is_captured_twice(fraction: float, seed: int) -> None:
+    """New lines lie between those of the first pass, and complete its runs to every line."""
+    planner = second_pass(fraction * FULL_S)
+    plan = planner.plan(drawn(seed))
+    lines = positions([*planner.first_pass, *plan.sweeps])
+    assert len(set(lines)) == len(lines)
+    rows = planner.rows
+    for number, place in np.argwhere(rows.there)[::5]:
+        patches = np.flatnonzero(rows.row == number * rows.first.shape[1] + place)
+        if np.isin(patches, plan.patch_index).all():
+            swath, found = (
+                planner.swaths[number],
+                {at for swath_px, at in lines if swath_px == planner.swaths[number].swath_px},
+            )
+            wanted = swath.start_px + np.arange(rows.first[number, place], rows.stop[number, place])
+            assert set(wanted.tolist()) <= found
+
+
+def test_time_goes_to_several_runs_of_a_swath() -> None:
+    """Two far rows of one swath are two runs, as the lines between them take longer than a set-up."""
+    planner, gain = second_pass(0.5 * FULL_S), np.zeros(int(np.prod(GRID.patch_shape)))
+    rows, count = planner.rows.row, planner.rows.first.shape[1]
+    gain[np.isin(rows, [1, count - 2])] = 1.0
+    plan = planner.plan(gain)
+    assert np.flatnonzero(gain).tolist() == plan.patch_index.tolist()
+    assert len({sweep.name.rpartition("-")[0] for sweep in plan.sweeps}) == 2
+    assert plan.lines < 0.3 * FULL[0].lines
+
+
+def test_more_seconds_gain_no_less() -> None:
+    """And the seconds of the whole field gain all of it, which the plan says."""
+    for seed in range(4):
+        gains = [second_pass(part * FULL_S).plan(drawn(seed)).expected_gain for part in (0.2, 0.4, 0.6, 1.0)]
+        assert gains == sorted(gains)
+        assert gains[-1] == pytest.approx(drawn(seed).sum())
+    whole = second_pass(FULL_S).plan(np.ones(int(np.prod(GRID.patch_shape))))
+    assert (whole.kind, whole.patch_index.tolist()) == ("full", GRID.valid_patches().tolist())
+    assert "the whole field, every line, 100 ms" in whole.reason
+
+
+def test_equal_gains_fill_the_time() -> None:
+    """Where no price of a second tells patches apart, less than a row of patches is left over."""
+    plan = second_pass(0.5 * FULL_S).plan(np.ones(int(np.prod(GRID.patch_shape))))
+    assert 0.5 * FULL_S - plan.seconds < 2 * (16 * 0.1 + COST.setup_seconds(CAMERA)) + COST.reload_s
+
+
+def test_a_margin_is_added_at_both_ends_of_a_run() -> None:
+    """With pointing errors, a run takes every line of its swath, so many more as the mirror may be off."""
+    gain = np.zeros(GRID.patch_shape)
+    gain[8, 3] = 1.0
+    (plain,) = second_pass(FULL_S, step=4, margin_px=1e-9).plan(gain.ravel()).sweeps
+    (wide,) = second_pass(FULL_S, step=4, margin_px=6.0).plan(gain.ravel()).sweeps
+    assert (wide.start_px, wide.lines) == (plain.start_px - 5, plain.lines + 10)  # 1e-9 is a line already
+    assert wide.step == 1
+
+
+def test_a_recording_cuts_the_sweeps() -> None:
+    """The time is that of the lines that exist."""
+    planner = replace(second_pass(FULL_S), recorded=lambda sweeps: sweeps[:1])
+    plan = planner.plan(drawn(1))
+    assert len(plan.sweeps) == 1
+    assert plan.seconds == COST.seconds(plan.sweeps, CAMERA)
+
+
+@pytest.mark.parametrize("step", FIRST_STEPS)
+def test_spacing_and_exposure_are_those_of_most_gain(step: int) -> None:
+    """No other pair that is tried gains more in the time; a small gain plans nothing."""
+    planner = second_pass(0.3 * FULL_S, step=step)
+    asked: list[tuple[int, float]] = []
+
+    def gain_of(spacing: int, mean_ms: float) -> np.ndarray:
+        asked.append((spacing, mean_ms))
+        return drawn(2) * RECORD.expected(spacing, mean_ms)[MIOU]
+
+    best = planner.best(RECORD, gain_of)
+    assert {spacing for spacing, _ in asked} == {one for one in RECORD.steps if one < step}
+    for spacing in (1, 2):
+        for exposure_ms in (5.0, 20.0, 100.0):
+            gain = drawn(2) * RECORD.expected(spacing, exposure_ms)[MIOU]
+            assert planner.plan(gain, step=spacing, exposure_ms=exposure_ms).expected_gain <= 1.02 * best.expected_gain
+    dim = replace(planner, first_pass=every_nth(FULL, step, 100.0), margin_px=6.0)
+    worse = replace(RECORD, steps=(1, step), scores={MIOU: np.array([[0.6, 0.95], [0.7, 0.8]])})
+    asked.clear()
+    dim.best(worse, gain_of)  # lines that score less than those of the first pass are not tried
+    assert asked
+    assert all(worse.expected(*pair)[MIOU] >= 0.8 for pair in asked)
+    nothing = planner.best(RECORD, lambda spacing, mean_ms: np.full(drawn(2).size, 0.1 * LEAST_GAIN / drawn(2).size))
+    assert (nothing.sweeps, nothing.kind) == ([], "lines")
+    assert "no second pass" in nothing.reason
