@@ -24,7 +24,7 @@ from flows.tasks.open_survey import STAGES, OpenSurvey, RunRef
 from flows.tasks.prefect_tasks import as_task, inside_flow
 from flows.tasks.stages.accuracy import evaluate
 from flows.tasks.stages.capture import capture_coarse, capture_fine
-from flows.tasks.stages.condense import raw_differs
+from flows.tasks.stages.condense import why_raw_stays
 from flows.terminal.figures import format_percent
 from pipeline.lazy import deferred
 from storage.archive.keys import StageRef, canonical_json
@@ -74,7 +74,7 @@ def add_accuracy(plan: OpenSurvey, run: RunRef, accuracy: StageRef) -> RunRef:
 
 
 def clear_raw(plan: OpenSurvey, run: RunRef) -> RunRef:
-    """Compare and clear the raw lines that the settings do not keep; in a flow as a task.
+    """Verify the signal, and clear the raw lines that the settings do not keep; in a flow as a task.
 
     The run is published again with the remaining bytes.
     """
@@ -89,7 +89,7 @@ def _clear_raw(plan: OpenSurvey, run: RunRef) -> RunRef:
     if not plan.products.signals or any(archive.find(raw.stage, raw.key) is None for raw in passes):
         return run  # cleared before
     others = (_kept_by_others(plan, name, raw) for name, raw in zip(there, passes, strict=True))
-    why = next(filter(None, others), None) or raw_differs(passes, plan.products.signals[0], plan.run.camera)
+    why = next(filter(None, others), None) or why_raw_stays(plan.products.signals[0])
     if why is not None:
         plan.observer.note(f"raw lines stay: {why}")
         return run

@@ -1,4 +1,4 @@
-"""Clear the raw lines that no run keeps any longer, after comparing them with their condensed signal.
+"""Clear the raw lines that no run keeps any longer, after verifying the signal that was condensed from them.
 
 The setting ``keep`` of a run is the time for which its raw lines stay. Lines of several runs stay as long as one keeps
 them. A killed process leaves each store complete or cleared; the next one counts the bytes of the runs again.
@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from flows.publish.byte_account import recount_bytes
 from flows.publish.report import replace_savings
 from flows.settings.values import parse_keep, raw_days
-from flows.tasks.stages.condense import SIGNAL, SIGNAL_FINE, camera_of, raw_differs
+from flows.tasks.stages.condense import SIGNAL, SIGNAL_FINE, why_raw_stays
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run, Store
@@ -47,7 +47,7 @@ def clear_raw_lines(
 ) -> RawClearance:
     """Clear the raw lines that have expired for every run that names them, and update the bytes in receipts.
 
-    Every line is compared first; lines that differ or cannot be read stay. With ``dry_run`` nothing is compared or
+    Every byte of their signal is verified first; lines of a damaged one stay. With ``dry_run`` nothing is verified or
     removed. Raises ArchiveError: the disk refuses.
     """
     found = list(outlived_lines(Catalogue.read(archive.root), archive.now()))
@@ -61,9 +61,7 @@ def clear_raw_lines(
             if progress is not None:
                 progress(one.raw.ref.uri, number / len(found))
             raw, signal = (archive.ref(store.ref.stage, store.ref.key) for store in (one.raw, one.signal))
-            others = (archive.find(raw.stage, key) for key in one.signal.inputs if key != raw.key)
-            passes = [raw, *(other for other in others if other is not None)]
-            why = raw_differs(passes, signal, camera_of(one.signal.params))
+            why = why_raw_stays(signal)
             if why is not None:
                 done.kept[raw.uri] = why
             elif archive.clear(raw, wait=False):
@@ -76,7 +74,7 @@ def outlived_lines(catalogue: Catalogue, now: datetime) -> Iterator[OutlivedLine
     """Yield the condensed raw lines of published runs that no run keeps any longer."""
     found = set[str]()
     for run in catalogue.runs:
-        for names in reversed(LINE_PRODUCTS.items()):  # fine pass first: its comparison needs the coarse one
+        for names in LINE_PRODUCTS.items():
             raw, signal = (_whole(catalogue, run, name) for name in names)
             if raw is None or signal is None or raw.ref.uri in found:
                 continue

@@ -19,7 +19,7 @@ from pipeline.geometry.scan import Sweep
 from pipeline.readings import SIGMA_OF_MEDIAN
 from pipeline.signal.calibrate import calibrate, judge_elements
 from pipeline.signal.components import Components
-from pipeline.signal.lines import BLOCK_LINES, CondensedLines
+from pipeline.signal.lines import BLOCK_LINES
 from pipeline.signal.subspace import SignalStatistics
 from pipeline.source import Line, References, SweepLines
 
@@ -33,8 +33,6 @@ CANCELLED = 1e-4  # of a spectrum's square: a smaller difference of squares has 
 SPECTRA_AT_ONCE = 1024  # projected at a time: they stay in cache
 MEAN_SIDE = 4  # of the blocks of spectra whose means are kept where scores are rounded coarsely
 RESIDUAL_STEP = 0.5  # in which residuals of rare spectra are kept [noise's deviations]
-
-SLACK, DIGITS = 1e-3, 1e-5  # of a step, and of a score, by which sums of float32 may differ
 
 Scores = NDArray[np.float32]
 Bools = NDArray[np.bool_]
@@ -309,23 +307,3 @@ def calibrated_blocks(
         if lost.any():
             valid[lost] &= raw[lost].any(axis=2).reshape(-1, raw.shape[1], *[1] * (valid.ndim - 2))
         yield first, values, valid
-
-
-def differing_lines(
-    lines: SweepLines, stored: CondensedLines, camera: LineCamera, components: Components | None = None
-) -> list[int]:
-    """Return the lines with a stored score that differs by more than rounding from that of the raw line.
-
-    The rest of a spectrum is noise by the tests of condensing, or was stored. ``components`` are those that the lines
-    were condensed by, if they hold more than what is stored.
-    """
-    wrong = list[int]()
-    for first, values, valid in calibrated_blocks(lines, camera):
-        last = first + len(values)
-        seen = score_lines(values, valid, components or stored.components)
-        off = np.abs(stored.read(first, last) * np.float32(stored.step) - seen.scores)
-        usable = seen.quality != UNUSABLE
-        most = 0.5 if stored.step <= 1 else 1  # see `whole_steps`
-        same = (off <= (most + SLACK) * stored.step + DIGITS * np.abs(seen.scores)).all(axis=2) | ~usable
-        wrong += (first + np.flatnonzero(~(same & (usable == stored.usable[first:last])).all(axis=1))).tolist()
-    return wrong

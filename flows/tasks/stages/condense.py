@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import reduce
 from pathlib import Path
@@ -29,7 +29,6 @@ from pipeline.signal.condense import (
     Condenser,
     ResidualLaw,
     calibrated_blocks,
-    differing_lines,
     score_lines,
     whole_steps,
 )
@@ -41,8 +40,7 @@ from storage.archive.manifests import check_files, read_table, write_table
 from storage.arrays.cubes import RawCube, SweepHeader, open_raw_cubes, read_statistics
 from storage.arrays.layout import SHARD_ROWS, numbers_in_memory
 from storage.arrays.mosaics import MosaicWriter
-from storage.arrays.signal_cubes import LineRows, SignalCubeWriter, open_signal_cubes
-from storage.arrays.spool import line_values
+from storage.arrays.signal_cubes import LineRows, SignalCubeWriter
 from storage.readers.raster_fields import RasterPixels
 
 SIGNAL = Product("condense", version=1)
@@ -152,11 +150,6 @@ def with_shared_directions(
     return replace(condenser, components=shared, law=ResidualLaw.learned(found.spectra, shared))
 
 
-def camera_of(params: Mapping[str, Any]) -> LineCamera:
-    """Return a camera with the values that scores depend on, from the parameters of a compressed pass."""
-    return LineCamera(**params["camera"])
-
-
 def components_of(found: SignalStatistics, cubes: Sequence[RawCube], choice: SignalChoice) -> Components:
     """Return the components of a pass; few bands are kept as they are, in steps of one DN."""
     if found.bands > FEW_BANDS or not found.count:
@@ -208,36 +201,20 @@ def _record(condenser: Condenser, done: Sequence[CondensedSweep]) -> dict[str, A
     }
 
 
-def raw_differs(passes: Sequence[StageRef], signal: StageRef, camera: LineCamera) -> str | None:
-    """Return why raw lines must be kept, or None if they can be deleted: every line is compared with its scores.
+def why_raw_stays(signal: StageRef) -> str | None:
+    """Return why the raw lines of a signal must be kept, or None if they can be deleted.
 
-    ``passes`` are the captures in the order of their compression. Before, every byte of the store is verified.
+    Every byte of the signal is verified.
     """
     try:
         check_files(signal.path, hashes=True)
-        return _lines_differ(passes, signal, camera)
+        record = read_table(signal.path / RECORD)
     except IncompleteStoreError as error:
         return f"{error}"
-
-
-def _lines_differ(passes: Sequence[StageRef], signal: StageRef, camera: LineCamera) -> str | None:
-    record = read_table(signal.path / RECORD)
-    if record["rare"] > MOST_RARE * max(record["spectra"], 1):
-        fraction = 100 * record["rare"] / record["spectra"]
-        return f"{record['components']} components leave {fraction:.1f} % of the spectra with residuals above the noise"
-    cubes = [cube for raw in passes for cube in open_raw_cubes(raw.path)]
-    of_sweep = {stored.sweep: stored for stored in open_signal_cubes(signal.path)}
-    if any(cube.sweep not in of_sweep for cube in cubes):
-        return "the sweeps of the signal are not those of the raw lines"
-    found = reduce(SignalStatistics.merged, (read_statistics(raw.path) for raw in passes))
-    whole = len(cubes) == len(of_sweep)
-    few = components_of(found, cubes, SignalChoice()) if found.bands <= FEW_BANDS and whole else None
-    for cube in cubes:
-        stored = of_sweep[cube.sweep]
-        wrong = differing_lines(cube, stored, camera, few)
-        if wrong:
-            return f"sweep {cube.sweep.name}: {line_values(wrong)} of the signal are not those of the raw lines"
-    return None
+    if record["rare"] <= MOST_RARE * max(record["spectra"], 1):
+        return None
+    fraction = 100 * record["rare"] / record["spectra"]
+    return f"{record['components']} components leave {fraction:.1f} % of the spectra with residuals above the noise"
 
 
 Rows = tuple[int, NDArray[np.float32], NDArray[np.bool_]]

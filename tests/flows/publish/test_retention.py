@@ -20,7 +20,6 @@ from flows.terminal.processes import DONE, PARTLY
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 from storage.archive.records import read_run
-from storage.arrays import signal_cubes
 from storage.maintenance.garbage import IN_USE
 from tests.conftest import Survey
 from tests.flows.conftest import problems
@@ -166,23 +165,6 @@ def test_a_flipped_bit_keeps_raw_lines(archive: Archive, part: str, capsys: pyte
     (why,) = done["raw_kept"].values()
     assert "has changed since it was published" in why
     assert len(raw_uris(archive)) == 1
-
-
-@pytest.mark.usefixtures("later")
-def test_lines_that_differ_stay(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One score that is off by one step: the reason names the sweep and its line."""
-    read = signal_cubes.SignalCube.read
-
-    def off(self: signal_cubes.SignalCube, start: int = 0, stop: int | None = None) -> Any:
-        found = read(self, start, stop).copy()
-        if start == 0 and self.sweep.name == "coarse-0":
-            found[3, 7, 0] += 2
-        return found
-
-    monkeypatch.setattr(signal_cubes.SignalCube, "read", off)
-    done = clear_raw_lines(archive)
-    assert set(done.kept.values()) == {"sweep coarse-0: line 3 of the signal are not those of the raw lines"}
-    assert set(done.kept) == raw_uris(archive)
 
 
 @pytest.mark.usefixtures("later")

@@ -80,16 +80,6 @@ def test_quality_says_how_much_was_seen(condensed: tuple) -> None:
     assert np.isnan(seen.residual[0]).tolist() == [False, False, False, True, True]
 
 
-def test_spectra_that_are_not_valid_are_unusable(condensed: tuple) -> None:
-    """With one validity a spectrum, and nothing missing, the others keep their scores."""
-    made, _, law = condensed
-    valid = np.ones((4, 4), np.bool_)
-    valid[2, 1] = False
-    seen, plain = scored(made.values[:4, :4], law, valid), scored(made.values[:4, :4], law)
-    assert np.argwhere(seen.quality == UNUSABLE).tolist() == [[2, 1]]
-    np.testing.assert_array_equal(seen.scores[valid], plain.scores[valid])
-
-
 def test_nan_counts_as_missing(condensed: tuple) -> None:
     """A NaN that validity does not know of is a missing band: it is restored, and the spectrum says so."""
     made, _, law = condensed
@@ -121,13 +111,6 @@ def test_many_components_and_few_bands_left_mark_nothing() -> None:
     valid = np.ones(made.values.shape, np.bool_)
     valid[40:60, :, 1::2] = False
     assert not marked(made.values, found, law, valid).any()
-
-
-def test_lines_without_light_are_unusable() -> None:
-    """No band has a value: no scores, all of them unusable."""
-    seen = score_lines(np.full((2, 3, 12), np.nan, np.float32), np.zeros((2, 3), np.bool_), Components.empty(12))
-    assert seen.scores.shape == (2, 3, 0)
-    assert (seen.quality == UNUSABLE).all()
 
 
 def test_one_of_two_bands_is_enough() -> None:
@@ -178,16 +161,6 @@ def test_noise_alone_marks_no_more_than_stated(shape: tuple[int, int], alarms: f
         noise = np.random.default_rng(seed).chisquare(50, shape) / 50
         total += int(find_rare(noise.astype(np.float32), law, alarms).sum())
     assert total <= 8 * poisson.ppf(0.999, 60 * alarms / 8)
-
-
-def test_noise_of_a_field_marks_no_more_than_stated() -> None:
-    """The same of fields of materials, whose noise, components and law are all learned of them: 8 fields, 10 each."""
-    total = 0
-    for seed in range(8):
-        made = field_of(seed, (64, 64), 24)
-        found = statistics_of(made.values)
-        total += int(marked(made.values, found, find_components(found), alarms=10.0).sum())
-    assert total <= 8 * poisson.ppf(0.999, 80 / 8)
 
 
 @pytest.mark.parametrize("sigma", [1.0, 2.0, 5.0, 20.0])

@@ -77,11 +77,6 @@ def test_statistics_come_back_of_arrays(bands: int) -> None:
     np.testing.assert_array_equal(find_components(back).axes, find_components(found).axes)
 
 
-def test_statistics_of_nothing_come_back_of_arrays() -> None:
-    """Before the first line there is no component, then as well as now."""
-    assert len(find_components(SignalStatistics.of_arrays(SignalStatistics(5, 100).arrays()))) == 0
-
-
 @pytest.mark.parametrize("bands", [24, 60])
 @pytest.mark.parametrize("materials", [1, 2, 4])
 def test_the_known_rank_is_found(bands: int, materials: int) -> None:
@@ -127,13 +122,6 @@ def test_noise_alone_gives_no_more_components_than_stated(bands: int) -> None:
         values = with_noise(np.full((48, 48, bands), 100.0), noise, seed)
         alarms += len(find_components(statistics_of(values), least=0, false_alarm=FALSE_ALARM)) > 0
     assert alarms <= binom.ppf(0.999, TRIALS, FALSE_ALARM)
-
-
-@pytest.mark.parametrize("materials", [0, 1, 5])
-def test_noise_is_estimated_within_three_percent(materials: int) -> None:
-    """In every band, of a field of 128 x 128 spectra, whatever the materials."""
-    made = field_of(8, (128, 128), 50, materials)
-    np.testing.assert_allclose(find_components(statistics_of(made.values)).noise, made.noise, rtol=0.03)
 
 
 @pytest.mark.parametrize("bands", [1, 2, 8])
@@ -198,14 +186,6 @@ def test_large_fields_keep_what_is_proved() -> None:
     assert counts[0] > counts[1] == proved
 
 
-@pytest.mark.parametrize("wavelength", [np.full(60, 550.0), np.linspace(400, 900, 60)[::-1]])
-def test_smooth_directions_need_wavelengths_that_differ(wavelength: np.ndarray) -> None:
-    """Bands of one wavelength add none; descending ones are as good as ascending."""
-    found = statistics_of(field_of(2, bands=60).values)
-    components = components_of_field(found, wavelength, false_alarm=0.01, least=4)
-    assert (len(components) > len(find_components(found, least=4))) == (np.ptp(wavelength) > 0)
-
-
 def test_all_dark_has_no_component() -> None:
     """Lines of which nothing may be used have no mean, no noise and no component."""
     found = statistics_of(np.full((8, 8, 12), np.nan, np.float32), np.zeros((8, 8), np.bool_))
@@ -223,15 +203,6 @@ def test_values_that_never_change_have_nothing_to_say(value: float) -> None:
     assert len(components) == 2
     np.testing.assert_array_equal(restored(scored(values, components), components), values)
     assert not marked(values, found, components).any()
-
-
-def test_one_material_has_the_least_number_of_components() -> None:
-    """A spectrum and its noise: no component rises above it, and what is asked for at least is kept."""
-    made = field_of(1, (128, 128), materials=0)
-    found = statistics_of(made.values)
-    assert len(find_components(found, least=0)) == 0
-    assert [len(find_components(found, least=least)) for least in (1, 4)] == [1, 4]
-    np.testing.assert_allclose(find_components(found).noise, made.noise, rtol=0.03)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 5), (3, 7), (8, 8)])
@@ -292,19 +263,6 @@ def test_a_band_that_lights_up_late_counts_from_then() -> None:
     components = find_components(statistics_of(values))
     assert components.mean[5] == pytest.approx(values[64:, :, 5].mean(), abs=3 * made.noise[5] + 0.05)
     assert np.isfinite(components.noise).all()
-
-
-def test_a_dark_frame_that_drifts_is_one_more_component() -> None:
-    """Drift by 3 deviations that all elements of a band share is held as a component, and nothing is rare."""
-    made = field_of(9)
-    drift = 3 * np.linspace(0, 1, 96)[:, None, None] * np.random.default_rng(1).normal(size=40) * made.noise
-    values = with_noise(made.clean + drift, made.noise, 9)
-    found = statistics_of(values)
-    components = find_components(found, least=1)
-    assert len(components) == 4
-    assert not marked(values, found, components).any()
-    left = (values - components.restore(scored(values, components).scores)) / made.noise
-    assert np.abs(left[-16:].mean(axis=(0, 1))).max() < 0.15
 
 
 def test_a_clouds_edge_adds_one_component() -> None:

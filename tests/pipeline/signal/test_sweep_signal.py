@@ -1,4 +1,4 @@
-"""A sweep, block by block: what lines tell as they arrive, what is stored of them, and which stored lines differ."""
+"""A sweep, block by block: what lines tell as they arrive, and what is stored of them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from pipeline.signal.condense import (
     Condenser,
     LineStatistics,
     ResidualLaw,
-    differing_lines,
     whole_steps,
 )
 from pipeline.signal.subspace import SignalStatistics, find_components
@@ -36,19 +35,10 @@ class Stored:
     scores: NDArray[np.int32]
     quality: NDArray[np.uint8]
 
-    @property
-    def usable(self) -> NDArray[np.bool_]:
-        """Spectra that may be used."""
-        return self.quality != UNUSABLE
-
     def write(self, first: int, scores: NDArray[np.float32], quality: NDArray[np.uint8]) -> None:
         """Take some lines."""
         part = slice(first, first + len(scores))
         self.scores[part], self.quality[part] = whole_steps(scores, self.step), quality
-
-    def read(self, start: int, stop: int) -> NDArray[np.int32]:
-        """Scores of some lines in steps."""
-        return self.scores[start:stop]
 
     def restored(self, done: CondensedSweep) -> NDArray[np.float32]:
         """Scene values of all lines."""
@@ -118,7 +108,6 @@ def test_a_lost_line_is_unusable_and_a_line_without_position_keeps_its_light(hot
     assert np.argwhere(stored.quality == UNUSABLE).tolist() == [[5, sample] for sample in range(40)]
     off = (stored.restored(done) - values_of(lines))[140] / stored.components.noise
     assert np.sqrt(np.mean(off**2)) == pytest.approx(1, abs=0.1)
-    assert differing_lines(lines, stored, CAMERA) == []
 
 
 @pytest.mark.parametrize("step", [0.5, 1.0, 3.0])
@@ -130,7 +119,6 @@ def test_scores_are_stored_in_steps(step: float) -> None:
     count = len(stored.components)
     assert np.mean(off**2) == pytest.approx((BANDS - count * (1 - step**2 / 12)) / BANDS, rel=0.05)
     assert (len(done.rare), done.known) == (0, 150 * 40)
-    assert differing_lines(lines, stored, CAMERA) == []
 
 
 def test_rare_spectra_come_back_within_a_quarter_deviation() -> None:
@@ -144,23 +132,6 @@ def test_rare_spectra_come_back_within_a_quarter_deviation() -> None:
     assert done.residuals.shape == (4, BANDS)
     off = (stored.restored(done) - values_of(lines)) / stored.components.noise
     assert max(np.abs(off[place]).max() for place in places) <= RESIDUAL_STEP / 2 + 1e-3
-
-
-def test_one_altered_score_is_found() -> None:
-    """One score a step off: its line differs, and no other does."""
-    lines = made_lines()
-    stored, _ = condense(lines)
-    stored.scores[77, 13, 1] += 1
-    assert differing_lines(lines, stored, CAMERA) == [77]
-
-
-def test_lines_that_changed_or_were_lost_are_found() -> None:
-    """A raw line that is another one now, and spectra stored as unusable that are not, are named by their lines."""
-    lines = made_lines()
-    stored, _ = condense(lines)
-    stored.quality[149, 0] = UNUSABLE
-    lines.raw[66] = lines.raw[0]
-    assert differing_lines(lines, stored, CAMERA) == [66, 149]
 
 
 def test_saturated_spectra_are_restored_or_unusable() -> None:
@@ -181,7 +152,7 @@ def test_saturated_spectra_are_restored_or_unusable() -> None:
 
 
 def test_dead_columns_and_elements() -> None:
-    """A column of bad elements is unusable, one bad element is filled from its neighbours, and no line differs."""
+    """A column of bad elements is unusable, one bad element is filled from its neighbours."""
     bad = np.zeros((40, BANDS), np.bool_)
     bad[8], bad[25, 4] = True, True
     lines = replace(made_lines(), references=MadeLines.of(made_lines().raw, bad).references)
@@ -191,11 +162,10 @@ def test_dead_columns_and_elements() -> None:
     assert np.flatnonzero(unusable.all(axis=0)).tolist() == [8]
     assert unusable.sum() == 150
     assert done.known == 150 * 39
-    assert differing_lines(lines, stored, CAMERA) == []
 
 
 def test_all_dark_lines() -> None:
-    """A white frame that is no brighter than the dark one: no component, no usable spectrum, and no line differs."""
+    """A white frame that is no brighter than the dark one: no component, no usable spectrum."""
     lines = made_lines()
     references = replace(lines.references, white=lines.references.dark)
     lines = replace(lines, references=references)
@@ -203,7 +173,6 @@ def test_all_dark_lines() -> None:
     assert (len(stored.components), done.known, done.rare.shape) == (0, 0, (0, 2))
     assert (stored.quality == UNUSABLE).all()
     assert done.residuals.shape == (0, BANDS)
-    assert differing_lines(lines, stored, CAMERA) == []
 
 
 def test_a_dark_frame_that_drifts_apart_in_every_element_makes_raw_lines_stay() -> None:
@@ -216,13 +185,3 @@ def test_a_dark_frame_that_drifts_apart_in_every_element_makes_raw_lines_stay() 
     assert len(done.rare) > 0.05 * done.known
     off = ((stored.restored(done) - values_of(lines)) / stored.components.noise)[tuple(done.rare.T)]
     assert np.abs(off).max() <= RESIDUAL_STEP / 2 + 1e-3
-
-
-def test_progress_ends_at_one() -> None:
-    """Every block is told, the last one as all of it."""
-    lines, told = made_lines(), []
-    found = statistics_of_lines(lines)
-    components = find_components(found)
-    condenser = Condenser(components, ResidualLaw.learned(found.spectra, components), CAMERA, 1.0)
-    condenser.sweep(lines, lambda first, scores, quality: scores, told.append)
-    assert told == [64 / 150, 128 / 150, 1.0]

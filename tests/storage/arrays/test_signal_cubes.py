@@ -16,7 +16,7 @@ from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.mirror import mirror_throughput
 from pipeline.signal.calibrate import calibrate
 from pipeline.signal.components import Components
-from pipeline.signal.condense import RESIDUAL_STEP, CondensedSweep, Condenser, ResidualLaw, differing_lines
+from pipeline.signal.condense import RESIDUAL_STEP, CondensedSweep, Condenser, ResidualLaw
 from pipeline.signal.subspace import SignalStatistics, find_components
 from storage.arrays.cubes import SweepHeader
 from storage.arrays.layout import read_array
@@ -133,16 +133,6 @@ def test_windows_are_parts_of_the_whole(tmp_path: Path) -> None:
     assert whole.dtype == np.int16
     np.testing.assert_array_equal(cube.read_window(slice(60, 70), slice(5, 66)), whole[60:70, 5:66])
     np.testing.assert_array_equal(cube.read(127), whole[127:])
-
-
-def test_no_line_of_the_store_differs(tmp_path: Path) -> None:
-    """Raw lines and what is read from the disk agree, and one score altered there is found."""
-    lines = lines_of()
-    cube, _ = store(tmp_path / "fine-0.zarr", lines)
-    assert differing_lines(lines, cube, CAMERA) == []
-    scores = zarr.open_group(tmp_path / "fine-0.zarr", mode="r+")["scores"]
-    scores[2, 99, 41] += 1
-    assert differing_lines(lines, open_signal_cube(tmp_path / "fine-0.zarr"), CAMERA) == [99]
 
 
 READS: dict[str, Callable[[SignalCube], object]] = {
