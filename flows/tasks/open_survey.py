@@ -142,7 +142,6 @@ class OpenSurvey:
         def watch(stage: str, state: str, done: float) -> None:
             if shown or state == "failed":
                 self.observer.watch(stage, state, done)
-            self.observer.progress(TITLES[stage], (list(STAGES).index(stage) + done) / len(STAGES))
 
         meter, reached = _Meter(), 0.0
 

@@ -1,10 +1,9 @@
-"""Run functions as Prefect tasks inside a flow, and report the progress of a survey to the terminal and to Prefect.
+"""Run functions as Prefect tasks inside a flow, and report what a survey does to the terminal and to Prefect.
 
 No ``from __future__ import annotations`` here: Prefect reads signatures.
 """
 
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
@@ -16,19 +15,16 @@ from pipeline.lazy import deferred
 
 if TYPE_CHECKING:
     import prefect
-    import prefect.artifacts as prefect_artifacts
     import prefect.cache_policies as prefect_cache_policies
     import prefect.context as prefect_context
     import prefect.runtime.task_run as prefect_task_run
 else:
     prefect = deferred("prefect")
-    prefect_artifacts = deferred("prefect.artifacts")
     prefect_cache_policies = deferred("prefect.cache_policies")
     prefect_context = deferred("prefect.context")
     prefect_task_run = deferred("prefect.runtime.task_run")
 
 RETRY_DELAY_S = 2.0
-PROGRESS_EVERY_S = 2.0
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
@@ -72,7 +68,6 @@ class Observer:
     note: Callable[[str], None] = lambda text: None  # assumptions and warnings
     say: Callable[[str], None] = lambda text: None  # state of a device before its first line
     log: Callable[[str], None] = lambda text: None  # one line for each finished stage
-    progress: Callable[[str, float], None] = lambda title, fraction: None  # progress of the survey, 0..1
 
 
 _terminal: ContextVar[Observer | None] = ContextVar("observer", default=None)
@@ -98,30 +93,10 @@ def current_observer() -> Observer:
         terminal.note(text)
         log_to_run(text)
 
-    return replace(terminal, note=note, log=log_to_run, progress=_ProgressPage().show)
+    return replace(terminal, note=note, log=log_to_run)
 
 
 def log_to_run(text: str) -> None:
     """Write a line into the log of the Prefect run; errors of the server are ignored."""
     with suppress(Exception):
         prefect.get_run_logger().info(text)
-
-
-class _ProgressPage:
-    """Progress artifact of a Prefect run, updated every two seconds at most."""
-
-    def __init__(self) -> None:
-        self._artifact: Any = None
-        self._last = -PROGRESS_EVERY_S
-
-    def show(self, title: str, fraction: float) -> None:
-        """Create or update the artifact; errors of the server are ignored."""
-        now = time.monotonic()
-        if now - self._last < PROGRESS_EVERY_S and fraction < 1:
-            return
-        self._last, percent = now, round(100 * fraction, 1)
-        with suppress(Exception):
-            if self._artifact is None:
-                self._artifact = prefect_artifacts.create_progress_artifact(percent, description=title)
-            else:
-                prefect_artifacts.update_progress_artifact(self._artifact, progress=percent, description=title)
