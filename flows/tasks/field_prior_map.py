@@ -31,7 +31,7 @@ class FieldPriorMap:
     """Paths of the prior map of a field, its age and shift."""
 
     probabilities: Path
-    mosaic: Path | None  # of the last visit; None where its pixels have another size
+    mosaic: Path  # of the last visit
     days: float
     classes: tuple[int, ...]  # see `flows.tasks.prior_maps.Prior`
     shift_px: tuple[int, int] = (0, 0)  # down and right, to the current visit
@@ -47,11 +47,9 @@ class FieldPriorMap:
         values, age, light = (_framed(part, gaps) for part in store.read(rows[0], columns[0]))
         if self.classes != tuple(range(values.shape[-1])):
             values = in_classes(values, self.classes)
-        lies = None
-        if self.mosaic is not None:
-            coarse = pooled(coarse_region(weights, self.mosaic, region, LineSpec()).seen_columns)
-            lies = shifted(coarse, _cells(self.shift_px, CELL_PX))
-        return PriorMap(ClassProbabilities(values, age, np.nan_to_num(light)), lies, self.days)
+        coarse = pooled(coarse_region(weights, self.mosaic, region, LineSpec()).seen_columns)
+        before = shifted(coarse, _cells(self.shift_px))
+        return PriorMap(ClassProbabilities(values, age, np.nan_to_num(light)), before, self.days)
 
 
 def laid_together(images: Iterable[NDArray[np.float32]]) -> NDArray[np.float32]:
@@ -76,21 +74,14 @@ def shifted(image: NDArray[np.float32], by: tuple[int, int]) -> NDArray[np.float
 
 
 def prior_map_lies(before: Sequence[EarlierRun], now: Path) -> FieldShift:
-    """Return the shift of earlier coarse passes, the newest first, against the present one [fine px].
-
-    They are compared in pixels that are multiples of all of theirs.
-    """
-    cell = math.lcm(CELL_PX, open_mosaic(now).factor, *(scan_pass.factor for scan_pass in before))
+    """Return the shift of earlier visits, the newest first, against the present one [px]; compared in cells."""
 
     def picture(mosaic: Path) -> NDArray[np.float32]:
-        return open_mosaic(mosaic).brightness(cell)
+        return open_mosaic(mosaic).brightness(CELL_PX)
 
-    pictures = (
-        shifted(picture(scan_pass.mosaic.path / "mosaic.zarr"), _cells(scan_pass.shift_px, cell))
-        for scan_pass in before
-    )
-    found = field_shift(picture(now), laid_together(pictures), reach_px=REACH_PX / cell)
-    return replace(found, shift=(cell * found.shift[0], cell * found.shift[1]))
+    pictures = (shifted(picture(one.mosaic.path / "mosaic.zarr"), _cells(one.shift_px)) for one in before)
+    found = field_shift(picture(now), laid_together(pictures), reach_px=REACH_PX / CELL_PX)
+    return replace(found, shift=(CELL_PX * found.shift[0], CELL_PX * found.shift[1]))
 
 
 def whole_pixels(lies: FieldShift) -> tuple[int, int]:
@@ -99,9 +90,9 @@ def whole_pixels(lies: FieldShift) -> tuple[int, int]:
     return (0, 0) if math.hypot(down, across) < LEAST_SHIFT_PX else (round(down), round(across))
 
 
-def _cells(shift_px: ArrayLike, factor: int) -> tuple[int, int]:
-    """Return the nearest shift of a coarse image to one in fine px."""
-    down, across = np.rint(np.divide(shift_px, factor)).astype(int).tolist()
+def _cells(shift_px: ArrayLike) -> tuple[int, int]:
+    """Return the nearest shift in cells to one in px."""
+    down, across = np.rint(np.divide(shift_px, CELL_PX)).astype(int).tolist()
     return down, across
 
 

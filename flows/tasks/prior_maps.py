@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,6 @@ from storage.archive.keys import StageRef, published_runs
 from storage.archive.manifests import read_table
 from storage.archive.records import Run, read_run
 from storage.arrays.class_maps import ProbabilityStore
-from storage.arrays.mosaics import Mosaic, open_mosaic
 
 NONE, LATEST, AUTO = "none", "latest", "auto"
 NEWEST_RUNS = 60  # newest runs of a field that are searched for the previous visit
@@ -37,7 +36,6 @@ class EarlierRun:
     """Coarse view of a field by an earlier run."""
 
     mosaic: StageRef
-    factor: int  # fine px to a pixel of it, along either axis
     shift_px: tuple[int, int] = (0, 0)  # (down, right) to the newest visit
 
 
@@ -47,9 +45,7 @@ class Prior:
 
     run: str
     probabilities: StageRef  # the store with class_probabilities.zarr
-    scan_passes: tuple[
-        EarlierRun, ...
-    ]  # that run's, then the earlier visits of what it did not capture, the newest first
+    scan_passes: tuple[EarlierRun, ...]  # that run, then visits of what it did not capture, the newest first
     days: float  # between that visit and this one
     classes: tuple[int, ...]  # of each class of the weights the number in the class probabilities; -1 for a new class
 
@@ -119,42 +115,23 @@ def _usable(
         if probabilities is None or mosaic is None:
             return "its stores were cleared; reprocess computes them again"
         store = ProbabilityStore(probabilities.path / "class_probabilities.zarr")
-        names, seen = store.legend.names, open_mosaic(mosaic.path / "mosaic.zarr")
+        names = store.legend.names
     except IncompleteStoreError as error:
         return f"{error}"
     if store.shape != (grid.height, grid.width):
         return f"it has {store.shape[1]} x {store.shape[0]} px, this field has {grid.width} x {grid.height}"
-    factor = _factor(seen, grid)
-    if factor is None:
-        return (
-            f"its mosaic has {seen.shape[1]} x {seen.shape[0]} px, which does not divide {grid.width} x {grid.height}"
-        )
-    camera = run.settings.get("camera")
-    same = not isinstance(camera, Mapping) or all(
-        camera.get(part) == getattr(settings.camera, part) for part in ("pitch_um", "focal_length_mm")
-    )
-    if not same:
+    camera, optics = run.settings["camera"], ("pitch_um", "focal_length_mm")
+    if any(camera[part] != getattr(settings.camera, part) for part in optics):
         return "its camera has another pitch or focal length"
     classes = tuple(names.index(one) if one in names else -1 for one in class_names)
     if all(number < 0 for number in classes):
         return f"it has none of the classes of these weights, but {', '.join(names)}"
     days = max(_days_since(run, settings.visit, settings.moment), 0.0)
-    earlier = (EarlierRun(mosaic, factor), *_earlier_runs(archive, run, grid))
+    earlier = (EarlierRun(mosaic), *_earlier_runs(archive, run))
     return Prior(run.folder.name, probabilities, earlier, days, classes)
 
 
-def _factor(seen: Mosaic, grid: SceneGrid) -> int | None:
-    """Return the fine px along a side of an earlier mosaic's pixel; None if they do not divide the field."""
-    fits = grid.patch % seen.factor == 0
-    rows, columns = (-(-size // seen.factor) for size in (grid.height, grid.width))
-    return (
-        seen.factor
-        if fits and seen.shape in ((rows, columns), replace(grid, factor=seen.factor).coarse_shape)
-        else None
-    )
-
-
-def _earlier_runs(archive: Archive, run: Run, grid: SceneGrid) -> Iterator[EarlierRun]:
+def _earlier_runs(archive: Archive, run: Run) -> Iterator[EarlierRun]:
     """Yield the earlier visits of a run that captured a part of the field, with their shifts."""
     down, across = 0, 0
     for _ in range(MOST_EARLIER - 1):
@@ -172,12 +149,11 @@ def _earlier_runs(archive: Archive, run: Run, grid: SceneGrid) -> Iterator[Earli
             return
         try:
             mosaic = archive.find(parts[1], parts[2])
-            factor = None if mosaic is None else _factor(open_mosaic(mosaic.path / "mosaic.zarr"), grid)
         except IncompleteStoreError:
             return
-        if mosaic is None or factor is None:
+        if mosaic is None:
             return
-        yield EarlierRun(mosaic, factor, (down, across))
+        yield EarlierRun(mosaic, (down, across))
 
 
 def _days_since(run: Run, visit: str | None, moment: tuple[int, float] | None) -> float:

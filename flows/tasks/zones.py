@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -103,8 +103,8 @@ def open_zones(files: ZoneChoice, place: FieldPlace, grid: SceneGrid) -> SurveyZ
     inside = None if area is None else pixels_inside(area, shape)
     if inside is not None and not inside.any():
         raise ZoneError(
-            f"the area of {files.area} contains no pixel centre: it is smaller than a pixel of this field"
-            f"{_format_pixels(place)}; give a larger one, or leave it out"
+            f"the area of {files.area} contains no pixel centre: it is smaller than a pixel of this field; give a "
+            "larger one, or leave it out"
         )
     kept = field_zones(inside, None if no_go is None else pixels_inside(no_go, shape, touched=True))
     if kept is not None and not kept.kept.any():
@@ -133,33 +133,14 @@ def _read(source: str, place: FieldPlace, notes: list[str], named_by: str | None
 
 def _format_beside(found: ZoneFile, place: FieldPlace) -> str:
     """Return a message on polygons that do not overlap the field, with the bounds of both."""
-    if found.crs is None or place.crs is None:
-        unit, here, there = "px", _bounds([one.bounds for one in found.shapes.values()]), place.outline.bounds
-        spans = [
-            f"x {west:g} to {east:g}, y {south:g} to {north:g} {unit}" for west, south, east, north in (there, here)
-        ]
-        hint = "are they degrees? then the survey needs a [pose] or a georeferenced scene"
-    else:
-        own = _bounds([extent_deg(one, found.crs) for one in found.shapes.values()])
-        corners = extent_deg(place.outline, place.crs), own
-        spans = [
-            f"longitude {west:.6g} to {east:.6g}, latitude {south:.6g} to {north:.6g}"
-            for west, south, east, north in corners
-        ]
-        hint = f"is {found.crs.name} their CRS, and the place of the field right?"
-    return f"the polygons of {found.path} do not lie on the field: expected some in {spans[0]}, got {spans[1]}; {hint}"
-
-
-def _bounds(of_each: Sequence[tuple[float, float, float, float]]) -> tuple[float, float, float, float]:
-    """Return west, south, east and north of all polygons together."""
-    each = np.array(of_each)
-    west, south = each[:, :2].min(axis=0).tolist()
-    east, north = each[:, 2:].max(axis=0).tolist()
-    return west, south, east, north
-
-
-def _format_pixels(place: FieldPlace) -> str:
-    """Return the pixel size as text; empty where it is unknown."""
-    rows, columns = place.shape
-    middle = place.pixel_areas_m2(slice(rows // 2, rows // 2 + 1), slice(columns // 2, columns // 2 + 1))
-    return "" if middle is None else f" ({float(np.sqrt(middle[0, 0])):.3g} m)"
+    each = [one.bounds if found.crs is None else extent_deg(one, found.crs) for one in found.shapes.values()]
+    low, high = np.min(each, axis=0).tolist(), np.max(each, axis=0).tolist()
+    field = place.outline.bounds if place.crs is None else extent_deg(place.outline, place.crs)
+    expected, got = (
+        f"x {west:.6g} to {east:.6g}, y {south:.6g} to {north:.6g}"
+        for west, south, east, north in (field, (*low[:2], *high[2:]))
+    )
+    return (
+        f"the polygons of {found.path} do not lie on the field: expected some in {expected}, got {got} "
+        f"[{'px' if place.crs is None else 'deg'}]; check their CRS and the place of the field"
+    )

@@ -1,12 +1,11 @@
 """A recording as a source of lines: recorded sweeps serve every later request for lines of that field.
 
 A request for a recorded sweep returns that sweep. A request for any other sweep returns the nearest recorded line for
-each planned line; finer samples are summed. A line keeps its recorded position, time and exposure. The rectification
-uses these, so an offset of half a pixel from the plan costs nothing.
+each planned line, of the same binning. A line keeps its recorded position, time and exposure. The rectification uses
+these, so an offset of half a pixel from the plan costs nothing.
 
-A coarse line of the simulator or the rig holds ``step`` mirror positions during one exposure. A recorded full scan has
-``step`` single lines there, and summing them would read the whole scan. One of them replaces the coarse line, so detail
-between the lines is not averaged.
+A line of every n-th position holds n mirror positions during one exposure. A recorded full scan has n single lines
+there, and one of them replaces it. So detail between the lines is not averaged.
 """
 
 from __future__ import annotations
@@ -21,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import NotRecordedError, SceneError, ShapeError
-from pipeline.geometry.camera import LineCamera, bin_samples
+from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_scene, position_to_direction
 from pipeline.geometry.scan import Sweep
-from pipeline.source import Line, References, SweepLines
+from pipeline.source import Line, References
 
 Floats = NDArray[np.float64]
 Numbers = NDArray[np.intp]
@@ -59,17 +58,6 @@ class RecordedSweep:
         for name in ("position", "time_s", "exposure_ms", "valid_line"):
             if len(getattr(self, name)) != lines:
                 raise ShapeError(f"sweep {self.sweep.name}: {name} is of {len(getattr(self, name))} lines, not {lines}")
-
-    @classmethod
-    def of(cls, lines: SweepLines, exposure_ms: Floats) -> RecordedSweep:
-        """Return a recording of any sweep, with exposures (line,) [ms]; consecutive lines are read together."""
-
-        def read_lines(numbers: Numbers) -> NDArray[np.uint16]:
-            return np.concatenate([lines.read(first, stop) for first, stop in line_runs(numbers)])
-
-        return cls(
-            lines.sweep, lines.references, lines.position, lines.time_s, exposure_ms, lines.valid_line, read_lines
-        )
 
     def read(self, start: int, stop: int) -> NDArray[np.uint16]:
         """Return raw numbers of the lines ``start`` to ``stop``, (line, sample, band)."""
@@ -169,16 +157,16 @@ class RecordedSource:
         """Yield the lines that serve a sweep, from line ``first`` on, in the order of `PickedLines`.
 
         A recorded line that serves two planned lines is valid once. Raises NotRecordedError: a planned line was never
-        captured. Raises ShapeError: sums of samples exceed uint16.
+        captured.
         """
         picked = self.pick(sweep)
         for start in range(first, sweep.lines, BLOCK_LINES):
             yield from self._lines_of(sweep, picked, np.arange(start, min(start + BLOCK_LINES, sweep.lines)))
 
     def references(self, sweep: Sweep) -> References:
-        """Return dark and white frames of the lines that serve a sweep, summed to its binning; raises as `lines`."""
+        """Return dark and white frames of the lines that serve a sweep; raises as `lines`."""
         served = self.sweeps[int(self.pick(sweep).place[0])] if sweep.lines else self.sweeps[0]
-        return sum_references(served.references, sweep.binning // served.sweep.binning)
+        return served.references
 
     def cut_to_recorded(self, sweep: Sweep) -> Sweep | None:
         """Return a sweep without the lines at either end that were never captured; None where none was.
@@ -204,8 +192,7 @@ class RecordedSource:
     def pick(self, sweep: Sweep) -> PickedLines:
         """Choose the recorded lines that serve a sweep; nothing is read.
 
-        All of them have the same references. Among sweeps with equal references the nearest lines are chosen, then
-        those with the planned binning.
+        All of them have the same references. Among sweeps with equal references the nearest lines are chosen.
 
         Raises NotRecordedError: a planned line was never captured.
         """
@@ -213,18 +200,11 @@ class RecordedSource:
         if own is not None:
             count = np.arange(sweep.lines)
             return PickedLines(np.full(sweep.lines, own), count, np.zeros(sweep.lines, np.bool_))
-        found = [(group, *self._nearest(sweep, group)) for group in self._groups]
-        whole = [one for one in found if (one[1] >= 0).all()]
+        found = [self._nearest(sweep, group) for group in self._groups]
+        whole = [one for one in found if (one[0] >= 0).all()]
         if not whole:
-            self._refuse(
-                sweep, max((place for _, place, _, _ in found), key=lambda place: np.count_nonzero(place >= 0))
-            )
-
-        def rank(one: tuple[list[int], Numbers, Numbers, Floats]) -> tuple[int, bool]:
-            distance = float(one[3].mean()) if len(one[3]) else 0.0
-            return round(distance / SAME_PX), self.sweeps[one[0][0]].sweep.binning != sweep.binning
-
-        _, place, line, _ = min(whole, key=rank)
+            self._refuse(sweep, max((place for place, _, _ in found), key=lambda place: np.count_nonzero(place >= 0)))
+        place, line, _ = min(whole, key=lambda one: round(float(one[2].mean()) / SAME_PX) if sweep.lines else 0)
         order = np.lexsort((line, place))
         place, line = place[order], line[order]
         again = np.zeros(len(line), np.bool_)
@@ -282,11 +262,11 @@ class RecordedSource:
         return place, line, best
 
     def _can_serve(self, sweep: Sweep, one: RecordedSweep) -> bool:
-        """Return whether a recorded sweep lies on a planned one's swath, with fine enough samples and lines."""
+        """Return whether a recorded sweep lies on a planned one's swath, with its binning and fine enough lines."""
         recorded = one.sweep
         return (
             recorded.along == sweep.along
-            and sweep.binning % recorded.binning == 0
+            and sweep.binning == recorded.binning
             and abs(recorded.swath_px - sweep.swath_px) <= SWATH_PX
             and one.line_distance / self.camera.ifov_rad <= FINE_ENOUGH * sweep.step
         )
@@ -301,17 +281,12 @@ class RecordedSource:
                 f"sweeps along {axes}"
             )
         missing = int(np.argmax(place < 0))
-        planned = np.array([sweep.swath_px, sweep.line_px()[missing]])
-        apart = [np.hypot(*(one.tangents / self.camera.ifov_rad - planned).T) for one in alike]
-        which = int(np.argmin([np.nanmin(distance) for distance in apart]))
-        number = int(np.nanargmin(apart[which]))
-        recorded = alike[which].sweep
-        swath_px, scan_px = alike[which].tangents[number] / self.camera.ifov_rad
+        near = min((one.sweep for one in alike), key=lambda one: abs(one.swath_px - sweep.swath_px))
         raise NotRecordedError(
-            f"line {missing} of sweep {sweep.name} was never captured: it lies at {planned[1]:g} px of the scan on the "
-            f"swath at {planned[0]:g} px (binning {sweep.binning}, step {sweep.step}), the nearest recorded line, "
-            f"{number} of {recorded.name}, at {scan_px:.6g} px on {swath_px:.6g} px (binning {recorded.binning}, step "
-            f"{recorded.step}). Ask for lines on the recording's own swaths, no finer than they were recorded"
+            f"line {missing} of sweep {sweep.name} was never captured: it lies at {sweep.line_px()[missing]:g} px of "
+            f"the scan on the swath at {sweep.swath_px:g} px (binning {sweep.binning}, step {sweep.step}), and sweep "
+            f"{near.name} from {near.line_px()[0]:g} to {near.line_px()[-1]:g} px on {near.swath_px:.6g} px (binning "
+            f"{near.binning}, step {near.step}). Ask for lines on the recording's swaths, no finer than recorded"
         )
 
     def _lines_of(self, sweep: Sweep, picked: PickedLines, numbers: Numbers) -> Iterator[Line]:
@@ -320,8 +295,7 @@ class RecordedSource:
         for place in np.unique(picked.place[numbers]):
             here = numbers[picked.place[numbers] == place]
             wanted, back = np.unique(picked.line[here], return_inverse=True)
-            one = self.sweeps[place]
-            block = bin_samples(one.read_lines(wanted), sweep.binning // one.sweep.binning)
+            block = self.sweeps[place].read_lines(wanted)
             data |= {int(number): block[at] for number, at in zip(here, back, strict=True)}
         for number in numbers.tolist():
             place, line = int(picked.place[number]), int(picked.line[number])
@@ -366,24 +340,3 @@ def nearest_line(scan_px: Floats, wanted_px: Floats) -> tuple[Numbers, Floats]:
     below, above = np.abs(wanted_px - places[before]), np.abs(places[after] - wanted_px)
     chosen = np.where(above < below - SAME_PX, after, before)
     return order[chosen], np.abs(places[chosen] - wanted_px)
-
-
-def sum_references(references: References, samples: int) -> References:
-    """Return references whose frames are summed over ``samples`` neighbours.
-
-    A sum is bad where one of its elements is. The relative response is the mean. A remainder is dropped.
-    """
-    if samples == 1:
-        return references
-
-    def grouped(frame: NDArray[Any]) -> NDArray[Any]:
-        count = len(frame) // samples
-        return frame[: count * samples].reshape(count, samples, -1)
-
-    return replace(
-        references,
-        dark=grouped(references.dark).sum(axis=1, dtype=np.float32),
-        white=grouped(references.white).sum(axis=1, dtype=np.float32),
-        bad=None if references.bad is None else np.asarray(grouped(references.bad).any(axis=1), np.bool_),
-        flat=None if references.flat is None else grouped(references.flat).mean(axis=1, dtype=np.float32),
-    )

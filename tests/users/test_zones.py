@@ -244,7 +244,7 @@ def test_polygons_in_any_crs_are_the_same_zones(opened: Opened, tmp_path: Path) 
         (shapely.box(300, 0, 400, 50), None, False, "expected some in x 0 to 128.*got x 300 to 400"),
         (shapely.box(10.1, 10.1, 10.3, 10.3), None, False, "smaller than a pixel"),
         (shapely.box(7.5, 51.9, 7.7, 52), 4326, False, r"WGS 84.*give the rig's \[pose\]"),
-        (shapely.box(8.5, 51.9, 8.7, 52), 4326, True, "longitude 7.6.*got longitude 8.5 to 8.7"),
+        (shapely.box(8.5, 51.9, 8.7, 52), 4326, True, "x 7.6.*got x 8.5 to 8.7"),
     ],
     ids=["beside", "tiny", "no place", "another farm"],
 )

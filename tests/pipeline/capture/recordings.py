@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.capture.recorded import RecordedSource, RecordedSweep
+from pipeline.capture.recorded import RecordedSource, RecordedSweep, line_runs
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.rig_model import Rig
@@ -36,7 +36,12 @@ def record(source: SimulatedSource, sweep: Sweep, counted: Counted | None = None
     """Record one sweep of the simulated rig; the numbers of the lines that are read later go to ``counted``."""
     lines = SimulatedSweep(source, sweep)
     exposure_ms = source.camera.exposure_ms if sweep.exposure_ms is None else sweep.exposure_ms
-    recorded = RecordedSweep.of(lines, np.full(sweep.lines, exposure_ms))
+
+    def read(numbers: NDArray[np.intp]) -> NDArray[np.uint16]:
+        return np.concatenate([lines.read(first, stop) for first, stop in line_runs(numbers)])
+
+    facts = lines.references, lines.position, lines.time_s, np.full(sweep.lines, exposure_ms), lines.valid_line
+    recorded = RecordedSweep(sweep, *facts, read)
     if counted is None:
         return recorded
 

@@ -9,9 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.capture.recorded import RecordedSweep, nearest_line, sum_references
+from pipeline.capture.recorded import RecordedSweep, nearest_line
 from pipeline.errors import NotRecordedError
-from pipeline.geometry.camera import bin_samples
 from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.source import Line, References
 from tests.pipeline.capture.recordings import CAMERA, FULL, Counted, record, recorded_source, simulated
@@ -45,14 +44,14 @@ def test_a_recorded_copy_of_a_sweep_gives_its_lines(sweep: Sweep) -> None:
 
 
 def test_a_coarse_pass_over_a_full_scan_reads_one_line_in_four() -> None:
-    """Each coarse line is the recorded line just before its middle, its samples summed; the others are not read."""
+    """Each coarse line is the recorded line just before its middle; the others are not read."""
     source, counted = simulated(), Counted()
     recorded = recorded_source(source, [record(source, FULL, counted)])
-    coarse = Sweep("coarse-0", "coarse", "x", 0.0, -39.5, 20, step=4, binning=4)
+    coarse = Sweep("coarse-0", "coarse", "x", 0.0, -39.5, 20, step=4)
     found, full = list(recorded.lines(coarse)), list(source.lines(FULL))
     for number, line in enumerate(found):
         of = full[4 * number + 1]  # the middle, 1.5 px after the first held position, lies between lines 1 and 2
-        np.testing.assert_array_equal(line.data, bin_samples(of.data, 4))
+        np.testing.assert_array_equal(line.data, of.data)
         assert (line.number, line.mirror_x, line.mirror_y, line.time_s) == (number, of.mirror_x, of.mirror_y, of.time_s)
     assert counted.numbers == list(range(1, 80, 4))
     assert_same_references(recorded.references(coarse), source.references(coarse))
@@ -71,11 +70,11 @@ def test_fine_lines_of_a_full_scan_are_found_by_their_place() -> None:
 
 
 def test_a_recorded_coarse_sweep_wins_over_the_full_scan() -> None:
-    """Of two sweeps that can serve a request, the one with its very lines and binning does."""
+    """Of two sweeps that can serve a request, the one with its very lines does."""
     source = simulated()
-    coarse = Sweep("recorded coarse", "coarse", "x", 0.0, -39.5, 20, step=4, binning=4)
+    coarse = Sweep("recorded coarse", "coarse", "x", 0.0, -39.5, 20, step=4)
     recorded = recorded_source(source, [record(source, FULL), record(source, coarse)])
-    part = Sweep("planned", "coarse", "x", 0.0, -31.5, 10, step=4, binning=4)
+    part = Sweep("planned", "coarse", "x", 0.0, -31.5, 10, step=4)
     expected = [replace(line, number=line.number - 2) for line in source.lines(coarse)][2:12]
     assert_same_lines(list(recorded.lines(part)), expected)
 
@@ -115,7 +114,7 @@ def test_a_lost_line_serves_only_where_no_other_does() -> None:
     whole = record(source, FULL)
     lost = replace(whole, valid_line=np.arange(80) != 5)
     recorded = recorded_source(source, [lost])
-    coarse = recorded.pick(Sweep("coarse-0", "coarse", "x", 0.0, -39.5, 20, step=4, binning=4))
+    coarse = recorded.pick(Sweep("coarse-0", "coarse", "x", 0.0, -39.5, 20, step=4))
     assert coarse.line[:3].tolist() == [1, 6, 9]
     fine = list(recorded.lines(Sweep("fine-0", "fine", "x", 0.0, -35.5, 3)))
     assert [line.valid for line in fine] == [True, False, True]
@@ -153,7 +152,7 @@ def _lines_apart(distance_px: float) -> RecordedSweep:
         (
             Sweep("fine-0", "fine", "x", 0.0, 35.5, 8),
             r"line 5 of sweep fine-0 was never captured: it lies at 40.5 px of the scan on the swath at 0 px "
-            r"\(binning 1, step 1\), the nearest recorded line, 79 of scan-0, at 39.5 px on 0 px",
+            r"\(binning 1, step 1\), and sweep scan-0 from -39.5 to 39.5 px on 0 px",
         ),
         (Sweep("fine-0", "fine", "x", 20.0, -9.5, 4), r"line 0 of sweep fine-0 was never captured: .* swath at 20 px"),
         (
@@ -176,7 +175,7 @@ def test_a_plan_is_cut_to_what_was_recorded() -> None:
     source = simulated()
     lower, upper = replace(FULL, lines=30), replace(FULL, name="scan-1", start_px=10.5, lines=30)
     recorded = recorded_source(source, [record(source, lower), record(source, upper)])
-    beyond = Sweep("coarse-0", "coarse", "x", 0.0, -49.5, 30, step=4, binning=4)
+    beyond = Sweep("coarse-0", "coarse", "x", 0.0, -49.5, 30, step=4)
     assert recorded.cut_to_recorded(beyond) == replace(beyond, start_px=-41.5, lines=21)
     inside = replace(lower, name="fine", lines=10)
     assert recorded.cut_to_recorded(inside) == inside
@@ -190,7 +189,7 @@ def test_a_coarse_line_beside_a_gap_takes_what_lies_within_its_own_lines() -> No
     source = simulated()
     whole = record(source, FULL)
     lost = replace(whole, valid_line=~np.isin(np.arange(80), [1, 2, 3]))
-    picked = recorded_source(source, [lost]).pick(Sweep("c", "coarse", "x", 0.0, -39.5, 20, step=4, binning=4))
+    picked = recorded_source(source, [lost]).pick(Sweep("c", "coarse", "x", 0.0, -39.5, 20, step=4))
     assert picked.line[:2].tolist() == [0, 5]
 
 
@@ -210,7 +209,7 @@ def test_finer_lines_than_were_recorded_are_refused() -> None:
     coarse = Sweep("coarse-0", "coarse", "x", 0.0, -39.5, 20, step=4, binning=4)
     stepped = Sweep("stepped", "coarse", "x", 0.0, -39.5, 20, step=4)
     for one in (coarse, stepped):
-        with pytest.raises(NotRecordedError, match="no finer than they were recorded"):
+        with pytest.raises(NotRecordedError, match="no finer than recorded"):
             recorded_source(source, [record(source, one)]).pick(Sweep("fine-0", "fine", "x", 0.0, -9.5, 4))
 
 
@@ -221,13 +220,3 @@ def test_nearest_line_is_nearest(tenths: list[int], wanted: float) -> None:
     near, distance = nearest_line(scan, np.array([wanted]))
     assert distance[0] == abs(scan[near[0]] - wanted)
     assert distance[0] <= np.abs(scan - wanted).min() + 1e-6
-
-
-def test_sums_of_references() -> None:
-    """Dark and white are summed, bad elements spread to their sum, the relative response is averaged."""
-    frame = np.arange(10, dtype=np.float32).reshape(5, 2)
-    summed = sum_references(References(frame, frame * 2, np.ones(2, np.float32), frame == 3, frame), 2)
-    np.testing.assert_array_equal(summed.dark, [[2, 4], [10, 12]])
-    np.testing.assert_array_equal(summed.white, [[4, 8], [20, 24]])
-    np.testing.assert_array_equal(summed.bad, [[False, True], [False, False]])
-    np.testing.assert_array_equal(summed.flat, [[1, 2], [5, 6]])

@@ -18,7 +18,7 @@ from tests.pipeline.capture.recordings import CAMERA, FULL, record, recorded_sou
 from tests.pipeline.simulator.small_scenes import image_scene
 
 GRID = SceneGrid(80, 64, 16, 4)
-COARSE = Sweep("coarse-0", "coarse", "x", 0.0, -39.5, 20, step=4, binning=4)
+COARSE = Sweep("coarse-0", "coarse", "x", 0.0, -39.5, 20, step=4)
 
 
 def _ramp() -> SimulatedSource:

@@ -12,7 +12,7 @@ from pipeline.errors import NotRecordedError, SceneError
 from pipeline.geometry.scan import Sweep
 from tests.pipeline.capture.recordings import CAMERA, FULL, record, recorded_source, simulated
 
-COARSE = Sweep("coarse-0", "coarse", "x", 0.0, -45.5, 23, step=4, binning=4)
+COARSE = Sweep("coarse-0", "coarse", "x", 0.0, -45.5, 23, step=4)
 ASIDE = replace(FULL, name="mine", swath_px=7.0)
 
 
@@ -25,7 +25,7 @@ def passes_over(*sweeps: Sweep) -> RecordedPasses:
 def test_a_planned_pass_is_cut_where_the_recording_ends() -> None:
     """A coarse pass from -44 to 44 px keeps the lines within 2 px of those recorded from -39.5 to 39.5 px."""
     (found,) = passes_over(FULL).first_pass([COARSE])
-    assert (found.swath_px, found.step, found.binning) == (0.0, 4, 4)
+    assert (found.swath_px, found.step, found.binning) == (0.0, 4, 1)
     assert found.line_px()[0] == pytest.approx(-40)
     assert found.line_px()[-1] == pytest.approx(40)
     assert passes_over(FULL).source.serves(found)
@@ -36,7 +36,7 @@ def test_a_pass_is_laid_on_the_recorded_swaths() -> None:
     passes = passes_over(ASIDE)
     assert passes.served([COARSE]) is None
     (found,) = passes.first_pass([COARSE])
-    assert (found.name, found.swath_px, found.step, found.binning) == ("coarse-0", 7.0, 4, 4)
+    assert (found.name, found.swath_px, found.step, found.binning) == ("coarse-0", 7.0, 4, 1)
     np.testing.assert_allclose(found.line_px(), -39.5 + 4 * np.arange(20))
     assert passes.full_scan([FULL]) == [ASIDE]
 
@@ -52,7 +52,7 @@ def test_lines_that_serve_twice_count_once() -> None:
 def test_a_line_that_is_missing_is_named() -> None:
     """A strip that lies elsewhere and lines that are finer than the recorded ones are refused with their place."""
     sparse = Sweep("scan-0", "coarse", "x", 0.0, -39.5, 20, step=4)
-    with pytest.raises(NotRecordedError, match=r"line \d+ of sweep scan-0 was never captured.*no finer than they were"):
+    with pytest.raises(NotRecordedError, match=r"line \d+ of sweep scan-0 was never captured.*no finer than recorded"):
         passes_over(sparse).first_pass([FULL])
     gap = replace(FULL, lines=20), replace(FULL, name="rest", start_px=10.5, lines=30)
     with pytest.raises(NotRecordedError, match=r"line \d+ of sweep fine was never captured"):
