@@ -279,8 +279,9 @@ class SurveyRun(CaptureRun):
     def scan_record(self) -> ScanPerformance | None:
         """Return the scan performance table by which a second pass is chosen; None without one."""
         content = self.described.record.get("scans")
-        chosen = content is not None and self.plan.by_record and self.settings.policy == "gain"
-        return ScanPerformance.read(content, self.scene.light_fraction) if chosen else None
+        if content is None or not self.plan.by_record or self.settings.policy != "gain":
+            return None
+        return ScanPerformance.read(content, self.scene.light_fraction)
 
     @property
     def scanned(self) -> FinePlan:
