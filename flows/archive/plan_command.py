@@ -91,7 +91,7 @@ class _WaitsError(IncompleteStoreError):
 class _Awaited(StageRef):
     """Address of a store that is still to be made: reading its path, or an unknown key, raises _WaitsError."""
 
-    made_by: str
+    made_by: str = ""
 
     def __getattribute__(self, name: str) -> Any:
         value = object.__getattribute__(self, name)
@@ -168,7 +168,7 @@ class Planner(OpenSurvey):
         except (PipelineError, OSError) as error:  # the survey would stop here
             why = f"waits for {error}" if isinstance(error, _WaitsError) else str(error)
             row = StageForecast(stage, "blocked", None, why)
-            ref = _Awaited(STAGES[stage].product.name, "", Path(), stage)
+            ref = _Awaited(STAGES[stage].product.name, "", Path(), made_by=stage)
         if row not in self.rows:  # the later of two passes asks for lines of the first again
             self.rows.append(row)
         self.products[stage] = ref
@@ -196,7 +196,7 @@ class Planner(OpenSurvey):
         self._planned[ref.uri] = Store(ref, facts)
         why, changes = self._reason(stage, self._planned[ref.uri])
         row = StageForecast(stage.name, "to run", key, why, changes)
-        return row, _Awaited(ref.stage, key, ref.path, stage.name)
+        return row, _Awaited(ref.stage, key, ref.path, made_by=stage.name)
 
     def _reason(self, stage: Stage, store: Store) -> tuple[str, tuple[Change, ...]]:
         """Return the differences from the newest store of the same stage and scene, in words and in full."""
