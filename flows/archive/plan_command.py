@@ -129,34 +129,7 @@ class Planner(OpenSurvey):
         if found is not None:
             return StageForecast(stage.name, "cached", key), found
         ref = store_at(self.run.archive.root, stage.product.name, key)
-<<<<<<< HEAD
         return StageForecast(stage.name, "to run", key), _Awaited(ref.stage, key, ref.folder, made_by=stage.name)
-=======
-        inputs = [one.key for one in wanted.inputs]
-        facts = {"version": stage.product.version, "params": plain(wanted.params), "inputs": inputs}
-        self._planned[ref.uri] = Store(ref, facts)
-        why, changes = self._reason(stage, self._planned[ref.uri])
-        row = StageForecast(stage.name, "to run", key, why, changes)
-        return row, _Awaited(ref.stage, key, ref.path, made_by=stage.name)
-
-    def _reason(self, stage: Stage, store: Store) -> tuple[str, tuple[Change, ...]]:
-        """Return the differences from the newest store of the same stage and scene, in words and in full."""
-        there = self.catalogue.stores.get(store.ref.uri)
-        if there is not None and there.cleared:
-            return "its files were cleared away by gc", ()
-        stored = [
-            one
-            for one in self.catalogue.stores.values()
-            if one.ref.stage == store.ref.stage and not one.problem and stage.inputs in (None, len(one.inputs))
-        ]
-        known = replace(self.catalogue, stores=self.catalogue.stores | self._planned)
-        same = [one for one in stored if scenes_of(known, one.ref.uri) <= {self.run.scene.key}]
-        before = max(same, key=lambda one: one.created, default=None)
-        if before is None:
-            return ("nothing stored yet of this scene" if stored else "nothing stored yet"), ()
-        found = tuple(change for change in changes_between(known, before, store) if change.kind != "library")
-        return _format_summary(found, store.ref.stage), found
->>>>>>> cut-storage
 
 
 MOST_SCANS = 8  # in the table
