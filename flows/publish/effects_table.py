@@ -25,7 +25,7 @@ def print_effects(effects: Iterable[Row], total: Row, console: Console) -> None:
     console.print(table(columns, (_figures(row, total) for row in there), left=2, whole=columns))
     console.print(escape(_KEY.format(unit=UNIT_NAMES[total["unit"]])), style="dim")
     for row in there:
-        console.print(f"[bold]{escape(row['name'])}[/]: {escape(_format_row(row))}")
+        console.print(f"[bold]{escape(row['name'])}[/]: {escape(format_row(row))}")
     absent = [f"{row['name']} ({row['magnitude']})" for row in rows if row["reason"] == "absent"]
     if absent:
         console.print(f"[bold]Absent[/]: {escape(', '.join(absent))}.")
@@ -47,7 +47,7 @@ def _figures(row: Row, total: Row) -> list[str]:
     ]
 
 
-def _format_row(row: Row) -> str:
+def format_row(row: Row) -> str:
     """Return the magnitude of an effect, and the reason for its state where its figures do not give it."""
     said = {
         "exact": "",
@@ -58,6 +58,7 @@ def _format_row(row: Row) -> str:
         "asked": "asked for: ",
         "unasked": "not asked for: ",
         "always": "always there: ",
+        "absent": "absent: ",
     }[row["reason"]]
     magnitude: str = row["magnitude"]
     return said + magnitude.removeprefix(f"{row['name']}: ")
