@@ -21,6 +21,10 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from jinja2.utils import htmlsafe_json_dumps
 from markupsafe import Markup
 
+<<<<<<< HEAD
+=======
+from flows.publish.effects_table import format_change, format_row, format_total
+>>>>>>> cut-simulator
 from flows.publish.field_map import ERROR_COLOURS, FieldMap
 from flows.publish.panels import data_address
 from flows.publish.receipt import Receipt
@@ -94,6 +98,7 @@ def _environment(*, markdown: bool) -> Environment:
     found.filters |= {
         "bytes": format_bytes,
         "change": format_change,
+        "reason": format_row,
         "percent": format_percent,
         "points": format_points,
         "seconds": format_seconds,

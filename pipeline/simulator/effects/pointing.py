@@ -325,8 +325,6 @@ def transient(rig: Rig, sweep: Sweep, numbers: NDArray[np.int64]) -> Floats:
     impulse, rise = responses(time, mirror.damping)
     place: Floats = start[0] * (1 - rise) + start[1] * impulse
     rate = -start[0] * impulse + start[1] * (1 - rise - 2 * mirror.damping * impulse)
-    if held == 0:
-        return place
     impulse, rise = responses(np.array([held]), mirror.damping)
     mean: Floats = (place * (impulse + 2 * mirror.damping * rise) + rate * rise) / held
     return mean

@@ -368,7 +368,7 @@ def test_the_effects_of_the_simulator_are_folded() -> None:
     """Their table opens on a click; nothing of it where nothing was simulated."""
     page = render_report(make_receipt(), PNG)
     folded = page.partition('<details id="effects"><summary>Simulated effects</summary>')[2]
-    assert "asked for" in folded.partition("</details>")[0]
+    assert "asked for: shot noise" in folded.partition("</details>")[0]
     receipt = make_receipt()
     del receipt["effects"], receipt["effects_total"]
     assert "Simulated effects" not in render_report(receipt, PNG)

@@ -38,18 +38,6 @@ def test_point_is_spread_by_the_closed_form_of_the_box(variant: str) -> None:
     np.testing.assert_allclose(got, wanted, atol=3e-5)
 
 
-def test_slit_of_no_width_sees_what_a_pixel_sees() -> None:
-    """A zero-width slit is a line of light, its probe finite and its variants alike."""
-    narrow = replace(RIG, camera=replace(RIG.camera, slit_um=0.0))
-    scene = image_scene(np.random.default_rng(3).uniform(0, 1, (50, 80, 1)), RIG.camera, [550.0])
-    probe = probe_scene(scene, narrow, [SWEEP])
-    assert np.isfinite(list(probe.slit_errors.values())).all()
-    assert np.isfinite(probe.slope).all()
-    block = SweepBlock(narrow, SWEEP, range(30), scene.wavelength_nm, scene.shape)
-    lights = [expected_light(scene, block, {SLIT: variant}) for variant in SLIT.variants]
-    np.testing.assert_allclose(lights, [lights[0]] * len(lights), atol=1e-3 * np.ptp(lights[0]))
-
-
 def test_no_smear_where_every_line_has_one_position() -> None:
     """Fine lines stand still: the bound is 0 and the position that of mid exposure."""
     sweep = Sweep("s", "fine", "x", swath_px=0.0, start_px=0.0, lines=4)

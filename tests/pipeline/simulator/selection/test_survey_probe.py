@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.errors import SceneError, SettingsError
+from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
@@ -134,15 +134,6 @@ def test_probe_finds_a_single_bright_pixel_in_a_large_scene() -> None:
     assert probe.slope.min() > 10
 
 
-def test_coarse_sweeps_are_looked_at_where_they_hold() -> None:
-    """A coarse sweep's probe is that of a fine one over the same path."""
-    scene = mixed(3)
-    fine = probe_scene(scene, RIG, [SWEEP])
-    coarse = probe_scene(scene, RIG, [replace(SWEEP, kind="coarse", lines=15, step=4)])
-    np.testing.assert_allclose(coarse.slope, fine.slope, rtol=0.2)
-    assert (coarse.lines, coarse.sweeps[0].step) == (15, 4)
-
-
 @pytest.mark.parametrize(("binning", "along"), [(2, "y"), (4, "x"), (7, "y")])
 def test_no_stored_sum_exceeds_its_probe(binning: int, along: str) -> None:
     """Sums' levels, and what a sample on either side changes of them, are within 1.05 of the probe for the binning."""
@@ -186,16 +177,6 @@ def test_a_survey_has_a_probe_for_each_exposure() -> None:
     assert dim["lag"].off.error > 0
     assert "in 5 ms" in dim["dark-current"].off.why
     assert "in 100 ms" in whole["dark-current"].off.why
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_number_that_is_not_finite_is_refused_with_its_place(bad: float) -> None:
-    """A scene with NaN or infinity is refused, and the message says where."""
-    planes = np.ones((70, 40, 3), np.float32)
-    planes[41, 17, 2] = bad
-    scene = made_scene(planes, np.ones((3, 4)), np.arange(4) + 400.0)
-    with pytest.raises(SceneError, match="made is not finite at row 41, column 17, component 2"):
-        probe_scene(scene, RIG, [SWEEP])
 
 
 def test_probe_of_a_noiseless_rig_is_finite() -> None:
