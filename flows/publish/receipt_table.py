@@ -148,18 +148,31 @@ def print_summary(receipt: Receipt, console: Console, *, verbose: bool = False) 
 def print_effects(effects: Iterable[Mapping[str, Any]], total: Mapping[str, Any], console: Console) -> None:
     """Print a row for every effect that the rig has, with its error bound and the reason for its state; the totals."""
     cells = [
-        [
-            escape(row["name"]),
-            escape(row["variant"] or "off"),
-            escape(f"{row['reason']}, {row['magnitude'].removeprefix(row['name'] + ': ')}"),
-            format_change(row["bound"]),
-        ]
+        [escape(row["name"]), escape(row["variant"] or "off"), escape(format_reason(row)), format_change(row["bound"])]
         for row in effects
         if row["reason"] != "absent"
     ]
     console.print(table(("effect", "computed", "why", "error"), cells, left=3, whole=("effect", "computed", "error")))
     for sentence in format_total(total):
         console.print(escape(sentence))
+
+
+REASONS = {
+    "exact": "",
+    "needed": "",
+    "small": "",
+    "unseen": "not visible in the scene: ",
+    "spent": "tolerance used for effects that save more: ",
+    "asked": "asked for: ",
+    "unasked": "not asked for: ",
+    "always": "always there: ",
+    "absent": "absent: ",
+}
+
+
+def format_reason(row: Mapping[str, Any]) -> str:
+    """Return the magnitude of an effect, and the reason for its state where its figures do not give it."""
+    return REASONS[row["reason"]] + str(row["magnitude"]).removeprefix(f"{row['name']}: ")
 
 
 def format_change(value: float | None) -> str:

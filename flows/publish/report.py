@@ -21,10 +21,6 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from jinja2.utils import htmlsafe_json_dumps
 from markupsafe import Markup
 
-<<<<<<< HEAD
-=======
-from flows.publish.effects_table import format_change, format_row, format_total
->>>>>>> cut-simulator
 from flows.publish.field_map import ERROR_COLOURS, FieldMap
 from flows.publish.panels import data_address
 from flows.publish.receipt import Receipt
@@ -32,6 +28,7 @@ from flows.publish.receipt_table import (
     area_rows,
     finding_rows,
     format_change,
+    format_reason,
     format_reference,
     format_total,
     headline,
@@ -98,7 +95,7 @@ def _environment(*, markdown: bool) -> Environment:
     found.filters |= {
         "bytes": format_bytes,
         "change": format_change,
-        "reason": format_row,
+        "reason": format_reason,
         "percent": format_percent,
         "points": format_points,
         "seconds": format_seconds,
