@@ -180,5 +180,5 @@ def _swaths(
     for top in range(0, grid.height, high):
         probabilities, age, light = store.read(slice(top, min(top + high, grid.height)))
         before = ClassProbabilities(in_classes(probabilities, prior.classes), age, light)
-        today = carried(PriorMap(before, None, prior.days), read)
+        today = carried(PriorMap(before, None, prior.days, prior.day_of_year), read)
         yield today.log_probability, today.age_days

@@ -33,6 +33,7 @@ class FieldPriorMap:
     probabilities: Path
     mosaic: Path  # of the last visit
     days: float
+    day_of_year: float | None  # of the current visit
     classes: tuple[int, ...]  # see `flows.tasks.prior_maps.Prior`
     shift_px: tuple[int, int] = (0, 0)  # down and right, to the current visit
 
@@ -48,8 +49,8 @@ class FieldPriorMap:
         if self.classes != tuple(range(values.shape[-1])):
             values = in_classes(values, self.classes)
         coarse = pooled(coarse_region(weights, self.mosaic, region, LineSpec()).seen_columns)
-        before = shifted(coarse, _cells(self.shift_px))
-        return PriorMap(ClassProbabilities(values, age, np.nan_to_num(light)), before, self.days)
+        before = ClassProbabilities(values, age, np.nan_to_num(light))
+        return PriorMap(before, shifted(coarse, _cells(self.shift_px)), self.days, self.day_of_year)
 
 
 def laid_together(images: Iterable[NDArray[np.float32]]) -> NDArray[np.float32]:

@@ -47,6 +47,7 @@ class Prior:
     probabilities: StageRef  # the store with class_probabilities.zarr
     scan_passes: tuple[EarlierRun, ...]  # that run, then visits of what it did not capture, the newest first
     days: float  # between that visit and this one
+    day_of_year: float | None  # of this visit; None if it is unknown
     classes: tuple[int, ...]  # of each class of the weights the number in the class probabilities; -1 for a new class
 
 
@@ -128,7 +129,7 @@ def _usable(
         return f"it has none of the classes of these weights, but {', '.join(names)}"
     days = max(_days_since(run, settings.visit, settings.moment), 0.0)
     earlier = (EarlierRun(mosaic), *_earlier_runs(archive, run))
-    return Prior(run.folder.name, probabilities, earlier, days, classes)
+    return Prior(run.folder.name, probabilities, earlier, days, _day_of_year(settings), classes)
 
 
 def _earlier_runs(archive: Archive, run: Run) -> Iterator[EarlierRun]:
@@ -173,6 +174,14 @@ def _days_since(run: Run, visit: str | None, moment: tuple[int, float] | None) -
         return moment[0] - day + (moment[1] - hour) / 24
     created = _called_moment(run.created)
     return 0.0 if created is None else float((datetime.now(UTC).date() - created.date()).days)
+
+
+def _day_of_year(settings: Settings) -> float | None:
+    """Return the day of the year of a visit: by the date it is called by, else by the built-in scene's day."""
+    called = _called_moment(settings.visit)
+    if called is not None:
+        return float(called.timetuple().tm_yday)
+    return None if settings.moment is None else float(settings.moment[0])
 
 
 def prior_map_figures(store: Path) -> dict[str, Any] | None:

@@ -78,6 +78,7 @@ else:
     rig_field = deferred("flows.tasks.rig_field")
 
 
+PRIOR_MAP_GAIN = 3.0  # least gain with a prior map over that without one: losses are then alike (prior-maps.md)
 USUAL_COMPONENTS = 32  # of condensed lines, before they are computed
 
 
@@ -199,11 +200,12 @@ class SurveyRun(CaptureRun):
     def least_gain(self) -> float | None:
         """Return the least expected gain of patches that are read at full resolution; None where all are read.
 
-        It follows from the accepted loss, unless the settings limit multiply-adds.
+        It follows from the accepted loss, unless the settings limit multiply-adds. A prior map leaves less to gain.
         """
         settings, cascade = self.settings, self.cascade
-        chosen = cascade is not None and settings.macs is None and settings.policy == "gain"
-        return cascade[0] if cascade is not None and chosen else None
+        if cascade is None or settings.macs is not None or settings.policy != "gain":
+            return None
+        return cascade[0] if self.prior is None else PRIOR_MAP_GAIN * cascade[0]
 
     @property
     def cascade(self) -> tuple[float, float] | None:

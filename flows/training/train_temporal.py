@@ -35,9 +35,10 @@ from pipeline.simulator.scenes.farm.farm_plan import CLASSES
 from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES, farm_scene
 
 SHAPE = (512, 640)  # (y, x) of a land
-LANDS, FIRST_SEED, JUDGED_SEED = 48, 200_000, 300_000
+LANDS, FIRST_SEED, JUDGED_SEED = 40, 200_000, 300_000
 VISITS = 5  # of each land
 DAYS, LAST_DAY = (95, 290), 318  # of the year: of first visits, and of any
+SPRING_DAY, SPRING_COUNTS = 135, 2  # lands first visited before it, when most changes, count so often
 GAPS = (0, 1, 1, 2, 3, 3, 5, 6, 6, 7, 7, 10, 14)  # days between two
 HOURS = (9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0)
 SPACINGS = {1: 0.3, 2: 0.5, 4: 0.2}  # line spacing [px] -> fraction of the passes
@@ -86,11 +87,12 @@ def train_temporal(request: TemporalRequest, report: Report = lambda what, done,
         report("visiting lands", number / request.lands, f"land {seed}")
         rng = np.random.default_rng([request.settings.seed, seed])
         lands.append([_visit(weights, augmentation, request.shape, seed, *moment, rng) for moment in _moments(rng)])
+    spring = [land for land in lands if land[0].moment < SPRING_DAY]
 
     def progress(now: Progress) -> None:
         report("training", now.done, f"step {now.step}, loss {now.loss:.3f}")
 
-    reader, steps = train_reader(lands, request.settings, progress)
+    reader, steps = train_reader(lands + (SPRING_COUNTS - 1) * spring, request.settings, progress)
     record = {
         "command": request.command,
         "lands": [FIRST_SEED + number for number in range(request.lands)],
@@ -189,7 +191,7 @@ def judge_temporal(
             )
             later = _Land.observed(weights, request.shape, seed, JUDGED_DAY + days, 11.0)
             now, anew = (later.observe(weights, augmentation, *how, rng) for how in (NOW, BEFORE))
-            prior_map = PriorMap(first_probabilities(before), before.coarse, float(days))
+            prior_map = PriorMap(first_probabilities(before), before.coarse, float(days), JUDGED_DAY + days)
             probabilities = {
                 "kept": first_probabilities(before),
                 "extent": first_probabilities(now),

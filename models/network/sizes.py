@@ -32,7 +32,9 @@ TOKEN_PX = 32  # pixels a side that a token stands for
 PLANES = 3  # beside the spectral features of a pixel: exposure, line spacing, binned samples
 SCORER_WIDTH = 16  # channels of the network that scores patches
 MOST_GAIN = 5.0  # gains are clipped to this [nat per px]; one confident error would outweigh a field
-OTHERS = 5  # inputs of the temporal reader beside probabilities: seen, age, light before, light, line spacing
+OTHERS = (
+    7  # inputs of the temporal reader beside probabilities: seen, age, light before, light, line spacing, season (2)
+)
 GATES = 3  # of the temporal reader: weight of prior map, weight of visit, weight of both against the prior map
 
 
@@ -84,14 +86,14 @@ class TemporalSizes:
 
     classes: int
     columns: int
-    width: int = 32
+    width: int = 40
     coarse_width: int = 16
 
     def multiply_adds(self, pixels: int) -> int:
         """Multiply-adds of reading so many fine pixels."""
         entered = 2 * self.classes + OTHERS + self.coarse_width
-        fine = 9 * self.width * (entered + self.width + self.classes + GATES)
-        coarse = 9 * self.width * (2 * self.columns + 1 + self.coarse_width)
+        fine = self.width * (entered + 9 + self.classes + GATES)
+        coarse = self.width * (2 * self.columns + 1 + 9 + self.coarse_width + 9 * self.width) + 9 * self.coarse_width
         return pixels * fine + pixels // CELL_PX**2 * coarse
 
 

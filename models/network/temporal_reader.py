@@ -17,6 +17,13 @@ STARTS = (2.2, 0.0, -1.0)  # of the gates, before training
 LEAST_LIGHT = 1e-4  # of a prior map, in reference exposures
 
 
+class Separable(nn.Sequential):
+    """A separable convolution: 1 x 1 across channels, then 3 x 3 within each (Howard et al., MobileNets, 2017)."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__(nn.Conv2d(inputs, outputs, 1), nn.Conv2d(outputs, outputs, 3, padding=1, groups=outputs))
+
+
 class TemporalReader(nn.Module):
     """Compute log-probabilities of today from those of a prior map and of the current visit."""
 
@@ -24,11 +31,11 @@ class TemporalReader(nn.Module):
         super().__init__()
         self.sizes = sizes
         width, classes = sizes.width, sizes.classes
-        self.coarse_enter = nn.Conv2d(2 * sizes.columns + 1, width, 3, padding=1)
-        self.coarse_leave = nn.Conv2d(width, sizes.coarse_width, 3, padding=1)
-        self.enter = nn.Conv2d(2 * classes + OTHERS + sizes.coarse_width, width, 3, padding=1)
-        self.middle = nn.Conv2d(width, width, 3, padding=2, dilation=2)
-        self.leave = nn.Conv2d(width, classes + GATES, 3, padding=1)
+        self.coarse_enter = Separable(2 * sizes.columns + 1, width)
+        self.coarse_leave = Separable(width, sizes.coarse_width)
+        self.enter = Separable(2 * classes + OTHERS + sizes.coarse_width, width)
+        self.middle = nn.Conv2d(width, width, 3, padding=1)
+        self.leave = nn.Conv2d(width, classes + GATES, 1)
         for start in self.leave.parameters():
             nn.init.zeros_(start)
         self.gates = nn.Parameter(torch.tensor(STARTS))
@@ -42,6 +49,7 @@ class TemporalReader(nn.Module):
         rests_on: Tensor,
         light: Tensor,
         step: Tensor,
+        season: Tensor,
         coarse_before: Tensor,
         coarse_now: Tensor,
         comparable: Tensor,
@@ -51,8 +59,9 @@ class TemporalReader(nn.Module):
         ``prior_map`` and ``observation`` are log-probabilities too. ``seen`` (B, 1, y, x) is 1 where the visit captured
         a pixel. ``age`` (B, 1, y, x) is the time since the last capture before it [days]. ``rests_on`` (B, 1, y, x) is
         the exposure of the prior map, in reference exposures a pixel. ``light`` (B,) is the visit's exposure as a
-        fraction of the reference, ``step`` (B,) its line spacing [px]. ``coarse_before`` and ``coarse_now`` (B, column,
-        y / s, x / s) are spectral features. ``comparable`` (B, 1, y / s, x / s) is 1 where both may be compared.
+        fraction of the reference, ``step`` (B,) its line spacing [px]. ``season`` (B, 2) is the day of the year as
+        `models.reading.prior_map.season_of` returns it. ``coarse_before`` and ``coarse_now`` (B, column, y / s, x / s)
+        are spectral features. ``comparable`` (B, 1, y / s, x / s) is 1 where both may be compared.
         """
         size = prior_map.shape[-2:]
         change = (coarse_now - coarse_before) * comparable
@@ -60,11 +69,16 @@ class TemporalReader(nn.Module):
         below = F.gelu(self.coarse_leave(below))
         below = F.interpolate(below, scale_factor=float(CELL_PX), mode="nearest")
         today = observation * seen
-        taken = torch.stack([light.log(), step.log2()], dim=1)[:, :, None, None].expand(-1, 2, *size)
+        taken = torch.cat([torch.stack([light.log(), step.log2()], dim=1), season], dim=1)[:, :, None, None]
         scaled = [(part / 4).clamp(-FAINT / 4, 0) for part in (prior_map, today)]
         known = rests_on.clamp(min=LEAST_LIGHT).log() / 2
-        features = F.gelu(self.enter(torch.cat([*scaled, seen, torch.log1p(age) / 2, known, taken, below], dim=1)))
-        features = features + F.gelu(self.middle(features))
+        features = F.gelu(
+            self.enter(
+                torch.cat([*scaled, seen, torch.log1p(age) / 2, known, taken.expand(-1, -1, *size), below], dim=1)
+            )
+        )
+        wider = self.middle(F.avg_pool2d(features, CELL_PX))
+        features = F.gelu(features + F.interpolate(wider, scale_factor=float(CELL_PX), mode="nearest"))
         added, gates = self.leave(features).split([self.sizes.classes, GATES], dim=1)
         old, new, replaced = (gates + self.gates[None, :, None, None]).split(1, dim=1)
         both = F.log_softmax(torch.sigmoid(old) * prior_map + torch.sigmoid(new) * today + added, dim=1)

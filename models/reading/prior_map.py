@@ -37,6 +37,7 @@ CERTAIN = 0.8  # confidence of prior map and map at which a pixel of another cla
 BLOCK_PX = 16  # a side: differences are taken as equal within a block, and as independent between blocks
 ERRORS_BEYOND = 2.0  # standard errors above the expected difference of two maps of the same ground
 ROWS = 128  # fused at a time
+DAYS_A_YEAR = 365.25
 SEEN_PX = 3  # reach of the reader around a pixel, beside three coarse pixels
 LEAST_AGREEMENT, LEAST_KAPPA = 0.5, 0.35  # below both a prior map is of another field
 Floats = NDArray[np.float32]
@@ -77,6 +78,15 @@ class PriorMap:
     probabilities: ClassProbabilities
     coarse: Floats | None  # as `CurrentVisit.coarse`, of the last visit; None if it is not comparable
     days: float
+    day_of_year: float | None = None  # of the current visit; None where its date is unknown
+
+
+def season_of(day_of_year: float | None) -> tuple[float, float]:
+    """Return cosine and sine of the day as an angle of the year; both are 0 where the day is unknown."""
+    if day_of_year is None:
+        return 0.0, 0.0
+    angle = 2 * math.pi * day_of_year / DAYS_A_YEAR
+    return math.cos(angle), math.sin(angle)
 
 
 def pooled(columns: Floats) -> Floats:
@@ -226,7 +236,8 @@ def _read(
     both = _finite(past) & _finite(now)
     if prior_map.coarse is None:
         both[...] = False
-    taken = torch.tensor([observation.light]), torch.tensor([float(observation.step)])
+    season = torch.tensor([season_of(prior_map.day_of_year)], dtype=torch.float32)
+    taken = torch.tensor([observation.light]), torch.tensor([float(observation.step)]), season
 
     def fine(values: NDArray[np.generic]) -> Tensor:
         fill = [(0, s * down - y), (0, s * across - x), *[(0, 0)] * (values.ndim - 2)]

@@ -11,6 +11,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,7 +21,7 @@ from torch import Tensor
 
 from models.network.sizes import CELL_PX, TemporalSizes
 from models.network.temporal_reader import TemporalReader
-from models.reading.prior_map import FAINTEST, LIGHT_FADES_DAYS
+from models.reading.prior_map import FAINTEST, LIGHT_FADES_DAYS, season_of
 from models.training.objective import class_weights, map_loss
 from models.training.train import Progress
 from pipeline.geometry.grid import UNLABELLED
@@ -29,6 +30,7 @@ FAINT = 1e-5  # least probability of a pass
 PARTLY_SEEN = 0.3  # fraction of later visits that capture a part of the land
 INCOMPARABLE = 0.1  # fraction of visits whose spectral features are not comparable
 OTHER_LAND, BESIDE = 0.06, 0.06  # fraction of batches with prior maps of another land, or shifted
+UNDATED = 0.1  # fraction of sequences of visits whose days are unknown
 WRONG = 0.4  # fraction of the prior maps of such a batch
 BESIDE_CELLS = 6  # at most, in coarse pixels
 WARM_UP = 50  # steps
@@ -48,7 +50,7 @@ class PastPass:
 class Visit:
     """A land on a day, as several scans show it."""
 
-    moment: float  # days
+    moment: float  # day of the year
     labels: NDArray[np.uint8]
     scan_passes: Sequence[PastPass]
 
@@ -80,6 +82,7 @@ class _Batch:
     days: Tensor  # (B, 1, 1, 1) since the visit before
     light: Tensor  # (B,)
     step: Tensor  # (B,)
+    season: Tensor  # (B, 2)
     comparable: Tensor  # (B, 1, 1, 1)
 
 
@@ -128,7 +131,7 @@ def _learn(reader: TemporalReader, visits: Sequence[_Batch], weight: Tensor, rng
         small = now.seen[:, :, factor // 2 :: factor, factor // 2 :: factor]
         before_map, coarse_before = _wrong(state, coarse, factor, rng)
         images = before_map, now.observation, now.seen, age, rests_on
-        found = reader(*images, now.light, now.step, coarse_before, now.coarse, small * now.comparable)
+        found = reader(*images, now.light, now.step, now.season, coarse_before, now.coarse, small * now.comparable)
         losses = F.nll_loss(found, now.labels.where(now.labels != UNLABELLED, 0), reduction="none")
         loss = map_loss(found, losses, now.labels, weight, soft_dice=True)
         torch.autograd.backward(loss)
@@ -167,15 +170,13 @@ def _sequences(lands: Sequence[Sequence[Visit]], settings: TemporalTraining, rng
         parts = list(zip(*(one[number] for one in drawn), strict=True))
         observation, coarse, labels, seen = (torch.from_numpy(np.stack(part)) for part in parts[:4])
         observation = observation - observation.logsumexp(dim=1, keepdim=True)
-        days, light, step, comparable = (torch.tensor(part, dtype=torch.float32) for part in parts[4:])
+        days, light, step, comparable, season = (torch.tensor(part, dtype=torch.float32) for part in parts[4:])
         column = days[:, None, None, None], comparable[:, None, None, None]
-        batches.append(_Batch(observation, coarse, labels.long(), seen, column[0], light, step, column[1]))
+        batches.append(_Batch(observation, coarse, labels.long(), seen, column[0], light, step, season, column[1]))
     return batches
 
 
-def _sequence(
-    land: Sequence[Visit], settings: TemporalTraining, rng: np.random.Generator
-) -> list[tuple[NDArray[np.generic] | float, ...]]:
+def _sequence(land: Sequence[Visit], settings: TemporalTraining, rng: np.random.Generator) -> list[tuple[Any, ...]]:
     """Return one crop through visits of a land; the last visit is repeated if there are too few."""
     side, shape = settings.crop, land[0].labels.shape
     first = int(rng.integers(0, max(len(land) - settings.visits, 0) + 1))
@@ -184,8 +185,8 @@ def _sequence(
     fine = np.s_[y : y + side, x : x + side]
     small = np.s_[y // factor : (y + side) // factor, x // factor : (x + side) // factor]
     turns, mirrored = int(rng.integers(4)), bool(rng.integers(2))
-    sequence: list[tuple[NDArray[np.generic] | float, ...]] = []
-    before = visits[0].moment
+    sequence: list[tuple[Any, ...]] = []
+    before, dated = visits[0].moment, rng.random() >= UNDATED
     for number, visit in enumerate(visits):
         coarse_pass = visit.scan_passes[int(rng.integers(len(visit.scan_passes)))]
         if number == 0 and rng.random() < 0.5:  # prior maps are often of the best scan
@@ -200,9 +201,8 @@ def _sequence(
         channels_first = [image.transpose(2, 0, 1) if image.ndim == 3 else image for image in turned]
         comparable = float(rng.random() >= INCOMPARABLE)
         days = abs(visit.moment - before)
-        sequence.append(
-            (*map(np.ascontiguousarray, channels_first), days, coarse_pass.light, float(coarse_pass.step), comparable)
-        )
+        taken = coarse_pass.light, float(coarse_pass.step), comparable, season_of(visit.moment if dated else None)
+        sequence.append((*map(np.ascontiguousarray, channels_first), days, *taken))
         before = visit.moment
     return sequence
 

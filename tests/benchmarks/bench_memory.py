@@ -93,7 +93,8 @@ def _revisits() -> Iterator[Row]:
                 view_farm(seed, when, how, noise)
                 for when, how, noise in ((day, ANEW, 0), (day + LATER, QUICK, 1), (day + LATER, ANEW, 1))
             )
-            prior_map = PriorMap(first_probabilities(before.observation), before.observation.coarse, LATER)
+            first = before.observation
+            prior_map = PriorMap(first_probabilities(first), first.coarse, LATER, float(day + LATER))
             fused = fuse(prior_map, now.observation, reader).classes()[0]
             for name, one in zip(scores, (before.alone, now.alone, fused, full.alone), strict=True):
                 scores[name].append(100 * mean_iou(now.counts(one)))

@@ -108,7 +108,8 @@ def segment(
     if prior is None:
         return Wanted(build, params, [mosaic, attention])
     shifts = [list(scan_pass.shift_px) for scan_pass in prior.scan_passes]
-    known = {"days": prior.days, "classes": list(prior.classes), "reader": None if reader is None else reader.key}
+    known = {"days": prior.days, "day_of_year": prior.day_of_year, "classes": list(prior.classes)}
+    known["reader"] = None if reader is None else reader.key
     earlier = [prior.probabilities, *(one.mosaic for one in prior.scan_passes)]
     return Wanted(build, {**params, **known, "shifts": shifts}, [mosaic, attention, *earlier])
 
@@ -154,7 +155,7 @@ def memory_of(prior: Prior, lies: FieldShift, grid: SceneGrid) -> FieldPriorMap 
         return None
     last, probabilities = prior.scan_passes[0], (prior.probabilities.path / "class_probabilities.zarr").resolve()
     coarse = (last.mosaic.path / "mosaic.zarr").resolve()
-    return FieldPriorMap(probabilities, coarse, prior.days, prior.classes, whole_pixels(lies))
+    return FieldPriorMap(probabilities, coarse, prior.days, prior.day_of_year, prior.classes, whole_pixels(lies))
 
 
 def _prior_map_figures(

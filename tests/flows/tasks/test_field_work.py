@@ -177,8 +177,8 @@ def test_a_memory_is_moved_and_leaves_nothing_behind(surveyed: tuple[SurveyRun, 
     probabilities, mosaic = (_store(stages, "segment/*/class_probabilities.zarr"), _mosaics(stages)[0])
     region = whole_field(run.grid)
     classes = tuple(range(len(run.weights.class_names)))
-    still = FieldPriorMap(probabilities, mosaic, 1.0, classes).of(region, run.weights)
-    moved = FieldPriorMap(probabilities, mosaic, 1.0, classes, shift).of(region, run.weights)
+    still = FieldPriorMap(probabilities, mosaic, 1.0, None, classes).of(region, run.weights)
+    moved = FieldPriorMap(probabilities, mosaic, 1.0, None, classes, shift).of(region, run.weights)
     coarse = tuple(round(by / CELL_PX) for by in shift)
     assert still.coarse is not None
     assert moved.coarse is not None

@@ -42,7 +42,9 @@ def test_the_temporal_reader_costs_what_the_counter_counts() -> None:
     fine, coarse = torch.zeros(1, 1, 16, 24), torch.zeros(1, 6, 16 // CELL_PX, 24 // CELL_PX)
     scores, one, counter = fine.expand(1, 5, 16, 24), torch.ones(1), FlopCounterMode(display=False)
     with torch.inference_mode(), counter:
-        TemporalReader(sizes).eval()(scores, scores, fine, fine, fine, one, one, coarse, coarse, coarse[:, :1])
+        TemporalReader(sizes).eval()(
+            scores, scores, fine, fine, fine, one, one, torch.zeros(1, 2), coarse, coarse, coarse[:, :1]
+        )
     assert sizes.multiply_adds(16 * 24) == counter.get_total_flops() / 2
 
 
