@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 import tempfile
 import threading
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -187,8 +188,7 @@ def run_emulate(
     for note in notes:
         console.print(f"[dim]note: {escape(note)}[/]")
     rig = EmulatedRig(source, FastClock(speed), mounting=settings.rig.mounting)
-    end = ended or threading.Event()
-    with rig.serve(baud=baud) as served, suppress(KeyboardInterrupt):
+    with _ending(ended or threading.Event()) as end, rig.serve(baud=baud) as served:
         table = _rig_table(served, settings.rig)
         if out is not None:
             _write_survey(out, settings, table)
@@ -204,6 +204,20 @@ def run_emulate(
                 line.update(escape(rig.state))
     console.print(f"closed: {escape(rig.state)}", soft_wrap=True)
     return 0
+
+
+@contextmanager
+def _ending(event: threading.Event) -> Iterator[threading.Event]:
+    """Set the event at SIGINT or SIGTERM, also in a process started in the background, where SIGINT is ignored."""
+    if threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+    before = {number: signal.signal(number, lambda *_: event.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield event
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _write_survey(out: Path, settings: Settings, table: dict[str, object]) -> None:
