@@ -143,7 +143,7 @@ class UnknownRule:
 
     number: int  # of the class, after those of the weights
     rate: float  # false-alarm rate
-    familiar: str  # key of the detector
+    detector: str  # its key
 
     def pixels(self, ood_detector: OodDetector, seen: CoarsePass, bands: int) -> NDArray[np.bool_]:
         """Return the unknown pixels of a region, (y, x), each by its own capture."""

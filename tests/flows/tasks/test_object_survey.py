@@ -158,7 +158,7 @@ def test_a_flipped_bit_is_named_and_made_again(
     ended = command_line("verify", bucket, "--json")
     (problem,) = json.loads(ended.out)["problems"]
     assert ended.code == 1
-    assert "(its SHA-256 differs) (mosaic.zarr/scores: " in problem["problem"]
+    assert "mosaic.zarr/scores/c/0/0/0 has changed since it was published" in problem["problem"]
     repaired = command_line("verify", bucket, "--repair", "--json")
     assert repaired.code == 0
     assert json.loads(repaired.out)["repair"]["remade"] == [problem["uri"]]
@@ -192,5 +192,5 @@ def test_a_bucket_that_cannot_be_reached_is_one_error(
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
     silent = command_line("ls", bucket)
     assert silent.code == 1
-    assert "cannot be reached: check the network and AWS_ENDPOINT_URL" in silent.errors[0]
+    assert "it does not answer: check the network and AWS_ENDPOINT_URL" in silent.errors[0]
     assert command_line("ls", "s3://").code == 2

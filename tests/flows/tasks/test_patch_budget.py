@@ -152,12 +152,12 @@ def test_a_part_of_the_scan_is_read_in_detail(survey_png: Survey, tmp_path: Path
     assert "captured again" not in page
 
 
-def test_a_plan_tells_what_the_budgets_pay_for(scene_files: Path, tiny: Path, tmp_path: Path) -> None:
+def test_a_plan_tells_what_the_budgets_pay_for(scene_files: Path, weights: Path, tmp_path: Path) -> None:
     """Before the first line: the most patches, and what they take."""
     given_settings = {
         "scene": str(scene_files / "scene.png"),
         "source": "sim",
-        "weights": str(tiny),
+        "weights": str(weights),
         "out": str(tmp_path),
     }
     content = plan_content(load_settings(None, {**given_settings, "scan_step": "1", "macs": "80%"}))
