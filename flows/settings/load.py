@@ -37,6 +37,7 @@ from flows.settings.survey_settings import (
 )
 from flows.settings.values import EXTENT_PART, EXTENT_WHOLE, parse_moment, parse_text
 from pipeline.errors import BudgetError, PoseError, SettingsError
+from pipeline.rig.device_settings import MOST_PAIRS
 from pipeline.setting_fields import format_number, span_of
 from pipeline.simulator.scenes.built_in import SCOUTING_NAMES
 from storage.archive.staging import read_toml
@@ -356,6 +357,11 @@ def _scene_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]
         yield f"{at('wavelengths')} must have one value for each of the {len(bands)} bands, got {len(wavelengths)}"
     if scene == RIG_FIELD and settings.source not in (RIG, RECORDED):
         yield f"scene {RIG_FIELD!r} is what stands before a rig: give --source rig, or a file"
+    if settings.source == RIG and settings.cost.vector_pairs > MOST_PAIRS:
+        yield (
+            f"cost.vector_pairs = {settings.cost.vector_pairs}: the mirror's vector memory takes at most {MOST_PAIRS} "
+            "pairs; give its size"
+        )
     if settings.is_map and scene in BUILT_IN_SCENES:
         yield f"source 'raster' takes the pixels of a file, and {scene} is built in: give --source sim, or a file"
     if settings.size is not None and scene not in (*BUILT_IN_SCENES, RIG_FIELD):

@@ -83,7 +83,7 @@ REFUSED = {
         "--budget 0.1",
         r"--budget 0.1 gives \d.*below the time of the first pass of every 4th line",
     ),
-    "weights corrupt": (1, "--weights corrupt.safetensors", "corrupt.safetensors is not a readable safetensors file"),
+    "weights corrupt": (1, "--weights corrupt.safetensors", "cannot read corrupt.safetensors: "),
     "weights missing": (1, "--weights none.safetensors", "no weights at none.safetensors; train some"),
     "weights of other wavelengths": (1, "--weights infrared.safetensors", "for 1500-2000 nm; .* at 460-640 nm"),
     "unknown policy": (2, "--policy guess", "one of gain, entropy, sobel, random, mask; got 'guess'"),
@@ -175,7 +175,7 @@ def class_map(archive: Archive) -> np.ndarray:
 def test_out_that_is_a_file(out: str, folder: Path, command_line: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Refused before anything runs; the file stays."""
     monkeypatch.chdir(folder)
-    command_line(*survey_words("", out)).refused(1, "file, expected a folder.*choose another --out")
+    command_line(*survey_words("", out)).refused(1, "(file, expected a folder|Not a directory).*choose another --out")
     assert (folder / "a_file").read_text() == "no folder"
 
 
@@ -202,7 +202,11 @@ def test_interrupted_survey_says_how_to_go_on(
 
 TRAINING = {
     "scenes of files": (2, "scene.png -o new.safetensors --scenes 3", "--scenes is for built-in scenes"),
-    "-o is a folder": (2, "scene.png -o archive --labels labels.png", "archive is a folder, expected a file"),
+    "-o is a folder": (
+        2,
+        "scene.png -o archive --labels labels.png",
+        "-o archive: expected the name of a file in a folder that exists",
+    ),
     "no patch": (2, "scene.png -o new.safetensors --patch 0", "--patch must be above 0, got 0"),
     "sizes do not fit": (
         2,

@@ -262,7 +262,10 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
         {"source": "rig", "rig.camera_driver": "nowhere:open_it"},
         r"rig.camera_driver = 'nowhere:open_it' cannot be imported .*No module named 'nowhere'",
     ),
-    "memory too large": ({"source": "rig", "cost.vector_pairs": 9000}, r"cost.vector_pairs = 9000: .* 2 to 8191 pairs"),
+    "memory too large": (
+        {"source": "rig", "cost.vector_pairs": 9000},
+        r"cost.vector_pairs = 9000: .* at most 8191 pairs",
+    ),
     "field without size": (
         {"source": "rig", "scene": "field", "bands": None, "size": None, "weights": "x"},
         r"give its size",
