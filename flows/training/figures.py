@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
@@ -13,7 +12,6 @@ from numpy.typing import NDArray
 from sklearn.ensemble import RandomForestClassifier
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.linear_model import LogisticRegression
-from torch import Tensor, nn
 
 from flows.training.data import Report
 from models.evaluation.expected_scores import Floats, MapScores, ScoredMap, expected_counts
@@ -34,7 +32,7 @@ from models.policies.policies import score_patches
 from models.reading.inference import coarse_prediction_of_columns, map_of_columns, segment
 from models.training.capture_augmentation import REFERENCE_MS, STEPS, CaptureAugmentation
 from models.training.examples import Example
-from models.training.train import LabelledPixels
+from models.training.train import LabelledPixels, discriminants_alone
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 
@@ -169,18 +167,14 @@ def _parts(weights: Weights, example: Example) -> tuple[SceneGrid, Patches, NDAr
 
 
 def better_reading(
-    weights: Weights, start: Mapping[str, Tensor], validation: Sequence[Example]
+    weights: Weights, start: Mapping[str, Any], validation: Sequence[Example]
 ) -> tuple[Weights, dict[str, Any]]:
     """Choose the better of the trained network and its initial linear discriminants, by mIoU of validation scenes.
 
     Returns the better weights, and both scores.
     """
-    plain = copy.deepcopy(weights.segmenter)
-    plain.load_state_dict(dict(start), strict=False)
-    for last in (plain.overview_classes, plain.full_classes):
-        nn.init.zeros_(last.weight)
-        nn.init.zeros_(last.bias)  # type: ignore[arg-type]
-    readings = {"network": weights, "linear discriminants": replace(weights, segmenter=plain)}
+    plain = replace(weights, segmenter=discriminants_alone(weights.segmenter, start))
+    readings = {"network": weights, "linear discriminants": plain}
     scores = {name: _miou(one, validation) for name, one in readings.items()}
     kept = max(scores, key=lambda name: scores[name])  # the network on a tie
     return readings[kept], {"miou": scores, "kept": kept}

@@ -245,6 +245,16 @@ def linear_discriminants(pixels: LabelledPixels, classes: int) -> dict[str, Tens
     }
 
 
+def discriminants_alone(segmenter: Segmenter, start: Mapping[str, Tensor]) -> Segmenter:
+    """Return a copy whose maps are those of the linear discriminants in ``start``, without any correction."""
+    plain = copy.deepcopy(segmenter)
+    plain.load_state_dict(dict(start), strict=False)
+    for last in (plain.overview_classes, plain.full_classes):
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)  # type: ignore[arg-type]
+    return plain
+
+
 def train(
     config: SegmenterConfig,
     examples: list[Example],

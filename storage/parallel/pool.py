@@ -30,8 +30,10 @@ from pipeline.lazy import deferred
 from storage.archive.staging import PART_SUFFIX
 
 if TYPE_CHECKING:
+    import dask
     import dask.distributed as dask_distributed
 else:
+    dask = deferred("dask")
     dask_distributed = deferred("dask.distributed")
 
 ANSWER_S = 5.0  # time limit of a scheduler's answer
@@ -298,8 +300,6 @@ class Cluster(Executor):
 
 def start(workers: int) -> Any:
     """Start a dask cluster of processes of this machine, with one arithmetic thread each, deaf to Ctrl-C."""
-    import dask
-
     resource_tracker.ensure_running()  # started later it would unblock signals
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
