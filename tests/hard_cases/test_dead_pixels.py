@@ -13,11 +13,9 @@ import numpy as np
 import pytest
 import torch
 
-from models.evaluation.placement import oracle_gain
 from models.network.sizes import TOKEN_PX
-from models.network.spectral import fill_dead
 from models.policies.policies import score_patches
-from models.reading.inference import read_coarse_pass, segment
+from models.reading.inference import read_coarse_pass
 from pipeline.geometry.grid import SceneGrid
 from tests.models.conftest import coarse_prediction, plain_weights
 
@@ -26,10 +24,6 @@ NM = np.linspace(400, 1000, 9)
 
 def _scene(height: int, width: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(0.1, 0.5, (height, width, 9)).astype(np.float32)
-
-
-def _patches(count: int) -> np.ndarray:
-    return np.random.default_rng(1).normal(0, 1, (count, 8, 8, 4)).astype(np.float32)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
@@ -59,41 +53,6 @@ def test_18_dead_pixels_show_within_a_token_alone_but_for_attention(size: int):
     beside[64 - TOKEN_PX : 64 + size + TOKEN_PX, : 32 + size + TOKEN_PX] = False
     assert np.abs(dead - whole)[beside].max() <= 1e-5
     assert np.abs(dead - whole)[~beside].max() > 0.01
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_18_what_a_look_showed_is_told_of_the_map_that_is_drawn(bad: float):
-    """Holes in either reading: gain compares the map without patches with the one that has them."""
-    weights, grid, values = plain_weights(classes=2), SceneGrid(48, 64, 8, 1), _scene(48, 64)
-    values[:16, 16:32] = bad
-    seen = coarse_prediction(weights, values, NM, grid)
-    patch_index = np.arange(48)
-    patches = _patches(48)
-    patches[7], patches[20, :3] = bad, bad
-    chances = [
-        np.where(drawn.classes == 1, drawn.confidence, 1 - drawn.confidence).astype(np.float64)
-        for drawn in (
-            segment(weights, seen, _patches(0), patch_index[:0]),
-            segment(weights, seen, patches, patch_index),
-        )
-    ]
-    before, after = (np.stack([1 - chance, chance]).reshape(2, 6, 8, 8, 8).swapaxes(2, 3) for chance in chances)
-    gained = np.log(after[1] / before[1]).mean(axis=(2, 3)).ravel()
-    assert oracle_gain(weights, seen, patches, np.ones((48, 64), np.uint8)) == pytest.approx(gained, abs=1e-4)
-
-
-def test_18_filling_holes_takes_the_memory_of_the_patches_once():
-    """One copy is made, however many patches have a hole."""
-    patches = np.ones((200, 16, 16, 8), np.float32)
-    dead = np.zeros(patches.shape[:3], bool)
-    dead[:, 3, 4] = True
-    patches[dead] = np.nan
-    tracemalloc.start()
-    filled = fill_dead(patches, dead)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert (filled == 1).all()
-    assert peak < 1.1 * patches.nbytes
 
 
 def test_18_holes_in_a_coarse_look_take_no_further_copy_of_it():

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from models.network.spectral import MOST_COLUMN
 from models.policies.policies import score_patches
-from models.reading.inference import CoarsePrediction, DrawnMap, coarse_prediction_of_columns, read_coarse_pass, segment
+from models.reading.inference import CoarsePrediction, DrawnMap, coarse_prediction_of_columns, segment
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.readings import MOST_VALUE, beyond_range, find_beyond, readings_alone
@@ -69,16 +69,6 @@ def test_a_out_of_range_value_is_as_if_it_had_not_been_captured(
     assert _alike(one, other)
     assert np.isfinite(one[0].probability).all()
     assert (one[1].classes < len(WEIGHTS.class_names)).all()
-
-
-def test_out_of_range_pixels_are_counted() -> None:
-    """By the pixel, where no band is a reading; NaN is none of them."""
-    values = VALUES.copy()
-    values[2, 5], values[7, 1], values[0, 0] = 1e30, -1e20, np.nan
-    scan_pass = read_coarse_pass(WEIGHTS, [values[:10], values[10:]], NM, GRID)
-    assert scan_pass.out_of_range is not None
-    assert np.argwhere(scan_pass.out_of_range).tolist() == [[2, 5], [7, 1]]
-    assert read_coarse_pass(WEIGHTS, [VALUES], NM, GRID).out_of_range is None
 
 
 @pytest.mark.parametrize("value", [10 * MOST_COLUMN, 1e18, 1e30, FAR, np.inf, -np.inf])

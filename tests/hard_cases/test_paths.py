@@ -9,7 +9,6 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_position, scene_to_direction
 from pipeline.geometry.scan import points_of_scan
 from pipeline.rectify.geolocation import path_geolocation
-from pipeline.rectify.placed import PixelGrid, tie_table
 from pipeline.rectify.resample import merge_lines, resample
 from pipeline.rectify.scan_paths import ScanPath, make_scan_paths, number_lines
 
@@ -63,16 +62,6 @@ def test_repeated_positions_are_averaged() -> None:
     )
 
 
-def test_reversal_gives_two_scan_paths_that_agree() -> None:
-    """A path up and down again is two runs; each shows the scene, the second with its lines turned round."""
-    scan = np.concatenate([np.arange(50.0), np.arange(49.0, 9, -1)])
-    up, down = make_scan_paths(aim(scan), CAMERA)
-    assert (up.lines[0], up.lines[-1], down.lines[0], down.lines[-1]) == (0, 49, 89, 50)
-    points, values = points_between(13, 46), captured(scan)
-    for scan_path in (up, down):
-        np.testing.assert_allclose(seen_through(scan_path, values, points), wave(*points.T), atol=2e-3)
-
-
 def test_stop_while_turning_leaves_no_empty_run() -> None:
     """Lines that stand still where the path turns and where it ends belong to a knot; no run is empty or NaN."""
     drift = 1e-9 * np.arange(6)  # which of the lines that stand is the highest must not matter
@@ -116,16 +105,6 @@ def test_one_sample(samples: int, binning: int) -> None:
     np.testing.assert_array_equal(np.isfinite(found[:, 1]), expected)
 
 
-def test_1500_and_1501_positions_are_the_same_path() -> None:
-    """The vector memory's 1500 positions are no border here: one more line changes nothing for the others."""
-    whole, one_more = (make_scan_paths(aim(np.arange(-700.0, stop)), CAMERA) for stop in (800, 801))
-    assert [len(scan_path) for scan_path in whole + one_more] == [1500, 1501]
-    points = points_between(-700, 799)
-    np.testing.assert_allclose(
-        *(path_geolocation(t, CAMERA, points, along="x") for (t,) in (whole, one_more)), atol=1e-7
-    )
-
-
 def test_lost_frames_are_a_gap_with_nothing_in_it() -> None:
     """Where 12 frames are lost the scene is NaN from half a step beyond the last line, and right up to there."""
     scan = np.concatenate([np.arange(30.0), np.arange(42.0, 80)])
@@ -138,60 +117,3 @@ def test_lost_frames_are_a_gap_with_nothing_in_it() -> None:
     np.testing.assert_allclose(seen_through(scan_path, captured(scan), rest), wave(*rest.T), atol=0.05)
     inner = np.vstack([points_between(2, 28), points_between(43, 77)])
     np.testing.assert_allclose(seen_through(scan_path, captured(scan), inner), wave(*inner.T), atol=2e-3)
-
-
-def test_one_unusable_line_spoils_only_itself() -> None:
-    """Points on an unusable line fail, points a third of a step beside it are read from the lines around."""
-    scan = np.arange(40.0)
-    (scan_path,) = make_scan_paths(aim(scan), CAMERA, usable=scan != 20)
-    values = captured(scan)
-    values[20] = np.nan
-    assert np.isnan(seen_through(scan_path, values, points_between(19.6, 20.4))).all()
-    beside = np.vstack([points_between(2, 19.3), points_between(20.7, 37)])
-    np.testing.assert_allclose(seen_through(scan_path, values, beside), wave(*beside.T), atol=0.05)
-
-
-def test_late_line_is_used_where_the_mirror_was() -> None:
-    """A frame 0.4 periods late is used at its own place, not at its number's."""
-    stamps = np.arange(60.0)
-    stamps[30] += 0.4
-    (scan_path,) = make_scan_paths(aim(stamps[:-1]), CAMERA)
-    points = points_between(3, 55)
-    np.testing.assert_allclose(seen_through(scan_path, captured(stamps), points), wave(*points.T), atol=2e-3)
-
-
-def test_grid_outside_the_swath_is_nan() -> None:
-    """A grid beside, behind or far beyond the sweep has no coordinates, located directly or by the table."""
-    position = aim(np.arange(50.0))
-    (scan_path,) = make_scan_paths(position, CAMERA)
-    for origin in ((0.0, 3100.0), (400.0, 2600.0), (-9000.0, -9000.0), (9000.0, 20_000.0)):
-        grid = {"origin_px": origin, "spacing_px": 1.0, "shape": (40, 50)}
-        points = PixelGrid(**grid).points(*(slice(0, size) for size in grid["shape"]))  # type: ignore[arg-type,attr-defined]
-        assert np.isnan(path_geolocation(scan_path, CAMERA, points, along="x")).all()
-        table = tie_table(scan_path, CAMERA, along="x", **grid)  # type: ignore[arg-type]
-        assert np.isnan(table.coordinates(slice(None), slice(None))).all()
-
-
-def test_vertical_tangent_is_a_path_like_any_other() -> None:
-    """A scan along x, whose slope dY/dX the paper cannot take, is the scan along y with its axes swapped."""
-    (scan_path,) = make_scan_paths(
-        aim(np.arange(50.0), 0.0), CAMERA
-    )  # X = 0 throughout on the axis: the slope is infinite
-    points = np.random.default_rng(1).uniform((0, -300), (49, 300), (200, 2))
-    across, down = (path_geolocation(scan_path, CAMERA, p, along=a) for p, a in ((points, "x"), (points[:, ::-1], "y")))  # type: ignore[arg-type]
-    np.testing.assert_array_equal(across, down)
-    assert np.isfinite(across).all()
-
-
-def test_uneven_path_shows_the_scene_at_its_own_places() -> None:
-    """Lines 0.5 to 1.5 px apart show the scene as well as their distances allow, and far better than taken as even."""
-    scan = np.cumsum(np.random.default_rng(3).uniform(0.5, 1.5, 60))
-    (scan_path,) = make_scan_paths(aim(scan), CAMERA, step_px=1.0)
-    points = points_between(scan[2], scan[-3])
-    error = np.abs(seen_through(scan_path, captured(scan), points) - wave(*points.T))
-    even = np.abs(
-        seen_through(make_scan_paths(aim(np.linspace(scan[0], scan[-1], 60)), CAMERA)[0], captured(scan), points)
-        - wave(*points.T)
-    )
-    assert error.max() < 5e-3
-    assert even.max() > 20 * error.max()

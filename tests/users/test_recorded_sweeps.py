@@ -48,7 +48,6 @@ SIZE = (128, 96)  # x, y
 NARROW = {"camera.samples": 80}  # two strips for the field
 PASSES: dict[str, dict[str, Any]] = {
     "two passes": {"budget": 0.8, "policy": "entropy"},
-    "every line": {"scan_step": 1},
     "lines down the field": {"scan_step": 1, "camera.samples": 96},
     "every second line, shorter": {"scan_step": 2, "scan_exposure_ms": 25},
 }
@@ -153,22 +152,6 @@ def test_raw_cubes_of_a_simulated_survey_give_its_map(tmp_path: Path, full_scan:
     again = survey_sweeps(tmp_path / "again", f"{archive}/runs/{published.folder.name}")
     assert digest_of_map(tmp_path / "again", again.receipt) == digest_of_map(archive, published.receipt)
     assert again.receipt["survey"] == published.receipt["survey"]
-
-
-@pytest.fixture(scope="module")
-def two_passes(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) -> tuple[Path, Published]:
-    """A simulated survey that zooms: its archive and its run."""
-    out = tmp_path_factory.mktemp("two_passes") / "sim"
-    with without_effects():
-        return out, survey_png(out, budget=0.8, policy="entropy", keep="raw", **NARROW)
-
-
-def test_two_simulated_passes_give_their_map(tmp_path: Path, two_passes: tuple[Path, Published]) -> None:
-    """Raw cubes of both passes, out of the archive itself."""
-    archive, published = two_passes
-    again = survey_sweeps(tmp_path / "again", f"{archive}/runs/{published.folder.name}")
-    assert "raw_fine" in again.receipt["products"]
-    assert digest_of_map(tmp_path / "again", again.receipt) == digest_of_map(archive, published.receipt)
 
 
 def test_a_budget_reads_only_the_lines_that_it_asks_for(
