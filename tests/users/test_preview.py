@@ -1,4 +1,4 @@
-"""Before going out: figures of field and captures in the plan."""
+"""Before going out: hectares in the plan."""
 
 from __future__ import annotations
 
@@ -37,6 +37,7 @@ def test_hectares_are_those_of_the_area(scene_files: Path, weights: Path, tmp_pa
     at = pyproj.Transformer.from_crs(4326, 32632, always_xy=True).transform(7.6, 51.96)
     path = Path(sketch(tmp_path / "half.geojson", {"half": shapely.box(at[0] - 5, at[1], at[0] + 5, at[1] + 5)}))
     path.write_text(json.dumps(json.loads(path.read_text()) | {"crs": place}))
+    assert whole["hectares"] == pytest.approx(128 * 96 * (100 * 7.4e-3 / 70) ** 2 / 1e4, rel=1e-6)
     half = planned(scene_files, weights, tmp_path, **DOWN, **{"zones.area": str(path)})["field"]
     assert half["hectares"] == pytest.approx(whole["hectares"] / 2, rel=0.05)
     assert half["kept_fraction"] == pytest.approx(0.5, abs=0.03)

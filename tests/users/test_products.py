@@ -331,25 +331,3 @@ def one_picture(tmp_path_factory: pytest.TempPathFactory, surveyed_png: Any) -> 
     receipt = surveyed_png(archive).receipt
     choice = choose_products(ProductFlags(polygons=True, indices="VARI", reflectance=True))
     return Products(archive, receipt, run_export(archive, None, out, False, QUIET, choice), out)
-
-
-def test_an_index_of_reflectance_stored_to_10000(tmp_path: Path, weights: Path) -> None:
-    """With a scale in scene.toml SAVI is its formula of reflectance; without it the refusal names the scale."""
-    red, near = np.meshgrid(np.linspace(300, 2500, 40), np.linspace(1500, 6000, 32))
-    values = np.stack([red * 0.8, red * 0.9, red, near]).astype(np.int16)
-    kind = {"driver": "GTiff", "count": 4, "height": 32, "width": 40, "dtype": "int16", "photometric": "MINISBLACK"}
-    place = {"crs": "EPSG:32632", "transform": Affine(10, 0, 600_000, 0, -10, 5_700_000)}
-    with rasterio.open(tmp_path / "tile.tif", "w", **kind, **place) as file:
-        file.write(values)
-    given = {"scene": str(tmp_path / "tile.tif"), "weights": str(weights), "engine": "plain", "accuracy": False}
-    choice, toml = choose_products(ProductFlags(indices="SAVI")), "wavelengths_nm = [460, 550, 640, 800]\n"
-    for name, more in (("raw", ""), ("scaled", "scale = 0.0001\n")):
-        (tmp_path / "scene.toml").write_text(toml + more)
-        run_survey(load_settings(None, {**given, "out": str(tmp_path / name), "controls": False}), QUIET)
-    with pytest.raises(SettingsError, match=r"SAVI wants reflectance .*scene\.toml .*scale = 0\.0001 if 10000"):
-        run_export(tmp_path / "raw", None, tmp_path / "none", False, QUIET, choice)
-    answer = run_export(tmp_path / "scaled", None, tmp_path / "out", False, QUIET, choice)
-    with rasterio.open(tmp_path / "out" / answer["files"]["SAVI"]) as file:
-        found = file.read(1)
-    r, n = (values[band].astype(float) / 10_000 for band in (2, 3))
-    np.testing.assert_allclose(found, 1.5 * (n - r) / (n + r + 0.5), atol=2e-3)
