@@ -1,8 +1,8 @@
-"""Numerical hard cases of what a camera did not see: rows 17, 18 and 21 of the design's table are in the names.
+"""Numerical hard cases of what a camera did not see: rows 17 and 18 of the design's table are in the names.
 
 Pixels that a survey's mirror missed take the first pass's columns before they come here; what these rows say holds for
 dead pixels, whose captured values are not numbers. tests/models/reading has the rest: what fills them, what they are
-told as, and that their content reaches nobody.
+told as; test_out_of_range_values that their content reaches nobody.
 """
 
 from __future__ import annotations
@@ -76,26 +76,3 @@ def test_18_a_scene_all_dead_still_has_scores():
     seen = coarse_prediction(plain_weights(), np.full((32, 32, 9), np.nan), NM, SceneGrid(32, 32, 8, 1))
     for policy in ("gain", "entropy", "sobel"):
         assert np.isfinite(score_patches(policy, seen)).all()
-
-
-def test_21_the_pad_is_a_mirror_image():
-    """Scenes are padded by reflection, by the edge pixel where there is one row or column only.
-
-    No patch of the pad is bought, its pixels have no label and no place on the map. The overview does read the part of
-    a border patch that lies in it: it shows the scene once more.
-    """
-    weights = plain_weights()
-    for height, width in ((40, 40), (2, 34), (1, 1)):
-        grid, values = SceneGrid(height, width, 8, 1), _scene(height, width)
-        seen = read_coarse_pass(weights, [values], NM, grid)
-        assert seen.columns.shape[:2] == grid.padded_shape
-        inner = weights.columns(values, NM)
-        assert seen.columns[:height, :width] == pytest.approx(inner, abs=1e-6)
-        for axis, size in enumerate((height, width)):
-            if size < seen.columns.shape[axis]:
-                mirrored = size - 2 if size > 1 else 0
-                one, other = (np.take(seen.columns, at, axis=axis) for at in (size, mirrored))
-                assert (one == other).all()
-        assert not (
-            grid.valid_fraction().ravel()[np.setdiff1d(np.arange(grid.valid_fraction().size), grid.valid_patches())]
-        ).any()

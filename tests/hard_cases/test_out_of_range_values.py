@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -14,8 +13,7 @@ from numpy.typing import NDArray
 from models.network.spectral import MOST_COLUMN
 from models.policies.policies import score_patches
 from models.reading.inference import CoarsePrediction, DrawnMap, coarse_prediction_of_columns, segment
-from models.weights.files import Weights
-from pipeline.geometry.grid import UNLABELLED, SceneGrid
+from pipeline.geometry.grid import SceneGrid
 from pipeline.readings import MOST_VALUE, beyond_range, find_beyond, readings_alone
 from tests.models.conftest import coarse_prediction, make_weights
 
@@ -84,20 +82,6 @@ def test_columns_that_no_reading_gives_are_dead(value: float) -> None:
         found.append((seen, segment(WEIGHTS, seen, fine, np.array([4, 30]))))
     assert _alike(*found)
     assert np.isfinite(found[0][0].probability).all()
-
-
-def test_weights_that_overflow_draw_no_class() -> None:
-    """Finite weights whose logits are not: the map says nothing there, instead of class 0."""
-    weights: Weights = make_weights(0)
-    with torch.no_grad():
-        weights.segmenter.overview_classes.weight.fill_(3e38)
-        weights.segmenter.full_classes.weight.fill_(3e38)
-    seen = coarse_prediction(weights, VALUES, NM, GRID)
-    drawn = segment(weights, seen, weights.columns(FINE, NM), PATCHES)
-    lost = np.isnan(drawn.confidence)
-    assert lost.mean() > 0.5
-    assert (drawn.classes[lost] == UNLABELLED).all()
-    assert (drawn.classes[~lost] != UNLABELLED).all()
 
 
 # --- the rule itself --------------------------------------------------------------------------------------------------

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.errors import SceneError
 from pipeline.simulator.effects.air import PARALLAX, PATH_RADIANCE, TURBULENCE, turbulence_px
 from pipeline.simulator.effects.blurs import DEFOCUS
 from pipeline.simulator.effects.lighting import DRIFT
@@ -21,8 +20,6 @@ from pipeline.simulator.readout import read_out
 from pipeline.simulator.render import EFFECTS, expected_light
 from pipeline.simulator.rig_model import Air, MirrorMotion, Optics, Rig, Sky
 from pipeline.simulator.scenes.daylight import sun_elevation_deg
-from pipeline.simulator.scenes.farm.farm_scene import farm_scene
-from pipeline.simulator.scenes.farm.land import LOWEST_SUN_DEG, sun_over_farm
 from pipeline.simulator.selection.choice import Decision, decide
 from tests.hard_cases.simulated_scene import CAMERA, RIG, block_of, decided, left_out, probed, scene_of
 
@@ -106,24 +103,6 @@ def test_survey_in_the_dark_keeps_every_bound(sky: Sky) -> None:
     assert {"drift", "cloud", "brdf", "path-radiance"} <= set(found)
     for change, counted in found.values():
         assert change <= counted < math.inf
-
-
-def test_farm_needs_a_sun_that_stands_high_enough() -> None:
-    """Up to the hour at which the sun is 5 deg high the farm is drawn; before it, and by night, the hour is refused."""
-    low, high = 0.0, 12.0
-    for _ in range(40):
-        middle = (low + high) / 2
-        try:
-            sun_over_farm(172, middle)
-            high = middle
-        except SceneError:
-            low = middle
-    scene = farm_scene(0, (12, 16), bands=2, day=172, hour=high)
-    assert sun_over_farm(172, high).elevation_deg == pytest.approx(LOWEST_SUN_DEG, abs=1e-6)
-    assert np.isfinite(scene.planes).all()
-    for hour in (low, 0.0, math.nan):
-        with pytest.raises(SceneError, match=r"of day 172 the sun stands at .* needs at least 5; take an hour nearer"):
-            farm_scene(0, (12, 16), bands=2, day=172, hour=hour)
 
 
 @cache

@@ -164,20 +164,6 @@ def test_bound_holds_over_the_field(swath: float, start: float, along: str, spac
     assert np.isfinite(found[inside]).all()
 
 
-@pytest.mark.parametrize("tie", [16, 1])
-def test_parts_are_those_of_the_whole(tie: int) -> None:
-    """Any part of the grid is, bit by bit, what the whole grid gives there; empty parts are empty."""
-    table = tie_table(scan_path_of(*PATHS["even"]), CAMERA, along="x", tie=tie, **GRID)
-    whole = table.coordinates(*EVERYTHING)
-    for rows, columns in (
-        (slice(0, 1), slice(0, 1)),
-        (slice(31, 33), slice(15, 700)),
-        (slice(169, 170), slice(64, 81)),
-    ):
-        np.testing.assert_array_equal(table.coordinates(rows, columns), whole[rows, columns])
-    assert table.coordinates(slice(5, 5), slice(0, 9)).shape == (0, 9, 2)
-
-
 def test_knots_that_nothing_saw_are_left_out() -> None:
     """Around lost lines the table is NaN where the geolocation grid is."""
     scan_path = scan_path_of(2600.0, LINES[(LINES < 40) | (LINES > 44)])
