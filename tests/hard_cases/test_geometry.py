@@ -1,4 +1,4 @@
-"""Hard cases of the mirror: grazing, the rim to the last bit, zero, NaN, vertical tangents, both precisions."""
+"""Hard cases of the mirror: grazing, the rim to the last bit, zero, NaN, both precisions."""
 
 from __future__ import annotations
 

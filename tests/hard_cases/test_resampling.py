@@ -1,4 +1,4 @@
-"""Hard cases of resampling: band counts, long sweeps, NaN and saturation, step edges, borders, positions, threads."""
+"""Hard cases of resampling: band counts, long sweeps, NaN, step edges, few pixels, positions, threads."""
 
 from __future__ import annotations
 
