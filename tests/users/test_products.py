@@ -30,7 +30,6 @@ from pipeline.ground.map_grid import grid_of_map, ground_grid, image_at
 from pipeline.ground.view import GroundView, RigPose
 from pipeline.products.indices import find_index
 from storage.arrays.mosaics import open_mosaic
-from storage.readers.scene_files import load_scene_file
 from tests.prior_work import without_effects
 from tests.storage.export.stac_rules import core_problems, extension_problems, is_cog
 from tests.users.test_georeference import SHAPE, TURNED, corners_px, survey, write_geotiff
@@ -101,12 +100,6 @@ def test_reflectance_lies_on_the_map_with_its_wavelengths(posed: Products) -> No
     centres = [1000 * float(tags["CENTRAL_WAVELENGTH_UM"]) for tags in imagery]
     np.testing.assert_allclose(centres, mosaic["wavelength"].values, rtol=1e-6)
     np.testing.assert_allclose([1000 * float(tags["FWHM_UM"]) for tags in imagery], mosaic["fwhm"].values, rtol=1e-6)
-
-
-def test_exported_reflectance_is_a_scene_again(posed: Products) -> None:
-    """This project reads its wavelengths and widths from the file's tags, and its place."""
-    scene = load_scene_file(str(posed.file("reflectance")))
-    np.testing.assert_allclose(scene.wavelength_nm, posed.store("mosaic")["wavelength"].values, rtol=1e-6)
 
 
 def test_indices_are_their_formula_of_the_reflectance(posed: Products) -> None:
