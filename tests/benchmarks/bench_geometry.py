@@ -19,6 +19,7 @@ from pipeline.geometry.mirror import (
     reflect,
 )
 from tests.pipeline.geometry.paper_equations import straight_slope_rotation
+from tests.pipeline.geometry.test_mirror import exact_direction
 from tests.pipeline.geometry.test_paper import paper_position, slope_rotation
 
 COUNT = 200_000
@@ -69,15 +70,8 @@ def _fifty_digits() -> Row:
 
     worst = 0.0
     with mpmath.workdps(50):
-        half, tangent = mpmath.sqrt(mpmath.mpf(1) / 2), mpmath.tan(50 * mpmath.pi / 180)
-        for x, y in _disk(100, seed=1) * (1 - 1e-15):
-            length = mpmath.sqrt((x * tangent) ** 2 + (y * tangent) ** 2 + 1)
-            device = [x * tangent / length, y * tangent / length, 1 / length + 1]
-            size = mpmath.sqrt(sum(part**2 for part in device))
-            across, side, ahead = (part / size for part in device)
-            n = ((ahead - across) * half, side, -(ahead + across) * half)
-            exact = [-2 * n[2] * n[0], -2 * n[2] * n[1], 1 - 2 * n[2] ** 2]
-            found = position_to_direction([x, y])
+        for position in _disk(100, seed=1) * (1 - 1e-15):
+            exact, found = exact_direction(position), position_to_direction(position)
             worst = max(worst, *(abs(float(e - mpmath.mpf(float(f)))) for e, f in zip(exact, found, strict=True)))
     return Row(
         "ray of 100 random positions against 50 digits, float64", f"{worst:.2g} rad", "< 1e-12 rad", worst < 1e-12

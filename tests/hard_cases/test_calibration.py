@@ -27,14 +27,6 @@ def test_sum_saturated_in_part() -> None:
     assert calibrate(raw, frames(3, 2), saturated_dn=4 * (FULL - 1) + 1)[1].tolist() == [[False, False, True]]
 
 
-def test_white_equal_to_dark_everywhere() -> None:
-    """References without any light calibrate nothing: all NaN, nothing valid, no warning."""
-    references = replace(frames(), white=frames().dark)
-    values, valid = calibrate(np.full((2, 12, 10), 500, np.uint16), references, saturated_dn=FULL)
-    assert np.isnan(values).all()
-    assert not valid.any()
-
-
 @pytest.mark.parametrize("kind", ["flagged", "unflagged"])
 def test_dead_column(kind: str) -> None:
     """A column without response is invalid and invents nothing, be it known as bad or not; its neighbours stay."""

@@ -1,8 +1,8 @@
-"""Numerical hard cases of what a camera did not see: rows 17, 18 and 21 of the design's table are in the names.
+"""Numerical hard cases of what a camera did not see: rows 17 and 18 of the design's table are in the names.
 
 Pixels that a survey's mirror missed take the first pass's columns before they come here; what these rows say holds for
 dead pixels, whose captured values are not numbers. tests/models/reading has the rest: what fills them, what they are
-told as, and that their content reaches nobody.
+told as; test_out_of_range_values that their content reaches nobody.
 """
 
 from __future__ import annotations
@@ -13,11 +13,9 @@ import numpy as np
 import pytest
 import torch
 
-from models.evaluation.placement import oracle_gain
 from models.network.sizes import TOKEN_PX
-from models.network.spectral import fill_dead
 from models.policies.policies import score_patches
-from models.reading.inference import read_coarse_pass, segment
+from models.reading.inference import read_coarse_pass
 from pipeline.geometry.grid import SceneGrid
 from tests.models.conftest import coarse_prediction, plain_weights
 
@@ -26,10 +24,6 @@ NM = np.linspace(400, 1000, 9)
 
 def _scene(height: int, width: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(0.1, 0.5, (height, width, 9)).astype(np.float32)
-
-
-def _patches(count: int) -> np.ndarray:
-    return np.random.default_rng(1).normal(0, 1, (count, 8, 8, 4)).astype(np.float32)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
@@ -61,41 +55,6 @@ def test_18_dead_pixels_show_within_a_token_alone_but_for_attention(size: int):
     assert np.abs(dead - whole)[~beside].max() > 0.01
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_18_what_a_look_showed_is_told_of_the_map_that_is_drawn(bad: float):
-    """Holes in either reading: gain compares the map without patches with the one that has them."""
-    weights, grid, values = plain_weights(classes=2), SceneGrid(48, 64, 8, 1), _scene(48, 64)
-    values[:16, 16:32] = bad
-    seen = coarse_prediction(weights, values, NM, grid)
-    patch_index = np.arange(48)
-    patches = _patches(48)
-    patches[7], patches[20, :3] = bad, bad
-    chances = [
-        np.where(drawn.classes == 1, drawn.confidence, 1 - drawn.confidence).astype(np.float64)
-        for drawn in (
-            segment(weights, seen, _patches(0), patch_index[:0]),
-            segment(weights, seen, patches, patch_index),
-        )
-    ]
-    before, after = (np.stack([1 - chance, chance]).reshape(2, 6, 8, 8, 8).swapaxes(2, 3) for chance in chances)
-    gained = np.log(after[1] / before[1]).mean(axis=(2, 3)).ravel()
-    assert oracle_gain(weights, seen, patches, np.ones((48, 64), np.uint8)) == pytest.approx(gained, abs=1e-4)
-
-
-def test_18_filling_holes_takes_the_memory_of_the_patches_once():
-    """One copy is made, however many patches have a hole."""
-    patches = np.ones((200, 16, 16, 8), np.float32)
-    dead = np.zeros(patches.shape[:3], bool)
-    dead[:, 3, 4] = True
-    patches[dead] = np.nan
-    tracemalloc.start()
-    filled = fill_dead(patches, dead)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert (filled == 1).all()
-    assert peak < 1.1 * patches.nbytes
-
-
 def test_18_holes_in_a_coarse_look_take_no_further_copy_of_it():
     """A look with a dead pixel in every patch is made in the memory of one without, but for a mask."""
     weights, peaks = plain_weights(), []
@@ -117,26 +76,3 @@ def test_18_a_scene_all_dead_still_has_scores():
     seen = coarse_prediction(plain_weights(), np.full((32, 32, 9), np.nan), NM, SceneGrid(32, 32, 8, 1))
     for policy in ("gain", "entropy", "sobel"):
         assert np.isfinite(score_patches(policy, seen)).all()
-
-
-def test_21_the_pad_is_a_mirror_image():
-    """Scenes are padded by reflection, by the edge pixel where there is one row or column only.
-
-    No patch of the pad is bought, its pixels have no label and no place on the map. The overview does read the part of
-    a border patch that lies in it: it shows the scene once more.
-    """
-    weights = plain_weights()
-    for height, width in ((40, 40), (2, 34), (1, 1)):
-        grid, values = SceneGrid(height, width, 8, 1), _scene(height, width)
-        seen = read_coarse_pass(weights, [values], NM, grid)
-        assert seen.columns.shape[:2] == grid.padded_shape
-        inner = weights.columns(values, NM)
-        assert seen.columns[:height, :width] == pytest.approx(inner, abs=1e-6)
-        for axis, size in enumerate((height, width)):
-            if size < seen.columns.shape[axis]:
-                mirrored = size - 2 if size > 1 else 0
-                one, other = (np.take(seen.columns, at, axis=axis) for at in (size, mirrored))
-                assert (one == other).all()
-        assert not (
-            grid.valid_fraction().ravel()[np.setdiff1d(np.arange(grid.valid_fraction().size), grid.valid_patches())]
-        ).any()

@@ -6,16 +6,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from models.network.spectral import MOST_COLUMN
 from models.policies.policies import score_patches
-from models.reading.inference import CoarsePrediction, DrawnMap, coarse_prediction_of_columns, read_coarse_pass, segment
-from models.weights.files import Weights
-from pipeline.geometry.grid import UNLABELLED, SceneGrid
+from models.reading.inference import CoarsePrediction, DrawnMap, coarse_prediction_of_columns, segment
+from pipeline.geometry.grid import SceneGrid
 from pipeline.readings import MOST_VALUE, beyond_range, find_beyond, readings_alone
 from tests.models.conftest import coarse_prediction, make_weights
 
@@ -71,16 +69,6 @@ def test_a_out_of_range_value_is_as_if_it_had_not_been_captured(
     assert (one[1].classes < len(WEIGHTS.class_names)).all()
 
 
-def test_out_of_range_pixels_are_counted() -> None:
-    """By the pixel, where no band is a reading; NaN is none of them."""
-    values = VALUES.copy()
-    values[2, 5], values[7, 1], values[0, 0] = 1e30, -1e20, np.nan
-    scan_pass = read_coarse_pass(WEIGHTS, [values[:10], values[10:]], NM, GRID)
-    assert scan_pass.out_of_range is not None
-    assert np.argwhere(scan_pass.out_of_range).tolist() == [[2, 5], [7, 1]]
-    assert read_coarse_pass(WEIGHTS, [VALUES], NM, GRID).out_of_range is None
-
-
 @pytest.mark.parametrize("value", [10 * MOST_COLUMN, 1e18, 1e30, FAR, np.inf, -np.inf])
 def test_columns_that_no_reading_gives_are_dead(value: float) -> None:
     """Given normalised already, to the overview or to the map, they count as NaN does."""
@@ -94,20 +82,6 @@ def test_columns_that_no_reading_gives_are_dead(value: float) -> None:
         found.append((seen, segment(WEIGHTS, seen, fine, np.array([4, 30]))))
     assert _alike(*found)
     assert np.isfinite(found[0][0].probability).all()
-
-
-def test_weights_that_overflow_draw_no_class() -> None:
-    """Finite weights whose logits are not: the map says nothing there, instead of class 0."""
-    weights: Weights = make_weights(0)
-    with torch.no_grad():
-        weights.segmenter.overview_classes.weight.fill_(3e38)
-        weights.segmenter.full_classes.weight.fill_(3e38)
-    seen = coarse_prediction(weights, VALUES, NM, GRID)
-    drawn = segment(weights, seen, weights.columns(FINE, NM), PATCHES)
-    lost = np.isnan(drawn.confidence)
-    assert lost.mean() > 0.5
-    assert (drawn.classes[lost] == UNLABELLED).all()
-    assert (drawn.classes[~lost] != UNLABELLED).all()
 
 
 # --- the rule itself --------------------------------------------------------------------------------------------------

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.errors import SceneError
 from pipeline.simulator.effects.air import PARALLAX, PATH_RADIANCE, TURBULENCE, turbulence_px
 from pipeline.simulator.effects.blurs import DEFOCUS
 from pipeline.simulator.effects.lighting import DRIFT
@@ -21,8 +20,6 @@ from pipeline.simulator.readout import read_out
 from pipeline.simulator.render import EFFECTS, expected_light
 from pipeline.simulator.rig_model import Air, MirrorMotion, Optics, Rig, Sky
 from pipeline.simulator.scenes.daylight import sun_elevation_deg
-from pipeline.simulator.scenes.farm.farm_scene import farm_scene
-from pipeline.simulator.scenes.farm.land import LOWEST_SUN_DEG, sun_over_farm
 from pipeline.simulator.selection.choice import Decision, decide
 from tests.hard_cases.simulated_scene import CAMERA, RIG, block_of, decided, left_out, probed, scene_of
 
@@ -53,18 +50,6 @@ def test_critical_damping_is_the_limit_from_both_sides(damping: float) -> None:
     assert LAG in critical.chosen
     assert decision.chosen == critical.chosen
     assert decision.error == pytest.approx(critical.error, rel=1e-6)
-
-
-@pytest.mark.parametrize("damping", [0.01, 1.0, 10.0])
-def test_stiff_mirror_stands_where_it_is_told(damping: float) -> None:
-    """One of 1e5 Hz is at rest long before a line of 1 s is over: no lag, exact or by Euler's steps."""
-    rig = moving(1000.0, damping=damping, natural_hz=1e5)
-    block = block_of(TEXTURE, rig)
-    plain = expected_light(TEXTURE, block, {ROTATION: "rays"})
-    for variant in LAG.variants:
-        light = expected_light(TEXTURE, block, {LAG: variant, ROTATION: "rays"})
-        np.testing.assert_allclose(light, plain, rtol=2e-6)
-    assert LAG not in decided(TEXTURE, rig).chosen
 
 
 @pytest.mark.parametrize(
@@ -120,24 +105,6 @@ def test_survey_in_the_dark_keeps_every_bound(sky: Sky) -> None:
         assert change <= counted < math.inf
 
 
-def test_farm_needs_a_sun_that_stands_high_enough() -> None:
-    """Up to the hour at which the sun is 5 deg high the farm is drawn; before it, and by night, the hour is refused."""
-    low, high = 0.0, 12.0
-    for _ in range(40):
-        middle = (low + high) / 2
-        try:
-            sun_over_farm(172, middle)
-            high = middle
-        except SceneError:
-            low = middle
-    scene = farm_scene(0, (12, 16), bands=2, day=172, hour=high)
-    assert sun_over_farm(172, high).elevation_deg == pytest.approx(LOWEST_SUN_DEG, abs=1e-6)
-    assert np.isfinite(scene.planes).all()
-    for hour in (low, 0.0, math.nan):
-        with pytest.raises(SceneError, match=r"of day 172 the sun stands at .* needs at least 5; take an hour nearer"):
-            farm_scene(0, (12, 16), bands=2, day=172, hour=hour)
-
-
 @cache
 def seen_from(distance_m: float, focus_m: float) -> tuple[NDArray[np.float32], Decision]:
     """Light with everything on and exact, and what is decided."""
@@ -147,7 +114,7 @@ def seen_from(distance_m: float, focus_m: float) -> tuple[NDArray[np.float32], D
 
 
 @pytest.mark.parametrize("focus_m", [30.0, math.inf])
-@pytest.mark.parametrize("distance_m", [1e9, 1e300])
+@pytest.mark.parametrize("distance_m", [1e300])
 def test_distance_goes_to_infinity_without_a_jump(distance_m: float, focus_m: float) -> None:
     """Beyond the air's end light and decision are those of infinity, where nothing but the air is left to see."""
     (light, decision), (limit, endless) = seen_from(distance_m, focus_m), seen_from(math.inf, focus_m)
@@ -158,7 +125,7 @@ def test_distance_goes_to_infinity_without_a_jump(distance_m: float, focus_m: fl
     assert (DEFOCUS in endless.chosen) == (focus_m == 30.0)
 
 
-@pytest.mark.parametrize("relief", ["flat", "plane", "step"])
+@pytest.mark.parametrize("relief", ["flat", "step"])
 def test_scene_that_reaches_to_the_horizon_keeps_every_bound(relief: str) -> None:
     """Its farthest part at infinity: the ends of lines there lie a lever over the distance off, and all is finite."""
     air = Air(distance_m=30.0, nearest_m=20.0, farthest_m=math.inf, relief=relief)  # type: ignore[arg-type]

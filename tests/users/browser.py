@@ -87,48 +87,6 @@ class Tab:
             assert time.monotonic() < end, f"{expression} did not come true; {self.troubles}"
             time.sleep(0.03)
 
-    def centre(self, selector: str, fraction: tuple[float, float] = (0.5, 0.5)) -> tuple[float, float]:
-        """A place of an element scrolled into view, by fractions of its width and height, in px of the window."""
-        found = self.run(
-            f"(() => {{ const one = document.querySelector({json.dumps(selector)}); "
-            "one.scrollIntoView({block: 'center', behavior: 'instant'}); "
-            "const box = one.getBoundingClientRect(); return [box.x, box.y, box.width, box.height]; })()"
-        )
-        return found[0] + fraction[0] * found[2], found[1] + fraction[1] * found[3]
-
-    def mouse(self, kind: str, x: float, y: float, **words: Any) -> None:
-        """Move, press or release the mouse."""
-        self.call("Input.dispatchMouseEvent", type=f"mouse{kind}", x=x, y=y, **words)
-
-    def click(self, x: float, y: float) -> None:
-        """Click at a place of the window."""
-        self.mouse("Moved", x, y)
-        self.mouse("Pressed", x, y, button="left", clickCount=1)
-        self.mouse("Released", x, y, button="left", clickCount=1)
-
-    def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
-        """Press the mouse, move it, let it go."""
-        self.mouse("Moved", *start)
-        self.mouse("Pressed", *start, button="left", buttons=1, clickCount=1)
-        for part in (0.25, 0.5, 0.75, 1.0):
-            x, y = (a + part * (b - a) for a, b in zip(start, end, strict=True))
-            self.mouse("Moved", x, y, button="left", buttons=1)
-        self.mouse("Released", *end, button="left", clickCount=1)
-
-    def tap(self, x: float, y: float) -> None:
-        """Touch a place of the window."""
-        self.call("Input.dispatchTouchEvent", type="touchStart", touchPoints=[{"x": x, "y": y}])
-        self.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
-
-    def swipe(self, start: tuple[float, float], end: tuple[float, float]) -> None:
-        """Touch, move the finger, let go."""
-        (x0, y0), (x1, y1) = start, end
-        self.call("Input.dispatchTouchEvent", type="touchStart", touchPoints=[{"x": x0, "y": y0}])
-        for part in (0.1, 0.25, 0.5, 0.75, 1.0):
-            point = {"x": x0 + part * (x1 - x0), "y": y0 + part * (y1 - y0)}
-            self.call("Input.dispatchTouchEvent", type="touchMove", touchPoints=[point])
-        self.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
-
     def key(self, name: str, code: int) -> None:
         """Press a key once."""
         words = {"key": name, "code": name, "windowsVirtualKeyCode": code}
@@ -136,10 +94,6 @@ class Tab:
             words["text"] = "\r"
         self.call("Input.dispatchKeyEvent", type="keyDown", **words)
         self.call("Input.dispatchKeyEvent", type="keyUp", key=name, code=name, windowsVirtualKeyCode=code)
-
-    def picture(self, whole: bool = False) -> bytes:
-        """PNG of what is seen, or of the whole page."""
-        return base64.b64decode(self.call("Page.captureScreenshot", captureBeyondViewport=whole)["data"])
 
     def pdf(self) -> bytes:
         """The page as it prints on A4."""

@@ -107,15 +107,6 @@ def test_the_wheel_holds_what_the_packages_hold(tree: Path, wheel: Path) -> None
     assert [name for name in known if found[name] != known[name]] == []
 
 
-def test_the_wheel_is_the_same_from_the_tree(tree: Path, wheel: Path, tmp_path: Path) -> None:
-    """The sdist has all that the wheel is made of."""
-    name = run([sys.executable, "-c", BUILD, "build_wheel", tmp_path], tree).splitlines()[-1]
-    with zipfile.ZipFile(wheel) as one, zipfile.ZipFile(tmp_path / name) as other:
-        assert {item.filename: item.CRC for item in one.infolist()} == {
-            item.filename: item.CRC for item in other.infolist()
-        }
-
-
 def test_the_wheel_works_for_a_user_without_a_home(
     installed: Path, ground: Path, scene_files: Path, make_weights: WeightsMaker
 ) -> None:

@@ -17,7 +17,6 @@ import xarray as xr
 from affine import Affine
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
-from odc.geo.xr import xr_coords
 from rasterio.enums import ColorInterp
 from rich.console import Console
 
@@ -89,19 +88,10 @@ def envi(folder: Path) -> tuple[Path, Affine]:
         return folder / "a.hdr", file.transform
 
 
-def zarr(folder: Path) -> tuple[Path, Affine]:
-    geobox = GeoBox(SHAPE, NORTH_UP, "EPSG:32632")
-    coords = {**xr_coords(geobox, dims=("y", "x")), "wavelength": ("band", np.array(RGB_NM), {"units": "nm"})}
-    values = xr.DataArray(pixels(), coords, ("y", "x", "band"), "values", {"grid_mapping": "spatial_ref"})
-    values.to_dataset().to_zarr(folder / "a.zarr", zarr_format=3, consolidated=False)
-    return folder / "a.zarr", NORTH_UP
-
-
 KINDS: dict[str, Callable[[Path], tuple[Path, Affine]]] = {
     "GeoTIFF": north_up,
     "turned GeoTIFF": turned,
     "turned ENVI": envi,
-    "Zarr": zarr,
 }
 
 
@@ -231,17 +221,8 @@ def test_a_place_is_in_the_keys_of_what_carries_it(tmp_path: Path, weights: Path
 def test_a_pose_is_the_one_place_of_a_run(tmp_path: Path, weights: Path) -> None:
     """With a pose the scene's own place is set aside, and a note says so."""
     scene = write_geotiff(tmp_path / "a.tif", NORTH_UP)
-    words = tmp_path / "posed.toml"
-    words.write_text("[pose]\nlon_deg = 7.6\nlat_deg = 51.96\nheight_m = 30\nheading_deg = 20\ntilt_deg = 35\n")
-    flags = {
-        "scene": str(scene),
-        "source": "sim",
-        "weights": str(weights),
-        "engine": "plain",
-        "out": str(tmp_path / "archive"),
-    }
-    with without_effects():
-        run = run_survey(load_settings(words, {**flags, "budget": 0.8, "accuracy": False, "controls": False}), QUIET)
+    pose = {"lon_deg": 7.6, "lat_deg": 51.96, "height_m": 30, "heading_deg": 20, "tilt_deg": 35}
+    run = survey(scene, weights, tmp_path / "archive", **{f"pose.{name}": value for name, value in pose.items()})
     assert any("[pose] replaces the georeference" in note for note in run.receipt["settings"]["notes"])
     assert "spatial_ref" not in opened(run, "class_map")
     assert "spatial_ref" in opened(run, "ground_map")

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rioxarray  # noqa: F401 - registers the accessor that users have
-import xarray as xr
 
 import spectralzoom
 from spectralzoom.opened import NoRunError, OpenedRun
@@ -84,15 +83,6 @@ def test_runs_are_found_by_name_and_the_latest_comes_first(run: OpenedRun, tmp_p
     assert issubclass(NoRunError, spectralzoom.Error)
 
 
-def test_every_axis_of_every_product_has_a_coordinate(run: OpenedRun) -> None:
-    """Whatever a run has left, nothing has to be counted by hand, and nothing warns."""
-    opened = [*(run.dataset(name) for name in run.products), *run.lines.values(), run.mosaic, run.cube]
-    assert len(opened) > 6
-    for one in opened:
-        assert set(one.sizes) <= set(one.indexes)
-        one.load()
-
-
 def test_classes_are_those_of_the_store(run: OpenedRun) -> None:
     """Numbers stay uint8 with their meanings, also where there is no class."""
     found = run.class_map
@@ -112,14 +102,6 @@ def test_mosaic_and_map_share_their_pixels(run: OpenedRun) -> None:
     joined = mosaic.where(classes == int(classes[0, 0]))  # what has other coordinates is left out
     assert joined.shape == mosaic.shape
     assert np.isfinite(joined.values[0, 0]).all()
-
-
-def test_a_band_is_found_by_its_wavelength(run: OpenedRun) -> None:
-    """By the nearest, in every product that has bands, and by its number still."""
-    for one in (run.mosaic, run.cube, run.lines["coarse-0"]):
-        red = one.sel(wavelength=660, method="nearest")
-        assert float(red.wavelength) == 640
-        xr.testing.assert_identical(red, one.isel(band=0))
 
 
 def test_the_map_on_the_ground_has_its_crs(run: OpenedRun) -> None:

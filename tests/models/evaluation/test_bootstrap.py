@@ -12,13 +12,6 @@ def _frames(runs: int, frames: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 50, (runs, frames, 3, 3))
 
 
-def test_a_row_does_not_differ_from_itself():
-    """Both are judged on the same draw: the interval is 0 to 0, however the frames scatter."""
-    row = _frames(2, 6)
-    found = paired_interval(row, row, draws=50)
-    assert (found.difference, found.low, found.high) == (0, 0, 0)
-
-
 def test_a_worked_case():
     """Two frames: 3/4 of draws by count hold the first, so that the bounds are those of either frame alone."""
     first, second = np.zeros((1, 2, 2, 2), np.int64), np.zeros((1, 2, 2, 2), np.int64)

@@ -7,12 +7,10 @@ import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 
-from models.network.segmenter import PatchScorer, Segmenter, cut
+from models.network.segmenter import PatchScorer, cut
 from models.network.sizes import PLANES, SegmenterConfig
-from models.policies.policies import score_patches
 from models.training.objective import scoring_loss
-from pipeline.geometry.grid import SceneGrid
-from tests.models.conftest import SMALL, Maker, coarse_prediction, make_network, noise
+from tests.models.conftest import SMALL, make_network, noise
 
 IMAGE = noise(0, 1, 4 + PLANES, 64, 96)  # 2 x 3 tokens, 8 x 12 patches
 
@@ -58,18 +56,6 @@ def test_a_composite_holds_patches_where_numbers_say():
             expected[scene, :, y : y + 8, x : x + 8] = fine[scene, place]
     assert torch.equal(model.composite(overview, fine, patch_index), expected)
     assert torch.equal(model.composite(overview, fine[:, :0], patch_index[:, :0]), overview)
-
-
-@torch.inference_mode()
-def test_a_fresh_network_reads_every_capture_alike():
-    """Kernels of the planes begin as 0: before something is learned of them they say nothing."""
-    fresh, learned = Segmenter(SegmenterConfig(**SMALL)).eval(), make_network()
-    other = IMAGE.clone()
-    other[:, -PLANES:] = 0
-    numbers = torch.tensor([[3]])
-    for model, alike in ((fresh, True), (learned, False)):
-        pairs = zip(*(model(one, one, numbers, torch.zeros(1, 2)) for one in (IMAGE, other)), strict=True)
-        assert [torch.equal(*pair) for pair in pairs] == [alike, alike]
 
 
 def test_every_parameter_learns():
@@ -126,12 +112,3 @@ def test_patches_without_a_label_have_no_say():
     assert torch.equal(score.grad != 0, known)
     assert loss == scoring_loss(score.detach().where(known, 9.0), gain, known)
     assert scoring_loss(score, gain, torch.zeros_like(known)) == 0
-
-
-def test_an_overview_tells_gains_and_the_policy_takes_them(tiny: Maker):
-    """Scores of the policy are the gains expected, by the fraction of each patch that lies on the scene."""
-    grid, values = SceneGrid(27, 40, 8, 1), np.random.default_rng(0).random((27, 40, 4))
-    seen = coarse_prediction(tiny(), values, np.linspace(500, 900, 4), grid)
-    assert seen.gain is not None
-    assert seen.gain.shape == grid.patch_shape
-    assert score_patches("gain", seen) == pytest.approx((seen.gain * grid.valid_fraction()).ravel())

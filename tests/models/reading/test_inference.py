@@ -25,7 +25,7 @@ from models.reading.inference import (
 from models.weights.files import Weights, with_record
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid
-from tests.models.conftest import Maker, coarse_prediction, noise, plain_weights, scene_columns
+from tests.models.conftest import Maker, noise, plain_weights, scene_columns
 
 NM = np.linspace(400, 1000, 9)
 NONE = np.empty(0, np.int64)
@@ -188,23 +188,6 @@ def test_a_token_dead_in_most_of_its_pixels_is_left_out(more: int):
     assert (np.isnan(seen.seen_columns).all(axis=-1) == hole).all()
     assert seen.out_of_range is not None
     assert np.count_nonzero(seen.out_of_range) == more + 6  # captured, and no readings
-
-
-def test_what_is_dead_reaches_nobody():
-    """Holes of any content give one map, in either reading; a scene all dead has one too, and so have its patches."""
-    weights, grid, maps = plain_weights(), SceneGrid(64, 64, 8, 1), []
-    fine = noise(1, 3, 8, 8, 4).numpy()
-    for bad in (np.nan, np.inf, -np.inf, 1e30):
-        values, patches = _values(64, 64), fine.copy()
-        values[:33, :32], values[:, 47], patches[0, 2, 1:4] = bad, bad, bad
-        seen = coarse_prediction(weights, values, NM, grid)
-        maps.append(segment(weights, seen, patches, np.array([1, 9, 63])).confidence)
-    assert np.isfinite(maps[0]).all()
-    assert all((other == maps[0]).all() for other in maps[1:])
-    seen = coarse_prediction(weights, np.full((64, 64, 9), np.nan), NM, grid)
-    assert seen.living is not None
-    assert not seen.living.any()
-    assert np.isfinite(segment(weights, seen, fine, np.array([1, 9, 63])).confidence).all()
 
 
 @pytest.mark.parametrize(("dead", "counts"), [(32, True), (33, False), (64, False)])

@@ -141,17 +141,6 @@ def test_one_that_knows_nothing_takes_the_other(reader: TemporalReader | None) -
     assert (after.classes()[0][4:8] == 255).all()
 
 
-@given(seed=seeds, days=st.floats(0, 400))
-def test_without_a_look_the_class_stays_and_fades(seed: int, days: float) -> None:
-    """A memory that nobody looks after keeps its likeliest class, and is never surer than it was."""
-    rng = np.random.default_rng(seed)
-    memory, coarse_pass = a_prior_map(rng, days=days), an_observation(rng)
-    after = fuse(memory, replace(coarse_pass, seen=np.zeros(SHAPE, np.bool_)), None)
-    before = memory.probabilities.log_probability
-    np.testing.assert_array_equal(after.classes()[0], before.argmax(axis=-1))
-    assert (after.log_probability.max(axis=-1) <= before.max(axis=-1) + 1e-5).all()
-
-
 def test_a_surer_look_speaks_against_a_memory_and_a_doubtful_one_does_not() -> None:
     """Without a reader 0.99 for another class wins over 0.9, 0.6 does not; two that agree are surer together."""
     before = np.log(np.array([[[0.9, 0.05, 0.05]] * 3], np.float32))
@@ -293,7 +282,7 @@ def two_maps(seed: int, truth: tuple[NDArray[np.int64], NDArray[np.int64]], nois
 
 
 @pytest.mark.parametrize("noise", [0.3, 0.45, 0.6])
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_two_maps_of_the_same_ground_tell_no_change(seed: int, noise: float) -> None:
     """Though up to one pixel in ten differs; the number that differ is the one expected of the confidences."""
     ground = np.random.default_rng(seed).integers(0, 3, (8, 8)).repeat(32, 0).repeat(32, 1)

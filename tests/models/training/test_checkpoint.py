@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -26,15 +25,6 @@ def example(seed: int = 1) -> Example:
     """A small scene of noise with labels by its sign."""
     columns = np.random.default_rng(seed).normal(0, 1, (32, 32, 2))
     return Example("e", columns.astype(np.float16), (columns[..., 0] > 0).astype(np.uint8), (32, 32))
-
-
-def left_behind(file: Path, identity: str) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
-    """What a run that was killed after four steps left in its checkpoint."""
-    with pytest.raises(KeyboardInterrupt):
-        train(CONFIG, [example()], SHIFT, SETTINGS, killed_after(4), checkpoint=file, keep_every_s=0)
-    found = load_checkpoint(file, identity)
-    assert found is not None
-    return found
 
 
 def test_a_killed_run_goes_on_to_the_same_weights(tmp_path: Path) -> None:

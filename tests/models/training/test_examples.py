@@ -55,15 +55,6 @@ def test_the_look_at_a_padded_scene():
     assert np.abs(seen.columns[40:44] - seen.columns[38:34:-1]).mean() < 0.1
 
 
-def test_exposure_changes_noise_and_not_reflectance():
-    """A quarter of the exposure gives the same mean columns with more noise."""
-    short = replace(CAMERA, exposure_ms=CAMERA.exposure_ms / 4)
-    usual, other = (_observed(_scene(), seed=seed).columns for seed in (0, 1))
-    brief, again = (_observed(_scene(), short, seed).columns for seed in (0, 1))
-    assert brief.mean() == pytest.approx(usual.mean(), rel=0.01)
-    assert (brief - again).std() > 1.8 * (usual - other).std()
-
-
 def test_scenes_without_labels_teach_nothing():
     """A scene without labels, and examples without one labelled pixel, are refused."""
     with pytest.raises(SceneError, match="scene s has no labels"):

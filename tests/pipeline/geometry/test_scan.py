@@ -68,14 +68,6 @@ def test_lines_and_samples_are_found_at_whole_numbers(step: int, binning: int):
     assert found[..., 1] == pytest.approx(np.broadcast_to(np.arange(float(count)), (5, count)), abs=1e-8)
 
 
-def test_a_line_through_the_axis_is_straight_and_unturned():
-    """On the strip through the axis points keep their scan coordinate and stretch along the line only."""
-    along, scan = points_of_scan(0.0, CAMERA, np.array([-2000.0, 0.0, 2000.0])[:, None], CAMERA.pixel_slopes())
-    assert scan == pytest.approx(np.broadcast_to([[-2000.0], [0.0], [2000.0]], scan.shape), abs=1e-9)
-    assert along[1] == pytest.approx(np.arange(640) - 319.5, abs=1e-9)
-    assert along[2, -1] > 319.5
-
-
 def test_lines_stand_in_the_middle_of_their_held_positions():
     """Mid exposure is the mean of the positions held during it, one px apart."""
     path = sweep(step=4)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
-from pipeline.geometry.scan import Sweep, line_positions, points_of_scan, scene_to_sweep
+from pipeline.geometry.scan import points_of_scan
 from pipeline.rectify.geolocation import path_geolocation
 from pipeline.rectify.placed import tie_table
 from pipeline.rectify.resample import resample
@@ -39,24 +39,6 @@ def test_lookup_undoes_the_rays(swath: float, start: float, binning: int, seed: 
     points = see(aim(swath, start + at[:, 0]), at[:, 1], binning)
     found = geolocation(aim(swath, start + np.arange(float(lines))), CAMERA, points, along="x", binning=binning)
     np.testing.assert_allclose(found, at, atol=1e-7)
-
-
-@given(places, places, st.sampled_from(["x", "y"]), st.sampled_from([1, 4]), st.integers(0, 99))
-@settings(max_examples=20, deadline=None)
-def test_lookup_agrees_with_the_plan(swath: float, start: float, along: str, step: int, seed: int) -> None:
-    """Where a planned sweep expects a point, the geolocation grid finds it from the mirror's positions alone."""
-    sweep = Sweep("a", "coarse", along, swath, start, lines=30, step=step, binning=step)  # type: ignore[arg-type]
-    rng = np.random.default_rng(seed)
-    slopes, centres = rng.uniform(-0.033, 0.033, 40), start + rng.uniform(1, 29 * step, 40)
-    on_line, on_scan = points_of_scan(swath, CAMERA, centres, slopes)
-    planned = scene_to_sweep(sweep, CAMERA, on_line, on_scan)
-    points = np.stack([on_scan, on_line] if along == "x" else [on_line, on_scan], axis=-1)
-    found = geolocation(line_positions(sweep, CAMERA), CAMERA, points, along=sweep.along, binning=step)
-    outer = (
-        np.abs(planned[:, 0] - 14.5) > 14.5
-    )  # beyond the outermost centres the geolocation grid goes on in equal steps
-    np.testing.assert_allclose(found[~outer], planned[~outer], atol=1e-7)
-    np.testing.assert_allclose(found[outer], planned[outer], atol=1e-3)
 
 
 def test_backward_sweep_counts_from_its_own_start() -> None:
@@ -123,17 +105,6 @@ def test_linear_scene_comes_back_from_any_path(seed: int, amount: float, swath: 
     assert whole.sum() > 500
 
 
-def test_evenness_changes_nothing_but_the_way() -> None:
-    """The closed form and Newton agree: lines 1e-6 px out of even give the same coordinates to 1e-5."""
-    points = np.random.default_rng(5).uniform((0, 2300), (119, 2900), (500, 2))
-    (even,) = make_scan_paths(aim(2600.0, np.arange(120.0)), CAMERA)
-    uneven = wandering_scan_path(1, 1e-6)
-    assert even.uniform
-    assert not uneven.uniform
-    first, second = (path_geolocation(scan_path, CAMERA, points, along="x") for scan_path in (even, uneven))
-    np.testing.assert_allclose(first, second, atol=1e-5)
-
-
 def scan_path_of(along_px: np.ndarray | float, scan_px: np.ndarray) -> ScanPath:
     """The one track of lines that look at points given in px along the line and the scan."""
     (scan_path,) = make_scan_paths(aim(along_px, scan_px), CAMERA)
@@ -191,20 +162,6 @@ def test_bound_holds_over_the_field(swath: float, start: float, along: str, spac
     assert np.nanmax(np.abs(found - truth), initial=0) <= table.bound_px + 1e-12 <= 2e-3
     inside = (np.abs(truth - [64.5, 319.5]) < np.array([65, 320]) - 0.01).all(axis=-1)
     assert np.isfinite(found[inside]).all()
-
-
-@pytest.mark.parametrize("tie", [16, 1])
-def test_parts_are_those_of_the_whole(tie: int) -> None:
-    """Any part of the grid is, bit by bit, what the whole grid gives there; empty parts are empty."""
-    table = tie_table(scan_path_of(*PATHS["even"]), CAMERA, along="x", tie=tie, **GRID)
-    whole = table.coordinates(*EVERYTHING)
-    for rows, columns in (
-        (slice(0, 1), slice(0, 1)),
-        (slice(31, 33), slice(15, 700)),
-        (slice(169, 170), slice(64, 81)),
-    ):
-        np.testing.assert_array_equal(table.coordinates(rows, columns), whole[rows, columns])
-    assert table.coordinates(slice(5, 5), slice(0, 9)).shape == (0, 9, 2)
 
 
 def test_knots_that_nothing_saw_are_left_out() -> None:

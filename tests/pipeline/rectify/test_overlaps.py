@@ -13,11 +13,11 @@ import pytest
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import Axis, Sweep, line_positions, points_of_scan, sweep_to_scene
+from pipeline.geometry.scan import Axis, Sweep, points_of_scan, sweep_to_scene
 from pipeline.lazy import Once
 from pipeline.planning.coverage import full_sweeps, uniform_sweeps
 from pipeline.rectify.registration.alignment import no_shifts
-from pipeline.rectify.registration.overlaps import BroadSweep, PlacedImage, overlap_windows, places_seen
+from pipeline.rectify.registration.overlaps import BroadSweep, PlacedImage, overlap_windows
 from pipeline.rectify.registration.seams import Registration, place_images, register_sweeps
 from pipeline.signal.lines import broad_bands
 from pipeline.simulator.effects.pointing import PointingErrors
@@ -172,10 +172,3 @@ def test_turn_is_how_places_move_with_the_swath():
     np.testing.assert_allclose(turn[:, 0], there - here, atol=1e-5)
     assert np.abs(turn - np.eye(2)).max() > 1e-3
     assert np.isfinite(place_images([broad], no_shifts(["s"]), CAMERA)[0].edges).all()
-
-
-def test_places_are_those_of_the_scan():
-    """Rays from mirror positions meet the places that the scan's closed form gives."""
-    sweep = Sweep("s", "fine", "x", 900.0, -700.0, 30)
-    seen = places_seen(line_positions(sweep, CAMERA), CAMERA.pixel_slopes(), CAMERA)
-    np.testing.assert_allclose(np.moveaxis(seen, -1, 0), sweep_to_scene(sweep, CAMERA), atol=1e-7)

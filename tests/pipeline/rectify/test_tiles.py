@@ -153,17 +153,6 @@ def test_raw_lines_are_projected_as_they_are_held(kind: type[Taken]) -> None:
     assert cache_bytes(placed, tiles, 1) < whole.bytes_held <= cache_bytes(placed, tiles, len(tiles))
 
 
-def test_only_chunks_of_samples_that_a_column_needs_are_read() -> None:
-    """A narrow column takes a part of every line, in whole chunks of 32 samples."""
-    lines = taken(TURNED, kind=Cropped)
-    placed = [place(lines, CAMERA)]
-    grid = PixelGrid((3040.0, -4700.0), 1, (64, 20))
-    in_tiles(placed, grid, (64, 640), LineCache(2**20))
-    first, last = (edge(asked[side] for asked in lines.asked) for edge, side in ((min, 2), (max, 3)))
-    assert first % 32 == 0
-    assert last - first < CAMERA.samples
-
-
 @given(st.integers(-100, 300), st.integers(-250, 250), st.integers(1, 60), st.integers(1, 60))
 @settings(max_examples=25, deadline=None)
 def test_reach_is_never_too_little(row: int, column: int, height: int, width: int) -> None:
