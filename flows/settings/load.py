@@ -374,6 +374,8 @@ def _scene_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]
         yield (f"{at('interest')} = {settings.interest:g} is for the scene scouting, and the scene is {scene}")
     if settings.pose is None and settings.map != MapChoice():
         yield "[map] needs to know where the rig stands: give [pose]"
+    if settings.zones.plots_name is not None and settings.zones.plots is None:
+        yield f"{at('zones.plots_name')} = {settings.zones.plots_name!r} names plots: give --plots FILE too"
     camera = settings.camera
     if camera.dark_dn >= camera.full_scale_dn:
         yield (

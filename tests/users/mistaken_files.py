@@ -40,19 +40,12 @@ def _pictures(here: Path, picture: np.ndarray) -> None:
     Image.fromarray(np.full_like(picture, 90)).save(here / "constant.png")
     (here / "cut.png").write_bytes((here / "field.png").read_bytes()[:200])
     (here / "text.png").write_text("this is a text\n")
-    (here / "empty.png").touch()
     (here / "field.jp2").write_bytes(b"\0\0\0\x0cjP  ")
-    (here / "field.pdf").write_bytes(b"%PDF-1.4")
     (here / "field.fits").write_bytes(b"SIMPLE  =                    T")
-    (here / "text.zip").write_text("this is a text\n")
     shutil.copy(here / "field.png", here / "no_ending")
     shutil.copy(here / "field.png", here / "field.tif")
     (here / "loop.png").symlink_to("loop.png")
-    for name, values in {
-        "small_labels.png": labels[:20],
-        "rgba_labels.png": np.dstack([labels * 255] * 3 + [np.full_like(labels, 255)]),
-        "two_classes.png": labels,
-    }.items():
+    for name, values in {"small_labels.png": labels[:20], "two_classes.png": labels}.items():
         Image.fromarray(values).save(here / name)
     Image.fromarray(np.dstack([labels * 255, labels * 90, labels * 0])).resize((32, 24)).save(here / "labels.jpg")
 
@@ -73,13 +66,11 @@ def _arrays(here: Path, cube: np.ndarray) -> None:
         "plane": cube[..., 0],
         "table": np.ones((198, 10000), np.float32),
         "five_axes": np.ones((2, 2, 3, 3, 2)),
-        "complex": cube.astype(np.complex64),
         "series": np.stack([cube, cube + 1, cube + 2]),
         "empty": np.ones((0, 16, 5)),
     }.items():
         np.save(here / f"{name}.npy", values)
     np.save(here / "objects.npy", np.array([{"soil": 1}], object), allow_pickle=True)
-    (here / "cut.npy").write_bytes((here / "cube.npy").read_bytes()[:500])
     np.savez(here / "two.npz", north=cube, south=cube)
     np.savez(here / "series.npz", visits=np.stack([cube, cube + 1]), days=np.arange(2))
 
@@ -108,7 +99,6 @@ def _containers(here: Path, cube: np.ndarray) -> None:
     old = zarr.create_group(here / "old.zarr", zarr_format=2)
     old.create_array("0", data=cube)
     zarr.create_group(here / "hollow.zarr")
-    (here / "packed.zip").write_bytes(b"PK\x05\x06" + bytes(18))
 
 
 def _texts(here: Path) -> None:
@@ -119,11 +109,8 @@ def _texts(here: Path) -> None:
     (here / "unknown.toml").write_text('scene = "field.png"\nbuget = 0.8\n')
     (here / "broken.toml").write_text("scene = field.png\n")
     (here / "latin.toml").write_bytes('scene = "Rüben.png"\n'.encode("latin-1"))
-    (here / "twice.toml").write_text("budget = 0.8\nbudget = 0.9\n")
     (here / "a_file").write_text("no archive")
     (here / "empty").mkdir()
-    (here / "notes").mkdir()
-    (here / "notes" / "read.txt").write_text("soon")
 
 
 def _folders(here: Path, picture: np.ndarray) -> None:

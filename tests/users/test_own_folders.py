@@ -16,7 +16,7 @@ from PIL import Image
 from flows.evaluate.frames import EvaluateRequest, open_candidates, open_frames, sort_frames
 from flows.settings.load import load_settings
 from flows.tasks.scene import open_scene
-from flows.training.data import alike_notes, load_data_set, open_training_data
+from flows.training.data import load_data_set, open_training_data
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 from storage.readers.scene_files import load_scene_file
@@ -151,4 +151,4 @@ def test_frames_of_one_class_are_told_when_weights_are_judged(made: Path, weight
     candidates, choices = open_candidates((weights,)), {"labels": None, "bands": None, "wavelengths": None}
     data = open_frames(str(made / "soil"), (), None, LineCamera(), choices)
     jobs = sort_frames(EvaluateRequest(str(made / "soil"), (weights,)), data, candidates, lambda *words: None)
-    assert alike_notes(jobs.alike)[0].startswith("all labels are class_0 in 001, 002; if its value")
+    assert jobs.notes[0].startswith("all labels are class_0 in 001, 002; if its value")

@@ -10,9 +10,7 @@ import geopandas
 import numpy as np
 import pandas
 import pytest
-import rasterio
 import shapely
-from PIL import Image
 
 from flows.publish.run_folder import Published
 from flows.settings.load import load_settings, parse_settings
@@ -21,7 +19,7 @@ from pipeline.errors import SettingsError, ZoneError
 from pipeline.geometry.grid import UNLABELLED
 from storage.archive.archive import Archive
 from storage.arrays.class_maps import ClassMap, ProbabilityStore, load_class_map
-from storage.arrays.mosaics import chosen_patches, load_attention, open_mosaic
+from storage.arrays.mosaics import chosen_patches, load_attention
 from tests.conftest import Survey
 from tests.prior_work import without_effects
 from tests.users.zone_sketches import sketch
@@ -157,25 +155,6 @@ def test_nothing_is_believed_of_what_was_left_out(kept_to: tuple[Path, Published
     assert np.array_equal(np.isfinite(age), classed)
 
 
-def test_a_plain_scan_cuts_the_patches_of_the_area(survey_png: Survey, zones: dict[str, str], tmp_path: Path) -> None:
-    """Each patch shows the picture where it lies; no patch outside is cut, and the map keeps to the area as well."""
-    plain = {"scan_step": 1, "budget": None, "camera.samples": 64, "accuracy": False}
-    published = survey_png(tmp_path, **plain, **zones)
-    products = published.receipt["products"]
-    chosen, seen = chosen_patches(tmp_path / products["attention"]), open_mosaic(tmp_path / products["mosaic"]).values()
-    row, column = np.divmod(chosen, 16)
-    values = np.array([seen[8 * y : 8 * y + 8, 8 * x : 8 * x + 8] for y, x in zip(row, column, strict=True)])
-    with Image.open(published.receipt["settings"]["scene"]) as found:
-        picture = np.asarray(found, np.float64)
-    there = [picture[8 * y : 8 * y + 8, 8 * x : 8 * x + 8] for y, x in zip(row, column, strict=True)]
-    assert 20 < len(chosen) < 16 * 12
-    assert np.abs(np.nan_to_num(values - there)).mean() < 2
-    boxes = shapely.box(8 * column, 8 * row, 8 * column + 8, 8 * row + 8)
-    assert shapely.intersects(boxes, AREA).all()
-    assert not (shapely.area(shapely.intersection(boxes, NO_GO)) > 0).any()
-    assert ((drawn(tmp_path, published).classes != UNLABELLED) <= inside(AREA.buffer(1e-6))).all()
-
-
 def test_a_visit_with_zones_keeps_the_memory_of_the_rest(
     survey_png: Survey, surveyed_png: Survey, zones: dict[str, str], tmp_path: Path
 ) -> None:
@@ -190,26 +169,6 @@ def test_a_visit_with_zones_keeps_the_memory_of_the_rest(
     assert np.array_equal(before[0][away].argmax(axis=-1), after[0][away].argmax(axis=-1))
     assert np.isfinite(after[0]).all()
     assert (after[2][away] <= before[2][away] + 1e-6).all()
-
-
-def test_a_georeferenced_scene_takes_polygons_by_its_transform(
-    survey_png: Survey, scene_files: Path, tmp_path: Path
-) -> None:
-    """Pixels of 10 cm: an area of 8 x 6 m on the map, given in degrees, is 80 x 60 of them and 48 square metres."""
-    with Image.open(scene_files / "scene.png") as found:
-        values = np.asarray(found).transpose(2, 0, 1)
-    grid = {"crs": 32632, "transform": rasterio.Affine(0.1, 0, 404000, 0, -0.1, 5757000)}
-    about = {"driver": "GTiff", "width": 128, "height": 96, "count": 3, "dtype": "uint8"}
-    with rasterio.open(tmp_path / "field.tif", "w", **about, **grid) as file:
-        file.write(values)
-    area = geopandas.GeoSeries([shapely.box(404002, 5756993, 404010, 5756999)], crs=32632).to_crs(4326).iloc[0]
-    path = sketch(tmp_path / "area.gpkg", {"mine": area}, 4326)
-    flags = {"scene": str(tmp_path / "field.tif"), "labels": None, "wavelengths": "640,550,460", "camera.samples": 64}
-    published = survey_png(tmp_path / "archive", **flags, **{"zones.area": path, "zones.plots": path})
-    rows, columns = np.nonzero(drawn(tmp_path / "archive", published).classes != UNLABELLED)
-    assert (rows.min(), rows.max(), columns.min(), columns.max(), len(rows)) == (10, 69, 20, 99, 4800)
-    assert published.receipt["plots"][0]["area_m2"] == pytest.approx(48, rel=2e-3)
-    assert published.receipt["zones"]["kept_m2"] == pytest.approx(48, rel=2e-3)
 
 
 def test_a_zone_of_the_whole_field_changes_no_bit(survey_png: Survey, surveyed_png: Survey, tmp_path: Path) -> None:
