@@ -78,10 +78,9 @@ def test_bits_flipped_in_weights_and_checkpoints(tmp_path: Path) -> None:
     assert found.refused > 100
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_mutated_headers_end_well(seed: int) -> None:
+def test_mutated_headers_end_well() -> None:
     """Each header gives a cube or one clear error, soon, in about the memory that the files take."""
-    found = mutated_files.try_headers(300, mutated_files.real_headers(), seed)
+    found = mutated_files.try_headers(300, mutated_files.real_headers(), seed=1)
     assert found.wrong == []
     assert found.read > 20  # else nothing but the first check was tried
     assert found.refused > 20
@@ -90,11 +89,11 @@ def test_mutated_headers_end_well(seed: int) -> None:
 @pytest.mark.filterwarnings("ignore::Warning")  # decoders may warn of what they then refuse
 def test_mutated_files_end_well() -> None:
     """Each file gives a cube or one clear error, soon, in memory bounded by its size."""
-    found = mutated_files.try_files(18 * len(FORMATS), seed=7).values()
+    found = mutated_files.try_files(8 * len(FORMATS), seed=7).values()
     assert [line for tally in found for line in tally.wrong] == []
-    assert min(tally.read + tally.refused for tally in found) == 18
-    assert sum(tally.refused for tally in found) > 40
-    assert sum(tally.read for tally in found) > 40
+    assert min(tally.read + tally.refused for tally in found) == 8
+    assert sum(tally.refused for tally in found) > 20
+    assert sum(tally.read for tally in found) > 20
 
 
 def test_a_fault_that_is_not_survived_is_seen(subject: Subject) -> None:

@@ -4,11 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -209,33 +204,3 @@ def test_a_source_that_changes_meanwhile(
     with pytest.raises(SceneError, match="changed while it was read; ingest it again once it is whole"):
         ingest(header, tmp_path / "archive")
     assert Archive.open(tmp_path / "archive").refs() == []
-
-
-CODE = """
-import sys
-from pathlib import Path
-from rich.console import Console
-from flows.archive.ingest_command import run_ingest
-print("go", flush=True)
-run_ingest(sys.argv[1], Path(sys.argv[2]), Console(quiet=True))
-"""
-
-
-@pytest.mark.parametrize("wait_s", [0.05, 0.15])
-def test_killed_it_leaves_nothing_half_made(tmp_path: Path, wait_s: float) -> None:
-    """After kill -9 the archive verifies, and the next ingest gives the store of an undisturbed one."""
-    rng = np.random.default_rng(3)
-    header = write_envi(tmp_path / "a.img", rng.integers(0, 4096, (640, 320, 3), dtype=np.uint16))
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3]), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-c", CODE, str(header), str(tmp_path / "archive")]
-    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE) as process:
-        assert process.stdout is not None
-        process.stdout.readline()
-        time.sleep(wait_s)
-        process.send_signal(signal.SIGKILL)
-    archive = Archive.open(tmp_path / "archive")
-    assert all(finding.problem is None for finding in verify_archive(archive))
-    record, undisturbed = ingest(header, tmp_path / "archive"), ingest(header, tmp_path / "other")
-    assert record["key"] == undisturbed["key"]
-    xr.testing.assert_identical(opened(record), opened(undisturbed))
-    assert not list((tmp_path / "archive").rglob("*.part"))

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import builtins
-import errno
 import os
 import shutil
 import subprocess
 import sys
-from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import numpy as np
 import pytest
@@ -47,7 +42,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory, scene_files: Path, weights:
     for name, values in {
         "small": labels[:50],
         "tiny": picture[:5, :6],
-        "odd": picture[:37, :53],
         "black": np.zeros_like(picture[:32, :48]),
     }.items():
         Image.fromarray(values).save(here / f"{name}.png")
@@ -141,7 +135,6 @@ WORKS = {
     "one band": ("--scene one.npy --wavelengths 550 --budget 1", "wavelengths stated: 550 nm"),
     "wavelengths out of order": ("--scene cube.npy --wavelengths 640,460,500,550,620,600 --budget 1", "640, 460"),
     "scene smaller than a patch": ("--scene tiny.png --budget 1", RAN),
-    "odd sizes": ("--scene odd.png --budget 1", RAN),
     "NaN pixels": (f"--scene gaps.npy --wavelengths {NM} --budget 1", "91 pixels without a value were given"),
     "all black": ("--scene black.png --budget 1", RAN),
 }
@@ -235,93 +228,3 @@ def test_real_process_ends_with_the_code(folder: Path) -> None:
     assert (ended.returncode, ended.stdout) == (2, "")
     assert ended.stderr.startswith("error: --budget must be a fraction of the full scan's seconds")
     assert ended.stderr.count("\n") == 1
-
-
-# --- a disk that refuses ----------------------------------------------------------------------------------------------
-
-
-@dataclass
-class FullDisk:
-    """Files below ``root`` take ``left`` writes (opened, written to by descriptor, renamed); then the disk is full."""
-
-    root: Path
-    left: float
-    writes: int = 0
-
-    def _spend(self, path: object) -> None:
-        if isinstance(path, str | Path) and Path(path).absolute().is_relative_to(self.root):
-            self.writes += 1
-            if self.writes > self.left:
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
-
-    def __enter__(self) -> FullDisk:
-        """Stand between Python and the disk."""
-        real_open, real_write, real_rename = builtins.open, os.write, os.rename
-
-        def open_(file: Any, mode: str = "r", *rest: Any, **named: Any) -> Any:
-            if set(mode) & set("wax+"):
-                self._spend(file)
-            return real_open(file, mode, *rest, **named)
-
-        def write(descriptor: int, content: Any) -> int:
-            self._spend(str(Path(f"/proc/self/fd/{descriptor}").resolve()))
-            return real_write(descriptor, content)
-
-        def rename(old: Any, new: Any, **named: Any) -> None:
-            self._spend(new)
-            real_rename(old, new, **named)
-
-        self._patches = ExitStack()
-        for name, value in {"io.open": open_, "builtins.open": open_, "os.write": write, "os.rename": rename}.items():
-            self._patches.enter_context(mock.patch(name, value))
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._patches.close()
-
-
-FULL_WORDS = "--labels labels.png --budget 0.7 --keep raw --effects none"
-
-
-@pytest.fixture(scope="module")
-def undisturbed(folder: Path, tmp_path_factory: pytest.TempPathFactory, survey_png: Any) -> tuple[int, np.ndarray]:
-    """Writes of a whole survey, and its class map."""
-    out = tmp_path_factory.mktemp("undisturbed")
-    with FullDisk(out, np.inf) as disk:
-        survey_png(
-            out,
-            keep="raw",
-            budget="0.7",
-            effects="none",
-            scene=str(folder / "scene.png"),
-            weights=str(folder / "w.safetensors"),
-        )
-    return disk.writes, class_map(Archive.open(out))
-
-
-@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="tells a descriptor's file by /proc")
-@pytest.mark.parametrize("fraction", [0.0, 0.4, 0.985, 0.9999])
-def test_full_disk_anywhere_in_a_survey(
-    fraction: float,
-    undisturbed: tuple[int, np.ndarray],
-    folder: Path,
-    tmp_path: Path,
-    command_line: Any,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """One message, exit 1, published stores whole and nothing half-made; with space again the rerun ends well."""
-    monkeypatch.chdir(folder)
-    writes, expected = undisturbed
-    out = tmp_path / "archive"
-    with FullDisk(out, int(fraction * writes)) as disk:
-        ended = command_line(*survey_words(FULL_WORDS, str(out)))
-    assert disk.writes > int(fraction * writes)
-    ended.refused(1, "the disk is full: free some space")
-    archive = Archive.open(out)
-    published = {ref.uri: contents(ref.path) for ref in archive.refs()}
-    assert [finding.problem for finding in verify_archive(archive) if finding.problem] == []
-    assert not [path for path in out.rglob("*.part") if "spool" not in path.parts]
-    assert command_line(*survey_words(FULL_WORDS, str(out))).code == 0
-    assert {uri: contents(out / uri) for uri in published} == published
-    np.testing.assert_array_equal(class_map(archive), expected)
-    assert archive.runs()
