@@ -7,17 +7,8 @@ from random import Random
 
 import pytest
 
-from tests.faults import (
-    checksummed_flips,
-    disk_full,
-    growing_files,
-    lost_lines,
-    many_writers,
-    mutated_files,
-    small_survey,
-)
+from tests.faults import checksummed_flips, disk_full, lost_lines, many_writers, mutated_files, small_survey
 from tests.faults.cube_files import FORMATS
-from tests.faults.fault_table import Row, markdown_table, plain_table
 from tests.faults.small_survey import Subject, stored
 
 
@@ -63,13 +54,6 @@ def test_capture_killed(tmp_path: Path) -> None:
     assert set(found.lost) == {0}
 
 
-def test_bit_flips_in_a_spool(tmp_path: Path) -> None:
-    """One line at most is lost, and none is another."""
-    found = growing_files.flip_spool(60, tmp_path, seed=2)
-    assert found.wrong == []
-    assert 0 < found.told < found.flips  # lines since the last sync are captured again
-
-
 def test_bits_flipped_in_weights_and_checkpoints(tmp_path: Path) -> None:
     """Each is refused in one message, or read as it was written."""
     found = checksummed_flips.flip_bits(150, tmp_path, seed=1)
@@ -109,10 +93,3 @@ def test_a_fault_that_is_not_survived_is_seen(subject: Subject) -> None:
     assert any("bytes, expected" in one for one in wrong)
     assert any("was lost" in one for one in wrong)
     assert not subject.nursery.run(["survey", "--scene", "nowhere.png", "--out", str(out)]).told
-
-
-def test_the_table_has_every_row(tmp_path: Path) -> None:
-    """Also as Markdown, where what is not met says so."""
-    rows = [Row("a", "by hand", 3, "nothing", "0 wrong", True, 1.4), Row("b", "x | y", 1, "z", "1 wrong", False, 2.0)]
-    assert plain_table(rows).splitlines()[-1].split() == ["b", "x", "|", "y", "1", "z", "1", "wrong", "NO", "2"]
-    assert "| b | x \\| y | 1 | z | 1 wrong | NO | 2 |" in markdown_table(rows)

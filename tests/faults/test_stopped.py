@@ -19,14 +19,12 @@ import pytest
 from flows.publish.receipt import check_receipt, is_pending
 from flows.terminal.processes import TERMINATED
 from storage.archive.archive import Archive
-from storage.arrays.spool import Spool
 from tests.faults.nursery import Ended
 from tests.faults.small_survey import Subject, problems, stored, words, wrong_after_fault, wrong_after_rerun
 from tests.receipts import comparable
 
 GOING_ON = "terminated; run the same command to resume"
 SYNC = 60  # of a survey's files, before which it is stopped
-TAKEN = 9  # lines of a sweep
 CODES = {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: TERMINATED}
 BEGUN = ("flows.tasks.stages.accuracy:load_class_map", 1)
 PLACES = {  # function and call before which a survey is stopped that has its map, and with what
@@ -58,20 +56,6 @@ def test_a_survey_that_is_terminated(subject: Subject, tmp_path: Path) -> None:
     assert told(ended), (ended.code, ended.text)
     assert problems(out) == []
     assert wrong_after_rerun(subject, out, subject.nursery.run(words(out)), runs=1) == []
-
-
-def test_a_capture_keeps_every_line(subject: Subject, tmp_path: Path) -> None:
-    """Lines that were there when it came are in the spool, which was closed as at any end."""
-    out = tmp_path / "archive"
-    ended = subject.nursery.run(
-        words(out), "end_before", place="storage.arrays.spool:Spool.append", number=signal.SIGTERM, call=TAKEN + 1
-    )
-    assert told(ended), ended.text
-    (lines,) = out.glob("spool/*/*.lines")
-    facts = json.loads(lines.read_bytes().split(b"\n")[0])
-    header = facts["header"]
-    with Spool.open(lines.parent, facts["samples"], facts["bands"], header=header, name=lines.stem) as spool:
-        assert [line.valid for block in spool.blocks() for line in block] == [True] * TAKEN
 
 
 # --- while the map is judged ------------------------------------------------------------------------------------------
