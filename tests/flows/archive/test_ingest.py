@@ -17,8 +17,6 @@ import flows.archive.ingest_command
 from flows.archive.ingest_command import run_ingest
 from pipeline.errors import ArchiveError, SceneError
 from storage.archive.archive import Archive
-from storage.readers.cube_sources import CubeSource
-from storage.readers.open_cubes import open_cube
 from storage.readers.scene_files import load_scene_file
 from storage.remote.opening import verify_archive
 
@@ -163,29 +161,6 @@ def test_names_that_lead_elsewhere(tmp_path: Path, raw: NDArray[np.uint16], name
     with pytest.raises(ArchiveError, match="cannot be a name in an archive"):
         ingest(header, tmp_path / "archive", name=name)
     assert not (tmp_path / "archive").exists()
-
-
-def test_a_source_that_fails_half_way(tmp_path: Path, raw: NDArray[np.uint16], monkeypatch: pytest.MonkeyPatch) -> None:
-    """An error in the middle leaves no store, and the next ingest makes it."""
-    header = write_envi(tmp_path / "a.img", raw)
-
-    def torn(path: str, **references: Any) -> CubeSource:
-        source = open_cube(path, **references)
-        object.__setattr__(source, "read", lambda start, stop: _raise() if start else raw[start:stop])
-        return source
-
-    with monkeypatch.context() as patch:
-        patch.setattr(flows.archive.ingest_command, "open_cube", torn)
-        with pytest.raises(SceneError, match="torn"):
-            ingest(header, tmp_path / "archive")
-    archive = Archive.open(tmp_path / "archive")
-    assert archive.refs() == []
-    assert not list((tmp_path / "archive").rglob("*.part"))
-    assert not ingest(header, tmp_path / "archive")["cached"]
-
-
-def _raise() -> None:
-    raise SceneError("torn")
 
 
 def test_a_source_that_changes_meanwhile(

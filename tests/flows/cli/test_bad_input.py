@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +16,6 @@ from storage.arrays.class_maps import load_class_map
 from storage.remote.opening import verify_archive
 from tests.flows.conftest import act_instead
 
-ROOT = Path(__file__).parents[3]
 NM = "460,500,550,600,620,640"
 RAN = "Report: "
 CAMERA = "[camera]\nsamples = 64\n"  # a narrow one: most of a small survey's time goes into samples beside the field
@@ -179,13 +175,3 @@ def test_training_refused_with_one_message(
     monkeypatch.chdir(folder)
     command_line("train", *words.split()).refused(code, message)
     assert not list(folder.glob("new.safetensors*"))
-
-
-def test_real_process_ends_with_the_code(folder: Path) -> None:
-    """What the shell sees: exit code, one message on stderr, nothing on stdout."""
-    command = [sys.executable, "-m", "flows.cli.main", *survey_words("--budget 1.5", "never_made")]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "80"}
-    ended = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-    assert (ended.returncode, ended.stdout) == (2, "")
-    assert ended.stderr.startswith("error: --budget must be a fraction of the full scan's seconds")
-    assert ended.stderr.count("\n") == 1

@@ -57,7 +57,7 @@ def scheduling(prefect_home: Path) -> Iterator[str]:
 @pytest.fixture
 def north(field_file: Callable[..., Path]) -> Any:
     """The field north, which is due at six in Berlin."""
-    return load_fields([field_file("north", effects="none")])[0]
+    return load_fields([field_file("north", source="raster", budget=None)])[0]
 
 
 def deployed(field: Any) -> Any:
