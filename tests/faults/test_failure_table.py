@@ -7,17 +7,8 @@ from random import Random
 
 import pytest
 
-from tests.faults import (
-    checksummed_flips,
-    disk_full,
-    growing_files,
-    lost_lines,
-    many_writers,
-    mutated_files,
-    small_survey,
-)
+from tests.faults import checksummed_flips, disk_full, lost_lines, many_writers, mutated_files, small_survey
 from tests.faults.cube_files import FORMATS
-from tests.faults.fault_table import Row, markdown_table, plain_table
 from tests.faults.small_survey import Subject, stored
 
 
@@ -63,13 +54,6 @@ def test_capture_killed(tmp_path: Path) -> None:
     assert set(found.lost) == {0}
 
 
-def test_bit_flips_in_a_spool(tmp_path: Path) -> None:
-    """One line at most is lost, and none is another."""
-    found = growing_files.flip_spool(60, tmp_path, seed=2)
-    assert found.wrong == []
-    assert 0 < found.told < found.flips  # lines since the last sync are captured again
-
-
 def test_bits_flipped_in_weights_and_checkpoints(tmp_path: Path) -> None:
     """Each is refused in one message, or read as it was written."""
     found = checksummed_flips.flip_bits(150, tmp_path, seed=1)
@@ -78,10 +62,9 @@ def test_bits_flipped_in_weights_and_checkpoints(tmp_path: Path) -> None:
     assert found.refused > 100
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_mutated_headers_end_well(seed: int) -> None:
+def test_mutated_headers_end_well() -> None:
     """Each header gives a cube or one clear error, soon, in about the memory that the files take."""
-    found = mutated_files.try_headers(300, mutated_files.real_headers(), seed)
+    found = mutated_files.try_headers(300, mutated_files.real_headers(), seed=1)
     assert found.wrong == []
     assert found.read > 20  # else nothing but the first check was tried
     assert found.refused > 20
@@ -90,11 +73,11 @@ def test_mutated_headers_end_well(seed: int) -> None:
 @pytest.mark.filterwarnings("ignore::Warning")  # decoders may warn of what they then refuse
 def test_mutated_files_end_well() -> None:
     """Each file gives a cube or one clear error, soon, in memory bounded by its size."""
-    found = mutated_files.try_files(18 * len(FORMATS), seed=7).values()
+    found = mutated_files.try_files(8 * len(FORMATS), seed=7).values()
     assert [line for tally in found for line in tally.wrong] == []
-    assert min(tally.read + tally.refused for tally in found) == 18
-    assert sum(tally.refused for tally in found) > 40
-    assert sum(tally.read for tally in found) > 40
+    assert min(tally.read + tally.refused for tally in found) == 8
+    assert sum(tally.refused for tally in found) > 20
+    assert sum(tally.read for tally in found) > 20
 
 
 def test_a_fault_that_is_not_survived_is_seen(subject: Subject) -> None:
@@ -110,10 +93,3 @@ def test_a_fault_that_is_not_survived_is_seen(subject: Subject) -> None:
     assert any("bytes, expected" in one for one in wrong)
     assert any("was lost" in one for one in wrong)
     assert not subject.nursery.run(["survey", "--scene", "nowhere.png", "--out", str(out)]).told
-
-
-def test_the_table_has_every_row(tmp_path: Path) -> None:
-    """Also as Markdown, where what is not met says so."""
-    rows = [Row("a", "by hand", 3, "nothing", "0 wrong", True, 1.4), Row("b", "x | y", 1, "z", "1 wrong", False, 2.0)]
-    assert plain_table(rows).splitlines()[-1].split() == ["b", "x", "|", "y", "1", "z", "1", "wrong", "NO", "2"]
-    assert "| b | x \\| y | 1 | z | 1 wrong | NO | 2 |" in markdown_table(rows)

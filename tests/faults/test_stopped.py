@@ -8,11 +8,8 @@ A run is published once its map is drawn; stopped while the map is judged it is 
 from __future__ import annotations
 
 import json
-import random
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -22,16 +19,12 @@ import pytest
 from flows.publish.receipt import check_receipt, is_pending
 from flows.terminal.processes import TERMINATED
 from storage.archive.archive import Archive
-from storage.arrays.spool import Spool
-from storage.remote.opening import verify_archive
-from tests.faults.nursery import ROOT, Ended
+from tests.faults.nursery import Ended
 from tests.faults.small_survey import Subject, problems, stored, words, wrong_after_fault, wrong_after_rerun
-from tests.flows.small_fields import write_field
 from tests.receipts import comparable
 
 GOING_ON = "terminated; run the same command to resume"
-SYNCS = (2, 60)  # of a survey's files, before which it is stopped
-TAKEN = 9  # lines of a sweep
+SYNC = 60  # of a survey's files, before which it is stopped
 CODES = {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: TERMINATED}
 BEGUN = ("flows.tasks.stages.accuracy:load_class_map", 1)
 PLACES = {  # function and call before which a survey is stopped that has its map, and with what
@@ -41,9 +34,7 @@ PLACES = {  # function and call before which a survey is stopped that has its ma
     "after the run has changed": ("storage.archive.run_folders:remove_tree", 2, signal.SIGKILL),
 }
 ADDED = "after the run has changed"
-KILLS = 3
-MOMENTS = (0.28, 0.98)  # of the time it takes; those between are of runs that die again and again
-PATIENCE_S = 120.0
+MOMENTS = (0.28, 0.98)  # of the time it takes
 
 
 def told(ended: Ended) -> bool:
@@ -56,43 +47,15 @@ def told(ended: Ended) -> bool:
     )
 
 
-@pytest.mark.parametrize("sync", SYNCS)
-def test_a_survey_that_is_terminated(subject: Subject, tmp_path: Path, sync: int) -> None:
+def test_a_survey_that_is_terminated(subject: Subject, tmp_path: Path) -> None:
     """What was published verifies, and the same command ends as if nothing had been."""
     out = tmp_path / "archive"
     ended = subject.nursery.run(
-        words(out), "end_before", place="storage.archive.manifests:sync_path", number=signal.SIGTERM, call=sync
+        words(out), "end_before", place="storage.archive.manifests:sync_path", number=signal.SIGTERM, call=SYNC
     )
     assert told(ended), (ended.code, ended.text)
     assert problems(out) == []
-    if sync == SYNCS[1]:
-        assert wrong_after_rerun(subject, out, subject.nursery.run(words(out)), runs=1) == []
-
-
-def test_a_capture_keeps_every_line(subject: Subject, tmp_path: Path) -> None:
-    """Lines that were there when it came are in the spool, which was closed as at any end."""
-    out = tmp_path / "archive"
-    ended = subject.nursery.run(
-        words(out), "end_before", place="storage.arrays.spool:Spool.append", number=signal.SIGTERM, call=TAKEN + 1
-    )
-    assert told(ended), ended.text
-    (lines,) = out.glob("spool/*/*.lines")
-    facts = json.loads(lines.read_bytes().split(b"\n")[0])
-    header = facts["header"]
-    with Spool.open(lines.parent, facts["samples"], facts["bands"], header=header, name=lines.stem) as spool:
-        assert [line.valid for block in spool.blocks() for line in block] == [True] * TAKEN
-
-
-def test_training_goes_on(subject: Subject, tmp_path: Path) -> None:
-    """It is broken off in a step; the same command ends well."""
-    field, out = write_field(tmp_path / "field", (16, 16)), tmp_path / "w.safetensors"
-    sizes = "--validation 0 --steps 4 --crop 16 --patch 8 --dim 16 --layers 1 --batch 1"
-    asked = ["train", str(field), "-o", str(out), *sizes.split()]
-    ended = subject.nursery.run(asked, "end_before", place="models.training.train:_step", number=signal.SIGTERM, call=2)
-    assert told(ended), ended.text
-    assert not out.exists()
-    assert subject.nursery.run(asked).code == 0
-    assert out.exists()
+    assert wrong_after_rerun(subject, out, subject.nursery.run(words(out)), runs=1) == []
 
 
 # --- while the map is judged ------------------------------------------------------------------------------------------
@@ -130,18 +93,6 @@ def whole(subject: Subject) -> Any:
     return receipt
 
 
-def test_the_run_is_there_before_its_map_is_judged(mapped: Path, whole: Any) -> None:
-    """With all that was made and spent, and that the map is not judged yet, in the receipt and in its report."""
-    (receipt,) = receipts(mapped)
-    assert problems(mapped) == []
-    assert is_pending(receipt)
-    assert "accuracy" not in receipt
-    assert [row["name"] for row in receipt["stages"]] == [row["name"] for row in whole["stages"]][:-1]
-    assert whole["savings"] == receipt["savings"]
-    (run,) = Archive.open(mapped).runs()
-    assert "The accuracy against the labels is added later" in (run / "report.html").read_text()
-
-
 @pytest.mark.parametrize("place", PLACES)
 def test_its_accuracy_is_added(subject: Subject, whole: Any, mapped: Path, tmp_path: Path, place: str) -> None:
     """Stopped again anywhere, it verifies and is as it was or has it; then it says what an undisturbed one says."""
@@ -165,24 +116,6 @@ def test_its_accuracy_is_added(subject: Subject, whole: Any, mapped: Path, tmp_p
     assert not [*out.rglob("*.part"), *out.glob("spool/*")]
 
 
-def test_evaluate_adds_it_as_the_survey_does(subject: Subject, whole: Any, mapped: Path) -> None:
-    """The receipt is the same, but for times; asked again it is left as it is."""
-    out = Path(shutil.copytree(mapped, subject.folder / "later"))
-    (before,) = receipts(out)
-    assert is_pending(before)
-    ended = subject.nursery.run(["evaluate", str(out), "latest"])
-    assert ended.code == 0, ended.text
-    (receipt,) = receipts(out)
-    assert comparable(receipt) == comparable(whole)
-    assert receipt["finished"] == before["finished"]
-    assert problems(out) == []
-    (run,) = Archive.open(out).runs()
-    manifest = (run / "manifest.json").read_bytes()
-    again = subject.nursery.run(["evaluate", str(run)])
-    assert (again.code, "has its accuracy already" in again.text) == (0, True)
-    assert (run / "manifest.json").read_bytes() == manifest
-
-
 # --- killed at random moments -----------------------------------------------------------------------------------------
 
 
@@ -197,54 +130,3 @@ def test_killed_survey_goes_on(subject: Subject, tmp_path: Path, moment: float) 
     assert wrong_after_fault(subject, tmp_path) == []
     assert wrong_after_rerun(subject, tmp_path, subject.nursery.run(words(tmp_path))) == []
     assert set(before) <= set(stored(tmp_path))
-
-
-def test_killed_again_and_again(subject: Subject, tmp_path: Path) -> None:
-    """Runs that are killed as soon as one store more is published each start from what the one before it left."""
-    published = 0
-    for _ in range(KILLS):
-        child = subject.nursery.start(words(tmp_path))
-        latest = time.monotonic() + PATIENCE_S
-        while len(stored(tmp_path)) <= published and time.monotonic() < latest:
-            time.sleep(0.01)
-        child.kill()
-        assert child.wait().code == -signal.SIGKILL
-        assert problems(tmp_path) == []
-        assert len(stored(tmp_path)) > published
-        published = len(stored(tmp_path))
-    assert wrong_after_rerun(subject, tmp_path, subject.nursery.run(words(tmp_path))) == []
-
-
-PUBLISH = """
-import sys
-from storage.archive.archive import Archive
-archive = Archive.open(sys.argv[1])
-made = 0
-for number in range(10**6):
-    def build(path):
-        for name in range(4):
-            (path / f"{name}.bin").write_bytes(bytes([number % 251]) * 20_000)
-    made += archive.produce("stage", build, version=1, params={"number": number})[1]
-    if made == 1:
-        print("published one", flush=True)
-"""
-
-
-def test_killed_while_publishing(tmp_path: Path) -> None:
-    """Every store with a final name is whole, what is torn has none, and the next run makes the rest."""
-    delays = random.Random(1)
-    seen = 0
-    for _ in range(KILLS):
-        command = [sys.executable, "-c", PUBLISH, str(tmp_path)]
-        with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
-            assert process.stdout is not None
-            assert process.stdout.readline().strip() == "published one"
-            time.sleep(delays.uniform(0.005, 0.06))
-            process.kill()
-        archive = Archive.open(tmp_path, create=False)
-        findings = verify_archive(archive)
-        assert [finding.problem for finding in findings if finding.problem] == []
-        assert len(findings) > seen
-        seen = len(findings)
-    archive.reclaim()
-    assert not list(tmp_path.glob("stages/*/*.part"))

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from html.parser import HTMLParser
@@ -92,6 +93,40 @@ class Page(HTMLParser):
     def handle_endtag(self, tag: str) -> None:
         """The innermost open tag closes."""
         assert self.open.pop() in (tag, "data" if tag == "script" else tag)
+
+
+RECORDED_S = 30.0  # in which a server has heard of a task that ended
+
+
+def newest_run(flow: str, count: int) -> tuple[Any, dict[str, Any]]:
+    """The newest run of a flow, and its ``count`` task runs by their names, as soon as the server has them ended.
+
+    It hears of tasks by events, of the last one after the flow has ended.
+    """
+    from prefect.client.orchestration import get_client
+    from prefect.client.schemas.filters import (
+        FlowFilter,
+        FlowFilterName,
+        FlowRunFilter,
+        FlowRunFilterId,
+        FlowRunFilterStartTime,
+    )
+    from prefect.client.schemas.sorting import FlowRunSort
+
+    with get_client(sync_client=True) as client:
+        named = FlowFilter(name=FlowFilterName(any_=[flow]))
+        begun = FlowRunFilter(start_time=FlowRunFilterStartTime(is_null_=False))  # others have deployments here
+        (run,) = client.read_flow_runs(
+            flow_filter=named, flow_run_filter=begun, sort=FlowRunSort.START_TIME_DESC, limit=1
+        )
+        of_it, latest = FlowRunFilter(id=FlowRunFilterId(any_=[run.id])), time.monotonic() + RECORDED_S
+        tasks = client.read_task_runs(flow_run_filter=of_it)
+        while time.monotonic() < latest and not (
+            len(tasks) >= count and all(task.state is not None and task.state.is_final() for task in tasks)
+        ):
+            time.sleep(0.2)
+            tasks = client.read_task_runs(flow_run_filter=of_it)
+    return run, {task.name: task for task in tasks}
 
 
 def turned(scene: Path, to: Path) -> Path:

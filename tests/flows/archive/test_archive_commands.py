@@ -13,7 +13,6 @@ from rich.console import Console
 
 from flows.archive.commands import command, contents, explain, gc, ls, run_verify
 from flows.settings.load import load_settings
-from flows.settings.survey_settings import Settings
 from flows.terminal.figures import format_bytes
 from flows.terminal.processes import DONE, FAILED, PARTLY
 from pipeline.errors import ArchiveError
@@ -166,27 +165,6 @@ def test_verify_repairs_by_surveying_again(archive: Path, capsys: pytest.Capture
     assert content["repair"]["remade"] == [mosaic.uri]
     assert run_verify(archive, QUIET) == DONE
     assert "21 stores and runs are as published, out of 21" in capsys.readouterr().out
-
-
-def test_verify_says_what_it_could_not_repair(
-    archive: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The scene's file has gone: the store is missing then, and the exit code tells."""
-    opened = Archive.open(archive)
-    (mosaic,) = opened.refs("rectify")
-    flip(mosaic.path / "lines.json")
-
-    def fail(settings: Settings, console: Console) -> None:
-        assert str(settings.scene).endswith("scene.png")
-        raise ArchiveError("no such scene")
-
-    monkeypatch.setattr("flows.publish.survey_command.run_survey", fail)
-    assert run_verify(archive, QUIET, remake=True) == FAILED
-    out = capsys.readouterr().out
-    assert "no such scene" in out
-    assert "some could not be made anew" in out
-    assert run_verify(archive, QUIET) == FAILED
-    assert f"{mosaic.uri}: is not there, but runs/" in capsys.readouterr().out
 
 
 def test_a_repair_that_could_do_some_of_it_says_so(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:

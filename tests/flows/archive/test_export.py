@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -152,15 +151,11 @@ def test_without_a_pose_images_lie_on_angles(plain: Exported) -> None:
 
 @pytest.mark.parametrize("number", [0, 1])
 def test_images_say_what_they_show_and_of_which_run(exports: list[Exported], number: int) -> None:
-    """Names and colours in the file; run, product, time and program in the tags."""
+    """Names of classes in the file; run, product, time and program in the tags."""
     done = exports[number]
-    about = done.store("class_map").attrs
+    names = done.store("class_map").attrs["class_names"]
     with rasterio.open(done.file("class_map")) as file:
-        table, tags = file.colormap(1), file.tags(1)
-        assert file.nodata == 255
-    assert [tags[f"CLASS_{number}"] for number in range(len(about["class_names"]))] == about["class_names"]
-    assert [list(table[number][:3]) for number in range(len(about["class_names"]))] == about["class_colours"]
-    done = exports[number]
+        assert [file.tags(1)[f"CLASS_{place}"] for place in range(len(names))] == names
     with rasterio.open(done.file("class_map")) as file:
         tags = file.tags()
     product = ("class_map", "ground_map")[number]
@@ -275,34 +270,17 @@ def test_a_store_that_is_gone_is_named(posed: Exported, tmp_path: Path) -> None:
 
 def test_leftovers_of_a_killed_export_go(posed: Exported, tmp_path: Path) -> None:
     """With the next export of the run, by whichever of its names."""
-    for run in (f"runs/{posed.id}", f"{posed.id}/", "latest"):
-        assert run_export(posed.archive, run, tmp_path / "out", envi=False, console=QUIET)["run"] == posed.id
     for folder in (tmp_path, tmp_path / posed.id):
         (folder / ".export-x.part").mkdir(parents=True)
-    run_export(posed.archive, posed.id, tmp_path, envi=False, console=QUIET)
+    assert run_export(posed.archive, f"runs/{posed.id}/", tmp_path, envi=False, console=QUIET)["run"] == posed.id
     assert not list(tmp_path.rglob("*.part"))
 
 
-def _change_receipt(archive: Path, published: Published) -> None:
-    receipt = archive / "runs" / published.folder.name / "receipt.json"
-    receipt.write_text(receipt.read_text().replace('"seed": 1', '"seed": 2', 1))
-
-
-def _flip_classes(archive: Path, published: Published) -> None:
-    classes = archive / published.receipt["products"]["ground_map"] / "classes"
-    flip(next(path for path in sorted(classes.rglob("*")) if path.is_file() and path.name != "zarr.json"), at=40)
-
-
-@pytest.mark.parametrize(
-    ("spoil", "words"),
-    [(_change_receipt, "is damaged: receipt.json has changed .*run verify"), (_flip_classes, "ground_map.*classes")],
-)
-def test_what_cannot_be_believed_is_named_and_gives_no_image(
-    posed: Exported, tmp_path: Path, spoil: Callable[[Path, Published], None], words: str
-) -> None:
-    """A receipt that was changed, a flipped bit: what it is, what to do, and no image of it."""
+def test_what_cannot_be_believed_is_named_and_gives_no_image(posed: Exported, tmp_path: Path) -> None:
+    """A flipped bit: what it is, what to do, and no image of it."""
     archive = Path(shutil.copytree(posed.archive, tmp_path / "field-a"))
-    spoil(archive, posed.published)
-    with pytest.raises(IncompleteStoreError, match=words):
+    classes = archive / posed.published.receipt["products"]["ground_map"] / "classes"
+    flip(next(path for path in sorted(classes.rglob("*")) if path.is_file() and path.name != "zarr.json"), at=40)
+    with pytest.raises(IncompleteStoreError, match=r"ground_map.*classes"):
         run_export(archive, posed.id, tmp_path / "out", envi=False, console=QUIET)
     assert not list((tmp_path / "out").rglob("*.tif"))

@@ -4,11 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +17,6 @@ import flows.archive.ingest_command
 from flows.archive.ingest_command import run_ingest
 from pipeline.errors import ArchiveError, SceneError
 from storage.archive.archive import Archive
-from storage.readers.cube_sources import CubeSource
-from storage.readers.open_cubes import open_cube
 from storage.readers.scene_files import load_scene_file
 from storage.remote.opening import verify_archive
 
@@ -170,29 +163,6 @@ def test_names_that_lead_elsewhere(tmp_path: Path, raw: NDArray[np.uint16], name
     assert not (tmp_path / "archive").exists()
 
 
-def test_a_source_that_fails_half_way(tmp_path: Path, raw: NDArray[np.uint16], monkeypatch: pytest.MonkeyPatch) -> None:
-    """An error in the middle leaves no store, and the next ingest makes it."""
-    header = write_envi(tmp_path / "a.img", raw)
-
-    def torn(path: str, **references: Any) -> CubeSource:
-        source = open_cube(path, **references)
-        object.__setattr__(source, "read", lambda start, stop: _raise() if start else raw[start:stop])
-        return source
-
-    with monkeypatch.context() as patch:
-        patch.setattr(flows.archive.ingest_command, "open_cube", torn)
-        with pytest.raises(SceneError, match="torn"):
-            ingest(header, tmp_path / "archive")
-    archive = Archive.open(tmp_path / "archive")
-    assert archive.refs() == []
-    assert not list((tmp_path / "archive").rglob("*.part"))
-    assert not ingest(header, tmp_path / "archive")["cached"]
-
-
-def _raise() -> None:
-    raise SceneError("torn")
-
-
 def test_a_source_that_changes_meanwhile(
     tmp_path: Path, raw: NDArray[np.uint16], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -209,33 +179,3 @@ def test_a_source_that_changes_meanwhile(
     with pytest.raises(SceneError, match="changed while it was read; ingest it again once it is whole"):
         ingest(header, tmp_path / "archive")
     assert Archive.open(tmp_path / "archive").refs() == []
-
-
-CODE = """
-import sys
-from pathlib import Path
-from rich.console import Console
-from flows.archive.ingest_command import run_ingest
-print("go", flush=True)
-run_ingest(sys.argv[1], Path(sys.argv[2]), Console(quiet=True))
-"""
-
-
-@pytest.mark.parametrize("wait_s", [0.05, 0.15])
-def test_killed_it_leaves_nothing_half_made(tmp_path: Path, wait_s: float) -> None:
-    """After kill -9 the archive verifies, and the next ingest gives the store of an undisturbed one."""
-    rng = np.random.default_rng(3)
-    header = write_envi(tmp_path / "a.img", rng.integers(0, 4096, (640, 320, 3), dtype=np.uint16))
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3]), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-c", CODE, str(header), str(tmp_path / "archive")]
-    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE) as process:
-        assert process.stdout is not None
-        process.stdout.readline()
-        time.sleep(wait_s)
-        process.send_signal(signal.SIGKILL)
-    archive = Archive.open(tmp_path / "archive")
-    assert all(finding.problem is None for finding in verify_archive(archive))
-    record, undisturbed = ingest(header, tmp_path / "archive"), ingest(header, tmp_path / "other")
-    assert record["key"] == undisturbed["key"]
-    xr.testing.assert_identical(opened(record), opened(undisturbed))
-    assert not list((tmp_path / "archive").rglob("*.part"))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import warnings
 from collections.abc import Callable
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from flows.archive.export_command import run_export
-from flows.archive.plan_command import plan_content, show_plan
 from flows.archive.product_choice import ProductFlags, choose_products
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
@@ -152,20 +150,6 @@ def test_areas_are_told_without_a_place(surveyed: Raster, tmp_path: Path, pixel_
     assert published.receipt["areas"]["ha"] == pytest.approx(hectares)
     assert f"<td>{format_area(hectares[most])}</td>" in table
     assert float(rows[most]["hectares"]) == pytest.approx(hectares[most], rel=1e-5)
-
-
-def test_the_plan_says_what_the_survey_does(surveyed: Raster, scene_files: Path, weights: Path, tmp_path: Path) -> None:
-    """Stages are to be made, then stored; a camera is not spoken of."""
-    given = {"scene": str(scene_files / "scene.png"), "weights": str(weights), "out": str(tmp_path / "archive")}
-    before = plan_content(load_settings(None, given))
-    published = surveyed(scene_files / "scene.png")
-    after = plan_content(load_settings(None, given))
-    assert {row["state"] for row in before["stages"]} == {"to run"}
-    assert [row["stage"] for row in before["stages"]] == [row["name"] for row in published.receipt["stages"]]
-    assert {row["state"] for row in after["stages"]} == {"cached"}
-    shown = Console(width=200, file=StringIO())
-    show_plan(after, shown)
-    assert "no camera: the pixels of the raster are taken as they are" in shown.file.getvalue()  # type: ignore[attr-defined]
 
 
 def test_an_export_has_the_rasters_own_pixels(surveyed: Raster, tmp_path: Path) -> None:

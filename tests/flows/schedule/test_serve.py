@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import signal
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from flows.cli import serve_command
 from flows.cli.serve_command import load_fields, schedule_of
 from storage.archive.archive import Archive
 from storage.archive.staging import take_lock
@@ -83,21 +80,6 @@ def test_a_server_that_cannot_be_had(
     ended = command_line("serve", field_file(), "--every", "30m", *words)
     ended.refused(2, message.replace(" ", r"\s+"))
     assert "serving" not in ended.err
-
-
-def test_sigterm_stops_a_schedule(
-    field_file: Callable[..., Path], command_line: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """That is the way to stop it, and no error: it says how to go on, and ends with 0."""
-
-    def terminated(*given: Any, **named: Any) -> None:
-        os.kill(os.getpid(), signal.SIGTERM)
-        pytest.fail("SIGTERM was not heard")
-
-    monkeypatch.setattr(serve_command, "_start_server", terminated)
-    ended = command_line("serve", field_file(), "--every", "30m")
-    assert (ended.code, ended.errors) == (0, [])
-    assert ended.err.splitlines()[-1] == "stopped: no run starts from now on; the same command serves again"
 
 
 def test_a_field_is_a_deployment_of_the_survey(field_file: Callable[..., Path], tmp_path: Path) -> None:

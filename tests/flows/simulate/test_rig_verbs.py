@@ -65,14 +65,6 @@ def test_settings_file_says_where_both_are(command_line: CommandLine, tmp_path: 
         assert not still(rig)
 
 
-def test_a_port_that_cannot_be_opened(command_line: CommandLine) -> None:
-    """One message, exit code 1."""
-    ended = command_line("rig", "check", "--port", "/dev/ttyACM7")
-    assert ended.code == 1
-    assert "/dev/ttyACM7 cannot be opened" in ended.out
-    assert "Traceback" not in ended.err
-
-
 def test_one_of_two_devices_is_partly(command_line: CommandLine) -> None:
     """A camera that cannot be reached beside a mirror that works: 3; a port that is not shared, or alone: 1."""
     with served() as rig, serial.Serial(rig.port, exclusive=True):

@@ -79,13 +79,6 @@ def receipt_weights(receipt: Any) -> str:
     return str(receipt["settings"]["weights"])
 
 
-def test_a_survey_is_told_beside_the_best_uniform_reading(judged: Path, survey_png: Survey, tmp_path: Path) -> None:
-    """With controls, random patches stand beside those chosen, as many of them."""
-    receipt = survey_png(tmp_path, **SCAN, weights=str(judged), controls=True).receipt
-    assert receipt["accuracy"]["controls_fraction"] == receipt["kept"]["patches"] / receipt["kept"]["of_patches"]
-    assert set(receipt["accuracy"]["controls"]) == {"gain", "entropy", "sobel", "random"}
-
-
 @pytest.mark.parametrize(
     ("flags", "least"),
     [

@@ -149,12 +149,3 @@ def test_memory_of_workers_elsewhere_is_not_counted(tmp_path: Path, cubes: list[
     assert tile_budget(work, tiles, (64, 640), memory=1, pool=elsewhere).workers == 1
     with pytest.raises(SettingsError, match="exceeds --memory 1 MiB"):
         tile_budget(work, tiles, (64, 640), memory=1, pool=ONE)
-
-
-def test_every_process_counts_against_the_memory(
-    tmp_path: Path, cubes: list[SignalCube], processes: WorkerPool
-) -> None:
-    """Two processes and this one do not fit where one does; the message says what each takes."""
-    writer = mosaic_at(tmp_path / "m.zarr")
-    with pytest.raises(SettingsError, match=r"each of two processes 512 MiB; give at least --memory 1\d\d\d MiB"):
-        write_mosaic(recipe_of(cubes), writer, memory=2**30, pool=processes)

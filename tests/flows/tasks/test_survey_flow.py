@@ -20,11 +20,9 @@ from flows.settings.parameters import SurveySettings
 from flows.survey import draw_class_map
 from flows.tasks.local_server import ServerUnavailable
 from flows.tasks.open_survey import STAGES, Products
-from flows.tasks.stages import accuracy as evaluation
-from pipeline.errors import IncompleteStoreError, SettingsError
-from storage.archive.archive import Archive
+from pipeline.errors import IncompleteStoreError
 from storage.archive.keys import StageRef
-from tests.flows.conftest import CommandLine, act_instead, problems
+from tests.flows.conftest import CommandLine, act_instead, newest_run
 from tests.prior_work import with_effects
 
 pytestmark = pytest.mark.usefixtures("no_effects")
@@ -174,39 +172,13 @@ def test_every_setting_is_a_described_field_of_the_form() -> None:
     assert all(one.get("description") or "$ref" in json.dumps(one) for one in schema.values())
 
 
-def of_run(api: str) -> tuple[Any, dict[str, Any], list[str], dict[str, Any]]:
-    """The newest run of the flow `survey`, its task runs by name, its log, and its artifacts by type."""
-    from prefect.client.orchestration import get_client
-    from prefect.client.schemas.filters import (
-        ArtifactFilter,
-        ArtifactFilterFlowRunId,
-        FlowFilter,
-        FlowFilterName,
-        FlowRunFilter,
-        FlowRunFilterId,
-        FlowRunFilterStartTime,
-        LogFilter,
-        LogFilterFlowRunId,
-    )
-    from prefect.client.schemas.sorting import FlowRunSort
-
-    with get_client(sync_client=True) as client:
-        named = FlowFilter(name=FlowFilterName(any_=["survey"]))
-        begun = FlowRunFilter(start_time=FlowRunFilterStartTime(is_null_=False))  # others have deployments here
-        (run,) = client.read_flow_runs(
-            flow_filter=named, flow_run_filter=begun, sort=FlowRunSort.START_TIME_DESC, limit=1
-        )
-        tasks = client.read_task_runs(flow_run_filter=FlowRunFilter(id=FlowRunFilterId(any_=[run.id])))
-        logs = client.read_logs(LogFilter(flow_run_id=LogFilterFlowRunId(any_=[run.id])))
-        mine = ArtifactFilter(flow_run_id=ArtifactFilterFlowRunId(any_=[run.id]))
-        artifacts = client.read_artifacts(artifact_filter=mine)
-    return run, {one.name: one for one in tasks}, [one.message for one in logs], {one.key: one for one in artifacts}
-
-
 def test_prefect_makes_the_stores_that_plain_makes(
     survey_png: Any, surveyed_png: Any, tmp_path: Path, server: str
 ) -> None:
     """Keys, savings and accuracy are those of plain; tasks have the edges, logs and artifacts of the mission."""
+    from prefect.client.orchestration import get_client
+    from prefect.client.schemas.filters import ArtifactFilter, ArtifactFilterFlowRunId, LogFilter, LogFilterFlowRunId
+
     with with_effects():  # as the other has them
         flow = survey_png(tmp_path / "flow", engine="prefect").receipt
     plain = surveyed_png(tmp_path / "plain").receipt
@@ -214,7 +186,11 @@ def test_prefect_makes_the_stores_that_plain_makes(
     assert flow["savings"] == plain["savings"]
     assert flow["accuracy"] == plain["accuracy"]
 
-    run, tasks, log, artifacts = of_run(server)
+    run, tasks = newest_run("survey", len(flow["stages"]) + len(STEPS))
+    with get_client(sync_client=True) as client:
+        log = [one.message for one in client.read_logs(LogFilter(flow_run_id=LogFilterFlowRunId(any_=[run.id])))]
+        mine = ArtifactFilter(flow_run_id=ArtifactFilterFlowRunId(any_=[run.id]))
+        artifacts = {one.key: one for one in client.read_artifacts(artifact_filter=mine)}
     assert run.name == "survey-scene"
     assert run.parameters["settings"]["budget"] == 0.8
     assert sorted(tasks) == sorted(
@@ -275,64 +251,20 @@ def test_a_named_server_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) ->
             pytest.fail("it was taken for one that answers")
 
 
-def test_the_run_is_published_before_its_map_is_judged(
-    survey_png: Any, tmp_path: Path, server: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """In the same flow; a stop while it is judged leaves the run, and the same command adds its accuracy to it."""
-
-    def interrupt(*given: Any) -> None:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(evaluation, "load_class_map", interrupt)
-        with pytest.raises(KeyboardInterrupt):
-            survey_png(tmp_path, engine="prefect", **NARROW)
-    (run,) = Archive.open(tmp_path).runs()
-    assert json.loads((run / "receipt.json").read_text())["accuracy_is"] == "pending"
-    published = survey_png(tmp_path, engine="prefect", **NARROW)
-    assert published.folder == run
-    assert published.receipt["accuracy_is"] == "judged"
-    assert problems(tmp_path) == []
-
-
 def test_sigterm_in_a_stage(
-    scene_files: Path,
-    weights: Path,
-    tmp_path: Path,
-    server: str,
-    monkeypatch: pytest.MonkeyPatch,
-    command_line: CommandLine,
+    field_file: Any, server: str, monkeypatch: pytest.MonkeyPatch, command_line: CommandLine
 ) -> None:
     """143 and one sentence, whatever Prefect makes of it; the same command continues."""
-    real = STAGES["rectify"]
+    real, file = STAGES["rectify"], field_file()
 
     def terminated(*given: Any) -> None:
         os.kill(os.getpid(), signal.SIGTERM)
         pytest.fail("SIGTERM was not heard")
 
-    words = (
-        "survey",
-        "--scene",
-        scene_files / "scene.png",
-        "--source",
-        "sim",
-        "--weights",
-        weights,
-        "--out",
-        tmp_path / "archive",
-    )
     act_instead(monkeypatch, "rectify", terminated)
-    ended = command_line(*words)
+    ended = command_line("survey", file)
     assert (ended.code, ended.out, ended.errors) == (143, "", [])
     assert ended.err.splitlines()[-1] == "terminated; run the same command to resume"
     monkeypatch.setitem(STAGES, "rectify", real)
-    assert command_line(*words).code == 0
+    assert command_line("survey", file).code == 0
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
-
-
-def test_a_pass_that_is_none() -> None:
-    """The flow `capture` takes coarse or fine sweeps."""
-    from flows.tasks.captures import capture_pass
-
-    with pytest.raises(SettingsError, match="no pass 'medium': expected coarse or fine"):
-        capture_pass(Noted(), "medium")  # type: ignore[arg-type]

@@ -172,33 +172,6 @@ def test_second_run_is_read_from_the_archive(survey_png: Any, surveyed_png: Any,
     assert not [*tmp_path.glob("spool/*"), *tmp_path.glob("stages/capture/*/*.zarr")]  # raw lines were deleted
 
 
-def test_products_open_with_plain_xarray(farm: Done) -> None:
-    """Named axes, wavelengths in nm and GeoZarr's place; the patches chosen; CF flags; facts of lines."""
-    mosaic, attention, detail, found = (farm.open(name) for name in ("mosaic", "attention", "detail", "class_map"))
-    assert mosaic["scores"].dims == ("component", "y", "x")
-    assert (mosaic.sizes["y"], mosaic.sizes["x"]) == FARM
-    assert np.isfinite(mosaic["scores"].values).all()
-    assert (mosaic["wavelength"].dims, mosaic["wavelength"].attrs["units"]) == (("band",), "nm")
-    assert mosaic.attrs["spatial:dimensions"] == ["y", "x"]
-    assert "CF" in mosaic.attrs["Conventions"]
-    assert detail["scores"].dims == ("component", "y", "x")
-    assert (detail.sizes["y"], detail.sizes["x"]) == FARM
-    np.testing.assert_array_equal(np.isfinite(detail["scores"].values[0]), detail["coverage"].values > 0)
-    assert attention["rank"].dims == ("patch_y", "patch_x")
-    names = found.attrs["class_names"]
-    assert (found["classes"].dims, (found.sizes["y"], found.sizes["x"])) == (("y", "x"), FARM)
-    assert found["classes"].attrs["flag_meanings"].split() == ["_".join(name.split()) for name in names]
-    assert set(names) == {*farm.receipt["accuracy"]["per_class_iou"], "unknown"}
-    known = found["classes"].values != names.index("unknown")  # which have a probability
-    assert ((found["confidence"].values[known] >= 0) & (found["confidence"].values[known] <= 1)).all()
-    for cube, _ in farm.sweeps():
-        assert cube["scores"].dims == ("component", "line", "sample")
-        for name in ("mirror_x", "mirror_y", "time", "exposure_ms", "valid_line"):
-            assert cube[name].dims == ("line",), name
-        assert (abs(cube["mirror_x"]) <= 1).all()
-        assert cube["exposure_ms"].values.tolist() == [100.0] * cube.sizes["line"]
-
-
 @pytest.mark.usefixtures("no_effects")
 def test_without_later_lines_the_first_pass_is_read_in_full(survey_png: Any, weights: Path, tmp_path: Path) -> None:
     """A budget that pays for the first pass alone gives the map of a uniform scan of these lines."""

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
-import re
-import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -35,8 +32,7 @@ from pipeline.rig.device_settings import SurveyRig
 from pipeline.rig.drivers import RigDevices
 from pipeline.rig.emulator.emulated_rig import REFERENCE_FRAMES, EmulatedRig, FastClock, SceneView
 from pipeline.rig.emulator.mirror_device import Mode
-from pipeline.rig.pro_mode import Command
-from pipeline.rig.transports import SYSTEM_CLOCK, DeviceGone, SerialTransport
+from pipeline.rig.transports import DeviceGone
 from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import References
@@ -45,10 +41,8 @@ from storage.arrays.class_maps import load_class_map
 from storage.arrays.cubes import open_raw_cube
 from storage.remote.opening import verify_archive
 from tests.conftest import patchy_scene
-from tests.flows.conftest import CommandLine
 from tests.pipeline.rig.camera_faults import CameraFault, FaultyRig
 from tests.pipeline.rig.in_process import InProcessRig, ManualClock
-from tests.pipeline.rig.mirror_faults import make_fault
 from tests.pipeline.simulator.small_scenes import effects_on
 from tests.prior_work import without_effects
 
@@ -176,21 +170,6 @@ def test_a_rig_as_the_defaults_have_it(tmp_path: Path, monkeypatch: pytest.Monke
     assert alike.mean() > 0.9, alike.mean()
 
 
-def test_what_the_rig_is_at_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Long before the first line: the path goes up, lines are captured, files are fetched, each with how far it is."""
-    out = io.StringIO()
-    monkeypatch.setattr(flows.terminal.progress, "LINE_EVERY_S", -1.0)  # every word, as bars on a terminal show them
-    settings = small_settings(tmp_path, source="rig", visit="first", budget=0.5)
-    with emulated(settings, {}, monkeypatch):
-        run_survey(settings, Console(file=out, width=200))
-    told = [line.removeprefix("capture: 0% ") for line in out.getvalue().splitlines() if "capture: 0% " in line]
-    kinds = [re.sub(r"\d[\d.]*", "N", words) for words in told]
-    wanted = ["path: N positions", "capturing: N of N s", "fetching: N of N MB"]
-    coarse = kinds[kinds.index(wanted[0]) :]  # behind the references
-    assert [kind for kind in dict.fromkeys(coarse) if kind in wanted] == wanted
-    assert any(re.fullmatch(r"fetching: (\d+\.\d) of \1 MB", words) for words in told)
-
-
 def test_visits_are_captured_and_broken_ones_gone_on_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """A survey whose camera goes away is gone on with by the same command; another visit is captured anew.
 
@@ -258,10 +237,6 @@ def test_survey_over_a_pty_and_sockets_gives_the_same_lines(tmp_path: Path):
 BAD: dict[str, tuple[dict[str, Any], str]] = {
     "unknown key": ({"rig.prot": "/dev/ttyUSB0"}, r"unknown setting .*prot.*did you mean 'rig.port'"),
     "axes that are none": ({"rig.mirror_axes": "x,x"}, r"mirror.axes must be one of x,y  x,-y .* -y,-x; got 'x,x'"),
-    "driver that is not there": (
-        {"source": "rig", "rig.camera_driver": "nowhere:open_it"},
-        r"rig.camera_driver = 'nowhere:open_it' cannot be imported .*No module named 'nowhere'",
-    ),
     "memory too large": (
         {"source": "rig", "cost.vector_pairs": 9000},
         r"cost.vector_pairs = 9000: .* at most 8191 pairs",
@@ -274,10 +249,6 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
         {"scene": "field", "source": "sim", "bands": None},
         r"scene 'field' is what stands before a rig",
     ),
-    "frame period of the camera": (
-        {"source": "rig", "camera.exposure_ms": 9500, "camera.readout_ms": 900},
-        r"frame period 10400 ms, expected",
-    ),
 }
 
 
@@ -288,62 +259,3 @@ def test_bad_setting_is_refused_in_one_message(tmp_path: Path, changed: dict[str
     with pytest.raises(SettingsError, match=message):
         run_survey(small_settings(tmp_path / "out", **told), QUIET)
     assert not (tmp_path / "out").exists()
-
-
-def free_port() -> int:
-    """A port of this machine that nothing listens at."""
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        return int(listener.getsockname()[1])
-
-
-def told_on_the_command_line(command_line: CommandLine, tmp_path: Path, **rig: Any) -> str:
-    """The one error of a survey with such a rig, which ends with 1 and leaves no run."""
-    table = "".join(f"{name} = {json.dumps(value)}\n" for name, value in rig.items())
-    plain = {name: value for name, value in SMALL.items() if "." not in name}
-    rest = "".join(f"{name} = {value!r}\n".replace("False", "false") for name, value in plain.items())
-    (tmp_path / "rig.toml").write_text(f'source = "rig"\n{rest}[rig]\n{table}')
-    ended = command_line("survey", tmp_path / "rig.toml", "--out", tmp_path / "archive")
-    assert ended.code == 1
-    assert len(ended.errors) == 1
-    assert not list((tmp_path / "archive" / "runs").glob("*/receipt.json"))
-    return ended.errors[0]
-
-
-@pytest.mark.parametrize(
-    ("port", "words"),
-    [("/dev/ttyNONE", "/dev/ttyNONE"), ("/dev/null", "/dev/null cannot be opened.*is it a serial port")],
-)
-def test_what_is_no_port(command_line: CommandLine, tmp_path: Path, port: str, words: str):
-    """A port that is not there, and a name that opens and is none."""
-    assert re.search(words, told_on_the_command_line(command_line, tmp_path, port=port))
-
-
-@pytest.mark.parametrize(
-    ("fault", "words"), [("wrong-firmware", "whose id begins with MR on /dev/"), ("mute", "no answer to")]
-)
-def test_another_device_is_not_moved(command_line: CommandLine, tmp_path: Path, fault: str, words: str):
-    """What answers as no mirror controller does, or as none that is known, is told nothing but who it should say."""
-    settings = small_settings(tmp_path)
-    scene, _ = open_scene(settings)
-    rig = FaultyRig(make_source(scene, settings), FastClock(20), mirror_faults=[make_fault(fault, at=0)])
-    with rig.serve() as served:
-        told = {"port": served.port, "host": served.host, "control_port": served.camera_port}
-        assert words in told_on_the_command_line(command_line, tmp_path, **told)
-    asked = {request.command for request in rig.mirror.requests}
-    assert not asked & {Command.SET_VALUES, Command.SET_VECTOR}
-
-
-def test_port_in_use_and_camera_unreachable(command_line: CommandLine, tmp_path: Path):
-    """Another program holds the mirror's port; it lets go, and then nobody answers for the camera. Nothing moves."""
-    scene, _ = open_scene(small_settings(tmp_path))
-    rig = EmulatedRig(make_source(scene, small_settings(tmp_path)), SYSTEM_CLOCK)
-    with rig.serve() as served:
-        told = {"port": served.port, "host": "127.0.0.1", "control_port": free_port(), "connect_s": 0.5}
-        other = SerialTransport(served.port, 115200)
-        assert "no other program" in told_on_the_command_line(command_line, tmp_path, **told)
-        other.close()
-        error = told_on_the_command_line(command_line, tmp_path, **told)
-        assert f"127.0.0.1:{told['control_port']}" in error
-        assert not rig.mirror.state.playbacks[0].running
-        assert rig.mirror.state.positions(rig.clock.now()).tolist() == [0.0, 0.0]

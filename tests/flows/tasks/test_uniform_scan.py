@@ -227,7 +227,7 @@ def test_what_only_two_passes_have_asks_for_them(recorded: Path, name: str, valu
     assert load_settings(None, flags).undecided
 
 
-@pytest.mark.parametrize("shape", [(32, 32, 3), (1, 40, 3), (1, 1, 3), (32, 32)])
+@pytest.mark.parametrize("shape", [(1, 1, 3), (32, 32)])
 @pytest.mark.parametrize("source", ["raster", "sim"])
 def test_any_scene_is_surveyed_without_a_flag(
     weights: Path, tmp_path: Path, shape: tuple[int, ...], source: str
@@ -246,7 +246,7 @@ def test_any_scene_is_surveyed_without_a_flag(
 def test_candidates_are_those_of_the_weights_that_would_read_them(tmp_path: Path) -> None:
     """The farm has two files of weights: plan names one reference, whatever was asked for."""
     farm = {"scene": "farm", "size": "160x128", "out": str(tmp_path)}
-    asked = ({}, {"budget": "0.8"}, {"seconds": "8"}, {"scan_step": "4"}, {"scan_step": "2"})
+    asked = ({}, {"budget": "0.8"}, {"scan_step": "4"})
     told = [plan_content(load_settings(None, farm | more))["scans"] for more in asked]
     assert [one["reference"] for one in told] == [told[0]["reference"]] * len(asked)
     assert told[0]["taken"] == told[0]["reference"]

@@ -1,10 +1,8 @@
-"""The simulated instrument: footprints against closed forms and rays traced one by one, and blocks of raw numbers."""
+"""The simulated instrument: footprints against closed forms and rays traced one by one."""
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -13,11 +11,11 @@ from pipeline.errors import PoseError
 from pipeline.geometry.camera import LineCamera, expose, footprint
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.geometry.scan import Sweep, line_positions
-from pipeline.simulator.render import EFFECTS, USUAL, Choice, expected_light
-from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Rig, Sky
+from pipeline.simulator.render import USUAL, Choice, expected_light
+from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import render_lines, sweep_block
-from tests.pipeline.simulator.small_scenes import effects_on, image_scene, made_scene, seen_at
+from tests.pipeline.simulator.small_scenes import effects_on, image_scene, seen_at
 
 CAMERA = LineCamera()
 OPTICS = effects_on("rotation", "slit", "smear")
@@ -81,58 +79,6 @@ def test_rays_are_those_of_the_mirror() -> None:
     x, y = direction_to_scene(reflect(ray, normal)).T / CAMERA.ifov_rad
     expected = seen_at(scene, y + 99.5, x + 349.5)[:, 0] * scene.electrons[0]
     np.testing.assert_allclose(line, expected, rtol=1e-4)
-
-
-# What a rig may have, all at once, and every effect exact: nothing may depend on the block. Two kinds of scene.
-LOUD = Rig(
-    replace(CAMERA, samples=60),
-    mirror=MirrorMotion(repeatability_urad=40.0, hysteresis_px=3.0, drift_px_per_min=2.0),
-    detector=Detector(dead_fraction=0.001, hot_fraction=0.001),
-    air=Air(distance_m=40.0, nearest_m=38.0, farthest_m=42.0, relief="step", wind_amplitude_m=0.01),
-    sky=Sky(cloud_fraction=0.4, hot_spot=0.1),
-)
-EVERY = effects_on(*(effect.name for effect in EFFECTS))
-COARSE = Sweep("coarse", "coarse", "y", swath_px=-900.0, start_px=300.0, lines=35, step=3, binning=3)
-FINE = replace(SWEEP, swath_px=700.0, start_px=-400.0, lines=35)
-
-
-@cache
-def grainy(kind: str) -> RasterScene:
-    """A scene that differs at every pixel: 3 components mixed to 7 bands, or a plane for each of 4."""
-    rng = np.random.default_rng(5)
-    if kind == "planes":
-        return scene_of(rng.uniform(0, 1, (60, 90, 4)))
-    electrons = rng.uniform(1e3, 6e3, (3, 7)).astype(np.float32)
-    planes = rng.uniform(0, 1, (60, 90, 3))
-    return made_scene(planes, electrons, np.linspace(400, 1000, 7), fwhm_nm=np.full(7, 3.0))
-
-
-@cache
-def whole_sweep(kind: str, sweep: Sweep) -> np.ndarray:
-    """All lines of a sweep in one call."""
-    return render_lines(grainy(kind), LOUD, EVERY, sweep, range(sweep.lines), seed=3, started_s=100.0)
-
-
-def parts(count: int, size: int) -> list[range]:
-    """Numbers 0 to ``count`` in runs of a size."""
-    return [range(first, min(first + size, count)) for first in range(0, count, size)]
-
-
-@pytest.mark.parametrize(
-    ("kind", "sweep", "size", "threads"), [("mixed", COARSE, 1, 2), ("planes", FINE, 1, 2), ("mixed", FINE, 7, 1)]
-)
-def test_lines_are_the_same_in_any_blocks_by_any_threads(kind: str, sweep: Sweep, size: int, threads: int) -> None:
-    """One and two threads give the same bytes out of blocks of 1, 7, 64 and all lines, with every effect on."""
-
-    def of(lines: range) -> np.ndarray:
-        return render_lines(grainy(kind), LOUD, EVERY, sweep, lines, seed=3, started_s=100.0)
-
-    blocks = parts(sweep.lines, size)
-    blocks = [*blocks[:4], *blocks[4:][-2:]]
-    with ThreadPoolExecutor(threads) as pool:
-        made = list(pool.map(of, blocks))
-    for lines, raw in zip(blocks, made, strict=True):
-        assert raw.tobytes() == whole_sweep(kind, sweep)[lines.start : lines.stop].tobytes()
 
 
 def test_lines_beyond_the_mirror_are_refused() -> None:

@@ -270,12 +270,6 @@ def test_defects_are_told_as_bad() -> None:
     assert white_reference_source_of(rig=rig).references(WHITE_REFERENCE_SWEEP).bad is None
 
 
-def test_bad_elements_are_filled_by_calibration() -> None:
-    """An even scene seen with dead and hot elements comes back even."""
-    rig = replace(RIG, detector=Detector(dead_fraction=0.02, hot_fraction=0.02, hot_e_per_s=2e4))
-    np.testing.assert_allclose(values_of(white_reference_source_of("defects", rig=rig)), 0.4, atol=2e-4)
-
-
 def test_white_reference_is_stated_in_the_rigs_bands() -> None:
     """Where the white reference's values have detail in the spectrum, the response rounds it as it does the light."""
     scene = even_scene()
@@ -315,11 +309,3 @@ def test_numbers_that_are_not_finite_are_refused_by_name(part: str, item: Any):
             continue
         with pytest.raises(SettingsError, match=rf"{part}\.{item.name} must be a (finite )?number"):
             with_number(part, item.name, value)
-
-
-def test_numbers_beyond_their_range_are_refused_with_it():
-    """Aperture and fraction of stray light."""
-    with pytest.raises(SettingsError, match=r"optics\.aperture_mm must be a number from 0\.1 to 1000 mm, got 0"):
-        with_number("optics", "aperture_mm", 0.0)
-    with pytest.raises(SettingsError, match=r"optics\.stray_fraction must be a number from 0 to 0\.5, got 0\.6"):
-        with_number("optics", "stray_fraction", 0.6)

@@ -40,12 +40,8 @@ def test_inputs_and_dependents_are_followed_all_the_way(tmp_path: Path, archive:
     "content",
     [
         "",
-        "{",
-        "[]",
-        '{"files": []}',
         "[" * 100_000,
         '{"files": {"../../x": {"sha256": "0", "size": 1}}}',
-        '{"files": {"a": 3}}',
         '{"files": {"/etc/passwd": {"sha256": "0", "size": 1}}}',
         '{"files": {}, "format": 2}',
     ],

@@ -21,7 +21,6 @@ from storage.archive.records import read_run
 from storage.archive.run_folders import RunDraft, try_exchange
 from storage.archive.staging import PART_SUFFIX
 from storage.maintenance.garbage import clear_up
-from storage.remote.object_archive import ObjectArchive
 from tests.storage.small_archive import problems, small_survey
 from tests.storage.small_bucket import FIRST, SECOND, Machine
 
@@ -105,17 +104,6 @@ def test_a_run_keeps_its_name_and_date(archive: Archive) -> None:
     assert (run.created, figure_of(archive)) == (created, 0.75)
     assert any(uri.startswith("stages/evaluate/") for uri in run.names)
     assert problems(archive) == []
-
-
-def test_an_old_run_does_not_become_the_newest(archive: Archive) -> None:
-    """It is extended after another was published, and stays the older one of the two."""
-    first = run_id(archive)
-    small_survey(archive, seed=1)
-    names = [run.folder.name for run in Catalogue.read(archive.root).runs]
-    with drafted(archive, first) as draft:
-        draft.write_file("receipt.json", "{}")
-        draft.publish()
-    assert [run.folder.name for run in Catalogue.read(archive.root).runs] == names
 
 
 def test_what_is_not_published_changes_nothing(archive: Archive) -> None:
@@ -215,29 +203,6 @@ def test_killed_before_the_files_of_before_go(machine: Machine, monkeypatch: pyt
     (gone,) = clear_up(other, keep_days=0).removals
     assert gone.what == "leftover"
     assert (figure_of(machine(SECOND, create=False)), problems(machine(FIRST))) == (0.75, [])
-
-
-def test_an_extension_that_could_not_be_uploaded_is_later(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Killed before its manifest is put the bucket has the run as it was; the next time this machine sends the rest."""
-    archive = machine(FIRST)
-    small_survey(archive)
-
-    upload = type(archive)._upload
-
-    def kill(self: ObjectArchive, uri: str, *, first: bool) -> None:
-        if uri.startswith("runs/"):
-            raise KeyboardInterrupt
-        upload(self, uri, first=first)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(type(archive), "_upload", kill)
-        with pytest.raises(KeyboardInterrupt):
-            extend(archive, run_id(archive))
-    other = machine(SECOND, create=False)
-    assert (figure_of(other), problems(other)) == (None, [])
-    machine(FIRST)
-    other = machine(SECOND, create=False)
-    assert (figure_of(other), problems(other)) == (0.75, [])
 
 
 def test_a_damaged_manifest_in_the_bucket_does_not_reach_the_copy(machine: Machine) -> None:

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.scan import Sweep
 from pipeline.source import Line, References
-from storage.archive.archive import Archive
-from storage.archive.manifests import check_files
 from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
 from storage.arrays.layout import AngularGrid
 from storage.arrays.mosaics import Attention, load_attention, open_mosaic, write_attention
@@ -189,23 +187,6 @@ def test_attention_round_trip(tmp_path: Path) -> None:
     assert found.policy == "entropy"
     with xr.open_zarr(tmp_path / "a.zarr", consolidated=False) as data:
         np.testing.assert_array_equal(data["score"].values, score)
-
-
-def test_a_flipped_bit_is_an_error_and_is_named(archive: Archive) -> None:
-    """crc32c stops the reader, here and in plain xarray; verify names the shard."""
-    with archive.publish("mosaic", "k") as staged:
-        write_values(staged.path / "m.zarr", _values(15), NM[:15], GRID)
-    ref = archive.refs()[0]
-    shard = ref.path / "m.zarr" / "scores" / "c" / "0" / "0" / "0"
-    content = bytearray(shard.read_bytes())
-    content[len(content) // 3] ^= 1
-    shard.write_bytes(content)
-    with pytest.raises(IncompleteStoreError, match=r"scores cannot be read.*run verify"):
-        open_mosaic(ref.path / "m.zarr").scores()
-    with xr.open_zarr(ref.path / "m.zarr", consolidated=False) as data, pytest.raises(ValueError, match="checksum"):
-        data["scores"].load()
-    with pytest.raises(IncompleteStoreError, match=r"scores/c/0/0/0 has changed"):
-        check_files(ref.path, hashes=True)
 
 
 def test_what_is_no_store(tmp_path: Path) -> None:

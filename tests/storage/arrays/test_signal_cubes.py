@@ -147,10 +147,7 @@ def test_no_line_of_the_store_differs(tmp_path: Path) -> None:
 
 READS: dict[str, Callable[[SignalCube], object]] = {
     "scores": lambda cube: cube.read(),
-    "axes": lambda cube: cube.components,
     "rare_residual": lambda cube: cube.spectra(0, 130),
-    "quality": lambda cube: cube.usable,
-    "mean": lambda cube: cube.components,
 }
 
 
@@ -263,25 +260,3 @@ def test_a_score_beyond_its_type_is_cut_off_and_does_not_wrap(tmp_path: Path) ->
     kept = read_array(writer.group, "scores")[0, 0]
     assert kept[0] > LARGEST_SHORT
     assert kept[1] < -LARGEST_SHORT
-
-
-def test_full_scale_lines_are_stored_in_32_bits_and_come_back(tmp_path: Path) -> None:
-    """A signal of thousands of deviations in every band: scores are large, and nothing is lost of them."""
-    made = field_of(4, SHAPE, BANDS, signal=8000)
-    values = made.values
-    found = SignalStatistics(BANDS, values[..., 0].size)
-    found.add(values, np.ones(SHAPE, np.bool_))
-    components = find_components(found)
-    lines = lines_of()
-    header = SweepHeader(lines.sweep, lines.references, np.linspace(400, 1000, BANDS))
-    largest = components.largest(found.largest)
-    writer = SignalCubeWriter(tmp_path / "a.zarr", header, components, step=1.0, largest=largest)
-    scores = components.white(values) @ components.axes.T.astype(np.float32)
-    assert largest > LARGEST_SHORT
-    writer.write(0, scores, np.zeros(SHAPE, np.uint8))
-    x, y = lines.position.T
-    facts = LineRows(lines.time_s, x, y, np.full(len(x), 100.0), lines.valid_line)
-    writer.close(facts, np.zeros((0, 2), np.intp), np.zeros((0, BANDS), np.int32))
-    cube = open_signal_cube(tmp_path / "a.zarr")
-    off = (cube.spectra(0, 130) - values) / made.noise
-    assert np.sqrt(np.mean(off**2)) == pytest.approx(1, abs=0.1)

@@ -120,40 +120,6 @@ def test_what_headers_say_of_bands(tmp_path: Path) -> None:
     assert ours.nodata == float(theirs.metadata["data ignore value"]) == -7.5
 
 
-def odd(text: str, rng: random.Random) -> str:
-    """The same header as others may write it: capitals, spaces, comments, lists over lines, nothing optional."""
-    lines = ["ENVI", "; a comment = of no account"]
-    for line in text.splitlines()[1:]:
-        key, _, value = (part.strip() for part in line.partition("="))
-        if not key or key in ("header offset", "file type", "description"):
-            continue
-        if rng.random() < 0.5:
-            key = key.title() if rng.random() < 0.5 else key.upper()
-        if key.lower() == "interleave" and rng.random() < 0.5:
-            value = value.upper()
-        if value.startswith("{"):
-            words = [word.strip() for word in value.strip("{}").split(",")]
-            value = "{\n " + " ,\n   ".join(words) + rng.choice(("}", "\n}"))
-        lines.append(f"{key}{rng.choice(('=', ' = ', '   =  '))}{value}{rng.choice(('', '  '))}")
-        if rng.random() < 0.3:
-            lines.append(rng.choice(("", "; between", ";key = value")))
-    return "\n".join(lines) + rng.choice(("", "\n", "\n\n"))
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_odd_headers(tmp_path: Path, seed: int) -> None:
-    """However a legal header is laid out, both readers find the same cube and bands in it."""
-    rng = random.Random(seed)
-    code, interleave, order = rng.choice(CODES), rng.choice(INTERLEAVES), rng.choice(sorted(ORDERS))
-    header, values = written_by_spy(tmp_path, code, interleave, order, wavelength=NM, fwhm=WIDTHS)
-    header.write_text(odd(header.read_text(), rng))
-    found = open_envi_cube(header)
-    assert_same(found, values, code, order)
-    np.testing.assert_array_equal(as_spy_reads(header), values)
-    assert found.header.wavelength_nm is not None
-    assert found.header.wavelength_nm.tolist() == envi.open(str(header)).bands.centers == NM
-
-
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 @pytest.mark.parametrize("dtype", ["u2", "f4"])
 def test_rasterio_reads_the_same(tmp_path: Path, dtype: str) -> None:

@@ -75,7 +75,7 @@ def test_only_the_array_wanted_is_read(tmp_path: Path) -> None:
             np.testing.assert_array_equal(read_all(tmp_path / name), cube)
 
 
-class _Trap:
+class Trap:
     """Unpickled, it would leave a file."""
 
     def __init__(self, path: Path) -> None:
@@ -87,7 +87,7 @@ class _Trap:
 
 def test_pickles_in_arrays_and_packs(tmp_path: Path) -> None:
     """What only unpickling could read is never read, whatever file it stands in."""
-    trap = pickle.dumps(_Trap(tmp_path / "trapped"))
+    trap = pickle.dumps(Trap(tmp_path / "trapped"))
     (tmp_path / "bare.npy").write_bytes(trap)
     (tmp_path / "object.npy").write_bytes(npy_header((2, 2, 2), "|O") + trap)
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as pack:
@@ -175,7 +175,7 @@ def test_tiffs_that_claim_too_much(tmp_path: Path, side: int, tile: int) -> None
 
 
 @pytest.mark.parametrize("compression", [None, "zlib"])
-@pytest.mark.parametrize("fraction", [0.02, 0.3, 0.9, 0.999])
+@pytest.mark.parametrize("fraction", [0.02, 0.9])
 def test_tiffs_that_are_cut_off(tmp_path: Path, compression: str | None, fraction: float) -> None:
     """A TIFF that ends too early is refused when its missing rows are asked for, not filled."""
     values = np.random.default_rng(0).integers(1, 255, (200, 100), dtype=np.uint8)

@@ -20,6 +20,7 @@ from pipeline.source import Line, References
 from storage.arrays.cubes import RawCubeWriter, SweepHeader
 from storage.readers.open_cubes import open_cube
 from storage.readers.scene_files import load_scene_file
+from tests.storage.readers.test_huge_claims import Trap
 
 NM = np.array([450.0, 550.0, 650.0, 800.0, 900.0])
 
@@ -82,22 +83,12 @@ def _edit(path: Path, change: Any) -> None:
     path.write_text(json.dumps(content))
 
 
-class _Trap:
-    """Unpickled, it would leave a file."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> Any:
-        return Path.touch, (self.path,)
-
-
 @pytest.mark.parametrize("filters", [True, False])
 def test_pickle_is_never_loaded(tmp_path: Path, cube: NDArray[np.uint16], filters: bool) -> None:
     """A store that asks for pickle, as filter or compressor, is refused before a chunk is read."""
     path = tmp_path / "a.zarr"
     zarr.create_array(path, data=cube, zarr_format=2, chunks=cube.shape, compressors=None)
-    (path / "0.0.0").write_bytes(pickle.dumps(_Trap(tmp_path / "trapped")))
+    (path / "0.0.0").write_bytes(pickle.dumps(Trap(tmp_path / "trapped")))
     key, value = ("filters", [{"id": "pickle"}]) if filters else ("compressor", {"id": "pickle"})
     _edit(path / ".zarray", lambda content: content.update({key: value}))
     with pytest.raises(SceneError, match="asks for the codec 'pickle', which is not read"):

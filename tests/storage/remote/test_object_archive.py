@@ -121,12 +121,11 @@ def test_a_flipped_bit_is_found_and_never_used(machine: Machine) -> None:
     assert not (other.root / found.uri / "deep" / "a.bin").exists()
 
 
-@pytest.mark.parametrize("at", [5, 200, -30])
-def test_a_flipped_bit_in_a_manifest_is_found(machine: Machine, at: int) -> None:
+def test_a_flipped_bit_in_a_manifest_is_found(machine: Machine) -> None:
     """The manifest vouches for itself, in the bucket too."""
     archive = machine(FIRST)
     ref, _ = make(archive)
-    rot(archive, f"{ref.uri}/manifest.json", at)
+    rot(archive, f"{ref.uri}/manifest.json", 200)
     assert [finding.uri for finding in verify_archive(archive) if finding.problem] == [ref.uri]
     with pytest.raises(IncompleteStoreError, match=r"no valid manifest\.json"):
         machine(SECOND).find("rectify", ref.key)
@@ -165,26 +164,6 @@ def test_runs_of_one_second_have_names_of_their_own(machine: Machine) -> None:
     """Two machines that begin a run in the same second do not get the same name."""
     drafts = [machine(name)._begin_run("20261120T101010-farm") for name in (FIRST, SECOND)]
     assert len({draft.id for draft in drafts if draft is not None}) == 2
-
-
-def test_what_could_not_be_sent_is_sent_by_the_next_command(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The bucket goes away in the middle: what was made is kept, and the same command uploads it and goes on."""
-    archive = machine(FIRST)
-
-    def refuse(*given: Any) -> None:
-        raise UnreachableError("it cannot be reached")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Objects, "write", refuse)
-        with pytest.raises(UnreachableError, match="it cannot be reached"):
-            make(archive, b"dark", seed=1)
-    key = next((archive.root / "stages" / "rectify").iterdir()).name
-    other = machine(SECOND)
-    assert other.find("rectify", key) is None
-    assert make(machine(FIRST), b"not made again", seed=1)[1] is False
-    found = other.find("rectify", key)
-    assert found is not None
-    assert (found.path / "deep" / "a.bin").read_bytes() == b"dark"
 
 
 @pytest.mark.parametrize("method", ["write", "create"])

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
-import numpy as np
 import pytest
 
-from pipeline.rig.emulator.camera_device import CameraConnection, CameraDevice
+from pipeline.rig.emulator.camera_device import CameraConnection
 from tests.pipeline.rig.camera.camera_line import LinesOf, control_of
 from tests.pipeline.rig.camera_faults import CameraFault, CameraFaults, FaultyCamera
 from tests.pipeline.rig.in_process import ManualClock
@@ -87,25 +84,3 @@ def test_frames_pass_with_time() -> None:
     assert not control.is_capturing()
     names = [file.name.rsplit("/", 1)[1] for file in control.list_files(folder)]
     assert names == ["frameIndex_0.txt", "imu_gps.txt", "raw_0", "raw_0.hdr"]
-
-
-def test_what_it_sees_is_asked_once() -> None:
-    """Each frame is looked at once, at its own mid exposure; and is one pulse."""
-    seen: list[float] = []
-
-    def lines(times: np.ndarray) -> np.ndarray:
-        seen.extend(times.tolist())
-        return np.zeros((len(times), 2, 2), np.uint16)
-
-    clock = ManualClock()
-    device = CameraDevice(lines, clock)
-    control = control_of(device, clock)
-    control.configure(8, 10)
-    control.capture(100)
-    for _ in range(20):
-        clock.sleep(0.07)
-        device.files()
-    assert seen == pytest.approx([0.014 + 0.01 * number for number in range(100)])
-    (capture,) = device.captures
-    begins = np.concatenate([capture.begins(*span) for span in pairwise(np.linspace(0, 2, 38))])
-    np.testing.assert_allclose(begins, 0.01 + np.arange(100) * 0.01, atol=1e-12)

@@ -14,9 +14,9 @@ from pipeline.errors import RigError
 from pipeline.rig.camera import camera_files
 from pipeline.rig.camera.camera_files import KeptInMemory, RemoteFile, fetch_files, log_in
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
-from pipeline.rig.device_settings import CameraAddress, ControlPatience, FileServer
+from pipeline.rig.device_settings import CameraAddress, FileServer
 from pipeline.rig.emulator.camera_device import MOST_LINE, CameraConnection, CameraDevice, CameraServer
-from pipeline.rig.transports import SYSTEM_CLOCK, DeviceGone, DeviceRefused, SocketTransport
+from pipeline.rig.transports import DeviceGone, DeviceRefused, SocketTransport
 from tests.pipeline.rig.camera.camera_line import LinesOf, wait_for
 from tests.pipeline.rig.camera_faults import CameraFault, CameraFaults, FaultyCamera, FaultyServer
 from tests.pipeline.rig.in_process import ManualClock
@@ -168,15 +168,3 @@ def test_server_closes_cleanly() -> None:
         line = SocketTransport(served.host, served.port)
     line.close()
     assert threading.active_count() == before
-
-
-def test_silence_on_a_real_socket() -> None:
-    """By the system's clock a lost reply costs its deadline, and the next connection answers."""
-    device = FaultyCamera(LinesOf(), SYSTEM_CLOCK, faults=CameraFaults({CameraFault.SILENT: 1}))
-    with CameraServer(device) as served:
-        driver = HeadwallCamera.at(
-            CameraAddress(served.host, served.port), FileServer(), patience=ControlPatience(0.3, 1, 0.01)
-        )
-        assert not driver.is_capturing()
-        driver.close()
-    assert device.commands[:2] == ["isCapturing", "isCapturing"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -15,11 +14,11 @@ from pipeline.geometry.scan import Sweep, sweep_positions
 from pipeline.rig.camera.camera_files import KeptInMemory
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.capture_paths import capture_prefix
-from pipeline.rig.device_settings import CameraAddress, FileServer, SurveyRig
-from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock
-from pipeline.rig.mirror_controller import MirrorController, open_mirror
+from pipeline.rig.device_settings import SurveyRig
+from pipeline.rig.emulator.emulated_rig import EmulatedRig
+from pipeline.rig.mirror_controller import MirrorController
 from pipeline.rig.pro_mode import Trigger
-from pipeline.rig.transports import SYSTEM_CLOCK, Clock, DeviceGone, SocketTransport
+from pipeline.rig.transports import Clock
 from pipeline.simulator.render import QUIET
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import AT_REST
@@ -137,29 +136,3 @@ def test_state_in_words() -> None:
         pair.mirror.settle(2.0)
         pair.camera.capture(2)
         assert rig.state == "mirror +0.2500; +0.0000, pro, requests checked | camera capturing, 1 captures"
-
-
-@contextmanager
-def served(speed: float) -> Iterator[tuple[Pair, EmulatedRig]]:
-    """Drivers of an emulated rig behind a pty and sockets, by the clock on the wall."""
-    rig = EmulatedRig(small_source(), FastClock(speed))
-    with contextlib.ExitStack() as stack:
-        ports = stack.enter_context(rig.serve())
-        mirror = stack.enter_context(open_mirror(SurveyRig(port=ports.port, deadline_s=5.0)))
-        files = FileServer(ports.host, ports.file_port)
-        camera = HeadwallCamera.at(CameraAddress(ports.host, ports.camera_port), files)
-        stack.callback(camera.close)
-        yield Pair(mirror, camera, SYSTEM_CLOCK), rig
-
-
-def test_closing_leaves_nothing() -> None:
-    """Both ports are gone, and a device that is used afterwards says so."""
-    with served(40.0) as (pair, rig):
-        port = pair.mirror.rig.port
-    with pytest.raises(DeviceGone, match="cannot be opened"):
-        open_mirror(SurveyRig(port=port))
-    assert not rig.camera.is_capturing()
-    with rig.serve() as again:
-        address = again.host, again.camera_port
-    with pytest.raises(DeviceGone, match="no connection"):
-        SocketTransport(*address, connect_s=0.5)

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 import serial
 
-from pipeline.errors import RigError, SettingsError
+from pipeline.errors import RigError
 from pipeline.rig.device_settings import SurveyRig
-from pipeline.rig.emulator.emulated_rig import EmulatedPort, FastClock
+from pipeline.rig.emulator.emulated_rig import EmulatedPort
 from pipeline.rig.emulator.mirror_device import MirrorDevice
 from pipeline.rig.mirror_controller import open_mirror
 from pipeline.rig.transports import SYSTEM_CLOCK, DeviceGone
@@ -83,20 +83,6 @@ def test_the_driver_drives_it() -> None:
     device = FaultyMirror(SYSTEM_CLOCK, [make_fault("gone-before", at=5)])
     with EmulatedPort(device) as port, pytest.raises(DeviceGone, match=f"{port.path} went away"):
         open_mirror(SurveyRig(port=port.path)).goto(0.0, 0.0)
-
-
-def test_emulated_time_may_run_faster() -> None:
-    """A clock at 100 times the speed lets a minute of the mirror pass in less than a second."""
-    clock = FastClock(100.0)
-    began = clock.now()
-    clock.sleep(10.0)
-    assert clock.now() - began >= 10.0
-    with pytest.raises(SettingsError, match="--speed 0: expected a factor above 0"):
-        FastClock(0.0)
-    device = MirrorDevice(clock)
-    with EmulatedPort(device) as port, serial.Serial(port.path, timeout=2.0) as user:
-        user.write(b"START\r\n")
-        assert user.read_until(b"\n") == b"OK\r\n"
 
 
 def test_without_ptys_there_is_one_clear_message(monkeypatch: pytest.MonkeyPatch) -> None:
