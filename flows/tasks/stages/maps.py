@@ -108,7 +108,7 @@ def segment(
     if prior is None:
         return Wanted(build, params, [mosaic, attention])
     shifts = [list(scan_pass.shift_px) for scan_pass in prior.scan_passes]
-    known = {"days": prior.days, "day_of_year": prior.day_of_year, "classes": list(prior.classes)}
+    known: dict[str, Any] = {"days": prior.days, "day_of_year": prior.day_of_year, "classes": list(prior.classes)}
     known["reader"] = None if reader is None else reader.key
     earlier = [prior.probabilities, *(one.mosaic for one in prior.scan_passes)]
     return Wanted(build, {**params, **known, "shifts": shifts}, [mosaic, attention, *earlier])
