@@ -96,6 +96,13 @@ def test_lines_that_another_run_keeps_stay(archive: Archive, survey_png: Survey)
     assert raw_uris(archive) == there
 
 
+@pytest.mark.usefixtures("no_effects", "later")
+def test_lines_that_no_run_keeps_go_with_the_next_survey(archive: Archive, survey_png: Survey) -> None:
+    """It finds the lines of a run whose week is over."""
+    survey_png(archive.root, keep="signal", accuracy=False)
+    assert raw_uris(archive) == set()
+
+
 @pytest.mark.usefixtures("no_effects")
 def test_what_a_killed_survey_did_not_clear_goes(
     survey_png: Survey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -115,6 +115,12 @@ def test_a_look_of_before_does_not_go_on_from_a_later_one(visited: Path, twice: 
     assert between.receipt["memory"]["days"] == 1.5
 
 
+def test_a_look_at_the_same_moment_goes_on_from_the_other(visited: Path, twice: Any, survey_png: Survey) -> None:
+    """The time between may be 0."""
+    again = survey_png(visited, **UNIFORM, visit="2026-06-04T12:00:00+02:00", prior="latest")
+    assert (again.receipt["memory"]["run"], again.receipt["memory"]["days"]) == (twice[2].folder.name, 0.0)
+
+
 def test_a_run_can_be_named(visited: Path, twice: Any, survey_png: Survey) -> None:
     """Whichever it is; one that is not there, or of another size, ends in one message."""
     named = survey_png(visited, **UNIFORM, visit="2026-06-09T10:00:00Z", prior=twice[1].folder.name)

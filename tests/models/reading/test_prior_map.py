@@ -67,6 +67,14 @@ def a_reader(seed: int = 0) -> TemporalReader:
 READERS = pytest.mark.parametrize("reader", [None, a_reader()], ids=["without a reader", "with one"])
 
 
+def test_exposure_of_visits_adds_up_and_fades() -> None:
+    """After 30 days one e-th of the earlier exposure is left, and lines 2 px apart give a quarter of theirs."""
+    rng, seen = np.random.default_rng(1), np.arange(SHAPE[1]) < np.full(SHAPE, 7)
+    visit = replace(an_observation(rng), light=0.4, seen=seen)
+    after = fuse(a_prior_map(rng, days=30.0), visit, None)
+    np.testing.assert_allclose(after.light, 0.0125 / math.e + np.where(seen, 0.1, 0.0), rtol=1e-5)
+
+
 @READERS
 @given(seed=seeds)
 def test_probabilities_stay_probabilities(reader: TemporalReader | None, seed: int) -> None:

@@ -66,3 +66,17 @@ def test_the_rectification_goes_by_positions() -> None:
     expected = _mosaic(one)
     other = replace(one, sweep=replace(one.sweep, swath_px=3.0, start_px=11.0))
     np.testing.assert_array_equal(_mosaic(other), expected)
+
+
+def test_lines_beyond_a_gap_do_not_reach_over_it() -> None:
+    """Rows before two lost lines stay the same, whatever the lines behind the gap hold."""
+    source = _ramp()
+    one = record(source, replace(FULL, start_px=FULL.start_px - 0.4))
+    one = replace(one, valid_line=~np.isin(np.arange(FULL.lines), (40, 41)))
+
+    def other(numbers: NDArray[np.intp]) -> NDArray[np.uint16]:
+        return np.where(numbers[:, None, None] > 41, 4 * one.read_lines(numbers), one.read_lines(numbers))
+
+    plain, bright = (_mosaic(lines)[:40] for lines in (one, replace(one, read_lines=other)))
+    assert np.isfinite(plain[36:40]).all()
+    np.testing.assert_array_equal(bright, plain)

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import Axis
-from pipeline.planning.coverage import full_sweeps, patches_shown, sweeps_over, uniform_sweeps
+from pipeline.geometry.scan import Axis, scene_to_sweep
+from pipeline.planning.coverage import full_sweeps, lines_showing, patches_shown, sweeps_over, uniform_sweeps
 
 GRID, CAMERA = SceneGrid(320, 416, 16, 4), LineCamera(samples=160)
 
@@ -48,3 +48,16 @@ def test_swaths_beside_the_area_are_left_out() -> None:
     assert len(sweeps) == 3
     assert [one.name for one in sweeps_over(sweeps, GRID, CAMERA, shown_of(0, 0, 3, 3))] == ["full-0"]
     assert sweeps_over(sweeps, GRID, CAMERA, np.zeros_like(shown_of(0, 0, 1, 1))) == []
+
+
+def test_a_patch_has_all_lines_that_resampling_reads() -> None:
+    """From the line before its first pixel to two lines after its last, where the sweep has them."""
+    for sweep in full_sweeps(GRID, CAMERA, "x"):
+        for patch in GRID.valid_patches()[::5]:
+            down, across = GRID.patch_origin(np.array([patch]))[0]
+            y, x = (place + np.arange(16) - (size - 1) / 2 for place, size in ((down, 320), (across, 416)))
+            at = scene_to_sweep(sweep, CAMERA, x[None, :], y[:, None])
+            line = np.floor(at[np.abs(at[..., 1] - 79.5) <= 80][:, 0])
+            first, stop = lines_showing(sweep, GRID, CAMERA, np.array([patch])) or (sweep.lines, 0)
+            assert first <= max(line.min(initial=np.inf) - 1, 0)
+            assert stop > min(line.max(initial=-np.inf) + 2, sweep.lines - 1)

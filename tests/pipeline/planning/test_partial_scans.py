@@ -137,6 +137,19 @@ def test_a_swath_that_does_not_pay_its_set_up_is_left_out() -> None:
     assert found.runs == wanted
 
 
+def test_lines_that_two_rows_share_are_paid_once() -> None:
+    """Neighbours of two good rows cost fewer lines than a far row of more gain."""
+    expected_gain, count = np.zeros(int(np.prod(GRID.patch_shape))), ROWS.first.shape[1]
+    for place, gain in ((2, 1.0), (3, 0.5), (9, 0.6), (15, 1.0), (16, 0.5)):
+        expected_gain[np.flatnonzero(place == ROWS.row)[0]] = gain
+    assert count > 16
+    wanted = tuple((0, int(ROWS.first[0, one]), int(ROWS.stop[0, one + 1])) for one in (2, 15))
+    times = RunTimes(1.0, 0.0, lambda runs: float(sum(stop - first for _, first, stop in runs)))
+    found = choose_runs(ROWS, expected_gain, times, seconds=times.seconds(wanted), several=True)
+    assert found is not None
+    assert found.runs == wanted
+
+
 def test_rows_worth_the_same_are_looked_at_as_far_as_time_goes() -> None:
     """Of a block that the seconds do not pay for as much as they do, and no lines beside it."""
     expected_gain = np.zeros(GRID.patch_shape)

@@ -171,6 +171,12 @@ def test_a_partial_patch_is_filled_from_inside() -> None:
     assert (place <= np.array([11, 20])).all()
 
 
+def test_pixels_beyond_the_border_are_reflected() -> None:
+    """Rows 12 to 14 of a scene of 12 rows repeat rows 10 to 8."""
+    points, _ = patch_pixels(SceneGrid(12, 21, 8, 2), np.array([4]))
+    assert (points[0, :, 0, 0] + 5.5).tolist() == [8, 9, 10, 11, 10, 9, 8, 11]
+
+
 @dataclass
 class Numbered:
     """Lines whose numbers say where they lie; notes what is read, slowly if asked."""

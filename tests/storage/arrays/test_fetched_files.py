@@ -56,10 +56,11 @@ def test_name_that_is_none_is_refused(tmp_path: Path):
             FetchedFiles(tmp_path).append(name, b"x")
 
 
-def test_full_disk_keeps_what_there_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("name", ["/a/raw_0", "notes"])
+def test_full_disk_keeps_what_there_was(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch):
     """A write that the disk takes a part of is taken back, and told with what to do."""
     kept = FetchedFiles(tmp_path)
-    kept.append("/a/raw_0", b"whole")
+    kept.append(name, b"whole")
     write = os.write
 
     def full(file: int, data: bytes) -> int:
@@ -68,9 +69,9 @@ def test_full_disk_keeps_what_there_was(tmp_path: Path, monkeypatch: pytest.Monk
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("storage.arrays.spool.os.write", full)
-    with pytest.raises(NotKept, match=r"cannot keep byte 5 of /a/raw_0 .*the disk is full.*the 5 bytes before"):
-        kept.append("/a/raw_0", b"torn")
-    assert kept.read("/a/raw_0", 0, 99) == b"whole"
+    with pytest.raises(NotKept, match=rf"cannot keep byte 5 of {name} .*the disk is full.*the 5 bytes before"):
+        kept.append(name, b"torn")
+    assert kept.read(name, 0, 99) == b"whole"
 
 
 @pytest.mark.parametrize("rotten", ["bytes", "sums"])

@@ -163,3 +163,11 @@ def test_references_that_do_not_fit() -> None:
         mean_frame(np.zeros((0, 2, 3), np.uint16))
     one = mean_frame(frames(64, 1))
     assert not one.stuck.any()
+
+
+def test_few_frames_show_no_stuck_element() -> None:
+    """An element may have the same number in seven frames by chance, but not in eight."""
+    dark = frames(64, 8)
+    dark[:, 3, 4] = 70
+    assert not mean_frame(dark[:7]).stuck.any()
+    assert mean_frame(dark).stuck[3, 4]

@@ -221,3 +221,9 @@ def test_light_changes_by_slope_times_way(effect: Any, sweep: Sweep):
     np.testing.assert_allclose(found[..., 0][away], stated[away], rtol=5e-3, atol=0.05)
     np.testing.assert_allclose(found[..., 1], found[..., 0] / 2, atol=2e-3)
     assert np.abs(found).max() > 0.1
+
+
+def test_offsets_of_a_sweep_are_of_its_seed() -> None:
+    """Two surveys have two offsets of the sweep of one name."""
+    one, other = (PointingErrors(6.0, seed).offset("full-0") for seed in (1, 2))
+    assert (one != other).all()
