@@ -300,11 +300,12 @@ class Cluster(Executor):
 
 def start(workers: int) -> Any:
     """Start a dask cluster of processes of this machine, with one arithmetic thread each, deaf to Ctrl-C."""
+    make_cluster = dask_distributed.LocalCluster  # imported before its settings are changed for a while
     resource_tracker.ensure_running()  # started later it would unblock signals
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         with dask.config.set({"distributed.nanny.pre-spawn-environ": _ENVIRONMENT}):
-            return dask_distributed.LocalCluster(  # type: ignore[no-untyped-call]
+            return make_cluster(  # type: ignore[no-untyped-call]
                 n_workers=workers,
                 threads_per_worker=1,
                 memory_limit=None,
