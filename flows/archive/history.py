@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -17,12 +17,14 @@ from rich.markup import escape
 from flows.archive.stale_runs import called
 from flows.cli.app import ArchiveName, AsJson, OutFile, check_outside, stderr
 from flows.publish.receipt import check_receipt
+from flows.settings.survey_settings import BUILT_IN_SCENES
 from flows.tasks.scores import score_of
 from flows.terminal.figures import counted, format_area, format_percent
 from flows.terminal.processes import DONE
 from flows.terminal.progress import print_json
 from pipeline.errors import ArchiveError, SettingsError, ShapeError, visible
 from pipeline.lazy import deferred
+from pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run
@@ -41,6 +43,7 @@ else:
 
 LEADING_CLASSES = 3  # of a run in the table
 SHOW_AREA = {"ha": format_area, "fraction": format_percent}
+COLOURS = 10  # of a chart, before they repeat
 AXES = {"ha": "hectares", "fraction": "fraction of the map"}
 Row = Mapping[str, Any]
 
@@ -106,7 +109,7 @@ def _row(run: Run) -> Row:
         "run": run.uri,
         "created": run.created,
         "visit": run.settings.get("visit"),
-        "visited": _moment(run.settings.get("visit")) or _moment(receipt.get("started")) or _moment(run.created),
+        "visited": time_of_visit(run),
         **score_of(receipt),
         "training_scene": receipt.get("training_scene"),
         "capture_s": (receipt["savings"].get("capture_s") or {}).get("done") if receipt else None,
@@ -114,6 +117,21 @@ def _row(run: Run) -> Row:
         "unit": unit,
         "problem": run.problem,
     }
+
+
+def time_of_visit(run: Run) -> str | None:
+    """Return the moment that names a run's visit, else day and hour of a built-in scene, else when the run began.
+
+    A day of a built-in scene counts in the year of the run. The moment is in ISO 8601 in UTC; None: nothing is known.
+    """
+    named, began = _moment(run.settings.get("visit")), _moment(run.receipt.get("started")) or _moment(run.created)
+    if named is not None or began is None or run.settings.get("scene") not in BUILT_IN_SCENES:
+        return named or began
+    day, hour = (run.settings.get(name) for name in ("day", "hour"))
+    with suppress(TypeError, ValueError, OverflowError):
+        grown = timedelta(days=(USUAL_DAY if day is None else day) - 1, hours=USUAL_HOUR if hour is None else hour)
+        return (datetime(int(began[:4]), 1, 1, tzinfo=UTC) + grown).isoformat()
+    return began
 
 
 def _moment(value: object) -> str | None:
@@ -147,10 +165,11 @@ def _draw_areas(rows: Sequence[Row]) -> str | None:
     dated = [row for row in dated if row["unit"] == unit]
     figure = mpl_figure.Figure(figsize=(9.5, 3.2), dpi=100, layout="constrained", facecolor=panels.PAPER)
     axes = figure.subplots()
-    for name in dict.fromkeys(name for row in dated for name in row["areas"]):
+    for number, name in enumerate(dict.fromkeys(name for row in dated for name in row["areas"])):
         points = [(datetime.fromisoformat(row["visited"]), row["areas"].get(name, 0.0)) for row in dated]
         label = visible(name).replace("_", " ").replace("$", r"\$")
-        axes.plot(*zip(*points, strict=True), marker="o", markersize=4, label=label)
+        dashes = "-" if number < COLOURS else "--"
+        axes.plot(*zip(*points, strict=True), marker="o", markersize=4, linestyle=dashes, label=label)
     axes.set_ylim(bottom=0)
     axes.set_ylabel(AXES[unit])
     axes.grid(color=panels.GRID)

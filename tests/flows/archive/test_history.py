@@ -9,8 +9,9 @@ from typing import Any
 
 import pytest
 
-from flows.archive.history import FieldHistory, read_history, render_history
+from flows.archive.history import FieldHistory, read_history, render_history, time_of_visit
 from storage.archive.archive import Archive
+from storage.archive.records import Run
 from tests.flows.conftest import Page
 
 pytestmark = pytest.mark.usefixtures("no_effects")
@@ -38,6 +39,23 @@ def test_runs_are_one_history(archive: Path) -> None:
         receipt = json.loads((archive / row["run"] / "receipt.json").read_text())
         assert row["miou"] == receipt["accuracy"]["miou"]
         assert row["capture_s"] == receipt["savings"]["capture_s"]["done"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "visited"),
+    [
+        ({"scene": "farm", "visit": "2026-06-21T09:30:00Z", "day": 130}, "2026-06-21T09:30"),
+        ({"scene": "farm", "day": 179}, "2026-06-28T11:00"),
+        ({"scene": "farm", "hour": 13.5}, "2026-06-21T13:30"),
+        ({"scene": "field.png", "day": 130}, "2026-11-22T08:00"),
+        ({"scene": "farm", "day": 10**12}, "2026-11-22T08:00"),
+    ],
+)
+def test_a_visit_has_the_day_of_its_farm(settings: dict[str, Any], visited: str) -> None:
+    """The name of a visit comes first; scenes of files have the time of their survey."""
+    facts = {"created": "2026-11-23T00:00:00Z", "settings": settings}
+    run = Run(Path("x"), facts, {"started": "2026-11-22T08:00:00Z"}, None)
+    assert str(time_of_visit(run)).startswith(visited)
 
 
 def test_pages_load_nothing_and_lead_to_reports(archive: Path, command_line: Any, tmp_path: Path) -> None:
