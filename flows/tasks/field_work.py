@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.tasks.patch_budget import SHARD
+from models.evaluation.placement import COMPARED, classes_by
 from models.network.machine import PROCESSOR
 from models.network.spectral import Capture, CaptureMap, LineSpec, patches_of
 from models.policies.policies import GLANCING_POLICIES, score_patches
@@ -32,6 +33,9 @@ from storage.parallel.pool import RESERVED_BYTES, WorkerPool, memory_refusal, mi
 
 if TYPE_CHECKING:
     from models.network.temporal_reader import TemporalReader
+
+NO_PATCHES = np.empty(0, np.int64)
+Report = Callable[[float], None]
 
 
 @dataclass(frozen=True)
@@ -113,6 +117,26 @@ class ExpectedErrors:
         return pixels[kept.top - top : kept.bottom - top, kept.left - left : kept.right - left]
 
 
+@dataclass(frozen=True)
+class Readings:
+    """Worker that segments a region by the overview alone and, if asked, by the full network everywhere."""
+
+    weights: WeightsFile
+    mosaic: Path
+    capture: LineSpec
+    in_full: bool
+
+    def __call__(self, region: Region) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+        """Return (reading, y, x) classes of the kept part, and (patch_y, patch_x, policy) scores of its patches."""
+        free_tiles()
+        weights = self.weights.load()
+        seen = read_coarse_prediction(weights, coarse_region(weights, self.mosaic, region, self.capture))
+        readings = (False, True) if self.in_full else (False,)
+        maps = [region.crop(classes_by(weights, seen, in_full=in_full)) for in_full in readings]
+        scores = [region.crop_patches(score_patches(policy, seen)) for policy in COMPARED]
+        return np.stack(maps), np.stack(scores, axis=-1)
+
+
 def coarse_region(weights: Weights, mosaic: Path, region: Region, capture: LineSpec) -> CoarsePass:
     """Read a region of a stored mosaic, in blocks of rows.
 
@@ -160,32 +184,50 @@ class FieldWork:
     pool: WorkerPool
     memory: int  # of this process and its workers [bytes]
 
-    def score(
-        self, policy: str, mosaic: Path, capture: LineSpec, report: Callable[[float], None]
-    ) -> NDArray[np.float64]:
+    def score(self, policy: str, mosaic: Path, capture: LineSpec, report: Report) -> NDArray[np.float64]:
         """Return the scores of all patches of the padded grid, (patch_y, patch_x).
 
         Raises SettingsError: one region does not fit the memory.
         """
         mosaic = mosaic.resolve()
-        return self._gathered(Scoring(self.weights, mosaic, policy, capture), mosaic, report)
+        work = Scoring(self.weights, mosaic, policy, capture)
+        return self._joined(self._of_regions(work, mosaic, NO_PATCHES, report))
 
-    def expected_errors(self, mosaic: Path, capture: LineSpec, report: Callable[[float], None]) -> PatchExpectedErrors:
+    def expected_errors(self, mosaic: Path, capture: LineSpec, report: Report) -> PatchExpectedErrors:
         """Return the expected errors of the overview of a mosaic, by patch.
 
         Raises SettingsError: one region does not fit the memory.
         """
         mosaic = mosaic.resolve()
-        pixels = self._gathered(ExpectedErrors(self.weights, mosaic, capture), mosaic, report)
+        work = ExpectedErrors(self.weights, mosaic, capture)
+        pixels = self._joined(self._of_regions(work, mosaic, NO_PATCHES, report))
         steps, ages = np.geomspace(LEAST_EXPECTED_ERROR, 1.0, STEPS), np.zeros(pixels[..., 0, 0].size)
         return PatchExpectedErrors(pixels.reshape(-1, *pixels.shape[2:]), steps, ages)
 
-    def _gathered(
-        self, worker: Callable[[Region], NDArray[Any]], mosaic: Path, report: Callable[[float], None]
-    ) -> NDArray[Any]:
-        """Return what a worker computes of all patches of the padded grid, (patch_y, patch_x, ...)."""
-        pool = self.pool_for(np.empty(0, np.int64), len(open_mosaic(mosaic).components))
-        parts = run_blocks(worker, self.regions, pool, report=report, paths=[mosaic])
+    def readings(
+        self, mosaic: Path, capture: LineSpec, *, in_full: bool, report: Report
+    ) -> tuple[NDArray[np.uint8], dict[str, NDArray[np.float64]]]:
+        """Return the class maps (reading, y, x) by the overview and, ``in_full``, by the full network everywhere.
+
+        Also returns the (patch_y, patch_x) scores by the policies that are compared.
+        """
+        grid, work = self.regions[0].field, Readings(self.weights, mosaic, capture, in_full)
+        parts = self._of_regions(work, mosaic, grid.valid_patches(), report)
+        maps = np.empty((len(parts[0][0]), grid.height, grid.width), np.uint8)
+        for region, (part, _) in zip(self.regions, parts, strict=True):
+            maps[:, region.kept.rows, region.kept.columns] = part
+        scores = self._joined([part for _, part in parts])
+        return maps, dict(zip(COMPARED, np.moveaxis(scores, -1, 0), strict=True))
+
+    def _of_regions(
+        self, worker: Callable[[Region], Any], mosaic: Path, patch_index: NDArray[np.integer], report: Report
+    ) -> list[Any]:
+        """Run a worker that reads ``patch_index`` in full for all regions."""
+        pool = self.pool_for(patch_index, len(open_mosaic(mosaic).components))
+        return run_blocks(worker, self.regions, pool, report=report, paths=[mosaic])
+
+    def _joined(self, parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+        """Join arrays of all regions' own patches to that of the padded grid, (patch_y, patch_x, ...)."""
         whole = np.zeros((*self.regions[0].field.patch_shape, *parts[0].shape[2:]), parts[0].dtype)
         for region, part in zip(self.regions, parts, strict=True):
             whole[region.kept_patches.rows, region.kept_patches.columns] = part

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -25,28 +25,30 @@ from models.evaluation.metrics import (
     judge_confidence,
     mean_iou,
 )
-from models.evaluation.placement import CONTROL_FRACTION, CascadeTable, ReadTwice, placement_figures, run_controls
+from models.evaluation.placement import CONTROL_FRACTION, ReadTwice, placement_figures, run_controls
 from models.network.sizes import PLANES
-from models.network.spectral import LineSpec, patches_of
-from models.policies.policies import score_patches
-from models.reading.inference import coarse_prediction_of_columns, map_of_columns, segment
+from models.network.spectral import LineSpec
+from models.reading.inference import coarse_prediction_of_columns, map_of_columns
 from models.training.capture_augmentation import REFERENCE_MS, STEPS, CaptureAugmentation
 from models.training.examples import Example
 from models.training.train import LabelledPixels, discriminants_alone
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 
-Show = Callable[[str], None]
-Patches = NDArray[np.float32]  # (patch, p, p, column) of every patch of the padded grid
 
-
-def validate(weights: Weights, examples: Iterable[Example], seed: int, show: Show) -> dict[str, Any] | None:
-    """Return `agreement` over all scenes by each policy at one fraction of the patches; None without a scene."""
-    rows = []
+def read_twice(weights: Weights, examples: Iterable[Example]) -> list[ReadTwice]:
+    """Segment each scene by the overview alone, and in full."""
+    found = []
     for example in examples:
-        grid, cells, labels = _parts(weights, example)
+        grid, labels = _parts(weights, example)
         seen = coarse_prediction_of_columns(weights, example.columns.astype(np.float32), grid)
-        rows.append(run_controls(weights, seen, cells, labels, fraction=CONTROL_FRACTION, seed=seed, report=show))
+        found.append(ReadTwice.of(weights, seen, labels))
+    return found
+
+
+def validate(scenes: Sequence[ReadTwice], classes: int, seed: int) -> dict[str, Any] | None:
+    """Return `agreement` over all scenes by each policy at one fraction of the patches; None without a scene."""
+    rows = [run_controls(scene, classes, fraction=CONTROL_FRACTION, seed=seed) for scene in scenes]
     if not rows:
         return None
     whole = {
@@ -61,24 +63,11 @@ def validate(weights: Weights, examples: Iterable[Example], seed: int, show: Sho
     }
 
 
-def judge_cascade(weights: Weights, examples: Iterable[Example]) -> dict[str, Any] | None:
-    """Return the loss of reading some patches in full, as a `CascadeTable`; None without a scene."""
-    scenes = []
-    for example in examples:
-        grid, cells, labels = _parts(weights, example)
-        seen = coarse_prediction_of_columns(weights, example.columns.astype(np.float32), grid)
-        nothing, everything = np.empty(0, np.int64), grid.valid_patches()
-        overview, full = (segment(weights, seen, cells[index], index).classes for index in (nothing, everything))
-        gain = score_patches("gain", seen).reshape(grid.patch_shape)
-        scenes.append(ReadTwice(overview, full, gain, labels, grid.patch))
-    return asdict(CascadeTable.judged(scenes, weights.config.classes)) if scenes else None
-
-
 def judge_calibration(weights: Weights, examples: Iterable[Example], seed: int) -> dict[str, Any] | None:
     """Return the calibration of maps of full scans; None without a scene."""
     maps = []
     for example in examples:
-        grid, _, labels = _parts(weights, example)
+        grid, labels = _parts(weights, example)
         _, every_class = map_of_columns(weights, example.columns.astype(np.float32), grid)
         maps.append(JudgedMap.of(every_class, labels))
     return judge_confidence(maps, seed) if maps else None
@@ -151,7 +140,7 @@ def _scanned(
 ) -> tuple[ScoredMap, Floats]:
     """Simulate a uniform scan of a scene and segment it in full; return counts of the map and its confidence."""
     assert example.noise is not None
-    grid, _, labels = _parts(weights, example)
+    grid, labels = _parts(weights, example)
     plain, classes = example.columns.astype(np.float32), weights.config.classes
     scan = augmentation.scan(plain, example.noise, light=light, step=step, rng=rng)[..., :-PLANES]
     drawn, every_class = map_of_columns(weights, scan, grid, LineSpec(light, step))
@@ -161,9 +150,9 @@ def _scanned(
     return ScoredMap(confusion(labels, drawn.classes, classes), expected), sure
 
 
-def _parts(weights: Weights, example: Example) -> tuple[SceneGrid, Patches, NDArray[np.uint8]]:
+def _parts(weights: Weights, example: Example) -> tuple[SceneGrid, NDArray[np.uint8]]:
     grid = SceneGrid(*example.shape, weights.config.patch, 1)
-    return grid, patches_of(example.columns, grid.patch).astype(np.float32), example.labels[: grid.height, : grid.width]
+    return grid, example.labels[: grid.height, : grid.width]
 
 
 def better_reading(
@@ -184,7 +173,7 @@ def _miou(weights: Weights, examples: Sequence[Example]) -> float:
     """Return the mIoU of all scenes together, by every line at the reference exposure."""
     counts = np.zeros((weights.config.classes,) * 2, np.int64)
     for example in examples:
-        grid, _, labels = _parts(weights, example)
+        grid, labels = _parts(weights, example)
         drawn, _ = map_of_columns(weights, example.columns.astype(np.float32), grid)
         counts += confusion(labels, drawn.classes, weights.config.classes)
     return mean_iou(counts)

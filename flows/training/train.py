@@ -15,16 +15,10 @@ from rich.console import Console
 
 from flows.terminal.progress import one_after_the_other, table
 from flows.training.data import Report, open_training_data
-from flows.training.figures import (
-    better_reading,
-    judge_baselines,
-    judge_calibration,
-    judge_cascade,
-    judge_scans,
-    validate,
-)
+from flows.training.figures import better_reading, judge_baselines, judge_calibration, judge_scans, read_twice, validate
 from flows.training.fit_ood import fit_and_add, trained_on
 from flows.training.train_scenes import Scenes, TrainRequest, check_out, network_config, observe_all, training_capture
+from models.evaluation.placement import CascadeTable
 from models.network.machine import choose_device
 from models.network.spectral import Normalisation
 from models.training.capture_augmentation import REFERENCE_MS
@@ -123,9 +117,12 @@ def _learned(
     if frames:
         weights, found["readings"] = better_reading(weights, start, frames)
         found["baselines"] = judge_baselines(examples, frames, config.classes, seed, report)
-        found[CASCADE] = judge_cascade(weights, frames)
+        report("validating", 0.0, f"{len(frames)} scenes")
         found[CALIBRATION] = judge_calibration(weights, frames, seed)
-    found["validation"] = validate(weights, frames, seed, lambda row: report("validating", 0.0, row))
+    twice = read_twice(weights, frames)
+    if twice:
+        found[CASCADE] = asdict(CascadeTable.judged(twice, config.classes))
+    found["validation"] = validate(twice, config.classes, seed)
     return weights, {"training": summary, **found}
 
 

@@ -5,7 +5,7 @@ This is evaluation only: it needs labels and the whole scene at full resolution.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from models.evaluation.metrics import agreement, confusion, gap_closed, mean_iou
 from models.network.sizes import MOST_GAIN
 from models.network.spectral import patches_of
-from models.policies.policies import score_patches
+from models.policies.policies import random_scores, score_patches
 from models.reading.inference import CoarsePrediction, captured, overview_of, patch_logits, segment
 from models.weights.files import Weights
-from pipeline.geometry.grid import UNLABELLED, patch_pixels
+from pipeline.geometry.grid import UNLABELLED, SceneGrid, patch_pixels
 from pipeline.lazy import deferred
 from pipeline.planning.prices import frame_patches
 
@@ -99,38 +99,57 @@ def placement_figures(rows: Placements) -> dict[str, dict[str, Any]]:
     return found
 
 
-def run_controls(
-    weights: Weights,
-    seen: CoarsePrediction,
-    fine: NDArray[np.floating],
-    labels: NDArray[np.uint8],
-    *,
-    fraction: float,
-    seed: int,
-    among: NDArray[np.bool_] | None = None,
-    report: Callable[[str], None] = lambda row: None,
-) -> Placements:
-    """Segment with no patch, every patch, and ``fraction`` of the valid patches by each policy and at random.
+def classes_by(weights: Weights, seen: CoarsePrediction, *, in_full: bool) -> NDArray[np.uint8]:
+    """Return the class map (y, x) by the overview alone, or with every patch read in full."""
+    patch_index = seen.grid.valid_patches() if in_full else np.empty(0, np.int64)
+    return segment(weights, seen, seen.patches(patch_index), patch_index).classes
 
-    ``fine`` (patch, p, p, column) are normalised columns of every patch of the padded grid, ``labels`` (y, x) class
-    indices, 255 unlabelled. ``among`` (patch,) says which patches may be chosen (None: all).
+
+@dataclass(frozen=True)
+class ReadTwice:
+    """Maps of a scene by the overview, and by the full network everywhere. Any choice of patches is a mix of both."""
+
+    overview: NDArray[np.uint8]  # (y, x) classes
+    full: NDArray[np.uint8]  # (y, x)
+    scores: Mapping[str, NDArray[np.float64]]  # (patch_y, patch_x) by policies
+    labels: NDArray[np.uint8]  # (y, x) class indices, 255 unlabelled
+    grid: SceneGrid
+
+    @staticmethod
+    def of(weights: Weights, seen: CoarsePrediction, labels: NDArray[np.uint8]) -> ReadTwice:
+        """Segment a scene twice, and score its patches by the policies that are compared."""
+        overview, full = classes_by(weights, seen, in_full=False), classes_by(weights, seen, in_full=True)
+        scores = {policy: score_patches(policy, seen).reshape(seen.grid.patch_shape) for policy in COMPARED}
+        return ReadTwice(overview, full, scores, labels, seen.grid)
+
+    def counts(self, chosen: NDArray[np.bool_], classes: int) -> Counts:
+        """Return the confusion of the map whose ``chosen`` (patch_y, patch_x) patches are read in full."""
+        p, (y, x) = self.grid.patch, self.labels.shape
+        pixels = chosen.repeat(p, 0).repeat(p, 1)[:y, :x]
+        return confusion(self.labels, np.where(pixels, self.full, self.overview), classes)
+
+
+def run_controls(
+    scene: ReadTwice, classes: int, *, fraction: float, seed: int, among: NDArray[np.bool_] | None = None
+) -> Placements:
+    """Return the confusion with no patch, all patches, and ``fraction`` of the valid ones by each policy and at random.
+
+    ``among`` (patch,) says which patches may be chosen (None: all).
     """
-    valid = seen.grid.valid_fraction().ravel() > 0
+    grid = scene.grid
+    valid = grid.valid_fraction().ravel() > 0
     valid = valid if among is None else valid & among
 
-    def counts(row: str, patch_index: NDArray[np.integer]) -> Counts:
-        report(row)
-        drawn = segment(weights, seen, fine[patch_index], patch_index)
-        return confusion(labels, drawn.classes, weights.config.classes)
-
-    def placed(policy: str, number: int = 0) -> NDArray[np.integer]:
-        return frame_patches(score_patches(policy, seen, seed=seed + number), fraction, valid)
+    def placed(scores: NDArray[np.float64]) -> Counts:
+        chosen = np.zeros(valid.shape, np.bool_)
+        chosen[frame_patches(scores.ravel(), fraction, valid)] = True
+        return scene.counts(chosen.reshape(grid.patch_shape), classes)
 
     return {
-        "none": [counts("none", np.empty(0, np.int64))],
-        "all": [counts("all", np.flatnonzero(valid))],
-        **{policy: [counts(policy, placed(policy))] for policy in COMPARED},
-        "random": [counts("random", placed("random", 1000 * (draw + 1))) for draw in range(RANDOM_DRAWS)],
+        "none": [scene.counts(np.zeros(grid.patch_shape, np.bool_), classes)],
+        "all": [scene.counts(valid.reshape(grid.patch_shape), classes)],
+        **{policy: [placed(scores)] for policy, scores in scene.scores.items()},
+        "random": [placed(random_scores(grid, seed + 1000 * (draw + 1))) for draw in range(RANDOM_DRAWS)],
     }
 
 
@@ -149,13 +168,13 @@ class CascadeTable:
 
     @staticmethod
     def judged(scenes: Sequence[ReadTwice], classes: int) -> CascadeTable:
-        """Judge the maps of all scenes together."""
-        whole = mean_iou(np.sum([one.counts(0.0, classes)[0] for one in scenes], axis=0))
-        losses, fractions = [], []
+        """Judge the maps of all scenes together, for each threshold of the score by ``gain``."""
+        every = [np.ones(one.grid.patch_shape, np.bool_) for one in scenes]
+        whole, losses, fractions = _miou(scenes, every, classes), [], []
         for least in LEAST_GAINS:
-            counts, read = zip(*(one.counts(least, classes) for one in scenes), strict=True)
-            losses.append(whole - mean_iou(np.sum(counts, axis=0)))
-            fractions.append(sum(read) / sum(one.gain.size for one in scenes))
+            chosen = [one.scores["gain"] >= least for one in scenes]
+            losses.append(whole - _miou(scenes, chosen, classes))
+            fractions.append(float(np.concatenate([one.ravel() for one in chosen]).mean()))
         return CascadeTable(LEAST_GAINS, tuple(losses), tuple(fractions))
 
     def within(self, loss: float) -> tuple[float, float] | None:
@@ -171,22 +190,6 @@ class CascadeTable:
         return float(np.exp(gain)), float(np.interp(loss, self.loss[ends], self.fraction[ends]))
 
 
-@dataclass(frozen=True)
-class ReadTwice:
-    """The map of a scene by the overview, and by the full network everywhere."""
-
-    overview: NDArray[np.uint8]  # (y, x) classes
-    full: NDArray[np.uint8]  # (y, x)
-    gain: NDArray[np.float64]  # (patch_y, patch_x) expected [nat per px]
-    labels: NDArray[np.uint8]  # (y, x)
-    patch: int
-
-    def counts(self, least_gain: float, classes: int) -> tuple[NDArray[np.int64], int]:
-        """Return the confusion of the map with patches of at least this gain read in full, and their number.
-
-        A threshold of 0 reads all of them.
-        """
-        chosen = (self.gain >= least_gain) | (least_gain == 0)
-        y, x = self.labels.shape
-        pixels = chosen.repeat(self.patch, 0).repeat(self.patch, 1)[:y, :x]
-        return confusion(self.labels, np.where(pixels, self.full, self.overview), classes), int(chosen.sum())
+def _miou(scenes: Sequence[ReadTwice], chosen: Sequence[NDArray[np.bool_]], classes: int) -> float:
+    """Return the mIoU of all scenes together, with the chosen patches of each read in full."""
+    return mean_iou(np.sum([one.counts(some, classes) for one, some in zip(scenes, chosen, strict=True)], axis=0))

@@ -41,16 +41,25 @@ def score_patches(
             raise SettingsError(f"the policy {policy!r} needs a prediction by the weights; choose another policy")
         scores = seen.gain.astype(np.float64)
     elif policy == "random":
-        scores = np.random.default_rng([seed, 0x5EA7]).random(seen.grid.patch_shape)
+        return random_scores(seen.grid, seed)
     elif policy == "mask":
         scores = _mask_scores(seen, mask)
     elif policy in PIXEL_SCORES:
         scores = _patch_means(PIXEL_SCORES[policy].of(seen), seen)
     else:
         raise SettingsError(f"unknown policy {policy!r}; choose one of {', '.join(POLICIES)}")
-    fraction = seen.grid.valid_fraction()
-    expected_gain: Scores = np.where(fraction > 0, scores, 0.0) * fraction
-    return expected_gain.ravel()
+    return _on_scene(scores, seen.grid)
+
+
+def random_scores(grid: SceneGrid, seed: int) -> Scores:
+    """Return random scores of every patch of the padded grid, (patches,), weighted by its fraction on the scene."""
+    return _on_scene(np.random.default_rng([seed, 0x5EA7]).random(grid.patch_shape), grid)
+
+
+def _on_scene(scores: Scores, grid: SceneGrid) -> Scores:
+    """Return (patch_y, patch_x) scores times the fraction of each patch on the scene, (patches,)."""
+    fraction = grid.valid_fraction()
+    return (np.where(fraction > 0, scores, 0.0) * fraction).ravel()
 
 
 def score_multiply_adds(policy: str, config: SegmenterConfig, grid: SceneGrid) -> int:

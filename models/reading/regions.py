@@ -106,12 +106,6 @@ class Region:
         return image[kept.top - top : kept.bottom - top, kept.left - left : kept.right - left]
 
 
-def whole_field(field: SceneGrid) -> Region:
-    """Return a single region that covers the field."""
-    box = Box(0, 0, field.height, field.width)
-    return Region(field, box, box)
-
-
 def plan_regions(
     field: SceneGrid, shard: tuple[int, int], *, most_px: tuple[int, int] = (REGION_PX, REGION_PX), halo: int = HALO_PX
 ) -> list[Region]:

@@ -1,12 +1,12 @@
 """Define the stage that evaluates a map by labels: its accuracy, and that of no, all and other fine patches.
 
-It needs labels and does not count as cost of the survey. Controls read the whole field as one region.
+It needs labels and does not count as cost of the survey. Other placements are mixed from two maps of the field: by the
+overview alone, and with every patch read in full.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.tasks.capture_plan import CapturePlan
-from flows.tasks.field_work import coarse_region
-from flows.tasks.patch_budget import SHARD
 from flows.tasks.stage import Product, Report, Wanted, stage
 from flows.tasks.stages.attention import PatchGains, read_in_full
 from flows.tasks.stages.placement import load_registration
@@ -28,9 +26,7 @@ from models.evaluation.metrics import (
     iou_per_class,
     kappa,
 )
-from models.evaluation.placement import CONTROL_FRACTION, Placements, placement_figures, run_controls
-from models.reading.inference import read_coarse_prediction, segment
-from models.reading.regions import plan_regions, whole_field
+from models.evaluation.placement import CONTROL_FRACTION, Placements, ReadTwice, placement_figures, run_controls
 from models.weights.files import Weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
@@ -46,7 +42,7 @@ from storage.arrays.class_maps import load_class_map
 from storage.readers.scene_files import RasterPixels
 
 RECORD = "accuracy.json"
-ACCURACY = Product("evaluate", version=12, files=(RECORD,), by_weights=True)
+ACCURACY = Product("evaluate", version=13, files=(RECORD,), by_weights=True)
 
 
 @stage("evaluate", "accuracy, after publication", ACCURACY)
@@ -80,11 +76,13 @@ def evaluate(
         judged = np.where(drawn.classes == UNLABELLED, np.uint8(UNLABELLED), labels)  # only pixels with a class
         counts = confusion(judged, drawn.classes, len(drawn.names))  # includes the class unknown
         result: dict[str, Any] = map_figures(names, counts) | {"confusion": counts.tolist()}
-        result["none"] = map_figures(names, _confusion_of_overview(gains, image, judged))
+        readings, scores = gains.work.readings(image, gains.capture, in_full=controls, report=report)
+        result["none"] = map_figures(names, confusion(judged, readings[0], len(names)))
         result |= {"all": {"miou": None, "per_class_iou": {}}, "gap_closed": None, "controls": {}}
         if controls:
             patches = read_in_full(attention, class_map) if chooses else None
-            fraction, found = control_placements(gains, image, judged, patches, seed=seed, report=report)
+            scene = ReadTwice(readings[0], readings[1], scores, judged, gains.frame.grid)
+            fraction, found = control_placements(gains, scene, len(names), patches, seed=seed)
             figures = map_figures(names, found["all"][0])
             gap = gap_closed(result["miou"], result["none"]["miou"], figures["miou"])
             compared = {"controls": placement_figures(found), "controls_fraction": fraction}
@@ -96,43 +94,13 @@ def evaluate(
 
 
 def control_placements(
-    gains: PatchGains,
-    mosaic: Path,
-    labels: NDArray[np.uint8],
-    patch_index: NDArray[np.intp] | None,
-    *,
-    seed: int,
-    report: Report,
+    gains: PatchGains, scene: ReadTwice, classes: int, patch_index: NDArray[np.intp] | None, *, seed: int
 ) -> tuple[float, Placements]:
     """Judge other placements of as many fine patches as the map has, or of the usual fraction; return that fraction."""
-    grid, fractions, weights = gains.frame.grid, gains.zones.fractions, gains.work.weights.load()
-    coarse = coarse_region(weights, mosaic, whole_field(grid), gains.capture)
-    valid = grid.valid_fraction().ravel() > 0
+    fractions, valid = gains.zones.fractions, scene.grid.valid_fraction().ravel() > 0
     among = valid if fractions is None else valid & (fractions > 0)
     fraction = CONTROL_FRACTION if patch_index is None else len(patch_index) / max(int(among.sum()), 1)
-    rows = count(1)
-    return fraction, run_controls(
-        weights,
-        read_coarse_prediction(weights, coarse),
-        coarse.patches(np.arange(int(np.prod(grid.patch_shape)))),
-        labels,
-        fraction=fraction,
-        seed=seed,
-        among=among,
-        report=lambda row: report(0.09 * next(rows)),
-    )
-
-
-def _confusion_of_overview(gains: PatchGains, mosaic: Path, labels: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """Return the confusion matrix (class, class) of the overview alone, region by region as in surveys."""
-    weights, grid = gains.work.weights.load(), gains.frame.grid
-    empty = np.empty((0, grid.patch, grid.patch, weights.basis.columns), np.float32)
-    counts = np.zeros((weights.config.classes,) * 2, np.int64)
-    for region in plan_regions(grid, SHARD):
-        drawn = segment(weights, coarse_region(weights, mosaic, region, gains.capture), empty, np.empty(0, np.int64))
-        inside = labels[region.kept.rows, region.kept.columns]
-        counts += confusion(inside, region.crop(drawn.classes), weights.config.classes)
-    return counts
+    return fraction, run_controls(scene, classes, fraction=fraction, seed=seed, among=among)
 
 
 def map_offset(simulated: SimulatedSource, pointing: Sequence[StageRef]) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ from flows.tasks.field_work import FieldWork, Scoring, WeightsFile, region_param
 from flows.tasks.patch_budget import SHARD
 from flows.tasks.run import SurveyRun, open_run
 from models.network.sizes import CELL_PX
-from models.reading.regions import plan_regions, whole_field
+from models.reading.regions import plan_regions
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
 from storage.arrays.class_maps import ClassNames, create_class_map, create_probabilities, load_class_map
@@ -174,7 +174,7 @@ def test_a_memory_is_moved_and_leaves_nothing_behind(surveyed: tuple[SurveyRun, 
     """What lay at a pixel lies ``shift`` further, in fine and coarse pixels alike, and nothing where it came from."""
     run, stages = surveyed
     probabilities, mosaic = (_store(stages, "segment/*/class_probabilities.zarr"), _mosaics(stages)[0])
-    region = whole_field(run.grid)
+    (region,) = plan_regions(run.grid, SHARD)
     classes = tuple(range(len(run.weights.class_names)))
     still = FieldPriorMap(probabilities, mosaic, 1.0, None, classes).of(region, run.weights)
     moved = FieldPriorMap(probabilities, mosaic, 1.0, None, classes, shift).of(region, run.weights)

@@ -12,7 +12,7 @@ from flows.tasks.run import open_run
 from flows.tasks.stages.accuracy import columns_of_sweeps
 from flows.tasks.survey_model import shipped_weights, weights_path
 from models.evaluation.metrics import mean_iou
-from models.evaluation.placement import Placements, placement_figures, run_controls
+from models.evaluation.placement import Placements, ReadTwice, placement_figures, run_controls
 from models.reading.inference import coarse_prediction_of_patches
 from models.weights.files import Weights, describe_weights, load_weights
 from pipeline.errors import BudgetError
@@ -44,7 +44,8 @@ def controls(weights: Weights) -> Placements:
     sweeps = [SimulatedSweep(source, sweep) for sweep in full_sweeps(grid, camera, "x")]
     columns = columns_of_sweeps(sweeps, camera, source.wavelength_nm, grid, weights, memory=2**30)
     seen = coarse_prediction_of_patches(weights, columns, grid)
-    return run_controls(weights, seen, columns, np.asarray(scene.labels), fraction=0.35, seed=41)
+    twice = ReadTwice.of(weights, seen, np.asarray(scene.labels))
+    return run_controls(twice, weights.config.classes, fraction=0.35, seed=41)
 
 
 def test_file_is_small_and_tells_its_making(weights: Weights) -> None:

@@ -23,14 +23,15 @@ from flows.training.train import run_train, train_weights
 from flows.training.train_scenes import TrainRequest, suggested_patch
 from models.evaluation.expected_scores import MapScores
 from models.evaluation.metrics import mean_iou
+from models.evaluation.placement import ReadTwice
 from models.training.examples import Example
 from models.training.train import TrainingSettings
 from models.weights.files import TrainedOn, describe_weights, load_ood, load_weights
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
 from pipeline.simulator.scenes.scene import RasterScene
 from tests.flows.small_fields import write_field
-from tests.models.conftest import make_weights
 
 SETTINGS = TrainingSettings(steps=1, batch=1, crop=16)
 
@@ -161,11 +162,9 @@ def test_counts_of_validation_scenes_add_up(monkeypatch: pytest.MonkeyPatch) -> 
         {"none": counts[:1], "all": counts[1:2], "gain": counts[2:3], "random": [counts[at], counts[3]]}
         for at in (0, 2)
     )
-    monkeypatch.setattr(figures, "_parts", lambda weights, example: (None, None, None))
-    monkeypatch.setattr(figures, "coarse_prediction_of_columns", lambda *given: None)
     monkeypatch.setattr(figures, "run_controls", lambda *given, **named: next(scenes))
-    one = Example("e", np.zeros((1, 1, 1), np.float32), np.zeros((1, 1), np.uint8), (1, 1))
-    found = figures.validate(make_weights(), [one, one], 0, lambda row: None)
+    one = ReadTwice(*np.zeros((2, 1, 1), np.uint8), {}, np.zeros((1, 1), np.uint8), SceneGrid(1, 1, 1, 1))
+    found = figures.validate([one, one], 2, 0)
     assert found is not None
     assert found["gain"]["miou"] == mean_iou(2 * counts[2])
     draws = [mean_iou(counts[0] + counts[2]), mean_iou(2 * counts[3])]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from models.evaluation.placement import LEAST_GAINS, CascadeTable, ReadTwice
+from pipeline.geometry.grid import SceneGrid
 
 FOUR = np.array([[0.3, 0.03], [0.003, 0.0]])
 
@@ -17,21 +18,17 @@ def _scene() -> ReadTwice:
     labels = np.repeat(np.repeat(np.array([[0, 1], [1, 0]], np.uint8), 2, 0), 2, 1)
     overview, full = 1 - labels, labels.copy()
     overview[2:, 2:], full[2:, 2:] = 0, 1
-    return ReadTwice(overview, full, FOUR, labels, 2)
+    return ReadTwice(overview, full, {"gain": FOUR}, labels, SceneGrid(4, 4, 2, 1))
 
 
-def test_patches_that_promise_enough_are_read_in_full() -> None:
+def test_chosen_patches_are_read_in_full() -> None:
     """By hand: one patch is right from the overview, each other one once it is read in full."""
-    counts, read = _scene().counts(0.03, 2)
-    assert read == 2
-    np.testing.assert_array_equal(counts, [[8, 0], [4, 4]])
+    np.testing.assert_array_equal(_scene().counts(FOUR >= 0.03, 2), [[8, 0], [4, 4]])
 
 
-def test_a_least_gain_of_nothing_reads_everything() -> None:
-    """Also what promises to make the map worse, which then does."""
-    counts, read = _scene().counts(0.0, 2)
-    assert read == 4
-    np.testing.assert_array_equal(counts, [[4, 4], [0, 8]])
+def test_everything_read_includes_what_gets_worse() -> None:
+    """The last patch is right by the overview, and wrong by the full network."""
+    np.testing.assert_array_equal(_scene().counts(np.ones((2, 2), np.bool_), 2), [[4, 4], [0, 8]])
 
 
 def test_losses_stand_beside_fractions() -> None:

@@ -7,17 +7,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models.evaluation.metrics import agreement, mean_iou
+from models.evaluation.metrics import agreement, confusion, mean_iou
 from models.evaluation.placement import (
     RANDOM_DRAWS,
     Placements,
+    ReadTwice,
     captured_gain,
     gain_sums,
     oracle_gain,
     placement_figures,
     run_controls,
 )
-from models.reading.inference import CoarsePrediction, coarse_prediction_of_columns, segment
+from models.reading.inference import coarse_prediction_of_columns, segment
 from models.weights.files import Weights
 from tests.models.conftest import Maker, scene_columns
 
@@ -76,15 +77,29 @@ def test_the_oracle_captures_all_of_its_own_gain(values: list[float], count: int
     assert captured_gain(own, best) in (None, pytest.approx(1))
 
 
-def _scene(weights: Weights) -> tuple[CoarsePrediction, np.ndarray, np.ndarray]:
-    coarse_pass, fine = scene_columns(weights, 30, 45)
+def _scene(weights: Weights) -> ReadTwice:
+    coarse_pass, _ = scene_columns(weights, 30, 45)
     labels = np.random.default_rng(2).integers(0, 3, (30, 45)).astype(np.uint8)
     labels[:3] = 255
-    return coarse_prediction_of_columns(weights, coarse_pass.columns, coarse_pass.grid), fine, labels
+    return ReadTwice.of(weights, coarse_prediction_of_columns(weights, coarse_pass.columns, coarse_pass.grid), labels)
 
 
 def _run(weights: Weights, fraction: float = 0.35, seed: int = 0) -> Placements:
-    return run_controls(weights, *_scene(weights), fraction=fraction, seed=seed)
+    return run_controls(_scene(weights), weights.config.classes, fraction=fraction, seed=seed)
+
+
+def test_a_mix_of_two_maps_is_the_map_of_those_patches(tiny: Maker):
+    """A patch's pixels do not depend on which other patches are read: a segmentation of some gives the same counts."""
+    weights = tiny()
+    coarse_pass, _ = scene_columns(weights, 30, 45)
+    seen = coarse_prediction_of_columns(weights, coarse_pass.columns, coarse_pass.grid)
+    scene = _scene(weights)
+    some = np.random.default_rng(4).random(seen.grid.patch_shape) < 0.5
+    index = np.flatnonzero(some.ravel() & (seen.grid.valid_fraction().ravel() > 0))
+    drawn = segment(weights, seen, seen.patches(index), index)
+    expected = confusion(scene.labels, drawn.classes, weights.config.classes)
+    assert (scene.overview != scene.full).any()
+    np.testing.assert_array_equal(scene.counts(some, weights.config.classes), expected)
 
 
 def test_every_row_counts_every_labelled_pixel(tiny: Maker):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from models.network.sizes import PLANES, TOKEN_PX, SegmenterConfig
-from models.reading.regions import REGION_PX, Box, plan_regions, region_bytes, whole_field
+from models.reading.regions import REGION_PX, Box, plan_regions, region_bytes
 from pipeline.geometry.grid import SceneGrid
 
 SHARD = (64, 640)
@@ -81,5 +81,5 @@ def test_memory_is_that_of_a_region_not_of_the_field():
         for side in (REGION_PX, 3 * REGION_PX, 12 * REGION_PX)
     ]
     assert need[0] < need[1] == need[2] < 1.2 * need[0]
-    whole = whole_field(SceneGrid(640, 640, 16, 4))
+    (whole,) = plan_regions(SceneGrid(640, 640, 16, 4), SHARD)
     assert region_bytes(config, whole, 500, 270) > region_bytes(config, whole, 0, 270) + 64 * (24 + PLANES) * 4 * 16**2
