@@ -30,7 +30,7 @@ from pipeline.planning.coverage import uniform_sweeps
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import raster_from_values
 
-PURE = {effect_choice: ("probe_survey", "decide"), run_folder: ("draw_quicklook", "webp")}
+PURE = {effect_choice: ("probe_survey", "decide"), run_folder: ("draw_quicklook",)}
 WORKED_OUT: dict[str, tuple[ModuleType, Any]] = {
     name: (module, getattr(module, name)) for module, names in PURE.items() for name in names
 }
@@ -62,23 +62,10 @@ def remember(folder: Path, put: Callable[[object, str, Any], None] = setattr) ->
             decisions[question] = WORKED_OUT["decide"][1](probes, rig, effects, *given)
         return decisions[question]
 
-    def drawn(path: Path, panels: Any) -> None:
-        fresh: list[bytes] = []
+    def drawn(panels: Any) -> Any:
+        return known(_kind_of(panels), lambda: WORKED_OUT["draw_quicklook"][1](panels))
 
-        def draw() -> bytes:
-            WORKED_OUT["draw_quicklook"][1](path, panels)
-            fresh.append(path.read_bytes())
-            return fresh[0]
-
-        picture = known(_kind_of(panels), draw)
-        if not fresh:  # as often as a picture that is drawn: tests count what is written
-            path.write_bytes(picture)
-
-    def packed(picture: Any, **choices: Any) -> bytes:
-        question = "packed", picture.size, hashlib.blake2b(picture.tobytes()).hexdigest(), choices
-        return known(question, lambda: WORKED_OUT["webp"][1](picture, **choices))
-
-    each = {"probe_survey": probed, "decide": decided, "draw_quicklook": drawn, "webp": packed}
+    each = {"probe_survey": probed, "decide": decided, "draw_quicklook": drawn}
     for name, remembering in each.items():
         REMEMBERING[name] = (WORKED_OUT[name][0], remembering)
         put(WORKED_OUT[name][0], name, remembering)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -175,9 +174,7 @@ def _draw_areas(rows: Sequence[Row]) -> str | None:
     axes.grid(color=panels.GRID)
     axes.tick_params(axis="x", labelrotation=20)
     figure.legend(loc="outside right upper", frameon=False, fontsize=8)
-    file = io.BytesIO()
-    panels.save_png(figure, file)
-    return panels.data_address(file.getvalue())
+    return panels.data_address(panels.png(figure))
 
 
 def _shown(row: Row, runs_at: str) -> dict[str, Any]:

@@ -5,7 +5,7 @@ The bytes kept include the receipt and the report. Both are written again until 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -42,18 +42,19 @@ def publish_counted(
     page_of: Callable[[Receipt], str],
     *,
     rests_on: Mapping[str, str],
+    of_earlier: Collection[str] = (),
     written: int = 0,
 ) -> Receipt:
     """Publish a run with receipt and page, and return the receipt with the bytes of the published run.
 
-    Raw lines that the setting ``keep`` drops after the publication do not count as kept. All other files are in the
-    draft's folder. ``rests_on`` is of `Archive.manifest_hashes`, ``written`` are bytes of
-    stores that the receipt does not count yet.
+    Raw lines that the setting ``keep`` drops after the publication do not count as kept, nor do the stores
+    ``of_earlier`` visits. All other files are in the draft's folder. ``rests_on`` is of `Archive.manifest_hashes`,
+    ``written`` are bytes of stores that the receipt does not count yet.
     """
     facts: dict[str, Any] = {"survey": receipt["survey"], "settings": receipt["settings"], "rests_on": rests_on}
     products, drops_raw = receipt["products"], receipt["settings"]["keep"] == KEEP_SIGNAL
-    dropped = {products[name] for name in LINE_PRODUCTS if drops_raw and name in products}
-    stores = {uri: size for uri, size in archive.sizes(rests_on).items() if uri not in dropped}
+    others = {*of_earlier, *(products[name] for name in LINE_PRODUCTS if drops_raw and name in products)}
+    stores = archive.sizes(uri for uri in rests_on if uri not in others)
     moved = archive.take_moved()
     before, longest, folder = receipt["data_bytes"], {RECEIPT: 0, REPORT: 0}, 0
     while True:

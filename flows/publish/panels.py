@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
-from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -22,6 +21,7 @@ from storage.arrays.ground_maps import GroundMap
 from storage.arrays.mosaics import Mosaic
 from storage.arrays.quicklooks import stretch
 
+COLOURS = 256  # of a PNG
 GROUND_IN, GROUND_DPI, GROUND_MOST_PX = 9.0, 130, 1200
 INK = "#22241f"
 MUTED = "#6a6d64"
@@ -40,10 +40,13 @@ STYLE: Any = {
 UNLABELLED_COLOUR = (0.86, 0.86, 0.84)
 
 
-def save_png(figure: Figure, file: str | Path | IO[bytes], **choices: Any) -> None:
-    """Write a figure as PNG, into a file or a buffer."""
-    FigureCanvasAgg(figure)
-    figure.savefig(file, format="png", **choices)
+def png(figure: Figure) -> bytes:
+    """Return a figure as PNG of 256 colours."""
+    canvas, file = FigureCanvasAgg(figure), io.BytesIO()
+    canvas.draw()
+    drawn = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    drawn.quantize(COLOURS, dither=Image.Dither.NONE).save(file, "PNG")
+    return file.getvalue()
 
 
 def webp(picture: Image.Image, **choices: Any) -> bytes:
@@ -126,9 +129,7 @@ def draw_ground(found: GroundMap) -> bytes:
         if number in present
     ]
     figure.legend(handles=patches, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
-    buffer = io.BytesIO()
-    save_png(figure, buffer)
-    return buffer.getvalue()
+    return png(figure)
 
 
 LEAST_BANDS = 5  # of a curve
@@ -138,7 +139,7 @@ DOTS: Any = {"marker": ".", "markersize": 2.4, "markeredgewidth": 0}  # they sho
 
 
 def draw_spectra(mosaic: Mosaic, found: ClassMap) -> bytes | None:
-    """Draw the mean spectrum of each mapped class as WebP; None with fewer than `LEAST_BANDS` bands or no value."""
+    """Draw the mean spectrum of each mapped class as PNG; None with fewer than `LEAST_BANDS` bands or no value."""
     spectra = class_spectra(mosaic, found.classes, len(found.names))
     if len(mosaic.wavelength_nm) < LEAST_BANDS or not np.isfinite(spectra).any():
         return None
@@ -154,11 +155,7 @@ def draw_spectra(mosaic: Mosaic, found: ClassMap) -> bytes | None:
                 axes.plot(nm, curve, color=colour, linewidth=1.2, label=name, **DOTS)
         axes.set(xlabel="wavelength [nm]", ylabel="value of the scene")
         axes.legend(loc="best", ncols=2, fontsize=7, frameon=False)
-        drawn = io.BytesIO()
-        save_png(figure, drawn)
-    with Image.open(drawn) as opened:
-        flat = opened.convert("RGB").quantize(256, dither=Image.Dither.NONE)
-    return webp(flat.convert("RGB"), lossless=True)
+        return png(figure)
 
 
 def class_spectra(mosaic: Mosaic, classes: NDArray[np.integer], count: int) -> NDArray[np.float32]:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
@@ -17,14 +15,12 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Patch, Rectangle
 from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 from numpy.typing import NDArray
-from PIL import Image
 
-from flows.publish.panels import MUTED, STYLE, UNLABELLED_COLOUR, class_palette, class_rgb, grey_of, outline, save_png
+from flows.publish.panels import MUTED, STYLE, UNLABELLED_COLOUR, class_palette, class_rgb, grey_of, outline, png
 from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.quicklooks import choose_bands, develop, stretch
 
 Box = tuple[int, int, int, int]
-COLOURS = 256
 HEAT_ALPHA = 0.72  # of scores over the field
 
 
@@ -55,13 +51,10 @@ class QuicklookData:
     days: float = 0.0  # since the visit before
 
 
-def draw_quicklook(path: str | Path, panels: QuicklookData) -> None:
-    """Draw the four panels as a PNG of about 1800 x 1400 px with 256 colours; raises OSError."""
-    drawn = io.BytesIO()
+def draw_quicklook(panels: QuicklookData) -> bytes:
+    """Draw the four panels as a PNG of about 1800 x 1400 px."""
     with mpl.rc_context(_STYLE):
-        save_png(_compose(panels), drawn)
-    with Image.open(drawn) as opened:
-        opened.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(path, "PNG", optimize=True)
+        return png(_compose(panels))
 
 
 _STYLE: Any = {**STYLE, "axes.titlesize": 14, "axes.titleweight": "bold", "axes.titlelocation": "left"}

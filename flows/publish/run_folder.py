@@ -7,19 +7,19 @@ from __future__ import annotations
 
 import platform
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from flows.publish.byte_account import open_account, publish_counted
-from flows.publish.field_map import block_of, field_map, prior_map
+from flows.publish.field_map import FieldMap, block_of, field_map, prior_map
 from flows.publish.findings import PLOTS_FILE, field_figures, find_areas, find_ground, find_map, find_zones, plots_csv
-from flows.publish.panels import draw_ground, draw_spectra, webp
+from flows.publish.panels import draw_ground, draw_spectra
 from flows.publish.quicklook import QuicklookData, draw_quicklook
 from flows.publish.receipt import AccuracyIs, Receipt, build_receipt, check_receipt, with_accuracy
 from flows.publish.report import Picture, render_report
@@ -98,15 +98,21 @@ def load_receipt(folder: Path) -> Receipt:
     return check_receipt(found.receipt)
 
 
-def _publish(survey: OpenSurvey, draft: RunDraft, plan: FinePlan, receipt: Receipt) -> Published:
+@dataclass(frozen=True)
+class _Drawn:
+    """Pictures of a survey that stay as they are when its accuracy is added, and the data of its quicklook."""
+
+    shown: QuicklookData
+    pictures: tuple[Picture, ...]
+    field: FieldMap
+
+
+_DRAWN: WeakKeyDictionary[OpenSurvey, _Drawn] = WeakKeyDictionary()  # of surveys that this process has published
+
+
+def _draw(survey: OpenSurvey, plan: FinePlan, receipt: Receipt) -> _Drawn:
     run, products = survey.run, survey.products
-    again = None if run.plan.plain else len(plan.patch_index) / len(run.grid.valid_patches())
-    shown = quicklook_data(run, products, plan, receipt)
-    draw_quicklook(draft.folder / "quicklook.png", shown)
-    if "plots" in receipt:
-        draft.write_file(PLOTS_FILE, plots_csv(receipt["plots"]))
-    with Image.open(draft.folder / "quicklook.png") as opened:
-        picture = webp(opened.convert("RGB"), lossless=True)
+    shown = quicklook_data(run, products, plan)
     maps = (load_ground_map(ref.path / STORE) for ref in products.there("ground"))
     pictures = [Picture(draw_ground(drawn), "The map on the ground, north up.") for drawn in maps]
     mosaic = open_mosaic(products.mosaic.path / "mosaic.zarr")
@@ -114,12 +120,26 @@ def _publish(survey: OpenSurvey, draft: RunDraft, plan: FinePlan, receipt: Recei
     if (spectra := draw_spectra(mosaic, drawn)) is not None:
         pictures.append(Picture(spectra, SPECTRA_CAPTION))
     field = field_map(run, plan, shown, prior_map(run.prior, products["segment"], receipt))
+    return _Drawn(shown, tuple(pictures), field)
+
+
+def _publish(survey: OpenSurvey, draft: RunDraft, plan: FinePlan, receipt: Receipt) -> Published:
+    run, products = survey.run, survey.products
+    again = None if run.plan.plain else len(plan.patch_index) / len(run.grid.valid_patches())
+    if survey not in _DRAWN:
+        _DRAWN[survey] = _draw(survey, plan, receipt)
+    drawn = _DRAWN[survey]
+    quicklook = draw_quicklook(replace(drawn.shown, note=_note(run, receipt)))
+    draft.write_file("quicklook.png", quicklook)
+    if "plots" in receipt:
+        draft.write_file(PLOTS_FILE, plots_csv(receipt["plots"]))
     receipt = publish_counted(
         run.archive,
         draft,
         receipt,
-        lambda told: render_report(told, picture, pictures, captured_again=again, field=field),
+        lambda told: render_report(told, quicklook, drawn.pictures, captured_again=again, field=drawn.field),
         rests_on=run.archive.manifest_hashes(products.values()),
+        of_earlier=() if run.prior is None else run.archive.manifest_hashes(run.prior.stores),
         written=survey.take_written(),
     )
     return Published(receipt, draft.published, again)
@@ -202,8 +222,18 @@ def _model_savings(run: SurveyRun, read: NDArray[np.intp]) -> dict[str, Any]:
     }
 
 
-def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: Receipt) -> QuicklookData:
-    """Return the data of the quicklook, with three bands."""
+def _note(run: SurveyRun, receipt: Receipt) -> str:
+    """Return the end of the quicklook's title line: the moment of a simulated scene, and the accuracy."""
+    accuracy, moment = receipt.get("accuracy"), run.settings.moment
+    notes = [] if moment is None else [f"day {moment[0]}, {moment[1]:g} h"]
+    if accuracy is not None and accuracy["miou"] is not None:
+        where = " on a scene of the training" if "training_scene" in receipt else ""
+        notes.append(f"mIoU {100 * accuracy['miou']:.1f} %{where}")
+    return "   ·   ".join(notes)
+
+
+def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan) -> QuicklookData:
+    """Return the data of the quicklook, with three bands, without its note."""
     bands, _ = choose_bands(run.scene.wavelength_nm)
     chosen = list(bands)
     mosaic = open_mosaic(products.mosaic.path / "mosaic.zarr")
@@ -213,13 +243,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
     changed = attention.changed
     found = load_class_map(products["segment"].path / "class_map.zarr")
     order = np.argsort(attention.rank.ravel(), kind="stable")
-    accuracy = receipt.get("accuracy")
-    memory, drawn = receipt.get("memory"), ProbabilityStore(products["segment"].path / "class_probabilities.zarr")
-    moment = run.settings.moment  # of a farm that grows
-    notes = [] if moment is None else [f"day {moment[0]}, {moment[1]:g} h"]
-    if accuracy is not None and accuracy["miou"] is not None:
-        where = " on a scene of the training" if "training_scene" in receipt else ""
-        notes.append(f"mIoU {100 * accuracy['miou']:.1f} %{where}")
+    memory, drawn = prior_map_figures(products["segment"].path), products["segment"].path / "class_probabilities.zarr"
     return QuicklookData(
         survey=run.name,
         seed=run.settings.seed,
@@ -239,8 +263,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
         class_colours=found.colours,
         truth=run.labels,
         confidence=found.confidence,
-        note="   ·   ".join(notes),
-        was=None if memory is None or memory["put_aside"] else drawn.old_class(),
+        was=None if memory is None or memory["put_aside"] else ProbabilityStore(drawn).old_class(),
         days=0.0 if memory is None else memory["days"],
     )
 

@@ -50,6 +50,11 @@ class Prior:
     day_of_year: float | None  # of this visit; None if it is unknown
     classes: tuple[int, ...]  # of each class of the weights the number in the class probabilities; -1 for a new class
 
+    @property
+    def stores(self) -> list[StageRef]:
+        """Return the stores of earlier runs that a visit reads."""
+        return [self.probabilities, *(one.mosaic for one in self.scan_passes)]
+
 
 def find_prior(
     archive: Archive, settings: Settings, name: str, grid: SceneGrid, class_names: tuple[str, ...]

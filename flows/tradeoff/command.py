@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from flows.cli.app import AsJson, OutFile, stderr
-from flows.publish.panels import GRID, INK, PAPER, save_png
+from flows.publish.panels import GRID, INK, PAPER, png
 from flows.terminal.processes import writing
 from flows.terminal.progress import print_json, table
 from flows.tradeoff.entries import Point, Result, Setting, Tradeoff, measure_tradeoff
@@ -73,7 +73,7 @@ def tradeoff(
     content = {"tradeoffs": [asdict(result) for result in results]}
     with writing(out):
         (out / "tradeoff.json").write_text(to_json(content), encoding="utf-8")
-        save_png(tradeoff_figure(results), out / "tradeoff.png")
+        (out / "tradeoff.png").write_bytes(png(tradeoff_figure(results)))
     stderr.print(f"{out / 'tradeoff.json'}\n{out / 'tradeoff.png'}", soft_wrap=True)
     if as_json:
         print_json(content)

@@ -167,9 +167,9 @@ class Normalisation:
         known = np.where(there, normal, np.float32(0))
         alike = (there == reached).all(axis=-1)
         self._complete(known, alike, reached)
-        broken = there[~alike]
-        for pattern in np.unique(broken, axis=0):
-            self._complete(known, np.asarray(~alike & (there == pattern).all(axis=-1), np.bool_), pattern)
+        partly = ~alike & there.any(axis=-1)  # a pixel without a column keeps the medians
+        for pattern in np.unique(there[partly], axis=0):
+            self._complete(known, np.asarray(partly & (there == pattern).all(axis=-1), np.bool_), pattern)
         return np.asarray(known @ self.whitening, np.float32)
 
     def _complete(self, known: NDArray[np.float32], pixels: NDArray[np.bool_], reached: NDArray[np.bool_]) -> None:

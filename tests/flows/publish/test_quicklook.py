@@ -45,7 +45,7 @@ def make_data(height: int, width: int, bands: int = 5, *, patch: int = 16) -> Qu
 @pytest.mark.parametrize(("height", "width"), [(96, 128), (20, 300), (300, 20), (1, 1)])
 def test_picture_has_a_readable_size(tmp_path: Path, height, width):
     """Any proportions give a page of 800 to 2000 px a side, mostly covered."""
-    draw_quicklook(tmp_path / "q.png", make_data(height, width))
+    (tmp_path / "q.png").write_bytes(draw_quicklook(make_data(height, width)))
     with Image.open(tmp_path / "q.png") as image:
         assert 1200 <= image.width <= 1800
         assert 600 <= image.height <= 2000
@@ -62,7 +62,7 @@ def test_scores_without_a_range_are_drawn(score):
 def test_pictures_of_less_and_of_the_same(tmp_path: Path):
     """No truth, patch, block or score still make a picture; the same data give the same bytes."""
     for name in ("one", "two"):
-        draw_quicklook(tmp_path / name, make_data(32, 48))
+        (tmp_path / name).write_bytes(draw_quicklook(make_data(32, 48)))
     assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
     data = make_data(64, 64)
     empty = replace(
@@ -75,8 +75,8 @@ def test_pictures_of_less_and_of_the_same(tmp_path: Path):
         rectified=np.full_like(data.rectified, np.nan),
         class_map=np.full_like(data.class_map, 255),
     )
-    draw_quicklook(tmp_path / "empty.png", empty)
-    draw_quicklook(tmp_path / "confidence.png", replace(data, truth=None))
+    (tmp_path / "empty.png").write_bytes(draw_quicklook(empty))
+    (tmp_path / "confidence.png").write_bytes(draw_quicklook(replace(data, truth=None)))
     assert (tmp_path / "empty.png").stat().st_size > 10_000
 
 
@@ -114,7 +114,7 @@ def test_a_plain_scan_shows_how_sure_its_map_is(monkeypatch: pytest.MonkeyPatch,
     monkeypatch.setattr(quicklook, "_caption", lambda axes, title, text: words.append((title, text)))
     data = make_data(96, 128)
     confidence = data.confidence if confident else None
-    draw_quicklook(tmp_path / "q.png", replace(data, policy=None, blocks=(), confidence=confidence))
+    (tmp_path / "q.png").write_bytes(draw_quicklook(replace(data, policy=None, blocks=(), confidence=confidence)))
     told = dict(words)
     assert told["2  Confidence"] == ("of the model" if confident else "the map has none")
     assert "2  Captured again" not in told
@@ -130,7 +130,7 @@ def test_a_revisit_shows_what_changed(monkeypatch: pytest.MonkeyPatch, tmp_path:
     was = np.full((96, 128), 255, np.uint8)
     was[5:7, 10:20] = 1
     now = np.where(was == 255, data.class_map, 0).astype(np.uint8)
-    draw_quicklook(tmp_path / "picture.png", replace(data, was=was, days=7.0, class_map=now))
+    (tmp_path / "picture.png").write_bytes(draw_quicklook(replace(data, was=was, days=7.0, class_map=now)))
     assert ("1  Changed", "20 px with another class than 7 days before") in words
     changed = images[0]
     assert (changed[was != 255] == np.float32(data.class_colours[0] / 255)).all()

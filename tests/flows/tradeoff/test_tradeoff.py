@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from flows.publish.panels import save_png
+from flows.publish.panels import png
 from flows.tradeoff import command
 from flows.tradeoff import entries as tradeoff_module
 from flows.tradeoff.command import print_tradeoff, tradeoff, tradeoff_figure
@@ -207,5 +207,4 @@ def test_plots_take_errors_of_zero_and_none_at_all(tmp_path, errors):
     """Exact settings and failed ones neither stop the plot nor warn."""
     points = mark_pareto([make_point(error, 1.0 + number) for number, error in enumerate(errors)])
     result = replace(measure_tradeoff(SERIES, repeats=1), points=points, level=("half", 0.5))
-    save_png(tradeoff_figure([result] * 4), tmp_path / "plot.png")
-    assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
+    assert png(tradeoff_figure([result] * 4)).startswith(b"\x89PNG")
