@@ -310,7 +310,7 @@ class SurveyRun(CaptureRun):
     def work_done(self, patch_index: NDArray[np.integer]) -> MultiplyAdds:
         """Count multiply-adds of the map with these patches at full resolution, and of the scores if used."""
         done = self.costs.of_map(patch_index)
-        if self.least_gain is not None:  # while the map is drawn, which reads the overview once
+        if self.least_gain is not None and self.plan.plain:  # while the map is drawn, which reads the overview once
             done = replace(done, score=self.costs.score(self.settings.policy))
         elif self.chooses:
             done = self.costs.with_scores(patch_index, self.settings.policy)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from flows.archive.plan_command import plan_content
 from flows.settings.load import load_settings, parse_settings
 from flows.tasks.patch_budget import PatchBudget, ReadingCosts
+from flows.tasks.run import open_run
 from models.network.sizes import SegmenterConfig, multiply_adds
 from models.policies.policies import score_multiply_adds
 from pipeline.errors import BudgetError, SettingsError
@@ -174,6 +175,16 @@ def test_a_large_field_is_counted_region_by_region() -> None:
     )
     assert 16 * small.detail < large.detail < 16 * 1.1 * small.detail
     assert 16 * small.total < large.total < 16 * 1.3 * small.total
+
+
+def test_a_zoomed_survey_reads_the_overview_twice(tmp_path: Path) -> None:
+    """Once to choose lines, once with all lines; a uniform scan reads it once, while the map is drawn."""
+    flags = {"scene": "farm", "size": "320x256", "seconds": "12", "out": str(tmp_path)}
+    never, always = (
+        open_run(load_settings(None, {**flags, "zoom": zoom}), planning=True) for zoom in ("never", "always")
+    )
+    assert always.least_gain is not None
+    assert always.work_done(np.arange(5)).overview == 2 * never.work_done(np.arange(5)).overview
 
 
 @pytest.mark.parametrize(("policy", "scan_passes"), [("gain", 2), ("entropy", 2), ("sobel", 1), ("random", 1)])

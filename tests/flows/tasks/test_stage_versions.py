@@ -101,7 +101,9 @@ def test_code_changed_means_version_raised(stage: str) -> None:
     """The code behind each stage is the code that its version was recorded for."""
     recorded = json.loads(RECORD.read_text())[stage]
     now = {"version": VERSIONS[stage], "digest": digest_of(stage, sources())}
-    assert now == recorded, f"raise VERSIONS[{stage!r}] or keep it, then run: python tests/flows/{Path(__file__).name}"
+    assert now == recorded, (
+        f"raise the version of the product of {stage} or keep it, then run: python {Path(__file__).relative_to(ROOT)}"
+    )
 
 
 def test_every_barrier_stands_in_a_way() -> None:
