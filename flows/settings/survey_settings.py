@@ -273,8 +273,8 @@ class Settings:
     )
     unknown: Unknown = stated(
         "auto",
-        "Label out-of-distribution pixels `unknown`: auto (false-alarm rate 0.1% if the weights have a detector), off,"
-        " or a false-alarm rate: 0.5%",
+        "Label out-of-distribution pixels `unknown`: auto (false-alarm rate 0.1% if the weights have a detector; off"
+        " in a zoomed survey), off, or a false-alarm rate: 0.5%",
     )
     seed: int = stated(0, "Random seed of built-in scenes and of all noise", "", 0, 2**63 - 1)
     effects: Effects = stated(
@@ -369,8 +369,11 @@ class Settings:
 
     @property
     def unknown_rate(self) -> float | None:
-        """Return the false-alarm rate of the class unknown; None where it is off."""
-        usual = {UNKNOWN_AUTO: RATE, UNKNOWN_OFF: None}
+        """Return the false-alarm rate of the class unknown; None where it is off.
+
+        Detectors do not know merged passes: their false-alarm rate is 13 to 20 times the asked one there.
+        """
+        usual = {UNKNOWN_AUTO: None if self.zooms else RATE, UNKNOWN_OFF: None}
         return usual[self.unknown] if self.unknown in usual else float(self.unknown.removesuffix("%")) / 100
 
     @property

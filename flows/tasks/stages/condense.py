@@ -116,14 +116,15 @@ def condense(
             """Write every sweep with the noise model of its own pass, since exposures differ."""
             of_passes = []
             for of_pass, statistics in captured:
-                law = condenser.law if len(passes) == 1 else ResidualLaw.learned(statistics.spectra, components)
+                spectra = statistics.spectra
+                law = condenser.law if len(passes) == 1 else ResidualLaw.learned(spectra, condenser.components)
                 of_passes += [(cube, replace(condenser, law=law)) for cube in of_pass]
             return _write_sweeps(path, of_passes, found, report)
 
         done = written(condenser)
         better = with_shared_directions(condenser, done, found, signal.false_alarm)
         if better is not None:
-            condenser, components, done = better, better.components, written(better)
+            condenser, done = better, written(better)
         write_table(path / RECORD, _record(condenser, done))
         rig_record = passes[0].path / RIG_RECORD
         if rig_record.is_file():  # the raw lines may be deleted

@@ -28,8 +28,10 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.planning.coverage import on_scene
+from pipeline.signal.subspace import SMOOTH
 from pipeline.simulator.render import BY_NAME
 from storage.archive.archive import Archive
+from storage.archive.manifests import read_table
 from storage.arrays.class_maps import ClassMap, load_class_map
 from storage.arrays.mosaics import open_mosaic
 from storage.remote.opening import verify_archive
@@ -288,3 +290,12 @@ def test_readings_that_the_weights_cannot_take_are_counted(survey_png: Any, tmp_
     assert pixels["map_without_a_class"] == 0
     store = scene.parent / "a" / Path(found.receipt["products"]["class_map"]).parent
     assert json.loads((store / "out_of_range.json").read_text())["px"] == 64 * 96
+
+
+def test_two_passes_share_components_of_rare_spectra(tmp_path: Path) -> None:
+    """Rare spectra of both passes add components; then both passes are written again by all of them."""
+    flags = {"size": "160x128", "zoom": "always", "seconds": "4", "effects": "none", "accuracy": "false"}
+    found = load_settings(None, {"scene": "farm", "engine": "plain", "out": str(tmp_path), **flags})
+    assert run_survey(found, Console(quiet=True)).receipt["plan"]["lines"] > 0
+    (record,) = (read_table(path) for path in tmp_path.glob("stages/condense_fine/*/signal.json"))
+    assert record["components"] > SMOOTH + 8

@@ -27,7 +27,8 @@ from tests.conftest import CLASSES, RGB_NM, Survey
 
 SEEN = TrainedOn(3, (460.0, 640.0), (3.0, 100.0), 2, CLASSES, (96, 300), (24.0, 60.0), 0.12)
 Maker = Callable[[float], Path]
-NARROW: dict[str, Any] = {"effects": "none", "camera.samples": 160}  # fewer samples beside the field
+# one scan, and fewer samples beside the field
+NARROW: dict[str, Any] = {"effects": "none", "camera.samples": 160, "budget": None, "scan_step": 1}
 
 
 @pytest.fixture(scope="module")
@@ -149,6 +150,12 @@ def test_pixels_without_a_value_have_no_class_rather_than_an_unknown_one(
     classes = _stored(tmp_path / "out", "class_map")["classes"].values
     assert (classes[:8, :8] == UNLABELLED).all()
     assert (classes[8:, 8:] == 3).all()
+
+
+@pytest.mark.parametrize(("flags", "rate"), [({}, None), ({"unknown": "1%"}, 0.01), ({"zoom": "never"}, 0.001)])
+def test_the_default_of_a_zoomed_survey_is_off(flags: dict[str, str], rate: float | None) -> None:
+    """Detectors do not know merged passes; a stated rate is used all the same."""
+    assert load_settings(None, {"zoom": "always", "seconds": "9", **flags}).unknown_rate == rate
 
 
 def test_a_rate_needs_weights_that_were_measured(survey_png: Survey, weights: Path, tmp_path: Path) -> None:
