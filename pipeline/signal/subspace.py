@@ -189,7 +189,7 @@ class SignalStatistics:
 
     @classmethod
     def of_arrays(cls, stored: Mapping[str, NDArray[np.generic]]) -> SignalStatistics:
-        """Return the statistics that `arrays` described; those of earlier versions have no regions."""
+        """Return the statistics that `arrays` described; stored ones may lack regions."""
         expected, count, means = stored["counts"].tolist()
         found = cls(len(stored["origin"]), expected, count, means)
         found.origin = None if np.isnan(stored["origin"]).all() else stored["origin"].astype(np.float32)
@@ -271,8 +271,8 @@ def components_of_field(
 def local_directions(scores: Floats, false_alarm: float) -> Floats:
     """Return orthonormal directions (n, direction) in which some rows of scores (region, direction) exceed noise.
 
-    The noise of a score has unit variance, or more if most regions have. The region farthest from 0 gives a direction
-    if noise is as far in any of the regions with less than the probability ``false_alarm``; the rest gives the next.
+    The noise of a score has unit variance, or more if most regions have. The region farthest from 0 gives a direction.
+    The rest gives the next, until noise is as far in any region with the probability ``false_alarm``.
     """
     regions, count = scores.shape
     rest, found = scores.copy(), np.zeros((0, count))
