@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from flows.evaluate.frames import EvaluateRequest, ObservedFrame
 from models.evaluation.metrics import (
     average_accuracy,
-    confusion,
     false_pixels,
     gap_closed,
     iou_per_class,
@@ -25,7 +24,7 @@ from models.evaluation.metrics import (
     overall_accuracy,
     paired_interval,
 )
-from models.evaluation.placement import RANDOM_DRAWS, captured_gain, gain_sums, oracle_gain
+from models.evaluation.placement import RANDOM_DRAWS, ReadTwice, captured_gain, gain_sums, oracle_gain
 from models.network.sizes import multiply_adds
 from models.policies.policies import score_multiply_adds, score_patches
 from models.reading.inference import segment
@@ -40,13 +39,14 @@ PatchIndex = NDArray[np.intp]
 
 def judge_frame(request: EvaluateRequest, frame: ObservedFrame, weights: Weights) -> Record:
     """Return the confusion counts, gain and multiply-adds of every policy and fraction."""
-    grid = frame.seen.grid
+    grid, valid = frame.seen.grid, frame.seen.grid.valid_patches()
     gain = oracle_gain(weights, frame.seen, frame.fine, frame.labels)
-    rows = []
+    maps = (segment(weights, frame.seen, frame.fine[some], some).classes for some in (valid[:0], valid))
+    scene, rows = ReadTwice(*maps, {}, frame.labels, grid), list[Record]()
     for policy, draw, fraction, patch_index in _rows(request, frame, gain):
         scored = 0 if policy in (*ENDS, ORACLE) else score_multiply_adds(policy, weights.config, grid)
-        bought, best = gain_sums(gain, patch_index, grid.valid_patches())
-        drawn = segment(weights, frame.seen, frame.fine[patch_index], patch_index).classes
+        bought, best = gain_sums(gain, patch_index, valid)
+        chosen = np.isin(np.arange(gain.size), patch_index).reshape(grid.patch_shape)
         row = {
             "policy": policy,
             "draw": draw,
@@ -54,7 +54,7 @@ def judge_frame(request: EvaluateRequest, frame: ObservedFrame, weights: Weights
             "patches": len(patch_index),
             "gain": bought,
             "best_gain": best,
-            "counts": confusion(frame.labels, drawn, weights.config.classes).tolist(),
+            "counts": scene.counts(chosen, weights.config.classes).tolist(),
             "multiply_adds": multiply_adds(weights.config, grid, len(patch_index), frame.bands, score=scored).total,
         }
         rows.append(row)
