@@ -257,12 +257,10 @@ def estimate_survey(run: SurveyRun, fine: FinePlan | None) -> dict[str, Estimate
     ``fine`` is the fine pass, where it is planned already.
     """
     camera = {} if run.raster is not None else _of_camera(run, fine)
-    patch_index, source, expected = run.likely_patches, "the size of network and field", run.least_gain is not None
-    if fine is not None and not expected and (run.plan.plain or fine.sweeps):
-        patch_index = fine.patch_index
-    if expected:  # patches are chosen while the map is drawn
-        every = format_count(run.work_done(run.kept_patches).total)
-        source = f"the fraction of patches that other scenes needed; {every} with every patch"
+    expected = run.least_gain is not None  # patches are chosen while the map is drawn
+    patch_index = fine.patch_index if fine is not None and fine.sweeps and not expected else run.likely_patches
+    every = format_count(run.work_done(run.kept_patches).total)
+    source = f"the patches that other scenes needed; {every} with every patch" if expected else "network and field"
     work = Estimate(run.work_done(patch_index).total, source, fine is None and run.chooses and not expected)
     captured = (camera["bytes_captured"].value or 0.0) if camera else 0.0
     return {**camera, "bytes_kept": _kept(run, captured), "multiply_adds": work, "miou": _score(run)}
