@@ -160,7 +160,7 @@ def contents(archive: Archive, now: datetime | None = None) -> dict[str, Any]:
             "version": store.version,
             "created": store.created,
             "age_s": _age_s(store.created, now),
-            "bytes": store.size,
+            "bytes": sizes[store.ref.uri],  # with its manifest
             "cleared": store.cleared,
             "runs": len(catalogue.named_by(store.ref.uri)),
             "problem": store.problem,
@@ -412,8 +412,8 @@ def show_verdict(content: dict[str, Any], console: Console) -> None:
     for uri, why in content.get("hopeless", {}).items():
         _say(console, f"{uri} cannot be remade: {why}")
     if content.get("to_remake") or content.get("surveys"):
-        count = len(content["to_remake"])
-        _say(console, f"verify --repair makes {count} broken stores anew by:")
+        count = counted(len(content["to_remake"]), "broken store")
+        _say(console, f"verify --repair makes {count} anew by:")
         for survey in content["surveys"]:
             _say(console, f"  {survey['run']}: {survey['command']}")
     _say(console, f"{content['whole']} stores and runs are as published, out of {content['checked']}")

@@ -6,7 +6,7 @@ import math
 import tempfile
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from textwrap import shorten
 from typing import TYPE_CHECKING, Any, Literal
@@ -170,7 +170,7 @@ def plan_content(settings: Settings) -> dict[str, Any]:
         "field": figures,
         "estimate": {name: asdict(one) for name, one in estimate_survey(run, fine).items()},
     }
-    if run.plan.plain and run.chooses:  # at most, of a uniform scan that is segmented in part
+    if run.plan.plain and run.chooses:  # expected, of a uniform scan that is segmented in part
         content["kept"] = run.reading_figures(run.likely_patches)
     return content
 
@@ -257,23 +257,28 @@ def estimate_survey(run: SurveyRun, fine: FinePlan | None) -> dict[str, Estimate
     ``fine`` is the fine pass, where it is planned already.
     """
     camera = {} if run.raster is not None else _of_camera(run, fine)
-    patch_index = run.likely_patches if run.plan.plain or fine is None else fine.patch_index
-    done = run.work_done(patch_index).total
-    return {
-        **camera,
-        "bytes_kept": _kept(run, (camera["bytes_captured"].value or 0.0) if camera else 0.0),
-        "multiply_adds": Estimate(done, "the size of network and field", at_most=fine is None and run.chooses),
-        "miou": _score(run),
-    }
+    expected = run.least_gain is not None  # patches are chosen while the map is drawn
+    patch_index = fine.patch_index if fine is not None and fine.sweeps and not expected else run.likely_patches
+    every = format_count(run.work_done(run.kept_patches).total)
+    source = f"the patches that other scenes needed; {every} with every patch" if expected else "network and field"
+    work = Estimate(run.work_done(patch_index).total, source, fine is None and run.chooses and not expected)
+    captured = (camera["bytes_captured"].value or 0.0) if camera else 0.0
+    return {**camera, "bytes_kept": _kept(run, captured), "multiply_adds": work, "miou": _score(run)}
 
 
 def _of_camera(run: SurveyRun, fine: FinePlan | None) -> dict[str, Estimate]:
-    """Return seconds and bytes of the passes; a fine pass that is not planned yet counts with all of its budget."""
-    plan, camera, bands = run.plan, run.camera, len(run.scene.wavelength_nm)
-    open_end = fine is None and not plan.plain
+    """Return seconds and bytes of the passes.
+
+    A fine pass that is not planned yet counts with all of its budget, and with as many lines as can fit into it.
+    """
+    plan, camera, bands, second = run.plan, run.camera, len(run.scene.wavelength_nm), run.second_pass
     captured = raw_bytes([*plan.coarse, *(fine.sweeps if fine else ())], camera, bands)
-    if open_end:
-        captured += int(plan.fine_s / (camera.frame_ms * 1e-3)) * camera.samples * bands * BYTES_PER_SAMPLE
+    open_end = fine is None and second is not None
+    if fine is None and second is not None:
+        record, left = run.scan_record, raw_bytes(second.swaths, camera, bands) - second.interlaces * captured
+        shortest = camera if record is None else replace(camera, exposure_ms=record.offered_ms(camera)[0])
+        lines = int(plan.fine_s / (shortest.frame_ms * 1e-3))
+        captured += min(lines * camera.samples * bands * BYTES_PER_SAMPLE, left)
     seconds = plan.coarse_s + (plan.fine_s if fine is None else fine.seconds)
     return {
         "capture_s": Estimate(seconds, "the cost model of mirror and camera", open_end),
@@ -299,12 +304,10 @@ def _score(run: SurveyRun) -> Estimate:
 
 
 def _kept(run: SurveyRun, captured: float) -> Estimate:
-    pixels, bands, is_farm = (
-        math.prod(run.scene.shape),
-        len(run.scene.wavelength_nm),
-        run.settings.scene in BUILT_IN_SCENES,
-    )
-    kept = estimated_bytes(pixels, bands, captured, is_farm=is_farm, most=run.settings.kept_bytes)
+    pixels, bands = math.prod(run.scene.shape), len(run.scene.wavelength_nm)
+    seen = captured + (0 if run.plan.plain else pixels * bands * BYTES_PER_SAMPLE)  # the overview is a mosaic too
+    is_farm = run.settings.scene in BUILT_IN_SCENES
+    kept = estimated_bytes(pixels, bands, seen, is_farm=is_farm, most=run.settings.kept_bytes)
     if run.settings.keep == KEEP_SIGNAL:
         return Estimate(kept, KEPT_FROM)
     return Estimate(kept + captured, f"{KEPT_FROM}, and raw lines as they are captured", at_most=True)

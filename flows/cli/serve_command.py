@@ -143,7 +143,9 @@ def load_fields(files: Sequence[Path], out: str | None = None) -> list[ServedFie
         if not is_remote(settings.out):
             settings = replace(settings, out=str(Path(settings.out).absolute()))
         if "scene" not in read_toml(file) and settings.source != "rig":
-            raise SettingsError(f"{file} has neither scene nor source = 'rig'; set the field's scene, or its rig")
+            raise SettingsError(
+                f"{file} has neither scene nor source = 'rig'; set the field's scene ('field' for sweeps), or its rig"
+            )
         name = settings.name or re.sub(r"[^A-Za-z0-9_.-]+", "-", file.stem).strip("-.") or "field"
         if name in fields:
             raise SettingsError(

@@ -23,7 +23,7 @@ from flows.tasks.scene import SimulatedField, farm_refusal, open_scene
 from flows.tasks.stage import Stage, Wanted
 from flows.tasks.stages.capture import capture_coarse
 from flows.tasks.stages.effects import choose_effects, load_manifest
-from flows.terminal.figures import format_bytes, format_seconds
+from flows.terminal.figures import counted, format_bytes, format_seconds
 from flows.terminal.progress import StageProgress, print_json
 from models.network.machine import keep_freed_memory
 from pipeline.errors import SceneError, SettingsError
@@ -145,7 +145,8 @@ def _print(record: Mapping[str, Any], console: Console) -> None:
     print_effects(record["effects"], record["effects_total"], console)
     done = "already there" if record["cached"] else f"{format_seconds(record['cpu_s'])} of CPU"
     console.print(
-        f"{record['lines']} lines in {record['sweeps']} sweeps: {done}, {format_bytes(record['bytes_stored'])} stored"
+        f"{counted(record['lines'], 'line')} in {counted(record['sweeps'], 'sweep')}: {done}, "
+        f"{format_bytes(record['bytes_stored'])} stored"
     )
     for name in record["cubes"]:
         console.print(f"  {escape(str(Path(record['path']) / Path(name).name))}", soft_wrap=True)

@@ -118,9 +118,11 @@ class PassLayout:
                 asked = (
                     f"--seconds {seconds:g}" if budget is None else f"--budget {budget:g} gives {limit_s:.1f} s, which"
                 )
+                shorter = ", a shorter --coarse-exposure-ms" if self.coarse_exposure_ms is None else ""
                 raise BudgetError(
-                    f"{asked} is below the time of the first pass of every {self.first_step}th line, {coarse_s:.1f} s "
-                    f"of the full scan's {full_s:.1f} s; give more, a shorter --coarse-exposure-ms, or --zoom never"
+                    f"{asked} is below the time of the first pass of every {self.first_step}th line, "
+                    f"{coarse_s + 0.01:.2f} s of the full scan's {full_s:.1f} s; "
+                    f"give more{shorter}, or take one uniform scan"
                 )
         margin, plain = 2 * self.pointing_px, budget is None and seconds is None
         return CapturePlan(along, coarse, full, coarse_s, full_s, fine_s, margin, plain=plain, by_record=by_record)
@@ -279,7 +281,7 @@ class FirstPass:
 
 
 def choose_first_pass(layout: PassLayout, record: ScanPerformance, seconds: float) -> FirstPass | None:
-    """Choose the lines of a first pass within the time; None where none fits.
+    """Choose the lines of a first pass within the time, or the fastest where none fits; None: the table has none.
 
     The criterion is the expected mIoU if the second pass covers the whole field. Among nearly equal choices, the
     closest lines are taken, then the longest exposure.
@@ -287,11 +289,13 @@ def choose_first_pass(layout: PassLayout, record: ScanPerformance, seconds: floa
     camera, cost, full = layout.camera, layout.cost, layout.sweeps()[2]
     shortest, longest = record.offered_ms(camera)
     found: list[FirstPass] = []
+    fastest: FirstPass | None = None
     for first_step in (step for step in FIRST_STEPS if step in record.steps):
         for first_ms in exposures_between(shortest, longest):
             first = every_nth(full, first_step, first_ms)
             left_s = seconds - cost.seconds(first, camera)
             if left_s < 0:
+                fastest = FirstPass(first_step, first_ms, 0.0)
                 break
             scores = [0.0]
             for step in (step for step in record.steps if step < first_step):
@@ -302,7 +306,7 @@ def choose_first_pass(layout: PassLayout, record: ScanPerformance, seconds: floa
             found.append(FirstPass(first_step, first_ms, max(scores)))
     best = max((one.expected for one in found), default=0.0)
     good = [one for one in found if one.expected >= best - LOSS]
-    return max(good, key=lambda one: (-one.step, one.exposure_ms), default=None)
+    return max(good, key=lambda one: (-one.step, one.exposure_ms), default=fastest)
 
 
 def as_figures(scan: UniformScan | None) -> dict[str, Any] | None:

@@ -125,7 +125,7 @@ def _in_clear_light(settings: Settings, known: Sequence[str] | None) -> tuple[Ra
     )
     file = _judged_by_known(file, known)
     scene, notes = _placed_once(scene_of_file(file, settings.camera), file.provenance, posed=settings.pose is not None)
-    return scene, (*notes, *_gap_note(scene, "were given their band's median"))
+    return scene, (*notes, *_gap_note(scene, "given their band's median"))
 
 
 def open_map(settings: Settings, known: Sequence[str] | None = None) -> tuple[SceneFile, RasterScene, tuple[str, ...]]:
@@ -158,7 +158,7 @@ def open_map(settings: Settings, known: Sequence[str] | None = None) -> tuple[Sc
         content=file.content,
     )
     scene, notes = _placed_once(scene, file.provenance, posed=settings.pose is not None)
-    return file, scene, (*notes, *_gap_note(scene, "are as they are in the other bands"))
+    return file, scene, (*notes, *_gap_note(scene, "whose other bands are used"))
 
 
 def _judged_by_known(file: SceneFile, known: Sequence[str] | None) -> SceneFile:
@@ -167,8 +167,8 @@ def _judged_by_known(file: SceneFile, known: Sequence[str] | None) -> SceneFile:
     if not (file.labels_found and out_of_range):
         return file
     note = (
-        f"the labels beside the scene are left out: the weights do not know their class {out_of_range[0]!r}; name the "
-        "classes in a scene.toml to use them"
+        f"the labels beside the scene are left out: the weights know {', '.join(known or ())}, not {out_of_range[0]!r};"
+        " give the classes these names in a scene.toml to use them"
     )
     nothing: dict[str, Any] = {"labels": None, "class_names": (), "class_values": ()}
     return replace(file, **nothing, class_colours=file.class_colours[:0], provenance=(*file.provenance, note))
@@ -182,12 +182,10 @@ def _placed_once(scene: RasterScene, notes: tuple[str, ...], *, posed: bool) -> 
 
 
 def _gap_note(scene: RasterScene, became: str) -> tuple[str, ...]:
-    """Return a note on pixels without a value in some band."""
-    if not scene.filled_px:
-        return ()
+    """Return notes on pixels without a value in some or most bands."""
     void = 0 if scene.missing is None else int(np.count_nonzero(scene.missing))
-    unclassed = f"; {void} without most of their bands have no class in the map" if void else ""
-    return (f"{scene.filled_px} pixels without a value {became}{unclassed}",)
+    counts = {f"some bands, {became}": scene.filled_px - void, "most bands, of no class in the map": void}
+    return tuple(f"pixels without {what}: {count}" for what, count in counts.items() if count)
 
 
 def _field_before_rig(settings: Settings) -> RasterScene:

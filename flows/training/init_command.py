@@ -88,6 +88,7 @@ def run_init(source: str, console: Console, *, force: bool = False) -> dict[str,
     found, bands = draft.files, draft.cube.bands
     count = draft.cube.shape[2]
     first = f"write the {count} wavelengths into {path}: wavelengths_nm or wavelengths_file, as its lines say"
+    again = shlex.join(["spectralzoom", "init", source, "--force"]) if found.labels and not draft.classes else None
     return {
         "file": str(path),
         "images": len(found.images),
@@ -99,8 +100,8 @@ def run_init(source: str, console: Console, *, force: bool = False) -> dict[str,
         "classes": [{"name": one.name, "value": one.value, "fraction": one.fraction} for one in draft.classes],
         "notes": list(draft.notes),
         "unseen": _unseen(draft),
-        "first": None if bands.wavelength_nm is not None else first,
-        "next": _next(source, draft),
+        "first": "repair these label files" if again else None if bands.wavelength_nm is not None else first,
+        "next": again or _next(source, draft),
     }
 
 

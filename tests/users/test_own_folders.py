@@ -85,6 +85,15 @@ def test_init_tells_what_it_could_not_see(made: Path, command_line: Any) -> None
     (made / "scene.toml").unlink()
 
 
+def test_init_asks_to_repair_labels_of_another_size(tmp_path: Path, command_line: Any) -> None:
+    """Without a label that fits, the next step is the same command again."""
+    for name, size in (("001", 32), ("001_mask", 24)):
+        Image.fromarray(np.eye(size, dtype=np.uint8)).save(tmp_path / f"{name}.png")
+    told = json.loads(command_line("init", tmp_path, "--json").out)
+    assert told["first"] == "repair these label files"
+    assert told["next"].split()[1:] == ["init", str(tmp_path), "--force"]
+
+
 def test_training_leaves_out_and_says_so(made: Path, tmp_path: Path, command_line: Any) -> None:
     """Scenes without labels are no part of it; tiles that lack a class are, in the classes of all tiles."""
     out = tmp_path / "mine.safetensors"
@@ -129,7 +138,7 @@ def test_labels_that_nobody_stated_are_left_out_where_the_weights_know_others(ma
     (made / "apart" / "scene.toml").unlink(missing_ok=True)
     found, notes = open_scene(settings, ("soil", "crop"))
     assert found.labels is None
-    assert any("the labels beside the scene are left out" in note for note in notes)
+    assert any("left out: the weights know soil, crop, not 'class_0'; give" in note for note in notes)
     assert open_scene(settings, ("class_0", "class_1"))[0].labels is not None
 
 

@@ -49,6 +49,9 @@ def test_ls_shows_runs_and_stores(two_budgets: Path, capsys: pytest.CaptureFixtu
     shared = content["shared_bytes"]
     assert first["bytes"] - first["own_bytes"] == second["bytes"] - second["own_bytes"] == shared > 10_000
     assert content["bytes"] == first["own_bytes"] + second["own_bytes"] + shared
+    stores = sum(row["bytes"] for rows in content["stages"].values() for row in rows)
+    folders = sum(map(Archive(two_budgets).size_of, (f"runs/{run['id']}" for run in (first, second))))
+    assert content["bytes"] == stores + folders
     assert [len(content["stages"][stage]) for stage in ("capture", "rectify", "segment")] == [3, 1, 2]
     assert content["stages"]["rectify"][0]["runs"] == 2
     ls(two_budgets)

@@ -224,3 +224,14 @@ def test_estimates_of_a_capture_are_what_it_takes_at_most(settings: Settings, ar
     show_plan(plan_content(replace(settings, out=str(tmp_path / "new"))), Console(file=shown, width=160))
     assert "Estimates: nothing of this has run" in shown.getvalue()
     assert f"at most {format_seconds(ahead['capture_s']['value'])}" in shown.getvalue()
+
+
+def test_a_zoomed_farm_may_take_every_line_and_read_every_patch(tmp_path: Path) -> None:
+    """The second pass may take short exposures, so that 8 s are enough for all lines; patches are an expectation."""
+    farm = {"scene": "farm", "size": "160x128", "zoom": "always", "seconds": "8", "out": str(tmp_path)}
+    found = plan_content(load_settings(None, farm))
+    captured, work = found["estimate"]["bytes_captured"], found["estimate"]["multiply_adds"]
+    assert captured["at_most"]
+    assert captured["value"] == pytest.approx(found["scans"]["candidates"][-1]["bytes_raw"], rel=0.03)
+    assert not work["at_most"]
+    assert work["known_from"].endswith("million with every patch")

@@ -63,7 +63,12 @@ REFUSED = {
     "budget below the coarse pass": (
         2,
         "--budget 0.1",
-        r"--budget 0.1 gives \d.*below the time of the first pass of every 4th line",
+        r"--budget 0.1 gives \d.*below the time of the first pass of every 4th line.*, or take one uniform scan$",
+    ),
+    "seconds below the fastest first pass": (
+        2,
+        "--scene farm --size 160x128 --weights farm --zoom always --seconds 1",
+        r"--seconds 1 is below .* first pass of every 8th line, 1\.92 s of the full scan's 15\.1 s; give more, or take",
     ),
     "farm beyond memory": (2, "--scene farm --size 60000x60000", "takes about .* GB of memory, this machine has"),
     "memory for no process": (
@@ -106,7 +111,7 @@ WORKS = {
     "one band": ("--scene one.npy --wavelengths 550 --budget 1", "wavelengths stated: 550 nm"),
     "wavelengths out of order": ("--scene cube.npy --wavelengths 640,460,500,550,620,600 --budget 1", "640, 460"),
     "scene smaller than a patch": ("--scene tiny.png --budget 1", RAN),
-    "NaN pixels": (f"--scene gaps.npy --wavelengths {NM} --budget 1", "91 pixels without a value were given"),
+    "NaN pixels": (f"--scene gaps.npy --wavelengths {NM} --budget 1", "given their band's median: 1 "),
     "all black": ("--scene black.png --budget 1", RAN),
 }
 

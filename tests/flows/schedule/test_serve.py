@@ -23,7 +23,7 @@ BAD = {
     "no zone": (("north",), "--cron 0_6_*_*_* --timezone Mars/Base", 2, "no such schedule: .*Invalid timezone"),
     "no such file": (("nowhere",), "--every 30m", 2, "no settings file .*nowhere.toml"),
     "unknown key": (("typo",), "--every 30m", 2, "unknown setting 'sceene' in .*typo.toml; did you mean 'scene'"),
-    "neither scene nor rig": (("blind",), "--every 30m", 2, "blind.toml has neither scene nor source = 'rig'"),
+    "neither scene nor rig": (("blind",), "--every 30m", 2, "blind.toml has neither scene .*'field' for sweeps"),
     "scene missing": (("gone",), "--every 30m", 1, "gone.toml: there is no file .*gone.png"),
     "twice": (("north", "north"), "--every 30m", 2, "are both called north"),
     "limit": (("north",), "--every 30m --limit 0", 2, "Invalid value .*--limit.* >= 1"),
