@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     import flows.publish.report as pages
     import storage.arrays.class_maps as class_maps
     import storage.arrays.layout as layout
-    from storage.arrays.class_maps import ClassNames
 else:
     mpl_figure = deferred("matplotlib.figure")
     panels = deferred("flows.publish.panels")
@@ -58,7 +57,7 @@ class FieldHistory:
     field: str
     archive: str
     runs: Sequence[Row]
-    legend: ClassNames | None = None  # of the newest run's map
+    legend: class_maps.ClassNames | None = None  # of the newest run's map
 
 
 def report(archive: ArchiveName, *, field: str | None = None, out: OutFile, as_json: AsJson = False) -> int:
@@ -163,7 +162,7 @@ def render_history(history: FieldHistory, runs_at: str) -> str:
     )
 
 
-def _draw_areas(rows: Sequence[Row], legend: ClassNames | None) -> str | None:
+def _draw_areas(rows: Sequence[Row], legend: class_maps.ClassNames | None) -> str | None:
     """Return a chart of the class areas over time, in the newest run's unit, as a data address; None without areas."""
     dated = [row for row in rows if row["visited"] and row["areas"]]
     if not dated:
@@ -172,8 +171,7 @@ def _draw_areas(rows: Sequence[Row], legend: ClassNames | None) -> str | None:
     dated = [row for row in dated if row["unit"] == unit]
     figure = mpl_figure.Figure(figsize=(9.5, 3.2), dpi=100, layout="constrained", facecolor=panels.PAPER)
     axes = figure.subplots()
-    exact = panels.NO_COLOURS if legend is None else legend.colours
-    colours = {} if legend is None else dict(zip(legend.names, panels.class_palette(exact), strict=True))
+    colours = {} if legend is None else dict(zip(legend.names, legend.colours / 255, strict=True))
     for name in dict.fromkeys(name for row in dated for name in row["areas"]):
         points = [(datetime.fromisoformat(row["visited"]), row["areas"].get(name, 0.0)) for row in dated]
         label = visible(name).replace("_", " ").replace("$", r"\$")
@@ -183,7 +181,7 @@ def _draw_areas(rows: Sequence[Row], legend: ClassNames | None) -> str | None:
     axes.grid(color=panels.GRID)
     axes.tick_params(axis="x", labelrotation=20)
     figure.legend(loc="outside right upper", frameon=False, fontsize=8)
-    return panels.data_address(panels.png(figure, exact))
+    return panels.data_address(panels.png(figure, () if legend is None else legend.colours))
 
 
 def _shown(row: Row, runs_at: str) -> dict[str, Any]:

@@ -64,7 +64,6 @@ class FieldMap:
 class PriorMapField:
     """Images of the prior map: the class map of an earlier run, and the ages."""
 
-    run: str
     days: float  # between that capture and this one
     classes: Bytes  # (y, x) of that run's map, by the class numbers of this run; 255 for other classes
     age_days: NDArray[np.float32]  # (y, x) since a pixel was captured, NaN where it never was
@@ -84,7 +83,7 @@ def prior_map(prior: Prior | None, drawn: StageRef, receipt: Receipt) -> PriorMa
             names[earlier] = number
     probabilities = ProbabilityStore(drawn.path / "class_probabilities.zarr")
     before = read_array(open_group(prior.probabilities.path / "class_map.zarr"), "classes")
-    return PriorMapField(prior.run, prior.days, names[before], probabilities.age())
+    return PriorMapField(prior.days, names[before], probabilities.age())
 
 
 def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: PriorMapField | None) -> FieldMap:

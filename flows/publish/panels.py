@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from flows.terminal.figures import format_area
@@ -22,7 +22,6 @@ from storage.arrays.mosaics import Mosaic
 from storage.arrays.quicklooks import stretch
 
 COLOURS = 256  # of a PNG
-NO_COLOURS = np.zeros((0, 3), np.uint8)
 GROUND_IN, GROUND_DPI, GROUND_MOST_PX = 9.0, 130, 1200
 INK = "#22241f"
 MUTED = "#6a6d64"
@@ -41,18 +40,18 @@ STYLE: Any = {
 UNLABELLED_COLOUR = (0.86, 0.86, 0.84)
 
 
-def png(figure: Figure, exact: NDArray[np.integer] = NO_COLOURS) -> bytes:
+def png(figure: Figure, exact: ArrayLike = ()) -> bytes:
     """Return a figure as PNG of 256 colours, with these ``exact`` ones (n, 3) among them, at most half of all."""
     canvas, file = FigureCanvasAgg(figure), io.BytesIO()
     canvas.draw()
-    drawn, exact = np.asarray(canvas.buffer_rgba()), exact[: COLOURS // 2].astype(np.uint8)
-    others = COLOURS - len(exact)
+    drawn, kept = np.asarray(canvas.buffer_rgba()), np.reshape(exact, (-1, 3))[: COLOURS // 2].astype(np.uint8)
+    others = COLOURS - len(kept)
     rough = Image.fromarray(drawn).convert("RGB").quantize(others, dither=Image.Dither.NONE)
     numbers, packed, palette = np.array(rough), drawn.view(np.uint32)[..., 0], rough.getpalette() or []
-    for number, colour in enumerate(exact, others):
+    for number, colour in enumerate(kept, others):
         numbers[packed == np.array([*colour, 255], np.uint8).view(np.uint32)] = number
     picture = Image.fromarray(numbers)
-    picture.putpalette([*palette, *[0] * (3 * others - len(palette)), *exact.ravel().tolist()])
+    picture.putpalette([*palette, *[0] * (3 * others - len(palette)), *kept.ravel().tolist()])
     picture.save(file, "PNG")
     return file.getvalue()
 

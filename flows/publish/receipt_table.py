@@ -95,8 +95,8 @@ def format_score(receipt: Mapping[str, Any]) -> str:
         score = (
             f"mIoU {format_points(accuracy['miou'])} of 100 against the labels{scene} ({right} % of pixels correct)."
         )
-        alone = receipt.get("plan", {}).get("kind") in ("scan", "raster") and "kept" not in receipt
-        alone = alone or accuracy["none"]["miou"] is None
+        plan, compared = receipt.get("plan", {}), accuracy["none"]["miou"] is not None
+        alone = not compared or (plan.get("kind") in ("scan", "raster") and "kept" not in receipt)
         return f"{score} {format_worst_class(accuracy, alone=alone)}".rstrip()
     if is_foreign(receipt):
         return f"Unknown: {format_percent(receipt['unknown']['fraction'])} of the map. {FOREIGN_WORDS}."
