@@ -21,7 +21,7 @@ from flows.tasks.scores import score_of
 from flows.terminal.figures import counted, format_area, format_percent
 from flows.terminal.processes import DONE
 from flows.terminal.progress import print_json
-from pipeline.errors import ArchiveError, SettingsError, ShapeError, visible
+from pipeline.errors import ArchiveError, PipelineError, SettingsError, ShapeError, visible
 from pipeline.lazy import deferred
 from pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
 from storage.archive.archive import Archive
@@ -35,14 +35,17 @@ if TYPE_CHECKING:
 
     import flows.publish.panels as panels
     import flows.publish.report as pages
+    import storage.arrays.class_maps as class_maps
+    import storage.arrays.layout as layout
 else:
     mpl_figure = deferred("matplotlib.figure")
     panels = deferred("flows.publish.panels")
     pages = deferred("flows.publish.report")
+    class_maps = deferred("storage.arrays.class_maps")
+    layout = deferred("storage.arrays.layout")
 
 LEADING_CLASSES = 3  # of a run in the table
 SHOW_AREA = {"ha": format_area, "fraction": format_percent}
-COLOURS = 10  # of a chart, before they repeat
 AXES = {"ha": "hectares", "fraction": "fraction of the map"}
 Row = Mapping[str, Any]
 
@@ -54,6 +57,7 @@ class FieldHistory:
     field: str
     archive: str
     runs: Sequence[Row]
+    legend: class_maps.ClassNames | None = None  # of the newest run's map
 
 
 def report(archive: ArchiveName, *, field: str | None = None, out: OutFile, as_json: AsJson = False) -> int:
@@ -92,8 +96,11 @@ def read_history(archive: Archive, field: str | None = None) -> FieldHistory:
     if name not in names:
         which = f"no field of {archive.name} is called {name!r}" if name else f"{archive.name} has {len(names)} fields"
         raise ArchiveError(f"{which}; give --field with one of: {', '.join(names) or 'none'}")
-    rows = [_row(run) for run in catalogue.runs if called(run) == name]
-    return FieldHistory(str(name), archive.name, sorted(rows, key=lambda row: str(row["visited"])))
+    runs = sorted((run for run in catalogue.runs if called(run) == name), key=lambda run: str(time_of_visit(run)))
+    legend = None
+    with suppress(KeyError, OSError, PipelineError):  # the map was deleted
+        legend = class_maps.legend_of(layout.open_group(archive.locate(runs[-1].products["class_map"])))
+    return FieldHistory(str(name), archive.name, [_row(run) for run in runs], legend)
 
 
 def _row(run: Run) -> Row:
@@ -149,13 +156,13 @@ def render_history(history: FieldHistory, runs_at: str) -> str:
         title=history.field,
         lead=f"{counted(len(history.runs), 'run')} in the archive.",
         about=f"{history.archive}; times in UTC",
-        chart=_draw_areas(history.runs),
+        chart=_draw_areas(history.runs, history.legend),
         runs=[_shown(row, runs_at) for row in reversed(history.runs)],
         trained=any(row["training_scene"] for row in history.runs),
     )
 
 
-def _draw_areas(rows: Sequence[Row]) -> str | None:
+def _draw_areas(rows: Sequence[Row], legend: class_maps.ClassNames | None) -> str | None:
     """Return a chart of the class areas over time, in the newest run's unit, as a data address; None without areas."""
     dated = [row for row in rows if row["visited"] and row["areas"]]
     if not dated:
@@ -164,17 +171,17 @@ def _draw_areas(rows: Sequence[Row]) -> str | None:
     dated = [row for row in dated if row["unit"] == unit]
     figure = mpl_figure.Figure(figsize=(9.5, 3.2), dpi=100, layout="constrained", facecolor=panels.PAPER)
     axes = figure.subplots()
-    for number, name in enumerate(dict.fromkeys(name for row in dated for name in row["areas"])):
+    colours = {} if legend is None else dict(zip(legend.names, legend.colours / 255, strict=True))
+    for name in dict.fromkeys(name for row in dated for name in row["areas"]):
         points = [(datetime.fromisoformat(row["visited"]), row["areas"].get(name, 0.0)) for row in dated]
         label = visible(name).replace("_", " ").replace("$", r"\$")
-        dashes = "-" if number < COLOURS else "--"
-        axes.plot(*zip(*points, strict=True), marker="o", markersize=4, linestyle=dashes, label=label)
+        axes.plot(*zip(*points, strict=True), marker="o", markersize=4, color=colours.get(name), label=label)
     axes.set_ylim(bottom=0)
     axes.set_ylabel(AXES[unit])
     axes.grid(color=panels.GRID)
     axes.tick_params(axis="x", labelrotation=20)
     figure.legend(loc="outside right upper", frameon=False, fontsize=8)
-    return panels.data_address(panels.png(figure))
+    return panels.data_address(panels.png(figure, () if legend is None else legend.colours))
 
 
 def _shown(row: Row, runs_at: str) -> dict[str, Any]:

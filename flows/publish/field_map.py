@@ -30,7 +30,7 @@ from storage.arrays.quicklooks import choose_bands
 MOST_PX = 2048  # of a map's longer side; larger maps are subsampled
 QUALITY = 80  # of a photograph as WebP
 LEVELS = 50  # of a colour ramp; the next number is transparent
-CHANGED_RGB, PATCH_RGB = (196, 38, 46), (0, 190, 200)
+DIFFERS_RGB, PATCH_RGB = (196, 38, 46), (0, 190, 200)
 ERROR_COLOURS = {"right": "#c9d3c4", "wrong": "#c4262e"}  # of labelled pixels
 Bytes = NDArray[np.uint8]
 
@@ -62,12 +62,10 @@ class FieldMap:
 
 @dataclass(frozen=True)
 class PriorMapField:
-    """Images of the prior map: the class map of an earlier run, and the changes since."""
+    """Images of the prior map: the class map of an earlier run, and the ages."""
 
-    run: str
     days: float  # between that capture and this one
     classes: Bytes  # (y, x) of that run's map, by the class numbers of this run; 255 for other classes
-    changed: NDArray[np.float32]  # (patch_y, patch_x) fractions of pixels of another class
     age_days: NDArray[np.float32]  # (y, x) since a pixel was captured, NaN where it never was
 
 
@@ -84,10 +82,8 @@ def prior_map(prior: Prior | None, drawn: StageRef, receipt: Receipt) -> PriorMa
         if earlier >= 0:
             names[earlier] = number
     probabilities = ProbabilityStore(drawn.path / "class_probabilities.zarr")
-    changed = probabilities.changed()
-    assert changed is not None
     before = read_array(open_group(prior.probabilities.path / "class_map.zarr"), "classes")
-    return PriorMapField(prior.run, prior.days, names[before], changed, probabilities.age())
+    return PriorMapField(prior.days, names[before], probabilities.age())
 
 
 def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: PriorMapField | None) -> FieldMap:
@@ -116,11 +112,10 @@ def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: Prio
         oldest = float(np.nanmax(before.age_days)) if np.isfinite(before.age_days).any() else 0.0
         ages = _ramp_address(before.age_days[thin, thin], oldest)
         layers.append(MapLayer(f"Days since it was captured, 0 to {oldest:.2g}", ages, opacity=0.8))
-        table = np.array([(*CHANGED_RGB, round(255 * fraction / LEVELS)) for fraction in range(LEVELS + 1)], np.uint8)
-        fractions = np.rint(LEVELS * np.clip(np.nan_to_num(before.changed), 0, 1)).astype(np.uint8)
-        layers.append(
-            MapLayer("Changed since", layer_address(_on_field(run, fractions)[thin, thin], table), opacity=0.8)
-        )
+    if shown.was is not None:
+        differs = (shown.was[thin, thin] != UNLABELLED).astype(np.uint8)
+        table = np.array([(0, 0, 0, 0), (*DIFFERS_RGB, 255)], np.uint8)
+        layers.append(MapLayer("Captured and differing", layer_address(differs, table), opacity=0.8))
     if not run.plan.plain:
         patch_index = np.zeros(run.grid.patch_shape, np.uint8)
         patch_index.ravel()[plan.patch_index] = 1

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from flows.terminal.figures import format_area
@@ -40,12 +40,19 @@ STYLE: Any = {
 UNLABELLED_COLOUR = (0.86, 0.86, 0.84)
 
 
-def png(figure: Figure) -> bytes:
-    """Return a figure as PNG of 256 colours."""
+def png(figure: Figure, exact: ArrayLike = ()) -> bytes:
+    """Return a figure as PNG of 256 colours, with these ``exact`` ones (n, 3) among them, at most half of all."""
     canvas, file = FigureCanvasAgg(figure), io.BytesIO()
     canvas.draw()
-    drawn = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-    drawn.quantize(COLOURS, dither=Image.Dither.NONE).save(file, "PNG")
+    drawn, kept = np.asarray(canvas.buffer_rgba()), np.reshape(exact, (-1, 3))[: COLOURS // 2].astype(np.uint8)
+    others = COLOURS - len(kept)
+    rough = Image.fromarray(drawn).convert("RGB").quantize(others, dither=Image.Dither.NONE)
+    numbers, packed, palette = np.array(rough), drawn.view(np.uint32)[..., 0], rough.getpalette() or []
+    for number, colour in enumerate(kept, others):
+        numbers[packed == np.array([*colour, 255], np.uint8).view(np.uint32)] = number
+    picture = Image.fromarray(numbers)
+    picture.putpalette([*palette, *[0] * (3 * others - len(palette)), *kept.ravel().tolist()])
+    picture.save(file, "PNG")
     return file.getvalue()
 
 
@@ -129,7 +136,7 @@ def draw_ground(found: GroundMap) -> bytes:
         if number in present
     ]
     figure.legend(handles=patches, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
-    return png(figure)
+    return png(figure, found.legend.colours)
 
 
 LEAST_BANDS = 5  # of a curve
@@ -155,7 +162,7 @@ def draw_spectra(mosaic: Mosaic, found: ClassMap) -> bytes | None:
                 axes.plot(nm, curve, color=colour, linewidth=1.2, label=name, **DOTS)
         axes.set(xlabel="wavelength [nm]", ylabel="value of the scene")
         axes.legend(loc="best", ncols=2, fontsize=7, frameon=False)
-        return png(figure)
+        return png(figure, found.colours)
 
 
 def class_spectra(mosaic: Mosaic, classes: NDArray[np.integer], count: int) -> NDArray[np.float32]:

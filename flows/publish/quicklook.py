@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from textwrap import fill
 from typing import Any
 
 import matplotlib as mpl
@@ -17,11 +18,13 @@ from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 from numpy.typing import NDArray
 
 from flows.publish.panels import MUTED, STYLE, UNLABELLED_COLOUR, class_palette, class_rgb, grey_of, outline, png
+from flows.terminal.figures import format_percent
 from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.quicklooks import choose_bands, develop, stretch
 
 Box = tuple[int, int, int, int]
 HEAT_ALPHA = 0.72  # of scores over the field
+TITLE_LETTERS = 7.5  # to an inch of a line
 
 
 @dataclass(frozen=True)
@@ -47,14 +50,15 @@ class QuicklookData:
     changed: bool = False  # ``score`` is the fraction of a patch's pixels that the full network changed, NaN elsewhere
     scan: bool = False  # a uniform scan
     raster: bool = False  # without lines
-    was: NDArray[np.integer] | None = None  # (y, x) previous class of changed pixels, 255 elsewhere
+    was: NDArray[np.integer] | None = None  # (y, x) previous class of captured pixels that differ, 255 elsewhere
     days: float = 0.0  # since the visit before
 
 
 def draw_quicklook(panels: QuicklookData) -> bytes:
     """Draw the four panels as a PNG of about 1800 x 1400 px."""
     with mpl.rc_context(_STYLE):
-        return png(_compose(panels))
+        grey = np.rint(255 * np.array(UNLABELLED_COLOUR)).astype(np.uint8)
+        return png(_compose(panels), np.vstack([panels.class_colours, grey]))
 
 
 _STYLE: Any = {**STYLE, "axes.titlesize": 14, "axes.titleweight": "bold", "axes.titlelocation": "left"}
@@ -71,8 +75,9 @@ def _compose(data: QuicklookData) -> Figure:
     page = 18.0 if len(counts) != 2 else min(18.0, 12.5 / (tallness * sum(1 / count for count in counts)))
     tall = [min(max(page * tallness / count, 1.1), 12.0) + 0.9 for count in counts]  # with words above
     figure = Figure(figsize=(page, sum(tall) + 1.6), dpi=_DPI, layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.08))
-    about = [f"{width} × {height} px", data.about, f"seed {data.seed}", *([data.note] if data.note else [])]  # noqa: RUF001
-    figure.suptitle(f"{data.survey}   ·   {'   ·   '.join(about)}", x=0.01, ha="left", size=15, weight="bold")
+    about = [data.survey, f"{width} × {height} px", data.about, f"seed {data.seed}", data.note]  # noqa: RUF001
+    title = fill("   ·   ".join(filter(None, about)), int(page * TITLE_LETTERS))
+    figure.suptitle(title, x=0.01, ha="left", size=15, weight="bold")
     panels = iter((_draw_rectified, _draw_attention, _draw_classes, _draw_truth))
     rows = figure.subfigures(len(counts), 1, height_ratios=tall, squeeze=False).ravel()
     for row, count in zip(rows, counts, strict=True):
@@ -84,14 +89,14 @@ def _compose(data: QuicklookData) -> Figure:
 
 
 def _draw_rectified(axes: Axes, data: QuicklookData) -> None:
-    """Draw the field; for a revisit the field in grey, with the present classes of changed pixels."""
+    """Draw the field; for a revisit the field in grey, with the present classes of differing pixels."""
     if data.was is not None:
         changed = data.was != UNLABELLED
         grey = np.repeat((0.25 + 0.6 * grey_of(data.rectified))[..., None], 3, axis=-1)
         classes = class_rgb(data.class_map, class_palette(data.class_colours))
         _show(axes, np.where(changed[..., None], classes, grey).astype(np.float32), interpolation="nearest")
-        words = f"{np.count_nonzero(changed)} px with another class than {data.days:.3g} days before"
-        return _caption(axes, "1  Changed", words)
+        words = f"{np.count_nonzero(changed)} px captured now differ from {data.days:.3g} days before"
+        return _caption(axes, "1  Differing", words)
     _, words = choose_bands(data.wavelength_nm)
     _show(axes, colours_of(data, data.rectified))
     return _caption(axes, "1  Raster" if data.raster else "1  Rectified", words)
@@ -191,8 +196,8 @@ def _draw_legend(figure: Figure, data: QuicklookData, columns: int) -> None:
     counts = np.bincount(data.class_map.ravel(), minlength=256)[: len(data.class_names)]
     fractions = counts / max(int(counts.sum()), 1)
     marks = [Patch(facecolor=tuple(colour), edgecolor="#555555", linewidth=0.6) for colour in palette]
-    words = ["< 0.1 %" if 0 < fraction < 0.001 else f"{100 * fraction:.1f} %" for fraction in fractions]
-    names = [f"{name.replace('_', ' ')}  {fraction}" for name, fraction in zip(data.class_names, words, strict=True)]
+    words = zip(data.class_names, map(format_percent, fractions), strict=True)
+    names = [f"{name.replace('_', ' ')}  {fraction}" for name, fraction in words]
     others = [data.class_map] if data.truth is None else [data.class_map, data.truth]
     if any((image == UNLABELLED).any() for image in others):
         marks.append(Patch(facecolor=UNLABELLED_COLOUR, edgecolor="#555555", linewidth=0.6))

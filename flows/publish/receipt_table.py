@@ -89,13 +89,14 @@ def format_reference(receipt: Mapping[str, Any]) -> str:
 
 def format_score(receipt: Mapping[str, Any]) -> str:
     """Return the score of the map in one or two sentences: against labels, else as its own probabilities expect."""
-    if (accuracy := receipt.get("accuracy")) is not None:
+    if (accuracy := shown_accuracy(receipt)) is not None:
         scene = f" on {TRAINING_SCENE[receipt['training_scene']]}" if "training_scene" in receipt else ""
         right = format_points(accuracy.get("overall_accuracy"))
         score = (
             f"mIoU {format_points(accuracy['miou'])} of 100 against the labels{scene} ({right} % of pixels correct)."
         )
-        alone = receipt.get("plan", {}).get("kind") in ("scan", "raster") and "kept" not in receipt
+        plan, compared = receipt.get("plan", {}), accuracy["none"]["miou"] is not None
+        alone = not compared or (plan.get("kind") in ("scan", "raster") and "kept" not in receipt)
         return f"{score} {format_worst_class(accuracy, alone=alone)}".rstrip()
     if is_foreign(receipt):
         return f"Unknown: {format_percent(receipt['unknown']['fraction'])} of the map. {FOREIGN_WORDS}."
@@ -104,6 +105,15 @@ def format_score(receipt: Mapping[str, Any]) -> str:
     if predicted := format_prediction(expected.get("miou"), expected.get("error")):
         return f"Expected mIoU {predicted} of 100, estimated from the map's own probabilities.{later}"
     return later.strip() or "The score is not known: there are no labels."
+
+
+def shown_accuracy(receipt: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """Return the accuracy; after a revisit without the maps to compare, which lack the prior map."""
+    accuracy, memory = receipt.get("accuracy"), receipt.get("memory")
+    if accuracy is None or memory is None or memory["put_aside"] is not None:
+        return accuracy
+    unknown: Receipt = {"miou": None, "per_class_iou": {}}
+    return {**accuracy, "none": unknown, "all": unknown, "controls": {}, "gap_closed": None}
 
 
 def headline(receipt: Receipt, captured_again: float | None = None) -> str:
@@ -328,7 +338,7 @@ _SHOWN: Mapping[str, tuple[str, Sequence[str]]] = {
     "field": ("field", ("view_deg", "range_m", "hectares", "ground_pixel_m", "hectares_per_hour")),
     "plan": ("plan", ("reason", "lines")),
     "recording": ("recording", ("lines_read", "lines_recorded", "passes_s", "full_scan_s")),
-    "extent": ("captured", ("lines", "fraction", "expected_wrong", "due_left")),
+    "extent": ("captured", ("lines", "patches_touched", "expected_wrong", "due_left")),
     "kept": ("at full resolution", ("patches", "multiply_adds")),
     "memory": (
         "prior map",
@@ -366,7 +376,7 @@ _FORMATS: Mapping[str, Callable[[Any], str]] = {
     "too_narrow": lambda value: f"{counted(len(value), 'overlap')} too narrow to compare",
 }
 _VALUES: Mapping[str, Callable[[Any], str]] = {
-    **dict.fromkeys(("fraction", "rate", "agreement", "expected_wrong"), format_percent),
+    **dict.fromkeys(("fraction", "patches_touched", "rate", "agreement", "expected_wrong"), format_percent),
     **dict.fromkeys(("miou", "error"), format_points),
     **dict.fromkeys(("taken", "best_in_time", "reference"), _scan),
 }

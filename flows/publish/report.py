@@ -34,6 +34,7 @@ from flows.publish.receipt_table import (
     headline,
     plot_rows,
     saving_rows,
+    shown_accuracy,
 )
 from flows.tasks.scores import error_matrix, format_false_classes
 from flows.terminal.figures import format_bytes, format_percent, format_points, format_seconds
@@ -147,7 +148,7 @@ def render_report(
     """
     shown = [Picture(quicklook, "The survey at a glance."), *pictures]
     scene = split_variable(receipt["settings"]["scene"])[0].name
-    total, accuracy = receipt.get("effects_total"), receipt.get("accuracy")
+    total, accuracy = receipt.get("effects_total"), shown_accuracy(receipt)
     return render_page(
         "report.html",
         () if field is None else MAP_SCRIPTS,

@@ -18,7 +18,16 @@ from numpy.typing import NDArray
 
 from flows.publish.byte_account import open_account, publish_counted
 from flows.publish.field_map import FieldMap, block_of, field_map, prior_map
-from flows.publish.findings import PLOTS_FILE, field_figures, find_areas, find_ground, find_map, find_zones, plots_csv
+from flows.publish.findings import (
+    PLOTS_FILE,
+    differing_now,
+    field_figures,
+    find_areas,
+    find_ground,
+    find_map,
+    find_zones,
+    plots_csv,
+)
 from flows.publish.panels import draw_ground, draw_spectra
 from flows.publish.quicklook import QuicklookData, draw_quicklook
 from flows.publish.receipt import AccuracyIs, Receipt, build_receipt, check_receipt, with_accuracy
@@ -247,7 +256,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan) -> Quickl
     return QuicklookData(
         survey=run.name,
         seed=run.settings.seed,
-        about=_format_asked(run),
+        about=_format_asked(run, plan),
         policy=run.settings.policy if run.chooses else None,
         scan=run.plan.plain,
         raster=run.raster is not None,
@@ -263,19 +272,19 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan) -> Quickl
         class_colours=found.colours,
         truth=run.labels,
         confidence=found.confidence,
-        was=None if memory is None or memory["put_aside"] else ProbabilityStore(drawn).old_class(),
+        was=None if memory is None or memory["put_aside"] else differing_now(ProbabilityStore(drawn)),
         days=0.0 if memory is None else memory["days"],
     )
 
 
-def _format_asked(run: SurveyRun) -> str:
+def _format_asked(run: SurveyRun, plan: FinePlan) -> str:
     """Return a short description of the capture."""
     if run.raster is not None:
         return "raster"
     if run.plan.plain:
         return format_scan(run.settings.scan_step or 1, run.settings.scan_exposure_ms or run.camera.exposure_ms)
     first = format_scan(run.plan.coarse[0].step, run.settings.coarse_exposure_ms or run.camera.exposure_ms)
-    return f"first {first}, then the lines between in chosen patches"
+    return f"first {first}; {plan.reason}"
 
 
 def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
@@ -293,8 +302,8 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
         asked = run.grid.valid_fraction().ravel() > 0 if run.zones.shown is None else run.zones.shown
         expected = {} if run.extent is None else asdict(run.extent)
         remembers = memory is not None and memory["put_aside"] is None
-        fraction = len(plan.patch_index) / np.count_nonzero(asked)
-        found["extent"] = {"lines": run.settings.extent, "fraction": fraction, "remembers": remembers, **expected}
+        touched = len(plan.patch_index) / np.count_nonzero(asked)
+        found["extent"] = {"lines": run.settings.extent, "patches_touched": touched, "remembers": remembers, **expected}
     passes = {"coarse": products.get("register_coarse"), "fine": products.get("register_fine")}
     pointing = {name: _pointing(ref) for name, ref in passes.items() if ref is not None}
     if "fine" in pointing:

@@ -60,6 +60,8 @@ def format_percent(fraction: float | None) -> str:
     """Return a fraction in percent, with one decimal below 10 %, and from 10 on as a factor."""
     if not _known(fraction):
         return DASH
+    if 0 < fraction < 0.0005:
+        return "< 0.1 %"
     if abs(fraction) >= MOST_PERCENT / 100:
         return f"{three_digits(fraction)} times"
     return f"{100 * fraction:.1f} %" if abs(fraction) < 0.0995 else f"{100 * fraction:.0f} %"

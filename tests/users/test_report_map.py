@@ -88,6 +88,17 @@ def test_keys_move_the_map(opened: Tab) -> None:
 
 
 @needs_browser
+@pytest.mark.parametrize("width", [900, 1024, 1100, 1440])
+def test_savings_are_whole_and_the_layers_closed(tab: Tab, page: Path, width: int) -> None:
+    """All columns lie within their card, and the box of the layers covers little of the map."""
+    tab.open(page, (width, 900), ready=READY)
+    assert tab.run(
+        "[...document.querySelectorAll('#savings .wide')].every((one) => one.scrollWidth <= one.clientWidth)"
+    )
+    assert tab.run("document.querySelector('.leaflet-control-layers').offsetWidth") < 100
+
+
+@needs_browser
 def test_on_a_phone_nothing_is_cut(tab: Tab, page: Path) -> None:
     """The page is as wide as the window, scores are seen without scrolling."""
     tab.open(page, (390, 844), ready=READY, touch=True)

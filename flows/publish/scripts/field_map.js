@@ -7,7 +7,7 @@ for (const { title, picture, shown, opacity } of facts.layers) {
   layers[title] = L.imageOverlay(picture, whole, { opacity, alt: title });
   if (shown) layers[title].addTo(map);
 }
-L.control.layers(null, layers, { collapsed: window.innerWidth < 720 }).addTo(map);
+L.control.layers(null, layers).addTo(map);
 map.fitBounds(whole, { animate: false });
 map.setMaxBounds(map.getBounds().pad(0.5));
 document.getElementById("field").dataset.ready = "yes";

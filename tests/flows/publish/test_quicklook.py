@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import matplotlib as mpl
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -131,10 +132,28 @@ def test_a_revisit_shows_what_changed(monkeypatch: pytest.MonkeyPatch, tmp_path:
     was[5:7, 10:20] = 1
     now = np.where(was == 255, data.class_map, 0).astype(np.uint8)
     (tmp_path / "picture.png").write_bytes(draw_quicklook(replace(data, was=was, days=7.0, class_map=now)))
-    assert ("1  Changed", "20 px with another class than 7 days before") in words
+    assert ("1  Differing", "20 px captured now differ from 7 days before") in words
     changed = images[0]
     assert (changed[was != 255] == np.float32(data.class_colours[0] / 255)).all()
     assert np.ptp(changed[was == 255], axis=-1).max() == 0
+
+
+def test_class_colours_are_exact(tmp_path: Path) -> None:
+    """Among many colours, a rare class and pixels without a class keep their colours."""
+    data = make_data(96, 128)
+    data.class_map[:3, :3], data.class_map[3:6, :3] = 2, 255
+    (tmp_path / "q.png").write_bytes(draw_quicklook(replace(data, truth=None)))
+    with Image.open(tmp_path / "q.png") as image:
+        found = {colour for _, colour in image.convert("RGB").getcolors(2**24)}
+    assert {(140, 94, 60), (0, 158, 115), (200, 30, 90), (219, 219, 214)} <= found
+
+
+def test_a_long_title_stays_within_the_picture() -> None:
+    """It is wrapped, so that the note at its end is seen."""
+    with mpl.rc_context(quicklook._STYLE):
+        figure = quicklook._compose(replace(make_data(96, 128), about="every line, 25 ms; " * 8))
+        FigureCanvasAgg(figure).draw()
+    assert figure._suptitle.get_window_extent().x1 <= figure.bbox.width
 
 
 def test_a_legend_of_long_names_lies_within_the_picture():

@@ -159,6 +159,17 @@ def test_missing_field_is_named(path):
         check_receipt(broken)
 
 
+def test_maps_without_the_prior_map_are_not_compared() -> None:
+    """After a revisit neither the sentence nor the page has them; with a rejected prior map both do."""
+    receipt = make_receipt()
+    for why in (None, "turned"):
+        receipt["memory"] = {"put_aside": why}
+        text = render_report(receipt, b"")
+        told = [words in text for words in ("coarse pass alone", "by random", "recovered", ">full resolution every")]
+        assert told == 4 * [why is not None]
+        assert ("the overview alone gives" in format_score(receipt)) == (why is not None)
+
+
 def test_words_outside_the_design_are_refused():
     """A stage has one of four states, a full figure one of two origins; a judged map has its accuracy."""
     for path, wrong in ((("stages", 1, "state"), "done"), (("savings", "lines", "full_is"), "guessed")):

@@ -73,12 +73,12 @@ def test_a_part_is_looked_at_and_the_rest_remembered(visits: tuple[Path, Any, An
     """In its seconds; where lines went the map is of today, elsewhere three days old, and it is whole."""
     out, first, part = visits
     scan_pass, age = part.receipt["extent"], product(out, part, "class_probabilities").age.values
-    assert 0.1 < scan_pass["fraction"] < 0.9
+    assert 0.1 < scan_pass["patches_touched"] < 0.9
     assert part.receipt["settings"]["scan_step"] < 4  # lines that are cheaper, and poorer than what is remembered
     assert part.receipt["savings"]["capture_s"]["done"] == pytest.approx(scan_pass["seconds"])
     assert scan_pass["seconds"] <= 2.1
     assert sorted(np.unique(age)) == [0.0, 3.0]
-    assert (age == 0).mean() == pytest.approx(scan_pass["fraction"], abs=0.15)
+    assert (age == 0).mean() == pytest.approx(scan_pass["patches_touched"], abs=0.15)
     reached = product(out, part, "mosaic").coverage.values > 0
     assert reached[age == 0].all()  # what is filled in at the edge of the part is no look
     before, now = (product(out, one, "class_map").classes.values for one in (first, part))
@@ -204,7 +204,7 @@ def test_what_is_beyond_another_fields_part_has_no_class(
     assert other.receipt["memory"]["put_aside"] == "another field"
     assert "the rest is unchanged" not in (other.folder / "report.html").read_text(encoding="utf-8")
     classes = product(visited, other, "class_map").classes.values
-    assert 1 - other.receipt["extent"]["fraction"] <= (classes == 255).mean() < 1
+    assert 1 - other.receipt["extent"]["patches_touched"] <= (classes == 255).mean() < 1
 
 
 @pytest.mark.parametrize(

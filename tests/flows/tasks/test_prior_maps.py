@@ -89,7 +89,7 @@ def test_a_later_look_goes_on_from_the_one_before(twice: tuple[Path, Any, Any]) 
     page = (later.folder / "report.html").read_text(encoding="utf-8")
     assert first.folder.name in page
     assert re.search("3.0 days earlier; .*agreement [0-9.]+ %", page)
-    assert "Changed since" in page
+    assert "Captured and differing" in page
     store = out / later.receipt["products"]["class_probabilities"]
     manifest = json.loads((store.parent / "manifest.json").read_text())
     assert Path(first.receipt["products"]["class_probabilities"]).parent.name in manifest["inputs"]
