@@ -16,7 +16,7 @@ from flows.evaluate.command import run_evaluate
 from flows.evaluate.frames import FRACTIONS, USUAL, EvaluateRequest
 from flows.terminal.progress import print_json
 from flows.training.fit_ood import OodRequest, run_measure_ood
-from flows.training.train import asked_command, run_train, usual_crop
+from flows.training.train import CROPS_PX, asked_command, run_train
 from flows.training.train_scenes import TrainRequest
 from flows.training.train_temporal import JUDGED_LANDS, LANDS, TemporalRequest, run_remember
 from models.evaluation.metrics import DRAWS
@@ -24,6 +24,7 @@ from models.network.machine import PROCESSOR, Device
 from models.training.temporal import TemporalTraining
 from models.training.train import TrainingSettings
 from pipeline.errors import SettingsError
+from pipeline.simulator.scenes.built_in import built_in_laws
 
 
 @Parameter(name="*")
@@ -142,7 +143,7 @@ class TrainFlags(SceneFlags):
             steps=self.steps,
             minutes=self.minutes,
             seed=self.seed,
-            crop=usual_crop(dataset) if self.crop is None else self.crop,
+            crop=CROPS_PX[bool(built_in_laws(dataset))] if self.crop is None else self.crop,
             batch=self.batch,
             darkest_ms=self.min_exposure_ms,
         )

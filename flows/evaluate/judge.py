@@ -24,7 +24,7 @@ from models.evaluation.metrics import (
     overall_accuracy,
     paired_interval,
 )
-from models.evaluation.placement import RANDOM_DRAWS, ReadTwice, captured_gain, gain_sums, oracle_gain
+from models.evaluation.placement import RANDOM_DRAWS, ReadTwice, gain_sums, oracle_gain
 from models.network.sizes import multiply_adds
 from models.policies.policies import score_multiply_adds, score_patches
 from models.reading.inference import segment
@@ -41,8 +41,8 @@ def judge_frame(request: EvaluateRequest, frame: ObservedFrame, weights: Weights
     """Return the confusion counts, gain and multiply-adds of every policy and fraction."""
     grid, valid = frame.seen.grid, frame.seen.grid.valid_patches()
     gain = oracle_gain(weights, frame.seen, frame.fine, frame.labels)
-    maps = (segment(weights, frame.seen, frame.fine[some], some).classes for some in (valid[:0], valid))
-    scene, rows = ReadTwice(*maps, {}, frame.labels, grid), list[Record]()
+    overview, full = (segment(weights, frame.seen, frame.fine[some], some).classes for some in (valid[:0], valid))
+    scene, rows = ReadTwice(overview, full, {}, frame.labels, grid), list[Record]()
     for policy, draw, fraction, patch_index in _rows(request, frame, gain):
         scored = 0 if policy in (*ENDS, ORACLE) else score_multiply_adds(policy, weights.config, grid)
         bought, best = gain_sums(gain, patch_index, valid)
@@ -154,7 +154,8 @@ def summarise(runs: Runs, class_names: Sequence[str], request: EvaluateRequest) 
         figures: Record = {"policy": policy, "fraction": fraction, "uses_labels": policy == ORACLE}
         figures |= _accuracy(row, class_names)
         figures["gap_closed"] = None if policy in ENDS else gap_closed(figures["miou"], *ends)
-        figures["captured_gain"] = captured_gain(*(sum(p[name] for p in row.parts) for name in ("gain", "best_gain")))
+        bought, best = (sum(part[name] for part in row.parts) for name in ("gain", "best_gain"))
+        figures["captured_gain"] = bought / best if best > 0 else None
         figures["against_all"] = difference(row, whole, request)
         figures["against_random"] = difference(row, rows.get(("random", fraction)), request)
         table.append(figures | {"cost": _cost(row, whole)})

@@ -43,8 +43,9 @@ UNLABELLED_COLOUR = (0.86, 0.86, 0.84)
 def png(figure: Figure, exact: ArrayLike = ()) -> bytes:
     """Return a figure as PNG of 256 colours, with these ``exact`` ones (n, 3) among them, at most half of all."""
     canvas, file = FigureCanvasAgg(figure), io.BytesIO()
-    canvas.draw()
-    drawn, kept = np.asarray(canvas.buffer_rgba()), np.reshape(exact, (-1, 3))[: COLOURS // 2].astype(np.uint8)
+    canvas.draw()  # type: ignore[no-untyped-call]
+    drawn = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
+    kept = np.reshape(exact, (-1, 3))[: COLOURS // 2].astype(np.uint8)
     others = COLOURS - len(kept)
     rough = Image.fromarray(drawn).convert("RGB").quantize(others, dither=Image.Dither.NONE)
     numbers, packed, palette = np.array(rough), drawn.view(np.uint32)[..., 0], rough.getpalette() or []

@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
 from flows.settings.values import parse_keep, raw_days
-from flows.tasks.stages.condense import SIGNAL, SIGNAL_FINE, camera_of, raw_differs
+from flows.tasks.stages.condense import SIGNAL, SIGNAL_FINE, raw_differs
+from pipeline.geometry.camera import LineCamera
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run, Store
@@ -61,7 +62,7 @@ def clear_raw_lines(
             raw, signal = (archive.ref(store.ref.stage, store.ref.key) for store in (one.raw, one.signal))
             others = (archive.find(raw.stage, key) for key in one.signal.inputs if key != raw.key)
             passes = [raw, *(other for other in others if other is not None)]
-            why = raw_differs(passes, signal, camera_of(one.signal.params))
+            why = raw_differs(passes, signal, LineCamera(**one.signal.params["camera"]))
             if why is not None:
                 done.kept[raw.uri] = why
             elif archive.clear(raw, wait=False):

@@ -29,7 +29,7 @@ from models.weights.files import CALIBRATION, CASCADE, MAP_SCORES, TRAINED_ON, W
 from pipeline.errors import SceneError, SettingsError
 from pipeline.simulator.scenes.built_in import built_in_laws
 
-FRAME_CROP, FARM_CROP = 384, 256  # px
+CROPS_PX = {True: 256, False: 384}  # by default: of built-in scenes, and of frames
 
 
 def train_weights(
@@ -124,11 +124,6 @@ def _learned(
         found[CASCADE] = asdict(CascadeTable.judged(twice, config.classes))
     found["validation"] = validate(twice, config.classes, seed)
     return weights, {"training": summary, **found}
-
-
-def usual_crop(dataset: str) -> int:
-    """Return the default size of crops [px]."""
-    return FARM_CROP if built_in_laws(dataset) else FRAME_CROP
 
 
 def run_train(request: TrainRequest, console: Console) -> dict[str, Any]:

@@ -77,11 +77,6 @@ def gain_sums(gain: Values, chosen: NDArray[np.integer], valid: NDArray[np.integ
     return float(gain[chosen].sum()), float(best.sum())
 
 
-def captured_gain(bought: float, best: float) -> float | None:
-    """Return the gain of the chosen patches as a fraction of the best ones'; None where that is 0."""
-    return bought / best if best > 0 else None
-
-
 Placements = dict[str, list[Counts]]  # row -> confusion counts of its map; of ``random`` several
 
 

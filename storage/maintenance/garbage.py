@@ -15,7 +15,6 @@ from pipeline.errors import SettingsError
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, without_manifest
 from storage.archive.lineage import Catalogue
-from storage.archive.records import Store
 from storage.archive.staging import MANIFEST_NAME, refusals
 
 DAY_S = 86400.0
@@ -106,16 +105,12 @@ def _spared(catalogue: Catalogue, named: set[str], keep_days: float, raw_too: bo
     for uri, store in catalogue.stores.items():
         if uri in named:
             continue
-        if _age_days(store, now) < keep_days:
+        published = (store.ref.path / MANIFEST_NAME).stat().st_mtime  # or copied here
+        if now.timestamp() - published < keep_days * DAY_S:
             kept[uri] = f"younger than {keep_days:g} days"
         elif not raw_too and catalogue.is_only_copy(uri):
             kept[uri] = "raw lines that cannot be had again; --raw-too removes them"
     return kept
-
-
-def _age_days(store: Store, now: datetime) -> float:
-    """Return the days since a store was published, or copied here."""
-    return (now.timestamp() - (store.ref.path / MANIFEST_NAME).stat().st_mtime) / DAY_S
 
 
 def _obstacle(archive: Archive, catalogue: Catalogue, kept: Iterable[str]) -> str | None:

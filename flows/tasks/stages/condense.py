@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import reduce
 from pathlib import Path
@@ -151,11 +151,6 @@ def with_shared_directions(
     if len(shared) == len(components):
         return None
     return replace(condenser, components=shared, law=ResidualLaw.learned(found.spectra, shared))
-
-
-def camera_of(params: Mapping[str, Any]) -> LineCamera:
-    """Return a camera with the values that scores depend on, from the parameters of a compressed pass."""
-    return LineCamera(**params["camera"])
 
 
 def components_of(found: SignalStatistics, cubes: Sequence[RawCube], choice: SignalChoice) -> Components:

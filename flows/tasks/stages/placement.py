@@ -14,7 +14,7 @@ from flows.tasks.mosaic_work import MosaicRecipe, open_sweeps, write_mosaic
 from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
 from models.network.spectral import LineSpec
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Sweep, exposing
+from pipeline.geometry.scan import exposing
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.placed import PixelGrid, PlacedSweep, TieTable
 from pipeline.rectify.registration.alignment import SweepShift
@@ -230,19 +230,14 @@ def rectify_fine(
         write_mosaic(recipe, writer, memory=memory, pool=pool, report=report)
         placed = recipe.open().placed
         number = np.maximum(capture_numbers(placed, camera, grid), 0).astype(np.uint8)
-        sweeps = [one.lines.sweep for one in placed]
-        writer.write_captures([spec_of(sweep, camera, light) for sweep in sweeps], number)
+        exposed = [(exposing(camera, one.lines.sweep).exposure_ms, one.lines.sweep.step) for one in placed]
+        captures = [LineSpec(light.light * exposure_ms / camera.exposure_ms, step) for exposure_ms, step in exposed]
+        writer.write_captures(captures, number)
         finish_mosaic(writer, frame)
         write_table(path / "lines.json", {one.lines.sweep.name: one.facts() for one in recipe.sweeps()})
 
     params = {"grid": asdict(frame.grid), "resampling": resampling, "light": light.light, **frame.key}
     return Wanted(build, params, [signal, *_there(registration)])
-
-
-def spec_of(sweep: Sweep, camera: LineCamera, light: LineSpec) -> LineSpec:
-    """Return line spacing and light of a sweep; ``light`` is that of a full scan in the camera's exposure."""
-    exposed = exposing(camera, sweep).exposure_ms / camera.exposure_ms
-    return LineSpec(light.light * exposed, sweep.step)
 
 
 def mosaic_of_sweeps(path: Path, signal: StageRef, frame: FieldFrame) -> MosaicWriter:
