@@ -153,33 +153,22 @@ def rows(picture: Path | None = None) -> list[Row]:
 
 
 def draw(measured: Sequence[Cell], picture: Path) -> None:
-    """Draw the mean gain of zooming over the best uniform scan, for each light, share and field."""
-    figure = Figure((9, 3.2), dpi=150, layout="constrained")
-    for axes, (way, title), swaths in (
-        (axes, way, swaths)
-        for axes, (way, swaths) in zip(
-            figure.subplots(1, 4, sharey=True),
-            itertools.product({"always": "planner", "ideal": "known place"}.items(), SWATHS),
-            strict=True,
-        )
-    ):
-        gains = np.array(
-            [
-                [
-                    np.mean([c.gain(way) for c in measured if (c.light, c.share, c.swaths) == (light, share, swaths)])
-                    for share in SHARES
-                ]
-                for light in LIGHTS
-            ]
-        )
-        image = axes.imshow(gains, cmap="RdBu", vmin=-5, vmax=5)
-        axes.set_xticks(range(len(SHARES)), [f"{share:.2g}" for share in SHARES])
-        axes.set_yticks(range(len(LIGHTS)), [f"{light:.2g}" for light in LIGHTS])
-        axes.set(title=f"{title}, {swaths} swath{'s' * (swaths > 1)}", xlabel="share of interest")
-        for (y, x), gain in np.ndenumerate(gains):
-            axes.text(x, y, f"{gain:+.1f}", ha="center", va="center")
-    figure.axes[0].set_ylabel("light")
-    figure.colorbar(image, ax=figure.axes, label="points over the best uniform scan", shrink=0.8)
+    """Draw the gain of zooming over the best uniform scan, for each light, share and field."""
+    figure, ways = Figure((9, 2.6), dpi=150, layout="constrained"), {"always": "planner", "ideal": "known place"}
+    ticks = [[f"1/{1 / one:g}" if one < 1 else "1" for one in each] for each in (LIGHTS, SHARES)]
+    panels = figure.subplots(1, len(ways) * len(SWATHS), sharey=True)
+    for axes, (way, swaths) in zip(panels, itertools.product(ways, SWATHS), strict=True):
+        gains = [cell.gain(way) for cell in measured if cell.swaths == swaths]  # by light, then by share
+        image = axes.imshow(np.reshape(gains, (len(LIGHTS), len(SHARES))), cmap="RdBu", vmin=-5, vmax=5)
+        axes.set_xticks(range(len(SHARES)), ticks[1])
+        axes.set_yticks(range(len(LIGHTS)), ticks[0])
+        axes.set_title(f"{ways[way]}, {swaths} swath{'s' * (swaths > 1)}", fontsize=9)
+        axes.set_xlabel("share of interest")
+        for place, gain in enumerate(gains):
+            y, x = divmod(place, len(SHARES))
+            axes.text(x, y, f"{gain:+.1f}", ha="center", va="center", color="white" if abs(gain) > 3 else "black")
+    panels[0].set_ylabel("light")
+    figure.colorbar(image, ax=panels, label="points over uniform", shrink=0.7)
     figure.savefig(picture)
 
 
