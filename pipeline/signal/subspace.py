@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from pipeline.readings import SIGMA_OF_MEDIAN
@@ -24,10 +23,7 @@ SPECTRA_A_BAND = 200  # single spectra for the covariance, for each band; more a
 FEW_BANDS = 8  # fewer cannot predict each other: their noise comes from neighbouring pixels, and all are stored
 KEPT_SPECTRA = 8192  # from which the law of residuals is learned
 FINE = 1 / 16  # of the noise: the step of few bands, unless a better one is known
-SMALL_FIELD = 500_000  # spectra: in larger fields the regions' test adds bytes and hardly any accuracy
-REGION = 32  # spectra a side of a region
-ENOUGH = 0.75  # of its spectra, with which a region counts
-FEW_REGIONS = 64  # with fewer, a field keeps all smooth directions, for some kilobytes
+SMALL_FIELD = 500_000  # spectra: smaller fields keep all smooth directions, for some megabytes
 SMOOTH = 24  # bumps over the wavelengths; as many as the columns that networks read
 LACKING = 0.3  # of the length of a bump: with less outside the components a direction is in them already
 NOISE_ROUNDS = 6
@@ -49,7 +45,7 @@ Bools = NDArray[np.bool_]
 
 @dataclass
 class SignalStatistics:
-    """Second moments of spectra, of their means over 4 x 4 and of neighbours' differences; means over regions; spectra.
+    """Second moments of spectra, of their means over 4 x 4 and of neighbours' differences, and some of the spectra.
 
     Spectra are centred on a mean of the first ones, so that nothing cancels. Those that miss bands are left out: they
     would count as the mean there, and make a direction of it. If most spectra miss some, those with half of them count
@@ -67,8 +63,6 @@ class SignalStatistics:
     block: Floats = field(init=False)  # (band, band) the same of means
     block_total: Floats = field(init=False)
     largest: Floats = field(init=False)  # (band,) farthest value from the origin
-    regions: list[Values] = field(default_factory=list)  # (n, band) means of regions, from the origin
-    in_regions: list[Floats] = field(default_factory=list)  # (n,) spectra of these
     rough: list[Values] = field(default_factory=list)  # (n, band) second differences of neighbours
     kept: list[Values] = field(default_factory=list)  # (n, band) spectra, from the origin
 
@@ -92,14 +86,11 @@ class SignalStatistics:
             cut = np.s_[: lines * BLOCK, : samples * BLOCK]
             shape = (lines, BLOCK, samples, BLOCK)
             every = whole[cut].reshape(shape).all(axis=(1, 3))
-            counted = spectra if whole.all() else np.where(whole[..., None], spectra, np.float32(0))
-            rows = counted[cut].reshape(lines, BLOCK, samples * BLOCK, -1).sum(axis=1)
+            rows = spectra[cut].reshape(lines, BLOCK, samples * BLOCK, -1).sum(axis=1)
             means = (rows.reshape(lines, samples, BLOCK, -1).sum(axis=2)[every] / BLOCK**2).astype(np.float64)
             self.block += means.T @ means  # float32 would round off the noise below a signal of 300 deviations
             self.block_total += means.sum(axis=0)
             self.means += len(means)
-            if self.expected < SMALL_FIELD:
-                self._add_regions(rows, whole[cut])
         thin = np.s_[:: self._stride, :: self._stride]
         some = spectra[thin][whole[thin]]
         exact = some.astype(np.float64)
@@ -109,18 +100,6 @@ class SignalStatistics:
         self.count += len(some)
         if self.bands <= FEW_BANDS:
             self._add_rough(spectra, whole)
-
-    def _add_regions(self, rows: Values, whole: Bools) -> None:
-        """Add the means of regions with most of their spectra, by sums over 4 lines (line, sample, band) of these."""
-        deep = REGION // BLOCK
-        lines, samples = len(rows) // deep, whole.shape[1] // REGION
-        shape = (lines, REGION, samples, REGION)
-        count = whole[: lines * REGION, : samples * REGION].reshape(shape).sum(axis=(1, 3))
-        sums = rows[: lines * deep, : samples * REGION].reshape(lines, deep, samples, REGION, self.bands)
-        sums = sums.sum(axis=(1, 3))
-        enough = count >= ENOUGH * REGION**2
-        self.regions.append((sums[enough] / count[enough][:, None]).astype(np.float32))
-        self.in_regions.append(count[enough].astype(np.float64))
 
     def _centred(self, values: Values, valid: Bools) -> tuple[Values, Bools]:
         """Return spectra from the origin with 0 for missing values, and which of them count."""
@@ -162,8 +141,6 @@ class SignalStatistics:
             setattr(found, sums, getattr(self, sums) + total + count * apart)
         found.largest = np.maximum(self.largest, other.largest + np.abs(apart))
         found.rough = [*self.rough, *other.rough]
-        found.regions = [*self.regions, *((some + apart).astype(np.float32) for some in other.regions)]
-        found.in_regions = [*self.in_regions, *other.in_regions]
         found.kept = [*self.kept, *((some + apart).astype(np.float32) for some in other.kept)]
         return found
 
@@ -182,21 +159,16 @@ class SignalStatistics:
             "origin": np.full(self.bands, np.nan) if self.origin is None else self.origin,
             "rough": np.concatenate(self.rough) if self.rough else none,
             "kept": np.concatenate(self.kept) if self.kept else none,
-            "regions": np.concatenate(self.regions) if self.regions else none,
-            "in_regions": np.concatenate(self.in_regions) if self.in_regions else none[:, 0],
             **{name: getattr(self, name) for name in SUMS},
         }
 
     @classmethod
     def of_arrays(cls, stored: Mapping[str, NDArray[np.generic]]) -> SignalStatistics:
-        """Return the statistics that `arrays` described; stored ones may lack regions."""
+        """Return the statistics that `arrays` described."""
         expected, count, means = stored["counts"].tolist()
         found = cls(len(stored["origin"]), expected, count, means)
         found.origin = None if np.isnan(stored["origin"]).all() else stored["origin"].astype(np.float32)
         found.rough, found.kept = [stored["rough"].astype(np.float32)], [stored["kept"].astype(np.float32)]
-        if "regions" in stored:
-            found.regions = [stored["regions"].astype(np.float32)]
-            found.in_regions = [stored["in_regions"].astype(np.float64)]
         for name in SUMS:
             setattr(found, name, stored[name])
         return found
@@ -240,52 +212,26 @@ def find_components(found: SignalStatistics, *, false_alarm: float = 0.01, least
 def components_of_field(
     found: SignalStatistics, wavelength_nm: Floats, *, false_alarm: float, least: int
 ) -> Components:
-    """Find the components of a field; those of single regions of a small field are added.
+    """Find the components of a field; a small field gets all smooth directions too.
 
     Materials differ smoothly. A difference far below the noise of a spectrum separates two crops where it is averaged
     over many spectra. A test of the whole field misses it if one crop covers a small part: a thirtieth of a million
-    spectra, or more of fewer. So the mean of each region of 32 x 32 spectra is tested, too. The test looks within
-    `SMOOTH` bumps, evenly spread over the wavelengths, which is the resolution of the networks. A field with few
-    regions keeps all these smooth directions. ``wavelength_nm`` is (band,).
+    spectra, or more of fewer. So small fields keep `SMOOTH` bumps, evenly spread over the wavelengths, which is the
+    resolution of the networks. ``wavelength_nm`` is (band,).
     """
     components = find_components(found, false_alarm=false_alarm, least=least)
     lit = np.isfinite(components.mean)
     nm = np.asarray(wavelength_nm, np.float64)[lit]
-    if found.expected >= SMALL_FIELD or len(nm) <= FEW_BANDS or np.ptp(nm) == 0 or found.origin is None:
+    if found.expected >= SMALL_FIELD or len(nm) <= FEW_BANDS or np.ptp(nm) == 0:
         return components
     centres, spacing = np.linspace(nm.min(), nm.max(), SMOOTH, retstep=True)
     bumps = np.exp(-0.5 * ((nm - centres[:, None]) / (spacing / 2)) ** 2) * components.noise[lit]
     bumps /= np.linalg.norm(bumps, axis=1, keepdims=True)
     known = components.axes[:, lit]
     length, rows = np.linalg.svd(bumps - (bumps @ known.T) @ known, full_matrices=False)[1:]
-    smooth = rows[length > LACKING]
-    if sum(map(len, found.regions)) >= FEW_REGIONS:
-        means = np.concatenate(found.regions).astype(np.float64) + (found.origin - components.mean)
-        white = np.sqrt(np.concatenate(found.in_regions))[:, None] * means[:, lit] / components.noise[lit]
-        smooth = local_directions((white - (white @ known.T) @ known) @ smooth.T, false_alarm) @ smooth
-    axes = np.zeros((len(smooth), components.bands))
-    axes[:, lit] = smooth
+    axes = np.zeros((np.count_nonzero(length > LACKING), components.bands))
+    axes[:, lit] = rows[length > LACKING]
     return replace(components, axes=np.concatenate([components.axes, axes]))
-
-
-def local_directions(scores: Floats, false_alarm: float) -> Floats:
-    """Return orthonormal directions (n, direction) in which some rows of scores (region, direction) exceed noise.
-
-    The noise of a score has unit variance, or more if most regions have. The region farthest from 0 gives a direction.
-    The rest gives the next, until noise is as far in any region with the probability ``false_alarm``.
-    """
-    regions, count = scores.shape
-    rest, found = scores.copy(), np.zeros((0, count))
-    noise = max(float(np.median((scores**2).sum(axis=1))) / scipy.stats.chi2.median(count), 1.0) if count else 1.0
-    while len(found) < count:
-        power = (rest**2).sum(axis=1)
-        farthest = int(power.argmax())
-        if power[farthest] <= noise * scipy.stats.chi2.isf(false_alarm / regions, count - len(found)):
-            break
-        direction = rest[farthest] / np.sqrt(power[farthest])
-        found = np.concatenate([found, direction[None]])
-        rest -= np.outer(rest @ direction, direction)
-    return found
 
 
 def bands_alone(found: SignalStatistics, unit: Floats | float | None = None) -> Components:

@@ -61,8 +61,6 @@ def test_merged_statistics_are_those_of_all_lines() -> None:
         )
         np.testing.assert_allclose(one, other, atol=1e-4 * np.abs(other).max())
     np.testing.assert_allclose(np.sort(merged.spectra, axis=0), np.sort(whole.spectra, axis=0), atol=1e-5)
-    one, other = (np.concatenate(found.regions) + found.origin for found in (merged, whole))
-    np.testing.assert_allclose(one, other, atol=1e-5)
 
 
 @pytest.mark.parametrize("bands", [2, 12])
@@ -74,8 +72,6 @@ def test_statistics_come_back_of_arrays(bands: int) -> None:
     for name in SUMS:
         np.testing.assert_array_equal(getattr(back, name), getattr(found, name))
     np.testing.assert_array_equal(back.spectra, found.spectra)
-    np.testing.assert_array_equal(back.regions[0], found.regions[0])
-    assert back.in_regions[0].tolist() == found.in_regions[0].tolist() == [1024]
     for one in (found, back):
         one.add(values[:8], np.ones((8, 32), np.bool_))
     np.testing.assert_array_equal(find_components(back).axes, find_components(found).axes)
@@ -190,33 +186,6 @@ def test_small_fields_keep_a_weak_difference_of_a_small_part() -> None:
     assert along[1] == pytest.approx(1, abs=0.1)
     assert len(few) == 4 < len(all_smooth) <= 28
     np.testing.assert_allclose(all_smooth.axes @ all_smooth.axes.T, np.eye(len(all_smooth)), atol=1e-9)
-
-
-def test_a_region_adds_the_direction_that_it_lies_apart_in() -> None:
-    """One region of 81 lies a third of a deviation apart: a few directions are added, and noise alone adds none."""
-    rng, bands = np.random.default_rng(4), 120
-    wavelength = np.linspace(400, 1000, bands)
-    smooth = np.exp(-0.5 * ((wavelength - 700) / 40) ** 2)
-    values = 10 + rng.normal(size=(288, 288, bands)).astype(np.float32)
-    noise = components_of_field(statistics_of(values), wavelength, false_alarm=0.01, least=4)
-    values[64:96, 64:96] += (0.35 * smooth / np.linalg.norm(smooth)).astype(np.float32)
-    found = components_of_field(statistics_of(values), wavelength, false_alarm=0.01, least=4)
-    assert len(noise) == 4 < len(found) <= 6
-    white = smooth / found.noise / np.linalg.norm(smooth / found.noise)
-    assert np.sum((found.axes @ white) ** 2) > 0.8
-
-
-def test_regions_count_whole_spectra_alone() -> None:
-    """Spectra that are not valid change no mean; a region without three quarters of its spectra has none."""
-    values, valid = field_of(7, (64, 64), 12).values, np.ones((64, 64), np.bool_)
-    plain = statistics_of(values).regions[0]
-    valid[:8, :8], valid[32:, 32:48], values[:8, :8] = False, False, 1e4
-    found = statistics_of(values, valid)
-    assert found.in_regions[0].tolist() == [32 * 32 - 64, 32 * 32, 32 * 32]
-    assert found.origin is not None
-    mean = values[:32, :32][valid[:32, :32]].mean(axis=0)
-    np.testing.assert_allclose(found.regions[0][0] + found.origin, mean, atol=1e-4)
-    assert len(plain) == 4
 
 
 def test_large_fields_keep_what_is_proved() -> None:
