@@ -15,7 +15,15 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from flows.archive.stale_runs import asked_again, called, from_raw_cubes, is_called, is_current, newest_runs, renewals
+from flows.archive.stale_runs import (
+    asked_again,
+    called,
+    from_raw_cubes,
+    generations,
+    is_called,
+    is_current,
+    newest_runs,
+)
 from flows.cli.app import ArchiveName, AsJson, Scheduler, Switch, Workers, stderr
 from flows.publish.receipt import Receipt
 from flows.publish.run_folder import extend_with_accuracy, load_receipt
@@ -100,7 +108,7 @@ def reprocess_fields(
         names = ", ".join(dict.fromkeys(map(called, fields))) or "none"
         raise SettingsError(f"--field {field}: no field of this archive has this name; there are {names}")
     rows: list[dict[str, Any]] = []
-    renewed = renewals(catalogue)
+    renewed = {old.folder.name: runs[-1].folder.name for runs in generations(catalogue) for old in runs[:-1]}
     with pool.open():  # workers start once for all fields
         for number, run in enumerate(wanted, 1):
             old = run.folder.name

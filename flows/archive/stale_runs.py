@@ -26,7 +26,7 @@ def called(run: Run) -> str:
     return str(run.receipt.get("survey") or run.facts.get("survey") or run.folder.name)
 
 
-def _generations(catalogue: Catalogue) -> list[list[Run]]:
+def generations(catalogue: Catalogue) -> list[list[Run]]:
     """Return the runs of each field, oldest first: those of one name, source, visit and scene, by the scene's key.
 
     A run without a readable receipt is a field of its own.
@@ -42,13 +42,8 @@ def _generations(catalogue: Catalogue) -> list[list[Run]]:
 
 def newest_runs(catalogue: Catalogue) -> list[Run]:
     """Return the newest run of every field, oldest first."""
-    newest = {runs[-1].uri for runs in _generations(catalogue)}
+    newest = {runs[-1].uri for runs in generations(catalogue)}
     return [run for run in catalogue.runs if run.uri in newest]
-
-
-def renewals(catalogue: Catalogue) -> dict[str, str]:
-    """Return the name of the newest generation for each run that has one."""
-    return {earlier.folder.name: runs[-1].folder.name for runs in _generations(catalogue) for earlier in runs[:-1]}
 
 
 def _recorded_run(catalogue: Catalogue, run: Run) -> Run:

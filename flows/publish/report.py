@@ -157,7 +157,11 @@ def render_report(
         lead=headline(receipt, captured_again),
         about=f"{scene}, source {receipt['source']}, seed {receipt['seed']}, finished {receipt['finished']}",
         receipt=receipt,
-        links=product_links(receipt),
+        links={  # without raw lines, which may be cleared, and the report itself
+            name.replace("_", " "): quote(posixpath.relpath(address, _run_folder(receipt)))
+            for name, address in receipt["products"].items()
+            if name not in (*LINE_PRODUCTS, "report.html")
+        },
         export=shlex.join(["spectralzoom", "export", receipt["settings"]["out"], *_run_folder(receipt).split("/")[1:]]),
         field=field,
         leaflet=LEAFLET,
@@ -180,18 +184,6 @@ def render_report(
             "Versions": receipt["versions"],
         },
     )
-
-
-def product_links(receipt: Receipt) -> dict[str, str]:
-    """Return the products of a run by name, as addresses relative to its report.
-
-    Raw lines, which may be cleared away, and the report itself are left out.
-    """
-    return {
-        name.replace("_", " "): quote(posixpath.relpath(address, _run_folder(receipt)))
-        for name, address in receipt["products"].items()
-        if name not in (*LINE_PRODUCTS, "report.html")
-    }
 
 
 def _run_folder(receipt: Receipt) -> str:

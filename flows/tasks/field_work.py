@@ -209,10 +209,11 @@ class FieldWork:
     ) -> tuple[NDArray[np.uint8], dict[str, NDArray[np.float64]]]:
         """Return the class maps (reading, y, x) by the overview and, ``in_full``, by the full network everywhere.
 
-        Also returns the (patch_y, patch_x) scores by the policies that are compared.
+        Also returns the (patch_y, patch_x) scores by the policies that are compared. Raises as `score`.
         """
-        grid, work = self.regions[0].field, Readings(self.weights, mosaic, capture, in_full)
-        parts = self._of_regions(work, mosaic, grid.valid_patches(), report)
+        grid, mosaic = self.regions[0].field, mosaic.resolve()
+        work, read = Readings(self.weights, mosaic, capture, in_full), grid.valid_patches() if in_full else NO_PATCHES
+        parts = self._of_regions(work, mosaic, read, report)
         maps = np.empty((len(parts[0][0]), grid.height, grid.width), np.uint8)
         for region, (part, _) in zip(self.regions, parts, strict=True):
             maps[:, region.kept.rows, region.kept.columns] = part

@@ -173,8 +173,10 @@ def _write_sweeps(
         out, first = path / f"{cube.sweep.name}.zarr", sweeps[0][0]
         shutil.rmtree(out, ignore_errors=True)
         shared = first.sweep.name if number and cube.references.same_as(first.references) else None
+        bands = cube.wavelength_nm, cube.fwhm_nm
+        header = SweepHeader(cube.sweep, cube.references, *bands, cube.source, cube.started, cube.simulation)
         writer = SignalCubeWriter(
-            out, header_of(cube), condenser.components, step=condenser.step, largest=largest, frames_of=shared
+            out, header, condenser.components, step=condenser.step, largest=largest, frames_of=shared
         )
 
         def part(fraction: float, number: int = number) -> None:
@@ -185,12 +187,6 @@ def _write_sweeps(
         facts = LineRows(cube.time_s, x, y, cube.exposure_ms, cube.valid_line)
         writer.close(facts, done[-1].rare, done[-1].residuals)
     return done
-
-
-def header_of(cube: RawCube) -> SweepHeader:
-    """Return the header of a stored sweep."""
-    bands = cube.wavelength_nm, cube.fwhm_nm
-    return SweepHeader(cube.sweep, cube.references, *bands, cube.source, cube.started, cube.simulation)
 
 
 def _record(condenser: Condenser, done: Sequence[CondensedSweep]) -> dict[str, Any]:
