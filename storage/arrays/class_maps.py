@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import zarr
@@ -235,6 +235,14 @@ def unpacked_days(packed: NDArray[np.uint16]) -> Floats:
     return np.where(packed == NEVER, np.float32(np.nan), packed * np.float32(DAY_STEP)).astype(np.float32)
 
 
+class Changes(NamedTuple):
+    """Changes since the prior map."""
+
+    fraction: Floats  # (patch_y, patch_x) fraction of each patch's pixels that changed
+    patch_px: int
+    old_class: NDArray[np.uint8]  # (y, x) previous class where it changed, else 255
+
+
 class ProbabilityStore:
     """Stored class probabilities, read in parts. Raises IncompleteStoreError: they are missing or damaged."""
 
@@ -270,11 +278,10 @@ class ProbabilityStore:
         """Return the previous (y, x) classes of changed pixels, else 255; None for a first visit."""
         return read_array(self._group, OLD_CLASS) if OLD_CLASS in self._group else None
 
-    @property
-    def patch_px(self) -> int:
-        """Side of the patches of `changed` [px]."""
-        return int(self._group["changed"].attrs["patch_px"])  # type: ignore[arg-type]
-
-    def changed(self) -> Floats | None:
-        """Return the fraction of changed pixels of each patch; None for a first visit."""
-        return read_array(self._group, "changed") if "changed" in self._group else None
+    def changes(self) -> Changes | None:
+        """Return what changed since the prior map; None for a first visit."""
+        old_class = self.old_class()
+        if old_class is None or "changed" not in self._group:
+            return None
+        patch_px = int(self._group["changed"].attrs["patch_px"])  # type: ignore[arg-type]
+        return Changes(read_array(self._group, "changed"), patch_px, old_class)

@@ -18,7 +18,7 @@ from affine import Affine
 from pipeline.errors import PoseError
 from pipeline.ground.georeference import zoomed_out
 from pipeline.lazy import deferred
-from storage.arrays.layout import AngularGrid, create_group, damage_named, open_group, write_small
+from storage.arrays.layout import AngularGrid, SmallArray, create_group, damage_named, open_group
 
 if TYPE_CHECKING:  # half a second to import, for images on the earth alone
     import odc.geo.crs as odc_crs
@@ -60,20 +60,13 @@ def create_placed_group(
     """
     if grid is None:
         return create_group(path, title, attributes), {}
-    geobox = None if grid.geobox is None else zoomed_out(grid.geobox, grid.factor, (shape[0], shape[1]))
-    record = {"angular_grid": grid.record()}
-    if geobox is not None:
-        place = map_attributes(geobox)
-        group = create_group(path, title, {**place, **record, **attributes})
-        write_map_coordinates(group, geobox)
-        return group, {**place, **ON_THE_MAP}
-    place = grid.attributes((shape[0], shape[1]))
-    group = create_group(path, title, {**place, **record, **attributes})
-    step, left, top = (place["spatial:transform"][number] for number in (0, 2, 5))
-    for name, first, size in (("y", top, shape[0]), ("x", left, shape[1])):
-        about = {"long_name": f"tangent of the angle from the undeflected direction along {name}", "units": "rad"}
-        write_small(group, name, (name,), first + step * (np.arange(size) + 0.5), {**about, "axis": name.upper()})
-    return group, place
+    facts = {"angular_grid": grid.record(), **attributes}
+    if grid.geobox is None:
+        place = grid.attributes((shape[0], shape[1]))
+        return create_group(path, title, {**place, **facts}, grid.coordinates((shape[0], shape[1]))), place
+    geobox = zoomed_out(grid.geobox, grid.factor, (shape[0], shape[1]))
+    place = map_attributes(geobox)
+    return create_group(path, title, {**place, **facts}, map_coordinates(geobox)), {**place, **ON_THE_MAP}
 
 
 def map_attributes(geobox: GeoBox) -> dict[str, Any]:
@@ -96,9 +89,9 @@ def map_attributes(geobox: GeoBox) -> dict[str, Any]:
     }
 
 
-def write_map_coordinates(group: zarr.Group, geobox: GeoBox) -> None:
-    """Store ``x``, ``y`` and the grid mapping ``spatial_ref`` of a map by CF's rules."""
-    crs = _crs_of(geobox)
+def map_coordinates(geobox: GeoBox) -> dict[str, SmallArray]:
+    """Return ``x``, ``y`` and the grid mapping ``spatial_ref`` of a map by CF's rules."""
+    crs, found = _crs_of(geobox), {}
     a, _, c, _, e, f = (float(number) for number in geobox.affine[:6])
     for name, size, step, first in (("x", geobox.shape[1], a, c), ("y", geobox.shape[0], e, f)):
         if geobox.axis_aligned:
@@ -106,14 +99,14 @@ def write_map_coordinates(group: zarr.Group, geobox: GeoBox) -> None:
         else:
             about = {"long_name": f"pixels along {name}; the grid is turned, see GeoTransform", "units": "pixel"}
             centres = np.arange(size) + 0.5
-        write_small(group, name, (name,), np.asarray(centres, np.float64), {**about, "axis": name.upper()})
-    write_grid_mapping(group, geobox)
+        found[name] = SmallArray((name,), centres, {**about, "axis": name.upper()})
+    return {**found, GRID_MAPPING: grid_mapping(geobox)}
 
 
-def write_grid_mapping(group: zarr.Group, geobox: GeoBox) -> None:
-    """Store CRS and transform of a map as CF's grid mapping."""
+def grid_mapping(geobox: GeoBox) -> SmallArray:
+    """Return CRS and transform of a map as CF's grid mapping."""
     mapping = odc_geo_xr.xr_crs_coord(_crs_of(geobox), transform=geobox.transform)
-    write_small(group, GRID_MAPPING, (), np.asarray(mapping.values, np.int32), dict(mapping.attrs))
+    return SmallArray((), np.asarray(mapping.values, np.int32), dict(mapping.attrs))
 
 
 def _axis(crs: CRS, name: str) -> dict[str, str]:

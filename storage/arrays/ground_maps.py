@@ -23,7 +23,7 @@ from storage.arrays.class_maps import (
     legend_of,
     old_class_flags,
 )
-from storage.arrays.georeference import ON_THE_MAP, geobox_of_group, load_geobox, map_attributes, write_map_coordinates
+from storage.arrays.georeference import ON_THE_MAP, geobox_of_group, load_geobox, map_attributes, map_coordinates
 from storage.arrays.layout import (
     SHARD_COLUMNS,
     SHARD_ROWS,
@@ -102,8 +102,8 @@ class GroundMapWriter:
         """Create a map; one of a later visit (``goes_on``) also has images of the changes."""
         place = map_attributes(geobox)
         names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
-        self._group = create_group(path, "class map on the ground", {**place, **names, **about})
-        write_map_coordinates(self._group, geobox)
+        facts = {**place, **names, **about}
+        self._group = create_group(path, "class map on the ground", facts, map_coordinates(geobox))
         self._shape, self._legend = tuple(geobox.shape), legend
         images: dict[str, tuple[str, Mapping[str, Any]]] = {
             "classes": ("|u1", class_flags(legend.names, legend.colours)),

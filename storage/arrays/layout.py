@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 import zarr
@@ -47,6 +47,14 @@ _SPATIAL_CONVENTION = {
 NO_CLASS = {"classes": UNLABELLED, "confidence": np.nan}
 
 
+class SmallArray(NamedTuple):
+    """An array that is stored in one chunk, such as a coordinate."""
+
+    dims: tuple[str, ...]
+    values: NDArray[Any]
+    attributes: dict[str, Any]
+
+
 @dataclass(frozen=True)
 class AngularGrid:
     """The grid of an image in tangents from the undeflected direction, the scene's centre; and its place on earth."""
@@ -73,6 +81,15 @@ class AngularGrid:
             "zarr_conventions": [_SPATIAL_CONVENTION],
         }
 
+    def coordinates(self, shape: tuple[int, int]) -> dict[str, SmallArray]:
+        """Return the coordinates y and x [rad] of the pixel centres of an image of (y, x) ``shape``."""
+        step, found = self.ifov_rad * self.factor, {}
+        for name, size, whole in zip("yx", shape, self.scene_shape, strict=True):
+            about = {"long_name": f"tangent of the angle from the undeflected direction along {name}", "units": "rad"}
+            centres = -whole / 2 * self.ifov_rad + step * (np.arange(size) + 0.5)
+            found[name] = SmallArray((name,), centres, {**about, "axis": name.upper()})
+        return found
+
     def record(self) -> dict[str, Any]:
         """Return the values from which `grid_of` makes this grid of angles again."""
         return {"ifov_rad": self.ifov_rad, "scene_shape": list(self.scene_shape), "factor": self.factor}
@@ -87,11 +104,17 @@ def grid_of(attributes: Mapping[str, Any]) -> AngularGrid | None:
     return AngularGrid(float(record["ifov_rad"]), (int(y), int(x)), int(record["factor"]))
 
 
-def create_group(path: StorePlace, title: str, attributes: Mapping[str, Any]) -> zarr.Group:
-    """Create a Zarr v3 store at ``path``, which must not exist."""
+def create_group(
+    path: StorePlace, title: str, attributes: Mapping[str, Any], coordinates: Mapping[str, SmallArray] | None = None
+) -> zarr.Group:
+    """Create a Zarr v3 store with its coordinates at ``path``, which must not exist."""
     if isinstance(path, Path):
         path.parent.mkdir(parents=True, exist_ok=True)
-    return zarr.create_group(path, zarr_format=3, attributes={"Conventions": "CF-1.12", "title": title, **attributes})
+    about = {"Conventions": "CF-1.12", "title": title, **attributes}
+    group = zarr.create_group(path, zarr_format=3, attributes=about)
+    for name, one in (coordinates or {}).items():
+        write_small(group, name, *one)
+    return group
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from storage.arrays.layout import (
     SHARD_ROWS,
     AngularGrid,
     array_of,
+    blank_pixels,
     create_array,
     create_group,
     grid_of,
@@ -125,15 +126,15 @@ class MosaicWriter:
                 part = np.s_[top : top + deep, left : left + wide]
                 self.write_tile(first + top, left, scores[part], seen[part])
 
+    def blank(self, where: NDArray[np.bool_] | None) -> None:
+        """Set the (y, x) pixels ``where``, which show no scene, to unseen; None: all show it."""
+        if where is not None:
+            blank_pixels(self.path, where, {"scores": _unseen(self._scores.dtype.str), "coverage": 0})
+
     def write_captures(self, specs: Sequence[Sequence[float]], number: NDArray[np.uint8]) -> None:
         """Store the kind of capture of each pixel: ``number`` (y, x) is an index into ``specs``."""
         about = {"long_name": "kind of capture", "units": "1", "kinds": [list(one) for one in specs]}
         write_image(self.group, CAPTURES, ("y", "x"), number, about)
-
-
-def nothing_seen(path: Path) -> dict[str, float]:
-    """Return the value of a pixel that shows no scene, by the names of a mosaic's images."""
-    return {"scores": _unseen(array_of(open_group(path), "scores").dtype.str), "coverage": 0}
 
 
 def _unseen(dtype: str) -> int:

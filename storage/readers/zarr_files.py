@@ -29,7 +29,7 @@ import zarr
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from storage.arrays.georeference import ON_THE_MAP, map_attributes, write_grid_mapping
+from storage.arrays.georeference import GRID_MAPPING, ON_THE_MAP, grid_mapping, map_attributes
 from storage.arrays.layout import create_array, create_group, image_spec, write_bands, write_counts, write_small
 from storage.readers.array_cubes import Arrays, FileArray
 from storage.readers.cube_sources import BLOCK_LINES, CubeSource, LineFacts
@@ -228,6 +228,6 @@ def _write_coordinates(group: zarr.Group, source: CubeSource) -> dict[str, str]:
             write_small(group, name, ("sample", "band"), np.asarray(frame), {"long_name": title, "units": "1"})
     placed = {} if source.geobox is None else ON_THE_MAP
     if source.geobox is not None:
-        write_grid_mapping(group, source.geobox)
-        names.append(ON_THE_MAP["coordinates"])
+        write_small(group, GRID_MAPPING, *grid_mapping(source.geobox))
+        names.append(GRID_MAPPING)
     return {**placed, **({"coordinates": " ".join(names)} if names else {})}

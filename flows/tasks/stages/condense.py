@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from flows.settings.survey_settings import RASTER, SignalChoice
 from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
 from flows.tasks.stages.capture import RIG_RECORD
-from flows.tasks.stages.placement import MOSAIC, MOSAIC_STEP, finish_mosaic
+from flows.tasks.stages.placement import MOSAIC, MOSAIC_STEP
 from flows.terminal.figures import format_bytes
 from pipeline.errors import BudgetError, IncompleteStoreError
 from pipeline.geometry.camera import LineCamera
@@ -277,7 +277,7 @@ def condense_raster(
             scored = score_lines(values, valid, components)
             writer.write_rows(first, scored.scores, scored.quality != UNUSABLE)
             report(0.5 + 0.5 * (first + len(values)) / frame.grid.height)
-        finish_mosaic(writer, frame)
+        writer.blank(frame.missing)
 
     params = {"source": RASTER, "scene": scene.key, "grid": asdict(frame.grid), **asdict(signal), **frame.key}
     return Wanted(build, params | {"bands": raster.bands})

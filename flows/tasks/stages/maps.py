@@ -213,8 +213,7 @@ def ground(
         found = load_class_map(class_map.path / "class_map.zarr")
         probabilities = ProbabilityStore(class_map.path / "class_probabilities.zarr")
         colours = coarse_colours(mosaic, None)
-        unsure, age_days = np.isnan(found.confidence), probabilities.age()
-        fractions, old_class = probabilities.changed(), probabilities.old_class()  # None for a first visit
+        unsure, age_days, changes = np.isnan(found.confidence), probabilities.age(), probabilities.changes()
 
         def shown(pixels: NDArray[np.float64]) -> dict[str, NDArray[np.generic]]:
             """Return the images of a block by name, at places (row, column, 2); nodata is 255, NaN and 0.
@@ -230,12 +229,12 @@ def ground(
                 "picture": picture,
                 "age": nearest_at(age_days, pixels, np.nan),
             }
-            if fractions is not None and old_class is not None:
-                images["changed"] = nearest_at(fractions, pixels, np.nan, factor=probabilities.patch_px)
-                images[OLD_CLASS] = nearest_at(old_class, pixels, UNLABELLED)
+            if changes is not None:
+                images["changed"] = nearest_at(changes.fraction, pixels, np.nan, factor=changes.patch_px)
+                images[OLD_CLASS] = nearest_at(changes.old_class, pixels, UNLABELLED)
             return images
 
-        legend, goes_on = ClassNames(found.names, found.colours), fractions is not None and old_class is not None
+        legend, goes_on = ClassNames(found.names, found.colours), changes is not None
         about = {"rig_pose": asdict(grid.frame.view.pose), "scene_pixels": grid.counts()}
         writer = GroundMapWriter(path / STORE, grid.geobox, legend, about=about, goes_on=goes_on)
         for rows, columns in map_blocks(grid.shape, BLOCK):

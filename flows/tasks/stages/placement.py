@@ -27,8 +27,7 @@ from pipeline.signal.components import BROAD_BANDS, Components
 from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table, write_table
 from storage.arrays.geolocation import path_digest, write_geolocation
-from storage.arrays.layout import blank_pixels
-from storage.arrays.mosaics import MosaicWriter, nothing_seen, open_mosaic
+from storage.arrays.mosaics import MosaicWriter, open_mosaic
 from storage.arrays.signal_cubes import open_signal_cubes
 from storage.parallel.pool import WorkerPool
 
@@ -198,7 +197,7 @@ def rectify(
         )
         writer = mosaic_of_sweeps(path, signal, frame)
         write_mosaic(recipe, writer, memory=memory, pool=pool, report=report)
-        finish_mosaic(writer, frame)
+        writer.blank(frame.missing)
         write_table(path / "lines.json", {one.lines.sweep.name: one.facts() for one in recipe.sweeps()})
 
     params = {"grid": asdict(frame.grid), "resampling": resampling, **frame.key}
@@ -233,7 +232,7 @@ def rectify_fine(
         exposed = [(exposing(camera, one.lines.sweep).exposure_ms, one.lines.sweep.step) for one in placed]
         captures = [LineSpec(light.light * exposure_ms / camera.exposure_ms, step) for exposure_ms, step in exposed]
         writer.write_captures(captures, number)
-        finish_mosaic(writer, frame)
+        writer.blank(frame.missing)
         write_table(path / "lines.json", {one.lines.sweep.name: one.facts() for one in recipe.sweeps()})
 
     params = {"grid": asdict(frame.grid), "resampling": resampling, "light": light.light, **frame.key}
@@ -255,12 +254,6 @@ def mosaic_of_sweeps(path: Path, signal: StageRef, frame: FieldFrame) -> MosaicW
         grid=frame.angular_grid(),
         simulation=sweeps[0].simulation if sweeps else None,
     )
-
-
-def finish_mosaic(writer: MosaicWriter, frame: FieldFrame) -> None:
-    """Set nodata pixels."""
-    if frame.missing is not None:
-        blank_pixels(writer.path, frame.missing, nothing_seen(writer.path))
 
 
 def _there(registration: StageRef | None) -> list[StageRef]:

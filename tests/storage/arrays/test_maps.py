@@ -22,7 +22,7 @@ from storage.arrays.class_maps import (
     load_class_map,
     write_class_tile,
 )
-from storage.arrays.georeference import ON_THE_MAP, load_geobox, map_attributes, write_map_coordinates
+from storage.arrays.georeference import ON_THE_MAP, load_geobox, map_attributes, map_coordinates
 from storage.arrays.ground_maps import BLOCK, GroundMapWriter, load_ground_map
 from storage.arrays.layout import (
     NO_CLASS,
@@ -142,8 +142,7 @@ def box(epsg: int = 32632, resolution: float = 0.03) -> GeoBox:
 
 def write(path: Path, geobox: GeoBox) -> Path:
     """A store with one image on the map."""
-    group = create_group(path, "a map", map_attributes(geobox))
-    write_map_coordinates(group, geobox)
+    group = create_group(path, "a map", map_attributes(geobox), map_coordinates(geobox))
     image = np.arange(np.prod(geobox.shape), dtype=np.float32).reshape(geobox.shape)
     write_image(group, "height", ("y", "x"), image, {"units": "m", **ON_THE_MAP})
     return path

@@ -104,14 +104,15 @@ def test_xarray_unpacks_it(tmp_path: Path) -> None:
 
 
 def test_changes_are_there_once_written(tmp_path: Path) -> None:
-    """A first look has none."""
-    path = stored(tmp_path / "class_probabilities.zarr")
-    assert ProbabilityStore(path).changed() is None
+    """A first visit has none."""
+    assert ProbabilityStore(stored(tmp_path / "first.zarr")).changes() is None
+    path, old = gone_on(tmp_path / "later.zarr")
+    assert ProbabilityStore(path).changes() is None
     write_changes(path, np.array([[0.0, 0.5]], np.float32), 16)
-    assert ProbabilityStore(path).patch_px == 16
-    found = ProbabilityStore(path).changed()
+    found = ProbabilityStore(path).changes()
     assert found is not None
-    assert found.tolist() == [[0.0, 0.5]]
+    assert (found.fraction.tolist(), found.patch_px) == ([[0.0, 0.5]], 16)
+    np.testing.assert_array_equal(found.old_class, old)
 
 
 def gone_on(path: Path) -> tuple[Path, np.ndarray]:
