@@ -281,7 +281,10 @@ def test_22_a_scene_alike_everywhere_scores_alike():
 
 @torch.inference_mode()
 def test_23_a_scene_reads_alike_alone_and_in_a_batch():
-    """Batch-mates, the size of the batch and the order of patches do not show."""
+    """Batch-mates, the size of the batch and the order of patches do not show beyond float32's rounding.
+
+    Some processors multiply matrices of another size in another order: 1.2e-6 was seen.
+    """
     model, image, detail = make_network(layers=2), _image(32, 64, 8), _image(32, 64, 8, 1)
     places = torch.arange(16).view(8, 2)
     numbers = torch.stack([torch.randperm(32, generator=torch.Generator().manual_seed(i))[:5] for i in range(8)])
@@ -289,10 +292,10 @@ def test_23_a_scene_reads_alike_alone_and_in_a_batch():
     for i in (0, 3, 7):
         one = slice(i, i + 1)
         alone = model.composite(*model(image[one], detail[one], numbers[one], places[one]), numbers[one])
-        assert (alone - together[one]).abs().max() <= 1e-6
+        assert (alone - together[one]).abs().max() <= 4e-6
     turned = numbers.flip(1)
     reordered = model.composite(*model(image, detail, turned, places), turned)
-    assert (reordered - together).abs().max() <= 2e-6
+    assert (reordered - together).abs().max() <= 4e-6
 
 
 @torch.inference_mode()
