@@ -35,6 +35,7 @@ CLASSES = ("class_0", "class_1", "class_2")  # as a label file of the numbers 0.
 
 WeightsMaker = Callable[..., Path]
 Survey = Callable[..., Published]
+Flags = Callable[..., dict[str, Any]]
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # for what tests start; workers that share cores lose most of their time
 torch.set_num_threads(1)
 law_settings.register_profile("anew", deadline=None, max_examples=40)  # a loaded machine is no broken law
@@ -170,20 +171,19 @@ def scene_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def survey_png(scene_files: Path, weights: Path) -> Survey:
+def flags_png(scene_files: Path, weights: Path) -> Flags:
+    """Flags of a survey of scene.png by the simulated rig into a folder; keywords change some and add others."""
+    given = {"scene": str(scene_files / "scene.png"), "source": "sim", "weights": str(weights)}
+    return lambda out, **flags: {**given, "out": str(out), **flags}
+
+
+@pytest.fixture(scope="session")
+def survey_png(scene_files: Path, flags_png: Flags) -> Survey:
     """Survey scene.png with its labels by the simulated rig into a folder; keywords change flags, None drops one."""
 
     def survey(out: Path, console: Console | None = None, **flags: Any) -> Published:
-        given = {
-            "scene": str(scene_files / "scene.png"),
-            "source": "sim",
-            "labels": str(scene_files / "labels.png"),
-            "weights": str(weights),
-            "engine": "plain",
-            "out": str(out),
-            "budget": "0.8",
-            "controls": False,
-        }
+        labels = str(scene_files / "labels.png")
+        given = flags_png(out, labels=labels, engine="plain", budget="0.8", controls=False)
         return run_survey(load_settings(None, given | flags), console or Console(quiet=True))
 
     return survey

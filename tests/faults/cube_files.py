@@ -52,13 +52,8 @@ def _npy(folder: Path) -> str:
     return "a.npy"
 
 
-def _npz(folder: Path) -> str:
-    np.savez(folder / "a.npz", cube=_cube(), more=np.arange(9))
-    return "a.npz"
-
-
-def _npz_packed(folder: Path) -> str:
-    np.savez_compressed(folder / "a.npz", cube=_cube(), more=np.arange(9))
+def _npz(folder: Path, save: Callable[..., None] = np.savez) -> str:
+    save(folder / "a.npz", cube=_cube(), more=np.arange(9))
     return "a.npz"
 
 
@@ -78,11 +73,6 @@ def _mat_hdf(folder: Path) -> str:
     return "a.mat"
 
 
-def _png(folder: Path) -> str:
-    Image.fromarray((_cube()[..., :3] >> 4).astype(np.uint8)).save(folder / "a.png")
-    return "a.png"
-
-
 def _deep_png(folder: Path) -> str:
     import cv2
 
@@ -95,17 +85,10 @@ def _image(folder: Path, name: str) -> str:
     return name
 
 
-def _tiff(folder: Path, **how: Any) -> str:
+def _tiff(folder: Path, values: Any, **how: Any) -> str:
     from tifffile import imwrite
 
-    imwrite(folder / "a.tif", _cube(), photometric="minisblack", planarconfig="contig", **how)
-    return "a.tif"
-
-
-def _pages(folder: Path) -> str:
-    from tifffile import imwrite
-
-    imwrite(folder / "a.tif", np.moveaxis(_cube(), -1, 0), photometric="minisblack", compression="zlib")
+    imwrite(folder / "a.tif", values, photometric="minisblack", **how)
     return "a.tif"
 
 
@@ -144,17 +127,17 @@ FORMATS: dict[str, Callable[[Path], str]] = {
     "Headwall folder": _headwall,
     ".npy": _npy,
     ".npz": _npz,
-    ".npz packed": _npz_packed,
+    ".npz packed": lambda folder: _npz(folder, np.savez_compressed),
     ".mat v5": lambda folder: _mat(folder),
     ".mat v7": lambda folder: _mat(folder, do_compression=True),
     ".mat v7.3": _mat_hdf,
-    "PNG": _png,
+    "PNG": lambda folder: _image(folder, "a.png"),
     "PNG 16 bit": _deep_png,
     "JPEG": lambda folder: _image(folder, "a.jpg"),
     "BMP": lambda folder: _image(folder, "a.bmp"),
-    "TIFF strips": lambda folder: _tiff(folder, rowsperstrip=4),
-    "TIFF tiles": lambda folder: _tiff(folder, tile=(16, 16), compression="zlib"),
-    "TIFF pages": _pages,
+    "TIFF strips": lambda folder: _tiff(folder, _cube(), planarconfig="contig", rowsperstrip=4),
+    "TIFF tiles": lambda folder: _tiff(folder, _cube(), planarconfig="contig", tile=(16, 16), compression="zlib"),
+    "TIFF pages": lambda folder: _tiff(folder, np.moveaxis(_cube(), -1, 0), compression="zlib"),
     "Zarr v2": lambda folder: _zarr(folder, 2),
     "Zarr v3": lambda folder: _zarr(folder, 3),
     "NetCDF 4": _netcdf,

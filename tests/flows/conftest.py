@@ -21,7 +21,7 @@ from flows.tasks.local_server import QUIET, local_server
 from flows.tasks.open_survey import STAGES
 from storage.archive.archive import Archive
 from storage.remote.opening import verify_archive
-from tests.conftest import Survey
+from tests.conftest import Flags, Survey
 from tests.flows.small_fields import write_field
 from tests.prior_work import without_effects
 
@@ -186,18 +186,11 @@ def server(prefect_home: Path) -> Iterator[str]:
 
 
 @pytest.fixture
-def field_file(tmp_path: Path, scene_files: Path, weights: Path) -> Callable[..., Path]:
+def field_file(tmp_path: Path, flags_png: Flags) -> Callable[..., Path]:
     """Write a field's settings, with other lines before them."""
 
     def write(stem: str = "north", lines: str = "", **changes: str | None) -> Path:
-        values: dict[str, str | None] = {
-            "scene": str(scene_files / "scene.png"),
-            "source": "sim",
-            "weights": str(weights),
-            "budget": "0.8",
-            "out": str(tmp_path / "archive"),
-            **changes,
-        }
+        values = flags_png(tmp_path / "archive", budget="0.8") | changes
         path = tmp_path / f"{stem}.toml"
         told = "\n".join(f'{key} = "{value}"' for key, value in values.items() if value is not None)
         path.write_text(f"{lines}\n{told}\n")

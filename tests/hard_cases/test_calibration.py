@@ -40,22 +40,18 @@ def test_dead_column(kind: str) -> None:
     assert np.argwhere(~valid).tolist() == [[0, 5], [1, 5]]
 
 
-@pytest.mark.parametrize("frame", ["dark", "white", "flat"])
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_reference_not_finite(frame: str, value: float) -> None:
-    """An element whose references are not finite is NaN and invalid, alone."""
-    references = replace(frames(), flat=np.ones((12, 10), np.float32))
-    getattr(references, frame)[3, 7] = value
-    values, valid = calibrate(np.full((1, 12, 10), 500, np.uint16), references, saturated_dn=FULL)
-    assert np.argwhere(np.isnan(values)).tolist() == [[0, 3, 7]]
-    assert np.argwhere(~valid).tolist() == [[0, 3, 7]]
+NOT_FINITE = [{frame: value} for frame in ("dark", "white", "flat") for value in (np.nan, np.inf, -np.inf)]
+NO_SENSE = [
+    {"dark": 0, "white": above, "flat": flat} for above, flat in [(-5, 1), (-5, -1), (5, -1), (5, 0), (1e-39, 1)]
+]
 
 
-@pytest.mark.parametrize(("above", "flat"), [(-5, 1), (-5, -1), (5, -1), (5, 0), (1e-39, 1)])
-def test_references_that_make_no_sense(above: float, flat: float) -> None:
-    """An element whose white is below dark, too near to it for a number, or whose flat is not positive is out."""
+@pytest.mark.parametrize("changed", [*NOT_FINITE, *NO_SENSE], ids=str)
+def test_references_that_cannot_be(changed: dict[str, float]) -> None:
+    """An element that is not finite, or has white below dark or near to it or a flat not positive, is out, alone."""
     references = replace(frames(), flat=np.ones((12, 10), np.float32))
-    references.dark[3, 7], references.white[3, 7], references.flat[3, 7] = 0, above, flat  # type: ignore[index]
+    for frame, value in changed.items():
+        getattr(references, frame)[3, 7] = value
     values, valid = calibrate(np.full((1, 12, 10), 500, np.uint16), references, saturated_dn=FULL)
     assert np.argwhere(np.isnan(values)).tolist() == np.argwhere(~valid).tolist() == [[0, 3, 7]]
 

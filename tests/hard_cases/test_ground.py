@@ -13,7 +13,6 @@ from pipeline.ground.field_places import PosedField
 from pipeline.ground.map_grid import GroundGrid, ground_grid
 from pipeline.ground.view import GroundView, RigPose
 
-pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 IFOV = 7.4e-3 / 70
 
 

@@ -14,8 +14,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rasterio
-from affine import Affine
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -23,24 +21,13 @@ from flows.settings.load import load_settings
 from pipeline.errors import SettingsError
 from storage.readers.scene_files import load_scene_file
 from tests.flows.conftest import command_line
+from tests.storage.readers.test_label_grids import write
 
 __all__ = ["command_line"]
 
-pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")
 SMALL = ["--steps", "1", "--dim", "16", "--layers", "1", "--heads", "2", "--batch", "1", "--crop", "16"]
 RNG = np.random.default_rng(4)
 CLASSES = np.kron(RNG.integers(0, 2, (4, 4)), np.ones((8, 8))).astype(np.uint8)
-
-
-def write(path: Path, values: NDArray[Any], **about: Any) -> Path:
-    """A GeoTIFF of (y, x) or (y, x, band) values."""
-    planes = np.moveaxis(np.atleast_3d(values), -1, 0)
-    count, height, width = planes.shape
-    kind = {"driver": "GTiff", "count": count, "height": height, "width": width, "dtype": values.dtype}
-    place = {"crs": "EPSG:32632", "transform": Affine(1, 0, 600_000, 0, -1, 5_700_000)}
-    with rasterio.open(path, "w", photometric="MINISBLACK", **kind, **place, **about) as file:
-        file.write(planes)
-    return path
 
 
 def image() -> NDArray[np.int16]:

@@ -42,7 +42,6 @@ EVERY_STORE = (
 UNCOUNTED = ("rgb", "rare")  # rare spectra are found by their line and sample
 GAP = np.s_[:20, :24]
 QUIET = Console(quiet=True)
-pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")
 
 
 def pixels(bands: int = 3) -> NDArray[np.uint8]:

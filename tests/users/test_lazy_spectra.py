@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -104,7 +104,6 @@ PLACES = st.one_of(
 )
 
 
-@settings(max_examples=40)
 @given(st.sampled_from(["sweep", "mosaic"]), PLACES, PLACES, st.integers(0, BANDS - 1) | st.just(slice(None, None, -1)))
 def test_any_selection_is_that_of_all_values(
     sweep: tuple[Path, NDArray[np.float64]],

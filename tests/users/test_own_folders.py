@@ -26,8 +26,6 @@ from tests.users.mistaken_files import write_files
 
 __all__ = ["command_line"]
 
-pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")
-
 SMALL = ["--steps", "1", "--dim", "16", "--layers", "1", "--heads", "2", "--batch", "1", "--crop", "16"]
 
 

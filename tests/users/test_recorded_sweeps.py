@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shlex
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -234,60 +234,35 @@ def table(folder: Path, header: str, rows: Sequence[str]) -> None:
     (folder / "scan.pointing.csv").write_text("\n".join([header, *rows]) + "\n")
 
 
-Fault = Callable[[Path], None]
-BAD: dict[str, tuple[Fault, list[str], str]] = {
-    "fewer rows": (
-        lambda at: table(at, "position_px", [str(line) for line in range(95)]),
-        [],
-        "has 95 rows for scan, fewer than its 96 lines; give one row for each line",
-    ),
-    "lines too far apart": (
-        lambda at: table(at, "position_px", [str(9 * line) for line in range(96)]),
-        [],
-        "the lines of the recording lie 9 px .* apart, and a uniform scan may have up to 8 px",
-    ),
-    "no such table": (lambda at: None, ["--pointing", "nowhere.csv"], "there is no pointing table .*nowhere.csv"),
-    "no such recording": (lambda at: None, ["--sweeps", "nowhere"], "there is no recording nowhere; check the name"),
-    "a scene beside it": (
-        lambda at: None,
-        ["--scene", "farm"],
-        "--scene = 'farm', and the field of recorded sweeps is what they show; leave it out",
-    ),
-    "the simulated rig": (
-        lambda at: None,
-        ["--source", "sim"],
-        "--sweeps is for recorded sweeps, and source = 'sim'; give --source recorded",
-    ),
-    "a part of the field": (
-        lambda at: None,
-        ["--extent", "part", "--seconds", "5"],
-        "--extent = 'part' chooses lines to capture",
-    ),
-    "two scans": (
-        lambda at: None,
-        ["--scan", "recorded", "--budget", "0.5"],
-        "one uniform scan .*leave one of them out",
-    ),
+POSITIONS = {"fewer rows": range(95), "lines far apart": range(0, 9 * 96, 9)}  # of the lines, beside the cube
+BAD = {  # flags, and the message
+    "fewer rows": ("", "has 95 rows for scan, fewer than its 96 lines; give one row for each line"),
+    "lines far apart": ("", "the lines of the recording lie 9 px .* apart, and a uniform scan may have up to 8 px"),
+    "no such table": ("--pointing nowhere.csv", "there is no pointing table .*nowhere.csv"),
+    "no such recording": ("--sweeps nowhere", "there is no recording nowhere; check the name"),
+    "a scene": ("--scene farm", "--scene = 'farm', and the field of recorded sweeps is what they show; leave it out"),
+    "simulated rig": ("--source sim", "--sweeps is for recorded sweeps, and source = 'sim'; give --source recorded"),
+    "a part of the field": ("--extent part --seconds 5", "--extent = 'part' chooses lines to capture"),
+    "two scans": ("--scan recorded --budget 0.5", "one uniform scan .*leave one of them out"),
 }
 
 
-@pytest.mark.parametrize(("fault", "flags", "message"), BAD.values(), ids=BAD)
+@pytest.mark.parametrize("mistake", BAD)
 def test_bad_input_gives_one_message(
     command_line: CommandLine,
     monkeypatch: pytest.MonkeyPatch,
     pushbroom: tuple[Path, NDArray[np.uint16]],
     weights: Path,
-    fault: Fault,
-    flags: list[str],
-    message: str,
+    mistake: str,
 ) -> None:
     """By the command line: one message with value and remedy, no traceback, and no archive."""
-    folder, _ = pushbroom
+    (folder, _), (flags, message) = pushbroom, BAD[mistake]
     monkeypatch.chdir(folder)
-    fault(folder)
+    if mistake in POSITIONS:
+        table(folder, "position_px", [str(position) for position in POSITIONS[mistake]])
     asked = ["--engine", "plain", "--out", "a", "--weights", weights]
     sweeps = [] if "--sweeps" in flags else ["--sweeps", "scan.hdr"]
-    ended = command_line("survey", *sweeps, *asked, *flags)
+    ended = command_line("survey", *sweeps, *asked, *flags.split())
     ended.refused(2 if ended.code == 2 else 1, message)  # 2 where settings alone are wrong
     assert not (folder / "a").exists()
 

@@ -29,7 +29,6 @@ from tests.prior_work import without_effects
 from tests.storage.export.stac_rules import core_problems, extension_problems, is_cog
 from tests.storage.small_archive import flip
 
-pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 POSE = RigPose(lon_deg=9.5, lat_deg=52.1, heading_deg=25.0, tilt_deg=50.0, height_m=14.0)
 QUIET = Console(quiet=True)
 
@@ -66,17 +65,8 @@ class Exported:
 def surveys(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Published]]:
     """One archive with the same farm twice: without a pose and with one."""
     archive = tmp_path_factory.mktemp("surveys") / "field-a"
-    flags = {
-        "size": "128x96",
-        "bands": "20,60,100,150,200",
-        "budget": "0.9",
-        "engine": "plain",
-        "out": str(archive),
-        "controls": False,
-        "seed": "1",
-        "keep": "raw",
-    }
-    settings = load_settings(None, flags)
+    flags = {"size": "128x96", "bands": "20,60,100,150,200", "budget": "0.9", "engine": "plain", "keep": "raw"}
+    settings = load_settings(None, {**flags, "out": str(archive), "controls": False, "seed": "1"})
     with without_effects():
         return archive, [run_survey(settings, QUIET), run_survey(replace(settings, pose=POSE), QUIET)]
 

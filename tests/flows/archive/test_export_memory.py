@@ -26,7 +26,6 @@ from tests.conftest import RGB_NM, patchy_scene
 from tests.prior_work import without_effects
 from tests.storage.export.stac_rules import is_cog
 
-pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 POSE = RigPose(lon_deg=9.5, lat_deg=52.1, heading_deg=25.0, tilt_deg=50.0, height_m=14.0)
 QUIET = Console(quiet=True)
 SHAPE, PATCH = (96, 128), 8

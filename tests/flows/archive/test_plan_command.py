@@ -22,6 +22,7 @@ from flows.terminal.figures import format_seconds
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive.archive import Archive
+from tests.conftest import Flags
 from tests.flows.conftest import be_version, python
 
 pytestmark = pytest.mark.usefixtures("no_effects")
@@ -30,16 +31,11 @@ WAITS = {"locate": "condense_coarse", "rectify": "locate", "score": "rectify", "
 
 
 @pytest.fixture(scope="module")
-def settings(scene_files: Path, weights: Path) -> Settings:
-    """Those of the small picture with labels, without an archive."""
-    flags = {
-        "scene": scene_files / "scene.png",
-        "source": "sim",
-        "labels": scene_files / "labels.png",
-        "weights": weights,
-    }
-    given = {name: str(path) for name, path in flags.items()}
-    return load_settings(None, given | {"engine": "plain", "budget": "0.8", "controls": False})
+def settings(scene_files: Path, flags_png: Flags) -> Settings:
+    """Those of the small picture with labels; each plan names its own archive."""
+    labels = str(scene_files / "labels.png")
+    flags = flags_png("archive", labels=labels, engine="plain", budget="0.8", controls=False)
+    return load_settings(None, flags)
 
 
 @pytest.fixture

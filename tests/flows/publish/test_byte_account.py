@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import io
 import json
 from pathlib import Path
 from typing import Any
 
 import pytest
-from rich.console import Console
 
 from flows.archive.commands import contents
 from flows.publish.byte_account import publish_counted
-from flows.publish.receipt import Receipt
-from flows.publish.receipt_table import print_summary, saving_rows
+from flows.publish.receipt_table import saving_rows
 from flows.publish.report import render_report
 from flows.publish.run_folder import Published
 from storage.archive.archive import Archive
 from tests.conftest import Survey
 from tests.flows.conftest import Page, problems
-from tests.flows.publish.test_receipt import make_receipt
+from tests.flows.publish.test_receipt import make_receipt, printed
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 
@@ -153,12 +150,6 @@ def test_the_figure_of_a_folder_that_holds_the_figure(
     assert told(folder)["written"] == 7_000_000 + walked(folder)
 
 
-def _printed(receipt: Receipt, width: int = 80) -> str:
-    console = Console(file=io.StringIO(), width=width)
-    print_summary(receipt, console, verbose=True)
-    return " ".join(console.file.getvalue().split())  # type: ignore[attr-defined]
-
-
 def test_terminal_and_page_show_megabytes_against_one_reference() -> None:
     """A row each, with its fraction of the reference."""
     rows = [row for row in saving_rows(make_receipt()) if row["label"].startswith("bytes")]
@@ -169,7 +160,7 @@ def test_terminal_and_page_show_megabytes_against_one_reference() -> None:
     ]
     page = render_report(make_receipt(), PNG)
     Page(page)
-    for text in (_printed(make_receipt()), page):
+    for text in (" ".join(printed(make_receipt(), 80, verbose=True).split()), page):
         for figure in ("bytes kept", "1.5 MB", "38 %", "4 MB"):
             assert figure in text, figure
 
@@ -182,6 +173,7 @@ def test_a_tiny_field_has_no_absurd_percentage() -> None:
     rows = {row["label"]: (row["done"], row["full"]) for row in saving_rows(receipt)}
     assert rows["bytes captured"] == ("384 B", "384 B")
     assert rows["bytes kept"] == ("656 kB", "384 B")
-    for text in (_printed(receipt), render_report(receipt, PNG).replace("\u202f", " ")):
+    page = render_report(receipt, PNG).replace("\u202f", " ")
+    for text in (" ".join(printed(receipt, 80, verbose=True).split()), page):
         assert "1 710 times" in text
         assert "170717" not in text

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,17 +14,16 @@ import xarray as xr
 from flows.publish.findings import changed_hectares, differing_now, older_hectares
 from flows.publish.receipt_table import finding_rows
 from models.evaluation.expected_scores import MapScores, expected_counts, expected_score
-from models.reading.ood import Limits, OodDetector
-from models.weights.files import MAP_SCORES, TrainedOn, add_ood
+from models.weights.files import MAP_SCORES
 from pipeline.errors import WeightsError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.field_places import NoPlace
 from storage.arrays.class_maps import ClassMap
 from tests.conftest import CLASSES, Survey
+from tests.flows.tasks.test_unknown import add_judgement
 
 PLACE = NoPlace((2, 4), pixel_m=10.0)  # a hundredth of a hectare a pixel
 GROUND: dict[str, Any] = {"crs": "EPSG:32632", "resolution_m": 0.12}
-SEEN = TrainedOn(3, (460.0, 640.0), (3.0, 100.0), 2, CLASSES, (96, 300), (24.0, 60.0), 0.12)
 BIAS = np.array([-0.4, 0.1, 0.0])
 SCORES = MapScores((1,), (50.0, 100.0), np.stack([[0 * BIAS, BIAS]]), np.array([[0.02, 0.01]]), 4)
 
@@ -68,13 +66,7 @@ def test_rows_have_hectares_and_changes_where_they_are_known() -> None:
 
 def _judged(weights: Path, folder: Path, content: dict[str, Any], limit: float = 1e6) -> Path:
     """A copy of the tiny weights beside which stands how what their maps expect came true."""
-    path = folder / "judged.safetensors"
-    shutil.copy(weights, path)
-    one, table = np.eye(3), np.full((1, 1, 2), limit)
-    limits = Limits(np.array([0.001, 0.05]), np.ones(1), (1,), table)
-    ood_detector = OodDetector(np.zeros((1, 3)), one[None], 1e-9 * one[None], 1e-9 * one, limits, 3)
-    add_ood(path, path, ood_detector, SEEN, {MAP_SCORES: content})
-    return path
+    return add_judgement(weights, folder / "judged.safetensors", limit, {MAP_SCORES: content})
 
 
 def test_a_plain_scan_is_told_what_its_map_scores_by_itself(survey_png: Survey, weights: Path, tmp_path: Path):

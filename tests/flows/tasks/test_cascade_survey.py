@@ -14,7 +14,7 @@ from flows.archive.plan_command import plan_content
 from flows.settings.load import load_settings
 from models.evaluation.placement import CascadeTable
 from models.weights.files import CASCADE, save_weights
-from tests.conftest import RGB_NM, Survey, random_weights
+from tests.conftest import RGB_NM, Flags, Survey, random_weights
 from tests.prior_work import without_effects
 
 SCAN: dict[str, Any] = {"budget": None, "scan_step": "1", "camera.samples": 160}  # few beside the field
@@ -89,17 +89,15 @@ def receipt_weights(receipt: Any) -> str:
     ],
 )
 def test_what_is_asked_for_comes_first(
-    judged: Path, scene_files: Path, tmp_path: Path, flags: dict[str, str], least: float | None
+    judged: Path, flags_png: Flags, tmp_path: Path, flags: dict[str, str], least: float | None
 ) -> None:
     """A gain or multiply-adds by hand, another loss."""
-    given = {"scene": str(scene_files / "scene.png"), "source": "sim", "weights": str(judged), "out": str(tmp_path)}
-    content = plan_content(load_settings(None, {**given, "scan_step": "1", **flags}))
+    content = plan_content(load_settings(None, flags_png(tmp_path, weights=str(judged), scan_step="1", **flags)))
     asked = content.get("kept", {"asked": {"least_gain": None}})["asked"]
     assert asked["least_gain"] == (least if least is None else pytest.approx(least))
 
 
-def test_a_plan_tells_how_much_is_likely_to_be_read(judged: Path, scene_files: Path, tmp_path: Path) -> None:
+def test_a_plan_tells_how_much_is_likely_to_be_read(judged: Path, flags_png: Flags, tmp_path: Path) -> None:
     """By the fraction that scenes kept from training had."""
-    given = {"scene": str(scene_files / "scene.png"), "source": "sim", "weights": str(judged), "out": str(tmp_path)}
-    kept = plan_content(load_settings(None, {**given, "scan_step": "1"}))["kept"]
+    kept = plan_content(load_settings(None, flags_png(tmp_path, weights=str(judged), scan_step="1")))["kept"]
     assert kept["patches"] == round(0.4 * kept["of_patches"])

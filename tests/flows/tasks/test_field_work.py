@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,27 +23,20 @@ from storage.arrays.class_maps import ClassNames, create_class_map, create_proba
 from storage.arrays.layout import consolidate_stores
 from storage.arrays.mosaics import load_attention
 from storage.parallel.pool import WorkerPool
+from tests.conftest import Flags, Survey
 
-Survey = Callable[..., object]
 MOST_PX = (64, 640)  # of 96 x 128 px: two regions
 ALL_PX = 96  # a halo that reaches over the whole field
 
 
 @pytest.fixture(scope="module")
 def surveyed(
-    tmp_path_factory: pytest.TempPathFactory, surveyed_png: Survey, scene_files: Path, weights: Path
+    tmp_path_factory: pytest.TempPathFactory, surveyed_png: Survey, flags_png: Flags
 ) -> tuple[SurveyRun, Path]:
     """A survey of scene.png, and the folder of its stages."""
     out = tmp_path_factory.mktemp("field") / "archive"
     surveyed_png(out)
-    flags = {
-        "scene": str(scene_files / "scene.png"),
-        "source": "sim",
-        "weights": str(weights),
-        "out": str(out),
-        "budget": "0.8",
-    }
-    return open_run(load_settings(None, flags)), out / "stages"
+    return open_run(load_settings(None, flags_png(out, budget="0.8"))), out / "stages"
 
 
 def _store(stages: Path, name: str) -> Path:

@@ -36,7 +36,6 @@ from storage.arrays.layout import AngularGrid
 from tests.storage.plain_mosaic import write_values
 from tests.storage.small_archive import write_class_map
 
-pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 POSE = RigPose(lon_deg=9.5, lat_deg=52.1, heading_deg=25.0, tilt_deg=50.0, height_m=14.0)
 SHAPE = (120, 160)
 FIELD: Any = SimpleNamespace(shape=SHAPE, geobox=None, pixel_m=None)

@@ -22,7 +22,7 @@ from models.network.sizes import SegmenterConfig, multiply_adds
 from models.policies.policies import score_multiply_adds
 from pipeline.errors import BudgetError, SettingsError
 from pipeline.geometry.grid import SceneGrid
-from tests.conftest import Survey
+from tests.conftest import Flags, Survey
 
 COSTS = ReadingCosts(SegmenterConfig(classes=5), SceneGrid(192, 256, 16, 1), 30)
 PATCHES = 12 * 16
@@ -153,15 +153,9 @@ def test_a_part_of_the_scan_is_read_in_detail(survey_png: Survey, tmp_path: Path
     assert "captured again" not in page
 
 
-def test_a_plan_tells_what_the_budgets_pay_for(scene_files: Path, weights: Path, tmp_path: Path) -> None:
+def test_a_plan_tells_what_the_budgets_pay_for(flags_png: Flags, tmp_path: Path) -> None:
     """Before the first line: the most patches, and what they take."""
-    given_settings = {
-        "scene": str(scene_files / "scene.png"),
-        "source": "sim",
-        "weights": str(weights),
-        "out": str(tmp_path),
-    }
-    content = plan_content(load_settings(None, {**given_settings, "scan_step": "1", "macs": "80%"}))
+    content = plan_content(load_settings(None, flags_png(tmp_path, scan_step="1", macs="80%")))
     costs = content["kept"]["multiply_adds"]
     assert 0.75 < costs["done"] / costs["everything"] <= 0.8
     assert content["kept"]["of_patches"] == 192

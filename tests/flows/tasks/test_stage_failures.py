@@ -93,17 +93,9 @@ def walk(
     receipt = surveyed_png(folder / "undisturbed").receipt
     keys = {stage["name"]: stage["key"] for stage in receipt["stages"] if stage["state"] == "ran"}
     found = Walk(folder / "undisturbed", folder / "archive", keys, {}, Counter(), {})
-    scene = [
-        "--scene",
-        scene_files / "scene.png",
-        "--source",
-        "sim",
-        "--labels",
-        scene_files / "labels.png",
-        "--weights",
-        weights,
-    ]
-    words = ["survey", *scene, "--engine", "plain", "--budget", "0.8", "--no-controls", "--out", found.out]
+    files = ["--scene", scene_files / "scene.png", "--labels", scene_files / "labels.png", "--weights", weights]
+    flags = ["--source", "sim", "--engine", "plain", "--budget", "0.8", "--no-controls"]
+    words = ["survey", *files, *flags, "--out", found.out]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tempfile, "tempdir", str(folder))
         for stage in OF_THIS:

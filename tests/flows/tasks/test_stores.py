@@ -38,18 +38,10 @@ def surveyed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Published]
 
 def _survey_farm(root: Path) -> Published:
     """A small farm in as many bands as light with a spectrum needs."""
-    flags = {
-        "scene": "farm",
-        "size": "192x160",
-        "bands": ",".join(map(str, range(5, 265, 10))),
-        "engine": "plain",
-        "controls": False,
-        "budget": "0.95",
-        "keep": "raw",
-        "out": str(root),
-    }
+    flags = {"scene": "farm", "size": "192x160", "engine": "plain", "controls": False, "budget": "0.95", "keep": "raw"}
+    bands = ",".join(map(str, range(5, 265, 10)))
     with without_effects():
-        return run_survey(load_settings(None, flags), Console(quiet=True))
+        return run_survey(load_settings(None, {**flags, "bands": bands, "out": str(root)}), Console(quiet=True))
 
 
 @pytest.fixture

@@ -40,19 +40,8 @@ from tests.flows.conftest import FEW_BANDS, Page
 from tests.models.conftest import coarse_prediction
 from tests.receipts import comparable
 
-STAGES = [
-    "choose_effects",
-    "capture_coarse",
-    "condense_coarse",
-    "locate",
-    "rectify",
-    "score",
-    "capture_fine",
-    "condense_fine",
-    "rectify_fine",
-    "segment",
-    "evaluate",
-]
+COARSE = ("choose_effects", "capture_coarse", "condense_coarse", "locate", "rectify", "score")
+STAGES = [*COARSE, "capture_fine", "condense_fine", "rectify_fine", "segment", "evaluate"]
 FARM = (128, 192)
 
 

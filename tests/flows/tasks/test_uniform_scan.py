@@ -17,7 +17,7 @@ from flows.archive.reprocess_command import run_reprocess
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from pipeline.errors import BudgetError, SettingsError, WeightsError
-from tests.conftest import Survey, WeightsMaker
+from tests.conftest import Flags, Survey, WeightsMaker
 from tests.prior_work import with_effects
 
 RECORD = {
@@ -105,16 +105,9 @@ def test_seconds_choose_the_scan_and_are_kept(
     assert {one["name"]: one["state"] for one in again["stages"]}["capture_coarse"] == "cached"
 
 
-def test_a_plan_tells_the_scan_of_a_goal(scene_files: Path, recorded: Path, tmp_path: Path) -> None:
+def test_a_plan_tells_the_scan_of_a_goal(flags_png: Flags, recorded: Path, tmp_path: Path) -> None:
     """Its expected mIoU reaches the goal; the reference is nearly the best."""
-    given = {
-        "scene": str(scene_files / "scene.png"),
-        "source": "sim",
-        "weights": str(recorded),
-        "goal": "88",
-        "out": str(tmp_path),
-    }
-    told = plan_content(load_settings(None, given))["scans"]
+    told = plan_content(load_settings(None, flags_png(tmp_path, weights=str(recorded), goal="88")))["scans"]
     assert told["taken"]["expected_miou"] >= 0.88
     assert told["reference"]["expected_miou"] >= told["taken"]["expected_miou"] - 0.005
 
@@ -146,12 +139,11 @@ def test_what_no_scan_can_do_is_refused_in_a_sentence(
 
 @pytest.mark.parametrize(("exposure_ms", "told"), [("6", True), ("5", False), ("100", True), ("101", False)])
 def test_nothing_is_expected_of_a_scan_beyond_the_record(
-    scene_files: Path, recorded: Path, tmp_path: Path, exposure_ms: str, told: bool
+    flags_png: Flags, recorded: Path, tmp_path: Path, exposure_ms: str, told: bool
 ) -> None:
     """By hand any exposure may be taken; one beside those that were judged has no expectation."""
-    given = {"scene": str(scene_files / "scene.png"), "source": "sim", "weights": str(recorded), "out": str(tmp_path)}
-    scan = {"scan_step": "2", "scan_exposure_ms": exposure_ms}
-    assert (plan_content(load_settings(None, given | scan))["scans"]["taken"] is not None) == told
+    given = flags_png(tmp_path, weights=str(recorded), scan_step="2", scan_exposure_ms=exposure_ms)
+    assert (plan_content(load_settings(None, given))["scans"]["taken"] is not None) == told
 
 
 def test_weights_without_a_record_scan_by_hand_alone(survey_png: Survey, tmp_path: Path) -> None:

@@ -31,20 +31,20 @@ Maker = Callable[[float], Path]
 NARROW: dict[str, Any] = {"effects": "none", "camera.samples": 160, "budget": None, "scan_step": 1}
 
 
+def add_judgement(weights: Path, path: Path, limit: float, tables: dict[str, Any]) -> Path:
+    """A copy of weights that knows spectra up to a squared distance from the middle, with tables beside that."""
+    shutil.copy(weights, path)
+    one, table = np.eye(3), np.full((1, 1, 2), limit)
+    limits = Limits(np.array([0.001, 0.05]), np.ones(1), (1,), table)
+    ood_detector = OodDetector(np.zeros((1, 3)), one[None], 1e-9 * one[None], 1e-9 * one, limits, 3)
+    add_ood(path, path, ood_detector, SEEN, tables)
+    return path
+
+
 @pytest.fixture(scope="module")
 def judging(weights: Path, tmp_path_factory: pytest.TempPathFactory) -> Maker:
     """Maker of copies of the tiny weights to which spectra up to a squared distance from the middle are familiar."""
-
-    def make(limit: float) -> Path:
-        path = tmp_path_factory.mktemp("judging") / "w.safetensors"
-        shutil.copy(weights, path)
-        one, table = np.eye(3), np.full((1, 1, 2), limit)
-        limits = Limits(np.array([0.001, 0.05]), np.ones(1), (1,), table)
-        ood_detector = OodDetector(np.zeros((1, 3)), one[None], 1e-9 * one[None], 1e-9 * one, limits, 3)
-        add_ood(path, path, ood_detector, SEEN, {})
-        return path
-
-    return make
+    return lambda limit: add_judgement(weights, tmp_path_factory.mktemp("judging") / "w.safetensors", limit, {})
 
 
 def _stored(out: Path, name: str) -> xr.Dataset:

@@ -26,10 +26,10 @@ from tests.pipeline.geometry.paper_equations import (
     straight_slope_rotation,
     unlimited_position,
 )
+from tests.pipeline.geometry.test_mirror import E1, E3, tilted
 
 CAMERA = LineCamera()
 IFOV = CAMERA.ifov_rad
-E1, E3 = np.array([-1.0, 0.0, -1.0]) / np.sqrt(2), np.array([1.0, 0.0, -1.0]) / np.sqrt(2)
 
 
 def paper_position(normal: np.ndarray) -> np.ndarray:
@@ -58,12 +58,6 @@ def stable_normal(direction: np.ndarray) -> np.ndarray:
     o[..., 2] = np.where(z < 0, (o[..., 0] ** 2 + o[..., 1] ** 2) / (1 - np.minimum(z, 0)), 1 + z)
     o /= np.abs(o).max(axis=-1, keepdims=True)
     return o / np.sqrt(np.sum(o**2, axis=-1, keepdims=True))
-
-
-def tilted(tilt_deg: float) -> np.ndarray:
-    """The normal tilted in the plane of incidence."""
-    tilt = np.deg2rad(tilt_deg)
-    return np.sin(tilt) * E1 + np.cos(tilt) * E3
 
 
 def optical_deg(position: np.ndarray) -> float:

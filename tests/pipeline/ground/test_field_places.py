@@ -23,7 +23,6 @@ from pipeline.ground.map_grid import ground_grid
 from pipeline.ground.view import GroundView, RigPose, pixel_places
 from tests.pipeline.ground.test_view import view
 
-pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 SHAPE = (600, 30)  # more rows than are taken at once
 CLASSES = np.random.default_rng(0).choice(np.array([0, 2, UNLABELLED], np.uint8), SHAPE)
 IFOV = 1e-4

@@ -13,7 +13,6 @@ from odc.geo.geobox import GeoBox
 from pipeline.geometry.grid import SceneGrid, patch_pixels
 from pipeline.ground.georeference import pixel_rows_m2, pixel_side_m, zoomed_out
 
-pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")
 PLACES = {32632: (8.0, 51.0), 3857: (8.0, 60.0), 3035: (8.0, 51.0), 4326: (8.0, 51.0), 2263: (-74.0, 40.7)}
 
 

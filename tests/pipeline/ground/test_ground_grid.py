@@ -23,8 +23,6 @@ from pipeline.ground.map_grid import (
 from pipeline.ground.view import pixel_places
 from tests.pipeline.ground.test_view import view
 
-pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
-
 
 def whole(grid: GroundGrid) -> np.ndarray:
     """Scene pixels of all of a map."""

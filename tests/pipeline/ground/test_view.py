@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pyproj import Geod, Proj
 
@@ -164,7 +164,6 @@ def test_metres_around_the_foot_are_the_textbooks(lon: float, lat: float):
     assert earth_centred(*found) == pytest.approx(wanted, abs=1e-8)
 
 
-@settings(max_examples=40)
 @given(
     st.floats(-180, 180),
     st.floats(-89.9, 89.9),

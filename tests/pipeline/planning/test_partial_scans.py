@@ -6,7 +6,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import SettingsError
@@ -70,7 +70,6 @@ def test_every_patch_is_in_a_row_whose_lines_show_it(along: Axis, step: int) -> 
         assert shown[rows.row == number * rows.first.shape[1] + place].all()
 
 
-@settings(max_examples=40, deadline=None)
 @given(worths, st.floats(0.02, 1.2))
 def test_no_run_of_the_same_sweep_is_worth_more_in_its_seconds(expected_gain: np.ndarray, fraction: float) -> None:
     """Each chosen run is worth most of all runs of its sweep that have as many lines or fewer."""
@@ -84,7 +83,6 @@ def test_no_run_of_the_same_sweep_is_worth_more_in_its_seconds(expected_gain: np
                 assert values[begin:end].sum() <= taken * (1 + 1e-9)
 
 
-@settings(max_examples=40, deadline=None)
 @given(worths, st.floats(0.1, 1.0), st.floats(0.1, 4.0))
 def test_no_run_of_one_swath_that_ends_in_time_is_worth_more(
     expected_gain: np.ndarray, fraction: float, power: float
@@ -175,7 +173,6 @@ def test_a_patch_that_two_swaths_show_is_of_the_nearer(along: Axis) -> None:
     assert (own <= off.min(axis=1) + 1).all()  # lines are turned by a pixel at most
 
 
-@settings(max_examples=40, deadline=None)
 @given(worths, st.floats(0.02, 1.2))
 def test_looks_end_in_time_and_are_worth_what_they_show(expected_gain: np.ndarray, fraction: float) -> None:
     """Seconds are those of the cost model, at most those given; the worth is that of the rows the lines show."""
@@ -188,7 +185,6 @@ def test_looks_end_in_time_and_are_worth_what_they_show(expected_gain: np.ndarra
     assert scan_pass.expected_gain <= expected_gain[patches_shown(sweeps, GRID, CAMERA)].sum() * (1 + 1e-9)
 
 
-@settings(max_examples=40, deadline=None)
 @given(worths)
 def test_more_seconds_are_worth_no_less(expected_gain: np.ndarray) -> None:
     """And all the seconds of the whole scan buy all that a scan is worth."""

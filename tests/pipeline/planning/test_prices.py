@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.geometry.camera import LineCamera
@@ -38,7 +38,6 @@ def test_samples_beside_the_scene_are_not_counted():
     assert raw_bytes([beside], CAMERA, 10) == 3 * 640 * 10 * 2
 
 
-@settings(max_examples=40)
 @given(st.integers(1, 90), st.integers(1, 45), st.sampled_from(["x", "y"]))
 def test_a_full_scan_near_the_axis_samples_every_pixel_once(scan: int, half: int, along: str):
     """One strip through the axis takes as many samples on the scene as it has pixels."""

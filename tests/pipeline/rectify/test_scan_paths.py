@@ -20,7 +20,6 @@ def members(scan_path: ScanPath) -> list[np.ndarray]:
 
 
 @given(STEPS, st.integers(0, 99))
-@settings(max_examples=40, deadline=None)
 def test_every_usable_line_is_on_one_knot(steps: list[float], seed: int) -> None:
     """On any path each usable line is a member of one seen knot, at the mean of its members, and knots ascend."""
     position = aim(30.0, np.concatenate([[0.0], np.cumsum(steps)]))
@@ -141,7 +140,6 @@ def test_line_out_of_reach_is_named() -> None:
 
 
 @given(st.lists(st.integers(0, 400), min_size=2, max_size=60, unique=True), st.floats(0.97, 1.03), st.integers(0, 99))
-@settings(max_examples=40, deadline=None)
 def test_numbers_are_those_of_the_lines_that_came(lines: list[int], pace: float, seed: int) -> None:
     """Whatever frames are lost, with a clock off by 3 % and jitter of a tenth, short gaps are counted exactly."""
     came = np.sort(lines)
@@ -154,7 +152,6 @@ def test_numbers_are_those_of_the_lines_that_came(lines: list[int], pace: float,
 
 
 @given(st.integers(0, 99), st.integers(3, 40))
-@settings(max_examples=40, deadline=None)
 def test_copies_and_wild_stamps_change_no_other_line(seed: int, lines: int) -> None:
     """A frame sent again and a single wild stamp are marked; the others keep the numbers that they had."""
     rng = np.random.default_rng(seed)

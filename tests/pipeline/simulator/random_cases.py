@@ -83,16 +83,9 @@ def random_case(number: int) -> Case:
     step = int(rng.choice([1, 1, 1, 4]))
     count = int(rng.integers(LINES[0], LINES[1] + 1))
     axis = "y" if upright else "x"
+    kind = "fine" if step == 1 else "coarse"
     sweeps = tuple(
-        Sweep(
-            name,
-            "fine" if step == 1 else "coarse",
-            axis,
-            float(rng.uniform(-20, 20)),
-            start - count * step / 2,
-            count,
-            step,
-        )
+        Sweep(name, kind, axis, float(rng.uniform(-20, 20)), start - count * step / 2, count, step)
         for name, start in (("first", far), ("last", float(rng.uniform(-200, 200))))
     )
     seconds = float(np.exp(rng.uniform(np.log(60), np.log(LONGEST_S)))) if rng.random() < 0.5 else None

@@ -56,11 +56,8 @@ def test_a_sweep_of_its_own_exposure_is_as_by_a_camera_that_has_it(exposure_ms: 
     """Numbers, times, exposures and references, of light that drifts while the survey goes on."""
     values = np.random.default_rng(2).random((40, 100, 3))
     other = replace(CAMERA, exposure_ms=exposure_ms)
-    options: dict[str, Any] = {
-        "seed": 5,
-        "chosen": effects_on(*QUIET, "lag", "shot", "dark-current"),
-        "clock": {"s": 7.0},
-    }
+    chosen = effects_on(*QUIET, "lag", "shot", "dark-current")
+    options: dict[str, Any] = {"seed": 5, "chosen": chosen, "clock": {"s": 7.0}}
     source, told = source_of(values, **options), source_of(values, other, **options)
     own = replace(SWEEP, exposure_ms=exposure_ms)
     for line, same in zip(source.lines(own), told.lines(SWEEP), strict=True):
@@ -101,13 +98,8 @@ def test_references_give_back_scene_values(binning: int, exposure_ms: float) -> 
     source = source_of(values, replace(CAMERA, exposure_ms=exposure_ms), chosen=effects_on(*QUIET))
     sweep = replace(SWEEP, lines=10, step=binning, binning=binning)
     out, valid = calibrate(raw_of(source, sweep), source.references(sweep), saturated_dn=4095 * binning)
-    step = (
-        source.scene.white_reference[0]
-        / source.scene.white_reference_electrons[0]
-        * CAMERA.electrons_per_dn
-        * 100
-        / exposure_ms
-    )
+    per_electron = source.scene.white_reference[0] / source.scene.white_reference_electrons[0]
+    step = per_electron * CAMERA.electrons_per_dn * 100 / exposure_ms
     if valid.any():
         np.testing.assert_allclose(out[valid], np.broadcast_to(values[0, 0], out.shape)[valid], atol=0.51 * step)
     assert valid.all() == (values.max() * source.scene.electrons[0] * exposure_ms / 100 < CAMERA.full_scale_e)
@@ -181,9 +173,8 @@ def test_light_goes_with_the_clock() -> None:
     assert [line.time_s for line in later.lines(sweep)] == [line.time_s for line in now.lines(sweep)]
 
 
-WHITE_REFERENCE_CAMERA = LineCamera(
-    samples=64, bits=16, electrons_per_dn=1.0
-)  # fine steps: rounding is no part of the figures
+# fine steps: rounding is no part of the figures
+WHITE_REFERENCE_CAMERA = LineCamera(samples=64, bits=16, electrons_per_dn=1.0)
 RIG = Rig(WHITE_REFERENCE_CAMERA, detector=Detector(prnu_std=0.05, striping_std=0.02, temperature_deg_c=45.0))
 WHITE_REFERENCE_SWEEP = Sweep("s", "fine", "x", swath_px=900.0, start_px=-1500.0, lines=6)
 BANDS = 12
@@ -203,14 +194,9 @@ def white_reference_source_of(*names: str, rig: Rig = RIG) -> SimulatedSource:
 
 def values_of(source: SimulatedSource, sweep: Sweep = WHITE_REFERENCE_SWEEP) -> np.ndarray:
     """Calibrated lines."""
-    raw = source.render(sweep, range(sweep.lines))
-    values, _ = calibrate(
-        raw,
-        source.references(sweep),
-        saturated_dn=65535 * sweep.binning,
-        position=line_positions(sweep, WHITE_REFERENCE_CAMERA),
-    )
-    return values
+    raw, references = source.render(sweep, range(sweep.lines)), source.references(sweep)
+    position = line_positions(sweep, WHITE_REFERENCE_CAMERA)
+    return calibrate(raw, references, saturated_dn=65535 * sweep.binning, position=position)[0]
 
 
 @pytest.mark.parametrize(
@@ -273,9 +259,8 @@ def test_defects_are_told_as_bad() -> None:
 def test_white_reference_is_stated_in_the_rigs_bands() -> None:
     """Where the white reference's values have detail in the spectrum, the response rounds it as it does the light."""
     scene = even_scene()
-    scene = replace(
-        scene, white_reference=(1 - 0.5 * np.exp(-(((scene.wavelength_nm - 762) / 4) ** 2))).astype(np.float32)
-    )
+    detailed = 1 - 0.5 * np.exp(-(((scene.wavelength_nm - 762) / 4) ** 2))
+    scene = replace(scene, white_reference=detailed.astype(np.float32))
     plain, wide = (
         SimulatedSource(scene, RIG, chosen=effects_on(*names)).references(WHITE_REFERENCE_SWEEP).white_reference
         for names in ((), ("response",))

@@ -22,7 +22,6 @@ from storage.arrays.layout import AngularGrid
 from storage.export.image_files import ANGULAR, CogImage, angular_geobox, write_cog
 from tests.storage.export.stac_rules import is_cog
 
-pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 LEGEND = ClassNames(
     ("sugar beet", "soil & stones", "maïs"), np.array([[10, 200, 30], [120, 90, 60], [0, 0, 255]], "u1")
 )

@@ -21,11 +21,8 @@ from storage.readers.envi_files import EnviCube, open_envi_cube
 pytest.importorskip("spectral", reason="SPy is the oracle: pip install spectral")
 envi = pytest.importorskip("spectral.io.envi", reason="SPy is the oracle: pip install spectral")
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning"),  # odc-geo on affine 3
-    pytest.mark.filterwarnings("ignore:Parameters with non-lowercase names"),  # SPy says so of keys as ENVI has them
-    pytest.mark.filterwarnings("ignore:Dataset has no geotransform"),  # GDAL of a cube that lies on no map
-]
+# SPy says so of keys as ENVI has them
+pytestmark = pytest.mark.filterwarnings("ignore:Parameters with non-lowercase names")
 ORDERS = {"little": "<", "big": ">"}
 CODES = sorted(DATA_TYPES)
 SHAPE = (6, 7, 5)

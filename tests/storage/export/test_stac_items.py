@@ -16,7 +16,6 @@ from pipeline.errors import ArchiveError
 from storage.export.stac_items import COG, COLLECTION, ZARR, Item, clean_id, footprint, projection, write_stac
 from tests.storage.export.stac_rules import core_problems, extension_problems
 
-pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 BOX = GeoBox.from_bbox((500000, 5770000, 500050, 5770040), crs="EPSG:32632", resolution=0.5)
 ABOUT = "field-a"
 

@@ -102,18 +102,13 @@ def test_few_blocks_are_begun_ahead_of_the_oldest(workers: int) -> None:
     assert sorted(begun) == list(range(24))
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_an_error_on_threads_is_raised_here(workers: int) -> None:
-    """What a block raises ends the work."""
+@pytest.mark.parametrize("pool", [WorkerPool(workers=1), WorkerPool(workers=2), None], ids=["here", "two", "processes"])
+def test_an_error_of_a_block_is_raised_here(processes: WorkerPool, pool: WorkerPool | None) -> None:
+    """What a block raises ends the work with its type and message, and the workers serve the next call."""
+    pool = processes if pool is None else pool
     with pytest.raises(ShapeError, match="no 3"):
-        run_blocks(partial(square_unless, 3), range(9), WorkerPool(workers=workers))
-
-
-def test_an_error_of_a_process_is_raised_here(processes: WorkerPool) -> None:
-    """What a block raises comes over with its type and message, and the workers serve the next call."""
-    with pytest.raises(ShapeError, match="no 3"):
-        run_blocks(partial(square_unless, 3), range(9), processes)
-    assert run_blocks(square, range(3), processes) == [0, 1, 4]
+        run_blocks(partial(square_unless, 3), range(9), pool)
+    assert run_blocks(square, range(3), pool) == [0, 1, 4]
 
 
 def test_a_killed_worker_costs_only_time(tmp_path: Path, processes: WorkerPool) -> None:

@@ -18,9 +18,6 @@ from storage.readers.cube_sources import read_by_chunks
 from storage.readers.open_cubes import open_cube
 from storage.readers.scene_files import load_scene_file
 
-pytestmark = pytest.mark.filterwarnings(
-    "ignore:Use `@` matmul:PendingDeprecationWarning", "ignore:Dataset has no geotransform"
-)
 RNG = np.random.default_rng(5)
 NM = np.array([450.0, 550.0, 660.0, 800.0, 900.0])
 CUBE = RNG.integers(1, 9000, (7, 6, 5)).astype(np.int16)  # (y, x, band)

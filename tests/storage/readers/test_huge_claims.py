@@ -150,18 +150,8 @@ def test_images_that_claim_too_much(tmp_path: Path, side: int) -> None:
 
 def hollow_tiff(path: Path, side: int, tile: int) -> None:
     """A TIFF that says its size, and holds nothing."""
-    entries = [
-        (256, 4, side),
-        (257, 4, side),
-        (258, 3, 8),
-        (259, 3, 1),
-        (262, 3, 1),
-        (277, 3, 1),
-        (322, 4, tile),
-        (323, 4, tile),
-        (324, 4, 0),
-        (325, 4, 0),
-    ]
+    told = {(256, 257): (4, side), (258,): (3, 8), (259, 262, 277): (3, 1), (322, 323): (4, tile), (324, 325): (4, 0)}
+    entries = [(tag, *one) for tags, one in told.items() for tag in tags]
     body = b"".join(struct.pack("<HHII", tag, kind, 1, value) for tag, kind, value in entries)
     path.write_bytes(b"II*\0" + struct.pack("<IH", 8, len(entries)) + body + bytes(4))
 

@@ -17,14 +17,15 @@ from flows.training.init_command import draft_scene
 from pipeline.errors import SceneError
 from storage.readers.scene_files import load_scene_file, open_scene_file
 
-pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")
 WEST, NORTH, SIDE = 600_000.0, 5_700_000.0, 60
 CLASSES = np.zeros((SIDE, SIDE), np.uint8)  # three stripes and a corner, nothing of them symmetric
 CLASSES[:, 20:], CLASSES[:, 45:], CLASSES[:10, :15] = 1, 2, 3
 NORTH_UP = Affine(1, 0, WEST, 0, -1, NORTH)
 
 
-def write(path: Path, values: NDArray[Any], transform: Affine, crs: str | None = "EPSG:32632", **about: Any) -> Path:
+def write(
+    path: Path, values: NDArray[Any], transform: Affine = NORTH_UP, crs: str | None = "EPSG:32632", **about: Any
+) -> Path:
     """A GeoTIFF of (y, x) or (y, x, band) values."""
     planes = np.moveaxis(np.atleast_3d(values), -1, 0)
     count, height, width = planes.shape

@@ -18,11 +18,7 @@ from flows.training.init_command import draft_scene
 from pipeline.errors import SceneError
 from storage.readers.scene_files import load_scene_file
 
-pytestmark = pytest.mark.filterwarnings(
-    "ignore:Use `@` matmul:PendingDeprecationWarning",
-    "ignore:Dataset has no geotransform",
-    "ignore:'crs' was not provided",
-)
+pytestmark = pytest.mark.filterwarnings("ignore:'crs' was not provided")
 PLACE = Affine(2, 0, 400_000, 0, -2, 5_700_000)
 SHAPE = 10, 12  # (y, x)
 WEST, EAST = shapely.box(400_000, 5_699_980, 400_008, 5_700_000), shapely.box(400_012, 5_699_990, 400_024, 5_700_000)

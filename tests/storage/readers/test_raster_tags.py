@@ -22,9 +22,6 @@ from storage.readers.open_cubes import open_cube
 from storage.readers.scene_files import bands_text, load_scene_file
 from storage.readers.zarr_files import write_ingested_cube
 
-pytestmark = pytest.mark.filterwarnings(
-    "ignore:Use `@` matmul:PendingDeprecationWarning", "ignore:Dataset has no geotransform"
-)
 PLACE = Affine(0.5, 0, 400_000, 0, -0.5, 5_700_000)
 VALUES = np.random.default_rng(3).integers(1, 200, (4, 6, 7)).astype(np.uint8)  # (band, y, x)
 NM = [450.0, 550.0, 660.5, 800.0]

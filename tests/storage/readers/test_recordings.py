@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -195,33 +194,24 @@ def write_envi_cube(stem: Path, values: NDArray[Any], ending: str = "", **fields
 VALUES = np.random.default_rng(0).integers(100, 4000, (6, 16, 3)).astype("<u2")
 
 
+NO_WAVELENGTHS = "has 3 bands and nothing says their wavelengths; give --wavelengths in nm"
+
+
 @pytest.mark.parametrize(
-    ("write", "error", "message"),
+    ("values", "fields", "error", "message"),
     [
-        (lambda stem: write_envi_cube(stem, VALUES, interleave=None), SceneError, "no interleave, expected one of bil"),
-        (lambda stem: write_envi_cube(stem, VALUES, interleave="bpl"), SceneError, "interleave = 'bpl', expected one"),
-        (
-            lambda stem: write_envi_cube(stem, VALUES, wavelength=None),
-            WavelengthError,
-            "has 3 bands and nothing says their wavelengths; give --wavelengths in nm",
-        ),
-        (
-            lambda stem: write_envi_cube(stem, VALUES.astype("<f4")),
-            SceneError,
-            "holds float32, expected a camera's own numbers",
-        ),
-        (
-            lambda stem: write_envi_cube(stem, VALUES.astype("<i2") - np.int16(2000)),
-            SceneError,
-            "expected a camera's own numbers from 0",
-        ),
+        (VALUES, {"interleave": None}, SceneError, "no interleave, expected one of bil"),
+        (VALUES, {"interleave": "bpl"}, SceneError, "interleave = 'bpl', expected one"),
+        (VALUES, {"wavelength": None}, WavelengthError, NO_WAVELENGTHS),
+        (VALUES.astype("<f4"), {}, SceneError, "holds float32, expected a camera's own numbers"),
+        (VALUES.astype("<i2") - np.int16(2000), {}, SceneError, "expected a camera's own numbers from 0"),
     ],
 )
 def test_a_cube_that_cannot_be_used_says_why(
-    tmp_path: Path, write: Callable[[Path], None], error: type[PipelineError], message: str
+    tmp_path: Path, values: NDArray[Any], fields: dict[str, Any], error: type[PipelineError], message: str
 ) -> None:
     """Interleave, wavelengths and types: each fault has its own message."""
-    write(tmp_path / "cube")
+    write_envi_cube(tmp_path / "cube", values, **fields)
     with pytest.raises(error) as caught:
         open_recording(tmp_path / "cube.hdr").sweeps[0].read_lines(np.arange(6))
     assert message in str(caught.value)

@@ -17,9 +17,6 @@ from pipeline.errors import SceneError
 from storage.readers.open_cubes import open_cube
 from storage.readers.scene_files import load_scene_file, open_scene_file
 
-pytestmark = pytest.mark.filterwarnings(
-    "ignore:Use `@` matmul:PendingDeprecationWarning", "ignore:Dataset has no geotransform"
-)
 RNG = np.random.default_rng(9)
 REVERSIBLE = {"QUALITY": "100", "REVERSIBLE": "YES"}
 

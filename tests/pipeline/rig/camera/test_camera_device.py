@@ -19,56 +19,37 @@ def device_with(fault: CameraFault | None = None, times: int = 1, seed: int = 0)
     return FaultyCamera(LinesOf(), ManualClock(), faults=faults)
 
 
+EXPOSURE = b'configure({"exposure": 4.5, "framePeriod": 5})'
+NO = b'{"success": false, "response": null, "errorMessage": "%s"}'
+YES = b'{"success": true, "response": %s, "errorMessage": ""}'
+TOO_LONG = b'configure({"exposure": 6, "framePeriod": 5})'
+
+
 @pytest.mark.parametrize(
-    ("sent", "received"),
+    ("sent", "end", "reply"),
     [
-        (
-            b'configure({"exposure": 4.5, "framePeriod": 5})\r',
-            b'configure({"exposure": 4.5, "framePeriod": 5})\r\n{"success": true, '
-            b'"response": {"exposure": 4.5, "framePeriod": 5.0}, "errorMessage": ""}' + PROMPT,
-        ),
-        (
-            b'configure({"exposure": 6, "framePeriod": 5})\r',
-            b'configure({"exposure": 6, "framePeriod": 5})\r\n{"success": false, "response": null, '
-            b'"errorMessage": "exposure longer than frame period"}' + PROMPT,
-        ),
-        (
-            CAPTURE + b"\r\n",
-            CAPTURE + b'\r\n{"success": true, "response": {"folder": "/captured/000000"}, "errorMessage": ""}' + PROMPT,
-        ),
-        (b"isCapturing\r", b'isCapturing\r\n{"success": true, "response": false, "errorMessage": ""}' + PROMPT),
-        (b"stopCapture\r", b'stopCapture\r\n{"success": true, "response": false, "errorMessage": ""}' + PROMPT),
-        (
-            b'listFiles("/")\r',
-            b'listFiles("/")\r\n{"success": true, "response": [{"name": "/captured", "size": 0, "mtime": 0, '
-            b'"isDirectory": true}], "errorMessage": ""}' + PROMPT,
-        ),
-        (
-            b'listFiles("/x")\r',
-            b'listFiles("/x")\r\n{"success": false, "response": null, "errorMessage": "no such folder /x"}' + PROMPT,
-        ),
-        (
-            b"hello\r",
-            b'hello\r\n{"success": false, "response": null, "errorMessage": "unknown command hello"}' + PROMPT,
-        ),
-        (
-            b"configure({]\r",
-            b'configure({]\r\n{"success": false, "response": null, "errorMessage": '
-            b'"argument of configure is not JSON"}' + PROMPT,
-        ),
-        (b"\r", PROMPT),
+        (EXPOSURE, b"\r", YES % b'{"exposure": 4.5, "framePeriod": 5.0}'),
+        (TOO_LONG, b"\r", NO % b"exposure longer than frame period"),
+        (CAPTURE, b"\r\n", YES % b'{"folder": "/captured/000000"}'),
+        (b"isCapturing", b"\r", YES % b"false"),
+        (b"stopCapture", b"\r", YES % b"false"),
+        (b'listFiles("/")', b"\r", YES % b'[{"name": "/captured", "size": 0, "mtime": 0, "isDirectory": true}]'),
+        (b'listFiles("/x")', b"\r", NO % b"no such folder /x"),
+        (b"hello", b"\r", NO % b"unknown command hello"),
+        (b"configure({]", b"\r", NO % b"argument of configure is not JSON"),
+        (b"", b"\r", None),
     ],
 )
-def test_bytes_of_every_command(sent: bytes, received: bytes) -> None:
-    """Each command gives its bytes, in one piece or byte by byte."""
-    for size in (1, len(sent)):
+def test_bytes_of_every_command(sent: bytes, end: bytes, reply: bytes | None) -> None:
+    """Each command gives its bytes after its own echo, in one piece or byte by byte."""
+    for size in (1, len(sent + end)):
         talk = CameraConnection(device_with())
         came = b""
-        for at in range(0, len(sent), size):
-            chunks, goes_on = talk.feed(sent[at : at + size])
+        for at in range(0, len(sent + end), size):
+            chunks, goes_on = talk.feed((sent + end)[at : at + size])
             assert goes_on
             came += b"".join(chunk.data for chunk in chunks)
-        assert came == received
+        assert came == (PROMPT if reply is None else sent + b"\r\n" + reply + PROMPT)
         assert talk.feed(b"exit\r") == ([], False)
 
 

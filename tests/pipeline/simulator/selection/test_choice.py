@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import SettingsError
@@ -42,7 +42,6 @@ def variants(decision: Decision) -> dict[str, str]:
 
 
 @given(made_up(), TOLERANCES)
-@settings(deadline=None)
 def test_errors_never_exceed_the_tolerance(effects: list[MadeUp], tolerance: float):
     """The bounds of what is left out, with safety, sum up to the tolerance at most."""
     decision = decide(PROBE, RIG, effects, tolerance)
@@ -51,7 +50,6 @@ def test_errors_never_exceed_the_tolerance(effects: list[MadeUp], tolerance: flo
 
 
 @given(made_up(), TOLERANCES, TOLERANCES)
-@settings(deadline=None)
 def test_larger_tolerance_never_costs_more(effects: list[MadeUp], one: float, other: float):
     """Whatever may be left out under a tolerance may be left out under a larger one."""
     strict, loose = (decide(PROBE, RIG, effects, tolerance) for tolerance in sorted((one, other)))
@@ -60,7 +58,6 @@ def test_larger_tolerance_never_costs_more(effects: list[MadeUp], one: float, ot
 
 
 @given(made_up(), TOLERANCES, st.randoms(use_true_random=False))
-@settings(deadline=None)
 def test_order_of_effects_changes_nothing(effects: list[MadeUp], tolerance: float, random):
     """Only the names tell effects apart; the decision keeps the order of the chain."""
     mixed = random.sample(effects, len(effects))
@@ -70,7 +67,6 @@ def test_order_of_effects_changes_nothing(effects: list[MadeUp], tolerance: floa
 
 
 @given(made_up())
-@settings(deadline=None)
 def test_tolerance_of_zero_computes_all_that_the_rig_has(effects: list[MadeUp]):
     """Exact and on, but for what is absent."""
     decision = decide(PROBE, RIG, effects, 0.0)
@@ -82,7 +78,6 @@ def test_tolerance_of_zero_computes_all_that_the_rig_has(effects: list[MadeUp]):
 
 
 @given(made_up())
-@settings(deadline=None)
 def test_infinite_tolerance_leaves_only_what_is_stored(effects: list[MadeUp]):
     """All that may be off is off."""
     on = [one.name for one in decide(PROBE, RIG, effects, math.inf).taken if one.is_on]
@@ -90,7 +85,6 @@ def test_infinite_tolerance_leaves_only_what_is_stored(effects: list[MadeUp]):
 
 
 @given(made_up(), TOLERANCES, st.data())
-@settings(deadline=None)
 def test_asking_by_name_switches_on_those_and_no_others(effects: list[MadeUp], tolerance: float, data):
     """Named ones are on in a variant within the tolerance, where the rig has them; the others are off."""
     known = [effect.name for effect in effects]
@@ -111,7 +105,6 @@ def enumerated_cost(effects: list[MadeUp], tolerance: float) -> float:
 
 
 @given(made_up(5), st.floats(1e-3, 5))
-@settings(deadline=None)
 def test_at_least_half_of_what_can_be_saved_is_saved(effects: list[MadeUp], tolerance: float):
     """The rule's worst case against an enumeration of all options."""
     decision = decide(PROBE, RIG, effects, tolerance)
