@@ -16,7 +16,7 @@ from prefect import flow
 
 from flows.publish.publishing import add_accuracy, clear_raw, publish
 from flows.settings.parameters import SurveySettings
-from flows.tasks.captures import capture_pass, captured_signal, plan_capture
+from flows.tasks.captures import capture_pass, captured_signal, first_mosaic, plan_capture
 from flows.tasks.open_survey import OpenSurvey, RunRef
 from flows.tasks.prefect_tasks import as_task
 from flows.tasks.stages.accuracy import evaluate
@@ -24,7 +24,7 @@ from flows.tasks.stages.attention import score
 from flows.tasks.stages.condense import condense_raster
 from flows.tasks.stages.effects import choose_effects
 from flows.tasks.stages.maps import ground, segment
-from flows.tasks.stages.placement import locate, rectify, rectify_fine, register_coarse, register_fine
+from flows.tasks.stages.placement import locate, rectify_fine, register_coarse, register_fine
 from storage.archive.keys import StageRef
 
 
@@ -74,7 +74,7 @@ def _draw_captured(plan: OpenSurvey) -> tuple[StageRef, StageRef]:
     effects = choose_effects(plan)
     signal = captured_signal(plan, "coarse", effects)
     seams = register_coarse(plan, signal) if plan.registers else None
-    mosaic = rectify(plan, signal, locate(plan, signal, seams), seams)
+    mosaic = first_mosaic(plan, signal, locate(plan, signal, seams), seams)
     request = score(plan, mosaic)
     if plan.goes_back(request):  # second pass
         signal = captured_signal(plan, "fine", request, effects)

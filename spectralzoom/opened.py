@@ -158,17 +158,13 @@ class OpenedRun:
 
     @property
     def mosaic(self) -> xarray.DataArray:
-        """(y, x, band) float32 values of the first pass, NaN where not captured; also indexed by ``wavelength``."""
+        """(y, x, band) float32 values of all passes, NaN where not captured; also indexed by ``wavelength``.
+
+        Spectra are restored from their components when they are used.
+        """
         return spectra.open_lazy_mosaic(self._place("mosaic"))
 
-    @property
-    def cube(self) -> xarray.DataArray:
-        """(y, x, band) float32 values in the finest captured pixels: of the fine pass, if there is one.
-
-        NaN where that pass captured nothing. Spectra are restored from their components when they are used.
-        """
-        name = "detail" if "detail" in self.receipt["products"] else "mosaic"
-        return spectra.open_lazy_mosaic(self._place(name))
+    cube = mosaic  # beside `lines`
 
     @property
     def lines(self) -> dict[str, xarray.DataArray]:

@@ -174,8 +174,7 @@ def _add_stores(export: Export) -> None:
     """Add the archive's own stores and the run's files to the catalogue."""
     run, root = export.run, export.run.archive.root
     titles = {
-        "mosaic": "Mosaic of the first pass or of a uniform scan",
-        "detail": "Mosaic of the fine sweeps",
+        "mosaic": "Mosaic of all passes",
         "class_map": "Class map and confidence on the camera's grid",
         "attention": "Score and rank of the patches",
         "ground_map": "Class map, picture and prior map, on the map",

@@ -54,6 +54,7 @@ def _publish(plan: OpenSurvey, *products: StageRef) -> RunRef:
     if judged and _accuracy_is_stored(plan):
         plan(evaluate.name, *plan.products.judged)
         judged = False
+    _clear_first_mosaic(plan)
     published = publish_run(plan)
     if judged:
         plan.observer.note(f"published: {published.folder}; accuracy follows")
@@ -91,6 +92,16 @@ def _clear_raw(plan: OpenSurvey, run: RunRef) -> RunRef:
     for raw in passes:
         archive.clear(raw, wait=False)
     return run
+
+
+def _clear_first_mosaic(plan: OpenSurvey) -> None:
+    """Clear the mosaic of the first pass, whose lines are in that of both passes."""
+    archive, first = plan.run.archive, plan.products.get("rectify")
+    if first is None or "rectify_fine" not in plan.products or plan.registers:  # fine sweeps are registered on it
+        return
+    runs = [] if plan.records["rectify"].state == "ran" else Catalogue.read(archive.root).runs
+    if not any(run.products.get("mosaic", "").startswith(first.uri) for run in runs):
+        archive.clear(first, wait=False)
 
 
 def _kept_by_others(plan: OpenSurvey, stage: str, raw: StageRef) -> str | None:

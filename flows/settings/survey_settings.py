@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal, cast
 from pydantic import PlainValidator
 
 from flows.settings.values import (
+    EXTENT_WHOLE,
     UNKNOWN_AUTO,
     UNKNOWN_OFF,
     Bands,
@@ -62,8 +63,10 @@ PATHS = (
     *("scene", "labels", "sweeps", "pointing", "dark", "white", "out", "mask", "weights"),
     *("zones.area", "zones.no_go", "zones.plots"),
 )
-ALWAYS: Literal["always"] = "always"  # value of the setting `zoom`
-AUTO, SIM, RIG, RASTER, RECORDED = "auto", "sim", "rig", "raster", "recorded"  # values of the setting `source`
+ALWAYS: Literal["always"] = "always"  # values of the setting `zoom`
+NEVER: Literal["never"] = "never"
+AUTO: Literal["auto"] = "auto"  # value of the settings `zoom` and `source`
+SIM, RIG, RASTER, RECORDED = "sim", "rig", "raster", "recorded"  # values of the setting `source`
 # settings and tables that only a camera has
 OF_A_CAMERA = (
     *("camera", "optics", "mirror", "detector", "air", "sky", "cost", "rig", *UNIFORM, "scan_exposure_ms"),
@@ -225,13 +228,14 @@ class Settings:
         " chosen by the policy",
         example=0.5,
     )
-    zoom: Literal["never", "always"] = stated(
-        "never", "Two-pass survey: every 4th or 8th line first, then the lines of highest expected gain"
+    zoom: Literal["auto", "never", "always"] = stated(
+        AUTO,
+        "Two-pass survey: every 4th or 8th line first, then the lines of highest expected gain; auto: with --seconds,"
+        " for fields of four swaths or more, if the weights' table of scans expects as much as of a uniform scan",
     )
     seconds: float | None = stated(
         None,
-        "Time budget of the capture; selects the uniform scan with the highest expected mIoU within it, or with --zoom"
-        " the two passes",
+        "Time budget of the capture; selects the uniform scan or the two passes with the highest expected mIoU",
         "s",
         0.1,
         1e6,
@@ -243,7 +247,12 @@ class Settings:
         example="92",
     )
     scan_step: int | None = stated(
-        None, "Line spacing of the uniform scan; with --zoom that of the first pass", "px", 1, MOST_STEP, example=2
+        None,
+        "Line spacing of the uniform scan; with --zoom always that of the first pass",
+        "px",
+        1,
+        MOST_STEP,
+        example=2,
     )
     scan_exposure_ms: float | None = stated(
         None, "Exposure of the uniform scan; default: the camera's", "ms", 0.5, 10_000, example=25.0
@@ -356,6 +365,14 @@ class Settings:
     def zooms(self) -> bool:
         """Return whether the field is captured in two passes."""
         return not self.is_map and (self.budget is not None or self.zoom == ALWAYS)
+
+    @property
+    def may_zoom(self) -> bool:
+        """Return whether the planner may choose two passes: a time budget is the only limit of the capture."""
+        others = (self.kept_bytes, self.macs, *(getattr(self, name) for name in UNIFORM if name != "seconds"))
+        free = self.seconds is not None and all(one is None for one in others)
+        whole = self.extent == EXTENT_WHOLE and not self.pointing_px
+        return self.zoom == AUTO and free and whole and self.source in (SIM, RIG)
 
     @property
     def undecided(self) -> bool:

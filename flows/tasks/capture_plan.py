@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings.survey_settings import RECORDED, Settings
+from flows.settings.survey_settings import ALWAYS, AUTO, NEVER, RECORDED, Settings
 from flows.settings.values import EXTENT_WHOLE, parse_extent_runs, parse_goals
 from models.weights.files import Description
 from pipeline.capture.recorded_passes import RecordedPasses
@@ -35,6 +35,10 @@ from pipeline.planning.uniform_scans import (
     uniform_scans,
 )
 from pipeline.rectify.registration.overlaps import LEAST_OVERLAP_PX
+
+
+LEAST_SWATHS = 4  # of a field on which two passes pay (docs/measurements/accuracy.md)
+NEARLY = 0.003  # of mIoU: expected scores that differ by less count as equal
 
 
 @dataclass(frozen=True)
@@ -250,15 +254,19 @@ def lay_out_passes(
     Returns layout, plan, settings that request exactly this plan, and notes. Without settings or a table, every line
     is captured. Raises what `PassLayout.plan` raises.
     """
-    chosen, content = scans.chosen, weights.record.get("scans")
-    if settings.zooms:
-        layout = replace(layout, first_step=settings.scan_step or FIRST_STEP, step=None)
-        if content is not None and settings.seconds is not None and settings.coarse_exposure_ms is None:
+    chosen, content, first = scans.chosen, weights.record.get("scans"), None
+    if content is not None and settings.seconds is not None and settings.coarse_exposure_ms is None:
+        if settings.zooms or zoom_may_pay(layout, scans, settings):
             record = ScanPerformance.read(content, settings.sky.fraction_of_clear)
             first = choose_first_pass(layout, record, settings.seconds)
-            if first is not None:
-                layout = replace(layout, first_step=first.step, coarse_exposure_ms=first.exposure_ms)
-                settings = replace(settings, coarse_exposure_ms=first.exposure_ms)
+    if settings.zoom == AUTO:
+        pays = first is not None and chosen is not None and first.expected >= chosen.expected[MIOU] - NEARLY
+        settings = replace(settings, zoom=ALWAYS if pays and not settings.zooms else NEVER)
+    if settings.zooms:
+        layout = replace(layout, first_step=settings.scan_step or FIRST_STEP, step=None)
+        if first is not None:
+            layout = replace(layout, first_step=first.step, coarse_exposure_ms=first.exposure_ms)
+            settings = replace(settings, coarse_exposure_ms=first.exposure_ms)
         settings = replace(settings, scan_step=None if settings.budget is not None else layout.first_step)
         return layout, layout.plan(settings.budget, settings.seconds), settings, ()
     if chosen is not None and layout.step is None:
@@ -269,6 +277,14 @@ def lay_out_passes(
     every = layout.uniform(1)
     note = "every line is captured: the weights have no record of scans to choose by"
     return every, every.plan(None), replace(settings, scan_step=1), (note,)
+
+
+def zoom_may_pay(layout: PassLayout, scans: ScanChoice, settings: Settings) -> bool:
+    """Return whether two passes may score more than the uniform scan: on wide fields, if the time limits it."""
+    if scans.chosen is None or not settings.may_zoom:
+        return False
+    best = max(one.expected[MIOU] for one in scans.offered)
+    return scans.chosen.expected[MIOU] < best - NEARLY and len(layout.sweeps()[2]) >= LEAST_SWATHS
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,10 @@ from flows.tasks.open_survey import OpenSurvey, RunRef
 from flows.tasks.prefect_tasks import as_task, current_observer, inside_flow
 from flows.tasks.run import SurveyRun, open_run
 from flows.tasks.scene import scene_of_visit
+from flows.tasks.stages.attention import score
 from flows.tasks.stages.capture import capture_coarse, capture_fine
 from flows.tasks.stages.condense import condense_coarse, condense_fine
+from flows.tasks.stages.placement import rectify
 from pipeline.errors import ArchiveError, IncompleteStoreError, NothingToMend, RigError, SettingsError
 from pipeline.lazy import deferred
 from storage.archive.keys import StageRef
@@ -119,6 +121,19 @@ def captured_signal(plan: OpenSurvey, sweeps: str, *inputs: StageRef) -> StageRe
     if archive.is_known(raw):
         plan.take_as_found(stage.name, raw, *inputs)
     return condense(plan, raw, *before)
+
+
+def first_mosaic(plan: OpenSurvey, *inputs: StageRef | None) -> StageRef:
+    """Return the mosaic of the first pass; one that was cleared after the second pass is not made again."""
+    archive, given = plan.run.archive, [ref for ref in inputs if ref is not None]
+    with suppress(IncompleteStoreError):  # an incomplete input is an error of the stage
+        mosaic = archive.ref(rectify.product.name, rectify.key(rectify.wants(plan.run, *given)))
+        cleared = archive.is_known(mosaic) and archive.find(mosaic.stage, mosaic.key) is None
+        request = score.find(archive, score.wants(plan.run, mosaic)) if cleared else None
+        if request is not None and plan.goes_back(request):
+            plan.take_as_found(rectify.name, mosaic, *given)
+            return mosaic
+    return rectify(plan, *given)
 
 
 def _captured_elsewhere(plan: OpenSurvey, sweeps: str, *inputs: StageRef) -> str:

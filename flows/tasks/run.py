@@ -472,6 +472,7 @@ def _plan_capture(
         extent_notes = (note,)
     scans = choose_uniform_scan(layout, described, path, bands, settings)
     layout, plan, settings, plan_notes = lay_out_passes(layout, scans, described, settings)
+    scans = replace(scans, chosen=None) if settings.zooms else scans
     settings = replace(settings, extent=layout.extent)
     return _PlannedCapture(settings, plan, scans, extent, (*plan_notes, *extent_notes))
 

@@ -36,7 +36,7 @@ NORTH_UP = Affine(0.05, 0, 534_257.65, 0, -0.05, 5_772_301.4)
 TURNED = Affine(0.0433, 0.025, 534_257.65, 0.025, -0.0433, 5_772_301.4)  # by 30 degrees
 ENVI_TURNED = (1, 1, 534_257.65, 5_772_301.4, 0.05, 0.05)
 EVERY_STORE = (
-    *("class_map", "class_probabilities", "mosaic", "detail", "attention"),
+    *("class_map", "class_probabilities", "mosaic", "attention"),
     *("raw_coarse", "raw_fine", "signal_coarse", "signal_fine"),
 )
 UNCOUNTED = ("rgb", "rare")  # rare spectra are found by their line and sample

@@ -35,7 +35,7 @@ RECORD = "registration.json"
 POINTING = Product("register", version=2, files=(RECORD,))
 GEOLOCATION = Product("locate", version=3, files=("geolocation.zarr",))
 MOSAIC = Product("rectify", version=5, files=("mosaic.zarr",))
-DETAIL = Product("rectify_fine", version=2, files=("mosaic.zarr",))
+MERGED = Product("rectify_fine", version=2, files=("mosaic.zarr",))
 MOSAIC_STEP = 0.5  # quantisation step, relative to the sweeps: resampled scores have less noise
 KERNEL_GAIN = 2.0  # greatest overshoot of the kernels
 
@@ -204,7 +204,7 @@ def rectify(
     return Wanted(build, params, [signal, geolocation, *_there(registration)])
 
 
-@stage("rectify_fine", "mosaic of all passes", DETAIL, named="detail")
+@stage("rectify_fine", "mosaic of all passes", MERGED)
 def rectify_fine(
     signal: StageRef,
     registration: StageRef | None = None,

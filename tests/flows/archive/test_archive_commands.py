@@ -156,16 +156,16 @@ def test_gc_keeps_what_surveys_name(archive: Path, capsys: pytest.CaptureFixture
 
 
 def test_verify_repairs_by_surveying_again(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A mosaic is broken: both surveys run again from their settings, wherever the archive now lies."""
-    (mosaic,) = Archive.open(archive).refs("rectify")
-    flip(mosaic.path / "mosaic.zarr/scores/c/0/0/0")
+    """What two surveys share is broken: both run again from their settings, wherever the archive now lies."""
+    (signal,) = Archive.open(archive).refs("condense")
+    flip(signal.path / "coarse-0.zarr/scores/c/0/0/0")
     content = _json(capsys, lambda: run_verify(archive, QUIET, as_json=True), FAILED)
-    assert [one["uri"] for one in content["problems"]] == [mosaic.uri]
-    assert "mosaic.zarr/scores" in content["problems"][0]["problem"]
+    assert [one["uri"] for one in content["problems"]] == [signal.uri]
+    assert "coarse-0.zarr/scores" in content["problems"][0]["problem"]
     assert len(content["surveys"]) == 2
     content = _json(capsys, lambda: run_verify(archive, QUIET, remake=True, as_json=True))
     assert content["repair"]["complete"]
-    assert content["repair"]["remade"] == [mosaic.uri]
+    assert content["repair"]["remade"] == [signal.uri]
     assert run_verify(archive, QUIET) == DONE
     assert "21 stores and runs are as published, out of 21" in capsys.readouterr().out
 
@@ -173,7 +173,7 @@ def test_verify_repairs_by_surveying_again(archive: Path, capsys: pytest.Capture
 def test_a_repair_that_could_do_some_of_it_says_so(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """What is not of the archive is left to people, and so is raw light of a rig: done in part."""
     opened = Archive.open(archive)
-    flip(opened.refs("rectify")[0].path / "lines.json")
+    flip(opened.refs("rectify_fine")[0].path / "lines.json")
     (archive / "stages" / "notes.txt").write_text("mine")
     content = _json(capsys, lambda: run_verify(archive, QUIET, as_json=True), FAILED)
     assert content["checked"] - content["whole"] == 1
@@ -182,7 +182,7 @@ def test_a_repair_that_could_do_some_of_it_says_so(archive: Path, capsys: pytest
     (archive / "stages" / "notes.txt").unlink()
     with opened.publish("ingest", "cube") as staged:
         (staged.path / "data.bin").write_bytes(b"light")
-    for path in (opened.refs("rectify")[0].path / "lines.json", archive / "stages/ingest/cube/data.bin"):
+    for path in (opened.refs("rectify_fine")[0].path / "lines.json", archive / "stages/ingest/cube/data.bin"):
         flip(path)
     content = _json(capsys, lambda: run_verify(archive, QUIET, remake=True, as_json=True), PARTLY)
     assert "restore them from a copy" in content["repair"]["hopeless"]["stages/ingest/cube"]

@@ -190,7 +190,7 @@ def test_the_catalogue_is_valid_and_leads_to_every_file(exports: list[Exported])
             assert (target / "zarr.json").is_file() if "zarr" in asset.media_type else target.is_file()
             assert asset.roles
         assert any(one.title.startswith("Raw sweep ") for one in item.assets.values() if "raw" in one.roles)
-    assert {"class_map", "mosaic_zarr", "detail_zarr", "receipt"} <= set(items[0].assets)
+    assert {"class_map", "mosaic_zarr", "receipt"} <= set(items[0].assets)
 
 
 def test_items_say_when_where_and_how(plain: Exported, posed: Exported) -> None:

@@ -101,12 +101,12 @@ def test_planning_leaves_an_archive_as_it_is(
 def test_only_what_differs_is_to_be_made(
     settings: Settings, archive: Path, make_weights: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Other weights leave the mosaic, a newer stage leaves what it was made of."""
+    """Other weights need the cleared mosaic of the first pass; a newer stage leaves what it was made of."""
     other = _plan(settings, archive, weights=str(make_weights(layers=2)))
-    assert (other["rectify"].state, other["score"].state) == ("cached", "to run")
-    be_version(monkeypatch, "rectify", 99)
+    assert [other[name].state for name in ("locate", "rectify", "score")] == ["cached", "to run", "to run"]
+    be_version(monkeypatch, "rectify_fine", 99)
     planned = _plan(settings, archive)
-    assert (planned["locate"].state, planned["rectify"].state) == ("cached", "to run")
+    assert [planned[name].state for name in ("rectify", "score", "rectify_fine")] == ["cached", "cached", "to run"]
 
 
 def test_a_field_beyond_this_machine_is_planned_without_drawing_it(
@@ -144,12 +144,12 @@ def test_a_plan_loads_neither_torch_nor_figures_nor_maps() -> None:
 
 def test_a_damaged_store_blocks_what_needs_it(settings: Settings, archive: Path, tmp_path: Path) -> None:
     """With the archive's own words; an archive that is a file is refused as a survey refuses it."""
-    store = Archive(archive).refs("rectify")[0]
+    store = Archive(archive).refs("rectify_fine")[0]
     (store.path / "lines.json").unlink()
     planned = _plan(settings, archive)
-    assert planned["rectify"].state == "blocked"
-    assert "verify --repair" in planned["rectify"].why
-    assert planned["score"].why == "waits for rectify"
+    assert planned["rectify_fine"].state == "blocked"
+    assert "verify --repair" in planned["rectify_fine"].why
+    assert planned["segment"].why == "waits for rectify_fine"
     (tmp_path / "file").write_text("no archive")
     with pytest.raises(ArchiveError, match="is a file"):
         _plan(settings, tmp_path / "file")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 from dataclasses import replace
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -30,12 +31,11 @@ ALL_PX = 96  # a halo that reaches over the whole field
 
 
 @pytest.fixture(scope="module")
-def surveyed(
-    tmp_path_factory: pytest.TempPathFactory, surveyed_png: Survey, flags_png: Flags
-) -> tuple[SurveyRun, Path]:
-    """A survey of scene.png, and the folder of its stages."""
+def surveyed(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey, flags_png: Flags) -> tuple[SurveyRun, Path]:
+    """A survey of scene.png that keeps the mosaic of the first pass, and the folder of its stages."""
     out = tmp_path_factory.mktemp("field") / "archive"
-    surveyed_png(out)
+    with mock.patch("flows.publish.publishing._clear_first_mosaic"):
+        survey_png(out)
     return open_run(load_settings(None, flags_png(out, budget="0.8"))), out / "stages"
 
 

@@ -139,7 +139,7 @@ def rot_mosaic(address: str) -> None:
     """Let a bit of the mosaic's numbers flip in the bucket."""
     archive = open_archive(address)
     assert isinstance(archive, ObjectArchive)
-    name = next(name for name in archive.objects.listing("stages/rectify") if "/scores/c/" in name)
+    name = next(name for name in archive.objects.listing("stages/rectify_fine") if "/scores/c/" in name)
     content = bytearray(archive.objects.read(name) or b"")
     content[100] ^= 1
     archive.objects.write(name, bytes(content))

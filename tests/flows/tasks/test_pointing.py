@@ -69,7 +69,7 @@ def test_sweeps_are_put_right_by_seams_and_on_the_mosaic(surveyed: tuple[dict[st
 def test_what_the_mirror_missed_is_told_and_detail_still_helps(surveyed: tuple[dict[str, Any], Path]) -> None:
     """Patches seen in part are counted, either pass has its row, and with patches the map is better than without."""
     receipt, archive = surveyed
-    detail = open_mosaic(archive / receipt["products"]["detail"])
+    detail = open_mosaic(archive / receipt["products"]["mosaic"])
     kinds, number = detail.captures() or ([], np.zeros(detail.shape))
     unseen = patch_pixels(SceneGrid(*detail.shape, 16, 1), np.array([step == 4 for _, step, _ in kinds])[number])
     unseen = unseen[json.loads((archive / receipt["products"]["plan"]).read_text())["patch_index"]]

@@ -74,7 +74,7 @@ def test_raw_is_stored_once_and_as_uint16(surveyed: tuple[Path, Published]) -> N
     assert [path for path in (root / "spool").rglob("*") if path.is_file()] == []
     raw = {path for path, _ in by_line}
     assert not [path for path, array in arrays if array.dtype == np.uint16 and path not in raw and path.name != "age"]
-    for kind in ("condense", "condense_fine", "rectify", "rectify_fine"):  # no derived array has every band of a pixel
+    for kind in ("condense", "condense_fine", "rectify_fine"):  # no derived array has every band of a pixel
         scores = [array for path, array in arrays if path.match(f"stages/{kind}/*/*.zarr/scores")]
         assert scores, kind
         assert all(array.shape[0] < by_line[0][1].shape[2] for array in scores), kind

@@ -93,7 +93,7 @@ def test_receipt_has_every_field(farm: Done) -> None:
     assert all(stage["wall_s"] > 0 and stage["peak_rss_bytes"] > 0 for stage in ran)
     for stage in ran:
         (manifest,) = farm.archive.glob(f"stages/*/{stage['key']}/manifest.json")
-        if not stage["name"].startswith("capture"):  # of which raw lines were cleared away since
+        if stage["name"] not in ("capture_coarse", "capture_fine", "rectify"):  # cleared away since
             assert stage["manifest_sha256"] == hashlib.sha256(manifest.read_bytes()).hexdigest()
     assert set(receipt["accuracy"]["controls"]) == {"gain", "entropy", "sobel", "random"}
     assert 0 <= receipt["accuracy"]["miou"] <= 1
@@ -124,7 +124,7 @@ def test_savings_add_up_and_ranks_follow_the_scores(farm: Done) -> None:
     assert savings["capture_s"]["done"] <= 0.9 * farm.receipt["field"]["camera_s"]["full_scan"] + 1e-9
     work = savings["multiply_adds"]
     assert work["done"] == sum(work[part] for part in ("overview", "score", "detail"))
-    attention, detail = farm.open("attention"), farm.open("detail")
+    attention, detail = farm.open("attention"), farm.open("mosaic")
     score, rank = attention["score"].values.ravel(), attention["rank"].values.ravel()
     chosen = np.flatnonzero(rank >= 0)
     y, x = (16 * int(place) for place in np.divmod(chosen[0], attention.sizes["patch_x"]))
@@ -160,7 +160,21 @@ def test_second_run_is_read_from_the_archive(survey_png: Any, surveyed_png: Any,
     archive = Archive.open(tmp_path)
     assert len(archive.runs()) == 2
     assert [finding.problem for finding in verify_archive(archive)] == [None] * (len(STAGES) + 2)
-    assert not [*tmp_path.glob("spool/*"), *tmp_path.glob("stages/capture/*/*.zarr")]  # raw lines were deleted
+    cleared = [
+        *tmp_path.glob("spool/*"),
+        *tmp_path.glob("stages/capture/*/*.zarr"),
+        *tmp_path.glob("stages/rectify/*/*"),
+    ]
+    assert {path.name for path in cleared} == {"manifest.json"}  # raw lines and the mosaic of the first pass
+
+
+def test_a_first_mosaic_that_another_run_publishes_stays(survey_png: Any, tmp_path: Path) -> None:
+    """A survey of the first pass alone has it as its mosaic; a longer one in the same archive leaves it there."""
+    alone = Done(survey_png(tmp_path, budget="0.45"), tmp_path)
+    survey_png(tmp_path)
+    assert np.isfinite(alone.open("mosaic")["scores"].values).all()
+    archive = Archive.open(tmp_path)
+    assert [finding.problem for finding in verify_archive(archive) if finding.problem] == []
 
 
 @pytest.mark.usefixtures("no_effects")
