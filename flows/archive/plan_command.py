@@ -162,6 +162,7 @@ def plan_content(settings: Settings) -> dict[str, Any]:
         "stages": [asdict(row) for row in planner.rows],
         "to_make": sum(row.state != "cached" for row in planner.rows),
         "refused": run.refused,  # why this machine would refuse the survey
+        "notes": list(run.notes),
         "scans": {
             "taken": as_figures(run.scans.chosen),
             "reference": as_figures(run.scans.reference),
@@ -190,6 +191,8 @@ def show_plan(content: dict[str, Any], console: Console) -> None:
         console.print("everything is stored: it would be published")
     if content["scans"]["candidates"]:
         console.print(scan_table(content["scans"]))
+    for note in content["notes"]:
+        console.print(f"note: {escape(note)}", soft_wrap=True)
     if content["refused"] is not None:
         console.print(f"[yellow]refused here[/]: {escape(content['refused'])}", soft_wrap=True)
 
@@ -305,9 +308,8 @@ def _score(run: SurveyRun) -> Estimate:
 
 def _kept(run: SurveyRun, captured: float) -> Estimate:
     pixels, bands = math.prod(run.scene.shape), len(run.scene.wavelength_nm)
-    seen = captured + (0 if run.plan.plain else pixels * bands * BYTES_PER_SAMPLE)  # the overview is a mosaic too
     is_farm = run.settings.scene in BUILT_IN_SCENES
-    kept = estimated_bytes(pixels, bands, seen, is_farm=is_farm, most=run.settings.kept_bytes)
+    kept = estimated_bytes(pixels, bands, captured, is_farm=is_farm, most=run.settings.kept_bytes)
     if run.settings.keep == KEEP_SIGNAL:
         return Estimate(kept, KEPT_FROM)
     return Estimate(kept + captured, f"{KEPT_FROM}, and raw lines as they are captured", at_most=True)

@@ -29,13 +29,13 @@ from pipeline.planning.uniform_scans import (
     UniformScan,
     choose_scan,
     exposures_between,
+    format_scan,
     longest_exposure,
     priced_scan,
     reference_scan,
     uniform_scans,
 )
 from pipeline.rectify.registration.overlaps import LEAST_OVERLAP_PX
-
 
 LEAST_SWATHS = 4  # of a field on which two passes pay (docs/measurements/accuracy.md)
 NEARLY = 0.003  # of mIoU: expected scores that differ by less count as equal
@@ -255,20 +255,27 @@ def lay_out_passes(
     is captured. Raises what `PassLayout.plan` raises.
     """
     chosen, content, first = scans.chosen, weights.record.get("scans"), None
-    if content is not None and settings.seconds is not None and settings.coarse_exposure_ms is None:
-        if settings.zooms or zoom_may_pay(layout, scans, settings):
-            record = ScanPerformance.read(content, settings.sky.fraction_of_clear)
+    if content is not None and (settings.zooms or zoom_may_pay(layout, scans, settings)):
+        record = ScanPerformance.read(content, settings.sky.fraction_of_clear)
+        if settings.seconds is not None and settings.coarse_exposure_ms is None:
             first = choose_first_pass(layout, record, settings.seconds)
+    notes = tuple[str, ...]()
     if settings.zoom == AUTO:
         pays = first is not None and chosen is not None and first.expected >= chosen.expected[MIOU] - NEARLY
         settings = replace(settings, zoom=ALWAYS if pays and not settings.zooms else NEVER)
+        if pays and first is not None and chosen is not None:
+            notes = (
+                f"two passes: {format_scan(first.step, first.exposure_ms)} first, then lines of the highest expected "
+                f"gain; expected mIoU {100 * first.expected:.1f} or more, one uniform scan {chosen.words} "
+                f"{100 * chosen.expected[MIOU]:.1f} (--zoom never)",
+            )
     if settings.zooms:
         layout = replace(layout, first_step=settings.scan_step or FIRST_STEP, step=None)
         if first is not None:
             layout = replace(layout, first_step=first.step, coarse_exposure_ms=first.exposure_ms)
             settings = replace(settings, coarse_exposure_ms=first.exposure_ms)
         settings = replace(settings, scan_step=None if settings.budget is not None else layout.first_step)
-        return layout, layout.plan(settings.budget, settings.seconds), settings, ()
+        return layout, layout.plan(settings.budget, settings.seconds), settings, notes
     if chosen is not None and layout.step is None:
         layout = replace(layout, step=chosen.step, exposure_ms=chosen.exposure_ms)
     settings = replace(settings, scan_step=layout.step, scan_exposure_ms=layout.exposure_ms)

@@ -137,7 +137,7 @@ def test_words_beside_the_code_concern_no_stage() -> None:
 
 @pytest.mark.parametrize("absent", [("condense_raster", "rectify"), ("rectify", "rectify_fine")])
 def test_every_stage_says_once_what_receipts_call_its_store(absent: tuple[str, ...]) -> None:
-    """No two stages of a survey or of a raster share a name in receipts, but for the mosaics of first and both passes."""
+    """No two stages share a name in receipts, but for the mosaics of the first pass and of both passes."""
     ran = [one for name, one in STAGES.items() if name not in absent]
     named = [one.addresses(StageRef(one.product.name, "abc", Path())) for one in ran]
     assert all(named)
