@@ -9,8 +9,6 @@ from dataclasses import Field, field, fields
 from functools import partial
 from typing import Any, Literal
 
-from pipeline.errors import SettingsError
-
 Source = Literal["", "measured", "data sheet", "assumed"]
 
 
@@ -61,12 +59,6 @@ def misfits(part: Any) -> Iterator[tuple[str, str]]:
         if isinstance(value, bool) or not low <= value <= high or (math.isinf(value) and not endless):
             words = format_number(low, high, item.metadata["json_schema_extra"]["unit"], endless=endless)
             yield item.name, f"must be {words}, got {value!r}"
-
-
-def check_stated(part: Any, place: str) -> None:
-    """Raise SettingsError for a dataclass with a number out of range or not finite; messages name it ``place.name``."""
-    for name, words in misfits(part):
-        raise SettingsError(f"{place}.{name} {words}")
 
 
 def numbers_of(item: object) -> Sequence[object]:

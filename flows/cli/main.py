@@ -32,7 +32,8 @@ def _run(arguments: list[str]) -> int:
         app = build_app(listed={" ".join(arguments[:1]), " ".join(arguments[:2])}.isdisjoint(VERBS))
         code = app(arguments, result_action="return_value", exit_on_error=False, print_error=False)
     except CycloptsError as error:
-        say(_usage(error))
+        what = str(error).partition(" Available commands:")[0].rstrip(".")  # the help lists all commands
+        say(f"{what}; see {' '.join(('spectralzoom', *(error.command_chain or ())))} --help")
         return SettingsError.exit_code
     except PipelineError as error:
         say(str(error))
@@ -53,12 +54,6 @@ def _run(arguments: list[str]) -> int:
         say(f"{type(error).__name__}: {error}; this is a defect of SpectralZoom: please report {file.name}")
         return 1
     return code if isinstance(code, int) else 0
-
-
-def _usage(error: CycloptsError) -> str:
-    """Return the message of a wrong command line, with the help to read."""
-    what = str(error).partition(" Available commands:")[0].rstrip(".")  # the help lists all commands
-    return f"{what}; see {' '.join(('spectralzoom', *(error.command_chain or ())))} --help"
 
 
 if __name__ == "__main__":

@@ -119,10 +119,9 @@ def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: Prio
     if not run.plan.plain:
         patch_index = np.zeros(run.grid.patch_shape, np.uint8)
         patch_index.ravel()[plan.patch_index] = 1
-        table = np.array([(0, 0, 0, 0), (*PATCH_RGB, 255)], np.uint8)
-        layers.append(
-            MapLayer("Captured again", layer_address(_on_field(run, patch_index)[thin, thin], table), opacity=0.6)
-        )
+        p, table = run.grid.patch, np.array([(0, 0, 0, 0), (*PATCH_RGB, 255)], np.uint8)
+        pixels = patch_index.repeat(p, axis=0).repeat(p, axis=1)[: run.grid.height, : run.grid.width]
+        layers.append(MapLayer("Captured again", layer_address(pixels[thin, thin], table), opacity=0.6))
     counts = np.bincount(shown.class_map.ravel(), minlength=256) / max(shown.class_map.size, 1)
     covered = [*counts[: len(shown.class_names)].tolist(), float(counts[len(shown.class_names) :].sum())]
     rows = [
@@ -169,12 +168,6 @@ def _ramp_address(values: NDArray[np.floating], most: float) -> str:
     known = np.isfinite(values)
     levels = np.rint(LEVELS * np.clip(np.where(known, values, 0) / (most or 1.0), 0, 1))
     return layer_address(np.where(known, levels, LEVELS + 1).astype(np.uint8), table)
-
-
-def _on_field(run: SurveyRun, patches: Bytes) -> Bytes:
-    """Return numbers of patches (row, column) on the pixels of the field (y, x)."""
-    p = run.grid.patch
-    return patches.repeat(p, axis=0).repeat(p, axis=1)[: run.grid.height, : run.grid.width]
 
 
 def block_of(sweep: Sweep, run: SurveyRun) -> tuple[int, int, int, int]:

@@ -77,11 +77,6 @@ class PatchExpectedErrors:
             self.pixels.sum(axis=(0, 1), dtype=np.float64) @ self.expected_error / self.pixels.sum(dtype=np.float64)
         )
 
-    def expected_wrong_pixels(self) -> Floats:
-        """Return the expected number of wrong pixels of each patch, (patch,)."""
-        found: Floats = self.pixels.sum(axis=1, dtype=np.float64) @ self.expected_error
-        return found
-
     def expected_gain(self, wrong_after: Floats) -> Floats:
         """Return the expected increase of the mean accuracy over classes by capturing each patch, (patch,) 0..1.
 

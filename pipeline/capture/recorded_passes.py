@@ -55,7 +55,8 @@ class RecordedPasses:
 
     def full_scan(self, planned: Sequence[Sweep]) -> list[Sweep]:
         """Return the full scan that savings are stated against: the recording's own, else the planned one."""
-        own = self._full_sweeps() if len(self._kinds) == 1 else []
+        every_line = [one.sweep for one in self.source.sweeps if one.sweep.step == one.sweep.binning == 1]
+        own = every_line if len(self._kinds) == 1 else []
         return self.served(planned) or own or list(planned)
 
     def first_pass(self, planned: Sequence[Sweep]) -> list[Sweep]:
@@ -91,10 +92,6 @@ class RecordedPasses:
     def _kinds(self) -> list[tuple[Axis, int, int]]:
         """Return axis, step and binning of the recorded sweeps, each once."""
         return sorted({(one.sweep.along, one.sweep.step, one.sweep.binning) for one in self.source.sweeps})
-
-    def _full_sweeps(self) -> list[Sweep]:
-        """Return the recorded sweeps with every line at full resolution."""
-        return [one.sweep for one in self.source.sweeps if one.sweep.step == one.sweep.binning == 1]
 
     def _on_recorded_swaths(self, planned: Sequence[Sweep]) -> list[Sweep]:
         """Return sweeps of the planned step and binning on every recorded swath, over its lines."""

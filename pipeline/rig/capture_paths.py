@@ -23,7 +23,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_scene, position_to_direction
 from pipeline.geometry.scan import Axis, Sweep, exposing, line_positions, memory_loads, sweep_positions
 from pipeline.rig.camera.camera_cubes import CapturedLines
-from pipeline.rig.device_settings import Pulses, check_prefix
+from pipeline.rig.device_settings import check_prefix
 from pipeline.rig.mirror_controller import MotionLog, wire_positions
 
 Floats = NDArray[Any]  # float64
@@ -228,11 +228,6 @@ def path_of(sweep: Sweep, lines: tuple[int, int], camera: LineCamera, *, trigger
     )
     rate_hz = sweep.positions * 1000 / exposing(camera, sweep).frame_ms
     return CapturePath(sweep, *lines, cells, middle, rate_hz, triggered)
-
-
-def can_trigger(pulses: Pulses, sweep: Sweep) -> bool:
-    """Return whether the pulses at the mirror's input step through this sweep: it needs one per position."""
-    return pulses == "position" or (pulses == "frame" and sweep.positions == 1)
 
 
 @dataclass(frozen=True)

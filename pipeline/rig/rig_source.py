@@ -29,15 +29,7 @@ from pipeline.geometry.mirror import STRAIGHT
 from pipeline.geometry.scan import Sweep, exposing
 from pipeline.rig.camera.camera_cubes import as_references
 from pipeline.rig.camera.camera_files import NOT_LOGGED_IN, Kept
-from pipeline.rig.capture_paths import (
-    REFERENCES,
-    CaptureRecord,
-    UnusableCaptureError,
-    can_trigger,
-    locate_lines,
-    next_path,
-    path_of,
-)
+from pipeline.rig.capture_paths import REFERENCES, CaptureRecord, UnusableCaptureError, locate_lines, next_path, path_of
 from pipeline.rig.capture_runner import CaptureJournal, CaptureRunner, Say, say_nothing
 from pipeline.rig.device_settings import SurveyRig
 from pipeline.rig.drivers import RigDevices
@@ -151,7 +143,8 @@ class RigSource:
                 before, reason = line, "its files end there"
                 held = self._journal.holding(sweep, line)
                 if held is None:
-                    triggered = can_trigger(self.rig.pulses, sweep)
+                    pulses = self.rig.pulses  # they step through the sweep if there is one per position
+                    triggered = pulses == "position" or (pulses == "frame" and sweep.positions == 1)
                     path = next_path(sweep, line, self.camera, vector_pairs=self.vector_pairs, triggered=triggered)
                     taken = runner.take(path)
                 else:

@@ -208,7 +208,6 @@ class LineCache:
 
     def __init__(self, most_bytes: int) -> None:
         self.most_bytes = most_bytes
-        self.reads = 0
         self.bytes_held = 0
         self._blocks: OrderedDict[_Key, _Block] = OrderedDict()
         self._lock = threading.Lock()
@@ -242,7 +241,6 @@ class LineCache:
                     raw = lines.read(rows.start, rows.stop)
                 with self._lock:
                     block.raw = raw
-                    self.reads += 1
                     self.bytes_held += raw.nbytes
                     for old, held in list(self._blocks.items()):  # the newest and those still being read stay
                         if self.bytes_held > self.most_bytes and old != key and held.raw is not None:

@@ -27,16 +27,7 @@ from pipeline.simulator.effects.counting import (
 )
 from pipeline.simulator.effects.effect import OFF, Effect, SweepBlock
 from pipeline.simulator.effects.lighting import BRDF, CLOUD, DRIFT, POLARISATION, VIGNETTING
-from pipeline.simulator.effects.line import (
-    BOXES,
-    FOLDED,
-    ROTATION,
-    SLIT,
-    SMEAR,
-    box_of,
-    folded_positions,
-    smeared_positions,
-)
+from pipeline.simulator.effects.line import BOXES, FOLDED, ROTATION, SLIT, SMEAR, box_of, smeared_positions
 from pipeline.simulator.effects.pointing import HYSTERESIS, JITTER, LAG, STAIRCASE, THERMAL_DRIFT
 from pipeline.simulator.effects.spectrometer import PRNU, RESPONSE, SMILE, STRAY_LIGHT, STRIPING
 from pipeline.simulator.optics.kernel_fit import Moments, fold
@@ -157,9 +148,8 @@ def _sampler(
     slit, smear, rotation = names
     views = sweep_views(rig, sweep, exact=rotation != OFF)
     together = Moments.together(moments, len(wavelength))
-    return SceneSampler(
-        fold(box_of(slit, rig), BOXES.get(slit, (1, 1)), folded_positions(sweep, smear), together), views
-    )
+    held = sweep.positions if smear == FOLDED else 1  # positions, 1 px apart, that the footprint itself holds
+    return SceneSampler(fold(box_of(slit, rig), BOXES.get(slit, (1, 1)), held, together), views)
 
 
 def sweep_views(rig: Rig, sweep: Sweep, *, exact: bool) -> RayViews:

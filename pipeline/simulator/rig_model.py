@@ -13,7 +13,7 @@ from typing import Literal
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, exposing
-from pipeline.setting_fields import assumed, check_stated, stated
+from pipeline.setting_fields import assumed, misfits, stated
 
 Coating = Literal["aluminium", "gold", "silver", "ideal"]  # ideal: reflects everything, at any angle
 Relief = Literal["flat", "step", "plane"]
@@ -145,7 +145,8 @@ class Rig:
             if not math.isfinite(value):
                 raise SettingsError(f"camera.{name} must be a finite number, got {value:g}")
         for place in ("optics", "mirror", "detector", "air", "sky"):
-            check_stated(getattr(self, place), place)
+            for name, words in misfits(getattr(self, place)):
+                raise SettingsError(f"{place}.{name} {words}")
         if self.sky.started is not None and self.sky.started.tzinfo is None:
             raise SettingsError(f"sky.started needs a time zone, got {self.sky.started}; add +00:00 for UTC")
 

@@ -154,7 +154,9 @@ def open_headwall_cube(folder: Path) -> CubeSource:
     Lines are missing between parts, and at the end of a file that is cut off. Empty parts are left out. Raises
     SceneError: a part cannot be used, parts differ in their frames, or too many lines are missing.
     """
-    headers, notes, opened = _headers(folder), list[str](), dict[int, EnviCube]()
+    files = ((_PART.fullmatch(entry.name), entry) for entry in folder.iterdir() if entry.suffix.lower() == ".hdr")
+    headers = dict(sorted((int(match[1]), entry) for match, entry in files if match is not None and entry.is_file()))
+    notes, opened = list[str](), dict[int, EnviCube]()
     if not headers:
         raise SceneError(
             f"{folder} is a folder, expected a file, a Zarr store, or a folder with raw_<frame> files of a Headwall "
@@ -271,9 +273,3 @@ def load_frame_index(path: Path) -> FrameIndex:
             return parse_frame_index(iter(lambda: file.readline(LONGEST_LINE), ""), path.name, str(path))
     except OSError as error:
         raise SceneError(f"{path} cannot be read: {error}; remove it to read the cube without times") from error
-
-
-def _headers(folder: Path) -> dict[int, Path]:
-    """Return the header of each part by its first frame, sorted."""
-    files = ((_PART.fullmatch(entry.name), entry) for entry in folder.iterdir() if entry.suffix.lower() == ".hdr")
-    return dict(sorted((int(match[1]), entry) for match, entry in files if match is not None and entry.is_file()))

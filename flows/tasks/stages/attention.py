@@ -137,7 +137,7 @@ def score(
 def gain_by_record(
     gains: PatchGains, mosaic: Path, second_pass: SecondPass, record: ScanPerformance, report: Report
 ) -> tuple[Scores, FinePlan]:
-    """Return the expected errors of the first pass, and the second pass with the most gain by the table of scans."""
+    """Return the expected wrong pixels of the first pass, and the second pass of the highest expected gain."""
     errors = gains.work.expected_errors(mosaic, gains.capture, report)
     class_names = gains.work.weights.load().class_names
 
@@ -146,7 +146,8 @@ def gain_by_record(
         iou = np.array([expected.get(name, expected[MIOU]) for name in class_names])
         return gains.within_zones(errors.expected_gain((1 - iou) / (1 + iou)))
 
-    return errors.expected_wrong_pixels(), second_pass.best(record, gain_of)
+    wrong: Scores = errors.pixels.sum(axis=1, dtype=np.float64) @ errors.expected_error  # pixels of each patch
+    return wrong, second_pass.best(record, gain_of)
 
 
 def all_seen(grid: SceneGrid, sweeps: Sequence[Sweep], camera: LineCamera, *, part: bool) -> FinePlan:

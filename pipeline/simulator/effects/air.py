@@ -82,14 +82,10 @@ def turbulence_px(rig: Rig) -> float:
     sqrt(lambda d) must not be much wider than D. Turbulence must be weak. Returns 0 without
     a distance; no way is longer than `FARTHEST_M`.
     """
-    metres = _way_m(rig)
+    metres = 0.0 if rig.distances_m is None else min(max(rig.distances_m), FARTHEST_M)
     aperture_m = rig.optics.aperture_mm * 1e-3 * _REST
     angle = math.sqrt(NEAR_POINTS * PLANE * rig.air.turbulence_cn2 * metres * aperture_m ** (-1 / 3))
     return angle / rig.camera.ifov_rad
-
-
-def _way_m(rig: Rig) -> float:
-    return 0.0 if rig.distances_m is None else min(max(rig.distances_m), FARTHEST_M)
 
 
 @dataclass(frozen=True)

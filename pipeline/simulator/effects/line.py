@@ -159,9 +159,4 @@ def smeared_positions(block: SweepBlock, variant: str) -> Floats:
     return block.middle[:, None]
 
 
-def folded_positions(sweep: Sweep, variant: str) -> int:
-    """Return the number of held positions that the footprint itself holds, 1 px apart along the scan."""
-    return sweep.positions if variant == FOLDED else 1
-
-
 ROTATION, SLIT, SMEAR = Rotation(), SlitBox(), Smear()
