@@ -259,9 +259,13 @@ class CaptureMap:
 Capture = LineSpec | CaptureMap
 
 
-def with_planes(columns: NDArray[np.floating], capture: Capture) -> NDArray[np.float32]:
-    """Append the planes of the capture to spectral features, (..., column) -> (..., column + 3)."""
-    planes = np.broadcast_to(capture.planes, (*columns.shape[:-1], len(PLANE_SCALES)))
+def with_planes(columns: NDArray[np.floating], capture: Capture, *, fainter: float = 1.0) -> NDArray[np.float32]:
+    """Append the planes of the capture to spectral features, (..., column) -> (..., column + 3).
+
+    ``fainter`` is a factor of the octaves by which exposures are shorter than the reference.
+    """
+    planes = capture.planes * np.array([fainter, 1, 1], np.float32)
+    planes = np.broadcast_to(planes, (*columns.shape[:-1], len(PLANE_SCALES)))
     return np.concatenate([columns, planes], axis=-1, dtype=np.float32)
 
 

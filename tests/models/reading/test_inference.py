@@ -12,6 +12,7 @@ from models.network.sizes import TOKEN_PX
 from models.network.spectral import LineSpec, with_planes
 from models.reading import inference
 from models.reading.inference import (
+    FAINTER,
     CoarsePass,
     CoarsePrediction,
     coarse_prediction_of_columns,
@@ -90,7 +91,10 @@ def test_chunks_do_not_show(tiny: Maker, most: int, monkeypatch: pytest.MonkeyPa
 @pytest.mark.parametrize("patch", [8, 32, 64])
 @pytest.mark.parametrize("origin", [(0, 0), (8, 40)])
 def test_a_region_is_drawn_as_training_saw_crops(tiny: Maker, patch: int, origin: tuple[int, int]):
-    """What is drawn is the composite that the loss of training is taken of, at the same places, by both captures."""
+    """What is drawn is the composite that the loss of training is taken of, at the same places, by both captures.
+
+    Exposures alone are told as fainter.
+    """
     weights = tiny(patch=patch)
     coarse_pass, fine = scene_columns(weights, 64, 128)
     moved, patch_index = replace(coarse_pass, origin=origin, capture=DARK), np.array([1, 0])
@@ -100,7 +104,7 @@ def test_a_region_is_drawn_as_training_saw_crops(tiny: Maker, patch: int, origin
     for (y, x), own in zip(coarse_pass.grid.patch_origin(patch_index), fine[patch_index], strict=True):
         detail[y : y + patch, x : x + patch] = own
     images = (
-        torch.from_numpy(with_planes(*one)).permute(2, 0, 1)[None]
+        torch.from_numpy(with_planes(*one, fainter=FAINTER)).permute(2, 0, 1)[None]
         for one in ((coarse_pass.columns, DARK), (detail, other))
     )
     model, numbers = weights.segmenter, torch.from_numpy(patch_index)[None]
