@@ -151,8 +151,8 @@ def run_verify(archive: str | Path, console: Console, *, remake: bool = False, a
 def contents(archive: Archive, now: datetime | None = None) -> dict[str, Any]:
     """Return the runs of an archive, newest last, and its stores by stage, oldest first."""
     catalogue, now = Catalogue.read(archive.root), now or datetime.now(UTC)
-    sizes = archive.all_sizes(catalogue)
-    kept, own = catalogue.kept_by_runs(sizes), catalogue.own_by_runs(sizes)
+    of_runs = (uri for run in catalogue.runs for uri in (run.uri, *run.names))  # also of stores that are missing
+    sizes = archive.sizes(sorted({*catalogue.stores, *of_runs}))
     stages: dict[str, list[dict[str, Any]]] = {}
     for store in sorted(catalogue.stores.values(), key=lambda store: (store.ref.stage, store.created, store.ref.key)):
         row = {
@@ -169,7 +169,12 @@ def contents(archive: Archive, now: datetime | None = None) -> dict[str, Any]:
     return {
         "archive": archive.name,
         "runs": [
-            _run_row(catalogue, run, kept[run.uri]) | {"own_bytes": own[run.uri], "age_s": _age_s(run.created, now)}
+            _run_row(catalogue, run, sum(sizes[uri] for uri in (run.uri, *run.names)))
+            | {
+                # would go with the run: its folder, and the stores that no other run needs
+                "own_bytes": sizes[run.uri] + sum(sizes[uri] for uri in run.names if len(catalogue.named_by(uri)) == 1),
+                "age_s": _age_s(run.created, now),
+            }
             for run in catalogue.runs
         ],
         "stages": stages,

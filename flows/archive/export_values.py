@@ -44,7 +44,16 @@ def write_areas(run: ExportedRun, path: Path) -> None:
     """Write the table with a row for each class; unknown values are empty."""
     path_of_map = run.path(run.map_product)
     names = tuple(open_image(path_of_map, "classes").about["class_names"])
-    pixels, confidence = _counted(path_of_map, len(names))
+    counts, sums, sure_pixels = np.zeros(256, np.int64), np.zeros(256), np.zeros(256, np.int64)
+    for (_, classes), (_, sure) in zip(
+        open_image(path_of_map, "classes").rows(), open_image(path_of_map, "confidence").rows(), strict=True
+    ):
+        counts += np.bincount(classes.ravel(), minlength=256)
+        known = np.isfinite(sure)
+        sums += np.bincount(classes[known], sure[known], 256)
+        sure_pixels += np.bincount(classes[known], minlength=256)
+    confidence = np.where(sure_pixels > 0, sums / np.maximum(sure_pixels, 1), np.nan)
+    pixels = counts[: len(names)]
     areas = hectares_of_classes(run.receipt)
     hectares = None if areas is None else np.array([areas.get(name, 0.0) for name in names], np.float64)
     fraction = pixels / max(pixels.sum(), 1) if hectares is None else hectares / (hectares.sum() or 1.0)
@@ -59,19 +68,6 @@ def write_areas(run: ExportedRun, path: Path) -> None:
         figures = [column[number] for column in (own, fraction, confidence, *estimate)]
         table.writerow([name, count, *(f"{value:.{DIGITS}g}" if np.isfinite(value) else "" for value in figures)])
     write_whole(path, text.getvalue())
-
-
-def _counted(path: Path, count: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return (class,) pixels and mean confidence of the exported map; NaN without any."""
-    pixels, sums, sure_pixels = np.zeros(256, np.int64), np.zeros(256), np.zeros(256, np.int64)
-    for (_, classes), (_, sure) in zip(
-        open_image(path, "classes").rows(), open_image(path, "confidence").rows(), strict=True
-    ):
-        pixels += np.bincount(classes.ravel(), minlength=256)
-        known = np.isfinite(sure)
-        sums += np.bincount(classes[known], sure[known], 256)
-        sure_pixels += np.bincount(classes[known], minlength=256)
-    return pixels[:count], np.where(sure_pixels > 0, sums / np.maximum(sure_pixels, 1), np.nan)[:count]
 
 
 @dataclass(frozen=True)

@@ -183,7 +183,14 @@ def show_plan(content: dict[str, Any], console: Console) -> None:
         for row in content["stages"]
     ]
     console.print(table(("stage", "state", "why"), rows, left=3, whole=("stage", "state")))
-    console.print(escape(format_field(content["field"])), soft_wrap=True)
+    figures = content["field"]
+    size = f"{' x '.join(map(format_count, figures['size_px']))} px"
+    told = [size, *(text for _, text in finding_rows({"field": figures}))]
+    if figures["ground_pixel_m"] is None:
+        told.append("no metres are known: a [pose], or a georeferenced scene, gives them and hectares an hour")
+    if figures["camera_s"] is None:
+        told.append("no camera: the pixels of the raster are taken as they are")
+    console.print(escape(f"field: {'; '.join(told)}"), soft_wrap=True)
     if content["to_make"]:
         console.print(f"{content['to_make']} stages to make")
         console.print(estimate_table(content["estimate"]))
@@ -214,17 +221,6 @@ def scan_table(scans: Mapping[str, Any]) -> Table:
     ]
     columns = ("uniform scan", "", "capture time", "bytes captured", "mIoU, about")
     return table(columns, cells, left=2, whole=columns)
-
-
-def format_field(figures: Mapping[str, Any]) -> str:
-    """Return the size of the field, and what gives metres where they are not known."""
-    size = f"{' x '.join(map(format_count, figures['size_px']))} px"
-    told = [size, *(text for _, text in finding_rows({"field": figures}))]
-    if figures["ground_pixel_m"] is None:
-        told.append("no metres are known: a [pose], or a georeferenced scene, gives them and hectares an hour")
-    if figures["camera_s"] is None:
-        told.append("no camera: the pixels of the raster are taken as they are")
-    return f"field: {'; '.join(told)}"
 
 
 # --- estimates --------------------------------------------------------------------------------------------------------

@@ -218,7 +218,12 @@ def _serve(fields: Sequence[ServedField], schedule: Any, limit: int) -> None:
                         _wait_for_server()
         raise KeyboardInterrupt
     finally:
-        _pause([one.name for one in fields])
+        try:
+            with get_client(sync_client=True) as client:
+                for one in fields:
+                    client.pause_deployment(client.read_deployment_by_name(f"survey/{one.name}").id)
+        except Exception as error:
+            _say(f"the schedules could not be paused ({type(error).__name__}); runs that are due start late")
 
 
 async def _run(deployments: Sequence[Any], limit: int, asked_to_stop: threading.Event) -> None:
@@ -237,16 +242,6 @@ async def _run(deployments: Sequence[Any], limit: int, asked_to_stop: threading.
 
     loop.add_signal_handler(signal.SIGTERM, stop)  # SIGINT may be ignored here
     await running
-
-
-def _pause(fields: Sequence[str]) -> None:
-    """Pause the schedules of the fields; report it where the server does not answer."""
-    try:
-        with get_client(sync_client=True) as client:
-            for name in fields:
-                client.pause_deployment(client.read_deployment_by_name(f"survey/{name}").id)
-    except Exception as error:
-        _say(f"the schedules could not be paused ({type(error).__name__}); runs that are due start late")
 
 
 def _prepare(fields: Sequence[str]) -> None:

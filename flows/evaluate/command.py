@@ -143,10 +143,11 @@ def _accuracy(content: dict[str, Any]) -> Table:
     columns = (*shared, "to all", "to random", "captured", "MACs")
     rows = []
     for row in content["rows"]:
+        spread = row["spread"] if row["spread"] is not None else row["draws_spread"]
         cells = (
             f"{row['policy']}{'*' if row['uses_labels'] else ''}",
             format_percent(row["fraction"]),
-            _miou(row),
+            format_points(row["miou"]) + ("" if spread is None else f" ±{100 * spread:.1f}"),
             format_points(row["pixel_accuracy"]),
             format_points(row["average_accuracy"]),
             f"{row['kappa']:.2f}",
@@ -157,11 +158,6 @@ def _accuracy(content: dict[str, Any]) -> Table:
         )
         rows.append([f"[dim]{cell}" if row["uses_labels"] else cell for cell in cells])
     return table(columns, rows, whole=columns)
-
-
-def _miou(row: dict[str, Any]) -> str:
-    spread = row["spread"] if row["spread"] is not None else row["draws_spread"]
-    return format_points(row["miou"]) + ("" if spread is None else f" ±{100 * spread:.1f}")
 
 
 def _classes(content: dict[str, Any]) -> Table:

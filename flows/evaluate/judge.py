@@ -158,7 +158,11 @@ def summarise(runs: Runs, class_names: Sequence[str], request: EvaluateRequest) 
         figures["captured_gain"] = bought / best if best > 0 else None
         figures["against_all"] = difference(row, whole, request)
         figures["against_random"] = difference(row, rows.get(("random", fraction)), request)
-        table.append(figures | {"cost": _cost(row, whole)})
+        cost = {}  # means of a frame, and their ratio to those of all patches
+        for name in COSTS:
+            done, full = (float(np.mean([one[name] for one in some.parts])) for some in (row, whole))
+            cost[name] = {"done": done, "ratio": done / full if full else None}
+        table.append(figures | {"cost": cost})
     named = dict(zip(class_names, support.tolist(), strict=True))
     return {"rows": table, "support": named}
 
@@ -182,15 +186,6 @@ def _accuracy(row: Row, class_names: Sequence[str]) -> Record:
         "per_class_iou": dict(zip(class_names, [_mean(column) for column in classes.T], strict=True)),
         "false_classes": {name: pixels for name, pixels in zip(class_names, false, strict=True) if pixels},
     }
-
-
-def _cost(row: Row, whole: Row) -> Record:
-    """Return the mean costs of a frame, and their ratio to those of all patches."""
-    found = {}
-    for name in COSTS:
-        done, full = (float(np.mean([one[name] for one in some.parts])) for some in (row, whole))
-        found[name] = {"done": done, "ratio": done / full if full else None}
-    return found
 
 
 def _mean(values: Sequence[float] | NDArray[np.float64]) -> float:

@@ -138,7 +138,12 @@ def _publish(survey: OpenSurvey, draft: RunDraft, plan: FinePlan, receipt: Recei
     if survey not in _DRAWN:
         _DRAWN[survey] = _draw(survey, plan, receipt)
     drawn = _DRAWN[survey]
-    quicklook = draw_quicklook(replace(drawn.shown, note=_note(run, receipt)))
+    accuracy, moment = receipt.get("accuracy"), run.settings.moment
+    notes = [] if moment is None else [f"day {moment[0]}, {moment[1]:g} h"]  # the end of the picture's title line
+    if accuracy is not None and accuracy["miou"] is not None:
+        where = " on a scene of the training" if "training_scene" in receipt else ""
+        notes.append(f"mIoU {100 * accuracy['miou']:.1f} %{where}")
+    quicklook = draw_quicklook(replace(drawn.shown, note="   ·   ".join(notes)))
     draft.write_file("quicklook.png", quicklook)
     if "plots" in receipt:
         draft.write_file(PLOTS_FILE, plots_csv(receipt["plots"]))
@@ -229,16 +234,6 @@ def _model_savings(run: SurveyRun, read: NDArray[np.intp]) -> dict[str, Any]:
         "patches": SavingEntry(len(read), len(run.grid.valid_patches())).as_dict(),
         "multiply_adds": {**SavingEntry(did.total, scan.total).as_dict(), **asdict(did)},
     }
-
-
-def _note(run: SurveyRun, receipt: Receipt) -> str:
-    """Return the end of the quicklook's title line: the moment of a simulated scene, and the accuracy."""
-    accuracy, moment = receipt.get("accuracy"), run.settings.moment
-    notes = [] if moment is None else [f"day {moment[0]}, {moment[1]:g} h"]
-    if accuracy is not None and accuracy["miou"] is not None:
-        where = " on a scene of the training" if "training_scene" in receipt else ""
-        notes.append(f"mIoU {100 * accuracy['miou']:.1f} %{where}")
-    return "   ·   ".join(notes)
 
 
 def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan) -> QuicklookData:

@@ -258,7 +258,12 @@ def _check_table(
         if value is None:
             continue
         if key not in declared:
-            raise SettingsError(f"unknown setting {place}{_hint(full, declared, prefix)}")
+            everywhere = [*SURVEY, *(f"{name}.{inner}" for name, keys in TABLES.items() for inner in keys)]
+            near = [name for name in everywhere if name.split(".")[-1] == key]
+            near = near or [prefix + name for name in difflib.get_close_matches(key, declared, n=1, cutoff=0.5)]
+            every = f"; known keys: {', '.join(prefix + name for name in declared)}"
+            hint = f"; did you mean '{near[0]}'?" if near else every
+            raise SettingsError(f"unknown setting {place}{hint}")
         if not prefix and key in TABLES:
             checked[key] = _parse_table(key, value, place, origin)
         else:
@@ -277,15 +282,6 @@ def _parse_table(key: str, value: object, place: str, origin: Mapping[str, str])
         return SURVEY[key].kind(**stated)
     except PoseError as error:
         raise SettingsError(f"[{key}]: {error}") from None
-
-
-def _hint(full: str, known: Mapping[str, Declared], prefix: str) -> str:
-    """Return the nearest known key of the table or of another table, else all keys of the table."""
-    everywhere = [*SURVEY, *(f"{name}.{key}" for name, keys in TABLES.items() for key in keys)]
-    short = full.removeprefix(prefix)
-    near = [name for name in everywhere if name.split(".")[-1] == short]
-    near = near or [prefix + key for key in difflib.get_close_matches(short, known, n=1, cutoff=0.5)]
-    return f"; did you mean '{near[0]}'?" if near else f"; known keys: {', '.join(prefix + key for key in known)}"
 
 
 def of_this_version(stored: Mapping[str, Any]) -> dict[str, Any]:

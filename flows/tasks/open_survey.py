@@ -165,7 +165,9 @@ class OpenSurvey:
         if built:
             self._written += bytes_below(self.run.archive.root / ref.uri)
         watch(stage, state, 1.0)
-        self.observer.log(self._summary(stage, ref))
+        record, title = self.records[stage], TITLES[stage]
+        took = "found" if record.wall_s is None else f"{record.wall_s:.1f} s"
+        self.observer.log(f"{title}: {took}, {(record.bytes_out or 0) / 1e6:.1f} MB, {ref.uri}")
         return ref
 
     def take_as_found(self, stage: str, ref: StageRef, *inputs: StageRef) -> None:
@@ -192,11 +194,6 @@ class OpenSurvey:
         """Return the bytes of stores and spools that were written since the last call."""
         taken, self._written = self._written + self.run.archive.take_spooled(), 0
         return taken
-
-    def _summary(self, stage: str, ref: StageRef) -> str:
-        record, title = self.records[stage], TITLES[stage]
-        took = "found" if record.wall_s is None else f"{record.wall_s:.1f} s"
-        return f"{title}: {took}, {(record.bytes_out or 0) / 1e6:.1f} MB, {ref.uri}"
 
 
 class _Meter:

@@ -111,10 +111,5 @@ class PatchBudget:
         return ranked[: bisect_right(counts, self._most, key=lambda count: self.operations_of(ranked[:count]))]
 
     @property
-    def most_patches(self) -> NDArray[np.intp]:
-        """Return the patches that the budget pays for if all have the same gain."""
-        return self.choose(np.full(math.prod(self.costs.grid.patch_shape), np.inf))
-
-    @property
     def _most(self) -> float:
         return limit_of(self.macs, self.everything)

@@ -336,7 +336,7 @@ class SurveyRun(CaptureRun):
     def likely_patches(self) -> NDArray[np.intp]:
         """Return as many patches as are expected to be read at full resolution, or as the budget pays for."""
         if self.budget is not None:
-            return self.budget.most_patches
+            return self.budget.choose(np.full(self.budget.costs.grid.patch_shape, np.inf).ravel())  # all gain the same
         cascade, every = self.cascade, self.kept_patches
         return every if cascade is None or self.least_gain is None else every[: round(cascade[1] * len(every))]
 

@@ -295,11 +295,14 @@ def draft_scene(address: str | Path, report: Report = lambda done, name: None) -
     source = with_wavelengths(open_cube(first), first, None)
     found, unseen = _shared_labels(found, source.shape[:2]), list[str]()
     classes = _classes(found, source.shape[2], unseen, report)
+    # one file may have the labels of all images; else names find them
+    of_all = set(found.labels.values())
+    label_path = os.path.relpath(of_all.pop(), folder) if len(of_all) == 1 and not found.bare else ""
     return SceneDraft(
         files=found,
         first=str(first),
         cube=source,
-        only_label=_only_label(found, folder),
+        only_label=Path(label_path).as_posix() if label_path and label_path.isprintable() else None,
         classes=classes,
         notes=(*series, *source.notes),
         unseen=tuple(unseen),
@@ -325,13 +328,6 @@ def _shared_labels(found: MatchedFiles, shape: tuple[int, ...]) -> MatchedFiles:
         if open_labels(found.alone[0]).shape[:2] == shape:
             return MatchedFiles(found.images, dict.fromkeys(found.images, found.alone[0]), ())
     return found
-
-
-def _only_label(found: MatchedFiles, folder: Path) -> str | None:
-    """Return the ``labels`` of a scene.toml if one file has the labels of all images; None if names find them."""
-    files = set(found.labels.values())
-    path = os.path.relpath(files.pop(), folder) if len(files) == 1 and not found.bare else ""
-    return Path(path).as_posix() if path and path.isprintable() else None
 
 
 def _classes(found: MatchedFiles, bands: int, unseen: list[str], report: Report) -> tuple[FoundClass, ...]:

@@ -71,16 +71,6 @@ def exposing(camera: LineCamera, sweep: Sweep) -> LineCamera:
     return camera if sweep.exposure_ms in (None, camera.exposure_ms) else replace(camera, exposure_ms=sweep.exposure_ms)
 
 
-def count_by_exposure(sweeps: Sequence[Sweep], camera: LineCamera) -> dict[LineCamera, tuple[int, int]]:
-    """Count lines and sweeps of each exposure, by the camera with that exposure, in order of capture."""
-    counts: dict[LineCamera, tuple[int, int]] = {}
-    for sweep in sweeps:
-        exposed = exposing(camera, sweep)
-        lines, count = counts.get(exposed, (0, 0))
-        counts[exposed] = lines + sweep.lines, count + 1
-    return counts
-
-
 @dataclass(frozen=True)
 class CostModel:
     """Capture time of a plan. Values are assumed until measured on a rig; settings name their source."""
@@ -98,8 +88,13 @@ class CostModel:
 
     def seconds(self, sweeps: list[Sweep], camera: LineCamera) -> float:
         """Return the time of the sweeps in the given order [s]: lines, set-ups, and reloads of the vector memory."""
+        counts: dict[LineCamera, tuple[int, int]] = {}
+        for sweep in sweeps:
+            exposed = exposing(camera, sweep)
+            lines, count = counts.get(exposed, (0, 0))
+            counts[exposed] = lines + sweep.lines, count + 1
         reloads = len(memory_loads(sweeps, self.vector_pairs))
-        return self.line_seconds(count_by_exposure(sweeps, camera)) + reloads * self.reload_s
+        return self.line_seconds(counts) + reloads * self.reload_s
 
     def line_seconds(self, counts: Mapping[LineCamera, tuple[int, int]]) -> float:
         """Return the time of so many lines and sweeps of each exposure, set-ups included [s]."""

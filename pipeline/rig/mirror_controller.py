@@ -275,11 +275,16 @@ class MirrorController(Closing):
                 self._greet()
             except DeadlinePassed:
                 LOG.info("%s does not answer in simple mode; it may be in pro mode", self.wire.port)
-                self._leave_pro()
+                with suppress(DeadlinePassed):  # it may have changed; the greeting shows
+                    # with a CRC: an earlier session may have had them checked
+                    ProLink(self.wire, with_crc=True).set(pro.go_simple(), "changing to simple mode")
+                self._greet()
             self.identity = Identity(*(ask_line(self.wire, request, read_text) for request in (ID, VERSION, SERIAL)))
             self._check_identity()
             try:
-                self._enter_pro()
+                with suppress(DeadlinePassed):  # it may have changed; the status shows
+                    ask_line(self.wire, GO_PRO_CRC if self.rig.with_crc else GO_PRO, read_done, "write")
+                self.status()
             except (DeadlinePassed, DeviceRefused) as error:
                 own, other = ("with", "without")[:: 1 if self.rig.with_crc else -1]
                 raise RigError(
@@ -292,17 +297,6 @@ class MirrorController(Closing):
             ask_line(self.wire, START, read_done)
         except DeviceRefused:  # the greeting ended a line that was begun before
             ask_line(self.wire, START, read_done)
-
-    def _leave_pro(self) -> None:
-        """Change to simple mode, by a frame with a CRC: an earlier session may have had them checked."""
-        with suppress(DeadlinePassed):  # it may have changed; the greeting shows
-            ProLink(self.wire, with_crc=True).set(pro.go_simple(), "changing to simple mode")
-        self._greet()
-
-    def _enter_pro(self) -> None:
-        with suppress(DeadlinePassed):  # it may have changed; the status shows
-            ask_line(self.wire, GO_PRO_CRC if self.rig.with_crc else GO_PRO, read_done, "write")
-        self.status()
 
     def _check_identity(self) -> None:
         """Raise RigError for another model than the settings expect, or than the documented ones."""

@@ -276,19 +276,15 @@ class Condenser:
             ratio[first : first + len(values)] = seen.residual / self.law.expected(seen.scores)
             report((first + len(values)) / count)
         rare = find_rare(ratio, self.law, self.false_alarm)
-        return CondensedSweep(np.argwhere(rare), self._residuals(lines, rare), int(np.isfinite(ratio).sum()))
-
-    def _residuals(self, lines: SweepLines, rare: NDArray[np.bool_]) -> NDArray[np.int32]:
-        """Return the (rare, band) residuals of rare spectra from their rounded scores; their lines are read again."""
-        found = [np.zeros((0, self.components.bands), np.int32)]
-        blocks = set((np.flatnonzero(rare.any(axis=1)) // BLOCK_LINES).tolist())
+        residuals = [np.zeros((0, self.components.bands), np.int32)]  # of rare spectra, from their rounded scores
+        blocks = set((np.flatnonzero(rare.any(axis=1)) // BLOCK_LINES).tolist())  # their lines are read again
         for first, values, valid in calibrated_blocks(lines, self.camera, blocks):
             here = rare[first : first + len(values)]
             scores = score_lines(values, valid, self.components).scores
             rounded = whole_steps(scores, self.step)[here] * np.float32(self.step)
             there = None if valid.ndim == 2 else valid[here]
-            found.append(residual_steps(values[here], rounded, self.components, there))
-        return np.concatenate(found)
+            residuals.append(residual_steps(values[here], rounded, self.components, there))
+        return CondensedSweep(np.argwhere(rare), np.concatenate(residuals), int(np.isfinite(ratio).sum()))
 
 
 def calibrated_blocks(

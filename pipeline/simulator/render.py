@@ -146,18 +146,14 @@ def _sampler(
     wavelength, normal = np.frombuffer(wavelengths), middle_normal(sweep, rig.camera)
     moments = [blur.moments(rig, wavelength, variant, normal) for blur, variant in blurs]
     slit, smear, rotation = names
-    views = sweep_views(rig, sweep, exact=rotation != OFF)
-    together = Moments.together(moments, len(wavelength))
-    held = sweep.positions if smear == FOLDED else 1  # positions, 1 px apart, that the footprint itself holds
-    return SceneSampler(fold(box_of(slit, rig), BOXES.get(slit, (1, 1)), held, together), views)
-
-
-def sweep_views(rig: Rig, sweep: Sweep, *, exact: bool) -> RayViews:
-    """Return views all over a sweep: the shape of a footprint varies smoothly between them."""
     whole = line_positions(replace(sweep, lines=max(sweep.lines, 1)), rig.camera)
     lines = np.linspace(0, len(whole) - 1, PROBES).round().astype(np.intp)
     slopes = np.linspace(-0.5, 0.5, PROBES) * rig.camera.samples * rig.camera.ifov_rad
-    return _tangents(whole[lines][:, None], slopes, exact=exact).flat()
+    # all over the sweep: the shape of a footprint varies smoothly between these views
+    views = _tangents(whole[lines][:, None], slopes, exact=rotation != OFF).flat()
+    together = Moments.together(moments, len(wavelength))
+    held = sweep.positions if smear == FOLDED else 1  # positions, 1 px apart, that the footprint itself holds
+    return SceneSampler(fold(box_of(slit, rig), BOXES.get(slit, (1, 1)), held, together), views)
 
 
 AIMS: tuple[Effect, ...] = (STAIRCASE, LAG, JITTER, HYSTERESIS, THERMAL_DRIFT, TURBULENCE)

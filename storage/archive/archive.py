@@ -32,7 +32,7 @@ from storage.archive.keys import (
     stage_key,
     store_at,
 )
-from storage.archive.lineage import Catalogue, rests_on
+from storage.archive.lineage import rests_on
 from storage.archive.manifests import (
     check_files,
     cleared_facts,
@@ -268,7 +268,11 @@ class Archive:
 
         In a bucket also incomplete uploads that are older than ``keep_days``.
         """
-        spools = [path for path in self.root.glob("spool/*") if self._is_published(path.name)]
+        spools = [
+            path
+            for path in self.root.glob("spool/*")
+            if any(try_manifest(store)[1] is None for store in self.root.glob(f"stages/*/{path.name}"))
+        ]
         parts = [*self.root.glob(f"stages/*/*{PART_SUFFIX}"), *self.root.glob(f"runs/*{PART_SUFFIX}")]
         found: dict[str, int] = {}
         for path in sorted((*parts, *spools)):
@@ -287,9 +291,6 @@ class Archive:
             remove_tree(path)
             release()
         return not path.exists()
-
-    def _is_published(self, key: str) -> bool:
-        return any(try_manifest(store)[1] is None for store in self.root.glob(f"stages/*/{key}"))
 
     def _lock_of(self, path: Path) -> Path:
         kind = "capture" if path.parent.name == "spool" else path.parent.name
@@ -310,12 +311,6 @@ class Archive:
     def kept_bytes(self, run: Run) -> int:
         """Return the bytes kept for a run: its folder, the stores that it names, and their inputs, with manifests."""
         return sum(self.sizes([run.uri, *run.names]).values())
-
-    def all_sizes(self, catalogue: Catalogue) -> dict[str, int]:
-        """Return the bytes of every store and run, by address; missing stores that a run names are included."""
-        return self.sizes(
-            sorted({*catalogue.stores, *(uri for run in catalogue.runs for uri in (run.uri, *run.names))})
-        )
 
     def take_moved(self) -> int:
         """Return the bytes transferred to and from a bucket since the last call."""

@@ -79,20 +79,6 @@ class Catalogue:
                 found.setdefault(uri, []).append(run)
         return found
 
-    def kept_by_runs(self, sizes: Mapping[str, int]) -> dict[str, int]:
-        """Return `Archive.kept_bytes` of all runs, by address; ``sizes`` are of `Archive.all_sizes`."""
-        return {run.uri: sum(sizes[uri] for uri in (run.uri, *run.names)) for run in self.runs}
-
-    def own_by_runs(self, sizes: Mapping[str, int]) -> dict[str, int]:
-        """Return the bytes that would go with each run: its folder, and the stores that no other run needs.
-
-        ``sizes`` are of `Archive.all_sizes`.
-        """
-        return {
-            run.uri: sizes[run.uri] + sum(sizes[uri] for uri in run.names if len(self.named_by(uri)) == 1)
-            for run in self.runs
-        }
-
     def roles(self, uri: str) -> set[str]:
         """Return the names that runs give the stage of a store, such as capture_fine."""
         return self._roles.get(uri.rpartition("/")[2], set())

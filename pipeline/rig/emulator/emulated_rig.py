@@ -87,14 +87,16 @@ class SceneView:
         planned = sweep_positions(sweep, rig.camera)[number]
         wired = wire_positions(planned.reshape(-1, 2), self.mounting).reshape(planned.shape)
         as_planned = (held.astype(np.float32) == wired).all(axis=(1, 2))
-        raw = []
+        source, raw = self.source, []
+        known = source.clock is not None and sweep.name in source.clock
+        started_s = source.started_s(sweep) if known else started_s
         for run in _runs(number, as_planned):
             lines = range(int(number[run][0]), int(number[run][-1]) + 1)
-            choice = self.source.choice
+            choice = source.choice
             if not as_planned[run][0]:
                 aim = OffPlanAim(self._place(position[run]) - self._place(planned[run]), lines.start)
                 choice = Choice(((aim, "exact"), *choice.effects))
-            raw.append(self._render(rig, choice, sweep, lines, started_s))
+            raw.append(render_lines(source.scene, rig, choice, sweep, lines, seed=source.seed, started_s=started_s))
         return np.concatenate(raw)
 
     def numbers(self, sweep: Sweep, position: Floats) -> Ints:
@@ -129,12 +131,6 @@ class SceneView:
         rate = max(camera.max_rate_hz, 1000 / period)
         changed = replace(camera, exposure_ms=exposure, readout_ms=period - exposure, max_rate_hz=rate)
         return replace(self.source.rig, camera=changed)
-
-    def _render(self, rig: Rig, choice: Choice, sweep: Sweep, lines: range, started_s: float) -> Raw:
-        source = self.source
-        known = source.clock is not None and sweep.name in source.clock
-        started_s = source.started_s(sweep) if known else started_s
-        return render_lines(source.scene, rig, choice, sweep, lines, seed=source.seed, started_s=started_s)
 
 
 def _runs(number: Ints, alike: NDArray[np.bool_]) -> Iterator[slice]:

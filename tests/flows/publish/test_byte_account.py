@@ -54,16 +54,16 @@ def published(survey_png: Survey, tmp_path: Path) -> Published:
     return survey_png(tmp_path / "archive", accuracy=False)
 
 
-@pytest.mark.parametrize("keep", ["raw", "signal"])
+@pytest.mark.parametrize(("keep", "budget"), [("raw", "0.45"), ("signal", "0.8")])
 def test_the_account_of_a_survey_is_what_lies_in_its_folders(
-    spooled: list[int], survey_png: Survey, tmp_path: Path, keep: str
+    spooled: list[int], survey_png: Survey, tmp_path: Path, keep: str, budget: str
 ) -> None:
     """Kept and written by walking the archive, captured by the lines; nothing is moved.
 
-    Raw lines that are cleared after the publication are written and not kept.
+    Raw lines that are cleared after the publication are written and not kept, and so is the mosaic of a first pass.
     """
     root = tmp_path / "archive"
-    published = survey_png(root, accuracy=False, keep=keep)
+    published = survey_png(root, accuracy=False, keep=keep, budget=budget)
     account = told(published.folder)
     assert account == published.receipt["data_bytes"]
     cleared = [root / "stages" / "capture"] if keep == "signal" else []
