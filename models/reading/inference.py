@@ -37,7 +37,7 @@ else:
     torch = deferred("torch")
 
 ROWS_DRAWN = 64  # at once
-# Factor of the octaves by which exposures are told to be shorter than the reference. The network then relies more on
+# Factor of the octaves by which exposures are stated to be shorter than the reference. The network then relies more on
 # the surroundings of a pixel: up to 1.2 points more on scans of 4 ms (docs/measurements/accuracy.md).
 FAINTER = 1.4
 

@@ -1,4 +1,4 @@
-"""What it brings to tell the network that short exposures are fainter than they are: factors of the octaves.
+"""What it brings to state short exposures as fainter than they are: factors of the octaves.
 
 Farms 51 to 53 chose the factor `FAINTER`; farms 41 to 43 and 0, which no training saw, check it.
 """

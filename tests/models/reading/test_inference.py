@@ -93,7 +93,7 @@ def test_chunks_do_not_show(tiny: Maker, most: int, monkeypatch: pytest.MonkeyPa
 def test_a_region_is_drawn_as_training_saw_crops(tiny: Maker, patch: int, origin: tuple[int, int]):
     """What is drawn is the composite that the loss of training is taken of, at the same places, by both captures.
 
-    Exposures alone are told as fainter.
+    Exposures alone are stated as fainter.
     """
     weights = tiny(patch=patch)
     coarse_pass, fine = scene_columns(weights, 64, 128)
