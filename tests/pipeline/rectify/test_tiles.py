@@ -135,7 +135,7 @@ def test_a_block_of_lines_is_read_once_down_a_column(kind: type[Taken]) -> None:
         for tile in tiles:
             mosaic_tile(placed, CAMERA, grid, tile.rows, tile.columns, cache=cache, reach=tile.reach)
             assert cache.bytes_held <= cache.most_bytes
-        assert len(lines.asked) == len(set(lines.asked)) == cache.reads > 1
+        assert len(lines.asked) == len(set(lines.asked)) > 1
 
 
 @pytest.mark.parametrize("kind", [Taken, Cropped])
