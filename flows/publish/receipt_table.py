@@ -119,14 +119,14 @@ def shown_accuracy(receipt: Mapping[str, Any]) -> Mapping[str, Any] | None:
 def headline(receipt: Receipt, captured_again: float | None = None) -> str:
     """Return the score, the capture time and the fraction of the field captured again, as plain sentences.
 
-    ``captured_again`` is the fraction of the field that was captured in detail, 0..1; None leaves it out.
+    ``captured_again`` is the fraction of the field that was captured again, 0..1; None leaves it out.
     """
     sentences = [format_score(receipt)]
     if (capture := receipt["savings"].get("capture_s")) is not None:
         done, full = (format_seconds(capture[name]) for name in ("done", "full"))
         sentences.append(f"Capture time: {done} ({format_percent(capture['ratio'])} of the reference, {full}).")
     if captured_again is not None:
-        sentences.append(f"Captured again at full resolution: {format_percent(captured_again)} of the field.")
+        sentences.append(f"Captured again: {format_percent(captured_again)} of the field.")
     return " ".join(sentences)
 
 

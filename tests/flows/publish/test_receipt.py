@@ -145,7 +145,7 @@ def test_maps_without_the_prior_map_are_not_compared() -> None:
     for why in (None, "turned"):
         receipt["memory"] = {"put_aside": why}
         text = render_report(receipt, b"")
-        told = [words in text for words in ("coarse pass alone", "by random", "recovered", ">full resolution every")]
+        told = [words in text for words in ("overview alone", "by random", "recovered", ">full resolution every")]
         assert told == 4 * [why is not None]
         assert ("the overview alone gives" in format_score(receipt)) == (why is not None)
 
@@ -222,7 +222,7 @@ def test_headline_is_one_paragraph_with_the_figures():
     assert headline(make_receipt(), 0.23) == (
         "mIoU 75.0 of 100 against the labels (93.4 % of pixels correct). Its worst class is bare weed with 60.0: the"
         " overview alone gives 20.0, a full reading 80.0. Capture time: 104 s (50 % of the reference, 209 s). Captured"
-        " again at full resolution: 23 % of the field."
+        " again: 23 % of the field."
     )
     assert "labels (" not in headline(make_receipt(labels=False))
 
