@@ -1,6 +1,6 @@
 """What it brings to state short exposures as fainter than they are: factors of the octaves.
 
-Farms 51 to 53 chose the factor `FAINTER`; farms 41 to 43 and 0, which no training saw, check it.
+Farms 51 to 53 chose the factor `FAINTER`; farms 0 and 41 to 43 check it.
 """
 
 from __future__ import annotations
