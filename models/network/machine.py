@@ -18,7 +18,8 @@ else:
 Device = Literal["auto", "cpu", "cuda", "mps"]
 Present = Literal["cpu", "cuda", "mps"]
 PROCESSOR: Present = "cpu"
-KEPT = ((-3, 2**30), (-1, 2**31 - 1), (-2, 2**26))  # mallopt: mmap threshold, trim threshold, top pad [bytes]
+# mallopt: mmap threshold, trim threshold, top pad [bytes]; one arena, since threads' own keep what they freed
+KEPT = ((-3, 2**30), (-1, 2**31 - 1), (-2, 2**26), (-8, 1))
 
 
 def choose_device(asked: str) -> Present:
