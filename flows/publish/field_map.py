@@ -12,7 +12,7 @@ from matplotlib.colors import to_rgba
 from numpy.typing import NDArray
 from PIL import Image
 
-from flows.publish.panels import UNLABELLED_COLOUR, data_address, webp
+from flows.publish.panels import UNLABELLED_COLOUR, data_address, thinned, webp
 from flows.publish.quicklook import QuicklookData, colours_of
 from flows.publish.receipt import Receipt
 from flows.publish.receipt_table import format_days
@@ -27,7 +27,6 @@ from storage.arrays.class_maps import ProbabilityStore
 from storage.arrays.layout import open_group, read_array
 from storage.arrays.quicklooks import choose_bands
 
-MOST_PX = 2048  # of a map's longer side; larger maps are subsampled
 QUALITY = 80  # of a photograph as WebP
 LEVELS = 50  # of a colour ramp; the next number is transparent
 DIFFERS_RGB, PATCH_RGB = (196, 38, 46), (0, 190, 200)
@@ -88,32 +87,31 @@ def prior_map(prior: Prior | None, drawn: StageRef, receipt: Receipt) -> PriorMa
 
 def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: PriorMapField | None) -> FieldMap:
     """Return the map of a run; ``shown`` are the data of its quicklook."""
-    height, width = shown.class_map.shape
-    thin = slice(None, None, -(-max(height, width) // MOST_PX))
+    thin = thinned(shown.class_map)
     palette = palette_bytes(shown.class_colours)
 
     def classes(image: NDArray[np.integer]) -> str:
-        return layer_address(image[thin, thin].astype(np.uint8), palette)
+        return layer_address(image[thin].astype(np.uint8), palette)
 
     title = choose_bands(shown.wavelength_nm)[1].capitalize()
     colours = np.rint(255 * colours_of(shown, shown.rectified)).astype(np.uint8)
-    photo = webp(Image.fromarray(np.ascontiguousarray(colours[thin, thin])), quality=QUALITY)
+    photo = webp(Image.fromarray(colours), quality=QUALITY)
     layers = [MapLayer(title, data_address(photo), shown=True)]
     layers.append(MapLayer("Class map", classes(shown.class_map), shown=True))
     if shown.confidence is not None:
-        layers.append(MapLayer("Confidence, dark 0 to bright 1", _ramp_address(shown.confidence[thin, thin], 1.0)))
+        layers.append(MapLayer("Confidence, dark 0 to bright 1", _ramp_address(shown.confidence, 1.0)))
     errors = None
     if shown.truth is not None:
         layers.append(MapLayer("Truth", classes(shown.truth)))
-        errors = error_address(shown.class_map[thin, thin], shown.truth[thin, thin])
+        errors = error_address(shown.class_map[thin], shown.truth[thin])
         layers.append(MapLayer("Errors: map and truth differ", errors, opacity=0.8))
     if before is not None:
         layers.append(MapLayer(f"Before: {format_days(before.days)}", classes(before.classes)))
         oldest = float(np.nanmax(before.age_days)) if np.isfinite(before.age_days).any() else 0.0
-        ages = _ramp_address(before.age_days[thin, thin], oldest)
+        ages = _ramp_address(before.age_days[thin], oldest)
         layers.append(MapLayer(f"Days since it was captured, 0 to {oldest:.2g}", ages, opacity=0.8))
     if shown.was is not None:
-        differs = (shown.was[thin, thin] != UNLABELLED).astype(np.uint8)
+        differs = (shown.was[thin] != UNLABELLED).astype(np.uint8)
         table = np.array([(0, 0, 0, 0), (*DIFFERS_RGB, 255)], np.uint8)
         layers.append(MapLayer("Captured and differing", layer_address(differs, table), opacity=0.8))
     if not run.plan.plain:
@@ -121,7 +119,7 @@ def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: Prio
         patch_index.ravel()[plan.patch_index] = 1
         p, table = run.grid.patch, np.array([(0, 0, 0, 0), (*PATCH_RGB, 255)], np.uint8)
         pixels = patch_index.repeat(p, axis=0).repeat(p, axis=1)[: run.grid.height, : run.grid.width]
-        layers.append(MapLayer("Captured again", layer_address(pixels[thin, thin], table), opacity=0.6))
+        layers.append(MapLayer("Captured again", layer_address(pixels[thin], table), opacity=0.6))
     counts = np.bincount(shown.class_map.ravel(), minlength=256) / max(shown.class_map.size, 1)
     covered = [*counts[: len(shown.class_names)].tolist(), float(counts[len(shown.class_names) :].sum())]
     rows = [
@@ -133,7 +131,7 @@ def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: Prio
         for name, fraction, colour in zip((*shown.class_names, "no class"), covered, palette, strict=False)
         if fraction
     ]
-    return FieldMap((width, height), layers, rows, errors)
+    return FieldMap((shown.class_map.shape[1], shown.class_map.shape[0]), layers, rows, errors)
 
 
 def error_address(class_map: NDArray[np.integer], labels: NDArray[np.integer]) -> str:

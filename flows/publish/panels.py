@@ -22,6 +22,7 @@ from storage.arrays.mosaics import Mosaic
 from storage.arrays.quicklooks import stretch
 
 COLOURS = 256  # of a PNG
+MOST_PX = 2048  # of a picture's longer side; larger fields are subsampled
 GROUND_IN, GROUND_DPI, GROUND_MOST_PX = 9.0, 130, 1200
 INK = "#22241f"
 MUTED = "#6a6d64"
@@ -38,6 +39,11 @@ STYLE: Any = {
     "savefig.facecolor": "#fbfaf7",
 }
 UNLABELLED_COLOUR = (0.86, 0.86, 0.84)
+
+
+def thinned(image: NDArray[np.generic]) -> tuple[slice, slice]:
+    """Return the rows and columns of a (y, x) field that pictures show."""
+    return (slice(None, None, -(-max(image.shape) // MOST_PX)),) * 2
 
 
 def png(figure: Figure, exact: ArrayLike = ()) -> bytes:

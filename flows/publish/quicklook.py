@@ -17,7 +17,17 @@ from matplotlib.patches import Patch, Rectangle
 from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 from numpy.typing import NDArray
 
-from flows.publish.panels import MUTED, STYLE, UNLABELLED_COLOUR, class_palette, class_rgb, grey_of, outline, png
+from flows.publish.panels import (
+    MUTED,
+    STYLE,
+    UNLABELLED_COLOUR,
+    class_palette,
+    class_rgb,
+    grey_of,
+    outline,
+    png,
+    thinned,
+)
 from flows.terminal.figures import format_percent
 from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.quicklooks import choose_bands, develop, stretch
@@ -35,7 +45,7 @@ class QuicklookData:
     seed: int
     about: str  # how the field was captured
     policy: str | None  # of the choice of patches; None where all are segmented at full resolution
-    rectified: NDArray[np.floating]  # (y, x, band), NaN where nothing was captured
+    rectified: NDArray[np.floating]  # (y, x, band) of the pixels `thinned`, NaN where nothing was captured
     wavelength_nm: NDArray[np.floating]  # (band,)
     score: NDArray[np.floating]  # (row, column) of the padded grid's patches; NaN or -inf without a score
     patch_px: int
@@ -45,7 +55,7 @@ class QuicklookData:
     class_names: tuple[str, ...]
     class_colours: NDArray[np.integer]  # (class, 3) 0..255
     truth: NDArray[np.integer] | None = None  # (y, x), 255 unlabelled
-    confidence: NDArray[np.floating] | None = None  # (y, x) 0..1, shown without labels
+    confidence: NDArray[np.floating] | None = None  # (y, x) 0..1 of the pixels `thinned`, shown without labels
     note: str = ""  # at the end of the title line, such as the accuracy
     changed: bool = False  # ``score`` is the fraction of a patch's pixels that the full network changed, NaN elsewhere
     scan: bool = False  # a uniform scan
@@ -91,14 +101,14 @@ def _compose(data: QuicklookData) -> Figure:
 def _draw_rectified(axes: Axes, data: QuicklookData) -> None:
     """Draw the field; for a revisit the field in grey, with the present classes of differing pixels."""
     if data.was is not None:
-        changed = data.was != UNLABELLED
+        changed = data.was[thinned(data.was)] != UNLABELLED
         grey = np.repeat((0.25 + 0.6 * grey_of(data.rectified))[..., None], 3, axis=-1)
-        classes = class_rgb(data.class_map, class_palette(data.class_colours))
-        _show(axes, np.where(changed[..., None], classes, grey).astype(np.float32), interpolation="nearest")
-        words = f"{np.count_nonzero(changed)} px captured now differ from {data.days:.3g} days before"
+        classes = class_rgb(data.class_map[thinned(data.class_map)], class_palette(data.class_colours))
+        _show(axes, data, np.where(changed[..., None], classes, grey).astype(np.float32), interpolation="nearest")
+        words = f"{np.count_nonzero(data.was != UNLABELLED)} px captured now differ from {data.days:.3g} days before"
         return _caption(axes, "1  Differing", words)
     _, words = choose_bands(data.wavelength_nm)
-    _show(axes, colours_of(data, data.rectified))
+    _show(axes, data, colours_of(data, data.rectified))
     return _caption(axes, "1  Raster" if data.raster else "1  Rectified", words)
 
 
@@ -117,10 +127,10 @@ def _draw_attention(axes: Axes, data: QuicklookData) -> None:
     For a uniform scan draw the confidence of the map.
     """
     if data.policy is None:
-        return _draw_confidence(axes, data.confidence, "2  Confidence")
+        return _draw_confidence(axes, data, "2  Confidence")
     height, width = data.class_map.shape
     rows, columns = data.score.shape
-    axes.imshow(grey_of(data.rectified), cmap="gray", vmin=-0.4, vmax=1.4)
+    _show(axes, data, grey_of(data.rectified), cmap="gray", vmin=-0.4, vmax=1.4)
     scores, low, high = _score_range(data.score)
     heat = axes.imshow(
         scores,
@@ -160,7 +170,12 @@ def _score_range(score: NDArray[np.floating]) -> tuple[NDArray[np.float64], floa
 
 
 def _draw_classes(axes: Axes, data: QuicklookData) -> None:
-    _show(axes, class_rgb(data.class_map, class_palette(data.class_colours)), interpolation="nearest")
+    _show(
+        axes,
+        data,
+        class_rgb(data.class_map[thinned(data.class_map)], class_palette(data.class_colours)),
+        interpolation="nearest",
+    )
     most = max(data.class_map.shape[1] / 4, 1)  # of a bar of a round number of pixels
     length = max(step * 10 ** int(np.log10(most)) for step in (1, 2, 5) if step * 10 ** int(np.log10(most)) <= most)
     axes.add_artist(AnchoredSizeBar(axes.transData, length, f"{length} px", "lower left", borderpad=0.5))
@@ -170,23 +185,27 @@ def _draw_classes(axes: Axes, data: QuicklookData) -> None:
 def _draw_truth(axes: Axes, data: QuicklookData) -> None:
     """Draw the labels; without labels the confidence."""
     if data.truth is not None:
-        _show(axes, class_rgb(data.truth, class_palette(data.class_colours)), interpolation="nearest")
+        _show(
+            axes,
+            data,
+            class_rgb(data.truth[thinned(data.truth)], class_palette(data.class_colours)),
+            interpolation="nearest",
+        )
         labelled = (data.truth != UNLABELLED) & (data.class_map != UNLABELLED)
         right = float(np.mean(data.truth[labelled] == data.class_map[labelled])) if labelled.any() else float("nan")
         words = f"labelled pixels correct: {100 * right:.1f} %" if labelled.any() else "no pixel is labelled"
         return _caption(axes, "4  Labels", words)
     if data.confidence is not None and data.policy is not None:
-        return _draw_confidence(axes, data.confidence, "4  Confidence", " (no labels given)")
+        return _draw_confidence(axes, data, "4  Confidence", " (no labels given)")
     axes.axis("off")
     return _caption(axes, "4  Labels", "no labels were given")
 
 
-def _draw_confidence(axes: Axes, confidence: NDArray[np.floating] | None, title: str, why: str = "") -> None:
-    if confidence is None:
+def _draw_confidence(axes: Axes, data: QuicklookData, title: str, why: str = "") -> None:
+    if data.confidence is None:
         axes.axis("off")
         return _caption(axes, title, "the map has none")
-    image = axes.imshow(confidence, cmap="viridis", vmin=0, vmax=1)
-    _frame(axes, confidence.shape)
+    image = _show(axes, data, data.confidence, cmap="viridis", vmin=0, vmax=1)
     _heat_key(image, ("0", "1"))
     return _caption(axes, title, f"of the model{why}")
 
@@ -210,9 +229,10 @@ def _draw_legend(figure: Figure, data: QuicklookData, columns: int) -> None:
             legend.remove()
 
 
-def _show(axes: Axes, image: NDArray[np.float32], *, interpolation: str = "antialiased") -> None:
-    axes.imshow(image, interpolation=interpolation)
-    _frame(axes, image.shape)
+def _show(axes: Axes, data: QuicklookData, image: NDArray[np.floating], **choices: Any) -> AxesImage:
+    """Draw a thinned image over the whole field."""
+    _frame(axes, data.class_map.shape)
+    return axes.imshow(image, extent=(*axes.get_xlim(), *axes.get_ylim()), **choices)
 
 
 def _frame(axes: Axes, shape: tuple[int, ...]) -> None:

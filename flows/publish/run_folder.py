@@ -28,7 +28,7 @@ from flows.publish.findings import (
     find_zones,
     plots_csv,
 )
-from flows.publish.panels import draw_ground, draw_spectra
+from flows.publish.panels import draw_ground, draw_spectra, thinned
 from flows.publish.quicklook import QuicklookData, draw_quicklook
 from flows.publish.receipt import AccuracyIs, Receipt, build_receipt, check_receipt, with_accuracy
 from flows.publish.report import Picture, render_report
@@ -241,7 +241,6 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan) -> Quickl
     bands, _ = choose_bands(run.scene.wavelength_nm)
     chosen = list(bands)
     mosaic = open_mosaic(products.mosaic.path / "mosaic.zarr")
-    coarse = np.concatenate([mosaic.spectra(strip, chosen) for strip in mosaic.row_blocks()])
     decided = products["segment"].path / READING
     attention = load_attention(decided if decided.exists() else products["score"].path / READING)
     changed = attention.changed
@@ -255,7 +254,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan) -> Quickl
         policy=run.settings.policy if run.chooses else None,
         scan=run.plan.plain,
         raster=run.raster is not None,
-        rectified=coarse,
+        rectified=mosaic.thinned(thinned(found.classes)[0].step, chosen),
         wavelength_nm=run.scene.wavelength_nm[chosen],
         score=attention.score if changed is None else np.where(attention.rank >= 0, changed, np.nan),
         changed=changed is not None,
@@ -266,7 +265,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan) -> Quickl
         class_names=found.names,
         class_colours=found.colours,
         truth=run.labels,
-        confidence=found.confidence,
+        confidence=np.ascontiguousarray(found.confidence[thinned(found.classes)]),
         was=None if memory is None or memory["put_aside"] else differing_now(ProbabilityStore(drawn)),
         days=0.0 if memory is None else memory["days"],
     )

@@ -37,7 +37,7 @@ def confusion(labels: Numbers, predicted: Numbers, classes: int) -> Counts:
     if labels.shape != predicted.shape:
         raise ShapeError(f"labels are {labels.shape}, the class map is {predicted.shape}; they must be equal")
     counted = labels != UNLABELLED
-    truth, guess = labels[counted].astype(np.int64), predicted[counted].astype(np.int64)
+    truth, guess = labels[counted].astype(np.int32), predicted[counted].astype(np.int32)
     for name, values in (("label", truth), ("prediction", guess)):
         if (outside := values[(values < 0) | (values >= classes)]).size:
             raise ShapeError(f"{name} {outside[0]} is none of the {classes} classes 0..{classes - 1}")

@@ -197,15 +197,16 @@ def _runs(paths: Sequence[SweepPath], camera: LineCamera, grid: PixelGrid | None
     return found
 
 
-def capture_numbers(placed: Sequence[PlacedSweep], camera: LineCamera, grid: PixelGrid) -> NDArray[np.intp]:
+def capture_numbers(placed: Sequence[PlacedSweep], camera: LineCamera, grid: PixelGrid) -> NDArray[np.int16]:
     """Return the number of the sweep with the closest lines at each pixel of a grid, (y, x); -1 if none shows it.
 
     It is computed for the middle of every 4 x 4 px.
     """
     height, width = grid.shape
-    rows, columns = (np.minimum(np.arange(0, size, CELL_PX) + CELL_PX // 2, size - 1) for size in (height, width))
-    points = grid.points(slice(0, height), slice(0, width))[np.ix_(rows, columns)]
-    found = np.full(points.shape[:2], -1, np.intp)
+    places = (np.minimum(np.arange(0, size, CELL_PX) + CELL_PX // 2, size - 1) for size in (height, width))
+    centres = (first + grid.spacing_px * place for first, place in zip(grid.origin_px, places, strict=True))
+    points = np.stack(np.meshgrid(*centres, indexing="ij"), axis=-1)
+    found = np.full(points.shape[:2], -1, np.int16)
     for number in sorted(range(len(placed)), key=lambda one: -placed[one].lines.sweep.step):  # the closest last
         for scan_path, _ in placed[number].scan_paths:
             seen = np.isfinite(placed[number].locate_point(scan_path, camera, points)[..., 0])

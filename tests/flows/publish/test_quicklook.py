@@ -8,11 +8,13 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from PIL import Image
 
-from flows.publish import quicklook
+from flows.publish import panels, quicklook
 from flows.publish.panels import class_palette, class_rgb, outline
 from flows.publish.quicklook import QuicklookData, _draw_attention, draw_quicklook
 from storage.arrays.quicklooks import choose_bands
@@ -126,7 +128,12 @@ def test_a_revisit_shows_what_changed(monkeypatch: pytest.MonkeyPatch, tmp_path:
     words, images = list[tuple[str, str]](), list[np.ndarray]()
     monkeypatch.setattr(quicklook, "_caption", lambda axes, title, text: words.append((title, text)))
     show = quicklook._show
-    monkeypatch.setattr(quicklook, "_show", lambda axes, image, **given: (images.append(image), show(axes, image)))
+
+    def shown(axes: Axes, data: QuicklookData, image: np.ndarray, **how: object) -> AxesImage:
+        images.append(image)
+        return show(axes, data, image)
+
+    monkeypatch.setattr(quicklook, "_show", shown)
     data = make_data(96, 128)
     was = np.full((96, 128), 255, np.uint8)
     was[5:7, 10:20] = 1
@@ -163,3 +170,16 @@ def test_a_legend_of_long_names_lies_within_the_picture():
     quicklook._draw_legend(figure, replace(make_data(32, 32), class_names=names, class_colours=colours), 5)
     assert figure.legends[0].get_window_extent().width <= figure.bbox.width
     assert len(figure.legends[0].get_texts()) >= 16
+
+
+def test_a_large_field_is_drawn_from_every_nth_pixel(monkeypatch: pytest.MonkeyPatch):
+    """The map is thinned for the picture; axes are those of the whole field."""
+    monkeypatch.setattr(panels, "MOST_PX", 64)
+    data = make_data(96, 128)
+    given = {"rectified": data.rectified[::2, ::2], "confidence": None, "truth": None}
+    with mpl.rc_context(quicklook._STYLE):
+        drawn = [row.axes[0] for row in quicklook._compose(replace(data, **given)).subfigs]
+    for axes in drawn:
+        assert axes.images[0].get_array().shape[:2] == (48, 64)
+        assert axes.get_xlim() == (-0.5, 127.5)
+        assert tuple(axes.images[0].get_extent()) == (-0.5, 127.5, 95.5, -0.5)
