@@ -6,8 +6,10 @@ One is made of any image: without a radiance law it is relative, linear light of
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from tempfile import TemporaryFile
 from threading import Lock
 from typing import TYPE_CHECKING
 
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
 
 Drawn = tuple[NDArray[np.float32], NDArray[np.uint8] | None]
 _BINOMIAL = (np.array([1, 8, 28, 56, 70, 56, 28, 8, 1]) / 256).astype(np.float32)
+MOST_BYTES = 2**27  # of an array in memory; larger ones are in a file
 _ROWS_AT_ONCE = 4  # of what is halved: they stay in the processor's cache
 THINNED_MARGIN = 4  # pixels of a level beside the scene: as far as the binomial kernel reaches
 DEFAULT_EXPOSURE_MS = 100.0  # the exposure at which a scene's electrons are stated
@@ -82,12 +85,24 @@ class SceneRaster:
         return planes, labels
 
 
+def scratch(shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Return an array of zeros; a large one is in a file without a name, which the system reads and writes by pages.
+
+    Raises OSError: the disk is full. The folder is that of TMPDIR, by default /var/tmp, since /tmp may be memory.
+    """
+    if 4 * np.prod(shape) <= MOST_BYTES:
+        return np.zeros(shape, np.float32)
+    with TemporaryFile(dir=os.environ.get("TMPDIR", "/var/tmp")) as file:
+        os.posix_fallocate(file.fileno(), 0, 4 * int(np.prod(shape)))  # a full disk would end the process later
+        return np.asarray(np.memmap(file, np.float32, "r+", shape=shape))
+
+
 def _halved(planes: NDArray[np.float32], before: int) -> NDArray[np.float32]:
     """Return every second pixel of blurred planes along either axis, from the one that ``before`` others precede."""
     half = len(_BINOMIAL) // 2
     counts = [-(-(size - 1 + half - before) // 2) + THINNED_MARGIN + 1 for size in planes.shape[:2]]
     rows, columns = (before + 2 * (np.arange(count) - THINNED_MARGIN) - half for count in counts)
-    out = np.empty((*counts, planes.shape[2]), np.float32)
+    out = scratch((*counts, planes.shape[2]))
     for first in range(0, counts[0], _ROWS_AT_ONCE):
         some = slice(first, first + _ROWS_AT_ONCE)
         out[some] = _binomial(_binomial(planes, rows[some], 0), columns, 1)

@@ -30,6 +30,7 @@ from pipeline.simulator.scenes.farm.land import (
     visible_area,
 )
 from pipeline.simulator.scenes.farm.spectra import MATERIALS, wet_fraction
+from pipeline.simulator.scenes.scene import scratch
 
 _COLOURS = {
     "soil": (158, 119, 82),
@@ -92,8 +93,7 @@ class Canvas:
     def __init__(self, shape: tuple[int, int], materials: tuple[str, ...]) -> None:
         self.shape = shape
         self._column = {name: number for number, name in enumerate(materials)}
-        self.materials = np.zeros((shape[0] * shape[1], len(materials)), np.float32)
-        self.classes = np.zeros((shape[0] * shape[1], len(CLASSES)), np.float32)
+        self.materials, self.classes = (scratch((shape[0] * shape[1], len(one))) for one in (materials, CLASSES))
 
     def add(self, index: NDArray[np.intp], cover: Field, mixture: Mixture, fractions: Mixture) -> None:
         """Lay a surface beside what is there."""

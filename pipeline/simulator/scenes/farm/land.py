@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import SceneError
+from pipeline.simulator.scenes.scene import scratch
 
 Field = NDArray[np.float32]
 Points = NDArray[np.float64]
@@ -210,12 +211,14 @@ def scene_points(index: NDArray[np.intp], shape: tuple[int, int]) -> Points:
 
 def smooth_noise(rng: np.random.Generator, shape: tuple[int, int], cell: float) -> Field:
     """Return noise of sd about 1 with bumps about ``cell`` px wide: a cubic B-spline over white noise, (y, x)."""
-    knots = [int(size / cell) + 5 for size in shape]
-    field = rng.standard_normal((knots[0], knots[1])).astype(np.float32)
-    shift = rng.uniform(0, 1, 2)
-    for axis, size in enumerate(shape):
-        field = np.moveaxis(_spline(np.moveaxis(field, axis, 0), np.arange(size) / cell + shift[axis]), 0, axis)
-    return np.ascontiguousarray(field) / np.float32(_SPLINE_SD)
+    knots = rng.standard_normal([int(size / cell) + 5 for size in shape]).astype(np.float32)
+    down, across = (np.arange(size) / cell + shift for size, shift in zip(shape, rng.uniform(0, 1, 2), strict=True))
+    field = scratch(shape)
+    for first in range(0, shape[0], 256):
+        field[first : first + 256] = _spline(_spline(knots, down[first : first + 256]).T, across).T / np.float32(
+            _SPLINE_SD
+        )
+    return field
 
 
 def _spline(knots: Field, position: Points) -> Field:
