@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 Drawn = tuple[NDArray[np.float32], NDArray[np.uint8] | None]
 _BINOMIAL = (np.array([1, 8, 28, 56, 70, 56, 28, 8, 1]) / 256).astype(np.float32)
-MOST_BYTES = 2**27  # of an array in memory; larger ones are in a file
+MOST_BYTES = 2**28  # of an array in memory; larger ones are in a file
 _ROWS_AT_ONCE = 4  # of what is halved: they stay in the processor's cache
 THINNED_MARGIN = 4  # pixels of a level beside the scene: as far as the binomial kernel reaches
 DEFAULT_EXPOSURE_MS = 100.0  # the exposure at which a scene's electrons are stated
@@ -93,7 +93,8 @@ def scratch(shape: tuple[int, ...]) -> NDArray[np.float32]:
     if 4 * np.prod(shape) <= MOST_BYTES:
         return np.zeros(shape, np.float32)
     with TemporaryFile(dir=os.environ.get("TMPDIR", "/var/tmp")) as file:
-        os.posix_fallocate(file.fileno(), 0, 4 * int(np.prod(shape)))  # a full disk would end the process later
+        if hasattr(os, "posix_fallocate"):  # not on macOS; a full disk would end the process later
+            os.posix_fallocate(file.fileno(), 0, 4 * int(np.prod(shape)))
         return np.asarray(np.memmap(file, np.float32, "r+", shape=shape))
 
 
