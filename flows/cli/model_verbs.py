@@ -84,6 +84,9 @@ class TrainFlags(SceneFlags):
         Channels of the overview network.
     columns
         Number of spectral features per pixel, for any camera.
+    start
+        Weights from which the training starts, at a third of the learning rate. They must come from a training of the
+        same scenes and sizes.
     train_temporal
         Weights to which only a temporal reader is added, for surveys with --prior. It takes --scenes, --steps,
         --minutes, --seed and --validation, and resumes. It needs 4 GB of memory, and half an hour for reading the
@@ -120,6 +123,7 @@ class TrainFlags(SceneFlags):
     width: int = TrainRequest.width
     overview_width: int = TrainRequest.overview_width
     columns: int = TrainRequest.columns
+    start: Path | None = None
     train_temporal: Path | None = None
     fit_ood: Path | None = None
     dim: int = 64
@@ -146,6 +150,7 @@ class TrainFlags(SceneFlags):
             crop=CROPS_PX[bool(built_in_laws(dataset))] if self.crop is None else self.crop,
             batch=self.batch,
             darkest_ms=self.min_exposure_ms,
+            learning_rate=TrainingSettings.learning_rate / (3 if self.start else 1),
         )
         return TrainRequest(
             dataset,
@@ -162,6 +167,7 @@ class TrainFlags(SceneFlags):
             settings=settings,
             command=command,
             device=self.device,
+            start=self.start,
         )
 
 

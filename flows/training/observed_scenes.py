@@ -8,20 +8,22 @@ noise of `models.training.examples.observe`.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.network.spectral import SpectralBasis, project
-from models.training.capture_augmentation import ColumnNoise
-from models.training.examples import Example, noise_of, observe
+from models.training.capture_augmentation import ColumnNoise, SceneSpectra
+from models.training.examples import Example, noise_of, observe, value_of_electron
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
 from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.planning.coverage import cheapest_full
 from pipeline.rectify.region import mosaic_rows
+from pipeline.signal.subspace import FEW_BANDS
 from pipeline.simulator.render import EFFECTS, Choice
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.built_in import is_built_in_key
@@ -76,7 +78,9 @@ def observe_finely(
     clock = sweep_starts(full, camera, cost)
     source = SimulatedSource(scene, rig, seed, chosen_effects(scene, rig, full), clock=clock)
     matrix, _ = basis.matrix(scene.wavelength_nm)
-    return _columns(source, full, grid, matrix), noise_of(scene, matrix, camera)
+    columns, spectra = _columns(source, full, grid, matrix)
+    condensed = len(matrix) > FEW_BANDS
+    return columns, replace(noise_of(scene, matrix, camera), spectra=spectra if condensed else None)
 
 
 def chosen_effects(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep]) -> Choice:
@@ -84,11 +88,25 @@ def chosen_effects(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep]) -> Cho
     return Choice.of(decide(probe_survey(scene, rig, sweeps, "sigma"), rig, EFFECTS, TOLERANCE_SIGMA).chosen)
 
 
-def _columns(source: SimulatedSource, sweeps: Sequence[Sweep], grid: SceneGrid, matrix: Columns) -> Columns:
-    """Return the rectified pass on the basis, (y, x, column)."""
+def _columns(
+    source: SimulatedSource, sweeps: Sequence[Sweep], grid: SceneGrid, matrix: Columns
+) -> tuple[Columns, SceneSpectra]:
+    """Return the rectified pass on the basis, (y, x, column), and the moments of its spectra."""
     taken = [_Taken(source, sweep) for sweep in sweeps]
-    rows = [project(part, matrix) for _, part, _ in mosaic_rows(taken, source.camera, grid, rows=_ROWS)]
+    bands, rows = len(matrix), list[Columns]()
+    count, total, products = 0, np.zeros(bands), np.zeros((bands, bands))
+    for _, part, _ in mosaic_rows(taken, source.camera, grid, rows=_ROWS):
+        rows.append(project(part, matrix))
+        some = part[::2, ::2].reshape(-1, bands).astype(np.float64)
+        count, total, products = count + len(some), total + some.sum(axis=0), products + some.T @ some
     seen = np.concatenate(rows)
     if not np.isfinite(seen).all():
         raise SceneError(f"scene {source.scene.name} has pixels that no line reached; training needs all of it")
-    return seen
+    mean = total / count
+    covariance = products / count - np.outer(mean, mean)
+    scene = source.scene
+    spectra = SceneSpectra(mean, covariance, matrix, value_of_electron(scene), source.camera.read_noise_e)
+    noise = np.sum(spectra.noise(1.0), axis=0)
+    power = np.linalg.eigvalsh(covariance / np.sqrt(np.outer(noise, noise)))
+    floor = np.quantile(power, 0.1)  # of directions without a signal
+    return seen, replace(spectra, covariance=covariance - floor * np.diag(noise))

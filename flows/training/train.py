@@ -14,7 +14,7 @@ import numpy as np
 from rich.console import Console
 
 from flows.terminal.progress import one_after_the_other, table
-from flows.training.data import Report, open_training_data
+from flows.training.data import Report, TrainingData, open_training_data
 from flows.training.figures import better_reading, judge_baselines, judge_calibration, judge_scans, read_twice, validate
 from flows.training.fit_ood import fit_and_add, trained_on
 from flows.training.train_scenes import Scenes, TrainRequest, check_out, network_config, observe_all, training_capture
@@ -25,7 +25,16 @@ from models.training.capture_augmentation import REFERENCE_MS
 from models.training.examples import measured_normalisation
 from models.training.train import LabelledPixels, Progress, linear_discriminants, train
 from models.weights.checksummed_files import load_checkpoint
-from models.weights.files import CALIBRATION, CASCADE, MAP_SCORES, TRAINED_ON, Weights, save_weights, with_record
+from models.weights.files import (
+    CALIBRATION,
+    CASCADE,
+    MAP_SCORES,
+    TRAINED_ON,
+    Weights,
+    load_weights,
+    save_weights,
+    with_record,
+)
 from pipeline.errors import SceneError, SettingsError
 from pipeline.simulator.scenes.built_in import built_in_laws
 
@@ -45,15 +54,20 @@ def train_weights(
     checkpoint = request.out.with_name(request.out.name + ".checkpoint")
     check_out(request.out)
     load_checkpoint(checkpoint)  # a damaged one fails before minutes are spent
+    begun = None if request.start is None else load_weights(request.start)
     device, settings = choose_device(request.device), request.settings
     hold_out = {"hold_out": request.hold_out, **request.choices}
     data = open_training_data(request.dataset, request.validation, request.scenes, request.camera, **hold_out)
     for note in data.notes:
         tell(note)
     scenes = observe_all(request, data, report, tell)
-    normalisation = measured_normalisation(scenes.train.examples, math.sqrt(settings.darkest_ms * REFERENCE_MS))
+    if begun is None:
+        normalisation = measured_normalisation(scenes.train.examples, math.sqrt(settings.darkest_ms * REFERENCE_MS))
+    else:
+        check_start(request, begun, data, scenes)
+        normalisation = begun.normalisation
     scenes = scenes.normalised(normalisation)
-    weights, training = _learned(request, scenes, normalisation, checkpoint, report)
+    weights, training = _learned(request, scenes, normalisation, begun, checkpoint, report)
     trained = trained_on(data, scenes, settings.darkest_ms)
     record = {
         "command": request.command,
@@ -69,6 +83,7 @@ def train_weights(
         "settings": asdict(settings),
         "camera": asdict(request.camera),
         "device": device,
+        **({} if begun is None else {"started_from": begun.record.get("command", "")}),
         **training,
     }
     scans = judge_scans(
@@ -90,8 +105,29 @@ def train_weights(
     return record
 
 
+def check_start(request: TrainRequest, begun: Weights, data: TrainingData, scenes: Scenes) -> None:
+    """Raise SettingsError unless a training can start from these weights: one of the same scenes, classes and sizes."""
+    split, common = begun.record.get("split", {}), scenes.common
+    own, theirs = (
+        (list(data.train), list(data.validation), common.basis, common.names, network_config(request, common)),
+        (list(split.get("train", ())), list(split.get("validation", ())), begun.basis, begun.class_names, begun.config),
+    )
+    for what, mine, started in zip(
+        ("training scenes", "validation scenes", "bands", "classes", "sizes of the network"), own, theirs, strict=True
+    ):
+        if mine != started:
+            raise SettingsError(
+                f"--start {request.start}: its training had other {what}; give its data set and options"
+            )
+
+
 def _learned(
-    request: TrainRequest, scenes: Scenes, normalisation: Normalisation, checkpoint: Path, report: Report
+    request: TrainRequest,
+    scenes: Scenes,
+    normalisation: Normalisation,
+    begun: Weights | None,
+    checkpoint: Path,
+    report: Report,
 ) -> tuple[Weights, dict[str, Any]]:
     """Train the network; return weights, and their figures on the validation scenes for the record."""
 
@@ -107,7 +143,7 @@ def _learned(
         normalisation.gain_shift,
         settings,
         progress,
-        start=start,
+        start=start if begun is None else begun.segmenter.state_dict(),
         augmentation=training_capture(normalisation, settings.darkest_ms),
         checkpoint=checkpoint,
         device=choose_device(request.device),

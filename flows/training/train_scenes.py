@@ -53,6 +53,7 @@ class TrainRequest:
     camera: LineCamera = field(default_factory=LineCamera)
     command: str = ""
     device: str = PROCESSOR  # or auto
+    start: Path | None = None  # weights from which the training starts
 
 
 @dataclass(frozen=True)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.network.spectral import LineSpec, Normalisation, with_planes
+from pipeline.signal.components import Components
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS
 
 REFERENCE_MS = DEFAULT_EXPOSURE_MS  # exposures are fractions of this one
@@ -17,6 +20,11 @@ INTERLACED = 0.5  # fraction of crops with lines apart that get closer lines in 
 AREAS = (0.3, 0.4, 0.3)  # probability of 0, 1, 2 areas with closer lines
 ACROSS = 0.5  # fraction of areas as wide as the crop
 TINY = 1e-9  # added to correlations against negative eigenvalues by rounding
+CONDENSED = 0.75  # fraction of crops with the components of a large field alone; small fields keep all directions
+LEAST_POWERS = (0.001, 0.02)  # of components: variance of their signal over that of a spectrum's noise
+TYPICAL_POWER = 0.004  # by farms of 1280 x 1024 px
+LEAST_COMPONENTS = 4
+ROUNDED = 1 / 12  # variance that rounding adds to scores, in squares of the noise
 Matrix = NDArray[np.float64]
 Columns = NDArray[np.float32]  # (y, x, column)
 
@@ -31,6 +39,7 @@ class ColumnNoise:
 
     shot: Matrix  # (column,) variance for a unit of light
     read: Matrix  # (column, column)
+    spectra: SceneSpectra | None = None  # None: crops of the scene are never condensed
 
     @staticmethod
     def of_bands(
@@ -61,6 +70,55 @@ class ColumnNoise:
         return covariance
 
 
+class Condensing(NamedTuple):
+    """Components of a scene by a survey. Scores have the noise of one spectrum as their unit."""
+
+    of_columns: Columns  # (column, component) weights that give scores of columns less those of the mean
+    back: Columns  # (component, column) weights that give columns of scores
+    mean: Columns  # (column,) of the mean spectrum
+    power: Matrix  # (component,) variance of the signal, falling
+
+
+@dataclass(frozen=True, eq=False)
+class SceneSpectra:
+    """Moments of a scene's spectra without noise: crops are condensed by them as surveys condense their lines."""
+
+    centre: Matrix  # (band,) mean spectrum
+    covariance: Matrix  # (band, band)
+    matrix: NDArray[np.floating]  # (band, column)
+    value_of_electron: Matrix  # (band,) at the reference exposure
+    read_noise_e: float
+
+    def noise(self, light: float) -> tuple[Matrix, Matrix]:
+        """Return the variances (band,) of shot and read noise of the mean spectrum, at a fraction of the reference."""
+        shot = np.maximum(self.centre, 0) * self.value_of_electron / light
+        return shot, (self.value_of_electron * self.read_noise_e / light) ** 2
+
+    @lru_cache(maxsize=2048)  # noqa: B019 - a training has some dozens of scenes, which stay
+    def condensing(self, light: float) -> Condensing:
+        """Return the components of a survey with this exposure, at most one for each column."""
+        sigma, most = np.sqrt(np.sum(self.noise(light), axis=0)), self.matrix.shape[1]
+        power, axes = np.linalg.eigh(self.covariance / np.outer(sigma, sigma))
+        power, axes = power[::-1][:most], axes[:, ::-1][:, :most]
+        back, mean = Components(self.centre, axes.T, sigma).onto(self.matrix)
+        matrix = self.matrix.astype(np.float64)
+        seen = matrix.T @ self.covariance @ matrix + (matrix.T * np.sum(self.noise(1.0), axis=0)) @ matrix
+        spectra = np.linalg.solve(seen, matrix.T @ self.covariance)  # (column, band) expected from columns
+        return Condensing(((spectra / sigma) @ axes).astype(np.float32), back, mean, power)
+
+    def added(self, light: float, unit: float, samples: int) -> tuple[float, float]:
+        """Return the shot and read noise that an exposure adds to means of ``samples`` pixels of the reference.
+
+        They are means over the bands, in variances of the noise of the exposure ``unit``.
+        """
+        whole = np.sum(self.noise(unit), axis=0)
+        more = [
+            np.mean((own - before / samples) / whole)
+            for own, before in zip(self.noise(light), self.noise(1.0), strict=True)
+        ]
+        return float(more[0]), float(more[1])
+
+
 class CaptureAugmentation:
     """Turn crops of the reference exposure into captures of shorter exposures and wider line spacings.
 
@@ -78,10 +136,12 @@ class CaptureAugmentation:
         """
         odds = {step: often for step, often in STEPS.items() if len(columns) % step == 0}
         step = int(rng.choice(list(odds), p=np.array(list(odds.values())) / sum(odds.values())))
+        least_power = float(np.exp(rng.uniform(*np.log(LEAST_POWERS)))) if rng.random() < CONDENSED else 0.0
         if step > 1 and rng.random() < INTERLACED:
-            image = self.interlaced(columns, noise, step=step, rng=rng)
+            image = self.interlaced(columns, noise, step=step, rng=rng, least_power=least_power)
         else:
-            image = self.scan(columns, noise, light=self._light(rng), step=step, rng=rng)
+            light = self._light(rng)
+            image = self.scan(columns, noise, light=light, step=step, rng=rng, least_power=least_power)
         return image, image
 
     def _light(self, rng: np.random.Generator) -> float:
@@ -89,26 +149,36 @@ class CaptureAugmentation:
         return float(np.exp(rng.uniform(np.log(self.darkest_ms / REFERENCE_MS), 0.0)))
 
     def scan(
-        self, columns: Columns, noise: ColumnNoise, *, light: float, step: int, rng: np.random.Generator
+        self,
+        columns: Columns,
+        noise: ColumnNoise,
+        *,
+        light: float,
+        step: int,
+        rng: np.random.Generator,
+        least_power: float = 0.0,
     ) -> Columns:
         """Return a crop by a uniform scan of lines ``step`` px apart, with rows between them interpolated.
 
         ``light`` is the exposure as a fraction of the reference; ``step`` is a power of two that divides the rows.
+        Components of less than ``least_power`` are left out.
         """
         scaled = columns @ self.unwhiten
         means = scaled.reshape(-1, step, *scaled.shape[1:]).mean(axis=1)
-        lines = self._noisy(means, noise, light, rng, samples=step)
+        lines = self._captured(means, noise, light, rng, samples=step, condensed=(light, least_power))
         between = rows_between(lines, len(columns), first=(step - 1) / 2, apart=step) if step > 1 else lines
         return with_planes(between @ self.normalisation.whitening, LineSpec(light, step))
 
-    def interlaced(self, columns: Columns, noise: ColumnNoise, *, step: int, rng: np.random.Generator) -> Columns:
+    def interlaced(
+        self, columns: Columns, noise: ColumnNoise, *, step: int, rng: np.random.Generator, least_power: float = 0.0
+    ) -> Columns:
         """Return a crop by a first pass of rows ``step`` px apart, and areas with later lines between them.
 
         Lines of the first pass stay among the closer lines of an area, each with its own exposure.
         """
         scaled, size = columns @ self.unwhiten, len(columns)
         light, first = self._light(rng), int(rng.integers(step))
-        lines = self._noisy(scaled[first::step], noise, light, rng)
+        lines = self._captured(scaled[first::step], noise, light, rng, condensed=(light, least_power))
         between = rows_between(lines, size, first=first, apart=step)
         image = with_planes(between @ self.normalisation.whitening, LineSpec(light, step))
         for _ in range(rng.choice(len(AREAS), p=AREAS)):
@@ -117,7 +187,8 @@ class CaptureAugmentation:
             samples = slice(None) if rng.random() < ACROSS else samples
             closer, later = step // int(rng.choice([own for own in (2, 4, 8) if own <= step])), self._light(rng)
             start = first % closer
-            taken = self._noisy(scaled[start::closer, samples], noise, later, rng)
+            later_lines = scaled[start::closer, samples]
+            taken = self._captured(later_lines, noise, later, rng, condensed=(light, least_power))
             taken[first // closer :: step // closer] = lines[:, samples]
             between = rows_between(taken, size, first=start, apart=closer) @ self.normalisation.whitening
             nearest = np.clip(np.rint((np.arange(size) - start) / closer), 0, len(taken) - 1) * closer + start
@@ -126,6 +197,32 @@ class CaptureAugmentation:
             planes = np.broadcast_to(planes, (*between.shape[:-1], planes.shape[-1]))
             image[rows, samples] = np.concatenate([between, planes], axis=-1)[rows]
         return image
+
+    def _captured(
+        self,
+        scaled: Columns,
+        noise: ColumnNoise,
+        light: float,
+        rng: np.random.Generator,
+        *,
+        condensed: tuple[float, float],
+        samples: int = 1,
+    ) -> Columns:
+        """Add the noise of an exposure; condense by components of an exposure, from a least power on."""
+        unit, least_power = condensed
+        if noise.spectra is None or least_power == 0:
+            return self._noisy(scaled, noise, light, rng, samples=samples)
+        unit = float(2 ** (np.round(4 * np.log2(unit)) / 4))  # a quarter of an octave
+        law = noise.spectra.condensing(unit)
+        kept = max(np.count_nonzero(law.power > least_power), LEAST_COMPONENTS)
+        values = scaled * self.normalisation.spread + self.normalisation.centre
+        shot, read = noise.spectra.added(light, unit, samples)
+        brightness = np.maximum(values.mean(axis=-1, keepdims=True) / max(float(law.mean.mean()), TINY), 0)
+        size = np.sqrt(np.maximum(read + shot * brightness, 0) + ROUNDED)
+        scores = (values - law.mean) @ law.of_columns[:, :kept]
+        scores += size * rng.standard_normal(scores.shape, np.float32)
+        values = scores @ law.back[:kept] + law.mean
+        return np.asarray((values - self.normalisation.centre) / self.normalisation.spread, np.float32)
 
     def _noisy(
         self, scaled: Columns, noise: ColumnNoise, light: float, rng: np.random.Generator, *, samples: int = 1

@@ -63,7 +63,12 @@ def observe(
 
 def noise_of(scene: RasterScene, matrix: NDArray[np.float32], camera: LineCamera) -> ColumnNoise:
     """Return the shot and read noise of a camera in the columns of a scene."""
-    return ColumnNoise.of_bands(matrix, scene.white_reference / scene.white_reference_electrons, camera.read_noise_e)
+    return ColumnNoise.of_bands(matrix, value_of_electron(scene), camera.read_noise_e)
+
+
+def value_of_electron(scene: RasterScene) -> NDArray[np.float64]:
+    """Return the scene values (band,) of an electron at the reference exposure."""
+    return np.asarray(scene.white_reference / scene.white_reference_electrons, np.float64)
 
 
 def electrons_of(scene: RasterScene, planes: NDArray[np.float32], camera: LineCamera) -> NDArray[np.float32]:

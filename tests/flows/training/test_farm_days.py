@@ -127,15 +127,26 @@ def test_training_mixes_built_in_scenes() -> None:
     assert not {read_farm_name(name)[0] for name in judged} & {read_farm_name(name)[0] for name in scouted}
 
 
-def test_training_sees_the_farm_through_the_rig() -> None:
-    """Beside the footprint and the noise alone, blur and shading count, by little."""
-    scene, camera = open_scene(_settings(seed=5, size="96x64"))[0], LineCamera(samples=96)
+@pytest.mark.parametrize("bands", [BANDS, tuple(range(0, 270, 5))])
+def test_training_sees_the_farm_through_the_rig(bands: tuple[int, ...]) -> None:
+    """Beside the footprint and the noise alone, blur and shading count, by little. Surveys condense many bands."""
+    scene, camera = open_scene(_settings(seed=5, size="96x64", bands=bands))[0], LineCamera(samples=96)
     grid, basis = SceneGrid(*scene.shape, 8, 1), SpectralBasis.spanning(scene.wavelength_nm, 6)
     seen = observe_scene(scene, camera, grid, basis, np.random.default_rng(3))
     plain = observe(scene, camera, grid, basis, np.random.default_rng(3))
     np.testing.assert_array_equal(seen.labels, plain.labels)
     assert seen.columns.shape == plain.columns.shape
     assert 0.01 * plain.columns.std() < np.abs(seen.columns - plain.columns).mean() < 0.2 * plain.columns.std()
+    assert seen.noise is not None
+    assert (seen.noise.spectra is not None) == (bands != BANDS)
+    if seen.noise.spectra is not None:
+        spectra = seen.noise.spectra
+        mean = seen.columns[:64, :96].mean(axis=(0, 1))
+        np.testing.assert_allclose(spectra.condensing(1.0).mean, mean, rtol=0.02)
+        sigma = np.sqrt(np.sum(spectra.noise(1.0), axis=0))
+        power = np.linalg.eigvalsh(spectra.covariance / np.outer(sigma, sigma))
+        assert power[-1] > 1000
+        assert abs(np.median(power)) < 0.3  # most directions have noise alone, which is taken out
 
 
 @pytest.mark.parametrize(("size", "measured"), [("1280x1024", 1.69e9), ("2560x2560", 3.10e9)])

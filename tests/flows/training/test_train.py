@@ -267,6 +267,34 @@ def test_whitening_knows_the_noise_of_short_exposures(folder: Path, out: Path):
     assert sizes[1] < sizes[0]
 
 
+def test_a_training_goes_on_from_weights(folder: Path, out: Path, tmp_path: Path) -> None:
+    """The normalisation stays, and a rate of nothing leaves the network as it was; the record names the first."""
+    train_weights(_request(folder, out, validation=1, command="first"))
+    still = replace(SETTINGS, learning_rate=1e-12, seed=1)
+    record = train_weights(_request(folder, tmp_path / "b.safetensors", validation=1, start=out, settings=still))
+    first, second = load_weights(out), load_weights(tmp_path / "b.safetensors")
+    assert record["started_from"] == "first"
+    np.testing.assert_array_equal(second.normalisation.whitening, first.normalisation.whitening)
+    for one, other in zip(first.segmenter.parameters(), second.segmenter.parameters(), strict=True):
+        np.testing.assert_allclose(other.detach().numpy(), one.detach().numpy(), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changed", "what"),
+    [
+        ({"hold_out": ("003",)}, "training scenes"),
+        ({"validation": 0}, "training scenes"),
+        ({"columns": 2}, "bands"),
+        ({"width": 8}, "sizes of the network"),
+    ],
+)
+def test_a_training_cannot_go_on_from_another(folder: Path, out: Path, changed: dict[str, Any], what: str) -> None:
+    """Scenes, bands and sizes are those of the first training: one message says which are not."""
+    train_weights(_request(folder, out, validation=1))
+    with pytest.raises(SettingsError, match=f"its training had other {what}; give its data set and options"):
+        train_weights(_request(folder, out.with_name("b.safetensors"), **{"validation": 1, "start": out, **changed}))
+
+
 @pytest.mark.parametrize("darkest_ms", [0.0, -1.0, 200.0, float("nan")])
 def test_exposures_that_no_look_has_are_refused(folder: Path, out: Path, darkest_ms: float):
     """Above the exposure that scenes are looked at with, or none at all: one message with the limits."""

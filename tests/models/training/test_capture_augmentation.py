@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 
 from models.network.spectral import LineSpec, Normalisation, SpectralBasis
 from models.training import capture_augmentation
-from models.training.capture_augmentation import CaptureAugmentation, ColumnNoise, rows_between
+from models.training.capture_augmentation import CaptureAugmentation, ColumnNoise, SceneSpectra, rows_between
 from pipeline.geometry.camera import LineCamera, expose
 
 BANDS = np.linspace(400.0, 1000.0, 60)
@@ -188,3 +189,58 @@ def test_later_lines_lie_between_those_of_the_first_pass(monkeypatch: pytest.Mon
         rows = (seen[..., 12:] == LineSpec(light, closer).planes).all(axis=(1, 2))
         told = _noise().variance(np.full(12, 0.3), light) - _noise().variance(np.full(12, 0.3), 1.0)
         np.testing.assert_allclose(values[rows].var(axis=1).max(axis=0), told, rtol=0.15)  # rows of lines have most
+
+
+def _spectra(rng: np.random.Generator, sizes: tuple[float, ...], light: float) -> tuple[np.ndarray, SceneSpectra]:
+    """Noiseless spectra (200, 100, band) about .3 in smooth directions of some deviations of the noise, and moments."""
+    bumps = np.exp(-0.5 * ((BANDS - np.linspace(430, 970, len(sizes))[:, None]) / 60) ** 2)
+    sigma = np.sqrt(0.3 * light * WHITE_REFERENCE_E + 20.0**2) / (light * WHITE_REFERENCE_E)
+    axes = np.linalg.qr(bumps.T)[0].T * np.array(sizes)[:, None] * sigma
+    spectra = 0.3 + rng.normal(size=(200, 100, len(sizes))) @ axes
+    return spectra, SceneSpectra(np.full(60, 0.3), axes.T @ axes, MATRIX, 1 / WHITE_REFERENCE_E, 20.0)
+
+
+def test_a_condensed_crop_has_the_noise_of_a_condensed_survey() -> None:
+    """Spectra with noise in all bands, projected onto their components and rounded, give the same columns."""
+    light, rng = 0.1, np.random.default_rng(3)
+    augmentation, normalisation = _augmentation()
+    spectra, moments = _spectra(rng, (30.0, 5.0, 1.0, 0.3), light)
+    sigma = np.sqrt(np.sum(moments.noise(light), axis=0))
+    axes = np.linalg.eigh(moments.covariance / np.outer(sigma, sigma))[1][:, ::-1][:, :4]
+    more = sigma * np.sqrt(1 - np.sum(moments.noise(1.0), axis=0) / sigma**2)  # the crop has noise of the reference
+    noisy = spectra + more * rng.normal(size=spectra.shape)
+    surveyed = 0.3 + (np.rint((noisy - 0.3) / sigma @ axes) @ axes.T) * sigma
+    crop = normalisation.apply(spectra @ MATRIX, np.ones(12, bool))
+    noise = replace(_noise(), spectra=moments)
+    seen = augmentation.scan(crop, noise, light=light, step=1, rng=rng, least_power=0.01)[..., :12]
+    columns = seen @ augmentation.unwhiten * normalisation.spread + normalisation.centre
+    added, wanted = (np.cov((one - spectra @ MATRIX).reshape(-1, 12).T) for one in (columns, surveyed @ MATRIX))
+    np.testing.assert_allclose(np.diag(added), np.diag(wanted), rtol=0.1)
+    np.testing.assert_allclose(np.linalg.eigvalsh(added)[:8], 0, atol=1e-3 * np.linalg.eigvalsh(added)[-1])
+
+
+@pytest.mark.parametrize(("least_power", "left"), [(0.01, 5), (0.5, 4), (40.0, 4)])
+def test_a_condensed_crop_keeps_components_above_a_power(least_power: float, left: int) -> None:
+    """The fifth direction goes if its power is below; four always stay."""
+    rng, light = np.random.default_rng(4), 0.1
+    augmentation, normalisation = _augmentation()
+    spectra, moments = _spectra(rng, (30.0, 5.0, 3.0, 2.0, 0.5), light)
+    crop = normalisation.apply(spectra @ MATRIX, np.ones(12, bool))
+    noise = replace(_noise(), spectra=moments)
+    seen = augmentation.scan(crop, noise, light=light, step=1, rng=rng, least_power=least_power)[..., :12]
+    power = np.linalg.eigvalsh(np.cov((seen @ augmentation.unwhiten * normalisation.spread).reshape(-1, 12).T))
+    assert np.count_nonzero(power > 1e-6 * power[-1]) == left
+
+
+def test_later_lines_of_an_area_lie_in_the_components_of_all() -> None:
+    """Lines of several exposures share the components of the first pass."""
+    rng = np.random.default_rng(6)
+    augmentation, normalisation = _augmentation()
+    spectra, moments = _spectra(rng, (30.0, 5.0, 3.0, 2.0), 0.1)
+    crop = normalisation.apply(spectra[:64, :64] @ MATRIX, np.ones(12, bool))
+    noise = replace(_noise(), spectra=moments)
+    seen = augmentation.interlaced(crop, noise, step=4, rng=rng, least_power=0.05)
+    assert len(_captures(seen[..., 12:])) > 1
+    columns = seen[..., :12] @ augmentation.unwhiten * normalisation.spread
+    power = np.linalg.eigvalsh(np.cov(columns.reshape(-1, 12).T))
+    assert np.count_nonzero(power > 1e-6 * power[-1]) == 4
