@@ -28,7 +28,7 @@ from storage.archive.archive import Archive
 from storage.archive.keys import in_text
 from storage.archive.lineage import Catalogue, changes_between, find_product, version_before
 from storage.archive.records import Run
-from storage.maintenance.garbage import clear_up
+from storage.maintenance.garbage import DAY_S, clear_up
 from storage.maintenance.verification import Finding, plan_repair, repair
 from storage.remote.opening import open_archive, verify_archive
 
@@ -40,7 +40,6 @@ else:
 SHORT_KEY = 12
 WHOLE = ("when", "key", "seed", "budget", "mIoU", "size", "own", "state", "age", "stage", "what")  # never folded
 MOST_ROWS = 20  # stores of a stage, changes, removals
-DAY_S = 86400.0
 
 
 def ls(archive: ArchiveName, *, as_json: AsJson = False) -> int:

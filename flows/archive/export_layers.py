@@ -220,8 +220,7 @@ def prior_map_layers(run: ExportedRun) -> list[Layer]:
         layers.append(layer if product == "ground_map" else _in_days(layer))
     if (product := _product_with(run, "changed")) is not None:
         title = "Fraction of the patch's pixels with another class than in the prior map"
-        of_pixels = product == "ground_map"
-        make = image_layer if of_pixels else patch_layer
+        make = image_layer if product == "ground_map" else patch_layer
         layers.append(replace(make(run, product, "changed", "changed", title), unit="1"))
     if (product := _product_with(run, OLD_CLASS)) is not None:
         legend = legend_of(open_group(run.path(product)))

@@ -289,8 +289,7 @@ def _score(run: SurveyRun) -> Estimate:
     """Return the score by the weights' table of scans, else by the scenes that were kept for validation."""
     record = run.described.record
     if (scan := run.scans.chosen) is not None:
-        scenes = counted(int(record["scans"]["scenes"]), "scene")
-        source = f"the weights' record of such scans, {scenes}"
+        source = f"the weights' record of such scans, {counted(int(record['scans']['scenes']), 'scene')}"
         if scan.spread is not None and scan.spread > MOST_ERROR:
             return Estimate(None, f"{source}; the scenes differ too much")
         return Estimate(scan.expected["mIoU"], source, at_most=run.budget is not None, spread=scan.spread)

@@ -224,8 +224,7 @@ def run_judge(
         if draft is None:
             raise ArchiveError(f"{found.uri} is being judged by another process; it adds the accuracy")
         with draft:
-            made = survey.products
-            published = extend_with_accuracy(survey, draft, evaluate(survey, *made.judged))
+            published = extend_with_accuracy(survey, draft, evaluate(survey, *survey.products.judged))
     show_published(published, settings.out, console)
     return published.receipt
 

@@ -26,7 +26,7 @@ from flows.cli.survey_verbs import NO_RENDERING_FLAGS, RenderingFlags, by_settin
 from flows.settings.documents import as_toml
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
-from flows.tasks.stages.effects import choose_effects, source_with
+from flows.tasks.stages.effects import choose_effects, chosen_effects
 from flows.terminal.processes import DONE, FAILED, PARTLY
 from flows.terminal.progress import on_stdout, print_json
 from pipeline.errors import SettingsError
@@ -263,4 +263,4 @@ def emulated_source(settings: Settings) -> tuple[SimulatedSource, tuple[str, ...
         apart = replace(settings, source="sim", out=str(Path(folder) / "effects"))
         run, _, notes = open_simulation(apart)
         effects, _ = choose_effects.produce(run.archive, choose_effects.wants(run))
-        return source_with(run.simulated, effects), notes
+        return replace(run.simulated, chosen=chosen_effects(effects)), notes

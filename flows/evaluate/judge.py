@@ -34,7 +34,6 @@ from pipeline.planning.prices import frame_patches
 ORACLE = "oracle"
 ENDS = ("none", "all")  # no patch, every patch
 Record = dict[str, Any]
-PatchIndex = NDArray[np.intp]
 
 
 def judge_frame(request: EvaluateRequest, frame: ObservedFrame, weights: Weights) -> Record:
@@ -63,7 +62,7 @@ def judge_frame(request: EvaluateRequest, frame: ObservedFrame, weights: Weights
 
 def _rows(
     request: EvaluateRequest, frame: ObservedFrame, gain: NDArray[np.float64]
-) -> Iterator[tuple[str, int, float, PatchIndex]]:
+) -> Iterator[tuple[str, int, float, NDArray[np.intp]]]:
     """Yield policy, draw, fraction and patches of each row; the random policy has several draws."""
     allowed = frame.seen.grid.valid_fraction().ravel() > 0
     yield "none", 0, 0.0, np.empty(0, np.intp)
@@ -163,8 +162,7 @@ def summarise(runs: Runs, class_names: Sequence[str], request: EvaluateRequest) 
             done, full = (float(np.mean([one[name] for one in some.parts])) for some in (row, whole))
             cost[name] = {"done": done, "ratio": done / full if full else None}
         table.append(figures | {"cost": cost})
-    named = dict(zip(class_names, support.tolist(), strict=True))
-    return {"rows": table, "support": named}
+    return {"rows": table, "support": dict(zip(class_names, support.tolist(), strict=True))}
 
 
 def _accuracy(row: Row, class_names: Sequence[str]) -> Record:

@@ -58,11 +58,10 @@ def publish_counted(
     moved = archive.take_moved()
     before, longest, folder = receipt["data_bytes"], {RECEIPT: 0, REPORT: 0}, 0
     while True:
-        sent = moved + folder if archive.in_bucket else 0
         told = {
             "written": before["written"] + written + folder,
             "kept": sum(stores.values()) + folder,
-            "moved_bucket": before["moved_bucket"] + sent,
+            "moved_bucket": before["moved_bucket"] + (moved + folder if archive.in_bucket else 0),
         }
         receipt = check_receipt(receipt | {"data_bytes": before | told})
         for name, text in ((RECEIPT, to_json(receipt)), (REPORT, page_of(receipt))):

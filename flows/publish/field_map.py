@@ -95,8 +95,7 @@ def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: Prio
 
     title = choose_bands(shown.wavelength_nm)[1].capitalize()
     colours = np.rint(255 * colours_of(shown, shown.rectified)).astype(np.uint8)
-    photo = webp(Image.fromarray(colours), quality=QUALITY)
-    layers = [MapLayer(title, data_address(photo), shown=True)]
+    layers = [MapLayer(title, data_address(webp(Image.fromarray(colours), quality=QUALITY)), shown=True)]
     layers.append(MapLayer("Class map", classes(shown.class_map), shown=True))
     if shown.confidence is not None:
         layers.append(MapLayer("Confidence, dark 0 to bright 1", _ramp_address(shown.confidence, 1.0)))

@@ -228,9 +228,8 @@ def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
     store = ProbabilityStore(ref.path / "class_probabilities.zarr")
     rows = range(0, store.shape[0], STRIP_ROWS)
     strips = (store.read(slice(top, min(top + STRIP_ROWS, store.shape[0])))[0] for top in rows)
-    counts = expected_counts(strips, len(names))
     exposure_ms = (settings.scan_exposure_ms or run.camera.exposure_ms) * run.scene.light_fraction
-    score = run.map_scores.expected(counts, step, exposure_ms)
+    score = run.map_scores.expected(expected_counts(strips, len(names)), step, exposure_ms)
     if score is None or not np.isfinite(score.miou):
         return None
     if score.error > MOST_ERROR:

@@ -205,8 +205,7 @@ def _draw_confidence(axes: Axes, data: QuicklookData, title: str, why: str = "")
     if data.confidence is None:
         axes.axis("off")
         return _caption(axes, title, "the map has none")
-    image = _show(axes, data, data.confidence, cmap="viridis", vmin=0, vmax=1)
-    _heat_key(image, ("0", "1"))
+    _heat_key(_show(axes, data, data.confidence, cmap="viridis", vmin=0, vmax=1), ("0", "1"))
     return _caption(axes, title, f"of the model{why}")
 
 
@@ -243,8 +242,8 @@ def _caption(axes: Axes, title: str, words: str) -> None:
     """Write a bold title over a line of words."""
     axes.set_title(f"{title}\n")
     placed: Any = {"xycoords": "axes fraction", "textcoords": "offset points"}
-    line = axes.annotate(words, (0, 1), (0, 7), color=MUTED, size=12, **placed)
-    line.set_in_layout(False)  # long captions do not narrow the panel
+    # Long captions do not narrow the panel.
+    axes.annotate(words, (0, 1), (0, 7), color=MUTED, size=12, **placed).set_in_layout(False)
 
 
 def _heat_key(image: AxesImage, ends: tuple[str, str]) -> None:

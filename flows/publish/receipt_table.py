@@ -23,6 +23,7 @@ from flows.terminal.figures import (
     format_percent,
     format_points,
     format_seconds,
+    spaced,
     three_digits,
 )
 from flows.terminal.progress import table
@@ -240,11 +241,11 @@ def format_figure(name: str, value: Any) -> str:
     if name in _FORMATS:
         return _FORMATS[name](value)
     if name in _VALUES:
-        return f"{_spaced(name)} {_VALUES[name](value)}"
+        return f"{spaced(name)} {_VALUES[name](value)}"
     label, _, unit = name.rpartition("_")
     if unit in _UNITS:
-        return f"{_spaced(label)} {_UNITS[unit](value)}"
-    return _spaced(name) if value is True else f"{_spaced(name)} {_format_value(value)}"
+        return f"{spaced(label)} {_UNITS[unit](value)}"
+    return spaced(name) if value is True else f"{spaced(name)} {_format_value(value)}"
 
 
 def _format_value(value: Any) -> str:
@@ -267,7 +268,7 @@ def plot_rows(plots: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
 
     def leading(fractions: Mapping[str, float | None]) -> str:
         known = sorted(((fraction, name) for name, fraction in fractions.items() if fraction), key=lambda one: -one[0])
-        return ", ".join(f"{_spaced(name)} {format_percent(fraction)}" for fraction, name in known[:LEADING_CLASSES])
+        return ", ".join(f"{spaced(name)} {format_percent(fraction)}" for fraction, name in known[:LEADING_CLASSES])
 
     return [
         {
@@ -290,23 +291,19 @@ def area_rows(receipt: Mapping[str, Any]) -> list[dict[str, str]]:
     pixels: Mapping[str, int] = (receipt.get("areas") or {}).get("px", {})
     hectares, every = hectares_of_classes(receipt), sum(pixels.values())
     return [
-        {"class": _spaced(name), "pixels": format_count(count), "fraction": format_percent(count / every)}
+        {"class": spaced(name), "pixels": format_count(count), "fraction": format_percent(count / every)}
         | ({} if hectares is None else {"area": format_area(hectares.get(name, 0.0))})
         for name, count in pixels.items()
         if count
     ]
 
 
-def _spaced(name: str) -> str:
-    return name.replace("_", " ")
-
-
 def _areas(areas: Mapping[str, float]) -> str:
-    return ", ".join(f"{_spaced(name)} {format_area(area)}" for name, area in areas.items() if area)
+    return ", ".join(f"{spaced(name)} {format_area(area)}" for name, area in areas.items() if area)
 
 
 def _changes(changes: Sequence[Sequence[Any]]) -> str:
-    most = [f"{_spaced(old)} to {_spaced(new)} {format_area(area)}" for area, old, new in changes[:MOST_NAMED]]
+    most = [f"{spaced(old)} to {spaced(new)} {format_area(area)}" for area, old, new in changes[:MOST_NAMED]]
     return f"changed {format_area(sum(area for area, _, _ in changes))}: {', '.join(most)}"
 
 

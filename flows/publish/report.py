@@ -113,9 +113,7 @@ def _format_visible(content: Any) -> Any:
         return visible(content)
     if isinstance(content, Mapping):
         return {visible(name): _format_visible(item) for name, item in content.items()}
-    if isinstance(content, list | tuple):
-        return [_format_visible(item) for item in content]
-    return content
+    return [_format_visible(item) for item in content] if isinstance(content, list | tuple) else content
 
 
 def _plain(value: object) -> object:

@@ -16,10 +16,9 @@ from pipeline.geometry.camera import LineCamera
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run, Store
-from storage.maintenance.garbage import IN_USE, Removal
+from storage.maintenance.garbage import DAY_S, IN_USE, Removal
 from storage.readers.recordings import LINE_PRODUCTS
 
-DAY_S = 86400.0
 PRESENT = {one.name: str(one.version) for one in (SIGNAL, SIGNAL_FINE)}
 
 

@@ -76,8 +76,7 @@ def publish_run(survey: OpenSurvey) -> Published:
     """Publish a run folder with receipt.json, quicklook.png and report.html."""
     plan = load_plan(survey.products["score"])
     with survey.run.archive.new_run(survey.run.name) as draft:
-        receipt = make_receipt(survey, plan, f"runs/{draft.id}")
-        return _publish(survey, draft, plan, receipt)
+        return _publish(survey, draft, plan, make_receipt(survey, plan, f"runs/{draft.id}"))
 
 
 def extend_with_accuracy(survey: OpenSurvey, draft: RunDraft, accuracy: StageRef) -> Published:
@@ -176,10 +175,9 @@ def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str) -> Receipt:
     for name in LIBRARIES:
         with suppress(PackageNotFoundError):  # run from a source tree that is not installed
             versions[name] = version(name)
-    best = run.scans.best_within(run.plan.coarse_s + plan.seconds)
     scans = {
         "taken": run.scans.chosen,
-        "best_in_time": best,
+        "best_in_time": run.scans.best_within(run.plan.coarse_s + plan.seconds),
         "reference": run.scans.reference,
     }  # where there is a table
     return build_receipt(

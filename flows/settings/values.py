@@ -106,11 +106,6 @@ def parse_compute(value: object) -> str:
     return f"{number!r}"
 
 
-def limit_of(text: str, whole: float) -> float:
-    """Return the number that a limit such as 25% or 4e9 stands for."""
-    return float(text.removesuffix("%")) / 100 * whole if text.endswith("%") else float(text)
-
-
 def parse_memory(value: object) -> int:
     """Return bytes that suffice for one process, as `parse_bytes` reads them."""
     count = parse_bytes(value)
@@ -250,9 +245,7 @@ def parse_keep(value: object) -> str:
 def raw_days(keep: str) -> float:
     """Return for how many days raw lines are kept: 0 for ``signal``, infinite for ``raw``."""
     word, _, age = keep.partition(" ")
-    if word == KEEP_SIGNAL:
-        return 0.0
-    return _amount(age, _DAYS) or math.inf
+    return 0.0 if word == KEEP_SIGNAL else _amount(age, _DAYS) or math.inf
 
 
 def parse_unknown(value: object) -> str:

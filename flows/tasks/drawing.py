@@ -150,9 +150,8 @@ class UnknownRule:
         found = np.zeros(seen.grid.padded_shape, np.bool_)
         for spec in seen.capture.specs:
             here = seen.capture.where(spec)
-            columns = seen.columns if here is None else seen.columns[here]
             found[... if here is None else here] = ood_detector.unknown(
-                columns, rate=self.rate, capture=spec, bands=bands
+                seen.columns if here is None else seen.columns[here], rate=self.rate, capture=spec, bands=bands
             )
         return found[: seen.grid.height, : seen.grid.width]
 

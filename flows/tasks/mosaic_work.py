@@ -12,7 +12,17 @@ from pathlib import Path
 from pipeline.geometry.camera import LineCamera
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.placed import PixelGrid, PlacedSweep
-from pipeline.rectify.region import MosaicWork, Tile, TileMaker, free_tiles, opened_tiles, opened_work, plan_tiles
+from pipeline.rectify.region import (
+    COPIES,
+    MosaicWork,
+    Tile,
+    TileMaker,
+    cache_bytes,
+    free_tiles,
+    opened_tiles,
+    opened_work,
+    plan_tiles,
+)
 from pipeline.rectify.sweep_paths import SweepPath, interlaced_paths, sweep_paths
 from storage.archive.manifests import read_table
 from storage.arrays.geolocation import Tables, open_geolocation
@@ -118,13 +128,14 @@ def tile_budget(
     Raises SettingsError: one tile does not fit the memory.
     """
     processes = not pool.shares_memory
+    bands = work.placed[0].signal.bands if work.placed else 1
+    one = COPIES * tile_shape[0] * tile_shape[1] * bands * 4
     most = max(1, min(1 if pool.elsewhere else pool.count, len(tiles)))
     for count in range(most, 0, -1):
-        one, lines = work.tile_memory(tiles, tile_shape, 1 if processes else count)
+        lines = cache_bytes(work.placed, tiles, 1 if processes else count)
         budget = TileBudget(count, lines, one, processes)
         if pool.elsewhere or budget.projected <= memory:
             return budget
-    bands = work.placed[0].signal.bands if work.placed else 1
     raise memory_refusal(
         budget.projected,
         memory,

@@ -10,7 +10,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings.values import limit_of
 from models.network.sizes import MultiplyAdds, SegmenterConfig, multiply_adds
 from models.policies.policies import GLANCING_POLICIES, score_multiply_adds
 from models.reading.regions import Region, plan_regions
@@ -112,4 +111,5 @@ class PatchBudget:
 
     @property
     def _most(self) -> float:
-        return limit_of(self.macs, self.everything)
+        number = float(self.macs.removesuffix("%"))
+        return number / 100 * self.everything if self.macs.endswith("%") else number

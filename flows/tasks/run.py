@@ -88,8 +88,9 @@ def check_memory(source: SimulatedSource, grid: SceneGrid, plan: CapturePlan, me
     placed = [place(_PlannedSweep(source, sweep), source.camera) for sweep in plan.coarse]
     rows, columns = image_spec(("y", "x"), pixels.shape, "<f4").shard or pixels.shape
     tiles = plan_tiles(placed, source.camera, pixels, (rows, columns))
-    work = MosaicWork(placed, source.camera, pixels)
-    tile_budget(work, tiles, (rows, columns), memory=memory, pool=replace(pool, workers=1))
+    tile_budget(
+        MosaicWork(placed, source.camera, pixels), tiles, (rows, columns), memory=memory, pool=replace(pool, workers=1)
+    )
 
 
 class _PlannedSweep(SimulatedSweep):
@@ -511,9 +512,7 @@ def field_source(
     """Return the source of lines. Raises what `flows.tasks.rig_field.rig_field` raises."""
     if settings.is_map:
         return FieldSource()
-    if settings.source != RIG:
-        return SimulatedField(simulated)
-    return rig_field.rig_field(scene, settings, planned)
+    return rig_field.rig_field(scene, settings, planned) if settings.source == RIG else SimulatedField(simulated)
 
 
 def make_source(scene: RasterScene, settings: Settings) -> SimulatedSource:

@@ -197,11 +197,10 @@ def _field_before_rig(settings: Settings) -> RasterScene:
     assert settings.wavelengths is not None
     width, height = settings.size
     bands = len(settings.wavelengths)
-    nothing = np.zeros((height, width, 1), np.float32)
     return RasterScene(
         name=settings.name or RIG_FIELD,
         key=f"{RIG_FIELD}/{settings.name or ''}/{width}x{height}",
-        raster=SceneRaster.of(nothing),
+        raster=SceneRaster.of(np.zeros((height, width, 1), np.float32)),
         light=Once.of(
             SceneRadiance(np.zeros((1, bands), np.float32), np.full(bands, settings.camera.full_scale_e, np.float32))
         ),

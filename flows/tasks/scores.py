@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from flows.terminal.figures import format_count, format_points, known_number
+from flows.terminal.figures import format_count, format_points, known_number, spaced
 
 JUDGING = "evaluate"  # the stage that judges the map
 MOST_ERROR = 0.1  # standard deviation of an expected mIoU, above which it is not shown
@@ -93,17 +93,13 @@ def error_matrix(accuracy: Mapping[str, Any]) -> ErrorMatrix | None:
     label, mapped = [sum(row) for row in counts], [sum(row[one] for row in counts) for one in range(size)]
     columns = [one for one in range(size) if label[one]]
     rows = [
-        [_spaced(names[one]), *(format_count(counts[by][one]) for by in columns), _right(counts[one][one], mapped[one])]
+        [spaced(names[one]), *(format_count(counts[by][one]) for by in columns), _right(counts[one][one], mapped[one])]
         for one in range(size)
         if label[one] or mapped[one]
     ]
     producers = [_right(counts[one][one], label[one]) for one in columns]
-    return ErrorMatrix([_spaced(names[one]) for one in columns], [*rows, ["producer's accuracy", *producers, ""]])
+    return ErrorMatrix([spaced(names[one]) for one in columns], [*rows, ["producer's accuracy", *producers, ""]])
 
 
 def _right(right: int, pixels: int) -> str:
     return format_points(right / pixels if pixels else None)
-
-
-def _spaced(name: str) -> str:
-    return name.replace("_", " ")

@@ -48,14 +48,13 @@ class SurveyModel:
         Raises WeightsError: the file is missing, damaged or inconsistent; SettingsError: the machine lacks the device.
         """
         described, load = describe_weights(path), Once(lambda: load_weights(path).on(choose_device(device)))
-        model = SurveyModel(path, described, load)
         if not planning:
             load()
             if described.reader is not None:
                 load_reader(path)
             if described.ood_detector is not None and unknown != UNKNOWN_OFF:
                 load_ood(path)
-        return model
+        return SurveyModel(path, described, load)
 
     def check_bands(self, wavelength_nm: NDArray[np.floating]) -> None:
         """Check that the bands overlap the spectral range of the weights. Raises WeightsError: they do not."""

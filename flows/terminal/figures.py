@@ -51,9 +51,7 @@ def format_count(count: float | None) -> str:
 
 def three_digits(value: float) -> str:
     """Return a number with three digits: 0.0823, 12.8, 43 700."""
-    if abs(value) < 100:
-        return f"{value:.3g}"
-    return format_count(round(value, 2 - math.floor(math.log10(abs(value)))))
+    return f"{value:.3g}" if abs(value) < 100 else format_count(round(value, 2 - math.floor(math.log10(abs(value)))))
 
 
 def format_percent(fraction: float | None) -> str:
@@ -83,6 +81,11 @@ def format_metres(length: float) -> str:
 def format_points(score: float | None) -> str:
     """Return a score of 0..1 in points of 100 with one decimal."""
     return f"{100 * score:.1f}" if _known(score) else DASH
+
+
+def spaced(name: str) -> str:
+    """Return a name of a class or a figure in words."""
+    return name.replace("_", " ")
 
 
 def counted(number: int, noun: str) -> str:

@@ -246,9 +246,8 @@ def uniform_pass(
     seen = [SimulatedSweep(source, sweep) for sweep in sweeps]
     columns = columns_of_sweeps(seen, source.camera, source.wavelength_nm, grid, weights, memory=MEMORY)
     patch_index, size = grid.valid_patches(), raw_bytes(sweeps, source.camera, len(source.wavelength_nm))
-    seconds = cost.seconds(sweeps, source.camera)
     coarse = coarse_prediction_of_patches(weights, columns, grid, capture)
-    return PlannedPass(coarse, patch_index, columns[patch_index], weights, seconds, size)
+    return PlannedPass(coarse, patch_index, columns[patch_index], weights, cost.seconds(sweeps, source.camera), size)
 
 
 def open_field(seed: int, scene: str | None, weights: Path | None, source: str) -> SurveyRun:

@@ -94,8 +94,7 @@ def error_of_passes(maps: Sequence[ScoredMap]) -> float:
     """Return the error of expected mIoU that small classes do not explain, by leaving out one scene at a time."""
     beyond = []
     for i, one in enumerate(maps):
-        others = [*maps[:i], *maps[i + 1 :]]
-        expected = expected_score(one.expected, fitted_bias(others or maps), 0.0)
+        expected = expected_score(one.expected, fitted_bias([*maps[:i], *maps[i + 1 :]] or maps), 0.0)
         beyond.append((expected.miou - mean_iou(one.counts)) ** 2 - expected.error**2)
     return max(LEAST_ERROR, math.sqrt(max(float(np.nanmean(beyond)), 0.0)))
 
@@ -141,9 +140,8 @@ class MapScores:
 
     def expected(self, counts: Floats, step: int, exposure_ms: float) -> ExpectedScore | None:
         """Return the expected score of a map by its `expected_counts`; None for a scan beyond the record."""
-        if step not in self.steps or not self.exposures_ms[0] <= exposure_ms <= self.exposures_ms[-1]:
-            return None
-        if len(counts) != self.bias.shape[-1]:
+        within = self.exposures_ms[0] <= exposure_ms <= self.exposures_ms[-1]
+        if step not in self.steps or not within or len(counts) != self.bias.shape[-1]:
             return None
         row = self.steps.index(step)
         at, known = math.log(exposure_ms), np.log(self.exposures_ms)

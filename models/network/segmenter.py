@@ -36,8 +36,7 @@ def code_2d(yx: Tensor, dim: int) -> Tensor:
         raise ShapeError(f"a 2-D code needs a width that divides by 4, got {dim}")
     if yx.dtype in (torch.float16, torch.bfloat16):  # exact up to 2048 and 256 only
         raise ShapeError(f"places of tokens must be float32, float64 or whole numbers, got {yx.dtype}")
-    count = dim // 4
-    periods = torch.linspace(math.log(2.0), math.log(LONGEST_PERIOD), count, dtype=torch.float64).exp()
+    periods = torch.linspace(math.log(2.0), math.log(LONGEST_PERIOD), dim // 4, dtype=torch.float64).exp()
     turns = yx.to(torch.float64)[..., None] / periods.to(yx.device)
     angle = 2 * math.pi * (turns - turns.round())
     return torch.cat([angle.sin(), angle.cos()], dim=-1).flatten(-2).to(torch.float32)

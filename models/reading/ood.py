@@ -62,8 +62,7 @@ class OodDetector:
         spread = np.stack([_floored(one) for one in self.covariance + noise])
         base = _whitening(spread.mean(axis=0))
         back = np.linalg.inv(base)
-        columns = len(self.read)
-        parts = np.stack([back @ _whitening(one) for one in spread]) / np.sqrt(columns)
+        parts = np.stack([back @ _whitening(one) for one in spread]) / np.sqrt(len(self.read))
         return LitDetector(*(one.astype(np.float32) for one in (base, self.centres @ base, parts)))
 
     def unknown(

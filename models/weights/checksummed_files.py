@@ -32,7 +32,6 @@ TENSORS, SEAL = "tensors", "seal"  # entries of the description: hashes of the t
 # errors of reading damaged or forged content; the last two are those of a network that does not fit its tensors
 DAMAGED = (SafetensorError, OSError, KeyError, TypeError, ValueError, RecursionError, RuntimeError)
 CHECKPOINT = "spectralzoom-checkpoint/2"
-Checkpoint = tuple[dict[str, Any], "dict[str, Tensor]"]
 
 
 def write_checksummed(path: Path, about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
@@ -119,7 +118,7 @@ def save_checkpoint(path: Path, identity: str, about: dict[str, Any], tensors: d
     write_checksummed(path, {"format": CHECKPOINT, "identity": identity, **about}, tensors)
 
 
-def load_checkpoint(path: Path, identity: str | None = None) -> Checkpoint | None:
+def load_checkpoint(path: Path, identity: str | None = None) -> tuple[dict[str, Any], dict[str, Tensor]] | None:
     """Read the checkpoint of a training run, or of any; None without a file, or where it is of another run.
 
     Raises WeightsError: it is damaged; the file stays.

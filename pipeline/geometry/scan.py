@@ -93,8 +93,7 @@ class CostModel:
             exposed = exposing(camera, sweep)
             lines, count = counts.get(exposed, (0, 0))
             counts[exposed] = lines + sweep.lines, count + 1
-        reloads = len(memory_loads(sweeps, self.vector_pairs))
-        return self.line_seconds(counts) + reloads * self.reload_s
+        return self.line_seconds(counts) + len(memory_loads(sweeps, self.vector_pairs)) * self.reload_s
 
     def line_seconds(self, counts: Mapping[LineCamera, tuple[int, int]]) -> float:
         """Return the time of so many lines and sweeps of each exposure, set-ups included [s]."""

@@ -97,8 +97,7 @@ class MapFrame:
 
     def ground_to_geodetic(self, ground_m: ArrayLike) -> Floats:
         """Return (..., 3) longitude, latitude [deg] and ellipsoidal height [m] of east, north, up of the foot."""
-        ground = np.asarray(ground_m, np.float64)
-        east, north, up = np.moveaxis(ground, -1, 0)
+        east, north, up = np.moveaxis(np.asarray(ground_m, np.float64), -1, 0)
         return _stacked(self._around_foot.transform(east, north, up, direction="INVERSE"))
 
     def ground_to_map(self, ground_m: ArrayLike) -> Floats:

@@ -24,7 +24,6 @@ else:
     spyndex = deferred("spyndex")
 
 Floats = NDArray[np.float32]
-Formula = Callable[[Mapping[str, Any]], Any]
 
 DARK_FRACTION = 0.01  # of white: pixels with a darker mean of bands have no index
 NARROW_NM = 10.0  # largest distance of a band from the wavelength of a narrow one
@@ -61,7 +60,7 @@ class SpectralIndex:
     title: str
     reference: str
     bands: tuple[IndexBand, ...]
-    formula: Formula  # of the bands' values and, with "lambda" before the symbol, wavelengths
+    formula: Callable[[Mapping[str, Any]], Any]  # of bands' values and, with "lambda" before the symbol, wavelengths
 
     @property
     def wants_reflectance(self) -> bool:

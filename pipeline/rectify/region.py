@@ -233,11 +233,6 @@ class MosaicWork:
     grid: PixelGrid
     kernel: Kernel = "catmull-rom"
 
-    def tile_memory(self, tiles: Sequence[Tile], tile_shape: tuple[int, int], at_once: int) -> tuple[int, int]:
-        """Return the bytes of one tile of (y, x) ``tile_shape``, and of the stored lines that tiles share."""
-        bands = self.placed[0].signal.bands if self.placed else 1
-        return COPIES * tile_shape[0] * tile_shape[1] * bands * 4, cache_bytes(self.placed, tiles, at_once)
-
 
 OpenWork = Callable[[], MosaicWork]  # hashable, and picklable for worker processes: it holds paths
 

@@ -120,9 +120,8 @@ def _usual_step(scan: Floats, lines: NDArray[np.intp], apart: float) -> float:
     """Return the median distance of consecutive lines that move; ``apart`` if none moves."""
     steps = np.abs(np.diff(scan)) / np.diff(lines)
     steps = steps[steps > STANDING_STEPS * apart]
-    if not len(steps):
-        return apart
-    return float(np.percentile(steps, 50, method="lower"))  # of one step and one gap, the step
+    # The lower median: of one step and one gap, the step.
+    return float(np.percentile(steps, 50, method="lower")) if len(steps) else apart
 
 
 def _runs(scan: Floats, most_back: float, still: float) -> list[slice]:

@@ -18,12 +18,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import RigError
+from pipeline.errors import RigError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_scene, position_to_direction
 from pipeline.geometry.scan import Axis, Sweep, exposing, line_positions, memory_loads, sweep_positions
 from pipeline.rig.camera.camera_cubes import CapturedLines
-from pipeline.rig.device_settings import check_prefix
 from pipeline.rig.mirror_controller import MotionLog, wire_positions
 
 Floats = NDArray[Any]  # float64
@@ -159,7 +158,8 @@ def capture_prefix(sweep: Sweep, first: int = 0) -> str:
     sizes = f"{sweep.lines}x{sweep.step}x{sweep.binning}" + ("" if sweep.held is None else f"x{sweep.held}")
     place = f"{sweep.kind[0]}{sweep.along}{_written(sweep.swath_px)}_{_written(sweep.start_px)}"
     prefix = f"{sweep.name}_{place}_{sizes}_{first}"
-    check_prefix(prefix)
+    if not re.fullmatch(r"[A-Za-z0-9_-]{0,128}", prefix):
+        raise SettingsError(f"a prefix names a folder: expected up to 128 letters, digits, - and _, got {prefix!r}")
     return prefix
 
 

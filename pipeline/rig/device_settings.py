@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from typing import Literal
 
@@ -67,12 +66,6 @@ def check_times(exposure_ms: float, frame_period_ms: float, most_rate_hz: float)
             f"exposure {exposure_ms:g} ms, expected {LEAST_EXPOSURE_MS:g} ms up to the frame period of "
             f"{frame_period_ms:g} ms; times are in ms"
         )
-
-
-def check_prefix(prefix: str) -> None:
-    """Raise SettingsError for a prefix that cannot be part of a folder's name."""
-    if not re.fullmatch(r"[A-Za-z0-9_-]{0,128}", prefix):
-        raise SettingsError(f"a prefix names a folder: expected up to 128 letters, digits, - and _, got {prefix!r}")
 
 
 @dataclass(frozen=True)

@@ -193,8 +193,7 @@ def upload(link: ProLink, cells: bytes, read_back: ReadBack) -> None:
         link.set(pro.set_vector(pro.VECTOR_MEMORY, start, sent), f"writing cells {start} to {stop}")
     for number in frames_to_check(len(frames), read_back):
         start, sent = frames[number]
-        held = read_cells(link, pro.VECTOR_MEMORY, start, len(sent) // pro.CELL)
-        if held != sent:
+        if read_cells(link, pro.VECTOR_MEMORY, start, len(sent) // pro.CELL) != sent:
             raise RigError(
                 f"cells {start} to {start + len(sent) // pro.CELL} of the vector memory on {link.wire.port} hold other "
                 "values than were sent; nothing was moved: load the path again"

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import Literal, Protocol, Self, TypeVar
 
 import serial
-from serial import SerialException, SerialTimeoutException
 from serial.tools import list_ports
 
 from pipeline.errors import RigError, SettingsError
@@ -131,7 +130,7 @@ def _errors(port: str) -> Iterator[None]:
         yield
     except RigError:
         raise
-    except (SerialException, OSError, TypeError) as error:
+    except (serial.SerialException, OSError, TypeError) as error:
         raise DeviceGone(f"{port} went away ({error}); look at the cable and the power, then run again") from error
 
 
@@ -149,7 +148,7 @@ class SerialTransport:
             self._serial = serial.serial_for_url(
                 port, baudrate=baud, timeout=_SLICE_S, write_timeout=_WRITE_S, exclusive=True
             )
-        except SerialException as error:
+        except serial.SerialException as error:
             there = ", ".join(sorted(one.device for one in list_ports.comports())) or "none"
             raise DeviceGone(
                 f"{port} cannot be opened ({error}), ports of this machine: {there}; is it a serial port, the "
@@ -167,7 +166,7 @@ class SerialTransport:
         with _errors(self.port):
             try:
                 self._serial.write(data)
-            except SerialTimeoutException:
+            except serial.SerialTimeoutException:
                 raise DeadlinePassed(
                     f"{self.port} did not take {len(data)} bytes within {_WRITE_S:g} s; is the device on?"
                 ) from None

@@ -112,8 +112,7 @@ def _least_squares(white: Scores, there: Bools, axes: Scores, bands: int) -> tup
         part = slice(first, first + 4096)
         gram = (there[part].astype(np.float32) @ products).reshape(-1, count, count).astype(np.float64)
         gram += 1e-6 * np.eye(count)
-        found = np.linalg.solve(gram, (white[part] @ axes).astype(np.float64)[..., None])[..., 0]
-        scores[part] = found
+        scores[part] = np.linalg.solve(gram, (white[part] @ axes).astype(np.float64)[..., None])[..., 0]
         rest = np.where(there[part], white[part] - scores[part] @ axes.T, 0)
         left = np.einsum("nb,nb->n", rest, rest) + np.minimum(bands - there[part].sum(axis=1), bands - count)
         residual[part] = left / max(bands - count, 1)

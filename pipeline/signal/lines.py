@@ -71,8 +71,7 @@ class Signal:
         values, valid = calibrate(raw, elements, saturated_dn=saturated, position=position)
         if whole:
             values, valid = values[:, samples], valid[:, samples]
-        usable = self.lines.valid_line[numbers]
-        return values, valid & usable.reshape(-1, *[1] * (valid.ndim - 1))
+        return values, valid & self.lines.valid_line[numbers].reshape(-1, *[1] * (valid.ndim - 1))
 
     def broad_image(
         self, usable: NDArray[np.bool_], full_scale_dn: float, bands: int = BROAD_BANDS

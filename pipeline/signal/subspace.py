@@ -84,8 +84,7 @@ class SignalStatistics:
         lines, samples = (size // BLOCK for size in whole.shape)
         if lines and samples:
             cut = np.s_[: lines * BLOCK, : samples * BLOCK]
-            shape = (lines, BLOCK, samples, BLOCK)
-            every = whole[cut].reshape(shape).all(axis=(1, 3))
+            every = whole[cut].reshape(lines, BLOCK, samples, BLOCK).all(axis=(1, 3))
             rows = spectra[cut].reshape(lines, BLOCK, samples * BLOCK, -1).sum(axis=1)
             means = (rows.reshape(lines, samples, BLOCK, -1).sum(axis=2)[every] / BLOCK**2).astype(np.float64)
             self.block += means.T @ means  # float32 would round off the noise below a signal of 300 deviations
@@ -283,8 +282,7 @@ def _left_over(white: Floats, axes: Floats) -> Floats:
     """Return the standard deviation of the components' residuals of whitened bands, over that of unit noise."""
     rest = np.eye(len(white)) - axes @ axes.T
     left = np.einsum("ij,jk,ik->i", rest, white, rest)
-    open_to = np.maximum(np.diag(rest), 1e-3)
-    return np.asarray(np.sqrt(np.clip(left / open_to, 0.25, 4.0)))
+    return np.asarray(np.sqrt(np.clip(left / np.maximum(np.diag(rest), 1e-3), 0.25, 4.0)))
 
 
 def _axes(

@@ -5,7 +5,6 @@ Find stores and runs among other files, and check that a folder can be an archiv
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
 import math
@@ -14,7 +13,7 @@ import re
 import secrets
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from enum import Enum
 from pathlib import Path, PurePath
 from typing import Any
@@ -68,8 +67,8 @@ def plain(value: object) -> Any:
             raise ArchiveError("an array of objects cannot be part of a key; give numbers")
         content = hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
         return {"dtype": value.dtype.str, "shape": list(value.shape), "sha256": content}
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {one.name: plain(getattr(value, one.name)) for one in dataclasses.fields(value)}
+    if is_dataclass(value) and not isinstance(value, type):
+        return {one.name: plain(getattr(value, one.name)) for one in fields(value)}
     if isinstance(value, Mapping):
         return {str(name): plain(entry) for name, entry in value.items()}
     if isinstance(value, set | frozenset):
@@ -148,9 +147,8 @@ def without_manifest(root: Path) -> list[Path]:
 def in_text(text: str) -> str | None:
     """Return the store's address that begins a text such as ``stages/rectify/<key>/mosaic.zarr``, or None."""
     found = STORE_URI.match(text)
-    if found is None or not all(is_name(part) for part in found.groups()):  # stages/../.. leads out of the archive
-        return None
-    return found.group(0)
+    # stages/../.. leads out of the archive
+    return found.group(0) if found is not None and all(is_name(part) for part in found.groups()) else None
 
 
 def open_folder(path: Path, *, create: bool, write: bool) -> None:

@@ -47,9 +47,7 @@ class Catalogue:
     def inputs_of(self, uri: str) -> list[str]:
         """Return the addresses of a store's inputs; a key without a store stays a bare key."""
         store = self.stores.get(uri)
-        if store is None:
-            return []
-        return [self.by_key.get(given, [given])[0] for given in store.inputs]
+        return [] if store is None else [self.by_key.get(given, [given])[0] for given in store.inputs]
 
     def ancestors(self, uris: Iterable[str]) -> set[str]:
         """Return all inputs of these stores, direct and indirect, without themselves; missing ones as bare keys."""

@@ -156,8 +156,7 @@ def _receipt(folder: Path, facts: Mapping[str, Any]) -> tuple[dict[str, Any], st
             return {}, f"{RECEIPT} has changed since it was published (its SHA-256 differs)"
         return _table(json.loads(path.read_bytes())), None
     except (OSError, ValueError, RecursionError) as error:
-        words = error.strerror if isinstance(error, OSError) else error
-        return {}, f"{RECEIPT} cannot be read: {words}"
+        return {}, f"{RECEIPT} cannot be read: {error.strerror if isinstance(error, OSError) else error}"
 
 
 def _table(value: object) -> dict[str, Any]:

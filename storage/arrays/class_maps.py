@@ -197,8 +197,7 @@ def write_probabilities_tile(
         0, len(age_days), SHARD_ROWS
     ):  # so that the packed values of all rows are never in memory together
         part = log_probability[top : top + SHARD_ROWS]
-        likely = np.where(part < LEAST, UNLIKELY, np.minimum(part, 0))
-        packed = np.rint((likely - FAINTEST) / STEP)
+        packed = np.rint((np.where(part < LEAST, UNLIKELY, np.minimum(part, 0)) - FAINTEST) / STEP)
         rows = slice(place[0].start + top, place[0].start + top + len(part))
         likelihood[rows, place[1]] = np.where(np.isnan(part), NOTHING, np.minimum(packed, NOTHING - 1)).astype(np.uint8)
     days = np.rint(np.clip(age_days, 0, DAY_STEP * (NEVER - 1)) / DAY_STEP)
@@ -226,8 +225,7 @@ def drop_changes(path: Path) -> None:
 
 def write_changes(path: Path, changed: Floats, patch_px: int) -> None:
     """Add the fraction of changed pixels of each patch (patch_y, patch_x) of ``patch_px`` to class probabilities."""
-    about = {**CHANGED, "patch_px": patch_px}
-    write_image(open_group(path, "r+"), "changed", ("patch_y", "patch_x"), changed, about)
+    write_image(open_group(path, "r+"), "changed", ("patch_y", "patch_x"), changed, {**CHANGED, "patch_px": patch_px})
 
 
 def unpacked_days(packed: NDArray[np.uint16]) -> Floats:

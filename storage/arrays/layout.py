@@ -276,9 +276,8 @@ def damage_named(where: str) -> Iterator[None]:
 def numbers_in_memory(values: NDArray[Any]) -> tuple[int, zarr.Array[Any]]:
     """Store integers (line, sample, band) in memory, in chunks of raw lines; return the bytes and the array."""
     held: dict[str, Any] = {}
-    group = zarr.create_group(MemoryStore(store_dict=held), zarr_format=3)
     spec = image_spec(("line", "sample", "band"), values.shape, values.dtype.str)
-    array = create_array(group, "dn", spec, {})
+    array = create_array(zarr.create_group(MemoryStore(store_dict=held), zarr_format=3), "dn", spec, {})
     array[...] = values
     return bytes_held(held, "dn"), array
 

@@ -168,9 +168,8 @@ class SignalCubeWriter:
         for name, column in (("rare_line", 0), ("rare_sample", 1)):
             write_small(self.group, name, ("rare",), rare[:, column].astype(np.int32), {"units": "1"})
         about = {"long_name": "residual of a rare spectrum", "units": "1", "scale_factor": RESIDUAL_STEP}
-        kind = _kind(float(np.abs(residuals).max(initial=0)))
         chunk = (min(1024, max(len(residuals), 1)), residuals.shape[1])
-        spec = ArraySpec(("rare", "band"), residuals.shape, kind, chunk)
+        spec = ArraySpec(("rare", "band"), residuals.shape, _kind(float(np.abs(residuals).max(initial=0))), chunk)
         array = create_array(self.group, "rare_residual", spec, about)
         if residuals.size:
             array[...] = residuals

@@ -68,8 +68,7 @@ def _write_cog(path: Path, image: CogImage, blocks: Blocks) -> None:
     rasterio = importlib.import_module("rasterio")
     copy = importlib.import_module("rasterio.shutil").copy
     sidecar = f"{path.name}.aux.xml"
-    files = [path.name] if image.legend is None else [path.name, sidecar]
-    with written_aside(path.parent, files) as aside:
+    with written_aside(path.parent, [path.name] if image.legend is None else [path.name, sidecar]) as aside:
         plain, made = aside / "plain.tif", aside / path.name
         _write_plain(rasterio, plain, image, blocks)
         options = {

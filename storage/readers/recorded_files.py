@@ -359,13 +359,12 @@ def _csv_cells(path: Path) -> tuple[list[str], list[list[str]]]:
     if not rows:
         raise SceneError(f"{path} is empty; give a header and a row for each line")
     names = [name.lower() for name in rows[0]]
-    cells = [row for row in rows[1:] if any(row)]
     for number, row in enumerate(rows[1:], 2):
         if any(row) and len(row) != len(names):
             raise SceneError(
                 f"{path}, row {number} has {len(row)} cells, its header {len(names)}; give each row one cell a column"
             )
-    return names, cells
+    return names, [row for row in rows[1:] if any(row)]
 
 
 def find_pointing(folder: Path, stem: str) -> Path | None:

@@ -362,9 +362,8 @@ def find_raw_cubes(address: str | Path) -> list[Path] | None:
         raise SceneError(f"there is no recording {path}; check the name (seen from {Path.cwd()})")
     if not path.is_dir():
         return None
-    if _is_raw_cube(path):
-        return [path]
-    return sorted(one for one in path.glob("*.zarr") if _is_raw_cube(one)) or None
+    found = [path] if _is_raw_cube(path) else sorted(one for one in path.glob("*.zarr") if _is_raw_cube(one))
+    return found or None
 
 
 def _is_raw_cube(path: Path) -> bool:

@@ -27,7 +27,6 @@ from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings,
 if TYPE_CHECKING:
     from odc.geo.geobox import GeoBox
 
-ReadRows = Callable[[int, int], NDArray[np.float32]]
 USUAL_NODATA = -9999.0  # assumed where no file states another
 COPIES = 6  # of a block in memory while it is read and processed
 FRACTION = 4  # of the free memory for a block: larger ones are no faster
@@ -42,7 +41,7 @@ class SceneFile:
     wavelength_nm: NDArray[np.float64]  # (band,)
     fwhm_nm: NDArray[np.float64] | None = None  # (band,)
     shape: tuple[int, int]  # (y, x)
-    read: ReadRows  # rows from one to another: (y, x, band) float32, NaN without a value
+    read: Callable[[int, int], NDArray[np.float32]]  # rows from one to another: (y, x, band), NaN without a value
     missing: NDArray[np.bool_]  # (y, x) pixels without a value in more than half of their bands
     filled_px: int  # pixels without a value in a band
     light_hash: str  # of values and wavelengths, without labels

@@ -156,9 +156,8 @@ def answers_of(place: ObjectPlace) -> Iterator[None]:
             raise
         text = str(error)
         known = (words for signs, words in _MEANINGS if any(sign in text for sign in signs))
-        meaning = next(known, _first_line(error))
         at = "" if place.endpoint is None else f" at {place.endpoint}"
-        raise UnreachableError(f"{place.url}{at}: {meaning}") from error
+        raise UnreachableError(f"{place.url}{at}: {next(known, _first_line(error))}") from error
 
 
 def _first_line(error: BaseException) -> str:

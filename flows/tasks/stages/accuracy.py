@@ -66,8 +66,7 @@ def evaluate(
 
     ``sources`` are the effects and the registration of the capture; a raster has neither.
     """
-    off = map_offset(simulated, sources[1:])
-    labels = moved_labels(labels, off, plan.along)
+    labels = moved_labels(labels, map_offset(simulated, sources[1:]), plan.along)
 
     def build(path: Path) -> None:
         """Write the figures of the map, of the overview alone and, with controls, of other placements."""

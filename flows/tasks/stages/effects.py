@@ -6,8 +6,8 @@ scan represent all sweeps.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,6 @@ from pipeline.simulator.rig_model import OF_THE_SCENE, Rig
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.selection.choice import decide, list_effects, sum_up
 from pipeline.simulator.selection.survey_probe import probe_survey
-from pipeline.simulator.simulated import SimulatedSource
 from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table
 from storage.archive.whole_files import to_json
@@ -98,10 +97,3 @@ def chosen_effects(effects: StageRef) -> dict[Effect, str]:
             )
         chosen[BY_NAME[row["name"]]] = row["variant"]
     return chosen
-
-
-def source_with(
-    source: SimulatedSource, effects: StageRef, clock: Mapping[str, float] | None = None
-) -> SimulatedSource:
-    """Return the source with the chosen effects; ``clock`` has the start of each sweep by name [s]."""
-    return replace(source, chosen=chosen_effects(effects), clock=clock)

@@ -222,11 +222,10 @@ def ground(
             """
             confidence = image_at(found.confidence[..., None], pixels)[..., 0]
             confidence[nearest_at(unsure, pixels, False)] = np.nan  # class unknown
-            picture = np.nan_to_num(np.rint(image_at(colours, pixels, factor=1))).astype(np.uint8)
             images: dict[str, NDArray[np.generic]] = {
                 "classes": nearest_at(found.classes, pixels, UNLABELLED),
                 "confidence": confidence,
-                "picture": picture,
+                "picture": np.nan_to_num(np.rint(image_at(colours, pixels, factor=1))).astype(np.uint8),
                 "age": nearest_at(age_days, pixels, np.nan),
             }
             if changes is not None:

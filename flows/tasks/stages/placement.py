@@ -90,16 +90,14 @@ def _shift_record(shift: SweepShift) -> dict[str, Any]:
 
 
 def _window_record(seen: SeamWindow, names: Sequence[str]) -> dict[str, Any]:
-    left = seen.residual_px.tolist() if np.isfinite(seen.residual_px).all() else None
-    status = "too narrow" if seen.found is None else seen.found.status
     window = seen.window
     return {
         "reference": names[window.reference],
         "moving": names[window.moving],
         "along_px": window.along_px,
         "scan_px": window.scan_px,
-        "status": status,
-        "residual_px": left,
+        "status": "too narrow" if seen.found is None else seen.found.status,
+        "residual_px": seen.residual_px.tolist() if np.isfinite(seen.residual_px).all() else None,
     }
 
 
@@ -242,11 +240,10 @@ def rectify_fine(
 def mosaic_of_sweeps(path: Path, signal: StageRef, frame: FieldFrame) -> MosaicWriter:
     """Create the mosaic of compressed sweeps, in the pixels of the scene."""
     sweeps = open_signal_cubes(signal.path)
-    components = sweeps[0].components if sweeps else Components.empty(len(frame.wavelength_nm))
     return MosaicWriter(
         path / "mosaic.zarr",
         (frame.grid.height, frame.grid.width),
-        components,
+        sweeps[0].components if sweeps else Components.empty(len(frame.wavelength_nm)),
         frame.wavelength_nm,
         step=MOSAIC_STEP * sweeps[0].step if sweeps else 1.0,
         largest=max((sweep.largest for sweep in sweeps), default=0.0) * KERNEL_GAIN,

@@ -210,9 +210,8 @@ def _agreed(
         return 0, FieldShift()
     middle = np.array(shape[:2]) / 2
     places = np.array([place - middle for place, _ in pairs])
-    moved = places + np.array([shift for _, shift in pairs])
     model, inliers = skimage.measure.ransac(  # type: ignore[no-untyped-call]
-        (places, moved),
+        (places, places + np.array([shift for _, shift in pairs])),
         skimage.transform.EuclideanTransform,
         min_samples=2,
         residual_threshold=within_px,

@@ -60,8 +60,7 @@ def light_ratio(
     each = np.full(usable.shape, np.nan)
     each[usable] = np.log(sums[1][usable] / sums[0][usable])
     ratio, error = np.full(each.shape[1], np.nan), np.full(each.shape[1], np.inf)
-    count = usable.sum(axis=0)
-    for band in np.flatnonzero(count >= LEAST_GROUPS):
+    for band in np.flatnonzero(usable.sum(axis=0) >= LEAST_GROUPS):
         known = each[usable[:, band], band]
         ratio[band] = np.median(known)
         spread = SIGMA_OF_MEDIAN * np.median(np.abs(known - ratio[band]))
@@ -86,10 +85,9 @@ def solve_lights(ratios: Sequence[LightRatio], sweeps: int, wavelength_nm: Float
         # The least solution: what no ratio sees, the mean of joined sweeps, is 0.
         solved, *_ = np.linalg.lstsq(np.vstack(rows), np.concatenate(wanted), rcond=1e-10)
         answer = solved.reshape(sweeps, -1)
-    log_light = answer @ basis.T
     seen = {number for ratio in known for number in (ratio.reference, ratio.moving)}
     untied = tuple(number for number in range(sweeps) if number not in seen)
-    return SweepLights(np.exp(log_light).astype(np.float32), untied)
+    return SweepLights(np.exp(answer @ basis.T).astype(np.float32), untied)
 
 
 def overlap_light(placed: Sequence[PlacedSweep], camera: LineCamera, windows: Sequence[Window]) -> list[LightRatio]:

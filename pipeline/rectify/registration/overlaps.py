@@ -177,8 +177,7 @@ def _pair_windows(images: Sequence[PlacedImage], one: int, other: int, window_px
     edges = [images[number].edges for number in (one, other)]
     low = max(float(edge[..., 1].min()) for edge in edges)
     high = min(float(edge[..., 1].max()) for edge in edges)
-    count = int(np.ceil((high - low) / window_px))
-    cuts = np.linspace(low, high, max(count, 0) + 1)
+    cuts = np.linspace(low, high, max(int(np.ceil((high - low) / window_px)), 0) + 1)
     for start, stop in zip(cuts[:-1].tolist(), cuts[1:].tolist(), strict=True):
         probes = np.linspace(start, stop, 5)
         reach = [[np.interp(probes, end[:, 1], end[:, 0]) for end in edge] for edge in edges]

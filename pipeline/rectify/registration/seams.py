@@ -85,8 +85,7 @@ def register_sweeps(
     shifts, among, reference = no_shifts(names), frozenset(range(len(sweeps))), None
     rounds: list[tuple[list[SeamWindow], SweepShifts]] = []
     for reach in (2 * prior_px, min(SETTLED_PRIOR_PX, 2 * prior_px)):
-        images = place_images(sweeps, shifts, camera)
-        seen = _measure_windows(images, reach, window_px, among)
+        seen = _measure_windows(place_images(sweeps, shifts, camera), reach, window_px, among)
         measured = [each.measured for each in seen if each.measured is not None]
         solved = solve_sweeps(measured, names, lines, reference=reference)
         shifts = tuple(old.plus(new) for old, new in zip(shifts, solved.shifts, strict=True))

@@ -129,9 +129,7 @@ def _standardised(image: NDArray[np.floating]) -> Floats | None:
         return None
     values = np.where(seen, image, np.nan).astype(np.float64)
     mean, spread = float(np.nanmean(values)), float(np.nanstd(values))
-    if spread <= FLAT_SPREAD * abs(mean) or spread == 0:
-        return None
-    return (values - mean) / spread
+    return None if spread <= FLAT_SPREAD * abs(mean) or spread == 0 else (values - mean) / spread
 
 
 def _is_textured(image: Floats) -> bool:

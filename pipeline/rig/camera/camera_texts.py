@@ -345,9 +345,8 @@ def times_of_lines(index: FrameIndex, first_frame: int, lines: int, lost: int = 
         dropped = int(index.frame[-1] - index.frame[0]) + 1 - len(index.frame)
         notes = (f"{dropped} frames between the first and the last were dropped by the camera",) if dropped else ()
         return LineTimes(index.frame[:lines], index.stamp_us[:lines], notes)
-    origin = 0 if index.frame[0] == 0 else first_frame
     found = LineTimes.unknown(lines)
-    place = index.frame - origin
+    place = index.frame - (0 if index.frame[0] == 0 else first_frame)
     inside = (place >= 0) & (place < lines)
     found.frame[place[inside]] = index.frame[inside]
     found.stamp_us[place[inside]] = index.stamp_us[inside]

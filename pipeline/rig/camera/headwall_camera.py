@@ -61,9 +61,8 @@ def response_of(text: str, name: str, port: str) -> Any:
 
     Raises DeviceRefused: it reports a failure. Raises RigError: it is no such reply.
     """
-    body = text
-    if not text.startswith("{"):  # the command, repeated
-        body = text.replace("\n", "\r").partition("\r")[2]
+    # The command is repeated before a reply that does not begin as JSON.
+    body = text if text.startswith("{") else text.replace("\n", "\r").partition("\r")[2]
     try:
         content = json.loads(body)
         success, response, reason = content["success"], content.get("response"), content.get("errorMessage")

@@ -300,8 +300,7 @@ class EmulatedRig:
     ) -> None:
         self.clock = clock
         self.mirror = self.mirror_kind(self.clock)
-        view = SceneView(source, mounting)
-        self.camera = self.camera_kind(view, self.mirror, self.clock, wired=wired)
+        self.camera = self.camera_kind(SceneView(source, mounting), self.mirror, self.clock, wired=wired)
         self.mirror.pulses = self.camera.pulses
 
     @property

@@ -55,9 +55,8 @@ class Turbulence(Aim):
     cost_ns = MappingProxyType({"jitter": 0.13})
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
-        sigma = turbulence_px(block.rig)
         draws = [block.stream(self.name, int(number)).standard_normal(2) for number in block.numbers]
-        return sigma * np.array(draws, np.float64).reshape(-1, 1, 2)
+        return turbulence_px(block.rig) * np.array(draws, np.float64).reshape(-1, 1, 2)
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound for all lines at once, but in one survey of 1000: no line of N exceeds sqrt(2 ln(N / risk)) sigma."""
@@ -196,11 +195,9 @@ def greatest_fraction(air: Air) -> float:
 
 def reach_m(rig: Rig) -> tuple[float, float] | None:
     """Return the nearest and the farthest distance that the scene's relief has [m]; None for one without a distance."""
-    ends = rig.distances_m
-    if ends is None or rig.air.distance_m is None:
+    if rig.air.distance_m is None or rig.distances_m is None:
         return None
-    if rig.air.relief == "flat":
-        ends = (rig.air.distance_m, rig.air.distance_m)
+    ends = (rig.air.distance_m,) if rig.air.relief == "flat" else rig.distances_m
     return min(*ends, FARTHEST_M), min(max(ends), FARTHEST_M)
 
 
@@ -338,8 +335,7 @@ class PathRadiance(LightChange):
         if reach is None:
             return GainRange.between(1.0, 1.0, len(nm))
         passed = np.exp(-np.array(reach)[:, None] * extinction_per_m(rig.air, nm))
-        uneven = float(passed.max(initial=0.0) - passed.min(initial=1.0))
-        alone = GainRange.of(passed, uneven=uneven)
+        alone = GainRange.of(passed, uneven=float(passed.max(initial=0.0) - passed.min(initial=1.0)))
         if probe.white_e is None:
             return alone
         most = DRIFT.gain_range(probe, rig).greatest.max(initial=1.0)
@@ -347,8 +343,7 @@ class PathRadiance(LightChange):
 
     def change(self, light: Radiance, block: SweepBlock, variant: str) -> Radiance:
         """Return light (line, sample, band) [e-] with what air takes of it and adds; changed in place."""
-        reach = reach_m(block.rig)
-        if reach is None:
+        if reach_m(block.rig) is None:
             return light
         metres = sample_distances(block)[..., None]
         depth = (extinction_per_m(block.rig.air, block.wavelength_nm) * metres).astype(np.float32)
@@ -370,8 +365,7 @@ def extinction_per_m(air: Air, wavelength_nm: Floats) -> Floats:
     by Angstrom's exponent: 1.14 [4], below 7.4 km Kruse's 0.585 V^(1/3) [5]. Above 336 km no aerosol is left. Valid
     from 400 to 1000 nm beside the lines of gases, and down to some 0.5 km of visibility.
     """
-    molecules = rayleigh_per_m(np.array([VISIBLE_NM]))[0]
-    aerosol = max(KOSCHMIEDER / air.visibility_km * 1e-3 - molecules, 0.0)
+    aerosol = max(KOSCHMIEDER / air.visibility_km * 1e-3 - rayleigh_per_m(np.array([VISIBLE_NM]))[0], 0.0)
     exponent = min(ANGSTROM, KRUSE * air.visibility_km ** (1 / 3))
     return np.asarray(aerosol * (wavelength_nm / VISIBLE_NM) ** -exponent + rayleigh_per_m(wavelength_nm))
 

@@ -166,7 +166,6 @@ DRIFT, CLOUD, BRDF = Drift(), Cloud(), Brdf()
 
 
 REST_RAD = math.radians(45)
-Indices = NDArray[np.complex128]
 # Rows: wavelength [nm], n, k; straight between. Evaporated films at room temperature.
 _ALUMINIUM = np.array([  # [2]
     (309.96, 0.28003, 3.7081), (326.28, 0.31474, 3.9165), (364.66, 0.39877, 4.3957), (413.28, 0.52135, 5.0008),
@@ -260,8 +259,7 @@ class Polarisation(Gain):
         incidence = _incidence(sweep_ends(probe, rig.camera))
         if rig.mirror.coating == "ideal" or not incidence.size:
             return Bound(0.0, "the mirror reflects everything" if incidence.size else "no line is taken")
-        factors = _factors_between(incidence, rig, probe.wavelength_nm)
-        most = np.abs(factors - 1).max(axis=0)
+        most = np.abs(_factors_between(incidence, rig, probe.wavelength_nm) - 1).max(axis=0)
         least_deg, most_deg = np.degrees(incidence.min()), np.degrees(incidence.max())
         where = f" at {probe.wavelength_nm[int(most.argmax())]:.0f} nm" if most.size else ""
         why = (
@@ -310,7 +308,7 @@ def reflectance(coating: Coating, wavelength_nm: Floats, incidence_rad: Floats) 
     return (across + within) / 2
 
 
-def fresnel(index: Indices, incidence_rad: Floats) -> tuple[Floats, Floats]:
+def fresnel(index: NDArray[np.complex128], incidence_rad: Floats) -> tuple[Floats, Floats]:
     """Return what a surface in air reflects of light polarised across (s) and within (p) the plane of incidence [1]."""
     cosine, square = np.cos(incidence_rad), index**2
     beyond = np.sqrt(square - np.sin(incidence_rad) ** 2)  # index times the cosine behind the surface

@@ -61,10 +61,9 @@ class Rotation(Effect):
         ]
         along, scan = (max(way[0] for way in ways), max(way[1] for way in ways)) if ways else (0.0, 0.0)
         most = f"{round(along, 9):.3g} px along and {round(scan, 9):.3g} px along the scan"
-        why = f"lines are turned and stretched by at most {most}"
         # The footprint does not lie turned either: the same as one box that does not.
         shape = MARGIN * probe.slit_errors.get(UPRIGHT, 0.0)
-        return Bound(probe.moved(along, scan) + shape, why)
+        return Bound(probe.moved(along, scan) + shape, f"lines are turned and stretched by at most {most}")
 
 
 def _course(sweep: Sweep, camera: LineCamera, beside: tuple[float, float]) -> tuple[float, float]:
@@ -99,9 +98,8 @@ class SlitBox(Effect):
         instead = "its middle ray" if variant == OFF else f"{variant.replace('x', ' x ')} boxes that are not turned"
         why = f"{instead} in place of a footprint {width:.2g} px wide and 1 px long"
         box = np.array([[1.0], [width**2]]) / 12
-        whole = probe.blurred(np.repeat(box, bands, axis=1))
         if variant not in probe.slit_errors:
-            return Bound(whole, why)
+            return Bound(probe.blurred(np.repeat(box, bands, axis=1)), why)
         value = MARGIN * probe.slit_errors[variant]
         if variant != OFF:
             turned = max(beside_plan_px(probe, rig)) * rig.camera.ifov_rad * (width**2 + 1) / 12
@@ -154,9 +152,7 @@ def _courses(sweeps: tuple[Sweep, ...], rig: Rig) -> Iterator[Floats]:
 
 def smeared_positions(block: SweepBlock, variant: str) -> Floats:
     """Return the mirror positions (line, step, 2) at which a footprint stands in an exposure."""
-    if variant == POSITIONS and block.sweep.positions > 1:
-        return block.positions
-    return block.middle[:, None]
+    return block.positions if variant == POSITIONS and block.sweep.positions > 1 else block.middle[:, None]
 
 
 ROTATION, SLIT, SMEAR = Rotation(), SlitBox(), Smear()

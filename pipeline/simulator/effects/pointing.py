@@ -101,8 +101,7 @@ def tilt_to_scene(normals: Floats) -> Floats:
     """
     within = np.stack([normals[..., 2], np.zeros_like(normals[..., 0]), -normals[..., 0]], axis=-1)  # y x n
     within /= np.hypot(normals[..., 2], normals[..., 0])[..., None]
-    across = np.cross(normals, within)
-    tilts = np.stack([across, within], axis=-2)  # (..., tilt, 3)
+    tilts = np.stack([np.cross(normals, within), within], axis=-2)  # (..., tilt, 3)
     # o = k - 2 (n . k) n with k = (0, 0, 1)
     view = -2 * normals[..., 2:] * normals
     view[..., 2] += 1
@@ -309,8 +308,7 @@ def greatest_lag_px(rig: Rig, sweeps: Iterable[Sweep]) -> float:
     """Return the greatest shift along the scan of any line. [px]"""
     worst = 0.0
     for sweep in {(one.lines, one.step, one.positions): one for one in sweeps if one.lines}.values():
-        numbers = np.arange(sweep.lines)
-        off = transient(rig, sweep, numbers)
+        off = transient(rig, sweep, np.arange(sweep.lines))
         worst = max(worst, float(np.abs(off).mean(axis=1).max()))
     return worst
 

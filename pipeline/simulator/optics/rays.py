@@ -122,5 +122,4 @@ def extreme_normals(sweeps: Iterable[Sweep], camera: LineCamera) -> Floats:
 def middle_normal(sweep: Sweep, camera: LineCamera) -> Floats:
     """Return the mirror's normal in the middle of a sweep, (3,): one kernel for all its lines, whatever the block."""
     middle = sweep.start_px + ((sweep.lines - 1) * sweep.step + sweep.positions - 1) / 2
-    tangents = np.array([sweep.swath_px, middle]) * camera.ifov_rad
-    return direction_to_normal(scene_to_direction(tangents))
+    return direction_to_normal(scene_to_direction(np.array([sweep.swath_px, middle]) * camera.ifov_rad))

@@ -63,9 +63,8 @@ LAWS = dict.fromkeys(FARM_NAMES, FARM_LAW) | dict.fromkeys(SCOUTING_NAMES, SCOUT
 
 def built_in_scene(name: str, seed: int, *args: Any, **moment: Any) -> RasterScene:
     """Draw the built-in scene of a name; arguments and errors are those of `farm_scene` and `scouting_scene`."""
-    if LAWS[name] == FARM_LAW:
-        return farm_scene(seed, *args, **moment)
-    return scouting_scene(seed, *args, **moment)
+    make = farm_scene if LAWS[name] == FARM_LAW else scouting_scene
+    return make(seed, *args, **moment)
 
 
 def is_built_in_key(key: str) -> bool:

@@ -55,7 +55,7 @@ def find_extrema(scene: RasterScene, camera: LineCamera, sweeps: Sequence[Sweep]
     for first, planes in _row_blocks(scene, _TILES_HIGH * tile, optics.halo):
         light = to_bands(planes[..., bands] if own_planes else planes, some)
         for measure, values in enumerate(optics.measures(light)):
-            _offer(ranking, measure, values, first, tile, kinds)
+            ranking.offer(measure, values, first, tile, kinds)
     return ranking.best(most)
 
 
@@ -93,7 +93,7 @@ def telling_bands(
         for number, values in enumerate((inner, -inner, *steps)):
             worst[number] = np.maximum(worst[number], values.max(axis=(0, 1), initial=-np.inf))
         in_groups = np.maximum.reduceat(steepest_difference(inner, nm) / noise, starts, axis=2)
-        _offer(ranking, _SPECTRAL, in_groups, first, tile, range(len(groups)))
+        ranking.offer(_SPECTRAL, in_groups, first, tile, range(len(groups)))
     return np.unique([one.start + values[one].argmax() for one in groups for values in worst])
 
 
@@ -121,33 +121,29 @@ def _check_finite(scene: RasterScene, planes: Radiance, first: int) -> None:
     )
 
 
-def _offer(ranking: Ranking, measure: int, values: Radiance, first: int, tile: int, kinds: Sequence[int]) -> None:
-    """Offer the greatest of every tile and band; ``values`` (row, column, band) of the strip that begins at a row.
-
-    ``kinds`` (band,) say with which other bands each is ranked.
-    """
-    rows, columns, bands = values.shape
-    padded = np.pad(values, [(0, -rows % tile), (0, -columns % tile), (0, 0)], constant_values=-np.inf)
-    tall = padded.reshape(-1, tile, padded.shape[1], bands)  # (row of tiles, row, column, band)
-    ridge = tall.max(axis=1).reshape(len(tall), -1, tile, bands)
-    within = ridge.argmax(axis=2)  # (row of tiles, tile, band)
-    greatest = np.take_along_axis(ridge, within[:, :, None], axis=2)[:, :, 0]
-    column = within + np.arange(ridge.shape[1])[:, None] * tile
-    high = np.arange(len(tall))[:, None, None]
-    row = first + high * tile + tall[high, :, column, np.arange(bands)].argmax(axis=-1)
-    for band, kind in enumerate(kinds):
-        ranking.offer((measure, kind), *(one[..., band].ravel() for one in (greatest, row, column)))
-
-
 class Ranking:
     """The best places of every kind."""
 
     def __init__(self) -> None:
         self._offers: dict[Kind, list[Floats]] = {}
 
-    def offer(self, kind: Kind, measure: NDArray[np.floating], row: NDArray[np.intp], column: NDArray[np.intp]) -> None:
-        """Add places of one kind, (place,) each."""
-        self._offers.setdefault(kind, []).append(np.stack([measure, row, column]).astype(np.float64))
+    def offer(self, measure: int, values: Radiance, first: int, tile: int, kinds: Sequence[int]) -> None:
+        """Offer the greatest of every tile and band; ``values`` (row, column, band) of the strip that begins at a row.
+
+        ``kinds`` (band,) say with which other bands each is ranked.
+        """
+        rows, columns, bands = values.shape
+        padded = np.pad(values, [(0, -rows % tile), (0, -columns % tile), (0, 0)], constant_values=-np.inf)
+        tall = padded.reshape(-1, tile, padded.shape[1], bands)  # (row of tiles, row, column, band)
+        ridge = tall.max(axis=1).reshape(len(tall), -1, tile, bands)
+        within = ridge.argmax(axis=2)  # (row of tiles, tile, band)
+        greatest = np.take_along_axis(ridge, within[:, :, None], axis=2)[:, :, 0]
+        column = within + np.arange(ridge.shape[1])[:, None] * tile
+        high = np.arange(len(tall))[:, None, None]
+        row = first + high * tile + tall[high, :, column, np.arange(bands)].argmax(axis=-1)
+        for band, kind in enumerate(kinds):
+            places = np.stack([one[..., band].ravel() for one in (greatest, row, column)])
+            self._offers.setdefault((measure, kind), []).append(places.astype(np.float64))
 
     def best(self, most: int) -> Floats:
         """Return the best of each kind in turns, none twice, (place, 2) rows and columns."""

@@ -338,8 +338,7 @@ def _changes(
 def _footprint(
     variant: str, rig: Rig, parts: tuple[int, int], moments: Moments | None, scene: RasterScene
 ) -> Footprint:
-    blurs = moments or Moments.together([], len(scene.wavelength_nm))
-    return fold(box_of(variant, rig), parts, 1, blurs)
+    return fold(box_of(variant, rig), parts, 1, moments or Moments.together([], len(scene.wavelength_nm)))
 
 
 def _least_blurs(rig: Rig, wavelength_nm: Floats, sweeps: Sequence[Sweep]) -> Moments:

@@ -10,8 +10,9 @@ import pytest
 from flows.cli.simulate_command import open_simulation
 from flows.settings.load import load_settings
 from flows.tasks.run import CaptureRun
+from flows.tasks.scene import SimulatedField
 from flows.tasks.stages import effects as effect_choice
-from flows.tasks.stages.effects import choose_effects, chosen_effects, load_manifest, source_with
+from flows.tasks.stages.effects import choose_effects, chosen_effects, load_manifest
 from pipeline.errors import IncompleteStoreError
 from pipeline.simulator.render import EFFECTS
 from pipeline.simulator.scenes.scene import SceneRaster
@@ -56,7 +57,8 @@ def test_the_manifest_and_the_source_have_what_was_decided(decided: tuple[Path, 
     }
     assert rows["diffraction"]["bound"] > 0
     assert (manifest["total"]["asked"], manifest["total"]["tolerance"]) == (ASKED, 0.1)
-    source = source_with(opened(scene_files, decided[0]).simulated, decided[1], {"a": 3.0})
+    simulated = opened(scene_files, decided[0]).simulated
+    source = SimulatedField(simulated).lit(chosen_effects(decided[1]), {"a": 3.0}).source
     on = {row["name"]: row["variant"] for row in load_manifest(decided[1])["effects"] if row["state"] == "on"}
     assert {effect.name: variant for effect, variant in source.choice.effects} == on
     assert (source.clock, list(chosen_effects(decided[1]))) == (

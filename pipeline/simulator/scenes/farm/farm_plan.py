@@ -135,8 +135,7 @@ def moist_soil(plan: FarmPlan, here: Ground, wetter: float = 0.0) -> Mixture:
     water = plan.moisture + wetter + 0.035 * here.moisture + 0.008 * here.tuft
     wet = wet_fraction(np.clip(water, 0.02, 0.45))
     low = min(float(np.hypot(*plan.sun.cast)), 3.0)
-    rough = low * (0.07 + 0.04 * here.grain + 0.01 * here.tuft)
-    shade = np.asarray(np.clip(rough, 0, 0.33), np.float32)
+    shade = np.asarray(np.clip(low * (0.07 + 0.04 * here.grain + 0.01 * here.tuft), 0, 0.33), np.float32)
     return {"soil_dry": (1 - wet) * (1 - shade), "soil_wet": wet * (1 - shade), "shade": shade}
 
 
@@ -261,8 +260,7 @@ def farm_plan(seed: int, shape: tuple[int, int] = (1024, 1280), *, day: int = 17
     """
     check_land(seed, shape)
     sun = sun_over_farm(day, hour)
-    size = land_size(shape)
-    parcels, borders = divide_land(stream(seed, "land"), size, PARCEL_AREA_PX)
+    parcels, borders = divide_land(stream(seed, "land"), land_size(shape), PARCEL_AREA_PX)
     uses = allot(stream(seed, "use"), [visible_area(parcel, shape) for parcel in parcels], USE_FRACTIONS)
     kinds = allot(stream(seed, "borders"), [border.length for border in borders], BORDER_FRACTIONS)
     fields = tuple(

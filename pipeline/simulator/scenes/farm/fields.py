@@ -96,8 +96,7 @@ def _content(
         return _bare_field(rows, field, here, soil)
     if crop is None or land.phase == "stubble":
         return _stubble_field(rows, field, here, soil, land.days)
-    gaps = row_gaps(salt, field, rows, here)
-    return _standing_crop(work, field, crop, (rows, here, soil), (gaps, down))
+    return _standing_crop(work, field, crop, (rows, here, soil), (row_gaps(salt, field, rows, here), down))
 
 
 def _standing_crop(
@@ -183,8 +182,7 @@ def _bare_field(rows: Rows, field: FieldPlan, here: Ground, soil: Mixture) -> Co
 
 def _lodged(noise: Field, field: FieldPlan, day: int) -> Field:
     fraction = field.lodging * lodged_fraction(day)
-    crop = field.crop
-    if fraction <= 0 or crop is None or field.land_on(day).phase != "crop" or field.land_on(day).days < 150:
+    if fraction <= 0 or field.crop is None or field.land_on(day).phase != "crop" or field.land_on(day).days < 150:
         return np.zeros_like(noise)
     return np.asarray(np.clip((noise - NormalDist().inv_cdf(1 - fraction)) / 0.2 + 0.5, 0, 1), np.float32)
 

@@ -66,8 +66,7 @@ def stream(seed: int, name: str) -> np.random.Generator:
 
 def divide_land(rng: np.random.Generator, size: tuple[float, float], area: float) -> tuple[list[Parcel], list[Border]]:
     """Split a rectangle about the origin until every parcel has about ``area`` px; also the lines that split it."""
-    half = np.array(size) / 2
-    corners = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]]) * half
+    corners = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]]) * np.array(size) / 2
     turn = rng.uniform(-0.6, 0.6)
     waiting, parcels, borders = [Parcel(corners)], [], []
     while waiting:
