@@ -23,7 +23,7 @@ from models.network.machine import choose_device
 from models.network.spectral import Normalisation
 from models.training.capture_augmentation import REFERENCE_MS
 from models.training.examples import measured_normalisation
-from models.training.train import LabelledPixels, Progress, linear_discriminants, train
+from models.training.train import LabelledPixels, Progress, halfway, linear_discriminants, train
 from models.weights.checksummed_files import load_checkpoint
 from models.weights.files import (
     CALIBRATION,
@@ -148,6 +148,8 @@ def _learned(
         checkpoint=checkpoint,
         device=choose_device(request.device),
     )
+    if begun is not None:
+        model = halfway(begun.segmenter, model)
     weights = Weights(model, common.basis, normalisation, common.names, common.colours)
     frames, found = scenes.validation.examples, dict[str, Any]()
     if frames:

@@ -293,6 +293,15 @@ def train(
     return trainer.averaged.to(PROCESSOR), trainer.summary()
 
 
+def halfway(start: Segmenter, trained: Segmenter) -> Segmenter:
+    """Return a network with the mean weights of both: good where either was (Wortsman et al. 2022, WiSE-FT)."""
+    mean = copy.deepcopy(trained)
+    with torch.no_grad():
+        for own, before in zip(mean.parameters(), start.parameters(), strict=True):
+            own.lerp_(before, 0.5)
+    return mean
+
+
 def run_identity(
     config: SegmenterConfig,
     examples: list[Example],

@@ -15,7 +15,15 @@ from models.reading.inference import map_of_columns
 from models.training import train as training
 from models.training.examples import CropSampler
 from models.training.objective import batch_loss, class_weights, draw_patches, map_loss, phase_at, pixel_losses
-from models.training.train import LabelledPixels, Progress, TrainingSettings, linear_discriminants, rate_at, train
+from models.training.train import (
+    LabelledPixels,
+    Progress,
+    TrainingSettings,
+    halfway,
+    linear_discriminants,
+    rate_at,
+    train,
+)
 from pipeline.geometry.grid import SceneGrid
 from tests.models.conftest import Maker, block_example
 
@@ -171,3 +179,13 @@ def test_discriminants_of_absent_classes_are_out_of_reach():
     logits = features @ found["spectral.weight"][:, :, 0, 0].numpy().T + found["spectral.bias"].numpy()
     assert (logits.argmax(axis=1) == labels).all()
     assert (logits[:, 1] == -20).all()
+
+
+def test_a_network_halfway_has_the_mean_of_each_weight() -> None:
+    """Neither network changes."""
+    one, other = (Segmenter(SegmenterConfig(3, 4, patch=8, width=8, dim=16, layers=1, heads=2)) for _ in range(2))
+    before = [parameter.clone() for parameter in (*one.parameters(), *other.parameters())]
+    mean = halfway(one, other)
+    for middle, first, second in zip(*(net.parameters() for net in (mean, one, other)), strict=True):
+        torch.testing.assert_close(middle, (first + second) / 2)
+    assert all(map(torch.equal, before, (*one.parameters(), *other.parameters())))
