@@ -29,7 +29,7 @@ from models.evaluation.placement import CONTROL_FRACTION, ReadTwice, placement_f
 from models.network.sizes import PLANES
 from models.network.spectral import LineSpec
 from models.reading.inference import coarse_prediction_of_columns, map_of_columns
-from models.training.capture_augmentation import REFERENCE_MS, STEPS, TYPICAL_POWER, CaptureAugmentation
+from models.training.capture_augmentation import REFERENCE_MS, STEPS, CaptureAugmentation
 from models.training.examples import Example
 from models.training.train import LabelledPixels, discriminants_alone
 from models.weights.files import Weights
@@ -142,9 +142,7 @@ def _scanned(
     assert example.noise is not None
     grid, labels = _parts(weights, example)
     plain, classes = example.columns.astype(np.float32), weights.config.classes
-    scan = augmentation.scan(plain, example.noise, light=light, step=step, rng=rng, least_power=TYPICAL_POWER)[
-        ..., :-PLANES
-    ]
+    scan = augmentation.scan(plain, example.noise, light=light, step=step, rng=rng)[..., :-PLANES]
     drawn, every_class = map_of_columns(weights, scan, grid, LineSpec(light, step))
     valid = (labels != UNLABELLED) & np.isfinite(drawn.confidence)
     sure = confidence_counts(drawn.confidence[valid], drawn.classes[valid] == labels[valid])

@@ -24,7 +24,7 @@ from models.network.spectral import LineSpec
 from models.network.temporal_reader import TemporalReader
 from models.reading.inference import map_of_columns
 from models.reading.prior_map import CurrentVisit, PriorMap, first_probabilities, fuse, pooled
-from models.training.capture_augmentation import REFERENCE_MS, TYPICAL_POWER, CaptureAugmentation, ColumnNoise
+from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation, ColumnNoise
 from models.training.temporal import PastPass, TemporalTraining, Visit, train_reader
 from models.training.train import Progress
 from models.weights.files import Weights, add_reader, load_weights
@@ -162,9 +162,7 @@ class _Land:
     ) -> CurrentVisit:
         """Return a visit by a uniform scan, segmented by the weights."""
         light = exposure_ms / REFERENCE_MS
-        scan = augmentation.scan(self.columns, self.noise, light=light, step=step, rng=rng, least_power=TYPICAL_POWER)[
-            ..., :-PLANES
-        ]
+        scan = augmentation.scan(self.columns, self.noise, light=light, step=step, rng=rng)[..., :-PLANES]
         _, every_class = map_of_columns(weights, scan, self.grid, LineSpec(light, step))
         return CurrentVisit(every_class, np.ones(self.labels.shape, np.bool_), pooled(scan), light, step)
 

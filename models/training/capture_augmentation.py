@@ -22,7 +22,6 @@ ACROSS = 0.5  # fraction of areas as wide as the crop
 TINY = 1e-9  # added to correlations against negative eigenvalues by rounding
 CONDENSED = 0.75  # fraction of crops with the components of a large field alone; small fields keep all directions
 LEAST_POWERS = (0.001, 0.02)  # of components: variance of their signal over that of a spectrum's noise
-TYPICAL_POWER = 0.004  # by farms of 1280 x 1024 px
 LEAST_COMPONENTS = 4
 ROUNDED = 1 / 12  # variance that rounding adds to scores, in squares of the noise
 Matrix = NDArray[np.float64]
