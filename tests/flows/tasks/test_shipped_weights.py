@@ -50,11 +50,11 @@ def controls(weights: Weights) -> Placements:
 
 def test_file_is_small_and_tells_its_making(weights: Weights) -> None:
     """The key that its products know, at most 3 MB; command, seed, law of the data, figures of unseen scenes."""
-    assert describe_weights(PATH).key == "440c8df17764e8f83f2f"
+    assert describe_weights(PATH).key == "f653b262a9b3246a36b6"
     assert PATH.stat().st_size <= 3e6
     assert weights.record["command"].startswith("spectralzoom train farm")
     assert weights.record["data"] == FARM_LAW
-    assert weights.record["settings"]["seed"] == 0
+    assert weights.record["settings"]["seed"] == 1
     assert weights.record["validation"]["entropy"]["miou"] > 0.8
     assert weights.class_names == tuple(entry for entry in CLASSES)
     split = weights.record["split"]

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import SceneError
-from pipeline.simulator.scenes.scene import scratch
+from pipeline.simulator.scenes.scratch import scratch
 
 Field = NDArray[np.float32]
 Points = NDArray[np.float64]

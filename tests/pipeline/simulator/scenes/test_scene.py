@@ -12,10 +12,11 @@ from pipeline.errors import SceneError, ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.lazy import Once
 from pipeline.simulator.rig_model import Sky
-from pipeline.simulator.scenes import scene as scene_module
+from pipeline.simulator.scenes import scratch as scratch_module
 from pipeline.simulator.scenes.daylight import knots_within, relative_daylight, sun_elevation_deg
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
-from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster, raster_from_values, scratch
+from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster, raster_from_values
+from pipeline.simulator.scenes.scratch import scratch
 
 BANDS = np.array([400.0, 550.0, 760.0, 1000.0])
 EQUINOX = Sky(started=datetime(2026, 3, 20, 0, 0, tzinfo=UTC), latitude_deg=29.5, longitude_deg=0.0)
@@ -224,7 +225,7 @@ def test_pixels_without_most_bands_are_missing_and_unlabelled() -> None:
 def test_a_large_array_lies_in_a_file(monkeypatch: pytest.MonkeyPatch):
     """It is zero at first, and keeps what is written."""
     assert scratch((4, 5)).base is None
-    monkeypatch.setattr(scene_module, "MOST_BYTES", 64)
+    monkeypatch.setattr(scratch_module, "MOST_BYTES", 64)
     held = scratch((4, 5))
     assert held.base is not None
     assert not held.any()
@@ -242,7 +243,7 @@ def test_a_farm_is_the_same_from_files(monkeypatch: pytest.MonkeyPatch):
     """Planes, labels and blurred planes are the same bytes."""
     here, there = farm_scene(3, (300, 200)), farm_scene(3, (300, 200))
     want = here.planes, here.labels, here.raster.thinned(2)
-    monkeypatch.setattr(scene_module, "MOST_BYTES", 1000)
+    monkeypatch.setattr(scratch_module, "MOST_BYTES", 1000)
     found = there.planes, there.labels, there.raster.thinned(2)
     assert found[0].base is not None
     assert all(np.array_equal(one, other) for one, other in zip(want, found, strict=True))
