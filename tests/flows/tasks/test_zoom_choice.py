@@ -22,7 +22,7 @@ def planned(out: Path, **flags: str) -> SurveyRun:
     [
         (WIDE, True),
         ({**WIDE, "seconds": "182", "sky.light_fraction": "0.0625"}, True),
-        ({**WIDE, "camera.samples": "160", "seconds": "14"}, False),  # first pass and set-ups leave too little time
+        ({**WIDE, "camera.samples": "160", "seconds": "10"}, False),  # first pass and set-ups leave too little time
         ({**WIDE, "camera.samples": "640", "seconds": "6"}, False),
         ({**WIDE, "seconds": "200"}, False),  # a uniform scan is as good as the best
         ({"camera.samples": "80"}, False),
