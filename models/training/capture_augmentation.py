@@ -22,7 +22,7 @@ ACROSS = 0.5  # fraction of areas as wide as the crop
 TINY = 1e-9  # added to correlations against negative eigenvalues by rounding
 CONDENSED = 0.75  # fraction of crops with the components of a large field alone; small fields keep all directions
 LEAST_POWERS = (0.001, 0.02)  # of components: variance of their signal over that of a spectrum's noise
-LEAST_COMPONENTS = 4
+LEAST_COMPONENTS = 4  # that stay whatever their power, as in a survey
 ROUNDED = 1 / 12  # variance that rounding adds to scores, in squares of the noise
 Matrix = NDArray[np.float64]
 Columns = NDArray[np.float32]  # (y, x, column)
@@ -164,7 +164,7 @@ class CaptureAugmentation:
         """
         scaled = columns @ self.unwhiten
         means = scaled.reshape(-1, step, *scaled.shape[1:]).mean(axis=1)
-        lines = self._captured(means, noise, light, rng, samples=step, condensed=(light, least_power))
+        lines = self._captured(means, noise, light, rng, unit=light, least_power=least_power, samples=step)
         between = rows_between(lines, len(columns), first=(step - 1) / 2, apart=step) if step > 1 else lines
         return with_planes(between @ self.normalisation.whitening, LineSpec(light, step))
 
@@ -177,7 +177,7 @@ class CaptureAugmentation:
         """
         scaled, size = columns @ self.unwhiten, len(columns)
         light, first = self._light(rng), int(rng.integers(step))
-        lines = self._captured(scaled[first::step], noise, light, rng, condensed=(light, least_power))
+        lines = self._captured(scaled[first::step], noise, light, rng, unit=light, least_power=least_power)
         between = rows_between(lines, size, first=first, apart=step)
         image = with_planes(between @ self.normalisation.whitening, LineSpec(light, step))
         for _ in range(rng.choice(len(AREAS), p=AREAS)):
@@ -186,8 +186,8 @@ class CaptureAugmentation:
             samples = slice(None) if rng.random() < ACROSS else samples
             closer, later = step // int(rng.choice([own for own in (2, 4, 8) if own <= step])), self._light(rng)
             start = first % closer
-            later_lines = scaled[start::closer, samples]
-            taken = self._captured(later_lines, noise, later, rng, condensed=(light, least_power))
+            area = scaled[start::closer, samples]
+            taken = self._captured(area, noise, later, rng, unit=light, least_power=least_power)
             taken[first // closer :: step // closer] = lines[:, samples]
             between = rows_between(taken, size, first=start, apart=closer) @ self.normalisation.whitening
             nearest = np.clip(np.rint((np.arange(size) - start) / closer), 0, len(taken) - 1) * closer + start
@@ -204,11 +204,14 @@ class CaptureAugmentation:
         light: float,
         rng: np.random.Generator,
         *,
-        condensed: tuple[float, float],
+        unit: float,
+        least_power: float,
         samples: int = 1,
     ) -> Columns:
-        """Add the noise of an exposure; condense by components of an exposure, from a least power on."""
-        unit, least_power = condensed
+        """Add the noise of an exposure ``light``, and condense by the components of an exposure ``unit``.
+
+        Components of less than ``least_power`` are left out. With 0, or without spectra, nothing is condensed.
+        """
         if noise.spectra is None or least_power == 0:
             return self._noisy(scaled, noise, light, rng, samples=samples)
         unit = float(2 ** (np.round(4 * np.log2(unit)) / 4))  # a quarter of an octave

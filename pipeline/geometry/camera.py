@@ -80,7 +80,8 @@ class LineCamera:
         """Return the tangent k_y/k_z of each (binned) sample's ray, (sample,) float64."""
         count = self.samples // binning
         centre = (self.samples - 1) / 2
-        return ((np.arange(count, dtype=np.float64) + 0.5) * binning - 0.5 - centre) * self.ifov_rad
+        middle = (np.arange(count, dtype=np.float64) + 0.5) * binning - 0.5
+        return (middle - centre) * self.ifov_rad
 
     def sample_at(self, slopes: NDArray[np.float64], binning: int = 1) -> NDArray[np.float64]:
         """Return the continuous (binned) sample of each slope, integers at centres: the inverse of ``pixel_slopes``."""

@@ -365,7 +365,8 @@ def extinction_per_m(air: Air, wavelength_nm: Floats) -> Floats:
     by Angstrom's exponent: 1.14 [4], below 7.4 km Kruse's 0.585 V^(1/3) [5]. Above 336 km no aerosol is left. Valid
     from 400 to 1000 nm beside the lines of gases, and down to some 0.5 km of visibility.
     """
-    aerosol = max(KOSCHMIEDER / air.visibility_km * 1e-3 - rayleigh_per_m(np.array([VISIBLE_NM]))[0], 0.0)
+    molecules = rayleigh_per_m(np.array([VISIBLE_NM]))[0]
+    aerosol = max(KOSCHMIEDER / air.visibility_km * 1e-3 - molecules, 0.0)
     exponent = min(ANGSTROM, KRUSE * air.visibility_km ** (1 / 3))
     return np.asarray(aerosol * (wavelength_nm / VISIBLE_NM) ** -exponent + rayleigh_per_m(wavelength_nm))
 

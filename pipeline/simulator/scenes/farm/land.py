@@ -27,6 +27,7 @@ from pipeline.simulator.scenes.scratch import scratch
 Field = NDArray[np.float32]
 Points = NDArray[np.float64]
 
+ROWS_AT_ONCE = 256  # of noise that is drawn
 _SPLINE_SD = 0.4794  # of a cubic B-spline through white noise of sd 1, mean over positions, two axes
 
 
@@ -213,10 +214,9 @@ def smooth_noise(rng: np.random.Generator, shape: tuple[int, int], cell: float) 
     knots = rng.standard_normal([int(size / cell) + 5 for size in shape]).astype(np.float32)
     down, across = (np.arange(size) / cell + shift for size, shift in zip(shape, rng.uniform(0, 1, 2), strict=True))
     field = scratch(shape)
-    for first in range(0, shape[0], 256):
-        field[first : first + 256] = _spline(_spline(knots, down[first : first + 256]).T, across).T / np.float32(
-            _SPLINE_SD
-        )
+    for first in range(0, shape[0], ROWS_AT_ONCE):
+        rows = slice(first, first + ROWS_AT_ONCE)
+        field[rows] = _spline(_spline(knots, down[rows]).T, across).T / np.float32(_SPLINE_SD)
     return field
 
 
