@@ -200,9 +200,13 @@ def _spectra(rng: np.random.Generator, sizes: tuple[float, ...], light: float) -
     return spectra, SceneSpectra(np.full(60, 0.3), axes.T @ axes, MATRIX, 1 / WHITE_REFERENCE_E, 20.0)
 
 
-def test_a_condensed_crop_has_the_noise_of_a_condensed_survey() -> None:
-    """Spectra with noise in all bands, projected onto their components and rounded, give the same columns."""
-    light, rng = 0.1, np.random.default_rng(3)
+@pytest.mark.parametrize(("light", "rtol"), [(0.1, 0.04), (0.5, 0.25)])
+def test_a_condensed_crop_has_the_noise_of_a_condensed_survey(light: float, rtol: float) -> None:
+    """Spectra with noise in all bands, projected onto their components and rounded, give the same columns.
+
+    Weak components in bright light are worse: columns of the reference exposure have noise too.
+    """
+    rng = np.random.default_rng(3)
     augmentation, normalisation = _augmentation()
     spectra, moments = _spectra(rng, (30.0, 5.0, 1.0, 0.3), light)
     sigma = np.sqrt(np.sum(moments.noise(light), axis=0))
@@ -215,7 +219,7 @@ def test_a_condensed_crop_has_the_noise_of_a_condensed_survey() -> None:
     seen = augmentation.scan(crop, noise, light=light, step=1, rng=rng, least_power=0.01)[..., :12]
     columns = seen @ augmentation.unwhiten * normalisation.spread + normalisation.centre
     added, wanted = (np.cov((one - spectra @ MATRIX).reshape(-1, 12).T) for one in (columns, surveyed @ MATRIX))
-    np.testing.assert_allclose(np.diag(added), np.diag(wanted), rtol=0.1)
+    np.testing.assert_allclose(np.diag(added), np.diag(wanted), rtol=rtol)
     np.testing.assert_allclose(np.linalg.eigvalsh(added)[:8], 0, atol=1e-3 * np.linalg.eigvalsh(added)[-1])
 
 
