@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from rich.console import Console
 
 from flows.cli.main import main
+from flows.cli.model_verbs import TrainFlags
 from flows.settings.load import load_settings
 from flows.tasks.run import open_run
 from flows.training import figures, train_scenes
@@ -267,16 +269,31 @@ def test_whitening_knows_the_noise_of_short_exposures(folder: Path, out: Path):
     assert sizes[1] < sizes[0]
 
 
-def test_a_training_goes_on_from_weights(folder: Path, out: Path, tmp_path: Path) -> None:
-    """The normalisation stays, and a rate of nothing leaves the network as it was; the record names the first."""
+def test_a_training_goes_on_from_weights(
+    folder: Path, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The normalisation stays, a step begins at the first network, and the result is halfway between both."""
     train_weights(_request(folder, out, validation=1, command="first"))
-    still = replace(SETTINGS, learning_rate=1e-12, seed=1)
-    record = train_weights(_request(folder, tmp_path / "b.safetensors", validation=1, start=out, settings=still))
+    trained = flow.train
+    ends: list[Any] = []
+    monkeypatch.setattr(flow, "train", lambda *given, **options: ends.append(trained(*given, **options)) or ends[0])
+    request = _request(folder, tmp_path / "b.safetensors", validation=1, start=out, settings=replace(SETTINGS, seed=1))
+    record = train_weights(request)
     first, second = load_weights(out), load_weights(tmp_path / "b.safetensors")
     assert record["started_from"] == "first"
     np.testing.assert_array_equal(second.normalisation.whitening, first.normalisation.whitening)
-    for one, other in zip(first.segmenter.parameters(), second.segmenter.parameters(), strict=True):
-        np.testing.assert_allclose(other.detach().numpy(), one.detach().numpy(), atol=1e-6)
+    networks = (one.parameters() for one in (first.segmenter, second.segmenter, ends[0][0]))
+    for before, halfway, after in zip(*networks, strict=True):
+        torch.testing.assert_close(after, before, atol=0.01, rtol=0)
+        torch.testing.assert_close(halfway, (before + after) / 2)
+    assert not torch.equal(after, before)
+
+
+def test_a_training_that_goes_on_learns_more_slowly(out: Path) -> None:
+    """At a third of the rate, from the file that the flag names."""
+    anew, on = (TrainFlags(start=start).request("farm", out, "") for start in (None, Path("first.safetensors")))
+    assert 3 * on.settings.learning_rate == pytest.approx(anew.settings.learning_rate)
+    assert (anew.start, on.start) == (None, Path("first.safetensors"))
 
 
 @pytest.mark.parametrize(
