@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from dataclasses import replace
 from datetime import UTC, datetime
 
@@ -14,7 +16,9 @@ from pipeline.lazy import Once
 from pipeline.simulator.rig_model import Sky
 from pipeline.simulator.scenes import scratch as scratch_module
 from pipeline.simulator.scenes.daylight import knots_within, relative_daylight, sun_elevation_deg
+from pipeline.simulator.scenes.farm import land
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
+from pipeline.simulator.scenes.farm.land import smooth_noise
 from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster, raster_from_values
 from pipeline.simulator.scenes.scratch import scratch
 
@@ -234,9 +238,22 @@ def test_a_large_array_lies_in_a_file(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_full_disk_is_an_error(monkeypatch: pytest.MonkeyPatch):
-    """A file with holes would end the process later, with a signal."""
-    with pytest.raises(OSError, match=r"large|space"):
-        scratch((2**30, 2**20))
+    """Space is taken before anything is written: a file with holes would end the process later, with a signal."""
+
+    def full(*given: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(scratch_module, "MOST_BYTES", 64)
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(OSError, match="No space left"):
+        scratch((4, 5))
+
+
+def test_noise_does_not_depend_on_the_rows_drawn_at_once(monkeypatch: pytest.MonkeyPatch):
+    """Rows of later strips lie where they lie in one strip."""
+    strips = smooth_noise(np.random.default_rng(1), (600, 30), 22)
+    monkeypatch.setattr(land, "ROWS_AT_ONCE", 600)
+    np.testing.assert_array_equal(smooth_noise(np.random.default_rng(1), (600, 30), 22), strips)
 
 
 def test_a_farm_is_the_same_from_files(monkeypatch: pytest.MonkeyPatch):
