@@ -258,7 +258,8 @@ def lay_out_passes(
     if content is not None and (settings.zooms or zoom_may_pay(layout, scans, settings)):
         record = ScanPerformance.read(content, settings.sky.fraction_of_clear)
         if settings.seconds is not None and settings.coarse_exposure_ms is None:
-            first = choose_first_pass(layout, record, settings.seconds)
+            steps = FIRST_STEPS if settings.scan_step is None else (settings.scan_step,)
+            first = choose_first_pass(layout, record, settings.seconds, steps)
     notes = tuple[str, ...]()
     if settings.zoom == AUTO:
         pays = first is not None and chosen is not None and first.expected >= chosen.expected[MIOU] - NEARLY
@@ -303,7 +304,9 @@ class FirstPass:
     expected: float
 
 
-def choose_first_pass(layout: PassLayout, record: ScanPerformance, seconds: float) -> FirstPass | None:
+def choose_first_pass(
+    layout: PassLayout, record: ScanPerformance, seconds: float, steps: tuple[int, ...]
+) -> FirstPass | None:
     """Choose the lines of a first pass within the time, or the fastest where none fits; None: the table has none.
 
     The criterion is the expected mIoU if the second pass covers the whole field. Among nearly equal choices, the
@@ -313,7 +316,7 @@ def choose_first_pass(layout: PassLayout, record: ScanPerformance, seconds: floa
     shortest, longest = record.offered_ms(camera)
     found: list[FirstPass] = []
     fastest: FirstPass | None = None
-    for first_step in (step for step in FIRST_STEPS if step in record.steps):
+    for first_step in (step for step in steps if step in record.steps):
         for first_ms in exposures_between(shortest, longest):
             first = every_nth(full, first_step, first_ms)
             left_s = seconds - cost.seconds(first, camera)

@@ -48,3 +48,11 @@ def test_the_choice_is_the_plan_that_one_may_ask_for(tmp_path: Path) -> None:
     chosen, asked = planned(tmp_path, **WIDE), planned(tmp_path, **WIDE, zoom="always")
     assert (chosen.plan, chosen.settings) == (asked.plan, asked.settings)
     assert chosen.plan.coarse_s + chosen.plan.fine_s == pytest.approx(27)
+
+
+def test_the_line_spacing_of_the_first_pass_may_be_given(tmp_path: Path) -> None:
+    """Its exposure is then the best one for that spacing; without it the weights choose every 4th line."""
+    given, usual = (planned(tmp_path, **WIDE, zoom="always", **step) for step in ({"scan_step": "8"}, {}))
+    assert (given.settings.scan_step, usual.settings.scan_step) == (8, 4)
+    assert given.plan.coarse_s < usual.plan.coarse_s
+    assert given.plan.coarse_s + given.plan.fine_s == pytest.approx(27)
