@@ -132,6 +132,8 @@ def test_without_a_pose_images_lie_on_angles(plain: Exported) -> None:
             assert list(file.transform[:6]) == store.attrs["spatial:transform"]
             np.testing.assert_array_equal(file.read(1), store[array].values)
             assert "no CRS" in file.tags()["place"]
+            assert "[rad]" in file.tags()["place"]
+            assert key == "class_map" or np.isnan(file.nodata)
     with rasterio.open(plain.file("rgb")) as file:
         mosaic = plain.store("mosaic")
         assert list(file.transform[:6]) == mosaic.attrs["spatial:transform"]
@@ -182,6 +184,7 @@ def test_the_catalogue_is_valid_and_leads_to_every_file(exports: list[Exported])
     collection = pystac.Collection.from_file(str(path))
     items = list(collection.get_items(recursive=True))
     assert [item.id for item in items] == [done.id for done in exports]
+    assert {item.get_parent().id for item in items} == {collection.id}
     for done, item in zip(exports, items, strict=True):
         assert core_problems(Path(done.answer["item"])) == []
         assert extension_problems(done.item()) == []

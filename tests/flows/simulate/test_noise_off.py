@@ -126,10 +126,3 @@ def test_survey_is_the_scene_through_the_footprint(
     inner = np.s_[8:-8, 8:-8]  # at its border the scene ends, the waves go on
     assert error_fraction(mosaic[inner], scene.seen(along)[inner]) < BOUND
     assert error_fraction(mosaic, scene.raster()) > 4 * BOUND  # the bound tells footprints apart
-
-
-def test_survey_of_two_swaths(surveyed: Callable[[Waves], Stored]) -> None:
-    """Wider than a line: turned lines and a seam hold waves from 4 px on."""
-    scene = waves((32, 240), 4, 40)
-    stored = surveyed(scene)
-    assert error_fraction(stored.mosaic.values(), convolved(scene, stored.along)) < BOUND

@@ -15,7 +15,6 @@ import xarray as xr
 from flows.settings.survey_settings import MapChoice, Settings
 from flows.tasks.stages.maps import STORE, coarse_colours, ground
 from flows.tasks.zones import place_of_field
-from pipeline.errors import PoseError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.field_places import PosedField
 from pipeline.ground.map_grid import GroundGrid
@@ -124,14 +123,6 @@ def test_what_is_unknown_has_no_confidence_on_the_map_either(
     assert (found.classes == 1).sum() > 50
     np.testing.assert_array_equal(np.isnan(found.confidence), found.classes != 0)
     np.testing.assert_array_equal(np.isnan(found.age_days), found.classes != 0)
-
-
-def test_without_ground_nothing_is_written(run: Run, stores: tuple[StageRef, StageRef]) -> None:
-    """A pose that looks at the sky is refused by its name."""
-    sky = Settings(pose=replace(POSE, tilt_deg=-30.0))
-    with pytest.raises(PoseError, match=r"no ray of the field meets the ground .*tilt_deg -30"):
-        draw(replace(run, settings=sky), stores)
-    assert run.archive.refs() == []
 
 
 def test_map_and_picture_lie_where_the_rays_end(run: Run, stores: tuple[StageRef, StageRef]) -> None:

@@ -28,7 +28,6 @@ from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
 from storage.archive.archive import Archive
 from storage.archive.records import read_run
-from storage.maintenance.garbage import clear_up
 from tests.conftest import CLASSES, Survey, WeightsMaker, patchy_scene
 from tests.flows.conftest import problems
 from tests.prior_work import without_effects
@@ -36,7 +35,7 @@ from tests.prior_work import without_effects
 pytestmark = pytest.mark.usefixtures("no_effects")
 
 UNIFORM: dict[str, Any] = {"budget": None, "scan_step": "2", "name": "north", "accuracy": False}
-FIRST, LATER, BETWEEN = "2026-06-01T10:00:00Z", "2026-06-04T10:00:00Z", "2026-06-02T22:00:00Z"
+FIRST, LATER = "2026-06-01T10:00:00Z", "2026-06-04T10:00:00Z"
 
 
 @pytest.fixture(scope="module")
@@ -108,25 +107,29 @@ def test_by_hand_nothing_is_remembered_unless_asked(visited: Path, survey_png: S
     assert row["state"] == "cached"
 
 
-def test_a_look_of_before_does_not_go_on_from_a_later_one(visited: Path, twice: Any, survey_png: Survey) -> None:
-    """A visit that is taken in late goes on from what was looked at before it."""
-    between = survey_png(visited, **UNIFORM, visit=BETWEEN, prior="latest")
-    assert between.receipt["memory"]["run"] == twice[1].folder.name
-    assert between.receipt["memory"]["days"] == 1.5
-
-
-def test_a_look_at_the_same_moment_goes_on_from_the_other(visited: Path, twice: Any, survey_png: Survey) -> None:
-    """The time between may be 0."""
-    again = survey_png(visited, **UNIFORM, visit="2026-06-04T12:00:00+02:00", prior="latest")
-    assert (again.receipt["memory"]["run"], again.receipt["memory"]["days"]) == (twice[2].folder.name, 0.0)
-
-
-def test_a_run_can_be_named(visited: Path, twice: Any, survey_png: Survey) -> None:
-    """Whichever it is; one that is not there, or of another size, ends in one message."""
-    named = survey_png(visited, **UNIFORM, visit="2026-06-09T10:00:00Z", prior=twice[1].folder.name)
-    assert (named.receipt["memory"]["run"], named.receipt["memory"]["days"]) == (twice[1].folder.name, 8.0)
+@pytest.mark.parametrize(
+    ("visit", "named", "before", "days"),
+    [
+        ("2026-06-02T22:00:00Z", False, 1, 1.5),  # taken in late
+        ("2026-06-04T12:00:00+02:00", False, 2, 0.0),  # at the same moment as the other
+        ("2026-06-09T10:00:00Z", True, 1, 8.0),
+    ],
+)
+def test_the_prior_map_is_the_last_before_the_visit_or_the_one_named(
+    twice: tuple[Path, Any, Any], visit: str, named: bool, before: int, days: float
+) -> None:
+    """A run that is not there ends in one message."""
+    run = twice[before].folder.name
+    assert found_prior(twice[0], visit, run if named else "latest") == (run, days)
     with pytest.raises(SettingsError, match=r"--prior nobody: there is no such run in the archive; give another run"):
-        survey_png(visited, **UNIFORM, prior="nobody")
+        found_prior(twice[0], visit, "nobody")
+
+
+def found_prior(out: Path, visit: str, prior: str) -> tuple[str, float] | None:
+    """Name and days of the run that a visit to north goes on from."""
+    settings = load_settings(None, {"prior": prior, "visit": visit})
+    found, _ = memory.find_prior(Archive.open(out), settings, "north", SceneGrid(96, 128, 8, 4), CLASSES)
+    return found and (found.run, found.days)
 
 
 def test_a_field_of_another_size_is_no_memory(visited: Path, survey_png: Survey, tmp_path: Path) -> None:
@@ -177,14 +180,6 @@ def test_other_classes_are_found_by_their_names(visited: Path, survey_png: Surve
         visited, survey_png, **{**flags, "weights": str(strangers), "visit": "2026-06-06T10:00:00Z"}
     )
     assert "it has none of the classes of these weights, but class_0, class_1, class_2" in words
-
-
-def test_what_runs_rest_on_is_kept(visited: Path, twice: Any) -> None:
-    """Clearing up takes nothing of a visit that a later one goes on from, and a check finds nothing wrong."""
-    before = sorted(path.name for path in visited.glob("stages/*/*"))
-    assert clear_up(Archive.open(visited), keep_days=0).removals == ()
-    assert sorted(path.name for path in visited.glob("stages/*/*")) == before
-    assert problems(visited) == []
 
 
 def test_visits_are_reprocessed_in_order(visited: Path, twice: Any, make_weights: WeightsMaker) -> None:
@@ -273,10 +268,9 @@ def test_a_thousand_visits_cost_as_much_as_sixty(visited: Path, twice: Any, monk
         return read_run(folder)
 
     monkeypatch.setattr(memory, "read_run", counted)
-    settings = load_settings(None, {"prior": "latest", "visit": "2026-06-20T10:00:00Z"})
-    found, _ = memory.find_prior(Archive.open(visited), settings, "north", SceneGrid(96, 128, 8, 4), CLASSES)
+    found = found_prior(visited, "2026-06-20T10:00:00Z", "latest")
     assert found is not None
-    assert found.days == 16.0
+    assert found[1] == 16.0
     assert len(read) == memory.NEWEST_RUNS
     assert {name.rpartition("-")[2] for name in read} == {"north"}
 

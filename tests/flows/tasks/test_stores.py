@@ -18,15 +18,9 @@ from rich.console import Console
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
-from pipeline.errors import RigError
-from pipeline.source import Line
-from storage.archive.archive import Archive
 from storage.arrays.cubes import open_raw_cube
-from storage.arrays.spool import Spool
-from storage.remote.opening import verify_archive
 from tests.conftest import Survey
 from tests.prior_work import without_effects
-from tests.storage.small_archive import flip
 
 
 @pytest.fixture(scope="module")
@@ -83,38 +77,6 @@ def test_raw_is_stored_once_and_as_uint16(surveyed: tuple[Path, Published]) -> N
         for kind, name in (("capture", "dn"), ("condense_fine", "scores"))
     )
     assert signal < lines
-
-
-BROKEN_AT = 21
-
-
-def test_an_interrupted_capture_continues(
-    survey_png: Any, surveyed_png: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Bits flip in header and last lines: the same command ends with the same stores."""
-    surveyed_png(tmp_path / "whole")
-    append, appended = Spool.append, [0]
-
-    def breaks(spool: Spool, line: Line) -> None:
-        append(spool, line)
-        appended[0] += 1
-        if appended[0] == BROKEN_AT:
-            raise RigError("unplugged")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Spool, "append", breaks)
-        with pytest.raises(RigError, match="unplugged"):
-            survey_png(tmp_path / "broken")
-    (lines,) = (tmp_path / "broken" / "spool").glob("*/*.lines")
-    size = lines.stat().st_size
-    for at in (40, size // 3, size // 2, size - 9):
-        flip(lines, at)
-    survey_png(tmp_path / "broken")
-    before, after = (Archive.open(tmp_path / name) for name in ("whole", "broken"))
-    assert [ref.uri for ref in after.refs()] == [ref.uri for ref in before.refs()]
-    for ref in before.refs("capture"):
-        assert after.manifest(after.ref("capture", ref.key))["files"] == before.manifest(ref)["files"]
-    assert {one.kind for one in verify_archive(after)} == {"whole"}
 
 
 def test_processes_make_the_same_archive(tmp_path: Path, survey_png: Survey, surveyed_png: Survey) -> None:

@@ -28,10 +28,10 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.planning.coverage import on_scene
-from pipeline.signal.subspace import SMOOTH
+from pipeline.signal.components import Components
+from pipeline.signal.subspace import with_shared
 from pipeline.simulator.render import BY_NAME
 from storage.archive.archive import Archive
-from storage.archive.manifests import read_table
 from storage.arrays.class_maps import ClassMap, load_class_map
 from storage.arrays.mosaics import open_mosaic
 from storage.remote.opening import verify_archive
@@ -57,15 +57,14 @@ class Done:
         """The receipt."""
         return self.published.receipt
 
-    def open(self, product: str, inside: str = "") -> xr.Dataset:
+    def open(self, product: str) -> xr.Dataset:
         """A product as a stranger opens it: plain xarray, nothing of this project."""
-        return xr.open_zarr(self.archive / self.receipt["products"][product] / inside, consolidated=False)
+        return xr.open_zarr(self.archive / self.receipt["products"][product], consolidated=False)
 
-    def sweeps(self) -> list[tuple[xr.Dataset, Path]]:
-        """Every condensed sweep with its folder."""
-        folders = [self.archive / self.receipt["products"][name] for name in ("signal_fine",)]
-        found = [path for folder in folders for path in sorted(folder.glob("*.zarr"))]
-        return [(xr.open_zarr(path, consolidated=False), path) for path in found]
+    def sweeps(self) -> list[xr.Dataset]:
+        """Every condensed sweep."""
+        found = sorted((self.archive / self.receipt["products"]["signal_fine"]).glob("*.zarr"))
+        return [xr.open_zarr(path, consolidated=False) for path in found]
 
 
 @pytest.fixture(scope="module")
@@ -136,19 +135,17 @@ def test_savings_add_up_and_ranks_follow_the_scores(farm: Done) -> None:
 
 def test_savings_are_those_of_the_stored_cubes(farm: Done) -> None:
     """Lines, samples on the scene and bytes are the cubes'; seconds are the cost model's price of either pass."""
-    done = farm
-    savings, sweeps = done.receipt["savings"], done.sweeps()
-    shape = tuple(done.open("class_map").sizes[axis] for axis in ("y", "x"))
-    seen = [on_scene(shape, LineCamera(), Sweep(**cube.attrs["sweep"])) for cube, _ in sweeps]
-    assert savings["lines"]["done"] == sum(cube.sizes["line"] for cube, _ in sweeps)
-    assert savings["samples"]["done"] == sum(int(inside.sum()) for inside in seen)
-    lines = (cube.sizes["line"] * cube.sizes["sample"] * cube.sizes["band"] for cube, _ in sweeps)
-    assert done.receipt["data_bytes"]["captured"] == 2 * sum(lines)
-    sweeps = [Sweep(**cube.attrs["sweep"]) for cube, _ in done.sweeps()]
+    savings, cubes = farm.receipt["savings"], farm.sweeps()
+    shape = tuple(farm.open("class_map").sizes[axis] for axis in ("y", "x"))
+    sweeps = [Sweep(**cube.attrs["sweep"]) for cube in cubes]
+    assert savings["lines"]["done"] == sum(cube.sizes["line"] for cube in cubes)
+    assert savings["samples"]["done"] == sum(int(on_scene(shape, LineCamera(), sweep).sum()) for sweep in sweeps)
+    values = (cube.sizes["line"] * cube.sizes["sample"] * cube.sizes["band"] for cube in cubes)
+    assert farm.receipt["data_bytes"]["captured"] == 2 * sum(values)
     passes = [[sweep for sweep in sweeps if sweep.kind == kind] for kind in ("coarse", "fine")]
     assert all(passes)
     seconds = sum(CostModel().seconds(part, LineCamera()) for part in passes)
-    assert done.receipt["savings"]["capture_s"]["done"] == pytest.approx(seconds)
+    assert savings["capture_s"]["done"] == pytest.approx(seconds)
 
 
 def test_second_run_is_read_from_the_archive(survey_png: Any, surveyed_png: Any, tmp_path: Path) -> None:
@@ -295,10 +292,20 @@ def test_readings_that_the_weights_cannot_take_are_counted(survey_png: Any, tmp_
     assert json.loads((store / "out_of_range.json").read_text())["px"] == 64 * 96
 
 
-def test_two_passes_share_components_of_rare_spectra(tmp_path: Path) -> None:
+def test_two_passes_share_components_of_rare_spectra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Rare spectra of both passes add components; then both passes are written again by all of them."""
-    flags = {"size": "160x128", "zoom": "always", "seconds": "4", "effects": "none", "accuracy": "false"}
-    found = load_settings(None, {"scene": "farm", "engine": "plain", "out": str(tmp_path), **flags})
-    assert run_survey(found, Console(quiet=True)).receipt["plan"]["lines"] > 0
-    (record,) = (read_table(path) for path in tmp_path.glob("stages/condense_fine/*/signal.json"))
-    assert record["components"] > SMOOTH + 8
+    grown: list[list[int]] = []
+
+    def watched(components: Components, *given: Any) -> Components:
+        shared = with_shared(components, *given)
+        grown.append([len(components), len(shared)])
+        return shared
+
+    monkeypatch.setattr("flows.tasks.stages.condense.with_shared", watched)
+    size = {"size": "128x112", "camera.samples": 192, "bands": ",".join(map(str, range(4, 270, 3)))}
+    flags = {"zoom": "always", "seconds": "4", "effects": "none", "accuracy": "false", "engine": "plain"}
+    found = load_settings(None, {"scene": "farm", "out": str(tmp_path), **size, **flags})
+    done = Done(run_survey(found, Console(quiet=True)), tmp_path)
+    assert done.receipt["plan"]["lines"] > 0
+    assert grown[-1][0] < grown[-1][1]
+    assert {cube["scores"].shape[0] for cube in done.sweeps()} == {grown[-1][1]}

@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import pwd
 import stat
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
@@ -17,7 +15,6 @@ from pipeline.errors import SettingsError
 
 ROOT = Path(__file__).parents[3]
 NOWHERE = "/proc/nonexistent"  # where not even root can write
-FARM = ["--scene", "farm", "--size", "64x64", "--effects", "all"]
 
 
 @pytest.fixture
@@ -73,16 +70,3 @@ def test_pages_of_prefect_are_unpacked_where_that_is_possible(tmp_path: Path, mo
     assert place_pages(environment) == {
         "PREFECT_SERVER_UI_STATIC_DIRECTORY": str(tmp_path / "spectralzoom" / "prefect-pages")
     }
-
-
-def test_a_user_without_a_home_plans_a_survey(tmp_path: Path) -> None:
-    """It ends well, without a word of homes; caches of libraries end with the process."""
-    temporary = tmp_path / "temporary"
-    temporary.mkdir()
-    environment = {"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT), "HOME": NOWHERE, "TMPDIR": str(temporary)}
-    command = [sys.executable, "-m", "flows.cli.main", "plan", *FARM, "--out", str(tmp_path / "archive")]
-    done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "nonexistent" not in done.stderr
-    assert "atplotlib" not in done.stderr
-    assert not list(temporary.glob("spectralzoom-*"))

@@ -13,8 +13,6 @@ from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.probe import Probe, Unit, steepest_difference
 from pipeline.simulator.rig_model import Optics, Rig
-from pipeline.simulator.scenes.scene import RasterScene
-from tests.pipeline.simulator.small_scenes import made_scene
 
 Floats = NDArray[np.float64]
 Radiance = NDArray[np.float32]
@@ -49,15 +47,6 @@ def block_of(
 ) -> SweepBlock:
     """Some lines of the usual sweep."""
     return SweepBlock(rig, SWEEP, lines, wavelength_nm, (640, 640), fwhm_nm=fwhm_nm, **more)
-
-
-def small_scene(fwhm_nm: float | None = None) -> tuple[Floats, RasterScene]:
-    """Wavelengths and a raster of three components whose spectra differ, with a pattern of its own at every pixel."""
-    wavelength, light = random_light(7, bands=40)
-    planes = np.random.default_rng(7).uniform(0.1, 1, (90, 110, 3)).astype(np.float32)
-    spectra = np.ascontiguousarray(light[0, [0, 20, 40]])
-    widths = None if fwhm_nm is None else np.full(40, fwhm_nm)
-    return wavelength, made_scene(planes, spectra, wavelength, fwhm_nm=widths)
 
 
 def units(light: Radiance, unit: Unit) -> Floats:

@@ -7,15 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.errors import PoseError
 from pipeline.geometry.camera import LineCamera, expose, footprint
-from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
-from pipeline.geometry.scan import Sweep, line_positions
-from pipeline.simulator.render import USUAL, Choice, expected_light
+from pipeline.geometry.scan import Sweep
+from pipeline.simulator.render import Choice, expected_light
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import RasterScene
-from pipeline.simulator.simulated import render_lines, sweep_block
-from tests.pipeline.simulator.small_scenes import effects_on, image_scene, seen_at
+from pipeline.simulator.simulated import sweep_block
+from tests.pipeline.simulator.small_scenes import effects_on, image_scene
 
 CAMERA = LineCamera()
 OPTICS = effects_on("rotation", "slit", "smear")
@@ -66,22 +64,3 @@ def test_undeflected_sweep_is_the_operator_on_the_grid(step: int) -> None:
     viewed = expose(footprint(values.astype(np.float32) * scene.electrons, exact), exact, step=step, rng=None)
     binned = lines.reshape(sweep.lines, 640 // step, step, 1).mean(axis=2)
     assert np.abs(binned - viewed).max() < 0.02 * viewed.std()
-
-
-def test_rays_are_those_of_the_mirror() -> None:
-    """Without slit and smear a sample sees the point that the reflected ray of its centre meets."""
-    scene = scene_of(smooth((200, 700, 1)))
-    sweep = Sweep("s", "fine", "x", swath_px=150.0, start_px=-50.0, lines=20)
-    line = light_of(scene, sweep, range(7, 8), effects_on("rotation"))[0, :, 0]
-    slope = CAMERA.pixel_slopes()
-    ray = np.stack([0 * slope, slope, 1 + 0 * slope], axis=-1)
-    normal = position_to_normal(line_positions(sweep, CAMERA)[7])
-    x, y = direction_to_scene(reflect(ray, normal)).T / CAMERA.ifov_rad
-    expected = seen_at(scene, y + 99.5, x + 349.5)[:, 0] * scene.electrons[0]
-    np.testing.assert_allclose(line, expected, rtol=1e-4)
-
-
-def test_lines_beyond_the_mirror_are_refused() -> None:
-    """A sweep that the mirror cannot reach is told of, not rendered."""
-    with pytest.raises(PoseError):
-        render_lines(scene_of(np.ones((4, 4, 1))), Rig(), USUAL, replace(SWEEP, swath_px=2e4), range(1))

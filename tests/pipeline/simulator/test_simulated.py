@@ -105,17 +105,6 @@ def test_references_give_back_scene_values(binning: int, exposure_ms: float) -> 
     assert valid.all() == (values.max() * source.scene.electrons[0] * exposure_ms / 100 < CAMERA.full_scale_e)
 
 
-def test_black_scene_reads_dark() -> None:
-    """An all-black scene gives the dark level, zeros after calibration, and read noise alone."""
-    source = source_of(np.zeros((20, 20, 2)))
-    raw = raw_of(source)
-    assert raw.mean() == pytest.approx(64, abs=0.1)
-    position = line_positions(SWEEP, CAMERA)
-    out, valid = calibrate(raw, source.references(SWEEP), saturated_dn=4095, position=position)
-    assert valid.all()
-    assert abs(out.mean()) < 1e-3 * source.scene.white_reference[0]
-
-
 def test_impossible_settings_are_refused() -> None:
     """Unknown variants, and sums that overflow uint16 are named."""
     with pytest.raises(SettingsError, match=r"shot has no variant 'rough'"):

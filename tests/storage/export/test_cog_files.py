@@ -19,7 +19,7 @@ from pipeline.errors import ArchiveError
 from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.class_maps import ClassNames
 from storage.arrays.layout import AngularGrid
-from storage.export.image_files import ANGULAR, CogImage, angular_geobox, write_cog
+from storage.export.image_files import CogImage, angular_geobox, write_cog
 from tests.storage.export.stac_rules import is_cog
 
 LEGEND = ClassNames(
@@ -65,25 +65,6 @@ def test_rasterio_reads_what_was_written(tmp_path: Path, crs: str) -> None:
         assert file.transform == box.affine
         assert (file.nodata, file.descriptions, file.dtypes) == (UNLABELLED, ("class",), ("uint8",))
         assert file.tags()["run"] == "r1"
-
-
-def test_without_a_pose_the_transform_is_in_radians(tmp_path: Path) -> None:
-    """On the angular grid there is no CRS, pixels lie where the Zarr attributes say, and y grows downwards."""
-    values = np.random.default_rng(0).random(FEW).astype(np.float32)
-    values[:5] = np.nan
-    geobox = angular_geobox(AngularGrid(1e-4, FEW), FEW)
-    write_cog(
-        tmp_path / "a.tif",
-        CogImage(geobox, "float32", ("confidence",), np.nan, tags={"place": ANGULAR}),
-        rows_of(values),
-    )
-    with rasterio.open(tmp_path / "a.tif") as file:
-        np.testing.assert_array_equal(file.read(1), values)
-        assert file.crs is None
-        assert np.isnan(file.nodata)
-        assert file.transform[:6] == geobox.affine[:6] == pytest.approx((1e-4, 0, -35e-4, 0, 1e-4, -45e-4))
-        assert "[rad]" in file.tags()["place"]
-        assert "no CRS" in file.tags()["place"]
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "float32", "float64"])

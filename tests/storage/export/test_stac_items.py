@@ -7,14 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pystac
 import pytest
 import shapely
 from odc.geo.geobox import GeoBox
 
 from pipeline.errors import ArchiveError
 from storage.export.stac_items import COG, COLLECTION, ZARR, Item, clean_id, footprint, projection, write_stac
-from tests.storage.export.stac_rules import core_problems, extension_problems
 
 BOX = GeoBox.from_bbox((500000, 5770000, 500050, 5770040), crs="EPSG:32632", resolution=0.5)
 ABOUT = "field-a"
@@ -40,21 +38,6 @@ def read(path: Path) -> dict[str, Any]:
     """A JSON file."""
     found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     return found
-
-
-@pytest.mark.parametrize("placed", [True, False])
-def test_item_and_collection_fit_the_schemas(tmp_path: Path, placed: bool) -> None:
-    """STAC's core schemas and the extensions' rules find nothing, and pystac reads both as what they are."""
-    paths = write_stac(tmp_path, ABOUT, "Surveys", item("r1", placed=placed))
-    assert [core_problems(path) for path in paths] == [[], []]
-    assert extension_problems(read(paths[0])) == []
-    json.dumps(read(paths[0]), allow_nan=False)
-    collection = pystac.Collection.from_file(str(tmp_path / COLLECTION))
-    (found,) = collection.get_items(recursive=True)
-    assert found.id == "r1"
-    assert found.collection_id == collection.id == "field-a"
-    assert found.get_parent().id == "field-a"
-    assert found.datetime.isoformat() == "2026-05-01T10:00:00+00:00"
 
 
 def test_without_a_place_there_is_no_geometry(tmp_path: Path) -> None:

@@ -146,20 +146,6 @@ def test_missing_and_foreign_objects_are_found(machine: Machine) -> None:
     }
 
 
-def test_a_run_is_seen_elsewhere_with_all_it_rests_on(machine: Machine) -> None:
-    """ls of another machine has runs, receipts and stores; a rerun here sends no store again."""
-    small = small_survey(machine(FIRST))
-    other = machine(SECOND, create=False, write=False)
-    catalogue = Catalogue.read(other.root)
-    (run,) = catalogue.runs
-    assert run.problem is None
-    assert run.names == {small.map.uri, small.mosaic.uri, small.raw.uri}
-    assert set(catalogue.stores) == run.names
-    again = machine(FIRST)
-    small_survey(again)
-    assert problems(again) == []
-
-
 def test_runs_of_one_second_have_names_of_their_own(machine: Machine) -> None:
     """Two machines that begin a run in the same second do not get the same name."""
     drafts = [machine(name)._begin_run("20261120T101010-farm") for name in (FIRST, SECOND)]

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import ndtr
 
-from pipeline.geometry.camera import LineCamera, footprint_kernel
+from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import position_to_normal
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.compiled_loops import read_weights
@@ -100,14 +100,6 @@ def test_box_is_the_mean_of_the_kernel(width: float) -> None:
     inside = (np.arange(1000) + 0.5) / 1000 - 0.5
     wanted = np.interp(DISTANCE[:, None] + inside * width, [-1, 0, 1], [0, 1, 0]).mean(axis=1)
     np.testing.assert_allclose(box_weight(DISTANCE, width), wanted, atol=2e-6)
-
-
-@pytest.mark.parametrize("width", [1.0, 2.7])
-def test_box_at_pixel_centres_is_the_camera_s_kernel(width: float) -> None:
-    """At whole distances it is the operator by which every pass looks at light."""
-    kernel = footprint_kernel(width)
-    places = np.arange(len(kernel)) - len(kernel) // 2
-    np.testing.assert_allclose(box_weight(places.astype(float), width), kernel, atol=1e-14)
 
 
 @pytest.mark.parametrize("held", [1, 4])
