@@ -139,7 +139,7 @@ def _tangents(position: Floats, slopes: Floats, *, exact: bool) -> RayViews:
     return RayViews(along, np.broadcast_to(centre[..., 1], along.shape), one, none, none, one)
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=2)  # tens of megabytes each; sweeps follow each other
 def _sampler(
     rig: Rig, sweep: Sweep, wavelengths: bytes, blurs: tuple[tuple[Any, str], ...], names: tuple[str, ...]
 ) -> SceneSampler:
