@@ -32,7 +32,7 @@ from storage.arrays.layout import SHARD_ROWS
 
 OLDER_DAYS = (1, 7, 30)  # since a capture, for which hectares are given
 PLOTS_FILE = "plots.csv"
-STRIP_PX = 2**20  # of class probabilities read at a time; 64 rows to 256
+STRIP_PX = 2**20  # of class probabilities read at a time: 1 to 4 shards high
 
 
 def field_figures(run: SurveyRun, fine: FinePlan | None) -> dict[str, Any]:
@@ -227,8 +227,10 @@ def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
         return None
     names = run.described.class_names
     store = ProbabilityStore(ref.path / "class_probabilities.zarr")
-    high = SHARD_ROWS * min(max(STRIP_PX // (SHARD_ROWS * store.shape[1]), 1), 4)
-    strips = (store.read(rows)[0] for rows in cuts(store.shape[0], high))
+    strips = (
+        store.read(rows)[0]
+        for rows in cuts(store.shape[0], SHARD_ROWS * min(max(STRIP_PX // (SHARD_ROWS * store.shape[1]), 1), 4))
+    )
     exposure_ms = (settings.scan_exposure_ms or run.camera.exposure_ms) * run.scene.light_fraction
     score = run.map_scores.expected(expected_counts(strips, len(names)), step, exposure_ms)
     if score is None or not np.isfinite(score.miou):

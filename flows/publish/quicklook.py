@@ -193,7 +193,7 @@ def _draw_truth(axes: Axes, data: QuicklookData) -> None:
             interpolation="nearest",
         )
         labelled = (data.truth != UNLABELLED) & (data.class_map != UNLABELLED)
-        right = np.count_nonzero(labelled & (data.truth == data.class_map)) / max(np.count_nonzero(labelled), 1)
+        right = np.count_nonzero(labelled & (data.truth == data.class_map)) / max(int(np.count_nonzero(labelled)), 1)
         words = f"labelled pixels correct: {100 * right:.1f} %" if labelled.any() else "no pixel is labelled"
         return _caption(axes, "4  Labels", words)
     if data.confidence is not None and data.policy is not None:
