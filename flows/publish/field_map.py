@@ -23,7 +23,7 @@ from pipeline.geometry.grid import UNLABELLED
 from pipeline.geometry.scan import Sweep
 from pipeline.planning.fine_pass import FinePlan
 from storage.archive.keys import StageRef
-from storage.arrays.class_maps import ProbabilityStore
+from storage.arrays.class_maps import ProbabilityStore, class_counts
 from storage.arrays.layout import open_group, read_array
 from storage.arrays.quicklooks import choose_bands
 
@@ -119,8 +119,8 @@ def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: Prio
         p, table = run.grid.patch, np.array([(0, 0, 0, 0), (*PATCH_RGB, 255)], np.uint8)
         pixels = patch_index.repeat(p, axis=0).repeat(p, axis=1)[: run.grid.height, : run.grid.width]
         layers.append(MapLayer("Captured again", layer_address(pixels[thin], table), opacity=0.6))
-    counts = np.bincount(shown.class_map.ravel(), minlength=256) / max(shown.class_map.size, 1)
-    covered = [*counts[: len(shown.class_names)].tolist(), float(counts[len(shown.class_names) :].sum())]
+    counts = class_counts(shown.class_map, len(shown.class_names))
+    covered = np.append(counts, shown.class_map.size - counts.sum()) / max(shown.class_map.size, 1)
     rows = [
         {
             "name": name.replace("_", " "),

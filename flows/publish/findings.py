@@ -19,19 +19,20 @@ from flows.tasks.scores import MOST_ERROR
 from flows.tasks.stages.maps import OUT_OF_RANGE
 from flows.terminal.figures import format_points
 from models.evaluation.expected_scores import expected_counts
-from pipeline.geometry.grid import UNLABELLED
+from pipeline.geometry.grid import UNLABELLED, cuts
 from pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, FieldScale, areas_by_number
 from pipeline.ground.georeference import crs_name, pixel_side_m
 from pipeline.ground.zones import figures_of_plot
 from pipeline.planning.fine_pass import FinePlan
 from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table
-from storage.arrays.class_maps import ClassMap, ProbabilityStore
+from storage.arrays.class_maps import ClassMap, ProbabilityStore, class_counts
 from storage.arrays.ground_maps import GroundMap
+from storage.arrays.layout import SHARD_ROWS
 
 OLDER_DAYS = (1, 7, 30)  # since a capture, for which hectares are given
 PLOTS_FILE = "plots.csv"
-STRIP_ROWS = 256  # rows of class probabilities read at a time
+STRIP_PX = 2**20  # of class probabilities read at a time: 1 to 4 shards high
 
 
 def field_figures(run: SurveyRun, fine: FinePlan | None) -> dict[str, Any]:
@@ -80,12 +81,12 @@ def find_areas(run: SurveyRun, posed: GroundMap | None, drawn: ClassMap) -> dict
     With a pose, hectares are those of the map on the ground.
     """
     names = drawn.names
-    pixels = np.bincount(drawn.classes.ravel(), minlength=len(names)).tolist()
+    pixels = class_counts(drawn.classes, len(names)).tolist()
     m2 = None if posed is not None else areas_by_number(run.zones.place, drawn.classes, len(names))
     hectares = {} if m2 is None else dict(zip(names, (m2 / M2_PER_HECTARE).tolist(), strict=True))
     if posed is not None:
         hectares = {name: area["ha"] for name, area in posed.areas.items()}
-    return {"areas": {"px": dict(zip(names, pixels, strict=False)), **({"ha": hectares} if hectares else {})}}
+    return {"areas": {"px": dict(zip(names, pixels, strict=True)), **({"ha": hectares} if hectares else {})}}
 
 
 def find_ground(
@@ -226,8 +227,10 @@ def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
         return None
     names = run.described.class_names
     store = ProbabilityStore(ref.path / "class_probabilities.zarr")
-    rows = range(0, store.shape[0], STRIP_ROWS)
-    strips = (store.read(slice(top, min(top + STRIP_ROWS, store.shape[0])))[0] for top in rows)
+    strips = (
+        store.read(rows)[0]
+        for rows in cuts(store.shape[0], SHARD_ROWS * min(max(STRIP_PX // (SHARD_ROWS * store.shape[1]), 1), 4))
+    )
     exposure_ms = (settings.scan_exposure_ms or run.camera.exposure_ms) * run.scene.light_fraction
     score = run.map_scores.expected(expected_counts(strips, len(names)), step, exposure_ms)
     if score is None or not np.isfinite(score.miou):

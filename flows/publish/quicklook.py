@@ -30,6 +30,7 @@ from flows.publish.panels import (
 )
 from flows.terminal.figures import format_percent
 from pipeline.geometry.grid import UNLABELLED
+from storage.arrays.class_maps import class_counts
 from storage.arrays.quicklooks import choose_bands, develop, stretch
 
 Box = tuple[int, int, int, int]
@@ -192,7 +193,7 @@ def _draw_truth(axes: Axes, data: QuicklookData) -> None:
             interpolation="nearest",
         )
         labelled = (data.truth != UNLABELLED) & (data.class_map != UNLABELLED)
-        right = float(np.mean(data.truth[labelled] == data.class_map[labelled])) if labelled.any() else float("nan")
+        right = np.count_nonzero(labelled & (data.truth == data.class_map)) / max(int(np.count_nonzero(labelled)), 1)
         words = f"labelled pixels correct: {100 * right:.1f} %" if labelled.any() else "no pixel is labelled"
         return _caption(axes, "4  Labels", words)
     if data.confidence is not None and data.policy is not None:
@@ -211,7 +212,7 @@ def _draw_confidence(axes: Axes, data: QuicklookData, title: str, why: str = "")
 
 def _draw_legend(figure: Figure, data: QuicklookData, columns: int) -> None:
     palette = class_palette(data.class_colours)
-    counts = np.bincount(data.class_map.ravel(), minlength=256)[: len(data.class_names)]
+    counts = class_counts(data.class_map, len(data.class_names))
     fractions = counts / max(int(counts.sum()), 1)
     marks = [Patch(facecolor=tuple(colour), edgecolor="#555555", linewidth=0.6) for colour in palette]
     words = zip(data.class_names, map(format_percent, fractions), strict=True)

@@ -31,7 +31,6 @@ from models.reading.prior_map import (
 )
 from models.reading.regions import Region
 from pipeline.geometry.grid import UNLABELLED, patch_pixels
-from pipeline.rectify.region import free_tiles
 from storage.arrays.class_maps import write_changes_tile, write_class_tile, write_probabilities_tile
 from storage.arrays.mosaics import Mosaic, chosen_patches, open_mosaic
 from storage.parallel.pool import run_blocks
@@ -58,7 +57,6 @@ class Drawing:
 
     def __call__(self, region: Region) -> Drawn:
         """Read what was seen of the region coarsely and finely, and store the part of the map that is kept."""
-        free_tiles()
         weights, mosaic = self.weights.load(), open_mosaic(self.mosaic)
         seen, chosen = coarse_region(weights, self.mosaic, region, self.capture), chosen_patches(self.attention)
         if self.least_gain is not None:

@@ -16,7 +16,7 @@ from models.reading.expected_errors import PatchExpectedErrors
 from models.reading.prior_map import COME_TRUE, ClassProbabilities, PriorMap, carried, in_classes
 from models.weights.files import Description, load_reader
 from pipeline.errors import BudgetError, NothingToMend, SettingsError, WeightsError
-from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.grid import SceneGrid, cuts
 from pipeline.planning.coverage import patches_shown
 from pipeline.planning.partial_scans import (
     PartialScan,
@@ -177,8 +177,8 @@ def _swaths(
     """Yield class probabilities of the prior map at the time of the visit, and their ages, in blocks of rows."""
     store, high = ProbabilityStore(prior.probabilities.path / "class_probabilities.zarr"), SWATH_PATCHES * grid.patch
     read = None if weights.reader is None else load_reader(path)
-    for top in range(0, grid.height, high):
-        probabilities, age, light = store.read(slice(top, min(top + high, grid.height)))
+    for rows in cuts(grid.height, high):
+        probabilities, age, light = store.read(rows)
         before = ClassProbabilities(in_classes(probabilities, prior.classes), age, light)
         today = carried(PriorMap(before, None, prior.days, prior.day_of_year), read)
         yield today.log_probability, today.age_days

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from flows.tasks.patch_budget import SHARD
 from models.evaluation.placement import COMPARED, classes_by
-from models.network.machine import PROCESSOR
+from models.network.machine import PROCESSOR, give_back_freed_memory
 from models.network.spectral import Capture, CaptureMap, LineSpec, patches_of
 from models.policies.policies import GLANCING_POLICIES, score_patches
 from models.reading.expected_errors import LEAST_EXPECTED_ERROR, STEPS, PatchExpectedErrors
@@ -83,7 +83,6 @@ class Scoring:
 
     def __call__(self, region: Region) -> NDArray[np.float64]:
         """Return the scores of the region's own patches, (patch_y, patch_x)."""
-        free_tiles()
         weights = self.weights.load()
         scan_pass = coarse_region(weights, self.mosaic, region, self.capture)
         if self.policy in GLANCING_POLICIES:
@@ -105,7 +104,6 @@ class ExpectedErrors:
 
     def __call__(self, region: Region) -> NDArray[np.float32]:
         """Return the counted pixels of the region's own patches, (patch_y, patch_x, class, step)."""
-        free_tiles()
         weights = self.weights.load()
         coarse = read_coarse_prediction(weights, coarse_region(weights, self.mosaic, region, self.capture))
         with np.errstate(divide="ignore"):
@@ -128,7 +126,6 @@ class Readings:
 
     def __call__(self, region: Region) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
         """Return (reading, y, x) classes of the kept part, and (patch_y, patch_x, policy) scores of its patches."""
-        free_tiles()
         weights = self.weights.load()
         seen = read_coarse_prediction(weights, coarse_region(weights, self.mosaic, region, self.capture))
         readings = (False, True) if self.in_full else (False,)
@@ -138,10 +135,12 @@ class Readings:
 
 
 def coarse_region(weights: Weights, mosaic: Path, region: Region, capture: LineSpec) -> CoarsePass:
-    """Read a region of a stored mosaic, in blocks of rows.
+    """Read a region of a stored mosaic, in blocks of rows, after the memory of the one before is given back.
 
     ``capture`` is the capture of pixels for which the mosaic has none.
     """
+    free_tiles()
+    give_back_freed_memory()  # regions differ in size: their remainders would add up over a large field
     coarse, window = open_mosaic(mosaic), (region.read.rows, region.read.columns)
     mixed = coarse.captures(*window)
     how: Capture = capture if mixed is None else CaptureMap(tuple(LineSpec(*one) for one in mixed[0]), mixed[1])

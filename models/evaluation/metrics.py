@@ -15,7 +15,7 @@ import scipy
 from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
-from pipeline.geometry.grid import UNLABELLED
+from pipeline.geometry.grid import UNLABELLED, cuts
 
 DRAWS = 2000  # of the bootstrap
 LEVEL = 0.95
@@ -23,6 +23,7 @@ CONFIDENCE_BINS = 20
 BAD_ERROR = 0.02  # expected calibration error above which a temperature is fitted
 COOLEST, HOTTEST = 0.2, 5.0
 FITTED_PIXELS = 20_000  # random pixels of a scene to fit a temperature to
+PIXELS_AT_ONCE = 2**20  # that are counted: their numbers take more memory than the maps
 Counts = NDArray[np.int64]
 Numbers = NDArray[np.integer]
 Floats = NDArray[np.float64]
@@ -36,12 +37,15 @@ def confusion(labels: Numbers, predicted: Numbers, classes: int) -> Counts:
     """
     if labels.shape != predicted.shape:
         raise ShapeError(f"labels are {labels.shape}, the class map is {predicted.shape}; they must be equal")
-    counted = labels != UNLABELLED
-    truth, guess = labels[counted].astype(np.int32), predicted[counted].astype(np.int32)
-    for name, values in (("label", truth), ("prediction", guess)):
-        if (outside := values[(values < 0) | (values >= classes)]).size:
-            raise ShapeError(f"{name} {outside[0]} is none of the {classes} classes 0..{classes - 1}")
-    return np.bincount(truth * classes + guess, minlength=classes**2).reshape(classes, classes)
+    counts = np.zeros(classes**2, np.int64)
+    for part in cuts(labels.size, PIXELS_AT_ONCE):
+        some, drawn = (one.reshape(-1)[part] for one in (labels, predicted))
+        truth, guess = (one[some != UNLABELLED].astype(np.int32) for one in (some, drawn))
+        for name, values in (("label", truth), ("prediction", guess)):
+            if (outside := values[(values < 0) | (values >= classes)]).size:
+                raise ShapeError(f"{name} {outside[0]} is none of the {classes} classes 0..{classes - 1}")
+        counts += np.bincount(truth * classes + guess, minlength=classes**2)
+    return counts.reshape(classes, classes)
 
 
 def labelled_classes(counts: NDArray[np.number]) -> NDArray[np.bool_]:

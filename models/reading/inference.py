@@ -24,7 +24,7 @@ from models.network.spectral import (
 )
 from models.weights.files import Weights
 from pipeline.errors import ShapeError
-from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
+from pipeline.geometry.grid import UNLABELLED, SceneGrid, cuts, pad_by_reflection
 from pipeline.lazy import deferred
 from pipeline.signal.components import Components
 
@@ -228,11 +228,10 @@ def patch_logits(
     Chunks fit the processor's caches. Values that are not finite count as 0, the median.
     """
     network = weights.segmenter
-    for first in range(0, len(patches), PATCHES_AT_ONCE):
-        some = slice(first, first + PATCHES_AT_ONCE)
+    for some in cuts(len(patches), PATCHES_AT_ONCE):
         planes = CaptureMap(capture.specs, capture.number[some]) if isinstance(capture, CaptureMap) else capture
         chunk = torch.from_numpy(with_planes(patches[some], planes, fainter=FAINTER)).nan_to_num_(0.0, 0.0, 0.0)
-        index = torch.from_numpy(patch_index[first : first + PATCHES_AT_ONCE])[None].to(network.device)
+        index = torch.from_numpy(patch_index[some])[None].to(network.device)
         yield network.read_patches(overview, chunk.permute(0, 3, 1, 2)[None].to(network.device), index)[0].cpu()
 
 
@@ -291,8 +290,7 @@ def draw(logits: Tensor, *, every_class: bool = False) -> DrawnMap:
     _, y, x = logits.shape
     every = np.empty((y, x, len(logits)), np.float32) if every_class else None
     drawn = DrawnMap(np.empty((y, x), np.uint8), np.empty((y, x), np.float32), every)
-    for top in range(0, y, ROWS_DRAWN):
-        rows = slice(top, top + ROWS_DRAWN)
+    for rows in cuts(y, ROWS_DRAWN):
         confidence, classes = decide(logits[:, rows], dim=0)
         drawn.classes[rows], drawn.confidence[rows] = classes.numpy(), confidence.numpy()
         if drawn.log_probability is not None:

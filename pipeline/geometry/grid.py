@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -65,6 +66,11 @@ class SceneGrid:
         """Return (patch, 2) y and x of the first pixel of each patch."""
         rows, columns = np.divmod(np.asarray(patch_index), self.patch_shape[1])
         return np.stack([rows, columns], axis=-1).astype(np.intp) * self.patch
+
+
+def cuts(size: int, step: int) -> Iterator[slice]:
+    """Yield the parts of ``size`` rows or other numbers, ``step`` in each but the last."""
+    return (slice(first, min(first + step, size)) for first in range(0, size, step))
 
 
 def patch_pixels(grid: SceneGrid, image: NDArray[Kind], beyond: int = 0) -> NDArray[Kind]:

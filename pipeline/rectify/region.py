@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.grid import SceneGrid, cuts
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.mosaic import LocatedSweep, cut_runs, mosaic, read_part
 from pipeline.rectify.placed import TAPS, ColumnReach, PixelGrid, PlacedSweep, ScanPathReach, member_lines, place
@@ -88,7 +88,7 @@ def mosaic_rows(
     placed = [place(lines, camera) for lines in sweeps]
     columns = slice(0, pixels.shape[1])
     reach = column_reach(placed, camera, pixels, columns)
-    for part in _cuts(pixels.shape[0], rows):
+    for part in cuts(pixels.shape[0], rows):
         yield part.start, *mosaic_tile(placed, camera, pixels, part, columns, reach=reach)
 
 
@@ -191,14 +191,10 @@ def plan_tiles(
     """List a grid's tiles down the columns, so that lines are read once for the next tiles."""
     reaches = [[ScanPathReach(one, scan_path, camera, grid) for scan_path, _ in one.scan_paths] for one in placed]
     tiles = []
-    for columns in _cuts(grid.shape[1], tile_shape[1]):
+    for columns in cuts(grid.shape[1], tile_shape[1]):
         shown = [[reach.in_columns(columns) for reach in scan_paths] for scan_paths in reaches]
-        tiles += [Tile(rows, columns, shown) for rows in _cuts(grid.shape[0], tile_shape[0])]
+        tiles += [Tile(rows, columns, shown) for rows in cuts(grid.shape[0], tile_shape[0])]
     return tiles
-
-
-def _cuts(size: int, step: int) -> Iterator[slice]:
-    return (slice(first, min(first + step, size)) for first in range(0, size, step))
 
 
 def cache_bytes(placed: Sequence[PlacedSweep], tiles: Sequence[Tile], at_once: int) -> int:

@@ -15,6 +15,7 @@ from scipy.ndimage import uniform_filter
 from scipy.special import chdtri
 
 from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import cuts
 from pipeline.geometry.scan import Sweep
 from pipeline.readings import SIGMA_OF_MEDIAN
 from pipeline.signal.calibrate import calibrate, judge_elements
@@ -87,8 +88,7 @@ def _projected(values: NDArray[np.float32], components: Components) -> tuple[Sco
     axes, flat = components.axes.T.astype(np.float32), values.reshape(-1, components.bands)
     scores, left = np.empty((len(flat), len(components)), np.float32), np.empty(len(flat), np.float32)
     with np.errstate(invalid="ignore", over="ignore"):
-        for first in range(0, len(flat), SPECTRA_AT_ONCE):
-            part = slice(first, first + SPECTRA_AT_ONCE)
+        for part in cuts(len(flat), SPECTRA_AT_ONCE):
             white = components.white(flat[part])
             scores[part] = white @ axes
             square = np.einsum("nb,nb->n", white, white)
@@ -108,8 +108,7 @@ def _least_squares(white: Scores, there: Bools, axes: Scores, bands: int) -> tup
     count = axes.shape[1]
     products = (axes[:, :, None] * axes[:, None, :]).reshape(len(axes), -1)
     scores, residual = np.empty((len(white), count), np.float32), np.empty(len(white), np.float32)
-    for first in range(0, len(white), 4096):
-        part = slice(first, first + 4096)
+    for part in cuts(len(white), 4096):
         gram = (there[part].astype(np.float32) @ products).reshape(-1, count, count).astype(np.float64)
         gram += 1e-6 * np.eye(count)
         scores[part] = np.linalg.solve(gram, (white[part] @ axes).astype(np.float64)[..., None])[..., 0]
@@ -294,16 +293,15 @@ def calibrated_blocks(
     A line that is not valid because its position is unknown keeps its values. A lost line holds zeros, which are out.
     """
     elements, saturated = judge_elements(lines.references), float(camera.full_scale_dn * lines.sweep.binning)
-    for first in range(0, len(lines.valid_line), BLOCK_LINES):
-        if chosen is not None and first // BLOCK_LINES not in chosen:
+    for part in cuts(len(lines.valid_line), BLOCK_LINES):
+        if chosen is not None and part.start // BLOCK_LINES not in chosen:
             continue
-        part = slice(first, min(first + BLOCK_LINES, len(lines.valid_line)))
         raw = lines.read(part.start, part.stop)
         values, valid = calibrate(raw, elements, saturated_dn=saturated, position=lines.position[part])
         lost = ~lines.valid_line[part]
         if lost.any():
             valid[lost] &= raw[lost].any(axis=2).reshape(-1, raw.shape[1], *[1] * (valid.ndim - 2))
-        yield first, values, valid
+        yield part.start, values, valid
 
 
 def differing_lines(

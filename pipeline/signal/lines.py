@@ -15,6 +15,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.geometry.grid import cuts
 from pipeline.signal.calibrate import Elements, calibrate, judge_elements, of_bands
 from pipeline.signal.components import BROAD_BANDS, Components, broad_weights, spread_bands
 from pipeline.source import References, SweepLines
@@ -83,8 +84,7 @@ class Signal:
         lines, chosen = self.lines, broad_bands(self.lines.references, bands)
         references, saturated = of_bands(lines.references, chosen.tolist()), full_scale_dn * lines.sweep.binning
         image = np.full((len(usable), self.samples), np.nan, np.float32)
-        for first in range(0, len(usable), BLOCK_LINES):
-            part = slice(first, min(first + BLOCK_LINES, len(usable)))
+        for part in cuts(len(usable), BLOCK_LINES):
             raw = np.ascontiguousarray(lines.read(part.start, part.stop)[..., chosen])
             at = np.where(usable[part, None], lines.position[part], np.nan)
             values, valid = calibrate(raw, references, saturated_dn=saturated, position=at)
@@ -159,8 +159,7 @@ class CondensedSignal:
         """Return the mean of ``bands`` bands spread over all, (line, sample); NaN where one is not valid."""
         weights, offset = broad_weights(self._condensed.components, bands)
         image = np.full((len(usable), self.samples), np.nan, np.float32)
-        for first in range(0, len(usable), BLOCK_LINES):
-            part = slice(first, min(first + BLOCK_LINES, len(usable)))
+        for part in cuts(len(usable), BLOCK_LINES):
             scores = self.lines.read(part.start, part.stop).astype(np.float32) * np.float32(self._condensed.step)
             seen = self._condensed.usable[part] & usable[part, None]
             image[part] = np.where(seen, scores @ weights + offset, np.nan)

@@ -147,6 +147,11 @@ def load_class_map(path: Path) -> ClassMap:
     return ClassMap(classes, confidence, legend.names, legend.colours, grid_of(dict(group.attrs)))
 
 
+def class_counts(classes: NDArray[np.integer], count: int) -> NDArray[np.int64]:
+    """Return the number of pixels of each of the first ``count`` classes, (class,)."""
+    return np.array([np.count_nonzero(classes == number) for number in range(count)], np.int64)
+
+
 def create_probabilities(
     path: Path, shape: tuple[int, int], legend: ClassNames, *, grid: AngularGrid | None = None, goes_on: bool = False
 ) -> None:

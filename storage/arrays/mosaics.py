@@ -13,7 +13,7 @@ import zarr
 from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
-from pipeline.geometry.grid import block_means
+from pipeline.geometry.grid import block_means, cuts
 from pipeline.signal.components import Components, broad_weights
 from storage.arrays.georeference import create_placed_group
 from storage.arrays.layout import (
@@ -121,10 +121,9 @@ class MosaicWriter:
     def write_rows(self, first: int, scores: NDArray[np.floating], seen: NDArray[np.bool_]) -> None:
         """Store rows of scores (y, x, component) and of the mask ``seen`` (y, x); ``first`` is a multiple of 64."""
         deep, wide = self.tile_shape
-        for top in range(0, len(scores), deep):
-            for left in range(0, scores.shape[1], wide):
-                part = np.s_[top : top + deep, left : left + wide]
-                self.write_tile(first + top, left, scores[part], seen[part])
+        for rows in cuts(len(scores), deep):
+            for columns in cuts(scores.shape[1], wide):
+                self.write_tile(first + rows.start, columns.start, scores[rows, columns], seen[rows, columns])
 
     def blank(self, where: NDArray[np.bool_] | None) -> None:
         """Set the (y, x) pixels ``where``, which show no scene, to unseen; None: all show it."""
@@ -246,11 +245,7 @@ class Mosaic:
 
         They are read a shard's rows at a time.
         """
-        starts = range(0, self.shape[0], SHARD_ROWS)
-        blocks = (
-            self.scores(slice(first, min(first + SHARD_ROWS, self.shape[0])))[-first % step :: step, ::step]
-            for first in starts
-        )
+        blocks = (self.scores(rows)[-rows.start % step :: step, ::step] for rows in cuts(self.shape[0], SHARD_ROWS))
         return np.concatenate([self.spectra(block, bands) for block in blocks])
 
     def brightness(self, factor: int | None = None, bands: int | None = None) -> NDArray[np.float32]:

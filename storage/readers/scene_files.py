@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import EmptySceneError, SceneError
-from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.grid import SceneGrid, cuts
 from pipeline.readings import MOST_VALUE, beyond_range, find_beyond
 from storage.archive.staging import file_hash
 from storage.parallel.pool import RESERVED_BYTES, memory_refusal
@@ -323,8 +323,7 @@ def _find_gaps(
     chosen, nodata, notes = values.bands, values.nodata, list[str]()
     missing, seen = np.zeros((height, width), np.bool_), np.zeros(len(chosen), np.bool_)
     filled_px = void = infinite = absent = 0
-    for first in range(0, height, BLOCK_LINES):
-        rows = slice(first, min(first + BLOCK_LINES, height))
+    for rows in cuts(height, BLOCK_LINES):
         picked, block, empty = values.converted(rows.start, rows.stop)
         void += 0 if empty is None else int(np.count_nonzero(empty))
         if beyond_range(picked) is not None:
@@ -332,7 +331,7 @@ def _find_gaps(
             if found is not None:
                 y, x, band = found.place
                 raise SceneError(
-                    f"{path} has {found.value!s} at y {first + y}, x {x}, band {chosen[band]}, above the limit of"
+                    f"{path} has {found.value!s} at y {rows.start + y}, x {x}, band {chosen[band]}, above the limit of"
                     f" {MOST_VALUE:g}; if it means no data, write nodata = {found.value!s} into a {SETTINGS_NAME}"
                     " beside the file, else leave the band out with --bands, or give the values in a larger unit"
                 )

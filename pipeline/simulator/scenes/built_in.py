@@ -153,8 +153,7 @@ def _draw(plan: FarmPlan, interest: float | None) -> Drawn:
     soil = moist_soil(plan, ground.at(bare), plan.fields[0].wetter)
     work.canvas.over(bare, patches["bare"].ravel()[bare], soil, "soil")
     draw_weeds(work, _weeds_within(plan, patches["weeds"]))
-    work.canvas.dim(ground.light)
-    return work.canvas.drawn()
+    return work.canvas.drawn(ground.light)
 
 
 def _weeds_within(plan: FarmPlan, cover: Field) -> dict[str, Points]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError, ShapeError
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import UNLABELLED
+from pipeline.geometry.grid import UNLABELLED, cuts
 from pipeline.lazy import Once
 from pipeline.readings import MOST_VALUE, find_beyond
 from pipeline.simulator.scenes.scratch import scratch
@@ -89,8 +89,7 @@ def _halved(planes: NDArray[np.float32], before: int) -> NDArray[np.float32]:
     counts = [-(-(size - 1 + half - before) // 2) + THINNED_MARGIN + 1 for size in planes.shape[:2]]
     rows, columns = (before + 2 * (np.arange(count) - THINNED_MARGIN) - half for count in counts)
     out = scratch((*counts, planes.shape[2]))
-    for first in range(0, counts[0], _ROWS_AT_ONCE):
-        some = slice(first, first + _ROWS_AT_ONCE)
+    for some in cuts(counts[0], _ROWS_AT_ONCE):
         out[some] = _binomial(_binomial(planes, rows[some], 0), columns, 1)
     return out
 

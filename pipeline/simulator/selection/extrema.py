@@ -30,7 +30,8 @@ _LEAST_WEIGHT = 1e-3  # of a kernel's tap: enough to find places
 _MEAN_PX = 4  # side of the squares whose means are compared: a slit is wider than a pixel
 _SPECTRAL = 100  # number of the measure over wavelength
 _TILES = 8192  # about the most; each offers its best place
-_TILES_HIGH = 3  # strips: what is made of one stays in the processor's cache
+_TILES_HIGH = 3  # strips, at most: what is made of one stays in the processor's cache
+_STRIP_PX = 2**21  # of which a strip of more tiles has less
 
 
 def find_extrema(scene: RasterScene, camera: LineCamera, sweeps: Sequence[Sweep], most: int) -> Floats:
@@ -52,7 +53,8 @@ def find_extrema(scene: RasterScene, camera: LineCamera, sweeps: Sequence[Sweep]
         bands = chosen_bands(spectra)
         kinds = list(range(len(bands)))
     some = spectra[bands] if own_planes else np.ascontiguousarray(spectra[:, bands])
-    for first, planes in _row_blocks(scene, _TILES_HIGH * tile, optics.halo):
+    high = min(_TILES_HIGH, max(1, _STRIP_PX // (tile * scene.shape[1]))) * tile
+    for first, planes in _row_blocks(scene, high, optics.halo):
         light = to_bands(planes[..., bands] if own_planes else planes, some)
         for measure, values in enumerate(optics.measures(light)):
             ranking.offer(measure, values, first, tile, kinds)
@@ -99,11 +101,11 @@ def telling_bands(
 
 def _row_blocks(scene: RasterScene, high: int, halo: int) -> Iterator[tuple[int, Radiance]]:
     """Yield the first row of each strip, and its planes with a halo in which the scene's edge is repeated."""
-    rows = scene.shape[0]
+    rows, columns = scene.shape
+    across = np.arange(-halo, columns + halo).clip(0, columns - 1)
     for first in range(0, rows, high):
         down = np.arange(first - halo, min(first + high, rows) + halo).clip(0, rows - 1)
-        inner = scene.planes[down[0] : down[-1] + 1][down - down[0]]
-        planes = np.pad(inner, ((0, 0), (halo, halo), (0, 0)), mode="edge")
+        planes = scene.planes[down[:, None], across]
         _check_finite(scene, planes, first - halo)
         yield first, planes
 

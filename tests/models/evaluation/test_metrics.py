@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from unittest import mock
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from models.evaluation import metrics
 from models.evaluation.metrics import (
     agreement,
     average_accuracy,
@@ -38,6 +41,8 @@ def test_counts_of_parts_add_up(pairs: list[tuple[int, int]], cut: int):
     whole = confusion(labels, drawn, 4)
     parts = confusion(labels[:cut], drawn[:cut], 4) + confusion(labels[cut:], drawn[cut:], 4)
     assert (whole == parts).all()
+    with mock.patch.object(metrics, "PIXELS_AT_ONCE", 7):
+        assert (confusion(labels, drawn, 4) == whole).all()
     assert whole.sum() == np.count_nonzero(labels != 255)
 
 

@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
+from pipeline.geometry.grid import cuts
 from pipeline.simulator.scenes.farm.land import (
     CROPS,
+    ROWS_AT_ONCE,
     YEAR_DAYS,
     Border,
     Crop,
@@ -73,9 +75,11 @@ class Ground:
     @classmethod
     def draw(cls, rng: np.random.Generator, shape: tuple[int, int]) -> Ground:
         """Draw the fields: moisture 70 and 22 px wide, vigour 55 px, tufts 3 px, light 260 px."""
-        moisture = 0.85 * smooth_noise(rng, shape, 70) + 0.5 * smooth_noise(rng, shape, 22)
-        light = np.clip(0.95 + 0.03 * smooth_noise(rng, shape, 260), 0.85, 1)
-        grain = rng.standard_normal(shape, dtype=np.float32)
+        moisture = smooth_noise(rng, shape, 70, sd=0.85)
+        moisture += smooth_noise(rng, shape, 22, sd=0.5)
+        light = smooth_noise(rng, shape, 260, sd=0.03)
+        np.clip(np.add(light, 0.95, out=light), 0.85, 1, out=light)
+        grain = rng.standard_normal(dtype=np.float32, out=scratch(shape))
         return cls(moisture, smooth_noise(rng, shape, 55), smooth_noise(rng, shape, 3), grain, light)
 
     def at(self, index: NDArray[np.intp]) -> Ground:
@@ -109,16 +113,19 @@ class Canvas:
             self.classes[index] *= (1 - cover)[:, None]
         self.add(index, cover, mixture, {} if label is None else {label: np.ones_like(cover)})
 
-    def dim(self, light: Field) -> None:
-        """Replace 1 - ``light`` (y, x) of every pixel by shade."""
-        self.materials *= light.reshape(-1, 1)
-        self.materials[:, self._column["shade"]] += 1 - light.ravel()
+    def drawn(self, light: Field) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+        """Return abundances (y, x, material), summing to 1, and the class that covers most of each pixel (y, x).
 
-    def drawn(self) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """Return abundances (y, x, material), summing to 1, and the class that covers most of each pixel (y, x)."""
-        self.materials /= self.materials.sum(axis=1, keepdims=True)
-        labels = self.classes.argmax(axis=1).astype(np.uint8)
-        return self.materials.reshape(*self.shape, -1), labels.reshape(self.shape)
+        Shade replaces 1 - ``light`` (y, x) of every pixel.
+        """
+        materials, classes = (one.reshape(*self.shape, -1) for one in (self.materials, self.classes))
+        labels = np.empty(self.shape, np.uint8)
+        for rows in cuts(self.shape[0], ROWS_AT_ONCE):
+            materials[rows] *= light[rows, :, None]
+            materials[rows, :, self._column["shade"]] += 1 - light[rows]
+            materials[rows] /= materials[rows].sum(axis=2, keepdims=True)
+            labels[rows] = classes[rows].argmax(axis=2)
+        return materials, labels
 
 
 @dataclass(frozen=True)
@@ -144,12 +151,6 @@ def grass(ground: Ground, dryness: float = 0.3) -> Mixture:
     dry = np.clip(dryness - 0.14 * ground.moisture + 0.10 * ground.tuft + 0.04 * ground.grain, 0.02, 0.85)
     soil = np.clip(0.06 + 0.03 * ground.grain, 0, 0.2)
     return {"grass_green": (1 - dry) * (1 - soil), "grass_dry": dry * (1 - soil), "soil_dry": soil}
-
-
-def hard_track(ground: Ground) -> Mixture:
-    """Return gravel trodden into dry soil."""
-    stone = np.clip(0.75 + 0.08 * ground.tuft + 0.05 * ground.grain, 0, 1)
-    return {"gravel": stone, "soil_dry": 0.85 * (1 - stone), "soil_wet": 0.15 * (1 - stone)}
 
 
 def blend(lower: Mixture, upper: Mixture, cover: Field) -> Mixture:

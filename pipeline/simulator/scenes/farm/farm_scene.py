@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import cuts
 from pipeline.lazy import Once
 from pipeline.simulator.scenes.farm.farm_plan import (
     CLASS_COLOURS,
@@ -40,10 +41,10 @@ from pipeline.simulator.scenes.farm.farm_plan import (
     Painting,
     farm_plan,
     grass,
-    hard_track,
 )
 from pipeline.simulator.scenes.farm.fields import paint_fields, plant_weeds
 from pipeline.simulator.scenes.farm.land import (
+    ROWS_AT_ONCE,
     Band,
     Points,
     Sun,
@@ -57,6 +58,7 @@ from pipeline.simulator.scenes.farm.land import (
 )
 from pipeline.simulator.scenes.farm.spectra import WHITE_REFERENCE_REFLECTANCE, band_centres, spectral_library
 from pipeline.simulator.scenes.scene import Drawn, RasterScene, SceneRadiance, SceneRaster
+from pipeline.simulator.scenes.scratch import scratch
 
 # A law is what a seed is drawn by; it stands first in a scene's key, and one that is out there never changes.
 FARM_LAW = "farm@2"
@@ -132,8 +134,7 @@ def _draw(plan: FarmPlan) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     paint_borders(work)
     dig_ponds(work)
     plant_trees(work)
-    work.canvas.dim(ground.light)
-    return work.canvas.drawn()
+    return work.canvas.drawn(ground.light)
 
 
 def paint_borders(work: Painting) -> None:
@@ -159,7 +160,9 @@ def paint_borders(work: Painting) -> None:
                     full = half * (0.75 + 1.4 * plan.moisture)
                     _cover(canvas, band, full, {"water": np.ones_like(band.across)}, "water")
                 if kind == "road":
-                    _cover(canvas, band, half, hard_track(here), "track")
+                    stone = np.clip(0.75 + 0.08 * here.tuft + 0.05 * here.grain, 0, 1)  # trodden into dry soil
+                    ground = {"gravel": stone, "soil_dry": 0.85 * (1 - stone), "soil_wet": 0.15 * (1 - stone)}
+                    _cover(canvas, band, half, ground, "track")
                     if swath:
                         _cover(canvas, band, inner, grass(here, 0.5), "grass")
 
@@ -180,11 +183,11 @@ def dig_ponds(work: Painting) -> None:
     for _ in range(1 + shape[0] * shape[1] // 650_000):
         corners = meadows[rng.integers(len(meadows))].corners
         centre = corners.mean(axis=0) + 0.5 * (corners[rng.integers(len(corners))] - corners.mean(axis=0))
-        index = disc_pixels(centre[None], np.array([34.0]), shape)[0]
-        distance = np.hypot(*(scene_points(index, shape) - centre).T)
-        inside = rng.uniform(14, 24) + 1.8 * shore[index] - distance
-        canvas.over(index, edge(inside + 4), grass(work.ground.at(index), 0.15), "grass")
-        ponds.append((index, edge(inside)))
+        radius = rng.uniform(14, 24)
+        for index, _, _ in disc_pixels(centre[None], np.array([34.0]), shape):
+            inside = radius + 1.8 * shore[index] - np.hypot(*(scene_points(index, shape) - centre).T)
+            canvas.over(index, edge(inside + 4), grass(work.ground.at(index), 0.15), "grass")
+            ponds.append((index, edge(inside)))
     for index, cover in ponds:  # after every bank: two ponds may meet
         canvas.over(index, cover, {"water": np.ones_like(cover)}, "water")
 
@@ -219,17 +222,18 @@ def plant_trees(work: Painting) -> None:
     centres, radius = crowns[:, :2], crowns[:, 2]
     leaves = {name: fraction for name, fraction in foliage(plan.day).items() if fraction > 0}
     opaque = 1 - (1 - BARE_CROWN) * leaves.get("twigs", 0.0)
-    shadow = crown_shadows(centres, radius, plan.sun, plan.shape).ravel()
-    dark = np.flatnonzero(shadow)
-    depth = np.asarray(SHADOW * opaque * shadow[dark], np.float32)
-    canvas.over(dark, depth, {"shade": np.ones_like(depth)}, None)
-    index, cover, disc = disc_pixels(centres, radius, plan.shape)
-    away = ((scene_points(index, plan.shape) - centres[disc]) / radius[disc, None]) @ plan.sun.cast
-    away /= np.hypot(*plan.sun.cast)
-    here = work.ground.at(index)
-    shade = np.asarray(np.clip(0.18 + 0.18 * away + 0.08 * here.tuft + 0.05 * here.grain, 0, 0.6), np.float32)
-    mixture = {name: fraction * (1 - shade) for name, fraction in leaves.items()}
-    canvas.over(index, np.asarray(opaque * cover, np.float32), mixture | {"shade": shade}, "tree")
+    shadow = crown_shadows(centres, radius, plan.sun, plan.shape)
+    for rows in cuts(plan.shape[0], ROWS_AT_ONCE):
+        dark = np.flatnonzero(shadow[rows]) + rows.start * plan.shape[1]
+        depth = np.asarray(SHADOW * opaque * shadow.ravel()[dark], np.float32)
+        canvas.over(dark, depth, {"shade": np.ones_like(depth)}, None)
+    for index, cover, disc in disc_pixels(centres, radius, plan.shape):
+        away = ((scene_points(index, plan.shape) - centres[disc]) / radius[disc, None]) @ plan.sun.cast
+        away /= np.hypot(*plan.sun.cast)
+        here = work.ground.at(index)
+        shade = np.asarray(np.clip(0.18 + 0.18 * away + 0.08 * here.tuft + 0.05 * here.grain, 0, 0.6), np.float32)
+        mixture = {name: fraction * (1 - shade) for name, fraction in leaves.items()}
+        canvas.over(index, np.asarray(opaque * cover, np.float32), mixture | {"shade": shade}, "tree")
 
 
 def crown_shadows(
@@ -240,7 +244,7 @@ def crown_shadows(
     A crown is ``radius`` wide and 0.9 ``radius`` high each way about a point 1.2 ``radius`` above the ground. Its
     shadow is an ellipse; the darker one counts where shadows meet.
     """
-    covered = np.zeros(shape, np.float32)
+    covered = scratch(shape)
     length = float(np.hypot(*sun.cast))
     along = sun.cast / length
     middles = centres + 1.2 * radius[:, None] * sun.cast + (np.array(shape) - 1) / 2

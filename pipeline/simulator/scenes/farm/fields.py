@@ -285,8 +285,8 @@ def plant_weeds(work: Painting) -> None:
 def draw_weeds(work: Painting, grown: Mapping[str, Points]) -> None:
     """Draw plants, each a disc of one spectrum: y, x and radius (n, 3) by spectrum."""
     for name, plants in sorted(grown.items()):
-        index, cover, _ = disc_pixels(plants[:, :2], plants[:, 2], work.plan.shape)
-        work.canvas.over(index, 0.92 * cover, {name: np.ones_like(cover)}, "weed")
+        for index, cover, _ in disc_pixels(plants[:, :2], plants[:, 2], work.plan.shape):
+            work.canvas.over(index, 0.92 * cover, {name: np.ones_like(cover)}, "weed")
 
 
 def field_weeds(rng: np.random.Generator, field: FieldPlan, day: int) -> dict[str, Points]:

@@ -15,6 +15,7 @@ project's. A stand's spectrum is a mixture of those of neighbouring stages, stra
 from __future__ import annotations
 
 import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -22,12 +23,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import SceneError
+from pipeline.geometry.grid import cuts
 from pipeline.simulator.scenes.scratch import scratch
 
 Field = NDArray[np.float32]
 Points = NDArray[np.float64]
 
-ROWS_AT_ONCE = 256  # of noise that is drawn
+ROWS_AT_ONCE = 256  # that are drawn: what is made of them does not grow with the scene
 _SPLINE_SD = 0.4794  # of a cubic B-spline through white noise of sd 1, mean over positions, two axes
 
 
@@ -188,35 +190,35 @@ def edge(distance: NDArray[np.floating]) -> Field:
 
 def disc_pixels(
     centres: Points, radius: NDArray[np.float64], shape: tuple[int, int]
-) -> tuple[NDArray[np.intp], Field, NDArray[np.intp]]:
-    """Return pixels under discs: flat numbers, coverage, number of the disc that covers most, (n,) each."""
-    reach = int(np.ceil(radius.max(initial=0.0) + 1))
-    offset = np.arange(-reach, reach + 1)
-    place = centres + (np.array(shape) - 1) / 2
-    base = np.rint(place).astype(int)
-    y = base[:, 0, None, None] + offset[:, None] + np.zeros_like(offset)
-    x = base[:, 1, None, None] + offset + np.zeros_like(offset)[:, None]
-    dy, dx = y - place[:, 0, None, None], x - place[:, 1, None, None]
-    cover = edge(radius[:, None, None] - np.hypot(dy, dx))
-    hit = (cover > 0) & (y >= 0) & (y < shape[0]) & (x >= 0) & (x < shape[1])
-    index, cover, disc = (y * shape[1] + x)[hit], cover[hit], np.nonzero(hit)[0]
-    order = np.lexsort((cover, index))
-    last = order[np.flatnonzero(np.diff(index[order], append=-1))]
-    return index[last], cover[last], disc[last]
+) -> Iterator[tuple[NDArray[np.intp], Field, NDArray[np.intp]]]:
+    """Yield pixels under discs by strips: flat numbers, coverage, number of the disc that covers most, (n,) each."""
+    places = centres + (np.array(shape) - 1) / 2
+    for rows in cuts(shape[0], ROWS_AT_ONCE):
+        near = np.flatnonzero((places[:, 0] + radius > rows.start - 1) & (places[:, 0] - radius < rows.stop))
+        place, reach = places[near, :, None, None], int(np.ceil(radius[near].max(initial=0.0) + 1))
+        offset = np.arange(-reach, reach + 1)
+        base = np.rint(place).astype(int)
+        y = base[:, 0] + offset[:, None] + np.zeros_like(offset)
+        x = base[:, 1] + offset + np.zeros_like(offset)[:, None]
+        cover = edge(radius[near, None, None] - np.hypot(y - place[:, 0], x - place[:, 1]))
+        hit = (cover > 0) & (y >= rows.start) & (y < rows.stop) & (x >= 0) & (x < shape[1])
+        index, cover, disc = (y * shape[1] + x)[hit], cover[hit], near[np.nonzero(hit)[0]]
+        order = np.lexsort((cover, index))
+        last = order[np.flatnonzero(np.diff(index[order], append=-1))]
+        yield index[last], cover[last], disc[last]
 
 
 def scene_points(index: NDArray[np.intp], shape: tuple[int, int]) -> Points:
     return np.stack(np.divmod(index, shape[1]), axis=-1) - (np.array(shape) - 1) / 2
 
 
-def smooth_noise(rng: np.random.Generator, shape: tuple[int, int], cell: float) -> Field:
-    """Return noise of sd about 1 with bumps about ``cell`` px wide: a cubic B-spline over white noise, (y, x)."""
+def smooth_noise(rng: np.random.Generator, shape: tuple[int, int], cell: float, sd: float = 1.0) -> Field:
+    """Return noise of about ``sd`` with bumps about ``cell`` px wide: a cubic B-spline over white noise, (y, x)."""
     knots = rng.standard_normal([int(size / cell) + 5 for size in shape]).astype(np.float32)
     down, across = (np.arange(size) / cell + shift for size, shift in zip(shape, rng.uniform(0, 1, 2), strict=True))
     field = scratch(shape)
-    for first in range(0, shape[0], ROWS_AT_ONCE):
-        rows = slice(first, first + ROWS_AT_ONCE)
-        field[rows] = _spline(_spline(knots, down[rows]).T, across).T / np.float32(_SPLINE_SD)
+    for rows in cuts(shape[0], ROWS_AT_ONCE):
+        field[rows] = sd * (_spline(_spline(knots, down[rows]).T, across).T / np.float32(_SPLINE_SD))
     return field
 
 

@@ -16,9 +16,9 @@ from pipeline.lazy import Once
 from pipeline.simulator.rig_model import Sky
 from pipeline.simulator.scenes import scratch as scratch_module
 from pipeline.simulator.scenes.daylight import knots_within, relative_daylight, sun_elevation_deg
-from pipeline.simulator.scenes.farm import land
+from pipeline.simulator.scenes.farm import farm_plan, land
+from pipeline.simulator.scenes.farm import farm_scene as farm_scene_module
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
-from pipeline.simulator.scenes.farm.land import smooth_noise
 from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster, raster_from_values
 from pipeline.simulator.scenes.scratch import scratch
 
@@ -249,11 +249,16 @@ def test_a_full_disk_is_an_error(monkeypatch: pytest.MonkeyPatch):
         scratch((4, 5))
 
 
-def test_noise_does_not_depend_on_the_rows_drawn_at_once(monkeypatch: pytest.MonkeyPatch):
-    """Rows of later strips lie where they lie in one strip."""
-    strips = smooth_noise(np.random.default_rng(1), (600, 30), 22)
-    monkeypatch.setattr(land, "ROWS_AT_ONCE", 600)
-    np.testing.assert_array_equal(smooth_noise(np.random.default_rng(1), (600, 30), 22), strips)
+def test_a_farm_does_not_depend_on_the_rows_drawn_at_once(monkeypatch: pytest.MonkeyPatch):
+    """Noise, weeds, ponds, shadows and trees lie across strips as they lie in one; each fills its own pixels."""
+    whole, parted = farm_scene(3, (300, 400)), farm_scene(3, (300, 400))
+    for rows, scene in ((300, whole), (7, parted)):
+        for module in (land, farm_plan, farm_scene_module):
+            monkeypatch.setattr(module, "ROWS_AT_ONCE", rows)
+        scene.raster.drawn()
+    np.testing.assert_array_equal(parted.planes, whole.planes)
+    np.testing.assert_array_equal(parted.labels, whole.labels)
+    assert {"water", "tree", "weed"} <= {whole.class_names[number] for number in np.unique(whole.labels)}
 
 
 def test_a_farm_is_the_same_from_files(monkeypatch: pytest.MonkeyPatch):

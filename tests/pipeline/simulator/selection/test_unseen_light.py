@@ -10,6 +10,7 @@ import pytest
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.rig_model import Optics, Rig
+from pipeline.simulator.selection import extrema
 from pipeline.simulator.selection.extrema import find_extrema
 from pipeline.simulator.selection.survey_probe import probe_scene
 from tests.pipeline.simulator.bound_trials import trials
@@ -85,8 +86,11 @@ def test_bounds_hold_where_bands_differ(number: int, effect: str, lines: range |
 
 
 @pytest.mark.parametrize("bands", [3, 12])
-def test_places_lie_within_the_scene(bands: int) -> None:
-    """The brightest pixel is the last one, of a scene whose tiles end beyond it; its edge is repeated there."""
+def test_places_lie_within_the_scene(bands: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The brightest pixel is the last one, of a scene whose tiles end beyond it; its edge is repeated there.
+
+    Strips of one tile, as those of a large scene, give the same places.
+    """
     values = np.ones((45, 43, bands))
     values[-1, -1] = 5.0
     scene = image_scene(values, CAMERA, np.linspace(400, 1000, bands))
@@ -94,6 +98,8 @@ def test_places_lie_within_the_scene(bands: int) -> None:
     assert [44.0, 42.0] in places.tolist()
     assert (places >= 0).all()
     assert (places < scene.shape).all()
+    monkeypatch.setattr(extrema, "_STRIP_PX", 1)
+    np.testing.assert_array_equal(find_extrema(scene, CAMERA, [Sweep("s", "fine", "x", 0.0, -22.0, 45)], 200), places)
 
 
 def test_a_lone_sweep_is_bounded_by_all_of_the_scene() -> None:
