@@ -298,36 +298,15 @@ def area_rows(receipt: Mapping[str, Any]) -> list[dict[str, str]]:
     ]
 
 
-def _areas(areas: Mapping[str, float]) -> str:
-    return ", ".join(f"{spaced(name)} {format_area(area)}" for name, area in areas.items() if area)
-
-
 def _changes(changes: Sequence[Sequence[Any]]) -> str:
     most = [f"{spaced(old)} to {spaced(new)} {format_area(area)}" for area, old, new in changes[:MOST_NAMED]]
     return f"changed {format_area(sum(area for area, _, _ in changes))}: {', '.join(most)}"
-
-
-def _older(areas: Mapping[str, float]) -> str:
-    older = [f"{counted(int(days), 'day')} {format_area(area)}" for days, area in areas.items() if area]
-    return f"captured longer ago than {', '.join(older)}" if older else ""
 
 
 def _scan(scan: Mapping[str, Any]) -> str:
     words = f"{format_scan(scan['step'], scan['exposure_ms'])}, {scan['seconds']:.1f} s"
     predicted = format_prediction(scan["expected_miou"], scan.get("expected_spread"))
     return f"{words}, expected mIoU {predicted}" if predicted else words
-
-
-def _shift(shift_px: Sequence[float]) -> str:
-    return f"shifted by {math.hypot(*shift_px):.0f} px" if any(shift_px) else ""
-
-
-def _offsets(sweeps: Mapping[str, Sequence[float]]) -> str:
-    return f"corrected by up to {max(math.hypot(*offset) for offset in sweeps.values()):.1f} px"
-
-
-def _multiply_adds(cost: Mapping[str, float]) -> str:
-    return f"multiply-adds {format_percent(cost['done'] / cost['everything'])} of full resolution"
 
 
 # parts of a receipt: their label, and the figures that are shown, in order
@@ -363,13 +342,18 @@ _FORMATS: Mapping[str, Callable[[Any], str]] = {
     **dict.fromkeys(("run", "crs", "reason", "not_predicted"), str),
     "days": format_days,
     "hectares": format_area,
-    "shift_px": _shift,
+    "shift_px": lambda px: f"shifted by {math.hypot(*px):.0f} px" if any(px) else "",
     "put_aside": lambda value: f"not used: {value}",
-    "multiply_adds": _multiply_adds,
-    "ha": _areas,
+    "multiply_adds": lambda did: f"multiply-adds {format_percent(did['done'] / did['everything'])} of full resolution",
+    "ha": lambda areas: ", ".join(f"{spaced(name)} {format_area(area)}" for name, area in areas.items() if area),
     "changes_ha": _changes,
-    "older_ha": _older,
-    "sweeps": _offsets,
+    "older_ha": lambda areas: (
+        "captured longer ago than "
+        + ", ".join(f"{counted(int(days), 'day')} {format_area(area)}" for days, area in areas.items() if area)
+        if any(areas.values())
+        else ""
+    ),
+    "sweeps": lambda sweeps: f"corrected by up to {max(math.hypot(*one) for one in sweeps.values()):.1f} px",
     "too_narrow": lambda value: f"{counted(len(value), 'overlap')} too narrow to compare",
 }
 _VALUES: Mapping[str, Callable[[Any], str]] = {

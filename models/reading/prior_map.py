@@ -139,12 +139,8 @@ def carried(prior_map: PriorMap, reader: TemporalReader | None) -> ClassProbabil
     shape = prior_map.probabilities.log_probability.shape
     s, columns = CELL_PX, 1 if reader is None else reader.sizes.columns
     unseen, coarse = np.zeros(shape[:2], np.bool_), (-(-shape[0] // s), -(-shape[1] // s), columns)
-    nothing = CurrentVisit(_nothing(shape), unseen, _nothing(coarse), *CARRIED_AS_BY)
-    return fuse(prior_map, nothing, reader)
-
-
-def _nothing(shape: tuple[int, ...]) -> Floats:
-    return np.full(shape, np.nan, np.float32)
+    nothing, features = (np.full(size, np.nan, np.float32) for size in (shape, coarse))
+    return fuse(prior_map, CurrentVisit(nothing, unseen, features, *CARRIED_AS_BY), reader)
 
 
 def _fused(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,10 +16,7 @@ from pipeline.lazy import deferred
 from pipeline.readings import SIGMA_OF_MEDIAN
 from pipeline.source import References
 
-if TYPE_CHECKING:
-    import pipeline.signal.compiled_loops as compiled_loops
-else:
-    compiled_loops = deferred("pipeline.signal.compiled_loops")
+compiled_loops: Any = deferred("pipeline.signal.compiled_loops")
 
 FILL_REACH = 8  # samples; elements farther away have seen something else
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +20,7 @@ from pipeline.lazy import deferred
 from pipeline.readings import SIGMA_OF_MEDIAN
 from pipeline.signal.components import Components
 
-if TYPE_CHECKING:
-    import pipeline.signal.compiled_loops as compiled_loops
-else:
-    compiled_loops = deferred("pipeline.signal.compiled_loops")
+compiled_loops: Any = deferred("pipeline.signal.compiled_loops")
 
 BLOCK = 4  # spectra a side of a mean
 SPECTRA_A_BAND = 200  # single spectra for the covariance, for each band; more add time and little accuracy
@@ -89,8 +86,8 @@ class SignalStatistics:
         spectra, whole, origin = np.ascontiguousarray(values, np.float32), valid, self.origin
         sums = np.zeros((*(size // BLOCK for size in valid.shape[:2]), self.bands), np.float32)
         largest = np.zeros(self.bands, np.float32)
-        plain = origin is not None and self.bands > FEW_BANDS and valid.ndim == 2 and valid.all() and self.lit.all()
-        if not (plain and compiled_loops.sum_blocks(spectra, origin, largest, sums)):
+        plain = self.bands > FEW_BANDS and valid.ndim == 2 and valid.all() and self.lit.all()
+        if origin is None or not (plain and compiled_loops.sum_blocks(spectra, origin, largest, sums)):
             (spectra, whole), origin = self._centred(values, valid), np.zeros_like(largest)
             sums[:], largest[:] = 0, 0
             compiled_loops.sum_blocks(spectra, origin, largest, sums)
