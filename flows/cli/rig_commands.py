@@ -33,7 +33,7 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.mirror import STRAIGHT
 from pipeline.rig.device_settings import SurveyRig
 from pipeline.rig.drivers import open_camera_driver, open_mirror_driver
-from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock, ServedRig
+from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock
 from pipeline.rig.rig_check import CheckRow, Device, check_camera, check_mirror, works
 from pipeline.rig.transports import SYSTEM_CLOCK
 from pipeline.simulator.simulated import SimulatedSource
@@ -189,7 +189,17 @@ def run_emulate(
         console.print(f"[dim]note: {escape(note)}[/]")
     rig = EmulatedRig(source, FastClock(speed), mounting=settings.rig.mounting)
     with _ending(ended or threading.Event()) as end, rig.serve(baud=baud) as served:
-        table = _rig_table(served, settings.rig)
+        mounted = ("mirror_axes", "mirror_clocking_deg", "mirror_offset_x", "mirror_offset_y")
+        table = {
+            "port": served.port,
+            "host": served.host,
+            "control_port": served.camera_port,
+            "file_port": served.file_port,
+            "pulses": served.rig.camera.wired,
+            "white_reference": round(float(served.rig.camera.view.source.scene.white_reference.mean()), 6),
+            "provenance": "emulated",
+            **{name: getattr(settings.rig, name) for name in mounted if settings.rig.mounting != STRAIGHT},
+        }
         if out is not None:
             _write_survey(out, settings, table)
             console.print(f"survey it with: spectralzoom survey {escape(str(out))}")
@@ -236,21 +246,6 @@ def _write_survey(out: Path, settings: Settings, table: dict[str, object]) -> No
         out.write_text(text, encoding="utf-8")
     except OSError as error:
         raise SettingsError(f"cannot write {out}: {error.strerror}; choose another --out") from error
-
-
-def _rig_table(served: ServedRig, rig: SurveyRig) -> dict[str, object]:
-    white_reference = served.rig.camera.view.source.scene.white_reference
-    mounted = ("mirror_axes", "mirror_clocking_deg", "mirror_offset_x", "mirror_offset_y")
-    return {
-        "port": served.port,
-        "host": served.host,
-        "control_port": served.camera_port,
-        "file_port": served.file_port,
-        "pulses": served.rig.camera.wired,
-        "white_reference": round(float(white_reference.mean()), 6),
-        "provenance": "emulated",
-        **{name: getattr(rig, name) for name in mounted if rig.mounting != STRAIGHT},
-    }
 
 
 def _toml_table(name: str, values: dict[str, object]) -> str:

@@ -303,11 +303,6 @@ def _changes(changes: Sequence[Sequence[Any]]) -> str:
     return f"changed {format_area(sum(area for area, _, _ in changes))}: {', '.join(most)}"
 
 
-def _older(areas: Mapping[str, float]) -> str:
-    older = [f"{counted(int(days), 'day')} {format_area(area)}" for days, area in areas.items() if area]
-    return f"captured longer ago than {', '.join(older)}" if older else ""
-
-
 def _scan(scan: Mapping[str, Any]) -> str:
     words = f"{format_scan(scan['step'], scan['exposure_ms'])}, {scan['seconds']:.1f} s"
     predicted = format_prediction(scan["expected_miou"], scan.get("expected_spread"))
@@ -349,11 +344,16 @@ _FORMATS: Mapping[str, Callable[[Any], str]] = {
     "hectares": format_area,
     "shift_px": lambda px: f"shifted by {math.hypot(*px):.0f} px" if any(px) else "",
     "put_aside": lambda value: f"not used: {value}",
-    "multiply_adds": lambda of: f"multiply-adds {format_percent(of['done'] / of['everything'])} of full resolution",
-    "ha": lambda ha: ", ".join(f"{spaced(name)} {format_area(area)}" for name, area in ha.items() if area),
+    "multiply_adds": lambda did: f"multiply-adds {format_percent(did['done'] / did['everything'])} of full resolution",
+    "ha": lambda areas: ", ".join(f"{spaced(name)} {format_area(area)}" for name, area in areas.items() if area),
     "changes_ha": _changes,
-    "older_ha": _older,
-    "sweeps": lambda sweeps: f"corrected by up to {max(math.hypot(*px) for px in sweeps.values()):.1f} px",
+    "older_ha": lambda areas: (
+        "captured longer ago than "
+        + ", ".join(f"{counted(int(days), 'day')} {format_area(area)}" for days, area in areas.items() if area)
+        if any(areas.values())
+        else ""
+    ),
+    "sweeps": lambda sweeps: f"corrected by up to {max(math.hypot(*one) for one in sweeps.values()):.1f} px",
     "too_narrow": lambda value: f"{counted(len(value), 'overlap')} too narrow to compare",
 }
 _VALUES: Mapping[str, Callable[[Any], str]] = {

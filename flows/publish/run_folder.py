@@ -44,7 +44,6 @@ from flows.tasks.stages.attention import READING, load_plan, read_in_full
 from flows.tasks.stages.effects import load_manifest
 from flows.tasks.stages.maps import STORE
 from flows.tasks.stages.placement import load_registration
-from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.grid import patch_pixels
 from pipeline.planning.fine_pass import FinePlan
@@ -285,7 +284,13 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     figures: dict[str, Any] = {"kind": plan.kind, "reason": plan.reason, "lines": plan.lines, "seconds": plan.seconds}
     found: dict[str, Any] = {"field": field_figures(run, plan), "plan": figures}
     if run.recorded is not None:
-        found["recording"] = _recording(run, run.recorded, plan)
+        found["recording"] = {
+            "sweeps": str(run.settings.sweeps),
+            "lines_read": run.recorded.lines_served([*run.plan.coarse, *plan.sweeps]),
+            "lines_recorded": run.recorded.source.lines_recorded,
+            "passes_s": run.plan.coarse_s + plan.seconds,
+            "full_scan_s": run.settings.cost.seconds(run.plan.full, run.camera),
+        }
     if run.chooses and (run.plan.plain or run.least_gain is not None):
         found["kept"] = run.reading_figures(read_in_full(products["score"], products["segment"]))
     if (memory := prior_map_figures(products["segment"].path)) is not None:
@@ -323,18 +328,6 @@ def _partly_seen(run: SurveyRun, mosaic: StageRef, plan: FinePlan) -> int:
         return 0
     coarse = np.array([step >= run.plan.coarse[0].step for _, step, _ in kinds[0]])[kinds[1]]
     return int(np.count_nonzero(patch_pixels(run.grid, coarse)[plan.patch_index].any(axis=(1, 2))))
-
-
-def _recording(run: SurveyRun, recorded: RecordedPasses, plan: FinePlan) -> dict[str, Any]:
-    """Return the lines read of a recording, and the predicted capture time of its passes and of every line."""
-    done, full, cost = [*run.plan.coarse, *plan.sweeps], run.plan.full, run.settings.cost
-    return {
-        "sweeps": str(run.settings.sweeps),
-        "lines_read": recorded.lines_served(done),
-        "lines_recorded": recorded.source.lines_recorded,
-        "passes_s": run.plan.coarse_s + plan.seconds,
-        "full_scan_s": cost.seconds(full, run.camera),
-    }
 
 
 def _pointing(ref: StageRef) -> dict[str, Any]:

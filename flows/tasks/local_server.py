@@ -5,7 +5,6 @@ A thread needs no second import of Prefect, and ends with the process. A passwor
 
 from __future__ import annotations
 
-import gc
 import os
 import secrets
 import socket
@@ -134,13 +133,7 @@ def _using(home: Path, port: int, *, schedules: bool) -> Iterator[str]:
 
 def _start(listening: socket.socket, *, schedules: bool) -> tuple[uvicorn.Server, threading.Thread]:
     """Start the server in a thread and wait for it. Raises ServerUnavailable."""
-    collects = gc.isenabled()
-    gc.disable()  # garbage collection takes a third of the import time of the server's 2000 modules
-    try:
-        made: Any = prefect_server.create_app(final=schedules, ephemeral=not schedules)
-    finally:
-        if collects:
-            gc.enable()
+    made: Any = prefect_server.create_app(final=schedules, ephemeral=not schedules)
     server = uvicorn.Server(uvicorn.Config(made, log_level="critical", lifespan="on"))
     thread = threading.Thread(
         target=copy_context().run, args=(server.run, [listening]), name="prefect-server", daemon=True

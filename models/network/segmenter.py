@@ -110,6 +110,17 @@ def joined(patches: Tensor, columns: int) -> Tensor:
     return cells.reshape(b, c, n // columns * p, columns * p)
 
 
+def mean_around(image: Tensor, axis: int) -> Tensor:
+    """Return means of up to ``AROUND_PX`` neighbours along an axis; a pooling layer takes three times as long."""
+    size, reach = image.shape[axis], AROUND_PX // 2
+    found, count = torch.zeros_like(image), image.new_zeros(size)
+    for off in range(max(-reach, 1 - size), min(reach, size - 1) + 1):
+        to, length = max(0, -off), size - abs(off)
+        found.narrow(axis, to, length).add_(image.narrow(axis, max(0, off), length))
+        count[to : to + length] += 1
+    return found / count.reshape(-1, *[1] * (3 - axis))
+
+
 class ChannelNorm(nn.Module):
     """Root-mean-square norm over the channels of each pixel, (P, c, y, x)."""
 
@@ -230,7 +241,6 @@ class Segmenter(nn.Module):
 
         Tokens that are not ``living``, (tokens,) bool of a single scene, take no part in the attention.
         """
-        image = image.contiguous()  # two layers read it
         height, width = image.shape[2:]
         gap = -width % TOKEN_PX, -height % TOKEN_PX
         if any(gap):
@@ -247,9 +257,9 @@ class Segmenter(nn.Module):
         context = self.from_token(read.transpose(1, 2).reshape(grid.shape))
         features[-1] = features[-1] + F.pixel_shuffle(context, BOTTOM)
         drawn = self.overview_head(features)[:, :, :height, :width]
-        alone = self.spectral(image[:, : self.config.columns])  # the logits' mean is that of the mean spectrum
-        for size in ((AROUND_PX, 1), (1, AROUND_PX)):
-            alone = F.avg_pool2d(alone, size, 1, (size[0] // 2, size[1] // 2), count_include_pad=False)
+        columns = image[:, : self.config.columns].permute(0, 2, 3, 1)
+        alone = F.linear(columns, self.spectral.weight.flatten(1), self.spectral.bias).permute(0, 3, 1, 2)
+        alone = mean_around(mean_around(alone, 2), 3)  # the logits' mean is that of the mean spectrum
         logits = self.overview_classes(F.gelu(drawn)) + alone[:, :, :height, :width]
         return Overview(drawn, logits)
 

@@ -127,7 +127,9 @@ def multiply_adds(
     patch = p * p * (apart * basis + config.width * config.classes) + _pyramid(
         inputs + config.overview_width, config.width, p
     )
-    return MultiplyAdds(tokens * overview + _transformer(config, tokens), score, patches * patch)
+    dim = config.dim  # tokens read each other: L ((4 + 2 r) d^2 N + 2 N^2 d)
+    read = config.layers * ((4 + 2 * config.mlp_ratio) * dim * dim * tokens + 2 * tokens * tokens * dim)
+    return MultiplyAdds(tokens * overview + read, score, patches * patch)
 
 
 def _pyramid(inputs: int, width: int, size: int) -> int:
@@ -137,9 +139,3 @@ def _pyramid(inputs: int, width: int, size: int) -> int:
     blocks -= 9 * levels[-1][0] ** 2 * levels[-1][1]  # the lowest level has one
     between = sum(8 * upper * lower * pixels for (upper, _), (lower, pixels) in pairwise(levels))
     return inputs * width * size**2 + blocks + between
-
-
-def _transformer(config: SegmenterConfig, tokens: int) -> int:
-    """Return L ((4 + 2 r) d^2 N + 2 N^2 d), the multiply-adds of N tokens that read each other."""
-    d, r = config.dim, config.mlp_ratio
-    return config.layers * ((4 + 2 * r) * d * d * tokens + 2 * tokens * tokens * d)

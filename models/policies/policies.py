@@ -83,7 +83,7 @@ def pixel_entropy(probability: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def _edges(seen: CoarsePrediction) -> NDArray[np.float64]:
-    brightness = seen.columns.astype(np.float64).mean(axis=-1)
+    brightness = np.einsum("yxc->yx", seen.columns, dtype=np.float64) / seen.columns.shape[-1]
     down, across = (scipy.ndimage.sobel(brightness, axis=axis, mode="nearest") for axis in (0, 1))
     edges: NDArray[np.float64] = np.hypot(down, across)
     return edges

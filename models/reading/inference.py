@@ -282,7 +282,7 @@ def overview_of(weights: Weights, coarse_pass: CoarsePass) -> Overview:
     living = None if coarse_pass.living is None else torch.from_numpy(coarse_pass.living).to(network.device)
     patches = TOKEN_PX / coarse_pass.grid.patch  # of a token
     origin = torch.tensor([coarse_pass.origin], dtype=torch.float64) / patches
-    return network.read_overview(torch.from_numpy(image).permute(2, 0, 1)[None].to(network.device), origin, living)
+    return network.read_overview(torch.from_numpy(image[None]).permute(0, 3, 1, 2).to(network.device), origin, living)
 
 
 def draw(logits: Tensor, *, every_class: bool = False) -> DrawnMap:

@@ -53,11 +53,15 @@ class ClassProbabilities:
 
     def classes(self) -> tuple[NDArray[np.uint8], Floats]:
         """Return the most probable class of each pixel and its probability; 255 and NaN for unknown pixels."""
-        known = np.isfinite(self.log_probability[..., 0])
-        found = np.nan_to_num(self.log_probability, nan=-np.inf).argmax(axis=-1)
-        sure = np.exp(np.take_along_axis(self.log_probability, found[..., None], axis=-1)[..., 0])
-        classes = np.where(known, found, UNLABELLED).astype(np.uint8)
-        return classes, np.where(known, sure, np.nan).astype(np.float32)
+        found, sure = likeliest(self.log_probability)
+        classes = np.where(np.isfinite(sure), found, UNLABELLED).astype(np.uint8)
+        return classes, np.exp(sure)
+
+
+def likeliest(log_probability: Floats) -> tuple[NDArray[np.int64], Floats]:
+    """Return the most probable class (..., class) -> (...) and its log-probability; 0 and NaN for unknown pixels."""
+    sure, found = torch.from_numpy(log_probability).max(dim=-1)
+    return found.numpy(), sure.numpy()
 
 
 @dataclass(frozen=True)
@@ -95,6 +99,8 @@ def pooled(columns: Floats) -> Floats:
     whole = np.pad(columns, [(0, y), (0, x), (0, 0)], mode="edge") if y or x else columns
     parts = np.stack([whole[i::CELL_PX, j::CELL_PX] for i in range(CELL_PX) for j in range(CELL_PX)])
     known = np.isfinite(parts)
+    if known.all():
+        return np.asarray(parts.sum(axis=0) / np.float32(len(parts)))
     sums = np.where(known, parts, np.float32(0)).sum(axis=0)
     count = known.sum(axis=0, dtype=np.float32)
     return np.where(count > 0, sums / np.maximum(count, 1), np.float32(np.nan))
@@ -133,12 +139,8 @@ def carried(prior_map: PriorMap, reader: TemporalReader | None) -> ClassProbabil
     shape = prior_map.probabilities.log_probability.shape
     s, columns = CELL_PX, 1 if reader is None else reader.sizes.columns
     unseen, coarse = np.zeros(shape[:2], np.bool_), (-(-shape[0] // s), -(-shape[1] // s), columns)
-    nothing = CurrentVisit(_nothing(shape), unseen, _nothing(coarse), *CARRIED_AS_BY)
-    return fuse(prior_map, nothing, reader)
-
-
-def _nothing(shape: tuple[int, ...]) -> Floats:
-    return np.full(shape, np.nan, np.float32)
+    nothing, features = (np.full(size, np.nan, np.float32) for size in (shape, coarse))
+    return fuse(prior_map, CurrentVisit(nothing, unseen, features, *CARRIED_AS_BY), reader)
 
 
 def _fused(
@@ -257,7 +259,7 @@ def _finite(values: Floats) -> NDArray[np.bool_]:
 def _image(values: NDArray[np.generic]) -> Tensor:
     """Return (y, x) or (y, x, channel) as a batch of one image, (1, channel, y, x)."""
     deep = values[..., None] if values.ndim == 2 else values
-    return torch.from_numpy(np.ascontiguousarray(deep.transpose(2, 0, 1)[None], np.float32))
+    return torch.from_numpy(np.ascontiguousarray(deep[None], np.float32)).permute(0, 3, 1, 2)
 
 
 @dataclass(frozen=True)
@@ -317,11 +319,10 @@ def compare(
         values[part]
         for values in (prior_map.probabilities.log_probability, observation.log_probability, after.log_probability)
     )
-    known = _finite(before) & _finite(today) & observation.seen[part]
-    old, new = (np.nan_to_num(values, nan=-np.inf).argmax(axis=-1) for values in (before, now))
-    shown = np.nan_to_num(today, nan=-np.inf).argmax(axis=-1)
+    (old, old_sure), (shown, shown_sure), (new, new_sure) = map(likeliest, (before, today, now))
+    known = np.isfinite(old_sure) & np.isfinite(shown_sure) & observation.seen[part]
     least = math.log(CERTAIN)
-    sure = known & (before.max(axis=-1) > least) & (now.max(axis=-1) > least)
+    sure = known & (old_sure > least) & (new_sure > least)
     return TemporalAgreement(
         confusion(old[known], shown[known], classes),
         confusion(old[sure], new[sure], classes),
@@ -333,9 +334,8 @@ def compare(
 def changed_from(prior_map: PriorMap, after: ClassProbabilities) -> NDArray[np.uint8]:
     """Return the earlier class of pixels (y, x) whose prior map and map are confident of two classes; else 255."""
     before, now = prior_map.probabilities.log_probability, after.log_probability
-    least = math.log(CERTAIN)
-    sure = (before.max(axis=-1) > least) & (now.max(axis=-1) > least)  # NaN is not
-    old, new = (np.nan_to_num(values, nan=-9).argmax(axis=-1) for values in (before, now))
+    (old, old_sure), (new, new_sure) = map(likeliest, (before, now))
+    sure = np.minimum(old_sure, new_sure) > math.log(CERTAIN)  # NaN is not
     return np.where(sure & (old != new), old, UNLABELLED).astype(np.uint8)
 
 

@@ -183,7 +183,7 @@ class Weights:
     def _normalised(self, projected: NDArray[np.float32], reached: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Normalise columns; NaN in pixels without a finite one."""
         columns = self.normalisation.apply(projected, reached)
-        columns[~np.isfinite(projected[..., reached]).any(axis=-1)] = np.nan
+        columns[~(np.isfinite(projected) & reached).any(axis=-1)] = np.nan
         return columns
 
     def on(self, device: str) -> Weights:

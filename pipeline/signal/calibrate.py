@@ -12,10 +12,12 @@ from scipy import ndimage
 
 from pipeline.errors import PoseError, RigError, ShapeError
 from pipeline.geometry.mirror import mirror_throughput
+from pipeline.lazy import deferred
 from pipeline.readings import SIGMA_OF_MEDIAN
 from pipeline.source import References
 
-BLOCK_ELEMENTS = 1 << 18  # 1 MB of float32: cast, subtraction and product happen in the cache
+compiled_loops: Any = deferred("pipeline.signal.compiled_loops")
+
 FILL_REACH = 8  # samples; elements farther away have seen something else
 
 # thresholds of `find_bad_elements`
@@ -185,20 +187,14 @@ def _line_gain(raw: NDArray[np.integer[Any]], references: References, position: 
 
 
 def _scene_values(raw: NDArray[np.integer[Any]], elements: Elements, line_gain: Floats32 | None) -> Floats32:
-    values = np.empty(raw.shape, np.float32)
-    dark, fill = elements.references.dark, elements.fill
-    lines = max(1, BLOCK_ELEMENTS // max(dark.size, 1))
-    for block in (slice(first, first + lines) for first in range(0, len(raw), lines)):
-        part = values[block]
-        part[...] = raw[block]
-        part -= dark
-        part *= elements.gain
-        if line_gain is not None:
-            part *= line_gain[block, None, None]
-        if len(fill.element):
-            flat = part.reshape(len(part), -1)
-            before = flat[:, fill.before]
-            flat[:, fill.element] = before + (flat[:, fill.after] - before) * fill.fraction
+    numbers, fill = np.ascontiguousarray(raw, np.uint16), elements.fill
+    frames = (np.ascontiguousarray(frame, np.float32) for frame in (elements.references.dark, elements.gain))
+    gains, values = np.ones(len(raw), np.float32) if line_gain is None else line_gain, np.empty(raw.shape, np.float32)
+    compiled_loops.calibrate_lines(numbers, *frames, gains, values)
+    if len(fill.element):
+        flat = values.reshape(len(values), -1)
+        before = flat[:, fill.before]
+        flat[:, fill.element] = before + (flat[:, fill.after] - before) * fill.fraction
     return values
 
 

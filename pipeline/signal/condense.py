@@ -31,7 +31,7 @@ LAW_ROUNDS, LAW_CLIP = 4, 4.0
 LEAST_EXPECTED = 0.2  # of the mean residual: least prediction of the law, ...
 LEAST_RESIDUAL = 0.02  # ... and of the noise's variance: less is rounding
 CANCELLED = 1e-4  # of a spectrum's square: a smaller difference of squares has lost digits of float32
-SPECTRA_AT_ONCE = 1024  # projected at a time: they stay in cache
+SPECTRA_AT_ONCE = 256  # projected at a time: they stay in cache
 MEAN_SIDE = 4  # of the blocks of spectra whose means are kept where scores are rounded coarsely
 RESIDUAL_STEP = 0.5  # in which residuals of rare spectra are kept [noise's deviations]
 

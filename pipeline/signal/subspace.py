@@ -11,12 +11,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.lazy import deferred
 from pipeline.readings import SIGMA_OF_MEDIAN
 from pipeline.signal.components import Components
+
+compiled_loops: Any = deferred("pipeline.signal.compiled_loops")
 
 BLOCK = 4  # spectra a side of a mean
 SPECTRA_A_BAND = 200  # single spectra for the covariance, for each band; more add time and little accuracy
@@ -79,19 +83,24 @@ class SignalStatistics:
         """Add some neighbouring lines: (line, sample, band) scene values, and their validity by `calibrate`."""
         if not values.size or not valid.any():
             return
-        spectra, whole = self._centred(values, valid)
-        np.maximum(self.largest, np.maximum(spectra.max(axis=(0, 1)), -spectra.min(axis=(0, 1))), out=self.largest)
-        lines, samples = (size // BLOCK for size in whole.shape)
-        if lines and samples:
-            cut = np.s_[: lines * BLOCK, : samples * BLOCK]
-            every = whole[cut].reshape(lines, BLOCK, samples, BLOCK).all(axis=(1, 3))
-            rows = spectra[cut].reshape(lines, BLOCK, samples * BLOCK, -1).sum(axis=1)
-            means = (rows.reshape(lines, samples, BLOCK, -1).sum(axis=2)[every] / BLOCK**2).astype(np.float64)
+        spectra, whole, origin = np.ascontiguousarray(values, np.float32), valid, self.origin
+        sums = np.zeros((*(size // BLOCK for size in valid.shape[:2]), self.bands), np.float32)
+        largest = np.zeros(self.bands, np.float32)
+        plain = self.bands > FEW_BANDS and valid.ndim == 2 and valid.all() and self.lit.all()
+        if origin is None or not (plain and compiled_loops.sum_blocks(spectra, origin, largest, sums)):
+            (spectra, whole), origin = self._centred(values, valid), np.zeros_like(largest)
+            sums[:], largest[:] = 0, 0
+            compiled_loops.sum_blocks(spectra, origin, largest, sums)
+        np.maximum(self.largest, largest, out=self.largest)
+        lines, samples = sums.shape[:2]
+        if sums.size:
+            every = whole[: lines * BLOCK, : samples * BLOCK].reshape(lines, BLOCK, samples, BLOCK).all(axis=(1, 3))
+            means = (sums[every] / BLOCK**2).astype(np.float64)
             self.block += means.T @ means  # float32 would round off the noise below a signal of 300 deviations
             self.block_total += means.sum(axis=0)
             self.means += len(means)
         thin = np.s_[:: self._stride, :: self._stride]
-        some = spectra[thin][whole[thin]]
+        some = spectra[thin][whole[thin]] - origin
         exact = some.astype(np.float64)
         self.single += exact.T @ exact
         self.total += exact.sum(axis=0)
@@ -111,8 +120,6 @@ class SignalStatistics:
             self.origin = np.where(self.lit, before, first).astype(np.float32)
             self.lit |= seen > 0
         spectra = values - self.origin
-        if valid.ndim == 2 and valid.all() and self.lit.all() and np.isfinite(spectra).all():
-            return spectra, valid
         there = np.isfinite(spectra) & by_band
         spectra = np.where(there, spectra, np.float32(0))
         seen, bands = there.sum(axis=2), max(int(self.lit.sum()), 1)

@@ -97,7 +97,7 @@ def format_disk_error(error: OSError) -> str:
     return disk_advice(error) or f"{error.strerror or error}; free space or rights and run again"
 
 
-def write_all(descriptor: int, content: bytes) -> None:
+def write_all(descriptor: int, content: bytes | memoryview) -> None:
     """Write every byte, in several calls if need be."""
     view = memoryview(content)
     while view:

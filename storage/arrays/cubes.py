@@ -239,11 +239,6 @@ def open_raw_cubes(folder: Path) -> list[RawCube]:
 STATISTICS = "statistics.npz"
 
 
-def write_statistics(folder: Path, found: SignalStatistics) -> None:
-    """Store the statistics of a capture in its folder."""
-    np.savez(folder / STATISTICS, allow_pickle=False, **found.arrays())
-
-
 def read_statistics(folder: Path) -> SignalStatistics:
     """Read the statistics of a capture (IncompleteStoreError: they are missing or damaged)."""
     with damage_named(str(folder / STATISTICS)), np.load(folder / STATISTICS) as stored:

@@ -180,6 +180,7 @@ def create_array(
         filters=(TransposeCodec(order=(2, 0, 1)),) if flat and len(spec.shape) == 3 else None,
         compressors=(blosc, Crc32cCodec()),
         chunk_key_encoding={"name": "default", "separator": "." if flat else "/"},
+        config={"write_empty_chunks": packing == RAW_PACKING},  # spares a comparison of every number with the fill
     )
 
 

@@ -100,12 +100,13 @@ class Spool:
                 f"{(self.samples, self.bands)} (sample, band). Give lines in order, missing ones with valid=False"
             )
         facts = _FACTS.pack(line.number, line.mirror_x, line.mirror_y, line.time_s, line.exposure_ms, line.valid)
-        data = np.ascontiguousarray(line.data, "<u2").tobytes()
+        data = np.ascontiguousarray(line.data, "<u2").data.cast("B")  # no copy: it is written and summed once
         with _refusals(self.path, self.count):
             if self._file is None:
                 self._file = self.path.open("ab", buffering=0)
             try:
-                write_all(self._file.fileno(), facts + self._crc(facts, data) + data)
+                for part in (facts + self._crc(facts, data), data):
+                    write_all(self._file.fileno(), part)
             except OSError:
                 self._cut_back()
                 raise
@@ -170,7 +171,7 @@ class Spool:
         nothing, unknown = np.zeros((self.samples, self.bands), np.uint16), float("nan")
         return Line(number, nothing, unknown, unknown, unknown, unknown, valid=False)
 
-    def _crc(self, facts: bytes, data: bytes) -> bytes:
+    def _crc(self, facts: bytes, data: bytes | memoryview) -> bytes:
         return _CRC.pack(zlib.crc32(data, zlib.crc32(facts, self._seed)))
 
     def _cut_back(self) -> None:

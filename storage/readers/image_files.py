@@ -112,6 +112,7 @@ def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> Cub
 
         at_once = height if picture else block[0] if driver == "JP2OpenJPEG" else 1
         read = read_by_chunks(read_rows, height, at_once)
+        bad = set(bad_bands(_file_tags(file).get("bbl"), file.count))
         source = CubeSource(
             name=path.name,
             shape=(height, width, count),
@@ -121,7 +122,7 @@ def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> Cub
             bands=known,
             nodata=file.nodata,
             geobox=geobox,
-            bad_bands=_bad_bands_of(file, keep) if len(pages) == 1 else (),
+            bad_bands=tuple(place for place, band in enumerate(keep) if band in bad) if len(pages) == 1 else (),
             void=void,
             notes=tuple(notes),
         )
@@ -294,12 +295,6 @@ def bad_bands(listed: str | None, count: int) -> tuple[int, ...]:
     """Return the bands (from 0) that a list of ``count`` flags marks by 0, such as ``{1, 1, 0}``."""
     flags = [finite_number(word) for word in re.split(r"[,\s{}]+", listed or "") if word]
     return tuple(band for band, flag in enumerate(flags) if flag == 0) if len(flags) == count else ()
-
-
-def _bad_bands_of(file: Any, keep: Sequence[int]) -> tuple[int, ...]:
-    """Return the bands of an open file that it marks as bad, by their index in ``keep``."""
-    bad = set(bad_bands(_file_tags(file).get("bbl"), file.count))
-    return tuple(place for place, band in enumerate(keep) if band in bad)
 
 
 def _file_tags(file: Any) -> dict[str, str]:

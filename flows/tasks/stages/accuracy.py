@@ -42,7 +42,7 @@ from storage.arrays.class_maps import load_class_map
 from storage.readers.scene_files import RasterPixels
 
 RECORD = "accuracy.json"
-ACCURACY = Product("evaluate", version=14, files=(RECORD,), by_weights=True)
+ACCURACY = Product("evaluate", version=15, files=(RECORD,), by_weights=True)
 
 
 @stage("evaluate", "accuracy, after publication", ACCURACY)

@@ -29,7 +29,7 @@ from pipeline.source import Line, Source
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, stage_key
 from storage.archive.manifests import write_table
-from storage.arrays.cubes import RawCubeWriter, SweepHeader, write_statistics
+from storage.arrays.cubes import STATISTICS, RawCubeWriter, SweepHeader
 from storage.arrays.spool import Spool
 from storage.parallel.pool import WorkerPool
 
@@ -87,7 +87,7 @@ class SweepRecorder:
 
                     self._capture(source, sweep, path, folder, manifest, found, taken)
                     before += sweep.lines
-                write_statistics(path, found)
+                np.savez(path / STATISTICS, allow_pickle=False, **found.arrays())
                 if source.record is not None:
                     write_table(path / RIG_RECORD, source.record)
 

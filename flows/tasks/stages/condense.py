@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import reduce
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,7 +124,9 @@ def condense(
         better = with_shared_directions(condenser, done, found, signal.false_alarm)
         if better is not None:
             condenser, done = better, written(better)
-        write_table(path / RECORD, _record(condenser, done))
+        record = {"components": len(condenser.components), "bands": condenser.components.bands, "step": condenser.step}
+        of_lines = {"spectra": sum(one.known for one in done), "rare": sum(len(one.rare) for one in done)}
+        write_table(path / RECORD, record | of_lines)
         rig_record = passes[0].path / RIG_RECORD
         if rig_record.is_file():  # the raw lines may be deleted
             shutil.copyfile(rig_record, path / RIG_RECORD)
@@ -187,17 +188,6 @@ def _write_sweeps(
         facts = LineRows(cube.time_s, x, y, cube.exposure_ms, cube.valid_line)
         writer.close(facts, done[-1].rare, done[-1].residuals)
     return done
-
-
-def _record(condenser: Condenser, done: Sequence[CondensedSweep]) -> dict[str, Any]:
-    """Return the figures of a compressed pass, for receipts and checks."""
-    return {
-        "components": len(condenser.components),
-        "bands": condenser.components.bands,
-        "step": condenser.step,
-        "spectra": sum(one.known for one in done),
-        "rare": sum(len(one.rare) for one in done),
-    }
 
 
 def raw_differs(passes: Sequence[StageRef], signal: StageRef, camera: LineCamera) -> str | None:

@@ -20,7 +20,7 @@ from pipeline.rectify.placed import PixelGrid, PlacedSweep, TieTable
 from pipeline.rectify.registration.alignment import SweepShift
 from pipeline.rectify.registration.illumination import overlap_light, solve_lights
 from pipeline.rectify.registration.overlaps import BroadSweep
-from pipeline.rectify.registration.seams import Anchor, Registration, SeamWindow, anchor_sweep, register_sweeps
+from pipeline.rectify.registration.seams import Anchor, Registration, anchor_sweep, register_sweeps
 from pipeline.rectify.scan_paths import ScanPath
 from pipeline.rectify.sweep_paths import capture_numbers
 from pipeline.signal.components import BROAD_BANDS, Components
@@ -66,7 +66,17 @@ def register_coarse(
             "sweeps": {shift.name: _shift_record(shift) | {"gain": gains.get(shift.name)} for shift in found.shifts},
             "untied": list(found.untied),
             "narrow": [asdict(narrow) for narrow in found.narrow],
-            "windows": [_window_record(seen, names) for seen in found.windows],
+            "windows": [
+                {
+                    "reference": names[seen.window.reference],
+                    "moving": names[seen.window.moving],
+                    "along_px": seen.window.along_px,
+                    "scan_px": seen.window.scan_px,
+                    "status": "too narrow" if seen.found is None else seen.found.status,
+                    "residual_px": seen.residual_px.tolist() if np.isfinite(seen.residual_px).all() else None,
+                }
+                for seen in found.windows
+            ],
         }
         write_table(path / RECORD, record)
 
@@ -87,18 +97,6 @@ def light_gains(
 
 def _shift_record(shift: SweepShift) -> dict[str, Any]:
     return {"offset_px": shift.offset.tolist(), "drift_px_per_line": shift.drift.tolist()}
-
-
-def _window_record(seen: SeamWindow, names: Sequence[str]) -> dict[str, Any]:
-    window = seen.window
-    return {
-        "reference": names[window.reference],
-        "moving": names[window.moving],
-        "along_px": window.along_px,
-        "scan_px": window.scan_px,
-        "status": "too narrow" if seen.found is None else seen.found.status,
-        "residual_px": seen.residual_px.tolist() if np.isfinite(seen.residual_px).all() else None,
-    }
 
 
 @stage("register_fine", "registration to the mosaic", POINTING, inputs=2, named="fine_pointing")
