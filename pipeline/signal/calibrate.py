@@ -187,10 +187,14 @@ def _line_gain(raw: NDArray[np.integer[Any]], references: References, position: 
 
 
 def _scene_values(raw: NDArray[np.integer[Any]], elements: Elements, line_gain: Floats32 | None) -> Floats32:
-    numbers, fill = np.ascontiguousarray(raw, np.uint16), elements.fill
-    frames = (np.ascontiguousarray(frame, np.float32) for frame in (elements.references.dark, elements.gain))
-    gains, values = np.ones(len(raw), np.float32) if line_gain is None else line_gain, np.empty(raw.shape, np.float32)
-    compiled_loops.calibrate_lines(numbers, *frames, gains, values)
+    fill, frames = elements.fill, (elements.references.dark, elements.gain)
+    dark, gain = (np.ascontiguousarray(frame, np.float32) for frame in frames)
+    gains = np.ones(len(raw), np.float32) if line_gain is None else line_gain
+    if raw.dtype == np.uint16:
+        values = np.empty(raw.shape, np.float32)
+        compiled_loops.calibrate_lines(np.ascontiguousarray(raw), dark, gain, gains, values)
+    else:  # sums of binned samples, and numbers with parts
+        values = (raw.astype(np.float32) - dark) * gain * gains[:, None, None]
     if len(fill.element):
         flat = values.reshape(len(values), -1)
         before = flat[:, fill.before]

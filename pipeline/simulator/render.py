@@ -143,6 +143,7 @@ def _tangents(position: Floats, slopes: Floats, *, exact: bool) -> RayViews:
 def sampler_of(
     rig: Rig, sweep: Sweep, wavelengths: bytes, blurs: tuple[tuple[Any, str], ...], names: tuple[str, ...]
 ) -> SceneSampler:
+    """Return what samples a scene through the footprint of a sweep; the last ones are kept."""
     wavelength, normal = np.frombuffer(wavelengths), middle_normal(sweep, rig.camera)
     moments = [blur.moments(rig, wavelength, variant, normal) for blur, variant in blurs]
     slit, smear, rotation = names

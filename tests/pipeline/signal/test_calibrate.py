@@ -39,6 +39,15 @@ def test_hand_worked_values() -> None:
     np.testing.assert_allclose(values[1, :, 0], [0, 2, 0.5, -0.1], atol=1e-6)
 
 
+def test_sums_of_samples_and_parts_of_numbers_are_calibrated_as_they_are() -> None:
+    """Numbers beyond 16 bits do not wrap, and no part is cut off."""
+    for raw in (np.full((2, 6, 3), 100_000, np.uint32), np.full((2, 6, 3), 10.25, np.float32)):
+        values, _ = calibrate(raw, frames(6), saturated_dn=np.inf)
+        small, _ = calibrate(np.full(raw.shape, 10, np.uint16), frames(6), saturated_dn=np.inf)
+        one, _ = calibrate(np.full(raw.shape, 11, np.uint16), frames(6), saturated_dn=np.inf)
+        np.testing.assert_allclose(values, small + (raw - 10.0) * (one - small), rtol=1e-5)
+
+
 @pytest.mark.parametrize(
     ("unlit", "bad", "hot", "out"),
     [
