@@ -129,7 +129,7 @@ def evaluate(dataset: str | Path | OpenedRun, *, progress: Told | None = None, *
     request = _flags(model_verbs.EvaluateFlags, "evaluate", flags, weights=files).request(str(dataset))
     with _working(progress):
         content: dict[str, Any] = evaluate_command.evaluate_weights(
-            request, lambda what, done, words: _tell(progress, what, done)
+            request, lambda what, done, words: None if progress is None else progress(what, done, 1.0)
         )
     return content
 
@@ -199,11 +199,6 @@ def _judge(
     with _working(progress) as console:
         receipt = reprocess_command.run_judge(run.archive_name, run.name, console, controls=controls, labels=asked)
     return dict(receipt["accuracy"])
-
-
-def _tell(progress: Told | None, what: str, done: float) -> None:
-    if progress is not None:
-        progress(what, done, 1.0)
 
 
 def _flags(kind: type[Any], verb: str, given: Mapping[str, Any], **more: Any) -> Any:

@@ -22,7 +22,7 @@ def main(arguments: list[str] | None = None) -> None:
     # Sums that are split among threads round differently: results of one seed would depend on the number of cores.
     # numpy reads the variable when a verb first imports it.
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
-    gc.set_threshold(10_000, 20, 20)  # with Python's own, collections take a third of the time of imports
+    gc.set_threshold(10_000, 20, 20)  # with Python's own, garbage collection takes a third of the time of imports
     with terminable(last=arguments is None):
         sys.exit(_run(sys.argv[1:] if arguments is None else arguments))
 

@@ -227,10 +227,8 @@ def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
         return None
     names = run.described.class_names
     store = ProbabilityStore(ref.path / "class_probabilities.zarr")
-    strips = (
-        store.read(rows)[0]
-        for rows in cuts(store.shape[0], SHARD_ROWS * min(max(STRIP_PX // (SHARD_ROWS * store.shape[1]), 1), 4))
-    )
+    high = SHARD_ROWS * int(np.clip(STRIP_PX // (SHARD_ROWS * store.shape[1]), 1, 4))
+    strips = (store.read(rows)[0] for rows in cuts(store.shape[0], high))
     exposure_ms = (settings.scan_exposure_ms or run.camera.exposure_ms) * run.scene.light_fraction
     score = run.map_scores.expected(expected_counts(strips, len(names)), step, exposure_ms)
     if score is None or not np.isfinite(score.miou):

@@ -303,6 +303,11 @@ def _changes(changes: Sequence[Sequence[Any]]) -> str:
     return f"changed {format_area(sum(area for area, _, _ in changes))}: {', '.join(most)}"
 
 
+def _older(areas: Mapping[str, float]) -> str:
+    older = [f"{counted(int(days), 'day')} {format_area(area)}" for days, area in areas.items() if area]
+    return f"captured longer ago than {', '.join(older)}" if older else ""
+
+
 def _scan(scan: Mapping[str, Any]) -> str:
     words = f"{format_scan(scan['step'], scan['exposure_ms'])}, {scan['seconds']:.1f} s"
     predicted = format_prediction(scan["expected_miou"], scan.get("expected_spread"))
@@ -347,12 +352,7 @@ _FORMATS: Mapping[str, Callable[[Any], str]] = {
     "multiply_adds": lambda did: f"multiply-adds {format_percent(did['done'] / did['everything'])} of full resolution",
     "ha": lambda areas: ", ".join(f"{spaced(name)} {format_area(area)}" for name, area in areas.items() if area),
     "changes_ha": _changes,
-    "older_ha": lambda areas: (
-        "captured longer ago than "
-        + ", ".join(f"{counted(int(days), 'day')} {format_area(area)}" for days, area in areas.items() if area)
-        if any(areas.values())
-        else ""
-    ),
+    "older_ha": _older,
     "sweeps": lambda sweeps: f"corrected by up to {max(math.hypot(*one) for one in sweeps.values()):.1f} px",
     "too_narrow": lambda value: f"{counted(len(value), 'overlap')} too narrow to compare",
 }

@@ -282,8 +282,8 @@ def judged_labels(scene: RasterScene, weights: Description) -> NDArray[np.uint8]
         return None
     order = np.full(256, UNLABELLED, np.uint8)
     order[: len(scene.class_names)] = [weights.class_names.index(name) for name in scene.class_names]
-    table = order.tobytes()  # an array as index would take eight bytes a pixel
-    labels = np.frombuffer(bytearray(scene.labels.data).translate(table), np.uint8).reshape(scene.shape)
+    # `order[labels]` would take eight bytes a pixel more
+    labels = np.frombuffer(bytearray(scene.labels.data).translate(order.tobytes()), np.uint8).reshape(scene.shape)
     trained = weights.record.get("split", {}).get("pixels", {}).get(scene.clear_key)
     if trained is not None:
         labels[unpack_mask(trained, scene.shape)] = UNLABELLED

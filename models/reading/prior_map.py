@@ -99,8 +99,6 @@ def pooled(columns: Floats) -> Floats:
     whole = np.pad(columns, [(0, y), (0, x), (0, 0)], mode="edge") if y or x else columns
     parts = np.stack([whole[i::CELL_PX, j::CELL_PX] for i in range(CELL_PX) for j in range(CELL_PX)])
     known = np.isfinite(parts)
-    if known.all():
-        return np.asarray(parts.sum(axis=0) / np.float32(len(parts)))
     sums = np.where(known, parts, np.float32(0)).sum(axis=0)
     count = known.sum(axis=0, dtype=np.float32)
     return np.where(count > 0, sums / np.maximum(count, 1), np.float32(np.nan))

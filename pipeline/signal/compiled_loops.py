@@ -7,9 +7,9 @@ from numba import types
 from numpy.typing import NDArray
 
 from pipeline.compiled import FLOATS, compiled, rows_of
+from pipeline.signal.subspace import BLOCK
 
 Values = NDArray[np.float32]
-BLOCK = 4  # spectra a side of a mean
 _LINES, _FRAME, _BANDS = (rows_of(FLOATS, axes, read_only=True) for axes in (3, 2, 1))
 
 
@@ -38,7 +38,7 @@ def sum_blocks(values: Values, origin: Values, largest: Values, sums: Values) ->
                 for band in range(bands):
                     value = values[line, sample, band] - origin[band]
                     across[band] += value
-                    broken[band] += value - value
+                    broken[band] += value - value  # 0, or NaN where it is not finite
                     largest[band] = max(largest[band], abs(value))
             row, column = first // BLOCK, sample // BLOCK
             if row < sums.shape[0] and column < sums.shape[1]:

@@ -83,7 +83,7 @@ def expected_light(scene: RasterScene, block: SweepBlock, chosen: Mapping[Any, s
     steps = [views.flat() for views in _views(block, choice, scene.shape)]
     exposure_ratio = block.rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS
     moments, names = tuple(choice.doing("moments")), tuple(map(choice.variant, ("slit", "smear", "rotation")))
-    light = sampler_of(block.rig, block.sweep, block.wavelength_nm.tobytes(), moments, names).scan_pass(
+    light = _sampler(block.rig, block.sweep, block.wavelength_nm.tobytes(), moments, names).scan_pass(
         scene, steps, along_y=block.sweep.along == "y", exposure_ratio=exposure_ratio
     )
     light = light.reshape(len(block.lines), -1, light.shape[1])
@@ -139,11 +139,10 @@ def _tangents(position: Floats, slopes: Floats, *, exact: bool) -> RayViews:
     return RayViews(along, np.broadcast_to(centre[..., 1], along.shape), one, none, none, one)
 
 
-@lru_cache(maxsize=8)  # its tables take up to 630 MB, in the most oblique sweep of 10 240 px
-def sampler_of(
+@lru_cache(maxsize=2)  # its tables take up to 630 MB, in the most oblique sweep of 10 240 px
+def _sampler(
     rig: Rig, sweep: Sweep, wavelengths: bytes, blurs: tuple[tuple[Any, str], ...], names: tuple[str, ...]
 ) -> SceneSampler:
-    """Return what samples a scene through the footprint of a sweep; the last ones are kept."""
     wavelength, normal = np.frombuffer(wavelengths), middle_normal(sweep, rig.camera)
     moments = [blur.moments(rig, wavelength, variant, normal) for blur, variant in blurs]
     slit, smear, rotation = names

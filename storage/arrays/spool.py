@@ -158,10 +158,8 @@ class Spool:
 
     def _line(self, number: int, record: bytes) -> Line | None:
         """Return the line of a record; None where the record is torn or damaged."""
-        if len(record) < self._size:
-            return None
         facts, data = record[: _FACTS.size], record[_FACTS.size + _CRC.size :]
-        if record[_FACTS.size : _FACTS.size + _CRC.size] != self._crc(facts, data):
+        if len(record) < self._size or record[_FACTS.size : _FACTS.size + _CRC.size] != self._crc(facts, data):
             return None
         found, mirror_x, mirror_y, time_s, exposure_ms, valid = _FACTS.unpack(facts)
         values = np.frombuffer(data, "<u2").reshape(self.samples, self.bands).astype(np.uint16)

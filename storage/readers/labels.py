@@ -165,9 +165,7 @@ def load_codes(
         if void.any() and codes[void][0] not in map(_code, classes):
             codes[void] = NO_VALUE
             notes.append(f"{void.sum()} px have the label file's no-data value {source.nodata:g}: unlabelled")
-    shift = None if own is None or geobox is None or own.crs != geobox.crs else shift_px(geobox, own)
-    near = shift is not None and max(map(abs, shift)) <= OFF_GRID_PX
-    if geobox is not None and own is not None and not (near and own.shape == geobox.shape):
+    if geobox is not None and own is not None and not _is_same_grid(own, geobox):
         codes, regridded = _on_grid(codes, own, geobox, address), True
         notes.append(f"labels {address} have another grid than the scene: they are resampled by nearest neighbour")
     return LabelCodes(codes, of_colours, tuple(notes), regridded)
@@ -192,6 +190,11 @@ def _whole_numbers(values: NDArray[Any], address: str | Path, *, by_number: bool
         f"labels {address} have shape {values.shape} and type {values.dtype}; expected whole numbers (y, x) or colours "
         f"(y, x, 3) of 8 bits"
     )
+
+
+def _is_same_grid(own: GeoBox, scene: GeoBox) -> bool:
+    shift = shift_px(scene, own) if own.crs == scene.crs else None
+    return shift is not None and max(map(abs, shift)) <= OFF_GRID_PX and own.shape == scene.shape
 
 
 def _on_grid(codes: NDArray[np.int64], own: GeoBox, grid: GeoBox, address: str | Path) -> NDArray[np.int64]:

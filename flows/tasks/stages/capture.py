@@ -23,7 +23,6 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.signal.condense import LineStatistics
 from pipeline.signal.subspace import SignalStatistics
-from pipeline.simulator.render import sampler_of
 from pipeline.simulator.simulated import BLOCK_LINES, SimulatedSource, sweep_starts
 from pipeline.source import Line, Source
 from storage.archive.archive import Archive
@@ -127,7 +126,6 @@ class SweepRecorder:
             taken(spool.count)
             take_lines(source, sweep, take, self.pool, first=spool.count)
             statistics.flush()
-        sampler_of.cache_clear()  # the next sweep has another footprint
 
 
 Take = Callable[[Line], None]

@@ -44,12 +44,13 @@ from storage.arrays.signal_cubes import LineRows, SignalCubeWriter, open_signal_
 from storage.arrays.spool import line_values
 from storage.readers.scene_files import RasterPixels
 
-SIGNAL = Product("condense", version=1)
-SIGNAL_FINE = Product("condense_fine", version=2)
+SIGNAL = Product("condense", version=2)
+SIGNAL_FINE = Product("condense_fine", version=3)
 RECORD = "signal.json"
 SHARED_FRACTION = 2e-3  # of rare spectra, from which on a component takes less space than residuals
 COARSER = (1.5, 2.0, 3.0, 4.0, 6.0)  # quantisation steps for a limit of bytes [standard deviations of the noise]
 SAMPLED_BLOCKS = 8  # of lines, to estimate bytes
+MOST_COMPARED = 65_536  # rare spectra, in which shared directions are searched for
 MOST_RARE = 0.05  # fraction of spectra, above which raw lines are kept
 
 
@@ -147,8 +148,8 @@ def with_shared_directions(
     components = condenser.components
     if rare <= max(2 * components.bands, SHARED_FRACTION * spectra):
         return None
-    residuals = np.concatenate([one.residuals for one in done]) * np.float32(RESIDUAL_STEP)
-    shared = with_shared(components, residuals, false_alarm)
+    some = [one.residuals[:: -(-rare // MOST_COMPARED)] for one in done]
+    shared = with_shared(components, np.concatenate(some) * np.float32(RESIDUAL_STEP), false_alarm)
     if len(shared) == len(components):
         return None
     return replace(condenser, components=shared, law=ResidualLaw.learned(found.spectra, shared))

@@ -67,7 +67,7 @@ def test_neither_pool_nor_blocks_change_a_number(
 ) -> None:
     """With every effect on, in blocks of 1, 7, 64 and all lines, with nothing remembered from before."""
     monkeypatch.setattr(simulated, "BLOCK_LINES", size)
-    render.sampler_of.cache_clear()
+    render._sampler.cache_clear()
     assert_same(taken(source_of(), WorkerPool(scheduler, workers), at_once=size), expected)
 
 

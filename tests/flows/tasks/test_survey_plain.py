@@ -296,12 +296,14 @@ def test_two_passes_share_components_of_rare_spectra(tmp_path: Path, monkeypatch
     """Rare spectra of both passes add components; then both passes are written again by all of them."""
     grown: list[list[int]] = []
 
-    def watched(components: Components, *given: Any) -> Components:
-        shared = with_shared(components, *given)
+    def watched(components: Components, residuals: Any, false_alarm: float) -> Components:
+        shared = with_shared(components, residuals, false_alarm)
         grown.append([len(components), len(shared)])
+        assert 256 < len(residuals) <= 512 + 2  # a part of each of two sweeps
         return shared
 
     monkeypatch.setattr("flows.tasks.stages.condense.with_shared", watched)
+    monkeypatch.setattr("flows.tasks.stages.condense.MOST_COMPARED", 512)
     size = {"size": "128x112", "camera.samples": 192, "bands": ",".join(map(str, range(4, 270, 3)))}
     flags = {"zoom": "always", "seconds": "4", "effects": "none", "accuracy": "false", "engine": "plain"}
     found = load_settings(None, {"scene": "farm", "out": str(tmp_path), **size, **flags})
