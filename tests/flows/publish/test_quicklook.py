@@ -17,6 +17,7 @@ from PIL import Image
 from flows.publish import panels, quicklook
 from flows.publish.panels import class_palette, class_rgb, outline
 from flows.publish.quicklook import QuicklookData, _draw_attention, draw_quicklook
+from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.quicklooks import choose_bands
 
 WAVES = np.linspace(400, 1000, 61)
@@ -116,10 +117,12 @@ def test_a_plain_scan_shows_how_sure_its_map_is(monkeypatch: pytest.MonkeyPatch,
     words = []
     monkeypatch.setattr(quicklook, "_caption", lambda axes, title, text: words.append((title, text)))
     data = make_data(96, 128)
+    data.class_map[:9] = data.truth[:9] = UNLABELLED
     confidence = data.confidence if confident else None
     (tmp_path / "q.png").write_bytes(draw_quicklook(replace(data, policy=None, blocks=(), confidence=confidence)))
     told = dict(words)
     assert told["2  Confidence"] == ("of the model" if confident else "the map has none")
+    assert told["4  Labels"].endswith(f"correct: {100 * (data.class_map == data.truth)[9:].mean():.1f} %")
     assert "2  Captured again" not in told
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flows.tasks.scene import judged_labels
 from flows.tasks.scores import format_false_classes, score_of, worst_class
 from flows.tasks.stages import accuracy as evaluation
 from flows.tasks.stages import placement
@@ -101,3 +102,11 @@ def test_a_receipt_gives_its_own_figures():
     assert format_false_classes(accuracy) == words
     accuracy["false_classes"] = accuracy["none"]["false_classes"] = {}
     assert format_false_classes(accuracy) == ""
+
+
+def test_labels_are_judged_in_the_order_of_the_weights_classes() -> None:
+    """Pixels without a label stay so."""
+    labels = np.array([[0, 1, UNLABELLED]], np.uint8)
+    scene: Any = SimpleNamespace(labels=labels, class_names=("b", "a"), shape=(1, 3), clear_key="")
+    weights: Any = SimpleNamespace(class_names=("a", "b"), record={})
+    np.testing.assert_array_equal(judged_labels(scene, weights), [[1, 0, UNLABELLED]])

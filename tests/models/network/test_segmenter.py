@@ -7,7 +7,7 @@ import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 
-from models.network.segmenter import PatchScorer, cut
+from models.network.segmenter import AROUND_PX, PatchScorer, cut, mean_around
 from models.network.sizes import PLANES, SegmenterConfig
 from models.training.objective import scoring_loss
 from tests.models.conftest import SMALL, make_network, noise
@@ -25,6 +25,14 @@ def test_an_image_of_parts_of_tokens_is_read_as_one_that_goes_on(size: tuple[int
     assert own.logits.shape[2:] == own.features.shape[2:] == size
     for one, other in ((own.logits, expected.logits), (own.features, expected.features)):
         assert (one - other[..., : size[0], : size[1]]).abs().max() <= 1e-5
+
+
+@pytest.mark.parametrize("size", [(1, 1), (2, 9), (40, 7)])
+def test_means_around_a_pixel_are_those_of_a_pooling_layer(size: tuple[int, int]):
+    image, reach = noise(1, 1, 3, *size), AROUND_PX // 2
+    down = F.avg_pool2d(image, (AROUND_PX, 1), 1, (reach, 0), count_include_pad=False)
+    expected = F.avg_pool2d(down, (1, AROUND_PX), 1, (0, reach), count_include_pad=False)
+    assert (mean_around(mean_around(image, 2), 3) - expected).abs().max() <= 1e-5
 
 
 @torch.inference_mode()

@@ -37,6 +37,7 @@ def test_statistics_do_not_depend_on_how_many_lines_come_at_a_time(cuts: list[in
         parts.add(values[first:last], np.ones((last - first, 40), np.bool_))
     assert (parts.count, parts.means) == (whole.count, whole.means)
     np.testing.assert_allclose(parts.spectra, whole.spectra, atol=1e-6)
+    np.testing.assert_allclose(parts.largest, np.abs(values - parts.origin).max(axis=(0, 1)), rtol=1e-5)
     one, other = (find_components(found) for found in (whole, parts))
     np.testing.assert_allclose(other.mean, one.mean, rtol=1e-6)
     np.testing.assert_allclose(other.noise, one.noise, rtol=1e-4)

@@ -18,6 +18,7 @@ from storage.arrays.class_maps import (
     CONFIDENCE_STEP,
     ClassMap,
     ClassNames,
+    class_counts,
     create_class_map,
     load_class_map,
     write_class_tile,
@@ -298,6 +299,7 @@ def test_class_map_round_trip(tmp_path: Path) -> None:
     found = load_class_map(tmp_path / "c.zarr")
     np.testing.assert_array_equal(found.classes, classes)
     np.testing.assert_array_equal(found.colours, colours)
+    assert class_counts(found.classes, 2).tolist() == [(classes == 0).sum(), (classes == 1).sum()]
     assert found.names == ("bare soil", "crop", "weed")
     with xr.open_zarr(tmp_path / "c.zarr", consolidated=False) as data:
         assert data["classes"].attrs["flag_meanings"] == "bare_soil crop weed"
