@@ -91,10 +91,12 @@ def choose_extent(
     seconds: float,
     max_age: float | None,
     skip_below_error: float | None,
+    left_out: Mask | None = None,
 ) -> tuple[PassLayout, ExtentChoice, str]:
     """Choose the lines of a partial scan within a time; return their layout, the choice, and a sentence.
 
-    Patches that would become older than ``max_age`` days come first. Raises NothingToMend: the expected error of the
+    Patches that would become older than ``max_age`` days come first. Pixels of ``left_out`` (y, x) are not of interest:
+    they lie outside of zones or have no data. Raises NothingToMend: the expected error of the
     prior map is below ``skip_below_error``, and no patch is too old; WeightsError: the weights have no scan performance
     table; BudgetError: no line fits the time; names the least time; PoseError: the field exceeds the mirror's range.
     """
@@ -107,8 +109,9 @@ def choose_extent(
     available = grid.valid_fraction().ravel() > 0 if layout.shown is None else layout.shown
     swaths, classes = _swaths(prior, grid, weights, path), len(weights.class_names)
     expected_errors = PatchExpectedErrors.of(
-        swaths, grid, classes, come_true=1.0 if weights.reader is None else COME_TRUE
+        swaths, grid, classes, come_true=1.0 if weights.reader is None else COME_TRUE, left_out=left_out
     )
+    available = available & expected_errors.pixels.any(axis=(1, 2))
     due = np.zeros(len(expected_errors.age_days), np.bool_)
     if max_age is not None:  # after an equally long time without a capture
         due = np.asarray(expected_errors.age_days + prior.days > max_age)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
@@ -62,6 +63,7 @@ from pipeline.rectify.placed import PixelGrid, place
 from pipeline.rectify.region import MosaicWork, plan_tiles
 from pipeline.signal.subspace import SMOOTH
 from pipeline.simulator.effects.pointing import PointingErrors
+from pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from pipeline.source import References
@@ -132,7 +134,7 @@ class CaptureRun:
         return {
             "source": self.source.name,
             "scene": self.scene.key,
-            "seed": self.settings.seed,
+            "seed": noise_seed(self.settings),
             "camera": asdict(self.camera),
             "pointing_px": self.settings.pointing_px,
             **({} if self.settings.visit is None else {"visit": self.settings.visit}),
@@ -376,7 +378,9 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     planned = _PlannedCapture(settings)
     if pixels is None:
         prior = None if found is None else found[0]
-        planned = _plan_capture(settings, grid, bands, path, described, prior, shown=zones.shown, passes=passes)
+        left_out = [one for one in (zones.left_out, scene.missing) if one is not None]
+        where = {"shown": zones.shown, "left_out": np.logical_or.reduce(left_out) if left_out else None}
+        planned = _plan_capture(settings, grid, bands, path, described, prior, passes=passes, **where)
     settings, plan = planned.settings, planned.plan
     read = min(bands, SMOOTH)  # components that the network reads, at most
     costs = ReadingCosts(described.config, grid, read)
@@ -454,6 +458,7 @@ def _plan_capture(
     prior: Prior | None,
     *,
     shown: NDArray[np.bool_] | None,
+    left_out: NDArray[np.bool_] | None,
     passes: RecordedPasses | None,
 ) -> _PlannedCapture:
     """Choose the extent, then the uniform scan or two passes, for the weights of the file ``path``.
@@ -469,7 +474,9 @@ def _plan_capture(
         assert settings.seconds is not None  # checked with the settings
         limits = {"max_age": settings.max_age, "skip_below_error": settings.skip_below_error}
         light = settings.sky.fraction_of_clear
-        layout, extent, note = choose_extent(layout, prior, described, path, light, seconds=settings.seconds, **limits)
+        layout, extent, note = choose_extent(
+            layout, prior, described, path, light, seconds=settings.seconds, left_out=left_out, **limits
+        )
         extent_notes = (note,)
     scans = choose_uniform_scan(layout, described, path, bands, settings)
     layout, plan, settings, plan_notes = lay_out_passes(layout, scans, described, settings)
@@ -515,12 +522,18 @@ def field_source(
     return rig_field.rig_field(scene, settings, planned) if settings.source == RIG else SimulatedField(simulated)
 
 
+def noise_seed(settings: Settings) -> int:
+    """Return the seed of noise, clouds and pointing errors: each visit, day and hour has its own."""
+    moment = "" if settings.moment in (None, (USUAL_DAY, USUAL_HOUR)) else settings.moment
+    return zlib.crc32(f"{settings.visit or ''}{moment}".encode()) << 64 | settings.seed
+
+
 def make_source(scene: RasterScene, settings: Settings) -> SimulatedSource:
     """Return the simulated rig in front of a scene, without effects."""
-    pointing = None
+    pointing, seed = None, noise_seed(settings)
     if settings.source == "sim" and settings.pointing_px:
-        pointing = PointingErrors(offset_px=settings.pointing_px, seed=settings.seed)
-    return SimulatedSource(scene, settings.simulated_rig, settings.seed, {}, name=settings.source, pointing=pointing)
+        pointing = PointingErrors(offset_px=settings.pointing_px, seed=seed)
+    return SimulatedSource(scene, settings.simulated_rig, seed, {}, name=settings.source, pointing=pointing)
 
 
 def now() -> str:

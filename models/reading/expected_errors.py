@@ -41,11 +41,12 @@ class PatchExpectedErrors:
         classes: int,
         *,
         come_true: float = 1.0,
+        left_out: NDArray[np.bool_] | None = None,
     ) -> PatchExpectedErrors:
         """Sort the pixels of a field given in strips from the top: log-probabilities (y, x, class), ages (y, x) [days].
 
         Every strip but the last is a number of whole patches high. ``come_true`` is the ratio of true to expected
-        errors.
+        errors. Pixels of ``left_out`` (y, x) do not count.
         """
         expected_error = np.geomspace(LEAST_EXPECTED_ERROR, 1.0, STEPS)
         rows, columns = grid.patch_shape
@@ -62,11 +63,11 @@ class PatchExpectedErrors:
                 np.isfinite(probabilities[..., 0]), np.nan_to_num(probabilities, nan=-np.inf).argmax(axis=-1), 0
             )
             place = (patch_number * classes + likeliest) * STEPS + step
-            counted = np.bincount(place.ravel(), minlength=pixels[here].size)
+            asked = np.True_ if left_out is None else ~left_out[top : top + len(probabilities)]
+            counted = np.bincount(place[np.broadcast_to(asked, place.shape)], minlength=pixels[here].size)
             pixels[here] = counted.reshape(pixels[here].shape)
-            np.maximum.at(
-                ages[here].reshape(-1), patch_number.ravel(), np.where(np.isfinite(age), age, -np.inf).ravel()
-            )
+            known_age = np.where(asked & np.isfinite(age), age, -np.inf)
+            np.maximum.at(ages[here].reshape(-1), patch_number.ravel(), known_age.ravel())
             top += len(probabilities)
         known = np.where(ages < 0, np.inf, ages).ravel()
         return PatchExpectedErrors(pixels.reshape(-1, classes, STEPS), expected_error, known)

@@ -14,6 +14,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from pipeline.lazy import deferred
@@ -180,12 +181,16 @@ class SignalStatistics:
         return found
 
     def _add_rough(self, spectra: Values, whole: Bools) -> None:
-        """Store second differences in both directions: for a smooth field they have 36 times the noise's variance."""
+        """Store second differences in both directions: for a smooth field they have 36 times the noise's variance.
+
+        All nine spectra must count.
+        """
         if min(whole.shape) < 3:
             return
         across = spectra[:, :-2] - 2 * spectra[:, 1:-1] + spectra[:, 2:]
         both = across[:-2] - 2 * across[1:-1] + across[2:]
-        self.rough.append(both.reshape(-1, self.bands)[:: self._thin * self._stride**2].copy())
+        near = sliding_window_view(whole, (3, 3)).all(axis=(2, 3))
+        self.rough.append(both[near][:: self._thin * self._stride**2].copy())
 
 
 def find_components(found: SignalStatistics, *, false_alarm: float = 0.01, least: int = 4) -> Components:

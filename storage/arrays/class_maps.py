@@ -44,8 +44,8 @@ CONFIDENCE = {"long_name": "probability of the class given", "units": "1", "vali
 CONFIDENCE_STEP = 1 / 256
 STEP, FAINTEST, NOTHING = 0.05, -12.7, 255  # nats; 254 is certainty, 255 unknown
 LEAST, UNLIKELY = -7.0, -11.0  # nats: lower values are stored as their mean, in a tenth of the bytes
-DAY_STEP, NEVER = 0.125, 65535
-OCTAVE_STEP, DARKEST, DARK = 0.0625, -10.0, 255  # log2 of reference exposures; 255 where there was no light
+DAY_STEP, NEVER = 1 / 86400, 2**32 - 1  # each visit rounds the age of the one before: a second is short enough
+OCTAVE_STEP, DARKEST, DARK = 2.0**-12, -10.0, 65535  # log2 of reference exposures; the last: without any light
 # values of the images in unknown pixels
 NOT_BELIEVED = {"log_probability": NOTHING, "age": NEVER, "log2_light": DARK}
 OLD_CLASS = "changed_from"
@@ -172,10 +172,10 @@ def create_probabilities(
     }
     _create_flat(group, "log_probability", ("y", "x", "class"), (*shape, len(legend.names)), "|u1", about)
     about = {"long_name": "time since the pixel was looked at", "units": "days", "scale_factor": DAY_STEP, **place}
-    _create_flat(group, "age", ("y", "x"), shape, "<u2", {**about, "_FillValue": NEVER})
+    _create_flat(group, "age", ("y", "x"), shape, "<u4", {**about, "_FillValue": NEVER})
     about = {"long_name": "log2 of the reference exposures that it rests on", "units": "1", "_FillValue": DARK, **place}
     packing = {"scale_factor": OCTAVE_STEP, "add_offset": DARKEST}
-    _create_flat(group, "log2_light", ("y", "x"), shape, "|u1", {**about, **packing})
+    _create_flat(group, "log2_light", ("y", "x"), shape, "<u2", {**about, **packing})
     if goes_on:
         _create_flat(group, OLD_CLASS, ("y", "x"), shape, "|u1", {**old_class_flags(legend), **place})
 
@@ -206,11 +206,11 @@ def write_probabilities_tile(
         packed = np.rint((likely - FAINTEST) / STEP)
         rows = slice(place[0].start + top, place[0].start + top + len(part))
         likelihood[rows, place[1]] = np.where(np.isnan(part), NOTHING, np.minimum(packed, NOTHING - 1)).astype(np.uint8)
-    days = np.rint(np.clip(age_days, 0, DAY_STEP * (NEVER - 1)) / DAY_STEP)
-    ages[place] = np.where(np.isnan(age_days), NEVER, days).astype(np.uint16)
+    days = np.minimum(np.rint(np.maximum(age_days, 0, dtype=np.float64) / DAY_STEP), NEVER - 1)
+    ages[place] = np.where(np.isnan(age_days), NEVER, days).astype(np.uint32)
     octaves = np.clip(np.log2(np.maximum(light, 2.0**DARKEST)), DARKEST, DARKEST + OCTAVE_STEP * (DARK - 1))
     packed = np.rint((octaves - DARKEST) / OCTAVE_STEP)
-    octave[place] = np.where(light > 0, packed, DARK).astype(np.uint8)
+    octave[place] = np.where(light > 0, packed, DARK).astype(np.uint16)
 
 
 def write_changes_tile(path: Path, origin: tuple[int, int], old_class: NDArray[np.uint8]) -> None:
@@ -234,7 +234,7 @@ def write_changes(path: Path, changed: Floats, patch_px: int) -> None:
     write_image(open_group(path, "r+"), "changed", ("patch_y", "patch_x"), changed, {**CHANGED, "patch_px": patch_px})
 
 
-def unpacked_days(packed: NDArray[np.uint16]) -> Floats:
+def unpacked_days(packed: NDArray[np.uint32]) -> Floats:
     """Return packed ages in days; NaN where unknown."""
     return np.where(packed == NEVER, np.float32(np.nan), packed * np.float32(DAY_STEP)).astype(np.float32)
 

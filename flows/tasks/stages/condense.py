@@ -44,8 +44,8 @@ from storage.arrays.signal_cubes import LineRows, SignalCubeWriter, open_signal_
 from storage.arrays.spool import line_values
 from storage.readers.scene_files import RasterPixels
 
-SIGNAL = Product("condense", version=2)
-SIGNAL_FINE = Product("condense_fine", version=3)
+SIGNAL = Product("condense", version=3)
+SIGNAL_FINE = Product("condense_fine", version=4)
 RECORD = "signal.json"
 SHARED_FRACTION = 2e-3  # of rare spectra, from which on a component takes less space than residuals
 COARSER = (1.5, 2.0, 3.0, 4.0, 6.0)  # quantisation steps for a limit of bytes [standard deviations of the noise]

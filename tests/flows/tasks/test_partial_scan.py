@@ -148,6 +148,22 @@ def test_what_is_due_is_looked_at_first(visited: Path, visits: Any, survey_png: 
     assert f"due left {scan_pass['due_left']}" in page
 
 
+def test_places_without_data_are_never_due(survey_png: Survey, recorded: Path, tmp_path: Path) -> None:
+    """A map of yesterday is younger than --max-age wherever the field has values."""
+    values = np.random.default_rng(0).uniform(50, 200, (96, 128, 3))
+    values[:, 96:] = np.nan
+    np.save(tmp_path / "scene.npy", values)
+    given = {
+        "scene": str(tmp_path / "scene.npy"),
+        "labels": None,
+        "weights": str(recorded),
+        "wavelengths": "450,550,650",
+    }
+    for flags, day in ((WHOLE, "2026-06-01"), ({**PART, "max_age": "30"}, "2026-06-02")):
+        found = survey_png(tmp_path / "archive", **flags, **given, visit=day)
+    assert found.receipt["extent"]["due"] == 0
+
+
 def test_of_what_is_sure_enough_nothing_is_looked_at(
     visited: Path, survey_png: Survey, recorded: Path, scene_files: Path, command_line: CommandLine
 ) -> None:

@@ -9,6 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from flows.settings.load import load_settings
+from flows.tasks.run import noise_seed
 from flows.tasks.stages.capture import take_lines
 from pipeline.errors import RigError, SceneError
 from pipeline.geometry.camera import LineCamera
@@ -127,3 +129,11 @@ def test_nothing_is_rendered_after_lines_are_refused(error: BaseException) -> No
         take_lines(source_of("rotation"), SWEEP, take, TWO, at_once=7)
     assert lines == list(range(40))
     assert threading.active_count() == before
+
+
+def test_every_visit_has_noise_of_its_own() -> None:
+    """Also every day and hour of a farm; the first visit on the usual day has the seed of the settings."""
+    asked = ({}, {"visit": "a"}, {"visit": "b"}, {"day": "179"}, {"day": "179", "visit": "a"}, {"hour": "9"})
+    seeds = [noise_seed(load_settings(None, {"scene": "farm", "seed": "7", **one})) for one in asked]
+    assert seeds[0] == 7 == noise_seed(load_settings(None, {"scene": "farm", "seed": "7", "day": "172"}))
+    assert len(set(seeds)) == len(asked)

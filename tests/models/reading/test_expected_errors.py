@@ -62,3 +62,12 @@ def test_swaths_say_what_the_whole_says(high: int, seed: int) -> None:
     assert np.array_equal(whole.age_days, parts.age_days)
     assert whole.pixels.sum() == 8 * 12
     assert 0 < whole.expected_wrong() <= 2 / 3 * whole.expected_error[1] / whole.expected_error[0]
+
+
+def test_pixels_that_nobody_asks_for_do_not_count() -> None:
+    """Outside of zones and without data: neither their errors nor their ages; a patch of them alone has no age."""
+    probabilities, age, left_out = believed(0.9), np.ones((8, 12)), np.zeros((8, 12), np.bool_)
+    left_out[:4, :5], probabilities[:, :6], age[0, 4] = True, np.nan, 50.0
+    asked = PatchExpectedErrors.of([(probabilities, age)], GRID, 3, left_out=left_out)
+    assert asked.pixels.sum(axis=(1, 2)).tolist() == [0, 12, 16, 16, 16, 16]
+    assert asked.age_days.tolist() == [np.inf, 1, 1, 1, 1, 1]

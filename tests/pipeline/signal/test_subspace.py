@@ -140,6 +140,13 @@ def test_noise_is_estimated_in_every_band(seed: int, bands: int, materials: int,
     np.testing.assert_allclose(find_components(statistics_of(made.values)).noise, made.noise, rtol=within)
 
 
+def test_pixels_without_data_say_nothing_of_the_noise_of_few_bands() -> None:
+    """More than half of the field is missing, and the noise of four bands is that of the rest."""
+    made = field_of(0, (128, 128), 4, 1)
+    valid = np.broadcast_to(np.arange(128) >= 72, (128, 128))
+    np.testing.assert_allclose(find_components(statistics_of(made.values, valid)).noise, made.noise, rtol=0.08)
+
+
 @pytest.mark.parametrize("bands", [1, 2, 8])
 def test_all_of_few_bands_are_kept(bands: int) -> None:
     """Up to 8 bands have as many components: rounding to a step is all that is lost, and no spectrum is rare."""
