@@ -25,6 +25,7 @@ from flows.tasks.stages.accuracy import evaluate
 from flows.tasks.stages.capture import capture_coarse, capture_fine
 from flows.tasks.stages.condense import raw_differs
 from pipeline.lazy import deferred
+from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, canonical_json
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run, read_run
@@ -80,12 +81,13 @@ def clear_raw(plan: OpenSurvey, run: RunRef) -> RunRef:
 
 
 def _clear_raw(plan: OpenSurvey, run: RunRef) -> RunRef:
-    archive, there = plan.run.archive, [name for name in PASSES if name in plan.products]
-    passes = [plan.products[name] for name in there]
+    archive, passes = plan.run.archive, [plan.products[name] for name in PASSES if name in plan.products]
     if not plan.products.signals or any(archive.find(raw.stage, raw.key) is None for raw in passes):
         return run  # cleared before
-    others = (_kept_by_others(plan, name, raw) for name, raw in zip(there, passes, strict=True))
+    others = (_kept_by_others(archive, raw) for raw in passes)
     why = next(filter(None, others), None) or raw_differs(passes, plan.products.signals[0], plan.run.camera)
+    if any(archive.find(raw.stage, raw.key) is None for raw in passes):
+        return run  # cleared meanwhile, by another survey
     if why is not None:
         plan.observer.note(f"raw lines stay: {why}")
         return run
@@ -99,16 +101,12 @@ def _clear_first_mosaic(plan: OpenSurvey) -> None:
     archive, first = plan.run.archive, plan.products.get("rectify")
     if first is None or "rectify_fine" not in plan.products or plan.registers:  # fine sweeps are registered on it
         return
-    runs = [] if plan.records["rectify"].state == "ran" else Catalogue.read(archive.root).runs
-    if not any(run.products.get("mosaic", "").startswith(first.uri) for run in runs):
+    if not any(run.products.get("mosaic", "").startswith(first.uri) for run in Catalogue.read(archive.root).runs):
         archive.clear(first, wait=False)
 
 
-def _kept_by_others(plan: OpenSurvey, stage: str, raw: StageRef) -> str | None:
-    """Return the other run that keeps raw lines of an earlier survey; None without one."""
-    if plan.records[stage].state == "ran":
-        return None
-    archive = plan.run.archive
+def _kept_by_others(archive: Archive, raw: StageRef) -> str | None:
+    """Return the other run that keeps raw lines; None without one."""
     runs = Catalogue.read(archive.root).named_by(raw.uri)
     return next((f"{one.uri} keeps them" for one in runs if not is_outlived(one, archive.now())), None)
 

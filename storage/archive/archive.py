@@ -271,7 +271,10 @@ class Archive:
         spools = [
             path
             for path in self.root.glob("spool/*")
-            if any(try_manifest(store)[1] is None for store in self.root.glob(f"stages/*/{path.name}"))
+            if any(
+                problem is None and not is_cleared(manifest)  # a cleared capture is being taken again
+                for manifest, problem in map(try_manifest, self.root.glob(f"stages/*/{path.name}"))
+            )
         ]
         parts = [*self.root.glob(f"stages/*/*{PART_SUFFIX}"), *self.root.glob(f"runs/*{PART_SUFFIX}")]
         found: dict[str, int] = {}

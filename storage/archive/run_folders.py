@@ -47,6 +47,7 @@ class RunDraft:
         self.send: Callable[[str], None] | None = None  # called with the address of the published run
         self._root = root
         self._release = release
+        self._done = False
 
     @property
     def published(self) -> Path:
@@ -89,9 +90,10 @@ class RunDraft:
                 take_its_place(self.folder, final)
             else:
                 rename_into_place(self.folder, final)
-        self._release()
+        self._done = True
         if self.send is not None:
             self.send(f"runs/{self.id}")
+        self._release()
         return final
 
     def bytes_published(self, *, rests_on: Mapping[str, str] | None = None, **facts: Any) -> int:
@@ -110,7 +112,8 @@ class RunDraft:
 
     def abandon(self) -> None:
         """Remove an unpublished draft and release its lock; may be called again."""
-        remove_tree(self.folder)
+        if not self._done:  # another process may have a draft of this name by now
+            remove_tree(self.folder)
         self._release()
 
 

@@ -130,10 +130,12 @@ class MosaicWriter:
         if where is not None:
             blank_pixels(self.path, where, {"scores": _unseen(self._scores.dtype.str), "coverage": 0})
 
-    def write_captures(self, specs: Sequence[Sequence[float]], number: NDArray[np.uint8]) -> None:
-        """Store the kind of capture of each pixel: ``number`` (y, x) is an index into ``specs``."""
-        about = {"long_name": "kind of capture", "units": "1", "kinds": [list(one) for one in specs]}
-        write_image(self.group, CAPTURES, ("y", "x"), number, about)
+    def write_captures(self, specs: Sequence[Sequence[float]], number: NDArray[np.integer[Any]]) -> None:
+        """Store the kind of capture of each pixel: ``number`` (y, x) is an index into ``specs``, which may repeat."""
+        kinds = list(dict.fromkeys(map(tuple, specs)))
+        of_spec = np.array([kinds.index(tuple(one)) for one in specs], np.uint8)
+        about = {"long_name": "kind of capture", "units": "1", "kinds": [list(one) for one in kinds]}
+        write_image(self.group, CAPTURES, ("y", "x"), of_spec[number], about)
 
 
 def _unseen(dtype: str) -> int:

@@ -35,7 +35,7 @@ RECORD = "registration.json"
 POINTING = Product("register", version=2, files=(RECORD,))
 GEOLOCATION = Product("locate", version=3, files=("geolocation.zarr",))
 MOSAIC = Product("rectify", version=5, files=("mosaic.zarr",))
-MERGED = Product("rectify_fine", version=2, files=("mosaic.zarr",))
+MERGED = Product("rectify_fine", version=3, files=("mosaic.zarr",))
 MOSAIC_STEP = 0.5  # quantisation step, relative to the sweeps: resampled scores have less noise
 KERNEL_GAIN = 2.0  # greatest overshoot of the kernels
 
@@ -224,7 +224,7 @@ def rectify_fine(
         writer = mosaic_of_sweeps(path, signal, frame)
         write_mosaic(recipe, writer, memory=memory, pool=pool, report=report)
         placed = recipe.open().placed
-        number = np.maximum(capture_numbers(placed, camera, grid), 0).astype(np.uint8)
+        number = np.maximum(capture_numbers(placed, camera, grid), 0)
         exposed = [(exposing(camera, one.lines.sweep).exposure_ms, one.lines.sweep.step) for one in placed]
         captures = [LineSpec(light.light * exposure_ms / camera.exposure_ms, step) for exposure_ms, step in exposed]
         writer.write_captures(captures, number)

@@ -15,9 +15,15 @@ import xarray as xr
 import zarr
 from rich.console import Console
 
+from flows.publish.publishing import clear_raw, publish
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
+from flows.settings.parameters import SurveySettings
+from flows.survey import draw_class_map, survey
+from flows.tasks.captures import plan_capture
+from flows.tasks.open_survey import OpenSurvey
+from storage.archive.records import read_run
 from storage.arrays.cubes import open_raw_cube
 from tests.conftest import Survey
 from tests.prior_work import without_effects
@@ -44,6 +50,24 @@ def copied(surveyed: tuple[Path, Published], tmp_path: Path) -> Path:
     return Path(shutil.copytree(surveyed[0], tmp_path / "archive"))
 
 
+@pytest.mark.usefixtures("no_effects")
+def test_what_a_run_names_that_another_survey_published_meanwhile_stays(tmp_path: Path) -> None:
+    """Raw lines that it keeps, and the mosaic of a first pass to which it adds no second one."""
+    np.save(tmp_path / "nothing.npy", np.zeros((96, 96), np.float32))
+    bands = ",".join(map(str, range(5, 265, 40)))
+    given: dict[str, Any] = {"scene": "farm", "size": (96, 96), "bands": bands, "out": str(tmp_path / "archive")}
+    given |= {"engine": "plain", "accuracy": False, "budget": 0.95, "coarse_exposure_ms": 4.0, "zoom": "always"}
+    first = plan_capture(SurveySettings(**given, policy="random"))
+    assert isinstance(first, OpenSurvey)
+    with first.at_work():
+        draw_class_map(first)
+        other = survey.fn(SurveySettings(**given, policy="mask", mask=str(tmp_path / "nothing.npy"), keep="raw"))
+        clear_raw(first, publish(first))
+    assert first.run.archive.is_there(first.products["capture_coarse"].uri)
+    mosaic = read_run(other.folder).products["mosaic"]
+    assert first.run.archive.is_there("/".join(mosaic.split("/")[:3]))
+
+
 def _arrays(root: Path) -> Iterator[tuple[Path, zarr.Array[Any]]]:
     """Every array of every store, with its folder."""
     for about in sorted((root / "stages").rglob("zarr.json")):
@@ -67,7 +91,8 @@ def test_raw_is_stored_once_and_as_uint16(surveyed: tuple[Path, Published]) -> N
     assert sum(array.shape[0] for _, array in by_line) == published.receipt["savings"]["lines"]["done"]
     assert [path for path in (root / "spool").rglob("*") if path.is_file()] == []
     raw = {path for path, _ in by_line}
-    assert not [path for path, array in arrays if array.dtype == np.uint16 and path not in raw and path.name != "age"]
+    others = [path.name for path, array in arrays if array.dtype == np.uint16 and path not in raw]
+    assert set(others) <= {"log2_light"}
     for kind in ("condense", "condense_fine", "rectify_fine"):  # no derived array has every band of a pixel
         scores = [array for path, array in arrays if path.match(f"stages/{kind}/*/*.zarr/scores")]
         assert scores, kind

@@ -76,6 +76,16 @@ def test_a_dead_runs_rest_is_reclaimed(tmp_path: Path, archive: Archive) -> None
     assert [ref.key for ref in archive.refs()] == ["abc"]
 
 
+def test_lines_of_a_cleared_capture_that_is_taken_again_are_no_leftover(archive: Archive) -> None:
+    """Those of a published one are."""
+    _publish(archive)
+    (archive.spool_folder("abc") / "lines").write_text("x")
+    archive.clear(archive.refs()[0])
+    assert archive.reclaim() == []
+    _publish(archive)
+    assert archive.reclaim() == ["spool/abc"]
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

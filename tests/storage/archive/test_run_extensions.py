@@ -131,6 +131,15 @@ def test_one_at_a_time(archive: Archive) -> None:
         archive.extend_run("20261120T101701-gone")
 
 
+def test_the_next_process_keeps_its_draft(archive: Archive) -> None:
+    """It may begin as soon as a run is published, before the process that published it leaves its block."""
+    with drafted(archive, run_id(archive)) as draft:
+        draft.write_file("receipt.json", "{}")
+        draft.publish()
+        draft.folder.mkdir()
+    assert draft.folder.is_dir()
+
+
 def test_killed_at_every_call_of_the_system(archive: Archive, tmp_path: Path) -> None:
     """The run is there, whole, without what is added or with it; the next time it is added."""
     command = [sys.executable, "-c", KILL_EVERYWHERE, str(archive.root), str(tmp_path)]

@@ -42,6 +42,17 @@ def test_tiles_and_rows_store_the_same(tmp_path: Path) -> None:
     assert np.isnan(other.values()[coverage == 0]).all()
 
 
+def test_each_pixel_keeps_its_capture_of_hundreds_of_sweeps(tmp_path: Path) -> None:
+    """Sweeps of the same exposure and spacing are one kind."""
+    first, later = (0.1, 4.0), (0.5, 1.0)
+    number = np.tile(np.arange(SHAPE[1]) % 300, (SHAPE[0], 1))
+    writer(tmp_path / "mosaic.zarr").write_captures([first] * 16 + [later] * 284, number)
+    found = open_mosaic(tmp_path / "mosaic.zarr").captures()
+    assert found is not None
+    assert found[0] == [first, later]
+    np.testing.assert_array_equal(found[1], number >= 16)
+
+
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, NDArray[np.float32]]:
     """A stored mosaic of 150 x 90 px, a part of it not seen, and its values."""
