@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote, unquote
 
 from odc.geo.geobox import GeoBox
 from rich.console import Console
@@ -114,7 +115,9 @@ def run_export(
         raise
     except OSError as error:
         raise ArchiveError(f"cannot export to {out}: {error.strerror}; choose another --out") from error
-    paths = {key: Path(os.path.normpath(export.folder / asset["href"])) for key, asset in export.assets.items()}
+    paths = {
+        key: Path(os.path.normpath(export.folder / unquote(asset["href"]))) for key, asset in export.assets.items()
+    }
     files = {key: path.relative_to(out).as_posix() for key, path in paths.items() if path.is_relative_to(out)}
     placed = opened.geobox is not None
     if not placed:
@@ -145,7 +148,7 @@ class Export:
     def add(self, key: str, path: Path, title: str, kind: str, roles: list[str], **fields: Any) -> None:
         """Add a file or store to the catalogue, by its address relative to the item."""
         href = Path(os.path.relpath(path.resolve(), self.folder)).as_posix()
-        self.assets[key] = {"href": href, "title": title, "type": kind, "roles": roles, **fields}
+        self.assets[key] = {"href": quote(href), "title": title, "type": kind, "roles": roles, **fields}
 
 
 def _export_images(export: Export, layers: Sequence[Layer], console: Console) -> None:
@@ -209,4 +212,4 @@ def describe_item(export: Export) -> Item:
     if geobox is not None:
         properties |= {"proj:code": projection(geobox)["proj:code"], "gsd": pixel_side_m(geobox)}
         outline = footprint(geobox)
-    return Item(run.id, receipt["started"], receipt["finished"], properties, export.assets, outline)
+    return Item(run.id, *run.observed, properties, export.assets, outline)

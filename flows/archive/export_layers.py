@@ -13,6 +13,7 @@ from affine import Affine
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
+from flows.archive.history import time_of_visit
 from flows.publish.receipt import Receipt, check_receipt
 from flows.tasks.stages.maps import coarse_colours
 from pipeline.errors import IncompleteStoreError, SettingsError, ShapeError
@@ -45,6 +46,13 @@ class ExportedRun:
     @property
     def id(self) -> str:
         return self.folder.name
+
+    @property
+    def observed(self) -> tuple[str, str]:
+        """Return begin and end of the observation: those of the run, unless its visit is another moment."""
+        began, ended = self.receipt["started"], self.receipt["finished"]
+        visit = time_of_visit(read_run(self.folder))
+        return (began, ended) if visit is None or visit[:19] == began[:19] else (visit, visit)
 
     def store(self, product: str) -> StageRef | None:
         """Return the store of a product; None if there is none, or if its files were cleared away.
@@ -141,7 +149,7 @@ def layer_tags(run: ExportedRun, product: str, geobox: GeoBox) -> dict[str, str]
         "TIFFTAG_SOFTWARE": f"spectralzoom {run.receipt['versions'].get('spectralzoom', 'of unknown version')}",
         "run": run.id,
         "product": run.receipt["products"][product],
-        "surveyed": run.receipt["started"],
+        "surveyed": run.observed[0],
         "place": ANGULAR if geobox.crs is None else "map",
     }
 

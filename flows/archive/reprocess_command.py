@@ -173,7 +173,7 @@ def _format_row(row: Mapping[str, Any]) -> str:
 def _show(content: Mapping[str, Any], console: Console) -> None:
     rows = content["fields"]
     counts = ", ".join(f"{count} {state}" for state, count in Counter(row["state"] for row in rows).items())
-    total = f"{counted(len(rows), 'field')}: {counts}" if rows else "no field matches: nothing to do"
+    total = f"{counted(len(rows), 'run')}: {counts}" if rows else "no field matches: nothing to do"
     for line in (*map(_format_row, rows), total):
         console.print(escape(line), soft_wrap=True)
 

@@ -231,8 +231,8 @@ def finding_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _figures(found: Mapping[str, Any] | None, names: Sequence[str]) -> str:
-    """Return the named figures of a part; None, 0 and what is empty are left out."""
-    told = [(name, found[name]) for name in names if found and found.get(name)]
+    """Return the named figures of a part; None, most zeros and what is empty are left out."""
+    told = [(name, found[name]) for name in names if found and (found.get(name) or (name, found.get(name)) == ZERO)]
     return "; ".join(words for name, value in told if (words := format_figure(name, value)))
 
 
@@ -315,6 +315,7 @@ def _scan(scan: Mapping[str, Any]) -> str:
 
 
 # parts of a receipt: their label, and the figures that are shown, in order
+ZERO = ("differing_px", 0)  # shown although it is 0: the expected number stands beside it
 _SHOWN: Mapping[str, tuple[str, Sequence[str]]] = {
     "field": ("field", ("view_deg", "range_m", "hectares", "ground_pixel_m", "hectares_per_hour")),
     "plan": ("plan", ("reason", "lines")),

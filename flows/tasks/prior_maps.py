@@ -57,9 +57,9 @@ class Prior:
 
 
 def find_prior(
-    archive: Archive, settings: Settings, name: str, grid: SceneGrid, class_names: tuple[str, ...]
+    archive: Archive, settings: Settings, name: str, grid: SceneGrid, class_names: tuple[str, ...], scene_key: str
 ) -> tuple[Prior | None, tuple[str, ...]]:
-    """Return the run of the prior map of a survey of ``name``, or None, and notes.
+    """Return the run of the prior map of a survey of ``name``, or None, and notes. ``scene_key`` identifies its light.
 
     It is the run with the last capture before this visit, among the newest runs of the field. The time of publication
     does not count. Raises SettingsError: the named run cannot be a prior map.
@@ -76,7 +76,7 @@ def find_prior(
             why = found
         raise SettingsError(f"--prior {settings.prior}: {why}; give another run, latest or none")
     notes: list[str] = []
-    for run in _before(archive, settings, name):
+    for run in _before(archive, settings, name, scene_key):
         found = _usable(archive, run, settings, grid, class_names)
         if isinstance(found, Prior):
             return found, (*notes, f"prior map: {run.folder.name}, {found.days:.3g} days earlier")
@@ -84,7 +84,7 @@ def find_prior(
     return None, (*notes, f"{name} has no prior map: this is its first visit")
 
 
-def _before(archive: Archive, settings: Settings, name: str) -> Iterator[Run]:
+def _before(archive: Archive, settings: Settings, name: str, scene_key: str) -> Iterator[Run]:
     """Return the newest runs of a field with class probabilities, the last captured before this visit first."""
     found: list[tuple[float, int, Run]] = []
     part, asked = run_stem(name), anchor_paths(settings.to_dict(), Path.cwd())
@@ -97,7 +97,7 @@ def _before(archive: Archive, settings: Settings, name: str) -> Iterator[Run]:
         run = read_run(folder)
         if run.receipt.get("survey") == name and PROBABILITIES in run.products:
             before = {"extent": EXTENT_WHOLE, **run.settings}
-            if all(before.get(key) == asked[key] for key in light):
+            if run.receipt.get("scene") == scene_key and all(before.get(key) == asked[key] for key in light):
                 continue  # made of the requested light itself: no earlier visit
             days = _days_since(run, settings.visit, settings.moment)
             if days >= 0:

@@ -373,7 +373,11 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
         settings = replace(settings, skip_below_error=None)
     if settings.extent == EXTENT_PART:  # the prior map chooses the lines
         archive = open_archive(settings.out) if archive is None and is_archive(settings.out) else archive
-        found = (None, ()) if archive is None else find_prior(archive, settings, name, grid, described.class_names)
+        found = (
+            (None, ())
+            if archive is None
+            else find_prior(archive, settings, name, grid, described.class_names, scene.key)
+        )
     passes = None if recorded is None else recorded.passes
     planned = _PlannedCapture(settings)
     if pixels is None:
@@ -388,7 +392,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     budget = None if settings.macs is None else PatchBudget.asked(costs, shown, settings.policy, settings.macs)
     source, simulated, raster = _open_source(settings, scene, grid, plan, recorded, pixels)
     archive = open_archive(settings.out) if archive is None else archive
-    prior, prior_notes = found or find_prior(archive, settings, name, grid, described.class_names)
+    prior, prior_notes = found or find_prior(archive, settings, name, grid, described.class_names, scene.key)
     if settings.prior != AUTO:  # a receipt names the run
         settings = replace(settings, prior=NONE if prior is None else prior.run)
     return SurveyRun(

@@ -37,7 +37,7 @@ from storage.archive.manifests import manifest_sha256
 from storage.archive.records import Run, read_run, read_store
 from storage.archive.staging import MANIFEST_NAME
 from storage.arrays.layout import open_group
-from storage.arrays.signal_cubes import open_lines
+from storage.arrays.signal_cubes import RestoredCube, open_lines
 from storage.readers.cube_sources import CubeSource
 from storage.readers.envi_files import find_envi_pair, load_envi_header
 from storage.readers.open_cubes import reader_of
@@ -59,6 +59,7 @@ from storage.remote.opening import is_archive, open_archive
 Floats = NDArray[np.float64]
 
 SAME_PERIOD = 0.01
+RESTORED = "the raw lines were deleted: these are restored from the stored signal"
 LINE_PRODUCTS = {"raw_coarse": "signal_coarse", "raw_fine": "signal_fine"}  # of a run: raw lines, and condensed ones
 
 
@@ -131,7 +132,7 @@ def open_recording(
 
     Raises SceneError: there is no recording, or files or pointing cannot be used; WavelengthError: there are no
     wavelengths; SettingsError: a flag is given for an archive; ArchiveError, IncompleteStoreError: the archive cannot
-    be read, or its raw cubes were cleared away; PoseError: a position of a raw cube is beyond the mirror.
+    be read; PoseError: a position of a raw cube is beyond the mirror.
     """
     camera, given = camera or LineCamera(), given or RecordedWith()
     stores = find_raw_cubes(address)
@@ -159,7 +160,16 @@ def open_recording(
         else " ".join(_stamps(sorted(file for file in path.rglob("*") if file.is_file())))
         for path in stores
     )
-    return Recording(str(address), sweeps, first.wavelength_nm, first.fwhm_nm, camera, (), light)
+    camera = _exposing(camera, [float(np.nanmedian(one.exposure_ms)) for one in sweeps if one.valid_line.any()])
+    notes = (RESTORED,) if any(isinstance(cube, RestoredCube) for cube in cubes) else ()
+    return Recording(str(address), sweeps, first.wavelength_nm, first.fwhm_nm, camera, notes, light)
+
+
+def _exposing(camera: LineCamera, exposures_ms: Sequence[float]) -> LineCamera:
+    """Return the camera with the exposure of a recording, if known."""
+    if not exposures_ms or camera.exposure_ms in exposures_ms:
+        return camera
+    return replace(camera, exposure_ms=exposures_ms[0])
 
 
 def _stamps(files: Iterable[Path]) -> list[str]:
@@ -253,8 +263,7 @@ def _timed(
         if times is not None and np.count_nonzero(np.isfinite(times)) > 1:
             at = np.flatnonzero(np.isfinite(times))
             periods.append(float(np.median(np.diff(times[at]) / np.diff(at))) * 1e3)
-    if exposures and camera.exposure_ms not in exposures:
-        camera = replace(camera, exposure_ms=exposures[0])
+    camera = _exposing(camera, exposures)
     if periods and abs(periods[0] - camera.frame_ms) > SAME_PERIOD * camera.frame_ms:
         period = max(periods[0], camera.exposure_ms)
         rate = max(camera.max_rate_hz, 1000 / period)

@@ -128,8 +128,17 @@ def test_the_prior_map_is_the_last_before_the_visit_or_the_one_named(
 def found_prior(out: Path, visit: str, prior: str) -> tuple[str, float] | None:
     """Name and days of the run that a visit to north goes on from."""
     settings = load_settings(None, {"prior": prior, "visit": visit})
-    found, _ = memory.find_prior(Archive.open(out), settings, "north", SceneGrid(96, 128, 8, 4), CLASSES)
+    found, _ = memory.find_prior(Archive.open(out), settings, "north", SceneGrid(96, 128, 8, 4), CLASSES, "scene")
     return found and (found.run, found.days)
+
+
+def test_other_light_under_the_same_path_is_another_visit(survey_png: Survey, tmp_path: Path) -> None:
+    """A file that was written anew, though all settings are equal; read again it is not the prior map of itself."""
+    flags: dict[str, Any] = {**UNIFORM, "scene": str(tmp_path / "week.png"), "labels": None, "prior": "latest"}
+    for seed, earlier in ((1, False), (2, True), (2, True)):
+        Image.fromarray(patchy_scene((96, 128), 3, seed=seed)[0].astype(np.uint8)).save(tmp_path / "week.png")
+        _, published = words_of(tmp_path / "archive", survey_png, **flags)
+        assert ("memory" in published.receipt) == earlier
 
 
 def test_a_field_of_another_size_is_no_memory(visited: Path, survey_png: Survey, tmp_path: Path) -> None:
