@@ -83,7 +83,7 @@ class TrainFlags(SceneFlags):
     overview_width
         Channels of the overview network.
     columns
-        Number of spectral features per pixel, for any camera.
+        Number of spectral features per pixel, for any camera. Default: 24 for built-in scenes, 48 for files.
     start
         Weights from which the training starts, at a third of the learning rate. They must come from a training of the
         same scenes and sizes. The result is the mean of both networks.
@@ -122,7 +122,7 @@ class TrainFlags(SceneFlags):
     patch: int | None = None
     width: int = TrainRequest.width
     overview_width: int = TrainRequest.overview_width
-    columns: int = TrainRequest.columns
+    columns: int | None = None
     start: Path | None = None
     train_temporal: Path | None = None
     fit_ood: Path | None = None

@@ -136,7 +136,9 @@ def _learned(
 
     common, settings, examples = scenes.common, request.settings, scenes.train.examples
     config, seed = network_config(request, common), settings.seed
-    start = linear_discriminants(LabelledPixels.drawn(examples, np.random.default_rng([0x1DA])), config.classes)
+    rng = np.random.default_rng([0x1DA])
+    pixels = LabelledPixels.drawn(examples, rng).brightened(normalisation.gain_shift, rng)
+    start = linear_discriminants(pixels, config.classes)
     model, summary = train(
         config,
         examples,

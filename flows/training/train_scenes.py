@@ -33,6 +33,8 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.simulator.scenes.built_in import built_in_laws
 from pipeline.simulator.scenes.scene import RasterScene
 
+COLUMNS = {True: 24, False: 48}  # spectral features: of built-in scenes, and of files
+
 
 @dataclass(frozen=True)
 class TrainRequest:
@@ -44,7 +46,7 @@ class TrainRequest:
     validation: int | None = None
     scenes: int | None = None  # of a built-in farm; None: its default
     patch: int | None = None
-    columns: int = 24
+    columns: int | None = None  # of spectral features; None: 24 of built-in scenes, 48 of files
     width: int = 20
     overview_width: int = 8
     tokens: dict[str, Any] = field(default_factory=dict)  # dim, layers, heads, mlp_ratio
@@ -157,8 +159,9 @@ def _common(request: TrainRequest, scene: RasterScene) -> Common:
     if len(scene.class_names) < 2:
         notes = alike_notes({scene.name: scene.class_names[0]})
         raise SceneError(f"{request.dataset}: training needs two or more classes, and {notes[0]}")
-    basis = SpectralBasis.spanning(scene.wavelength_nm, request.columns)
-    patch = request.patch or suggested_patch(scene.shape, built_in=bool(built_in_laws(request.dataset)))
+    built_in = bool(built_in_laws(request.dataset))
+    basis = SpectralBasis.spanning(scene.wavelength_nm, request.columns or COLUMNS[built_in])
+    patch = request.patch or suggested_patch(scene.shape, built_in=built_in)
     common = Common(basis, scene.class_names, scene.class_colours, patch, scene.wavelength_nm)
     network_config(request, common)  # raises for invalid sizes before the first scene is imaged
     return common

@@ -19,6 +19,7 @@ from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 
 NOISY = 0.25  # fraction of crops with added noise
+BRIGHTNESS = 0.04  # standard deviation of the factor of a crop's light
 HALO, STRIP_ROWS = 8, 64  # rows around a strip that its footprint reaches; most rows of a strip
 
 
@@ -146,7 +147,7 @@ class CropSampler:
             labels = example.labels[y : y + size, x : x + size]
             if (labels != UNLABELLED).any():
                 break
-        gain = np.float32(rng.normal(1.0, 0.04))
+        gain = np.float32(rng.normal(1.0, BRIGHTNESS))
         transpose, down, across = rng.integers(0, 2, 3)  # one of the eight symmetries of a square
 
         def turn(image: NDArray[np.generic]) -> NDArray[np.generic]:

@@ -22,7 +22,7 @@ from models.network.machine import PROCESSOR, keep_freed_memory
 from models.network.segmenter import Segmenter
 from models.network.sizes import AROUND_PX, SegmenterConfig
 from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
-from models.training.examples import CropSampler, Example
+from models.training.examples import BRIGHTNESS, CropSampler, Example
 from models.training.objective import PHASES, batch_loss, class_weights, phase_at
 from models.weights.checksummed_files import load_checkpoint, save_checkpoint
 from pipeline.errors import PipelineError
@@ -222,6 +222,11 @@ class LabelledPixels:
             features.append(means.reshape(-1, means.shape[-1])[places])
             labels.append(example.labels.ravel()[places])
         return LabelledPixels(np.concatenate(features), np.concatenate(labels))
+
+    def brightened(self, gain_shift: NDArray[np.float32], rng: np.random.Generator) -> LabelledPixels:
+        """Vary the light of each pixel as that of crops: discriminants that rely on it would be unlearned first."""
+        gain = rng.normal(1.0, BRIGHTNESS, (len(self.features), 1)).astype(np.float32)
+        return LabelledPixels(self.features * gain + (gain - 1) * gain_shift, self.labels)
 
 
 def linear_discriminants(pixels: LabelledPixels, classes: int) -> dict[str, Tensor]:

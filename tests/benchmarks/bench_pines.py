@@ -224,6 +224,7 @@ def _through_camera(folder: Path, path: Path) -> list[Result]:
 
 def _of_the_file(folder: Path, split: Split) -> list[Result]:
     """The segmenter trained on the spectra of the file."""
+    from flows.training.train_scenes import COLUMNS
     from models.network.segmenter import Segmenter
     from models.network.sizes import SegmenterConfig
     from models.network.spectral import SpectralBasis, patches_of
@@ -234,7 +235,7 @@ def _of_the_file(folder: Path, split: Split) -> list[Result]:
     from pipeline.geometry.grid import SceneGrid, pad_by_reflection
 
     scene = _scene(folder)
-    (height, width), basis = split.train.shape, SpectralBasis.spanning(scene.wavelength_nm)
+    (height, width), basis = split.train.shape, SpectralBasis.spanning(scene.wavelength_nm, COLUMNS[False])
     grid = SceneGrid(height, width, patch=8, factor=1)
     columns = (split.values / np.float32(split.values.max())) @ basis.matrix(scene.wavelength_nm)[0]
     columns = np.asarray(pad_by_reflection(columns, grid.padded_shape), np.float32)
@@ -244,7 +245,8 @@ def _of_the_file(folder: Path, split: Split) -> list[Result]:
     normalisation = measured_normalisation([observed])
     example = normalised(observed, normalisation, np.ones(basis.columns, bool))
     config = SegmenterConfig(split.classes, basis.columns, grid.patch)
-    start = linear_discriminants(LabelledPixels.drawn([example], np.random.default_rng(0)), split.classes)
+    pixels, rng = LabelledPixels.drawn([example], np.random.default_rng(0)), np.random.default_rng(1)
+    start = linear_discriminants(pixels.brightened(normalisation.gain_shift, rng), split.classes)
     network, record = train(config, [example], normalisation.gain_shift, _settings(), start=start)
     assert isinstance(network, Segmenter)
     weights = Weights(network, basis, normalisation, scene.class_names, scene.class_colours, {"training": record})

@@ -181,6 +181,20 @@ def test_discriminants_of_absent_classes_are_out_of_reach():
     assert (logits[:, 1] == -20).all()
 
 
+def test_discriminants_do_not_rely_on_the_light() -> None:
+    """A feature that tells classes at one brightness alone has little weight; one that brightness leaves has all."""
+    rng, labels = np.random.default_rng(0), np.repeat(np.array([0, 1], np.uint8), 500)
+    features = (rng.normal(0, 0.1, (1000, 2)) + 1.5 * labels[:, None]).astype(np.float32)
+    shift = np.array([100.0, 0.0], np.float32)  # twice the light moves the first feature by so much
+    own = LabelledPixels(features, labels)
+    weights = [
+        linear_discriminants(one, 2)["spectral.weight"][1, :, 0, 0].abs()
+        for one in (own, own.brightened(shift, np.random.default_rng(1)))
+    ]
+    assert weights[0][0] > 0.5 * weights[0][1]
+    assert weights[1][0] < 0.05 * weights[1][1]
+
+
 def test_a_network_halfway_has_the_mean_of_each_weight() -> None:
     """Neither network changes."""
     one, other = (Segmenter(SegmenterConfig(3, 4, patch=8, width=8, dim=16, layers=1, heads=2)) for _ in range(2))
