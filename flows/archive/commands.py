@@ -267,8 +267,8 @@ def _tree(catalogue: Catalogue, uri: str, shown: set[str]) -> dict[str, Any]:
 def verdict(archive: Archive, findings: list[Finding]) -> dict[str, Any]:
     """Return the summary of a verification, with the surveys that would repair the archive."""
     bad = [finding for finding in findings if finding.problem is not None]
-    places = {finding.uri for finding in findings if finding.kind in ("whole", "broken")}
-    broken = {finding.uri for finding in bad if finding.kind == "broken"}
+    places = {finding.uri for finding in findings if finding.kind in ("whole", "broken", "missing")}
+    broken = {finding.uri for finding in bad if finding.kind in ("broken", "missing")}
     content: dict[str, Any] = {
         "archive": archive.name,
         "checked": len(places),
@@ -416,8 +416,8 @@ def show_verdict(content: dict[str, Any], console: Console) -> None:
     for uri, why in content.get("hopeless", {}).items():
         _say(console, f"{uri} cannot be remade: {why}")
     if content.get("to_remake") or content.get("surveys"):
-        count = counted(len(content["to_remake"]), "broken store")
-        _say(console, f"verify --repair makes {count} anew by:")
+        broken = counted(len(content["to_remake"]), "broken store") if content["to_remake"] else "broken runs"
+        _say(console, f"verify --repair makes {broken} anew by:")
         for survey in content["surveys"]:
             _say(console, f"  {survey['run']}: {survey['command']}")
     _say(console, f"{content['whole']} stores and runs are as published, out of {content['checked']}")

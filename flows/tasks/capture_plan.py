@@ -122,7 +122,8 @@ class PassLayout:
                 asked = (
                     f"--seconds {seconds:g}" if budget is None else f"--budget {budget:g} gives {limit_s:.1f} s, which"
                 )
-                shorter = ", a shorter --coarse-exposure-ms" if self.coarse_exposure_ms is None else ""
+                free = self.coarse_exposure_ms is None and self.recorded is None
+                shorter = ", a shorter --coarse-exposure-ms" if free else ""
                 raise BudgetError(
                     f"{asked} is below the time of the first pass of every {self.first_step}th line, "
                     f"{coarse_s + 0.01:.2f} s of the full scan's {full_s:.1f} s; "

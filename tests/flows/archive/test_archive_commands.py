@@ -164,6 +164,17 @@ def test_a_repair_that_could_do_some_of_it_says_so(archive: Path, capsys: pytest
     assert [one["uri"] for one in content["problems"]] == ["stages/ingest/cube"]
 
 
+def test_what_is_gone_counts_as_broken(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A store that a run names, and a run whose receipt is empty: no store has to be made anew for it."""
+    run = next(archive.glob("runs/*"))
+    (run / "receipt.json").write_text("")
+    assert run_verify(archive, QUIET) == FAILED
+    assert "makes broken runs anew by" in capsys.readouterr().out
+    shutil.rmtree(Archive.open(archive).refs("rectify_fine")[0].path)
+    content = _json(capsys, lambda: run_verify(archive, QUIET, as_json=True), FAILED)
+    assert content["checked"] - content["whole"] == 2
+
+
 def test_commands_ask_for_the_settings_again(tmp_path: Path) -> None:
     """Only what differs from the defaults; tables are pointed at."""
     flags = {"scene": "farm", "size": "640x512", "bands": "3,4", "controls": False, "camera.exposure_ms": 50}
