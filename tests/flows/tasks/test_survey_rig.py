@@ -126,7 +126,7 @@ def test_every_line_is_the_simulated_one(tmp_path: Path, monkeypatch: pytest.Mon
     """By Prefect: coarse sweep, attention, plan and fine sweeps give each line of the simulated survey, and its map."""
     with without_effects(), pytest.MonkeyPatch.context() as patch:  # but for those that it names
         references_of_frames(patch)
-        simulated = run_survey(small_settings(tmp_path / "sim", keep="raw"), QUIET)
+        simulated = run_survey(small_settings(tmp_path / "sim", visit="first", keep="raw"), QUIET)
     effects = chosen_effects(next(ref for ref in Archive.open(tmp_path / "sim").refs("effects")))
     settings = small_settings(tmp_path / "rig", source="rig", visit="first", engine="prefect", keep="raw")
     with emulated(settings, effects, monkeypatch):
