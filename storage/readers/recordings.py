@@ -132,7 +132,7 @@ def open_recording(
 
     Raises SceneError: there is no recording, or files or pointing cannot be used; WavelengthError: there are no
     wavelengths; SettingsError: a flag is given for an archive; ArchiveError, IncompleteStoreError: the archive cannot
-    be read; PoseError: a position of a raw cube is beyond the mirror.
+    be read, or has neither raw lines nor a signal; PoseError: a position of a raw cube is beyond the mirror.
     """
     camera, given = camera or LineCamera(), given or RecordedWith()
     stores = find_raw_cubes(address)

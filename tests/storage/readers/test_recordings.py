@@ -90,6 +90,8 @@ def test_raw_cubes_of_a_folder_a_store_and_an_archive(tmp_path: Path, archive: A
         assert_is_recording_of(recording.sweeps[0], cube)
         numbers = np.array([0, 3, 17])
         np.testing.assert_array_equal(recording.sweeps[0].read_lines(numbers), cube.read()[numbers])
+    longer = replace(CAMERA, exposure_ms=2 * CAMERA.exposure_ms)
+    assert open_recording(store, longer).camera.exposure_ms == full.exposure_ms[0]  # plans are priced as recorded
     with pytest.raises(SettingsError, match=r"--dark is for files, and .* holds raw cubes"):
         open_recording(store, CAMERA, RecordedWith(dark=store))
     with pytest.raises(ArchiveError, match=f"has no run 'x'; its latest are {runs[0].name}, {runs[1].name}"):
