@@ -172,15 +172,19 @@ class RecordedSource:
         """Return a sweep without the lines at either end that were never captured; None where none was.
 
         Plans begin and end a few lines beyond the field, where a recording may have none. A missing line in between
-        stays, and `lines` names it.
+        stays, and `lines` names it. A recorded line that serves the last two lines of an end counts as one of them.
         """
         if self._own(sweep) is not None:
             return sweep
-        served = max((self._nearest(sweep, group)[0] >= 0 for group in self._groups), key=np.count_nonzero)
-        taken = np.flatnonzero(served)
+        found = (self._nearest(sweep, group) for group in self._groups)
+        place, line, _ = max(found, key=lambda one: np.count_nonzero(one[0] >= 0))
+        taken = np.flatnonzero(place >= 0)
         if not len(taken):
             return None
+        again = (np.diff(place) == 0) & (np.diff(line) == 0)  # a line and the next
         first, last = int(taken[0]), int(taken[-1])
+        first += int(first < last and again[first])
+        last -= int(first < last and again[last - 1])
         return replace(sweep, start_px=sweep.start_px + first * sweep.step, lines=last + 1 - first)
 
     def serves(self, sweep: Sweep) -> bool:

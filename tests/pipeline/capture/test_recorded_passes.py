@@ -31,6 +31,18 @@ def test_a_planned_pass_is_cut_where_the_recording_ends() -> None:
     assert passes_over(FULL).source.serves(found)
 
 
+def test_a_recorded_line_serves_the_end_of_a_plan_once() -> None:
+    """A plan half a pixel beside the recording has a line more; a single line, and lines in between, stay."""
+    passes = passes_over(FULL)
+    beside = replace(FULL, start_px=-40.0, lines=81)
+    (found,) = passes.full_scan([beside])
+    assert (found.lines, found.start_px) == (80, -39.0)
+    assert passes.first_pass([beside]) == [found]
+    assert passes.lines_served([found]) == 80
+    (one,) = passes.fine_pass([replace(FULL, name="fine", start_px=-39.75, lines=1)])
+    assert one.lines == 1
+
+
 def test_a_pass_is_laid_on_the_recorded_swaths() -> None:
     """Where no recorded line lies on a planned strip, lines of the same kind go along the recorded one, end to end."""
     passes = passes_over(ASIDE)
