@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 import odc.geo.xr  # noqa: F401 - gives xarray its .odc
@@ -64,7 +66,7 @@ class Exported:
 @pytest.fixture(scope="module")
 def surveys(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Published]]:
     """One archive with the same farm twice: without a pose and with one."""
-    archive = tmp_path_factory.mktemp("surveys") / "field-a"
+    archive = tmp_path_factory.mktemp("surveys") / "field #ä"
     flags = {"size": "128x96", "bands": "20,60,100,150,200", "budget": "0.9", "engine": "plain", "keep": "raw"}
     settings = load_settings(None, {**flags, "out": str(archive), "controls": False, "seed": "1"})
     with without_effects():
@@ -189,7 +191,8 @@ def test_the_catalogue_is_valid_and_leads_to_every_file(exports: list[Exported])
         assert core_problems(Path(done.answer["item"])) == []
         assert extension_problems(done.item()) == []
         for asset in item.assets.values():
-            target = Path(str(asset.get_absolute_href()))
+            assert re.fullmatch("[A-Za-z0-9._~/%-]+", asset.href)
+            target = Path(unquote(str(asset.get_absolute_href())))
             assert (target / "zarr.json").is_file() if "zarr" in asset.media_type else target.is_file()
             assert asset.roles
         assert any(one.title.startswith("Raw sweep ") for one in item.assets.values() if "raw" in one.roles)

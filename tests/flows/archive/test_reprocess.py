@@ -85,6 +85,8 @@ def test_nothing_has_changed_in_fields_however_they_are_chosen(surveyed: Path, r
     rows = reprocess(surveyed)
     assert [(row["field"], row["state"]) for row in rows] == [("turned", "skipped"), ("scene", "skipped")]
     assert rows[1]["old"] == newest
+    run_reprocess(surveyed, QUIET)
+    assert reprocess.capsys.readouterr().out.endswith("2 runs: 2 skipped\n")
     assert len(Archive.open(surveyed).runs()) == 3
     for field in ("turned", "tur*", "turned.png"):
         assert reprocess.states(surveyed, field=field) == [("turned", "skipped")]

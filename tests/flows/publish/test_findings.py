@@ -117,6 +117,8 @@ def test_words_of_a_memory_tell_change_beyond_what_maps_differ_by() -> None:
     assert dict(finding_rows({"memory": memory}))["prior map"] == words
     changed = dict(finding_rows({"memory": memory | {"changed_px": 700}}))["prior map"]
     assert changed == f"{words}; changed 700 px"
+    same = dict(finding_rows({"memory": memory | {"differing_px": 0}}))["prior map"]
+    assert same == words.replace("950", "0")
 
 
 @pytest.mark.parametrize(

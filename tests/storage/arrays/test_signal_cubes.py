@@ -30,6 +30,7 @@ from storage.arrays.signal_cubes import (
     open_signal_cube,
     open_signal_cubes,
 )
+from storage.readers.recordings import RESTORED, open_recording
 from tests.pipeline.signal.made_spectra import CAMERA, DARK, GAIN, MadeLines, field_of, raw_of
 from tests.storage.small_archive import flip
 
@@ -183,6 +184,7 @@ def test_restored_lines_are_raw_numbers(tmp_path: Path, by_mirror: bool) -> None
     cube, _ = store(tmp_path / "fine-0.zarr", lines)
     restored = open_lines(tmp_path / "fine-0.zarr")
     assert isinstance(restored, RestoredCube)
+    assert open_recording(tmp_path / "fine-0.zarr").notes == (RESTORED,)
     numbers = restored.read()
     assert (numbers.dtype, numbers.shape, restored.shape) == (np.uint16, raw.shape, raw.shape)
     off = numbers.astype(float) - raw

@@ -88,6 +88,7 @@ def test_raw_cubes_of_a_folder_a_store_and_an_archive(tmp_path: Path, archive: A
     ):
         recording = open_recording(address, CAMERA)
         assert_is_recording_of(recording.sweeps[0], cube)
+        assert recording.notes == ()
         numbers = np.array([0, 3, 17])
         np.testing.assert_array_equal(recording.sweeps[0].read_lines(numbers), cube.read()[numbers])
     longer = replace(CAMERA, exposure_ms=2 * CAMERA.exposure_ms)
