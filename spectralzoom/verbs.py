@@ -41,7 +41,7 @@ else:
 Asked = str | Path | Mapping[str, Any] | None  # a settings file, a table of settings, or keywords alone
 Told = Callable[[str, float, float], None]
 USUAL = {"engine": "plain"}  # a Prefect server starts only on request
-FILES = ("out", "init", "train_temporal", "fit_ood")
+FILES = ("out", "init", "train_temporal")
 
 
 def survey(settings: Asked = None, *, progress: Told | None = None, quiet: bool = True, **flags: Any) -> OpenedRun:

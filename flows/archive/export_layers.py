@@ -22,7 +22,7 @@ from pipeline.ground.georeference import zoomed_out
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.archive.records import RECEIPT, read_run, read_store
-from storage.arrays.class_maps import OLD_CLASS, ClassNames, legend_of, unpacked_days
+from storage.arrays.class_maps import OLD_CLASS, ClassNames, legend_of
 from storage.arrays.georeference import load_geobox
 from storage.arrays.ground_maps import StoredImage, open_image
 from storage.arrays.layout import grid_of, open_group
@@ -224,8 +224,7 @@ def prior_map_layers(run: ExportedRun) -> list[Layer]:
     """Return the days since each pixel was captured, and what a prior map adds: changes, and earlier classes."""
     layers = []
     if (product := _product_with(run, "age")) is not None:
-        layer = image_layer(run, product, "age", "age", "Days since the pixel was captured", unit="days")
-        layers.append(layer if product == "ground_map" else _in_days(layer))
+        layers.append(image_layer(run, product, "age", "age", "Days since the pixel was captured", unit="days"))
     if (product := _product_with(run, "changed")) is not None:
         title = "Fraction of the patch's pixels with another class than in the prior map"
         make = image_layer if product == "ground_map" else patch_layer
@@ -243,9 +242,3 @@ def _product_with(run: ExportedRun, array: str) -> str | None:
     """Return the product that has an image: the map on the ground, else class probabilities."""
     products = (name for name in ("ground_map", PROBABILITIES) if run.store(name) is not None)
     return next((name for name in products if array in open_group(run.path(name))), None)
-
-
-def _in_days(layer: Layer) -> Layer:
-    """Return a layer of packed ages in float32, as few readers of GeoTIFF apply a scale."""
-    image = replace(layer.image, dtype="float32")
-    return replace(layer, image=image, rows=lambda: ((first, unpacked_days(rows)) for first, rows in layer.rows()))

@@ -15,7 +15,6 @@ from flows.cli.app import AsJson, OutFile, OutFolder, parse_numbers, parse_whole
 from flows.evaluate.command import run_evaluate
 from flows.evaluate.frames import FRACTIONS, USUAL, EvaluateRequest
 from flows.terminal.progress import print_json
-from flows.training.fit_ood import OodRequest, run_measure_ood
 from flows.training.train import CROPS_PX, asked_command, run_train
 from flows.training.train_scenes import TrainRequest
 from flows.training.train_temporal import JUDGED_LANDS, LANDS, TemporalRequest, run_remember
@@ -91,9 +90,6 @@ class TrainFlags(SceneFlags):
         Weights to which only a temporal reader is added, for surveys with --prior. It takes --scenes, --steps,
         --minutes, --seed and --validation, and resumes. It needs 4 GB of memory, and half an hour for reading the
         scenes besides --minutes.
-    fit_ood
-        Weights to which only an out-of-distribution detector is added. DATASET must be the data set of their training.
-        Surveys then label out-of-distribution pixels `unknown`. Training with validation scenes adds it by default.
     dim
         Token width of the transformer.
     layers
@@ -125,7 +121,6 @@ class TrainFlags(SceneFlags):
     columns: int | None = None
     start: Path | None = None
     train_temporal: Path | None = None
-    fit_ood: Path | None = None
     dim: int = 64
     layers: int = 3
     heads: int = 4
@@ -243,15 +238,13 @@ def train(dataset: str, *, out: OutFile, flags: TrainFlags = NO_TRAIN_FLAGS, as_
 
 
 def run_training(dataset: str, out: Path, flags: TrainFlags, command: str, console: Console) -> dict[str, Any]:
-    """Train weights, or only the temporal reader or the detector of given ones; return the record."""
+    """Train weights, or only the temporal reader of given ones; return the record."""
     if flags.train_temporal is not None:
         how = TemporalTraining(flags.minutes, flags.steps, flags.seed)
         lands = LANDS if flags.scenes is None else flags.scenes
         judged = JUDGED_LANDS if flags.validation is None else flags.validation
         request = TemporalRequest(dataset, flags.train_temporal, out, lands, judged, settings=how, command=command)
         return run_remember(request, console)
-    if flags.fit_ood is not None:
-        return run_measure_ood(OodRequest(dataset, flags.fit_ood, out, flags.choices(), command), console)
     return run_train(flags.request(dataset, out, command), console)
 
 

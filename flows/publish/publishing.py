@@ -25,7 +25,6 @@ from flows.tasks.stages.accuracy import evaluate
 from flows.tasks.stages.capture import capture_coarse, capture_fine
 from flows.tasks.stages.condense import raw_differs
 from pipeline.lazy import deferred
-from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, canonical_json
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run, read_run
@@ -84,8 +83,10 @@ def _clear_raw(plan: OpenSurvey, run: RunRef) -> RunRef:
     archive, passes = plan.run.archive, [plan.products[name] for name in PASSES if name in plan.products]
     if not plan.products.signals or any(archive.find(raw.stage, raw.key) is None for raw in passes):
         return run  # cleared before
-    others = (_kept_by_others(archive, raw) for raw in passes)
-    why = next(filter(None, others), None) or raw_differs(passes, plan.products.signals[0], plan.run.camera)
+    catalogue = Catalogue.read(archive.root)
+    others = [one for raw in passes for one in catalogue.named_by(raw.uri) if not is_outlived(one, archive.now())]
+    kept = f"{others[0].uri} keeps them" if others else None
+    why = kept or raw_differs(passes, plan.products.signals[0], plan.run.camera)
     if any(archive.find(raw.stage, raw.key) is None for raw in passes):
         return run  # cleared meanwhile, by another survey
     if why is not None:
@@ -103,12 +104,6 @@ def _clear_first_mosaic(plan: OpenSurvey) -> None:
         return
     if not any(run.products.get("mosaic", "").startswith(first.uri) for run in Catalogue.read(archive.root).runs):
         archive.clear(first, wait=False)
-
-
-def _kept_by_others(archive: Archive, raw: StageRef) -> str | None:
-    """Return the other run that keeps raw lines; None without one."""
-    runs = Catalogue.read(archive.root).named_by(raw.uri)
-    return next((f"{one.uri} keeps them" for one in runs if not is_outlived(one, archive.now())), None)
 
 
 def _ref(published: Published, *, pending: bool = False) -> RunRef:

@@ -96,9 +96,9 @@ def choose_extent(
     """Choose the lines of a partial scan within a time; return their layout, the choice, and a sentence.
 
     Patches that would become older than ``max_age`` days come first. Pixels of ``left_out`` (y, x) are not of interest:
-    they lie outside of zones or have no data. Raises NothingToMend: the expected error of the
-    prior map is below ``skip_below_error``, and no patch is too old; WeightsError: the weights have no scan performance
-    table; BudgetError: no line fits the time; names the least time; PoseError: the field exceeds the mirror's range.
+    they lie outside of zones or have no data. Raises NothingToMend: the expected error of the prior map is below
+    ``skip_below_error``, and no patch is too old; WeightsError: the weights have no scan performance table;
+    BudgetError: no line fits the time; names the least time; PoseError: the field exceeds the mirror's range.
     """
     content, grid = weights.record.get("scans"), layout.grid
     if content is None:

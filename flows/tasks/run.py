@@ -364,7 +364,6 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
         raise SettingsError(refused)
     pixels, scene, notes, label_notes = _scene_for(model, settings, recorded, planning=planning)
     grid = SceneGrid(*scene.shape, described.config.patch, 1)
-    bands = len(scene.wavelength_nm)
     zones = open_zones(settings.zones, place_of_field(settings, scene), grid)
     outside = beyond_training(settings, scene, described, model.trained_on, path)
     ood_detector = model.asked_ood(settings.unknown)
@@ -373,20 +372,15 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
         settings = replace(settings, skip_below_error=None)
     if settings.extent == EXTENT_PART:  # the prior map chooses the lines
         archive = open_archive(settings.out) if archive is None and is_archive(settings.out) else archive
-        found = (
-            (None, ())
-            if archive is None
-            else find_prior(archive, settings, name, grid, described.class_names, scene.key)
-        )
+        asked = (settings, name, grid, described.class_names, scene.key)
+        found = (None, ()) if archive is None else find_prior(archive, *asked)
     passes = None if recorded is None else recorded.passes
     planned = _PlannedCapture(settings)
     if pixels is None:
         prior = None if found is None else found[0]
-        left_out = [one for one in (zones.left_out, scene.missing) if one is not None]
-        where = {"shown": zones.shown, "left_out": np.logical_or.reduce(left_out) if left_out else None}
-        planned = _plan_capture(settings, grid, bands, path, described, prior, passes=passes, **where)
+        planned = _plan_capture(settings, scene, zones, path, described, prior, passes)
     settings, plan = planned.settings, planned.plan
-    read = min(bands, SMOOTH)  # components that the network reads, at most
+    read = min(len(scene.wavelength_nm), SMOOTH)  # components that the network reads, at most
     costs = ReadingCosts(described.config, grid, read)
     shown = None if zones.fractions is None else zones.fractions > 0
     budget = None if settings.macs is None else PatchBudget.asked(costs, shown, settings.policy, settings.macs)
@@ -455,14 +449,11 @@ class _PlannedCapture:
 
 def _plan_capture(
     settings: Settings,
-    grid: SceneGrid,
-    bands: int,
+    scene: RasterScene,
+    zones: SurveyZones,
     path: Path,
     described: Description,
     prior: Prior | None,
-    *,
-    shown: NDArray[np.bool_] | None,
-    left_out: NDArray[np.bool_] | None,
     passes: RecordedPasses | None,
 ) -> _PlannedCapture:
     """Choose the extent, then the uniform scan or two passes, for the weights of the file ``path``.
@@ -473,16 +464,16 @@ def _plan_capture(
     if is_part and prior is None:
         settings = replace(settings, extent=EXTENT_WHOLE, max_age=None, skip_below_error=None)
         extent_notes = ("there is no prior map: the whole field is captured",)
-    layout = PassLayout.of(settings, grid, shown, passes)
+    layout = PassLayout.of(settings, zones.grid, zones.shown, passes)
     if is_part and prior is not None:
         assert settings.seconds is not None  # checked with the settings
-        limits = {"max_age": settings.max_age, "skip_below_error": settings.skip_below_error}
+        limits: dict[str, Any] = {"max_age": settings.max_age, "skip_below_error": settings.skip_below_error}
+        masks = [one for one in (zones.left_out, scene.missing) if one is not None]
+        limits |= {"seconds": settings.seconds, "left_out": np.logical_or.reduce(masks) if masks else None}
         light = settings.sky.fraction_of_clear
-        layout, extent, note = choose_extent(
-            layout, prior, described, path, light, seconds=settings.seconds, left_out=left_out, **limits
-        )
+        layout, extent, note = choose_extent(layout, prior, described, path, light, **limits)
         extent_notes = (note,)
-    scans = choose_uniform_scan(layout, described, path, bands, settings)
+    scans = choose_uniform_scan(layout, described, path, len(scene.wavelength_nm), settings)
     layout, plan, settings, plan_notes = lay_out_passes(layout, scans, described, settings)
     scans = replace(scans, chosen=None) if settings.zooms else scans
     settings = replace(settings, extent=layout.extent)

@@ -78,8 +78,8 @@ class SurveyModel:
         """Return the out-of-distribution detector if ``unknown`` requests one. Raises WeightsError: it is missing."""
         if unknown not in (UNKNOWN_AUTO, UNKNOWN_OFF) and self.described.ood_detector is None:
             raise WeightsError(
-                f"--unknown {unknown}: {self.path.name} has no out-of-distribution detector; add one with: "
-                f"spectralzoom train DATASET --fit-ood {self.path} -o {self.path}, or leave --unknown out"
+                f"--unknown {unknown}: {self.path.name} has no out-of-distribution detector; train weights with "
+                "validation scenes (spectralzoom train DATASET --validation 3), or leave --unknown out"
             )
         return None if unknown == UNKNOWN_OFF else self.described.ood_detector
 

@@ -99,7 +99,7 @@ def train_weights(
     checkpoint.unlink(missing_ok=True)
     about = {"command": request.command, **({} if scans is None else {MAP_SCORES: scans[1].as_dict()})}
     try:
-        fit_and_add(weights, (request.out, request.out), scenes, trained, settings.seed, about, report)
+        fit_and_add(weights, request.out, scenes, trained, settings.seed, about, report)
     except SceneError as error:
         record["familiar"] = f"no pixel will be classified as unknown: {error}"
     return record

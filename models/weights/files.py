@@ -208,19 +208,17 @@ def save_weights(weights: Weights, path: Path) -> None:
     write_checksummed(path, {**about, "format": FORMAT, "keys": keys}, tensors)
 
 
-def add_ood(
-    weights: Path, out: Path, ood_detector: OodDetector, trained_on: TrainedOn, record: Mapping[str, Any]
-) -> None:
-    """Write the weights of a file with an out-of-distribution detector to ``out``, which may be the same file.
+def add_ood(weights: Path, ood_detector: OodDetector, trained_on: TrainedOn, record: Mapping[str, Any]) -> None:
+    """Add an out-of-distribution detector to a file of weights.
 
-    Raises WeightsError: the weights cannot be read, or ``out`` not be written.
+    Raises WeightsError: the file cannot be read or written.
     """
     limits = ood_detector.limits
     arrays = {name: getattr(ood_detector, name) for name in OF_COMPONENTS}
     arrays |= {name: getattr(limits, name) for name in OF_LIMITS}
     tensors = {name: torch.from_numpy(np.ascontiguousarray(one, np.float32)) for name, one in arrays.items()}
     about = {"bands": ood_detector.bands, "steps": list(limits.steps), "trained_on": trained_on.as_dict()}
-    _add_part(weights, out, OOD, {**about, "record": dict(record)}, tensors)
+    _add_part(weights, weights, OOD, {**about, "record": dict(record)}, tensors)
 
 
 def add_reader(weights: Path, out: Path, reader: TemporalReader, record: Mapping[str, Any]) -> None:
@@ -242,8 +240,8 @@ def load_ood(weights: Path) -> OodDetector:
     described = describe_weights(weights)
     if (about := described.ood_detector) is None:
         raise WeightsError(
-            f"{weights} has no out-of-distribution detector; fit one with: spectralzoom train DATASET"
-            f" --fit-ood {weights} -o {weights}"
+            f"{weights} has no out-of-distribution detector; train weights with validation scenes: spectralzoom train "
+            "DATASET --validation 3"
         )
     tensors = _read_part(weights, described, OOD)
     with refusing(weights):

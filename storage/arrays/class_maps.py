@@ -1,12 +1,8 @@
 """Store class maps and class probabilities on the grid of a mosaic; `ground_maps` stores maps on the ground.
 
-Names of classes are CF flags. Each pixel has log-probabilities of its classes, and age and light of its last capture,
-packed by CF's rules (scale_factor, add_offset). Units of the packed integers:
-
-    log_probability   one byte, 0.05 nat; all classes less likely than 1 in 1100 have the same value
-    log2_light        one byte, 1/16 octave
-    age               two bytes, 1/8 day
-
+Names of classes are CF flags. Each pixel has log-probabilities of its classes, and age and light of its last capture.
+Log-probabilities are packed by CF's rules into one byte of 0.05 nat; all classes less likely than 1 in 1100 have the
+same value. Ages and light are floats: each visit starts from those of the one before, and rounding would add up.
 Confidence is stored as floats in steps of 1/256.
 """
 
@@ -44,10 +40,8 @@ CONFIDENCE = {"long_name": "probability of the class given", "units": "1", "vali
 CONFIDENCE_STEP = 1 / 256
 STEP, FAINTEST, NOTHING = 0.05, -12.7, 255  # nats; 254 is certainty, 255 unknown
 LEAST, UNLIKELY = -7.0, -11.0  # nats: lower values are stored as their mean, in a tenth of the bytes
-DAY_STEP, NEVER = 1 / 86400, 2**32 - 1  # each visit rounds the age of the one before: a second is short enough
-OCTAVE_STEP, DARKEST, DARK = 2.0**-12, -10.0, 65535  # log2 of reference exposures; the last: without any light
 # values of the images in unknown pixels
-NOT_BELIEVED = {"log_probability": NOTHING, "age": NEVER, "log2_light": DARK}
+NOT_BELIEVED = {"log_probability": NOTHING, "age": np.nan, "light": 0}
 OLD_CLASS = "changed_from"
 CHANGED = {"long_name": "fraction of the patch's pixels with another class than remembered", "units": "1"}
 Floats = NDArray[np.float32]
@@ -171,11 +165,10 @@ def create_probabilities(
         **place,
     }
     _create_flat(group, "log_probability", ("y", "x", "class"), (*shape, len(legend.names)), "|u1", about)
-    about = {"long_name": "time since the pixel was looked at", "units": "days", "scale_factor": DAY_STEP, **place}
-    _create_flat(group, "age", ("y", "x"), shape, "<u4", {**about, "_FillValue": NEVER})
-    about = {"long_name": "log2 of the reference exposures that it rests on", "units": "1", "_FillValue": DARK, **place}
-    packing = {"scale_factor": OCTAVE_STEP, "add_offset": DARKEST}
-    _create_flat(group, "log2_light", ("y", "x"), shape, "<u2", {**about, **packing})
+    about = {"long_name": "time since the pixel was looked at", "units": "days", **place}
+    _create_flat(group, "age", ("y", "x"), shape, "<f4", about)
+    about = {"long_name": "reference exposures that it rests on", "units": "1", **place}
+    _create_flat(group, "light", ("y", "x"), shape, "<f4", about)
     if goes_on:
         _create_flat(group, OLD_CLASS, ("y", "x"), shape, "|u1", {**old_class_flags(legend), **place})
 
@@ -196,7 +189,7 @@ def write_probabilities_tile(
     Raises IncompleteStoreError: there is no store.
     """
     group = open_group(path, "r+")
-    likelihood, ages, octave = (array_of(group, name) for name in ("log_probability", "age", "log2_light"))
+    likelihood, ages, lights = (array_of(group, name) for name in ("log_probability", "age", "light"))
     place = tile_place(origin, age_days.shape)
     for top in range(
         0, len(age_days), SHARD_ROWS
@@ -206,11 +199,7 @@ def write_probabilities_tile(
         packed = np.rint((likely - FAINTEST) / STEP)
         rows = slice(place[0].start + top, place[0].start + top + len(part))
         likelihood[rows, place[1]] = np.where(np.isnan(part), NOTHING, np.minimum(packed, NOTHING - 1)).astype(np.uint8)
-    days = np.minimum(np.rint(np.maximum(age_days, 0, dtype=np.float64) / DAY_STEP), NEVER - 1)
-    ages[place] = np.where(np.isnan(age_days), NEVER, days).astype(np.uint32)
-    octaves = np.clip(np.log2(np.maximum(light, 2.0**DARKEST)), DARKEST, DARKEST + OCTAVE_STEP * (DARK - 1))
-    packed = np.rint((octaves - DARKEST) / OCTAVE_STEP)
-    octave[place] = np.where(light > 0, packed, DARK).astype(np.uint16)
+    ages[place], lights[place] = age_days, light
 
 
 def write_changes_tile(path: Path, origin: tuple[int, int], old_class: NDArray[np.uint8]) -> None:
@@ -232,11 +221,6 @@ def drop_changes(path: Path) -> None:
 def write_changes(path: Path, changed: Floats, patch_px: int) -> None:
     """Add the fraction of changed pixels of each patch (patch_y, patch_x) of ``patch_px`` to class probabilities."""
     write_image(open_group(path, "r+"), "changed", ("patch_y", "patch_x"), changed, {**CHANGED, "patch_px": patch_px})
-
-
-def unpacked_days(packed: NDArray[np.uint32]) -> Floats:
-    """Return packed ages in days; NaN where unknown."""
-    return np.where(packed == NEVER, np.float32(np.nan), packed * np.float32(DAY_STEP)).astype(np.float32)
 
 
 class Changes(NamedTuple):
@@ -269,14 +253,12 @@ class ProbabilityStore:
         values = (packed * np.float32(STEP) + np.float32(FAINTEST)).astype(np.float32)
         values -= np.log(np.exp(values).sum(axis=-1, keepdims=True))
         values[packed == NOTHING] = np.nan
-        days = self.age(rows, columns)
-        packed_light = read_array(self._group, "log2_light", np.s_[rows, columns])
-        light = np.exp2(packed_light * np.float32(OCTAVE_STEP) + np.float32(DARKEST))
-        return values, days, np.where(packed_light == DARK, 0, light).astype(np.float32)
+        light = read_array(self._group, "light", np.s_[rows, columns])
+        return values, self.age(rows, columns), np.nan_to_num(light)
 
     def age(self, rows: slice = slice(None), columns: slice = slice(None)) -> Floats:
         """Return (y, x) days since each pixel was captured; NaN where unknown."""
-        return unpacked_days(read_array(self._group, "age", np.s_[rows, columns]))
+        return read_array(self._group, "age", np.s_[rows, columns])
 
     def old_class(self) -> NDArray[np.uint8] | None:
         """Return the previous (y, x) classes of changed pixels, else 255; None for a first visit."""

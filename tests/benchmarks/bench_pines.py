@@ -3,7 +3,8 @@
 Two inputs, the same for everyone: the spectra of the file as they are, and what the simulated camera makes of them (its
 blur and noise), which is what surveys and `spectralzoom train` see. The peers read every band, pixel by pixel and
 averaged over 5 x 5 px; their settings are chosen on the training pixels alone, one half of each field against the
-other, as the test halves lie. bench_pines.py --weights FILE judges weights of the command instead of training some.
+other, as the test halves lie. bench_pines.py --weights FILE judges weights of the command instead of training some;
+--halves trains on one half of the training fields and judges on the other, to choose settings.
 """
 
 from __future__ import annotations
@@ -83,6 +84,17 @@ def rows(weights: Sequence[Path] = ()) -> list[Row]:
     seen = replace(split, values=_seen_by_camera(folder))
     table = _compared(found, _peers(seen, "camera"))
     return table + _compared([] if weights else _of_the_file(folder, split), _peers(split, "file"))
+
+
+def rows_of_halves() -> list[Row]:
+    """The segmenter trained on one half of each training field and judged on the other, and the other way round."""
+    folder = data_folder("indian_pines")
+    split, found = _open(folder), list[Row]()
+    half = halves(split.train)
+    for one in (0, 1):
+        train, test = (np.where(half == part, split.train, UNLABELLED).astype(np.uint8) for part in (one, 1 - one))
+        found += map(_row, _of_the_file(folder, replace(split, train=train, test=test)))
+    return found
 
 
 def _compared(ours: Sequence[Result], peers: Sequence[Result]) -> list[Row]:
@@ -279,7 +291,9 @@ def _judged(source: str, weights: Weights, seen: CoarsePrediction, fine: Values,
 def main(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(description="Indian Pines beside LDA, SVM and random forest.")
     parser.add_argument("--weights", type=Path, action="append", default=[], metavar="FILE", help="several are seeds")
-    for row in rows(parser.parse_args(arguments).weights):
+    parser.add_argument("--halves", action="store_true", help="train and judge on halves of the training fields")
+    flags = parser.parse_args(arguments)
+    for row in rows_of_halves() if flags.halves else rows(flags.weights):
         met = {True: "met", False: "NOT met", None: ""}[row.met]
         print("  ".join(text for text in (row.what, row.figure, row.goal, met, row.peers) if text))
     return 0

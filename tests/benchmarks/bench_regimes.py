@@ -7,7 +7,8 @@ Three ways in the same seconds: the best uniform scan; every 4th or 8th line fir
 gain (zoomed); and the same with the rectangle's patches known (ideal), in the exposure that shows all of them. The
 planner takes one of the first two before it has seen the field.
 
-`python tests/benchmarks/bench_regimes.py PICTURE` also draws the map of regimes.
+`python tests/benchmarks/bench_regimes.py PICTURE` also draws the map of regimes; with `other` in its place it compares
+fields and seconds with which nothing was chosen.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -45,6 +47,17 @@ LIGHTS, SHARES, SWATHS = (1.0, 0.0625), (1.0, 0.25, 0.0625), (1, 8)
 EXPOSURES_MS = (2.5,)  # of every line, by which seconds are stated
 LINES, SETUP_S = 515, 2.0  # of one swath of the full scan
 WAYS, PLANNER = ("never", "always", "ideal"), "auto"
+OTHER = (  # light, share of interest, swaths, seconds, farms
+    *((1.0, 1 / 16, 8, 27.3, (71, 72, 73)), (1 / 16, 1 / 16, 8, 181.8, (71, 72, 73))),
+    *(
+        (1.0, 1.0, 8, 27.3, (71, 72, 73)),
+        (1 / 16, 1.0, 8, 181.8, (71, 72, 73)),
+        (1 / 16, 1 / 4, 8, 181.8, (71, 72, 73)),
+    ),
+    *((1.0, 1 / 4, 8, 21.0, (64, 65, 66)), (1.0, 1 / 4, 8, 27.3, (64, 65, 66))),
+    *((1.0, 1 / 16, 8, 58.0, SEEDS), (1.0, 1.0, 8, 58.0, SEEDS), (1.0, 1 / 16, 4, 14.2, SEEDS)),
+    *((1 / 16, 1 / 16, 4, 91.4, SEEDS), (1.0, 1.0, 4, 14.2, SEEDS), (1 / 16, 1.0, 4, 91.4, SEEDS)),
+)
 GOALS = {1.0: -0.3, 0.25: -0.3, 0.0625: 3.0}  # points over the uniform scan, in the mean of a share's cells
 
 
@@ -165,6 +178,16 @@ def rows(picture: Path | None = None) -> list[Row]:
     return found
 
 
+def print_other() -> None:
+    """Print a row of the table in docs/measurements/accuracy.md for each of `OTHER`."""
+    for light, share, swaths, seconds, farms in OTHER:
+        uniform, zoomed = ([score(one, share, light, swaths, seconds, way) for one in farms] for way in WAYS[:2])
+        words = [", ".join(f"{one:.1f}" for one in scores) for scores in (uniform, zoomed)]
+        gain = np.mean(zoomed) - np.mean(uniform)
+        where = f"{Fraction(light)}, {Fraction(share)}, {swaths}, {seconds:.0f} s"
+        print(f"| {where} | {farms} | {words[0]} | {words[1]} | {gain:+.1f} |", flush=True)
+
+
 def draw(measured: Sequence[Cell], picture: Path) -> None:
     """Draw the gain over the best uniform scan, for each way, light, share and field."""
     ways = {PLANNER: "planner", "always": "always zoomed", "ideal": "known place"}
@@ -187,4 +210,7 @@ def draw(measured: Sequence[Cell], picture: Path) -> None:
 
 
 if __name__ == "__main__":
-    rows(Path(sys.argv[1]) if len(sys.argv) > 1 else None)
+    if sys.argv[1:] == ["other"]:
+        print_other()
+    else:
+        rows(Path(sys.argv[1]) if len(sys.argv) > 1 else None)

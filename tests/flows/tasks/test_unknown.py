@@ -37,7 +37,7 @@ def add_judgement(weights: Path, path: Path, limit: float, tables: dict[str, Any
     one, table = np.eye(3), np.full((1, 1, 2), limit)
     limits = Limits(np.array([0.001, 0.05]), np.ones(1), (1,), table)
     ood_detector = OodDetector(np.zeros((1, 3)), one[None], 1e-9 * one[None], 1e-9 * one, limits, 3)
-    add_ood(path, path, ood_detector, SEEN, tables)
+    add_ood(path, ood_detector, SEEN, tables)
     return path
 
 
@@ -160,7 +160,7 @@ def test_the_default_of_a_zoomed_survey_is_off(flags: dict[str, str], rate: floa
 
 def test_a_rate_needs_weights_that_were_measured(survey_png: Survey, weights: Path, tmp_path: Path) -> None:
     """With the command that measures them; nothing is left behind."""
-    with pytest.raises(WeightsError, match=r"--unknown 1%: .* has no out-of-distribution detector.* --fit-ood"):
+    with pytest.raises(WeightsError, match=r"--unknown 1%: .* has no out-of-distribution detector.* --validation 3"):
         survey_png(tmp_path / "out", weights=str(weights), unknown="1%")
     assert not (tmp_path / "out").exists()
 

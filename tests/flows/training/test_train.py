@@ -20,7 +20,6 @@ from flows.training import figures, train_scenes
 from flows.training import train as flow
 from flows.training.data import TrainingData
 from flows.training.figures import judge_baselines
-from flows.training.fit_ood import OodRequest, measure_ood
 from flows.training.train import run_train, train_weights
 from flows.training.train_scenes import TrainRequest, suggested_patch
 from models.evaluation.expected_scores import MapScores
@@ -28,7 +27,7 @@ from models.evaluation.metrics import mean_iou
 from models.evaluation.placement import ReadTwice
 from models.training.examples import Example
 from models.training.train import TrainingSettings
-from models.weights.files import TrainedOn, describe_weights, load_ood, load_weights
+from models.weights.files import TrainedOn, describe_weights, load_weights
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
@@ -82,21 +81,11 @@ def test_new_weights_say_what_they_saw_and_know_what_is_ood(tmp_path: Path):
     told = TrainedOn.read(load_weights(out).record["trained_on"])
     assert (told.scenes, told.exposure_ms, told.day) == (3, (100.0, 100.0), None)
     assert 0 <= record["calibration"]["expected_error"] <= 1
-    known, part = load_ood(out), describe_weights(out).ood_detector
+    part = describe_weights(out).ood_detector
     assert part is not None
     assert part.trained_on == told
-    again = tmp_path / "again.safetensors"
-    measure_ood(OodRequest(str(field), out, again))
-    measured = load_ood(again)
-    np.testing.assert_allclose(measured.centres, known.centres, atol=1e-5)
-    np.testing.assert_allclose(measured.limits.fine, known.limits.fine, rtol=1e-4)
-    other = write_field(tmp_path / "other", (32, 32), ("007", "008", "009"))
-    with pytest.raises(SettingsError, match="give the data set of their training"):
-        measure_ood(OodRequest(str(other), out, again))
     assert "no scene was kept" in train_weights(_request(field, out, validation=0))["familiar"]
     assert describe_weights(out).ood_detector is None
-    with pytest.raises(SettingsError, match="no scene was kept for validation"):
-        measure_ood(OodRequest(str(field), out, again))
 
 
 @pytest.mark.parametrize("sizes", [{"patch": 24}, {"tokens": {"dim": 18}}])
@@ -245,8 +234,6 @@ def test_weights_for_short_exposures_have_a_record_of_plain_scans(folder: Path, 
     scores = _map_scores(out)
     assert (scores.steps, scores.exposures_ms, scores.scenes) == ((1, 2, 4, 8), (6.0, 12.0, 25.0, 50.0, 100.0), 2)
     assert np.abs(scores.bias).max() > 0.01
-    measure_ood(OodRequest(str(folder), out, out))
-    np.testing.assert_allclose(_map_scores(out).bias, scores.bias, atol=0.05)
     assert "scans" not in train_weights(_request(folder, out, validation=2))
     assert "scans" not in train_weights(_request(folder, out, validation=0, settings=settings))
 

@@ -42,7 +42,7 @@ def with_ood(path: Path) -> None:
     columns = describe_weights(path).config.columns
     one = np.eye(columns)
     measured = OodDetector(np.zeros((1, columns)), one[None], 0.1 * one[None], 0.1 * one, some_limits(), 10)
-    add_ood(path, path, measured, SEEN, {"scenes": 48})
+    add_ood(path, measured, SEEN, {"scenes": 48})
 
 
 def with_reader(path: Path, **changed: int) -> None:
@@ -78,7 +78,7 @@ def test_what_is_added_is_read_and_leaves_the_weights_as_they_were(path: Path) -
         torch.testing.assert_close(weights.segmenter.state_dict()[name], tensor, rtol=0, atol=0)
 
 
-@pytest.mark.parametrize(("load", "words"), [(load_ood, "--fit-ood"), (load_reader, "--train-temporal")])
+@pytest.mark.parametrize(("load", "words"), [(load_ood, "--validation"), (load_reader, "--train-temporal")])
 def test_a_part_that_is_not_there_says_how_it_is_made(path: Path, load: Callable[[Path], object], words: str) -> None:
     """The message names the file and the command."""
     with pytest.raises(WeightsError, match=rf"own\.safetensors.*spectralzoom train DATASET {words}"):
