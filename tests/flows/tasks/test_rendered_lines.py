@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from flows.settings.load import load_settings
-from flows.tasks.run import noise_seed
+from flows.tasks.run import make_source
 from flows.tasks.stages.capture import take_lines
 from pipeline.errors import RigError, SceneError
 from pipeline.geometry.camera import LineCamera
@@ -132,8 +132,11 @@ def test_nothing_is_rendered_after_lines_are_refused(error: BaseException) -> No
 
 
 def test_every_visit_has_noise_of_its_own() -> None:
-    """Also every day and hour of a farm; the first visit on the usual day has the seed of the settings."""
+    """Also every day and hour of a farm, and pointing errors; the usual day has the seed of the settings."""
     asked = ({}, {"visit": "a"}, {"visit": "b"}, {"day": "179"}, {"day": "179", "visit": "a"}, {"hour": "9"})
-    seeds = [noise_seed(load_settings(None, {"scene": "farm", "seed": "7", **one})) for one in asked]
-    assert seeds[0] == 7 == noise_seed(load_settings(None, {"scene": "farm", "seed": "7", "day": "172"}))
+    given, scene = {"scene": "farm", "seed": "7", "pointing_px": "2"}, source_of().scene
+    sources = [make_source(scene, load_settings(None, given | one)) for one in (*asked, {"day": "172"})]
+    seeds = [source.seed for source in sources]
+    assert seeds[0] == seeds[-1] == 7
     assert len(set(seeds)) == len(asked)
+    assert [source.pointing and source.pointing.seed for source in sources] == seeds
