@@ -231,7 +231,7 @@ class Settings:
     zoom: Literal["auto", "never", "always"] = stated(
         AUTO,
         "Two-pass survey: every 4th or 8th line first, then the lines of highest expected gain; auto: with --seconds,"
-        " for fields of four swaths or more, if the weights' table of scans expects as much as of a uniform scan",
+        " for fields of eight swaths or more, if the weights' table of scans expects as much as of a uniform scan",
     )
     seconds: float | None = stated(
         None,

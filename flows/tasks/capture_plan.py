@@ -37,7 +37,7 @@ from pipeline.planning.uniform_scans import (
 )
 from pipeline.rectify.registration.overlaps import LEAST_OVERLAP_PX
 
-LEAST_SWATHS = 4  # of a field on which two passes pay (docs/measurements/accuracy.md)
+LEAST_SWATHS = 8  # of a field on which two passes pay (docs/measurements/accuracy.md)
 NEARLY = 0.003  # of mIoU: expected scores that differ by less count as equal
 
 

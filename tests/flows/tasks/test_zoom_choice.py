@@ -22,15 +22,15 @@ def planned(out: Path, **flags: str) -> SurveyRun:
     [
         (WIDE, True),
         ({**WIDE, "seconds": "182", "sky.light_fraction": "0.0625"}, True),
-        ({**WIDE, "camera.samples": "160", "seconds": "10"}, False),  # first pass and set-ups leave too little time
+        ({**WIDE, "camera.samples": "160", "seconds": "14"}, False),  # four swaths
         ({**WIDE, "camera.samples": "640", "seconds": "6"}, False),
         ({**WIDE, "seconds": "200"}, False),  # a uniform scan is as good as the best
         ({"camera.samples": "80"}, False),
         ({**WIDE, "zoom": "never"}, False),
         ({**WIDE, "macs": "60%"}, False),
         ({**WIDE, "kept_bytes": "8MB"}, False),
-        ({"size": "2560x2048", "seconds": "60"}, True),
-        ({"size": "2560x2048", "seconds": "60", "pointing_px": "2"}, False),
+        ({"size": "5120x4096", "seconds": "150"}, True),
+        ({"size": "5120x4096", "seconds": "150", "pointing_px": "2"}, False),
         ({"camera.samples": "80", "goal": "85"}, False),
     ],
     ids=str,
