@@ -178,6 +178,7 @@ def test_prefect_makes_the_stores_that_plain_makes(
     """Keys, savings and accuracy are those of plain; tasks have the edges, logs and artifacts of the mission."""
     from prefect.client.orchestration import get_client
     from prefect.client.schemas.filters import ArtifactFilter, ArtifactFilterFlowRunId, LogFilter, LogFilterFlowRunId
+    from prefect.logging.handlers import APILogHandler
 
     with with_effects():  # as the other has them
         flow = survey_png(tmp_path / "flow", engine="prefect").receipt
@@ -187,6 +188,7 @@ def test_prefect_makes_the_stores_that_plain_makes(
     assert flow["accuracy"] == plain["accuracy"]
 
     run, tasks = newest_run("survey", len(flow["stages"]) + len(STEPS))
+    APILogHandler().flush()  # lines are sent in batches
     with get_client(sync_client=True) as client:
         log = [one.message for one in client.read_logs(LogFilter(flow_run_id=LogFilterFlowRunId(any_=[run.id])))]
         mine = ArtifactFilter(flow_run_id=ArtifactFilterFlowRunId(any_=[run.id]))
