@@ -84,8 +84,8 @@ class TrainFlags(SceneFlags):
     columns
         Number of spectral features per pixel, for any camera. Default: 24 for built-in scenes, 48 for files.
     start
-        Weights from which the training starts, at a third of the learning rate. They must come from a training of the
-        same scenes and sizes. The result is the mean of both networks.
+        Weights from which the training starts, at a third of the learning rate. Bands, classes and sizes must be
+        theirs, and DATASET must contain the scenes that they know. The result is the mean of both networks.
     train_temporal
         Weights to which only a temporal reader is added, for surveys with --prior. It takes --scenes, --steps,
         --minutes, --seed and --validation, and resumes. It needs 4 GB of memory, and half an hour for reading the

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ from models.network.spectral import LineSpec
 from models.reading.inference import coarse_prediction_of_columns, map_of_columns
 from models.training.capture_augmentation import REFERENCE_MS, STEPS, CaptureAugmentation
 from models.training.examples import Example
-from models.training.train import LabelledPixels, discriminants_alone
+from models.training.train import LabelledPixels, with_discriminants
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 
@@ -155,17 +156,25 @@ def _parts(weights: Weights, example: Example) -> tuple[SceneGrid, NDArray[np.ui
     return grid, example.labels[: grid.height, : grid.width]
 
 
-def better_reading(
-    weights: Weights, start: Mapping[str, Any], validation: Sequence[Example]
-) -> tuple[Weights, dict[str, Any]]:
-    """Choose the better of the trained network and its initial linear discriminants, by mIoU of validation scenes.
+FEW_PIXELS = 50_000  # labelled pixels of a training, below which no reading is reliably the best
+READINGS = MappingProxyType({"network": 1.0, "mean of both": 0.5, "linear discriminants": 0.0})  # network's fraction
 
-    Returns the better weights, and both scores.
+
+def better_reading(
+    weights: Weights, start: Mapping[str, Any], validation: Sequence[Example], *, few: bool
+) -> tuple[Weights, dict[str, Any]]:
+    """Choose between the trained network, its initial linear discriminants and the mean of their logits.
+
+    With ``few`` labelled pixels it is the mean, as few validation pixels cannot tell. Else the best by mIoU of the
+    validation scenes, or the network without one. Returns the weights, and all scores.
     """
-    plain = replace(weights, segmenter=discriminants_alone(weights.segmenter, start))
-    readings = {"network": weights, "linear discriminants": plain}
-    scores = {name: _miou(one, validation) for name, one in readings.items()}
-    kept = max(scores, key=lambda name: scores[name])  # the network on a tie
+    readings = {
+        name: replace(weights, segmenter=with_discriminants(weights.segmenter, start, fraction))
+        for name, fraction in READINGS.items()
+    }
+    scores = {name: _miou(one, validation) for name, one in readings.items()} if validation else {}
+    best = max(scores, key=lambda name: scores[name], default="network")  # the network on a tie
+    kept = "mean of both" if few else best
     return readings[kept], {"miou": scores, "kept": kept}
 
 

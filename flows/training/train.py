@@ -15,7 +15,15 @@ from rich.console import Console
 
 from flows.terminal.progress import one_after_the_other, table
 from flows.training.data import Report, TrainingData, open_training_data
-from flows.training.figures import better_reading, judge_baselines, judge_calibration, judge_scans, read_twice, validate
+from flows.training.figures import (
+    FEW_PIXELS,
+    better_reading,
+    judge_baselines,
+    judge_calibration,
+    judge_scans,
+    read_twice,
+    validate,
+)
 from flows.training.fit_ood import fit_and_add, trained_on
 from flows.training.train_scenes import Scenes, TrainRequest, check_out, network_config, observe_all, training_capture
 from models.evaluation.placement import CascadeTable
@@ -36,6 +44,7 @@ from models.weights.files import (
     with_record,
 )
 from pipeline.errors import SceneError, SettingsError
+from pipeline.geometry.grid import UNLABELLED
 from pipeline.simulator.scenes.built_in import built_in_laws
 
 CROPS_PX = {True: 256, False: 384}  # by default: of built-in scenes, and of frames
@@ -106,16 +115,20 @@ def train_weights(
 
 
 def check_start(request: TrainRequest, begun: Weights, data: TrainingData, scenes: Scenes) -> None:
-    """Raise SettingsError unless a training can start from these weights: one of the same scenes, classes and sizes."""
+    """Raise SettingsError unless a training can start from these weights.
+
+    Bands, classes and sizes must be theirs, and the data must contain the scenes that they know. So none of these
+    scenes judges the result, and the record names them all.
+    """
     split, common = begun.record.get("split", {}), scenes.common
-    own, theirs = (
-        (list(data.train), list(data.validation), common.basis, common.names, network_config(request, common)),
-        (list(split.get("train", ())), list(split.get("validation", ())), begun.basis, begun.class_names, begun.config),
-    )
-    for what, mine, started in zip(
-        ("training scenes", "validation scenes", "bands", "classes", "sizes of the network"), own, theirs, strict=True
-    ):
-        if mine != started:
+    same = {
+        "training scenes": set(split.get("train", ())) <= set(data.train),
+        "bands": begun.basis == common.basis,
+        "classes": begun.class_names == common.names,
+        "sizes of the network": begun.config == network_config(request, common),
+    }
+    for what, kept in same.items():
+        if not kept:
             raise SettingsError(
                 f"--start {request.start}: its training had other {what}; give its data set and options"
             )
@@ -154,8 +167,10 @@ def _learned(
         model = halfway(begun.segmenter, model)
     weights = Weights(model, common.basis, normalisation, common.names, common.colours)
     frames, found = scenes.validation.examples, dict[str, Any]()
+    labelled = sum(int(np.count_nonzero(one.labels != UNLABELLED)) for one in examples)
+    few = begun is None and labelled < FEW_PIXELS
+    weights, found["readings"] = better_reading(weights, start, frames, few=few)
     if frames:
-        weights, found["readings"] = better_reading(weights, start, frames)
         found["baselines"] = judge_baselines(examples, frames, config.classes, seed, report)
         report("validating", 0.0, f"{len(frames)} scenes")
         found[CALIBRATION] = judge_calibration(weights, frames, seed)
@@ -216,7 +231,11 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
     console.print(f"weights: {out} ({out.stat().st_size / 1e6:.1f} MB), {record['training']['steps']} steps")
     if "familiar" in record:
         console.print(record["familiar"], markup=False, soft_wrap=True)
-    figures = record["validation"]
+    readings, figures = record["readings"], record["validation"]
+    scores = readings["miou"] | (record.get("baselines") or {})
+    beside = ", ".join(f"{name} {100 * miou:.1f}" for name, miou in scores.items())
+    words = f"mIoU of the whole scenes by each reading: {beside}; " if beside else ""
+    console.print(f"{words}kept: {readings['kept']}", soft_wrap=True)
     if figures is None:
         left = built_in_laws(request.dataset) or request.hold_out or request.choices.get("train_mask") is not None
         on = request.dataset if left else "OTHER_SCENES"
@@ -236,8 +255,3 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
     ]
     console.print(table(("placement", "mIoU", "overall"), rows, title=title))
     console.print(f"none: overview alone; all: every patch in full; others: {figures['share_of_seats']:.0%}")
-    if "readings" in record:
-        readings = record["readings"]
-        scores = readings["miou"] | (record["baselines"] or {})
-        beside = ", ".join(f"{name} {100 * miou:.1f}" for name, miou in scores.items())
-        console.print(f"mIoU of the whole scenes by each reading: {beside}; kept: {readings['kept']}", soft_wrap=True)

@@ -250,14 +250,16 @@ def linear_discriminants(pixels: LabelledPixels, classes: int) -> dict[str, Tens
     }
 
 
-def discriminants_alone(segmenter: Segmenter, start: Mapping[str, Tensor]) -> Segmenter:
-    """Return a copy whose maps are those of the linear discriminants in ``start``, without any correction."""
-    plain = copy.deepcopy(segmenter)
-    plain.load_state_dict(dict(start), strict=False)
-    for last in (plain.overview_classes, plain.full_classes):
-        nn.init.zeros_(last.weight)
-        nn.init.zeros_(last.bias)  # type: ignore[arg-type]
-    return plain
+def with_discriminants(segmenter: Segmenter, start: Mapping[str, Tensor], fraction: float) -> Segmenter:
+    """Return a copy whose logits are a ``fraction`` of its own, and for the rest those of the discriminants ``start``."""
+    mixed = copy.deepcopy(segmenter)
+    with torch.no_grad():
+        for name, own in mixed.spectral.named_parameters():
+            own.lerp_(start[f"spectral.{name}"], 1 - fraction)
+        for last in (mixed.overview_classes, mixed.full_classes):
+            for own in last.parameters():
+                own.mul_(fraction)
+    return mixed
 
 
 def train(

@@ -141,9 +141,20 @@ def test_training_shows_the_figures_of_validation(folder: Path, out: Path):
         assert name in shown.getvalue()
     record = describe_weights(out).record
     assert set(record["baselines"]) == {"logistic regression", "random forest"}
-    assert set(record["readings"]["miou"]) == {"network", "linear discriminants"}
+    assert set(record["readings"]["miou"]) == {"network", "mean of both", "linear discriminants"}
     beside = record["baselines"] | record["readings"]["miou"]
     assert all(f"{name} {100 * miou:.1f}" in shown.getvalue() for name, miou in beside.items())
+
+
+@pytest.mark.parametrize(("few", "validation", "kept"), [(2000, 1, "mean of both"), (0, 1, None), (0, 0, "network")])
+def test_few_labels_give_the_mean_of_network_and_discriminants(
+    folder: Path, out: Path, monkeypatch: pytest.MonkeyPatch, few: int, validation: int, kept: str | None
+) -> None:
+    """With more labels the reading that validation scenes score best is kept, and without scenes the network."""
+    monkeypatch.setattr(flow, "FEW_PIXELS", few)
+    readings = train_weights(_request(folder, out, validation=validation))["readings"]
+    scores = readings["miou"]
+    assert readings["kept"] == (kept or max(scores, key=lambda name: scores[name]))
 
 
 def test_counts_of_validation_scenes_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -276,6 +287,13 @@ def test_a_training_goes_on_from_weights(
     assert not torch.equal(after, before)
 
 
+def test_a_training_that_goes_on_may_have_more_scenes(folder: Path, out: Path, tmp_path: Path) -> None:
+    """Its record names them all."""
+    first = train_weights(_request(folder, out, validation=1))["split"]
+    second = train_weights(_request(folder, tmp_path / "b.safetensors", validation=0, start=out))["split"]
+    assert second["train"].items() > first["train"].items()
+
+
 def test_a_training_that_goes_on_learns_more_slowly(out: Path) -> None:
     """At a third of the rate, from the file that the flag names."""
     anew, on = (TrainFlags(start=start).request("farm", out, "") for start in (None, Path("first.safetensors")))
@@ -287,13 +305,13 @@ def test_a_training_that_goes_on_learns_more_slowly(out: Path) -> None:
     ("changed", "what"),
     [
         ({"hold_out": ("003",)}, "training scenes"),
-        ({"validation": 0}, "training scenes"),
+        ({"validation": 2}, "training scenes"),
         ({"columns": 2}, "bands"),
         ({"width": 8}, "sizes of the network"),
     ],
 )
 def test_a_training_cannot_go_on_from_another(folder: Path, out: Path, changed: dict[str, Any], what: str) -> None:
-    """Scenes, bands and sizes are those of the first training: one message says which are not."""
+    """Bands and sizes are those of the first training, and no scene of it is missing: one message says what is not."""
     train_weights(_request(folder, out, validation=1))
     with pytest.raises(SettingsError, match=f"its training had other {what}; give its data set and options"):
         train_weights(_request(folder, out.with_name("b.safetensors"), **{"validation": 1, "start": out, **changed}))

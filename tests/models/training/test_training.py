@@ -23,6 +23,7 @@ from models.training.train import (
     linear_discriminants,
     rate_at,
     train,
+    with_discriminants,
 )
 from pipeline.geometry.grid import SceneGrid
 from tests.models.conftest import Maker, block_example
@@ -193,6 +194,24 @@ def test_discriminants_do_not_rely_on_the_light() -> None:
     ]
     assert weights[0][0] > 0.5 * weights[0][1]
     assert weights[1][0] < 0.05 * weights[1][1]
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.5, 1.0])
+def test_logits_mix_with_those_of_discriminants(fraction: float) -> None:
+    """By the fraction, of the overview and of patches; the network stays as it is."""
+    own = Segmenter(SegmenterConfig(3, 4, patch=8, width=8, dim=16, layers=1, heads=2))
+    with torch.no_grad():
+        for parameter in own.parameters():
+            parameter.copy_(torch.randn_like(parameter))
+    start = {f"spectral.{name}": torch.randn_like(tensor) for name, tensor in own.spectral.named_parameters()}
+    flat = torch.randn(1, 4 + PLANES, 1, 1)
+    given = flat.expand(-1, -1, 32, 32), torch.randn(1, 4 + PLANES, 32, 32), torch.arange(16)[None]
+    nets = [with_discriminants(own, start, share) for share in (fraction, 0.0)]
+    mixed, alone, whole = (net(*given, torch.zeros(1, 2)) for net in (*nets, own))
+    for found, plain, full in zip(mixed, alone, whole, strict=True):
+        torch.testing.assert_close(found, fraction * full + (1 - fraction) * plain, rtol=1e-4, atol=1e-3)
+    told = start["spectral.weight"][:, :, 0, 0] @ flat[0, :4, 0, 0] + start["spectral.bias"]
+    torch.testing.assert_close(alone[0][0, :, 8, 8], told)
 
 
 def test_a_network_halfway_has_the_mean_of_each_weight() -> None:

@@ -1,0 +1,134 @@
+"""Twenty small labelled tiles, as a user brings them: `spectralzoom train` beside classifiers of scikit-learn.
+
+Indian Pines is cut into 5 x 4 tiles of 29 x 36 px and 200 bands. Three times a third of them is held out and judged;
+the rest trains, by the command with --validation 0. The peers read every band of the same camera's image, averaged over
+5 x 5 px of a tile.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from bench_pines import SCENE, WINDOW
+from measure import Row, data_folder, not_run
+from numpy.typing import NDArray
+
+from flows.cli.model_verbs import TrainFlags
+from flows.evaluate.frames import observe_frame
+from flows.training.data import TrainingData, load_data_set, open_training_data
+from flows.training.train import train_weights
+from models.evaluation.metrics import confusion, mean_iou, overall_accuracy
+from models.reading.inference import segment
+from models.training.examples import electrons_of
+from models.weights.files import Weights, load_weights
+from pipeline.geometry.camera import LineCamera, expose, footprint
+from pipeline.geometry.grid import UNLABELLED
+
+DOWN, ACROSS, FOLDS = 5, 4, 3
+Counts = NDArray[np.int64]
+
+
+def rows() -> list[Row]:
+    """Every fold and all together: mIoU and overall accuracy of the network and of the best classifiers."""
+    folder = data_folder("indian_pines")
+    if not (folder / SCENE).is_file():
+        return [not_run("20 tiles of Indian Pines", folder)]
+    found: list[dict[str, Counts]] = []
+    table = []
+    with tempfile.TemporaryDirectory() as name:
+        write_tiles(folder, Path(name))
+        for fold in range(FOLDS):
+            began = time.process_time()
+            found.append(judge_fold(Path(name), fold))
+            table.append(_row(f"third {fold}", found[-1], f"{time.process_time() - began:.0f} s of processor"))
+    together = {way: np.sum([one[way] for one in found], axis=0) for way in found[0]}
+    return [*table, _row("all 20 tiles", together, "")]
+
+
+def _row(what: str, counts: dict[str, Counts], words: str) -> Row:
+    figures = {way: f"{mean_iou(one):.1%} ({overall_accuracy(one):.1%})" for way, one in counts.items()}
+    best = max((way for way in counts if way != "network"), key=lambda way: mean_iou(counts[way]))
+    peers = ", ".join(f"{way} {figure}" for way, figure in figures.items() if way != "network")
+    met = mean_iou(counts["network"]) >= mean_iou(counts[best])
+    return Row(f"{what}: mIoU (right pixels)", figures["network"], f">= {best}", met, f"{peers}; {words}")
+
+
+def write_tiles(folder: Path, out: Path) -> None:
+    """Write the scene's tiles as files that `train` reads: ``images``, ``labels`` and ``scene.toml``."""
+    cube, labels = np.load(folder / SCENE), np.load(folder / "Indian_pines_gt.npy")
+    rows, columns = cube.shape[0] // DOWN, cube.shape[1] // ACROSS
+    for name in ("images", "labels"):
+        (out / name).mkdir()
+    known = load_data_set(folder / SCENE).load(Path(SCENE).stem).wavelength_nm
+    about = f"unlabelled = 0\nwavelengths_nm = {np.asarray(known).tolist()}\n"
+    (out / "scene.toml").write_text(about, encoding="utf-8")
+    for tile in range(DOWN * ACROSS):
+        y, x = tile // ACROSS * rows, tile % ACROSS * columns
+        np.save(out / "images" / f"{tile:02}.npy", cube[y : y + rows, x : x + columns])
+        np.save(out / "labels" / f"{tile:02}.npy", labels[y : y + rows, x : x + columns].astype(np.uint8))
+
+
+def judge_fold(tiles: Path, fold: int) -> dict[str, Counts]:
+    """Train on two thirds of the tiles; return confusion counts on the others, by the network and each classifier."""
+    held = tuple(f"{tile:02}" for tile in range(fold, DOWN * ACROSS, FOLDS))
+    out = tiles.parent / f"{tiles.name}-{fold}.safetensors"
+    train_weights(TrainFlags(seed=fold, hold_out=",".join(held), validation=0).request(str(tiles), out, "bench_tiles"))
+    weights = load_weights(out)
+    out.unlink()
+    data = open_training_data(str(tiles), 0, None, LineCamera())
+    classes, found = weights.config.classes, {"network": np.zeros((weights.config.classes,) * 2, np.int64)}
+    for name in held:
+        frame = observe_frame(data.scene(name), name, weights, LineCamera(), fold)
+        every = np.arange(len(frame.fine))
+        found["network"] += confusion(frame.labels, segment(weights, frame.seen, frame.fine, every).classes, classes)
+    names = [name for name in data.train if name not in held]
+    return found | judge_classifiers(data, names, held, weights, fold)
+
+
+def judge_classifiers(
+    data: TrainingData, names: Sequence[str], held: Sequence[str], weights: Weights, seed: int
+) -> dict[str, Counts]:
+    """Fit classifiers to every labelled pixel of some tiles; return their counts on the held-out ones."""
+    learnt, judged = (_pixels(data, some, weights, seed) for some in (names, held))
+    found = {}
+    for name, classifier in _classifiers().items():
+        drawn = classifier.fit(*learnt).predict(judged[0]).astype(np.uint8)
+        found[name] = confusion(judged[1], drawn, weights.config.classes)
+    return found
+
+
+def _pixels(data: TrainingData, names: Sequence[str], weights: Weights, seed: int) -> tuple[Any, Any]:
+    """Return (pixel, band) means of labelled pixels as the camera sees them, and their classes (pixel,)."""
+    from scipy.ndimage import uniform_filter
+
+    values, classes, camera = [], [], LineCamera()
+    for name in names:
+        scene = data.scene(name)
+        electrons = electrons_of(scene, footprint(np.asarray(scene.planes, np.float32), camera), camera)
+        seen = expose(electrons, camera, step=1, rng=np.random.default_rng([seed, int(name)]))
+        seen = seen * (scene.white_reference / scene.white_reference_electrons)
+        labels = scene.labels
+        assert labels is not None
+        assert scene.class_names == weights.class_names
+        values.append(uniform_filter(seen, (WINDOW, WINDOW, 1), mode="nearest")[labels != UNLABELLED])
+        classes.append(labels[labels != UNLABELLED])
+    return np.concatenate(values), np.concatenate(classes)
+
+
+def _classifiers() -> dict[str, Any]:
+    from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+    from sklearn.ensemble import RandomForestClassifier
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
+
+    return {
+        "LDA": LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto"),
+        "logistic regression": make_pipeline(StandardScaler(), LogisticRegression(max_iter=1000)),
+        "random forest": RandomForestClassifier(200, random_state=0),
+    }
