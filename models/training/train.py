@@ -251,7 +251,7 @@ def linear_discriminants(pixels: LabelledPixels, classes: int) -> dict[str, Tens
 
 
 def with_discriminants(segmenter: Segmenter, start: Mapping[str, Tensor], fraction: float) -> Segmenter:
-    """Return a copy whose logits are a ``fraction`` of its own, and for the rest those of the discriminants ``start``."""
+    """Return a copy with a ``fraction`` of its own logits, and for the rest those of the discriminants ``start``."""
     mixed = copy.deepcopy(segmenter)
     with torch.no_grad():
         for name, own in mixed.spectral.named_parameters():
