@@ -236,13 +236,13 @@ def _through_camera(folder: Path, path: Path) -> list[Result]:
 
 def _of_the_file(folder: Path, split: Split) -> list[Result]:
     """The segmenter trained on the spectra of the file."""
+    from flows.training.figures import READINGS
     from flows.training.train_scenes import COLUMNS
-    from models.network.segmenter import Segmenter
     from models.network.sizes import SegmenterConfig
     from models.network.spectral import SpectralBasis, patches_of
     from models.reading.inference import coarse_prediction_of_columns
     from models.training.examples import Example, measured_normalisation, normalised
-    from models.training.train import LabelledPixels, linear_discriminants, train
+    from models.training.train import LabelledPixels, linear_discriminants, train, with_discriminants
     from models.weights.files import Weights
     from pipeline.geometry.grid import SceneGrid, pad_by_reflection
 
@@ -260,7 +260,7 @@ def _of_the_file(folder: Path, split: Split) -> list[Result]:
     pixels, rng = LabelledPixels.drawn([example], np.random.default_rng(0)), np.random.default_rng(1)
     start = linear_discriminants(pixels.brightened(normalisation.gain_shift, rng), split.classes)
     network, record = train(config, [example], normalisation.gain_shift, _settings(), start=start)
-    assert isinstance(network, Segmenter)
+    network = with_discriminants(network, start, READINGS["mean of both"])
     weights = Weights(network, basis, normalisation, scene.class_names, scene.class_colours, {"training": record})
     patches = np.asarray(patches_of(example.columns, grid.patch), np.float32)
     return _judged("file", weights, coarse_prediction_of_columns(weights, example.columns, grid), patches, split.test)
