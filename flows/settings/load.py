@@ -36,6 +36,7 @@ from flows.settings.survey_settings import (
     source_of,
 )
 from flows.settings.values import EXTENT_PART, EXTENT_WHOLE, parse_moment, parse_text
+from flows.settings.visits import time_of_visit
 from pipeline.errors import BudgetError, PoseError, SettingsError
 from pipeline.rig.device_settings import MOST_PAIRS
 from pipeline.setting_fields import format_number, span_of
@@ -136,8 +137,9 @@ FLAGS = {"sky.light": "sky"}  # flags that are not named as their setting
 def usual_of_recording(table: Mapping[str, object]) -> dict[str, Any]:
     """Return the defaults of the settings beside ``sweeps``: those of the run that took them, where one is named.
 
-    So `survey --sweeps ARCHIVE/runs/NAME` plans as that run did. Without a run, budget or scan, every recorded line is
-    used as it is. Raises SceneError, ArchiveError: there is no such recording or run.
+    So `survey --sweeps ARCHIVE/runs/NAME` plans as that run did, and its visit is the time of that run. Without a run,
+    budget or scan, every recorded line is used as it is. Raises SceneError, ArchiveError: there is no such recording or
+    run.
     """
     if table.get("source", RECORDED) != RECORDED:
         return {}
@@ -150,7 +152,7 @@ def usual_of_recording(table: Mapping[str, object]) -> dict[str, Any]:
         another_plan = requested if uniform else requested & set(UNIFORM)
         names = OF_THE_RUN if another_plan else (*OF_THE_RUN, *OF_THE_PLAN)
         usual |= {name: run.settings[name] for name in names if run.settings.get(name) is not None}
-        usual |= {"name": str(run.receipt.get("survey") or run.folder.name)}
+        usual |= {"name": str(run.receipt.get("survey") or run.folder.name), "visit": time_of_visit(run)}
         usual |= {} if shape is None else {"size": shape[::-1]}
         if run.settings.get("weights") is None and run.settings.get("scene") in BUILT_IN_SCENES:
             usual["weights"] = BUILT_IN_WEIGHTS

@@ -8,6 +8,7 @@ import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -197,6 +198,16 @@ def test_a_scan_as_taken_is_compared_with_all_of_its_lines(
     assert [savings[name]["ratio"] for name in ("lines", "samples", "capture_s")] == [1, 1, 1]
 
 
+def test_lines_of_a_run_have_the_date_of_its_visit(full_scan: tuple[Path, Published, Path]) -> None:
+    """So exports, histories and prior maps date them by their capture; a visit that is asked for comes first."""
+    sweeps = str(full_scan[1].folder)
+    captured = datetime.fromisoformat(full_scan[1].receipt["started"])
+    visit = load_settings(None, {"sweeps": sweeps}).visit
+    assert visit is not None
+    assert datetime.fromisoformat(visit) == captured
+    assert load_settings(None, {"sweeps": sweeps, "visit": "mine"}).visit == "mine"
+
+
 def raw_cubes(full_scan: tuple[Path, Published, Path]) -> list[Path]:
     """Stores of the sweeps of the full scan."""
     archive, published, _ = full_scan
@@ -254,6 +265,7 @@ POSITIONS = {"fewer rows": range(95), "lines far apart": range(0, 9 * 96, 9)}  #
 BAD = {  # flags, and the message
     "fewer rows": ("", "has 95 rows for scan, fewer than its 96 lines; give one row for each line"),
     "lines far apart": ("", "the lines of the recording lie 9 px .* apart, and a uniform scan may have up to 8 px"),
+    "frames exchanged": ("--dark scan.white.hdr --white scan.dark.hdr", "is nowhere brighter than its dark frame"),
     "no such table": ("--pointing nowhere.csv", "there is no pointing table .*nowhere.csv"),
     "no such recording": ("--sweeps nowhere", "there is no recording nowhere; check the name"),
     "a scene": ("--scene farm", "--scene = 'farm', and the field of recorded sweeps is what they show; leave it out"),
