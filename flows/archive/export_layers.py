@@ -13,8 +13,8 @@ from affine import Affine
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
-from flows.archive.history import time_of_visit
 from flows.publish.receipt import Receipt, check_receipt
+from flows.settings.visits import time_of_visit
 from flows.tasks.stages.maps import coarse_colours
 from pipeline.errors import IncompleteStoreError, SettingsError, ShapeError
 from pipeline.geometry.grid import UNLABELLED

@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -16,14 +16,13 @@ from rich.markup import escape
 from flows.archive.stale_runs import called
 from flows.cli.app import ArchiveName, AsJson, OutFile, check_outside, stderr
 from flows.publish.receipt import check_receipt
-from flows.settings.survey_settings import BUILT_IN_SCENES
+from flows.settings.visits import time_of_visit
 from flows.tasks.scores import score_of
 from flows.terminal.figures import counted, format_area, format_percent
 from flows.terminal.processes import DONE
 from flows.terminal.progress import print_json
 from pipeline.errors import ArchiveError, PipelineError, SettingsError, ShapeError, visible
 from pipeline.lazy import deferred
-from pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run
@@ -123,29 +122,6 @@ def _row(run: Run) -> Row:
         "unit": unit,
         "problem": run.problem,
     }
-
-
-def time_of_visit(run: Run) -> str | None:
-    """Return the moment that names a run's visit, else day and hour of a built-in scene, else when the run began.
-
-    A day of a built-in scene counts in the year of the run. The moment is in ISO 8601 in UTC; None: nothing is known.
-    """
-    named, began = _moment(run.settings.get("visit")), _moment(run.receipt.get("started")) or _moment(run.created)
-    if named is not None or began is None or run.settings.get("scene") not in BUILT_IN_SCENES:
-        return named or began
-    day, hour = (run.settings.get(name) for name in ("day", "hour"))
-    with suppress(TypeError, ValueError, OverflowError):
-        grown = timedelta(days=(USUAL_DAY if day is None else day) - 1, hours=USUAL_HOUR if hour is None else hour)
-        return (datetime(int(began[:4]), 1, 1, tzinfo=UTC) + grown).isoformat()
-    return began
-
-
-def _moment(value: object) -> str | None:
-    """Return a moment in ISO 8601 in UTC; None for anything else."""
-    with suppress(ValueError, OverflowError):
-        found = datetime.fromisoformat(value) if isinstance(value, str) else None
-        return None if found is None else found.replace(tzinfo=found.tzinfo or UTC).astimezone(UTC).isoformat()
-    return None
 
 
 def render_history(history: FieldHistory, runs_at: str) -> str:

@@ -275,7 +275,9 @@ def _of_camera(run: SurveyRun, fine: FinePlan | None) -> dict[str, Estimate]:
     open_end = fine is None and second is not None
     if fine is None and second is not None:
         record, left = run.scan_record, raw_bytes(second.swaths, camera, bands) - second.interlaces * captured
-        shortest = camera if record is None else replace(camera, exposure_ms=record.offered_ms(camera)[0])
+        shortest = (
+            camera if record is None or run.recorded else replace(camera, exposure_ms=record.offered_ms(camera)[0])
+        )
         lines = int(plan.fine_s / (shortest.frame_ms * 1e-3))
         captured += min(lines * camera.samples * bands * BYTES_PER_SAMPLE, left)
     seconds = plan.coarse_s + (plan.fine_s if fine is None else fine.seconds)

@@ -36,6 +36,7 @@ from flows.settings.survey_settings import (
     source_of,
 )
 from flows.settings.values import EXTENT_PART, EXTENT_WHOLE, parse_moment, parse_text
+from flows.settings.visits import time_of_visit
 from pipeline.errors import BudgetError, PoseError, SettingsError
 from pipeline.rig.device_settings import MOST_PAIRS
 from pipeline.setting_fields import format_number, span_of
@@ -136,8 +137,9 @@ FLAGS = {"sky.light": "sky"}  # flags that are not named as their setting
 def usual_of_recording(table: Mapping[str, object]) -> dict[str, Any]:
     """Return the defaults of the settings beside ``sweeps``: those of the run that took them, where one is named.
 
-    So `survey --sweeps ARCHIVE/runs/NAME` plans as that run did. Without a run, budget or scan, every recorded line is
-    used as it is. Raises SceneError, ArchiveError: there is no such recording or run.
+    So `survey --sweeps ARCHIVE/runs/NAME` plans as that run did, and its visit is the time of that run. Without a run,
+    budget or scan, every recorded line is used as it is. Raises SceneError, ArchiveError: there is no such recording or
+    run.
     """
     if table.get("source", RECORDED) != RECORDED:
         return {}
@@ -150,7 +152,7 @@ def usual_of_recording(table: Mapping[str, object]) -> dict[str, Any]:
         another_plan = requested if uniform else requested & set(UNIFORM)
         names = OF_THE_RUN if another_plan else (*OF_THE_RUN, *OF_THE_PLAN)
         usual |= {name: run.settings[name] for name in names if run.settings.get(name) is not None}
-        usual |= {"name": str(run.receipt.get("survey") or run.folder.name)}
+        usual |= {"name": str(run.receipt.get("survey") or run.folder.name), "visit": time_of_visit(run)}
         usual |= {} if shape is None else {"size": shape[::-1]}
         if run.settings.get("weights") is None and run.settings.get("scene") in BUILT_IN_SCENES:
             usual["weights"] = BUILT_IN_WEIGHTS
@@ -323,8 +325,9 @@ def _contradictions(stated: set[str], origin: Mapping[str, str], *, zooms: bool)
         yield f"{uniform[0]} leaves the choice of the scan to the weights' record, {by_hand[0]} makes it: leave one out"
     if "scan_exposure_ms" in stated and "scan_step" not in stated:
         yield f"{by_hand[0]} is for a uniform scan: give --scan-step too (1 for every line), or --coarse-exposure-ms"
-    if {"sweeps", "coarse_exposure_ms"} <= stated:
-        yield f"{named(['coarse_exposure_ms'])[0]} is for a camera, and recorded lines have their own: leave it out"
+    exposures = named(("coarse_exposure_ms", "scan_exposure_ms"))
+    if exposures and "sweeps" in stated:
+        yield f"{exposures[0]} is for a camera, and recorded lines have their own: leave it out"
 
 
 def _camera_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]:

@@ -75,7 +75,7 @@ class PassLayout:
     extent: str = EXTENT_WHOLE  # of a uniform scan
     first_step: int = FIRST_STEP  # line spacing of the first of two passes
     as_taken: bool = False  # use all lines of a recording
-    shown: NDArray[np.bool_] | None = None  # (patch,) to capture; None: all
+    shown: NDArray[np.bool_] | None = None  # (patch,) to capture; None: all, also of a scan that is used as taken
     recorded: RecordedPasses | None = None  # recording that has the lines
 
     @classmethod
@@ -98,7 +98,7 @@ class PassLayout:
             settings.extent,
             FIRST_STEP if settings.scan_step is None else settings.scan_step,
             settings.scan == RECORDED,
-            shown,
+            None if settings.scan == RECORDED else shown,
             recorded,
         )
 
@@ -274,8 +274,9 @@ def lay_out_passes(
     if settings.zooms:
         layout = replace(layout, first_step=settings.scan_step or FIRST_STEP, step=None)
         if first is not None:
-            layout = replace(layout, first_step=first.step, coarse_exposure_ms=first.exposure_ms)
-            settings = replace(settings, coarse_exposure_ms=first.exposure_ms)
+            exposure_ms = first.exposure_ms if layout.recorded is None else None  # recorded lines have their own
+            layout = replace(layout, first_step=first.step, coarse_exposure_ms=exposure_ms)
+            settings = replace(settings, coarse_exposure_ms=exposure_ms)
         settings = replace(settings, scan_step=None if settings.budget is not None else layout.first_step)
         return layout, layout.plan(settings.budget, settings.seconds), settings, notes
     if chosen is not None and layout.step is None:
@@ -311,15 +312,19 @@ def choose_first_pass(
     """Choose the lines of a first pass within the time, or the fastest where none fits; None: the table has none.
 
     The criterion is the expected mIoU if the second pass covers the whole field. Among nearly equal choices, the
-    closest lines are taken, then the longest exposure.
+    closest lines are taken, then the longest exposure. Recorded lines have their own exposure.
     """
     camera, cost, full = layout.camera, layout.cost, layout.sweeps()[2]
     shortest, longest = record.offered_ms(camera)
+    offered_ms = exposures_between(shortest, longest)
+    if layout.recorded is not None:
+        shortest, longest, offered_ms = camera.exposure_ms, camera.exposure_ms, [camera.exposure_ms]
     found: list[FirstPass] = []
     fastest: FirstPass | None = None
     for first_step in (step for step in steps if step in record.steps):
-        for first_ms in exposures_between(shortest, longest):
+        for first_ms in offered_ms:
             first = every_nth(full, first_step, first_ms)
+            first = first if layout.recorded is None else layout.recorded.first_pass(first)
             left_s = seconds - cost.seconds(first, camera)
             if left_s < 0:
                 fastest = FirstPass(first_step, first_ms, 0.0)

@@ -272,11 +272,11 @@ class SurveyRun(CaptureRun):
     @property
     def second_pass(self) -> SecondPass | None:
         """Return the planner of the second pass; None for a uniform scan or a raster."""
-        plan, cut = self.plan, None if self.recorded is None else self.recorded.fine_pass
+        plan, field = self.plan, (self.grid, self.camera, self.settings.cost)
         if plan.plain:
             return None
-        field = self.grid, self.camera, self.settings.cost
-        return SecondPass(*field, plan.coarse, plan.full, plan.fine_s, plan.margin_px, cut)
+        of_recording = () if self.recorded is None else (self.recorded.fine_pass, self.recorded.exposures_ms)
+        return SecondPass(*field, plan.coarse, plan.full, plan.fine_s, plan.margin_px, *of_recording)
 
     @property
     def scan_record(self) -> ScanPerformance | None:

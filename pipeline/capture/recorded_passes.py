@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.capture.recorded import RecordedSource
 from pipeline.errors import SceneError
-from pipeline.geometry.scan import Axis, Sweep
+from pipeline.geometry.scan import Axis, Sweep, exposing
 
 MOST_CUT_LINES, MOST_CUT_PX = 3, 2.0  # largest excess of a plan over a recording, for the kernel and turned lines
 
@@ -28,6 +28,11 @@ class RecordedPasses:
     def axes(self) -> tuple[Axis, ...]:
         """Return the axes of the scene along which recorded lines lie."""
         return tuple(dict.fromkeys(one.sweep.along for one in self.source.sweeps))
+
+    @property
+    def exposures_ms(self) -> list[float]:
+        """Return the exposures of the recorded sweeps, each once."""
+        return sorted({exposing(self.source.camera, one.sweep).exposure_ms for one in self.source.sweeps})
 
     def uniform_scan(self) -> list[Sweep]:
         """Return all recorded sweeps as a uniform scan; SceneError where they differ in axis, step or binning."""

@@ -66,6 +66,7 @@ class SecondPass:
     seconds: float
     margin_px: float = 0.0
     recorded: Callable[[list[Sweep]], list[Sweep]] | None = None  # cuts sweeps to the lines of a recording
+    recorded_ms: Sequence[float] = ()  # exposures of that recording
 
     @property
     def key(self) -> dict[str, Any]:
@@ -130,7 +131,8 @@ class SecondPass:
     def best(self, record: ScanPerformance, gain_of: Callable[[int, float], Floats]) -> FinePlan:
         """Return the plan with the highest expected gain in mIoU, over line spacings and exposures.
 
-        ``gain_of`` returns the (patch,) gains of lines of a spacing, for the mean exposure [ms] of old and new lines.
+        A recording offers its own exposures. ``gain_of`` returns the (patch,) gains of lines of a spacing, for the mean
+        exposure [ms] of old and new lines.
         """
         first, (shortest, longest) = self.first_pass[0], record.offered_ms(self.camera)
         first_ms, plans = exposing(self.camera, first).exposure_ms, list[FinePlan]()
@@ -141,12 +143,13 @@ class SecondPass:
         for step in (step for step in record.steps if step < first.step):
             every = lines_between(self.full, self._between, step=step)
             last = longest_exposure(self.seconds, every, self.camera, self.cost, shortest, longest)
-            tried = np.geomspace(shortest, longest, EXPOSURES).round(1).tolist()
-            for exposure_ms in sorted({*tried, *([] if last is None else [last])}):
+            tried = {*np.geomspace(shortest, longest, EXPOSURES).round(1).tolist(), *([] if last is None else [last])}
+            for exposure_ms in self.recorded_ms or sorted(tried):
                 mean_ms = merged_ms(first_ms, exposure_ms, step / first.step if self.interlaces else 0.0)
                 mean_ms = float(np.clip(mean_ms, shortest, longest))
                 if record.expected(step, mean_ms)[MIOU] >= least:
                     plans.append(self.plan(gain_of(step, mean_ms), step=step, exposure_ms=exposure_ms))
+        plans = [plan for plan in plans if plan.seconds <= self.seconds]  # recorded lines may have longer exposures
         plan = max(plans, key=lambda made: (made.expected_gain, -made.seconds), default=None)
         if plan is None or plan.expected_gain < LEAST_GAIN:
             gain = 0.0 if plan is None else plan.expected_gain

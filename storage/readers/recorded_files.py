@@ -129,7 +129,8 @@ def find_references(
     """Return the reference frames of a cube: ``stated``, else ``stem.dark.hdr`` etc., else those of the folder.
 
     ``white_reference`` is the default value of the white reference, one or (band,). Raises SceneError: a frame has
-    other samples or bands than the cube.
+    other samples or bands than the cube, or white is not
+    brighter than dark.
     """
     name, frame = stem.name, source.shape[1:]
     white_dn = camera.full_scale_dn * max(camera.samples // frame[0], 1)
@@ -158,6 +159,11 @@ def find_references(
         notes.append(
             f"{name} has no white frame: full scale ({white_dn} DN) is assumed to be white, and values are relative; "
             "give --white"
+        )
+    if not (white > dark).any():
+        raise SceneError(
+            f"the white frame of {name} is nowhere brighter than its dark frame; exchange them, or give others with "
+            "--dark and --white"
         )
     bad: NDArray[Any] | None = found.get("bad")
     if bad is None and measured and files["bad"] is None:

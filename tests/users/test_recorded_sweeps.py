@@ -8,6 +8,7 @@ import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,7 @@ from storage.remote.opening import verify_archive
 from tests.conftest import Survey, WeightsMaker, patchy_scene, random_weights
 from tests.flows.conftest import CommandLine, be_version, command_line
 from tests.flows.tasks.test_survey_rig import emulated
+from tests.flows.tasks.test_uniform_scan import RECORD
 from tests.prior_work import without_effects
 from tests.storage.readers.test_recordings import write_envi_cube
 
@@ -174,6 +176,38 @@ def test_a_budget_reads_only_the_lines_that_it_asks_for(
     }
 
 
+def test_seconds_count_the_recorded_exposures(
+    tmp_path: Path, full_scan: tuple[Path, Published, Path], make_weights: WeightsMaker
+) -> None:
+    """Both passes are planned with the exposure of the lines, not with a shorter one of the weights' table."""
+    asked = {"weights": str(make_weights(scans=RECORD)), "seconds": 15, "zoom": "always", "keep": "raw"}
+    receipt = survey_sweeps(tmp_path / "a", full_scan[2], **asked).receipt
+    assert receipt["recording"]["passes_s"] <= 15
+    assert (receipt["plan"]["lines"] > 0, receipt["settings"]["coarse_exposure_ms"]) == (True, None)
+    assert "100 ms" in receipt["plan"]["reason"]
+
+
+def test_a_scan_as_taken_is_compared_with_all_of_its_lines(
+    tmp_path: Path, full_scan: tuple[Path, Published, Path], weights: Path
+) -> None:
+    """An area of interest limits the map: the lines beside it are read, and the reference has them too."""
+    corner = {"type": "Polygon", "coordinates": [[[0, 0], [30, 0], [30, 30], [0, 30], [0, 0]]]}
+    (tmp_path / "area.json").write_text(json.dumps(corner))
+    asked = {"weights": str(weights), "zones.area": str(tmp_path / "area.json")}
+    savings = survey_sweeps(tmp_path / "a", full_scan[2], **asked).receipt["savings"]
+    assert [savings[name]["ratio"] for name in ("lines", "samples", "capture_s")] == [1, 1, 1]
+
+
+def test_lines_of_a_run_have_the_date_of_its_visit(full_scan: tuple[Path, Published, Path]) -> None:
+    """So exports, histories and prior maps date them by their capture; a visit that is asked for comes first."""
+    sweeps = str(full_scan[1].folder)
+    captured = datetime.fromisoformat(full_scan[1].receipt["started"])
+    visit = load_settings(None, {"sweeps": sweeps}).visit
+    assert visit is not None
+    assert datetime.fromisoformat(visit) == captured
+    assert load_settings(None, {"sweeps": sweeps, "visit": "mine"}).visit == "mine"
+
+
 def raw_cubes(full_scan: tuple[Path, Published, Path]) -> list[Path]:
     """Stores of the sweeps of the full scan."""
     archive, published, _ = full_scan
@@ -231,6 +265,7 @@ POSITIONS = {"fewer rows": range(95), "lines far apart": range(0, 9 * 96, 9)}  #
 BAD = {  # flags, and the message
     "fewer rows": ("", "has 95 rows for scan, fewer than its 96 lines; give one row for each line"),
     "lines far apart": ("", "the lines of the recording lie 9 px .* apart, and a uniform scan may have up to 8 px"),
+    "frames exchanged": ("--dark scan.white.hdr --white scan.dark.hdr", "is nowhere brighter than its dark frame"),
     "no such table": ("--pointing nowhere.csv", "there is no pointing table .*nowhere.csv"),
     "no such recording": ("--sweeps nowhere", "there is no recording nowhere; check the name"),
     "a scene": ("--scene farm", "--scene = 'farm', and the field of recorded sweeps is what they show; leave it out"),
@@ -238,6 +273,7 @@ BAD = {  # flags, and the message
     "a part of the field": ("--extent part --seconds 5", "--extent = 'part' chooses lines to capture"),
     "two scans": ("--scan recorded --budget 0.5", "one uniform scan .*leave one of them out"),
     "an exposure": ("--budget 0.5 --coarse-exposure-ms 25", "--coarse-exposure-ms is for a camera.* leave it out"),
+    "an exposure of the scan": ("--scan-step 2 --scan-exposure-ms 25", "--scan-exposure-ms is for a camera"),
     "too little time": ("--budget 0.01", "full scan's [0-9.]+ s; give more, or take one uniform scan"),
 }
 
