@@ -129,8 +129,7 @@ def find_references(
     """Return the reference frames of a cube: ``stated``, else ``stem.dark.hdr`` etc., else those of the folder.
 
     ``white_reference`` is the default value of the white reference, one or (band,). Raises SceneError: a frame has
-    other samples or bands than the cube, or white is not
-    brighter than dark.
+    other samples or bands than the cube, or white is not brighter than dark.
     """
     name, frame = stem.name, source.shape[1:]
     white_dn = camera.full_scale_dn * max(camera.samples // frame[0], 1)
