@@ -114,7 +114,8 @@ class PassLayout:
         """
         along, coarse, full = self.sweeps()
         full_s, coarse_s = self.cost.seconds(full, self.camera), self.cost.seconds(coarse, self.camera)
-        fine_s, by_record = 0.0, budget is None and seconds is not None
+        repeated = self.coarse_exposure_ms is not None  # of a recording: the plan of its run
+        fine_s, by_record = 0.0, budget is None and seconds is not None and (self.recorded is None or repeated)
         limit_s = seconds if budget is None else budget * full_s
         if limit_s is not None:
             fine_s = limit_s - coarse_s
@@ -258,7 +259,8 @@ def lay_out_passes(
     chosen, content, first = scans.chosen, weights.record.get("scans"), None
     if content is not None and (settings.zooms or zoom_may_pay(layout, scans, settings)):
         record = ScanPerformance.read(content, settings.sky.fraction_of_clear)
-        if settings.seconds is not None and settings.coarse_exposure_ms is None:
+        free = settings.coarse_exposure_ms is None and layout.recorded is None
+        if settings.seconds is not None and free:
             steps = FIRST_STEPS if settings.scan_step is None else (settings.scan_step,)
             first = choose_first_pass(layout, record, settings.seconds, steps)
     notes = tuple[str, ...]()

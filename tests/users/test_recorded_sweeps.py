@@ -38,6 +38,7 @@ from storage.remote.opening import verify_archive
 from tests.conftest import Survey, WeightsMaker, patchy_scene, random_weights
 from tests.flows.conftest import CommandLine, be_version, command_line
 from tests.flows.tasks.test_survey_rig import emulated
+from tests.flows.tasks.test_uniform_scan import RECORD
 from tests.prior_work import without_effects
 from tests.storage.readers.test_recordings import write_envi_cube
 
@@ -174,6 +175,20 @@ def test_a_budget_reads_only_the_lines_that_it_asks_for(
     }
 
 
+def test_two_passes_within_a_time_have_recorded_exposures(
+    tmp_path: Path, full_scan: tuple[Path, Published, Path], survey_png: Survey, make_weights: WeightsMaker
+) -> None:
+    """Those of a full scan for any plan; the plan of a run of two exposures has its camera's for the reference."""
+    asked: dict[str, Any] = {"weights": str(make_weights(scans=RECORD)), "zoom": "always", "seconds": "15"}
+    of_scan = survey_sweeps(tmp_path / "scan", full_scan[2], **asked).receipt
+    assert of_scan["recording"]["passes_s"] <= 15
+    assert of_scan["settings"]["coarse_exposure_ms"] is None
+    run = survey_png(tmp_path / "sim", budget=None, keep="raw", **NARROW, **asked)
+    assert run.receipt["settings"]["coarse_exposure_ms"] < 100
+    again = survey_sweeps(tmp_path / "again", run.folder).receipt
+    assert again["recording"]["full_scan_s"] == run.receipt["savings"]["capture_s"]["full"]
+
+
 def raw_cubes(full_scan: tuple[Path, Published, Path]) -> list[Path]:
     """Stores of the sweeps of the full scan."""
     archive, published, _ = full_scan
@@ -237,6 +252,7 @@ BAD = {  # flags, and the message
     "simulated rig": ("--source sim", "--sweeps is for recorded sweeps, and source = 'sim'; give --source recorded"),
     "a part of the field": ("--extent part --seconds 5", "--extent = 'part' chooses lines to capture"),
     "two scans": ("--scan recorded --budget 0.5", "one uniform scan .*leave one of them out"),
+    "an exposure of a scan": ("--scan-step 1 --scan-exposure-ms 5", "--scan-exposure-ms is for a camera.* leave it out"),
     "an exposure": ("--budget 0.5 --coarse-exposure-ms 25", "--coarse-exposure-ms is for a camera.* leave it out"),
     "too little time": ("--budget 0.01", "full scan's [0-9.]+ s; give more, or take one uniform scan"),
 }
