@@ -15,6 +15,7 @@ from odc.geo.geobox import GeoBox
 
 from flows.archive.history import time_of_visit
 from flows.publish.receipt import Receipt, check_receipt
+from flows.settings.survey_settings import RIG
 from flows.tasks.stages.maps import coarse_colours
 from pipeline.errors import IncompleteStoreError, SettingsError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
@@ -49,10 +50,14 @@ class ExportedRun:
 
     @property
     def observed(self) -> tuple[str, str]:
-        """Return begin and end of the observation: those of the run, unless its visit is another moment."""
+        """Return begin and end of the observation: those of the run, unless its visit is another moment.
+
+        A visit of a rig may be known by its date alone, and captures lines during the run.
+        """
         began, ended = self.receipt["started"], self.receipt["finished"]
-        visit = time_of_visit(read_run(self.folder))
-        return (began, ended) if visit is None or visit[:19] == began[:19] else (visit, visit)
+        visit = time_of_visit(read_run(self.folder)) or began
+        known = 10 if self.receipt["source"] == RIG else 19  # characters: to the day, or to the second
+        return (began, ended) if visit[:known] == began[:known] else (visit, visit)
 
     def store(self, product: str) -> StageRef | None:
         """Return the store of a product; None if there is none, or if its files were cleared away.
