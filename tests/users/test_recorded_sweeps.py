@@ -252,7 +252,10 @@ BAD = {  # flags, and the message
     "simulated rig": ("--source sim", "--sweeps is for recorded sweeps, and source = 'sim'; give --source recorded"),
     "a part of the field": ("--extent part --seconds 5", "--extent = 'part' chooses lines to capture"),
     "two scans": ("--scan recorded --budget 0.5", "one uniform scan .*leave one of them out"),
-    "an exposure of a scan": ("--scan-step 1 --scan-exposure-ms 5", "--scan-exposure-ms is for a camera.* leave it out"),
+    "an exposure of a scan": (
+        "--scan-step 1 --scan-exposure-ms 5",
+        "--scan-exposure-ms is for a camera.* leave it out",
+    ),
     "an exposure": ("--budget 0.5 --coarse-exposure-ms 25", "--coarse-exposure-ms is for a camera.* leave it out"),
     "too little time": ("--budget 0.01", "full scan's [0-9.]+ s; give more, or take one uniform scan"),
 }
