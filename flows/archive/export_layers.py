@@ -23,7 +23,7 @@ from pipeline.ground.georeference import zoomed_out
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.archive.records import RECEIPT, read_run, read_store
-from storage.arrays.class_maps import OLD_CLASS, ClassNames, legend_of
+from storage.arrays.class_maps import OLD_CLASS, ClassNames, ProbabilityStore, legend_of
 from storage.arrays.georeference import load_geobox
 from storage.arrays.ground_maps import StoredImage, open_image
 from storage.arrays.layout import grid_of, open_group
@@ -226,8 +226,13 @@ def _picture(run: ExportedRun) -> Layer:
 
 
 def prior_map_layers(run: ExportedRun) -> list[Layer]:
-    """Return the days since each pixel was captured, and what a prior map adds: changes, and earlier classes."""
+    """Return the days since each pixel was captured, and what a prior map adds: changes, and earlier classes.
+
+    Raises IncompleteStoreError: class probabilities cannot be read.
+    """
     layers = []
+    if run.store(PROBABILITIES) is not None:
+        ProbabilityStore(run.path(PROBABILITIES))
     if (product := _product_with(run, "age")) is not None:
         layers.append(image_layer(run, product, "age", "age", "Days since the pixel was captured", unit="days"))
     if (product := _product_with(run, "changed")) is not None:
