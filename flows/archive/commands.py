@@ -16,8 +16,8 @@ from rich.tree import Tree
 from flows.cli.app import ArchiveName, AsJson, Switch, stderr
 from flows.publish.receipt import is_pending
 from flows.publish.retention import RawClearance, clear_raw_lines
-from flows.settings.load import of_this_version, parse_settings
-from flows.settings.survey_settings import OF_THE_MACHINE, Settings
+from flows.settings.load import OF_THE_PLAN, of_this_version, parse_settings
+from flows.settings.survey_settings import ALWAYS, OF_THE_MACHINE, RECORDED, Settings
 from flows.tasks.open_survey import versions
 from flows.tasks.scores import score_of
 from flows.terminal.figures import DASH, counted, format_bytes, format_points, format_seconds, known_number
@@ -283,14 +283,23 @@ def verdict(archive: Archive, findings: list[Finding]) -> dict[str, Any]:
 
 
 def command(settings: Mapping[str, Any], out: str) -> str:
-    """Return the command line of these settings into the archive ``out``; tables are only named."""
+    """Return the command line of these settings into the archive ``out``; tables are only named.
+
+    A chosen uniform scan stands for the time or goal that it was chosen by. Recorded lines have their own exposures.
+    Two passes of recorded lines that state an exposure repeat the plan of their run.
+    """
     if not settings:
         return ""
+    chosen = settings.get("scan_step") and settings.get("zoom") != ALWAYS
+    left_out: set[str] = {"seconds", "goal"} if chosen else set()
+    if settings.get("source") == RECORDED:
+        repeated = settings.get("coarse_exposure_ms") is not None
+        left_out |= {"coarse_exposure_ms", "scan_exposure_ms", *(OF_THE_PLAN if repeated else ())}
     asked, defaults = {**settings, "out": out}, Settings().to_dict()
     parts, tables = ["spectralzoom", "survey"], list[str]()
     for name, usual in defaults.items():
         value, flag = asked.get(name, usual), name.replace("_", "-")
-        if value is None or value == usual:
+        if value is None or value == usual or name in left_out:
             continue
         if isinstance(value, dict):
             tables.append(f"[{name}]")

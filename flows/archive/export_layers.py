@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
 from flows.publish.receipt import Receipt, check_receipt
+from flows.settings.survey_settings import RIG
 from flows.settings.visits import time_of_visit
 from flows.tasks.stages.maps import coarse_colours
 from pipeline.errors import IncompleteStoreError, SettingsError, ShapeError
@@ -22,7 +23,7 @@ from pipeline.ground.georeference import zoomed_out
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.archive.records import RECEIPT, read_run, read_store
-from storage.arrays.class_maps import OLD_CLASS, ClassNames, legend_of
+from storage.arrays.class_maps import OLD_CLASS, ClassNames, ProbabilityStore, legend_of
 from storage.arrays.georeference import load_geobox
 from storage.arrays.ground_maps import StoredImage, open_image
 from storage.arrays.layout import grid_of, open_group
@@ -49,10 +50,14 @@ class ExportedRun:
 
     @property
     def observed(self) -> tuple[str, str]:
-        """Return begin and end of the observation: those of the run, unless its visit is another moment."""
+        """Return begin and end of the observation: those of the run, unless its visit is another moment.
+
+        A visit of a rig may be known by its date alone, and captures lines during the run.
+        """
         began, ended = self.receipt["started"], self.receipt["finished"]
-        visit = time_of_visit(read_run(self.folder))
-        return (began, ended) if visit is None or visit[:19] == began[:19] else (visit, visit)
+        visit = time_of_visit(read_run(self.folder)) or began
+        known = 10 if self.receipt["source"] == RIG else 19  # characters: to the day, or to the second
+        return (began, ended) if visit[:known] == began[:known] else (visit, visit)
 
     def store(self, product: str) -> StageRef | None:
         """Return the store of a product; None if there is none, or if its files were cleared away.
@@ -221,8 +226,13 @@ def _picture(run: ExportedRun) -> Layer:
 
 
 def prior_map_layers(run: ExportedRun) -> list[Layer]:
-    """Return the days since each pixel was captured, and what a prior map adds: changes, and earlier classes."""
+    """Return the days since each pixel was captured, and what a prior map adds: changes, and earlier classes.
+
+    Raises IncompleteStoreError: class probabilities cannot be read.
+    """
     layers = []
+    if run.store(PROBABILITIES) is not None:
+        ProbabilityStore(run.path(PROBABILITIES))
     if (product := _product_with(run, "age")) is not None:
         layers.append(image_layer(run, product, "age", "age", "Days since the pixel was captured", unit="days"))
     if (product := _product_with(run, "changed")) is not None:

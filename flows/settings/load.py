@@ -320,14 +320,13 @@ def _contradictions(stated: set[str], origin: Mapping[str, str], *, zooms: bool)
             f"{uniform[0]} asks for one uniform scan of the field, and {passes[0]} is for a survey that captures "
             "again; leave one of them out"
         )
+    for exposure in named(("coarse_exposure_ms", "scan_exposure_ms")) if "sweeps" in stated else ():
+        yield f"{exposure} is for a camera, and recorded lines have their own: leave it out"
     by_hand = named(("scan_step", "scan_exposure_ms", "scan"))
     if by_hand and not zooms and stated & {"seconds", "goal"}:
         yield f"{uniform[0]} leaves the choice of the scan to the weights' record, {by_hand[0]} makes it: leave one out"
     if "scan_exposure_ms" in stated and "scan_step" not in stated:
         yield f"{by_hand[0]} is for a uniform scan: give --scan-step too (1 for every line), or --coarse-exposure-ms"
-    exposures = named(("coarse_exposure_ms", "scan_exposure_ms"))
-    if exposures and "sweeps" in stated:
-        yield f"{exposures[0]} is for a camera, and recorded lines have their own: leave it out"
 
 
 def _camera_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]:

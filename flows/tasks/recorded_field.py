@@ -101,7 +101,10 @@ def open_recorded(settings: Settings) -> OpenedRecording:
     recording = open_recording(str(settings.sweeps), settings.camera, files)
     shape, notes = _field_shape(recording, settings.shape, settings.sweeps)
     source = recording.source(shape)
-    settings = replace(settings, camera=recording.camera, size=shape[::-1])
+    camera = recording.camera
+    if settings.coarse_exposure_ms is not None:  # the plan of a run, whose full scan has the exposure of its camera
+        camera = replace(camera, exposure_ms=settings.camera.exposure_ms)
+    settings = replace(settings, camera=camera, size=shape[::-1])
     if settings.scan == RECORDED:
         step = max(sweep.step for sweep in RecordedPasses(source).uniform_scan())
         if step > MOST_STEP:

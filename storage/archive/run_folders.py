@@ -64,7 +64,7 @@ class RunDraft:
             if isinstance(error, OSError):  # of a file that the block wrote by itself
                 with refusals(self._root, "write to the archive"):
                     raise error
-            if kind is None and not self.extends and self.folder.exists():
+            if kind is None and not self.extends and not self._done:
                 self.publish()
         finally:
             self.abandon()

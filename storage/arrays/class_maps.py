@@ -17,7 +17,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from pipeline.errors import ShapeError
+from pipeline.errors import IncompleteStoreError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.georeference import create_placed_group
 from storage.arrays.layout import (
@@ -232,10 +232,15 @@ class Changes(NamedTuple):
 
 
 class ProbabilityStore:
-    """Stored class probabilities, read in parts. Raises IncompleteStoreError: they are missing or damaged."""
+    """Stored class probabilities, read in parts.
+
+    Raises IncompleteStoreError: they are missing or damaged, or their light is packed.
+    """
 
     def __init__(self, path: Path) -> None:
         self._group = open_group(path)
+        if "log2_light" in self._group:
+            raise IncompleteStoreError(f"{path} has packed light, which is not read; reprocess computes it again")
         array = self._group.get("age")
         self.shape = (array.shape[0], array.shape[1]) if isinstance(array, zarr.Array) else (0, 0)
 

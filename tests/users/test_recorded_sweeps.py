@@ -208,6 +208,15 @@ def test_lines_of_a_run_have_the_date_of_its_visit(full_scan: tuple[Path, Publis
     assert load_settings(None, {"sweeps": sweeps, "visit": "mine"}).visit == "mine"
 
 
+def test_a_repeated_run_has_its_reference(tmp_path: Path, survey_png: Survey, make_weights: WeightsMaker) -> None:
+    """That of two exposures has the camera's own for the full scan, as when it was captured."""
+    asked: dict[str, Any] = {"weights": str(make_weights(scans=RECORD)), "zoom": "always", "seconds": "15"}
+    run = survey_png(tmp_path / "sim", budget=None, keep="raw", **NARROW, **asked)
+    assert run.receipt["settings"]["coarse_exposure_ms"] < 100
+    again = survey_sweeps(tmp_path / "again", run.folder).receipt
+    assert again["recording"]["full_scan_s"] == run.receipt["savings"]["capture_s"]["full"]
+
+
 def raw_cubes(full_scan: tuple[Path, Published, Path]) -> list[Path]:
     """Stores of the sweeps of the full scan."""
     archive, published, _ = full_scan
@@ -272,8 +281,11 @@ BAD = {  # flags, and the message
     "simulated rig": ("--source sim", "--sweeps is for recorded sweeps, and source = 'sim'; give --source recorded"),
     "a part of the field": ("--extent part --seconds 5", "--extent = 'part' chooses lines to capture"),
     "two scans": ("--scan recorded --budget 0.5", "one uniform scan .*leave one of them out"),
+    "an exposure of a scan": (
+        "--scan-step 1 --scan-exposure-ms 5",
+        "--scan-exposure-ms is for a camera.* leave it out",
+    ),
     "an exposure": ("--budget 0.5 --coarse-exposure-ms 25", "--coarse-exposure-ms is for a camera.* leave it out"),
-    "an exposure of the scan": ("--scan-step 2 --scan-exposure-ms 25", "--scan-exposure-ms is for a camera"),
     "too little time": ("--budget 0.01", "full scan's [0-9.]+ s; give more, or take one uniform scan"),
 }
 

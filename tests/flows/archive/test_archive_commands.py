@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import pytest
 from rich.console import Console
 
 from flows.archive.commands import command, contents, explain, gc, ls, run_verify
-from flows.settings.load import load_settings
+from flows.settings.load import load_settings, parse_settings
 from flows.terminal.figures import format_bytes
 from flows.terminal.processes import DONE, FAILED, PARTLY
 from pipeline.errors import ArchiveError
@@ -181,3 +182,23 @@ def test_commands_ask_for_the_settings_again(tmp_path: Path) -> None:
     told = command({**load_settings(None, flags).to_dict(), "notes": ["x"]}, "archive")
     assert told == ("spectralzoom survey --bands 3,4 --no-controls --size 640x512  (with [camera] as in its receipt)")
     assert command({}, "archive") == ""
+
+
+@pytest.mark.parametrize(
+    ("chosen", "told"),
+    [
+        ({"zoom": "never", "seconds": 25.0, "scan_step": 1, "scan_exposure_ms": 9.9}, "--scan-exposure-ms 9.9"),
+        ({"zoom": "always", "seconds": 8.0, "scan_step": 4, "coarse_exposure_ms": 84.3}, "--coarse-exposure-ms 84.3"),
+        ({"sweeps": __file__, "scan_step": 2, "scan_exposure_ms": 25.0}, "--scan-step 2"),
+        (
+            {"sweeps": __file__, "zoom": "always", "seconds": 8.0, "scan_step": 4, "coarse_exposure_ms": 84.3},
+            f"--sweeps {__file__}",
+        ),
+    ],
+)
+def test_commands_name_scans_that_a_survey_accepts(chosen: dict[str, Any], told: str) -> None:
+    """The settings of a receipt have what the weights chose beside what was asked for."""
+    source = {"source": "recorded", "scene": "field"} if "sweeps" in chosen else {}
+    words = command(parse_settings({**source, **chosen}).to_dict(), "archive").split()[2:]
+    assert told in " ".join(words)
+    load_settings(None, {flag[2:].replace("-", "_"): value for flag, value in pairwise(words) if flag.startswith("--")})

@@ -19,6 +19,7 @@ import xarray as xr
 from rich.console import Console
 
 from flows.archive.export_command import run_export
+from flows.archive.export_layers import ExportedRun
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
@@ -197,6 +198,26 @@ def test_the_catalogue_is_valid_and_leads_to_every_file(exports: list[Exported])
             assert asset.roles
         assert any(one.title.startswith("Raw sweep ") for one in item.assets.values() if "raw" in one.roles)
     assert {"class_map", "mosaic_zarr", "receipt"} <= set(items[0].assets)
+
+
+@pytest.mark.parametrize(
+    ("source", "visit", "observed"),
+    [
+        ("rig", "2026-06-21", ("2026-06-21T08:00:00Z", "2026-06-21T08:05:00Z")),
+        ("rig", "2026-06-20", ("2026-06-20T00:00:00+00:00",) * 2),
+        ("raster", "2026-06-21", ("2026-06-21T00:00:00+00:00",) * 2),
+        ("raster", None, ("2026-06-21T08:00:00Z", "2026-06-21T08:05:00Z")),
+    ],
+)
+def test_a_rig_observes_while_it_runs(
+    tmp_path: Path, source: str, visit: str | None, observed: tuple[str, str]
+) -> None:
+    """Its visit is named by the date; a run of another date used its lines again. A file has the time of its visit."""
+    receipt: Any = {"source": source, "started": "2026-06-21T08:00:00Z", "finished": "2026-06-21T08:05:00Z"}
+    archive = Archive.open(tmp_path)
+    draft = archive.new_run("field")
+    draft.write_file("receipt.json", json.dumps(receipt))
+    assert ExportedRun(archive, draft.publish(settings={"visit": visit}), receipt).observed == observed
 
 
 def test_items_say_when_where_and_how(plain: Exported, posed: Exported) -> None:

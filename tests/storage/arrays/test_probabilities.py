@@ -26,6 +26,7 @@ from storage.arrays.class_maps import (
     write_changes_tile,
     write_probabilities_tile,
 )
+from storage.arrays.layout import open_group, write_image
 
 LEGEND = ClassNames(("soil", "maize", "weed"), np.arange(9, dtype=np.uint8).reshape(3, 3))
 SHAPE = (70, 50)
@@ -161,6 +162,11 @@ def test_a_store_that_is_not_there_is_refused(tmp_path: Path) -> None:
     """By its place."""
     with pytest.raises(IncompleteStoreError, match="cannot be read"):
         ProbabilityStore(tmp_path / "none.zarr")
+    write_image(
+        open_group(stored(tmp_path / "old.zarr"), "r+"), "log2_light", ("y", "x"), np.zeros(SHAPE, np.uint8), {}
+    )
+    with pytest.raises(IncompleteStoreError, match=r"has packed light, .*; reprocess computes it again"):
+        ProbabilityStore(tmp_path / "old.zarr")
 
 
 def test_certainty_is_not_mistaken_for_nothing(tmp_path: Path) -> None:
