@@ -21,6 +21,7 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.coverage import full_sweeps
 from pipeline.planning.uniform_scans import ScanPerformance
 from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.scenes.built_in import SCOUTING_LAW
 from pipeline.simulator.scenes.farm.farm_plan import CLASSES
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, farm_scene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
@@ -50,11 +51,11 @@ def controls(weights: Weights) -> Placements:
 
 def test_file_is_small_and_tells_its_making(weights: Weights) -> None:
     """The key that its products know, at most 3 MB; command, seed, law of the data, figures of unseen scenes."""
-    assert describe_weights(PATH).key == "f653b262a9b3246a36b6"
+    assert describe_weights(PATH).key == "bf97c383ee5820cb620a"
     assert PATH.stat().st_size <= 3e6
-    assert weights.record["command"].startswith("spectralzoom train farm")
-    assert weights.record["data"] == FARM_LAW
-    assert weights.record["settings"]["seed"] == 1
+    assert weights.record["command"].startswith("spectralzoom train farm@2,scouting@1")
+    assert weights.record["data"] == f"{FARM_LAW},{SCOUTING_LAW}"
+    assert weights.record["settings"]["seed"] == 2
     assert weights.record["validation"]["entropy"]["miou"] > 0.8
     assert weights.class_names == tuple(entry for entry in CLASSES)
     split = weights.record["split"]
