@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from sklearn.ensemble import RandomForestClassifier
 from sklearn.exceptions import ConvergenceWarning
@@ -142,11 +143,12 @@ def _scanned(
     """Simulate a uniform scan of a scene and segment it in full; return counts of the map and its confidence."""
     assert example.noise is not None
     grid, labels = _parts(weights, example)
-    plain, classes = example.columns.astype(np.float32), weights.config.classes
+    plain = torch.from_numpy(example.columns).to(weights.segmenter.device).float()
     scan = augmentation.scan(plain, example.noise, light=light, step=step, rng=rng)[..., :-PLANES]
-    drawn, every_class = map_of_columns(weights, scan, grid, LineSpec(light, step))
+    drawn, every_class = map_of_columns(weights, scan.cpu().numpy(), grid, LineSpec(light, step))
     valid = (labels != UNLABELLED) & np.isfinite(drawn.confidence)
     sure = confidence_counts(drawn.confidence[valid], drawn.classes[valid] == labels[valid])
+    classes = weights.config.classes
     expected = expected_counts([every_class[valid]], classes)
     return ScoredMap(confusion(labels, drawn.classes, classes), expected), sure
 

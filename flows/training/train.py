@@ -27,7 +27,7 @@ from flows.training.figures import (
 from flows.training.fit_ood import fit_and_add, trained_on
 from flows.training.train_scenes import Scenes, TrainRequest, check_out, network_config, observe_all, training_capture
 from models.evaluation.placement import CascadeTable
-from models.network.machine import choose_device
+from models.network.machine import PROCESSOR, choose_device
 from models.network.spectral import Normalisation
 from models.training.capture_augmentation import REFERENCE_MS
 from models.training.examples import measured_normalisation
@@ -104,7 +104,7 @@ def train_weights(
     )
     if scans is not None:
         record["scans"] = scans[0]
-    save_weights(with_record(weights, **record), request.out)
+    save_weights(with_record(weights.on(PROCESSOR), **record), request.out)
     checkpoint.unlink(missing_ok=True)
     about = {"command": request.command, **({} if scans is None else {MAP_SCORES: scans[1].as_dict()})}
     try:
@@ -148,9 +148,11 @@ def _learned(
         report("training", now.done, f"step {now.step}, loss {now.loss:.3f}")
 
     common, settings, examples = scenes.common, request.settings, scenes.train.examples
+    device = choose_device(request.device)
     config, seed = network_config(request, common), settings.seed
     rng = np.random.default_rng([0x1DA])
-    pixels = LabelledPixels.drawn(examples, rng).brightened(normalisation.gain_shift, rng)
+    augmentation = training_capture(normalisation, settings.darkest_ms)
+    pixels = LabelledPixels.drawn(examples, rng, augmentation).brightened(normalisation.gain_shift, rng)
     start = linear_discriminants(pixels, config.classes)
     model, summary = train(
         config,
@@ -159,13 +161,13 @@ def _learned(
         settings,
         progress,
         start=start if begun is None else begun.segmenter.state_dict(),
-        augmentation=training_capture(normalisation, settings.darkest_ms),
+        augmentation=augmentation,
         checkpoint=checkpoint,
-        device=choose_device(request.device),
+        device=device,
     )
     if begun is not None:
         model = halfway(begun.segmenter, model)
-    weights = Weights(model, common.basis, normalisation, common.names, common.colours)
+    weights = Weights(model, common.basis, normalisation, common.names, common.colours).on(device)
     frames, found = scenes.validation.examples, dict[str, Any]()
     labelled = sum(int(np.count_nonzero(one.labels != UNLABELLED)) for one in examples)
     few = begun is None and labelled < FEW_PIXELS

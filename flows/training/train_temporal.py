@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
@@ -162,7 +163,8 @@ class _Land:
     ) -> CurrentVisit:
         """Return a visit by a uniform scan, segmented by the weights."""
         light = exposure_ms / REFERENCE_MS
-        scan = augmentation.scan(self.columns, self.noise, light=light, step=step, rng=rng)[..., :-PLANES]
+        plain = torch.from_numpy(self.columns)
+        scan = augmentation.scan(plain, self.noise, light=light, step=step, rng=rng)[..., :-PLANES].numpy()
         _, every_class = map_of_columns(weights, scan, self.grid, LineSpec(light, step))
         return CurrentVisit(every_class, np.ones(self.labels.shape, np.bool_), pooled(scan), light, step)
 

@@ -8,9 +8,12 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from models.network.spectral import LineSpec, Normalisation, with_planes
+from models.network.sizes import PLANES
+from models.network.spectral import LineSpec, Normalisation
 from pipeline.signal.components import Components
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS
 
@@ -25,7 +28,6 @@ LEAST_POWERS = (0.001, 0.02)  # of components: variance of their signal over tha
 LEAST_COMPONENTS = 4  # that stay whatever their power, as in a survey
 ROUNDED = 1 / 12  # variance that rounding adds to scores, in squares of the noise
 Matrix = NDArray[np.float64]
-Columns = NDArray[np.float32]  # (y, x, column)
 
 
 @dataclass(frozen=True)
@@ -72,9 +74,9 @@ class ColumnNoise:
 class Condensing(NamedTuple):
     """Components of a scene by a survey. Scores have the noise of one spectrum as their unit."""
 
-    of_columns: Columns  # (column, component) weights that give scores of columns less those of the mean
-    back: Columns  # (component, column) weights that give columns of scores
-    mean: Columns  # (column,) of the mean spectrum
+    of_columns: NDArray[np.float32]  # (column, component) weights that give scores of columns less those of the mean
+    back: NDArray[np.float32]  # (component, column) weights that give columns of scores
+    mean: NDArray[np.float32]  # (column,) of the mean spectrum
     power: Matrix  # (component,) variance of the signal, falling
 
 
@@ -121,14 +123,15 @@ class SceneSpectra:
 class CaptureAugmentation:
     """Turn crops of the reference exposure into captures of shorter exposures and wider line spacings.
 
-    Results have the planes of `models.network.spectral.LineSpec` after the spectral features.
+    Crops are tensors (y, x, column) of any device, which also simulates them. Results have the planes of
+    `models.network.spectral.LineSpec` after the spectral features.
     """
 
     def __init__(self, normalisation: Normalisation, *, darkest_ms: float = 3.0) -> None:
         self.normalisation, self.darkest_ms = normalisation, darkest_ms
         self.unwhiten = np.linalg.inv(normalisation.whitening.astype(np.float64)).astype(np.float32)
 
-    def draw(self, columns: Columns, noise: ColumnNoise, rng: np.random.Generator) -> tuple[Columns, Columns]:
+    def draw(self, columns: Tensor, noise: ColumnNoise, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
         """Return a crop (y, x, column) by a random capture, as inputs of the overview and the full network.
 
         It is a uniform scan, or a first pass with closer lines in some areas. Exposures are log-uniform.
@@ -149,57 +152,59 @@ class CaptureAugmentation:
 
     def scan(
         self,
-        columns: Columns,
+        columns: Tensor,
         noise: ColumnNoise,
         *,
         light: float,
         step: int,
         rng: np.random.Generator,
         least_power: float = 0.0,
-    ) -> Columns:
+    ) -> Tensor:
         """Return a crop by a uniform scan of lines ``step`` px apart, with rows between them interpolated.
 
         ``light`` is the exposure as a fraction of the reference; ``step`` is a power of two that divides the rows.
         Components of less than ``least_power`` are left out.
         """
-        scaled = columns @ self.unwhiten
-        means = scaled.reshape(-1, step, *scaled.shape[1:]).mean(axis=1)
+        scaled = columns @ beside(columns, self.unwhiten)
+        means = scaled.reshape(-1, step, *scaled.shape[1:]).mean(dim=1)
         lines = self._captured(means, noise, light, rng, unit=light, least_power=least_power, samples=step)
         between = rows_between(lines, len(columns), first=(step - 1) / 2, apart=step) if step > 1 else lines
-        return with_planes(between @ self.normalisation.whitening, LineSpec(light, step))
+        return self._input(between, LineSpec(light, step).planes)
 
     def interlaced(
-        self, columns: Columns, noise: ColumnNoise, *, step: int, rng: np.random.Generator, least_power: float = 0.0
-    ) -> Columns:
+        self, columns: Tensor, noise: ColumnNoise, *, step: int, rng: np.random.Generator, least_power: float = 0.0
+    ) -> Tensor:
         """Return a crop by a first pass of rows ``step`` px apart, and areas with later lines between them.
 
         Lines of the first pass stay among the closer lines of an area, each with its own exposure.
         """
-        scaled, size = columns @ self.unwhiten, len(columns)
+        scaled, size = columns @ beside(columns, self.unwhiten), len(columns)
         light, first = self._light(rng), int(rng.integers(step))
         lines = self._captured(scaled[first::step], noise, light, rng, unit=light, least_power=least_power)
-        between = rows_between(lines, size, first=first, apart=step)
-        image = with_planes(between @ self.normalisation.whitening, LineSpec(light, step))
+        image = self._input(rows_between(lines, size, first=first, apart=step), LineSpec(light, step).planes)
         for _ in range(rng.choice(len(AREAS), p=AREAS)):
-            rows = slice(*np.sort(rng.integers(0, size + 1, 2)))
-            samples = slice(*np.sort(rng.integers(0, columns.shape[1] + 1, 2)))
+            rows = slice(*np.sort(rng.integers(0, size + 1, 2)).tolist())
+            samples = slice(*np.sort(rng.integers(0, columns.shape[1] + 1, 2)).tolist())
             samples = slice(None) if rng.random() < ACROSS else samples
             closer, later = step // int(rng.choice([own for own in (2, 4, 8) if own <= step])), self._light(rng)
             start = first % closer
             area = scaled[start::closer, samples]
             taken = self._captured(area, noise, later, rng, unit=light, least_power=least_power)
             taken[first // closer :: step // closer] = lines[:, samples]
-            between = rows_between(taken, size, first=start, apart=closer) @ self.normalisation.whitening
+            between = rows_between(taken, size, first=start, apart=closer)[rows]
             nearest = np.clip(np.rint((np.arange(size) - start) / closer), 0, len(taken) - 1) * closer + start
-            own = np.where((nearest - first) % step == 0, light, later)
-            planes = np.stack([LineSpec(float(one), closer).planes for one in own])[:, None]
-            planes = np.broadcast_to(planes, (*between.shape[:-1], planes.shape[-1]))
-            image[rows, samples] = np.concatenate([between, planes], axis=-1)[rows]
+            own = np.where((nearest - first) % step == 0, light, later)[rows]
+            planes = np.array([LineSpec(float(one), closer).planes for one in own]).reshape(-1, 1, PLANES)
+            image[rows, samples] = self._input(between, planes)
         return image
+
+    def _input(self, scaled: Tensor, planes: NDArray[np.floating]) -> Tensor:
+        """Whiten columns, and append the planes of their capture, which broadcast to them."""
+        return with_capture(scaled @ beside(scaled, self.normalisation.whitening), planes)
 
     def _captured(
         self,
-        scaled: Columns,
+        scaled: Tensor,
         noise: ColumnNoise,
         light: float,
         rng: np.random.Generator,
@@ -207,7 +212,7 @@ class CaptureAugmentation:
         unit: float,
         least_power: float,
         samples: int = 1,
-    ) -> Columns:
+    ) -> Tensor:
         """Add the noise of an exposure ``light``, and condense by the components of an exposure ``unit``.
 
         Components of less than ``least_power`` are left out. With 0, or without spectra, nothing is condensed.
@@ -217,42 +222,60 @@ class CaptureAugmentation:
         unit = float(2 ** (np.round(4 * np.log2(unit)) / 4))  # a quarter of an octave
         law = noise.spectra.condensing(unit)
         kept = max(np.count_nonzero(law.power > least_power), LEAST_COMPONENTS)
-        values = scaled * self.normalisation.spread + self.normalisation.centre
+        centre, spread = (beside(scaled, one) for one in (self.normalisation.centre, self.normalisation.spread))
+        values, mean = scaled * spread + centre, beside(scaled, law.mean)
         shot, read = noise.spectra.added(light, unit, samples)
-        brightness = np.maximum(values.mean(axis=-1, keepdims=True) / max(float(law.mean.mean()), TINY), 0)
-        size = np.sqrt(np.maximum(read + shot * brightness, 0) + ROUNDED)
-        scores = (values - law.mean) @ law.of_columns[:, :kept]
-        scores += size * rng.standard_normal(scores.shape, np.float32)
-        values = scores @ law.back[:kept] + law.mean
-        return np.asarray((values - self.normalisation.centre) / self.normalisation.spread, np.float32)
+        brightness = values.mean(dim=-1, keepdim=True) / max(float(law.mean.mean()), TINY)
+        size = ((read + shot * brightness.clamp(min=0)).clamp(min=0) + ROUNDED).sqrt()
+        scores = (values - mean) @ beside(scaled, law.of_columns[:, :kept])
+        scores += size * normal(scores, rng)
+        return (scores @ beside(scaled, law.back[:kept]) + mean - centre) / spread
 
     def _noisy(
-        self, scaled: Columns, noise: ColumnNoise, light: float, rng: np.random.Generator, *, samples: int = 1
-    ) -> Columns:
+        self, scaled: Tensor, noise: ColumnNoise, light: float, rng: np.random.Generator, *, samples: int = 1
+    ) -> Tensor:
         """Add the noise of an exposure ``light`` to means of ``samples`` pixels of the reference exposure."""
-        values = scaled * self.normalisation.spread + self.normalisation.centre
-        more = noise.variance(values, light) - noise.variance(values, 1.0) / samples
-        size = np.sqrt(np.maximum(more, 0)) / self.normalisation.spread
-        mixing = np.linalg.cholesky(noise.correlation() + TINY * np.eye(len(noise.shot))).T.astype(np.float32)
-        drawn = rng.standard_normal(scaled.shape, np.float32) @ mixing
-        return np.asarray(scaled + size.astype(np.float32) * drawn, np.float32)
+        spread = beside(scaled, self.normalisation.spread)
+        values = scaled * spread + beside(scaled, self.normalisation.centre)
+        shot = beside(scaled, noise.shot * (1 / light - 1 / samples))
+        read = beside(scaled, np.diag(noise.read) * (1 / light**2 - 1 / samples))
+        size = (values.clamp(min=0) * shot + read).clamp(min=0).sqrt() / spread
+        mixing = np.linalg.cholesky(noise.correlation() + TINY * np.eye(len(noise.shot))).T
+        return scaled + size * (normal(scaled, rng) @ beside(scaled, mixing))
 
 
-def rows_between(lines: Columns, size: int, *, first: float, apart: float) -> Columns:
+def beside(image: Tensor, numbers: NDArray[np.floating]) -> Tensor:
+    """Return numbers as float32 on the device of an image."""
+    return torch.from_numpy(np.asarray(numbers, np.float32)).to(image.device)
+
+
+def with_capture(columns: Tensor, planes: NDArray[np.floating]) -> Tensor:
+    """Append the planes of a capture (..., 3) to spectral features, (y, x, column) -> (y, x, column + 3)."""
+    return torch.cat([columns, beside(columns, planes).expand(*columns.shape[:-1], PLANES)], dim=-1)
+
+
+def normal(like: Tensor, rng: np.random.Generator) -> Tensor:
+    """Draw standard normal numbers on the device of a tensor, by a seed of ``rng``."""
+    seeded = torch.Generator(like.device).manual_seed(int(rng.integers(2**63)))
+    return torch.randn(like.shape, generator=seeded, device=like.device)
+
+
+def rows_between(lines: Tensor, size: int, *, first: float, apart: float) -> Tensor:
     """Interpolate ``size`` rows from lines (line, x, column) at row ``first`` and every ``apart`` rows, by Catmull-Rom.
 
     The border's lines are repeated beyond it.
     """
     at = (np.arange(size) - first) / apart
     before = np.floor(at).astype(np.intp)
-    t = (at - before).astype(np.float32)
+    t = at - before
     weights = (
         ((-0.5 * t + 1.0) * t - 0.5) * t,
         (1.5 * t - 2.5) * t * t + 1.0,
         ((-1.5 * t + 2.0) * t + 0.5) * t,
         (0.5 * t - 0.5) * t * t,
     )
-    rows = np.zeros((size, *lines.shape[1:]), np.float32)
+    rows = lines.new_zeros(size, *lines.shape[1:])
     for tap, weight in enumerate(weights, start=-1):
-        rows += weight[:, None, None] * lines[np.clip(before + tap, 0, len(lines) - 1)]
+        near = torch.from_numpy(np.clip(before + tap, 0, len(lines) - 1)).to(lines.device)
+        rows += beside(lines, weight)[:, None, None] * lines[near]
     return rows

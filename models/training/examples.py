@@ -10,9 +10,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from models.network.machine import PROCESSOR
 from models.network.sizes import TOKEN_PX
-from models.network.spectral import LineSpec, Normalisation, SpectralBasis, with_planes
-from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation, ColumnNoise
+from models.network.spectral import LineSpec, Normalisation, SpectralBasis
+from models.training.capture_augmentation import (
+    REFERENCE_MS,
+    CaptureAugmentation,
+    ColumnNoise,
+    beside,
+    normal,
+    with_capture,
+)
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera, expose, footprint
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
@@ -106,10 +114,6 @@ class Batch:
     labels: Tensor  # (B, y, x) int64
     origin: Tensor  # (B, 2) random offsets of the places [tokens]
 
-    def on(self, device: str) -> Batch:
-        """Move the batch to a device."""
-        return Batch(*(one.to(device) for one in (self.image, self.detail, self.labels, self.origin)))
-
 
 class CropSampler:
     """Draw random crops: place, flips, transposition, brightness and noise."""
@@ -122,45 +126,58 @@ class CropSampler:
         *,
         noise: float = 0.0,
         augmentation: CaptureAugmentation | None = None,
+        device: str = PROCESSOR,
     ) -> None:
-        """Set up the crops. ``noise`` [spreads of the columns] is the largest added without an ``augmentation``."""
-        smallest = min(min(example.labels.shape) for example in examples)
-        cell = max(TOKEN_PX, patch) if smallest >= TOKEN_PX else patch
-        self.size = max(cell, min(crop, smallest) // cell * cell)
-        self.examples, self.patch, self.noise, self.augmentation = examples, patch, noise, augmentation
+        """Set up the crops. ``noise`` [spreads of the columns] is the largest added without an ``augmentation``.
+
+        The scenes stay on the ``device``, where crops are made.
+        """
+        self.smallest: int = min(min(example.labels.shape) for example in examples)
+        self.examples, self.patch, self.crop, self.noise = examples, patch, crop, noise
+        self.augmentation, self.device = augmentation, device
+        self.columns = [torch.from_numpy(example.columns).to(device) for example in examples]
         areas = np.array([np.count_nonzero(example.labels != UNLABELLED) for example in examples], np.float64)
         if not areas.any():
             raise SceneError(f"none of {len(examples)} scenes has a labelled pixel; training needs some")
         self.fraction = areas / areas.sum()
 
-    def draw(self, count: int, rng: np.random.Generator, gain_shift: NDArray[np.float32]) -> Batch:
-        """Draw ``count`` crops. ``gain_shift`` is the shift of normalised columns by brightness."""
-        crops = [self._crop(rng, gain_shift) for _ in range(count)]
-        image, detail, labels = (torch.stack([torch.from_numpy(crop[i]) for crop in crops]) for i in range(3))
-        return Batch(image, detail, labels, torch.from_numpy(rng.integers(0, 4096, (count, 2))))
+    def size(self, larger: int = 1) -> int:
+        """Return the side [px] of crops whose area is ``larger`` times that of ``crop``, or of the smallest scene."""
+        cell = max(TOKEN_PX, self.patch) if self.smallest >= TOKEN_PX else self.patch
+        crop = round(self.crop * math.sqrt(larger))
+        return max(cell, min(crop, self.smallest) // cell * cell)
 
-    def _crop(self, rng: np.random.Generator, gain_shift: NDArray[np.float32]) -> tuple[NDArray[np.generic], ...]:
-        size = self.size
-        example = self.examples[rng.choice(len(self.examples), p=self.fraction)]
+    def draw(self, count: int, rng: np.random.Generator, gain_shift: NDArray[np.float32], *, larger: int = 1) -> Batch:
+        """Draw ``count`` crops. ``gain_shift`` is the shift of normalised columns by brightness."""
+        crops = [self._crop(rng, gain_shift, self.size(larger)) for _ in range(count)]
+        image, detail, labels = (torch.stack(one) for one in zip(*crops, strict=True))
+        origin = torch.from_numpy(rng.integers(0, 4096, (count, 2)))
+        return Batch(image, detail, labels.to(torch.int64), origin)
+
+    def _crop(
+        self, rng: np.random.Generator, gain_shift: NDArray[np.float32], size: int
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        number = int(rng.choice(len(self.examples), p=self.fraction))
+        example = self.examples[number]
         for _ in range(20):  # until the crop has a label
             y, x = (int(rng.integers(0, side - size + 1)) for side in example.labels.shape)
             labels = example.labels[y : y + size, x : x + size]
             if (labels != UNLABELLED).any():
                 break
-        gain = np.float32(rng.normal(1.0, BRIGHTNESS))
-        transpose, down, across = rng.integers(0, 2, 3)  # one of the eight symmetries of a square
+        gain = float(rng.normal(1.0, BRIGHTNESS))
+        transpose, *flipped = rng.integers(0, 2, 3)  # one of the eight symmetries of a square
 
-        def turn(image: NDArray[np.generic]) -> NDArray[np.generic]:
-            turned = image.swapaxes(0, 1) if transpose else image
-            return turned[:: 1 - 2 * down, :: 1 - 2 * across]
+        def turn(image: Tensor) -> Tensor:
+            turned = image.transpose(0, 1) if transpose else image
+            return turned.flip([axis for axis, back in enumerate(flipped) if back])
 
-        columns = turn(example.columns[y : y + size, x : x + size]).astype(np.float32) * gain + (gain - 1) * gain_shift
+        plain = turn(self.columns[number][y : y + size, x : x + size]).float()
+        columns = plain * gain + beside(plain, (gain - 1) * gain_shift)
         if self.augmentation is not None and example.noise is not None:
             image, detail = self.augmentation.draw(columns, example.noise, rng)
         else:
             if rng.random() < NOISY:
-                noise = np.float32(rng.uniform(0, self.noise))
-                columns += noise * rng.standard_normal(columns.shape, np.float32)
-            image = detail = with_planes(columns, LineSpec())
-        channels = [np.ascontiguousarray(one.transpose(2, 0, 1)) for one in (image, detail)]
-        return channels[0], channels[1], np.ascontiguousarray(turn(labels)).astype(np.int64)
+                columns += normal(columns, rng) * rng.uniform(0, self.noise)
+            image = detail = with_capture(columns, LineSpec().planes)
+        turned = turn(torch.from_numpy(labels).to(self.device))
+        return image.permute(2, 0, 1), detail.permute(2, 0, 1), turned

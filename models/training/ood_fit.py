@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import scipy
+import torch
 from numpy.typing import NDArray
 
 from models.network.sizes import PLANES
@@ -140,10 +141,10 @@ def measured_limits(
         for i, step in enumerate(steps):
             distances = []
             for one in examples:
-                pixels = np.asarray(one.columns, np.float32)
+                pixels = torch.from_numpy(np.asarray(one.columns, np.float32))
                 if one.noise is not None:
                     pixels = augmentation.scan(pixels, one.noise, light=fraction, step=step, rng=rng)[..., :-PLANES]
-                distances.append(ood_detector.lit(fraction).distance(pixels[one.labels != UNLABELLED]))
+                distances.append(ood_detector.lit(fraction).distance(pixels.numpy()[one.labels != UNLABELLED]))
             together = np.concatenate(distances).astype(np.float64)
             fine[i, j] = np.quantile(together, 1 - np.array(RATES))
             report((j * len(steps) + i + 1) / (len(steps) * len(light)))

@@ -20,16 +20,17 @@ from torch import Tensor, nn
 
 from models.network.machine import PROCESSOR, keep_freed_memory
 from models.network.segmenter import Segmenter
-from models.network.sizes import AROUND_PX, SegmenterConfig
+from models.network.sizes import AROUND_PX, PLANES, SegmenterConfig
 from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
 from models.training.examples import BRIGHTNESS, CropSampler, Example
-from models.training.objective import PHASES, batch_loss, class_weights, phase_at
+from models.training.objective import batch_loss, class_weights, phase_at
 from models.weights.checksummed_files import load_checkpoint, save_checkpoint
 from pipeline.errors import PipelineError
 from pipeline.geometry.grid import UNLABELLED
 
 KEEP_EVERY_S = 120.0  # between checkpoints
 PIXELS = 60_000  # to fit classifiers to, of all scenes together
+CAPTURES = 16  # simulated for discriminants, of all scenes together or more
 ABSENT = -20.0  # logit of a class without a pixel
 
 
@@ -90,7 +91,7 @@ class Trainer:
         augmentation: CaptureAugmentation | None = None,
         device: str = PROCESSOR,
     ) -> None:
-        self.settings, self.gain_shift, self.device = settings, gain_shift, device
+        self.settings, self.gain_shift = settings, gain_shift
         self.rng = np.random.default_rng([settings.seed, 0x7EA])
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(settings.seed)
@@ -105,12 +106,9 @@ class Trainer:
             {"params": [p for p in parameters if p.ndim <= 1], "weight_decay": 0.0},
         ]
         self.optimiser = torch.optim.AdamW(groups, settings.learning_rate)
-        self.samplers = {}
-        for larger in {phase.larger for phase in PHASES}:
-            crop = round(settings.crop * math.sqrt(larger))
-            self.samplers[larger] = CropSampler(
-                examples, config.patch, crop, noise=settings.noise, augmentation=augmentation
-            )
+        self.sampler = CropSampler(
+            examples, config.patch, settings.crop, noise=settings.noise, augmentation=augmentation, device=device
+        )
         self.weight = class_weights([one.labels for one in examples], config.classes, settings.weight_cap).to(device)
         self.course = Course()
         self._started, self._worked = time.monotonic(), time.process_time()
@@ -130,10 +128,9 @@ class Trainer:
         for group in self.optimiser.param_groups:
             group["lr"] = self.settings.learning_rate * rate_at(done)
         phase = phase_at(done)
-        sampler = self.samplers[phase.larger]
-        fewer = phase.larger if sampler.size > self.samplers[1].size else 1  # where scenes are large enough
+        fewer = phase.larger if self.sampler.size(phase.larger) > self.sampler.size() else 1  # in large scenes
         count = max(1, self.settings.batch // fewer)
-        batch = sampler.draw(count, self.rng, self.gain_shift).on(self.device)
+        batch = self.sampler.draw(count, self.rng, self.gain_shift, larger=phase.larger)
         if not (batch.labels != UNLABELLED).any():  # decay and momentum alone would move the weights
             course.step, course.unlabelled = course.step + 1, course.unlabelled + 1
             return
@@ -209,16 +206,25 @@ class LabelledPixels:
     labels: NDArray[np.uint8]  # (pixel,)
 
     @staticmethod
-    def drawn(examples: Sequence[Example], rng: np.random.Generator) -> LabelledPixels:
-        """Draw labelled pixels at random, at most `PIXELS`, from each scene in proportion to its number."""
+    def drawn(
+        examples: Sequence[Example], rng: np.random.Generator, augmentation: CaptureAugmentation | None = None
+    ) -> LabelledPixels:
+        """Draw labelled pixels at random, about `PIXELS`, from each scene in proportion to its number.
+
+        With an ``augmentation`` scenes are captured as crops of the training are: discriminants of bright pixels have
+        logits so large that a training unlearns the errors of dark ones for thousands of steps.
+        """
         counts = [int(np.count_nonzero(one.labels != UNLABELLED)) for one in examples]
-        fraction = min(1.0, PIXELS / max(sum(counts), 1))
+        captures = 1 if augmentation is None else math.ceil(CAPTURES / len(examples))
+        fraction = min(1.0, PIXELS / max(sum(counts), 1)) / captures
         features, labels = [], []
-        for example, count in zip(examples, counts, strict=True):
+        for example, count in [pair for pair in zip(examples, counts, strict=True) for _ in range(captures)]:
+            columns = torch.from_numpy(example.columns).float()
+            if augmentation is not None and example.noise is not None:
+                columns = augmentation.draw(columns, example.noise, rng)[0][..., :-PLANES]
             places = np.flatnonzero(example.labels != UNLABELLED)
             places = np.sort(rng.choice(places, min(count, math.ceil(count * fraction)), replace=False))
-            size = (AROUND_PX, AROUND_PX, 1)
-            means = scipy.ndimage.uniform_filter(example.columns.astype(np.float32), size, mode="nearest")
+            means = scipy.ndimage.uniform_filter(columns.numpy(), (AROUND_PX, AROUND_PX, 1), mode="nearest")
             features.append(means.reshape(-1, means.shape[-1])[places])
             labels.append(example.labels.ravel()[places])
         return LabelledPixels(np.concatenate(features), np.concatenate(labels))
@@ -255,7 +261,7 @@ def with_discriminants(segmenter: Segmenter, start: Mapping[str, Tensor], fracti
     mixed = copy.deepcopy(segmenter)
     with torch.no_grad():
         for name, own in mixed.spectral.named_parameters():
-            own.lerp_(start[f"spectral.{name}"], 1 - fraction)
+            own.lerp_(start[f"spectral.{name}"].to(own.device), 1 - fraction)
         for last in (mixed.overview_classes, mixed.full_classes):
             for own in last.parameters():
                 own.mul_(fraction)

@@ -13,13 +13,15 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import torch
 from measure import ROOT
 from numpy.typing import NDArray
+from torch import Tensor
 
 from flows.training.data import FARM_SHAPE, FARM_TRAIN_SEED, farm_days, load_data_set, read_farm_name, scene_of_file
 from models.network.sizes import SegmenterConfig
-from models.network.spectral import LineSpec, SpectralBasis, with_planes
-from models.training.capture_augmentation import CaptureAugmentation, ColumnNoise
+from models.network.spectral import LineSpec, SpectralBasis
+from models.training.capture_augmentation import CaptureAugmentation, ColumnNoise, with_capture
 from models.training.examples import measured_normalisation, normalised, observe
 from models.training.train import LabelledPixels, Progress, TrainingSettings, linear_discriminants, train
 from models.weights.files import Weights, load_weights, save_weights
@@ -57,9 +59,10 @@ def coarse_image(columns: Image, factor: int) -> Image:
 class PaperCaptures(CaptureAugmentation):
     """Shows crops as the paper takes them: area means to the overview, fine pixels to the full network."""
 
-    def draw(self, columns: Image, noise: ColumnNoise, rng: np.random.Generator) -> tuple[Image, Image]:
-        factor, fine = int(rng.choice((1, *INPUTS))), with_planes(columns, LineSpec())
-        return with_planes(coarse_image(columns, factor), LineSpec(step=factor, binned=factor)), fine
+    def draw(self, columns: Tensor, noise: ColumnNoise, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+        factor, fine = int(rng.choice((1, *INPUTS))), with_capture(columns, LineSpec().planes)
+        coarse = torch.from_numpy(coarse_image(columns.numpy(), factor))
+        return with_capture(coarse, LineSpec(step=factor, binned=factor).planes), fine
 
 
 def trained(name: str, scenes: Mapping[str, Callable[[], RasterScene]], patch: int, steps: int, say: Say) -> Weights:

@@ -10,9 +10,10 @@ import torch
 
 from models.network.segmenter import Segmenter
 from models.network.sizes import PLANES, SegmenterConfig
-from models.network.spectral import LineSpec
+from models.network.spectral import LineSpec, Normalisation
 from models.reading.inference import map_of_columns
 from models.training import train as training
+from models.training.capture_augmentation import CaptureAugmentation, ColumnNoise
 from models.training.examples import CropSampler
 from models.training.objective import batch_loss, class_weights, draw_patches, map_loss, phase_at, pixel_losses
 from models.training.train import (
@@ -194,6 +195,21 @@ def test_discriminants_do_not_rely_on_the_light() -> None:
     ]
     assert weights[0][0] > 0.5 * weights[0][1]
     assert weights[1][0] < 0.05 * weights[1][1]
+
+
+def test_discriminants_of_dark_trainings_are_fitted_to_dark_pixels() -> None:
+    """Their logits are far smaller than those of bright pixels, which are as many; scenes without noise stay bright."""
+    plain = Normalisation(np.zeros(2, np.float32), np.ones(2, np.float32), np.eye(2, dtype=np.float32))
+    augmentation, silent = CaptureAugmentation(plain, darkest_ms=3.0), block_example(64, 16)
+    noisy = replace(silent, noise=ColumnNoise(np.zeros(2), 0.01 * np.eye(2)))
+    drawn = [
+        LabelledPixels.drawn([scene], np.random.default_rng(0), how)
+        for scene, how in ((noisy, None), (noisy, augmentation), (silent, augmentation))
+    ]
+    bright, dark, same = (linear_discriminants(one, 3)["spectral.weight"].abs().max().item() for one in drawn)
+    assert dark < bright / 2
+    assert same == pytest.approx(bright, rel=0.2)
+    assert {len(one.labels) for one in drawn} == {64 * 64}
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.5, 1.0])
