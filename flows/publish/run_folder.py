@@ -287,7 +287,7 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
         found["recording"] = {
             "sweeps": str(run.settings.sweeps),
             "lines_read": run.recorded.lines_served([*run.plan.coarse, *plan.sweeps]),
-            "lines_recorded": run.recorded.source.lines_recorded,
+            "lines_recorded": sum(one.sweep.lines for one in run.recorded.source.sweeps),
             "passes_s": run.plan.coarse_s + plan.seconds,
             "full_scan_s": run.settings.cost.seconds(run.plan.full, run.camera),
         }

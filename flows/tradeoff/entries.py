@@ -35,11 +35,6 @@ class Timing:
         """Least processor time [s]."""
         return min(self.cpu_s)
 
-    @property
-    def wall_min_s(self) -> float:
-        """Least wall time [s]."""
-        return min(self.wall_s)
-
 
 def time_in_turn(calls: Mapping[Any, Callable[[], object]], rounds: int = 5) -> dict[Any, Timing]:
     """Time all calls in each round. Every round begins with another call; there is no warm-up."""

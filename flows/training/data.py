@@ -91,11 +91,6 @@ class DataSet:
         """Return the names of all scenes, in the order of their files."""
         return tuple(self.files)
 
-    @property
-    def train_names(self) -> tuple[str, ...]:
-        """Return the names of the scenes to train on."""
-        return tuple(name for name in self.files if name not in self.held_out)
-
     def load(self, name: str, part: Literal["train", "test"] | None = None) -> SceneFile:
         """Read one scene by its name with all labels, or with those inside or outside of the training mask.
 
@@ -331,7 +326,7 @@ def file_data(files: DataSet, validation: int, camera: LineCamera) -> TrainingDa
 
 
 def _labelled_names(files: DataSet) -> tuple[str, ...]:
-    names = tuple(name for name in files.train_names if name not in files.unlabelled)
+    names = tuple(name for name in files.files if name not in (*files.held_out, *files.unlabelled))
     if not names:
         raise SceneError(f"{files.path}: {'; '.join(files.notes)}; held-out scenes cannot be trained on")
     return names

@@ -9,7 +9,6 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from sklearn.ensemble import RandomForestClassifier
 from sklearn.exceptions import ConvergenceWarning
@@ -28,7 +27,6 @@ from models.evaluation.metrics import (
     mean_iou,
 )
 from models.evaluation.placement import CONTROL_FRACTION, ReadTwice, placement_figures, run_controls
-from models.network.sizes import PLANES
 from models.network.spectral import LineSpec
 from models.reading.inference import coarse_prediction_of_columns, map_of_columns
 from models.training.capture_augmentation import REFERENCE_MS, STEPS, CaptureAugmentation
@@ -143,9 +141,9 @@ def _scanned(
     """Simulate a uniform scan of a scene and segment it in full; return counts of the map and its confidence."""
     assert example.noise is not None
     grid, labels = _parts(weights, example)
-    plain = torch.from_numpy(example.columns).to(weights.segmenter.device).float()
-    scan = augmentation.scan(plain, example.noise, light=light, step=step, rng=rng)[..., :-PLANES]
-    drawn, every_class = map_of_columns(weights, scan.cpu().numpy(), grid, LineSpec(light, step))
+    device = weights.segmenter.device
+    scan = augmentation.scanned(example.columns, example.noise, light=light, step=step, rng=rng, device=device)
+    drawn, every_class = map_of_columns(weights, scan, grid, LineSpec(light, step))
     valid = (labels != UNLABELLED) & np.isfinite(drawn.confidence)
     sure = confidence_counts(drawn.confidence[valid], drawn.classes[valid] == labels[valid])
     classes = weights.config.classes

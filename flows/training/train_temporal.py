@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
@@ -20,7 +19,6 @@ from flows.terminal.progress import one_after_the_other
 from flows.training.data import Report
 from flows.training.observed_scenes import observe_finely
 from models.evaluation.metrics import confusion, mean_iou
-from models.network.sizes import PLANES
 from models.network.spectral import LineSpec
 from models.network.temporal_reader import TemporalReader
 from models.reading.inference import map_of_columns
@@ -163,8 +161,7 @@ class _Land:
     ) -> CurrentVisit:
         """Return a visit by a uniform scan, segmented by the weights."""
         light = exposure_ms / REFERENCE_MS
-        plain = torch.from_numpy(self.columns)
-        scan = augmentation.scan(plain, self.noise, light=light, step=step, rng=rng)[..., :-PLANES].numpy()
+        scan = augmentation.scanned(self.columns, self.noise, light=light, step=step, rng=rng)
         _, every_class = map_of_columns(weights, scan, self.grid, LineSpec(light, step))
         return CurrentVisit(every_class, np.ones(self.labels.shape, np.bool_), pooled(scan), light, step)
 

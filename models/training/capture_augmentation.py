@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from models.network.machine import PROCESSOR
 from models.network.sizes import PLANES
 from models.network.spectral import LineSpec, Normalisation
 from pipeline.signal.components import Components
@@ -170,6 +171,21 @@ class CaptureAugmentation:
         lines = self._captured(means, noise, light, rng, unit=light, least_power=least_power, samples=step)
         between = rows_between(lines, len(columns), first=(step - 1) / 2, apart=step) if step > 1 else lines
         return self._input(between, LineSpec(light, step).planes)
+
+    def scanned(
+        self,
+        columns: NDArray[np.floating],
+        noise: ColumnNoise,
+        *,
+        light: float,
+        step: int,
+        rng: np.random.Generator,
+        device: str | torch.device = PROCESSOR,
+    ) -> NDArray[np.float32]:
+        """Return columns (y, x, column) by such a scan, without the planes of the capture."""
+        plain = torch.from_numpy(np.asarray(columns, np.float32)).to(device)
+        scan = self.scan(plain, noise, light=light, step=step, rng=rng)[..., :-PLANES]
+        return np.asarray(scan.cpu().numpy(), np.float32)
 
     def interlaced(
         self, columns: Tensor, noise: ColumnNoise, *, step: int, rng: np.random.Generator, least_power: float = 0.0

@@ -7,10 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import scipy
-import torch
 from numpy.typing import NDArray
 
-from models.network.sizes import PLANES
 from models.network.spectral import Normalisation
 from models.reading.ood import Exact, Limits, OodDetector
 from models.training.capture_augmentation import REFERENCE_MS, STEPS, CaptureAugmentation, ColumnNoise
@@ -141,10 +139,10 @@ def measured_limits(
         for i, step in enumerate(steps):
             distances = []
             for one in examples:
-                pixels = torch.from_numpy(np.asarray(one.columns, np.float32))
+                pixels = np.asarray(one.columns, np.float32)
                 if one.noise is not None:
-                    pixels = augmentation.scan(pixels, one.noise, light=fraction, step=step, rng=rng)[..., :-PLANES]
-                distances.append(ood_detector.lit(fraction).distance(pixels.numpy()[one.labels != UNLABELLED]))
+                    pixels = augmentation.scanned(pixels, one.noise, light=fraction, step=step, rng=rng)
+                distances.append(ood_detector.lit(fraction).distance(pixels[one.labels != UNLABELLED]))
             together = np.concatenate(distances).astype(np.float64)
             fine[i, j] = np.quantile(together, 1 - np.array(RATES))
             report((j * len(steps) + i + 1) / (len(steps) * len(light)))

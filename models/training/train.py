@@ -211,8 +211,8 @@ class LabelledPixels:
     ) -> LabelledPixels:
         """Draw labelled pixels at random, about `PIXELS`, from each scene in proportion to its number.
 
-        With an ``augmentation`` scenes are captured as crops of the training are: discriminants of bright pixels have
-        logits so large that a training unlearns the errors of dark ones for thousands of steps.
+        With an ``augmentation`` scenes are captured as crops are. Discriminants of bright pixels have large logits, and
+        a training unlearns their errors on dark pixels for thousands of steps.
         """
         counts = [int(np.count_nonzero(one.labels != UNLABELLED)) for one in examples]
         captures = 1 if augmentation is None else math.ceil(CAPTURES / len(examples))

@@ -143,11 +143,6 @@ class RecordedSource:
                 )
 
     @property
-    def lines_recorded(self) -> int:
-        """Return the number of recorded lines."""
-        return sum(one.sweep.lines for one in self.sweeps)
-
-    @property
     def record(self) -> Mapping[str, Any]:
         """Return the sweeps of the recording, and the assumptions on it."""
         sweeps = [{"name": one.sweep.name, "lines": one.sweep.lines} for one in self.sweeps]

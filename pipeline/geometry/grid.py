@@ -46,11 +46,6 @@ class SceneGrid:
         y, x = self.padded_shape
         return y // self.patch, x // self.patch
 
-    @property
-    def coarse_shape(self) -> tuple[int, int]:
-        """Return (y, x) of the coarse pixels that hold part of the scene."""
-        return -(-self.height // self.factor), -(-self.width // self.factor)
-
     def valid_fraction(self) -> NDArray[np.float64]:
         """Return the fraction of each patch's pixels that lie on the scene, (rows, columns) in 0..1."""
         rows, columns = self.patch_shape

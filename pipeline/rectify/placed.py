@@ -195,7 +195,7 @@ class PixelGrid:
     @classmethod
     def of_scene(cls, grid: SceneGrid, step: int) -> PixelGrid:
         """Return the scene's own pixels for step 1, its coarse ones for ``grid.factor``."""
-        shape = (grid.height, grid.width) if step == 1 else grid.coarse_shape
+        shape = -(-grid.height // step), -(-grid.width // step)  # of pixels that hold part of the scene
         return cls(((step - grid.height) / 2, (step - grid.width) / 2), step, shape)
 
     def points(self, rows: slice, columns: slice) -> NDArray[np.float64]:

@@ -259,14 +259,6 @@ class FetchedFiles:
                 "before it are kept, and the camera still has the file"
             ) from error
 
-    def drop(self, name: str) -> None:
-        """Remove all bytes of a file (NotKept: the disk refuses)."""
-        path = self._path(name)
-        with _unread(path):
-            path.unlink(missing_ok=True)
-            _sums_of(path).unlink(missing_ok=True)
-            self._crc32.pop(name, None)
-
     def _compare(self, name: str, path: Path) -> None:
         """Cut off the bytes that no sum covers, once for each file; notes have checksums of their own."""
         if name in self._crc32 or _is_note(name):

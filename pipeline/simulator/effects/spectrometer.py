@@ -226,62 +226,36 @@ LEAST_MODE = 1e-8  # of a wide Gaussian's cosines; fainter ones are below float3
 
 
 @dataclass(frozen=True)
-class Prnu(Gain):
-    """Every element has a gain of its own, normal about 1, never below 0."""
+class SensorGain(Gain):
+    """Parts of the sensor have gains of their own, normal about 1, never below 0."""
 
-    name = "prnu"
+    name: str = "prnu"
+    parts: str = "elements"  # or columns: samples of all bands
     cost_ns = MappingProxyType({"exact": 0.2})
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound it by the greatest signal of each band times the greatest gain beside 1 that the sensor has there."""
-        fraction = rig.detector.prnu_std
+        fraction = self._deviation(rig)
         if fraction == 0:
-            return Bound(0.0, "all elements respond alike")
-        off = np.abs(response_gain(rig, len(probe.wavelength_nm)) - 1).max(axis=0)
-        return Bound(probe.scaled(off), f"gains differ by {fraction:.2%} (sd), {off.max():.2%} at most")
+            return Bound(0.0, f"all {self.parts} respond alike")
+        off = np.abs(self.gains(rig, len(probe.wavelength_nm)) - 1).max(axis=0)
+        return Bound(probe.scaled(off), f"gains of {self.parts} differ by {fraction:.2%} (sd), {off.max():.2%} at most")
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
-        return _range_of(response_gain(rig, len(probe.wavelength_nm)), probe)
+        gains = self.gains(rig, len(probe.wavelength_nm))
+        least, greatest = float(gains.min(initial=1.0)), float(gains.max(initial=1.0))
+        return GainRange.between(least, greatest, len(probe.wavelength_nm), uneven=greatest - least)
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
-        return response_gain(block.rig, len(block.wavelength_nm))[None]
+        return self.gains(block.rig, len(block.wavelength_nm))[None]
 
+    def gains(self, rig: Rig, bands: int) -> Radiance:
+        """Return the gains of the sensor's parts, (sample, band) or (sample, 1) of the whole camera."""
+        own = bands if self.parts == "elements" else 1
+        return _gains(rig.detector.unit, self.name, rig.camera.samples, own, fraction=self._deviation(rig))
 
-@dataclass(frozen=True)
-class Striping(Gain):
-    """All bands of a sample share a gain, normal about 1, never below 0: stripes along the scan."""
-
-    name = "striping"
-    cost_ns = MappingProxyType({"exact": 0.2})
-
-    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound it by the greatest signal times the greatest gain beside 1 that the sensor has."""
-        fraction = rig.detector.striping_std
-        if fraction == 0:
-            return Bound(0.0, "all columns respond alike")
-        off = float(np.abs(stripe_gain(rig) - 1).max())
-        return Bound(probe.scaled(off), f"gains of columns differ by {fraction:.2%} (sd), {off:.2%} at most")
-
-    def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
-        return _range_of(stripe_gain(rig), probe)
-
-    def gain(self, block: SweepBlock, variant: str) -> Radiance:
-        return stripe_gain(block.rig)[None]
-
-
-def response_gain(rig: Rig, bands: int) -> Radiance:
-    """Return the gains of the sensor's elements, (sample, band) of the whole camera."""
-    return _gains(rig.detector.unit, "prnu", rig.camera.samples, bands, fraction=rig.detector.prnu_std)
-
-
-def stripe_gain(rig: Rig) -> Radiance:
-    """Return the gains of the sensor's columns, (sample, 1) of the whole camera."""
-    return _gains(rig.detector.unit, "striping", rig.camera.samples, 1, fraction=rig.detector.striping_std)
-
-
-def _range_of(gains: Radiance, probe: Probe) -> GainRange:
-    least, greatest = float(gains.min(initial=1.0)), float(gains.max(initial=1.0))
-    return GainRange.between(least, greatest, len(probe.wavelength_nm), uneven=greatest - least)
+    def _deviation(self, rig: Rig) -> float:
+        return float(getattr(rig.detector, f"{self.name}_std"))
 
 
 @lru_cache(maxsize=8)
@@ -339,4 +313,4 @@ def _cosines(count: int, sd_px: float) -> tuple[Radiance, NDArray[np.float64]]:
     return waves.astype(np.float32), passed[modes]
 
 
-PRNU, STRIPING, STRAY_LIGHT = Prnu(), Striping(), StrayLight()
+PRNU, STRIPING, STRAY_LIGHT = SensorGain(), SensorGain("striping", "columns"), StrayLight()

@@ -17,7 +17,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel, Sweep, line_positions
 from pipeline.signal.calibrate import calibrate
 from pipeline.simulator.effects.counting import SHOT, dark_electrons, dead_elements, hot_electrons
-from pipeline.simulator.effects.spectrometer import response_gain, stripe_gain
+from pipeline.simulator.effects.spectrometer import PRNU, STRIPING
 from pipeline.simulator.rig_model import Detector, Rig, Sky
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_block, sweep_starts
@@ -225,7 +225,7 @@ def test_frames_show_dark_current_and_gains() -> None:
     """The dark frame has the mean dark current, the white frame both gains of every element."""
     found = white_reference_source_of("dark-current", "prnu", "striping").references(WHITE_REFERENCE_SWEEP)
     np.testing.assert_allclose(found.dark, 64 + dark_electrons(RIG), rtol=1e-6)
-    gains = response_gain(RIG, BANDS) * stripe_gain(RIG)
+    gains = PRNU.gains(RIG, BANDS) * STRIPING.gains(RIG, BANDS)
     np.testing.assert_allclose(found.white - found.dark, gains * even_scene().white_reference_electrons, rtol=1e-4)
 
 

@@ -230,5 +230,5 @@ def test_every_effect_of_every_module_is_registered_once():
         if not name.startswith("__") and type(one).__module__ == module.__name__
         if hasattr(one, "bound") and hasattr(one, "variants")
     ]
-    assert {type(one) for one in there} == {type(one) for one in EFFECTS}
-    assert len(EFFECTS) == len({type(one) for one in EFFECTS}) == len(there)
+    assert {one.name: type(one) for one in there} == {one.name: type(one) for one in EFFECTS}
+    assert len(EFFECTS) == len({one.name for one in EFFECTS}) == len(there)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from pipeline.simulator.effects.spectrometer import STRAY_LIGHT, response_gain, stripe_gain
+from pipeline.simulator.effects.spectrometer import PRNU, STRAY_LIGHT, STRIPING
 from pipeline.simulator.rig_model import Detector, Rig
 from tests.pipeline.simulator.spectral_light import block_of, random_light, rig_with
 
@@ -52,7 +52,7 @@ RIG = Rig()
 
 def test_gains_have_the_spread_that_is_stated() -> None:
     """1 % an element, 0.2 % a column; of mean 1; nothing shared between the two."""
-    elements, columns = response_gain(RIG, 270), stripe_gain(RIG)
+    elements, columns = PRNU.gains(RIG, 270), STRIPING.gains(RIG, 1)
     assert elements.shape == (640, 270)
     assert elements.mean() == pytest.approx(1, abs=1e-4)
     assert elements.std() == pytest.approx(0.01, rel=0.02)
@@ -62,12 +62,12 @@ def test_gains_have_the_spread_that_is_stated() -> None:
 
 def test_gains_belong_to_the_unit() -> None:
     """Another sensor has others; more bands have the same."""
-    assert not np.array_equal(response_gain(RIG, 5), response_gain(Rig(detector=Detector(unit=1)), 5))
-    np.testing.assert_array_equal(response_gain(RIG, 9)[:, :5], response_gain(RIG, 5))
+    assert not np.array_equal(PRNU.gains(RIG, 5), PRNU.gains(Rig(detector=Detector(unit=1)), 5))
+    np.testing.assert_array_equal(PRNU.gains(RIG, 9)[:, :5], PRNU.gains(RIG, 5))
 
 
 def test_gains_never_fall_below_0() -> None:
     """A spread of 50 % leaves elements without response, none with less."""
-    gains = response_gain(Rig(detector=Detector(prnu_std=0.5)), 50)
+    gains = PRNU.gains(Rig(detector=Detector(prnu_std=0.5)), 50)
     assert gains.min() == 0
     assert gains.max() > 2
