@@ -13,7 +13,6 @@ import pytest
 from flows.terminal.processes import place_caches, place_pages
 from pipeline.errors import SettingsError
 
-ROOT = Path(__file__).parents[3]
 NOWHERE = "/proc/nonexistent"  # where not even root can write
 
 

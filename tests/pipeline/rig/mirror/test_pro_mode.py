@@ -47,9 +47,6 @@ nasty = st.one_of(
 frames = st.builds(Frame, st.integers(0, 255), nasty, st.integers(0, 255))
 
 
-rubbish = st.binary(max_size=30).map(lambda data: data.replace(b"\x7e", b"?"))
-
-
 def parts(stream: bytes, cuts: list[int]) -> list[bytes]:
     """Cut a stream at places taken modulo its length."""
     places = sorted({0, len(stream), *(cut % (len(stream) + 1) for cut in cuts)})
@@ -171,9 +168,6 @@ REPLIES = [
     (refuse(0x14, ErrorCode.VECTOR_INDEX), "7E 00 94 04 00 00 01 07 AD 46 7E"),
     (refuse(0x12, ErrorCode.CHAIN), "7E 00 92 04 00 00 02 03 AC 13 7E"),
 ]
-
-
-a_cell = st.binary(min_size=4, max_size=4)
 
 
 @pytest.mark.parametrize(("frame", "data"), [*REQUESTS, *REPLIES])

@@ -24,15 +24,6 @@ def folded(shift: np.ndarray, variance: np.ndarray) -> Footprint:
     return fold(*PLAIN, Moments(shift, variance))
 
 
-def transfer(width: float, shift: np.ndarray, variance: np.ndarray, wave: float) -> np.ndarray:
-    """What a scene's pixels, a box and Gaussians leave of a wave, with its phase; wave in turns per px."""
-    return (
-        np.sinc(wave) ** 2
-        * np.sinc(width * wave)
-        * np.exp(-2 * np.pi**2 * variance * wave**2 - 2j * np.pi * shift * wave)
-    )
-
-
 def test_bands_alike_have_one_kernel() -> None:
     """Equal moments need one kernel, and it has exactly those."""
     found = folded(np.full((2, 9), 0.1), np.full((2, 9), 0.3))
