@@ -24,12 +24,7 @@ def sweep_at(swath_px, start_px, lines):
     return Sweep("fine", "fine", "x", swath_px=swath_px, start_px=start_px, lines=lines)
 
 
-def coated(coating="aluminium"):
-    """A rig whose mirror is of some metal."""
-    return replace(rig_with(), mirror=MirrorMotion(coating=coating))
-
-
-RIG = coated()
+RIG = replace(rig_with(), mirror=MirrorMotion(coating="aluminium"))
 
 
 def factors(sweep, rig=RIG):

@@ -11,16 +11,11 @@ from tests.pipeline.simulator.spectral_light import SAMPLES, block_of, probe_of,
 VARIANCE_OF_6 = 36 / (8 * np.log(2))
 
 
-def kernel(wavelength, fwhm, wanted=6.0):
-    """What each band takes of each other, (band made, band taken)."""
-    return widen_bands(np.eye(len(wavelength)), wavelength, fwhm, wanted).T
-
-
 @pytest.mark.parametrize("fwhm_nm", [0.0, 2.0, 5.9])
 def test_kernel_has_the_missing_variance_on_uneven_bands(fwhm_nm):
     """No weight below 0, sum 1, mean 0 and the variance to 1e-6, however few bands a width spans."""
     nm = 400 + np.cumsum(np.random.default_rng(0).uniform(1, 3, 60))
-    rows = kernel(nm, np.full(60, fwhm_nm))
+    rows = widen_bands(np.eye(60), nm, np.full(60, fwhm_nm), 6.0).T  # (band made, band taken)
     way = nm - nm[:, None]
     np.testing.assert_allclose(rows.sum(axis=1), 1, atol=1e-6)
     np.testing.assert_allclose((rows * way).sum(axis=1), 0, atol=1e-5)
