@@ -27,7 +27,7 @@ from models.network.spectral import Normalisation, SpectralBasis
 from models.weights.files import Weights, save_weights, with_record
 from storage.readers.labels import default_colour
 from tests.object_server import bucket, machine, s3_server  # noqa: F401 - fixtures
-from tests.prior_work import WORKED_OUT, remember, with_effects, without_effects
+from tests.prior_work import remember, with_effects, without_effects
 from tests.zarr_at_once import close_loops, work_at_once
 
 RGB_NM = (640.0, 550.0, 460.0)
@@ -118,13 +118,6 @@ def zarr_in_this_thread() -> Iterator[None]:
         work_at_once(patch)
         yield
     close_loops()
-
-
-@pytest.fixture
-def choosing_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every survey of this test works out its choice of effects, and draws its picture, by itself."""
-    for name, (module, real) in WORKED_OUT.items():
-        monkeypatch.setattr(module, name, real)
 
 
 @pytest.fixture

@@ -2,8 +2,8 @@
 
 Only what is pure is kept: the look at the scene that a choice of effects rests on, and the choice, which each process
 remembers by itself. Of pictures one of each kind is drawn and packed, and stands
-for all of that kind. Stores, receipt and run are made each time. Tests that surveys repeat themselves put `WORKED_OUT`
-back; those that ask nothing of effects have no scene looked at: `without_effects`.
+for all of that kind. Stores, receipt and run are made each time. Tests that ask nothing of effects have no scene
+looked at: `without_effects`.
 """
 
 from __future__ import annotations

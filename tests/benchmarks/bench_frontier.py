@@ -22,12 +22,12 @@ from measure import Row
 from numpy.typing import NDArray
 
 from flows.tasks.survey_model import shipped_weights
-from flows.tradeoff.stages import uniform_pass
+from flows.tradeoff.stages import PlannedPass, uniform_pass
 from flows.training.observed_scenes import chosen_effects
 from models.evaluation.expected_scores import MapScores, expected_counts
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.spectral import LineSpec
-from models.reading.inference import segment
+from models.reading.inference import DrawnMap, segment
 from models.weights.files import Weights, describe_weights, load_weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
@@ -157,17 +157,23 @@ def _plain(seed: int, step: int, exposure_ms: float) -> PlanMap:
     return map_of(farm_scene(seed, SHAPE, camera=CAMERA), seed, step, exposure_ms)
 
 
-def map_of(scene: RasterScene, seed: int, step: int, exposure_ms: float, weights: Weights | None = None) -> PlanMap:
-    """The map of a scene's uniform scan; what it says of itself by the house's own weights alone."""
-    others, weights, rig = weights is not None, weights or shipped(), Rig(CAMERA)
-    grid = SceneGrid(*scene.shape, weights.config.patch, 1)
+def scanned(
+    scene: RasterScene, weights: Weights, seed: int, step: int, exposure_ms: float
+) -> tuple[PlannedPass, DrawnMap]:
+    """A uniform scan of a scene, and the map of it with every patch read."""
+    grid, rig = SceneGrid(*scene.shape, weights.config.patch, 1), Rig(CAMERA)
     along, _, _ = cheapest_full(grid, CAMERA, COST)
     sweeps = uniform_sweeps(grid, CAMERA, along, step=step, exposure_ms=exposure_ms)
     chosen = chosen_effects(scene, rig, sweeps)
     source = SimulatedSource(scene, rig, seed, chosen, clock=sweep_starts(sweeps, CAMERA, COST))
-    scan = LineSpec(exposure_ms / CAMERA.exposure_ms, step)
-    scan_pass = uniform_pass(weights, source, sweeps, grid, COST, scan)
-    drawn = segment(weights, scan_pass.coarse, scan_pass.columns, scan_pass.patch_index, every_class=True)
+    scan_pass = uniform_pass(weights, source, sweeps, grid, COST, LineSpec(exposure_ms / CAMERA.exposure_ms, step))
+    return scan_pass, segment(weights, scan_pass.coarse, scan_pass.columns, scan_pass.patch_index, every_class=True)
+
+
+def map_of(scene: RasterScene, seed: int, step: int, exposure_ms: float, weights: Weights | None = None) -> PlanMap:
+    """The map of a scene's uniform scan; what it says of itself by the house's own weights alone."""
+    others, weights = weights is not None, weights or shipped()
+    scan_pass, drawn = scanned(scene, weights, seed, step, exposure_ms)
     judged = _judged(scene, drawn.classes, weights)
     if others:
         return PlanMap(scan_pass.seconds, judged)

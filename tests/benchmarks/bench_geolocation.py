@@ -68,12 +68,8 @@ def _calls(scan_path: ScanPath) -> dict[str, Callable[[], object]]:
     return {
         "tree": lambda: cKDTree(samples).query(pixels, workers=1),
         "query": lambda: tree.query(pixels, workers=1),
-        "ties 16": lambda: _read(_tie_points(scan_path, 16)),
+        "ties 16": lambda: _read(tie_table(scan_path, CAMERA, along="x", tie=16, tolerance_px=np.inf, **GRID)),
     }
-
-
-def _tie_points(scan_path: ScanPath, tie: int) -> TieTable:
-    return tie_table(scan_path, CAMERA, along="x", tie=tie, tolerance_px=np.inf, **GRID)
 
 
 def _read(table: TieTable) -> None:

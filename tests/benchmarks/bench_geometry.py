@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from measure import Row, time_in_turn
 from numpy.typing import NDArray
@@ -119,12 +117,10 @@ def _noise() -> tuple[float, float]:
 
 def _time() -> Row:
     position = _disk(COUNT)
-    clocks = time_in_turn({name: _there_and_back(position.astype(name)) for name in ("float64", "float32")}, rounds=3)
+    given = {name: position.astype(name) for name in ("float64", "float32")}
+    calls = {name: lambda one=one: direction_to_position(position_to_direction(one)) for name, one in given.items()}
+    clocks = time_in_turn(calls, rounds=3)
     spent = {name: 1e9 * clock.cpu_min_s / COUNT for name, clock in clocks.items()}
     return Row(
         "time of position -> ray -> position", f"{spent['float64']:.3g} ns", peers=f"float32: {spent['float32']:.3g} ns"
     )
-
-
-def _there_and_back(position: NDArray[np.floating]) -> Callable[[], object]:
-    return lambda: direction_to_position(position_to_direction(position))

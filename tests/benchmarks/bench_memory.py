@@ -8,31 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
+from bench_frontier import CAMERA, SHAPE, scanned, shipped
 from measure import Row
 from numpy.typing import NDArray
 
 from flows.tasks.survey_model import shipped_weights
-from flows.tradeoff.stages import uniform_pass
-from flows.training.observed_scenes import chosen_effects
 from models.evaluation.metrics import confusion, iou_per_class, mean_iou
-from models.network.spectral import LineSpec
-from models.reading.inference import segment
 from models.reading.prior_map import CurrentVisit, PriorMap, first_probabilities, fuse, pooled
-from models.training.capture_augmentation import REFERENCE_MS
-from models.weights.files import Weights, load_reader, load_weights
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import CostModel
-from pipeline.planning.coverage import cheapest_full, uniform_sweeps
-from pipeline.simulator.rig_model import Rig
+from models.weights.files import load_reader
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
-from pipeline.simulator.simulated import SimulatedSource, sweep_starts
 
-SHAPE, HOUR = (512, 640), 11.0  # pixels (y, x) of every farm
-CAMERA, COST = LineCamera(), CostModel()
+HOUR = 11.0
 ANEW, QUICK = (1, 25.0), (2, 5.0)  # step and exposure [ms]
 FARMS, DAYS, LATER = range(71, 79), (110, 172, 255), 7  # days of April, June and September
 GOAL, LEAST, WORSE = 65, 45, -1  # mean and least fraction of the gap [%]; points that a class may lose
@@ -56,26 +44,13 @@ class Seen:
         return confusion(self.labels, classes, len(shipped().class_names))
 
 
-@cache
-def shipped() -> Weights:
-    return load_weights(shipped_weights())
-
-
 def view_farm(seed: int, day: int, how: tuple[int, float], noise: int) -> Seen:
     """Scan a farm as it is on a day, read by the shipped weights."""
-    weights, (step, exposure_ms), rig = shipped(), how, Rig(CAMERA)
-    scene = farm_scene(seed, SHAPE, camera=CAMERA, day=day, hour=HOUR)
-    grid = SceneGrid(*SHAPE, weights.config.patch, 1)
-    along, _, _ = cheapest_full(grid, CAMERA, COST)
-    sweeps = uniform_sweeps(grid, CAMERA, along, step=step, exposure_ms=exposure_ms)
-    clock, stream = sweep_starts(sweeps, CAMERA, COST), seed + 1000 * day + 100_000_000 * noise
-    source = SimulatedSource(scene, rig, stream, chosen_effects(scene, rig, sweeps), clock=clock)
-    light = exposure_ms / REFERENCE_MS
-    scan_pass = uniform_pass(weights, source, sweeps, grid, COST, LineSpec(light, step))
-    drawn = segment(weights, scan_pass.coarse, scan_pass.columns, scan_pass.patch_index, every_class=True)
+    (step, exposure_ms), scene = how, farm_scene(seed, SHAPE, camera=CAMERA, day=day, hour=HOUR)
+    scan_pass, drawn = scanned(scene, shipped(), seed + 1000 * day + 100_000_000 * noise, step, exposure_ms)
     assert drawn.log_probability is not None
     columns, everything = pooled(scan_pass.coarse.columns), np.ones(SHAPE, np.bool_)
-    observation = CurrentVisit(drawn.log_probability, everything, columns, light, step)
+    observation = CurrentVisit(drawn.log_probability, everything, columns, exposure_ms / CAMERA.exposure_ms, step)
     return Seen(observation, np.asarray(scene.labels, np.uint8))
 
 

@@ -165,14 +165,8 @@ def rows(picture: Path | None = None) -> list[Row]:
     for share in SHARES:
         each = [cell.gain(PLANNER) for cell in measured if cell.share == share]
         gain = float(np.mean(each))
-        found.append(
-            Row(
-                f"share {share:g}, mean of {len(each)} cells",
-                f"{gain:+.1f}",
-                f"{GOALS[share]:+g}",
-                gain >= GOALS[share],
-            )
-        )
+        goal, what = GOALS[share], f"share {share:g}, mean of {len(each)} cells"
+        found.append(Row(what, f"{gain:+.1f}", f"{goal:+g}", gain >= goal))
     if picture is not None:
         draw(measured, picture)
     return found

@@ -72,15 +72,10 @@ def _over_take(scene: Turned) -> list[Row]:
     found = []
     for kernel in KERNELS:
         times, goal = ratio(clocks, kernel, "take"), 3.0 if kernel == "catmull-rom" else None
-        found.append(
-            Row(
-                f"{kernel}, {BANDS} bands, over np.take of the same rows",
-                f"{times:.2f} x",
-                f"<= {goal:g} x" if goal else "",
-                times <= goal if goal else None,
-                f"{_ns(clocks[kernel], TILES * out.size):.2f} ns/(px*band), np.take {take:.2f}",
-            )
-        )
+        what = f"{kernel}, {BANDS} bands, over np.take of the same rows"
+        judged = (f"<= {goal:g} x", times <= goal) if goal else ("", None)
+        spent = f"{_ns(clocks[kernel], TILES * out.size):.2f} ns/(px*band), np.take {take:.2f}"
+        found.append(Row(what, f"{times:.2f} x", *judged, spent))
     return [*found, _over_take_cached(scene)]
 
 
@@ -137,15 +132,8 @@ def _over_linear(natural: Turned, flat: Turned) -> list[Row]:
         ours, theirs = scene.error(_call(scene, "catmull-rom")()[0]), scene.error(linear.by_pixel(linear.call()))
         listed = f"{ours:.4f}, cv2 linear {theirs:.4f}"
         fraction = ours / theirs
-        found.append(
-            Row(
-                f"catmull-rom: error over cv2.remap linear, {what}",
-                f"{fraction:.3f}",
-                "<= 1/3",
-                fraction <= 1 / 3,
-                listed,
-            )
-        )
+        name = f"catmull-rom: error over cv2.remap linear, {what}"
+        found.append(Row(name, f"{fraction:.3f}", "<= 1/3", fraction <= 1 / 3, listed))
     out = np.empty(natural.truth.shape, np.float32)
     calls = {"ours": _call(natural, "catmull-rom", out), "joined": peers(natural, 1, only="cv2.remap")[0].call}
     calls["parted"] = cv2_parts(natural, 1)

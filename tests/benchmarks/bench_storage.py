@@ -38,13 +38,9 @@ def _raw() -> NDArray[np.uint16]:
     return np.concatenate([np.roll(block, turn, axis=1) for turn in range(LINES // SHARD_ROWS)])
 
 
-def _lines(raw: NDArray[np.uint16]) -> list[Line]:
-    return [Line(number, data, 0.0, 1e-4 * number, 0.1 * number, 100.0) for number, data in enumerate(raw)]
-
-
 def _against_zarr(folder: Path, raw: NDArray[np.uint16]) -> list[Row]:
     """A raw cube written 64 lines at a time and read whole, by our writer and reader and by zarr alone."""
-    lines = _lines(raw)
+    lines = [Line(number, data, 0.0, 1e-4 * number, 0.1 * number, 100.0) for number, data in enumerate(raw)]
     frame = np.zeros((SAMPLES, BANDS), np.float32)
     references = References(frame, frame + 1000, np.ones(BANDS, np.float32))
     header = SweepHeader(Sweep("fine-0", "fine", "x", 0.0, 0.0, LINES), references, np.linspace(400, 1000, BANDS))
@@ -78,15 +74,9 @@ def _against_zarr(folder: Path, raw: NDArray[np.uint16]) -> list[Row]:
     found = []
     for what, clocks in (("write", writes), ("read", reads)):
         fraction = ratio(clocks, "plain", "ours")
-        found.append(
-            Row(
-                f"{what} a raw cube of {size:.0f} MB: speed over plain zarr-python's",
-                f"{fraction:.0%}",
-                ">= 80 %",
-                fraction >= 0.8,
-                f"{size / min(clocks['ours'].wall_s):.0f} MB/s, plain {size / min(clocks['plain'].wall_s):.0f} MB/s",
-            )
-        )
+        ours, theirs = (f"{size / min(clocks[way].wall_s):.0f} MB/s" for way in ("ours", "plain"))
+        name = f"{what} a raw cube of {size:.0f} MB: speed over plain zarr-python's"
+        found.append(Row(name, f"{fraction:.0%}", ">= 80 %", fraction >= 0.8, f"{ours}, plain {theirs}"))
     return found
 
 

@@ -35,7 +35,6 @@ WEIGHTS = shipped_weights()
 BANDS_NM = np.linspace(405.0, 995.0, 60)
 PINES = data_folder("indian_pines")
 BRIGHTNESS = 0.22  # mean reflectance of farms
-Values = NDArray[np.float32]
 Judged = dict[str, float]
 
 

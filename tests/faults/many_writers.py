@@ -16,7 +16,7 @@ from pathlib import Path
 
 from storage.archive.archive import Archive
 from tests.faults.fault_table import Clock, Row, reported_wrong
-from tests.faults.nursery import Ended, Nursery
+from tests.faults.nursery import Nursery
 from tests.faults.small_survey import Stored, Subject, prepare, problems, stored, words
 
 ROUNDS = 10
@@ -55,7 +55,8 @@ def write_together(
         time.sleep(chance.uniform(0.0, subject.whole_s))
         children[0].kill()
     ended = [child.wait() for child in children]
-    found.waited += sum("waiting for another run" in one.text or _was_given(one) for one in ended)
+    given = [one for one in ended if "% cached" in one.text and "% ran" in one.text]  # a stage that it had asked for
+    found.waited += sum("waiting for another run" in one.text or one in given for one in ended)
     wrong += [f"exit {one.code}: {one.message[-200:]}" for one in ended[int(kill) :] if one.code != 0]
     if kill:
         wrong += [f"killed, but exit {one.code}" for one in ended[:1] if one.code not in (0, -9)]
@@ -72,11 +73,6 @@ def write_together(
     found.wrong += wrong
     found.wrong += _left(out, killed=kill)
     shutil.rmtree(out)
-
-
-def _was_given(one: Ended) -> bool:
-    """Whether a survey found a stage made that it had begun to ask for: some ran, some were cached."""
-    return "% cached" in one.text and "% ran" in one.text
 
 
 def _left(out: Path, *, killed: bool) -> list[str]:

@@ -21,11 +21,6 @@ def planned(grid: SceneGrid, gain: np.ndarray, seconds: float, along: Axis = "x"
     return SecondPass(grid, CAMERA, cost, every_nth(full), full, seconds, margin_px=1e-9).plan(gain)
 
 
-def even(grid: SceneGrid) -> np.ndarray:
-    """The same gain for every patch."""
-    return np.ones(int(np.prod(grid.patch_shape)))
-
-
 @pytest.mark.parametrize(("lines", "loads"), [(1500, 1), (1501, 2)])
 def test_the_memorys_last_pair(lines: int, loads: int):
     """1500 positions are one load and 1501 two, in the layout and in the price."""

@@ -65,7 +65,9 @@ def rows(quick: bool) -> list[Row]:
             observation = survey(folder / "rig", str(rig), "--visit", "first")
         simulated = survey(folder / "simulated", *scene)
         found = [_of_check(checked), _of_lines(observation, simulated, clock.seconds)]
-        return [*found, _of_maps(observation, simulated), _of_end(process.returncode)]
+        code = process.returncode
+        end = Row("the emulated rig", "told to end as by Ctrl-C", 1, "exit code 0", f"exit code {code}", code == 0, 0.0)
+        return [*found, _of_maps(observation, simulated), end]
 
 
 @contextmanager
@@ -164,7 +166,3 @@ def _of_maps(one: Surveyed, other: Surveyed) -> Row:
         odd <= MOST_OTHER * seen.size,
         0.0,
     )
-
-
-def _of_end(code: int) -> Row:
-    return Row("the emulated rig", "told to end as by Ctrl-C", 1, "exit code 0", f"exit code {code}", code == 0, 0.0)

@@ -67,14 +67,6 @@ def write_geotiff(path: Path, transform: Affine, *, gap: bool = False, crs: str 
     return path
 
 
-def north_up(folder: Path) -> tuple[Path, Affine]:
-    return write_geotiff(folder / "a.tif", NORTH_UP), NORTH_UP
-
-
-def turned(folder: Path) -> tuple[Path, Affine]:
-    return write_geotiff(folder / "a.tif", TURNED), TURNED
-
-
 def envi(folder: Path) -> tuple[Path, Affine]:
     place = ", ".join(map(str, ENVI_TURNED))
     (folder / "a.hdr").write_text(
@@ -88,8 +80,8 @@ def envi(folder: Path) -> tuple[Path, Affine]:
 
 
 KINDS: dict[str, Callable[[Path], tuple[Path, Affine]]] = {
-    "GeoTIFF": north_up,
-    "turned GeoTIFF": turned,
+    "GeoTIFF": lambda folder: (write_geotiff(folder / "a.tif", NORTH_UP), NORTH_UP),
+    "turned GeoTIFF": lambda folder: (write_geotiff(folder / "a.tif", TURNED), TURNED),
     "turned ENVI": envi,
 }
 

@@ -1,14 +1,18 @@
-"""The scale of things: the same ground pixel and hectares in settings, pages, receipts and words."""
+"""The scale of things: the same ground pixel and hectares in settings, plans, pages, receipts and words."""
 
 from __future__ import annotations
 
+import json
 import re
 import tomllib
 from dataclasses import fields
 from pathlib import Path
 
+import pyproj
 import pytest
+import shapely
 
+from flows.archive.plan_command import plan_content
 from flows.publish.receipt_table import finding_rows
 from flows.settings.load import load_settings
 from flows.tasks.zones import place_of_field
@@ -16,7 +20,8 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.ground.field_places import scale_of_pixels, scale_of_view
 from pipeline.ground.view import GroundView, RigPose
 from pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M, farm_scene
-from tests.conftest import Survey
+from tests.conftest import Flags, Survey
+from tests.users.zone_sketches import sketch
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "ground-and-zones.md"
 
@@ -64,3 +69,21 @@ def test_words_are_those_of_the_figures() -> None:
     }
     ((_, said),) = finding_rows({"field": field})
     assert said == "view 7.74 x 6.2 degrees; range 860 m; 1.89 ha; ground pixel 12 cm; hectares per hour 277"
+
+
+DOWN = {"pose.lon_deg": 7.6, "pose.lat_deg": 51.96, "pose.height_m": 100, "pose.heading_deg": 0, "pose.tilt_deg": 90}
+
+
+@pytest.mark.usefixtures("no_effects")
+def test_hectares_are_those_of_the_area(flags_png: Flags, tmp_path: Path) -> None:
+    """With an area of interest the ground, and what is scanned in an hour, is that of the area."""
+    asked = flags_png(tmp_path, budget="0.8") | DOWN
+    whole = plan_content(load_settings(None, asked))["field"]
+    place = {"type": "name", "properties": {"name": "EPSG:32632"}}
+    at = pyproj.Transformer.from_crs(4326, 32632, always_xy=True).transform(7.6, 51.96)
+    path = Path(sketch(tmp_path / "half.geojson", {"half": shapely.box(at[0] - 5, at[1], at[0] + 5, at[1] + 5)}))
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"crs": place}))
+    assert whole["hectares"] == pytest.approx(128 * 96 * (100 * 7.4e-3 / 70) ** 2 / 1e4, rel=1e-6)
+    half = plan_content(load_settings(None, asked | {"zones.area": str(path)}))["field"]
+    assert half["hectares"] == pytest.approx(whole["hectares"] / 2, rel=0.05)
+    assert half["kept_fraction"] == pytest.approx(0.5, abs=0.03)

@@ -120,8 +120,8 @@ def _of_rig(scene: RasterScene, name: str, rig: Rig, sweeps: tuple[Sweep, ...]) 
     clocks = time_in_turn({way: partial(_image, scene, blocks[0], chosen) for way, chosen in ways.items()}, rounds=3)
     return [
         _tolerance_row(name, apart, decision),
-        _cpu_row(name, "cheap", clocks, apart["cheap"]),
-        _cpu_row(name, "exact", clocks, 0.0),
+        _cpu_row(name, "cheap", clocks),
+        _cpu_row(name, "exact", clocks),
         Row(f"farm, {name}: probe and choice of effects, processor time", f"{probed:.1f} s and {decided:.2f} s"),
         Row(f"farm, {name}: on", ", ".join(f"{one.name}" for one in decision.taken if one.is_on)),
     ]
@@ -151,7 +151,7 @@ def _tolerance_row(name: str, apart: Mapping[str, float], decision: Decision) ->
     )
 
 
-def _cpu_row(name: str, against: str, clocks: Mapping[str, Timing], apart: float) -> Row:
+def _cpu_row(name: str, against: str, clocks: Mapping[str, Timing]) -> Row:
     numbers = len(LINES) * 640 * 270
     ns = {way: 1e9 * clock.cpu_min_s / numbers for way, clock in clocks.items()}
     goal = against == "cheap" and RIGS[name] == Rig()

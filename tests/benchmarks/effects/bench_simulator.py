@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from measure import Row, Timing, ratio, time_in_turn
-from numpy.typing import NDArray
 
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
@@ -155,7 +154,8 @@ def _footprints(survey: Survey) -> list[Row]:
         clocks = time_in_turn(calls, 3)
         ns = {variant: _ns(clock, survey.values * AT_ONCE / LINES) for variant, clock in clocks.items()}
         exact, *others = (expected_light(survey.scene, corner, chosen) for chosen in choices.values())
-        errors = [_error(other, exact, survey.rig) for other in others]
+        noise = noise_electrons(exact, survey.rig)
+        errors = [float((np.abs(other - exact) / noise).max()) for other in others]
         met = ns["3x1"] <= RENDER_NS if blurs else None
         found.append(
             Row(
@@ -167,10 +167,6 @@ def _footprints(survey: Survey) -> list[Row]:
             )
         )
     return found
-
-
-def _error(light: NDArray[np.float32], exact: NDArray[np.float32], rig: Rig) -> float:
-    return float((np.abs(light - exact) / noise_electrons(exact, rig)).max())
 
 
 def _ns(clock: Timing, values: float) -> float:

@@ -37,11 +37,6 @@ def served(*faults: str) -> Iterator[ServedRig]:
         yield rig
 
 
-def camera_of(rig: ServedRig) -> str:
-    """Its address, as the flag takes it."""
-    return f"{rig.host}:{rig.camera_port}:{rig.file_port}"
-
-
 def still(rig: ServedRig) -> bool:
     """Whether the mirror was told nothing but its mode."""
     return not any(request.command in SETS for request in rig.rig.mirror.requests)
@@ -106,7 +101,8 @@ def test_usage_errors(command_line: CommandLine, words: tuple[str, ...]) -> None
 def test_rig_in_order(command_line: CommandLine) -> None:
     """A table of what was asked and came, and nothing moved."""
     with served() as rig:
-        ended = command_line("rig", "check", "--port", rig.port, "--camera", camera_of(rig))
+        camera = f"{rig.host}:{rig.camera_port}:{rig.file_port}"
+        ended = command_line("rig", "check", "--port", rig.port, "--camera", camera)
         assert ended.code == 0
         assert "MR-E-2" in ended.out
         assert "nothing to mend" in ended.out

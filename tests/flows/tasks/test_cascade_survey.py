@@ -62,21 +62,14 @@ def test_the_loss_that_is_allowed_says_what_gain_is_enough(cascade: tuple[Path, 
 def test_each_patch_has_the_map_of_its_reading(cascade: tuple[Path, Any], survey_png: Survey, tmp_path: Path) -> None:
     """Read patches are those of a survey that reads everything; elsewhere the two maps may differ."""
     out, receipt = cascade
-    everything = survey_png(tmp_path, **SCAN, weights=receipt_weights(receipt), expected_loss="0").receipt
+    weights = str(receipt["settings"]["weights"])
+    everything = survey_png(tmp_path, **SCAN, weights=weights, expected_loss="0").receipt
     assert "kept" not in everything
     ours, whole = _classes(out, receipt), _classes(tmp_path, everything)
-    read = (
-        (_open(out, receipt, "attention")["rank"].values >= 0)
-        .repeat(8, 0)
-        .repeat(8, 1)[: ours.shape[0], : ours.shape[1]]
-    )
+    patches = _open(out, receipt, "attention")["rank"].values >= 0
+    read = patches.repeat(8, 0).repeat(8, 1)[: ours.shape[0], : ours.shape[1]]
     np.testing.assert_array_equal(ours[read], whole[read])
     assert (ours[~read] != whole[~read]).any()
-
-
-def receipt_weights(receipt: Any) -> str:
-    """Path of the weights that a receipt names."""
-    return str(receipt["settings"]["weights"])
 
 
 @pytest.mark.parametrize(

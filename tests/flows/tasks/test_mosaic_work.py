@@ -74,11 +74,6 @@ def recipe_of(cubes: list[SignalCube]) -> MosaicRecipe:
     return MosaicRecipe(Path(str(cubes[0].group.store_path.store.root)).parent, CAMERA, GRID)
 
 
-def work_of(cubes: list[SignalCube]) -> MosaicWork:
-    """Both sweeps on the grid."""
-    return MosaicWork([place(cube, CAMERA, grid=GRID) for cube in cubes], CAMERA, GRID)
-
-
 def mosaic_at(path: Path) -> MosaicWriter:
     """An empty mosaic on the grid."""
     return plain_writer(path, GRID.shape, BANDS)
@@ -134,7 +129,8 @@ def test_a_worker_lets_tiles_go(cubes: list[SignalCube]) -> None:
 
 def test_memory_of_workers_elsewhere_is_not_counted(tmp_path: Path, cubes: list[SignalCube]) -> None:
     """They lie on other machines; here the least memory refuses nothing."""
-    work, elsewhere = work_of(cubes), WorkerPool("tcp://127.0.0.1:9")
+    work = MosaicWork([place(cube, CAMERA, grid=GRID) for cube in cubes], CAMERA, GRID)
+    elsewhere = WorkerPool("tcp://127.0.0.1:9")
     tiles = plan_tiles(work.placed, CAMERA, GRID, (64, 640))
     assert tile_budget(work, tiles, (64, 640), memory=1, pool=elsewhere).workers == 1
     with pytest.raises(SettingsError, match="exceeds --memory 1 MiB"):

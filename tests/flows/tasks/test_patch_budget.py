@@ -27,7 +27,6 @@ from tests.conftest import Flags, Survey
 COSTS = ReadingCosts(SegmenterConfig(classes=5), SceneGrid(192, 256, 16, 1), 30)
 PATCHES = 12 * 16
 SCAN: dict[str, Any] = {"budget": None, "scan_step": "2", "scan_exposure_ms": "25"}
-fractions = st.floats(5, 100).map(lambda percent: f"{percent!r}%")
 scores = st.integers(0, 2**32 - 1).map(lambda seed: np.random.default_rng(seed).normal(0.1, 0.1, PATCHES))
 
 

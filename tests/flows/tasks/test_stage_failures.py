@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -40,21 +41,30 @@ def refusal(stage: str) -> RigError | ArchiveError:
     return RigError(NO_REPLY) if stage in CAPTURES else ArchiveError(FULL_DISK)
 
 
-def failing(stage: str, error: Exception, tried: Callable[[], None] = lambda: None) -> Stage:
-    """The stage, failing when its files are written and not yet published."""
+def altered(stage: str, built: Callable[[], None], tried: Callable[[], None] = lambda: None) -> Stage:
+    """The stage, with something done when it is asked for, and when its files are written and not yet published."""
     real = STAGES[stage]
 
-    def fail(*given: Any) -> Wanted:
+    def wants(*given: Any) -> Wanted:
         tried()
         wanted = real.wants(*given)
 
-        def broken(path: Path) -> None:
+        def build(path: Path) -> None:
             wanted.build(path)
-            raise error
+            built()
 
-        return replace(wanted, build=broken)
+        return replace(wanted, build=build)
 
-    return replace(real, wants=fail)
+    return replace(real, wants=wants)
+
+
+def failing(stage: str, error: Exception, tried: Callable[[], None] = lambda: None) -> Stage:
+    """The stage, failing when its files are written and not yet published."""
+
+    def broken() -> None:
+        raise error
+
+    return altered(stage, broken, tried)
 
 
 def class_map(out: Path) -> np.ndarray:
@@ -99,7 +109,7 @@ def walk(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tempfile, "tempdir", str(folder))
         for stage in OF_THIS:
-            patch.setitem(STAGES, stage, counted(stage, found.builds))
+            patch.setitem(STAGES, stage, altered(stage, partial(found.builds.update, [stage])))
         for stage in OF_THIS:
             with pytest.MonkeyPatch.context() as broken:
                 broken.setitem(STAGES, stage, failing(stage, KeyError("north") if stage == BUG else refusal(stage)))
@@ -109,22 +119,6 @@ def walk(
         receipt = survey_png(found.out).receipt
         found.last.update({stage["name"]: stage["state"] for stage in receipt["stages"]})
     return found
-
-
-def counted(stage: str, builds: Counter[str]) -> Stage:
-    """The stage, counting how often its store is made."""
-    real = STAGES[stage]
-
-    def count(*given: Any) -> Wanted:
-        wanted = real.wants(*given)
-
-        def made(path: Path) -> None:
-            builds[stage] += 1
-            wanted.build(path)
-
-        return replace(wanted, build=made)
-
-    return replace(real, wants=count)
 
 
 def command(words: list[Any]) -> Ended:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -42,12 +41,6 @@ def _survey_farm(root: Path) -> Published:
     bands = ",".join(map(str, range(5, 265, 10)))
     with without_effects():
         return run_survey(load_settings(None, {**flags, "bands": bands, "out": str(root)}), Console(quiet=True))
-
-
-@pytest.fixture
-def copied(surveyed: tuple[Path, Published], tmp_path: Path) -> Path:
-    """A copy of that archive."""
-    return Path(shutil.copytree(surveyed[0], tmp_path / "archive"))
 
 
 @pytest.mark.usefixtures("no_effects")

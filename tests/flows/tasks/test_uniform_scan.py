@@ -1,4 +1,4 @@
-"""A survey of one uniform scan: what is captured, stored, read and told, and how the scan is chosen."""
+"""A survey of one uniform scan: what is captured, stored, read and told; how scans and two passes are chosen."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from flows.archive.plan_command import plan_content
 from flows.archive.reprocess_command import run_reprocess
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
+from flows.tasks.run import SurveyRun, open_run
 from pipeline.errors import BudgetError, SettingsError, WeightsError
 from tests.conftest import Flags, Survey, WeightsMaker
 from tests.prior_work import with_effects
@@ -244,3 +245,73 @@ def test_candidates_are_those_of_the_weights_that_would_read_them(tmp_path: Path
     scores = [one["expected_miou"] for one in told[0]["candidates"]]
     assert len(scores) > 4
     assert scores == sorted(scores)  # by ascending seconds
+
+
+def test_a_faster_coarse_pass_leaves_its_seconds_to_the_fine_one(survey_png: Any, tmp_path: Path) -> None:
+    """Cubes say which exposure a line had; the budget is the same, and the fine pass gets what the coarse one saves."""
+    usual = survey_png(tmp_path / "usual", budget="0.6").receipt
+    fast = survey_png(tmp_path / "fast", budget="0.6", coarse_exposure_ms="25").receipt
+    found = (tmp_path / "fast").glob("stages/condense*/*/*.zarr")
+    cubes = {path.stem: xr.open_zarr(path, consolidated=False) for path in found}
+    coarse = [cube for name, cube in cubes.items() if name.startswith("coarse")]
+    assert {value for cube in coarse for value in cube["exposure_ms"].values.tolist()} == {25.0}
+    assert {len(set(np.diff(cube["time"].values).round(6).tolist())) for cube in coarse} == {1}
+    fine = [cube for name, cube in cubes.items() if name.startswith("fine")]
+    assert {value for cube in fine for value in cube["exposure_ms"].values.tolist()} == {100.0}
+    fine_s = [receipt["plan"]["seconds"] for receipt in (usual, fast)]
+    coarse_s = [one["savings"]["capture_s"]["done"] - fine for one, fine in zip((usual, fast), fine_s, strict=True)]
+    spared_s = (sum(cube.sizes["line"] for cube in coarse) + 2 * len(coarse)) * 0.075  # lines, and frames to settle
+    assert coarse_s[0] - coarse_s[1] == pytest.approx(spared_s)
+    assert fine_s[1] > fine_s[0] + spared_s / 2
+    seconds = [receipt["savings"]["capture_s"] for receipt in (usual, fast)]
+    assert seconds[0]["full"] == seconds[1]["full"]
+    assert all(one["done"] <= 0.6 * one["full"] for one in seconds)
+
+
+WIDE = {"camera.samples": "80", "seconds": "27"}  # eight swaths; the usual camera covers the field by one
+
+
+def planned(out: Path, **flags: str) -> SurveyRun:
+    """An opened survey of the farm."""
+    return open_run(load_settings(None, {"scene": "farm", "size": "640x512", "out": str(out), **flags}), planning=True)
+
+
+@pytest.mark.parametrize(
+    ("flags", "zooms"),
+    [
+        (WIDE, True),
+        ({**WIDE, "seconds": "182", "sky.light_fraction": "0.0625"}, True),
+        ({**WIDE, "camera.samples": "160", "seconds": "14"}, False),  # four swaths
+        ({**WIDE, "camera.samples": "640", "seconds": "6"}, False),
+        ({**WIDE, "seconds": "200"}, False),  # a uniform scan is as good as the best
+        ({"camera.samples": "80"}, False),
+        ({**WIDE, "zoom": "never"}, False),
+        ({**WIDE, "macs": "60%"}, False),
+        ({**WIDE, "kept_bytes": "8MB"}, False),
+        ({"size": "5120x4096", "seconds": "150"}, True),
+        ({"size": "5120x4096", "seconds": "150", "pointing_px": "2"}, False),
+        ({"camera.samples": "80", "goal": "85"}, False),
+    ],
+    ids=str,
+)
+def test_two_passes_are_taken_on_wide_fields_in_short_times(tmp_path: Path, flags: dict[str, str], zooms: bool) -> None:
+    """The settings of the run say which way was taken, and no limit of a uniform scan is dropped."""
+    run = planned(tmp_path, **flags)
+    assert (run.settings.zoom, run.plan.plain) == ("always" if zooms else "never", not zooms)
+    assert (run.scans.chosen is None) == zooms
+    assert any(note.startswith("two passes: every 4th line") for note in run.notes) == zooms
+
+
+def test_the_choice_is_the_plan_that_one_may_ask_for(tmp_path: Path) -> None:
+    """First pass and time left are those of `--zoom always`; a receipt's settings plan the same again."""
+    chosen, asked = planned(tmp_path, **WIDE), planned(tmp_path, **WIDE, zoom="always")
+    assert (chosen.plan, chosen.settings) == (asked.plan, asked.settings)
+    assert chosen.plan.coarse_s + chosen.plan.fine_s == pytest.approx(27)
+
+
+def test_the_line_spacing_of_the_first_pass_may_be_given(tmp_path: Path) -> None:
+    """Its exposure is then the best one for that spacing; without it the weights choose every 4th line."""
+    given, usual = (planned(tmp_path, **WIDE, zoom="always", **step) for step in ({"scan_step": "8"}, {}))
+    assert (given.settings.scan_step, usual.settings.scan_step) == (8, 4)
+    assert given.plan.coarse_s < usual.plan.coarse_s
+    assert given.plan.coarse_s + given.plan.fine_s == pytest.approx(27)

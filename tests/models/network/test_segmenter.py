@@ -1,4 +1,4 @@
-"""The segmenter: what its overview and its patches may depend on, composites, and its scorer of patches."""
+"""The segmenter and its layers: what overview and patches may depend on, composites, and its scorer of patches."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
+from hypothesis import given
+from hypothesis import strategies as st
 
-from models.network.segmenter import AROUND_PX, PatchScorer, cut, mean_around
-from models.network.sizes import PLANES, SegmenterConfig
+from models.network.segmenter import AROUND_PX, Head, PatchScorer, Stem, cut, joined, mean_around
+from models.network.sizes import PLANES, SegmenterConfig, level_widths
 from models.training.objective import scoring_loss
 from tests.models.conftest import SMALL, make_network, noise
 
@@ -120,3 +122,27 @@ def test_patches_without_a_label_have_no_say():
     assert torch.equal(score.grad != 0, known)
     assert loss == scoring_loss(score.detach().where(known, 9.0), gain, known)
     assert scoring_loss(score, gain, torch.zeros_like(known)) == 0
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("patch", [4, 8, 32, 64])
+def test_an_image_comes_back_at_its_size(patch: int):
+    """Features of every level, finest first, down to 4 px, and the width per pixel again."""
+    widths = level_widths(8, patch)
+    assert widths[:3] == [8, 16, 24][: len(widths)]
+    features = Stem(5, widths)(torch.zeros(3, 5, patch, 2 * patch))
+    assert [tuple(level.shape) for level in features] == [
+        (3, width, patch >> i, 2 * patch >> i) for i, width in enumerate(widths)
+    ]
+    assert features[-1].shape[2] == 4
+    assert Head(widths)(features).shape == (3, 8, patch, 2 * patch)
+
+
+@given(st.integers(1, 3), st.integers(1, 4), st.sampled_from([1, 4]))
+def test_patches_lie_row_by_row_and_make_the_image_again(rows: int, columns: int, patch: int):
+    """Cut and joined an image is what it was; the second patch lies right of the first."""
+    image = torch.arange(2 * 3 * rows * columns * patch**2).view(2, 3, rows * patch, columns * patch)
+    cells = cut(image, patch)
+    assert torch.equal(joined(cells, columns), image)
+    if columns > 1:
+        assert torch.equal(cells[:, 1], image[:, :, :patch, patch : 2 * patch])

@@ -1,4 +1,4 @@
-"""Sweeps out of positions come back as they were planned; what is not straight is refused; scans without a mirror."""
+"""Sweeps out of positions come back as they were planned; what is not straight is refused; angles are positions."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.capture.straight_scans import covered_field, fit_sweep, flat_camera, flat_positions
+from pipeline.capture.straight_scans import angles_to_positions, covered_field, fit_sweep, flat_camera, flat_positions
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.mirror import direction_to_scene, position_to_direction
+from pipeline.geometry.mirror import REST_TANGENT, direction_to_scene, position_to_direction
 from pipeline.geometry.scan import CostModel, Sweep, line_positions, points_of_scan, shifted_position
 from pipeline.planning.coverage import cheapest_full
 
@@ -125,3 +125,28 @@ def test_lines_of_a_scan_without_a_mirror_are_parallel(extent_px: float) -> None
     np.testing.assert_allclose(along, np.broadcast_to(np.arange(640) - 319.5, along.shape), atol=0.011)
     np.testing.assert_allclose(across, np.broadcast_to(scan[:, None], across.shape), atol=1e-6)
     assert flat.slit_px == CAMERA.slit_px
+
+
+def test_angles_along_the_scan_are_known_by_hand() -> None:
+    """On the axis X is -tan(angle) / tan 50 deg: the beam along the rest normal is turned by the same angle."""
+    positions, reached = angles_to_positions(np.array([[0, 0], [0, 10], [0, -30], [0, 50]], float))
+    expected = -np.tan(np.deg2rad([0, 10, -30, 50])) / REST_TANGENT
+    np.testing.assert_allclose(positions, np.stack([expected, np.zeros(4)], axis=-1), atol=1e-12)
+    assert reached.all()
+
+
+def test_positions_of_angles_look_there() -> None:
+    """The scene tangents of a position are the tangents of its two angles."""
+    angles = np.array([[12.0, -20.0], [-30.0, 5.0], [33.0, 12.0]])
+    positions, reached = angles_to_positions(angles)
+    assert reached.all()
+    seen = np.rad2deg(np.arctan(direction_to_scene(position_to_direction(positions))))
+    np.testing.assert_allclose(seen, angles, atol=1e-10)
+
+
+def test_angles_beyond_the_mirror_are_told() -> None:
+    """50 deg is the rim along the scan and 35.6 deg across it; a view to the side or behind is never reached."""
+    angles = np.array([[0, 50.01], [35.6, 0], [35.7, 0], [0, 90], [120, 0]], float)
+    positions, reached = angles_to_positions(angles)
+    assert reached.tolist() == [False, True, False, False, False]
+    assert np.isnan(positions[~reached]).all()

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import CostModel, Sweep
+from pipeline.geometry.scan import CostModel
 from pipeline.planning.coverage import full_sweeps, patches_shown
 from pipeline.planning.fine_pass import FIRST_STEPS, LEAST_GAIN, SecondPass, every_nth
 from pipeline.planning.uniform_scans import MIOU, ScanPerformance
@@ -32,11 +32,6 @@ def drawn(seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     gain = rng.exponential(size=int(np.prod(GRID.patch_shape))) ** 3
     return np.where(rng.random(gain.size) > 0.25, gain, 0.0)
-
-
-def positions(sweeps: list[Sweep]) -> list[tuple[float, float]]:
-    """Swath and place of all lines."""
-    return [(sweep.swath_px, float(place)) for sweep in sweeps for place in sweep.line_px()]
 
 
 @settings(max_examples=15, deadline=None)
@@ -67,7 +62,8 @@ def test_no_line_is_captured_twice(fraction: float, seed: int) -> None:
     """New lines lie between those of the first pass, and complete its runs to every line."""
     planner = second_pass(fraction * FULL_S)
     plan = planner.plan(drawn(seed))
-    lines = positions([*planner.first_pass, *plan.sweeps])
+    sweeps = [*planner.first_pass, *plan.sweeps]
+    lines = [(sweep.swath_px, float(place)) for sweep in sweeps for place in sweep.line_px()]
     assert len(set(lines)) == len(lines)
     rows = planner.rows
     for number, place in np.argwhere(rows.there)[::5]:

@@ -19,7 +19,6 @@ from pipeline.planning.uniform_scans import (
     MIOU,
     REFERENCE_LOSS,
     ScanPerformance,
-    UniformScan,
     choose_scan,
     priced_scan,
     reference_scan,
@@ -36,10 +35,6 @@ CONTENT = {
     "per_class_iou": {"weed": [[0.8, 0.7, 0.6], [0.7, 0.65, 0.5], [0.5, 0.4, 0.3]]},
 }
 RECORD = ScanPerformance.read(CONTENT)
-
-
-def _scan(step: int, exposure_ms: float, camera: LineCamera = CAMERA) -> UniformScan:
-    return priced_scan(RECORD, SWEEPS[step], camera, COST, 270, exposure_ms)
 
 
 SCANS = uniform_scans(RECORD, SWEEPS, CAMERA, COST, 270)
@@ -143,4 +138,4 @@ def test_the_reference_is_the_cheapest_scan_that_is_nearly_as_good_as_any() -> N
     reference = reference_scan(SCANS)
     assert reference.expected[MIOU] >= 0.94 - REFERENCE_LOSS
     assert all(one.expected[MIOU] < 0.94 - REFERENCE_LOSS for one in SCANS if one.seconds < reference.seconds)
-    assert reference.seconds < _scan(1, 100.0).seconds
+    assert reference.seconds < priced_scan(RECORD, SWEEPS[1], CAMERA, COST, 270, 100.0).seconds

@@ -17,7 +17,6 @@ from pipeline.rectify.resample import resample
 from pipeline.rectify.scan_paths import ScanPath, make_scan_paths
 from tests.pipeline.rectify.aiming import CAMERA, aim, geolocation
 
-places = st.floats(-4500, 4500)
 GRID: dict[str, Any] = {"origin_px": (-20.0, 2250.0), "spacing_px": 1.0, "shape": (170, 700)}
 EVERYTHING = (slice(None), slice(None))
 

@@ -8,15 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import PoseError
-from pipeline.rectify.scan_paths import ScanPath, line_centres, make_scan_paths, number_lines
+from pipeline.rectify.scan_paths import line_centres, make_scan_paths, number_lines
 from tests.pipeline.rectify.aiming import CAMERA, aim
 
 STEPS = st.lists(st.sampled_from([-3.0, -1.0, 0.0, 0.1, 1.0, 1.0, 1.2, 4.0]), min_size=0, max_size=60)
-
-
-def members(scan_path: ScanPath) -> list[np.ndarray]:
-    """Lines of each knot."""
-    return np.split(scan_path.lines, scan_path.starts[1:])
 
 
 @given(STEPS, st.integers(0, 99))
@@ -28,7 +23,7 @@ def test_every_usable_line_is_on_one_knot(steps: list[float], seed: int) -> None
     held = []
     for scan_path in make_scan_paths(position, CAMERA, usable=usable, step_px=1.0):
         assert (np.diff(scan_path.scan) > 0).all()
-        for knot, lines in enumerate(members(scan_path)):
+        for knot, lines in enumerate(np.split(scan_path.lines, scan_path.starts[1:])):
             assert len(lines) > 0
             if scan_path.seen[knot]:
                 held += lines.tolist()

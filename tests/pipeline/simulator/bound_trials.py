@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from pipeline.simulator.effects.effect import OFF, Effect, Radiance, SweepBlock
+from pipeline.simulator.effects.effect import OFF, Effect, Radiance
 from pipeline.simulator.effects.line import SLIT, SMEAR
 from pipeline.simulator.effects.probe import noise_electrons
 from pipeline.simulator.optics.scene_radiance import TABULATED
@@ -86,8 +86,8 @@ def trials(case: Case, binnings: Sequence[int] = (1,), only: str = "") -> Iterat
     for menu in (one for one in present if only in ("", one.name)):
         for variant in (OFF, *(option.variant for option in menu.variants[1:])):
             chosen = {effect: variant if effect is menu.effect else way for effect, way in exact.items()}
-            light = [_light(case, block, chosen) for block in blocks]
             shown = {one: way for one, way in chosen.items() if way != OFF}
+            light = [expected_light(case.scene, block, shown) for block in blocks]
             fraction = misplaced_fraction(exact, shown)
             for one in stored:
                 bound = _error(one.menus, menu.name, variant) / SAFETY
@@ -120,10 +120,6 @@ def _summed(values: Radiance, binning: int) -> Radiance:
 def _error(menus: tuple[Menu, ...], name: str, variant: str) -> float:
     menu = next(one for one in menus if one.name == name)
     return next(option.error for option in (menu.off, *menu.variants) if option.variant == variant)
-
-
-def _light(case: Case, block: SweepBlock, chosen: dict[Effect, str]) -> Radiance:
-    return expected_light(case.scene, block, {effect: way for effect, way in chosen.items() if way != OFF})
 
 
 def misplaced_fraction(exact: Mapping[Effect, str], chosen: Mapping[Effect, str]) -> float:

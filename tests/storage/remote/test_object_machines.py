@@ -1,15 +1,18 @@
-"""Several machines at one archive in a bucket: what one clears away, repairs or uploads late harms no other's."""
+"""Several machines at one archive in a bucket: none harms what another clears, repairs or uploads, and all read it."""
 
 from __future__ import annotations
 
 import errno
+import json
 import os
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
@@ -17,8 +20,11 @@ pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
 from pipeline.errors import ArchiveError, IncompleteStoreError
 from storage.archive.archive import Archive
 from storage.maintenance.garbage import clear_up
+from storage.readers.recordings import open_recording
 from storage.remote import object_archive
 from storage.remote.object_stores import Objects
+from tests.pipeline.capture.recordings import CAMERA, FULL, simulated
+from tests.storage.readers.test_recordings import write_raw
 from tests.storage.small_archive import problems, small_survey
 from tests.storage.small_bucket import FIRST, SECOND, Machine, make
 
@@ -181,3 +187,20 @@ def test_what_one_machine_cleared_another_makes_again(machine: Machine) -> None:
     assert any(name.endswith("/data.bin") for name in third.objects.listing(again.mosaic.uri))
     assert (third.root / again.mosaic.uri / "data.bin").read_bytes() == before
     assert problems(third) == []
+
+
+pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
+
+
+def test_a_run_of_a_bucket_is_a_recording(bucket: str, machine: Machine) -> None:
+    """The newest run and the run named give the cubes that the first machine wrote; another name is refused."""
+    archive, source = machine(FIRST), simulated()
+    ref, _ = archive.produce("capture", partial(write_raw, source=source, sweep=FULL), version=1, params={})
+    with archive.new_run("field") as draft:
+        draft.write_file("receipt.json", json.dumps({"products": {"raw_coarse": ref.uri}}))
+    machine(SECOND)
+    for address in (bucket, f"{bucket}/runs/{draft.id}"):
+        (sweep,) = open_recording(address, CAMERA).sweeps
+        np.testing.assert_array_equal(sweep.read(0, 80), np.stack([line.data for line in source.lines(FULL)]))
+    with pytest.raises(ArchiveError, match="has no run 'other'"):
+        open_recording(f"{bucket}/runs/other", CAMERA)

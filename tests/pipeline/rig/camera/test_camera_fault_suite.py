@@ -30,7 +30,6 @@ from tests.pipeline.rig.small_rig import SmallRig, assert_simulated, small_rig
 SEEDS = range(8)
 SWEEP = Sweep("fine-5", "fine", "x", 1.5, -4.5, 7)
 PAIRS = 5  # of the vector memory, with its lead-in: four lines a capture
-CAPTURES = [(0, 4), (4, 7)]
 COMMANDS, TRANSFERS = 12, 8  # occasions of an undisturbed sweep, a few less
 PATIENCE = ControlPatience()
 # a request that is asked again: each time a connection, its prompt, the reply

@@ -15,7 +15,7 @@ from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.capture_runner import JOURNAL
 from pipeline.rig.transports import DeviceGone, DeviceRefused, StateUnknown
 from pipeline.source import Line
-from tests.pipeline.rig.camera_faults import CameraFault, CameraFaults
+from tests.pipeline.rig.camera_faults import CameraFault
 from tests.pipeline.rig.mirror_faults import make_fault
 from tests.pipeline.rig.small_rig import COARSE, FINE, SmallRig, assert_simulated, small_rig, small_source
 
@@ -62,18 +62,13 @@ def test_cut_cubes_are_taken_again_from_their_first_missing_line(cut: int, pairs
         assert [said.split("_")[-1].split('"')[0] for said in rig.captures] == begun
 
 
-def breaks_off(faults: CameraFaults) -> None:
-    """Have the next transfer break off."""
-    faults.left = {CameraFault.BREAKS_OFF: 1}
-
-
 def test_broken_transfer_goes_on_in_the_next_process():
     """The camera goes away in the midst of a file: what has come is kept, and nothing is captured again."""
     with small_rig() as rig:
         faults = rig.emulated.camera.faults
         kept = KeptUntil(
             acts={
-                b"raw_0.hdr": lambda: breaks_off(faults),
+                b"raw_0.hdr": lambda: setattr(faults, "left", {CameraFault.BREAKS_OFF: 1}),
                 b"raw_0": lambda: faults.left.update({CameraFault.REFUSES_FILES: 9}),
             }
         )

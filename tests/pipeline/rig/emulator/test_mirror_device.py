@@ -47,7 +47,6 @@ PRO = {
     "CRC": ("7e 00 02 02 00 00 00 00 7e", "7e 00 82 04 00 00 00 04 ee 21 7e"),
     "no frame": ("7e 00 11 05 50 7e", "7e 00 91 04 00 00 00 01 2c 81 7e"),
 }
-STORY = "set vector", "set two", "get index", "no frame", "escapes", "unknown command", "simple mode"
 
 
 def answer(device: MirrorDevice, data: bytes) -> bytes:

@@ -9,34 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import ShapeError
-from pipeline.rig.pro_mode import (
-    FEEDBACK_X,
-    FEEDBACK_Y,
-    VECTOR_MEMORY,
-    Command,
-    Damaged,
-    ErrorCode,
-    Frame,
-    FrameReader,
-    Status,
-    VectorRegister,
-    X,
-    Y,
-    ask_status,
-    cell_int,
-    encode,
-    format_error,
-    get_value,
-    get_vector,
-    go_simple,
-    int_cell,
-    log_slot,
-    read_registers,
-    read_vector,
-    refuse,
-    set_values,
-    set_vector,
-)
+from pipeline.rig import pro_mode as pro
 from tests.pipeline.rig.mirror.mirror_bytes import ASK_FIRMWARE, set_value
 
 nasty = st.one_of(
@@ -44,10 +17,7 @@ nasty = st.one_of(
 )
 
 
-frames = st.builds(Frame, st.integers(0, 255), nasty, st.integers(0, 255))
-
-
-rubbish = st.binary(max_size=30).map(lambda data: data.replace(b"\x7e", b"?"))
+frames = st.builds(pro.Frame, st.integers(0, 255), nasty, st.integers(0, 255))
 
 
 def parts(stream: bytes, cuts: list[int]) -> list[bytes]:
@@ -59,27 +29,27 @@ def parts(stream: bytes, cuts: list[int]) -> list[bytes]:
 def test_the_documented_frame():
     """The one reply whose CRC is documented, 00 11 04 00 00 00 00, is written and read so; without a CRC zeros."""
     data = bytes.fromhex("7E 00 11 04 00 00 00 00 F2 81 7E")
-    assert encode(Frame(Command.GET_VALUE, bytes(4))) == data
-    assert encode(Frame(Command.GET_VALUE, bytes(4)), with_crc=False) == data[:-3] + b"\x00\x00\x7e"
-    (found,) = FrameReader().feed(data)
-    assert found == Frame(0x11, bytes(4))
+    assert pro.encode(pro.Frame(pro.Command.GET_VALUE, bytes(4))) == data
+    assert pro.encode(pro.Frame(pro.Command.GET_VALUE, bytes(4)), with_crc=False) == data[:-3] + b"\x00\x00\x7e"
+    (found,) = pro.FrameReader().feed(data)
+    assert found == pro.Frame(0x11, bytes(4))
     assert found.crc_good
 
 
 def test_both_marks_are_escaped():
     """7D and 7E in a payload are sent as 7D 5D and 7D 5E."""
     data = bytes.fromhex("7E 00 11 04 7D 5D 7D 5E 7D 5D 7D 5E 2B 85 7E")
-    frame = Frame(0x11, b"\x7d\x7e\x7d\x7e")
-    assert encode(frame) == data
-    assert FrameReader().feed(data) == [frame]
+    frame = pro.Frame(0x11, b"\x7d\x7e\x7d\x7e")
+    assert pro.encode(frame) == data
+    assert pro.FrameReader().feed(data) == [frame]
 
 
 @given(frames)
-def test_reading_undoes_writing(frame: Frame):
+def test_reading_undoes_writing(frame: pro.Frame):
     """Any frame comes back, with a CRC that fits, and boundaries stand nowhere but at its ends."""
-    data = encode(frame)
+    data = pro.encode(frame)
     assert 0x7E not in data[1:-1]
-    found = FrameReader().feed(data)
+    found = pro.FrameReader().feed(data)
     assert found == [frame]
     assert found[0].crc_good
 
@@ -87,24 +57,24 @@ def test_reading_undoes_writing(frame: Frame):
 @given(st.binary(max_size=400), st.lists(st.integers(0, 1000), max_size=20))
 def test_no_stream_stops_a_reader(stream: bytes, cuts: list[int]):
     """Any bytes, however cut, give the same findings, and the next frame is found after a boundary."""
-    whole, cut = FrameReader(), FrameReader()
+    whole, cut = pro.FrameReader(), pro.FrameReader()
     found = whole.feed(stream)
     assert [item for part in parts(stream, cuts) for item in cut.feed(part)] == found
     assert whole._held == cut._held
     assert len(whole._held) <= 111
-    frame = Frame(0x15, b"abcd")
-    assert whole.feed(b"\x7e" + encode(frame))[-1] == frame
+    frame = pro.Frame(0x15, b"abcd")
+    assert whole.feed(b"\x7e" + pro.encode(frame))[-1] == frame
 
 
 @given(frames, st.integers(0, 2000))
-def test_a_flipped_bit_is_never_a_good_frame(frame: Frame, place: int):
+def test_a_flipped_bit_is_never_a_good_frame(frame: pro.Frame, place: int):
     """One wrong bit inside a frame leaves no frame whose CRC fits, but for one cut in two by a false boundary."""
-    data = bytearray(encode(frame))
+    data = bytearray(pro.encode(frame))
     at, bit = 1 + place // 8 % (len(data) - 2), place % 8
     data[at] ^= 1 << bit
     if 0x7E not in data[1:-1]:
-        found = FrameReader().feed(bytes(data))
-        assert not any(isinstance(item, Frame) and item.crc_good for item in found)
+        found = pro.FrameReader().feed(bytes(data))
+        assert not any(isinstance(item, pro.Frame) and item.crc_good for item in found)
 
 
 @pytest.mark.parametrize(
@@ -121,20 +91,20 @@ def test_a_flipped_bit_is_never_a_good_frame(frame: Frame, place: int):
 )
 def test_what_is_no_frame_is_given_back(data: str):
     """Too short, another size than stated, an escape of nothing, or too long."""
-    (found,) = FrameReader().feed(bytes.fromhex(data))
-    assert found == Damaged(bytes.fromhex(data).strip(b"\x7e"))
+    (found,) = pro.FrameReader().feed(bytes.fromhex(data))
+    assert found == pro.Damaged(bytes.fromhex(data).strip(b"\x7e"))
 
 
 def test_error_codes_have_words():
     """Known codes are said by name and number; others by number."""
-    assert format_error(ErrorCode.OUT_OF_RANGE) == "out of range (code 0103)"
-    assert format_error(0x7777) == "unknown error (code 7777)"
+    assert pro.format_error(pro.ErrorCode.OUT_OF_RANGE) == "out of range (code 0103)"
+    assert pro.format_error(0x7777) == "unknown error (code 7777)"
 
 
 def test_a_wrong_crc_is_a_frame_all_the_same():
     """A reader says that the CRC does not fit; what to make of it is the driver's."""
-    (found,) = FrameReader().feed(bytes.fromhex("7E 00 11 04 00 00 00 00 F2 82 7E"))
-    assert isinstance(found, Frame)
+    (found,) = pro.FrameReader().feed(bytes.fromhex("7E 00 11 04 00 00 00 00 F2 82 7E"))
+    assert isinstance(found, pro.Frame)
     assert not found.crc_good
 
 
@@ -143,53 +113,50 @@ HALF, MINUS_QUARTER = b"\x3f\x00\x00\x00", b"\xbe\x80\x00\x00"
 
 REQUESTS = [
     (ASK_FIRMWARE, "7E 00 01 02 00 00 A0 3C 7E"),
-    (ask_status(), "7E 00 02 02 00 00 A0 78 7E"),
-    (go_simple(), "7E 00 06 02 00 00 A1 48 7E"),
+    (pro.ask_status(), "7E 00 02 02 00 00 A0 78 7E"),
+    (pro.go_simple(), "7E 00 06 02 00 00 A1 48 7E"),
     (set_value(0x5002, 0.5), "7E 00 10 06 50 02 3F 00 00 00 1E 88 7E"),
-    (get_value(0x680A), "7E 00 11 02 68 0A 0B 3B 7E"),
-    (set_values({0x6801: 1, 0x6901: 1}), "7E 00 12 0E 00 02 68 01 69 01 00 00 00 01 00 00 00 01 42 49 7E"),
-    (set_vector(0x2600, 10, HALF + MINUS_QUARTER), "7E 00 14 0D 26 00 00 28 08 3F 00 00 00 BE 80 00 00 EF B0 7E"),
-    (get_vector(0x2600, 10, 2), "7E 00 15 05 26 00 00 28 08 52 95 7E"),
+    (pro.get_value(0x680A), "7E 00 11 02 68 0A 0B 3B 7E"),
+    (pro.set_values({0x6801: 1, 0x6901: 1}), "7E 00 12 0E 00 02 68 01 69 01 00 00 00 01 00 00 00 01 42 49 7E"),
+    (pro.set_vector(0x2600, 10, HALF + MINUS_QUARTER), "7E 00 14 0D 26 00 00 28 08 3F 00 00 00 BE 80 00 00 EF B0 7E"),
+    (pro.get_vector(0x2600, 10, 2), "7E 00 15 05 26 00 00 28 08 52 95 7E"),
 ]
 
 
 REPLIES = [
-    (Frame(0x01, b"MRE2"), "7E 00 01 04 4D 52 45 32 F5 E9 7E"),
-    (Frame(0x02, int_cell(0x11)), "7E 00 02 04 00 00 00 11 30 2E 7E"),
-    (Frame(0x06), "7E 00 06 00 03 A0 7E"),
-    (Frame(0x10), "7E 00 10 00 0D C0 7E"),
-    (Frame(0x11, int_cell(300)), "7E 00 11 04 00 00 01 2C F2 CC 7E"),
-    (Frame(0x12), "7E 00 12 00 0C A0 7E"),
-    (Frame(0x14), "7E 00 14 00 0F 00 7E"),
-    (Frame(0x15, HALF + MINUS_QUARTER), "7E 00 15 08 3F 00 00 00 BE 80 00 00 10 D1 7E"),
-    (refuse(0x11, ErrorCode.FRAME_INVALID), "7E 00 91 04 00 00 00 01 2C 81 7E"),
-    (refuse(0x11, ErrorCode.LENGTH_MISMATCH), "7E 00 91 04 00 00 00 03 AD 40 7E"),
-    (refuse(0x11, ErrorCode.CRC_WRONG), "7E 00 91 04 00 00 00 04 EC 82 7E"),
-    (refuse(0x11, ErrorCode.NO_REGISTER), "7E 00 91 04 00 00 01 01 2D 11 7E"),
-    (refuse(0x10, ErrorCode.OUT_OF_RANGE), "7E 00 90 04 00 00 01 03 AD 01 7E"),
-    (refuse(0x10, ErrorCode.READ_ONLY), "7E 00 90 04 00 00 01 06 6D 02 7E"),
-    (refuse(0x14, ErrorCode.VECTOR_INDEX), "7E 00 94 04 00 00 01 07 AD 46 7E"),
-    (refuse(0x12, ErrorCode.CHAIN), "7E 00 92 04 00 00 02 03 AC 13 7E"),
+    (pro.Frame(0x01, b"MRE2"), "7E 00 01 04 4D 52 45 32 F5 E9 7E"),
+    (pro.Frame(0x02, pro.int_cell(0x11)), "7E 00 02 04 00 00 00 11 30 2E 7E"),
+    (pro.Frame(0x06), "7E 00 06 00 03 A0 7E"),
+    (pro.Frame(0x10), "7E 00 10 00 0D C0 7E"),
+    (pro.Frame(0x11, pro.int_cell(300)), "7E 00 11 04 00 00 01 2C F2 CC 7E"),
+    (pro.Frame(0x12), "7E 00 12 00 0C A0 7E"),
+    (pro.Frame(0x14), "7E 00 14 00 0F 00 7E"),
+    (pro.Frame(0x15, HALF + MINUS_QUARTER), "7E 00 15 08 3F 00 00 00 BE 80 00 00 10 D1 7E"),
+    (pro.refuse(0x11, pro.ErrorCode.FRAME_INVALID), "7E 00 91 04 00 00 00 01 2C 81 7E"),
+    (pro.refuse(0x11, pro.ErrorCode.LENGTH_MISMATCH), "7E 00 91 04 00 00 00 03 AD 40 7E"),
+    (pro.refuse(0x11, pro.ErrorCode.CRC_WRONG), "7E 00 91 04 00 00 00 04 EC 82 7E"),
+    (pro.refuse(0x11, pro.ErrorCode.NO_REGISTER), "7E 00 91 04 00 00 01 01 2D 11 7E"),
+    (pro.refuse(0x10, pro.ErrorCode.OUT_OF_RANGE), "7E 00 90 04 00 00 01 03 AD 01 7E"),
+    (pro.refuse(0x10, pro.ErrorCode.READ_ONLY), "7E 00 90 04 00 00 01 06 6D 02 7E"),
+    (pro.refuse(0x14, pro.ErrorCode.VECTOR_INDEX), "7E 00 94 04 00 00 01 07 AD 46 7E"),
+    (pro.refuse(0x12, pro.ErrorCode.CHAIN), "7E 00 92 04 00 00 02 03 AC 13 7E"),
 ]
 
 
-a_cell = st.binary(min_size=4, max_size=4)
-
-
 @pytest.mark.parametrize(("frame", "data"), [*REQUESTS, *REPLIES])
-def test_forms_are_these_bytes(frame: Frame, data: str):
+def test_forms_are_these_bytes(frame: pro.Frame, data: str):
     """Every request and reply is these bytes, and these bytes are it."""
-    assert encode(frame) == bytes.fromhex(data)
-    assert FrameReader().feed(bytes.fromhex(data)) == [frame]
+    assert pro.encode(frame) == bytes.fromhex(data)
+    assert pro.FrameReader().feed(bytes.fromhex(data)) == [frame]
 
 
 @pytest.mark.parametrize(
     ("make", "match"),
     [
-        (lambda: encode(Frame(1, bytes(51))), "at most 50 bytes, got 51"),
-        (lambda: read_registers(b"\x00\x02\x11"), "expected 14 bytes, got 3"),
-        (lambda: read_vector(b"\x26"), "5 bytes or more, got 1"),
-        (lambda: cell_int(b"123"), "expected 4 bytes, got 3"),
+        (lambda: pro.encode(pro.Frame(1, bytes(51))), "at most 50 bytes, got 51"),
+        (lambda: pro.read_registers(b"\x00\x02\x11"), "expected 14 bytes, got 3"),
+        (lambda: pro.read_vector(b"\x26"), "5 bytes or more, got 1"),
+        (lambda: pro.cell_int(b"123"), "expected 4 bytes, got 3"),
     ],
 )
 def test_payloads_that_do_not_fit_are_refused(make, match):
@@ -200,17 +167,17 @@ def test_payloads_that_do_not_fit_are_refused(make, match):
 
 def test_registers_have_the_published_ids():
     """Ids are system times 256 plus number."""
-    assert (X.static_xy, Y.static_xy) == (0x5002, 0x5102)
-    assert [X.vector(register) & 0xFF for register in VectorRegister] == [0, 1, 2, 3, 4, 7, 8, 10]
-    assert X.vector(VectorRegister.RUN) == 0x6801
-    assert Y.vector(VectorRegister.INDEX) == 0x690A
-    assert (X.input, X.control, Y.input, Y.control) == (0x4000, 0x4002, 0x4005, 0x4007)
-    assert (X.xy_system, Y.xy_system, X.vector_system, Y.static_system) == (0xC0, 0xC1, 0x68, 0x51)
-    assert (VECTOR_MEMORY, FEEDBACK_X, FEEDBACK_Y, log_slot(5)) == (0x2600, 0x2302, 0x2303, 0x2405)
+    assert (pro.X.static_xy, pro.Y.static_xy) == (0x5002, 0x5102)
+    assert [pro.X.vector(register) & 0xFF for register in pro.VectorRegister] == [0, 1, 2, 3, 4, 7, 8, 10]
+    assert pro.X.vector(pro.VectorRegister.RUN) == 0x6801
+    assert pro.Y.vector(pro.VectorRegister.INDEX) == 0x690A
+    assert (pro.X.input, pro.X.control, pro.Y.input, pro.Y.control) == (0x4000, 0x4002, 0x4005, 0x4007)
+    assert (pro.X.xy_system, pro.Y.xy_system, pro.X.vector_system, pro.Y.static_system) == (0xC0, 0xC1, 0x68, 0x51)
+    assert (pro.VECTOR_MEMORY, pro.FEEDBACK_X, pro.FEEDBACK_Y, pro.log_slot(5)) == (0x2600, 0x2302, 0x2303, 0x2405)
 
 
 def test_status_in_words():
     """Known bits have names, others the number; only what holds now, and moves no mirror, stops motion."""
-    assert Status(0).sentence == "status 00000000: no known bit"
-    assert Status(0x80000090).sentence == "status 80000090: not stable, trimmed"
-    assert [bit for bit in range(32) if Status(1 << bit).stops_motion] == [0, 1, 2, 3]
+    assert pro.Status(0).sentence == "status 00000000: no known bit"
+    assert pro.Status(0x80000090).sentence == "status 80000090: not stable, trimmed"
+    assert [bit for bit in range(32) if pro.Status(1 << bit).stops_motion] == [0, 1, 2, 3]

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.special import j0
 
-from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import scene_to_direction
 from pipeline.geometry.scan import Sweep, sweep_to_scene
 from pipeline.simulator.effects.air import PARALLAX, TURBULENCE, WIND, closeness, sway_px, turbulence_px
@@ -75,12 +75,11 @@ SWEEP = Sweep("swath", "fine", "x", 0.0, -100.0, 201)
 STEP = Air(distance_m=30.0, relief="step", nearest_m=3.0)
 
 
-def shown(air: Air, sweep: Sweep = SWEEP, lines: range = range(201)) -> tuple[np.ndarray, np.ndarray]:
-    """Displacement of the points of some lines."""
+def shown(air: Air, sweep: Sweep = SWEEP, effect: Any = PARALLAX, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Displacement of all points of a sweep."""
     rig = Rig(air=air)
-    along, scan = sweep_to_scene(sweep, rig.camera)
-    taken = slice(lines.start, lines.stop)
-    return PARALLAX.displaced(SweepBlock(rig, sweep, lines, np.ones(1), (201, 640)), along[taken], scan[taken], "exact")
+    block = SweepBlock(rig, sweep, range(201), np.ones(1), (201, 640), seed=seed)
+    return effect.displaced(block, *sweep_to_scene(sweep, rig.camera), "exact")
 
 
 def test_line_ends_move_by_half_a_line_times_the_lever():
@@ -119,23 +118,17 @@ def test_reliefs():
 
 
 BREEZE = Air(distance_m=30.0, wind_amplitude_m=0.02, wind_hz=1.0)
-CAMERA = LineCamera()
 
 
-def wind_shown(
-    air: Air, sweep: Sweep = SWEEP, lines: range = range(201), **options: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Displacement of the points of some lines."""
-    along, scan = sweep_to_scene(sweep, CAMERA)
-    taken = slice(lines.start, lines.stop)
-    block = SweepBlock(Rig(air=air), sweep, lines, np.ones(1), (201, 640), **options)
-    return WIND.displaced(block, along[taken], scan[taken], "exact")
+def wind_shown(sweep: Sweep = SWEEP, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Displacement of all points by the breeze."""
+    return shown(BREEZE, sweep, WIND, seed)
 
 
 def test_sizes():
     """2 cm at 30 m are 6.3 px; at 1 Hz and 100 ms a line a tenth of a sway, up to 3.9 px from line to line."""
     assert sway_px(Rig(air=BREEZE)) == pytest.approx(6.3, abs=0.01)
-    along, scan = wind_shown(BREEZE)
+    along, scan = wind_shown()
     assert np.hypot(along, scan).max() == pytest.approx(6.306, rel=0.01)
     moved = np.hypot(np.diff(along[:, 320]), np.diff(scan[:, 320])).max()
     assert 0.9 < moved / (2 * 6.306 * math.sin(0.1 * math.pi)) < 1.01
@@ -145,7 +138,7 @@ def test_sizes():
 def test_the_crop_sways_along_the_wind(along: str):
     """The motion lies along the heading that is drawn for the survey, on the scene's own axes."""
     heading = survey_stream(0, WIND.name).uniform(0, 2 * math.pi, 2)[1]
-    first, second = wind_shown(BREEZE, sweep=replace(SWEEP, along=along))
+    first, second = wind_shown(replace(SWEEP, along=along))
     right, down = (first, second) if along == "x" else (second, first)
     np.testing.assert_allclose(right * math.sin(heading), down * math.cos(heading), atol=1e-9)
     assert np.abs(right).max() == pytest.approx(6.306 * abs(math.cos(heading)), rel=0.02)
@@ -161,4 +154,4 @@ def test_one_wave_for_all_sweeps():
         SweepBlock(Rig(air=BREEZE), across, range(1), np.ones(1), (201, 640)), *point[::-1], "exact"
     )
     np.testing.assert_allclose(turned[::-1], seen)
-    assert not np.allclose(wind_shown(BREEZE, seed=3), wind_shown(BREEZE))
+    assert not np.allclose(wind_shown(seed=3), wind_shown())

@@ -24,18 +24,13 @@ from tests.pipeline.simulator.made_up_effects import steep_probe
 from tests.pipeline.simulator.small_scenes import made_scene
 
 
-def rig_of(sigma_px: float) -> Rig:
-    """A rig whose lens blurs by so much."""
-    return Rig(optics=Optics(aberration_px=sigma_px))
-
-
 def test_a_ridge_changes_by_as_much_as_is_bounded():
     """At the top of a ridge a blur takes its slope times the mean way of the light: no bound of slopes may be less."""
     ridge = steep_probe((3.0, 0.0), curvature=(1e9, 0.0))
     x = np.linspace(-1, 1, 200_001)
     gauss, half_disc = np.exp(-((8 * x) ** 2) / 2), np.sqrt(1 - x**2)
     by_lens = 3.0 * 0.4 * np.average(np.abs(8 * x), weights=gauss)
-    assert ABERRATION.bound(ridge, rig_of(0.4)).value == pytest.approx(by_lens, rel=1e-4)
+    assert ABERRATION.bound(ridge, Rig(optics=Optics(aberration_px=0.4))).value == pytest.approx(by_lens, rel=1e-4)
     radius = defocus_px(rig_at(30.0), 30.0)[0] / 2
     by_disc = 3.0 * radius * np.average(np.abs(x), weights=half_disc)
     assert DEFOCUS.bound(ridge, rig_at(30.0)).value == pytest.approx(by_disc, rel=1e-3)

@@ -1,7 +1,8 @@
-"""Diffraction: the pupil's contrast by other ways, what is rendered of it, the Gaussians in its place, and bounds."""
+"""Diffraction: widths, contrast, the kernels that stand for it, and the reference that sums all waves of a pupil."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +18,7 @@ from pipeline.simulator.optics.rays import pupil_contrast
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Optics, Rig
 from tests.pipeline.simulator.made_up_effects import SWEEP, steep_probe
+from tests.pipeline.simulator.pupil_reference import Tile, autocorrelation, distances, random_tile
 from tests.pipeline.simulator.small_scenes import made_scene
 
 RIG = Rig()
@@ -119,3 +121,24 @@ def test_bound_covers_every_tilt_of_the_sweeps():
     steep, flat = (replace(SWEEP, start_px=start) for start in (4000.0, -5000.0))
     assert DIFFRACTION.bound(replace(probe, sweeps=(steep,)), RIG).value > rest
     assert DIFFRACTION.bound(replace(probe, sweeps=(flat,)), RIG).value == pytest.approx(rest, rel=2e-3)
+
+
+def few(tile: Tile) -> Tile:
+    """Return the tile with one sample to compare: the integral over all waves takes seconds each."""
+    return replace(tile, samples=tile.samples[:1])
+
+
+def test_quadrature_over_chords_is_the_closed_form() -> None:
+    """What a round pupil passes of a wave, integrated, is Goodman's formula."""
+    u, passed = autocorrelation()
+    np.testing.assert_allclose(passed, pupil_contrast(u), atol=1e-6)
+
+
+def test_kernels_show_what_the_pupil_does() -> None:
+    """Of noise, edges, points and beside wide bright fields light is within 0.1 sigma of the integral."""
+    assert distances(few(random_tile(23))).max() < 0.1
+
+
+def test_kernels_show_the_disc_too() -> None:
+    """Out of focus as well, 40 m away when focused at infinity."""
+    assert distances(few(random_tile(32, math.inf))).max() < 0.1

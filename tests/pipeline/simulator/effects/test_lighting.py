@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.simulator.effects.lighting import BRDF, CLOUD, EDGE_FRACTION, HOT_SPOT_RAD, shadow
+from pipeline.simulator.rig_model import Rig
 from tests.pipeline.simulator.outdoors import SWEEP, block_of, rig_with
 
 
@@ -37,17 +39,6 @@ def test_reflectance_is_never_negative() -> None:
     rig = rig_with(brdf_per_rad=5.0)
     gain = BRDF.gain(block_of(rig, sweep=replace(SWEEP, swath_px=-3000.0)), "angles")
     assert gain.min() == 0
-
-
-def test_crossing_sweeps_agree() -> None:
-    """Reflectance belongs to the scene: two sweeps that cross see the same at the same place."""
-    rig = rig_with(brdf_per_rad=0.4, hot_spot=0.1)
-    along_x = replace(SWEEP, swath_px=0.0, start_px=100.0)
-    along_y = replace(SWEEP, along="y", swath_px=100.0, start_px=0.0)
-    seen = [
-        BRDF.gain(block_of(rig, range(1), sweep=sweep), "angles")[0, 319:321].mean() for sweep in (along_x, along_y)
-    ]
-    assert seen[0] == pytest.approx(seen[1], abs=1e-5)
 
 
 SIZE = 300.0
@@ -80,11 +71,15 @@ def test_shadow_moves_at_its_speed() -> None:
     np.testing.assert_array_equal(first, last)
 
 
-def test_crossing_sweeps_see_the_same_shadow() -> None:
-    """Two sweeps of any name that cross see the same light where and when they do."""
-    along_x = replace(SWEEP, name="a", swath_px=0.0, start_px=0.0)
-    along_y = replace(SWEEP, name="b", along="y", swath_px=0.0, start_px=0.0)
-    seen = [
-        CLOUD.gain(block_of(RIG, range(1), sweep=sweep), "shadow")[0, 319:321].mean() for sweep in (along_x, along_y)
-    ]
-    assert seen[0] == pytest.approx(seen[1], abs=1e-6)
+@pytest.mark.parametrize(
+    ("effect", "rig", "place_px", "apart"),
+    [(BRDF, rig_with(brdf_per_rad=0.4, hot_spot=0.1), 100.0, 1e-5), (CLOUD, RIG, 0.0, 1e-6)],
+    ids=["reflectance", "shadow"],
+)
+def test_crossing_sweeps_see_the_same(effect: Any, rig: Rig, place_px: float, apart: float) -> None:
+    """Light belongs to the scene: two sweeps of any name that cross see the same where and when they do."""
+    along_x = replace(SWEEP, name="a", swath_px=0.0, start_px=place_px)
+    along_y = replace(SWEEP, name="b", along="y", swath_px=place_px, start_px=0.0)
+    blocks = (block_of(rig, range(1), sweep=sweep) for sweep in (along_x, along_y))
+    seen = [effect.gain(block, effect.variants[0])[0, 319:321].mean() for block in blocks]
+    assert seen[0] == pytest.approx(seen[1], abs=apart)

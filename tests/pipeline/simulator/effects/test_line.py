@@ -54,13 +54,6 @@ def test_folded_smear_counts_what_sways_within_an_exposure() -> None:
     assert not trial.is_broken
 
 
-def waves(seed: int) -> np.ndarray:
-    """Long waves (400, 500)."""
-    rng = np.random.default_rng(seed)
-    y, x = np.mgrid[:400, :500]
-    return 1 + 0.02 * sum(np.sin((y * a + x * b) / 30 + c) for a, b, c in rng.normal(size=(5, 3)))
-
-
 def test_ends_of_a_line_are_turned_by_the_line_rotation() -> None:
     """The ends of a line of 640 samples lie 320 px times the sine of its rotation off the plan, and stretched."""
     camera = LineCamera()

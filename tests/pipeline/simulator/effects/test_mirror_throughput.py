@@ -19,29 +19,25 @@ from tests.pipeline.simulator.spectral_light import probe_of, rig_with
 NM = np.linspace(400.0, 1000.0, 61)
 
 
-def sweep_at(swath_px, start_px, lines):
+def sweep_at(swath_px, start_px, lines, step=1):
     """A sweep along x."""
-    return Sweep("fine", "fine", "x", swath_px=swath_px, start_px=start_px, lines=lines)
+    return Sweep("fine", "fine", "x", swath_px=swath_px, start_px=start_px, lines=lines, step=step)
 
 
-def coated(coating="aluminium"):
-    """A rig whose mirror is of some metal."""
-    return replace(rig_with(), mirror=MirrorMotion(coating=coating))
+RIG = replace(rig_with(), mirror=MirrorMotion(coating="aluminium"))
 
 
-RIG = coated()
-
-
-def factors(sweep, rig=RIG):
+def factors(sweep, effect=POLARISATION, variant="exact", rig=RIG, nm=NM):
     """Factor of every line, (line, band)."""
-    gain = POLARISATION.gain(SweepBlock(rig, sweep, range(sweep.lines), NM, (640, 640)), "exact")
-    assert gain.shape == (sweep.lines, 1, len(NM))
+    gain = effect.gain(SweepBlock(rig, sweep, range(sweep.lines), nm, (640, 640)), variant)
+    assert gain.shape == (sweep.lines, 1, len(nm))
+    assert gain.dtype == np.float32
     return gain[:, 0].astype(np.float64)
 
 
-def looking(view_deg, rig=RIG):
+def looking(view_deg):
     """Factors of one line that looks so far from rest: twice the mirror's turn, (band,)."""
-    return factors(sweep_at(0, np.tan(np.radians(view_deg)) / rig.camera.ifov_rad, 1), rig)[0]
+    return factors(sweep_at(0, np.tan(np.radians(view_deg)) / RIG.camera.ifov_rad, 1))[0]
 
 
 def test_bare_aluminium_by_fresnel():
@@ -64,23 +60,15 @@ VIGNETTING_RIG, VIGNETTING_NM = Rig(), np.array([700.0])
 VIGNETTING_FLAT = np.full((2, 8, 1), 10_000, np.float32)
 
 
-def vignetting_sweep_at(swath_px, start_px, lines, step=1):
-    """A sweep along x."""
-    return Sweep("fine", "fine", "x", swath_px=swath_px, start_px=start_px, lines=lines, step=step)
-
-
 def vignetting_factors(sweep, variant="held"):
     """Factor of every line, (line,)."""
-    gain = VIGNETTING.gain(SweepBlock(VIGNETTING_RIG, sweep, range(sweep.lines), VIGNETTING_NM, (640, 640)), variant)
-    assert gain.shape == (sweep.lines, 1, 1)
-    assert gain.dtype == np.float32
-    return gain[:, 0, 0].astype(np.float64)
+    return factors(sweep, VIGNETTING, variant, VIGNETTING_RIG, VIGNETTING_NM)[:, 0]
 
 
 @pytest.mark.parametrize(("variant", "at"), [("held", "positions"), ("middle", "middle")])
 def test_fractions_are_those_of_the_mirror(variant, at):
     """What calibration divides by is what the lines are multiplied by, at any place of the field."""
-    sweep = vignetting_sweep_at(-2300, 1700, 50, 4)
+    sweep = sweep_at(-2300, 1700, 50, 4)
     fractions = mirror_throughput(
         getattr(SweepBlock(VIGNETTING_RIG, sweep, range(50), VIGNETTING_NM, (640, 640)), at)
     ).reshape(50, -1)
@@ -89,7 +77,7 @@ def test_fractions_are_those_of_the_mirror(variant, at):
 
 def test_one_sweep_of_640_lines_changes_138_dn():
     """3.4 % from end to end, 138 of 4095 DN (139 if rounded first), of which the bound counts the way from rest."""
-    sweep = vignetting_sweep_at(0, -320, 640)
+    sweep = sweep_at(0, -320, 640)
     held = vignetting_factors(sweep)
     assert 4095 * np.ptp(held) == pytest.approx(138.5, abs=0.5)
     bound = VIGNETTING.bound(probe_of(VIGNETTING_FLAT, VIGNETTING_NM, "dn", sweep=sweep), VIGNETTING_RIG)

@@ -37,11 +37,6 @@ SWEEP = Sweep("swath", "fine", "x", 0.0, -500.0, 1001)
 RIG = Rig(mirror=replace(MirrorMotion(), repeatability_urad=40.0))
 
 
-def shifts(lines: range = range(1001), *, seed: int = 0, rig: Rig = RIG, sweep: Sweep = SWEEP) -> np.ndarray:
-    """The shift of some lines."""
-    return JITTER.aim(SweepBlock(rig, sweep, lines, np.ones(1), (64, 64), seed), "exact")
-
-
 @pytest.mark.parametrize("position", [(0.0, 0.0), (0.3, 0.4), (-0.7, 0.5), (0.1, -0.9)])
 def test_gains_are_the_derivatives_of_the_reflection(position: tuple[float, float]):
     """Small turns of the normal about two axes of its own move the view by the gains, anywhere on the disk."""
@@ -56,7 +51,7 @@ def test_gains_are_the_derivatives_of_the_reflection(position: tuple[float, floa
 
 def test_spread_of_the_draws():
     """Lines scatter by .76 px rms along the scan and .54 px along the line, without bias or correlation."""
-    shift = shifts()[:, 0]
+    shift = JITTER.aim(SweepBlock(RIG, SWEEP, range(1001), np.ones(1), (64, 64)), "exact")[:, 0]
     assert np.std(shift, axis=0) == pytest.approx((0.535, 0.757), rel=0.1)
     assert np.abs(shift.mean(axis=0)).max() < 0.1
     assert abs(np.corrcoef(shift.T)[0, 1]) < 0.1

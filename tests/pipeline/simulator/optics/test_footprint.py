@@ -12,30 +12,14 @@ from hypothesis.extra.numpy import arrays
 
 from pipeline.geometry.mirror import direction_to_normal, scene_to_direction
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.optics.kernel_fit import Footprint, Moments, box_weight, fold
+from pipeline.simulator.optics.kernel_fit import Moments, box_weight, fold
 from pipeline.simulator.optics.rays import REST_NORMAL, extreme_normals, middle_normal, spread_of_rays, spread_of_waves
 from pipeline.simulator.rig_model import Rig
-
-PLAIN = ((2.7, 1.0), (1, 1), 1)
-
-
-def folded(shift: np.ndarray, variance: np.ndarray) -> Footprint:
-    """The usual slit with blurs."""
-    return fold(*PLAIN, Moments(shift, variance))
-
-
-def transfer(width: float, shift: np.ndarray, variance: np.ndarray, wave: float) -> np.ndarray:
-    """What a scene's pixels, a box and Gaussians leave of a wave, with its phase; wave in turns per px."""
-    return (
-        np.sinc(wave) ** 2
-        * np.sinc(width * wave)
-        * np.exp(-2 * np.pi**2 * variance * wave**2 - 2j * np.pi * shift * wave)
-    )
 
 
 def test_bands_alike_have_one_kernel() -> None:
     """Equal moments need one kernel, and it has exactly those."""
-    found = folded(np.full((2, 9), 0.1), np.full((2, 9), 0.3))
+    found = fold((2.7, 1.0), (1, 1), 1, Moments(np.full((2, 9), 0.1), np.full((2, 9), 0.3)))
     assert found.kernels == 1
     np.testing.assert_allclose(np.concatenate([found.shift, found.variance])[:, 0], [0.1, 0.1, 0.3, 0.3])
     np.testing.assert_array_equal(found.mixing, 1.0)
