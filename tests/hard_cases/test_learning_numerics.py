@@ -34,8 +34,7 @@ def test_4_a_crop_without_a_label_is_no_step():
     labels = np.full((64, 64), UNLABELLED, np.uint8)
     labels[0, 0] = 1
     trainer = Trainer(SegmenterConfig(**SIZES), [_example(labels)], NO_SHIFT, SETTINGS)
-    for sampler in trainer.samplers.values():
-        sampler.examples = [_example(np.full((64, 64), UNLABELLED, np.uint8))]
+    trainer.sampler.examples = [_example(np.full((64, 64), UNLABELLED, np.uint8))]
     before = [parameter.clone() for parameter in trainer.model.parameters()]
     for _ in range(4):  # three in a row are no failure
         trainer.step(0.5)
