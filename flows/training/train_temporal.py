@@ -26,7 +26,7 @@ from models.reading.prior_map import CurrentVisit, PriorMap, first_probabilities
 from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation, ColumnNoise
 from models.training.temporal import PastPass, TemporalTraining, Visit, train_reader
 from models.training.train import Progress
-from models.weights.files import Weights, add_reader, load_weights
+from models.weights.files import Weights, add_reader, describe_weights, load_reader, load_weights
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid, pad_by_reflection
@@ -64,6 +64,7 @@ class TemporalRequest:
 def train_temporal(request: TemporalRequest, report: Report = lambda what, done, figure: None) -> dict[str, Any]:
     """Train a temporal reader for weights, judge it on other lands, save it, and return the record of its file.
 
+    If the weights have a reader, the training goes on from it.
     Raises SettingsError: the dataset is not the built-in farm, its classes are not those of the weights, or the file
     cannot be written; WeightsError: the weights cannot be read.
     """
@@ -91,12 +92,15 @@ def train_temporal(request: TemporalRequest, report: Report = lambda what, done,
     def progress(now: Progress) -> None:
         report("training", now.done, f"step {now.step}, loss {now.loss:.3f}")
 
-    reader, steps = train_reader(lands + (SPRING_COUNTS - 1) * spring, request.settings, progress)
+    known = describe_weights(request.weights).reader
+    start = None if known is None else load_reader(request.weights)
+    reader, steps = train_reader(lands + (SPRING_COUNTS - 1) * spring, request.settings, progress, start=start)
     record = {
         "command": request.command,
         "lands": [FIRST_SEED + number for number in range(request.lands)],
         "settings": asdict(request.settings),
         "steps": steps,
+        "started_from": None if known is None else known.key,
         "validation": judge_temporal(weights, augmentation, reader, request, report),
     }
     add_reader(request.weights, request.out, reader, record)

@@ -87,14 +87,22 @@ class _Batch:
 
 
 def train_reader(
-    lands: Sequence[Sequence[Visit]], settings: TemporalTraining, report: Callable[[Progress], None] = lambda now: None
+    lands: Sequence[Sequence[Visit]],
+    settings: TemporalTraining,
+    report: Callable[[Progress], None] = lambda now: None,
+    *,
+    start: TemporalReader | None = None,
 ) -> tuple[TemporalReader, int]:
-    """Train on visits to lands in the order of their days; return the averaged reader and the number of steps."""
+    """Train on visits to lands in the order of their days, from ``start`` on where one is given.
+
+    Returns the averaged reader and the number of steps.
+    """
     first = lands[0][0].scan_passes[0]
     sizes = TemporalSizes(first.probability.shape[-1], first.coarse.shape[-1])
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
-        reader = TemporalReader(sizes).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        reader = TemporalReader(sizes) if start is None else copy.deepcopy(start).train()
+    reader = reader.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     averaged = copy.deepcopy(reader).eval()
     labels = [visit.labels for land in lands for visit in land]
     weight = class_weights(labels, sizes.classes, settings.weight_cap)

@@ -1,6 +1,6 @@
 """What the class unknown costs on farms that training never saw, and how much of other fields it finds.
 
-Farms of other seeds and days than any that weights or limits were made with, looked at in four ways; each map is drawn
+Farms of other seeds and days than any that weights or limits were made with, looked at in three ways; each map is drawn
 with the class and without it, of the same lines. Other fields have spectra that no farm has: invented ones, a farm's in
 shuffled bands, grey boards, and Indian Pines (AVIRIS, of the data folder) brought to the farm's brightness.
 """
@@ -28,7 +28,6 @@ SEEDS, DAYS, SIZE = (21, 22, 23), (120, 172, 250), "640x512"
 PROBES: dict[str, dict[str, Any]] = {
     "every line, 100 ms": {"scan_step": 1},
     "survey --seconds 25": {"seconds": 25},
-    "zoomed, budget 0.5": {"budget": 0.5},
     "every line, 5 ms": {"scan_step": 1, "scan_exposure_ms": 5},
 }
 WEIGHTS = shipped_weights()
