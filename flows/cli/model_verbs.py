@@ -87,9 +87,9 @@ class TrainFlags(SceneFlags):
         Weights from which the training starts, at a third of the learning rate. Bands, classes and sizes must be
         theirs, and DATASET must contain the scenes that they know. The result is the mean of both networks.
     train_temporal
-        Weights to which only a temporal reader is added, for surveys with --prior. The training goes on from a reader
-        that they have. It takes --scenes, --steps, --minutes, --seed and --validation, and resumes. It needs 4 GB of memory, and half an hour for reading the
-        scenes besides --minutes.
+        Weights to which only a temporal reader is added, for surveys with --prior. The training starts from the
+        reader that they have. It takes --scenes, --steps, --minutes, --seed and --validation, and resumes. It needs
+        4 GB of memory, and half an hour for reading the scenes besides --minutes.
     dim
         Token width of the transformer.
     layers

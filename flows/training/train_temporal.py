@@ -64,7 +64,7 @@ class TemporalRequest:
 def train_temporal(request: TemporalRequest, report: Report = lambda what, done, figure: None) -> dict[str, Any]:
     """Train a temporal reader for weights, judge it on other lands, save it, and return the record of its file.
 
-    If the weights have a reader, the training goes on from it.
+    The training starts from the reader of the weights if they have one.
     Raises SettingsError: the dataset is not the built-in farm, its classes are not those of the weights, or the file
     cannot be written; WeightsError: the weights cannot be read.
     """

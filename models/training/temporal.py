@@ -93,7 +93,7 @@ def train_reader(
     *,
     start: TemporalReader | None = None,
 ) -> tuple[TemporalReader, int]:
-    """Train on visits to lands in the order of their days, from ``start`` on where one is given.
+    """Train on visits to lands in the order of their days, from ``start`` where one is given.
 
     Returns the averaged reader and the number of steps.
     """

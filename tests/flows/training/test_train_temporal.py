@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from rich.console import Console
 
 import flows.training.train_temporal as remember
@@ -50,6 +51,10 @@ def test_a_reader_learns_whom_to_believe() -> None:
     ]
     assert scores[2] > scores[0] - 0.01
     assert scores[2] > scores[1] + 0.3
+    again, none = train_reader(lands, TemporalTraining(minutes=1e-9, visits=2), start=reader)  # no time: the start
+    assert none == 0
+    for one, other in zip(again.parameters(), reader.parameters(), strict=True):
+        assert torch.equal(one, other)
 
 
 def test_lands_are_visited_in_the_order_of_their_days() -> None:
@@ -76,6 +81,9 @@ def test_the_command_trains_judges_and_says_how(tmp_path: Path, monkeypatch: pyt
     assert found is not None
     assert describe_weights(out).key == describe_weights(weights).key
     assert dict(found.record) == record
+    started_from = describe_weights(weights).reader
+    assert started_from is not None
+    assert record["started_from"] == started_from.key
     assert (record["lands"], record["steps"], record["command"]) == ([200_000], 2, "spectralzoom train")
     assert [row["days"] for row in record["validation"]] == [3.0]
     for row in record["validation"]:
