@@ -6,6 +6,7 @@ When the accuracy is known, the folder is made again with it and replaces the fi
 from __future__ import annotations
 
 import platform
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
@@ -189,7 +190,9 @@ def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str) -> Receipt:
         versions=versions,
         settings=asked_settings(run),
         stages=[asdict(one) for one in survey.records.values()],
-        savings=_savings(run, plan, read_in_full(products["score"], products["segment"])),
+        savings=_savings(
+            run, plan, read_in_full(products["score"], products["segment"]), prior_map_figures(products["segment"].path)
+        ),
         data_bytes=open_account(run, plan),
         accuracy_is=accuracy_is,
         judged=None if accuracy is None else now(),
@@ -208,10 +211,12 @@ def asked_settings(run: SurveyRun) -> dict[str, object]:
     return {**anchor_paths(run.settings.to_dict(), Path.cwd()), "notes": list(run.notes)}
 
 
-def _savings(run: SurveyRun, plan: FinePlan, read: NDArray[np.intp]) -> dict[str, Any]:
+def _savings(
+    run: SurveyRun, plan: FinePlan, read: NDArray[np.intp], memory: Mapping[str, Any] | None
+) -> dict[str, Any]:
     """Return the costs against the full scan; for a raster those of the model alone."""
     if run.raster is not None:
-        return _model_savings(run, read)
+        return _model_savings(run, read, memory)
     done = [*run.plan.coarse, *plan.sweeps]
     entries = capture_savings(done, run.plan.full, run.camera, run.grid, cost=run.settings.cost)
     capture = SavingEntry(run.plan.coarse_s + plan.seconds, run.plan.full_s).as_dict()
@@ -220,13 +225,13 @@ def _savings(run: SurveyRun, plan: FinePlan, read: NDArray[np.intp]) -> dict[str
     return {
         **{name: entry.as_dict() for name, entry in entries.items()},
         "capture_s": capture,
-        **_model_savings(run, read),
+        **_model_savings(run, read, memory),
     }
 
 
-def _model_savings(run: SurveyRun, read: NDArray[np.intp]) -> dict[str, Any]:
+def _model_savings(run: SurveyRun, read: NDArray[np.intp], memory: Mapping[str, Any] | None) -> dict[str, Any]:
     """Return the patches segmented at full resolution and the multiply-adds, against those of every patch."""
-    did, scan = run.work_done(read), run.costs.of_map(run.grid.valid_patches())
+    did, scan = run.work_done(read, memory), run.costs.of_map(run.grid.valid_patches())
     return {
         "patches": SavingEntry(len(read), len(run.grid.valid_patches())).as_dict(),
         "multiply_adds": {**SavingEntry(did.total, scan.total).as_dict(), **asdict(did)},
@@ -283,6 +288,7 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     plan = load_plan(products["score"])
     figures: dict[str, Any] = {"kind": plan.kind, "reason": plan.reason, "lines": plan.lines, "seconds": plan.seconds}
     found: dict[str, Any] = {"field": field_figures(run, plan), "plan": figures}
+    memory = prior_map_figures(products["segment"].path)
     if run.recorded is not None:
         found["recording"] = {
             "sweeps": str(run.settings.sweeps),
@@ -292,8 +298,8 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
             "full_scan_s": run.settings.cost.seconds(run.plan.full, run.camera),
         }
     if run.chooses and (run.plan.plain or run.least_gain is not None):
-        found["kept"] = run.reading_figures(read_in_full(products["score"], products["segment"]))
-    if (memory := prior_map_figures(products["segment"].path)) is not None:
+        found["kept"] = run.reading_figures(read_in_full(products["score"], products["segment"]), memory)
+    if memory is not None:
         found["memory"] = memory
     if run.settings.extent != EXTENT_WHOLE:
         asked = run.grid.valid_fraction().ravel() > 0 if run.zones.shown is None else run.zones.shown

@@ -15,8 +15,9 @@ from flows.tasks.prior_maps import EarlierRun
 from models.network.sizes import CELL_PX
 from models.network.spectral import LineSpec
 from models.reading.prior_map import ClassProbabilities, PriorMap, in_classes, pooled
-from models.reading.regions import Region
+from models.reading.regions import Box, Region
 from models.weights.files import Weights
+from pipeline.geometry.grid import pad_by_reflection
 from pipeline.rectify.registration.alignment import FieldShift, field_shift
 from storage.arrays.class_maps import ProbabilityStore
 from storage.arrays.mosaics import open_mosaic
@@ -48,9 +49,14 @@ class FieldPriorMap:
         values, age, light = (_framed(part, gaps) for part in store.read(rows[0], columns[0]))
         if self.classes != tuple(range(values.shape[-1])):
             values = in_classes(values, self.classes)
-        coarse = pooled(coarse_region(weights, self.mosaic, region, LineSpec()).seen_columns)
+        moved = replace(region, read=Box(rows[0].start, columns[0].start, rows[0].stop, columns[0].stop))
+        height, width = moved.read.shape
+        columns_before = np.empty((height, width, weights.config.columns), np.float32)
+        if height and width:
+            columns_before = coarse_region(weights, self.mosaic, moved, LineSpec()).seen_columns[:height, :width]
+        whole = np.asarray(pad_by_reflection(_framed(columns_before, gaps), region.grid.padded_shape), np.float32)
         before = ClassProbabilities(values, age, np.nan_to_num(light))
-        return PriorMap(before, shifted(coarse, _cells(self.shift_px)), self.days, self.day_of_year)
+        return PriorMap(before, pooled(whole), self.days, self.day_of_year)
 
 
 def laid_together(images: Iterable[NDArray[np.float32]]) -> NDArray[np.float32]:

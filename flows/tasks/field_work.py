@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from flows.tasks.patch_budget import SHARD
@@ -19,7 +20,7 @@ from models.evaluation.placement import COMPARED, classes_by
 from models.network.machine import PROCESSOR, give_back_freed_memory
 from models.network.spectral import Capture, CaptureMap, LineSpec, patches_of
 from models.policies.policies import GLANCING_POLICIES, score_patches
-from models.reading.expected_errors import LEAST_EXPECTED_ERROR, STEPS, PatchExpectedErrors
+from models.reading.expected_errors import PatchExpectedErrors
 from models.reading.inference import CoarsePass, CoarsePrediction, read_coarse_pass, read_coarse_prediction
 from models.reading.ood import OodDetector
 from models.reading.regions import HALO_PX, REGION_PX, Region, most_bytes, plan_regions
@@ -102,17 +103,15 @@ class ExpectedErrors:
     mosaic: Path
     capture: LineSpec
 
-    def __call__(self, region: Region) -> NDArray[np.float32]:
-        """Return the counted pixels of the region's own patches, (patch_y, patch_x, class, step)."""
+    def __call__(self, region: Region) -> PatchExpectedErrors:
+        """Return the expected errors of the region's own patches."""
         weights = self.weights.load()
         coarse = read_coarse_prediction(weights, coarse_region(weights, self.mosaic, region, self.capture))
         with np.errstate(divide="ignore"):
-            sure = np.log(coarse.probability[: region.grid.height, : region.grid.width])
-        ages = np.zeros(sure.shape[:2], np.float32)
-        found = PatchExpectedErrors.of([(sure, ages)], region.grid, len(weights.class_names))
-        pixels = found.pixels.reshape(*region.grid.patch_shape, *found.pixels.shape[1:])
-        (top, left), kept = region.origin, region.kept_patches
-        return pixels[kept.top - top : kept.bottom - top, kept.left - left : kept.right - left]
+            sure = np.log(region.crop(coarse.probability)) / weights.temperature
+        sure -= scipy.special.logsumexp(sure, axis=-1, keepdims=True)
+        grid = SceneGrid(*region.kept.shape, region.grid.patch, 1)
+        return PatchExpectedErrors.of([(sure, np.zeros(sure.shape[:2]))], grid, len(weights.class_names))
 
 
 @dataclass(frozen=True)
@@ -199,9 +198,11 @@ class FieldWork:
         """
         mosaic = mosaic.resolve()
         work = ExpectedErrors(self.weights, mosaic, capture)
-        pixels = self._joined(self._of_regions(work, mosaic, NO_PATCHES, report))
-        steps, ages = np.geomspace(LEAST_EXPECTED_ERROR, 1.0, STEPS), np.zeros(pixels[..., 0, 0].size)
-        return PatchExpectedErrors(pixels.reshape(-1, *pixels.shape[2:]), steps, ages)
+        parts: list[PatchExpectedErrors] = self._of_regions(work, mosaic, NO_PATCHES, report)
+        shapes = [(*region.kept_patches.shape, *parts[0].wrong.shape) for region in self.regions]
+        pixels = self._joined([part.pixels.reshape(shape) for part, shape in zip(parts, shapes, strict=True)])
+        pixels = pixels.reshape(-1, *parts[0].wrong.shape)
+        return PatchExpectedErrors(pixels, np.sum([part.wrong for part in parts], axis=0), np.zeros(len(pixels)))
 
     def readings(
         self, mosaic: Path, capture: LineSpec, *, in_full: bool, report: Report

@@ -25,6 +25,7 @@ NEWEST_RUNS = 60  # newest runs of a field that are searched for the previous vi
 MOST_EARLIER = 12  # earlier visits that show a field which was captured in parts
 PROBABILITIES = "class_probabilities"  # a product of runs
 MEMORY = "prior_map.json"  # beside a map: the figures of its prior map
+TURNED, ANOTHER_FIELD = "turned", "another field"  # reasons to put a prior map aside
 OF_THE_LIGHT = (  # settings that two runs of the same captured light share
     *("scene", "source", "seed", "size", "visit", "day", "hour", "effects", "pointing_px"),
     *("extent", "scan_step", "scan_exposure_ms", "coarse_exposure_ms", "budget", "policy"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from functools import cached_property
@@ -22,7 +22,7 @@ from flows.tasks.extent_choice import ExtentChoice, choose_extent
 from flows.tasks.field_work import FieldWork, WeightsFile
 from flows.tasks.mosaic_work import tile_budget
 from flows.tasks.patch_budget import SHARD, PatchBudget, ReadingCosts
-from flows.tasks.prior_maps import AUTO, NONE, Prior, find_prior
+from flows.tasks.prior_maps import ANOTHER_FIELD, AUTO, NONE, TURNED, Prior, find_prior
 from flows.tasks.recorded_field import OpenedRecording, open_recorded
 from flows.tasks.scene import (
     FieldSource,
@@ -310,22 +310,35 @@ class SurveyRun(CaptureRun):
         """Return the settings of the map on the ground."""
         return self.settings.map
 
-    def work_done(self, patch_index: NDArray[np.integer]) -> MultiplyAdds:
-        """Count multiply-adds of the map with these patches at full resolution, and of the scores if used."""
+    def work_done(self, patch_index: NDArray[np.integer], memory: Mapping[str, Any] | None = None) -> MultiplyAdds:
+        """Count multiply-adds of the map with these patches at full resolution, and of the scores if used.
+
+        ``memory`` are the figures of the prior map. One of another field is put aside, and the map drawn again.
+        """
+        aside = None if memory is None else memory["put_aside"]
         done = self.costs.of_map(patch_index)
-        if self.least_gain is not None and self.plan.plain:  # while the map is drawn, which reads the overview once
+        scored = (
+            self.least_gain is not None and self.plan.plain
+        )  # while the map is drawn, which reads the overview once
+        if scored:
             done = replace(done, score=self.costs.score(self.settings.policy))
         elif self.chooses:
             done = self.costs.with_scores(patch_index, self.settings.policy)
-        if self.prior is None or self.reader is None:
+        if memory is not None and aside == ANOTHER_FIELD:
+            every = self.costs.of_map(self.kept_patches)
+            before = every.detail * memory["patches_read"] // max(len(self.kept_patches), 1)
+            done = MultiplyAdds(done.overview + every.overview, done.score * (2 if scored else 1), done.detail + before)
+        if self.prior is None or self.reader is None or aside == TURNED:
             return done
         return replace(done, detail=done.detail + self.reader.sizes.multiply_adds(self.grid.height * self.grid.width))
 
-    def reading_figures(self, patch_index: NDArray[np.integer]) -> dict[str, Any]:
+    def reading_figures(
+        self, patch_index: NDArray[np.integer], memory: Mapping[str, Any] | None = None
+    ) -> dict[str, Any]:
         """Return limits, patches and multiply-adds of the full network, for receipts."""
         settings, everything = self.settings, self.kept_patches
         limits = {"macs": settings.macs, "least_gain": self.least_gain, "expected_loss": settings.expected_loss}
-        costs = {"done": self.work_done(patch_index).total, "everything": self.costs.of_map(everything).total}
+        costs = {"done": self.work_done(patch_index, memory).total, "everything": self.costs.of_map(everything).total}
         figures = {"patches": len(patch_index), "of_patches": len(everything), "multiply_adds": costs}
         return {"asked": limits, **figures}
 
@@ -380,7 +393,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
         prior = None if found is None else found[0]
         planned = _plan_capture(settings, scene, zones, path, described, prior, passes)
     settings, plan = planned.settings, planned.plan
-    read = min(len(scene.wavelength_nm), SMOOTH)  # components that the network reads, at most
+    read = min(len(scene.wavelength_nm), SMOOTH)  # components of most mosaics; a few have more
     costs = ReadingCosts(described.config, grid, read)
     shown = None if zones.fractions is None else zones.fractions > 0
     budget = None if settings.macs is None else PatchBudget.asked(costs, shown, settings.policy, settings.macs)

@@ -17,14 +17,13 @@ from numpy.typing import NDArray
 
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import RASTER, Settings
-from flows.tasks.patch_budget import PatchBudget, ReadingCosts
+from flows.tasks.patch_budget import ReadingCosts
 from flows.tasks.run import SurveyRun, open_run
 from flows.tasks.stages.accuracy import columns_of_raster, columns_of_sweeps
 from flows.tradeoff.entries import Figures, Setting, Tradeoff
 from flows.tradeoff.store import STORE
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.machine import keep_freed_memory
-from models.network.sizes import multiply_adds
 from models.network.spectral import LineSpec
 from models.policies.policies import score_patches
 from models.reading.inference import CoarsePrediction, DrawnMap, coarse_prediction_of_patches, segment
@@ -200,7 +199,7 @@ SIMULATE = Tradeoff(
 FARM_SHAPE = (384, 512)
 SCANS = {format_scan(step, ms): (step, ms) for step in (1, 2, 4) for ms in (100.0, 50.0, 25.0, 12.0, 6.0)}
 PART_OF = (1, 25.0)  # step and exposure [ms] of the scan of which parts are read in full
-PARTS = {f"{format_scan(*PART_OF)}, {fraction} of multiply-adds": fraction for fraction in ("50%", "35%", "25%")}
+PARTS = {f"{format_scan(*PART_OF)}, {fraction:.0%} of the patches": fraction for fraction in (0.5, 0.35, 0.2)}
 POLICY = "gain"
 
 
@@ -221,7 +220,7 @@ class PlannedField:
     """A field with labels, scanned or read by several plans."""
 
     labels: NDArray[np.uint8]
-    bands: int
+    costs: ReadingCosts
     passes: Mapping[Setting, PlannedPass]
 
     def read(self, plan: Setting) -> DrawnMap:
@@ -233,7 +232,7 @@ class PlannedField:
         """Return 1 - mIoU of a map, the seconds of its scan, and the multiply-adds of the network."""
         one = self.passes[plan]
         config = one.weights.config
-        macs = multiply_adds(config, one.coarse.grid, len(one.patch_index), self.bands).total
+        macs = self.costs.of_map(one.patch_index).total
         raw = {} if one.seconds is None else {"MB raw": one.bytes_raw / 1e6}
         error = 1 - mean_iou(confusion(self.labels, drawn.classes, config.classes))
         return Figures(error, one.seconds, {**raw, "billion multiply-adds": macs / 1e9})
@@ -268,7 +267,7 @@ def open_field(seed: int, scene: str | None, weights: Path | None, source: str) 
 def plan_every_way(seed: int, scene: str | None = None, weights: Path | None = None) -> PlannedField:
     """Scan a farm or another scene by every uniform scan, and read parts of one of them."""
     run = open_field(seed, scene, weights, "sim")
-    camera, cost, source, bands = run.camera, run.settings.cost, run.simulated, len(run.scene.wavelength_nm)
+    camera, cost, source = run.camera, run.settings.cost, run.simulated
     grid = SceneGrid(*run.scene.shape, run.described.config.patch, 1)
     along, _, _ = cheapest_full(grid, camera, cost)
     passes: dict[Setting, PlannedPass] = {}
@@ -277,13 +276,13 @@ def plan_every_way(seed: int, scene: str | None = None, weights: Path | None = N
         scan = LineSpec(exposure_ms / DEFAULT_EXPOSURE_MS, step)
         passes[words] = uniform_pass(run.weights, source, sweeps, grid, cost, scan)
     whole = passes[format_scan(*PART_OF)]
-    costs, scores = ReadingCosts(run.weights.config, grid, bands), score_patches(POLICY, whole.coarse)
+    scores, valid = score_patches(POLICY, whole.coarse), grid.valid_fraction().ravel() > 0
     for words, fraction in PARTS.items():
-        kept = np.sort(PatchBudget(costs, whole.patch_index, POLICY, fraction).choose(scores))
+        kept = np.sort(frame_patches(scores, fraction, valid))
         columns = whole.columns[np.searchsorted(whole.patch_index, kept)]
         passes[words] = replace(whole, patch_index=kept, columns=columns)
     assert run.labels is not None
-    return PlannedField(run.labels, bands, passes)
+    return PlannedField(run.labels, run.costs, passes)
 
 
 SURVEY = Tradeoff(
@@ -322,7 +321,7 @@ def plan_every_fraction(seed: int, scene: str | None = None, weights: Path | Non
     passes: dict[Setting, PlannedPass] = {
         one: PlannedPass(coarse, index, columns[index], run.weights) for one, index in chosen.items()
     }
-    return PlannedField(run.labels, len(run.scene.wavelength_nm), passes)
+    return PlannedField(run.labels, run.costs, passes)
 
 
 SEGMENT = Tradeoff(

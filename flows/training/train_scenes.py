@@ -121,6 +121,7 @@ def _imaged(
 ) -> tuple[Common | None, Imaged]:
     """Image named scenes, and check that they have the bands and classes of earlier ones. Raises SceneError."""
     found, empty, regridded, alike = Imaged(), list[str](), list[str](), dict[str, str]()
+    stream = 0x0B5 if names == data.train else 0x0B6  # validation has noise of its own
     for number, name in enumerate(names):
         report(what, number / len(names), name)
         try:
@@ -145,7 +146,7 @@ def _imaged(
         if scene.regridded:
             regridded.append(name)
         grid = SceneGrid(*scene.shape, common.patch, 1)
-        rng = np.random.default_rng([request.settings.seed, 0x0B5, number])
+        rng = np.random.default_rng([request.settings.seed, stream, number])
         found.examples.append(observe_scene(scene, request.camera, grid, common.basis, rng))
     notes = alike_notes(alike)
     if names == data.train and len(alike) == len(found.keys) and len(notes) == 1:

@@ -108,11 +108,11 @@ def train_temporal(request: TemporalRequest, report: Report = lambda what, done,
 
 
 def _moments(rng: np.random.Generator) -> list[tuple[int, float]]:
-    """Draw days of the year in ascending order, with hours."""
+    """Draw days of the year with hours, in ascending order."""
     days = [int(rng.integers(*DAYS))]
     while len(days) < VISITS:
         days.append(min(days[-1] + max(int(rng.choice(GAPS)), 0), LAST_DAY))
-    return [(day, float(rng.choice(HOURS))) for day in days]
+    return sorted((day, float(rng.choice(HOURS))) for day in days)
 
 
 def _visit(
@@ -125,7 +125,7 @@ def _visit(
     rng: np.random.Generator,
 ) -> Visit:
     """Return a land on a day, as scans drawn at random show it."""
-    seen = _Land.observed(weights, shape, seed, day, hour)
+    seen = _Land.observed(weights, shape, seed, day, hour, rng)
     drawn = []
     for _ in range(PASSES):
         step = int(rng.choice(list(SPACINGS), p=list(SPACINGS.values())))
@@ -146,11 +146,13 @@ class _Land:
     grid: SceneGrid
 
     @staticmethod
-    def observed(weights: Weights, shape: tuple[int, int], seed: int, day: int, hour: float) -> _Land:
+    def observed(
+        weights: Weights, shape: tuple[int, int], seed: int, day: int, hour: float, rng: np.random.Generator
+    ) -> _Land:
         camera = LineCamera()
         scene = farm_scene(seed, shape, camera=camera, day=day, hour=hour)
         grid = SceneGrid(*shape, weights.config.patch, 1)
-        seen, noise = observe_finely(scene, camera, grid, weights.basis, 1000 * seed + day)
+        seen, noise = observe_finely(scene, camera, grid, weights.basis, int(rng.integers(2**31)))
         padded = np.asarray(pad_by_reflection(seen, grid.padded_shape), np.float32)
         columns = weights.normalisation.apply(padded, np.ones(weights.basis.columns, np.bool_))
         return _Land(columns, noise, np.asarray(scene.labels, np.uint8), grid)
@@ -186,13 +188,13 @@ def judge_temporal(
     for number in range(request.judged):
         seed = JUDGED_SEED + number
         rng = np.random.default_rng([request.settings.seed, seed])
-        land = _Land.observed(weights, request.shape, seed, JUDGED_DAY, 11.0)
+        land = _Land.observed(weights, request.shape, seed, JUDGED_DAY, 11.0, rng)
         before = land.observe(weights, augmentation, *BEFORE, rng)
         for days in JUDGED_AFTER:
             report(
                 "judging", (number * len(rows) + JUDGED_AFTER.index(days)) / (len(rows) * request.judged), f"{days} d"
             )
-            later = _Land.observed(weights, request.shape, seed, JUDGED_DAY + days, 11.0)
+            later = _Land.observed(weights, request.shape, seed, JUDGED_DAY + days, 11.0, rng)
             now, anew = (later.observe(weights, augmentation, *how, rng) for how in (NOW, BEFORE))
             prior_map = PriorMap(first_probabilities(before), before.coarse, float(days), JUDGED_DAY + days)
             probabilities = {

@@ -25,6 +25,7 @@ THERE_PX = 100.0  # expected pixels of a class that is present with probability 
 SURE_PX = 2000.0  # of a class: a scene with so many counts in full; fewer in all scenes shrink the bias
 SMALL_PX, SMALL_ERROR = 300.0, 0.3  # the IoU of a class of so few pixels has half of this error
 LEAST_IOU = 0.005  # IoU is kept as far from 0 and 1
+ROUNDING_MS = 0.05  # of exposures, to a tenth of a millisecond
 LEAST_ERROR = 0.005  # of mIoU: lower bound of the estimate from a few scenes
 
 
@@ -140,7 +141,7 @@ class MapScores:
 
     def expected(self, counts: Floats, step: int, exposure_ms: float) -> ExpectedScore | None:
         """Return the expected score of a map by its `expected_counts`; None for a scan beyond the record."""
-        within = self.exposures_ms[0] <= exposure_ms <= self.exposures_ms[-1]
+        within = self.exposures_ms[0] - ROUNDING_MS <= exposure_ms <= self.exposures_ms[-1] + ROUNDING_MS
         if step not in self.steps or not within or len(counts) != self.bias.shape[-1]:
             return None
         row = self.steps.index(step)

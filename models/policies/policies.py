@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from models.network.sizes import SCORER_WIDTH, SegmenterConfig, scorer_inputs
 from models.network.spectral import patches_of
 from models.reading.inference import CoarsePrediction
-from pipeline.errors import SettingsError
+from pipeline.errors import SettingsError, ShapeError
 from pipeline.geometry.grid import SceneGrid
 
 Pixels = NDArray[np.float64]
@@ -123,6 +123,10 @@ def _mask_scores(seen: CoarsePrediction, mask: NDArray[np.generic] | None) -> Sc
     grid = seen.grid
     if mask is None:
         raise SettingsError("the policy 'mask' needs --mask FILE, an image of the scene's size")
+    if mask.shape[:2] != (grid.height, grid.width):
+        raise ShapeError(
+            f"the mask has {mask.shape[:2]} px (y, x), the scene {(grid.height, grid.width)}; give one of its size"
+        )
     flat = mask.reshape(grid.height, grid.width, -1).astype(np.float64).mean(axis=-1)
     image = np.zeros(grid.padded_shape)
     image[: grid.height, : grid.width] = np.nan_to_num(flat)

@@ -28,10 +28,13 @@ def expected_error_of(log_probability: NDArray[np.floating]) -> Floats:
 
 @dataclass(frozen=True)
 class PatchExpectedErrors:
-    """Pixels of each patch by their likeliest class and expected error, and the age of the oldest ones."""
+    """Pixels of each patch by their likeliest class and expected error, and the age of the oldest ones.
 
-    pixels: NDArray[np.float32]  # (patch, class, step) counts
-    expected_error: Floats  # (step,) upper bound of each step
+    One class more than the map has is for pixels of which nothing is known.
+    """
+
+    pixels: NDArray[np.float32]  # (patch, class + 1, step) counts
+    wrong: Floats  # (class + 1, step) sum of their expected errors
     age_days: Floats  # (patch,) of its oldest pixel with data; inf without one
 
     @staticmethod
@@ -46,47 +49,62 @@ class PatchExpectedErrors:
         """Sort the pixels of a field given in strips from the top: log-probabilities (y, x, class), ages (y, x) [days].
 
         Every strip but the last is a number of whole patches high. ``come_true`` is the ratio of true to expected
-        errors. Pixels of ``left_out`` (y, x) do not count.
+        errors of known pixels. Pixels of ``left_out`` (y, x) do not count.
         """
-        expected_error = np.geomspace(LEAST_EXPECTED_ERROR, 1.0, STEPS)
+        edges, kinds = np.geomspace(LEAST_EXPECTED_ERROR, 1.0, STEPS), classes + 1
         rows, columns = grid.patch_shape
-        pixels, ages = np.zeros((rows, columns, classes, STEPS), np.float32), np.full((rows, columns), -np.inf)
-        top = 0
+        pixels, ages = np.zeros((rows, columns, kinds, STEPS), np.float32), np.full((rows, columns), -np.inf)
+        sums, top = np.zeros(kinds * STEPS), 0
         for probabilities, age in strips:
             first = top // grid.patch
             down, across = (np.arange(size) // grid.patch for size in (len(probabilities), grid.width))
             patch_number = down[:, None] * columns + across  # of each pixel, from the first of the strip
             here = slice(first, first + math.ceil(len(probabilities) / grid.patch))
-            wrong = come_true * expected_error_of(probabilities)
-            step = np.minimum(np.searchsorted(expected_error, wrong), STEPS - 1)
-            likeliest = np.where(
-                np.isfinite(probabilities[..., 0]), np.nan_to_num(probabilities, nan=-np.inf).argmax(axis=-1), 0
-            )
-            place = (patch_number * classes + likeliest) * STEPS + step
+            known = np.isfinite(probabilities[..., 0])
+            wrong = np.where(known, come_true, 1.0) * expected_error_of(probabilities)
+            step = np.minimum(np.searchsorted(edges, wrong), STEPS - 1)
+            likeliest = np.where(known, np.nan_to_num(probabilities, nan=-np.inf).argmax(axis=-1), classes)
+            place = likeliest * STEPS + step
             asked = np.True_ if left_out is None else ~left_out[top : top + len(probabilities)]
-            counted = np.bincount(place[np.broadcast_to(asked, place.shape)], minlength=pixels[here].size)
-            pixels[here] = counted.reshape(pixels[here].shape)
+            counts = np.broadcast_to(asked, place.shape)
+            sums += np.bincount(place[counts], wrong[counts], minlength=sums.size)
+            place = place + patch_number * sums.size
+            pixels[here] = np.bincount(place[counts], minlength=pixels[here].size).reshape(pixels[here].shape)
             known_age = np.where(asked & np.isfinite(age), age, -np.inf)
             np.maximum.at(ages[here].reshape(-1), patch_number.ravel(), known_age.ravel())
             top += len(probabilities)
-        known = np.where(ages < 0, np.inf, ages).ravel()
-        return PatchExpectedErrors(pixels.reshape(-1, classes, STEPS), expected_error, known)
+        age_days = np.where(ages < 0, np.inf, ages).ravel()
+        return PatchExpectedErrors(pixels.reshape(-1, kinds, STEPS), sums.reshape(kinds, STEPS), age_days)
+
+    @property
+    def expected_error(self) -> Floats:
+        """Return the mean expected error of the pixels of each class and step, (class + 1, step); 0 without pixels."""
+        counts = self.pixels.sum(axis=0, dtype=np.float64)
+        found: Floats = np.divide(self.wrong, counts, out=np.zeros_like(counts), where=counts > 0)
+        return found
+
+    def wrong_pixels(self) -> Floats:
+        """Return the expected number of wrong pixels of each patch, (patch,)."""
+        found: Floats = np.tensordot(self.pixels, self.expected_error, 2)
+        return found
 
     def expected_wrong(self) -> float:
-        """Return the expected fraction of wrong pixels of the field."""
-        return float(
-            self.pixels.sum(axis=(0, 1), dtype=np.float64) @ self.expected_error / self.pixels.sum(dtype=np.float64)
-        )
+        """Return the expected fraction of wrong pixels of the field; 0 without pixels."""
+        return float(self.wrong.sum() / max(self.pixels.sum(dtype=np.float64), 1.0))
 
     def expected_gain(self, wrong_after: Floats) -> Floats:
         """Return the expected increase of the mean accuracy over classes by capturing each patch, (patch,) 0..1.
 
         ``wrong_after`` (class,) is the fraction of wrong pixels of each class in a map of the new capture. A pixel
-        with a smaller expected error gains nothing. All classes have the same weight.
+        with a smaller expected error gains nothing. All classes have the same weight. Pixels of which nothing is known
+        are expected to have the classes of the others, in the same proportions.
         """
         count = self.pixels.sum(axis=(0, 2), dtype=np.float64)
-        there = count > 0
-        weight = np.divide(1.0, count, out=np.zeros_like(count), where=there) / max(int(there.sum()), 1)
-        gained = np.maximum(self.expected_error - wrong_after[:, None], 0.0) * weight[:, None]
-        found: Floats = self.pixels.reshape(len(self.pixels), -1) @ gained.ravel()
+        every, there = max(count.sum(), 1.0), count[:-1] > 0
+        known = count[:-1].sum() / every
+        weight = np.divide(known, count, out=np.full_like(count, 1 / every), where=[*there, False])
+        weight[:-1] /= max(int(there.sum()), 1)
+        after = np.append(wrong_after, np.mean(wrong_after, where=there if there.any() else True))
+        gained = np.maximum(self.expected_error - after[:, None], 0.0) * weight[:, None]
+        found: Floats = np.tensordot(self.pixels, gained, 2)
         return found

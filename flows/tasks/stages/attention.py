@@ -28,7 +28,7 @@ from storage.archive.manifests import read_table, write_table
 from storage.arrays.mosaics import Attention, chosen_patches, open_mosaic, write_attention
 
 READING = "attention.zarr"  # beside a class map whose drawing chose the patches
-ATTENTION = Product("score", version=14, files=("attention.zarr", "plan.json"), by_weights=True)
+ATTENTION = Product("score", version=15, files=("attention.zarr", "plan.json"), by_weights=True)
 Scores = NDArray[np.float64]
 
 
@@ -146,8 +146,7 @@ def gain_by_record(
         iou = np.array([expected.get(name, expected[MIOU]) for name in class_names])
         return gains.within_zones(errors.expected_gain((1 - iou) / (1 + iou)))
 
-    wrong: Scores = errors.pixels.sum(axis=1, dtype=np.float64) @ errors.expected_error  # pixels of each patch
-    return wrong, second_pass.best(record, gain_of)
+    return errors.wrong_pixels(), second_pass.best(record, gain_of)
 
 
 def all_seen(grid: SceneGrid, sweeps: Sequence[Sweep], camera: LineCamera, *, part: bool) -> FinePlan:

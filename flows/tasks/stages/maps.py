@@ -14,7 +14,7 @@ from flows.settings.survey_settings import MapChoice
 from flows.tasks.drawing import Drawing, FullReading, UnknownRule, draw_field
 from flows.tasks.field_prior_map import FieldPriorMap, prior_map_lies, whole_pixels
 from flows.tasks.field_work import region_params
-from flows.tasks.prior_maps import MEMORY, Prior
+from flows.tasks.prior_maps import ANOTHER_FIELD, MEMORY, TURNED, Prior
 from flows.tasks.stage import Product, Report, Wanted, stage
 from flows.tasks.stages.attention import READING, PatchGains
 from models.reading.prior_map import TemporalAgreement, changed_fractions
@@ -39,11 +39,11 @@ from storage.arrays.class_maps import (
 )
 from storage.arrays.ground_maps import BLOCK, GroundMapWriter
 from storage.arrays.layout import NO_CLASS, blank_pixels
-from storage.arrays.mosaics import Attention, open_mosaic, write_attention
+from storage.arrays.mosaics import Attention, chosen_patches, open_mosaic, write_attention
 from storage.arrays.quicklooks import choose_bands, develop, stretch
 
 MAP, PROBABILITIES = "class_map.zarr", "class_probabilities.zarr"
-CLASS_MAP = Product("segment", version=17, files=(MAP, PROBABILITIES), by_weights=True)
+CLASS_MAP = Product("segment", version=18, files=(MAP, PROBABILITIES), by_weights=True)
 OUT_OF_RANGE = "out_of_range.json"  # beside a map with values out of range
 LEFT_OUT = "left_out.npy"  # pixels outside of zones, while the map is drawn
 MOST_TURN_PX = 12.0  # greatest offset of the corners by rotation, at which a prior map is used
@@ -92,7 +92,8 @@ def segment(
         drawn = draw_field(work, drawing, report)
         if prior is not None:
             figures = _prior_map_figures(prior, reader, names, lies, drawn.comparison)
-            write_table(path / MEMORY, figures)
+            before = chosen_patches(drawing.attention) if drawn.reading is None else np.flatnonzero(drawn.reading.read)
+            write_table(path / MEMORY, figures | {"patches_read": len(before)})
             if figures["put_aside"] is not None and drawn.comparison is not None:
                 drop_changes(path / PROBABILITIES)
                 drawn = draw_field(work, replace(drawing, memory=None), report)
@@ -170,7 +171,7 @@ def _prior_map_figures(
     Changed pixels exceed the expected difference of two maps of the same ground; all differing pixels are counted too.
     """
     agreement = None if comparison is None or np.isnan(comparison.agreement) else comparison.agreement
-    put_aside = "turned" if comparison is None else "another field" if comparison.is_of_another_field else None
+    put_aside = TURNED if comparison is None else ANOTHER_FIELD if comparison.is_of_another_field else None
     compared = 0 if comparison is None else int(comparison.changed.sum())
     differing, expected, pairs = 0, 0.0, list[tuple[int, int, str, str]]()
     if comparison is not None and put_aside is None:

@@ -35,18 +35,27 @@ def test_a_look_is_worth_what_it_mends_of_each_class() -> None:
     probabilities[:4, :6], probabilities[4:] = believed(0.6, shape=(4, 6)), believed(0.999, shape=(4, 12), kind=1)
     expected_errors = PatchExpectedErrors.of([(probabilities, np.zeros((8, 12)))], GRID, 3)
     expected_gain = expected_errors.expected_gain(np.array([0.1, 0.1, 0.1]))
-    step = expected_errors.expected_error[
-        np.searchsorted(expected_errors.expected_error, 0.4)
-    ]  # expected errors are kept in steps, no less than they are
-    assert expected_gain.sum() == pytest.approx(0.5 * (step - 0.1) / 2)
+    assert expected_gain.sum() == pytest.approx(0.5 * 0.3 / 2, rel=1e-5)
     assert np.flatnonzero(expected_gain).tolist() == [0, 1]
     assert expected_gain[0] == pytest.approx(2 * expected_gain[1])
 
 
 def test_a_look_that_sees_worse_than_is_remembered_is_worth_nothing() -> None:
-    """However much of the field it shows."""
+    """However much of the field it shows; and no less than is remembered is worth nothing too."""
     expected_errors = PatchExpectedErrors.of([(believed(0.95), np.zeros((8, 12)))], GRID, 3)
     assert not expected_errors.expected_gain(np.full(3, 0.2)).any()
+    assert expected_errors.expected_gain(np.full(3, 0.05)).sum() == pytest.approx(0, abs=1e-6)
+
+
+def test_pixels_of_which_nothing_is_known_are_of_no_class_and_do_not_come_true() -> None:
+    """Half a field of two equal classes: each pixel gains as a part of a class twice as large, the rest in the mean."""
+    probabilities = np.full((8, 12, 3), np.nan, np.float32)
+    probabilities[:4, :8], probabilities[:4, 4:8] = believed(0.8, shape=(4, 8)), believed(0.8, shape=(4, 4), kind=1)
+    errors = PatchExpectedErrors.of([(probabilities, np.zeros((8, 12)))], GRID, 3, come_true=0.5)
+    assert errors.wrong_pixels() == pytest.approx([1.6, 1.6, *[16 * 2 / 3] * 4], rel=1e-5)
+    gain = errors.expected_gain(np.array([0.0, 0.06, 0.5]))
+    assert gain[:2] == pytest.approx([0.1 / 6, 0.04 / 6], rel=1e-4)
+    assert gain[2:] == pytest.approx((2 / 3 - 0.03) / 6, rel=1e-5)
 
 
 @given(st.integers(1, 2), st.integers(0, 2**32 - 1))
@@ -61,7 +70,8 @@ def test_swaths_say_what_the_whole_says(high: int, seed: int) -> None:
     assert np.array_equal(whole.pixels, parts.pixels)
     assert np.array_equal(whole.age_days, parts.age_days)
     assert whole.pixels.sum() == 8 * 12
-    assert 0 < whole.expected_wrong() <= 2 / 3 * whole.expected_error[1] / whole.expected_error[0]
+    for one in (whole, parts):
+        assert one.expected_wrong() == pytest.approx(expected_error_of(probabilities).mean())
 
 
 def test_pixels_that_nobody_asks_for_do_not_count() -> None:
