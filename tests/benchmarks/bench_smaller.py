@@ -1,6 +1,7 @@
 """Ours with a part of the patches read in full, beside smaller networks that read everything, at equal multiply-adds.
 
 All are trained as long, from discriminants of their own, on the same farms in full light. Other farms judge them once.
+A step takes 1.3 s of one core, and 400 steps are too few (82.6 with everything): use a machine with an accelerator.
 `python tests/benchmarks/bench_smaller.py 20` trains for 20 steps in place of `STEPS`.
 """
 
@@ -17,6 +18,7 @@ from flows.training.figures import read_twice
 from flows.training.train_scenes import Scenes, TrainRequest, network_config, observe_all
 from models.evaluation.metrics import mean_iou
 from models.evaluation.placement import ReadTwice, run_controls
+from models.network.machine import choose_device
 from models.network.sizes import SegmenterConfig, multiply_adds
 from models.network.spectral import Normalisation
 from models.training.capture_augmentation import REFERENCE_MS
@@ -26,7 +28,7 @@ from models.weights.files import Weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 
-STEPS, TRAINED_ON, JUDGED = 400, 24, 6  # steps, and farms
+STEPS, TRAINED_ON, JUDGED = 3000, 24, 6  # steps, and farms
 Sizes = tuple[int, int, int]
 OURS: Sizes = (8, 20, 64)  # channels of the overview and of the full network, and the token width
 SMALLER: tuple[Sizes, ...] = ((8, 16, 64), (12, 12, 64), (10, 10, 64), (6, 12, 64), (6, 8, 48), (4, 8, 32))
@@ -52,7 +54,7 @@ def trained(asked: TrainRequest, scenes: Scenes, normalisation: Normalisation) -
     common, examples, rng = scenes.common, scenes.train.examples, np.random.default_rng([0x1DA])
     config, shift = network_config(asked, common), normalisation.gain_shift
     start = linear_discriminants(LabelledPixels.drawn(examples, rng).brightened(shift, rng), config.classes)
-    model, summary = train(config, examples, shift, asked.settings, start=start)
+    model, summary = train(config, examples, shift, asked.settings, start=start, device=choose_device("auto"))
     print(config, summary, flush=True)
     return read_twice(
         Weights(model, common.basis, normalisation, common.names, common.colours), scenes.validation.examples

@@ -98,8 +98,10 @@ def solve_sweeps(
         groups = [sorted(tied_to(windows, sweep, len(names))) for sweep in range(len(names))]
         largest = max(groups, key=len, default=[0])
         held = largest[len(largest) // 2]
+    joined = tied_to(windows, held, len(names))
+    untied = tuple(number for number in range(len(names)) if number not in joined)
     if not windows:
-        return SweepShifts(no_shifts(names), np.empty((0, 2)), held, tuple(n for n in range(len(names)) if n != held))
+        return SweepShifts(no_shifts(names), np.empty((0, 2)), held, untied)
     halves = [max((count - 1) / 2, 1.0) for count in lines]
     system = np.zeros((2 * len(windows), 4 * len(lines)))  # columns of a sweep: offset, and drift in px at its end
     for row, window in enumerate(windows):
@@ -116,8 +118,6 @@ def solve_sweeps(
         kept = np.repeat(~wrong, 2)
         answer = _robust(system[kept], measured[kept], error[kept])
     residual = (measured - system @ answer).reshape(-1, 2)
-    joined = tied_to([window for window, out in zip(windows, wrong, strict=True) if not out], held, len(names))
-    untied = tuple(number for number in range(len(names)) if number not in joined)
     ends = zip(names, answer.reshape(-1, 2, 2), halves, strict=True)
     shifts = tuple(SweepShift(name, offset, drift / half) for name, (offset, drift), half in ends)
     return SweepShifts(shifts, residual, held, untied)

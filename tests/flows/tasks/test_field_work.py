@@ -184,3 +184,18 @@ def test_a_memory_is_moved_and_leaves_nothing_behind(surveyed: tuple[SurveyRun, 
         here = [slice(max(-one, 0), max(size - max(one, 0), 0)) for one, size in zip(by, before.shape, strict=False)]
         expected[tuple(there)] = before[tuple(here)]
         np.testing.assert_array_equal(now, expected)
+
+
+def test_a_moved_memory_has_no_seams_between_regions(surveyed: tuple[SurveyRun, Path]) -> None:
+    """Features come from beyond a region's halo, wherever the field has them."""
+    run, stages = surveyed
+    probabilities, mosaic = (_store(stages, "segment/*/class_probabilities.zarr"), _mosaics(stages)[0])
+    before = FieldPriorMap(probabilities, mosaic, 1.0, None, tuple(range(len(run.weights.class_names))), (40, -8))
+    (field,) = plan_regions(run.grid, SHARD)
+    whole = before.of(field, run.weights).coarse
+    for region in plan_regions(run.grid, SHARD, most_px=MOST_PX, halo=16):
+        part = before.of(region, run.weights).coarse
+        assert whole is not None
+        assert part is not None
+        here = region.read.over(CELL_PX)
+        np.testing.assert_array_equal(part, whole[here.rows, here.columns])

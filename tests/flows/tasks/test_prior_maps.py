@@ -159,6 +159,10 @@ def test_another_field_under_the_same_name_is_put_aside(visited: Path, survey_pn
     alone = survey_png(tmp_path / "alone", **{**UNIFORM, **flags})
     assert wrong.receipt["memory"]["put_aside"] == "another field"
     assert "not used: another field" in words
+    cost, once = (run.receipt["savings"]["multiply_adds"] for run in (wrong, alone))  # the map was drawn twice
+    assert cost["overview"] == 2 * once["overview"]
+    patches = once["detail"] / alone.receipt["savings"]["patches"]["done"]
+    assert cost["detail"] == pytest.approx(once["detail"] + wrong.receipt["memory"]["patches_read"] * patches)
     np.testing.assert_array_equal(class_map(visited, wrong), class_map(tmp_path / "alone", alone))
     probabilities = xr.open_zarr(visited / wrong.receipt["products"]["class_probabilities"], consolidated=False)
     assert float(probabilities.age.max()) == 0.0

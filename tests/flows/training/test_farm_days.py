@@ -15,6 +15,7 @@ from flows.settings.survey_settings import Settings
 from flows.tasks.scene import farm_refusal, open_scene
 from flows.training.data import farm_days, farm_test_data, open_training_data, read_farm_name
 from flows.training.observed_scenes import observe_scene
+from flows.training.train_scenes import TrainRequest, observe_all
 from models.network.spectral import SpectralBasis
 from models.training.examples import observe
 from pipeline.errors import SceneError, SettingsError
@@ -155,3 +156,18 @@ def test_a_machine_too_small_for_a_farm_is_told(size: str, measured: float, monk
     for there, refused in ((measured, True), (1.1 * measured, False)):
         monkeypatch.setattr("flows.tasks.scene.machine_bytes", lambda there=there: int(there))
         assert (farm_refusal(_settings(size=size)) is not None) == refused
+
+
+def test_validation_scenes_have_noise_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each scene is imaged from a stream that no other scene has, of training or of validation."""
+    streams: list[int] = []
+
+    def imaged(scene: RasterScene, camera: LineCamera, grid: SceneGrid, basis: SpectralBasis, rng: Any) -> None:
+        streams.append(rng.bit_generator.state["state"]["state"])
+
+    monkeypatch.setattr("flows.training.train_scenes.observe_scene", imaged)
+    monkeypatch.setattr("flows.training.train_scenes.trained_pixels", lambda scene: None)
+    monkeypatch.setattr("flows.training.train_scenes.only_class", lambda scene: None)
+    data = open_training_data("farm", 2, 2, LineCamera())
+    observe_all(TrainRequest("farm", Path()), data, lambda what, done, figure: None)
+    assert len(set(streams)) == len(streams) == 4

@@ -164,6 +164,9 @@ def test_exposures_between_are_between_by_their_logarithm():
     assert first.miou == expected_score(counts, scores.bias[1, 0], scores.error[1, 0]).miou
     assert middle.miou == pytest.approx((first.miou + last.miou) / 2, abs=0.005)
     assert middle.miou != last.miou
+    rounded = scores.expected(counts, 2, 3.96)  # of an exposure, to a tenth of a millisecond
+    assert rounded is not None
+    assert rounded.miou == first.miou
 
 
 @pytest.mark.parametrize(("step", "exposure_ms"), [(4, 16.0), (1, 3.9), (1, 65.0)])

@@ -7,6 +7,7 @@ import pytest
 
 from models.policies.policies import POLICIES, pixel_entropy, score_patches
 from models.reading.inference import CoarsePrediction
+from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid
 
 
@@ -60,6 +61,8 @@ def test_a_mask_is_averaged_over_each_patch():
     assert score_patches("mask", _coarse_prediction(), mask=mask) == pytest.approx(expected)
     colour = np.repeat(mask[..., None], 3, axis=-1)
     assert score_patches("mask", _coarse_prediction(), mask=colour) == pytest.approx(expected)
+    with pytest.raises(ShapeError, match="give one of its size"):
+        score_patches("mask", _coarse_prediction(), mask=mask[:, :-1])
 
 
 @pytest.mark.parametrize("policy", POLICIES)
