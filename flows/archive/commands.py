@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
@@ -28,6 +29,7 @@ from storage.archive.archive import Archive
 from storage.archive.keys import in_text
 from storage.archive.lineage import Catalogue, changes_between, find_product, version_before
 from storage.archive.records import Run
+from storage.archive.whole_files import to_json
 from storage.maintenance.garbage import DAY_S, clear_up
 from storage.maintenance.verification import Finding, plan_repair, repair
 from storage.remote.opening import open_archive, verify_archive
@@ -135,9 +137,9 @@ def run_verify(archive: str | Path, console: Console, *, remake: bool = False, a
     if not as_json:
         show_verdict(content, console)
 
-    def survey_again(settings: dict[str, Any]) -> None:  # with the settings of this machine
+    def survey_again(settings: dict[str, Any]) -> str:  # with the settings of this machine
         here = {**of_this_version(settings), "out": opened.name, **dict.fromkeys(OF_THE_MACHINE)}
-        survey_command.run_survey(parse_settings(here), console)
+        return f"runs/{survey_command.run_survey(parse_settings(here), console).folder.name}"
 
     done = repair(opened, bad, survey_again, versions=versions())
     kept = {name: getattr(done, name) for name in ("remade", "dropped", "failed", "complete")}
@@ -295,7 +297,7 @@ def command(settings: Mapping[str, Any], out: str) -> str:
     if settings.get("source") == RECORDED:
         repeated = settings.get("coarse_exposure_ms") is not None
         left_out |= {"coarse_exposure_ms", "scan_exposure_ms", *(OF_THE_PLAN if repeated else ())}
-    asked, defaults = {**settings, "out": out}, Settings().to_dict()
+    asked, defaults = (json.loads(to_json(one)) for one in ({**settings, "out": out}, Settings().to_dict()))
     parts, tables = ["spectralzoom", "survey"], list[str]()
     for name, usual in defaults.items():
         value, flag = asked.get(name, usual), name.replace("_", "-")
@@ -309,7 +311,7 @@ def command(settings: Mapping[str, Any], out: str) -> str:
             parts += [f"--{flag}", ("x" if name == "size" else ",").join(map(str, value))]
         else:
             parts += [f"--{flag}", str(value)]
-    return shlex.join(parts) + (f"  (with {', '.join(tables)} as in its receipt)" if tables else "")
+    return shlex.join(parts) + (f"  # with {', '.join(tables)} as in its receipt" if tables else "")
 
 
 def show_contents(content: dict[str, Any], console: Console) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,7 @@ from flows.archive.export_layers import ExportedRun
 from flows.archive.product_choice import ProductChoice
 from flows.publish.receipt import hectares_of_classes
 from pipeline.errors import SettingsError
-from pipeline.geometry.grid import UNLABELLED
+from pipeline.geometry.grid import UNLABELLED, cuts
 from pipeline.ground.field_places import M2_PER_HECTARE
 from pipeline.ground.georeference import pixel_side_m
 from pipeline.lazy import deferred
@@ -34,10 +35,12 @@ from storage.export.map_files import (
 )
 
 if TYPE_CHECKING:
+    import pyproj
     import rasterio.features as rasterio_features
     import rasterio.warp as rasterio_warp
     import shapely
 else:
+    pyproj = deferred("pyproj")
     rasterio_features = deferred("rasterio.features")
     rasterio_warp = deferred("rasterio.warp")
     shapely = deferred("shapely")
@@ -45,6 +48,8 @@ else:
 CELL_M = 3.0  # default of a prescription, if pixels are smaller
 MOST_CELLS = 4_000_000
 DEGREE_M = 111_320.0  # of latitude
+WITHIN = (0.01, 0.5, 0.99)  # places in a pixel, down and across, whose cells get its dose
+PIXELS_AT_ONCE = 1_000_000
 WGS84 = "EPSG:4326"
 IN_DEGREES = {"proj:code": WGS84}
 Add = Callable[..., None]  # adds a file to the catalogue: key, path, title, media type, roles, STAC fields
@@ -161,9 +166,9 @@ def dose_cells(raster: ClassRaster, doses: Mapping[str, float], cells: GeoBox) -
     of_class[UNLABELLED] = 0
     for name, dose in doses.items():
         of_class[raster.legend.names.index(name)] = np.searchsorted(levels[1:], dose) + 1
-    found = np.zeros(cells.shape, np.uint8)
+    found, level = np.zeros(cells.shape, np.uint8), of_class[raster.classes]
     rasterio_warp.reproject(
-        of_class[raster.classes],
+        level,
         found,
         src_transform=raster.geobox.affine,
         src_crs=str(raster.geobox.crs),
@@ -173,4 +178,17 @@ def dose_cells(raster: ClassRaster, doses: Mapping[str, float], cells: GeoBox) -
         dst_nodata=0,
         resampling=rasterio_warp.Resampling.max,
     )
+    _raise_doses(found, level, raster.geobox, cells)
     return np.asarray(levels[found])
+
+
+def _raise_doses(found: NDArray[np.uint8], level: NDArray[np.uint8], geobox: GeoBox, cells: GeoBox) -> None:
+    """Raise the level of each cell to that of every pixel in it, in place: GDAL misses pixels of rotated maps."""
+    between = pyproj.Transformer.from_crs(str(geobox.crs), str(cells.crs), always_xy=True)
+    rows, columns = np.nonzero(level > 1)
+    for some in cuts(len(rows), PIXELS_AT_ONCE):
+        for down, across in itertools.product(WITHIN, WITHIN):
+            x, y = between.transform(*(geobox.affine * (columns[some] + across, rows[some] + down)))
+            column, row = (np.floor(one).astype(np.int64) for one in ~cells.affine * (x, y))
+            inside = (row >= 0) & (row < found.shape[0]) & (column >= 0) & (column < found.shape[1])
+            np.maximum.at(found, (row[inside], column[inside]), level[rows[some], columns[some]][inside])

@@ -49,6 +49,7 @@ from storage.archive.staging import (
     PART_SUFFIX,
     bytes_below,
     check_name,
+    files_below,
     refusals,
     remove_tree,
     rename_into_place,
@@ -323,6 +324,31 @@ class Archive:
         """Remove a damaged run."""
         with refusals(self.root, "remove from the archive"):
             retire(self.root / uri)
+
+    def rename_run(self, uri: str, to: str) -> None:
+        """Publish a run again under the name of one that is gone, and remove it under its own.
+
+        Later visits know their prior map by this name.
+        """
+        before, name = self.root / uri, Path(to).name
+        manifest = read_manifest(before)
+        rests_on, own = manifest["rests_on"], {"run", "rests_on", "files", "format", "seal"}
+        with self._named_draft(name) as draft:
+            for path in files_below(before):
+                content = path.read_bytes()
+                if path.suffix in (".json", ".html"):
+                    content = content.replace(before.name.encode(), name.encode())
+                draft.write_file(path.name, content)
+            draft.publish(rests_on=rests_on, **{key: value for key, value in manifest.items() if key not in own})
+        self.drop_run(uri)
+
+    def _named_draft(self, run_id: str) -> RunDraft:
+        """Create the folder of a run of this name. Raises ArchiveError: the name is taken."""
+        with refusals(self.root, "write to the archive"):
+            draft = self._draft(run_id, wait=True, extends=False)
+        if draft is None:
+            raise ArchiveError(f"there is a run {run_id} in {self.name} already")
+        return draft
 
     # --- runs and spools ----------------------------------------------------------------------------------------------
 

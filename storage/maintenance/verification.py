@@ -94,7 +94,7 @@ def _missing(catalogue: Catalogue) -> Iterator[Finding]:
                 yield Finding(given, f"is not there, but {uri} was made of it", "missing")
 
 
-Rerun = Callable[[dict[str, Any]], None]  # settings of a survey: runs and publishes it; PipelineError where it cannot
+Rerun = Callable[[dict[str, Any]], str]  # settings of a survey -> address of the run; PipelineError where it cannot
 
 
 @dataclass(frozen=True)
@@ -144,9 +144,10 @@ def repair(
 ) -> Repaired:
     """Remove the damaged stores, and run the surveys again that name them.
 
-    ``findings`` are those of `verify_archive`. ``rerun`` runs a survey into this archive by its settings.
-    ``versions`` are the present ones of the stages; stores of other versions stay. Raises ArchiveError: another process
-    uses the archive, or the disk or bucket refuses.
+    ``findings`` are those of `verify_archive`. ``rerun`` runs a survey into this archive by its settings. A damaged run
+    is published again under its name; the repetition of an undamaged one is removed. ``versions`` are the present ones
+    of the stages; stores of other versions stay. Raises ArchiveError: another process uses the archive, or the disk or
+    bucket refuses.
     """
     with archive.in_use(alone=True) as alone:
         if not alone:
@@ -155,11 +156,10 @@ def repair(
         done = Repaired(plan)
         for uri in plan.remade:
             archive.discard(archive.ref(*uri.split("/")[1:]))
-    succeeded: set[str] = set()
+    there, repeated = {run.uri for run in Catalogue.read(archive.root).runs} | set(plan.broken_runs), dict[str, str]()
     for run, settings in plan.surveys:
         try:
-            rerun({name: value for name, value in settings.items() if name != "notes"})
-            succeeded.add(_settings_text(run))
+            repeated[_settings_text(run)] = rerun({name: value for name, value in settings.items() if name != "notes"})
         except PipelineError as error:
             done.failed[run.uri] = str(error)
     catalogue = Catalogue.read(archive.root)
@@ -171,12 +171,17 @@ def repair(
         else:
             done.failed[uri] = "; ".join(done.failed.values()) or "its survey ran again without building it"
     for uri, text in plan.broken_runs.items():
-        if text in succeeded:  # its survey has run again, into a folder of its own
+        if text in repeated:  # its survey has run again
             archive.drop_run(uri)
+            if repeated[text] not in there:
+                archive.rename_run(repeated[text], uri)
+                repeated[text] = uri
             done.remade.append(uri)
         else:
             words = f"its {RECEIPT} or the settings in it cannot be read: run that survey again by hand"
             done.failed.setdefault(uri, words)
+    for uri in set(repeated.values()) - there:
+        archive.drop_run(uri)
     return done
 
 

@@ -142,6 +142,11 @@ class ObjectArchive(Archive):
     def _begin_run(self, run_id: str) -> RunDraft | None:
         return self._sending(super()._begin_run(f"{run_id}-{secrets.token_hex(3)}"))  # which no other machine takes
 
+    def _named_draft(self, run_id: str) -> RunDraft:
+        draft = self._sending(super()._named_draft(run_id))
+        assert draft is not None
+        return draft
+
     def extend_run(self, run_id: str, *, wait: bool = True) -> RunDraft | None:
         """Return a draft that replaces a published run; see `Archive.extend_run`."""
         return self._sending(super().extend_run(run_id, wait=wait))

@@ -18,6 +18,7 @@ from flows.terminal.figures import format_bytes
 from flows.terminal.processes import DONE, FAILED, PARTLY
 from pipeline.errors import ArchiveError
 from storage.archive.archive import Archive
+from storage.archive.whole_files import to_json
 from tests.storage.small_archive import flip, small_survey
 
 pytestmark = pytest.mark.usefixtures("no_effects")
@@ -154,7 +155,7 @@ def test_a_repair_that_could_do_some_of_it_says_so(archive: Path, capsys: pytest
     assert content["repair"]["complete"]
     (archive / "stages" / "notes.txt").unlink()
     assert run_verify(archive, QUIET) == DONE
-    assert "20 stores and runs are as published, out of 20" in capsys.readouterr().out
+    assert "19 stores and runs are as published, out of 19" in capsys.readouterr().out
     with opened.publish("ingest", "cube") as staged:
         (staged.path / "data.bin").write_bytes(b"light")
     for path in (opened.refs("rectify_fine")[0].path / "lines.json", archive / "stages/ingest/cube/data.bin"):
@@ -180,7 +181,9 @@ def test_commands_ask_for_the_settings_again(tmp_path: Path) -> None:
     """Only what differs from the defaults; tables are pointed at."""
     flags = {"scene": "farm", "size": "640x512", "bands": "3,4", "controls": False, "camera.exposure_ms": 50}
     told = command({**load_settings(None, flags).to_dict(), "notes": ["x"]}, "archive")
-    assert told == ("spectralzoom survey --bands 3,4 --no-controls --size 640x512  (with [camera] as in its receipt)")
+    assert told == ("spectralzoom survey --bands 3,4 --no-controls --size 640x512  # with [camera] as in its receipt")
+    receipt = json.loads(to_json(load_settings(None, {"scene": "farm"}).to_dict()))
+    assert command(receipt, "archive") == "spectralzoom survey"
     assert command({}, "archive") == ""
 
 

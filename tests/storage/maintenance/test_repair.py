@@ -22,11 +22,15 @@ def _bad(archive: Archive) -> list[str]:
     return [one.uri for one in verify_archive(archive) if one.problem is not None]
 
 
-def _repair(archive: Archive, rerun: Callable[[dict[str, Any]], None] | None = None) -> Repaired:
-    def again(settings: dict[str, Any]) -> None:
-        small_survey(archive, seed=settings["seed"], kernel=settings["kernel"])
+def _repair(archive: Archive, rerun: Callable[[dict[str, Any]], str] | None = None) -> Repaired:
+    def again(settings: dict[str, Any]) -> str:
+        return _run(small_survey(archive, seed=settings["seed"], kernel=settings["kernel"]))
 
     return repair(archive, verify_archive(archive), rerun or again, versions=VERSIONS)
+
+
+def _run(small: Small) -> str:
+    return f"runs/{small.run.name}"
 
 
 def _two(archive: Archive) -> tuple[Small, Small]:
@@ -47,6 +51,7 @@ def test_only_what_is_broken_is_made_again(archive: Archive) -> None:
     assert done.remade == [small.mosaic.uri]
     after = _moments(archive)
     assert {uri for uri in after if after[uri] != before[uri]} == set(done.remade)
+    assert len(archive.runs()) == 2  # the repetition is gone
     assert _bad(archive) == []
 
 
@@ -64,9 +69,9 @@ def test_broken_raw_lines_of_the_simulator_are_made_again(archive: Archive, how:
         archive.discard(small.raw)
     ran: list[str] = []
 
-    def again(settings: dict[str, Any]) -> None:
+    def again(settings: dict[str, Any]) -> str:
         ran.append(settings["kernel"])
-        small_survey(archive, kernel=settings["kernel"])
+        return _run(small_survey(archive, kernel=settings["kernel"]))
 
     done = _repair(archive, again)
     assert done.complete
@@ -86,7 +91,7 @@ def test_raw_lines_of_a_rig_stay_with_all_that_was_made_of_them(archive: Archive
     assert _moments(archive) == before
     assert _bad(archive) == [small.raw.uri]
     flip(small.map.path / "data.bin")
-    done = _repair(archive, lambda settings: small_survey(archive, simulated=False) and None)
+    done = _repair(archive, lambda settings: _run(small_survey(archive, simulated=False)))
     assert done.remade == [small.map.uri]
     assert _bad(archive) == [small.raw.uri]
 
@@ -97,7 +102,7 @@ def test_what_could_not_be_made_again_is_named_by_the_next_verify(archive: Archi
     small = small_survey(archive)
     flip(small.mosaic.path / "data.bin")
 
-    def fail(settings: dict[str, Any]) -> None:
+    def fail(settings: dict[str, Any]) -> str:
         raise error
 
     if isinstance(error, KeyboardInterrupt):
@@ -118,7 +123,12 @@ def test_one_survey_is_run_again_once(archive: Archive) -> None:
         archive.new_run("farm").publish(settings=asked, rests_on=archive.manifest_hashes([small.map]))
     flip(small.mosaic.path / "data.bin")
     ran: list[str] = []
-    repair(archive, verify_archive(archive), lambda settings: ran.append(settings["kernel"]), versions=VERSIONS)
+
+    def again(settings: dict[str, Any]) -> str:
+        ran.append(settings["kernel"])
+        return _run(small)
+
+    repair(archive, verify_archive(archive), again, versions=VERSIONS)
     assert ran == ["bilinear"]
 
 
@@ -186,8 +196,9 @@ def test_a_damaged_run_is_run_again(archive: Archive) -> None:
     done = _repair(archive)
     assert done.complete
     assert done.remade == [f"runs/{run.name}"]
-    assert not run.exists()
-    (run,) = archive.runs()
+    assert archive.runs() == [run]  # under its name, by which later visits know their prior map
+    assert json.loads((run / "manifest.json").read_text())["run"] == run.name
+    assert _bad(archive) == []
     flip(run / "receipt.json")
     done = _repair(archive)
     assert not done.complete
