@@ -20,6 +20,7 @@ from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.archive.staging import check_name, file_hash
 from storage.readers.cube_sources import CubeSource
+from storage.readers.image_files import IMAGE_ENDINGS
 from storage.readers.open_cubes import open_cube, with_wavelengths
 from storage.readers.recorded_files import find_pointing
 from storage.readers.scene_files import with_stated_values
@@ -118,10 +119,10 @@ def hash_files(source: CubeSource, report: Report = lambda done: None) -> list[S
 
 
 def _next(record: Mapping[str, Any], source: str) -> str:
-    """Return the command that surveys the stored cube: a camera's numbers as a recording, others as a scene."""
-    words = ["spectralzoom", "survey"]
-    if record["source_dtype"].lstrip("<>=|") in ("u1", "u2", "i2"):
-        path = Path(source)
+    """Return the command that surveys the cube: a camera's numbers as a recording, images and maps as a scene."""
+    words, path = ["spectralzoom", "survey"], Path(source)
+    image = record["georeferenced"] or path.suffix.lower() in IMAGE_ENDINGS
+    if not image and record["source_dtype"].lstrip("<>=|") in ("u1", "u2", "i2"):
         table = find_pointing(path.parent, path.name.removesuffix(path.suffix))
         words += ["--source", "recorded", "--sweeps", record["path"]]
         words += [] if table is None else ["--pointing", str(table)]
@@ -169,6 +170,7 @@ def _record(
         "wavelength_nm": None if centres is None else [float(centres.min()), float(centres.max())],
         "dark": source.dark is not None,
         "white": source.white is not None,
+        "georeferenced": source.geobox is not None,
         "bytes_read": sum(file.size for file in files),
         "bytes_stored": archive.stored_bytes(ref),
         "files": [asdict(file) for file in files],

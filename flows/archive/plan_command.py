@@ -220,7 +220,7 @@ def scan_table(scans: Mapping[str, Any]) -> Table:
         for seconds, one in sorted(rows.items())
     ]
     columns = ("uniform scan", "", "capture time", "bytes captured", "mIoU, about")
-    return table(columns, cells, left=2, whole=columns)
+    return table(columns, cells, left=2, whole=columns[2:])
 
 
 # --- estimates --------------------------------------------------------------------------------------------------------

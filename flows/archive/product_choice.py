@@ -21,7 +21,8 @@ class ProductFlags:
     """Flags of the products to make of a run."""
 
     reflectance: Annotated[
-        Switch, Parameter(help="Also all bands as GeoTIFF: the coarse mosaic, of a raster its own pixels.")
+        Switch,
+        Parameter(help="Also all bands as GeoTIFF: the coarse mosaic, of a raster its pixels, both without noise."),
     ] = False
     indices: Annotated[
         str | None, Parameter(help="Spectral indices to write as GeoTIFF, with commas: NDVI,NDRE,MCARI,PRI.")

@@ -157,7 +157,7 @@ def _accuracy(content: dict[str, Any]) -> Table:
             format_count(row["cost"]["multiply_adds"]["done"]),
         )
         rows.append([f"[dim]{cell}" if row["uses_labels"] else cell for cell in cells])
-    return table(columns, rows, whole=columns)
+    return table(columns, rows, whole=columns[1:])
 
 
 def _classes(content: dict[str, Any]) -> Table:
@@ -173,7 +173,7 @@ def _classes(content: dict[str, Any]) -> Table:
             false = row["false_classes"].get(name)  # pixels of a class that the labels lack
             cells += [format_points(row["per_class_iou"][name]) if false is None else f"{format_count(false)} px false"]
         rows.append([escape(name), format_count(support), *cells])
-    return table(columns, rows, title="IoU by class", whole=columns)
+    return table(columns, rows, title="IoU by class", whole=columns[1:])
 
 
 def format_difference(interval: dict[str, float | None] | None) -> str:

@@ -19,7 +19,7 @@ from rich.markup import escape
 from flows.cli.app import AsJson, OutFile, stderr
 from flows.publish.panels import GRID, INK, PAPER, png
 from flows.terminal.processes import writing
-from flows.terminal.progress import print_json, table
+from flows.terminal.progress import on_stdout, print_json, table
 from flows.tradeoff.entries import Point, Result, Setting, Tradeoff, measure_tradeoff
 from flows.tradeoff.stages import SEGMENT, SURVEY, TRADEOFFS, segment_tradeoff, survey_tradeoff
 from flows.tradeoff.store import STORE, store_tradeoff
@@ -69,7 +69,7 @@ def tradeoff(
     for one in wanted:
         with stderr.status(f"measuring {one.stage}: {one.knob}"):
             results.append(measure_tradeoff(one, repeats=repeats, seed=seed))
-        print_tradeoff(results[-1], stderr)
+        print_tradeoff(results[-1], stderr if as_json else on_stdout())
     content = {"tradeoffs": [asdict(result) for result in results]}
     with writing(out):
         (out / "tradeoff.json").write_text(to_json(content), encoding="utf-8")
@@ -109,7 +109,7 @@ def print_tradeoff(result: Result, console: Console) -> None:
     headings = [one.replace(" ", "\n") for one in ("error", *points[0].beside, *priced, "time", "x first")]
     title = f"{escape(result.stage)}, {escape(result.knob)}: error and cost"
     columns = ("", result.knob, *headings)
-    console.print(table(columns, rows, left=2, title=title, whole=columns), _caption(result))
+    console.print(table(columns, rows, left=2, title=title, whole=("", *headings)), _caption(result))
 
 
 def _named(setting: Setting, default: Setting | None) -> str:

@@ -243,7 +243,7 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
         on = request.dataset if left else "OTHER_SCENES"
         console.print(
             "no scene was kept for validation; to judge the weights on other scenes: "
-            f"spectralzoom evaluate {on} --weights {out}"
+            f"{shlex.join(['spectralzoom', 'evaluate', str(on), '--weights', str(out)])}"
             + ("" if left or len(record["split"]["train"]) < 2 else "; or train with some held out: --hold-out NAMES"),
             soft_wrap=True,
         )

@@ -98,7 +98,18 @@ class Run:
     @cached_property
     def names(self) -> frozenset[str]:
         """Return the addresses of its stores and of all their inputs; empty where its manifest is damaged."""
-        return frozenset(uri for uri in _table(self.facts.get(RESTS_ON)) if in_text(uri) == uri)
+        named = {uri for uri in _table(self.facts.get(RESTS_ON)) if in_text(uri) == uri}
+        return frozenset(named | self._ingested() if named else named)
+
+    def _ingested(self) -> set[str]:
+        """Return the addresses of ingested cubes of this archive that the survey read."""
+        root, found = self.folder.resolve().parents[1], set[str]()
+        for name in ("scene", "sweeps"):
+            path = Path(_text(self.settings.get(name))).resolve()
+            parts = path.relative_to(root).parts if path.is_relative_to(root) else ()
+            if parts[:2] == ("stages", "ingest") and len(parts) > 2:
+                found.add("/".join(parts[:3]))
+        return found
 
     @property
     def settings(self) -> dict[str, Any]:

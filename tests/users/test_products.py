@@ -18,10 +18,12 @@ import xarray as xr
 from affine import Affine
 from isoxml.converter.np_grid import to_numpy_array
 from isoxml.util.isoxml_io import isoxml_from_path
+from odc.geo.geobox import GeoBox
 from rich.console import Console
 from scipy import ndimage
 
 from flows.archive.export_command import run_export
+from flows.archive.export_zones import ClassRaster, dose_cells
 from flows.archive.product_choice import ProductFlags, choose_products
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
@@ -29,6 +31,7 @@ from pipeline.errors import SettingsError, WavelengthError
 from pipeline.ground.map_grid import grid_of_map, ground_grid, image_at
 from pipeline.ground.view import GroundView, RigPose
 from pipeline.products.indices import find_index
+from storage.arrays.class_maps import ClassNames
 from storage.arrays.mosaics import open_mosaic
 from tests.prior_work import without_effects
 from tests.storage.export.stac_rules import core_problems, extension_problems, is_cog
@@ -292,6 +295,23 @@ def test_products_of_a_georeferenced_scene_lie_where_it_does(
     np.testing.assert_allclose(cells.area, 0.25, rtol=1e-6)
     assert (cells.dose == 2).any()
     assert {0.0, 2.0} >= set(cells.dose)
+
+
+@pytest.mark.parametrize("turned_deg", [0, 15, 30, 45])
+@pytest.mark.parametrize("pixel_m", [0.1, 0.5, 2.0])
+def test_no_pixel_gets_less_than_its_dose(turned_deg: float, pixel_m: float) -> None:
+    """Single pixels of weed on a turned map: the cell of each has its dose."""
+    rng, shape = np.random.default_rng(1), (120, 150)
+    classes = (rng.random(shape) < 0.005).astype(np.uint8)
+    place = Affine.translation(400_000, 5_750_000) * Affine.rotation(turned_deg) * Affine.scale(pixel_m, -pixel_m)
+    field = GeoBox(shape, place, "EPSG:32632")
+    legend = ClassNames(("soil", "weed"), np.zeros((2, 3), np.uint8))
+    cells = GeoBox.from_bbox(tuple(field.extent.boundingbox), crs="EPSG:32632", resolution=3)
+    dose = dose_cells(ClassRaster(classes, legend, place, field), {"weed": 2.0}, cells)
+    row, column = np.nonzero(classes)
+    x, y = ~cells.affine * (place * (column + 0.5, row + 0.5))
+    assert (dose[y.astype(int), x.astype(int)] == 2).all()
+    assert (dose == 0).any() or pixel_m < 0.5  # small fields are full of weed
 
 
 def test_cells_of_coarse_pixels_are_the_field(tmp_path: Path, weights: Path) -> None:

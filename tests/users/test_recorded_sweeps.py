@@ -334,6 +334,13 @@ def test_ingest_names_the_survey_as_the_next_step(
     assert digest_of_map(tmp_path / "a", json.loads(surveyed.out)) == digest_of_map(tmp_path / "b", of_files.receipt)
 
 
+def test_an_ingested_image_is_surveyed_as_a_scene(command_line: CommandLine, tmp_path: Path) -> None:
+    """A picture of whole numbers is no recording of a camera."""
+    Image.fromarray(np.zeros((16, 24, 3), np.uint8)).save(tmp_path / "a.png")
+    ended = command_line("ingest", tmp_path / "a.png", tmp_path / "store")
+    assert f"next: spectralzoom survey --scene {tmp_path / 'a.png'} --weights" in ended.err
+
+
 def test_a_run_of_the_rig_is_reprocessed_from_its_raw_cubes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights: Path
 ) -> None:
