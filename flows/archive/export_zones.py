@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from affine import Affine
@@ -185,10 +185,11 @@ def dose_cells(raster: ClassRaster, doses: Mapping[str, float], cells: GeoBox) -
 def _raise_doses(found: NDArray[np.uint8], level: NDArray[np.uint8], geobox: GeoBox, cells: GeoBox) -> None:
     """Raise the level of each cell to that of every pixel in it, in place: GDAL misses pixels of rotated maps."""
     between = pyproj.Transformer.from_crs(str(geobox.crs), str(cells.crs), always_xy=True)
+    to_map, to_cells = geobox.affine, ~cells.affine
     rows, columns = np.nonzero(level > 1)
     for some in cuts(len(rows), PIXELS_AT_ONCE):
         for down, across in itertools.product(WITHIN, WITHIN):
-            x, y = between.transform(*(geobox.affine * (columns[some] + across, rows[some] + down)))
-            column, row = (np.floor(one).astype(np.int64) for one in ~cells.affine * (x, y))
+            place: Any = between.transform(*(to_map * (columns[some] + across, rows[some] + down)))
+            column, row = (np.floor(one).astype(np.int64) for one in to_cells * place)
             inside = (row >= 0) & (row < found.shape[0]) & (column >= 0) & (column < found.shape[1])
             np.maximum.at(found, (row[inside], column[inside]), level[rows[some], columns[some]][inside])

@@ -149,6 +149,7 @@ class _Land:
     def observed(
         weights: Weights, shape: tuple[int, int], seed: int, day: int, hour: float, rng: np.random.Generator
     ) -> _Land:
+        """Image the farm of a seed on a day, with noise of its own."""
         camera = LineCamera()
         scene = farm_scene(seed, shape, camera=camera, day=day, hour=hour)
         grid = SceneGrid(*shape, weights.config.patch, 1)
