@@ -185,7 +185,8 @@ def dose_cells(raster: ClassRaster, doses: Mapping[str, float], cells: GeoBox) -
 def _raise_doses(found: NDArray[np.uint8], level: NDArray[np.uint8], geobox: GeoBox, cells: GeoBox) -> None:
     """Raise the level of each cell to that of every pixel in it, in place: GDAL misses pixels of rotated maps."""
     between = pyproj.Transformer.from_crs(str(geobox.crs), str(cells.crs), always_xy=True)
-    to_map, to_cells = geobox.affine, ~cells.affine
+    to_map: Any = geobox.affine
+    to_cells: Any = ~cells.affine
     rows, columns = np.nonzero(level > 1)
     for some in cuts(len(rows), PIXELS_AT_ONCE):
         for down, across in itertools.product(WITHIN, WITHIN):
