@@ -85,6 +85,10 @@ def check_zones(run: ExportedRun, choice: ProductChoice) -> None:
             "a prescription is in metres, and the run has no place on the earth; survey with a [pose], or a scene with "
             "a CRS"
         )
+    if choice.doses and run.geobox is not None:
+        west, _, east, _ = _bounds(run.geobox, WGS84)
+        if west > east:
+            raise SettingsError("the map lies across 180 degrees of longitude, a prescription cannot: survey each side")
 
 
 def write_zones(run: ExportedRun, folder: Path, choice: ProductChoice, add: Add) -> None:

@@ -102,10 +102,12 @@ def _m2_of_units(geobox: GeoBox, column: Floats, row: Floats) -> Floats:
     x, y = a * column + b * row + c, d * column + e * row + f
     step = STEP_M / (crs.axis_info[0].unit_conversion_factor * (ellipsoid.a if crs.is_geographic else 1.0))
     east, north = (
-        (np.radians(to_degrees.transform(x + dx, y + dy)) - np.radians(to_degrees.transform(x - dx, y - dy)))
+        np.radians(
+            (np.subtract(to_degrees.transform(x + dx, y + dy), to_degrees.transform(x - dx, y - dy)) + 180) % 360 - 180
+        )
         / (2 * step)
         for dx, dy in ((step, 0.0), (0.0, step))
-    )  # slopes of longitude and latitude along x and along y
+    )  # slopes of longitude, which may pass 180 degrees, and latitude along x and along y
     lat = np.radians(to_degrees.transform(x, y)[1])
     bent = 1 - ellipsoid.es * np.sin(lat) ** 2  # radii of curvature are a (1 - e2) / bent^1.5 and a / sqrt(bent)
     metres = ellipsoid.a**2 * (1 - ellipsoid.es) / bent**2 * np.cos(lat)

@@ -165,7 +165,12 @@ def find_geobox(
         return None
     crs, numbers = odc_crs.CRS(said), str(mapping.get("GeoTransform", "")).split()
     if len(numbers) == 6:
-        return odc_geobox.GeoBox(shape, Affine.from_gdal(*map(float, numbers)), crs)
+        upright = Affine.from_gdal(*map(float, numbers))
+        flipped = upright * Affine(1, 0, 0, 0, -1, shape[0])
+        axes = _transform_of_axes(arrays, dims)
+        # GDAL stores netCDF from the bottom up, with the GeoTransform of the image upright.
+        bottom_up = axes is not None and axes.almost_equals(flipped, _EVEN * abs(upright.e))
+        return odc_geobox.GeoBox(shape, flipped if bottom_up else upright, crs)
     if (stated := attributes.get("spatial:transform")) is not None:
         return odc_geobox.GeoBox(shape, Affine(*map(float, stated)), crs)
     transform = _transform_of_axes(arrays, dims)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pyproj
 import shapely
+import shapely.affinity
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
@@ -37,7 +38,10 @@ def clean_id(text: str, otherwise: str) -> str:
 
 
 def footprint(geobox: GeoBox) -> dict[str, Any]:
-    """Return the outline of a map as a GeoJSON polygon in longitude and latitude, anticlockwise."""
+    """Return the outline of a map as a GeoJSON polygon in longitude and latitude, anticlockwise.
+
+    A map across 180 degrees of longitude is cut there, as RFC 7946 asks for.
+    """
     place, (height, width) = map_attributes(geobox), geobox.shape
     transformer = pyproj.Transformer.from_crs(place["proj:wkt2"], "EPSG:4326", always_xy=True)
     a, b, c, d, e, f = place["spatial:transform"]
@@ -49,7 +53,15 @@ def footprint(geobox: GeoBox) -> dict[str, Any]:
 
     outline = shapely.segmentize(shapely.box(0, 0, width, height), max(height, width) / EDGE_POINTS)
     on_earth = shapely.transform(outline, to_degrees)
-    return dict(shapely.geometry.mapping(shapely.geometry.polygon.orient(on_earth)))
+    west, _, east, _ = on_earth.bounds
+    if east - west > 180 and geobox.crs is not None and not geobox.crs.geographic:
+        beyond = shapely.transform(on_earth, lambda at: np.stack([at[:, 0] % 360, at[:, 1]], axis=-1))
+        there = shapely.affinity.translate(beyond.intersection(shapely.box(180, -90, 360, 90)), -360)
+        halves = [beyond.intersection(shapely.box(0, -90, 180, 90)), there]
+        on_earth = shapely.MultiPolygon([shapely.geometry.polygon.orient(one) for one in halves])
+    else:
+        on_earth = shapely.geometry.polygon.orient(on_earth)
+    return dict(shapely.geometry.mapping(on_earth))
 
 
 def projection(geobox: GeoBox) -> dict[str, Any]:
@@ -149,7 +161,9 @@ def _item(pystac: Any, item: Item) -> Any:
         end_datetime=end,
     )
     if item.footprint is not None:
-        made.bbox = list(shapely.geometry.shape(item.footprint).bounds)
+        parts = shapely.get_parts(shapely.geometry.shape(item.footprint))
+        first, last = parts[0].bounds, parts[-1].bounds  # west is more than east across 180 degrees
+        made.bbox = [first[0], min(first[1], last[1]), last[2], max(first[3], last[3])]
     for key, about in item.assets.items():
         made.add_asset(key, pystac.Asset.from_dict(dict(about)))
     names = {*item.properties, *(name for about in item.assets.values() for name in about)}

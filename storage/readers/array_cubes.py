@@ -142,7 +142,11 @@ def cube_source(
     array.check(part)
     scale, offset = (_number(array.attrs.get(name)) for name in ("scale_factor", "add_offset"))
     plain = scale in (None, 1.0) and offset in (None, 0.0)
-    fill = _number(array.attrs.get("_FillValue", array.attrs.get("missing_value")))
+    unsigned = array.dtype.kind == "i" and str(array.attrs.get("_Unsigned", "")).lower() == "true"
+    stored = np.dtype(f"u{array.dtype.itemsize}") if unsigned else array.dtype.newbyteorder("=")
+    missing = _missing(array.attrs, stored)
+    fill, (low, high) = missing[0] if missing else None, _valid_range(array.attrs, stored)
+    checked = len(missing) > 1 or (low, high) != (-np.inf, np.inf)
     sizes = [int(array.shape[axis]) for axis in order]
 
     def read(start: int, stop: int) -> NDArray[Any]:
@@ -156,20 +160,25 @@ def cube_source(
         with guard():
             block = np.transpose(np.asarray(array[tuple(selection)]), left)
         native = np.ascontiguousarray(block, block.dtype.newbyteorder("="))
-        native = native[..., None] if native.ndim == 2 else native
-        return native if plain else unpacked(native, 1.0 if scale is None else scale, offset or 0.0, fill)
+        native = (native[..., None] if native.ndim == 2 else native).view(stored)
+        out = (native < low) | (native > high) | np.isin(native, missing[1:]) if checked else np.False_
+        if not plain:
+            values = unpacked(native, 1.0 if scale is None else scale, offset or 0.0, fill)
+            return np.where(out, np.float32(np.nan), values) if checked else values
+        return native if fill is None or np.isnan(fill) or not out.any() else np.where(out, stored.type(fill), native)
 
     dims = cube.dims[order[0]], cube.dims[order[1]]
     geobox, notes = place_or_note(lambda: find_geobox(attributes, arrays, (sizes[0], sizes[1]), dims))
     return CubeSource(
         name=path.name,
         shape=(sizes[0], sizes[1], sizes[2] if len(sizes) == 3 else 1),
-        dtype=np.dtype(array.dtype.newbyteorder("=") if plain else np.float32),
+        dtype=stored if plain else np.dtype(np.float32),
         read=read_by_chunks(read, sizes[0], array.chunks[order[0]]),
         files=(path,),
         bands=_bands_of(cube, arrays, sizes[2] if len(sizes) == 3 else 1),
         nodata=fill if plain else None,
         geobox=geobox,
+        scaling=f"{stored} without {missing}, {low} to {high}" if unsigned or checked else "",
         notes=(*cube.notes, *notes),
     )
 
@@ -324,6 +333,27 @@ def _base(name: str) -> str:
 
 def _word(name: str) -> str:
     return _base(name).lower()
+
+
+def _missing(attributes: Mapping[str, Any], stored: np.dtype[Any]) -> list[float]:
+    """Return the numbers of an array that stand for no value: its fill value, and missing values."""
+    given = [np.ravel(attributes[name]) for name in ("_FillValue", "missing_value") if name in attributes]
+    known = [one for one in given if one.dtype.kind in "iuf"]
+    return list(dict.fromkeys(float(number) for one in known for number in _as_stored(one, stored)))
+
+
+def _valid_range(attributes: Mapping[str, Any], stored: np.dtype[Any]) -> tuple[float, float]:
+    """Return the smallest and largest valid number of an array, before scale and offset."""
+    pair = attributes.get("valid_range", (attributes.get("valid_min"), attributes.get("valid_max")))
+    ends = [None if one is None else np.ravel(one) for one in pair] if np.size(pair) == 2 else [None, None]
+    low, high = (None if one is None or one.dtype.kind not in "iuf" else _as_stored(one, stored)[0] for one in ends)
+    return -np.inf if low is None else float(low), np.inf if high is None else float(high)
+
+
+def _as_stored(numbers: NDArray[Any], stored: np.dtype[Any]) -> NDArray[Any]:
+    """Return numbers of an attribute as those of an unsigned array that is stored with a sign."""
+    signed = stored.kind == "u" and numbers.dtype.kind == "i" and (numbers < 0).any()
+    return numbers % 2 ** (8 * stored.itemsize) if signed else numbers
 
 
 def _number(value: object) -> float | None:

@@ -136,16 +136,28 @@ def load_envi_header(path: Path) -> EnviHeader:
 def open_envi_source(path: Path, *, scaled: bool = True) -> CubeSource:
     """Open one ENVI cube by its header or data file (SceneError as `open_envi_cube`).
 
-    Numbers are divided by the header's reflectance scale factor if ``scaled``.
+    Numbers are divided by the header's reflectance scale factor if ``scaled``, or else have its gains and offsets.
     """
     cube = open_envi_cube(path)
     source = _joined(cube.path.name, {0: cube}, list(cube.notes))
     geobox, where = place_of_envi(cube.header.fields, cube.path, source.shape[:2])
     source = replace(source, geobox=geobox, notes=(*source.notes, *where))
-    factor = finite_number(cube.header.fields.get("reflectance scale factor", "")) or 1.0
-    if not scaled or factor == 1 or factor <= 0:
-        return source
-    return rescaled(source, np.full(source.shape[2], 1 / factor), np.zeros(source.shape[2]), source.nodata)
+    fields, bands = cube.header.fields, source.shape[2]
+    factor = finite_number(fields.get("reflectance scale factor", "")) or 0.0
+    gain, offset = _numbers(fields, "data gain values", bands, 1.0), _numbers(fields, "data offset values", bands, 0.0)
+    if factor > 0:
+        gain, offset = np.full(bands, 1 / factor), np.zeros(bands)
+    plain = (gain == 1).all() and not offset.any()
+    return source if plain or not scaled else rescaled(source, gain, offset, source.nodata)
+
+
+def _numbers(fields: Mapping[str, str], name: str, count: int, default: float) -> NDArray[np.float64]:
+    """Return the numbers of a list in a header, one a band; the default where there is none. SceneError: others."""
+    words = [word for word in re.split(r"[{},\s]+", fields.get(name, "")) if word]
+    found = [finite_number(word) for word in words] or [default] * count
+    if len(found) != count or None in found:
+        raise SceneError(f"the header lists {name} = {fields[name]!r}, expected {count} numbers; correct the header")
+    return np.array(found, np.float64)
 
 
 def open_headwall_cube(folder: Path) -> CubeSource:

@@ -38,7 +38,7 @@ from storage.readers.open_cubes import load_frame, open_cube, reader_of, with_wa
 from storage.readers.zarr_files import find_zarr_store
 
 FRAMES = ("dark", "white", "bad", "flat")  # behind the name of a cube in those of its frames
-SAMPLED_LINES = 16  # for bits
+SAMPLED_LINES = 64  # for bits
 
 
 @dataclass(frozen=True)
@@ -99,13 +99,18 @@ def open_recorded_cube(path: Path, wavelengths: Sequence[float] | None) -> Recor
     return RecordedFile(_stem(path), path, source)
 
 
-def with_bits(camera: LineCamera, cubes: Sequence[RecordedFile], notes: list[str]) -> LineCamera:
-    """Return the camera with as many bits as some lines of each cube need."""
+def with_bits(
+    camera: LineCamera, cubes: Sequence[RecordedFile], stated: Mapping[str, Path | None], notes: list[str]
+) -> LineCamera:
+    """Return the camera with as many bits as the white frame and some lines of each cube need."""
     bits = camera.bits
     for cube in cubes:
         valid = np.flatnonzero(cube.source.valid)
-        chosen = valid[:: max(len(valid) // SAMPLED_LINES, 1)][:SAMPLED_LINES]
+        chosen = np.unique(valid[np.linspace(0, len(valid) - 1, SAMPLED_LINES).astype(int)])
         most = max(int(cube.source.read(int(line), int(line) + 1).max()) for line in chosen)
+        file = reference_files(cube.folder / cube.name, stated)["white"]
+        white = cube.source.white if file is None else load_frame(file)[0]
+        most = most if white is None else max(most, int(np.nanmax(white)))
         full = camera.full_scale_dn * max(camera.samples // cube.source.shape[1], 1)
         needed = (most * camera.full_scale_dn // full).bit_length()
         if most > full and needed > bits:
@@ -117,13 +122,23 @@ def with_bits(camera: LineCamera, cubes: Sequence[RecordedFile], notes: list[str
     return replace(camera, bits=bits)
 
 
+def reference_files(stem: Path, stated: Mapping[str, Path | None]) -> dict[str, Path | None]:
+    """Return the file of each kind of frame: ``stated``, else beside the cube ``stem``, else of the folder, or None."""
+    files: dict[str, Path | None] = {}
+    for kind in FRAMES:
+        beside = [stem.with_name(f"{stem.name}.{kind}{ending}") for ending in (".hdr", ".npy")]
+        file = stated.get(kind) or next((one for one in beside if one.is_file()), None)
+        files[kind] = find_reference(stem.parent, kind) if file is None and kind in ("dark", "white") else file
+    return files
+
+
 def find_references(
     source: CubeSource,
     stem: Path,
     camera: LineCamera,
     notes: list[str],
     *,
-    stated: dict[str, Path | None],
+    stated: Mapping[str, Path | None],
     white_reference: NDArray[np.float32],
 ) -> References:
     """Return the reference frames of a cube: ``stated``, else ``stem.dark.hdr`` etc., else those of the folder.
@@ -133,11 +148,7 @@ def find_references(
     """
     name, frame = stem.name, source.shape[1:]
     white_dn = camera.full_scale_dn * max(camera.samples // frame[0], 1)
-    files: dict[str, Path | None] = {}
-    for kind in FRAMES:
-        beside = [stem.with_name(f"{name}.{kind}{ending}") for ending in (".hdr", ".npy")]
-        file = stated.get(kind) or next((one for one in beside if one.is_file()), None)
-        files[kind] = find_reference(stem.parent, kind) if file is None and kind in ("dark", "white") else file
+    files = reference_files(stem, stated)
     found: dict[str, NDArray[np.float32]] = {}
     for kind, file in files.items():
         if file is not None:

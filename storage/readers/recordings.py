@@ -124,6 +124,11 @@ class RecordedWith:
     white_reference: ArrayLike = 1.0  # value of the white reference, one or (band,)
     mounting: Mounting = STRAIGHT  # of the device whose positions the pointing has
 
+    @property
+    def frames(self) -> dict[str, Path | None]:
+        """Return the files of reference frames by their kind."""
+        return {"dark": self.dark, "white": self.white}
+
 
 def open_recording(
     address: str | Path, camera: LineCamera | None = None, given: RecordedWith | None = None
@@ -187,7 +192,7 @@ def _open_files(path: Path, camera: LineCamera, given: RecordedWith) -> Recordin
             raise SceneError(f"{cube.path} has other wavelengths than {cubes[0].path}; survey them one by one")
     notes = [note for cube in cubes for note in (*cube.source.notes, cube.source.bands.origin) if note]
     samples = max(cube.source.shape[1] for cube in cubes)  # the widest are not binned
-    camera = with_bits(replace(camera, samples=samples), cubes, notes)
+    camera = with_bits(replace(camera, samples=samples), cubes, given.frames, notes)
     pointing = [_point(cube, given, notes, alone=len(cubes) == 1) for cube in cubes]
     without = [one is None or one.kind in WITHOUT_MIRROR for one in pointing]
     if any(without) and len(cubes) > 1:
@@ -289,7 +294,7 @@ def _sweeps_of(
         cube.folder / cube.name,
         camera,
         notes,
-        stated={"dark": given.dark, "white": given.white},
+        stated=given.frames,
         white_reference=np.asarray(given.white_reference, np.float32),
     )
     names = (cube.name,) if pointing.part is None else tuple(name for name in dict.fromkeys(pointing.part) if name)
@@ -351,8 +356,12 @@ def _middle_s(source: CubeSource, stated_s: Floats | None, camera: LineCamera, n
     if stated_s is None or not np.isfinite(stated_s).any():
         notes.append(f"nothing says when lines were taken: one every {camera.frame_ms:g} ms is assumed")
         return np.asarray(camera.mid_exposure_s(at.astype(np.float64)))
-    known = np.isfinite(stated_s)
-    return stated_s if known.all() else np.interp(at, at[known], stated_s[known])
+    known = np.flatnonzero(np.isfinite(stated_s))
+    filled, first, last = np.interp(at, known, stated_s[known]), known[0], known[-1]
+    period_s = np.median(np.diff(stated_s[known]) / np.diff(known)) if len(known) > 1 else camera.frame_ms * 1e-3
+    filled[:first] += (at[:first] - first) * period_s  # beyond the known ones a line a period
+    filled[last:] += (at[last:] - last) * period_s
+    return filled
 
 
 # --- raw cubes of archives --------------------------------------------------------------------------------------------

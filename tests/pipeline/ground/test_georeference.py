@@ -68,3 +68,13 @@ def test_patches_hold_every_pixel_once(height: int, width: int, patch: int, fact
     for (y, x), patch_number in zip(grid.patch_origin(numbers), patch_index, strict=True):
         part = image[y : y + patch, x : x + patch]
         np.testing.assert_array_equal(patch_number[: part.shape[0], : part.shape[1]], part)
+
+
+def test_areas_do_not_change_across_180_degrees_of_longitude() -> None:
+    """Fiji: longitudes jump there, square metres do not."""
+    areas = []
+    for shift_m in (0, 20_000):
+        field = GeoBox((20, 200), Affine(10, 0, 179_300 + shift_m, 0, -10, 8_140_000), "EPSG:32701")
+        areas.append(np.concatenate(list(pixel_rows_m2(field))))
+    assert areas[0] == pytest.approx(areas[1], rel=1e-3)
+    assert areas[0] == pytest.approx(100, rel=0.01)

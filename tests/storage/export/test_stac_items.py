@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -124,3 +125,17 @@ def test_the_footprint_is_the_grid_in_degrees() -> None:
     west, south, east, north = shapely.geometry.shape(footprint(BOX)).bounds
     assert 9 <= west < east < 9.001
     assert 52 < south < north < 52.1
+
+
+def test_an_outline_across_180_degrees_is_cut_there(tmp_path: Path) -> None:
+    """Two polygons of a map of 2 km, and a box whose west is more than its east, as RFC 7946 has it."""
+    box = GeoBox.from_bbox((179_000, 8_140_000, 181_000, 8_142_000), crs="EPSG:32701", resolution=10)
+    place = footprint(box)
+    shape = shapely.geometry.shape(place)
+    assert place["type"] == "MultiPolygon"
+    assert shape.area < 0.03**2
+    path, _ = write_stac(tmp_path, ABOUT, "Surveys", replace(item("r1"), footprint=place))
+    west, south, east, north = read(path)["bbox"]
+    assert 179.9 < west < 180
+    assert -180 < east < -179.9
+    assert south < north

@@ -255,3 +255,15 @@ def test_texts_that_would_keep_a_reader_busy(made: str) -> None:
         parse_envi_header(PLAIN + made)
     except SceneError as error:
         assert "more braces than it closes" in str(error)  # noqa: PT017 - either end is well
+
+
+def test_gains_and_offsets_of_bands(tmp_path: Path) -> None:
+    """The header's lists, one number a band; a list of another length is refused."""
+    path = write_envi(tmp_path / "a.img", np.arange(6, dtype=np.uint16).reshape(1, 3, 2))
+    header = path.with_suffix(".hdr")
+    text = header.read_text()
+    header.write_text(text + "data gain values = {0.5, 2}\ndata offset values = {1, 0}\n")
+    assert open_cube(path).read(0, 1).tolist() == [[[1, 2], [2, 6], [3, 10]]]
+    header.write_text(text + "data gain values = {0.5}\n")
+    with pytest.raises(SceneError, match="expected 2 numbers; correct the header"):
+        open_cube(path)

@@ -9,6 +9,8 @@ import h5py
 import numpy as np
 import pytest
 import rasterio
+import rasterio.shutil
+import rasterio.transform
 import rioxarray  # noqa: F401 - registers the accessor that writes a place
 import xarray as xr
 from numpy.typing import NDArray
@@ -241,3 +243,50 @@ def test_bad_files_end_in_one_message(write: Any, words: str, tmp_path: Path) ->
     write(tmp_path / "bad.h5")
     with pytest.raises((SceneError, WavelengthError), match=words):
         load_scene_file(tmp_path / "bad.h5")
+
+
+def test_rows_from_the_bottom_up_lie_where_gdal_has_them(tmp_path: Path) -> None:
+    """GDAL writes the south first, under the GeoTransform of the image upright."""
+    values = np.arange(12, dtype=np.float32).reshape(3, 4)
+    upright = rasterio.transform.from_origin(500_000, 5_000_030, 10, 10)
+    size = {"height": 3, "width": 4, "count": 1, "dtype": "float32"}
+    with rasterio.open(tmp_path / "a.tif", "w", driver="GTiff", crs="EPSG:32632", transform=upright, **size) as file:
+        file.write(values, 1)
+    rasterio.shutil.copy(tmp_path / "a.tif", tmp_path / "a.nc", driver="netCDF", FORMAT="NC4")
+    cube = open_cube(f"{tmp_path / 'a.nc'}:Band1")
+    assert cube.geobox is not None
+    assert cube.geobox.affine.to_gdal() == (500_000, 10, 0, 5_000_000, 0, 10)
+    assert np.array_equal(cube.read(0, 3)[::-1, :, 0], values)
+
+
+@pytest.mark.parametrize(
+    ("stored", "about", "read"),
+    [
+        (np.int8([0, 100, -128, -1]), {"_Unsigned": "true", "_FillValue": np.int8(-1)}, [0, 1, 1.28, np.nan]),
+        (np.int16([0, 101, -3, 9]), {"valid_min": np.int16(0), "valid_max": np.int16(100)}, [0, np.nan, np.nan, 0.09]),
+        (np.int16([0, 101, -3, 9]), {"valid_range": np.int16([0, 200])}, [0, 1.01, np.nan, 0.09]),
+        (
+            np.int16([5, -9, -3, 9]),
+            {"_FillValue": np.int16(-9), "missing_value": np.int16(-3)},
+            [0.05, np.nan, np.nan, 0.09],
+        ),
+    ],
+    ids=["unsigned", "least and most", "range", "two fills"],
+)
+def test_numbers_mean_what_xarray_reads(tmp_path: Path, stored: Any, about: dict[str, Any], read: list[float]) -> None:
+    """Unsigned numbers, ranges and several numbers for no value, by the conventions of NetCDF."""
+    with h5py.File(tmp_path / "a.nc", "w") as file:
+        file["values"] = stored.reshape(1, 4, 1)
+        file["values"].attrs.update({"scale_factor": 0.01, **about})
+    found = open_cube(f"{tmp_path / 'a.nc'}:values").read(0, 1)
+    np.testing.assert_allclose(found[0, :, 0], read, rtol=1e-6)
+
+
+def test_without_a_scale_numbers_out_of_range_are_the_fill_value(tmp_path: Path) -> None:
+    """Whole numbers stay whole."""
+    with h5py.File(tmp_path / "a.nc", "w") as file:
+        file["values"] = np.int16([0, 101, -3, -9]).reshape(1, 4, 1)
+        file["values"].attrs.update({"_FillValue": np.int16(-9), "valid_range": np.int16([0, 100])})
+    cube = open_cube(f"{tmp_path / 'a.nc'}:values")
+    assert (cube.dtype, cube.nodata) == (np.int16, -9)
+    assert cube.read(0, 1)[0, :, 0].tolist() == [0, -9, -9, -9]

@@ -6,6 +6,7 @@ import json
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -27,8 +28,9 @@ from pipeline.simulator.simulated import SimulatedSource
 from storage.archive.archive import Archive
 from storage.arrays.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube
 from storage.export.image_files import write_recorded_files
-from storage.readers.recordings import RecordedWith, open_recording
+from storage.readers.recordings import RecordedWith, _middle_s, open_recording
 from tests.pipeline.capture.recordings import CAMERA, FULL, simulated
+from tests.storage.readers.test_envi_cubes import write_envi
 
 COARSE = Sweep("coarse-0", "coarse", "x", 0.0, -39.5, 20, step=4, binning=4)
 
@@ -284,3 +286,19 @@ def test_the_key_of_a_recording_is_its_content(files: Path, tmp_path: Path) -> N
     assert all(one != other for at, one in enumerate(keys) for other in keys[:at])
     stored = [open_recording(path, CAMERA).key() for path in (tmp_path / "raw", tmp_path / "raw" / "scan-0.zarr")]
     assert stored[0] == stored[1]
+
+
+def test_the_white_frame_says_how_many_bits_a_camera_has(tmp_path: Path) -> None:
+    """Over dark ground no line does."""
+    write_envi(tmp_path / "a.raw", np.full((40, 8, 2), 2000, np.uint16))
+    np.save(tmp_path / "a.white.npy", np.full((8, 2), 12_000, np.float32))
+    recording = open_recording(tmp_path / "a.hdr", None, RecordedWith(wavelengths=(500.0, 600.0)))
+    assert recording.camera.bits == 14
+    assert any("numbers reach 12000, so 14 bits" in note for note in recording.notes)
+
+
+def test_lines_without_a_time_go_on_in_the_period_of_the_others() -> None:
+    """Before the first and after the last too: lines at one time would count as repeated."""
+    source: Any = SimpleNamespace(shape=(6,))
+    times = _middle_s(source, np.array([np.nan, 1.0, np.nan, 3.0, np.nan, np.nan]), CAMERA, [])
+    assert times.tolist() == [0, 1, 2, 3, 4, 5]
