@@ -112,7 +112,7 @@ class OpenedRun:
 
     @property
     def name(self) -> str:
-        """Name in the archive: start of the survey, and the field."""
+        """Name in the archive: time of publication, and the field."""
         return self.folder.name
 
     @property

@@ -64,7 +64,7 @@ def field_figures(run: SurveyRun, fine: FinePlan | None) -> dict[str, Any]:
         "camera_s": camera_s if captured else None,
         "fine_planned": fine is not None or run.plan.plain,
         "lines": lines if captured else None,
-        "hectares_per_hour": kept.hectares_per_hour(seconds) if captured else None,
+        "hectares_per_hour": kept.hectares_per_hour(seconds) if captured and not run.part else None,
     }
 
 

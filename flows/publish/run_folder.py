@@ -302,10 +302,9 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     if memory is not None:
         found["memory"] = memory
     if run.settings.extent != EXTENT_WHOLE:
-        asked = run.grid.valid_fraction().ravel() > 0 if run.zones.shown is None else run.zones.shown
         expected = {} if run.extent is None else asdict(run.extent)
         remembers = memory is not None and memory["put_aside"] is None
-        touched = len(plan.patch_index) / np.count_nonzero(asked)
+        touched = len(plan.patch_index) / max(len(run.kept_patches), 1)
         found["extent"] = {"lines": run.settings.extent, "patches_touched": touched, "remembers": remembers, **expected}
     passes = {"coarse": products.get("register_coarse"), "fine": products.get("register_fine")}
     pointing = {name: _pointing(ref) for name, ref in passes.items() if ref is not None}

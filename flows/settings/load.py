@@ -17,6 +17,7 @@ from pydantic import Field, PlainValidator, TypeAdapter, ValidationError
 
 from flows.settings.survey_settings import (
     ALWAYS,
+    AUTO,
     BUILT_IN_SCENES,
     OF_A_CAMERA,
     OF_A_PART,
@@ -192,7 +193,7 @@ def load_settings(
     passes |= requested.get("zoom") == ALWAYS and requested.get("seconds") is None
     if passes and not _is_map(requested) and not any(requested.get(name) is not None for name in (*UNIFORM, "budget")):
         requested["budget"] = USUAL_BUDGET
-    if "prior" in stated and "extent" not in stated and _may_choose_a_part(requested):
+    if requested.get("prior", AUTO) != AUTO and "extent" not in stated and _may_choose_a_part(requested):
         requested["extent"] = EXTENT_PART
     return parse_settings(requested, origin)
 

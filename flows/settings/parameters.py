@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, model_validator
 
 from flows.settings.documents import about, toml_value
 from flows.settings.load import SURVEY, TABLES, Declared, anchor_paths, load_settings
-from flows.settings.survey_settings import AUTO, BUILT_IN_SCENES, Settings
+from flows.settings.survey_settings import ALWAYS, AUTO, BUILT_IN_SCENES, Settings
 from pipeline.errors import PipelineError, SettingsError
 
 OF_LISTS = {"bands": "integer", "wavelengths": "number", "size": "integer"}  # also as text: 0-3,7
@@ -92,6 +92,13 @@ class SurveySettings(BaseModel):
         made: SurveySettings = cls.model_construct(**changed)
         made._settings = settings
         return made
+
+    @classmethod
+    def planned(cls, settings: Settings) -> SurveySettings:
+        """Return planned settings as parameters: a chosen scan stands for the time or goal that it was chosen by."""
+        if settings.scan_step is not None and settings.zoom != ALWAYS:
+            settings = replace(settings, seconds=None, goal=None, max_age=None, skip_below_error=None)
+        return cls.of(settings)
 
     def with_rig_of(self, file: str) -> SurveySettings:
         """Return the settings with the table [rig] of another file. Raises SettingsError: the file is not valid."""

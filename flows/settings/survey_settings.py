@@ -151,7 +151,7 @@ class Settings:
     extent: Extent = stated(
         "whole",
         "Extent of a uniform scan: whole; part (lines of the highest expected gain; needs --seconds and a prior map;"
-        " default for a revisit with --seconds); or lines as SWEEP:FIRST-STOP, such as 0:12-310,1:0-40",
+        " default with --seconds and a stated --prior); or lines as SWEEP:FIRST-STOP, such as 0:12-310,1:0-40",
     )
     max_age: float | None = stated(
         None,

@@ -186,10 +186,8 @@ class ScanChoice:
 
     def best_within(self, seconds: float) -> UniformScan | None:
         """Return the scan with the highest expected mIoU within a time; None where there is none."""
-        try:
-            return choose_scan(self.offered, seconds) if self.offered else None
-        except BudgetError:
-            return None
+        within = [one for one in self.offered if one.seconds <= seconds + 1e-6]
+        return max(within, key=lambda one: one.expected[MIOU], default=None)
 
     @property
     def reference(self) -> UniformScan | None:

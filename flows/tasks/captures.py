@@ -11,7 +11,8 @@ from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
 from flows.settings.parameters import SurveySettings, at_due_time
-from flows.settings.survey_settings import Settings
+from flows.settings.survey_settings import RIG, Settings
+from flows.settings.values import KEEP_SIGNAL
 from flows.tasks.open_survey import OpenSurvey, RunRef
 from flows.tasks.prefect_tasks import as_task, current_observer, inside_flow
 from flows.tasks.run import SurveyRun, open_run
@@ -118,7 +119,10 @@ def captured_signal(plan: OpenSurvey, sweeps: str, *inputs: StageRef) -> StageRe
         if before and not archive.is_there(before[0].uri):  # raw lines were deleted
             capture_pass(plan, "coarse", inputs[-1])
         return condense(plan, capture_pass(plan, sweeps, *inputs), *before)
-    if archive.is_known(raw):
+    settings = plan.run.settings
+    if settings.keep != KEEP_SIGNAL and settings.source != RIG and archive.find(raw.stage, raw.key) is None:
+        capture_pass(plan, sweeps, *inputs)  # an earlier run deleted the raw lines that this one keeps
+    elif archive.is_known(raw):
         plan.take_as_found(stage.name, raw, *inputs)
     return condense(plan, raw, *before)
 
@@ -140,7 +144,7 @@ def _captured_elsewhere(plan: OpenSurvey, sweeps: str, *inputs: StageRef) -> str
     """Run the deployment for captures, and return the address of the stored sweeps."""
     assert plan.capture_deployment is not None
     parameters: dict[str, Any] = {
-        "settings": SurveySettings.of(plan.run.settings).model_dump(exclude_none=True),
+        "settings": SurveySettings.planned(plan.run.settings).model_dump(exclude_none=True),
         "sweeps": sweeps,
         "inputs": [ref.uri for ref in inputs],
     }

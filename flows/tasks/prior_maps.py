@@ -166,10 +166,13 @@ def _earlier_runs(archive: Archive, run: Run) -> Iterator[EarlierRun]:
 def _days_since(run: Run, visit: str | None, moment: tuple[int, float] | None) -> float:
     """Return the days from a run's visit to another one; negative if that came first.
 
-    The dates of both visits count, else day and hour of a built-in scene, else whole days of the clock.
+    The dates of both visits count, with their times if both have one. Else day and hour of a built-in scene count, else
+    whole days of the clock.
     """
     then, now = (_called_moment(one) for one in (run.settings.get("visit"), visit))
     if then is not None and now is not None:
+        if min(len(str(one)) for one in (run.settings.get("visit"), visit)) <= len("2026-06-01"):  # a date alone
+            return float((now.date() - then.date()).days)
         return (now - then).total_seconds() / 86400
     if moment is not None and run.settings.get("scene") in BUILT_IN_SCENES:
         before = [run.settings.get("day"), run.settings.get("hour")]

@@ -12,6 +12,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from flows.settings.survey_settings import RIG, Settings
 from flows.tasks.scene import FieldSource
 from pipeline.errors import RigError
@@ -25,6 +27,7 @@ from pipeline.rig.rig_source import RigSource
 from pipeline.rig.transports import SYSTEM_CLOCK, Clock
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.source import Source
+from storage.archive.keys import array_digest
 from storage.arrays.spool import FetchedFiles
 
 FETCHED = "camera"  # folder within a capture's spool
@@ -38,8 +41,12 @@ class RigField(FieldSource):
     name = RIG
 
     def key(self, field: str) -> dict[str, Any]:
-        mounting = self.rig.rig.mounting
-        return {"field": field} | ({} if mounting == STRAIGHT else {"mounting": asdict(mounting)})
+        rig = self.rig.rig
+        white = {"white_reference": rig.white_reference, "white_at_rest": rig.white_at_rest}
+        bands = {"wavelengths": array_digest(np.asarray(self.rig.wavelength_nm, np.float64))}
+        return {"field": field, **white, **bands} | (
+            {} if rig.mounting == STRAIGHT else {"mounting": asdict(rig.mounting)}
+        )
 
     def saying(self, say: Callable[[str], None]) -> RigField:
         return RigField(self.rig.saying(say))

@@ -7,6 +7,7 @@ import tomllib
 from dataclasses import MISSING, asdict, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 
 from flows.settings.documents import example_toml, settings_table
 from flows.settings.load import SURVEY, TABLES, load_settings, parse_settings
+from flows.settings.parameters import SurveySettings
 from flows.settings.survey_settings import MapChoice, Settings
 from flows.settings.values import Tolerance
 from pipeline.errors import BudgetError, SettingsError
@@ -274,3 +276,19 @@ def test_receipt_settings_read_back_the_same(budget, seed, bands, memory, exposu
 def test_a_revisit_within_seconds_chooses_a_part(more: dict[str, str], extent: str) -> None:
     """Another choice of lines, or none of the memory, leaves it the whole field."""
     assert load_settings(None, {"scene": "farm", "seconds": "8", "prior": "latest", **more}).extent == extent
+
+
+@pytest.mark.parametrize("asked", [{"seconds": 12}, {"goal": "90"}, {"seconds": 12, "kept_bytes": "50MB"}])
+def test_planned_settings_are_parameters_of_another_machine(asked: dict[str, Any], weights: Path) -> None:
+    """The chosen scan stands for the time or goal that it was chosen by."""
+    given = load_settings(None, {"scene": "farm", "size": "640x512", **asked})
+    planned = replace(given, scan_step=2, scan_exposure_ms=6.0)
+    there = SurveySettings(**SurveySettings.planned(planned).model_dump(exclude_none=True)).settings()
+    assert (there.scan_step, there.scan_exposure_ms, there.kept_bytes) == (2, 6.0, planned.kept_bytes)
+
+
+def test_a_stated_default_is_the_default() -> None:
+    """prior = auto, stated or not, leaves the extent as it is."""
+    asked = {"scene": "farm", "seconds": 5}
+    assert load_settings(None, asked) == load_settings(None, {**asked, "prior": "auto"})
+    assert load_settings(None, {**asked, "prior": "latest"}).extent == "part"

@@ -125,6 +125,12 @@ def test_the_prior_map_is_the_last_before_the_visit_or_the_one_named(
         found_prior(twice[0], visit, "nobody")
 
 
+def test_a_date_alone_is_a_day_and_not_its_midnight(twice: tuple[Path, Any, Any]) -> None:
+    """A visit that is named by a date goes on from an earlier one of that day, whatever its time."""
+    day = str(twice[2].receipt["settings"]["visit"])[:10]
+    assert found_prior(twice[0], day, "latest") == (twice[2].folder.name, 0.0)
+
+
 def found_prior(out: Path, visit: str, prior: str) -> tuple[str, float] | None:
     """Name and days of the run that a visit to north goes on from."""
     settings = load_settings(None, {"prior": prior, "visit": visit})

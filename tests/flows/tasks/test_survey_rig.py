@@ -194,6 +194,8 @@ def test_visits_are_captured_and_broken_ones_gone_on_with(tmp_path: Path, monkey
         assert coarse_captures(rig) == 3
         run_survey(replace(settings, rig=replace(settings.rig, mirror_axes="-x,-y")), QUIET)  # mounted otherwise
         assert coarse_captures(rig) == 4
+        white = replace(settings, rig=replace(settings.rig, white_reference=0.5))  # another calibration
+        assert run_survey(white, QUIET).receipt["products"]["mosaic"] != published.receipt["products"]["mosaic"]
     assert {finding.kind for finding in verify_archive(Archive.open(tmp_path))} == {"whole"}
 
 
