@@ -98,9 +98,12 @@ def test_lines_that_another_run_keeps_stay(archive: Archive, survey_png: Survey)
 
 @pytest.mark.usefixtures("no_effects", "later")
 def test_lines_that_no_run_keeps_go_with_the_next_survey(archive: Archive, survey_png: Survey) -> None:
-    """It finds the lines of a run whose week is over."""
+    """It finds the lines of a run whose week is over; one that keeps them captures them again."""
+    there = raw_uris(archive)
     survey_png(archive.root, keep="signal", accuracy=False)
     assert raw_uris(archive) == set()
+    survey_png(archive.root, keep="raw", accuracy=False)
+    assert raw_uris(archive) == there
 
 
 @pytest.mark.usefixtures("no_effects")
