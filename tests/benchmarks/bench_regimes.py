@@ -43,14 +43,14 @@ from pipeline.simulator.scenes.farm.land import smooth_noise, stream
 from pipeline.simulator.scenes.scene import Drawn, RasterScene, SceneRaster
 
 SEEDS, SIZE = (61, 62, 63), "640x512"
-LIGHTS, SHARES, SWATHS = (1.0, 0.25, 0.0625), (1.0, 0.25, 0.0625), 8
+LIGHTS, SHARES, SWATHS = (1.0, 0.25), (1.0, 0.25, 0.0625), 8
 EXPOSURES_MS = (1.25, 2.5, 5.0)  # of every line in full light, by which seconds are stated
 LINES, SETUP_S = 515, 2.0  # of one swath of the full scan
 WAYS, PLANNER = ("never", "always", "ideal"), "auto"
 UNSEEN = (71, 72, 73)
 OTHER = (  # light, share of interest, swaths, seconds, farms
     *((1.0, share, 8, 27.3, UNSEEN) for share in (1 / 16, 1.0)),
-    *((1 / 16, share, 8, 181.8, UNSEEN) for share in (1 / 16, 1 / 4, 1.0)),
+    *((1 / 16, share, 8, 181.8, farms) for share in (1 / 16, 1 / 4, 1.0) for farms in (SEEDS, UNSEEN)),
     *((1.0, 1 / 4, 8, seconds, (64, 65, 66)) for seconds in (21.0, 27.3)),
     *((1.0, share, 8, 58.0, SEEDS) for share in (1 / 16, 1.0)),
     *((light, share, 4, seconds, SEEDS) for light, seconds in ((1.0, 14.2), (1 / 16, 91.4)) for share in (1 / 16, 1.0)),
@@ -190,7 +190,7 @@ def print_other() -> None:
 def draw(measured: Sequence[Cell], picture: Path) -> None:
     """Draw the gain over the best uniform scan, for each way, light, seconds, share and field."""
     ways = {PLANNER: "planner", "always": "zoomed", "ideal": "known place"}
-    figure = Figure((10, 3.8), dpi=150, layout="constrained")
+    figure = Figure((10, 3), dpi=150, layout="constrained")
     shares, lights = ([str(Fraction(one)) for one in each] for each in (SHARES, LIGHTS))
     budgets = [f"{light}, {exposure_ms:g} ms" for light, exposure_ms in itertools.product(lights, EXPOSURES_MS)]
     panels = figure.subplots(1, len(ways), sharey=True)
