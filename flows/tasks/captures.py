@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from flows.settings.parameters import SurveySettings, at_due_time
 from flows.settings.survey_settings import RIG, Settings
-from flows.settings.values import KEEP_SIGNAL
+from flows.settings.values import KEEP_RAW
 from flows.tasks.open_survey import OpenSurvey, RunRef
 from flows.tasks.prefect_tasks import as_task, current_observer, inside_flow
 from flows.tasks.run import SurveyRun, open_run
@@ -120,7 +120,7 @@ def captured_signal(plan: OpenSurvey, sweeps: str, *inputs: StageRef) -> StageRe
             capture_pass(plan, "coarse", inputs[-1])
         return condense(plan, capture_pass(plan, sweeps, *inputs), *before)
     settings = plan.run.settings
-    if settings.keep != KEEP_SIGNAL and settings.source != RIG and archive.find(raw.stage, raw.key) is None:
+    if settings.keep == KEEP_RAW and settings.source != RIG and archive.find(raw.stage, raw.key) is None:
         capture_pass(plan, sweeps, *inputs)  # an earlier run deleted the raw lines that this one keeps
     elif archive.is_known(raw):
         plan.take_as_found(stage.name, raw, *inputs)
