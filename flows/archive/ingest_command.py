@@ -20,8 +20,7 @@ from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.archive.staging import check_name, file_hash
 from storage.readers.cube_sources import CubeSource
-from storage.readers.image_files import IMAGE_ENDINGS
-from storage.readers.open_cubes import open_cube, with_wavelengths
+from storage.readers.open_cubes import open_cube, reader_of, with_wavelengths
 from storage.readers.recorded_files import find_pointing
 from storage.readers.scene_files import with_stated_values
 from storage.readers.zarr_files import Report, SourceFile, write_ingested_cube
@@ -121,7 +120,7 @@ def hash_files(source: CubeSource, report: Report = lambda done: None) -> list[S
 def _next(record: Mapping[str, Any], source: str) -> str:
     """Return the command that surveys the cube: a camera's numbers as a recording, images and maps as a scene."""
     words, path = ["spectralzoom", "survey"], Path(source)
-    image = record["georeferenced"] or path.suffix.lower() in IMAGE_ENDINGS
+    image = record["georeferenced"] or reader_of(source) in ("image", "array")
     if not image and record["source_dtype"].lstrip("<>=|") in ("u1", "u2", "i2"):
         table = find_pointing(path.parent, path.name.removesuffix(path.suffix))
         words += ["--source", "recorded", "--sweeps", record["path"]]

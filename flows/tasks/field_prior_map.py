@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from flows.tasks.field_work import coarse_region
 from flows.tasks.prior_maps import EarlierRun
@@ -74,7 +74,7 @@ def laid_together(images: Iterable[NDArray[np.float32]]) -> NDArray[np.float32]:
     return whole
 
 
-def shifted(image: NDArray[np.float32], by: tuple[int, int]) -> NDArray[np.float32]:
+def shifted(image: NDArray[np.float32], by: Sequence[int]) -> NDArray[np.float32]:
     """Return an image (y, x, ...) shifted down and right, with NaN at its edges."""
     parts = [_moved(slice(0, size), one, size) for size, one in zip(image.shape, by, strict=False)]
     return _framed(image[parts[0][0], parts[1][0]], (parts[0][1], parts[1][1]))
@@ -86,7 +86,8 @@ def prior_map_lies(before: Sequence[EarlierRun], now: Path) -> FieldShift:
     def picture(mosaic: Path) -> NDArray[np.float32]:
         return open_mosaic(mosaic).brightness(CELL_PX)
 
-    pictures = (shifted(picture(one.mosaic.path / "mosaic.zarr"), _cells(one.shift_px)) for one in before)
+    shifts = ([round(by / CELL_PX) for by in one.shift_px] for one in before)
+    pictures = (shifted(picture(one.mosaic.path / "mosaic.zarr"), by) for one, by in zip(before, shifts, strict=True))
     found = field_shift(picture(now), laid_together(pictures), reach_px=REACH_PX / CELL_PX)
     return replace(found, shift=(CELL_PX * found.shift[0], CELL_PX * found.shift[1]))
 
@@ -95,12 +96,6 @@ def whole_pixels(lies: FieldShift) -> tuple[int, int]:
     """Return the shift of a prior map in rows and columns; 0 within the accuracy of the registration."""
     down, across = lies.shift
     return (0, 0) if math.hypot(down, across) < LEAST_SHIFT_PX else (round(down), round(across))
-
-
-def _cells(shift_px: ArrayLike) -> tuple[int, int]:
-    """Return the nearest shift in cells to one in px."""
-    down, across = np.rint(np.divide(shift_px, CELL_PX)).astype(int).tolist()
-    return down, across
 
 
 def _moved(part: slice, by: int, size: int) -> tuple[slice, Gap]:

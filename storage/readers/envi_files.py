@@ -142,13 +142,15 @@ def open_envi_source(path: Path, *, scaled: bool = True) -> CubeSource:
     source = _joined(cube.path.name, {0: cube}, list(cube.notes))
     geobox, where = place_of_envi(cube.header.fields, cube.path, source.shape[:2])
     source = replace(source, geobox=geobox, notes=(*source.notes, *where))
+    if not scaled:
+        return source
     fields, bands = cube.header.fields, source.shape[2]
     factor = finite_number(fields.get("reflectance scale factor", "")) or 0.0
     gain, offset = _numbers(fields, "data gain values", bands, 1.0), _numbers(fields, "data offset values", bands, 0.0)
     if factor > 0:
         gain, offset = np.full(bands, 1 / factor), np.zeros(bands)
     plain = (gain == 1).all() and not offset.any()
-    return source if plain or not scaled else rescaled(source, gain, offset, source.nodata)
+    return source if plain else rescaled(source, gain, offset, source.nodata)
 
 
 def _numbers(fields: Mapping[str, str], name: str, count: int, default: float) -> NDArray[np.float64]:

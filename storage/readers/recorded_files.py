@@ -110,7 +110,8 @@ def with_bits(
         most = max(int(cube.source.read(int(line), int(line) + 1).max()) for line in chosen)
         file = reference_files(cube.folder / cube.name, stated)["white"]
         white = cube.source.white if file is None else load_frame(file)[0]
-        most = most if white is None else max(most, int(np.nanmax(white)))
+        if white is not None:
+            most = max(most, int(white[np.isfinite(white)].max(initial=0)))
         full = camera.full_scale_dn * max(camera.samples // cube.source.shape[1], 1)
         needed = (most * camera.full_scale_dn // full).bit_length()
         if most > full and needed > bits:
