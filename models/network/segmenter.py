@@ -110,15 +110,12 @@ def joined(patches: Tensor, columns: int) -> Tensor:
     return cells.reshape(b, c, n // columns * p, columns * p)
 
 
-def mean_around(image: Tensor, axis: int) -> Tensor:
-    """Return means of up to ``AROUND_PX`` neighbours along an axis; a pooling layer takes three times as long."""
-    size, reach = image.shape[axis], AROUND_PX // 2
-    found, count = torch.zeros_like(image), image.new_zeros(size)
-    for off in range(max(-reach, 1 - size), min(reach, size - 1) + 1):
-        to, length = max(0, -off), size - abs(off)
-        found.narrow(axis, to, length).add_(image.narrow(axis, max(0, off), length))
-        count[to : to + length] += 1
-    return found / count.reshape(-1, *[1] * (3 - axis))
+def mean_around(image: Tensor) -> Tensor:
+    """Return means of up to ``AROUND_PX`` x ``AROUND_PX`` neighbours of each pixel, (B, c, y, x)."""
+    reach = AROUND_PX // 2
+    for size, padding in (((AROUND_PX, 1), (reach, 0)), ((1, AROUND_PX), (0, reach))):  # faster than both at once
+        image = F.avg_pool2d(image, size, 1, padding, count_include_pad=False)
+    return image
 
 
 class ChannelNorm(nn.Module):
@@ -259,7 +256,7 @@ class Segmenter(nn.Module):
         drawn = self.overview_head(features)[:, :, :height, :width]
         columns = image[:, : self.config.columns].permute(0, 2, 3, 1)
         alone = F.linear(columns, self.spectral.weight.flatten(1), self.spectral.bias).permute(0, 3, 1, 2)
-        alone = mean_around(mean_around(alone, 2), 3)  # the logits' mean is that of the mean spectrum
+        alone = mean_around(alone)  # the logits' mean is that of the mean spectrum
         logits = self.overview_classes(F.gelu(drawn)) + alone[:, :, :height, :width]
         return Overview(drawn, logits)
 
