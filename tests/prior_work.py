@@ -83,7 +83,7 @@ def _kind_of(panels: QuicklookData) -> object:
 def without_effects() -> Iterator[None]:
     """Surveys look at no scene and simulate no effect but those that their settings name, in any of their variants."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(effect_choice, "probe_survey", lambda scene, rig, planned, unit: _any_probes(unit))
+        patch.setattr(effect_choice, "probe_survey", lambda scene, rig, planned, unit, cost: _any_probes(unit))
         patch.setattr(
             effect_choice,
             "decide",

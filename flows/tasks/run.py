@@ -81,6 +81,7 @@ else:
 
 
 PRIOR_MAP_GAIN = 3.0  # least gain with a prior map over that without one: losses are then alike (prior-maps.md)
+REPRESENTATIVE = 3  # exposures of a second pass, for which effects are chosen
 USUAL_COMPONENTS = 32  # of condensed lines, before they are computed
 
 
@@ -115,7 +116,7 @@ class CaptureRun:
     source: FieldSource
     simulated: SimulatedSource  # without effects; for a rig, a model of its sizes, paths and memory
     scene: RasterScene
-    planned: tuple[Sweep, ...]  # the coarse pass and the full scan, which represent all sweeps
+    planned: tuple[Sweep, ...]  # they represent all sweeps of the capture
     report: Report = field(default=lambda done: None)
 
     @property
@@ -408,7 +409,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
         source=source,
         simulated=simulated,
         scene=scene,
-        planned=(*plan.coarse, *plan.full),
+        planned=_representative_sweeps(plan, settings, scene, described),
         described=described,
         load=model.load,
         grid=grid,
@@ -425,6 +426,19 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
         notes=(*notes, *zones.notes, *planned.notes, *prior_notes, *outside, *label_notes),
         refused=refused,
     )
+
+
+def _representative_sweeps(
+    plan: CapturePlan, settings: Settings, scene: RasterScene, described: Description
+) -> tuple[Sweep, ...]:
+    """Return the sweeps of a uniform scan, or of a first pass and full scans of exposures that a second may have."""
+    if plan.plain:
+        return tuple(plan.coarse)
+    record, exposures = described.record.get("scans"), [None]
+    if record is not None and plan.by_record:
+        ends = ScanPerformance.read(record, scene.light_fraction).offered_ms(settings.camera)
+        exposures = np.geomspace(*ends, REPRESENTATIVE).tolist()
+    return (*plan.coarse, *(replace(sweep, exposure_ms=ms) for ms in exposures for sweep in plan.full))
 
 
 def _open_source(

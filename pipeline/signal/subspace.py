@@ -269,13 +269,16 @@ def _covariance(products: Floats, total: Floats, count: int) -> tuple[Floats, Fl
 def _noise(found: SignalStatistics, covariance: Floats, lit: NDArray[np.intp], mean: Floats) -> Floats:
     """Return a first estimate of the noise's standard deviation, (band,): unpredicted by other bands or neighbours."""
     variance = np.diag(covariance)
-    floor = LEAST_NOISE * np.maximum(np.sqrt(variance), np.abs(mean)).max(initial=0.0) or 1.0
+    floor = LEAST_NOISE * np.maximum(np.sqrt(variance), np.abs(mean))
+    floor = np.where(floor > 0, floor, floor.min(where=floor > 0, initial=1.0))
     if len(lit) <= FEW_BANDS:
         rough = np.concatenate(found.rough)[:, lit] if found.rough else np.zeros((0, len(lit)))
         sigma = SIGMA_OF_MEDIAN * np.median(np.abs(rough), axis=0) / 6 if len(rough) else np.sqrt(variance)
     elif found.count >= 4 * len(lit):
+        scale = np.sqrt(np.where(variance > 0, variance, 1.0))  # bands may be in different units
         with np.errstate(divide="ignore"):
-            sigma = 1 / np.sqrt(np.abs(np.diag(np.linalg.pinv(covariance, hermitian=True))))
+            correlation = covariance / scale[:, None] / scale
+            sigma = scale / np.sqrt(np.abs(np.diag(np.linalg.pinv(correlation, hermitian=True))))
     else:
         sigma = np.array([_unpredicted(covariance, band) for band in range(len(lit))])
     sigma = np.minimum(np.where(np.isfinite(sigma), sigma, 0), np.sqrt(np.maximum(variance, 0)))

@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
@@ -53,12 +54,19 @@ def read_out(light: Radiance, block: SweepBlock, chosen: Mapping[Any, str] | Cho
 
 
 def dark_frame(block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> Radiance:
-    """Return what the chosen readout shows without light, on average, (sample, band) float32, before rounding. [DN]"""
+    """Return what the chosen readout shows without light, on average, (sample, band) float32, before rounding. [DN]
+
+    Numbers below 0 become 0, so that the mean is above a dark level that noise reaches down from.
+    """
     readout, camera = Readout(block, Choice.of(chosen)), block.rig.camera
     dark = np.zeros((camera.samples, len(block.wavelength_nm)), np.float32)
     dark += readout.added
     dark /= np.float32(camera.electrons_per_dn)
     dark += np.float32(camera.dark_dn)
+    if readout.read_noise_e:
+        sd = np.sqrt(readout.read_noise_e**2 + readout.added) / camera.electrons_per_dn
+        bell = np.exp(-((dark / sd) ** 2) / 2) / math.sqrt(math.tau)
+        dark = (dark * scipy.special.ndtr(dark / sd) + sd * bell).astype(np.float32)
     return np.minimum(dark, np.float32(camera.full_scale_dn), out=dark)
 
 

@@ -29,8 +29,8 @@ class Optics:
 
     aperture_mm: float = stated(15.0, "Diameter of the mirror, the aperture stop", "mm", 0.1, 1e3, source="data sheet")
     focus_m: float = assumed(math.inf, "Distance that is sharp", "m", 0.01)
-    aberration_px: float = assumed(0.2, "Standard deviation of the lens's own blur", "px", 0.0, 1e3)
-    keystone_px: float = assumed(0.15, "Shift along the line, first wavelength to last", "px", 0.0, 1e3)
+    aberration_px: float = assumed(0.2, "Standard deviation of the lens's own blur", "px", 0.0, 10.0)
+    keystone_px: float = assumed(0.15, "Shift along the line, first wavelength to last", "px", 0.0, 20.0)
     smile_nm: float = assumed(0.3, "Excess of the wavelengths at a line's ends", "nm", -100.0, 100.0)
     fwhm_nm: float = stated(6.0, "Width of a band", "nm", 0.0, 1e3, source="data sheet")
     stray_fraction: float = assumed(1e-3, "Fraction of a line's light that is spread over its detector", "", 0.0, 0.5)

@@ -1,7 +1,6 @@
 """Define the stage that chooses the simulated effects: it probes the scene and decides.
 
-Its store is a table of simulated and omitted effects, with reasons. Captures depend on it. The coarse pass and the full
-scan represent all sweeps.
+Its store is a table of simulated and omitted effects, with reasons. Captures depend on it.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from flows.settings.values import Tolerance
 from flows.tasks.scene import FieldSource
 from flows.tasks.stage import Product, Report, Wanted, stage
 from pipeline.errors import IncompleteStoreError
-from pipeline.geometry.scan import Sweep
+from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.simulator.effects.effect import Effect
 from pipeline.simulator.render import BY_NAME, EFFECTS
 from pipeline.simulator.rig_model import OF_THE_SCENE, Rig
@@ -28,7 +27,7 @@ from storage.archive.manifests import read_table
 from storage.archive.whole_files import to_json
 
 RECORD = "effects.json"
-MANIFEST = Product("effects", version=11, files=(RECORD,))
+MANIFEST = Product("effects", version=12, files=(RECORD,))
 
 
 @stage("choose_effects", "choice of effects", MANIFEST)
@@ -38,6 +37,7 @@ def choose_effects(
     scene: RasterScene,
     simulated_rig: Rig,
     planned: Sequence[Sweep],
+    cost: CostModel,
     seed: int,
     effects: str,
     tol: Tolerance,
@@ -56,7 +56,7 @@ def choose_effects(
 
     def build(path: Path) -> None:
         """Probe the scene and choose effects."""
-        probes = probe_survey(scene, simulated_rig, planned, tol.unit)
+        probes = probe_survey(scene, simulated_rig, planned, tol.unit, cost)
         decision = decide(probes, simulated_rig, EFFECTS, tol.value, effects)
         write(path, {"effects": list_effects(decision), "total": sum_up(decision)})
         report(1.0)
@@ -69,6 +69,7 @@ def choose_effects(
         "camera": asdict(simulated_rig.camera),
         "rig": {name: plain_value(part) for name, part in _parts(simulated_rig).items() if name != "camera"},
         "sweeps": [asdict(sweep) for sweep in planned],
+        "cost": asdict(cost),
     }
     return Wanted(build, params)
 

@@ -103,6 +103,8 @@ def _options_of(probe: Probe, rig: Rig, effects: Sequence[Effect]) -> list[Menu]
         arriving = probe
         if hasattr(effect, "change") or hasattr(effect, "gain"):
             arriving = light_after(probe, rig, [one for one in ranges[:place] if one is not None], blurred)
+        elif not acts_on_light(effect):
+            arriving = light_read(probe, rig, [one for one in ranges if one is not None])
         growth = 1.0
         if acts_on_light(effect):
             beside = ranges[:place] + ranges[place + 1 :]
@@ -188,4 +190,20 @@ def light_after(probe: Probe, rig: Rig, gains: Iterable[GainRange], blurred: flo
         brightest_e=probe.brightest_e + float(added.max(initial=0.0)),
         darkest_e=probe.darkest_e * max(1 - uneven, 0.0),
         unit_least_dn=probe.unit_least_dn / ratio,
+    )
+
+
+def light_read(probe: Probe, rig: Rig, gains: Sequence[GainRange]) -> Probe:
+    """Return the probe of light after all gains, which the readout gets: the darkest and the brightest that they make.
+
+    Each sample is counted by the greatest product of the gains, or by the least.
+    """
+    least = math.prod(float(np.minimum(one.least, 1.0).min(initial=1.0)) for one in gains)
+    greatest = math.prod(float(np.maximum(one.greatest, 1.0).max(initial=1.0)) for one in gains)
+    after = light_after(probe, rig, gains)
+    return replace(
+        after,
+        level=after.level * error_growth(probe, rig, None, greatest),
+        brightest_e=after.brightest_e * greatest,
+        darkest_e=probe.darkest_e * least,
     )

@@ -55,10 +55,16 @@ def _shifts() -> list[tuple[Way, Way]]:
 SHIFTS = tuple(_shifts())  # of rays and of points; derivatives are differences between them
 
 
-def probe_survey(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "sigma") -> tuple[Probe, ...]:
+def probe_survey(
+    scene: RasterScene,
+    rig: Rig,
+    sweeps: Sequence[Sweep],
+    unit: Unit = "sigma",
+    cost: CostModel = CostModel(),  # noqa: B008 - a value
+) -> tuple[Probe, ...]:
     """Return a probe for each pair of binning and exposure of the sweeps, the smallest binning first.
 
-    They have time and lines in common.
+    They have time and lines in common. ``cost`` says how long slewing, setting up and reloading take.
 
     Raises SceneError, SettingsError, PoseError as `probe_scene`.
     """
@@ -67,7 +73,7 @@ def probe_survey(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Un
     for sweep in taken:
         alike.setdefault((sweep.binning, exposing(rig.camera, sweep).exposure_ms), []).append(sweep)
     probes = [probe_scene(scene, rig, some, unit) for _, some in sorted(alike.items())]
-    lines, seconds = sum(one.lines for one in probes), CostModel().seconds(list(taken), rig.camera)
+    lines, seconds = sum(one.lines for one in probes), cost.seconds(list(taken), rig.camera)
     return tuple(replace(one, lines=lines, seconds=seconds) for one in probes)
 
 

@@ -158,6 +158,7 @@ def test_amounts_have_units():
         ({"size": "64x64", "scene": "a.png"}, "has its own"),
         ({"camera": 3}, "must be a table"),
         ({"camera": {"dark_dn": 5000}}, "leaves no room"),
+        ({"detector": {"full_well_e": 5000}}, "full pixels would count as valid"),
         ({"out": " "}, "text that is not empty"),
         ({"pose": {"lat_deg": 52.1, "tilt_deg": 40}}, r"\[pose\] lacks lon_deg, heading_deg; give every one"),
         ({"pose": POSE | {"range_m": 20}}, r"\[pose\]: .* height_m or range_m, one of the two; got height_m = 12"),
@@ -257,7 +258,7 @@ def test_receipt_settings_read_back_the_same(budget, seed, bands, memory, exposu
         tol=tolerance,
         sky=Sky(started=datetime(2026, 6, 1, 10, tzinfo=UTC) if posed else None, cloud_fraction=budget),
         air=Air(distance_m=exposure if posed else None),
-        detector=Detector(full_well_e=exposure + 1),
+        detector=Detector(full_well_e=1e6 + exposure),
     )
     assert parse_settings(settings.to_dict()) == settings
     assert parse_settings(json.loads(to_json(settings.to_dict()))) == settings

@@ -298,6 +298,8 @@ def test_two_passes_are_taken_on_wide_fields_in_short_times(tmp_path: Path, flag
     """The settings of the run say which way was taken, and no limit of a uniform scan is dropped."""
     run = planned(tmp_path, **flags)
     assert (run.settings.zoom, run.plan.plain) == ("always" if zooms else "never", not zooms)
+    exposures = {sweep.exposure_ms for sweep in run.planned}  # for which simulated effects are chosen
+    assert (len(exposures) >= 3) if zooms else (run.planned == tuple(run.plan.coarse))
     assert (run.scans.chosen is None) == zooms
     assert any(note.startswith("two passes: every 4th line") for note in run.notes) == zooms
 

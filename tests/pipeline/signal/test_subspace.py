@@ -140,6 +140,13 @@ def test_noise_is_estimated_in_every_band(seed: int, bands: int, materials: int,
     np.testing.assert_allclose(find_components(statistics_of(made.values)).noise, made.noise, rtol=within)
 
 
+def test_noise_is_estimated_in_bands_of_different_units() -> None:
+    """One band counts in millionths of the others' unit."""
+    made, scale = field_of(8, (128, 128), 20, 3), np.where(np.arange(20) == 4, 1e7, 1.0)
+    noise = find_components(statistics_of((made.values * scale).astype(np.float32))).noise
+    np.testing.assert_allclose(noise / scale, made.noise, rtol=0.05)
+
+
 def test_pixels_without_data_say_nothing_of_the_noise_of_few_bands() -> None:
     """More than half of the field is missing, and the noise of four bands is that of the rest."""
     made = field_of(0, (128, 128), 4, 1)

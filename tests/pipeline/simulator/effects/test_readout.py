@@ -113,15 +113,16 @@ def test_dead_and_hot_elements() -> None:
     np.testing.assert_array_equal(raw, 64 + 4 + 1000 * ~dead + 1000 * hot)
 
 
-def test_the_mean_dark_frame_is_that_of_many_lines() -> None:
-    """What a cap on the lens would show: dark level, dark current, hot elements up to full scale."""
-    rig = Rig(camera=LineCamera(exposure_ms=500.0), detector=Detector(hot_fraction=0.01, dead_fraction=0.01))
+@pytest.mark.parametrize(("dark_dn", "exposure_ms"), [(64.0, 500.0), (0.0, 500.0), (2.0, 20.0)])
+def test_the_mean_dark_frame_is_that_of_many_lines(dark_dn: float, exposure_ms: float) -> None:
+    """What a cap on the lens would show: dark level, dark current, hot elements up to full scale, nothing below 0."""
+    rig = Rig(camera=LineCamera(exposure_ms=exposure_ms, dark_dn=dark_dn), detector=Detector(hot_fraction=0.01, dead_fraction=0.01))
     block = block_of(rig, range(64))
     mean = read_out(np.zeros((64, 640, BANDS), np.float32), block, ALL_EXACT).mean(axis=0)
     expected = dark_frame(block, ALL_EXACT)
-    assert expected.max() == 4095
+    assert (expected.max() == 4095) == (exposure_ms == 500)
     fine = expected < 4000
-    sd = np.sqrt((expected - 64) * 5 + 400) / 5 / 8
+    sd = np.sqrt((expected - dark_dn) * 5 + 400) / 5 / 8
     assert np.abs((mean - expected) / sd)[fine].max() < 5.5
 
 

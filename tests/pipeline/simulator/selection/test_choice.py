@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import SettingsError
+from pipeline.simulator.effects.counting import READ_NOISE
 from pipeline.simulator.effects.lighting import CLOUD
 from pipeline.simulator.rig_model import Rig, Sky
 from pipeline.simulator.selection.choice import Decision, decide, list_effects, named_effects, sum_up
@@ -149,14 +150,14 @@ def test_worked_by_hand(effects: list[MadeUp], tolerance: float, asked: str, wan
 
 
 def test_gains_multiply_the_errors_of_others_but_not_their_own():
-    """Light that is brightened by a quarter carries a shift's error a quarter higher; a unit of DN follows no light."""
+    """Light that is brightened by a quarter carries errors a quarter higher, also to the readout; DN follow no light."""
     effects = [
         MadeUp("read", 0.1),
         Brightening("vignetting", 0.25, fraction=0.25),
         Brightening("cloud", 0.5, fraction=-0.5),
     ]
     errors = [menu.off.error for menu in list_options(replace(PROBE, unit="dn"), RIG, effects)]
-    assert errors == pytest.approx([0.1 * SAFETY, 0.25 * 1.5 * SAFETY, 0.5 * 1.25 * SAFETY])
+    assert errors == pytest.approx([0.1 * 1.875 * SAFETY, 0.25 * 1.5 * SAFETY, 0.5 * 1.25 * SAFETY])
 
 
 def test_of_several_binnings_the_worst_counts():
@@ -184,10 +185,19 @@ def test_a_gain_that_only_darkens_does_not_multiply_errors():
 
 @pytest.mark.parametrize("name", ["rotation", "slit", "smear"])
 def test_later_gains_multiply_errors_of_what_the_renderer_does(name: str):
-    """Lines that are not turned, seen in 1.5 times the light, err by 1.5 times; noise that is read out does not."""
+    """Lines that are not turned, seen in 1.5 times the light, err by 1.5 times; so does a readout of that light."""
     effects = [MadeUp(name, 0.1), MadeUp("read", 0.1), Brightening("drift", 0.5, fraction=0.5)]
     errors = [menu.off.error for menu in list_options(replace(PROBE, unit="dn"), RIG, effects)]
-    assert errors[:2] == pytest.approx([0.15 * SAFETY, 0.1 * SAFETY])
+    assert errors[:2] == pytest.approx([0.15 * SAFETY, 0.15 * SAFETY])
+
+
+def test_the_readout_is_bounded_in_the_light_that_it_gets():
+    """Under a cloud that takes all light read noise is all noise, and its bound that of darkness."""
+    probe, rig = even_probe(brightest_e=1e4, darkest_e=1e4), Rig(sky=Sky(cloud_fraction=1.0))
+    found = {menu.name: menu.off.error for menu in list_options(probe, rig, [READ_NOISE, CLOUD])}
+    dark = READ_NOISE.bound(replace(probe, darkest_e=0.0), rig).value
+    assert found["read-noise"] == pytest.approx(SAFETY * dark)
+    assert dark > 10 * READ_NOISE.bound(probe, rig).value
 
 
 def test_even_scene_shows_no_geometry_but_the_rig_has_it():

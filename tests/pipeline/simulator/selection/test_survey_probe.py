@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Sweep
+from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT
@@ -177,6 +177,13 @@ def test_a_survey_has_a_probe_for_each_exposure() -> None:
     assert dim["lag"].off.error > 0
     assert "in 5 ms" in dim["dark-current"].off.why
     assert "in 100 ms" in whole["dark-current"].off.why
+
+
+def test_a_survey_lasts_as_long_as_its_mirror_and_camera_take() -> None:
+    """Drifts are bounded over the whole survey, slow set-ups included."""
+    slow, sweeps = CostModel(slew_s=10, reload_s=60), [replace(SWEEP, name=name) for name in "ab"]
+    (probe,) = probe_survey(mixed(4), RIG, sweeps, "sigma", slow)
+    assert probe.seconds == slow.seconds(sweeps, RIG.camera) > CostModel().seconds(sweeps, RIG.camera) + 60
 
 
 def test_probe_of_a_noiseless_rig_is_finite() -> None:
