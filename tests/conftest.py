@@ -25,7 +25,7 @@ from models.network.segmenter import Segmenter
 from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
 from models.weights.files import Weights, save_weights, with_record
-from storage.readers.labels import default_colour
+from storage.readers.labels import DEFAULT_COLOURS
 from tests.object_server import bucket, machine, s3_server  # noqa: F401 - fixtures
 from tests.prior_work import remember, with_effects, without_effects
 from tests.zarr_at_once import close_loops, work_at_once
@@ -79,7 +79,7 @@ def random_weights(wavelength_nm: tuple[float, ...], names: tuple[str, ...] = CL
             torch.nn.init.zeros_(last.bias)
     one = np.ones(basis.columns, np.float32)
     normalisation = Normalisation(110 * one, 40 * one, np.eye(basis.columns, dtype=np.float32))
-    colours = np.array([default_colour(number) for number in range(len(names))], np.uint8)
+    colours = np.array([DEFAULT_COLOURS[number] for number in range(len(names))], np.uint8)
     return Weights(model, basis, normalisation, names, colours, {"seed": 5})
 
 

@@ -47,7 +47,6 @@ else:
 
 CELL_M = 3.0  # default of a prescription, if pixels are smaller
 MOST_CELLS = 4_000_000
-DEGREE_M = 111_320.0  # of latitude
 WITHIN = (0.01, 0.5, 0.99)  # places in a pixel, down and across, whose cells get its dose
 PIXELS_AT_ONCE = 1_000_000
 WGS84 = "EPSG:4326"
@@ -138,7 +137,8 @@ def _write_prescription(run: ExportedRun, raster: ClassRaster, folder: Path, cho
     text = ", ".join(f"{name} {one:g} {unit.name}" for name, one in choice.doses.items())
     write_polygons(path, outlines, columns, str(plane), layer="prescription", when=run.receipt["finished"])
     add("prescription", path, f"Prescription ({text}) in cells of {cell_m:g} m", GEOPACKAGE, ["data"])
-    metres = DEGREE_M, DEGREE_M * float(np.cos(np.deg2rad((south + north) / 2)))
+    middle, length = (south + north) / 2, pyproj.Geod(ellps="WGS84").line_length
+    metres = length([west, west], [middle - 0.5, middle + 0.5]), length([west - 0.5, west + 0.5], [middle, middle])
     down, across = (round(cell_m / one, DEGREE_DIGITS) for one in metres)
     cells = GeoBox.from_bbox((west, south, east, north), crs=WGS84, resolution=resxy_(across, -down))
     box = cells.boundingbox

@@ -3,6 +3,7 @@
 No ``from __future__ import annotations`` here: Prefect reads the signatures.
 """
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +31,14 @@ def reprocess(archive: str, field: str | None = None, weights: str | None = None
     return f"some fields failed: {'; '.join(refused)}" if refused else "done"
 
 
-def deployment(archive: str, number: int = 1) -> Any:
-    """Return a deployment of the flow for one archive, run on request, one at a time."""
+def deployment(archive: str, number: int = 1, *, shared: bool = False) -> Any:
+    """Return a deployment of the flow for one archive, run on request, one at a time.
+
+    It is named ``archive``, or by the archive's address on a ``shared`` server.
+    """
+    address = re.sub(r"[^A-Za-z0-9_.-]+", "-", archive).strip("-.")
     return reprocess.to_deployment(
-        "archive" if number == 1 else f"archive-{number}",
+        address if shared else "archive" if number == 1 else f"archive-{number}",
         parameters={"archive": archive},
         concurrency_limit=ConcurrencyLimitConfig(limit=1, collision_strategy=ConcurrencyLimitStrategy.CANCEL_NEW),
         description=f"Surveys of {archive} again, with newer weights or stages; on request.",

@@ -23,13 +23,14 @@ from prefect.client.orchestration import get_client
 from prefect.client.schemas import filters
 from prefect.client.schemas.objects import ConcurrencyLimitConfig, ConcurrencyLimitStrategy, StateType
 from prefect.client.schemas.schedules import CronSchedule, IntervalSchedule
+from prefect.exceptions import ObjectNotFound
 from prefect.runner import Runner
 from prefect.states import Cancelled, Crashed
 from prefect.types.entrypoint import EntrypointType
 from pydantic import ValidationError
 from rich.markup import escape
 
-from flows.archive.reprocess_flow import deployment
+from flows.archive.reprocess_flow import deployment, reprocess
 from flows.cli.app import stderr
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
@@ -91,6 +92,7 @@ def serve(
                         f"another serve uses the archive {name}; give all its fields to that one, or stop it"
                     )
                 held.callback(release)
+            shared = "PREFECT_API_URL" in os.environ
             pages = _start_server(home, port, held)
             # Prefect's runner keeps the code that it starts in /tmp/runner_storage, which its first user could replace
             tempfile.tempdir = held.enter_context(
@@ -99,7 +101,7 @@ def serve(
             held.callback(setattr, tempfile, "tempdir", None)
             _say(f"serving {', '.join(one.name for one in served)}, {cron or f'every {every}'}; Ctrl-C stops it")
             _say(f"Prefect's pages: {pages}")
-            _serve(served, schedule, limit or len(served) + 1)
+            _serve(served, schedule, limit or len(served) + 1, shared=shared)
     except KeyboardInterrupt:
         _say("stopped: no run starts from now on; the same command serves again")
     return DONE
@@ -170,6 +172,8 @@ def schedule_of(cron: str | None, every: timedelta | None, timezone: str | None 
         got = "neither" if cron is None else "both"
         raise SettingsError(f"a schedule needs --cron or --every, got {got}; such as --every 30m or --cron '0 6 * * *'")
     try:
+        if every is not None and timezone is not None:
+            raise SettingsError("--timezone is that of --cron, and --every counts from midnight UTC; leave one out")
         if every is not None:
             return IntervalSchedule(interval=every, anchor_date=EPOCH, timezone="UTC")
         return CronSchedule(cron=str(cron), timezone=timezone or tzlocal.get_localzone_name())
@@ -196,12 +200,12 @@ def _start_server(home: Path, port: int, held: ExitStack) -> str:
         raise SettingsError(f"{error}: start it, or unset PREFECT_API_URL and have one started here") from error
 
 
-def _serve(fields: Sequence[ServedField], schedule: Any, limit: int) -> None:
+def _serve(fields: Sequence[ServedField], schedule: Any, limit: int, *, shared: bool) -> None:
     """Serve the fields and the reprocessing of their archives until interrupted, also while the server is away."""
     surveys = [one.deployment(schedule) for one in fields]
     outs = dict.fromkeys(str(one.settings.out) for one in fields)
-    again = [deployment(out, number) for number, out in enumerate(outs, 1)]
-    _prepare([one.name for one in fields])
+    again = [deployment(out, number, shared=shared) for number, out in enumerate(outs, 1)]
+    _prepare([*surveys, *again], shared=shared)
     asked_to_stop = threading.Event()
     try:
         while not asked_to_stop.is_set():
@@ -244,25 +248,48 @@ async def _run(deployments: Sequence[Any], limit: int, asked_to_stop: threading.
     await running
 
 
-def _prepare(fields: Sequence[str]) -> None:
+def _prepare(deployments: Sequence[Any], *, shared: bool) -> None:
     """Limit a rig to one survey at a time in Prefect, and end the runs that an earlier serve left.
 
     Runs that were due while serve was stopped are cancelled; those that ran at its end have crashed.
+    Raises SettingsError: on a ``shared`` server a deployment of the same name is for another archive.
     """
-    named = filters.DeploymentFilter(name=filters.DeploymentFilterName(any_=list(fields)))
+    own: dict[str, Any] = {
+        "deployment_filter": filters.DeploymentFilter(
+            name=filters.DeploymentFilterName(any_=[one.name for one in deployments])
+        ),
+        "flow_filter": filters.FlowFilter(name=filters.FlowFilterName(any_=[survey.name, reprocess.name])),
+    }
     now: Any = datetime.now(UTC)
-    begun = [StateType.SCHEDULED, StateType.PENDING, StateType.RUNNING]
-    left = filters.FlowRunFilter(
-        state=filters.FlowRunFilterState(type=filters.FlowRunFilterStateType(any_=begun)),
-        expected_start_time=filters.FlowRunFilterExpectedStartTime(before_=now),
-    )
-    missed: Any = Cancelled(message="no serve was running when it was due")
+    due = filters.FlowRunFilterExpectedStartTime(before_=now)
     crashed: Any = Crashed(message="the process that ran it is gone")
+    missed: Any = Cancelled(message="no serve was running when it was due")
+    gone: Any = Cancelled(message="cancelled; the process that ran it is gone")
     with get_client(sync_client=True) as client:
+        for one in deployments if shared else ():
+            _check_other(client, one)
         client.upsert_global_concurrency_limit_by_name(RIG_LIMIT, 1)
-        for run in client.read_flow_runs(deployment_filter=named, flow_run_filter=left):
-            waited = run.state is not None and run.state.is_scheduled()
-            client.set_flow_run_state(run.id, missed if waited else crashed, force=True)
+        for kinds, ended, when in (
+            ([StateType.SCHEDULED], missed, due),
+            ([StateType.PENDING, StateType.RUNNING], crashed, None),
+            ([StateType.CANCELLING], gone, None),
+        ):
+            state = filters.FlowRunFilterState(type=filters.FlowRunFilterStateType(any_=kinds))
+            left = filters.FlowRunFilter(state=state, expected_start_time=when)
+            while found := client.read_flow_runs(**own, flow_run_filter=left):  # a page at a time
+                for run in found:
+                    client.set_flow_run_state(run.id, ended, force=True)
+
+
+def _check_other(client: Any, one: Any) -> None:
+    """Raise SettingsError where the server has a deployment of this name whose surveys go into another archive."""
+    with suppress(ObjectNotFound):
+        known = client.read_deployment_by_name(f"{one.flow_name}/{one.name}").parameters.get("settings", {}).get("out")
+        if known is not None and known != one.parameters.get("settings", {}).get("out"):
+            raise SettingsError(
+                f"the Prefect server has a field {one.name} of the archive {known}: give this field another name, or "
+                f"delete the deployment {one.flow_name}/{one.name} there"
+            )
 
 
 def _wait_for_server() -> None:

@@ -45,10 +45,11 @@ else:
 HOST = "127.0.0.1"
 STARTED_WITHIN_S, ENDED_WITHIN_S = 120.0, 10.0
 PATIENCE_S = 10.0  # timeout of a named server
+LEASES = "prefect.server.concurrency.lease_storage.filesystem"
 RECORDED_WITHIN_S = 5.0  # timeout for the states of the last tasks
 OF_SCHEDULES = (  # services that a single survey does not use
     *("CANCELLATION_CLEANUP", "CLEANUP_RECONCILER", "DB_VACUUM", "EVENT_LOGGER", "FOREMAN", "LATE_RUNS"),
-    *("PAUSE_EXPIRATIONS", "REPOSSESSOR", "SCHEDULER", "TRIGGERS"),
+    *("PAUSE_EXPIRATIONS", "SCHEDULER", "TRIGGERS"),
 )
 QUIET = {  # no requests to other machines, no output on the terminal; run logs go to the server
     "DO_NOT_SCAN_PATH": "1",
@@ -109,6 +110,7 @@ def _using(home: Path, port: int, *, schedules: bool) -> Iterator[str]:
         **(place_pages() if schedules else {"PREFECT_SERVER_UI_ENABLED": "false"}),
         "PREFECT_API_URL": api,
         "PREFECT_API_DATABASE_CONNECTION_URL": f"sqlite+aiosqlite:///{home / 'prefect.db'}",
+        "PREFECT_SERVER_CONCURRENCY_LEASE_STORAGE": LEASES,  # they outlive a killed server, which frees the rig again
         "PREFECT_API_BLOCKS_REGISTER_ON_START": "true" if schedules else "false",
         "PREFECT_SERVER_API_AUTH_STRING": password,
         "PREFECT_API_AUTH_STRING": password,

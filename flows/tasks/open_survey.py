@@ -34,6 +34,7 @@ else:
     rig_field = deferred("flows.tasks.rig_field")
 
 RIG_LIMIT = "rig"  # Prefect's global concurrency limit, where the server has one of that name
+LEASE_S, TRY_S = 60, 10  # of that limit: until a lost process frees it, and between two tries
 OF_THE_SURVEY = (
     *(choose_effects, capture_coarse, condense_coarse, register_coarse, locate, rectify, condense_raster, score),
     *(capture_fine, condense_fine, register_fine, rectify_fine, segment, ground, evaluate),
@@ -131,7 +132,7 @@ class OpenSurvey:
         with ExitStack() as held:
             if captures and self.run.settings.source == "rig" and self.capture_deployment is None:
                 if inside_flow():
-                    held.enter_context(prefect_concurrency.concurrency(RIG_LIMIT, occupy=1, lease_duration=60))
+                    held.enter_context(rig_turn(self.observer))
                 held.enter_context(rig_field.rig_to_oneself(self.run.settings.rig.port))
             held.enter_context(self.run.archive.in_use())
             held.enter_context(self.run.settings.pool.open())
@@ -194,6 +195,23 @@ class OpenSurvey:
         """Return the bytes of stores and spools that were written since the last call."""
         taken, self._written = self._written + self.run.archive.take_spooled(), 0
         return taken
+
+
+@contextmanager
+def rig_turn(observer: Observer) -> Iterator[None]:
+    """Wait for Prefect's limit ``rig`` and hold it; signals are handled between tries."""
+    with ExitStack() as held:
+        waits = True
+        while waits:
+            try:
+                limit = prefect_concurrency.concurrency(
+                    RIG_LIMIT, occupy=1, lease_duration=LEASE_S, timeout_seconds=TRY_S
+                )
+                held.enter_context(limit)
+                waits = False
+            except TimeoutError:
+                observer.note(f"waits for the rig: another survey has it, or was killed less than {LEASE_S} s ago")
+        yield
 
 
 class _Meter:

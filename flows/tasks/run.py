@@ -39,7 +39,7 @@ from flows.tasks.scene import (
 from flows.tasks.stage import FieldFrame, Report
 from flows.tasks.stages.attention import PatchGains, all_seen
 from flows.tasks.stages.capture import SweepRecorder
-from flows.tasks.survey_model import SurveyModel, beyond_training, weights_path
+from flows.tasks.survey_model import SurveyModel, beyond_training, other_unit, weights_path
 from flows.tasks.zones import SurveyZones, open_zones, place_of_field
 from models.evaluation.expected_scores import MapScores
 from models.evaluation.placement import CascadeTable
@@ -400,6 +400,8 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     budget = None if settings.macs is None else PatchBudget.asked(costs, shown, settings.policy, settings.macs)
     source, simulated, raster = _open_source(settings, scene, grid, plan, recorded, pixels)
     archive = open_archive(settings.out) if archive is None else archive
+    if raster is not None and not planning:
+        outside += other_unit(raster, scene.wavelength_nm, model.load(), path)
     prior, prior_notes = found or find_prior(archive, settings, name, grid, described.class_names, scene.key)
     if settings.prior != AUTO:  # a receipt names the run
         settings = replace(settings, prior=NONE if prior is None else prior.run)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
 from importlib import resources
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
 from flows.settings.values import UNKNOWN_AUTO, UNKNOWN_OFF
 from models.network.machine import choose_device
+from models.network.spectral import project
 from models.weights.files import (
     TRAINED_ON,
     Description,
@@ -31,6 +33,7 @@ from pipeline.lazy import Once
 from pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M
 from pipeline.simulator.scenes.farm.land import sun_over_farm
 from pipeline.simulator.scenes.scene import RasterScene
+from storage.readers.scene_files import RasterPixels
 
 
 @dataclass(frozen=True)
@@ -104,6 +107,7 @@ def shipped_weights() -> Path:
     return Path(str(resources.files("models") / "shipped" / "farm.safetensors"))
 
 
+OTHER_UNIT, SAMPLED_ROWS = 20.0, 64  # largest ratio of medians, and rows of which it is measured
 DAYS, SUN_DEG, DARKER, SCALE, BAND_NM = 10, 3.0, 0.9, 1.5, 25.0  # tolerances of the ranges of training
 
 
@@ -119,6 +123,8 @@ def beyond_training(
     if (known & ~reached).any():
         found.append(f"the bands cover {(known & reached).sum()} of the weights' {known.sum()} spectral features")
     if trained is not None:
+        if lacking := _lacking(trained.bands_nm or (), scene, described):
+            found.append(f"no band near {', '.join(f'{nm:g}' for nm in lacking)} nm")
         low, high = trained.wavelength_nm
         beyond = (scene.wavelength_nm < low - BAND_NM) | (scene.wavelength_nm > high + BAND_NM)
         if 2 * beyond.sum() > len(beyond):
@@ -142,6 +148,34 @@ def beyond_training(
     return (
         f"outside of the training data of {path.name}: {'; '.join(found)}. Expect a poorer map; train on such labelled"
         f" scenes: spectralzoom train DATASET -o my.safetensors",
+    )
+
+
+def _lacking(bands_nm: Sequence[float], scene: RasterScene, described: Description) -> list[float]:
+    """Return the bands of a training that a scene has no band near to, where each is a spectral feature of its own."""
+    bands = np.unique(bands_nm)
+    if not 0 < len(bands) <= described.basis.columns:
+        return []
+    gaps = np.diff(bands, prepend=-np.inf, append=np.inf)
+    near_nm = np.maximum(BAND_NM, np.minimum(gaps[:-1], gaps[1:]) / 2) if len(bands) > 1 else BAND_NM
+    apart_nm = np.abs(bands[:, None] - scene.wavelength_nm).min(axis=1)
+    return [float(nm) for nm in bands[apart_nm > near_nm]]
+
+
+def other_unit(
+    raster: RasterPixels, wavelength_nm: NDArray[np.float64], weights: Weights, path: Path
+) -> tuple[str, ...]:
+    """Return a note where the values of a raster are far from those of training, or nothing; some rows are read."""
+    first = max(0, (raster.grid.height - SAMPLED_ROWS) // 2)
+    matrix, reached = weights.basis.matrix(wavelength_nm)
+    seen = project(raster.rows(first, min(first + SAMPLED_ROWS, raster.grid.height)), matrix)[..., reached]
+    known = float(np.median(weights.normalisation.centre[reached])) if reached.any() else 0.0
+    here = float(np.median(seen[np.isfinite(seen)])) if np.isfinite(seen).any() else known
+    if known <= 0 or known / OTHER_UNIT <= here <= known * OTHER_UNIT:
+        return ()
+    return (
+        f"the values have a median of {here:.3g}, those of the training of {path.name} {known:.3g}; if they are in "
+        "another unit, state their scale in a scene.toml beside the scene",
     )
 
 

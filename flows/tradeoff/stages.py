@@ -224,9 +224,9 @@ class PlannedField:
     passes: Mapping[Setting, PlannedPass]
 
     def read(self, plan: Setting) -> DrawnMap:
-        """Return the class map of a plan."""
+        """Return the class map of a plan; the overview is read anew, whose time counts."""
         one = self.passes[plan]
-        return segment(one.weights, one.coarse, one.columns, one.patch_index)
+        return segment(one.weights, replace(one.coarse, overview=None), one.columns, one.patch_index)
 
     def judge(self, plan: Setting, drawn: DrawnMap) -> Figures:
         """Return 1 - mIoU of a map, the seconds of its scan, and the multiply-adds of the network."""

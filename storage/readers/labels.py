@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import colorsys
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import skimage
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
@@ -25,7 +26,8 @@ if TYPE_CHECKING:  # half a second to import, for labels on another grid alone
 else:
     odc_warp = deferred("odc.geo.warp")
 
-NO_VALUE = -1  # in codes
+Distances = NDArray[np.float64]
+NO_VALUE = int(np.iinfo(np.int64).min)  # in codes
 MOST_FOUND_CLASSES = 64
 MIXED = (
     "JPEG, soft edges and scaling mix values; save the labels again as PNG, with hard edges and by nearest neighbour,"
@@ -44,6 +46,14 @@ _EIGHT_COLOURS = (
     (204, 121, 167),
     (90, 90, 90),
 )
+
+# and hues, from which the most different one is taken
+DEFAULT_COLOURS: tuple[Colour, ...] = _EIGHT_COLOURS + tuple(
+    (round(255 * red), round(255 * green), round(255 * blue))
+    for saturation, value in ((0.8, 0.95), (0.5, 0.95), (0.8, 0.6), (0.5, 0.6))
+    for red, green, blue in (colorsys.hsv_to_rgb(turn / 24, saturation, value) for turn in range(24))
+)
+ALIKE, DISTINCT = 10.0, 25.0  # distances in CIELAB
 
 # Usual colours of land cover on maps; the words of one row are synonyms.
 _COLOURS_OF_WORDS: dict[str, Colour] = {
@@ -89,7 +99,7 @@ class Labels:
 class LabelCodes:
     """A label file as one whole number a pixel."""
 
-    values: NDArray[np.int64]  # (y, x), -1 = no value
+    values: NDArray[np.int64]  # (y, x), `NO_VALUE` = no value
     of_colours: bool  # a number is r * 65536 + g * 256 + b
     notes: tuple[str, ...] = ()
     regridded: bool = False  # from another grid
@@ -122,12 +132,14 @@ def load_labels(
         codes = np.where(codes < 0, codes, codes * 0x010101)  # a grey value g is the colour (g, g, g)
     none = None if unlabelled is None else _code(unlabelled)
     stated = dict(classes) or found_codes(codes, none, is_colour or by_colour, str(address))
+    negative = (codes < 0) & (codes != NO_VALUE) & ~np.isin(codes, [none or 0, *map(_code, stated.values())])
+    note = (f"{negative.sum()} px of labels {address} have negative values: unlabelled",) if negative.any() else ()
     return Labels(
-        index=_index(codes, stated, none, str(address)),
+        index=_index(np.where(negative, NO_VALUE, codes), stated, none, str(address), of_colours=is_colour),
         names=tuple(stated),
         values=tuple(stated.values()),
         colours=class_colours(stated, colours),
-        notes=read.notes,
+        notes=(*read.notes, *note),
         regridded=read.regridded,
     )
 
@@ -172,7 +184,7 @@ def load_codes(
 
 
 def _whole_numbers(values: NDArray[Any], address: str | Path, *, by_number: bool) -> tuple[NDArray[np.int64], bool]:
-    """Return one number a pixel for (y, x, band) values, -1 for NaN, and whether they are colours."""
+    """Return one number a pixel for (y, x, band) values, `NO_VALUE` for NaN, and whether they are colours."""
     if values.shape[2] == 1:
         values = values[..., 0]
         if values.dtype.kind != "f":
@@ -198,16 +210,16 @@ def _is_same_grid(own: GeoBox, scene: GeoBox) -> bool:
 
 
 def _on_grid(codes: NDArray[np.int64], own: GeoBox, grid: GeoBox, address: str | Path) -> NDArray[np.int64]:
-    """Return the nearest code to each pixel of a grid, -1 beside the labels (SceneError: all pixels are)."""
+    """Return the nearest code to each pixel of a grid, `NO_VALUE` beside the labels (SceneError: all pixels are)."""
     values, index = np.unique(codes, return_inverse=True)
-    found = np.full(tuple(grid.shape), NO_VALUE, np.int32)
-    odc_warp.rio_reproject(index.reshape(codes.shape).astype(np.int32), found, own, grid, "nearest", NO_VALUE, NO_VALUE)
-    if (found == NO_VALUE).all():
+    found = np.full(tuple(grid.shape), -1, np.int32)
+    odc_warp.rio_reproject(index.reshape(codes.shape).astype(np.int32), found, own, grid, "nearest", -1, -1)
+    if (found < 0).all():
         raise SceneError(
             f"labels {address} do not lie on the scene: {_extent(own)}, the scene {_extent(grid)}; give the labels of "
             "this scene, or correct the CRS of one of them (gdal_edit -a_srs)"
         )
-    return np.where(found == NO_VALUE, NO_VALUE, values[found])
+    return np.where(found < 0, NO_VALUE, values[found])
 
 
 def _extent(grid: GeoBox) -> str:
@@ -239,7 +251,7 @@ def found_codes(codes: NDArray[np.int64], none: int | None, is_colour: bool, whe
 
 
 def _index(
-    codes: NDArray[np.int64], classes: Mapping[str, ClassValue], none: int | None, where: str
+    codes: NDArray[np.int64], classes: Mapping[str, ClassValue], none: int | None, where: str, *, of_colours: bool
 ) -> NDArray[np.uint8]:
     values, inverse = np.unique(codes, return_inverse=True)
     table = {_code(value): index for index, value in enumerate(classes.values())}
@@ -250,6 +262,11 @@ def _index(
     if unknown:
         count = int((codes == unknown[0]).sum())
         cure = "add it to [classes] or state it as unlabelled in scene.toml"
+        if of_colours and not any(isinstance(value, tuple) for value in classes.values()):
+            raise SceneError(
+                f"labels {where} have colours, such as {list(colour_of(unknown[0]))}, and the classes are numbers; "
+                "write the colour of each class into [classes], or give labels of numbers"
+            )
         raise SceneError(
             f"labels {where} have {count} px of {_shown(unknown[0], classes)}, which is no class (and "
             f"{len(unknown) - 1} more such values); {MIXED if len(unknown) > _MANY_UNKNOWN else cure}"
@@ -271,16 +288,21 @@ def class_colours(classes: Mapping[str, ClassValue], stated: Mapping[str, Colour
     words = {name: re.findall(r"[a-z]+", name.lower()) for name in classes}
     found = {name: value for name, value in classes.items() if isinstance(value, tuple)} | dict(stated or {})
     for name in sorted(set(classes) - set(found), key=lambda name: (len(words[name]), list(classes).index(name))):
-        known = (_COLOURS_OF_WORDS[word] for word in words[name] if word in _COLOURS_OF_WORDS)
-        usual = next((colour for colour in known if colour not in found.values()), None)
-        found[name] = usual or default_colour(list(classes).index(name))
+        known = [_COLOURS_OF_WORDS[word] for word in words[name] if word in _COLOURS_OF_WORDS]
+        apart = dict(zip(known, _apart(known, found.values()), strict=True))
+        if usual := next((colour for colour in known if apart[colour] >= ALIKE), None):
+            found[name] = usual
+    for name in (name for name in classes if name not in found):
+        apart_by = _apart(DEFAULT_COLOURS, found.values())
+        distinct = np.flatnonzero(apart_by[: len(_EIGHT_COLOURS)] >= DISTINCT)
+        found[name] = DEFAULT_COLOURS[int(distinct[0] if distinct.size else np.argmax(apart_by))]
     return np.array([found[name] for name in classes], np.uint8).reshape(-1, 3)
 
 
-def default_colour(index: int) -> Colour:
-    """Return a default colour: eight colours for colour blindness, then hues a golden angle apart."""
-    if index < len(_EIGHT_COLOURS):
-        return _EIGHT_COLOURS[index]
-    turn = index * 0.618033988749895 % 1.0
-    red, green, blue = colorsys.hsv_to_rgb(turn, 0.55 + 0.15 * (index % 3), 0.95 - 0.2 * (index % 2))
-    return round(red * 255), round(green * 255), round(blue * 255)
+def _apart(colours: Sequence[Colour], others: Iterable[Colour]) -> Distances:
+    """Return the distance in CIELAB of each colour to the nearest of others; infinite without one."""
+    lab, beside = (
+        skimage.color.rgb2lab(np.array([*some], np.uint8).reshape(-1, 1, 3))[:, 0] for some in (colours, others)
+    )
+    found: Distances = np.linalg.norm(lab[:, None] - beside[None], axis=-1).min(axis=1, initial=np.inf)
+    return found

@@ -345,7 +345,7 @@ def _find_gaps(
         seen |= known.any(axis=(0, 1))
         if kept is not None:
             kept[rows] = values.scaled(block)
-    if nodata is not None and not values.assumed:
+    if void and not values.assumed:
         notes.append(f"{void} samples have the file's no-data value {nodata:g}")
     elif void:
         notes.append(

@@ -158,8 +158,11 @@ def settle_wavelengths(
     if known.wavelength_nm is not None and len(known.wavelength_nm) == file_bands:
         centre = check_wavelengths(known.wavelength_nm, str(path))[chosen]
         return Bands(centre, None if known.fwhm_nm is None else known.fwhm_nm[chosen], known.origin)
+    told = "nothing says their wavelengths"
+    if known.wavelength_nm is not None:
+        told = f"its header has {len(known.wavelength_nm)} wavelengths; correct that list"
     raise WavelengthError(
-        f"{path} has {file_bands} bands and nothing says their wavelengths; give --wavelengths in nm, or write "
+        f"{path} has {file_bands} bands and {told}; give --wavelengths in nm, or write "
         f"wavelengths_nm or wavelengths_file into a scene.toml beside it (axes are y, x, band)"
     )
 

@@ -33,7 +33,12 @@ def server_process(home: Path, port: int) -> Iterator[subprocess.Popen[str]]:
     """Have a Prefect server in a process of its own, on a port; killed at the end."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
     words = [sys.executable, "-c", SERVES, str(home), str(port)]
-    environment |= {"PYTHONPATH": str(ROOT), "DO_NOT_SCAN_PATH": "1", "PREFECT_SERVER_LOGGING_LEVEL": "CRITICAL"}
+    environment |= {
+        "PREFECT_HOME": str(home),
+        "PYTHONPATH": str(ROOT),
+        "DO_NOT_SCAN_PATH": "1",
+        "PREFECT_SERVER_LOGGING_LEVEL": "CRITICAL",
+    }
     with subprocess.Popen(words, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None

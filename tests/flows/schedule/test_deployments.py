@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -12,20 +13,24 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import copy_context
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from queue import Queue
 from types import SimpleNamespace
 from typing import Any
 
+import httpx
 import pytest
 import yaml
 
+from flows.archive.reprocess_flow import deployment as reprocessing
 from flows.cli.serve_command import _prepare, load_fields, schedule_of
 from flows.settings.load import load_settings
 from flows.tasks.local_server import local_server
-from flows.tasks.open_survey import RIG_LIMIT, OpenSurvey
+from flows.tasks.open_survey import LEASE_S, RIG_LIMIT, OpenSurvey
+from flows.tasks.prefect_tasks import Observer
+from pipeline.errors import SettingsError
 from storage.archive.archive import Archive
 from storage.archive.records import read_run
 from storage.parallel.pool import THREADS
@@ -107,24 +112,75 @@ def test_a_run_is_a_visit_of_its_due_time_and_goes_on_from_the_newest(north: Any
     assert [memory is None for memory in memories] == [True, False]
 
 
-def test_what_a_killed_serve_left_is_ended_when_it_is_served_again(north: Any) -> None:
-    """What waited is cancelled, what ran has crashed and gives its place back; what is to come stays."""
-    from prefect.states import Pending, Running
+def test_what_a_killed_serve_left_is_ended_when_it_is_served_again(north: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What waited is cancelled, what ran has crashed and gives its place back; what is to come or not ours stays."""
+    from prefect import flow
+    from prefect.client.orchestration import SyncPrefectClient
+    from prefect.states import Cancelling, Pending, Running
 
-    deployment = deployed(north)
-    ran, waited, later = (planned(deployment, DUE.replace(year=year)).id for year in (2024, 2025, 2099))
+    @flow(persist_result=False)
+    def another() -> None:
+        """A flow of somebody else."""
+
+    made = north.deployment(schedule_of("0 6 * * *", None, "Europe/Berlin"))
+    again = reprocessing(str(north.settings.out))
+    deployment, foreign = made.apply(), another.to_deployment("north").apply()
+    ran, ended, waited, other, later = (
+        planned(deployment, DUE.replace(year=year)).id for year in (2023, 2024, 2025, 2025, 2099)
+    )
+    ahead, strange = planned(again.apply(), DUE.replace(year=2099)).id, planned(foreign, DUE.replace(year=2025)).id
+    read = SyncPrefectClient.read_flow_runs
+    monkeypatch.setattr(SyncPrefectClient, "read_flow_runs", lambda self, **given: read(self, **given, limit=1))
     with client() as asked:
-        asked.set_flow_run_state(ran, Pending())
-        asked.set_flow_run_state(ran, Running())
-        _prepare(["north"])
-        assert [asked.read_flow_run(one).state.type.value for one in (ran, waited, later)] == [
-            "CRASHED",
-            "CANCELLED",
-            "SCHEDULED",
+        for one, states in (
+            (ran, (Pending, Running)),
+            (ended, (Cancelling,)),
+            (ahead, (Pending,)),
+            (strange, (Pending,)),
+        ):
+            for state in states:
+                asked.set_flow_run_state(one, state(), force=True)
+        _prepare([made, again], shared=False)
+        kinds = [
+            asked.read_flow_run(one).state.type.value for one in (ran, ended, waited, other, later, ahead, strange)
         ]
+        assert kinds == ["CRASHED", *["CANCELLED"] * 3, "SCHEDULED", "CRASHED", "PENDING"]
         after = planned(deployment, DUE).id
         asked.set_flow_run_state(after, Pending())
         assert asked.read_flow_run(after).state.is_pending()
+
+
+def test_a_shared_server_keeps_the_fields_of_others(north: Any) -> None:
+    """A field of another archive under the same name is refused, and reprocessing is named by the archive."""
+    schedule = schedule_of(None, timedelta(hours=1))
+    north.deployment(schedule).apply()
+    _prepare([north.deployment(schedule), reprocessing("/data/a b", shared=True)], shared=True)
+    moved = replace(north, settings=replace(north.settings, out="/data/a b"))
+    with pytest.raises(SettingsError, match=r"the Prefect server has a field north of the archive .*another name"):
+        _prepare([moved.deployment(schedule)], shared=True)
+    assert reprocessing("/data/a b", shared=True).name == "data-a-b"
+
+
+def test_a_rig_is_free_again_when_the_server_of_its_survey_was_killed(tmp_path: Path) -> None:
+    """Its lease outlives the server, and the next server takes it back when it has run out."""
+    port, leases = free_port(), tmp_path / "concurrency_leases"
+
+    def asked() -> Any:
+        password = tuple((tmp_path / "password").read_text().strip().split(":", 1))
+        return httpx.Client(base_url=f"http://127.0.0.1:{port}/api/v2/concurrency_limits", auth=password)
+
+    with server_process(tmp_path, port), asked() as client:
+        client.post("/", json={"name": RIG_LIMIT, "limit": 1}).raise_for_status()
+        wanted = {"names": [RIG_LIMIT], "slots": 1, "lease_duration": LEASE_S}
+        client.post("/increment-with-lease", json=wanted).raise_for_status()
+        assert client.get(f"/{RIG_LIMIT}").json()["active_slots"] == 1
+    for file in leases.glob("*.json"):  # a minute later
+        file.write_text(re.sub(r'"20\d\d-', '"2020-', file.read_text()))
+    with server_process(tmp_path, port), asked() as client:
+        end = time.monotonic() + PATIENCE_S
+        while client.get(f"/{RIG_LIMIT}").json()["active_slots"]:
+            assert time.monotonic() < end
+            time.sleep(0.5)
 
 
 def test_two_fields_that_are_due_at_once_take_turns_at_the_rig(tmp_path: Path) -> None:
@@ -134,7 +190,8 @@ def test_two_fields_that_are_due_at_once_take_turns_at_the_rig(tmp_path: Path) -
     archive = Archive.open(tmp_path / "archive")
     usual = load_settings(None, {"scene": "farm"})
     rig = replace(usual, source="rig", rig=replace(usual.rig, port=f"/dev/ttyTURNS{os.getpid()}"))
-    plan: Any = SimpleNamespace(run=SimpleNamespace(settings=rig, archive=archive, name="x"), capture_deployment=None)
+    run = SimpleNamespace(settings=rig, archive=archive, name="x")
+    plan: Any = SimpleNamespace(run=run, capture_deployment=None, observer=Observer())
     held: list[tuple[float, float]] = []
     inside = threading.Barrier(2)
 

@@ -20,6 +20,7 @@ BAD = {
     "neither": (("north",), "", 2, "a schedule needs --cron or --every, got neither"),
     "both": (("north",), "--every 1h --cron 0_6_*_*_*", 2, "a schedule needs --cron or --every, got both"),
     "no interval": (("north",), "--every 0s", 2, "no such schedule: Input should be greater than 0 seconds"),
+    "zone of an interval": (("north",), "--every 1h --timezone Europe/Berlin", 2, "--timezone is that of --cron"),
     "no zone": (("north",), "--cron 0_6_*_*_* --timezone Mars/Base", 2, "no such schedule: .*Invalid timezone"),
     "no such file": (("nowhere",), "--every 30m", 2, "no settings file .*nowhere.toml"),
     "unknown key": (("typo",), "--every 30m", 2, "unknown setting 'sceene' in .*typo.toml; did you mean 'scene'"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -230,6 +231,31 @@ def test_pixels_trained_on_are_not_judged(out: Path, tmp_path: Path) -> None:
     assert run.labels is not None
     assert (run.labels[:10] == 255).all()
     assert (run.labels[10:] != 255).all()
+
+
+@pytest.mark.parametrize(
+    ("factor", "bands", "note"),
+    [
+        (1.0, [500, 600, 700, 800], ""),
+        (1e-3, [500, 600, 700, 800], "the values have a median of 0.002, those of the training of .*; if they are"),
+        (1.0, [500, 600, 700], "no band near 800 nm"),
+    ],
+)
+def test_a_survey_says_that_a_scene_is_unlike_the_training(
+    factor: float, bands: list[int], note: str, out: Path, tmp_path: Path
+) -> None:
+    """In its unit or in its bands; a scene of the training's kind is surveyed without a note."""
+    labels = np.random.default_rng(4).choice([1, 2], (40, 40), p=[0.3, 0.7]).astype(np.uint8)
+    values = (labels[..., None] * np.ones(4)).astype(np.float32)
+    np.save(tmp_path / "cube.npy", values)
+    np.save(tmp_path / "labels.npy", labels)
+    choices = {"labels": str(tmp_path / "labels.npy"), "wavelengths": [500, 600, 700, 800]}
+    train_weights(_request(tmp_path / "cube.npy", out, choices=choices))
+    np.save(tmp_path / "other.npy", factor * values[..., : len(bands)])
+    asked = {"scene": str(tmp_path / "other.npy"), "wavelengths": bands, "source": "raster", "weights": str(out)}
+    notes = " ".join(open_run(load_settings(None, asked | {"out": str(tmp_path / "a")})).notes)
+    assert re.search(note, notes)
+    assert bool(note) == ("of the training" in notes)
 
 
 def test_weights_for_short_exposures_have_a_record_of_plain_scans(folder: Path, out: Path):

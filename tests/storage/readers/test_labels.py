@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import scipy.io
+import skimage
 from PIL import Image
 
 from pipeline.errors import SceneError
-from storage.readers.labels import class_colours, default_colour, load_labels
+from storage.readers.labels import DEFAULT_COLOURS, class_colours, load_labels
 
 COLOURS = {"soil": (0, 0, 0), "crop": (0, 255, 0), "weed": (255, 0, 0)}
 
@@ -67,7 +69,35 @@ def test_classes_are_found_where_none_are_stated(tmp_path: Path) -> None:
     found = load_labels(tmp_path / "a.npy", (2, 2), classes={})
     assert found.names == ("class_1", "class_5")
     assert found.index.tolist() == [[0, 1], [255, 1]]
-    assert len({default_colour(index) for index in range(80)}) == 80
+    assert len(set(DEFAULT_COLOURS)) == len(DEFAULT_COLOURS) >= 64
+
+
+MANY = "alfalfa", "corn", "corn_notill", "grass_pasture", "oats", "soybean", "woods", "wheat"
+
+
+@pytest.mark.parametrize("names", [range(24), MANY], ids=["numbers", "words"])
+def test_classes_have_colours_that_differ(names: Iterable[object]) -> None:
+    """By 15 in CIELAB and more, words and numbers alike."""
+    colours = class_colours({str(name): number for number, name in enumerate(names)})
+    lab = skimage.color.rgb2lab(colours[:, None])[:, 0]
+    apart = np.linalg.norm(lab[:, None] - lab[None], axis=-1)
+    assert apart[~np.eye(len(lab), dtype=bool)].min() >= 15
+
+
+@pytest.mark.parametrize("classes", [{}, {"grass": 1, "soil": 5}, {"lost": -1, "grass": 1, "soil": 5}])
+def test_negative_values_are_no_class_unless_one_has_them(tmp_path: Path, classes: dict[str, int]) -> None:
+    """NaN and what lies beside the labels never is."""
+    np.save(tmp_path / "a.npy", np.array([[-1.0, 5.0], [np.nan, 1.0]]))
+    found = load_labels(tmp_path / "a.npy", (2, 2), classes=classes)
+    assert (found.index == 255).tolist() == [["lost" not in classes, False], [True, False]]
+    assert len(found.notes) == ("lost" not in classes)
+
+
+def test_colours_for_classes_of_numbers_are_refused(tmp_path: Path) -> None:
+    """The message shows a colour, not the number that it is packed into."""
+    Image.fromarray(np.full((2, 2, 3), (0, 120, 0), np.uint8)).save(tmp_path / "a.png")
+    with pytest.raises(SceneError, match=r"have colours, such as \[0, 120, 0\], and the classes are numbers"):
+        load_labels(tmp_path / "a.png", (2, 2), classes={"soil": 1})
 
 
 def test_unlabelled_cannot_be_a_class(tmp_path: Path) -> None:
@@ -83,8 +113,8 @@ def test_names_that_all_know_have_their_colour() -> None:
     water, winter, spring, other, soil, watery = class_colours(names).tolist()
     assert max(water) == water[2]
     assert soil[0] > soil[1] > soil[2]
-    assert winter != spring == list(default_colour(2))
-    assert (other, watery) == (list(default_colour(3)), list(default_colour(5)))
+    assert winter == [240, 210, 110]
+    assert all(list(colour) in map(list, DEFAULT_COLOURS[:8]) for colour in (spring, other, watery))
     assert class_colours(names, {"Bare soil": (1, 2, 3)})[4].tolist() == [1, 2, 3]
     assert class_colours({"water": (9, 9, 9)}).tolist() == [[9, 9, 9]]
     assert class_colours({"grass_trees": 1, "woods": 2})[1].tolist() == class_colours({"forest": 1})[0].tolist()

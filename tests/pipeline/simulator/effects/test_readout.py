@@ -116,7 +116,10 @@ def test_dead_and_hot_elements() -> None:
 @pytest.mark.parametrize(("dark_dn", "exposure_ms"), [(64.0, 500.0), (0.0, 500.0), (2.0, 20.0)])
 def test_the_mean_dark_frame_is_that_of_many_lines(dark_dn: float, exposure_ms: float) -> None:
     """What a cap on the lens would show: dark level, dark current, hot elements up to full scale, nothing below 0."""
-    rig = Rig(camera=LineCamera(exposure_ms=exposure_ms, dark_dn=dark_dn), detector=Detector(hot_fraction=0.01, dead_fraction=0.01))
+    rig = Rig(
+        camera=LineCamera(exposure_ms=exposure_ms, dark_dn=dark_dn),
+        detector=Detector(hot_fraction=0.01, dead_fraction=0.01),
+    )
     block = block_of(rig, range(64))
     mean = read_out(np.zeros((64, 640, BANDS), np.float32), block, ALL_EXACT).mean(axis=0)
     expected = dark_frame(block, ALL_EXACT)

@@ -150,7 +150,7 @@ def test_worked_by_hand(effects: list[MadeUp], tolerance: float, asked: str, wan
 
 
 def test_gains_multiply_the_errors_of_others_but_not_their_own():
-    """Light that is brightened by a quarter carries errors a quarter higher, also to the readout; DN follow no light."""
+    """Light that is brightened by a quarter carries errors a quarter higher, to the readout too; DN follow no light."""
     effects = [
         MadeUp("read", 0.1),
         Brightening("vignetting", 0.25, fraction=0.25),
