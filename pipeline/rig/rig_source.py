@@ -201,7 +201,11 @@ class RigSource:
                 f"{folder} on the camera holds no {' and no '.join(missing)} reference; take both with the camera's "
                 "own program, then run again"
             )
-        whole = as_references(frames["dark"], frames["white"], white_reference=self.rig.white_reference)
+        whole = as_references(
+            *(frames["dark"], frames["white"]),
+            saturated_dn=self.camera.full_scale_dn,
+            white_reference=self.rig.white_reference,
+        )
         self._check_size(whole.dark.shape, folder)
         return whole
 

@@ -239,7 +239,7 @@ def find_bad_elements(
 ) -> Bools:
     """Find unreliable elements (sample, band) of the detector from mean dark and white frames [DN].
 
-    An element is bad if a frame is not finite there, or if the white frame is at ``saturated_dn`` or more. It is also
+    An element is bad if a frame is not finite there, or if the white frame reaches ``saturated_dn``. It is also
     bad if its dark level is above those of its band (hot), or if it hardly responds although its neighbours do (dead).
     The last kind has a response that differs from its neighbours in the band by more than its column does in most bands
     (odd). Dust on the slit darkens a column in all bands and is no fault, since the white frame corrects it. Nor is a
@@ -249,7 +249,7 @@ def find_bad_elements(
     bad elements only where it is not finite or saturated.
 
     Raises ShapeError: the frames are not (sample, band), or not of one size. Raises RigError: more than 5 % of the
-    elements, and more than one column, would be bad.
+    elements, and more than one column, would be bad, or are saturated.
     """
     if dark.ndim != 2 or dark.shape != white.shape:
         raise ShapeError(
@@ -257,14 +257,21 @@ def find_bad_elements(
         )
     low, high = np.asarray(dark, np.float64), np.asarray(white, np.float64)
     bad = ~(np.isfinite(low) & np.isfinite(high))
+    most = max(MOST_BAD * bad.size, bad.shape[1])
     if saturated_dn is not None:
-        bad |= high >= saturated_dn
+        saturated = high > saturated_dn - 0.5  # the mean of frames
+        if np.count_nonzero(saturated) > most:
+            raise RigError(
+                f"the white frame is saturated in {100 * saturated.mean():.1f} % of the elements, at most "
+                f"{100 * MOST_BAD:g} % can be; take it again with a shorter exposure or less light"
+            )
+        bad |= saturated
     low = np.where(bad, np.nan, low)
     above = low - _median(low, axis=0)
     noise = np.maximum(SIGMA_OF_MEDIAN * _median(np.abs(above), axis=0), LEAST_NOISE_DN)
     bad |= above > HOT_SIGMAS * noise
     bad |= _off_neighbours(np.where(bad, np.nan, high - low), noise)
-    if np.count_nonzero(bad) > max(MOST_BAD * bad.size, bad.shape[1]):
+    if np.count_nonzero(bad) > most:
         raise RigError(
             f"{100 * bad.mean():.1f} % of the elements look bad, at most {100 * MOST_BAD:g} % can be; is the white "
             "frame lit evenly along the slit and the dark one taken with the same exposure? Take both again"

@@ -178,7 +178,10 @@ def find_references(
         )
     bad: NDArray[Any] | None = found.get("bad")
     if bad is None and measured and files["bad"] is None:
-        bad = find_bad_elements(dark, white)
+        bad, saturated = find_bad_elements(dark, white), white > white_dn - 0.5
+        if saturated.any():
+            bad |= saturated
+            notes.append(f"{name}: the white frame is saturated in {100 * saturated.mean():.2g} % of the elements")
     bands = frame[1]
     if white_reference.shape not in ((), (bands,)):
         raise SceneError(
