@@ -34,6 +34,7 @@ from pipeline.rig.capture_runner import CaptureJournal, CaptureRunner, Say, say_
 from pipeline.rig.device_settings import SurveyRig
 from pipeline.rig.drivers import RigDevices
 from pipeline.rig.transports import DeviceRefused, StateUnknown
+from pipeline.signal.calibrate import full_scale_notes
 from pipeline.simulator.simulated import check_binning
 from pipeline.source import Line, References
 
@@ -201,12 +202,10 @@ class RigSource:
                 f"{folder} on the camera holds no {' and no '.join(missing)} reference; take both with the camera's "
                 "own program, then run again"
             )
-        whole = as_references(
-            *(frames["dark"], frames["white"]),
-            saturated_dn=self.camera.full_scale_dn,
-            white_reference=self.rig.white_reference,
-        )
+        whole = as_references(frames["dark"], frames["white"], white_reference=self.rig.white_reference)
         self._check_size(whole.dark.shape, folder)
+        for note in full_scale_notes(whole.white, self.camera.full_scale_dn):
+            self._say(note)
         return whole
 
     def _read(self, runner: CaptureRunner, taken: CaptureRecord, line: int) -> Iterator[Line]:

@@ -234,22 +234,20 @@ def _judged(raw: NDArray[np.integer[Any]], references: References | Elements) ->
     return references if isinstance(references, Elements) else judge_elements(references)
 
 
-def find_bad_elements(
-    dark: NDArray[np.floating], white: NDArray[np.floating], *, saturated_dn: float | None = None
-) -> Bools:
+def find_bad_elements(dark: NDArray[np.floating], white: NDArray[np.floating]) -> Bools:
     """Find unreliable elements (sample, band) of the detector from mean dark and white frames [DN].
 
-    An element is bad if a frame is not finite there, or if the white frame reaches ``saturated_dn``. It is also
-    bad if its dark level is above those of its band (hot), or if it hardly responds although its neighbours do (dead).
-    The last kind has a response that differs from its neighbours in the band by more than its column does in most bands
-    (odd). Dust on the slit darkens a column in all bands and is no fault, since the white frame corrects it. Nor is a
-    slope, as at the slit's ends. Responses are not judged where the neighbours see no light.
+    An element is bad if a frame is not finite there, if its dark level is above those of its band (hot), or if it
+    hardly responds although its neighbours do (dead). So is one whose response differs from its neighbours in the band
+    by more than its column does in most bands (odd). Dust on the slit darkens a column in all bands and is no fault,
+    since the white frame corrects it. Nor is a slope, as at the slit's ends. Responses are not judged where the
+    neighbours see no light.
 
     Spreads are medians of absolute deviations. With fewer than 7 samples no element is odd. A frame of one sample has
-    bad elements only where it is not finite or saturated.
+    bad elements only where it is not finite.
 
     Raises ShapeError: the frames are not (sample, band), or not of one size. Raises RigError: more than 5 % of the
-    elements, and more than one column, would be bad, or are saturated.
+    elements, and more than one column, would be bad.
     """
     if dark.ndim != 2 or dark.shape != white.shape:
         raise ShapeError(
@@ -257,26 +255,24 @@ def find_bad_elements(
         )
     low, high = np.asarray(dark, np.float64), np.asarray(white, np.float64)
     bad = ~(np.isfinite(low) & np.isfinite(high))
-    most = max(MOST_BAD * bad.size, bad.shape[1])
-    if saturated_dn is not None:
-        saturated = high > saturated_dn - 0.5  # the mean of frames
-        if np.count_nonzero(saturated) > most:
-            raise RigError(
-                f"the white frame is saturated in {100 * saturated.mean():.1f} % of the elements, at most "
-                f"{100 * MOST_BAD:g} % can be; take it again with a shorter exposure or less light"
-            )
-        bad |= saturated
     low = np.where(bad, np.nan, low)
     above = low - _median(low, axis=0)
     noise = np.maximum(SIGMA_OF_MEDIAN * _median(np.abs(above), axis=0), LEAST_NOISE_DN)
     bad |= above > HOT_SIGMAS * noise
     bad |= _off_neighbours(np.where(bad, np.nan, high - low), noise)
-    if np.count_nonzero(bad) > most:
+    if np.count_nonzero(bad) > max(MOST_BAD * bad.size, bad.shape[1]):
         raise RigError(
             f"{100 * bad.mean():.1f} % of the elements look bad, at most {100 * MOST_BAD:g} % can be; is the white "
             "frame lit evenly along the slit and the dark one taken with the same exposure? Take both again"
         )
     return bad
+
+
+def full_scale_notes(white: NDArray[np.floating], full_scale_dn: float) -> list[str]:
+    """Return a note where elements of a white frame are at the converter's full scale."""
+    full = float(np.mean(np.abs(white - full_scale_dn) < 0.5))
+    what = f"the white frame is at full scale in {100 * full:.2g} % of the elements"
+    return [f"{what}: if it is saturated, values there are too high, and a darker one is needed"] if full else []
 
 
 def _off_neighbours(response: Floats, noise: Floats) -> Bools:

@@ -30,7 +30,7 @@ from pipeline.errors import SceneError, WavelengthError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import RIM_SLACK, STRAIGHT, Mounting
 from pipeline.rig.camera.camera_texts import listed_numbers
-from pipeline.signal.calibrate import find_bad_elements
+from pipeline.signal.calibrate import find_bad_elements, full_scale_notes
 from pipeline.source import References
 from storage.readers.cube_sources import CubeSource
 from storage.readers.envi_files import DATA_ENDINGS, find_envi_pair, find_reference, load_envi_header
@@ -178,10 +178,8 @@ def find_references(
         )
     bad: NDArray[Any] | None = found.get("bad")
     if bad is None and measured and files["bad"] is None:
-        bad, saturated = find_bad_elements(dark, white), white > white_dn - 0.5
-        if saturated.any():
-            bad |= saturated
-            notes.append(f"{name}: the white frame is saturated in {100 * saturated.mean():.2g} % of the elements")
+        bad = find_bad_elements(dark, white)
+        notes += full_scale_notes(white, white_dn)
     bands = frame[1]
     if white_reference.shape not in ((), (bands,)):
         raise SceneError(

@@ -168,14 +168,12 @@ def mean_frame(lines: NDArray[np.integer]) -> MeanFrame:
     return MeanFrame(mean, stuck)
 
 
-def as_references(
-    dark: MeanFrame, white: MeanFrame, *, saturated_dn: float, white_reference: ArrayLike = 1.0
-) -> References:
+def as_references(dark: MeanFrame, white: MeanFrame, *, white_reference: ArrayLike = 1.0) -> References:
     """Join dark and white into the references of a sweep.
 
     An element is bad where its dark frame is stuck, or `pipeline.signal.calibrate.find_bad_elements` finds it bad.
     ``white_reference`` is the value of the white reference, one or (band,). Raises RigError: the frames are of two
-    sizes, swapped, without light, or saturated.
+    sizes, swapped or without light.
     """
     if dark.mean.shape != white.mean.shape:
         raise RigError(f"dark is {dark.mean.shape} (sample, band), white {white.mean.shape}; take both anew")
@@ -184,6 +182,6 @@ def as_references(
         raise RigError(
             f"white is above dark in {100 * lit:.0f} % of the elements; are they swapped, or was the lamp off?"
         )
-    bad = find_bad_elements(dark.mean, white.mean, saturated_dn=saturated_dn) | dark.stuck
+    bad = find_bad_elements(dark.mean, white.mean) | dark.stuck
     values = np.broadcast_to(np.asarray(white_reference, np.float32), dark.mean.shape[1]).copy()
     return References(dark.mean, white.mean, values, bad)

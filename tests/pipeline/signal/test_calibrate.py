@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import PoseError, RigError, ShapeError
 from pipeline.geometry.mirror import mirror_throughput
-from pipeline.signal.calibrate import calibrate, find_bad_elements
+from pipeline.signal.calibrate import calibrate, find_bad_elements, full_scale_notes
 from pipeline.source import References
 
 
@@ -207,12 +207,13 @@ def test_bands_without_light_are_not_judged() -> None:
     assert not find_bad_elements(dark, white)[:, :4].any()
 
 
-def test_saturated_white_is_bad() -> None:
-    """A white frame at full scale says nothing of the response."""
-    dark, white = simulated()
-    limit = np.sort(white, axis=None)[-20]
-    assert not find_bad_elements(dark, white).any()
-    np.testing.assert_array_equal(find_bad_elements(dark, white, saturated_dn=limit), white >= limit)
+def test_a_white_frame_at_full_scale_is_noted() -> None:
+    """With its part of the elements; one below or, of a camera that scales its frames, beyond it is not."""
+    white = np.full((10, 10), 4095.0)
+    white[:, :5] = 4094.4
+    (note,) = full_scale_notes(white, 4095)
+    assert "at full scale in 50 % of the elements" in note
+    assert full_scale_notes(white, 4000) == []
 
 
 def test_more_than_a_detector_can_have_is_refused() -> None:
