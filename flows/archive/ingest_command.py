@@ -58,7 +58,7 @@ def ingest(
     """
     nm = parse_numbers(wavelengths, "--wavelengths")
     record = run_ingest(source, archive, stderr, name=name, dark=dark, white=white, wavelengths=nm)
-    stderr.print(escape(f"next: {_next(record, source)}"), soft_wrap=True)
+    stderr.print(escape(f"next: {_next(record, source, wavelengths)}"), soft_wrap=True)
     if as_json:
         print_json(record)
     return DONE
@@ -117,7 +117,7 @@ def hash_files(source: CubeSource, report: Report = lambda done: None) -> list[S
     return files
 
 
-def _next(record: Mapping[str, Any], source: str) -> str:
+def _next(record: Mapping[str, Any], source: str, wavelengths: str | None) -> str:
     """Return the command that surveys the cube: a camera's numbers as a recording, images and maps as a scene."""
     words, path = ["spectralzoom", "survey"], Path(source)
     image = record["georeferenced"] or reader_of(source) in ("image", "array")
@@ -126,7 +126,9 @@ def _next(record: Mapping[str, Any], source: str) -> str:
         words += ["--source", "recorded", "--sweeps", record["path"]]
         words += [] if table is None else ["--pointing", str(table)]
     else:
-        words += ["--scene", source]
+        words += ["--scene", source, *([] if wavelengths is None else ["--wavelengths", wavelengths])]
+    if record["wavelength_nm"] is None:
+        words += ["--wavelengths", "NM,NM,..."]
     return shlex.join([*words, "--weights", "WEIGHTS.safetensors"])
 
 

@@ -341,6 +341,16 @@ def test_an_ingested_image_is_surveyed_as_a_scene(command_line: CommandLine, tmp
     assert f"next: spectralzoom survey --scene {tmp_path / 'a.png'} --weights" in ended.err
 
 
+@pytest.mark.parametrize(("given", "words"), [(("--wavelengths", "500,600"), "500,600"), ((), "NM,NM,...")])
+def test_the_next_step_names_wavelengths_that_a_file_lacks(
+    given: tuple[str, ...], words: str, command_line: CommandLine, tmp_path: Path
+) -> None:
+    """Those that were given, or a place for them."""
+    np.save(tmp_path / "a.npy", np.zeros((16, 24, 2), np.float32))
+    ended = command_line("ingest", tmp_path / "a.npy", tmp_path / "store", *given)
+    assert f"--scene {tmp_path / 'a.npy'} --wavelengths {words} --weights" in ended.err
+
+
 def test_a_run_of_the_rig_is_reprocessed_from_its_raw_cubes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights: Path
 ) -> None:
