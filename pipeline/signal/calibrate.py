@@ -237,11 +237,11 @@ def _judged(raw: NDArray[np.integer[Any]], references: References | Elements) ->
 def find_bad_elements(dark: NDArray[np.floating], white: NDArray[np.floating]) -> Bools:
     """Find unreliable elements (sample, band) of the detector from mean dark and white frames [DN].
 
-    An element is bad if a frame is not finite there, if its dark level is above those of its band (hot), or if it
-    hardly responds although its neighbours do (dead). So is one whose response differs from its neighbours in the band
-    by more than its column does in most bands (odd). Dust on the slit darkens a column in all bands and is no fault,
-    since the white frame corrects it. Nor is a slope, as at the slit's ends. Responses are not judged where the
-    neighbours see no light.
+    An element is bad if a frame is not finite there, or if its dark level is above those of its band (hot). So is one
+    that hardly responds although its neighbours do (dead). An odd element differs from its neighbours in the band by
+    more than its column does in most bands. Dust on the slit darkens a column in all bands and is no fault, since the
+    white frame corrects it. Nor is a slope, as at the slit's ends. Responses are not judged where the neighbours see no
+    light.
 
     Spreads are medians of absolute deviations. With fewer than 7 samples no element is odd. A frame of one sample has
     bad elements only where it is not finite.
