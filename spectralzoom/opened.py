@@ -76,6 +76,8 @@ class OpenedArchive(Mapping[str, "OpenedRun"]):
 
     def __getitem__(self, name: str) -> OpenedRun:
         folders = {folder.name: folder for folder in self._archive.runs()}
+        if not isinstance(name, str):
+            raise NoRunError(f"a run is named by text, got {name!r}")
         if not folders:
             raise ArchiveError(f"{self.name} has no published run; survey into it first")
         called = next(reversed(folders)) if name == LATEST else name.removeprefix("runs/").rstrip("/")

@@ -41,7 +41,7 @@ else:
 Asked = str | Path | Mapping[str, Any] | None  # a settings file, a table of settings, or keywords alone
 Told = Callable[[str, float, float], None]
 USUAL = {"engine": "plain"}  # a Prefect server starts only on request
-FILES = ("out", "init", "train_temporal")
+FILES = ("out", "start", "train_temporal")
 
 
 def survey(settings: Asked = None, *, progress: Told | None = None, quiet: bool = True, **flags: Any) -> OpenedRun:
@@ -121,6 +121,8 @@ def evaluate(dataset: str | Path | OpenedRun, *, progress: Told | None = None, *
         A value or a file is not valid.
     """
     if isinstance(dataset, OpenedRun):
+        if wrong := sorted(set(flags) - {"labels", "controls"}):
+            raise SettingsError(f"evaluate of a run has no {wrong[0]!r}; it has controls, labels")
         return _judge(dataset, progress, **flags)
     if "weights" not in flags:
         raise SettingsError("evaluate needs weights=FILE to judge them on a data set, or a run to judge its map")
@@ -176,8 +178,15 @@ def _by_key(table: Mapping[str, Any]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name, value in table.items():
         inner = {f"{name}.{key}": one for key, one in value.items()} if isinstance(value, Mapping) else {name: value}
-        found |= {key: str(one) if isinstance(one, Path) else one for key, one in inner.items()}
+        found |= {key: _plain(one) for key, one in inner.items()}
     return found
+
+
+def _plain(value: Any) -> Any:
+    """Return paths as text, and NumPy's numbers and arrays and ranges as Python's."""
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return str(value) if isinstance(value, Path) else list(value) if isinstance(value, range) else value
 
 
 @contextmanager

@@ -120,7 +120,8 @@ def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: Prio
         pixels = patch_index.repeat(p, axis=0).repeat(p, axis=1)[: run.grid.height, : run.grid.width]
         layers.append(MapLayer("Captured again", layer_address(pixels[thin], table), opacity=0.6))
     counts = class_counts(shown.class_map, len(shown.class_names))
-    covered = np.append(counts, shown.class_map.size - counts.sum()) / max(shown.class_map.size, 1)
+    beyond = 1 - counts.sum() / max(shown.class_map.size, 1)  # of the field; classes are of what has one, as in tables
+    covered = np.append(counts / max(counts.sum(), 1), beyond)
     rows = [
         {
             "name": name.replace("_", " "),

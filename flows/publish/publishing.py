@@ -83,6 +83,7 @@ def _clear_raw(plan: OpenSurvey, run: RunRef) -> RunRef:
     archive, passes = plan.run.archive, [plan.products[name] for name in PASSES if name in plan.products]
     if not plan.products.signals or any(archive.find(raw.stage, raw.key) is None for raw in passes):
         return run  # cleared before
+    archive.refresh()
     catalogue = Catalogue.read(archive.root)
     others = [one for raw in passes for one in catalogue.named_by(raw.uri) if not is_outlived(one, archive.now())]
     kept = f"{others[0].uri} keeps them" if others else None
@@ -102,6 +103,7 @@ def _clear_first_mosaic(plan: OpenSurvey) -> None:
     archive, first = plan.run.archive, plan.products.get("rectify")
     if first is None or "rectify_fine" not in plan.products or plan.registers:  # fine sweeps are registered on it
         return
+    archive.refresh()
     if not any(run.products.get("mosaic", "").startswith(first.uri) for run in Catalogue.read(archive.root).runs):
         archive.clear(first, wait=False)
 

@@ -36,6 +36,7 @@ from storage.arrays.quicklooks import choose_bands, develop, stretch
 Box = tuple[int, int, int, int]
 HEAT_ALPHA = 0.72  # of scores over the field
 TITLE_LETTERS = 7.5  # to an inch of a line
+MOST_LETTERS = 60  # of a class in the legend
 
 
 @dataclass(frozen=True)
@@ -216,7 +217,7 @@ def _draw_legend(figure: Figure, data: QuicklookData, columns: int) -> None:
     fractions = counts / max(int(counts.sum()), 1)
     marks = [Patch(facecolor=tuple(colour), edgecolor="#555555", linewidth=0.6) for colour in palette]
     words = zip(data.class_names, map(format_percent, fractions), strict=True)
-    names = [f"{name.replace('_', ' ')}  {fraction}" for name, fraction in words]
+    names = [f"{name.replace('_', ' ')[:MOST_LETTERS]}  {fraction}" for name, fraction in words]
     others = [data.class_map] if data.truth is None else [data.class_map, data.truth]
     if any((image == UNLABELLED).any() for image in others):
         marks.append(Patch(facecolor=UNLABELLED_COLOUR, edgecolor="#555555", linewidth=0.6))

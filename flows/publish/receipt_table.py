@@ -326,7 +326,7 @@ _SHOWN: Mapping[str, tuple[str, Sequence[str]]] = {
         "prior map",
         (
             *("run", "days", "shift_px", "turned_deg", "put_aside", "agreement"),
-            *("differing_px", "expected_differing_px", "changed_px"),
+            *("compared_px", "differing_px", "expected_differing_px", "changed_px"),
         ),
     ),
     "unknown": ("unknown", ("fraction", "rate")),

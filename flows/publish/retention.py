@@ -7,7 +7,7 @@ them. A killed process leaves each store complete or cleared.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 
 from flows.settings.values import parse_keep, raw_days
@@ -33,11 +33,12 @@ class RawClearance:
 
 @dataclass(frozen=True)
 class OutlivedLines:
-    """Expired raw lines, the store condensed from them, and the reason."""
+    """Expired raw lines, the store condensed from them, the reason, and what keeps them all the same."""
 
     raw: Store
     signal: Store
     why: str
+    stay: str | None
 
 
 def clear_raw_lines(
@@ -48,13 +49,15 @@ def clear_raw_lines(
     Every line is compared first; lines that differ or cannot be read stay. With ``dry_run`` nothing is compared or
     removed. Raises ArchiveError: the disk refuses.
     """
-    found = list(outlived_lines(Catalogue.read(archive.root), archive.now()))
+    archive.refresh()
+    expired = list(outlived_lines(Catalogue.read(archive.root), archive.now()))
+    found = [one for one in expired if one.stay is None]
+    done = RawClearance(kept={one.raw.ref.uri: one.stay for one in expired if one.stay is not None})
     if dry_run:
-        return RawClearance([_removal(one) for one in found])
-    done = RawClearance()
+        return replace(done, removals=[_removal(one) for one in found])
     with archive.in_use(alone=True) as alone:
         if not alone:
-            return RawClearance(obstacle=IN_USE if found else None)
+            return replace(done, obstacle=IN_USE if found else None)
         for number, one in enumerate(found):
             if progress is not None:
                 progress(one.raw.ref.uri, number / len(found))
@@ -78,13 +81,14 @@ def outlived_lines(catalogue: Catalogue, now: datetime) -> Iterator[OutlivedLine
             if raw is None or signal is None or raw.ref.uri in found:
                 continue
             runs = catalogue.named_by(raw.ref.uri)
-            condensed = (
-                raw.ref.uri in catalogue.inputs_of(signal.ref.uri) and PRESENT.get(signal.ref.stage) == signal.version
-            )
+            condensed = raw.ref.uri in catalogue.inputs_of(signal.ref.uri)
             if condensed and all(is_outlived(one, now) for one in runs):
                 found.add(raw.ref.uri)
                 keeps = sorted({str(one.settings["keep"]) for one in runs})
-                yield OutlivedLines(raw, signal, f"keep = {', '.join(keeps)}, and they were condensed")
+                stage, present = signal.ref.stage, PRESENT.get(signal.ref.stage)
+                old = f"they were condensed by version {signal.version} of {stage}, now {present}: run reprocess"
+                stay = None if present == signal.version else old
+                yield OutlivedLines(raw, signal, f"keep = {', '.join(keeps)}, and they were condensed", stay)
 
 
 def _whole(catalogue: Catalogue, run: Run, product: str) -> Store | None:
@@ -101,7 +105,7 @@ def is_outlived(run: Run, now: datetime) -> bool:
     except (KeyError, ValueError):
         return False
     made = made if made.tzinfo else made.replace(tzinfo=UTC)
-    return run.problem is None and (now - made).total_seconds() >= days * DAY_S
+    return run.problem is None and (days <= 0 or (now - made).total_seconds() >= days * DAY_S)
 
 
 def _removal(one: OutlivedLines) -> Removal:

@@ -171,8 +171,8 @@ class Settings:
     )
     scene: str = stated(
         "farm",
-        "Scene: farm or scouting (built in; with a seed: farm@2), or a file: PNG, JPEG, BMP, GeoTIFF, .npy, .npz, .mat,"
-        " ENVI, Zarr. Patterns for repeated visits: {date:%Y-%m-%d}.tif, {new}.tif (newest file that was not surveyed)",
+        "Scene: farm or scouting (built in; --seed gives another), or a file: PNG, JPEG, BMP, GeoTIFF, .npy, .npz,"
+        " .mat, ENVI, Zarr. Patterns for repeated visits: {date:%Y-%m-%d}.tif, {new}.tif (newest one not yet surveyed)",
     )
     labels: str | None = stated(
         None, "Label image on the scene's pixels (class colours or numbers); enables accuracy", example="labels.png"
@@ -283,7 +283,7 @@ class Settings:
     unknown: Unknown = stated(
         "auto",
         "Label out-of-distribution pixels `unknown`: auto (false-alarm rate 0.1% if the weights have a detector; off"
-        " in a zoomed survey), off, or a false-alarm rate: 0.5%",
+        " in a zoomed survey and for rasters), off, or a false-alarm rate: 0.5%",
     )
     seed: int = stated(0, "Random seed of built-in scenes and of all noise", "", 0, 2**63 - 1)
     effects: Effects = stated(
@@ -388,9 +388,10 @@ class Settings:
     def unknown_rate(self) -> float | None:
         """Return the false-alarm rate of the class unknown; None where it is off.
 
-        Detectors do not know merged passes: their false-alarm rate is 13 to 20 times the asked one there.
+        Detectors do not know merged passes: their false-alarm rate is 13 to 20 times the asked one there. Nor do they
+        know pixels without a camera, of rasters, which are rougher than those of the simulated rig.
         """
-        usual = {UNKNOWN_AUTO: None if self.zooms else RATE, UNKNOWN_OFF: None}
+        usual = {UNKNOWN_AUTO: None if self.zooms or self.is_map else RATE, UNKNOWN_OFF: None}
         return usual[self.unknown] if self.unknown in usual else float(self.unknown.removesuffix("%")) / 100
 
     @property

@@ -7,6 +7,7 @@ import hashlib
 import json
 import math
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -243,7 +244,9 @@ def linear_discriminants(pixels: LabelledPixels, classes: int) -> dict[str, Tens
     weight, bias = np.zeros((classes, pixels.features.shape[1])), np.full(classes, ABSENT)
     known = np.unique(pixels.labels)
     if len(known) > 1:
-        fitted = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto").fit(pixels.features, pixels.labels)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Only one sample available", UserWarning)  # of a class of one pixel
+            fitted = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto").fit(pixels.features, pixels.labels)
         slope, offset = fitted.coef_, fitted.intercept_
         if len(known) == 2:  # one function separates both
             slope, offset = np.concatenate([0 * slope, slope]), np.concatenate([0 * offset, offset])
@@ -298,7 +301,7 @@ def train(
         trainer.resume(checkpoint, identity)
     kept = time.monotonic()
     while (done := trainer.done) < 1:
-        trainer.step(done)
+        trainer.step(done if trainer.course.step else 0.0)  # the first learning rate does not depend on the clock
         report(Progress(trainer.course.step, settings.steps, done, trainer.course.loss))
         if checkpoint is not None and time.monotonic() - kept >= keep_every_s:
             trainer.keep(checkpoint, identity)

@@ -147,14 +147,14 @@ def interlaced_paths(
 ) -> list[PlacedSweep]:
     """Find where sweeps of several passes lie: each by itself, and together where lines lie between others.
 
-    Sweeps of one swath whose lines fill the same even positions make runs of closer lines. The mosaic takes the
-    closest lines that reach a pixel (`pipeline.rectify.mosaic`).
+    Sweeps of one swath whose lines fill the same even positions make runs of closer lines. A sweep that repeats lines
+    of the first pass lies by itself. The mosaic takes the closest lines that reach a pixel (`pipeline.rectify.mosaic`).
     """
     placed, swaths = list[PlacedSweep](), dict[tuple[str, float], list[SweepPath]]()
     for one in sorted(paths, key=lambda path: path.lines.sweep.kind != "coarse"):
         sweep = one.lines.sweep
         same = swaths.get((sweep.along, sweep.swath_px))
-        if sweep.kind != "coarse" and same is not None:
+        if sweep.kind != "coarse" and same is not None and not _shares_lines(sweep, same[0].lines.sweep):
             same.append(one)
             continue
         placed.append(one.placed(camera, grid))
@@ -163,6 +163,10 @@ def interlaced_paths(
     for same in swaths.values():
         placed += _runs(same, camera, grid)
     return placed
+
+
+def _shares_lines(sweep: Sweep, other: Sweep) -> bool:
+    return bool(np.isin(sweep.line_px().round(3), other.line_px().round(3)).any())
 
 
 def _runs(paths: Sequence[SweepPath], camera: LineCamera, grid: PixelGrid | None) -> list[PlacedSweep]:

@@ -416,6 +416,9 @@ class Archive:
             self._spooled += bytes_below(self.root / "spool" / key)
             remove_tree(self.root / "spool" / key)
 
+    def refresh(self) -> None:
+        """Read again which runs there are; in a folder nothing has to be fetched for that."""
+
     def take_spooled(self) -> int:
         """Return the bytes of the spools removed since the last call."""
         taken, self._spooled = self._spooled, 0

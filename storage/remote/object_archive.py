@@ -164,11 +164,17 @@ class ObjectArchive(Archive):
             draft.send = send
         return draft
 
+    def refresh(self) -> None:
+        """Fetch the manifests and receipts of runs that other machines have published or extended."""
+        self._mirror_runs()
+
     def send_runs(self) -> None:
-        """Upload runs and extensions of runs that a killed command has left in the working copy."""
+        """Upload runs and extensions of runs that a killed command has left; remove those that others removed."""
         there = _manifests(self.objects.listing("runs"))
         for uri in (f"runs/{folder.name}" for folder in self.runs() if try_manifest(folder)[1] is None):
-            if uri not in there:
+            if uri not in there and self._sent(uri).exists():
+                retire(self.root / uri)
+            elif uri not in there:
                 self._ensure(read_run(self.root / uri).names)
                 self._upload(uri, first=True)
             elif not self._is_dated(uri, there[uri]):
@@ -315,6 +321,13 @@ class ObjectArchive(Archive):
                 retire(folder)
                 made.rename(folder)
             sync_path(folder.parent)
+            if uri.startswith("runs/"):
+                self._sent(uri).parent.mkdir(exist_ok=True)
+                self._sent(uri).touch()
+
+    def _sent(self, uri: str) -> Path:
+        """Return the file that says that a run was in the bucket."""
+        return self.root / ".sent" / uri.removeprefix("runs/")
 
     @contextmanager
     def _aside(self) -> Iterator[Path]:
@@ -370,8 +383,14 @@ class ObjectArchive(Archive):
         waiting = [name for name, one in files.items() if sizes.get(f"{place}/{name}") != one["size"]]
         some_at_a_time(lambda name: objects.write(f"{place}/{name}", folder / name), waiting)
         if not first:
+            standing = objects.read(f"{uri}/{MANIFEST_NAME}") or b""
+            known = {hashlib.sha256(text).hexdigest(), *manifests_before(read_manifest(folder))}
+            if uri.startswith("runs/") and standing and hashlib.sha256(standing).hexdigest() not in known:
+                self._find(uri)  # another machine has extended it meanwhile
+                return
             objects.write(f"{uri}/{MANIFEST_NAME}", text)
-            objects.remove([path for path in there if ATTEMPT.fullmatch(path) and not path.startswith(f"{place}/")])
+            if (before := _files_at(uri, standing)) != place:
+                objects.remove([path for path in there if path.startswith(f"{before}/")])
         elif not objects.create(f"{uri}/{MANIFEST_NAME}", text):
             self._find(uri)  # another writer was first, or the answer to this put was lost
             return
@@ -468,7 +487,9 @@ def open_object_archive(text: str | Path, *, create: bool = True, write: bool = 
             remove_tree(old)
     if write:
         archive.send_runs()
-    if not create:
+    if create:
+        archive.refresh()
+    else:
         archive.mirror()
     return archive
 

@@ -80,6 +80,7 @@ def test_runs_are_found_by_name_and_the_latest_comes_first(run: OpenedRun, tmp_p
     assert archive[f"runs/{run.name}"].receipt == run.receipt
     with pytest.raises(KeyError, match=r"its latest are .*29990101"):
         archive.runs["no-such"]
+    assert 0 not in archive.runs
     assert issubclass(NoRunError, spectralzoom.Error)
 
 
@@ -167,6 +168,7 @@ def test_weights_are_trained_and_judged(tmp_path: Path) -> None:
         data, tmp_path / "mine.safetensors", steps=2, hold_out=["003"], validation=0, **small, progress=told
     )
     assert made == tmp_path / "mine.safetensors"
+    spectralzoom.train(data, tmp_path / "more.safetensors", steps=1, start=str(made), hold_out=["003"], **small)
     quick = {"fractions": [0.25], "policies": ["entropy"], "draws": 10}
     scores = spectralzoom.evaluate(data, weights=made, **quick, progress=told)
     assert scores["frames"] == ["003"]
@@ -186,6 +188,10 @@ def test_what_cannot_be_is_one_error(make_weights: WeightsMaker, tmp_path: Path)
         spectralzoom.evaluate("farm")
     with pytest.raises(spectralzoom.Error, match="evaluate has no 'fraction'"):
         spectralzoom.evaluate("farm", weights=make_weights(), fraction=[0.1])
+    with pytest.raises(spectralzoom.Error, match="evaluate of a run has no 'weights'; it has controls, labels"):
+        spectralzoom.evaluate(object.__new__(OpenedRun), weights="x")
+    with pytest.raises(spectralzoom.Error, match=r"seed must be .* got -3"):
+        spectralzoom.survey(seed=np.int64(-3), out=out)
     with pytest.raises(AttributeError, match="it has Error"):
         _ = spectralzoom.surveys
     assert not out.exists()

@@ -42,7 +42,7 @@ from storage.arrays.class_maps import load_class_map
 from storage.readers.scene_files import RasterPixels
 
 RECORD = "accuracy.json"
-ACCURACY = Product("evaluate", version=15, files=(RECORD,), by_weights=True)
+ACCURACY = Product("evaluate", version=16, files=(RECORD,), by_weights=True)
 
 
 @stage("evaluate", "accuracy, after publication", ACCURACY)
@@ -76,12 +76,13 @@ def evaluate(
         counts = confusion(judged, drawn.classes, len(drawn.names))  # includes the class unknown
         result: dict[str, Any] = map_figures(names, counts) | {"confusion": counts.tolist()}
         readings, scores = gains.work.readings(image, gains.capture, in_full=controls, report=report)
-        result["none"] = map_figures(names, confusion(judged, readings[0], len(names)))
+        readings = np.where(drawn.classes == len(names), drawn.classes, readings)  # unknown in all
+        result["none"] = map_figures(names, confusion(judged, readings[0], len(drawn.names)))
         result |= {"all": {"miou": None, "per_class_iou": {}}, "gap_closed": None, "controls": {}}
         if controls:
             patches = read_in_full(attention, class_map) if chooses else None
             scene = ReadTwice(readings[0], readings[1], scores, judged, gains.frame.grid)
-            fraction, found = control_placements(gains, scene, len(names), patches, seed=seed)
+            fraction, found = control_placements(gains, scene, len(drawn.names), patches, seed=seed)
             figures = map_figures(names, found["all"][0])
             gap = gap_closed(result["miou"], result["none"]["miou"], figures["miou"])
             compared = {"controls": placement_figures(found), "controls_fraction": fraction}

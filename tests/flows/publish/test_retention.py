@@ -117,8 +117,22 @@ def test_what_a_killed_survey_did_not_clear_goes(
     archive = Archive.open(tmp_path / "archive")
     there = raw_uris(archive)
     assert there
+    monkeypatch.setattr(Archive, "now", lambda self: datetime.now(UTC) - timedelta(minutes=2))  # a bucket's clock
     assert {one.uri for one in clear_raw_lines(archive).removals} == there
     assert raw_uris(archive) == set()
+
+
+@pytest.mark.usefixtures("later")
+def test_lines_of_an_older_signal_stay_and_say_so(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They cannot be compared with a signal of an earlier version; reprocess makes it anew."""
+    there = raw_uris(archive)
+    monkeypatch.setattr("flows.publish.retention.PRESENT", {"condense": "99", "condense_fine": "99"})
+    for dry_run in (True, False):
+        done = clear_raw_lines(archive, dry_run=dry_run)
+        assert done.removals == []
+        assert done.kept.keys() == there
+        assert all("now 99: run reprocess" in why for why in done.kept.values())
+    assert raw_uris(archive) == there
 
 
 @pytest.mark.usefixtures("later")

@@ -77,6 +77,14 @@ def test_later_lines_and_those_of_the_first_pass_are_one_sweep(step: int) -> Non
     assert run.sweep.exposure_ms == pytest.approx(1 / np.where(first, 1 / 50.0, 1 / 100.0).mean())
 
 
+def test_lines_that_repeat_those_of_the_first_pass_are_a_sweep_of_their_own() -> None:
+    """As after pointing errors, which registration then takes off each by itself."""
+    lines = [PlaceLines(sweep) for sweep in (*FIRST, *lines_between([RUN], []))]
+    placed = interlaced_paths(sweep_paths(lines, CAMERA), CAMERA)
+    assert [(one.lines.sweep.kind, one.lines.sweep.step) for one in placed] == [("coarse", 4), ("fine", 1)]
+    assert placed[1].lines.sweep.lines == RUN.lines
+
+
 def test_the_closest_lines_take_a_pixel() -> None:
     """Pixels within the run are of its lines, all others of the first pass."""
     lines = [PlaceLines(sweep) for sweep in (*FIRST, *lines_between([RUN], FIRST))]

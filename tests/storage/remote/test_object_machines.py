@@ -19,6 +19,7 @@ pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
 
 from pipeline.errors import ArchiveError, IncompleteStoreError
 from storage.archive.archive import Archive
+from storage.archive.lineage import Catalogue
 from storage.maintenance.garbage import clear_up
 from storage.readers.recordings import open_recording
 from storage.remote import object_archive
@@ -58,6 +59,57 @@ def test_gc_counts_runs_that_others_published_since_it_was_opened(machine: Machi
     small_survey(archive)
     assert clear_up(opened, keep_days=0).removals == ()
     assert problems(archive) == []
+
+
+def test_a_survey_sees_runs_of_other_machines(machine: Machine) -> None:
+    """Those that were there when it opened the archive, and after a refresh those that came since."""
+    archive = machine(FIRST)
+    runs = [small_survey(archive).run.name]
+    opened = machine(SECOND)
+    assert [folder.name for folder in opened.runs()] == runs
+    runs.append(small_survey(archive, seed=1).run.name)
+    opened.refresh()
+    assert {run.uri for run in Catalogue.read(opened.root).runs} == {f"runs/{name}" for name in runs}
+
+
+def test_a_run_that_was_removed_elsewhere_goes(machine: Machine) -> None:
+    """It is neither uploaded again nor in the way of the next command."""
+    archive = machine(FIRST)
+    folder = small_survey(archive).run
+    assert len(machine(SECOND, create=False).runs()) == 1
+    archive.drop_run(f"runs/{folder.name}")
+    for name in (FIRST, SECOND):
+        assert machine(name).runs() == []
+    assert problems(archive) == []
+
+
+def test_two_machines_that_extend_a_run_at_once_leave_it_whole(
+    machine: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second finds that the manifest is not the one that it extended, and takes the first's."""
+    archives = machine(FIRST), machine(SECOND)
+    name = small_survey(archives[0]).run.name
+    archives[1].refresh()
+    write, done = Objects.write, list[bool]()
+
+    def extend(archive: Archive, content: str) -> None:
+        draft = archive.extend_run(name)
+        assert draft is not None
+        with draft:
+            draft.write_file("note.txt", content)
+            draft.publish(survey="farm")
+
+    def first_goes_between(self: Objects, path: str, content: Any) -> None:
+        write(self, path, content)
+        if self is archives[1].objects and path.endswith("note.txt") and not done:
+            done.append(True)
+            extend(archives[0], "first")
+
+    monkeypatch.setattr(Objects, "write", first_goes_between)
+    extend(archives[1], "second")
+    assert problems(archives[0]) == []
+    for archive in archives:
+        assert archive.locate(f"runs/{name}/note.txt").read_text() == "first"
 
 
 def test_what_was_cleared_away_elsewhere_is_made_again(machine: Machine) -> None:
