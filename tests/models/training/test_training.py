@@ -183,6 +183,14 @@ def test_discriminants_of_absent_classes_are_out_of_reach():
     assert (logits[:, 1] == -20).all()
 
 
+def test_a_class_of_one_pixel_has_discriminants() -> None:
+    """Without a warning of the library."""
+    features = np.random.default_rng(1).normal(size=(40, 3)).astype(np.float32)
+    labels = np.repeat([0, 1, 2], [20, 19, 1]).astype(np.uint8)
+    start = linear_discriminants(LabelledPixels(features, labels), 3)
+    assert all(torch.isfinite(one).all() for one in start.values())
+
+
 def test_discriminants_do_not_rely_on_the_light() -> None:
     """A feature that tells classes at one brightness alone has little weight; one that brightness leaves has all."""
     rng, labels = np.random.default_rng(0), np.repeat(np.array([0, 1], np.uint8), 500)
