@@ -154,19 +154,17 @@ def interlaced_paths(
     for one in sorted(paths, key=lambda path: path.lines.sweep.kind != "coarse"):
         sweep = one.lines.sweep
         same = swaths.get((sweep.along, sweep.swath_px))
-        if sweep.kind != "coarse" and same is not None and not _shares_lines(sweep, same[0].lines.sweep):
-            same.append(one)
-            continue
+        if sweep.kind != "coarse" and same is not None:
+            first_px, px = (path.lines.sweep.line_px().round(3) for path in (same[0], one))
+            if not np.isin(px, first_px).any():
+                same.append(one)
+                continue
         placed.append(one.placed(camera, grid))
         if sweep.kind == "coarse" and sweep.held == 1:
             swaths[sweep.along, sweep.swath_px] = [one]
     for same in swaths.values():
         placed += _runs(same, camera, grid)
     return placed
-
-
-def _shares_lines(sweep: Sweep, other: Sweep) -> bool:
-    return bool(np.isin(sweep.line_px().round(3), other.line_px().round(3)).any())
 
 
 def _runs(paths: Sequence[SweepPath], camera: LineCamera, grid: PixelGrid | None) -> list[PlacedSweep]:
