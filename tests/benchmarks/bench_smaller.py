@@ -1,7 +1,7 @@
 """Ours with a part of the patches read in full, beside smaller networks that read everything, at equal multiply-adds.
 
 All are trained as long, from discriminants of their own, on the same farms in full light. Other farms judge them once.
-A step takes 1.3 s of one core, and 400 steps are too few (82.6 with everything): use a machine with an accelerator.
+A step takes 1 s of one core; with 400 steps everything scores 82.6, with 1200 89.9. An accelerator takes 15 minutes.
 `python tests/benchmarks/bench_smaller.py 20` trains for 20 steps in place of `STEPS`.
 """
 
@@ -31,7 +31,7 @@ from pipeline.geometry.grid import SceneGrid
 STEPS, TRAINED_ON, JUDGED = 3000, 24, 6  # steps, and farms
 Sizes = tuple[int, int, int]
 OURS: Sizes = (8, 20, 64)  # channels of the overview and of the full network, and the token width
-SMALLER: tuple[Sizes, ...] = ((8, 16, 64), (12, 12, 64), (10, 10, 64), (6, 12, 64), (6, 8, 48), (4, 8, 32))
+SMALLER: tuple[Sizes, ...] = ((8, 16, 64), (10, 10, 64), (6, 12, 64), (12, 12, 64), (6, 8, 48), (4, 8, 32))
 TODAY = 78_000  # multiply-adds a pixel of version d779c059, to which goals refer
 GRID = SceneGrid(512, 640, 16, 1)
 PATCHES = int(np.prod(GRID.patch_shape))
