@@ -49,7 +49,7 @@ from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.grid import patch_pixels
 from pipeline.planning.fine_pass import FinePlan
 from pipeline.planning.prices import SavingEntry, capture_savings
-from pipeline.planning.uniform_scans import format_scan
+from pipeline.planning.uniform_scans import MIOU, format_scan
 from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table
 from storage.archive.records import read_run
@@ -175,9 +175,11 @@ def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str) -> Receipt:
     for name in LIBRARIES:
         with suppress(PackageNotFoundError):  # run from a source tree that is not installed
             versions[name] = version(name)
+    most_s = run.plan.coarse_s + plan.seconds + 1e-6
+    in_time = [one for one in run.scans.offered if one.seconds <= most_s]
     scans = {
         "taken": run.scans.chosen,
-        "best_in_time": run.scans.best_within(run.plan.coarse_s + plan.seconds),
+        "best_in_time": max(in_time, key=lambda one: one.expected[MIOU], default=None),
         "reference": run.scans.reference,
     }  # where there is a table
     return build_receipt(

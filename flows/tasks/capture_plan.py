@@ -184,11 +184,6 @@ class ScanChoice:
     offered: tuple[UniformScan, ...] = ()  # empty without a table
     chosen: UniformScan | None = None  # None of two passes, or beyond the table
 
-    def best_within(self, seconds: float) -> UniformScan | None:
-        """Return the scan with the highest expected mIoU within a time; None where there is none."""
-        within = [one for one in self.offered if one.seconds <= seconds + 1e-6]
-        return max(within, key=lambda one: one.expected[MIOU], default=None)
-
     @property
     def reference(self) -> UniformScan | None:
         """Return the reference: the cheapest scan that is nearly as good as the best; None without a table."""

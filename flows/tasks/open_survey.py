@@ -201,14 +201,12 @@ class OpenSurvey:
 def rig_turn(observer: Observer) -> Iterator[None]:
     """Wait for Prefect's limit ``rig`` and hold it; signals are handled between tries."""
     with ExitStack() as held:
-        waits = True
-        while waits:
+        while True:
             try:
-                limit = prefect_concurrency.concurrency(
-                    RIG_LIMIT, occupy=1, lease_duration=LEASE_S, timeout_seconds=TRY_S
+                held.enter_context(
+                    prefect_concurrency.concurrency(RIG_LIMIT, occupy=1, lease_duration=LEASE_S, timeout_seconds=TRY_S)
                 )
-                held.enter_context(limit)
-                waits = False
+                break
             except TimeoutError:
                 observer.note(f"waits for the rig: another survey has it, or was killed less than {LEASE_S} s ago")
         yield

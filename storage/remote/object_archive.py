@@ -169,10 +169,13 @@ class ObjectArchive(Archive):
         self._mirror_runs()
 
     def send_runs(self) -> None:
-        """Upload runs and extensions of runs that a killed command has left; remove those that others removed."""
+        """Upload runs and extensions of runs that a killed command has left in the working copy.
+
+        A run of which there is only the receipt here was removed by another machine, and goes.
+        """
         there = _manifests(self.objects.listing("runs"))
         for uri in (f"runs/{folder.name}" for folder in self.runs() if try_manifest(folder)[1] is None):
-            if uri not in there and self._sent(uri).exists():
+            if uri not in there and self._lacks(uri, read_manifest(self.root / uri)):
                 retire(self.root / uri)
             elif uri not in there:
                 self._ensure(read_run(self.root / uri).names)
@@ -321,13 +324,6 @@ class ObjectArchive(Archive):
                 retire(folder)
                 made.rename(folder)
             sync_path(folder.parent)
-            if uri.startswith("runs/"):
-                self._sent(uri).parent.mkdir(exist_ok=True)
-                self._sent(uri).touch()
-
-    def _sent(self, uri: str) -> Path:
-        """Return the file that says that a run was in the bucket."""
-        return self.root / ".sent" / uri.removeprefix("runs/")
 
     @contextmanager
     def _aside(self) -> Iterator[Path]:

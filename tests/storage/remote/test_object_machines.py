@@ -61,6 +61,15 @@ def test_gc_counts_runs_that_others_published_since_it_was_opened(machine: Machi
     assert problems(archive) == []
 
 
+def extend(archive: Archive, name: str, content: str) -> None:
+    """Add a note to a run."""
+    draft = archive.extend_run(name)
+    assert draft is not None
+    with draft:
+        draft.write_file("note.txt", content)
+        draft.publish(survey="farm")
+
+
 def test_a_survey_sees_runs_of_other_machines(machine: Machine) -> None:
     """Those that were there when it opened the archive, and after a refresh those that came since."""
     archive = machine(FIRST)
@@ -76,6 +85,7 @@ def test_a_run_that_was_removed_elsewhere_goes(machine: Machine) -> None:
     """It is neither uploaded again nor in the way of the next command."""
     archive = machine(FIRST)
     folder = small_survey(archive).run
+    extend(archive, folder.name, "of more files than the receipt")
     assert len(machine(SECOND, create=False).runs()) == 1
     archive.drop_run(f"runs/{folder.name}")
     for name in (FIRST, SECOND):
@@ -92,21 +102,14 @@ def test_two_machines_that_extend_a_run_at_once_leave_it_whole(
     archives[1].refresh()
     write, done = Objects.write, list[bool]()
 
-    def extend(archive: Archive, content: str) -> None:
-        draft = archive.extend_run(name)
-        assert draft is not None
-        with draft:
-            draft.write_file("note.txt", content)
-            draft.publish(survey="farm")
-
     def first_goes_between(self: Objects, path: str, content: Any) -> None:
         write(self, path, content)
         if self is archives[1].objects and path.endswith("note.txt") and not done:
             done.append(True)
-            extend(archives[0], "first")
+            extend(archives[0], name, "first")
 
     monkeypatch.setattr(Objects, "write", first_goes_between)
-    extend(archives[1], "second")
+    extend(archives[1], name, "second")
     assert problems(archives[0]) == []
     for archive in archives:
         assert archive.locate(f"runs/{name}/note.txt").read_text() == "first"

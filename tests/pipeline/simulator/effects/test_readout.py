@@ -127,6 +127,7 @@ def test_the_mean_dark_frame_is_that_of_many_lines(dark_dn: float, exposure_ms: 
     fine = expected < 4000
     sd = np.sqrt((expected - dark_dn) * 5 + 400) / 5 / 8
     assert np.abs((mean - expected) / sd)[fine].max() < 5.5
+    assert abs((mean - expected)[fine].mean()) < 0.05
 
 
 def test_an_ideal_sensor_is_silent() -> None:
