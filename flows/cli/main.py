@@ -42,7 +42,8 @@ def _run(arguments: list[str]) -> int:
         return error.exit_code
     except KeyboardInterrupt as error:
         what, code = ("terminated", TERMINATED) if isinstance(error, Terminated) else ("interrupted", INTERRUPTED)
-        resume = "; run the same command to resume" if next(iter(arguments), "") in GOES_ON else ""
+        resumes = next(iter(arguments), "") in GOES_ON and not any("train-temporal" in word for word in arguments)
+        resume = "; run the same command to resume" if resumes else ""
         stderr.print(f"{what}{resume}", highlight=False)
         return code
     except BrokenPipeError:

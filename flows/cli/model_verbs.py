@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,7 +16,7 @@ from flows.cli.app import AsJson, OutFile, OutFolder, parse_numbers, parse_whole
 from flows.evaluate.command import run_evaluate
 from flows.evaluate.frames import FRACTIONS, USUAL, EvaluateRequest
 from flows.terminal.progress import print_json
-from flows.training.train import CROPS_PX, asked_command, run_train
+from flows.training.train import CROPS_PX, asked_command, check_counts, run_train
 from flows.training.train_scenes import TrainRequest
 from flows.training.train_temporal import JUDGED_LANDS, LANDS, TemporalRequest, run_remember
 from models.evaluation.metrics import DRAWS
@@ -88,8 +89,8 @@ class TrainFlags(SceneFlags):
         theirs, and DATASET must contain the scenes that they know. The result is the mean of both networks.
     train_temporal
         Weights to which only a temporal reader is added, for surveys with --prior. The training starts from the
-        reader that they have. It takes --scenes, --steps, --minutes, --seed and --validation, and resumes. It needs
-        4 GB of memory, and half an hour for reading the scenes besides --minutes.
+        reader that they have. It takes --scenes, --steps, --minutes, --seed and --validation; it does not resume. It
+        needs 4 GB of memory, and half an hour for reading the scenes besides --minutes.
     dim
         Token width of the transformer.
     layers
@@ -239,13 +240,26 @@ def train(dataset: str, *, out: OutFile, flags: TrainFlags = NO_TRAIN_FLAGS, as_
 
 def run_training(dataset: str, out: Path, flags: TrainFlags, command: str, console: Console) -> dict[str, Any]:
     """Train weights, or only the temporal reader of given ones; return the record."""
-    if flags.train_temporal is not None:
-        how = TemporalTraining(flags.minutes, flags.steps, flags.seed)
-        lands = LANDS if flags.scenes is None else flags.scenes
-        judged = JUDGED_LANDS if flags.validation is None else flags.validation
-        request = TemporalRequest(dataset, flags.train_temporal, out, lands, judged, settings=how, command=command)
-        return run_remember(request, console)
-    return run_train(flags.request(dataset, out, command), console)
+    request = flags.request(dataset, out, command)
+    if flags.train_temporal is None:
+        return run_train(request, console)
+    check_counts(request)
+    check_default(flags, OF_TEMPORAL, "not for --train-temporal")
+    how = TemporalTraining(flags.minutes, flags.steps, flags.seed)
+    lands = LANDS if flags.scenes is None else flags.scenes
+    judged = JUDGED_LANDS if flags.validation is None else flags.validation
+    reader = TemporalRequest(dataset, flags.train_temporal, out, lands, judged, settings=how, command=command)
+    return run_remember(reader, console)
+
+
+OF_TEMPORAL = ("train_temporal", "scenes", "steps", "minutes", "seed", "validation")
+
+
+def check_default(flags: SceneFlags, but: Sequence[str], why: str) -> None:
+    """Raise SettingsError where a flag has another value than its default, ``but`` for some."""
+    for one in fields(flags):
+        if one.name not in but and getattr(flags, one.name) != one.default:
+            raise SettingsError(f"--{one.name.replace('_', '-')} is {why}; leave it out")
 
 
 def evaluate(
@@ -265,12 +279,7 @@ def evaluate(
     """
     address = _run_address(dataset, run, weights=bool(flags.weights))
     if address is not None:
-        for one in fields(flags):
-            if one.name not in ("labels", "controls") and getattr(flags, one.name) != one.default:
-                raise SettingsError(
-                    f"--{one.name.replace('_', '-')} is for weights that are judged on a data set, not for a run; leave"
-                    " it out"
-                )
+        check_default(flags, ("labels", "controls"), "for weights that are judged on a data set, not for a run")
         receipt = run_judge(*address, stderr, controls=flags.controls, labels=flags.labels)
         if as_json:
             print_json(receipt)

@@ -16,7 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.tasks.scene import check_labels, judged_labels, seen_in_training
-from flows.training.data import TrainingData, alike_notes, farm_test_data, only_class, open_training_data, scene_notes
+from flows.training.data import (
+    TrainingData,
+    alike_notes,
+    farm_test_data,
+    listed_scenes,
+    only_class,
+    open_training_data,
+    scene_notes,
+)
 from flows.training.observed_scenes import observe_scene
 from models.evaluation.metrics import DRAWS
 from models.network.machine import PROCESSOR
@@ -103,6 +111,11 @@ class Candidate:
         """Return the training, validation and held-out scenes of the record."""
         split: dict[str, Any] = self.described.record.get("split", {})
         return split
+
+    def validated_on(self, scene: RasterScene) -> bool:
+        """Return whether the scene was one for validation; files of before 2026-11-26 do not tell its content."""
+        known = self.split.get("validation", ())
+        return isinstance(known, dict) and scene.clear_key in known.values()
 
 
 @dataclass(frozen=True)
@@ -194,7 +207,7 @@ def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[
     SettingsError: weights were trained on different pixels of a frame.
     """
     frames, left_out, labelled = dict[str, tuple[int, ...]](), list[str](), False
-    alike, empty, regridded = dict[str, str](), list[str](), list[str]()
+    alike, empty, regridded, validated = dict[str, str](), list[str](), list[str](), list[str]()
     in_turn = len({tuple(one.split.get("held_out", ())) for one in weights}) > 1
     for number, name in enumerate(data.train):
         show("looking for frames", number / len(data.train), name)
@@ -214,10 +227,7 @@ def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[
         fit = [
             at
             for at, one in enumerate(weights)
-            if seen_in_training(scene, one.described) != "all"
-            and not (
-                in_turn and one.described.record.get("data") == data.law and name in one.split.get("validation", ())
-            )
+            if seen_in_training(scene, one.described) != "all" and not (in_turn and one.validated_on(scene))
         ]
         if not fit:
             left_out.append(name)
@@ -230,6 +240,8 @@ def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[
                     "separately"
                 )
         frames[name] = tuple(fit)
+        if any(weights[at].validated_on(scene) for at in fit):
+            validated.append(name)
         if scene.regridded:
             regridded.append(name)
         labels = judged_labels(scene, first.described)
@@ -243,4 +255,10 @@ def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[
         )
     if not labelled:
         raise SceneError(f"no labelled pixel is left on the {len(frames)} frames of {request.dataset} to judge by")
-    return Jobs(frames, left_out, (*alike_notes(alike), *scene_notes(empty, regridded)))
+    notes = [*alike_notes(alike), *scene_notes(empty, regridded)]
+    if validated:
+        notes.append(
+            f"the training chose reading, calibration and thresholds by {listed_scenes(validated)}: scores of these"
+            " validation frames may be too good; --frames names others"
+        )
+    return Jobs(frames, left_out, tuple(notes))

@@ -91,7 +91,8 @@ class Figures:
 class Tradeoff:
     """Define the measurement of one stage. Only ``run`` is timed.
 
-    Functions take the state that ``prepare`` returns for a seed, then a setting, then the result of ``run``.
+    Functions take the state that ``prepare`` returns for a seed, then a setting, then the result of ``run``. A state
+    may have ``notes`` on its reference.
     """
 
     stage: str
@@ -160,7 +161,7 @@ def measure_tradeoff(tradeoff: Tradeoff, *, repeats: int | None = None, seed: in
         tradeoff.knob,
         tradeoff.error,
         tradeoff.cost,
-        tradeoff.reference,
+        "; ".join((tradeoff.reference, *getattr(state, "notes", ()))),
         repeats,
         seed,
         machine,

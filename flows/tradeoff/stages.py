@@ -19,6 +19,7 @@ from flows.settings.load import load_settings
 from flows.settings.survey_settings import RASTER, Settings
 from flows.tasks.patch_budget import ReadingCosts
 from flows.tasks.run import SurveyRun, open_run
+from flows.tasks.scene import check_labels
 from flows.tasks.stages.accuracy import columns_of_raster, columns_of_sweeps
 from flows.tradeoff.entries import Figures, Setting, Tradeoff
 from flows.tradeoff.store import STORE
@@ -222,6 +223,7 @@ class PlannedField:
     labels: NDArray[np.uint8]
     costs: ReadingCosts
     passes: Mapping[Setting, PlannedPass]
+    notes: tuple[str, ...] = ()  # on the labels
 
     def read(self, plan: Setting) -> DrawnMap:
         """Return the class map of a plan; the overview is read anew, whose time counts."""
@@ -282,7 +284,7 @@ def plan_every_way(seed: int, scene: str | None = None, weights: Path | None = N
         columns = whole.columns[np.searchsorted(whole.patch_index, kept)]
         passes[words] = replace(whole, patch_index=kept, columns=columns)
     assert run.labels is not None
-    return PlannedField(run.labels, run.costs, passes)
+    return PlannedField(run.labels, run.costs, passes, check_labels(run.scene, run.described))
 
 
 SURVEY = Tradeoff(
@@ -321,7 +323,7 @@ def plan_every_fraction(seed: int, scene: str | None = None, weights: Path | Non
     passes: dict[Setting, PlannedPass] = {
         one: PlannedPass(coarse, index, columns[index], run.weights) for one, index in chosen.items()
     }
-    return PlannedField(run.labels, run.costs, passes)
+    return PlannedField(run.labels, run.costs, passes, check_labels(run.scene, run.described))
 
 
 SEGMENT = Tradeoff(

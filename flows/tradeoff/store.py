@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.settings.survey_settings import SignalChoice
-from flows.tasks.scene import judged_labels
+from flows.tasks.scene import check_labels, judged_labels
 from flows.tasks.stages.accuracy import columns_of_raster, columns_of_sweeps
 from flows.tasks.stages.condense import with_shared_directions
 from flows.tasks.survey_model import shipped_weights
@@ -107,6 +107,7 @@ class ScanLines:
     sigma: Values  # deviation of the noise of a value, as large or (band,)
     noise_dn: NDArray[np.float64]  # (band,) of raw numbers, on average
     miou: Callable[[Values], float]  # NaN without labels
+    notes: tuple[str, ...] = ()  # on the labels
 
     def judge(self, _setting: Setting, stored: KeptLines) -> Figures:
         """Compare restored scene values with the truth: root mean square, means of blocks, and the map."""
@@ -174,6 +175,8 @@ def scan_raster(path: str, weights_path: Path | None) -> ScanLines:
     statistics.add(values, np.ones(values.shape[:2], np.bool_))
     noise = find_components(statistics, false_alarm=choice.false_alarm, least=choice.least).noise
     known = np.where(np.isfinite(noise) & (noise > 0), noise, 1.0)
+    scene = scene_of_file(file, LineCamera())
+    notes = () if weights_path is None else check_labels(scene, describe_weights(weights_path))
 
     def miou(restored: Values) -> float:
         """Read the pixels where they are."""
@@ -183,12 +186,12 @@ def scan_raster(path: str, weights_path: Path | None) -> ScanLines:
         grid = SceneGrid(*file.shape, weights.config.patch, 1)
         raster = RasterPixels(lambda first, last: restored[first:last].copy(), file.missing, restored.shape[2], grid)
         columns = columns_of_raster(raster, weights, file.wavelength_nm, memory=4 * MEMORY)
-        labels = judged_labels(scene_of_file(file, LineCamera()), describe_weights(weights_path))
+        labels = judged_labels(scene, describe_weights(weights_path))
         assert labels is not None
         return _miou(weights, columns, grid, labels, LineSpec())
 
     sigma = known.astype(np.float32)
-    return ScanLines(lines, LineCamera(bits=16), file.wavelength_nm, values, values, sigma, known, miou)
+    return ScanLines(lines, LineCamera(bits=16), file.wavelength_nm, values, values, sigma, known, miou, notes)
 
 
 def _unit_references(shape: tuple[int, ...]) -> References:

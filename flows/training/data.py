@@ -364,8 +364,16 @@ def pack_mask(mask: NDArray[np.bool_]) -> str:
 
 def unpack_mask(text: str, shape: tuple[int, int]) -> NDArray[np.bool_]:
     """Decode a mask of `pack_mask`."""
-    bits = np.frombuffer(zlib.decompress(base64.b64decode(text)), np.uint8)
-    return np.unpackbits(bits, count=shape[0] * shape[1]).reshape(shape).astype(bool)
+    return np.unpackbits(_packed_bits(text), count=shape[0] * shape[1]).reshape(shape).astype(bool)
+
+
+def masks_contain(mask: str, other: str | None) -> bool:
+    """Return whether a mask of `pack_mask` contains all pixels of another one of its scene; None: every pixel."""
+    return other is not None and not (_packed_bits(other) & ~_packed_bits(mask)).any()
+
+
+def _packed_bits(text: str) -> NDArray[np.uint8]:
+    return np.frombuffer(zlib.decompress(base64.b64decode(text)), np.uint8)
 
 
 def only_class(scene: RasterScene) -> str | None:

@@ -14,7 +14,7 @@ import numpy as np
 from rich.console import Console
 
 from flows.terminal.progress import one_after_the_other, table
-from flows.training.data import Report, TrainingData, open_training_data
+from flows.training.data import Report, masks_contain, open_training_data
 from flows.training.figures import (
     FEW_PIXELS,
     better_reading,
@@ -31,7 +31,7 @@ from models.network.machine import PROCESSOR, choose_device
 from models.network.spectral import Normalisation
 from models.training.capture_augmentation import REFERENCE_MS
 from models.training.examples import measured_normalisation
-from models.training.train import LabelledPixels, Progress, halfway, linear_discriminants, train
+from models.training.train import PIXELS, LabelledPixels, Progress, halfway, linear_discriminants, train
 from models.weights.checksummed_files import load_checkpoint
 from models.weights.files import (
     CALIBRATION,
@@ -73,10 +73,10 @@ def train_weights(
     if begun is None:
         normalisation = measured_normalisation(scenes.train.examples, math.sqrt(settings.darkest_ms * REFERENCE_MS))
     else:
-        check_start(request, begun, data, scenes)
+        check_start(request, begun, scenes)
         normalisation = begun.normalisation
     scenes = scenes.normalised(normalisation)
-    weights, training = _learned(request, scenes, normalisation, begun, checkpoint, report)
+    weights, training = _learned(request, scenes, normalisation, begun, checkpoint, device, report)
     trained = trained_on(data, scenes, settings.darkest_ms)
     record = {
         "command": request.command,
@@ -85,7 +85,7 @@ def train_weights(
         "split": {
             "train": scenes.train.keys,
             "content": scenes.train.content,
-            "validation": list(data.validation),
+            "validation": scenes.validation.keys,
             "held_out": list(data.held_out),
             "pixels": scenes.train.pixels,
         },
@@ -114,15 +114,17 @@ def train_weights(
     return record
 
 
-def check_start(request: TrainRequest, begun: Weights, data: TrainingData, scenes: Scenes) -> None:
+def check_start(request: TrainRequest, begun: Weights, scenes: Scenes) -> None:
     """Raise SettingsError unless a training can start from these weights.
 
-    Bands, classes and sizes must be theirs, and the data must contain the scenes that they know. So none of these
-    scenes judges the result, and the record names them all.
+    Bands, classes and sizes must be theirs, and the training must contain the pixels that they know, by the content of
+    the scenes. So none of these pixels judges the result, and the record names them all.
     """
-    split, common = begun.record.get("split", {}), scenes.common
+    split, common, now = begun.record.get("split", {}), scenes.common, scenes.train
+    known, masks = set(split.get("train", {}).values()), split.get("pixels", {})
     same = {
-        "training scenes": set(split.get("train", ())) <= set(data.train),
+        "training scenes": known <= set(now.keys.values()),
+        "training pixels": all(masks_contain(now.pixels[key], masks.get(key)) for key in known & now.pixels.keys()),
         "bands": begun.basis == common.basis,
         "classes": begun.class_names == common.names,
         "sizes of the network": begun.config == network_config(request, common),
@@ -140,6 +142,7 @@ def _learned(
     normalisation: Normalisation,
     begun: Weights | None,
     checkpoint: Path,
+    device: str,
     report: Report,
 ) -> tuple[Weights, dict[str, Any]]:
     """Train the network; return weights, and their figures on the validation scenes for the record."""
@@ -148,7 +151,6 @@ def _learned(
         report("training", now.done, f"step {now.step}, loss {now.loss:.3f}")
 
     common, settings, examples = scenes.common, request.settings, scenes.train.examples
-    device = choose_device(request.device)
     config, seed = network_config(request, common), settings.seed
     rng = np.random.default_rng([0x1DA])
     augmentation = training_capture(normalisation, settings.darkest_ms)
@@ -185,7 +187,7 @@ def _learned(
 
 def run_train(request: TrainRequest, console: Console) -> dict[str, Any]:
     """Train with a progress bar on ``console``; print and return the record."""
-    _check_counts(request)
+    check_counts(request)
     request = replace(request, command=request.command or asked_command())
     with one_after_the_other(console) as report:
         record = train_weights(
@@ -195,7 +197,8 @@ def run_train(request: TrainRequest, console: Console) -> dict[str, Any]:
     return record
 
 
-def _check_counts(request: TrainRequest) -> None:
+def check_counts(request: TrainRequest) -> None:
+    """Raise SettingsError for a count or size that is not positive, or an exposure beyond the reference."""
     settings = request.settings
     counts = {
         "--steps": settings.steps,
@@ -234,10 +237,14 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
     if "familiar" in record:
         console.print(record["familiar"], markup=False, soft_wrap=True)
     readings, figures = record["readings"], record["validation"]
-    scores = readings["miou"] | (record.get("baselines") or {})
-    beside = ", ".join(f"{name} {100 * miou:.1f}" for name, miou in scores.items())
-    words = f"mIoU of the whole scenes by each reading: {beside}; " if beside else ""
+    of_readings, of_baselines = (
+        ", ".join(f"{name} {100 * miou:.1f}" for name, miou in scores.items())
+        for scores in (readings["miou"], record.get("baselines") or {})
+    )
+    words = f"mIoU of the whole scenes by each reading: {of_readings}; " if of_readings else ""
     console.print(f"{words}kept: {readings['kept']}", soft_wrap=True)
+    if of_baselines:
+        console.print(f"on at most {PIXELS} of their pixels at full exposure: {of_baselines}", soft_wrap=True)
     if figures is None:
         left = built_in_laws(request.dataset) or request.hold_out or request.choices.get("train_mask") is not None
         on = request.dataset if left else "OTHER_SCENES"

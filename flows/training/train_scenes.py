@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flows.terminal.figures import counted
 from flows.training.data import (
     Report,
     TrainingData,
@@ -106,7 +107,7 @@ def observe_all(
         raise SceneError(
             f"{request.dataset} has no scene to train on: no value anywhere in {listed_scenes(data.train)}"
         )
-    _, validation = _imaged(request, data, data.validation, "imaging validation scenes", report, tell, common)
+    _, validation = _imaged(request, data, data.validation, "imaging validation scenes", report, tell, common, train)
     return Scenes(common, train, validation)
 
 
@@ -118,10 +119,15 @@ def _imaged(
     report: Report,
     tell: Callable[[str], None],
     common: Common | None = None,
+    trained: Imaged | None = None,
 ) -> tuple[Common | None, Imaged]:
-    """Image named scenes, and check that they have the bands and classes of earlier ones. Raises SceneError."""
+    """Image named scenes, and check that they have the bands and classes of earlier ones. Raises SceneError.
+
+    Beside ``trained`` scenes these are for validation: those without a label, or of a trained image, are left out.
+    """
     found, empty, regridded, alike = Imaged(), list[str](), list[str](), dict[str, str]()
-    stream = 0x0B5 if names == data.train else 0x0B6  # validation has noise of its own
+    unfit = list[str]()
+    stream = 0x0B5 if trained is None else 0x0B6  # validation has noise of its own
     for number, name in enumerate(names):
         report(what, number / len(names), name)
         try:
@@ -137,6 +143,9 @@ def _imaged(
             raise SceneError(
                 f"scene {scene.name} has other bands than the scenes before it; train on scenes of one camera"
             )
+        if trained is not None and (scene.key in trained.keys.values() or not mask.any()):
+            unfit.append(name)
+            continue
         found.keys[name] = scene.key
         found.content.extend(scene.content)
         if request.choices.get("train_mask") is not None:
@@ -149,10 +158,15 @@ def _imaged(
         rng = np.random.default_rng([request.settings.seed, stream, number])
         found.examples.append(observe_scene(scene, request.camera, grid, common.basis, rng))
     notes = alike_notes(alike)
-    if names == data.train and len(alike) == len(found.keys) and len(notes) == 1:
+    if trained is None and len(alike) == len(found.keys) and len(notes) == 1:
         raise SceneError(f"{request.dataset}: training needs two or more classes, and {notes[0]}")
     for note in (*notes, *scene_notes(empty, regridded)):
         tell(note)
+    if unfit:
+        tell(
+            f"{counted(len(unfit), 'validation scene')} left out, without a labelled pixel or with the image of a"
+            f" training scene: {listed_scenes(unfit)}"
+        )
     return common, found
 
 

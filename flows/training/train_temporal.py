@@ -111,7 +111,7 @@ def _moments(rng: np.random.Generator) -> list[tuple[int, float]]:
     """Draw days of the year with hours, in ascending order."""
     days = [int(rng.integers(*DAYS))]
     while len(days) < VISITS:
-        days.append(min(days[-1] + max(int(rng.choice(GAPS)), 0), LAST_DAY))
+        days.append(min(days[-1] + int(rng.choice(GAPS)), LAST_DAY))
     return sorted((day, float(rng.choice(HOURS))) for day in days)
 
 

@@ -5,6 +5,7 @@ Multiply-adds of the segmenter are counted by stage, in closed form.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 from numbers import Integral
@@ -121,15 +122,16 @@ def multiply_adds(
     basis = bands * config.columns
     rows, columns = (-(-size // TOKEN_PX) for size in grid.padded_shape)
     tokens, cell, p = rows * columns, TOKEN_PX**2, config.patch
-    inputs, drawn = config.columns + PLANES, (config.overview_width + config.columns) * config.classes
+    inputs, pixels = config.columns + PLANES, math.prod(grid.padded_shape)
     bottom = 2 * level_widths(config.overview_width, TOKEN_PX)[-1] * BOTTOM**2 * config.dim  # to a token and back
-    overview = cell * (basis + drawn) + _pyramid(inputs, config.overview_width, TOKEN_PX) + bottom
+    overview = cell * config.columns * config.classes + _pyramid(inputs, config.overview_width, TOKEN_PX) + bottom
+    drawn = pixels * (basis + config.overview_width * config.classes)
     patch = p * p * (apart * basis + config.width * config.classes) + _pyramid(
         inputs + config.overview_width, config.width, p
     )
     dim = config.dim  # tokens read each other: L ((4 + 2 r) d^2 N + 2 N^2 d)
     read = config.layers * ((4 + 2 * config.mlp_ratio) * dim * dim * tokens + 2 * tokens * tokens * dim)
-    return MultiplyAdds(tokens * overview + read, score, patches * patch)
+    return MultiplyAdds(tokens * overview + drawn + read, score, patches * patch)
 
 
 def _pyramid(inputs: int, width: int, size: int) -> int:

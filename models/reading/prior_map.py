@@ -192,12 +192,13 @@ def _ages(log_probability: Floats, age_days: Floats) -> Floats:
 def in_classes(log_probability: Floats, numbers: Sequence[int]) -> Floats:
     """Return log-probabilities (..., class) of other classes, given the present number of each; -1 is a new class.
 
-    A new class gets the probability of one class of a uniform distribution.
+    A new class gets the probability of one class of a uniform distribution. That of removed classes is spread over all
+    classes.
     """
-    new = [number < 0 for number in numbers]
-    taken = np.where(new, np.float32(-math.log(len(numbers))), log_probability[..., list(numbers)])
-    taken -= np.log(np.exp(taken).sum(axis=-1, keepdims=True))
-    found: Floats = np.where(np.isfinite(log_probability[..., :1]), taken, np.nan).astype(np.float32)
+    new, kept = np.array(numbers) < 0, np.exp(log_probability[..., list(numbers)])
+    removed = np.setdiff1d(np.arange(log_probability.shape[-1]), numbers)
+    spread = np.exp(log_probability[..., removed]).sum(axis=-1, keepdims=True) / len(numbers)
+    found: Floats = _normalised(np.log(np.where(new, 1 / len(numbers), kept) + spread)).astype(np.float32)
     return found
 
 

@@ -123,19 +123,18 @@ def map_loss(logits: Tensor, losses: Tensor, labels: Tensor, weight: Tensor, *, 
     return loss + 0.5 * (1 - 2 * both[present] / (size[present] + 1)).mean()
 
 
-def scoring_loss(score: Tensor, gain: Tensor, known: Tensor | None = None) -> Tensor:
+def scoring_loss(score: Tensor, gain: Tensor, known: Tensor) -> Tensor:
     """Return the loss of scores (B, K) against gains (B, K), in size and order.
 
     It is Huber's loss plus, with a fifth of the weight, that of pairs in the wrong order. Patches that are not
     ``known`` (B, K) have no label and are left out. Without a known one the loss and its gradient are 0.
     """
-    known_gain = torch.ones_like(score, dtype=torch.bool) if known is None else known
-    if not known_gain.any():
+    if not known.any():
         return score.sum() * 0.0
     gain = gain.clamp(-MOST_GAIN, MOST_GAIN)
-    size = F.smooth_l1_loss(score[known_gain], gain[known_gain], beta=HUBER_NAT)
+    size = F.smooth_l1_loss(score[known], gain[known], beta=HUBER_NAT)
     apart = gain[:, :, None] - gain[:, None, :]
-    pairs = (apart > 0) & known_gain[:, :, None] & known_gain[:, None, :]
+    pairs = (apart > 0) & known[:, :, None] & known[:, None, :]
     if not pairs.any():
         return size
     wrong = F.softplus((score[:, None, :] - score[:, :, None]) / RANK_NAT)

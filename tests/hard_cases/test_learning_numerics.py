@@ -111,8 +111,9 @@ def test_28_gains_are_signed_and_clipped(sign: int):
     """A gain of 100 nat, or a loss of as much, teaches the scorer no more than one of 5; its sign stays."""
     score = torch.tensor([[0.1, -0.2, 0.0]])
     wild, clipped = (torch.tensor([[0.05, -0.3, sign * most]]) for most in (100.0, MOST_GAIN))
-    assert torch.equal(scoring_loss(score, wild), scoring_loss(score, clipped))
+    known = torch.ones(1, 3, dtype=torch.bool)
+    assert torch.equal(scoring_loss(score, wild, known), scoring_loss(score, clipped, known))
     towards = score.clone().requires_grad_()
-    scoring_loss(towards, wild).backward()
+    scoring_loss(towards, wild, known).backward()
     assert towards.grad is not None
     assert towards.grad[0, 2] * sign < 0

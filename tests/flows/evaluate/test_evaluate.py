@@ -106,13 +106,14 @@ def test_folds_that_kept_frames_for_validation_are_one_seed(data: Path, tmp_path
     keys = {name: scene_at(data, name).key for name in FRAMES}
     paths = []
     for number, (kept, validated, trained) in enumerate((("001", "002", "003"), ("002", "001", "003"))):
-        split = {"train": {trained: keys[trained]}, "held_out": [kept], "validation": [validated]}
+        split = {"train": {trained: keys[trained]}, "held_out": [kept], "validation": {validated: keys[validated]}}
         paths.append(write_weights(tmp_path / f"{number}.safetensors", number, data="field", split=split))
     content = evaluate_weights(EvaluateRequest(str(data), tuple(paths), **QUICK))
     assert [one["covers"] for one in content["weights"]] == [["001"], ["002"]]
     assert content["seeds"] == [["0.safetensors", "1.safetensors"]]
     alone = evaluate_weights(EvaluateRequest(str(data), (paths[0],), **QUICK))
     assert alone["frames"] == ["001", "002"]
+    assert "thresholds by 002: scores of these" in " ".join(alone["data_notes"])
 
 
 def test_files_that_leave_different_pixels_are_not_compared(data: Path, tmp_path: Path):

@@ -166,7 +166,7 @@ def test_validation_scenes_have_noise_of_their_own(monkeypatch: pytest.MonkeyPat
         streams.append(rng.bit_generator.state["state"]["state"])
 
     monkeypatch.setattr("flows.training.train_scenes.observe_scene", imaged)
-    monkeypatch.setattr("flows.training.train_scenes.trained_pixels", lambda scene: None)
+    monkeypatch.setattr("flows.training.train_scenes.trained_pixels", lambda scene: np.ones(1, bool))
     monkeypatch.setattr("flows.training.train_scenes.only_class", lambda scene: None)
     data = open_training_data("farm", 2, 2, LineCamera())
     observe_all(TrainRequest("farm", Path()), data, lambda what, done, figure: None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from rich.console import Console
 
 from flows.cli.main import main
@@ -341,6 +343,58 @@ def test_a_training_cannot_go_on_from_another(folder: Path, out: Path, changed: 
     train_weights(_request(folder, out, validation=1))
     with pytest.raises(SettingsError, match=f"its training had other {what}; give its data set and options"):
         train_weights(_request(folder, out.with_name("b.safetensors"), **{"validation": 1, "start": out, **changed}))
+
+
+def test_a_training_cannot_go_on_with_other_scenes_of_the_same_names(folder: Path, out: Path, tmp_path: Path) -> None:
+    """Scenes are told by their content: else the first ones would judge a network that knows them."""
+    train_weights(_request(folder, out, validation=0))
+    other = write_field(tmp_path / "field", (16, 16), ("001", "002", "003", "004"), seed=9)
+    with pytest.raises(SettingsError, match="other training scenes"):
+        train_weights(_request(other, tmp_path / "b.safetensors", validation=0, start=out))
+
+
+@pytest.mark.parametrize(("rows", "held"), [(8, False), (12, True), (None, True)])
+def test_a_training_goes_on_with_all_pixels_that_it_had(
+    out: Path, tmp_path: Path, rows: int | None, held: bool
+) -> None:
+    """Another mask must contain the first one; without a mask every pixel is trained on."""
+    labels = np.random.default_rng(4).integers(1, 3, (16, 16)).astype(np.uint8)
+    np.save(tmp_path / "cube.npy", (labels[..., None] * np.ones(4)).astype(np.float32))
+    np.save(tmp_path / "labels.npy", labels)
+
+    def asked(rows: slice | None, out: Path, **more: Path) -> TrainRequest:
+        given = {"labels": str(tmp_path / "labels.npy"), "wavelengths": [500, 600, 700, 800]}
+        if rows is not None:
+            mask = np.zeros_like(labels)
+            mask[rows] = labels[rows]
+            np.save(tmp_path / "mask.npy", mask)
+            given["train_mask"] = str(tmp_path / "mask.npy")
+        return _request(tmp_path / "cube.npy", out, validation=0, choices=given, **more)
+
+    train_weights(asked(slice(2, 10), out))
+    again = asked(None if rows is None else slice(rows), tmp_path / "b.safetensors", start=out)
+    if held:
+        train_weights(again)
+    else:
+        with pytest.raises(SettingsError, match="other training pixels"):
+            train_weights(again)
+
+
+@pytest.mark.parametrize("unfit", ["copy", "unlabelled"])
+def test_scenes_that_cannot_validate_are_left_out(folder: Path, out: Path, tmp_path: Path, unfit: str) -> None:
+    """One without a label judges nothing, a copy of a training scene too well; without another one none is judged."""
+    field = tmp_path / "field"
+    shutil.copytree(folder, field)
+    if unfit == "copy":
+        shutil.copy(field / "images" / "002_image.png", field / "images" / "001_image.png")
+    else:
+        Image.fromarray(np.full((16, 16, 3), 9, np.uint8)).save(field / "annotations" / "001_annotation.png")
+        about = (field / "scene.toml").read_text()
+        (field / "scene.toml").write_text(f"unlabelled = [9, 9, 9]\n{about}")
+    notes: list[str] = []
+    record = train_weights(_request(field, out, validation=1), tell=notes.append)
+    assert any("1 validation scene left out" in note and note.endswith(": 001") for note in notes)
+    assert (record["validation"], record["split"]["validation"], len(record["split"]["train"])) == (None, {}, 3)
 
 
 @pytest.mark.parametrize("darkest_ms", [0.0, -1.0, 200.0, float("nan")])

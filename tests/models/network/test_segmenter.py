@@ -101,7 +101,7 @@ def test_a_scorer_learns_gains():
     for _ in range(200):
         features = F.interpolate(torch.randn(4, 8, 8, 8, generator=stream), scale_factor=4.0)
         gain = F.avg_pool2d(features[:, :1], 8).flatten(1)
-        loss = scoring_loss(scorer(features, features[:, :3]).flatten(1), gain)
+        loss = scoring_loss(scorer(features, features[:, :3]).flatten(1), gain, torch.ones_like(gain, dtype=torch.bool))
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()

@@ -23,16 +23,17 @@ def _attention(q: Any, k: Any, v: Any, *args: Any, out_shape: Any = None, **kwar
     ("sizes", "patch_index"),
     [({"patch": 16}, 7), ({"patch": 8, "overview_width": 12}, 1), ({"patch": 32, "dim": 32, "layers": 1}, 3)],
 )
-def test_closed_form_equals_the_counter(sizes: dict[str, int], patch_index: int) -> None:
+@pytest.mark.parametrize("width", [96, 104])  # with patches of 8 px, a part of the last tokens
+def test_closed_form_equals_the_counter(sizes: dict[str, int], patch_index: int, width: int) -> None:
     """The closed form counts just what torch counts while the model runs."""
     config = SegmenterConfig(classes=5, columns=6, **sizes)
-    model, image = Segmenter(config).eval(), torch.zeros(1, 6 + PLANES, 64, 96)
+    grid = SceneGrid(64, width, config.patch, 1)
+    model, image = Segmenter(config).eval(), torch.zeros(1, 6 + PLANES, *grid.padded_shape)
     counter = FlopCounterMode(
         display=False, custom_mapping={torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: _attention}
     )
     with torch.inference_mode(), counter:
         model(image, image, torch.arange(patch_index)[None], torch.zeros(1, 2))
-    grid = SceneGrid(64, 96, config.patch, 1)
     assert multiply_adds(config, grid, patch_index, 0).total == counter.get_total_flops() / 2
 
 

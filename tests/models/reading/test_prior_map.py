@@ -226,6 +226,14 @@ def test_classes_find_their_numbers(seed: int, order: list[int]) -> None:
     assert np.isnan(there[0, 0]).all()
 
 
+def test_a_removed_class_says_little_of_a_new_one() -> None:
+    """Where a class went that was almost certain, no other class is; without a removed one a new one is uniform."""
+    before = np.log(np.array([[[0.001, 0.001, 0.998]]], np.float32))
+    np.testing.assert_allclose(np.exp(in_classes(before, (0, 1, -1)))[0, 0], [0.25, 0.25, 0.5], atol=1e-3)
+    np.testing.assert_allclose(np.exp(in_classes(before, (0, 1)))[0, 0], [0.5, 0.5], atol=1e-6)
+    np.testing.assert_allclose(np.exp(in_classes(before, (2, 1, 0, -1)))[0, 0, 3], 0.25 / 1.25, atol=1e-6)
+
+
 def test_another_field_is_known_by_its_agreement() -> None:
     """The same field agrees with itself; one with its classes drawn anew is another; nothing in common says nothing."""
     rng = np.random.default_rng(11)
