@@ -16,7 +16,7 @@ from odc.geo.geobox import GeoBox
 from flows.publish.receipt import Receipt, check_receipt
 from flows.settings.survey_settings import RIG
 from flows.settings.visits import time_of_visit
-from flows.tasks.stages.maps import coarse_colours
+from flows.tasks.stages.maps import colours_of
 from pipeline.errors import IncompleteStoreError, SettingsError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.georeference import zoomed_out
@@ -220,7 +220,7 @@ def _picture(run: ExportedRun) -> Layer:
     image = CogImage(geobox, "uint8", RGB, 0, tags=layer_tags(run, "mosaic", geobox))
 
     def rows() -> Rows:
-        yield 0, np.nan_to_num(np.rint(coarse_colours(ref, None))).astype(np.uint8)
+        yield 0, np.nan_to_num(np.rint(colours_of(ref))).astype(np.uint8)
 
     return Layer("rgb", title, roles, image, rows)
 

@@ -82,6 +82,11 @@ def format_reference(receipt: Mapping[str, Any]) -> str:
         return "Reference: every pixel of the raster, segmented at full resolution."
     usual = f"{receipt['settings']['camera']['exposure_ms']:g} ms"
     words = f"Reference: every line at {usual}, kept as captured, every patch segmented at full resolution."
+    names = [stage["name"] for stage in receipt["stages"]]
+    if "capture_fine" in names:
+        between = receipt["stages"][names.index("capture_coarse") + 1 : names.index("capture_fine")]
+        if decided_s := sum(stage["wall_s"] or 0.0 for stage in between):
+            words += f" The decision between the passes took {format_seconds(decided_s)} more."
     if capture.get("uniform") is None:
         return words
     scan = f"{format_seconds(capture['uniform'])} ({capture['uniform_scan']})"

@@ -12,6 +12,7 @@ from datetime import UTC, datetime
 
 from flows.settings.values import parse_keep, raw_days
 from flows.tasks.stages.condense import SIGNAL, SIGNAL_FINE, raw_differs
+from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.camera import LineCamera
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
@@ -62,7 +63,11 @@ def clear_raw_lines(
             if progress is not None:
                 progress(one.raw.ref.uri, number / len(found))
             raw, signal = (archive.ref(store.ref.stage, store.ref.key) for store in (one.raw, one.signal))
-            others = (archive.find(raw.stage, key) for key in one.signal.inputs if key != raw.key)
+            try:
+                others = [archive.find(raw.stage, key) for key in one.signal.inputs if key != raw.key]
+            except IncompleteStoreError as error:
+                done.kept[raw.uri] = str(error)
+                continue
             passes = [raw, *(other for other in others if other is not None)]
             why = raw_differs(passes, signal, LineCamera(**one.signal.params["camera"]))
             if why is not None:

@@ -220,7 +220,7 @@ def _savings(
     if run.raster is not None:
         return _model_savings(run, read, memory)
     done = [*run.plan.coarse, *plan.sweeps]
-    entries = capture_savings(done, run.plan.full, run.camera, run.grid, cost=run.settings.cost)
+    entries = capture_savings(done, run.plan.full, run.camera, run.grid)
     capture = SavingEntry(run.plan.coarse_s + plan.seconds, run.plan.full_s).as_dict()
     if (uniform := run.scans.reference) is not None:  # the cheapest scan with nearly the best score
         capture |= {"uniform": uniform.seconds, "uniform_scan": uniform.words}
@@ -233,9 +233,9 @@ def _savings(
 
 def _model_savings(run: SurveyRun, read: NDArray[np.intp], memory: Mapping[str, Any] | None) -> dict[str, Any]:
     """Return the patches segmented at full resolution and the multiply-adds, against those of every patch."""
-    did, scan = run.work_done(read, memory), run.costs.of_map(run.grid.valid_patches())
+    did, scan = run.work_done(read, memory), run.costs.of_map(run.kept_patches)
     return {
-        "patches": SavingEntry(len(read), len(run.grid.valid_patches())).as_dict(),
+        "patches": SavingEntry(len(read), len(run.kept_patches)).as_dict(),
         "multiply_adds": {**SavingEntry(did.total, scan.total).as_dict(), **asdict(did)},
     }
 

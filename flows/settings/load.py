@@ -39,6 +39,7 @@ from flows.settings.survey_settings import (
 from flows.settings.values import EXTENT_PART, EXTENT_WHOLE, parse_moment, parse_text
 from flows.settings.visits import time_of_visit
 from pipeline.errors import BudgetError, PoseError, SettingsError
+from pipeline.planning.fine_pass import FIRST_STEPS
 from pipeline.rig.device_settings import MOST_PAIRS
 from pipeline.setting_fields import format_number, span_of
 from pipeline.simulator.scenes.built_in import SCOUTING_NAMES
@@ -431,6 +432,11 @@ def _extent_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str
 
 def _limit_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]:
     """Yield errors: limits of kept bytes or multiply-adds for a survey that has no use for them."""
+    if settings.zooms and settings.scan_step not in (None, *FIRST_STEPS):
+        yield (
+            f"{at('scan_step')} = {settings.scan_step} is the spacing of the first of two passes, which others halve: "
+            f"give {' or '.join(map(str, FIRST_STEPS))}, or leave it out"
+        )
     if settings.kept_bytes is not None and (settings.is_map or not settings.plain):
         yield f"{at('kept_bytes')} is for a uniform scan: give --seconds or --scan-step too, or leave it out"
     if settings.macs is None:

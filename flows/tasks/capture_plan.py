@@ -18,7 +18,7 @@ from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.errors import BudgetError, NotRecordedError, SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import Axis, CostModel, Sweep
+from pipeline.geometry.scan import Axis, CostModel, Sweep, exposing
 from pipeline.planning.coverage import cheapest_full, full_sweeps, sweeps_over, uniform_sweeps, with_margin
 from pipeline.planning.fine_pass import FIRST_STEP, FIRST_STEPS, every_nth, lines_between, merged_ms
 from pipeline.planning.partial_scans import sweeps_of_runs
@@ -119,13 +119,12 @@ class PassLayout:
         if limit_s is not None:
             fine_s = limit_s - coarse_s
             if fine_s < 0:
-                asked = (
-                    f"--seconds {seconds:g}" if budget is None else f"--budget {budget:g} gives {limit_s:.1f} s, which"
-                )
-                free = self.coarse_exposure_ms is None and self.recorded is None
+                limit = f"--seconds {seconds:g}" if budget is None else f"a --budget of {budget:g}, {limit_s:.1f} s,"
+                fixed = (self.cost.seconds([replace(one, lines=0) for one in coarse], self.camera)) if coarse else 0.0
+                free = self.coarse_exposure_ms is None and self.recorded is None and fixed < limit_s
                 shorter = ", a shorter --coarse-exposure-ms" if free else ""
                 raise BudgetError(
-                    f"{asked} is below the time of the first pass of every {self.first_step}th line, "
+                    f"{limit} is below the time of the first pass of every {self.first_step}th line, "
                     f"{coarse_s + 0.01:.2f} s of the full scan's {full_s:.1f} s; "
                     f"give more{shorter}, or take one uniform scan"
                 )
@@ -218,15 +217,17 @@ def choose_uniform_scan(
             raise SettingsError(f"--goal {name}={100 * goals[name]:g}: no class of the weights; give one of {known}")
     camera, cost = layout.camera, layout.cost
     sweeps: dict[int, list[Sweep]] = {}  # by line spacing; of a recording, those that its lines contain
-    taken_ms = None if layout.recorded is None else [camera.exposure_ms]
     for step in record.steps:
         with nullcontext() if layout.recorded is None else suppress(NotRecordedError):
             sweeps[step] = layout.uniform(step, layout.exposure_ms).sweeps()[1]
-    scans = uniform_scans(record, sweeps, camera, cost, bands, seconds=settings.seconds, exposures_ms=taken_ms)
-    chosen, exposure_ms = None, layout.exposure_ms or camera.exposure_ms
+    recorded_ms = None  # by line spacing: recorded lines have exposures of their own
+    if layout.recorded is not None:
+        recorded_ms = {step: exposing(camera, found[0]).exposure_ms for step, found in sweeps.items()}
+    scans = uniform_scans(record, sweeps, camera, cost, bands, seconds=settings.seconds, recorded_ms=recorded_ms)
+    chosen, exposure_ms = None, (recorded_ms or {}).get(layout.step or 0) or layout.exposure_ms or camera.exposure_ms
     if layout.extent != EXTENT_WHOLE:  # the table is for whole fields
         pass
-    elif layout.step in sweeps and layout.step in record.steps and record.knows(exposure_ms):
+    elif layout.step in sweeps and record.knows(exposure_ms):
         chosen = priced_scan(record, sweeps[layout.step], camera, cost, bands, exposure_ms)
     elif plain and layout.step is None:
         if not scans:
@@ -272,13 +273,14 @@ def lay_out_passes(
             settings = replace(settings, coarse_exposure_ms=exposure_ms)
         settings = replace(settings, scan_step=None if settings.budget is not None else layout.first_step)
         return layout, layout.plan(settings.budget, settings.seconds), settings, notes
-    if chosen is not None and layout.step is None:
+    if chosen is not None and (layout.step is None or (layout.recorded is not None and not layout.as_taken)):
         layout = replace(layout, step=chosen.step, exposure_ms=chosen.exposure_ms)
     settings = replace(settings, scan_step=layout.step, scan_exposure_ms=layout.exposure_ms)
     if layout.step is not None or settings.plain:
         return layout, layout.plan(None), settings, ()
     every = layout.uniform(1)
-    note = "every line is captured: the weights have no record of scans to choose by"
+    why = "have no record of scans to choose by" if content is None else "know no scan of this exposure or shorter"
+    note = f"every line is captured: the weights {why}"
     return every, every.plan(None), replace(settings, scan_step=1), (note,)
 
 

@@ -55,8 +55,8 @@ def opened_first(settings: Settings) -> Iterator[None]:
     watch(OPENING, "running", 0.0)
     try:
         run = open_run(settings)
-    except BaseException:
-        watch(OPENING, "failed", 1.0)
+    except BaseException as error:
+        watch(OPENING, "opened" if isinstance(error, NothingToMend) else "failed", 1.0)
         raise
     watch(OPENING, "opened", 1.0)
     before = _opened.set((settings, run))

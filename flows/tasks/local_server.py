@@ -14,11 +14,12 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from contextvars import copy_context
 from http.client import HTTPException
 from importlib import resources
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from flows.terminal.processes import place_pages
@@ -102,7 +103,10 @@ def local_server(home: Path, port: int = 0, *, schedules: bool = False) -> Itera
 def _using(home: Path, port: int, *, schedules: bool) -> Iterator[str]:
     """Configure clients and server of this process and its children for a server of this port."""
     password = password_in(home / "password") if schedules else f"spectralzoom:{secrets.token_urlsafe(24)}"
-    create_database(home / "prefect.db")
+    try:
+        create_database(home / "prefect.db")
+    except (sqlite3.Error, OSError) as error:
+        raise ServerUnavailable(f"the Prefect server has no database in {home} ({error})") from error
     services = {} if schedules else {f"PREFECT_SERVER_SERVICES_{name}_ENABLED": "false" for name in OF_SCHEDULES}
     api = f"http://{HOST}:{port}/api"
     wanted = {
@@ -158,13 +162,13 @@ def create_database(path: Path) -> None:
     schema = resources.files("flows.tasks").joinpath("prefect_schema.sql").read_text(encoding="utf-8")
     if path.exists() or f"Prefect {prefect.__version__}\n" not in schema:
         return
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
-    with sqlite3.connect(part) as made:
-        made.execute("PRAGMA page_size = 1024")  # small pages for 229 almost empty tables and indices
-        made.execute("PRAGMA journal_mode = WAL")
-        made.executescript(schema)
-    made.close()
-    part.replace(path)
+    with TemporaryDirectory(prefix=f"{path.name}-", dir=path.parent) as folder:
+        part = Path(folder) / path.name
+        with closing(sqlite3.connect(part)) as made:
+            made.execute("PRAGMA page_size = 1024")  # small pages for 229 almost empty tables and indices
+            made.execute("PRAGMA journal_mode = WAL")
+            made.executescript(schema)
+        part.replace(path)
 
 
 @contextmanager

@@ -50,7 +50,7 @@ from models.reading.regions import plan_regions
 from models.weights.checksummed_files import SEAL
 from models.weights.files import CASCADE, Description, OodPart, ReaderPart, Weights
 from pipeline.capture.recorded_passes import RecordedPasses
-from pipeline.errors import SceneError, SettingsError
+from pipeline.errors import NothingToMend, SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
@@ -382,8 +382,6 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     outside = beyond_training(settings, scene, described, model.trained_on, path)
     ood_detector = model.asked_ood(settings.unknown)
     name, found = settings.name or Path(scene.name).stem, None
-    if planning:  # also if a survey would be skipped
-        settings = replace(settings, skip_below_error=None)
     if settings.extent == EXTENT_PART:  # the prior map chooses the lines
         archive = open_archive(settings.out) if archive is None and is_archive(settings.out) else archive
         asked = (settings, name, grid, described.class_names, scene.key)
@@ -392,7 +390,14 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     planned = _PlannedCapture(settings)
     if pixels is None:
         prior = None if found is None else found[0]
-        planned = _plan_capture(settings, scene, zones, path, described, prior, passes)
+        try:
+            planned = _plan_capture(settings, scene, zones, path, described, prior, passes)
+        except NothingToMend as known:
+            if not planning:
+                raise
+            taken = replace(settings, skip_below_error=None)
+            planned = _plan_capture(taken, scene, zones, path, described, prior, passes)
+            notes = (*notes, f"a survey would skip this visit, {known}")
     settings, plan = planned.settings, planned.plan
     read = min(len(scene.wavelength_nm), SMOOTH)  # components of most mosaics; a few have more
     costs = ReadingCosts(described.config, grid, read)

@@ -24,10 +24,12 @@ from numpy.typing import NDArray
 
 from flows.tasks.prefect_tasks import as_task
 from models.network.machine import give_back_freed_memory
+from pipeline.errors import ArchiveError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.ground.georeference import georeference_record
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, array_digest, stage_key
+from storage.archive.manifests import try_manifest
 from storage.arrays.layout import AngularGrid
 
 if TYPE_CHECKING:
@@ -122,10 +124,25 @@ class Stage:
         return archive.find(self.product.name, self.key(wanted))
 
     def produce(self, archive: Archive, wanted: Wanted) -> tuple[StageRef, bool]:
-        """Find or build the requested store; return it, and whether it was built."""
+        """Find or build the requested store; return it, and whether it was built.
+
+        Raises ArchiveError: another survey has cleared an input meanwhile.
+        """
+
+        def build(folder: Path) -> None:
+            manifests = [archive.root / ref.uri for ref in wanted.inputs]
+            before = [try_manifest(one) for one in manifests]
+            try:
+                wanted.build(folder)
+            finally:  # a cleared array reads as nodata, or fails
+                if [try_manifest(one) for one in manifests] != before:
+                    raise ArchiveError(
+                        f"another survey has cleared an input of {self.name} meanwhile; repeat the command"
+                    )
+
         ref, built = archive.produce(
             self.product.name,
-            wanted.build,
+            build,
             version=self.product.version,
             params=wanted.params,
             inputs=[ref.key for ref in wanted.inputs],

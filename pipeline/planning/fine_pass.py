@@ -151,11 +151,12 @@ class SecondPass:
                     plans.append(self.plan(gain_of(step, mean_ms), step=step, exposure_ms=exposure_ms))
         plans = [plan for plan in plans if plan.seconds <= self.seconds]  # recorded lines may have longer exposures
         plan = max(plans, key=lambda made: (made.expected_gain, -made.seconds), default=None)
-        if plan is None or plan.expected_gain < LEAST_GAIN:
-            gain = 0.0 if plan is None else plan.expected_gain
-            reason = f"no second pass: its expected gain is {100 * gain:.2f} points"
-            return FinePlan([], np.empty(0, np.intp), 0.0, gain, reason=reason)
-        return plan
+        if plan is None or not plan.sweeps or plan.expected_gain >= LEAST_GAIN:
+            return plan or FinePlan(
+                [], np.empty(0, np.intp), 0.0, 0.0, reason="no lines that promise more fit the time"
+            )
+        reason = f"no second pass: its expected gain is {100 * plan.expected_gain:.2f} points"
+        return FinePlan([], np.empty(0, np.intp), 0.0, plan.expected_gain, reason=reason)
 
     @property
     def _between(self) -> Sequence[Sweep]:

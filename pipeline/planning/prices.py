@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pipeline.errors import BudgetError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import CostModel, Sweep
+from pipeline.geometry.scan import Sweep
 from pipeline.planning.coverage import on_scene
 
 BYTES_PER_SAMPLE = 2  # raw samples are uint16
@@ -72,11 +72,10 @@ def raw_bytes(sweeps: Sequence[Sweep], camera: LineCamera, bands: int) -> int:
 
 
 def capture_savings(
-    done: Sequence[Sweep], full: Sequence[Sweep], camera: LineCamera, grid: SceneGrid, *, cost: CostModel
+    done: Sequence[Sweep], full: Sequence[Sweep], camera: LineCamera, grid: SceneGrid
 ) -> dict[str, SavingEntry]:
-    """Compare sweeps with those of a full scan: lines, samples on the scene, seconds by the cost model."""
+    """Compare sweeps with those of a full scan: lines, and samples on the scene."""
     return {
         "lines": SavingEntry(sum(one.lines for one in done), sum(one.lines for one in full)),
         "samples": SavingEntry(count_samples(done, camera, grid), count_samples(full, camera, grid)),
-        "capture_s": SavingEntry(cost.seconds(list(done), camera), cost.seconds(list(full), camera)),
     }

@@ -108,19 +108,20 @@ def uniform_scans(
     bands: int,
     *,
     seconds: float | None = None,
-    exposures_ms: Sequence[float] | None = None,
+    recorded_ms: Mapping[int, float] | None = None,
 ) -> list[UniformScan]:
     """Return candidate scans of every step and many exposures, none longer than the camera's own.
 
     ``sweeps`` cover the field, by steps of the record, whatever their exposure. With ``seconds`` the longest exposure
-    of each step that ends in time is a candidate. With ``exposures_ms`` only those are tried that the record knows.
+    of each step that ends in time is a candidate. With ``recorded_ms``, exposures by step, only those are tried that
+    the record knows.
     """
     found = []
     shortest, longest = record.offered_ms(camera)
     for step in sweeps:
         tried = exposures_between(shortest, longest)
-        if exposures_ms is not None:
-            tried = [exposure_ms for exposure_ms in exposures_ms if record.knows(exposure_ms)]
+        if recorded_ms is not None:
+            tried = [recorded_ms[step]] if record.knows(recorded_ms[step]) else []
         elif seconds is not None and tried:
             last = longest_exposure(seconds, sweeps[step], camera, cost, shortest, longest)
             tried += [] if last is None else [last]

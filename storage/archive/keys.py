@@ -127,8 +127,11 @@ def published_runs(root: Path) -> list[Path]:
 
     Runs are sorted by the second in their names, then by the time at which they were written.
     """
-    folders = [path for path in (root / "runs").glob("*") if _is_published(path)]
-    ages = {path: (path / MANIFEST_NAME).lstat().st_mtime_ns for path in folders}
+    ages = dict[Path, int]()
+    for path in (root / "runs").glob("*"):
+        with suppress(FileNotFoundError):  # it goes meanwhile
+            if _is_published(path):
+                ages[path] = (path / MANIFEST_NAME).lstat().st_mtime_ns
     return sorted(ages, key=lambda folder: (folder.name[:SECOND], ages[folder], folder.name))
 
 
@@ -141,7 +144,8 @@ def without_manifest(root: Path) -> list[Path]:
     """Return folders without a manifest, and foreign files, that lie among stores and runs."""
     inside = [*root.glob("stages/*/*"), *root.glob("runs/*")]
     loose = [path for path in root.glob("stages/*") if not path.is_dir()]
-    return sorted(path for path in (*inside, *loose) if not path.name.endswith(PART_SUFFIX) and not _is_published(path))
+    foreign = (path for path in (*inside, *loose) if not path.name.endswith(PART_SUFFIX) and not _is_published(path))
+    return sorted(path for path in foreign if os.path.lexists(path))  # else it has gone meanwhile
 
 
 def in_text(text: str) -> str | None:

@@ -268,4 +268,7 @@ def scenes_of(catalogue: Catalogue, uri: str) -> set[str]:
 
 def _moment(store: Store) -> tuple[str, int]:
     """Return the time at which a store was published; the file's own date decides between equal times."""
-    return store.created, (store.ref.path / "manifest.json").stat().st_mtime_ns
+    try:
+        return store.created, (store.ref.path / "manifest.json").stat().st_mtime_ns
+    except FileNotFoundError:  # it goes meanwhile
+        return store.created, 0

@@ -12,7 +12,7 @@ import secrets
 import shutil
 import tomllib
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -140,8 +140,12 @@ def files_below(folder: Path) -> list[Path]:
 
 
 def bytes_below(folder: Path) -> int:
-    """Return the bytes of a folder's files, manifest included."""
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    """Return the bytes of a folder's files, manifest included; files that go meanwhile count as 0."""
+    total = 0
+    for path in folder.rglob("*"):
+        with suppress(FileNotFoundError):
+            total += path.stat().st_size if path.is_file() else 0
+    return total
 
 
 def file_hash(path: Path) -> str:

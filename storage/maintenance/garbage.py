@@ -105,7 +105,10 @@ def _spared(catalogue: Catalogue, named: set[str], keep_days: float, raw_too: bo
     for uri, store in catalogue.stores.items():
         if uri in named:
             continue
-        published = (store.ref.path / MANIFEST_NAME).stat().st_mtime  # or copied here
+        try:
+            published = (store.ref.path / MANIFEST_NAME).stat().st_mtime  # or copied here
+        except FileNotFoundError:
+            continue  # another process has removed it
         if now.timestamp() - published < keep_days * DAY_S:
             kept[uri] = f"younger than {keep_days:g} days"
         elif not raw_too and catalogue.is_only_copy(uri):

@@ -52,9 +52,9 @@ def verify_everything(
         if progress is not None:
             progress(uri, done / total)
         done += size
+        problems = list(read_again(path))
         if not path.exists() and not catalogue.named_by(uri):
             continue  # gc or a repair has cleared it away since
-        problems = list(read_again(path))
         found += [Finding(uri, problem, "broken") for problem in problems]
         if not problems:
             found.append(Finding(uri, None))
@@ -67,8 +67,9 @@ def _problems(folder: Path) -> Iterator[str]:
     if problem is not None:
         yield f"{MANIFEST_NAME} is damaged: {problem}"
         return
-    for name, problem in broken_files(folder, manifest, hashes=True):
-        yield f"{name} {problem}"
+    found = [f"{name} {problem}" for name, problem in broken_files(folder, manifest, hashes=True)]
+    changed = found and try_manifest(folder)[0] != manifest  # cleared meanwhile, or made anew
+    yield from _problems(folder) if changed else found
 
 
 def _without_manifest(root: Path) -> Iterator[Finding]:

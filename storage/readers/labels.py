@@ -268,8 +268,9 @@ def _index(
                 "write the colour of each class into [classes], or give labels of numbers"
             )
         others = f" (and {len(unknown) - 1} more such values)" if len(unknown) > 1 else ""
+        cure = MIXED if len(unknown) > _MANY_UNKNOWN else cure
         raise SceneError(
-            f"labels {where} have {count} px of {_shown(unknown[0], classes)}, which is no class{others}; {MIXED if len(unknown) > _MANY_UNKNOWN else cure}"
+            f"labels {where} have {count} px of {_shown(unknown[0], classes)}, which is no class{others}; {cure}"
         )
     index = np.array([table.get(int(value), UNLABELLED) for value in values], np.uint8)
     return index[inverse.reshape(codes.shape)]

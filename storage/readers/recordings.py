@@ -33,10 +33,11 @@ from pipeline.geometry.mirror import STRAIGHT, Mounting
 from pipeline.geometry.scan import Axis, Sweep
 from storage.archive.archive import Archive
 from storage.archive.keys import array_digest
-from storage.archive.manifests import manifest_sha256
+from storage.archive.manifests import check_files, manifest_sha256
 from storage.archive.records import Run, read_run, read_store
 from storage.archive.staging import MANIFEST_NAME
-from storage.arrays.layout import open_group
+from storage.arrays.cubes import RawCube
+from storage.arrays.layout import array_of, missing_files, open_group
 from storage.arrays.signal_cubes import RestoredCube, open_lines
 from storage.readers.cube_sources import CubeSource
 from storage.readers.envi_files import find_envi_pair, load_envi_header
@@ -148,11 +149,15 @@ def open_recording(
             raise SettingsError(
                 f"--{name} is for files, and {address} holds raw cubes, which have their own; leave --{name} out"
             )
+    for folder in {path.parent for path in stores if (path.parent / MANIFEST_NAME).is_file()}:
+        check_files(folder, hashes=False)
     cubes = [open_lines(path) for path in stores]
     first = cubes[0]
     for path, cube in zip(stores, cubes, strict=True):
         if not np.array_equal(cube.wavelength_nm, first.wavelength_nm):
             raise SceneError(f"{path} has other bands than {stores[0]}; name the raw cubes of one survey")
+        if isinstance(cube, RawCube) and (lost := missing_files(path / "dn", array_of(cube.group, "dn"))):
+            raise IncompleteStoreError(f"{path}/dn lacks {lost} of its files, whose lines would be 0; copy it again")
     sweeps = tuple(
         RecordedSweep(
             cube.sweep, cube.references, cube.position, cube.time_s, cube.exposure_ms, cube.valid_line, cube.read_lines

@@ -12,11 +12,12 @@ a working copy may be deleted while no process uses it.
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import re
 import secrets
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -46,6 +47,7 @@ MARK_TEXT = b'{"archive": "spectralzoom", "layout": 1}\n'
 ATTEMPT = re.compile(r"((?:stages/[^/]+|runs)/[^/]+)/([0-9a-f]{16})/.+")  # a file's address, and its upload
 ASIDE = ".fetch-"  # prefix of folders of the working copy for incomplete files
 DAY_S = 86400.0
+log = logging.getLogger(__name__)
 
 
 class ObjectArchive(Archive):
@@ -105,10 +107,10 @@ class ObjectArchive(Archive):
         """Remove one store here and in the bucket; see `Archive.discard`.
 
         Its manifest is removed first. An ``unnamed`` store is put back if a run that names it was published since this
-        archive was opened. Publishing a run looks for its stores after that.
+        archive was opened. Publishing a run looks for its stores after that, and puts back what it lacks; that stays.
         """
         manifest = f"{ref.uri}/{MANIFEST_NAME}"
-        standing = self.objects.read(manifest)
+        standing, there = self.objects.read(manifest), self.objects.listing(ref.uri)
         self.objects.remove([manifest])
         if unnamed:
             self._mirror_runs()
@@ -118,8 +120,10 @@ class ObjectArchive(Archive):
                 return False
         self._standing.pop(ref.uri, None)
         gone = super().discard(store_at(self.root, ref.stage, ref.key), wait=wait)
+        if gone and self.objects.read(manifest) is not None:
+            return False  # another machine has put it back, or made it anew
         if gone:
-            self.objects.remove(self.objects.listing(ref.uri))
+            self.objects.remove(path for path in there if path != manifest)
         elif standing is not None:
             self.objects.create(manifest, standing)
         return gone
@@ -171,15 +175,18 @@ class ObjectArchive(Archive):
     def send_runs(self) -> None:
         """Upload runs and extensions of runs that a killed command has left in the working copy.
 
-        A run of which there is only the receipt here was removed by another machine, and goes.
+        A run stays here alone while its stores are neither here nor in the bucket.
         """
         there = _manifests(self.objects.listing("runs"))
+        self._drop_removed((f"runs/{folder.name}" for folder in self.runs()), there)
         for uri in (f"runs/{folder.name}" for folder in self.runs() if try_manifest(folder)[1] is None):
-            if uri not in there and self._lacks(uri, read_manifest(self.root / uri)):
-                retire(self.root / uri)
-            elif uri not in there:
-                self._ensure(read_run(self.root / uri).names)
-                self._upload(uri, first=True)
+            if uri not in there:
+                try:
+                    self._ensure(read_run(self.root / uri).names)
+                except IncompleteStoreError as error:
+                    log.warning("%s is on this machine alone until its survey runs again: %s", uri, error)
+                else:
+                    self._upload(uri, first=True)
             elif not self._is_dated(uri, there[uri]):
                 standing = hashlib.sha256(self.objects.read(f"{uri}/{MANIFEST_NAME}") or b"").hexdigest()
                 if standing in manifests_before(read_manifest(self.root / uri)):  # something was added to it
@@ -188,20 +195,29 @@ class ObjectArchive(Archive):
     # --- the whole of it ----------------------------------------------------------------------------------------------
 
     def mirror(self) -> None:
-        """Fetch the manifests of all stores, and of runs the receipts too."""
+        """Fetch the manifests of all stores, and of runs the receipts too; drop those that other machines removed."""
         stages = [f"stages/{stage}" for stage in self.objects.children("stages")]
         found = [f"{folder}/{key}" for folder in stages for key in self.objects.children(folder)]
         with refusals(self.root, "write to the working copy"):
             some_at_a_time(self._bring, [uri for uri in found if not (self.root / uri / MANIFEST_NAME).is_file()])
+            self._drop_removed((ref.uri for ref in self.refs()), set(found))
             self._mirror_runs()
         self._later_runs.clear()
 
     def _mirror_runs(self) -> None:
-        """Fetch manifests and receipts of new and extended runs."""
+        """Fetch manifests and receipts of new and extended runs; drop those that other machines removed."""
         found = _manifests(self.objects.listing("runs"))
+        self._drop_removed((f"runs/{folder.name}" for folder in self.runs()), found)
         changed = [uri for uri, one in found.items() if not self._is_dated(uri, one)]
         some_at_a_time(self._bring, changed)
         self._later_runs |= {self.root / uri for uri in changed}
+
+    def _drop_removed(self, here: Iterable[str], there: Container[str]) -> None:
+        """Drop what is incomplete here and no longer in the bucket; what is complete may not have been sent yet."""
+        for uri in here:
+            manifest, problem = try_manifest(self.root / uri)
+            if uri not in there and problem is None and (is_cleared(manifest) or self._lacks(uri, manifest)):
+                retire(self.root / uri)
 
     def _bring(self, uri: str) -> None:
         with suppress(IncompleteStoreError):  # its reader says so

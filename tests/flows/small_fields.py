@@ -21,9 +21,7 @@ NAMES = ("soil", "crop")
 QUICK: dict[str, Any] = {"fractions": (0.25, 0.5), "policies": ("entropy", "random"), "draws": 20}
 
 
-def write_field(
-    root: Path, size: tuple[int, int] = (24, 40), names: Sequence[str] = FRAMES, *, seed: int = 0
-) -> Path:
+def write_field(root: Path, size: tuple[int, int] = (24, 40), names: Sequence[str] = FRAMES, *, seed: int = 0) -> Path:
     """Frames of two classes."""
     rng = np.random.default_rng(seed)
     for folder in ("images", "annotations"):

@@ -215,6 +215,9 @@ def test_a_repeated_run_has_its_reference(tmp_path: Path, survey_png: Survey, ma
     assert run.receipt["settings"]["coarse_exposure_ms"] < 100
     again = survey_sweeps(tmp_path / "again", run.folder).receipt
     assert again["recording"]["full_scan_s"] == run.receipt["savings"]["capture_s"]["full"]
+    scan = survey_sweeps(tmp_path / "scan", run.folder, seconds=15).receipt  # of shorter exposures
+    assert scan["scans"]["taken"]["seconds"] == pytest.approx(scan["savings"]["capture_s"]["done"])
+    assert scan["settings"]["scan_exposure_ms"] < 100
 
 
 def raw_cubes(full_scan: tuple[Path, Published, Path]) -> list[Path]:

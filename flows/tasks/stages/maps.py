@@ -213,7 +213,7 @@ def ground(
         """Write the map in blocks, then the area of each class."""
         found = load_class_map(class_map.path / "class_map.zarr")
         probabilities = ProbabilityStore(class_map.path / "class_probabilities.zarr")
-        colours = coarse_colours(mosaic, None)
+        colours = colours_of(mosaic)
         unsure, age_days, changes = np.isnan(found.confidence), probabilities.age(), probabilities.changes()
 
         def shown(pixels: NDArray[np.float64]) -> dict[str, NDArray[np.generic]]:
@@ -253,14 +253,11 @@ def ground(
     return Wanted(build, params, [class_map, mosaic])
 
 
-def coarse_colours(mosaic: StageRef, factor: int | None) -> NDArray[np.float32]:
-    """Return three bands of a mosaic as a picture (y, x, 3) in 1..255; NaN where nothing was captured.
-
-    Its pixels consist of ``factor`` x ``factor`` fine ones; None: pixels of the mosaic.
-    """
+def colours_of(mosaic: StageRef) -> NDArray[np.float32]:
+    """Return three bands of a mosaic as a picture (y, x, 3) in 1..255; NaN where nothing was captured."""
     seen = open_mosaic(mosaic.path / "mosaic.zarr")
     bands, band_choice = choose_bands(seen.wavelength_nm)
-    values = np.concatenate([seen.spectra(strip, bands) for strip in seen.row_blocks(factor)])
+    values = np.concatenate([seen.spectra(strip, bands) for strip in seen.row_blocks(None)])
     tones = develop(values, values) if band_choice.startswith("true colour") else stretch(values)
     picture: NDArray[np.float32] = np.where(np.isfinite(values), 1 + 254 * tones, np.nan).astype(np.float32)
     return picture

@@ -63,7 +63,12 @@ REFUSED = {
     "budget below the coarse pass": (
         2,
         "--budget 0.1",
-        r"--budget 0.1 gives \d.*below the time of the first pass of every 4th line.*, or take one uniform scan$",
+        r"a --budget of 0.1, \d.*below the time of the first pass of every 4th line.*, or take one uniform scan$",
+    ),
+    "a first pass that others cannot halve": (
+        2,
+        "--zoom always --seconds 20 --scan-step 5",
+        r"--scan-step = 5 is the spacing of the first of two passes, which others halve: give 4 or 8",
     ),
     "seconds below the fastest first pass": (
         2,

@@ -15,6 +15,10 @@ import urllib.request
 from importlib import metadata
 from pathlib import Path
 
+import pytest
+
+from flows.tasks.local_server import ServerUnavailable, local_server
+
 SCHEMA = Path(__file__).parents[3] / "flows" / "tasks" / "prefect_schema.sql"
 HEAD = "-- The empty database of Prefect {}\n-- python tests/flows/schedule/test_local_server.py writes this file.\n"
 
@@ -49,6 +53,13 @@ def answer(url: str, **headers: str) -> int:
 def test_the_schema_is_of_the_pinned_version() -> None:
     """A newer Prefect migrates it; the file is to be written anew with it."""
     assert SCHEMA.read_text().startswith(HEAD.format(metadata.version("prefect")))
+
+
+def test_a_server_without_a_place_for_its_database_is_unavailable(tmp_path: Path) -> None:
+    """As on a full disk: surveys then run without it."""
+    (tmp_path / "home").write_text("a file")
+    with pytest.raises(ServerUnavailable, match="the Prefect server has no database"), local_server(tmp_path / "home"):
+        pass
 
 
 def test_the_schema_is_what_migrations_leave(tmp_path: Path) -> None:

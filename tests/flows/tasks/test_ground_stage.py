@@ -13,7 +13,7 @@ import pytest
 import xarray as xr
 
 from flows.settings.survey_settings import MapChoice, Settings
-from flows.tasks.stages.maps import STORE, coarse_colours, ground
+from flows.tasks.stages.maps import STORE, colours_of, ground
 from flows.tasks.zones import place_of_field
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.field_places import PosedField
@@ -139,7 +139,7 @@ def test_map_and_picture_lie_where_the_rays_end(run: Run, stores: tuple[StageRef
     sure = found.confidence[row, column]
     np.testing.assert_array_equal(np.isnan(sure), wanted == UNLABELLED)
     assert sure[wanted == 1] == pytest.approx(0.75)
-    tones = coarse_colours(stores[1], None)
+    tones = colours_of(stores[1])
     assert np.nanmin(tones) >= 1
     assert np.isnan(tones[:20, :20]).all()
     seen = found.picture.max(axis=2) > 0

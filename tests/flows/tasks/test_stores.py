@@ -22,6 +22,9 @@ from flows.settings.parameters import SurveySettings
 from flows.survey import draw_class_map, survey
 from flows.tasks.captures import plan_capture
 from flows.tasks.open_survey import OpenSurvey
+from flows.tasks.stage import Product, Stage, Wanted
+from pipeline.errors import ArchiveError
+from storage.archive.archive import Archive
 from storage.archive.records import read_run
 from storage.arrays.cubes import open_raw_cube
 from tests.conftest import Survey
@@ -41,6 +44,17 @@ def _survey_farm(root: Path) -> Published:
     bands = ",".join(map(str, range(5, 265, 10)))
     with without_effects():
         return run_survey(load_settings(None, {**flags, "bands": bands, "out": str(root)}), Console(quiet=True))
+
+
+def test_a_store_of_an_input_that_was_cleared_meanwhile_is_not_published(tmp_path: Path) -> None:
+    """What a survey beside it cleared reads as nodata, so the store would hold wrong numbers."""
+    archive = Archive.open(tmp_path / "archive", create=True)
+    product = Product("rectify", 1)
+    given, _ = archive.produce("capture", lambda folder: (folder / "a").write_text("a") and None, version=1, params={})
+    one = Stage("rectify", "", product, lambda: None, None, 0, None)  # type: ignore[arg-type, return-value]
+    with pytest.raises(ArchiveError, match="another survey has cleared an input of rectify meanwhile"):
+        one.produce(archive, Wanted(lambda folder: archive.clear(given) and None, {}, [given]))
+    assert archive.refs("rectify") == []
 
 
 @pytest.mark.usefixtures("no_effects")

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from pipeline.errors import ArchiveError, IncompleteStoreError
-from storage.archive import run_folders
+from storage.archive import manifests, run_folders
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.archive.records import read_store
@@ -65,6 +66,23 @@ def test_a_reader_of_what_was_cleared_is_told_what_to_do(archive: Archive) -> No
     cleared(archive)
     with pytest.raises(IncompleteStoreError, match=r"cleared away by gc\. Run its survey again"):
         archive.locate(f"{small.mosaic.uri}/mosaic.zarr")
+
+
+def test_a_store_that_is_cleared_while_it_is_checked_is_whole(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a survey beside it: neither its reader nor verify takes it for damaged."""
+    small = small_survey(archive)
+    problem = manifests.file_problem
+
+    def clear_first(path: Path, *given: Any, **options: Any) -> str | None:
+        archive.clear(small.mosaic)
+        return problem(path, *given, **options)
+
+    monkeypatch.setattr(manifests, "file_problem", clear_first)
+    manifests.check_files(small.mosaic.path, hashes=False)
+    small_survey(archive, named=False)
+    assert problems(archive) == []
 
 
 @pytest.mark.parametrize("exchanges", [True, False])

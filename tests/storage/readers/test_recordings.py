@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -102,6 +103,19 @@ def test_raw_cubes_of_a_folder_a_store_and_an_archive(tmp_path: Path, archive: A
     archive.clear(archive.ref("capture", store.name))
     with pytest.raises(IncompleteStoreError, match="were cleared away"):
         open_recording(runs[0], CAMERA)
+
+
+@pytest.mark.parametrize("copied", [False, True])
+def test_a_lost_part_of_a_raw_cube_is_named(tmp_path: Path, archive: Archive, copied: bool) -> None:
+    """In a store and in a folder without a manifest: zarr would read zeros in its place."""
+    build = partial(write_raw, source=simulated(), sweep=FULL)
+    folder = archive.produce("capture", build, version=1, params={})[0].path
+    if copied:
+        folder = Path(shutil.copytree(folder, tmp_path / "copy", ignore=shutil.ignore_patterns("manifest.json")))
+        assert open_recording(folder, CAMERA).sweeps
+    next(path for path in (folder / "scan-0.zarr" / "dn" / "c").rglob("*") if path.is_file()).unlink()
+    with pytest.raises(IncompleteStoreError, match=r"dn lacks 1 of its files" if copied else "it is missing"):
+        open_recording(folder, CAMERA)
 
 
 @pytest.fixture

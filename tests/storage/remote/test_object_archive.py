@@ -174,6 +174,27 @@ def test_a_run_that_could_not_be_sent_is_sent_by_the_next_command(
     assert problems(opened) == []
 
 
+def test_a_run_whose_stores_are_gone_is_in_the_way_of_no_command(
+    machine: Machine, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Killed before its run was sent, then another machine removes a store of it: the same survey mends that."""
+    small_survey(machine(FIRST), named=False)
+    archive = machine(SECOND)
+    with monkeypatch.context() as patch:
+        patch.setattr(archive, "_upload", lambda uri, first: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            small_survey(archive)
+    other = machine(FIRST)
+    other.discard(other.refs("segment")[0])
+    again = machine(SECOND)
+    assert "is on this machine alone until its survey runs again" in caplog.text
+    assert len(again.runs()) == 1
+    small_survey(again)
+    machine(SECOND)
+    assert len(machine(FIRST).runs()) == 2
+    assert problems(machine(FIRST)) == []
+
+
 def test_gc_takes_what_no_run_names_and_broken_off_uploads(machine: Machine) -> None:
     """Manifest first; what a receipt names stays, on every machine; a broken-off upload goes with its files."""
     archive = machine(FIRST)

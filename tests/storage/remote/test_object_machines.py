@@ -51,6 +51,23 @@ def test_gc_gives_a_store_back_that_a_run_has_named_meanwhile(
     assert problems(archive) == []
 
 
+def test_gc_leaves_what_another_machine_puts_back(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run that names a store is published after gc's last look at the runs: the publisher's store stays."""
+    archive = machine(FIRST)
+    ref = small_survey(archive, named=False).map
+    opened, discard, done = machine(SECOND, create=False), Archive.discard, list[bool]()
+
+    def publish_first(self: Archive, *given: Any, **options: Any) -> bool:
+        if not done:
+            done.append(True)
+            small_survey(archive)
+        return discard(self, *given, **options)
+
+    monkeypatch.setattr(Archive, "discard", publish_first)
+    assert not opened.discard(ref, unnamed=True)
+    assert problems(archive) == []
+
+
 def test_gc_counts_runs_that_others_published_since_it_was_opened(machine: Machine) -> None:
     """Between opening and clearing up another machine names old stores: they stay."""
     archive = machine(FIRST)
@@ -91,6 +108,15 @@ def test_a_run_that_was_removed_elsewhere_goes(machine: Machine) -> None:
     for name in (FIRST, SECOND):
         assert machine(name).runs() == []
     assert problems(archive) == []
+
+
+def test_a_store_that_was_removed_elsewhere_goes(machine: Machine) -> None:
+    """From the list of stores on a machine that had its manifest alone."""
+    archive = machine(FIRST)
+    ref = small_survey(archive, named=False).map
+    assert ref.uri in {one.uri for one in machine(SECOND, create=False).refs()}
+    archive.discard(ref)
+    assert ref.uri not in {one.uri for one in machine(SECOND, create=False).refs()}
 
 
 def test_two_machines_that_extend_a_run_at_once_leave_it_whole(
