@@ -113,9 +113,11 @@ def test_no_patch_outside_or_in_a_no_go_zone_is_asked_for(kept_to: tuple[Path, P
 def test_lines_that_show_nothing_of_the_area_are_not_taken(
     kept_to: tuple[Path, Published], opened: Opened, zones: dict[str, str]
 ) -> None:
-    """Coarse pass and full scan are of the area: both take fewer lines than for the field."""
+    """Coarse pass, full scan and reference of the reading are of the area: all take less than for the field."""
     rest = {"camera": {"samples": 64}, "budget": 1.0}
-    kept = opened(zones={name.partition(".")[2]: path for name, path in zones.items()}, **rest).plan
+    run = opened(zones={name.partition(".")[2]: path for name, path in zones.items()}, **rest)
+    kept = run.plan
+    assert kept_to[1].receipt["savings"]["patches"]["full"] == len(run.kept_patches) < run.grid.valid_patches().size
     whole = opened(**rest).plan
     assert sum(one.lines for one in kept.coarse) < sum(one.lines for one in whole.coarse)
     assert kept.full_s < whole.full_s
