@@ -313,13 +313,16 @@ def choose_first_pass(
     shortest, longest = record.offered_ms(camera)
     offered_ms = exposures_between(shortest, longest)
     if layout.recorded is not None:
-        shortest, longest, offered_ms = camera.exposure_ms, camera.exposure_ms, [camera.exposure_ms]
+        taken_ms = layout.recorded.exposures_ms
+        shortest, longest, offered_ms = taken_ms[0], taken_ms[-1], taken_ms[:1]
     found: list[FirstPass] = []
     fastest: FirstPass | None = None
     for first_step in (step for step in steps if step in record.steps):
         for first_ms in offered_ms:
             first = every_nth(full, first_step, first_ms)
-            first = first if layout.recorded is None else layout.recorded.first_pass(first)
+            if layout.recorded is not None:
+                first = layout.recorded.first_pass(first)
+                first_ms = exposing(camera, first[0]).exposure_ms
             left_s = seconds - cost.seconds(first, camera)
             if left_s < 0:
                 fastest = FirstPass(first_step, first_ms, 0.0)

@@ -20,7 +20,7 @@ from pipeline.lazy import Once
 from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster
 from pipeline.source import Source
 from storage.archive.keys import stage_key
-from storage.readers.recordings import RecordedWith, Recording, open_recording
+from storage.readers.recordings import RecordedWith, Recording, find_recorded_run, open_recording
 from storage.readers.scene_files import load_field_labels
 
 OFF_CENTRE_PX = 0.5  # least offset of a recorded field that is noted
@@ -102,7 +102,7 @@ def open_recorded(settings: Settings) -> OpenedRecording:
     shape, notes = _field_shape(recording, settings.shape, settings.sweeps)
     source = recording.source(shape)
     camera = recording.camera
-    if settings.coarse_exposure_ms is not None:  # the plan of a run, whose full scan has the exposure of its camera
+    if find_recorded_run(str(settings.sweeps)) is not None:  # its full scan has the exposure of its camera
         camera = replace(camera, exposure_ms=settings.camera.exposure_ms)
     settings = replace(settings, camera=camera, size=shape[::-1])
     if settings.scan == RECORDED:
