@@ -20,7 +20,7 @@ from models.network.sizes import CELL_PX
 from models.reading.regions import plan_regions
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
-from storage.arrays.class_maps import ClassNames, create_class_map, create_probabilities
+from storage.arrays.class_maps import ClassNames, create_class_map, create_probabilities, load_class_map
 from storage.arrays.layout import consolidate_stores
 from storage.arrays.mosaics import load_attention
 from storage.parallel.pool import WorkerPool
@@ -82,6 +82,16 @@ def test_regions_that_see_the_field_draw_the_map_of_the_field(
     assert len(_work(run, pool, ALL_PX).regions) == 2
     assert _draw(_work(run, pool, ALL_PX), run, stages, tmp_path / "m.zarr") == stored
     assert _draw(run.work, run, stages, tmp_path / "one.zarr") == stored
+
+
+def test_every_pool_draws_the_same_regions(surveyed: tuple[SurveyRun, Path], tmp_path: Path) -> None:
+    """Two at a time or one after the other, the bytes are the same; every pixel has a class."""
+    run, stages = surveyed
+    one = _draw(_work(run, WorkerPool(workers=1), 0), run, stages, tmp_path / "one.zarr")
+    assert one == _draw(_work(run, WorkerPool(workers=2), 0), run, stages, tmp_path / "two.zarr")
+    found = load_class_map(tmp_path / "one.zarr")
+    assert found.classes.max() < len(found.names)
+    assert np.isfinite(found.confidence).all()
 
 
 @pytest.mark.parametrize("policy", ["entropy", "sobel"])
