@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
@@ -15,10 +13,6 @@ from models.policies.policies import score_multiply_adds
 from pipeline.geometry.grid import SceneGrid
 
 
-def _attention(q: Any, k: Any, v: Any, *args: Any, out_shape: Any = None, **kwargs: Any) -> int:
-    return sdpa_flop_count(q, k, v)
-
-
 @pytest.mark.parametrize(
     ("sizes", "patch_index"),
     [({"patch": 16}, 7), ({"patch": 8, "overview_width": 12}, 1), ({"patch": 32, "dim": 32, "layers": 1}, 3)],
@@ -27,9 +21,9 @@ def test_closed_form_equals_the_counter(sizes: dict[str, int], patch_index: int)
     """The closed form counts just what torch counts while the model runs."""
     config = SegmenterConfig(classes=5, columns=6, **sizes)
     model, image = Segmenter(config).eval(), torch.zeros(1, 6 + PLANES, 64, 96)
-    counter = FlopCounterMode(
-        display=False, custom_mapping={torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: _attention}
-    )
+    attention = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu
+    flops = {attention: lambda q, k, v, *args, out_shape=None, **kwargs: sdpa_flop_count(q, k, v)}
+    counter = FlopCounterMode(display=False, custom_mapping=flops)
     with torch.inference_mode(), counter:
         model(image, image, torch.arange(patch_index)[None], torch.zeros(1, 2))
     grid = SceneGrid(64, 96, config.patch, 1)
