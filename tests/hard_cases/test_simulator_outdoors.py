@@ -109,10 +109,9 @@ def seen_from(distance_m: float, focus_m: float) -> tuple[NDArray[np.float32], D
 
 
 @pytest.mark.parametrize("focus_m", [30.0, math.inf])
-@pytest.mark.parametrize("distance_m", [1e300])
-def test_distance_goes_to_infinity_without_a_jump(distance_m: float, focus_m: float) -> None:
+def test_distance_goes_to_infinity_without_a_jump(focus_m: float) -> None:
     """Beyond the air's end light and decision are those of infinity, where nothing but the air is left to see."""
-    (light, decision), (limit, endless) = seen_from(distance_m, focus_m), seen_from(math.inf, focus_m)
+    (light, decision), (limit, endless) = seen_from(1e300, focus_m), seen_from(math.inf, focus_m)
     assert np.isfinite(limit).all()
     np.testing.assert_allclose(light, limit, rtol=1e-5)
     assert decision.error == pytest.approx(endless.error, rel=0.01)
