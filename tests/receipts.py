@@ -1,15 +1,23 @@
-"""What two runs of the same seed and settings must agree on in their receipts."""
+"""Receipts of an archive's runs, and what two runs of the same seed and settings must agree on in them."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
-from flows.publish.receipt import Receipt
+from flows.publish.receipt import Receipt, check_receipt
 from flows.tasks.scores import JUDGING
+from storage.archive.archive import Archive
 
 # what another run of the same seed has otherwise
 OF_ONE_RUN = ("wall_s", "cpu_s", "peak_rss_bytes", "state", "manifest_sha256")
+
+
+def receipts(out: Path) -> list[Any]:
+    """What the runs of an archive say, oldest first."""
+    return [check_receipt(json.loads((run / "receipt.json").read_text())) for run in Archive.open(out).runs()]
 
 
 def comparable(receipt: Receipt) -> dict[str, Any]:

@@ -53,26 +53,17 @@ def main(arguments: Sequence[str]) -> int:
             print(f"\n{name}: crashed; the others go on")
             continue
         print(f"\n{name} ({time.perf_counter() - began:.0f} s)")
-        print(plain_table(tables[name]), flush=True)
+        print(aligned(_cells_of(tables[name]), WIDTHS), flush=True)
     _summarise(tables, failed)
     if asked.markdown:
-        asked.markdown.write_text(markdown_table([row for rows in tables.values() for row in rows]), encoding="utf-8")
+        lines = markdown_lines(_cells_of([row for rows in tables.values() for row in rows]))
+        asked.markdown.write_text("\n".join([*lines, "", _machine(), ""]), encoding="utf-8")
         print(f"{asked.markdown}")
     return 1 if failed else 0
 
 
-def plain_table(rows: Sequence[Row]) -> str:
-    """Set rows in aligned columns, long texts folded inside their own."""
-    return aligned([HEADINGS, *(_cells(row) for row in rows)], WIDTHS)
-
-
-def markdown_table(rows: Sequence[Row]) -> str:
-    """Set rows as a table of Markdown."""
-    return "\n".join([*markdown_lines([HEADINGS, *(_cells(row) for row in rows)]), "", _machine(), ""])
-
-
-def _cells(row: Row) -> tuple[str, str, str, str, str]:
-    return row.what, row.figure, row.goal or "-", MET[row.met], row.peers or "-"
+def _cells_of(rows: Sequence[Row]) -> list[tuple[str, ...]]:
+    return [HEADINGS, *((row.what, row.figure, row.goal or "-", MET[row.met], row.peers or "-") for row in rows)]
 
 
 def _summarise(tables: dict[str, Sequence[Row]], failed: Sequence[str]) -> None:

@@ -19,7 +19,6 @@ from pathlib import Path
 
 import numpy as np
 from measure import Row
-from numpy.typing import NDArray
 
 from flows.tasks.survey_model import shipped_weights
 from flows.tradeoff.stages import PlannedPass, uniform_pass
@@ -174,18 +173,14 @@ def map_of(scene: RasterScene, seed: int, step: int, exposure_ms: float, weights
     """The map of a scene's uniform scan; what it says of itself by the house's own weights alone."""
     others, weights = weights is not None, weights or shipped()
     scan_pass, drawn = scanned(scene, weights, seed, step, exposure_ms)
-    judged = _judged(scene, drawn.classes, weights)
+    assert scene.labels is not None
+    judged = 100 * mean_iou(confusion(scene.labels, drawn.classes, weights.config.classes))
     if others:
         return PlanMap(scan_pass.seconds, judged)
     assert drawn.log_probability is not None
     told = scores().expected(expected_counts([drawn.log_probability], weights.config.classes), step, exposure_ms)
     assert told is not None
     return PlanMap(scan_pass.seconds, judged, 100 * told.miou, 100 * told.error)
-
-
-def _judged(scene: RasterScene, classes: NDArray[np.uint8], weights: Weights) -> float:
-    assert scene.labels is not None
-    return 100 * mean_iou(confusion(scene.labels, classes, weights.config.classes))
 
 
 def main(arguments: Sequence[str]) -> int:

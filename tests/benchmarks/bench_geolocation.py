@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from measure import Row, Timing, ratio, time_in_turn
+from measure import Row, Timing, ns_of, ratio, time_in_turn
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -35,17 +35,12 @@ Floats = NDArray[np.float64]
 
 def rows() -> list[Row]:
     """Error and time of the ties."""
-    scan_path = _scan_path(SWATH, np.arange(float(LINES)))
+    tangents = np.stack(np.broadcast_arrays(SWATH, np.arange(float(LINES))), axis=-1) * CAMERA.ifov_rad
+    (scan_path,) = make_scan_paths(direction_to_position(scene_to_direction(tangents)), CAMERA, step_px=1.0)
     truth = _by_reflected_rays(path_geolocation(scan_path, CAMERA, _pixels(), along="x"))
     clocks = time_in_turn(_calls(scan_path), rounds=5)
     table = tie_table(scan_path, CAMERA, along="x", **GRID)
     return [_error(table, truth), *_against_tree(scan_path, table, truth, clocks)]
-
-
-def _scan_path(along_px: Floats | float, scan_px: Floats) -> ScanPath:
-    tangents = np.stack(np.broadcast_arrays(along_px, scan_px), axis=-1) * CAMERA.ifov_rad
-    (scan_path,) = make_scan_paths(direction_to_position(scene_to_direction(tangents)), CAMERA, step_px=1.0)
-    return scan_path
 
 
 def _pixels(**grid: Any) -> Floats:
@@ -110,10 +105,6 @@ def _worst(found: Floats, truth: Floats) -> float:
     return float(np.nanmax(np.abs(found - truth))) if apart.mean() < 1e-4 else np.inf
 
 
-def _ns(clock: Timing) -> float:
-    return 1e9 * clock.cpu_min_s / PIXELS
-
-
 def _error(table: TieTable, truth: Floats) -> Row:
     off = _worst(_whole(table), truth)
     turn = np.rad2deg(line_rotation(scene_to_direction(np.array([[SWATH, 0.0], [SWATH, LINES]]) * CAMERA.ifov_rad)))
@@ -125,13 +116,12 @@ def _against_tree(scan_path: ScanPath, table: TieTable, truth: Floats, clocks: d
     _, nearest = cKDTree(_samples()).query(_pixels(), workers=1)
     tree_off = _worst(np.stack(np.divmod(nearest, CAMERA.samples), axis=-1).astype(np.float64), truth)
     faster, closer = ratio(clocks, "tree", "ties 16"), tree_off / _worst(_whole(table), truth)
-    peer = (
-        f"scipy cKDTree, one worker: {_ns(clocks['tree']):.0f} ns/px with building, {_ns(clocks['query']):.0f} without"
-    )
+    tree, query, ties = (ns_of(clocks[name], PIXELS) for name in ("tree", "query", "ties 16"))
+    peer = f"scipy cKDTree, one worker: {tree:.0f} ns/px with building, {query:.0f} without"
     return [
         Row(
             "geolocation grid by ties, made and read: processor time",
-            f"{_ns(clocks['ties 16']):.2g} ns/px, 1/{faster:.0f} of the tree",
+            f"{ties:.2g} ns/px, 1/{faster:.0f} of the tree",
             ">= 10x less",
             faster >= 10,
             peer,

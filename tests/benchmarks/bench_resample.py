@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from beside.resample_peers import BANDS, Peer, Turned, cv2_parts, peers, spline, turned_waves
-from measure import Row, Timing, ratio, time_in_turn
+from measure import Row, ns_of, ratio, time_in_turn
 from numpy.typing import NDArray
 
 from pipeline.rectify.kernels import Kernel
@@ -59,22 +59,18 @@ def _take(scene: Turned, out: NDArray[np.float32]) -> Callable[[], None]:
     return call
 
 
-def _ns(clock: Timing, values: int) -> float:
-    return clock.cpu_min_s / values * 1e9
-
-
 def _over_take(scene: Turned) -> list[Row]:
     """Each kernel over a copy of the same rows, on a sweep larger than the cache and on one that stays in it."""
     out = np.empty(scene.truth.shape, np.float32)
     calls = {"take": _take(scene, out)} | {kernel: _call(scene, kernel, out) for kernel in KERNELS}
     clocks = time_in_turn({name: _often(call, TILES) for name, call in calls.items()}, 7)
-    take = _ns(clocks["take"], TILES * out.size)
+    take = ns_of(clocks["take"], TILES * out.size)
     found = []
     for kernel in KERNELS:
         times, goal = ratio(clocks, kernel, "take"), 3.0 if kernel == "catmull-rom" else None
         what = f"{kernel}, {BANDS} bands, over np.take of the same rows"
         judged = (f"<= {goal:g} x", times <= goal) if goal else ("", None)
-        spent = f"{_ns(clocks[kernel], TILES * out.size):.2f} ns/(px*band), np.take {take:.2f}"
+        spent = f"{ns_of(clocks[kernel], TILES * out.size):.2f} ns/(px*band), np.take {take:.2f}"
         found.append(Row(what, f"{times:.2f} x", *judged, spent))
     return [*found, _over_take_cached(scene)]
 
@@ -87,7 +83,7 @@ def _over_take_cached(scene: Turned) -> Row:
     out = np.empty(small.truth.shape, np.float32)
     once = {"take": _take(small, out), "ours": _call(small, "catmull-rom", out)}
     clocks = time_in_turn({name: _often(call, 20) for name, call in once.items()}, 5)
-    ours, take = (_ns(clocks[name], 20 * out.size) for name in ("ours", "take"))
+    ours, take = (ns_of(clocks[name], 20 * out.size) for name in ("ours", "take"))
     return Row(
         f"catmull-rom, {BANDS} bands, the same with rows and result in the cache",
         f"{ratio(clocks, 'ours', 'take'):.2f} x",
@@ -109,8 +105,8 @@ def _beside_peers(kernel: Kernel, natural: Turned, flat: Turned) -> list[Row]:
     others, out = peers(natural, order), np.empty(natural.truth.shape, np.float32)
     ours = {"warm": _call(natural, kernel, out), "fresh": _call(natural, kernel)}
     clocks = time_in_turn(ours | {peer.name: peer.call for peer in others}, ROUNDS)
-    warm, fresh = (_ns(clocks[memory], out.size) for memory in ours)
-    theirs = {peer.name: _ns(clocks[peer.name], peer.bands * len(natural.truth)) for peer in others}
+    warm, fresh = (ns_of(clocks[memory], out.size) for memory in ours)
+    theirs = {peer.name: ns_of(clocks[peer.name], peer.bands * len(natural.truth)) for peer in others}
     met = all((warm if peer.warm else fresh) < theirs[peer.name] for peer in others)
     listed = _listed(theirs, "{:.3g}") + _prepared(others, natural)
     found = [
@@ -146,7 +142,10 @@ def _over_linear(natural: Turned, flat: Turned) -> list[Row]:
 def _beside_spline(natural: Turned) -> Row:
     smooth = spline(natural)
     clocks = time_in_turn({"ours": _call(natural, "catmull-rom"), "spline": smooth.call}, ROUNDS)
-    ours, theirs = _ns(clocks["ours"], natural.truth.size), _ns(clocks["spline"], smooth.bands * len(natural.truth))
+    ours, theirs = (
+        ns_of(clocks["ours"], natural.truth.size),
+        ns_of(clocks["spline"], smooth.bands * len(natural.truth)),
+    )
     errors = natural.error(_call(natural, "catmull-rom")()[0]), natural.error(smooth.by_pixel(smooth.call()))
     return Row(
         "catmull-rom beside the order-3 spline",
@@ -166,5 +165,5 @@ def _prepared(others: Sequence[Peer], scene: Turned) -> str:
         return ""
     clocks = time_in_turn(before, 1)
     return "; not counted: " + _listed(
-        {name: _ns(clock, len(scene.truth)) for name, clock in clocks.items()}, "{:.0f} ns/px"
+        {name: ns_of(clock, len(scene.truth)) for name, clock in clocks.items()}, "{:.0f} ns/px"
     )

@@ -94,7 +94,10 @@ def _survey(given: dict[str, Any], unknown: str) -> Judged:
 def other_fields(folder: Path) -> Iterator[tuple[str, Path]]:
     """Fields with spectra that no farm has, as files with their wavelengths beside them."""
     rng = np.random.default_rng(0)
-    yield "invented spectra", _written(folder / "invented", _picture(_invented(rng), rng), BANDS_NM)
+    middle, width, height = (rng.uniform(*span, (7, 3, 1)) for span in ((400, 1000), (40, 150), (0.05, 0.4)))
+    bumps = height * np.exp(-0.5 * ((BANDS_NM - middle) / width) ** 2)  # (spectrum, bump, band)
+    invented = np.asarray(bumps.sum(axis=1) + rng.uniform(0.02, 0.1, (7, 1)))
+    yield "invented spectra", _written(folder / "invented", _picture(invented, rng), BANDS_NM)
     boards = np.repeat(np.array([0.1, 0.2, 0.35, 0.5, 0.7]), 64)[None, :, None]
     grey = np.broadcast_to(boards, (256, 320, len(BANDS_NM)))
     yield "grey boards", _written(folder / "boards", grey, BANDS_NM)
@@ -108,13 +111,6 @@ def other_fields(folder: Path) -> Iterator[tuple[str, Path]]:
         yield "Indian Pines at the farm's brightness", _pines(PINES, folder / "pines")
 
 
-def _invented(rng: np.random.Generator) -> NDArray[np.float64]:
-    """Seven smooth spectra of three bumps each, (spectrum, band)."""
-    middle, width, height = (rng.uniform(*span, (7, 3, 1)) for span in ((400, 1000), (40, 150), (0.05, 0.4)))
-    bumps = height * np.exp(-0.5 * ((BANDS_NM - middle) / width) ** 2)
-    return np.asarray(bumps.sum(axis=1) + rng.uniform(0.02, 0.1, (7, 1)))
-
-
 def _picture(spectra: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
     """Patches of the spectra with soft shades and edges, as a photograph has them, (y, x, band)."""
     fields = np.stack([scipy.ndimage.gaussian_filter(rng.standard_normal((256, 320)), 12) for _ in spectra], axis=-1)
@@ -126,17 +122,13 @@ def _picture(spectra: NDArray[np.float64], rng: np.random.Generator) -> NDArray[
 def _pines(source: Path, folder: Path) -> Path:
     """The file of the set at the farm's brightness, with a description of its bands."""
     values = np.load(source / "Indian_pines_corrected.npy").astype(np.float32)
-    nm = np.loadtxt(source / "92AV3C.spc", usecols=0, skiprows=_head(source / "92AV3C.spc"))
+    lines = (source / "92AV3C.spc").read_text().splitlines()
+    head = next(number for number, line in enumerate(lines) if line.split()[:1] and line.split()[0][0].isdigit())
+    nm = np.loadtxt(lines, usecols=0, skiprows=head)
     dropped = np.r_[103:108, 149:163, 219]
     nm = np.delete(nm, dropped)
     seen = (nm >= 400) & (nm <= 1000)
     return _written(folder, values * (BRIGHTNESS / values[..., seen].mean()), nm)
-
-
-def _head(path: Path) -> int:
-    """Lines before the first that begins with a number."""
-    lines = path.read_text().splitlines()
-    return next(number for number, line in enumerate(lines) if line.split()[:1] and line.split()[0][0].isdigit())
 
 
 def _written(folder: Path, values: NDArray[np.floating], wavelength_nm: NDArray[np.floating]) -> Path:

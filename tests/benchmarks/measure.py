@@ -48,6 +48,11 @@ def time_in_turn(calls: Mapping[str, Callable[[], object]], rounds: int = 5) -> 
     return in_turn(calls, rounds)
 
 
+def ns_of(clock: Timing, values: float) -> float:
+    """Least processor time of a value. [ns]"""
+    return clock.cpu_min_s / values * 1e9
+
+
 def alone(call: Callable[..., T], *given: object) -> T:
     """Call in a process of its own, whose memory and settings are not those of other benchmarks."""
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:

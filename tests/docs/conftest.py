@@ -21,14 +21,6 @@ CLASSES = 'labels = "labels/{number}_labels.png"\n[classes]\nclass_0 = 0\nclass_
 HEADER = "ENVI\nsamples = 40\nlines = 24\nbands = 3\ndata type = 4\ninterleave = bip\nbyte order = 0\n"
 
 
-def write_masked(folder: Path, number: str, values: np.ndarray, labels: np.ndarray) -> None:
-    """A picture and its mask of three colours, of which nothing else is told."""
-    colours = np.array([(0, 0, 0), (0, 255, 0), (255, 0, 0)], np.uint8)
-    for kind, picture in {"images": values.astype(np.uint8), "masks": colours[labels]}.items():
-        (folder / kind).mkdir(parents=True, exist_ok=True)
-        Image.fromarray(picture).save(folder / kind / f"{number}.png")
-
-
 @pytest.fixture(scope="session")
 def surveyed(
     tmp_path_factory: pytest.TempPathFactory,
@@ -47,11 +39,14 @@ def surveyed(
     (folder / "cube.hdr").write_text(HEADER + "wavelength units = nm\nwavelength = {640, 550, 460}\n")
     for number in ("001", "002"):
         values, labels = patchy_scene((64, 64), 3, seed=int(number))
-        for kind, picture in {"images": values.astype(np.uint8), "labels": labels}.items():
-            path = folder / "fields" / kind / f"{number}_{kind.removesuffix('s') if kind == 'images' else kind}.png"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            Image.fromarray(picture).save(path)
-        write_masked(folder / "meadow", number, values, labels)
+        image, colours = values.astype(np.uint8), np.array([(0, 0, 0), (0, 255, 0), (255, 0, 0)], np.uint8)
+        pictures = {
+            **{f"fields/images/{number}_image.png": image, f"fields/labels/{number}_labels.png": labels},
+            **{f"meadow/images/{number}.png": image, f"meadow/masks/{number}.png": colours[labels]},  # nothing is told
+        }
+        for path, picture in pictures.items():
+            (folder / path).parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(picture).save(folder / path)
     (folder / "fields" / "scene.toml").write_text(CLASSES)
     for name in ("north", "south", "survey"):
         told = SETTINGS.format(name="south" if name == "south" else "north", camera=CAMERA)

@@ -25,15 +25,13 @@ OTHERS = {  # words that mean something else in these files
 KEPT = {"LookupError", "ProcessLookupError", "shares_memory"}  # names of Python and numpy
 
 
+PARTS = re.compile(r"[A-Z]+(?![a-z])|[A-Z][a-z0-9]*|[a-z0-9]+")  # the words of a name in snake or camel case
+
+
 def banned(column: int) -> set[str]:
     """The words of a column of the glossary's table."""
     rows = [line.split("|")[1:-1] for line in GLOSSARY.read_text().splitlines() if line.startswith("| ")][1:]
     return {word.strip() for row in rows for word in row[column].split(",") if word.strip()}
-
-
-def parts_of(name: str) -> set[str]:
-    """The words of a name in snake or camel case."""
-    return {part.lower() for part in re.findall(r"[A-Z]+(?![a-z])|[A-Z][a-z0-9]*|[a-z0-9]+", name)}
 
 
 @cache
@@ -52,7 +50,7 @@ def test_no_name_has_a_banned_word(word: str) -> None:
         for path in SOURCES
         if not str(path.relative_to(ROOT)).startswith(others or ("-",))
         for name in names_in(path)
-        if word in parts_of(name) and name not in KEPT
+        if word in map(str.lower, PARTS.findall(name)) and name not in KEPT
     ]
     assert wrong == []
 

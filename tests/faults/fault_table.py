@@ -55,16 +55,6 @@ def reported_wrong(wrong: Sequence[str]) -> str:
     return f"{len(wrong)} wrong{': ' + '; '.join(wrong[:3]) if wrong else ''}"
 
 
-def plain_table(rows: Sequence[Row], headings: Sequence[str] = HEADINGS) -> str:
-    """Rows in aligned columns, long texts folded inside their own."""
-    return aligned([headings, *(row.cells for row in rows)], WIDTHS)
-
-
-def markdown_table(rows: Sequence[Row], headings: Sequence[str] = HEADINGS) -> str:
-    """Rows as a table of Markdown."""
-    return "\n".join([*markdown_lines([headings, *(row.cells for row in rows)]), ""])
-
-
 def run_table(
     arguments: Sequence[str],
     prog: str,
@@ -95,11 +85,12 @@ def run_table(
             rows = [Row(name, "", 0, "that it can be tried", "crashed; the others went on", False, clock.seconds)]
         found += rows
         print("\n".join(f"{row.fault}: {row.found}" for row in rows), flush=True)
-    print(f"\n{plain_table(found, headings)}")
+    cells = [headings, *(row.cells for row in found)]
+    print(f"\n{aligned(cells, WIDTHS)}")
     missed = [row.fault for row in found if not row.met]
     print(f"\n{len(found) - len(missed)} of {len(found)} as demanded{': not ' + ', '.join(missed) if missed else ''}")
     if asked.markdown:
-        asked.markdown.write_text(markdown_table(found, headings), encoding="utf-8")
+        asked.markdown.write_text("\n".join([*markdown_lines(cells), ""]), encoding="utf-8")
     return 1 if missed else 0
 
 

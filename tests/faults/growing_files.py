@@ -21,6 +21,7 @@ from pipeline.rig.capture_runner import JOURNAL, CaptureJournal
 from storage.arrays.spool import Spool
 from tests.faults.fault_table import Clock, Row, reported_wrong
 from tests.faults.lost_lines import BANDS, HEADER, SAMPLES, fill, line, same
+from tests.storage.small_archive import flip
 
 LINES = 100
 FLIPS = 2000
@@ -49,9 +50,10 @@ def flip_spool(flips: int, folder: Path, seed: int = 0) -> Rot:
     place.mkdir()
     for _ in range(flips):
         (place / "lines.lines").write_bytes(truth)
-        where = _flip(place / "lines.lines", chance)
+        at, bit = chance.randrange(len(truth)), chance.randrange(8)
+        flip(place / "lines.lines", at, bit)
         found.told += (lost := _guarded(lambda: _go_on(place))) == ["a line is lost"]
-        found.wrong += [f"{where}: {one}" for one in lost if one != "a line is lost"]
+        found.wrong += [f"byte {at}: bit {bit}: {one}" for one in lost if one != "a line is lost"]
         found.flips += 1
     return found
 
@@ -91,14 +93,6 @@ def _held(rotten: bytearray, truth: list[dict[str, Any]], found: Rot) -> list[st
     held = [taken for number in range(8) if (taken := journal.holding(SWEEP, 5 * number)) is not None]
     found.told += bool(journal.damage)
     return ["another capture"] * any(asdict(one) not in truth for one in held) + ["captures lost"] * (len(held) < 7)
-
-
-def _flip(path: Path, chance: random.Random) -> str:
-    content = bytearray(path.read_bytes())
-    at, bit = chance.randrange(len(content)), chance.randrange(8)
-    content[at] ^= 1 << bit
-    path.write_bytes(content)
-    return f"byte {at}: bit {bit} of {path.name}"
 
 
 def _guarded(tried: Callable[[], list[str]]) -> list[str]:

@@ -91,12 +91,6 @@ class Tally:
 # --- headers ----------------------------------------------------------------------------------------------------------
 
 
-def seeds(folder: Path | None) -> list[str]:
-    """Texts to begin from: hand-made headers, and the real ones of a folder."""
-    real = [] if folder is None else sorted(folder.glob("*.hdr"))
-    return [*HAND_MADE, *(path.read_bytes().decode("latin-1") for path in real)]
-
-
 def mutate_header(text: str, rng: random.Random) -> str:
     """One to four random changes of a header's text: its values, keys, lines, characters."""
     for _ in range(rng.randint(1, 4)):
@@ -152,7 +146,8 @@ def _set(lines: list[str], key: str, word: str) -> list[str]:
 
 def try_headers(count: int, folder: Path | None, seed: int = 0) -> Tally:
     """Mutate ``count`` headers, read each with a data file of a few KB beside it, and say how it went."""
-    rng, texts, tally = random.Random(seed), seeds(folder), Tally()
+    rng, tally, real = random.Random(seed), Tally(), [] if folder is None else sorted(folder.glob("*.hdr"))
+    texts = [*HAND_MADE, *(path.read_bytes().decode("latin-1") for path in real)]
     with tempfile.TemporaryDirectory() as name:
         header = Path(name) / "a.hdr"
         for text in texts:  # what reads them is imported before memory is measured

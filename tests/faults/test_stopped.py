@@ -7,7 +7,6 @@ A run is published once its map is drawn; stopped while the map is judged it is 
 
 from __future__ import annotations
 
-import json
 import shutil
 import signal
 import time
@@ -16,12 +15,11 @@ from typing import Any
 
 import pytest
 
-from flows.publish.receipt import check_receipt, is_pending
+from flows.publish.receipt import is_pending
 from flows.terminal.processes import TERMINATED
-from storage.archive.archive import Archive
 from tests.faults.nursery import Ended
 from tests.faults.small_survey import Subject, problems, stored, words, wrong_after_fault, wrong_after_rerun
-from tests.receipts import comparable
+from tests.receipts import comparable, receipts
 
 GOING_ON = "terminated; run the same command to resume"
 SYNC = 60  # of a survey's files, before which it is stopped
@@ -78,11 +76,6 @@ def asked(out: Path) -> list[str]:
 def stopped(subject: Subject, out: Path, place: str, call: int, number: int) -> Ended:
     """The survey, stopped."""
     return subject.nursery.run(asked(out), "end_before", place=place, call=call, number=number)
-
-
-def receipts(out: Path) -> list[Any]:
-    """What the runs of an archive say, oldest first."""
-    return [check_receipt(json.loads((run / "receipt.json").read_text())) for run in Archive.open(out).runs()]
 
 
 @pytest.fixture(scope="module")

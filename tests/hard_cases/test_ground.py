@@ -10,8 +10,9 @@ from pyproj import Proj
 
 from pipeline.errors import PoseError
 from pipeline.ground.field_places import PosedField
-from pipeline.ground.map_grid import GroundGrid, ground_grid
+from pipeline.ground.map_grid import ground_grid
 from pipeline.ground.view import GroundView, RigPose
+from tests.pipeline.ground.test_ground_grid import whole
 
 IFOV = 7.4e-3 / 70
 
@@ -20,11 +21,6 @@ def view(**changes: Any) -> GroundView:
     """A rig 12 m up that looks down at 40 deg, or as changed."""
     given = {"lon_deg": 9.5, "lat_deg": 52.1, "heading_deg": 0.0, "tilt_deg": 40.0, "height_m": 12.0}
     return GroundView(RigPose(**(given | changes)), IFOV)
-
-
-def seen(grid: GroundGrid) -> np.ndarray:
-    """Scene pixels of all of a map, (y, x, 2)."""
-    return grid.scene_pixels(slice(0, grid.shape[0]), slice(0, grid.shape[1]))
 
 
 def test_nadir_has_no_heading_of_its_own_but_keeps_the_rigs():
@@ -74,7 +70,7 @@ def test_near_a_pole_the_map_is_stereographic(lat: float, epsg: int):
     assert grid.geobox.crs.epsg == epsg
     pixel_m2 = grid.geobox.resolution.x**2 / Proj(grid.frame.crs).get_factors(9.5, lat).areal_scale
     exact = np.nansum(PosedField(grid).pixel_areas_m2(slice(None), slice(None)))
-    assert np.isfinite(seen(grid)[..., 0]).sum() * pixel_m2 == pytest.approx(exact, rel=1e-2)
+    assert np.isfinite(whole(grid)[..., 0]).sum() * pixel_m2 == pytest.approx(exact, rel=1e-2)
 
 
 @pytest.mark.parametrize(("lon", "heading"), [(179.99999, 90.0), (-179.99999, -90.0), (180.0, 90.0), (-180.0, 0.0)])
@@ -83,13 +79,13 @@ def test_the_date_line_is_no_border(lon: float, heading: float):
     across = ground_grid(view(lon_deg=lon, lat_deg=-17.0, heading_deg=heading), (100, 100))
     here = ground_grid(view(lon_deg=170.5, lat_deg=-17.0, heading_deg=heading), (100, 100))
     assert np.abs(np.array(across.shape) - here.shape).max() <= 8  # the zone's meridians turn it a little
-    assert np.isfinite(seen(across)[..., 0]).mean() == pytest.approx(np.isfinite(seen(here)[..., 0]).mean(), abs=0.1)
+    assert np.isfinite(whole(across)[..., 0]).mean() == pytest.approx(np.isfinite(whole(here)[..., 0]).mean(), abs=0.1)
 
 
 def test_one_pixel_is_a_map():
     """A scene of one pixel has a footprint, a grid, and its class on it."""
     grid = ground_grid(view(), (1, 1))
-    places = seen(grid)[..., 0]
+    places = whole(grid)[..., 0]
     assert 1 <= np.isfinite(places).sum() <= 6
     assert np.nanmax(np.abs(places)) <= 0.5
     assert grid.counts() == {"mapped_px": 1, "beyond_reach_px": 0, "no_ground_px": 0}

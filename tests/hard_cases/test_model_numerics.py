@@ -262,15 +262,11 @@ def test_21_any_size_gives_its_own_map(size: tuple[int, int]):
     assert drawn.classes.max() < 3
 
 
-def _flat_coarse_prediction(height: int, width: int) -> CoarsePrediction:
-    grid = SceneGrid(height, width, 8, 2)
-    y, x = grid.padded_shape
-    return CoarsePrediction(grid, np.full((y, x, 4), 0.3, np.float32), np.full((y, x, 3), 1 / 3, np.float32))
-
-
 def test_22_a_scene_alike_everywhere_scores_alike():
     """Whole patches score equal to 1e-6, at the border too; partly filled ones rank by their pixels on the scene."""
-    seen = _flat_coarse_prediction(36, 50)
+    grid = SceneGrid(36, 50, 8, 2)
+    columns, probability = (np.full((*grid.padded_shape, n), of, np.float32) for n, of in ((4, 0.3), (3, 1 / 3)))
+    seen = CoarsePrediction(grid, columns, probability)
     fraction = seen.grid.valid_fraction().ravel()
     scores = score_patches("entropy", seen)
     assert np.ptp(scores[fraction == 1]) <= 1e-6

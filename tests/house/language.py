@@ -67,20 +67,10 @@ def broken_rules(sentence: Sentence) -> Iterator[str]:
     plain = re.sub(r"`[^`]*`|\{[^}]*\}", "", text)
     if sentence.kind == "page" and (numbers := len(_NUMBER.findall(plain))) > MOST_NUMBERS:
         yield f"4: {numbers} numbers"
-    if found := _phrases().search(plain):
+    if found := re.search(rf"\b(?:{PHRASES})\b", plain, re.IGNORECASE):
         yield f"6: {found[0]}"
-    if found := _history().search(plain):
+    if found := re.search(rf"\b(?:{HISTORY})\b", plain, re.IGNORECASE):
         yield f"7: {found[0]}"
-
-
-@cache
-def _phrases() -> re.Pattern[str]:
-    return re.compile(rf"\b(?:{PHRASES})\b", re.IGNORECASE)
-
-
-@cache
-def _history() -> re.Pattern[str]:
-    return re.compile(rf"\b(?:{HISTORY})\b", re.IGNORECASE)
 
 
 def sentences_of_page(path: Path) -> Iterator[Sentence]:

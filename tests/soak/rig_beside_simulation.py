@@ -138,7 +138,11 @@ def _of_lines(one: Surveyed, other: Surveyed, seconds: float) -> Row:
             there = name in seen and name in wanted and seen[name].shape == wanted[name].shape
             count = max(found[name].shape[0] for found in (seen, wanted) if name in found)
             lines += count
-            odd += _odd_lines(seen[name], wanted[name]) if there else count
+            odd += (
+                int((np.asarray(seen[name][:]) != np.asarray(wanted[name][:])).any(axis=(1, 2)).sum())
+                if there
+                else count
+            )
     return Row(
         "raw lines",
         "coarse and fine, rig beside simulated",
@@ -148,10 +152,6 @@ def _of_lines(one: Surveyed, other: Surveyed, seconds: float) -> Row:
         odd == 0,
         seconds,
     )
-
-
-def _odd_lines(one: zarr.Array[Any], other: zarr.Array[Any]) -> int:
-    return int((np.asarray(one[:]) != np.asarray(other[:])).any(axis=(1, 2)).sum())
 
 
 def _of_maps(one: Surveyed, other: Surveyed) -> Row:

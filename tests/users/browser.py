@@ -109,7 +109,9 @@ def chromium(profile: Path) -> Iterator[Tab]:
     with subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         try:
             port = _port(profile / "DevToolsActivePort")
-            with _line_to_page(port) as line:
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/json", timeout=PATIENCE_S) as answer:
+                (page, *_) = [one for one in json.load(answer) if one["type"] == "page"]
+            with connect(page["webSocketDebuggerUrl"], max_size=None, compression=None) as line:
                 yield Tab(line)
         finally:
             process.terminate()
@@ -121,9 +123,3 @@ def _port(file: Path) -> int:
         assert time.monotonic() < end, "chromium did not start"
         time.sleep(0.05)
     return int(lines[0])
-
-
-def _line_to_page(port: int) -> ClientConnection:
-    with urllib.request.urlopen(f"http://127.0.0.1:{port}/json", timeout=PATIENCE_S) as answer:
-        (page, *_) = [one for one in json.load(answer) if one["type"] == "page"]
-    return connect(page["webSocketDebuggerUrl"], max_size=None, compression=None)

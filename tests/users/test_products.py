@@ -28,7 +28,7 @@ from flows.archive.product_choice import ProductFlags, choose_products
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from pipeline.errors import SettingsError, WavelengthError
-from pipeline.ground.map_grid import grid_of_map, ground_grid, image_at
+from pipeline.ground.map_grid import ground_grid, image_at
 from pipeline.ground.view import GroundView, RigPose
 from pipeline.products.indices import find_index
 from storage.arrays.class_maps import ClassNames
@@ -40,13 +40,7 @@ from tests.users.test_georeference import SHAPE, TURNED, corners_px, survey, wri
 POSE = RigPose(lon_deg=9.5, lat_deg=52.1, heading_deg=25.0, tilt_deg=50.0, height_m=1400.0)
 QUIET = Console(quiet=True)
 BANDS = ",".join(map(str, range(5, 270, 11)))
-FLAGS = {
-    "reflectance": True,
-    "indices": "NDVI,SAVI",
-    "polygons": True,
-    "prescription": "track=2.5,wheat_a=1",
-    "cell": 3.0,
-}
+FLAGS = {"reflectance": True, "indices": "NDVI,SAVI", "polygons": True, "prescription": "track=2.5,wheat_a=1"}
 
 
 @dataclass(frozen=True)
@@ -68,6 +62,12 @@ class Products:
         return xr.open_zarr(path, consolidated=False, mask_and_scale=False)
 
 
+def exported(archive: Path, out: Path, receipt: Any, **flags: Any) -> Products:
+    """What these flags export of an archive's newest run."""
+    choice = choose_products(ProductFlags(**flags))
+    return Products(archive, receipt, run_export(archive, None, out, False, QUIET, choice), out)
+
+
 @pytest.fixture(scope="module")
 def posed(tmp_path_factory: pytest.TempPathFactory) -> Products:
     """A small farm with a pose, so high that a pixel sees about a metre, and all of its products."""
@@ -77,8 +77,7 @@ def posed(tmp_path_factory: pytest.TempPathFactory) -> Products:
     settings = load_settings(None, {**given, "out": str(archive), "controls": False})
     with without_effects():
         published = run_survey(replace(settings, pose=POSE), QUIET)
-    choice = choose_products(ProductFlags(**FLAGS))
-    return Products(archive, published.receipt, run_export(archive, None, out, False, QUIET, choice), out)
+    return exported(archive, out, published.receipt, **FLAGS, cell=3.0)
 
 
 def test_reflectance_lies_on_the_map_with_its_wavelengths(posed: Products) -> None:
@@ -86,8 +85,7 @@ def test_reflectance_lies_on_the_map_with_its_wavelengths(posed: Products) -> No
     ground, mosaic = posed.store("ground_map"), posed.store("mosaic")
     assert is_cog(posed.file("reflectance"))
     scene, about = posed.store("class_map"), posed.store("class_map").attrs["angular_grid"]
-    fine, factor = ground_grid(GroundView(POSE, about["ifov_rad"]), scene["classes"].shape), 1
-    grid = grid_of_map(fine.frame.view, fine.scene_shape, fine.geobox.zoom_out(factor))
+    grid = ground_grid(GroundView(POSE, about["ifov_rad"]), scene["classes"].shape)
     rows, columns = (slice(0, size) for size in grid.shape)
     values = open_mosaic(posed.archive / posed.receipt["products"]["mosaic"]).values()
     wanted = image_at(values, grid.scene_pixels(rows, columns), factor=mosaic.attrs["angular_grid"]["factor"])
@@ -95,7 +93,7 @@ def test_reflectance_lies_on_the_map_with_its_wavelengths(posed: Products) -> No
         np.testing.assert_allclose(np.moveaxis(file.read(), 0, -1), wanted, atol=1e-6)
         assert file.crs.to_epsg() == 32632
         resolution, _, left, _, _, top = ground.attrs["spatial:transform"]
-        assert (file.transform.a, file.transform.c, file.transform.f) == (factor * resolution, left, top)
+        assert (file.transform.a, file.transform.c, file.transform.f) == (resolution, left, top)
         assert np.isnan(file.nodata)
         imagery = [file.tags(band, ns="IMAGERY") for band in file.indexes]
         assert file.descriptions[0] == f"{mosaic['wavelength'].values[0]:.1f} nm"
@@ -230,12 +228,14 @@ def test_what_cannot_be_made_is_refused_before_anything_is(
 ) -> None:
     """One message that says what was expected; the folder stays empty."""
     with pytest.raises((SettingsError, WavelengthError), match=words):
-        run_export(posed.archive, None, tmp_path / "out", False, QUIET, choose_products(ProductFlags(**flags)))
+        exported(posed.archive, tmp_path / "out", {}, **flags)
     assert not (tmp_path / "out").exists()
 
 
-def test_a_survey_without_a_place_has_what_needs_none(one_picture: Products) -> None:
+def test_a_survey_without_a_place_has_what_needs_none(surveyed_png: Any, tmp_path: Path) -> None:
     """Polygons on the camera's angles, no GeoJSON, no hectares; doses and metres are refused with what is missing."""
+    archive, out, needs_none = tmp_path / "archive", tmp_path / "out", {"polygons": True, "reflectance": True}
+    one_picture = exported(archive, out, surveyed_png(archive).receipt, indices="VARI", **needs_none)
     found = geopandas.read_file(one_picture.file("polygons"))
     assert found.crs is None
     assert "polygons_geojson" not in one_picture.answer["files"]
@@ -246,21 +246,12 @@ def test_a_survey_without_a_place_has_what_needs_none(one_picture: Products) -> 
         table = list(csv.DictReader(text))
     assert {row["hectares"] for row in table} == {""}
     assert sum(int(row["pixels"]) for row in table) == pixels
-    choice = choose_products(ProductFlags(prescription="class_1=1"))
     with pytest.raises(SettingsError, match=r"metres, and the run has no place .* \[pose\]"):
-        run_export(one_picture.archive, None, one_picture.out / "no", False, QUIET, choice)
-    with pytest.raises(
-        SettingsError, match=r"ExG wants reflectance \(0 to 1\), and the values .* choose an index of ratios"
-    ):
-        run_export(
-            one_picture.archive,
-            None,
-            one_picture.out / "no",
-            False,
-            QUIET,
-            choose_products(ProductFlags(indices="ExG")),
-        )
-    assert not (one_picture.out / "no").exists()
+        exported(archive, out / "no", {}, prescription="class_1=1")
+    words = r"ExG wants reflectance \(0 to 1\), and the values .* choose an index of ratios"
+    with pytest.raises(SettingsError, match=words):
+        exported(archive, out / "no", {}, indices="ExG")
+    assert not (out / "no").exists()
 
 
 @pytest.mark.parametrize(
@@ -274,13 +265,10 @@ def test_products_of_a_georeferenced_scene_lie_where_it_does(
     """Corners of indices and polygons to 0.1 px, in its CRS; cells are square in metres; a gap gets no dose."""
     run = survey(write_geotiff(tmp_path / "a.tif", transform, gap=True, crs=crs), weights, tmp_path / "archive")
     flags = {"polygons": True, "indices": "VARI", "prescription": "class_1=2", "cell": 0.5}
-    out = tmp_path / "out"
-    answer = run_export(tmp_path / "archive", None, out, False, QUIET, choose_products(ProductFlags(**flags)))
-    done = Products(tmp_path / "archive", run.receipt, answer, out)
+    done = exported(tmp_path / "archive", tmp_path / "out", run.receipt, **flags)
     with rasterio.open(done.file("VARI")) as file:
         assert str(file.crs) == crs
-        coarse = Affine(*(number for number in transform[:6]))
-        assert corners_px(file.transform, coarse, file.shape) < 0.1
+        assert corners_px(file.transform, transform, file.shape) < 0.1
         assert np.isnan(file.read(1)[:5, :6]).all()
     found = geopandas.read_file(done.file("polygons"))
     assert str(found.crs) == crs
@@ -288,8 +276,7 @@ def test_products_of_a_georeferenced_scene_lie_where_it_does(
     column, row = ~transform * places.T
     rows, columns = SHAPE
     assert (column.min(), column.max(), row.min(), row.max()) == pytest.approx((0, columns, 0, rows), abs=0.1)
-    seen = ((column >= 24 - 0.1) | (row >= 20 - 0.1)).all()
-    assert seen  # nothing in the gap
+    assert ((column >= 24 - 0.1) | (row >= 20 - 0.1)).all()  # nothing in the gap
     cells = geopandas.read_file(done.file("prescription"))
     assert cells.crs.to_epsg() == 32632
     np.testing.assert_allclose(cells.area, 0.25, rtol=1e-6)
@@ -318,9 +305,7 @@ def test_cells_of_coarse_pixels_are_the_field(tmp_path: Path, weights: Path) -> 
     """Of pixels of 30 m on multiples of their side, by default a cell a pixel; the gap of a corner gets none."""
     scene = write_geotiff(tmp_path / "a.tif", Affine(30, 0, 534_240, 0, -30, 5_772_330), gap=True)
     survey(scene, weights, tmp_path / "archive")
-    choice = choose_products(ProductFlags(polygons=True, prescription="class_1=2,class_2=1"))
-    answer = run_export(tmp_path / "archive", None, tmp_path / "out", False, QUIET, choice)
-    done = Products(tmp_path / "archive", {}, answer, tmp_path / "out")
+    done = exported(tmp_path / "archive", tmp_path / "out", {}, polygons=True, prescription="class_1=2,class_2=1")
     cells, field = geopandas.read_file(done.file("prescription")), geopandas.read_file(done.file("polygons"))
     assert len(cells) == 3160
     assert cells.area.sum() == pytest.approx(field.area.sum())
@@ -331,12 +316,3 @@ def test_cells_of_coarse_pixels_are_the_field(tmp_path: Path, weights: Path) -> 
     (grid,) = task_data.tasks[0].grids
     fraction = (to_numpy_array(numbers[grid.filename], grid) > 0).mean()
     assert fraction == pytest.approx(treated / field.area.sum(), rel=0.35)
-
-
-@pytest.fixture(scope="module")
-def one_picture(tmp_path_factory: pytest.TempPathFactory, surveyed_png: Any) -> Products:
-    """A survey of a picture, which lies nowhere, with its polygons and an index of ratios."""
-    archive, out = tmp_path_factory.mktemp("picture") / "archive", tmp_path_factory.mktemp("maps").resolve()
-    receipt = surveyed_png(archive).receipt
-    choice = choose_products(ProductFlags(polygons=True, indices="VARI", reflectance=True))
-    return Products(archive, receipt, run_export(archive, None, out, False, QUIET, choice), out)

@@ -46,7 +46,7 @@ def rows() -> list[Row]:
         *_bounds({number: random_case(number) for number in CASES}, "random scenes and rigs"),
         *sparse,
         *_pupil(),
-        *_farm(),
+        *(row for name, rig in RIGS.items() for row in _of_rig(farm_scene(1, (1024, 1280)), name, rig)),
     ]
 
 
@@ -101,23 +101,24 @@ def _of_effect(name: str, variant: str, cases: list[tuple[int, Trial]], what: st
     )
 
 
-def _farm() -> list[Row]:
-    scene = farm_scene(1, (1024, 1280))
+def _of_rig(scene: RasterScene, name: str, rig: Rig) -> list[Row]:
     sweeps = tuple(Sweep(f"strip {swath:g}", "fine", "x", swath, -512.0, 1024) for swath in (-320.0, 320.0))
-    return [row for name, rig in RIGS.items() for row in _of_rig(scene, name, rig, sweeps)]
-
-
-def _of_rig(scene: RasterScene, name: str, rig: Rig, sweeps: tuple[Sweep, ...]) -> list[Row]:
     clock = time.process_time()
     probe = probe_scene(scene, rig, sweeps)
     probed = time.process_time() - clock
     decision = decide(probe, rig, EFFECTS, TOLERANCE)
     decided = time.process_time() - clock - probed
-    blocks = [_block(scene, rig, sweep, LINES) for sweep in sweeps]
+    white = scene.white_reference_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
+    told = {"fwhm_nm": scene.fwhm_nm, "white_e": white}
+    blocks = [SweepBlock(rig, sweep, LINES, scene.wavelength_nm, scene.shape, **told) for sweep in sweeps]
     ways = {"auto": decision.chosen, "exact": decision.exact, "cheap": cheap_effects(decision)}
     light = {way: [expected_light(scene, block, chosen) for block in blocks] for way, chosen in ways.items()}
     apart = {way: _apart(light[way], light["exact"], rig) for way in ("auto", "cheap")}
-    clocks = time_in_turn({way: partial(_image, scene, blocks[0], chosen) for way, chosen in ways.items()}, rounds=3)
+
+    def image(chosen: Mapping[Effect, str]) -> None:
+        read_out(expected_light(scene, blocks[0], chosen), blocks[0], chosen)
+
+    clocks = time_in_turn({way: partial(image, chosen) for way, chosen in ways.items()}, rounds=3)
     return [
         _tolerance_row(name, apart, decision),
         _cpu_row(name, "cheap", clocks),
@@ -125,15 +126,6 @@ def _of_rig(scene: RasterScene, name: str, rig: Rig, sweeps: tuple[Sweep, ...]) 
         Row(f"farm, {name}: probe and choice of effects, processor time", f"{probed:.1f} s and {decided:.2f} s"),
         Row(f"farm, {name}: on", ", ".join(f"{one.name}" for one in decision.taken if one.is_on)),
     ]
-
-
-def _block(scene: RasterScene, rig: Rig, sweep: Sweep, lines: range) -> SweepBlock:
-    white = scene.white_reference_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
-    return SweepBlock(rig, sweep, lines, scene.wavelength_nm, scene.shape, fwhm_nm=scene.fwhm_nm, white_e=white)
-
-
-def _image(scene: RasterScene, block: SweepBlock, chosen: Mapping[Effect, str]) -> None:
-    read_out(expected_light(scene, block, chosen), block, chosen)
 
 
 def _apart(light: Sequence[Radiance], exact: Sequence[Radiance], rig: Rig) -> float:

@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from measure import Row, Timing, ratio, time_in_turn
+from measure import Row, ns_of, ratio, time_in_turn
 
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
@@ -70,7 +70,7 @@ def rows() -> list[Row]:
     }
     clocks = time_in_turn(calls, 3)
     fractions = {"auto": 1.0, "cheap": 4 * AT_ONCE / LINES, "exact": AT_ONCE / LINES, "take": 1.0}
-    ns = {name: _ns(clocks[name], survey.values * fraction) for name, fraction in fractions.items()}
+    ns = {name: ns_of(clocks[name], survey.values * fraction) for name, fraction in fractions.items()}
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     rate = 1e9 / ns["auto"]
     on = ", ".join(f"{effect.name} {variant}" for effect, variant in decision.chosen.items())
@@ -152,7 +152,7 @@ def _footprints(survey: Survey) -> list[Row]:
         }
         calls = {variant: partial(expected_light, survey.scene, middle, chosen) for variant, chosen in choices.items()}
         clocks = time_in_turn(calls, 3)
-        ns = {variant: _ns(clock, survey.values * AT_ONCE / LINES) for variant, clock in clocks.items()}
+        ns = {variant: ns_of(clock, survey.values * AT_ONCE / LINES) for variant, clock in clocks.items()}
         exact, *others = (expected_light(survey.scene, corner, chosen) for chosen in choices.values())
         noise = noise_electrons(exact, survey.rig)
         errors = [float((np.abs(other - exact) / noise).max()) for other in others]
@@ -167,7 +167,3 @@ def _footprints(survey: Survey) -> list[Row]:
             )
         )
     return found
-
-
-def _ns(clock: Timing, values: float) -> float:
-    return clock.cpu_min_s / values * 1e9

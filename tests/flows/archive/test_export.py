@@ -65,20 +65,13 @@ class Exported:
 
 
 @pytest.fixture(scope="module")
-def surveys(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Published]]:
-    """One archive with the same farm twice: without a pose and with one."""
-    archive = tmp_path_factory.mktemp("surveys") / "field #ä"
+def exports(tmp_path_factory: pytest.TempPathFactory) -> list[Exported]:
+    """One archive with the same farm twice, without a pose and with one; both exported into one folder."""
+    archive, out = tmp_path_factory.mktemp("surveys") / "field #ä", tmp_path_factory.mktemp("exports").resolve()
     flags = {"size": "128x96", "bands": "20,60,100,150,200", "budget": "0.9", "engine": "plain", "keep": "raw"}
     settings = load_settings(None, {**flags, "out": str(archive), "controls": False, "seed": "1"})
     with without_effects():
-        return archive, [run_survey(settings, QUIET), run_survey(replace(settings, pose=POSE), QUIET)]
-
-
-@pytest.fixture(scope="module")
-def exports(surveys: tuple[Path, list[Published]], tmp_path_factory: pytest.TempPathFactory) -> list[Exported]:
-    """Both runs exported into one folder, with ENVI files."""
-    archive, published = surveys
-    out = tmp_path_factory.mktemp("exports").resolve()
+        published = [run_survey(settings, QUIET), run_survey(replace(settings, pose=POSE), QUIET)]
     return [
         Exported(one, archive, out, run_export(archive, one.folder.name, out, envi=True, console=QUIET))
         for one in published

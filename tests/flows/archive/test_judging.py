@@ -13,25 +13,20 @@ import pytest
 from rich.console import Console
 
 from flows.archive.reprocess_command import run_reprocess
-from flows.publish.receipt import check_receipt, is_pending
+from flows.publish.receipt import is_pending
 from flows.tasks.open_survey import STAGES
 from flows.tasks.stages import accuracy as evaluation
 from models.weights.files import save_weights
 from storage.archive.archive import Archive
 from tests.conftest import RGB_NM, random_weights
 from tests.flows.conftest import CommandLine, act_instead, be_version, problems, turned
-from tests.receipts import comparable
+from tests.receipts import comparable, receipts
 from tests.storage.small_archive import flip
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 
 QUIET = Console(quiet=True)
 Refuse = Callable[[Path, Path, pytest.MonkeyPatch], None]
-
-
-def receipts(out: Path) -> list[Any]:
-    """What the runs of an archive say, oldest first."""
-    return [check_receipt(json.loads((run / "receipt.json").read_text())) for run in Archive.open(out).runs()]
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,7 @@ from pipeline.errors import SceneError, SettingsError
 from storage.archive.archive import Archive
 from storage.arrays.mosaics import open_mosaic
 from storage.remote.opening import verify_archive
-from tests.conftest import RGB_NM, patchy_scene
+from tests.conftest import RGB_NM, WeightsMaker, patchy_scene
 
 QUIET = Console(quiet=True)
 CORNER = Affine(0.5, 0, 500_000, 0, -0.5, 5_400_000)
@@ -67,17 +67,6 @@ def rounding(values: NDArray[Any]) -> float:
     return 1e-3 if (values == np.rint(values)).all() else 0.05 * float(np.nanstd(values))
 
 
-def means_of(values: NDArray[Any], factor: int = 4) -> NDArray[np.float64]:
-    """Work the coarse means out by hand, NaN left out; (y, x, band)."""
-    height, width, _ = values.shape
-    rows = [
-        [np.nanmean(values[y : y + factor, x : x + factor].reshape(-1, values.shape[2]).astype(float), axis=0)]
-        for y in range(0, height, factor)
-        for x in range(0, width, factor)
-    ]
-    return np.array(rows).reshape(-(-height // factor), -(-width // factor), values.shape[2])
-
-
 @pytest.mark.parametrize(("shape", "kind"), [((33, 47), np.float32), ((1, 40), np.uint8), ((5, 3), np.uint16)])
 def test_what_is_stored_is_what_the_file_says(
     surveyed: Raster, tmp_path: Path, kind: type[np.generic], shape: tuple[int, int]
@@ -88,7 +77,11 @@ def test_what_is_stored_is_what_the_file_says(
     published = surveyed(tmp_path / "field.tif", wavelengths="640,550,460")
     image, mosaic = whole(published, tmp_path / "archive")
     np.testing.assert_allclose(image, values, atol=rounding(values))
-    np.testing.assert_allclose(mosaic, means_of(values), atol=rounding(values) + 1e-4)
+    assert mosaic.shape[:2] == (-(-shape[0] // 4), -(-shape[1] // 4))
+    for y, row in enumerate(mosaic):
+        for x, mean in enumerate(row):
+            block = values[4 * y : 4 * y + 4, 4 * x : 4 * x + 4].astype(float)
+            np.testing.assert_allclose(mean, block.mean(axis=(0, 1)), atol=rounding(values) + 1e-4)
 
 
 def test_what_has_no_value_stays_without_one(surveyed: Raster, tmp_path: Path) -> None:
@@ -152,11 +145,11 @@ def test_areas_are_told_without_a_place(surveyed: Raster, tmp_path: Path, pixel_
     assert float(rows[most]["hectares"]) == pytest.approx(hectares[most], rel=1e-5)
 
 
-def test_an_export_has_the_rasters_own_pixels(surveyed: Raster, tmp_path: Path) -> None:
+def test_an_export_has_the_rasters_own_pixels(surveyed: Raster, make_weights: WeightsMaker, tmp_path: Path) -> None:
     """Reflectance and NDVI are the file's by rasterio, on its grid and CRS; so are classes and confidence."""
     values = (patchy_scene((50, 70), 3, seed=7)[0] / 255).astype(np.float32)
     source = write_tif(tmp_path / "field.tif", values)
-    published = surveyed(source, wavelengths="670,550,800", weights=str(_weights_at(tmp_path)))
+    published = surveyed(source, wavelengths="670,550,800", weights=str(make_weights((550.0, 670.0, 800.0))))
     out = tmp_path / "out"
     choice = choose_products(ProductFlags(reflectance=True, indices="NDVI"))
     run_export(tmp_path / "archive", None, out, False, QUIET, choice)
@@ -170,15 +163,6 @@ def test_an_export_has_the_rasters_own_pixels(surveyed: Raster, tmp_path: Path) 
         assert np.sqrt(np.mean((exported.read(1) - ndvi) ** 2)) < 0.01
     with rasterio.open(folder / "class_map.tif") as exported:
         assert (exported.crs, exported.transform, exported.shape) == (own.crs, own.transform, own.shape)
-
-
-def _weights_at(folder: Path) -> Path:
-    from models.weights.files import save_weights
-    from tests.conftest import random_weights
-
-    path = folder / "w.safetensors"
-    save_weights(random_weights((550.0, 670.0, 800.0)), path)
-    return path
 
 
 def test_a_second_visit_goes_on_from_the_first(surveyed: Raster, scene_files: Path) -> None:

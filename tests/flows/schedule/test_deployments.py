@@ -242,14 +242,6 @@ def wait_for(name: str) -> None:
     pytest.fail(f"{name} is not served")
 
 
-def asked_for(name: str, **parameters: Any) -> Any:
-    """Have a deployment run, wait for the end, and give the state."""
-    from prefect.deployments import run_deployment
-
-    run: Any = run_deployment(name, parameters=parameters, timeout=PATIENCE_S, poll_interval=0.5)
-    return run.state
-
-
 def test_the_rig_and_the_reading_machine_are_two_deployments(
     field_file: Callable[..., Path], tmp_path: Path, scheduling: str
 ) -> None:
@@ -350,6 +342,7 @@ def test_a_serve_goes_on_when_its_server_was_killed_and_is_back(
 
     It is started as a shell starts what goes on in the background, which ignores SIGINT.
     """
+    from prefect.deployments import run_deployment
     from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary_settings
 
     file, home, port = field_file("north", source="raster", budget=None), tmp_path / "home", free_port()
@@ -373,7 +366,8 @@ def test_a_serve_goes_on_when_its_server_was_killed_and_is_back(
                 while "does not answer" not in (tmp_path / "said").read_text() and time.monotonic() < end:
                     time.sleep(0.2)
                 with server_process(home, port):
-                    assert asked_for("survey/north").is_completed()
+                    run: Any = run_deployment("survey/north", timeout=PATIENCE_S, poll_interval=0.5)
+                    assert run.state.is_completed()
                     process.terminate()
                     assert process.wait(PATIENCE_S) == 0
                     with client() as asked:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,8 +12,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import convolve1d
 
 from pipeline.geometry.camera import LineCamera, footprint_kernel
-from storage.arrays.mosaics import Mosaic, open_mosaic
+from storage.arrays.mosaics import open_mosaic
 from storage.arrays.signal_cubes import open_signal_cubes
+from tests.conftest import Survey, WeightsMaker
 
 SLIT_PX = LineCamera().slit_px
 SAMPLES = 192  # of a line; a narrow camera is quick to simulate
@@ -40,14 +40,11 @@ class Waves:
         """The scene's pixels."""
         return self.values(*np.mgrid[: self.shape[0], : self.shape[1]].astype(float))
 
-    def seen(self, along: str, factor: int = 1) -> NDArray[np.float64]:
-        """What the footprint leaves of the waves, in closed form, at pixels of ``factor`` scene px."""
+    def seen(self, along: str) -> NDArray[np.float64]:
+        """What the footprint leaves of the waves, in closed form, at the scene's pixels."""
         scan, line = self.frequency.T if along == "x" else self.frequency.T[::-1]
-        held = np.arange(factor) - (factor - 1) / 2
-        smear, binned = (np.cos(2 * np.pi * np.outer(f, held)).mean(axis=1) for f in (scan, line))
-        pixels = np.mgrid[: self.shape[0] // factor, : self.shape[1] // factor]
-        y, x = pixels * factor + (factor - 1) / 2
-        return self.values(y, x, through(scan, SLIT_PX) * through(line, 1.0) * smear * binned)
+        left = through(scan, SLIT_PX) * through(line, 1.0)
+        return self.values(*np.mgrid[: self.shape[0], : self.shape[1]].astype(float), left)
 
 
 def through(frequency: NDArray[np.float64], width: float) -> NDArray[np.float64]:
@@ -65,62 +62,35 @@ def waves(shape: tuple[int, int], shortest_px: float, longest_px: float) -> Wave
     return Waves(shape, frequency, rng.uniform(0, 2 * np.pi, 12), 0.8 * period / period.sum())
 
 
-@dataclass(frozen=True)
-class Stored:
-    """What the survey left, opened with plain xarray."""
-
-    mosaic: Mosaic
-    along: str
-
-
-@pytest.fixture
-def surveyed(survey_png: Any, make_weights: Any, tmp_path: Path) -> Callable[[Waves], Stored]:
-    """Survey waves from a .npy file by every line, camera's footprint on and noise off."""
-
-    def survey(scene: Waves) -> Stored:
-        np.save(tmp_path / "waves.npy", scene.raster())
-        found = survey_png(
-            tmp_path / "archive",
-            scene=str(tmp_path / "waves.npy"),
-            labels=None,
-            wavelengths="500,700",
-            weights=str(make_weights((500.0, 700.0))),
-            effects="rotation,slit,smear",
-            tol="0",
-            **{"camera.samples": SAMPLES},
-            scan_step="1",
-            budget=None,
-        ).receipt
-        mosaic = open_mosaic(tmp_path / "archive" / found["products"]["mosaic"])
-        sweeps = open_signal_cubes(tmp_path / "archive" / found["products"]["signal_coarse"])
-        return Stored(mosaic, sweeps[0].sweep.along)
-
-    return survey
-
-
 def error_fraction(got: NDArray[np.floating], truth: NDArray[np.floating]) -> float:
     """Rms error over the standard deviation of the truth, the worse of the two bands; NaN in ``got`` is left out."""
     spread = truth.std(axis=(0, 1))
     return float((np.sqrt(np.nanmean((got - truth) ** 2, axis=(0, 1))) / spread).max())
 
 
-def convolved(scene: Waves, along: str) -> NDArray[np.float64]:
-    """The scene's pixels convolved with the slit across the line and one pixel along it, edge pixels repeated."""
-    scan, line = (0, 1) if along == "x" else (1, 0)
-    blurred = convolve1d(scene.raster(), footprint_kernel(SLIT_PX), axis=scan, mode="nearest")
-    found: NDArray[np.float64] = convolve1d(blurred, footprint_kernel(1.0), axis=line, mode="nearest")
-    return found
-
-
 @pytest.mark.parametrize(("shape", "along"), [((96, 128), "x"), ((160, 96), "y")])
 def test_survey_is_the_scene_through_the_footprint(
-    shape: tuple[int, int], along: str, surveyed: Callable[[Waves], Stored]
+    shape: tuple[int, int], along: str, survey_png: Survey, make_weights: WeightsMaker, tmp_path: Path
 ) -> None:
     """Waves of 4 to 40 px: the mosaic equals the convolved pixels, and the waves' own closed form inside."""
-    scene = waves(shape, 4, 40)
-    stored = surveyed(scene)
-    assert stored.along == along
-    mosaic, pixels = stored.mosaic.values(), convolved(scene, along)
+    scene, archive = waves(shape, 4, 40), tmp_path / "archive"
+    np.save(tmp_path / "waves.npy", scene.raster())
+    products = survey_png(
+        archive,
+        scene=str(tmp_path / "waves.npy"),
+        labels=None,
+        wavelengths="500,700",
+        weights=str(make_weights((500.0, 700.0))),
+        effects="rotation,slit,smear",
+        tol="0",
+        **{"camera.samples": SAMPLES},
+        scan_step="1",
+        budget=None,
+    ).receipt["products"]
+    assert open_signal_cubes(archive / products["signal_coarse"])[0].sweep.along == along
+    mosaic = open_mosaic(archive / products["mosaic"]).values()
+    blurred = convolve1d(scene.raster(), footprint_kernel(SLIT_PX), axis="xy".index(along), mode="nearest")
+    pixels = convolve1d(blurred, footprint_kernel(1.0), axis="yx".index(along), mode="nearest")  # along the line
     assert np.isfinite(mosaic).all()
     assert error_fraction(mosaic, pixels) < BOUND
     inner = np.s_[8:-8, 8:-8]  # at its border the scene ends, the waves go on

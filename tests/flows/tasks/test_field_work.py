@@ -115,7 +115,6 @@ def test_edges_need_one_patch_of_halo_and_work_travels_as_paths(surveyed: tuple[
     np.testing.assert_allclose(
         _work(run, WorkerPool(), 32).score("sobel", mosaic, run.capture, lambda done: None), whole, rtol=1e-5
     )
-    run, stages = surveyed
     work = run.work
     scoring = Scoring(work.weights, _mosaics(stages)[0], "entropy", run.capture)
     sent = pickle.dumps((scoring, work.regions[0]))

@@ -6,7 +6,6 @@ import hashlib
 import os
 import signal
 import weakref
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -62,13 +61,6 @@ class KillOnce(TileMaker):
         return super().__call__(rows, columns)
 
 
-@pytest.fixture(scope="module")
-def processes() -> Iterator[WorkerPool]:
-    """Two worker processes for all tests here."""
-    with WorkerPool("processes", 2).open() as pool:
-        yield pool
-
-
 def recipe_of(cubes: list[SignalCube]) -> MosaicRecipe:
     """Both sweeps by the folder that they lie in."""
     return MosaicRecipe(Path(str(cubes[0].group.store_path.store.root)).parent, CAMERA, GRID)
@@ -105,14 +97,15 @@ def test_an_error_in_a_tile_ends_the_work(tmp_path: Path, cubes: list[SignalCube
 
 
 def test_a_worker_killed_between_tiles_changes_nothing(
-    tmp_path: Path, cubes: list[SignalCube], processes: WorkerPool, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, cubes: list[SignalCube], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """kill -9 of a process that makes tiles, with a shard half written: the mosaic is that of an undisturbed thread."""
     folder = tmp_path / "key.part"
     write_mosaic(recipe_of(cubes), mosaic_at(tmp_path / "a.zarr"), memory=PLENTY, pool=ONE)
     monkeypatch.setattr("flows.tasks.mosaic_work.TileMaker", partial(KillOnce, folder=str(folder)))
-    budget = write_mosaic(recipe_of(cubes), mosaic_at(folder / "m.zarr"), memory=PLENTY, pool=processes)
-    assert (budget.workers, budget.processes) == (processes.workers, True)
+    with WorkerPool("processes", 2).open() as pool:
+        budget = write_mosaic(recipe_of(cubes), mosaic_at(folder / "m.zarr"), memory=PLENTY, pool=pool)
+    assert (budget.workers, budget.processes) == (2, True)
     assert (folder / "killed").exists()
     assert digest_of(folder / "m.zarr") == digest_of(tmp_path / "a.zarr")
 

@@ -25,6 +25,7 @@ from storage.remote.object_stores import Objects
 from tests.conftest import Survey
 from tests.flows.conftest import FEW_BANDS, CommandLine
 from tests.prior_work import with_effects
+from tests.storage.small_bucket import rot
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 
@@ -139,9 +140,7 @@ def rot_mosaic(address: str) -> None:
     archive = open_archive(address)
     assert isinstance(archive, ObjectArchive)
     name = next(name for name in archive.objects.listing("stages/rectify_fine") if "/scores/c/" in name)
-    content = bytearray(archive.objects.read(name) or b"")
-    content[100] ^= 1
-    archive.objects.write(name, bytes(content))
+    rot(archive, name, 100)
 
 
 def test_a_flipped_bit_is_named_and_made_again(

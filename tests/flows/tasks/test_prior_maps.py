@@ -113,6 +113,7 @@ def test_by_hand_nothing_is_remembered_unless_asked(visited: Path, survey_png: S
         ("2026-06-02T22:00:00Z", False, 1, 1.5),  # taken in late
         ("2026-06-04T12:00:00+02:00", False, 2, 0.0),  # at the same moment as the other
         ("2026-06-09T10:00:00Z", True, 1, 8.0),
+        ("2026-06-04", False, 2, 0.0),  # a date alone is a day and not its midnight
     ],
 )
 def test_the_prior_map_is_the_last_before_the_visit_or_the_one_named(
@@ -123,12 +124,6 @@ def test_the_prior_map_is_the_last_before_the_visit_or_the_one_named(
     assert found_prior(twice[0], visit, run if named else "latest") == (run, days)
     with pytest.raises(SettingsError, match=r"--prior nobody: there is no such run in the archive; give another run"):
         found_prior(twice[0], visit, "nobody")
-
-
-def test_a_date_alone_is_a_day_and_not_its_midnight(twice: tuple[Path, Any, Any]) -> None:
-    """A visit that is named by a date goes on from an earlier one of that day, whatever its time."""
-    day = str(twice[2].receipt["settings"]["visit"])[:10]
-    assert found_prior(twice[0], day, "latest") == (twice[2].folder.name, 0.0)
 
 
 def found_prior(out: Path, visit: str, prior: str) -> tuple[str, float] | None:
@@ -233,18 +228,13 @@ def test_a_reader_in_the_weights_is_used(visited: Path, survey_png: Survey, weig
         survey_png(visited, **flags)
 
 
-def moved(folder: Path) -> list[dict[str, Any]]:
-    """Flags of one field twice, the second time 12 px lower and 20 px further left."""
-    values, _ = patchy_scene((160, 192), 3, seed=5)
-    flags = {**UNIFORM, "labels": None, "prior": "latest"}
-    for name, part in {"before": np.s_[12:140, 0:160], "now": np.s_[0:128, 20:180]}.items():
-        Image.fromarray(values[part].astype(np.uint8)).save(folder / f"{name}.png")
-    return [{**flags, "scene": str(folder / f"{name}.png")} for name in ("before", "now")]
-
-
 def test_a_rig_that_was_moved_between_two_parts_is_noticed(survey_png: Survey, tmp_path: Path) -> None:
     """Where they share nothing today's lines are laid onto those of the visit before the last."""
-    out, (before, now) = tmp_path / "archive", moved(tmp_path)
+    out, (values, _) = tmp_path / "archive", patchy_scene((160, 192), 3, seed=5)
+    flags = {**UNIFORM, "labels": None, "prior": "latest"}
+    before, now = ({**flags, "scene": str(tmp_path / f"{name}.png")} for name in ("before", "now"))
+    for one, part in ((before, np.s_[12:140, 0:160]), (now, np.s_[0:128, 20:180])):  # 12 px lower, 20 further left
+        Image.fromarray(values[part].astype(np.uint8)).save(one["scene"])
     survey_png(out, **before, visit=FIRST)
     middle = survey_png(out, **before, visit=LATER, extent="0:0-20")
     words, later = words_of(out, survey_png, **now, visit="2026-06-07T10:00:00Z", extent="0:40-64")

@@ -36,8 +36,7 @@ def weights() -> Weights:
     return load_weights(PATH)
 
 
-@pytest.fixture(scope="module")
-def controls(weights: Weights) -> Placements:
+def placements(weights: Weights) -> Placements:
     """Placements judged on a farm that training has not seen, through the exact rays of the simulated rig."""
     camera, scene = LineCamera(), farm_scene(41, SHAPE)
     grid = SceneGrid(*SHAPE, weights.config.patch, 1)
@@ -50,7 +49,7 @@ def controls(weights: Weights) -> Placements:
 
 
 def test_file_is_small_and_tells_its_making(weights: Weights) -> None:
-    """The key that its products know, at most 3 MB; command, seed, law of the data, figures of unseen scenes."""
+    """The key that its products know, at most 3 MB; command, seed, law of the data, figures of scenes and scans."""
     assert describe_weights(PATH).key == "5fca755bb6df8e23c46f"
     assert PATH.stat().st_size <= 3e6
     assert weights.record["command"].startswith("spectralzoom train farm@2,scouting@1")
@@ -60,11 +59,7 @@ def test_file_is_small_and_tells_its_making(weights: Weights) -> None:
     assert weights.class_names == tuple(entry for entry in CLASSES)
     split = weights.record["split"]
     assert not set(split["train"]) & set(split["validation"])
-
-
-def test_scans_of_every_spacing_are_known() -> None:
-    """Lines of up to 8 px apart are read, and what each scan scored stands in the record."""
-    assert ScanPerformance.read(describe_weights(PATH).record["scans"]).steps == (1, 2, 4, 8)
+    assert ScanPerformance.read(weights.record["scans"]).steps == (1, 2, 4, 8)
 
 
 @pytest.mark.parametrize("asked", [{"budget": "0.5"}, {"scan_step": "4"}, {"seconds": "9"}, {}])
@@ -82,8 +77,9 @@ def test_seconds_that_no_scan_ends_in_are_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "a").exists()
 
 
-def test_a_full_reading_where_the_map_is_unsure_beats_chance(controls: Placements) -> None:
+def test_a_full_reading_where_the_map_is_unsure_beats_chance(weights: Weights) -> None:
     """At K = 35 % expected gain is above random by more than its spread, and most of the way to all."""
+    controls = placements(weights)
     rows = placement_figures(controls)
     assert rows["gain"]["miou"] > rows["random"]["miou"] + rows["random"]["spread"]
     none, every = mean_iou(controls["none"][0]), mean_iou(controls["all"][0])

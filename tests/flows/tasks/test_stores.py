@@ -15,7 +15,6 @@ import zarr
 from rich.console import Console
 
 from flows.publish.publishing import clear_raw, publish
-from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from flows.settings.parameters import SurveySettings
@@ -28,22 +27,6 @@ from storage.archive.archive import Archive
 from storage.archive.records import read_run
 from storage.arrays.cubes import open_raw_cube
 from tests.conftest import Survey
-from tests.prior_work import without_effects
-
-
-@pytest.fixture(scope="module")
-def surveyed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Published]:
-    """An archive with one survey that kept its raw lines, which nobody changes, and what it published."""
-    root = tmp_path_factory.mktemp("raw") / "archive"
-    return root, _survey_farm(root)
-
-
-def _survey_farm(root: Path) -> Published:
-    """A small farm in as many bands as light with a spectrum needs."""
-    flags = {"scene": "farm", "size": "192x160", "engine": "plain", "controls": False, "budget": "0.95", "keep": "raw"}
-    bands = ",".join(map(str, range(5, 265, 10)))
-    with without_effects():
-        return run_survey(load_settings(None, {**flags, "bands": bands, "out": str(root)}), Console(quiet=True))
 
 
 def test_a_store_of_an_input_that_was_cleared_meanwhile_is_not_published(tmp_path: Path) -> None:
@@ -82,15 +65,15 @@ def _arrays(root: Path) -> Iterator[tuple[Path, zarr.Array[Any]]]:
             yield about.parent, zarr.open_array(about.parent, mode="r")
 
 
-def _dims(array: zarr.Array[Any]) -> tuple[str, ...]:
-    return tuple(getattr(array.metadata, "dimension_names", None) or ())
-
-
-def test_raw_is_stored_once_and_as_uint16(surveyed: tuple[Path, Published]) -> None:
+@pytest.mark.usefixtures("no_effects")
+def test_raw_is_stored_once_and_as_uint16(tmp_path: Path) -> None:
     """Every captured line is in one array, and under no other name; no spool is left; what is derived is smaller."""
-    root, published = surveyed
+    flags = {"scene": "farm", "size": "192x160", "engine": "plain", "controls": False, "budget": "0.95", "keep": "raw"}
+    bands, root = ",".join(map(str, range(5, 265, 10))), tmp_path / "archive"  # as many as light with a spectrum needs
+    published = run_survey(load_settings(None, {**flags, "bands": bands, "out": str(root)}), Console(quiet=True))
     arrays = list(_arrays(root))
-    by_line = [(path, array) for path, array in arrays if {"line", "band"} <= set(_dims(array))]
+    named = [getattr(array.metadata, "dimension_names", None) or () for _, array in arrays]
+    by_line = [one for one, names in zip(arrays, named, strict=True) if {"line", "band"} <= set(names)]
     assert {path.name for path, _ in by_line} == {"dn"}
     assert {array.dtype for _, array in by_line} == {np.dtype(np.uint16)}
     sweeps = [open_raw_cube(path.parent).sweep.name for path, _ in by_line]

@@ -76,13 +76,6 @@ def farm(tmp_path_factory: pytest.TempPathFactory) -> Done:
     return Done(run_survey(load_settings(None, flags), Console(quiet=True)), out)
 
 
-@pytest.fixture(scope="module")
-def picture(tmp_path_factory: pytest.TempPathFactory, surveyed_png: Any) -> Done:
-    """A PNG with labels, no controls."""
-    out = tmp_path_factory.mktemp("picture")
-    return Done(surveyed_png(out), out)
-
-
 def test_receipt_has_every_field(farm: Done) -> None:
     """The built-in scene's receipt is whole: stages in order, all ran, accuracy with controls, effects."""
     receipt = check_receipt(farm.receipt)
@@ -190,9 +183,9 @@ def test_without_later_lines_the_first_pass_is_read_in_full(survey_png: Any, wei
 
 
 @pytest.mark.usefixtures("no_effects")
-def test_what_is_not_judged_is_left_out(picture: Done, survey_png: Any, scene_files: Path, tmp_path: Path) -> None:
+def test_what_is_not_judged_is_left_out(surveyed_png: Any, survey_png: Any, scene_files: Path, tmp_path: Path) -> None:
     """Without controls neither other placements nor `all` are judged; without labels there is no accuracy."""
-    accuracy = picture.receipt["accuracy"]
+    accuracy = surveyed_png(tmp_path / "picture").receipt["accuracy"]
     assert accuracy["controls"] == {}
     assert accuracy["all"]["miou"] is None
     assert accuracy["gap_closed"] is None

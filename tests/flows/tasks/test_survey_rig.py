@@ -140,13 +140,6 @@ def test_every_line_is_the_simulated_one(tmp_path: Path, monkeypatch: pytest.Mon
     np.testing.assert_array_equal(class_map_of(published, tmp_path / "rig"), class_map_of(simulated, tmp_path / "sim"))
 
 
-@pytest.fixture(scope="module")
-def simulated_map(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray[Any, Any]:
-    """The map of the simulated rig without effects."""
-    out = tmp_path_factory.mktemp("sim")
-    return class_map_of(run_survey(small_settings(out, effects="none"), QUIET), out)
-
-
 def test_a_mounting_that_does_not_reach_the_field_is_refused_first(tmp_path: Path) -> None:
     """Before anything moves: the mirror's rest lies where its range ends before the field does."""
     beside = {"rig.mirror_offset_x": 0.5, "rig.mirror_offset_y": 0.5, "size": "6400x6400"}
@@ -155,18 +148,19 @@ def test_a_mounting_that_does_not_reach_the_field_is_refused_first(tmp_path: Pat
 
 
 @pytest.mark.usefixtures("no_effects")
-def test_a_rig_as_the_defaults_have_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, simulated_map: np.ndarray):
+def test_a_rig_as_the_defaults_have_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """No pulses and no CRC: every line lies where the mirror's log measured it, and the map is nearly the simulated."""
     usual = SurveyRig()
     told = {"rig.pulses": usual.pulses, "rig.with_crc": usual.with_crc, "effects": "none", "keep": "raw"}
     settings = small_settings(tmp_path, source="rig", visit="first", **told)
+    simulated = run_survey(small_settings(tmp_path / "sim", effects="none"), QUIET)
     with emulated(settings, {}, monkeypatch) as rig:
         published = run_survey(settings, QUIET)
         assert (rig.camera.wired, rig.mirror.mode) == ("none", Mode.PRO)
     for name in ("raw_coarse", "raw_fine"):
         record = json.loads((tmp_path / published.receipt["products"][name] / "rig.json").read_text())
         assert {one["method"] for one in record["captures"]} == {"log"}
-    alike = class_map_of(published, tmp_path) == simulated_map
+    alike = class_map_of(published, tmp_path) == class_map_of(simulated, tmp_path / "sim")
     assert alike.mean() > 0.9, alike.mean()
 
 

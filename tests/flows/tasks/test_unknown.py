@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -165,9 +166,9 @@ def test_a_rate_needs_weights_that_were_measured(survey_png: Survey, weights: Pa
     assert not (tmp_path / "out").exists()
 
 
-def _notes(weights: Path, nm: tuple[float, ...] = RGB_NM, **flags: Any) -> tuple[str, ...]:
+def _notes(weights: Path, nm: tuple[float, ...] = RGB_NM, seen: TrainedOn = SEEN, **flags: Any) -> tuple[str, ...]:
     scene: Any = SimpleNamespace(wavelength_nm=np.array(nm), shape=(96, 128), light_fraction=1.0)
-    return beyond_training(load_settings(None, flags), scene, describe_weights(weights), SEEN, weights)
+    return beyond_training(load_settings(None, flags), scene, describe_weights(weights), seen, weights)
 
 
 @given(st.integers(96, 300), st.floats(3.0, 100.0))
@@ -184,19 +185,11 @@ def test_a_survey_within_training_has_no_note(weights: Path, day: int, exposure_
         ({"coarse_exposure_ms": 2}, "exposures of 2 ms"),
         ({"nm": (460.0, 470.0, 480.0)}, "the bands cover 2 of the weights' 3 spectral features"),
         ({"nm": (460.0, 900.0, 1500.0, 1600.0)}, "bands outside of 460-640 nm: 3 of 4"),
+        ({"seen": replace(SEEN, ground_pixel_m=0.01)}, r"GSD of 12 cm \(training: 1 cm\)"),
     ],
 )
 def test_what_training_did_not_see_is_told_in_one_note(weights: Path, flags: dict[str, Any], words: str) -> None:
     """With what it saw, and what to do."""
-    nm = flags.pop("nm", RGB_NM)
-    (note,) = _notes(weights, nm, **flags)
+    (note,) = _notes(weights, **flags)
     assert re.search(words, note), note
     assert "spectralzoom train DATASET -o" in note
-
-
-def test_a_pixel_of_another_size_is_told(weights: Path) -> None:
-    """Before weights that know pixels of 1 cm."""
-    scene: Any = SimpleNamespace(wavelength_nm=np.array(RGB_NM), shape=(96, 128), light_fraction=1.0)
-    other = TrainedOn(3, SEEN.wavelength_nm, SEEN.exposure_ms, 2, CLASSES, None, None, 0.01)
-    (note,) = beyond_training(load_settings(None, {}), scene, describe_weights(weights), other, weights)
-    assert "GSD of 12 cm (training: 1 cm)" in note

@@ -56,11 +56,6 @@ def clock(monkeypatch):
     return stands_in
 
 
-def sum_series(terms: int) -> float:
-    """The first terms of 1/n^2."""
-    return math.fsum(1 / n**2 for n in range(1, terms + 1))
-
-
 SERIES = Tradeoff(
     stage="series",
     knob="terms",
@@ -68,7 +63,7 @@ SERIES = Tradeoff(
     reference="pi^2 / 6",
     settings=(4000.0, 16000.0, 64000.0),
     prepare=lambda seed: math.pi**2 / 6,
-    run=lambda truth, terms: sum_series(int(terms)),
+    run=lambda truth, terms: math.fsum(1 / n**2 for n in range(1, int(terms) + 1)),
     judge=lambda truth, terms, out: Figures(abs(out - truth)),
 )
 

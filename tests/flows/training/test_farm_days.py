@@ -18,7 +18,7 @@ from flows.training.observed_scenes import observe_scene
 from flows.training.train_scenes import TrainRequest, observe_all
 from models.network.spectral import SpectralBasis
 from models.training.examples import observe
-from pipeline.errors import SceneError, SettingsError
+from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.simulator.scenes.farm.farm_plan import CLASSES
@@ -52,20 +52,6 @@ def test_two_days_of_a_field_are_one_land() -> None:
     assert len({open_scene(_settings(**moment))[0].key for moment in given}) == 3
     key = open_scene(_settings(day=173))[0].key
     assert key.startswith("farm@2/seed=0/day=173/shape=200x240/hour=11/bands=270")
-
-
-@pytest.mark.parametrize(
-    ("table", "words"),
-    [
-        ({"scene": "field.png", "hour": 9.5}, "'hour' = 9.5 is for built-in scenes, whose crops grow; field.png"),
-        ({"scene": FARM_LAW, "day": 0}, "'day' must be a whole number from 1 to 366, got 0"),
-        ({"scene": FARM_LAW, "hour": 25}, "'hour' must be a number from 0 to 24 h"),
-    ],
-)
-def test_days_that_are_none_are_refused(table: dict[str, Any], words: str) -> None:
-    """By the settings, before any scene is opened."""
-    with pytest.raises(SettingsError, match=words):
-        parse_settings(table)
 
 
 def test_night_is_refused() -> None:

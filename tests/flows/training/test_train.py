@@ -25,7 +25,6 @@ from flows.training.data import TrainingData
 from flows.training.figures import judge_baselines
 from flows.training.train import run_train, train_weights
 from flows.training.train_scenes import TrainRequest, suggested_patch
-from models.evaluation.expected_scores import MapScores
 from models.evaluation.metrics import mean_iou
 from models.evaluation.placement import ReadTwice
 from models.training.examples import Example
@@ -67,13 +66,6 @@ def test_the_record_tells_what_was_trained_on(folder: Path, out: Path, tmp_path:
     assert split["held_out"] == ["003"]
     assert record["training"]["steps"] == 1
     assert load_weights(tmp_path / "w.safetensors").record["split"] == split
-
-
-def _map_scores(weights: Path) -> MapScores:
-    ood_detector = describe_weights(weights).ood_detector
-    assert ood_detector is not None
-    assert ood_detector.map_scores is not None
-    return ood_detector.map_scores
 
 
 def test_new_weights_say_what_they_saw_and_know_what_is_ood(tmp_path: Path):
@@ -270,7 +262,10 @@ def test_weights_for_short_exposures_have_a_record_of_plain_scans(folder: Path, 
     tables = [scans["miou"], *scans["per_class_iou"].values()]
     assert all(np.shape(table) == (4, 5) and np.min(table) >= 0 and np.max(table) <= 1 for table in tables)
     assert np.shape(scans["spread"]) == (4, 5)
-    scores = _map_scores(out)
+    ood_detector = describe_weights(out).ood_detector
+    assert ood_detector is not None
+    scores = ood_detector.map_scores
+    assert scores is not None
     assert (scores.steps, scores.exposures_ms, scores.scenes) == ((1, 2, 4, 8), (6.0, 12.0, 25.0, 50.0, 100.0), 2)
     assert np.abs(scores.bias).max() > 0.01
     assert "scans" not in train_weights(_request(folder, out, validation=2))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
@@ -13,10 +11,6 @@ from models.network.sizes import CELL_PX, PLANES, SegmenterConfig, TemporalSizes
 from models.network.temporal_reader import TemporalReader
 from models.policies.policies import score_multiply_adds
 from pipeline.geometry.grid import SceneGrid
-
-
-def _attention(q: Any, k: Any, v: Any, *args: Any, out_shape: Any = None, **kwargs: Any) -> int:
-    return sdpa_flop_count(q, k, v)
 
 
 @pytest.mark.parametrize(
@@ -29,9 +23,9 @@ def test_closed_form_equals_the_counter(sizes: dict[str, int], patch_index: int,
     config = SegmenterConfig(classes=5, columns=6, **sizes)
     grid = SceneGrid(64, width, config.patch, 1)
     model, image = Segmenter(config).eval(), torch.zeros(1, 6 + PLANES, *grid.padded_shape)
-    counter = FlopCounterMode(
-        display=False, custom_mapping={torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: _attention}
-    )
+    attention = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu
+    flops = {attention: lambda q, k, v, *args, out_shape=None, **kwargs: sdpa_flop_count(q, k, v)}
+    counter = FlopCounterMode(display=False, custom_mapping=flops)
     with torch.inference_mode(), counter:
         model(image, image, torch.arange(patch_index)[None], torch.zeros(1, 2))
     assert multiply_adds(config, grid, patch_index, 0).total == counter.get_total_flops() / 2

@@ -51,12 +51,6 @@ def test_noise_and_spikes_do_not_move_the_sweep() -> None:
     assert abs(found.distance_px - 1) < 1e-3
 
 
-def _moved(along_px: np.ndarray, scan_px: np.ndarray) -> np.ndarray:
-    """Mirror positions of line centres."""
-    rest = np.zeros((len(scan_px), 2))
-    return shifted_position(rest, np.stack([along_px, scan_px], axis=-1), CAMERA)
-
-
 @pytest.mark.parametrize(
     ("along", "scan", "message"),
     [
@@ -67,8 +61,9 @@ def _moved(along_px: np.ndarray, scan_px: np.ndarray) -> np.ndarray:
 )
 def test_what_is_no_straight_scan_is_refused(along: np.ndarray, scan: np.ndarray, message: str) -> None:
     """A bend, a mirror at rest, and a scan that goes back: each says what to do."""
+    position = shifted_position(np.zeros((len(scan), 2)), np.stack([along, scan], axis=-1), CAMERA)
     with pytest.raises(SceneError, match=message):
-        fit_sweep(_moved(along, scan), CAMERA, name="s", samples=640)
+        fit_sweep(position, CAMERA, name="s", samples=640)
 
 
 def test_too_few_lines_and_odd_samples_are_refused() -> None:

@@ -22,16 +22,11 @@ def aim(along_px: np.ndarray | float, scan_px: np.ndarray) -> np.ndarray:
 def geolocation(
     position: np.ndarray, camera: LineCamera, points_px: np.ndarray, *, along: Axis, binning: int = 1
 ) -> np.ndarray:
-    """Line and sample at which a sweep that runs one way, either way, saw points (..., 2); a knot for every line."""
+    """Line and sample at which a sweep that runs forward saw points (..., 2); a knot for every line."""
     scan, across, lines = line_centres(position, camera)
-    order = np.argsort(scan, kind="stable")
-    scan, across, lines = scan[order], across[order], lines[order]
     steps = np.diff(scan)
     width = float(np.median(steps)) if len(steps) else camera.ifov_rad * binning
     if len(steps) and np.ptp(steps) < 1e-7 * width:
         width = float(scan[-1] - scan[0]) / len(steps)
     scan_path = ScanPath(scan, across, lines, np.arange(len(lines)), np.ones(len(lines), np.bool_), width)
-    found = path_geolocation(scan_path, camera, points_px, along=along, binning=binning)
-    if lines[0] > lines[-1]:
-        found[..., 0] = len(position) - 1 - found[..., 0]
-    return found
+    return path_geolocation(scan_path, camera, points_px, along=along, binning=binning)

@@ -20,9 +20,7 @@ from pipeline.simulator.simulated import SimulatedSource
 from tests.pipeline.rectify.aiming import geolocation
 from tests.pipeline.simulator.small_scenes import effects_on, made_scene
 
-CAMERA = LineCamera(
-    bits=14, electrons_per_dn=1.0
-)  # finer steps than the rig's, so that rounding does not blur the figure
+CAMERA = LineCamera(bits=14, electrons_per_dn=1.0)  # finer steps than the rig's: rounding does not blur the figure
 FULL = 15_000.0
 BESIDE = 24  # px
 
@@ -79,7 +77,10 @@ def rectified(scene: Waves, swaths: list[float], along: Axis, step: int) -> tupl
 def rectified_swath(scene: Waves, swath: float, along: Axis, step: int) -> MosaicPart:
     """One sweep on the grid of the scene: captured, calibrated, looked up, resampled."""
     source = SimulatedSource(scene.pixels(), Rig(CAMERA), chosen=effects_on("rotation", "slit", "smear"))
-    sweep = sweep_over(scene, swath, along, step)
+    length = scene.shape[0] if along == "x" else scene.shape[1]
+    margin = (3 + int(abs(swath) * 330 * CAMERA.ifov_rad / step)) * step  # for the line's rotation, and for taps
+    lines = (length + 2 * margin) // step
+    sweep = Sweep(f"strip {swath}", "fine", along, swath, -(length - 1) / 2 - margin, lines, step, step)
     lines = list(source.lines(sweep))
     raw = np.stack([line.data for line in lines])
     position = np.array([(line.mirror_x, line.mirror_y) for line in lines])
@@ -89,14 +90,6 @@ def rectified_swath(scene: Waves, swath: float, along: Axis, step: int) -> Mosai
     points = PixelGrid(origin, step, (rows, columns)).points(slice(0, rows), slice(0, columns)).reshape(-1, 2)
     at = geolocation(position, CAMERA, points, along=along, binning=step)
     return MosaicPart(*resample(values, valid, at), edge_distance(at, raw.shape[0], raw.shape[1]))
-
-
-def sweep_over(scene: Waves, swath: float, along: Axis, step: int) -> Sweep:
-    """A strip with a margin for the line's rotation and the kernel's taps."""
-    length = scene.shape[0] if along == "x" else scene.shape[1]
-    margin = (3 + int(abs(swath) * 330 * CAMERA.ifov_rad / step)) * step
-    lines = (length + 2 * margin) // step
-    return Sweep(f"strip {swath}", "fine", along, swath, -(length - 1) / 2 - margin, lines, step, step)
 
 
 @pytest.mark.parametrize(

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import dataclass, field
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,13 +13,12 @@ from hypothesis import strategies as st
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import Sweep
 from pipeline.planning.coverage import full_sweeps
 from pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
 from pipeline.rectify.region import mosaic_rows, patch_pixels, read_patches
 from pipeline.signal.lines import LineCache
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
+from pipeline.simulator.scenes.scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from tests.pipeline.simulator.small_scenes import effects_on
 
@@ -120,24 +117,15 @@ def test_edge_distance_is_to_the_nearest_border() -> None:
 CAMERA = LineCamera()
 
 
-def smooth_scene(shape: tuple[int, int], bands: int = 2) -> RasterScene:
-    """A few slow waves, above zero everywhere."""
-    y, x = np.mgrid[: shape[0], : shape[1]]
-    waves = [2 + np.sin(2 * np.pi * (y / (17 + 3 * k) + x / (23 - 2 * k))) for k in range(bands)]
-    values = np.stack(waves, axis=-1).astype(np.float32)
-    return raster_from_values(values, CAMERA, name="waves", wavelength_nm=np.linspace(500, 700, bands))
-
-
-def viewed(scene: RasterScene, sweeps: list[Sweep]) -> list[SimulatedSweep]:
-    """The sweeps without noise."""
-    source = SimulatedSource(scene, Rig(CAMERA), 0, effects_on("rotation", "slit", "smear"))
-    return [SimulatedSweep(source, sweep) for sweep in sweeps]
-
-
 def test_patches_are_windows_of_the_mosaic() -> None:
     """A patch read by itself holds the mosaic's own pixels."""
     grid = SceneGrid(150, 100, 10, 2)
-    sweeps = viewed(smooth_scene((150, 100)), full_sweeps(grid, CAMERA, "x"))
+    y, x = np.mgrid[:150, :100]
+    waves = [2 + np.sin(2 * np.pi * (y / (17 + 3 * k) + x / (23 - 2 * k))) for k in range(2)]
+    values = np.stack(waves, axis=-1).astype(np.float32)
+    scene = raster_from_values(values, CAMERA, name="waves", wavelength_nm=np.array([500.0, 700.0]))
+    source = SimulatedSource(scene, Rig(CAMERA), 0, effects_on("rotation", "slit", "smear"))
+    sweeps = [SimulatedSweep(source, sweep) for sweep in full_sweeps(grid, CAMERA, "x")]
     mosaic = np.concatenate([values for _, values, _ in mosaic_rows(sweeps, CAMERA, grid, rows=64)])
     patch_index = grid.valid_patches()
     plain, valid = read_patches(sweeps, CAMERA, grid, patch_index)
@@ -163,19 +151,15 @@ def test_pixels_beyond_the_border_are_reflected() -> None:
     assert (points[0, :, 0, 0] + 5.5).tolist() == [8, 9, 10, 11, 10, 9, 8, 11]
 
 
-@dataclass
 class Numbered:
     """Lines whose numbers say where they lie; notes what is read, slowly if asked."""
 
-    delay_s: float = 0.0
-    asked: list[tuple[int, int]] = field(default_factory=list)
-    valid_line: np.ndarray = field(default_factory=lambda: np.ones(LINES, np.bool_))
-    references: Any = field(default_factory=lambda: SimpleNamespace(dark=np.zeros((SAMPLES, BANDS), np.float32)))
-    raw: np.ndarray = field(
-        default_factory=lambda: (
-            np.arange(LINES * SAMPLES * BANDS, dtype=np.uint32).astype(np.uint16).reshape(LINES, SAMPLES, BANDS)
-        )
-    )
+    valid_line = np.ones(LINES, np.bool_)
+    references = SimpleNamespace(dark=np.zeros((SAMPLES, BANDS), np.float32))
+    raw = np.arange(LINES * SAMPLES * BANDS, dtype=np.uint32).astype(np.uint16).reshape(LINES, SAMPLES, BANDS)
+
+    def __init__(self, delay_s: float = 0.0) -> None:
+        self.delay_s, self.asked = delay_s, list[tuple[int, int]]()
 
     def read(self, start: int, stop: int) -> np.ndarray:
         """Whole lines."""

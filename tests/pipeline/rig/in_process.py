@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import heapq
-from collections import deque
 from dataclasses import dataclass, field
 from itertools import count
 
@@ -33,8 +32,42 @@ class ManualClock:
             self._now += seconds
 
 
+class Incoming:
+    """What is on its way to a driver, an error among it perhaps; whoever waits for it moves the clock."""
+
+    clock: Clock
+
+    def __post_init__(self) -> None:
+        self.coming: list[tuple[float, int, bytes | Exception]] = []  # by the time at which it can be read
+        self._order = count()
+
+    def expect(self, when_s: float, data: bytes | Exception) -> None:
+        """Have something come at a time, behind all that comes then."""
+        heapq.heappush(self.coming, (when_s, next(self._order), data))
+
+    def read(self, at_most: int, deadline: float) -> bytes:
+        """Give the next part, at the time that it comes."""
+        if not self.coming or self.coming[0][0] > deadline:
+            self.clock.sleep(deadline - self.clock.now())
+            return b""
+        when_s, order, data = heapq.heappop(self.coming)
+        self.clock.sleep(when_s - self.clock.now())
+        if isinstance(data, Exception):
+            raise data
+        if data[at_most:]:
+            heapq.heappush(self.coming, (when_s, order, data[at_most:]))
+        return data[:at_most]
+
+    def drain(self) -> bytes:
+        """Give what came already."""
+        found = b""
+        while self.coming and self.coming[0][0] <= self.clock.now():
+            found += self.read(1 << 20, self.clock.now())
+        return found
+
+
 @dataclass
-class InProcessTransport:
+class InProcessTransport(Incoming):
     """A :class:`~pipeline.rig.transports.Transport` to ``device``; both share the clock.
 
     ``sent`` are the writes, for whoever checks what was sent. ``baud`` paces both directions; 0 does not.
@@ -45,12 +78,11 @@ class InProcessTransport:
     baud: int = 0
     port: str = "emulator"
     sent: list[bytes] = field(default_factory=list)
-    _due: list[tuple[float, int, bytes]] = field(default_factory=list, init=False)
-    _order: count[int] = field(default_factory=count, init=False)
     _free_s: float = field(default=0.0, init=False)  # when the line from the device is free again
     _closed: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if isinstance(self.device, FaultyMirror):
             self._schedule(self.device.opened())
 
@@ -70,31 +102,23 @@ class InProcessTransport:
     def read(self, at_most: int, deadline: float) -> bytes:
         """Give what the device has answered by then."""
         self._check_open()
-        if not self._due and getattr(self.device, "gone", False):
+        if not self.coming and getattr(self.device, "gone", False):
             raise self._gone()
-        until = min(self._due[0][0], deadline) if self._due else deadline
-        self.clock.sleep(until - self.clock.now())
-        data = self.drain()
-        if len(data) > at_most:
-            heapq.heappush(self._due, (self.clock.now(), -next(self._order), data[at_most:]))
-        return data[:at_most]
+        return super().read(at_most, deadline)
 
     def drain(self) -> bytes:
         self._check_open()
-        data = b""
-        while self._due and self._due[0][0] <= self.clock.now():
-            data += heapq.heappop(self._due)[2]
-        return data
+        return super().drain()
 
     def close(self) -> None:
         self._closed = True
-        self._due.clear()
+        self.coming.clear()
 
     def _schedule(self, chunks: list[Chunk]) -> None:
         now = self.clock.now()
         for delay_s, data in chunks:
             self._free_s = max(now + delay_s, self._free_s if self.baud else 0.0) + self._seconds(len(data))
-            heapq.heappush(self._due, (self._free_s, next(self._order), data))
+            self.expect(self._free_s, data)
 
     def _seconds(self, size: int) -> float:
         return size * BITS_PER_BYTE / self.baud if self.baud else 0.0
@@ -108,16 +132,16 @@ class InProcessTransport:
 
 
 @dataclass
-class InProcessCameraLine:
+class InProcessCameraLine(Incoming):
     """A :class:`~pipeline.rig.transports.Transport` to ``device``; both share the clock."""
 
     device: CameraDevice
     clock: Clock
     port: str = "emulated camera"
-    _coming: deque[tuple[float, bytes]] = field(default_factory=deque, init=False)
     _open: bool = field(default=True, init=False)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         self._talk = CameraConnection(self.device)
         self._say(self.device.greet())
 
@@ -128,32 +152,19 @@ class InProcessCameraLine:
 
     def read(self, at_most: int, deadline: float) -> bytes:
         """Give what the camera has answered by then."""
-        if not self._coming:
+        if not self.coming:
             self._check_open()
-        if not self._coming or self._coming[0][0] > deadline:
-            self.clock.sleep(deadline - self.clock.now())
-            return b""
-        due_s, data = self._coming.popleft()
-        self.clock.sleep(due_s - self.clock.now())
-        if len(data) > at_most:
-            self._coming.appendleft((due_s, data[at_most:]))
-        return data[:at_most]
-
-    def drain(self) -> bytes:
-        found = b""
-        while self._coming and self._coming[0][0] <= self.clock.now():
-            found += self._coming.popleft()[1]
-        return found
+        return super().read(at_most, deadline)
 
     def close(self) -> None:
         self._open = False
-        self._coming.clear()
+        self.coming.clear()
 
     def _say(self, chunks: list[Chunk]) -> None:
         due_s = self.clock.now()
         for chunk in chunks:
             due_s += chunk.delay_s
-            self._coming.append((due_s, chunk.data))
+            self.expect(due_s, chunk.data)
 
     def _check_open(self) -> None:
         if not self._open:

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from tests.pipeline.rig.in_process import ManualClock
+from tests.pipeline.rig.in_process import Incoming, ManualClock
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ Reply = bytes | Late | Exception
 Pair = tuple[bytes, bytes | Sequence[Reply]]
 
 
-class ScriptedTransport:
+class ScriptedTransport(Incoming):
     """Plays (sent, received) pairs. What is received may come in parts, late, or be an error; waiting takes no time.
 
     ``stale`` lies on the line at first.
@@ -32,11 +32,13 @@ class ScriptedTransport:
 
     def __init__(self, pairs: Sequence[Pair], clock: ManualClock, stale: bytes = b"") -> None:
         self.clock = clock
+        self.__post_init__()
         self.drained = b""
         self.sent = 0
         self.closed = False
         self._pairs = deque(pairs)
-        self._line: deque[tuple[float, bytes | Exception]] = deque([(clock.now(), stale)] if stale else [])
+        if stale:
+            self.expect(clock.now(), stale)
 
     def write(self, data: bytes, deadline: float) -> None:
         """Take a request: the next one, to the byte."""
@@ -48,28 +50,11 @@ class ScriptedTransport:
         for part in [received] if isinstance(received, bytes) else received:
             after, reply = (part.after_s, part.data) if isinstance(part, Late) else (0.0, part)
             if reply:
-                self._line.append((self.clock.now() + after, reply))
-
-    def read(self, at_most: int, deadline: float) -> bytes:
-        """Give the next part, at the time that it comes."""
-        if not self._line or self._line[0][0] > deadline:
-            self.clock.sleep(deadline - self.clock.now())
-            return b""
-        when, reply = self._line.popleft()
-        self.clock.sleep(when - self.clock.now())
-        if isinstance(reply, Exception):
-            raise reply
-        if reply[at_most:]:
-            self._line.appendleft((when, reply[at_most:]))
-        return reply[:at_most]
+                self.expect(self.clock.now() + after, reply)
 
     def drain(self) -> bytes:
-        """Give what came already."""
-        found = b""
-        while self._line and self._line[0][0] <= self.clock.now():
-            reply = self._line.popleft()[1]
-            assert isinstance(reply, bytes)
-            found += reply
+        """Give what came already, and note it."""
+        found = super().drain()
         self.drained += found
         return found
 
@@ -80,7 +65,7 @@ class ScriptedTransport:
     def check(self) -> None:
         """Fail on requests that were not sent, and on bytes that were not read."""
         assert not self._pairs, f"{self._pairs[0][0].hex(' ')} was not sent"
-        assert not self._line, f"{self._line[0][1]!r} was not read"
+        assert not self.coming, f"{self.coming[0][2]!r} was not read"
 
 
 @contextmanager

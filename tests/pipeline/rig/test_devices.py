@@ -8,6 +8,7 @@ import sys
 import threading
 import tty
 from collections.abc import Iterator
+from io import FileIO
 
 import pytest
 
@@ -18,18 +19,13 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo terminal
 
 
 @pytest.fixture
-def ends() -> Iterator[tuple[int, str]]:
+def ends() -> Iterator[tuple[FileIO, str]]:
     """The device's end of a pseudo terminal, and the name of the driver's."""
     device, driver = os.openpty()
     tty.setraw(driver)
-    yield device, os.ttyname(driver)
+    with FileIO(device, "r+") as end:
+        yield end, os.ttyname(driver)
     os.close(driver)
-    if device not in _CLOSED:
-        os.close(device)
-    _CLOSED.discard(device)
-
-
-_CLOSED: set[int] = set()
 
 
 def soon(seconds: float = 5.0) -> float:
@@ -38,13 +34,13 @@ def soon(seconds: float = 5.0) -> float:
 
 
 @pytest.mark.parametrize("baud", [115200, 256000])
-def test_bytes_pass_both_ways(ends: tuple[int, str], baud: int):
+def test_bytes_pass_both_ways(ends: tuple[FileIO, str], baud: int):
     """All 256 values, at speeds that the system has a name for and that it has none for."""
     device, name = ends
     line = SerialTransport(name, baud)
     line.write(bytes(range(256)), soon())
-    assert os.read(device, 1000) == bytes(range(256))
-    os.write(device, bytes(range(256)))
+    assert device.read(1000) == bytes(range(256))
+    device.write(bytes(range(256)))
     got = b""
     while len(got) < 256:
         got += line.read(100, soon())
@@ -52,21 +48,21 @@ def test_bytes_pass_both_ways(ends: tuple[int, str], baud: int):
     line.close()
 
 
-def test_reading_ends_at_the_deadline_and_draining_at_once(ends: tuple[int, str]):
+def test_reading_ends_at_the_deadline_and_draining_at_once(ends: tuple[FileIO, str]):
     """Nothing comes: nothing is given, and a deadline that has passed is not waited for; what is there is, once."""
     line = SerialTransport(ends[1], 115200)
     assert line.read(10, SYSTEM_CLOCK.now() + 0.03) == b""
     assert line.read(10, SYSTEM_CLOCK.now() - 1) == b""
     with pytest.raises(DeadlinePassed, match="no time was left to send 1 bytes"):
         line.write(b"x", SYSTEM_CLOCK.now() - 1)
-    os.write(ends[0], b"stale")
+    ends[0].write(b"stale")
     assert line.read(1, soon()) == b"s"
     assert line.drain() == b"tale"
     assert line.drain() == b""
     line.close()
 
 
-def test_a_port_in_use_is_refused(ends: tuple[int, str]):
+def test_a_port_in_use_is_refused(ends: tuple[FileIO, str]):
     """Two programs would mix their motions; when the first lets go, the second gets it."""
     first = SerialTransport(ends[1], 115200)
     with pytest.raises(DeviceGone, match=r"cannot be opened .*no other program at it"):
@@ -75,18 +71,17 @@ def test_a_port_in_use_is_refused(ends: tuple[int, str]):
     SerialTransport(ends[1], 115200).close()
 
 
-def test_a_device_that_goes_away_is_said(ends: tuple[int, str]):
+def test_a_device_that_goes_away_is_said(ends: tuple[FileIO, str]):
     """The cable was pulled: reading, writing and draining say so."""
     line = SerialTransport(ends[1], 115200)
-    os.close(ends[0])
-    _CLOSED.add(ends[0])
+    ends[0].close()
     for call in (lambda: line.read(1, soon()), lambda: line.write(b"x", soon()), line.drain):
         with pytest.raises(DeviceGone, match=r"went away .*cable.*run again"):
             call()
     line.close()
 
 
-def test_a_full_line_does_not_hold_up(ends: tuple[int, str]):
+def test_a_full_line_does_not_hold_up(ends: tuple[FileIO, str]):
     """A device that takes no bytes costs the write's own time; addresses and speeds that mean nothing are settings."""
     line = SerialTransport(ends[1], 115200)
     with pytest.raises(DeadlinePassed, match=r"did not take 1000000 bytes within 0.25 s"):

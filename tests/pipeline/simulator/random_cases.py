@@ -148,7 +148,9 @@ def random_rig(rng: np.random.Generator) -> Rig:
         read_noise_e=float(rng.uniform(5, 40)),
     )
     air = _air(rng)
-    return Rig(camera, _optics(rng, air.distance_m), _mirror(rng), _detector(rng), air, _sky(rng))
+    optics, mirror = _optics(rng, air.distance_m), _mirror(rng)
+    detector = Detector(prnu_std=_some(rng, 1e-3, 0.03), striping_std=_some(rng, 1e-3, 0.02))
+    return Rig(camera, optics, mirror, detector, air, _sky(rng))
 
 
 def _some(rng: np.random.Generator, least: float, most: float, none: float = 0.0) -> float:
@@ -190,10 +192,6 @@ def _mirror(rng: np.random.Generator) -> MirrorMotion:
         hysteresis_px=_some(rng, 0.05, 5),
         drift_px_per_min=_some(rng, 0.01, 1),
     )
-
-
-def _detector(rng: np.random.Generator) -> Detector:
-    return Detector(prnu_std=_some(rng, 1e-3, 0.03), striping_std=_some(rng, 1e-3, 0.02))
 
 
 def _air(rng: np.random.Generator) -> Air:

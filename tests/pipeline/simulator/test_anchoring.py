@@ -36,16 +36,9 @@ def coarse_mean(scene: RasterScene, factor: int) -> np.ndarray:
     return np.asarray(fine.reshape(y.shape[0] // factor, factor, -1, factor).mean(axis=(1, 3)))
 
 
-def anchored(
-    sweep: Sweep,
-    offset: tuple[float, float],
-    *,
-    factor: int = 4,
-    prior_px: float = 16,
-    scene: RasterScene | None = None,
-) -> Anchor:
+def anchored(sweep: Sweep, offset: tuple[float, float], *, factor: int = 4, prior_px: float = 16) -> Anchor:
     """A sweep seen by a mirror that looks beside the plan, on the mosaic of one that does not."""
-    seen = textured() if scene is None else scene
+    seen = textured()
     source = SimulatedSource(
         seen, Rig(CAMERA), 0, effects_on("rotation", "read-noise"), pointing=CommonOffset(way_px=offset)
     )
@@ -82,14 +75,6 @@ def test_sweep_is_compared_with_all_that_it_may_have_seen() -> None:
     np.testing.assert_allclose(found.shift.offset, [-3.0, 24.0], atol=0.2)
     back = anchored(sweep_of(start=-10.0, lines=24), (3.0, -24.0), prior_px=30)
     np.testing.assert_allclose(back.shift.offset, [3.0, -24.0], atol=0.2)
-
-
-def test_sweep_without_texture_stays_and_says_so() -> None:
-    """On a field without texture nothing is found and nothing is moved."""
-    flat = image_scene(np.ones((240, 300, 2)), CAMERA, [600.0, 700.0])
-    found = anchored(sweep_of(), (5.0, 5.0), scene=flat)
-    assert found.found.status == "flat"
-    assert (found.shift.offset == 0).all()
 
 
 def test_sweep_beyond_the_prior_stays_where_it_was() -> None:

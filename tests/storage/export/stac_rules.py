@@ -56,13 +56,10 @@ def _problems(item: Mapping[str, Any]) -> Iterator[str]:
                 checker = jsonschema.Draft7Validator(FIELDS[name])
                 yield from (f"{place}: {name}: {error.message}" for error in checker.iter_errors(table[name]))
         yield from (f"{place}: {text}" for text in _together(table))
-    stated = {prefix for prefix, name in PREFIXES.items() if _uri(name) in item["stac_extensions"]}
+    uri = "https://stac-extensions.github.io/{}/schema.json"
+    stated = {prefix for prefix, name in PREFIXES.items() if uri.format(name) in item["stac_extensions"]}
     if stated != used or len(stated) != len(item["stac_extensions"]):
         yield f"stac_extensions names {sorted(stated)}, used are {sorted(used)}"
-
-
-def _uri(name: str) -> str:
-    return f"https://stac-extensions.github.io/{name}/schema.json"
 
 
 def _tables(item: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, Any]]]:

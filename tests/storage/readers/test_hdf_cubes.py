@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -203,13 +204,10 @@ def test_chunks_are_read_once(tmp_path: Path) -> None:
     assert asked == [0, 3, 6, 0, 3, 6]
 
 
-def wrong_axes(path: Path) -> None:
-    xr.Dataset({"rain": (("level", "lat", "lon"), CUBE.astype(float))}).to_netcdf(path, engine="h5netcdf")
-
-
-def no_cube(path: Path) -> None:
+def hold(path: Path, name: str, value: Any) -> None:
+    """An HDF5 file of one entry."""
     with h5py.File(path, "w") as file:
-        file["name"] = "nothing"
+        file[name] = value
 
 
 def lost_attribute(path: Path) -> None:
@@ -218,24 +216,29 @@ def lost_attribute(path: Path) -> None:
         del file.attrs["L2ScaleSwirMax"]
 
 
-def short_list(path: Path) -> None:
-    prisma_file(path, List_Cw_Vnir=np.ones(3, np.float32), List_Fwhm_Vnir=np.ones(3, np.float32))
-
-
-def level_1(path: Path) -> None:
-    with h5py.File(path, "w") as file:
-        file["HDFEOS/SWATHS/PRS_L1_HCO/Data Fields/VNIR_Cube"] = np.ones((7, 4, 6), np.uint16)
+SHORT_LISTS = dict.fromkeys(("List_Cw_Vnir", "List_Fwhm_Vnir"), np.ones(3, np.float32))
+LEVEL_1 = "HDFEOS/SWATHS/PRS_L1_HCO/Data Fields/VNIR_Cube"
+NO_CUBE_AXES = xr.Dataset({"rain": (("level", "lat", "lon"), CUBE.astype(float))})
 
 
 @pytest.mark.parametrize(
     ("write", "words"),
     [
         (lambda path: path.write_text("text"), "cannot be read as NetCDF or HDF5: it does not begin as HDF5.*nccopy"),
-        (wrong_axes, r"has dims level, lat, lon; expected y, x, band \(or band, y, x\); rename them"),
-        (no_cube, "has no array of numbers with the axes y, x and band; it has none"),
+        (
+            partial(NO_CUBE_AXES.to_netcdf, engine="h5netcdf"),
+            r"has dims level, lat, lon; expected y, x, band \(or band, y, x\); rename them",
+        ),
+        (
+            partial(hold, name="name", value="nothing"),
+            "has no array of numbers with the axes y, x and band; it has none",
+        ),
         (lost_attribute, "cannot be read as NetCDF or HDF5: KeyError: .*L2ScaleSwirMax"),
-        (short_list, r"expected one size \(y, x\) and \[3, 3\] bands, as it has wavelengths"),
-        (level_1, "is no PRISMA product of level 2B, 2C or 2D"),
+        (partial(prisma_file, **SHORT_LISTS), r"expected one size \(y, x\) and \[3, 3\] bands, as it has wavelengths"),
+        (
+            partial(hold, name=LEVEL_1, value=np.ones((7, 4, 6), np.uint16)),
+            "is no PRISMA product of level 2B, 2C or 2D",
+        ),
     ],
 )
 def test_bad_files_end_in_one_message(write: Any, words: str, tmp_path: Path) -> None:

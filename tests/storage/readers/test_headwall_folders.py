@@ -18,15 +18,13 @@ from storage.readers.open_cubes import open_cube
 NM = "wavelength units = nm\nwavelength = {\n400.0\n,500.0\n,600.0\n}\n"
 
 
-def write_part(
-    folder: Path, name: str, values: NDArray[Any], *, lines: int | None = None, more: str = NM, code: int = 12
-) -> None:
+def write_part(folder: Path, name: str, values: NDArray[Any], *, lines: int | None = None, more: str = NM) -> None:
     """Write (line, sample, band) values as the camera does: BIL without an ending, the header beside it."""
     folder.mkdir(exist_ok=True)
     promised = len(values) if lines is None else lines
     (folder / f"{name}.hdr").write_text(
         f"ENVI\n;Exposure (ms) = 4.5\nsamples = {values.shape[1]}\nlines = {promised}\nbands = {values.shape[2]}\n"
-        f"header offset = 0\nfile type = ENVI Standard\ndata type = {code}\ninterleave = bil\nbyte order = 0\n{more}"
+        f"header offset = 0\nfile type = ENVI Standard\ndata type = 12\ninterleave = bil\nbyte order = 0\n{more}"
     )
     (folder / name).write_bytes(values.transpose(0, 2, 1).tobytes())
 

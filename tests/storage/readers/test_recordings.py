@@ -32,6 +32,7 @@ from storage.export.image_files import write_recorded_files
 from storage.readers.recordings import RecordedWith, _middle_s, open_recording
 from tests.pipeline.capture.recordings import CAMERA, FULL, simulated
 from tests.storage.readers.test_envi_cubes import write_envi
+from tests.storage.small_archive import flip
 
 COARSE = Sweep("coarse-0", "coarse", "x", 0.0, -39.5, 20, step=4, binning=4)
 
@@ -293,9 +294,7 @@ def test_the_key_of_a_recording_is_its_content(files: Path, tmp_path: Path) -> N
     (moved / "scan-0.pointing.csv").write_text(text.replace("0.05,", "0.06,", 1))
     keys.append(open_recording(moved, CAMERA).key())
     (moved / "scan-0.pointing.csv").write_text(text)
-    content = bytearray((moved / "scan-0.bil").read_bytes())
-    content[100] ^= 1
-    (moved / "scan-0.bil").write_bytes(content)
+    flip(moved / "scan-0.bil", 100)
     keys.append(open_recording(moved, CAMERA).key())
     assert all(one != other for at, one in enumerate(keys) for other in keys[:at])
     stored = [open_recording(path, CAMERA).key() for path in (tmp_path / "raw", tmp_path / "raw" / "scan-0.zarr")]

@@ -11,10 +11,10 @@ from pipeline.rig.emulator.camera_device import CameraDevice
 from tests.pipeline.rig.in_process import InProcessCameraLine, ManualClock
 
 
-def control_of(device: CameraDevice, clock: ManualClock, retries: int = 2) -> HeadwallCamera:
+def control_of(device: CameraDevice, clock: ManualClock) -> HeadwallCamera:
     """A control client of an emulated camera in this process."""
     line = lambda: InProcessCameraLine(device, clock, "emulated:8100")  # noqa: E731
-    return HeadwallCamera(line, FileServer(), clock=clock, patience=ControlPatience(5.0, retries))
+    return HeadwallCamera(line, FileServer(), clock=clock, patience=ControlPatience(5.0, 2))
 
 
 def wait_for(camera: HeadwallCamera, at_most_s: float) -> None:
@@ -28,15 +28,13 @@ def wait_for(camera: HeadwallCamera, at_most_s: float) -> None:
 class LinesOf:
     """Lines that only their own time has, kept as they were given."""
 
-    def __init__(self, samples: int = 6, bands: int = 4) -> None:
-        self.size = (samples, bands)
+    def __init__(self) -> None:
         self.given: list[NDArray[np.uint16]] = []
 
     def __call__(self, times: NDArray[np.float64]) -> NDArray[np.uint16]:
         """(line, sample, band) uint16."""
-        samples, bands = self.size
         seed = np.rint(times * 1e4).astype(np.int64) * 7919
-        cell = np.arange(samples * bands).reshape(samples, bands) * 31
+        cell = np.arange(24).reshape(6, 4) * 31
         lines = ((seed[:, None, None] + cell) % 4096).astype(np.uint16)
         self.given.append(lines)
         return lines

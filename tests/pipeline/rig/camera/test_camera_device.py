@@ -1,22 +1,15 @@
-"""The emulated camera speaks the documented bytes, and its faults meet a client that says what happened."""
+"""The emulated camera speaks the documented bytes, and its frames pass with time."""
 
 from __future__ import annotations
 
 import pytest
 
-from pipeline.rig.emulator.camera_device import CameraConnection
+from pipeline.rig.emulator.camera_device import CameraConnection, CameraDevice
 from tests.pipeline.rig.camera.camera_line import LinesOf, control_of
-from tests.pipeline.rig.camera_faults import CameraFault, CameraFaults, FaultyCamera
 from tests.pipeline.rig.in_process import ManualClock
 
 CAPTURE = b'capture({"prefix": "", "maxCubes": 1, "maxFramesPerCube": 5})'
 PROMPT = b"\r\nhpi> "
-
-
-def device_with(fault: CameraFault | None = None, times: int = 1, seed: int = 0) -> FaultyCamera:
-    """A camera with one fault."""
-    faults = CameraFaults({} if fault is None else {fault: times}, seed)
-    return FaultyCamera(LinesOf(), ManualClock(), faults=faults)
 
 
 EXPOSURE = b'configure({"exposure": 4.5, "framePeriod": 5})'
@@ -43,7 +36,7 @@ TOO_LONG = b'configure({"exposure": 6, "framePeriod": 5})'
 def test_bytes_of_every_command(sent: bytes, end: bytes, reply: bytes | None) -> None:
     """Each command gives its bytes after its own echo, in one piece or byte by byte."""
     for size in (1, len(sent + end)):
-        talk = CameraConnection(device_with())
+        talk = CameraConnection(CameraDevice(LinesOf(), ManualClock()))
         came = b""
         for at in range(0, len(sent + end), size):
             chunks, goes_on = talk.feed((sent + end)[at : at + size])
@@ -55,13 +48,14 @@ def test_bytes_of_every_command(sent: bytes, end: bytes, reply: bytes | None) ->
 
 def test_frames_pass_with_time() -> None:
     """A capture runs for its frames' time; what is over by then is in the files."""
-    device = device_with()
-    control = control_of(device, device.clock)  # type: ignore[arg-type]
+    clock = ManualClock()
+    device = CameraDevice(LinesOf(), clock)
+    control = control_of(device, clock)
     folder = control.capture(60).folder
-    device.clock.sleep(0.3)
+    clock.sleep(0.3)
     assert control.is_capturing()
     assert len(device.files()[f"{folder}/raw_0"]) == 29 * 48
-    device.clock.sleep(0.4)
+    clock.sleep(0.4)
     assert not control.is_capturing()
     names = [file.name.rsplit("/", 1)[1] for file in control.list_files(folder)]
     assert names == ["frameIndex_0.txt", "imu_gps.txt", "raw_0", "raw_0.hdr"]

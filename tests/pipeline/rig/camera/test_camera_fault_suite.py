@@ -132,15 +132,6 @@ def assert_right(lines: list[Line], undisturbed: list[Line]) -> None:
         assert (line.mirror_x, line.mirror_y, line.valid) == (expected.mirror_x, expected.mirror_y, True)
 
 
-def assert_clear(error: RigError) -> None:
-    """One line of words with the place."""
-    words = str(error)
-    assert PLACES.search(words), words
-    assert "\n" not in words
-    assert "Traceback" not in words
-    assert 20 < len(words) < 900, words
-
-
 def session(scan_passes: Polls, undisturbed: list[Line], camera: CameraFaults, mirror: tuple[Fault, ...] = ()) -> None:
     """A sweep with a fault, then the rest of it without: every line once, and right."""
     kept, lines = KeptInMemory(), list[Line]()
@@ -156,7 +147,11 @@ def session(scan_passes: Polls, undisturbed: list[Line], camera: CameraFaults, m
     assert_right(lines, undisturbed)
     assert scan_passes.errors or len(lines) == SWEEP.lines
     for error in scan_passes.errors:
-        assert_clear(error)
+        words = str(error)
+        assert PLACES.search(words), words
+        assert "\n" not in words
+        assert "Traceback" not in words
+        assert 20 < len(words) < 900, words
     motions = [data for data in scan_passes.sent if moves(data)]  # there and along the path, in turn
     assert all(one != other for one, other in pairwise(motions)), "a motion was sent twice"
     broke = len(scan_passes.errors)

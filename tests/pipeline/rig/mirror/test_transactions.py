@@ -194,8 +194,9 @@ def test_transactions_do_not_mix():
         """Answers with what was asked, in two parts."""
 
         def write(self, data: bytes, deadline: float) -> None:
-            assert not self._line
-            self._line.extend([(0.0, data[:1]), (0.0, data[1:])])
+            assert not self.coming
+            for part in (data[:1], data[1:]):
+                self.expect(0.0, part)
 
     def whole() -> object:
         held = b""

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, defocus_px, keystone_shift
@@ -19,7 +18,6 @@ from pipeline.simulator.optics.kernel_fit import disc_contrast
 from pipeline.simulator.optics.rays import pupil_contrast
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Optics, Rig
-from pipeline.simulator.scenes.scene import RasterScene
 from tests.pipeline.simulator.made_up_effects import steep_probe
 from tests.pipeline.simulator.small_scenes import made_scene
 
@@ -91,32 +89,18 @@ RIG = Rig(optics=Optics(aberration_px=0.3, keystone_px=0.4), air=Air(distance_m=
 WAVES_SWEEP = Sweep("fine", "fine", "x", swath_px=0.0, start_px=-20.0, lines=40)
 
 
-def scene_of(planes: NDArray[np.float32]) -> RasterScene:
-    """A raster of one component, of the same 1000 e- in all bands."""
-    electrons = np.full((1, 3), 1000.0, np.float32)
-    return made_scene(planes, electrons, RENDERED_BLURS_NM)
-
-
-def waves(period: float) -> RasterScene:
-    """Light of 1 + cos along the scan."""
-    wave = 1 + np.cos(2 * np.pi * (np.arange(120) - 59.5) / period)
-    return scene_of(np.repeat(wave[:, None, None], 60, axis=1).astype(np.float32))
-
-
-def light_of(scene: RasterScene, lines: range, chosen: dict[Any, str]) -> NDArray[Any]:
-    """Electrons of some lines through the footprint and what is chosen."""
-    block = SweepBlock(RIG, WAVES_SWEEP, lines, RENDERED_BLURS_NM, scene.shape)
-    return expected_light(scene, block, {SLIT: "3x1", **chosen})
-
-
 @pytest.mark.parametrize("blur", [DIFFRACTION, DEFOCUS, ABERRATION], ids=lambda blur: blur.name)
 def test_contrast_is_that_of_the_blur(blur: Any):
     """A wave of 16 px along the scan keeps exp(-2 pi^2 s^2 / 16^2) of what the footprint left of it, or the pupil's.
 
     Or the disc's.
     """
-    scene = waves(16.0)
-    before, after = (light_of(scene, range(40), chosen)[:, 310:330] for chosen in ({}, {blur: blur.variants[0]}))
+    wave = 1 + np.cos(2 * np.pi * (np.arange(120) - 59.5) / 16)
+    electrons = np.full((1, 3), 1000.0, np.float32)
+    scene = made_scene(np.repeat(wave[:, None, None], 60, axis=1).astype(np.float32), electrons, RENDERED_BLURS_NM)
+    block = SweepBlock(RIG, WAVES_SWEEP, range(40), RENDERED_BLURS_NM, scene.shape)
+    ways: list[dict[Any, str]] = [{SLIT: "3x1"}, {SLIT: "3x1", blur: blur.variants[0]}]
+    before, after = (expected_light(scene, block, chosen)[:, 310:330] for chosen in ways)
     moments = blur.moments(RIG, RENDERED_BLURS_NM, blur.variants[0])
     passed = np.exp(-2 * np.pi**2 * moments.variance[1] / 16**2)
     passed = passed * disc_contrast(np.zeros(1), np.full(1, 1 / 16), moments.disc)

@@ -52,12 +52,6 @@ def even(level: float, lines: int = 16, bands: int = BANDS) -> NDArray[np.float3
     return np.full((lines, 640, bands), level, np.float32)
 
 
-def light_of(lines: range, seed: int = 0) -> NDArray[np.float32]:
-    """Light of each line of a scene from 0 to 25,000 e-, some of it negative."""
-    whole = np.random.default_rng(seed).uniform(-100, 25_000, (SWEEP.lines, 640, BANDS))
-    return (whole * np.linspace(0, 1, BANDS))[list(lines)].astype(np.float32)
-
-
 def test_read_noise_alone() -> None:
     """Without shot noise it is normal about the light, below zero light too."""
     camera = LineCamera(electrons_per_dn=1.0, dark_dn=500.0)
@@ -133,7 +127,7 @@ def test_the_mean_dark_frame_is_that_of_many_lines(dark_dn: float, exposure_ms: 
 def test_an_ideal_sensor_is_silent() -> None:
     """Neither shot noise, read noise nor dark current, even when asked for; its pattern and its bits stay."""
     rig = Rig(detector=Detector(noiseless=True))
-    light = light_of(range(4))
+    light = np.random.default_rng(0).uniform(-100, 25_000, (4, 640, BANDS)).astype(np.float32)
     np.testing.assert_array_equal(
         read_out(light, block_of(rig, range(4)), EVERYTHING), read_out(light, block_of(rig, range(4)), {})
     )

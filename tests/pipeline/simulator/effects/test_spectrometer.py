@@ -93,11 +93,10 @@ def test_steep_step_is_bounded_by_its_slope():
     assert RESPONSE.bound(probe, rig_with(), "exact").value == 0
 
 
-def bent(light, wavelength, smile_nm, variant="cubic", **more):
+def bent(light, wavelength, smile_nm, **more):
     """Light after smile."""
-    return SMILE.change(
-        light.copy(), block_of(rig_with(light.shape[1], smile_nm=smile_nm), wavelength, **more), variant
-    )
+    block = block_of(rig_with(light.shape[1], smile_nm=smile_nm), wavelength, **more)
+    return SMILE.change(light.copy(), block, "cubic")
 
 
 def test_shift_is_0_at_the_centre_and_smile_at_both_ends():

@@ -39,11 +39,11 @@ def grain(bands: int = 3) -> RasterScene:
     return image_scene(values, CAMERA, np.linspace(400, 1000, bands))
 
 
-def error(sweep: Sweep, line: int, variant: str, blurs: dict[Any, str], rig: Rig = RIG) -> float:
+def error(sweep: Sweep, line: int, variant: str, blurs: dict[Any, str]) -> float:
     """Greatest difference from the rays, over the light's standard deviation."""
     scene = grain()
     # The scene lies where the line does: a block's shape is where the scene's first pixel lies.
-    block = SweepBlock(rig, sweep, range(line, line + 1), scene.wavelength_nm, scene.shape)
+    block = SweepBlock(RIG, sweep, range(line, line + 1), scene.wavelength_nm, scene.shape)
     moved = Moved.to(block, scene)
     light = expected_light(scene, block, {moved: "only", ROTATION: "rays", SLIT: variant, **blurs})[:, ::10]
     wanted = fine_light(scene, block, moved, blurs)
@@ -132,12 +132,10 @@ def test_table_is_the_kernel_at_any_place_and_scale(width: float, blur: float, s
     np.testing.assert_allclose(weight, wanted, atol=2e-3)
 
 
-Places = tuple[np.ndarray, np.ndarray]
+PER_PX = 24  # steps of the sums that are written out
 
 
-def fine_light(
-    scene: RasterScene, block: SweepBlock, moved: Any, blurs: dict[Any, str], per_px: int = 24
-) -> np.ndarray:
+def fine_light(scene: RasterScene, block: SweepBlock, moved: Any, blurs: dict[Any, str]) -> np.ndarray:
     """Electrons (line, every tenth sample, band) of a diagonal scene; ``moved`` displaces points."""
     rig, bands = block.rig, len(block.wavelength_nm)
     ifov, size = rig.camera.ifov_rad, scene.shape if block.sweep.along == "y" else scene.shape[::-1]
@@ -147,9 +145,9 @@ def fine_light(
     for band, (shift, variance) in enumerate(zip(*_moments(block, blurs), strict=True)):
         if band and not blurs:
             break
-        runs, weights = _axis(1.0, variance[0], per_px)
+        runs, weights = _axis(1.0, variance[0])
         slopes = centres + (runs + shift[0]) * ifov
-        for turn, one in zip(*_axis(rig.camera.slit_px, variance[1], per_px), strict=True):
+        for turn, one in zip(*_axis(rig.camera.slit_px, variance[1]), strict=True):
             views = exact_views(normals, (turn + shift[1]) * ifov, slopes.ravel())
             along, scan = views.along / ifov, views.scan / ifov
             beside = moved.displaced(block, along, scan, "only")
@@ -169,12 +167,12 @@ def _moments(block: SweepBlock, blurs: dict[Any, str]) -> tuple[np.ndarray, np.n
     return sum((one.shift for one in found), none).T, sum((one.variance for one in found), none).T
 
 
-def _axis(width: float, variance: float, per_px: int) -> Places:
+def _axis(width: float, variance: float) -> tuple[np.ndarray, np.ndarray]:
     """Even steps over a box; with a Gaussian steps over both, as heavy as both together are there."""
     if variance == 0:
-        count = int(np.ceil(per_px * width))
+        count = int(np.ceil(PER_PX * width))
         return ((np.arange(count) + 0.5) / count - 0.5) * width, np.full(count, 1 / count)
-    sd, steps = np.sqrt(variance), 2 * per_px // 3
+    sd, steps = np.sqrt(variance), 2 * PER_PX // 3
     half = int(np.ceil((width / 2 + 5 * sd) * steps))
     place = np.arange(-half, half + 1) / steps
     weight = ndtr((place + width / 2) / sd) - ndtr((place - width / 2) / sd)

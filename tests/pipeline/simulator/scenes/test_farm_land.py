@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.simulator.scenes.farm.farm_plan import FarmPlan, FieldPlan, farm_plan
+from pipeline.simulator.scenes.farm.farm_plan import FieldPlan, farm_plan
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.farm.land import Parcel, clip_polygon, divide_land, parcel_pixels, polygon_area, stream
 
@@ -36,13 +36,6 @@ def test_coverage_is_area() -> None:
 WINDOW = 128
 
 
-@pytest.fixture(scope="module")
-def survey() -> tuple[FarmPlan, NDArray[np.float32]]:
-    """A farm's plan in June and what the near infrared shows of it, (y, x)."""
-    scene = farm_scene(1, bands=4)
-    return farm_plan(1), scene.planes @ np.ascontiguousarray(scene.spectra()[:, 3])
-
-
 def middle(field: FieldPlan, image: NDArray[np.float32]) -> NDArray[np.float32] | None:
     """The square window that lies deepest in a field; None where the field is too narrow."""
     index, _, centres = parcel_pixels(field.parcel, image.shape)
@@ -68,10 +61,10 @@ def wave(image: NDArray[np.float32], near_period: float) -> tuple[float, float]:
     return float(1 / frequency[row, column]), float(angle % 180)
 
 
-def test_period_and_heading_are_in_the_picture(survey: tuple[FarmPlan, NDArray[np.float32]]) -> None:
+def test_period_and_heading_are_in_the_picture() -> None:
     """In every field with a crop, the Fourier transform finds the period to 2 % and the heading to 1.2 degrees."""
-    plan, picture = survey
-    seen = 0
+    plan, scene, seen = farm_plan(1), farm_scene(1, bands=4), 0
+    picture = scene.planes @ np.ascontiguousarray(scene.spectra()[:, 3])  # in June, in the near infrared
     for field in plan.fields:
         window = middle(field, picture)
         if field.crop is None or field.land_on(plan.day).phase != "crop" or window is None:

@@ -16,15 +16,10 @@ from pipeline.simulator.scenes.built_in import (
     scouting_scene,
 )
 from pipeline.simulator.scenes.farm.farm_plan import CLASS_COLOURS, CLASSES
-from pipeline.simulator.scenes.scene import RasterScene
+from tests.pipeline.simulator.scenes.test_farm_scene import labels_of
 
 SIZE = (320, 400)
 SEEDS = (0, 1, 2, 3, 33)
-
-
-def _labels(scene: RasterScene) -> np.ndarray:
-    assert scene.labels is not None
-    return scene.labels
 
 
 def test_equal_arguments_give_equal_fields() -> None:
@@ -45,7 +40,7 @@ def test_another_day_is_the_same_land() -> None:
     for name, cover in patches[0].items():
         np.testing.assert_array_equal(cover, patches[1][name])
     for day in (140, 172, 190):
-        bare = _labels(scouting_scene(5, SIZE, 2, day=day))[patches[0]["bare"] > 0.9]
+        bare = labels_of(scouting_scene(5, SIZE, 2, day=day))[patches[0]["bare"] > 0.9]
         assert (bare == CLASSES.index("soil")).mean() > 0.97
 
 
@@ -83,7 +78,7 @@ def test_classes_are_the_farms() -> None:
         scene = scouting_scene(seed, SIZE, 2)
         assert scene.class_names == CLASSES
         np.testing.assert_array_equal(scene.class_colours, CLASS_COLOURS)
-        shares = {name: float((_labels(scene) == number).mean()) for number, name in enumerate(CLASSES)}
+        shares = {name: float((labels_of(scene) == number).mean()) for number, name in enumerate(CLASSES)}
         crop = scouting_plan(seed, SIZE, day=172, hour=11.0).fields[0].use
         uses.add(crop)
         assert shares[crop] > 0.8
