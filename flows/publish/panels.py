@@ -94,8 +94,7 @@ def class_rgb(classes: NDArray[np.integer], palette: NDArray[np.float32]) -> NDA
     """Return a class map as a picture (y, x, 3); numbers without a colour, such as 255, are light grey."""
     table = np.tile(np.asarray(UNLABELLED_COLOUR, np.float32), (256, 1))
     table[: len(palette)] = palette
-    picture: NDArray[np.float32] = table[np.clip(classes, 0, UNLABELLED)]
-    return picture
+    return np.asarray(table[np.clip(classes, 0, UNLABELLED)])
 
 
 def outline(chosen: NDArray[np.bool_], patch_px: int, shape: tuple[int, int]) -> list[list[tuple[float, float]]]:

@@ -72,8 +72,7 @@ class Waves:
     def at(self, coordinates: Floats) -> Floats:
         """Return exact values at (n, 2) positions [px], (n, band)."""
         phase = 2 * np.pi * coordinates @ self.frequency.T
-        values: Floats = np.cos(phase) @ self.cosine + np.sin(phase) @ self.sine
-        return values
+        return np.cos(phase) @ self.cosine + np.sin(phase) @ self.sine
 
 
 def draw_waves(seed: int, bands: int, periods_px: tuple[float, float]) -> Waves:

@@ -410,5 +410,4 @@ def trained_pixels(scene: RasterScene) -> NDArray[np.bool_]:
             f"scene {scene.name} has no labels; training needs them: give --labels, or call"
             f" its label file {scene.name}_mask.png or labels/{scene.name}.png (scene.toml: other names)"
         )
-    mask: NDArray[np.bool_] = scene.labels != UNLABELLED
-    return mask
+    return np.asarray(scene.labels != UNLABELLED)

@@ -87,8 +87,7 @@ def fitted_bias(maps: Sequence[ScoredMap]) -> Floats:
     counts = np.stack([one.counts for one in maps])
     weight = np.minimum(expected.sum(axis=-1), SURE_PX) * labelled_classes(counts)
     true, predicted = (_logit(iou_per_class(one)) for one in (counts, expected))
-    bias: Floats = ((true - predicted) * weight).sum(axis=0) / (weight.sum(axis=0) + SURE_PX)
-    return bias
+    return np.asarray(((true - predicted) * weight).sum(axis=0) / (weight.sum(axis=0) + SURE_PX))
 
 
 def error_of_passes(maps: Sequence[ScoredMap]) -> float:
@@ -152,5 +151,4 @@ class MapScores:
 
 def _logit(fraction: Floats) -> Floats:
     """Return logits of fractions 0..1, clipped away from both ends; NaN counts as 0."""
-    found: Floats = scipy.special.logit(np.clip(np.nan_to_num(fraction), LEAST_IOU, 1 - LEAST_IOU))
-    return found
+    return np.asarray(scipy.special.logit(np.clip(np.nan_to_num(fraction), LEAST_IOU, 1 - LEAST_IOU)))

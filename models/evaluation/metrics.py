@@ -50,8 +50,7 @@ def confusion(labels: Numbers, predicted: Numbers, classes: int) -> Counts:
 
 def labelled_classes(counts: NDArray[np.number]) -> NDArray[np.bool_]:
     """Return which classes the labels have, (..., class, class) -> (..., class)."""
-    held: NDArray[np.bool_] = counts.sum(axis=-1) > 0
-    return held
+    return np.asarray(counts.sum(axis=-1) > 0)
 
 
 def false_pixels(counts: Counts) -> Counts:
@@ -68,8 +67,7 @@ def iou_per_class(counts: NDArray[np.number]) -> Floats:
 
 def _divided(total: NDArray[np.number], number: NDArray[np.number], where: NDArray[np.bool_]) -> Floats:
     """Return a quotient, NaN elsewhere."""
-    quotient: Floats = np.divide(total, number, out=np.full(np.shape(total), np.nan), where=where)
-    return quotient
+    return np.asarray(np.divide(total, number, out=np.full(np.shape(total), np.nan), where=where))
 
 
 def mean_iou(counts: Numbers) -> float:

@@ -173,20 +173,17 @@ def _phased_in(old: Floats, after: Floats, seen: NDArray[np.bool_], days: float)
     if fraction == 1:
         return after
     mixed = np.log((1 - fraction) * np.exp(old) + fraction * np.exp(after)).astype(np.float32)
-    held: Floats = np.where(seen[..., None], after, mixed)
-    return held
+    return np.where(seen[..., None], after, mixed)
 
 
 def _normalised(log_probability: Floats) -> Floats:
     """Return log-probabilities (..., class) of probabilities that sum to 1."""
-    summing: Floats = log_probability - np.log(np.exp(log_probability).sum(axis=-1, keepdims=True))
-    return summing
+    return np.asarray(log_probability - np.log(np.exp(log_probability).sum(axis=-1, keepdims=True)))
 
 
 def _ages(log_probability: Floats, age_days: Floats) -> Floats:
     """Return ages, NaN for unknown pixels."""
-    ages: Floats = np.where(np.isfinite(log_probability[..., 0]), age_days, np.nan).astype(np.float32)
-    return ages
+    return np.where(np.isfinite(log_probability[..., 0]), age_days, np.nan).astype(np.float32)
 
 
 def in_classes(log_probability: Floats, numbers: Sequence[int]) -> Floats:
@@ -197,16 +194,14 @@ def in_classes(log_probability: Floats, numbers: Sequence[int]) -> Floats:
     new = [number < 0 for number in numbers]
     taken = np.where(new, np.float32(-math.log(len(numbers))), log_probability[..., list(numbers)])
     taken -= np.log(np.exp(taken).sum(axis=-1, keepdims=True))
-    found: Floats = np.where(np.isfinite(log_probability[..., :1]), taken, np.nan).astype(np.float32)
-    return found
+    return np.where(np.isfinite(log_probability[..., :1]), taken, np.nan).astype(np.float32)
 
 
 def faded(log_probability: Floats, age_days: Floats) -> Floats:
     """Return a prior map that is mixed with equal probabilities by its age."""
     left = np.exp(-age_days.astype(np.float64) / FADES_DAYS).astype(np.float32)[..., None]
     mixed = left * np.exp(log_probability) + (1 - left) / log_probability.shape[-1]
-    expected_gain: Floats = np.log(np.maximum(mixed, np.float32(math.exp(FAINTEST)))).astype(np.float32)
-    return expected_gain
+    return np.asarray(np.log(np.maximum(mixed, np.float32(math.exp(FAINTEST)))).astype(np.float32))
 
 
 def _more_confident(before: Floats, today: Floats, seen: NDArray[np.bool_], age: Floats) -> Floats:
@@ -216,8 +211,7 @@ def _more_confident(before: Floats, today: Floats, seen: NDArray[np.bool_], age:
     together = old + np.where(seen[..., None], today, 0)
     together -= np.log(np.exp(together).sum(axis=-1, keepdims=True))
     surer = (today.max(axis=-1) > math.log(SURE)) | (today.max(axis=-1) > old.max(axis=-1) + math.log(2))
-    found: Floats = np.where((against & surer)[..., None], today, np.where(against[..., None], old, together))
-    return found
+    return np.where((against & surer)[..., None], today, np.where(against[..., None], old, together))
 
 
 def _read(
@@ -341,5 +335,4 @@ def changed_fractions(old: NDArray[np.uint8], patch: int) -> Floats:
     """Return the fraction of changed pixels of each patch (patch_y, patch_x), from ``old`` of `changed_from`."""
     y, x = (-(-size // patch) * patch for size in old.shape)
     padded = np.pad(old != UNLABELLED, [(0, y - old.shape[0]), (0, x - old.shape[1])])
-    fractions: Floats = padded.reshape(y // patch, patch, x // patch, patch).mean(axis=(1, 3), dtype=np.float32)
-    return fractions
+    return np.asarray(padded.reshape(y // patch, patch, x // patch, patch).mean(axis=(1, 3), dtype=np.float32))

@@ -55,8 +55,7 @@ def position_to_normal(position: ArrayLike) -> Floats:
     half[..., :2] = xy * REST_TANGENT
     # r + e3 up to a factor, r = (X T, Y T, 1) / |.|: no angle and no difference of near numbers.
     half[..., 2] = 1 + np.sqrt(1 + half[..., 0] ** 2 + half[..., 1] ** 2)
-    normal: Floats = _unit(half) @ _DEVICE_AXES.astype(xy.dtype)
-    return normal
+    return np.asarray(_unit(half) @ _DEVICE_AXES.astype(xy.dtype))
 
 
 def normal_to_position(normal: ArrayLike) -> Floats:
@@ -73,15 +72,13 @@ def normal_to_position(normal: ArrayLike) -> Floats:
     lateral = 2 * device[..., 2] * np.hypot(device[..., 0], device[..., 1])
     inside = (device[..., 2] > 0) & (c2 > 0) & (lateral <= REST_TANGENT * c2 * (1 + RIM_SLACK[n.dtype.name]))
     _refuse(~inside, n, "is turned beyond the rim of the mirror's range (25 deg)")
-    position: Floats = 2 * device[..., 2:] * device[..., :2] / (c2 * n.dtype.type(REST_TANGENT))[..., None]
-    return position
+    return np.asarray(2 * device[..., 2:] * device[..., :2] / (c2 * n.dtype.type(REST_TANGENT))[..., None])
 
 
 def normal_to_device(normal: ArrayLike) -> Floats:
     """Return the components (..., 3) of normals along the device's X and Y axes and along the rest normal."""
     n = _vectors(normal, 3, "mirror normal")
-    device: Floats = n @ _DEVICE_AXES.T.astype(n.dtype)
-    return device
+    return np.asarray(n @ _DEVICE_AXES.T.astype(n.dtype))
 
 
 def direction_to_normal(direction: ArrayLike) -> Floats:
@@ -101,8 +98,7 @@ def reflect(ray: ArrayLike, normal: ArrayLike) -> Floats:
     """Reflect travelling rays, o = k - 2 (n . k) n, over (..., 3) arrays that broadcast."""
     n = np.asarray(normal, _kept(ray, normal))
     k = np.asarray(ray, n.dtype)
-    out: Floats = k - 2 * np.sum(n * k, axis=-1, keepdims=True) * n
-    return out
+    return np.asarray(k - 2 * np.sum(n * k, axis=-1, keepdims=True) * n)
 
 
 def position_to_direction(position: ArrayLike) -> Floats:
@@ -154,8 +150,7 @@ def mirror_throughput(position: ArrayLike) -> Floats:
     Raises PoseError: a position is not finite or beyond the rim.
     """
     normal = position_to_normal(position)
-    fraction: Floats = -normal[..., 2] / normal.dtype.type(_HALF)
-    return fraction
+    return np.asarray(-normal[..., 2] / normal.dtype.type(_HALF))
 
 
 def line_centre(along: Floats, scan: Floats, across: ArrayLike) -> Floats:
@@ -199,8 +194,7 @@ def _one_minus_z(o: Floats) -> Floats:
 def _unit(vectors: Floats) -> Floats:
     # Divide by the largest component first: near grazing the squares of small vectors lose digits or vanish.
     scaled = vectors / np.max(np.abs(vectors), axis=-1, keepdims=True)
-    unit: Floats = scaled / np.sqrt(np.sum(scaled**2, axis=-1, keepdims=True))
-    return unit
+    return np.asarray(scaled / np.sqrt(np.sum(scaled**2, axis=-1, keepdims=True)))
 
 
 def _kept(*values: ArrayLike) -> np.dtype[Any]:

@@ -304,5 +304,4 @@ def _apart(colours: Sequence[Colour], others: Iterable[Colour]) -> Distances:
     lab, beside = (
         skimage.color.rgb2lab(np.array([*some], np.uint8).reshape(-1, 1, 3))[:, 0] for some in (colours, others)
     )
-    found: Distances = np.linalg.norm(lab[:, None] - beside[None], axis=-1).min(axis=1, initial=np.inf)
-    return found
+    return np.asarray(np.linalg.norm(lab[:, None] - beside[None], axis=-1).min(axis=1, initial=np.inf))

@@ -324,8 +324,7 @@ def transient(rig: Rig, sweep: Sweep, numbers: NDArray[np.int64]) -> Floats:
     place: Floats = start[0] * (1 - rise) + start[1] * impulse
     rate = -start[0] * impulse + start[1] * (1 - rise - 2 * mirror.damping * impulse)
     impulse, rise = responses(np.array([held]), mirror.damping)
-    mean: Floats = (place * (impulse + 2 * mirror.damping * rise) + rate * rise) / held
-    return mean
+    return np.asarray((place * (impulse + 2 * mirror.damping * rise) + rate * rise) / held)
 
 
 def responses(time: Floats, damping: float) -> tuple[Floats, Floats]:

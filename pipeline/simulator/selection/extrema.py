@@ -187,8 +187,7 @@ class PixelOptics:
 
     def noise(self, light: Radiance) -> Radiance:
         """Return one standard deviation at each light [e-]."""
-        noise: Radiance = np.sqrt(np.maximum(light, 0) + np.float32(self.fixed_noise))
-        return noise
+        return np.sqrt(np.maximum(light, 0) + np.float32(self.fixed_noise))
 
     def measures(self, light: Radiance) -> Iterator[Radiance]:
         """Yield measures of light without its halo, (row, column, band) each: higher ones are probed first.
