@@ -93,8 +93,7 @@ class OpenedArchive(Mapping[str, "OpenedRun"]):
         return len(self._archive.runs())
 
     def __repr__(self) -> str:
-        lines = [f"spectralzoom archive {self.name}, {len(self)} runs", *(f"  {name}" for name in self)]
-        return "\n".join(lines)
+        return "\n".join([f"spectralzoom archive {self.name}, {len(self)} runs", *(f"  {name}" for name in self)])
 
 
 class NoRunError(ArchiveError, KeyError):

@@ -59,8 +59,7 @@ def explain(archive: ArchiveName, product: str, *, as_json: AsJson = False) -> i
         Its address (stages/rectify/KEY), a key or its beginning, a run's name or `latest`, or a product's name in the
         newest run (class_map, mosaic).
     """
-    found = explanation(open_archive(archive, create=False, write=False), product)
-    put_out(found, show_explanation, as_json=as_json)
+    put_out(explanation(open_archive(archive, create=False, write=False), product), show_explanation, as_json=as_json)
     return DONE
 
 

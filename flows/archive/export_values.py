@@ -103,8 +103,7 @@ class MosaicView:
         assert scene is not None
         assert geobox is not None
         pose = RigPose(**open_image(path, "classes").about["rig_pose"])
-        coarse = geobox.zoom_out(self.factor)
-        return grid_of_map(GroundView(pose, scene.ifov_rad), scene.scene_shape, coarse)
+        return grid_of_map(GroundView(pose, scene.ifov_rad), scene.scene_shape, geobox.zoom_out(self.factor))
 
     @property
     def factor(self) -> int:

@@ -216,8 +216,7 @@ def _names(images: Sequence[Path]) -> dict[str, Path]:
     Names keep their endings only if they are not unique without.
     """
     numbers = [scene_number(image) or "" for image in images]
-    stems = [image.stem for image in images]
-    for names in (numbers, stems):
+    for names in (numbers, [image.stem for image in images]):
         if all(names) and len(set(names)) == len(images):
             return dict(zip(names, images, strict=True))
     return {image.name: image for image in images}

@@ -147,8 +147,7 @@ def _scanned(
     valid = (labels != UNLABELLED) & np.isfinite(drawn.confidence)
     sure = confidence_counts(drawn.confidence[valid], drawn.classes[valid] == labels[valid])
     classes = weights.config.classes
-    expected = expected_counts([every_class[valid]], classes)
-    return ScoredMap(confusion(labels, drawn.classes, classes), expected), sure
+    return ScoredMap(confusion(labels, drawn.classes, classes), expected_counts([every_class[valid]], classes)), sure
 
 
 def _parts(weights: Weights, example: Example) -> tuple[SceneGrid, NDArray[np.uint8]]:

@@ -170,8 +170,7 @@ def _learned(
     weights = Weights(model, common.basis, normalisation, common.names, common.colours).on(device)
     frames, found = scenes.validation.examples, dict[str, Any]()
     labelled = sum(int(np.count_nonzero(one.labels != UNLABELLED)) for one in examples)
-    few = begun is None and labelled < FEW_PIXELS
-    weights, found["readings"] = better_reading(weights, start, frames, few=few)
+    weights, found["readings"] = better_reading(weights, start, frames, few=begun is None and labelled < FEW_PIXELS)
     if frames:
         found["baselines"] = judge_baselines(examples, frames, config.classes, seed, report)
         report("validating", 0.0, f"{len(frames)} scenes")
@@ -224,8 +223,7 @@ def _check_counts(request: TrainRequest) -> None:
 
 def asked_command() -> str:
     """Return the command without folders, for the record."""
-    words = [Path(word).name if "/" in word else word for word in sys.argv[1:]]
-    return shlex.join(["spectralzoom", *words])
+    return shlex.join(["spectralzoom", *[Path(word).name if "/" in word else word for word in sys.argv[1:]]])
 
 
 def _print_figures(record: dict[str, Any], request: TrainRequest, console: Console) -> None:

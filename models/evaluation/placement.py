@@ -73,8 +73,7 @@ def _losses(logits: NDArray[np.float32], truth: NDArray[np.uint8]) -> NDArray[np
 
 def gain_sums(gain: Values, chosen: NDArray[np.integer], valid: NDArray[np.integer]) -> tuple[float, float]:
     """Return the gain of the chosen patches, and of as many of the best valid ones; sum over frames, then divide."""
-    best = np.sort(gain[valid])[::-1][: len(chosen)]
-    return float(gain[chosen].sum()), float(best.sum())
+    return float(gain[chosen].sum()), float(np.sort(gain[valid])[::-1][: len(chosen)].sum())
 
 
 Placements = dict[str, list[Counts]]  # row -> confusion counts of its map; of ``random`` several

@@ -139,8 +139,7 @@ def _mend(columns: NDArray[np.float32], p: int) -> NDArray[np.bool_] | None:
     for number in np.flatnonzero(holes.any(axis=(1, 2))):  # one by one: a copy of a field is large
         y, x = (p * int(at) for at in divmod(number, columns.shape[1] // p))
         columns[y : y + p, x : x + p] = fill_dead(columns[None, y : y + p, x : x + p], holes[number][None])[0]
-    whole = np.pad(dead, [(0, -size % TOKEN_PX) for size in dead.shape], mode="edge")
-    return readable(patches_of(whole, TOKEN_PX))
+    return readable(patches_of(np.pad(dead, [(0, -size % TOKEN_PX) for size in dead.shape], mode="edge"), TOKEN_PX))
 
 
 def coarse_prediction_of_columns(

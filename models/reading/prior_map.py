@@ -54,8 +54,7 @@ class ClassProbabilities:
     def classes(self) -> tuple[NDArray[np.uint8], Floats]:
         """Return the most probable class of each pixel and its probability; 255 and NaN for unknown pixels."""
         found, sure = likeliest(self.log_probability)
-        classes = np.where(np.isfinite(sure), found, UNLABELLED).astype(np.uint8)
-        return classes, np.exp(sure)
+        return np.where(np.isfinite(sure), found, UNLABELLED).astype(np.uint8), np.exp(sure)
 
 
 def likeliest(log_probability: Floats) -> tuple[NDArray[np.int64], Floats]:

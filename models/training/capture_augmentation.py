@@ -140,8 +140,7 @@ class CaptureAugmentation:
         if step > 1 and rng.random() < INTERLACED:
             image = self.interlaced(columns, noise, step=step, rng=rng, least_power=least_power)
         else:
-            light = self._light(rng)
-            image = self.scan(columns, noise, light=light, step=step, rng=rng, least_power=least_power)
+            image = self.scan(columns, noise, light=self._light(rng), step=step, rng=rng, least_power=least_power)
         return image, image
 
     def _light(self, rng: np.random.Generator) -> float:

@@ -143,7 +143,6 @@ def measured_limits(
                 if one.noise is not None:
                     pixels = augmentation.scanned(pixels, one.noise, light=fraction, step=step, rng=rng)
                 distances.append(ood_detector.lit(fraction).distance(pixels[one.labels != UNLABELLED]))
-            together = np.concatenate(distances).astype(np.float64)
-            fine[i, j] = np.quantile(together, 1 - np.array(RATES))
+            fine[i, j] = np.quantile(np.concatenate(distances).astype(np.float64), 1 - np.array(RATES))
             report((j * len(steps) + i + 1) / (len(steps) * len(light)))
     return Limits(np.array(RATES), np.array(light), steps, fine)

@@ -104,8 +104,7 @@ def train_reader(
         reader = TemporalReader(sizes) if start is None else copy.deepcopy(start).train()
     reader = reader.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     averaged = copy.deepcopy(reader).eval()
-    labels = [visit.labels for land in lands for visit in land]
-    weight = class_weights(labels, sizes.classes, settings.weight_cap)
+    weight = class_weights([visit.labels for land in lands for visit in land], sizes.classes, settings.weight_cap)
     rng = np.random.default_rng([settings.seed, 0x3E3])
     optimiser = torch.optim.AdamW(reader.parameters(), settings.learning_rate, weight_decay=settings.weight_decay)
     started, step, loss = time.monotonic(), 0, math.nan

@@ -204,8 +204,7 @@ def save_weights(weights: Weights, path: Path) -> None:
         "class_names": list(weights.class_names),
         "record": weights.record,
     }
-    keys = {"weights": key_of(about, tensors)}
-    write_checksummed(path, {**about, "format": FORMAT, "keys": keys}, tensors)
+    write_checksummed(path, {**about, "format": FORMAT, "keys": {"weights": key_of(about, tensors)}}, tensors)
 
 
 def add_ood(weights: Path, ood_detector: OodDetector, trained_on: TrainedOn, record: Mapping[str, Any]) -> None:

@@ -160,8 +160,7 @@ class RecordedSource:
 
     def references(self, sweep: Sweep) -> References:
         """Return dark and white frames of the lines that serve a sweep; raises as `lines`."""
-        served = self.sweeps[int(self.pick(sweep).place[0])] if sweep.lines else self.sweeps[0]
-        return served.references
+        return (self.sweeps[int(self.pick(sweep).place[0])] if sweep.lines else self.sweeps[0]).references
 
     def cut_to_recorded(self, sweep: Sweep) -> Sweep | None:
         """Return a sweep without the lines at either end that were never captured; None where none was.
@@ -197,8 +196,7 @@ class RecordedSource:
         """
         own = self._own(sweep)
         if own is not None:
-            count = np.arange(sweep.lines)
-            return PickedLines(np.full(sweep.lines, own), count, np.zeros(sweep.lines, np.bool_))
+            return PickedLines(np.full(sweep.lines, own), np.arange(sweep.lines), np.zeros(sweep.lines, np.bool_))
         found = [self._nearest(sweep, group) for group in self._groups]
         whole = [one for one in found if (one[0] >= 0).all()]
         if not whole:
@@ -254,8 +252,7 @@ class RecordedSource:
                     continue
                 apart = one.line_distance / self.camera.ifov_rad
                 reach = max(REACH_STEPS * apart, PLANNED_REACH * sweep.step)
-                scan_px = one.tangents[candidates, 1] / self.camera.ifov_rad
-                near, distance = nearest_line(scan_px, sweep.line_px())
+                near, distance = nearest_line(one.tangents[candidates, 1] / self.camera.ifov_rad, sweep.line_px())
                 better = open_lines & (distance <= reach) & (distance < best - SAME_PX)
                 place[better], line[better], best[better] = number, candidates[near[better]], distance[better]
         return place, line, best

@@ -174,8 +174,7 @@ class PlacedPicture:
 
     @property
     def outline(self) -> BaseGeometry:
-        corners = shapely.box(0, 0, self.shape[1], self.shape[0])
-        edges = shapely.segmentize(corners, max(self.shape) / EDGE_PARTS)
+        edges = shapely.segmentize(shapely.box(0, 0, self.shape[1], self.shape[0]), max(self.shape) / EDGE_PARTS)
         return shapely.affinity.affine_transform(edges, self.geobox.affine.to_shapely())
 
     def to_pixels(self, shape: BaseGeometry) -> BaseGeometry:
@@ -229,8 +228,7 @@ class PosedField:
 
     def _pixels(self, plane: Floats) -> Floats:
         normal = self.view.normal
-        ground = np.column_stack([plane, -(plane @ normal[:2]) / normal[2]])
-        seen = self.view.ground_to_scene(ground)
+        seen = self.view.ground_to_scene(np.column_stack([plane, -(plane @ normal[:2]) / normal[2]]))
         return np.asarray(seen[:, ::-1] + np.array([self.shape[1] / 2, self.shape[0] / 2]))
 
     def pixel_areas_m2(self, rows: slice, columns: slice) -> Floats | None:

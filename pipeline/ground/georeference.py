@@ -35,8 +35,7 @@ def zoomed_out(geobox: GeoBox, factor: int, shape: tuple[int, int]) -> GeoBox:
     if factor == 1 and tuple(geobox.shape) == shape:
         return geobox
     a, b, c, d, e, f = geobox.affine[:6]
-    coarser = Affine(a * factor, b * factor, c, d * factor, e * factor, f)
-    return odc_geobox.GeoBox(shape, coarser, geobox.crs)
+    return odc_geobox.GeoBox(shape, Affine(a * factor, b * factor, c, d * factor, e * factor, f), geobox.crs)
 
 
 def shift_px(grid: GeoBox, other: GeoBox) -> tuple[float, float] | None:

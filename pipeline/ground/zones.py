@@ -75,8 +75,7 @@ def _unwrapped(shape: BaseGeometry, middle_deg: float | None) -> BaseGeometry:
         return shape
 
     def wrapped(places: Floats) -> Floats:
-        lon = (places[:, 0] - middle_deg + 180) % 360 - 180 + middle_deg
-        return np.column_stack([lon, places[:, 1:]])
+        return np.column_stack([(places[:, 0] - middle_deg + 180) % 360 - 180 + middle_deg, places[:, 1:]])
 
     return shapely.make_valid(shapely.transform(shape, wrapped))
 

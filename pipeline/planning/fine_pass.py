@@ -71,8 +71,7 @@ class SecondPass:
     @property
     def key(self) -> dict[str, Any]:
         """Return the parameters of the planner, without the first pass."""
-        full = [asdict(sweep) for sweep in self.full]
-        known = {"fine_s": self.seconds, "margin_px": self.margin_px, "full": full}
+        known = {"fine_s": self.seconds, "margin_px": self.margin_px, "full": [asdict(sweep) for sweep in self.full]}
         return {**known, "camera": asdict(self.camera), "cost": asdict(self.cost)}
 
     @property
@@ -115,8 +114,7 @@ class SecondPass:
             self.cost.setup_seconds(exposed) * sweeps_a_run,
             lambda runs: self.cost.seconds(sweeps_of(runs), self.camera),
         )
-        wanted = np.where(gain > 0, gain, 0.0)
-        chosen = choose_runs(self.rows, wanted, times, seconds=self.seconds, several=True)
+        chosen = choose_runs(self.rows, np.where(gain > 0, gain, 0.0), times, seconds=self.seconds, several=True)
         if chosen is None:
             return FinePlan([], np.empty(0, np.intp), 0.0, 0.0, reason="no run of lines with a gain fits the time")
         sweeps, patch_index = sweeps_of(chosen.runs), self.rows.patches(chosen.runs)

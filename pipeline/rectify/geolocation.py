@@ -134,8 +134,7 @@ def _catmull_rom_pieces(knots: Floats, alone: float) -> Floats:
 def _find_knots(curve: KnotCurve, a: Floats, b: Floats, tolerance: float) -> Floats:
     """Return the knot coordinate (n,) of the line that sees each point: by Newton, or by bisection if that fails."""
     scan_path = curve.scan_path
-    middle = np.full_like(a, scan_path.across[len(scan_path) // 2])
-    rough = curve.rough_knot(line_centre(a, b, middle))
+    rough = curve.rough_knot(line_centre(a, b, np.full_like(a, scan_path.across[len(scan_path) // 2])))
     knot = rough.copy()
     left = np.flatnonzero(np.isfinite(knot))
     for turn in range(NEWTON_ROUNDS + 1):

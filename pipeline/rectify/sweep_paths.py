@@ -43,8 +43,7 @@ class SweepPath:
     @property
     def usable(self) -> NDArray[np.bool_]:
         """Return (line,) valid lines with a time stamp and a position of their own."""
-        known = np.isfinite(self.lines.position.sum(axis=1))
-        return np.asarray(self.lines.valid_line & self.numbers.usable & known)
+        return np.asarray(self.lines.valid_line & self.numbers.usable & np.isfinite(self.lines.position.sum(axis=1)))
 
     @property
     def shift_px(self) -> NDArray[np.float64]:

@@ -51,8 +51,7 @@ class MirrorScanPath:
 
 def played_scan_path(position: Floats, rate_hz: float) -> MirrorScanPath:
     """Return the scan path of positions (held, 2) that are each held for 1 / ``rate_hz``, one after the other."""
-    ends = np.repeat(np.arange(len(position) + 1), 2)[1:-1] / rate_hz
-    return MirrorScanPath(ends, np.repeat(position, 2, axis=0))
+    return MirrorScanPath(np.repeat(np.arange(len(position) + 1), 2)[1:-1] / rate_hz, np.repeat(position, 2, axis=0))
 
 
 @dataclass(frozen=True)
@@ -214,8 +213,7 @@ def next_path(sweep: Sweep, first: int, camera: LineCamera, *, vector_pairs: int
 
     Raises SettingsError: the positions of one line do not fit the memory. Raises PoseError: one is beyond the disk.
     """
-    rest = replace(sweep, lines=sweep.lines - first)
-    stop = first + memory_loads([rest], vector_pairs - LEAD)[0].parts[0].lines[1]
+    stop = first + memory_loads([replace(sweep, lines=sweep.lines - first)], vector_pairs - LEAD)[0].parts[0].lines[1]
     return path_of(sweep, (first, stop), camera, triggered=triggered)
 
 

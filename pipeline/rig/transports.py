@@ -177,8 +177,7 @@ class SerialTransport:
             while self._clock.now() < deadline:
                 first: bytes = self._serial.read(1)
                 if first:
-                    rest: bytes = self._serial.read(min(at_most - 1, self._serial.in_waiting))
-                    return first + rest
+                    return first + self._serial.read(min(at_most - 1, self._serial.in_waiting))
         return b""
 
     def drain(self) -> bytes:

@@ -172,8 +172,7 @@ def find_rare(ratio: NDArray[np.float32], law: ResidualLaw, false_alarm: float) 
         high[within] = mean[within] > _limit(law.freedom * size, part / size)
         if high.any():  # all spectra of the window that the mark came from
             back = tuple(-1 if side % 2 == 0 else 0 for side in (lines, samples))
-            reach = uniform_filter(high, (lines, samples), mode="constant", origin=back)
-            rare |= known & (reach > 0.5 / size)
+            rare |= known & (uniform_filter(high, (lines, samples), mode="constant", origin=back) > 0.5 / size)
     return rare
 
 

@@ -87,9 +87,8 @@ class Readout:
             self.block.rig.camera,
             np.empty(light.shape, np.uint16),
         )
-        added = np.ravel(np.asarray(self.added, np.float32))
         finite = compiled_loops.read_merged(
-            *(seen.reshape(-1), added, deviate.reshape(-1), self.read_noise_e),
+            *(seen.reshape(-1), np.ravel(np.asarray(self.added, np.float32)), deviate.reshape(-1), self.read_noise_e),
             *(camera.electrons_per_dn, camera.dark_dn, camera.full_scale_dn, raw.reshape(-1)),
         )
         least = least_expected(self.read_noise_e)

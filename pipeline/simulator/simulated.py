@@ -128,8 +128,7 @@ class SimulatedSweep:
     @property
     def time_s(self) -> NDArray[np.float64]:
         """Return the time of each line at mid exposure, since the start of the sweep [s]."""
-        camera = exposing(self.source.camera, self.sweep)
-        return camera.mid_exposure_s(np.arange(self.sweep.lines, dtype=np.float64))
+        return exposing(self.source.camera, self.sweep).mid_exposure_s(np.arange(self.sweep.lines, dtype=np.float64))
 
     @property
     def valid_line(self) -> NDArray[np.bool_]:
@@ -195,8 +194,7 @@ def render_lines(
     for first in range(0, len(lines), BLOCK_LINES):
         some = slice(first, first + BLOCK_LINES)
         block = sweep_block(scene, rig, sweep, lines[some], seed=seed, started_s=started_s)
-        light = expected_light(scene, block, choice)
-        raw[some] = bin_samples(read_out(light, block, choice), sweep.binning)
+        raw[some] = bin_samples(read_out(expected_light(scene, block, choice), block, choice), sweep.binning)
     return raw
 
 

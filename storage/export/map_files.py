@@ -135,8 +135,7 @@ def _task_file(grid: TaskGrid, text: TaskText, length: int) -> ElementTree.Eleme
         ManagementSoftwareVersion=text.version[:DESIGNATOR],
         DataTransferOrigin="1",
     )
-    field = {"A": "PFD1", "C": text.field[:DESIGNATOR], "D": f"{text.area_m2:.0f}"}
-    ElementTree.SubElement(root, "PFD", field)
+    ElementTree.SubElement(root, "PFD", {"A": "PFD1", "C": text.field[:DESIGNATOR], "D": f"{text.area_m2:.0f}"})
     ElementTree.SubElement(root, "PDT", {"A": "PDT1", "B": text.product[:DESIGNATOR], "D": "VPN1"})
     zones = {"H": str(UNTREATED), "I": str(UNTREATED), "J": str(UNTREATED)}
     task = ElementTree.SubElement(

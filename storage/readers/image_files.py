@@ -165,9 +165,8 @@ def _opened(path: Path, image: str = "") -> Iterator[Any]:
     driver = _DRIVERS[path.suffix.lower()]
     with warnings.catch_warnings(), rasterio.Env(**_STRICT):
         warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-        kind = _CALLED.get(driver, path.suffix.lower())
         with (
-            reading(path, kind, "Copy it again, or save it as PNG or TIFF"),
+            reading(path, _CALLED.get(driver, path.suffix.lower()), "Copy it again, or save it as PNG or TIFF"),
             rasterio.open(image or path, driver=driver) as file,
         ):
             yield file

@@ -67,10 +67,9 @@ class KeptBytes:
         Raises BudgetError: the coarsest step does not fit; names its bytes.
         """
         blocks = [(cube, block) for cube in cubes for block in range(-(-cube.shape[0] // BLOCK_LINES))]
-        some = blocks[:: max(1, len(blocks) // SAMPLED_BLOCKS)]
         scores = [
             score_lines(values, valid, components).scores
-            for cube, block in some
+            for cube, block in blocks[:: max(1, len(blocks) // SAMPLED_BLOCKS)]
             for _, values, valid in calibrated_blocks(cube, camera, [block])
         ]
         spectra = sum(cube.shape[0] * cube.shape[1] for cube in cubes)

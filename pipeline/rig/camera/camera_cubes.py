@@ -135,8 +135,7 @@ def _times(by_name: Mapping[str, str], first: int, cube: CubeLines, read: Read, 
         notes.append(f"there is no frame index for raw_{first}")
         return None
     try:
-        text = read(by_name[name]).decode("utf-8-sig", errors="replace")
-        index = parse_frame_index(text.splitlines(), name)
+        index = parse_frame_index(read(by_name[name]).decode("utf-8-sig", errors="replace").splitlines(), name)
     except SceneError as error:
         notes.append(str(error))
         return None

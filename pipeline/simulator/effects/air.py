@@ -278,8 +278,7 @@ class Absorption(Gain):
             return np.ones((1, 1, 1), np.float32)
         if reach[0] == reach[1]:
             return transmission(np.array(reach[:1]), rig, block.wavelength_nm)[:, None].astype(np.float32)
-        knots = np.geomspace(*reach, _KNOTS)
-        table = transmission(knots, rig, block.wavelength_nm).astype(np.float32)
+        table = transmission(np.geomspace(*reach, _KNOTS), rig, block.wavelength_nm).astype(np.float32)
         place = np.log(sample_distances(block) / reach[0]) / np.log(reach[1] / reach[0]) * (_KNOTS - 1)
         low = np.clip(place.astype(np.int64), 0, _KNOTS - 2)
         gain: Radiance = table[low]

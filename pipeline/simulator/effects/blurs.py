@@ -136,8 +136,7 @@ class Defocus(Blur):
         normals = extreme_normals(probe.sweeps, rig.camera)
         worst = np.max([defocus_px(rig, rig.air.distance_m, normal) ** 2 / 16 for normal in normals], axis=0)
         cause = f"defocus at {rig.air.distance_m:g} m, focused at {rig.optics.focus_m:g} m"
-        variance = even(worst, len(probe.wavelength_nm)).variance[None]
-        return blurred_bound(probe, cause, variance, mean_way=DISC_WAY)
+        return blurred_bound(probe, cause, even(worst, len(probe.wavelength_nm)).variance[None], mean_way=DISC_WAY)
 
 
 def defocus_px(rig: Rig, distance_m: float | None, normal: Floats | None = None) -> Floats:

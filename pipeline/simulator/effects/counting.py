@@ -265,8 +265,7 @@ def most_hot_electrons(rig: Rig) -> float:
 
 @lru_cache(maxsize=8)
 def _mask(unit: int, kind: str, samples: int, bands: int, *, fraction: float) -> Mask:
-    below = unit_stream(unit, kind).random((bands, samples)) < fraction
-    mask: Mask = np.ascontiguousarray(below.T)
+    mask: Mask = np.ascontiguousarray((unit_stream(unit, kind).random((bands, samples)) < fraction).T)
     mask.setflags(write=False)
     return mask
 

@@ -224,8 +224,7 @@ class Vignetting(Gain):
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
         sweep, camera = block.sweep, block.rig.camera
-        scan_px = sweep.held_px()
-        fraction = np.sqrt(1 - ahead(sweep.swath_px, scan_px[block.numbers], camera)).mean(axis=1)
+        fraction = np.sqrt(1 - ahead(sweep.swath_px, sweep.held_px()[block.numbers], camera)).mean(axis=1)
         return np.asarray(fraction.astype(np.float32)[:, None, None])
 
 

@@ -308,8 +308,7 @@ def greatest_lag_px(rig: Rig, sweeps: Iterable[Sweep]) -> float:
     """Return the greatest shift along the scan of any line. [px]"""
     worst = 0.0
     for sweep in {(one.lines, one.step, one.positions): one for one in sweeps if one.lines}.values():
-        off = transient(rig, sweep, np.arange(sweep.lines))
-        worst = max(worst, float(np.abs(off).mean(axis=1).max()))
+        worst = max(worst, float(np.abs(transient(rig, sweep, np.arange(sweep.lines))).mean(axis=1).max()))
     return worst
 
 
@@ -319,8 +318,7 @@ def transient(rig: Rig, sweep: Sweep, numbers: NDArray[np.int64]) -> Floats:
     pace = 2 * math.pi * mirror.natural_hz * 1e-3  # [1/ms]
     period, held = pace * camera.frame_ms, pace * camera.exposure_ms / sweep.positions
     start = _at_start(mirror, sweep, period, held)
-    time = numbers[:, None] * period + np.arange(sweep.positions) * held
-    impulse, rise = responses(time, mirror.damping)
+    impulse, rise = responses(numbers[:, None] * period + np.arange(sweep.positions) * held, mirror.damping)
     place: Floats = start[0] * (1 - rise) + start[1] * impulse
     rate = -start[0] * impulse + start[1] * (1 - rise - 2 * mirror.damping * impulse)
     impulse, rise = responses(np.array([held]), mirror.damping)

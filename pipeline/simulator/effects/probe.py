@@ -155,8 +155,7 @@ class GainRange:
 def rising_runs(wavelength_nm: Floats) -> list[slice]:
     """Return the runs of bands whose wavelengths rise: where they fall back or stay, another detector begins."""
     breaks = np.flatnonzero(~(np.diff(wavelength_nm) > 0)) + 1
-    ends = [0, *breaks.tolist(), len(wavelength_nm)]
-    return [slice(start, stop) for start, stop in pairwise(ends)]
+    return [slice(start, stop) for start, stop in pairwise([0, *breaks.tolist(), len(wavelength_nm)])]
 
 
 def rising_gaps(wavelength_nm: Floats) -> Floats:

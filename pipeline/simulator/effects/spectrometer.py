@@ -159,8 +159,7 @@ class Smile(LightChange):
     def change(self, light: Radiance, block: SweepBlock, variant: str) -> Radiance:
         """Return light (line, sample, band) [e-] at the wavelengths that each sample sees."""
         camera, smile = block.rig.camera, block.rig.optics.smile_nm
-        bands = tuple(map(float, block.wavelength_nm))
-        first, weights = _tap_weights(bands, float(smile), camera.samples)
+        first, weights = _tap_weights(tuple(map(float, block.wavelength_nm)), float(smile), camera.samples)
         out = np.empty(light.shape, np.float32)
         compiled_loops.mix_neighbours(np.ascontiguousarray(light, np.float32), weights, first, out)
         return out

@@ -113,8 +113,7 @@ def _fit(packed: bytes, bands: int, box: tuple[float, float], held: int, disc: A
     size = np.concatenate([moments[:2], np.sqrt(moments[2:4]), moments[4:]])
     place = np.linalg.svd(size - size.mean(axis=1, keepdims=True), full_matrices=False)[2][0]
     order = np.argsort(place)
-    steps = np.arange(held) - (held - 1) / 2
-    smeared = np.cos(2 * np.pi * np.outer(_SCAN, steps)).mean(axis=1)
+    smeared = np.cos(2 * np.pi * np.outer(_SCAN, np.arange(held) - (held - 1) / 2)).mean(axis=1)
     own = np.sinc(_ALONG * box[1]) * np.sinc(_SCAN * box[0]) * smeared  # what slit, pixel and held positions pass
     own *= disc_contrast(_ALONG, _SCAN, disc)
     own *= _STRICT

@@ -126,8 +126,7 @@ class SceneSampler:
     ) -> None:
         for views in steps:
             for level, some, gatherer in self.gatherers:
-                seen = views.thinned(level, THINNED_MARGIN)
-                gatherer.gather(pixels[level], seen, out, numbers[some], gains[some])
+                gatherer.gather(pixels[level], views.thinned(level, THINNED_MARGIN), out, numbers[some], gains[some])
 
 
 @dataclass(frozen=True)

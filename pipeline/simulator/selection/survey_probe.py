@@ -324,8 +324,7 @@ def _slit_errors(
 
 def _roughest(scene: RasterScene, rig: Rig, views: SampleViews, unit: Unit) -> NDArray[np.intp]:
     """Return the stored numbers that the slit, or one upright box in its place, changes most."""
-    boxes = _footprint(SLIT.variants[0], rig, _CLOSE, None, scene)
-    close = light_seen(scene, rig.camera, views, boxes, _PHASES)
+    close = light_seen(scene, rig.camera, views, _footprint(SLIT.variants[0], rig, _CLOSE, None, scene), _PHASES)
     scale, most = unit_at(_stored(close, views), rig, unit, views.binning), max(FINEST_SAMPLES // views.binning, 50)
     others = [_footprint(variant, rig, (1, 1), None, scene) for variant in (OFF, UPRIGHT)]
     changes = [_changes(scene, rig, views, other, close, scale) for other in others]

@@ -168,15 +168,13 @@ def _meadow(rows: Rows, field: FieldPlan, here: Ground, days: float, day: int) -
     winter = 0.5 + 0.5 * np.cos(2 * np.pi * (day - 25) / YEAR_DAYS)
     dryness = float(0.18 + 0.34 * np.exp(-days / 12) + 0.24 * winter)
     bands = stripes(rows.across, field.row_period_px, field.row_period_px / 2)
-    mixture = blend(grass(here, dryness), grass(here, dryness + 0.16), bands)
-    return Content(mixture, {"grass": np.ones_like(bands)})
+    return Content(blend(grass(here, dryness), grass(here, dryness + 0.16), bands), {"grass": np.ones_like(bands)})
 
 
 def _bare_field(rows: Rows, field: FieldPlan, here: Ground, soil: Mixture) -> Content:
     period = field.row_period_px if field.crop is None else 10.5
     furrow = stripes(rows.place, period, 3.0)
-    mixture = blend(soil, {"shade": np.ones_like(furrow)}, 0.15 * furrow)
-    content = Content(mixture, {"soil": np.ones_like(furrow)})
+    content = Content(blend(soil, {"shade": np.ones_like(furrow)}, 0.15 * furrow), {"soil": np.ones_like(furrow)})
     return _with_wheel_marks(content, field, rows, soil) if field.crop is None else content
 
 
