@@ -6,7 +6,7 @@ from collections.abc import Callable
 from importlib import import_module
 from threading import Lock
 from types import ModuleType
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 Value = TypeVar("Value")
 
@@ -60,3 +60,54 @@ def deferred(name: str) -> Any:
             torch = deferred("torch")
     """
     return DeferredModule(name)
+
+
+# Import them from here: each takes half a second or more, and most commands need few of them.
+if TYPE_CHECKING:
+    import geopandas
+    import h5py
+    import odc.geo.crs as odc_crs
+    import odc.geo.geobox as odc_geobox
+    import odc.geo.warp as odc_warp
+    import odc.geo.xr as odc_geo_xr
+    import pyogrio
+    import pyproj
+    import rasterio
+    import rasterio.features as rasterio_features
+    import rasterio.warp as rasterio_warp
+    import safetensors.torch as safetensors_torch
+    import shapely
+    import torch
+else:
+    geopandas = deferred("geopandas")
+    h5py = deferred("h5py")
+    odc_crs = deferred("odc.geo.crs")
+    odc_geobox = deferred("odc.geo.geobox")
+    odc_warp = deferred("odc.geo.warp")
+    odc_geo_xr = deferred("odc.geo.xr")
+    pyogrio = deferred("pyogrio")
+    pyproj = deferred("pyproj")
+    rasterio = deferred("rasterio")
+    rasterio_features = deferred("rasterio.features")
+    rasterio_warp = deferred("rasterio.warp")
+    safetensors_torch = deferred("safetensors.torch")
+    shapely = deferred("shapely")
+    torch = deferred("torch")
+__all__ = [
+    "Once",
+    "deferred",
+    "geopandas",
+    "h5py",
+    "odc_crs",
+    "odc_geo_xr",
+    "odc_geobox",
+    "odc_warp",
+    "pyogrio",
+    "pyproj",
+    "rasterio",
+    "rasterio_features",
+    "rasterio_warp",
+    "safetensors_torch",
+    "shapely",
+    "torch",
+]

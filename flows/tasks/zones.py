@@ -17,16 +17,13 @@ from pipeline.ground.field_places import FieldPlace, NoPlace, PlacedPicture, Pos
 from pipeline.ground.map_grid import ground_grid
 from pipeline.ground.view import GroundView
 from pipeline.ground.zones import FieldZones, extent_deg, field_zones, on_field, pixels_inside
-from pipeline.lazy import deferred
+from pipeline.lazy import pyproj
 from pipeline.simulator.scenes.scene import RasterScene
 from storage.archive.keys import array_digest
 from storage.readers.polygons import GEOJSON, ZoneFile, read_zones
 
 if TYPE_CHECKING:
-    import pyproj
     from shapely.geometry.base import BaseGeometry
-else:
-    pyproj = deferred("pyproj")
 
 WGS84 = 4326  # CRS of GeoJSON (RFC 7946), on a georeferenced field
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import scipy
@@ -20,13 +20,8 @@ from models.policies.policies import random_scores, score_patches
 from models.reading.inference import CoarsePrediction, captured, overview_of, patch_logits, segment
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, patch_pixels
-from pipeline.lazy import deferred
+from pipeline.lazy import torch
 from pipeline.planning.prices import frame_patches
-
-if TYPE_CHECKING:
-    import torch
-else:
-    torch = deferred("torch")
 
 Values = NDArray[np.floating]
 RANDOM_DRAWS = 5

@@ -25,16 +25,13 @@ from models.network.spectral import (
 from models.weights.files import Weights
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, cuts, pad_by_reflection
-from pipeline.lazy import deferred
+from pipeline.lazy import torch
 from pipeline.signal.components import Components
 
 if TYPE_CHECKING:
-    import torch
     from torch import Tensor
 
     from models.network.segmenter import Overview
-else:
-    torch = deferred("torch")
 
 ROWS_DRAWN = 64  # at once
 # Factor of the octaves by which exposures are stated to be shorter than the reference. The network then relies more on

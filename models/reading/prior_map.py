@@ -18,15 +18,12 @@ from models.evaluation.expected_scores import expected_counts
 from models.evaluation.metrics import confusion, kappa, overall_accuracy
 from models.network.sizes import CELL_PX
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.lazy import deferred
+from pipeline.lazy import torch
 
 if TYPE_CHECKING:
-    import torch
     from torch import Tensor
 
     from models.network.temporal_reader import TemporalReader
-else:
-    torch = deferred("torch")
 
 FAINTEST = -12.7  # least log-probability that is stored: one in 330 000
 LIGHT_FADES_DAYS = 30.0  # in which the exposure of a prior map loses weight by a factor of e

@@ -16,15 +16,10 @@ from typing import TYPE_CHECKING, Any
 from safetensors import SafetensorError, safe_open
 
 from pipeline.errors import WeightsError
-from pipeline.lazy import deferred
+from pipeline.lazy import safetensors_torch, torch
 
 if TYPE_CHECKING:
-    import safetensors.torch as safetensors_torch
-    import torch
     from torch import Tensor
-else:
-    torch = deferred("torch")
-    safetensors_torch = deferred("safetensors.torch")
 
 KEY_DIGITS = 20
 ABOUT = "about"  # name of the text in the file

@@ -16,17 +16,11 @@ from pipeline.errors import PoseError
 from pipeline.ground.georeference import pixel_rows_m2, pixel_side_m
 from pipeline.ground.map_grid import SAMPLES, GroundGrid, least_mapped_sink, median_footprint_m
 from pipeline.ground.view import ROWS_AT_ONCE, GroundView, pixel_places
-from pipeline.lazy import deferred
+from pipeline.lazy import pyproj, shapely
 
 if TYPE_CHECKING:
-    import pyproj
-    import shapely
-    import shapely.affinity
     from odc.geo.geobox import GeoBox
     from shapely.geometry.base import BaseGeometry
-else:
-    pyproj = deferred("pyproj")
-    shapely = deferred("shapely")
 
 Floats = NDArray[np.float64]
 

@@ -9,15 +9,10 @@ import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
 
-from pipeline.lazy import deferred
+from pipeline.lazy import odc_geobox, pyproj
 
 if TYPE_CHECKING:  # half a second to import, for scenes with a place alone
-    import odc.geo.geobox as odc_geobox
-    import pyproj
     from odc.geo.geobox import GeoBox
-else:
-    odc_geobox = deferred("odc.geo.geobox")
-    pyproj = deferred("pyproj")
 
 Floats = NDArray[np.float64]
 WGS84 = 4326  # by EPSG

@@ -18,17 +18,12 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.errors import PoseError
 from pipeline.ground.georeference import WGS84
 from pipeline.ground.view import LEAST_SINK, GroundView, RigPose, pixel_places
-from pipeline.lazy import deferred
+from pipeline.lazy import odc_geobox, pyproj
 from pipeline.rectify.resample import resample
 
 if TYPE_CHECKING:  # half a second to import, for maps alone
-    import odc.geo.geobox as odc_geobox
-    import pyproj
     from odc.geo.geobox import GeoBox
     from pyproj import CRS
-else:
-    odc_geobox = deferred("odc.geo.geobox")
-    pyproj = deferred("pyproj")
 
 Floats = NDArray[np.float64]
 Pixel = TypeVar("Pixel", bound=np.generic)

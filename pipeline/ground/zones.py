@@ -12,19 +12,10 @@ from numpy.typing import NDArray
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, patch_pixels
 from pipeline.ground.field_places import BORDER_PX, FieldPlace
 from pipeline.ground.georeference import WGS84
-from pipeline.lazy import deferred
+from pipeline.lazy import pyproj, rasterio, rasterio_features, shapely
 
 if TYPE_CHECKING:
-    import pyproj
-    import rasterio
-    import rasterio.features as rasterio_features
-    import shapely
     from shapely.geometry.base import BaseGeometry
-else:
-    pyproj = deferred("pyproj")
-    rasterio = deferred("rasterio")
-    rasterio_features = deferred("rasterio.features")
-    shapely = deferred("shapely")
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 ROUND_THE_FIELD = 1.0  # times its size, on every side, within which polygons are converted

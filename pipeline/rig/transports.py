@@ -177,7 +177,8 @@ class SerialTransport:
             while self._clock.now() < deadline:
                 first: bytes = self._serial.read(1)
                 if first:
-                    return first + self._serial.read(min(at_most - 1, self._serial.in_waiting))
+                    rest: bytes = self._serial.read(min(at_most - 1, self._serial.in_waiting))
+                    return first + rest
         return b""
 
     def drain(self) -> bytes:

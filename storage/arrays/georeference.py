@@ -17,19 +17,12 @@ from affine import Affine
 
 from pipeline.errors import PoseError
 from pipeline.ground.georeference import zoomed_out
-from pipeline.lazy import deferred
+from pipeline.lazy import odc_crs, odc_geo_xr, odc_geobox
 from storage.arrays.layout import AngularGrid, SmallArray, create_group, damage_named, open_group
 
 if TYPE_CHECKING:  # half a second to import, for images on the earth alone
-    import odc.geo.crs as odc_crs
-    import odc.geo.geobox as odc_geobox
-    import odc.geo.xr as odc_geo_xr
     from odc.geo.crs import CRS
     from odc.geo.geobox import GeoBox
-else:
-    odc_crs = deferred("odc.geo.crs")
-    odc_geobox = deferred("odc.geo.geobox")
-    odc_geo_xr = deferred("odc.geo.xr")
 
 GRID_MAPPING = "spatial_ref"
 # on every image: CF's link to the grid mapping, and the same as a coordinate, so that plain xarray takes it for one

@@ -11,22 +11,15 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ArchiveError, SettingsError
-from pipeline.lazy import deferred
+from pipeline.lazy import geopandas, pyogrio
 from storage.archive.whole_files import written_aside
-
-if TYPE_CHECKING:
-    import geopandas
-    import pyogrio
-else:
-    geopandas = deferred("geopandas")
-    pyogrio = deferred("pyogrio")
 
 GEOPACKAGE = "application/geopackage+sqlite3"
 GEOJSON = "application/geo+json"

@@ -25,17 +25,12 @@ from affine import Affine
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from pipeline.lazy import deferred
+from pipeline.lazy import h5py, odc_geobox
 from storage.readers.array_cubes import ArrayCube, Arrays, FileArray, place_or_note
 from storage.readers.cube_sources import BLOCK_LINES, DEFLATE_RATIO, Bands, CubeSource, read_by_chunks, unpacked
 
 if TYPE_CHECKING:
-    import h5py
-    import odc.geo.geobox as odc_geobox
     from odc.geo.geobox import GeoBox
-else:
-    h5py = deferred("h5py")
-    odc_geobox = deferred("odc.geo.geobox")
 
 ARRAY_ENDINGS = (".npy", ".npz", ".mat")
 HDF_ENDINGS = (".nc", ".nc4", ".h5", ".hdf5", ".he5")

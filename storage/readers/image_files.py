@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from pipeline.lazy import deferred
+from pipeline.lazy import odc_crs, odc_geobox, pyproj
 from pipeline.rig.camera.camera_texts import finite_number, wavelengths_nm
 from storage.readers.cube_sources import (
     BLOCK_LINES,
@@ -36,14 +36,7 @@ from storage.readers.cube_sources import (
 )
 
 if TYPE_CHECKING:  # half a second to import
-    import odc.geo.crs as odc_crs
-    import odc.geo.geobox as odc_geobox
-    import pyproj
     from odc.geo.geobox import GeoBox
-else:
-    odc_crs = deferred("odc.geo.crs")
-    odc_geobox = deferred("odc.geo.geobox")
-    pyproj = deferred("pyproj")
 
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp")  # of files that are read as a whole
 JPEG2000_ENDINGS = (".jp2", ".j2k")

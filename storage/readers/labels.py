@@ -16,15 +16,12 @@ from numpy.typing import NDArray
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.georeference import OFF_GRID_PX, crs_name, shift_px
-from pipeline.lazy import deferred
+from pipeline.lazy import odc_warp
 from storage.readers.open_cubes import open_labels
 from storage.readers.scene_toml import ClassValue, Colour
 
 if TYPE_CHECKING:  # half a second to import, for labels on another grid alone
-    import odc.geo.warp as odc_warp
     from odc.geo.geobox import GeoBox
-else:
-    odc_warp = deferred("odc.geo.warp")
 
 Distances = NDArray[np.float64]
 NO_VALUE = int(np.iinfo(np.int64).min)  # in codes

@@ -22,22 +22,13 @@ from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.field_places import FieldPlace, NoPlace, PlacedPicture
 from pipeline.ground.georeference import WGS84
 from pipeline.ground.zones import on_field
-from pipeline.lazy import deferred
+from pipeline.lazy import pyogrio, pyproj, rasterio_features, shapely
 from storage.readers.labels import MOST_FOUND_CLASSES, Labels, class_colours
 from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings
 
 if TYPE_CHECKING:
-    import pyogrio
-    import pyproj
-    import rasterio.features as rasterio_features
-    import shapely
     from odc.geo.geobox import GeoBox
     from shapely.geometry.base import BaseGeometry
-else:  # two seconds to import
-    pyogrio = deferred("pyogrio")
-    pyproj = deferred("pyproj")
-    rasterio_features = deferred("rasterio.features")
-    shapely = deferred("shapely")
 
 GEOJSON = (".geojson", ".json")
 ZONE_ENDINGS = (*GEOJSON, ".gpkg", ".shp")
