@@ -64,12 +64,16 @@ def deferred(name: str) -> Any:
 
 # Import them from here: each takes half a second or more, and most commands need few of them.
 if TYPE_CHECKING:
+    import dask
+    import dask.distributed as dask_distributed
     import geopandas
     import h5py
     import odc.geo.crs as odc_crs
     import odc.geo.geobox as odc_geobox
     import odc.geo.warp as odc_warp
     import odc.geo.xr as odc_geo_xr
+    import prosail
+    import pvlib
     import pyogrio
     import pyproj
     import rasterio
@@ -77,14 +81,23 @@ if TYPE_CHECKING:
     import rasterio.warp as rasterio_warp
     import safetensors.torch as safetensors_torch
     import shapely
+    import spyndex
     import torch
+    from odc.geo.geobox import GeoBox
+    from shapely.geometry.base import BaseGeometry
+    from torch import Tensor
 else:
+    BaseGeometry = GeoBox = Tensor = Any  # only type checkers look at them
+    dask = deferred("dask")
+    dask_distributed = deferred("dask.distributed")
     geopandas = deferred("geopandas")
     h5py = deferred("h5py")
     odc_crs = deferred("odc.geo.crs")
     odc_geobox = deferred("odc.geo.geobox")
     odc_warp = deferred("odc.geo.warp")
     odc_geo_xr = deferred("odc.geo.xr")
+    prosail = deferred("prosail")
+    pvlib = deferred("pvlib")
     pyogrio = deferred("pyogrio")
     pyproj = deferred("pyproj")
     rasterio = deferred("rasterio")
@@ -92,9 +105,15 @@ else:
     rasterio_warp = deferred("rasterio.warp")
     safetensors_torch = deferred("safetensors.torch")
     shapely = deferred("shapely")
+    spyndex = deferred("spyndex")
     torch = deferred("torch")
 __all__ = [
+    "BaseGeometry",
+    "GeoBox",
     "Once",
+    "Tensor",
+    "dask",
+    "dask_distributed",
     "deferred",
     "geopandas",
     "h5py",
@@ -102,6 +121,8 @@ __all__ = [
     "odc_geo_xr",
     "odc_geobox",
     "odc_warp",
+    "prosail",
+    "pvlib",
     "pyogrio",
     "pyproj",
     "rasterio",
@@ -109,5 +130,6 @@ __all__ = [
     "rasterio_warp",
     "safetensors_torch",
     "shapely",
+    "spyndex",
     "torch",
 ]

@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,12 +26,10 @@ from flows.tasks.prefect_tasks import as_task
 from models.network.machine import give_back_freed_memory
 from pipeline.geometry.grid import SceneGrid
 from pipeline.ground.georeference import georeference_record
+from pipeline.lazy import GeoBox
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, array_digest, stage_key
 from storage.arrays.layout import AngularGrid
-
-if TYPE_CHECKING:
-    from odc.geo.geobox import GeoBox
 
 Report = Callable[[float], None]  # progress of a stage, 0..1
 Build = Callable[[Path], None]

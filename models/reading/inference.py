@@ -25,12 +25,10 @@ from models.network.spectral import (
 from models.weights.files import Weights
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, cuts, pad_by_reflection
-from pipeline.lazy import torch
+from pipeline.lazy import Tensor, torch
 from pipeline.signal.components import Components
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from models.network.segmenter import Overview
 
 ROWS_DRAWN = 64  # at once

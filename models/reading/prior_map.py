@@ -18,11 +18,9 @@ from models.evaluation.expected_scores import expected_counts
 from models.evaluation.metrics import confusion, kappa, overall_accuracy
 from models.network.sizes import CELL_PX
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.lazy import torch
+from pipeline.lazy import Tensor, torch
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from models.network.temporal_reader import TemporalReader
 
 FAINTEST = -12.7  # least log-probability that is stored: one in 330 000

@@ -11,15 +11,12 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from safetensors import SafetensorError, safe_open
 
 from pipeline.errors import WeightsError
-from pipeline.lazy import safetensors_torch, torch
-
-if TYPE_CHECKING:
-    from torch import Tensor
+from pipeline.lazy import Tensor, safetensors_torch, torch
 
 KEY_DIGITS = 20
 ABOUT = "about"  # name of the text in the file

@@ -20,13 +20,11 @@ from models.network.spectral import Normalisation, SpectralBasis, check_basis, p
 from models.reading.ood import Limits, OodDetector
 from models.weights.checksummed_files import key_of, read_about, read_tensors, refusing, write_checksummed
 from pipeline.errors import WeightsError
-from pipeline.lazy import deferred, torch
+from pipeline.lazy import Tensor, deferred, torch
 from pipeline.readings import readings_alone
 from pipeline.signal.components import Components
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from models.network import segmenter, temporal_reader
     from models.network.segmenter import Segmenter
     from models.network.temporal_reader import TemporalReader

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +15,7 @@ from pipeline.errors import PoseError
 from pipeline.ground.georeference import pixel_rows_m2, pixel_side_m
 from pipeline.ground.map_grid import SAMPLES, GroundGrid, least_mapped_sink, median_footprint_m
 from pipeline.ground.view import ROWS_AT_ONCE, GroundView, pixel_places
-from pipeline.lazy import pyproj, shapely
-
-if TYPE_CHECKING:
-    from odc.geo.geobox import GeoBox
-    from shapely.geometry.base import BaseGeometry
+from pipeline.lazy import BaseGeometry, GeoBox, pyproj, shapely
 
 Floats = NDArray[np.float64]
 

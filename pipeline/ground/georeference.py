@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
 
-from pipeline.lazy import odc_geobox, pyproj
-
-if TYPE_CHECKING:  # half a second to import, for scenes with a place alone
-    from odc.geo.geobox import GeoBox
+from pipeline.lazy import GeoBox, odc_geobox, pyproj
 
 Floats = NDArray[np.float64]
 WGS84 = 4326  # by EPSG

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,12 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.errors import PoseError
 from pipeline.ground.georeference import WGS84
 from pipeline.ground.view import LEAST_SINK, GroundView, RigPose, pixel_places
-from pipeline.lazy import odc_geobox, pyproj
+from pipeline.lazy import GeoBox, odc_geobox, pyproj
 from pipeline.rectify.resample import resample
-
-if TYPE_CHECKING:  # half a second to import, for maps alone
-    from odc.geo.geobox import GeoBox
-    from pyproj import CRS
 
 Floats = NDArray[np.float64]
 Pixel = TypeVar("Pixel", bound=np.generic)
@@ -72,7 +68,7 @@ def map_crs(pose: RigPose, epsg: int | None = None) -> pyproj.CRS:
     return crs
 
 
-def _made_for(crs: CRS, pose: RigPose) -> bool:
+def _made_for(crs: pyproj.CRS, pose: RigPose) -> bool:
     """Return whether the rig is in the CRS's area of use, which may cross the date line."""
     if crs.area_of_use is None:
         return True
@@ -88,7 +84,7 @@ class MapFrame:
     """Convert between the plane of ground under a posed rig and the coordinates of a map (x east, y north) [m]."""
 
     view: GroundView
-    crs: CRS
+    crs: pyproj.CRS
 
     def ground_to_geodetic(self, ground_m: ArrayLike) -> Floats:
         """Return (..., 3) longitude, latitude [deg] and ellipsoidal height [m] of east, north, up of the foot."""

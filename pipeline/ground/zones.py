@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +11,8 @@ from numpy.typing import NDArray
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, patch_pixels
 from pipeline.ground.field_places import BORDER_PX, FieldPlace
 from pipeline.ground.georeference import WGS84
-from pipeline.lazy import pyproj, rasterio, rasterio_features, shapely
+from pipeline.lazy import BaseGeometry, pyproj, rasterio, rasterio_features, shapely
 
-if TYPE_CHECKING:
-    from shapely.geometry.base import BaseGeometry
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 ROUND_THE_FIELD = 1.0  # times its size, on every side, within which polygons are converted

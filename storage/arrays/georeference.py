@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import zarr
@@ -17,12 +17,8 @@ from affine import Affine
 
 from pipeline.errors import PoseError
 from pipeline.ground.georeference import zoomed_out
-from pipeline.lazy import odc_crs, odc_geo_xr, odc_geobox
+from pipeline.lazy import GeoBox, odc_crs, odc_geo_xr, odc_geobox
 from storage.arrays.layout import AngularGrid, SmallArray, create_group, damage_named, open_group
-
-if TYPE_CHECKING:  # half a second to import, for images on the earth alone
-    from odc.geo.crs import CRS
-    from odc.geo.geobox import GeoBox
 
 GRID_MAPPING = "spatial_ref"
 # on every image: CF's link to the grid mapping, and the same as a coordinate, so that plain xarray takes it for one
@@ -102,7 +98,7 @@ def grid_mapping(geobox: GeoBox) -> SmallArray:
     return SmallArray((), np.asarray(mapping.values, np.int32), dict(mapping.attrs))
 
 
-def _axis(crs: CRS, name: str) -> dict[str, str]:
+def _axis(crs: odc_crs.CRS, name: str) -> dict[str, str]:
     """Return CF's attributes of one axis of a map."""
     if crs.geographic:
         standard, unit = _DEGREES[name]
@@ -115,7 +111,7 @@ def _axis(crs: CRS, name: str) -> dict[str, str]:
     }
 
 
-def _crs_of(geobox: GeoBox) -> CRS:
+def _crs_of(geobox: GeoBox) -> odc_crs.CRS:
     if geobox.crs is None:
         raise PoseError(f"a map needs a CRS, got {geobox!r}")
     return geobox.crs

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import zarr
@@ -23,9 +23,7 @@ from zarr.storage import MemoryStore
 
 from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.grid import UNLABELLED
-
-if TYPE_CHECKING:
-    from odc.geo.geobox import GeoBox
+from pipeline.lazy import GeoBox
 
 StorePlace = Path | MemoryStore  # where a store lies
 CHUNK_PX = 32

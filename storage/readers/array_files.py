@@ -18,19 +18,16 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from pipeline.lazy import h5py, odc_geobox
+from pipeline.lazy import GeoBox, h5py, odc_geobox
 from storage.readers.array_cubes import ArrayCube, Arrays, FileArray, place_or_note
 from storage.readers.cube_sources import BLOCK_LINES, DEFLATE_RATIO, Bands, CubeSource, read_by_chunks, unpacked
-
-if TYPE_CHECKING:
-    from odc.geo.geobox import GeoBox
 
 ARRAY_ENDINGS = (".npy", ".npz", ".mat")
 HDF_ENDINGS = (".nc", ".nc4", ".h5", ".hdf5", ".he5")

@@ -14,13 +14,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from pipeline.lazy import odc_crs, odc_geobox, pyproj
+from pipeline.lazy import GeoBox, odc_crs, odc_geobox, pyproj
 from pipeline.rig.camera.camera_texts import finite_number, wavelengths_nm
 from storage.readers.cube_sources import (
     BLOCK_LINES,
@@ -34,9 +34,6 @@ from storage.readers.cube_sources import (
     reading,
     unpacked,
 )
-
-if TYPE_CHECKING:  # half a second to import
-    from odc.geo.geobox import GeoBox
 
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp")  # of files that are read as a whole
 JPEG2000_ENDINGS = (".jp2", ".j2k")

@@ -12,16 +12,13 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pipeline.errors import SceneError
+from pipeline.lazy import GeoBox
 from storage.readers.labels import Labels, found_classes, load_labels
 from storage.readers.open_cubes import CUBE_ENDINGS
 from storage.readers.polygons import POLYGON_ENDINGS, is_polygon_file, load_polygon_labels, polygon_classes, split_layer
 from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, is_image_folder
-
-if TYPE_CHECKING:
-    from odc.geo.geobox import GeoBox
 
 _OF_LAND = ("lulc", "landcover", "land_cover")
 _OF_TRUTH = ("gt", "groundtruth", "truth", "seg")

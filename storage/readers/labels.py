@@ -7,7 +7,7 @@ import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import skimage
@@ -16,12 +16,9 @@ from numpy.typing import NDArray
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.georeference import OFF_GRID_PX, crs_name, shift_px
-from pipeline.lazy import odc_warp
+from pipeline.lazy import GeoBox, odc_warp
 from storage.readers.open_cubes import open_labels
 from storage.readers.scene_toml import ClassValue, Colour
-
-if TYPE_CHECKING:  # half a second to import, for labels on another grid alone
-    from odc.geo.geobox import GeoBox
 
 Distances = NDArray[np.float64]
 NO_VALUE = int(np.iinfo(np.int64).min)  # in codes

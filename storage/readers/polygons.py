@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,13 +22,9 @@ from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.field_places import FieldPlace, NoPlace, PlacedPicture
 from pipeline.ground.georeference import WGS84
 from pipeline.ground.zones import on_field
-from pipeline.lazy import pyogrio, pyproj, rasterio_features, shapely
+from pipeline.lazy import BaseGeometry, GeoBox, pyogrio, pyproj, rasterio_features, shapely
 from storage.readers.labels import MOST_FOUND_CLASSES, Labels, class_colours
 from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings
-
-if TYPE_CHECKING:
-    from odc.geo.geobox import GeoBox
-    from shapely.geometry.base import BaseGeometry
 
 GEOJSON = (".geojson", ".json")
 ZONE_ENDINGS = (*GEOJSON, ".gpkg", ".shp")

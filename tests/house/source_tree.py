@@ -36,11 +36,14 @@ def nodes(tree: ast.AST) -> list[ast.AST]:
 
 @cache
 def late_packages() -> dict[str, str]:
-    """Packages that `pipeline.lazy` defers for all, by their names there."""
+    """Packages that `pipeline.lazy` defers for all, and those of types, by their names there."""
     tree = ast.parse((ROOT / LAZY).read_text(encoding="utf-8"))
     inner = [node for block in tree.body if isinstance(block, ast.If) for node in block.body]
+    types = {
+        alias.name: node.module or "" for node in inner if isinstance(node, ast.ImportFrom) for alias in node.names
+    }
     found = [alias for node in inner if isinstance(node, ast.Import) for alias in node.names]
-    return {alias.asname or alias.name: alias.name for alias in found}
+    return types | {alias.asname or alias.name: alias.name for alias in found}
 
 
 def imported(tree: ast.AST) -> Iterator[str]:
