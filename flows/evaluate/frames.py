@@ -161,9 +161,8 @@ def observe_frame(scene: RasterScene, name: str, weights: Weights, camera: LineC
     config = weights.config
     grid = SceneGrid(*scene.shape, config.patch, 1)
     rng = np.random.default_rng([seed, 0xE7A1, zlib.crc32(name.encode())])
-    observed = observe_scene(scene, camera, grid, weights.basis, rng)
     _, reached = weights.basis.matrix(scene.wavelength_nm)
-    example = normalised(observed, weights.normalisation, reached)
+    example = normalised(observe_scene(scene, camera, grid, weights.basis, rng), weights.normalisation, reached)
     labels = judged_labels(scene, Description(config, weights.basis, weights.class_names, weights.record))
     assert labels is not None  # sort_frames
     seen = coarse_prediction_of_columns(weights, example.columns, grid)

@@ -230,10 +230,9 @@ class PlannedField:
     def judge(self, plan: Setting, drawn: DrawnMap) -> Figures:
         """Return 1 - mIoU of a map, the seconds of its scan, and the multiply-adds of the network."""
         one = self.passes[plan]
-        config = one.weights.config
         macs = self.costs.of_map(one.patch_index).total
         raw = {} if one.seconds is None else {"MB raw": one.bytes_raw / 1e6}
-        error = 1 - mean_iou(confusion(self.labels, drawn.classes, config.classes))
+        error = 1 - mean_iou(confusion(self.labels, drawn.classes, one.weights.config.classes))
         return Figures(error, one.seconds, {**raw, "billion multiply-adds": macs / 1e9})
 
 

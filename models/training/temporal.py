@@ -207,9 +207,8 @@ def _sequence(land: Sequence[Visit], settings: TemporalTraining, rng: np.random.
         turned = [np.rot90(image[::-1] if mirrored else image, turns) for image in images]
         channels_first = [image.transpose(2, 0, 1) if image.ndim == 3 else image for image in turned]
         comparable = float(rng.random() >= INCOMPARABLE)
-        days = abs(visit.moment - before)
         taken = coarse_pass.light, float(coarse_pass.step), comparable, season_of(visit.moment if dated else None)
-        sequence.append((*map(np.ascontiguousarray, channels_first), days, *taken))
+        sequence.append((*map(np.ascontiguousarray, channels_first), abs(visit.moment - before), *taken))
         before = visit.moment
     return sequence
 

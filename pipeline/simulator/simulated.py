@@ -236,13 +236,12 @@ def take_references(scene: RasterScene, rig: Rig, choice: Choice, sweep: Sweep) 
         seen[dead] = 0
         elements = dead | (hot_electrons(rig, seen.shape[1]) > 0)  # of a sum one is enough
         bad = _binned(elements.astype(np.float32), sweep.binning) > 0 if elements.any() else None
-    white = dark + seen / np.float32(rig.camera.electrons_per_dn)
     white_reference = scene.white_reference.astype(np.float32)
     if (response := choice.variant(RESPONSE.name)) != OFF:
         white_reference = RESPONSE.change(white_reference[None, None], block, response)[0, 0]
     return References(
         dark=_binned(dark, sweep.binning),
-        white=_binned(white, sweep.binning),
+        white=_binned(dark + seen / np.float32(rig.camera.electrons_per_dn), sweep.binning),
         white_reference=white_reference,
         bad=bad,
         by_mirror=choice.variant(VIGNETTING.name) != OFF,

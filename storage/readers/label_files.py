@@ -94,12 +94,11 @@ def match_folder(folder: Path) -> MatchedFiles:
     Raises SceneError: several files may be an image's labels, or one those of several images; both are named.
     """
     own = scene_entries(folder)
-    apart = _in_label_folders(folder)
     beside = [entry for entry in own if is_label_name(entry)]
     images = [entry for entry in own if entry not in beside]
     if not images:  # a folder of labels is read as images
         images, beside = own, []
-    pictures, polygons = [*beside, *apart], _polygons_near(folder)
+    pictures, polygons = [*beside, *_in_label_folders(folder)], _polygons_near(folder)
     matched = {image: _label_of(image, pictures) or _label_of(image, polygons) for image in images}
     labels = {image: found for image, found in matched.items() if found is not None}
     if len(images) == len(pictures) == 1:  # a single pair may have any names

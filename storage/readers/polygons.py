@@ -64,9 +64,8 @@ def read_zones(source: str, *, named_by: str | None = None) -> ZoneFile:
     file cannot be read, or it has other shapes than polygons.
     """
     layer = read_polygons(source)
-    called = _names(layer, named_by, source)
     shapes: dict[str, BaseGeometry] = {}
-    for name, shape in zip(called, layer.shapes, strict=True):
+    for name, shape in zip(_names(layer, named_by, source), layer.shapes, strict=True):
         shapes[name] = shape if name not in shapes else shapely.union(shapes[name], shape)
     return ZoneFile(source, layer.crs, shapes, layer.notes)
 

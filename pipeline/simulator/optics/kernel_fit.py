@@ -373,9 +373,8 @@ _SDS = 6.5  # of a Gaussian: nothing beyond
 
 def box_weight(distance: Floats, width: float, held: int = 1) -> Floats:
     """Return the linear kernel averaged over a box and over ``held`` positions 1 px apart, at distances [px]."""
-    places = np.arange(held) - (held - 1) / 2
     total = np.zeros(np.shape(distance))
-    for place in places:
+    for place in np.arange(held) - (held - 1) / 2:
         beside = distance - place
         if width > 1e-6:
             total += (_integral(beside + width / 2) - _integral(beside - width / 2)) / width
