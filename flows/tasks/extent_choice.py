@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from flows.settings.values import format_extent
 from flows.tasks.capture_plan import PassLayout
 from flows.tasks.prior_maps import Prior
-from models.reading.expected_errors import PatchExpectedErrors
+from models.reading.expected_errors import Floats, PatchExpectedErrors
 from models.reading.prior_map import COME_TRUE, ClassProbabilities, PriorMap, carried, in_classes
 from models.weights.files import Description, load_reader
 from pipeline.errors import BudgetError, NothingToMend, SettingsError, WeightsError
@@ -30,7 +30,6 @@ from pipeline.planning.uniform_scans import LOSS, MIOU, ScanPerformance, exposur
 from storage.arrays.class_maps import ProbabilityStore
 
 Mask = NDArray[np.bool_]
-Floats = NDArray[np.float64]
 SWATH_PATCHES = 4  # rows of patches whose class probabilities are read at a time
 POORER = 0.05  # mIoU below the best scan: poorer scans would degrade the prior map
 DUE = 1e3  # weight of patches that are too old, relative to the gain of the whole field

@@ -21,7 +21,7 @@ from flows.tasks.patch_budget import ReadingCosts
 from flows.tasks.run import SurveyRun, open_run
 from flows.tasks.stages.accuracy import columns_of_raster, columns_of_sweeps
 from flows.tradeoff.entries import Figures, Setting, Tradeoff
-from flows.tradeoff.store import STORE
+from flows.tradeoff.store import MEMORY, STORE, Values
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.machine import keep_freed_memory
 from models.network.spectral import LineSpec
@@ -31,7 +31,7 @@ from models.weights.files import Weights
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
-from pipeline.geometry.scan import CostModel, Sweep
+from pipeline.geometry.scan import CostModel, Floats, Sweep
 from pipeline.planning.coverage import cheapest_full, full_sweeps, uniform_sweeps
 from pipeline.planning.prices import frame_patches, raw_bytes
 from pipeline.planning.uniform_scans import format_scan
@@ -48,10 +48,6 @@ from pipeline.simulator.selection.choice import Decision, decide
 from pipeline.simulator.selection.survey_probe import probe_scene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_block
 from storage.archive.archive import Archive
-
-Values = NDArray[np.float32]
-Floats = NDArray[np.float64]
-MEMORY = 2**30  # bytes that rectifying may take
 
 # rectify: kernels on plane waves, whose values are known at every point
 

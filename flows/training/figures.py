@@ -15,8 +15,9 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.linear_model import LogisticRegression
 
 from flows.training.data import Report
-from models.evaluation.expected_scores import Floats, MapScores, ScoredMap, expected_counts
+from models.evaluation.expected_scores import MapScores, ScoredMap, expected_counts
 from models.evaluation.metrics import (
+    Floats,
     JudgedMap,
     agreement,
     calibration_error,

@@ -18,9 +18,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from models.evaluation.metrics import iou_per_class, labelled_classes, mean_iou
+from models.evaluation.metrics import Floats, iou_per_class, labelled_classes, mean_iou
 
-Floats = NDArray[np.float64]
 THERE_PX = 100.0  # expected pixels of a class that is present with probability 1/2
 SURE_PX = 2000.0  # of a class: a scene with so many counts in full; fewer in all scenes shrink the bias
 SMALL_PX, SMALL_ERROR = 300.0, 0.3  # the IoU of a class of so few pixels has half of this error

@@ -13,7 +13,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from models.evaluation.metrics import agreement, confusion, gap_closed, mean_iou
+from models.evaluation.metrics import Counts, agreement, confusion, gap_closed, mean_iou
 from models.network.sizes import MOST_GAIN
 from models.network.spectral import patches_of
 from models.policies.policies import random_scores, score_patches
@@ -28,7 +28,6 @@ RANDOM_DRAWS = 5
 COMPARED = ("gain", "entropy", "sobel")  # policies beside the random one
 LEAST_GAINS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2)  # thresholds [nat per px]
 CONTROL_FRACTION = 0.35  # of the valid patches: K = 35 % of surveys' receipts and of the weights' records
-Counts = NDArray[np.int64]
 
 
 def oracle_gain(

@@ -22,10 +22,9 @@ from numpy.typing import NDArray
 from pipeline.errors import NotRecordedError, SceneError, ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_scene, position_to_direction
-from pipeline.geometry.scan import Sweep
+from pipeline.geometry.scan import Floats, Sweep
 from pipeline.source import Line, References
 
-Floats = NDArray[np.float64]
 Numbers = NDArray[np.intp]
 ReadLines = Callable[[Numbers], NDArray[np.uint16]]
 

@@ -12,12 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import PoseError
-from pipeline.ground.georeference import pixel_rows_m2, pixel_side_m
+from pipeline.ground.georeference import Floats, pixel_rows_m2, pixel_side_m
 from pipeline.ground.map_grid import SAMPLES, GroundGrid, least_mapped_sink, median_footprint_m
 from pipeline.ground.view import ROWS_AT_ONCE, GroundView, pixel_places
 from pipeline.lazy import BaseGeometry, GeoBox, pyproj, shapely
-
-Floats = NDArray[np.float64]
 
 M2_PER_HECTARE = 10_000.0
 SECONDS_PER_HOUR = 3600.0

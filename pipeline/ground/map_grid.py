@@ -16,12 +16,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import PoseError
-from pipeline.ground.georeference import WGS84
+from pipeline.ground.georeference import WGS84, Floats
 from pipeline.ground.view import LEAST_SINK, GroundView, RigPose, pixel_places
 from pipeline.lazy import GeoBox, odc_geobox, pyproj
 from pipeline.rectify.resample import resample
 
-Floats = NDArray[np.float64]
 Pixel = TypeVar("Pixel", bound=np.generic)
 
 UTM_LATITUDES = (-80.0, 84.0)

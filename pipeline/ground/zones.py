@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, patch_pixels
 from pipeline.ground.field_places import BORDER_PX, FieldPlace
-from pipeline.ground.georeference import WGS84
+from pipeline.ground.georeference import WGS84, Floats
 from pipeline.lazy import BaseGeometry, pyproj, rasterio, rasterio_features, shapely
 
 Mask = NDArray[np.bool_]
-Floats = NDArray[np.float64]
 ROUND_THE_FIELD = 1.0  # times its size, on every side, within which polygons are converted
 EDGE_PARTS = 256  # of that: a straight edge of one map is curved on another
 FAR_EAST_DEG = 90.0  # beyond this longitude of the field, those of polygons count from it and not from Greenwich

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import CostModel, Sweep, exposing
+from pipeline.geometry.scan import CostModel, Floats, Sweep, exposing
 from pipeline.planning.coverage import some_lines
 from pipeline.planning.partial_scans import LineRun, PatchRows, RunTimes, choose_runs
 from pipeline.planning.uniform_scans import MIOU, ScanPerformance, format_scan, longest_exposure
@@ -26,7 +26,6 @@ FIRST_STEP = 4  # positions of the full scan from line to line of the first pass
 FIRST_STEPS = (4, 8)  # allowed values
 LEAST_GAIN = 1e-3  # of mIoU; below it there is no second pass
 EXPOSURES = 7  # that are tried, equally spaced by logarithm
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

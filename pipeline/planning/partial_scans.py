@@ -20,12 +20,11 @@ from numpy.typing import NDArray
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import CostModel, Sweep, exposing, scene_to_sweep
+from pipeline.geometry.scan import CostModel, Floats, Sweep, exposing, scene_to_sweep
 from pipeline.planning.coverage import lines_showing, some_lines
 
 LEAST_PRICE, MOST_PRICE = 1e-9, 1e6  # of a second, in fractions of the total gain: all runs pay, or none
 HALVINGS = 48  # of the logarithm of the interval between them
-Floats = NDArray[np.float64]
 LineRun = tuple[int, int, int]  # number of the sweep, its first line, and the one after its last
 
 

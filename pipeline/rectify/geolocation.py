@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import camera_slope, line_centre
-from pipeline.geometry.scan import Axis
+from pipeline.geometry.scan import Axis, Floats
 from pipeline.rectify.scan_paths import ScanPath
 
 NEWTON_ROUNDS = 4
@@ -24,8 +24,6 @@ END_KNOTS = 4  # whose mean step is used beyond the end
 FAR_KNOTS = 1e6  # Newton does not return from a larger step
 SETTLED_PX = 1e-7
 BLOCK_PX = 16384  # some twenty temporaries of this length stay in cache
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

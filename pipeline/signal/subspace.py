@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from pipeline.lazy import deferred
 from pipeline.readings import SIGMA_OF_MEDIAN
-from pipeline.signal.components import Components
+from pipeline.signal.components import Components, Floats
 
 compiled_loops: Any = deferred("pipeline.signal.compiled_loops")
 
@@ -43,7 +43,6 @@ TRACY_WIDOM = (
 
 SUMS = ("lit", "total", "single", "block", "block_total", "largest")
 
-Floats = NDArray[np.float64]
 Values = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 

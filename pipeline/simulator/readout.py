@@ -31,10 +31,8 @@ from pipeline.simulator.effects.counting import (
     rounded_counts,
     well_reached,
 )
-from pipeline.simulator.effects.effect import OFF, SweepBlock
+from pipeline.simulator.effects.effect import OFF, Radiance, SweepBlock
 from pipeline.simulator.render import Choice
-
-Radiance = NDArray[np.float32]
 
 
 def read_out(light: Radiance, block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> NDArray[np.uint16]:

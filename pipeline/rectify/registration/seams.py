@@ -22,10 +22,8 @@ from pipeline.rectify.registration.alignment import (
     tied_to,
 )
 from pipeline.rectify.registration.overlaps import LEAST_OVERLAP_PX, BroadSweep, PlacedImage, Window, overlap_windows
-from pipeline.rectify.registration.shifts import PairShift, nothing_found, pair_shift
+from pipeline.rectify.registration.shifts import Floats, PairShift, nothing_found, pair_shift
 from pipeline.rectify.resample import resample
-
-Floats = NDArray[np.float64]
 
 WINDOW_PX = 512.0
 SETTLED_PRIOR_PX = 3.0  # after the first round

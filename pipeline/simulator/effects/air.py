@@ -15,9 +15,8 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipeline.geometry.scan import points_of_scan
+from pipeline.geometry.scan import Floats, points_of_scan
 from pipeline.simulator.effects.effect import (
     Aim,
     Bound,
@@ -33,7 +32,6 @@ from pipeline.simulator.effects.probe import UNITS, GainRange, Probe
 from pipeline.simulator.rig_model import Air, Rig
 from pipeline.simulator.scenes.daylight import relative_daylight
 
-Floats = NDArray[np.float64]
 PLANE = 2.91  # angle of arrival of a star's light [1]
 NEAR_POINTS = 3 / 8  # of it from a path's end: the mean of (z / d)^(5/3); r0 [2] is (8/3)^(3/5) times as wide
 RISK = 1e-3  # fraction of the surveys in which a line may stray further than the bound says

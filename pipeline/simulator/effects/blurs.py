@@ -9,15 +9,13 @@ from types import MappingProxyType
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from pipeline.simulator.effects.effect import Blur, Bound
 from pipeline.simulator.effects.probe import UNITS, Probe
-from pipeline.simulator.optics.kernel_fit import Moments
+from pipeline.simulator.optics.kernel_fit import Floats, Moments
 from pipeline.simulator.optics.rays import extreme_normals, pupil_contrast, spread_of_rays, spread_of_waves
 from pipeline.simulator.rig_model import Rig
 
-Floats = NDArray[np.float64]
 AIRY = "airy"
 FIRST_NM, LAST_NM = 400.0, 1000.0  # of the spectrograph
 _ALONE: Floats = np.ones(1)

@@ -16,12 +16,11 @@ import scipy
 from numpy.typing import NDArray
 
 from pipeline.simulator import compiled_loops
-from pipeline.simulator.effects.effect import Bound, Effect, unit_stream
+from pipeline.simulator.effects.effect import Bound, Effect, Radiance, unit_stream
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Rig
 
 Floats = NDArray[np.float64]
-Radiance = NDArray[np.float32]
 CHIP_SAMPLES = 1_000_000  # numbers of a patch that later stages judge as one: 61 x 61 px of 270 bands
 MOST_VARIATION = 0.05  # total variation between a patch of cheap draws and one of exact draws
 LEAST_MERGED_READ_E = 1.0  # below, the whole numbers of the counts show through the read noise

@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Sweep, points_of_scan
+from pipeline.geometry.scan import Floats, Sweep, points_of_scan
 from pipeline.simulator.effects.effect import Bound, Gain, Radiance, SweepBlock, survey_stream
 from pipeline.simulator.effects.probe import GainRange, Probe
 from pipeline.simulator.rig_model import Coating, Rig
 from pipeline.simulator.scenes.daylight import knots_within, relative_daylight, sun_elevation_deg
 
-Floats = NDArray[np.float64]
 EDGE_FRACTION = 0.1  # width of a shadow's edge, over the shadow's size (assumed)
 HOT_SPOT_RAD = float(np.deg2rad(2.0))  # from its peak to 1/e (assumed)
 _PROBES = 65  # incidences that bounds are taken at

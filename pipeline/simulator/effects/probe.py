@@ -15,10 +15,9 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.scan import Sweep
+from pipeline.geometry.scan import Floats, Sweep
 from pipeline.simulator.rig_model import Rig
 
-Floats = NDArray[np.float64]
 Unit = Literal["sigma", "dn"]
 UNITS = {"sigma": "sigma", "dn": "DN"}
 Radiance = NDArray[np.float32]

@@ -17,12 +17,10 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera, footprint_kernel
-from pipeline.geometry.scan import Sweep
-from pipeline.simulator.effects.probe import steepest_difference
+from pipeline.geometry.scan import Floats, Sweep
+from pipeline.simulator.effects.probe import Radiance, steepest_difference
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, to_bands
 
-Radiance = NDArray[np.float32]
-Floats = NDArray[np.float64]
 Kind = tuple[int, int]  # measure, and band or group of bands
 BAND_GROUPS = 8
 CHOSEN_BANDS = 4

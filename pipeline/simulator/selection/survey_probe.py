@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_normal, scene_to_direction
-from pipeline.geometry.scan import CostModel, Sweep, exposing, scene_to_sweep
+from pipeline.geometry.scan import CostModel, Floats, Sweep, exposing, scene_to_sweep
 from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE
-from pipeline.simulator.effects.effect import OFF
+from pipeline.simulator.effects.effect import OFF, Radiance
 from pipeline.simulator.effects.line import BOXES, SLIT, UPRIGHT, box_of
 from pipeline.simulator.effects.probe import Probe, Unit, steepest_difference, stored_mean, unit_at
 from pipeline.simulator.optics.kernel_fit import Footprint, Moments, fold
@@ -27,8 +27,6 @@ from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from pipeline.simulator.selection.extrema import CHOSEN_BANDS, band_groups, find_extrema
 
-Floats = NDArray[np.float64]
-Radiance = NDArray[np.float32]
 Way = tuple[float, float]  # along the line and the scan [px]
 MOST_VALUES = 1_000_000  # samples times bands; each is seen a few times over, a fraction of a px apart
 MOST_SAMPLES = 6_000
