@@ -495,7 +495,6 @@ def _plan_capture(
         extent_notes = ("there is no prior map: the whole field is captured",)
     layout = PassLayout.of(settings, zones.grid, zones.shown, passes)
     if is_part and prior is not None:
-        assert settings.seconds is not None  # checked with the settings
         limits: dict[str, Any] = {"max_age": settings.max_age, "skip_below_error": settings.skip_below_error}
         masks = [one for one in (zones.left_out, scene.missing) if one is not None]
         limits |= {"seconds": settings.seconds, "left_out": np.logical_or.reduce(masks) if masks else None}

@@ -120,7 +120,6 @@ class GroundView:
         """
         if self.pose.height_m is not None:
             return self.pose.height_m
-        assert self.pose.range_m is not None
         if self.sinks[0] <= LEAST_SINK:
             raise PoseError(
                 f"a range needs a view direction that meets the ground, got {self.pose}; tilt it below the horizon, "

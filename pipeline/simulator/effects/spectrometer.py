@@ -13,12 +13,11 @@ import scipy
 from numpy.typing import NDArray
 
 from pipeline.simulator import compiled_loops
-from pipeline.simulator.effects.counting import Floats, normal_deviates
+from pipeline.simulator.effects.counting import EXACT, Floats, normal_deviates
 from pipeline.simulator.effects.effect import Bound, Gain, LightChange, Radiance, SweepBlock, unit_stream
 from pipeline.simulator.effects.probe import GainRange, Probe, difference_rates, rising_gaps, rising_runs
 from pipeline.simulator.rig_model import Rig
 
-EXACT = "exact"
 FWHM2_PER_VARIANCE = 8 * math.log(2)
 BANDS_AT_ONCE = 32  # bands that one product makes
 LEAST_WEIGHT = 1e-8
