@@ -16,10 +16,10 @@ from odc.geo.geobox import GeoBox
 from flows.archive.export_layers import ExportedRun, Layer, Rows, geobox_of, layer_tags
 from flows.archive.product_choice import ProductChoice
 from flows.publish.receipt import hectares_of_classes
+from models.evaluation.metrics import stratified_fractions
 from pipeline.errors import SettingsError
 from pipeline.ground.map_grid import GroundGrid, grid_of_map, image_at, map_blocks
 from pipeline.ground.view import GroundView, RigPose
-from pipeline.products.areas import stratified_fractions
 from pipeline.products.indices import Floats, SpectralIndex, index_values, pick_bands, white_level
 from storage.archive.whole_files import write_whole
 from storage.arrays.georeference import load_geobox

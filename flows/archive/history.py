@@ -107,7 +107,6 @@ def _row(run: Run) -> Row:
         receipt = check_receipt(run.receipt)
     areas: Mapping[str, Mapping[str, float]] = receipt.get("areas") or {}
     unit, counts = "ha" if "ha" in areas else "fraction", areas.get("px", {})
-    fractions = {name: count / sum(counts.values()) for name, count in counts.items() if count}
     return {
         "run": run.uri,
         "created": run.created,
@@ -116,7 +115,7 @@ def _row(run: Run) -> Row:
         **score_of(receipt),
         "training_scene": receipt.get("training_scene"),
         "capture_s": (receipt["savings"].get("capture_s") or {}).get("done") if receipt else None,
-        "areas": areas.get("ha", fractions),
+        "areas": areas.get("ha", {name: count / sum(counts.values()) for name, count in counts.items() if count}),
         "unit": unit,
         "problem": run.problem,
     }

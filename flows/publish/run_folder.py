@@ -162,9 +162,7 @@ def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str) -> Receipt:
     run, products = survey.run, survey.products
     accuracy = load_accuracy(products["evaluate"]) if "evaluate" in products else None
     effects = load_manifest(products["choose_effects"]) if run.source.simulates else {}
-    stores: dict[str, str] = {}
-    for name, ref in products.items():
-        stores |= STAGES[name].addresses(ref)
+    stores = {key: place for name, ref in products.items() for key, place in STAGES[name].addresses(ref).items()}
     if (products["segment"].path / READING).exists():  # patches were chosen in the segmentation
         stores["attention"] = f"{products['segment'].uri}/{READING}"
     files = ("receipt.json", "quicklook.png", "report.html", *([PLOTS_FILE] if run.zones.plots is not None else []))

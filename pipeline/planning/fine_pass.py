@@ -176,11 +176,11 @@ def merged_ms(first_ms: float, later_ms: float, first_fraction: float) -> float:
 
 def every_nth(full: Sequence[Sweep], step: int = FIRST_STEP, exposure_ms: float | None = None) -> list[Sweep]:
     """Return the first pass: every ``step``-th line of the sweeps of a full scan, to its last line or just beyond."""
-    found = []
-    for number, sweep in enumerate(full):
-        name, lines = f"coarse-{number}", -(-(sweep.lines - 1) // step) + 1
-        found.append(replace(sweep, name=name, kind="coarse", step=step, held=1, lines=lines, exposure_ms=exposure_ms))
-    return found
+    shared: dict[str, Any] = {"kind": "coarse", "step": step, "held": 1, "exposure_ms": exposure_ms}
+    return [
+        replace(sweep, name=f"coarse-{number}", lines=-(-(sweep.lines - 1) // step) + 1, **shared)
+        for number, sweep in enumerate(full)
+    ]
 
 
 def lines_between(

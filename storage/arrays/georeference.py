@@ -64,9 +64,8 @@ def map_attributes(geobox: GeoBox) -> dict[str, Any]:
     Raises PoseError: the grid has no CRS.
     """
     crs = _crs_of(geobox)
-    code = {} if crs.epsg is None else {"proj:code": f"EPSG:{crs.epsg}"}
     return {
-        **code,
+        **({} if crs.epsg is None else {"proj:code": f"EPSG:{crs.epsg}"}),
         "proj:wkt2": crs.to_wkt(),
         "spatial:dimensions": ["y", "x"],
         "spatial:shape": list(geobox.shape),

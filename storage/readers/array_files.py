@@ -209,13 +209,12 @@ def in_scope(arrays: Arrays, name: str) -> dict[str, FileArray]:
     """Return all arrays by their paths; those of the array's group, and of groups above it, by their names alone."""
     groups = name.split("/")[:-1]
     heads = ["".join(f"{group}/" for group in groups[:depth]) for depth in range(len(groups) + 1)]
-    near = {
+    return {
         path.removeprefix(head): array
         for head in heads
         for path, array in arrays.items()
         if path.startswith(head) and "/" not in path.removeprefix(head)
-    }
-    return near | {path: array for path, array in arrays.items() if "/" in path}
+    } | {path: array for path, array in arrays.items() if "/" in path}
 
 
 # --- EMIT, NEON and PRISMA --------------------------------------------------------------------------------------------

@@ -200,8 +200,7 @@ def _from_file(path: Path, dropped: Sequence[int], chosen: list[int], file_bands
     centre = check_wavelengths(kept[:, 0], str(path))[chosen]
     widths = kept[:, 1] if kept.shape[1] > 1 else None
     known = widths is not None and bool((np.isfinite(widths) & (widths > 0)).all())
-    fwhm = widths[chosen] if known and widths is not None else None
-    return Bands(centre, fwhm, f"wavelengths from {path}")
+    return Bands(centre, widths[chosen] if known and widths is not None else None, f"wavelengths from {path}")
 
 
 def _table(path: Path) -> NDArray[np.float64]:

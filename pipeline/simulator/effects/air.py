@@ -343,8 +343,7 @@ class PathRadiance(LightChange):
         if reach_m(block.rig) is None:
             return light
         metres = sample_distances(block)[..., None]
-        depth = (extinction_per_m(block.rig.air, block.wavelength_nm) * metres).astype(np.float32)
-        lost = -np.expm1(-depth)
+        lost = -np.expm1(-(extinction_per_m(block.rig.air, block.wavelength_nm) * metres).astype(np.float32))
         light *= 1 - lost
         if block.white_e is not None:
             sky, still = block.rig.sky, block.rig.air.airlight_fraction * np.asarray(block.white_e, np.float64)

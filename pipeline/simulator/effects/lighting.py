@@ -52,8 +52,7 @@ class Drift(Gain):
         nm = np.asarray(probe.wavelength_nm, np.float64)
         if rig.sky.started is None:
             return GainRange.between(1.0, 1.0, len(nm))
-        times = knots_within(rig.sky, probe.seconds + rig.camera.frame_ms * 1e-3)
-        light = relative_daylight(rig.sky, nm, times)
+        light = relative_daylight(rig.sky, nm, knots_within(rig.sky, probe.seconds + rig.camera.frame_ms * 1e-3))
         return GainRange.of(light, uneven=float(np.ptp(light, axis=1).max(initial=0.0)))
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:

@@ -174,17 +174,15 @@ def wavelength_shift(samples: int, smile_nm: float) -> Floats:
 def _tap_weights(wavelength_nm: tuple[float, ...], smile_nm: float, samples: int) -> tuple[int, NDArray[np.float32]]:
     """Return the offset of the first tap and the weights of all, (tap, sample, band)."""
     wavelength, shift = np.array(wavelength_nm), wavelength_shift(samples, smile_nm)
-    taps: list[tuple[slice, NDArray[np.int64], Floats]] = []
-    for run in rising_runs(wavelength):
-        if run.stop - run.start > 1:
-            taps += [(run, off, weight) for off, weight in _run_taps(wavelength[run], shift)]
+    runs = [run for run in rising_runs(wavelength) if run.stop - run.start > 1]
+    taps = [(run, off, weight) for run in runs for off, weight in _run_taps(wavelength[run], shift)]
     first = min((int(off.min()) for _, off, _ in taps), default=0)
     last = max((int(off.max()) for _, off, _ in taps), default=0)
     first, last = min(first, 0), max(last, 0)
     weights = np.zeros((last - first + 1, samples, len(wavelength)))
     weights[-first] = 1
     sample = np.arange(samples)[:, None]
-    for run in {run.start: run for run, _, _ in taps}.values():
+    for run in runs:
         weights[-first, :, run] = 0
     for run, off, weight in taps:
         weights[off - first, sample, np.arange(run.start, run.stop)] += weight

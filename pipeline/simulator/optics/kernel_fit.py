@@ -391,8 +391,7 @@ def blurred_weight(width: float, variance: Floats, held: int = 1) -> tuple[Float
     if not variance.any():
         return distance, np.repeat(sharp[None], len(variance), axis=0)
     length = 2 * len(distance)
-    wave = np.fft.rfftfreq(length, 1 / PER_PX)
-    passed = np.exp(-2 * np.pi**2 * variance[:, None] * wave**2)
+    passed = np.exp(-2 * np.pi**2 * variance[:, None] * np.fft.rfftfreq(length, 1 / PER_PX) ** 2)
     blurred = np.fft.irfft(np.fft.rfft(sharp, length) * passed, length)[:, : len(distance)]
     return distance, np.where(variance[:, None] > 0, np.maximum(blurred, 0.0), sharp)
 

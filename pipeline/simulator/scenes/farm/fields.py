@@ -113,8 +113,7 @@ def _standing_crop(
     growth = np.clip(1 + 0.32 * np.minimum(here.vigour + 1.9, 0), 0.15, 1)  # bare spots where vigour fails
     plants = growth * np.clip(between + (ON_ROW - between) * row + uneven, 0, 0.99) * (1 - gaps * (1 - 0.6 * closed))
     plants = np.asarray(plants + down * (ON_ROW - plants), np.float32)
-    height = float(np.interp(age, *np.array(crop.heights).T))
-    shaded = row_shadow(work.plan.sun, height, rows, period, width)
+    shaded = row_shadow(work.plan.sun, float(np.interp(age, *np.array(crop.heights).T)), rows, period, width)
     dense = np.clip(0.2 + 0.3 * width, 0, 0.75) * (1 - gaps) * (1 - down)  # seedlings let light through
     soil = blend(soil, {"shade": np.ones_like(plants)}, np.asarray(dense * shaded, np.float32))
     deep = np.asarray(0.24 * (1 - row) * closed * (1 - down), np.float32)  # between rows that have closed
@@ -172,8 +171,7 @@ def _meadow(rows: Rows, field: FieldPlan, here: Ground, days: float, day: int) -
 
 
 def _bare_field(rows: Rows, field: FieldPlan, here: Ground, soil: Mixture) -> Content:
-    period = field.row_period_px if field.crop is None else 10.5
-    furrow = stripes(rows.place, period, 3.0)
+    furrow = stripes(rows.place, field.row_period_px if field.crop is None else 10.5, 3.0)
     content = Content(blend(soil, {"shade": np.ones_like(furrow)}, 0.15 * furrow), {"soil": np.ones_like(furrow)})
     return _with_wheel_marks(content, field, rows, soil) if field.crop is None else content
 
