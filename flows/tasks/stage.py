@@ -32,7 +32,6 @@ from storage.archive.keys import StageRef, array_digest, stage_key
 from storage.arrays.layout import AngularGrid
 
 Report = Callable[[float], None]  # progress of a stage, 0..1
-Build = Callable[[Path], None]
 
 
 @dataclass(frozen=True)
@@ -71,7 +70,7 @@ class Product:
 class Wanted:
     """Request for a store: its parameters and inputs, and the function that builds it."""
 
-    build: Build  # writes into a given folder
+    build: Callable[[Path], None]  # writes into a given folder
     params: Mapping[str, Any]
     inputs: Sequence[StageRef] = ()
     then: Callable[[], object] = field(default=lambda: None)  # called once the store exists

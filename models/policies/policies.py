@@ -15,7 +15,6 @@ from models.reading.inference import CoarsePrediction
 from pipeline.errors import SettingsError, ShapeError
 from pipeline.geometry.grid import SceneGrid
 
-Pixels = NDArray[np.float64]
 Scores = NDArray[np.float64]
 Policy = Literal["gain", "entropy", "sobel", "random", "mask"]
 POLICIES: tuple[Policy, ...] = get_args(Policy)
@@ -90,7 +89,7 @@ def _edges(seen: CoarsePrediction) -> NDArray[np.float64]:
 class PixelScore(NamedTuple):
     """Score of coarse pixels, with its multiply-adds a pixel."""
 
-    of: Callable[[CoarsePrediction], Pixels]
+    of: Callable[[CoarsePrediction], NDArray[np.float64]]
     adds: int
     per_column: int = 0
     per_class: int = 0

@@ -26,7 +26,6 @@ from pipeline.geometry.scan import Floats, Sweep
 from pipeline.source import Line, References
 
 Numbers = NDArray[np.intp]
-ReadLines = Callable[[Numbers], NDArray[np.uint16]]
 
 BLOCK_LINES = 64  # read at a time
 SWATH_PX = 1.0  # largest distance of a planned swath from the recorded one
@@ -50,7 +49,7 @@ class RecordedSweep:
     time_s: Floats  # (line,) of mid exposure, since the start of the sweep
     exposure_ms: Floats  # (line,)
     valid_line: NDArray[np.bool_]  # (line,)
-    read_lines: ReadLines  # numbers of lines, ascending -> (line, sample, band) uint16
+    read_lines: Callable[[Numbers], NDArray[np.uint16]]  # numbers of lines, ascending -> (line, sample, band) uint16
 
     def __post_init__(self) -> None:
         lines = self.sweep.lines

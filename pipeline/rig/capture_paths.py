@@ -27,7 +27,6 @@ from pipeline.rig.mirror_controller import MotionLog, wire_positions
 
 Floats = NDArray[Any]  # float64
 Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 Span = tuple[float, float]  # moments between which a command took effect: sent and acknowledged [s]
 
 
@@ -59,7 +58,7 @@ class LinePositions:
     """Mirror positions of lines, and the method that gave them. NaN where ``valid`` is False."""
 
     position: Floats  # (line, 2) device X and Y at mid exposure
-    valid: Bools  # (line,)
+    valid: NDArray[np.bool_]  # (line,)
     method: Literal["trigger", "log", "command"]
     residual_px: float | None  # how far they may be off by the times of the commands; None where it is not measured
     notes: tuple[str, ...] = ()

@@ -20,7 +20,6 @@ from pipeline.lazy import GeoBox, odc_warp
 from storage.readers.open_cubes import open_labels
 from storage.readers.scene_toml import ClassValue, Colour
 
-Distances = NDArray[np.float64]
 NO_VALUE = int(np.iinfo(np.int64).min)  # in codes
 MOST_FOUND_CLASSES = 64
 MIXED = (
@@ -293,7 +292,7 @@ def class_colours(classes: Mapping[str, ClassValue], stated: Mapping[str, Colour
     return np.array([found[name] for name in classes], np.uint8).reshape(-1, 3)
 
 
-def _apart(colours: Sequence[Colour], others: Iterable[Colour]) -> Distances:
+def _apart(colours: Sequence[Colour], others: Iterable[Colour]) -> NDArray[np.float64]:
     """Return the distance in CIELAB of each colour to the nearest of others; infinite without one."""
     lab, beside = (
         skimage.color.rgb2lab(np.array([*some], np.uint8).reshape(-1, 1, 3))[:, 0] for some in (colours, others)

@@ -20,7 +20,6 @@ IMAGE_FOLDERS = ("images", "image", "imgs", "img", "pictures", "photos")  # scen
 
 Colour = tuple[int, int, int]
 ClassValue = int | Colour
-_Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 _Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0)]
 _Channel = Annotated[int, Field(strict=True, ge=0, le=255)]
 _Value = StrictInt | tuple[_Channel, _Channel, _Channel]
@@ -43,7 +42,7 @@ class SceneSettings(BaseModel):
     nodata: Annotated[float, Field(strict=True)] | None = None
     # values = file's * scale + offset
     scale: _Positive = 1.0
-    offset: _Number = 0.0
+    offset: Annotated[float, Field(strict=True, allow_inf_nan=False)] = 0.0
     # side of a pixel on the ground
     pixel_m: _Positive | None = None
     # relative to scene.toml, with {number} or {name}; "" if there are none

@@ -359,7 +359,6 @@ def fold(box: tuple[float, float], parts: tuple[int, int], held: int, blurs: Mom
     return Footprint(box, parts, held, kernels.shift, kernels.variance, fractions, between, kernels.level, blurs.disc)
 
 
-Weights = NDArray[np.float32]
 PER_PX = 128  # rows of a table; between them weights are linear, right to 8e-6 of a kernel's curvature
 SCALE_STEP = 1 / 4096  # from one tabulated scale to the next; the nearest is taken
 _WORKED_OUT = 16  # every so many of them are worked out, those between are linear: right to 2e-6
@@ -402,7 +401,7 @@ class TapTable(NamedTuple):
     A position is given by its distance ``place`` from the first tap, which lies ``left`` px before the centre's pixel.
     """
 
-    weight: Weights
+    weight: NDArray[np.float32]
     left: int
     first: float  # place of the first row of each scale
     least_scale: float

@@ -21,7 +21,6 @@ from pipeline.geometry.scan import Floats, Sweep
 from pipeline.simulator.effects.probe import Radiance, steepest_difference
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, to_bands
 
-Kind = tuple[int, int]  # measure, and band or group of bands
 BAND_GROUPS = 8
 CHOSEN_BANDS = 4
 _LEAST_WEIGHT = 1e-3  # of a kernel's tap: enough to find places
@@ -125,7 +124,7 @@ class Ranking:
     """The best places of every kind."""
 
     def __init__(self) -> None:
-        self._offers: dict[Kind, list[Floats]] = {}
+        self._offers: dict[tuple[int, int], list[Floats]] = {}  # by measure, and band or group of bands
 
     def offer(self, measure: int, values: Radiance, first: int, tile: int, kinds: Sequence[int]) -> None:
         """Offer the greatest of every tile and band; ``values`` (row, column, band) of the strip that begins at a row.
