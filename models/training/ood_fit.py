@@ -117,8 +117,7 @@ def components(pixels: Spectra, classes: Classes, seed: int) -> tuple[Exact, Exa
     for part, middle, own in zip(parts, centres, scatter, strict=True):
         mixed = (own + weight * common) / (len(part) + weight)
         apart = scipy.linalg.solve_triangular(np.linalg.cholesky(mixed), (part - middle).T, lower=True)
-        usual = float(np.quantile((apart**2).sum(axis=0), USUAL))
-        covariance.append(mixed * max(usual / columns, 1.0))
+        covariance.append(mixed * max(float(np.quantile((apart**2).sum(axis=0), USUAL)) / columns, 1.0))
     return np.stack(centres), np.stack(covariance)
 
 

@@ -164,8 +164,7 @@ def _swath_centres(
             overlap = (width.sum() - (high - low)) / count
             if overlap < least_overlap - ROUNDING_PX:
                 break
-            starts = low - overlap / 2 + np.concatenate([[0.0], np.cumsum(width - overlap)[:-1]])
-            centres = starts - reach[:, 0]
+            centres = low - overlap / 2 + np.concatenate([[0.0], np.cumsum(width - overlap)[:-1]]) - reach[:, 0]
         else:
             return centres
 

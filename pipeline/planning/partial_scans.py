@@ -203,8 +203,7 @@ def _longest_run(values: Floats, first: NDArray[np.intp], stop: NDArray[np.intp]
         return None
     summed = np.concatenate([[0.0], np.cumsum(values[there])])
     end = np.searchsorted(stop[there], first[there] + lines, side="right")  # the row after its last
-    gain = np.where(end > np.arange(there.size), summed[end] - summed[:-1], 0.0)
-    begin = int(gain.argmax())
+    begin = int(np.where(end > np.arange(there.size), summed[end] - summed[:-1], 0.0).argmax())
     some = np.flatnonzero(values[there[begin : end[begin]]] > 0)
     if not some.size:
         return None

@@ -223,8 +223,7 @@ def number_lines(time_s: Floats, frame_s: float) -> LineNumbers:
     number = np.zeros(len(time_s), np.intp)
     if len(count):
         same = np.minimum(np.searchsorted(time_s[usable], time_s), len(count) - 1)
-        before = count[np.maximum(np.cumsum(usable) - 1, 0)]
-        number = np.where(time_s[usable][same] == time_s, count[same], before)
+        number = np.where(time_s[usable][same] == time_s, count[same], count[np.maximum(np.cumsum(usable) - 1, 0)])
     return LineNumbers(
         number=number,
         usable=usable,

@@ -125,8 +125,7 @@ class Readout:
     @cached_property
     def added(self) -> Radiance | np.float32:
         """Return electrons that come without light: a number, or (sample, band) where there are hot elements."""
-        dark = self._variant(DARK_CURRENT.name) != OFF
-        same = np.float32(dark_electrons(self.block.rig) if dark else 0.0)
+        same = np.float32(dark_electrons(self.block.rig) if self._variant(DARK_CURRENT.name) != OFF else 0.0)
         if self._variant(DEFECTS.name) == OFF or not self.block.rig.detector.hot_fraction:
             return same
         return hot_electrons(self.block.rig, len(self.block.wavelength_nm)) + same

@@ -193,8 +193,7 @@ def write_probabilities_tile(
         0, len(age_days), SHARD_ROWS
     ):  # so that the packed values of all rows are never in memory together
         part = log_probability[top : top + SHARD_ROWS]
-        likely = np.where(part < LEAST, UNLIKELY, np.minimum(part, 0))
-        packed = np.rint((likely - FAINTEST) / STEP)
+        packed = np.rint((np.where(part < LEAST, UNLIKELY, np.minimum(part, 0)) - FAINTEST) / STEP)
         rows = slice(place[0].start + top, place[0].start + top + len(part))
         likelihood[rows, place[1]] = np.where(np.isnan(part), NOTHING, np.minimum(packed, NOTHING - 1)).astype(np.uint8)
     ages[place], lights[place] = age_days, light

@@ -116,8 +116,7 @@ def read_components(group: zarr.Group) -> Components:
     """Read what `write_components` stored."""
     rows, mean, noise = (read_array(group, name).astype(np.float64) for name in ("axes", "mean", "noise"))
     lit = np.isfinite(noise)
-    axes = np.where(lit, rows / np.where(lit, noise, 1), 0) if len(rows) else rows
-    return Components(mean, axes, noise)
+    return Components(mean, np.where(lit, rows / np.where(lit, noise, 1), 0) if len(rows) else rows, noise)
 
 
 class SignalCubeWriter:

@@ -422,8 +422,7 @@ class TapTable(NamedTuple):
         """Tabulate kernels of a width and variances (kernel,), between two scales, up to ``beside`` px off centre."""
         least = (math.floor(scales[0] / SCALE_STEP) - 1) * SCALE_STEP
         count = math.ceil((scales[1] - least) / SCALE_STEP) + 2
-        worked_out = range(0, count + _WORKED_OUT, _WORKED_OUT)
-        sizes = [max(least + SCALE_STEP * number, 1e-3) for number in worked_out]
+        sizes = [max(least + SCALE_STEP * number, 1e-3) for number in range(0, count + _WORKED_OUT, _WORKED_OUT)]
         found = [blurred_weight(width * size, variance * size**2, held) for size in sizes]
         reach = max(_reach(*one, tail) for one in found)
         off = 0.5 + beside

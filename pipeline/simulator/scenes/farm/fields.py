@@ -256,8 +256,7 @@ def wheel_marks(field: FieldPlan, rows: Rows) -> Field:
     pair = stripes(shift, trams.spacing, trams.width) + stripes(shift + trams.gauge, trams.spacing, trams.width)
     middle = field.headland_px / 2
     turn = edge(trams.width / 2 - np.abs(np.abs(rows.ends - middle) - trams.gauge / 2))
-    inner = edge(rows.ends - middle - trams.gauge / 2)
-    return np.asarray(np.clip(np.maximum(pair * inner, turn), 0, 1), np.float32)
+    return np.asarray(np.clip(np.maximum(pair * edge(rows.ends - middle - trams.gauge / 2), turn), 0, 1), np.float32)
 
 
 def _scatter(first: NDArray[np.int64], second: NDArray[np.int64], salt: int) -> Floats:
