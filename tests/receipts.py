@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from flows.publish.receipt import Receipt
-from flows.tasks.scores import JUDGING
 
 # what another run of the same seed has otherwise
 OF_ONE_RUN = ("wall_s", "cpu_s", "peak_rss_bytes", "state", "manifest_sha256")
@@ -21,7 +20,7 @@ def comparable(receipt: Receipt) -> dict[str, Any]:
     same = _without(receipt, ("started", "finished", "judged"))
     same["settings"] = _without(receipt["settings"], ("out",))
     same["stages"] = [
-        _without(stage, (*OF_ONE_RUN, *(("bytes_out",) if stage["name"] == JUDGING else ())))
+        _without(stage, (*OF_ONE_RUN, *(("bytes_out",) if stage["name"] == "evaluate" else ())))
         for stage in receipt["stages"]
     ]
     same["data_bytes"] = {name: receipt["data_bytes"][name] for name in ("captured", "reference")}

@@ -24,7 +24,7 @@ from flows.training.figures import (
     read_twice,
     validate,
 )
-from flows.training.train_scenes import Scenes, TrainRequest, check_out, network_config, observe_all, training_capture
+from flows.training.train_scenes import Scenes, TrainRequest, network_config, observe_all, training_capture
 from models.evaluation.placement import CascadeTable
 from models.network.machine import PROCESSOR, choose_device
 from models.network.spectral import Normalisation
@@ -65,7 +65,8 @@ def train_weights(
     output path, sizes that do not fit, or an unavailable device.
     """
     checkpoint = request.out.with_name(request.out.name + ".checkpoint")
-    check_out(request.out)
+    if not request.out.parent.is_dir() or request.out.is_dir():
+        raise SettingsError(f"-o {request.out}: expected the name of a file in a folder that exists")
     load_checkpoint(checkpoint)  # a damaged one fails before minutes are spent
     begun = None if request.start is None else load_weights(request.start)
     device, settings = choose_device(request.device), request.settings

@@ -190,12 +190,6 @@ def network_config(request: TrainRequest, common: Common) -> SegmenterConfig:
         raise SettingsError(f"{error}; choose another --patch, --dim or --heads") from error
 
 
-def check_out(out: Path) -> None:
-    """Raise SettingsError where a file of this name cannot be written."""
-    if not out.parent.is_dir() or out.is_dir():
-        raise SettingsError(f"-o {out}: expected the name of a file in a folder that exists")
-
-
 def training_capture(normalisation: Normalisation, darkest_ms: float) -> CaptureAugmentation | None:
     """Return the simulation of shorter exposures and wider spacings; None for the reference exposure alone."""
     return CaptureAugmentation(normalisation, darkest_ms=darkest_ms) if darkest_ms < REFERENCE_MS else None

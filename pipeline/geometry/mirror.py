@@ -127,20 +127,6 @@ def direction_to_scene(direction: ArrayLike) -> Floats:
     return o[..., 1:] / o[..., :1]
 
 
-def line_rotation(direction: ArrayLike) -> Floats:
-    """Return the rotation of the slit's image in the scene tangent plane, for unit directions (..., 3) [rad].
-
-    It depends on the pose and not on the path (erratum E8). For a slit along y it is psi = atan2(o_y, 1 - o_z),
-    anticlockwise from xi to eta. The line is exactly straight and runs along (cos psi, sin psi) in (xi, eta).
-
-    A survey uses `scan.points_of_scan` instead, which includes the rotation; `line_centre` and `camera_slope` undo it.
-
-    Raises PoseError: a direction is not finite, not of length 1, or is the camera's own ray.
-    """
-    o = _units(direction, "view direction")
-    return np.arctan2(o[..., 1], _one_minus_z(o))
-
-
 def mirror_throughput(position: ArrayLike) -> Floats:
     """Return the light that the mirror passes at device positions (..., 2), relative to rest (erratum E16).
 
