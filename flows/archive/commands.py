@@ -269,11 +269,10 @@ def verdict(archive: Archive, findings: list[Finding]) -> dict[str, Any]:
     """Return the summary of a verification, with the surveys that would repair the archive."""
     bad = [finding for finding in findings if finding.problem is not None]
     places = {finding.uri for finding in findings if finding.kind in ("whole", "broken", "missing")}
-    broken = {finding.uri for finding in bad if finding.kind in ("broken", "missing")}
     content: dict[str, Any] = {
         "archive": archive.name,
         "checked": len(places),
-        "whole": len(places - broken),
+        "whole": len(places - {finding.uri for finding in bad if finding.kind in ("broken", "missing")}),
         "problems": [asdict(finding) for finding in bad],
     }
     if bad:

@@ -48,8 +48,7 @@ class ExtentChoice:
     @property
     def sentence(self) -> str:
         """Return the choice in a sentence."""
-        captured = self.due - self.due_left
-        due = f"; patches beyond --max-age: {captured} of {self.due} included" if self.due else ""
+        due = f"; patches beyond --max-age: {self.due - self.due_left} of {self.due} included" if self.due else ""
         return (
             f"captures the lines of highest expected gain in {self.seconds:.1f} s; the prior map's expected error is"
             f" {self.expected_wrong:.1%}{due}"

@@ -352,8 +352,7 @@ def open_training_data(
     if scenes is not None:
         raise SettingsError(f"--scenes is for built-in scenes; {dataset} has its own scenes")
     files = load_data_set(Path(dataset), **choices)  # type: ignore[arg-type]
-    fraction = min(4, len(_labelled_names(files)) // 8)
-    return file_data(files, fraction if validation is None else validation, camera)
+    return file_data(files, min(4, len(_labelled_names(files)) // 8) if validation is None else validation, camera)
 
 
 def pack_mask(mask: NDArray[np.bool_]) -> str:

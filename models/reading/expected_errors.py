@@ -62,8 +62,7 @@ class PatchExpectedErrors:
             known = np.isfinite(probabilities[..., 0])
             wrong = np.where(known, come_true, 1.0) * expected_error_of(probabilities)
             step = np.minimum(np.searchsorted(edges, wrong), STEPS - 1)
-            likeliest = np.where(known, np.nan_to_num(probabilities, nan=-np.inf).argmax(axis=-1), classes)
-            place = likeliest * STEPS + step
+            place = np.where(known, np.nan_to_num(probabilities, nan=-np.inf).argmax(axis=-1), classes) * STEPS + step
             asked = np.True_ if left_out is None else ~left_out[top : top + len(probabilities)]
             counts = np.broadcast_to(asked, place.shape)
             sums += np.bincount(place[counts], wrong[counts], minlength=sums.size)

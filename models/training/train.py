@@ -186,13 +186,12 @@ class Trainer:
     def summary(self) -> dict[str, float | int]:
         """Return steps, skipped steps, the smoothed loss, and wall and processor seconds."""
         course = self.course
-        seconds = round(course.seconds + time.monotonic() - self._started)
         return {
             "steps": course.step,
             "skipped_steps": course.skipped,
             "unlabelled_steps": course.unlabelled,
             "last_loss": round(course.loss, 5),
-            "seconds": seconds,
+            "seconds": round(course.seconds + time.monotonic() - self._started),
             "processor_seconds": round(course.processor_seconds + time.process_time() - self._worked),
         }
 

@@ -253,8 +253,7 @@ def _bounds(frame: MapFrame, outline: Floats) -> tuple[float, float, float, floa
 
     Lines of the scene are lines on the ground.
     """
-    fraction = np.linspace(0, 1, EDGE_POINTS)[:, None, None]
-    sides = outline + fraction * (np.roll(outline, -1, axis=0) - outline)
+    sides = outline + np.linspace(0, 1, EDGE_POINTS)[:, None, None] * (np.roll(outline, -1, axis=0) - outline)
     places = frame.ground_to_map(frame.view.scene_to_ground(sides.reshape(-1, 2)))
     if not np.isfinite(places).all():
         raise PoseError(f"the field's footprint does not fit on the map {frame.crs.name} (pose {frame.view.pose})")

@@ -331,8 +331,7 @@ def significant_axes(covariance: Floats, spectra: int, false_alarm: float, *, kn
     """
     bands = len(covariance)
     values, vectors = np.linalg.eigh(covariance)
-    noise = np.maximum(values[known:], 0)
-    edge = noise_edge(noise, min(1.0, bands / max(spectra, 1)), false_alarm)
+    edge = noise_edge(np.maximum(values[known:], 0), min(1.0, bands / max(spectra, 1)), false_alarm)
     count = int(np.count_nonzero(values > edge))
     return vectors[:, ::-1][:, : min(count, bands - known, max(spectra - 1, 0))]
 

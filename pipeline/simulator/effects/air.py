@@ -187,8 +187,7 @@ def greatest_fraction(air: Air) -> float:
     """Return the greatest displacement per px of distance from the line's centre."""
     if air.distance_m is None:
         return 0.0
-    ends = closeness(air, np.array([-1.0, 1.0])) - 1 / air.distance_m
-    return air.lever_m * float(np.abs(ends).max())
+    return air.lever_m * float(np.abs(closeness(air, np.array([-1.0, 1.0])) - 1 / air.distance_m).max())
 
 
 def reach_m(rig: Rig) -> tuple[float, float] | None:
@@ -207,8 +206,7 @@ def sample_distances(block: SweepBlock) -> Floats:
     sweep = block.sweep
     along, scan = points_of_scan(sweep.swath_px, block.rig.camera, block.scan_px[:, None], block.slopes)
     row = scan if sweep.along == "x" else along
-    inverse = closeness(block.rig.air, row / max((block.shape[0] - 1) / 2, 0.5))
-    return 1 / np.clip(inverse, 1 / ends[1], 1 / ends[0])
+    return 1 / np.clip(closeness(block.rig.air, row / max((block.shape[0] - 1) / 2, 0.5)), 1 / ends[1], 1 / ends[0])
 
 
 def format_reach(ends: tuple[float, float]) -> str:

@@ -238,8 +238,7 @@ class Defects(Effect):
         electrons = float(hot.max())
         gained = min(electrons, rig.camera.full_scale_e)  # the converter's end
         why = f"{dead.sum()} dead and {(hot > 0).sum()} hot elements of {dead.size}, these with {electrons:.3g} e- more"
-        added = probe.added(gained, rig.camera.electrons_per_dn) if gained else 0.0
-        return Bound(max(lost, added), why)
+        return Bound(max(lost, probe.added(gained, rig.camera.electrons_per_dn) if gained else 0.0), why)
 
 
 def dead_elements(rig: Rig, bands: int) -> Mask:

@@ -224,8 +224,7 @@ def light_seen(
 def _rays_of(views: SampleViews, camera: LineCamera, turned: Way) -> RayViews:
     """Return the middle rays of samples, moved by (along, across) px of the camera, in tangents."""
     ifov = camera.ifov_rad
-    tangents = np.stack([views.swath_px, views.scan_px], axis=-1) * ifov
-    normal = direction_to_normal(scene_to_direction(tangents))
+    normal = direction_to_normal(scene_to_direction(np.stack([views.swath_px, views.scan_px], axis=-1) * ifov))
     return exact_views(normal, turned[1] * ifov, views.slope + turned[0] * ifov)
 
 

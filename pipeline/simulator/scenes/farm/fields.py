@@ -144,8 +144,7 @@ def _with_wheel_marks(content: Content, field: FieldPlan, rows: Rows, soil: Mixt
     if field.tramlines is None:
         return content
     marks = wheel_marks(field, rows)
-    trodden = blend(soil, {"gravel": np.ones_like(marks)}, np.full_like(marks, 0.22))
-    mixture = blend(content.mixture, trodden, marks)
+    mixture = blend(content.mixture, blend(soil, {"gravel": np.ones_like(marks)}, np.full_like(marks, 0.22)), marks)
     return Content(mixture, blend(content.fractions, {"track": np.ones_like(marks)}, marks))
 
 
@@ -327,8 +326,7 @@ def _clustered(rng: np.random.Generator, field: FieldPlan, count: int) -> Points
     inside = np.ones(count, bool)
     for ny, nx, offset in field.parcel.cuts:
         inside &= near @ np.array([ny, nx]) > offset
-    kept = inside & (rng.uniform(size=count) < CLUSTERED)
-    return np.where(kept[:, None], near, places)
+    return np.where((inside & (rng.uniform(size=count) < CLUSTERED))[:, None], near, places)
 
 
 def points_within(rng: np.random.Generator, corners: Points, count: int) -> Points:
