@@ -6,7 +6,7 @@ from collections.abc import Callable
 from importlib import import_module
 from threading import Lock
 from types import ModuleType
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 Value = TypeVar("Value")
 
@@ -56,7 +56,120 @@ def deferred(name: str) -> Any:
 
         if TYPE_CHECKING:
             import torch
+    import uvicorn
         else:
             torch = deferred("torch")
     """
     return DeferredModule(name)
+
+
+# Import them from here: each takes half a second or more, and most commands need few of them.
+if TYPE_CHECKING:
+    import dask
+    import dask.distributed as dask_distributed
+    import geopandas
+    import h5py
+    import odc.geo.crs as odc_crs
+    import odc.geo.geobox as odc_geobox
+    import odc.geo.warp as odc_warp
+    import odc.geo.xr as odc_geo_xr
+    import prefect
+    import prefect.artifacts as prefect_artifacts
+    import prefect.cache_policies as prefect_cache_policies
+    import prefect.client.orchestration as prefect_client
+    import prefect.client.schemas.filters as prefect_filters
+    import prefect.concurrency.sync as prefect_concurrency
+    import prefect.context as prefect_context
+    import prefect.deployments as prefect_deployments
+    import prefect.logging.handlers as prefect_handlers
+    import prefect.runtime.task_run as prefect_task_run
+    import prefect.server.api.server as prefect_server
+    import prefect.settings as prefect_settings
+    import prosail
+    import pvlib
+    import pyogrio
+    import pyproj
+    import rasterio
+    import rasterio.features as rasterio_features
+    import rasterio.warp as rasterio_warp
+    import safetensors.torch as safetensors_torch
+    import shapely
+    import spyndex
+    import torch
+    import uvicorn
+    from odc.geo.geobox import GeoBox
+    from shapely.geometry.base import BaseGeometry
+    from torch import Tensor
+else:
+    BaseGeometry = GeoBox = Tensor = Any  # only type checkers look at them
+    dask = deferred("dask")
+    dask_distributed = deferred("dask.distributed")
+    geopandas = deferred("geopandas")
+    h5py = deferred("h5py")
+    odc_crs = deferred("odc.geo.crs")
+    odc_geobox = deferred("odc.geo.geobox")
+    odc_warp = deferred("odc.geo.warp")
+    odc_geo_xr = deferred("odc.geo.xr")
+    prefect = deferred("prefect")
+    prefect_artifacts = deferred("prefect.artifacts")
+    prefect_cache_policies = deferred("prefect.cache_policies")
+    prefect_client = deferred("prefect.client.orchestration")
+    prefect_concurrency = deferred("prefect.concurrency.sync")
+    prefect_context = deferred("prefect.context")
+    prefect_deployments = deferred("prefect.deployments")
+    prefect_filters = deferred("prefect.client.schemas.filters")
+    prefect_handlers = deferred("prefect.logging.handlers")
+    prefect_server = deferred("prefect.server.api.server")
+    prefect_settings = deferred("prefect.settings")
+    prefect_task_run = deferred("prefect.runtime.task_run")
+    prosail = deferred("prosail")
+    pvlib = deferred("pvlib")
+    pyogrio = deferred("pyogrio")
+    pyproj = deferred("pyproj")
+    rasterio = deferred("rasterio")
+    rasterio_features = deferred("rasterio.features")
+    rasterio_warp = deferred("rasterio.warp")
+    safetensors_torch = deferred("safetensors.torch")
+    shapely = deferred("shapely")
+    spyndex = deferred("spyndex")
+    torch = deferred("torch")
+    uvicorn = deferred("uvicorn")
+__all__ = [
+    "BaseGeometry",
+    "GeoBox",
+    "Once",
+    "Tensor",
+    "dask",
+    "dask_distributed",
+    "deferred",
+    "geopandas",
+    "h5py",
+    "odc_crs",
+    "odc_geo_xr",
+    "odc_geobox",
+    "odc_warp",
+    "prefect",
+    "prefect_artifacts",
+    "prefect_cache_policies",
+    "prefect_client",
+    "prefect_concurrency",
+    "prefect_context",
+    "prefect_deployments",
+    "prefect_filters",
+    "prefect_handlers",
+    "prefect_server",
+    "prefect_settings",
+    "prefect_task_run",
+    "prosail",
+    "pvlib",
+    "pyogrio",
+    "pyproj",
+    "rasterio",
+    "rasterio_features",
+    "rasterio_warp",
+    "safetensors_torch",
+    "shapely",
+    "spyndex",
+    "torch",
+    "uvicorn",
+]

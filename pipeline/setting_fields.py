@@ -9,8 +9,6 @@ from dataclasses import Field, field, fields
 from functools import partial
 from typing import Any, Literal
 
-Source = Literal["", "measured", "data sheet", "assumed"]
-
 
 def stated(
     default: Any,
@@ -19,7 +17,7 @@ def stated(
     ge: float | None = None,
     le: float | None = None,
     *,
-    source: Source = "",
+    source: Literal["", "measured", "data sheet", "assumed"] = "",
     example: object = None,
 ) -> Any:
     """Return a dataclass field with the complete description of a setting.

@@ -7,22 +7,20 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from pipeline.errors import PipelineError as Error
 from pipeline.lazy import deferred
 
 if TYPE_CHECKING:
     import importlib.metadata as metadata
 
-    import pipeline.errors as errors
     import spectralzoom.opened as opened
     import spectralzoom.verbs as verbs
-    from pipeline.errors import PipelineError as Error
     from spectralzoom.opened import OpenedArchive, OpenedRun, open
     from spectralzoom.verbs import evaluate, plan, survey, train
 
     __version__: str
 else:
     metadata = deferred("importlib.metadata")
-    errors = deferred("pipeline.errors")
     opened = deferred("spectralzoom.opened")
     verbs = deferred("spectralzoom.verbs")
 
@@ -32,8 +30,6 @@ __all__ = ["Error", "OpenedArchive", "OpenedRun", "__version__", "evaluate", "op
 def __getattr__(name: str) -> Any:
     if name == "__version__":
         return metadata.version("spectralzoom")
-    if name == "Error":
-        return errors.PipelineError
     if name in ("OpenedArchive", "OpenedRun", "open"):
         return getattr(opened, name)
     if name in __all__:

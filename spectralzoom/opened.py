@@ -18,15 +18,14 @@ from storage.archive.archive import Archive
 from storage.archive.records import Run, read_run
 from storage.arrays.layout import damage_named
 from storage.readers.recordings import LINE_PRODUCTS
+from storage.remote.opening import open_archive
 
 if TYPE_CHECKING:
     import xarray
 
     import spectralzoom.spectra as spectra
-    import storage.remote.opening as opening
 else:
     spectra = deferred("spectralzoom.spectra")
-    opening = deferred("storage.remote.opening")
     xarray = deferred("xarray")  # takes a second to import
 
 LATEST = "latest"
@@ -50,7 +49,7 @@ def open(archive: str | Path) -> OpenedArchive:
     ArchiveError
         There is no archive, or it cannot be read.
     """
-    return OpenedArchive(opening.open_archive(archive, create=False, write=False))
+    return OpenedArchive(open_archive(archive, create=False, write=False))
 
 
 class OpenedArchive(Mapping[str, "OpenedRun"]):
@@ -93,8 +92,7 @@ class OpenedArchive(Mapping[str, "OpenedRun"]):
         return len(self._archive.runs())
 
     def __repr__(self) -> str:
-        lines = [f"spectralzoom archive {self.name}, {len(self)} runs", *(f"  {name}" for name in self)]
-        return "\n".join(lines)
+        return "\n".join([f"spectralzoom archive {self.name}, {len(self)} runs", *(f"  {name}" for name in self)])
 
 
 class NoRunError(ArchiveError, KeyError):

@@ -44,8 +44,7 @@ class RestoredArray(BackendArray):
         if 0 in kept:
             return np.empty(kept, np.float32)
         (rows, row), (columns, column) = (_span(np.atleast_1d(one)) for one in chosen[:2])
-        found = self._restore(rows, columns, np.atleast_1d(chosen[2]).tolist())
-        return found[row][:, column].reshape(kept)
+        return self._restore(rows, columns, np.atleast_1d(chosen[2]).tolist())[row][:, column].reshape(kept)
 
 
 def _span(places: NDArray[np.intp]) -> tuple[slice, slice | NDArray[np.intp]]:

@@ -8,35 +8,30 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import threadpoolctl
+
+import spectralzoom.opened as opened
+from flows.archive.plan_command import plan_content
+from flows.settings.load import load_settings
+from flows.terminal.processes import place_caches
+from flows.terminal.progress import heard_by, on_stderr
 from pipeline.errors import SettingsError
 from pipeline.lazy import deferred
 from spectralzoom.opened import OpenedRun
 
 if TYPE_CHECKING:
-    import threadpoolctl
     from rich.console import Console
 
-    import flows.archive.plan_command as plan_command
     import flows.archive.reprocess_command as reprocess_command
     import flows.cli.model_verbs as model_verbs
     import flows.evaluate.command as evaluate_command
     import flows.publish.survey_command as survey_command
-    import flows.settings.load as settings_load
-    import flows.terminal.processes as processes
-    import flows.terminal.progress as terminal_progress
-    import spectralzoom.opened as opened
     from flows.settings.survey_settings import Settings
 else:
-    threadpoolctl = deferred("threadpoolctl")
-    plan_command = deferred("flows.archive.plan_command")
     reprocess_command = deferred("flows.archive.reprocess_command")
     model_verbs = deferred("flows.cli.model_verbs")
     evaluate_command = deferred("flows.evaluate.command")
     survey_command = deferred("flows.publish.survey_command")
-    settings_load = deferred("flows.settings.load")
-    processes = deferred("flows.terminal.processes")
-    terminal_progress = deferred("flows.terminal.progress")
-    opened = deferred("spectralzoom.opened")
 
 Asked = str | Path | Mapping[str, Any] | None  # a settings file, a table of settings, or keywords alone
 Told = Callable[[str, float, float], None]
@@ -93,7 +88,7 @@ def plan(settings: Asked = None, **flags: Any) -> dict[str, Any]:
     """
     asked = _settings(settings, flags)
     with _working(None):
-        content: dict[str, Any] = plan_command.plan_content(asked)
+        content: dict[str, Any] = plan_content(asked)
     return content
 
 
@@ -170,7 +165,7 @@ def _settings(given: Asked, flags: Mapping[str, Any]) -> Settings:
     """Return the settings of a file or a table; keywords win over them."""
     path = None if given is None or isinstance(given, Mapping) else given
     table = _by_key(given) if isinstance(given, Mapping) else {}
-    return settings_load.load_settings(path, table | _by_key(flags), usual=USUAL)
+    return load_settings(path, table | _by_key(flags), usual=USUAL)
 
 
 def _by_key(table: Mapping[str, Any]) -> dict[str, Any]:
@@ -192,11 +187,11 @@ def _plain(value: Any) -> Any:
 @contextmanager
 def _working(progress: Told | None, *, quiet: bool = True) -> Iterator[Console]:
     """Set up caches, progress and one BLAS thread as for a command, and yield a console."""
-    processes.place_caches()
-    console = terminal_progress.on_stderr()
+    place_caches()
+    console = on_stderr()
     console.quiet = quiet
     # With several threads, rounding of sums and so the content of stores would depend on the number of cores.
-    with terminal_progress.heard_by(progress), threadpoolctl.threadpool_limits(1, user_api="blas"):
+    with heard_by(progress), threadpoolctl.threadpool_limits(1, user_api="blas"):
         yield console
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from flows.publish.receipt import Receipt, check_receipt
-from flows.tasks.scores import JUDGING
 from storage.archive.archive import Archive
 
 # what another run of the same seed has otherwise
@@ -29,7 +28,7 @@ def comparable(receipt: Receipt) -> dict[str, Any]:
     same = _without(receipt, ("started", "finished", "judged"))
     same["settings"] = _without(receipt["settings"], ("out",))
     same["stages"] = [
-        _without(stage, (*OF_ONE_RUN, *(("bytes_out",) if stage["name"] == JUDGING else ())))
+        _without(stage, (*OF_ONE_RUN, *(("bytes_out",) if stage["name"] == "evaluate" else ())))
         for stage in receipt["stages"]
     ]
     same["data_bytes"] = {name: receipt["data_bytes"][name] for name in ("captured", "reference")}

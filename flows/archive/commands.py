@@ -59,8 +59,7 @@ def explain(archive: ArchiveName, product: str, *, as_json: AsJson = False) -> i
         Its address (stages/rectify/KEY), a key or its beginning, a run's name or `latest`, or a product's name in the
         newest run (class_map, mosaic).
     """
-    found = explanation(open_archive(archive, create=False, write=False), product)
-    put_out(found, show_explanation, as_json=as_json)
+    put_out(explanation(open_archive(archive, create=False, write=False), product), show_explanation, as_json=as_json)
     return DONE
 
 
@@ -270,11 +269,10 @@ def verdict(archive: Archive, findings: list[Finding]) -> dict[str, Any]:
     """Return the summary of a verification, with the surveys that would repair the archive."""
     bad = [finding for finding in findings if finding.problem is not None]
     places = {finding.uri for finding in findings if finding.kind in ("whole", "broken", "missing")}
-    broken = {finding.uri for finding in bad if finding.kind in ("broken", "missing")}
     content: dict[str, Any] = {
         "archive": archive.name,
         "checked": len(places),
-        "whole": len(places - broken),
+        "whole": len(places - {finding.uri for finding in bad if finding.kind in ("broken", "missing")}),
         "problems": [asdict(finding) for finding in bad],
     }
     if bad:

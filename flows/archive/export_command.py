@@ -176,20 +176,18 @@ def _export_sweeps(export: Export, console: Console) -> None:
 def _add_stores(export: Export) -> None:
     """Add the archive's own stores and the run's files to the catalogue."""
     run, root = export.run, export.run.archive.root
-    titles = {
+    for product, title in {
         "mosaic": "Mosaic of all passes",
         "class_map": "Class map and confidence on the camera's grid",
         "attention": "Score and rank of the patches",
         "ground_map": "Class map, picture and prior map, on the map",
-    }
-    for product, title in titles.items():
+    }.items():
         if run.store(product) is not None and (product != "ground_map" or run.geobox is not None):
             box = None if product == "attention" else load_geobox(run.path(product))
             path = root / run.receipt["products"][product]
             export.add(f"{product}_zarr", path, title, ZARR, ["data"], **export.projection(box))
     for sweep in run.sweeps():
-        is_raw = (sweep / "dn").is_dir()
-        title, roles = ("Raw sweep", ["data", "raw"]) if is_raw else ("Signal of sweep", ["data"])
+        title, roles = ("Raw sweep", ["data", "raw"]) if (sweep / "dn").is_dir() else ("Signal of sweep", ["data"])
         export.add(f"{sweep.stem}_zarr", sweep, f"{title} {sweep.stem}", ZARR, roles, **export.projection())
     for name, (title, kind, roles) in RUN_FILES.items():
         if (run.folder / name).is_file():

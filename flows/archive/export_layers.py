@@ -185,8 +185,7 @@ def image_layer(
     """Return an image of a store on the store's own grid."""
     stored = open_image(run.path(product), array)
     geobox = geobox_of(run, stored)
-    tags = layer_tags(run, product, geobox)
-    image = CogImage(geobox, stored.dtype.name, (band or array,), nodata, legend, tags)
+    image = CogImage(geobox, stored.dtype.name, (band or array,), nodata, legend, layer_tags(run, product, geobox))
     return Layer(name, title, roles, image, stored.rows, unit)
 
 

@@ -16,11 +16,11 @@ from odc.geo.geobox import GeoBox
 from flows.archive.export_layers import ExportedRun, Layer, Rows, geobox_of, layer_tags
 from flows.archive.product_choice import ProductChoice
 from flows.publish.receipt import hectares_of_classes
+from models.evaluation.metrics import stratified_fractions
 from pipeline.errors import SettingsError
 from pipeline.ground.map_grid import GroundGrid, grid_of_map, image_at, map_blocks
 from pipeline.ground.view import GroundView, RigPose
-from pipeline.products.areas import stratified_fractions
-from pipeline.products.indices import SpectralIndex, index_values, pick_bands, white_level
+from pipeline.products.indices import Floats, SpectralIndex, index_values, pick_bands, white_level
 from storage.archive.whole_files import write_whole
 from storage.arrays.georeference import load_geobox
 from storage.arrays.ground_maps import open_image
@@ -37,7 +37,6 @@ DIGITS = 6
 BYTES_AT_ONCE = 1 << 27
 COLUMNS_AT_ONCE = 640
 SAMPLED = 4  # step in pixels for finding the white level
-Floats = NDArray[np.float32]
 
 
 def write_areas(run: ExportedRun, path: Path) -> None:
@@ -103,8 +102,7 @@ class MosaicView:
         assert scene is not None
         assert geobox is not None
         pose = RigPose(**open_image(path, "classes").about["rig_pose"])
-        coarse = geobox.zoom_out(self.factor)
-        return grid_of_map(GroundView(pose, scene.ifov_rad), scene.scene_shape, coarse)
+        return grid_of_map(GroundView(pose, scene.ifov_rad), scene.scene_shape, geobox.zoom_out(self.factor))
 
     @property
     def factor(self) -> int:

@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from affine import Affine
@@ -21,7 +21,7 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.grid import UNLABELLED, cuts
 from pipeline.ground.field_places import M2_PER_HECTARE
 from pipeline.ground.georeference import pixel_side_m
-from pipeline.lazy import deferred
+from pipeline.lazy import pyproj, rasterio_features, rasterio_warp, shapely
 from storage.arrays.class_maps import ClassNames
 from storage.arrays.ground_maps import open_image
 from storage.export.map_files import (
@@ -33,17 +33,6 @@ from storage.export.map_files import (
     write_polygons,
     write_task_data,
 )
-
-if TYPE_CHECKING:
-    import pyproj
-    import rasterio.features as rasterio_features
-    import rasterio.warp as rasterio_warp
-    import shapely
-else:
-    pyproj = deferred("pyproj")
-    rasterio_features = deferred("rasterio.features")
-    rasterio_warp = deferred("rasterio.warp")
-    shapely = deferred("shapely")
 
 CELL_M = 3.0  # default of a prescription, if pixels are smaller
 MOST_CELLS = 4_000_000

@@ -27,6 +27,8 @@ from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run
 from storage.archive.whole_files import write_whole
+from storage.arrays.class_maps import ClassNames, legend_of
+from storage.arrays.layout import open_group
 from storage.remote.opening import open_archive
 
 if TYPE_CHECKING:
@@ -34,14 +36,10 @@ if TYPE_CHECKING:
 
     import flows.publish.panels as panels
     import flows.publish.report as pages
-    import storage.arrays.class_maps as class_maps
-    import storage.arrays.layout as layout
 else:
     mpl_figure = deferred("matplotlib.figure")
     panels = deferred("flows.publish.panels")
     pages = deferred("flows.publish.report")
-    class_maps = deferred("storage.arrays.class_maps")
-    layout = deferred("storage.arrays.layout")
 
 LEADING_CLASSES = 3  # of a run in the table
 SHOW_AREA = {"ha": format_area, "fraction": format_percent}
@@ -56,7 +54,7 @@ class FieldHistory:
     field: str
     archive: str
     runs: Sequence[Row]
-    legend: class_maps.ClassNames | None = None  # of the newest run's map
+    legend: ClassNames | None = None  # of the newest run's map
 
 
 def report(archive: ArchiveName, *, field: str | None = None, out: OutFile, as_json: AsJson = False) -> int:
@@ -98,7 +96,7 @@ def read_history(archive: Archive, field: str | None = None) -> FieldHistory:
     runs = sorted((run for run in catalogue.runs if called(run) == name), key=lambda run: str(time_of_visit(run)))
     legend = None
     with suppress(KeyError, OSError, PipelineError):  # the map was deleted
-        legend = class_maps.legend_of(layout.open_group(archive.locate(runs[-1].products["class_map"])))
+        legend = legend_of(open_group(archive.locate(runs[-1].products["class_map"])))
     return FieldHistory(str(name), archive.name, [_row(run) for run in runs], legend)
 
 
@@ -109,7 +107,6 @@ def _row(run: Run) -> Row:
         receipt = check_receipt(run.receipt)
     areas: Mapping[str, Mapping[str, float]] = receipt.get("areas") or {}
     unit, counts = "ha" if "ha" in areas else "fraction", areas.get("px", {})
-    fractions = {name: count / sum(counts.values()) for name, count in counts.items() if count}
     return {
         "run": run.uri,
         "created": run.created,
@@ -118,7 +115,7 @@ def _row(run: Run) -> Row:
         **score_of(receipt),
         "training_scene": receipt.get("training_scene"),
         "capture_s": (receipt["savings"].get("capture_s") or {}).get("done") if receipt else None,
-        "areas": areas.get("ha", fractions),
+        "areas": areas.get("ha", {name: count / sum(counts.values()) for name, count in counts.items() if count}),
         "unit": unit,
         "problem": run.problem,
     }
@@ -138,7 +135,7 @@ def render_history(history: FieldHistory, runs_at: str) -> str:
     )
 
 
-def _draw_areas(rows: Sequence[Row], legend: class_maps.ClassNames | None) -> str | None:
+def _draw_areas(rows: Sequence[Row], legend: ClassNames | None) -> str | None:
     """Return a chart of the class areas over time, in the newest run's unit, as a data address; None without areas."""
     dated = [row for row in rows if row["visited"] and row["areas"]]
     if not dated:

@@ -47,8 +47,6 @@ if TYPE_CHECKING:
 else:
     survey_flow = deferred("flows.survey")  # Prefect
 
-State = Literal["cached", "to run", "blocked"]
-
 
 def plan(settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = False) -> int:
     """Print what a survey would run: the stages that are stored, those to be made, and estimates.
@@ -70,7 +68,7 @@ class StageForecast:
     """Forecast of one stage."""
 
     stage: str
-    state: State
+    state: Literal["cached", "to run", "blocked"]
     key: str | None  # None while an input of it is not known
     why: str = ""  # a stage is blocked
 

@@ -35,8 +35,7 @@ def generations(catalogue: Catalogue) -> list[list[Run]]:
     for run in catalogue.runs:
         lit = _recorded_run(catalogue, run)
         asked = [lit.settings.get(name) for name in ("source", "visit")]
-        field = [called(run), lit.receipt.get("scene", run.uri), *asked]
-        found.setdefault(canonical_json(field), []).append(run)
+        found.setdefault(canonical_json([called(run), lit.receipt.get("scene", run.uri), *asked]), []).append(run)
     return list(found.values())
 
 

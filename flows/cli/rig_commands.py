@@ -100,8 +100,7 @@ def check(
 def _print(rows: Sequence[CheckRow], console: Console) -> None:
     table = Table("device", "asked", "came", "", box=SIMPLE_HEAD)
     for row in rows:
-        verdict = f"[{_COLOURS[row.verdict]}]{row.verdict}[/]"
-        table.add_row(row.device, escape(row.asked), escape(row.came), verdict)
+        table.add_row(row.device, escape(row.asked), escape(row.came), f"[{_COLOURS[row.verdict]}]{row.verdict}[/]")
     console.print(table)
     mend = [row for row in rows if row.mend]
     for row in mend:
@@ -128,8 +127,7 @@ USUAL_SIZE = (256, 256)  # of a built-in scene [px]
 def emulated_settings(path: Path | None, flags: Mapping[str, object]) -> Settings:
     """Return the settings of the emulated rig; a built-in scene is small by default. Raises SettingsError."""
     wanted = load_settings(path, flags, usual={"source": "sim"})
-    small = wanted.scene in BUILT_IN_SCENES and wanted.size is None
-    return replace(wanted, size=USUAL_SIZE) if small else wanted
+    return replace(wanted, size=USUAL_SIZE) if wanted.scene in BUILT_IN_SCENES and wanted.size is None else wanted
 
 
 def emulate(
@@ -255,7 +253,6 @@ def _toml_table(name: str, values: dict[str, object]) -> str:
 def emulated_source(settings: Settings) -> tuple[SimulatedSource, tuple[str, ...]]:
     """Return the simulated source of the scene, and assumptions on it; nothing is stored. Raises PipelineError."""
     with tempfile.TemporaryDirectory(prefix="spectralzoom-") as folder:
-        apart = replace(settings, source="sim", out=str(Path(folder) / "effects"))
-        run, _, notes = open_simulation(apart)
+        run, _, notes = open_simulation(replace(settings, source="sim", out=str(Path(folder) / "effects")))
         effects, _ = choose_effects.produce(run.archive, choose_effects.wants(run))
         return replace(run.simulated, chosen=chosen_effects(effects)), notes

@@ -139,8 +139,7 @@ def print_evaluation(content: dict[str, Any], console: Console) -> None:
 
 
 def _accuracy(content: dict[str, Any]) -> Table:
-    shared = ("placement", "K", "mIoU", "overall", "average", "kappa")
-    columns = (*shared, "to all", "to random", "captured", "MACs")
+    columns = ("placement", "K", "mIoU", "overall", "average", "kappa", "to all", "to random", "captured", "MACs")
     rows = []
     for row in content["rows"]:
         spread = row["spread"] if row["spread"] is not None else row["draws_spread"]

@@ -113,7 +113,7 @@ class Candidate:
         return split
 
     def validated_on(self, scene: RasterScene) -> bool:
-        """Return whether the scene was one for validation; files of before 2026-11-26 do not tell its content."""
+        """Return whether the scene was one for validation; older files record only names, and give False."""
         known = self.split.get("validation", ())
         return isinstance(known, dict) and scene.clear_key in known.values()
 
@@ -174,9 +174,8 @@ def observe_frame(scene: RasterScene, name: str, weights: Weights, camera: LineC
     config = weights.config
     grid = SceneGrid(*scene.shape, config.patch, 1)
     rng = np.random.default_rng([seed, 0xE7A1, zlib.crc32(name.encode())])
-    observed = observe_scene(scene, camera, grid, weights.basis, rng)
     _, reached = weights.basis.matrix(scene.wavelength_nm)
-    example = normalised(observed, weights.normalisation, reached)
+    example = normalised(observe_scene(scene, camera, grid, weights.basis, rng), weights.normalisation, reached)
     labels = judged_labels(scene, Description(config, weights.basis, weights.class_names, weights.record))
     assert labels is not None  # sort_frames
     seen = coarse_prediction_of_columns(weights, example.columns, grid)

@@ -80,9 +80,8 @@ def prior_map(prior: Prior | None, drawn: StageRef, receipt: Receipt) -> PriorMa
     for number, earlier in enumerate(prior.classes):
         if earlier >= 0:
             names[earlier] = number
-    probabilities = ProbabilityStore(drawn.path / "class_probabilities.zarr")
     before = read_array(open_group(prior.probabilities.path / "class_map.zarr"), "classes")
-    return PriorMapField(prior.days, names[before], probabilities.age())
+    return PriorMapField(prior.days, names[before], ProbabilityStore(drawn.path / "class_probabilities.zarr").age())
 
 
 def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: PriorMapField | None) -> FieldMap:

@@ -94,8 +94,7 @@ def class_rgb(classes: NDArray[np.integer], palette: NDArray[np.float32]) -> NDA
     """Return a class map as a picture (y, x, 3); numbers without a colour, such as 255, are light grey."""
     table = np.tile(np.asarray(UNLABELLED_COLOUR, np.float32), (256, 1))
     table[: len(palette)] = palette
-    picture: NDArray[np.float32] = table[np.clip(classes, 0, UNLABELLED)]
-    return picture
+    return np.asarray(table[np.clip(classes, 0, UNLABELLED)])
 
 
 def outline(chosen: NDArray[np.bool_], patch_px: int, shape: tuple[int, int]) -> list[list[tuple[float, float]]]:
@@ -116,8 +115,7 @@ def draw_ground(found: GroundMap) -> bytes:
     """Draw picture and class map side by side as PNG: north up, axes in metres, hectares in the legend."""
     box = found.geobox.boundingbox
     extent = (0.0, box.right - box.left, 0.0, box.top - box.bottom)
-    tall = extent[3] / extent[1]
-    size = (GROUND_IN, GROUND_IN / 2 * min(max(tall, 0.4), 1.6) + 1.1)
+    size = (GROUND_IN, GROUND_IN / 2 * min(max(extent[3] / extent[1], 0.4), 1.6) + 1.1)
     figure = Figure(figsize=size, dpi=GROUND_DPI, layout="constrained")
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
     thin = slice(None, None, -(-max(found.classes.shape) // GROUND_MOST_PX))

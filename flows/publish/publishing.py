@@ -10,7 +10,6 @@ import base64
 import io
 import json
 from contextlib import suppress
-from typing import TYPE_CHECKING
 
 from flows.publish.receipt import is_pending
 from flows.publish.receipt_table import finding_rows, headline
@@ -24,16 +23,11 @@ from flows.tasks.prefect_tasks import as_task, inside_flow
 from flows.tasks.stages.accuracy import evaluate
 from flows.tasks.stages.capture import capture_coarse, capture_fine
 from flows.tasks.stages.condense import raw_differs
-from pipeline.lazy import deferred
+from pipeline.lazy import prefect_artifacts
 from storage.archive.keys import StageRef, canonical_json
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run, read_run
 from storage.archive.whole_files import to_json
-
-if TYPE_CHECKING:
-    import prefect.artifacts as prefect_artifacts
-else:
-    prefect_artifacts = deferred("prefect.artifacts")
 
 PASSES = (capture_fine.name, capture_coarse.name)  # in the order in which they are condensed
 NOT_ASKED = ("notes", "out", "engine", *OF_THE_MACHINE)  # settings without an effect on the results

@@ -33,7 +33,6 @@ from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.class_maps import class_counts
 from storage.arrays.quicklooks import choose_bands, develop, stretch
 
-Box = tuple[int, int, int, int]
 HEAT_ALPHA = 0.72  # of scores over the field
 TITLE_LETTERS = 7.5  # to an inch of a line
 MOST_LETTERS = 60  # of a class in the legend
@@ -52,7 +51,7 @@ class QuicklookData:
     score: NDArray[np.floating]  # (row, column) of the padded grid's patches; NaN or -inf without a score
     patch_px: int
     patch_index: NDArray[np.integer]  # chosen, in order of rank
-    blocks: tuple[Box, ...]  # captured at full resolution: (y0, y1, x0, x1), half open [px]
+    blocks: tuple[tuple[int, int, int, int], ...]  # captured at full resolution: (y0, y1, x0, x1), half open [px]
     class_map: NDArray[np.integer]  # (y, x), 255 unlabelled
     class_names: tuple[str, ...]
     class_colours: NDArray[np.integer]  # (class, 3) 0..255

@@ -221,8 +221,7 @@ def finding_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
     With weights that do not fit the field, no score is predicted.
     """
     if is_foreign(found) and "scans" in found:
-        scans = {name: {**scan, "expected_miou": None} for name, scan in found["scans"].items()}
-        found = {**found, "scans": scans}
+        found = {**found, "scans": {name: {**scan, "expected_miou": None} for name, scan in found["scans"].items()}}
     rows = [(label, _figures(found.get(part), names)) for part, (label, names) in _SHOWN.items()]
     for name, one in found.get("pointing", {}).items():
         if isinstance(one, Mapping):

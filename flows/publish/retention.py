@@ -86,8 +86,7 @@ def outlived_lines(catalogue: Catalogue, now: datetime) -> Iterator[OutlivedLine
             if raw is None or signal is None or raw.ref.uri in found:
                 continue
             runs = catalogue.named_by(raw.ref.uri)
-            condensed = raw.ref.uri in catalogue.inputs_of(signal.ref.uri)
-            if condensed and all(is_outlived(one, now) for one in runs):
+            if raw.ref.uri in catalogue.inputs_of(signal.ref.uri) and all(is_outlived(one, now) for one in runs):
                 found.add(raw.ref.uri)
                 keeps = sorted({str(one.settings["keep"]) for one in runs})
                 stage, present = signal.ref.stage, PRESENT.get(signal.ref.stage)

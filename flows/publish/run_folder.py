@@ -123,9 +123,8 @@ def _draw(survey: OpenSurvey, plan: FinePlan, receipt: Receipt) -> _Drawn:
     shown = quicklook_data(run, products, plan)
     maps = (load_ground_map(ref.path / STORE) for ref in products.there("ground"))
     pictures = [Picture(draw_ground(drawn), "The map on the ground, north up.") for drawn in maps]
-    mosaic = open_mosaic(products.mosaic.path / "mosaic.zarr")
     drawn = load_class_map(products["segment"].path / "class_map.zarr")
-    if (spectra := draw_spectra(mosaic, drawn)) is not None:
+    if (spectra := draw_spectra(open_mosaic(products.mosaic.path / "mosaic.zarr"), drawn)) is not None:
         pictures.append(Picture(spectra, SPECTRA_CAPTION))
     field = field_map(run, plan, shown, prior_map(run.prior, products["segment"], receipt))
     return _Drawn(shown, tuple(pictures), field)
@@ -163,9 +162,7 @@ def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str) -> Receipt:
     run, products = survey.run, survey.products
     accuracy = load_accuracy(products["evaluate"]) if "evaluate" in products else None
     effects = load_manifest(products["choose_effects"]) if run.source.simulates else {}
-    stores: dict[str, str] = {}
-    for name, ref in products.items():
-        stores |= STAGES[name].addresses(ref)
+    stores = {key: place for name, ref in products.items() for key, place in STAGES[name].addresses(ref).items()}
     if (products["segment"].path / READING).exists():  # patches were chosen in the segmentation
         stores["attention"] = f"{products['segment'].uri}/{READING}"
     files = ("receipt.json", "quicklook.png", "report.html", *([PLOTS_FILE] if run.zones.plots is not None else []))

@@ -78,12 +78,9 @@ class Declared:
         low, high = span_of(self.item)
         if self.kind is float:
             return format_number(low, high, self.about["unit"], endless=self.item.default == math.inf)
-        expected_by_kind = {
-            int: f"a whole number from {low} to {high}",
-            bool: "true or false",
-            str: "text that is not empty",
-        }
-        return expected_by_kind.get(self.kind, "")
+        return {int: f"a whole number from {low} to {high}", bool: "true or false", str: "text that is not empty"}.get(
+            self.kind, ""
+        )
 
     @cached_property
     def _adapter(self) -> TypeAdapter[Any]:

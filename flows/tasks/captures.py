@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import replace
 from datetime import datetime
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from flows.settings.parameters import SurveySettings, at_due_time
 from flows.settings.survey_settings import RIG, Settings
@@ -22,16 +22,9 @@ from flows.tasks.stages.capture import capture_coarse, capture_fine
 from flows.tasks.stages.condense import condense_coarse, condense_fine
 from flows.tasks.stages.placement import rectify
 from pipeline.errors import ArchiveError, IncompleteStoreError, NothingToMend, RigError, SettingsError
-from pipeline.lazy import deferred
+from pipeline.lazy import prefect_context, prefect_deployments
 from storage.archive.keys import StageRef
 from storage.remote.opening import open_archive
-
-if TYPE_CHECKING:
-    import prefect.context as prefect_context
-    import prefect.deployments as prefect_deployments
-else:
-    prefect_context = deferred("prefect.context")
-    prefect_deployments = deferred("prefect.deployments")
 
 OPENING = "plan"
 _opened: ContextVar[tuple[Settings, SurveyRun] | None] = ContextVar("opened", default=None)

@@ -187,7 +187,6 @@ def draw_field(field: FieldWork, work: Drawing, report: Callable[[float], None])
         shape = field.regions[0].field.patch_shape
         reading = FullReading(np.zeros(shape), np.zeros(shape, np.bool_), np.zeros(shape, np.float32))
         for region, part in zip(field.regions, parts, strict=True):
-            assert part.reading is not None
             for name, whole in vars(reading).items():
                 whole[region.kept_patches.rows, region.kept_patches.columns] = getattr(part.reading, name)
     return Drawn(sum(part.unread_px for part in parts), reduce(add, compared) if compared else None, reading)

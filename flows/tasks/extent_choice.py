@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from flows.settings.values import format_extent
 from flows.tasks.capture_plan import PassLayout
 from flows.tasks.prior_maps import Prior
-from models.reading.expected_errors import PatchExpectedErrors
+from models.reading.expected_errors import Floats, PatchExpectedErrors
 from models.reading.prior_map import COME_TRUE, ClassProbabilities, PriorMap, carried, in_classes
 from models.weights.files import Description, load_reader
 from pipeline.errors import BudgetError, NothingToMend, SettingsError, WeightsError
@@ -30,7 +30,6 @@ from pipeline.planning.uniform_scans import LOSS, MIOU, ScanPerformance, exposur
 from storage.arrays.class_maps import ProbabilityStore
 
 Mask = NDArray[np.bool_]
-Floats = NDArray[np.float64]
 SWATH_PATCHES = 4  # rows of patches whose class probabilities are read at a time
 POORER = 0.05  # mIoU below the best scan: poorer scans would degrade the prior map
 DUE = 1e3  # weight of patches that are too old, relative to the gain of the whole field
@@ -49,8 +48,7 @@ class ExtentChoice:
     @property
     def sentence(self) -> str:
         """Return the choice in a sentence."""
-        captured = self.due - self.due_left
-        due = f"; patches beyond --max-age: {captured} of {self.due} included" if self.due else ""
+        due = f"; patches beyond --max-age: {self.due - self.due_left} of {self.due} included" if self.due else ""
         return (
             f"captures the lines of highest expected gain in {self.seconds:.1f} s; the prior map's expected error is"
             f" {self.expected_wrong:.1%}{due}"

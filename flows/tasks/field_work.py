@@ -30,13 +30,12 @@ from pipeline.errors import WeightsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.rectify.region import free_tiles
 from storage.arrays.mosaics import open_mosaic
-from storage.parallel.pool import RESERVED_BYTES, WorkerPool, memory_refusal, mib, run_blocks
+from storage.parallel.pool import RESERVED_BYTES, Report, WorkerPool, memory_refusal, mib, run_blocks
 
 if TYPE_CHECKING:
     from models.network.temporal_reader import TemporalReader
 
 NO_PATCHES = np.empty(0, np.int64)
-Report = Callable[[float], None]
 
 
 @dataclass(frozen=True)

@@ -20,28 +20,19 @@ from http.client import HTTPException
 from importlib import resources
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from flows.terminal.processes import place_pages
 from pipeline.errors import SettingsError
-from pipeline.lazy import deferred
-
-if TYPE_CHECKING:
-    import prefect
-    import prefect.client.orchestration as prefect_client
-    import prefect.client.schemas.filters as prefect_filters
-    import prefect.logging.handlers as prefect_handlers
-    import prefect.server.api.server as prefect_server
-    import prefect.settings as prefect_settings
-    import uvicorn
-else:
-    prefect = deferred("prefect")
-    prefect_client = deferred("prefect.client.orchestration")
-    prefect_filters = deferred("prefect.client.schemas.filters")
-    prefect_handlers = deferred("prefect.logging.handlers")
-    prefect_server = deferred("prefect.server.api.server")
-    prefect_settings = deferred("prefect.settings")
-    uvicorn = deferred("uvicorn")
+from pipeline.lazy import (
+    prefect,
+    prefect_client,
+    prefect_filters,
+    prefect_handlers,
+    prefect_server,
+    prefect_settings,
+    uvicorn,
+)
 
 HOST = "127.0.0.1"
 STARTED_WITHIN_S, ENDED_WITHIN_S = 120.0, 10.0

@@ -130,8 +130,7 @@ def tile_budget(
     processes = not pool.shares_memory
     bands = work.placed[0].signal.bands if work.placed else 1
     one = COPIES * tile_shape[0] * tile_shape[1] * bands * 4
-    most = max(1, min(1 if pool.elsewhere else pool.count, len(tiles)))
-    for count in range(most, 0, -1):
+    for count in range(max(1, min(1 if pool.elsewhere else pool.count, len(tiles))), 0, -1):
         lines = cache_bytes(work.placed, tiles, 1 if processes else count)
         budget = TileBudget(count, lines, one, processes)
         if pool.elsewhere or budget.projected <= memory:

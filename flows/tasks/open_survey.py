@@ -20,17 +20,14 @@ from flows.tasks.stages.condense import condense_coarse, condense_fine, condense
 from flows.tasks.stages.effects import choose_effects
 from flows.tasks.stages.maps import ground, segment
 from flows.tasks.stages.placement import locate, rectify, rectify_fine, register_coarse, register_fine
-from pipeline.lazy import deferred
+from pipeline.lazy import deferred, prefect_concurrency
 from storage.archive.keys import StageRef
 from storage.archive.records import StageRecord
 from storage.archive.staging import bytes_below
 
 if TYPE_CHECKING:
-    import prefect.concurrency.sync as prefect_concurrency
-
     import flows.tasks.rig_field as rig_field
 else:
-    prefect_concurrency = deferred("prefect.concurrency.sync")
     rig_field = deferred("flows.tasks.rig_field")
 
 RIG_LIMIT = "rig"  # Prefect's global concurrency limit, where the server has one of that name

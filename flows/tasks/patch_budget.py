@@ -76,8 +76,7 @@ class PatchBudget:
         overview; names the least that does.
         """
         patch_index = costs.grid.valid_patches()
-        kept = patch_index if shown is None else patch_index[shown[patch_index]]
-        budget = PatchBudget(costs, kept, policy, macs)
+        budget = PatchBudget(costs, patch_index if shown is None else patch_index[shown[patch_index]], policy, macs)
         coarse = budget.operations_of(patch_index[:0])
         if budget._most < coarse:
             least = str(coarse)

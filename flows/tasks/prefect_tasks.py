@@ -9,20 +9,9 @@ from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
-from pipeline.lazy import deferred
-
-if TYPE_CHECKING:
-    import prefect
-    import prefect.cache_policies as prefect_cache_policies
-    import prefect.context as prefect_context
-    import prefect.runtime.task_run as prefect_task_run
-else:
-    prefect = deferred("prefect")
-    prefect_cache_policies = deferred("prefect.cache_policies")
-    prefect_context = deferred("prefect.context")
-    prefect_task_run = deferred("prefect.runtime.task_run")
+from pipeline.lazy import prefect, prefect_cache_policies, prefect_context, prefect_task_run
 
 RETRY_DELAY_S = 2.0
 Function = TypeVar("Function", bound=Callable[..., Any])

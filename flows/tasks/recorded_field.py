@@ -114,8 +114,7 @@ def open_recorded(settings: Settings) -> OpenedRecording:
                 "camera.focal_length_mm"
             )
         settings = replace(settings, scan_step=step)
-    field = RecordedField(source, recording.key())
-    return OpenedRecording(settings, recording, field, (*recording.notes, *notes))
+    return OpenedRecording(settings, recording, RecordedField(source, recording.key()), (*recording.notes, *notes))
 
 
 def _field_shape(

@@ -500,12 +500,10 @@ def _plan_capture(
         extent_notes = ("there is no prior map: the whole field is captured",)
     layout = PassLayout.of(settings, zones.grid, zones.shown, passes)
     if is_part and prior is not None:
-        assert settings.seconds is not None  # checked with the settings
         limits: dict[str, Any] = {"max_age": settings.max_age, "skip_below_error": settings.skip_below_error}
         masks = [one for one in (zones.left_out, scene.missing) if one is not None]
         limits |= {"seconds": settings.seconds, "left_out": np.logical_or.reduce(masks) if masks else None}
-        light = settings.sky.fraction_of_clear
-        layout, extent, note = choose_extent(layout, prior, described, path, light, **limits)
+        layout, extent, note = choose_extent(layout, prior, described, path, settings.sky.fraction_of_clear, **limits)
         extent_notes = (note,)
     scans = choose_uniform_scan(layout, described, path, len(scene.wavelength_nm), settings)
     layout, plan, settings, plan_notes = lay_out_passes(layout, scans, described, settings)

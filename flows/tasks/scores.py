@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 from flows.terminal.figures import format_count, format_points, known_number, spaced
 
-JUDGING = "evaluate"  # the stage that judges the map
 MOST_ERROR = 0.1  # standard deviation of an expected mIoU, above which it is not shown
 MAPS = {"this survey": None, "none": "none", "all": "all"}  # name: key in a receipt's accuracy
 

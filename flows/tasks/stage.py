@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,16 +27,13 @@ from models.network.machine import give_back_freed_memory
 from pipeline.errors import ArchiveError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.ground.georeference import georeference_record
+from pipeline.lazy import GeoBox
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, array_digest, stage_key
 from storage.archive.manifests import try_manifest
 from storage.arrays.layout import AngularGrid
 
-if TYPE_CHECKING:
-    from odc.geo.geobox import GeoBox
-
 Report = Callable[[float], None]  # progress of a stage, 0..1
-Build = Callable[[Path], None]
 
 
 @dataclass(frozen=True)
@@ -75,7 +72,7 @@ class Product:
 class Wanted:
     """Request for a store: its parameters and inputs, and the function that builds it."""
 
-    build: Build  # writes into a given folder
+    build: Callable[[Path], None]  # writes into a given folder
     params: Mapping[str, Any]
     inputs: Sequence[StageRef] = ()
     then: Callable[[], object] = field(default=lambda: None)  # called once the store exists
@@ -130,6 +127,7 @@ class Stage:
         """
 
         def build(folder: Path) -> None:
+            """Build the store, and check that its inputs are the same afterwards."""
             manifests = [archive.root / ref.uri for ref in wanted.inputs]
             before = [try_manifest(one) for one in manifests]
             try:

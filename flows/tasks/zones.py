@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,16 +16,10 @@ from pipeline.ground.field_places import FieldPlace, NoPlace, PlacedPicture, Pos
 from pipeline.ground.map_grid import ground_grid
 from pipeline.ground.view import GroundView
 from pipeline.ground.zones import FieldZones, extent_deg, field_zones, on_field, pixels_inside
-from pipeline.lazy import deferred
+from pipeline.lazy import BaseGeometry, pyproj
 from pipeline.simulator.scenes.scene import RasterScene
 from storage.archive.keys import array_digest
 from storage.readers.polygons import GEOJSON, ZoneFile, read_zones
-
-if TYPE_CHECKING:
-    import pyproj
-    from shapely.geometry.base import BaseGeometry
-else:
-    pyproj = deferred("pyproj")
 
 WGS84 = 4326  # CRS of GeoJSON (RFC 7946), on a georeferenced field
 

@@ -157,8 +157,7 @@ class StageProgress:
             self._tasks[stage] = self._bars.add_task(title, total=1.0, words="", ended=False)
             self._said[stage] = time.monotonic()
         self._bars.update(self._tasks[stage], completed=done, words=words, ended=ended)
-        due = time.monotonic() - self._said[stage] > LINE_EVERY_S
-        if not self.console.is_terminal and (ended or due):
+        if not self.console.is_terminal and (ended or time.monotonic() - self._said[stage] > LINE_EVERY_S):
             self._said[stage] = time.monotonic()
             left = None if ended else self._bars.tasks[self._tasks[stage]].time_remaining
             time_left = "" if left is None else f", {format_seconds(left)} left"

@@ -22,7 +22,7 @@ from flows.tasks.run import SurveyRun, open_run
 from flows.tasks.scene import check_labels
 from flows.tasks.stages.accuracy import columns_of_raster, columns_of_sweeps
 from flows.tradeoff.entries import Figures, Setting, Tradeoff
-from flows.tradeoff.store import STORE
+from flows.tradeoff.store import MEMORY, STORE, Values
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.machine import keep_freed_memory
 from models.network.spectral import LineSpec
@@ -32,7 +32,7 @@ from models.weights.files import Weights
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
-from pipeline.geometry.scan import CostModel, Sweep
+from pipeline.geometry.scan import CostModel, Floats, Sweep
 from pipeline.planning.coverage import cheapest_full, full_sweeps, uniform_sweeps
 from pipeline.planning.prices import frame_patches, raw_bytes
 from pipeline.planning.uniform_scans import format_scan
@@ -49,10 +49,6 @@ from pipeline.simulator.selection.choice import Decision, decide
 from pipeline.simulator.selection.survey_probe import probe_scene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_block
 from storage.archive.archive import Archive
-
-Values = NDArray[np.float32]
-Floats = NDArray[np.float64]
-MEMORY = 2**30  # bytes that rectifying may take
 
 # rectify: kernels on plane waves, whose values are known at every point
 
@@ -73,8 +69,7 @@ class Waves:
     def at(self, coordinates: Floats) -> Floats:
         """Return exact values at (n, 2) positions [px], (n, band)."""
         phase = 2 * np.pi * coordinates @ self.frequency.T
-        values: Floats = np.cos(phase) @ self.cosine + np.sin(phase) @ self.sine
-        return values
+        return np.cos(phase) @ self.cosine + np.sin(phase) @ self.sine
 
 
 def draw_waves(seed: int, bands: int, periods_px: tuple[float, float]) -> Waves:
@@ -233,10 +228,9 @@ class PlannedField:
     def judge(self, plan: Setting, drawn: DrawnMap) -> Figures:
         """Return 1 - mIoU of a map, the seconds of its scan, and the multiply-adds of the network."""
         one = self.passes[plan]
-        config = one.weights.config
         macs = self.costs.of_map(one.patch_index).total
         raw = {} if one.seconds is None else {"MB raw": one.bytes_raw / 1e6}
-        error = 1 - mean_iou(confusion(self.labels, drawn.classes, config.classes))
+        error = 1 - mean_iou(confusion(self.labels, drawn.classes, one.weights.config.classes))
         return Figures(error, one.seconds, {**raw, "billion multiply-adds": macs / 1e9})
 
 

@@ -126,8 +126,7 @@ def block_means_of(values: Values, side: int) -> NDArray[np.float32]:
     down, across = (min(side, size) for size in values.shape[:2])
     lines, samples = values.shape[0] // down, values.shape[1] // across
     cut = values[: lines * down, : samples * across].reshape(lines, down, samples, across, -1)
-    means: NDArray[np.float32] = cut.mean(axis=(1, 3), dtype=np.float64).astype(np.float32)
-    return means
+    return np.asarray(cut.mean(axis=(1, 3), dtype=np.float64).astype(np.float32))
 
 
 def scan_farm(seed: int, shape: tuple[int, int] = FIELD_SHAPE, camera: LineCamera | None = None) -> ScanLines:

@@ -216,8 +216,7 @@ def _names(images: Sequence[Path]) -> dict[str, Path]:
     Names keep their endings only if they are not unique without.
     """
     numbers = [scene_number(image) or "" for image in images]
-    stems = [image.stem for image in images]
-    for names in (numbers, stems):
+    for names in (numbers, [image.stem for image in images]):
         if all(names) and len(set(names)) == len(images):
             return dict(zip(names, images, strict=True))
     return {image.name: image for image in images}
@@ -353,8 +352,7 @@ def open_training_data(
     if scenes is not None:
         raise SettingsError(f"--scenes is for built-in scenes; {dataset} has its own scenes")
     files = load_data_set(Path(dataset), **choices)  # type: ignore[arg-type]
-    fraction = min(4, len(_labelled_names(files)) // 8)
-    return file_data(files, fraction if validation is None else validation, camera)
+    return file_data(files, min(4, len(_labelled_names(files)) // 8) if validation is None else validation, camera)
 
 
 def pack_mask(mask: NDArray[np.bool_]) -> str:
@@ -418,5 +416,4 @@ def trained_pixels(scene: RasterScene) -> NDArray[np.bool_]:
             f"scene {scene.name} has no labels; training needs them: give --labels, or call"
             f" its label file {scene.name}_mask.png or labels/{scene.name}.png (scene.toml: other names)"
         )
-    mask: NDArray[np.bool_] = scene.labels != UNLABELLED
-    return mask
+    return np.asarray(scene.labels != UNLABELLED)

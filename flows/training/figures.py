@@ -15,8 +15,9 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.linear_model import LogisticRegression
 
 from flows.training.data import Report
-from models.evaluation.expected_scores import Floats, MapScores, ScoredMap, expected_counts
+from models.evaluation.expected_scores import MapScores, ScoredMap, expected_counts
 from models.evaluation.metrics import (
+    Floats,
     JudgedMap,
     agreement,
     calibration_error,
@@ -147,8 +148,7 @@ def _scanned(
     valid = (labels != UNLABELLED) & np.isfinite(drawn.confidence)
     sure = confidence_counts(drawn.confidence[valid], drawn.classes[valid] == labels[valid])
     classes = weights.config.classes
-    expected = expected_counts([every_class[valid]], classes)
-    return ScoredMap(confusion(labels, drawn.classes, classes), expected), sure
+    return ScoredMap(confusion(labels, drawn.classes, classes), expected_counts([every_class[valid]], classes)), sure
 
 
 def _parts(weights: Weights, example: Example) -> tuple[SceneGrid, NDArray[np.uint8]]:

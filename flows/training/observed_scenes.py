@@ -79,8 +79,7 @@ def observe_finely(
     source = SimulatedSource(scene, rig, seed, chosen_effects(scene, rig, full), clock=clock)
     matrix, _ = basis.matrix(scene.wavelength_nm)
     columns, spectra = _columns(source, full, grid, matrix)
-    condensed = len(matrix) > FEW_BANDS
-    return columns, replace(noise_of(scene, matrix, camera), spectra=spectra if condensed else None)
+    return columns, replace(noise_of(scene, matrix, camera), spectra=spectra if len(matrix) > FEW_BANDS else None)
 
 
 def chosen_effects(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep]) -> Choice:
@@ -104,8 +103,7 @@ def _columns(
         raise SceneError(f"scene {source.scene.name} has pixels that no line reached; training needs all of it")
     mean = total / count
     covariance = products / count - np.outer(mean, mean)
-    scene = source.scene
-    spectra = SceneSpectra(mean, covariance, matrix, value_of_electron(scene), source.camera.read_noise_e)
+    spectra = SceneSpectra(mean, covariance, matrix, value_of_electron(source.scene), source.camera.read_noise_e)
     noise = np.sum(spectra.noise(1.0), axis=0)
     power = np.linalg.eigvalsh(covariance / np.sqrt(np.outer(noise, noise)))
     floor = np.quantile(power, 0.1)  # of directions without a signal

@@ -14,7 +14,7 @@ import numpy as np
 from rich.console import Console
 
 from flows.terminal.progress import one_after_the_other, table
-from flows.training.data import Report, masks_contain, open_training_data
+from flows.training.data import Report, TrainingData, masks_contain, open_training_data, read_farm_name
 from flows.training.figures import (
     FEW_PIXELS,
     better_reading,
@@ -24,13 +24,13 @@ from flows.training.figures import (
     read_twice,
     validate,
 )
-from flows.training.fit_ood import fit_and_add, trained_on
-from flows.training.train_scenes import Scenes, TrainRequest, check_out, network_config, observe_all, training_capture
+from flows.training.train_scenes import Scenes, TrainRequest, network_config, observe_all, training_capture
 from models.evaluation.placement import CascadeTable
 from models.network.machine import PROCESSOR, choose_device
 from models.network.spectral import Normalisation
 from models.training.capture_augmentation import REFERENCE_MS
 from models.training.examples import measured_normalisation
+from models.training.ood_fit import fit_ood
 from models.training.train import PIXELS, LabelledPixels, Progress, halfway, linear_discriminants, train
 from models.weights.checksummed_files import load_checkpoint
 from models.weights.files import (
@@ -38,7 +38,9 @@ from models.weights.files import (
     CASCADE,
     MAP_SCORES,
     TRAINED_ON,
+    TrainedOn,
     Weights,
+    add_ood,
     load_weights,
     save_weights,
     with_record,
@@ -46,6 +48,8 @@ from models.weights.files import (
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.simulator.scenes.built_in import built_in_laws
+from pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M
+from pipeline.simulator.scenes.farm.land import sun_over_farm
 
 CROPS_PX = {True: 256, False: 384}  # by default: of built-in scenes, and of frames
 
@@ -61,7 +65,8 @@ def train_weights(
     output path, sizes that do not fit, or an unavailable device.
     """
     checkpoint = request.out.with_name(request.out.name + ".checkpoint")
-    check_out(request.out)
+    if not request.out.parent.is_dir() or request.out.is_dir():
+        raise SettingsError(f"-o {request.out}: expected the name of a file in a folder that exists")
     load_checkpoint(checkpoint)  # a damaged one fails before minutes are spent
     begun = None if request.start is None else load_weights(request.start)
     device, settings = choose_device(request.device), request.settings
@@ -77,7 +82,7 @@ def train_weights(
         normalisation = begun.normalisation
     scenes = scenes.normalised(normalisation)
     weights, training = _learned(request, scenes, normalisation, begun, checkpoint, device, report)
-    trained = trained_on(data, scenes, settings.darkest_ms)
+    trained = _trained_on(data, scenes, settings.darkest_ms)
     record = {
         "command": request.command,
         "data": data.law,
@@ -108,10 +113,34 @@ def train_weights(
     checkpoint.unlink(missing_ok=True)
     about = {"command": request.command, **({} if scans is None else {MAP_SCORES: scans[1].as_dict()})}
     try:
-        fit_and_add(weights, request.out, scenes, trained, settings.seed, about, report)
+        ood_detector = fit_ood(
+            scenes.train.examples,
+            scenes.validation.examples,
+            weights.normalisation,
+            darkest_ms=trained.exposure_ms[0],
+            bands=trained.bands,
+            seed=settings.seed,
+            report=lambda done: report("fitting the out-of-distribution detector", done, ""),
+        )
+        add_ood(request.out, ood_detector, trained, about)
     except SceneError as error:
         record["familiar"] = f"no pixel will be classified as unknown: {error}"
     return record
+
+
+def _trained_on(data: TrainingData, scenes: Scenes, darkest_ms: float) -> TrainedOn:
+    """Return the ranges of the training data; season, sun and scale are known for built-in farms alone."""
+    nm = scenes.common.wavelength_nm
+    exposures = (darkest_ms, max(darkest_ms, data.camera.exposure_ms))
+    span, bands_nm = (float(nm.min()), float(nm.max())), tuple(nm.tolist())
+    trained = TrainedOn(len(nm), span, exposures, len(data.train), scenes.common.names, bands_nm=bands_nm)
+    if data.files is not None:
+        return trained
+    moments = [read_farm_name(name)[1:] for name in data.train]
+    days, heights = [day for day, _ in moments], [sun_over_farm(*moment).elevation_deg for moment in moments]
+    return replace(
+        trained, day=(min(days), max(days)), sun_elevation_deg=(min(heights), max(heights)), ground_pixel_m=FARM_PIXEL_M
+    )
 
 
 def check_start(request: TrainRequest, begun: Weights, scenes: Scenes) -> None:
@@ -122,14 +151,13 @@ def check_start(request: TrainRequest, begun: Weights, scenes: Scenes) -> None:
     """
     split, common, now = begun.record.get("split", {}), scenes.common, scenes.train
     known, masks = set(split.get("train", {}).values()), split.get("pixels", {})
-    same = {
+    for what, kept in {
         "training scenes": known <= set(now.keys.values()),
         "training pixels": all(masks_contain(now.pixels[key], masks.get(key)) for key in known & now.pixels.keys()),
         "bands": begun.basis == common.basis,
         "classes": begun.class_names == common.names,
         "sizes of the network": begun.config == network_config(request, common),
-    }
-    for what, kept in same.items():
+    }.items():
         if not kept:
             raise SettingsError(
                 f"--start {request.start}: its training had other {what}; give its data set and options"
@@ -172,8 +200,7 @@ def _learned(
     weights = Weights(model, common.basis, normalisation, common.names, common.colours).on(device)
     frames, found = scenes.validation.examples, dict[str, Any]()
     labelled = sum(int(np.count_nonzero(one.labels != UNLABELLED)) for one in examples)
-    few = begun is None and labelled < FEW_PIXELS
-    weights, found["readings"] = better_reading(weights, start, frames, few=few)
+    weights, found["readings"] = better_reading(weights, start, frames, few=begun is None and labelled < FEW_PIXELS)
     if frames:
         found["baselines"] = judge_baselines(examples, frames, config.classes, seed, report)
         report("validating", 0.0, f"{len(frames)} scenes")
@@ -227,8 +254,7 @@ def check_counts(request: TrainRequest) -> None:
 
 def asked_command() -> str:
     """Return the command without folders, for the record."""
-    words = [Path(word).name if "/" in word else word for word in sys.argv[1:]]
-    return shlex.join(["spectralzoom", *words])
+    return shlex.join(["spectralzoom", *[Path(word).name if "/" in word else word for word in sys.argv[1:]]])
 
 
 def _print_figures(record: dict[str, Any], request: TrainRequest, console: Console) -> None:

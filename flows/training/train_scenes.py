@@ -123,7 +123,7 @@ def _imaged(
 ) -> tuple[Common | None, Imaged]:
     """Image named scenes, and check that they have the bands and classes of earlier ones. Raises SceneError.
 
-    Beside ``trained`` scenes these are for validation: those without a label, or of a trained image, are left out.
+    With ``trained`` scenes, these are for validation: those without a label, or of a trained image, are left out.
     """
     found, empty, regridded, alike = Imaged(), list[str](), list[str](), dict[str, str]()
     unfit = list[str]()
@@ -202,12 +202,6 @@ def network_config(request: TrainRequest, common: Common) -> SegmenterConfig:
         )
     except ValueError as error:
         raise SettingsError(f"{error}; choose another --patch, --dim or --heads") from error
-
-
-def check_out(out: Path) -> None:
-    """Raise SettingsError where a file of this name cannot be written."""
-    if not out.parent.is_dir() or out.is_dir():
-        raise SettingsError(f"-o {out}: expected the name of a file in a folder that exists")
 
 
 def training_capture(normalisation: Normalisation, darkest_ms: float) -> CaptureAugmentation | None:

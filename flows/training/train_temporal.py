@@ -225,10 +225,9 @@ def run_remember(request: TemporalRequest, console: Console) -> dict[str, Any]:
         f"weights with a temporal reader: {request.out}, {record['steps']} steps", markup=False, soft_wrap=True
     )
     if record["validation"]:
-        rows = record["validation"]
         title = f"mIoU on {request.judged} lands that training did not see"
         table = Table("days later", "first map", "visit alone", "more confident", "fused", "new full scan", title=title)
-        for row in rows:
+        for row in record["validation"]:
             figures = (f"{row[name]:.1%}" for name in ("kept", "extent", "surer", "prior_map", "anew"))
             table.add_row(f"{row['days']:g}", *figures)
         console.print(table)

@@ -18,9 +18,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from models.evaluation.metrics import iou_per_class, labelled_classes, mean_iou
+from models.evaluation.metrics import Floats, iou_per_class, labelled_classes, mean_iou
 
-Floats = NDArray[np.float64]
 THERE_PX = 100.0  # expected pixels of a class that is present with probability 1/2
 SURE_PX = 2000.0  # of a class: a scene with so many counts in full; fewer in all scenes shrink the bias
 SMALL_PX, SMALL_ERROR = 300.0, 0.3  # the IoU of a class of so few pixels has half of this error
@@ -87,8 +86,7 @@ def fitted_bias(maps: Sequence[ScoredMap]) -> Floats:
     counts = np.stack([one.counts for one in maps])
     weight = np.minimum(expected.sum(axis=-1), SURE_PX) * labelled_classes(counts)
     true, predicted = (_logit(iou_per_class(one)) for one in (counts, expected))
-    bias: Floats = ((true - predicted) * weight).sum(axis=0) / (weight.sum(axis=0) + SURE_PX)
-    return bias
+    return np.asarray(((true - predicted) * weight).sum(axis=0) / (weight.sum(axis=0) + SURE_PX))
 
 
 def error_of_passes(maps: Sequence[ScoredMap]) -> float:
@@ -152,5 +150,4 @@ class MapScores:
 
 def _logit(fraction: Floats) -> Floats:
     """Return logits of fractions 0..1, clipped away from both ends; NaN counts as 0."""
-    found: Floats = scipy.special.logit(np.clip(np.nan_to_num(fraction), LEAST_IOU, 1 - LEAST_IOU))
-    return found
+    return np.asarray(scipy.special.logit(np.clip(np.nan_to_num(fraction), LEAST_IOU, 1 - LEAST_IOU)))

@@ -7,33 +7,27 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from models.evaluation.metrics import agreement, confusion, gap_closed, mean_iou
+from models.evaluation.metrics import Counts, agreement, confusion, gap_closed, mean_iou
 from models.network.sizes import MOST_GAIN
 from models.network.spectral import patches_of
 from models.policies.policies import random_scores, score_patches
 from models.reading.inference import CoarsePrediction, captured, overview_of, patch_logits, segment
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, patch_pixels
-from pipeline.lazy import deferred
+from pipeline.lazy import torch
 from pipeline.planning.prices import frame_patches
-
-if TYPE_CHECKING:
-    import torch
-else:
-    torch = deferred("torch")
 
 Values = NDArray[np.floating]
 RANDOM_DRAWS = 5
 COMPARED = ("gain", "entropy", "sobel")  # policies beside the random one
 LEAST_GAINS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2)  # thresholds [nat per px]
 CONTROL_FRACTION = 0.35  # of the valid patches: K = 35 % of surveys' receipts and of the weights' records
-Counts = NDArray[np.int64]
 
 
 def oracle_gain(
@@ -73,8 +67,7 @@ def _losses(logits: NDArray[np.float32], truth: NDArray[np.uint8]) -> NDArray[np
 
 def gain_sums(gain: Values, chosen: NDArray[np.integer], valid: NDArray[np.integer]) -> tuple[float, float]:
     """Return the gain of the chosen patches, and of as many of the best valid ones; sum over frames, then divide."""
-    best = np.sort(gain[valid])[::-1][: len(chosen)]
-    return float(gain[chosen].sum()), float(best.sum())
+    return float(gain[chosen].sum()), float(np.sort(gain[valid])[::-1][: len(chosen)].sum())
 
 
 Placements = dict[str, list[Counts]]  # row -> confusion counts of its map; of ``random`` several

@@ -5,15 +5,10 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import Literal, get_args
 
 from pipeline.errors import SettingsError
-from pipeline.lazy import deferred
-
-if TYPE_CHECKING:
-    import torch
-else:
-    torch = deferred("torch")  # not needed for a simulation
+from pipeline.lazy import torch
 
 Device = Literal["auto", "cpu", "cuda", "mps"]
 Present = Literal["cpu", "cuda", "mps"]

@@ -257,8 +257,7 @@ class Segmenter(nn.Module):
         columns = image[:, : self.config.columns].permute(0, 2, 3, 1)
         alone = F.linear(columns, self.spectral.weight.flatten(1), self.spectral.bias).permute(0, 3, 1, 2)
         alone = mean_around(alone)  # the logits' mean is that of the mean spectrum
-        logits = self.overview_classes(F.gelu(drawn)) + alone[:, :, :height, :width]
-        return Overview(drawn, logits)
+        return Overview(drawn, self.overview_classes(F.gelu(drawn)) + alone[:, :, :height, :width])
 
     def _coded(self, grid: Tensor, origin: Tensor | None) -> Tensor:
         """Add the code of its place to each token, (B, d, rows, columns) -> (B, rows * columns, d)."""

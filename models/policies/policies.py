@@ -15,7 +15,6 @@ from models.reading.inference import CoarsePrediction
 from pipeline.errors import SettingsError, ShapeError
 from pipeline.geometry.grid import SceneGrid
 
-Pixels = NDArray[np.float64]
 Scores = NDArray[np.float64]
 Policy = Literal["gain", "entropy", "sobel", "random", "mask"]
 POLICIES: tuple[Policy, ...] = get_args(Policy)
@@ -78,21 +77,19 @@ def score_multiply_adds(policy: str, config: SegmenterConfig, grid: SceneGrid) -
 def pixel_entropy(probability: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the entropy over the last axis [nat]; a probability of 0 adds 0."""
     exact = probability.astype(np.float64)
-    entropy: NDArray[np.float64] = -scipy.special.xlogy(exact, exact).sum(axis=-1)
-    return entropy
+    return np.asarray(-scipy.special.xlogy(exact, exact).sum(axis=-1))
 
 
 def _edges(seen: CoarsePrediction) -> NDArray[np.float64]:
     brightness = np.einsum("yxc->yx", seen.columns, dtype=np.float64) / seen.columns.shape[-1]
     down, across = (scipy.ndimage.sobel(brightness, axis=axis, mode="nearest") for axis in (0, 1))
-    edges: NDArray[np.float64] = np.hypot(down, across)
-    return edges
+    return np.asarray(np.hypot(down, across))
 
 
 class PixelScore(NamedTuple):
     """Score of coarse pixels, with its multiply-adds a pixel."""
 
-    of: Callable[[CoarsePrediction], Pixels]
+    of: Callable[[CoarsePrediction], NDArray[np.float64]]
     adds: int
     per_column: int = 0
     per_class: int = 0
@@ -115,8 +112,7 @@ def _patch_means(pixels: NDArray[np.float64], seen: CoarsePrediction) -> Scores:
         patches_of(image, grid.patch).sum(axis=(1, 2)).reshape(grid.patch_shape)
         for image in (pixels * on_scene, on_scene)
     )
-    means: Scores = np.divide(total, count, out=np.zeros(grid.patch_shape), where=count > 0)
-    return means
+    return np.asarray(np.divide(total, count, out=np.zeros(grid.patch_shape), where=count > 0))
 
 
 def _mask_scores(seen: CoarsePrediction, mask: NDArray[np.generic] | None) -> Scores:

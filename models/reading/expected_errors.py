@@ -22,8 +22,7 @@ def expected_error_of(log_probability: NDArray[np.floating]) -> Floats:
     """
     right = np.exp(np.minimum(log_probability.max(axis=-1).astype(np.float64), 0.0))
     nothing = 1 - 1 / log_probability.shape[-1]
-    found: Floats = np.where(np.isfinite(right), np.minimum(1 - right, nothing), nothing)
-    return found
+    return np.asarray(np.where(np.isfinite(right), np.minimum(1 - right, nothing), nothing))
 
 
 @dataclass(frozen=True)
@@ -63,8 +62,7 @@ class PatchExpectedErrors:
             known = np.isfinite(probabilities[..., 0])
             wrong = np.where(known, come_true, 1.0) * expected_error_of(probabilities)
             step = np.minimum(np.searchsorted(edges, wrong), STEPS - 1)
-            likeliest = np.where(known, np.nan_to_num(probabilities, nan=-np.inf).argmax(axis=-1), classes)
-            place = likeliest * STEPS + step
+            place = np.where(known, np.nan_to_num(probabilities, nan=-np.inf).argmax(axis=-1), classes) * STEPS + step
             asked = np.True_ if left_out is None else ~left_out[top : top + len(probabilities)]
             counts = np.broadcast_to(asked, place.shape)
             sums += np.bincount(place[counts], wrong[counts], minlength=sums.size)
@@ -80,13 +78,11 @@ class PatchExpectedErrors:
     def expected_error(self) -> Floats:
         """Return the mean expected error of the pixels of each class and step, (class + 1, step); 0 without pixels."""
         counts = self.pixels.sum(axis=0, dtype=np.float64)
-        found: Floats = np.divide(self.wrong, counts, out=np.zeros_like(counts), where=counts > 0)
-        return found
+        return np.asarray(np.divide(self.wrong, counts, out=np.zeros_like(counts), where=counts > 0))
 
     def wrong_pixels(self) -> Floats:
         """Return the expected number of wrong pixels of each patch, (patch,)."""
-        found: Floats = np.tensordot(self.pixels, self.expected_error, 2)
-        return found
+        return np.tensordot(self.pixels, self.expected_error, 2)
 
     def expected_wrong(self) -> float:
         """Return the expected fraction of wrong pixels of the field; 0 without pixels."""
@@ -106,5 +102,4 @@ class PatchExpectedErrors:
         weight[:-1] /= max(int(there.sum()), 1)
         after = np.append(wrong_after, np.mean(wrong_after, where=there if there.any() else True))
         gained = np.maximum(self.expected_error - after[:, None], 0.0) * weight[:, None]
-        found: Floats = np.tensordot(self.pixels, gained, 2)
-        return found
+        return np.tensordot(self.pixels, gained, 2)

@@ -25,16 +25,11 @@ from models.network.spectral import (
 from models.weights.files import Weights
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, cuts, pad_by_reflection
-from pipeline.lazy import deferred
+from pipeline.lazy import Tensor, torch
 from pipeline.signal.components import Components
 
 if TYPE_CHECKING:
-    import torch
-    from torch import Tensor
-
     from models.network.segmenter import Overview
-else:
-    torch = deferred("torch")
 
 ROWS_DRAWN = 64  # at once
 # Factor of the octaves by which exposures are stated to be shorter than the reference. The network then relies more on
@@ -139,8 +134,7 @@ def _mend(columns: NDArray[np.float32], p: int) -> NDArray[np.bool_] | None:
     for number in np.flatnonzero(holes.any(axis=(1, 2))):  # one by one: a copy of a field is large
         y, x = (p * int(at) for at in divmod(number, columns.shape[1] // p))
         columns[y : y + p, x : x + p] = fill_dead(columns[None, y : y + p, x : x + p], holes[number][None])[0]
-    whole = np.pad(dead, [(0, -size % TOKEN_PX) for size in dead.shape], mode="edge")
-    return readable(patches_of(whole, TOKEN_PX))
+    return readable(patches_of(np.pad(dead, [(0, -size % TOKEN_PX) for size in dead.shape], mode="edge"), TOKEN_PX))
 
 
 def coarse_prediction_of_columns(

@@ -18,15 +18,10 @@ from models.evaluation.expected_scores import expected_counts
 from models.evaluation.metrics import confusion, kappa, overall_accuracy
 from models.network.sizes import CELL_PX
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.lazy import deferred
+from pipeline.lazy import Tensor, torch
 
 if TYPE_CHECKING:
-    import torch
-    from torch import Tensor
-
     from models.network.temporal_reader import TemporalReader
-else:
-    torch = deferred("torch")
 
 FAINTEST = -12.7  # least log-probability that is stored: one in 330 000
 LIGHT_FADES_DAYS = 30.0  # in which the exposure of a prior map loses weight by a factor of e
@@ -54,8 +49,7 @@ class ClassProbabilities:
     def classes(self) -> tuple[NDArray[np.uint8], Floats]:
         """Return the most probable class of each pixel and its probability; 255 and NaN for unknown pixels."""
         found, sure = likeliest(self.log_probability)
-        classes = np.where(np.isfinite(sure), found, UNLABELLED).astype(np.uint8)
-        return classes, np.exp(sure)
+        return np.where(np.isfinite(sure), found, UNLABELLED).astype(np.uint8), np.exp(sure)
 
 
 def likeliest(log_probability: Floats) -> tuple[NDArray[np.int64], Floats]:
@@ -173,20 +167,17 @@ def _phased_in(old: Floats, after: Floats, seen: NDArray[np.bool_], days: float)
     if fraction == 1:
         return after
     mixed = np.log((1 - fraction) * np.exp(old) + fraction * np.exp(after)).astype(np.float32)
-    held: Floats = np.where(seen[..., None], after, mixed)
-    return held
+    return np.where(seen[..., None], after, mixed)
 
 
 def _normalised(log_probability: Floats) -> Floats:
     """Return log-probabilities (..., class) of probabilities that sum to 1."""
-    summing: Floats = log_probability - np.log(np.exp(log_probability).sum(axis=-1, keepdims=True))
-    return summing
+    return np.asarray(log_probability - np.log(np.exp(log_probability).sum(axis=-1, keepdims=True)))
 
 
 def _ages(log_probability: Floats, age_days: Floats) -> Floats:
     """Return ages, NaN for unknown pixels."""
-    ages: Floats = np.where(np.isfinite(log_probability[..., 0]), age_days, np.nan).astype(np.float32)
-    return ages
+    return np.where(np.isfinite(log_probability[..., 0]), age_days, np.nan).astype(np.float32)
 
 
 def in_classes(log_probability: Floats, numbers: Sequence[int]) -> Floats:
@@ -198,16 +189,14 @@ def in_classes(log_probability: Floats, numbers: Sequence[int]) -> Floats:
     new, kept = np.array(numbers) < 0, np.exp(log_probability[..., list(numbers)])
     removed = np.setdiff1d(np.arange(log_probability.shape[-1]), numbers)
     spread = np.exp(log_probability[..., removed]).sum(axis=-1, keepdims=True) / len(numbers)
-    found: Floats = _normalised(np.log(np.where(new, 1 / len(numbers), kept) + spread)).astype(np.float32)
-    return found
+    return _normalised(np.log(np.where(new, 1 / len(numbers), kept) + spread)).astype(np.float32)
 
 
 def faded(log_probability: Floats, age_days: Floats) -> Floats:
     """Return a prior map that is mixed with equal probabilities by its age."""
     left = np.exp(-age_days.astype(np.float64) / FADES_DAYS).astype(np.float32)[..., None]
     mixed = left * np.exp(log_probability) + (1 - left) / log_probability.shape[-1]
-    expected_gain: Floats = np.log(np.maximum(mixed, np.float32(math.exp(FAINTEST)))).astype(np.float32)
-    return expected_gain
+    return np.asarray(np.log(np.maximum(mixed, np.float32(math.exp(FAINTEST)))).astype(np.float32))
 
 
 def _more_confident(before: Floats, today: Floats, seen: NDArray[np.bool_], age: Floats) -> Floats:
@@ -217,8 +206,7 @@ def _more_confident(before: Floats, today: Floats, seen: NDArray[np.bool_], age:
     together = old + np.where(seen[..., None], today, 0)
     together -= np.log(np.exp(together).sum(axis=-1, keepdims=True))
     surer = (today.max(axis=-1) > math.log(SURE)) | (today.max(axis=-1) > old.max(axis=-1) + math.log(2))
-    found: Floats = np.where((against & surer)[..., None], today, np.where(against[..., None], old, together))
-    return found
+    return np.where((against & surer)[..., None], today, np.where(against[..., None], old, together))
 
 
 def _read(
@@ -342,5 +330,4 @@ def changed_fractions(old: NDArray[np.uint8], patch: int) -> Floats:
     """Return the fraction of changed pixels of each patch (patch_y, patch_x), from ``old`` of `changed_from`."""
     y, x = (-(-size // patch) * patch for size in old.shape)
     padded = np.pad(old != UNLABELLED, [(0, y - old.shape[0]), (0, x - old.shape[1])])
-    fractions: Floats = padded.reshape(y // patch, patch, x // patch, patch).mean(axis=(1, 3), dtype=np.float32)
-    return fractions
+    return np.asarray(padded.reshape(y // patch, patch, x // patch, patch).mean(axis=(1, 3), dtype=np.float32))

@@ -143,8 +143,7 @@ def _cuts(size: int, unit: int, most: int) -> list[tuple[int, int]]:
         return [(0, size)]
     units = -(-size // unit)
     count = -(-units // max(most // unit, 1))
-    edges = [part * units // count * unit for part in range(count)] + [size]
-    return list(pairwise(edges))
+    return list(pairwise([part * units // count * unit for part in range(count)] + [size]))
 
 
 def region_bytes(config: SegmenterConfig, region: Region, patch_index: int, bands: int) -> int:

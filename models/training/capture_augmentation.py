@@ -56,20 +56,17 @@ class ColumnNoise:
     def correlation(self) -> Matrix:
         """Return the correlation of the noise, (column, column): columns share bands."""
         size = np.sqrt(np.maximum(np.diag(self.read), 1e-300))
-        correlation: Matrix = self.read / np.outer(size, size)
-        return correlation
+        return np.asarray(self.read / np.outer(size, size))
 
     def variance(self, columns: NDArray[np.floating], light: float) -> NDArray[np.floating]:
         """Return the variance of columns (..., column) in scene values; negative values have no shot noise."""
         read = np.diag(self.read).astype(columns.dtype) / light**2
-        variance: NDArray[np.floating] = np.maximum(columns, 0) * (self.shot / light).astype(columns.dtype) + read
-        return variance
+        return np.asarray(np.maximum(columns, 0) * (self.shot / light).astype(columns.dtype) + read)
 
     def covariance(self, columns: NDArray[np.floating], light: float) -> Matrix:
         """Return the covariance (column, column) of a spectrum (column,)."""
         size = np.sqrt(self.variance(columns.astype(np.float64), light))
-        covariance: Matrix = self.correlation() * np.outer(size, size)
-        return covariance
+        return self.correlation() * np.outer(size, size)
 
 
 class Condensing(NamedTuple):
@@ -143,8 +140,7 @@ class CaptureAugmentation:
         if step > 1 and rng.random() < INTERLACED:
             image = self.interlaced(columns, noise, step=step, rng=rng, least_power=least_power)
         else:
-            light = self._light(rng)
-            image = self.scan(columns, noise, light=light, step=step, rng=rng, least_power=least_power)
+            image = self.scan(columns, noise, light=self._light(rng), step=step, rng=rng, least_power=least_power)
         return image, image
 
     def _light(self, rng: np.random.Generator) -> float:

@@ -144,15 +144,13 @@ class CropSampler:
     def size(self, larger: int = 1) -> int:
         """Return the side [px] of crops whose area is ``larger`` times that of ``crop``, or of the smallest scene."""
         cell = max(TOKEN_PX, self.patch) if self.smallest >= TOKEN_PX else self.patch
-        crop = round(self.crop * math.sqrt(larger))
-        return max(cell, min(crop, self.smallest) // cell * cell)
+        return max(cell, min(round(self.crop * math.sqrt(larger)), self.smallest) // cell * cell)
 
     def draw(self, count: int, rng: np.random.Generator, gain_shift: NDArray[np.float32], *, larger: int = 1) -> Batch:
         """Draw ``count`` crops. ``gain_shift`` is the shift of normalised columns by brightness."""
         crops = [self._crop(rng, gain_shift, self.size(larger)) for _ in range(count)]
         image, detail, labels = (torch.stack(one) for one in zip(*crops, strict=True))
-        origin = torch.from_numpy(rng.integers(0, 4096, (count, 2)))
-        return Batch(image, detail, labels.to(torch.int64), origin)
+        return Batch(image, detail, labels.to(torch.int64), torch.from_numpy(rng.integers(0, 4096, (count, 2))))
 
     def _crop(
         self, rng: np.random.Generator, gain_shift: NDArray[np.float32], size: int

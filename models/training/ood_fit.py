@@ -117,8 +117,7 @@ def components(pixels: Spectra, classes: Classes, seed: int) -> tuple[Exact, Exa
     for part, middle, own in zip(parts, centres, scatter, strict=True):
         mixed = (own + weight * common) / (len(part) + weight)
         apart = scipy.linalg.solve_triangular(np.linalg.cholesky(mixed), (part - middle).T, lower=True)
-        usual = float(np.quantile((apart**2).sum(axis=0), USUAL))
-        covariance.append(mixed * max(usual / columns, 1.0))
+        covariance.append(mixed * max(float(np.quantile((apart**2).sum(axis=0), USUAL)) / columns, 1.0))
     return np.stack(centres), np.stack(covariance)
 
 
@@ -143,7 +142,6 @@ def measured_limits(
                 if one.noise is not None:
                     pixels = augmentation.scanned(pixels, one.noise, light=fraction, step=step, rng=rng)
                 distances.append(ood_detector.lit(fraction).distance(pixels[one.labels != UNLABELLED]))
-            together = np.concatenate(distances).astype(np.float64)
-            fine[i, j] = np.quantile(together, 1 - np.array(RATES))
+            fine[i, j] = np.quantile(np.concatenate(distances).astype(np.float64), 1 - np.array(RATES))
             report((j * len(steps) + i + 1) / (len(steps) * len(light)))
     return Limits(np.array(RATES), np.array(light), steps, fine)

@@ -104,8 +104,7 @@ def train_reader(
         reader = TemporalReader(sizes) if start is None else copy.deepcopy(start).train()
     reader = reader.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     averaged = copy.deepcopy(reader).eval()
-    labels = [visit.labels for land in lands for visit in land]
-    weight = class_weights(labels, sizes.classes, settings.weight_cap)
+    weight = class_weights([visit.labels for land in lands for visit in land], sizes.classes, settings.weight_cap)
     rng = np.random.default_rng([settings.seed, 0x3E3])
     optimiser = torch.optim.AdamW(reader.parameters(), settings.learning_rate, weight_decay=settings.weight_decay)
     started, step, loss = time.monotonic(), 0, math.nan
@@ -208,9 +207,8 @@ def _sequence(land: Sequence[Visit], settings: TemporalTraining, rng: np.random.
         turned = [np.rot90(image[::-1] if mirrored else image, turns) for image in images]
         channels_first = [image.transpose(2, 0, 1) if image.ndim == 3 else image for image in turned]
         comparable = float(rng.random() >= INCOMPARABLE)
-        days = abs(visit.moment - before)
         taken = coarse_pass.light, float(coarse_pass.step), comparable, season_of(visit.moment if dated else None)
-        sequence.append((*map(np.ascontiguousarray, channels_first), days, *taken))
+        sequence.append((*map(np.ascontiguousarray, channels_first), abs(visit.moment - before), *taken))
         before = visit.moment
     return sequence
 

@@ -178,8 +178,7 @@ class Trainer:
                 parts[part][rest] = tensor
         self.model.load_state_dict(parts["model"])
         self.averaged.load_state_dict(parts["averaged"])
-        groups = self.optimiser.state_dict()["param_groups"]
-        self.optimiser.load_state_dict({"state": state, "param_groups": groups})
+        self.optimiser.load_state_dict({"state": state, "param_groups": self.optimiser.state_dict()["param_groups"]})
         self.rng.bit_generator.state = about["rng"]
         self.course, self._started, self._worked = Course(**about["course"]), time.monotonic(), time.process_time()
         return True
@@ -187,15 +186,13 @@ class Trainer:
     def summary(self) -> dict[str, float | int]:
         """Return steps, skipped steps, the smoothed loss, and wall and processor seconds."""
         course = self.course
-        seconds = round(course.seconds + time.monotonic() - self._started)
-        worked = round(course.processor_seconds + time.process_time() - self._worked)
         return {
             "steps": course.step,
             "skipped_steps": course.skipped,
             "unlabelled_steps": course.unlabelled,
             "last_loss": round(course.loss, 5),
-            "seconds": seconds,
-            "processor_seconds": worked,
+            "seconds": round(course.seconds + time.monotonic() - self._started),
+            "processor_seconds": round(course.processor_seconds + time.process_time() - self._worked),
         }
 
 

@@ -11,20 +11,12 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from safetensors import SafetensorError, safe_open
 
 from pipeline.errors import WeightsError
-from pipeline.lazy import deferred
-
-if TYPE_CHECKING:
-    import safetensors.torch as safetensors_torch
-    import torch
-    from torch import Tensor
-else:
-    torch = deferred("torch")
-    safetensors_torch = deferred("safetensors.torch")
+from pipeline.lazy import Tensor, safetensors_torch, torch
 
 KEY_DIGITS = 20
 ABOUT = "about"  # name of the text in the file

@@ -20,19 +20,15 @@ from models.network.spectral import Normalisation, SpectralBasis, check_basis, p
 from models.reading.ood import Limits, OodDetector
 from models.weights.checksummed_files import key_of, read_about, read_tensors, refusing, write_checksummed
 from pipeline.errors import WeightsError
-from pipeline.lazy import deferred
+from pipeline.lazy import Tensor, deferred, torch
 from pipeline.readings import readings_alone
 from pipeline.signal.components import Components
 
 if TYPE_CHECKING:
-    import torch
-    from torch import Tensor
-
     from models.network import segmenter, temporal_reader
     from models.network.segmenter import Segmenter
     from models.network.temporal_reader import TemporalReader
 else:
-    torch = deferred("torch")
     temporal_reader = deferred("models.network.temporal_reader")
     segmenter = deferred("models.network.segmenter")
 
@@ -204,8 +200,7 @@ def save_weights(weights: Weights, path: Path) -> None:
         "class_names": list(weights.class_names),
         "record": weights.record,
     }
-    keys = {"weights": key_of(about, tensors)}
-    write_checksummed(path, {**about, "format": FORMAT, "keys": keys}, tensors)
+    write_checksummed(path, {**about, "format": FORMAT, "keys": {"weights": key_of(about, tensors)}}, tensors)
 
 
 def add_ood(weights: Path, ood_detector: OodDetector, trained_on: TrainedOn, record: Mapping[str, Any]) -> None:

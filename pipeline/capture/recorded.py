@@ -22,12 +22,10 @@ from numpy.typing import NDArray
 from pipeline.errors import NotRecordedError, SceneError, ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_scene, position_to_direction
-from pipeline.geometry.scan import Sweep
+from pipeline.geometry.scan import Floats, Sweep
 from pipeline.source import Line, References
 
-Floats = NDArray[np.float64]
 Numbers = NDArray[np.intp]
-ReadLines = Callable[[Numbers], NDArray[np.uint16]]
 
 BLOCK_LINES = 64  # read at a time
 SWATH_PX = 1.0  # largest distance of a planned swath from the recorded one
@@ -51,7 +49,7 @@ class RecordedSweep:
     time_s: Floats  # (line,) of mid exposure, since the start of the sweep
     exposure_ms: Floats  # (line,)
     valid_line: NDArray[np.bool_]  # (line,)
-    read_lines: ReadLines  # numbers of lines, ascending -> (line, sample, band) uint16
+    read_lines: Callable[[Numbers], NDArray[np.uint16]]  # numbers of lines, ascending -> (line, sample, band) uint16
 
     def __post_init__(self) -> None:
         lines = self.sweep.lines
@@ -160,8 +158,7 @@ class RecordedSource:
 
     def references(self, sweep: Sweep) -> References:
         """Return dark and white frames of the lines that serve a sweep; raises as `lines`."""
-        served = self.sweeps[int(self.pick(sweep).place[0])] if sweep.lines else self.sweeps[0]
-        return served.references
+        return (self.sweeps[int(self.pick(sweep).place[0])] if sweep.lines else self.sweeps[0]).references
 
     def cut_to_recorded(self, sweep: Sweep) -> Sweep | None:
         """Return a sweep without the lines at either end that were never captured; None where none was.
@@ -197,8 +194,7 @@ class RecordedSource:
         """
         own = self._own(sweep)
         if own is not None:
-            count = np.arange(sweep.lines)
-            return PickedLines(np.full(sweep.lines, own), count, np.zeros(sweep.lines, np.bool_))
+            return PickedLines(np.full(sweep.lines, own), np.arange(sweep.lines), np.zeros(sweep.lines, np.bool_))
         found = [self._nearest(sweep, group) for group in self._groups]
         whole = [one for one in found if (one[0] >= 0).all()]
         if not whole:
@@ -254,8 +250,7 @@ class RecordedSource:
                     continue
                 apart = one.line_distance / self.camera.ifov_rad
                 reach = max(REACH_STEPS * apart, PLANNED_REACH * sweep.step)
-                scan_px = one.tangents[candidates, 1] / self.camera.ifov_rad
-                near, distance = nearest_line(scan_px, sweep.line_px())
+                near, distance = nearest_line(one.tangents[candidates, 1] / self.camera.ifov_rad, sweep.line_px())
                 better = open_lines & (distance <= reach) & (distance < best - SAME_PX)
                 place[better], line[better], best[better] = number, candidates[near[better]], distance[better]
         return place, line, best

@@ -24,9 +24,8 @@ from pipeline.geometry.mirror import (
     position_to_direction,
     scene_to_direction,
 )
-from pipeline.geometry.scan import Axis, Sweep, points_of_scan
+from pipeline.geometry.scan import Axis, Floats, Sweep, points_of_scan
 
-Floats = NDArray[np.float64]
 MOST_DEG = 89.0  # a direction at a larger angle misses the scene plane
 
 

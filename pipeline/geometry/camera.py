@@ -121,8 +121,7 @@ def digitise(
         read = rng.standard_normal(signal.shape, dtype=np.float32) * np.float32(camera.read_noise_e)
         signal = read + rng.poisson(signal).astype(np.float32)
     dn = np.rint(signal / np.float32(camera.electrons_per_dn) + np.float32(camera.dark_dn))
-    raw: NDArray[np.uint16] = np.clip(dn, 0, camera.full_scale_dn).astype(np.uint16)
-    return raw
+    return np.asarray(np.clip(dn, 0, camera.full_scale_dn).astype(np.uint16))
 
 
 def _shot_and_read(expected: NDArray[np.float32], camera: LineCamera, rng: np.random.Generator) -> NDArray[np.float32]:
@@ -161,8 +160,7 @@ def bin_samples(dn: NDArray[np.uint16], binning: int) -> NDArray[np.uint16]:
             f"the sum of {binning} samples reaches {largest} DN, above the {LARGEST_SUM_DN} that 16 bits hold;"
             " use a smaller factor or fewer bits"
         )
-    raw: NDArray[np.uint16] = sums.astype(np.uint16)
-    return raw
+    return np.asarray(sums.astype(np.uint16))
 
 
 def footprint(light: NDArray[np.floating], camera: LineCamera) -> NDArray[np.float32]:

@@ -55,8 +55,7 @@ def position_to_normal(position: ArrayLike) -> Floats:
     half[..., :2] = xy * REST_TANGENT
     # r + e3 up to a factor, r = (X T, Y T, 1) / |.|: no angle and no difference of near numbers.
     half[..., 2] = 1 + np.sqrt(1 + half[..., 0] ** 2 + half[..., 1] ** 2)
-    normal: Floats = _unit(half) @ _DEVICE_AXES.astype(xy.dtype)
-    return normal
+    return np.asarray(_unit(half) @ _DEVICE_AXES.astype(xy.dtype))
 
 
 def normal_to_position(normal: ArrayLike) -> Floats:
@@ -73,15 +72,13 @@ def normal_to_position(normal: ArrayLike) -> Floats:
     lateral = 2 * device[..., 2] * np.hypot(device[..., 0], device[..., 1])
     inside = (device[..., 2] > 0) & (c2 > 0) & (lateral <= REST_TANGENT * c2 * (1 + RIM_SLACK[n.dtype.name]))
     _refuse(~inside, n, "is turned beyond the rim of the mirror's range (25 deg)")
-    position: Floats = 2 * device[..., 2:] * device[..., :2] / (c2 * n.dtype.type(REST_TANGENT))[..., None]
-    return position
+    return np.asarray(2 * device[..., 2:] * device[..., :2] / (c2 * n.dtype.type(REST_TANGENT))[..., None])
 
 
 def normal_to_device(normal: ArrayLike) -> Floats:
     """Return the components (..., 3) of normals along the device's X and Y axes and along the rest normal."""
     n = _vectors(normal, 3, "mirror normal")
-    device: Floats = n @ _DEVICE_AXES.T.astype(n.dtype)
-    return device
+    return np.asarray(n @ _DEVICE_AXES.T.astype(n.dtype))
 
 
 def direction_to_normal(direction: ArrayLike) -> Floats:
@@ -101,8 +98,7 @@ def reflect(ray: ArrayLike, normal: ArrayLike) -> Floats:
     """Reflect travelling rays, o = k - 2 (n . k) n, over (..., 3) arrays that broadcast."""
     n = np.asarray(normal, _kept(ray, normal))
     k = np.asarray(ray, n.dtype)
-    out: Floats = k - 2 * np.sum(n * k, axis=-1, keepdims=True) * n
-    return out
+    return np.asarray(k - 2 * np.sum(n * k, axis=-1, keepdims=True) * n)
 
 
 def position_to_direction(position: ArrayLike) -> Floats:
@@ -131,20 +127,6 @@ def direction_to_scene(direction: ArrayLike) -> Floats:
     return o[..., 1:] / o[..., :1]
 
 
-def line_rotation(direction: ArrayLike) -> Floats:
-    """Return the rotation of the slit's image in the scene tangent plane, for unit directions (..., 3) [rad].
-
-    It depends on the pose and not on the path (erratum E8). For a slit along y it is psi = atan2(o_y, 1 - o_z),
-    anticlockwise from xi to eta. The line is exactly straight and runs along (cos psi, sin psi) in (xi, eta).
-
-    A survey uses `scan.points_of_scan` instead, which includes the rotation; `line_centre` and `camera_slope` undo it.
-
-    Raises PoseError: a direction is not finite, not of length 1, or is the camera's own ray.
-    """
-    o = _units(direction, "view direction")
-    return np.arctan2(o[..., 1], _one_minus_z(o))
-
-
 def mirror_throughput(position: ArrayLike) -> Floats:
     """Return the light that the mirror passes at device positions (..., 2), relative to rest (erratum E16).
 
@@ -154,8 +136,7 @@ def mirror_throughput(position: ArrayLike) -> Floats:
     Raises PoseError: a position is not finite or beyond the rim.
     """
     normal = position_to_normal(position)
-    fraction: Floats = -normal[..., 2] / normal.dtype.type(_HALF)
-    return fraction
+    return np.asarray(-normal[..., 2] / normal.dtype.type(_HALF))
 
 
 def line_centre(along: Floats, scan: Floats, across: ArrayLike) -> Floats:
@@ -199,8 +180,7 @@ def _one_minus_z(o: Floats) -> Floats:
 def _unit(vectors: Floats) -> Floats:
     # Divide by the largest component first: near grazing the squares of small vectors lose digits or vanish.
     scaled = vectors / np.max(np.abs(vectors), axis=-1, keepdims=True)
-    unit: Floats = scaled / np.sqrt(np.sum(scaled**2, axis=-1, keepdims=True))
-    return unit
+    return np.asarray(scaled / np.sqrt(np.sum(scaled**2, axis=-1, keepdims=True)))
 
 
 def _kept(*values: ArrayLike) -> np.dtype[Any]:

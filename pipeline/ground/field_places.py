@@ -7,28 +7,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import PoseError
-from pipeline.ground.georeference import pixel_rows_m2, pixel_side_m
+from pipeline.ground.georeference import Floats, pixel_rows_m2, pixel_side_m
 from pipeline.ground.map_grid import SAMPLES, GroundGrid, least_mapped_sink, median_footprint_m
 from pipeline.ground.view import ROWS_AT_ONCE, GroundView, pixel_places
-from pipeline.lazy import deferred
-
-if TYPE_CHECKING:
-    import pyproj
-    import shapely
-    import shapely.affinity
-    from odc.geo.geobox import GeoBox
-    from shapely.geometry.base import BaseGeometry
-else:
-    pyproj = deferred("pyproj")
-    shapely = deferred("shapely")
-
-Floats = NDArray[np.float64]
+from pipeline.lazy import BaseGeometry, GeoBox, pyproj, shapely
 
 M2_PER_HECTARE = 10_000.0
 SECONDS_PER_HOUR = 3600.0
@@ -174,8 +161,7 @@ class PlacedPicture:
 
     @property
     def outline(self) -> BaseGeometry:
-        corners = shapely.box(0, 0, self.shape[1], self.shape[0])
-        edges = shapely.segmentize(corners, max(self.shape) / EDGE_PARTS)
+        edges = shapely.segmentize(shapely.box(0, 0, self.shape[1], self.shape[0]), max(self.shape) / EDGE_PARTS)
         return shapely.affinity.affine_transform(edges, self.geobox.affine.to_shapely())
 
     def to_pixels(self, shape: BaseGeometry) -> BaseGeometry:
@@ -229,8 +215,7 @@ class PosedField:
 
     def _pixels(self, plane: Floats) -> Floats:
         normal = self.view.normal
-        ground = np.column_stack([plane, -(plane @ normal[:2]) / normal[2]])
-        seen = self.view.ground_to_scene(ground)
+        seen = self.view.ground_to_scene(np.column_stack([plane, -(plane @ normal[:2]) / normal[2]]))
         return np.asarray(seen[:, ::-1] + np.array([self.shape[1] / 2, self.shape[0] / 2]))
 
     def pixel_areas_m2(self, rows: slice, columns: slice) -> Floats | None:

@@ -3,21 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
 
-from pipeline.lazy import deferred
-
-if TYPE_CHECKING:  # half a second to import, for scenes with a place alone
-    import odc.geo.geobox as odc_geobox
-    import pyproj
-    from odc.geo.geobox import GeoBox
-else:
-    odc_geobox = deferred("odc.geo.geobox")
-    pyproj = deferred("pyproj")
+from pipeline.lazy import GeoBox, odc_geobox, pyproj
 
 Floats = NDArray[np.float64]
 WGS84 = 4326  # by EPSG
@@ -35,8 +27,7 @@ def zoomed_out(geobox: GeoBox, factor: int, shape: tuple[int, int]) -> GeoBox:
     if factor == 1 and tuple(geobox.shape) == shape:
         return geobox
     a, b, c, d, e, f = geobox.affine[:6]
-    coarser = Affine(a * factor, b * factor, c, d * factor, e * factor, f)
-    return odc_geobox.GeoBox(shape, coarser, geobox.crs)
+    return odc_geobox.GeoBox(shape, Affine(a * factor, b * factor, c, d * factor, e * factor, f), geobox.crs)
 
 
 def shift_px(grid: GeoBox, other: GeoBox) -> tuple[float, float] | None:

@@ -10,27 +10,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import PoseError
-from pipeline.ground.georeference import WGS84
+from pipeline.ground.georeference import WGS84, Floats
 from pipeline.ground.view import LEAST_SINK, GroundView, RigPose, pixel_places
-from pipeline.lazy import deferred
+from pipeline.lazy import GeoBox, odc_geobox, pyproj
 from pipeline.rectify.resample import resample
 
-if TYPE_CHECKING:  # half a second to import, for maps alone
-    import odc.geo.geobox as odc_geobox
-    import pyproj
-    from odc.geo.geobox import GeoBox
-    from pyproj import CRS
-else:
-    odc_geobox = deferred("odc.geo.geobox")
-    pyproj = deferred("pyproj")
-
-Floats = NDArray[np.float64]
 Pixel = TypeVar("Pixel", bound=np.generic)
 
 UTM_LATITUDES = (-80.0, 84.0)
@@ -77,7 +67,7 @@ def map_crs(pose: RigPose, epsg: int | None = None) -> pyproj.CRS:
     return crs
 
 
-def _made_for(crs: CRS, pose: RigPose) -> bool:
+def _made_for(crs: pyproj.CRS, pose: RigPose) -> bool:
     """Return whether the rig is in the CRS's area of use, which may cross the date line."""
     if crs.area_of_use is None:
         return True
@@ -93,7 +83,7 @@ class MapFrame:
     """Convert between the plane of ground under a posed rig and the coordinates of a map (x east, y north) [m]."""
 
     view: GroundView
-    crs: CRS
+    crs: pyproj.CRS
 
     def ground_to_geodetic(self, ground_m: ArrayLike) -> Floats:
         """Return (..., 3) longitude, latitude [deg] and ellipsoidal height [m] of east, north, up of the foot."""
@@ -263,8 +253,7 @@ def _bounds(frame: MapFrame, outline: Floats) -> tuple[float, float, float, floa
 
     Lines of the scene are lines on the ground.
     """
-    fraction = np.linspace(0, 1, EDGE_POINTS)[:, None, None]
-    sides = outline + fraction * (np.roll(outline, -1, axis=0) - outline)
+    sides = outline + np.linspace(0, 1, EDGE_POINTS)[:, None, None] * (np.roll(outline, -1, axis=0) - outline)
     places = frame.ground_to_map(frame.view.scene_to_ground(sides.reshape(-1, 2)))
     if not np.isfinite(places).all():
         raise PoseError(f"the field's footprint does not fit on the map {frame.crs.name} (pose {frame.view.pose})")

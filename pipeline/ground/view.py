@@ -120,7 +120,6 @@ class GroundView:
         """
         if self.pose.height_m is not None:
             return self.pose.height_m
-        assert self.pose.range_m is not None
         if self.sinks[0] <= LEAST_SINK:
             raise PoseError(
                 f"a range needs a view direction that meets the ground, got {self.pose}; tilt it below the horizon, "
@@ -131,8 +130,7 @@ class GroundView:
     def sink(self, points_px: ArrayLike) -> Floats:
         """Return w of scene points (..., 2): above 0 where the ray meets the ground, 0 at the horizon."""
         tangents = _pairs(points_px) * self.ifov_rad
-        w: Floats = self.sinks[0] + tangents[..., 1] * self.sinks[1] + tangents[..., 0] * self.sinks[2]
-        return w
+        return np.asarray(self.sinks[0] + tangents[..., 1] * self.sinks[1] + tangents[..., 0] * self.sinks[2])
 
     def scene_to_ground(self, points_px: ArrayLike) -> Floats:
         """Return where rays of scene points (..., 2), y and x [px], meet the ground: (..., 3) from the foot [m].
@@ -155,8 +153,7 @@ class GroundView:
         """
         seen = (np.asarray(ground_m, np.float64) - np.array([0.0, 0.0, self.height_m])) @ self.axes.T
         depth = np.where(seen[..., :1] > 0, seen[..., :1], np.nan)
-        points: Floats = seen[..., :0:-1] / (depth * self.ifov_rad)
-        return points
+        return np.asarray(seen[..., :0:-1] / (depth * self.ifov_rad))
 
     def area_m2(self, points_px: ArrayLike) -> Floats:
         """Return the ground area of a pixel on a map (of a slope its level part), (...) [m2]; NaN off the ground.

@@ -4,29 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, patch_pixels
 from pipeline.ground.field_places import BORDER_PX, FieldPlace
-from pipeline.ground.georeference import WGS84
-from pipeline.lazy import deferred
+from pipeline.ground.georeference import WGS84, Floats
+from pipeline.lazy import BaseGeometry, pyproj, rasterio, rasterio_features, shapely
 
-if TYPE_CHECKING:
-    import pyproj
-    import rasterio
-    import rasterio.features as rasterio_features
-    import shapely
-    from shapely.geometry.base import BaseGeometry
-else:
-    pyproj = deferred("pyproj")
-    rasterio = deferred("rasterio")
-    rasterio_features = deferred("rasterio.features")
-    shapely = deferred("shapely")
 Mask = NDArray[np.bool_]
-Floats = NDArray[np.float64]
 ROUND_THE_FIELD = 1.0  # times its size, on every side, within which polygons are converted
 EDGE_PARTS = 256  # of that: a straight edge of one map is curved on another
 FAR_EAST_DEG = 90.0  # beyond this longitude of the field, those of polygons count from it and not from Greenwich
@@ -75,8 +62,7 @@ def _unwrapped(shape: BaseGeometry, middle_deg: float | None) -> BaseGeometry:
         return shape
 
     def wrapped(places: Floats) -> Floats:
-        lon = (places[:, 0] - middle_deg + 180) % 360 - 180 + middle_deg
-        return np.column_stack([lon, places[:, 1:]])
+        return np.column_stack([(places[:, 0] - middle_deg + 180) % 360 - 180 + middle_deg, places[:, 1:]])
 
     return shapely.make_valid(shapely.transform(shape, wrapped))
 

@@ -56,10 +56,9 @@ def uniform_sweeps(
     Raises SettingsError: the overlap is negative or as wide as a line. Raises PoseError: the field is beyond the
     mirror's range.
     """
-    covering = _cover(grid, camera, along, step=step, overlap_px=overlap_px)
     return [
         replace(sweep, name=f"scan-{number}", kind="coarse", binning=1, exposure_ms=exposure_ms)
-        for number, sweep in enumerate(covering)
+        for number, sweep in enumerate(_cover(grid, camera, along, step=step, overlap_px=overlap_px))
     ]
 
 
@@ -165,8 +164,7 @@ def _swath_centres(
             overlap = (width.sum() - (high - low)) / count
             if overlap < least_overlap - ROUNDING_PX:
                 break
-            starts = low - overlap / 2 + np.concatenate([[0.0], np.cumsum(width - overlap)[:-1]])
-            centres = starts - reach[:, 0]
+            centres = low - overlap / 2 + np.concatenate([[0.0], np.cumsum(width - overlap)[:-1]]) - reach[:, 0]
         else:
             return centres
 
@@ -186,8 +184,7 @@ def _scan_range(swath: float, seen: NDArray[np.float64], scan: int, camera: Line
     Lines lie on the scene's own rows, so that a swath through the axis needs no interpolation along the scan.
     """
     origin = (step - 1 - (scan - 1)) / 2  # centre of the first (coarse) row
-    rows = origin + step * np.array([0, -(-scan // step) - 1])
-    centres, _ = scan_of_points(swath, camera, seen[:, None], rows)
+    centres, _ = scan_of_points(swath, camera, seen[:, None], origin + step * np.array([0, -(-scan // step) - 1]))
     # The line through a point moves one way with either coordinate, so the corners hold the extremes.
     first = int(np.floor((centres.min() - origin) / step + ROUNDING_PX)) - TAPS_BEFORE
     last = int(np.floor((centres.max() - origin) / step + ROUNDING_PX)) + TAPS_AFTER

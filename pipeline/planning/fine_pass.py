@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import CostModel, Sweep, exposing
+from pipeline.geometry.scan import CostModel, Floats, Sweep, exposing
 from pipeline.planning.coverage import some_lines
 from pipeline.planning.partial_scans import LineRun, PatchRows, RunTimes, choose_runs
 from pipeline.planning.uniform_scans import MIOU, ScanPerformance, format_scan, longest_exposure
@@ -26,7 +26,6 @@ FIRST_STEP = 4  # positions of the full scan from line to line of the first pass
 FIRST_STEPS = (4, 8)  # allowed values
 LEAST_GAIN = 1e-3  # of mIoU; below it there is no second pass
 EXPOSURES = 7  # that are tried, equally spaced by logarithm
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -71,8 +70,7 @@ class SecondPass:
     @property
     def key(self) -> dict[str, Any]:
         """Return the parameters of the planner, without the first pass."""
-        full = [asdict(sweep) for sweep in self.full]
-        known = {"fine_s": self.seconds, "margin_px": self.margin_px, "full": full}
+        known = {"fine_s": self.seconds, "margin_px": self.margin_px, "full": [asdict(sweep) for sweep in self.full]}
         return {**known, "camera": asdict(self.camera), "cost": asdict(self.cost)}
 
     @property
@@ -115,8 +113,7 @@ class SecondPass:
             self.cost.setup_seconds(exposed) * sweeps_a_run,
             lambda runs: self.cost.seconds(sweeps_of(runs), self.camera),
         )
-        wanted = np.where(gain > 0, gain, 0.0)
-        chosen = choose_runs(self.rows, wanted, times, seconds=self.seconds, several=True)
+        chosen = choose_runs(self.rows, np.where(gain > 0, gain, 0.0), times, seconds=self.seconds, several=True)
         if chosen is None:
             return FinePlan([], np.empty(0, np.intp), 0.0, 0.0, reason="no run of lines with a gain fits the time")
         sweeps, patch_index = sweeps_of(chosen.runs), self.rows.patches(chosen.runs)
@@ -152,9 +149,7 @@ class SecondPass:
         plans = [plan for plan in plans if plan.seconds <= self.seconds]  # recorded lines may have longer exposures
         plan = max(plans, key=lambda made: (made.expected_gain, -made.seconds), default=None)
         if plan is None or not plan.sweeps or plan.expected_gain >= LEAST_GAIN:
-            return plan or FinePlan(
-                [], np.empty(0, np.intp), 0.0, 0.0, reason="no lines that promise more fit the time"
-            )
+            return plan or FinePlan([], np.empty(0, np.intp), 0.0, 0.0, reason="no second pass fits the time")
         reason = f"no second pass: its expected gain is {100 * plan.expected_gain:.2f} points"
         return FinePlan([], np.empty(0, np.intp), 0.0, plan.expected_gain, reason=reason)
 
@@ -180,11 +175,11 @@ def merged_ms(first_ms: float, later_ms: float, first_fraction: float) -> float:
 
 def every_nth(full: Sequence[Sweep], step: int = FIRST_STEP, exposure_ms: float | None = None) -> list[Sweep]:
     """Return the first pass: every ``step``-th line of the sweeps of a full scan, to its last line or just beyond."""
-    found = []
-    for number, sweep in enumerate(full):
-        name, lines = f"coarse-{number}", -(-(sweep.lines - 1) // step) + 1
-        found.append(replace(sweep, name=name, kind="coarse", step=step, held=1, lines=lines, exposure_ms=exposure_ms))
-    return found
+    shared: dict[str, Any] = {"kind": "coarse", "step": step, "held": 1, "exposure_ms": exposure_ms}
+    return [
+        replace(sweep, name=f"coarse-{number}", lines=-(-(sweep.lines - 1) // step) + 1, **shared)
+        for number, sweep in enumerate(full)
+    ]
 
 
 def lines_between(

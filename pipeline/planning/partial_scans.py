@@ -20,12 +20,11 @@ from numpy.typing import NDArray
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import CostModel, Sweep, exposing, scene_to_sweep
+from pipeline.geometry.scan import CostModel, Floats, Sweep, exposing, scene_to_sweep
 from pipeline.planning.coverage import lines_showing, some_lines
 
 LEAST_PRICE, MOST_PRICE = 1e-9, 1e6  # of a second, in fractions of the total gain: all runs pay, or none
 HALVINGS = 48  # of the logarithm of the interval between them
-Floats = NDArray[np.float64]
 LineRun = tuple[int, int, int]  # number of the sweep, its first line, and the one after its last
 
 
@@ -204,8 +203,7 @@ def _longest_run(values: Floats, first: NDArray[np.intp], stop: NDArray[np.intp]
         return None
     summed = np.concatenate([[0.0], np.cumsum(values[there])])
     end = np.searchsorted(stop[there], first[there] + lines, side="right")  # the row after its last
-    gain = np.where(end > np.arange(there.size), summed[end] - summed[:-1], 0.0)
-    begin = int(gain.argmax())
+    begin = int(np.where(end > np.arange(there.size), summed[end] - summed[:-1], 0.0).argmax())
     some = np.flatnonzero(values[there[begin : end[begin]]] > 0)
     if not some.size:
         return None

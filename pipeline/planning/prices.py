@@ -25,8 +25,7 @@ def select_patches(score: NDArray[np.floating], count: int, valid: NDArray[np.bo
     """
     allowed = np.arange(len(score)) if valid is None else np.flatnonzero(valid)
     given = np.asarray(score, np.float64)[allowed]
-    order = np.argsort(np.where(np.isnan(given), np.inf, -given), kind="stable")
-    return allowed[order[:count]]
+    return allowed[np.argsort(np.where(np.isnan(given), np.inf, -given), kind="stable")[:count]]
 
 
 def frame_patches(
@@ -67,8 +66,7 @@ def count_samples(sweeps: Sequence[Sweep], camera: LineCamera, grid: SceneGrid) 
 
 def raw_bytes(sweeps: Sequence[Sweep], camera: LineCamera, bands: int) -> int:
     """Count the bytes of the captured lines, with all of their samples."""
-    samples = sum(sweep.lines * (camera.samples // sweep.binning) for sweep in sweeps)
-    return samples * bands * BYTES_PER_SAMPLE
+    return sum(sweep.lines * (camera.samples // sweep.binning) for sweep in sweeps) * bands * BYTES_PER_SAMPLE
 
 
 def capture_savings(

@@ -10,18 +10,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import SettingsError, WavelengthError
-from pipeline.lazy import deferred
-
-if TYPE_CHECKING:
-    import spyndex
-else:
-    spyndex = deferred("spyndex")
+from pipeline.lazy import spyndex
 
 Floats = NDArray[np.float32]
 

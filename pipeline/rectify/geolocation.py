@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import camera_slope, line_centre
-from pipeline.geometry.scan import Axis
+from pipeline.geometry.scan import Axis, Floats
 from pipeline.rectify.scan_paths import ScanPath
 
 NEWTON_ROUNDS = 4
@@ -24,8 +24,6 @@ END_KNOTS = 4  # whose mean step is used beyond the end
 FAR_KNOTS = 1e6  # Newton does not return from a larger step
 SETTLED_PX = 1e-7
 BLOCK_PX = 16384  # some twenty temporaries of this length stay in cache
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -134,8 +132,7 @@ def _catmull_rom_pieces(knots: Floats, alone: float) -> Floats:
 def _find_knots(curve: KnotCurve, a: Floats, b: Floats, tolerance: float) -> Floats:
     """Return the knot coordinate (n,) of the line that sees each point: by Newton, or by bisection if that fails."""
     scan_path = curve.scan_path
-    middle = np.full_like(a, scan_path.across[len(scan_path) // 2])
-    rough = curve.rough_knot(line_centre(a, b, middle))
+    rough = curve.rough_knot(line_centre(a, b, np.full_like(a, scan_path.across[len(scan_path) // 2])))
     knot = rough.copy()
     left = np.flatnonzero(np.isfinite(knot))
     for turn in range(NEWTON_ROUNDS + 1):

@@ -8,17 +8,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.lazy import deferred
-
-if TYPE_CHECKING:  # takes a second to import, and the plan of a survey never needs it
-    import torch
-else:
-    torch = deferred("torch")
+from pipeline.lazy import torch
 
 Kernel = Literal["catmull-rom", "bilinear", "nearest"]
 Rows: TypeAlias = NDArray[np.intp]

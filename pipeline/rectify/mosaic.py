@@ -37,9 +37,7 @@ class MosaicPart:
 def edge_distance(coordinates: NDArray[np.float64], lines: int, samples: int) -> NDArray[np.float64]:
     """Return the distance (...) of coordinates (..., 2) to the nearest edge of their sweep [px of it]; NaN off it."""
     line, sample = coordinates[..., 0], coordinates[..., 1]
-    down = np.minimum(line + 0.5, lines - 0.5 - line)
-    across = np.minimum(sample + 0.5, samples - 0.5 - sample)
-    return np.minimum(down, across)
+    return np.minimum(np.minimum(line + 0.5, lines - 0.5 - line), np.minimum(sample + 0.5, samples - 0.5 - sample))
 
 
 def mosaic(parts: Sequence[MosaicPart]) -> tuple[NDArray[np.float32], NDArray[np.intp]]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import Axis, points_of_scan
+from pipeline.geometry.scan import Axis, Floats, points_of_scan
 from pipeline.rectify.geolocation import KnotCurve, drop_unseen, knots_of_points, path_geolocation
 from pipeline.rectify.scan_paths import ScanPath, make_scan_paths
 from pipeline.signal.lines import CondensedSignal, Signal, signal_of
@@ -24,8 +24,6 @@ PIECE_SAMPLES = 64
 MARGIN_PX = 2.0  # of the grid: half a pixel, half a sample, and rounding
 TAPS = 3  # knots and samples that a kernel reads beyond the outermost coordinate
 LEAST_TIE_PX = 4  # closer tie points take a byte a pixel and more
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -4,18 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import reduce
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.lazy import deferred
+from pipeline.lazy import torch
 from pipeline.rectify.kernels import TAPS, Kernel, Rows, Unlocked, Windows, weighted_rows, windows
-
-if TYPE_CHECKING:
-    import torch
-else:
-    torch = deferred("torch")
 
 LEAST_WEIGHT = 0.5
 ROUNDING = 1e-6

@@ -85,8 +85,7 @@ def make_scan_paths(
     scan, across, lines = line_centres(position, camera, usable, shift_px)
     if not len(lines):
         return ()
-    apart = camera.ifov_rad * binning
-    step = _usual_step(scan, lines, apart) if step_px is None else step_px * camera.ifov_rad
+    step = _usual_step(scan, lines, camera.ifov_rad * binning) if step_px is None else step_px * camera.ifov_rad
     bends = np.abs(np.diff(scan, 2))  # of a position's own noise: sqrt 6 times its standard deviation
     noise = float(np.median(bends)) * SIGMA_OF_MEDIAN / 6**0.5 if len(bends) else 0.0
     runs = _runs(scan, max(GAP_STEPS * step, NOISE_SIGMAS * noise), DWELL_STEPS * step)
@@ -224,8 +223,7 @@ def number_lines(time_s: Floats, frame_s: float) -> LineNumbers:
     number = np.zeros(len(time_s), np.intp)
     if len(count):
         same = np.minimum(np.searchsorted(time_s[usable], time_s), len(count) - 1)
-        before = count[np.maximum(np.cumsum(usable) - 1, 0)]
-        number = np.where(time_s[usable][same] == time_s, count[same], before)
+        number = np.where(time_s[usable][same] == time_s, count[same], count[np.maximum(np.cumsum(usable) - 1, 0)])
     return LineNumbers(
         number=number,
         usable=usable,

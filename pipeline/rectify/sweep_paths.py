@@ -43,8 +43,7 @@ class SweepPath:
     @property
     def usable(self) -> NDArray[np.bool_]:
         """Return (line,) valid lines with a time stamp and a position of their own."""
-        known = np.isfinite(self.lines.position.sum(axis=1))
-        return np.asarray(self.lines.valid_line & self.numbers.usable & known)
+        return np.asarray(self.lines.valid_line & self.numbers.usable & np.isfinite(self.lines.position.sum(axis=1)))
 
     @property
     def shift_px(self) -> NDArray[np.float64]:
@@ -211,6 +210,5 @@ def capture_numbers(placed: Sequence[PlacedSweep], camera: LineCamera, grid: Pix
     found = np.full(points.shape[:2], -1, np.int16)
     for number in sorted(range(len(placed)), key=lambda one: -placed[one].lines.sweep.step):  # the closest last
         for scan_path, _ in placed[number].scan_paths:
-            seen = np.isfinite(placed[number].locate_point(scan_path, camera, points)[..., 0])
-            found[seen] = number
+            found[np.isfinite(placed[number].locate_point(scan_path, camera, points)[..., 0])] = number
     return found.repeat(CELL_PX, axis=0).repeat(CELL_PX, axis=1)[:height, :width]

@@ -27,7 +27,6 @@ from pipeline.rig.mirror_controller import MotionLog, wire_positions
 
 Floats = NDArray[Any]  # float64
 Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 Span = tuple[float, float]  # moments between which a command took effect: sent and acknowledged [s]
 
 
@@ -51,8 +50,7 @@ class MirrorScanPath:
 
 def played_scan_path(position: Floats, rate_hz: float) -> MirrorScanPath:
     """Return the scan path of positions (held, 2) that are each held for 1 / ``rate_hz``, one after the other."""
-    ends = np.repeat(np.arange(len(position) + 1), 2)[1:-1] / rate_hz
-    return MirrorScanPath(ends, np.repeat(position, 2, axis=0))
+    return MirrorScanPath(np.repeat(np.arange(len(position) + 1), 2)[1:-1] / rate_hz, np.repeat(position, 2, axis=0))
 
 
 @dataclass(frozen=True)
@@ -60,7 +58,7 @@ class LinePositions:
     """Mirror positions of lines, and the method that gave them. NaN where ``valid`` is False."""
 
     position: Floats  # (line, 2) device X and Y at mid exposure
-    valid: Bools  # (line,)
+    valid: NDArray[np.bool_]  # (line,)
     method: Literal["trigger", "log", "command"]
     residual_px: float | None  # how far they may be off by the times of the commands; None where it is not measured
     notes: tuple[str, ...] = ()
@@ -214,8 +212,7 @@ def next_path(sweep: Sweep, first: int, camera: LineCamera, *, vector_pairs: int
 
     Raises SettingsError: the positions of one line do not fit the memory. Raises PoseError: one is beyond the disk.
     """
-    rest = replace(sweep, lines=sweep.lines - first)
-    stop = first + memory_loads([rest], vector_pairs - LEAD)[0].parts[0].lines[1]
+    stop = first + memory_loads([replace(sweep, lines=sweep.lines - first)], vector_pairs - LEAD)[0].parts[0].lines[1]
     return path_of(sweep, (first, stop), camera, triggered=triggered)
 
 

@@ -15,7 +15,6 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,6 +26,7 @@ from pipeline.rig import pro_mode as pro
 from pipeline.rig.device_settings import Patience, ReadBack, SurveyRig
 from pipeline.rig.transports import (
     SYSTEM_CLOCK,
+    Answer,
     Clock,
     Closing,
     DeadlinePassed,
@@ -50,8 +50,6 @@ ID, VERSION, SERIAL = "GETID", "GETVERSION", "GETSN"
 GO_PRO, GO_PRO_CRC = "GOPRO", "GOPROCRC"
 OK = "OK"
 REFUSALS = ("NO", "OL", "OU", "ERROR")  # unknown or not now; below or above the range; an error on the device
-
-Answer = TypeVar("Answer")
 
 
 def read_done(line: bytes, request: str, port: str) -> bool:

@@ -19,7 +19,6 @@ from pipeline.rig.drivers import CameraDriver, MirrorDriver
 from pipeline.rig.mirror_controller import MirrorController
 from pipeline.rig.transports import Clock
 
-Verdict = Literal["ok", "warn", "fail"]
 Device = Literal["mirror", "camera"]
 
 SQUARE = ((0.03, 0.03), (0.03, -0.03), (-0.03, -0.03), (-0.03, 0.03))  # within 0.05 of the middle
@@ -37,7 +36,7 @@ class CheckRow:
     device: Device
     asked: str
     came: str
-    verdict: Verdict = "ok"
+    verdict: Literal["ok", "warn", "fail"] = "ok"
     mend: str = ""
 
 

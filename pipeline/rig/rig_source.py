@@ -258,5 +258,4 @@ class RigSource:
 
 def _sums(frame: NDArray[Any], binning: int) -> NDArray[np.float32]:
     count = len(frame) // binning
-    sums: NDArray[np.float32] = frame[: count * binning].reshape(count, binning, -1).sum(axis=1, dtype=np.float32)
-    return sums
+    return np.asarray(frame[: count * binning].reshape(count, binning, -1).sum(axis=1, dtype=np.float32))

@@ -153,11 +153,10 @@ def calibrate(
     """
     elements = _judged(raw, references)
     line_gain = _line_gain(raw, elements.references, position)
-    values = _scene_values(raw, elements, line_gain)
     valid = _valid(raw, elements, saturated_dn)
     if line_gain is not None:
         valid[~np.isfinite(line_gain)] = False
-    return values, valid
+    return _scene_values(raw, elements, line_gain), valid
 
 
 def of_bands(references: References, bands: Sequence[int]) -> References:

@@ -18,8 +18,8 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import cuts
 from pipeline.geometry.scan import Sweep
 from pipeline.readings import SIGMA_OF_MEDIAN
-from pipeline.signal.calibrate import calibrate, judge_elements
-from pipeline.signal.components import Components
+from pipeline.signal.calibrate import Bools, calibrate, judge_elements
+from pipeline.signal.components import Components, Scores
 from pipeline.signal.lines import BLOCK_LINES, CondensedLines
 from pipeline.signal.subspace import SignalStatistics
 from pipeline.source import Line, References, SweepLines
@@ -37,8 +37,6 @@ RESIDUAL_STEP = 0.5  # in which residuals of rare spectra are kept [noise's devi
 
 SLACK, DIGITS = 1e-3, 1e-5  # of a step, and of a score, by which sums of float32 may differ
 
-Scores = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 Store = Callable[[int, Scores, NDArray[np.uint8]], None]
 Report = Callable[[float], None]
 
@@ -172,8 +170,7 @@ def find_rare(ratio: NDArray[np.float32], law: ResidualLaw, false_alarm: float) 
         high[within] = mean[within] > _limit(law.freedom * size, part / size)
         if high.any():  # all spectra of the window that the mark came from
             back = tuple(-1 if side % 2 == 0 else 0 for side in (lines, samples))
-            reach = uniform_filter(high, (lines, samples), mode="constant", origin=back)
-            rare |= known & (reach > 0.5 / size)
+            rare |= known & (uniform_filter(high, (lines, samples), mode="constant", origin=back) > 0.5 / size)
     return rare
 
 

@@ -23,7 +23,6 @@ from pipeline.source import References, SweepLines
 BLOCK_LINES = 64  # a shard of a stored sweep: one line of it takes as long to read as all
 CHUNK_SAMPLES = 32  # likewise along the line
 
-_Key = tuple[int, int, int, int]  # sweep, block, samples held
 Raw = NDArray[np.integer[Any]]  # numbers of the camera, or scores in steps
 ReadWindow = Callable[[slice, slice], Raw]  # (lines, samples) -> (line, sample, band)
 
@@ -207,7 +206,7 @@ class LineCache:
     def __init__(self, most_bytes: int) -> None:
         self.most_bytes = most_bytes
         self.bytes_held = 0
-        self._blocks: OrderedDict[_Key, _Block] = OrderedDict()
+        self._blocks: OrderedDict[tuple[int, int, int, int], _Block] = OrderedDict()  # sweep, block, samples held
         self._lock = threading.Lock()
 
     def window(self, lines: SweepLines, wanted: slice, samples: slice, *, likely: slice | None = None) -> Raw:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from pipeline.lazy import deferred
 from pipeline.readings import SIGMA_OF_MEDIAN
-from pipeline.signal.components import Components
+from pipeline.signal.components import Components, Floats
 
 compiled_loops: Any = deferred("pipeline.signal.compiled_loops")
 
@@ -43,7 +43,6 @@ TRACY_WIDOM = (
 
 SUMS = ("lit", "total", "single", "block", "block_total", "largest")
 
-Floats = NDArray[np.float64]
 Values = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 
@@ -332,8 +331,7 @@ def significant_axes(covariance: Floats, spectra: int, false_alarm: float, *, kn
     """
     bands = len(covariance)
     values, vectors = np.linalg.eigh(covariance)
-    noise = np.maximum(values[known:], 0)
-    edge = noise_edge(noise, min(1.0, bands / max(spectra, 1)), false_alarm)
+    edge = noise_edge(np.maximum(values[known:], 0), min(1.0, bands / max(spectra, 1)), false_alarm)
     count = int(np.count_nonzero(values > edge))
     return vectors[:, ::-1][:, : min(count, bands - known, max(spectra - 1, 0))]
 

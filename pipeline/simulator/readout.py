@@ -31,10 +31,8 @@ from pipeline.simulator.effects.counting import (
     rounded_counts,
     well_reached,
 )
-from pipeline.simulator.effects.effect import OFF, SweepBlock
+from pipeline.simulator.effects.effect import OFF, Radiance, SweepBlock
 from pipeline.simulator.render import Choice
-
-Radiance = NDArray[np.float32]
 
 
 def read_out(light: Radiance, block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> NDArray[np.uint16]:
@@ -87,9 +85,8 @@ class Readout:
             self.block.rig.camera,
             np.empty(light.shape, np.uint16),
         )
-        added = np.ravel(np.asarray(self.added, np.float32))
         finite = compiled_loops.read_merged(
-            *(seen.reshape(-1), added, deviate.reshape(-1), self.read_noise_e),
+            *(seen.reshape(-1), np.ravel(np.asarray(self.added, np.float32)), deviate.reshape(-1), self.read_noise_e),
             *(camera.electrons_per_dn, camera.dark_dn, camera.full_scale_dn, raw.reshape(-1)),
         )
         least = least_expected(self.read_noise_e)
@@ -128,8 +125,7 @@ class Readout:
     @cached_property
     def added(self) -> Radiance | np.float32:
         """Return electrons that come without light: a number, or (sample, band) where there are hot elements."""
-        dark = self._variant(DARK_CURRENT.name) != OFF
-        same = np.float32(dark_electrons(self.block.rig) if dark else 0.0)
+        same = np.float32(dark_electrons(self.block.rig) if self._variant(DARK_CURRENT.name) != OFF else 0.0)
         if self._variant(DEFECTS.name) == OFF or not self.block.rig.detector.hot_fraction:
             return same
         return hot_electrons(self.block.rig, len(self.block.wavelength_nm)) + same

@@ -9,11 +9,10 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError
 from pipeline.geometry.mirror import direction_to_scene, position_to_direction, position_to_normal
-from pipeline.geometry.scan import Sweep, line_positions, shifted_position
+from pipeline.geometry.scan import Floats, Sweep, line_positions, shifted_position
 from pipeline.simulator.effects.air import ABSORPTION, PARALLAX, PATH_RADIANCE, TURBULENCE, WIND
 from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.counting import (
@@ -25,7 +24,7 @@ from pipeline.simulator.effects.counting import (
     SATURATION,
     SHOT,
 )
-from pipeline.simulator.effects.effect import OFF, Effect, SweepBlock
+from pipeline.simulator.effects.effect import OFF, Effect, Radiance, SweepBlock
 from pipeline.simulator.effects.lighting import BRDF, CLOUD, DRIFT, POLARISATION, VIGNETTING
 from pipeline.simulator.effects.line import BOXES, FOLDED, ROTATION, SLIT, SMEAR, box_of, smeared_positions
 from pipeline.simulator.effects.pointing import HYSTERESIS, JITTER, LAG, STAIRCASE, THERMAL_DRIFT
@@ -36,8 +35,6 @@ from pipeline.simulator.optics.scene_radiance import SceneSampler
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 
-Floats = NDArray[np.float64]
-Radiance = NDArray[np.float32]
 PROBES = 17  # lines of a sweep and samples of a line that tell how far a footprint's shape varies
 
 

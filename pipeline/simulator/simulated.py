@@ -128,8 +128,7 @@ class SimulatedSweep:
     @property
     def time_s(self) -> NDArray[np.float64]:
         """Return the time of each line at mid exposure, since the start of the sweep [s]."""
-        camera = exposing(self.source.camera, self.sweep)
-        return camera.mid_exposure_s(np.arange(self.sweep.lines, dtype=np.float64))
+        return exposing(self.source.camera, self.sweep).mid_exposure_s(np.arange(self.sweep.lines, dtype=np.float64))
 
     @property
     def valid_line(self) -> NDArray[np.bool_]:
@@ -195,8 +194,7 @@ def render_lines(
     for first in range(0, len(lines), BLOCK_LINES):
         some = slice(first, first + BLOCK_LINES)
         block = sweep_block(scene, rig, sweep, lines[some], seed=seed, started_s=started_s)
-        light = expected_light(scene, block, choice)
-        raw[some] = bin_samples(read_out(light, block, choice), sweep.binning)
+        raw[some] = bin_samples(read_out(expected_light(scene, block, choice), block, choice), sweep.binning)
     return raw
 
 
@@ -238,13 +236,12 @@ def take_references(scene: RasterScene, rig: Rig, choice: Choice, sweep: Sweep) 
         seen[dead] = 0
         elements = dead | (hot_electrons(rig, seen.shape[1]) > 0)  # of a sum one is enough
         bad = _binned(elements.astype(np.float32), sweep.binning) > 0 if elements.any() else None
-    white = dark + seen / np.float32(rig.camera.electrons_per_dn)
     white_reference = scene.white_reference.astype(np.float32)
     if (response := choice.variant(RESPONSE.name)) != OFF:
         white_reference = RESPONSE.change(white_reference[None, None], block, response)[0, 0]
     return References(
         dark=_binned(dark, sweep.binning),
-        white=_binned(white, sweep.binning),
+        white=_binned(dark + seen / np.float32(rig.camera.electrons_per_dn), sweep.binning),
         white_reference=white_reference,
         bad=bad,
         by_mirror=choice.variant(VIGNETTING.name) != OFF,

@@ -81,16 +81,14 @@ def create_class_map(
     """Create a class map of (y, x) ``shape`` without classified pixels."""
     names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
     group, place = create_placed_group(path, "class map", grid, shape, names)
-    about = {**class_flags(legend.names, legend.colours), **place}
-    _create_flat(group, "classes", ("y", "x"), shape, "|u1", about)
+    _create_flat(group, "classes", ("y", "x"), shape, "|u1", {**class_flags(legend.names, legend.colours), **place})
     _create_flat(group, "confidence", ("y", "x"), shape, "<f4", {**CONFIDENCE, **place})
 
 
 def _create_flat(
     group: zarr.Group, name: str, dims: tuple[str, ...], shape: tuple[int, ...], dtype: str, about: dict[str, Any]
 ) -> None:
-    spec = image_spec(dims, shape, dtype, whole=True)
-    create_array(group, name, spec, about, packing=MAP_PACKING, flat=True)
+    create_array(group, name, image_spec(dims, shape, dtype, whole=True), about, packing=MAP_PACKING, flat=True)
 
 
 def write_class_tile(
@@ -195,8 +193,7 @@ def write_probabilities_tile(
         0, len(age_days), SHARD_ROWS
     ):  # so that the packed values of all rows are never in memory together
         part = log_probability[top : top + SHARD_ROWS]
-        likely = np.where(part < LEAST, UNLIKELY, np.minimum(part, 0))
-        packed = np.rint((likely - FAINTEST) / STEP)
+        packed = np.rint((np.where(part < LEAST, UNLIKELY, np.minimum(part, 0)) - FAINTEST) / STEP)
         rows = slice(place[0].start + top, place[0].start + top + len(part))
         likelihood[rows, place[1]] = np.where(np.isnan(part), NOTHING, np.minimum(packed, NOTHING - 1)).astype(np.uint8)
     ages[place], lights[place] = age_days, light
@@ -207,8 +204,7 @@ def write_changes_tile(path: Path, origin: tuple[int, int], old_class: NDArray[n
 
     Raises IncompleteStoreError: the store is missing, or is of a first visit.
     """
-    array = array_of(open_group(path, "r+"), OLD_CLASS)
-    array[tile_place(origin, old_class.shape)] = old_class
+    array_of(open_group(path, "r+"), OLD_CLASS)[tile_place(origin, old_class.shape)] = old_class
 
 
 def drop_changes(path: Path) -> None:
@@ -258,8 +254,7 @@ class ProbabilityStore:
         values = (packed * np.float32(STEP) + np.float32(FAINTEST)).astype(np.float32)
         values -= np.log(np.exp(values).sum(axis=-1, keepdims=True))
         values[packed == NOTHING] = np.nan
-        light = read_array(self._group, "light", np.s_[rows, columns])
-        return values, self.age(rows, columns), np.nan_to_num(light)
+        return values, self.age(rows, columns), np.nan_to_num(read_array(self._group, "light", np.s_[rows, columns]))
 
     def age(self, rows: slice = slice(None), columns: slice = slice(None)) -> Floats:
         """Return (y, x) days since each pixel was captured; NaN where unknown."""

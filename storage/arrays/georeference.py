@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import zarr
@@ -17,19 +17,8 @@ from affine import Affine
 
 from pipeline.errors import PoseError
 from pipeline.ground.georeference import zoomed_out
-from pipeline.lazy import deferred
+from pipeline.lazy import GeoBox, odc_crs, odc_geo_xr, odc_geobox
 from storage.arrays.layout import AngularGrid, SmallArray, create_group, damage_named, open_group
-
-if TYPE_CHECKING:  # half a second to import, for images on the earth alone
-    import odc.geo.crs as odc_crs
-    import odc.geo.geobox as odc_geobox
-    import odc.geo.xr as odc_geo_xr
-    from odc.geo.crs import CRS
-    from odc.geo.geobox import GeoBox
-else:
-    odc_crs = deferred("odc.geo.crs")
-    odc_geobox = deferred("odc.geo.geobox")
-    odc_geo_xr = deferred("odc.geo.xr")
 
 GRID_MAPPING = "spatial_ref"
 # on every image: CF's link to the grid mapping, and the same as a coordinate, so that plain xarray takes it for one
@@ -75,9 +64,8 @@ def map_attributes(geobox: GeoBox) -> dict[str, Any]:
     Raises PoseError: the grid has no CRS.
     """
     crs = _crs_of(geobox)
-    code = {} if crs.epsg is None else {"proj:code": f"EPSG:{crs.epsg}"}
     return {
-        **code,
+        **({} if crs.epsg is None else {"proj:code": f"EPSG:{crs.epsg}"}),
         "proj:wkt2": crs.to_wkt(),
         "spatial:dimensions": ["y", "x"],
         "spatial:shape": list(geobox.shape),
@@ -109,7 +97,7 @@ def grid_mapping(geobox: GeoBox) -> SmallArray:
     return SmallArray((), np.asarray(mapping.values, np.int32), dict(mapping.attrs))
 
 
-def _axis(crs: CRS, name: str) -> dict[str, str]:
+def _axis(crs: odc_crs.CRS, name: str) -> dict[str, str]:
     """Return CF's attributes of one axis of a map."""
     if crs.geographic:
         standard, unit = _DEGREES[name]
@@ -122,7 +110,7 @@ def _axis(crs: CRS, name: str) -> dict[str, str]:
     }
 
 
-def _crs_of(geobox: GeoBox) -> CRS:
+def _crs_of(geobox: GeoBox) -> odc_crs.CRS:
     if geobox.crs is None:
         raise PoseError(f"a map needs a CRS, got {geobox!r}")
     return geobox.crs

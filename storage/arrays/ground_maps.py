@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import zarr
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import IncompleteStoreError, ShapeError
 from pipeline.ground.field_places import M2_PER_HECTARE
+from pipeline.lazy import GeoBox
 from storage.arrays.class_maps import (
     CHANGED,
     CONFIDENCE,
@@ -34,9 +35,6 @@ from storage.arrays.layout import (
     open_group,
     read_array,
 )
-
-if TYPE_CHECKING:
-    from odc.geo.geobox import GeoBox
 
 PICTURE = "picture"
 NUMBERED = {"classes", OLD_CLASS}

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import zarr
@@ -24,9 +24,7 @@ from zarr.storage import MemoryStore
 
 from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.grid import UNLABELLED
-
-if TYPE_CHECKING:
-    from odc.geo.geobox import GeoBox
+from pipeline.lazy import GeoBox
 
 StorePlace = Path | MemoryStore  # where a store lies
 CHUNK_PX = 32
@@ -167,7 +165,6 @@ def create_array(
     """
     kind, (codec, level) = np.dtype(spec.dtype), packing
     shuffle = BloscShuffle.shuffle if flat else BloscShuffle.bitshuffle
-    blosc = BloscCodec(cname=codec, clevel=level, shuffle=shuffle, typesize=kind.itemsize)
     fill: Any = np.nan if kind.kind == "f" else attributes.get("_FillValue", attributes.get("nodata", 0))
     return group.create_array(
         name,
@@ -179,7 +176,7 @@ def create_array(
         dimension_names=spec.dims,
         attributes=dict(attributes),
         filters=(TransposeCodec(order=(2, 0, 1)),) if flat and len(spec.shape) == 3 else None,
-        compressors=(blosc, Crc32cCodec()),
+        compressors=(BloscCodec(cname=codec, clevel=level, shuffle=shuffle, typesize=kind.itemsize), Crc32cCodec()),
         chunk_key_encoding={"name": "default", "separator": "." if flat else "/"},
         config={"write_empty_chunks": packing == RAW_PACKING},  # spares a comparison of every number with the fill
     )

@@ -94,8 +94,7 @@ def score_spec(dims: tuple[str, str, str], shape: tuple[int, int, int], largest:
 def steps_within(scores: NDArray[np.floating], step: float, kind: np.dtype[Any]) -> NDArray[np.floating]:
     """Return scores in whole steps, clipped to the range of an integer type."""
     most = np.iinfo(kind).max & ~127  # a float32
-    steps: NDArray[np.floating] = np.clip(whole_steps(scores, step), -most, most)
-    return steps
+    return np.asarray(np.clip(whole_steps(scores, step), -most, most))
 
 
 def write_components(group: zarr.Group, components: Components) -> None:
@@ -117,8 +116,7 @@ def read_components(group: zarr.Group) -> Components:
     """Read what `write_components` stored."""
     rows, mean, noise = (read_array(group, name).astype(np.float64) for name in ("axes", "mean", "noise"))
     lit = np.isfinite(noise)
-    axes = np.where(lit, rows / np.where(lit, noise, 1), 0) if len(rows) else rows
-    return Components(mean, axes, noise)
+    return Components(mean, np.where(lit, rows / np.where(lit, noise, 1), 0) if len(rows) else rows, noise)
 
 
 class SignalCubeWriter:
@@ -187,8 +185,7 @@ class SignalCube(StoredSweep):
     @cached_property
     def usable(self) -> NDArray[np.bool_]:
         """(line, sample) spectra of which at least half of the bands were seen."""
-        usable: NDArray[np.bool_] = read_array(self.group, "quality") != UNUSABLE
-        return usable
+        return np.asarray(read_array(self.group, "quality") != UNUSABLE)
 
     @cached_property
     def references(self) -> References:

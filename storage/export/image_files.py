@@ -212,8 +212,7 @@ def write_recorded_files(cube: RawCube, folder: Path) -> Path:
     header = folder / f"{name}.hdr"
     bands = EnviFile(cube.shape, "u2", cube.wavelength_nm, cube.fwhm_nm)
     axis = {"line axis": cube.sweep.along}
-    about = f"raw numbers of sweep {name}"
-    write_envi(header, replace(bands, description=about, ending=".bil", more=axis), blocks())
+    write_envi(header, replace(bands, description=f"raw numbers of sweep {name}", ending=".bil", more=axis), blocks())
     known = cube.references
     white_reference = ", ".join(repr(value) for value in known.white_reference.astype(np.float64).tolist())
     of_white = {"white_reference": f"{{{white_reference}}}", **({"mirror at rest": "1"} if known.by_mirror else {})}

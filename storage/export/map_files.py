@@ -11,22 +11,15 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ArchiveError, SettingsError
-from pipeline.lazy import deferred
+from pipeline.lazy import geopandas, pyogrio
 from storage.archive.whole_files import written_aside
-
-if TYPE_CHECKING:
-    import geopandas
-    import pyogrio
-else:
-    geopandas = deferred("geopandas")
-    pyogrio = deferred("pyogrio")
 
 GEOPACKAGE = "application/geopackage+sqlite3"
 GEOJSON = "application/geo+json"
@@ -135,8 +128,7 @@ def _task_file(grid: TaskGrid, text: TaskText, length: int) -> ElementTree.Eleme
         ManagementSoftwareVersion=text.version[:DESIGNATOR],
         DataTransferOrigin="1",
     )
-    field = {"A": "PFD1", "C": text.field[:DESIGNATOR], "D": f"{text.area_m2:.0f}"}
-    ElementTree.SubElement(root, "PFD", field)
+    ElementTree.SubElement(root, "PFD", {"A": "PFD1", "C": text.field[:DESIGNATOR], "D": f"{text.area_m2:.0f}"})
     ElementTree.SubElement(root, "PDT", {"A": "PDT1", "B": text.product[:DESIGNATOR], "D": "VPN1"})
     zones = {"H": str(UNTREATED), "I": str(UNTREATED), "J": str(UNTREATED)}
     task = ElementTree.SubElement(

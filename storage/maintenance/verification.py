@@ -19,7 +19,6 @@ from storage.archive.manifests import broken_files, listed_bytes, try_manifest
 from storage.archive.records import RECEIPT, Run
 from storage.archive.staging import MANIFEST_NAME
 
-Kind = Literal["whole", "broken", "missing", "stray"]
 Progress = Callable[[str, float], None]  # address being read, fraction of all bytes
 
 
@@ -32,7 +31,7 @@ class Finding:
 
     uri: str
     problem: str | None
-    kind: Kind = "whole"
+    kind: Literal["whole", "broken", "missing", "stray"] = "whole"
 
 
 def verify_everything(

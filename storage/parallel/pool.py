@@ -23,18 +23,11 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from multiprocessing import resource_tracker
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from pipeline.errors import SettingsError, WorkerError
-from pipeline.lazy import deferred
+from pipeline.lazy import dask, dask_distributed
 from storage.archive.staging import PART_SUFFIX
-
-if TYPE_CHECKING:
-    import dask
-    import dask.distributed as dask_distributed
-else:
-    dask = deferred("dask")
-    dask_distributed = deferred("dask.distributed")
 
 ANSWER_S = 5.0  # time limit of a scheduler's answer
 AHEAD = 2  # blocks sent to a worker: one running, one waiting

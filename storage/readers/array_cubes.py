@@ -11,12 +11,13 @@ from collections.abc import Callable, Container, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError, SeriesError
+from pipeline.lazy import GeoBox
 from pipeline.rig.camera.camera_texts import MICROMETRES, NANOMETRES, UNSAID
 from storage.arrays.georeference import find_geobox
 from storage.readers.cube_sources import (
@@ -29,9 +30,6 @@ from storage.readers.cube_sources import (
     read_by_chunks,
     unpacked,
 )
-
-if TYPE_CHECKING:
-    from odc.geo.geobox import GeoBox
 
 ROWS = ("y", "line", "lines", "row", "rows", "lat", "latitude", "northing", "downtrack", "along_track")
 _ACROSS = ("crosstrack", "across_track")

@@ -18,24 +18,16 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from pipeline.lazy import deferred
+from pipeline.lazy import GeoBox, h5py, odc_geobox
 from storage.readers.array_cubes import ArrayCube, Arrays, FileArray, place_or_note
 from storage.readers.cube_sources import BLOCK_LINES, DEFLATE_RATIO, Bands, CubeSource, read_by_chunks, unpacked
-
-if TYPE_CHECKING:
-    import h5py
-    import odc.geo.geobox as odc_geobox
-    from odc.geo.geobox import GeoBox
-else:
-    h5py = deferred("h5py")
-    odc_geobox = deferred("odc.geo.geobox")
 
 ARRAY_ENDINGS = (".npy", ".npz", ".mat")
 HDF_ENDINGS = (".nc", ".nc4", ".h5", ".hdf5", ".he5")
@@ -217,13 +209,12 @@ def in_scope(arrays: Arrays, name: str) -> dict[str, FileArray]:
     """Return all arrays by their paths; those of the array's group, and of groups above it, by their names alone."""
     groups = name.split("/")[:-1]
     heads = ["".join(f"{group}/" for group in groups[:depth]) for depth in range(len(groups) + 1)]
-    near = {
+    return {
         path.removeprefix(head): array
         for head in heads
         for path, array in arrays.items()
         if path.startswith(head) and "/" not in path.removeprefix(head)
-    }
-    return near | {path: array for path, array in arrays.items() if "/" in path}
+    } | {path: array for path, array in arrays.items() if "/" in path}
 
 
 # --- EMIT, NEON and PRISMA --------------------------------------------------------------------------------------------

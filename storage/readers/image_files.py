@@ -14,13 +14,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from pipeline.lazy import deferred
+from pipeline.lazy import GeoBox, odc_crs, odc_geobox, pyproj
 from pipeline.rig.camera.camera_texts import finite_number, wavelengths_nm
 from storage.readers.cube_sources import (
     BLOCK_LINES,
@@ -34,16 +34,6 @@ from storage.readers.cube_sources import (
     reading,
     unpacked,
 )
-
-if TYPE_CHECKING:  # half a second to import
-    import odc.geo.crs as odc_crs
-    import odc.geo.geobox as odc_geobox
-    import pyproj
-    from odc.geo.geobox import GeoBox
-else:
-    odc_crs = deferred("odc.geo.crs")
-    odc_geobox = deferred("odc.geo.geobox")
-    pyproj = deferred("pyproj")
 
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp")  # of files that are read as a whole
 JPEG2000_ENDINGS = (".jp2", ".j2k")
@@ -165,9 +155,8 @@ def _opened(path: Path, image: str = "") -> Iterator[Any]:
     driver = _DRIVERS[path.suffix.lower()]
     with warnings.catch_warnings(), rasterio.Env(**_STRICT):
         warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-        kind = _CALLED.get(driver, path.suffix.lower())
         with (
-            reading(path, kind, "Copy it again, or save it as PNG or TIFF"),
+            reading(path, _CALLED.get(driver, path.suffix.lower()), "Copy it again, or save it as PNG or TIFF"),
             rasterio.open(image or path, driver=driver) as file,
         ):
             yield file

@@ -12,16 +12,13 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pipeline.errors import SceneError
+from pipeline.lazy import GeoBox
 from storage.readers.labels import Labels, found_classes, load_labels
 from storage.readers.open_cubes import CUBE_ENDINGS
 from storage.readers.polygons import POLYGON_ENDINGS, is_polygon_file, load_polygon_labels, polygon_classes, split_layer
 from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, is_image_folder
-
-if TYPE_CHECKING:
-    from odc.geo.geobox import GeoBox
 
 _OF_LAND = ("lulc", "landcover", "land_cover")
 _OF_TRUTH = ("gt", "groundtruth", "truth", "seg")
@@ -97,12 +94,11 @@ def match_folder(folder: Path) -> MatchedFiles:
     Raises SceneError: several files may be an image's labels, or one those of several images; both are named.
     """
     own = scene_entries(folder)
-    apart = _in_label_folders(folder)
     beside = [entry for entry in own if is_label_name(entry)]
     images = [entry for entry in own if entry not in beside]
     if not images:  # a folder of labels is read as images
         images, beside = own, []
-    pictures, polygons = [*beside, *apart], _polygons_near(folder)
+    pictures, polygons = [*beside, *_in_label_folders(folder)], _polygons_near(folder)
     matched = {image: _label_of(image, pictures) or _label_of(image, polygons) for image in images}
     labels = {image: found for image, found in matched.items() if found is not None}
     if len(images) == len(pictures) == 1:  # a single pair may have any names

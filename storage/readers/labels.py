@@ -7,7 +7,7 @@ import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import skimage
@@ -16,17 +16,10 @@ from numpy.typing import NDArray
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.georeference import OFF_GRID_PX, crs_name, shift_px
-from pipeline.lazy import deferred
+from pipeline.lazy import GeoBox, odc_warp
 from storage.readers.open_cubes import open_labels
 from storage.readers.scene_toml import ClassValue, Colour
 
-if TYPE_CHECKING:  # half a second to import, for labels on another grid alone
-    import odc.geo.warp as odc_warp
-    from odc.geo.geobox import GeoBox
-else:
-    odc_warp = deferred("odc.geo.warp")
-
-Distances = NDArray[np.float64]
 NO_VALUE = int(np.iinfo(np.int64).min)  # in codes
 MOST_FOUND_CLASSES = 64
 MIXED = (
@@ -300,10 +293,9 @@ def class_colours(classes: Mapping[str, ClassValue], stated: Mapping[str, Colour
     return np.array([found[name] for name in classes], np.uint8).reshape(-1, 3)
 
 
-def _apart(colours: Sequence[Colour], others: Iterable[Colour]) -> Distances:
+def _apart(colours: Sequence[Colour], others: Iterable[Colour]) -> NDArray[np.float64]:
     """Return the distance in CIELAB of each colour to the nearest of others; infinite without one."""
     lab, beside = (
         skimage.color.rgb2lab(np.array([*some], np.uint8).reshape(-1, 1, 3))[:, 0] for some in (colours, others)
     )
-    found: Distances = np.linalg.norm(lab[:, None] - beside[None], axis=-1).min(axis=1, initial=np.inf)
-    return found
+    return np.asarray(np.linalg.norm(lab[:, None] - beside[None], axis=-1).min(axis=1, initial=np.inf))

@@ -38,7 +38,6 @@ from storage.readers.image_files import IMAGE_ENDINGS, open_image
 from storage.readers.scene_toml import SceneSettings, find_scene_settings, settle_wavelengths
 from storage.readers.zarr_files import INGESTED, find_zarr_store, with_ingested, zarr_arrays
 
-Reader = Literal["zarr", "headwall", "envi", "image", "array", "none"]
 CUBE_ENDINGS = (*IMAGE_ENDINGS, *ARRAY_ENDINGS, ".hdr", *HDF_ENDINGS)
 NO_UNIT = ("", "1", "unitless", "none", "dimensionless")
 _WITH_VARIABLE = re.compile(
@@ -56,7 +55,7 @@ def split_variable(address: str | Path) -> tuple[Path, str | None]:
     return Path(found["path"] or found["path2"]), found["variable"] or found["variable2"]
 
 
-def reader_of(address: str | Path) -> Reader:
+def reader_of(address: str | Path) -> Literal["zarr", "headwall", "envi", "image", "array", "none"]:
     """Return the reader of an address; "none" if there is no such file, or none reads its kind.
 
     A folder is a Zarr store or a Headwall camera's; an ENVI cube is named by its header or its data file.

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,22 +22,9 @@ from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.field_places import FieldPlace, NoPlace, PlacedPicture
 from pipeline.ground.georeference import WGS84
 from pipeline.ground.zones import on_field
-from pipeline.lazy import deferred
+from pipeline.lazy import BaseGeometry, GeoBox, pyogrio, pyproj, rasterio_features, shapely
 from storage.readers.labels import MOST_FOUND_CLASSES, Labels, class_colours
 from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings
-
-if TYPE_CHECKING:
-    import pyogrio
-    import pyproj
-    import rasterio.features as rasterio_features
-    import shapely
-    from odc.geo.geobox import GeoBox
-    from shapely.geometry.base import BaseGeometry
-else:  # two seconds to import
-    pyogrio = deferred("pyogrio")
-    pyproj = deferred("pyproj")
-    rasterio_features = deferred("rasterio.features")
-    shapely = deferred("shapely")
 
 GEOJSON = (".geojson", ".json")
 ZONE_ENDINGS = (*GEOJSON, ".gpkg", ".shp")
@@ -77,9 +64,8 @@ def read_zones(source: str, *, named_by: str | None = None) -> ZoneFile:
     file cannot be read, or it has other shapes than polygons.
     """
     layer = read_polygons(source)
-    called = _names(layer, named_by, source)
     shapes: dict[str, BaseGeometry] = {}
-    for name, shape in zip(called, layer.shapes, strict=True):
+    for name, shape in zip(_names(layer, named_by, source), layer.shapes, strict=True):
         shapes[name] = shape if name not in shapes else shapely.union(shapes[name], shape)
     return ZoneFile(source, layer.crs, shapes, layer.notes)
 

@@ -30,7 +30,7 @@ from pipeline.errors import SceneError, WavelengthError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import RIM_SLACK, STRAIGHT, Mounting
 from pipeline.rig.camera.camera_texts import listed_numbers
-from pipeline.signal.calibrate import find_bad_elements, full_scale_notes
+from pipeline.signal.calibrate import Floats, find_bad_elements, full_scale_notes
 from pipeline.source import References
 from storage.readers.cube_sources import CubeSource
 from storage.readers.envi_files import DATA_ENDINGS, find_envi_pair, find_reference, load_envi_header
@@ -198,7 +198,6 @@ def find_references(
 
 # --- pointing ---------------------------------------------------------------------------------------------------------
 
-Floats = NDArray[np.float64]
 Kind = Literal["mirror", "angles", "angle", "px", "m"]
 KINDS: Mapping[Kind, tuple[str, ...]] = {
     "mirror": ("mirror_x", "mirror_y"),

@@ -30,7 +30,7 @@ from pipeline.capture.straight_scans import covered_field, fit_sweep, flat_camer
 from pipeline.errors import ArchiveError, IncompleteStoreError, SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import STRAIGHT, Mounting
-from pipeline.geometry.scan import Axis, Sweep
+from pipeline.geometry.scan import Axis, Floats, Sweep
 from storage.archive.archive import Archive
 from storage.archive.keys import array_digest
 from storage.archive.manifests import check_files, manifest_sha256
@@ -56,8 +56,6 @@ from storage.readers.recorded_files import (
 )
 from storage.remote.object_stores import is_remote
 from storage.remote.opening import is_archive, open_archive
-
-Floats = NDArray[np.float64]
 
 SAME_PERIOD = 0.01
 RESTORED = "the raw lines were deleted: these are restored from the stored signal"

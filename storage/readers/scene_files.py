@@ -8,13 +8,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import EmptySceneError, SceneError
 from pipeline.geometry.grid import SceneGrid, cuts
+from pipeline.lazy import GeoBox
 from pipeline.readings import MOST_VALUE, beyond_range, find_beyond
 from storage.archive.staging import file_hash
 from storage.parallel.pool import RESERVED_BYTES, memory_refusal
@@ -23,9 +24,6 @@ from storage.readers.label_files import label_file, read_labels
 from storage.readers.labels import Labels
 from storage.readers.open_cubes import open_cube, split_variable
 from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings, settle_wavelengths
-
-if TYPE_CHECKING:
-    from odc.geo.geobox import GeoBox
 
 USUAL_NODATA = -9999.0  # assumed where no file states another
 COPIES = 6  # of a block in memory while it is read and processed

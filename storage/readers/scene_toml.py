@@ -20,7 +20,6 @@ IMAGE_FOLDERS = ("images", "image", "imgs", "img", "pictures", "photos")  # scen
 
 Colour = tuple[int, int, int]
 ClassValue = int | Colour
-_Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 _Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0)]
 _Channel = Annotated[int, Field(strict=True, ge=0, le=255)]
 _Value = StrictInt | tuple[_Channel, _Channel, _Channel]
@@ -43,7 +42,7 @@ class SceneSettings(BaseModel):
     nodata: Annotated[float, Field(strict=True)] | None = None
     # values = file's * scale + offset
     scale: _Positive = 1.0
-    offset: _Number = 0.0
+    offset: Annotated[float, Field(strict=True, allow_inf_nan=False)] = 0.0
     # side of a pixel on the ground
     pixel_m: _Positive | None = None
     # relative to scene.toml, with {number} or {name}; "" if there are none
@@ -200,8 +199,7 @@ def _from_file(path: Path, dropped: Sequence[int], chosen: list[int], file_bands
     centre = check_wavelengths(kept[:, 0], str(path))[chosen]
     widths = kept[:, 1] if kept.shape[1] > 1 else None
     known = widths is not None and bool((np.isfinite(widths) & (widths > 0)).all())
-    fwhm = widths[chosen] if known and widths is not None else None
-    return Bands(centre, fwhm, f"wavelengths from {path}")
+    return Bands(centre, widths[chosen] if known and widths is not None else None, f"wavelengths from {path}")
 
 
 def _table(path: Path) -> NDArray[np.float64]:

@@ -213,7 +213,7 @@ class ObjectArchive(Archive):
         self._later_runs |= {self.root / uri for uri in changed}
 
     def _drop_removed(self, here: Iterable[str], there: Container[str]) -> None:
-        """Drop what is incomplete here and no longer in the bucket; what is complete may not have been sent yet."""
+        """Drop what is incomplete here and not in the bucket; what is complete may not have been sent yet."""
         for uri in here:
             manifest, problem = try_manifest(self.root / uri)
             if uri not in there and problem is None and (is_cleared(manifest) or self._lacks(uri, manifest)):

@@ -14,7 +14,6 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import (
     direction_to_position,
     direction_to_scene,
-    line_rotation,
     position_to_normal,
     reflect,
     scene_to_direction,
@@ -23,6 +22,7 @@ from pipeline.geometry.scan import points_of_scan
 from pipeline.rectify.geolocation import path_geolocation
 from pipeline.rectify.placed import TieTable, tie_table
 from pipeline.rectify.scan_paths import ScanPath, make_scan_paths
+from tests.pipeline.geometry.paper_equations import line_rotation
 
 CAMERA = LineCamera()
 SWATH, LINES = 2450.0, 640

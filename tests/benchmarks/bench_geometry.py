@@ -11,12 +11,11 @@ from pipeline.geometry.mirror import (
     direction_to_normal,
     direction_to_position,
     direction_to_scene,
-    line_rotation,
     position_to_direction,
     position_to_normal,
     reflect,
 )
-from tests.pipeline.geometry.paper_equations import straight_slope_rotation
+from tests.pipeline.geometry.paper_equations import line_rotation, straight_slope_rotation
 from tests.pipeline.geometry.test_mirror import exact_direction
 from tests.pipeline.geometry.test_paper import paper_position, slope_rotation
 

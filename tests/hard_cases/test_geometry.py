@@ -10,12 +10,12 @@ from pipeline.geometry.mirror import (
     direction_to_normal,
     direction_to_position,
     direction_to_scene,
-    line_rotation,
     mirror_throughput,
     position_to_direction,
     position_to_normal,
     scene_to_direction,
 )
+from tests.pipeline.geometry.paper_equations import line_rotation
 
 PRECISIONS = [np.float64, np.float32]
 

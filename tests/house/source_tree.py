@@ -10,6 +10,7 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
+LAZY = "pipeline/lazy.py"
 ROOMS = ("pipeline", "models", "storage", "flows", "spectralzoom")
 Trees = Mapping[Path, ast.Module]
 Documented = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
@@ -33,13 +34,27 @@ def nodes(tree: ast.AST) -> list[ast.AST]:
     return list(ast.walk(tree))
 
 
+@cache
+def late_packages() -> dict[str, str]:
+    """Packages that `pipeline.lazy` defers for all, and those of types, by their names there."""
+    tree = ast.parse((ROOT / LAZY).read_text(encoding="utf-8"))
+    inner = [node for block in tree.body if isinstance(block, ast.If) for node in block.body]
+    types = {
+        alias.name: node.module or "" for node in inner if isinstance(node, ast.ImportFrom) for alias in node.names
+    }
+    found = [alias for node in inner if isinstance(node, ast.Import) for alias in node.names]
+    return types | {alias.asname or alias.name: alias.name for alias in found}
+
+
 def imported(tree: ast.AST) -> Iterator[str]:
-    """Names of all modules imported anywhere in the file, those for type checkers included."""
+    """Names of all modules imported anywhere in the file, those for type checkers and deferred ones included."""
     for node in nodes(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             yield "." * node.level + (node.module or "")
+            if node.module == "pipeline.lazy":
+                yield from (late_packages()[alias.name] for alias in node.names if alias.name in late_packages())
 
 
 def imported_in_functions(trees: Trees) -> dict[str, set[str]]:

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from flows.publish.field_map import FieldMap, MapLayer, layer_address
-from flows.publish.report import LEAFLET, SHA256, Picture, render_report
+from flows.publish.report import LEAFLET, Picture, render_report
 from tests.flows.publish.test_receipt import make_receipt
 from tests.users.browser import Tab, chromium, needs_browser
 
@@ -23,6 +23,11 @@ BAD = '<img src=x onerror="document.title=1">\u202e</script>'
 READY = "document.getElementById('field').dataset.ready"
 BOXES = "[...document.querySelectorAll('.leaflet-control-layers-overlays input')]"
 SHOWN = "document.querySelectorAll('#map .leaflet-overlay-pane img').length"
+SHA256 = {
+    f"{LEAFLET}/leaflet.js": "db49d009c841f5ca34a888c96511ae936fd9f5533e90d8b2c4d57596f4e5641a",
+    f"{LEAFLET}/leaflet.css": "a7837102824184820dfa198d1ebcd109ff6d0ff9a2672a074b9a1b4d147d04c6",
+    f"{LEAFLET}/LICENSE": "53e8dc25862014e4324741ca18fbe3611e11d42ef69f59f86ea8c5389647d4cb",
+}
 
 
 def known_map() -> FieldMap:

@@ -127,7 +127,6 @@ def map_figures(names: Sequence[str], counts: NDArray[np.int64]) -> dict[str, An
     """Return the figures of a map from its confusion matrix."""
     known = len(names)
     false = zip(names, false_pixels(counts)[:known].tolist(), strict=True)
-    unknown = {} if len(counts) == known else {"unknown_px": int(counts[:, known].sum())}
     return {
         **agreement(counts),
         "average_accuracy": average_accuracy(counts),
@@ -135,7 +134,7 @@ def map_figures(names: Sequence[str], counts: NDArray[np.int64]) -> dict[str, An
         "pixels": int(counts.sum()),
         "per_class_iou": dict(zip(names, iou_per_class(counts)[:known].tolist(), strict=True)),
         "false_classes": {name: pixels for name, pixels in false if pixels},
-        **unknown,
+        **({} if len(counts) == known else {"unknown_px": int(counts[:, known].sum())}),
     }
 
 

@@ -15,7 +15,7 @@ from flows.tasks.patch_budget import PatchBudget
 from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
 from flows.tasks.zones import SurveyZones
 from models.network.spectral import LineSpec
-from models.policies.policies import SEEING_POLICIES, score_patches
+from models.policies.policies import SEEING_POLICIES, Scores, score_patches
 from models.reading.inference import CoarsePrediction
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid, patch_pixels
@@ -29,7 +29,6 @@ from storage.arrays.mosaics import Attention, chosen_patches, open_mosaic, write
 
 READING = "attention.zarr"  # beside a class map whose drawing chose the patches
 ATTENTION = Product("score", version=15, files=("attention.zarr", "plan.json"), by_weights=True)
-Scores = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -67,10 +67,9 @@ class KeptBytes:
         Raises BudgetError: the coarsest step does not fit; names its bytes.
         """
         blocks = [(cube, block) for cube in cubes for block in range(-(-cube.shape[0] // BLOCK_LINES))]
-        some = blocks[:: max(1, len(blocks) // SAMPLED_BLOCKS)]
         scores = [
             score_lines(values, valid, components).scores
-            for cube, block in some
+            for cube, block in blocks[:: max(1, len(blocks) // SAMPLED_BLOCKS)]
             for _, values, valid in calibrated_blocks(cube, camera, [block])
         ]
         spectra = sum(cube.shape[0] * cube.shape[1] for cube in cubes)
@@ -223,16 +222,13 @@ def _lines_differ(passes: Sequence[StageRef], signal: StageRef, camera: LineCame
     return None
 
 
-Rows = tuple[int, NDArray[np.float32], NDArray[np.bool_]]
-
-
 @stage("condense_raster", "signal of the raster", MOSAIC, inputs=0)
 def condense_raster(
     *, raster: RasterPixels, frame: FieldFrame, signal: SignalChoice, scene: RasterScene, memory: int, report: Report
 ) -> Wanted:
     """Compress the pixels of a raster into its mosaic."""
 
-    def blocks() -> Iterator[Rows]:
+    def blocks() -> Iterator[tuple[int, NDArray[np.float32], NDArray[np.bool_]]]:
         """Yield blocks of rows: first row, values, validity."""
         deep = max(raster.rows_at_once(memory) // SHARD_ROWS, 1) * SHARD_ROWS
         for first in range(0, frame.grid.height, deep):

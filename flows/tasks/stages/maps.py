@@ -259,5 +259,4 @@ def colours_of(mosaic: StageRef) -> NDArray[np.float32]:
     bands, band_choice = choose_bands(seen.wavelength_nm)
     values = np.concatenate([seen.spectra(strip, bands) for strip in seen.row_blocks(None)])
     tones = develop(values, values) if band_choice.startswith("true colour") else stretch(values)
-    picture: NDArray[np.float32] = np.where(np.isfinite(values), 1 + 254 * tones, np.nan).astype(np.float32)
-    return picture
+    return np.where(np.isfinite(values), 1 + 254 * tones, np.nan).astype(np.float32)

@@ -224,10 +224,9 @@ def rectify_fine(
         writer = mosaic_of_sweeps(path, signal, frame)
         write_mosaic(recipe, writer, memory=memory, pool=pool, report=report)
         placed = recipe.open().placed
-        number = np.maximum(capture_numbers(placed, camera, grid), 0)
         exposed = [(exposing(camera, one.lines.sweep).exposure_ms, one.lines.sweep.step) for one in placed]
         captures = [LineSpec(light.light * exposure_ms / camera.exposure_ms, step) for exposure_ms, step in exposed]
-        writer.write_captures(captures, number)
+        writer.write_captures(captures, np.maximum(capture_numbers(placed, camera, grid), 0))
         writer.blank(frame.missing)
         write_table(path / "lines.json", {one.lines.sweep.name: one.facts() for one in recipe.sweeps()})
 

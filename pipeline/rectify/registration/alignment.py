@@ -16,9 +16,7 @@ import scipy
 import skimage
 from numpy.typing import NDArray
 
-from pipeline.rectify.registration.shifts import pair_shift
-
-Floats = NDArray[np.float64]
+from pipeline.rectify.registration.shifts import Floats, pair_shift
 
 ERROR_FLOOR_PX = 0.05  # least error of a window: lines jitter
 OUTLIER_ERRORS = 2.0  # the influence of a window is limited beyond

@@ -87,8 +87,7 @@ def solve_lights(ratios: Sequence[LightRatio], sweeps: int, wavelength_nm: Float
         answer = solved.reshape(sweeps, -1)
     seen = {number for ratio in known for number in (ratio.reference, ratio.moving)}
     untied = tuple(number for number in range(sweeps) if number not in seen)
-    log_light = answer @ basis.T
-    return SweepLights(np.exp(log_light).astype(np.float32), untied)
+    return SweepLights(np.exp(answer @ basis.T).astype(np.float32), untied)
 
 
 def overlap_light(placed: Sequence[PlacedSweep], camera: LineCamera, windows: Sequence[Window]) -> list[LightRatio]:

@@ -15,14 +15,12 @@ from numpy.typing import NDArray
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
-from pipeline.geometry.scan import Sweep, shifted_position
+from pipeline.geometry.scan import Floats, Sweep, shifted_position
 from pipeline.rectify.geolocation import path_geolocation
 from pipeline.rectify.resample import resample
 from pipeline.rectify.scan_paths import ScanPath, make_scan_paths
 from pipeline.signal.lines import signal_of
 from pipeline.source import SweepLines
-
-Floats = NDArray[np.float64]
 
 LEAST_OVERLAP_PX = 64.0  # of the smaller side of a window, after the largest shift; below it errors grow fast
 EDGE_LINES = 16  # a sweep's edges are computed at every 16th line; they bend by 1e-3 px between

@@ -22,10 +22,8 @@ from pipeline.rectify.registration.alignment import (
     tied_to,
 )
 from pipeline.rectify.registration.overlaps import LEAST_OVERLAP_PX, BroadSweep, PlacedImage, Window, overlap_windows
-from pipeline.rectify.registration.shifts import PairShift, nothing_found, pair_shift
+from pipeline.rectify.registration.shifts import Floats, PairShift, nothing_found, pair_shift
 from pipeline.rectify.resample import resample
-
-Floats = NDArray[np.float64]
 
 WINDOW_PX = 512.0
 SETTLED_PRIOR_PX = 3.0  # after the first round
@@ -147,8 +145,7 @@ def _narrow(seen: Sequence[SeamWindow], names: Sequence[str], reach_px: float) -
     measured = [each.measured for each in seen if each.measured is not None]
     for (one, other), group in groupby(seen, key=lambda each: (each.window.reference, each.window.moving)):
         windows = list(group)
-        apart = other not in tied_to(measured, one, len(names))
-        if apart and all(each.found is None for each in windows):
+        if other not in tied_to(measured, one, len(names)) and all(each.found is None for each in windows):
             width = max(each.window.width_px for each in windows)
             yield NarrowOverlap(names[one], names[other], width, LEAST_OVERLAP_PX + reach_px)
 

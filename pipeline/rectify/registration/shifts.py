@@ -238,8 +238,7 @@ def _least_squares(one: Floats, other: Floats, kept: NDArray[np.bool_], shift: F
 def _fit_of(shift: Floats, target: Floats, left: Floats, slopes: Floats, others: Floats) -> _Fit:
     """Return error and quality of a fit. Only slopes that both images share count, since noise has slopes as well."""
     misfit = min(float(np.var(left) / np.var(target)), 1.0)
-    shared: Floats = np.asarray(slopes @ others.T + others @ slopes.T) / 2
-    value, direction = np.linalg.eigh(shared)
+    value, direction = np.linalg.eigh(np.asarray(slopes @ others.T + others @ slopes.T) / 2)
     weakest = direction[:, 0]
     strength = float(np.linalg.norm(weakest @ slopes) * np.linalg.norm(weakest @ others))
     noise = float(np.var(left)) / SMOOTHED_NOISE

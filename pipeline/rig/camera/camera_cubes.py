@@ -135,8 +135,7 @@ def _times(by_name: Mapping[str, str], first: int, cube: CubeLines, read: Read, 
         notes.append(f"there is no frame index for raw_{first}")
         return None
     try:
-        text = read(by_name[name]).decode("utf-8-sig", errors="replace")
-        index = parse_frame_index(text.splitlines(), name)
+        index = parse_frame_index(read(by_name[name]).decode("utf-8-sig", errors="replace").splitlines(), name)
     except SceneError as error:
         notes.append(str(error))
         return None
@@ -161,11 +160,10 @@ def mean_frame(lines: NDArray[np.integer]) -> MeanFrame:
     if lines.ndim != 3 or not lines.size:
         raise ShapeError(f"expected at least one frame (line, sample, band), got {lines.shape}; capture the reference")
     count = len(lines)
-    mean = (lines.sum(axis=0, dtype=np.int64) / count).astype(np.float32)
     stuck = lines.min(axis=0) == lines.max(axis=0)
     if count < FRAMES_FOR_STUCK or stuck.mean() > 0.5:  # most elements have some noise
         stuck = np.zeros(stuck.shape, np.bool_)
-    return MeanFrame(mean, stuck)
+    return MeanFrame((lines.sum(axis=0, dtype=np.int64) / count).astype(np.float32), stuck)
 
 
 def as_references(dark: MeanFrame, white: MeanFrame, *, white_reference: ArrayLike = 1.0) -> References:
@@ -182,6 +180,5 @@ def as_references(dark: MeanFrame, white: MeanFrame, *, white_reference: ArrayLi
         raise RigError(
             f"white is above dark in {100 * lit:.0f} % of the elements; are they swapped, or was the lamp off?"
         )
-    bad = find_bad_elements(dark.mean, white.mean) | dark.stuck
     values = np.broadcast_to(np.asarray(white_reference, np.float32), dark.mean.shape[1]).copy()
-    return References(dark.mean, white.mean, values, bad)
+    return References(dark.mean, white.mean, values, find_bad_elements(dark.mean, white.mean) | dark.stuck)

@@ -12,7 +12,7 @@ import re
 import threading
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
 from pipeline.errors import RigError
 from pipeline.rig.camera.camera_cubes import CapturedLines, MeanFrame, Read, mean_frame, read_capture, read_references
@@ -20,6 +20,7 @@ from pipeline.rig.camera.camera_files import Capture, Kept, Progress, RemoteFile
 from pipeline.rig.device_settings import CameraAddress, ControlPatience, FileServer
 from pipeline.rig.transports import (
     SYSTEM_CLOCK,
+    Answer,
     Clock,
     DeadlinePassed,
     DeviceRefused,
@@ -30,7 +31,6 @@ from pipeline.rig.transports import (
 
 LOG = logging.getLogger(__name__)
 LONGEST_REPLY = 1 << 24  # bytes: a listing of a hundred thousand files
-Answer = TypeVar("Answer")
 _RAW = re.compile(r"raw_\d+", re.IGNORECASE)
 _PROMPT = re.compile(rb"(?:\A|(?<=[\r\n}]))hpi> ")  # a reply may hold the word, but not there
 _NEGOTIATION = re.compile(rb"\xff[\xfb-\xfe].", re.DOTALL)  # of telnet; UTF-8 never holds the byte FF

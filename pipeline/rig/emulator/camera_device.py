@@ -155,8 +155,7 @@ class CameraDevice:
             capture, numbers = next(((one, some) for one, some in waiting if len(some)), (None, np.zeros(0, np.int64)))
         if capture is None:
             return False
-        middle_s = capture.began_s + numbers * capture.period_s + capture.exposure_s / 2
-        lines = self._lines(middle_s)
+        lines = self._lines(capture.began_s + numbers * capture.period_s + capture.exposure_s / 2)
         with self._lock:
             capture.put(lines)
         return True

@@ -103,8 +103,7 @@ class SceneView:
         """Return the line (line,) of the sweep that each exposure (line, step, 2) is nearest to."""
         scan = self._place(position)[..., 1].mean(axis=1)
         number = np.rint((scan - sweep.start_px - (sweep.positions - 1) / 2) / sweep.step)
-        lines: Ints = np.clip(number, 0, sweep.lines - 1).astype(np.int64)
-        return lines
+        return np.asarray(np.clip(number, 0, sweep.lines - 1).astype(np.int64))
 
     def references(self, times_ms: tuple[float, float], frames: int) -> dict[str, Raw]:
         """Return dark and white frames (frame, sample, band) whose means are the source's.

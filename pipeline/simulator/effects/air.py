@@ -15,9 +15,8 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipeline.geometry.scan import points_of_scan
+from pipeline.geometry.scan import Floats, points_of_scan
 from pipeline.simulator.effects.effect import (
     Aim,
     Bound,
@@ -33,7 +32,6 @@ from pipeline.simulator.effects.probe import UNITS, GainRange, Probe
 from pipeline.simulator.rig_model import Air, Rig
 from pipeline.simulator.scenes.daylight import relative_daylight
 
-Floats = NDArray[np.float64]
 PLANE = 2.91  # angle of arrival of a star's light [1]
 NEAR_POINTS = 3 / 8  # of it from a path's end: the mean of (z / d)^(5/3); r0 [2] is (8/3)^(3/5) times as wide
 RISK = 1e-3  # fraction of the surveys in which a line may stray further than the bound says
@@ -189,8 +187,7 @@ def greatest_fraction(air: Air) -> float:
     """Return the greatest displacement per px of distance from the line's centre."""
     if air.distance_m is None:
         return 0.0
-    ends = closeness(air, np.array([-1.0, 1.0])) - 1 / air.distance_m
-    return air.lever_m * float(np.abs(ends).max())
+    return air.lever_m * float(np.abs(closeness(air, np.array([-1.0, 1.0])) - 1 / air.distance_m).max())
 
 
 def reach_m(rig: Rig) -> tuple[float, float] | None:
@@ -209,8 +206,7 @@ def sample_distances(block: SweepBlock) -> Floats:
     sweep = block.sweep
     along, scan = points_of_scan(sweep.swath_px, block.rig.camera, block.scan_px[:, None], block.slopes)
     row = scan if sweep.along == "x" else along
-    inverse = closeness(block.rig.air, row / max((block.shape[0] - 1) / 2, 0.5))
-    return 1 / np.clip(inverse, 1 / ends[1], 1 / ends[0])
+    return 1 / np.clip(closeness(block.rig.air, row / max((block.shape[0] - 1) / 2, 0.5)), 1 / ends[1], 1 / ends[0])
 
 
 def format_reach(ends: tuple[float, float]) -> str:
@@ -278,8 +274,7 @@ class Absorption(Gain):
             return np.ones((1, 1, 1), np.float32)
         if reach[0] == reach[1]:
             return transmission(np.array(reach[:1]), rig, block.wavelength_nm)[:, None].astype(np.float32)
-        knots = np.geomspace(*reach, _KNOTS)
-        table = transmission(knots, rig, block.wavelength_nm).astype(np.float32)
+        table = transmission(np.geomspace(*reach, _KNOTS), rig, block.wavelength_nm).astype(np.float32)
         place = np.log(sample_distances(block) / reach[0]) / np.log(reach[1] / reach[0]) * (_KNOTS - 1)
         low = np.clip(place.astype(np.int64), 0, _KNOTS - 2)
         gain: Radiance = table[low]
@@ -346,8 +341,7 @@ class PathRadiance(LightChange):
         if reach_m(block.rig) is None:
             return light
         metres = sample_distances(block)[..., None]
-        depth = (extinction_per_m(block.rig.air, block.wavelength_nm) * metres).astype(np.float32)
-        lost = -np.expm1(-depth)
+        lost = -np.expm1(-(extinction_per_m(block.rig.air, block.wavelength_nm) * metres).astype(np.float32))
         light *= 1 - lost
         if block.white_e is not None:
             sky, still = block.rig.sky, block.rig.air.airlight_fraction * np.asarray(block.white_e, np.float64)

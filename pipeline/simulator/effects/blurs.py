@@ -9,15 +9,13 @@ from types import MappingProxyType
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from pipeline.simulator.effects.effect import Blur, Bound
 from pipeline.simulator.effects.probe import UNITS, Probe
-from pipeline.simulator.optics.kernel_fit import Moments
+from pipeline.simulator.optics.kernel_fit import Floats, Moments
 from pipeline.simulator.optics.rays import extreme_normals, pupil_contrast, spread_of_rays, spread_of_waves
 from pipeline.simulator.rig_model import Rig
 
-Floats = NDArray[np.float64]
 AIRY = "airy"
 FIRST_NM, LAST_NM = 400.0, 1000.0  # of the spectrograph
 _ALONE: Floats = np.ones(1)
@@ -136,8 +134,7 @@ class Defocus(Blur):
         normals = extreme_normals(probe.sweeps, rig.camera)
         worst = np.max([defocus_px(rig, rig.air.distance_m, normal) ** 2 / 16 for normal in normals], axis=0)
         cause = f"defocus at {rig.air.distance_m:g} m, focused at {rig.optics.focus_m:g} m"
-        variance = even(worst, len(probe.wavelength_nm)).variance[None]
-        return blurred_bound(probe, cause, variance, mean_way=DISC_WAY)
+        return blurred_bound(probe, cause, even(worst, len(probe.wavelength_nm)).variance[None], mean_way=DISC_WAY)
 
 
 def defocus_px(rig: Rig, distance_m: float | None, normal: Floats | None = None) -> Floats:

@@ -16,12 +16,11 @@ import scipy
 from numpy.typing import NDArray
 
 from pipeline.simulator import compiled_loops
-from pipeline.simulator.effects.effect import Bound, Effect, unit_stream
+from pipeline.simulator.effects.effect import Bound, Effect, Radiance, unit_stream
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Rig
 
 Floats = NDArray[np.float64]
-Radiance = NDArray[np.float32]
 CHIP_SAMPLES = 1_000_000  # numbers of a patch that later stages judge as one: 61 x 61 px of 270 bands
 MOST_VARIATION = 0.05  # total variation between a patch of cheap draws and one of exact draws
 LEAST_MERGED_READ_E = 1.0  # below, the whole numbers of the counts show through the read noise
@@ -239,8 +238,7 @@ class Defects(Effect):
         electrons = float(hot.max())
         gained = min(electrons, rig.camera.full_scale_e)  # the converter's end
         why = f"{dead.sum()} dead and {(hot > 0).sum()} hot elements of {dead.size}, these with {electrons:.3g} e- more"
-        added = probe.added(gained, rig.camera.electrons_per_dn) if gained else 0.0
-        return Bound(max(lost, added), why)
+        return Bound(max(lost, probe.added(gained, rig.camera.electrons_per_dn) if gained else 0.0), why)
 
 
 def dead_elements(rig: Rig, bands: int) -> Mask:
@@ -265,8 +263,7 @@ def most_hot_electrons(rig: Rig) -> float:
 
 @lru_cache(maxsize=8)
 def _mask(unit: int, kind: str, samples: int, bands: int, *, fraction: float) -> Mask:
-    below = unit_stream(unit, kind).random((bands, samples)) < fraction
-    mask: Mask = np.ascontiguousarray(below.T)
+    mask: Mask = np.ascontiguousarray((unit_stream(unit, kind).random((bands, samples)) < fraction).T)
     mask.setflags(write=False)
     return mask
 

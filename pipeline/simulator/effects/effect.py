@@ -17,12 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.mirror import position_to_normal
-from pipeline.geometry.scan import Sweep, line_positions, sweep_positions
+from pipeline.geometry.scan import Floats, Sweep, line_positions, sweep_positions
 from pipeline.simulator.effects.probe import GainRange, Probe
 from pipeline.simulator.optics.kernel_fit import Moments
 from pipeline.simulator.rig_model import Rig
 
-Floats = NDArray[np.float64]
 Radiance = NDArray[np.float32]
 OFF = "off"
 

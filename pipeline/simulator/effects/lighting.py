@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Sweep, points_of_scan
+from pipeline.geometry.scan import Floats, Sweep, points_of_scan
 from pipeline.simulator.effects.effect import Bound, Gain, Radiance, SweepBlock, survey_stream
 from pipeline.simulator.effects.probe import GainRange, Probe
 from pipeline.simulator.rig_model import Coating, Rig
 from pipeline.simulator.scenes.daylight import knots_within, relative_daylight, sun_elevation_deg
 
-Floats = NDArray[np.float64]
 EDGE_FRACTION = 0.1  # width of a shadow's edge, over the shadow's size (assumed)
 HOT_SPOT_RAD = float(np.deg2rad(2.0))  # from its peak to 1/e (assumed)
 _PROBES = 65  # incidences that bounds are taken at
@@ -53,8 +52,7 @@ class Drift(Gain):
         nm = np.asarray(probe.wavelength_nm, np.float64)
         if rig.sky.started is None:
             return GainRange.between(1.0, 1.0, len(nm))
-        times = knots_within(rig.sky, probe.seconds + rig.camera.frame_ms * 1e-3)
-        light = relative_daylight(rig.sky, nm, times)
+        light = relative_daylight(rig.sky, nm, knots_within(rig.sky, probe.seconds + rig.camera.frame_ms * 1e-3))
         return GainRange.of(light, uneven=float(np.ptp(light, axis=1).max(initial=0.0)))
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
@@ -224,8 +222,7 @@ class Vignetting(Gain):
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
         sweep, camera = block.sweep, block.rig.camera
-        scan_px = sweep.held_px()
-        fraction = np.sqrt(1 - ahead(sweep.swath_px, scan_px[block.numbers], camera)).mean(axis=1)
+        fraction = np.sqrt(1 - ahead(sweep.swath_px, sweep.held_px()[block.numbers], camera)).mean(axis=1)
         return np.asarray(fraction.astype(np.float32)[:, None, None])
 
 

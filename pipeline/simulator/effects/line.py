@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Sweep, points_of_scan
+from pipeline.geometry.scan import Floats, Sweep, points_of_scan
 from pipeline.simulator.effects.air import turbulence_px
 from pipeline.simulator.effects.effect import OFF, Bound, Effect, SweepBlock
 from pipeline.simulator.effects.pointing import beside_plan, greatest_lag_px, transient
@@ -23,7 +22,6 @@ from pipeline.simulator.rig_model import Rig
 MARGIN = 1.5  # over what the probe measured at the roughest places found
 UPRIGHT = "1x1"  # the slit's variant of one box that does not lie turned
 _RAY_PER_TILT = 2.6  # a ray turns by twice the tilt; the scene plane is oblique to it by up to 30 deg
-Floats = NDArray[np.float64]
 _PROBES = 33  # lines of a sweep and samples of a line at which its course is taken; both are smooth
 BOXES = {"9x3": (9, 3), "5x2": (5, 2), "3x1": (3, 1), UPRIGHT: (1, 1)}  # of the slit's variants, across and along
 POSITIONS, FOLDED = "positions", "folded"

@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import position_to_normal
-from pipeline.geometry.scan import Sweep, line_positions, points_of_scan
+from pipeline.geometry.scan import Floats, Sweep, line_positions, points_of_scan
 from pipeline.simulator.effects.effect import Aim, Bound, SweepBlock, unit_stream
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import MirrorMotion, Rig
 
-Floats = NDArray[np.float64]
 EXCEEDED = 1e-3  # probability that any line of a survey lies beyond the bound
 _MODES = 6
 
@@ -308,8 +307,7 @@ def greatest_lag_px(rig: Rig, sweeps: Iterable[Sweep]) -> float:
     """Return the greatest shift along the scan of any line. [px]"""
     worst = 0.0
     for sweep in {(one.lines, one.step, one.positions): one for one in sweeps if one.lines}.values():
-        off = transient(rig, sweep, np.arange(sweep.lines))
-        worst = max(worst, float(np.abs(off).mean(axis=1).max()))
+        worst = max(worst, float(np.abs(transient(rig, sweep, np.arange(sweep.lines))).mean(axis=1).max()))
     return worst
 
 
@@ -319,13 +317,11 @@ def transient(rig: Rig, sweep: Sweep, numbers: NDArray[np.int64]) -> Floats:
     pace = 2 * math.pi * mirror.natural_hz * 1e-3  # [1/ms]
     period, held = pace * camera.frame_ms, pace * camera.exposure_ms / sweep.positions
     start = _at_start(mirror, sweep, period, held)
-    time = numbers[:, None] * period + np.arange(sweep.positions) * held
-    impulse, rise = responses(time, mirror.damping)
+    impulse, rise = responses(numbers[:, None] * period + np.arange(sweep.positions) * held, mirror.damping)
     place: Floats = start[0] * (1 - rise) + start[1] * impulse
     rate = -start[0] * impulse + start[1] * (1 - rise - 2 * mirror.damping * impulse)
     impulse, rise = responses(np.array([held]), mirror.damping)
-    mean: Floats = (place * (impulse + 2 * mirror.damping * rise) + rate * rise) / held
-    return mean
+    return np.asarray((place * (impulse + 2 * mirror.damping * rise) + rate * rise) / held)
 
 
 def responses(time: Floats, damping: float) -> tuple[Floats, Floats]:

@@ -15,10 +15,9 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.scan import Sweep
+from pipeline.geometry.scan import Floats, Sweep
 from pipeline.simulator.rig_model import Rig
 
-Floats = NDArray[np.float64]
 Unit = Literal["sigma", "dn"]
 UNITS = {"sigma": "sigma", "dn": "DN"}
 Radiance = NDArray[np.float32]
@@ -155,8 +154,7 @@ class GainRange:
 def rising_runs(wavelength_nm: Floats) -> list[slice]:
     """Return the runs of bands whose wavelengths rise: where they fall back or stay, another detector begins."""
     breaks = np.flatnonzero(~(np.diff(wavelength_nm) > 0)) + 1
-    ends = [0, *breaks.tolist(), len(wavelength_nm)]
-    return [slice(start, stop) for start, stop in pairwise(ends)]
+    return [slice(start, stop) for start, stop in pairwise([0, *breaks.tolist(), len(wavelength_nm)])]
 
 
 def rising_gaps(wavelength_nm: Floats) -> Floats:

@@ -13,14 +13,11 @@ import scipy
 from numpy.typing import NDArray
 
 from pipeline.simulator import compiled_loops
-from pipeline.simulator.effects.counting import normal_deviates
-from pipeline.simulator.effects.effect import Bound, Gain, LightChange, SweepBlock, unit_stream
+from pipeline.simulator.effects.counting import EXACT, Floats, normal_deviates
+from pipeline.simulator.effects.effect import Bound, Gain, LightChange, Radiance, SweepBlock, unit_stream
 from pipeline.simulator.effects.probe import GainRange, Probe, difference_rates, rising_gaps, rising_runs
 from pipeline.simulator.rig_model import Rig
 
-Floats = NDArray[np.float64]
-Radiance = NDArray[np.float32]
-EXACT = "exact"
 FWHM2_PER_VARIANCE = 8 * math.log(2)
 BANDS_AT_ONCE = 32  # bands that one product makes
 LEAST_WEIGHT = 1e-8
@@ -159,8 +156,7 @@ class Smile(LightChange):
     def change(self, light: Radiance, block: SweepBlock, variant: str) -> Radiance:
         """Return light (line, sample, band) [e-] at the wavelengths that each sample sees."""
         camera, smile = block.rig.camera, block.rig.optics.smile_nm
-        bands = tuple(map(float, block.wavelength_nm))
-        first, weights = _tap_weights(bands, float(smile), camera.samples)
+        first, weights = _tap_weights(tuple(map(float, block.wavelength_nm)), float(smile), camera.samples)
         out = np.empty(light.shape, np.float32)
         compiled_loops.mix_neighbours(np.ascontiguousarray(light, np.float32), weights, first, out)
         return out
@@ -178,17 +174,15 @@ def wavelength_shift(samples: int, smile_nm: float) -> Floats:
 def _tap_weights(wavelength_nm: tuple[float, ...], smile_nm: float, samples: int) -> tuple[int, NDArray[np.float32]]:
     """Return the offset of the first tap and the weights of all, (tap, sample, band)."""
     wavelength, shift = np.array(wavelength_nm), wavelength_shift(samples, smile_nm)
-    taps: list[tuple[slice, NDArray[np.int64], Floats]] = []
-    for run in rising_runs(wavelength):
-        if run.stop - run.start > 1:
-            taps += [(run, off, weight) for off, weight in _run_taps(wavelength[run], shift)]
+    runs = [run for run in rising_runs(wavelength) if run.stop - run.start > 1]
+    taps = [(run, off, weight) for run in runs for off, weight in _run_taps(wavelength[run], shift)]
     first = min((int(off.min()) for _, off, _ in taps), default=0)
     last = max((int(off.max()) for _, off, _ in taps), default=0)
     first, last = min(first, 0), max(last, 0)
     weights = np.zeros((last - first + 1, samples, len(wavelength)))
     weights[-first] = 1
     sample = np.arange(samples)[:, None]
-    for run in {run.start: run for run, _, _ in taps}.values():
+    for run in runs:
         weights[-first, :, run] = 0
     for run, off, weight in taps:
         weights[off - first, sample, np.arange(run.start, run.stop)] += weight

@@ -113,8 +113,7 @@ def _fit(packed: bytes, bands: int, box: tuple[float, float], held: int, disc: A
     size = np.concatenate([moments[:2], np.sqrt(moments[2:4]), moments[4:]])
     place = np.linalg.svd(size - size.mean(axis=1, keepdims=True), full_matrices=False)[2][0]
     order = np.argsort(place)
-    steps = np.arange(held) - (held - 1) / 2
-    smeared = np.cos(2 * np.pi * np.outer(_SCAN, steps)).mean(axis=1)
+    smeared = np.cos(2 * np.pi * np.outer(_SCAN, np.arange(held) - (held - 1) / 2)).mean(axis=1)
     own = np.sinc(_ALONG * box[1]) * np.sinc(_SCAN * box[0]) * smeared  # what slit, pixel and held positions pass
     own *= disc_contrast(_ALONG, _SCAN, disc)
     own *= _STRICT
@@ -360,7 +359,6 @@ def fold(box: tuple[float, float], parts: tuple[int, int], held: int, blurs: Mom
     return Footprint(box, parts, held, kernels.shift, kernels.variance, fractions, between, kernels.level, blurs.disc)
 
 
-Weights = NDArray[np.float32]
 PER_PX = 128  # rows of a table; between them weights are linear, right to 8e-6 of a kernel's curvature
 SCALE_STEP = 1 / 4096  # from one tabulated scale to the next; the nearest is taken
 _WORKED_OUT = 16  # every so many of them are worked out, those between are linear: right to 2e-6
@@ -374,9 +372,8 @@ _SDS = 6.5  # of a Gaussian: nothing beyond
 
 def box_weight(distance: Floats, width: float, held: int = 1) -> Floats:
     """Return the linear kernel averaged over a box and over ``held`` positions 1 px apart, at distances [px]."""
-    places = np.arange(held) - (held - 1) / 2
     total = np.zeros(np.shape(distance))
-    for place in places:
+    for place in np.arange(held) - (held - 1) / 2:
         beside = distance - place
         if width > 1e-6:
             total += (_integral(beside + width / 2) - _integral(beside - width / 2)) / width
@@ -393,8 +390,7 @@ def blurred_weight(width: float, variance: Floats, held: int = 1) -> tuple[Float
     if not variance.any():
         return distance, np.repeat(sharp[None], len(variance), axis=0)
     length = 2 * len(distance)
-    wave = np.fft.rfftfreq(length, 1 / PER_PX)
-    passed = np.exp(-2 * np.pi**2 * variance[:, None] * wave**2)
+    passed = np.exp(-2 * np.pi**2 * variance[:, None] * np.fft.rfftfreq(length, 1 / PER_PX) ** 2)
     blurred = np.fft.irfft(np.fft.rfft(sharp, length) * passed, length)[:, : len(distance)]
     return distance, np.where(variance[:, None] > 0, np.maximum(blurred, 0.0), sharp)
 
@@ -405,7 +401,7 @@ class TapTable(NamedTuple):
     A position is given by its distance ``place`` from the first tap, which lies ``left`` px before the centre's pixel.
     """
 
-    weight: Weights
+    weight: NDArray[np.float32]
     left: int
     first: float  # place of the first row of each scale
     least_scale: float
@@ -426,8 +422,7 @@ class TapTable(NamedTuple):
         """Tabulate kernels of a width and variances (kernel,), between two scales, up to ``beside`` px off centre."""
         least = (math.floor(scales[0] / SCALE_STEP) - 1) * SCALE_STEP
         count = math.ceil((scales[1] - least) / SCALE_STEP) + 2
-        worked_out = range(0, count + _WORKED_OUT, _WORKED_OUT)
-        sizes = [max(least + SCALE_STEP * number, 1e-3) for number in worked_out]
+        sizes = [max(least + SCALE_STEP * number, 1e-3) for number in range(0, count + _WORKED_OUT, _WORKED_OUT)]
         found = [blurred_weight(width * size, variance * size**2, held) for size in sizes]
         reach = max(_reach(*one, tail) for one in found)
         off = 0.5 + beside

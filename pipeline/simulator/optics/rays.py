@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_normal, scene_to_direction
-from pipeline.geometry.scan import Sweep
+from pipeline.geometry.scan import Floats, Sweep
 
-Floats = NDArray[np.float64]
 REST_NORMAL: Floats = np.array([np.sqrt(0.5), 0.0, -np.sqrt(0.5)])
 
 

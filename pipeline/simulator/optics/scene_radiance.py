@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.simulator import compiled_loops
-from pipeline.simulator.optics.kernel_fit import TAIL, Footprint, TapTable, disc_points
+from pipeline.simulator.optics.kernel_fit import TAIL, Floats, Footprint, TapTable, disc_points
 from pipeline.simulator.optics.rays import RayViews
 from pipeline.simulator.scenes.scene import THINNED_MARGIN, RasterScene
 
-Floats = NDArray[np.float64]
 Radiance = NDArray[np.float32]
 MOST_PARTS = 1_500_000  # components of samples through kernels, at once: few calls, and little memory
 LEAST_BANDS = 16  # that are mixed by themselves: fewer cost as much
@@ -126,8 +125,7 @@ class SceneSampler:
     ) -> None:
         for views in steps:
             for level, some, gatherer in self.gatherers:
-                seen = views.thinned(level, THINNED_MARGIN)
-                gatherer.gather(pixels[level], seen, out, numbers[some], gains[some])
+                gatherer.gather(pixels[level], views.thinned(level, THINNED_MARGIN), out, numbers[some], gains[some])
 
 
 @dataclass(frozen=True)

@@ -12,19 +12,13 @@ SPECTRL2 [2]. The sky is clear, at sea level. Times are seconds since the survey
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError
-from pipeline.lazy import deferred
+from pipeline.lazy import pvlib
 from pipeline.simulator.rig_model import Sky
-
-if TYPE_CHECKING:
-    import pvlib
-else:
-    pvlib = deferred("pvlib")
 
 Floats = NDArray[np.float64]
 KNOT_S = 10.0  # light is straight between such times: right to 2e-6 of that of a high sun

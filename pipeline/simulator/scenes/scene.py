@@ -9,7 +9,6 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from threading import Lock
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +16,9 @@ from numpy.typing import NDArray
 from pipeline.errors import SceneError, ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, cuts
-from pipeline.lazy import Once
+from pipeline.lazy import GeoBox, Once
 from pipeline.readings import MOST_VALUE, find_beyond
 from pipeline.simulator.scenes.scratch import scratch
-
-if TYPE_CHECKING:
-    from odc.geo.geobox import GeoBox
 
 Drawn = tuple[NDArray[np.float32], NDArray[np.uint8] | None]
 _BINOMIAL = (np.array([1, 8, 28, 56, 70, 56, 28, 8, 1]) / 256).astype(np.float32)

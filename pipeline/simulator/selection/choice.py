@@ -105,8 +105,7 @@ def decide(
     named = named_effects(asked, [effect.name for effect in effects])
     menus = list_options(probes, rig, effects)
     settled = {menu.name: _settled(menu, tolerance, named, exact=asked == "all") for menu in menus}
-    open_menus = [menu for menu in menus if settled[menu.name] is None]
-    options = _cheapened(open_menus, tolerance, forced=named is not None)
+    options = _cheapened([menu for menu in menus if settled[menu.name] is None], tolerance, forced=named is not None)
     taken = [
         settled[menu.name] or Treatment(menu, options[menu.name], _reason(menu, options[menu.name], tolerance, named))
         for menu in menus

@@ -17,13 +17,10 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera, footprint_kernel
-from pipeline.geometry.scan import Sweep
-from pipeline.simulator.effects.probe import steepest_difference
+from pipeline.geometry.scan import Floats, Sweep
+from pipeline.simulator.effects.probe import Radiance, steepest_difference
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, to_bands
 
-Radiance = NDArray[np.float32]
-Floats = NDArray[np.float64]
-Kind = tuple[int, int]  # measure, and band or group of bands
 BAND_GROUPS = 8
 CHOSEN_BANDS = 4
 _LEAST_WEIGHT = 1e-3  # of a kernel's tap: enough to find places
@@ -127,7 +124,7 @@ class Ranking:
     """The best places of every kind."""
 
     def __init__(self) -> None:
-        self._offers: dict[Kind, list[Floats]] = {}
+        self._offers: dict[tuple[int, int], list[Floats]] = {}  # by measure, and band or group of bands
 
     def offer(self, measure: int, values: Radiance, first: int, tile: int, kinds: Sequence[int]) -> None:
         """Offer the greatest of every tile and band; ``values`` (row, column, band) of the strip that begins at a row.
@@ -187,8 +184,7 @@ class PixelOptics:
 
     def noise(self, light: Radiance) -> Radiance:
         """Return one standard deviation at each light [e-]."""
-        noise: Radiance = np.sqrt(np.maximum(light, 0) + np.float32(self.fixed_noise))
-        return noise
+        return np.sqrt(np.maximum(light, 0) + np.float32(self.fixed_noise))
 
     def measures(self, light: Radiance) -> Iterator[Radiance]:
         """Yield measures of light without its halo, (row, column, band) each: higher ones are probed first.

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_normal, scene_to_direction
-from pipeline.geometry.scan import CostModel, Sweep, exposing, scene_to_sweep
+from pipeline.geometry.scan import CostModel, Floats, Sweep, exposing, scene_to_sweep
 from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE
-from pipeline.simulator.effects.effect import OFF
+from pipeline.simulator.effects.effect import OFF, Radiance
 from pipeline.simulator.effects.line import BOXES, SLIT, UPRIGHT, box_of
 from pipeline.simulator.effects.probe import Probe, Unit, steepest_difference, stored_mean, unit_at
 from pipeline.simulator.optics.kernel_fit import Footprint, Moments, fold
@@ -27,8 +27,6 @@ from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from pipeline.simulator.selection.extrema import CHOSEN_BANDS, band_groups, find_extrema
 
-Floats = NDArray[np.float64]
-Radiance = NDArray[np.float32]
 Way = tuple[float, float]  # along the line and the scan [px]
 MOST_VALUES = 1_000_000  # samples times bands; each is seen a few times over, a fraction of a px apart
 MOST_SAMPLES = 6_000
@@ -226,8 +224,7 @@ def light_seen(
 def _rays_of(views: SampleViews, camera: LineCamera, turned: Way) -> RayViews:
     """Return the middle rays of samples, moved by (along, across) px of the camera, in tangents."""
     ifov = camera.ifov_rad
-    tangents = np.stack([views.swath_px, views.scan_px], axis=-1) * ifov
-    normal = direction_to_normal(scene_to_direction(tangents))
+    normal = direction_to_normal(scene_to_direction(np.stack([views.swath_px, views.scan_px], axis=-1) * ifov))
     return exact_views(normal, turned[1] * ifov, views.slope + turned[0] * ifov)
 
 
@@ -324,8 +321,7 @@ def _slit_errors(
 
 def _roughest(scene: RasterScene, rig: Rig, views: SampleViews, unit: Unit) -> NDArray[np.intp]:
     """Return the stored numbers that the slit, or one upright box in its place, changes most."""
-    boxes = _footprint(SLIT.variants[0], rig, _CLOSE, None, scene)
-    close = light_seen(scene, rig.camera, views, boxes, _PHASES)
+    close = light_seen(scene, rig.camera, views, _footprint(SLIT.variants[0], rig, _CLOSE, None, scene), _PHASES)
     scale, most = unit_at(_stored(close, views), rig, unit, views.binning), max(FINEST_SAMPLES // views.binning, 50)
     others = [_footprint(variant, rig, (1, 1), None, scene) for variant in (OFF, UPRIGHT)]
     changes = [_changes(scene, rig, views, other, close, scale) for other in others]

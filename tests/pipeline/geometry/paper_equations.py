@@ -15,8 +15,9 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import (
     REST_TANGENT,
     Floats,
+    _one_minus_z,
+    _units,
     direction_to_normal,
-    line_rotation,
     normal_to_device,
     scene_to_direction,
 )
@@ -25,6 +26,20 @@ from pipeline.geometry.scan import points_of_scan
 LineModel = Literal["L0", "L1", "L2", "L3", "L4"]
 LINE_MODELS: tuple[LineModel, ...] = get_args(LineModel)
 _SMALL_SLOPE = 1e-6
+
+
+def line_rotation(direction: ArrayLike) -> Floats:
+    """Return the rotation of the slit's image in the scene tangent plane, for unit directions (..., 3) [rad].
+
+    It depends on the pose and not on the path (erratum E8). For a slit along y it is psi = atan2(o_y, 1 - o_z),
+    anticlockwise from xi to eta. The line is exactly straight and runs along (cos psi, sin psi) in (xi, eta).
+
+    A survey uses `scan.points_of_scan` instead, which includes the rotation; `line_centre` and `camera_slope` undo it.
+
+    Raises PoseError: a direction is not finite, not of length 1, or is the camera's own ray.
+    """
+    o = _units(direction, "view direction")
+    return np.arctan2(o[..., 1], _one_minus_z(o))
 
 
 def unlimited_position(normal: ArrayLike) -> Floats:

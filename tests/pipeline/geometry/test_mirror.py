@@ -20,7 +20,6 @@ from pipeline.geometry.mirror import (
     direction_to_position,
     direction_to_scene,
     line_centre,
-    line_rotation,
     mirror_throughput,
     normal_to_position,
     position_to_direction,
@@ -28,6 +27,7 @@ from pipeline.geometry.mirror import (
     reflect,
     scene_to_direction,
 )
+from tests.pipeline.geometry.paper_equations import line_rotation
 
 E1, E3 = np.array([-1.0, 0.0, -1.0]) / np.sqrt(2), np.array([1.0, 0.0, -1.0]) / np.sqrt(2)
 

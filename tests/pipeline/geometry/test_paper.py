@@ -12,7 +12,6 @@ from pipeline.geometry.mirror import (
     direction_to_normal,
     direction_to_position,
     direction_to_scene,
-    line_rotation,
     normal_to_device,
     normal_to_position,
     position_to_direction,
@@ -22,6 +21,7 @@ from pipeline.geometry.scan import CostModel, Sweep, device_range, memory_loads
 from tests.pipeline.geometry.paper_equations import (
     LINE_MODELS,
     line_points,
+    line_rotation,
     paper_numbers,
     straight_slope_rotation,
     unlimited_position,

@@ -113,8 +113,7 @@ def _standing_crop(
     growth = np.clip(1 + 0.32 * np.minimum(here.vigour + 1.9, 0), 0.15, 1)  # bare spots where vigour fails
     plants = growth * np.clip(between + (ON_ROW - between) * row + uneven, 0, 0.99) * (1 - gaps * (1 - 0.6 * closed))
     plants = np.asarray(plants + down * (ON_ROW - plants), np.float32)
-    height = float(np.interp(age, *np.array(crop.heights).T))
-    shaded = row_shadow(work.plan.sun, height, rows, period, width)
+    shaded = row_shadow(work.plan.sun, float(np.interp(age, *np.array(crop.heights).T)), rows, period, width)
     dense = np.clip(0.2 + 0.3 * width, 0, 0.75) * (1 - gaps) * (1 - down)  # seedlings let light through
     soil = blend(soil, {"shade": np.ones_like(plants)}, np.asarray(dense * shaded, np.float32))
     deep = np.asarray(0.24 * (1 - row) * closed * (1 - down), np.float32)  # between rows that have closed
@@ -145,8 +144,7 @@ def _with_wheel_marks(content: Content, field: FieldPlan, rows: Rows, soil: Mixt
     if field.tramlines is None:
         return content
     marks = wheel_marks(field, rows)
-    trodden = blend(soil, {"gravel": np.ones_like(marks)}, np.full_like(marks, 0.22))
-    mixture = blend(content.mixture, trodden, marks)
+    mixture = blend(content.mixture, blend(soil, {"gravel": np.ones_like(marks)}, np.full_like(marks, 0.22)), marks)
     return Content(mixture, blend(content.fractions, {"track": np.ones_like(marks)}, marks))
 
 
@@ -168,15 +166,12 @@ def _meadow(rows: Rows, field: FieldPlan, here: Ground, days: float, day: int) -
     winter = 0.5 + 0.5 * np.cos(2 * np.pi * (day - 25) / YEAR_DAYS)
     dryness = float(0.18 + 0.34 * np.exp(-days / 12) + 0.24 * winter)
     bands = stripes(rows.across, field.row_period_px, field.row_period_px / 2)
-    mixture = blend(grass(here, dryness), grass(here, dryness + 0.16), bands)
-    return Content(mixture, {"grass": np.ones_like(bands)})
+    return Content(blend(grass(here, dryness), grass(here, dryness + 0.16), bands), {"grass": np.ones_like(bands)})
 
 
 def _bare_field(rows: Rows, field: FieldPlan, here: Ground, soil: Mixture) -> Content:
-    period = field.row_period_px if field.crop is None else 10.5
-    furrow = stripes(rows.place, period, 3.0)
-    mixture = blend(soil, {"shade": np.ones_like(furrow)}, 0.15 * furrow)
-    content = Content(mixture, {"soil": np.ones_like(furrow)})
+    furrow = stripes(rows.place, field.row_period_px if field.crop is None else 10.5, 3.0)
+    content = Content(blend(soil, {"shade": np.ones_like(furrow)}, 0.15 * furrow), {"soil": np.ones_like(furrow)})
     return _with_wheel_marks(content, field, rows, soil) if field.crop is None else content
 
 
@@ -260,8 +255,7 @@ def wheel_marks(field: FieldPlan, rows: Rows) -> Field:
     pair = stripes(shift, trams.spacing, trams.width) + stripes(shift + trams.gauge, trams.spacing, trams.width)
     middle = field.headland_px / 2
     turn = edge(trams.width / 2 - np.abs(np.abs(rows.ends - middle) - trams.gauge / 2))
-    inner = edge(rows.ends - middle - trams.gauge / 2)
-    return np.asarray(np.clip(np.maximum(pair * inner, turn), 0, 1), np.float32)
+    return np.asarray(np.clip(np.maximum(pair * edge(rows.ends - middle - trams.gauge / 2), turn), 0, 1), np.float32)
 
 
 def _scatter(first: NDArray[np.int64], second: NDArray[np.int64], salt: int) -> Floats:
@@ -332,8 +326,7 @@ def _clustered(rng: np.random.Generator, field: FieldPlan, count: int) -> Points
     inside = np.ones(count, bool)
     for ny, nx, offset in field.parcel.cuts:
         inside &= near @ np.array([ny, nx]) > offset
-    kept = inside & (rng.uniform(size=count) < CLUSTERED)
-    return np.where(kept[:, None], near, places)
+    return np.where((inside & (rng.uniform(size=count) < CLUSTERED))[:, None], near, places)
 
 
 def points_within(rng: np.random.Generator, corners: Points, count: int) -> Points:

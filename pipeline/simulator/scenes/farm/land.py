@@ -81,8 +81,7 @@ def divide_land(rng: np.random.Generator, size: tuple[float, float], area: float
         angle = turn + (np.pi / 2 if np.ptp(spans[1]) > np.ptp(spans[0]) else 0.0) + rng.uniform(-0.12, 0.12)
         low, high = _span(parcel.corners, angle)
         cut = float(np.cos(angle)), float(np.sin(angle)), float(low + (high - low) * rng.uniform(0.36, 0.64))
-        opposite = (-cut[0], -cut[1], -cut[2])
-        for side in (cut, opposite):
+        for side in (cut, (-cut[0], -cut[1], -cut[2])):
             waiting.append(Parcel(clip_polygon(parcel.corners, side), (*parcel.cuts, side)))
         ends = clip_polygon(parcel.corners, cut)
         on_cut = ends[np.abs(ends @ np.array(cut[:2]) - cut[2]) < 1e-6]

@@ -18,20 +18,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import WavelengthError
 from pipeline.geometry.camera import LineCamera
-from pipeline.lazy import deferred
+from pipeline.lazy import prosail
 from pipeline.simulator.scenes.daylight import clear_sky
-
-if TYPE_CHECKING:
-    import prosail
-else:
-    prosail = deferred("prosail")
 
 Spectrum = NDArray[np.float64]
 
