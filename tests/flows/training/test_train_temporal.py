@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import torch
 from rich.console import Console
 
 import flows.training.train_temporal as remember
+from flows.cli.model_verbs import TrainFlags, run_training
 from flows.tasks.survey_model import shipped_weights
 from flows.training.train_temporal import TemporalRequest, _moments, run_remember, train_temporal
 from models.evaluation.metrics import confusion, mean_iou
@@ -116,3 +118,19 @@ def test_the_shipped_weights_have_a_reader() -> None:
     assert found is not None
     assert min(found.record["lands"]) >= 200_000
     assert found.sizes == load_reader(weights).sizes == TemporalSizes(11, 24)
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        ({"seed": -1}, "--seed must be 0 or more, got -1"),
+        ({"scenes": 0}, "--scenes must be above 0, got 0"),
+        ({"steps": 0}, "--steps must be above 0, got 0"),
+        ({"hold_out": "3"}, "--hold-out is not for --train-temporal; leave it out"),
+    ],
+)
+def test_flags_are_checked_before_the_first_visit(tmp_path: Path, flags: dict[str, Any], words: str) -> None:
+    """Counts, and flags of a training of all weights."""
+    asked = TrainFlags(train_temporal=shipped_weights(), **flags)
+    with pytest.raises(SettingsError, match=words):
+        run_training("farm", tmp_path / "w.safetensors", asked, "", Console(quiet=True))
