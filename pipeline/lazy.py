@@ -50,15 +50,14 @@ class DeferredModule(ModuleType):
 
 
 def deferred(name: str) -> Any:
-    """Return a package that is imported at its first use: one that loads slowly, or is an optional extra.
+    """Return a module that is imported at its first use; packages that are listed below are imported from here.
 
     Write it beside the import for type checkers::
 
         if TYPE_CHECKING:
-            import torch
-    import uvicorn
+            import flows.survey as survey_flow
         else:
-            torch = deferred("torch")
+            survey_flow = deferred("flows.survey")
     """
     return DeferredModule(name)
 

@@ -216,6 +216,7 @@ class EvaluateFlags(SceneFlags):
 
 
 NO_TRAIN_FLAGS, NO_EVALUATE_FLAGS = TrainFlags(), EvaluateFlags()
+OF_TEMPORAL = ("train_temporal", "scenes", "steps", "minutes", "seed", "validation")  # flags of --train-temporal
 
 
 def train(dataset: str, *, out: OutFile, flags: TrainFlags = NO_TRAIN_FLAGS, as_json: AsJson = False) -> int:
@@ -252,11 +253,8 @@ def run_training(dataset: str, out: Path, flags: TrainFlags, command: str, conso
     return run_remember(reader, console)
 
 
-OF_TEMPORAL = ("train_temporal", "scenes", "steps", "minutes", "seed", "validation")
-
-
 def check_default(flags: SceneFlags, but: Sequence[str], why: str) -> None:
-    """Raise SettingsError where a flag has another value than its default, ``but`` for some."""
+    """Raise SettingsError where a flag other than ``but`` differs from its default."""
     for one in fields(flags):
         if one.name not in but and getattr(flags, one.name) != one.default:
             raise SettingsError(f"--{one.name.replace('_', '-')} is {why}; leave it out")

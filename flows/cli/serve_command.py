@@ -197,7 +197,9 @@ def _start_server(home: Path, port: int, held: ExitStack) -> str:
         api = held.enter_context(local_server(home, port, schedules=True))
         return f"{api.removesuffix('/api')}; the password is in {home / 'password'}"
     except ServerUnavailable as error:
-        raise SettingsError(f"{error}: start it, or unset PREFECT_API_URL and have one started here") from error
+        named = "PREFECT_API_URL" in os.environ
+        cure = ": start it, or unset PREFECT_API_URL and have one started here" if named else ""
+        raise SettingsError(f"{error}{cure}") from error
 
 
 def _serve(fields: Sequence[ServedField], schedule: Any, limit: int, *, shared: bool) -> None:

@@ -85,8 +85,9 @@ def format_reference(receipt: Mapping[str, Any]) -> str:
     names = [stage["name"] for stage in receipt["stages"]]
     if "capture_fine" in names:
         between = receipt["stages"][names.index("capture_coarse") + 1 : names.index("capture_fine")]
-        if decided_s := sum(stage["wall_s"] or 0.0 for stage in between):
-            words += f" The decision between the passes took {format_seconds(decided_s)} more."
+        times = [stage["wall_s"] for stage in between]
+        if times and None not in times:  # stages that were stored before have none
+            words += f" The decision between the passes took {format_seconds(sum(times))}, beside the capture time."
     if capture.get("uniform") is None:
         return words
     scan = f"{format_seconds(capture['uniform'])} ({capture['uniform_scan']})"

@@ -428,11 +428,11 @@ def _extent_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str
 
 
 def _limit_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]:
-    """Yield errors: limits of kept bytes or multiply-adds for a survey that has no use for them."""
+    """Yield errors: a line spacing, or a limit of kept bytes or multiply-adds, that the survey cannot use."""
     if settings.zooms and settings.scan_step not in (None, *FIRST_STEPS):
         yield (
-            f"{at('scan_step')} = {settings.scan_step} is the spacing of the first of two passes, which others halve: "
-            f"give {' or '.join(map(str, FIRST_STEPS))}, or leave it out"
+            f"{at('scan_step')} = {settings.scan_step}: the first of two passes takes every 4th or 8th line; give "
+            f"{' or '.join(map(str, FIRST_STEPS))}, or leave it out"
         )
     if settings.kept_bytes is not None and (settings.is_map or not settings.plain):
         yield f"{at('kept_bytes')} is for a uniform scan: give --seconds or --scan-step too, or leave it out"

@@ -120,7 +120,7 @@ class PassLayout:
             fine_s = limit_s - coarse_s
             if fine_s < 0:
                 limit = f"--seconds {seconds:g}" if budget is None else f"a --budget of {budget:g}, {limit_s:.1f} s,"
-                fixed = (self.cost.seconds([replace(one, lines=0) for one in coarse], self.camera)) if coarse else 0.0
+                fixed = self.cost.seconds([replace(one, lines=0) for one in coarse], self.camera)
                 free = self.coarse_exposure_ms is None and self.recorded is None and fixed < limit_s
                 shorter = ", a shorter --coarse-exposure-ms" if free else ""
                 raise BudgetError(
@@ -231,8 +231,11 @@ def choose_uniform_scan(
         chosen = priced_scan(record, sweeps[layout.step], camera, cost, bands, exposure_ms)
     elif plain and layout.step is None:
         if not scans:
+            offered = f"camera.exposure_ms = {camera.exposure_ms:g}"
+            if recorded_ms is not None:
+                offered = f"recorded lines of {', '.join(f'{one:g}' for one in sorted({*recorded_ms.values()}))} ms"
             raise SettingsError(
-                f"camera.exposure_ms = {camera.exposure_ms:g}: the scan performance of the weights starts at "
+                f"{offered}: the scan performance of the weights starts at "
                 f"{record.exposures_ms[0]:g} ms; choose the scan with --scan-step"
             )
         chosen = choose_scan(scans, settings.seconds, goals)

@@ -397,7 +397,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
                 raise
             taken = replace(settings, skip_below_error=None)
             planned = _plan_capture(taken, scene, zones, path, described, prior, passes)
-            notes = (*notes, f"a survey would skip this visit, {known}")
+            notes = (*notes, f"a survey would skip this visit: {str(known).removeprefix('nothing is captured: ')}")
     settings, plan = planned.settings, planned.plan
     read = min(len(scene.wavelength_nm), SMOOTH)  # components of most mosaics; a few have more
     costs = ReadingCosts(described.config, grid, read)

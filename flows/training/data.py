@@ -366,7 +366,7 @@ def unpack_mask(text: str, shape: tuple[int, int]) -> NDArray[np.bool_]:
 
 
 def masks_contain(mask: str, other: str | None) -> bool:
-    """Return whether a mask of `pack_mask` contains all pixels of another one of its scene; None: every pixel."""
+    """Return whether a mask of `pack_mask` contains all pixels of another one; None, every pixel, is in no mask."""
     return other is not None and not (_packed_bits(other) & ~_packed_bits(mask)).any()
 
 

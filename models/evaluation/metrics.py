@@ -249,8 +249,8 @@ def _error(maps: list[JudgedMap], temperature: float) -> float:
 def stratified_fractions(mapped: ArrayLike, confusion: ArrayLike) -> tuple[Floats, Floats]:
     """Estimate fractions (class,) and their standard errors from a map and the confusion matrix of judged pixels.
 
-    ``mapped`` is (class,) fractions of the map, ``confusion`` (label, mapped class) counts, as the function of this
-    name returns them. The judged pixels count as a random sample of each mapped class. The result is NaN if a mapped
+    ``mapped`` is (class,) fractions of the map, ``confusion`` (label, mapped class) counts, as `confusion` above
+    returns them. The judged pixels count as a random sample of each mapped class. The result is NaN if a mapped
     class has fewer than the two judged pixels that an error needs.
 
     References

@@ -148,8 +148,11 @@ class SecondPass:
                     plans.append(self.plan(gain_of(step, mean_ms), step=step, exposure_ms=exposure_ms))
         plans = [plan for plan in plans if plan.seconds <= self.seconds]  # recorded lines may have longer exposures
         plan = max(plans, key=lambda made: (made.expected_gain, -made.seconds), default=None)
-        if plan is None or not plan.sweeps or plan.expected_gain >= LEAST_GAIN:
-            return plan or FinePlan([], np.empty(0, np.intp), 0.0, 0.0, reason="no second pass fits the time")
+        if plan is None:
+            reason = "no second pass in the time would score more than the first one"
+            return FinePlan([], np.empty(0, np.intp), 0.0, 0.0, reason=reason)
+        if not plan.sweeps or plan.expected_gain >= LEAST_GAIN:
+            return plan
         reason = f"no second pass: its expected gain is {100 * plan.expected_gain:.2f} points"
         return FinePlan([], np.empty(0, np.intp), 0.0, plan.expected_gain, reason=reason)
 

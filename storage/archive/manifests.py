@@ -150,9 +150,9 @@ def check_files(folder: Path, *, hashes: bool) -> None:
     manifest = read_manifest(folder)
     for name, problem in broken_files(folder, manifest, hashes=hashes):
         if read_manifest(folder) != manifest:  # another process has cleared it, or made it anew
-            return check_files(folder, hashes=hashes)
+            check_files(folder, hashes=hashes)
+            return
         raise IncompleteStoreError(f"{folder / name} {problem}; {CURE}")
-    return None
 
 
 def broken_files(folder: Path, manifest: Mapping[str, Any], *, hashes: bool) -> Iterator[tuple[str, str]]:

@@ -262,7 +262,7 @@ def missing_files(path: Path, array: zarr.Array[Any]) -> int:
     """Return how many files of an array in the folder ``path`` are not there: zarr reads its fill value for them."""
     parts = zip(array.shape, array.shards or array.chunks, strict=True)
     files = math.prod(-(-int(size) // int(part)) for size, part in parts)
-    return files - sum(one.is_file() for one in (path / "c").rglob("*"))
+    return files - sum(one.name.isdigit() and one.is_file() for one in (path / "c").rglob("*"))
 
 
 def read_bands(group: zarr.Group) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:

@@ -149,7 +149,7 @@ def open_envi_source(path: Path, *, scaled: bool = True) -> CubeSource:
     gain, offset = _numbers(fields, "data gain values", bands, 1.0), _numbers(fields, "data offset values", bands, 0.0)
     if factor > 0:
         gain, offset = np.full(bands, 1 / factor), np.zeros(bands)
-    return source if ((gain == 1).all() and not offset.any()) else rescaled(source, gain, offset, source.nodata)
+    return source if (gain == 1).all() and not offset.any() else rescaled(source, gain, offset, source.nodata)
 
 
 def _numbers(fields: Mapping[str, str], name: str, count: int, default: float) -> NDArray[np.float64]:

@@ -36,7 +36,6 @@ from storage.archive.keys import array_digest
 from storage.archive.manifests import check_files, manifest_sha256
 from storage.archive.records import Run, read_run, read_store
 from storage.archive.staging import MANIFEST_NAME
-from storage.arrays.cubes import RawCube
 from storage.arrays.layout import array_of, missing_files, open_group
 from storage.arrays.signal_cubes import RestoredCube, open_lines
 from storage.readers.cube_sources import CubeSource
@@ -154,7 +153,7 @@ def open_recording(
     for path, cube in zip(stores, cubes, strict=True):
         if not np.array_equal(cube.wavelength_nm, first.wavelength_nm):
             raise SceneError(f"{path} has other bands than {stores[0]}; name the raw cubes of one survey")
-        if isinstance(cube, RawCube) and (lost := missing_files(path / "dn", array_of(cube.group, "dn"))):
+        if "dn" in cube.group and (lost := missing_files(path / "dn", array_of(cube.group, "dn"))):
             raise IncompleteStoreError(f"{path}/dn lacks {lost} of its files, whose lines would be 0; copy it again")
     sweeps = tuple(
         RecordedSweep(

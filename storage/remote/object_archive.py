@@ -47,7 +47,7 @@ MARK_TEXT = b'{"archive": "spectralzoom", "layout": 1}\n'
 ATTEMPT = re.compile(r"((?:stages/[^/]+|runs)/[^/]+)/([0-9a-f]{16})/.+")  # a file's address, and its upload
 ASIDE = ".fetch-"  # prefix of folders of the working copy for incomplete files
 DAY_S = 86400.0
-log = logging.getLogger(__name__)
+LOG = logging.getLogger(__name__)
 
 
 class ObjectArchive(Archive):
@@ -177,14 +177,15 @@ class ObjectArchive(Archive):
 
         A run stays here alone while its stores are neither here nor in the bucket.
         """
+        here = [f"runs/{folder.name}" for folder in self.runs()]
         there = _manifests(self.objects.listing("runs"))
-        self._drop_removed((f"runs/{folder.name}" for folder in self.runs()), there)
+        self._drop_removed(here, there)
         for uri in (f"runs/{folder.name}" for folder in self.runs() if try_manifest(folder)[1] is None):
             if uri not in there:
                 try:
                     self._ensure(read_run(self.root / uri).names)
-                except IncompleteStoreError as error:
-                    log.warning("%s is on this machine alone until its survey runs again: %s", uri, error)
+                except IncompleteStoreError:
+                    LOG.warning("%s stays on this machine until its survey runs again: a store of it was removed", uri)
                 else:
                     self._upload(uri, first=True)
             elif not self._is_dated(uri, there[uri]):
@@ -196,27 +197,31 @@ class ObjectArchive(Archive):
 
     def mirror(self) -> None:
         """Fetch the manifests of all stores, and of runs the receipts too; drop those that other machines removed."""
+        here = [ref.uri for ref in self.refs()]
         stages = [f"stages/{stage}" for stage in self.objects.children("stages")]
         found = [f"{folder}/{key}" for folder in stages for key in self.objects.children(folder)]
         with refusals(self.root, "write to the working copy"):
             some_at_a_time(self._bring, [uri for uri in found if not (self.root / uri / MANIFEST_NAME).is_file()])
-            self._drop_removed((ref.uri for ref in self.refs()), set(found))
+            self._drop_removed(here, set(found))
             self._mirror_runs()
         self._later_runs.clear()
 
     def _mirror_runs(self) -> None:
         """Fetch manifests and receipts of new and extended runs; drop those that other machines removed."""
+        here = [f"runs/{folder.name}" for folder in self.runs()]  # before the bucket's: others here may add some
         found = _manifests(self.objects.listing("runs"))
-        self._drop_removed((f"runs/{folder.name}" for folder in self.runs()), found)
+        self._drop_removed(here, found)
         changed = [uri for uri, one in found.items() if not self._is_dated(uri, one)]
         some_at_a_time(self._bring, changed)
         self._later_runs |= {self.root / uri for uri in changed}
 
     def _drop_removed(self, here: Iterable[str], there: Container[str]) -> None:
-        """Drop what is incomplete here and not in the bucket; what is complete may not have been sent yet."""
+        """Drop what is not in the bucket and known here by manifest and receipt alone; files may not have been sent."""
         for uri in here:
             manifest, problem = try_manifest(self.root / uri)
-            if uri not in there and problem is None and (is_cleared(manifest) or self._lacks(uri, manifest)):
+            files = [] if problem is not None else [name for name in manifest["files"] if name != RECEIPT]
+            known = problem is None and not any((self.root / uri / name).exists() for name in files)
+            if uri not in there and known and (is_cleared(manifest) or self._lacks(uri, manifest)):
                 retire(self.root / uri)
 
     def _bring(self, uri: str) -> None:

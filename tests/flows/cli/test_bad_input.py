@@ -68,7 +68,7 @@ REFUSED = {
     "a first pass that others cannot halve": (
         2,
         "--zoom always --seconds 20 --scan-step 5",
-        r"--scan-step = 5 is the spacing of the first of two passes, which others halve: give 4 or 8",
+        r"--scan-step = 5: the first of two passes takes every 4th or 8th line; give 4 or 8, or leave it out",
     ),
     "seconds below the fastest first pass": (
         2,

@@ -184,7 +184,7 @@ def test_of_what_is_sure_enough_nothing_is_looked_at(
     assert json.loads(told.out) == {"captured": False, "run": runs[-1].name, "why": told.err.strip().splitlines()[-1]}
     planned = plan_content(load_settings(None, asked))
     assert planned["to_make"] > 0
-    assert any("a survey would skip this visit, nothing is captured" in note for note in planned["notes"])
+    assert any("a survey would skip this visit: the prior map's expected error is" in note for note in planned["notes"])
     assert (
         survey_png(visited, **{**flags, "skip_below_error": "0.001"}).receipt["settings"]["skip_below_error"] == 0.001
     )

@@ -113,8 +113,11 @@ def test_a_lost_part_of_a_raw_cube_is_named(tmp_path: Path, archive: Archive, co
     folder = archive.produce("capture", build, version=1, params={})[0].path
     if copied:
         folder = Path(shutil.copytree(folder, tmp_path / "copy", ignore=shutil.ignore_patterns("manifest.json")))
+        (folder / "scan-0.zarr" / "dn" / "c" / "._0").write_text("of the system that copied it")
         assert open_recording(folder, CAMERA).sweeps
-    next(path for path in (folder / "scan-0.zarr" / "dn" / "c").rglob("*") if path.is_file()).unlink()
+    next(
+        path for path in (folder / "scan-0.zarr" / "dn" / "c").rglob("*") if path.name.isdigit() and path.is_file()
+    ).unlink()
     with pytest.raises(IncompleteStoreError, match=r"dn lacks 1 of its files" if copied else "it is missing"):
         open_recording(folder, CAMERA)
 

@@ -187,7 +187,7 @@ def test_a_run_whose_stores_are_gone_is_in_the_way_of_no_command(
     other = machine(FIRST)
     other.discard(other.refs("segment")[0])
     again = machine(SECOND)
-    assert "is on this machine alone until its survey runs again" in caplog.text
+    assert "stays on this machine until its survey runs again" in caplog.text
     assert len(again.runs()) == 1
     small_survey(again)
     machine(SECOND)
