@@ -153,8 +153,8 @@ def _draw_attention(axes: Axes, data: QuicklookData) -> None:
     if data.changed:
         _heat_key(heat, (f"{low:.0%}", f"{high:.0%}"))
         mean = float(np.nanmean(data.score)) if len(data.patch_index) else 0.0
-        words = f"{len(data.patch_index)} patches by {data.policy} (cyan); {mean:.0%} of their pixels changed class"
-        words += "; captured again (dashed)" if data.blocks else ""
+        of_pixels = "changed class; dashed: captured again" if data.blocks else "of their pixels changed class"
+        words = f"{len(data.patch_index)} patches by {data.policy} (cyan); {mean:.0%} {of_pixels}"
         return _caption(axes, "2  Segmented at full resolution, and changes", words)
     _heat_key(heat, ("low", "high"))
     words = f"{len(data.patch_index)} patches chosen by {data.policy} (cyan)"

@@ -16,7 +16,7 @@ from rich.console import Console
 
 from flows.publish.field_map import ERROR_COLOURS, FieldMap, error_address
 from flows.publish.receipt import COSTS, Receipt, build_receipt, check_receipt
-from flows.publish.receipt_table import format_score, headline, print_summary
+from flows.publish.receipt_table import format_reference, format_score, headline, print_summary
 from flows.publish.report import Picture, render_report
 from flows.settings.survey_settings import Settings
 from flows.terminal.figures import format_area
@@ -354,3 +354,13 @@ def test_an_error_map_stands_beside_the_scores() -> None:
     page = render_report(make_receipt(), PNG, field=FieldMap((2, 2), [], [], address))
     assert address in page.partition("<h3>Errors</h3>")[2]
     assert "<h3>Errors" not in render_report(make_receipt(), PNG, field=FieldMap((2, 2), [], []))
+
+
+@pytest.mark.parametrize(("scored_s", "words"), [(0.7, "between the passes took 1.2 s, beside"), (None, "")])
+def test_the_decision_between_passes_is_told(scored_s: float | None, words: str) -> None:
+    """As the time of the stages between; not where one of them was stored before."""
+    times = {"capture_coarse": 9.0, "rectify": 0.5, "score": scored_s, "capture_fine": 9.0}
+    stages = [{"name": name, "wall_s": seconds} for name, seconds in times.items()]
+    receipt = {"savings": {"capture_s": {}}, "settings": {"camera": {"exposure_ms": 100}}, "stages": stages}
+    assert words in format_reference(receipt)
+    assert ("The decision" in format_reference(receipt)) == bool(words)
