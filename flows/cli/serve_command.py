@@ -9,6 +9,7 @@ import signal
 import tempfile
 import threading
 import time
+import warnings
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
@@ -204,6 +205,8 @@ def _start_server(home: Path, port: int, held: ExitStack) -> str:
 
 def _serve(fields: Sequence[ServedField], schedule: Any, limit: int, *, shared: bool) -> None:
     """Serve the fields and the reprocessing of their archives until interrupted, also while the server is away."""
+    # Prefect's runner drops this coroutine where it has given up; the interpreter would say so at its end
+    warnings.filterwarnings("ignore", "coroutine 'Runner._handle_cancellation_observer_failure' was never awaited")
     surveys = [one.deployment(schedule) for one in fields]
     outs = dict.fromkeys(str(one.settings.out) for one in fields)
     again = [deployment(out, number, shared=shared) for number, out in enumerate(outs, 1)]
