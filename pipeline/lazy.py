@@ -72,18 +72,6 @@ if TYPE_CHECKING:
     import odc.geo.geobox as odc_geobox
     import odc.geo.warp as odc_warp
     import odc.geo.xr as odc_geo_xr
-    import prefect
-    import prefect.artifacts as prefect_artifacts
-    import prefect.cache_policies as prefect_cache_policies
-    import prefect.client.orchestration as prefect_client
-    import prefect.client.schemas.filters as prefect_filters
-    import prefect.concurrency.sync as prefect_concurrency
-    import prefect.context as prefect_context
-    import prefect.deployments as prefect_deployments
-    import prefect.logging.handlers as prefect_handlers
-    import prefect.runtime.task_run as prefect_task_run
-    import prefect.server.api.server as prefect_server
-    import prefect.settings as prefect_settings
     import prosail
     import pvlib
     import pyogrio
@@ -95,7 +83,6 @@ if TYPE_CHECKING:
     import shapely
     import spyndex
     import torch
-    import uvicorn
     from odc.geo.geobox import GeoBox
     from shapely.geometry.base import BaseGeometry
     from torch import Tensor
@@ -109,18 +96,6 @@ else:
     odc_geobox = deferred("odc.geo.geobox")
     odc_warp = deferred("odc.geo.warp")
     odc_geo_xr = deferred("odc.geo.xr")
-    prefect = deferred("prefect")
-    prefect_artifacts = deferred("prefect.artifacts")
-    prefect_cache_policies = deferred("prefect.cache_policies")
-    prefect_client = deferred("prefect.client.orchestration")
-    prefect_concurrency = deferred("prefect.concurrency.sync")
-    prefect_context = deferred("prefect.context")
-    prefect_deployments = deferred("prefect.deployments")
-    prefect_filters = deferred("prefect.client.schemas.filters")
-    prefect_handlers = deferred("prefect.logging.handlers")
-    prefect_server = deferred("prefect.server.api.server")
-    prefect_settings = deferred("prefect.settings")
-    prefect_task_run = deferred("prefect.runtime.task_run")
     prosail = deferred("prosail")
     pvlib = deferred("pvlib")
     pyogrio = deferred("pyogrio")
@@ -132,7 +107,6 @@ else:
     shapely = deferred("shapely")
     spyndex = deferred("spyndex")
     torch = deferred("torch")
-    uvicorn = deferred("uvicorn")
 __all__ = [
     "BaseGeometry",
     "GeoBox",
@@ -147,18 +121,6 @@ __all__ = [
     "odc_geo_xr",
     "odc_geobox",
     "odc_warp",
-    "prefect",
-    "prefect_artifacts",
-    "prefect_cache_policies",
-    "prefect_client",
-    "prefect_concurrency",
-    "prefect_context",
-    "prefect_deployments",
-    "prefect_filters",
-    "prefect_handlers",
-    "prefect_server",
-    "prefect_settings",
-    "prefect_task_run",
     "prosail",
     "pvlib",
     "pyogrio",
@@ -170,5 +132,4 @@ __all__ = [
     "shapely",
     "spyndex",
     "torch",
-    "uvicorn",
 ]

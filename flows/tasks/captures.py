@@ -14,6 +14,7 @@ from flows.settings.parameters import SurveySettings, at_due_time
 from flows.settings.survey_settings import RIG, Settings
 from flows.settings.values import KEEP_RAW
 from flows.tasks.open_survey import OpenSurvey, RunRef
+from flows.tasks.prefect_modules import prefect_context, prefect_deployments
 from flows.tasks.prefect_tasks import as_task, current_observer, inside_flow
 from flows.tasks.run import SurveyRun, open_run
 from flows.tasks.scene import scene_of_visit
@@ -22,7 +23,6 @@ from flows.tasks.stages.capture import capture_coarse, capture_fine
 from flows.tasks.stages.condense import condense_coarse, condense_fine
 from flows.tasks.stages.placement import rectify
 from pipeline.errors import ArchiveError, IncompleteStoreError, NothingToMend, RigError, SettingsError
-from pipeline.lazy import prefect_context, prefect_deployments
 from storage.archive.keys import StageRef
 from storage.remote.opening import open_archive
 

@@ -22,9 +22,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from flows.terminal.processes import place_pages
-from pipeline.errors import SettingsError
-from pipeline.lazy import (
+from flows.tasks.prefect_modules import (
     prefect,
     prefect_client,
     prefect_filters,
@@ -33,6 +31,8 @@ from pipeline.lazy import (
     prefect_settings,
     uvicorn,
 )
+from flows.terminal.processes import place_pages
+from pipeline.errors import SettingsError
 
 HOST = "127.0.0.1"
 STARTED_WITHIN_S, ENDED_WITHIN_S = 120.0, 10.0

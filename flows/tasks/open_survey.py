@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from flows.tasks.prefect_modules import prefect_concurrency
 from flows.tasks.prefect_tasks import Observer, current_observer, inside_flow
 from flows.tasks.run import SurveyRun, now
 from flows.tasks.stage import Stage
@@ -20,7 +21,7 @@ from flows.tasks.stages.condense import condense_coarse, condense_fine, condense
 from flows.tasks.stages.effects import choose_effects
 from flows.tasks.stages.maps import ground, segment
 from flows.tasks.stages.placement import locate, rectify, rectify_fine, register_coarse, register_fine
-from pipeline.lazy import deferred, prefect_concurrency
+from pipeline.lazy import deferred
 from storage.archive.keys import StageRef
 from storage.archive.records import StageRecord
 from storage.archive.staging import bytes_below

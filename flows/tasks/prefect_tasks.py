@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, TypeVar
 
-from pipeline.lazy import prefect, prefect_cache_policies, prefect_context, prefect_task_run
+from flows.tasks.prefect_modules import prefect, prefect_cache_policies, prefect_context, prefect_task_run
 
 RETRY_DELAY_S = 2.0
 Function = TypeVar("Function", bound=Callable[..., Any])

@@ -390,14 +390,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     planned = _PlannedCapture(settings)
     if pixels is None:
         prior = None if found is None else found[0]
-        try:
-            planned = _plan_capture(settings, scene, zones, path, described, prior, passes)
-        except NothingToMend as known:
-            if not planning:
-                raise
-            taken = replace(settings, skip_below_error=None)
-            planned = _plan_capture(taken, scene, zones, path, described, prior, passes)
-            notes = (*notes, f"a survey would skip this visit: {str(known).removeprefix('nothing is captured: ')}")
+        planned = _plan_capture(settings, scene, zones, path, described, prior, passes, planning=planning)
     settings, plan = planned.settings, planned.plan
     read = min(len(scene.wavelength_nm), SMOOTH)  # components of most mosaics; a few have more
     costs = ReadingCosts(described.config, grid, read)
@@ -489,10 +482,13 @@ def _plan_capture(
     described: Description,
     prior: Prior | None,
     passes: RecordedPasses | None,
+    *,
+    planning: bool,
 ) -> _PlannedCapture:
     """Choose the extent, then the uniform scan or two passes, for the weights of the file ``path``.
 
-    Raises what `choose_extent`, `choose_uniform_scan` and `lay_out_passes` raise.
+    Raises what `choose_extent`, `choose_uniform_scan` and `lay_out_passes` raise. With ``planning``, a visit that a
+    survey would skip has a note.
     """
     extent, extent_notes, is_part = None, tuple[str, ...](), settings.extent == EXTENT_PART
     if is_part and prior is None:
@@ -503,7 +499,14 @@ def _plan_capture(
         limits: dict[str, Any] = {"max_age": settings.max_age, "skip_below_error": settings.skip_below_error}
         masks = [one for one in (zones.left_out, scene.missing) if one is not None]
         limits |= {"seconds": settings.seconds, "left_out": np.logical_or.reduce(masks) if masks else None}
-        layout, extent, note = choose_extent(layout, prior, described, path, settings.sky.fraction_of_clear, **limits)
+        given = (layout, prior, described, path, settings.sky.fraction_of_clear)
+        try:
+            layout, extent, note = choose_extent(*given, **limits)
+        except NothingToMend as known:
+            if not planning:
+                raise
+            layout, extent, note = choose_extent(*given, **limits | {"skip_below_error": None})
+            note = f"a survey would skip this visit: {str(known).removeprefix('nothing is captured: ')}; else it {note}"
         extent_notes = (note,)
     scans = choose_uniform_scan(layout, described, path, len(scene.wavelength_nm), settings)
     layout, plan, settings, plan_notes = lay_out_passes(layout, scans, described, settings)

@@ -88,6 +88,12 @@ class Scenes:
     train: Imaged
     validation: Imaged
 
+    @property
+    def split(self) -> dict[str, Any]:
+        """Return the record by which an evaluation tells scenes and pixels of the training."""
+        one = self.train
+        return {"train": one.keys, "content": one.content, "validation": self.validation.keys, "pixels": one.pixels}
+
     def normalised(self, normalisation: Normalisation) -> Scenes:
         """Normalise the scenes; their basis spans their bands and reaches every column."""
         reached = np.ones(len(normalisation.centre), np.bool_)
