@@ -213,8 +213,8 @@ class SurveyRun(CaptureRun):
 
     @property
     def cascade(self) -> tuple[float, float] | None:
-        """Return least gain and fraction of patches for the accepted loss; None without a table of losses."""
-        content = self.described.record.get(CASCADE)
+        """Return least gain and fraction of patches for the accepted loss; None without a loss or a table of losses."""
+        content = self.described.record.get(CASCADE) if self.settings.expected_loss else None
         return None if content is None else CascadeTable.read(content).within(self.settings.expected_loss / 100)
 
     @property

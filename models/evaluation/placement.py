@@ -14,7 +14,6 @@ import scipy
 from numpy.typing import NDArray
 
 from models.evaluation.metrics import Counts, agreement, confusion, gap_closed, mean_iou
-from models.network.sizes import MOST_GAIN
 from models.network.spectral import patches_of
 from models.policies.policies import random_scores, score_patches
 from models.reading.inference import CoarsePrediction, captured, overview_of, patch_logits, segment
@@ -26,7 +25,8 @@ from pipeline.planning.prices import frame_patches
 Values = NDArray[np.floating]
 RANDOM_DRAWS = 5
 COMPARED = ("gain", "entropy", "sobel")  # policies beside the random one
-LEAST_GAINS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2)  # thresholds [nat per px]
+MOST_GAIN = 5.0  # gains are clipped to this [nat per px]; one confident error would outweigh a field
+LEAST_GAINS = tuple(np.geomspace(0.005, 0.5, 25).round(4).tolist())  # thresholds of scores by ``gain``
 CONTROL_FRACTION = 0.35  # of the valid patches: K = 35 % of surveys' receipts and of the weights' records
 
 
@@ -143,9 +143,9 @@ def run_controls(
 
 @dataclass(frozen=True)
 class CascadeTable:
-    """Losses on validation scenes, for each threshold of the expected gain."""
+    """Mean losses of validation scenes, for each threshold of the expected gain."""
 
-    least_gain: tuple[float, ...]  # ascending [nat per px]
+    least_gain: tuple[float, ...]  # ascending
     loss: tuple[float, ...]  # mIoU of the map read in full minus that of the part
     fraction: tuple[float, ...]  # of the patches that are read in full
 
@@ -156,14 +156,15 @@ class CascadeTable:
 
     @staticmethod
     def judged(scenes: Sequence[ReadTwice], classes: int) -> CascadeTable:
-        """Judge the maps of all scenes together, for each threshold of the score by ``gain``."""
-        every = [np.ones(one.grid.patch_shape, np.bool_) for one in scenes]
-        whole, losses, fractions = _miou(scenes, every, classes), [], []
-        for least in LEAST_GAINS:
-            chosen = [one.scores["gain"] >= least for one in scenes]
-            losses.append(whole - _miou(scenes, chosen, classes))
-            fractions.append(float(np.concatenate([one.ravel() for one in chosen]).mean()))
-        return CascadeTable(LEAST_GAINS, tuple(losses), tuple(fractions))
+        """Judge the map of each scene, for each threshold of the score by ``gain``."""
+        losses, fractions = np.zeros((2, len(LEAST_GAINS), len(scenes)))
+        for number, one in enumerate(scenes):
+            every = one.counts(np.ones(one.grid.patch_shape, np.bool_), classes)
+            for row, least in enumerate(LEAST_GAINS):
+                chosen = one.scores["gain"] >= least
+                losses[row, number] = mean_iou(every) - mean_iou(one.counts(chosen, classes))
+                fractions[row, number] = chosen.mean()
+        return CascadeTable(LEAST_GAINS, *(tuple(rows.mean(axis=1).tolist()) for rows in (losses, fractions)))
 
     def within(self, loss: float) -> tuple[float, float] | None:
         """Return the highest threshold within a loss, and the fraction of patches read by it; None where all lose more.
@@ -176,8 +177,3 @@ class CascadeTable:
         ends = slice(rows - 1, rows + 1)
         gain = np.interp(loss, self.loss[ends], np.log(self.least_gain[ends]))
         return float(np.exp(gain)), float(np.interp(loss, self.loss[ends], self.fraction[ends]))
-
-
-def _miou(scenes: Sequence[ReadTwice], chosen: Sequence[NDArray[np.bool_]], classes: int) -> float:
-    """Return the mIoU of all scenes together, with the chosen patches of each read in full."""
-    return mean_iou(np.sum([one.counts(some, classes) for one, some in zip(scenes, chosen, strict=True)], axis=0))

@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor, nn
 
-from models.network.sizes import AROUND_PX, BOTTOM, PLANES, SCORER_WIDTH, TOKEN_PX, level_widths, scorer_inputs
+from models.network.sizes import AROUND_PX, BOTTOM, PLANES, TOKEN_PX, level_widths
 from models.network.sizes import SegmenterConfig as SegmenterConfig
 from pipeline.errors import ShapeError
 
@@ -209,7 +209,6 @@ class Segmenter(nn.Module):
         self.full_stem = Stem(inputs + config.overview_width, widths)
         self.full_head = Head(widths)
         self.full_classes = nn.Conv2d(config.width, config.classes, 1)
-        self.scorer = PatchScorer(config)
         with torch.no_grad():
             for stem in (self.overview_stem, self.full_stem):  # planes of the capture have no effect unless trained
                 stem.enter.weight[:, config.columns : inputs] = 0
@@ -268,11 +267,6 @@ class Segmenter(nn.Module):
         coded: Tensor = grid.flatten(2).transpose(1, 2) + code_2d(places, self.config.dim).to(grid.device)
         return coded
 
-    def score(self, overview: Overview) -> Tensor:
-        """Return the expected gain of reading each patch in full, (B, H/p, W/p) [nat per px]."""
-        gain: Tensor = self.scorer(overview.features, overview.logits)
-        return gain
-
     def read_patches(self, overview: Overview, patches: Tensor, patch_index: Tensor) -> Tensor:
         """Return logits (B, K, classes, p, p) of patches (B, K, J + PLANES, p, p) at ``patch_index`` (B, K)."""
         b, k = patch_index.shape
@@ -298,33 +292,3 @@ class Segmenter(nn.Module):
         cells = cut(logits.float(), self.config.patch)
         index = patch_index[:, :, None, None, None].expand(-1, -1, *cells.shape[2:])
         return joined(cells.scatter(1, index, patches.float()), logits.shape[-1] // self.config.patch)
-
-
-class PatchScorer(nn.Module):
-    """Predict the gain of each patch. Gradients stop here: the segmenter does not learn from its scores."""
-
-    def __init__(self, config: SegmenterConfig) -> None:
-        super().__init__()
-        self.patch = config.patch
-        inputs = scorer_inputs(config)
-        self.norm = ChannelNorm(inputs)
-        self.enter = nn.Conv2d(inputs, SCORER_WIDTH, 1)
-        self.around = nn.Conv2d(SCORER_WIDTH, SCORER_WIDTH, 3, padding=1, padding_mode="replicate", groups=SCORER_WIDTH)
-        self.mix = nn.Conv2d(SCORER_WIDTH, SCORER_WIDTH, 1)
-        self.leave = nn.Conv2d(SCORER_WIDTH, 1, 1)
-        nn.init.zeros_(self.leave.weight)
-        nn.init.zeros_(self.leave.bias)  # type: ignore[arg-type]
-        self.of_entropy = nn.Parameter(torch.tensor(0.2))  # factor of the entropy, to which the network adds
-
-    def forward(self, features: Tensor, logits: Tensor) -> Tensor:
-        """Return the gain of each patch, (B, H/p, W/p) [nat per px], by features and logits (B, c, H, W)."""
-        features, logits = features.detach(), logits.detach()
-        probability = logits.float().softmax(dim=1).to(features.dtype)
-        entropy = torch.special.entr(probability).sum(dim=1, keepdim=True)
-        images = (features, probability, entropy)  # pooled one by one, without a copy
-        mean = torch.cat([F.avg_pool2d(image, self.patch) for image in images], dim=1)
-        most = torch.cat([F.max_pool2d(image, self.patch) for image in (features, entropy)], dim=1)
-        x = self.enter(self.norm(torch.cat([mean, most], dim=1)))
-        x = x + self.mix(self.around(F.gelu(x)))
-        gain: Tensor = self.of_entropy * mean[:, -1] + self.leave(F.gelu(x))[:, 0]
-        return gain

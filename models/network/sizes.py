@@ -31,8 +31,6 @@ CELL_PX = 2  # pixels a side of the spectral features of the temporal reader
 AROUND_PX = 5  # pixels a side whose mean spectrum the spectral classifier reads
 TOKEN_PX = 32  # pixels a side that a token stands for
 PLANES = 3  # beside the spectral features of a pixel: exposure, line spacing, binned samples
-SCORER_WIDTH = 16  # channels of the network that scores patches
-MOST_GAIN = 5.0  # gains are clipped to this [nat per px]; one confident error would outweigh a field
 OTHERS = (
     7  # inputs of the temporal reader beside probabilities: seen, age, light before, light, line spacing, season (2)
 )
@@ -76,11 +74,6 @@ class SegmenterConfig:
             raise ShapeError(f"token width {self.dim} must divide by 4 and by its {self.heads} heads")
 
 
-def scorer_inputs(config: SegmenterConfig) -> int:
-    """Numbers that are known of a patch: mean and greatest feature and entropy, and mean probabilities."""
-    return 2 * config.overview_width + config.classes + 2
-
-
 @dataclass(frozen=True)
 class TemporalSizes:
     """All that is needed to build the network again."""
@@ -94,7 +87,7 @@ class TemporalSizes:
         """Multiply-adds of reading so many fine pixels."""
         entered = 2 * self.classes + OTHERS + self.coarse_width
         fine = self.width * (entered + 9 + self.classes + GATES)
-        coarse = self.width * (2 * self.columns + 1 + 9 + self.coarse_width + 9 * self.width) + 9 * self.coarse_width
+        coarse = self.width * (2 * self.columns + 1 + 9 + self.coarse_width + self.width + 9) + 9 * self.coarse_width
         return pixels * fine + pixels // CELL_PX**2 * coarse
 
 

@@ -34,7 +34,7 @@ class TemporalReader(nn.Module):
         self.coarse_enter = Separable(2 * sizes.columns + 1, width)
         self.coarse_leave = Separable(width, sizes.coarse_width)
         self.enter = Separable(2 * classes + OTHERS + sizes.coarse_width, width)
-        self.middle = nn.Conv2d(width, width, 3, padding=1)
+        self.middle = Separable(width, width)
         self.leave = nn.Conv2d(width, classes + GATES, 1)
         for start in self.leave.parameters():
             nn.init.zeros_(start)

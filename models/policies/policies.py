@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from models.network.sizes import SCORER_WIDTH, SegmenterConfig, scorer_inputs
+from models.network.sizes import SegmenterConfig
 from models.network.spectral import patches_of
 from models.reading.inference import CoarsePrediction
 from pipeline.errors import SettingsError, ShapeError
@@ -17,6 +17,7 @@ from pipeline.geometry.grid import SceneGrid
 
 Scores = NDArray[np.float64]
 Policy = Literal["gain", "entropy", "sobel", "random", "mask"]
+LEAST_SHARE = 0.005  # of a scene: rarer classes count as if they had it
 POLICIES: tuple[Policy, ...] = get_args(Policy)
 
 
@@ -27,7 +28,7 @@ def score_patches(
 
     ``policy`` is one of `POLICIES`:
 
-    - ``gain``: Expected gain, by the weights.
+    - ``gain``: Expected errors of the overview, weighted by the rarity of their classes (`_rare_errors`).
     - ``entropy``: Entropy of the class probabilities.
     - ``sobel``: Edges of the coarse image (the paper's ED).
     - ``random``: Random numbers by ``seed``.
@@ -35,13 +36,9 @@ def score_patches(
 
     Raises SettingsError for an unknown policy, or ``mask`` without a mask; ShapeError for a mask of another size.
     """
-    if policy == "gain":
-        if seen.gain is None:
-            raise SettingsError(f"the policy {policy!r} needs a prediction by the weights; choose another policy")
-        scores = seen.gain.astype(np.float64)
-    elif policy == "random":
+    if policy == "random":
         return random_scores(seen.grid, seed)
-    elif policy == "mask":
+    if policy == "mask":
         scores = _mask_scores(seen, mask)
     elif policy in PIXEL_SCORES:
         scores = _patch_means(PIXEL_SCORES[policy].of(seen), seen)
@@ -63,14 +60,10 @@ def _on_scene(scores: Scores, grid: SceneGrid) -> Scores:
 
 def score_multiply_adds(policy: str, config: SegmenterConfig, grid: SceneGrid) -> int:
     """Return the multiply-adds of scoring every patch of a grid."""
-    pixels = grid.padded_shape[0] * grid.padded_shape[1]
-    if policy == "gain":  # entropy and pooling per pixel, then the network per patch
-        inputs, patches = scorer_inputs(config), pixels // config.patch**2
-        per_patch = SCORER_WIDTH * (inputs + 9 + SCORER_WIDTH + 1) + 1
-        return pixels * (2 + config.classes + inputs) + patches * per_patch
     score = PIXEL_SCORES.get(policy)
     if score is None:  # random or mask
         return 0
+    pixels = grid.padded_shape[0] * grid.padded_shape[1]
     return (score.adds + score.per_class * config.classes + score.per_column * config.columns) * pixels
 
 
@@ -78,6 +71,22 @@ def pixel_entropy(probability: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the entropy over the last axis [nat]; a probability of 0 adds 0."""
     exact = probability.astype(np.float64)
     return np.asarray(-scipy.special.xlogy(exact, exact).sum(axis=-1))
+
+
+def _rare_errors(seen: CoarsePrediction) -> NDArray[np.float64]:
+    """Return the expected error of each pixel, with more weight for rare classes, (y, x).
+
+    A pixel of probabilities p has the expected error sum p (1 - p). The part of a class is divided by its share of the
+    scene, at least `LEAST_SHARE`, and by the number of classes. So the mean over the scene is that over the classes,
+    of the fraction of each that is expected to be wrong. This fraction lowers the mean IoU.
+    """
+    scene = np.s_[: seen.grid.height, : seen.grid.width]
+    known = np.ones((seen.grid.height, seen.grid.width), np.bool_)
+    if seen.filled is not None and not seen.filled[scene].all():
+        known = ~seen.filled[scene]
+    share = seen.probability[scene].mean(axis=(0, 1), dtype=np.float64, where=known[..., None])
+    weight = 1 / np.maximum(share, LEAST_SHARE) / np.minimum(share / LEAST_SHARE, 1).sum()
+    return np.asarray((seen.probability * (1 - seen.probability)) @ weight)
 
 
 def _edges(seen: CoarsePrediction) -> NDArray[np.float64]:
@@ -96,10 +105,11 @@ class PixelScore(NamedTuple):
 
 
 PIXEL_SCORES = {  # of the coarse prediction
+    "gain": PixelScore(_rare_errors, 0, per_class=2),
     "entropy": PixelScore(lambda seen: pixel_entropy(seen.probability), 2, per_class=1),
     "sobel": PixelScore(_edges, 19, per_column=1),
 }
-SEEING_POLICIES = ("gain", *PIXEL_SCORES)  # depend on the surroundings alone: a large field is scored in parts
+SEEING_POLICIES = tuple(PIXEL_SCORES)  # depend on the surroundings alone: a large field is scored in parts
 GLANCING_POLICIES = ("gain", "entropy")  # depend on the network's prediction
 
 

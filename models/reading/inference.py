@@ -66,7 +66,6 @@ class CoarsePrediction(CoarsePass):
     """Prediction of the overview for a scene, on the padded grid."""
 
     probability: NDArray[np.float32]  # (y, x, class)
-    gain: NDArray[np.float32] | None = field(default=None, kw_only=True)  # (patch_y, patch_x) expected [nat per px]
     overview: Overview | None = field(default=None, kw_only=True, repr=False, compare=False)  # by the same weights
 
 
@@ -163,13 +162,12 @@ def coarse_prediction_of_patches(
 
 
 def read_coarse_prediction(weights: Weights, coarse_pass: CoarsePass) -> CoarsePrediction:
-    """Predict class probabilities and expected gain from a coarse pass."""
+    """Predict class probabilities from a coarse pass."""
     with torch.inference_mode():
         overview = overview_of(weights, coarse_pass)
         return CoarsePrediction(
             **vars(coarse_pass),
             probability=np.ascontiguousarray(overview.logits[0].softmax(dim=0).permute(1, 2, 0).cpu().numpy()),
-            gain=weights.segmenter.score(overview)[0].cpu().numpy(),
             overview=overview,
         )
 

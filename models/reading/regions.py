@@ -81,12 +81,14 @@ class Region:
         return self.kept.over(self.field.patch)
 
     def numbers_here(self, patch_index: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Convert patch numbers of the field to those of the region; -1 outside."""
-        (rows, columns), (top, left) = self.grid.patch_shape, self.origin
+        """Convert patch numbers of the field to those of the region; -1 outside of the kept box.
+
+        The full network reads none of the halo: a patch depends on the overview and its own pixels alone.
+        """
+        (top, left), kept = self.origin, self.kept_patches
         row, column = np.divmod(np.asarray(patch_index, np.int64), self.field.patch_shape[1])
-        row, column = row - top, column - left
-        inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-        return np.where(inside, row * columns + column, -1)
+        inside = (row >= kept.top) & (row < kept.bottom) & (column >= kept.left) & (column < kept.right)
+        return np.where(inside, (row - top) * self.grid.patch_shape[1] + column - left, -1)
 
     def crop(self, image: NDArray[Scalar]) -> NDArray[Scalar]:
         """Crop a (y, x, ...) image of the box that is read to the box that is kept."""

@@ -33,7 +33,7 @@ else:
     segmenter = deferred("models.network.segmenter")
 
 NORMALISATION = ("centre", "spread", "whitening")
-FORMAT = "spectralzoom-weights/4"
+FORMAT = "spectralzoom-weights/5"
 OF_COMPONENTS = ("centres", "covariance", "shot", "read")
 OF_LIMITS = ("rates", "light", "fine")
 COLOURS = "class_colours"

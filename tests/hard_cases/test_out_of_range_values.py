@@ -37,10 +37,7 @@ def _drawn(coarse: NDArray[np.float32], fine: NDArray[np.float32]) -> tuple[Coar
 
 
 def _alike(one: tuple[CoarsePrediction, DrawnMap], other: tuple[CoarsePrediction, DrawnMap]) -> bool:
-    parts = [
-        (a.columns, a.probability, a.gain, score_patches("entropy", a), b.classes, b.confidence)
-        for a, b in (one, other)
-    ]
+    parts = [(a.columns, a.probability, score_patches("gain", a), b.classes, b.confidence) for a, b in (one, other)]
     return all(np.asarray(a).tobytes() == np.asarray(b).tobytes() for a, b in zip(*parts, strict=True))
 
 

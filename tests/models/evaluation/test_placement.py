@@ -147,7 +147,7 @@ def test_one_draw_has_no_spread_and_a_small_gap_no_fraction():
     assert rows["sobel"] == {**agreement(_counts(61)), "spread": None, "gap_closed": None}
 
 
-FOUR = np.array([[0.3, 0.03], [0.003, 0.0]])
+FOUR = np.array([[0.6, 0.3], [0.05, 0.0]])
 
 
 def _four_patches() -> ReadTwice:
@@ -160,7 +160,7 @@ def _four_patches() -> ReadTwice:
 
 def test_chosen_patches_are_read_in_full() -> None:
     """By hand: one patch is right from the overview, each other one once it is read in full."""
-    np.testing.assert_array_equal(_four_patches().counts(FOUR >= 0.03, 2), [[8, 0], [4, 4]])
+    np.testing.assert_array_equal(_four_patches().counts(FOUR >= 0.3, 2), [[8, 0], [4, 4]])
 
 
 def test_everything_read_includes_what_gets_worse() -> None:

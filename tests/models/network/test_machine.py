@@ -66,7 +66,7 @@ def test_what_a_map_is_drawn_from_is_brought_to_the_network(elsewhere: Weights) 
     """Images, patches and their numbers come from the processor; the logits of patches are asked back from there."""
     coarse_pass, patches = scene_columns(elsewhere, 16, 16)
     overview = overview_of(elsewhere, replace(coarse_pass, origin=(2, 3)))
-    assert overview.logits.device.type == elsewhere.segmenter.score(overview).device.type == "meta"
+    assert overview.logits.device.type == "meta"
     with pytest.raises(NotImplementedError, match="copy out of meta tensor"):
         next(patch_logits(elsewhere, overview, patches[:2], np.array([0, 3]), LineSpec()))
 
@@ -80,8 +80,7 @@ def test_a_step_learns_on_the_device_of_its_crops(elsewhere: Weights) -> None:
     network = elsewhere.segmenter
     batch = Batch(crops(7, 64, 64), crops(7, 64, 64), crops(64, 64).long(), crops(2).long())
     overview = network.read_overview(batch.image, torch.zeros(2, 2))  # places are reckoned on the processor
-    score = network.score(overview).flatten(1)
-    patch_index = draw_patches(overview.logits, score, network.config, np.random.default_rng(0), PHASES[1])
+    patch_index = draw_patches(overview.logits, network.config, np.random.default_rng(0), PHASES[1])
     cells = cut(batch.detail, network.config.patch)
     chosen = cells.gather(1, patch_index[:, :, None, None, None].expand(-1, -1, *cells.shape[2:]))
     assert network.read_patches(overview, chosen, patch_index).device.type == "meta"

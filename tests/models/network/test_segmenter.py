@@ -1,4 +1,4 @@
-"""The segmenter and its layers: what overview and patches may depend on, composites, and its scorer of patches."""
+"""The segmenter and its layers: what overview and patches may depend on, and composites."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ import torch.nn.functional as F  # noqa: N812 - its usual name
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models.network.segmenter import AROUND_PX, Head, PatchScorer, Stem, cut, joined, mean_around
-from models.network.sizes import PLANES, SegmenterConfig, level_widths
-from models.training.objective import scoring_loss
-from tests.models.conftest import SMALL, make_network, noise
+from models.network.segmenter import AROUND_PX, Head, Stem, cut, joined, mean_around
+from models.network.sizes import PLANES, level_widths
+from tests.models.conftest import make_network, noise
 
 IMAGE = noise(0, 1, 4 + PLANES, 64, 96)  # 2 x 3 tokens, 8 x 12 patches
 
@@ -69,59 +68,12 @@ def test_a_composite_holds_patches_where_numbers_say():
 
 
 def test_every_parameter_learns():
-    """The loss of a map with some patches, and of their scores, has a gradient in every parameter."""
+    """The loss of a map with some patches has a gradient in every parameter."""
     model, numbers = make_network(layers=2), torch.tensor([[3, 0, 9]])
     logits, patches = model(IMAGE, IMAGE, numbers, torch.zeros(1, 2))
-    gain = model.score(model.read_overview(IMAGE))
-    (model.composite(logits, patches, numbers).square().mean() + gain.square().mean()).backward()
+    model.composite(logits, patches, numbers).square().mean().backward()
     idle = [name for name, value in model.named_parameters() if value.grad is None or not value.grad.any()]
     assert not idle
-
-
-def _scorer() -> PatchScorer:
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        scorer = PatchScorer(SegmenterConfig(**SMALL))
-        torch.nn.init.normal_(scorer.leave.weight, std=0.3)
-    return scorer
-
-
-def test_the_segmenter_learns_nothing_through_its_scorer():
-    """No gradient goes back into features or logits."""
-    features, logits = noise(2, 2, 8, 16, 24).requires_grad_(), noise(3, 2, 3, 16, 24).requires_grad_()
-    _scorer()(features, logits).sum().backward()
-    assert features.grad is None
-    assert logits.grad is None
-
-
-def test_a_scorer_learns_gains():
-    """Gains that follow one feature are told after 200 steps, to a tenth of their spread."""
-    scorer, stream = _scorer(), torch.Generator().manual_seed(4)
-    optimiser = torch.optim.Adam(scorer.parameters(), 1e-2)
-    for _ in range(200):
-        features = F.interpolate(torch.randn(4, 8, 8, 8, generator=stream), scale_factor=4.0)
-        gain = F.avg_pool2d(features[:, :1], 8).flatten(1)
-        loss = scoring_loss(scorer(features, features[:, :3]).flatten(1), gain, torch.ones_like(gain, dtype=torch.bool))
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-    told = scorer(features, features[:, :3]).flatten(1).detach()
-    assert np.corrcoef(told.flatten(), gain.flatten())[0, 1] > 0.9
-
-
-def test_patches_without_a_label_have_no_say():
-    """Scores at patches of which nothing is known change no loss and learn nothing; with none known it is 0."""
-    gain, known = (
-        torch.tensor([[0.3, 0.1, 0.0], [0.2, 0.0, 0.0]]),
-        torch.tensor([[True, True, False], [True, False, False]]),
-    )
-    score = torch.tensor([[0.1, 0.2, 3.0], [0.5, -3.0, 1.0]], requires_grad=True)
-    loss = scoring_loss(score, gain, known)
-    loss.backward()
-    assert score.grad is not None
-    assert torch.equal(score.grad != 0, known)
-    assert loss == scoring_loss(score.detach().where(known, 9.0), gain, known)
-    assert scoring_loss(score, gain, torch.zeros_like(known)) == 0
 
 
 @torch.inference_mode()

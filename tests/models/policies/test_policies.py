@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
 
-from models.policies.policies import POLICIES, pixel_entropy, score_patches
+from models.policies.policies import LEAST_SHARE, POLICIES, pixel_entropy, score_patches
 from models.reading.inference import CoarsePrediction
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid
@@ -15,7 +18,7 @@ def _coarse_prediction(height: int = 32, width: int = 48, patch: int = 8, factor
     """A flat scene of which the coarse prediction is equally unsure everywhere."""
     grid = SceneGrid(height, width, patch, factor)
     columns, probability = (np.full((*grid.padded_shape, n), 1 / n, np.float32) for n in (3, 4))
-    return CoarsePrediction(grid, columns, probability, gain=np.ones(grid.patch_shape, np.float32))
+    return CoarsePrediction(grid, columns, probability)
 
 
 @pytest.mark.parametrize("classes", [2, 5, 12])
@@ -25,6 +28,45 @@ def test_entropy_runs_from_none_to_the_log_of_classes(classes: int):
     assert pixel_entropy(np.stack([sure, even])) == pytest.approx([0, np.log(classes)])
     drawn = np.random.default_rng(0).dirichlet(np.ones(classes), 20)
     assert pixel_entropy(drawn[:, ::-1]) == pytest.approx(pixel_entropy(drawn))
+
+
+def _of_classes(*probability: tuple[float, ...], filled: NDArray[np.bool_] | None = None) -> CoarsePrediction:
+    """Patches of one pixel in a row, each with its own probabilities."""
+    grid, shown = SceneGrid(1, len(probability), 1, 1), np.array([probability], np.float32)
+    return CoarsePrediction(grid, shown, shown, filled=filled)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(2, 6))
+def test_the_mean_gain_is_the_mean_error_of_classes(seed: int, classes: int):
+    """Of each class with enough of the scene: the expected fraction of its pixels that has another class."""
+    shown = np.random.default_rng(seed).dirichlet(np.ones(classes), 400)
+    of_class = (shown * (1 - shown)).sum(axis=0) / shown.sum(axis=0)
+    assert score_patches("gain", _of_classes(*shown)).mean() == pytest.approx(of_class.mean(), rel=1e-4)
+
+
+def test_an_error_in_a_rare_class_counts_more():
+    """A tenth of the area counts nine times as much as the rest; what is sure counts nothing."""
+    seen = _of_classes(*[(1.0, 0.0, 0.0)] * 89, *[(0.0, 1.0, 0.0)] * 9, (0.5, 0.0, 0.5), (0.0, 0.5, 0.5))
+    scores = score_patches("gain", seen)
+    assert not scores[:-2].any()
+    share = np.array([0.895, 0.095, 0.01])
+    assert scores[-2:] == pytest.approx([np.sum(0.25 / share[[one, 2]]) / 3 for one in (0, 1)], rel=1e-4)
+
+
+def test_the_weight_of_a_class_has_a_limit():
+    """A class of a thousandth of the scene counts as one of `LEAST_SHARE`, and as a part of a class."""
+    scores = score_patches("gain", _of_classes(*[(1.0, 0.0)] * 499, (0.5, 0.5)))
+    assert scores[-1] == pytest.approx((0.25 / 0.999 + 0.25 / LEAST_SHARE) / (1 + 0.001 / LEAST_SHARE), rel=1e-4)
+
+
+def test_pixels_without_data_have_no_share():
+    """Shares are those of pixels with data; without any, those of all pixels."""
+    shown = [(0.5, 0.5), (0.5, 0.5), (1.0, 0.0)]
+    alone, every = (_of_classes(*shown, filled=np.array([[False, False, lost]])) for lost in (True, False))
+    assert score_patches("gain", alone)[0] == pytest.approx(0.5)
+    assert score_patches("gain", every)[0] == pytest.approx((0.25 * 3 / 2 + 0.25 * 3) / 2)
+    nothing = _of_classes(*shown, filled=np.ones((1, 3), np.bool_))
+    assert score_patches("gain", nothing) == pytest.approx(score_patches("gain", every))
 
 
 def test_entropy_looks_where_the_coarse_prediction_is_unsure():
@@ -85,5 +127,5 @@ def test_a_border_patch_is_worth_its_fraction(policy: str, factor: int):
     """On a scene alike everywhere a patch scores in proportion to its pixels on the scene."""
     seen = _coarse_prediction(37, 53, factor=factor)
     scores = score_patches(policy, seen, mask=np.full((37, 53), np.log(4)))
-    level = 1 if policy == "gain" else np.log(4)
+    level = 0.75 if policy == "gain" else np.log(4)
     assert scores == pytest.approx(level * seen.grid.valid_fraction().ravel(), abs=1e-6)
