@@ -126,8 +126,9 @@ class Readings:
         """Return (reading, y, x) classes of the kept part, and (patch_y, patch_x, policy) scores of its patches."""
         weights = self.weights.load()
         seen = read_coarse_prediction(weights, coarse_region(weights, self.mosaic, region, self.capture))
-        readings = (False, True) if self.in_full else (False,)
-        maps = [region.crop(classes_by(weights, seen, in_full=in_full)) for in_full in readings]
+        kept = region.numbers_here(region.field.valid_patches())
+        readings = (kept[:0], kept[kept >= 0]) if self.in_full else (kept[:0],)
+        maps = [region.crop(classes_by(weights, seen, patch_index)) for patch_index in readings]
         scores = [region.crop_patches(score_patches(policy, seen)) for policy in COMPARED]
         return np.stack(maps), np.stack(scores, axis=-1)
 

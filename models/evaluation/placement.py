@@ -87,9 +87,8 @@ def placement_figures(rows: Placements) -> dict[str, dict[str, Any]]:
     return found
 
 
-def classes_by(weights: Weights, seen: CoarsePrediction, *, in_full: bool) -> NDArray[np.uint8]:
-    """Return the class map (y, x) by the overview alone, or with every patch read in full."""
-    patch_index = seen.grid.valid_patches() if in_full else np.empty(0, np.int64)
+def classes_by(weights: Weights, seen: CoarsePrediction, patch_index: NDArray[np.int64]) -> NDArray[np.uint8]:
+    """Return the class map (y, x) with these patches read in full."""
     return segment(weights, seen, seen.patches(patch_index), patch_index).classes
 
 
@@ -106,7 +105,8 @@ class ReadTwice:
     @staticmethod
     def of(weights: Weights, seen: CoarsePrediction, labels: NDArray[np.uint8]) -> ReadTwice:
         """Segment a scene twice, and score its patches by the policies that are compared."""
-        overview, full = classes_by(weights, seen, in_full=False), classes_by(weights, seen, in_full=True)
+        every = seen.grid.valid_patches()
+        overview, full = (classes_by(weights, seen, some) for some in (every[:0], every))
         scores = {policy: score_patches(policy, seen).reshape(seen.grid.patch_shape) for policy in COMPARED}
         return ReadTwice(overview, full, scores, labels, seen.grid)
 

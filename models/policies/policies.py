@@ -17,7 +17,7 @@ from pipeline.geometry.grid import SceneGrid
 
 Scores = NDArray[np.float64]
 Policy = Literal["gain", "entropy", "sobel", "random", "mask"]
-LEAST_SHARE = 0.005  # of a scene: rarer classes count as if they had it
+LEAST_FRACTION = 0.005  # of a scene: rarer classes count as if they had it
 POLICIES: tuple[Policy, ...] = get_args(Policy)
 
 
@@ -77,15 +77,15 @@ def _rare_errors(seen: CoarsePrediction) -> NDArray[np.float64]:
     """Return the expected error of each pixel, with more weight for rare classes, (y, x).
 
     A pixel of probabilities p has the expected error sum p (1 - p). The part of a class is divided by its share of the
-    scene, at least `LEAST_SHARE`, and by the number of classes. So the mean over the scene is that over the classes,
+    scene, at least `LEAST_FRACTION`, and by the number of classes. So the mean over the scene is that over the classes,
     of the fraction of each that is expected to be wrong. This fraction lowers the mean IoU.
     """
     scene = np.s_[: seen.grid.height, : seen.grid.width]
     known = np.ones((seen.grid.height, seen.grid.width), np.bool_)
     if seen.filled is not None and not seen.filled[scene].all():
         known = ~seen.filled[scene]
-    share = seen.probability[scene].mean(axis=(0, 1), dtype=np.float64, where=known[..., None])
-    weight = 1 / np.maximum(share, LEAST_SHARE) / np.minimum(share / LEAST_SHARE, 1).sum()
+    fraction = seen.probability[scene].mean(axis=(0, 1), dtype=np.float64, where=known[..., None])
+    weight = 1 / np.maximum(fraction, LEAST_FRACTION) / np.minimum(fraction / LEAST_FRACTION, 1).sum()
     return np.asarray((seen.probability * (1 - seen.probability)) @ weight)
 
 

@@ -49,7 +49,7 @@ POLICIES = {  # the paper's name, what computes it, and how a patch is pooled
 }
 CAPTION = (
     "ED: Sobel edges of the coarse image. SA: the entropy of the overview's classes stands for the gradients of VGG19. "
-    "TA: gain, the score that the network learns, is its successor. The paper pools all maps by maximum. "
+    "TA: gain, expected errors with rare classes weighted more, is its successor. The paper pools maps by maximum. "
     "ideal*: chosen by the labels, the patches in which reading in full corrects most pixels. "
     "mIoU and right pixels [%]: all scenes together, ± the standard deviation between scenes. "
     "patches: those of the coarse image and K. MACs: multiply-adds a scene [10^9] in closed form. "

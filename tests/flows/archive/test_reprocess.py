@@ -111,7 +111,7 @@ def test_new_weights_make_a_generation_beside_the_old(archive: Path, other: Path
     assert [run.settings["budget"] for run in after[3:]] == [0.8, 0.7]
     for run in after[3:]:
         states = {row["name"]: row["state"] for row in run.stages}
-        assert (states["capture_coarse"], states["locate"], states["segment"]) == ("cached", "cached", "ran")
+        assert (states["condense_coarse"], states["locate"], states["segment"]) == ("cached", "cached", "ran")
     assert reprocess.states(archive, weights=other) == [("turned", "skipped"), ("scene", "skipped")]
     assert reprocess.states(archive) == [("turned", "skipped"), ("scene", "skipped")]
     assert run_verify(archive, QUIET) == DONE

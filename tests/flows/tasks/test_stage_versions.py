@@ -115,7 +115,7 @@ def test_every_barrier_stands_in_a_way() -> None:
 @pytest.mark.parametrize(
     ("stage", "names"),
     {
-        "score": ("PatchScorer", "Encoder", "fill_dead", "SceneGrid"),
+        "score": ("PixelScore", "Encoder", "fill_dead", "SceneGrid"),
         "segment": ("Encoder", "fill_dead", "MOST_DEAD", "Segmenter", "write_class_tile"),
         "capture": ("RigSource", "CaptureRunner", "open_mirror", "HeadwallCamera", "lines_by_time", "EFFECTS"),
         "condense": ("find_components", "find_rare", "calibrate", "SignalCubeWriter"),

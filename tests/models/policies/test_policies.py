@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from models.policies.policies import LEAST_SHARE, POLICIES, pixel_entropy, score_patches
+from models.policies.policies import LEAST_FRACTION, POLICIES, pixel_entropy, score_patches
 from models.reading.inference import CoarsePrediction
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid
@@ -54,9 +54,9 @@ def test_an_error_in_a_rare_class_counts_more():
 
 
 def test_the_weight_of_a_class_has_a_limit():
-    """A class of a thousandth of the scene counts as one of `LEAST_SHARE`, and as a part of a class."""
+    """A class of a thousandth of the scene counts as one of `LEAST_FRACTION`, and as a part of a class."""
     scores = score_patches("gain", _of_classes(*[(1.0, 0.0)] * 499, (0.5, 0.5)))
-    assert scores[-1] == pytest.approx((0.25 / 0.999 + 0.25 / LEAST_SHARE) / (1 + 0.001 / LEAST_SHARE), rel=1e-4)
+    assert scores[-1] == pytest.approx((0.25 / 0.999 + 0.25 / LEAST_FRACTION) / (1 + 0.001 / LEAST_FRACTION), rel=1e-4)
 
 
 def test_pixels_without_data_have_no_share():
