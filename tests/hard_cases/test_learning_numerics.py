@@ -1,4 +1,4 @@
-"""Numerical hard cases of what is learned and counted: rows 4, 13, 14, 16, 26 and 28 of the design's table."""
+"""Numerical hard cases of what is learned and counted: rows 4, 13, 14, 16 and 26 of the design's table."""
 
 from __future__ import annotations
 

@@ -79,11 +79,15 @@ def test_what_is_no_whole_file_is_not_readable(saved: Path, keep: int | None):
 
 
 def test_another_format_is_named(saved: Path):
-    """A newer format, that of two scales, and tensors without any mark, are told apart."""
-    for other in ("spectralzoom-weights/9", "spectralzoom-weights/3"):
-        _rewritten(saved, {**_about(saved), "format": other})
-        with pytest.raises(WeightsError, match=f"holds {other}, expected {FORMAT}"):
+    """A newer or older format, with the command that made the file; another file; tensors without any mark."""
+    record = {"command": "spectralzoom train mine"}
+    for other in ("spectralzoom-weights/9", "spectralzoom-weights/4"):
+        _rewritten(saved, {**_about(saved), "record": record, "format": other})
+        with pytest.raises(WeightsError, match=rf"{other}, expected {FORMAT}.*make it again: spectralzoom train mine"):
             load_weights(saved)
+    _rewritten(saved, {**_about(saved), "format": "spectralzoom-checkpoint/1"})
+    with pytest.raises(WeightsError, match=f"holds spectralzoom-checkpoint/1, expected {FORMAT}"):
+        load_weights(saved)
     save_file({"a": torch.zeros(1)}, saved)
     with pytest.raises(WeightsError, match="holds no format mark"):
         load_weights(saved)
