@@ -5,8 +5,9 @@ A worker gets paths and numbers, opens its inputs, and holds one region in memor
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -143,7 +144,7 @@ def coarse_region(weights: Weights, mosaic: Path, region: Region, capture: LineS
     coarse, window = open_mosaic(mosaic), (region.read.rows, region.read.columns)
     mixed = coarse.captures(*window)
     how: Capture = capture if mixed is None else CaptureMap(tuple(LineSpec(*one) for one in mixed[0]), mixed[1])
-    return read_coarse_pass(
+    seen = read_coarse_pass(
         weights,
         coarse.row_blocks(None, *window),
         coarse.wavelength_nm,
@@ -152,6 +153,7 @@ def coarse_region(weights: Weights, mosaic: Path, region: Region, capture: LineS
         origin=region.origin,
         components=coarse.components,
     )
+    return replace(seen, of_field=math.prod(region.kept.shape) / (region.field.height * region.field.width))
 
 
 def seen_patches(

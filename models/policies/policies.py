@@ -17,7 +17,7 @@ from pipeline.geometry.grid import SceneGrid
 
 Scores = NDArray[np.float64]
 Policy = Literal["gain", "entropy", "sobel", "random", "mask"]
-LEAST_FRACTION = 0.005  # of a scene: rarer classes count as if they had it
+LEAST_FRACTION, MOST_FRACTION = 0.005, 0.05  # of a field: rarer classes count as if they had it; of a region, at most
 POLICIES: tuple[Policy, ...] = get_args(Policy)
 
 
@@ -78,14 +78,16 @@ def _rare_errors(seen: CoarsePrediction) -> NDArray[np.float64]:
 
     A pixel of probabilities p has the expected error sum p (1 - p). The part of a class is divided by its share of the
     scene, at least `LEAST_FRACTION`, and by the number of classes. So the mean over the scene is that over the classes,
-    of the fraction of each that is expected to be wrong. This fraction lowers the mean IoU.
+    of the fraction of each that is expected to be wrong. This fraction lowers the mean IoU. A class that is rare in a
+    region of a field may be frequent elsewhere: the smaller the region, the less a rare class counts.
     """
     scene = np.s_[: seen.grid.height, : seen.grid.width]
     known = np.ones((seen.grid.height, seen.grid.width), np.bool_)
     if seen.filled is not None and not seen.filled[scene].all():
         known = ~seen.filled[scene]
     fraction = seen.probability[scene].mean(axis=(0, 1), dtype=np.float64, where=known[..., None])
-    weight = 1 / np.maximum(fraction, LEAST_FRACTION) / np.minimum(fraction / LEAST_FRACTION, 1).sum()
+    least = min(LEAST_FRACTION / seen.of_field, MOST_FRACTION)
+    weight = 1 / np.maximum(fraction, least) / np.minimum(fraction / least, 1).sum()
     return np.asarray((seen.probability * (1 - seen.probability)) @ weight)
 
 

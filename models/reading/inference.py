@@ -48,6 +48,7 @@ class CoarsePass:
     living: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (token,) tokens that are read; None: all
     out_of_range: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (y, x) of the scene: captured, invalid
     filled: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (y, x) pixels without data; None: no pixel
+    of_field: float = field(default=1.0, kw_only=True)  # fraction of the field that the region keeps
 
     @property
     def seen_columns(self) -> NDArray[np.float32]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -129,3 +131,12 @@ def test_a_border_patch_is_worth_its_fraction(policy: str, factor: int):
     scores = score_patches(policy, seen, mask=np.full((37, 53), np.log(4)))
     level = 0.75 if policy == "gain" else np.log(4)
     assert scores == pytest.approx(level * seen.grid.valid_fraction().ravel(), abs=1e-6)
+
+
+@pytest.mark.parametrize(("of_field", "least"), [(1.0, 0.005), (0.25, 0.02), (0.01, 0.05)])
+def test_a_class_of_a_region_may_be_frequent_elsewhere(of_field: float, least: float):
+    """So a region weights rare classes less, the smaller a part of the field it is, up to a limit."""
+    seen = replace(_of_classes(*[(1.0, 0.0)] * 499, (0.5, 0.5)), of_field=of_field)
+    assert score_patches("gain", seen)[-1] == pytest.approx(
+        (0.25 / 0.999 + 0.25 / least) / (1 + 0.001 / least), rel=1e-4
+    )
