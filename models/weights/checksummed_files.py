@@ -63,12 +63,9 @@ def read_about(path: Path, kind: str) -> dict[str, Any]:
     """Read the description of a file of a ``kind``, without torch. Raises WeightsError: it is damaged, or another."""
     with refusing(path), safe_open(path, framework="np") as file:
         about = json.loads((file.metadata() or {}).get(ABOUT, "{}"))
-        written = str(about.get("format", "no format mark"))
-        if written != kind and written.partition("/")[0] == kind.partition("/")[0]:
-            made = dict(about.get("record") or {}).get("command", "the command that made it")
-            raise WeightsError(f"{path} is of another version ({written}, expected {kind}); make it again: {made}")
-        if written != kind:
-            raise ValueError(f"it holds {written}, expected {kind}")
+        if (written := about.get("format", "no format mark")) != kind:
+            made = dict(about.get("record") or {}).get("command")
+            raise ValueError(f"it holds {written}, expected {kind}" + (f"; it was made by: {made}" if made else ""))
         if about.get(SEAL) != _seal(about):
             raise ValueError("it is damaged: its description is not what was written")
     return dict(about)

@@ -79,15 +79,12 @@ def test_what_is_no_whole_file_is_not_readable(saved: Path, keep: int | None):
 
 
 def test_another_format_is_named(saved: Path):
-    """A newer or older format, with the command that made the file; another file; tensors without any mark."""
+    """A newer or older format, with the command that made the file; tensors without any mark."""
     record = {"command": "spectralzoom train mine"}
     for other in ("spectralzoom-weights/9", "spectralzoom-weights/4"):
         _rewritten(saved, {**_about(saved), "record": record, "format": other})
-        with pytest.raises(WeightsError, match=rf"{other}, expected {FORMAT}.*make it again: spectralzoom train mine"):
+        with pytest.raises(WeightsError, match=f"{other}, expected {FORMAT}; it was made by: spectralzoom train mine;"):
             load_weights(saved)
-    _rewritten(saved, {**_about(saved), "format": "spectralzoom-checkpoint/1"})
-    with pytest.raises(WeightsError, match=f"holds spectralzoom-checkpoint/1, expected {FORMAT}"):
-        load_weights(saved)
     save_file({"a": torch.zeros(1)}, saved)
     with pytest.raises(WeightsError, match="holds no format mark"):
         load_weights(saved)
