@@ -1,8 +1,8 @@
 """Cut a field into regions that the segmenter reads as scenes of their own, which bounds its memory.
 
 A field of up to 640 x 640 px is one region. A larger one is cut; each region is read with a halo of pixels around it,
-which is discarded. The four regions of a field of 1280 x 1024 px need 29 % of the memory of a single one
-(`region_bytes`), and 1 % more multiply-adds if every patch is read in full.
+which is discarded. The four regions of a field of 1280 x 1024 px need 29 % of the memory of a single one, by
+`region_bytes`. They take 1 % more multiply-adds if every patch is read in full.
 """
 
 from __future__ import annotations
