@@ -76,10 +76,10 @@ def pixel_entropy(probability: NDArray[np.floating]) -> NDArray[np.float64]:
 def _rare_errors(seen: CoarsePrediction) -> NDArray[np.float64]:
     """Return the expected error of each pixel, with more weight for rare classes, (y, x).
 
-    A pixel of probabilities p has the expected error sum p (1 - p). The part of a class is divided by its share of the
-    scene, at least `LEAST_FRACTION`, and by the number of classes. So the mean over the scene is that over the classes,
-    of the fraction of each that is expected to be wrong. This fraction lowers the mean IoU. A class that is rare in a
-    region of a field may be frequent elsewhere: the smaller the region, the less a rare class counts.
+    A pixel with class probabilities p has the expected error sum p (1 - p). Each class's part of it is divided by the
+    class's fraction of the scene, at least `LEAST_FRACTION`, and by the number of classes. The mean over the scene is
+    then the expected fraction of wrong pixels of a class, averaged over the classes. A class that is rare in a region
+    may be frequent elsewhere in the field: the smaller the region, the less a rare class counts.
     """
     scene = np.s_[: seen.grid.height, : seen.grid.width]
     known = np.ones((seen.grid.height, seen.grid.width), np.bool_)
