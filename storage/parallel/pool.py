@@ -7,6 +7,7 @@ arithmetic threads are the same.
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import logging
 import os
@@ -239,12 +240,16 @@ class Cluster(Executor):
             raise SettingsError(
                 f"{self.name}: {expected} ({type(error).__name__}); start `dask scheduler`, or use --scheduler threads"
             ) from None
-        self._tasks: Any = self.client.get_executor(pure=False)  # type: ignore[no-untyped-call]
 
     def submit(self, make: Callable[..., Any], /, *given: Any, **named: Any) -> Future[Any]:
-        """Send one block."""
-        sent: Future[Any] = self._tasks.submit(make, *given, **named)
-        return sent
+        """Send one block.
+
+        dask's own executor fails where a block is lost with its worker between its end and its delivery.
+        """
+        sent = self.client.submit(make, *given, pure=False, **named)
+        return asyncio.run_coroutine_threadsafe(
+            self.client.gather(sent, asynchronous=True), self.client.loop.asyncio_loop
+        )
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Disconnect from the workers; those elsewhere keep running."""

@@ -22,6 +22,8 @@ from storage.parallel.pool import THREADS_OF, WorkerPool, run_blocks
 
 ROOT = Path(__file__).parents[3]
 PROCESSES = WorkerPool("processes", 2)
+# dask leaves its half of a handshake with a worker that dies
+pytestmark = pytest.mark.filterwarnings("ignore:unclosed <ssl.SSLSocket:ResourceWarning")
 
 
 def square(number: int) -> int:
