@@ -5,8 +5,9 @@ As in `flows.tasks.field_work` a worker gets paths and numbers, and arrays never
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
 from pathlib import Path
@@ -15,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.tasks.field_prior_map import FieldPriorMap
-from flows.tasks.field_work import FieldWork, WeightsFile, coarse_region, seen_patches
+from flows.tasks.field_work import FieldWork, OverviewErrors, WeightsFile, coarse_region, overview_file, seen_patches
 from models.network.spectral import LineSpec
-from models.policies.policies import score_patches
-from models.reading.inference import CoarsePass, read_coarse_prediction, segment
+from models.policies.policies import class_errors, gain_of
+from models.reading.inference import CoarsePass, load_overview, read_coarse_prediction, segment
 from models.reading.ood import OodDetector
 from models.reading.prior_map import (
     CurrentVisit,
@@ -35,6 +36,8 @@ from storage.arrays.class_maps import write_changes_tile, write_class_tile, writ
 from storage.arrays.mosaics import Mosaic, chosen_patches, open_mosaic
 from storage.parallel.pool import run_blocks
 
+OVERVIEWS = "overviews"  # beside the map, while it is drawn
+MOST_OVERVIEWS = 16  # regions whose overviews are kept: 0.5 GB; they say how frequent each class is in the field
 ENOUGH_SEEN = 0.5  # least covered fraction of a patch at the edge of a partial scan
 
 
@@ -52,17 +55,17 @@ class Drawing:
     left_out: Path | None = None  # (y, x) pixels of which zones have no map drawn
     unknown: UnknownRule | None = None  # which pixels are called unknown
     part: bool = False  # of the field was looked at: of the rest today's look says nothing
-    least_gain: float | None = None  # from which on patches are read in full; None: those that ``attention`` ranks
-    policy: str = "gain"  # by which that is judged
+    choice: GainChoice | None = None  # of the patches that are read in full; None: all that ``attention`` ranks
 
     def __call__(self, region: Region) -> Drawn:
         """Read what was seen of the region coarsely and finely, and store the part of the map that is kept."""
         weights, mosaic = self.weights.load(), open_mosaic(self.mosaic)
         seen, chosen = coarse_region(weights, self.mosaic, region, self.capture), chosen_patches(self.attention)
-        if self.least_gain is not None:
-            seen = predicted = read_coarse_prediction(weights, seen)
-            gain, here = score_patches(self.policy, seen), region.numbers_here(chosen)
-            chosen = chosen[(here >= 0) & (gain[here] >= self.least_gain)]
+        if self.choice is not None:
+            overview = load_overview(overview_file(self.choice.overviews, region), weights)
+            seen = predicted = read_coarse_prediction(weights, seen, overview)
+            gain, here = gain_of(class_errors(seen)[:, 0], self.choice.class_pixels), region.numbers_here(chosen)
+            chosen = chosen[(here >= 0) & (gain[here] >= self.choice.least_gain)]
         patch_index, columns = seen_patches(chosen, seen, region)
         drawn = segment(weights, seen, columns, patch_index, every_class=True)
         del columns  # a memory takes their room
@@ -97,7 +100,7 @@ class Drawing:
             self.probabilities, origin, *map(region.crop, (after.log_probability, after.age_days, after.light))
         )
         unread = 0 if seen.out_of_range is None else int(np.count_nonzero(region.crop(seen.out_of_range)))
-        if self.least_gain is None:
+        if self.choice is None:
             return Drawn(unread, comparison)
         read, changed = np.zeros(gain.shape, np.bool_), np.zeros(gain.shape, np.float32)
         read[patch_index] = True
@@ -133,6 +136,15 @@ class Drawing:
         rows, columns = grid.patch_shape
         pixels = detailed.reshape(rows, columns, p, p).swapaxes(1, 2).reshape(rows * p, columns * p)
         return np.ascontiguousarray(pixels[: grid.height, : grid.width])
+
+
+@dataclass(frozen=True)
+class GainChoice:
+    """Choice of patches by their gain: by how frequent the classes are in the field, as its overviews say."""
+
+    least_gain: float
+    overviews: Path  # folder with those of some regions, which are not computed again
+    class_pixels: NDArray[np.float64]  # (class,) expected in those regions
 
 
 @dataclass(frozen=True)
@@ -172,18 +184,32 @@ class Drawn:
     reading: FullReading | None = None  # None where patches were chosen before
 
 
-def draw_field(field: FieldWork, work: Drawing, report: Callable[[float], None]) -> Drawn:
+def draw_field(field: FieldWork, work: Drawing, least_gain: float | None, report: Callable[[float], None]) -> Drawn:
     """Draw class map and class probabilities into stores that were created for them.
 
+    With ``least_gain``, the full network reads the patches with that gain, among those that the attention ranks.
     Raises SettingsError: not even one region at a time fits the memory.
     """
     pool = field.pool_for(chosen_patches(work.attention), len(open_mosaic(work.mosaic).components))
     prior_map = () if work.memory is None else (work.memory.probabilities, work.memory.mosaic)
-    paths = (work.mosaic, work.attention, work.out, work.probabilities, *prior_map)
-    parts: list[Drawn] = run_blocks(work, field.regions, pool, report=report, paths=paths)
+    paths = [work.mosaic, work.attention, work.out, work.probabilities, *prior_map]
+    begun, overviews = 0.0, work.out.parent / OVERVIEWS
+    if least_gain is not None:
+        begun = 0.3
+        overviews.mkdir()
+        paths.append(overviews)
+        overview = OverviewErrors(work.weights, work.mosaic, work.capture, overviews)
+        some = field.regions[:: -(-len(field.regions) // MOST_OVERVIEWS)]
+        found = run_blocks(overview, some, pool, report=lambda done: report(begun * done), paths=paths)
+        class_pixels = np.sum([one[..., 1, :].sum(axis=(0, 1)) for one in found], axis=0)
+        work = replace(work, choice=GainChoice(least_gain, overviews, class_pixels))
+    parts: list[Drawn] = run_blocks(
+        work, field.regions, pool, report=lambda done: report(begun + (1 - begun) * done), paths=paths
+    )
     compared = [part.comparison for part in parts if part.comparison is not None]
     reading = None
-    if work.least_gain is not None:
+    if least_gain is not None:
+        shutil.rmtree(overviews)
         shape = field.regions[0].field.patch_shape
         reading = FullReading(np.zeros(shape), np.zeros(shape, np.bool_), np.zeros(shape, np.float32))
         for region, part in zip(field.regions, parts, strict=True):

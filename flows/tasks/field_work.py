@@ -5,9 +5,8 @@ A worker gets paths and numbers, opens its inputs, and holds one region in memor
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,9 +19,15 @@ from flows.tasks.patch_budget import SHARD
 from models.evaluation.placement import COMPARED, classes_by
 from models.network.machine import PROCESSOR, give_back_freed_memory
 from models.network.spectral import Capture, CaptureMap, LineSpec, patches_of
-from models.policies.policies import GLANCING_POLICIES, score_patches
+from models.policies.policies import GLANCING_POLICIES, class_errors, gain_of, score_patches
 from models.reading.expected_errors import PatchExpectedErrors
-from models.reading.inference import CoarsePass, CoarsePrediction, read_coarse_pass, read_coarse_prediction
+from models.reading.inference import (
+    CoarsePass,
+    CoarsePrediction,
+    read_coarse_pass,
+    read_coarse_prediction,
+    save_overview,
+)
 from models.reading.ood import OodDetector
 from models.reading.regions import HALO_PX, REGION_PX, Region, most_bytes, plan_regions
 from models.weights.checksummed_files import SEAL
@@ -37,6 +42,7 @@ if TYPE_CHECKING:
     from models.network.temporal_reader import TemporalReader
 
 NO_PATCHES = np.empty(0, np.int64)
+OTHERS = [policy for policy in COMPARED if policy != "gain"]
 
 
 @dataclass(frozen=True)
@@ -75,7 +81,7 @@ class WeightsFile:
 
 @dataclass(frozen=True)
 class Scoring:
-    """Worker that scores the patches of a region by the coarse prediction."""
+    """Worker that scores the patches of a region by ``entropy`` or ``sobel``."""
 
     weights: WeightsFile
     mosaic: Path
@@ -93,6 +99,29 @@ class Scoring:
                 scan_pass.grid, scan_pass.columns, np.empty((0, 0, 0), np.float32), origin=scan_pass.origin
             )
         return region.crop_patches(score_patches(self.policy, coarse))
+
+
+@dataclass(frozen=True)
+class OverviewErrors:
+    """Worker that computes the overview of a region, and its expected errors by class."""
+
+    weights: WeightsFile
+    mosaic: Path
+    capture: LineSpec
+    folder: Path | None = None  # that keeps the overview; None: it is not kept
+
+    def __call__(self, region: Region) -> NDArray[np.float64]:
+        """Return the `class_errors` of the region's own patches, (patch_y, patch_x, 2, class)."""
+        weights = self.weights.load()
+        seen = read_coarse_prediction(weights, coarse_region(weights, self.mosaic, region, self.capture))
+        if self.folder is not None and seen.overview is not None:
+            save_overview(overview_file(self.folder, region), seen.overview)
+        return region.crop_patches(class_errors(seen))
+
+
+def overview_file(folder: Path, region: Region) -> Path:
+    """Return the file that keeps the overview of a region."""
+    return folder / f"{region.kept.top}-{region.kept.left}.npy"
 
 
 @dataclass(frozen=True)
@@ -123,15 +152,18 @@ class Readings:
     capture: LineSpec
     in_full: bool
 
-    def __call__(self, region: Region) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-        """Return (reading, y, x) classes of the kept part, and (patch_y, patch_x, policy) scores of its patches."""
+    def __call__(self, region: Region) -> tuple[NDArray[np.uint8], NDArray[np.float64], NDArray[np.float64]]:
+        """Return (reading, y, x) classes of the kept part, and scores and errors of its patches.
+
+        Scores are (patch_y, patch_x, policy) by the policies other than ``gain``, errors those of `OverviewErrors`.
+        """
         weights = self.weights.load()
         seen = read_coarse_prediction(weights, coarse_region(weights, self.mosaic, region, self.capture))
         kept = region.numbers_here(region.field.valid_patches())
         readings = (kept[:0], kept[kept >= 0]) if self.in_full else (kept[:0],)
         maps = [region.crop(classes_by(weights, seen, patch_index)) for patch_index in readings]
-        scores = [region.crop_patches(score_patches(policy, seen)) for policy in COMPARED]
-        return np.stack(maps), np.stack(scores, axis=-1)
+        scores = np.stack([score_patches(policy, seen) for policy in OTHERS], axis=-1)
+        return np.stack(maps), region.crop_patches(scores), region.crop_patches(class_errors(seen))
 
 
 def coarse_region(weights: Weights, mosaic: Path, region: Region, capture: LineSpec) -> CoarsePass:
@@ -144,7 +176,7 @@ def coarse_region(weights: Weights, mosaic: Path, region: Region, capture: LineS
     coarse, window = open_mosaic(mosaic), (region.read.rows, region.read.columns)
     mixed = coarse.captures(*window)
     how: Capture = capture if mixed is None else CaptureMap(tuple(LineSpec(*one) for one in mixed[0]), mixed[1])
-    seen = read_coarse_pass(
+    return read_coarse_pass(
         weights,
         coarse.row_blocks(None, *window),
         coarse.wavelength_nm,
@@ -153,7 +185,6 @@ def coarse_region(weights: Weights, mosaic: Path, region: Region, capture: LineS
         origin=region.origin,
         components=coarse.components,
     )
-    return replace(seen, of_field=math.prod(region.kept.shape) / (region.field.height * region.field.width))
 
 
 def seen_patches(
@@ -190,8 +221,11 @@ class FieldWork:
         Raises SettingsError: one region does not fit the memory.
         """
         mosaic = mosaic.resolve()
-        work = Scoring(self.weights, mosaic, policy, capture)
-        return self._joined(self._of_regions(work, mosaic, NO_PATCHES, report))
+        if policy != "gain":
+            scoring = Scoring(self.weights, mosaic, policy, capture)
+            return self.joined(self._of_regions(scoring, mosaic, NO_PATCHES, report))
+        work = OverviewErrors(self.weights, mosaic, capture)
+        return _field_gain(self.joined(self._of_regions(work, mosaic, NO_PATCHES, report)))
 
     def expected_errors(self, mosaic: Path, capture: LineSpec, report: Report) -> PatchExpectedErrors:
         """Return the expected errors of the overview of a mosaic, by patch.
@@ -202,7 +236,7 @@ class FieldWork:
         work = ExpectedErrors(self.weights, mosaic, capture)
         parts: list[PatchExpectedErrors] = self._of_regions(work, mosaic, NO_PATCHES, report)
         shapes = [(*region.kept_patches.shape, *parts[0].wrong.shape) for region in self.regions]
-        pixels = self._joined([part.pixels.reshape(shape) for part, shape in zip(parts, shapes, strict=True)])
+        pixels = self.joined([part.pixels.reshape(shape) for part, shape in zip(parts, shapes, strict=True)])
         pixels = pixels.reshape(-1, *parts[0].wrong.shape)
         return PatchExpectedErrors(pixels, np.sum([part.wrong for part in parts], axis=0), np.zeros(len(pixels)))
 
@@ -217,10 +251,10 @@ class FieldWork:
         work, read = Readings(self.weights, mosaic, capture, in_full), grid.valid_patches() if in_full else NO_PATCHES
         parts = self._of_regions(work, mosaic, read, report)
         maps = np.empty((len(parts[0][0]), grid.height, grid.width), np.uint8)
-        for region, (part, _) in zip(self.regions, parts, strict=True):
+        for region, (part, _, _) in zip(self.regions, parts, strict=True):
             maps[:, region.kept.rows, region.kept.columns] = part
-        scores = self._joined([part for _, part in parts])
-        return maps, dict(zip(COMPARED, np.moveaxis(scores, -1, 0), strict=True))
+        scores, errors = (self.joined([part[which] for part in parts]) for which in (1, 2))
+        return maps, {"gain": _field_gain(errors), **dict(zip(OTHERS, np.moveaxis(scores, -1, 0), strict=True))}
 
     def _of_regions(
         self, worker: Callable[[Region], Any], mosaic: Path, patch_index: NDArray[np.integer], report: Report
@@ -229,7 +263,7 @@ class FieldWork:
         pool = self.pool_for(patch_index, len(open_mosaic(mosaic).components))
         return run_blocks(worker, self.regions, pool, report=report, paths=[mosaic])
 
-    def _joined(self, parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    def joined(self, parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
         """Join arrays of all regions' own patches to that of the padded grid, (patch_y, patch_x, ...)."""
         whole = np.zeros((*self.regions[0].field.patch_shape, *parts[0].shape[2:]), parts[0].dtype)
         for region, part in zip(self.regions, parts, strict=True):
@@ -257,3 +291,8 @@ class FieldWork:
             )
         fits = (self.memory - RESERVED_BYTES) // each
         return self.pool if fits >= self.pool.count else WorkerPool(self.pool.scheduler, fits)
+
+
+def _field_gain(errors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the gain of all patches of a field, (patch_y, patch_x), by their `class_errors`."""
+    return gain_of(errors[..., 0, :], errors[..., 1, :].sum(axis=(0, 1)))

@@ -17,7 +17,7 @@ from pipeline.geometry.grid import SceneGrid
 
 Scores = NDArray[np.float64]
 Policy = Literal["gain", "entropy", "sobel", "random", "mask"]
-LEAST_FRACTION, MOST_FRACTION = 0.005, 0.05  # of a field: rarer classes count as if they had it; of a region, at most
+LEAST_FRACTION = 0.005  # of a field: rarer classes count as if they had it
 POLICIES: tuple[Policy, ...] = get_args(Policy)
 
 
@@ -28,7 +28,7 @@ def score_patches(
 
     ``policy`` is one of `POLICIES`:
 
-    - ``gain``: Expected errors of the overview, weighted by the rarity of their classes (`_rare_errors`).
+    - ``gain``: Expected errors of the overview, weighted by the rarity of their classes (`gain_of`).
     - ``entropy``: Entropy of the class probabilities.
     - ``sobel``: Edges of the coarse image (the paper's ED).
     - ``random``: Random numbers by ``seed``.
@@ -38,10 +38,13 @@ def score_patches(
     """
     if policy == "random":
         return random_scores(seen.grid, seed)
+    if policy == "gain":
+        found = class_errors(seen)
+        return gain_of(found[:, 0], found[:, 1].sum(axis=0))
     if policy == "mask":
         scores = _mask_scores(seen, mask)
     elif policy in PIXEL_SCORES:
-        scores = _patch_means(PIXEL_SCORES[policy].of(seen), seen)
+        scores = _patch_means(PIXEL_SCORES[policy](seen), seen)
     else:
         raise SettingsError(f"unknown policy {policy!r}; choose one of {', '.join(POLICIES)}")
     return _on_scene(scores, seen.grid)
@@ -60,7 +63,7 @@ def _on_scene(scores: Scores, grid: SceneGrid) -> Scores:
 
 def score_multiply_adds(policy: str, config: SegmenterConfig, grid: SceneGrid) -> int:
     """Return the multiply-adds of scoring every patch of a grid."""
-    score = PIXEL_SCORES.get(policy)
+    score = SCORE_COSTS.get(policy)
     if score is None:  # random or mask
         return 0
     pixels = grid.padded_shape[0] * grid.padded_shape[1]
@@ -73,22 +76,30 @@ def pixel_entropy(probability: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.asarray(-scipy.special.xlogy(exact, exact).sum(axis=-1))
 
 
-def _rare_errors(seen: CoarsePrediction) -> NDArray[np.float64]:
-    """Return the expected error of each pixel, with more weight for rare classes, (y, x).
+def class_errors(seen: CoarsePrediction) -> NDArray[np.float64]:
+    """Return expected errors and expected pixels of each class in each patch, (patch, 2, class).
 
-    A pixel with class probabilities p has the expected error sum p (1 - p). Each class's part of it is divided by the
-    class's fraction of the scene, at least `LEAST_FRACTION`, and by the number of classes. The mean over the scene is
-    then the expected fraction of wrong pixels of a class, averaged over the classes. A class that is rare in a region
-    may be frequent elsewhere in the field: the smaller the region, the less a rare class counts.
+    A pixel with class probabilities p has the expected errors p (1 - p). Both are means over the pixels of a patch.
+    Pixels outside of the scene count as 0. The expected pixels of a class are those with data.
     """
-    scene = np.s_[: seen.grid.height, : seen.grid.width]
-    known = np.ones((seen.grid.height, seen.grid.width), np.bool_)
-    if seen.filled is not None and not seen.filled[scene].all():
-        known = ~seen.filled[scene]
-    fraction = seen.probability[scene].mean(axis=(0, 1), dtype=np.float64, where=known[..., None])
-    least = min(LEAST_FRACTION / seen.of_field, MOST_FRACTION)
-    weight = 1 / np.maximum(fraction, least) / np.minimum(fraction / least, 1).sum()
-    return np.asarray((seen.probability * (1 - seen.probability)) @ weight)
+    grid, shown = seen.grid, seen.probability.copy()
+    shown[grid.height :], shown[:, grid.width :] = 0, 0
+    known = shown if seen.filled is None else np.where(seen.filled[..., None], np.float32(0), shown)
+    images = (shown * (1 - shown), known)
+    return np.stack([patches_of(one, grid.patch).mean(axis=(1, 2), dtype=np.float64) for one in images], axis=1)
+
+
+def gain_of(errors: NDArray[np.float64], pixels: NDArray[np.float64]) -> Scores:
+    """Return the expected errors of patches, with more weight for rare classes, (patch,).
+
+    ``errors`` (patch, class) are those of `class_errors`, ``pixels`` (class,) the expected pixels of each class in the
+    whole field. A class's part of the errors is divided by its fraction of the field, at least `LEAST_FRACTION`, and by
+    the number of classes. The mean over the field is then the expected fraction of wrong pixels of a class, averaged
+    over the classes. In a field without data, all classes have the same fraction.
+    """
+    fraction = pixels / pixels.sum() if pixels.any() else np.full(pixels.shape, 1 / len(pixels))
+    weight = 1 / np.maximum(fraction, LEAST_FRACTION) / np.minimum(fraction / LEAST_FRACTION, 1).sum()
+    return np.asarray(errors @ weight)
 
 
 def _edges(seen: CoarsePrediction) -> NDArray[np.float64]:
@@ -97,21 +108,24 @@ def _edges(seen: CoarsePrediction) -> NDArray[np.float64]:
     return np.asarray(np.hypot(down, across))
 
 
-class PixelScore(NamedTuple):
-    """Score of coarse pixels, with its multiply-adds a pixel."""
+class ScoreCost(NamedTuple):
+    """Multiply-adds of scoring a coarse pixel."""
 
-    of: Callable[[CoarsePrediction], NDArray[np.float64]]
     adds: int
     per_column: int = 0
     per_class: int = 0
 
 
-PIXEL_SCORES = {  # of the coarse prediction
-    "gain": PixelScore(_rare_errors, 0, per_class=2),
-    "entropy": PixelScore(lambda seen: pixel_entropy(seen.probability), 2, per_class=1),
-    "sobel": PixelScore(_edges, 19, per_column=1),
+SCORE_COSTS = {
+    "gain": ScoreCost(0, per_class=2),
+    "entropy": ScoreCost(2, per_class=1),
+    "sobel": ScoreCost(19, per_column=1),
 }
-SEEING_POLICIES = tuple(PIXEL_SCORES)  # depend on the surroundings alone: a large field is scored in parts
+PIXEL_SCORES: dict[str, Callable[[CoarsePrediction], NDArray[np.float64]]] = {
+    "entropy": lambda seen: pixel_entropy(seen.probability),
+    "sobel": _edges,
+}
+SEEING_POLICIES = tuple(SCORE_COSTS)  # depend on the surroundings alone: a large field is scored in parts
 GLANCING_POLICIES = ("gain", "entropy")  # depend on the network's prediction
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,11 +26,14 @@ from models.network.spectral import (
 from models.weights.files import Weights
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, cuts, pad_by_reflection
-from pipeline.lazy import Tensor, torch
+from pipeline.lazy import Tensor, deferred, torch
 from pipeline.signal.components import Components
 
 if TYPE_CHECKING:
+    from models.network import segmenter
     from models.network.segmenter import Overview
+else:
+    segmenter = deferred("models.network.segmenter")
 
 ROWS_DRAWN = 64  # at once
 # Factor of the octaves by which exposures are stated to be shorter than the reference. The network then relies more on
@@ -48,7 +52,6 @@ class CoarsePass:
     living: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (token,) tokens that are read; None: all
     out_of_range: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (y, x) of the scene: captured, invalid
     filled: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (y, x) pixels without data; None: no pixel
-    of_field: float = field(default=1.0, kw_only=True)  # fraction of the field that the region keeps
 
     @property
     def seen_columns(self) -> NDArray[np.float32]:
@@ -162,15 +165,31 @@ def coarse_prediction_of_patches(
     return coarse_prediction_of_columns(weights, image, grid, capture)
 
 
-def read_coarse_prediction(weights: Weights, coarse_pass: CoarsePass) -> CoarsePrediction:
-    """Predict class probabilities from a coarse pass."""
+def read_coarse_prediction(
+    weights: Weights, coarse_pass: CoarsePass, overview: Overview | None = None
+) -> CoarsePrediction:
+    """Predict class probabilities from a coarse pass, or from its ``overview`` where that is known."""
     with torch.inference_mode():
-        overview = overview_of(weights, coarse_pass)
+        overview = overview_of(weights, coarse_pass) if overview is None else overview
         return CoarsePrediction(
             **vars(coarse_pass),
             probability=np.ascontiguousarray(overview.logits[0].softmax(dim=0).permute(1, 2, 0).cpu().numpy()),
             overview=overview,
         )
+
+
+def save_overview(path: Path, overview: Overview) -> None:
+    """Store features and logits of an overview."""
+    np.save(path, torch.cat([overview.features, overview.logits], dim=1).cpu().numpy())
+
+
+def load_overview(path: Path, weights: Weights) -> Overview | None:
+    """Read an overview by the same weights; None where there is no file."""
+    if not path.exists():
+        return None
+    stored = torch.from_numpy(np.load(path)).to(weights.segmenter.device)
+    width = weights.config.overview_width
+    return segmenter.Overview(stored[:, :width], stored[:, width:])
 
 
 def segment(

@@ -102,9 +102,9 @@ class Region:
         return slice(top, top + self.kept.shape[0]), slice(left, left + self.kept.shape[1])
 
     def crop_patches(self, values: NDArray[Scalar]) -> NDArray[Scalar]:
-        """Crop values of all patches that are read, (patch,), to the kept ones, (y, x)."""
+        """Crop values of all patches that are read, (patch, ...), to the kept ones, (y, x, ...)."""
         (top, left), kept = self.origin, self.kept_patches
-        image = values.reshape(self.grid.patch_shape)
+        image = values.reshape(*self.grid.patch_shape, *values.shape[1:])
         return image[kept.top - top : kept.bottom - top, kept.left - left : kept.right - left]
 
 

@@ -43,7 +43,7 @@ from storage.arrays.mosaics import Attention, chosen_patches, open_mosaic, write
 from storage.arrays.quicklooks import choose_bands, develop, stretch
 
 MAP, PROBABILITIES = "class_map.zarr", "class_probabilities.zarr"
-CLASS_MAP = Product("segment", version=20, files=(MAP, PROBABILITIES), by_weights=True)
+CLASS_MAP = Product("segment", version=21, files=(MAP, PROBABILITIES), by_weights=True)
 OUT_OF_RANGE = "out_of_range.json"  # beside a map with values out of range
 LEFT_OUT = "left_out.npy"  # pixels outside of zones, while the map is drawn
 MOST_TURN_PX = 12.0  # greatest offset of the corners by rotation, at which a prior map is used
@@ -86,17 +86,15 @@ def segment(
             None if left_out is None else (path / LEFT_OUT).resolve(),
             unknown,
             part,
-            least_gain,
-            gains.policy,
         )
-        drawn = draw_field(work, drawing, report)
+        drawn = draw_field(work, drawing, least_gain, report)
         if prior is not None:
             figures = _prior_map_figures(prior, reader, names, lies, drawn.comparison)
             before = chosen_patches(drawing.attention) if drawn.reading is None else np.flatnonzero(drawn.reading.read)
             write_table(path / MEMORY, figures | {"patches_read": len(before)})
             if figures["put_aside"] is not None and drawn.comparison is not None:
                 drop_changes(path / PROBABILITIES)
-                drawn = draw_field(work, replace(drawing, memory=None), report)
+                drawn = draw_field(work, replace(drawing, memory=None), least_gain, report)
         if drawn.reading is not None:
             write_attention(path / READING, attention_of(drawn.reading, gains.policy))
         if drawn.unread_px:
@@ -105,7 +103,7 @@ def segment(
 
     params = {**model_key, "grid": asdict(grid), **region_params(grid), **gains.frame.key, **gains.zones.key}
     params |= {"capture": list(gains.capture), "part": part, "unknown": None if unknown is None else asdict(unknown)}
-    params["least_gain"] = None if least_gain is None else [least_gain, gains.policy]
+    params["least_gain"] = least_gain
     if prior is None:
         return Wanted(build, params, [mosaic, attention])
     shifts = [list(scan_pass.shift_px) for scan_pass in prior.scan_passes]
