@@ -46,7 +46,7 @@ def test_one_sharp_edge_wins_by_maximum_and_fine_texture_by_mean(paper: ModuleTy
     image[4, 4] = 5.0  # one bright pixel in patch 0
     image[8:, 8:] = np.indices((8, 8)).sum(axis=0)[..., None] // 2 % 2  # texture all over patch 3
     seen = CoarsePrediction(grid, image, np.full((16, 16, 2), 0.5, np.float32))
-    by_maximum = paper.patch_maxima(PIXEL_SCORES["sobel"](seen), grid)
+    by_maximum = paper.patch_maxima(PIXEL_SCORES["sobel"].of(seen), grid)
     assert by_maximum[0] == pytest.approx(10.0)
     assert select_patches(by_maximum, 1).tolist() == [0]
     assert select_patches(score_patches("sobel", seen), 1).tolist() == [3]

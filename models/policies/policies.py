@@ -43,8 +43,8 @@ def score_patches(
         return gain_of(found[:, 0], found[:, 1].sum(axis=0))
     if policy == "mask":
         scores = _mask_scores(seen, mask)
-    elif policy in PIXEL_SCORES:
-        scores = _patch_means(PIXEL_SCORES[policy](seen), seen)
+    elif policy in PIXEL_SCORES and (of := PIXEL_SCORES[policy].of) is not None:
+        scores = _patch_means(of(seen), seen)
     else:
         raise SettingsError(f"unknown policy {policy!r}; choose one of {', '.join(POLICIES)}")
     return _on_scene(scores, seen.grid)
@@ -63,7 +63,7 @@ def _on_scene(scores: Scores, grid: SceneGrid) -> Scores:
 
 def score_multiply_adds(policy: str, config: SegmenterConfig, grid: SceneGrid) -> int:
     """Return the multiply-adds of scoring every patch of a grid."""
-    score = SCORE_COSTS.get(policy)
+    score = PIXEL_SCORES.get(policy)
     if score is None:  # random or mask
         return 0
     pixels = grid.padded_shape[0] * grid.padded_shape[1]
@@ -108,24 +108,21 @@ def _edges(seen: CoarsePrediction) -> NDArray[np.float64]:
     return np.asarray(np.hypot(down, across))
 
 
-class ScoreCost(NamedTuple):
-    """Multiply-adds of scoring a coarse pixel."""
+class PixelScore(NamedTuple):
+    """Score of coarse pixels, with its multiply-adds a pixel."""
 
+    of: Callable[[CoarsePrediction], NDArray[np.float64]] | None  # None: `gain_of` scores whole patches
     adds: int
     per_column: int = 0
     per_class: int = 0
 
 
-SCORE_COSTS = {
-    "gain": ScoreCost(0, per_class=2),
-    "entropy": ScoreCost(2, per_class=1),
-    "sobel": ScoreCost(19, per_column=1),
+PIXEL_SCORES = {  # of the coarse prediction
+    "gain": PixelScore(None, 0, per_class=2),
+    "entropy": PixelScore(lambda seen: pixel_entropy(seen.probability), 2, per_class=1),
+    "sobel": PixelScore(_edges, 19, per_column=1),
 }
-PIXEL_SCORES: dict[str, Callable[[CoarsePrediction], NDArray[np.float64]]] = {
-    "entropy": lambda seen: pixel_entropy(seen.probability),
-    "sobel": _edges,
-}
-SEEING_POLICIES = tuple(SCORE_COSTS)  # depend on the surroundings alone: a large field is scored in parts
+SEEING_POLICIES = tuple(PIXEL_SCORES)  # depend on the surroundings alone: a large field is scored in parts
 GLANCING_POLICIES = ("gain", "entropy")  # depend on the network's prediction
 
 

@@ -83,7 +83,7 @@ class Readings:
             before, after = (patch_pixels(self.seen.grid, one).sum(axis=(1, 2)) for one in wrong)
             return np.asarray(before - after, np.float64)
         if pooling == "maximum":
-            return patch_maxima(PIXEL_SCORES[policy](self.seen), self.seen.grid)
+            return patch_maxima(PIXEL_SCORES[policy].of(self.seen), self.seen.grid)
         return score_patches(policy, self.seen, seed=seed)
 
 
