@@ -138,7 +138,8 @@ def run_verify(archive: str | Path, console: Console, *, remake: bool = False, a
 
     def survey_again(settings: dict[str, Any]) -> str:  # with the settings of this machine
         here = {**of_this_version(settings), "out": opened.name, **dict.fromkeys(OF_THE_MACHINE)}
-        return f"runs/{survey_command.run_survey(parse_settings(here), console).folder.name}"
+        done = survey_command.run_survey(parse_settings(here), console, summary=False)
+        return f"runs/{done.folder.name}"  # `repair` renames or removes it
 
     done = repair(opened, bad, survey_again, versions=versions())
     kept = {name: getattr(done, name) for name in ("remade", "dropped", "failed", "complete")}

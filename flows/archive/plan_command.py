@@ -287,6 +287,8 @@ def _of_camera(run: SurveyRun, fine: FinePlan | None) -> dict[str, Estimate]:
 
 def _score(run: SurveyRun) -> Estimate:
     """Return the score by the weights' table of scans, else by the scenes that were kept for validation."""
+    if run.part:
+        return Estimate(None, "a part of the field is captured, the prior map shows the rest")
     record = run.described.record
     if (scan := run.scans.chosen) is not None:
         source = f"the weights' record of such scans, {counted(int(record['scans']['scenes']), 'scene')}"

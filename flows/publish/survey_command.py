@@ -38,8 +38,8 @@ else:
     survey_flow = deferred("flows.survey")
 
 
-def run_survey(settings: Settings, console: Console, *, verbose: bool = False) -> Published:
-    """Survey, publish the run and print its summary on ``console``; with ``verbose`` also its stages and effects.
+def run_survey(settings: Settings, console: Console, *, verbose: bool = False, summary: bool = True) -> Published:
+    """Survey, publish the run and print its ``summary`` on ``console``; with ``verbose`` also its stages and effects.
 
     Raises PipelineError: of the flow; NothingToMend: the expected error of an earlier map is small enough.
     """
@@ -53,7 +53,8 @@ def run_survey(settings: Settings, console: Console, *, verbose: bool = False) -
         with observed_by(Observer(progress.watch, note, progress.say)), opened_first(settings):
             run = _survey(settings, console)
     published = Published(load_receipt(run.folder), run.folder, run.captured_again)
-    show_published(published, settings.out, console, verbose=verbose)
+    if summary:
+        show_published(published, settings.out, console, verbose=verbose)
     return published
 
 

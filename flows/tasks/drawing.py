@@ -87,6 +87,10 @@ class Drawing:
         else:
             prior_map = self.memory.of(region, weights)
             after = fuse(prior_map, observation, self.weights.load_reader())
+            if unknown is not None:  # the classes say nothing of them: no earlier class, and no age that grows
+                for image in (after.log_probability, after.age_days):
+                    image[unknown] = np.nan
+                after.light[unknown] = 0
             classes, confidence = after.classes()
             comparison = compare(prior_map, observation, after, region.kept_here)
             old = changed_from(prior_map, after)

@@ -76,13 +76,23 @@ def find_prior(
                 return found, ()
             why = found
         raise SettingsError(f"--prior {settings.prior}: {why}; give another run, latest or none")
-    notes: list[str] = []
+    runs_by_reason: dict[str, list[str]] = {}
     for run in _before(archive, settings, name, scene_key):
         found = _usable(archive, run, settings, grid, class_names)
         if isinstance(found, Prior):
-            return found, (*notes, f"prior map: {run.folder.name}, {found.days:.3g} days earlier")
-        notes.append(f"{run.folder.name} cannot be the prior map: {found}")
-    return None, (*notes, f"{name} has no prior map: this is its first visit")
+            notes = (f"prior map: {run.folder.name}, {found.days:.3g} days earlier",)
+            return found, _unusable(runs_by_reason) + notes
+        runs_by_reason.setdefault(found, []).append(run.folder.name)
+    why = "none of its earlier runs can be one" if runs_by_reason else "this is its first visit"
+    return None, (*_unusable(runs_by_reason), f"{name} has no prior map: {why}")
+
+
+def _unusable(runs_by_reason: dict[str, list[str]]) -> tuple[str, ...]:
+    """Return a note for each reason why runs cannot be the prior map."""
+    return tuple(
+        f"{runs[0]} cannot be the prior map: {why}" + (f"; {len(runs) - 1} more likewise" if len(runs) > 1 else "")
+        for why, runs in runs_by_reason.items()
+    )
 
 
 def _before(archive: Archive, settings: Settings, name: str, scene_key: str) -> Iterator[Run]:
@@ -133,7 +143,9 @@ def _usable(
     classes = tuple(names.index(one) if one in names else -1 for one in class_names)
     if all(number < 0 for number in classes):
         return f"it has none of the classes of these weights, but {', '.join(names)}"
-    days = max(_days_since(run, settings.visit, settings.moment), 0.0)
+    days = _days_since(run, settings.visit, settings.moment)
+    if days < 0:
+        return f"it was captured {-days:.3g} days after this visit"
     earlier = (EarlierRun(mosaic), *_earlier_runs(archive, run))
     return Prior(run.folder.name, probabilities, earlier, days, _day_of_year(settings), classes)
 

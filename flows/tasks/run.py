@@ -209,13 +209,14 @@ class SurveyRun(CaptureRun):
         settings, cascade = self.settings, self.cascade
         if cascade is None or settings.macs is not None or settings.policy != "gain":
             return None
-        return cascade[0] if self.prior is None else PRIOR_MAP_GAIN * cascade[0]
+        least = cascade.within(settings.expected_loss / 100)
+        return least if least is None or self.prior is None else PRIOR_MAP_GAIN * least
 
     @property
-    def cascade(self) -> tuple[float, float] | None:
-        """Return least gain and fraction of patches for the accepted loss; None without a loss or a table of losses."""
+    def cascade(self) -> CascadeTable | None:
+        """Return the table of losses; None without an accepted loss, or where the weights have no table."""
         content = self.described.record.get(CASCADE) if self.settings.expected_loss else None
-        return None if content is None else CascadeTable.read(content).within(self.settings.expected_loss / 100)
+        return None if content is None else CascadeTable.read(content)
 
     @property
     def chooses(self) -> bool:
@@ -354,8 +355,10 @@ class SurveyRun(CaptureRun):
         """Return as many patches as are expected to be read at full resolution, or as the budget pays for."""
         if self.budget is not None:
             return self.budget.choose(np.full(self.budget.costs.grid.patch_shape, np.inf).ravel())  # all gain the same
-        cascade, every = self.cascade, self.kept_patches
-        return every if cascade is None or self.least_gain is None else every[: round(cascade[1] * len(every))]
+        cascade, least, every = self.cascade, self.least_gain, self.kept_patches
+        if self.part:
+            every = np.intersect1d(every, self.scanned.patch_index)
+        return every if cascade is None or least is None else every[: round(cascade.fraction_at(least) * len(every))]
 
 
 def open_run(settings: Settings, *, planning: bool = False, archive: Archive | None = None) -> SurveyRun:

@@ -166,8 +166,8 @@ class CascadeTable:
                 fractions[row, number] = chosen.mean()
         return CascadeTable(LEAST_GAINS, *(tuple(rows.mean(axis=1).tolist()) for rows in (losses, fractions)))
 
-    def within(self, loss: float) -> tuple[float, float] | None:
-        """Return the highest threshold within a loss, and the fraction of patches read by it; None where all lose more.
+    def within(self, loss: float) -> float | None:
+        """Return the highest threshold within a loss; None where all lose more.
 
         Between the last row within the loss and the first beyond it, logarithms of the gain are interpolated.
         """
@@ -175,5 +175,8 @@ class CascadeTable:
         if rows == 0:
             return None
         ends = slice(rows - 1, rows + 1)
-        gain = np.interp(loss, self.loss[ends], np.log(self.least_gain[ends]))
-        return float(np.exp(gain)), float(np.interp(loss, self.loss[ends], self.fraction[ends]))
+        return float(np.exp(np.interp(loss, self.loss[ends], np.log(self.least_gain[ends]))))
+
+    def fraction_at(self, least_gain: float) -> float:
+        """Return the fraction of patches that a threshold reads, interpolated over logarithms of the gain."""
+        return float(np.interp(np.log(least_gain), np.log(self.least_gain), self.fraction))

@@ -229,3 +229,12 @@ def test_a_zoomed_farm_may_take_every_line_and_read_every_patch(tmp_path: Path) 
     assert captured["value"] == pytest.approx(found["scans"]["candidates"][-1]["bytes_raw"], rel=0.03)
     assert not work["at_most"]
     assert work["known_from"].endswith("million with every patch")
+
+
+def test_a_part_of_a_field_promises_no_score_and_reads_what_it_captures(settings: Settings, tmp_path: Path) -> None:
+    """Patches beside the lines keep the prior map; how good that is no record of scans says."""
+    one_scan = {"budget": None, "scan_step": 1, "out": str(tmp_path)}
+    whole, part = (plan_content(replace(settings, extent=one, **one_scan))["estimate"] for one in ("whole", "0:0-20"))
+    assert part["multiply_adds"]["value"] < 0.5 * whole["multiply_adds"]["value"]
+    assert part["miou"]["value"] is None
+    assert "a part of the field" in part["miou"]["known_from"]

@@ -126,6 +126,12 @@ def test_the_prior_map_is_the_last_before_the_visit_or_the_one_named(
         found_prior(twice[0], visit, "nobody")
 
 
+def test_a_run_captured_after_the_visit_is_refused(twice: tuple[Path, Any, Any]) -> None:
+    """Plants do not shrink: a map of a later day would say how the field will be."""
+    with pytest.raises(SettingsError, match=r"it was captured 2 days after this visit; give another run, latest or"):
+        found_prior(twice[0], "2026-06-02", twice[2].folder.name)
+
+
 def found_prior(out: Path, visit: str, prior: str) -> tuple[str, float] | None:
     """Name and days of the run that a visit to north goes on from."""
     settings = load_settings(None, {"prior": prior, "visit": visit})
@@ -180,7 +186,8 @@ def test_what_was_cleared_is_gone_on_without(visited: Path, twice: Any, survey_p
     shutil.rmtree((visited / first.receipt["products"]["class_probabilities"]).parent)
     shutil.rmtree((visited / published.receipt["products"]["class_probabilities"]).parent)
     words, published = words_of(visited, survey_png, visit="2026-06-08T10:00:00Z", prior="latest")
-    assert "north has no prior map: this is its first visit" in words
+    assert "its stores were cleared; reprocess computes them again; 2 more likewise" in words
+    assert "north has no prior map: none of its earlier runs can be one" in words
 
 
 def test_other_classes_are_found_by_their_names(visited: Path, survey_png: Survey, make_weights: WeightsMaker) -> None:

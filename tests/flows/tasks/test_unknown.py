@@ -104,7 +104,7 @@ def test_without_it_every_bit_is_kept(
 
 
 def test_of_unknown_pixels_nothing_is_believed(both: tuple[Path, Path, dict[str, Any]]) -> None:
-    """What was seen says nothing of the classes; a later look takes its own word, or a memory keeps its."""
+    """What was seen says nothing of the classes; a later look takes its own word."""
     out, _, _ = both
     probabilities, classes = _stored(out, "class_probabilities"), _stored(out, "class_map")["classes"].values
     np.testing.assert_array_equal(np.isnan(probabilities["log_probability"].values).all(axis=-1), classes == 3)
@@ -113,7 +113,7 @@ def test_of_unknown_pixels_nothing_is_believed(both: tuple[Path, Path, dict[str,
 def test_a_later_visit_goes_on_from_such_a_map(
     both: tuple[Path, Path, dict[str, Any]], survey_png: Survey, judging: Maker, tmp_path: Path
 ) -> None:
-    """What is unknown today is so whatever is remembered there, and its memory stays."""
+    """What is unknown today is so whatever is remembered there; no earlier class or age of it stays."""
     shutil.copytree(both[0], tmp_path, dirs_exist_ok=True)
     before = set(tmp_path.glob("stages/segment/*"))
     flags = {"visit": "later", "seed": "1", "prior": "latest", **NARROW}
@@ -122,6 +122,9 @@ def test_a_later_visit_goes_on_from_such_a_map(
     (store,) = set(tmp_path.glob("stages/segment/*")) - before
     found = xr.open_zarr(store / "class_map.zarr", consolidated=False)["classes"].values
     assert (found == 3).sum() == receipt["unknown"]["pixels"] > 0
+    after = xr.open_zarr(store / "class_probabilities.zarr", consolidated=False)
+    for values in (after["age"].values, after["log_probability"].values[..., 0]):
+        np.testing.assert_array_equal(np.isnan(values), found == 3)
 
 
 def test_a_map_of_nothing_known_is_published_and_says_what_to_do(

@@ -178,17 +178,20 @@ def test_losses_stand_beside_fractions() -> None:
 
 
 @pytest.mark.parametrize(
-    ("loss", "wanted"),
-    [(0.0, (0.02, 0.5)), (0.1, (math.sqrt(0.02 * 0.03), 0.4)), (0.2, (0.03, 0.3)), (1.0, (0.04, 0.1)), (-0.5, None)],
+    ("loss", "gain", "fraction"),
+    [(0.0, 0.02, 0.5), (0.1, math.sqrt(0.02 * 0.03), 0.4), (0.2, 0.03, 0.3), (1.0, 0.04, 0.1)],
 )
-def test_the_highest_gain_within_a_loss(loss: float, wanted: tuple[float, float] | None) -> None:
-    """Between two rows by the logarithm of the gain; none beyond the last."""
+def test_the_highest_gain_within_a_loss(loss: float, gain: float, fraction: float) -> None:
+    """Between two rows by the logarithm of the gain, and so is the fraction of patches; none beyond the last."""
     table = CascadeTable((0.01, 0.02, 0.03, 0.04), (-0.1, 0.0, 0.2, 0.3), (0.9, 0.5, 0.3, 0.1))
-    assert table.within(loss) == (wanted if wanted is None else pytest.approx(wanted))
+    found = table.within(loss)
+    assert found == pytest.approx(gain)
+    assert table.fraction_at(gain) == pytest.approx(fraction)
+    assert table.within(-0.5) is None
 
 
 def test_a_worse_row_ends_the_search() -> None:
     """Noise of few scenes does not open a higher gain behind it."""
     found = CascadeTable((0.01, 0.02, 0.03), (0.0, 0.5, 0.1), (0.9, 0.5, 0.3)).within(0.2)
     assert found is not None
-    assert 0.01 < found[0] < 0.02
+    assert 0.01 < found < 0.02
