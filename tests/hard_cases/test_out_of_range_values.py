@@ -52,9 +52,7 @@ def _alike(one: tuple[CoarsePrediction, DrawnMap], other: tuple[CoarsePrediction
 @example(value=np.float32(1e30), y=3, x=3, bands=set(range(7)), at=True)
 @example(value=np.float32(1e18), y=3, x=3, bands=set(range(7)), at=True)
 @example(value=np.float32(1e30), y=3, x=3, bands=set(range(7)), at=False)
-def test_a_out_of_range_value_is_as_if_it_had_not_been_captured(
-    value: float, y: int, x: int, bands: set[int], at: bool
-) -> None:
+def test_an_out_of_range_value_is_as_if_not_captured(value: float, y: int, x: int, bands: set[int], at: bool) -> None:
     """A pixel of what the overview reads or of a patch, in some bands or all: every bit is as with NaN in its place."""
     out_of_range, hole = (VALUES if at else FINE).copy(), (VALUES if at else FINE).copy()
     place = (y, x, sorted(bands)) if at else (y % len(PATCHES), y % 8, x % 8, sorted(bands))

@@ -84,9 +84,7 @@ def test_a_tile_without_any_value_is_left_out(tiles: Path, tmp_path: Path, comma
 
 
 @pytest.mark.parametrize("held_out", [False, True])
-def test_the_evaluation_that_training_advises_is_none_that_refuses(
-    tiles: Path, tmp_path: Path, command_line: Any, held_out: bool
-) -> None:
+def test_the_advised_evaluation_is_not_refused(tiles: Path, tmp_path: Path, command_line: Any, held_out: bool) -> None:
     """Where all scenes were trained on it asks for others; where some were held out, its command runs."""
     out = tmp_path / "w.safetensors"
     ended = command_line("train", tiles, "-o", out, *(["--hold-out", "004"] if held_out else []), *SMALL)
@@ -148,7 +146,7 @@ def test_init_names_the_wavelengths_that_its_next_command_needs(
 
 
 @pytest.mark.parametrize("there", [False, True])
-def test_init_says_why_it_cannot_write(
+def test_init_says_why_it_fails(
     tmp_path: Path, command_line: Any, monkeypatch: pytest.MonkeyPatch, there: bool
 ) -> None:
     """On a disk that is read-only the message says so, with --force too, and a file that is there stays."""

@@ -151,9 +151,7 @@ def test_transparent_pixels_are_no_data_to_the_end(tmp_path: Path, weights: Path
         assert (attention["score"].values[:2, :3] == 0).all()  # patches of 8 px without a pixel of the scene
 
 
-def test_pixels_that_became_transparent_did_not_change(
-    tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pixels_now_transparent_did_not_change(tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """To a second visit they are as old as nothing, whatever was put in their place to look at; others did change."""
     for name in ("CERTAIN", "SURE"):  # untrained weights are sure of nothing: what they say is taken for sure
         monkeypatch.setattr(prior_map, name, 1e-6)

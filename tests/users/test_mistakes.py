@@ -126,9 +126,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_mistake_ends_in_one_message(
-    case: str, files: Path, command_line: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_mistakes_are_one_message(case: str, files: Path, command_line: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """One line that says what to do, the right exit code, no traceback, and nothing written."""
     code, words, message = CASES[case]
     monkeypatch.chdir(files)

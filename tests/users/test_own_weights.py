@@ -67,9 +67,7 @@ def survey(command_line: Any, made: Path, scene: object, out: Path, *words: str)
     return " ".join((ended.out + ended.err).split()), json.loads((folder / "receipt.json").read_text())
 
 
-def test_a_score_on_a_scene_of_the_training_says_so_in_its_sentence(
-    made: Path, tmp_path: Path, command_line: Any
-) -> None:
+def test_a_score_on_a_scene_of_the_training_says_so_in_words(made: Path, tmp_path: Path, command_line: Any) -> None:
     """Terminal, report and receipt say it, and ls marks the score; of a scene that was kept from training they do not.
 
     The file is known by what it holds: under another name, and in other bands.

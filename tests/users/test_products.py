@@ -223,7 +223,7 @@ def test_the_catalogue_names_every_product(posed: Products) -> None:
         ({"indices": "NDVI,NDMI"}, "NDMI wants Short-wave Infrared"),
     ],
 )
-def test_what_cannot_be_made_is_refused_before_anything_is(
+def test_what_cannot_be_made_is_refused_first(
     posed: Products, tmp_path: Path, flags: dict[str, Any], words: str
 ) -> None:
     """One message that says what was expected; the folder stays empty."""
@@ -259,7 +259,7 @@ def test_a_survey_without_a_place_has_what_needs_none(surveyed_png: Any, tmp_pat
     [("EPSG:32632", TURNED), ("EPSG:4326", Affine(7e-7, 0, 9.5, 0, -4.5e-7, 52.1))],
     ids=["turned", "in degrees"],
 )
-def test_products_of_a_georeferenced_scene_lie_where_it_does(
+def test_products_of_a_georeferenced_scene_lie_there(
     tmp_path: Path, weights: Path, crs: str, transform: Affine
 ) -> None:
     """Corners of indices and polygons to 0.1 px, in its CRS; cells are square in metres; a gap gets no dose."""

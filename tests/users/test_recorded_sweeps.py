@@ -354,7 +354,7 @@ def test_the_next_step_names_wavelengths_that_a_file_lacks(
     assert f"--scene {tmp_path / 'a.npy'} --wavelengths {words} --weights" in ended.err
 
 
-def test_a_run_of_the_rig_is_reprocessed_from_its_raw_cubes(
+def test_a_run_of_the_rig_is_reprocessed_from_raw(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights: Path
 ) -> None:
     """Once captures have a newer version the rig is not asked: the same map, once, and nothing is left to do."""

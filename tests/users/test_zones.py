@@ -209,9 +209,7 @@ def test_polygons_in_any_crs_are_the_same_zones(opened: Opened, tmp_path: Path) 
     ],
     ids=["beside", "tiny", "no place", "another farm"],
 )
-def test_an_area_that_is_not_of_the_field_is_refused(
-    opened: Opened, tmp_path: Path, shape: Any, crs: Any, pose: bool, words: str
-) -> None:
+def test_a_wrong_area_is_refused(opened: Opened, tmp_path: Path, shape: Any, crs: Any, pose: bool, words: str) -> None:
     """One message with both extents, or what is missing."""
     path = sketch(tmp_path / ("area.gpkg" if crs else "area.geojson"), {"a": shape}, crs)
     with pytest.raises(ZoneError, match=words):

@@ -202,9 +202,7 @@ def test_the_catalogue_is_valid_and_leads_to_every_file(exports: list[Exported])
         ("raster", None, ("2026-06-21T08:00:00Z", "2026-06-21T08:05:00Z")),
     ],
 )
-def test_a_rig_observes_while_it_runs(
-    tmp_path: Path, source: str, visit: str | None, observed: tuple[str, str]
-) -> None:
+def test_rigs_observe_while_they_run(tmp_path: Path, source: str, visit: str | None, observed: tuple[str, str]) -> None:
     """Its visit is named by the date; a run of another date used its lines again. A file has the time of its visit."""
     receipt: Any = {"source": source, "started": "2026-06-21T08:00:00Z", "finished": "2026-06-21T08:05:00Z"}
     archive = Archive.open(tmp_path)

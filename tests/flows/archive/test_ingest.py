@@ -163,9 +163,7 @@ def test_names_that_lead_elsewhere(tmp_path: Path, raw: NDArray[np.uint16], name
     assert not (tmp_path / "archive").exists()
 
 
-def test_a_source_that_changes_meanwhile(
-    tmp_path: Path, raw: NDArray[np.uint16], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_source_that_then_changes(tmp_path: Path, raw: NDArray[np.uint16], monkeypatch: pytest.MonkeyPatch) -> None:
     """Files that change while they are read are not kept."""
     header = write_envi(tmp_path / "a.img", raw)
     real = flows.archive.ingest_command.write_ingested_cube

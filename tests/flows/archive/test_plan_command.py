@@ -77,9 +77,7 @@ def test_without_an_archive_the_plan_makes_none(settings: Settings, tmp_path: Pa
     assert {name: planned[name].why for name in WAITS} == {name: f"waits for {on}" for name, on in WAITS.items()}
 
 
-def test_planning_leaves_an_archive_as_it_is(
-    settings: Settings, archive: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_planning_leaves_an_archive_alone(settings: Settings, archive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every file and folder, the spool of a broken capture too; not one line of light is asked for."""
     key = _plan(settings, archive)["capture_coarse"].key
     (archive / "spool" / str(key)).mkdir(parents=True)
@@ -107,9 +105,7 @@ def test_only_what_differs_is_to_be_made(
     assert [planned[name].state for name in ("rectify", "score", "rectify_fine")] == ["cached", "cached", "to run"]
 
 
-def test_a_field_beyond_this_machine_is_planned_without_drawing_it(
-    settings: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_field_beyond_memory_is_planned(settings: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither its ground nor its spectra; the plan says what the survey says when it refuses."""
 
     def refuse(*_: object) -> None:

@@ -117,9 +117,7 @@ def test_new_weights_make_a_generation_beside_the_old(archive: Path, other: Path
     assert run_verify(archive, QUIET) == DONE
 
 
-def test_a_newer_stage_is_run_for_those_that_rest_on_an_older(
-    archive: Path, reprocess: Reprocess, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_newer_stage_replaces_an_older(archive: Path, reprocess: Reprocess, monkeypatch: pytest.MonkeyPatch) -> None:
     """A raised version makes it and what follows anew; light is not captured again."""
     light = _captures(archive)
     be_version(monkeypatch, "segment", 99)

@@ -93,9 +93,7 @@ def test_printed_json_is_json(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_sigterm_ends_every_verb(
-    verb: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_sigterm_ends_any_verb(verb: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """143 and one sentence, which says whether the same command goes on; afterwards SIGTERM is what it was before."""
 
     def terminated() -> None:

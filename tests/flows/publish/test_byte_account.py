@@ -89,9 +89,7 @@ def test_an_accuracy_that_is_added_is_in_the_account(survey_png: Survey, tmp_pat
     assert account["written"] > account["kept"]  # the folder was written twice
 
 
-def test_what_is_found_counts_as_kept_and_not_as_written(
-    published: Published, survey_png: Survey, tmp_path: Path
-) -> None:
+def test_what_is_found_counts_as_kept_not_as_written(published: Published, survey_png: Survey, tmp_path: Path) -> None:
     """A second run of the same survey writes its folder alone, and keeps the stores of the first."""
     root = tmp_path / "archive"
     again = survey_png(root, accuracy=False)
@@ -136,9 +134,7 @@ def test_a_run_in_a_bucket_counts_its_objects(
 
 
 @pytest.mark.parametrize("stores", [899, 99_000, 999_400, 9_999_999_000])
-def test_the_figure_of_a_folder_that_holds_the_figure(
-    stores: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_figure_of_a_folder_that_holds_it(stores: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where a digit more of it makes the folder larger, or shorter words make the page smaller, it holds as well."""
     archive = Archive.open(tmp_path / "archive")
     monkeypatch.setattr(archive, "sizes", lambda uris: {"stages/capture/ab12": stores})  # which the run built

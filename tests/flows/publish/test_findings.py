@@ -126,9 +126,7 @@ def test_words_of_a_memory_tell_change_beyond_what_maps_differ_by() -> None:
     [{"budget": None, "scan_step": "2"}, {"budget": None, "scan_step": "1", "macs": "80%"}],
     ids=["another step", "read in part"],
 )
-def test_nothing_is_told_of_maps_of_which_nobody_knows(
-    survey_png: Survey, weights: Path, tmp_path: Path, flags: dict[str, str | None]
-):
+def test_unknown_maps_have_no_findings(survey_png: Survey, weights: Path, tmp_path: Path, flags: dict[str, str | None]):
     """A step that was not measured, a scan of which a part alone is read."""
     path = _judged(weights, tmp_path, SCORES.as_dict())
     assert "expected" not in survey_png(tmp_path / "a", weights=str(path), effects="none", **flags).receipt

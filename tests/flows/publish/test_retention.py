@@ -107,9 +107,7 @@ def test_lines_that_no_run_keeps_go_with_the_next_survey(archive: Archive, surve
 
 
 @pytest.mark.usefixtures("no_effects")
-def test_what_a_killed_survey_did_not_clear_goes(
-    survey_png: Survey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_killed_survey_left_goes(survey_png: Survey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With `keep = signal` at once, whatever the age."""
     with monkeypatch.context() as patch:
         patch.setattr("flows.survey.clear_raw", lambda plan, run: run)

@@ -246,9 +246,7 @@ def wait_for(name: str) -> None:
     pytest.fail(f"{name} is not served")
 
 
-def test_the_rig_and_the_reading_machine_are_two_deployments(
-    field_file: Callable[..., Path], tmp_path: Path, scheduling: str
-) -> None:
+def test_rig_and_reader_are_two_deployments(field_file: Callable[..., Path], tmp_path: Path, scheduling: str) -> None:
     """One process takes the sweeps, another reads them from the same archive; the map is that of one plain survey."""
     from flows.settings.parameters import SurveySettings
     from flows.survey import survey
@@ -339,9 +337,7 @@ def test_the_automation_tells_of_a_failed_run(north: Any, tmp_path: Path, schedu
     assert "no settings file" in found["why"]
 
 
-def test_a_serve_goes_on_when_its_server_was_killed_and_is_back(
-    field_file: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_a_serve_goes_on_when_its_killed_server_is_back(field_file: Callable[..., Path], tmp_path: Path) -> None:
     """A run after that ends well; SIGTERM then ends it with one sentence and pauses the schedule.
 
     It is started as a shell starts what goes on in the background, which ignores SIGINT.

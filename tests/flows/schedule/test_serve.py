@@ -34,9 +34,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_refused_before_anything_is_served(
-    case: str, field_file: Callable[..., Path], tmp_path: Path, command_line: Any
-) -> None:
+def test_refused_before_serving(case: str, field_file: Callable[..., Path], tmp_path: Path, command_line: Any) -> None:
     """One clear message and the right exit code; no server is left."""
     names, words, code, message = BAD[case]
     field_file("north")

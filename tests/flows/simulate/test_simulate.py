@@ -121,9 +121,7 @@ def test_a_broken_scan_goes_on_where_it_was(
         (["--size", "64x64"], "size is for built-in scenes"),
     ],
 )
-def test_wrong_words_are_refused(
-    command_line: Any, scene_files: Path, tmp_path: Path, flags: list[str], message: str
-) -> None:
+def test_wrong_is_refused(command_line: Any, scene_files: Path, tmp_path: Path, flags: list[str], message: str) -> None:
     """One message, exit code 2, no archive."""
     command_line("simulate", scene_files / "scene.png", "-o", tmp_path / "none", *flags).refused(2, message)
     assert not (tmp_path / "none").exists()

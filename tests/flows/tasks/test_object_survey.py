@@ -167,7 +167,7 @@ def test_a_flipped_bit_is_named_and_made_again(
     np.testing.assert_array_equal(map_of(open_archive(bucket), published), before)
 
 
-def test_a_bucket_that_cannot_be_reached_is_one_error(
+def test_an_unreachable_bucket_is_one_error(
     bucket: str, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No traceback, a cause and what to do; the exit code is 1, and 2 for an address that is none."""

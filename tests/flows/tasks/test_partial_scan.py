@@ -210,7 +210,7 @@ def test_nothing_is_worth_more_than_what_is_due() -> None:
     assert np.argsort(nobody.expected_gain(np.zeros(4))).tolist() == [0, 1, 2, 3]
 
 
-def test_what_is_beyond_another_fields_part_has_no_class(
+def test_beyond_another_fields_part_is_no_class(
     visited: Path, survey_png: Survey, recorded: Path, tmp_path: Path
 ) -> None:
     """A memory of another field is put aside, and where nobody looked nothing is said of this one."""

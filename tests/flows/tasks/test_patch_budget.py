@@ -43,7 +43,7 @@ def _budget(**limits: object) -> PatchBudget:
 
 
 @given(scores, st.floats(40, 99), st.sampled_from(["gain", "sobel"]))
-def test_no_budget_is_exceeded_and_no_patch_more_is_paid_for(
+def test_no_budget_is_exceeded_and_none_left_unspent(
     given_scores: NDArray[np.float64], macs: float, policy: str
 ) -> None:
     """Multiply-adds with the scores are within their fraction; one patch more is beyond it."""
@@ -59,9 +59,7 @@ def test_no_budget_is_exceeded_and_no_patch_more_is_paid_for(
 
 
 @given(scores, st.floats(40, 99), st.floats(40, 99))
-def test_a_larger_budget_buys_what_a_smaller_one_does_and_more(
-    given_scores: NDArray[np.float64], one: float, other: float
-) -> None:
+def test_a_larger_budget_buys_all_of_a_smaller_one(given_scores: NDArray[np.float64], one: float, other: float) -> None:
     """Choices are nested."""
     less, more = (_budget(macs=f"{percent}%").choose(given_scores) for percent in sorted((one, other)))
     np.testing.assert_array_equal(less, more[: len(less)])
@@ -121,9 +119,7 @@ def test_numbers_are_limits_too() -> None:
         ({"macs": "50%", "extent": "0:1-9"}, SettingsError, "a whole field, 'extent' covers a part"),
     ],
 )
-def test_what_is_no_budget_is_refused_in_a_sentence(
-    limits: dict[str, object], error: type[Exception], words: str
-) -> None:
+def test_what_is_no_budget_is_refused_in_words(limits: dict[str, object], error: type[Exception], words: str) -> None:
     """The message says what it must be, or what to leave out."""
     with pytest.raises(error, match=words):
         _asked(**limits)

@@ -208,9 +208,7 @@ def test_a_stage_that_fails_by_prefect(
     assert problems(tmp_path) == []
 
 
-def test_a_reprocessing_of_which_a_stage_fails(
-    server: str, walk: Walk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_reprocessing_that_fails(server: str, walk: Walk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It ends Failed and says why; the next one makes what was missing, and completes."""
     from flows.archive.reprocess_flow import reprocess
 

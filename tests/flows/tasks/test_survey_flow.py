@@ -172,9 +172,7 @@ def test_every_setting_is_a_described_field_of_the_form() -> None:
     assert all(one.get("description") or "$ref" in json.dumps(one) for one in schema.values())
 
 
-def test_prefect_makes_the_stores_that_plain_makes(
-    survey_png: Any, surveyed_png: Any, tmp_path: Path, server: str
-) -> None:
+def test_prefect_makes_the_stores_of_plain(survey_png: Any, surveyed_png: Any, tmp_path: Path, server: str) -> None:
     """Keys, savings and accuracy are those of plain; tasks have the edges, logs and artifacts of the mission."""
     from prefect.client.orchestration import get_client
     from prefect.client.schemas.filters import ArtifactFilter, ArtifactFilterFlowRunId, LogFilter, LogFilterFlowRunId

@@ -168,9 +168,7 @@ def _step(out: Path) -> float:
     return float(json.loads(record.read_text())["step"])
 
 
-def test_scores_keep_to_a_limit_of_bytes(
-    scanned: tuple[Path, Any], survey_png: Survey, recorded: Path, tmp_path: Path
-) -> None:
+def test_scores_keep_to_a_limit(scanned: tuple[Path, Any], survey_png: Survey, recorded: Path, tmp_path: Path) -> None:
     """Coarser steps are taken, as few as suffice; raw lines are cleared."""
     every = _scores_bytes(scanned[0])
     flags = {**BY_HAND, "weights": str(recorded)}
@@ -198,9 +196,7 @@ def test_a_limit_without_lines_of_a_uniform_scan_is_refused(given: dict[str, str
         load_settings(None, {"scene": "field.png", "kept_bytes": "8MB", **given})
 
 
-def test_without_a_flag_the_cheapest_scan_nearly_as_good_as_any_is_taken(
-    survey_png: Survey, recorded: Path, tmp_path: Path
-) -> None:
+def test_without_a_flag_the_cheapest_good_scan_is_taken(survey_png: Survey, recorded: Path, tmp_path: Path) -> None:
     """The settings of the receipt say which it was; its seconds are told beside those of every line."""
     receipt = survey_png(tmp_path, weights=str(recorded), budget=None).receipt
     taken, capture = receipt["scans"]["taken"], receipt["savings"]["capture_s"]
@@ -221,9 +217,7 @@ def test_what_only_two_passes_have_asks_for_them(recorded: Path, name: str, valu
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (32, 32)])
 @pytest.mark.parametrize("source", ["raster", "sim"])
-def test_any_scene_is_surveyed_without_a_flag(
-    weights: Path, tmp_path: Path, shape: tuple[int, ...], source: str
-) -> None:
+def test_all_scenes_need_no_flag(weights: Path, tmp_path: Path, shape: tuple[int, ...], source: str) -> None:
     """However small, of one band too: a map of its size; for a camera every line is a scan that always pays."""
     values = np.random.default_rng(0).integers(0, 255, shape, dtype=np.uint8)
     Image.fromarray(values).save(tmp_path / "scene.png")

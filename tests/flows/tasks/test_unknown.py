@@ -127,9 +127,7 @@ def test_a_later_visit_goes_on_from_such_a_map(
         np.testing.assert_array_equal(np.isnan(values), found == 3)
 
 
-def test_a_map_of_nothing_known_is_published_and_says_what_to_do(
-    survey_png: Survey, judging: Maker, tmp_path: Path
-) -> None:
+def test_a_map_of_nothing_known_says_what_to_do(survey_png: Survey, judging: Maker, tmp_path: Path) -> None:
     """Receipt, report, quicklook and accuracy; the sentence names the way out."""
     published = survey_png(tmp_path, weights=str(judging(1e-6)), **NARROW)
     receipt: Any = published.receipt

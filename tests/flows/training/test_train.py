@@ -290,7 +290,7 @@ def test_whitening_knows_the_noise_of_short_exposures(folder: Path, out: Path):
     assert sizes[1] < sizes[0]
 
 
-def test_a_training_goes_on_from_weights(
+def test_training_goes_on_from_weights(
     folder: Path, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The normalisation stays, a step begins at the first network, and the result is halfway between both."""
@@ -349,9 +349,7 @@ def test_a_training_cannot_go_on_with_other_scenes_of_the_same_names(folder: Pat
 
 
 @pytest.mark.parametrize(("rows", "held"), [(8, False), (12, True), (None, True)])
-def test_a_training_goes_on_with_all_pixels_that_it_had(
-    out: Path, tmp_path: Path, rows: int | None, held: bool
-) -> None:
+def test_a_training_goes_on_with_all_its_pixels(out: Path, tmp_path: Path, rows: int | None, held: bool) -> None:
     """Another mask must contain the first one; without a mask every pixel is trained on."""
     labels = np.random.default_rng(4).integers(1, 3, (16, 16)).astype(np.uint8)
     np.save(tmp_path / "cube.npy", (labels[..., None] * np.ones(4)).astype(np.float32))

@@ -73,9 +73,7 @@ def test_equal_seeds_give_equal_weights_and_leave_global_streams_alone():
 
 
 @pytest.mark.parametrize(("crop", "first", "last"), [(48, 32, (2, 64)), (64, 64, (4, 64)), (16, 32, (4, 32))])
-def test_batches_are_halved_where_crops_grow(
-    crop: int, first: int, last: tuple[int, int], monkeypatch: pytest.MonkeyPatch
-):
+def test_batches_halve_where_crops_grow(crop: int, first: int, last: tuple[int, int], monkeypatch: pytest.MonkeyPatch):
     """The last phase has larger crops and fewer of them; where scenes have no larger ones, as many as before."""
     trainer = training.Trainer(CONFIG, [block_example(64)], SHIFT, replace(SETTINGS, batch=4, crop=crop))
     sizes, loss = [], training.batch_loss

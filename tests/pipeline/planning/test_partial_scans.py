@@ -84,9 +84,7 @@ def test_no_run_of_the_same_sweep_is_worth_more_in_its_seconds(expected_gain: np
 
 
 @given(worths, st.floats(0.1, 1.0), st.floats(0.1, 4.0))
-def test_no_run_of_one_swath_that_ends_in_time_is_worth_more(
-    expected_gain: np.ndarray, fraction: float, power: float
-) -> None:
+def test_no_run_of_one_swath_in_time_is_worth_more(expected_gain: np.ndarray, fraction: float, power: float) -> None:
     """Whatever the strip: also where rows are worth the same, and no price of a second divides them."""
     seconds = fraction * WHOLE_S
     scan_pass = partial_scan(expected_gain**power, seconds)

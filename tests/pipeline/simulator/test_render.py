@@ -88,9 +88,7 @@ def test_light_is_within_that_of_the_scene(
     start=st.floats(-20.0, -18.0),
     along=st.sampled_from("xy"),
 )
-def test_light_of_what_is_swept_is_kept(
-    picture: str, chosen: dict[Any, str], swath: float, start: float, along: Any
-) -> None:
+def test_light_of_a_sweep_is_kept(picture: str, chosen: dict[Any, str], swath: float, start: float, along: Any) -> None:
     """Where lines lie straight, samples 1 px apart sum to the light of a spot on black, wherever among them it lies.
 
     Of the tails of diffraction a part falls beside what is swept: they have a law of their own.

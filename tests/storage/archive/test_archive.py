@@ -102,9 +102,7 @@ def test_every_byte_of_a_manifest_counts(archive: Archive, change: Callable[[str
         archive.find("mosaic", "abc")
 
 
-def test_a_store_is_on_the_disk_before_and_after_it_gets_its_name(
-    archive: Archive, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_store_is_on_disk_before_and_after_it_has_its_name(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
     """Files, manifest and folders first, then the name, then the folder that holds the name."""
     told, rename = list[str](), Path.rename
 
@@ -168,9 +166,7 @@ def test_what_cannot_be_an_archive(tmp_path: Path) -> None:
     ("number", "words"),
     [(errno.EACCES, "permission is denied"), (errno.EROFS, "read-only"), (errno.ENOSPC, "the disk is full: free some")],
 )
-def test_a_refusing_disk_is_told_at_once(
-    tmp_path: Path, number: int, words: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_refusing_disks_are_told_of(tmp_path: Path, number: int, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Opening writes a probe, so that a survey does not begin what it cannot keep."""
 
     def refuse(path: Path, content: bytes) -> int:

@@ -101,9 +101,7 @@ def test_versions_and_libraries_count_as_changes(tmp_path: Path, archive: Archiv
     ]
 
 
-def test_raw_lines_of_which_nobody_says_where_they_come_from_are_the_only_copy(
-    tmp_path: Path, archive: Archive
-) -> None:
+def test_raw_lines_of_which_nobody_says_their_origin_are_the_only_copy(tmp_path: Path, archive: Archive) -> None:
     """The simulator's say so, by a run or by their own parameters; one run of a rig is enough against all others."""
     for key, params in (("bare", {}), ("light", {"effects": []}), ("rig", {"effects": [], "source": "rig"})):
         with archive.publish("capture", key, params=params):

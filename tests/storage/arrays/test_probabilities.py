@@ -64,9 +64,7 @@ def test_visits_of_every_hour_do_not_stop_the_clock(tmp_path: Path) -> None:
 
 
 @given(seed=st.integers(0, 2**16))
-def test_what_is_read_is_what_was_written_within_half_a_step(
-    tmp_path_factory: pytest.TempPathFactory, seed: int
-) -> None:
+def test_what_is_read_was_written_within_half_a_step(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
     """The likeliest class stays where no other is within a step; ages and light stay as they are, NaN where unknown."""
     path = stored(tmp_path_factory.mktemp("class_probabilities") / "class_probabilities.zarr", seed)
     values, ages, light = drawn(seed)

@@ -115,9 +115,7 @@ def test_classes_have_colours_and_names(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kept", [0.0, 0.3, 0.9])
-def test_a_file_that_the_disk_cut_short_gets_no_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept: float
-) -> None:
+def test_a_file_that_the_disk_cut_gets_no_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept: float) -> None:
     """What does not read back as it was given is an error, whatever GDAL said while it wrote."""
     module = importlib.import_module("rasterio.shutil")
     whole = module.copy

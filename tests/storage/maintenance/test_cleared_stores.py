@@ -68,9 +68,7 @@ def test_a_reader_of_what_was_cleared_is_told_what_to_do(archive: Archive) -> No
         archive.locate(f"{small.mosaic.uri}/mosaic.zarr")
 
 
-def test_a_store_that_is_cleared_while_it_is_checked_is_whole(
-    archive: Archive, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_store_that_is_cleared_while_checked_is_whole(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
     """By a survey beside it: neither its reader nor verify takes it for damaged."""
     small = small_survey(archive)
     problem = manifests.file_problem
@@ -86,9 +84,7 @@ def test_a_store_that_is_cleared_while_it_is_checked_is_whole(
 
 
 @pytest.mark.parametrize("exchanges", [True, False])
-def test_broken_off_it_leaves_the_store_whole(
-    archive: Archive, monkeypatch: pytest.MonkeyPatch, exchanges: bool
-) -> None:
+def test_broken_off_it_leaves_a_store_whole(archive: Archive, monkeypatch: pytest.MonkeyPatch, exchanges: bool) -> None:
     """Whichever rename fails, the files are there yet, or can be had again."""
     small = small_survey(archive)
     before = content(small.mosaic)

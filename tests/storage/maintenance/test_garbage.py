@@ -100,9 +100,7 @@ def test_a_spool_stays_while_its_capture_may_be_in_need_of_it(archive: Archive) 
     assert [removal.what for removal in clear_up(archive).removals] == ["leftover"]
 
 
-def test_what_does_not_let_itself_be_removed_is_not_told_as_gone(
-    tmp_path: Path, archive: Archive, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_cannot_be_removed_is_not_gone(tmp_path: Path, archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
     """The disk refuses: the next gc tries again."""
     (tmp_path / "stages/segment/aaaa.part").mkdir(parents=True)
     with monkeypatch.context() as broken:

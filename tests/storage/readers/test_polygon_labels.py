@@ -166,9 +166,7 @@ def test_a_folder_of_scenes(tmp_path: Path) -> None:
         ([WEST.centroid.buffer(0.1)] * 2, 32632, {}, PLACE, "no pixel's centre lies in a polygon that has a class"),
     ],
 )
-def test_mistakes_end_in_one_message(
-    shapes: Any, crs: Any, columns: Any, place: Any, words: str, tmp_path: Path
-) -> None:
+def test_mistakes_are_one_message(shapes: Any, crs: Any, columns: Any, place: Any, words: str, tmp_path: Path) -> None:
     """Each says what is wrong with which file, and what to do."""
     path = written(tmp_path / "labels.shp", shapes, crs, **columns)
     with pytest.raises(SceneError, match=words):

@@ -75,9 +75,7 @@ def test_a_store_without_conditional_puts_is_refused(bucket: str, monkeypatch: p
         open_archive(bucket)
 
 
-def test_a_publisher_killed_before_the_manifest_leaves_nothing_visible(
-    bucket: str, machine: Machine, tmp_path: Path
-) -> None:
+def test_a_publisher_killed_before_the_manifest_leaves_nothing(bucket: str, machine: Machine, tmp_path: Path) -> None:
     """Killed between files and manifest: others find nothing; the rerun uploads the manifest, and no file again."""
     script = (
         "import os, signal, sys\n"
@@ -153,9 +151,7 @@ def test_runs_of_one_second_have_names_of_their_own(machine: Machine) -> None:
 
 
 @pytest.mark.parametrize("method", ["write", "create"])
-def test_a_run_that_could_not_be_sent_is_sent_by_the_next_command(
-    machine: Machine, monkeypatch: pytest.MonkeyPatch, method: str
-) -> None:
+def test_a_run_that_was_not_sent_is_sent_later(machine: Machine, monkeypatch: pytest.MonkeyPatch, method: str) -> None:
     """Killed with its files on the way, or before its manifest: whoever opens the archive there uploads it."""
     archive = machine(FIRST)
     small_survey(archive, named=False)

@@ -32,9 +32,7 @@ from tests.storage.small_bucket import FIRST, SECOND, Machine, make
 THIRD = "third"
 
 
-def test_gc_gives_a_store_back_that_a_run_has_named_meanwhile(
-    machine: Machine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gc_gives_a_store_back_that_a_run_named_meanwhile(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     """Another machine publishes a run between gc's look at the runs and its removal of a store: the store stays."""
     archive = machine(FIRST)
     small_survey(archive, named=False)
@@ -119,9 +117,7 @@ def test_a_store_that_was_removed_elsewhere_goes(machine: Machine) -> None:
     assert ref.uri not in {one.uri for one in machine(SECOND, create=False).refs()}
 
 
-def test_two_machines_that_extend_a_run_at_once_leave_it_whole(
-    machine: Machine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_machines_that_extend_one_run_leave_it_whole(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     """The second finds that the manifest is not the one that it extended, and takes the first's."""
     archives = machine(FIRST), machine(SECOND)
     name = small_survey(archives[0]).run.name
@@ -179,9 +175,7 @@ def test_ages_are_counted_by_the_clock_of_the_bucket(machine: Machine, monkeypat
     assert clear_up(opened, keep_days=1).removals == ()
 
 
-def test_a_store_that_is_cleared_away_under_verify_is_no_damage(
-    machine: Machine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_store_that_is_cleared_under_verify_is_no_damage(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     """gc on another machine takes a store whose manifest was read, and its files not yet."""
     archive = machine(FIRST)
     ref, _ = make(archive)
@@ -195,9 +189,7 @@ def test_a_store_that_is_cleared_away_under_verify_is_no_damage(
     assert problems(archive) == []
 
 
-def test_a_full_disk_under_the_working_copy_is_one_clear_error(
-    machine: Machine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_under_the_working_copy_is_one_error(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     """While a file is fetched, and while what is known is noted; what was there stays, and the next try goes on."""
     ref, _ = make(machine(FIRST))
     other = machine(SECOND)

@@ -168,9 +168,7 @@ def session(scan_passes: Polls, undisturbed: list[Line], camera: CameraFaults, m
 
 
 @pytest.mark.parametrize("fault", CameraFault, ids=lambda fault: fault.name)
-def test_no_fault_of_the_camera_loses_lines_or_hangs(
-    fault: CameraFault, scan_passes: Polls, undisturbed: list[Line]
-) -> None:
+def test_no_camera_fault_loses_lines_or_hangs(fault: CameraFault, scan_passes: Polls, undisturbed: list[Line]) -> None:
     """Eight sweeps with each: struck once at some occasion, or so often that asking again does not help."""
     ended, struck = 0, 0
     for seed in SEEDS:

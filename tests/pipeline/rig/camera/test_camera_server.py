@@ -105,9 +105,7 @@ def test_another_file_of_the_same_name() -> None:
         (100, DeviceGone, r"ended at byte 480 of 580; look at the file there"),
     ],
 )
-def test_transfer_of_another_length(
-    more: int, kind: type[RigError], words: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_transfer_of_other_length(more: int, kind: type[RigError], words: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A file that is longer, or shorter, than the server said is not taken for whole."""
     with camera(tries=2) as (driver, device, _):
         driver.capture(10)

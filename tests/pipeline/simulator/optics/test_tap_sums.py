@@ -78,7 +78,7 @@ class Moved:
         (CORNER, 2, "3x1", 3e-3, 1e-2),
     ],
 )
-def test_closed_form_is_what_thousands_of_rays_give(
+def test_closed_form_is_what_many_rays_give(
     sweep: Sweep, line: int, variant: str, sharp: float, blurred: float
 ) -> None:
     """In the middle of a survey and at its corner, where lines are turned by 9 deg, with blurs and without.
