@@ -38,26 +38,15 @@ MAY_IMPORT = {
     "spectralzoom": {"spectralzoom", "flows", "models", "storage", "pipeline"},
 }
 OWNERS = {
-    "prefect": ("flows",),
-    "cyclopts": ("flows",),
-    "rich": ("flows", "spectralzoom"),
-    "matplotlib": ("flows",),
-    "zarr": ("storage",),
-    "xarray": ("storage", "spectralzoom"),
-    "dask": ("storage", "flows"),
-    "obstore": ("storage",),
-    "serial": ("pipeline/rig",),
-    "pyftpdlib": ("pipeline/rig",),
-    "torch": ("models", "pipeline/rectify"),
-    "numba": ("pipeline",),
+    **dict.fromkeys(("prefect", "cyclopts", "matplotlib"), ("flows",)),
+    **dict.fromkeys(("zarr", "obstore"), ("storage",)),
+    **dict.fromkeys(("serial", "pyftpdlib"), ("pipeline/rig",)),
+    **{"rich": ("flows", "spectralzoom"), "xarray": ("storage", "spectralzoom"), "dask": ("storage", "flows")},
+    **{"torch": ("models", "pipeline/rectify"), "numba": ("pipeline",)},
 }
 DISTRIBUTIONS = {
-    "PIL": "pillow",
-    "sklearn": "scikit-learn",
-    "serial": "pyserial",
-    "skimage": "scikit-image",
-    "odc": "odc-geo",
-    "mpl_toolkits": "matplotlib",
+    **{"PIL": "pillow", "sklearn": "scikit-learn", "serial": "pyserial", "skimage": "scikit-image"},
+    **{"odc": "odc-geo", "mpl_toolkits": "matplotlib"},
 }
 FILE_MODULES = {"pathlib", "shutil", "tempfile", "glob", "io", "fileinput"}
 READS = {"open", "read_text", "read_bytes", "getenv", "load_dotenv", "read_csv", "loadtxt", "load_file"}

@@ -55,14 +55,8 @@ def measure(px: int) -> Moments:
 
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         told = {
-            "size": f"{px}x{px}",
-            "source": "rig",
-            "visit": "first",
-            "out": name,
-            "engine": "plain",
-            "controls": False,
-            "rig.white_reference": 0.99,
-            "rig.pulses": "position",
+            **{"size": f"{px}x{px}", "source": "rig", "visit": "first", "out": name, "engine": "plain"},
+            **{"controls": False, "rig.white_reference": 0.99, "rig.pulses": "position"},
         }
         settings = load_settings(None, told)
         moments = Moments()

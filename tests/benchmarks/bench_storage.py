@@ -55,14 +55,8 @@ def _against_zarr(folder: Path, raw: NDArray[np.uint16]) -> list[Row]:
     def write_plain() -> None:
         shutil.rmtree(folder / "plain.zarr", ignore_errors=True)
         blosc = BloscCodec(cname="zstd", clevel=3, shuffle=BloscShuffle.bitshuffle, typesize=2)
-        array = zarr.create_array(
-            folder / "plain.zarr",
-            shape=spec.shape,
-            dtype="<u2",
-            chunks=spec.chunk,
-            shards=spec.shard,
-            compressors=(blosc, Crc32cCodec()),
-        )
+        layout = {"chunks": spec.chunk, "shards": spec.shard, "compressors": (blosc, Crc32cCodec())}
+        array = zarr.create_array(folder / "plain.zarr", shape=spec.shape, dtype="<u2", **layout)
         for first in range(0, LINES, SHARD_ROWS):
             array[first : first + SHARD_ROWS] = raw[first : first + SHARD_ROWS]
 

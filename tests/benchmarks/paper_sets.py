@@ -86,15 +86,8 @@ def trained(name: str, scenes: Mapping[str, Callable[[], RasterScene]], patch: i
         if now.step % 50 == 0:
             say(f"{name}: step {now.step} of {steps}, loss {now.loss:.3f}")
 
-    model, summary = train(
-        config,
-        examples,
-        normalisation.gain_shift,
-        TrainingSettings(steps=steps, minutes=1e6),
-        progress,
-        start=start,
-        augmentation=PaperCaptures(normalisation),
-    )
+    asked, seen = TrainingSettings(steps=steps, minutes=1e6), PaperCaptures(normalisation)
+    model, summary = train(config, examples, normalisation.gain_shift, asked, progress, start=start, augmentation=seen)
     record = {"training": summary, "split": {"train": dict.fromkeys(scenes, "")}}
     weights = Weights(model, basis, normalisation, first.class_names, first.class_colours, record)
     path.parent.mkdir(exist_ok=True)

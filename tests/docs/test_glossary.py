@@ -20,11 +20,7 @@ OTHERS = {  # words that mean something else in these files
     "strips": ("models/reading", "flows/publish", "storage/readers", "flows/tasks"),  # of rows of a picture
     "panel": ("flows/publish",),  # of a picture
 }
-
-
 KEPT = {"LookupError", "ProcessLookupError", "shares_memory"}  # names of Python and numpy
-
-
 PARTS = re.compile(r"[A-Z]+(?![a-z])|[A-Z][a-z0-9]*|[a-z0-9]+")  # the words of a name in snake or camel case
 
 

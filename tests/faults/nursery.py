@@ -107,14 +107,8 @@ class Nursery:
         """Begin a command of the command line, with a fault and what that is told."""
         self._number += 1
         log = self.folder / f"child-{self._number}.log"
-        request = {
-            "words": list(words),
-            "fault": fault,
-            "arguments": arguments,
-            "log": str(log),
-            "folder": str(self.folder),
-        }
-        return Child(self, int(self.ask(request)), log)
+        request = {"words": list(words), "fault": fault, "arguments": arguments, "log": str(log)}
+        return Child(self, int(self.ask(request | {"folder": str(self.folder)})), log)
 
     def run(self, words: Iterable[str], fault: str | None = None, **arguments: Any) -> Ended:
         """Begin a command and wait for its end."""
@@ -136,18 +130,9 @@ class Nursery:
 def serve(choices: Path) -> None:
     """Fork a child for each request on stdin, or wait for one; what effects they choose is remembered in a folder."""
     for name in (
-        "flows.cli.main",
-        "flows.publish.run_folder",
-        "flows.publish.survey_command",
-        "flows.survey",
-        "flows.cli.survey_verbs",
-        "flows.archive.commands",
-        "matplotlib.backends.backend_agg",
-        "models.network.segmenter",
-        "rich.status",
-        "safetensors.torch",
-        "scipy.optimize",
-        "tests.faults.injection",
+        *("flows.cli.main", "flows.publish.run_folder", "flows.publish.survey_command", "flows.survey"),
+        *("flows.cli.survey_verbs", "flows.archive.commands", "matplotlib.backends.backend_agg"),
+        *("models.network.segmenter", "rich.status", "safetensors.torch", "scipy.optimize", "tests.faults.injection"),
     ):
         importlib.import_module(name)
     importlib.import_module("tests.prior_work").remember(choices)

@@ -13,16 +13,16 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
-from pipeline.lazy import Once
 from pipeline.simulator.effects.effect import Effect, SweepBlock
 from pipeline.simulator.effects.probe import Probe, noise_electrons
 from pipeline.simulator.render import EFFECTS, expected_light
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Rig, Sky
-from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster
+from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.selection import survey_probe
 from pipeline.simulator.selection.choice import Decision, decide
 from pipeline.simulator.selection.options import acts_on_light
 from pipeline.simulator.simulated import sweep_block
+from tests.pipeline.simulator.small_scenes import made_scene
 
 ROUNDING = 4e-6  # of the light over its noise: sums of float32 in another order
 CAMERA = LineCamera(samples=64)
@@ -42,16 +42,7 @@ EVERYTHING = Rig(  # that a rig may have
 def scene_of(values: NDArray[np.floating], electrons: float = 5000.0) -> RasterScene:
     """A scene whose value 1 gives so many electrons in every band; the bands are 6 nm wide."""
     bands = values.shape[2]
-    light = np.full(bands, electrons, np.float32)
-    return RasterScene(
-        "t",
-        "t",
-        SceneRaster.of(values.astype(np.float32)),
-        Once.of(SceneRadiance(light, light)),
-        np.ones(bands, np.float32),
-        np.linspace(450, 850, bands),
-        fwhm_nm=np.full(bands, 6.0),
-    )
+    return made_scene(values, np.full(bands, electrons), np.linspace(450, 850, bands), fwhm_nm=np.full(bands, 6.0))
 
 
 def block_of(scene: RasterScene, rig: Rig, lines: range = range(0, 30, 5), sweep: Sweep = SWEEP) -> SweepBlock:

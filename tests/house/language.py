@@ -27,14 +27,8 @@ HISTORY = (  # for the changelog and the log of measurements alone
     "(?:measured|trained) on 20\\d\\d|before 20\\d\\d|20\\d\\d-\\d\\d-\\d\\d"
 )
 UNITS = {  # last word of a number's name -> suffixes of its unit; a name ends with one of these
-    "wavelength": ("nm",),
-    "fwhm": ("nm", "px"),
-    "exposure": ("ms", "s"),
-    "altitude": ("m",),
-    "distance": ("m", "px", "km"),
-    "focal": ("mm", "m"),
-    "duration": ("s", "ms"),
-    "timeout": ("s", "ms"),
+    **{"wavelength": ("nm",), "fwhm": ("nm", "px"), "exposure": ("ms", "s"), "altitude": ("m",)},
+    **{"distance": ("m", "px", "km"), "focal": ("mm", "m"), "duration": ("s", "ms"), "timeout": ("s", "ms")},
 }
 
 _SENTENCE_END = re.compile(r"(?<=[.!?])[)\"']?\s+(?=[A-Z`*\[(\"{])")

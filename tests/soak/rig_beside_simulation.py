@@ -73,19 +73,8 @@ def rows(quick: bool) -> list[Row]:
 @contextmanager
 def emulated(file: Path, scene: Sequence[str]) -> Iterator[tuple[Path, subprocess.Popen[bytes]]]:
     """Have a rig, and the settings of a survey of it, while the block runs; then it is told to end, as by Ctrl-C."""
-    words = [
-        sys.executable,
-        "-m",
-        "flows.cli.main",
-        "rig",
-        "emulate",
-        *scene,
-        "--speed",
-        str(SPEED),
-        "--out",
-        str(file),
-    ]
-    process = subprocess.Popen(words, cwd=ROOT, stdout=subprocess.DEVNULL)
+    words = [sys.executable, "-m", "flows.cli.main", "rig", "emulate", *scene, "--speed", str(SPEED)]
+    process = subprocess.Popen([*words, "--out", str(file)], cwd=ROOT, stdout=subprocess.DEVNULL)
     try:
         end = time.monotonic() + BEGUN_WITHIN_S
         while not file.exists() or "[rig]" not in file.read_text():
@@ -119,15 +108,9 @@ def survey(archive: Path, *words: str) -> Surveyed:
 
 def _of_check(checked: subprocess.CompletedProcess[str]) -> Row:
     mended = "nothing to mend" in checked.stdout
-    return Row(
-        "rig check",
-        "on the emulated rig, by the file that it wrote",
-        1,
-        "exit code 0, nothing to mend",
-        f"exit code {checked.returncode}{', nothing to mend' if mended else ''}",
-        checked.returncode == 0 and mended,
-        0.0,
-    )
+    what, wanted = "on the emulated rig, by the file that it wrote", "exit code 0, nothing to mend"
+    came = f"exit code {checked.returncode}{', nothing to mend' if mended else ''}"
+    return Row("rig check", what, 1, wanted, came, checked.returncode == 0 and mended, 0.0)
 
 
 def _of_lines(one: Surveyed, other: Surveyed, seconds: float) -> Row:
@@ -143,26 +126,14 @@ def _of_lines(one: Surveyed, other: Surveyed, seconds: float) -> Row:
                 if there
                 else count
             )
-    return Row(
-        "raw lines",
-        "coarse and fine, rig beside simulated",
-        lines,
-        "equal bit for bit",
-        f"{odd} of {lines} lines differ",
-        odd == 0,
-        seconds,
-    )
+    what, came = "coarse and fine, rig beside simulated", f"{odd} of {lines} lines differ"
+    return Row("raw lines", what, lines, "equal bit for bit", came, odd == 0, seconds)
 
 
 def _of_maps(one: Surveyed, other: Surveyed) -> Row:
     seen, wanted = one.class_map(), other.class_map()
     odd = int((seen != wanted).sum()) if seen.shape == wanted.shape else seen.size
-    return Row(
-        "class map",
-        f"{seen.shape[1]} x {seen.shape[0]} px, rig beside simulated",
-        1,
-        f"at most {100 * MOST_OTHER:g} % of the pixels differ",
-        f"{odd} of {seen.size} pixels differ ({100 * odd / seen.size:.2g} %)",
-        odd <= MOST_OTHER * seen.size,
-        0.0,
-    )
+    what = f"{seen.shape[1]} x {seen.shape[0]} px, rig beside simulated"
+    wanted = f"at most {100 * MOST_OTHER:g} % of the pixels differ"
+    came = f"{odd} of {seen.size} pixels differ ({100 * odd / seen.size:.2g} %)"
+    return Row("class map", what, 1, wanted, came, odd <= MOST_OTHER * seen.size, 0.0)

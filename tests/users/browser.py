@@ -19,13 +19,8 @@ from websockets.sync.client import ClientConnection, connect
 CHROMIUM = shutil.which("chromium")
 QUIETLY = (
     *("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"),
-    *(
-        "--disable-component-update",
-        "--disable-sync",
-        "--disable-extensions",
-        "--mute-audio",
-        "--remote-debugging-port=0",
-    ),
+    *("--disable-component-update", "--disable-sync", "--disable-extensions", "--mute-audio"),
+    "--remote-debugging-port=0",
 )
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed: no page can be tried")
 PATIENCE_S = 15.0

@@ -108,9 +108,7 @@ def test_the_wheel_holds_what_the_packages_hold(tree: Path, wheel: Path) -> None
     assert [name for name in known if found[name] != known[name]] == []
 
 
-def test_the_wheel_works_for_a_user_without_a_home(
-    installed: Path, ground: Path, scene_files: Path, make_weights: WeightsMaker
-) -> None:
+def test_the_wheel_needs_no_home(installed: Path, ground: Path, scene_files: Path, make_weights: WeightsMaker) -> None:
     """Command and package run from it, where nothing but the archive can be written, and no variable is set."""
     place, archive, temporary = (ground / name for name in ("place", "archive", "tmp"))
     for folder in (place, archive, temporary):

@@ -146,9 +146,7 @@ def test_init_names_the_wavelengths_that_its_next_command_needs(
 
 
 @pytest.mark.parametrize("there", [False, True])
-def test_init_says_why_it_fails(
-    tmp_path: Path, command_line: Any, monkeypatch: pytest.MonkeyPatch, there: bool
-) -> None:
+def test_init_says_why_not(tmp_path: Path, command_line: Any, monkeypatch: pytest.MonkeyPatch, there: bool) -> None:
     """On a disk that is read-only the message says so, with --force too, and a file that is there stays."""
     Image.fromarray(image().astype(np.uint8)).save(tmp_path / "a.png")
     if there:

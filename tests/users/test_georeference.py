@@ -40,8 +40,6 @@ EVERY_STORE = (
 UNCOUNTED = ("rgb", "rare")  # rare spectra are found by their line and sample
 GAP = np.s_[:20, :24]
 QUIET = Console(quiet=True)
-
-
 PIXELS = patchy_scene(SHAPE, 3, seed=4)[0].astype(np.uint8)  # (y, x, band) of a field of three classes
 
 

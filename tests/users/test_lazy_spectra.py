@@ -24,6 +24,7 @@ from storage.arrays.mosaics import MosaicWriter
 from storage.arrays.signal_cubes import LineRows, SignalCubeWriter
 
 LINES, SAMPLES, BANDS, COUNT, STEP = 70, 90, 12, 4, 0.5
+Restored = tuple[Path, NDArray[np.float64]]  # a store, and its values
 WAVELENGTHS = np.linspace(400, 900, BANDS)
 RARE = np.array([[3, 5], [66, 80]])
 
@@ -42,7 +43,7 @@ def restored(scores: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 @pytest.fixture(scope="module")
-def sweep(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, NDArray[np.float64]]:
+def sweep(tmp_path_factory: pytest.TempPathFactory) -> Restored:
     """A condensed sweep with two rare spectra and one that is unusable, and what it is to give."""
     path = tmp_path_factory.mktemp("sweep") / "coarse-0.zarr"
     rng = np.random.default_rng(1)
@@ -64,7 +65,7 @@ def sweep(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, NDArray[np.fl
 
 
 @pytest.fixture(scope="module")
-def mosaic(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, NDArray[np.float64]]:
+def mosaic(tmp_path_factory: pytest.TempPathFactory) -> Restored:
     """A mosaic of two shards across, a corner of which nothing saw, and what it is to give."""
     path = tmp_path_factory.mktemp("mosaic") / "mosaic.zarr"
     scores = np.random.default_rng(2).normal(0, 20, (70, 700, COUNT)).astype(np.float32)
@@ -74,7 +75,7 @@ def mosaic(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, NDArray[np.f
     return path, np.where(seen[..., None], restored(scores), np.nan)
 
 
-def test_lines_are_restored_with_rare_spectra(sweep: tuple[Path, NDArray[np.float64]]) -> None:
+def test_lines_are_restored_with_rare_spectra(sweep: Restored) -> None:
     """Every line and band, NaN where unusable, with what is known of each line beside it."""
     path, values = sweep
     lines = open_lazy_lines(path)
@@ -86,7 +87,7 @@ def test_lines_are_restored_with_rare_spectra(sweep: tuple[Path, NDArray[np.floa
     np.testing.assert_allclose(red.values, values[..., np.abs(WAVELENGTHS - 660).argmin()], rtol=1e-5)
 
 
-def test_a_cube_is_restored(mosaic: tuple[Path, NDArray[np.float64]]) -> None:
+def test_a_cube_is_restored(mosaic: Restored) -> None:
     """In blocks of whole shards, NaN where nothing was seen, a coordinate on every axis."""
     path, values = mosaic
     cube = open_lazy_mosaic(path)
@@ -106,12 +107,7 @@ PLACES = st.one_of(
 
 @given(st.sampled_from(["sweep", "mosaic"]), PLACES, PLACES, st.integers(0, BANDS - 1) | st.just(slice(None, None, -1)))
 def test_any_selection_is_that_of_all_values(
-    sweep: tuple[Path, NDArray[np.float64]],
-    mosaic: tuple[Path, NDArray[np.float64]],
-    which: str,
-    row: Any,
-    column: Any,
-    band: Any,
+    sweep: Restored, mosaic: Restored, which: str, row: Any, column: Any, band: Any
 ) -> None:
     """Numbers, slices of any step and lists of places, before dask and through it."""
     path, values = sweep if which == "sweep" else mosaic
@@ -121,9 +117,7 @@ def test_any_selection_is_that_of_all_values(
     np.testing.assert_allclose(opened.isel(wanted).values, expected.values, rtol=1e-5)
 
 
-def test_nothing_is_read_before_it_is_asked_for(
-    sweep: tuple[Path, NDArray[np.float64]], mosaic: tuple[Path, NDArray[np.float64]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nothing_is_read_before_it_is_asked(sweep: Restored, mosaic: Restored, monkeypatch: pytest.MonkeyPatch) -> None:
     """Opening reads coordinates alone, in less than .2 s."""
     names: list[str] = []
     for module in ("storage.arrays.mosaics", "storage.arrays.signal_cubes"):

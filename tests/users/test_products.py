@@ -223,9 +223,7 @@ def test_the_catalogue_names_every_product(posed: Products) -> None:
         ({"indices": "NDVI,NDMI"}, "NDMI wants Short-wave Infrared"),
     ],
 )
-def test_what_cannot_be_made_is_refused_first(
-    posed: Products, tmp_path: Path, flags: dict[str, Any], words: str
-) -> None:
+def test_the_impossible_is_refused_first(posed: Products, tmp_path: Path, flags: dict[str, Any], words: str) -> None:
     """One message that says what was expected; the folder stays empty."""
     with pytest.raises((SettingsError, WavelengthError), match=words):
         exported(posed.archive, tmp_path / "out", {}, **flags)
@@ -259,9 +257,7 @@ def test_a_survey_without_a_place_has_what_needs_none(surveyed_png: Any, tmp_pat
     [("EPSG:32632", TURNED), ("EPSG:4326", Affine(7e-7, 0, 9.5, 0, -4.5e-7, 52.1))],
     ids=["turned", "in degrees"],
 )
-def test_products_of_a_georeferenced_scene_lie_there(
-    tmp_path: Path, weights: Path, crs: str, transform: Affine
-) -> None:
+def test_products_lie_where_their_scene_lies(tmp_path: Path, weights: Path, crs: str, transform: Affine) -> None:
     """Corners of indices and polygons to 0.1 px, in its CRS; cells are square in metres; a gap gets no dose."""
     run = survey(write_geotiff(tmp_path / "a.tif", transform, gap=True, crs=crs), weights, tmp_path / "archive")
     flags = {"polygons": True, "indices": "VARI", "prescription": "class_1=2", "cell": 0.5}

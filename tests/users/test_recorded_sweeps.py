@@ -46,6 +46,8 @@ from tests.storage.readers.test_recordings import write_envi_cube
 __all__ = ["command_line"]
 pytestmark = pytest.mark.usefixtures("no_effects")
 QUIET = Console(quiet=True)
+FullScan = tuple[Path, Published, Path]  # archive, run, sweeps as files
+Pushbroom = tuple[Path, NDArray[np.uint16]]  # files of a straight scan, and its numbers
 SIZE = (128, 96)  # x, y
 NARROW = {"camera.samples": 80}  # two strips for the field
 PASSES: dict[str, dict[str, Any]] = {
@@ -141,7 +143,7 @@ def counted_lines(patch: pytest.MonkeyPatch) -> Iterator[set[tuple[str, int]]]:
 
 
 @pytest.fixture(scope="module")
-def full_scan(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) -> tuple[Path, Published, Path]:
+def full_scan(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) -> FullScan:
     """A full scan of the session's picture by the simulated rig: its archive, its run, and its sweeps as files."""
     folder = tmp_path_factory.mktemp("recorded")
     with without_effects():
@@ -150,7 +152,7 @@ def full_scan(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) -> t
 
 
 def test_a_budget_reads_only_the_lines_that_it_asks_for(
-    tmp_path: Path, full_scan: tuple[Path, Published, Path], weights: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, full_scan: FullScan, weights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of a recorded full scan two passes read their own lines and no other; the receipt says what zooming saves."""
     _, _, sweeps = full_scan
@@ -169,16 +171,11 @@ def test_a_budget_reads_only_the_lines_that_it_asks_for(
     asked = sum(cube.sweep.lines for cube in (*coarse, *fine))
     assert len(read) <= asked
     assert told["passes_s"] <= 0.6 * told["full_scan_s"]
-    assert published.receipt["savings"]["lines"] == {
-        **published.receipt["savings"]["lines"],
-        "done": asked,
-        "full": recorded,
-    }
+    lines = published.receipt["savings"]["lines"]
+    assert (lines["done"], lines["full"]) == (asked, recorded)
 
 
-def test_seconds_count_the_recorded_exposures(
-    tmp_path: Path, full_scan: tuple[Path, Published, Path], make_weights: WeightsMaker
-) -> None:
+def test_seconds_count_the_recorded_exposures(tmp_path: Path, full_scan: FullScan, make_weights: WeightsMaker) -> None:
     """Both passes are planned with the exposure of the lines, not with a shorter one of the weights' table."""
     asked = {"weights": str(make_weights(scans=RECORD)), "seconds": 15, "zoom": "always", "keep": "raw"}
     receipt = survey_sweeps(tmp_path / "a", full_scan[2], **asked).receipt
@@ -187,9 +184,7 @@ def test_seconds_count_the_recorded_exposures(
     assert "100 ms" in receipt["plan"]["reason"]
 
 
-def test_a_scan_as_taken_is_compared_with_all_of_its_lines(
-    tmp_path: Path, full_scan: tuple[Path, Published, Path], weights: Path
-) -> None:
+def test_a_scan_as_taken_is_compared_with_all_of_its_lines(tmp_path: Path, full_scan: FullScan, weights: Path) -> None:
     """An area of interest limits the map: the lines beside it are read, and the reference has them too."""
     corner = {"type": "Polygon", "coordinates": [[[0, 0], [30, 0], [30, 30], [0, 30], [0, 0]]]}
     (tmp_path / "area.json").write_text(json.dumps(corner))
@@ -198,7 +193,7 @@ def test_a_scan_as_taken_is_compared_with_all_of_its_lines(
     assert [savings[name]["ratio"] for name in ("lines", "samples", "capture_s")] == [1, 1, 1]
 
 
-def test_lines_of_a_run_have_the_date_of_its_visit(full_scan: tuple[Path, Published, Path]) -> None:
+def test_lines_of_a_run_have_the_date_of_its_visit(full_scan: FullScan) -> None:
     """So exports, histories and prior maps date them by their capture; a visit that is asked for comes first."""
     sweeps = str(full_scan[1].folder)
     captured = datetime.fromisoformat(full_scan[1].receipt["started"])
@@ -220,7 +215,7 @@ def test_a_repeated_run_has_its_reference(tmp_path: Path, survey_png: Survey, ma
     assert scan["settings"]["scan_exposure_ms"] < 100
 
 
-def raw_cubes(full_scan: tuple[Path, Published, Path]) -> list[Path]:
+def raw_cubes(full_scan: FullScan) -> list[Path]:
     """Stores of the sweeps of the full scan."""
     archive, published, _ = full_scan
     return sorted((archive / published.receipt["products"]["raw_coarse"]).glob("*.zarr"))
@@ -236,7 +231,7 @@ def write_pushbroom(folder: Path, values: NDArray[np.uint16]) -> Path:
 
 
 @pytest.fixture
-def pushbroom(tmp_path: Path) -> tuple[Path, NDArray[np.uint16]]:
+def pushbroom(tmp_path: Path) -> Pushbroom:
     """A straight scan of 96 lines of 64 samples, and its numbers."""
     values = (patchy_scene((96, 64), 3, 3)[0] * 12 + 60).astype(np.uint16)
     return write_pushbroom(tmp_path / "drone", values), values
@@ -244,7 +239,7 @@ def pushbroom(tmp_path: Path) -> tuple[Path, NDArray[np.uint16]]:
 
 @pytest.mark.parametrize(("column", "place"), [(None, None), ("position_px", lambda line: 200.0 - line)])
 def test_a_straight_scan_is_a_recording(
-    tmp_path: Path, pushbroom: tuple[Path, NDArray[np.uint16]], weights: Path, column: str | None, place: Any
+    tmp_path: Path, pushbroom: Pushbroom, weights: Path, column: str | None, place: Any
 ) -> None:
     """Drone, stage or conveyor: by pixels a line, or, as the run says, taken to be even."""
     folder, values = pushbroom
@@ -284,10 +279,7 @@ BAD = {  # flags, and the message
     "simulated rig": ("--source sim", "--sweeps is for recorded sweeps, and source = 'sim'; give --source recorded"),
     "a part of the field": ("--extent part --seconds 5", "--extent = 'part' chooses lines to capture"),
     "two scans": ("--scan recorded --budget 0.5", "one uniform scan .*leave one of them out"),
-    "an exposure of a scan": (
-        "--scan-step 1 --scan-exposure-ms 5",
-        "--scan-exposure-ms is for a camera.* leave it out",
-    ),
+    "a scan's exposure": ("--scan-step 1 --scan-exposure-ms 5", "--scan-exposure-ms is for a camera.* leave it out"),
     "an exposure": ("--budget 0.5 --coarse-exposure-ms 25", "--coarse-exposure-ms is for a camera.* leave it out"),
     "too little time": ("--budget 0.01", "full scan's [0-9.]+ s; give more, or take one uniform scan"),
 }
@@ -295,11 +287,7 @@ BAD = {  # flags, and the message
 
 @pytest.mark.parametrize("mistake", BAD)
 def test_bad_input_gives_one_message(
-    command_line: CommandLine,
-    monkeypatch: pytest.MonkeyPatch,
-    pushbroom: tuple[Path, NDArray[np.uint16]],
-    weights: Path,
-    mistake: str,
+    command_line: CommandLine, monkeypatch: pytest.MonkeyPatch, pushbroom: Pushbroom, weights: Path, mistake: str
 ) -> None:
     """By the command line: one message with value and remedy, no traceback, and no archive."""
     (folder, _), (flags, message) = pushbroom, BAD[mistake]
@@ -321,7 +309,7 @@ def test_source_without_sweeps(command_line: CommandLine, tmp_path: Path) -> Non
 
 
 def test_ingest_names_the_survey_as_the_next_step(
-    command_line: CommandLine, tmp_path: Path, pushbroom: tuple[Path, NDArray[np.uint16]], weights: Path
+    command_line: CommandLine, tmp_path: Path, pushbroom: Pushbroom, weights: Path
 ) -> None:
     """Its next command surveys the stored cube with the frames that were stored with it."""
     folder, _ = pushbroom
@@ -354,9 +342,7 @@ def test_the_next_step_names_wavelengths_that_a_file_lacks(
     assert f"--scene {tmp_path / 'a.npy'} --wavelengths {words} --weights" in ended.err
 
 
-def test_a_run_of_the_rig_is_reprocessed_from_raw(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights: Path
-) -> None:
+def test_a_rigs_run_is_reprocessed_from_raw(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights: Path) -> None:
     """Once captures have a newer version the rig is not asked: the same map, once, and nothing is left to do."""
     archive = tmp_path / "rig"
     with emulated(rig_settings(archive, weights, keep="raw"), {}, monkeypatch, scene=field()):
@@ -373,7 +359,7 @@ def test_a_run_of_the_rig_is_reprocessed_from_raw(
 
 
 def test_a_recording_whose_files_moved_is_reprocessed(
-    tmp_path: Path, pushbroom: tuple[Path, NDArray[np.uint16]], weights: Path, make_weights: WeightsMaker
+    tmp_path: Path, pushbroom: Pushbroom, weights: Path, make_weights: WeightsMaker
 ) -> None:
     """New weights read the raw cubes that the archive has of it."""
     folder, _ = pushbroom
@@ -387,9 +373,7 @@ def test_a_recording_whose_files_moved_is_reprocessed(
     assert digest_of_map(archive, again) == digest_of_map(tmp_path / "b", fresh.receipt)
 
 
-def test_labels_judge_the_map_of_a_recording(
-    tmp_path: Path, pushbroom: tuple[Path, NDArray[np.uint16]], weights: Path
-) -> None:
+def test_labels_judge_the_map_of_a_recording(tmp_path: Path, pushbroom: Pushbroom, weights: Path) -> None:
     """Labels on the field's pixels give accuracy; those of another size are refused."""
     folder, _ = pushbroom
     Image.fromarray(patchy_scene((96, 64), 3, 3)[1]).save(tmp_path / "labels.png")

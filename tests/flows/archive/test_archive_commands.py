@@ -87,11 +87,8 @@ def test_explain_shows_lineage_and_what_changed(two_budgets: Path, capsys: pytes
     """The second map differs by its budget, which the plan turned into other sweeps."""
     content = _json(capsys, lambda: explain(two_budgets, "class_map", as_json=True))
     (top,) = content["lineage"]
-    assert (top["stage"], top["called"], [one["stage"] for one in top["inputs"]]) == (
-        "segment",
-        ["segment"],
-        ["rectify_fine", "score"],
-    )
+    assert (top["stage"], top["called"]) == ("segment", ["segment"])
+    assert [one["stage"] for one in top["inputs"]] == ["rectify_fine", "score"]
     assert top["wall_s"] > 0
     assert content["before"].startswith("stages/segment/")
     kinds = {(one["where"], one["kind"], one["name"]) for one in content["changes"]}

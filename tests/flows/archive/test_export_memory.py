@@ -83,14 +83,8 @@ def visited(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     archive, out = folder / "archive", folder / "maps"
     sharp = with_record(load_weights(weights), calibration={"temperature": 0.2})  # maps that hardly differ by chance
     save_weights(sharp, folder / "sharp.safetensors")
-    given = {
-        "weights": str(folder / "sharp.safetensors"),
-        "engine": "plain",
-        "out": str(archive),
-        "accuracy": False,
-        "name": "north",
-    }
-    given |= {"wavelengths": ",".join(map(str, RGB_NM)), "prior": "latest", "camera.samples": 64}
+    given = {"weights": str(folder / "sharp.safetensors"), "engine": "plain", "out": str(archive), "accuracy": False}
+    given |= {"name": "north", "wavelengths": ",".join(map(str, RGB_NM)), "prior": "latest", "camera.samples": 64}
     runs = []
     with without_effects(), pytest.MonkeyPatch.context() as patch:
         for name in ("CERTAIN", "SURE"):  # untrained weights are sure of nothing: what they say is taken for sure

@@ -18,7 +18,7 @@ from flows.tasks.open_survey import STAGES
 from flows.tasks.stages import accuracy as evaluation
 from models.weights.files import save_weights
 from storage.archive.archive import Archive
-from tests.conftest import RGB_NM, random_weights
+from tests.conftest import RGB_NM, Survey, random_weights
 from tests.flows.conftest import CommandLine, act_instead, be_version, problems, turned
 from tests.receipts import comparable, receipts
 from tests.storage.small_archive import flip
@@ -56,7 +56,7 @@ def words_of(folder: Path) -> dict[str, str]:
 
 
 @pytest.fixture
-def survey(survey_png: Any, scene: Path, out: Path) -> Callable[..., Any]:
+def survey(survey_png: Any, scene: Path, out: Path) -> Survey:
     """Survey the scene of the folder into the archive of the test."""
 
     def run(**flags: Any) -> Any:
@@ -84,7 +84,7 @@ def unjudged(surveyed: Path, scene: Path, out: Path) -> Path:
     return Path(shutil.copytree(surveyed, out))
 
 
-def break_off(survey: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, **flags: Any) -> None:
+def break_off(survey: Survey, monkeypatch: pytest.MonkeyPatch, **flags: Any) -> None:
     """Survey, and break off when the map is about to be judged."""
 
     def interrupt(*given: Any) -> None:
@@ -96,9 +96,7 @@ def break_off(survey: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, **fla
             survey(**flags)
 
 
-def test_the_run_is_published_before_its_map_is_judged(
-    survey: Callable[..., Any], out: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_is_published_before_it_is_judged(survey: Survey, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """While the map is looked at the run is there and says so; then it is the same run, and has its accuracy."""
     real, seen = STAGES["evaluate"], list[Any]()
 
@@ -123,9 +121,7 @@ def test_the_run_is_published_before_its_map_is_judged(
     assert receipts(out) == [published.receipt]
 
 
-def test_reprocess_adds_what_a_stopped_survey_lacks(
-    survey: Callable[..., Any], out: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_reprocess_adds_what_a_stopped_survey_lacks(survey: Survey, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The field is not as it would become: its run is judged, and no other is made."""
     break_off(survey, monkeypatch)
     for _ in range(2):
@@ -136,7 +132,7 @@ def test_reprocess_adds_what_a_stopped_survey_lacks(
 
 
 def test_a_run_that_is_being_judged_is_left_alone(
-    survey: Callable[..., Any], out: Path, monkeypatch: pytest.MonkeyPatch, command_line: CommandLine
+    survey: Survey, out: Path, monkeypatch: pytest.MonkeyPatch, command_line: CommandLine
 ) -> None:
     """The same survey publishes a run of its own meanwhile, and `evaluate` says who is at it."""
     break_off(survey, monkeypatch)
@@ -151,9 +147,7 @@ def test_a_run_that_is_being_judged_is_left_alone(
     assert [is_pending(one) for one in receipts(out)] == [True, False]
 
 
-def test_what_was_left_out_is_added_later(
-    unjudged: Path, survey: Callable[..., Any], command_line: CommandLine
-) -> None:
+def test_what_was_left_out_is_added_later(unjudged: Path, survey: Survey, command_line: CommandLine) -> None:
     """Accuracy first, then controls, each to the same run: its receipt is that of a survey that was asked for both."""
     (run,) = Archive.open(unjudged).runs()
     ended = command_line("evaluate", unjudged, run.name, "--json")
@@ -171,7 +165,7 @@ def test_what_was_left_out_is_added_later(
 
 
 def test_labels_may_come_later(
-    survey: Callable[..., Any], scene: Path, out: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
+    survey: Survey, scene: Path, out: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A run without any is judged by those that are given, with a path that can be read from anywhere."""
     survey(labels=None)

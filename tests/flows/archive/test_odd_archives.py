@@ -18,8 +18,6 @@ from storage.archive.staging import file_hash
 from tests.storage.small_archive import Small, small_survey
 
 pytestmark = pytest.mark.usefixtures("no_effects")
-
-
 SECRET = b"not of this archive"
 LEADS = ("../../../secret", "/etc/passwd", "stages/../../secret", "secret\0", "..", "")
 

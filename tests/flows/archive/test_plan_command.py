@@ -150,9 +150,7 @@ def test_a_damaged_store_blocks_what_needs_it(settings: Settings, archive: Path,
 
 
 @pytest.mark.parametrize("change", [('"', "x"), ("1", "2")], ids=["no JSON", "another number"])
-def test_a_damaged_plan_of_sweeps_blocks_what_reads_it(
-    settings: Settings, archive: Path, survey_png: Any, change: tuple[str, str]
-) -> None:
+def test_a_damaged_plan_is_a_block(settings: Settings, archive: Path, survey_png: Any, change: tuple[str, str]) -> None:
     """The plan says so and goes on; the survey stops there with one message, and captures nothing by it."""
     (path,) = archive.glob("stages/score/*/plan.json")
     path.write_text(path.read_text().replace(*change))

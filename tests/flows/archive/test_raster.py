@@ -68,9 +68,7 @@ def rounding(values: NDArray[Any]) -> float:
 
 
 @pytest.mark.parametrize(("shape", "kind"), [((33, 47), np.float32), ((1, 40), np.uint8), ((5, 3), np.uint16)])
-def test_what_is_stored_is_what_the_file_says(
-    surveyed: Raster, tmp_path: Path, kind: type[np.generic], shape: tuple[int, int]
-) -> None:
+def test_stores_hold_the_file(surveyed: Raster, tmp_path: Path, kind: type[np.generic], shape: tuple[int, int]) -> None:
     """Pixels are the file's numbers but for rounding, whole numbers exactly, and coarse values are their means."""
     values = patchy_scene(shape, 3, seed=4)[0].astype(kind)
     write_tif(tmp_path / "field.tif", values)

@@ -239,9 +239,7 @@ def test_weights_without_a_common_frame_are_one_seed() -> None:
 def test_the_farm_is_judged_on_seeds_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Small built-in fields, neither trained on nor shown, noisy."""
     monkeypatch.setattr("flows.training.data.FARM_SHAPE", (32, 48))
-    monkeypatch.setattr(
-        "flows.training.observed_scenes.chosen_effects", lambda *given: USUAL
-    )  # choosing takes seconds a look
+    monkeypatch.setattr("flows.training.observed_scenes.chosen_effects", lambda *_: USUAL)  # choosing takes seconds
     made, weights = make_weights(classes=len(CLASSES), columns=6), tmp_path / "w.safetensors"
     save_weights(replace(made, class_names=CLASSES), weights)
     quick = {**QUICK, "policies": ("entropy",), "fractions": (0.25,)}

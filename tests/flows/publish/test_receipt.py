@@ -51,27 +51,12 @@ def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:
         },
     }
     row = {
-        "name": "shot",
-        "state": "on",
-        "variant": "exact",
-        "bound": 0.0,
-        "cost_s": 1.5,
-        "reason": "asked",
-        "left_out": 0.5,
-        "magnitude": "shot noise",
-        "unit": "sigma",
+        **{"name": "shot", "state": "on", "variant": "exact", "bound": 0.0, "cost_s": 1.5, "reason": "asked"},
+        **{"left_out": 0.5, "magnitude": "shot noise", "unit": "sigma"},
     }
     total = {
-        "asked": "auto",
-        "tolerance": 0.1,
-        "unit": "sigma",
-        "bound": 0.08,
-        "within": True,
-        "on": 1,
-        "off": 0,
-        "cost_s": 1.5,
-        "exact_cost_s": 9.0,
-        "saved_s": 7.5,
+        **{"asked": "auto", "tolerance": 0.1, "unit": "sigma", "bound": 0.08, "within": True, "on": 1, "off": 0},
+        **{"cost_s": 1.5, "exact_cost_s": 9.0, "saved_s": 7.5},
     }
     stages = [
         StageRecord("capture", "ab12", "ran", wall, wall, 10**9, 0, 10**8, f"{wall:064}"),  # a manifest holds times
@@ -107,11 +92,10 @@ def test_receipt_has_the_fields_of_the_design_and_reads_back():
     assert " ".join(receipt) == f"{before} effects_total products"
     assert set(receipt["savings"]) == {*COSTS}
     assert "accuracy" not in make_receipt(labels=False)
-    receipt = make_receipt()
     assert check_receipt(json.loads(to_json(receipt))) == receipt
     text = to_json({"nan": float("nan"), "list": [np.float64("inf"), np.int64(3)], "tuple": (1.5, None, True)})
     assert json.loads(text) == {"nan": None, "list": [None, 3], "tuple": [1.5, None, True]}
-    assert make_receipt()["accuracy"]["per_class_iou"] == {"soil": 0.9, "bare_weed": 0.6, "wheat": None}
+    assert receipt["accuracy"]["per_class_iou"] == {"soil": 0.9, "bare_weed": 0.6, "wheat": None}
 
 
 @pytest.mark.parametrize(
@@ -176,16 +160,8 @@ def test_the_end_of_a_survey_fits_the_terminal():
     lines = printed(make_receipt(), 80).rstrip().splitlines()
     assert len(lines) <= 13
     assert max(map(len, lines)) <= 80
-    for words in (
-        "capture time",
-        "104 s",
-        "209 s",
-        "50 %",
-        "bytes kept",
-        "1.5 MB",
-        "multiply-adds",
-        "mIoU 75.0 of 100",
-    ):
+    told = ("capture time", "104 s", "209 s", "50 %", "bytes kept", "1.5 MB", "multiply-adds", "mIoU 75.0 of 100")
+    for words in told:
         assert any(words in line for line in lines), words
     assert not any(words in line for line in lines for words in ("rectify", "torch", "shot", "samples"))
     assert [format_area(hectares) for hectares in (2.5, 0.1, 0.0999, 0.0012)] == ["2.5 ha", "0.1 ha", "999 m²", "12 m²"]
@@ -279,9 +255,8 @@ def test_the_cheapest_good_scan_is_named():
     receipt = make_receipt()
     assert "uniform scan" not in printed(receipt)
     receipt["savings"]["capture_s"] |= {"uniform": 40.0, "uniform_scan": "every line, 17 ms"}
-    assert "uniform scan with nearly the best score takes 40 s (every line, 17 ms)." in " ".join(
-        printed(receipt).split()
-    )
+    told = " ".join(printed(receipt).split())
+    assert "uniform scan with nearly the best score takes 40 s (every line, 17 ms)." in told
 
 
 def test_a_report_begins_with_map_savings_and_score():
@@ -299,13 +274,8 @@ def test_a_report_has_the_confusion_matrix() -> None:
     receipt["accuracy"] |= {"confusion": [[8, 2, 1], [1, 6, 1], [0, 0, 0]], "kappa": 0.4875}
     page = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", render_report(receipt, b"")))
     assert "mapped as soil bare weed user's accuracy" in page.replace("&#39;", "'")
-    for row in (
-        "soil 8 1 88.9",
-        "bare weed 2 6 75.0",
-        "wheat 1 1 0.0",
-        "producer's accuracy 72.7 75.0",
-        "kappa: 0.487",
-    ):
+    rows = ("soil 8 1 88.9", "bare weed 2 6 75.0", "wheat 1 1 0.0", "producer's accuracy 72.7 75.0", "kappa: 0.487")
+    for row in rows:
         assert row in page.replace("&#39;", "'"), row
 
 

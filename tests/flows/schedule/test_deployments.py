@@ -132,18 +132,12 @@ def test_what_a_killed_serve_left_is_ended_when_it_is_served_again(north: Any, m
     read = SyncPrefectClient.read_flow_runs
     monkeypatch.setattr(SyncPrefectClient, "read_flow_runs", lambda self, **given: read(self, **given, limit=1))
     with client() as asked:
-        for one, states in (
-            (ran, (Pending, Running)),
-            (ended, (Cancelling,)),
-            (ahead, (Pending,)),
-            (strange, (Pending,)),
-        ):
-            for state in states:
-                asked.set_flow_run_state(one, state(), force=True)
+        begun = ((ran, Pending), (ran, Running), (ended, Cancelling), (ahead, Pending), (strange, Pending))
+        for one, state in begun:
+            asked.set_flow_run_state(one, state(), force=True)
         _prepare([made, again], shared=False)
-        kinds = [
-            asked.read_flow_run(one).state.type.value for one in (ran, ended, waited, other, later, ahead, strange)
-        ]
+        every = (ran, ended, waited, other, later, ahead, strange)
+        kinds = [asked.read_flow_run(one).state.type.value for one in every]
         assert kinds == ["CRASHED", *["CANCELLED"] * 3, "SCHEDULED", "CRASHED", "PENDING"]
         after = planned(deployment, DUE).id
         asked.set_flow_run_state(after, Pending())
@@ -288,18 +282,13 @@ def test_the_file_of_deployments_is_complete(scheduling: str) -> None:
     prefect_cli(ROOT, "deploy", "--all", "--no-prompt")
     with client() as asked:
         north, rig, archive = map(asked.read_deployment_by_name, ("survey/north", "capture/rig", "reprocess/archive"))
-    assert [(one.work_pool_name, one.global_concurrency_limit.limit) for one in (north, rig, archive)] == [
-        ("reading", 1),
-        ("rig", 1),
-        ("reading", 1),
-    ]
+    pools = [(one.work_pool_name, one.global_concurrency_limit.limit) for one in (north, rig, archive)]
+    assert pools == [("reading", 1), ("rig", 1), ("reading", 1)]
     assert [one.concurrency_options.collision_strategy.value for one in (north, rig)] == ["CANCEL_NEW", "ENQUEUE"]
-    assert [(one.schedule.cron, one.schedule.timezone) for one in north.schedules] == [
-        ("0 6-20 * * *", "Europe/Berlin")
-    ]
-    assert set(north.parameters["settings"]) <= set(
-        survey.parameters.model_dump()["definitions"]["SurveySettings"]["properties"]
-    )
+    schedules = [(one.schedule.cron, one.schedule.timezone) for one in north.schedules]
+    assert schedules == [("0 6-20 * * *", "Europe/Berlin")]
+    known = survey.parameters.model_dump()["definitions"]["SurveySettings"]["properties"]
+    assert set(north.parameters["settings"]) <= set(known)
     reprocess.validate_parameters(archive.parameters)
 
 

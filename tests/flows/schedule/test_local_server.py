@@ -21,8 +21,6 @@ from flows.tasks.local_server import ServerUnavailable, local_server
 
 SCHEMA = Path(__file__).parents[3] / "flows" / "tasks" / "prefect_schema.sql"
 HEAD = "-- The empty database of Prefect {}\n-- python tests/flows/schedule/test_local_server.py writes this file.\n"
-
-
 MIGRATE = """
 import asyncio
 from prefect.server.database.dependencies import provide_database_interface

@@ -39,13 +39,8 @@ def takers(folder: Path, count: int) -> Iterator[list[tuple[subprocess.Popen[str
             temporary = folder / f"tmp-{number}"
             temporary.mkdir(mode=0o777)
             environment = {**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(temporary), "HOME": str(temporary)}
-            process = subprocess.Popen(
-                [sys.executable, "-c", TAKES, PORT],
-                env=environment,
-                text=True,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-            )
+            pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+            process = subprocess.Popen([sys.executable, "-c", TAKES, PORT], env=environment, text=True, **pipes)
             assert process.stdout is not None
             tried.append((process, process.stdout.readline() == "True\n"))
         yield tried

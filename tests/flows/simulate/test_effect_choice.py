@@ -18,6 +18,7 @@ from pipeline.simulator.render import EFFECTS
 from pipeline.simulator.scenes.scene import SceneRaster
 from storage.archive.keys import StageRef
 
+Decided = tuple[Path, StageRef]  # an archive, and the decision in it
 ASKED = "rotation,vignetting,shot,read-noise"
 CAMERA = {"camera.samples": 160}  # as wide as the small picture: all of what else it sees takes its time
 
@@ -39,37 +40,30 @@ def opened(scene_files: Path, out: Path, **flags: Any) -> CaptureRun:
 
 
 @pytest.fixture(scope="module")
-def decided(scene_files: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, StageRef]:
+def decided(scene_files: Path, tmp_path_factory: pytest.TempPathFactory) -> Decided:
     """An archive with a decision, and its store."""
     out = tmp_path_factory.mktemp("decided")
     return out, choose(opened(scene_files, out))
 
 
-def test_the_manifest_and_the_source_have_what_was_decided(decided: tuple[Path, StageRef], scene_files: Path) -> None:
+def test_the_manifest_and_the_source_have_what_was_decided(decided: Decided, scene_files: Path) -> None:
     """Every effect in the chain's order, those left out within their bounds; the source has variants and clock."""
     manifest = load_manifest(decided[1])
     rows = {row["name"]: row for row in manifest["effects"]}
     assert list(rows) == [effect.name for effect in EFFECTS]
-    assert {name for name, row in rows.items() if row["state"] == "on"} == {
-        *ASKED.split(","),
-        "quantisation",
-        "saturation",
-    }
+    on = {name for name, row in rows.items() if row["state"] == "on"}
+    assert on == {*ASKED.split(","), "quantisation", "saturation"}
     assert rows["diffraction"]["bound"] > 0
     assert (manifest["total"]["asked"], manifest["total"]["tolerance"]) == (ASKED, 0.1)
     simulated = opened(scene_files, decided[0]).simulated
     source = SimulatedField(simulated).lit(chosen_effects(decided[1]), {"a": 3.0}).source
     on = {row["name"]: row["variant"] for row in load_manifest(decided[1])["effects"] if row["state"] == "on"}
     assert {effect.name: variant for effect, variant in source.choice.effects} == on
-    assert (source.clock, list(chosen_effects(decided[1]))) == (
-        {"a": 3.0},
-        [effect for effect, _ in source.choice.effects],
-    )
+    assert source.clock == {"a": 3.0}
+    assert list(chosen_effects(decided[1])) == [effect for effect, _ in source.choice.effects]
 
 
-def test_a_decision_that_is_there_draws_nothing(
-    scene_files: Path, decided: tuple[Path, StageRef], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stored_decision_draws_nothing(scene_files: Path, decided: Decided, monkeypatch: pytest.MonkeyPatch) -> None:
     """No probe; not one point of the scene is asked for."""
 
     def refuse(*_: object, **__: object) -> None:
@@ -94,17 +88,13 @@ def test_a_decision_that_is_there_draws_nothing(
     ],
     ids=str,
 )
-def test_what_the_decision_depends_on_is_its_key(
-    scene_files: Path, decided: tuple[Path, StageRef], flags: dict[str, Any]
-) -> None:
+def test_what_the_decision_depends_on_is_its_key(scene_files: Path, decided: Decided, flags: dict[str, Any]) -> None:
     """Tolerance with its unit, what was asked, seed, camera and rig."""
     assert key_of(opened(scene_files, decided[0])) == decided[1].key
     assert key_of(opened(scene_files, decided[0], **flags)) != decided[1].key
 
 
-def test_effects_that_this_version_does_not_know_are_refused(
-    monkeypatch: pytest.MonkeyPatch, decided: tuple[Path, StageRef]
-) -> None:
+def test_effects_that_this_version_does_not_know_are_refused(monkeypatch: pytest.MonkeyPatch, decided: Decided) -> None:
     """By name."""
     row = {"name": "glare", "state": "on", "variant": "exact"}
     monkeypatch.setattr(effect_choice, "load_manifest", lambda effects: {"effects": [row]})

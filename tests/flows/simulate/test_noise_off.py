@@ -75,18 +75,9 @@ def test_survey_is_the_scene_through_the_footprint(
     """Waves of 4 to 40 px: the mosaic equals the convolved pixels, and the waves' own closed form inside."""
     scene, archive = waves(shape, 4, 40), tmp_path / "archive"
     np.save(tmp_path / "waves.npy", scene.raster())
-    products = survey_png(
-        archive,
-        scene=str(tmp_path / "waves.npy"),
-        labels=None,
-        wavelengths="500,700",
-        weights=str(make_weights((500.0, 700.0))),
-        effects="rotation,slit,smear",
-        tol="0",
-        **{"camera.samples": SAMPLES},
-        scan_step="1",
-        budget=None,
-    ).receipt["products"]
+    flags = {"labels": None, "wavelengths": "500,700", "weights": str(make_weights((500.0, 700.0))), "budget": None}
+    flags |= {"effects": "rotation,slit,smear", "tol": "0", "camera.samples": SAMPLES, "scan_step": "1"}
+    products = survey_png(archive, scene=str(tmp_path / "waves.npy"), **flags).receipt["products"]
     assert open_signal_cubes(archive / products["signal_coarse"])[0].sweep.along == along
     mosaic = open_mosaic(archive / products["mosaic"]).values()
     blurred = convolve1d(scene.raster(), footprint_kernel(SLIT_PX), axis="xy".index(along), mode="nearest")

@@ -26,12 +26,13 @@ from storage.arrays.mosaics import load_attention
 from storage.parallel.pool import WorkerPool
 from tests.conftest import Flags, Survey
 
+Surveyed = tuple[SurveyRun, Path]
 MOST_PX = (64, 640)  # of 96 x 128 px: two regions
 ALL_PX = 96  # a halo that reaches over the whole field
 
 
 @pytest.fixture(scope="module")
-def surveyed(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey, flags_png: Flags) -> tuple[SurveyRun, Path]:
+def surveyed(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey, flags_png: Flags) -> Surveyed:
     """A survey of scene.png that keeps the mosaic of the first pass, and the folder of its stages."""
     out = tmp_path_factory.mktemp("field") / "archive"
     with mock.patch("flows.publish.publishing._clear_first_mosaic"):
@@ -75,9 +76,7 @@ def _contents(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("pool", [WorkerPool(workers=1), WorkerPool(workers=2)], ids=["one", "two"])
-def test_regions_that_see_the_field_draw_the_map_of_the_field(
-    surveyed: tuple[SurveyRun, Path], tmp_path: Path, pool: WorkerPool
-) -> None:
+def test_regions_that_see_the_field_draw_the_fields_map(surveyed: Surveyed, tmp_path: Path, pool: WorkerPool) -> None:
     """With a halo over everything, to the byte, whoever draws them; the stage's own map is that of one region."""
     run, stages = surveyed
     stored = _contents(_store(stages, "segment/*/class_map.zarr"))
@@ -88,7 +87,7 @@ def test_regions_that_see_the_field_draw_the_map_of_the_field(
 
 @pytest.mark.parametrize("stored", [True, False])
 def test_regions_choose_patches_by_the_classes_of_the_field(
-    surveyed: tuple[SurveyRun, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stored: bool
+    surveyed: Surveyed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stored: bool
 ) -> None:
     """With a halo over everything they choose as one region does; no overview is left beside the map."""
     run, stages = surveyed
@@ -102,7 +101,7 @@ def test_regions_choose_patches_by_the_classes_of_the_field(
     assert not (tmp_path / "overviews").exists()
 
 
-def test_every_pool_draws_the_same_regions(surveyed: tuple[SurveyRun, Path], tmp_path: Path) -> None:
+def test_every_pool_draws_the_same_regions(surveyed: Surveyed, tmp_path: Path) -> None:
     """Two at a time or one after the other, the bytes are the same; every pixel has a class."""
     run, stages = surveyed
     one = _draw(_work(run, WorkerPool(workers=1), 0), run, stages, tmp_path / "one.zarr")
@@ -113,7 +112,7 @@ def test_every_pool_draws_the_same_regions(surveyed: tuple[SurveyRun, Path], tmp
 
 
 @pytest.mark.parametrize("policy", ["gain", "entropy", "sobel"])
-def test_scores_of_regions_make_those_of_the_field(surveyed: tuple[SurveyRun, Path], policy: str) -> None:
+def test_scores_of_regions_make_those_of_the_field(surveyed: Surveyed, policy: str) -> None:
     """With a halo over everything they are equal, patch by patch, and the stage's own where it used that policy."""
     run, stages = surveyed
     mosaic = _mosaics(stages)[0]
@@ -124,7 +123,7 @@ def test_scores_of_regions_make_those_of_the_field(surveyed: tuple[SurveyRun, Pa
         assert (load_attention(_store(stages, "score/*/attention.zarr")).score == whole).all()
 
 
-def test_edges_need_one_patch_of_halo_and_work_travels_as_paths(surveyed: tuple[SurveyRun, Path]) -> None:
+def test_edges_need_one_patch_of_halo_and_work_travels_as_paths(surveyed: Surveyed) -> None:
     """With one coarse patch regions give the field's own edges; what another process gets is small."""
     run, stages = surveyed
     mosaic = _mosaics(stages)[0]
@@ -143,9 +142,7 @@ def test_edges_need_one_patch_of_halo_and_work_travels_as_paths(surveyed: tuple[
 @pytest.mark.parametrize(
     ("pool", "words"), [(WorkerPool(), "the process itself"), (WorkerPool("processes"), "each of two proc")]
 )
-def test_too_little_memory_is_refused_before_the_work(
-    surveyed: tuple[SurveyRun, Path], tmp_path: Path, pool: WorkerPool, words: str
-) -> None:
+def test_too_little_memory_is_refused_first(surveyed: Surveyed, tmp_path: Path, pool: WorkerPool, words: str) -> None:
     """The message says what a region takes and the least memory that does, and that much is enough."""
     work = replace(surveyed[0].work, pool=pool, memory=300 * 2**20)
     with pytest.raises(SettingsError, match=rf"exceeds --memory 300 MiB: .*96 x 128 px.*{words}") as refused:
@@ -154,7 +151,7 @@ def test_too_little_memory_is_refused_before_the_work(
     replace(work, memory=least * 2**20).pool_for(np.arange(192), 3)
 
 
-def test_no_more_regions_at_a_time_than_memory_holds(surveyed: tuple[SurveyRun, Path]) -> None:
+def test_no_more_regions_at_a_time_than_memory_holds(surveyed: Surveyed) -> None:
     """A worker pool shrinks to what fits, and stays as it is where all of it does."""
     work = replace(surveyed[0].work, pool=WorkerPool(workers=7))
     assert work.pool_for(np.arange(9), 3) is work.pool
@@ -178,7 +175,7 @@ def test_only_keys_of_fields_that_are_cut_know_of_regions(size: tuple[int, int])
 
 
 @pytest.mark.parametrize("shift", [(0, 0), (8, -20), (-500, 3), (-3, 500)])
-def test_a_memory_is_moved_and_leaves_nothing_behind(surveyed: tuple[SurveyRun, Path], shift: tuple[int, int]) -> None:
+def test_a_memory_is_moved_and_leaves_nothing_behind(surveyed: Surveyed, shift: tuple[int, int]) -> None:
     """What lay at a pixel lies ``shift`` further, in fine and coarse pixels alike, and nothing where it came from."""
     run, stages = surveyed
     probabilities, mosaic = (_store(stages, "segment/*/class_probabilities.zarr"), _mosaics(stages)[0])
@@ -202,7 +199,7 @@ def test_a_memory_is_moved_and_leaves_nothing_behind(surveyed: tuple[SurveyRun, 
         np.testing.assert_array_equal(now, expected)
 
 
-def test_a_moved_memory_has_no_seams_between_regions(surveyed: tuple[SurveyRun, Path]) -> None:
+def test_a_moved_memory_has_no_seams_between_regions(surveyed: Surveyed) -> None:
     """Features come from beyond a region's halo, wherever the field has them."""
     run, stages = surveyed
     probabilities, mosaic = (_store(stages, "segment/*/class_probabilities.zarr"), _mosaics(stages)[0])

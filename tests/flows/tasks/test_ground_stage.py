@@ -35,6 +35,7 @@ from storage.arrays.layout import AngularGrid
 from tests.storage.plain_mosaic import write_values
 from tests.storage.small_archive import write_class_map
 
+Stores = tuple[StageRef, StageRef]
 POSE = RigPose(lon_deg=9.5, lat_deg=52.1, heading_deg=25.0, tilt_deg=50.0, height_m=14.0)
 SHAPE = (120, 160)
 FIELD: Any = SimpleNamespace(shape=SHAPE, geobox=None, pixel_m=None)
@@ -88,7 +89,7 @@ def run(tmp_path: Path) -> Run:
 
 
 @pytest.fixture
-def stores(tmp_path: Path) -> tuple[StageRef, StageRef]:
+def stores(tmp_path: Path) -> Stores:
     """A class map of two halves, the right one unknown in its upper part, and a mosaic that brightens down."""
     classes = np.zeros(SHAPE, np.uint8)
     classes[:, 80:] = 1
@@ -104,14 +105,12 @@ def stores(tmp_path: Path) -> tuple[StageRef, StageRef]:
     return StageRef("segment", "m", tmp_path / "map"), StageRef("rectify", "r", tmp_path / "mosaic")
 
 
-def draw(run: Run, stores: tuple[StageRef, StageRef]) -> StageRef:
+def draw(run: Run, stores: Stores) -> StageRef:
     """Run the stage as an engine would."""
     return ground.produce(run.archive, ground.wants(run, *stores))[0]
 
 
-def test_what_is_unknown_has_no_confidence_on_the_map_either(
-    run: Run, stores: tuple[StageRef, StageRef], tmp_path: Path
-) -> None:
+def test_what_is_unknown_has_no_confidence_on_the_map_either(run: Run, stores: Stores, tmp_path: Path) -> None:
     """Single pixels of the class unknown among pixels that are sure: none is lent the confidence of those beside it."""
     classes = np.zeros(SHAPE, np.uint8)
     classes[40:70:3, 50:90:3] = 1
@@ -125,7 +124,7 @@ def test_what_is_unknown_has_no_confidence_on_the_map_either(
     np.testing.assert_array_equal(np.isnan(found.age_days), found.classes != 0)
 
 
-def test_map_and_picture_lie_where_the_rays_end(run: Run, stores: tuple[StageRef, StageRef]) -> None:
+def test_map_and_picture_lie_where_the_rays_end(run: Run, stores: Stores) -> None:
     """Each scene pixel's class is found where its ray meets the ground; the mosaic's ramp rises towards the rig."""
     ref = draw(run, stores)
     found = load_ground_map(ref.path / STORE)
@@ -157,9 +156,7 @@ def field_pixels(run: Run, found: GroundMap) -> tuple[np.ndarray, np.ndarray]:
     return seen, np.floor(places[seen] + 0.5).astype(int).T
 
 
-def test_age_and_changes_are_those_of_the_pixel_that_is_shown(
-    run: Run, stores: tuple[StageRef, StageRef], tmp_path: Path
-) -> None:
+def test_age_and_changes_are_those_of_the_pixel_that_is_shown(run: Run, stores: Stores, tmp_path: Path) -> None:
     """Of a second visit: days, changed fraction and old class are no blend of neighbours; the unknown is NaN."""
     rng = np.random.default_rng(3)
     age = 0.125 * rng.integers(0, 400, SHAPE).astype(np.float32)
@@ -180,7 +177,7 @@ def test_age_and_changes_are_those_of_the_pixel_that_is_shown(
     assert (found.old_class[~seen] == UNLABELLED).all()
 
 
-def test_a_first_look_has_ages_and_no_changes(run: Run, stores: tuple[StageRef, StageRef]) -> None:
+def test_a_first_look_has_ages_and_no_changes(run: Run, stores: Stores) -> None:
     """All that is seen was looked at today; to plain xarray there is nothing about a change."""
     ref = draw(run, stores)
     found = load_ground_map(ref.path / STORE)
@@ -192,7 +189,7 @@ def test_a_first_look_has_ages_and_no_changes(run: Run, stores: tuple[StageRef, 
         assert content["age"].attrs["units"] == "days"
 
 
-def test_the_store_has_hectares_and_where_it_was_seen_from(run: Run, stores: tuple[StageRef, StageRef]) -> None:
+def test_the_store_has_hectares_and_where_it_was_seen_from(run: Run, stores: Stores) -> None:
     """Areas are sums of footprints at any resolution; plain xarray reads pose, counts of pixels and CRS."""
     ref = draw(replace(run, settings=Settings(pose=POSE, map=MapChoice(resolution_m=0.02))), stores)
     areas = load_ground_map(ref.path / STORE).areas
@@ -208,7 +205,7 @@ def test_the_store_has_hectares_and_where_it_was_seen_from(run: Run, stores: tup
         assert content.attrs["scene_pixels"] == {"mapped_px": 120 * 160, "beyond_reach_px": 0, "no_ground_px": 0}
 
 
-def test_the_key_follows_pose_and_map(run: Run, stores: tuple[StageRef, StageRef]) -> None:
+def test_the_key_follows_pose_and_map(run: Run, stores: Stores) -> None:
     """The same pose finds its store; another tilt or resolution makes another."""
     changed = [
         run.settings,

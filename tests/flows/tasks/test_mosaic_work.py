@@ -96,9 +96,7 @@ def test_an_error_in_a_tile_ends_the_work(tmp_path: Path, cubes: list[SignalCube
         write_mosaic(recipe_of(cubes), other, memory=PLENTY, pool=TWO)
 
 
-def test_a_worker_killed_between_tiles_changes_nothing(
-    tmp_path: Path, cubes: list[SignalCube], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_killed_workers_harm_nothing(tmp_path: Path, cubes: list[SignalCube], monkeypatch: pytest.MonkeyPatch) -> None:
     """kill -9 of a process that makes tiles, with a shard half written: the mosaic is that of an undisturbed thread."""
     folder = tmp_path / "key.part"
     write_mosaic(recipe_of(cubes), mosaic_at(tmp_path / "a.zarr"), memory=PLENTY, pool=ONE)

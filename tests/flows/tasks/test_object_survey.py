@@ -167,9 +167,7 @@ def test_a_flipped_bit_is_named_and_made_again(
     np.testing.assert_array_equal(map_of(open_archive(bucket), published), before)
 
 
-def test_an_unreachable_bucket_is_one_error(
-    bucket: str, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unreachable_buckets_are_told(bucket: str, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch) -> None:
     """No traceback, a cause and what to do; the exit code is 1, and 2 for an address that is none."""
     missing = command_line("survey", "--out", "s3://no-such-bucket/x", *SMALL)
     assert missing.code == 1

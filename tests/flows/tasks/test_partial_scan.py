@@ -97,10 +97,8 @@ def test_receipt_and_page_say_what_was_looked_at(visits: tuple[Path, Any, Any]) 
     assert f"lines {scan_pass['lines']}; " in page
     assert "a part of the field was scanned once: every" in part.receipt["plan"]["reason"]
     assert "this one: " not in page  # the record tells of scans of all, which remember nothing
-    assert any(
-        "lines of highest expected gain" in note and "expected error is" in note
-        for note in part.receipt["settings"]["notes"]
-    )
+    notes = part.receipt["settings"]["notes"]
+    assert any("lines of highest expected gain" in note and "expected error is" in note for note in notes)
 
 
 def test_the_same_visit_finds_its_own_lines(visited: Path, visits: Any, survey_png: Survey, recorded: Path) -> None:
@@ -141,9 +139,8 @@ def test_what_is_due_is_looked_at_first(visited: Path, visits: Any, survey_png: 
     assert (product(visited, part, "class_probabilities").age.values[due] < 1).any()
     assert 0 < scan_pass["due"] - scan_pass["due_left"] < scan_pass["due"]
     notes = " ".join(part.receipt["settings"]["notes"])
-    assert (
-        f"patches beyond --max-age: {scan_pass['due'] - scan_pass['due_left']} of {scan_pass['due']} included" in notes
-    )
+    included = f"{scan_pass['due'] - scan_pass['due_left']} of {scan_pass['due']} included"
+    assert f"patches beyond --max-age: {included}" in notes
     page = " ".join((part.folder / "report.html").read_text(encoding="utf-8").split())
     assert f"due left {scan_pass['due_left']}" in page
 
@@ -153,12 +150,8 @@ def test_places_without_data_are_never_due(survey_png: Survey, recorded: Path, t
     values = np.random.default_rng(0).uniform(50, 200, (96, 128, 3))
     values[:, 96:] = np.nan
     np.save(tmp_path / "scene.npy", values)
-    given = {
-        "scene": str(tmp_path / "scene.npy"),
-        "labels": None,
-        "weights": str(recorded),
-        "wavelengths": "450,550,650",
-    }
+    given = {"scene": str(tmp_path / "scene.npy"), "labels": None, "weights": str(recorded)}
+    given["wavelengths"] = "450,550,650"
     for flags, day in ((WHOLE, "2026-06-01"), ({**PART, "max_age": "30"}, "2026-06-02")):
         found = survey_png(tmp_path / "archive", **flags, **given, visit=day)
     assert found.receipt["extent"]["due"] == 0
@@ -185,23 +178,19 @@ def test_of_what_is_sure_enough_nothing_is_looked_at(
     planned = plan_content(load_settings(None, asked))
     assert planned["to_make"] > 0
     assert any("a survey would skip this visit: the prior map's expected error is" in note for note in planned["notes"])
-    assert (
-        survey_png(visited, **{**flags, "skip_below_error": "0.001"}).receipt["settings"]["skip_below_error"] == 0.001
-    )
+    surveyed = survey_png(visited, **{**flags, "skip_below_error": "0.001"})
+    assert surveyed.receipt["settings"]["skip_below_error"] == 0.001
 
 
 def test_nothing_is_worth_more_than_what_is_due() -> None:
     """A patch that is due counts more than all that the others gain; without gains the oldest counts most."""
     grid = SceneGrid(4, 16, 4, 1)
-    probabilities, age = (
-        np.log([0.6, 0.4]) * np.ones((4, 16, 1)),
-        np.repeat([[1.0, 2.0, 3.0, 4.0]], 4, axis=0).repeat(4, axis=1),
-    )
+    probabilities = np.log([0.6, 0.4]) * np.ones((4, 16, 1))
+    age = np.repeat([[1.0, 2.0, 3.0, 4.0]], 4, axis=0).repeat(4, axis=1)
     expected_errors = PatchExpectedErrors.of([(probabilities, age)], grid, 2)
     record, all_patches = ScanPerformance.read(RECORD), np.ones(4, bool)
-    wanted = ExtentGains(
-        record, ("class_0", "class_1"), expected_errors, np.array([False, True, False, False]), all_patches
-    )
+    due = np.array([False, True, False, False])
+    wanted = ExtentGains(record, ("class_0", "class_1"), expected_errors, due, all_patches)
     gains = wanted.gains(1, 25.0)
     assert (gains > 0).all()
     assert wanted.expected_gain(gains)[1] > 10 * wanted.expected_gain(gains)[[0, 2, 3]].sum()
@@ -210,9 +199,7 @@ def test_nothing_is_worth_more_than_what_is_due() -> None:
     assert np.argsort(nobody.expected_gain(np.zeros(4))).tolist() == [0, 1, 2, 3]
 
 
-def test_beyond_another_fields_part_is_no_class(
-    visited: Path, survey_png: Survey, recorded: Path, tmp_path: Path
-) -> None:
+def test_without_a_memory_unseen_is_no_class(visited: Path, survey_png: Survey, recorded: Path, tmp_path: Path) -> None:
     """A memory of another field is put aside, and where nobody looked nothing is said of this one."""
     values, labels = patchy_scene((96, 128), 3, seed=77)
     Image.fromarray(values.astype(np.uint8)).save(tmp_path / "other.png")

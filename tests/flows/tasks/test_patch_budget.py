@@ -43,9 +43,7 @@ def _budget(**limits: object) -> PatchBudget:
 
 
 @given(scores, st.floats(40, 99), st.sampled_from(["gain", "sobel"]))
-def test_no_budget_is_exceeded_and_none_left_unspent(
-    given_scores: NDArray[np.float64], macs: float, policy: str
-) -> None:
+def test_no_budget_is_exceeded_or_left_unspent(given_scores: NDArray[np.float64], macs: float, policy: str) -> None:
     """Multiply-adds with the scores are within their fraction; one patch more is beyond it."""
     budget = _budget(macs=f"{macs}%", policy=policy)
     bought, promising = budget.choose(given_scores), np.argsort(-given_scores)[: np.count_nonzero(given_scores > 0)]

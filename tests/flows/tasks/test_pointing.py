@@ -82,13 +82,8 @@ def test_what_the_mirror_missed_is_told_and_detail_still_helps(surveyed: tuple[d
 
 def found_of(**told: Any) -> dict[str, Any]:
     """What a survey says of one pass."""
-    nothing: dict[str, Any] = {
-        "held": "a",
-        "sweeps": {"a": [0.0, 0.0]},
-        "residual_rms_px": None,
-        "not_found": [],
-        "too_narrow": [],
-    }
+    nothing: dict[str, Any] = {"held": "a", "sweeps": {"a": [0.0, 0.0]}, "residual_rms_px": None}
+    nothing |= {"not_found": [], "too_narrow": []}
     return {"pointing": {"prior_px": 5.0, "coarse": {**nothing, **told}}}
 
 

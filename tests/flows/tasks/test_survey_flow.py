@@ -22,7 +22,7 @@ from flows.tasks.local_server import ServerUnavailable
 from flows.tasks.open_survey import STAGES, Products
 from pipeline.errors import IncompleteStoreError
 from storage.archive.keys import StageRef
-from tests.flows.conftest import CommandLine, act_instead, newest_run
+from tests.flows.conftest import act_instead, newest_run
 from tests.prior_work import with_effects
 
 pytestmark = pytest.mark.usefixtures("no_effects")
@@ -114,12 +114,8 @@ def test_a_raster_is_neither_captured_nor_rectified() -> None:
 SETTINGS = [
     {"scene": "farm", "seconds": "25", "camera.exposure_ms": "50", "size": "64x96", "tol": "0.5dn"},
     {
-        "source": "sim",
-        "scene": "field.png",
-        "weights": "w.safetensors",
-        "bands": "0-3",
-        "wavelengths": "500,600,700,800",
-        "budget": "0.8",
+        **{"source": "sim", "scene": "field.png", "weights": "w.safetensors", "bands": "0-3"},
+        **{"wavelengths": "500,600,700,800", "budget": "0.8"},
     },
     {"scene": "farm", "sky.started": "2026-06-01T12:00:00Z", "memory": "2GiB", "zones.plots": "plots.gpkg"},
 ]
@@ -193,9 +189,8 @@ def test_prefect_makes_the_stores_of_plain(survey_png: Any, surveyed_png: Any, t
         artifacts = {one.key: one for one in client.read_artifacts(artifact_filter=mine)}
     assert run.name == "survey-scene"
     assert run.parameters["settings"]["budget"] == 0.8
-    assert sorted(tasks) == sorted(
-        [*(f"{stage['name']}-scene" for stage in flow["stages"]), *(f"{one}-scene" for one in STEPS)]
-    )
+    names = [*(stage["name"] for stage in flow["stages"]), *STEPS]
+    assert sorted(tasks) == sorted(f"{name}-scene" for name in names)
     assert {one.state.type.value for one in tasks.values()} == {"COMPLETED"}
     assert edges(tasks, "condense_fine") == {"plan_capture", "capture_fine", "capture_coarse"}
     assert edges(tasks, "rectify") == {"plan_capture", "condense_coarse", "locate"}
@@ -213,12 +208,8 @@ STEPS = ("plan_capture", "publish", "add_accuracy", "clear_raw")
 def edges(tasks: dict[str, Any], name: str) -> set[str]:
     """Names of the tasks that a task got something from."""
     by_id = {one.id: key.removesuffix("-scene") for key, one in tasks.items()}
-    return {
-        by_id[given.id]
-        for some in tasks[f"{name}-scene"].task_inputs.values()
-        for given in some
-        if hasattr(given, "id")
-    }
+    given = (one for some in tasks[f"{name}-scene"].task_inputs.values() for one in some)
+    return {by_id[one.id] for one in given if hasattr(one, "id")}
 
 
 def test_a_survey_has_a_server_of_its_own(survey_png: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -251,9 +242,7 @@ def test_a_named_server_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) ->
             pytest.fail("it was taken for one that answers")
 
 
-def test_sigterm_in_a_stage(
-    field_file: Any, server: str, monkeypatch: pytest.MonkeyPatch, command_line: CommandLine
-) -> None:
+def test_sigterm_in_a_stage(field_file: Any, server: str, monkeypatch: pytest.MonkeyPatch, command_line: Any) -> None:
     """143 and one sentence, whatever Prefect makes of it; the same command continues."""
     real, file = STAGES["rectify"], field_file()
 

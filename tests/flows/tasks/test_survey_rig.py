@@ -197,9 +197,8 @@ def test_field_without_a_picture_is_surveyed(tmp_path: Path, monkeypatch: pytest
     """A field of which only size and bands are known: what the rig sees of it is mapped, and nothing judged."""
     told = {"scene": "field", "bands": None, "wavelengths": "640,550,460", "weights": str(weights), "effects": None}
     settings = small_settings(tmp_path, source="rig", **told)
-    scene = raster_from_values(
-        patchy_scene((128, 128), 3, 1)[0], settings.camera, name="x", wavelength_nm=np.array([640.0, 550.0, 460.0])
-    )
+    values, nm = patchy_scene((128, 128), 3, 1)[0], np.array([640.0, 550.0, 460.0])
+    scene = raster_from_values(values, settings.camera, name="x", wavelength_nm=nm)
     with emulated(settings, {}, monkeypatch, scene=scene):
         published = run_survey(settings, QUIET)
     assert len(np.unique(class_map_of(published, tmp_path))) > 1
@@ -214,13 +213,8 @@ def test_survey_over_a_pty_and_sockets_gives_the_same_lines(tmp_path: Path):
     scene, _ = open_scene(settings)
     source = replace(make_source(scene, settings), chosen=effects_on("rotation", "slit", "smear", "shot"))
     with EmulatedRig(source, FastClock(40)).serve() as served:
-        rig = {
-            "port": served.port,
-            "host": served.host,
-            "control_port": served.camera_port,
-            "file_port": served.file_port,
-        }
-        told = {f"rig.{name}": value for name, value in rig.items()}
+        told = {"rig.port": served.port, "rig.host": served.host, "rig.control_port": served.camera_port}
+        told["rig.file_port"] = served.file_port
         published = run_survey(small_settings(tmp_path, **asked, **told), QUIET)
     cube = open_raw_cube(tmp_path / published.receipt["products"]["raw_coarse"] / "coarse-0.zarr")
     np.testing.assert_array_equal(cube.read(0, cube.sweep.lines), source.render(cube.sweep, range(cube.sweep.lines)))

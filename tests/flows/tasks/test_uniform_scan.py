@@ -84,9 +84,7 @@ def test_receipt_and_pages_tell_a_scan(scanned: tuple[Path, Any]) -> None:
     assert "expected mIoU 91.0 ± 3.0" in page
 
 
-def test_seconds_choose_the_scan_and_are_kept(
-    survey_png: Survey, recorded: Path, make_weights: WeightsMaker, tmp_path: Path
-) -> None:
+def test_seconds_choose_a_scan(survey_png: Survey, recorded: Path, make_weights: WeightsMaker, tmp_path: Path) -> None:
     """It ends in time, the settings say what was chosen, and read again by other weights the light is found."""
     published = survey_png(tmp_path, budget=None, seconds="4", weights=str(recorded))
     settings, done = published.receipt["settings"], published.receipt["savings"]["capture_s"]["done"]
@@ -99,9 +97,8 @@ def test_seconds_choose_the_scan_and_are_kept(
     assert {path.parent.name for path in tmp_path.glob("stages/condense/*/*.zarr")} == captured
     newest = max(tmp_path.glob("runs/*/receipt.json"), key=lambda path: path.stat().st_mtime)
     again = json.loads(newest.read_text())
-    assert {name: again["settings"][name] for name in ("scan_step", "scan_exposure_ms")} == {
-        name: settings[name] for name in ("scan_step", "scan_exposure_ms")
-    }
+    for name in ("scan_step", "scan_exposure_ms"):
+        assert again["settings"][name] == settings[name]
     assert {one["name"]: one["state"] for one in again["stages"]}["capture_coarse"] == "cached"
 
 

@@ -147,12 +147,8 @@ def test_words_go_beside_the_stage_that_runs() -> None:
         progress.say("afterwards")
 
     told = progress_of(steps, **TERMINAL)
-    assert [words in told for words in ("before any stage", "afterwards", "looking", "ran")] == [
-        False,
-        False,
-        True,
-        True,
-    ]
+    found = [words in told for words in ("before any stage", "afterwards", "looking", "ran")]
+    assert found == [False, False, True, True]
 
 
 def test_time_left_stands_behind_the_words(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -85,11 +85,8 @@ def test_masks_that_do_not_fit(tmp_path: Path, mask: int, classes: list[int] | N
 def test_indian_pines_disjoint_mask(real_data: Path) -> None:
     """5,528 pixels train, the labelled rest of 10,249 tests."""
     folder = real_data / "indian_pines"
-    data = load_data_set(
-        folder / "Indian_pines_corrected.npy",
-        train_mask=folder / "indianpines_disjoint_dset.mat",
-        mask_classes=MASK_TO_CLASS,
-    )
+    mask = folder / "indianpines_disjoint_dset.mat"
+    data = load_data_set(folder / "Indian_pines_corrected.npy", train_mask=mask, mask_classes=MASK_TO_CLASS)
     (name,) = data.names
     train, test = data.load(name, "train"), data.load(name, "test")
     assert np.count_nonzero(np.asarray(train.labels) != 255) == 5528

@@ -213,15 +213,8 @@ def test_pixels_trained_on_are_not_judged(out: Path, tmp_path: Path) -> None:
     given = {"labels": str(tmp_path / "labels.npy"), "wavelengths": [500, 600, 700, 800]}
     choices = {**given, "train_mask": str(tmp_path / "mask.npy")}
     train_weights(_request(tmp_path / "cube.npy", out, choices=choices))
-    flags = {
-        **given,
-        "scene": str(tmp_path / "cube.npy"),
-        "source": "sim",
-        "weights": str(out),
-        "out": str(tmp_path / "a"),
-        "budget": 1,
-    }
-    run = open_run(load_settings(None, flags))
+    flags = given | {"scene": str(tmp_path / "cube.npy"), "source": "sim", "weights": str(out), "budget": 1}
+    run = open_run(load_settings(None, flags | {"out": str(tmp_path / "a")}))
     assert run.labels is not None
     assert (run.labels[:10] == 255).all()
     assert (run.labels[10:] != 255).all()
@@ -235,9 +228,7 @@ def test_pixels_trained_on_are_not_judged(out: Path, tmp_path: Path) -> None:
         (1.0, [500, 600, 700], "no band near 800 nm"),
     ],
 )
-def test_a_survey_says_that_a_scene_is_unlike_the_training(
-    factor: float, bands: list[int], note: str, out: Path, tmp_path: Path
-) -> None:
+def test_surveys_tell_of_unlike_scenes(factor: float, bands: list[int], note: str, out: Path, tmp_path: Path) -> None:
     """In its unit or in its bands; a scene of the training's kind is surveyed without a note."""
     labels = np.random.default_rng(4).choice([1, 2], (40, 40), p=[0.3, 0.7]).astype(np.uint8)
     values = (labels[..., None] * np.ones(4)).astype(np.float32)
@@ -290,9 +281,7 @@ def test_whitening_knows_the_noise_of_short_exposures(folder: Path, out: Path):
     assert sizes[1] < sizes[0]
 
 
-def test_training_goes_on_from_weights(
-    folder: Path, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_training_goes_on_from_a_file(folder: Path, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The normalisation stays, a step begins at the first network, and the result is halfway between both."""
     train_weights(_request(folder, out, validation=1, command="first"))
     trained = flow.train

@@ -71,9 +71,7 @@ def test_lands_are_visited_in_the_order_of_their_days() -> None:
 
 def test_the_command_trains_judges_and_says_how(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A file for the weights that it was trained for, with seeds, settings and what it is worth on another land."""
-    monkeypatch.setattr(
-        "flows.training.observed_scenes.chosen_effects", lambda *given: USUAL
-    )  # choosing takes seconds a look
+    monkeypatch.setattr("flows.training.observed_scenes.chosen_effects", lambda *_: USUAL)  # choosing takes seconds
     monkeypatch.setattr(remember, "VISITS", 2)
     monkeypatch.setattr(remember, "JUDGED_AFTER", (3,))
     out, weights = tmp_path / "farm.safetensors", shipped_weights()

@@ -31,13 +31,8 @@ def _two_classes(tiny: Maker, height: int = 24, width: int = 32):
     weights = tiny(classes=2)
     coarse_pass, fine = scene_columns(weights, height, width)
     seen = coarse_prediction_of_columns(weights, coarse_pass.columns, coarse_pass.grid)
-    return (
-        weights,
-        coarse_pass.grid,
-        seen,
-        fine,
-        np.random.default_rng(0).integers(0, 2, (height, width)).astype(np.uint8),
-    )
+    labels = np.random.default_rng(0).integers(0, 2, (height, width)).astype(np.uint8)
+    return weights, coarse_pass.grid, seen, fine, labels
 
 
 def test_the_gain_is_the_loss_that_all_patches_take_away(tiny: Maker):

@@ -85,11 +85,8 @@ def test_a_pixel_without_columns_is_not_unknown() -> None:
     """It was not captured, which is another thing; what was, however far away, is."""
     ood_detector = some_ood()
     pixels = np.array([[np.nan] * COLUMNS, [np.inf] * COLUMNS, [1e6] * COLUMNS])
-    assert ood_detector.unknown(pixels, rate=0.005, capture=LineSpec(binned=4), bands=10).tolist() == [
-        False,
-        False,
-        True,
-    ]
+    told = ood_detector.unknown(pixels, rate=0.005, capture=LineSpec(binned=4), bands=10)
+    assert told.tolist() == [False, False, True]
     assert ood_detector.unknown(pixels[:0], rate=0.005, capture=LineSpec(), bands=10).shape == (0,)
 
 
@@ -97,12 +94,8 @@ def test_a_capture_is_held_against_its_own_limit() -> None:
     """Lines between two spacings that were measured count as the wider."""
     fine = np.array([1.0, 3.0])[:, None, None] * np.ones((2, 2, 2))
     limits = Limits(np.array([0.001, 0.01]), np.array([0.03, 1.0]), (1, 2), fine)
-    ood_detector = some_ood(
-        covariance=np.stack([np.eye(COLUMNS)] * 3),
-        shot=np.zeros((3, COLUMNS, COLUMNS)),
-        read=np.zeros((COLUMNS, COLUMNS)),
-        limits=limits,
-    )
+    even, silent = np.stack([np.eye(COLUMNS)] * 3), np.zeros((3, COLUMNS, COLUMNS))
+    ood_detector = some_ood(covariance=even, shot=silent, read=silent[0], limits=limits)
     pixels = ood_detector.centres[0] + np.sqrt([[0.9], [2.0], [5.0], [7.0]])  # so far away, squared
     captures = [LineSpec(), LineSpec(step=1.5), LineSpec(step=2)]
     told = [ood_detector.unknown(pixels, rate=0.01, capture=one, bands=10).sum() for one in captures]

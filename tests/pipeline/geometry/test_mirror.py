@@ -52,9 +52,8 @@ def test_position_and_direction_are_inverse_over_the_whole_disk(precision: type,
     direction = position_to_direction(position)
     back = direction_to_position(direction)
     assert direction.dtype == back.dtype == precision
-    away = position_to_direction(back.astype(np.float64) * 0.999) - position_to_direction(
-        position.astype(np.float64) * 0.999
-    )
+    there, here = (position_to_direction(one.astype(np.float64) * 0.999) for one in (back, position))
+    away = there - here
     assert np.linalg.norm(away, axis=-1).max() < most_rad
 
 

@@ -69,10 +69,8 @@ def test_no_line_is_captured_twice(fraction: float, seed: int) -> None:
     for number, place in np.argwhere(rows.there)[::5]:
         patches = np.flatnonzero(rows.row == number * rows.first.shape[1] + place)
         if np.isin(patches, plan.patch_index).all():
-            swath, found = (
-                planner.swaths[number],
-                {at for swath_px, at in lines if swath_px == planner.swaths[number].swath_px},
-            )
+            swath = planner.swaths[number]
+            found = {at for swath_px, at in lines if swath_px == swath.swath_px}
             wanted = swath.start_px + np.arange(rows.first[number, place], rows.stop[number, place])
             assert set(wanted.tolist()) <= found
 

@@ -100,10 +100,8 @@ def test_no_run_of_one_swath_in_time_is_worth_more(expected_gain: np.ndarray, fr
 @pytest.mark.parametrize("fraction", [0.66, 0.8, 0.95])
 def test_hardly_any_runs_of_two_swaths_are_worth_more(seed: int, fraction: float) -> None:
     """In the same seconds, set-ups included, where one load of the mirror's memory holds all lines."""
-    cost, expected_gain = (
-        CostModel(vector_pairs=100_000, capture_start_s=0.3),
-        _patchy(np.random.default_rng(seed)) ** 4,
-    )
+    cost = CostModel(vector_pairs=100_000, capture_start_s=0.3)
+    expected_gain = _patchy(np.random.default_rng(seed)) ** 4
     rows = PatchRows.of(uniform_sweeps(GRID, WIDER, "x", step=4, exposure_ms=EXPOSURE_MS), GRID, WIDER)
     assert len(rows.sweeps) == 2
     given_s = fraction * cost.seconds(list(rows.sweeps), WIDER)
@@ -163,9 +161,8 @@ def test_a_patch_that_two_swaths_show_is_of_the_nearer(along: Axis) -> None:
     """By how far its middle lies from the middle of their lines."""
     rows = rows_of(along)
     patch_index = GRID.valid_patches()
-    across = (GRID.patch_origin(patch_index) + GRID.patch / 2 - np.array([GRID.height, GRID.width]) / 2)[
-        :, "yx".index(along)
-    ]
+    middle = GRID.patch_origin(patch_index) + GRID.patch / 2 - np.array([GRID.height, GRID.width]) / 2
+    across = middle[:, "yx".index(along)]
     off = np.abs(across[:, None] - np.array([sweep.swath_px for sweep in rows.sweeps]))
     own = off[np.arange(len(patch_index)), rows.row[patch_index] // rows.first.shape[1]]
     assert (own <= off.min(axis=1) + 1).all()  # lines are turned by a pixel at most

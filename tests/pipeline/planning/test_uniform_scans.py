@@ -35,8 +35,6 @@ CONTENT = {
     "per_class_iou": {"weed": [[0.8, 0.7, 0.6], [0.7, 0.65, 0.5], [0.5, 0.4, 0.3]]},
 }
 RECORD = ScanPerformance.read(CONTENT)
-
-
 SCANS = uniform_scans(RECORD, SWEEPS, CAMERA, COST, 270)
 CHEAPEST = min(scan.seconds for scan in SCANS)
 

@@ -62,9 +62,8 @@ def taken(sweep: Sweep, *, bands: int = 3, seed: int = 0, kind: type[Taken] = Ta
         raw[rng.random(raw.shape) < 0.002] = CAMERA.full_scale_dn
         bad = rng.random(frame) < 0.02
         bad[:, 1] |= np.arange(CAMERA.samples) % 20 < 5
-        references = replace(
-            references, bad=bad, by_mirror=True, white=rng.uniform(500, 4000, frame).astype(np.float32)
-        )
+        white = rng.uniform(500, 4000, frame).astype(np.float32)
+        references = replace(references, bad=bad, by_mirror=True, white=white)
         valid = rng.random(sweep.lines) > 0.02
     return kind(sweep, raw, references, valid, line_positions(sweep, CAMERA))
 
@@ -217,13 +216,8 @@ def test_lines_that_are_missing_count_nothing() -> None:
     """Beside a lost line a point is what the kernel's other lines say: the line that stands in for it has no weight."""
     whole = taken(Sweep("straight", "fine", "x", 0.0, -30.0, 60))
     came = np.arange(60) != 30
-    lines = replace(
-        whole,
-        raw=whole.raw[came],
-        position=whole.position[came],
-        valid_line=whole.valid_line[came],
-        sweep=replace(whole.sweep, lines=59),
-    )
+    rows = {name: getattr(whole, name)[came] for name in ("raw", "position", "valid_line")}
+    lines = replace(whole, sweep=replace(whole.sweep, lines=59), **rows)
     seen, coverage = in_tiles([place(lines, CAMERA)], PixelGrid((-0.7, -59.5), 1, (1, 120)), (64, 640))
     assert (coverage == 1).all()
     number, weight = kernel_taps(np.array([29.3]), "catmull-rom")
@@ -249,9 +243,8 @@ def test_a_sweep_that_turns_is_two_sweeps() -> None:
     """Lines taken there and back are blended as if each way were a sweep of its own, in any tiling."""
     there = taken(Sweep("there", "fine", "x", 0.0, -30.0, 60))
     path = np.concatenate([there.position, there.position[::-1]])
-    both = replace(
-        taken(replace(there.sweep, start_px=0.0, lines=120)), position=path, sweep=replace(there.sweep, lines=120)
-    )
+    longer = taken(replace(there.sweep, start_px=0.0, lines=120))
+    both = replace(longer, position=path, sweep=replace(there.sweep, lines=120))
     placed = place(both, CAMERA)
     each = [replace(placed, scan_paths=(scan_path,)) for scan_path in placed.scan_paths]
     grid = PixelGrid((-20.0, -60.0), 1, (40, 120))

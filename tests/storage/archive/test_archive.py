@@ -178,9 +178,7 @@ def test_refusing_disks_are_told_of(tmp_path: Path, number: int, words: str, mon
 
 
 @pytest.mark.parametrize("where", ["fsync", "rename", "body"])
-def test_a_full_disk_leaves_the_archive_as_it_was(
-    tmp_path: Path, archive: Archive, where: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_full_disks_harm_nothing(tmp_path: Path, archive: Archive, where: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Refused while writing, syncing or renaming: one message, no new store, the old one whole."""
     _publish(archive, key="old")
 

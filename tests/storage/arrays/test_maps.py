@@ -292,10 +292,8 @@ def test_class_map_round_trip(tmp_path: Path) -> None:
     classes[0, :9] = 255
     confidence = np.where(classes == 255, np.nan, 0.75).astype(np.float32)
     colours = np.array([[0, 0, 0], [0, 255, 0], [255, 0, 0]], np.uint8)
-    write_class_map(
-        tmp_path / "c.zarr",
-        ClassMap(classes, confidence, ("bare soil", "crop", "weed"), colours, AngularGrid(1e-4, (50, 70))),
-    )
+    made = ClassMap(classes, confidence, ("bare soil", "crop", "weed"), colours, AngularGrid(1e-4, (50, 70)))
+    write_class_map(tmp_path / "c.zarr", made)
     found = load_class_map(tmp_path / "c.zarr")
     np.testing.assert_array_equal(found.classes, classes)
     np.testing.assert_array_equal(found.colours, colours)

@@ -15,6 +15,7 @@ from storage.arrays.layout import AngularGrid
 from storage.arrays.mosaics import MosaicWriter, open_mosaic
 from tests.storage.plain_mosaic import plain_writer, write_values
 
+Stored = tuple[Path, NDArray[np.float32]]
 SHAPE = (100, 1300)
 NM = np.linspace(400, 1000, 17)
 
@@ -54,7 +55,7 @@ def test_each_pixel_keeps_its_capture_of_hundreds_of_sweeps(tmp_path: Path) -> N
 
 
 @pytest.fixture(scope="module")
-def stored(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, NDArray[np.float32]]:
+def stored(tmp_path_factory: pytest.TempPathFactory) -> Stored:
     """A stored mosaic of 150 x 90 px, a part of it not seen, and its values."""
     path = tmp_path_factory.mktemp("mosaic") / "mosaic.zarr"
     values = np.random.default_rng(0).random((150, 90, len(NM)), np.float32)
@@ -70,9 +71,7 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, NDArray[np.f
         (slice(70, 71), slice(0, 1), [1]),
     ],
 )
-def test_strips_make_the_window(
-    stored: tuple[Path, NDArray[np.float32]], rows: slice, columns: slice, heights: list[int]
-) -> None:
+def test_strips_make_the_window(stored: Stored, rows: slice, columns: slice, heights: list[int]) -> None:
     """They end where shards do, and together are what is stored there."""
     mosaic = open_mosaic(stored[0])
     strips = [mosaic.spectra(strip) for strip in mosaic.row_blocks(None, rows, columns)]
@@ -82,7 +81,7 @@ def test_strips_make_the_window(
 
 @given(st.sampled_from([1, 2, 3, 4, 8]), st.integers(0, 30), st.integers(0, 12))
 @settings(max_examples=12, deadline=None)
-def test_coarser_pixels_are_means(stored: tuple[Path, NDArray[np.float32]], factor: int, top: int, left: int) -> None:
+def test_coarser_pixels_are_means(stored: Stored, factor: int, top: int, left: int) -> None:
     """Of the pixels that were seen; NaN where these are less than half, at the borders of those that there are."""
     mosaic, (height, width) = open_mosaic(stored[0]), stored[1].shape[:2]
     rows, columns = slice(top, -(-height // factor)), slice(left, -(-width // factor))
@@ -96,7 +95,7 @@ def test_coarser_pixels_are_means(stored: tuple[Path, NDArray[np.float32]], fact
         np.testing.assert_allclose(found[y, x], mean, atol=1e-5)
 
 
-def test_brightness_is_the_mean_over_bands(stored: tuple[Path, NDArray[np.float32]]) -> None:
+def test_brightness_is_the_mean_over_bands(stored: Stored) -> None:
     """NaN where nothing was seen; a folder that is no mosaic is refused."""
     np.testing.assert_allclose(open_mosaic(stored[0]).brightness(), stored[1].mean(axis=-1), atol=1e-5)
     with pytest.raises(IncompleteStoreError, match="cannot be read"):

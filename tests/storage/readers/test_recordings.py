@@ -83,13 +83,8 @@ def test_raw_cubes_of_a_folder_a_store_and_an_archive(tmp_path: Path, archive: A
         cubes.append(open_raw_cube(ref.path / f"{sweep.name}.zarr"))
     full, coarse = cubes
     store = Path(str(full.group.store_path).removeprefix("file://")).parent
-    for address, cube in (
-        (store, full),
-        (store / "scan-0.zarr", full),
-        (runs[0], full),
-        (runs[1], coarse),
-        (archive.root, coarse),
-    ):
+    places = ((store, full), (store / "scan-0.zarr", full), (runs[0], full), (runs[1], coarse), (archive.root, coarse))
+    for address, cube in places:
         recording = open_recording(address, CAMERA)
         assert_is_recording_of(recording.sweeps[0], cube)
         assert recording.notes == ()
@@ -115,9 +110,8 @@ def test_a_lost_part_of_a_raw_cube_is_named(tmp_path: Path, archive: Archive, co
         folder = Path(shutil.copytree(folder, tmp_path / "copy", ignore=shutil.ignore_patterns("manifest.json")))
         (folder / "scan-0.zarr" / "dn" / "c" / "._0").write_text("of the system that copied it")
         assert open_recording(folder, CAMERA).sweeps
-    next(
-        path for path in (folder / "scan-0.zarr" / "dn" / "c").rglob("*") if path.name.isdigit() and path.is_file()
-    ).unlink()
+    parts = (folder / "scan-0.zarr" / "dn" / "c").rglob("*")
+    next(path for path in parts if path.name.isdigit() and path.is_file()).unlink()
     with pytest.raises(IncompleteStoreError, match=r"dn lacks 1 of its files" if copied else "it is missing"):
         open_recording(folder, CAMERA)
 
@@ -135,16 +129,11 @@ def test_frames_that_are_not_there_are_assumed_and_said(files: Path) -> None:
         (files / f"scan-0.{kind}.hdr").unlink()
     recording = open_recording(files, CAMERA)
     known = recording.sweeps[0].references
-    assert (known.dark.max(), known.white.min(), known.white.max(), known.white_reference.tolist()) == (
-        0,
-        4095,
-        4095,
-        [1, 1, 1],
-    )
+    levels = (known.dark.max(), known.white.min(), known.white.max(), known.white_reference.tolist())
+    assert levels == (0, 4095, 4095, [1, 1, 1])
     assert any("has no dark frame: a dark level of 0 is assumed" in note for note in recording.notes)
-    assert any(
-        "full scale (4095 DN) is assumed to be white, and values are relative" in note for note in recording.notes
-    )
+    said = "full scale (4095 DN) is assumed to be white, and values are relative"
+    assert any(said in note for note in recording.notes)
 
 
 def test_a_cube_without_pointing_is_an_even_straight_scan(files: Path) -> None:
@@ -199,13 +188,8 @@ def write_envi_cube(stem: Path, values: NDArray[Any], ending: str = "", **fields
     lines, samples, bands = values.shape
     code = {"u2": 12, "u1": 1, "i2": 2, "f4": 4}[values.dtype.str[1:]]
     said: dict[str, object] = {
-        "samples": samples,
-        "lines": lines,
-        "bands": bands,
-        "data type": code,
-        "interleave": "bil",
-        "byte order": 0,
-        "wavelength units": "nm",
+        **{"samples": samples, "lines": lines, "bands": bands, "data type": code, "interleave": "bil"},
+        **{"byte order": 0, "wavelength units": "nm"},
         "wavelength": "{" + ", ".join(str(500 + 100 * band) for band in range(bands)) + "}",
     }
     said |= {key.replace("_", " "): one for key, one in fields.items()}
@@ -215,8 +199,6 @@ def write_envi_cube(stem: Path, values: NDArray[Any], ending: str = "", **fields
 
 
 VALUES = np.random.default_rng(0).integers(100, 4000, (6, 16, 3)).astype("<u2")
-
-
 NO_WAVELENGTHS = "has 3 bands and nothing says their wavelengths; give --wavelengths in nm"
 
 

@@ -64,9 +64,8 @@ def test_scale_and_offset_of_tiff(tmp_path: Path) -> None:
     expected = np.where(raw == 0, np.nan, raw * [0.001, 0.002] + [0.5, 0.0])
     np.testing.assert_allclose(scene.values, expected, rtol=1e-6)
     np.testing.assert_allclose(open_cube(scaled).read(1, 3), expected[1:3], rtol=1e-6)
-    assert any(
-        note.startswith("values are the file's numbers times 0.001 plus 0.5 (others") for note in scene.provenance
-    )
+    said = "values are the file's numbers times 0.001 plus 0.5 (others"
+    assert any(note.startswith(said) for note in scene.provenance)
     sidecar = write_tiff(tmp_path / "sidecar.tif")
     before = load_scene_file(sidecar, wavelengths=[500, 600])
     bands = "".join(f'<PAMRasterBand band="{band}"><Scale>0.1</Scale></PAMRasterBand>' for band in (1, 2))

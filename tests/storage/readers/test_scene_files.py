@@ -95,9 +95,7 @@ def test_geotiff_says_its_colours(tmp_path: Path) -> None:
         (None, "5 bands and nothing says their wavelengths; give --wavelengths"),
     ],
 )
-def test_wrong_wavelengths_say_what_to_write(
-    tmp_path: Path, cube: NDArray[np.uint16], stated: list[float] | None, words: str
-) -> None:
+def test_wrong_wavelengths(tmp_path: Path, cube: NDArray[np.uint16], stated: list[float] | None, words: str) -> None:
     """Micrometres, a wrong number, a wrong range and none at all each have their own words."""
     with pytest.raises(WavelengthError, match=words):
         load_scene_file(_save(tmp_path / "a.npy", cube), wavelengths=stated)

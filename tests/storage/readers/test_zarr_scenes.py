@@ -57,9 +57,7 @@ def test_plain_arrays(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
 
 @pytest.mark.parametrize("version", [2, 3])
 @pytest.mark.parametrize("packing", [{"dtype": "f4"}, {"dtype": "i2", "scale_factor": 0.5, "add_offset": 1.0}])
-def test_void_numbers_as_xarray_keeps_them(
-    tmp_path: Path, cube: NDArray[np.uint16], version: int, packing: dict[str, Any]
-) -> None:
+def test_xarrays_void_numbers(tmp_path: Path, cube: NDArray[np.uint16], version: int, packing: dict[str, Any]) -> None:
     """Packed numbers are what they mean, and the one that stands for none is found, in both versions."""
     data = _dataset(np.where(cube > 4000, np.nan, cube * 0.5 + 1), ("y", "x", "band"), units="nm")
     encoding: Any = {"reflectance": {**packing, "_FillValue": -9999}}

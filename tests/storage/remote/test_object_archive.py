@@ -201,12 +201,8 @@ def test_gc_takes_what_no_run_names_and_broken_off_uploads(machine: Machine) -> 
     planned = clear_up(opened, keep_days=0, dry_run=True)
     done = clear_up(opened, keep_days=0)
     assert done == planned
-    assert [removal.uri for removal in done.removals] == [
-        gone.map.uri,
-        gone.mosaic.uri,
-        gone.raw.uri,
-        "stages/rectify/half/0123456789abcdef",
-    ]
+    gone_uris = [gone.map.uri, gone.mosaic.uri, gone.raw.uri, "stages/rectify/half/0123456789abcdef"]
+    assert [removal.uri for removal in done.removals] == gone_uris
     left = {name.rpartition("/")[0] for name in archive.objects.listing("stages")}
     assert {name.split("/")[2] for name in left} == {kept.map.key, kept.mosaic.key, kept.raw.key}
     assert problems(opened) == []

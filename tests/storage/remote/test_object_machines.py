@@ -262,9 +262,6 @@ def test_what_one_machine_cleared_another_makes_again(machine: Machine) -> None:
     assert problems(third) == []
 
 
-pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
-
-
 def test_a_run_of_a_bucket_is_a_recording(bucket: str, machine: Machine) -> None:
     """The newest run and the run named give the cubes that the first machine wrote; another name is refused."""
     archive, source = machine(FIRST), simulated()

@@ -10,8 +10,6 @@ from tests.pipeline.rig.in_process import ManualClock
 
 CAPTURE = b'capture({"prefix": "", "maxCubes": 1, "maxFramesPerCube": 5})'
 PROMPT = b"\r\nhpi> "
-
-
 EXPOSURE = b'configure({"exposure": 4.5, "framePeriod": 5})'
 NO = b'{"success": false, "response": null, "errorMessage": "%s"}'
 YES = b'{"success": true, "response": %s, "errorMessage": ""}'

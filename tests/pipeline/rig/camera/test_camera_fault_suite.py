@@ -39,14 +39,8 @@ MOST_TAKEN_S = 300.0  # a sweep, whatever is asked again
 HARMLESS = (CameraFault.SLOW, CameraFault.SPLIT)
 OF_FILES = (CameraFault.BREAKS_OFF, CameraFault.REFUSES_FILES)
 OF_MIRROR = (
-    "no-reply",
-    "reply-bit-flipped",
-    "request-byte-lost",
-    "silent-reset",
-    "reset-in-upload",
-    "gone-after",
-    "cell-lost",
-    "split-replies",
+    *("no-reply", "reply-bit-flipped", "request-byte-lost", "silent-reset", "reset-in-upload"),
+    *("gone-after", "cell-lost", "split-replies"),
 )
 PLACES = re.compile(r"emulat|127\.0\.0\.1|/captured/|camera")
 

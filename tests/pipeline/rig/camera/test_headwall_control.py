@@ -16,11 +16,7 @@ from tests.pipeline.rig.in_process import ManualClock
 from tests.pipeline.rig.scripted import Pair, Reply, ScriptedTransport
 
 HELLO = b"Hyperspec\r\nhpi> "
-
-
 CAPTURE = b'capture({"prefix": "f1", "maxCubes": 1, "maxFramesPerCube": 500})\r'
-
-
 IS_CAPTURING = b"isCapturing\r"
 
 

@@ -61,8 +61,6 @@ def test_names_that_no_folder_has_are_refused(name: str) -> None:
 
 
 PATH = next_path(FINE, 3, CAMERA, vector_pairs=7, triggered=True)  # lines 3 to 9
-
-
 TAKEN = CaptureRecord(FINE, 3, 9, "/captured/x", True, (0.0, 0.1), (0.1, 0.2), index_at_end=6)
 
 

@@ -20,8 +20,6 @@ from pipeline.rig.transports import SYSTEM_CLOCK, DeviceGone
 from tests.pipeline.rig.mirror_faults import FaultyMirror, make_fault
 
 ASKED = bytes.fromhex("7e 00 11 02 68 0a 0b 3b 7e")
-
-
 REPLIED = bytes.fromhex("7e 00 11 04 00 00 00 00 f2 81 7e")
 
 

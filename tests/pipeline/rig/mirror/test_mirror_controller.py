@@ -172,14 +172,8 @@ def test_opening_connects_or_lets_go_of_the_port(monkeypatch: pytest.MonkeyPatch
 
 
 START: list[Pair] = [w.STOP_LOG, w.SET_LOG, w.START_LOG]
-
-
 X3 = pair("7E 00 15 05 24 00 00 00 0C 34 96 7E", "7E 00 15 0C 3F 00 00 00 3F 80 00 00 00 00 00 00 93 D1 7E")
-
-
 Y3 = pair("7E 00 15 05 24 01 00 00 0C 35 6A 7E", "7E 00 15 0C BE 80 00 00 00 00 00 00 BE 80 00 00 22 F2 7E")
-
-
 OUT_OF_RANGE = "7E 00 95 04 00 00 01 07 AC 97 7E"
 
 

@@ -15,8 +15,6 @@ from tests.pipeline.rig.mirror.mirror_bytes import ASK_FIRMWARE, set_value
 nasty = st.one_of(
     st.binary(max_size=50), st.lists(st.sampled_from([0x7D, 0x7E, 0x5D, 0x5E, 0]), max_size=50).map(bytes)
 )
-
-
 frames = st.builds(pro.Frame, st.integers(0, 255), nasty, st.integers(0, 255))
 
 
@@ -104,8 +102,6 @@ def test_a_wrong_crc_is_a_frame_all_the_same():
 
 
 HALF, MINUS_QUARTER = b"\x3f\x00\x00\x00", b"\xbe\x80\x00\x00"
-
-
 REQUESTS = [
     (ASK_FIRMWARE, "7E 00 01 02 00 00 A0 3C 7E"),
     (pro.ask_status(), "7E 00 02 02 00 00 A0 78 7E"),
@@ -116,8 +112,6 @@ REQUESTS = [
     (pro.set_vector(0x2600, 10, HALF + MINUS_QUARTER), "7E 00 14 0D 26 00 00 28 08 3F 00 00 00 BE 80 00 00 EF B0 7E"),
     (pro.get_vector(0x2600, 10, 2), "7E 00 15 05 26 00 00 28 08 52 95 7E"),
 ]
-
-
 REPLIES = [
     (pro.Frame(0x01, b"MRE2"), "7E 00 01 04 4D 52 45 32 F5 E9 7E"),
     (pro.Frame(0x02, pro.int_cell(0x11)), "7E 00 02 04 00 00 00 11 30 2E 7E"),

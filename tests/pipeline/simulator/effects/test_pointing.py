@@ -98,10 +98,8 @@ def test_units_differ_and_a_unit_keeps_its_field():
 
 def test_sign_is_that_of_the_scan():
     """A scan that comes back meets the same field with the other sign; one position counts as forward."""
-    forth, back = (
-        HYSTERESIS.aim(block(), "exact"),
-        HYSTERESIS.aim(block(sweep=Returning(**vars(HYSTERESIS_SWEEP))), "exact"),
-    )
+    forth = HYSTERESIS.aim(block(), "exact")
+    back = HYSTERESIS.aim(block(sweep=Returning(**vars(HYSTERESIS_SWEEP))), "exact")
     np.testing.assert_array_equal(back, -forth)
     assert scan_sign(replace(HYSTERESIS_SWEEP, lines=1)) == 1
     assert np.abs(forth).max() <= 50
@@ -155,19 +153,13 @@ def test_mirror_looks_beside_and_reports_the_plan():
     """An offset shows the scene moved by as much, while the lines and the sweep report planned positions."""
     errors = PointingErrors(offset_px=20.0, seed=1)
     along, scan = errors.offset("s")
-    moved = replace(
-        POINTING_ERRORS_SWEEP,
-        swath_px=float(along),
-        start_px=float(POINTING_ERRORS_SWEEP.start_px + scan),
-        name="moved",
-    )
+    start_px = float(POINTING_ERRORS_SWEEP.start_px + scan)
+    moved = replace(POINTING_ERRORS_SWEEP, swath_px=float(along), start_px=start_px, name="moved")
     seen = SimulatedSweep(source_of(errors), POINTING_ERRORS_SWEEP)
     np.testing.assert_allclose(seen.read(0, 40), SimulatedSweep(source_of(None), moved).read(0, 40), atol=1)
     np.testing.assert_array_equal(seen.position, line_positions(POINTING_ERRORS_SWEEP, CAMERA))
-    assert (
-        next(source_of(errors).lines(POINTING_ERRORS_SWEEP)).mirror_x
-        == line_positions(POINTING_ERRORS_SWEEP, CAMERA)[0, 0]
-    )
+    line = next(source_of(errors).lines(POINTING_ERRORS_SWEEP))
+    assert line.mirror_x == line_positions(POINTING_ERRORS_SWEEP, CAMERA)[0, 0]
 
 
 MIRROR_EFFECTS_CAMERA = LineCamera(samples=64, exposure_ms=4.0)

@@ -78,9 +78,7 @@ class Moved:
         (CORNER, 2, "3x1", 3e-3, 1e-2),
     ],
 )
-def test_closed_form_is_what_many_rays_give(
-    sweep: Sweep, line: int, variant: str, sharp: float, blurred: float
-) -> None:
+def test_closed_form_is_that_of_many_rays(sweep: Sweep, line: int, variant: str, sharp: float, blurred: float) -> None:
     """In the middle of a survey and at its corner, where lines are turned by 9 deg, with blurs and without.
 
     Tables misplace 1e-4 of the light, and grain ranges over 6 of its deviations: .0003 for either axis.

@@ -37,9 +37,8 @@ def mixed(seed: int, shape: tuple[int, int] = (80, 110), bands: int = 6) -> Rast
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float64)
     grain = rng.uniform(0, 1, (*shape, 3)) * rng.uniform(0, 0.6)
-    wave = np.sin(2 * np.pi * (y * rng.normal() + x * rng.normal()) / rng.uniform(4, 30))[..., None] * rng.normal(
-        size=3
-    )
+    wave = np.sin(2 * np.pi * (y * rng.normal() + x * rng.normal()) / rng.uniform(4, 30))
+    wave = wave[..., None] * rng.normal(size=3)
     edge = ((y - 40) * rng.normal() + (x - 55) * rng.normal() > 0)[..., None] * rng.uniform(0, 1, 3)
     planes = np.clip(0.4 + grain + 0.2 * wave + edge, 0, None).astype(np.float32)
     planes[rng.integers(20, 60), rng.integers(20, 90)] += rng.uniform(0, 2)
@@ -192,15 +191,8 @@ def test_probe_of_a_noiseless_rig_is_finite() -> None:
     values[30:] = 1.0
     noiseless = replace(RIG, detector=Detector(noiseless=True))
     probe = probe_scene(scene_of(values), noiseless, [SWEEP])
-    found = [
-        probe.level,
-        probe.span,
-        probe.slope,
-        probe.curvature,
-        probe.spectral_slope,
-        list(probe.slit_errors.values()),
-    ]
-    assert all(np.isfinite(one).all() for one in found)
+    found = (probe.level, probe.span, probe.slope, probe.curvature, probe.spectral_slope)
+    assert all(np.isfinite(one).all() for one in (*found, list(probe.slit_errors.values())))
     assert probe.unit_least_dn == pytest.approx(1 / np.sqrt(12))
     assert all(np.isfinite(menu.off.error) for menu in list_options(probe, noiseless, EFFECTS))
 

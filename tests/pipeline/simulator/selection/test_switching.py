@@ -93,8 +93,6 @@ BRIGHT_ROOF = Case(roof_e=ROOF)
 DEPTH_STEP = Case(  # focused where it looks: at infinity, all of it were a blur of 33 px
     texture=0.2, rig=rig_of(air=Air(distance_m=3.0, nearest_m=2.0, relief="step"), optics=Optics(focus_m=3.0))
 )
-
-
 TABLE = [
     pytest.param(
         FLAT,
