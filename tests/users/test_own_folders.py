@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rasterio
 from affine import Affine
 from PIL import Image
 
@@ -22,6 +21,7 @@ from pipeline.geometry.camera import LineCamera
 from storage.readers.scene_files import load_scene_file
 from storage.readers.scene_toml import load_scene_settings
 from tests.flows.conftest import command_line
+from tests.storage.readers.test_label_grids import write
 from tests.users.mistaken_files import write_files
 
 __all__ = ["command_line"]
@@ -110,16 +110,8 @@ def test_training_and_judging_say_that_labels_lay_elsewhere(tmp_path: Path, comm
     (folder / "scene.toml").write_text("wavelengths_nm = [800]\n")
     classes = np.kron(np.random.default_rng(1).integers(0, 2, (4, 4)), np.ones((8, 8))).astype(np.uint8)
     for number, beside in (("001", 0), ("002", 7), ("003", 7)):
-        for name, values, west in (
-            (number, classes * 50 + np.uint8(number), 0),
-            (f"{number}_labels", classes[:, beside:], beside),
-        ):
-            height, width = values.shape
-            kind = {"driver": "GTiff", "count": 1, "dtype": "uint8", "height": height, "width": width}
-            with rasterio.open(
-                folder / f"{name}.tif", "w", **kind, crs="EPSG:32632", transform=Affine(1, 0, west, 0, -1, 60)
-            ) as file:
-                file.write(values, 1)
+        write(folder / f"{number}.tif", classes * 50 + np.uint8(number), Affine(1, 0, 0, 0, -1, 60))
+        write(folder / f"{number}_labels.tif", classes[:, beside:], Affine(1, 0, beside, 0, -1, 60))
     out = tmp_path / "w.safetensors"
     ended = command_line("train", folder, "-o", out, "--validation", "1", "--hold-out", "003", *SMALL)
     assert ended.code == 0, ended.err

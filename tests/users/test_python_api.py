@@ -37,12 +37,9 @@ def asked(scene_files: Path, weights: Path) -> dict[str, object]:
 def surveyed(asked: dict[str, object], tmp_path_factory: pytest.TempPathFactory) -> tuple[OpenedRun, Heard]:
     """A run, and what was heard of its stages."""
     heard: Heard = defaultdict(list)
+    out = tmp_path_factory.mktemp("api") / "archive"
     with without_effects():
-        run = spectralzoom.survey(
-            asked,
-            out=tmp_path_factory.mktemp("api") / "archive",
-            progress=lambda stage, done, total: heard[stage].append(done / total),
-        )
+        run = spectralzoom.survey(asked, out=out, progress=lambda stage, done, of: heard[stage].append(done / of))
     return run, heard
 
 

@@ -123,11 +123,8 @@ def test_camera_in_order() -> None:
     """Whether it captures, what is there, and its files' server; a capture that runs is told and left alone."""
     with rig() as line:
         rows = check_camera(line.camera)
-        assert [row.asked.partition(",")[0] for row in rows] == [
-            "whether it captures",
-            "list its files",
-            "log in to its files",
-        ]
+        asked = [row.asked.partition(",")[0] for row in rows]
+        assert asked == ["whether it captures", "list its files", "log in to its files"]
         assert {row.verdict for row in rows} == {"ok"}
         line.camera().capture(5, prefix=capture_prefix(FINE))
         assert told(check_camera(line.camera), "warn") == ["whether it captures"]
