@@ -25,6 +25,7 @@ from flows.tasks.stages.condense import condense_raster
 from flows.tasks.stages.effects import choose_effects
 from flows.tasks.stages.maps import ground, segment
 from flows.tasks.stages.placement import locate, rectify_fine, register_coarse, register_fine
+from pipeline.errors import SettingsError
 from storage.archive.keys import StageRef
 
 
@@ -116,5 +117,11 @@ def capture(
     if isinstance(plan, RunRef):
         return plan.uri
     with plan.at_work():
-        known = [plan.run.archive.ref(*address.split("/")[1:]) for address in inputs or []]
+        parts = [address.split("/") for address in inputs or []]
+        if any(len(part) != 3 for part in parts) or (sweeps == "fine" and len(parts) != 2):
+            raise SettingsError(
+                f"inputs = {inputs}: expected addresses stages/STAGE/KEY of stores; a fine pass needs those of its "
+                "scores and of its effects"
+            )
+        known = [plan.run.archive.ref(*part[1:]) for part in parts]
         return capture_pass(plan, sweeps, *(known or [choose_effects(plan)])).uri

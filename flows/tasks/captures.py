@@ -14,7 +14,7 @@ from flows.settings.parameters import SurveySettings, at_due_time
 from flows.settings.survey_settings import RIG, Settings
 from flows.settings.values import KEEP_RAW
 from flows.tasks.open_survey import OpenSurvey, RunRef
-from flows.tasks.prefect_modules import prefect_context, prefect_deployments
+from flows.tasks.prefect_modules import prefect_context, prefect_deployments, prefect_exceptions
 from flows.tasks.prefect_tasks import as_task, current_observer, inside_flow
 from flows.tasks.run import SurveyRun, open_run
 from flows.tasks.scene import scene_of_visit
@@ -141,7 +141,13 @@ def _captured_elsewhere(plan: OpenSurvey, sweeps: str, *inputs: StageRef) -> str
         "sweeps": sweeps,
         "inputs": [ref.uri for ref in inputs],
     }
-    run: Any = prefect_deployments.run_deployment(plan.capture_deployment, parameters=parameters)
+    try:
+        run: Any = prefect_deployments.run_deployment(plan.capture_deployment, parameters=parameters)
+    except (prefect_exceptions.ObjectNotFound, ValueError):  # ValueError: no FLOW/NAME
+        raise RigError(
+            f"there is no deployment {plan.capture_deployment!r} on the Prefect server; expected FLOW/NAME of one: "
+            "deploy it, or correct capture_deployment"
+        ) from None
     if run.state is None or not run.state.is_completed():
         why = "it did not end" if run.state is None else run.state.message or run.state.name
         raise RigError(f"the deployment {plan.capture_deployment} did not capture the {sweeps} pass: {why}")

@@ -69,20 +69,19 @@ class Drawing:
         patch_index, columns = seen_patches(chosen, seen, region)
         drawn = segment(weights, seen, columns, patch_index, every_class=True)
         del columns  # a memory takes their room
-        shown = self._shown(region, mosaic, patch_index)
+        shown = self._shown(region, mosaic)
         assert drawn.log_probability is not None
         unknown = None
         if self.unknown is not None:
             unknown = self.unknown.pixels(self.weights.load_ood(), seen, len(mosaic.wavelength_nm))
-            unknown &= drawn.classes != UNLABELLED
-            unknown &= shown | (not self.part)
+            unknown &= (drawn.classes != UNLABELLED) & shown
             drawn.log_probability[unknown] = np.nan  # of what these pixels show the classes say nothing
         observation = self._observation(region, drawn.log_probability, shown, seen)
         classes, confidence = drawn.classes, drawn.confidence
         comparison, old = None, None
         if self.memory is None:
             after = first_probabilities(observation)
-            if self.part:
+            if not shown.all():
                 classes, confidence = after.classes()
         else:
             prior_map = self.memory.of(region, weights)
@@ -117,29 +116,29 @@ class Drawing:
     def _observation(
         self, region: Region, log_probability: NDArray[np.float32], shown: NDArray[np.bool_], seen: CoarsePass
     ) -> CurrentVisit:
-        """Return the current visit; pixels that zones or a part leave out are NaN, and keep their prior map."""
+        """Return the current visit; NaN where it captured nothing or zones leave pixels out: the prior map stays."""
         if self.left_out is not None:
             away = np.load(self.left_out, mmap_mode="r")[region.read.rows, region.read.columns]
             log_probability = np.where(away[..., None], np.float32(np.nan), log_probability)
-        if self.part:
+        if not shown.all():
             log_probability = np.where(shown[..., None], log_probability, np.float32(np.nan))
         light, step, _ = seen.capture.usual
         return CurrentVisit(log_probability, shown, pooled(seen.seen_columns), light, int(step))
 
-    def _shown(self, region: Region, mosaic: Mosaic, patch_index: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def _shown(self, region: Region, mosaic: Mosaic) -> NDArray[np.bool_]:
         """Return the pixels (y, x) of a region that were captured.
 
         In a partial scan, these are pixels that lines cover, in patches with enough of them. Filled pixels beside them
         would replace better values of the prior map.
         """
-        grid, p = region.grid, region.grid.patch
-        detailed = np.ones((int(np.prod(grid.patch_shape)), p, p), np.bool_)
-        if self.part:
-            reached = patch_pixels(grid, mosaic.coverage(region.read.rows, region.read.columns) > 0)
-            detailed &= reached & (reached.mean(axis=(1, 2), keepdims=True) >= ENOUGH_SEEN)
-        rows, columns = grid.patch_shape
-        pixels = detailed.reshape(rows, columns, p, p).swapaxes(1, 2).reshape(rows * p, columns * p)
-        return np.ascontiguousarray(pixels[: grid.height, : grid.width])
+        covered = mosaic.coverage(region.read.rows, region.read.columns) > 0
+        if not self.part:
+            return covered
+        reached = patch_pixels(region.grid, covered)
+        reached &= reached.mean(axis=(1, 2), keepdims=True) >= ENOUGH_SEEN
+        (rows, columns), p = region.grid.patch_shape, region.grid.patch
+        pixels = reached.reshape(rows, columns, p, p).swapaxes(1, 2).reshape(rows * p, columns * p)
+        return np.ascontiguousarray(pixels[: region.grid.height, : region.grid.width])
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ flipped bit is an error instead of a wrong number. An image without bands has on
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -256,13 +255,6 @@ def read_array(group: zarr.Group, name: str, selection: Any = ...) -> NDArray[An
     array = array_of(group, name)
     with damage_named(f"{group.store_path}/{name}"):
         return np.asarray(array[selection])
-
-
-def missing_files(path: Path, array: zarr.Array[Any]) -> int:
-    """Return how many files of an array in the folder ``path`` are not there: zarr reads its fill value for them."""
-    parts = zip(array.shape, array.shards or array.chunks, strict=True)
-    files = math.prod(-(-int(size) // int(part)) for size, part in parts)
-    return files - sum(one.name.isdigit() and one.is_file() for one in (path / "c").rglob("*"))
 
 
 def read_bands(group: zarr.Group) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:

@@ -61,6 +61,7 @@ class FileArray:
     chunks: tuple[int, ...]  # numbers along each axis that are read at a time
     stored: int  # bytes on the disk that it may take
     ratio: int = MOST_RATIO  # bytes of numbers that one of them can be
+    lost: str = ""  # note on parts without a file
 
     @property
     def ndim(self) -> int:

@@ -170,6 +170,10 @@ def open_headwall_cube(folder: Path) -> CubeSource:
     files = ((_PART.fullmatch(entry.name), entry) for entry in folder.iterdir() if entry.suffix.lower() == ".hdr")
     headers = dict(sorted((int(match[1]), entry) for match, entry in files if match is not None and entry.is_file()))
     notes, opened = list[str](), dict[int, EnviCube]()
+    for entry in sorted(folder.iterdir()):
+        match = _PART.fullmatch(entry.name)
+        if headers and match is not None and entry.is_file() and int(match[1]) not in headers:
+            raise SceneError(f"{entry} has no header {entry.stem}.hdr; copy the header, or move {entry.name} elsewhere")
     if not headers:
         raise SceneError(
             f"{folder} is a folder, expected a file, a Zarr store, or a folder with raw_<frame> files of a Headwall "

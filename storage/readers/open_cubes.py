@@ -136,7 +136,8 @@ def _open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSourc
         near = in_scope(arrays, cube.name)
         source = cube_source(path, cube, near, {**about, **cube.array.attrs}, guard)
         unit = str(cube.array.attrs.get("units", "")).strip()
-        notes = () if unit.lower() in NO_UNIT else (f"values are in {unit}",)
+        notes = [] if unit.lower() in NO_UNIT else [f"values are in {unit}"]
+        notes += [f"{cube.name or path.name}: {cube.array.lost}"] if cube.array.lost else []
         geobox, where = (source.geobox, ()) if source.geobox is not None else other_place(near, cube, source.shape)
         plain = tuple(note for note in source.notes if ending not in ARRAY_ENDINGS or note != UNNAMED)
         source = replace(

@@ -36,7 +36,7 @@ from storage.archive.keys import array_digest
 from storage.archive.manifests import check_files, manifest_sha256
 from storage.archive.records import Run, read_run, read_store
 from storage.archive.staging import MANIFEST_NAME
-from storage.arrays.layout import array_of, missing_files, open_group
+from storage.arrays.layout import array_of, open_group
 from storage.arrays.signal_cubes import RestoredCube, open_lines
 from storage.readers.cube_sources import CubeSource
 from storage.readers.envi_files import find_envi_pair, load_envi_header
@@ -53,6 +53,7 @@ from storage.readers.recorded_files import (
     open_recorded_cube,
     with_bits,
 )
+from storage.readers.zarr_files import lost_chunks
 from storage.remote.object_stores import is_remote
 from storage.remote.opening import is_archive, open_archive
 
@@ -153,8 +154,8 @@ def open_recording(
     for path, cube in zip(stores, cubes, strict=True):
         if not np.array_equal(cube.wavelength_nm, first.wavelength_nm):
             raise SceneError(f"{path} has other bands than {stores[0]}; name the raw cubes of one survey")
-        if "dn" in cube.group and (lost := missing_files(path / "dn", array_of(cube.group, "dn"))):
-            raise IncompleteStoreError(f"{path}/dn lacks {lost} of its files, whose lines would be 0; copy it again")
+        if "dn" in cube.group and (lost := lost_chunks(array_of(cube.group, "dn"))):
+            raise IncompleteStoreError(f"{path}/dn lacks {lost} of its chunks, whose lines would be 0; copy it again")
     sweeps = tuple(
         RecordedSweep(
             cube.sweep, cube.references, cube.position, cube.time_s, cube.exposure_ms, cube.valid_line, cube.read_lines
@@ -270,6 +271,8 @@ def _timed(
         if times is not None and np.count_nonzero(np.isfinite(times)) > 1:
             at = np.flatnonzero(np.isfinite(times))
             periods.append(float(np.median(np.diff(times[at]) / np.diff(at))) * 1e3)
+    if not exposures and periods and periods[0] < camera.exposure_ms:  # an exposure ends before the next one begins
+        exposures = [periods[0]]
     camera = _exposing(camera, exposures)
     if periods and abs(periods[0] - camera.frame_ms) > SAME_PERIOD * camera.frame_ms:
         period = max(periods[0], camera.exposure_ms)

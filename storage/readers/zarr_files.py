@@ -78,6 +78,11 @@ def zarr_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
     return {name: _file_array(path / name, array) for name, array in node.arrays()}, dict(node.attrs)
 
 
+def lost_chunks(array: zarr.Array[Any]) -> int:
+    """Return how many chunks have no file: zarr reads its fill value for them."""
+    return int(array.nchunks - array.nchunks_initialized)
+
+
 def _file_array(path: Path, array: zarr.Array[Any]) -> FileArray:
     """Return an array of a store, with its no-data value as CF, xarray or Zarr has it."""
     attributes = dict(array.attrs)
@@ -89,9 +94,13 @@ def _file_array(path: Path, array: zarr.Array[Any]) -> FileArray:
     if named is not None:
         attributes["_ARRAY_DIMENSIONS"] = list(named)
     stored = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
-    return FileArray(
-        str(path), array.shape, array.dtype, attributes, lambda part: np.asarray(array[part]), array.chunks, stored
-    )
+    lost = lost_chunks(array)
+    note = f"{lost} of {array.nchunks} chunks have no file, and are read as {array.fill_value}" if lost else ""
+
+    def get(part: Any) -> NDArray[Any]:
+        return np.asarray(array[part])
+
+    return FileArray(str(path), array.shape, array.dtype, attributes, get, array.chunks, stored, lost=note)
 
 
 def with_ingested(source: CubeSource, arrays: Arrays, attributes: Mapping[str, Any]) -> CubeSource:

@@ -25,6 +25,7 @@ from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from models.weights.files import save_weights
 from pipeline.errors import SceneError
+from pipeline.geometry.grid import UNLABELLED
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
@@ -266,6 +267,19 @@ def test_a_straight_scan_is_a_recording(
 def table(folder: Path, header: str, rows: Sequence[str]) -> None:
     """Write the pointing table beside the cube of a straight scan."""
     (folder / "scan.pointing.csv").write_text("\n".join([header, *rows]) + "\n")
+
+
+def test_what_no_valid_line_captured_has_no_class(tmp_path: Path, pushbroom: Pushbroom, weights: Path) -> None:
+    """A third of the lines is not valid: nodata in the map, without a probability, and the receipt counts it."""
+    folder, _ = pushbroom
+    table(folder, "position_px,valid", [f"{line},{int(not 40 <= line < 72)}" for line in range(96)])
+    receipt = survey_sweeps(tmp_path / "a", folder / "scan.hdr", weights=str(weights)).receipt
+    found = load_class_map(tmp_path / "a" / receipt["products"]["class_map"])
+    lost = found.classes == UNLABELLED
+    assert lost[42:70].all()
+    assert not lost[:38].any()
+    assert np.isnan(found.confidence[lost]).all()
+    assert receipt["pixels"]["map_without_a_class"] == lost.sum()
 
 
 POSITIONS = {"fewer rows": range(95), "lines far apart": range(0, 9 * 96, 9)}  # of the lines, beside the cube

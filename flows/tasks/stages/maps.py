@@ -43,7 +43,7 @@ from storage.arrays.mosaics import Attention, chosen_patches, open_mosaic, write
 from storage.arrays.quicklooks import choose_bands, develop, stretch
 
 MAP, PROBABILITIES = "class_map.zarr", "class_probabilities.zarr"
-CLASS_MAP = Product("segment", version=22, files=(MAP, PROBABILITIES), by_weights=True)
+CLASS_MAP = Product("segment", version=23, files=(MAP, PROBABILITIES), by_weights=True)
 OUT_OF_RANGE = "out_of_range.json"  # beside a map with values out of range
 LEFT_OUT = "left_out.npy"  # pixels outside of zones, while the map is drawn
 MOST_TURN_PX = 12.0  # greatest offset of the corners by rotation, at which a prior map is used

@@ -30,7 +30,7 @@ from flows.settings.load import load_settings
 from flows.tasks.local_server import local_server
 from flows.tasks.open_survey import LEASE_S, RIG_LIMIT, OpenSurvey
 from flows.tasks.prefect_tasks import Observer
-from pipeline.errors import SettingsError
+from pipeline.errors import RigError, SettingsError
 from storage.archive.archive import Archive
 from storage.archive.records import read_run
 from storage.parallel.pool import THREADS
@@ -249,6 +249,11 @@ def test_rig_and_reader_are_two_deployments(field_file: Callable[..., Path], tmp
     given = {"settings_file": str(file), "name": "north", "visit": "2026-06-01T04:00:00Z", "prior": "none"}
     with serving(scheduling, "capture/rig"):
         apart = survey(SurveySettings(**given), capture_deployment="capture/rig")
+    for name in ("capture/nobody", "rig"):
+        with pytest.raises(
+            RigError, match=f"there is no deployment '{name}' on the Prefect server; expected FLOW/NAME"
+        ):
+            survey(SurveySettings(**given, out=str(tmp_path / "elsewhere")), capture_deployment=name)
     with client() as asked:
         sweeps = [run.parameters["sweeps"] for run in asked.read_flow_runs() if run.name == "capture-north"]
     assert sorted(sweeps) == ["coarse", "fine"]

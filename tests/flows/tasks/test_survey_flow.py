@@ -17,10 +17,10 @@ from flows import survey as survey_flow
 from flows.publish import survey_command
 from flows.settings.load import load_settings
 from flows.settings.parameters import SurveySettings
-from flows.survey import draw_class_map
+from flows.survey import capture, draw_class_map
 from flows.tasks.local_server import ServerUnavailable
 from flows.tasks.open_survey import STAGES, Products
-from pipeline.errors import IncompleteStoreError
+from pipeline.errors import IncompleteStoreError, SettingsError
 from storage.archive.keys import StageRef
 from tests.flows.conftest import act_instead, newest_run
 from tests.prior_work import with_effects
@@ -157,6 +157,13 @@ def test_a_wrong_parameter_is_refused_with_the_message_of_the_command_line() -> 
         SurveySettings(budget=3)
     with pytest.raises(ValidationError, match=r"unknown setting .*did you mean 'budget'"):
         SurveySettings(bugdet=0.5)
+
+
+@pytest.mark.parametrize(("sweeps", "inputs"), [("fine", None), ("coarse", ["rectify/0123"])])
+def test_wrong_inputs_of_a_pass_are_refused(field_file: Any, sweeps: str, inputs: list[str] | None) -> None:
+    """Of a pass on its own, as a deployment runs it."""
+    with pytest.raises(SettingsError, match=r"inputs = .*: expected addresses stages/STAGE/KEY of stores"):
+        capture.fn(SurveySettings(settings_file=str(field_file())), sweeps=sweeps, inputs=inputs)
 
 
 def test_every_setting_is_a_described_field_of_the_form() -> None:

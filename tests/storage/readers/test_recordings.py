@@ -112,7 +112,7 @@ def test_a_lost_part_of_a_raw_cube_is_named(tmp_path: Path, archive: Archive, co
         assert open_recording(folder, CAMERA).sweeps
     parts = (folder / "scan-0.zarr" / "dn" / "c").rglob("*")
     next(path for path in parts if path.name.isdigit() and path.is_file()).unlink()
-    with pytest.raises(IncompleteStoreError, match=r"dn lacks 1 of its files" if copied else "it is missing"):
+    with pytest.raises(IncompleteStoreError, match=r"dn lacks 1 of its chunks" if copied else "it is missing"):
         open_recording(folder, CAMERA)
 
 
@@ -232,6 +232,10 @@ def test_several_cubes_need_pointing_and_the_same_bands(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match=r"b\.hdr has other wavelengths than .*a\.hdr"):
         open_recording(tmp_path)
     write_envi_cube(tmp_path / "b", VALUES)
+    (tmp_path / "c.pointing.csv").touch()
+    with pytest.raises(SceneError, match=r"c\.pointing\.csv is there, but no cube c; copy its header, or move"):
+        open_recording(tmp_path)
+    (tmp_path / "c.pointing.csv").unlink()
     (tmp_path / "tables").mkdir()
     with pytest.raises(SceneError, match=r"has no pointing for a; add a\.csv, or name one table for all"):
         open_recording(tmp_path, given=RecordedWith(pointing=tmp_path / "tables"))
@@ -246,6 +250,8 @@ def test_a_zarr_cube_of_anyones_is_a_recording(tmp_path: Path, version: Any) -> 
     recording = open_recording(tmp_path / "cube.zarr")
     assert recording.wavelength_nm.tolist() == [500, 600, 700]
     np.testing.assert_array_equal(recording.sweeps[0].read_lines(np.array([1, 4])), VALUES[[1, 4]])
+    next(path for path in (tmp_path / "cube.zarr" / "counts").rglob("*0") if path.is_file()).unlink()
+    assert "counts: 1 of 1 chunks have no file, and are read as 0" in open_recording(tmp_path / "cube.zarr").notes
 
 
 def test_a_headwall_folder_is_a_recording(tmp_path: Path) -> None:
@@ -266,6 +272,13 @@ def test_a_headwall_folder_is_a_recording(tmp_path: Path) -> None:
     assert recording.camera.frame_ms == pytest.approx(10.0)
     assert (sweep.references.dark.min(), sweep.references.white.max()) == (60, 3000)
     assert "frames are taken to be stamped as their exposure begins" in recording.notes
+    for header in tmp_path.glob("raw_*.hdr"):
+        header.write_text(header.read_text().replace(";Exposure (ms) = 4.0\n", ""))
+    camera = open_recording(tmp_path).camera  # no exposure is longer than the period
+    assert (camera.exposure_ms, camera.frame_ms) == pytest.approx((10.0, 10.0))
+    (tmp_path / "raw_4.hdr").unlink()
+    with pytest.raises(SceneError, match=r"raw_4.* has no header raw_4\.hdr; copy the header, or move"):
+        open_recording(tmp_path)
 
 
 def test_the_key_of_a_recording_is_its_content(files: Path, tmp_path: Path) -> None:
