@@ -80,11 +80,6 @@ class MosaicView:
         """Return the stored mosaic."""
         return open_mosaic(self.run.path("mosaic"))
 
-    @property
-    def pixels(self) -> str:
-        """Return the size of its pixels as a text."""
-        return "Pixels of the field" if self.factor == 1 else f"Pixels of {self.factor} x {self.factor} px"
-
     @cached_property
     def geobox(self) -> GeoBox:
         """Return the image's grid, in angles without a CRS."""
@@ -94,7 +89,7 @@ class MosaicView:
 
     @cached_property
     def ground(self) -> GroundGrid | None:
-        """Return the map's grid in coarse pixels with its rays, by the pose in the map's store; None without one."""
+        """Return the map's grid with its rays, by the pose in the map's store; None without one."""
         if self.run.store("ground_map") is None:
             return None
         path, scene = self.run.path("ground_map"), grid_of(open_image(self.run.path("class_map"), "classes").about)
@@ -102,12 +97,7 @@ class MosaicView:
         assert scene is not None
         assert geobox is not None
         pose = RigPose(**open_image(path, "classes").about["rig_pose"])
-        return grid_of_map(GroundView(pose, scene.ifov_rad), scene.scene_shape, geobox.zoom_out(self.factor))
-
-    @property
-    def factor(self) -> int:
-        """Return the side of a pixel in fine pixels."""
-        return self.mosaic.factor
+        return grid_of_map(GroundView(pose, scene.ifov_rad), scene.scene_shape, geobox)
 
     def rows(self, bands: Sequence[int]) -> Rows:
         """Yield the first row and the values (row, x, band) of some bands, from the top down."""
@@ -117,27 +107,27 @@ class MosaicView:
                 yield first, self.mosaic.spectra(block, bands)
                 first += len(block)
             return
-        factor, (height, width) = self.factor, self.ground.shape
+        height, width = self.ground.shape
         at_once = int(np.clip(BYTES_AT_ONCE // (4 * len(bands) * width), 1, 256))
         for first in range(0, height, at_once):
             last = min(first + at_once, height)
             out = np.full((last - first, width, len(bands)), np.nan, np.float32)
             for _, columns in map_blocks((last - first, width), (last - first, COLUMNS_AT_ONCE)):
                 pixels = self.ground.scene_pixels(slice(first, last), columns)
-                out[:, columns] = _window_at(self.mosaic, pixels, factor, bands)
+                out[:, columns] = _window_at(self.mosaic, pixels, bands)
             yield first, out
 
 
-def _window_at(mosaic: Mosaic, pixels: NDArray[np.float64], factor: int, bands: Sequence[int]) -> Floats:
+def _window_at(mosaic: Mosaic, pixels: NDArray[np.float64], bands: Sequence[int]) -> Floats:
     """Return the values at scene places (row, column, 2), reading only the window around them."""
     known = pixels[np.isfinite(pixels).all(axis=-1)]
     if not len(known):
         return np.full((*pixels.shape[:2], len(bands)), np.nan, np.float32)
     size = mosaic.shape
-    first = np.clip(np.floor(known.min(axis=0) / factor).astype(int) - 2, 0, size)
-    last = np.clip(np.ceil(known.max(axis=0) / factor).astype(int) + 2, 0, size)
+    first = np.clip(np.floor(known.min(axis=0)).astype(int) - 2, 0, size)
+    last = np.clip(np.ceil(known.max(axis=0)).astype(int) + 2, 0, size)
     window = mosaic.values(slice(first[0], last[0]), slice(first[1], last[1]), bands)
-    return image_at(np.ascontiguousarray(window), pixels - factor * first, factor=factor)
+    return image_at(np.ascontiguousarray(window), pixels - first)
 
 
 def spectral_layers(run: ExportedRun, choice: ProductChoice) -> list[Layer]:
@@ -169,11 +159,11 @@ def _reflectance(view: MosaicView, white: float) -> Layer:
         "float32",
         tuple(f"{centre:.1f} nm" for centre in wave.tolist()),
         np.nan,
-        tags={**layer_tags(view.run, "mosaic", view.geobox), "values": _format_value(white), "pixels": view.pixels},
+        tags={**layer_tags(view.run, "mosaic", view.geobox), "values": _format_value(white)},
         wavelength_nm=wave.tolist(),
         fwhm_nm=None if width is None else width.tolist(),
     )
-    title = f"{view.pixels}, {len(wave)} bands: {_format_value(white)}"
+    title = f"{len(wave)} bands: {_format_value(white)}"
     return Layer("reflectance", title, ("data", "reflectance"), image, lambda: view.rows(range(len(wave))), "1")
 
 
@@ -184,7 +174,7 @@ def _format_value(white: float) -> str:
 def _index(view: MosaicView, index: SpectralIndex, bands: Sequence[int], white: float) -> Layer:
     wave = read_bands(open_group(view.run.path("mosaic")))[0][list(bands)].tolist()
     taken = ", ".join(f"{band.symbol} {nm:.1f} nm" for band, nm in zip(index.bands, wave, strict=True))
-    tags = {"index": index.name, "bands": taken, "reference": index.reference, "pixels": view.pixels}
+    tags = {"index": index.name, "bands": taken, "reference": index.reference}
     about = layer_tags(view.run, "mosaic", view.geobox) | tags
     image = CogImage(view.geobox, "float32", (index.name,), np.nan, tags=about)
 

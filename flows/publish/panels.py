@@ -173,14 +173,11 @@ def draw_spectra(mosaic: Mosaic, found: ClassMap) -> bytes | None:
 def class_spectra(mosaic: Mosaic, classes: NDArray[np.integer], count: int) -> NDArray[np.float32]:
     """Return the mean spectra (class, band) of ``count`` classes; NaN for one that no pixel of the mosaic shows.
 
-    ``classes`` (y, x) are of the fine grid; a pixel of the mosaic has the class at its centre.
+    ``classes`` (y, x) are of the same pixels.
     """
-    half, step = mosaic.factor // 2, mosaic.factor
     sums, pixels, top = np.zeros((count, len(mosaic.components))), np.zeros(count), 0
     for scores in mosaic.row_blocks():
-        rows = np.minimum(np.arange(top, top + len(scores)) * step + half, classes.shape[0] - 1)
-        columns = np.minimum(np.arange(scores.shape[1]) * step + half, classes.shape[1] - 1)
-        under, seen = classes[np.ix_(rows, columns)], np.isfinite(scores).all(axis=2)
+        under, seen = classes[top : top + len(scores)], np.isfinite(scores).all(axis=2)
         for number in range(count):
             here = scores[seen & (under == number)]
             sums[number] += here.sum(axis=0, dtype=np.float64)

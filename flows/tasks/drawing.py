@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.tasks.field_prior_map import FieldPriorMap
-from flows.tasks.field_work import FieldWork, OverviewErrors, WeightsFile, coarse_region, overview_file, seen_patches
+from flows.tasks.field_work import GAIN, FieldWork, Scoring, WeightsFile, coarse_region, overview_file, seen_patches
 from models.network.spectral import LineSpec
 from models.policies.policies import class_errors, gain_of
 from models.reading.inference import CoarsePass, load_overview, read_coarse_prediction, segment
@@ -201,7 +201,7 @@ def draw_field(field: FieldWork, work: Drawing, least_gain: float | None, report
         begun = 0.3
         overviews.mkdir()
         paths.append(overviews)
-        overview = OverviewErrors(work.weights, work.mosaic, work.capture, overviews)
+        overview = Scoring(work.weights, work.mosaic, GAIN, work.capture, overviews)
         some = field.regions[:: -(-len(field.regions) // MOST_OVERVIEWS)]
         found = run_blocks(overview, some, pool, report=lambda done: report(begun * done), paths=paths)
         class_pixels = np.sum([one[..., 1, :].sum(axis=(0, 1)) for one in found], axis=0)

@@ -42,7 +42,8 @@ if TYPE_CHECKING:
     from models.network.temporal_reader import TemporalReader
 
 NO_PATCHES = np.empty(0, np.int64)
-OTHERS = [policy for policy in COMPARED if policy != "gain"]
+GAIN = "gain"
+OTHERS = [policy for policy in COMPARED if policy != GAIN]
 
 
 @dataclass(frozen=True)
@@ -81,15 +82,19 @@ class WeightsFile:
 
 @dataclass(frozen=True)
 class Scoring:
-    """Worker that scores the patches of a region by ``entropy`` or ``sobel``."""
+    """Worker that scores the patches of a region by the coarse prediction."""
 
     weights: WeightsFile
     mosaic: Path
     policy: str
     capture: LineSpec
+    overviews: Path | None = None  # folder that keeps the overview; None: it is not kept
 
     def __call__(self, region: Region) -> NDArray[np.float64]:
-        """Return the scores of the region's own patches, (patch_y, patch_x)."""
+        """Return the scores of the region's own patches, (patch_y, patch_x).
+
+        For ``gain``, which depends on the whole field, their `class_errors`, (patch_y, patch_x, 2, class).
+        """
         weights = self.weights.load()
         scan_pass = coarse_region(weights, self.mosaic, region, self.capture)
         if self.policy in GLANCING_POLICIES:
@@ -98,25 +103,9 @@ class Scoring:
             coarse = CoarsePrediction(
                 scan_pass.grid, scan_pass.columns, np.empty((0, 0, 0), np.float32), origin=scan_pass.origin
             )
-        return region.crop_patches(score_patches(self.policy, coarse))
-
-
-@dataclass(frozen=True)
-class OverviewErrors:
-    """Worker that computes the overview of a region, and its expected errors by class."""
-
-    weights: WeightsFile
-    mosaic: Path
-    capture: LineSpec
-    folder: Path | None = None  # that keeps the overview; None: it is not kept
-
-    def __call__(self, region: Region) -> NDArray[np.float64]:
-        """Return the `class_errors` of the region's own patches, (patch_y, patch_x, 2, class)."""
-        weights = self.weights.load()
-        seen = read_coarse_prediction(weights, coarse_region(weights, self.mosaic, region, self.capture))
-        if self.folder is not None and seen.overview is not None:
-            save_overview(overview_file(self.folder, region), seen.overview)
-        return region.crop_patches(class_errors(seen))
+        if self.overviews is not None and coarse.overview is not None:
+            save_overview(overview_file(self.overviews, region), coarse.overview)
+        return region.crop_patches(class_errors(coarse) if self.policy == GAIN else score_patches(self.policy, coarse))
 
 
 def overview_file(folder: Path, region: Region) -> Path:
@@ -155,7 +144,7 @@ class Readings:
     def __call__(self, region: Region) -> tuple[NDArray[np.uint8], NDArray[np.float64], NDArray[np.float64]]:
         """Return (reading, y, x) classes of the kept part, and scores and errors of its patches.
 
-        Scores are (patch_y, patch_x, policy) by the policies other than ``gain``, errors those of `OverviewErrors`.
+        Scores are (patch_y, patch_x, policy) by the policies other than ``gain``, errors those of `class_errors`.
         """
         weights = self.weights.load()
         seen = read_coarse_prediction(weights, coarse_region(weights, self.mosaic, region, self.capture))
@@ -178,7 +167,7 @@ def coarse_region(weights: Weights, mosaic: Path, region: Region, capture: LineS
     how: Capture = capture if mixed is None else CaptureMap(tuple(LineSpec(*one) for one in mixed[0]), mixed[1])
     return read_coarse_pass(
         weights,
-        coarse.row_blocks(None, *window),
+        coarse.row_blocks(1, *window),
         coarse.wavelength_nm,
         region.grid,
         capture=how,
@@ -221,11 +210,9 @@ class FieldWork:
         Raises SettingsError: one region does not fit the memory.
         """
         mosaic = mosaic.resolve()
-        if policy != "gain":
-            scoring = Scoring(self.weights, mosaic, policy, capture)
-            return self.joined(self._of_regions(scoring, mosaic, NO_PATCHES, report))
-        work = OverviewErrors(self.weights, mosaic, capture)
-        return _field_gain(self.joined(self._of_regions(work, mosaic, NO_PATCHES, report)))
+        work = Scoring(self.weights, mosaic, policy, capture)
+        found = self._joined(self._of_regions(work, mosaic, NO_PATCHES, report))
+        return _field_gain(found) if policy == GAIN else found
 
     def expected_errors(self, mosaic: Path, capture: LineSpec, report: Report) -> PatchExpectedErrors:
         """Return the expected errors of the overview of a mosaic, by patch.
@@ -236,7 +223,7 @@ class FieldWork:
         work = ExpectedErrors(self.weights, mosaic, capture)
         parts: list[PatchExpectedErrors] = self._of_regions(work, mosaic, NO_PATCHES, report)
         shapes = [(*region.kept_patches.shape, *parts[0].wrong.shape) for region in self.regions]
-        pixels = self.joined([part.pixels.reshape(shape) for part, shape in zip(parts, shapes, strict=True)])
+        pixels = self._joined([part.pixels.reshape(shape) for part, shape in zip(parts, shapes, strict=True)])
         pixels = pixels.reshape(-1, *parts[0].wrong.shape)
         return PatchExpectedErrors(pixels, np.sum([part.wrong for part in parts], axis=0), np.zeros(len(pixels)))
 
@@ -253,8 +240,8 @@ class FieldWork:
         maps = np.empty((len(parts[0][0]), grid.height, grid.width), np.uint8)
         for region, (part, _, _) in zip(self.regions, parts, strict=True):
             maps[:, region.kept.rows, region.kept.columns] = part
-        scores, errors = (self.joined([part[which] for part in parts]) for which in (1, 2))
-        return maps, {"gain": _field_gain(errors), **dict(zip(OTHERS, np.moveaxis(scores, -1, 0), strict=True))}
+        scores, errors = (self._joined([part[which] for part in parts]) for which in (1, 2))
+        return maps, {GAIN: _field_gain(errors), **dict(zip(OTHERS, np.moveaxis(scores, -1, 0), strict=True))}
 
     def _of_regions(
         self, worker: Callable[[Region], Any], mosaic: Path, patch_index: NDArray[np.integer], report: Report
@@ -263,7 +250,7 @@ class FieldWork:
         pool = self.pool_for(patch_index, len(open_mosaic(mosaic).components))
         return run_blocks(worker, self.regions, pool, report=report, paths=[mosaic])
 
-    def joined(self, parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    def _joined(self, parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
         """Join arrays of all regions' own patches to that of the padded grid, (patch_y, patch_x, ...)."""
         whole = np.zeros((*self.regions[0].field.patch_shape, *parts[0].shape[2:]), parts[0].dtype)
         for region, part in zip(self.regions, parts, strict=True):

@@ -290,18 +290,17 @@ def nearest_at(image: NDArray[Pixel], pixels: Floats, nothing: float, *, factor:
     return np.where(known, image[index[..., 0], index[..., 1]], image.dtype.type(nothing))
 
 
-def image_at(image: NDArray[np.float32], pixels: Floats, *, factor: int = 1) -> NDArray[np.float32]:
-    """Read an image (y, x, band), ``factor`` scene px wide, bilinearly, at scene places (row, column, 2).
+def image_at(image: NDArray[np.float32], pixels: Floats) -> NDArray[np.float32]:
+    """Read an image (y, x, band) bilinearly at scene places (row, column, 2).
 
     The result is (row, column, band) float32; NaN without a place or a value. NaN of the image is left out, as in
     ``resample``.
     """
     out = np.full((*pixels.shape[:2], image.shape[2]), np.nan, np.float32)
-    places = (pixels + 0.5) / factor - 0.5
-    known: NDArray[np.bool_] = np.all(np.isfinite(places), axis=-1)
+    known: NDArray[np.bool_] = np.all(np.isfinite(pixels), axis=-1)
     if not known.any():
         return out
-    inside = np.clip(places[known], 0, np.array(image.shape[:2]) - 1)  # the border pixels' outer halves
+    inside = np.clip(pixels[known], 0, np.array(image.shape[:2]) - 1)  # the border pixels' outer halves
     first = np.floor(inside.min(axis=0)).astype(int)
     last = np.ceil(inside.max(axis=0)).astype(int) + 1
     window = np.ascontiguousarray(image[first[0] : last[0], first[1] : last[1]])

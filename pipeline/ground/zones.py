@@ -108,11 +108,8 @@ class FieldZones:
         return fractions if self.no_go is None else np.where(_patch_means(self.no_go, grid) > 0, 0.0, fractions)
 
     def shown_patches(self, grid: SceneGrid) -> Mask:
-        """Return the patches (patch,) that are read together and hold a pixel to map: lines have to show them."""
-        rows, columns = grid.patch_shape
-        kept = _patch_means(self.kept, grid).reshape(rows // grid.factor, grid.factor, columns // grid.factor, -1) > 0
-        shown: Mask = np.repeat(np.repeat(kept.any(axis=(1, 3)), grid.factor, axis=0), grid.factor, axis=1)
-        return (shown & (grid.valid_fraction() > 0)).ravel()
+        """Return the patches (patch,) that hold a pixel to map: lines have to show them."""
+        return np.asarray((_patch_means(self.kept, grid) > 0) & (grid.valid_fraction().ravel() > 0))
 
 
 def field_zones(area: Mask | None, no_go: Mask | None) -> FieldZones | None:

@@ -194,11 +194,6 @@ class Mosaic:
         y, x = array_of(self.group, "coverage").shape
         return y, x
 
-    @property
-    def factor(self) -> int:
-        """Side of a pixel in pixels of the fine grid."""
-        return 1 if self.grid is None else self.grid.factor
-
     def scores(self, rows: slice = slice(None), columns: slice = slice(None)) -> NDArray[np.float32]:
         """Return the scores of some pixels, (y, x, component) float32, NaN where no line was captured.
 
@@ -250,8 +245,8 @@ class Mosaic:
         blocks = (self.scores(rows)[-rows.start % step :: step, ::step] for rows in cuts(self.shape[0], SHARD_ROWS))
         return np.concatenate([self.spectra(block, bands) for block in blocks])
 
-    def brightness(self, factor: int | None = None, bands: int | None = None) -> NDArray[np.float32]:
-        """Return the mean over the bands, (y, x) in pixels of ``factor`` fine ones.
+    def brightness(self, factor: int = 1, bands: int | None = None) -> NDArray[np.float32]:
+        """Return the mean over the bands, (y, x), of ``factor`` x ``factor`` px each.
 
         ``bands`` limits the mean to so many bands, spread over all.
         """
@@ -259,26 +254,24 @@ class Mosaic:
         return np.concatenate([block @ weights + offset for block in self.row_blocks(factor)])
 
     def row_blocks(
-        self, factor: int | None = None, rows: slice = slice(None), columns: slice = slice(None)
+        self, factor: int = 1, rows: slice = slice(None), columns: slice = slice(None)
     ) -> Iterator[NDArray[np.float32]]:
         """Yield the scores of a window, (y, x, component), from the top down in blocks that end at shards.
 
-        ``factor`` is the side of the returned pixels in fine ones, a multiple of the store's own; None: its own pixels.
-        Larger pixels are means of the captured ones, NaN where fewer than half are. Rows and columns count returned
-        pixels.
+        ``factor`` is the side of the returned pixels in those of the store: they are means of the captured ones, NaN
+        where fewer than half are. Rows and columns count returned pixels.
         """
-        times = 1 if factor is None else factor // self.factor
         (first, last, _), (left, right, _) = (
-            part.indices(-(-size // times)) for part, size in zip((rows, columns), self.shape, strict=True)
+            part.indices(-(-size // factor)) for part, size in zip((rows, columns), self.shape, strict=True)
         )
         while first < last:
-            below = min((first * times // SHARD_ROWS + 1) * SHARD_ROWS // times, last)
+            below = min((first * factor // SHARD_ROWS + 1) * SHARD_ROWS // factor, last)
             below = max(below, first + 1)
-            scores = self.scores(slice(first * times, below * times), slice(left * times, right * times))
-            if times > 1:
+            scores = self.scores(slice(first * factor, below * factor), slice(left * factor, right * factor))
+            if factor > 1:
                 seen = np.isfinite(scores[..., :1]).astype(np.float32)
                 none = np.zeros(seen.shape[:2], np.intp)
-                fraction, (scores, _) = block_means(seen, none, times)[0], block_means(scores, none, times)
+                fraction, (scores, _) = block_means(seen, none, factor)[0], block_means(scores, none, factor)
                 scores[fraction[..., 0] < HALF] = np.nan
             yield scores
             first = below

@@ -224,7 +224,7 @@ def ground(
             images: dict[str, NDArray[np.generic]] = {
                 "classes": nearest_at(found.classes, pixels, UNLABELLED),
                 "confidence": confidence,
-                "picture": np.nan_to_num(np.rint(image_at(colours, pixels, factor=1))).astype(np.uint8),
+                "picture": np.nan_to_num(np.rint(image_at(colours, pixels))).astype(np.uint8),
                 "age": nearest_at(age_days, pixels, np.nan),
             }
             if changes is not None:
@@ -255,6 +255,6 @@ def colours_of(mosaic: StageRef) -> NDArray[np.float32]:
     """Return three bands of a mosaic as a picture (y, x, 3) in 1..255; NaN where nothing was captured."""
     seen = open_mosaic(mosaic.path / "mosaic.zarr")
     bands, band_choice = choose_bands(seen.wavelength_nm)
-    values = np.concatenate([seen.spectra(strip, bands) for strip in seen.row_blocks(None)])
+    values = np.concatenate([seen.spectra(strip, bands) for strip in seen.row_blocks()])
     tones = develop(values, values) if band_choice.startswith("true colour") else stretch(values)
     return np.where(np.isfinite(values), 1 + 254 * tones, np.nan).astype(np.float32)

@@ -139,14 +139,14 @@ def test_a_patch_is_read_at_every_pixel_of_it(seed: int, factor: int, rows: int,
     assert np.isnan(found[0, 0])
 
 
-def test_images_are_read_between_their_own_pixels():
-    """A ramp at a quarter of the resolution is read as the ramp; a pixel without value leaves its neighbours."""
-    y, x = (np.arange(size) * 4 + 1.5 for size in (5, 6))
-    ramp = (y[:, None] * 2 + x + np.zeros((5, 6))).astype(np.float32)[..., None]
-    places = np.array([[[3.0, 7.25], [9.5, 2.0], [np.nan, np.nan]]])
-    found = image_at(ramp, places, factor=4)[0, :, 0]
-    assert found[:2] == pytest.approx([13.25, 21.0], abs=1e-5)
+def test_images_are_read_between_their_pixels():
+    """A ramp is read as the ramp, beyond the centres of the outer pixels as they are; NaN leaves its neighbours."""
+    y, x = (np.arange(size) for size in (5, 6))
+    ramp = (y[:, None] * 2 + x).astype(np.float32)[..., None]
+    places = np.array([[[0.75, 1.5], [4.4, 2.0], [np.nan, np.nan]]])
+    found = image_at(ramp, places)[0, :, 0]
+    assert found[:2] == pytest.approx([3.0, 10.0], abs=1e-5)
     assert np.isnan(found[2])
     ramp[0, 0] = np.nan
-    assert np.isnan(image_at(ramp, np.array([[[1.5, 1.5]]]), factor=4)).all()
-    assert image_at(ramp, np.array([[[1.5, 5.5]]]), factor=4)[0, 0, 0] == pytest.approx(8.5)
+    assert np.isnan(image_at(ramp, np.array([[[0.0, 0.0]]]))).all()
+    assert image_at(ramp, np.array([[[0.0, 0.75]]]))[0, 0, 0] == pytest.approx(1.0)
