@@ -20,18 +20,17 @@ from flows.settings.survey_settings import RASTER, Settings
 from flows.tasks.patch_budget import ReadingCosts
 from flows.tasks.run import SurveyRun, open_run
 from flows.tasks.scene import check_labels
-from flows.tasks.stages.accuracy import columns_of_raster, columns_of_sweeps
 from flows.tradeoff.entries import Figures, Setting, Tradeoff
-from flows.tradeoff.store import MEMORY, STORE, Values
+from flows.tradeoff.store import STORE, Values, coarse_of_sweeps
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.machine import keep_freed_memory
 from models.network.spectral import LineSpec
 from models.policies.policies import score_patches
-from models.reading.inference import CoarsePrediction, DrawnMap, coarse_prediction_of_patches, segment
+from models.reading.inference import CoarsePrediction, DrawnMap, read_coarse_pass, read_coarse_prediction, segment
 from models.weights.files import Weights
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import UNLABELLED, SceneGrid
+from pipeline.geometry.grid import UNLABELLED, SceneGrid, cuts
 from pipeline.geometry.scan import CostModel, Floats, Sweep
 from pipeline.planning.coverage import cheapest_full, full_sweeps, uniform_sweeps
 from pipeline.planning.prices import frame_patches, raw_bytes
@@ -201,11 +200,10 @@ POLICY = "gain"
 
 @dataclass(frozen=True)
 class PlannedPass:
-    """A coarse prediction, the patches to read in full with their spectral features, and the cost of the scan."""
+    """A coarse prediction, the patches to read in full, and the cost of the scan."""
 
     coarse: CoarsePrediction
     patch_index: NDArray[np.intp]
-    columns: Values  # (patch, p, p, column)
     weights: Weights
     seconds: float | None = None
     bytes_raw: int = 0
@@ -223,7 +221,8 @@ class PlannedField:
     def read(self, plan: Setting) -> DrawnMap:
         """Return the class map of a plan; the overview is read anew, whose time counts."""
         one = self.passes[plan]
-        return segment(one.weights, replace(one.coarse, overview=None), one.columns, one.patch_index)
+        coarse = replace(one.coarse, overview=None)
+        return segment(one.weights, coarse, coarse.patches(one.patch_index), one.patch_index)
 
     def judge(self, plan: Setting, drawn: DrawnMap) -> Figures:
         """Return 1 - mIoU of a map, the seconds of its scan, and the multiply-adds of the network."""
@@ -239,10 +238,9 @@ def uniform_pass(
 ) -> PlannedPass:
     """Plan to read all patches of a uniform scan."""
     seen = [SimulatedSweep(source, sweep) for sweep in sweeps]
-    columns = columns_of_sweeps(seen, source.camera, source.wavelength_nm, grid, weights, memory=MEMORY)
-    patch_index, size = grid.valid_patches(), raw_bytes(sweeps, source.camera, len(source.wavelength_nm))
-    coarse = coarse_prediction_of_patches(weights, columns, grid, capture)
-    return PlannedPass(coarse, patch_index, columns[patch_index], weights, cost.seconds(sweeps, source.camera), size)
+    coarse = coarse_of_sweeps(seen, source.camera, source.wavelength_nm, grid, weights, capture)
+    size = raw_bytes(sweeps, source.camera, len(source.wavelength_nm))
+    return PlannedPass(coarse, grid.valid_patches(), weights, cost.seconds(sweeps, source.camera), size)
 
 
 def open_field(seed: int, scene: str | None, weights: Path | None, source: str) -> SurveyRun:
@@ -274,9 +272,7 @@ def plan_every_way(seed: int, scene: str | None = None, weights: Path | None = N
     whole = passes[format_scan(*PART_OF)]
     scores, valid = score_patches(POLICY, whole.coarse), grid.valid_fraction().ravel() > 0
     for words, fraction in PARTS.items():
-        kept = np.sort(frame_patches(scores, fraction, valid))
-        columns = whole.columns[np.searchsorted(whole.patch_index, kept)]
-        passes[words] = replace(whole, patch_index=kept, columns=columns)
+        passes[words] = replace(whole, patch_index=np.sort(frame_patches(scores, fraction, valid)))
     assert run.labels is not None
     return PlannedField(run.labels, run.costs, passes, check_labels(run.scene, run.described))
 
@@ -302,21 +298,20 @@ FRACTIONS = (1.0, 0.35, 0.2, 0.15, 0.1, 0.05, 0.0)
 def plan_every_fraction(seed: int, scene: str | None = None, weights: Path | None = None) -> PlannedField:
     """Scan a farm by every line, or take a raster as it is; choose every fraction of its patches by expected gain."""
     run = open_field(seed, scene, weights, "sim" if scene is None else RASTER)
-    grid, memory = SceneGrid(*run.scene.shape, run.described.config.patch, 1), run.settings.memory
-    if run.raster is not None:
-        columns = columns_of_raster(run.raster, run.weights, run.scene.wavelength_nm, memory=memory)
+    grid, raster, wavelength_nm = run.grid, run.raster, run.scene.wavelength_nm
+    keep_freed_memory()  # as surveys do
+    if raster is not None:
+        parts = cuts(grid.height, raster.rows_at_once(run.settings.memory))
+        strips = (raster.rows(part.start, part.stop) for part in parts)
+        coarse = read_coarse_prediction(run.weights, read_coarse_pass(run.weights, strips, wavelength_nm, grid))
     else:
         _, full, _ = cheapest_full(grid, run.camera, run.settings.cost)
         seen = [SimulatedSweep(run.simulated, sweep) for sweep in full]
-        columns = columns_of_sweeps(seen, run.camera, run.scene.wavelength_nm, grid, run.weights, memory=memory)
-    keep_freed_memory()  # as surveys do
-    coarse = coarse_prediction_of_patches(run.weights, columns, grid)
+        coarse = coarse_of_sweeps(seen, run.camera, wavelength_nm, grid, run.weights)
     scores, valid = score_patches(POLICY, coarse), grid.valid_fraction().ravel() > 0
     chosen = {one: frame_patches(scores, one, valid) if one < 1 else np.flatnonzero(valid) for one in FRACTIONS}
     assert run.labels is not None
-    passes: dict[Setting, PlannedPass] = {
-        one: PlannedPass(coarse, index, columns[index], run.weights) for one, index in chosen.items()
-    }
+    passes: dict[Setting, PlannedPass] = {one: PlannedPass(coarse, index, run.weights) for one, index in chosen.items()}
     return PlannedField(run.labels, run.costs, passes, check_labels(run.scene, run.described))
 
 

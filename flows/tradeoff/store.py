@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -20,20 +20,20 @@ from numpy.typing import NDArray
 
 from flows.settings.survey_settings import SignalChoice
 from flows.tasks.scene import check_labels, judged_labels
-from flows.tasks.stages.accuracy import columns_of_raster, columns_of_sweeps
 from flows.tasks.stages.condense import with_shared_directions
 from flows.tasks.survey_model import shipped_weights
 from flows.tradeoff.entries import Figures, Setting, Tradeoff
 from flows.training.data import scene_of_file
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.spectral import LineSpec
-from models.reading.inference import coarse_prediction_of_patches, segment
+from models.reading.inference import CoarsePrediction, read_coarse_pass, read_coarse_prediction, segment
 from models.weights.files import Weights, describe_weights, load_weights
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.planning.coverage import cheapest_full, uniform_sweeps
+from pipeline.rectify.region import mosaic_rows
 from pipeline.signal.calibrate import calibrate
 from pipeline.signal.components import Components
 from pipeline.signal.condense import CondensedSweep, Condenser, ResidualLaw, calibrated_blocks, score_lines, whole_steps
@@ -45,17 +45,17 @@ from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_block
-from pipeline.source import References
+from pipeline.source import References, SweepLines
 from storage.arrays.cubes import SweepHeader
 from storage.arrays.layout import numbers_in_memory
 from storage.arrays.signal_cubes import LineRows, SignalCubeInMemory
-from storage.readers.scene_files import RasterPixels, load_scene_file
+from storage.readers.scene_files import load_scene_file
 
 Values = NDArray[np.float32]
 FIELD_SHAPE = (256, 600)  # one swath
 EXPOSURE_MS = 10.0
 BLOCK_PX = 64  # to a side, over which residuals are averaged
-MEMORY = 2**30  # bytes that rectifying may take
+ROWS = 64  # that are rectified at a time
 STEPS = (0.5, 1.0, 2.0, 3.0)  # deviations of the noise
 FEWER = (8, 6, 4)  # components
 BINS = (2, 4, 8, 17)  # bands
@@ -146,8 +146,8 @@ def scan_farm(seed: int, shape: tuple[int, int] = FIELD_SHAPE, camera: LineCamer
     def miou(values: Values) -> float:
         """Rectify scene values and read them, as a survey does."""
         plain = replace(lines, references=_unit_references(values.shape), data=values)
-        columns = columns_of_sweeps([plain], camera, source.wavelength_nm, grid, weights, memory=MEMORY)
-        return _miou(weights, columns, grid, labels, LineSpec(EXPOSURE_MS / DEFAULT_EXPOSURE_MS))
+        capture = LineSpec(EXPOSURE_MS / DEFAULT_EXPOSURE_MS)
+        return _miou(weights, coarse_of_sweeps([plain], camera, source.wavelength_nm, grid, weights, capture), labels)
 
     dark = dark_frame(block, source.choice)
     truth, sigma = lines.calibrated(light / per_dn + dark), lines.calibrated(noise_dn + dark)
@@ -183,11 +183,10 @@ def scan_raster(path: str, weights_path: Path | None) -> ScanLines:
             return float("nan")
         weights = load_weights(weights_path)
         grid = SceneGrid(*file.shape, weights.config.patch, 1)
-        raster = RasterPixels(lambda first, last: restored[first:last].copy(), file.missing, restored.shape[2], grid)
-        columns = columns_of_raster(raster, weights, file.wavelength_nm, memory=4 * MEMORY)
+        coarse = read_coarse_prediction(weights, read_coarse_pass(weights, [restored], file.wavelength_nm, grid))
         labels = judged_labels(scene, describe_weights(weights_path))
         assert labels is not None
-        return _miou(weights, columns, grid, labels, LineSpec())
+        return _miou(weights, coarse, labels)
 
     sigma = known.astype(np.float32)
     return ScanLines(lines, LineCamera(bits=16), file.wavelength_nm, values, values, sigma, known, miou, notes)
@@ -199,11 +198,23 @@ def _unit_references(shape: tuple[int, ...]) -> References:
     return References(frame, frame + 1, np.ones(shape[2], np.float32))
 
 
-def _miou(weights: Weights, columns: Values, grid: SceneGrid, labels: NDArray[np.uint8], capture: LineSpec) -> float:
+def coarse_of_sweeps(
+    sweeps: Sequence[SweepLines],
+    camera: LineCamera,
+    wavelength_nm: NDArray[np.floating],
+    grid: SceneGrid,
+    weights: Weights,
+    capture: LineSpec = LineSpec(),  # noqa: B008 - a value
+) -> CoarsePrediction:
+    """Rectify sweeps over a scene to its pixels, and predict from them."""
+    strips = (values for _, values, _ in mosaic_rows(sweeps, camera, grid, rows=ROWS))
+    return read_coarse_prediction(weights, read_coarse_pass(weights, strips, wavelength_nm, grid, capture=capture))
+
+
+def _miou(weights: Weights, coarse: CoarsePrediction, labels: NDArray[np.uint8]) -> float:
     """Return the mIoU of the map of all patches."""
-    patch_index = grid.valid_patches()
-    coarse = coarse_prediction_of_patches(weights, columns, grid, capture)
-    drawn = segment(weights, coarse, columns[patch_index], patch_index)
+    patch_index = coarse.grid.valid_patches()
+    drawn = segment(weights, coarse, coarse.patches(patch_index), patch_index)
     return mean_iou(confusion(labels, drawn.classes, weights.config.classes))
 
 

@@ -153,18 +153,6 @@ def coarse_prediction_of_columns(
     return read_coarse_prediction(weights, CoarsePass(grid, mended, capture=capture, living=living))
 
 
-def coarse_prediction_of_patches(
-    weights: Weights,
-    patches: NDArray[np.float32],
-    grid: SceneGrid,
-    capture: Capture = LineSpec(),  # noqa: B008 - a value
-) -> CoarsePrediction:
-    """Predict from normalised columns of all patches of the padded grid, (patch, p, p, column)."""
-    (down, across), (y, x) = grid.patch_shape, grid.padded_shape
-    image = patches.reshape(down, across, grid.patch, grid.patch, -1).swapaxes(1, 2).reshape(y, x, -1)
-    return coarse_prediction_of_columns(weights, image, grid, capture)
-
-
 def read_coarse_prediction(
     weights: Weights, coarse_pass: CoarsePass, overview: Overview | None = None
 ) -> CoarsePrediction:

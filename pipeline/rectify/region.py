@@ -77,65 +77,18 @@ def mosaic_tile(
 
 
 def mosaic_rows(
-    sweeps: Sequence[SweepLines], camera: LineCamera, grid: SceneGrid, *, rows: int
+    sweeps: Sequence[SweepLines], camera: LineCamera, grid: SceneGrid, *, rows: int, step: int = 1
 ) -> Iterator[tuple[int, Values, Counts]]:
-    """Rectify and blend the sweeps of one pass onto its grid, ``rows`` rows at a time.
+    """Rectify and blend the sweeps of one pass onto pixels of ``step`` scene pixels, ``rows`` rows at a time.
 
-    The pass's step selects the grid: 1 the scene's pixels, ``grid.factor`` the coarse ones. Yields the first row,
-    (row, x, band) float32 with NaN where no line reached, and (row, x) how many sweeps did.
+    Yields the first row, (row, x, band) float32 with NaN where no line reached, and (row, x) how many sweeps did.
     """
-    pixels = PixelGrid.of_scene(grid, sweeps[0].sweep.step)
+    pixels = PixelGrid.of_scene(grid, step)
     placed = [place(lines, camera) for lines in sweeps]
     columns = slice(0, pixels.shape[1])
     reach = column_reach(placed, camera, pixels, columns)
     for part in cuts(pixels.shape[0], rows):
         yield part.start, *mosaic_tile(placed, camera, pixels, part, columns, reach=reach)
-
-
-def patch_pixels(grid: SceneGrid, patch_index: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return the points of whole patches, (patch, p, p, 2), and which of them lie on the scene.
-
-    A pixel beyond the scene's border repeats one inside by reflection within the patch, or the border pixel.
-    """
-    inside, places = [], []
-    for axis, size in enumerate((grid.height, grid.width)):
-        first = grid.patch_origin(patch_index)[:, axis, None]
-        pixel = first + np.arange(grid.patch)
-        mirrored = 2 * (size - 1) - pixel
-        inside.append(pixel < size)
-        places.append(np.where(pixel < size, pixel, np.where(mirrored >= first, mirrored, size - 1)) - (size - 1) / 2)
-    points = np.stack(np.broadcast_arrays(places[0][:, :, None], places[1][:, None, :]), axis=-1)
-    return points, inside[0][:, :, None] & inside[1][:, None, :]
-
-
-def read_patches(
-    sweeps: Sequence[SweepLines],
-    camera: LineCamera,
-    grid: SceneGrid,
-    patch_index: NDArray[np.integer],
-    kernel: Kernel = "catmull-rom",
-) -> tuple[Values, NDArray[np.bool_]]:
-    """Rectify whole patches from the sweeps that saw them.
-
-    The order in which the sweeps pass the patches is the fastest: neighbours share the lines that are read.
-
-    The result is (patch, p, p, band) float32, NaN where no line reached. The mask (patch, p, p) marks pixels of the
-    scene that were seen.
-    """
-    placed = [place(one, camera) for one in sweeps]
-    points, on_scene = patch_pixels(grid, patch_index)
-    located = []
-    for one in placed:
-        for scan_path, _ in one.scan_paths:
-            coordinates = one.locate_point(scan_path, camera, points)
-            if np.isfinite(coordinates[..., 0]).any():
-                read = _reader(one, scan_path, coordinates, None, slice(0, one.signal.samples))
-                located.append(LocatedSweep(one, scan_path, coordinates, read))
-    bands = placed[0].signal.bands
-    values, coverage = np.full((*points.shape[:3], bands), np.nan, np.float32), np.zeros(points.shape[:3], np.intp)
-    for run in cut_runs([one.coordinates for one in located], bands) if located else []:
-        values[run], coverage[run] = _blend(located, run, camera, kernel)
-    return values, on_scene & (coverage > 0)
 
 
 def _blend(located: Sequence[LocatedSweep], part: Any, camera: LineCamera, kernel: Kernel) -> tuple[Values, Counts]:

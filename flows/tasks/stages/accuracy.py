@@ -27,19 +27,14 @@ from models.evaluation.metrics import (
     kappa,
 )
 from models.evaluation.placement import CONTROL_FRACTION, Placements, ReadTwice, placement_figures, run_controls
-from models.weights.files import Weights
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import UNLABELLED, SceneGrid
+from pipeline.geometry.grid import UNLABELLED
 from pipeline.geometry.scan import Axis
-from pipeline.rectify.region import read_patches
 from pipeline.simulator.effects.pointing import PointingErrors
 from pipeline.simulator.simulated import SimulatedSource
-from pipeline.source import SweepLines
 from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table
 from storage.archive.whole_files import to_json
 from storage.arrays.class_maps import load_class_map
-from storage.readers.scene_files import RasterPixels
 
 RECORD = "accuracy.json"
 ACCURACY = Product("evaluate", version=16, files=(RECORD,), by_weights=True)
@@ -141,56 +136,3 @@ def map_figures(names: Sequence[str], counts: NDArray[np.int64]) -> dict[str, An
 def load_accuracy(evaluated: StageRef) -> dict[str, Any]:
     """Read the figures of an evaluation."""
     return read_table(evaluated.path / RECORD)
-
-
-def columns_of_raster(
-    raster: RasterPixels, weights: Weights, wavelength_nm: NDArray[np.floating], *, memory: int
-) -> NDArray[np.float32]:
-    """Return the normalised spectral features of all pixels of a raster, read in blocks of rows.
-
-    The shape is (patch, p, p, column), float32, of the padded grid; nodata is 0. ``memory`` is in bytes.
-    """
-    grid = raster.grid
-    p, (down, across), valid = grid.patch, grid.patch_shape, grid.valid_patches()
-    row, column = np.divmod(valid, across)
-    columns = np.zeros((down * across, p, p, weights.basis.columns), np.float32)
-    deep = raster.rows_at_once(memory) // p
-    for first in range(0, down, deep):
-        here = (row >= first) & (row < first + deep)
-        if here.any():
-            pixels = raster.rows(first * p, min((int(row[here].max()) + 1) * p, grid.height))
-            beyond = [(0, -len(pixels) % p), (0, across * p - grid.width), (0, 0)]
-            cut = np.pad(pixels, beyond, mode="edge").reshape(-1, p, across, p, raster.bands).swapaxes(1, 2)
-            values = cut[row[here] - first, column[here]]
-            columns[valid[here]] = np.nan_to_num(weights.columns(values, wavelength_nm), nan=0.0)
-    return columns
-
-
-MEMORY_FRACTION = 32  # of the memory for a band of patches
-
-
-def columns_of_sweeps(
-    sweeps: Sequence[SweepLines],
-    camera: LineCamera,
-    wavelength_nm: NDArray[np.floating],
-    grid: SceneGrid,
-    weights: Weights,
-    *,
-    memory: int,
-) -> NDArray[np.float32]:
-    """Return the normalised spectral features of sweeps over a whole scene, computed in bands of patches.
-
-    The shape is (patch, p, p, column), float32, of the padded grid; patches beyond the scene are 0. ``memory`` is in
-    bytes.
-    """
-    p, valid = grid.patch, grid.valid_patches()
-    columns = np.zeros((int(np.prod(grid.patch_shape)), p, p, weights.basis.columns), np.float32)
-    row, column = np.divmod(valid, grid.patch_shape[1])
-    place = row if sweeps[0].sweep.along == "x" else column
-    one = int(np.count_nonzero(place == 0)) * p**2 * len(wavelength_nm) * 4
-    deep = max(1, memory // MEMORY_FRACTION // one)
-    for band in range(int(place.max()) // deep + 1):
-        patch_index = valid[place // deep == band]
-        values, _ = read_patches(sweeps, camera, grid, patch_index)
-        columns[patch_index] = weights.columns(values, wavelength_nm)
-    return columns

@@ -9,11 +9,10 @@ import pytest
 
 from flows.settings.load import load_settings
 from flows.tasks.run import open_run
-from flows.tasks.stages.accuracy import columns_of_sweeps
 from flows.tasks.survey_model import shipped_weights, weights_path
+from flows.tradeoff.store import coarse_of_sweeps
 from models.evaluation.metrics import mean_iou
 from models.evaluation.placement import Placements, ReadTwice, placement_figures, run_controls
-from models.reading.inference import coarse_prediction_of_patches
 from models.weights.files import Weights, describe_weights, load_weights
 from pipeline.errors import BudgetError
 from pipeline.geometry.camera import LineCamera
@@ -42,8 +41,7 @@ def placements(weights: Weights) -> Placements:
     grid = SceneGrid(*SHAPE, weights.config.patch, 1)
     source = SimulatedSource(scene, Rig(camera), 41)
     sweeps = [SimulatedSweep(source, sweep) for sweep in full_sweeps(grid, camera, "x")]
-    columns = columns_of_sweeps(sweeps, camera, source.wavelength_nm, grid, weights, memory=2**30)
-    seen = coarse_prediction_of_patches(weights, columns, grid)
+    seen = coarse_of_sweeps(sweeps, camera, source.wavelength_nm, grid, weights)
     twice = ReadTwice.of(weights, seen, np.asarray(scene.labels))
     return run_controls(twice, weights.config.classes, fraction=0.35, seed=41)
 

@@ -16,7 +16,6 @@ from models.reading.inference import (
     CoarsePass,
     CoarsePrediction,
     coarse_prediction_of_columns,
-    coarse_prediction_of_patches,
     draw,
     map_of_columns,
     read_coarse_pass,
@@ -156,16 +155,12 @@ def test_a_look_in_swaths_is_the_look_at_once(tiny: Maker, bands: np.ndarray):
     assert (whole.columns[37:] == whole.columns[35 : 35 - added : -1]).all()  # the pad is a mirror image
 
 
-def test_columns_and_patches_of_a_scene_are_read_alike(tiny: Maker):
-    """An image, and its patches row by row, have one overview; read in full everywhere it is the whole map."""
+def test_a_scene_is_read_in_full_by_its_columns(tiny: Maker):
+    """By the overview and all patches; a capture of other light gives another map."""
     weights = tiny()
     coarse_pass, _ = scene_columns(weights, 32, 48)
     every = coarse_pass.grid.valid_patches()
-    image, cells = (
-        coarse_prediction_of_columns(weights, coarse_pass.columns, coarse_pass.grid, DARK),
-        coarse_prediction_of_patches(weights, coarse_pass.patches(every), coarse_pass.grid, DARK),
-    )
-    assert (image.probability == cells.probability).all()
+    image = coarse_prediction_of_columns(weights, coarse_pass.columns, coarse_pass.grid, DARK)
     drawn, log_probability = map_of_columns(weights, coarse_pass.columns, coarse_pass.grid, DARK)
     own = segment(weights, image, image.patches(every), every)
     assert (drawn.confidence == own.confidence).all()

@@ -42,7 +42,9 @@ def _captured(source: RecordedSource, sweep: Sweep) -> RecordedSweep:
 
 
 def _mosaic(lines: SweepLines) -> NDArray[np.float32]:
-    return np.concatenate([values for _, values, _ in mosaic_rows([lines], CAMERA, GRID, rows=80)])
+    return np.concatenate(
+        [values for _, values, _ in mosaic_rows([lines], CAMERA, GRID, rows=80, step=lines.sweep.step)]
+    )
 
 
 def test_a_coarse_pass_from_single_lines_is_not_displaced() -> None:

@@ -12,15 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
-from pipeline.planning.coverage import full_sweeps
 from pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
-from pipeline.rectify.region import mosaic_rows, patch_pixels, read_patches
 from pipeline.signal.lines import LineCache
-from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.scene import raster_from_values
-from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
-from tests.pipeline.simulator.small_scenes import effects_on
 
 LINES, SAMPLES, BANDS = 300, 100, 2
 
@@ -115,40 +108,6 @@ def test_edge_distance_is_to_the_nearest_border() -> None:
 
 
 CAMERA = LineCamera()
-
-
-def test_patches_are_windows_of_the_mosaic() -> None:
-    """A patch read by itself holds the mosaic's own pixels."""
-    grid = SceneGrid(150, 100, 10, 2)
-    y, x = np.mgrid[:150, :100]
-    waves = [2 + np.sin(2 * np.pi * (y / (17 + 3 * k) + x / (23 - 2 * k))) for k in range(2)]
-    values = np.stack(waves, axis=-1).astype(np.float32)
-    scene = raster_from_values(values, CAMERA, name="waves", wavelength_nm=np.array([500.0, 700.0]))
-    source = SimulatedSource(scene, Rig(CAMERA), 0, effects_on("rotation", "slit", "smear"))
-    sweeps = [SimulatedSweep(source, sweep) for sweep in full_sweeps(grid, CAMERA, "x")]
-    mosaic = np.concatenate([values for _, values, _ in mosaic_rows(sweeps, CAMERA, grid, rows=64)])
-    patch_index = grid.valid_patches()
-    plain, valid = read_patches(sweeps, CAMERA, grid, patch_index)
-    np.testing.assert_array_equal(plain, mosaic.reshape(15, 10, 10, 10, -1).swapaxes(1, 2).reshape(150, 10, 10, -1))
-    assert valid.all()
-
-
-def test_a_partial_patch_is_filled_from_inside() -> None:
-    """Pixels beyond the scene repeat pixels of the same patch and are marked as not on the scene."""
-    grid = SceneGrid(12, 21, 8, 2)
-    patch_index = grid.valid_patches()
-    points, inside = patch_pixels(grid, patch_index)
-    assert inside.sum() == 12 * 21
-    origin = grid.patch_origin(patch_index)[:, None, None, :]
-    place = points + (np.array([12, 21]) - 1) / 2
-    assert (place >= origin).all()
-    assert (place <= np.array([11, 20])).all()
-
-
-def test_pixels_beyond_the_border_are_reflected() -> None:
-    """Rows 12 to 14 of a scene of 12 rows repeat rows 10 to 8."""
-    points, _ = patch_pixels(SceneGrid(12, 21, 8, 2), np.array([4]))
-    assert (points[0, :, 0, 0] + 5.5).tolist() == [8, 9, 10, 11, 10, 9, 8, 11]
 
 
 class Numbered:
