@@ -123,7 +123,8 @@ class Drawing:
         if not shown.all():
             log_probability = np.where(shown[..., None], log_probability, np.float32(np.nan))
         light, step, _ = seen.capture.usual
-        return CurrentVisit(log_probability, shown, pooled(seen.seen_columns), light, int(step))
+        coarse = seen.columns[:0] if self.memory is None else pooled(seen.seen_columns)
+        return CurrentVisit(log_probability, shown, coarse, light, int(step))
 
     def _shown(self, region: Region, mosaic: Mosaic) -> NDArray[np.bool_]:
         """Return the pixels (y, x) of a region that were captured.
