@@ -302,8 +302,8 @@ def plan_every_fraction(seed: int, scene: str | None = None, weights: Path | Non
     keep_freed_memory()  # as surveys do
     if raster is not None:
         parts = cuts(grid.height, raster.rows_at_once(run.settings.memory))
-        strips = (raster.rows(part.start, part.stop) for part in parts)
-        coarse = read_coarse_prediction(run.weights, read_coarse_pass(run.weights, strips, wavelength_nm, grid))
+        blocks = (raster.rows(part.start, part.stop) for part in parts)
+        coarse = read_coarse_prediction(run.weights, read_coarse_pass(run.weights, blocks, wavelength_nm, grid))
     else:
         _, full, _ = cheapest_full(grid, run.camera, run.settings.cost)
         seen = [SimulatedSweep(run.simulated, sweep) for sweep in full]

@@ -207,8 +207,8 @@ def coarse_of_sweeps(
     capture: LineSpec = LineSpec(),  # noqa: B008 - a value
 ) -> CoarsePrediction:
     """Rectify sweeps over a scene to its pixels, and predict from them."""
-    strips = (values for _, values, _ in mosaic_rows(sweeps, camera, grid, rows=ROWS))
-    return read_coarse_prediction(weights, read_coarse_pass(weights, strips, wavelength_nm, grid, capture=capture))
+    blocks = (values for _, values, _ in mosaic_rows(sweeps, camera, grid, rows=ROWS))
+    return read_coarse_prediction(weights, read_coarse_pass(weights, blocks, wavelength_nm, grid, capture=capture))
 
 
 def _miou(weights: Weights, coarse: CoarsePrediction, labels: NDArray[np.uint8]) -> float:

@@ -258,7 +258,7 @@ class Mosaic:
     ) -> Iterator[NDArray[np.float32]]:
         """Yield the scores of a window, (y, x, component), from the top down in blocks that end at shards.
 
-        ``factor`` is the side of the returned pixels in those of the store: they are means of the captured ones, NaN
+        ``factor`` is the side of the returned pixels in those of the store. They are means of the captured ones, NaN
         where fewer than half are. Rows and columns count returned pixels.
         """
         (first, last, _), (left, right, _) = (
