@@ -85,18 +85,20 @@ def test_regions_that_see_the_field_draw_the_fields_map(surveyed: Surveyed, tmp_
     assert _draw(run.work, run, stages, tmp_path / "one.zarr") == stored
 
 
-@pytest.mark.parametrize("stored", [True, False])
+@pytest.mark.parametrize(("overviews", "stored"), [(16, True), (16, False), (1, True)])
 def test_regions_choose_patches_by_the_classes_of_the_field(
-    surveyed: Surveyed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stored: bool
+    surveyed: Surveyed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, overviews: int, stored: bool
 ) -> None:
     """With a halo over everything they choose as one region does; no overview is left beside the map."""
     run, stages = surveyed
     gain = run.work.score("gain", _mosaics(stages)[1], run.capture, lambda done: None)
     least = float(np.quantile(gain, 0.7)) + 1e-9
+    monkeypatch.setattr("flows.tasks.drawing.MOST_OVERVIEWS", overviews)
     if not stored:  # an overview that was not kept is computed again
         monkeypatch.setattr("flows.tasks.drawing.load_overview", lambda path, weights: None)
     regions = _draw(_work(run, WorkerPool(workers=2), ALL_PX), run, stages, tmp_path / "m.zarr", least)
-    assert regions == _draw(run.work, run, stages, tmp_path / "one.zarr", least)
+    whole = _draw(run.work, run, stages, tmp_path / "one.zarr", least)
+    assert (regions == whole) == (overviews == 16)  # one of two regions has other classes
     assert regions != _contents(_store(stages, "segment/*/class_map.zarr"))
     assert not (tmp_path / "overviews").exists()
 

@@ -114,7 +114,7 @@ def test_a_later_visit_goes_on_from_such_a_map(
     both: tuple[Path, Path, dict[str, Any]], survey_png: Survey, judging: Maker, tmp_path: Path
 ) -> None:
     """What is unknown today is so whatever is remembered there; no earlier class or age of it stays."""
-    shutil.copytree(both[0], tmp_path, dirs_exist_ok=True)
+    shutil.copytree(both[1], tmp_path, dirs_exist_ok=True)
     before = set(tmp_path.glob("stages/segment/*"))
     flags = {"visit": "later", "seed": "1", "prior": "latest", **NARROW}
     receipt = survey_png(tmp_path, weights=str(judging(0.5)), **flags).receipt
