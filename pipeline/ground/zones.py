@@ -109,7 +109,7 @@ class FieldZones:
 
     def shown_patches(self, grid: SceneGrid) -> Mask:
         """Return the patches (patch,) that hold a pixel to map: lines have to show them."""
-        return np.asarray((_patch_means(self.kept, grid) > 0) & (grid.valid_fraction().ravel() > 0))
+        return _patch_means(self.kept, grid) > 0
 
 
 def field_zones(area: Mask | None, no_go: Mask | None) -> FieldZones | None:

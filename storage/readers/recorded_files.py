@@ -69,11 +69,12 @@ def find_cubes(path: Path) -> list[Path]:
         if not stem.startswith(("dark", "white")) and stem.rpartition(".")[2] not in FRAMES
     ]
     stores = sorted(entry for entry in path.iterdir() if entry.is_dir() and find_zarr_store(entry) == entry)
-    known = {stem for _, stem in stems} | {entry.name.removesuffix(".zarr").lower() for entry in stores}
+    known = {stem for _, stem in stems}
     for table in sorted(path.glob("*.pointing.*")):
         stem = table.name.partition(".pointing.")[0]
-        if stem.lower() not in known:
-            raise SceneError(f"{table} is there, but no cube {stem}; copy its header, or move the table elsewhere")
+        for data in (path / f"{stem}{ending}" for ending in DATA_ENDINGS):
+            if stem.lower() not in known and data.is_file():
+                raise SceneError(f"{data} has no header {stem}.hdr; copy the header, or move {data.name} elsewhere")
     if not cubes and not stores:
         raise SceneError(f"{path} holds no cube; expected ENVI headers (.hdr), raw_<frame> files or Zarr stores in it")
     return cubes or stores

@@ -232,10 +232,11 @@ def test_several_cubes_need_pointing_and_the_same_bands(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match=r"b\.hdr has other wavelengths than .*a\.hdr"):
         open_recording(tmp_path)
     write_envi_cube(tmp_path / "b", VALUES)
-    (tmp_path / "c.pointing.csv").touch()
-    with pytest.raises(SceneError, match=r"c\.pointing\.csv is there, but no cube c; copy its header, or move"):
+    for name in ("c.pointing.csv", "c.img"):
+        (tmp_path / name).touch()
+    with pytest.raises(SceneError, match=r"c\.img has no header c\.hdr; copy the header, or move c\.img elsewhere"):
         open_recording(tmp_path)
-    (tmp_path / "c.pointing.csv").unlink()
+    (tmp_path / "c.img").unlink()  # a table alone may be another recording's
     (tmp_path / "tables").mkdir()
     with pytest.raises(SceneError, match=r"has no pointing for a; add a\.csv, or name one table for all"):
         open_recording(tmp_path, given=RecordedWith(pointing=tmp_path / "tables"))
