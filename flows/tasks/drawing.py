@@ -1,16 +1,16 @@
 """A field's map drawn region by region: what was seen today, weighed against what is remembered of the field.
 
-As in `flows.tasks.field_work` a worker gets paths and numbers, and arrays never travel.
+As in `flows.tasks.field_work` a worker gets references to stores, and returns arrays. The survey's process writes them.
 """
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,37 +32,53 @@ from models.reading.prior_map import (
 )
 from models.reading.regions import Region
 from pipeline.geometry.grid import UNLABELLED, patch_pixels
-from storage.arrays.class_maps import write_changes_tile, write_class_tile, write_probabilities_tile
+from storage.archive.keys import StageRef
+from storage.arrays.class_maps import (
+    packed_probabilities,
+    write_changes_tile,
+    write_class_tile,
+    write_probabilities_tile,
+)
 from storage.arrays.mosaics import Mosaic, chosen_patches, open_mosaic
 from storage.parallel.pool import run_blocks
 
-OVERVIEWS = "overviews"  # beside the map, while it is drawn
+MAP, PROBABILITIES = "class_map.zarr", "class_probabilities.zarr"
 MOST_OVERVIEWS = 16  # regions whose overviews are kept: 0.5 GB; they say how frequent each class is in the field
 ENOUGH_SEEN = 0.5  # least covered fraction of a patch at the edge of a partial scan
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """Draws a region of the class map into its store: what a worker needs for that."""
+    """Draws a region of the class map: what a worker needs for that."""
 
     weights: WeightsFile
-    mosaic: Path
-    attention: Path  # whose ranks say which patches are read in detail
-    out: Path  # of the class map
-    probabilities: Path
+    mosaic: StageRef
+    attention: StageRef  # whose ranks say which patches are read in detail
     capture: LineSpec  # of the mosaic's pixels, where it does not say so itself
     memory: FieldPriorMap | None = None  # what is remembered of the field
-    left_out: Path | None = None  # (y, x) pixels of which zones have no map drawn
+    left_out: NDArray[np.bool_] | None = None  # (y, x) pixels of which zones have no map drawn
     unknown: UnknownRule | None = None  # which pixels are called unknown
     part: bool = False  # of the field was looked at: of the rest today's look says nothing
     choice: GainChoice | None = None  # of the patches that are read in full; None: all that ``attention`` ranks
 
-    def __call__(self, region: Region) -> Drawn:
-        """Read what was seen of the region coarsely and finely, and store the part of the map that is kept."""
-        weights, mosaic = self.weights.load(), open_mosaic(self.mosaic)
-        seen, chosen = coarse_region(weights, self.mosaic, region, self.capture), chosen_patches(self.attention)
+    @property
+    def inputs(self) -> list[StageRef]:
+        """Return the stores that workers read."""
+        return [self.mosaic, self.attention, *(() if self.memory is None else self.memory.inputs)]
+
+    @property
+    def chosen(self) -> NDArray[np.int64]:
+        """Return the numbers of the patches that the attention ranks, ascending."""
+        return chosen_patches(self.attention.path / "attention.zarr")
+
+    def __call__(self, region: Region) -> DrawnRegion:
+        """Read what was seen of the region coarsely and finely, and return the part of the map that is kept."""
+        weights, mosaic, chosen = self.weights.load(), open_mosaic(self.mosaic.path / "mosaic.zarr"), self.chosen
+        seen = coarse_region(weights, self.mosaic, region, self.capture)
         if self.choice is not None:
-            overview = load_overview(overview_file(self.choice.overviews, region), weights)
+            overview = None
+            if self.choice.overviews is not None:
+                overview = load_overview(overview_file(self.choice.overviews, region), weights)
             seen = predicted = read_coarse_prediction(weights, seen, overview)
             gain, here = gain_of(class_errors(seen)[:, 0], self.choice.class_pixels), region.numbers_here(chosen)
             chosen = chosen[(here >= 0) & (gain[here] >= self.choice.least_gain)]
@@ -95,30 +111,33 @@ class Drawing:
             old = changed_from(prior_map, after)
         if self.unknown is not None and unknown is not None:
             classes[unknown], confidence[unknown] = self.unknown.number, np.nan
-        origin = region.kept.top, region.kept.left
-        if old is not None:
-            write_changes_tile(self.probabilities, origin, region.crop(old))
-        write_class_tile(self.out, origin, region.crop(classes), region.crop(confidence))
-        write_probabilities_tile(
-            self.probabilities, origin, *map(region.crop, (after.log_probability, after.age_days, after.light))
-        )
         unread = 0 if seen.out_of_range is None else int(np.count_nonzero(region.crop(seen.out_of_range)))
+        images = DrawnRegion(
+            region.crop(classes),
+            region.crop(confidence),
+            packed_probabilities(region.crop(after.log_probability)),
+            region.crop(after.age_days),
+            region.crop(after.light),
+            None if old is None else region.crop(old),
+            Drawn(unread, comparison),
+        )
         if self.choice is None:
-            return Drawn(unread, comparison)
+            return images
         read, changed = np.zeros(gain.shape, np.bool_), np.zeros(gain.shape, np.float32)
         read[patch_index] = True
         kept = region.crop_patches
         before = predicted.probability.argmax(axis=-1)[: region.grid.height, : region.grid.width]
         other = (drawn.classes != before) & (drawn.classes != UNLABELLED)
         changed[patch_index] = patch_pixels(region.grid, other)[patch_index].mean(axis=(1, 2))
-        return Drawn(unread, comparison, FullReading(kept(gain), kept(read), kept(changed)))
+        reading = FullReading(kept(gain), kept(read), kept(changed))
+        return replace(images, drawn=replace(images.drawn, reading=reading))
 
     def _observation(
         self, region: Region, log_probability: NDArray[np.float32], shown: NDArray[np.bool_], seen: CoarsePass
     ) -> CurrentVisit:
         """Return the current visit; NaN where it captured nothing or zones leave pixels out: the prior map stays."""
         if self.left_out is not None:
-            away = np.load(self.left_out, mmap_mode="r")[region.read.rows, region.read.columns]
+            away = self.left_out[region.read.rows, region.read.columns]
             log_probability = np.where(away[..., None], np.float32(np.nan), log_probability)
         if not shown.all():
             log_probability = np.where(shown[..., None], log_probability, np.float32(np.nan))
@@ -147,7 +166,7 @@ class GainChoice:
     """Choice of patches by their gain: by how frequent the classes are in the field, as its overviews say."""
 
     least_gain: float
-    overviews: Path  # folder with those of some regions, which are not computed again
+    overviews: Path | None  # folder with those of some regions, which are not computed again
     class_pixels: NDArray[np.float64]  # (class,) expected in those regions
 
 
@@ -188,32 +207,57 @@ class Drawn:
     reading: FullReading | None = None  # None where patches were chosen before
 
 
-def draw_field(field: FieldWork, work: Drawing, least_gain: float | None, report: Callable[[float], None]) -> Drawn:
-    """Draw class map and class probabilities into stores that were created for them.
+@dataclass(frozen=True)
+class DrawnRegion:
+    """The part of the map that a region keeps: (y, x) images as they are stored."""
+
+    classes: NDArray[np.uint8]
+    confidence: NDArray[np.float32]
+    packed: NDArray[np.uint8]  # (y, x, class) `packed_probabilities`
+    age_days: NDArray[np.float32]
+    light: NDArray[np.float32]
+    old_class: NDArray[np.uint8] | None  # None without a prior map
+    drawn: Drawn
+
+
+def draw_field(
+    field: FieldWork, work: Drawing, path: Path, least_gain: float | None, report: Callable[[float], None]
+) -> Drawn:
+    """Draw class map and class probabilities into the stores that were created for them in the folder ``path``.
 
     With ``least_gain``, the full network reads the patches with that gain, among those that the attention ranks.
     Raises SettingsError: not even one region at a time fits the memory.
     """
-    pool = field.pool_for(chosen_patches(work.attention), len(open_mosaic(work.mosaic).components))
-    prior_map = () if work.memory is None else (work.memory.probabilities, work.memory.mosaic)
-    paths = [work.mosaic, work.attention, work.out, work.probabilities, *prior_map]
-    begun, overviews = 0.0, work.out.parent / OVERVIEWS
-    if least_gain is not None:
-        begun = 0.3
-        overviews.mkdir()
-        paths.append(overviews)
-        overview = Scoring(work.weights, work.mosaic, GAIN, work.capture, overviews)
-        some = field.regions[:: -(-len(field.regions) // MOST_OVERVIEWS)]
-        found = run_blocks(overview, some, pool, report=lambda done: report(begun * done), paths=paths)
-        class_pixels = np.sum([one[..., 1, :].sum(axis=(0, 1)) for one in found], axis=0)
-        work = replace(work, choice=GainChoice(least_gain, overviews, class_pixels))
-    parts: list[Drawn] = run_blocks(
-        work, field.regions, pool, report=lambda done: report(begun + (1 - begun) * done), paths=paths
-    )
+    pool = field.pool_for(work.chosen, len(open_mosaic(work.mosaic.path / "mosaic.zarr").components))
+
+    def take(region: Region, images: DrawnRegion) -> Drawn:
+        origin = region.kept.top, region.kept.left
+        if images.old_class is not None:
+            write_changes_tile(path / PROBABILITIES, origin, images.old_class)
+        write_class_tile(path / MAP, origin, images.classes, images.confidence)
+        write_probabilities_tile(path / PROBABILITIES, origin, images.packed, images.age_days, images.light)
+        return images.drawn
+
+    begun = 0.0
+    with TemporaryDirectory(prefix="overviews-", dir=path) as folder:
+        if least_gain is not None:
+            begun, overviews = 0.3, Path(folder) if pool.shares_memory else None
+            overview = Scoring(work.weights, work.mosaic, GAIN, work.capture, overviews)
+            some = field.regions[:: -(-len(field.regions) // MOST_OVERVIEWS)]
+            found = run_blocks(overview, some, pool, report=lambda done: report(begun * done), inputs=work.inputs)
+            class_pixels = np.sum([one[..., 1, :].sum(axis=(0, 1)) for one in found], axis=0)
+            work = replace(work, choice=GainChoice(least_gain, overviews, class_pixels))
+        parts: list[Drawn] = run_blocks(
+            work,
+            field.regions,
+            pool,
+            take=take,
+            report=lambda done: report(begun + (1 - begun) * done),
+            inputs=work.inputs,
+        )
     compared = [part.comparison for part in parts if part.comparison is not None]
     reading = None
     if least_gain is not None:
-        shutil.rmtree(overviews)
         shape = field.regions[0].field.patch_shape
         reading = FullReading(np.zeros(shape), np.zeros(shape, np.bool_), np.zeros(shape, np.float32))
         for region, part in zip(field.regions, parts, strict=True):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from models.reading.regions import Box, Region
 from models.weights.files import Weights
 from pipeline.geometry.grid import pad_by_reflection
 from pipeline.rectify.registration.alignment import FieldShift, field_shift
+from storage.archive.keys import StageRef
 from storage.arrays.class_maps import ProbabilityStore
 from storage.arrays.mosaics import open_mosaic
 
@@ -29,18 +29,23 @@ Gap = tuple[int, int]  # pixels before the first and after the last
 
 @dataclass(frozen=True)
 class FieldPriorMap:
-    """Paths of the prior map of a field, its age and shift."""
+    """Stores of the prior map of a field, its age and shift."""
 
-    probabilities: Path
-    mosaic: Path  # of the last visit
+    probabilities: StageRef  # the class map of the last visit
+    mosaic: StageRef
     days: float
     day_of_year: float | None  # of the current visit
     classes: tuple[int, ...]  # see `flows.tasks.prior_maps.Prior`
     shift_px: tuple[int, int] = (0, 0)  # down and right, to the current visit
 
+    @property
+    def inputs(self) -> list[StageRef]:
+        """Return the stores that workers read."""
+        return [self.probabilities, self.mosaic]
+
     def of(self, region: Region, weights: Weights) -> PriorMap:
         """Read the prior map of a region, in the classes of the weights."""
-        store = ProbabilityStore(self.probabilities)
+        store = ProbabilityStore(self.probabilities.path / "class_probabilities.zarr")
         rows, columns = (
             _moved(part, by, size)
             for part, by, size in zip((region.read.rows, region.read.columns), self.shift_px, store.shape, strict=True)
@@ -80,14 +85,14 @@ def shifted(image: NDArray[np.float32], by: Sequence[int]) -> NDArray[np.float32
     return _framed(image[parts[0][0], parts[1][0]], (parts[0][1], parts[1][1]))
 
 
-def prior_map_lies(before: Sequence[EarlierRun], now: Path) -> FieldShift:
+def prior_map_lies(before: Sequence[EarlierRun], now: StageRef) -> FieldShift:
     """Return the shift of earlier visits, the newest first, against the present one [px]; compared in cells."""
 
-    def picture(mosaic: Path) -> NDArray[np.float32]:
-        return open_mosaic(mosaic).brightness(CELL_PX)
+    def picture(mosaic: StageRef) -> NDArray[np.float32]:
+        return open_mosaic(mosaic.path / "mosaic.zarr").brightness(CELL_PX)
 
     shifts = ([round(by / CELL_PX) for by in one.shift_px] for one in before)
-    pictures = (shifted(picture(one.mosaic.path / "mosaic.zarr"), by) for one, by in zip(before, shifts, strict=True))
+    pictures = (shifted(picture(one.mosaic), by) for one, by in zip(before, shifts, strict=True))
     found = field_shift(picture(now), laid_together(pictures), reach_px=REACH_PX / CELL_PX)
     return replace(found, shift=(CELL_PX * found.shift[0], CELL_PX * found.shift[1]))
 

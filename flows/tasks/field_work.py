@@ -1,14 +1,15 @@
 """Compute the model over a field on disk, region by region, with any worker pool.
 
-A worker gets paths and numbers, opens its inputs, and holds one region in memory. No arrays are sent.
+A worker gets references to stores, opens them, holds one region in memory, and returns arrays.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -35,6 +36,7 @@ from models.weights.files import Weights, describe_weights, load_ood, load_reade
 from pipeline.errors import WeightsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.rectify.region import free_tiles
+from storage.archive.keys import StageRef
 from storage.arrays.mosaics import open_mosaic
 from storage.parallel.pool import RESERVED_BYTES, Report, WorkerPool, memory_refusal, mib, run_blocks
 
@@ -56,6 +58,10 @@ class WeightsFile:
     path: Path
     seal: str
     device: str = PROCESSOR  # of the network
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Travel with the content of the file, which other machines may lack."""
+        return _weights_there, (self.path.absolute(), self.seal, self.device, self.path.read_bytes())
 
     def _check(self) -> None:
         if describe_weights(self.path).about[SEAL] != self.seal:
@@ -80,12 +86,26 @@ class WeightsFile:
         return load_weights(self.path).on(self.device)
 
 
+@cache
+def _folder_of_weights() -> TemporaryDirectory[str]:
+    return TemporaryDirectory(prefix="spectralzoom-weights-")
+
+
+def _weights_there(path: Path, seal: str, device: str, content: bytes) -> WeightsFile:
+    """Return weights to a worker, in a temporary file where it does not see that of the survey."""
+    if not path.is_file():
+        path = Path(_folder_of_weights().name) / f"{seal[:20]}.safetensors"
+        if not path.is_file():
+            path.write_bytes(content)
+    return WeightsFile(path, seal, device)
+
+
 @dataclass(frozen=True)
 class Scoring:
     """Worker that scores the patches of a region by the coarse prediction."""
 
     weights: WeightsFile
-    mosaic: Path
+    mosaic: StageRef
     policy: str
     capture: LineSpec
     overviews: Path | None = None  # folder that keeps the overview; None: it is not kept
@@ -118,7 +138,7 @@ class ExpectedErrors:
     """Worker that computes the expected errors of the overview at a region."""
 
     weights: WeightsFile
-    mosaic: Path
+    mosaic: StageRef
     capture: LineSpec
 
     def __call__(self, region: Region) -> PatchExpectedErrors:
@@ -137,7 +157,7 @@ class Readings:
     """Worker that segments a region by the overview alone and, if asked, by the full network everywhere."""
 
     weights: WeightsFile
-    mosaic: Path
+    mosaic: StageRef
     capture: LineSpec
     in_full: bool
 
@@ -155,14 +175,14 @@ class Readings:
         return np.stack(maps), region.crop_patches(scores), region.crop_patches(class_errors(seen))
 
 
-def coarse_region(weights: Weights, mosaic: Path, region: Region, capture: LineSpec) -> CoarsePass:
+def coarse_region(weights: Weights, mosaic: StageRef, region: Region, capture: LineSpec) -> CoarsePass:
     """Read a region of a stored mosaic, in blocks of rows, after the memory of the one before is given back.
 
     ``capture`` is the capture of pixels for which the mosaic has none.
     """
     free_tiles()
     give_back_freed_memory()  # regions differ in size: their remainders would add up over a large field
-    coarse, window = open_mosaic(mosaic), (region.read.rows, region.read.columns)
+    coarse, window = open_mosaic(mosaic.path / "mosaic.zarr"), (region.read.rows, region.read.columns)
     mixed = coarse.captures(*window)
     how: Capture = capture if mixed is None else CaptureMap(tuple(LineSpec(*one) for one in mixed[0]), mixed[1])
     return read_coarse_pass(
@@ -204,22 +224,20 @@ class FieldWork:
     pool: WorkerPool
     memory: int  # of this process and its workers [bytes]
 
-    def score(self, policy: str, mosaic: Path, capture: LineSpec, report: Report) -> NDArray[np.float64]:
+    def score(self, policy: str, mosaic: StageRef, capture: LineSpec, report: Report) -> NDArray[np.float64]:
         """Return the scores of all patches of the padded grid, (patch_y, patch_x).
 
         Raises SettingsError: one region does not fit the memory.
         """
-        mosaic = mosaic.resolve()
         work = Scoring(self.weights, mosaic, policy, capture)
         found = self._joined(self._of_regions(work, mosaic, NO_PATCHES, report))
         return _field_gain(found) if policy == GAIN else found
 
-    def expected_errors(self, mosaic: Path, capture: LineSpec, report: Report) -> PatchExpectedErrors:
+    def expected_errors(self, mosaic: StageRef, capture: LineSpec, report: Report) -> PatchExpectedErrors:
         """Return the expected errors of the overview of a mosaic, by patch.
 
         Raises SettingsError: one region does not fit the memory.
         """
-        mosaic = mosaic.resolve()
         work = ExpectedErrors(self.weights, mosaic, capture)
         parts: list[PatchExpectedErrors] = self._of_regions(work, mosaic, NO_PATCHES, report)
         shapes = [(*region.kept_patches.shape, *parts[0].wrong.shape) for region in self.regions]
@@ -228,13 +246,13 @@ class FieldWork:
         return PatchExpectedErrors(pixels, np.sum([part.wrong for part in parts], axis=0), np.zeros(len(pixels)))
 
     def readings(
-        self, mosaic: Path, capture: LineSpec, *, in_full: bool, report: Report
+        self, mosaic: StageRef, capture: LineSpec, *, in_full: bool, report: Report
     ) -> tuple[NDArray[np.uint8], dict[str, NDArray[np.float64]]]:
         """Return the class maps (reading, y, x) by the overview and, ``in_full``, by the full network everywhere.
 
         Also returns the (patch_y, patch_x) scores by the policies that are compared. Raises as `score`.
         """
-        grid, mosaic = self.regions[0].field, mosaic.resolve()
+        grid = self.regions[0].field
         work, read = Readings(self.weights, mosaic, capture, in_full), grid.valid_patches() if in_full else NO_PATCHES
         parts = self._of_regions(work, mosaic, read, report)
         maps = np.empty((len(parts[0][0]), grid.height, grid.width), np.uint8)
@@ -244,11 +262,11 @@ class FieldWork:
         return maps, {GAIN: _field_gain(errors), **dict(zip(OTHERS, np.moveaxis(scores, -1, 0), strict=True))}
 
     def _of_regions(
-        self, worker: Callable[[Region], Any], mosaic: Path, patch_index: NDArray[np.integer], report: Report
+        self, worker: Callable[[Region], Any], mosaic: StageRef, patch_index: NDArray[np.integer], report: Report
     ) -> list[Any]:
         """Run a worker that reads ``patch_index`` in full for all regions."""
-        pool = self.pool_for(patch_index, len(open_mosaic(mosaic).components))
-        return run_blocks(worker, self.regions, pool, report=report, paths=[mosaic])
+        pool = self.pool_for(patch_index, len(open_mosaic(mosaic.path / "mosaic.zarr").components))
+        return run_blocks(worker, self.regions, pool, report=report, inputs=[mosaic])
 
     def _joined(self, parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
         """Join arrays of all regions' own patches to that of the padded grid, (patch_y, patch_x, ...)."""

@@ -7,16 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.placed import PixelGrid, PlacedSweep
 from pipeline.rectify.region import (
     COPIES,
+    Counts,
     MosaicWork,
+    Place,
     Tile,
     TileMaker,
+    Values,
     cache_bytes,
     free_tiles,
     opened_tiles,
@@ -24,36 +26,38 @@ from pipeline.rectify.region import (
     plan_tiles,
 )
 from pipeline.rectify.sweep_paths import SweepPath, interlaced_paths, sweep_paths
+from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table
 from storage.arrays.geolocation import Tables, open_geolocation
-from storage.arrays.mosaics import MosaicWriter, write_tiles
+from storage.arrays.mosaics import MosaicWriter
 from storage.arrays.signal_cubes import open_signal_cubes
-from storage.parallel.pool import RESERVED_BYTES, THREADS, WorkerPool, memory_refusal, mib
+from storage.parallel.pool import RESERVED_BYTES, THREADS, WorkerPool, memory_refusal, mib, run_blocks
+
+REGISTRATION, TIE_POINTS = "registration.json", "geolocation.zarr"
 
 
-def open_sweeps(signal: Path, registration: Path | None, camera: LineCamera) -> list[SweepPath]:
-    """Open the compressed sweeps of a folder, by name, with the corrections of a registration."""
-    found = None if registration is None else read_table(registration)["sweeps"]
-    return sweep_paths(open_signal_cubes(signal), camera, found)
+def open_sweeps(signal: StageRef, registration: StageRef | None, camera: LineCamera) -> list[SweepPath]:
+    """Open the compressed sweeps, by name, with the corrections of a registration."""
+    found = None if registration is None else read_table(registration.path / REGISTRATION)["sweeps"]
+    return sweep_paths(open_signal_cubes(signal.path), camera, found)
 
 
 @dataclass(frozen=True)
 class MosaicRecipe:
-    """Recipe of a mosaic: absolute paths and parameters, valid in every process that sees the paths."""
+    """Recipe of a mosaic: stores and parameters, valid in every process that can read the stores."""
 
-    signal: Path  # folder of compressed sweeps
+    signal: StageRef  # compressed sweeps
     camera: LineCamera
     grid: PixelGrid
     kernel: Kernel = "catmull-rom"
-    geolocation: Path | None = None  # tie points of the sweeps; None computes them
+    geolocation: StageRef | None = None  # tie points of the sweeps; None computes them
     interlaced: bool = False  # sweeps of two passes with lines between each other
-    registration: Path | None = None  # record of the corrections
+    registration: StageRef | None = None
 
     @property
-    def folders(self) -> list[Path]:
-        """Return the paths that workers must see."""
-        given = (self.signal, self.geolocation, None if self.registration is None else self.registration.parent)
-        return [path for path in given if path is not None]
+    def inputs(self) -> list[StageRef]:
+        """Return the stores that workers read."""
+        return [one for one in (self.signal, self.geolocation, self.registration) if one is not None]
 
     def sweeps(self) -> list[SweepPath]:
         """Open the sweeps, in the order of their names. Raises IncompleteStoreError: one is missing or damaged."""
@@ -68,7 +72,9 @@ class MosaicRecipe:
             return MosaicWork(
                 interlaced_paths(self.sweeps(), self.camera, self.grid), self.camera, self.grid, self.kernel
             )
-        tables: Tables = {} if self.geolocation is None else open_geolocation(self.geolocation)
+        tables: Tables = {}
+        if self.geolocation is not None:
+            tables = open_geolocation(self.geolocation.path / TIE_POINTS)
         placed = []
         for one in self.sweeps():  # no stored tie points if lines are too uneven
             stored = tables.get(one.lines.sweep.name)
@@ -115,7 +121,11 @@ def write_mosaic(
     if not pool.elsewhere and budget.workers < min(pool.count, len(tiles)):
         pool = WorkerPool(pool.scheduler, budget.workers)
     places = [(tile.rows, tile.columns) for tile in tiles]
-    write_tiles(writer, maker, places, pool, paths=recipe.folders, report=report)
+
+    def take(place: Place, made: tuple[Values, Counts]) -> None:
+        writer.write_tile(place[0].start, place[1].start, *made)
+
+    run_blocks(maker, places, pool, take=take, report=report, inputs=recipe.inputs)
     free_tiles()
     return budget
 

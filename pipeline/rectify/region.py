@@ -27,6 +27,7 @@ GROUP_COLUMNS = 32  # tiles are cut between groups of so many columns
 
 Values = NDArray[np.float32]
 Counts = NDArray[np.intp]
+Place = tuple[slice, slice]  # rows and columns of a mosaic
 Reaches = Sequence[Sequence[ColumnReach | None]]  # of each sweep, of each of its scan paths
 
 
@@ -193,8 +194,9 @@ class TileMaker:
     open: OpenWork
     cache: int
 
-    def __call__(self, rows: slice, columns: slice) -> tuple[Values, Counts]:
+    def __call__(self, place: Place) -> tuple[Values, Counts]:
         """Return the (y, x, component) scores and (y, x) coverage of a part, NaN and 0 where nothing is seen."""
+        rows, columns = place
         work, lines, reach = opened_tiles(self)
         shown = reach(columns.start, columns.stop)
         return mosaic_tile(

@@ -94,14 +94,12 @@ class StageRef:
     stage: str
     key: str
     folder: Path = field(compare=False)
-    fetch: Callable[[str], None] | None = field(default=None, compare=False, repr=False)
+    fetch: Callable[[str], Path] | None = field(default=None, compare=False, repr=False)
 
     @property
     def path(self) -> Path:
         """Folder of the store on this machine; a store in a bucket is fetched."""
-        if self.fetch is not None:
-            self.fetch(self.uri)
-        return self.folder
+        return self.folder if self.fetch is None else self.fetch(self.uri)
 
     @property
     def uri(self) -> str:

@@ -18,7 +18,7 @@ import zarr
 from numpy.typing import NDArray
 
 from pipeline.errors import IncompleteStoreError, ShapeError
-from pipeline.geometry.grid import UNLABELLED
+from pipeline.geometry.grid import UNLABELLED, cuts
 from storage.arrays.georeference import create_placed_group
 from storage.arrays.layout import (
     MAP_PACKING,
@@ -177,26 +177,26 @@ def old_class_flags(legend: ClassNames) -> dict[str, Any]:
     return {**class_flags(legend.names, legend.colours), "long_name": words}
 
 
-def write_probabilities_tile(
-    path: Path, origin: tuple[int, int], log_probability: Floats, age_days: Floats, light: Floats
-) -> None:
-    """Store (y, x, class) log-probabilities, (y, x) ages and light of whole shards, the first pixel at ``origin``.
+def packed_probabilities(log_probability: Floats) -> NDArray[np.uint8]:
+    """Return (y, x, class) log-probabilities in stored bytes; NaN is unknown, values below `LEAST` are `UNLIKELY`."""
+    packed = np.empty(log_probability.shape, np.uint8)
+    for rows in cuts(len(packed), SHARD_ROWS):  # so that temporary floats are few
+        part = log_probability[rows]
+        steps = np.rint((np.where(part < LEAST, UNLIKELY, np.minimum(part, 0)) - FAINTEST) / STEP)
+        packed[rows] = np.where(np.isnan(part), NOTHING, np.minimum(steps, NOTHING - 1))
+    return packed
 
-    NaN stands for unknown; values below `LEAST` become `UNLIKELY`.
+
+def write_probabilities_tile(
+    path: Path, origin: tuple[int, int], packed: NDArray[np.uint8], age_days: Floats, light: Floats
+) -> None:
+    """Store `packed_probabilities` (y, x, class), (y, x) ages and light of whole shards, the first pixel at ``origin``.
 
     Raises IncompleteStoreError: there is no store.
     """
-    group = open_group(path, "r+")
-    likelihood, ages, lights = (array_of(group, name) for name in ("log_probability", "age", "light"))
-    place = tile_place(origin, age_days.shape)
-    for top in range(
-        0, len(age_days), SHARD_ROWS
-    ):  # so that the packed values of all rows are never in memory together
-        part = log_probability[top : top + SHARD_ROWS]
-        packed = np.rint((np.where(part < LEAST, UNLIKELY, np.minimum(part, 0)) - FAINTEST) / STEP)
-        rows = slice(place[0].start + top, place[0].start + top + len(part))
-        likelihood[rows, place[1]] = np.where(np.isnan(part), NOTHING, np.minimum(packed, NOTHING - 1)).astype(np.uint8)
-    ages[place], lights[place] = age_days, light
+    group, place = open_group(path, "r+"), tile_place(origin, age_days.shape)
+    for name, values in (("log_probability", packed), ("age", age_days), ("light", light)):
+        array_of(group, name)[place] = values
 
 
 def write_changes_tile(path: Path, origin: tuple[int, int], old_class: NDArray[np.uint8]) -> None:

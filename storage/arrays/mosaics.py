@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +40,6 @@ from storage.arrays.signal_cubes import (
     steps_within,
     write_components,
 )
-from storage.parallel.pool import WorkerPool, run_blocks
 
 CAPTURES = "capture"  # array of a mosaic whose pixels were captured in several ways
 HALF = 0.5  # least fraction of its finer pixels with which a pixel has a value
@@ -76,18 +74,6 @@ class MosaicWriter:
         about = {"long_name": "sweeps that saw a pixel", "units": "1", **place}
         self._step = step
         self._coverage = create_array(self.group, "coverage", image_spec(("y", "x"), shape, "|u1"), about)
-
-    @classmethod
-    def reopen(cls, path: Path) -> MosaicWriter:
-        """Return a writer for a mosaic that was created before, in this process or another.
-
-        Raises IncompleteStoreError: there is no mosaic.
-        """
-        writer = cls.__new__(cls)
-        writer.path, writer.group = path, open_group(path, "r+")
-        writer._scores, writer._coverage = (array_of(writer.group, name) for name in ("scores", "coverage"))
-        writer._step = step_of(writer.group)
-        return writer
 
     @property
     def tile_shape(self) -> tuple[int, int]:
@@ -141,40 +127,6 @@ class MosaicWriter:
 def _unseen(dtype: str) -> int:
     """Return the value of a pixel without a score, CF's ``_FillValue``."""
     return int(np.iinfo(np.dtype(dtype)).min)
-
-
-MakeTile = Callable[[slice, slice], tuple[NDArray[np.float32], NDArray[np.integer[Any]]]]  # (rows, columns) of a mosaic
-
-
-def write_tiles(
-    writer: MosaicWriter,
-    make: MakeTile,
-    places: Sequence[tuple[slice, slice]],
-    pool: WorkerPool,
-    *,
-    paths: Sequence[Path] = (),
-    report: Callable[[float], None] = lambda done: None,
-) -> None:
-    """Store the tiles that ``make`` returns for the rows and columns of ``places``, one task for each.
-
-    Every worker gives the same bytes. Raises as `run_blocks`.
-    """
-    out = writer.path.absolute()
-    if pool.shares_memory:
-        _reopened(out)  # before several threads ask for it
-    run_blocks(partial(_write_tile, make, out), places, pool, report=report, paths=[*paths, out])
-    _reopened.cache_clear()
-
-
-def _write_tile(make: MakeTile, out: Path, place: tuple[slice, slice]) -> None:
-    """Make and store the tile of some rows and columns of a mosaic that was begun, in any process."""
-    scores, coverage = make(*place)
-    _reopened(out).write_tile(place[0].start, place[1].start, scores, coverage)
-
-
-@lru_cache(maxsize=1)
-def _reopened(path: Path) -> MosaicWriter:
-    return MosaicWriter.reopen(path)
 
 
 @dataclass(frozen=True)

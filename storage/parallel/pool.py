@@ -1,8 +1,8 @@
 """Map a function over blocks, one task for each, on threads, on processes, or on the workers of a dask scheduler.
 
-Threads are those of `concurrent.futures`; processes are a dask cluster of this machine. A block is a whole shard, so
-that no two tasks write the same file. The results are the same bytes everywhere if code, files and the number of
-arithmetic threads are the same.
+Threads are those of `concurrent.futures`; processes are a dask cluster of this machine. A block reads published stores
+and returns arrays; only the survey's own process writes. The results are the same bytes everywhere if code, files and
+the number of arithmetic threads are the same.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import asyncio
 import hashlib
 import logging
 import os
+import pickle
 import platform
 import re
 import signal
@@ -20,15 +21,16 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from multiprocessing import resource_tracker
+from operator import call
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pipeline.errors import SettingsError, WorkerError
+from pipeline.errors import PipelineError, SettingsError, WorkerError
 from pipeline.lazy import dask, dask_distributed
-from storage.archive.staging import PART_SUFFIX
+from storage.archive.keys import StageRef
 
 ANSWER_S = 5.0  # time limit of a scheduler's answer
 AHEAD = 2  # blocks sent to a worker: one running, one waiting
@@ -85,7 +87,7 @@ class WorkerPool:
 
     @property
     def shares_memory(self) -> bool:
-        """Return whether work may hold open files and arrays; otherwise it is pickled and holds paths."""
+        """Return whether blocks run in this process; otherwise their work and their results are pickled."""
         return self.scheduler == "threads"
 
     @property
@@ -132,19 +134,20 @@ def run_blocks(
     items: Sequence[Item],
     pool: WorkerPool = THREADS,
     *,
+    take: Callable[[Item, Result], Any] | None = None,
     report: Report = lambda done: None,
-    paths: Sequence[Path] = (),
-) -> list[Result]:
-    """Call ``make`` with every item, each in a task of its own.
+    inputs: Sequence[StageRef] = (),
+) -> list[Any]:
+    """Call ``make`` with every item, each in a task of its own, and ``take`` with each item and its result.
 
-    Blocks start in order, at most a few ahead of the oldest unfinished one, since neighbours share input. The first
-    error is raised when no block is running any more. Returns the results in the order of the items.
+    Returns what ``take`` returns, or without it the results, in the order of the items. Blocks start in order, at most
+    a few ahead of the oldest unfinished one, since neighbours share input. The first error is raised when no block is
+    running any more. ``report`` is called with the fraction done.
 
-    On threads ``make`` must be safe to call from several at once. Otherwise it and the items are pickled and hold
-    absolute paths, and writing a block twice must give the same bytes. ``report`` is called with the fraction done.
-    Workers of a dask scheduler must see the same files in ``paths``, the folders that the work reads or writes. Partial
-    files of killed workers are removed from staged stores (``*.part``) among them. Raises SettingsError: no scheduler
-    answers, or its workers see other files or run other versions; WorkerError: workers died repeatedly.
+    On threads ``make`` and ``take`` must be safe to call from several at once. Otherwise ``make``, items and results
+    are pickled, and ``take`` is called in this process. Workers of a dask scheduler read the stores ``inputs`` by the
+    same paths, or from the bucket. Raises SettingsError: no scheduler answers, or its workers lack the stores or run
+    other versions; WorkerError: workers died repeatedly.
     """
     results: dict[int, Any] = {}
 
@@ -152,20 +155,25 @@ def run_blocks(
         results[number] = result
         report(len(results) / len(items))
 
+    def whole(item: Item) -> Any:
+        return make(item) if take is None else take(item, make(item))
+
     workers = min(pool.count, len(items))
     if pool.shares_memory and workers < 2:
         for number, item in enumerate(items):
-            ended(number, make(item))
+            ended(number, whole(item))
     elif pool.shares_memory:
         with ThreadPoolExecutor(workers) as team:
-            _send(team, make, items, workers, ended)
+            _send(lambda item: team.submit(whole, item), items, workers, ended)
     elif items:
         with pool.open():
-            _send_away(pool, make, items, paths, ended)
-        for folder in paths:
-            if any(part.endswith(PART_SUFFIX) for part in folder.parts):
-                for file in folder.rglob("*.partial"):  # zarr gives a shard its name when it is whole
-                    file.unlink(missing_ok=True)
+            _send_away(
+                pool,
+                make,
+                items,
+                inputs,
+                lambda number, result: ended(number, result if take is None else take(items[number], result)),
+            )
     return [results[number] for number in range(len(items))]
 
 
@@ -173,7 +181,7 @@ def _send_away(
     pool: WorkerPool,
     make: Callable[[Any], Any],
     items: Sequence[Any],
-    paths: Sequence[Path],
+    inputs: Sequence[StageRef],
     ended: Callable[[int, Any], None],
 ) -> None:
     """Run blocks in processes; dask runs blocks whose worker died again on others."""
@@ -181,13 +189,15 @@ def _send_away(
         team = _teams.get(pool) or Cluster(pool)
         _teams[pool] = team
     try:
-        _send(team, make, items, AHEAD * team.check(paths), ended)
+        count = team.check(inputs)
+        shared = team.client.submit(_itself, make, pure=False)  # travels once to each worker
+        _send(partial(team.submit, call, shared), items, AHEAD * count, ended, alive=team.count)
     except (WorkerError, CancelledError, dask_distributed.KilledWorker) as error:
         _dismiss(pool)
         if isinstance(error, WorkerError):
             raise
         if isinstance(error, CancelledError):
-            words = "the scheduler is gone. Start it again and repeat the command: finished blocks are kept"
+            words = "the scheduler is gone. Start it again and repeat the command: finished stages are kept"
         else:
             words = (
                 "workers died several times in the same block, perhaps out of memory. Use fewer --workers, or "
@@ -196,23 +206,31 @@ def _send_away(
         raise WorkerError(f"{team.name}: {words}") from None
 
 
+def _itself(make: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    return make
+
+
 def _send(
-    team: Executor, make: Callable[[Any], Any], items: Sequence[Any], window: int, ended: Callable[[int, Any], None]
+    submit: Callable[[Any], Future[Any]],
+    items: Sequence[Any],
+    window: int,
+    ended: Callable[[int, Any], None],
+    alive: Callable[[], object] = lambda: None,
 ) -> None:
     """Send blocks in order, fewer than ``window`` ahead of the oldest unfinished one; ``ended`` takes each result.
 
-    An error is raised when the running blocks have ended.
+    An error is raised when the running blocks have ended; ``alive``, called while none ends, raises without workers.
     """
     running: dict[Future[Any], int] = {}
     sent = 0
     try:
         while running or sent < len(items):
             while sent < len(items) and sent - min(running.values(), default=sent) < window:
-                running[team.submit(make, items[sent])] = sent
+                running[submit(items[sent])] = sent
                 sent += 1
             done = wait(running, timeout=ANSWER_S, return_when=FIRST_COMPLETED).done
-            if not done and isinstance(team, Cluster):
-                team.count()  # raises where no worker is left
+            if not done:
+                alive()
             for future in sorted(done, key=running.__getitem__):
                 ended(running[future], future.result())
                 del running[future]
@@ -268,18 +286,20 @@ class Cluster(Executor):
             ) from None
         return max(1, sum(int(threads) for threads in self.client.nthreads().values()))
 
-    def check(self, paths: Sequence[Path]) -> int:
-        """Compare versions, threads and the content of folders of every worker with this process; return `count`.
+    def check(self, inputs: Sequence[StageRef]) -> int:
+        """Compare versions, threads and stores of every worker with this process; return `count`.
 
-        Raises SettingsError: a worker differs; WorkerError: there is none, or one was lost meanwhile.
+        Workers without the working copy of a bucket fetch the stores. Raises SettingsError: a worker differs, or cannot
+        read the bucket; WorkerError: there is none, or one was lost meanwhile.
         """
-        folders = [str(path.absolute()) for path in paths]
-        expected, count = {**about_here(folders), THREADS_OF: "1"}, self.count()
+        expected, count = {**about_here(inputs), THREADS_OF: "1"}, self.count()
         try:
-            theirs = self.client.run(about_here, folders)
+            theirs = self.client.run(_about_there, pickle.dumps(inputs))
+        except PipelineError as error:
+            raise SettingsError(f"{self.name}: a worker cannot read the archive. {error}") from None
         except OSError as error:
             raise WorkerError(
-                f"{self.name}: a worker was lost ({error}). Repeat the command: finished blocks are kept"
+                f"{self.name}: a worker was lost ({error}). Repeat the command: finished stages are kept"
             ) from None
         except Exception as error:  # of any type: errors of unpickling come back as text
             raise SettingsError(
@@ -291,7 +311,8 @@ class Cluster(Executor):
                 if facts.get(what) != value:
                     raise SettingsError(
                         f"{self.name}: worker {worker} has {what} {facts.get(what)}, expected {value} as here; install "
-                        f"the same there, mount the archive under the same path and set {THREADS_OF}=1"
+                        f"the same there, mount the archive under the same path or keep it in a bucket, and set "
+                        f"{THREADS_OF}=1"
                     )
         return count
 
@@ -315,10 +336,15 @@ def start(workers: int) -> Any:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
-def about_here(folders: Sequence[str]) -> dict[str, str]:
-    """Return versions, threads and the content of folders as this process sees them, by name."""
+def about_here(inputs: Sequence[StageRef]) -> dict[str, str]:
+    """Return versions, threads and the content of stores as this process sees them, by name."""
     threads = {THREADS_OF: os.environ.get(THREADS_OF, "not set")}
-    return versions_here() | threads | {folder: _seen(folder) for folder in folders}
+    return versions_here() | threads | {one.uri: _seen(one.path) for one in inputs}
+
+
+async def _about_there(inputs: bytes) -> dict[str, str]:
+    """Return `about_here` of a worker, which answers its scheduler while it fetches stores."""
+    return await asyncio.to_thread(lambda: about_here(pickle.loads(inputs)))
 
 
 @cache
@@ -336,8 +362,8 @@ def versions_here() -> dict[str, str]:
     return facts
 
 
-def _seen(folder: str) -> str:
-    if not Path(folder).is_dir():
+def _seen(folder: Path) -> str:
+    if not folder.is_dir():
         return "not there"
-    names = sorted(path.name for path in Path(folder).iterdir())
+    names = sorted(path.name for path in folder.iterdir())
     return f"with {len(names)} names ({hashlib.sha256(repr(names).encode()).hexdigest()[:8]})"

@@ -17,9 +17,10 @@ import os
 import re
 import secrets
 import time
-from collections.abc import Container, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from datetime import datetime, timedelta
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -60,6 +61,10 @@ class ObjectArchive(Archive):
         self.objects = objects
         self._standing: dict[str, bytes] = {}  # manifests found in the bucket since this was opened
         self._later_runs: set[Path] = set()  # that were published since it was mirrored first
+
+    def __reduce__(self) -> tuple[Callable[[str], ObjectArchive], tuple[str]]:
+        """Travel to workers as an address."""
+        return _at_worker, (self.name,)
 
     @property
     def name(self) -> str:
@@ -355,28 +360,29 @@ class ObjectArchive(Archive):
         ):
             yield Path(named)
 
-    def _fetch(self, uri: str) -> None:
-        """Fetch a store or run whose manifest is here.
+    def _fetch(self, uri: str) -> Path:
+        """Fetch a store or run, and return its folder, which is missing where there is none.
 
         Raises IncompleteStoreError: an object of it is missing or has changed.
         """
-        if (self.root / uri / MANIFEST_NAME).is_file() and self._lacks(uri, read_manifest(self.root / uri)):
+        known = (self.root / uri / MANIFEST_NAME).is_file() or self._find(uri)
+        if known and self._lacks(uri, read_manifest(self.root / uri)):
             self._fetch_files(uri)
+        return self.root / uri
 
     def _fetch_files(self, uri: str, only: Iterable[str] | None = None) -> None:
         """Fetch the missing files (``only`` these names), each checked by its hash."""
         folder = self.root / uri
         manifest = read_manifest(folder)
         place = _files_at(uri, (folder / MANIFEST_NAME).read_bytes())
-        lacking = [name for name in self._lacks(uri, manifest) if only is None or name in only]
 
-        with self._aside() as aside:
+        with self._locked(f"fetch-{uri.replace('/', '-')}"), self._aside() as aside:
 
             def fetch(name: str) -> None:
                 sha256 = manifest["files"][name]["sha256"]
                 self.objects.fetch(f"{place}/{name}", folder / name, sha256, aside / secrets.token_hex(8))
 
-            some_at_a_time(fetch, lacking)
+            some_at_a_time(fetch, [name for name in self._lacks(uri, manifest) if only is None or name in only])
 
     def _send(self, uri: str) -> None:
         """Upload a store that is published here, or take the one in the bucket unless that is cleared.
@@ -428,6 +434,15 @@ class ObjectArchive(Archive):
                 self._send(uri)
 
         some_at_a_time(ensure, list(uris))
+
+
+@cache
+def _at_worker(url: str) -> ObjectArchive:
+    """Return the archive to a worker, which fetches the stores that it reads into its own machine's working copy."""
+    place = parse_place(url)
+    archive = ObjectArchive(place.working_copy(), Objects(place), writes=False)
+    open_folder(archive.root, create=True, write=True)
+    return archive
 
 
 def _is_address(uri: str) -> bool:

@@ -65,12 +65,12 @@ def evaluate(
 
     def build(path: Path) -> None:
         """Write the figures of the map, of the overview alone and, with controls, of other placements."""
-        drawn, image = load_class_map(class_map.path / "class_map.zarr"), mosaic.path / "mosaic.zarr"
+        drawn = load_class_map(class_map.path / "class_map.zarr")
         names = gains.work.weights.load().class_names
         judged = np.where(drawn.classes == UNLABELLED, np.uint8(UNLABELLED), labels)  # only pixels with a class
         counts = confusion(judged, drawn.classes, len(drawn.names))  # includes the class unknown
         result: dict[str, Any] = map_figures(names, counts) | {"confusion": counts.tolist()}
-        readings, scores = gains.work.readings(image, gains.capture, in_full=controls, report=report)
+        readings, scores = gains.work.readings(mosaic, gains.capture, in_full=controls, report=report)
         readings = np.where(drawn.classes == len(names), drawn.classes, readings)  # unknown in all
         result["none"] = map_figures(names, confusion(judged, readings[0], len(drawn.names)))
         result |= {"all": {"miou": None, "per_class_iou": {}}, "gap_closed": None, "controls": {}}

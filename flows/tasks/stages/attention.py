@@ -56,7 +56,7 @@ class PatchGains:
             **self.zones.key,
         }
 
-    def by_policy(self, mosaic: Path, report: Report) -> Scores:
+    def by_policy(self, mosaic: StageRef, report: Report) -> Scores:
         """Return the (patch,) expected gain by the policy."""
         if self.policy in SEEING_POLICIES:
             return self.within_zones(self.work.score(self.policy, mosaic, self.capture, report).ravel())
@@ -97,13 +97,13 @@ def score(
     """
     grid = gains.frame.grid
 
-    def planned(seen: Path) -> tuple[Scores, FinePlan]:
+    def planned() -> tuple[Scores, FinePlan]:
         """Return the scores, and the plan of the second pass."""
         if second_pass is None and budget is None:
             return np.zeros(int(np.prod(grid.patch_shape))), scanned
         if second_pass is not None and scan_record is not None:
-            return gain_by_record(gains, seen, second_pass, scan_record, lambda done: report(0.5 * done))
-        scores = gains.by_policy(seen, lambda done: report(0.5 * done))
+            return gain_by_record(gains, mosaic, second_pass, scan_record, lambda done: report(0.5 * done))
+        scores = gains.by_policy(mosaic, lambda done: report(0.5 * done))
         if second_pass is not None:
             return scores, second_pass.plan(scores)
         assert budget is not None
@@ -111,14 +111,13 @@ def score(
 
     def build(path: Path) -> None:
         """Write score and rank of every patch, and the plan."""
-        seen = mosaic.path / "mosaic.zarr"
-        scores, found = planned(seen)
+        scores, found = planned()
         found = replace(found, patch_index=gains.kept(found.patch_index))
         read = found.patch_index
         if second_pass is not None and (least_gain is not None or found.kind == "full" or not found.sweeps):
             read = gains.kept(grid.valid_patches())  # the segmentation chooses among them
         # raises an error before the second pass where the map will not fit the memory
-        gains.work.pool_for(read, len(open_mosaic(seen).components))
+        gains.work.pool_for(read, len(open_mosaic(mosaic.path / "mosaic.zarr").components))
         rank = np.full(scores.shape, -1, np.int32)
         rank[read[np.argsort(-scores[read], kind="stable")]] = np.arange(len(read))
         shape = grid.patch_shape
@@ -134,7 +133,7 @@ def score(
 
 
 def gain_by_record(
-    gains: PatchGains, mosaic: Path, second_pass: SecondPass, record: ScanPerformance, report: Report
+    gains: PatchGains, mosaic: StageRef, second_pass: SecondPass, record: ScanPerformance, report: Report
 ) -> tuple[Scores, FinePlan]:
     """Return the expected wrong pixels of the first pass, and the second pass of the highest expected gain."""
     errors = gains.work.expected_errors(mosaic, gains.capture, report)

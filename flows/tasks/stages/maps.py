@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.settings.survey_settings import MapChoice
-from flows.tasks.drawing import Drawing, FullReading, UnknownRule, draw_field
+from flows.tasks.drawing import MAP, PROBABILITIES, Drawing, FullReading, UnknownRule, draw_field
 from flows.tasks.field_prior_map import FieldPriorMap, prior_map_lies, whole_pixels
 from flows.tasks.field_work import region_params
 from flows.tasks.prior_maps import ANOTHER_FIELD, MEMORY, TURNED, Prior
@@ -39,13 +39,11 @@ from storage.arrays.class_maps import (
 )
 from storage.arrays.ground_maps import BLOCK, GroundMapWriter
 from storage.arrays.layout import NO_CLASS, blank_pixels
-from storage.arrays.mosaics import Attention, chosen_patches, open_mosaic, write_attention
+from storage.arrays.mosaics import Attention, open_mosaic, write_attention
 from storage.arrays.quicklooks import choose_bands, develop, stretch
 
-MAP, PROBABILITIES = "class_map.zarr", "class_probabilities.zarr"
 CLASS_MAP = Product("segment", version=23, files=(MAP, PROBABILITIES), by_weights=True)
 OUT_OF_RANGE = "out_of_range.json"  # beside a map with values out of range
-LEFT_OUT = "left_out.npy"  # pixels outside of zones, while the map is drawn
 MOST_TURN_PX = 12.0  # greatest offset of the corners by rotation, at which a prior map is used
 
 
@@ -71,30 +69,18 @@ def segment(
 
     def build(path: Path) -> None:
         """Write class map and class probabilities; again without the prior map if it does not agree."""
-        seen = (mosaic.path / "mosaic.zarr").resolve()
-        lies = FieldShift() if prior is None else prior_map_lies(prior.scan_passes, seen)
+        lies = FieldShift() if prior is None else prior_map_lies(prior.scan_passes, mosaic)
         memory = None if prior is None else memory_of(prior, lies, grid)
         names = create_maps(path, gains, unknown, goes_on=memory is not None)
-        drawing = Drawing(
-            work.weights,
-            seen,
-            (attention.path / "attention.zarr").resolve(),
-            (path / MAP).resolve(),
-            (path / PROBABILITIES).resolve(),
-            gains.capture,
-            memory,
-            None if left_out is None else (path / LEFT_OUT).resolve(),
-            unknown,
-            part,
-        )
-        drawn = draw_field(work, drawing, least_gain, report)
+        drawing = Drawing(work.weights, mosaic, attention, gains.capture, memory, left_out, unknown, part)
+        drawn = draw_field(work, drawing, path, least_gain, report)
         if prior is not None:
             figures = _prior_map_figures(prior, reader, names, lies, drawn.comparison)
-            before = chosen_patches(drawing.attention) if drawn.reading is None else np.flatnonzero(drawn.reading.read)
+            before = drawing.chosen if drawn.reading is None else np.flatnonzero(drawn.reading.read)
             write_table(path / MEMORY, figures | {"patches_read": len(before)})
             if figures["put_aside"] is not None and drawn.comparison is not None:
                 drop_changes(path / PROBABILITIES)
-                drawn = draw_field(work, replace(drawing, memory=None), least_gain, report)
+                drawn = draw_field(work, replace(drawing, memory=None), path, least_gain, report)
         if drawn.reading is not None:
             write_attention(path / READING, attention_of(drawn.reading, gains.policy))
         if drawn.unread_px:
@@ -120,8 +106,6 @@ def create_maps(path: Path, gains: PatchGains, unknown: UnknownRule | None, *, g
     shown = legend if unknown is None else with_unknown(legend)
     create_class_map(path / MAP, shape, shown, grid=frame.angular_grid())
     create_probabilities(path / PROBABILITIES, shape, legend, grid=frame.angular_grid(), goes_on=goes_on)
-    if gains.zones.left_out is not None:
-        np.save(path / LEFT_OUT, gains.zones.left_out)
     return legend.names
 
 
@@ -133,7 +117,6 @@ def finish_maps(path: Path, gains: PatchGains, *, compared: bool) -> None:
         blank_pixels(probabilities, missing, NOT_BELIEVED | ({OLD_CLASS: UNLABELLED} if compared else {}))
     if left_out is not None:
         blank_pixels(path / MAP, left_out, NO_CLASS)
-        (path / LEFT_OUT).unlink()
     if (old_class := ProbabilityStore(probabilities).old_class()) is not None:
         patch = gains.frame.grid.patch
         write_changes(probabilities, changed_fractions(old_class, patch), patch)
@@ -152,9 +135,8 @@ def memory_of(prior: Prior, lies: FieldShift, grid: SceneGrid) -> FieldPriorMap 
     """Return the prior map with its shift; None where the field is rotated too far."""
     if lies.edge_px((grid.height, grid.width)) > MOST_TURN_PX:
         return None
-    last, probabilities = prior.scan_passes[0], (prior.probabilities.path / "class_probabilities.zarr").resolve()
-    coarse = (last.mosaic.path / "mosaic.zarr").resolve()
-    return FieldPriorMap(probabilities, coarse, prior.days, prior.day_of_year, prior.classes, whole_pixels(lies))
+    last = prior.scan_passes[0].mosaic
+    return FieldPriorMap(prior.probabilities, last, prior.days, prior.day_of_year, prior.classes, whole_pixels(lies))
 
 
 def _prior_map_figures(

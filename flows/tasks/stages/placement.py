@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.tasks.mosaic_work import MosaicRecipe, open_sweeps, write_mosaic
+from flows.tasks.mosaic_work import REGISTRATION, TIE_POINTS, MosaicRecipe, open_sweeps, write_mosaic
 from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
 from models.network.spectral import LineSpec
 from pipeline.geometry.camera import LineCamera
@@ -31,18 +31,12 @@ from storage.arrays.mosaics import MosaicWriter, open_mosaic
 from storage.arrays.signal_cubes import open_signal_cubes
 from storage.parallel.pool import WorkerPool
 
-RECORD = "registration.json"
-POINTING = Product("register", version=2, files=(RECORD,))
-GEOLOCATION = Product("locate", version=3, files=("geolocation.zarr",))
+POINTING = Product("register", version=2, files=(REGISTRATION,))
+GEOLOCATION = Product("locate", version=3, files=(TIE_POINTS,))
 MOSAIC = Product("rectify", version=5, files=("mosaic.zarr",))
 MERGED = Product("rectify_fine", version=3, files=("mosaic.zarr",))
 MOSAIC_STEP = 0.5  # quantisation step, relative to the sweeps: resampled scores have less noise
 KERNEL_GAIN = 2.0  # greatest overshoot of the kernels
-
-
-def record_of(registration: StageRef | None) -> Path | None:
-    """Return the path of the record of a registration."""
-    return None if registration is None else registration.path / RECORD
 
 
 @stage("register_coarse", "registration of the sweeps", POINTING, inputs=1, named="coarse_pointing")
@@ -53,7 +47,7 @@ def register_coarse(
 
     def build(path: Path) -> None:
         """Register the sweeps by their overlaps, and write shifts and gains."""
-        sweeps = open_sweeps(signal.path, None, camera)
+        sweeps = open_sweeps(signal, None, camera)
         broad = [BroadSweep.read(one.lines, camera, usable=one.usable) for one in sweeps]
         report(0.4)
         found = register_sweeps(broad, camera, prior_px=pointing_px)
@@ -78,7 +72,7 @@ def register_coarse(
                 for seen in found.windows
             ],
         }
-        write_table(path / RECORD, record)
+        write_table(path / REGISTRATION, record)
 
     return Wanted(build, {"prior_px": pointing_px, "pass": "coarse"}, [signal])
 
@@ -107,7 +101,7 @@ def register_fine(
 
     def build(path: Path) -> None:
         """Register each sweep on the mean of the mosaic's bands, and write its shift."""
-        sweeps = open_sweeps(signal.path, None, camera)
+        sweeps = open_sweeps(signal, None, camera)
         anchors: list[Anchor] = []
         seen = open_mosaic(mosaic.path / "mosaic.zarr")
         under = seen.brightness(bands=BROAD_BANDS) if sweeps else np.empty((0, 0), np.float32)
@@ -123,14 +117,14 @@ def register_fine(
             "narrow": [],
             "windows": [{"moving": one.shift.name, "status": one.found.status} for one in anchors],
         }
-        write_table(path / RECORD, record)
+        write_table(path / REGISTRATION, record)
 
     return Wanted(build, {"prior_px": pointing_px, "pass": "fine", "grid": asdict(frame.grid)}, [signal, mosaic])
 
 
 def load_registration(registration: StageRef) -> dict[str, Any]:
     """Read a registration: offset, drift and gain by sweep; reference, sweeps without overlap, and windows."""
-    return read_table(registration.path / RECORD)
+    return read_table(registration.path / REGISTRATION)
 
 
 @stage("locate", "geolocation grid", GEOLOCATION)
@@ -139,7 +133,7 @@ def locate(
 ) -> Wanted:
     """Compute the geolocation grid, which all surveys along the same path share."""
     grid = PixelGrid.of_scene(frame.grid, 1)
-    sweeps = open_sweeps(signal.path, record_of(registration), camera)
+    sweeps = open_sweeps(signal, registration, camera)
     params = {
         "camera": {name: getattr(camera, name) for name in ("samples", "pitch_um", "focal_length_mm")},
         "grid": asdict(grid),
@@ -161,7 +155,7 @@ def locate(
             # a sweep whose lines are too uneven for tie points is located directly
             tables[one.lines.sweep.name] = whole if len(whole) == len(made) else []
             report((number + 1) / len(sweeps))
-        write_geolocation(path / "geolocation.zarr", tables, params)
+        write_geolocation(path / TIE_POINTS, tables, params)
 
     return Wanted(build, params)  # the key depends on the paths, not on the values
 
@@ -184,12 +178,12 @@ def rectify(
     def build(path: Path) -> None:
         """Write mosaic and the record of each sweep's lines."""
         recipe = MosaicRecipe(
-            signal.path,
+            signal,
             camera,
             PixelGrid.of_scene(frame.grid, 1),
             resampling,
-            geolocation=geolocation.path / "geolocation.zarr",
-            registration=record_of(registration),
+            geolocation=geolocation,
+            registration=registration,
         )
         writer = mosaic_of_sweeps(path, signal, frame)
         write_mosaic(recipe, writer, memory=memory, pool=pool, report=report)
@@ -218,9 +212,7 @@ def rectify_fine(
     def build(path: Path) -> None:
         """Write mosaic, the capture of each pixel, and the record of each sweep's lines."""
         grid = PixelGrid.of_scene(frame.grid, 1)
-        recipe = MosaicRecipe(
-            signal.path, camera, grid, resampling, registration=record_of(registration), interlaced=True
-        )
+        recipe = MosaicRecipe(signal, camera, grid, resampling, registration=registration, interlaced=True)
         writer = mosaic_of_sweeps(path, signal, frame)
         write_mosaic(recipe, writer, memory=memory, pool=pool, report=report)
         placed = recipe.open().placed

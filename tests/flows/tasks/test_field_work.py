@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from flows.settings.load import load_settings
-from flows.tasks.drawing import Drawing, draw_field
+from flows.tasks.drawing import MAP, PROBABILITIES, Drawing, draw_field
 from flows.tasks.field_prior_map import FieldPriorMap
 from flows.tasks.field_work import FieldWork, Scoring, WeightsFile, region_params
 from flows.tasks.patch_budget import SHARD
@@ -20,6 +20,7 @@ from models.network.sizes import CELL_PX
 from models.reading.regions import plan_regions
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
+from storage.archive.keys import StageRef
 from storage.arrays.class_maps import ClassNames, create_class_map, create_probabilities, load_class_map
 from storage.arrays.layout import consolidate_stores
 from storage.arrays.mosaics import load_attention
@@ -40,14 +41,14 @@ def surveyed(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey, flags
     return open_run(load_settings(None, flags_png(out, budget="0.8"))), out / "stages"
 
 
-def _store(stages: Path, name: str) -> Path:
-    (path,) = stages.glob(name)
-    return path
+def _store(stages: Path, stage: str) -> StageRef:
+    (path,) = (stages / stage).iterdir()
+    return StageRef(stage, path.name, path)
 
 
-def _mosaics(stages: Path) -> list[Path]:
+def _mosaics(stages: Path) -> list[StageRef]:
     """The mosaics of both passes, the coarse one first."""
-    return [_store(stages, f"{name}/*/mosaic.zarr") for name in ("rectify", "rectify_fine")]
+    return [_store(stages, name) for name in ("rectify", "rectify_fine")]
 
 
 def _work(run: SurveyRun, pool: WorkerPool, halo: int) -> FieldWork:
@@ -57,18 +58,16 @@ def _work(run: SurveyRun, pool: WorkerPool, halo: int) -> FieldWork:
 def _draw(
     work: FieldWork, run: SurveyRun, stages: Path, out: Path, least_gain: float | None = None
 ) -> dict[str, bytes]:
-    """The bytes of the map that this work draws."""
+    """The bytes of the map that this work draws into a new folder."""
     legend = ClassNames(run.weights.class_names, run.weights.class_colours)
-    create_class_map(out, run.scene.shape, legend, grid=run.frame.angular_grid())
-    create_probabilities(
-        out.with_suffix(".class_probabilities"), run.scene.shape, legend, grid=run.frame.angular_grid()
-    )
-    mosaic = _mosaics(stages)[1]
-    attention = _store(stages, "score/*/attention.zarr")
-    drawing = Drawing(work.weights, mosaic, attention, out, out.with_suffix(".class_probabilities"), run.capture)
-    draw_field(work, drawing, least_gain, lambda done: None)
-    consolidate_stores(out.parent)  # as a store is published
-    return _contents(out)
+    out.mkdir()
+    create_class_map(out / MAP, run.scene.shape, legend, grid=run.frame.angular_grid())
+    create_probabilities(out / PROBABILITIES, run.scene.shape, legend, grid=run.frame.angular_grid())
+    drawing = Drawing(work.weights, _mosaics(stages)[1], _store(stages, "score"), run.capture)
+    draw_field(work, drawing, out, least_gain, lambda done: None)
+    assert sorted(path.name for path in out.iterdir()) == [MAP, PROBABILITIES]  # no overview is left
+    consolidate_stores(out)  # as a store is published
+    return _contents(out / MAP)
 
 
 def _contents(folder: Path) -> dict[str, bytes]:
@@ -79,36 +78,35 @@ def _contents(folder: Path) -> dict[str, bytes]:
 def test_regions_that_see_the_field_draw_the_fields_map(surveyed: Surveyed, tmp_path: Path, pool: WorkerPool) -> None:
     """With a halo over everything, to the byte, whoever draws them; the stage's own map is that of one region."""
     run, stages = surveyed
-    stored = _contents(_store(stages, "segment/*/class_map.zarr"))
+    stored = _contents(_store(stages, "segment").path / MAP)
     assert len(_work(run, pool, ALL_PX).regions) == 2
-    assert _draw(_work(run, pool, ALL_PX), run, stages, tmp_path / "m.zarr") == stored
-    assert _draw(run.work, run, stages, tmp_path / "one.zarr") == stored
+    assert _draw(_work(run, pool, ALL_PX), run, stages, tmp_path / "m") == stored
+    assert _draw(run.work, run, stages, tmp_path / "one") == stored
 
 
 @pytest.mark.parametrize(("overviews", "stored"), [(16, True), (16, False), (1, True)])
 def test_regions_choose_patches_by_the_classes_of_the_field(
     surveyed: Surveyed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, overviews: int, stored: bool
 ) -> None:
-    """With a halo over everything they choose as one region does; no overview is left beside the map."""
+    """With a halo over everything they choose as one region does."""
     run, stages = surveyed
     gain = run.work.score("gain", _mosaics(stages)[1], run.capture, lambda done: None)
     least = float(np.quantile(gain, 0.7)) + 1e-9
     monkeypatch.setattr("flows.tasks.drawing.MOST_OVERVIEWS", overviews)
     if not stored:  # an overview that was not kept is computed again
         monkeypatch.setattr("flows.tasks.drawing.load_overview", lambda path, weights: None)
-    regions = _draw(_work(run, WorkerPool(workers=2), ALL_PX), run, stages, tmp_path / "m.zarr", least)
-    whole = _draw(run.work, run, stages, tmp_path / "one.zarr", least)
+    regions = _draw(_work(run, WorkerPool(workers=2), ALL_PX), run, stages, tmp_path / "m", least)
+    whole = _draw(run.work, run, stages, tmp_path / "one", least)
     assert (regions == whole) == (overviews == 16)  # one of two regions has other classes
-    assert regions != _contents(_store(stages, "segment/*/class_map.zarr"))
-    assert not (tmp_path / "overviews").exists()
+    assert regions != _contents(_store(stages, "segment").path / MAP)
 
 
 def test_every_pool_draws_the_same_regions(surveyed: Surveyed, tmp_path: Path) -> None:
     """Two at a time or one after the other, the bytes are the same; every pixel has a class."""
     run, stages = surveyed
-    one = _draw(_work(run, WorkerPool(workers=1), 0), run, stages, tmp_path / "one.zarr")
-    assert one == _draw(_work(run, WorkerPool(workers=2), 0), run, stages, tmp_path / "two.zarr")
-    found = load_class_map(tmp_path / "one.zarr")
+    one = _draw(_work(run, WorkerPool(workers=1), 0), run, stages, tmp_path / "one")
+    assert one == _draw(_work(run, WorkerPool(workers=2), 0), run, stages, tmp_path / "two")
+    found = load_class_map(tmp_path / "one" / MAP)
     assert found.classes.max() < len(found.names)
     assert np.isfinite(found.confidence).all()
 
@@ -122,23 +120,34 @@ def test_scores_of_regions_make_those_of_the_field(surveyed: Surveyed, policy: s
     parts = _work(run, WorkerPool(workers=2), ALL_PX).score(policy, mosaic, run.capture, lambda done: None)
     np.testing.assert_allclose(parts, whole, rtol=1e-12 if policy == "gain" else 0)  # sums over the field
     if policy == run.settings.policy:
-        assert (load_attention(_store(stages, "score/*/attention.zarr")).score == whole).all()
+        assert (load_attention(_store(stages, "score").path / "attention.zarr").score == whole).all()
 
 
-def test_edges_need_one_patch_of_halo_and_work_travels_as_paths(surveyed: Surveyed) -> None:
-    """With one coarse patch regions give the field's own edges; what another process gets is small."""
+def test_edges_need_one_patch_of_halo(surveyed: Surveyed) -> None:
+    """With one coarse patch regions give the field's own edges."""
     run, stages = surveyed
     mosaic = _mosaics(stages)[0]
     whole = run.work.score("sobel", mosaic, run.capture, lambda done: None)
     np.testing.assert_allclose(
         _work(run, WorkerPool(), 32).score("sobel", mosaic, run.capture, lambda done: None), whole, rtol=1e-5
     )
-    work = run.work
-    scoring = Scoring(work.weights, _mosaics(stages)[0], "entropy", run.capture)
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_work_travels_with_its_weights(surveyed: Surveyed, tmp_path: Path, there: bool) -> None:
+    """A worker that sees the file of the weights reads it; another one has what travelled, and gives the same."""
+    run, stages = surveyed
+    copy, work = tmp_path / "w.safetensors", run.work
+    copy.write_bytes(work.weights.path.read_bytes())
+    scoring = Scoring(replace(work.weights, path=copy), _mosaics(stages)[0], "entropy", run.capture)
     sent = pickle.dumps((scoring, work.regions[0]))
-    there, region = pickle.loads(sent)
-    assert len(sent) < 2000
-    assert (there(region) == scoring(work.regions[0])).all()
+    assert len(sent) < copy.stat().st_size + 2000
+    expected = scoring(work.regions[0])
+    if not there:
+        copy.unlink()
+    travelled, region = pickle.loads(sent)
+    assert (travelled.weights.path == copy) == there
+    assert (travelled(region) == expected).all()
 
 
 @pytest.mark.parametrize(
@@ -180,7 +189,7 @@ def test_only_keys_of_fields_that_are_cut_know_of_regions(size: tuple[int, int])
 def test_a_memory_is_moved_and_leaves_nothing_behind(surveyed: Surveyed, shift: tuple[int, int]) -> None:
     """What lay at a pixel lies ``shift`` further, in fine and coarse pixels alike, and nothing where it came from."""
     run, stages = surveyed
-    probabilities, mosaic = (_store(stages, "segment/*/class_probabilities.zarr"), _mosaics(stages)[0])
+    probabilities, mosaic = _store(stages, "segment"), _mosaics(stages)[0]
     (region,) = plan_regions(run.grid, SHARD)
     classes = tuple(range(len(run.weights.class_names)))
     still = FieldPriorMap(probabilities, mosaic, 1.0, None, classes).of(region, run.weights)
@@ -204,7 +213,7 @@ def test_a_memory_is_moved_and_leaves_nothing_behind(surveyed: Surveyed, shift: 
 def test_a_moved_memory_has_no_seams_between_regions(surveyed: Surveyed) -> None:
     """Features come from beyond a region's halo, wherever the field has them."""
     run, stages = surveyed
-    probabilities, mosaic = (_store(stages, "segment/*/class_probabilities.zarr"), _mosaics(stages)[0])
+    probabilities, mosaic = _store(stages, "segment"), _mosaics(stages)[0]
     before = FieldPriorMap(probabilities, mosaic, 1.0, None, tuple(range(len(run.weights.class_names))), (40, -8))
     (field,) = plan_regions(run.grid, SHARD)
     whole = before.of(field, run.weights).coarse

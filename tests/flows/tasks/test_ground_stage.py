@@ -26,6 +26,7 @@ from storage.arrays.class_maps import (
     ClassNames,
     create_probabilities,
     load_class_map,
+    packed_probabilities,
     write_changes,
     write_changes_tile,
     write_probabilities_tile,
@@ -70,7 +71,8 @@ def believe(folder: Path, age_days: np.ndarray, old_class: np.ndarray | None = N
     create_probabilities(path, SHAPE, LEGEND, goes_on=old_class is not None)
     for top in range(0, SHAPE[0], 64):
         rows = slice(top, top + 64)
-        write_probabilities_tile(path, (top, 0), values[rows], age_days[rows], np.ones(SHAPE, np.float32)[rows])
+        packed, light = packed_probabilities(values[rows]), np.ones(SHAPE, np.float32)[rows]
+        write_probabilities_tile(path, (top, 0), packed, age_days[rows], light)
         if old_class is not None:
             write_changes_tile(path, (top, 0), old_class[rows])
     if old_class is not None:

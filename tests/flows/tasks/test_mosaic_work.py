@@ -18,8 +18,9 @@ from pipeline.errors import SettingsError, ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.rectify.placed import PixelGrid, place
-from pipeline.rectify.region import MosaicWork, TileMaker, free_tiles, opened_tiles, plan_tiles
+from pipeline.rectify.region import MosaicWork, Place, TileMaker, free_tiles, opened_tiles, plan_tiles
 from pipeline.source import References
+from storage.archive.keys import StageRef
 from storage.arrays.cubes import SweepHeader
 from storage.arrays.mosaics import MosaicWriter
 from storage.arrays.signal_cubes import SignalCube, open_signal_cubes
@@ -48,22 +49,22 @@ def cubes(tmp_path_factory: pytest.TempPathFactory) -> list[SignalCube]:
 
 @dataclass(frozen=True)
 class KillOnce(TileMaker):
-    """A maker that ends its process the first time, and leaves what an interrupted write leaves."""
+    """A maker that ends its process the first time."""
 
     folder: str = ""
 
-    def __call__(self, rows: slice, columns: slice) -> tuple[np.ndarray, np.ndarray]:
+    def __call__(self, place: Place) -> tuple[np.ndarray, np.ndarray]:
         """As a maker's, once somebody was killed."""
         if not (Path(self.folder) / "killed").exists():
-            (Path(self.folder) / "m.zarr" / "scores" / "c.1234.partial").write_bytes(b"half")
             (Path(self.folder) / "killed").touch()
             os.kill(os.getpid(), signal.SIGKILL)
-        return super().__call__(rows, columns)
+        return super().__call__(place)
 
 
 def recipe_of(cubes: list[SignalCube]) -> MosaicRecipe:
     """Both sweeps by the folder that they lie in."""
-    return MosaicRecipe(Path(str(cubes[0].group.store_path.store.root)).parent, CAMERA, GRID)
+    folder = Path(str(cubes[0].group.store_path.store.root)).parent
+    return MosaicRecipe(StageRef("condense", "key", folder), CAMERA, GRID)
 
 
 def mosaic_at(path: Path) -> MosaicWriter:
@@ -97,21 +98,20 @@ def test_an_error_in_a_tile_ends_the_work(tmp_path: Path, cubes: list[SignalCube
 
 
 def test_killed_workers_harm_nothing(tmp_path: Path, cubes: list[SignalCube], monkeypatch: pytest.MonkeyPatch) -> None:
-    """kill -9 of a process that makes tiles, with a shard half written: the mosaic is that of an undisturbed thread."""
-    folder = tmp_path / "key.part"
+    """kill -9 of a process that makes tiles: the mosaic is that of an undisturbed thread."""
     write_mosaic(recipe_of(cubes), mosaic_at(tmp_path / "a.zarr"), memory=PLENTY, pool=ONE)
-    monkeypatch.setattr("flows.tasks.mosaic_work.TileMaker", partial(KillOnce, folder=str(folder)))
+    monkeypatch.setattr("flows.tasks.mosaic_work.TileMaker", partial(KillOnce, folder=str(tmp_path)))
     with WorkerPool("processes", 2).open() as pool:
-        budget = write_mosaic(recipe_of(cubes), mosaic_at(folder / "m.zarr"), memory=PLENTY, pool=pool)
+        budget = write_mosaic(recipe_of(cubes), mosaic_at(tmp_path / "m.zarr"), memory=PLENTY, pool=pool)
     assert (budget.workers, budget.processes) == (2, True)
-    assert (folder / "killed").exists()
-    assert digest_of(folder / "m.zarr") == digest_of(tmp_path / "a.zarr")
+    assert (tmp_path / "killed").exists()
+    assert digest_of(tmp_path / "m.zarr") == digest_of(tmp_path / "a.zarr")
 
 
 def test_a_worker_lets_tiles_go(cubes: list[SignalCube]) -> None:
     """Raw lines are kept from tile to tile of a mosaic, and no longer than the process is at tiles."""
     maker = TileMaker(recipe_of(cubes).open, 2**24)
-    maker(slice(0, 64), slice(0, 640))
+    maker((slice(0, 64), slice(0, 640)))
     lines = weakref.ref(opened_tiles(maker)[1])
     assert lines() is not None
     free_tiles()

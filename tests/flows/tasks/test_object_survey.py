@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from dask.distributed import LocalCluster
 from numpy.typing import NDArray
 
 from storage.remote.opening import open_archive
@@ -20,6 +24,7 @@ from flows.publish.run_folder import Published
 from flows.tasks.open_survey import STAGES
 from storage.archive.archive import Archive
 from storage.arrays.class_maps import load_class_map
+from storage.parallel.pool import THREADS_OF
 from storage.remote.object_archive import ObjectArchive
 from storage.remote.object_stores import Objects
 from tests.conftest import Survey
@@ -75,6 +80,43 @@ def test_a_rerun_makes_nothing_and_moves_next_to_nothing(
     run = spectralzoom.open(bucket).latest
     np.testing.assert_array_equal(run.class_map, beside)
     assert run.report.is_file()
+
+
+@contextmanager
+def workers(count: int, environment: dict[str, str]) -> Iterator[str]:
+    """Start a scheduler and workers with this environment; yield its address."""
+    with LocalCluster(count, threads_per_worker=1, dashboard_address="127.0.0.1:0", env=environment) as cluster:
+        yield cluster.scheduler_address
+
+
+def test_workers_read_the_bucket_themselves(
+    bucket: str, survey_png: Survey, surveyed_png: Survey, tmp_path: Path
+) -> None:
+    """Two workers with a working copy of their own fetch what they read, and the map is that of a folder."""
+    there = {"SPECTRALZOOM_WORK": str(tmp_path / "there"), THREADS_OF: "1"}
+    with workers(2, there) as address, with_effects():
+        published = survey_png(bucket, scheduler=address)
+    beside = map_of(open_archive(tmp_path / "folder"), surveyed_png(tmp_path / "folder"))
+    np.testing.assert_array_equal(map_of(open_archive(bucket), published), beside)
+    fetched = {path.parent.parent.name for path in (tmp_path / "there").glob("*/*/stages/*/*/manifest.json")}
+    assert fetched == {"condense", "locate", "rectify", "condense_fine", "rectify_fine", "score"}
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "words"),
+    [
+        ("http://127.0.0.1:9", "it does not answer: check the network and AWS_ENDPOINT_URL"),
+        ("nowhere", "AWS_ENDPOINT_URL='nowhere' is no address; expected https://HOST, or http://127.0.0.1:PORT"),
+    ],
+)
+def test_workers_that_cannot_read_the_bucket_are_one_message(
+    bucket: str, command_line: CommandLine, endpoint: str, words: str
+) -> None:
+    """The message says that it is a worker's, and what is wrong there."""
+    with workers(1, {"AWS_ENDPOINT_URL": endpoint, THREADS_OF: "1"}) as address:
+        ended = command_line("survey", "--out", bucket, *SMALL, "--scheduler", address)
+    assert ended.code == 2
+    assert re.fullmatch(rf".*--scheduler tcp:\S+: a worker cannot read the archive\. .*{words}", ended.errors[-1])
 
 
 def test_another_machine_clears_outlived_raw_lines_in_a_bucket(

@@ -22,6 +22,7 @@ from storage.arrays.class_maps import (
     ProbabilityStore,
     create_probabilities,
     drop_changes,
+    packed_probabilities,
     write_changes,
     write_changes_tile,
     write_probabilities_tile,
@@ -47,7 +48,9 @@ def stored(path: Path, seed: int = 0) -> Path:
     values, ages, light = drawn(seed)
     create_probabilities(path, SHAPE, LEGEND)
     for top, bottom in ((0, 64), (64, 70)):
-        write_probabilities_tile(path, (top, 0), values[top:bottom], ages[top:bottom], light[top:bottom])
+        write_probabilities_tile(
+            path, (top, 0), packed_probabilities(values[top:bottom]), ages[top:bottom], light[top:bottom]
+        )
     return path
 
 
@@ -56,8 +59,9 @@ def test_visits_of_every_hour_do_not_stop_the_clock(tmp_path: Path) -> None:
     values, age, light = drawn(0)
     age, light = np.zeros_like(age), np.ones_like(light)
     create_probabilities(tmp_path / "visits.zarr", SHAPE, LEGEND)
+    packed = packed_probabilities(values)
     for _ in range(72):
-        write_probabilities_tile(tmp_path / "visits.zarr", (0, 0), values, age + 1 / 24, light * np.float32(0.998))
+        write_probabilities_tile(tmp_path / "visits.zarr", (0, 0), packed, age + 1 / 24, light * np.float32(0.998))
         _, age, light = ProbabilityStore(tmp_path / "visits.zarr").read()
     np.testing.assert_allclose(age, 3, atol=1e-3)
     np.testing.assert_allclose(light, 0.998**72, rtol=0.01)
@@ -173,7 +177,7 @@ def test_certainty_is_not_mistaken_for_nothing(tmp_path: Path) -> None:
     create_probabilities(path, (4, 4), LEGEND)
     sure = np.full((4, 4, 3), -50.0, np.float32)
     sure[..., 1] = 0.0
-    write_probabilities_tile(path, (0, 0), sure, *np.full((2, 4, 4), 1e9, np.float32))
+    write_probabilities_tile(path, (0, 0), packed_probabilities(sure), *np.full((2, 4, 4), 1e9, np.float32))
     found, days, light = ProbabilityStore(path).read()
     assert (found.argmax(axis=-1) == 1).all()
     assert np.exp(found[..., 1]).min() > 0.99

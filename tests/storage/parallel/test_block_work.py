@@ -17,6 +17,7 @@ import pytest
 from dask.distributed import LocalCluster
 
 from pipeline.errors import SettingsError, ShapeError, WorkerError
+from storage.archive.keys import StageRef
 from storage.parallel import pool as pool_module
 from storage.parallel.pool import THREADS_OF, WorkerPool, run_blocks
 
@@ -162,8 +163,9 @@ def elsewhere() -> Iterator[WorkerPool]:
 
 
 def test_workers_of_a_scheduler_elsewhere_give_the_same(elsewhere: WorkerPool, tmp_path: Path) -> None:
-    """By the address of a scheduler its workers make the blocks, once they have shown that they see the folder."""
-    assert run_blocks(square, range(6), elsewhere, paths=[tmp_path]) == [square(item) for item in range(6)]
+    """By the address of a scheduler its workers make the blocks, once they have shown that they see the store."""
+    store = StageRef("rectify", "key", tmp_path)
+    assert run_blocks(square, range(6), elsewhere, inputs=[store]) == [square(item) for item in range(6)]
 
 
 @pytest.mark.parametrize(
@@ -171,7 +173,7 @@ def test_workers_of_a_scheduler_elsewhere_give_the_same(elsewhere: WorkerPool, t
     [
         ({"numpy": "0.1"}, r"has numpy \d.*, expected 0.1 as here; install the same there"),
         ({"spectralzoom": "of code abc"}, r"has spectralzoom of code \w+, expected of code abc as here"),
-        ({"/archive": "with 7 names"}, r"has /archive None, expected with 7 names as here.*mount the archive"),
+        ({"stages/a/b": "with 7 names"}, r"has stages/a/b None, expected with 7 names as here.*mount the archive"),
     ],
 )
 def test_workers_that_differ_are_refused(
@@ -179,8 +181,8 @@ def test_workers_that_differ_are_refused(
 ) -> None:
     """Other code, another numpy or other files would give other bytes: the first that differs is named."""
     run, true = pool_module.dask_distributed.Client.run, pool_module.about_here([])
-    monkeypatch.setattr(pool_module.dask_distributed.Client, "run", lambda self, ask, folders: run(self, _true, true))
-    monkeypatch.setattr(pool_module, "about_here", lambda folders: {**true, **here})
+    monkeypatch.setattr(pool_module.dask_distributed.Client, "run", lambda self, ask, inputs: run(self, _true, true))
+    monkeypatch.setattr(pool_module, "about_here", lambda inputs: {**true, **here})
     with pytest.raises(SettingsError, match=rf"worker tcp:.* {words}"):
         run_blocks(square, [1], elsewhere)
 
@@ -267,7 +269,7 @@ def test_a_scheduler_that_goes_away_is_one_error(tmp_path: Path) -> None:
     with run_script(tmp_path, GONE, address) as started:
         printed, said = started.communicate(timeout=60)
     gone = (
-        f"--scheduler {address}: the scheduler is gone. Start it again and repeat the command: finished blocks are kept"
+        f"--scheduler {address}: the scheduler is gone. Start it again and repeat the command: finished stages are kept"
     )
     assert (started.returncode, printed.splitlines(), said) == (0, [gone, "[0, 1, 2]"], "")
 
