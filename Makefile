@@ -3,8 +3,7 @@
 PY ?= python3
 VENV ?= .venv
 ARCHIVE ?= archive
-SCENE ?= farm
-SECONDS ?= 25
+SURVEY ?= docs/tutorials/first-visit.toml docs/tutorials/week-later.toml
 PYTEST_ARGS ?= -n 3 --dist worksteal
 BENCH ?=
 BIN := $(VENV)/bin
@@ -33,12 +32,9 @@ $(BIN)/.ok-dev: $(BIN)/.ok
 	$(PIP) -e '.[dev,s3,bench]'
 	touch $@
 
-# Surveys the scene; surveys the built-in farm again a week later, with the first map as prior map.
+# Surveys the built-in farm, and again a week later with the first map as prior map; or by other settings and flags.
 survey: $(BIN)/.ok
-	$(BIN)/spectralzoom survey --scene $(SCENE) --seconds $(SECONDS) --out $(ARCHIVE)
-ifeq ($(SCENE),farm)
-	$(BIN)/spectralzoom survey --scene farm --day 179 --seconds 8 --prior latest --no-controls --out $(ARCHIVE)
-endif
+	$(BIN)/spectralzoom survey $(SURVEY) --out $(ARCHIVE)
 
 # Runs a survey through a rig emulated behind a pty and sockets, and compares it with the simulated one. One minute.
 survey-rig: $(BIN)/.ok-dev

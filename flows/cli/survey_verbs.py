@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from flows.cli.app import AsJson, stderr
+from flows.cli.app import AsJson, say, stderr
 from flows.settings.documents import about, toml_value
 from flows.settings.load import SURVEY, TABLES, load_settings
+from flows.settings.survey_settings import Settings
 from flows.terminal.progress import print_json
-from pipeline.errors import NothingToMend
+from pipeline.errors import NothingToMend, PipelineError
 from pipeline.lazy import deferred
 
 if TYPE_CHECKING:
@@ -74,24 +75,36 @@ NO_SIMULATION_FLAGS = SimulationFlags()
 NO_RENDERING_FLAGS = RenderingFlags()
 
 
-def survey(
-    settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = False, verbose: Verbose = False
-) -> int:
+def survey(*settings: Path, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = False, verbose: Verbose = False) -> int:
     """Survey a field: capture it in one or two passes, map its classes, and publish a receipt and a report.
+
+    If a survey fails, the next ones go on, and the exit code is that of the last failure.
 
     Parameters
     ----------
     settings
-        Settings file (TOML); flags override it. Default: none.
+        Settings files (TOML), surveyed one after the other; flags override each. Default: none.
     """
-    requested = load_settings(settings, by_setting(flags))
+    every, code = [load_settings(file, by_setting(flags)) for file in settings or (None,)], 0
+    for number, requested in enumerate(every):
+        try:
+            _survey(requested, as_json=as_json, verbose=verbose)
+        except PipelineError as error:
+            if len(every) == 1:
+                raise
+            say(f"{settings[number]}: {error}")
+            code = error.exit_code
+    return code
+
+
+def _survey(requested: Settings, *, as_json: bool, verbose: bool) -> None:
+    """Survey one field, and print its receipt ``as_json``, or why nothing was captured."""
     try:
         published = survey_command.run_survey(requested, stderr, verbose=verbose)
     except NothingToMend as skipped:
         if as_json:
             print_json({"captured": False, "run": skipped.run, "why": str(skipped)})
         stderr.print(f"{skipped}", markup=False, soft_wrap=True)
-        return 0
-    if as_json:
-        print_json(published.receipt)
-    return 0
+    else:
+        if as_json:
+            print_json(published.receipt)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from flows.tasks.open_survey import STAGES
 from storage.archive.archive import Archive
 from storage.arrays.class_maps import load_class_map
 from storage.remote.opening import verify_archive
-from tests.flows.conftest import act_instead
+from tests.flows.conftest import FEW_BANDS, CommandLine, act_instead
 
 NM = "460,500,550,600,620,640"
 RAN = "Report: "
@@ -128,7 +129,7 @@ def test_unusual_input_works(
     """The survey ends with 0, says what it assumed, every pixel with a value has a class, the archive verifies."""
     words, says = WORKS[case]
     monkeypatch.chdir(folder)
-    flags = "--effects", "rotation,shot", "--settings", "camera.toml"
+    flags = "--effects", "rotation,shot", "camera.toml"
     ended = command_line(*survey_words(words, str(tmp_path / "archive")), *flags)
     assert (ended.code, ended.errors) == (0, [])
     assert says in " ".join(ended.err.split())
@@ -143,6 +144,21 @@ def class_map(archive: Archive) -> np.ndarray:
     """The one class map of an archive."""
     (ref,) = archive.refs("segment")
     return load_class_map(ref.path / "class_map.zarr").classes
+
+
+def test_surveys_go_on_after_one_that_fails(
+    command_line: CommandLine, field_file: Callable[..., Path], tmp_path: Path
+) -> None:
+    """The message has the file of the survey that failed, and the exit code is its; a file that is none stops all."""
+    few = {"scene": "farm", "size": "32x32", "source": None, "weights": None, "budget": None, "engine": "plain"}
+    files = [field_file(stem, seconds=seconds, **few) for stem, seconds in (("a", "9"), ("b", "0.1"), ("c", "9"))]
+    ended = command_line("survey", *files, "--bands", FEW_BANDS, "--no-accuracy", "--json")
+    assert (ended.code, len(ended.errors)) == (2, 1)
+    assert ended.errors[0].startswith(f"{files[1]}: ")
+    archive = Archive.open(tmp_path / "archive")
+    assert [run.name.partition("-")[2] for run in archive.runs()] == ["farm"] * 2
+    assert command_line("survey", files[0], tmp_path / "d.toml").code == 2
+    assert len(archive.runs()) == 2
 
 
 def test_interrupted_survey_says_how_to_go_on(
