@@ -187,7 +187,7 @@ def coarse_region(weights: Weights, mosaic: StageRef, region: Region, capture: L
     how: Capture = capture if mixed is None else CaptureMap(tuple(LineSpec(*one) for one in mixed[0]), mixed[1])
     return read_coarse_pass(
         weights,
-        coarse.row_blocks(1, *window),
+        coarse.row_blocks(*window),
         coarse.wavelength_nm,
         region.grid,
         capture=how,

@@ -88,24 +88,20 @@ def pad_by_reflection(image: NDArray[np.generic], shape: tuple[int, int]) -> NDA
     return grown
 
 
-def block_means(
-    values: NDArray[np.float32], coverage: NDArray[np.intp], times: int
-) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
-    """Return the mean of ``times`` x ``times`` pixels without NaN, (y, x, band), and the largest coverage of a block.
+def block_means(values: NDArray[np.float32], times: int) -> NDArray[np.float32]:
+    """Return the mean of ``times`` x ``times`` pixels without NaN, (y, x, band); NaN where a block has no value.
 
-    Blocks at the end may be smaller. NaN where a block has no value.
+    Blocks at the end may be smaller.
     """
-    beyond = [(0, -size % times) for size in coverage.shape]
+    beyond = [(0, -size % times) for size in values.shape[:2]]
     if any(more for _, more in beyond):
         values = np.pad(values, (*beyond, (0, 0)), constant_values=np.nan)
-        coverage = np.pad(coverage, beyond)
     blocks = values.reshape(values.shape[0] // times, times, values.shape[1] // times, times, -1)
-    covered = coverage.reshape(*blocks.shape[:4]).max(axis=(1, 3))
     with np.errstate(over="ignore", invalid="ignore"):
-        total = blocks.sum(axis=(1, 3), dtype=np.float32)
+        total: NDArray[np.float32] = blocks.sum(axis=(1, 3), dtype=np.float32)
     if np.isfinite(total).all():  # the usual case: all pixels have a value
-        return total / np.float32(times**2), covered
+        return np.asarray(total / np.float32(times**2))
     seen = np.isfinite(blocks)
     count = seen.sum(axis=(1, 3), dtype=np.float32)
     total = np.where(seen, blocks, np.float32(0)).sum(axis=(1, 3), dtype=np.float32)
-    return np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0), covered
+    return np.asarray(np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0))

@@ -198,34 +198,26 @@ class Mosaic:
         return np.concatenate([self.spectra(block, bands) for block in blocks])
 
     def brightness(self, factor: int = 1, bands: int | None = None) -> NDArray[np.float32]:
-        """Return the mean over the bands, (y, x), of ``factor`` x ``factor`` px each.
+        """Return the mean over the bands, (y, x), of ``factor`` x ``factor`` px each; ``factor`` divides 64.
 
-        ``bands`` limits the mean to so many bands, spread over all.
+        Pixels are means of the captured ones, NaN where fewer than half are. ``bands`` limits the mean to so many
+        bands, spread over all.
         """
         weights, offset = broad_weights(self.components, bands or self.components.bands)
-        return np.concatenate([block @ weights + offset for block in self.row_blocks(factor)])
 
-    def row_blocks(
-        self, factor: int = 1, rows: slice = slice(None), columns: slice = slice(None)
-    ) -> Iterator[NDArray[np.float32]]:
-        """Yield the scores of a window, (y, x, component), from the top down in blocks that end at shards.
+        def means(block: NDArray[np.float32]) -> NDArray[np.float32]:
+            bright = np.asarray(block @ weights + offset, np.float32)[..., None]
+            fraction = block_means(np.isfinite(bright).astype(np.float32), factor)
+            return np.where(fraction < HALF, np.float32(np.nan), block_means(bright, factor))[..., 0]
 
-        ``factor`` is the side of the returned pixels in those of the store. They are means of the captured ones, NaN
-        where fewer than half are. Rows and columns count returned pixels.
-        """
-        (first, last, _), (left, right, _) = (
-            part.indices(-(-size // factor)) for part, size in zip((rows, columns), self.shape, strict=True)
-        )
+        return np.concatenate([means(block) for block in self.row_blocks()])
+
+    def row_blocks(self, rows: slice = slice(None), columns: slice = slice(None)) -> Iterator[NDArray[np.float32]]:
+        """Yield the scores of a window, (y, x, component), from the top down in blocks that end at shards."""
+        first, last, _ = rows.indices(self.shape[0])
         while first < last:
-            below = min((first * factor // SHARD_ROWS + 1) * SHARD_ROWS // factor, last)
-            below = max(below, first + 1)
-            scores = self.scores(slice(first * factor, below * factor), slice(left * factor, right * factor))
-            if factor > 1:
-                seen = np.isfinite(scores[..., :1]).astype(np.float32)
-                none = np.zeros(seen.shape[:2], np.intp)
-                fraction, (scores, _) = block_means(seen, none, factor)[0], block_means(scores, none, factor)
-                scores[fraction[..., 0] < HALF] = np.nan
-            yield scores
+            below = min((first // SHARD_ROWS + 1) * SHARD_ROWS, last)
+            yield self.scores(slice(first, below), columns)
             first = below
 
 

@@ -52,7 +52,7 @@ class DataSet:
 
 def coarse_image(columns: Image, factor: int) -> Image:
     """Return area means of ``factor`` x ``factor`` px, each repeated over its pixels."""
-    means, _ = block_means(columns, np.ones(columns.shape[:2], np.intp), factor)
+    means = block_means(columns, factor)
     return means.repeat(factor, 0).repeat(factor, 1)
 
 

@@ -25,7 +25,7 @@ from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from models.weights.files import save_weights
 from pipeline.errors import SceneError
-from pipeline.geometry.grid import UNLABELLED
+from pipeline.geometry.grid import UNLABELLED, block_means
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
@@ -255,7 +255,7 @@ def test_a_straight_scan_is_a_recording(
     width, height = published.receipt["settings"]["size"]
     assert (width, height) == (64, 96)
     seen = open_mosaic(tmp_path / "a" / published.receipt["products"]["mosaic"])
-    mosaic = np.concatenate([seen.spectra(block) for block in seen.row_blocks(4)])
+    mosaic = block_means(seen.values(), 4)
     light = (values.astype(np.float64) - 60) / (3500 - 60)
     light = light[::-1] if column == "position_px" else light
     coarse = light.reshape(24, 4, 16, 4, 3).mean(axis=(1, 3))

@@ -22,6 +22,7 @@ from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from flows.terminal.figures import format_area, format_count
 from pipeline.errors import SceneError, SettingsError
+from pipeline.geometry.grid import block_means
 from storage.archive.archive import Archive
 from storage.arrays.mosaics import open_mosaic
 from storage.remote.opening import verify_archive
@@ -59,7 +60,7 @@ def write_tif(path: Path, values: NDArray[Any], place: Affine | None = CORNER, *
 def whole(published: Any, archive: Path, factor: int = 4) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Read the stored pixels of a run, (y, x, band), and their coarse means."""
     mosaic = open_mosaic(archive / published.receipt["products"]["mosaic"])
-    return mosaic.values(), np.concatenate([mosaic.spectra(block) for block in mosaic.row_blocks(factor)])
+    return mosaic.values(), block_means(mosaic.values(), factor)
 
 
 def rounding(values: NDArray[Any]) -> float:
