@@ -106,5 +106,5 @@ def _any_probes(unit: Any) -> Any:
     """What a look at the smallest scene finds, for decisions that no test reads."""
     camera = LineCamera()
     scene = raster_from_values(np.full((32, 32, 3), 0.5), camera, name="t", wavelength_nm=np.linspace(460, 640, 3))
-    sweeps = uniform_sweeps(SceneGrid(32, 32, 8, 1), camera, "x", step=4)
+    sweeps = uniform_sweeps(SceneGrid(32, 32, 8), camera, "x", step=4)
     return REMEMBERING["probe_survey"][1](scene, Rig(camera), sweeps, unit)

@@ -41,7 +41,7 @@ def paper(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 def test_one_sharp_edge_wins_by_maximum_and_fine_texture_by_mean(paper: ModuleType) -> None:
     """The paper pools edges by maximum, the project by mean: they choose different patches of the same image."""
-    grid = SceneGrid(16, 16, 8, 1)
+    grid = SceneGrid(16, 16, 8)
     image = np.zeros((16, 16, 1), np.float32)
     image[4, 4] = 5.0  # one bright pixel in patch 0
     image[8:, 8:] = np.indices((8, 8)).sum(axis=0)[..., None] // 2 % 2  # texture all over patch 3
@@ -60,7 +60,7 @@ def test_rows_are_maps_of_chosen_patches_and_cost_the_closed_form(paper: ModuleT
     )
     weights = random_weights(BANDS_NM)
     config = weights.config
-    grid = SceneGrid(64, 64, config.patch, 4)
+    grid = SceneGrid(64, 64, config.patch)
     columns = np.random.default_rng(0).standard_normal((64, 64, config.columns)).astype(np.float32)
     read = paper.read_scene(weights, columns, labels, grid, 2)
     chosen = np.array([1, 6, 10])

@@ -33,7 +33,7 @@ from storage.archive.keys import StageRef
 from storage.remote.opening import open_archive
 
 TITLES = {"effects": "choice of effects", "capture": "scan"}
-PATCH, FACTOR = 16, 4  # of the shipped weights, so that scans are those of their surveys
+PATCH = 16  # of the shipped weights, so that scans are those of their surveys
 
 
 def simulate(
@@ -105,7 +105,7 @@ def open_simulation(settings: Settings, *, coarse: bool = False) -> tuple[Captur
             f"{settings.scene} has {scene.filled_px} pixels without a finite value, and a simulation needs one "
             "everywhere; fill or crop it, or choose other --bands"
         )
-    _, coarse_pass, full = PassLayout.of(settings, SceneGrid(*scene.shape, PATCH, FACTOR)).sweeps()
+    _, coarse_pass, full = PassLayout.of(settings, SceneGrid(*scene.shape, PATCH)).sweeps()
     simulated = make_source(scene, settings)
     run = CaptureRun(
         settings=settings,

@@ -78,7 +78,7 @@ NO_RENDERING_FLAGS = RenderingFlags()
 def survey(*settings: Path, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = False, verbose: Verbose = False) -> int:
     """Survey a field: capture it in one or two passes, map its classes, and publish a receipt and a report.
 
-    If a survey fails, the next ones go on, and the exit code is that of the last failure.
+    If a survey fails, the next ones still run. The exit code is that of the last failure.
 
     Parameters
     ----------

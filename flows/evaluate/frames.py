@@ -172,7 +172,7 @@ def open_frames(
 def observe_frame(scene: RasterScene, name: str, weights: Weights, camera: LineCamera, seed: int) -> ObservedFrame:
     """Image a frame by the camera of the training; the noise depends on the seed and the frame's name."""
     config = weights.config
-    grid = SceneGrid(*scene.shape, config.patch, 1)
+    grid = SceneGrid(*scene.shape, config.patch)
     rng = np.random.default_rng([seed, 0xE7A1, zlib.crc32(name.encode())])
     _, reached = weights.basis.matrix(scene.wavelength_nm)
     example = normalised(observe_scene(scene, camera, grid, weights.basis, rng), weights.normalisation, reached)

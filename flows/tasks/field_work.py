@@ -148,7 +148,7 @@ class ExpectedErrors:
         with np.errstate(divide="ignore"):
             sure = np.log(region.crop(coarse.probability)) / weights.temperature
         sure -= scipy.special.logsumexp(sure, axis=-1, keepdims=True)
-        grid = SceneGrid(*region.kept.shape, region.grid.patch, 1)
+        grid = SceneGrid(*region.kept.shape, region.grid.patch)
         return PatchExpectedErrors.of([(sure, np.zeros(sure.shape[:2]))], grid, len(weights.class_names))
 
 

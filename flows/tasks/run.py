@@ -87,7 +87,7 @@ USUAL_COMPONENTS = 32  # of condensed lines, before they are computed
 
 def check_memory(source: SimulatedSource, grid: SceneGrid, plan: CapturePlan, memory: int, pool: WorkerPool) -> None:
     """Check that one tile of the mosaic fits the memory. Raises SettingsError: it does not; names the least memory."""
-    pixels = PixelGrid.of_scene(grid, 1)
+    pixels = PixelGrid.of_scene(grid)
     placed = [place(_PlannedSweep(source, sweep), source.camera) for sweep in plan.coarse]
     rows, columns = image_spec(("y", "x"), pixels.shape, "<f4").shard or pixels.shape
     tiles = plan_tiles(placed, source.camera, pixels, (rows, columns))
@@ -380,7 +380,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     if refused is not None and not planning:
         raise SettingsError(refused)
     pixels, scene, notes, label_notes = _scene_for(model, settings, recorded, planning=planning)
-    grid = SceneGrid(*scene.shape, described.config.patch, 1)
+    grid = SceneGrid(*scene.shape, described.config.patch)
     zones = open_zones(settings.zones, place_of_field(settings, scene), grid)
     outside = beyond_training(settings, scene, described, model.trained_on, path)
     ood_detector = model.asked_ood(settings.unknown)

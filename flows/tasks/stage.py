@@ -53,9 +53,9 @@ class FieldFrame:
         gaps = {} if self.missing is None else {"missing": array_digest(self.missing)}
         return {**georeference_record(self.geobox), **gaps}
 
-    def angular_grid(self, factor: int = 1) -> AngularGrid:
-        """Return the grid of pixels of ``factor`` fine px."""
-        return AngularGrid(self.ifov_rad, (self.grid.height, self.grid.width), factor, self.geobox)
+    def angular_grid(self) -> AngularGrid:
+        """Return the grid of the scene's pixels."""
+        return AngularGrid(self.ifov_rad, (self.grid.height, self.grid.width), geobox=self.geobox)
 
 
 @dataclass(frozen=True)

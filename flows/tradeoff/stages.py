@@ -125,7 +125,7 @@ RECTIFY = Tradeoff(
 
 LAND_SHAPE = (512, 1280)
 LINES = 8  # at each end of a sweep and in its middle
-PATCH, FACTOR = 16, 4
+PATCH = 16
 EXACT = "exact"
 TOLERANCES = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)  # sigma
 
@@ -164,7 +164,7 @@ def _dark(block: SweepBlock, chosen: Mapping[Effect, str]) -> Values:
 def decide_for_lines(seed: int) -> FarmLines:
     """Plan the full scan of a farm, decide on effects for every tolerance, and take lines of the first sweep."""
     scene, rig = farm_scene(seed, LAND_SHAPE), Rig()
-    sweeps = full_sweeps(SceneGrid(*LAND_SHAPE, PATCH, FACTOR), rig.camera, "x")
+    sweeps = full_sweeps(SceneGrid(*LAND_SHAPE, PATCH), rig.camera, "x")
     probe = probe_scene(scene, rig, sweeps)
     starts = (0, (sweeps[0].lines - LINES) // 2, sweeps[0].lines - LINES)
     blocks = tuple(sweep_block(scene, rig, sweeps[0], range(at, at + LINES), seed=seed) for at in starts)
@@ -262,7 +262,7 @@ def plan_every_way(seed: int, scene: str | None = None, weights: Path | None = N
     """Scan a farm or another scene by every uniform scan, and read parts of one of them."""
     run = open_field(seed, scene, weights, "sim")
     camera, cost, source = run.camera, run.settings.cost, run.simulated
-    grid = SceneGrid(*run.scene.shape, run.described.config.patch, 1)
+    grid = SceneGrid(*run.scene.shape, run.described.config.patch)
     along, _, _ = cheapest_full(grid, camera, cost)
     passes: dict[Setting, PlannedPass] = {}
     for words, (step, exposure_ms) in SCANS.items():

@@ -132,7 +132,7 @@ def block_means_of(values: Values, side: int) -> NDArray[np.float32]:
 def scan_farm(seed: int, shape: tuple[int, int] = FIELD_SHAPE, camera: LineCamera | None = None) -> ScanLines:
     """Scan a farm of one swath by every line at 10 ms; the simulator also gives the values without noise."""
     camera, weights = camera or LineCamera(), load_weights(shipped_weights())
-    grid = SceneGrid(*shape, weights.config.patch, 1)
+    grid = SceneGrid(*shape, weights.config.patch)
     source = SimulatedSource(farm_scene(seed, shape, camera=camera), Rig(camera), seed)
     along, _, _ = cheapest_full(grid, camera, CostModel())
     (sweep,) = uniform_sweeps(grid, camera, along, step=1, exposure_ms=EXPOSURE_MS)
@@ -182,7 +182,7 @@ def scan_raster(path: str, weights_path: Path | None) -> ScanLines:
         if weights_path is None or file.labels is None:
             return float("nan")
         weights = load_weights(weights_path)
-        grid = SceneGrid(*file.shape, weights.config.patch, 1)
+        grid = SceneGrid(*file.shape, weights.config.patch)
         coarse = read_coarse_prediction(weights, read_coarse_pass(weights, [restored], file.wavelength_nm, grid))
         labels = judged_labels(scene, describe_weights(weights_path))
         assert labels is not None

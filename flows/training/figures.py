@@ -152,7 +152,7 @@ def _scanned(
 
 
 def _parts(weights: Weights, example: Example) -> tuple[SceneGrid, NDArray[np.uint8]]:
-    grid = SceneGrid(*example.shape, weights.config.patch, 1)
+    grid = SceneGrid(*example.shape, weights.config.patch)
     return grid, example.labels[: grid.height, : grid.width]
 
 

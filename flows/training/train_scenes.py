@@ -160,7 +160,7 @@ def _imaged(
             alike[name] = alone
         if scene.regridded:
             regridded.append(name)
-        grid = SceneGrid(*scene.shape, common.patch, 1)
+        grid = SceneGrid(*scene.shape, common.patch)
         rng = np.random.default_rng([request.settings.seed, stream, number])
         found.examples.append(observe_scene(scene, request.camera, grid, common.basis, rng))
     notes = alike_notes(alike)

@@ -152,7 +152,7 @@ class _Land:
         """Image the farm of a seed on a day, with noise of its own."""
         camera = LineCamera()
         scene = farm_scene(seed, shape, camera=camera, day=day, hour=hour)
-        grid = SceneGrid(*shape, weights.config.patch, 1)
+        grid = SceneGrid(*shape, weights.config.patch)
         seen, noise = observe_finely(scene, camera, grid, weights.basis, int(rng.integers(2**31)))
         padded = np.asarray(pad_by_reflection(seen, grid.padded_shape), np.float32)
         columns = weights.normalisation.apply(padded, np.ones(weights.basis.columns, np.bool_))

@@ -68,7 +68,7 @@ class Region:
     @property
     def grid(self) -> SceneGrid:
         """Return the grid of the box that is read."""
-        return SceneGrid(*self.read.shape, self.field.patch, self.field.factor)
+        return SceneGrid(*self.read.shape, self.field.patch)
 
     @property
     def origin(self) -> tuple[int, int]:
@@ -115,12 +115,12 @@ def plan_regions(
 
     ``shard`` is the (y, x) size of the blocks of the store [px]: a region consists of whole shards and tokens.
     ``most_px`` is the (y, x) size of the largest region, at least one shard and one token. ``halo`` [px] is read
-    around a region inside the field, rounded up to whole tokens, patches and coarse pixels.
+    around a region inside the field, rounded up to whole tokens and patches.
     """
-    cell, step = math.lcm(field.patch * field.factor, TOKEN_PX), math.lcm(field.patch, field.factor, TOKEN_PX)
+    step = math.lcm(field.patch, TOKEN_PX)
     margin = -(-halo // step) * step
     down, across = (
-        _cuts(size, math.lcm(cell, unit), most)
+        _cuts(size, math.lcm(step, unit), most)
         for size, unit, most in zip((field.height, field.width), shard, most_px, strict=True)
     )
     kept = [Box(top, left, bottom, right) for top, bottom in down for left, right in across]

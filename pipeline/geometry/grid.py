@@ -1,4 +1,4 @@
-"""Define the scene grid: pixels, patches, coarse pixels and padding."""
+"""Define the scene grid: pixels, patches and padding."""
 
 from __future__ import annotations
 
@@ -17,28 +17,24 @@ UNLABELLED = 255  # pixel without a class, in (y, x) uint8 images of class indic
 
 @dataclass(frozen=True)
 class SceneGrid:
-    """A scene of ``height`` x ``width`` px with patches of ``patch`` px and coarse pixels of ``factor`` px.
+    """A scene of ``height`` x ``width`` px with patches of ``patch`` px.
 
-    The padded grid is the smallest multiple of ``patch * factor`` that holds the scene. A coarse patch (``patch``
-    coarse pixels a side) then covers ``factor`` x ``factor`` whole patches. Patches are numbered row by row over the
-    padded grid; patches without a valid pixel are never captured.
+    The padded grid is the smallest multiple of ``patch`` that holds the scene. Patches are numbered row by row.
     """
 
     height: int
     width: int
     patch: int
-    factor: int
 
     def __post_init__(self) -> None:
-        for name in ("height", "width", "patch", "factor"):
+        for name in ("height", "width", "patch"):
             if getattr(self, name) < 1:
                 raise ShapeError(f"the scene grid's {name} must be at least 1, got {getattr(self, name)}")
 
     @property
     def padded_shape(self) -> tuple[int, int]:
         """Return (y, x) of the padded fine grid [px]."""
-        cell = self.patch * self.factor
-        return -(-self.height // cell) * cell, -(-self.width // cell) * cell
+        return -(-self.height // self.patch) * self.patch, -(-self.width // self.patch) * self.patch
 
     @property
     def patch_shape(self) -> tuple[int, int]:

@@ -191,10 +191,9 @@ class PixelGrid:
     shape: tuple[int, int]
 
     @classmethod
-    def of_scene(cls, grid: SceneGrid, step: int) -> PixelGrid:
-        """Return the scene's own pixels for step 1, its coarse ones for ``grid.factor``."""
-        shape = -(-grid.height // step), -(-grid.width // step)  # of pixels that hold part of the scene
-        return cls(((step - grid.height) / 2, (step - grid.width) / 2), step, shape)
+    def of_scene(cls, grid: SceneGrid) -> PixelGrid:
+        """Return the scene's own pixels."""
+        return cls(((1 - grid.height) / 2, (1 - grid.width) / 2), 1, (grid.height, grid.width))
 
     def points(self, rows: slice, columns: slice) -> NDArray[np.float64]:
         """Return the centres of a part of the pixels, (y, x, 2) from the scene's centre [px]."""

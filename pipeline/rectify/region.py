@@ -78,13 +78,13 @@ def mosaic_tile(
 
 
 def mosaic_rows(
-    sweeps: Sequence[SweepLines], camera: LineCamera, grid: SceneGrid, *, rows: int, step: int = 1
+    sweeps: Sequence[SweepLines], camera: LineCamera, grid: SceneGrid, *, rows: int
 ) -> Iterator[tuple[int, Values, Counts]]:
-    """Rectify and blend the sweeps of one pass onto pixels of ``step`` scene pixels, ``rows`` rows at a time.
+    """Rectify and blend the sweeps of one pass onto the pixels of the scene, ``rows`` rows at a time.
 
     Yields the first row, (row, x, band) float32 with NaN where no line reached, and (row, x) how many sweeps did.
     """
-    pixels = PixelGrid.of_scene(grid, step)
+    pixels = PixelGrid.of_scene(grid)
     placed = [place(lines, camera) for lines in sweeps]
     columns = slice(0, pixels.shape[1])
     reach = column_reach(placed, camera, pixels, columns)

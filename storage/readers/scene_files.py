@@ -389,7 +389,7 @@ class RasterPixels:
     def rows_at_once(self, memory: int) -> int:
         """Return the rows to read at a time: whole rows of patches (SettingsError: one does not fit the memory)."""
         grid = self.grid
-        deep, row = grid.patch * grid.factor, COPIES * grid.width * self.bands * 4
+        deep, row = grid.patch, COPIES * grid.width * self.bands * 4
         least = RESERVED_BYTES + deep * row
         if least > memory:
             why = f"{deep} rows of a raster of {grid.width} px and {self.bands} bands are read at a time"

@@ -32,7 +32,7 @@ def fields() -> list[ReadTwice]:
     weights, camera, examples = load_weights(shipped_weights()), LineCamera(), list[Example]()
     augmentation = training_capture(weights.normalisation, 3.0)
     assert augmentation is not None
-    data, grid = farm_test_data(FIELDS, camera, "farm,scouting"), SceneGrid(*FARM_SHAPE, weights.config.patch, 1)
+    data, grid = farm_test_data(FIELDS, camera, "farm,scouting"), SceneGrid(*FARM_SHAPE, weights.config.patch)
     for number, name in enumerate(data.train):
         rng = np.random.default_rng([number, 0xC0])
         seen = observe_scene(data.scene(name), camera, grid, weights.basis, rng)

@@ -116,7 +116,7 @@ def shipped() -> Weights:
 def chosen_scan(shape: tuple[int, int], seconds: float, weights: Weights | None = None) -> UniformScan:
     """The scan that a survey of so many seconds takes, by the weights for uniform scans or others."""
     weights = weights or shipped()
-    grid = SceneGrid(*shape, weights.config.patch, 1)
+    grid = SceneGrid(*shape, weights.config.patch)
     along, _, _ = cheapest_full(grid, CAMERA, COST)
     record = ScanPerformance.read(weights.record["scans"])
     sweeps = {step: uniform_sweeps(grid, CAMERA, along, step=step) for step in record.steps}
@@ -160,7 +160,7 @@ def scanned(
     scene: RasterScene, weights: Weights, seed: int, step: int, exposure_ms: float
 ) -> tuple[PlannedPass, DrawnMap]:
     """A uniform scan of a scene, and the map of it with every patch read."""
-    grid, rig = SceneGrid(*scene.shape, weights.config.patch, 1), Rig(CAMERA)
+    grid, rig = SceneGrid(*scene.shape, weights.config.patch), Rig(CAMERA)
     along, _, _ = cheapest_full(grid, CAMERA, COST)
     sweeps = uniform_sweeps(grid, CAMERA, along, step=step, exposure_ms=exposure_ms)
     chosen = chosen_effects(scene, rig, sweeps)

@@ -248,7 +248,7 @@ def _of_the_file(folder: Path, split: Split) -> list[Result]:
 
     scene = _scene(folder)
     (height, width), basis = split.train.shape, SpectralBasis.spanning(scene.wavelength_nm, COLUMNS[False])
-    grid = SceneGrid(height, width, patch=8, factor=1)
+    grid = SceneGrid(height, width, patch=8)
     columns = (split.values / np.float32(split.values.max())) @ basis.matrix(scene.wavelength_nm)[0]
     columns = np.asarray(pad_by_reflection(columns, grid.padded_shape), np.float32)
     labels = np.full(grid.padded_shape, UNLABELLED, np.uint8)

@@ -76,7 +76,7 @@ def trained(name: str, scenes: Mapping[str, Callable[[], RasterScene]], patch: i
     made = [make() for make in scenes.values()]
     first, rng = made[0], np.random.default_rng(0)
     basis = SpectralBasis.spanning(first.wavelength_nm)
-    seen = [observe(scene, CAMERA, SceneGrid(*scene.shape, patch, 1), basis, rng) for scene in made]
+    seen = [observe(scene, CAMERA, SceneGrid(*scene.shape, patch), basis, rng) for scene in made]
     normalisation = measured_normalisation(seen)
     examples = [normalised(one, normalisation, np.ones(basis.columns, np.bool_)) for one in seen]
     config = SegmenterConfig(len(first.class_names), basis.columns, patch)

@@ -41,7 +41,7 @@ def test_17_a_pixel_dead_in_most_of_its_bands_is_dead(dead: int, lives: bool, ba
 @pytest.mark.parametrize("size", [8, 32])
 def test_18_dead_pixels_show_within_a_token_alone_but_for_attention(size: int):
     """A dead patch or token, of a network whose tokens say nothing, changes nothing farther away than a token."""
-    weights, grid, values = plain_weights(), SceneGrid(128, 128, 8, 1), _scene(128, 128)
+    weights, grid, values = plain_weights(), SceneGrid(128, 128, 8), _scene(128, 128)
     with torch.no_grad():
         for parameter in weights.segmenter.from_token.parameters():
             parameter.zero_()
@@ -63,7 +63,7 @@ def test_18_holes_in_a_coarse_look_take_no_further_copy_of_it():
         values[3::8, 4::8] = bad
         tracemalloc.start()
         seen = read_coarse_pass(
-            weights, [values[row : row + 16] for row in range(0, 256, 16)], NM, SceneGrid(256, 256, 8, 1)
+            weights, [values[row : row + 16] for row in range(0, 256, 16)], NM, SceneGrid(256, 256, 8)
         )
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
@@ -73,6 +73,6 @@ def test_18_holes_in_a_coarse_look_take_no_further_copy_of_it():
 
 def test_18_a_scene_all_dead_still_has_scores():
     """Where nothing was seen at all every policy's scores are finite."""
-    seen = coarse_prediction(plain_weights(), np.full((32, 32, 9), np.nan), NM, SceneGrid(32, 32, 8, 1))
+    seen = coarse_prediction(plain_weights(), np.full((32, 32, 9), np.nan), NM, SceneGrid(32, 32, 8))
     for policy in ("gain", "entropy", "sobel"):
         assert np.isfinite(score_patches(policy, seen)).all()

@@ -104,7 +104,7 @@ def test_4_nothing_labelled_is_no_loss(images: int, soft_dice: bool):
 @torch.inference_mode()
 def test_5_no_patch_is_the_overview_bit_by_bit():
     """With K = 0 training's forward, the overview and the survey's map come from one and the same logits."""
-    weights, grid = plain_weights(), SceneGrid(48, 64, 8, 1)
+    weights, grid = plain_weights(), SceneGrid(48, 64, 8)
     seen = coarse_prediction_of_columns(weights, noise(0, 48, 64, 4).numpy(), grid)
     image = torch.from_numpy(with_planes(seen.columns, LineSpec())).permute(2, 0, 1)[None]
     model = weights.segmenter
@@ -155,7 +155,7 @@ def test_9_a_dead_score_never_wins():
 def test_10_a_patch_given_twice_is_refused():
     """A choice names each patch once; where a caller does not, nothing is added up or overwritten: it is told which."""
     with pytest.raises(ValueError, match="patch 4 is given more than once"):
-        check_patch_index(np.array([4, 1, 4]), SceneGrid(37, 53, 8, 2))
+        check_patch_index(np.array([4, 1, 4]), SceneGrid(37, 53, 8))
 
 
 @torch.inference_mode()
@@ -250,7 +250,7 @@ def test_20_numbers_that_are_no_class_are_refused(label: int, guess: int):
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (37, 53), (100, 31)])
 def test_21_any_size_gives_its_own_map(size: tuple[int, int]):
     """Scenes that do not divide are padded and cropped back, from one pixel on; no patch of the pad is bought."""
-    weights, grid = plain_weights(), SceneGrid(*size, 8, 4)
+    weights, grid = plain_weights(), SceneGrid(*size, 8)
     values = np.random.default_rng(0).uniform(0.1, 0.5, (*size, 5))
     seen = coarse_prediction(weights, values, np.linspace(450, 950, 5), grid)
     valid = grid.valid_fraction().ravel() > 0
@@ -263,7 +263,7 @@ def test_21_any_size_gives_its_own_map(size: tuple[int, int]):
 
 def test_22_a_scene_alike_everywhere_scores_alike():
     """Whole patches score equal to 1e-6, at the border too; partly filled ones rank by their pixels on the scene."""
-    grid = SceneGrid(36, 50, 8, 2)
+    grid = SceneGrid(36, 50, 8)
     columns, probability = (np.full((*grid.padded_shape, n), of, np.float32) for n, of in ((4, 0.3), (3, 1 / 3)))
     seen = CoarsePrediction(grid, columns, probability)
     fraction = seen.grid.valid_fraction().ravel()
@@ -305,7 +305,7 @@ def test_23_tokens_in_another_order_say_the_same():
 def test_24_wavelengths_in_another_unit_are_refused(nm: list[float]):
     """Micrometres and numbers outside 200-3000 nm are a ValueError that says so."""
     with pytest.raises(ValueError, match="outside 200-3000 nm"):
-        coarse_prediction(plain_weights(), np.zeros((16, 16, 2)), np.array(nm), SceneGrid(16, 16, 8, 1))
+        coarse_prediction(plain_weights(), np.zeros((16, 16, 2)), np.array(nm), SceneGrid(16, 16, 8))
 
 
 def test_25_certainty_has_no_entropy():
@@ -357,7 +357,7 @@ def test_30_a_checkpoint_reads_other_bands(tmp_path: Path):
     weights, path = plain_weights(), tmp_path / "w.safetensors"
     save_weights(weights, path)
     loaded = load_weights(path)
-    grid = SceneGrid(16, 16, 8, 1)
+    grid = SceneGrid(16, 16, 8)
     for bands in (1, 3, 200):
         seen = coarse_prediction(loaded, np.full((16, 16, bands), 0.3), np.linspace(500, 900, bands), grid)
         assert np.isfinite(seen.probability).all()
@@ -365,7 +365,7 @@ def test_30_a_checkpoint_reads_other_bands(tmp_path: Path):
 
 def test_31_one_and_two_threads_choose_the_same_patches(threads: None):
     """The same scene gives the same plan on 1 and 2 threads, and no global stream is touched."""
-    weights, grid = plain_weights(), SceneGrid(96, 96, 8, 1)
+    weights, grid = plain_weights(), SceneGrid(96, 96, 8)
     columns = noise(0, 96, 96, 4).numpy()
     before, plans = torch.random.get_rng_state(), []
     for count in (1, 2):

@@ -18,7 +18,7 @@ from pipeline.readings import MOST_VALUE, beyond_range, find_beyond, readings_al
 from tests.models.conftest import coarse_prediction, make_weights
 
 WEIGHTS = make_weights(0)
-GRID, NM = SceneGrid(48, 64, 8, 1), np.linspace(420, 980, 7)
+GRID, NM = SceneGrid(48, 64, 8), np.linspace(420, 980, 7)
 MOST = WEIGHTS.normalisation.most_value
 VALUES = np.random.default_rng(0).uniform(0.1, 0.5, (*GRID.padded_shape, 7)).astype(np.float32)
 PATCHES = np.array([3, 9, 20, 21])

@@ -12,7 +12,7 @@ from pipeline.planning.coverage import full_sweeps
 from pipeline.planning.fine_pass import FinePlan, SecondPass, every_nth
 
 CAMERA, COST = LineCamera(), CostModel()
-GRID = SceneGrid(200, 900, 32, 4)
+GRID = SceneGrid(200, 900, 32)
 
 
 def planned(grid: SceneGrid, gain: np.ndarray, seconds: float, along: Axis = "x", cost: CostModel = COST) -> FinePlan:
@@ -43,7 +43,7 @@ def test_set_ups_that_cost_nothing():
 @pytest.mark.parametrize("shape", [(1, 1), (20, 32)])
 def test_one_patch(along: Axis, shape: tuple[int, int]):
     """A field of one patch, down to one pixel, is one run that shows it."""
-    grid = SceneGrid(*shape, max(shape), 1)
+    grid = SceneGrid(*shape, max(shape))
     plan = planned(grid, np.ones(1), 1e3, along)
     (sweep,) = plan.sweeps
     assert sweep.lines <= (shape[0] if along == "x" else shape[1]) + 5
@@ -72,7 +72,7 @@ def test_a_field_with_an_empty_side():
 
 def test_28_negative_gains_are_never_bought():
     """No run is bought for a negative score, nor for one that is no number; all is left unspent."""
-    grid, score = SceneGrid(256, 256, 16, 4), np.full(256, -0.3)
+    grid, score = SceneGrid(256, 256, 16), np.full(256, -0.3)
     score[[3, 70, 200]] = -5.0, np.nan, -np.inf
     plan = planned(grid, score, 10.0)
     assert (plan.patch_index.tolist(), plan.sweeps, plan.expected_gain) == ([], [], 0.0)

@@ -49,7 +49,7 @@ def coarse_prediction(
 def scene_columns(weights: Weights, height: int, width: int, seed: int = 0) -> tuple[CoarsePass, np.ndarray]:
     """A look at a scene of noise, and other noise for every patch of its padded grid."""
     p, columns = weights.config.patch, weights.config.columns
-    grid, rng = SceneGrid(height, width, p, 1), np.random.default_rng(seed)
+    grid, rng = SceneGrid(height, width, p), np.random.default_rng(seed)
     coarse_pass = CoarsePass(grid, rng.standard_normal((*grid.padded_shape, columns), np.float32))
     return coarse_pass, rng.standard_normal((int(np.prod(grid.patch_shape)), p, p, columns), np.float32)
 

@@ -132,7 +132,7 @@ def locate(
     signal: StageRef, registration: StageRef | None = None, *, camera: LineCamera, frame: FieldFrame, report: Report
 ) -> Wanted:
     """Compute the geolocation grid, which all surveys along the same path share."""
-    grid = PixelGrid.of_scene(frame.grid, 1)
+    grid = PixelGrid.of_scene(frame.grid)
     sweeps = open_sweeps(signal, registration, camera)
     params = {
         "camera": {name: getattr(camera, name) for name in ("samples", "pitch_um", "focal_length_mm")},
@@ -180,7 +180,7 @@ def rectify(
         recipe = MosaicRecipe(
             signal,
             camera,
-            PixelGrid.of_scene(frame.grid, 1),
+            PixelGrid.of_scene(frame.grid),
             resampling,
             geolocation=geolocation,
             registration=registration,
@@ -211,7 +211,7 @@ def rectify_fine(
 
     def build(path: Path) -> None:
         """Write mosaic, the capture of each pixel, and the record of each sweep's lines."""
-        grid = PixelGrid.of_scene(frame.grid, 1)
+        grid = PixelGrid.of_scene(frame.grid)
         recipe = MosaicRecipe(signal, camera, grid, resampling, registration=registration, interlaced=True)
         writer = mosaic_of_sweeps(path, signal, frame)
         write_mosaic(recipe, writer, memory=memory, pool=pool, report=report)

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
@@ -163,9 +162,8 @@ def anchor_sweep(
 ) -> Anchor:
     """Find the place of a fine sweep on the coarse mosaic, (y, x), the broad-band mean of the same bands as its image.
 
-    The sweep is rectified at the scene's pixels, blurred to coarse pixels, and compared with the interpolated mosaic.
-    The search goes up to ``prior_px`` from its reported positions in either axis [px]. The result is one offset for
-    the whole sweep, since runs of the fine pass are short.
+    The sweep is rectified at the scene's pixels. The search goes up to ``prior_px`` from its reported positions in
+    either axis [px]. The result is one offset for the whole sweep, since runs of the fine pass are short.
 
     Raises PoseError: a corrected position is beyond the mirror's rim.
     """
@@ -195,18 +193,10 @@ def _compare_with_mosaic(
     along_px, scan_px = shown
     if not (len(along_px) and len(scan_px)):
         return nothing_found("empty")
-    mean = np.full(grid.factor, 1 / grid.factor)
-    if grid.factor % 2 == 0:  # centred: the outer two count half
-        mean = np.concatenate([[0.5], np.ones(grid.factor - 1), [0.5]]) / grid.factor
     seen = image.seen_at(along_px, scan_px).astype(np.float64)
-    for axis in (0, 1):  # a coarse pixel is a mean over factor x factor; what is not seen spreads by as much
-        seen = scipy.ndimage.convolve1d(seen, mean, axis=axis, mode="constant", cval=np.nan)
     scan, along = np.meshgrid(scan_px, along_px, indexing="ij")
     y, x = (scan, along) if image.broad.sweep.along == "x" else (along, scan)
-    rows, columns = (
-        (place + (size - 1) / 2 - (grid.factor - 1) / 2) / grid.factor
-        for place, size in ((y, grid.height), (x, grid.width))
-    )
+    rows, columns = (place + (size - 1) / 2 for place, size in ((y, grid.height), (x, grid.width)))
     points = np.stack([rows.ravel(), columns.ravel()], axis=-1)
     under, _ = resample(np.ascontiguousarray(mosaic[..., None], np.float32), np.isfinite(mosaic), points)
     return pair_shift(under[:, 0].astype(np.float64).reshape(scan.shape), seen, prior_px=reach_px)

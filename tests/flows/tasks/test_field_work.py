@@ -182,7 +182,7 @@ def test_weights_that_changed_are_refused(tmp_path: Path, weights: Path) -> None
 @pytest.mark.parametrize("size", [(640, 640), (641, 90), (90, 641)])
 def test_only_keys_of_fields_that_are_cut_know_of_regions(size: tuple[int, int]) -> None:
     """What was stored of a field up to the limit is found again; a larger one is another result than read whole."""
-    assert bool(region_params(SceneGrid(*size, 16, 4))) == (max(size) > 640)
+    assert bool(region_params(SceneGrid(*size, 16))) == (max(size) > 640)
 
 
 @pytest.mark.parametrize("shift", [(0, 0), (8, -20), (-500, 3), (-3, 500)])

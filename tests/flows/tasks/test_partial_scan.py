@@ -184,7 +184,7 @@ def test_of_what_is_sure_enough_nothing_is_looked_at(
 
 def test_nothing_is_worth_more_than_what_is_due() -> None:
     """A patch that is due counts more than all that the others gain; without gains the oldest counts most."""
-    grid = SceneGrid(4, 16, 4, 1)
+    grid = SceneGrid(4, 16, 4)
     probabilities = np.log([0.6, 0.4]) * np.ones((4, 16, 1))
     age = np.repeat([[1.0, 2.0, 3.0, 4.0]], 4, axis=0).repeat(4, axis=1)
     expected_errors = PatchExpectedErrors.of([(probabilities, age)], grid, 2)

@@ -24,7 +24,7 @@ from pipeline.errors import BudgetError, SettingsError
 from pipeline.geometry.grid import SceneGrid
 from tests.conftest import Flags, Survey
 
-COSTS = ReadingCosts(SegmenterConfig(classes=5), SceneGrid(192, 256, 16, 1), 30)
+COSTS = ReadingCosts(SegmenterConfig(classes=5), SceneGrid(192, 256, 16), 30)
 PATCHES = 12 * 16
 SCAN: dict[str, Any] = {"budget": None, "scan_step": "2", "scan_exposure_ms": "25"}
 scores = st.integers(0, 2**32 - 1).map(lambda seed: np.random.default_rng(seed).normal(0.1, 0.1, PATCHES))
@@ -158,7 +158,7 @@ def test_a_large_field_is_counted_region_by_region() -> None:
     """Sixteen times the field takes as many fields and their halos, of which only the overview reads more."""
     small, large = (
         costs.of_map(costs.grid.valid_patches())
-        for costs in (replace(COSTS, grid=SceneGrid(side, side, 16, 1)) for side in (2560, 10240))
+        for costs in (replace(COSTS, grid=SceneGrid(side, side, 16)) for side in (2560, 10240))
     )
     assert large.detail == 16 * small.detail
     assert 16 * small.overview < large.overview < 16 * 1.1 * small.overview

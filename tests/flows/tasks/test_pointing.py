@@ -71,7 +71,7 @@ def test_what_the_mirror_missed_is_told_and_detail_still_helps(surveyed: tuple[d
     receipt, archive = surveyed
     detail = open_mosaic(archive / receipt["products"]["mosaic"])
     kinds, number = detail.captures() or ([], np.zeros(detail.shape))
-    unseen = patch_pixels(SceneGrid(*detail.shape, 16, 1), np.array([step == 4 for _, step, _ in kinds])[number])
+    unseen = patch_pixels(SceneGrid(*detail.shape, 16), np.array([step == 4 for _, step, _ in kinds])[number])
     unseen = unseen[json.loads((archive / receipt["products"]["plan"]).read_text())["patch_index"]]
     assert receipt["pointing"]["fine"]["partly_seen"] == np.count_nonzero(unseen.any(axis=(1, 2)))
     rows = dict(finding_rows(surveyed[0]))
@@ -111,7 +111,7 @@ def test_every_finding_has_its_words(case: str) -> None:
     assert finding_rows(found_of(**told)) == [("pointing, coarse", words)]
 
 
-GRID = SceneGrid(300, 1500, 16, 4)
+GRID = SceneGrid(300, 1500, 16)
 OFF = 20.0
 
 

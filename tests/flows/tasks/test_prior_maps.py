@@ -135,7 +135,7 @@ def test_a_run_captured_after_the_visit_is_refused(twice: tuple[Path, Any, Any])
 def found_prior(out: Path, visit: str, prior: str) -> tuple[str, float] | None:
     """Name and days of the run that a visit to north goes on from."""
     settings = load_settings(None, {"prior": prior, "visit": visit})
-    found, _ = memory.find_prior(Archive.open(out), settings, "north", SceneGrid(96, 128, 8, 4), CLASSES, "scene")
+    found, _ = memory.find_prior(Archive.open(out), settings, "north", SceneGrid(96, 128, 8), CLASSES, "scene")
     return found and (found.run, found.days)
 
 

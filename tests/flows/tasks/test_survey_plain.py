@@ -170,7 +170,7 @@ def test_without_later_lines_the_first_pass_is_read_in_full(survey_png: Any, wei
     assert done.published.captured_again == 0
     mosaic = open_mosaic(tmp_path / done.receipt["products"]["mosaic"])
     drawn = done.open("class_map")["classes"].values
-    grid = SceneGrid(*drawn.shape, 8, 1)
+    grid = SceneGrid(*drawn.shape, 8)
     values, capture = mosaic.values(), LineSpec(1.0, 4)
     seen = coarse_prediction(load_weights(weights), values, mosaic.wavelength_nm, grid, capture=capture)
     every = grid.valid_patches()

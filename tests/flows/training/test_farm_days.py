@@ -118,7 +118,7 @@ def test_training_mixes_built_in_scenes() -> None:
 def test_training_sees_the_farm_through_the_rig(bands: tuple[int, ...]) -> None:
     """Beside the footprint and the noise alone, blur and shading count, by little. Surveys condense many bands."""
     scene, camera = open_scene(_settings(seed=5, size="96x64", bands=bands))[0], LineCamera(samples=96)
-    grid, basis = SceneGrid(*scene.shape, 8, 1), SpectralBasis.spanning(scene.wavelength_nm, 6)
+    grid, basis = SceneGrid(*scene.shape, 8), SpectralBasis.spanning(scene.wavelength_nm, 6)
     seen = observe_scene(scene, camera, grid, basis, np.random.default_rng(3))
     plain = observe(scene, camera, grid, basis, np.random.default_rng(3))
     np.testing.assert_array_equal(seen.labels, plain.labels)

@@ -160,7 +160,7 @@ def test_counts_of_validation_scenes_add_up(monkeypatch: pytest.MonkeyPatch) -> 
         for at in (0, 2)
     )
     monkeypatch.setattr(figures, "run_controls", lambda *given, **named: next(scenes))
-    one = ReadTwice(*np.zeros((2, 1, 1), np.uint8), {}, np.zeros((1, 1), np.uint8), SceneGrid(1, 1, 1, 1))
+    one = ReadTwice(*np.zeros((2, 1, 1), np.uint8), {}, np.zeros((1, 1), np.uint8), SceneGrid(1, 1, 1))
     found = figures.validate([one, one], 2, 0)
     assert found is not None
     assert found["gain"]["miou"] == mean_iou(2 * counts[2])

@@ -150,7 +150,7 @@ def _four_patches() -> ReadTwice:
     labels = np.repeat(np.repeat(np.array([[0, 1], [1, 0]], np.uint8), 2, 0), 2, 1)
     overview, full = 1 - labels, labels.copy()
     overview[2:, 2:], full[2:, 2:] = 0, 1
-    return ReadTwice(overview, full, {"gain": FOUR}, labels, SceneGrid(4, 4, 2, 1))
+    return ReadTwice(overview, full, {"gain": FOUR}, labels, SceneGrid(4, 4, 2))
 
 
 def test_chosen_patches_are_read_in_full() -> None:

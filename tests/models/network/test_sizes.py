@@ -21,7 +21,7 @@ from pipeline.geometry.grid import SceneGrid
 def test_closed_form_equals_the_counter(sizes: dict[str, int], patch_index: int, width: int) -> None:
     """The closed form counts just what torch counts while the model runs."""
     config = SegmenterConfig(classes=5, columns=6, **sizes)
-    grid = SceneGrid(64, width, config.patch, 1)
+    grid = SceneGrid(64, width, config.patch)
     model, image = Segmenter(config).eval(), torch.zeros(1, 6 + PLANES, *grid.padded_shape)
     attention = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu
     flops = {attention: lambda q, k, v, *args, out_shape=None, **kwargs: sdpa_flop_count(q, k, v)}
@@ -46,7 +46,7 @@ def test_the_temporal_reader_costs_what_the_counter_counts() -> None:
 def test_each_patch_costs_the_same_and_the_overview_none_of_it() -> None:
     """What the policy took is added; columns are made of each band, again for patches that were captured apart."""
     config = SegmenterConfig(classes=5)
-    grid = SceneGrid(250, 256, 16, 4)
+    grid = SceneGrid(250, 256, 16)
     one, many, bare = (multiply_adds(config, grid, *given, score=9) for given in ((1, 270), (20, 270), (20, 0)))
     assert one.overview == many.overview == bare.overview + 256**2 * 270 * config.columns
     assert 20 * one.detail == many.detail == bare.detail
@@ -57,6 +57,6 @@ def test_each_patch_costs_the_same_and_the_overview_none_of_it() -> None:
 
 def test_edges_go_through_all_columns_once() -> None:
     """Each column more adds one multiply-add a pixel."""
-    grid = SceneGrid(256, 256, 16, 4)
+    grid = SceneGrid(256, 256, 16)
     few, many = (score_multiply_adds("sobel", SegmenterConfig(5, columns), grid) for columns in (2, 24))
     assert many - few == 22 * 256 * 256

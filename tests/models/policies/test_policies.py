@@ -14,9 +14,9 @@ from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid
 
 
-def _coarse_prediction(height: int = 32, width: int = 48, patch: int = 8, factor: int = 2) -> CoarsePrediction:
+def _coarse_prediction(height: int = 32, width: int = 48, patch: int = 8) -> CoarsePrediction:
     """A flat scene of which the coarse prediction is equally unsure everywhere."""
-    grid = SceneGrid(height, width, patch, factor)
+    grid = SceneGrid(height, width, patch)
     columns, probability = (np.full((*grid.padded_shape, n), 1 / n, np.float32) for n in (3, 4))
     return CoarsePrediction(grid, columns, probability)
 
@@ -32,7 +32,7 @@ def test_entropy_runs_from_none_to_the_log_of_classes(classes: int):
 
 def _of_classes(*probability: tuple[float, ...], filled: NDArray[np.bool_] | None = None) -> CoarsePrediction:
     """Patches of one pixel in a row, each with its own probabilities."""
-    grid, shown = SceneGrid(1, len(probability), 1, 1), np.array([probability], np.float32)
+    grid, shown = SceneGrid(1, len(probability), 1), np.array([probability], np.float32)
     return CoarsePrediction(grid, shown, shown, filled=filled)
 
 
@@ -122,10 +122,9 @@ def test_patches_off_the_scene_are_worth_nothing(policy: str, size: tuple[int, i
 
 
 @pytest.mark.parametrize("policy", ["entropy", "mask", "gain"])
-@pytest.mark.parametrize("factor", [1, 2, 4])
-def test_a_border_patch_is_worth_its_fraction(policy: str, factor: int):
+def test_a_border_patch_is_worth_its_fraction(policy: str):
     """On a scene alike everywhere a patch scores in proportion to its pixels on the scene."""
-    seen = _coarse_prediction(37, 53, factor=factor)
+    seen = _coarse_prediction(37, 53)
     scores = score_patches(policy, seen, mask=np.full((37, 53), np.log(4)))
     level = 0.75 if policy == "gain" else np.log(4)
     assert scores == pytest.approx(level * seen.grid.valid_fraction().ravel(), abs=1e-6)

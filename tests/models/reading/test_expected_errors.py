@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from models.reading.expected_errors import PatchExpectedErrors, expected_error_of
 from pipeline.geometry.grid import SceneGrid
 
-GRID = SceneGrid(8, 12, 4, 1)
+GRID = SceneGrid(8, 12, 4)
 
 
 def believed(sure: float, classes: int = 3, shape: tuple[int, int] = (8, 12), kind: int = 0) -> np.ndarray:

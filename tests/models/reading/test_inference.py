@@ -145,7 +145,7 @@ def test_a_patch_that_cannot_be_is_refused_before_anything_is_read(
 @pytest.mark.parametrize("bands", [NM, NM[:3]])
 def test_a_look_in_swaths_is_the_look_at_once(tiny: Maker, bands: np.ndarray):
     """Rows of the mosaic that come some at a time give the very same columns, with bands for all of them or not."""
-    weights, grid = tiny(), SceneGrid(37, 53, 8, 1)
+    weights, grid = tiny(), SceneGrid(37, 53, 8)
     values = _values(37, 53, len(bands))
     whole = read_coarse_pass(weights, [values], bands, grid)
     parts = read_coarse_pass(weights, np.split(values, [1, 9]), bands, grid)
@@ -172,7 +172,7 @@ def test_a_scene_is_read_in_full_by_its_columns(tiny: Maker):
 @pytest.mark.parametrize("more", [0, 1])
 def test_a_token_dead_in_most_of_its_pixels_is_left_out(more: int):
     """With half of its pixels dead a token is read, with one more it is not; holes take the mean of their patch."""
-    weights, grid, values = plain_weights(), SceneGrid(60, 64, 8, 1), _values(60, 64)
+    weights, grid, values = plain_weights(), SceneGrid(60, 64, 8), _values(60, 64)
     whole = read_coarse_pass(weights, [values], NM, grid).columns
     values[:16, :32], values[16, :more], values[41:43, 50:53] = np.nan, np.inf, -np.inf
     seen = read_coarse_pass(weights, [values], NM, grid)
@@ -216,7 +216,7 @@ def test_logits_that_are_not_finite_give_no_class(value: float):
 
 def test_what_was_never_dead_has_no_mask(tiny: Maker):
     """Where every pixel lives no token is left out, and nothing is filled."""
-    seen = read_coarse_pass(tiny(), [_values(30, 31)], NM, SceneGrid(30, 31, 8, 1))
+    seen = read_coarse_pass(tiny(), [_values(30, 31)], NM, SceneGrid(30, 31, 8))
     assert (seen.living, seen.filled, seen.out_of_range) == (None, None, None)
     assert seen.seen_columns is seen.columns
     assert CoarsePass(seen.grid, seen.columns).capture == LineSpec()

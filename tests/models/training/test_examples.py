@@ -30,7 +30,7 @@ def _scene(shape: tuple[int, int] = (40, 50), camera: LineCamera = CAMERA) -> Ra
 
 def _observed(scene: RasterScene, camera: LineCamera = CAMERA, seed: int = 0) -> Example:
     basis = SpectralBasis.spanning(NM)
-    return observe(scene, camera, SceneGrid(*scene.shape, 8, 2), basis, np.random.default_rng(seed))
+    return observe(scene, camera, SceneGrid(*scene.shape, 8), basis, np.random.default_rng(seed))
 
 
 def test_the_look_is_the_cameras_own():
@@ -45,14 +45,14 @@ def test_the_look_is_the_cameras_own():
 
 def test_the_look_at_a_padded_scene():
     """Columns and labels have the padded size; what was added is unlabelled and mirrors the scene."""
-    scene = _scene()
+    scene = _scene((36, 50))
     seen = _observed(scene)
-    assert seen.columns.shape == (48, 64, 6)
-    assert (seen.labels[:40, :50] == scene.labels).all()
-    assert (seen.labels[40:] == 255).all()
+    assert seen.columns.shape == (40, 56, 6)
+    assert (seen.labels[:36, :50] == scene.labels).all()
+    assert (seen.labels[36:] == 255).all()
     assert (seen.labels[:, 50:] == 255).all()
-    assert seen.shape == (40, 50)
-    assert np.abs(seen.columns[40:44] - seen.columns[38:34:-1]).mean() < 0.1
+    assert seen.shape == (36, 50)
+    assert np.abs(seen.columns[36:40] - seen.columns[34:30:-1]).mean() < 0.1
 
 
 def test_scenes_without_labels_teach_nothing():

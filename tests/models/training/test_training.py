@@ -53,7 +53,7 @@ def test_what_was_trained_at_the_reference_alone_reads_every_capture_alike(tiny:
     scene = block_example()
     model, _ = train(CONFIG, [scene], SHIFT, SETTINGS)
     assert not any(stem.enter.weight[:, 2 : 2 + PLANES].any() for stem in (model.overview_stem, model.full_stem))
-    weights, grid = replace(tiny(columns=2), segmenter=model), SceneGrid(32, 32, 8, 1)
+    weights, grid = replace(tiny(columns=2), segmenter=model), SceneGrid(32, 32, 8)
     usual, dark = (map_of_columns(weights, scene.columns, grid, one)[1] for one in (LineSpec(), LineSpec(0.1, 4, 4)))
     assert (usual == dark).all()
 

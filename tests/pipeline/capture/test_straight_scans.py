@@ -77,7 +77,7 @@ def test_too_few_lines_and_odd_samples_are_refused() -> None:
 
 def test_the_covered_field_of_a_full_scan_is_the_field() -> None:
     """Sweeps laid out for a field cover it along the scan to 4 px, and along the line at least as far as it reaches."""
-    grid = SceneGrid(700, 1500, 64, 4)
+    grid = SceneGrid(700, 1500, 64)
     along, sweeps, _ = cheapest_full(grid, CAMERA, CostModel(), overlap_px=0.0)
     tangents = [direction_to_scene(position_to_direction(line_positions(sweep, CAMERA))) for sweep in sweeps]
     found = covered_field(sweeps, tangents, CAMERA)

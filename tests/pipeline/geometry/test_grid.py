@@ -13,19 +13,19 @@ from pipeline.geometry.grid import SceneGrid, block_means, pad_by_reflection
 sizes = st.integers(1, 200)
 
 
-@given(sizes, sizes, st.integers(1, 40), st.integers(1, 8))
-def test_padded_grid_is_the_least_whole_number_of_coarse_patches(height: int, width: int, patch: int, factor: int):
-    """The padded size divides by patch * factor and is less than one such cell larger than the scene."""
-    padded = SceneGrid(height, width, patch, factor).padded_shape
+@given(sizes, sizes, st.integers(1, 40))
+def test_padded_grid_is_the_least_whole_number_of_patches(height: int, width: int, patch: int):
+    """The padded size divides by the patch and is less than one patch larger than the scene."""
+    padded = SceneGrid(height, width, patch).padded_shape
     for size, scene in zip(padded, (height, width), strict=True):
-        assert size % (patch * factor) == 0
-        assert 0 <= size - scene < patch * factor
+        assert size % patch == 0
+        assert 0 <= size - scene < patch
 
 
-@given(sizes, sizes, st.integers(1, 40), st.integers(1, 8))
-def test_valid_fractions_add_up_to_the_scene(height: int, width: int, patch: int, factor: int):
+@given(sizes, sizes, st.integers(1, 40))
+def test_valid_fractions_add_up_to_the_scene(height: int, width: int, patch: int):
     """Shares times a patch's area sum to the scene's area, and valid patches are those with a fraction."""
-    grid = SceneGrid(height, width, patch, factor)
+    grid = SceneGrid(height, width, patch)
     fraction = grid.valid_fraction()
     assert fraction.sum() * patch**2 == pytest.approx(height * width)
     assert len(grid.valid_patches()) == -(-height // patch) * -(-width // patch) == np.count_nonzero(fraction)
@@ -33,15 +33,15 @@ def test_valid_fractions_add_up_to_the_scene(height: int, width: int, patch: int
 
 def test_patches_are_numbered_row_by_row():
     """Patch 5 of a grid 4 patches wide starts in the second row and column."""
-    grid = SceneGrid(64, 64, 16, 2)
+    grid = SceneGrid(64, 64, 16)
     assert grid.patch_shape == (4, 4)
     assert grid.patch_origin(np.array([0, 5, 15])).tolist() == [[0, 0], [16, 16], [48, 48]]
 
 
-@pytest.mark.parametrize("field", ["height", "width", "patch", "factor"])
+@pytest.mark.parametrize("field", ["height", "width", "patch"])
 def test_sizes_below_one_are_refused(field: str):
     """The message names the size and what came."""
-    sizes = {"height": 4, "width": 4, "patch": 2, "factor": 2, field: 0}
+    sizes = {"height": 4, "width": 4, "patch": 2, field: 0}
     with pytest.raises(ShapeError, match=f"{field} .* at least 1, got 0"):
         SceneGrid(**sizes)
 

@@ -37,17 +37,17 @@ def unseen(sweeps: list[Sweep], grid: SceneGrid) -> int:
 
 
 @settings(max_examples=15, deadline=None)
-@given(st.integers(1, 1500), st.integers(1, 300), st.sampled_from(["x", "y"]), st.integers(1, 8))
-def test_every_pixel_is_seen(height: int, width: int, along: str, factor: int):
-    """A full scan holds every pixel of its grid, with resampling taps, for any size and factor."""
-    grid = SceneGrid(height, width, 16, factor)
+@given(st.integers(1, 1500), st.integers(1, 300), st.sampled_from(["x", "y"]))
+def test_every_pixel_is_seen(height: int, width: int, along: str):
+    """A full scan holds every pixel of its grid, with resampling taps, for any size."""
+    grid = SceneGrid(height, width, 16)
     assert unseen(full_sweeps(grid, CAMERA, along), grid) == 0
 
 
 @pytest.mark.parametrize(("size", "swaths"), [(1, 1), (640, 1), (641, 2), (1280, 2), (1281, 3), (1920, 3)])
 def test_swaths_are_the_fewest_that_cover(size: int, swaths: int):
     """A line of 640 samples covers 640 px and a little more away from the axis."""
-    grid = SceneGrid(200, size, 16, 4)
+    grid = SceneGrid(200, size, 16)
     sweeps = full_sweeps(grid, CAMERA, "x")
     assert len(sweeps) == swaths
     assert [sweep.swath_px for sweep in sweeps] == pytest.approx([-sweep.swath_px for sweep in sweeps[::-1]], abs=1e-6)
@@ -55,29 +55,29 @@ def test_swaths_are_the_fewest_that_cover(size: int, swaths: int):
 
 def test_swaths_on_the_axis_scan_the_scene_and_its_taps_only():
     """Without rotation a full scan takes the scene's rows and three lines for taps, standing on the rows."""
-    (sweep,) = full_sweeps(SceneGrid(480, 600, 16, 4), CAMERA, "x")
+    (sweep,) = full_sweeps(SceneGrid(480, 600, 16), CAMERA, "x")
     assert sweep.lines == 483
     assert sweep.start_px == -479 / 2 - 1
-    (coarse,) = uniform_sweeps(SceneGrid(480, 600, 16, 4), CAMERA, "x", step=4)
+    (coarse,) = uniform_sweeps(SceneGrid(480, 600, 16), CAMERA, "x", step=4)
     assert coarse.lines == 123
 
 
 def test_the_known_fields_have_their_known_lines():
     """1280 x 1024 takes 2098 lines in full and 528 coarse; 1296 x 966 is cheaper with lines along its short side."""
-    along, sweeps, seconds = cheapest_full(SceneGrid(1024, 1280, 16, 4), CAMERA, COST)
+    along, sweeps, seconds = cheapest_full(SceneGrid(1024, 1280, 16), CAMERA, COST)
     assert (along, sum(s.lines for s in sweeps), round(seconds, 1)) == ("x", 2098, 213.9)
-    assert sum(s.lines for s in uniform_sweeps(SceneGrid(1024, 1280, 16, 4), CAMERA, "x", step=4)) == 528
-    along, sweeps, _ = cheapest_full(SceneGrid(966, 1296, 32, 4), CAMERA, COST)
+    assert sum(s.lines for s in uniform_sweeps(SceneGrid(1024, 1280, 16), CAMERA, "x", step=4)) == 528
+    along, sweeps, _ = cheapest_full(SceneGrid(966, 1296, 32), CAMERA, COST)
     assert (along, len(sweeps)) == ("y", 2)
 
 
 def test_fields_beyond_the_mirror_are_refused():
     """The error names the sweep, where it would have to look, and what to do."""
-    grid = SceneGrid(23_000, 640, 32, 4)
+    grid = SceneGrid(23_000, 640, 32)
     with pytest.raises(PoseError, match=r"sweep full-0 .* beyond the mirror's range.*smaller scene"):
         full_sweeps(grid, CAMERA, "x")
     with pytest.raises(PoseError, match="beyond the mirror's range"):
-        cheapest_full(SceneGrid(24_000, 24_000, 32, 4), CAMERA, COST)
+        cheapest_full(SceneGrid(24_000, 24_000, 32), CAMERA, COST)
 
 
 @pytest.mark.parametrize("along", ["x", "y"])
@@ -98,7 +98,7 @@ def test_mask_follows_the_rays(along: str, binning: int):
 @pytest.mark.parametrize("overlap_px", [0.0, 64.0, 164.0, 320.0])
 def test_swaths_overlap_by_what_is_asked(overlap_px: float):
     """Neighbours share at least the overlap, with no strip more than it takes, and 0 changes nothing."""
-    grid = SceneGrid(300, 1100, 16, 4)
+    grid = SceneGrid(300, 1100, 16)
     for cover in (full_sweeps, partial(uniform_sweeps, step=4)):
         sweeps = cover(grid, CAMERA, "x", overlap_px=overlap_px)
         reach = [sweep.swath_px + reach_px(sweep.swath_px, grid.height, CAMERA, sweep.binning) for sweep in sweeps]
@@ -110,7 +110,7 @@ def test_swaths_overlap_by_what_is_asked(overlap_px: float):
 @pytest.mark.parametrize(("margin_px", "lines"), [(0.0, 0), (0.5, 1), (8.0, 2), (9.0, 3)])
 def test_margins_are_whole_lines_at_both_ends(margin_px: float, lines: int):
     """Every sweep begins and ends at least so much further out, by no line too many, and keeps its own lines."""
-    sweeps = uniform_sweeps(SceneGrid(300, 700, 16, 4), CAMERA, "x", step=4)
+    sweeps = uniform_sweeps(SceneGrid(300, 700, 16), CAMERA, "x", step=4)
     for sweep, grown in zip(sweeps, with_margin(sweeps, CAMERA, margin_px), strict=True):
         assert grown == replace(sweep, start_px=sweep.start_px - 4 * lines, lines=sweep.lines + 2 * lines)
         assert sweep.held_px()[0, 0] - grown.held_px()[0, 0] >= margin_px

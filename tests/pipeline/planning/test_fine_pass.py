@@ -16,7 +16,7 @@ from pipeline.planning.coverage import full_sweeps, patches_shown
 from pipeline.planning.fine_pass import FIRST_STEPS, LEAST_GAIN, SecondPass, every_nth
 from pipeline.planning.uniform_scans import MIOU, ScanPerformance
 
-CAMERA, COST, GRID = LineCamera(samples=320), CostModel(), SceneGrid(256, 600, 16, 1)
+CAMERA, COST, GRID = LineCamera(samples=320), CostModel(), SceneGrid(256, 600, 16)
 FULL = full_sweeps(GRID, CAMERA, "x")
 FULL_S = COST.seconds(FULL, CAMERA)
 RECORD = ScanPerformance((1, 2, 4), (5.0, 100.0), {MIOU: np.array([[0.9, 0.95], [0.85, 0.92], [0.7, 0.8]])}, 3)

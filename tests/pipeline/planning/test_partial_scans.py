@@ -23,7 +23,7 @@ from pipeline.planning.partial_scans import (
     sweeps_of_runs,
 )
 
-GRID, CAMERA, COST = SceneGrid(320, 416, 16, 4), LineCamera(samples=160), CostModel()
+GRID, CAMERA, COST = SceneGrid(320, 416, 16), LineCamera(samples=160), CostModel()
 WIDER = LineCamera(samples=240)
 EXPOSURE_MS = 5.0
 

@@ -31,10 +31,10 @@ def test_entries_have_a_ratio_unless_full_is_nothing():
 def test_samples_beside_the_scene_are_not_counted():
     """A line of 640 samples over a scene 100 px wide counts 100; lines above and below the scene count none."""
     path = Sweep("a", "fine", "x", 0.0, -32.5, 66)
-    assert count_samples([path], CAMERA, SceneGrid(60, 100, 16, 4)) == 60 * 100
-    assert count_samples([path], CAMERA, SceneGrid(60, 640, 16, 4)) == 60 * 640
+    assert count_samples([path], CAMERA, SceneGrid(60, 100, 16)) == 60 * 100
+    assert count_samples([path], CAMERA, SceneGrid(60, 640, 16)) == 60 * 640
     beside = Sweep("a", "fine", "x", 0.0, 5000.0, 3)
-    assert count_samples([beside], CAMERA, SceneGrid(60, 100, 16, 4)) == 0
+    assert count_samples([beside], CAMERA, SceneGrid(60, 100, 16)) == 0
     assert raw_bytes([beside], CAMERA, 10) == 3 * 640 * 10 * 2
 
 
@@ -42,13 +42,13 @@ def test_samples_beside_the_scene_are_not_counted():
 def test_a_full_scan_near_the_axis_samples_every_pixel_once(scan: int, half: int, along: str):
     """One strip through the axis takes as many samples on the scene as it has pixels."""
     height, width = (scan, 2 * half) if along == "x" else (2 * half, scan)
-    grid = SceneGrid(height, width, 8, 2)
+    grid = SceneGrid(height, width, 8)
     assert count_samples(full_sweeps(grid, CAMERA, along), CAMERA, grid) == height * width
 
 
 def test_the_ledger_compares_like_with_like():
     """The full scan against itself is 1 in every entry; nothing against it is 0."""
-    grid = SceneGrid(100, 700, 16, 4)
+    grid = SceneGrid(100, 700, 16)
     full = full_sweeps(grid, CAMERA, "x")
     same = capture_savings(full, full, CAMERA, grid)
     assert list(same) == ["lines", "samples"]

@@ -25,7 +25,7 @@ from pipeline.planning.uniform_scans import (
     uniform_scans,
 )
 
-CAMERA, COST, GRID = LineCamera(), CostModel(), SceneGrid(256, 320, 16, 4)
+CAMERA, COST, GRID = LineCamera(), CostModel(), SceneGrid(256, 320, 16)
 SWEEPS = {step: uniform_sweeps(GRID, CAMERA, "x", step=step) for step in (1, 2, 4)}
 CONTENT = {
     "scenes": 3,

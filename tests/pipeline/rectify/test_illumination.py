@@ -98,7 +98,7 @@ def test_drift_between_captured_sweeps_is_taken_out():
     values = np.kron(rng.uniform(0.3, 1, (15, 26, 8)), np.ones((8, 8, 1)))
     scene = raster_from_values(values, camera, name="t", wavelength_nm=np.linspace(400, 1000, 8))
     source = SimulatedSource(scene, Rig(camera), 0, effects_on("rotation", "shot", "read-noise"))
-    sweeps = full_sweeps(SceneGrid(100, 150, 16, 4), camera, "x", overlap_px=64)[:2]
+    sweeps = full_sweeps(SceneGrid(100, 150, 16), camera, "x", overlap_px=64)[:2]
     light = 1.2 + 0.1 * np.linspace(-1, 1, 8)
 
     plain, other = (SimulatedSweep(source, sweep) for sweep in sweeps)

@@ -27,7 +27,7 @@ from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from tests.pipeline.simulator.small_scenes import effects_on, seen_at
 
 CAMERA = LineCamera(samples=160)
-GRID = SceneGrid(260, 300, 16, 4)
+GRID = SceneGrid(260, 300, 16)
 
 
 def source_of(pointing: PointingErrors | None = None, bands: int = 2, *, turned: bool = False) -> SimulatedSource:

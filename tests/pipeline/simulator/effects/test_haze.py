@@ -78,7 +78,7 @@ def test_bands_without_light_have_a_finite_bound(air: Air, black: slice, monkeyp
     monkeypatch.setattr(survey_probe, "MOST_SAMPLES", 1500)  # as many as there are in so small a field
     scene = image_scene(values, LineCamera(samples=32), [640.0, 550.0, 460.0])
     rig = Rig(LineCamera(samples=32), air=air, sky=Sky(brdf_per_rad=0.3, hot_spot=0.2))
-    probe = survey_probe.probe_scene(scene, rig, full_sweeps(SceneGrid(24, 32, 8, 4), rig.camera, "x"))
+    probe = survey_probe.probe_scene(scene, rig, full_sweeps(SceneGrid(24, 32, 8), rig.camera, "x"))
     assert 0 < PATH_RADIANCE.bound(probe, rig).value < np.inf
 
 
