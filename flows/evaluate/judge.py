@@ -38,13 +38,13 @@ Record = dict[str, Any]
 
 def judge_frame(request: EvaluateRequest, frame: ObservedFrame, weights: Weights) -> Record:
     """Return the confusion counts, gain and multiply-adds of every policy and fraction."""
-    grid, valid = frame.seen.grid, frame.seen.grid.valid_patches()
+    grid, every = frame.seen.grid, frame.seen.grid.every_patch()
     gain = oracle_gain(weights, frame.seen, frame.fine, frame.labels)
-    overview, full = (segment(weights, frame.seen, frame.fine[some], some).classes for some in (valid[:0], valid))
+    overview, full = (segment(weights, frame.seen, frame.fine[some], some).classes for some in (every[:0], every))
     scene, rows = ReadTwice(overview, full, {}, frame.labels, grid), list[Record]()
     for policy, draw, fraction, patch_index in _rows(request, frame, gain):
         scored = 0 if policy in (*ENDS, ORACLE) else score_multiply_adds(policy, weights.config, grid)
-        bought, best = gain_sums(gain, patch_index, valid)
+        bought, best = gain_sums(gain, patch_index)
         chosen = np.isin(np.arange(gain.size), patch_index).reshape(grid.patch_shape)
         row = {
             "policy": policy,
@@ -64,15 +64,14 @@ def _rows(
     request: EvaluateRequest, frame: ObservedFrame, gain: NDArray[np.float64]
 ) -> Iterator[tuple[str, int, float, NDArray[np.intp]]]:
     """Yield policy, draw, fraction and patches of each row; the random policy has several draws."""
-    allowed = frame.seen.grid.valid_fraction().ravel() > 0
     yield "none", 0, 0.0, np.empty(0, np.intp)
-    yield "all", 0, 1.0, np.flatnonzero(allowed)
+    yield "all", 0, 1.0, frame.seen.grid.every_patch()
     for policy in (*request.policies, ORACLE):
         for draw in range(RANDOM_DRAWS if policy == "random" else 1):
             seed = request.seed + 1000 * (draw + 1)
             scores = gain if policy == ORACLE else score_patches(policy, frame.seen, seed=seed)
             for fraction in request.fractions:
-                yield policy, draw, fraction, frame_patches(scores, fraction, allowed)
+                yield policy, draw, fraction, frame_patches(scores, fraction)
 
 
 Runs = Sequence[Sequence[Record]]  # records of the frames, of each of the weights or seeds

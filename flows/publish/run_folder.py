@@ -132,7 +132,7 @@ def _draw(survey: OpenSurvey, plan: FinePlan, receipt: Receipt) -> _Drawn:
 
 def _publish(survey: OpenSurvey, draft: RunDraft, plan: FinePlan, receipt: Receipt) -> Published:
     run, products = survey.run, survey.products
-    again = None if run.plan.plain else len(plan.patch_index) / len(run.grid.valid_patches())
+    again = None if run.plan.plain else len(plan.patch_index) / len(run.grid.every_patch())
     if survey not in _DRAWN:
         _DRAWN[survey] = _draw(survey, plan, receipt)
     drawn = _DRAWN[survey]

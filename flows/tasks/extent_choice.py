@@ -104,12 +104,13 @@ def choose_extent(
             f"the weights {path.name} have no record of uniform scans to choose a part of the field by: leave --extent "
             "out, or train weights with --min-exposure-ms 3 and validation scenes"
         )
-    available = grid.valid_fraction().ravel() > 0 if layout.shown is None else layout.shown
     swaths, classes = _swaths(prior, grid, weights, path), len(weights.class_names)
     expected_errors = PatchExpectedErrors.of(
         swaths, grid, classes, come_true=1.0 if weights.reader is None else COME_TRUE, left_out=left_out
     )
-    available = available & expected_errors.pixels.any(axis=(1, 2))
+    available = np.asarray(expected_errors.pixels.any(axis=(1, 2)))
+    if layout.shown is not None:
+        available = available & layout.shown
     due = np.zeros(len(expected_errors.age_days), np.bool_)
     if max_age is not None:  # after an equally long time without a capture
         due = np.asarray(expected_errors.age_days + prior.days > max_age)

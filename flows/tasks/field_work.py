@@ -168,7 +168,7 @@ class Readings:
         """
         weights = self.weights.load()
         seen = read_coarse_prediction(weights, coarse_region(weights, self.mosaic, region, self.capture))
-        kept = region.numbers_here(region.field.valid_patches())
+        kept = region.numbers_here(region.field.every_patch())
         readings = (kept[:0], kept[kept >= 0]) if self.in_full else (kept[:0],)
         maps = [region.crop(classes_by(weights, seen, patch_index)) for patch_index in readings]
         scores = np.stack([score_patches(policy, seen) for policy in OTHERS], axis=-1)
@@ -253,7 +253,7 @@ class FieldWork:
         Also returns the (patch_y, patch_x) scores by the policies that are compared. Raises as `score`.
         """
         grid = self.regions[0].field
-        work, read = Readings(self.weights, mosaic, capture, in_full), grid.valid_patches() if in_full else NO_PATCHES
+        work, read = Readings(self.weights, mosaic, capture, in_full), grid.every_patch() if in_full else NO_PATCHES
         parts = self._of_regions(work, mosaic, read, report)
         maps = np.empty((len(parts[0][0]), grid.height, grid.width), np.uint8)
         for region, (part, _, _) in zip(self.regions, parts, strict=True):

@@ -75,8 +75,8 @@ class PatchBudget:
         ``shown`` (patch,) are the patches that zones leave; None: all. Raises BudgetError: it does not pay for the
         overview; names the least that does.
         """
-        patch_index = costs.grid.valid_patches()
-        budget = PatchBudget(costs, patch_index if shown is None else patch_index[shown[patch_index]], policy, macs)
+        patch_index = costs.grid.every_patch() if shown is None else np.flatnonzero(shown)
+        budget = PatchBudget(costs, patch_index, policy, macs)
         coarse = budget.operations_of(patch_index[:0])
         if budget._most < coarse:
             least = str(coarse)

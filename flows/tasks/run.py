@@ -347,8 +347,8 @@ class SurveyRun(CaptureRun):
     @property
     def kept_patches(self) -> NDArray[np.intp]:
         """Return the patches that zones leave."""
-        valid, fractions = self.grid.valid_patches(), self.zones.fractions
-        return valid if fractions is None else valid[fractions[valid] > 0]
+        fractions = self.zones.fractions
+        return self.grid.every_patch() if fractions is None else np.flatnonzero(fractions > 0)
 
     @property
     def likely_patches(self) -> NDArray[np.intp]:

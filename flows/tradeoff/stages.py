@@ -240,7 +240,7 @@ def uniform_pass(
     seen = [SimulatedSweep(source, sweep) for sweep in sweeps]
     coarse = coarse_of_sweeps(seen, source.camera, source.wavelength_nm, grid, weights, capture)
     size = raw_bytes(sweeps, source.camera, len(source.wavelength_nm))
-    return PlannedPass(coarse, grid.valid_patches(), weights, cost.seconds(sweeps, source.camera), size)
+    return PlannedPass(coarse, grid.every_patch(), weights, cost.seconds(sweeps, source.camera), size)
 
 
 def open_field(seed: int, scene: str | None, weights: Path | None, source: str) -> SurveyRun:
@@ -270,9 +270,9 @@ def plan_every_way(seed: int, scene: str | None = None, weights: Path | None = N
         scan = LineSpec(exposure_ms / DEFAULT_EXPOSURE_MS, step)
         passes[words] = uniform_pass(run.weights, source, sweeps, grid, cost, scan)
     whole = passes[format_scan(*PART_OF)]
-    scores, valid = score_patches(POLICY, whole.coarse), grid.valid_fraction().ravel() > 0
+    scores = score_patches(POLICY, whole.coarse)
     for words, fraction in PARTS.items():
-        passes[words] = replace(whole, patch_index=np.sort(frame_patches(scores, fraction, valid)))
+        passes[words] = replace(whole, patch_index=np.sort(frame_patches(scores, fraction)))
     assert run.labels is not None
     return PlannedField(run.labels, run.costs, passes, check_labels(run.scene, run.described))
 
@@ -308,8 +308,8 @@ def plan_every_fraction(seed: int, scene: str | None = None, weights: Path | Non
         _, full, _ = cheapest_full(grid, run.camera, run.settings.cost)
         seen = [SimulatedSweep(run.simulated, sweep) for sweep in full]
         coarse = coarse_of_sweeps(seen, run.camera, wavelength_nm, grid, run.weights)
-    scores, valid = score_patches(POLICY, coarse), grid.valid_fraction().ravel() > 0
-    chosen = {one: frame_patches(scores, one, valid) if one < 1 else np.flatnonzero(valid) for one in FRACTIONS}
+    scores = score_patches(POLICY, coarse)
+    chosen = {one: frame_patches(scores, one) if one < 1 else grid.every_patch() for one in FRACTIONS}
     assert run.labels is not None
     passes: dict[Setting, PlannedPass] = {one: PlannedPass(coarse, index, run.weights) for one, index in chosen.items()}
     return PlannedField(run.labels, run.costs, passes, check_labels(run.scene, run.described))

@@ -213,7 +213,7 @@ def coarse_of_sweeps(
 
 def _miou(weights: Weights, coarse: CoarsePrediction, labels: NDArray[np.uint8]) -> float:
     """Return the mIoU of the map of all patches."""
-    patch_index = coarse.grid.valid_patches()
+    patch_index = coarse.grid.every_patch()
     drawn = segment(weights, coarse, coarse.patches(patch_index), patch_index)
     return mean_iou(confusion(labels, drawn.classes, weights.config.classes))
 

@@ -27,7 +27,7 @@ RANDOM_DRAWS = 5
 COMPARED = ("gain", "entropy", "sobel")  # policies beside the random one
 MOST_GAIN = 5.0  # gains are clipped to this [nat per px]; one confident error would outweigh a field
 LEAST_GAINS = tuple(np.geomspace(0.005, 0.5, 25).round(4).tolist())  # thresholds of scores by ``gain``
-CONTROL_FRACTION = 0.35  # of the valid patches: K = 35 % of surveys' receipts and of the weights' records
+CONTROL_FRACTION = 0.35  # of the patches: K = 35 % of surveys' receipts and of the weights' records
 
 
 def oracle_gain(
@@ -43,8 +43,8 @@ def oracle_gain(
     """
     grid, p = seen.grid, seen.grid.patch
     truth = patch_pixels(grid, labels, UNLABELLED)
-    gain, valid = np.zeros(len(truth)), grid.valid_patches()
-    patches, patch_index = captured(fine[valid], valid)
+    gain = np.zeros(len(truth))
+    patches, patch_index = captured(fine, grid.every_patch())
     with torch.inference_mode():
         overview, first = overview_of(weights, seen), 0
         before = patches_of(overview.logits[0].permute(1, 2, 0).cpu().numpy(), p).transpose(0, 3, 1, 2)
@@ -65,9 +65,9 @@ def _losses(logits: NDArray[np.float32], truth: NDArray[np.uint8]) -> NDArray[np
     return np.where(labelled, loss, 0.0)
 
 
-def gain_sums(gain: Values, chosen: NDArray[np.integer], valid: NDArray[np.integer]) -> tuple[float, float]:
-    """Return the gain of the chosen patches, and of as many of the best valid ones; sum over frames, then divide."""
-    return float(gain[chosen].sum()), float(np.sort(gain[valid])[::-1][: len(chosen)].sum())
+def gain_sums(gain: Values, chosen: NDArray[np.integer]) -> tuple[float, float]:
+    """Return the gain of the chosen patches, and of as many of the best ones; sum over frames, then divide."""
+    return float(gain[chosen].sum()), float(np.sort(gain)[::-1][: len(chosen)].sum())
 
 
 Placements = dict[str, list[Counts]]  # row -> confusion counts of its map; of ``random`` several
@@ -105,7 +105,7 @@ class ReadTwice:
     @staticmethod
     def of(weights: Weights, seen: CoarsePrediction, labels: NDArray[np.uint8]) -> ReadTwice:
         """Segment a scene twice, and score its patches by the policies that are compared."""
-        every = seen.grid.valid_patches()
+        every = seen.grid.every_patch()
         overview, full = (classes_by(weights, seen, some) for some in (every[:0], every))
         scores = {policy: score_patches(policy, seen).reshape(seen.grid.patch_shape) for policy in COMPARED}
         return ReadTwice(overview, full, scores, labels, seen.grid)
@@ -120,22 +120,21 @@ class ReadTwice:
 def run_controls(
     scene: ReadTwice, classes: int, *, fraction: float, seed: int, among: NDArray[np.bool_] | None = None
 ) -> Placements:
-    """Return the confusion with no patch, all patches, and ``fraction`` of the valid ones by each policy and at random.
+    """Return the confusion with no patch, all patches, and a ``fraction`` of them by each policy and at random.
 
-    ``among`` (patch,) says which patches may be chosen (None: all).
+    ``among`` (patch,) says which patches count (None: all).
     """
     grid = scene.grid
-    valid = grid.valid_fraction().ravel() > 0
-    valid = valid if among is None else valid & among
+    allowed = np.ones(len(grid.every_patch()), np.bool_) if among is None else among
 
     def placed(scores: NDArray[np.float64]) -> Counts:
-        chosen = np.zeros(valid.shape, np.bool_)
-        chosen[frame_patches(scores.ravel(), fraction, valid)] = True
+        chosen = np.zeros(allowed.shape, np.bool_)
+        chosen[frame_patches(scores.ravel(), fraction, allowed)] = True
         return scene.counts(chosen.reshape(grid.patch_shape), classes)
 
     return {
         "none": [scene.counts(np.zeros(grid.patch_shape, np.bool_), classes)],
-        "all": [scene.counts(valid.reshape(grid.patch_shape), classes)],
+        "all": [scene.counts(allowed.reshape(grid.patch_shape), classes)],
         **{policy: [placed(scores)] for policy, scores in scene.scores.items()},
         "random": [placed(random_scores(grid, seed + 1000 * (draw + 1))) for draw in range(RANDOM_DRAWS)],
     }

@@ -57,8 +57,7 @@ def random_scores(grid: SceneGrid, seed: int) -> Scores:
 
 def _on_scene(scores: Scores, grid: SceneGrid) -> Scores:
     """Return (patch_y, patch_x) scores times the fraction of each patch on the scene, (patches,)."""
-    fraction = grid.valid_fraction()
-    return (np.where(fraction > 0, scores, 0.0) * fraction).ravel()
+    return (scores * grid.valid_fraction()).ravel()
 
 
 def score_multiply_adds(policy: str, config: SegmenterConfig, grid: SceneGrid) -> int:

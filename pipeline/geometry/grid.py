@@ -43,15 +43,16 @@ class SceneGrid:
         return y // self.patch, x // self.patch
 
     def valid_fraction(self) -> NDArray[np.float64]:
-        """Return the fraction of each patch's pixels that lie on the scene, (rows, columns) in 0..1."""
+        """Return the fraction of each patch's pixels that lie on the scene, (rows, columns), above 0 and at most 1."""
         rows, columns = self.patch_shape
         down = np.clip(self.height - np.arange(rows) * self.patch, 0, self.patch)
         across = np.clip(self.width - np.arange(columns) * self.patch, 0, self.patch)
         return down[:, None] * across[None, :] / self.patch**2
 
-    def valid_patches(self) -> NDArray[np.intp]:
-        """Return the numbers of the patches that hold a valid pixel, ascending."""
-        return np.flatnonzero(self.valid_fraction().ravel() > 0)
+    def every_patch(self) -> NDArray[np.intp]:
+        """Return the numbers of all patches, ascending."""
+        rows, columns = self.patch_shape
+        return np.arange(rows * columns)
 
     def patch_origin(self, patch_index: NDArray[np.integer]) -> NDArray[np.intp]:
         """Return (patch, 2) y and x of the first pixel of each patch."""

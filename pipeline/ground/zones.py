@@ -123,8 +123,7 @@ def field_zones(area: Mask | None, no_go: Mask | None) -> FieldZones | None:
 
 def _patch_means(mask: Mask, grid: SceneGrid) -> Floats:
     """Return the mean over the pixels of each patch that lie on the scene, (patch,)."""
-    total, fraction = patch_pixels(grid, mask).mean(axis=(1, 2)), grid.valid_fraction().ravel()
-    return np.asarray(np.divide(total, fraction, out=np.zeros(fraction.shape), where=fraction > 0))
+    return np.asarray(patch_pixels(grid, mask).mean(axis=(1, 2)) / grid.valid_fraction().ravel())
 
 
 @dataclass(frozen=True)

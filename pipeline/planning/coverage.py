@@ -236,11 +236,12 @@ def lines_showing(
 
 def patches_shown(sweeps: Sequence[Sweep], grid: SceneGrid, camera: LineCamera) -> NDArray[np.bool_]:
     """Return which patches (patch,) the samples of some sweeps show, without the taps of resampling."""
-    patch_index, shown = grid.valid_patches(), np.zeros(int(np.prod(grid.patch_shape)), np.bool_)
+    patch_index = grid.every_patch()
+    shown = np.zeros(len(patch_index), np.bool_)
     for sweep in sweeps:
         at = _corners_on(sweep, grid, camera, patch_index)
         ends = sweep.lines - 0.5, camera.samples // sweep.binning - 0.5
-        shown[patch_index] |= ((at.max(axis=0) > -0.5) & (at.min(axis=0) < ends)).all(axis=-1)
+        shown |= ((at.max(axis=0) > -0.5) & (at.min(axis=0) < ends)).all(axis=-1)
     return shown
 
 

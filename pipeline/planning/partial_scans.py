@@ -53,13 +53,11 @@ class PatchRows:
     @staticmethod
     def of(sweeps: Sequence[Sweep], grid: SceneGrid, camera: LineCamera) -> PatchRows:
         """Assign each patch of a field to the sweep whose lines have it nearest to their middle."""
-        patch_index = grid.valid_patches()
+        patch_index = grid.every_patch()
         down, across = np.divmod(patch_index, grid.patch_shape[1])
         rank, many = (down, grid.patch_shape[0]) if sweeps[0].along == "x" else (across, grid.patch_shape[1])
         nearest = _nearest_sweep(sweeps, grid, camera, patch_index)
-        row = np.full(int(np.prod(grid.patch_shape)), -1, np.intp)
-        shown = nearest >= 0
-        row[patch_index[shown]] = nearest[shown] * many + rank[shown]
+        row = np.where(nearest >= 0, nearest * many + rank, -1)
         first, stop = np.zeros((2, len(sweeps), many), np.intp)
         for number, sweep in enumerate(sweeps):
             for place in np.unique(rank[nearest == number]).tolist():

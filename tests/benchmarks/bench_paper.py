@@ -95,7 +95,7 @@ def patch_maxima(pixels: Scores, grid: SceneGrid) -> Scores:
 
 def read_scene(weights: Weights, columns: Image, labels: NDArray[np.uint8], grid: SceneGrid, factor: int) -> Readings:
     """Read normalised columns of the padded grid by an overview of coarse pixels, and all patches from fine ones."""
-    capture, every = LineSpec(step=factor, binned=factor), grid.valid_patches()
+    capture, every = LineSpec(step=factor, binned=factor), grid.every_patch()
     seen = coarse_prediction_of_columns(weights, coarse_image(columns, factor), grid, capture)
     fine = patches_of(columns, grid.patch)[every]
     maps = [segment(weights, seen, fine[:n], every[:n], capture=LineSpec()).classes for n in (0, len(every))]
@@ -141,8 +141,7 @@ def judge(data: DataSet, counts: Sequence[int], say: Say) -> Tallies:
         observed = observe(scene, CAMERA, grid, data.weights.basis, np.random.default_rng([number, 0x9A9E]))
         _, reached = data.weights.basis.matrix(scene.wavelength_nm)
         columns = normalised(observed, data.weights.normalisation, reached).columns.astype(np.float32)
-        valid = grid.valid_fraction().ravel() > 0
-        every = int(valid.sum())
+        every = len(grid.every_patch())
         for factor in (*INPUTS, 1):
             read = read_scene(data.weights, columns, scene.labels, grid, factor)
             coarse = 0 if factor == 1 else int(np.prod([-(-n // (grid.patch * factor)) for n in scene.shape]))
@@ -157,7 +156,7 @@ def judge(data: DataSet, counts: Sequence[int], say: Say) -> Tallies:
                         config, grid, k, len(scene.wavelength_nm), score=cost if 0 < k < every else 0, apart=factor > 1
                     )
                     row = found.setdefault((factor, label, text), Tally())
-                    row.counts.append([read.counts(select_patches(one, k, valid)) for one in scores])
+                    row.counts.append([read.counts(select_patches(one, k)) for one in scores])
                     row.patches.append(coarse + k)
                     row.multiply_adds.append(spent.total)
     return found

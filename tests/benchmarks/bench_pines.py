@@ -273,13 +273,13 @@ def _judged(source: str, weights: Weights, seen: CoarsePrediction, fine: Values,
     from models.reading.inference import coarse_prediction_of_columns, segment
     from pipeline.planning.prices import frame_patches
 
-    training, valid, found = weights.record["training"], seen.grid.valid_fraction().ravel() > 0, []
+    training, found = weights.record["training"], []
     words = f"a map; training {training.get('processor_seconds', 0)} s CPU, {training['steps']} steps"
     with one_thread():
         for fraction in FRACTIONS:
             began = time.process_time()
             observation = coarse_prediction_of_columns(weights, seen.columns, seen.grid)
-            patch_index = frame_patches(score_patches("entropy", observation), fraction, valid)
+            patch_index = frame_patches(score_patches("entropy", observation), fraction)
             drawn = segment(weights, observation, fine[patch_index], patch_index).classes
             spent, counts = time.process_time() - began, confusion(labels, drawn, weights.config.classes)
             found.append(

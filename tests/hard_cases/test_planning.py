@@ -53,7 +53,7 @@ def test_one_patch(along: Axis, shape: tuple[int, int]):
 def test_a_time_of_exactly_the_price_and_one_just_below_it():
     """The price of the one run pays for it; a rounding step less pays for nothing at all."""
     gain = np.zeros(int(np.prod(GRID.patch_shape)))
-    gain[GRID.valid_patches()[40]] = 3.0
+    gain[GRID.every_patch()[40]] = 3.0
     price = planned(GRID, gain, 20.0).seconds
     assert planned(GRID, gain, price).expected_gain == 3.0
     below = planned(GRID, gain, float(np.nextafter(price, 0)))

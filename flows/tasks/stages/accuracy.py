@@ -92,8 +92,8 @@ def control_placements(
     gains: PatchGains, scene: ReadTwice, classes: int, patch_index: NDArray[np.intp] | None, *, seed: int
 ) -> tuple[float, Placements]:
     """Judge other placements of as many fine patches as the map has, or of the usual fraction; return that fraction."""
-    fractions, valid = gains.zones.fractions, scene.grid.valid_fraction().ravel() > 0
-    among = valid if fractions is None else valid & (fractions > 0)
+    fractions = gains.zones.fractions
+    among = np.ones(len(scene.grid.every_patch()), np.bool_) if fractions is None else fractions > 0
     fraction = CONTROL_FRACTION if patch_index is None else len(patch_index) / max(int(among.sum()), 1)
     return fraction, run_controls(scene, classes, fraction=fraction, seed=seed, among=among)
 

@@ -115,7 +115,7 @@ def score(
         found = replace(found, patch_index=gains.kept(found.patch_index))
         read = found.patch_index
         if second_pass is not None and (least_gain is not None or found.kind == "full" or not found.sweeps):
-            read = gains.kept(grid.valid_patches())  # the segmentation chooses among them
+            read = gains.kept(grid.every_patch())  # the segmentation chooses among them
         # raises an error before the second pass where the map will not fit the memory
         gains.work.pool_for(read, len(open_mosaic(mosaic.path / "mosaic.zarr").components))
         rank = np.full(scores.shape, -1, np.int32)
@@ -149,7 +149,7 @@ def gain_by_record(
 
 def all_seen(grid: SceneGrid, sweeps: Sequence[Sweep], camera: LineCamera, *, part: bool) -> FinePlan:
     """Return the plan of a uniform scan, or of a raster without sweeps: the captured patches, and no second pass."""
-    patch_index = grid.valid_patches()
+    patch_index = grid.every_patch()
     if not sweeps:
         return FinePlan([], patch_index, 0.0, 0.0, "raster", "the pixels of the raster are used as they are")
     scan = format_scan(sweeps[0].step, exposing(camera, sweeps[0]).exposure_ms)

@@ -157,7 +157,7 @@ def test_a_plan_tells_what_the_budgets_pay_for(flags_png: Flags, tmp_path: Path)
 def test_a_large_field_is_counted_region_by_region() -> None:
     """Sixteen times the field takes as many fields and their halos, of which only the overview reads more."""
     small, large = (
-        costs.of_map(costs.grid.valid_patches())
+        costs.of_map(costs.grid.every_patch())
         for costs in (replace(COSTS, grid=SceneGrid(side, side, 16)) for side in (2560, 10240))
     )
     assert large.detail == 16 * small.detail

@@ -173,7 +173,7 @@ def test_without_later_lines_the_first_pass_is_read_in_full(survey_png: Any, wei
     grid = SceneGrid(*drawn.shape, 8)
     values, capture = mosaic.values(), LineSpec(1.0, 4)
     seen = coarse_prediction(load_weights(weights), values, mosaic.wavelength_nm, grid, capture=capture)
-    every = grid.valid_patches()
+    every = grid.every_patch()
     expected = segment(load_weights(weights), seen, seen.patches(every), every).classes
     assert (expected == drawn).mean() > 0.999
 

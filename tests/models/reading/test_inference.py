@@ -159,7 +159,7 @@ def test_a_scene_is_read_in_full_by_its_columns(tiny: Maker):
     """By the overview and all patches; a capture of other light gives another map."""
     weights = tiny()
     coarse_pass, _ = scene_columns(weights, 32, 48)
-    every = coarse_pass.grid.valid_patches()
+    every = coarse_pass.grid.every_patch()
     image = coarse_prediction_of_columns(weights, coarse_pass.columns, coarse_pass.grid, DARK)
     drawn, log_probability = map_of_columns(weights, coarse_pass.columns, coarse_pass.grid, DARK)
     own = segment(weights, image, image.patches(every), every)

@@ -58,7 +58,7 @@ def test_patches_lie_where_the_field_has_them(field: tuple[int, int, int]):
         times += inside
         origin = region.grid.patch_origin(numbers[inside]) + np.array([region.read.top, region.read.left])
         assert (origin == grid.patch_origin(patch_index[inside])).all()
-    assert (times[grid.valid_patches()] == 1).all()
+    assert (times[grid.every_patch()] == 1).all()
 
 
 @pytest.mark.parametrize("field", FIELDS)

@@ -28,7 +28,7 @@ def test_valid_fractions_add_up_to_the_scene(height: int, width: int, patch: int
     grid = SceneGrid(height, width, patch)
     fraction = grid.valid_fraction()
     assert fraction.sum() * patch**2 == pytest.approx(height * width)
-    assert len(grid.valid_patches()) == -(-height // patch) * -(-width // patch) == np.count_nonzero(fraction)
+    assert len(grid.every_patch()) == -(-height // patch) * -(-width // patch) == np.count_nonzero(fraction)
 
 
 def test_patches_are_numbered_row_by_row():

@@ -145,7 +145,7 @@ def test_no_patch_that_a_no_go_zone_touches_is_worth_anything(area: Any, no_go: 
     if found is None:
         return
     fractions, shown = found.patch_fractions(grid), found.shown_patches(grid)
-    for patch_number in grid.valid_patches():
+    for patch_number in grid.every_patch():
         y, x = grid.patch_origin(patch_number)
         kept, stopped = (mask[y : y + 8, x : x + 8] for mask in (found.kept, barred))
         assert fractions[patch_number] == pytest.approx(0 if stopped.any() else kept.mean())

@@ -63,7 +63,7 @@ def partial_scan(
 def test_every_patch_is_in_a_row_whose_lines_show_it(along: Axis, step: int) -> None:
     """The lines of a row show the patches of that row, and all rows together the field."""
     rows = rows_of(along, step)
-    assert (rows.row[GRID.valid_patches()] >= 0).all()
+    assert (rows.row[GRID.every_patch()] >= 0).all()
     for number, place in np.argwhere(rows.there)[:: 7 if step > 1 else 3]:
         run = (int(number), int(rows.first[number, place]), int(rows.stop[number, place]))
         shown = patches_shown(sweeps_of_runs(rows.sweeps, [run]), GRID, CAMERA)
@@ -160,7 +160,7 @@ def test_rows_worth_the_same_are_looked_at_as_far_as_time_goes() -> None:
 def test_a_patch_that_two_swaths_show_is_of_the_nearer(along: Axis) -> None:
     """By how far its middle lies from the middle of their lines."""
     rows = rows_of(along)
-    patch_index = GRID.valid_patches()
+    patch_index = GRID.every_patch()
     middle = GRID.patch_origin(patch_index) + GRID.patch / 2 - np.array([GRID.height, GRID.width]) / 2
     across = middle[:, "yx".index(along)]
     off = np.abs(across[:, None] - np.array([sweep.swath_px for sweep in rows.sweeps]))
@@ -208,7 +208,7 @@ def shown_of(top: int, left: int, rows: int, columns: int) -> np.ndarray:
     """Patches of a block, (patch,)."""
     shown = np.zeros(GRID.patch_shape, bool)
     shown[top : top + rows, left : left + columns] = True
-    return (shown & (GRID.valid_fraction() > 0)).ravel()
+    return shown.ravel()
 
 
 blocks = st.builds(shown_of, st.integers(0, 19), st.integers(0, 25), st.integers(1, 8), st.integers(1, 8))
@@ -243,7 +243,7 @@ def test_swaths_beside_the_area_are_left_out() -> None:
 def test_a_patch_has_all_lines_that_resampling_reads() -> None:
     """From the line before its first pixel to two lines after its last, where the sweep has them."""
     for sweep in full_sweeps(GRID, CAMERA, "x"):
-        for patch in GRID.valid_patches()[::5]:
+        for patch in GRID.every_patch()[::5]:
             down, across = GRID.patch_origin(np.array([patch]))[0]
             y, x = (place + np.arange(16) - (size - 1) / 2 for place, size in ((down, 320), (across, 416)))
             at = scene_to_sweep(sweep, CAMERA, x[None, :], y[:, None])
