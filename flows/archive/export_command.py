@@ -163,7 +163,10 @@ def _export_images(export: Export, layers: Sequence[Layer], console: Console) ->
 
 
 def _export_sweeps(export: Export, console: Console) -> None:
-    for path in export.run.sweeps():
+    sweeps = export.run.sweeps()
+    if not sweeps:
+        console.print("[dim]note: --envi writes sweeps, and this run has none[/]")
+    for path in sweeps:
         name = path.stem
         with console.status(f"writing {name}.bil"):
             header = write_recorded_files(open_lines(path), export.folder / "sweeps")

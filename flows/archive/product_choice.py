@@ -41,6 +41,7 @@ class ProductFlags:
 
 
 NO_PRODUCTS = ProductFlags()
+MOST_CELL_M = 1000
 
 
 @dataclass(frozen=True)
@@ -55,8 +56,8 @@ class ProductChoice:
 
 def choose_products(flags: ProductFlags) -> ProductChoice:
     """Parse the flags (SettingsError: a number, an index or a unit is wrong)."""
-    if flags.cell is not None and not 0 < flags.cell < float("inf"):
-        raise SettingsError(f"--cell expects metres above 0, got {flags.cell:g}")
+    if flags.cell is not None and not 0 < flags.cell <= MOST_CELL_M:
+        raise SettingsError(f"--cell expects metres above 0 and at most {MOST_CELL_M:g}, got {flags.cell:g}")
     if flags.dose_unit not in UNITS:
         raise SettingsError(f"--dose-unit expects {' or '.join(UNITS)}, got {flags.dose_unit!r}")
     doses = {}
@@ -64,6 +65,10 @@ def choose_products(flags: ProductFlags) -> ProductChoice:
         name, _, number = part.partition("=")
         if not re.fullmatch(r"\s*\d+(\.\d*)?|\s*\.\d+", number) or not name.strip():
             raise SettingsError(f"--prescription expects classes with numbers, weed=2.5, got {part!r}")
+        if name.strip() in doses:
+            raise SettingsError(f"--prescription names {name.strip()} twice; give it one number")
         doses[name.strip()] = float(number)
+    if not doses and (flags.cell is not None or flags.dose_unit != NO_PRODUCTS.dose_unit):
+        raise SettingsError("--cell and --dose-unit need --prescription, such as weed=2.5; give it or leave them out")
     indices = tuple(dict.fromkeys(find_index(name) for name in split_list(flags.indices)))
     return ProductChoice(flags, indices, doses, UNITS[flags.dose_unit])

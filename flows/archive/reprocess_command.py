@@ -39,6 +39,7 @@ from flows.terminal.figures import counted, format_points, format_seconds
 from flows.terminal.processes import DONE, FAILED, PARTLY
 from flows.terminal.progress import StageProgress, put_out
 from models.network.machine import keep_freed_memory, use_one_thread
+from models.weights.files import describe_weights
 from pipeline.errors import ArchiveError, PipelineError, SceneError, SettingsError, WeightsError
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
@@ -100,8 +101,8 @@ def reprocess_fields(
     """
     opened = open_archive(archive, create=False, write=not dry_run)
     catalogue = Catalogue.read(opened.root)
-    if weights is not None and not weights.is_file():
-        raise SettingsError(f"--weights {weights}: there is no such file; give weights that train has written")
+    if weights is not None:
+        describe_weights(weights)  # raises an error before any survey
     fields = newest_runs(catalogue)
     wanted = fields if field is None else [run for run in fields if is_called(run, field)]
     if field is not None and not wanted:

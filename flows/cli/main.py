@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import io
 import os
 import sys
 import tempfile
@@ -22,6 +23,9 @@ def main(arguments: list[str] | None = None) -> None:
     # Sums that are split among threads round differently: results of one seed would depend on the number of cores.
     # numpy reads the variable when a verb first imports it.
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
+    for stream in (sys.stdout, sys.stderr):  # a terminal may lack a character
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     gc.set_threshold(10_000, 20, 20)  # with Python's own, garbage collection takes a third of the time of imports
     with terminable(last=arguments is None):
         sys.exit(_run(sys.argv[1:] if arguments is None else arguments))

@@ -100,7 +100,8 @@ def serve(
                 tempfile.TemporaryDirectory(prefix="spectralzoom-runner-", ignore_cleanup_errors=True)
             )
             held.callback(setattr, tempfile, "tempdir", None)
-            _say(f"serving {', '.join(one.name for one in served)}, {cron or f'every {every}'}; Ctrl-C stops it")
+            when = cron or f"every {every}".removesuffix(", 0:00:00")
+            _say(f"serving {', '.join(one.name for one in served)}, {when}; Ctrl-C stops it")
             _say(f"Prefect's pages: {pages}")
             _serve(served, schedule, limit or len(served) + 1, shared=shared)
     except KeyboardInterrupt:

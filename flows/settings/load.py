@@ -176,6 +176,8 @@ def load_settings(
     if table.get("source") == SURVEY["source"].item.default:
         del table["source"]
     stated = {key for key, value in table.items() if value is not None}
+    if "sweeps" in stated and not isinstance(table["sweeps"], str | Path):
+        raise SettingsError(f"{place_of('sweeps', origin.get('sweeps'))} must be a path, got {table['sweeps']!r}")
     recorded = usual_of_recording(table) if "sweeps" in stated else {}
     for name in TABLES:
         inner = table.get(name)
@@ -299,7 +301,10 @@ def anchor_paths(table: dict[str, object], folder: Path) -> dict[str, object]:
         inner = anchored.get(head) if head else anchored
         value = inner.get(tail) if isinstance(inner, Mapping) else None
         if isinstance(value, str) and value and value not in named and "://" not in value:
-            path = str(folder / Path(value).expanduser())
+            try:
+                path = str(folder / Path(value).expanduser())
+            except RuntimeError:
+                raise SettingsError(f"{key!r}: there is no user of {value.partition('/')[0]!r}; give a path") from None
             anchored |= {head: {**inner, tail: path}} if head and isinstance(inner, Mapping) else {tail: path}
     return anchored
 

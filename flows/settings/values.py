@@ -50,6 +50,8 @@ def parse_text(value: object) -> str:
     """Return text that is not empty."""
     if not isinstance(value, str) or not value.strip():
         raise ValueError(f"must be text that is not empty, got {value!r}")
+    if "\0" in value:
+        raise ValueError(f"must be text without a null character, got {value!r}")
     return value
 
 

@@ -102,7 +102,7 @@ def print_tradeoff(result: Result, console: Console) -> None:
     rows = []
     for point in points:
         further = [*point.beside.values(), *([point.cost] if priced else [])]
-        figures = [f"{one:.2g}" if abs(one) < 10 else f"{one:.1f}" for one in further]
+        figures = ["-" if math.isnan(one) else f"{one:.2g}" if abs(one) < 10 else f"{one:.1f}" for one in further]
         name = ["●" if point.pareto else "○", _named(point.setting, result.default), f"{point.error:.3g}"]
         cells = [*name, *figures, f"{point.time_s:.3g} s", f"{point.ratio:.2f}"]
         rows.append([f"{'' if point.pareto else '[dim]'}{escape(cell)}" for cell in cells])

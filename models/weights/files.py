@@ -303,7 +303,8 @@ def describe_weights(path: Path) -> Description:
     Raises WeightsError: it is missing, cut short or of another format, or its description is damaged or invalid.
     """
     if not path.is_file():
-        raise WeightsError(f"no weights at {path}; train some with: spectralzoom train DATASET -o {path.name}")
+        what = f"the weights {path} are a folder, expected a file" if path.is_dir() else f"no weights at {path}"
+        raise WeightsError(f"{what}; train some with: spectralzoom train DATASET -o FILE.safetensors")
     about = read_about(path, FORMAT)
     with refusing(path):
         config, basis = SegmenterConfig(**about["config"]), SpectralBasis(**about["basis"])

@@ -216,7 +216,7 @@ def memory_loads(sweeps: Sequence[Sweep], vector_pairs: int) -> list[Load]:
         if sweep.positions > vector_pairs:
             raise SettingsError(
                 f"sweep {sweep.name} holds {sweep.positions} positions in each line, the mirror's vector memory "
-                f"{vector_pairs} pairs; take a smaller coarse factor"
+                f"{vector_pairs} pairs; give cost.vector_pairs of at least {sweep.positions}"
             )
         line = 0
         while line < sweep.lines:

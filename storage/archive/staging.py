@@ -53,6 +53,7 @@ _ADVICE = {
     errno.EIO: "the disk reports an error: check the disk, then run again",
     errno.EFBIG: "a file may not grow so large here: raise ulimit -f, or choose an --out on another file system",
     errno.EMFILE: "too many files are open: raise ulimit -n",
+    errno.ENAMETOOLONG: "the name is too long for this file system: give a shorter one",
     errno.ENOLCK: "the file system has no locks: choose an --out on a local disk",
     errno.ELOOP: "a link stands where a file of its own belongs: see where it leads, remove it and run again",
 }

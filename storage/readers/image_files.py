@@ -211,7 +211,10 @@ def place_of_file(file: Any) -> tuple[GeoBox | None, tuple[str, ...]]:
     """Return the grid on the earth of an open rasterio file, or None with a note."""
     if file.transform.is_identity:
         other = " and ".join([*(["ground control points"] if file.gcps[0] else []), *(["RPCs"] if file.rpcs else [])])
-        return None, (f"its place is given by {other}, which are not read; warp it first (gdalwarp)",) if other else ()
+        if other:
+            return None, (f"its place is given by {other}, which are not read; warp it first (gdalwarp)",)
+        lacks = "it has a CRS and no transform (gdal_edit -a_ullr), so that its place on the earth is not known"
+        return None, () if file.crs is None else (lacks,)
     if file.crs is None or not file.transform.determinant:
         lacks = "a transform and no CRS (gdal_edit -a_srs)" if file.crs is None else "a transform that is no grid"
         return None, (f"it has {lacks}, so that its place on the earth is not known",)

@@ -359,7 +359,8 @@ def _find_gaps(
             bands_text([band for band, there in zip(chosen, seen, strict=True) if there == wanted])
             for wanted in (False, True)
         )
-        raise SceneError(f"{path} has no value anywhere in bands {without} (from 0); take the others: --bands {rest}")
+        take = f"take the others: bands = [{rest}] in a scene.toml beside it, or survey --bands {rest}"
+        raise SceneError(f"{path} has no value anywhere in bands {without} (from 0); {take}")
     if absent:
         notes.append(f"missing samples: {absent} of {missing.size * len(chosen)}")
     return missing, filled_px, void, tuple(notes)

@@ -161,8 +161,8 @@ def settle_wavelengths(
     if known.wavelength_nm is not None:
         told = f"its header has {len(known.wavelength_nm)} wavelengths; correct that list"
     raise WavelengthError(
-        f"{path} has {file_bands} bands and {told}; give --wavelengths in nm, or write "
-        f"wavelengths_nm or wavelengths_file into a scene.toml beside it (axes are y, x, band)"
+        f"{path} has {file_bands} bands and {told}; write wavelengths_nm or wavelengths_file into a scene.toml beside "
+        f"it, or give survey --wavelengths in nm (axes are y, x, band)"
     )
 
 

@@ -66,7 +66,7 @@ CASES = {
     "step of what is no series": (1, SURVEY + "cube.npy:0" + BANDS, "no axis of time"),
     "name in an array file": (1, SURVEY + "cube.npy:red" + BANDS, "one array, which has no name"),
     # wavelengths and bands
-    "no wavelengths": (1, SURVEY + "cube.npy", "nothing says their wavelengths; give --wavelengths"),
+    "no wavelengths": (1, SURVEY + "cube.npy", "nothing says their wavelengths; .* or give survey --wavelengths"),
     "too few wavelengths": (1, SURVEY + "cube.npy --wavelengths 460,550", "expected 5 wavelengths.* got 2"),
     "band that is not there": (1, SURVEY + "cube.npy --bands 0,5 --wavelengths 460,550", "band 5, but .*0..4"),
     "band twice": (2, SURVEY + "cube.npy --bands 1,1 --wavelengths 460,550", "names a band twice"),
@@ -83,7 +83,11 @@ CASES = {
     ),
     # weights
     "name too long": (1, SURVEY + "x" * 5000 + ".png", "cannot be the name of a file"),
+    "labels of a long name": (1, SURVEY + "field.png --labels " + "x" * 300 + ".png", "name is too long"),
+    "weights in a folder": (1, "evaluate bare --weights apart", "the weights apart are a folder, expected a file"),
     # settings
+    "sweeps that are no path": (2, "survey sweeps.toml", "'sweeps' .*must be a path, got True"),
+    "home of nobody": (2, "survey nobody.toml", "'scene': there is no user of '~nobody-here'"),
     "unknown setting": (2, "survey unknown.toml", "buget"),
     "broken settings": (2, "survey broken.toml", "broken.toml.*line 1"),
     "settings not in UTF-8": (2, "survey latin.toml", "latin.toml.*utf-8"),

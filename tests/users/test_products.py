@@ -218,7 +218,12 @@ def test_the_catalogue_names_every_product(posed: Products) -> None:
     [
         ({"prescription": "weed"}, "expects classes with numbers, weed=2.5, got 'weed'"),
         ({"prescription": "weed=1", "dose_unit": "gal/ac"}, "--dose-unit expects l/ha or kg/ha, got 'gal/ac'"),
-        ({"prescription": "weed=1", "cell": 0.0}, "--cell expects metres above 0, got 0"),
+        ({"prescription": "weed=1,weed=2"}, "names weed twice; give it one number"),
+        *(
+            ({"prescription": "weed=1", "cell": m}, "--cell expects metres above 0 and at most 1000")
+            for m in (0.0, 1e9)
+        ),
+        *((one, "--cell and --dose-unit need --prescription") for one in ({"cell": 2.0}, {"dose_unit": "kg/ha"})),
         ({"prescription": "thistle=1"}, "no class 'thistle'; its classes are soil, maize"),
         ({"indices": "NDVI,NDMI"}, "NDMI wants Short-wave Infrared"),
     ],

@@ -67,7 +67,7 @@ def test_wavelengths_stand_in_tags_of_many_kinds(tmp_path: Path, say: Any) -> No
 
 
 def test_a_geotiff_keeps_its_place(tmp_path: Path) -> None:
-    """CRS and transform as written; a transform alone, and ground control points, are no place, and a note says so."""
+    """CRS and transform as written; one without the other, and ground control points, are no place, as a note says."""
     write(tmp_path / "a.tif", crs="EPSG:25832", transform=PLACE).close()
     scene = load_scene_file(tmp_path / "a.tif", wavelengths=NM)
     assert scene.geobox is not None
@@ -76,8 +76,14 @@ def test_a_geotiff_keeps_its_place(tmp_path: Path) -> None:
     write(tmp_path / "b.tif", transform=PLACE).close()
     points = [GroundControlPoint(0, 0, 7, 52), GroundControlPoint(6, 0, 7, 51.9), GroundControlPoint(0, 7, 7.1, 52)]
     write(tmp_path / "c.tif", gcps=points, crs="EPSG:4326").close()
-    for name, words in (("b.tif", "a transform and no CRS"), ("c.tif", "ground control points, which are not read")):
-        scene = load_scene_file(tmp_path / name, wavelengths=NM)
+    write(tmp_path / "d.tif", crs="EPSG:25832").close()
+    notes = {
+        "b": "a transform and no CRS",
+        "c": "ground control points, which are not read",
+        "d": "a CRS and no transform",
+    }
+    for name, words in notes.items():
+        scene = load_scene_file(tmp_path / f"{name}.tif", wavelengths=NM)
         assert scene.geobox is None
         assert any(words in note for note in scene.provenance)
 

@@ -92,7 +92,7 @@ def test_geotiff_says_its_colours(tmp_path: Path) -> None:
         ([450.0, 550.0], "expected 5 wavelengths, one a band, got 2"),
         ([450.0, 550, 650, 800, 9000], "9000 lie outside 200-3000 nm"),
         ([450.0, 550, 650, 800, float("nan")], "must be numbers"),
-        (None, "5 bands and nothing says their wavelengths; give --wavelengths"),
+        (None, "5 bands and nothing says their wavelengths; write wavelengths_nm"),
     ],
 )
 def test_wrong_wavelengths(tmp_path: Path, cube: NDArray[np.uint16], stated: list[float] | None, words: str) -> None:
