@@ -11,6 +11,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import pytest
 
+from flows.tasks.open_survey import STAGES
 from tests.prior_work import without_effects
 
 FOLDER = Path(__file__).parents[2] / "docs" / "notebooks"
@@ -57,6 +58,9 @@ def test_it_is_shown_with_what_it_gave(name: str) -> None:
     assert {output["output_type"] for output in outputs} <= {"stream", "display_data"}
     assert sum("image/png" in output.get("data", {}) for output in outputs) == 2
     assert "/tmp/" not in json.dumps(outputs)
+    ran = {stage for one in outputs for line in one.get("text", ()) if " > " in line for stage in line.split()[2::2]}
+    assert ran <= set(STAGES)
+    assert bool(ran) == (name == "first_survey")
     text = "".join("".join(cell["source"]) for cell in cells(name, "markdown"))
     targets = re.findall(r"\]\(([^)#]+)", text)
     assert [one for one in targets if not (FOLDER / one).exists()] == []
