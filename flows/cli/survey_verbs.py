@@ -87,6 +87,8 @@ def survey(*settings: Path, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = Fal
     """
     every, code = [load_settings(file, by_setting(flags)) for file in settings or (None,)], 0
     for number, requested in enumerate(every):
+        if number:
+            survey_command.free_memory()
         try:
             _survey(requested, as_json=as_json, verbose=verbose)
         except PipelineError as error:

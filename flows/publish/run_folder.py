@@ -115,7 +115,7 @@ class _Drawn:
     field: FieldMap
 
 
-_DRAWN: WeakKeyDictionary[OpenSurvey, _Drawn] = WeakKeyDictionary()  # of surveys that this process has published
+_DRAWN: WeakKeyDictionary[OpenSurvey, _Drawn] = WeakKeyDictionary()  # of surveys that are still to be evaluated
 
 
 def _draw(survey: OpenSurvey, plan: FinePlan, receipt: Receipt) -> _Drawn:
@@ -133,9 +133,9 @@ def _draw(survey: OpenSurvey, plan: FinePlan, receipt: Receipt) -> _Drawn:
 def _publish(survey: OpenSurvey, draft: RunDraft, plan: FinePlan, receipt: Receipt) -> Published:
     run, products = survey.run, survey.products
     again = None if run.plan.plain else len(plan.patch_index) / len(run.grid.every_patch())
-    if survey not in _DRAWN:
-        _DRAWN[survey] = _draw(survey, plan, receipt)
-    drawn = _DRAWN[survey]
+    drawn = _DRAWN.pop(survey, None) or _draw(survey, plan, receipt)
+    if not draft.extends:
+        _DRAWN[survey] = drawn
     accuracy, moment = receipt.get("accuracy"), run.settings.moment
     notes = [] if moment is None else [f"day {moment[0]}, {moment[1]:g} h"]  # the end of the picture's title line
     if accuracy is not None and accuracy["miou"] is not None:

@@ -27,7 +27,7 @@ from storage.archive.keys import StageRef
 from storage.remote.opening import open_archive
 
 OPENING = "plan"
-_opened: ContextVar[tuple[Settings, SurveyRun] | None] = ContextVar("opened", default=None)
+_opened: ContextVar[list[tuple[Settings, SurveyRun]] | None] = ContextVar("opened", default=None)
 PASSES = {"coarse": capture_coarse, "fine": capture_fine}
 CONDENSED = {"coarse": condense_coarse, "fine": condense_fine}
 
@@ -52,16 +52,18 @@ def opened_first(settings: Settings) -> Iterator[None]:
         watch(OPENING, "opened" if isinstance(error, NothingToMend) else "failed", 1.0)
         raise
     watch(OPENING, "opened", 1.0)
-    before = _opened.set((settings, run))
+    opened = [(settings, run)]
+    before = _opened.set(opened)
     try:
         yield
     finally:
         _opened.reset(before)
+        opened.clear()  # event loops of Zarr and Prefect keep the context in which they began
 
 
 def _plan_capture(settings: SurveySettings) -> OpenSurvey | RunRef:
     observer, requested, due = current_observer(), settings.settings(), _due_time()
-    first, run = _opened.get() or (None, None)
+    first, run = next(iter(_opened.get() or ()), (None, None))
     if run is None or first is not requested:
         try:
             if due is not None:

@@ -128,6 +128,7 @@ class OpenSurvey:
         is one. Raises RigError: another survey uses the rig.
         """
         with ExitStack() as held:
+            held.callback(vars(self).pop, "run", None)  # Prefect keeps the survey, which is the result of a task
             if captures and self.run.settings.source == "rig" and self.capture_deployment is None:
                 if inside_flow():
                     held.enter_context(rig_turn(self.observer))

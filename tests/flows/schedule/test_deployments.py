@@ -189,12 +189,12 @@ def test_two_fields_that_are_due_at_once_take_turns_at_the_rig(tmp_path: Path) -
     usual = load_settings(None, {"scene": "farm"})
     rig = replace(usual, source="rig", rig=replace(usual.rig, port=f"/dev/ttyTURNS{os.getpid()}"))
     run = SimpleNamespace(settings=rig, archive=archive, name="x")
-    plan: Any = SimpleNamespace(run=run, capture_deployment=None, observer=Observer())
     held: list[tuple[float, float]] = []
     inside = threading.Barrier(2)
 
     @flow(persist_result=False)
     def scan_pass() -> None:
+        plan: Any = SimpleNamespace(run=run, capture_deployment=None, observer=Observer())
         inside.wait(PATIENCE_S)
         with OpenSurvey.at_work(plan):
             began = time.monotonic()

@@ -49,13 +49,14 @@ def test_what_a_run_names_that_another_survey_published_meanwhile_stays(tmp_path
     given |= {"engine": "plain", "accuracy": False, "budget": 0.95, "coarse_exposure_ms": 4.0, "zoom": "always"}
     first = plan_capture(SurveySettings(**given, policy="random"))
     assert isinstance(first, OpenSurvey)
+    archive = first.run.archive
     with first.at_work():
         draw_class_map(first)
         other = survey.fn(SurveySettings(**given, policy="mask", mask=str(tmp_path / "nothing.npy"), keep="raw"))
         clear_raw(first, publish(first))
-    assert first.run.archive.is_there(first.products["capture_coarse"].uri)
+    assert archive.is_there(first.products["capture_coarse"].uri)
     mosaic = read_run(other.folder).products["mosaic"]
-    assert first.run.archive.is_there("/".join(mosaic.split("/")[:3]))
+    assert archive.is_there("/".join(mosaic.split("/")[:3]))
 
 
 def _arrays(root: Path) -> Iterator[tuple[Path, zarr.Array[Any]]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import signal
@@ -20,6 +21,7 @@ from flows.settings.parameters import SurveySettings
 from flows.survey import capture, draw_class_map
 from flows.tasks.local_server import ServerUnavailable
 from flows.tasks.open_survey import STAGES, Products
+from flows.tasks.run import SurveyRun
 from pipeline.errors import IncompleteStoreError, SettingsError
 from storage.archive.keys import StageRef
 from tests.flows.conftest import act_instead, newest_run
@@ -219,11 +221,19 @@ def edges(tasks: dict[str, Any], name: str) -> set[str]:
     return {by_id[one.id] for one in given if hasattr(one, "id")}
 
 
+def opened_surveys() -> set[int]:
+    """The scenes and grids that are in memory."""
+    gc.collect()
+    return {id(one) for one in gc.get_objects() if type(one) is SurveyRun}
+
+
 def test_a_survey_has_a_server_of_its_own(survey_png: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its files lie in the archive, and nothing of it is left in the environment."""
     monkeypatch.delenv("PREFECT_API_URL", raising=False)
     before = dict(os.environ)
+    opened = opened_surveys()
     survey_png(tmp_path, engine="prefect", **NARROW)
+    assert opened_surveys() <= opened  # nothing of it stays in memory
     assert (tmp_path / ".prefect" / "prefect.db").exists()
     assert dict(os.environ) == before
 
