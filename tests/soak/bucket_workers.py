@@ -1,12 +1,11 @@
 """A survey into a bucket, by two workers that share no folder with it: from sweeps to class map.
 
 The bucket is moto's, in a process of its own; each worker has a working copy of its own, as on another machine. The
-field has 105 million px of 270 bands. Quick, a small one is surveyed by threads into a folder too, and maps compared.
+field has 105 million px of 270 bands, quick 1.3 million.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import socket
@@ -16,11 +15,8 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from storage.arrays.class_maps import load_class_map
 from storage.remote.opening import open_archive
 from tests.faults.fault_table import Clock, Row
 from tests.faults.nursery import ROOT
@@ -33,54 +29,31 @@ EVERY_S, BEGUN_WITHIN_S = 1.0, 60.0
 
 
 def rows(quick: bool) -> list[Row]:
-    """Memory and bytes of the survey, and whether its map is that of threads."""
+    """Memory of the survey and its workers, and bytes kept."""
     size, address, clock = QUICK_SIZE if quick else SIZE, f"s3://{BUCKET}/field", Clock()
-    with tempfile.TemporaryDirectory(prefix="bucket-") as name, ExitStack() as stack:
-        folder = Path(name)
-        there = stack.enter_context(cluster(folder))
-        os.environ.update(there.environment)
-        receipt, peaks = survey(size, address, there, "--scheduler", there.scheduler)
-        archive, what = open_archive(address), f"farm of {size} px, {WORKERS} workers"
-        kept, seconds = sum(archive.sizes(["stages", "runs"]).values()), clock.seconds
-        memory = ", ".join(f"{peak / 2**30:.1f}" for peak in peaks)
-        small = max(peaks) <= MOST_GIB * 2**30
-        found = [
-            Row("peak memory [GiB]", f"{what}: survey, workers", 1, f"<= {MOST_GIB} each", memory, small, seconds),
-            Row("kept [MB]", "all objects", 1, f"<= {MOST_MB}", f"{kept / 1e6:.0f}", kept <= MOST_MB * 1e6, 0.0),
-        ]
-        if quick:
-            beside, _ = survey(size, str(folder / "beside"), there)
-            maps = [
-                load_class_map(open_archive(out).locate(one["products"]["class_map"])).classes
-                for out, one in ((address, receipt), (str(folder / "beside"), beside))
-            ]
-            odd = int((maps[0] != maps[1]).sum())
-            found.append(Row("class map", "beside that of threads", 1, "equal", f"{odd} px differ", odd == 0, 0.0))
-    return found
-
-
-@dataclass(frozen=True)
-class Cluster:
-    """A bucket, a scheduler and its workers."""
-
-    scheduler: str
-    environment: dict[str, str]  # of a survey
-    workers: list[int]  # process numbers
+    with tempfile.TemporaryDirectory(prefix="bucket-") as name, cluster(Path(name)) as (scheduler, workers):
+        given = ("--size", size, "--out", address, "--scheduler", scheduler, "--no-accuracy")
+        peaks = survey(workers, *given)
+        kept = sum(open_archive(address).sizes(["stages", "runs"]).values())
+    memory, small = ", ".join(f"{peak / 2**30:.1f}" for peak in peaks), max(peaks) <= MOST_GIB * 2**30
+    how = f"farm of {size} px, {WORKERS} workers: survey, workers"
+    return [
+        Row("peak memory [GiB]", how, 1, f"<= {MOST_GIB} each", memory, small, clock.seconds),
+        Row("kept [MB]", "all objects", 1, f"<= {MOST_MB}", f"{kept / 1e6:.0f}", kept <= MOST_MB * 1e6, 0.0),
+    ]
 
 
 @contextmanager
-def cluster(folder: Path) -> Iterator[Cluster]:
-    """Start a bucket and workers, in processes of their own that end with the block."""
+def cluster(folder: Path) -> Iterator[tuple[str, list[int]]]:
+    """Start a bucket and workers, which end with the block; yield the scheduler's address and the workers' numbers."""
     ports = [free_port(), free_port()]
-    environment = {**KEYS, "AWS_ENDPOINT_URL": f"http://127.0.0.1:{ports[0]}"}
+    os.environ.update(KEYS, AWS_ENDPOINT_URL=f"http://127.0.0.1:{ports[0]}", SPECTRALZOOM_WORK=str(folder / "survey"))
     scheduler = f"tcp://127.0.0.1:{ports[1]}"
     with ExitStack() as stack:
 
         def start(*words: str, **more: str) -> int:
-            quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-            process = subprocess.Popen(
-                [sys.executable, "-m", *words], cwd=ROOT, env={**os.environ, **environment, **more}, **quiet
-            )
+            command, null = [sys.executable, "-m", *words], subprocess.DEVNULL
+            process = subprocess.Popen(command, cwd=ROOT, env={**os.environ, **more}, stdout=null, stderr=null)
             stack.callback(process.wait)
             stack.callback(process.terminate)
             return process.pid
@@ -88,12 +61,10 @@ def cluster(folder: Path) -> Iterator[Cluster]:
         start("moto.server", "-H", "127.0.0.1", "-p", str(ports[0]))
         start("distributed.cli.dask_scheduler", "--host", scheduler, "--no-dashboard")
         asked = ("--nthreads", "1", "--memory-limit", "0", "--no-dashboard")
-        workers = [
-            start("distributed.cli.dask_worker", scheduler, *asked, SPECTRALZOOM_WORK=str(folder / f"worker {number}"))
-            for number in range(WORKERS)
-        ]
-        create_bucket(environment["AWS_ENDPOINT_URL"])
-        yield Cluster(scheduler, {**environment, "SPECTRALZOOM_WORK": str(folder / "survey")}, workers)
+        copies = [str(folder / f"worker {number}") for number in range(WORKERS)]
+        workers = [start("distributed.cli.dask_worker", scheduler, *asked, SPECTRALZOOM_WORK=copy) for copy in copies]
+        create_bucket()
+        yield scheduler, workers
 
 
 def free_port() -> int:
@@ -102,14 +73,13 @@ def free_port() -> int:
         return int(free.getsockname()[1])
 
 
-def create_bucket(endpoint: str) -> None:
+def create_bucket() -> None:
     """Create the bucket, once its server answers."""
     import boto3
     from botocore.exceptions import ConnectionError as NoAnswer
 
     end = time.monotonic() + BEGUN_WITHIN_S
-    known = {"aws_access_key_id": "key", "aws_secret_access_key": "secret", "region_name": "us-east-1"}
-    client = boto3.client("s3", endpoint_url=endpoint, **known)
+    client = boto3.client("s3", endpoint_url=os.environ["AWS_ENDPOINT_URL"], region_name=KEYS["AWS_REGION"])
     while True:
         try:
             client.create_bucket(Bucket=BUCKET)
@@ -120,20 +90,17 @@ def create_bucket(endpoint: str) -> None:
             time.sleep(0.2)
 
 
-def survey(size: str, out: str, there: Cluster, *words: str) -> tuple[dict[str, Any], list[int]]:
-    """Survey; return the receipt, and the peak memory [bytes] of this survey and of each worker."""
-    command = [sys.executable, "-m", "flows.cli.main", *SURVEY, "--size", size, "--out", out, "--json", "--no-accuracy"]
-    with subprocess.Popen([*command, *words], cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        of = [process.pid, *there.workers]
+def survey(workers: list[int], *words: str) -> list[int]:
+    """Survey; return the peak memory [bytes] of this survey and of each worker."""
+    with subprocess.Popen([sys.executable, "-m", "flows.cli.main", *SURVEY, *words], cwd=ROOT) as process:
+        of = [process.pid, *workers]
         peaks = [0] * len(of)
         while process.poll() is None:
             peaks = [max(peak, anonymous(pid)) for peak, pid in zip(peaks, of, strict=True)]
             time.sleep(EVERY_S)
-        text = process.stdout.read()
     if process.returncode:
-        raise RuntimeError(f"the survey ended with {process.returncode}: {text}")
-    return json.loads(text), peaks
+        raise RuntimeError(f"the survey ended with {process.returncode}")
+    return peaks
 
 
 def anonymous(pid: int) -> int:
