@@ -190,7 +190,8 @@ def _send_away(
         _teams[pool] = team
     try:
         count = team.check(inputs)
-        shared = team.client.submit(_itself, make, pure=False)  # travels once to each worker
+        with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 GiB"}):
+            shared = team.client.submit(_itself, make, pure=False)  # travels once to each worker
         _send(partial(team.submit, call, shared), items, AHEAD * count, ended, alive=team.count)
     except (WorkerError, CancelledError, dask_distributed.KilledWorker) as error:
         _dismiss(pool)

@@ -77,8 +77,9 @@ def test_threads_give_results_in_order(workers: int, count: int) -> None:
 
 
 def test_processes_give_results_in_order(processes: WorkerPool) -> None:
-    """Other processes give what threads give."""
+    """Other processes give what threads give, and what all blocks share may be large."""
     assert run_blocks(square, range(20), processes) == [square(item) for item in range(20)]
+    assert run_blocks(bytes(12 * 2**20).__getitem__, [1, 2], processes) == [0, 0]
 
 
 def test_workers_are_kept_and_have_one_thread(processes: WorkerPool) -> None:
