@@ -89,6 +89,8 @@ def survey(*settings: Path, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = Fal
     for number, requested in enumerate(every):
         if number:
             survey_command.free_memory()
+        if len(every) > 1:
+            stderr.print(f"survey {number + 1} of {len(every)}: {settings[number]}", markup=False, soft_wrap=True)
         try:
             _survey(requested, as_json=as_json, verbose=verbose)
         except PipelineError as error:
