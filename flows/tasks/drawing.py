@@ -1,4 +1,4 @@
-"""A field's map drawn region by region: what was seen today, weighed against what is remembered of the field.
+"""Draw a field's map region by region: the current visit, fused with the prior map of the field.
 
 As in `flows.tasks.field_work` a worker gets references to stores, and returns arrays. The survey's process writes them.
 """
@@ -55,10 +55,10 @@ class Drawing:
     mosaic: StageRef
     attention: StageRef  # whose ranks say which patches are read in detail
     capture: LineSpec  # of the mosaic's pixels, where it does not say so itself
-    memory: FieldPriorMap | None = None  # what is remembered of the field
+    memory: FieldPriorMap | None = None  # prior map of the field
     left_out: NDArray[np.bool_] | None = None  # (y, x) pixels of which zones have no map drawn
     unknown: UnknownRule | None = None  # which pixels are called unknown
-    part: bool = False  # of the field was looked at: of the rest today's look says nothing
+    part: bool = False  # whether the scan covers a part of the field; the rest is that of the prior map
     choice: GainChoice | None = None  # of the patches that are read in full; None: all that ``attention`` ranks
 
     @property
@@ -111,26 +111,25 @@ class Drawing:
             old = changed_from(prior_map, after)
         if self.unknown is not None and unknown is not None:
             classes[unknown], confidence[unknown] = self.unknown.number, np.nan
+        reading = None
+        if self.choice is not None:
+            read, changed = np.zeros(gain.shape, np.bool_), np.zeros(gain.shape, np.float32)
+            read[patch_index] = True
+            before = predicted.probability.argmax(axis=-1)[: region.grid.height, : region.grid.width]
+            other = (drawn.classes != before) & (drawn.classes != UNLABELLED)
+            changed[patch_index] = patch_pixels(region.grid, other)[patch_index].mean(axis=(1, 2))
+            kept = region.crop_patches
+            reading = FullReading(kept(gain), kept(read), kept(changed))
         unread = 0 if seen.out_of_range is None else int(np.count_nonzero(region.crop(seen.out_of_range)))
-        images = DrawnRegion(
+        return DrawnRegion(
             region.crop(classes),
             region.crop(confidence),
             packed_probabilities(region.crop(after.log_probability)),
             region.crop(after.age_days),
             region.crop(after.light),
             None if old is None else region.crop(old),
-            Drawn(unread, comparison),
+            Drawn(unread, comparison, reading),
         )
-        if self.choice is None:
-            return images
-        read, changed = np.zeros(gain.shape, np.bool_), np.zeros(gain.shape, np.float32)
-        read[patch_index] = True
-        kept = region.crop_patches
-        before = predicted.probability.argmax(axis=-1)[: region.grid.height, : region.grid.width]
-        other = (drawn.classes != before) & (drawn.classes != UNLABELLED)
-        changed[patch_index] = patch_pixels(region.grid, other)[patch_index].mean(axis=(1, 2))
-        reading = FullReading(kept(gain), kept(read), kept(changed))
-        return replace(images, drawn=replace(images.drawn, reading=reading))
 
     def _observation(
         self, region: Region, log_probability: NDArray[np.float32], shown: NDArray[np.bool_], seen: CoarsePass
