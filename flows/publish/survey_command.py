@@ -60,7 +60,7 @@ def run_survey(settings: Settings, console: Console, *, verbose: bool = False, s
 
 
 def free_memory() -> None:
-    """Give the memory of the survey before back to the system: 0.4 GB on the farm."""
+    """Give the memory of the survey before back to the system."""
     gc.collect()
     give_back_freed_memory()
 

@@ -61,7 +61,7 @@ class WeightsFile:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Travel with the content of the file, which other machines may lack."""
-        return _weights_there, (self.path.absolute(), self.seal, self.device, self.path.read_bytes())
+        return _weights_there, (self.seal, self.device, self.path.read_bytes())
 
     def _check(self) -> None:
         if describe_weights(self.path).about[SEAL] != self.seal:
@@ -91,12 +91,11 @@ def _folder_of_weights() -> TemporaryDirectory[str]:
     return TemporaryDirectory(prefix="spectralzoom-weights-")
 
 
-def _weights_there(path: Path, seal: str, device: str, content: bytes) -> WeightsFile:
-    """Return weights to a worker, in a temporary file where it does not see that of the survey."""
+def _weights_there(seal: str, device: str, content: bytes) -> WeightsFile:
+    """Return weights to a worker, in a temporary file: a file of the same path may be another one there."""
+    path = Path(_folder_of_weights().name) / f"{seal}.safetensors"
     if not path.is_file():
-        path = Path(_folder_of_weights().name) / f"{seal[:20]}.safetensors"
-        if not path.is_file():
-            path.write_bytes(content)
+        path.write_bytes(content)
     return WeightsFile(path, seal, device)
 
 

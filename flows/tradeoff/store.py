@@ -207,7 +207,7 @@ def coarse_of_sweeps(
     capture: LineSpec = LineSpec(),  # noqa: B008 - a value
 ) -> CoarsePrediction:
     """Rectify sweeps over a scene to its pixels, and predict from them."""
-    blocks = (values for _, values, _ in mosaic_rows(sweeps, camera, grid, rows=ROWS))
+    blocks = mosaic_rows(sweeps, camera, grid, rows=ROWS)
     return read_coarse_prediction(weights, read_coarse_pass(weights, blocks, wavelength_nm, grid, capture=capture))
 
 

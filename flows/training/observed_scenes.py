@@ -94,7 +94,7 @@ def _columns(
     taken = [_Taken(source, sweep) for sweep in sweeps]
     bands, rows = len(matrix), list[Columns]()
     count, total, products = 0, np.zeros(bands), np.zeros((bands, bands))
-    for _, part, _ in mosaic_rows(taken, source.camera, grid, rows=_ROWS):
+    for part in mosaic_rows(taken, source.camera, grid, rows=_ROWS):
         rows.append(project(part, matrix))
         some = part[::2, ::2].reshape(-1, bands).astype(np.float64)
         count, total, products = count + len(some), total + some.sum(axis=0), products + some.T @ some

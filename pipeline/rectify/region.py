@@ -77,19 +77,17 @@ def mosaic_tile(
     return values, coverage
 
 
-def mosaic_rows(
-    sweeps: Sequence[SweepLines], camera: LineCamera, grid: SceneGrid, *, rows: int
-) -> Iterator[tuple[int, Values, Counts]]:
+def mosaic_rows(sweeps: Sequence[SweepLines], camera: LineCamera, grid: SceneGrid, *, rows: int) -> Iterator[Values]:
     """Rectify and blend the sweeps of one pass onto the pixels of the scene, ``rows`` rows at a time.
 
-    Yields the first row, (row, x, band) float32 with NaN where no line reached, and (row, x) how many sweeps did.
+    Yields (row, x, band) float32 with NaN where no line reached.
     """
     pixels = PixelGrid.of_scene(grid)
     placed = [place(lines, camera) for lines in sweeps]
     columns = slice(0, pixels.shape[1])
     reach = column_reach(placed, camera, pixels, columns)
     for part in cuts(pixels.shape[0], rows):
-        yield part.start, *mosaic_tile(placed, camera, pixels, part, columns, reach=reach)
+        yield mosaic_tile(placed, camera, pixels, part, columns, reach=reach)[0]
 
 
 def _blend(located: Sequence[LocatedSweep], part: Any, camera: LineCamera, kernel: Kernel) -> tuple[Values, Counts]:

@@ -18,7 +18,7 @@ import signal
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
@@ -126,7 +126,7 @@ def _dismiss(pool: WorkerPool) -> None:
     """Abandon the workers of a pool; the next use starts others."""
     team = _teams.pop(pool, None)
     if team is not None:
-        team.shutdown()
+        team.close()
 
 
 def run_blocks(
@@ -240,8 +240,8 @@ def _send(
         raise
 
 
-class Cluster(Executor):
-    """The workers of a dask scheduler as an executor, on this machine or elsewhere."""
+class Cluster:
+    """The workers of a dask scheduler, on this machine or elsewhere."""
 
     def __init__(self, pool: WorkerPool) -> None:
         """Connect to the scheduler, or start processes (SettingsError: none answers, or none start)."""
@@ -260,17 +260,17 @@ class Cluster(Executor):
                 f"{self.name}: {expected} ({type(error).__name__}); start `dask scheduler`, or use --scheduler threads"
             ) from None
 
-    def submit(self, make: Callable[..., Any], /, *given: Any, **named: Any) -> Future[Any]:
+    def submit(self, make: Callable[..., Any], *given: Any) -> Future[Any]:
         """Send one block.
 
         dask's own executor fails where a block is lost with its worker between its end and its delivery.
         """
-        sent = self.client.submit(make, *given, pure=False, **named)
+        sent = self.client.submit(make, *given, pure=False)
         return asyncio.run_coroutine_threadsafe(
             self.client.gather(sent, asynchronous=True), self.client.loop.asyncio_loop
         )
 
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+    def close(self) -> None:
         """Disconnect from the workers; those elsewhere keep running."""
         self.client.close()
         if self._own is not None:

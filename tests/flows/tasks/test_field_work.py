@@ -133,9 +133,8 @@ def test_edges_need_one_patch_of_halo(surveyed: Surveyed) -> None:
     )
 
 
-@pytest.mark.parametrize("there", [True, False])
-def test_work_travels_with_its_weights(surveyed: Surveyed, tmp_path: Path, there: bool) -> None:
-    """A worker that sees the file of the weights reads it; another one has what travelled, and gives the same."""
+def test_work_travels_with_its_weights(surveyed: Surveyed, tmp_path: Path) -> None:
+    """A worker reads what travelled, whatever lies at the path of the weights there."""
     run, stages = surveyed
     copy, work = tmp_path / "w.safetensors", run.work
     copy.write_bytes(work.weights.path.read_bytes())
@@ -143,10 +142,8 @@ def test_work_travels_with_its_weights(surveyed: Surveyed, tmp_path: Path, there
     sent = pickle.dumps((scoring, work.regions[0]))
     assert len(sent) < copy.stat().st_size + 2000
     expected = scoring(work.regions[0])
-    if not there:
-        copy.unlink()
+    copy.write_bytes(b"other weights")
     travelled, region = pickle.loads(sent)
-    assert (travelled.weights.path == copy) == there
     assert (travelled(region) == expected).all()
 
 

@@ -42,7 +42,7 @@ def _captured(source: RecordedSource, sweep: Sweep) -> RecordedSweep:
 
 
 def _mosaic(lines: SweepLines) -> NDArray[np.float32]:
-    return np.concatenate([values for _, values, _ in mosaic_rows([lines], CAMERA, GRID, rows=80)])
+    return np.concatenate(list(mosaic_rows([lines], CAMERA, GRID, rows=80)))
 
 
 def test_a_coarse_pass_from_single_lines_is_not_displaced() -> None:
