@@ -57,7 +57,7 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Stored:
     """A stored mosaic of 150 x 90 px, a part of it not seen, and its values."""
     path = tmp_path_factory.mktemp("mosaic") / "mosaic.zarr"
     values = np.random.default_rng(0).random((150, 90, len(NM)), np.float32)
-    values[:20, :30] = np.nan
+    values[:19, :29] = np.nan
     return path, write_values(path, values, NM, AngularGrid(1e-4, (150, 90)))
 
 
