@@ -25,7 +25,7 @@ from pipeline.planning.fine_pass import FinePlan
 from storage.archive.keys import StageRef
 from storage.arrays.class_maps import ProbabilityStore, class_counts
 from storage.arrays.layout import open_group, read_array
-from storage.arrays.quicklooks import choose_bands
+from storage.arrays.mosaics import choose_bands
 
 QUALITY = 80  # of a photograph as WebP
 LEVELS = 50  # of a colour ramp; the next number is transparent

@@ -18,8 +18,7 @@ from flows.terminal.figures import format_area
 from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.class_maps import ClassMap
 from storage.arrays.ground_maps import GroundMap
-from storage.arrays.mosaics import Mosaic
-from storage.arrays.quicklooks import stretch
+from storage.arrays.mosaics import Mosaic, stretch
 
 COLOURS = 256  # of a PNG
 MOST_PX = 2048  # of a picture's longer side; larger fields are subsampled

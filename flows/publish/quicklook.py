@@ -31,7 +31,7 @@ from flows.publish.panels import (
 from flows.terminal.figures import format_percent
 from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.class_maps import class_counts
-from storage.arrays.quicklooks import choose_bands, develop, stretch
+from storage.arrays.mosaics import choose_bands, develop, stretch
 
 HEAT_ALPHA = 0.72  # of scores over the field
 TITLE_LETTERS = 7.5  # to an inch of a line

@@ -1,12 +1,13 @@
 """Make receipt, quicklook and report of a survey, and publish them as one run folder.
 
-When the accuracy is known, the folder is made again with it and replaces the first.
+When the accuracy is known, the folder is made again with it and replaces the first. The bytes kept include the receipt
+and the report. Both are written again until the figure in them is right.
 """
 
 from __future__ import annotations
 
 import platform
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
@@ -17,7 +18,6 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.publish.byte_account import open_account, publish_counted
 from flows.publish.field_map import FieldMap, block_of, field_map, prior_map
 from flows.publish.findings import (
     PLOTS_FILE,
@@ -31,10 +31,10 @@ from flows.publish.findings import (
 )
 from flows.publish.panels import draw_ground, draw_spectra, thinned
 from flows.publish.quicklook import QuicklookData, draw_quicklook
-from flows.publish.receipt import AccuracyIs, Receipt, build_receipt, check_receipt, with_accuracy
+from flows.publish.receipt import AccuracyIs, Facts, Receipt, build_receipt, check_receipt, with_accuracy
 from flows.publish.report import Picture, render_report
 from flows.settings.load import anchor_paths
-from flows.settings.values import EXTENT_WHOLE
+from flows.settings.values import EXTENT_WHOLE, KEEP_SIGNAL
 from flows.tasks.capture_plan import as_figures
 from flows.tasks.open_survey import STAGES, OpenSurvey, Products
 from flows.tasks.prior_maps import prior_map_figures
@@ -48,18 +48,21 @@ from flows.tasks.stages.placement import load_registration
 from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.grid import patch_pixels
 from pipeline.planning.fine_pass import FinePlan
-from pipeline.planning.prices import SavingEntry, capture_savings
+from pipeline.planning.prices import BYTES_PER_SAMPLE, SavingEntry, capture_savings, raw_bytes
 from pipeline.planning.uniform_scans import MIOU, format_scan
+from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table
-from storage.archive.records import read_run
+from storage.archive.records import RECEIPT, read_run
 from storage.archive.run_folders import RunDraft
+from storage.archive.whole_files import to_json
 from storage.arrays.class_maps import ProbabilityStore, load_class_map
 from storage.arrays.ground_maps import load_ground_map
-from storage.arrays.mosaics import load_attention, open_mosaic
-from storage.arrays.quicklooks import choose_bands
+from storage.arrays.mosaics import choose_bands, load_attention, open_mosaic
+from storage.readers.recordings import LINE_PRODUCTS
 
 SPECTRA_CAPTION = "Mean spectra of the classes as mapped."
+REPORT = "report.html"
 LIBRARIES = ("spectralzoom", "numpy", "numba", "torch", "zarr", "xarray", "prefect")
 
 
@@ -346,3 +349,56 @@ def _pointing(ref: StageRef) -> dict[str, Any]:
         "not_found": record["untied"],
         "too_narrow": record["narrow"],
     }
+
+
+def open_account(run: SurveyRun, plan: FinePlan) -> Facts:
+    """Return the bytes of the passes and of the reference; figures that are counted at publication are 0."""
+    bands = len(run.scene.wavelength_nm)
+    if run.raster is None:
+        captured = raw_bytes([*run.plan.coarse, *plan.sweeps], run.camera, bands)
+        reference = raw_bytes(run.plan.full, run.camera, bands)
+    else:
+        captured, reference = 0, int(np.prod(run.scene.shape)) * bands * BYTES_PER_SAMPLE
+    return {**{"captured": captured, "written": 0, "kept": 0, "moved_bucket": 0}, "reference": reference}
+
+
+def publish_counted(
+    archive: Archive,
+    draft: RunDraft,
+    receipt: Receipt,
+    page_of: Callable[[Receipt], str],
+    *,
+    rests_on: Mapping[str, str],
+    of_earlier: Collection[str] = (),
+    written: int = 0,
+) -> Receipt:
+    """Publish a run with receipt and page, and return the receipt with the bytes of the published run.
+
+    Raw lines that the setting ``keep`` drops after the publication do not count as kept, nor do the stores
+    ``of_earlier`` visits. All other files are in the draft's folder. ``rests_on`` is of `Archive.manifest_hashes`,
+    ``written`` are bytes of stores that the receipt does not count yet.
+    """
+    facts: dict[str, Any] = {"survey": receipt["survey"], "settings": receipt["settings"], "rests_on": rests_on}
+    products, drops_raw = receipt["products"], receipt["settings"]["keep"] == KEEP_SIGNAL
+    others = {*of_earlier, *(products[name] for name in LINE_PRODUCTS if drops_raw and name in products)}
+    stores = archive.sizes(uri for uri in rests_on if uri not in others)
+    moved = archive.take_moved()
+    before, longest, folder = receipt["data_bytes"], {RECEIPT: 0, REPORT: 0}, 0
+    while True:
+        told = {
+            "written": before["written"] + written + folder,
+            "kept": sum(stores.values()) + folder,
+            "moved_bucket": before["moved_bucket"] + (moved + folder if archive.in_bucket else 0),
+        }
+        receipt = check_receipt(receipt | {"data_bytes": before | told})
+        for name, text in ((RECEIPT, to_json(receipt)), (REPORT, page_of(receipt))):
+            content = text.encode()
+            longest[name] = max(longest[name], len(content))
+            draft.write_file(name, content.ljust(longest[name], b"\n"))  # no file shrinks, so that the loop ends
+        size = draft.bytes_published(**facts)
+        if size == folder:
+            break
+        folder = size
+    draft.publish(**facts)
+    archive.take_moved()  # the upload of the folder is counted already
+    return receipt

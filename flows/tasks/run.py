@@ -20,7 +20,6 @@ from flows.tasks.capture_plan import CapturePlan, PassLayout, ScanChoice, choose
 from flows.tasks.drawing import UnknownRule
 from flows.tasks.extent_choice import ExtentChoice, choose_extent
 from flows.tasks.field_work import FieldWork, WeightsFile
-from flows.tasks.mosaic_work import tile_budget
 from flows.tasks.patch_budget import SHARD, PatchBudget, ReadingCosts
 from flows.tasks.prior_maps import ANOTHER_FIELD, AUTO, NONE, TURNED, Prior, find_prior
 from flows.tasks.recorded_field import OpenedRecording, open_recorded
@@ -39,6 +38,7 @@ from flows.tasks.scene import (
 from flows.tasks.stage import FieldFrame, Report
 from flows.tasks.stages.attention import PatchGains, all_seen
 from flows.tasks.stages.capture import SweepRecorder
+from flows.tasks.stages.placement import tile_budget
 from flows.tasks.survey_model import SurveyModel, beyond_training, other_unit, weights_path
 from flows.tasks.zones import SurveyZones, open_zones, place_of_field
 from models.evaluation.expected_scores import MapScores

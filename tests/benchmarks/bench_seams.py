@@ -9,7 +9,7 @@ from measure import Row
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from pipeline.rectify.registration.shifts import PairShift, pair_shift
+from pipeline.rectify.registration.alignment import PairShift, pair_shift
 
 Floats = NDArray[np.float64]
 Peer = Callable[[Floats, Floats], Floats]

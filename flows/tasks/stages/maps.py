@@ -39,8 +39,7 @@ from storage.arrays.class_maps import (
 )
 from storage.arrays.ground_maps import BLOCK, GroundMapWriter
 from storage.arrays.layout import NO_CLASS, blank_pixels
-from storage.arrays.mosaics import Attention, open_mosaic, write_attention
-from storage.arrays.quicklooks import choose_bands, develop, stretch
+from storage.arrays.mosaics import Attention, choose_bands, develop, open_mosaic, stretch, write_attention
 
 CLASS_MAP = Product("segment", version=23, files=(MAP, PROBABILITIES), by_weights=True)
 OUT_OF_RANGE = "out_of_range.json"  # beside a map with values out of range

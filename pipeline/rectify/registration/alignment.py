@@ -1,4 +1,4 @@
-"""Compute corrections from shifts of windows: of sweeps, by least squares over their overlaps, and of a whole field.
+"""Find shifts between images, and correct sweeps, by least squares over their overlaps, and whole fields by them.
 
 The shift and rotation of a field since an earlier visit come from windows of two coarse images. Crops grow, shadows
 move and leaves fall between two visits, so single windows may be wrong. The result is what most windows agree on.
@@ -7,17 +7,42 @@ move and leaves fall between two visits, so single windows may be wrong. The res
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
+from typing import Literal
 
 import numpy as np
 import scipy
 import skimage
 from numpy.typing import NDArray
 
-from pipeline.rectify.registration.shifts import Floats, pair_shift
+from pipeline.rectify.kernels import kernel_taps
 
+Status = Literal["found", "undecidable", "flat", "empty"]
+Floats = NDArray[np.float64]
+Pairs = list[tuple[Floats, Floats]]  # middle of a window, and its shift
+
+LEAST_FRACTION = 0.25  # of the largest common area; below it a chance correlation can exceed that of the true shift
+LEAST_SIDE_PX = 12  # of the pixels compared
+LOBE_PX = 3.0  # shifts nearer than this belong to one peak
+RIVALS = 4
+RIVAL_MARGIN, RIVAL_NOISE = 0.1, 8.0  # a rival must leave 1 + margin + noise / sqrt(pixels) times more unexplained
+INTERPOLATION_MISFIT = 2e-3  # of the variance: what Catmull-Rom leaves of sharp texture at half a pixel
+LEAST_LIKENESS = 0.1  # of the slopes of both images
+MOST_ERROR_PX = 0.3
+WHITE_ERRORS = 6.0  # of the correlation of white noise: above it neighbours are alike
+FLAT_SPREAD = 1e-6  # of the mean; and of the whole variance
+UPSAMPLE = 20
+ROUNDS = 8
+SETTLED_PX = 1e-3
+REALIGN_PX, REALIGNMENTS = 0.75, 4  # a fit further off is made again from the next integer
+MOST_STEP_PX = 1.0
+SMOOTHING = np.array([1, 4, 6, 4, 1]) / 16
+SMOOTHED_NOISE = float(SMOOTHING @ SMOOTHING) ** 2  # fraction of white noise's variance that smoothing leaves
+BORDER_PX = 5  # pixels that smoothing (2), the step (1) and interpolation (2) take from every side
+SINGULAR = 1e-12
+TINY = 1e-30
 ERROR_FLOOR_PX = 0.05  # least error of a window: lines jitter
 OUTLIER_ERRORS = 2.0  # the influence of a window is limited beyond
 WRONG_ERRORS = 10.0  # a window is left out beyond
@@ -29,8 +54,239 @@ WINDOW_REACH_PX = 8.0  # largest difference of a window's shift from that of the
 AGREE_PX, LOOSELY_PX = 0.5, 1.5  # largest differences of windows that agree, and agree loosely
 LOOSE_SHIFT_PX, LOOSE_EDGE_PX = 2.0, 3.0  # least loose estimates that count: growth causes smaller ones
 TRIED_DEG = (-8.0, 8.0, -16.0, 16.0)  # rotations that are tried if windows show nothing without one
-LEAST_WINDOWS, LEAST_FRACTION = 4, 0.6  # number and fraction of windows that have to agree
+LEAST_WINDOWS, LEAST_AGREEING = 4, 0.6  # number and fraction of windows that have to agree
 TRIALS = 200
+
+
+@dataclass(frozen=True)
+class PairShift:
+    """Shift between two images of an overlap; the figures are NaN where nothing was compared.
+
+    ``found`` is the only status with a shift. ``undecidable``: another shift explains the overlap as well within the
+    noise (periodic texture), or one direction has no structure (an edge, plain rows). So is a best shift beyond the
+    prior. ``flat``: no structure wider than a pixel. ``empty``: too few pixels in common.
+    """
+
+    status: Status
+    shift: Floats  # (2,) rows and columns to add to places in ``moving``; NaN unless found [px]
+    error_px: Floats  # (2,) standard error that the noise leaves
+    peak: float = np.nan  # correlation at the shift
+    pixels: int = 0
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Least squares around one candidate."""
+
+    shift: Floats
+    error: Floats
+    misfit: float  # fraction of the variance left unexplained
+    likeness: float  # correlation of the two images' slopes in the direction that has the least in common
+    pixels: int
+
+
+def pair_shift(reference: NDArray[np.floating], moving: NDArray[np.floating], *, prior_px: float) -> PairShift:
+    """Find the shift that brings ``moving`` onto ``reference``: ``reference(p) = moving(p - shift)``.
+
+    The search stays within the geometric prior, since crop rows alias. Candidates are the peaks of the normalised
+    correlation over all integer shifts, of the pixels that both see [1]. Each is refined by least squares of grey
+    values. The windowed phase correlation [2] is only the start, as its window biases the shift of broad texture
+    towards the integer. The best candidate is accepted if every other leaves clearly more variance unexplained.
+
+    Both are (row, column) broad-band images on the same grid, NaN where nothing was seen; gain and offset may differ.
+    ``prior_px`` is the largest possible shift in either direction.
+
+    References
+    ----------
+    .. [1] D. Padfield, "Masked object registration in the Fourier domain", IEEE Trans. Image Process., 2012.
+       doi:10.1109/TIP.2011.2181402
+    .. [2] M. Guizar-Sicairos, S. T. Thurman, J. R. Fienup, "Efficient subpixel image registration algorithms",
+       Opt. Lett., 2008. doi:10.1364/OL.33.000156
+    """
+    first, second = _standardised(reference), _standardised(moving)
+    if first is None or second is None:
+        none_seen = not (np.isfinite(reference).any() and np.isfinite(moving).any())
+        return nothing_found("empty" if none_seen else "flat")
+    correlation, common = _correlate(first, second, int(np.ceil(prior_px)) + 1)
+    if common.max() < 1:
+        return nothing_found("empty")
+    fits = [fit for integer in _candidates(correlation) if (fit := _refine(first, second, integer)) is not None]
+    found = _judge(sorted(fits, key=lambda fit: fit.misfit), prior_px) if fits else nothing_found("undecidable")
+    if found.status == "undecidable" and not (_is_textured(first) and _is_textured(second)):
+        return replace(found, status="flat")
+    return found
+
+
+def _judge(fits: list[_Fit], prior_px: float) -> PairShift:
+    """Accept the best fit if no other comes near it, both directions are certain and it lies within the prior."""
+    best = fits[0]
+    rival = min((fit.misfit for fit in fits if np.abs(fit.shift - best.shift).max() > LOBE_PX), default=1.0)
+    ratio = (rival + INTERPOLATION_MISFIT) / (best.misfit + INTERPOLATION_MISFIT)
+    sure = (
+        ratio > 1 + RIVAL_MARGIN + RIVAL_NOISE / np.sqrt(best.pixels)
+        and best.likeness > LEAST_LIKENESS
+        and best.error.max() < MOST_ERROR_PX
+        and np.abs(best.shift).max() <= prior_px + 0.5
+    )
+    return PairShift(
+        status="found" if sure else "undecidable",
+        shift=best.shift if sure else np.full(2, np.nan),
+        error_px=best.error,
+        peak=float(np.sqrt(1 - best.misfit)),
+        pixels=best.pixels,
+    )
+
+
+def nothing_found(status: Status) -> PairShift:
+    """Return a comparison without a result."""
+    return PairShift(status, np.full(2, np.nan), np.full(2, np.nan))
+
+
+def _standardised(image: NDArray[np.floating]) -> Floats | None:
+    """Return the image with mean 0 and deviation 1, NaN kept; None if it is empty or constant."""
+    seen = np.isfinite(image)
+    if not seen.any():
+        return None
+    values = np.where(seen, image, np.nan).astype(np.float64)
+    mean, spread = float(np.nanmean(values)), float(np.nanstd(values))
+    return None if spread <= FLAT_SPREAD * abs(mean) or spread == 0 else (values - mean) / spread
+
+
+def _is_textured(image: Floats) -> bool:
+    """Return whether near pixels correlate; white noise is no texture, since a footprint is wider than a pixel."""
+    for lag in (1, 2):
+        for one, other in ((image[lag:], image[:-lag]), (image[:, lag:], image[:, :-lag])):
+            both = np.isfinite(one) & np.isfinite(other)
+            alike = abs(float(np.mean(one[both] * other[both]))) if both.any() else 0.0
+            if alike > max(LEAST_LIKENESS / 2, WHITE_ERRORS / np.sqrt(max(int(both.sum()), 1))):
+                return True
+    return False
+
+
+def _correlate(first: Floats, second: Floats, reach: int) -> tuple[Floats, Floats]:
+    """Return correlation and common pixels for every integer shift up to ``reach``, (2 reach + 1, same) each [1].
+
+    Shifts with too little in common, or without variance there, get a correlation of -1.
+    """
+    size = [scipy.fft.next_fast_len(n + min(reach, n), real=True) for n in first.shape]
+    spectra = []
+    for image in (first, second):
+        seen = np.isfinite(image)
+        values = np.where(seen, image, 0.0)
+        spectra.append([scipy.fft.rfft2(plane, size) for plane in (seen.astype(np.float64), values, values * values)])
+    lags = np.arange(-reach, reach + 1)
+    inside = np.abs(lags)[:, None] < first.shape[0], np.abs(lags)[None, :] < first.shape[1]
+
+    def at_shifts(one: int, other: int) -> Floats:
+        product = scipy.fft.irfft2(spectra[0][one] * np.conj(spectra[1][other]), size)
+        return np.asarray(product[np.ix_(lags % size[0], lags % size[1])] * (inside[0] & inside[1]))
+
+    common = np.rint(at_shifts(0, 0))
+    count = np.maximum(common, 1)
+    sums = at_shifts(1, 0), at_shifts(0, 1)
+    variance = at_shifts(2, 0) - sums[0] ** 2 / count, at_shifts(0, 2) - sums[1] ** 2 / count
+    usable = (common >= LEAST_FRACTION * common.max()) & (common > 0)
+    usable &= np.minimum(*variance) > FLAT_SPREAD * count
+    correlation = np.full(common.shape, -1.0)
+    covariance = at_shifts(1, 1) - sums[0] * sums[1] / count
+    correlation[usable] = covariance[usable] / np.sqrt(variance[0][usable] * variance[1][usable])
+    return correlation, common
+
+
+def _candidates(correlation: Floats) -> Iterator[NDArray[np.intp]]:
+    """Yield the integer shifts (2,) of the highest peaks, best first, none within another's lobe."""
+    reach = correlation.shape[0] // 2
+    # The window is as wide as a lobe: noise on a broad peak makes no second one.
+    peaks = np.argwhere(
+        (correlation == scipy.ndimage.maximum_filter(correlation, 2 * int(LOBE_PX) + 1)) & (correlation > -1)
+    )
+    ranked = peaks[np.argsort(-correlation[tuple(peaks.T)], kind="stable")] - reach
+    yield from ranked[: RIVALS + 1]
+
+
+def _refine(first: Floats, second: Floats, integer: NDArray[np.intp]) -> _Fit | None:
+    """Return the fit around an integer shift; None if too little is common or it does not converge nearby."""
+    for _ in range(REALIGNMENTS):
+        moves = list(zip(first.shape, integer.tolist(), strict=True))
+        one = first[tuple(slice(max(move, 0), max(size + min(move, 0), 0)) for size, move in moves)]
+        other = second[tuple(slice(max(-move, 0), max(size + min(-move, 0), 0)) for size, move in moves)]
+        both = np.isfinite(one) & np.isfinite(other)
+        kept = scipy.ndimage.minimum_filter(both, 2 * BORDER_PX + 1, mode="constant", cval=False)
+        if kept.sum() < LEAST_SIDE_PX**2 / 4:
+            return None
+        one, other = (np.where(both, image - image[both].mean(), 0.0) for image in (one, other))
+        fit = _least_squares(_smoothed(one), _smoothed(other), kept, _phase_shift(one, other))
+        if fit is None:
+            return None
+        if np.abs(fit.shift).max() <= REALIGN_PX:
+            return replace(fit, shift=integer + fit.shift)
+        integer = integer + np.rint(fit.shift).astype(np.intp)
+    return None
+
+
+def _phase_shift(one: Floats, other: Floats) -> Floats:
+    """Return the shift by phase correlation under a Hann window [2], not normalised: noise has equal amplitudes."""
+    window = np.outer(*(np.hanning(size + 2)[1:-1] for size in one.shape))
+    shift, *_ = skimage.registration.phase_cross_correlation(  # type: ignore[no-untyped-call]
+        one * window, other * window, normalization=None, upsample_factor=UPSAMPLE
+    )
+    return np.asarray(np.clip(shift, -REALIGN_PX, REALIGN_PX))
+
+
+def _least_squares(one: Floats, other: Floats, kept: NDArray[np.bool_], shift: Floats) -> _Fit | None:
+    """Fit shift, gain and offset of grey values by Gauss-Newton, from a start within a pixel; None if gain < 0."""
+    target = one[kept]
+    if np.var(target) <= FLAT_SPREAD:
+        return None
+    for _ in range(ROUNDS):
+        moved = _moved(other, shift)
+        slopes = _slopes(moved, kept)
+        system = np.stack([-slopes[0], -slopes[1], moved[kept], np.ones(len(target))], axis=1)
+        answer, *_ = np.linalg.lstsq(system.T @ system, system.T @ target, rcond=SINGULAR)
+        if answer[2] <= 0:  # a negative image is no match
+            return None
+        change = answer[:2] / answer[2]
+        left = target - system @ answer
+        if np.abs(change).max() < SETTLED_PX:
+            break
+        shift = shift + np.clip(change, -1, 1)
+        if np.abs(shift).max() > MOST_STEP_PX:
+            return _fit_of(np.clip(shift, -MOST_STEP_PX, MOST_STEP_PX), target, left, _slopes(one, kept), slopes)
+    return _fit_of(shift, target, left, _slopes(one, kept), slopes)
+
+
+def _fit_of(shift: Floats, target: Floats, left: Floats, slopes: Floats, others: Floats) -> _Fit:
+    """Return error and quality of a fit. Only slopes that both images share count, since noise has slopes as well."""
+    misfit = min(float(np.var(left) / np.var(target)), 1.0)
+    value, direction = np.linalg.eigh(np.asarray(slopes @ others.T + others @ slopes.T) / 2)
+    weakest = direction[:, 0]
+    strength = float(np.linalg.norm(weakest @ slopes) * np.linalg.norm(weakest @ others))
+    noise = float(np.var(left)) / SMOOTHED_NOISE
+    error: Floats = np.sqrt(noise * np.sum(direction**2 / np.maximum(value, TINY), axis=1))
+    likeness = float(value.min()) / strength if strength > 0 else 0.0
+    return _Fit(shift, error, misfit, likeness, len(target))
+
+
+def _slopes(image: Floats, kept: NDArray[np.bool_]) -> Floats:
+    """Return slopes by rows and by columns, (2, kept pixel)."""
+    return np.stack([np.gradient(image, axis=axis)[kept] for axis in (0, 1)])
+
+
+def _smoothed(image: Floats) -> Floats:
+    """Damp noise and details that are too fine to interpolate."""
+    for axis in (0, 1):
+        image = scipy.ndimage.convolve1d(image, SMOOTHING, axis=axis, mode="nearest")
+    return image
+
+
+def _moved(image: Floats, shift: Floats) -> Floats:
+    """Return the image moved by less than a lobe, ``image(p - shift)`` by Catmull-Rom; the borders repeat."""
+    for axis in (0, 1):
+        index, weight = kernel_taps(np.arange(image.shape[axis]) - shift[axis], "catmull-rom")
+        np.clip(index, 0, image.shape[axis] - 1, out=index)
+        taps = [float(w) * np.take(image, row, axis=axis) for w, row in zip(weight[0], index.T, strict=True)]
+        image = np.asarray(np.sum(taps, axis=0))
+    return image
 
 
 @dataclass(frozen=True)
@@ -185,9 +441,6 @@ def field_shift(now: NDArray[np.floating], before: NDArray[np.floating], *, reac
     return FieldShift()
 
 
-Pairs = list[tuple[NDArray[np.float64], NDArray[np.float64]]]  # middle of a window, and its shift
-
-
 def _of_windows(now: NDArray[np.floating], before: NDArray[np.floating]) -> Pairs:
     """Return the middles and shifts of the windows with a shift."""
     edges = [np.linspace(0, size, WINDOWS + 1).astype(int).tolist() for size in now.shape]
@@ -217,7 +470,7 @@ def _agreed(
         rng=0,
     )
     count = 0 if inliers is None else int(inliers.sum())
-    if model is None or count < max(LEAST_WINDOWS, LEAST_FRACTION * len(pairs)):
+    if model is None or count < max(LEAST_WINDOWS, LEAST_AGREEING * len(pairs)):
         return 0, FieldShift()
     down, across = (model.translation + start).tolist()
     return count, FieldShift((float(down), float(across)), math.degrees(model.rotation))

@@ -13,15 +13,18 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.coverage import field_px
 from pipeline.rectify.registration.alignment import (
+    Floats,
+    PairShift,
     SweepShift,
     SweepShifts,
     WindowShift,
     no_shifts,
+    nothing_found,
+    pair_shift,
     solve_sweeps,
     tied_to,
 )
 from pipeline.rectify.registration.overlaps import LEAST_OVERLAP_PX, BroadSweep, PlacedImage, Window, overlap_windows
-from pipeline.rectify.registration.shifts import Floats, PairShift, nothing_found, pair_shift
 from pipeline.rectify.resample import resample
 
 WINDOW_PX = 512.0

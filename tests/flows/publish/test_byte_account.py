@@ -9,10 +9,9 @@ from typing import Any
 import pytest
 
 from flows.archive.commands import contents
-from flows.publish.byte_account import publish_counted
 from flows.publish.receipt_table import saving_rows
 from flows.publish.report import render_report
-from flows.publish.run_folder import Published
+from flows.publish.run_folder import Published, publish_counted
 from storage.archive.archive import Archive
 from tests.conftest import Survey
 from tests.flows.conftest import Page, problems

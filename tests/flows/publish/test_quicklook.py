@@ -18,7 +18,7 @@ from flows.publish import panels, quicklook
 from flows.publish.panels import class_palette, class_rgb, outline
 from flows.publish.quicklook import QuicklookData, _draw_attention, draw_quicklook
 from pipeline.geometry.grid import UNLABELLED
-from storage.arrays.quicklooks import choose_bands
+from storage.arrays.mosaics import choose_bands
 
 WAVES = np.linspace(400, 1000, 61)
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flows.tasks.mosaic_work import MosaicRecipe, tile_budget, write_mosaic
+from flows.tasks.stages.placement import MosaicRecipe, tile_budget, write_mosaic
 from pipeline.errors import SettingsError, ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
@@ -100,7 +100,7 @@ def test_an_error_in_a_tile_ends_the_work(tmp_path: Path, cubes: list[SignalCube
 def test_killed_workers_harm_nothing(tmp_path: Path, cubes: list[SignalCube], monkeypatch: pytest.MonkeyPatch) -> None:
     """kill -9 of a process that makes tiles: the mosaic is that of an undisturbed thread."""
     write_mosaic(recipe_of(cubes), mosaic_at(tmp_path / "a.zarr"), memory=PLENTY, pool=ONE)
-    monkeypatch.setattr("flows.tasks.mosaic_work.TileMaker", partial(KillOnce, folder=str(tmp_path)))
+    monkeypatch.setattr("flows.tasks.stages.placement.TileMaker", partial(KillOnce, folder=str(tmp_path)))
     with WorkerPool("processes", 2).open() as pool:
         budget = write_mosaic(recipe_of(cubes), mosaic_at(tmp_path / "m.zarr"), memory=PLENTY, pool=pool)
     assert (budget.workers, budget.processes) == (2, True)

@@ -11,8 +11,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, gaussian_filter1d, rotate
 
-from pipeline.rectify.registration.alignment import FieldShift, SweepShift, WindowShift, field_shift, solve_sweeps
-from pipeline.rectify.registration.shifts import pair_shift
+from pipeline.rectify.registration.alignment import (
+    FieldShift,
+    SweepShift,
+    WindowShift,
+    field_shift,
+    pair_shift,
+    solve_sweeps,
+)
 
 Field = tuple[np.ndarray, np.ndarray]
 SIZE = (120, 150)
