@@ -12,7 +12,7 @@ from rich.markup import escape
 
 from flows.publish.receipt import Receipt, hectares_of_classes, is_pending
 from flows.tasks.scene import TRAINING_SCENE
-from flows.tasks.scores import format_prediction, format_worst_class
+from flows.tasks.scores import NOT_JUDGED, format_prediction, format_worst_class
 from flows.terminal.figures import (
     counted,
     format_area,
@@ -119,8 +119,7 @@ def shown_accuracy(receipt: Mapping[str, Any]) -> Mapping[str, Any] | None:
     accuracy, memory = receipt.get("accuracy"), receipt.get("memory")
     if accuracy is None or memory is None or memory["put_aside"] is not None:
         return accuracy
-    unknown: Receipt = {"miou": None, "per_class_iou": {}}
-    return {**accuracy, "none": unknown, "all": unknown, "controls": {}, "gap_closed": None}
+    return {**accuracy, "none": NOT_JUDGED, "all": NOT_JUDGED, "controls": {}, "gap_closed": None}
 
 
 def headline(receipt: Receipt, captured_again: float | None = None) -> str:

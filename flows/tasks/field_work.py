@@ -153,12 +153,11 @@ class ExpectedErrors:
 
 @dataclass(frozen=True)
 class Readings:
-    """Worker that segments a region by the overview alone and, if asked, by the full network everywhere."""
+    """Worker that segments a region by the overview alone, and by the full network everywhere."""
 
     weights: WeightsFile
     mosaic: StageRef
     capture: LineSpec
-    in_full: bool
 
     def __call__(self, region: Region) -> tuple[NDArray[np.uint8], NDArray[np.float64], NDArray[np.float64]]:
         """Return (reading, y, x) classes of the kept part, and scores and errors of its patches.
@@ -168,8 +167,7 @@ class Readings:
         weights = self.weights.load()
         seen = read_coarse_prediction(weights, coarse_region(weights, self.mosaic, region, self.capture))
         kept = region.numbers_here(region.field.every_patch())
-        readings = (kept[:0], kept[kept >= 0]) if self.in_full else (kept[:0],)
-        maps = [region.crop(classes_by(weights, seen, patch_index)) for patch_index in readings]
+        maps = [region.crop(classes_by(weights, seen, patches)) for patches in (kept[:0], kept[kept >= 0])]
         scores = np.stack([score_patches(policy, seen) for policy in OTHERS], axis=-1)
         return np.stack(maps), region.crop_patches(scores), region.crop_patches(class_errors(seen))
 
@@ -245,16 +243,15 @@ class FieldWork:
         return PatchExpectedErrors(pixels, np.sum([part.wrong for part in parts], axis=0), np.zeros(len(pixels)))
 
     def readings(
-        self, mosaic: StageRef, capture: LineSpec, *, in_full: bool, report: Report
+        self, mosaic: StageRef, capture: LineSpec, report: Report
     ) -> tuple[NDArray[np.uint8], dict[str, NDArray[np.float64]]]:
-        """Return the class maps (reading, y, x) by the overview and, ``in_full``, by the full network everywhere.
+        """Return the class maps (2, y, x) by the overview, and by the full network everywhere.
 
         Also returns the (patch_y, patch_x) scores by the policies that are compared. Raises as `score`.
         """
         grid = self.regions[0].field
-        work, read = Readings(self.weights, mosaic, capture, in_full), grid.every_patch() if in_full else NO_PATCHES
-        parts = self._of_regions(work, mosaic, read, report)
-        maps = np.empty((len(parts[0][0]), grid.height, grid.width), np.uint8)
+        parts = self._of_regions(Readings(self.weights, mosaic, capture), mosaic, grid.every_patch(), report)
+        maps = np.empty((2, grid.height, grid.width), np.uint8)
         for region, (part, _, _) in zip(self.regions, parts, strict=True):
             maps[:, region.kept.rows, region.kept.columns] = part
         scores, errors = (self._joined([part[which] for part in parts]) for which in (1, 2))

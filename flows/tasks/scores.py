@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 from flows.terminal.figures import format_count, format_points, known_number, spaced
 
 MOST_ERROR = 0.1  # standard deviation of an expected mIoU, above which it is not shown
+NOT_JUDGED: Mapping[str, Any] = {"miou": None, "per_class_iou": {}}  # of a map that was not drawn
 MAPS = {"this survey": None, "none": "none", "all": "all"}  # name: key in a receipt's accuracy
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.tasks.capture_plan import CapturePlan
+from flows.tasks.scores import NOT_JUDGED
 from flows.tasks.stage import Product, Report, Wanted, stage
 from flows.tasks.stages.attention import PatchGains, read_in_full
 from flows.tasks.stages.placement import load_registration
@@ -37,7 +38,7 @@ from storage.archive.whole_files import to_json
 from storage.arrays.class_maps import load_class_map
 
 RECORD = "accuracy.json"
-ACCURACY = Product("evaluate", version=16, files=(RECORD,), by_weights=True)
+ACCURACY = Product("evaluate", version=17, files=(RECORD,), by_weights=True)
 
 
 @stage("evaluate", "accuracy, after publication", ACCURACY)
@@ -57,31 +58,30 @@ def evaluate(
     seed: int,
     report: Report,
 ) -> Wanted:
-    """Evaluate the map by the labels, and with controls other placements of fine patches.
+    """Evaluate the map by the labels, and with controls other readings and placements of fine patches.
 
     ``sources`` are the effects and the registration of the capture; a raster has neither.
     """
     labels = moved_labels(labels, map_offset(simulated, sources[1:]), plan.along)
 
     def build(path: Path) -> None:
-        """Write the figures of the map, of the overview alone and, with controls, of other placements."""
+        """Write the figures of the map and, with controls, of the overview, a full reading and other placements."""
         drawn = load_class_map(class_map.path / "class_map.zarr")
         names = gains.work.weights.load().class_names
         judged = np.where(drawn.classes == UNLABELLED, np.uint8(UNLABELLED), labels)  # only pixels with a class
         counts = confusion(judged, drawn.classes, len(drawn.names))  # includes the class unknown
         result: dict[str, Any] = map_figures(names, counts) | {"confusion": counts.tolist()}
-        readings, scores = gains.work.readings(mosaic, gains.capture, in_full=controls, report=report)
-        readings = np.where(drawn.classes == len(names), drawn.classes, readings)  # unknown in all
-        result["none"] = map_figures(names, confusion(judged, readings[0], len(drawn.names)))
-        result |= {"all": {"miou": None, "per_class_iou": {}}, "gap_closed": None, "controls": {}}
+        result |= {"none": NOT_JUDGED, "all": NOT_JUDGED, "gap_closed": None, "controls": {}}
         if controls:
+            readings, scores = gains.work.readings(mosaic, gains.capture, report)
+            readings = np.where(drawn.classes == len(names), drawn.classes, readings)  # unknown in all
             patches = read_in_full(attention, class_map) if chooses else None
             scene = ReadTwice(readings[0], readings[1], scores, judged, gains.frame.grid)
             fraction, found = control_placements(gains, scene, len(drawn.names), patches, seed=seed)
-            figures = map_figures(names, found["all"][0])
-            gap = gap_closed(result["miou"], result["none"]["miou"], figures["miou"])
+            none, every = (map_figures(names, found[which][0]) for which in ("none", "all"))
+            gap = gap_closed(result["miou"], none["miou"], every["miou"])
             compared = {"controls": placement_figures(found), "controls_fraction": fraction}
-            result |= {"all": figures, "gap_closed": gap, **compared}
+            result |= {"none": none, "all": every, "gap_closed": gap, **compared}
         (path / RECORD).write_text(to_json(result), encoding="utf-8")  # JSON without NaN
 
     params = {**model_key, "labels": array_digest(labels), "controls": controls, **source_key}

@@ -42,7 +42,6 @@ def surveyed(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], 
         "pointing_px": str(OFF_PX),
         "out": str(archive),
         "engine": "plain",
-        "controls": False,
     }
     with without_effects():
         found = run_survey(load_settings(None, flags), Console(quiet=True)).receipt
