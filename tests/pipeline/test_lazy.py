@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from unittest.mock import Mock
 
 import pytest
 
@@ -12,13 +13,7 @@ from pipeline.lazy import Once
 
 def test_a_value_is_made_once_whoever_asks() -> None:
     """Threads that ask at the same time get the same value, of one making."""
-    made: list[object] = []
-    together = threading.Barrier(8)
-
-    def make() -> object:
-        made.append(object())
-        return made[-1]
-
+    make, together = Mock(side_effect=object), threading.Barrier(8)
     once = Once(make)
 
     def ask(_: int) -> object:
@@ -29,20 +24,12 @@ def test_a_value_is_made_once_whoever_asks() -> None:
     with ThreadPoolExecutor(8) as pool:
         found = list(pool.map(ask, range(8)))
     assert once.is_made()
-    assert len(made) == 1
-    assert all(value is made[0] for value in found)
+    assert make.call_count == len(set(found)) == 1
 
 
 def test_what_fails_is_asked_for_again() -> None:
     """An error reaches who asked, and the next one tries anew; nothing is a value too."""
-    tries = iter([ValueError("not yet"), None])
-
-    def make() -> None:
-        one = next(tries)
-        if one is not None:
-            raise one
-
-    once: Once[None] = Once(make)
+    once: Once[None] = Once(Mock(side_effect=[ValueError("not yet"), None]))
     with pytest.raises(ValueError, match="not yet"):
         once()
     assert not once.is_made()

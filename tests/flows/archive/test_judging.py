@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from rich.console import Console
@@ -58,11 +59,7 @@ def words_of(folder: Path) -> dict[str, str]:
 @pytest.fixture
 def survey(survey_png: Any, scene: Path, out: Path) -> Survey:
     """Survey the scene of the folder into the archive of the test."""
-
-    def run(**flags: Any) -> Any:
-        return survey_png(out, **{**words_of(scene), **flags})
-
-    return run
+    return lambda **flags: survey_png(out, **{**words_of(scene), **flags})
 
 
 @pytest.fixture
@@ -86,12 +83,8 @@ def unjudged(surveyed: Path, scene: Path, out: Path) -> Path:
 
 def break_off(survey: Survey, monkeypatch: pytest.MonkeyPatch, **flags: Any) -> None:
     """Survey, and break off when the map is about to be judged."""
-
-    def interrupt(*given: Any) -> None:
-        raise KeyboardInterrupt
-
     with monkeypatch.context() as patch:
-        patch.setattr(evaluation, "load_class_map", interrupt)
+        patch.setattr(evaluation, "load_class_map", Mock(side_effect=KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             survey(**flags)
 
@@ -179,10 +172,6 @@ def test_labels_may_come_later(
     assert comparable(receipt)["accuracy"] == survey().receipt["accuracy"]
 
 
-def _other_weights(scene: Path, out: Path, patch: pytest.MonkeyPatch) -> None:
-    save_weights(random_weights(RGB_NM, dim=32), scene / "w.safetensors")
-
-
 def _mosaic_gone(scene: Path, out: Path, patch: pytest.MonkeyPatch) -> None:
     archive = Archive.open(out)
     archive.discard(archive.refs("rectify")[0])
@@ -203,7 +192,10 @@ REFUSED: dict[str, tuple[Refuse, str]] = {
         lambda scene, out, patch: be_version(patch, "segment", 99),
         r"version \d+ of the stage segment, which is now 99: `spectralzoom reprocess .*` makes a new run",
     ),
-    "other weights": (_other_weights, "w.safetensors are not those of the map of runs/.*; restore those"),
+    "other weights": (
+        lambda scene, *_: save_weights(random_weights(RGB_NM, dim=32), scene / "w.safetensors"),
+        "w.safetensors are not those of the map of runs/.*; restore those",
+    ),
 }
 
 

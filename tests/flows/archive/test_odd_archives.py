@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -75,10 +76,7 @@ def test_no_verb_leaves_the_archive(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Each verb ends with an answer or one message; what lies beside the archive stays, and none of it is shown."""
-
-    def no_server(*given: object) -> None:  # else each repair waits for one
-        raise ServerUnavailable("none here")
-
+    no_server = Mock(side_effect=ServerUnavailable("none here"))  # else each repair waits for one
     monkeypatch.setattr(survey_command, "_prefect_server", no_server)
     root = tmp_path / "archive"
     change(small_survey(Archive.open(root), simulated=False), lead)

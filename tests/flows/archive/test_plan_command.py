@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from rich.console import Console
@@ -86,11 +87,7 @@ def test_planning_leaves_an_archive_alone(settings: Settings, archive: Path, mon
     _plan(settings, archive)
     _plan(settings, archive, seed=9)
     assert _tree(archive) == before
-
-    def refuse(*_: object, **__: object) -> None:
-        raise AssertionError("the plan asked for light")
-
-    monkeypatch.setattr(SimulatedSource, "lines", refuse)
+    monkeypatch.setattr(SimulatedSource, "lines", Mock(side_effect=AssertionError("the plan asked for light")))
     assert _plan(settings, archive, seed=9)["capture_coarse"].state == "to run"
 
 
@@ -107,10 +104,7 @@ def test_only_what_differs_is_to_be_made(
 
 def test_a_field_beyond_memory_is_planned(settings: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither its ground nor its spectra; the plan says what the survey says when it refuses."""
-
-    def refuse(*_: object) -> None:
-        raise AssertionError("the plan looked at the field")
-
+    refuse = Mock(side_effect=AssertionError("the plan looked at the field"))
     monkeypatch.setattr("pipeline.simulator.scenes.farm.farm_scene._draw", refuse)
     monkeypatch.setattr("pipeline.simulator.scenes.farm.farm_scene.spectral_library", refuse)
     monkeypatch.setattr(

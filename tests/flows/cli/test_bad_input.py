@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -167,12 +168,8 @@ def test_interrupted_survey_says_how_to_go_on(
 ) -> None:
     """Ctrl-C in a stage ends with 130 and one line; the same command goes on with what was captured."""
     real = STAGES["score"]
-
-    def interrupted(*given: Any) -> None:
-        raise KeyboardInterrupt
-
     monkeypatch.chdir(folder)
-    act_instead(monkeypatch, "score", interrupted)
+    act_instead(monkeypatch, "score", Mock(side_effect=KeyboardInterrupt))
     words = survey_words("--budget 0.7 --effects none", str(tmp_path / "archive"))
     ended = command_line(*words)
     assert (ended.code, ended.out) == (130, "")

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import matplotlib as mpl
 import numpy as np
 import pytest
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
 from PIL import Image
 
 from flows.publish import panels, quicklook
@@ -128,14 +127,8 @@ def test_a_plain_scan_shows_how_sure_its_map_is(monkeypatch: pytest.MonkeyPatch,
 
 def test_a_revisit_shows_what_changed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Pixels that changed have today's colours, the others are grey; the caption counts them and tells the days."""
-    words, images = list[tuple[str, str]](), list[np.ndarray]()
+    words, shown = list[tuple[str, str]](), Mock(wraps=quicklook._show)
     monkeypatch.setattr(quicklook, "_caption", lambda axes, title, text: words.append((title, text)))
-    show = quicklook._show
-
-    def shown(axes: Axes, data: QuicklookData, image: np.ndarray, **how: object) -> AxesImage:
-        images.append(image)
-        return show(axes, data, image)
-
     monkeypatch.setattr(quicklook, "_show", shown)
     data = make_data(96, 128)
     was = np.full((96, 128), 255, np.uint8)
@@ -143,7 +136,7 @@ def test_a_revisit_shows_what_changed(monkeypatch: pytest.MonkeyPatch, tmp_path:
     now = np.where(was == 255, data.class_map, 0).astype(np.uint8)
     (tmp_path / "picture.png").write_bytes(draw_quicklook(replace(data, was=was, days=7.0, class_map=now)))
     assert ("1  Differing", "20 px captured now differ from 7 days before") in words
-    changed = images[0]
+    changed = shown.call_args_list[0].args[2]
     assert (changed[was != 255] == np.float32(data.class_colours[0] / 255)).all()
     assert np.ptp(changed[was == 255], axis=-1).max() == 0
 

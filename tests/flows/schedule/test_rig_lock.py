@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -82,11 +83,7 @@ def test_locks_are_of_the_port(tmp_path: Path) -> None:
 
 def test_a_rig_that_cannot_be_locked_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the kernel refuses for another reason than that it is held, there is one message and no rig."""
-
-    def refuse(*_: object) -> None:
-        raise PermissionError(1, "Operation not permitted")
-
-    monkeypatch.setattr(rig_field.socket, "socket", refuse)
+    monkeypatch.setattr(rig_field.socket, "socket", Mock(side_effect=PermissionError(1, "Operation not permitted")))
     with (
         pytest.raises(RigError, match=r"cannot lock the rig .*: Operation not permitted; .* need Linux"),
         rig_to_oneself(PORT),

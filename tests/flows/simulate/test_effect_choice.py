@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -65,10 +66,7 @@ def test_the_manifest_and_the_source_have_what_was_decided(decided: Decided, sce
 
 def test_a_stored_decision_draws_nothing(scene_files: Path, decided: Decided, monkeypatch: pytest.MonkeyPatch) -> None:
     """No probe; not one point of the scene is asked for."""
-
-    def refuse(*_: object, **__: object) -> None:
-        raise AssertionError("the scene was looked at")
-
+    refuse = Mock(side_effect=AssertionError("the scene was looked at"))
     run = opened(scene_files, decided[0], budget="0.9", policy="random")
     monkeypatch.setattr(SceneRaster, "thinned", refuse)
     monkeypatch.setattr(effect_choice, "probe_survey", refuse)

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -64,11 +65,7 @@ def test_a_scan_that_is_there_draws_nothing(
     scan: Any, command_line: Any, scene_files: Path, archive: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It is cached, with the same cubes; the table is shown nevertheless, an effect a row and the sums below."""
-
-    def refuse(*_: object, **__: object) -> None:
-        raise AssertionError("the scene was looked at")
-
-    monkeypatch.setattr(SceneRaster, "thinned", refuse)
+    monkeypatch.setattr(SceneRaster, "thinned", Mock(side_effect=AssertionError("the scene was looked at")))
     ended = command_line(*words(scene_files, archive))
     assert (ended.code, ended.out) == (0, "")
     there = [one["name"] for one in scan["effects"] if one["reason"] != "absent"]

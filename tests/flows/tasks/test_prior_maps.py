@@ -9,6 +9,7 @@ import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -277,18 +278,13 @@ def test_a_thousand_visits_cost_as_much_as_sixty(visited: Path, twice: Any, monk
         for name, source in (("north", later), ("south", first)):
             copy = visited / "runs" / f"20270101T{number:06d}-{name}"
             shutil.copytree(visited / "runs" / source.folder.name, copy)
-    read: list[str] = []
-
-    def counted(folder: Path) -> Any:
-        read.append(folder.name)
-        return read_run(folder)
-
+    counted = Mock(wraps=read_run)
     monkeypatch.setattr(memory, "read_run", counted)
     found = found_prior(visited, "2026-06-20T10:00:00Z", "latest")
     assert found is not None
     assert found[1] == 16.0
-    assert len(read) == memory.NEWEST_RUNS
-    assert {name.rpartition("-")[2] for name in read} == {"north"}
+    assert counted.call_count == memory.NEWEST_RUNS
+    assert {call.args[0].name.rpartition("-")[2] for call in counted.call_args_list} == {"north"}
 
 
 def test_two_visits_at_once_are_both_kept(visited: Path, twice: Any, survey_png: Survey) -> None:

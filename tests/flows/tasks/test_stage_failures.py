@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -163,12 +164,8 @@ def test_a_run_that_cannot_be_drawn_is_not_published(
     """Pictures and receipt come after the last stage: without them there is no run; the next one reads every store."""
     out = Path(shutil.copytree(walk.undisturbed, tmp_path / "archive"))
     before = Archive.open(out).runs()
-
-    def refuse(*given: Any) -> None:
-        raise ArchiveError(FULL_DISK)
-
     with monkeypatch.context() as broken:
-        broken.setattr(publish, "draw_quicklook", refuse)
+        broken.setattr(publish, "draw_quicklook", Mock(side_effect=ArchiveError(FULL_DISK)))
         with pytest.raises(ArchiveError, match="no space left"):
             survey_png(out)
     assert (Archive.open(out).runs(), problems(out)) == (before, [])

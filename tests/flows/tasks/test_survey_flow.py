@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from pydantic import ValidationError
@@ -246,10 +247,7 @@ def test_without_a_server_the_survey_runs_plain(
     survey_png: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """One line says that a server cannot start, and the survey runs without it."""
-
-    def refuse(*given: Any) -> None:
-        raise ServerUnavailable("the Prefect server did not start (no port)")
-
+    refuse = Mock(side_effect=ServerUnavailable("the Prefect server did not start (no port)"))
     monkeypatch.setattr(survey_command, "_prefect_server", refuse)
     found = survey_png(tmp_path, engine="prefect", **NARROW).receipt
     assert {stage["state"] for stage in found["stages"]} == {"ran"}

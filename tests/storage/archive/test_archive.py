@@ -10,7 +10,6 @@ import threading
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -181,9 +180,7 @@ def test_refusing_disks_are_told_of(tmp_path: Path, number: int, words: str, mon
 def test_full_disks_harm_nothing(tmp_path: Path, archive: Archive, where: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Refused while writing, syncing or renaming: one message, no new store, the old one whole."""
     _publish(archive, key="old")
-
-    def refuse(*_: Any) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    refuse = Mock(side_effect=OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
 
     def build(path: Path) -> None:
         (path / "a").write_text("x")

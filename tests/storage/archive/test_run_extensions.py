@@ -8,7 +8,7 @@ import subprocess
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -201,12 +201,8 @@ def test_killed_before_the_files_of_before_go(machine: Machine, monkeypatch: pyt
     archive = machine(FIRST)
     small_survey(archive)
     machine(SECOND, create=False)
-
-    def kill(*given: Any) -> None:
-        raise KeyboardInterrupt
-
     with monkeypatch.context() as patch:
-        patch.setattr(archive.objects, "remove", kill)
+        patch.setattr(archive.objects, "remove", Mock(side_effect=KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             extend(archive, run_id(archive))
     other = machine(SECOND, create=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -89,12 +90,8 @@ def test_broken_off_it_leaves_a_store_whole(archive: Archive, monkeypatch: pytes
     before = content(small.mosaic)
     if not exchanges:
         monkeypatch.setattr(run_folders, "try_exchange", lambda one, other: False)
-
-    def refuse(path: Path) -> None:
-        raise OSError(28, "full")
-
     with monkeypatch.context() as patch:
-        patch.setattr(run_folders, "sync_path", refuse)
+        patch.setattr(run_folders, "sync_path", Mock(side_effect=OSError(28, "full")))
         with pytest.raises(ArchiveError, match="the disk is full"):
             cleared(archive)
     assert content(small.mosaic) == before

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -101,10 +102,7 @@ def test_what_could_not_be_made_again_is_named_by_the_next_verify(archive: Archi
     """The scene has gone, or the repair was broken off: once that is mended the same command makes it."""
     small = small_survey(archive)
     flip(small.mosaic.path / "data.bin")
-
-    def fail(settings: dict[str, Any]) -> str:
-        raise error
-
+    fail = Mock(side_effect=error)
     if isinstance(error, KeyboardInterrupt):
         with pytest.raises(KeyboardInterrupt):
             _repair(archive, fail)
@@ -122,14 +120,9 @@ def test_one_survey_is_run_again_once(archive: Archive) -> None:
         asked = {"seed": 0, "kernel": "bilinear", "source": "sim", "scene": "farm", "budget": 0.5, **more}
         archive.new_run("farm").publish(settings=asked, rests_on=archive.manifest_hashes([small.map]))
     flip(small.mosaic.path / "data.bin")
-    ran: list[str] = []
-
-    def again(settings: dict[str, Any]) -> str:
-        ran.append(settings["kernel"])
-        return _run(small)
-
-    repair(archive, verify_archive(archive), again, versions=VERSIONS)
-    assert ran == ["bilinear"]
+    again = Mock(return_value=_run(small))
+    _repair(archive, again)
+    assert [call.args[0]["kernel"] for call in again.call_args_list] == ["bilinear"]
 
 
 def test_a_run_that_lost_its_manifest_is_left_to_people(archive: Archive) -> None:

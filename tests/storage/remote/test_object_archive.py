@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
-from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -155,12 +155,8 @@ def test_a_run_that_was_not_sent_is_sent_later(machine: Machine, monkeypatch: py
     """Killed with its files on the way, or before its manifest: whoever opens the archive there uploads it."""
     archive = machine(FIRST)
     small_survey(archive, named=False)
-
-    def kill(*given: Any) -> None:
-        raise KeyboardInterrupt
-
     with monkeypatch.context() as patch:
-        patch.setattr(Objects, method, kill)
+        patch.setattr(Objects, method, Mock(side_effect=KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             small_survey(archive)
     assert Catalogue.read(machine(SECOND, create=False).root).runs == []

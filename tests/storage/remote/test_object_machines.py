@@ -11,6 +11,7 @@ from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -192,11 +193,7 @@ def test_a_store_that_is_cleared_under_verify_is_no_damage(machine: Machine, mon
 def test_a_full_disk_under_the_working_copy_is_one_error(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     """While a file is fetched, and while what is known is noted; what was there stays, and the next try goes on."""
     ref, _ = make(machine(FIRST))
-    other = machine(SECOND)
-
-    def full(*given: Any) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
+    other, full = machine(SECOND), Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
     with monkeypatch.context() as patch:
         patch.setattr(object_archive, "sync_path", full)
         with pytest.raises(ArchiveError, match="the disk is full: free some space"):

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import serial
@@ -85,10 +86,6 @@ def test_the_driver_drives_it() -> None:
 
 def test_without_ptys_there_is_one_clear_message(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the system has no pty left, the error says so."""
-
-    def none() -> None:
-        raise OSError("out of pty devices")
-
-    monkeypatch.setattr(os, "openpty", none)
+    monkeypatch.setattr(os, "openpty", Mock(side_effect=OSError("out of pty devices")))
     with pytest.raises(RigError, match="no pty for the emulated port: out of pty devices"):
         EmulatedPort(MirrorDevice(SYSTEM_CLOCK))

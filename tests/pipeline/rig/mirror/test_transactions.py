@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from unittest.mock import Mock
 
 import pytest
 
@@ -110,11 +111,7 @@ def test_a_late_acknowledgement_never_answers_the_next_read(caplog: pytest.LogCa
 def test_an_interrupted_motion_freezes():
     """Whoever stops the program while a motion waits for its acknowledgement does not know either."""
     transport = ScriptedTransport([(b"m\n", b"x")], ManualClock())
-    wire = make(transport)
-
-    def stop(data: bytes) -> bytes:
-        raise KeyboardInterrupt
-
+    wire, stop = make(transport), Mock(side_effect=KeyboardInterrupt)
     with pytest.raises(KeyboardInterrupt):
         wire.exchange(b"m\n", "going", "motion", lambda: stop)
     with pytest.raises(StateUnknown, match="going was sent and not acknowledged"):

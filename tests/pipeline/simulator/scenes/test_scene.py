@@ -6,6 +6,7 @@ import errno
 import os
 from dataclasses import replace
 from datetime import UTC, datetime
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -174,21 +175,16 @@ def test_unusable_scenes_are_refused() -> None:
 
 def test_a_raster_is_drawn_when_it_is_looked_at() -> None:
     """Name, size and bands are known before; what is drawn must be what was announced."""
-    drawn: list[int] = []
-
-    def draw() -> tuple[np.ndarray, np.ndarray]:
-        drawn.append(1)
-        return np.ones((4, 5, 2), np.float32), np.zeros((4, 5), np.uint8)
-
+    draw = Mock(return_value=(np.ones((4, 5, 2), np.float32), np.zeros((4, 5), np.uint8)))
     light = Once.of(SceneRadiance(np.ones(2, np.float32), np.ones(2, np.float32)))
     scene = RasterScene(
         "s", "k", SceneRaster((4, 5, 2), labelled=True, draw=draw), light, np.ones(2, np.float32), WAVELENGTH
     )
-    assert (scene.shape, scene.labelled, drawn) == ((4, 5), True, [])
+    assert (scene.shape, scene.labelled, draw.call_count) == ((4, 5), True, 0)
     assert scene.labels is not None
     assert scene.labels.shape == scene.planes.shape[:2]
     assert replace(scene, key="other").planes is scene.planes
-    assert drawn == [1]
+    assert draw.call_count == 1
     for other in (SceneRaster((4, 6, 2), labelled=True, draw=draw), SceneRaster((4, 5, 2), labelled=False, draw=draw)):
         with pytest.raises(SceneError, match="crop or pad"):
             other.drawn()
@@ -238,12 +234,9 @@ def test_a_large_array_lies_in_a_file(monkeypatch: pytest.MonkeyPatch):
 
 def test_a_full_disk_is_an_error(monkeypatch: pytest.MonkeyPatch):
     """Space is taken before anything is written: a file with holes would end the process later, with a signal."""
-
-    def full(*given: int) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     monkeypatch.setattr(scratch_module, "MOST_BYTES", 64)
-    monkeypatch.setattr(os, "posix_fallocate", full)
+    monkeypatch.setattr(os, "posix_fallocate", Mock(side_effect=full))
     with pytest.raises(OSError, match="No space left"):
         scratch((4, 5))
 
