@@ -13,6 +13,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -20,6 +21,7 @@ from flows.cli.main import main
 from flows.tasks.local_server import QUIET, local_server
 from flows.tasks.open_survey import STAGES
 from storage.archive.archive import Archive
+from storage.arrays.class_maps import load_class_map
 from storage.remote.opening import verify_archive
 from tests.conftest import Flags, Survey
 from tests.flows.small_fields import write_field
@@ -52,6 +54,12 @@ class Ended:
 def problems(out: Path) -> list[str]:
     """What a full verification of an archive finds."""
     return [f"{one.uri} {one.problem}" for one in verify_archive(Archive.open(out)) if one.problem]
+
+
+def class_map(out: Path) -> np.ndarray:
+    """The one class map of an archive."""
+    (ref,) = Archive.open(out).refs("segment")
+    return load_class_map(ref.path / "class_map.zarr").classes
 
 
 class Page(HTMLParser):

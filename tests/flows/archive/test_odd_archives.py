@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
 import pytest
@@ -14,37 +13,29 @@ from flows.cli.main import main
 from flows.publish import survey_command
 from flows.tasks.local_server import ServerUnavailable
 from storage.archive.archive import Archive
-from storage.archive.manifests import _seal, _text
 from storage.archive.staging import file_hash
-from tests.storage.small_archive import Small, small_survey
+from tests.storage.small_archive import Small, rewrite, small_survey
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 SECRET = b"not of this archive"
 LEADS = ("../../../secret", "/etc/passwd", "stages/../../secret", "secret\0", "..", "")
 
 
-def rewrite(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    """Change a manifest, and seal it again as whoever made it could."""
-    path = folder / "manifest.json"
-    content = json.loads(path.read_text())
-    content.pop("seal")
-    change(content)
-    path.write_text(_text(content | {"seal": _seal(content)}))
-
-
 def list_file(small: Small, lead: str) -> None:
     """A store lists a file that is no file of its own."""
-    rewrite(small.mosaic.path, lambda facts: facts["files"].update({lead: {"sha256": "0" * 64, "size": len(SECRET)}}))
+    manifest = small.mosaic.path / "manifest.json"
+    listed = json.loads(manifest.read_text())["files"]
+    rewrite(manifest, files=listed | {lead: {"sha256": "0" * 64, "size": len(SECRET)}})
 
 
 def rest_on(small: Small, lead: str) -> None:
     """A store was made of something elsewhere."""
-    rewrite(small.mosaic.path, lambda facts: facts.update(inputs=[lead, f"capture/{lead}"]))
+    rewrite(small.mosaic.path / "manifest.json", inputs=[lead, f"capture/{lead}"])
 
 
 def call_itself(small: Small, lead: str) -> None:
     """A store says that it is another stage's, elsewhere."""
-    rewrite(small.mosaic.path, lambda facts: facts.update(stage=lead, key=lead))
+    rewrite(small.mosaic.path / "manifest.json", stage=lead, key=lead)
 
 
 def name_products(small: Small, lead: str) -> None:
@@ -55,10 +46,8 @@ def name_products(small: Small, lead: str) -> None:
     text = json.dumps(receipt).encode()
     (small.run / "receipt.json").write_bytes(text)
     entry = {"sha256": file_hash(small.run / "receipt.json"), "size": len(text)}
-    rewrite(
-        small.run,
-        lambda facts: facts.update(files={"receipt.json": entry}, rests_on={lead: "0" * 64, f"runs/{lead}": "0" * 64}),
-    )
+    rests_on = {lead: "0" * 64, f"runs/{lead}": "0" * 64}
+    rewrite(small.run / "manifest.json", files={"receipt.json": entry}, rests_on=rests_on)
 
 
 CHANGES = (list_file, rest_on, call_itself, name_products)

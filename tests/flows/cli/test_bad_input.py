@@ -14,9 +14,7 @@ from PIL import Image
 
 from flows.tasks.open_survey import STAGES
 from storage.archive.archive import Archive
-from storage.arrays.class_maps import load_class_map
-from storage.remote.opening import verify_archive
-from tests.flows.conftest import FEW_BANDS, CommandLine, act_instead
+from tests.flows.conftest import FEW_BANDS, CommandLine, act_instead, class_map, problems
 
 NM = "460,500,550,600,620,640"
 RAN = "Report: "
@@ -134,17 +132,10 @@ def test_unusual_input_works(
     ended = command_line(*survey_words(words, str(tmp_path / "archive")), *flags)
     assert (ended.code, ended.errors) == (0, [])
     assert says in " ".join(ended.err.split())
-    archive = Archive.open(tmp_path / "archive", create=False)
-    assert [finding.problem for finding in verify_archive(archive) if finding.problem] == []
-    drawn = class_map(archive)
+    assert problems(tmp_path / "archive") == []
+    drawn = class_map(tmp_path / "archive")
     assert np.count_nonzero(drawn == 255) == (90 if case == "NaN pixels" else 0)
     assert set(np.unique(drawn)) <= {0, 1, 2, 255}
-
-
-def class_map(archive: Archive) -> np.ndarray:
-    """The one class map of an archive."""
-    (ref,) = archive.refs("segment")
-    return load_class_map(ref.path / "class_map.zarr").classes
 
 
 def test_surveys_go_on_after_one_that_fails(

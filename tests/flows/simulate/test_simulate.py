@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,6 +18,7 @@ from flows.publish.receipt_table import print_effects
 from pipeline.simulator.render import EFFECTS
 from pipeline.simulator.scenes.scene import SceneRaster
 from pipeline.simulator.simulated import SimulatedSource
+from tests.flows.conftest import python
 
 ASKED = "rotation,vignetting,shot,read-noise"
 SAMPLES = 192  # of a line; a narrow camera is quick to simulate
@@ -171,9 +169,7 @@ def test_no_scan_waits_for_torch(tmp_path: Path) -> None:
     """It takes seconds to load, and with all effects on nothing of a scan is computed by it."""
     np.save(tmp_path / "some.npy", np.random.default_rng(0).uniform(0.1, 1, (20, 30, 3)).astype(np.float32))
     flags = ["-o", str(tmp_path / "scan"), "--coarse", "--effects", "all", "--wavelengths", "460,550,650"]
-    command = [sys.executable, "-c", WITHOUT, "simulate", str(tmp_path / "some.npy"), *narrow(tmp_path), *flags]
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
-    ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    ended = python(WITHOUT, "simulate", tmp_path / "some.npy", *narrow(tmp_path), *flags)
     assert ended.returncode == 0, ended.stderr
 
 

@@ -24,8 +24,7 @@ from flows.tasks.open_survey import STAGES
 from flows.tasks.stage import Stage, Wanted
 from pipeline.errors import ArchiveError, RigError
 from storage.archive.archive import Archive
-from storage.arrays.class_maps import load_class_map
-from tests.flows.conftest import Ended, newest_run, problems
+from tests.flows.conftest import Ended, class_map, newest_run, problems
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 
@@ -66,12 +65,6 @@ def failing(stage: str, error: Exception, tried: Callable[[], None] = lambda: No
         raise error
 
     return altered(stage, broken, tried)
-
-
-def class_map(out: Path) -> np.ndarray:
-    """The one class map of an archive."""
-    (ref,) = Archive.open(out).refs("segment")
-    return load_class_map(ref.path / "class_map.zarr").classes
 
 
 @dataclass(frozen=True)
