@@ -6,8 +6,8 @@ import dataclasses
 import errno
 import json
 import os
-import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
 from unittest.mock import Mock
@@ -119,22 +119,14 @@ def test_a_store_is_on_disk_before_and_after_it_has_its_name(archive: Archive, m
 
 def test_two_same_runs_make_one_store(tmp_path: Path, archive: Archive) -> None:
     """Eight threads ask for one key; one builds, seven find it."""
-    built: list[Path] = []
-    answers: list[bool] = []
+    build = Mock(side_effect=lambda path: (path / "a").write_text("x" * 1000))
 
-    def work() -> None:
-        def build(path: Path) -> None:
-            built.append(path)
-            (path / "a").write_text("x" * 1000)
+    def work(_: int) -> bool:
+        return Archive.open(tmp_path).produce("mosaic", build, version=1, params={"a": 1}, inputs=[])[1]
 
-        answers.append(Archive.open(tmp_path).produce("mosaic", build, version=1, params={"a": 1}, inputs=[])[1])
-
-    threads = [threading.Thread(target=work) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(built) == 1
+    with ThreadPoolExecutor(8) as pool:
+        answers = list(pool.map(work, range(8)))
+    assert build.call_count == 1
     assert sorted(answers) == [False] * 7 + [True]
     assert archive.find("mosaic", stage_key("mosaic", 1, {"a": 1}, [])) is not None
 

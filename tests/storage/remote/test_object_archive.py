@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -19,6 +20,7 @@ from storage.remote.opening import is_archive, open_archive, verify_archive
 pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
 
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
+from storage.archive.keys import StageRef
 from storage.archive.lineage import Catalogue
 from storage.archive.manifests import check_files
 from storage.arrays.layout import create_group, write_image
@@ -46,20 +48,17 @@ def test_a_store_is_found_and_fetched_elsewhere(machine: Machine) -> None:
 def test_a_second_writer_takes_what_stands(bucket: str, machine: Machine) -> None:
     """Of two machines that make one key at a time one publishes; both end with its store, whatever they had made."""
     archives = [machine(FIRST), machine(SECOND)]
-    made, together = {}, threading.Barrier(2)
+    together = threading.Barrier(2)
 
-    def publish(number: int) -> None:
+    def publish(number: int) -> StageRef:
         def build(path: Path) -> None:
             together.wait(20)
             (path / "a.bin").write_bytes(b"made by %d" % number)
 
-        made[number] = archives[number].produce("rectify", build, version=1, params={})[0]
+        return archives[number].produce("rectify", build, version=1, params={})[0]
 
-    threads = [threading.Thread(target=publish, args=(number,)) for number in (0, 1)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(2) as pool:
+        made = list(pool.map(publish, (0, 1)))
     assert made[0] == made[1]
     assert archives[0].manifest_hash(made[0]) == archives[1].manifest_hash(made[1])
     assert (made[0].path / "a.bin").read_bytes() == (made[1].path / "a.bin").read_bytes()

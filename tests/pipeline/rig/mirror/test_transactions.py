@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-import threading
+from concurrent.futures import ThreadPoolExecutor
 from unittest.mock import Mock
 
 import pytest
@@ -206,16 +206,9 @@ def test_transactions_do_not_mix():
         return take
 
     wire = make(Echo([], ManualClock()))
-    wrong: list[bytes] = []
 
-    def work(mine: bytes) -> None:
-        for _ in range(50):
-            if wire.exchange(mine, "it", "read", whole) != mine:
-                wrong.append(mine)
+    def work(mine: bytes) -> bool:
+        return all(wire.exchange(mine, "it", "read", whole) == mine for _ in range(50))
 
-    threads = [threading.Thread(target=work, args=(f"{number}\n".encode(),)) for number in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(10)
-    assert not wrong
+    with ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(work, (f"{number}\n".encode() for number in range(4))))
