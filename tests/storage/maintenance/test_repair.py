@@ -68,15 +68,10 @@ def test_broken_raw_lines_of_the_simulator_are_made_again(archive: Archive, how:
         (small.raw.path / "manifest.json").unlink()
     else:
         archive.discard(small.raw)
-    ran: list[str] = []
-
-    def again(settings: dict[str, Any]) -> str:
-        ran.append(settings["kernel"])
-        return _run(small_survey(archive, kernel=settings["kernel"]))
-
+    again = Mock(side_effect=lambda settings: _run(small_survey(archive, kernel=settings["kernel"])))
     done = _repair(archive, again)
     assert done.complete
-    assert sorted(ran) == ["bilinear", "nearest"]
+    assert sorted(call.args[0]["kernel"] for call in again.call_args_list) == ["bilinear", "nearest"]
     assert done.remade == [small.raw.uri]
     assert _bad(archive) == []
 

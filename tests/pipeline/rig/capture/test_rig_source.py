@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, replace
 from ftplib import FTP
 from itertools import islice
+from unittest.mock import create_autospec
 
 import numpy as np
 import pytest
@@ -135,35 +135,25 @@ def test_references_are_the_mean_of_the_cameras_frames(white_at_rest: bool):
 
 def test_references_are_fetched_once(monkeypatch: pytest.MonkeyPatch):
     """By all sweeps, and by whoever shares the files; one that keeps its files elsewhere fetches its own."""
-    log_ins: list[object] = []
-    monkeypatch.setattr(FTP, "login", counted(FTP.login, log_ins))
+    log_in = create_autospec(FTP.login, side_effect=FTP.login)
+    monkeypatch.setattr(FTP, "login", log_in)
     with small_rig() as rig:
         kept = KeptInMemory()
         source = rig.source(kept)
         source.references(FINE)
-        once, opened = len(log_ins), rig.opened
+        once, opened = log_in.call_count, rig.opened
         assert once > 0
         again = source.saying(lambda words: None)
         for sharing in (source, again):
             np.testing.assert_allclose(
                 sharing.references(COARSE).dark, small_source().references(COARSE).dark, atol=0.1
             )
-        assert (len(log_ins), rig.opened) == (once, opened)
+        assert (log_in.call_count, rig.opened) == (once, opened)
         elsewhere = KeptInMemory()
         CaptureJournal(elsewhere).record_references(CaptureJournal(kept).references[None])
         source.keeping(elsewhere).references(FINE)
-        assert (len(log_ins), rig.opened) == (2 * once, opened + 1)
+        assert (log_in.call_count, rig.opened) == (2 * once, opened + 1)
         assert elsewhere.files.keys() == kept.files.keys()
-
-
-def counted(call: Callable[..., object], calls: list[object]) -> Callable[..., object]:
-    """The same call, noted each time."""
-
-    def counting(*given: object) -> object:
-        calls.append(given)
-        return call(*given)
-
-    return counting
 
 
 @pytest.mark.parametrize("pulses", ["none", "frame"])
