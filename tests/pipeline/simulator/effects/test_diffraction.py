@@ -129,11 +129,10 @@ def test_quadrature_over_chords_is_the_closed_form() -> None:
     np.testing.assert_allclose(passed, pupil_contrast(u), atol=1e-6)
 
 
-def test_kernels_show_what_the_pupil_does() -> None:
-    """Of noise, edges, points and beside wide bright fields light is within 0.1 sigma of the integral."""
-    assert distances(few(random_tile(23))).max() < 0.1
+@pytest.mark.parametrize(("number", "focus_m"), [(23, None), (32, math.inf)], ids=["sharp", "out of focus"])
+def test_kernels_show_what_the_pupil_does(number: int, focus_m: float | None) -> None:
+    """Of noise, edges, points and beside wide bright fields light is within 0.1 sigma of the integral.
 
-
-def test_kernels_show_the_disc_too() -> None:
-    """Out of focus as well, 40 m away when focused at infinity."""
-    assert distances(few(random_tile(32, math.inf))).max() < 0.1
+    Out of focus as well, 40 m away when focused at infinity.
+    """
+    assert distances(few(random_tile(number, focus_m))).max() < 0.1
