@@ -174,11 +174,8 @@ def test_classifiers_beside_a_training_know_spectra_that_differ() -> None:
     rng, labels = np.random.default_rng(0), np.repeat(np.arange(2, dtype=np.uint8), 20)[:, None].repeat(40, 1)
     values = rng.normal(0, 1, (40, 40, 3))
 
-    def example(spectra: np.ndarray, truth: np.ndarray) -> Example:
-        return Example("e", np.asarray(spectra, np.float32), truth, truth.shape)
-
     def judged(spectra: np.ndarray, truth: np.ndarray) -> dict[str, float] | None:
-        one = example(spectra, truth)
+        one = Example("e", np.asarray(spectra, np.float32), truth, truth.shape)
         return judge_baselines([one], [one], 2, 0, lambda what, done, figure: None)
 
     mixed = rng.permutation(labels.ravel()).reshape(labels.shape)

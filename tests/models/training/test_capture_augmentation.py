@@ -76,17 +76,11 @@ SILENT = ColumnNoise(np.zeros(12), np.zeros((12, 12)))
 
 def _silent_scan(augmentation: CaptureAugmentation, columns: np.ndarray, step: int, light: float = 1.0) -> np.ndarray:
     """A scan in which nothing is drawn by chance."""
-    return _scan(augmentation, columns, SILENT, light=light, step=step, rng=np.random.default_rng(0))
+    return _seen(augmentation.scan, columns, SILENT, light=light, step=step, rng=np.random.default_rng(0))
 
 
-def _scan(augmentation: CaptureAugmentation, columns: np.ndarray, *args: Any, **choices: Any) -> np.ndarray:
-    seen: np.ndarray = augmentation.scan(torch.from_numpy(columns.copy()), *args, **choices).numpy()
-    return seen
-
-
-def _interlaced(augmentation: CaptureAugmentation, columns: np.ndarray, *args: Any, **choices: Any) -> np.ndarray:
-    seen: np.ndarray = augmentation.interlaced(torch.from_numpy(columns), *args, **choices).numpy()
-    return seen
+def _seen(capture: Any, columns: np.ndarray, *args: Any, **choices: Any) -> np.ndarray:
+    return capture(torch.from_numpy(columns.copy()), *args, **choices).numpy()
 
 
 def test_rows_between_lines_are_interpolated_by_their_cubic() -> None:
@@ -131,7 +125,7 @@ def test_a_scan_is_as_noisy_as_its_light_makes_it(light: float, step: int) -> No
     augmentation, normalisation = _augmentation()
     noise, unwhiten = _noise(), np.linalg.inv(normalisation.whitening.astype(np.float64))
     plain = _flat(normalisation, 0.3, (64, 1000))
-    seen = _scan(augmentation, plain, noise, light=light, step=step, rng=np.random.default_rng(6))
+    seen = _seen(augmentation.scan, plain, noise, light=light, step=step, rng=np.random.default_rng(6))
     assert (seen[..., 12:] == LineSpec(light, step).planes).all()
     one_line = np.zeros((64, 1, 12), np.float32)
     one_line[32 : 32 + step] = 1
@@ -175,7 +169,7 @@ def test_a_first_pass_stares_at_its_rows(monkeypatch: pytest.MonkeyPatch, step: 
     image = np.random.default_rng(1).normal(size=(32, 5, 12)).astype(np.float32)
     begun = set()
     for seed in range(40):
-        seen = _interlaced(augmentation, image, SILENT, step=step, rng=np.random.default_rng(seed))
+        seen = _seen(augmentation.interlaced, image, SILENT, step=step, rng=np.random.default_rng(seed))
         same = np.isclose(seen[..., :12], image, atol=1e-4).all(axis=(1, 2))
         (first,) = {int(row) % step for row in np.flatnonzero(same)}
         assert same[first::step].all()
@@ -193,7 +187,7 @@ def test_later_lines_lie_between_those_of_the_first_pass(monkeypatch: pytest.Mon
     lights = iter([0.5, 0.05])
     monkeypatch.setattr(augmentation, "_light", lambda rng: next(lights))
     unwhiten, plain = np.linalg.inv(normalisation.whitening.astype(np.float64)), _flat(normalisation, 0.3, (64, 2000))
-    seen = _interlaced(augmentation, plain, _noise(), step=8, rng=np.random.default_rng(8))
+    seen = _seen(augmentation.interlaced, plain, _noise(), step=8, rng=np.random.default_rng(8))
     captures = {(round(own.light, 3), own.step) for own in _captures(seen[..., 12:])}
     closer = min(step for _, step in captures)
     assert captures == {(0.5, 8), (0.5, closer), (0.05, closer)}
@@ -229,7 +223,7 @@ def test_a_condensed_crop_has_the_noise_of_a_condensed_survey(light: float, rtol
     surveyed = 0.3 + (np.rint((noisy - 0.3) / sigma @ axes) @ axes.T) * sigma
     crop = normalisation.apply(spectra @ MATRIX, np.ones(12, bool))
     noise = replace(_noise(), spectra=moments)
-    seen = _scan(augmentation, crop, noise, light=light, step=1, rng=rng, least_power=0.01)[..., :12]
+    seen = _seen(augmentation.scan, crop, noise, light=light, step=1, rng=rng, least_power=0.01)[..., :12]
     columns = seen @ augmentation.unwhiten * normalisation.spread + normalisation.centre
     added, wanted = (np.cov((one - spectra @ MATRIX).reshape(-1, 12).T) for one in (columns, surveyed @ MATRIX))
     np.testing.assert_allclose(np.diag(added), np.diag(wanted), rtol=rtol)
@@ -244,7 +238,7 @@ def test_a_condensed_crop_keeps_components_above_a_power(least_power: float, lef
     spectra, moments = _spectra(rng, (30.0, 5.0, 3.0, 2.0, 0.5), light)
     crop = normalisation.apply(spectra @ MATRIX, np.ones(12, bool))
     noise = replace(_noise(), spectra=moments)
-    seen = _scan(augmentation, crop, noise, light=light, step=1, rng=rng, least_power=least_power)[..., :12]
+    seen = _seen(augmentation.scan, crop, noise, light=light, step=1, rng=rng, least_power=least_power)[..., :12]
     power = np.linalg.eigvalsh(np.cov((seen @ augmentation.unwhiten * normalisation.spread).reshape(-1, 12).T))
     assert np.count_nonzero(power > 1e-6 * power[-1]) == left
 
@@ -257,7 +251,7 @@ def test_later_lines_of_an_area_lie_in_the_components_of_all(monkeypatch: pytest
     spectra, moments = _spectra(rng, (30.0, 5.0, 3.0, 2.0), 0.1)
     crop = normalisation.apply(spectra[:64, :64] @ MATRIX, np.ones(12, bool))
     noise = replace(_noise(), spectra=moments)
-    seen = _interlaced(augmentation, crop, noise, step=4, rng=rng, least_power=0.05)
+    seen = _seen(augmentation.interlaced, crop, noise, step=4, rng=rng, least_power=0.05)
     assert len(_captures(seen[..., 12:])) > 1
     columns = seen[..., :12] @ augmentation.unwhiten * normalisation.spread
     power = np.linalg.eigvalsh(np.cov(columns.reshape(-1, 12).T))

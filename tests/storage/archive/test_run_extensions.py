@@ -18,7 +18,7 @@ from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 from storage.archive.manifests import read_manifest
 from storage.archive.records import read_run
-from storage.archive.run_folders import RunDraft, try_exchange
+from storage.archive.run_folders import try_exchange
 from storage.archive.staging import PART_SUFFIX
 from storage.maintenance.garbage import clear_up
 from tests.storage.small_archive import problems, small_survey
@@ -57,13 +57,6 @@ def run_id(archive: Archive) -> str:
     return folder.name
 
 
-def drafted(archive: Archive, name: str) -> RunDraft:
-    """What is added to a run, which nobody else does."""
-    draft = archive.extend_run(name)
-    assert draft is not None
-    return draft
-
-
 def extend(archive: Archive, name: str, figure: float = 0.75) -> Path:
     """Judge the small survey's map, and publish the run again with what came of it."""
 
@@ -72,7 +65,7 @@ def extend(archive: Archive, name: str, figure: float = 0.75) -> Path:
 
     (map_,) = archive.refs("segment")
     ref, _ = archive.produce("evaluate", build, version=1, params={"figure": figure}, inputs=[map_.key])
-    with drafted(archive, name) as draft:
+    with archive.extend_run(name) as draft:
         before = json.loads((draft.published / "receipt.json").read_text())
         products = {**before["products"], "accuracy": f"{ref.uri}/accuracy.json"}
         draft.write_file("receipt.json", json.dumps({**before, "products": products, "accuracy": {"miou": figure}}))
@@ -110,7 +103,7 @@ def test_what_is_not_published_changes_nothing(archive: Archive) -> None:
     """A block that fails, and one that ends without a word, leave the run as it was, and nothing beside it."""
     name, before = run_id(archive), (archive.runs()[0] / "manifest.json").read_bytes()
     for error in (None, KeyboardInterrupt(), ArchiveError("the disk is full")):
-        with suppress(KeyboardInterrupt, ArchiveError), drafted(archive, name) as draft:
+        with suppress(KeyboardInterrupt, ArchiveError), archive.extend_run(name) as draft:
             draft.write_file("receipt.json", "{}")
             if error is not None:
                 raise error
@@ -122,7 +115,7 @@ def test_what_is_not_published_changes_nothing(archive: Archive) -> None:
 def test_one_at_a_time(archive: Archive) -> None:
     """A second process is told that it is being done, and a run that is not there is named."""
     name = run_id(archive)
-    with drafted(archive, name):
+    with archive.extend_run(name):
         assert archive.extend_run(name, wait=False) is None
         assert archive.reclaim() == []
         assert clear_up(archive, keep_days=0).removals == ()
