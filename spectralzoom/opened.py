@@ -213,7 +213,7 @@ class OpenedRun:
         return tuple(name for name, where in self.receipt["products"].items() if where.endswith(".zarr"))
 
     def dataset(self, product: str) -> xarray.Dataset:
-        """Return all arrays of a product, such as ``probabilities`` or ``geolocation``.
+        """Return all arrays of a product, such as ``class_probabilities`` or ``geolocation``.
 
         Raises IncompleteStoreError: the run has no such product, or it is damaged.
         """

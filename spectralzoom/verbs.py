@@ -202,6 +202,7 @@ def _judge(
     asked = None if labels is None else str(labels)
     with _working(progress) as console:
         receipt = reprocess_command.run_judge(run.archive_name, run.name, console, controls=controls, labels=asked)
+    vars(run).pop("receipt", None)  # read again, with the accuracy
     return dict(receipt["accuracy"])
 
 

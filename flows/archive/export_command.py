@@ -27,9 +27,10 @@ from pipeline.ground.georeference import pixel_side_m
 from storage.archive.staging import take_lock
 from storage.archive.whole_files import remove_leftovers
 from storage.arrays.georeference import load_geobox
-from storage.arrays.signal_cubes import open_lines
+from storage.arrays.signal_cubes import RestoredCube, open_lines
 from storage.export.image_files import write_cog, write_recorded_files
 from storage.export.stac_items import COG, ZARR, Item, check_owner, clean_id, footprint, projection, write_stac
+from storage.readers.recordings import RESTORED
 from storage.remote.opening import open_archive
 
 COLLECTION_TEXT = "Surveys exported from the archive {}. If no survey has a place, the extent is the whole earth."
@@ -169,9 +170,18 @@ def _export_sweeps(export: Export, console: Console) -> None:
     for path in sweeps:
         name = path.stem
         with console.status(f"writing {name}.bil"):
-            header = write_recorded_files(open_lines(path), export.folder / "sweeps")
+            header = write_recorded_files(lines := open_lines(path), export.folder / "sweeps")
+        if restored := isinstance(lines, RestoredCube):
+            console.print(f'[dim]note: {name}: {RESTORED}; keep = "raw" keeps the lines of the next survey[/]')
         data, table = header.with_suffix(".bil"), header.with_name(f"{name}.pointing.csv")
-        export.add(f"{name}_envi", data, f"Raw numbers of {name}", ENVI_NUMBERS, ["data"], **export.projection())
+        export.add(
+            f"{name}_envi",
+            data,
+            f"{'Restored' if restored else 'Raw'} numbers of {name}",
+            ENVI_NUMBERS,
+            ["data"],
+            **export.projection(),
+        )
         export.add(f"{name}_envi_header", header, f"{name} as ENVI, header", "text/plain", ["metadata"])
         export.add(f"{name}_pointing", table, f"Pointing of the lines of {name}", CSV, ["metadata"])
 

@@ -60,11 +60,15 @@ def choose_products(flags: ProductFlags) -> ProductChoice:
         raise SettingsError(f"--cell expects metres above 0 and at most {MOST_CELL_M:g}, got {flags.cell:g}")
     if flags.dose_unit not in UNITS:
         raise SettingsError(f"--dose-unit expects {' or '.join(UNITS)}, got {flags.dose_unit!r}")
+    for name in ("prescription", "indices"):
+        if (given := getattr(flags, name)) is not None and not split_list(given):
+            raise SettingsError(f"--{name} {given!r} names nothing; give names with commas, or leave it out")
     doses = {}
     for part in split_list(flags.prescription):
         name, _, number = part.partition("=")
         if not re.fullmatch(r"\s*\d+(\.\d*)?|\s*\.\d+", number) or not name.strip():
-            raise SettingsError(f"--prescription expects classes with numbers, weed=2.5, got {part!r}")
+            known = "numbers are 0 or more, without an exponent"
+            raise SettingsError(f"--prescription expects classes with numbers, weed=2.5, got {part!r}; {known}")
         if name.strip() in doses:
             raise SettingsError(f"--prescription names {name.strip()} twice; give it one number")
         doses[name.strip()] = float(number)

@@ -228,8 +228,8 @@ def train(dataset: str, *, out: OutFile, flags: TrainFlags = NO_TRAIN_FLAGS, as_
     Parameters
     ----------
     dataset
-        `farm` or `scouting` (with a seed: `farm@2`), both with a comma, a folder of images with labels (`init` writes
-        a scene.toml for it), or a file.
+        `farm` or `scouting` (`farm@2` names the version of its law), both with a comma, a folder of images with labels
+        (`init` writes a scene.toml for it), or a file.
     out
         Weights to write (.safetensors).
     """

@@ -148,7 +148,7 @@ def emulate(
     Parameters
     ----------
     scene
-        Scene: `farm` (with a seed: `farm@2`), or an image or cube file. Default: `farm`.
+        Scene: `farm` (`farm@2` names the version of its law), or an image or cube file. Default: `farm`.
     size
         Size of the scene `farm`, width x height [px]. Default: 256x256.
     settings

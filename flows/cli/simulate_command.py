@@ -52,8 +52,8 @@ def simulate(
     Parameters
     ----------
     scene
-        `farm` or `scouting` (built in; with a seed: `farm@2`), or an image or cube file: PNG, JPEG, BMP, GeoTIFF,
-        .npy, .npz, .mat, ENVI, Zarr.
+        `farm` or `scouting` (built in; `farm@2` names the version of its law), or an image or cube file: PNG, JPEG,
+        BMP, GeoTIFF, .npy, .npz, .mat, ENVI, Zarr.
     out
         Archive for the raw cubes: a folder, or s3://bucket/prefix.
     coarse

@@ -11,7 +11,7 @@ from cyclopts import Parameter
 
 from flows.cli.app import AsJson, say, stderr
 from flows.settings.documents import about, toml_value
-from flows.settings.load import SURVEY, TABLES, load_settings
+from flows.settings.load import FLAGS, SURVEY, TABLES, load_settings
 from flows.settings.survey_settings import Settings
 from flows.terminal.progress import print_json
 from pipeline.errors import NothingToMend, PipelineError
@@ -22,10 +22,7 @@ if TYPE_CHECKING:
 else:
     survey_command = deferred("flows.publish.survey_command")
 
-OF_ZONES = ("area", "no_go", "plots", "plots_name")
-# flag: setting in a table
-IN_TABLES = {"exposure_ms": "camera.exposure_ms", "sky": "sky.light", "light_fraction": "sky.light_fraction"}
-IN_TABLES |= {name: f"zones.{name}" for name in OF_ZONES}
+IN_TABLES = {flag: setting for setting, flag in FLAGS.items()}
 _IN_TABLES = {name: place.partition(".") for name, place in IN_TABLES.items()}
 _DECLARED = SURVEY | {name: TABLES[table][key] for name, (table, _, key) in _IN_TABLES.items()}
 

@@ -130,7 +130,10 @@ OF_THE_RUN = (
 )
 OF_ZOOM = ("seconds", "scan_step")  # settings of a uniform scan that a first pass has too
 BUILT_IN_WEIGHTS = "farm"
-FLAGS = {"sky.light": "sky"}  # flags that are not named as their setting
+FLAGS = {  # of settings in tables; other keys of tables have none
+    **{"camera.exposure_ms": "exposure_ms", "sky.light": "sky", "sky.light_fraction": "light_fraction"},
+    **{f"zones.{name}": name for name in ("area", "no_go", "plots", "plots_name")},
+}
 
 
 def usual_of_recording(table: Mapping[str, object]) -> dict[str, Any]:
@@ -245,7 +248,7 @@ def parse_settings(table: Mapping[str, object], origin: Mapping[str, str] | None
     def at(name: str) -> str:
         return place_of(name, origin.get(name))
 
-    for check in (_camera_errors, _scene_errors, _recorded_errors, _extent_errors, _limit_errors):
+    for check in (_camera_errors, _scene_errors, _air_errors, _recorded_errors, _extent_errors, _limit_errors):
         for error in check(settings, at):
             raise SettingsError(error)
     return settings
@@ -359,6 +362,8 @@ def _scene_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]
         yield f"{wants}: got policy = {settings.policy!r}, mask = {settings.mask!r}; give both or neither"
     if bands is not None and wavelengths is not None and len(bands) != len(wavelengths):
         yield f"{at('wavelengths')} must have one value for each of the {len(bands)} bands, got {len(wavelengths)}"
+    if scene.partition("@")[0] in BUILT_IN_SCENES and scene not in BUILT_IN_SCENES and not Path(scene).exists():
+        yield f"there is no scene {scene}: give one of {', '.join(BUILT_IN_SCENES)}, or a file; --seed has the seed"
     if scene == RIG_FIELD and settings.source not in (RIG, RECORDED):
         yield f"scene {RIG_FIELD!r} is what stands before a rig: give --source rig, or a file"
     if settings.source == RIG and settings.cost.vector_pairs > MOST_PAIRS:
@@ -391,6 +396,23 @@ def _scene_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]
             f"detector.full_well_e = {settings.detector.full_well_e:g} is below the {camera.full_scale_e:g} e- of the "
             "converter's end, and full pixels would count as valid; use fewer camera.bits or electrons_per_dn"
         )
+
+
+def _air_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]:
+    """Yield errors: distances of the air that contradict each other, or that a relief lacks."""
+    air = settings.air
+    if air.distance_m is None:
+        if air.nearest_m is not None or air.farthest_m is not None:
+            yield f"{at('air.nearest_m')} and air.farthest_m lie around air.distance_m: give it too, or leave them out"
+        return
+    near, far = air.nearest_m or air.distance_m, air.farthest_m or air.distance_m
+    if not near <= air.distance_m <= far:
+        yield (
+            f"{at('air.nearest_m')} = {near:g}, air.distance_m = {air.distance_m:g} and air.farthest_m = {far:g}: the "
+            "middle of the scene lies between its nearest and its farthest part"
+        )
+    if air.relief != "flat" and near == far:
+        yield f"{at('air.relief')} = {air.relief!r} needs air.nearest_m or air.farthest_m: give one, or relief = 'flat'"
 
 
 def _recorded_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]:
@@ -439,7 +461,9 @@ def _limit_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]
             f"{at('scan_step')} = {settings.scan_step}: the first of two passes takes every 4th or 8th line; give "
             f"{' or '.join(map(str, FIRST_STEPS))}, or leave it out"
         )
-    if settings.kept_bytes is not None and (settings.is_map or not settings.plain):
+    if settings.kept_bytes is not None and settings.is_map:
+        yield f"{at('kept_bytes')} is for a uniform scan, and the scene {settings.scene} is a raster: leave it out"
+    elif settings.kept_bytes is not None and not settings.plain:
         yield f"{at('kept_bytes')} is for a uniform scan: give --seconds or --scan-step too, or leave it out"
     if settings.macs is None:
         return
@@ -451,6 +475,6 @@ def _limit_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]
 
 def place_of(key: str, origin: str | None) -> str:
     """Return how a message names a setting: as a flag, without its table, or with its file."""
-    if origin == "flag":
-        return "--" + FLAGS.get(key, key.rpartition(".")[2]).replace("_", "-")
-    return f"'{key}'" + (f" in {origin}" if origin else "")
+    if origin == "flag" and "." not in (flag := FLAGS.get(key, key)):
+        return "--" + flag.replace("_", "-")
+    return f"'{key}'" + (f" in {origin}" if origin not in (None, "flag") else "")

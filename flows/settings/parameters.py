@@ -13,6 +13,7 @@ from flows.settings.documents import about, toml_value
 from flows.settings.load import SURVEY, TABLES, Declared, anchor_paths, load_settings
 from flows.settings.survey_settings import ALWAYS, AUTO, BUILT_IN_SCENES, Settings
 from pipeline.errors import PipelineError, SettingsError
+from pipeline.rig.device_settings import OF_THE_LINES
 
 OF_LISTS = {"bands": "integer", "wavelengths": "number", "size": "integer"}  # also as text: 0-3,7
 SECRET = "password"  # only from a settings file, since a server stores parameters
@@ -101,8 +102,19 @@ class SurveySettings(BaseModel):
         return cls.of(settings)
 
     def with_rig_of(self, file: str) -> SurveySettings:
-        """Return the settings with the table [rig] of another file. Raises SettingsError: the file is not valid."""
-        return SurveySettings.of(replace(self.settings(), rig=load_settings(file).rig))
+        """Return the settings with the table [rig] of another file.
+
+        Raises SettingsError: the file is not valid, or has another white reference or mounting.
+        """
+        requested, there = self.settings(), load_settings(file).rig
+        for name in OF_THE_LINES:
+            own, other = getattr(requested.rig, name), getattr(there, name)
+            if own != other:
+                raise SettingsError(
+                    f"rig.{name} is {other!r} in {file} and {own!r} in the settings of the survey, and lines mean the "
+                    "same by one value only: state it in both"
+                )
+        return SurveySettings.of(replace(requested, rig=there))
 
     @property
     def name_of_run(self) -> str:

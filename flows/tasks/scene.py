@@ -22,6 +22,7 @@ from pipeline.geometry.grid import UNLABELLED
 from pipeline.lazy import Once
 from pipeline.simulator.effects.effect import Effect
 from pipeline.simulator.scenes.built_in import built_in_scene
+from pipeline.simulator.scenes.daylight import sun_elevation_deg
 from pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE
 from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster
 from pipeline.simulator.simulated import SimulatedSource
@@ -96,6 +97,10 @@ def check_scene_there(scene: str) -> None:
 def open_scene(settings: Settings, known: Sequence[str] | None = None) -> tuple[RasterScene, tuple[str, ...]]:
     """Open the scene in the light of the settings' sky; arguments, notes and errors as in `_in_clear_light`."""
     scene, notes = _in_clear_light(settings, known)
+    if settings.source == SIM and settings.sky.started is not None:
+        height = float(sun_elevation_deg(settings.sky, np.zeros(1))[0])
+        if height <= 0:
+            notes += (f"the sun is {-height:.0f} degrees below the horizon at sky.started: the field is dark",)
     return scene.in_light(settings.sky.fraction_of_clear), notes
 
 

@@ -152,7 +152,8 @@ def measure_tradeoff(tradeoff: Tradeoff, *, repeats: int | None = None, seed: in
     for one, judged in figures.items():
         time_s, cost, relative = clocks[one].cpu_min_s, judged.cost, ratio(clocks, one, settings[0])
         if cost is not None:
-            relative = cost / (points[0].cost if points else cost)
+            first = points[0].cost if points else cost
+            relative = cost / first if first else math.nan  # a cube of one value takes no bytes
         points.append(
             Point(one, judged.error, time_s if cost is None else cost, time_s, relative, beside=judged.beside)
         )

@@ -12,6 +12,10 @@ from pipeline.setting_fields import assumed, stated
 
 ReadBack = Literal["none", "sampled", "all"]
 Pulses = Literal["position", "frame", "none"]
+OF_THE_LINES = (  # what the numbers and places of captured lines depend on
+    *("white_reference", "white_at_rest"),
+    *("mirror_axes", "mirror_clocking_deg", "mirror_offset_x", "mirror_offset_y"),
+)
 MOST_PAIRS = 8191  # a byte offset of 16 bits addresses the cells of the vector memory
 
 

@@ -23,6 +23,7 @@ from storage.archive.whole_files import make_folder, write_whole, written_aside
 from storage.arrays.class_maps import ClassNames
 from storage.arrays.cubes import RawCube
 from storage.arrays.layout import SHARD_ROWS, AngularGrid
+from storage.arrays.signal_cubes import RestoredCube
 
 TILE = 512  # px: rasters within one tile need no overviews
 ANGULAR = (
@@ -211,8 +212,10 @@ def write_recorded_files(cube: RawCube, folder: Path) -> Path:
 
     header = folder / f"{name}.hdr"
     bands = EnviFile(cube.shape, "u2", cube.wavelength_nm, cube.fwhm_nm)
-    axis = {"line axis": cube.sweep.along}
-    write_envi(header, replace(bands, description=f"raw numbers of sweep {name}", ending=".bil", more=axis), blocks())
+    axis, what = {"line axis": cube.sweep.along}, "restored" if isinstance(cube, RestoredCube) else "raw"
+    write_envi(
+        header, replace(bands, description=f"{what} numbers of sweep {name}", ending=".bil", more=axis), blocks()
+    )
     known = cube.references
     white_reference = ", ".join(repr(value) for value in known.white_reference.astype(np.float64).tolist())
     of_white = {"white_reference": f"{{{white_reference}}}", **({"mirror at rest": "1"} if known.by_mirror else {})}

@@ -71,6 +71,8 @@ def clear_up(
                     progress(removal, number / len(plan.removals))
                 if _remove(archive, removal):
                     gone.append(removal)
+            for lock in archive.root.glob(".locks/*-*.lock"):  # of stores and runs, which nobody makes meanwhile
+                lock.unlink(missing_ok=True)
     return Clearance(tuple(gone), plan.kept, plan.obstacle)
 
 

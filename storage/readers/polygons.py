@@ -86,9 +86,9 @@ def read_polygons(source: str) -> PolygonLayer:
             content = json.loads(path.read_text(encoding="utf-8-sig"))
             known = isinstance(content, dict) and content.get("crs") is not None
         crs = pyproj.CRS.from_user_input(about["crs"]) if known else None
-    except (OSError, ValueError, RuntimeError, pyproj.exceptions.CRSError) as error:  # GDAL's are RuntimeErrors
+        geometry = [None if one is None else shapely.from_wkb(one) for one in (() if found is None else found)]
+    except (OSError, ValueError, RuntimeError, pyproj.exceptions.CRSError, shapely.errors.GEOSException) as error:
         raise ZoneError(f"cannot read {source} as polygons: {error}; save it anew from a map program") from None
-    geometry = [None if one is None else shapely.from_wkb(one) for one in (() if found is None else found)]
     rows = [number for number, one in enumerate(geometry) if one is not None and not one.is_empty]
     kinds = Counter(one.geom_type for one in geometry if one is not None and one.geom_type not in POLYGONS)
     if kinds or not rows:

@@ -7,6 +7,7 @@ import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import geopandas
 import numpy as np
@@ -23,7 +24,8 @@ from rich.console import Console
 from scipy import ndimage
 
 from flows.archive.export_command import run_export
-from flows.archive.export_zones import ClassRaster, dose_cells
+from flows.archive.export_layers import open_exported
+from flows.archive.export_zones import ClassRaster, check_zones, dose_cells
 from flows.archive.product_choice import ProductFlags, choose_products
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
@@ -31,6 +33,7 @@ from pipeline.errors import SettingsError, WavelengthError
 from pipeline.ground.map_grid import ground_grid, image_at
 from pipeline.ground.view import GroundView, RigPose
 from pipeline.products.indices import find_index
+from storage.archive.archive import Archive
 from storage.arrays.class_maps import ClassNames
 from storage.arrays.mosaics import open_mosaic
 from tests.prior_work import without_effects
@@ -218,6 +221,8 @@ def test_the_catalogue_names_every_product(posed: Products) -> None:
     [
         ({"prescription": "weed"}, "expects classes with numbers, weed=2.5, got 'weed'"),
         ({"prescription": "weed=1", "dose_unit": "gal/ac"}, "--dose-unit expects l/ha or kg/ha, got 'gal/ac'"),
+        ({"prescription": "weed=1e9"}, "got 'weed=1e9'; numbers are 0 or more, without an exponent"),
+        *((({name: ","}), f"--{name} ',' names nothing") for name in ("prescription", "indices")),
         ({"prescription": "weed=1,weed=2"}, "names weed twice; give it one number"),
         *(
             ({"prescription": "weed=1", "cell": m}, "--cell expects metres above 0 and at most 1000")
@@ -233,6 +238,21 @@ def test_the_impossible_is_refused_first(posed: Products, tmp_path: Path, flags:
     with pytest.raises((SettingsError, WavelengthError), match=words):
         exported(posed.archive, tmp_path / "out", {}, **flags)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("crs", "box", "words"),
+    [
+        ("EPSG:4326", (10, 89.9, 11, 89.99), "beyond 84 degrees north or 80 south"),
+        ("EPSG:32660", (820_000, 1_100_000, 840_000, 1_110_000), "across 180 degrees of longitude"),
+    ],
+)
+def test_a_prescription_ends_at_borders(posed: Products, crs: str, box: tuple[float, ...], words: str) -> None:
+    """Of UTM, and of longitudes."""
+    run = Mock(wraps=open_exported(Archive.open(posed.archive), None), map_product="class_map")
+    run.geobox = GeoBox.from_bbox(box, crs=crs, shape=(4, 4))
+    with pytest.raises(SettingsError, match=words):
+        check_zones(run, choose_products(ProductFlags(prescription="weed=1")))
 
 
 def test_a_survey_without_a_place_has_what_needs_none(surveyed_png: Any, tmp_path: Path) -> None:

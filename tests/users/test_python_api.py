@@ -14,7 +14,6 @@ import rioxarray  # noqa: F401 - registers the accessor that users have
 
 import spectralzoom
 from spectralzoom.opened import NoRunError, OpenedRun
-from storage.archive.archive import Archive
 from storage.arrays.class_maps import load_class_map
 from storage.arrays.ground_maps import load_geobox
 from tests.conftest import WeightsMaker
@@ -141,7 +140,7 @@ def test_keywords_win_over_a_file(asked: dict[str, object], tmp_path: Path) -> N
     """A table in a keyword changes its own keys alone."""
     (tmp_path / "survey.toml").write_text("budget = 0.3\nengine = 'plain'\n[camera]\nsamples = 320\nbits = 10\n")
     same = {"source": "sim", "scene": asked["scene"], "weights": asked["weights"], "out": tmp_path / "archive"}
-    with pytest.raises(spectralzoom.Error, match=r"--bits must be a whole number from 8 to 16"):
+    with pytest.raises(spectralzoom.Error, match=r"'camera.bits' must be a whole number from 8 to 16"):
         spectralzoom.plan(tmp_path / "survey.toml", **same, camera={"bits": 40})
     (tmp_path / "survey.toml").write_text("[camera]\nsamples = 3\n")
     with pytest.raises(spectralzoom.Error, match=r"'camera.samples' in .*survey.toml must be"):
@@ -153,7 +152,7 @@ def test_a_run_is_judged_when_asked(run: OpenedRun) -> None:
     assert "accuracy" not in run.receipt
     scores = spectralzoom.evaluate(run)
     assert 0 <= scores["overall_accuracy"] <= 1
-    assert OpenedRun(Archive(Path(run.archive_name)), run.folder).receipt["accuracy"] == scores
+    assert run.receipt["accuracy"] == scores
 
 
 def test_weights_are_trained_and_judged(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
 from flows.tasks.stages.capture import RIG_RECORD
 from flows.tasks.stages.placement import MOSAIC, MOSAIC_STEP
 from flows.terminal.figures import format_bytes
-from pipeline.errors import BudgetError, IncompleteStoreError
+from pipeline.errors import BudgetError, IncompleteStoreError, SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.readings import MOST_VALUE, readings_alone
 from pipeline.signal.calibrate import number_values
@@ -106,6 +106,11 @@ def condense(
         captured = [(open_raw_cubes(raw.path), read_statistics(raw.path)) for raw in passes]
         cubes = [cube for of_pass, _ in captured for cube in of_pass]
         found = reduce(SignalStatistics.merged, (statistics for _, statistics in captured))
+        if cubes and not found.count:
+            raise SceneError(
+                "no spectrum of the sweeps is valid: their samples are saturated or dead, or their lines were lost; "
+                "capture with a shorter exposure, or look at the dark and white frames. The raw lines stay"
+            )
         components = components_of(found, cubes, signal)
         step = signal.step if limit is None else limit.step(cubes, components, camera, signal.step)
         law = ResidualLaw.learned(found.spectra, components)

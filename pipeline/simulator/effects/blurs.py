@@ -10,6 +10,7 @@ from types import MappingProxyType
 import numpy as np
 import scipy
 
+from pipeline.errors import SettingsError
 from pipeline.simulator.effects.effect import Blur, Bound
 from pipeline.simulator.effects.probe import UNITS, Probe
 from pipeline.simulator.optics.kernel_fit import Floats, Moments
@@ -17,6 +18,7 @@ from pipeline.simulator.optics.rays import extreme_normals, pupil_contrast, spre
 from pipeline.simulator.rig_model import Rig
 
 AIRY = "airy"
+MOST_BLUR_PX = 256  # diameter of a disc that is simulated
 FIRST_NM, LAST_NM = 400.0, 1000.0  # of the spectrograph
 _ALONE: Floats = np.ones(1)
 GAUSSIAN_WAY, DISC_WAY = math.sqrt(2 / math.pi), 8 / (3 * math.pi)  # mean of |x| over the standard deviation
@@ -145,6 +147,11 @@ def defocus_px(rig: Rig, distance_m: float | None, normal: Floats | None = None)
     if distance_m is None or distance_m == rig.optics.focus_m:
         return np.zeros(2)
     round_px = rig.optics.aperture_mm * 1e-3 * abs(1 / distance_m - 1 / rig.optics.focus_m) / rig.camera.ifov_rad
+    if round_px > MOST_BLUR_PX:
+        raise SettingsError(
+            f"a scene at {distance_m:g} m, with the focus at {rig.optics.focus_m:g} m, is blurred over {round_px:.0f} "
+            f"px; at most {MOST_BLUR_PX} px are simulated: give optics.focus_m near air.distance_m"
+        )
     return round_px * np.sqrt(spread_of_rays(normal))
 
 

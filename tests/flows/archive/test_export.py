@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import shutil
@@ -290,3 +291,16 @@ def test_what_cannot_be_believed_is_named_and_gives_no_image(posed: Exported, tm
     with pytest.raises(IncompleteStoreError, match=r"ground_map.*classes"):
         run_export(archive, posed.id, tmp_path / "out", envi=False, console=QUIET)
     assert not list((tmp_path / "out").rglob("*.tif"))
+
+
+def test_restored_sweeps_say_so(surveyed_png: Any, tmp_path: Path) -> None:
+    """Where the raw lines were deleted: a note, the header and the catalogue."""
+    surveyed_png(tmp_path / "archive")
+    console = Console(file=io.StringIO(), width=200)
+    answer = run_export(tmp_path / "archive", None, tmp_path / "out", envi=True, console=console)
+    assets = json.loads(Path(answer["item"]).read_text())["assets"]
+    titles = [asset["title"] for key, asset in assets.items() if key.endswith("_envi")]
+    assert titles
+    assert all(title.startswith("Restored numbers of ") for title in titles)
+    assert "the raw lines were deleted: these are restored from the stored signal" in console.file.getvalue()
+    assert all("restored numbers of sweep" in path.read_text() for path in tmp_path.glob("out/**/scan-*[0-9].hdr"))

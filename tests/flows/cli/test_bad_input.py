@@ -138,6 +138,18 @@ def test_unusual_input_works(
     assert set(np.unique(drawn)) <= {0, 1, 2, 255}
 
 
+def test_without_a_valid_spectrum_there_is_one_message(
+    folder: Path, tmp_path: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A dark current that fills every pixel: what was captured stays."""
+    monkeypatch.chdir(folder)
+    (tmp_path / "hot.toml").write_text(f"{CAMERA}[detector]\ndark_e_per_s = 1e9\n")
+    words = survey_words("--scan-step 1 --effects dark-current,shot", str(tmp_path / "archive"))
+    ended = command_line(*words, str(tmp_path / "hot.toml"))
+    ended.refused(1, "no spectrum of the sweeps is valid: .* saturated .* shorter exposure")
+    assert Archive.open(tmp_path / "archive").refs("capture")
+
+
 def test_surveys_go_on_after_one_that_fails(
     command_line: CommandLine, field_file: Callable[..., Path], tmp_path: Path
 ) -> None:

@@ -43,6 +43,14 @@ def test_a_sky_is_a_fraction_of_the_light() -> None:
     np.testing.assert_array_equal(overcast.electrons, clear.electrons / 8)
 
 
+def test_a_field_at_night_is_noted() -> None:
+    """Where the sun stands below the horizon when the survey begins."""
+    noon, night = ({"sky": {"started": f"2026-06-01T{hour}:00:00Z"}} for hour in (12, "00"))
+    assert open_scene(load_settings(None, SMALL | noon))[1] == ()
+    (note,) = open_scene(load_settings(None, SMALL | night))[1]
+    assert note == "the sun is 15 degrees below the horizon at sky.started: the field is dark"
+
+
 def test_under_clouds_scans_expose_longer(tmp_path: Path) -> None:
     """The scan taken without a limit has the light of the one under a clear sky; the network reads both alike."""
     planned = {"scene": "scouting", "size": "160x128", "out": str(tmp_path)}

@@ -152,6 +152,9 @@ def test_the_rig_of_a_pass_is_that_of_its_own_machine(tmp_path: Path) -> None:
     here = asked.with_rig_of(str(tmp_path / "rig.toml")).settings()
     assert (here.rig.port, here.rig.password) == ("/dev/ttyRIG", "secret-4711")
     assert replace(here, rig=asked.settings().rig) == asked.settings()
+    (tmp_path / "rig.toml").write_text("[rig]\nwhite_reference = 0.99\n")  # else the survey looks for other lines
+    with pytest.raises(SettingsError, match=r"rig.white_reference is 0.99 in .*rig.toml and 1.0 in the .* survey"):
+        asked.with_rig_of(str(tmp_path / "rig.toml"))
 
 
 def test_a_wrong_parameter_is_refused_with_the_message_of_the_command_line() -> None:

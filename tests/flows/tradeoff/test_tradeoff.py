@@ -84,6 +84,12 @@ def test_every_setting_is_judged_and_runs_in_turn():
     assert seen == [1, 2, 3, 1, 2, 3, 2, 3, 1]
 
 
+def test_a_first_setting_without_a_cost_leaves_no_ratio():
+    """A cube of one value takes no bytes."""
+    free = replace(SERIES, settings=(1.0, 2.0), judge=lambda truth, terms, out: Figures(0.0, cost=terms - 1))
+    assert [math.isnan(one.ratio) for one in measure_tradeoff(free, repeats=1).points] == [True, True]
+
+
 def test_least_times_are_the_cost(clock):
     """A machine that halts for a while does not raise the cost."""
     turns = iter((1.0, 1.0, 2.0, 4.0, 2.0, 2.0, 3.0, 9.0))  # the second round begins with the second setting

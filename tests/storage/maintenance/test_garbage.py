@@ -76,6 +76,7 @@ def test_spools_of_published_captures_and_dead_parts_go(tmp_path: Path, archive:
     }
     assert [path.name for path in (tmp_path / "spool").iterdir()] == ["underway"]
     assert not (tmp_path / "stages" / "rectify" / "dead.part").exists()
+    assert [path.name for path in (tmp_path / ".locks").iterdir()] == ["use.lock"]
 
 
 def test_a_stray_file_among_the_runs_holds_nothing_up(tmp_path: Path, archive: Archive) -> None:

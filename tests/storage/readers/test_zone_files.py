@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -93,3 +95,12 @@ def test_what_holds_no_polygons_is_one_message(name: str, content: str | None, w
         (tmp_path / name).write_text(content)
     with pytest.raises(ZoneError, match=words):
         read_zones(str(tmp_path / name))
+
+
+def test_a_ring_that_does_not_close_is_one_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As one with a corner of NaN, which is not equal to itself."""
+    ring = struct.pack("<BIII8d", 1, 3, 1, 4, *(math.nan, 1), *(5, 5), *(9, 1), *(math.nan, 1))
+    path = written(tmp_path / "z.geojson", [SQUARE])
+    monkeypatch.setattr("pyogrio.raw.read", lambda path, layer: ({"crs": None, "fields": []}, None, [ring], []))
+    with pytest.raises(ZoneError, match=r"cannot read .*z.geojson as polygons: .* closed .*; save it anew"):
+        read_zones(path)

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.errors import SettingsError
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, defocus_px, keystone_shift
 from pipeline.simulator.effects.effect import SweepBlock
@@ -47,6 +48,14 @@ def test_disc_at_30_m():
     assert defocus_px(rig_at(30.0), 30.0) == pytest.approx([4.73, 3.34], abs=0.005)
     variance = DEFOCUS.moments(rig_at(30.0), NM, "disc").spread[:, 0]
     assert variance == pytest.approx(np.array([4.73, 3.344]) ** 2 / 16, rel=1e-3)
+
+
+def test_a_scene_far_out_of_focus_is_refused():
+    """A disc of thousands of pixels would take terabytes."""
+    with pytest.raises(
+        SettingsError, match=r"0.001 m, with the focus at inf m, is blurred over 1\d{5} px; at most 256"
+    ):
+        defocus_px(rig_at(1e-3), 1e-3)
 
 
 def test_disc_at_grazing_incidence():
