@@ -148,7 +148,7 @@ def print_summary(receipt: Receipt, console: Console, *, verbose: bool = False) 
     console.print(table(columns, cells, whole=columns[1:]))
     console.print(escape(format_reference(receipt)))
     for name, words in finding_rows({"memory": receipt.get("memory")}):
-        console.print(escape(f"{name}: {words}"))
+        console.print(escape(f"{name}: {words}"), soft_wrap=True)  # numbers have spaces
     if not verbose:
         return
     stages = [
