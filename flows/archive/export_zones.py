@@ -76,9 +76,7 @@ def check_zones(run: ExportedRun, choice: ProductChoice) -> None:
     if choice.doses and run.geobox is not None:
         west, south, east, north = _bounds(run.geobox, WGS84)
         if not -80 <= south <= north <= 84:
-            raise SettingsError(
-                "the map lies beyond 84 degrees north or 80 south, where UTM and a prescription end"
-            )
+            raise SettingsError("the map lies beyond 84 degrees north or 80 south, where UTM and a prescription end")
         if west > east:
             raise SettingsError("the map lies across 180 degrees of longitude, a prescription cannot: survey each side")
 
