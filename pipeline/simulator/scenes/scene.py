@@ -6,10 +6,8 @@ One is made of any image: without a radiance law it is relative, linear light of
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from tempfile import TemporaryFile
 from threading import Lock
 
 import numpy as np
@@ -20,22 +18,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, cuts
 from pipeline.lazy import GeoBox, Once
 from pipeline.readings import MOST_VALUE, find_beyond
-
-MOST_BYTES = 2**28  # of an array in memory; larger ones are in a file
-
-
-def scratch(shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Return an array of zeros; a large one is in a file without a name, which the system reads and writes by pages.
-
-    Raises OSError: the disk is full. The folder is that of TMPDIR, by default /var/tmp, since /tmp may be memory.
-    """
-    if 4 * np.prod(shape) <= MOST_BYTES:
-        return np.zeros(shape, np.float32)
-    with TemporaryFile(dir=os.environ.get("TMPDIR", "/var/tmp")) as file:
-        if hasattr(os, "posix_fallocate"):  # not on macOS; a full disk would end the process later
-            os.posix_fallocate(file.fileno(), 0, 4 * int(np.prod(shape)))
-        return np.asarray(np.memmap(file, np.float32, "r+", shape=shape))
-
+from pipeline.simulator.scenes.scratch import scratch
 
 Drawn = tuple[NDArray[np.float32], NDArray[np.uint8] | None]
 _BINOMIAL = (np.array([1, 8, 28, 56, 70, 56, 28, 8, 1]) / 256).astype(np.float32)

@@ -183,7 +183,7 @@ def test_a_second_visit_goes_on_from_the_first(surveyed: Raster, scene_files: Pa
 )
 def test_a_setting_of_a_camera_is_refused(scene_files: Path, name: str, value: object) -> None:
     """Beside a raster one message names it, and says how to have the simulated rig look at the file."""
-    flag = "--" + name.rpartition(".")[2].replace("_", "-")
+    flag = f"'{name}'" if "." in name else "--" + name.replace("_", "-")
     with pytest.raises(SettingsError, match=rf"{flag} is of a camera, .* leave it out, or give --source sim"):
         load_settings(None, {"scene": str(scene_files / "scene.png"), name: value})
 

@@ -226,7 +226,10 @@ def test_survey_over_a_pty_and_sockets_gives_the_same_lines(tmp_path: Path):
 
 BAD: dict[str, tuple[dict[str, Any], str]] = {
     "unknown key": ({"rig.prot": "/dev/ttyUSB0"}, r"unknown setting .*prot.*did you mean 'rig.port'"),
-    "axes that are none": ({"rig.mirror_axes": "x,x"}, r"mirror.axes must be one of x,y  x,-y .* -y,-x; got 'x,x'"),
+    "axes that are none": (
+        {"rig.mirror_axes": "x,x"},
+        r"'rig.mirror_axes' must be one of x,y  x,-y .* -y,-x; got 'x,x'",
+    ),
     "memory too large": (
         {"source": "rig", "cost.vector_pairs": 9000},
         r"cost.vector_pairs = 9000: .* at most 8191 pairs",

@@ -186,10 +186,16 @@ def test_a_limit_that_nothing_fits_leaves_the_raw_lines(survey_png: Survey, reco
     assert list(tmp_path.glob("stages/capture/*/*.zarr"))
 
 
-@pytest.mark.parametrize("given", [{}, {"source": "raster"}])
-def test_a_limit_without_lines_of_a_uniform_scan_is_refused(given: dict[str, str]) -> None:
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"source": "raster"}, "a uniform scan, and the scene field.png is a raster: leave it out"),
+        ({"source": "sim", "budget": "0.5"}, "a uniform scan: give --seconds or --scan-step too"),
+    ],
+)
+def test_a_limit_without_lines_of_a_uniform_scan_is_refused(given: dict[str, str], words: str) -> None:
     """Two passes and rasters are kept otherwise."""
-    with pytest.raises(SettingsError, match="--kept-bytes is for a uniform scan: give --seconds"):
+    with pytest.raises(SettingsError, match=f"--kept-bytes is for {words}"):
         load_settings(None, {"scene": "field.png", "kept_bytes": "8MB", **given})
 
 

@@ -32,7 +32,7 @@ from pipeline.simulator.scenes.farm.land import (
     visible_area,
 )
 from pipeline.simulator.scenes.farm.spectra import MATERIALS, wet_fraction
-from pipeline.simulator.scenes.scene import scratch
+from pipeline.simulator.scenes.scratch import scratch
 
 _COLOURS = {
     "soil": (158, 119, 82),

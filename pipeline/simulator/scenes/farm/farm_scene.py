@@ -57,7 +57,8 @@ from pipeline.simulator.scenes.farm.land import (
     stream,
 )
 from pipeline.simulator.scenes.farm.spectra import WHITE_REFERENCE_REFLECTANCE, band_centres, spectral_library
-from pipeline.simulator.scenes.scene import Drawn, RasterScene, SceneRadiance, SceneRaster, scratch
+from pipeline.simulator.scenes.scene import Drawn, RasterScene, SceneRadiance, SceneRaster
+from pipeline.simulator.scenes.scratch import scratch
 
 # A law is what a seed is drawn by; it stands first in a scene's key, and one that is out there never changes.
 FARM_LAW = "farm@2"

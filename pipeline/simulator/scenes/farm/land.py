@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import cuts
-from pipeline.simulator.scenes.scene import scratch
+from pipeline.simulator.scenes.scratch import scratch
 
 Field = NDArray[np.float32]
 Points = NDArray[np.float64]

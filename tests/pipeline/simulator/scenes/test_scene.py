@@ -15,12 +15,13 @@ from pipeline.errors import SceneError, ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.lazy import Once
 from pipeline.simulator.rig_model import Sky
-from pipeline.simulator.scenes import scene as scratch_module
+from pipeline.simulator.scenes import scratch as scratch_module
 from pipeline.simulator.scenes.daylight import knots_within, relative_daylight, sun_elevation_deg
 from pipeline.simulator.scenes.farm import farm_plan, land
 from pipeline.simulator.scenes.farm import farm_scene as farm_scene_module
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
-from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster, raster_from_values, scratch
+from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster, raster_from_values
+from pipeline.simulator.scenes.scratch import scratch
 
 BANDS = np.array([400.0, 550.0, 760.0, 1000.0])
 EQUINOX = Sky(started=datetime(2026, 3, 20, 0, 0, tzinfo=UTC), latitude_deg=29.5, longitude_deg=0.0)
