@@ -172,7 +172,6 @@ def try_kills(kills: int, folder: Path, seed: int = 0) -> Losses:
     for number in range(kills):
         place = folder / f"killed-{number}"
         with subprocess.Popen([*command, str(place)], cwd=ROOT, env=environment, stdout=subprocess.PIPE) as process:
-            assert process.stdout is not None
             told = process.stdout.read(8)  # the first line is there
             time.sleep(chance.uniform(0.0, 0.1))
             process.send_signal(signal.SIGKILL)

@@ -66,7 +66,6 @@ def test_near_a_pole_the_map_is_stereographic(lat: float, epsg: int):
     """UTM ends at 84 N and 80 S; the default goes on, up to the pole itself, and areas stay true."""
     shape = (120, 90)
     grid = ground_grid(view(lat_deg=lat), shape)
-    assert grid.geobox.crs is not None
     assert grid.geobox.crs.epsg == epsg
     pixel_m2 = grid.geobox.resolution.x**2 / Proj(grid.frame.crs).get_factors(9.5, lat).areal_scale
     exact = np.nansum(PosedField(grid).pixel_areas_m2(slice(None), slice(None)))

@@ -331,7 +331,6 @@ def test_27_corrections_of_nothing_and_of_everything(size: float):
     assert drawn.softmax(dim=1).isfinite().all()
     map_loss(drawn, pixel_losses(drawn, labels), labels, torch.ones(3), soft_dice=True).backward()
     assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())
-    assert model.full_classes.bias.grad is not None
     assert model.full_classes.bias.grad.any()
 
 

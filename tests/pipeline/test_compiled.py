@@ -46,8 +46,6 @@ def doubled(module: ModuleType) -> list[float]:
 def opened(file: Path) -> ModuleType:
     """The module of a file, imported anew."""
     spec = importlib.util.spec_from_file_location("doubling", file)
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

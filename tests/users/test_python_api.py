@@ -105,7 +105,6 @@ def test_the_map_on_the_ground_has_its_crs(run: OpenedRun) -> None:
     """By rioxarray's convention, with the transform that the store was written with."""
     drawn = run.ground_map
     geobox = load_geobox(Path(run.archive_name) / run.receipt["products"]["ground_map"])
-    assert geobox is not None
     assert drawn["classes"].dtype == np.uint8
     assert (drawn["classes"].rio.crs.to_epsg(), drawn["classes"].rio.nodata) == (32632, 255)
     here = drawn["classes"].rio.transform()

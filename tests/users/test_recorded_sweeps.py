@@ -199,7 +199,6 @@ def test_lines_of_a_run_have_the_date_of_its_visit(full_scan: FullScan) -> None:
     sweeps = str(full_scan[1].folder)
     captured = datetime.fromisoformat(full_scan[1].receipt["started"])
     visit = load_settings(None, {"sweeps": sweeps}).visit
-    assert visit is not None
     assert datetime.fromisoformat(visit) == captured
     assert load_settings(None, {"sweeps": sweeps, "visit": "mine"}).visit == "mine"
 

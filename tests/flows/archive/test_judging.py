@@ -131,9 +131,7 @@ def test_a_run_that_is_being_judged_is_left_alone(
     break_off(survey, monkeypatch)
     archive = Archive.open(out)
     (run,) = archive.runs()
-    draft = archive.extend_run(run.name)
-    assert draft is not None
-    with draft:
+    with archive.extend_run(run.name):
         ended = command_line("evaluate", out, run.name)
         assert ended.errors == [f"runs/{run.name} is being judged by another process; it adds the accuracy"]
         survey()

@@ -41,7 +41,6 @@ def test_every_row_is_there(judged: Judged):
     """Every policy at every fraction, with means of the seeds and their spread; and the files of the folder."""
     request, content = judged
     folder = request.out
-    assert folder is not None
     keys = [(row["policy"], row["fraction"]) for row in content["rows"]]
     policies = [(policy, fraction) for policy in ("entropy", "random", ORACLE) for fraction in (0.25, 0.5)]
     assert keys == [("none", 0.0), *policies, ("all", 1.0)]
@@ -231,7 +230,6 @@ def test_weights_without_a_common_frame_are_one_seed() -> None:
     assert less.counts.shape == (2, 3, 2, 2)
     assert not less.counts[1, 2].any()
     found = difference(row, less, TRIAL)
-    assert found is not None
     wanted = row.over_runs(mean_iou).mean() - less.over_runs(mean_iou).mean()
     assert (found["difference"], found["frames"]) == (pytest.approx(wanted), 3)
 

@@ -41,7 +41,6 @@ def server_process(home: Path, port: int) -> Iterator[subprocess.Popen[str]]:
     }
     with subprocess.Popen(words, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True) as process:
         try:
-            assert process.stdout is not None
             if process.stdout.readline().strip() != "started":
                 raise RuntimeError(f"no Prefect server on port {port}")
             yield process

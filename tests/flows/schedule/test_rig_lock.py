@@ -42,7 +42,6 @@ def takers(folder: Path, count: int) -> Iterator[list[tuple[subprocess.Popen[str
             environment = {**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(temporary), "HOME": str(temporary)}
             pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
             process = subprocess.Popen([sys.executable, "-c", TAKES, PORT], env=environment, text=True, **pipes)
-            assert process.stdout is not None
             tried.append((process, process.stdout.readline() == "True\n"))
         yield tried
     finally:

@@ -199,7 +199,6 @@ def test_a_pose_and_its_map_are_read(toml):
         "\n".join(line for line in lines if line.startswith("[") or (" = " in line and not line.startswith("range_m")))
     )
     found = parse_settings(table)
-    assert found.pose is not None
     assert (found.pose.height_m, found.map.epsg) == (493.0, 32632)
     assert set(table["pose"]) | {"range_m"} == {item.name for item in fields(RigPose)}
 

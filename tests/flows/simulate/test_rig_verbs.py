@@ -155,7 +155,6 @@ def test_emulation_ends_in_order() -> None:
     with subprocess.Popen(
         [sys.executable, "-m", "flows.cli.main", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
-        assert process.stdout is not None
         lines = iter(process.stdout.readline, "")
         table = "".join(next(lines) for _ in range(7))
         port = tomllib.loads(table)["rig"]["port"]

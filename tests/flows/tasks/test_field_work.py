@@ -192,8 +192,6 @@ def test_a_memory_is_moved_and_leaves_nothing_behind(surveyed: Surveyed, shift: 
     still = FieldPriorMap(probabilities, mosaic, 1.0, None, classes).of(region, run.weights)
     moved = FieldPriorMap(probabilities, mosaic, 1.0, None, classes, shift).of(region, run.weights)
     coarse = tuple(round(by / CELL_PX) for by in shift)
-    assert still.coarse is not None
-    assert moved.coarse is not None
     pairs = [
         (still.probabilities.log_probability, moved.probabilities.log_probability, shift),
         (still.probabilities.age_days, moved.probabilities.age_days, shift),
@@ -216,7 +214,5 @@ def test_a_moved_memory_has_no_seams_between_regions(surveyed: Surveyed) -> None
     whole = before.of(field, run.weights).coarse
     for region in plan_regions(run.grid, SHARD, most_px=MOST_PX, halo=16):
         part = before.of(region, run.weights).coarse
-        assert whole is not None
-        assert part is not None
         here = region.read.over(CELL_PX)
         np.testing.assert_array_equal(part, whole[here.rows, here.columns])

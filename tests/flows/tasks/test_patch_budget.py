@@ -76,7 +76,6 @@ def test_zones_leave_fewer_patches_to_fraction() -> None:
     """Only patches of which zones leave something are chosen, and shares are of reading those."""
     shown = np.arange(PATCHES) < PATCHES // 2
     budget = _asked(shown, macs="80%")
-    assert budget is not None
     assert budget.everything < _budget(macs="80%").everything
     assert max(budget.choose(np.ones(PATCHES))) < PATCHES // 2
 

@@ -281,7 +281,6 @@ def test_a_thousand_visits_cost_as_much_as_sixty(visited: Path, twice: Any, monk
     counted = Mock(wraps=read_run)
     monkeypatch.setattr(memory, "read_run", counted)
     found = found_prior(visited, "2026-06-20T10:00:00Z", "latest")
-    assert found is not None
     assert found[1] == 16.0
     assert counted.call_count == memory.NEWEST_RUNS
     assert {call.args[0].name.rpartition("-")[2] for call in counted.call_args_list} == {"north"}

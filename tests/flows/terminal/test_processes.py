@@ -44,7 +44,6 @@ def test_without_one_they_are_in_a_temporary_folder(environment: dict[str, str],
     """Which only this user may enter; those who were told a place keep it."""
     environment = environment | {"MPLCONFIGDIR": "/elsewhere"}
     folder = place_caches(environment)
-    assert folder is not None
     assert folder.parent == temporary
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     assert environment["XDG_CACHE_HOME"] == str(folder)

@@ -55,8 +55,6 @@ def test_a_mask_splits_the_labels(tmp_path: Path) -> None:
     scipy.io.savemat(tmp_path / "mask.mat", {"m": np.array([[1, 1, 1], [2, 0, 2]], np.uint8)})
     data = load_data_set(tmp_path / "a.npy", train_mask=tmp_path / "mask.mat", mask_classes=[9, 4])
     train, test = data.load("a", "train"), data.load("a", "test")
-    assert train.labels is not None
-    assert test.labels is not None
     assert train.labels.tolist() == [[255, 255, 1], [255, 255, 0]]
     assert test.labels.tolist() == [[255, 0, 255], [1, 0, 255]]
     assert load_data_set(tmp_path, train_mask=tmp_path / "mask.mat").names == ("a",)

@@ -77,7 +77,6 @@ def test_new_weights_say_what_they_saw_and_know_what_is_ood(tmp_path: Path):
     assert (told.scenes, told.exposure_ms, told.day) == (3, (100.0, 100.0), None)
     assert 0 <= record["calibration"]["expected_error"] <= 1
     part = describe_weights(out).ood_detector
-    assert part is not None
     assert part.trained_on == told
     assert "no scene was kept" in train_weights(_request(field, out, validation=0))["familiar"]
     assert describe_weights(out).ood_detector is None
@@ -162,7 +161,6 @@ def test_counts_of_validation_scenes_add_up(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(figures, "run_controls", lambda *given, **named: next(scenes))
     one = ReadTwice(*np.zeros((2, 1, 1), np.uint8), {}, np.zeros((1, 1), np.uint8), SceneGrid(1, 1, 1))
     found = figures.validate([one, one], 2, 0)
-    assert found is not None
     assert found["gain"]["miou"] == mean_iou(2 * counts[2])
     draws = [mean_iou(counts[0] + counts[2]), mean_iou(2 * counts[3])]
     assert found["random"]["miou"] == pytest.approx(np.mean(draws))
@@ -180,8 +178,6 @@ def test_classifiers_beside_a_training_know_spectra_that_differ() -> None:
 
     mixed = rng.permutation(labels.ravel()).reshape(labels.shape)
     far, alike = judged(values + 9 * labels[..., None], labels), judged(values, mixed)
-    assert far is not None
-    assert alike is not None
     assert min(far.values()) > 0.95
     assert alike["logistic regression"] < 0.45
     assert judged(values, np.zeros_like(labels)) is None
@@ -212,7 +208,6 @@ def test_pixels_trained_on_are_not_judged(out: Path, tmp_path: Path) -> None:
     train_weights(_request(tmp_path / "cube.npy", out, choices=choices))
     flags = given | {"scene": str(tmp_path / "cube.npy"), "source": "sim", "weights": str(out), "budget": 1}
     run = open_run(load_settings(None, flags | {"out": str(tmp_path / "a")}))
-    assert run.labels is not None
     assert (run.labels[:10] == 255).all()
     assert (run.labels[10:] != 255).all()
 
@@ -251,9 +246,7 @@ def test_weights_for_short_exposures_have_a_record_of_plain_scans(folder: Path, 
     assert all(np.shape(table) == (4, 5) and np.min(table) >= 0 and np.max(table) <= 1 for table in tables)
     assert np.shape(scans["spread"]) == (4, 5)
     ood_detector = describe_weights(out).ood_detector
-    assert ood_detector is not None
     scores = ood_detector.map_scores
-    assert scores is not None
     assert (scores.steps, scores.exposures_ms, scores.scenes) == ((1, 2, 4, 8), (6.0, 12.0, 25.0, 50.0, 100.0), 2)
     assert np.abs(scores.bias).max() > 0.01
     assert "scans" not in train_weights(_request(folder, out, validation=2))

@@ -78,11 +78,9 @@ def test_the_command_trains_judges_and_says_how(tmp_path: Path, monkeypatch: pyt
     request = TemporalRequest("farm", weights, out, 1, 1, (128, 192), QUICK, "spectralzoom train")
     record = run_remember(request, Console(quiet=True))
     found = describe_weights(out).reader
-    assert found is not None
     assert describe_weights(out).key == describe_weights(weights).key
     assert dict(found.record) == record
     started_from = describe_weights(weights).reader
-    assert started_from is not None
     assert record["started_from"] == started_from.key
     assert (record["lands"], record["steps"], record["command"]) == ([200_000], 2, "spectralzoom train")
     assert [row["days"] for row in record["validation"]] == [3.0]
@@ -113,7 +111,6 @@ def test_the_shipped_weights_have_a_reader() -> None:
     """It fits them, was trained for them, and tells the lands that it has seen."""
     weights = shipped_weights()
     found = describe_weights(weights).reader
-    assert found is not None
     assert min(found.record["lands"]) >= 200_000
     assert found.sizes == load_reader(weights).sizes == TemporalSizes(11, 24)
 

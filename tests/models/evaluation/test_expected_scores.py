@@ -158,14 +158,10 @@ def test_exposures_between_are_between_by_their_logarithm():
     """Half of the way from 4 to 64 ms is 16 ms; the ends are what was measured."""
     scores, counts = _scores(), _scored(50).expected
     first, middle, last = (scores.expected(counts, 2, ms) for ms in (4.0, 16.0, 64.0))
-    assert first is not None
-    assert middle is not None
-    assert last is not None
     assert first.miou == expected_score(counts, scores.bias[1, 0], scores.error[1, 0]).miou
     assert middle.miou == pytest.approx((first.miou + last.miou) / 2, abs=0.005)
     assert middle.miou != last.miou
     rounded = scores.expected(counts, 2, 3.96)  # of an exposure, to a tenth of a millisecond
-    assert rounded is not None
     assert rounded.miou == first.miou
 
 

@@ -50,7 +50,6 @@ def test_numbers_outside_are_left_out_and_unknown_ground_is_none() -> None:
     """Those below 0 and from the count on; nothing is summed where nobody knows how large a pixel is."""
     numbers = np.array([[-1, 0, 0], [1, 2, 7]])
     found = areas_by_number(NoPlace((2, 3), pixel_m=0.5), numbers, 2)
-    assert found is not None
     assert found.tolist() == [0.5, 0.25]
     assert areas_by_number(NoPlace((2, 3)), numbers, 2) is None
 
@@ -66,7 +65,6 @@ def looking(tilt_deg: float, *, heading_deg: float = 30.0, roll_deg: float = 0.0
 def test_straight_down_a_field_is_its_pixels_times_their_side():
     """From 100 m, pixels of 0.1 mrad are 1 cm: 400 x 600 of them are 4 x 6 m, 1 ha an hour in 8.64 s."""
     found = scale_of_view(looking(90, height_m=100), (400, 600))
-    assert found.footprint is not None
     assert found.pixel_m == pytest.approx(0.01)
     assert (found.footprint.width_m, found.footprint.depth_m) == pytest.approx((6, 4))
     assert found.area_m2 == pytest.approx(24)

@@ -36,7 +36,6 @@ def test_areas_are_those_of_the_ellipsoid(epsg: int, step: float) -> None:
     to_degrees = pyproj.Transformer.from_crs(epsg, 4326, always_xy=True)
     places = to_degrees.transform(a * column + b * row + c, d * column + e * row + f)
     ellipsoid = pyproj.CRS.from_epsg(epsg).get_geod()
-    assert ellipsoid is not None
     outline = abs(ellipsoid.polygon_area_perimeter(*places)[0])
     assert np.sum(list(pixel_rows_m2(geobox))) == pytest.approx(outline, rel=1e-5)
     assert pixel_side_m(geobox) == pytest.approx(np.sqrt(outline / rows / columns), rel=1e-3)

@@ -127,7 +127,6 @@ def test_a_swath_that_does_not_pay_its_set_up_is_left_out() -> None:
     wanted = tuple((number, int(ROWS.first[number, 5]), int(ROWS.stop[number, 5])) for number in (0, 2))
     seconds = COST.seconds(sweeps_of_runs(ROWS.sweeps, wanted), CAMERA) + 0.01
     found = partial_scan(expected_gain, seconds)
-    assert found is not None
     assert found.runs == wanted
 
 
@@ -140,7 +139,6 @@ def test_lines_that_two_rows_share_are_paid_once() -> None:
     wanted = tuple((0, int(ROWS.first[0, one]), int(ROWS.stop[0, one + 1])) for one in (2, 15))
     times = RunTimes(1.0, 0.0, lambda runs: float(sum(stop - first for _, first, stop in runs)))
     found = choose_runs(ROWS, expected_gain, times, seconds=times.seconds(wanted), several=True)
-    assert found is not None
     assert found.runs == wanted
 
 
@@ -149,7 +147,6 @@ def test_rows_worth_the_same_are_looked_at_as_far_as_time_goes() -> None:
     expected_gain = np.zeros(GRID.patch_shape)
     expected_gain[4:16, 3:6] = 1.0
     scan_pass = partial_scan(expected_gain.ravel(), 2.2)
-    assert scan_pass is not None
     shown = patches_shown(sweeps_of_runs(ROWS.sweeps, scan_pass.runs), GRID, CAMERA).reshape(GRID.patch_shape)
     assert np.count_nonzero(shown[4:16, 3:6].all(axis=1)) >= 4
     assert not shown[:3].any()

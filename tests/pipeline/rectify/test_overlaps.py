@@ -166,7 +166,6 @@ def test_turn_is_how_places_move_with_the_swath():
         for step in (-0.5, 0.5)
     )
     found = image.line_and_turn(*(here + there) / 2)
-    assert found is not None
     line, turn = found
     assert line == 1
     np.testing.assert_allclose(turn[:, 0], there - here, atol=1e-5)

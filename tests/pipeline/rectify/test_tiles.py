@@ -164,7 +164,6 @@ def test_reach_is_never_too_little(row: int, column: int, height: int, width: in
     at = at[np.isfinite(at[:, 0])]
     near = ScanPathReach(placed, scan_path, CAMERA, grid).in_columns(columns)
     if len(at):
-        assert near is not None
         knots = near.knots(rows)
         assert max(knots.start, 0) <= max(at[:, 0].min() - 2, 0)
         assert knots.stop >= min(at[:, 0].max() + 3, len(scan_path))

@@ -41,7 +41,6 @@ def test_a_store_is_found_with_its_manifest(tmp_path: Path) -> None:
     assert archive.find("mosaic", "abc") is None
     path = _publish(archive)
     ref = archive.find("mosaic", "abc")
-    assert ref is not None
     assert (ref.uri, ref.path) == ("stages/mosaic/abc", path)
     manifest = archive.manifest(ref)
     assert (manifest["version"], manifest["params"], manifest["inputs"]) == (3, {"tol": 0.1}, ["k0"])

@@ -123,7 +123,6 @@ def test_changes_are_there_once_written(tmp_path: Path) -> None:
     assert ProbabilityStore(path).changes() is None
     write_changes(path, np.array([[0.0, 0.5]], np.float32), 16)
     found = ProbabilityStore(path).changes()
-    assert found is not None
     assert (found.fraction.tolist(), found.patch_px) == ([[0.0, 0.5]], 16)
     np.testing.assert_array_equal(found.old_class, old)
 

@@ -198,7 +198,6 @@ def test_headers_of_real_instruments(real_data: Path) -> None:
     }
     for name, (count, first, last) in spans.items():
         found = read[name].wavelength_nm
-        assert found is not None
         assert (len(found), found[0], found[-1]) == pytest.approx((count, first, last))
     assert read["hdr_gdal__uint16_envi_bigendian.hdr"].dtype == np.dtype(">u2")
     assert read["headwall_mvx__darkReference.hdr"].settings["exposure (ms)"] == "100.0033437"

@@ -57,7 +57,6 @@ def test_emit_reflectance(tmp_path: Path) -> None:
     assert (source.shape, source.nodata, source.bad_bands) == ((7, 6, 5), -9999.0, (2,))
     scene = load_scene_file(tmp_path / "emit.nc")
     np.testing.assert_array_equal(scene.wavelength_nm, NM[[0, 1, 3, 4]])
-    assert scene.fwhm_nm is not None
     np.testing.assert_array_equal(scene.fwhm_nm, 8.5)
     read = xr.open_dataset(tmp_path / "emit.nc", engine="h5netcdf")["reflectance"].values
     np.testing.assert_array_equal(scene.values, read[..., [0, 1, 3, 4]])
@@ -92,7 +91,6 @@ def test_neon_reflectance(tmp_path: Path) -> None:
     np.testing.assert_allclose(scene.values, expected, rtol=1e-6)
     np.testing.assert_array_equal(scene.wavelength_nm, NM)
     assert scene.fwhm_nm is not None
-    assert scene.geobox is not None
     assert scene.geobox.crs.epsg == 32632
     assert scene.geobox.affine[:6] == (2.0, 0.0, CORNER[0], 0.0, -2.0, CORNER[1])
     with rasterio.open(f"HDF5:{tmp_path / 'NEON_SERC.h5'}://SERC/Reflectance/Reflectance_Data") as other:
@@ -130,13 +128,11 @@ def test_prisma_reflectance(tmp_path: Path) -> None:
     cubes = prisma_file(tmp_path / "PRS_L2D.he5")
     scene = load_scene_file(tmp_path / "PRS_L2D.he5")
     np.testing.assert_allclose(scene.wavelength_nm, [450.1, 660.3, 943.4, 977.4, 2490.0], rtol=1e-6)
-    assert scene.fwhm_nm is not None
     np.testing.assert_allclose(scene.fwhm_nm, [11, 12, 10, 13, 9])
     expected = np.stack([cubes["Vnir"][:, 3], cubes["Vnir"][:, 2], cubes["Swir"][:, 1], cubes["Vnir"][:, 1]], axis=-1)
     np.testing.assert_allclose(scene.values[1:, :, :4], 0.1 + expected[1:] / 65535 * 0.8, rtol=1e-6)
     assert np.isnan(scene.values[0, 0]).all()
     assert scene.values[3, 3, 1] == pytest.approx(0.1)  # 0 in one band is a value
-    assert scene.geobox is not None
     assert scene.geobox.crs.epsg == 32632
     assert scene.geobox.affine[:6] == (30.0, 0.0, 400_000.0, 0.0, -30.0, 5_700_000.0)
     assert "a PRISMA product of level 2D; 2 bands without a wavelength are left out" in scene.provenance
@@ -167,7 +163,6 @@ def test_cf_files(tmp_path: Path, dims: tuple[str, ...], unit: str, scale: float
     with xr.open_dataset(path, engine="h5netcdf") as read:
         np.testing.assert_allclose(scene.values, read["radiance"].transpose("y", "x", "wl").values, rtol=1e-6)
     np.testing.assert_allclose(scene.wavelength_nm, NM)
-    assert scene.geobox is not None
     assert scene.geobox.crs.epsg == 32632
     assert scene.geobox.affine[:6] == (2.0, 0.0, CORNER[0], 0.0, -2.0, CORNER[1])
     assert "values are in W m-2 sr-1 um-1" in scene.provenance
@@ -253,7 +248,6 @@ def test_rows_from_the_bottom_up_lie_where_gdal_has_them(tmp_path: Path) -> None
         file.write(values, 1)
     rasterio.shutil.copy(tmp_path / "a.tif", tmp_path / "a.nc", driver="netCDF", FORMAT="NC4")
     cube = open_cube(f"{tmp_path / 'a.nc'}:Band1")
-    assert cube.geobox is not None
     assert cube.geobox.affine.to_gdal() == (500_000, 10, 0, 5_000_000, 0, 10)
     assert np.array_equal(cube.read(0, 3)[::-1, :, 0], values)
 

@@ -55,7 +55,6 @@ def test_labels_seven_metres_beside_the_image(tmp_path: Path) -> None:
     write(tmp_path / "field_labels.tif", CLASSES[:, 7:], NORTH_UP * Affine.translation(7, 0))
     write(tmp_path / "pixel_by_pixel.tif", np.pad(CLASSES[:, 7:], ((0, 0), (0, 7)), mode="edge"), NORTH_UP)
     scene = load_scene_file(path)
-    assert scene.labels is not None
     assert agree(scene) == 1.0
     assert (scene.labels[:, :7] == 255).all()
     assert (scene.labels[:, 7:] != 255).all()

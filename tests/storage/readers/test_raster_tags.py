@@ -62,7 +62,6 @@ def test_wavelengths_stand_in_tags_of_many_kinds(tmp_path: Path, say: Any) -> No
     scene = load_scene_file(tmp_path / "a.tif")
     assert scene.wavelength_nm.tolist() == pytest.approx(NM)
     if say in (say_in_imagery, say_in_a_list):
-        assert scene.fwhm_nm is not None
         assert scene.fwhm_nm.tolist() == pytest.approx([6.0] * 4)
 
 
@@ -70,8 +69,6 @@ def test_a_geotiff_keeps_its_place(tmp_path: Path) -> None:
     """CRS and transform as written; one without the other, and ground control points, are no place, as a note says."""
     write(tmp_path / "a.tif", crs="EPSG:25832", transform=PLACE).close()
     scene = load_scene_file(tmp_path / "a.tif", wavelengths=NM)
-    assert scene.geobox is not None
-    assert scene.geobox.crs is not None
     assert (scene.geobox.affine, scene.geobox.crs.epsg, tuple(scene.geobox.shape)) == (PLACE, 25832, (6, 7))
     write(tmp_path / "b.tif", transform=PLACE).close()
     points = [GroundControlPoint(0, 0, 7, 52), GroundControlPoint(6, 0, 7, 51.9), GroundControlPoint(0, 7, 7.1, 52)]
@@ -141,8 +138,6 @@ def test_a_zarr_store_says_its_place_in_any_of_three_ways(tmp_path: Path) -> Non
         if name == "halves":
             assert geobox is None
         else:
-            assert geobox is not None
-            assert geobox.crs is not None
             assert geobox.crs.epsg == 25832
             np.testing.assert_allclose(geobox.affine[:6], PLACE[:6])
 

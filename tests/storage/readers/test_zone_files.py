@@ -30,7 +30,6 @@ def written(path: Path, shapes: list[Any], crs: Any = 32632, layer: str | None =
 def test_every_format_gives_its_polygons_by_name(name: str, tmp_path: Path) -> None:
     """With the CRS that the file names."""
     found = read_zones(written(tmp_path / name, [SQUARE, OTHER], name=["west", "east"]))
-    assert found.crs is not None
     assert found.crs.to_epsg() == 32632
     assert {key: shape.area for key, shape in found.shapes.items()} == {"west": 100, "east": 50}
     assert found.notes == ()

@@ -65,8 +65,6 @@ def test_a_log_comes_back() -> None:
     journal.record_capture(ONE)
     journal.record_end(replace(ONE, log=MotionLog(position, 1000.0, 0.06, 0.04)))
     found = CaptureJournal(kept).holding(FINE, 0)
-    assert found is not None
-    assert found.log is not None
     np.testing.assert_array_equal(found.log.position, position)
     assert (found.log.rate_hz, found.log.started_s, found.log.start_error_s) == (1000.0, 0.06, 0.04)
 

@@ -29,7 +29,6 @@ RADIAN_PX = NM * 1e-9 / 15e-3 / RIG.camera.ifov_rad  # lambda / D
 def test_widths_at_rest():
     """0.37 px at 400 nm and 0.92 px at 1000 nm along the scan, where 10.6 mm are seen; 0.71 of it along the line."""
     waves = DIFFRACTION.moments(RIG, NM, "airy").waves
-    assert waves is not None
     along, scan = 1.029 * waves  # full widths at half maximum of the pattern, of the wavelength over the pupil's widths
     assert scan[[0, 2]] == pytest.approx([0.37, 0.92], abs=0.005)
     assert along == pytest.approx(scan * np.sqrt(0.5))

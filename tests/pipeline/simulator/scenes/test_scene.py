@@ -182,7 +182,6 @@ def test_a_raster_is_drawn_when_it_is_looked_at() -> None:
         "s", "k", SceneRaster((4, 5, 2), labelled=True, draw=draw), light, np.ones(2, np.float32), WAVELENGTH
     )
     assert (scene.shape, scene.labelled, draw.call_count) == ((4, 5), True, 0)
-    assert scene.labels is not None
     assert scene.labels.shape == scene.planes.shape[:2]
     assert replace(scene, key="other").planes is scene.planes
     assert draw.call_count == 1
