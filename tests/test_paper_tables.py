@@ -16,7 +16,7 @@ from models.network.spectral import LineSpec, patches_of
 from models.policies.policies import PIXEL_SCORES, score_multiply_adds, score_patches
 from models.reading.inference import CoarsePrediction, segment
 from pipeline.geometry.grid import SceneGrid
-from pipeline.planning.prices import select_patches
+from pipeline.planning.coverage import select_patches
 from pipeline.simulator.scenes.scene import raster_from_values
 from tests.conftest import CLASSES, patchy_scene, random_weights
 

@@ -15,10 +15,19 @@ from odc.geo.geobox import GeoBox
 from rich.console import Console
 from rich.markup import escape
 
-from flows.archive.export_layers import ExportedRun, Layer, map_layers, open_exported, prior_map_layers
+from flows.archive.export_layers import (
+    NO_PRODUCTS,
+    ExportedRun,
+    Layer,
+    ProductChoice,
+    ProductFlags,
+    choose_products,
+    map_layers,
+    open_exported,
+    prior_map_layers,
+)
 from flows.archive.export_values import CSV, spectral_layers, write_areas
 from flows.archive.export_zones import check_zones, write_zones
-from flows.archive.product_choice import NO_PRODUCTS, ProductChoice, ProductFlags, choose_products
 from flows.cli.app import ArchiveName, AsJson, OutFile, Switch, check_outside, stderr
 from flows.terminal.processes import DONE
 from flows.terminal.progress import print_json

@@ -1,25 +1,29 @@
-"""Open a published run for export, and list its images for map programs."""
+"""Open a published run for export, parse the flags of its products, and list its images for map programs."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from affine import Affine
+from cyclopts import Parameter
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
+from flows.cli.app import Switch, split_list
 from flows.publish.receipt import Receipt, check_receipt
+from flows.settings.load import time_of_visit
 from flows.settings.survey_settings import RIG
-from flows.settings.visits import time_of_visit
 from flows.tasks.stages.maps import colours_of
 from pipeline.errors import IncompleteStoreError, SettingsError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.georeference import zoomed_out
+from pipeline.products.indices import SpectralIndex, find_index
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.archive.records import RECEIPT, read_run, read_store
@@ -28,7 +32,74 @@ from storage.arrays.georeference import load_geobox
 from storage.arrays.ground_maps import StoredImage, open_image
 from storage.arrays.layout import grid_of, open_group
 from storage.export.image_files import ANGULAR, CogImage, angular_geobox
+from storage.export.map_files import UNITS, DoseUnit
 from storage.readers.recordings import stores_of_lines
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class ProductFlags:
+    """Flags of the products to make of a run."""
+
+    reflectance: Annotated[
+        Switch,
+        Parameter(help="Also all bands as GeoTIFF: the coarse mosaic, of a raster its pixels, both without noise."),
+    ] = False
+    indices: Annotated[
+        str | None, Parameter(help="Spectral indices to write as GeoTIFF, with commas: NDVI,NDRE,MCARI,PRI.")
+    ] = None
+    polygons: Annotated[
+        Switch, Parameter(help="Also the classes as polygons: GeoPackage, and GeoJSON where there is a CRS.")
+    ] = False
+    prescription: Annotated[
+        str | None,
+        Parameter(help="Doses by class, with commas: weed=2.5,grass=1. Written as GeoPackage and ISOXML task data."),
+    ] = None
+    dose_unit: Annotated[str, Parameter(help="Unit of the doses: l/ha or kg/ha.")] = "l/ha"
+    cell: Annotated[
+        float | None, Parameter(help="Side of the prescription's cells [m]; by default 3 m, or a pixel if larger.")
+    ] = None
+
+
+NO_PRODUCTS = ProductFlags()
+MOST_CELL_M = 1000
+
+
+@dataclass(frozen=True)
+class ProductChoice:
+    """The parsed flags: indices, doses by class (empty without a prescription) and their unit."""
+
+    flags: ProductFlags
+    indices: tuple[SpectralIndex, ...]
+    doses: Mapping[str, float]
+    unit: DoseUnit
+
+
+def choose_products(flags: ProductFlags) -> ProductChoice:
+    """Parse the flags (SettingsError: a number, an index or a unit is wrong)."""
+    if flags.cell is not None and not 0 < flags.cell <= MOST_CELL_M:
+        raise SettingsError(f"--cell expects metres above 0 and at most {MOST_CELL_M:g}, got {flags.cell:g}")
+    if flags.dose_unit not in UNITS:
+        raise SettingsError(f"--dose-unit expects {' or '.join(UNITS)}, got {flags.dose_unit!r}")
+    for name in ("prescription", "indices"):
+        if (given := getattr(flags, name)) is not None and not split_list(given):
+            raise SettingsError(f"--{name} {given!r} names nothing; give names with commas, or leave it out")
+    doses = {}
+    for part in split_list(flags.prescription):
+        name, _, number = part.partition("=")
+        if not re.fullmatch(r"\s*\d+(\.\d*)?|\s*\.\d+", number) or not name.strip():
+            raise SettingsError(
+                f"--prescription expects classes with numbers, weed=2.5, got {part!r}; numbers are 0 or more, without "
+                "an exponent"
+            )
+        if name.strip() in doses:
+            raise SettingsError(f"--prescription names {name.strip()} twice; give it one number")
+        doses[name.strip()] = float(number)
+    if not doses and (flags.cell is not None or flags.dose_unit != NO_PRODUCTS.dose_unit):
+        raise SettingsError("--cell and --dose-unit need --prescription, such as weed=2.5; give it or leave them out")
+    indices = tuple(dict.fromkeys(find_index(name) for name in split_list(flags.indices)))
+    return ProductChoice(flags, indices, doses, UNITS[flags.dose_unit])
+
 
 Rows = Iterator[tuple[int, NDArray[Any]]]
 RGB = ("red", "green", "blue")

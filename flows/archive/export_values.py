@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
-from flows.archive.export_layers import ExportedRun, Layer, Rows, geobox_of, layer_tags
-from flows.archive.product_choice import ProductChoice
+from flows.archive.export_layers import ExportedRun, Layer, ProductChoice, Rows, geobox_of, layer_tags
 from flows.publish.receipt import hectares_of_classes
 from models.evaluation.metrics import stratified_fractions
 from pipeline.errors import SettingsError

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from odc.geo import CRS, resxy_
 from odc.geo.geobox import GeoBox
 
-from flows.archive.export_layers import ExportedRun
-from flows.archive.product_choice import ProductChoice
+from flows.archive.export_layers import ExportedRun, ProductChoice
 from flows.publish.receipt import hectares_of_classes
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import UNLABELLED, cuts

@@ -16,7 +16,7 @@ from rich.markup import escape
 from flows.archive.stale_runs import called
 from flows.cli.app import ArchiveName, AsJson, OutFile, check_outside, stderr
 from flows.publish.receipt import check_receipt
-from flows.settings.visits import time_of_visit
+from flows.settings.load import time_of_visit
 from flows.tasks.scores import score_of
 from flows.terminal.figures import counted, format_area, format_percent
 from flows.terminal.processes import DONE

@@ -34,8 +34,8 @@ from flows.terminal.processes import DONE
 from flows.terminal.progress import put_out, table
 from pipeline.errors import IncompleteStoreError, PipelineError
 from pipeline.lazy import deferred
+from pipeline.planning.coverage import BYTES_PER_SAMPLE, raw_bytes
 from pipeline.planning.fine_pass import FinePlan
-from pipeline.planning.prices import BYTES_PER_SAMPLE, raw_bytes
 from pipeline.planning.uniform_scans import format_scan, frontier
 from pipeline.signal.subspace import SMALL_FIELD
 from storage.archive.archive import Archive

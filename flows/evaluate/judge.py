@@ -29,7 +29,7 @@ from models.network.sizes import multiply_adds
 from models.policies.policies import score_multiply_adds, score_patches
 from models.reading.inference import segment
 from models.weights.files import Weights
-from pipeline.planning.prices import frame_patches
+from pipeline.planning.coverage import frame_patches
 
 ORACLE = "oracle"
 ENDS = ("none", "all")  # no patch, every patch

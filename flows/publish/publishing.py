@@ -19,8 +19,7 @@ from flows.publish.run_folder import Published, asked_settings, extend_with_accu
 from flows.settings.survey_settings import OF_THE_MACHINE
 from flows.settings.values import KEEP_SIGNAL
 from flows.tasks.open_survey import STAGES, OpenSurvey, RunRef
-from flows.tasks.prefect_modules import prefect_artifacts
-from flows.tasks.prefect_tasks import as_task, inside_flow
+from flows.tasks.prefect_tasks import as_task, inside_flow, prefect_artifacts
 from flows.tasks.stages.accuracy import evaluate
 from flows.tasks.stages.capture import capture_coarse, capture_fine
 from flows.tasks.stages.condense import raw_differs

@@ -47,8 +47,8 @@ from flows.tasks.stages.maps import STORE
 from flows.tasks.stages.placement import load_registration
 from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.grid import patch_pixels
+from pipeline.planning.coverage import BYTES_PER_SAMPLE, SavingEntry, capture_savings, raw_bytes
 from pipeline.planning.fine_pass import FinePlan
-from pipeline.planning.prices import BYTES_PER_SAMPLE, SavingEntry, capture_savings, raw_bytes
 from pipeline.planning.uniform_scans import MIOU, format_scan
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef

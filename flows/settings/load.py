@@ -7,8 +7,9 @@ import difflib
 import math
 import types
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import MISSING
-from datetime import datetime
+from datetime import UTC, datetime, timedelta
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -37,12 +38,13 @@ from flows.settings.survey_settings import (
     source_of,
 )
 from flows.settings.values import EXTENT_PART, EXTENT_WHOLE, parse_moment, parse_text
-from flows.settings.visits import time_of_visit
 from pipeline.errors import BudgetError, PoseError, SettingsError
 from pipeline.planning.fine_pass import FIRST_STEPS
 from pipeline.rig.device_settings import MOST_PAIRS
 from pipeline.setting_fields import format_number, span_of
 from pipeline.simulator.scenes.built_in import SCOUTING_NAMES
+from pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
+from storage.archive.records import Run
 from storage.archive.staging import read_toml
 from storage.readers.recordings import find_recorded_run
 
@@ -478,3 +480,26 @@ def place_of(key: str, origin: str | None) -> str:
     if origin == "flag" and "." not in (flag := FLAGS.get(key, key)):
         return "--" + flag.replace("_", "-")
     return f"'{key}'" + (f" in {origin}" if origin not in (None, "flag") else "")
+
+
+def time_of_visit(run: Run) -> str | None:
+    """Return the moment that names a run's visit, else day and hour of a built-in scene, else when the run began.
+
+    A day of a built-in scene counts in the year of the run. The moment is in ISO 8601 in UTC; None: nothing is known.
+    """
+    named, began = _moment(run.settings.get("visit")), _moment(run.receipt.get("started")) or _moment(run.created)
+    if named is not None or began is None or run.settings.get("scene") not in BUILT_IN_SCENES:
+        return named or began
+    day, hour = (run.settings.get(name) for name in ("day", "hour"))
+    with suppress(TypeError, ValueError, OverflowError):
+        grown = timedelta(days=(USUAL_DAY if day is None else day) - 1, hours=USUAL_HOUR if hour is None else hour)
+        return (datetime(int(began[:4]), 1, 1, tzinfo=UTC) + grown).isoformat()
+    return began
+
+
+def _moment(value: object) -> str | None:
+    """Return a moment in ISO 8601 in UTC; None for anything else."""
+    with suppress(ValueError, OverflowError):
+        found = datetime.fromisoformat(value) if isinstance(value, str) else None
+        return None if found is None else found.replace(tzinfo=found.tzinfo or UTC).astimezone(UTC).isoformat()
+    return None

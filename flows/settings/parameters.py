@@ -108,8 +108,7 @@ class SurveySettings(BaseModel):
         """
         requested, there = self.settings(), load_settings(file).rig
         for name in OF_THE_LINES:
-            own, other = getattr(requested.rig, name), getattr(there, name)
-            if own != other:
+            if (own := getattr(requested.rig, name)) != (other := getattr(there, name)):
                 raise SettingsError(
                     f"rig.{name} is {other!r} in {file} and {own!r} in the settings of the survey, and lines mean the "
                     "same by one value only: state it in both"

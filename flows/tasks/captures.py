@@ -14,8 +14,14 @@ from flows.settings.parameters import SurveySettings, at_due_time
 from flows.settings.survey_settings import RIG, Settings
 from flows.settings.values import KEEP_RAW
 from flows.tasks.open_survey import OpenSurvey, RunRef
-from flows.tasks.prefect_modules import prefect_context, prefect_deployments, prefect_exceptions
-from flows.tasks.prefect_tasks import as_task, current_observer, inside_flow
+from flows.tasks.prefect_tasks import (
+    as_task,
+    current_observer,
+    inside_flow,
+    prefect_context,
+    prefect_deployments,
+    prefect_exceptions,
+)
 from flows.tasks.run import SurveyRun, open_run
 from flows.tasks.scene import scene_of_visit
 from flows.tasks.stages.attention import score

@@ -22,7 +22,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from flows.tasks.prefect_modules import (
+from flows.tasks.prefect_tasks import (
     prefect,
     prefect_client,
     prefect_filters,

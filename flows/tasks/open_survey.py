@@ -10,8 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from flows.tasks.prefect_modules import prefect_concurrency
-from flows.tasks.prefect_tasks import Observer, current_observer, inside_flow
+from flows.tasks.prefect_tasks import Observer, current_observer, inside_flow, prefect_concurrency
 from flows.tasks.run import SurveyRun, now
 from flows.tasks.stage import Stage
 from flows.tasks.stages.accuracy import evaluate

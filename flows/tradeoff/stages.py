@@ -32,8 +32,7 @@ from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, cuts
 from pipeline.geometry.scan import CostModel, Floats, Sweep
-from pipeline.planning.coverage import cheapest_full, full_sweeps, uniform_sweeps
-from pipeline.planning.prices import frame_patches, raw_bytes
+from pipeline.planning.coverage import cheapest_full, frame_patches, full_sweeps, raw_bytes, uniform_sweeps
 from pipeline.planning.uniform_scans import format_scan
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.resample import resample

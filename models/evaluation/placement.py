@@ -20,7 +20,7 @@ from models.reading.inference import CoarsePrediction, captured, overview_of, pa
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, patch_pixels
 from pipeline.lazy import torch
-from pipeline.planning.prices import frame_patches
+from pipeline.planning.coverage import frame_patches
 
 Values = NDArray[np.floating]
 RANDOM_DRAWS = 5

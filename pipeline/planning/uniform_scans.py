@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pipeline.errors import BudgetError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel, Sweep
-from pipeline.planning.prices import raw_bytes
+from pipeline.planning.coverage import raw_bytes
 
 EXPOSURES_AN_OCTAVE = 8  # candidates
 LOSS = 0.001  # of mIoU: scans that differ by less count as equal

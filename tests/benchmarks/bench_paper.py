@@ -32,7 +32,7 @@ from models.training.examples import normalised, observe
 from models.weights.files import Weights
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, patch_pixels
-from pipeline.planning.prices import select_patches
+from pipeline.planning.coverage import select_patches
 
 COUNTS = (100, 200, 300, 400, 500)
 NAMES = {4: "256", 2: "512", 1: "1024"}  # of inputs, by fine pixels to a coarse one

@@ -271,7 +271,7 @@ def _judged(source: str, weights: Weights, seen: CoarsePrediction, fine: Values,
     from models.network.machine import one_thread
     from models.policies.policies import score_patches
     from models.reading.inference import coarse_prediction_of_columns, segment
-    from pipeline.planning.prices import frame_patches
+    from pipeline.planning.coverage import frame_patches
 
     training, found = weights.record["training"], []
     words = f"a map; training {training.get('processor_seconds', 0)} s CPU, {training['steps']} steps"

@@ -26,7 +26,7 @@ from models.training.objective import map_loss, pixel_losses
 from models.training.train import TrainingSettings, train
 from models.weights.files import load_weights, save_weights
 from pipeline.geometry.grid import SceneGrid
-from pipeline.planning.prices import frame_patches, select_patches
+from pipeline.planning.coverage import frame_patches, select_patches
 from tests.models.conftest import SMALL, coarse_prediction, make_network, noise, plain_weights
 
 NONE = torch.zeros(1, 0, dtype=torch.int64)

@@ -24,9 +24,8 @@ from rich.console import Console
 from scipy import ndimage
 
 from flows.archive.export_command import run_export
-from flows.archive.export_layers import open_exported
+from flows.archive.export_layers import ProductFlags, choose_products, open_exported
 from flows.archive.export_zones import ClassRaster, check_zones, dose_cells
-from flows.archive.product_choice import ProductFlags, choose_products
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from pipeline.errors import SettingsError, WavelengthError

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from flows.archive.history import FieldHistory, read_history, render_history
-from flows.settings.visits import time_of_visit
+from flows.settings.load import time_of_visit
 from storage.archive.archive import Archive
 from storage.archive.records import Run
 from tests.flows.conftest import Page

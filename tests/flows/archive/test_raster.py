@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from flows.archive.export_command import run_export
-from flows.archive.product_choice import ProductFlags, choose_products
+from flows.archive.export_layers import ProductFlags, choose_products
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from flows.terminal.figures import format_area, format_count

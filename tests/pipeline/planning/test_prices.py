@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel, Sweep
-from pipeline.planning.coverage import full_sweeps
-from pipeline.planning.prices import (
+from pipeline.planning.coverage import (
     SavingEntry,
     capture_savings,
     count_samples,
     frame_patches,
+    full_sweeps,
     raw_bytes,
     select_patches,
 )
