@@ -16,9 +16,9 @@ from xarray.backends import BackendArray
 from xarray.core import indexing
 
 from storage.arrays.georeference import GRID_MAPPING
-from storage.arrays.layout import open_group
+from storage.arrays.layout import open_group, score_layout
 from storage.arrays.mosaics import Mosaic, open_mosaic
-from storage.arrays.signal_cubes import SignalCube, open_signal_cube, read_coordinates, score_layout
+from storage.arrays.signal_cubes import SignalCube, open_signal_cube, read_coordinates
 
 Restore = Callable[[slice, slice, Sequence[int]], NDArray[np.float32]]  # rows, columns, bands: (row, column, band)
 OF_WAVELENGTHS = ("band", "wavelength")

@@ -101,6 +101,7 @@ def test_storage_stores() -> None:
     """It rectifies and calibrates nothing: of `rectify` it knows what it writes down, of `signal` what files need."""
     known = {
         "storage/arrays/geolocation.py": {"pipeline.rectify.placed", "pipeline.rectify.scan_paths"},
+        "storage/arrays/layout.py": {f"pipeline.signal.{one}" for one in ("components", "condense")},
         "storage/arrays/mosaics.py": {"pipeline.signal.components"},
         "storage/arrays/signal_cubes.py": {f"pipeline.signal.{one}" for one in ("calibrate", "components", "condense")},
         "storage/arrays/cubes.py": {"pipeline.signal.subspace"},

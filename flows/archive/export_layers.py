@@ -28,9 +28,9 @@ from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.archive.records import RECEIPT, read_run, read_store
 from storage.arrays.class_maps import OLD_CLASS, ClassNames, ProbabilityStore, legend_of
-from storage.arrays.georeference import load_geobox
+from storage.arrays.georeference import grid_of, load_geobox
 from storage.arrays.ground_maps import StoredImage, open_image
-from storage.arrays.layout import grid_of, open_group
+from storage.arrays.layout import open_group
 from storage.export.image_files import ANGULAR, CogImage, angular_geobox
 from storage.export.map_files import UNITS, DoseUnit
 from storage.readers.recordings import stores_of_lines

@@ -21,9 +21,9 @@ from pipeline.ground.map_grid import GroundGrid, grid_of_map, image_at, map_bloc
 from pipeline.ground.view import GroundView, RigPose
 from pipeline.products.indices import Floats, SpectralIndex, index_values, pick_bands, white_level
 from storage.archive.whole_files import write_whole
-from storage.arrays.georeference import load_geobox
+from storage.arrays.georeference import grid_of, load_geobox
 from storage.arrays.ground_maps import open_image
-from storage.arrays.layout import grid_of, open_group, read_bands
+from storage.arrays.layout import open_group, read_bands
 from storage.arrays.mosaics import Mosaic, open_mosaic
 from storage.export.image_files import CogImage
 

@@ -31,7 +31,7 @@ from pipeline.lazy import GeoBox
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, array_digest, stage_key
 from storage.archive.manifests import try_manifest
-from storage.arrays.layout import AngularGrid
+from storage.arrays.georeference import AngularGrid
 
 Report = Callable[[float], None]  # progress of a stage, 0..1
 

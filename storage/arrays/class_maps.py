@@ -19,15 +19,13 @@ from numpy.typing import NDArray
 
 from pipeline.errors import IncompleteStoreError, ShapeError
 from pipeline.geometry.grid import UNLABELLED, cuts
-from storage.arrays.georeference import create_placed_group
+from storage.arrays.georeference import AngularGrid, create_placed_group, grid_of
 from storage.arrays.layout import (
     MAP_PACKING,
     SHARD_ROWS,
-    AngularGrid,
     array_of,
     create_array,
     damage_named,
-    grid_of,
     image_spec,
     open_group,
     read_array,

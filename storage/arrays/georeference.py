@@ -8,6 +8,7 @@ odc-geo; its grid mapping has the GeoTransform.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from affine import Affine
 from pipeline.errors import PoseError
 from pipeline.ground.georeference import zoomed_out
 from pipeline.lazy import GeoBox, odc_crs, odc_geo_xr, odc_geobox
-from storage.arrays.layout import AngularGrid, SmallArray, create_group, damage_named, open_group
+from storage.arrays.layout import SmallArray, create_group, damage_named, open_group
 
 GRID_MAPPING = "spatial_ref"
 # on every image: CF's link to the grid mapping, and the same as a coordinate, so that plain xarray takes it for one
@@ -36,8 +37,64 @@ _CONVENTIONS = [
         ("689b58e2-cf7b-45e0-9fff-9cfc0883d6b4", "spatial", "Relation of array indices to the map's coordinates"),
     )
 ]
+_SPATIAL_CONVENTION = {
+    "uuid": "689b58e2-cf7b-45e0-9fff-9cfc0883d6b4",
+    "name": "spatial",
+    "schema_url": "https://raw.githubusercontent.com/zarr-conventions/spatial/refs/tags/v1/schema.json",
+    "spec_url": "https://github.com/zarr-conventions/spatial/blob/v1/README.md",
+    "description": "Relation of array indices to tangents of the undeflected direction; there is no CRS",
+}
 _DEGREES = {"x": ("longitude", "degrees_east"), "y": ("latitude", "degrees_north")}
 _EVEN = 1e-3  # of a step, by which coordinates may differ from an even grid's
+
+
+@dataclass(frozen=True)
+class AngularGrid:
+    """The grid of an image in tangents from the undeflected direction, the scene's centre; and its place on earth."""
+
+    ifov_rad: float
+    scene_shape: tuple[int, int]  # (y, x) of the fine grid [px]
+    factor: int = 1  # fine px a pixel
+    geobox: GeoBox | None = None  # of the fine grid, where the scene's file says it
+
+    def attributes(self, shape: tuple[int, int]) -> dict[str, Any]:
+        """Return the GeoZarr ``spatial:`` attributes of an image of (y, x) ``shape``.
+
+        The transform maps pixel corners.
+        """
+        step = self.ifov_rad * self.factor
+        top, left = (-size / 2 * self.ifov_rad for size in self.scene_shape)
+        return {
+            "spatial:dimensions": ["y", "x"],
+            "spatial:shape": list(shape),
+            "spatial:transform_type": "affine",
+            "spatial:transform": [step, 0.0, left, 0.0, step, top],
+            "spatial:bbox": [left, top, left + step * shape[1], top + step * shape[0]],
+            "spatial:registration": "pixel",
+            "zarr_conventions": [_SPATIAL_CONVENTION],
+        }
+
+    def coordinates(self, shape: tuple[int, int]) -> dict[str, SmallArray]:
+        """Return the coordinates y and x [rad] of the pixel centres of an image of (y, x) ``shape``."""
+        step, found = self.ifov_rad * self.factor, {}
+        for name, size, whole in zip("yx", shape, self.scene_shape, strict=True):
+            about = {"long_name": f"tangent of the angle from the undeflected direction along {name}", "units": "rad"}
+            centres = -whole / 2 * self.ifov_rad + step * (np.arange(size) + 0.5)
+            found[name] = SmallArray((name,), centres, {**about, "axis": name.upper()})
+        return found
+
+    def record(self) -> dict[str, Any]:
+        """Return the values from which `grid_of` makes this grid of angles again."""
+        return {"ifov_rad": self.ifov_rad, "scene_shape": list(self.scene_shape), "factor": self.factor}
+
+
+def grid_of(attributes: Mapping[str, Any]) -> AngularGrid | None:
+    """Return the grid of angles that a group's attributes record, or None."""
+    record = attributes.get("angular_grid")
+    if not isinstance(record, dict):
+        return None
+    y, x = record["scene_shape"]
+    return AngularGrid(float(record["ifov_rad"]), (int(y), int(x)), int(record["factor"]))
 
 
 def create_placed_group(

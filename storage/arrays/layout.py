@@ -1,7 +1,8 @@
-"""Define the layout of stored arrays: Zarr v3 codecs and chunks, bands, CF and GeoZarr attributes.
+"""Define the layout of stored arrays: Zarr v3 codecs and chunks, bands, components and scores, CF attributes.
 
 Chunks are 32 x 32 px with all bands, in shards of 64 rows, each with its own crc32c. A patch is one range read, and a
-flipped bit is an error instead of a wrong number. An image without bands has one chunk in each shard.
+flipped bit is an error instead of a wrong number. An image without bands has one chunk in each shard. Scores of
+components have chunks of 64 x 64 px.
 """
 
 from __future__ import annotations
@@ -23,24 +24,20 @@ from zarr.storage import MemoryStore
 
 from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.lazy import GeoBox
+from pipeline.signal.components import Components
+from pipeline.signal.condense import whole_steps
 
 StorePlace = Path | MemoryStore  # where a store lies
 CHUNK_PX = 32
 SHARD_ROWS = 64
 SHARD_COLUMNS = 640
+SCORE_CHUNK = 64  # rows and columns of a chunk of scores, with all components
+LARGEST_SHORT = 32_000  # of scores and residuals in steps; larger ones are stored in 32 bits
 Packing = tuple[Literal["zstd", "lz4"], int]
 PACKING: Packing = ("zstd", 3)  # by blosc: codec and level
 MAP_PACKING: Packing = ("zstd", 5)  # of maps: a tenth shorter than at level 3; 9 takes forty times as long
 RAW_PACKING: Packing = ("lz4", 1)  # of raw lines, which are read once: a fifth of the time of zstd, 11 % longer
 
-_SPATIAL_CONVENTION = {
-    "uuid": "689b58e2-cf7b-45e0-9fff-9cfc0883d6b4",
-    "name": "spatial",
-    "schema_url": "https://raw.githubusercontent.com/zarr-conventions/spatial/refs/tags/v1/schema.json",
-    "spec_url": "https://github.com/zarr-conventions/spatial/blob/v1/README.md",
-    "description": "Relation of array indices to tangents of the undeflected direction; there is no CRS",
-}
 # images of a class map, and their value for nodata
 NO_CLASS = {"classes": UNLABELLED, "confidence": np.nan}
 
@@ -51,55 +48,6 @@ class SmallArray(NamedTuple):
     dims: tuple[str, ...]
     values: NDArray[Any]
     attributes: dict[str, Any]
-
-
-@dataclass(frozen=True)
-class AngularGrid:
-    """The grid of an image in tangents from the undeflected direction, the scene's centre; and its place on earth."""
-
-    ifov_rad: float
-    scene_shape: tuple[int, int]  # (y, x) of the fine grid [px]
-    factor: int = 1  # fine px a pixel
-    geobox: GeoBox | None = None  # of the fine grid, where the scene's file says it
-
-    def attributes(self, shape: tuple[int, int]) -> dict[str, Any]:
-        """Return the GeoZarr ``spatial:`` attributes of an image of (y, x) ``shape``.
-
-        The transform maps pixel corners.
-        """
-        step = self.ifov_rad * self.factor
-        top, left = (-size / 2 * self.ifov_rad for size in self.scene_shape)
-        return {
-            "spatial:dimensions": ["y", "x"],
-            "spatial:shape": list(shape),
-            "spatial:transform_type": "affine",
-            "spatial:transform": [step, 0.0, left, 0.0, step, top],
-            "spatial:bbox": [left, top, left + step * shape[1], top + step * shape[0]],
-            "spatial:registration": "pixel",
-            "zarr_conventions": [_SPATIAL_CONVENTION],
-        }
-
-    def coordinates(self, shape: tuple[int, int]) -> dict[str, SmallArray]:
-        """Return the coordinates y and x [rad] of the pixel centres of an image of (y, x) ``shape``."""
-        step, found = self.ifov_rad * self.factor, {}
-        for name, size, whole in zip("yx", shape, self.scene_shape, strict=True):
-            about = {"long_name": f"tangent of the angle from the undeflected direction along {name}", "units": "rad"}
-            centres = -whole / 2 * self.ifov_rad + step * (np.arange(size) + 0.5)
-            found[name] = SmallArray((name,), centres, {**about, "axis": name.upper()})
-        return found
-
-    def record(self) -> dict[str, Any]:
-        """Return the values from which `grid_of` makes this grid of angles again."""
-        return {"ifov_rad": self.ifov_rad, "scene_shape": list(self.scene_shape), "factor": self.factor}
-
-
-def grid_of(attributes: Mapping[str, Any]) -> AngularGrid | None:
-    """Return the grid of angles that a group's attributes record, or None."""
-    record = attributes.get("angular_grid")
-    if not isinstance(record, dict):
-        return None
-    y, x = record["scene_shape"]
-    return AngularGrid(float(record["ifov_rad"]), (int(y), int(x)), int(record["factor"]))
 
 
 def create_group(
@@ -218,6 +166,64 @@ def write_bands(group: zarr.Group, wavelength_nm: NDArray[np.float64], fwhm_nm: 
         group, "fwhm", ("band",), np.asarray(fwhm_nm), {"long_name": "full width at half maximum", "units": "nm"}
     )
     return "wavelength fwhm"
+
+
+def integers_for(largest: float) -> str:
+    """Return the type of scores or residuals of at most ``largest`` steps."""
+    return "<i2" if largest <= LARGEST_SHORT else "<i4"
+
+
+def score_spec(dims: tuple[str, str, str], shape: tuple[int, int, int], largest: float) -> ArraySpec:
+    """Return the layout of scores (component, row, column) of at most ``largest`` steps."""
+    count, rows, columns = shape
+    chunk = (max(count, 1), min(SCORE_CHUNK, max(rows, 1)), min(SCORE_CHUNK, max(columns, 1)))
+    whole = (
+        -(-min(size, most) // part) * part
+        for size, most, part in zip((rows, columns), (SHARD_ROWS, SHARD_COLUMNS), chunk[1:], strict=True)
+    )
+    return ArraySpec(dims, shape, integers_for(largest), chunk, (chunk[0], *whole))
+
+
+def steps_within(scores: NDArray[np.floating], step: float, kind: np.dtype[Any]) -> NDArray[np.floating]:
+    """Return scores in whole steps, clipped to the range of an integer type."""
+    most = np.iinfo(kind).max & ~127  # a float32
+    return np.asarray(np.clip(whole_steps(scores, step), -most, most))
+
+
+def write_components(group: zarr.Group, components: Components) -> None:
+    """Store the components that restore spectra."""
+    about = {"coordinates": "wavelength", "units": "1"}
+    rows = components.axes * np.nan_to_num(components.noise)
+    write_small(group, "axes", ("component", "band"), rows, {"long_name": "scene value of a score of 1", **about})
+    write_small(group, "mean", ("band",), components.mean, {"long_name": "mean scene value", **about})
+    write_small(
+        group,
+        "noise",
+        ("band",),
+        components.noise,
+        {"long_name": "standard deviation of one spectrum's noise", **about},
+    )
+
+
+def read_components(group: zarr.Group) -> Components:
+    """Read what `write_components` stored."""
+    rows, mean, noise = (read_array(group, name).astype(np.float64) for name in ("axes", "mean", "noise"))
+    lit = np.isfinite(noise)
+    return Components(mean, np.where(lit, rows / np.where(lit, noise, 1), 0) if len(rows) else rows, noise)
+
+
+def step_of(group: zarr.Group, said: str = "scale_factor") -> float:
+    """Return the step of a store's scores, or another numeric attribute (IncompleteStoreError: damaged)."""
+    scores = array_of(group, "scores")
+    with damage_named(str(group.store_path)):
+        return float(scores.attrs[said])  # type: ignore[arg-type]
+
+
+def score_layout(group: zarr.Group) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Return the rows and columns of scores, and of a shard of them (IncompleteStoreError: damaged)."""
+    scores = array_of(group, "scores")
+    (_, rows, columns), (_, deep, wide) = scores.shape, scores.shards or scores.chunks
+    return (rows, columns), (deep, wide)
 
 
 _FILTERING = Lock()

@@ -14,31 +14,27 @@ from numpy.typing import NDArray
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import block_means, cuts
 from pipeline.signal.components import Components, broad_weights
-from storage.arrays.georeference import create_placed_group
+from storage.arrays.georeference import AngularGrid, create_placed_group, grid_of
 from storage.arrays.layout import (
+    LARGEST_SHORT,
     SHARD_ROWS,
-    AngularGrid,
     array_of,
     blank_pixels,
     create_array,
     create_group,
-    grid_of,
     image_spec,
     open_group,
     read_array,
     read_bands,
-    tile_place,
-    write_bands,
-    write_counts,
-    write_image,
-)
-from storage.arrays.signal_cubes import (
-    LARGEST_SHORT,
     read_components,
     score_spec,
     step_of,
     steps_within,
+    tile_place,
+    write_bands,
     write_components,
+    write_counts,
+    write_image,
 )
 
 CAPTURES = "capture"  # array of a mosaic whose pixels were captured in several ways

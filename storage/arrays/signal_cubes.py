@@ -24,7 +24,7 @@ from zarr.storage import MemoryStore
 from pipeline.geometry.mirror import mirror_throughput
 from pipeline.signal.calibrate import judge_elements
 from pipeline.signal.components import Components
-from pipeline.signal.condense import RESIDUAL_STEP, UNUSABLE, whole_steps
+from pipeline.signal.condense import RESIDUAL_STEP, UNUSABLE
 from pipeline.source import References
 from storage.arrays.cubes import (
     RawCube,
@@ -37,31 +37,28 @@ from storage.arrays.cubes import (
     write_references,
 )
 from storage.arrays.layout import (
-    SHARD_ROWS,
     ArraySpec,
     StorePlace,
-    array_of,
     bytes_held,
     create_array,
     create_group,
     damage_named,
+    integers_for,
     open_group,
     read_array,
+    read_components,
+    score_spec,
+    step_of,
+    steps_within,
     write_bands,
+    write_components,
     write_counts,
     write_small,
 )
 
-CHUNK = 64  # lines and samples of a chunk of scores, with all components
-SHARD_SAMPLES = 640
 FRAMES_OF = "frames_of"  # attribute: the sweep beside it that holds the dark and white frames of both
 MOST_DN = np.iinfo(np.uint16).max
 SIGNAL_ARRAYS = ("scores", "quality", "axes", "mean", "noise", "rare_line", "rare_sample", "rare_residual")
-LARGEST_SHORT = 32_000  # of scores and residuals in steps; larger ones are stored in 32 bits
-
-
-def _kind(largest: float) -> str:
-    return "<i2" if largest <= LARGEST_SHORT else "<i4"
 
 
 @dataclass(frozen=True)
@@ -78,45 +75,6 @@ class LineRows:
         """Return the facts of each line as a tuple."""
         columns = (self.time_s, self.mirror_x, self.mirror_y, self.exposure_ms, self.valid)
         return list(zip(*(column.tolist() for column in columns), strict=True))
-
-
-def score_spec(dims: tuple[str, str, str], shape: tuple[int, int, int], largest: float) -> ArraySpec:
-    """Return the layout of scores (component, row, column) of at most ``largest`` steps."""
-    count, rows, columns = shape
-    chunk = (max(count, 1), min(CHUNK, max(rows, 1)), min(CHUNK, max(columns, 1)))
-    whole = (
-        -(-min(size, most) // part) * part
-        for size, most, part in zip((rows, columns), (SHARD_ROWS, SHARD_SAMPLES), chunk[1:], strict=True)
-    )
-    return ArraySpec(dims, shape, _kind(largest), chunk, (chunk[0], *whole))
-
-
-def steps_within(scores: NDArray[np.floating], step: float, kind: np.dtype[Any]) -> NDArray[np.floating]:
-    """Return scores in whole steps, clipped to the range of an integer type."""
-    most = np.iinfo(kind).max & ~127  # a float32
-    return np.asarray(np.clip(whole_steps(scores, step), -most, most))
-
-
-def write_components(group: zarr.Group, components: Components) -> None:
-    """Store the components that restore spectra."""
-    about = {"coordinates": "wavelength", "units": "1"}
-    rows = components.axes * np.nan_to_num(components.noise)
-    write_small(group, "axes", ("component", "band"), rows, {"long_name": "scene value of a score of 1", **about})
-    write_small(group, "mean", ("band",), components.mean, {"long_name": "mean scene value", **about})
-    write_small(
-        group,
-        "noise",
-        ("band",),
-        components.noise,
-        {"long_name": "standard deviation of one spectrum's noise", **about},
-    )
-
-
-def read_components(group: zarr.Group) -> Components:
-    """Read what `write_components` stored."""
-    rows, mean, noise = (read_array(group, name).astype(np.float64) for name in ("axes", "mean", "noise"))
-    lit = np.isfinite(noise)
-    return Components(mean, np.where(lit, rows / np.where(lit, noise, 1), 0) if len(rows) else rows, noise)
 
 
 class SignalCubeWriter:
@@ -167,7 +125,8 @@ class SignalCubeWriter:
             write_small(self.group, name, ("rare",), rare[:, column].astype(np.int32), {"units": "1"})
         about = {"long_name": "residual of a rare spectrum", "units": "1", "scale_factor": RESIDUAL_STEP}
         chunk = (min(1024, max(len(residuals), 1)), residuals.shape[1])
-        spec = ArraySpec(("rare", "band"), residuals.shape, _kind(float(np.abs(residuals).max(initial=0))), chunk)
+        dtype = integers_for(float(np.abs(residuals).max(initial=0)))
+        spec = ArraySpec(("rare", "band"), residuals.shape, dtype, chunk)
         array = create_array(self.group, "rare_residual", spec, about)
         if residuals.size:
             array[...] = residuals
@@ -236,20 +195,6 @@ class SignalCube(StoredSweep):
             values[line[here][inside] - start, sample[here][inside] - first] += steps
         values[~self.usable[start:stop, first:last]] = np.nan
         return values
-
-
-def step_of(group: zarr.Group, said: str = "scale_factor") -> float:
-    """Return the step of a store's scores, or another numeric attribute (IncompleteStoreError: damaged)."""
-    scores = array_of(group, "scores")
-    with damage_named(str(group.store_path)):
-        return float(scores.attrs[said])  # type: ignore[arg-type]
-
-
-def score_layout(group: zarr.Group) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Return the rows and columns of scores, and of a shard of them (IncompleteStoreError: damaged)."""
-    scores = array_of(group, "scores")
-    (_, rows, columns), (_, deep, wide) = scores.shape, scores.shards or scores.chunks
-    return (rows, columns), (deep, wide)
 
 
 def read_coordinates(

@@ -22,7 +22,8 @@ from pipeline.rig.camera.camera_texts import DATA_TYPES
 from storage.archive.whole_files import make_folder, write_whole, written_aside
 from storage.arrays.class_maps import ClassNames
 from storage.arrays.cubes import RawCube
-from storage.arrays.layout import SHARD_ROWS, AngularGrid
+from storage.arrays.georeference import AngularGrid
+from storage.arrays.layout import SHARD_ROWS
 from storage.arrays.signal_cubes import RestoredCube
 
 TILE = 512  # px: rasters within one tile need no overviews

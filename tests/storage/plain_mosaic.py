@@ -12,7 +12,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import line_positions
 from pipeline.signal.components import Components
 from storage.arrays.cubes import SweepHeader
-from storage.arrays.layout import AngularGrid
+from storage.arrays.georeference import AngularGrid
 from storage.arrays.mosaics import MosaicWriter
 from storage.arrays.signal_cubes import LineRows, SignalCubeWriter
 

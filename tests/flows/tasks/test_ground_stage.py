@@ -31,8 +31,8 @@ from storage.arrays.class_maps import (
     write_changes_tile,
     write_probabilities_tile,
 )
+from storage.arrays.georeference import AngularGrid
 from storage.arrays.ground_maps import GroundMap, load_ground_map
-from storage.arrays.layout import AngularGrid
 from tests.storage.plain_mosaic import write_values
 from tests.storage.small_archive import write_class_map
 

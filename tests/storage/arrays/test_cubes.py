@@ -16,7 +16,7 @@ from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.scan import Sweep
 from pipeline.source import Line, References
 from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
-from storage.arrays.layout import AngularGrid
+from storage.arrays.georeference import AngularGrid
 from storage.arrays.mosaics import Attention, load_attention, open_mosaic, write_attention
 from tests.storage.plain_mosaic import plain_writer, write_values
 

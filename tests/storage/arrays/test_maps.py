@@ -23,17 +23,9 @@ from storage.arrays.class_maps import (
     load_class_map,
     write_class_tile,
 )
-from storage.arrays.georeference import ON_THE_MAP, load_geobox, map_attributes, map_coordinates
+from storage.arrays.georeference import ON_THE_MAP, AngularGrid, load_geobox, map_attributes, map_coordinates
 from storage.arrays.ground_maps import BLOCK, GroundMapWriter, load_ground_map
-from storage.arrays.layout import (
-    NO_CLASS,
-    SHARD_COLUMNS,
-    SHARD_ROWS,
-    AngularGrid,
-    blank_pixels,
-    create_group,
-    write_image,
-)
+from storage.arrays.layout import NO_CLASS, SHARD_COLUMNS, SHARD_ROWS, blank_pixels, create_group, write_image
 from tests.storage.small_archive import write_class_map
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.errors import IncompleteStoreError
-from storage.arrays.layout import AngularGrid
+from storage.arrays.georeference import AngularGrid
 from storage.arrays.mosaics import MosaicWriter, open_mosaic
 from tests.storage.plain_mosaic import plain_writer, write_values
 

@@ -19,9 +19,8 @@ from pipeline.signal.components import Components
 from pipeline.signal.condense import RESIDUAL_STEP, CondensedSweep, Condenser, ResidualLaw, differing_lines
 from pipeline.signal.subspace import SignalStatistics, find_components
 from storage.arrays.cubes import SweepHeader
-from storage.arrays.layout import read_array
+from storage.arrays.layout import LARGEST_SHORT, read_array
 from storage.arrays.signal_cubes import (
-    LARGEST_SHORT,
     LineRows,
     RestoredCube,
     SignalCube,

@@ -18,7 +18,7 @@ from odc.geo.geobox import GeoBox
 from pipeline.errors import ArchiveError
 from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.class_maps import ClassNames
-from storage.arrays.layout import AngularGrid
+from storage.arrays.georeference import AngularGrid
 from storage.export.image_files import CogImage, angular_geobox, write_cog
 from tests.storage.export.stac_rules import is_cog
 
