@@ -135,6 +135,7 @@ class ReceiptFields(_Part):
     scans: Facts | None = None  # uniform ones by the scan performance table, where there is one
     recording: Facts | None = None  # of recorded sweeps: lines read and recorded, seconds of a camera
     extent: Facts | None = None  # which part of a field with a prior map was captured, and what was expected of it
+    signal: Facts | None = None  # of captured spectra: which fraction has saturated bands
     kept: Facts | None = None  # of a uniform scan that is kept and read in part: patches, costs of all
     memory: Facts | None = None  # what became of the prior map
     pointing: Facts | None = None  # where the mirror may look beside the plan

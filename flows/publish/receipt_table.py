@@ -137,7 +137,7 @@ def headline(receipt: Receipt, captured_again: float | None = None) -> str:
 
 
 def print_summary(receipt: Receipt, console: Console, *, verbose: bool = False) -> None:
-    """Print the score, the leading savings and their reference, and the prior map's state where there was one.
+    """Print the score, the leading savings and their reference, saturation, and the state of a prior map.
 
     With ``verbose`` print all savings, the stages that ran or were read from the archive, and the effects.
     """
@@ -147,7 +147,7 @@ def print_summary(receipt: Receipt, console: Console, *, verbose: bool = False) 
     columns = ("", "this survey", "reference", "fraction")
     console.print(table(columns, cells, whole=columns[1:]))
     console.print(escape(format_reference(receipt)))
-    for name, words in finding_rows({"memory": receipt.get("memory")}):
+    for name, words in finding_rows({part: receipt.get(part) for part in ("signal", "memory")}):
         console.print(escape(f"{name}: {words}"), soft_wrap=True)  # numbers have spaces
     if not verbose:
         return
@@ -324,6 +324,7 @@ _SHOWN: Mapping[str, tuple[str, Sequence[str]]] = {
     "field": ("field", ("view_deg", "range_m", "hectares", "ground_pixel_m", "hectares_per_hour")),
     "plan": ("plan", ("reason", "lines")),
     "recording": ("recording", ("lines_read", "lines_recorded", "passes_s", "full_scan_s")),
+    "signal": ("signal", ("saturated",)),
     "extent": ("captured", ("lines", "patches_touched", "expected_wrong", "due_left")),
     "kept": ("at full resolution", ("patches", "multiply_adds")),
     "memory": (
@@ -359,6 +360,10 @@ _FORMATS: Mapping[str, Callable[[Any], str]] = {
     "changes_ha": _changes,
     "older_ha": _older,
     "sweeps": lambda sweeps: f"corrected by up to {max(math.hypot(*one) for one in sweeps.values()):.1f} px",
+    "saturated": lambda fraction: (
+        f"{format_percent(fraction)} of the spectra have saturated bands, which are restored from the others, or "
+        "unknown where more than half are; a shorter exposure avoids it"
+    ),
     "too_narrow": lambda value: f"{counted(len(value), 'overlap')} too narrow to compare",
 }
 _VALUES: Mapping[str, Callable[[Any], str]] = {

@@ -44,7 +44,7 @@ from flows.tasks.stages.accuracy import load_accuracy
 from flows.tasks.stages.attention import READING, load_plan, read_in_full
 from flows.tasks.stages.effects import load_manifest
 from flows.tasks.stages.maps import STORE
-from flows.tasks.stages.placement import load_registration
+from flows.tasks.stages.placement import SIGNAL_RECORD, load_registration
 from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.grid import patch_pixels
 from pipeline.planning.coverage import BYTES_PER_SAMPLE, SavingEntry, capture_savings, raw_bytes
@@ -321,7 +321,13 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     found |= find_areas(run, posed, drawn)
     found |= find_ground(run, posed, drawn, probabilities, memory) | find_zones(run, drawn)
     found |= find_map(run, class_map, drawn)
-    lines = {} if run.raster is not None else read_table(products.mosaic.path / "lines.json")
+    if run.raster is not None:
+        return found
+    record = products.mosaic.path / SIGNAL_RECORD
+    saturated = read_table(record).get("saturated") if record.is_file() else None  # archives of before 2026-11-27
+    if saturated:
+        found["signal"] = {"saturated": saturated}
+    lines = read_table(products.mosaic.path / "lines.json")
     troubled = {name: facts for name, facts in lines.items() if any(facts.values())}
     if troubled:
         found["lines"] = troubled

@@ -97,6 +97,13 @@ def judge_elements(references: References) -> Elements:
     return Elements(references, gain, out, lit, fill)
 
 
+def missing_bands(references: References) -> NDArray[np.intp]:
+    """Return how many bands of each sample are not valid in any line, (sample,)."""
+    elements = judge_elements(references)
+    whole = (elements.out | ~elements.lit).all(axis=1)
+    return np.asarray(np.where(whole, elements.out.shape[1], elements.out.sum(axis=1)))
+
+
 def number_values(references: References) -> Floats:
     """Return the scene value of one DN, (band,): the median over the samples; NaN of bands without light."""
     gain, known = judge_elements(references).gain.astype(np.float64), np.full(references.dark.shape[1], np.nan)

@@ -18,7 +18,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import cuts
 from pipeline.geometry.scan import Sweep
 from pipeline.readings import SIGMA_OF_MEDIAN
-from pipeline.signal.calibrate import Bools, calibrate, judge_elements
+from pipeline.signal.calibrate import Bools, calibrate, judge_elements, missing_bands
 from pipeline.signal.components import Components, Scores
 from pipeline.signal.lines import BLOCK_LINES, CondensedLines
 from pipeline.signal.subspace import SignalStatistics
@@ -249,6 +249,7 @@ class CondensedSweep:
     rare: NDArray[np.intp]  # (rare, 2) line and sample, by line
     residuals: NDArray[np.int32]  # (rare, band) in half deviations of the noise
     known: int  # spectra with enough valid bands
+    saturated: int  # spectra of valid lines that miss bands which their sample's elements have
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,12 +265,16 @@ class Condenser:
     def sweep(self, lines: SweepLines, store: Store, report: Report = lambda done: None) -> CondensedSweep:
         """Pass the scores of all lines to ``store``, and find the rare spectra."""
         count, samples = len(lines.valid_line), len(lines.references.dark)
-        ratio = np.empty((count, samples), np.float32)
+        ratio, missing = np.empty((count, samples), np.float32), np.zeros((count, samples), np.int32)
         for first, values, valid in calibrated_blocks(lines, self.camera):
+            block = slice(first, first + len(values))
             seen = score_lines(values, valid, self.components)
             store(first, seen.scores, seen.quality)
-            ratio[first : first + len(values)] = seen.residual / self.law.expected(seen.scores)
+            ratio[block] = seen.residual / self.law.expected(seen.scores)
+            if not valid.all():
+                missing[block] = (~valid).sum(axis=2) if valid.ndim == 3 else values.shape[2] * ~valid
             report((first + len(values)) / count)
+        saturated = int((missing > missing_bands(lines.references))[lines.valid_line].sum())
         rare = find_rare(ratio, self.law, self.false_alarm)
         residuals = [np.zeros((0, self.components.bands), np.int32)]  # of rare spectra, from their rounded scores
         blocks = set((np.flatnonzero(rare.any(axis=1)) // BLOCK_LINES).tolist())  # their lines are read again
@@ -279,7 +284,7 @@ class Condenser:
             rounded = whole_steps(scores, self.step)[here] * np.float32(self.step)
             there = None if valid.ndim == 2 else valid[here]
             residuals.append(residual_steps(values[here], rounded, self.components, there))
-        return CondensedSweep(np.argwhere(rare), np.concatenate(residuals), int(np.isfinite(ratio).sum()))
+        return CondensedSweep(np.argwhere(rare), np.concatenate(residuals), int(np.isfinite(ratio).sum()), saturated)
 
 
 def calibrated_blocks(

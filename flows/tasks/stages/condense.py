@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from flows.settings.survey_settings import RASTER, SignalChoice
 from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
 from flows.tasks.stages.capture import RIG_RECORD
-from flows.tasks.stages.placement import MOSAIC, MOSAIC_STEP
+from flows.tasks.stages.placement import MOSAIC, MOSAIC_STEP, SIGNAL_RECORD
 from flows.terminal.figures import format_bytes
 from pipeline.errors import BudgetError, IncompleteStoreError, SceneError
 from pipeline.geometry.camera import LineCamera
@@ -46,7 +46,6 @@ from storage.readers.scene_files import RasterPixels
 
 SIGNAL = Product("condense", version=3)
 SIGNAL_FINE = Product("condense_fine", version=4)
-RECORD = "signal.json"
 SHARED_FRACTION = 2e-3  # of rare spectra, from which on a component takes less space than residuals
 COARSER = (1.5, 2.0, 3.0, 4.0, 6.0)  # quantisation steps for a limit of bytes [standard deviations of the noise]
 SAMPLED_BLOCKS = 8  # of lines, to estimate bytes
@@ -130,8 +129,10 @@ def condense(
         if better is not None:
             condenser, done = better, written(better)
         record = {"components": len(condenser.components), "bands": condenser.components.bands, "step": condenser.step}
-        of_lines = {"spectra": sum(one.known for one in done), "rare": sum(len(one.rare) for one in done)}
-        write_table(path / RECORD, record | of_lines)
+        every = sum(int(cube.valid_line.sum()) * cube.shape[1] for cube in cubes)
+        record |= {"spectra": sum(one.known for one in done), "rare": sum(len(one.rare) for one in done)}
+        record |= {"saturated": sum(one.saturated for one in done) / max(every, 1)}
+        write_table(path / SIGNAL_RECORD, record)
         rig_record = passes[0].path / RIG_RECORD
         if rig_record.is_file():  # the raw lines may be deleted
             shutil.copyfile(rig_record, path / RIG_RECORD)
@@ -208,7 +209,7 @@ def raw_differs(passes: Sequence[StageRef], signal: StageRef, camera: LineCamera
 
 
 def _lines_differ(passes: Sequence[StageRef], signal: StageRef, camera: LineCamera) -> str | None:
-    record = read_table(signal.path / RECORD)
+    record = read_table(signal.path / SIGNAL_RECORD)
     if record["rare"] > MOST_RARE * max(record["spectra"], 1):
         fraction = 100 * record["rare"] / record["spectra"]
         return f"{record['components']} components leave {fraction:.1f} % of the spectra with residuals above the noise"

@@ -6,6 +6,7 @@ A mosaic is computed several tiles at a time, within a limit of memory. A tile i
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -49,6 +50,7 @@ from storage.arrays.signal_cubes import open_signal_cubes
 from storage.parallel.pool import RESERVED_BYTES, THREADS, WorkerPool, memory_refusal, mib, run_blocks
 
 REGISTRATION, TIE_POINTS = "registration.json", "geolocation.zarr"
+SIGNAL_RECORD = "signal.json"  # of compressed sweeps; a copy lies beside their mosaic
 POINTING = Product("register", version=2, files=(REGISTRATION,))
 GEOLOCATION = Product("locate", version=3, files=(TIE_POINTS,))
 MOSAIC = Product("rectify", version=5, files=("mosaic.zarr",))
@@ -362,8 +364,9 @@ def rectify_fine(
 
 
 def mosaic_of_sweeps(path: Path, signal: StageRef, frame: FieldFrame) -> MosaicWriter:
-    """Create the mosaic of compressed sweeps, in the pixels of the scene."""
+    """Create the mosaic of compressed sweeps, in the pixels of the scene, and copy the record of their signal."""
     sweeps = open_signal_cubes(signal.path)
+    shutil.copyfile(signal.path / SIGNAL_RECORD, path / SIGNAL_RECORD)
     return MosaicWriter(
         path / "mosaic.zarr",
         (frame.grid.height, frame.grid.width),

@@ -14,6 +14,7 @@ from rich.console import Console
 
 from flows.archive.plan_command import plan_content
 from flows.archive.reprocess_command import run_reprocess
+from flows.publish.receipt_table import finding_rows
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from flows.tasks.run import SurveyRun, open_run
@@ -153,6 +154,18 @@ def test_weights_without_a_record_scan_by_hand_alone(survey_png: Survey, tmp_pat
     assert "scans" not in published.receipt
     assert "full_scan" not in published.receipt["savings"]["capture_s"]
     assert published.receipt["plan"]["reason"] == "the field was scanned once: every 4th line, 100 ms"
+
+
+def test_a_receipt_tells_of_saturated_spectra(survey_png: Survey, tmp_path: Path) -> None:
+    """An exposure that is too long for the bright part of a field: the fraction is that of the raw lines."""
+    given = BY_HAND | {"scan_exposure_ms": "200", "keep": "raw"}
+    published = survey_png(tmp_path, **given)
+    (cube,) = (xr.open_zarr(path, consolidated=False) for path in tmp_path.glob("stages/capture/*/*.zarr"))
+    saturated = float((cube["dn"].to_numpy() >= 4095).any(axis=2).mean())
+    assert 0.01 < saturated < 0.5
+    assert published.receipt["signal"] == {"saturated": pytest.approx(saturated)}
+    assert "of the spectra have saturated bands" in dict(finding_rows(published.receipt))["signal"]
+    assert "signal" not in survey_png(tmp_path, **BY_HAND).receipt
 
 
 def _scores_bytes(out: Path) -> int:

@@ -178,6 +178,18 @@ def test_saturated_spectra_are_restored_or_unusable() -> None:
     off = (stored.restored(done) - values)[20, 10:14] / before.noise
     assert np.abs(off).max() < 5
     assert len(done.rare) == 0
+    assert done.saturated == 5
+
+
+def test_saturated_spectra_are_counted_where_all_lines_have_them() -> None:
+    """A band that is bright everywhere; a lost line and the spectra of a dead column do not count."""
+    bad = np.zeros((40, BANDS), np.bool_)
+    bad[8] = True
+    lines = replace(made_lines(), references=MadeLines.of(made_lines().raw, bad).references)
+    lines.raw[..., 3] = CAMERA.full_scale_dn
+    lines.valid_line[70] = False
+    _, done = condense(lines)
+    assert done.saturated == 149 * 39
 
 
 def test_dead_columns_and_elements() -> None:
@@ -190,7 +202,7 @@ def test_dead_columns_and_elements() -> None:
     unusable = stored.quality == UNUSABLE
     assert np.flatnonzero(unusable.all(axis=0)).tolist() == [8]
     assert unusable.sum() == 150
-    assert done.known == 150 * 39
+    assert (done.known, done.saturated) == (150 * 39, 0)
     assert differing_lines(lines, stored, CAMERA) == []
 
 
