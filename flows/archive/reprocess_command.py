@@ -127,7 +127,7 @@ def reprocess_fields(
                 else:
                     folder = (survey or _survey)(settings, console)
                     row |= {"new": folder.name, "state": "ran", **_scores(read_run(folder).receipt, "after")}
-                    renewed[old] = folder.name
+                    renewed[old] = folder.name  # the same where a run got the accuracy that it lacked
             except PipelineError as error:
                 row |= {"message": str(error)}
             rows.append(row | {"seconds": time.perf_counter() - begun})
@@ -145,8 +145,8 @@ def _settings_of(
     here: dict[str, Any] = {"scheduler": pool.scheduler, "workers": pool.workers}
     settings = replace(asked_again(run, archive, weights), **here)
     prior = settings.prior
-    while prior in renewed:
-        prior = renewed[prior]
+    while (newer := renewed.get(prior, prior)) != prior:
+        prior = newer
     if prior == settings.prior and is_current(catalogue, run, settings):
         return None
     return replace(from_raw_cubes(catalogue, run, replace(settings, prior=prior)), **here)
@@ -219,7 +219,7 @@ def run_judge(
             if name not in survey.products:
                 raise ArchiveError(f"the {TITLES[name]} of {found.uri} is missing or damaged; run verify --repair")
         _check_same(catalogue, found, survey.products, run)
-    with survey.at_work(captures=False), StageProgress(console, TITLES) as progress:
+    with survey.at_work(), StageProgress(console, TITLES) as progress:
         survey.observer = Observer(progress.watch)
         draft = run.archive.extend_run(found.folder.name, wait=False)
         if draft is None:

@@ -151,7 +151,7 @@ def usual_of_recording(table: Mapping[str, object]) -> dict[str, Any]:
     requested = {name for name in OF_THE_PLAN if table.get(name) is not None}
     found = find_recorded_run(str(table["sweeps"]))
     if found is not None:
-        run, shape = found
+        run, shape, _ = found
         uniform = any(run.settings.get(name) is not None for name in UNIFORM)
         another_plan = requested if uniform else requested & set(UNIFORM)
         names = OF_THE_RUN if another_plan else (*OF_THE_RUN, *OF_THE_PLAN)

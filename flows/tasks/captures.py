@@ -105,6 +105,7 @@ def capture_pass(plan: OpenSurvey, sweeps: str, *inputs: StageRef) -> StageRef:
         raise SettingsError(f"there is no pass {sweeps!r}: expected {' or '.join(PASSES)}")
     if plan.capture_deployment is not None:
         as_task(_captured_elsewhere, "capture_elsewhere")(plan, sweeps, *inputs)
+    plan.hold_rig(PASSES[sweeps], *inputs)
     return PASSES[sweeps](plan, *inputs)
 
 

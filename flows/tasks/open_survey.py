@@ -94,6 +94,8 @@ class OpenSurvey:
         self.products = Products()
         self.records: dict[str, StageRecord] = {}
         self._written = 0
+        self._held: ExitStack | None = None  # while at work
+        self._holds_rig = False
 
     @property
     def name_of_run(self) -> str:
@@ -120,21 +122,29 @@ class OpenSurvey:
         return self.run.settings.pose is not None
 
     @contextmanager
-    def at_work(self, *, captures: bool = True) -> Iterator[None]:
-        """Lock archive, worker pool and, if this machine ``captures``, the rig.
+    def at_work(self) -> Iterator[None]:
+        """Lock archive and worker pool; the rig is locked by `hold_rig`."""
+        with ExitStack() as self._held:
+            self._held.callback(vars(self).pop, "run", None)  # Prefect keeps the survey, which is the result of a task
+            self._held.enter_context(self.run.archive.in_use())
+            self._held.enter_context(self.run.settings.pool.open())
+            yield
+
+    def hold_rig(self, capture: Stage, *inputs: StageRef) -> None:
+        """Lock the rig of this machine until the survey ends, if the archive lacks the sweeps of a capture.
 
         Inside a flow, the survey first waits for the global concurrency limit ``rig`` of the Prefect server, if there
         is one. Raises RigError: another survey uses the rig.
         """
-        with ExitStack() as held:
-            held.callback(vars(self).pop, "run", None)  # Prefect keeps the survey, which is the result of a task
-            if captures and self.run.settings.source == "rig" and self.capture_deployment is None:
-                if inside_flow():
-                    held.enter_context(rig_turn(self.observer))
-                held.enter_context(rig_field.rig_to_oneself(self.run.settings.rig.port))
-            held.enter_context(self.run.archive.in_use())
-            held.enter_context(self.run.settings.pool.open())
-            yield
+        here = self.run.settings.source == "rig" and self.capture_deployment is None
+        if self._held is None or self._holds_rig or not here:
+            return
+        if capture.find(self.run.archive, capture.wants(self.run, *inputs)) is not None:
+            return
+        if inside_flow():
+            self._held.enter_context(rig_turn(self.observer))
+        self._held.enter_context(rig_field.rig_to_oneself(self.run.settings.rig.port))
+        self._holds_rig = True
 
     def __call__(self, stage: str, /, *inputs: StageRef) -> StageRef:
         """Return the store of a stage, from the archive or built."""

@@ -16,7 +16,7 @@ from pipeline.capture.recorded import RecordedSource
 from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.capture.straight_scans import covered_field
 from pipeline.errors import SceneError
-from pipeline.lazy import Once
+from pipeline.lazy import GeoBox, Once
 from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster
 from pipeline.source import Source
 from storage.archive.keys import stage_key
@@ -49,6 +49,7 @@ class OpenedRecording:
     recording: Recording
     field: RecordedField
     notes: tuple[str, ...]
+    geobox: GeoBox | None  # of the run that captured the lines, if it is of the same field
 
     @property
     def passes(self) -> RecordedPasses:
@@ -80,6 +81,7 @@ class OpenedRecording:
             fwhm_nm=self.recording.fwhm_nm,
             class_names=() if found is None else found.names,
             class_colours=np.zeros((0, 3), np.uint8) if found is None else found.colours,
+            geobox=self.geobox,
         )
         return scene, (*self.notes, *notes)
 
@@ -101,9 +103,10 @@ def open_recorded(settings: Settings) -> OpenedRecording:
     recording = open_recording(str(settings.sweeps), settings.camera, files)
     shape, notes = _field_shape(recording, settings.shape, settings.sweeps)
     source = recording.source(shape)
-    camera = recording.camera
-    if find_recorded_run(str(settings.sweeps)) is not None:  # its full scan has the exposure of its camera
+    camera, geobox = recording.camera, None
+    if (run := find_recorded_run(str(settings.sweeps))) is not None:  # its full scan has the exposure of its camera
         camera = replace(camera, exposure_ms=settings.camera.exposure_ms)
+        geobox = run.geobox if run.shape == shape and settings.pose is None else None
     settings = replace(settings, camera=camera, size=shape[::-1])
     if settings.scan == RECORDED:
         step = max(sweep.step for sweep in RecordedPasses(source).uniform_scan())
@@ -114,7 +117,8 @@ def open_recorded(settings: Settings) -> OpenedRecording:
                 "camera.focal_length_mm"
             )
         settings = replace(settings, scan_step=step)
-    return OpenedRecording(settings, recording, RecordedField(source, recording.key()), (*recording.notes, *notes))
+    field = RecordedField(source, recording.key())
+    return OpenedRecording(settings, recording, field, (*recording.notes, *notes), geobox)
 
 
 def _field_shape(

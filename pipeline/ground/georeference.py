@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -44,6 +44,12 @@ def georeference_record(geobox: GeoBox | None) -> dict[str, Any]:
     if geobox is None:
         return {}
     return {"georeference": {"crs": crs_key(geobox), "transform": [float(number) for number in geobox.affine[:6]]}}
+
+
+def geobox_of_record(params: Mapping[str, Any], shape: tuple[int, int]) -> GeoBox | None:
+    """Return the grid of (y, x) ``shape`` that `georeference_record` wrote into a store's key; None without one."""
+    known = params.get("georeference")
+    return None if known is None else odc_geobox.GeoBox(shape, Affine(*known["transform"]), known["crs"])
 
 
 def crs_key(geobox: GeoBox) -> str:

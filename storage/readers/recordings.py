@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,8 +31,10 @@ from pipeline.errors import ArchiveError, IncompleteStoreError, SceneError, Sett
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import STRAIGHT, Mounting
 from pipeline.geometry.scan import Axis, Floats, Sweep
+from pipeline.ground.georeference import geobox_of_record
+from pipeline.lazy import GeoBox
 from storage.archive.archive import Archive
-from storage.archive.keys import array_digest
+from storage.archive.keys import array_digest, store_at
 from storage.archive.manifests import check_files, manifest_sha256
 from storage.archive.records import Run, read_run, read_store
 from storage.archive.staging import MANIFEST_NAME
@@ -399,8 +401,16 @@ def _is_raw_cube(path: Path) -> bool:
         return False
 
 
-def find_recorded_run(address: str | Path) -> tuple[Run, tuple[int, int] | None] | None:
-    """Return the run of an address, with its field's (y, x) size if known; None if the address is no archive's.
+class RecordedRun(NamedTuple):
+    """Run whose lines are a recording, with the field's (y, x) size and place on the earth, if known."""
+
+    run: Run
+    shape: tuple[int, int] | None
+    geobox: GeoBox | None
+
+
+def find_recorded_run(address: str | Path) -> RecordedRun | None:
+    """Return the run of an address; None if the address is no archive's.
 
     Raises SceneError, ArchiveError: as `find_raw_cubes`.
     """
@@ -410,12 +420,13 @@ def find_recorded_run(address: str | Path) -> tuple[Run, tuple[int, int] | None]
             raise SceneError(f"there is no recording {address}; check the name (seen from {Path.cwd()})")
         return None
     archive, run, _ = _run_with_cubes(*named)
-    for row in run.stages:
-        if row.get("name") == "score":
-            grid = read_store(archive.ref("score", str(row.get("key")))).params.get("grid", {})
-            if {"height", "width"} <= set(grid):
-                return run, (int(grid["height"]), int(grid["width"]))
-    return run, None
+    parts = run.products.get("mosaic", "").split("/")  # stages/STAGE/KEY/mosaic.zarr
+    params = read_store(store_at(archive.root, *parts[1:3])).params if len(parts) > 3 else {}
+    grid = params.get("grid", {})
+    if not {"height", "width"} <= set(grid):
+        return RecordedRun(run, None, None)
+    shape = int(grid["height"]), int(grid["width"])
+    return RecordedRun(run, shape, geobox_of_record(params, shape))
 
 
 def _named_run(address: str | Path) -> tuple[str, str | None] | None:

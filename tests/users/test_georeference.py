@@ -184,6 +184,23 @@ def test_a_place_is_in_the_keys_of_what_carries_it(tmp_path: Path, weights: Path
     assert archive.manifest(ref)["params"]["georeference"]["crs"] == "EPSG:32632"
 
 
+@pytest.mark.parametrize("transform", [NORTH_UP, TURNED])
+def test_lines_keep_their_place_where_the_scene_is_gone(tmp_path: Path, weights: Path, transform: Affine) -> None:
+    """Surveyed as a recording of its own lines, a field has its CRS and hectares; another part of it has none."""
+    scene = write_geotiff(tmp_path / "a.tif", transform)
+    before = survey(scene, weights, tmp_path / "archive", budget=None, scan_step=1, keep="raw")
+    scene.unlink()
+
+    def again(**size: str) -> Published:
+        given = {"sweeps": str(before.folder), "weights": str(weights), "out": str(tmp_path / "other"), **size}
+        return run_survey(load_settings(None, {**given, "engine": "plain"}), QUIET)
+
+    whole = again()
+    assert whole.receipt["areas"] == before.receipt["areas"]
+    assert corners_px(opened(whole, "class_map")["classes"].odc.geobox.affine, transform, SHAPE) < 1e-6
+    assert "ha" not in again(size="32x32").receipt["areas"]
+
+
 def test_a_pose_is_the_one_place_of_a_run(tmp_path: Path, weights: Path) -> None:
     """With a pose the scene's own place is set aside, and a note says so."""
     scene = write_geotiff(tmp_path / "a.tif", NORTH_UP)

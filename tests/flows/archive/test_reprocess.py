@@ -117,6 +117,22 @@ def test_new_weights_make_a_generation_beside_the_old(archive: Path, other: Path
     assert run_verify(archive, QUIET) == DONE
 
 
+def test_a_run_that_gets_its_accuracy_stays_the_prior_map_of_later_ones(
+    archive: Path, other: Path, reprocess: Reprocess, scene_files: Path, survey_png: Survey
+) -> None:
+    """A survey that was killed before its accuracy publishes no other run when it is surveyed again."""
+    first = Archive.open(archive).runs()[0]
+    asked: list[Settings] = []
+
+    def survey(settings: Settings, console: Console) -> Path:
+        asked.append(settings)
+        return first
+
+    survey_png(archive, scene=str(scene_files / "scene.png"), labels=None, budget="0.8", prior=first.name, visit="2")
+    reprocess(archive, survey=survey, weights=other)
+    assert asked[-1].prior == first.name
+
+
 def test_a_newer_stage_replaces_an_older(archive: Path, reprocess: Reprocess, monkeypatch: pytest.MonkeyPatch) -> None:
     """A raised version makes it and what follows anew; light is not captured again."""
     light = _captures(archive)

@@ -18,7 +18,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from queue import Queue
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
+from unittest.mock import Mock
 
 import httpx
 import pytest
@@ -194,9 +195,10 @@ def test_two_fields_that_are_due_at_once_take_turns_at_the_rig(tmp_path: Path) -
 
     @flow(persist_result=False)
     def scan_pass() -> None:
-        plan: Any = SimpleNamespace(run=run, capture_deployment=None, observer=Observer())
+        plan, capture = OpenSurvey(cast(Any, run), Observer()), SimpleNamespace(wants=Mock(), find=lambda *_: None)
         inside.wait(PATIENCE_S)
-        with OpenSurvey.at_work(plan):
+        with plan.at_work():
+            plan.hold_rig(cast(Any, capture))
             began = time.monotonic()
             time.sleep(0.5)
             held.append((began, time.monotonic()))
