@@ -7,7 +7,7 @@ import importlib
 import time
 import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
 from tests.benchmarks.measure import aligned, markdown_lines
@@ -83,7 +83,7 @@ def run_table(
         except Exception:
             traceback.print_exc()
             rows = [Row(name, "", 0, "that it can be tried", "crashed; the others went on", False, clock.seconds)]
-        found += rows
+        found += [replace(row, met=row.met and row.count > 0) for row in rows]  # nothing tried is nothing shown
         print("\n".join(f"{row.fault}: {row.found}" for row in rows), flush=True)
     cells = [headings, *(row.cells for row in found)]
     print(f"\n{aligned(cells, WIDTHS)}")

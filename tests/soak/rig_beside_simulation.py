@@ -31,7 +31,7 @@ QUICK_BANDS = ",".join(map(str, range(8, 264, 16)))
 SPEED, BUDGET, SEED = 10, "0.8", "7"
 MOST_OTHER = 1e-3  # fraction of the map's pixels that rounding may decide
 BEGUN_WITHIN_S, ENDED_WITHIN_S = 120.0, 30.0
-SURVEY = ("survey", "--budget", BUDGET, "--no-controls", "--engine", "plain", "--json")
+SURVEY = ("survey", "--budget", BUDGET, "--keep", "raw", "--no-controls", "--engine", "plain", "--json")
 
 
 @dataclass(frozen=True)
