@@ -166,7 +166,8 @@ def scanned(
     chosen = chosen_effects(scene, rig, sweeps)
     source = SimulatedSource(scene, rig, seed, chosen, clock=sweep_starts(sweeps, CAMERA, COST))
     scan_pass = uniform_pass(weights, source, sweeps, grid, COST, LineSpec(exposure_ms / CAMERA.exposure_ms, step))
-    return scan_pass, segment(weights, scan_pass.coarse, scan_pass.columns, scan_pass.patch_index, every_class=True)
+    coarse, index = scan_pass.coarse, scan_pass.patch_index
+    return scan_pass, segment(weights, coarse, coarse.patches(index), index, every_class=True)
 
 
 def map_of(scene: RasterScene, seed: int, step: int, exposure_ms: float, weights: Weights | None = None) -> PlanMap:
