@@ -108,7 +108,10 @@ def open_recorded_cube(path: Path, wavelengths: Sequence[float] | None) -> Recor
 def with_bits(
     camera: LineCamera, cubes: Sequence[RecordedFile], stated: Mapping[str, Path | None], notes: list[str]
 ) -> LineCamera:
-    """Return the camera with as many bits as the white frame and some lines of each cube need."""
+    """Return the camera with as many bits as the white frame and some lines of each cube need; 8 for cubes of bytes."""
+    if camera.bits > 8 and all(cube.source.dtype == np.uint8 for cube in cubes):
+        camera = replace(camera, bits=8, dark_dn=camera.dark_dn * 255 / camera.full_scale_dn)  # the same fraction
+        notes.append("the files hold bytes, so 8 bits are taken for camera.bits")
     bits = camera.bits
     for cube in cubes:
         valid = np.flatnonzero(cube.source.valid)

@@ -91,7 +91,7 @@ class Recording:
     light: tuple[str, ...]  # identity of the numbers: hashes of manifests, or sizes and times of files
 
     def key(self) -> dict[str, Any]:
-        """Return the parameters of captures from the recording: lines, references, bands and light, without names."""
+        """Return the parameters of captures from it: lines, references, bands, bits and light, without names."""
         arrays = list[NDArray[Any]]()
         for one in self.sweeps:
             known = one.references
@@ -104,6 +104,7 @@ class Recording:
             "lines": [array_digest(array) for array in arrays],
             "by_mirror": [one.references.by_mirror for one in self.sweeps],
             "wavelength_nm": self.wavelength_nm.tolist(),
+            "bits": self.camera.bits,
         }
 
     def source(self, field_shape: tuple[int, int] | None = None) -> RecordedSource:

@@ -23,6 +23,7 @@ from pipeline.errors import (
     SettingsError,
     WavelengthError,
 )
+from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_scene, position_to_direction
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.simulated import SimulatedSource
@@ -283,7 +284,7 @@ def test_a_headwall_folder_is_a_recording(tmp_path: Path) -> None:
 
 
 def test_the_key_of_a_recording_is_its_content(files: Path, tmp_path: Path) -> None:
-    """It is the same under another address, and another for other numbers, pointing or frames."""
+    """It is the same under another address, and another for other numbers, bits, pointing or frames."""
     key = open_recording(files, CAMERA).key()
     moved = files.rename(tmp_path / "moved")
     assert open_recording(moved, CAMERA).key() == open_recording(moved / "scan-0.hdr", CAMERA).key() == key
@@ -294,7 +295,7 @@ def test_the_key_of_a_recording_is_its_content(files: Path, tmp_path: Path) -> N
     keys.append(open_recording(moved, CAMERA).key())
     (moved / "scan-0.pointing.csv").write_text(text)
     flip(moved / "scan-0.bil", 100)
-    keys.append(open_recording(moved, CAMERA).key())
+    keys += [open_recording(moved, camera).key() for camera in (CAMERA, replace(CAMERA, bits=14))]
     assert all(one != other for at, one in enumerate(keys) for other in keys[:at])
     stored = [open_recording(path, CAMERA).key() for path in (tmp_path / "raw", tmp_path / "raw" / "scan-0.zarr")]
     assert stored[0] == stored[1]
@@ -307,6 +308,20 @@ def test_the_white_frame_says_how_many_bits_a_camera_has(tmp_path: Path) -> None
     recording = open_recording(tmp_path / "a.hdr", None, RecordedWith(wavelengths=(500.0, 600.0)))
     assert recording.camera.bits == 14
     assert any("numbers reach 12000, so 14 bits" in note for note in recording.notes)
+
+
+def test_cubes_of_bytes_are_of_8_bits(tmp_path: Path) -> None:
+    """Their full scale is 255, and a dark level of 12 bits keeps its fraction; beside a cube of 16 bits it stays."""
+    write_envi_cube(tmp_path / "a", np.full((6, 16, 3), 200, "u1"))
+    recording = open_recording(tmp_path / "a.hdr", LineCamera(dark_dn=819.0))
+    assert (recording.camera.bits, recording.camera.dark_dn) == (8, 51.0)
+    assert recording.sweeps[0].references.white.max() == 255
+    assert "the files hold bytes, so 8 bits are taken for camera.bits" in recording.notes
+    write_envi_cube(tmp_path / "b", VALUES)
+    for name in "ab":
+        rows = "".join(f"0,{line / 100}\n" for line in range(6))
+        (tmp_path / f"{name}.pointing.csv").write_text("angle_x_deg,angle_y_deg\n" + rows)
+    assert open_recording(tmp_path).camera.bits == 12
 
 
 def test_lines_without_a_time_go_on_in_the_period_of_the_others() -> None:
