@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import NotRecordedError, SceneError, ShapeError
-from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.camera import LARGEST_SUM_DN, LineCamera
 from pipeline.geometry.mirror import direction_to_scene, position_to_direction
 from pipeline.geometry.scan import Floats, Sweep
 from pipeline.source import Line, References
@@ -149,8 +149,8 @@ class RecordedSource:
     def lines(self, sweep: Sweep, first: int = 0) -> Iterator[Line]:
         """Yield the lines that serve a sweep, from line ``first`` on, in the order of `PickedLines`.
 
-        A recorded line that serves two planned lines is valid once. Raises NotRecordedError: a planned line was never
-        captured.
+        A recorded line that serves two planned lines is valid once; one that holds nothing but 65535 never is. Raises
+        NotRecordedError: a planned line was never captured.
         """
         picked = self.pick(sweep)
         for start in range(first, sweep.lines, BLOCK_LINES):
@@ -300,7 +300,7 @@ class RecordedSource:
                 mirror_y=float(one.position[line, 1]),
                 time_s=float(one.time_s[line]) + (self._begins_s[place] - self._begins_s[int(picked.place[0])]),
                 exposure_ms=float(one.exposure_ms[line]),
-                valid=bool(one.valid_line[line]) and not bool(picked.again[number]),
+                valid=bool(one.valid_line[line] and not picked.again[number] and data[number].min() < LARGEST_SUM_DN),
             )
 
     @cached_property

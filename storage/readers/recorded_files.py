@@ -35,6 +35,7 @@ from pipeline.source import References
 from storage.readers.cube_sources import CubeSource
 from storage.readers.envi_files import DATA_ENDINGS, find_envi_pair, find_reference, load_envi_header
 from storage.readers.open_cubes import load_frame, open_cube, reader_of, with_wavelengths
+from storage.readers.scene_files import bands_text
 from storage.readers.zarr_files import find_zarr_store
 
 FRAMES = ("dark", "white", "bad", "flat")  # behind the name of a cube in those of its frames
@@ -116,11 +117,13 @@ def with_bits(
     for cube in cubes:
         valid = np.flatnonzero(cube.source.valid)
         chosen = np.unique(valid[np.linspace(0, len(valid) - 1, SAMPLED_LINES).astype(int)])
-        most = max(int(cube.source.read(int(line), int(line) + 1).max()) for line in chosen)
+        good = ~_marked(cube.source)
+        lines = np.concatenate([cube.source.read(int(line), int(line) + 1) for line in chosen])[..., good]
+        most = int(lines[lines != cube.source.nodata].max(initial=0))
         file = reference_files(cube.folder / cube.name, stated)["white"]
         white = cube.source.white if file is None else load_frame(file)[0]
         if white is not None:
-            most = max(most, int(white[np.isfinite(white)].max(initial=0)))
+            most = max(most, int(white[np.isfinite(white) & good].max(initial=0)))
         full = camera.full_scale_dn * max(camera.samples // cube.source.shape[1], 1)
         needed = (most * camera.full_scale_dn // full).bit_length()
         if most > full and needed > bits:
@@ -130,6 +133,12 @@ def with_bits(
                 " fewer, correct the byte order in the header"
             )
     return replace(camera, bits=bits)
+
+
+def _marked(source: CubeSource) -> NDArray[np.bool_]:
+    """Return (band,) whether the file marks a band as bad; no band where it marks all."""
+    marked = np.isin(np.arange(source.shape[2]), source.bad_bands)
+    return np.asarray(marked & ~marked.all())
 
 
 def reference_files(stem: Path, stated: Mapping[str, Path | None]) -> dict[str, Path | None]:
@@ -200,8 +209,14 @@ def find_references(
         listed = listed_numbers(fields, "white_reference", bands, [])
         white_reference = white_reference if listed is None else listed.astype(np.float32)
         by_mirror = fields.get("mirror at rest", "0").strip() == "1"
-    bad = None if bad is None or not np.any(bad) else np.asarray(bad, np.bool_)
+    if (marked := _marked(source)).any():
+        left_out = bands_text(np.flatnonzero(marked).tolist())
+        notes.append(f"{name}: bands {left_out} are left out: the file marks them as bad")
+    if source.nodata is not None:
+        notes.append(f"{name}: the number {source.nodata:g} is no data, as the file says")
+    bad = marked | np.asarray(False if bad is None else bad, np.bool_)
     white_reference = np.broadcast_to(white_reference, bands).copy()
+    bad = np.broadcast_to(bad, frame).copy() if bad.any() else None
     return References(dark, white, white_reference, bad, found.get("flat"), by_mirror)
 
 

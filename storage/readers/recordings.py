@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.capture.recorded import RecordedSource, RecordedSweep, line_runs
 from pipeline.capture.straight_scans import covered_field, fit_sweep, flat_camera, flat_positions
 from pipeline.errors import ArchiveError, IncompleteStoreError, SceneError, SettingsError
-from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.camera import LARGEST_SUM_DN, LineCamera
 from pipeline.geometry.mirror import STRAIGHT, Mounting
 from pipeline.geometry.scan import Axis, Floats, Sweep
 from pipeline.ground.georeference import geobox_of_record
@@ -342,6 +342,8 @@ def _line_reader(source: CubeSource, own: NDArray[np.intp]) -> Callable[[NDArray
 
     def read_lines(numbers: NDArray[np.intp]) -> NDArray[np.uint16]:
         lines = np.concatenate([source.read(first, stop) for first, stop in line_runs(own[numbers])])
+        if source.nodata is not None:
+            lines = np.where(lines == source.nodata, np.int32(LARGEST_SUM_DN), lines)  # out, as saturated ones
         if lines.dtype.kind == "i" and lines.min() < 0:
             raise SceneError(
                 f"{source.name} holds the number {lines.min()}, expected a camera's own numbers from 0; write data "

@@ -268,17 +268,24 @@ def table(folder: Path, header: str, rows: Sequence[str]) -> None:
     (folder / "scan.pointing.csv").write_text("\n".join([header, *rows]) + "\n")
 
 
-def test_what_no_valid_line_captured_has_no_class(tmp_path: Path, pushbroom: Pushbroom, weights: Path) -> None:
+@pytest.mark.parametrize("by_value", [False, True])
+def test_what_no_valid_line_captured_has_no_class(
+    tmp_path: Path, pushbroom: Pushbroom, weights: Path, by_value: bool
+) -> None:
     """A third of the lines is not valid: nodata in the map, without a probability, and the receipt counts it."""
-    folder, _ = pushbroom
-    table(folder, "position_px,valid", [f"{line},{int(not 40 <= line < 72)}" for line in range(96)])
+    folder, values = pushbroom
+    if by_value:
+        values[40:72] = 7
+        write_envi_cube(folder / "scan", values, ".img", wavelength="{640, 550, 460}", data_ignore_value=7)
+    else:
+        table(folder, "position_px,valid", [f"{line},{int(not 40 <= line < 72)}" for line in range(96)])
     receipt = survey_sweeps(tmp_path / "a", folder / "scan.hdr", weights=str(weights)).receipt
     found = load_class_map(tmp_path / "a" / receipt["products"]["class_map"])
     lost = found.classes == UNLABELLED
     assert lost[42:70].all()
     assert not lost[:38].any()
     assert np.isnan(found.confidence[lost]).all()
-    assert receipt["pixels"]["map_without_a_class"] == lost.sum()
+    assert (receipt["pixels"]["map_without_a_class"], receipt.get("signal")) == (lost.sum(), None)
 
 
 POSITIONS = {"fewer rows": range(95), "lines far apart": range(0, 9 * 96, 9)}  # of the lines, beside the cube

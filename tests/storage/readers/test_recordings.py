@@ -324,6 +324,34 @@ def test_cubes_of_bytes_are_of_8_bits(tmp_path: Path) -> None:
     assert open_recording(tmp_path).camera.bits == 12
 
 
+def test_bands_marked_as_bad_are_left_out(tmp_path: Path) -> None:
+    """Their elements are bad, a note names them, and their numbers need no bits; a file that marks all marks none."""
+    values = VALUES.copy()
+    values[..., 1] = 60_000
+    write_envi_cube(tmp_path / "a", values, bbl="{1, 0, 1}")
+    recording = open_recording(tmp_path / "a.hdr")
+    bad = recording.sweeps[0].references.bad
+    assert bad is not None
+    assert (bad.all(axis=0).tolist(), bad.sum(), recording.camera.bits) == ([False, True, False], 16, 12)
+    assert "a: bands 1 are left out: the file marks them as bad" in recording.notes
+    write_envi_cube(tmp_path / "a", values, bbl="{0, 0, 0}")
+    assert open_recording(tmp_path / "a.hdr").sweeps[0].references.bad is None
+
+
+@pytest.mark.parametrize(("kind", "void"), [("<u2", 0), ("<u2", 65535), ("<i2", -9999)])
+def test_numbers_of_no_data_are_not_valid(tmp_path: Path, kind: str, void: int) -> None:
+    """They read as saturated ones, need no bits, and a line of them alone is not valid."""
+    values = VALUES.astype(kind)
+    values[2] = values[4, 3] = void
+    write_envi_cube(tmp_path / "a", values, data_ignore_value=void)
+    recording = open_recording(tmp_path / "a.hdr")
+    (sweep,), source = recording.sweeps, recording.source((6, 16))
+    np.testing.assert_array_equal(sweep.read(0, 6), np.where(values == void, np.int32(65535), values))
+    assert [line.valid for line in source.lines(sweep.sweep)] == [True, True, False, True, True, True]
+    assert recording.camera.bits == 12
+    assert f"a: the number {void} is no data, as the file says" in recording.notes
+
+
 def test_lines_without_a_time_go_on_in_the_period_of_the_others() -> None:
     """Before the first and after the last too: lines at one time would count as repeated."""
     source: Any = SimpleNamespace(shape=(6,))
