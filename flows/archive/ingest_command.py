@@ -162,7 +162,7 @@ def _record(
         "stage": ref.stage,
         "key": ref.key,
         "uri": ref.uri,
-        "path": str(ref.path),
+        "path": f"{archive.name}/{ref.uri}",
         "cached": cached,
         "name": source.name,
         "shape": list(source.shape),

@@ -142,6 +142,7 @@ def open_recording(
     be read, or has neither raw lines nor a signal; PoseError: a position of a raw cube is beyond the mirror.
     """
     camera, given = camera or LineCamera(), given or RecordedWith()
+    address = _fetched(address)
     stores = find_raw_cubes(address)
     if stores is None:
         return _open_files(Path(address), camera, given)
@@ -382,6 +383,7 @@ def find_raw_cubes(address: str | Path) -> list[Path] | None:
 
     Raises ArchiveError: the archive has no such run, or no run with raw cubes; SceneError: there is no such file.
     """
+    address = _fetched(address)
     named = _named_run(address)
     if named is not None:
         return _run_with_cubes(*named)[2]
@@ -417,6 +419,7 @@ def find_recorded_run(address: str | Path) -> RecordedRun | None:
 
     Raises SceneError, ArchiveError: as `find_raw_cubes`.
     """
+    address = _fetched(address)
     named = _named_run(address)
     if named is None:
         if not Path(address).exists():
@@ -430,6 +433,12 @@ def find_recorded_run(address: str | Path) -> RecordedRun | None:
         return RecordedRun(run, None, None)
     shape = int(grid["height"]), int(grid["width"])
     return RecordedRun(run, shape, geobox_of_record(params, shape))
+
+
+def _fetched(address: str | Path) -> str | Path:
+    """Return the path on this machine of a store in a bucket; other addresses as they are (IncompleteStoreError)."""
+    place, _, store = str(address).rpartition("/stages/")
+    return open_archive(place, create=False, write=False).locate(f"stages/{store}") if is_remote(place) else address
 
 
 def _named_run(address: str | Path) -> tuple[str, str | None] | None:

@@ -22,7 +22,7 @@ from pipeline.errors import ArchiveError, IncompleteStoreError
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 from storage.maintenance.garbage import clear_up
-from storage.readers.recordings import open_recording
+from storage.readers.recordings import find_recorded_run, open_recording
 from storage.remote import object_archive
 from storage.remote.object_stores import Objects
 from tests.pipeline.capture.recordings import CAMERA, FULL, simulated
@@ -256,14 +256,17 @@ def test_what_one_machine_cleared_another_makes_again(machine: Machine) -> None:
 
 
 def test_a_run_of_a_bucket_is_a_recording(bucket: str, machine: Machine) -> None:
-    """The newest run and the run named give the cubes that the first machine wrote; another name is refused."""
+    """The newest run, the run named and a store give the cubes that the first machine wrote; others are refused."""
     archive, source = machine(FIRST), simulated()
     ref, _ = archive.produce("capture", partial(write_raw, source=source, sweep=FULL), version=1, params={})
     with archive.new_run("field") as draft:
         draft.write_file("receipt.json", json.dumps({"products": {"raw_coarse": ref.uri}}))
     machine(SECOND)
-    for address in (bucket, f"{bucket}/runs/{draft.id}"):
+    for address in (bucket, f"{bucket}/runs/{draft.id}", f"{bucket}/{ref.uri}", f"{bucket}/{ref.uri}/scan-0.zarr"):
         (sweep,) = open_recording(address, CAMERA).sweeps
         np.testing.assert_array_equal(sweep.read(0, 80), np.stack([line.data for line in source.lines(FULL)]))
     with pytest.raises(ArchiveError, match="has no run 'other'"):
         open_recording(f"{bucket}/runs/other", CAMERA)
+    assert find_recorded_run(f"{bucket}/{ref.uri}") is None
+    with pytest.raises(IncompleteStoreError, match="stages/ingest/0123"):
+        open_recording(f"{bucket}/stages/ingest/0123", CAMERA)
