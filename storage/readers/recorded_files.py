@@ -78,6 +78,9 @@ def find_cubes(path: Path) -> list[Path]:
                 raise SceneError(f"{data} has no header {stem}.hdr; copy the header, or move {data.name} elsewhere")
     if not cubes and not stores:
         raise SceneError(f"{path} holds no cube; expected ENVI headers (.hdr), raw_<frame> files or Zarr stores in it")
+    if cubes and stores:
+        names = f"{cubes[0].name} and {stores[0].name}"
+        raise SceneError(f"{path} holds ENVI cubes and Zarr stores ({names}); name one, or move those of one kind")
     return cubes or stores
 
 

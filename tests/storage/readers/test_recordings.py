@@ -243,6 +243,21 @@ def test_several_cubes_need_pointing_and_the_same_bands(tmp_path: Path) -> None:
         open_recording(tmp_path, given=RecordedWith(pointing=tmp_path / "tables"))
 
 
+def test_a_file_without_a_header_is_not_told_to_get_one(tmp_path: Path) -> None:
+    """An array in .npy takes wavelengths by the flag alone."""
+    np.save(tmp_path / "a.npy", VALUES)
+    with pytest.raises(WavelengthError, match=r"give --wavelengths in nm$"):
+        open_recording(tmp_path / "a.npy")
+
+
+def test_cubes_of_two_formats_are_refused(tmp_path: Path) -> None:
+    """Neither is left out without a word."""
+    write_envi_cube(tmp_path / "a", VALUES)
+    zarr.create_array(tmp_path / "b.zarr", data=VALUES)
+    with pytest.raises(SceneError, match=r"holds ENVI cubes and Zarr stores \(a\.hdr and b\.zarr\); name one, or move"):
+        open_recording(tmp_path)
+
+
 @pytest.mark.parametrize("version", [2, 3])
 def test_a_zarr_cube_of_anyones_is_a_recording(tmp_path: Path, version: Any) -> None:
     """An array with wavelengths beside it is read line by line, of either version of the format."""
