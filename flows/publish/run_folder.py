@@ -295,7 +295,7 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
         found["recording"] = {
             "sweeps": str(run.settings.sweeps),
             "lines_read": run.recorded.lines_served([*run.plan.coarse, *plan.sweeps]),
-            "lines_recorded": sum(one.sweep.lines for one in run.recorded.source.sweeps),
+            "lines_recorded": sum(int(one.valid_line.sum()) for one in run.recorded.source.sweeps),
             "passes_s": run.plan.coarse_s + plan.seconds,
             "full_scan_s": run.settings.cost.seconds(run.plan.full, run.camera),
         }

@@ -286,6 +286,8 @@ def test_what_no_valid_line_captured_has_no_class(
     assert not lost[:38].any()
     assert np.isnan(found.confidence[lost]).all()
     assert (receipt["pixels"]["map_without_a_class"], receipt.get("signal")) == (lost.sum(), None)
+    known = 96 if by_value else 64  # what lines hold is not known before they are read
+    assert [receipt["recording"][name] for name in ("lines_read", "lines_recorded")] == [known, known]
 
 
 POSITIONS = {"fewer rows": range(95), "lines far apart": range(0, 9 * 96, 9)}  # of the lines, beside the cube
