@@ -429,6 +429,10 @@ def _recorded_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[s
         return
     if settings.sweeps is None:
         yield "source = 'recorded' reads sweeps that were taken before; give --sweeps, where they lie"
+    else:
+        sweeps, out = Path(settings.sweeps).resolve(), Path(settings.out).resolve()
+        if out == (sweeps.parent if sweeps.is_file() else sweeps) and not (out / "stages").is_dir():
+            yield f"{at('out')} = {settings.out!r} is the folder of the sweeps, and would hide them; choose another one"
     if settings.scene != RIG_FIELD:
         yield (
             f"{at('scene')} = {settings.scene!r}, and the field of recorded sweeps is what they show; leave it out, "
