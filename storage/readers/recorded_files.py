@@ -95,8 +95,9 @@ def open_recorded_cube(path: Path, wavelengths: Sequence[float] | None) -> Recor
     """Open one cube of whole numbers with wavelengths."""
     source = open_cube(path)
     if source.dtype not in (np.uint8, np.uint16, np.int16):
+        scaled = " by the scale or offset in its header" if source.scaling else ""
         raise SceneError(
-            f"{path} holds {source.dtype}, expected a camera's own numbers (whole, 8 or 16 bits); a cube of "
+            f"{path} holds {source.dtype}{scaled}, expected a camera's own numbers (whole, 8 or 16 bits); a cube of "
             "reflectance or radiance is no recording: give it as --scene"
         )
     if wavelengths is not None:

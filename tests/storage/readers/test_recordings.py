@@ -200,6 +200,7 @@ def write_envi_cube(stem: Path, values: NDArray[Any], ending: str = "", **fields
 
 
 VALUES = np.random.default_rng(0).integers(100, 4000, (6, 16, 3)).astype("<u2")
+SCALED = {"reflectance_scale_factor": 10_000}
 NO_WAVELENGTHS = "has 3 bands and nothing says their wavelengths; give --wavelengths in nm"
 
 
@@ -210,6 +211,7 @@ NO_WAVELENGTHS = "has 3 bands and nothing says their wavelengths; give --wavelen
         (VALUES, {"interleave": "bpl"}, SceneError, "interleave = 'bpl', expected one"),
         (VALUES, {"wavelength": None}, WavelengthError, NO_WAVELENGTHS),
         (VALUES.astype("<f4"), {}, SceneError, "holds float32, expected a camera's own numbers"),
+        (VALUES, SCALED, SceneError, "holds float32 by the scale or offset in its header, expected a camera's own"),
         (VALUES.astype("<i2") - np.int16(2000), {}, SceneError, "expected a camera's own numbers from 0"),
     ],
 )
