@@ -217,7 +217,7 @@ def choose_uniform_scan(
             raise SettingsError(f"--goal {name}={100 * goals[name]:g}: no class of the weights; give one of {known}")
     camera, cost = layout.camera, layout.cost
     sweeps: dict[int, list[Sweep]] = {}  # by line spacing; of a recording, those that its lines contain
-    for step in record.steps:
+    for step in (one for one in record.steps if one <= camera.samples):
         with nullcontext() if layout.recorded is None else suppress(NotRecordedError):
             sweeps[step] = layout.uniform(step, layout.exposure_ms).sweeps()[1]
     recorded_ms = None  # by line spacing: recorded lines have exposures of their own

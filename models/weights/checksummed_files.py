@@ -55,7 +55,8 @@ def refusing(path: Path) -> Iterator[None]:
     except DAMAGED as error:
         why = " ".join(str(error).split())[:300]
         raise WeightsError(
-            f"cannot read {path}: {why}; restore a copy of it, or delete it and train or measure it again"
+            f"cannot read {path}: {why}; restore a copy of it, name another file, or move it elsewhere and train or "
+            "measure it again"
         ) from error
 
 

@@ -104,8 +104,8 @@ def open_recorded_cube(path: Path, wavelengths: Sequence[float] | None) -> Recor
         source = with_wavelengths(source, path, wavelengths)
     if source.bands.wavelength_nm is None:
         raise WavelengthError(
-            f"{path} has {source.shape[2]} bands and nothing says their wavelengths; give --wavelengths in nm, or "
-            "write a list 'wavelength' into its header"
+            f"{path} has {source.shape[2]} bands and nothing says their wavelengths; give --wavelengths in nm"
+            + (", or write a list 'wavelength' into its header" if reader_of(path) == "envi" else "")
         )
     return RecordedFile(_stem(path), path, source)
 

@@ -263,6 +263,13 @@ def test_a_straight_scan_is_a_recording(
     assert published.receipt["recording"]["lines_read"] == 96
 
 
+def test_a_line_may_have_fewer_samples_than_a_scan_has_steps(tmp_path: Path, make_weights: WeightsMaker) -> None:
+    """Scans of more steps than samples are not offered: they were refused for an overlap that nobody asked for."""
+    folder = write_pushbroom(tmp_path / "drone", np.full((96, 1, 3), 900, np.uint16))
+    receipt = survey_sweeps(tmp_path / "a", folder / "scan.hdr", weights=str(make_weights(scans=RECORD))).receipt
+    assert receipt["settings"]["size"] == [1, 96]
+
+
 def table(folder: Path, header: str, rows: Sequence[str]) -> None:
     """Write the pointing table beside the cube of a straight scan."""
     (folder / "scan.pointing.csv").write_text("\n".join([header, *rows]) + "\n")

@@ -72,6 +72,6 @@ def test_a_damaged_checkpoint_is_refused(tmp_path: Path, damage: str) -> None:
     assert changed != raw
     file.write_bytes(changed)
     for identity in ("x", "another"):
-        with pytest.raises(WeightsError, match=r"cannot read .*/c: .*; restore a copy of it, or delete it"):
+        with pytest.raises(WeightsError, match=r"cannot read .*/c: .*; restore a copy of it, name another file, or"):
             load_checkpoint(file, identity)
     assert file.read_bytes() == changed
