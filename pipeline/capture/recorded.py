@@ -124,13 +124,8 @@ class RecordedSource:
     ) -> None:
         if not sweeps:
             raise SceneError("the recording holds no sweep; name a folder or file with raw cubes in it")
-        self.sweeps, self.camera, self.wavelength_nm, self.field_shape = (
-            tuple(sweeps),
-            camera,
-            wavelength_nm,
-            field_shape,
-        )
-        self.name, self.notes = name, tuple(notes)
+        self.sweeps, self.camera, self.wavelength_nm = tuple(sweeps), camera, wavelength_nm
+        self.field_shape, self.name, self.notes = field_shape, name, tuple(notes)
         for one in self.sweeps:
             wanted = (camera.samples // one.sweep.binning, len(wavelength_nm))
             if one.references.dark.shape != wanted:

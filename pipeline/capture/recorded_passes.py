@@ -89,9 +89,9 @@ class RecordedPasses:
 
     def lines_served(self, sweeps: Sequence[Sweep]) -> int:
         """Return the number of valid recorded lines that serve sweeps, each counted once."""
-        picked = [self.source.pick(sweep) for sweep in sweeps]
+        picked = map(self.source.pick, sweeps)
         served = {pair for one in picked for pair in zip(one.place.tolist(), one.line.tolist(), strict=True)}
-        return sum(bool(self.source.sweeps[place].valid_line[line]) for place, line in served)
+        return sum(int(self.source.sweeps[place].valid_line[line]) for place, line in served)
 
     @property
     def _kinds(self) -> list[tuple[Axis, int, int]]:

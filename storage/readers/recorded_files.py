@@ -79,8 +79,7 @@ def find_cubes(path: Path) -> list[Path]:
     if not cubes and not stores:
         raise SceneError(f"{path} holds no cube; expected ENVI headers (.hdr), raw_<frame> files or Zarr stores in it")
     if cubes and stores:
-        names = f"{cubes[0].name} and {stores[0].name}"
-        raise SceneError(f"{path} holds ENVI cubes and Zarr stores ({names}); name one, or move those of one kind")
+        raise SceneError(f"{path} holds ENVI cubes and the Zarr store {stores[0].name}; name one, or move either kind")
     return cubes or stores
 
 
@@ -95,10 +94,10 @@ def open_recorded_cube(path: Path, wavelengths: Sequence[float] | None) -> Recor
     """Open one cube of whole numbers with wavelengths."""
     source = open_cube(path)
     if source.dtype not in (np.uint8, np.uint16, np.int16):
-        scaled = " by the scale or offset in its header" if source.scaling else ""
         raise SceneError(
-            f"{path} holds {source.dtype}{scaled}, expected a camera's own numbers (whole, 8 or 16 bits); a cube of "
-            "reflectance or radiance is no recording: give it as --scene"
+            f"{path} holds {source.dtype}{' by the scale or offset in its header' if source.scaling else ''}, expected "
+            "a camera's own numbers (whole, 8 or 16 bits); a cube of reflectance or radiance is no recording: give it "
+            "as --scene"
         )
     if wavelengths is not None:
         source = with_wavelengths(source, path, wavelengths)
@@ -121,9 +120,10 @@ def with_bits(
     for cube in cubes:
         valid = np.flatnonzero(cube.source.valid)
         chosen = np.unique(valid[np.linspace(0, len(valid) - 1, SAMPLED_LINES).astype(int)])
+        lines = np.concatenate([cube.source.read(int(line), int(line) + 1) for line in chosen])
         good = ~_marked(cube.source)
-        lines = np.concatenate([cube.source.read(int(line), int(line) + 1) for line in chosen])[..., good]
-        most = int(lines[lines != cube.source.nodata].max(initial=0))
+        void = np.nan if cube.source.nodata is None else cube.source.nodata
+        most = int(lines.max(initial=0, where=good & (lines != void)))
         file = reference_files(cube.folder / cube.name, stated)["white"]
         white = cube.source.white if file is None else load_frame(file)[0]
         if white is not None:
@@ -141,8 +141,8 @@ def with_bits(
 
 def _marked(source: CubeSource) -> NDArray[np.bool_]:
     """Return (band,) whether the file marks a band as bad; no band where it marks all."""
-    marked = np.isin(np.arange(source.shape[2]), source.bad_bands)
-    return np.asarray(marked & ~marked.all())
+    count = source.shape[2]
+    return np.isin(np.arange(count), source.bad_bands if len(source.bad_bands) < count else ())
 
 
 def reference_files(stem: Path, stated: Mapping[str, Path | None]) -> dict[str, Path | None]:
@@ -213,15 +213,13 @@ def find_references(
         listed = listed_numbers(fields, "white_reference", bands, [])
         white_reference = white_reference if listed is None else listed.astype(np.float32)
         by_mirror = fields.get("mirror at rest", "0").strip() == "1"
-    if (marked := _marked(source)).any():
-        left_out = bands_text(np.flatnonzero(marked).tolist())
-        notes.append(f"{name}: bands {left_out} are left out: the file marks them as bad")
-    if source.nodata is not None:
-        notes.append(f"{name}: the number {source.nodata:g} is no data, as the file says")
-    bad = marked | np.asarray(False if bad is None else bad, np.bool_)
+    marked, out = _marked(source), source.nodata
+    left_out = f"bands {bands_text(np.flatnonzero(marked).tolist())} are left out: the file marks them as bad"
+    notes += [f"{name}: {left_out}"] if marked.any() else []
+    notes += [] if out is None else [f"{name}: the number {out:g} is no data, as the file says"]
+    bad = np.broadcast_to(marked | np.asarray(bad if bad is not None else False, np.bool_), frame).copy()
     white_reference = np.broadcast_to(white_reference, bands).copy()
-    bad = np.broadcast_to(bad, frame).copy() if bad.any() else None
-    return References(dark, white, white_reference, bad, found.get("flat"), by_mirror)
+    return References(dark, white, white_reference, bad if bad.any() else None, found.get("flat"), by_mirror)
 
 
 # --- pointing ---------------------------------------------------------------------------------------------------------

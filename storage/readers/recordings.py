@@ -142,10 +142,9 @@ def open_recording(
     be read, or has neither raw lines nor a signal; PoseError: a position of a raw cube is beyond the mirror.
     """
     camera, given = camera or LineCamera(), given or RecordedWith()
-    address = _fetched(address)
     stores = find_raw_cubes(address)
     if stores is None:
-        return _open_files(Path(address), camera, given)
+        return _open_files(Path(_fetched(address)), camera, given)
     for name in ("pointing", "dark", "white", "wavelengths"):
         if getattr(given, name) is not None:
             raise SettingsError(
@@ -179,9 +178,8 @@ def open_recording(
 
 def _exposing(camera: LineCamera, exposures_ms: Sequence[float]) -> LineCamera:
     """Return the camera with the exposure of a recording, if known."""
-    if not exposures_ms or camera.exposure_ms in exposures_ms:
-        return camera
-    return replace(camera, exposure_ms=exposures_ms[0])
+    kept = not exposures_ms or camera.exposure_ms in exposures_ms
+    return camera if kept else replace(camera, exposure_ms=exposures_ms[0])
 
 
 def _stamps(files: Iterable[Path]) -> list[str]:
@@ -298,43 +296,25 @@ def _sweeps_of(
         notes.append(f"{cube.name}: nothing says the exposure: {camera.exposure_ms:g} ms is assumed")
         known_ms = np.full(source.shape[0], camera.exposure_ms)
     exposure_ms = np.where(np.isfinite(known_ms), known_ms, np.nanmedian(known_ms))
-    references = find_references(
-        source,
-        cube.folder / cube.name,
-        camera,
-        notes,
-        stated=given.frames,
-        white_reference=np.asarray(given.white_reference, np.float32),
-    )
+    white = np.asarray(given.white_reference, np.float32)
+    stem = cube.folder / cube.name
+    references = find_references(source, stem, camera, notes, stated=given.frames, white_reference=white)
     names = (cube.name,) if pointing.part is None else tuple(name for name in dict.fromkeys(pointing.part) if name)
-    along: Axis = "x"
-    if reader_of(cube.path) == "envi":
-        axis = load_envi_header(find_envi_pair(cube.path)[0]).fields.get("line axis", "x").strip()
-        if axis not in ("x", "y"):
-            raise SceneError(f"{cube.path} has line axis = {axis!r}, expected x or y; correct the header")
-        along = "y" if axis == "y" else "x"
+    fields = load_envi_header(find_envi_pair(cube.path)[0]).fields if reader_of(cube.path) == "envi" else {}
+    if (axis := fields.get("line axis", "x").strip()) not in ("x", "y"):
+        raise SceneError(f"{cube.path} has line axis = {axis!r}, expected x or y; correct the header")
+    along: Axis = "y" if axis == "y" else "x"
     sweeps: list[RecordedSweep] = []
     for name in names:
-        own = np.arange(source.shape[0])
-        if pointing.part is not None:
-            own = np.flatnonzero(np.array(pointing.part) == name)
-        position, samples = pointing.position[own], source.shape[1]
-        scan = fit_sweep(position, camera, name=name, samples=samples, along=along, valid=valid[own])
+        own = np.flatnonzero(np.array(pointing.part or (name,) * source.shape[0]) == name)
+        position = pointing.position[own]
+        scan = fit_sweep(position, camera, name=name, samples=source.shape[1], along=along, valid=valid[own])
         exposed = float(np.median(exposure_ms[own]))
         sweep: Sweep = replace(scan.sweep, exposure_ms=None if exposed == camera.exposure_ms else exposed)
         if abs(scan.distance_px - sweep.step) > 1e-3 * sweep.step:
             notes.append(f"{name}: lines lie {scan.distance_px:.6g} px apart")
-        sweeps.append(
-            RecordedSweep(
-                sweep,
-                references,
-                pointing.position[own],
-                time_s[own],
-                exposure_ms[own],
-                valid[own],
-                _line_reader(source, own),
-            )
-        )
+        lines = position, time_s[own], exposure_ms[own], valid[own]
+        sweeps.append(RecordedSweep(sweep, references, *lines, _line_reader(source, own)))
     return sweeps
 
 
@@ -342,13 +322,14 @@ def _line_reader(source: CubeSource, own: NDArray[np.intp]) -> Callable[[NDArray
     """Return a reader of single lines of a sweep, which are the lines ``own`` of the cube."""
 
     def read_lines(numbers: NDArray[np.intp]) -> NDArray[np.uint16]:
+        """Return some lines (line, sample, band); numbers of no data are 65535."""
         lines = np.concatenate([source.read(first, stop) for first, stop in line_runs(own[numbers])])
         if source.nodata is not None:
             lines = np.where(lines == source.nodata, np.int32(LARGEST_SUM_DN), lines)  # out, as saturated ones
         if lines.dtype.kind == "i" and lines.min() < 0:
             raise SceneError(
-                f"{source.name} holds the number {lines.min()}, expected a camera's own numbers from 0; write data "
-                "type 12 (unsigned) into the header if they are unsigned"
+                f"{source.name} holds {lines.min()}, expected a camera's own numbers from 0; write data type 12 "
+                "(unsigned) into the header if they are unsigned"
             )
         return lines.astype(np.uint16)
 
@@ -359,10 +340,8 @@ def _middle_s(source: CubeSource, stated_s: Floats | None, camera: LineCamera, n
     """Return (line,) times of mid exposure since the first exposure began [s]: as stated, by stamps, or even."""
     at = np.arange(source.shape[0])
     if stated_s is None and source.lines.time_s is not None:
-        exposure_ms = camera.exposure_ms
-        if source.lines.exposure_ms is not None:
-            exposure_ms = float(np.nanmedian(source.lines.exposure_ms))
-        stated_s = source.lines.time_s + exposure_ms * 5e-4
+        known_ms = camera.exposure_ms if source.lines.exposure_ms is None else source.lines.exposure_ms
+        stated_s = source.lines.time_s + np.nanmedian(known_ms) * 5e-4
         notes.append("frames are taken to be stamped as their exposure begins")
     if stated_s is None or not np.isfinite(stated_s).any():
         notes.append(f"nothing says when lines were taken: one every {camera.frame_ms:g} ms is assumed")
@@ -383,11 +362,10 @@ def find_raw_cubes(address: str | Path) -> list[Path] | None:
 
     Raises ArchiveError: the archive has no such run, or no run with raw cubes; SceneError: there is no such file.
     """
-    address = _fetched(address)
     named = _named_run(address)
     if named is not None:
         return _run_with_cubes(*named)[2]
-    path = Path(address)
+    path = Path(_fetched(address))
     if not path.exists():
         raise SceneError(f"there is no recording {path}; check the name (seen from {Path.cwd()})")
     if not path.is_dir():
@@ -419,10 +397,9 @@ def find_recorded_run(address: str | Path) -> RecordedRun | None:
 
     Raises SceneError, ArchiveError: as `find_raw_cubes`.
     """
-    address = _fetched(address)
     named = _named_run(address)
     if named is None:
-        if not Path(address).exists():
+        if not Path(_fetched(address)).exists():
             raise SceneError(f"there is no recording {address}; check the name (seen from {Path.cwd()})")
         return None
     archive, run, _ = _run_with_cubes(*named)
@@ -443,7 +420,7 @@ def _fetched(address: str | Path) -> str | Path:
 
 def _named_run(address: str | Path) -> tuple[str, str | None] | None:
     """Return the archive and the run (None: the newest) of an address; None if it is no archive's."""
-    text = str(address).rstrip("/")
+    text = str(_fetched(address)).rstrip("/")
     place, _, run = text.rpartition("/runs/")
     if place and run and is_archive(place):
         return place, run
