@@ -30,6 +30,14 @@ def zoomed_out(geobox: GeoBox, factor: int, shape: tuple[int, int]) -> GeoBox:
     return odc_geobox.GeoBox(shape, Affine(a * factor, b * factor, c, d * factor, e * factor, f), geobox.crs)
 
 
+def wrapped(geobox: GeoBox) -> GeoBox:
+    """Return the grid with longitudes from -180 on; as it is if its unit is no degree."""
+    if geobox.crs is None or not geobox.crs.geographic:
+        return geobox
+    turns = (geobox.boundingbox.left + 180) // 360
+    return odc_geobox.GeoBox(geobox.shape, Affine.translation(-360 * turns, 0) * geobox.affine, geobox.crs)
+
+
 def shift_px(grid: GeoBox, other: GeoBox) -> tuple[float, float] | None:
     """Return the offset (x, y) of another grid of the same CRS from a grid [px].
 

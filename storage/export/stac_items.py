@@ -49,15 +49,15 @@ def footprint(geobox: GeoBox) -> dict[str, Any]:
     def to_degrees(corners: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return longitude and latitude of pixel corners (corner, 2)."""
         x, y = corners.T
-        return np.stack(transformer.transform(a * x + b * y + c, d * x + e * y + f), axis=-1).round(_DIGITS)
+        lon, lat = transformer.transform(a * x + b * y + c, d * x + e * y + f)
+        lon = np.unwrap(lon, period=360).round(_DIGITS)
+        return np.stack([lon - 360 * ((lon.min() + 180) // 360), lat], axis=-1).round(_DIGITS)
 
     outline = shapely.segmentize(shapely.box(0, 0, width, height), max(height, width) / EDGE_POINTS)
     on_earth = shapely.transform(outline, to_degrees)
-    west, _, east, _ = on_earth.bounds
-    if east - west > 180 and geobox.crs is not None and not geobox.crs.geographic:
-        beyond = shapely.transform(on_earth, lambda at: np.stack([at[:, 0] % 360, at[:, 1]], axis=-1))
-        there = shapely.affinity.translate(beyond.intersection(shapely.box(180, -90, 360, 90)), -360)
-        halves = [beyond.intersection(shapely.box(0, -90, 180, 90)), there]
+    if on_earth.bounds[2] > 180:
+        there = shapely.affinity.translate(on_earth.intersection(shapely.box(180, -90, 540, 90)), -360)
+        halves = [on_earth.intersection(shapely.box(-180, -90, 180, 90)), there]
         on_earth = shapely.MultiPolygon([shapely.geometry.polygon.orient(one) for one in halves])
     else:
         on_earth = shapely.geometry.polygon.orient(on_earth)
@@ -172,9 +172,17 @@ def _item(pystac: Any, item: Item) -> Any:
 
 
 def _extent(pystac: Any, items: Sequence[Any]) -> Any:
-    """Return the box around all items; the whole earth if no item has a place, as STAC requires a box."""
-    boxes = np.array([item.bbox for item in items if item.bbox is not None])
-    box = [*boxes[:, :2].min(axis=0).tolist(), *boxes[:, 2:].max(axis=0).tolist()] if len(boxes) else _EVERYWHERE
+    """Return the narrowest box around all items; the whole earth if no item has a place, as STAC requires a box.
+
+    West is more than east across 180 degrees.
+    """
+    box = _EVERYWHERE
+    if len(boxes := np.array([item.bbox for item in items if item.bbox is not None])):
+        west, south, east, north = boxes.T
+        reach = ((west - west[:, None]) % 360 + np.where(west > east, 360, 0) + east - west).max(axis=1)
+        first = reach.argmin()
+        end = float((west[first] + reach[first]).round(_DIGITS))
+        box = [float(west[first]), float(south.min()), end - 360 if end > 180 else end, float(north.max())]
     times = [(item.common_metadata.start_datetime, item.common_metadata.end_datetime) for item in items]
     interval = [min(start for start, _ in times), max(end for _, end in times)] if times else [None, None]
     return pystac.Extent(pystac.SpatialExtent([box]), pystac.TemporalExtent([interval]))

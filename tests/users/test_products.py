@@ -244,6 +244,7 @@ def test_the_impossible_is_refused_first(posed: Products, tmp_path: Path, flags:
     [
         ("EPSG:4326", (10, 89.9, 11, 89.99), "beyond 84 degrees north or 80 south"),
         ("EPSG:32660", (820_000, 1_100_000, 840_000, 1_110_000), "across 180 degrees of longitude"),
+        ("EPSG:4326", (179.9997, 10, 180.0003, 10.0005), "across 180 degrees of longitude"),
     ],
 )
 def test_a_prescription_ends_at_borders(posed: Products, crs: str, box: tuple[float, ...], words: str) -> None:
@@ -278,8 +279,8 @@ def test_a_survey_without_a_place_has_what_needs_none(surveyed_png: Any, tmp_pat
 
 @pytest.mark.parametrize(
     ("crs", "transform"),
-    [("EPSG:32632", TURNED), ("EPSG:4326", Affine(7e-7, 0, 9.5, 0, -4.5e-7, 52.1))],
-    ids=["turned", "in degrees"],
+    [("EPSG:32632", TURNED), *(("EPSG:4326", Affine(7e-7, 0, lon, 0, -4.5e-7, 52.1)) for lon in (9.5, 369.5))],
+    ids=["turned", "in degrees", "beyond 180 degrees"],
 )
 def test_products_lie_where_their_scene_lies(tmp_path: Path, weights: Path, crs: str, transform: Affine) -> None:
     """Corners of indices and polygons to 0.1 px, in its CRS; cells are square in metres; a gap gets no dose."""
@@ -302,6 +303,12 @@ def test_products_lie_where_their_scene_lies(tmp_path: Path, weights: Path, crs:
     np.testing.assert_allclose(cells.area, 0.25, rtol=1e-6)
     assert (cells.dose == 2).any()
     assert {0.0, 2.0} >= set(cells.dose)
+    task_data, numbers = isoxml_from_path(done.file("task_data"))
+    (grid,) = task_data.tasks[0].grids
+    lowest = float(grid.minimum_east_position), float(grid.minimum_north_position)
+    assert lowest == pytest.approx(json.loads(Path(done.answer["item"]).read_text())["bbox"][:2], abs=1e-5)
+    assert 9 < lowest[0] < 10
+    assert (to_numpy_array(numbers[grid.filename], grid) > 0).any()
 
 
 @pytest.mark.parametrize("turned_deg", [0, 15, 30, 45])

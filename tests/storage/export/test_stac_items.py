@@ -127,14 +127,23 @@ def test_the_footprint_is_the_grid_in_degrees() -> None:
     assert 52 < south < north < 52.1
 
 
-def test_an_outline_across_180_degrees_is_cut_there(tmp_path: Path) -> None:
-    """Two polygons of a map of 2 km, and a box whose west is more than its east, as RFC 7946 has it."""
-    box = GeoBox.from_bbox((179_000, 8_140_000, 181_000, 8_142_000), crs="EPSG:32701", resolution=10)
-    place = footprint(box)
+@pytest.mark.parametrize(
+    ("crs", "bounds"),
+    [("EPSG:32701", (179_000, 8_140_000, 181_000, 8_142_000)), ("EPSG:4326", (179.99, -17, 180.01, -16.98))],
+)
+def test_an_outline_across_180_degrees_is_cut_there(tmp_path: Path, crs: str, bounds: tuple[float, ...]) -> None:
+    """Two polygons of a map of 2 km, and a box whose west is more than its east, as RFC 7946 has it.
+
+    The collection of it and a field east of it is as narrow.
+    """
+    place = footprint(GeoBox.from_bbox(bounds, crs=crs, shape=(200, 200)))
     shape = shapely.geometry.shape(place)
     assert place["type"] == "MultiPolygon"
     assert shape.area < 0.03**2
     path, _ = write_stac(tmp_path, ABOUT, "Surveys", replace(item("r1"), footprint=place))
+    beside = footprint(GeoBox.from_bbox((-179.9, -17, -179.8, -16.9), crs="EPSG:4326", shape=(9, 9)))
+    _, collection = write_stac(tmp_path, ABOUT, "Surveys", replace(item("r2"), footprint=beside))
+    assert read(collection)["extent"]["spatial"]["bbox"][0][::2] == [read(path)["bbox"][0], -179.8]
     west, south, east, north = read(path)["bbox"]
     assert 179.9 < west < 180
     assert -180 < east < -179.9
