@@ -19,7 +19,7 @@ from flows.publish.receipt import hectares_of_classes
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import UNLABELLED, cuts
 from pipeline.ground.field_places import M2_PER_HECTARE
-from pipeline.ground.georeference import pixel_side_m, wrapped
+from pipeline.ground.georeference import is_in_metres, pixel_side_m, wrapped
 from pipeline.lazy import pyproj, rasterio_features, rasterio_warp, shapely
 from storage.arrays.class_maps import ClassNames
 from storage.arrays.ground_maps import open_image
@@ -113,7 +113,7 @@ def _write_prescription(run: ExportedRun, raster: ClassRaster, folder: Path, cho
     assert raster.geobox is not None
     assert raster.geobox.crs is not None
     crs, unit, (west, south, east, north) = raster.geobox.crs, choice.unit, _bounds(raster.geobox, WGS84)
-    in_metres = crs.projected and set(crs.units) == {"metre"}
+    in_metres = is_in_metres(raster.geobox)
     plane = crs if in_metres else CRS.utm((west + east) / 2, (south + north) / 2)
     side = abs(raster.geobox.affine.determinant) ** 0.5 if in_metres else pixel_side_m(raster.geobox)
     cell_m = choice.flags.cell or max(CELL_M, round(side, 3))  # no smaller than a pixel

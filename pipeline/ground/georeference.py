@@ -74,9 +74,12 @@ def crs_name(geobox: GeoBox) -> str:
 
 def pixel_side_m(geobox: GeoBox) -> float:
     """Return the side of the square that has the area of the middle pixel [m]."""
-    rows, columns = geobox.shape
-    middle = _m2_of_units(geobox, np.array([columns / 2]), np.array([rows / 2]))
-    return float(np.sqrt(abs(float(geobox.affine.determinant)) * middle[0]))
+    return float(np.sqrt(abs(float(geobox.affine.determinant) * np.linalg.det(_metres_in_the_middle(geobox)))))
+
+
+def is_in_metres(geobox: GeoBox) -> bool:
+    """Return whether a unit of the CRS is a metre on the ground within 1 %, in all directions at the middle pixel."""
+    return bool(np.all(np.abs(np.linalg.svd(_metres_in_the_middle(geobox), compute_uv=False) - 1) < 0.01))
 
 
 def pixel_rows_m2(geobox: GeoBox) -> Iterator[Floats]:
@@ -87,7 +90,7 @@ def pixel_rows_m2(geobox: GeoBox) -> Iterator[Floats]:
     """
     rows, columns = geobox.shape
     tie_points_y, tie_points_x = np.linspace(0, rows, TIE_POINTS), np.linspace(0, columns, TIE_POINTS)
-    tie_points = _m2_of_units(geobox, *np.meshgrid(tie_points_x, tie_points_y))
+    tie_points = np.abs(np.linalg.det(_metres_of_units(geobox, *np.meshgrid(tie_points_x, tie_points_y))))
     units = abs(float(geobox.affine.determinant))
     across = np.array([np.interp(np.arange(columns) + 0.5, tie_points_x, line) for line in tie_points])  # (tie, x)
     place = (np.arange(rows) + 0.5) * (TIE_POINTS - 1) / rows
@@ -95,8 +98,16 @@ def pixel_rows_m2(geobox: GeoBox) -> Iterator[Floats]:
         yield units * ((1 - fraction) * across[above] + fraction * across[above + 1])
 
 
-def _m2_of_units(geobox: GeoBox, column: Floats, row: Floats) -> Floats:
-    """Return the square metres of the ellipsoid in one square of the map's unit, at places counted in pixels."""
+def _metres_in_the_middle(geobox: GeoBox) -> Floats:
+    rows, columns = geobox.shape
+    return _metres_of_units(geobox, np.float64(columns / 2), np.float64(rows / 2))
+
+
+def _metres_of_units(geobox: GeoBox, column: Any, row: Any) -> Floats:
+    """Return metres to east and north on the ellipsoid of one unit of the map along x and y, at places in pixels.
+
+    The last two axes are (east or north, x or y).
+    """
     assert geobox.crs is not None
     crs = pyproj.CRS.from_wkt(geobox.crs.to_wkt())
     degrees, ellipsoid = crs.geodetic_crs, crs.get_geod()
@@ -106,14 +117,14 @@ def _m2_of_units(geobox: GeoBox, column: Floats, row: Floats) -> Floats:
     a, b, c, d, e, f = geobox.affine[:6]
     x, y = a * column + b * row + c, d * column + e * row + f
     step = STEP_M / (crs.axis_info[0].unit_conversion_factor * (ellipsoid.a if crs.is_geographic else 1.0))
-    east, north = (
+    slopes = [
         np.radians(
             (np.subtract(to_degrees.transform(x + dx, y + dy), to_degrees.transform(x - dx, y - dy)) + 180) % 360 - 180
         )
         / (2 * step)
         for dx, dy in ((step, 0.0), (0.0, step))
-    )  # slopes of longitude, which may pass 180 degrees, and latitude along x and along y
+    ]  # along x and along y: of longitude, which may pass 180 degrees, and latitude
     lat = np.radians(to_degrees.transform(x, y)[1])
     bent = 1 - ellipsoid.es * np.sin(lat) ** 2  # radii of curvature are a (1 - e2) / bent^1.5 and a / sqrt(bent)
-    metres = ellipsoid.a**2 * (1 - ellipsoid.es) / bent**2 * np.cos(lat)
-    return np.asarray(np.abs(east[0] * north[1] - east[1] * north[0]) * metres, np.float64)
+    radii = ellipsoid.a / np.sqrt(bent) * np.stack([np.cos(lat), (1 - ellipsoid.es) / bent])
+    return np.asarray(np.moveaxis(np.stack(slopes, axis=1) * radii[:, None], (0, 1), (-2, -1)), np.float64)

@@ -279,8 +279,12 @@ def test_a_survey_without_a_place_has_what_needs_none(surveyed_png: Any, tmp_pat
 
 @pytest.mark.parametrize(
     ("crs", "transform"),
-    [("EPSG:32632", TURNED), *(("EPSG:4326", Affine(7e-7, 0, lon, 0, -4.5e-7, 52.1)) for lon in (9.5, 369.5))],
-    ids=["turned", "in degrees", "beyond 180 degrees"],
+    [
+        ("EPSG:32632", TURNED),
+        *(("EPSG:4326", Affine(7e-7, 0, lon, 0, -4.5e-7, 52.1)) for lon in (9.5, 369.5)),
+        ("EPSG:3857", Affine(0.08, 0, 1_057_535, 0, -0.08, 6_819_000)),
+    ],
+    ids=["turned", "in degrees", "beyond 180 degrees", "web mercator"],
 )
 def test_products_lie_where_their_scene_lies(tmp_path: Path, weights: Path, crs: str, transform: Affine) -> None:
     """Corners of indices and polygons to 0.1 px, in its CRS; cells are square in metres; a gap gets no dose."""

@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from odc.geo.geobox import GeoBox
 
 from pipeline.geometry.grid import SceneGrid, patch_pixels
-from pipeline.ground.georeference import pixel_rows_m2, pixel_side_m, zoomed_out
+from pipeline.ground.georeference import is_in_metres, pixel_rows_m2, pixel_side_m, zoomed_out
 
 PLACES = {32632: (8.0, 51.0), 3857: (8.0, 60.0), 3035: (8.0, 51.0), 4326: (8.0, 51.0), 2263: (-74.0, 40.7)}
+PLACES[6933] = (8.0, 51.0)  # stretched to equal areas
 
 
 def box(epsg: int, step: float, turn: float = 20, shape: tuple[int, int] = (300, 400)) -> GeoBox:
@@ -39,6 +40,11 @@ def test_areas_are_those_of_the_ellipsoid(epsg: int, step: float) -> None:
     outline = abs(ellipsoid.polygon_area_perimeter(*places)[0])
     assert np.sum(list(pixel_rows_m2(geobox))) == pytest.approx(outline, rel=1e-5)
     assert pixel_side_m(geobox) == pytest.approx(np.sqrt(outline / rows / columns), rel=1e-3)
+
+
+def test_a_metre_of_the_map_is_one_on_the_ground_or_not() -> None:
+    """Within 1 % in every direction: neither where a projection stretches both, nor one on the cost of the other."""
+    assert [epsg for epsg in PLACES if is_in_metres(box(epsg, 1e-4))] == [32632, 3035]
 
 
 @given(st.integers(1, 70), st.integers(1, 70), st.sampled_from([1, 2, 4, 8]), st.floats(-180, 180))
