@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote, unquote
+from urllib.parse import quote
 
 from odc.geo.geobox import GeoBox
 from rich.console import Console
@@ -33,6 +33,7 @@ from flows.terminal.processes import DONE
 from flows.terminal.progress import print_json
 from pipeline.errors import ArchiveError, PipelineError
 from pipeline.ground.georeference import pixel_side_m
+from storage.archive.manifests import read_manifest
 from storage.archive.staging import take_lock
 from storage.archive.whole_files import remove_leftovers
 from storage.arrays.georeference import load_geobox
@@ -125,16 +126,12 @@ def run_export(
         raise
     except OSError as error:
         raise ArchiveError(f"cannot export to {out}: {error.strerror}; choose another --out") from error
-    paths = {
-        key: Path(os.path.normpath(export.folder / unquote(asset["href"]))) for key, asset in export.assets.items()
-    }
-    files = {key: path.relative_to(out).as_posix() for key, path in paths.items() if path.is_relative_to(out)}
     placed = opened.geobox is not None
     if not placed:
         console.print("[dim]note: neither a rig pose nor the scene has a place on the earth; images have no CRS[/]")
-    for path in (*(out / name for name in files.values()), item, collection):
+    for path in (*(out / name for name in export.files.values()), item, collection):
         console.print(f"  {escape(str(path))}", soft_wrap=True)
-    return {"run": opened.id, "item": str(item), "collection": str(collection), "placed": placed, "files": files}
+    return {"run": opened.id, "item": str(item), "collection": str(collection), "placed": placed, "files": export.files}
 
 
 @dataclass
@@ -144,6 +141,7 @@ class Export:
     run: ExportedRun
     out: Path  # with links resolved, so that the relative address of the archive is right
     assets: dict[str, Asset] = field(default_factory=dict)
+    files: dict[str, str] = field(default_factory=dict)  # paths of assets in `out`, relative to it
 
     @property
     def folder(self) -> Path:
@@ -156,9 +154,11 @@ class Export:
         return {"proj:code": None} if geobox is None or geobox.crs is None else projection(geobox)
 
     def add(self, key: str, path: Path, title: str, kind: str, roles: list[str], **fields: Any) -> None:
-        """Add a file or store to the catalogue, by its address relative to the item."""
-        href = Path(os.path.relpath(path.resolve(), self.folder)).as_posix()
-        self.assets[key] = {"href": quote(href), "title": title, "type": kind, "roles": roles, **fields}
+        """Add a file or store to the catalogue, by its address in a bucket, else by that relative to the item."""
+        href = self.run.archive.url(path) or quote(Path(os.path.relpath(path.resolve(), self.folder)).as_posix())
+        self.assets[key] = {"href": href, "title": title, "type": kind, "roles": roles, **fields}
+        if path.resolve().is_relative_to(self.out):
+            self.files[key] = path.resolve().relative_to(self.out).as_posix()
 
 
 def _export_images(export: Export, layers: Sequence[Layer], console: Console) -> None:
@@ -212,7 +212,7 @@ def _add_stores(export: Export) -> None:
         title, roles = ("Raw sweep", ["data", "raw"]) if (sweep / "dn").is_dir() else ("Signal of sweep", ["data"])
         export.add(f"{sweep.stem}_zarr", sweep, f"{title} {sweep.stem}", ZARR, roles, **export.projection())
     for name, (title, kind, roles) in RUN_FILES.items():
-        if (run.folder / name).is_file():
+        if name in read_manifest(run.folder)["files"]:
             export.add(Path(name).stem, run.folder / name, title, kind, roles)
 
 
