@@ -13,7 +13,7 @@ from urllib.parse import quote
 
 from rich.markup import escape
 
-from flows.archive.stale_runs import called
+from flows.archive.stale_runs import called, generations
 from flows.cli.app import ArchiveName, AsJson, OutFile, check_outside, stderr
 from flows.publish.receipt import check_receipt
 from flows.settings.load import time_of_visit
@@ -97,10 +97,14 @@ def read_history(archive: Archive, field: str | None = None) -> FieldHistory:
     legend = None
     with suppress(KeyError, OSError, PipelineError):  # the map was deleted
         legend = legend_of(open_group(archive.locate(runs[-1].products["class_map"])))
-    return FieldHistory(str(name), archive.name, [_row(run) for run in runs], legend)
+    every = enumerate(generations(catalogue))
+    newest = {(number, time_of_visit(run)): run.uri for number, generation in every for run in generation}.values()
+    return FieldHistory(
+        str(name), archive.name, [_row(run) | {"replaced": run.uri not in newest} for run in runs], legend
+    )
 
 
-def _row(run: Run) -> Row:
+def _row(run: Run) -> dict[str, Any]:
     """Return the figures of a run's receipt; a receipt that is not valid gives none."""
     receipt: Mapping[str, Any] = {}
     with suppress(ShapeError):
@@ -123,11 +127,12 @@ def _row(run: Run) -> Row:
 
 def render_history(history: FieldHistory, runs_at: str) -> str:
     """Return the page; ``runs_at`` is the relative address of the archive's folder, empty where there is none."""
+    visits = sum(not row["replaced"] for row in history.runs)
     return pages.render_page(
         "history.html",
         kicker="SpectralZoom field",
         title=history.field,
-        lead=f"{counted(len(history.runs), 'run')} in the archive.",
+        lead=f"{counted(visits, 'visit')}, {counted(len(history.runs), 'run')} in the archive.",
         about=f"{history.archive}; times in UTC",
         chart=_draw_areas(history.runs, history.legend),
         runs=[_shown(row, runs_at) for row in reversed(history.runs)],
@@ -137,7 +142,7 @@ def render_history(history: FieldHistory, runs_at: str) -> str:
 
 def _draw_areas(rows: Sequence[Row], legend: ClassNames | None) -> str | None:
     """Return a chart of the class areas over time, in the newest run's unit, as a data address; None without areas."""
-    dated = [row for row in rows if row["visited"] and row["areas"]]
+    dated = [row for row in rows if row["visited"] and row["areas"] and not row["replaced"]]
     if not dated:
         return None
     unit = dated[-1]["unit"]

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from flows.archive.history import FieldHistory, read_history, render_history
+from flows.archive.history import FieldHistory, _draw_areas, read_history, render_history
 from flows.settings.load import time_of_visit
 from storage.archive.archive import Archive
 from storage.archive.records import Run
@@ -41,6 +41,22 @@ def test_runs_are_one_history(archive: Path) -> None:
         receipt = json.loads((archive / row["run"] / "receipt.json").read_text())
         assert row["miou"] == receipt["accuracy"]["miou"]
         assert row["capture_s"] == receipt["savings"]["capture_s"]["done"]
+
+
+def test_a_visit_that_was_surveyed_again_is_one_point(tmp_path: Path) -> None:
+    """Of the newest run of its visit and scene; other scenes and other moments are visits of their own."""
+    archive = Archive.open(tmp_path)
+    for scene, visit in (("a", "2026-06-01"), ("a", "2026-06-08"), ("b", "2026-06-01"), ("a", "2026-06-01")):
+        with archive.new_run("north") as draft:
+            draft.write_file("receipt.json", json.dumps({"survey": "north", "scene": scene}))
+            draft.publish(survey="north", settings={"visit": visit})
+    history = read_history(archive)
+    assert [row["replaced"] for row in history.runs] == [True, False, False, False]
+    page = render_history(history, "")
+    assert "3 visits, 4 runs in the archive." in page
+    assert page.count("replaced by a later run") == 1
+    areas = [{**row, "unit": "fraction", "areas": {"soil": 1.0}} for row in history.runs]
+    assert _draw_areas(areas, None) == _draw_areas(areas[1:], None)
 
 
 @pytest.mark.parametrize(
@@ -80,7 +96,7 @@ def test_pages_load_nothing_and_lead_to_reports(archive: Path, command_line: Any
 def test_scores_on_a_scene_of_the_training_are_marked() -> None:
     """In the table, with a note below it; a run without a valid receipt has a row of dashes."""
     row = {"run": "runs/x", "created": "2026-06-01T10:00:00Z", "visited": None, "visit": None, "capture_s": None}
-    row |= {"unit": "fraction", "areas": {}, "miou": 0.5, "overall_accuracy": None}
+    row |= {"replaced": False, "unit": "fraction", "areas": {}, "miou": 0.5, "overall_accuracy": None}
     pages = [
         render_history(FieldHistory("north", "a", [{**row, "training_scene": seen}]), "") for seen in (None, "all")
     ]

@@ -55,7 +55,7 @@ def _history(words: str) -> FieldHistory:
     row = {
         **{"run": words, "created": "2026-06-01T10:00:00Z", "visited": "2026-06-01T10:00:00Z", "visit": words},
         **{"miou": 0.5, "overall_accuracy": None, "training_scene": None, "capture_s": 9.0},
-        **{"areas": {words: 1.0}, "unit": "fraction"},
+        **{"areas": {words: 1.0}, "unit": "fraction", "replaced": False},
     }
     return FieldHistory(words, words, [row])
 
