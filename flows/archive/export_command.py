@@ -41,6 +41,7 @@ from storage.arrays.signal_cubes import RestoredCube, open_lines
 from storage.export.image_files import write_cog, write_recorded_files
 from storage.export.stac_items import COG, ZARR, Item, check_owner, clean_id, footprint, projection, write_stac
 from storage.readers.recordings import RESTORED
+from storage.remote.object_archive import ObjectArchive
 from storage.remote.opening import open_archive
 
 COLLECTION_TEXT = "Surveys exported from the archive {}. If no survey has a place, the extent is the whole earth."
@@ -155,7 +156,9 @@ class Export:
 
     def add(self, key: str, path: Path, title: str, kind: str, roles: list[str], **fields: Any) -> None:
         """Add a file or store to the catalogue, by its address in a bucket, else by that relative to the item."""
-        href = self.run.archive.url(path) or quote(Path(os.path.relpath(path.resolve(), self.folder)).as_posix())
+        archive, href = self.run.archive, quote(Path(os.path.relpath(path.resolve(), self.folder)).as_posix())
+        if isinstance(archive, ObjectArchive) and path.is_relative_to(archive.root):
+            href = archive.url(path)
         self.assets[key] = {"href": href, "title": title, "type": kind, "roles": roles, **fields}
         if path.resolve().is_relative_to(self.out):
             self.files[key] = path.resolve().relative_to(self.out).as_posix()

@@ -162,8 +162,11 @@ class ExportedRun:
 
     @cached_property
     def geobox(self) -> GeoBox | None:
-        """Return the grid of the run's map on the earth, by its pose or its scene; None if neither has one."""
-        return load_geobox(self.path(self.map_product))
+        """Return the grid of the run's map by its pose or scene, with longitudes from -180; None if neither has one."""
+        found = load_geobox(self.path(self.map_product))
+        if found is None or found.crs is None or not found.crs.geographic:
+            return found
+        return Affine.translation(-360 * ((found.boundingbox.left + 180) // 360), 0) * found
 
     @property
     def map_product(self) -> str:

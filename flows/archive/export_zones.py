@@ -19,7 +19,7 @@ from flows.publish.receipt import hectares_of_classes
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import UNLABELLED, cuts
 from pipeline.ground.field_places import M2_PER_HECTARE
-from pipeline.ground.georeference import is_in_metres, pixel_side_m, wrapped
+from pipeline.ground.georeference import is_in_metres, pixel_side_m
 from pipeline.lazy import pyproj, rasterio_features, rasterio_warp, shapely
 from storage.arrays.class_maps import ClassNames
 from storage.arrays.ground_maps import open_image
@@ -49,7 +49,7 @@ class ClassRaster:
     classes: NDArray[np.uint8]  # (y, x)
     legend: ClassNames
     transform: Affine  # from pixel corners to the map; tangents of angles without a CRS
-    geobox: GeoBox | None  # `wrapped`
+    geobox: GeoBox | None
 
     @classmethod
     def of(cls, run: ExportedRun) -> ClassRaster:
@@ -58,8 +58,7 @@ class ClassRaster:
         names, colours = stored.about["class_names"], np.array(stored.about["class_colours"], np.uint8)
         classes = np.concatenate([rows for _, rows in stored.rows()])
         legend = ClassNames(tuple(names), colours.reshape(-1, 3))
-        transform = Affine(*stored.about["spatial:transform"])
-        return cls(classes, legend, transform, run.geobox and wrapped(run.geobox))
+        return cls(classes, legend, Affine(*stored.about["spatial:transform"]), run.geobox)
 
 
 def check_zones(run: ExportedRun, choice: ProductChoice) -> None:
@@ -74,7 +73,7 @@ def check_zones(run: ExportedRun, choice: ProductChoice) -> None:
             "a CRS"
         )
     if choice.doses and run.geobox is not None:
-        west, south, east, north = _bounds(wrapped(run.geobox), WGS84)
+        west, south, east, north = _bounds(run.geobox, WGS84)
         if not -80 <= south <= north <= 84:
             raise SettingsError("the map lies beyond 84 degrees north or 80 south, where UTM and a prescription end")
         if west > east or east > 180:

@@ -97,15 +97,13 @@ def read_history(archive: Archive, field: str | None = None) -> FieldHistory:
     legend = None
     with suppress(KeyError, OSError, PipelineError):  # the map was deleted
         legend = legend_of(open_group(archive.locate(runs[-1].products["class_map"])))
-    every = enumerate(generations(catalogue))
-    newest = {(number, time_of_visit(run)): run.uri for number, generation in every for run in generation}.values()
-    return FieldHistory(
-        str(name), archive.name, [_row(run) | {"replaced": run.uri not in newest} for run in runs], legend
-    )
+    every = ((number, run) for number, some in enumerate(generations(catalogue)) for run in some)
+    newest = {(number, time_of_visit(run)): run.uri for number, run in every}.values()
+    return FieldHistory(str(name), archive.name, [_row(run, run.uri not in newest) for run in runs], legend)
 
 
-def _row(run: Run) -> dict[str, Any]:
-    """Return the figures of a run's receipt; a receipt that is not valid gives none."""
+def _row(run: Run, replaced: bool) -> Row:
+    """Return the figures of a run's receipt, ``replaced`` or not; a receipt that is not valid gives none."""
     receipt: Mapping[str, Any] = {}
     with suppress(ShapeError):
         receipt = check_receipt(run.receipt)
@@ -113,6 +111,7 @@ def _row(run: Run) -> dict[str, Any]:
     unit, counts = "ha" if "ha" in areas else "fraction", areas.get("px", {})
     return {
         "run": run.uri,
+        "replaced": replaced,
         "created": run.created,
         "visit": run.settings.get("visit"),
         "visited": time_of_visit(run),

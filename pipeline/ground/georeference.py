@@ -30,14 +30,6 @@ def zoomed_out(geobox: GeoBox, factor: int, shape: tuple[int, int]) -> GeoBox:
     return odc_geobox.GeoBox(shape, Affine(a * factor, b * factor, c, d * factor, e * factor, f), geobox.crs)
 
 
-def wrapped(geobox: GeoBox) -> GeoBox:
-    """Return the grid with longitudes from -180 on; as it is if its unit is no degree."""
-    if geobox.crs is None or not geobox.crs.geographic:
-        return geobox
-    turns = (geobox.boundingbox.left + 180) // 360
-    return odc_geobox.GeoBox(geobox.shape, Affine.translation(-360 * turns, 0) * geobox.affine, geobox.crs)
-
-
 def shift_px(grid: GeoBox, other: GeoBox) -> tuple[float, float] | None:
     """Return the offset (x, y) of another grid of the same CRS from a grid [px].
 
@@ -74,12 +66,14 @@ def crs_name(geobox: GeoBox) -> str:
 
 def pixel_side_m(geobox: GeoBox) -> float:
     """Return the side of the square that has the area of the middle pixel [m]."""
-    return float(np.sqrt(abs(float(geobox.affine.determinant) * np.linalg.det(_metres_in_the_middle(geobox)))))
+    middle = _metres_of_units(geobox, *np.divide(geobox.shape.xy, 2))
+    return float(np.sqrt(abs(float(geobox.affine.determinant) * np.linalg.det(middle))))
 
 
 def is_in_metres(geobox: GeoBox) -> bool:
     """Return whether a unit of the CRS is a metre on the ground within 1 %, in all directions at the middle pixel."""
-    return bool(np.all(np.abs(np.linalg.svd(_metres_in_the_middle(geobox), compute_uv=False) - 1) < 0.01))
+    middle = _metres_of_units(geobox, *np.divide(geobox.shape.xy, 2))
+    return bool(np.all(np.abs(np.linalg.svd(middle, compute_uv=False) - 1) < 0.01))
 
 
 def pixel_rows_m2(geobox: GeoBox) -> Iterator[Floats]:
@@ -98,16 +92,8 @@ def pixel_rows_m2(geobox: GeoBox) -> Iterator[Floats]:
         yield units * ((1 - fraction) * across[above] + fraction * across[above + 1])
 
 
-def _metres_in_the_middle(geobox: GeoBox) -> Floats:
-    rows, columns = geobox.shape
-    return _metres_of_units(geobox, np.float64(columns / 2), np.float64(rows / 2))
-
-
 def _metres_of_units(geobox: GeoBox, column: Any, row: Any) -> Floats:
-    """Return metres to east and north on the ellipsoid of one unit of the map along x and y, at places in pixels.
-
-    The last two axes are (east or north, x or y).
-    """
+    """Return metres (..., east or north, x or y) of one unit of the map on the ellipsoid, at places in pixels."""
     assert geobox.crs is not None
     crs = pyproj.CRS.from_wkt(geobox.crs.to_wkt())
     degrees, ellipsoid = crs.geodetic_crs, crs.get_geod()

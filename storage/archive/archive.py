@@ -115,10 +115,6 @@ class Archive:
                 )
         return self.root / address
 
-    def url(self, path: Path) -> str | None:
-        """Return the address in a bucket of a file or store below `root`; None if it lies in no bucket."""
-        return None
-
     def find(self, stage: str, key: str) -> StageRef | None:
         """Return the published store; None where there is none or its files were cleared away.
 

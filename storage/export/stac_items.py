@@ -172,17 +172,11 @@ def _item(pystac: Any, item: Item) -> Any:
 
 
 def _extent(pystac: Any, items: Sequence[Any]) -> Any:
-    """Return the narrowest box around all items; the whole earth if no item has a place, as STAC requires a box.
-
-    West is more than east across 180 degrees.
-    """
-    box = _EVERYWHERE
-    if len(boxes := np.array([item.bbox for item in items if item.bbox is not None])):
-        west, south, east, north = boxes.T
-        reach = ((west - west[:, None]) % 360 + np.where(west > east, 360, 0) + east - west).max(axis=1)
-        first = reach.argmin()
-        end = float((west[first] + reach[first]).round(_DIGITS))
-        box = [float(west[first]), float(south.min()), end - 360 if end > 180 else end, float(north.max())]
+    """Return the narrowest box around all items, its west more than its east across 180 degrees, or the whole earth."""
+    west, south, east, north = np.array([item.bbox for item in items if item.bbox is not None] or [_EVERYWHERE]).T
+    reach = ((west - west[:, None]) % 360 + 360 * (west > east) + east - west).max(axis=1)  # from the west of each
+    begin, end = float(west[reach.argmin()]), round(float(west[reach.argmin()] + reach.min()), _DIGITS)
+    box = [begin, float(south.min()), end - 360 * (end > 180), float(north.max())]
     times = [(item.common_metadata.start_datetime, item.common_metadata.end_datetime) for item in items]
     interval = [min(start for start, _ in times), max(end for _, end in times)] if times else [None, None]
     return pystac.Extent(pystac.SpatialExtent([box]), pystac.TemporalExtent([interval]))

@@ -24,7 +24,6 @@ from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
-from urllib.parse import quote
 
 from pipeline.errors import ArchiveError, IncompleteStoreError
 from storage.archive.archive import Archive
@@ -109,14 +108,12 @@ class ObjectArchive(Archive):
         self._fetch(in_text(address) or "/".join(address.split("/")[:2]))
         return super().locate(address)
 
-    def url(self, path: Path) -> str | None:
-        """Return the address in the bucket of a file or store, by its path in the working copy; None for others."""
-        if not path.is_relative_to(self.root):
-            return None
+    def url(self, path: Path) -> str:
+        """Return the address in the bucket of a file or store, by its path in the working copy."""
         address = path.relative_to(self.root).as_posix()
         uri = in_text(address) or "/".join(address.split("/")[:2])
         place = _files_at(uri, (self.root / uri / MANIFEST_NAME).read_bytes())
-        return f"{self.name}/{quote(place + address.removeprefix(uri))}"
+        return f"{self.name}/{place}{address.removeprefix(uri)}"
 
     def discard(self, ref: StageRef, *, wait: bool = True, unnamed: bool = False) -> bool:
         """Remove one store here and in the bucket; see `Archive.discard`.
