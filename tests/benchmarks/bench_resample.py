@@ -41,9 +41,9 @@ def rows() -> list[Row]:
         torch.set_num_threads(before)
 
 
-def _call(scene: Turned, kernel: Kernel, out: NDArray[Any] | None = None, valid: Any = None) -> Callable[[], Any]:
-    valid = np.ones(scene.samples.shape[:2], bool) if valid is None else valid
-    return lambda: resample(scene.samples, valid, scene.coordinates, kernel, out=out)
+def _call(scene: Turned, kernel: Kernel) -> Callable[[], Any]:
+    valid = np.ones(scene.samples.shape[:2], bool)
+    return lambda: resample(scene.samples, valid, scene.coordinates, kernel)
 
 
 def _take(scene: Turned, out: NDArray[np.float32]) -> Callable[[], None]:
@@ -62,7 +62,7 @@ def _take(scene: Turned, out: NDArray[np.float32]) -> Callable[[], None]:
 def _over_take(scene: Turned) -> list[Row]:
     """Each kernel over a copy of the same rows, on a sweep larger than the cache and on one that stays in it."""
     out = np.empty(scene.truth.shape, np.float32)
-    calls = {"take": _take(scene, out)} | {kernel: _call(scene, kernel, out) for kernel in KERNELS}
+    calls = {"take": _take(scene, out)} | {kernel: _call(scene, kernel) for kernel in KERNELS}
     clocks = time_in_turn({name: _often(call, TILES) for name, call in calls.items()}, 7)
     take = ns_of(clocks["take"], TILES * out.size)
     found = []
@@ -81,7 +81,7 @@ def _over_take_cached(scene: Turned) -> Row:
     samples, coordinates = np.ascontiguousarray(scene.samples[middle, middle]), scene.coordinates[near] - middle.start
     small = replace(scene, samples=samples, coordinates=coordinates, truth=scene.truth[near])
     out = np.empty(small.truth.shape, np.float32)
-    once = {"take": _take(small, out), "ours": _call(small, "catmull-rom", out)}
+    once = {"take": _take(small, out), "ours": _call(small, "catmull-rom")}
     clocks = time_in_turn({name: _often(call, 20) for name, call in once.items()}, 5)
     ours, take = (ns_of(clocks[name], 20 * out.size) for name in ("ours", "take"))
     return Row(
@@ -100,18 +100,15 @@ def _often(call: Callable[[], Any], times: int) -> Callable[[], None]:
 
 
 def _beside_peers(kernel: Kernel, natural: Turned, flat: Turned) -> list[Row]:
-    """Time and error of one order, ours to used memory beside those that are given some, to fresh beside the rest."""
+    """Time and error of one order; ours writes to fresh memory, also beside those that are given some."""
     order, name = KERNELS[kernel]
-    others, out = peers(natural, order), np.empty(natural.truth.shape, np.float32)
-    ours = {"warm": _call(natural, kernel, out), "fresh": _call(natural, kernel)}
-    clocks = time_in_turn(ours | {peer.name: peer.call for peer in others}, ROUNDS)
-    warm, fresh = (ns_of(clocks[memory], out.size) for memory in ours)
+    others = peers(natural, order)
+    clocks = time_in_turn({"ours": _call(natural, kernel)} | {peer.name: peer.call for peer in others}, ROUNDS)
+    ours = ns_of(clocks["ours"], natural.truth.size)
     theirs = {peer.name: ns_of(clocks[peer.name], peer.bands * len(natural.truth)) for peer in others}
-    met = all((warm if peer.warm else fresh) < theirs[peer.name] for peer in others)
+    met = all(ours < theirs[peer.name] for peer in others)
     listed = _listed(theirs, "{:.3g}") + _prepared(others, natural)
-    found = [
-        Row(f"{name}: ns/(px*band), given memory / fresh", f"{warm:.2f} / {fresh:.2f}", "less than each", met, listed)
-    ]
+    found = [Row(f"{name}: ns/(px*band)", f"{ours:.2f}", "less than each", met, listed)]
     for what, scene, there in (("amplitude as period", natural, others), ("all waves alike", flat, peers(flat, order))):
         error = scene.error(_call(scene, kernel)()[0])
         errors = {peer.name: scene.error(peer.by_pixel(peer.call())) for peer in there}
@@ -130,8 +127,7 @@ def _over_linear(natural: Turned, flat: Turned) -> list[Row]:
         fraction = ours / theirs
         name = f"catmull-rom: error over cv2.remap linear, {what}"
         found.append(Row(name, f"{fraction:.3f}", "<= 1/3", fraction <= 1 / 3, listed))
-    out = np.empty(natural.truth.shape, np.float32)
-    calls = {"ours": _call(natural, "catmull-rom", out), "joined": peers(natural, 1, only="cv2.remap")[0].call}
+    calls = {"ours": _call(natural, "catmull-rom"), "joined": peers(natural, 1, only="cv2.remap")[0].call}
     calls["parted"] = cv2_parts(natural, 1)
     clocks = time_in_turn({name: _often(call, TILES) for name, call in calls.items()}, 7)
     times, parted = ratio(clocks, "ours", "joined"), ratio(clocks, "ours", "parted")

@@ -26,7 +26,6 @@ class Peer:
     call: Callable[[], Any]
     by_pixel: Callable[[Any], NDArray[np.float32]]
     bands: int
-    warm: bool = False  # writes to memory that is given, and was used before
     prepare: Callable[[], object] | None = None  # the index it builds first
 
 
@@ -99,11 +98,7 @@ def _cv2_remap(scene: Turned, order: int) -> Peer:
     """The sweep parted into groups of bands beforehand, the result joined, for that is what the others give."""
     parts, joined = cv2_parts(scene, order), np.empty((EDGE, EDGE, BANDS), np.float32)
     return Peer(
-        "cv2.remap",
-        lambda: np.concatenate(parts(), axis=2, out=joined),
-        lambda _: joined.reshape(-1, BANDS),
-        BANDS,
-        warm=True,
+        "cv2.remap", lambda: np.concatenate(parts(), axis=2, out=joined), lambda _: joined.reshape(-1, BANDS), BANDS
     )
 
 
@@ -183,7 +178,6 @@ def _rasterio_reproject(scene: Turned, order: int) -> Peer:
         lambda: reproject(planes, out, resampling=kernel, num_threads=1, **place, **same_scale),
         lambda _: _by_pixel(out),
         BANDS,
-        warm=True,
     )
 
 
