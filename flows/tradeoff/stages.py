@@ -98,12 +98,8 @@ def scatter_points(seed: int) -> Scattered:
     return Scattered(samples, coordinates, waves.at(coordinates))
 
 
-def noise_level(camera: LineCamera) -> float:
-    """Return a tenth of the noise over the scene's standard deviation."""
-    electrons = camera.full_scale_e / 2
-    return 0.1 * math.sqrt(electrons + camera.read_noise_e**2) / (CONTRAST * electrons)
-
-
+ELECTRONS = LineCamera().full_scale_e / 2
+NOISE = math.sqrt(ELECTRONS + LineCamera().read_noise_e ** 2) / (CONTRAST * ELECTRONS)  # over the standard deviation
 RECTIFY = Tradeoff(
     stage="rectify",
     knob="resampling",
@@ -116,7 +112,7 @@ RECTIFY = Tradeoff(
         state.samples, np.ones(state.samples.shape[:2], bool), state.coordinates, cast("Kernel", kernel)
     )[0],
     judge=lambda state, _kernel, out: Figures(float(np.sqrt(np.mean((out - state.truth) ** 2)) / np.std(state.truth))),
-    level=("0.1 σ of noise", noise_level(LineCamera())),  # noqa: RUF001
+    level=("0.1 σ of noise", 0.1 * NOISE),  # noqa: RUF001
 )
 
 

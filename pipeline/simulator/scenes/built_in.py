@@ -67,11 +67,6 @@ def built_in_scene(name: str, seed: int, *args: Any, **moment: Any) -> RasterSce
     return make(seed, *args, **moment)
 
 
-def is_built_in_key(key: str) -> bool:
-    """Return whether a scene's key is of a built-in scene."""
-    return key.partition("/")[0] in (FARM_LAW, SCOUTING_LAW)
-
-
 def built_in_laws(names: str) -> tuple[str, ...]:
     """Return laws of built-in scenes named with commas; none where one of them is not built in."""
     parts = [part.strip() for part in names.split(",")]

@@ -45,7 +45,7 @@ def test_waves_and_noise_are_what_they_claim():
     assert 4 <= period.min() <= period.max() <= 40
     np.testing.assert_array_equal(waves.at(np.ones((1, 2))), draw_waves(3, 64, PERIODS_PX).at(np.ones((1, 2))))
     electrons = LineCamera().full_scale_e / 2
-    assert stages.noise_level(LineCamera()) * 2 * electrons == pytest.approx(math.sqrt(electrons + 20**2))
+    assert stages.NOISE * 0.2 * electrons == pytest.approx(math.sqrt(electrons + 20**2))
 
 
 def test_errors_of_kernels_are_those_known():

@@ -7,14 +7,7 @@ import pytest
 from scipy import ndimage
 
 from pipeline.errors import SceneError
-from pipeline.simulator.scenes.built_in import (
-    SCOUTED,
-    built_in_scene,
-    is_built_in_key,
-    patches_of,
-    scouting_plan,
-    scouting_scene,
-)
+from pipeline.simulator.scenes.built_in import SCOUTED, built_in_scene, patches_of, scouting_plan, scouting_scene
 from pipeline.simulator.scenes.farm.farm_plan import CLASS_COLOURS, CLASSES
 from tests.pipeline.simulator.scenes.test_farm_scene import labels_of
 
@@ -93,7 +86,6 @@ def test_key_tells_the_share_and_the_light() -> None:
     assert scene.key == "scouting@1/seed=3/day=172/shape=20x30/hour=11/bands=7/full_well=20155"
     assert scouting_scene(3, (20, 30), 7, interest=0.25).key == scene.key.replace("/bands", "/interest=0.25/bands")
     assert scene.in_light(0.125).key == f"{scene.key}/light=0.125"
-    assert is_built_in_key(scene.key)
 
 
 @pytest.mark.parametrize("interest", [-0.1, 1.5, float("nan")])
