@@ -14,6 +14,7 @@ import time
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 # Before numpy and torch are loaded: one thread, as the figures are meant.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -79,7 +80,7 @@ def _machine() -> str:
     """Processor, cores, load and versions, on one line."""
     from flows.tradeoff.entries import describe_machine, mean_load
 
-    it = describe_machine(threads=1)
+    it: dict[str, Any] = describe_machine(threads=1)
     versions = ", ".join(f"{name} {version}" for name, version in it["versions"].items())
     return f"{it['processor']}, {it['cores']} cores, load {mean_load()}, one thread; python {it['python']}, {versions}"
 

@@ -137,7 +137,8 @@ def judge(data: DataSet, counts: Sequence[int], say: Say) -> Tallies:
         scene = make()
         if scene.labels is None or scene.class_names != data.weights.class_names:
             raise SceneError(f"scene {name} has classes {scene.class_names}, the weights {data.weights.class_names}")
-        grid = SceneGrid(*scene.shape, config.patch)
+        height, width = scene.shape
+        grid = SceneGrid(height, width, config.patch)
         observed = observe(scene, CAMERA, grid, data.weights.basis, np.random.default_rng([number, 0x9A9E]))
         _, reached = data.weights.basis.matrix(scene.wavelength_nm)
         columns = normalised(observed, data.weights.normalisation, reached).columns.astype(np.float32)

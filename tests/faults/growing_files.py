@@ -83,7 +83,7 @@ def flip_journal(flips: int, seed: int = 0) -> Rot:
         at, bit = chance.randrange(len(rotten)), chance.randrange(8)
         rotten[at] ^= 1 << bit
         found.flips += 1
-        for one in _guarded(lambda held=rotten: _held(held, truth, found)):  # type: ignore[misc]
+        for one in _guarded(lambda held=rotten: _held(held, truth, found)):
             found.wrong.append(f"byte {at}: bit {bit}: {one}")
     return found
 

@@ -5,7 +5,7 @@ Every function here is called once, in a process that does nothing else and ends
 
 from __future__ import annotations
 
-import _pyio  # type: ignore[import-not-found]
+import _pyio
 import builtins
 import errno
 import functools

@@ -98,7 +98,7 @@ def record(folder: Path) -> list[Moment]:
         synced = path.stat().st_size
         note()
 
-    os.fdatasync = watched  # type: ignore[assignment]
+    os.fdatasync = watched
     try:
         with Spool.open(folder, SAMPLES, BANDS, header=HEADER) as spool:
             for number in range(LINES):

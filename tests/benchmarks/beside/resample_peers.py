@@ -184,7 +184,7 @@ def _rasterio_reproject(scene: Turned, order: int) -> Peer:
 def _pyresample(scene: Turned, order: int) -> Peer:
     """The grid is an area of metres, the sweep a swath of longitudes and latitudes."""
     from pyresample import kd_tree
-    from pyresample.bilinear import NumpyBilinearResampler
+    from pyresample.bilinear import NumpyBilinearResampler  # type: ignore[attr-defined]
 
     swath, area = _swath_and_area(scene)
     if order == 0:
