@@ -47,6 +47,7 @@ from pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
 from storage.archive.records import Run
 from storage.archive.staging import read_toml
 from storage.readers.recordings import find_recorded_run
+from storage.remote.opening import is_archive
 
 
 @dataclasses.dataclass(frozen=True)
@@ -431,7 +432,7 @@ def _recorded_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[s
         yield "source = 'recorded' reads sweeps that were taken before; give --sweeps, where they lie"
     else:
         sweeps, out = Path(settings.sweeps).resolve(), Path(settings.out).resolve()
-        if out == (sweeps.parent if sweeps.is_file() else sweeps) and not (out / "stages").is_dir():
+        if out == (sweeps.parent if sweeps.is_file() else sweeps) and not is_archive(settings.out):
             yield f"{at('out')} = {settings.out!r} is the folder of the sweeps, and would hide them; choose another one"
     if settings.scene != RIG_FIELD:
         yield (

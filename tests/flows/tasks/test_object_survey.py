@@ -164,6 +164,7 @@ def test_verbs_read_an_archive_in_a_bucket(
     assert tree["product"].startswith("stages/segment/")
     assert json.loads(command_line("verify", bucket, "--json").out)["problems"] == []
     assert command_line("survey", "--out", bucket, *SMALL).code == 0
+    assert command_line("plan", "--sweeps", bucket, "--out", bucket).code == 0
     again = json.loads(command_line("reprocess", bucket, "--json").out)
     assert [row["state"] for row in again["fields"]] == ["skipped"]
     cleared = json.loads(command_line("gc", bucket, "--keep-days", "0", "--json").out)
