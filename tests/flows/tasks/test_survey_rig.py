@@ -24,7 +24,7 @@ from flows.settings.survey_settings import Settings
 from flows.tasks.run import make_source, open_run
 from flows.tasks.scene import open_scene
 from flows.tasks.stages.effects import chosen_effects
-from pipeline.errors import PoseError, SettingsError
+from pipeline.errors import PoseError, RigError, SettingsError
 from pipeline.geometry.scan import Sweep, exposing
 from pipeline.rig.camera.camera_cubes import mean_frame
 from pipeline.rig.capture_paths import REFERENCES
@@ -182,6 +182,10 @@ def test_visits_are_captured_and_broken_ones_gone_on_with(tmp_path: Path, monkey
         assert published.receipt["settings"]["visit"] == "first"
         assert "secret" not in (published.folder / "receipt.json").read_text()
         assert not list((tmp_path / "spool").iterdir())
+        with flows.tasks.rig_field.rig_to_oneself(settings.rig.port):  # by another survey: stored lines need no rig
+            assert run_survey(settings, QUIET).receipt["products"]["mosaic"] == published.receipt["products"]["mosaic"]
+            with pytest.raises(RigError, match="in use by another survey"):
+                run_survey(replace(settings, visit="second"), QUIET)
         run_survey(replace(settings, visit="second"), QUIET)
         assert coarse_captures(rig) == 2
         run_survey(replace(settings, name="west"), QUIET)  # another field of the same settings
