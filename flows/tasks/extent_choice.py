@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from flows.settings.values import format_extent
 from flows.tasks.capture_plan import PassLayout
 from flows.tasks.prior_maps import Prior
+from flows.terminal.figures import format_percent
 from models.reading.expected_errors import Floats, PatchExpectedErrors
 from models.reading.prior_map import COME_TRUE, ClassProbabilities, PriorMap, carried, in_classes
 from models.weights.files import Description, load_reader
@@ -51,7 +52,7 @@ class ExtentChoice:
         due = f"; patches beyond --max-age: {self.due - self.due_left} of {self.due} included" if self.due else ""
         return (
             f"captures the lines of highest expected gain in {self.seconds:.1f} s; the prior map's expected error is"
-            f" {self.expected_wrong:.1%}{due}"
+            f" {format_percent(self.expected_wrong)}{due}"
         )
 
 
@@ -116,15 +117,12 @@ def choose_extent(
         due = np.asarray(expected_errors.age_days + prior.days > max_age)
     record = ScanPerformance.read(content, light_fraction)
     extent_gains = ExtentGains(record, weights.class_names, expected_errors, available & due, available)
-    if (
-        skip_below_error is not None
-        and expected_errors.expected_wrong() < skip_below_error
-        and not extent_gains.due.any()
-    ):
+    wrong = expected_errors.expected_wrong()
+    if skip_below_error is not None and wrong < skip_below_error and not extent_gains.due.any():
         raise NothingToMend(
             prior.run,
-            f"nothing is captured: the prior map's expected error is {expected_errors.expected_wrong():.1%}, below "
-            f"--skip-below-error {skip_below_error:.1%}; the map of {prior.run} remains",
+            f"nothing is captured: the prior map's expected error is {format_percent(wrong)}, below "
+            f"--skip-below-error {skip_below_error:g}; the map of {prior.run} remains",
         )
     free = replace(layout, recorded=None)
     step, exposure_ms, extent = _best_extent(free, extent_gains, seconds)
