@@ -15,7 +15,6 @@ import numpy as np
 import pyproj
 import shapely
 import shapely.affinity
-from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
 from pipeline.errors import ArchiveError
@@ -40,22 +39,19 @@ def clean_id(text: str, otherwise: str) -> str:
 def footprint(geobox: GeoBox) -> dict[str, Any]:
     """Return the outline of a map as a GeoJSON polygon in longitude and latitude, anticlockwise.
 
-    A map across 180 degrees of longitude is cut there, as RFC 7946 asks for.
+    A map across 180 degrees of longitude is cut there, as RFC 7946 asks for; one around a pole has all longitudes.
     """
     place, (height, width) = map_attributes(geobox), geobox.shape
     transformer = pyproj.Transformer.from_crs(place["proj:wkt2"], "EPSG:4326", always_xy=True)
     a, b, c, d, e, f = place["spatial:transform"]
-
-    def to_degrees(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return longitude and latitude of pixel corners (corner, 2)."""
-        x, y = corners.T
-        lon, lat = transformer.transform(a * x + b * y + c, d * x + e * y + f)
-        lon = np.unwrap(lon, period=360).round(_DIGITS)
-        return np.stack([lon - 360 * ((lon.min() + 180) // 360), lat], axis=-1).round(_DIGITS)
-
     outline = shapely.segmentize(shapely.box(0, 0, width, height), max(height, width) / EDGE_POINTS)
-    on_earth = shapely.transform(outline, to_degrees)
-    if on_earth.bounds[2] > 180:
+    x, y = shapely.get_coordinates(outline).T
+    lon, lat = (one.round(_DIGITS) for one in transformer.transform(a * x + b * y + c, d * x + e * y + f))
+    lon = np.unwrap(lon, period=360)
+    on_earth = shapely.Polygon(np.stack([lon - 360 * ((lon.min() + 180) // 360), lat], axis=-1).round(_DIGITS))
+    if abs(lon[-1] - lon[0]) > 180:  # the outline goes around a pole
+        on_earth = shapely.box(-180, *((lat.min(), 180, 90) if lat.mean() > 0 else (-90, 180, lat.max())))
+    elif on_earth.bounds[2] > 180:
         there = shapely.affinity.translate(on_earth.intersection(shapely.box(180, -90, 540, 90)), -360)
         halves = [on_earth.intersection(shapely.box(-180, -90, 180, 90)), there]
         on_earth = shapely.MultiPolygon([shapely.geometry.polygon.orient(one) for one in halves])

@@ -127,6 +127,13 @@ def test_the_footprint_is_the_grid_in_degrees() -> None:
     assert 52 < south < north < 52.1
 
 
+@pytest.mark.parametrize(("crs", "south", "north"), [("EPSG:3413", 88.7, 90), ("EPSG:3031", -90, -88.7)])
+def test_a_map_around_a_pole_has_all_longitudes(crs: str, south: float, north: float) -> None:
+    """From its farthest corner to the pole."""
+    place = footprint(GeoBox.from_bbox((-1e5, -1e5, 1e5, 1e5), crs=crs, shape=(20, 20)))
+    assert shapely.geometry.shape(place).bounds == pytest.approx((-180, south, 180, north), abs=0.05)
+
+
 @pytest.mark.parametrize(
     ("crs", "bounds"),
     [("EPSG:32701", (179_000, 8_140_000, 181_000, 8_142_000)), ("EPSG:4326", (179.99, -17, 180.01, -16.98))],
