@@ -361,8 +361,8 @@ _FORMATS: Mapping[str, Callable[[Any], str]] = {
     "older_ha": _older,
     "sweeps": lambda sweeps: f"corrected by up to {max(math.hypot(*one) for one in sweeps.values()):.1f} px",
     "saturated": lambda fraction: (
-        f"{format_percent(fraction)} of the spectra miss bands that are saturated or no data. These are restored from "
-        "the others, or unknown where more than half are missing. A shorter exposure avoids saturation"
+        f"{format_percent(fraction)} of the spectra have bands that are saturated or without data. They are restored "
+        "from the others; where fewer than half are left, the spectrum is unknown. A shorter exposure avoids saturation"
     ),
     "too_narrow": lambda value: f"{counted(len(value), 'overlap')} too narrow to compare",
 }

@@ -24,7 +24,7 @@ from storage.arrays.layout import SmallArray, create_group, damage_named, open_g
 GRID_MAPPING = "spatial_ref"
 # on every image: CF's link to the grid mapping, and the same as a coordinate, so that plain xarray takes it for one
 ON_THE_MAP = {"grid_mapping": GRID_MAPPING, "coordinates": GRID_MAPPING}
-_CONVENTIONS = [
+_PROJ, _SPATIAL = (
     {
         "uuid": uuid,
         "name": name,
@@ -36,14 +36,8 @@ _CONVENTIONS = [
         ("f17cb550-5864-4468-aeb7-f3180cfb622f", "proj", "Coordinate reference system of the map"),
         ("689b58e2-cf7b-45e0-9fff-9cfc0883d6b4", "spatial", "Relation of array indices to the map's coordinates"),
     )
-]
-_SPATIAL_CONVENTION = {
-    "uuid": "689b58e2-cf7b-45e0-9fff-9cfc0883d6b4",
-    "name": "spatial",
-    "schema_url": "https://raw.githubusercontent.com/zarr-conventions/spatial/refs/tags/v1/schema.json",
-    "spec_url": "https://github.com/zarr-conventions/spatial/blob/v1/README.md",
-    "description": "Relation of array indices to tangents of the undeflected direction; there is no CRS",
-}
+)
+_OF_ANGLES = "Relation of array indices to tangents of the undeflected direction; there is no CRS"
 _DEGREES = {"x": ("longitude", "degrees_east"), "y": ("latitude", "degrees_north")}
 _EVEN = 1e-3  # of a step, by which coordinates may differ from an even grid's
 
@@ -71,7 +65,7 @@ class AngularGrid:
             "spatial:transform": [step, 0.0, left, 0.0, step, top],
             "spatial:bbox": [left, top, left + step * shape[1], top + step * shape[0]],
             "spatial:registration": "pixel",
-            "zarr_conventions": [_SPATIAL_CONVENTION],
+            "zarr_conventions": [_SPATIAL | {"description": _OF_ANGLES}],
         }
 
     def coordinates(self, shape: tuple[int, int]) -> dict[str, SmallArray]:
@@ -130,7 +124,7 @@ def map_attributes(geobox: GeoBox) -> dict[str, Any]:
         "spatial:transform": [float(number) for number in geobox.affine[:6]],
         "spatial:bbox": [float(number) for number in geobox.boundingbox.bbox],
         "spatial:registration": "pixel",
-        "zarr_conventions": _CONVENTIONS,
+        "zarr_conventions": [_PROJ, _SPATIAL],
     }
 
 

@@ -9,7 +9,15 @@ import pytest
 
 from tests.faults import checksummed_flips, disk_full, lost_lines, many_writers, mutated_files, small_survey
 from tests.faults.cube_files import FORMATS
+from tests.faults.fault_table import HEADINGS, Row, run_table
 from tests.faults.small_survey import Subject, stored
+
+
+@pytest.mark.parametrize(("count", "code"), [(0, 1), (1, 0)])
+def test_a_row_that_tried_nothing_is_not_met(count: int, code: int) -> None:
+    """Nothing of nothing differs; that shows nothing."""
+    row = Row("lines", "compared", count, "equal", f"0 of {count} differ", True, 0.0)
+    assert run_table(["lines"], "", "", {"lines": lambda quick: [row]}, (), HEADINGS) == code
 
 
 def test_disk_full_under_spool_manifest_and_run(subject: Subject) -> None:
