@@ -196,13 +196,8 @@ def write_components(group: zarr.Group, components: Components) -> None:
     rows = components.axes * np.nan_to_num(components.noise)
     write_small(group, "axes", ("component", "band"), rows, {"long_name": "scene value of a score of 1", **about})
     write_small(group, "mean", ("band",), components.mean, {"long_name": "mean scene value", **about})
-    write_small(
-        group,
-        "noise",
-        ("band",),
-        components.noise,
-        {"long_name": "standard deviation of one spectrum's noise", **about},
-    )
+    noise = {"long_name": "standard deviation of one spectrum's noise", **about}
+    write_small(group, "noise", ("band",), components.noise, noise)
 
 
 def read_components(group: zarr.Group) -> Components:
