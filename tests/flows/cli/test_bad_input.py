@@ -181,24 +181,3 @@ def test_interrupted_survey_says_how_to_go_on(
     ended = command_line(*words)
     assert ended.code == 0
     assert "capture: 100% cached" in ended.err
-
-
-TRAINING = {
-    "scenes of files": (2, "scene.png -o new.safetensors --scenes 3", "--scenes is for built-in scenes"),
-    "no patch": (2, "scene.png -o new.safetensors --patch 0", "--patch must be above 0, got 0"),
-    "too many for validation": (1, "scene.png -o new.safetensors --validation 3", "leave none of 1 to train on"),
-    "band that is no number": (2, "scene.png -o new.safetensors --bands a", "whole numbers with commas, got 'a'"),
-    "no -o": (2, "scene.png", "--out requires an argument"),
-    "hold-out of the farm": (2, "farm -o new.safetensors --hold-out 100000", "--hold-out is for scene files"),
-}
-
-
-@pytest.mark.parametrize("case", TRAINING)
-def test_training_refused_with_one_message(
-    case: str, folder: Path, surveyed: Path, command_line: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Before the first step: the right exit code, one line that says what to do, and no file of weights."""
-    code, words, message = TRAINING[case]
-    monkeypatch.chdir(folder)
-    command_line("train", *words.split()).refused(code, message)
-    assert not list(folder.glob("new.safetensors*"))
