@@ -4,7 +4,8 @@ The class probabilities of a map give the expected confusion counts, and from th
 overconfident at borders and for rare classes, most of all for short exposures and wide line spacings. A bias of each
 class, step and exposure corrects the logit of its IoU; it is fitted to validation scenes.
 
-A class of few expected pixels may be absent: its weight in the mean is the probability that it is present.
+A class may be absent if few pixels are expected, or a small fraction of all of which the map is not sure. Its weight in
+the mean is the probability that it is present.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from models.evaluation.metrics import Floats, iou_per_class, labelled_classes, mean_iou
 
 THERE_PX = 100.0  # expected pixels of a class that is present with probability 1/2
+SURE_IOU, LARGE = 0.2, 0.01  # the same by its corrected IoU, or by its fraction of all pixels
 SURE_PX = 2000.0  # of a class: a scene with so many counts in full; fewer in all scenes shrink the bias
 SMALL_PX, SMALL_ERROR = 300.0, 0.3  # the IoU of a class of so few pixels has half of this error
 LEAST_IOU = 0.005  # IoU is kept as far from 0 and 1
@@ -59,7 +61,8 @@ def expected_score(counts: Floats, bias: Floats, error: float = LEAST_ERROR) -> 
     """
     area = counts.sum(axis=1)
     iou = scipy.special.expit(_logit(iou_per_class(counts)) + bias)
-    there = area**2 / (area**2 + THERE_PX**2)
+    doubt = (1 - _odds(iou, SURE_IOU, 4)) * (1 - _odds(area / max(area.sum(), 1.0), LARGE, 2))
+    there = _odds(area, THERE_PX, 2) * (1 - doubt)
     number = float(there.sum())
     if not number > 0:
         return ExpectedScore(math.nan, math.nan, np.full(len(area), np.nan))
@@ -146,6 +149,11 @@ class MapScores:
         at, known = math.log(exposure_ms), np.log(self.exposures_ms)
         bias = np.array([np.interp(at, known, one) for one in self.bias[row].T])
         return expected_score(counts, bias, float(np.interp(at, known, self.error[row])))
+
+
+def _odds(size: Floats, half: float, power: int) -> Floats:
+    """Return a probability that increases with a size, 1/2 at ``half``."""
+    return np.asarray(size**power / (size**power + half**power))
 
 
 def _logit(fraction: Floats) -> Floats:
