@@ -221,8 +221,6 @@ def scan_table(scans: Mapping[str, Any]) -> Table:
     return table(columns, cells, left=2, whole=columns[2:])
 
 
-# --- estimates --------------------------------------------------------------------------------------------------------
-
 TITLE = "Estimates: nothing of this has run"
 LABELS: Mapping[str, tuple[str, Callable[[float | None], str]]] = {
     "capture_s": ("capture time", format_seconds),

@@ -222,9 +222,6 @@ def _names(images: Sequence[Path]) -> dict[str, Path]:
     return {image.name: image for image in images}
 
 
-# --- training data ----------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class TrainingData:
     """Names of training, validation and held-out scenes, which are opened one at a time."""

@@ -246,9 +246,6 @@ def _printable(text: str) -> str:
     return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
-# --- findings --------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class FoundClass:
     """A value of the label files: a name for scene.toml, and its fraction of the labelled pixels."""

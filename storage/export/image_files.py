@@ -138,9 +138,6 @@ def _tag_wavelengths(file: Any, image: CogImage) -> None:
         file.update_tags(band, **usual)
 
 
-# --- ENVI -------------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class EnviFile:
     """The content of one file, its lines interleaved by band (BIL) and its bytes little endian."""

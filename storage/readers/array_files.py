@@ -147,9 +147,6 @@ def check_picture(shape: tuple[int, ...], where: object) -> None:
     )
 
 
-# --- NetCDF and HDF5 --------------------------------------------------------------------------------------------------
-
-
 def _hdf_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
     """Return the arrays of an HDF5 file by their paths, and the attributes of its root."""
     arrays: dict[str, FileArray] = {}
@@ -215,9 +212,6 @@ def in_scope(arrays: Arrays, name: str) -> dict[str, FileArray]:
         for path, array in arrays.items()
         if path.startswith(head) and "/" not in path.removeprefix(head)
     } | {path: array for path, array in arrays.items() if "/" in path}
-
-
-# --- EMIT, NEON and PRISMA --------------------------------------------------------------------------------------------
 
 
 def marked_bands(arrays: Arrays, count: int) -> tuple[int, ...]:

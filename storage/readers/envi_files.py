@@ -130,9 +130,6 @@ def load_envi_header(path: Path) -> EnviHeader:
     return parse_envi_header(text, str(path))
 
 
-# --- cubes of one file or several -------------------------------------------------------------------------------------
-
-
 def open_envi_source(path: Path, *, scaled: bool = True) -> CubeSource:
     """Open one ENVI cube by its header or data file (SceneError as `open_envi_cube`).
 

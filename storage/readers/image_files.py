@@ -245,8 +245,6 @@ def place_of_envi(
     return (None if found is None else odc_geobox.GeoBox(shape, found.affine, found.crs)), notes
 
 
-# --- bands ------------------------------------------------------------------------------------------------------------
-
 _UNIT = "wavelength_units"
 _LENGTHS = r"nm|nanomet(?:er|re)s?|µm|um|micromet(?:er|re)s?"
 _DESCRIBED = re.compile(rf"(?<![\w.])(\d+(?:\.\d+)?)\s*({_LENGTHS})\b", re.IGNORECASE)  # Band 12 (660.5 Nanometers)

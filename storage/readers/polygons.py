@@ -147,9 +147,6 @@ def word_of(value: object) -> str:
     return str(value).strip()
 
 
-# --- labels -----------------------------------------------------------------------------------------------------------
-
-
 def is_polygon_file(address: str | Path) -> bool:
     """Return whether a label file holds polygons, by its name."""
     return split_layer(address)[0].suffix.lower() in POLYGON_ENDINGS

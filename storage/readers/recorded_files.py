@@ -222,8 +222,6 @@ def find_references(
     return References(dark, white, white_reference, bad if bad.any() else None, found.get("flat"), by_mirror)
 
 
-# --- pointing ---------------------------------------------------------------------------------------------------------
-
 Kind = Literal["mirror", "angles", "angle", "px", "m"]
 KINDS: Mapping[Kind, tuple[str, ...]] = {
     "mirror": ("mirror_x", "mirror_y"),

@@ -354,9 +354,6 @@ def _middle_s(source: CubeSource, stated_s: Floats | None, camera: LineCamera, n
     return filled
 
 
-# --- raw cubes of archives --------------------------------------------------------------------------------------------
-
-
 def find_raw_cubes(address: str | Path) -> list[Path] | None:
     """Return the raw cubes of an address, sorted by name; None if it has none.
 

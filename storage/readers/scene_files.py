@@ -240,9 +240,6 @@ def _digest(*parts: object) -> str:
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 
-# --- values -----------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class FileValues:
     """The numbers of a file in the chosen bands as the values of a scene, NaN without one."""

@@ -158,9 +158,6 @@ def _codecs(content: object) -> Iterator[str]:
                 yield from _codecs(codec.get("configuration") if isinstance(codec, dict) else None)
 
 
-# --- ingested cubes ---------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class SourceFile:
     """A file of a cube."""
