@@ -85,10 +85,13 @@ def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> Cub
         notes = [*notes, *([] if alpha is None else [ALPHA_NOTE]), *where, *of_bands]
         scale, offset = (np.tile([of[band] for band in keep], len(pages)) for of in (file.scales, file.offsets))
         picture, colours = driver not in _CALLED, None
+        nodata = None if "NODATA_VALUES" in file.tags() else file.nodata  # a colour is in the mask
         if picture and kinds == ["palette"] and not palette:
-            colours, count = np.zeros((256, 3), np.uint8), 3
+            listed, count = np.zeros((256, 4), np.uint8), 3
             for number, colour in file.colormap(1).items():
-                colours[number] = colour[:3]
+                listed[number] = colour
+            clear, colours, nodata = listed[file.read(1), 3] == 0, listed[:, :3], None
+            void = clear if clear.any() else None
             known, notes = _of_colours(RGB_NM), ["colours looked up in the image's palette"]
 
         def read_rows(first: int, last: int) -> NDArray[Any]:
@@ -110,7 +113,7 @@ def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> Cub
             read=read,
             files=(path,),
             bands=known,
-            nodata=file.nodata,
+            nodata=nodata,
             geobox=geobox,
             bad_bands=tuple(place for place, band in enumerate(keep) if band in bad) if len(pages) == 1 else (),
             void=void,

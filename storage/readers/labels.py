@@ -156,8 +156,9 @@ def found_classes(addresses: Iterable[str | Path], unlabelled: ClassValue | None
 def load_codes(
     address: str | Path, geobox: GeoBox | None = None, *, by_number: bool, classes: Collection[ClassValue] = ()
 ) -> LabelCodes:
-    """Read a file as one whole number a pixel; NaN, and a no-data value that is none of ``classes``, are no value.
+    """Read a file as one whole number a pixel.
 
+    NaN is no value. So are no-data value, transparent and masked pixels, if their number is none of ``classes``.
     A file with a place is resampled to ``geobox`` by nearest neighbour. ``by_number`` takes the indices of a palette,
     and the value of an image with equal channels. Raises SceneError: the file cannot be read, holds fractions, or lies
     beside the geobox.
@@ -170,6 +171,10 @@ def load_codes(
         if void.any() and codes[void][0] not in map(_code, classes):
             codes[void] = NO_VALUE
             notes.append(f"{void.sum()} px have the label file's no-data value {source.nodata:g}: unlabelled")
+    if source.void is not None and not source.void.all():
+        clear = source.void & ~np.isin(codes, [*map(_code, classes)])
+        codes[clear] = NO_VALUE
+        notes += [f"{clear.sum()} px of the label file are transparent or masked: unlabelled"] if clear.any() else []
     if geobox is not None and own is not None and not _is_same_grid(own, geobox):
         codes, regridded = _on_grid(codes, own, geobox, address), True
         notes.append(f"labels {address} have another grid than the scene: they are resampled by nearest neighbour")

@@ -63,6 +63,18 @@ def test_a_palette_is_read_either_way(tmp_path: Path) -> None:
         assert load_labels(tmp_path / "a.png", (2, 2), classes=classes).index.tolist() == [[0, 1], [2, 1]]
 
 
+@pytest.mark.parametrize(("classes", "unlabelled_px"), [({}, 2), (COLOURS, 1)])
+def test_transparent_pixels_are_no_class_unless_one_has_them(
+    tmp_path: Path, classes: dict[str, tuple[int, int, int]], unlabelled_px: int
+) -> None:
+    """A note has their number; a colour of [classes] counts."""
+    colours = [[(0, 0, 0, 0), (0, 255, 0, 255)], [(9, 9, 9, 0), (255, 0, 0, 255)]]
+    Image.fromarray(np.array(colours, np.uint8)).save(tmp_path / "a.png")
+    found = load_labels(tmp_path / "a.png", (2, 2), classes=classes)
+    assert int((found.index == 255).sum()) == unlabelled_px
+    assert f"{unlabelled_px} px of the label file are transparent" in found.notes[0]
+
+
 def test_classes_are_found_where_none_are_stated(tmp_path: Path) -> None:
     """Values become classes named after their number, NaN stays unlabelled."""
     np.save(tmp_path / "a.npy", np.array([[1.0, 5.0], [np.nan, 5.0]]))

@@ -98,9 +98,9 @@ def test_bands_that_a_file_calls_bad_are_left_out(tmp_path: Path) -> None:
     assert load_scene_file(tmp_path / "a.tif", bands=[1]).wavelength_nm.tolist() == [550.0]
 
 
-@pytest.mark.parametrize("kind", ["mask", "png"])
+@pytest.mark.parametrize("kind", ["mask", "RGBA", "P", "RGB"])
 def test_masked_and_transparent_pixels_have_no_value(tmp_path: Path, kind: str) -> None:
-    """An internal mask and the alpha of a PNG; another gap is another scene, whatever the pixels under it."""
+    """A mask; alpha, an index and a colour of a PNG. Another gap is another scene, whatever the pixels under it."""
     there = np.ones((6, 7), np.bool_)
     there[2:4, :3] = False
     hashes = set()
@@ -110,10 +110,18 @@ def test_masked_and_transparent_pixels_have_no_value(tmp_path: Path, kind: str) 
             with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), write(tmp_path / "a.tif") as file:
                 file.write_mask(mask)
             scene = load_scene_file(tmp_path / "a.tif", wavelengths=NM)
-        else:
+        elif kind == "RGBA":
             Image.fromarray(np.dstack([np.moveaxis(VALUES[:3], 0, -1), mask])).save(tmp_path / "a.png")
             scene = load_scene_file(tmp_path / "a.png")
-        np.testing.assert_array_equal(np.isnan(scene.values).all(axis=-1), ~there & gap)
+        else:  # in red both colours are alike
+            picture = Image.fromarray((~there).astype(np.uint8), "P")
+            picture.putpalette([200, 9, 1, 200, 9, 250])
+            clear = {"P": 1, "RGB": (200, 9, 250)}[kind]
+            picture.convert(kind).save(tmp_path / "a.png", **({"transparency": clear} if gap else {}))
+            scene = load_scene_file(tmp_path / "a.png")
+        np.testing.assert_array_equal(
+            np.isnan(scene.values), np.broadcast_to((~there & gap)[..., None], scene.values.shape)
+        )
         hashes.add(scene.light_hash)
     assert len(hashes) == 2
 
