@@ -157,7 +157,7 @@ def open_recording(
     for path, cube in zip(stores, cubes, strict=True):
         if not np.array_equal(cube.wavelength_nm, first.wavelength_nm):
             raise SceneError(f"{path} has other bands than {stores[0]}; name the raw cubes of one survey")
-        if "dn" in cube.group and (lost := lost_chunks(array_of(cube.group, "dn"))):
+        if "dn" in cube.group and (lost := lost_chunks(array_of(cube.group, "dn"))[0]):
             raise IncompleteStoreError(f"{path}/dn lacks {lost} of its chunks, whose lines would be 0; copy it again")
     sweeps = tuple(
         RecordedSweep(

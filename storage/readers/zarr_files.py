@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 import os
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -78,9 +79,11 @@ def zarr_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
     return {name: _file_array(path / name, array) for name, array in node.arrays()}, dict(node.attrs)
 
 
-def lost_chunks(array: zarr.Array[Any]) -> int:
-    """Return how many chunks have no file: zarr reads its fill value for them."""
-    return int(array.nchunks - array.nchunks_initialized)
+def lost_chunks(array: zarr.Array[Any]) -> tuple[int, int]:
+    """Return how many chunks, or shards of chunks, have no file, of how many: zarr reads its fill value for them."""
+    shard = array.shards or array.chunks
+    count = math.prod(-(-size // one) for size, one in zip(array.shape, shard, strict=True))
+    return count - array.nchunks_initialized * math.prod(array.chunks) // math.prod(shard), count
 
 
 def _file_array(path: Path, array: zarr.Array[Any]) -> FileArray:
@@ -94,8 +97,8 @@ def _file_array(path: Path, array: zarr.Array[Any]) -> FileArray:
     if named is not None:
         attributes["_ARRAY_DIMENSIONS"] = list(named)
     stored = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
-    lost = lost_chunks(array)
-    note = f"{lost} of {array.nchunks} chunks have no file, and are read as {array.fill_value}" if lost else ""
+    lost, count = lost_chunks(array)
+    note = f"{lost} of {count} chunks have no file, and are read as {array.fill_value}" if lost else ""
 
     def get(part: Any) -> NDArray[Any]:
         return np.asarray(array[part])

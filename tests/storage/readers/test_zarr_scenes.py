@@ -51,6 +51,11 @@ def test_plain_arrays(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
         scene = load_scene_file(path, wavelengths=NM.tolist())
         np.testing.assert_array_equal(scene.values, cube)
         assert "dims have no names, read as y, x, band" in scene.provenance
+    zarr.create_array(tmp_path / "shards.zarr", data=cube, chunks=(2, 2, 5), shards=(4, 4, 5))  # 2 x 3 of 7 x 9 px
+    assert load_scene_file(tmp_path / "shards.zarr", wavelengths=NM.tolist()).provenance == scene.provenance
+    (tmp_path / "shards.zarr/c/1/2/0").unlink()
+    torn = load_scene_file(tmp_path / "shards.zarr", wavelengths=NM.tolist())
+    assert torn.provenance[0] == "shards.zarr: 1 of 6 chunks have no file, and are read as 0"
     zarr.create_array(tmp_path / "flat.zarr", data=cube[..., 0])
     assert load_scene_file(tmp_path / "flat.zarr", wavelengths=[550]).values.shape == (7, 9, 1)
 
