@@ -396,14 +396,16 @@ def listed_scenes(names: Sequence[str]) -> str:
     return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 
-def scene_notes(empty: Sequence[str], regridded: Sequence[str]) -> tuple[str, ...]:
-    """Return notes on scenes without any value, and on scenes whose labels have another grid."""
+def scene_notes(empty: Sequence[str], regridded: Sequence[str], negative: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return notes on scenes without any value, with labels on another grid, and with mostly negative values."""
     left_out = f"{counted(len(empty), 'scene')} without any value left out: {listed_scenes(empty)}"
     moved = (
         f"labels of {listed_scenes(regridded)} have another place, CRS or pixels than their images: they are brought to"
         " the images' pixels by nearest neighbour"
     )
-    return (*([left_out] if empty else []), *([moved] if regridded else []))
+    dark = f"most values of {listed_scenes(negative)} are negative, thus without light; add an offset to the scene.toml"
+    kinds = ((empty, left_out), (regridded, moved), (negative, dark))
+    return tuple(note for names, note in kinds if names)
 
 
 def trained_pixels(scene: RasterScene) -> NDArray[np.bool_]:

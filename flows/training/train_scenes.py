@@ -132,7 +132,7 @@ def _imaged(
     With ``trained`` scenes, these are for validation: those without a label, or of a trained image, are left out.
     """
     found, empty, regridded, alike = Imaged(), list[str](), list[str](), dict[str, str]()
-    unfit = list[str]()
+    unfit, negative = list[str](), list[str]()
     stream = 0x0B5 if trained is None else 0x0B6  # validation has noise of its own
     for number, name in enumerate(names):
         report(what, number / len(names), name)
@@ -160,13 +160,15 @@ def _imaged(
             alike[name] = alone
         if scene.regridded:
             regridded.append(name)
+        if scene.content and 2 * np.count_nonzero(scene.planes < 0) > scene.planes.size:
+            negative.append(name)
         grid = SceneGrid(*scene.shape, common.patch)
         rng = np.random.default_rng([request.settings.seed, stream, number])
         found.examples.append(observe_scene(scene, request.camera, grid, common.basis, rng))
     notes = alike_notes(alike)
     if trained is None and len(alike) == len(found.keys) and len(notes) == 1:
         raise SceneError(f"{request.dataset}: training needs two or more classes, and {notes[0]}")
-    for note in (*notes, *scene_notes(empty, regridded)):
+    for note in (*notes, *scene_notes(empty, regridded, negative)):
         tell(note)
     if unfit:
         tell(

@@ -59,11 +59,11 @@ def test_minus_9999_that_nothing_declares_is_no_data(tmp_path: Path) -> None:
 
 @pytest.fixture
 def tiles(tmp_path: Path) -> Path:
-    """Four labelled tiles; the second is no data everywhere."""
+    """Four labelled tiles; the second is no data everywhere, the third mostly negative."""
     (folder := tmp_path / "tiles").mkdir()
     (folder / "scene.toml").write_text("wavelengths_nm = [460, 550, 640]\n")
     for number in range(1, 5):
-        values = np.full((32, 32, 3), -9999, np.int16) if number == 2 else image()
+        values = np.full((32, 32, 3), -9999, np.int16) if number == 2 else image() * (-1 if number == 3 else 1)
         write(folder / f"{number:03d}.tif", values, nodata=-9999)
         write(folder / f"{number:03d}_labels.tif", CLASSES)
     return folder
@@ -75,6 +75,8 @@ def test_a_tile_without_any_value_is_left_out(tiles: Path, tmp_path: Path, comma
     ended = command_line("train", tiles, "-o", out, "--hold-out", "004", *SMALL)
     assert ended.code == 0, ended.err
     assert "note: 1 scene without any value left out: 002" in ended.err
+    assert "note: most values of 003 are negative, thus without light; add an offset" in ended.err
+    assert "most values of 001" not in ended.err
     judged = command_line("evaluate", tiles, "--weights", out, "--policies", "random", "--fractions", "0.5")
     assert judged.code == 0, judged.err
     assert "note: 1 scene without any value left out: 002" in judged.err
