@@ -148,17 +148,19 @@ def load_data_set(
 def split_labels(
     scene: SceneFile, train_mask: str | Path, mask_classes: Sequence[int] | None
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return the labels with the mask's class, to train on, and all other labels, (y, x) each, 255 elsewhere."""
+    """Return the labels with the mask's class, or under a mask of one number, and all others, (y, x), 255 elsewhere."""
     if scene.labels is None:
         raise SceneError(f"{scene.path} has no labels, which a training mask needs; give --labels")
     mask = load_codes(train_mask, scene.geobox, by_number=True).values
     if mask.shape != scene.labels.shape:
         sizes = [f"{image.shape[0]} x {image.shape[1]} px" for image in (mask, scene.labels)]
-        raise SceneError(f"mask {train_mask} is {sizes[0]}, the scene is {sizes[1]} (y x x)")
+        raise SceneError(f"mask {train_mask} is {sizes[0]}, the scene is {sizes[1]} (y x x); give one of its size")
     highest = int(mask.max(initial=0))
+    if mask_classes is None and ((mask < 1) | (mask == highest)).all():
+        return _split(scene.labels, mask > 0)
     numbers = {value: index for index, value in enumerate(scene.class_values) if isinstance(value, int)}
     if not numbers:
-        raise SceneError(f"{scene.path} has classes by colour; a training mask needs classes by number")
+        raise SceneError(f"{scene.path} has classes by colour; a mask of classes needs numbers; give a mask of 0 and 1")
     classes = range(1, highest + 1) if mask_classes is None else mask_classes  # a range: a stray number may be huge
     if highest > len(classes):
         raise SceneError(f"mask {train_mask} goes up to {highest}, but only {len(classes)} mask classes are given")
@@ -169,8 +171,11 @@ def split_labels(
         )
     index = np.array([UNLABELLED, *(numbers[number] for number in classes[:highest])], np.uint8)
     wanted = index[np.maximum(mask, 0)]
-    trains = (wanted == scene.labels) & (wanted != UNLABELLED)
-    return (np.where(trains, scene.labels, np.uint8(UNLABELLED)), np.where(trains, np.uint8(UNLABELLED), scene.labels))
+    return _split(scene.labels, wanted == scene.labels)
+
+
+def _split(labels: NDArray[np.uint8], trains: NDArray[np.bool_]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    return np.where(trains, labels, np.uint8(UNLABELLED)), np.where(trains, np.uint8(UNLABELLED), labels)
 
 
 def _scenes(

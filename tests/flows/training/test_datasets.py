@@ -58,6 +58,10 @@ def test_a_mask_splits_the_labels(tmp_path: Path) -> None:
     assert train.labels.tolist() == [[255, 255, 1], [255, 255, 0]]
     assert test.labels.tolist() == [[255, 0, 255], [1, 0, 255]]
     assert load_data_set(tmp_path, train_mask=tmp_path / "mask.mat").names == ("a",)
+    np.save(tmp_path / "binary.npy", np.array([[255, 0, 255], [0, 255, 255]], np.uint8))
+    data = load_data_set(tmp_path / "a.npy", train_mask=tmp_path / "binary.npy")
+    assert data.load("a", "train").labels.tolist() == [[255, 255, 1], [255, 0, 0]]
+    assert data.load("a", "test").labels.tolist() == [[255, 0, 255], [1, 255, 255]]
 
 
 @pytest.mark.parametrize(
