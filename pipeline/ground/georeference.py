@@ -67,7 +67,7 @@ def crs_name(geobox: GeoBox) -> str:
 def pixel_side_m(geobox: GeoBox) -> float:
     """Return the side of the square that has the area of the middle pixel [m]."""
     middle = _metres_of_units(geobox, *np.divide(geobox.shape.xy, 2))
-    return float(np.sqrt(abs(float(geobox.affine.determinant) * np.linalg.det(middle))))
+    return float(np.sqrt(abs(float(geobox.affine.determinant)) * _area(middle)))
 
 
 def is_in_metres(geobox: GeoBox) -> bool:
@@ -84,7 +84,7 @@ def pixel_rows_m2(geobox: GeoBox) -> Iterator[Floats]:
     """
     rows, columns = geobox.shape
     tie_points_y, tie_points_x = np.linspace(0, rows, TIE_POINTS), np.linspace(0, columns, TIE_POINTS)
-    tie_points = np.abs(np.linalg.det(_metres_of_units(geobox, *np.meshgrid(tie_points_x, tie_points_y))))
+    tie_points = _area(_metres_of_units(geobox, *np.meshgrid(tie_points_x, tie_points_y)))
     units = abs(float(geobox.affine.determinant))
     across = np.array([np.interp(np.arange(columns) + 0.5, tie_points_x, line) for line in tie_points])  # (tie, x)
     place = (np.arange(rows) + 0.5) * (TIE_POINTS - 1) / rows
@@ -93,7 +93,7 @@ def pixel_rows_m2(geobox: GeoBox) -> Iterator[Floats]:
 
 
 def _metres_of_units(geobox: GeoBox, column: Any, row: Any) -> Floats:
-    """Return metres (..., east or north, x or y) of one unit of the map on the ellipsoid, at places in pixels."""
+    """Return the geocentric step (..., X, Y or Z, x or y) [m] of one unit of the map, at places in pixels."""
     assert geobox.crs is not None
     crs = pyproj.CRS.from_wkt(geobox.crs.to_wkt())
     degrees, ellipsoid = crs.geodetic_crs, crs.get_geod()
@@ -103,14 +103,17 @@ def _metres_of_units(geobox: GeoBox, column: Any, row: Any) -> Floats:
     a, b, c, d, e, f = geobox.affine[:6]
     x, y = a * column + b * row + c, d * column + e * row + f
     step = STEP_M / (crs.axis_info[0].unit_conversion_factor * (ellipsoid.a if crs.is_geographic else 1.0))
-    slopes = [
-        np.radians(
-            (np.subtract(to_degrees.transform(x + dx, y + dy), to_degrees.transform(x - dx, y - dy)) + 180) % 360 - 180
-        )
-        / (2 * step)
-        for dx, dy in ((step, 0.0), (0.0, step))
-    ]  # along x and along y: of longitude, which may pass 180 degrees, and latitude
-    lat = np.radians(to_degrees.transform(x, y)[1])
-    bent = 1 - ellipsoid.es * np.sin(lat) ** 2  # radii of curvature are a (1 - e2) / bent^1.5 and a / sqrt(bent)
-    radii = ellipsoid.a / np.sqrt(bent) * np.stack([np.cos(lat), (1 - ellipsoid.es) / bent])
-    return np.asarray(np.moveaxis(np.stack(slopes, axis=1) * radii[:, None], (0, 1), (-2, -1)), np.float64)
+
+    def place(dx: float, dy: float) -> Floats:
+        lon, lat = np.radians(to_degrees.transform(x + dx, y + dy))
+        normal = ellipsoid.a / np.sqrt(1 - ellipsoid.es * np.sin(lat) ** 2)  # radius of curvature
+        across = normal * np.cos(lat)
+        places = across * np.cos(lon), across * np.sin(lon), (1 - ellipsoid.es) * normal * np.sin(lat)
+        return np.stack(places, axis=-1)
+
+    return np.stack([place(*one) - place(-one[0], -one[1]) for one in ((step, 0.0), (0.0, step))], axis=-1) / (2 * step)
+
+
+def _area(steps: Floats) -> Floats:
+    """Return the area of the parallelograms between two steps (..., 3, 2)."""
+    return np.asarray(np.linalg.svd(steps, compute_uv=False).prod(axis=-1), np.float64)

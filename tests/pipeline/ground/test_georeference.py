@@ -14,7 +14,7 @@ from pipeline.geometry.grid import SceneGrid, patch_pixels
 from pipeline.ground.georeference import is_in_metres, pixel_rows_m2, pixel_side_m, zoomed_out
 
 PLACES = {32632: (8.0, 51.0), 3857: (8.0, 60.0), 3035: (8.0, 51.0), 4326: (8.0, 51.0), 2263: (-74.0, 40.7)}
-PLACES[6933] = (8.0, 51.0)  # stretched to equal areas
+PLACES |= {6933: (8.0, 51.0), 3413: (0.0, 90.0)}  # stretched to equal areas; a corner at the pole
 
 
 def box(epsg: int, step: float, turn: float = 20, shape: tuple[int, int] = (300, 400)) -> GeoBox:
@@ -24,7 +24,9 @@ def box(epsg: int, step: float, turn: float = 20, shape: tuple[int, int] = (300,
     return GeoBox(shape, Affine(step * cos, step * sin, left, step * sin, -step * cos, top), f"EPSG:{epsg}")
 
 
-@pytest.mark.parametrize(("epsg", "step"), [(32632, 10.0), (3857, 10.0), (3035, 10.0), (4326, 1e-4), (2263, 30.0)])
+@pytest.mark.parametrize(
+    ("epsg", "step"), [(32632, 10.0), (3857, 10.0), (3035, 10.0), (4326, 1e-4), (2263, 30.0), (3413, 10.0)]
+)
 def test_areas_are_those_of_the_ellipsoid(epsg: int, step: float) -> None:
     """In metres, feet and degrees, of any projection: the whole grid is as large as its outline on the ellipsoid."""
     geobox = box(epsg, step)
