@@ -175,10 +175,10 @@ def _class_lines(draft: SceneDraft) -> list[str]:
     lines = [
         f"# unlabelled = {_value(one)}   # if it means no class: remove the #, and its line below" for one in guess[:1]
     ]
-    parts = "name = value in the label files, fraction of all pixels; rename them as you like"
+    parts = "name = value in the label files; rename them as you like"
     if all(is_polygon_file(label) for label in draft.files.labels.values()):
-        parts = "name = number, fraction of the labelled pixels; polygons have the name or the number"
-    lines += ["", f"[classes]   # {parts}"]
+        parts = "name = number; polygons have the name or the number"
+    lines += ["", f"[classes]   # with its fraction of the labelled pixels: {parts}"]
     return lines + [f"{_key(one.name)} = {_value(one)}   # {one.fraction:.1%}" for one in classes]
 
 

@@ -50,6 +50,7 @@ def test_what_init_writes_reads_as_the_folder_did(folder: str, made: Path, comma
     for name, labels in seen.items():
         np.testing.assert_array_equal(after.load(name).labels, labels)
     assert tuple(load_scene_settings(path / "scene.toml").classes) == after.load(next(iter(seen))).class_names
+    assert "its fraction of the labelled pixels" in (path / "scene.toml").read_text()
     assert json.loads(ended.out)["next"].startswith("spectralzoom train ")
 
 
