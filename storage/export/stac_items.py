@@ -112,13 +112,14 @@ def write_stac(folder: Path, collection_id: str, description: str, item: Item) -
     for path in sorted(folder.glob("*/*.json")):  # earlier exports, each in the folder of its own name
         if path.stem == path.parent.name and path.stem != item.id:
             try:
-                items.append(pystac.Item.from_dict(_load(path), href=str(path), preserve_dict=False))
+                href = f"/{path.relative_to(folder)}"
+                items.append(pystac.Item.from_dict(_load(path), href=href, preserve_dict=False))
             except (pystac.STACError, pystac.STACTypeError, KeyError, TypeError, ValueError) as error:
                 raise ArchiveError(f"{path} is no STAC item: {error}; remove its folder and export again") from error
     items.sort(key=lambda one: (str(one.datetime), one.id))
     root.add_items(items)
     root.extent = _extent(pystac, items)
-    root.normalize_hrefs(str(folder))
+    root.normalize_hrefs("/")  # links are relative; a folder's name may have characters of addresses, as # and ?
     paths = folder / item.id / f"{item.id}.json", folder / COLLECTION
     for path, made in zip(paths, (mine, root), strict=True):
         content = made.to_dict(include_self_link=False)

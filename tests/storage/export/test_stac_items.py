@@ -52,19 +52,22 @@ def test_without_a_place_there_is_no_geometry(tmp_path: Path) -> None:
     assert read(collection)["extent"]["spatial"]["bbox"] == [[-180, -90, 180, 90]]
 
 
-def test_items_of_one_folder_are_one_collection(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["maps", "maps of #1? 50%20"])  # characters that mean something in an address
+def test_items_of_one_folder_are_one_collection(tmp_path: Path, name: str) -> None:
     """Items come in order of time, those of before stay as they are, and the extents hold them all."""
-    first, _ = write_stac(tmp_path, ABOUT, "Surveys", item("r2", day=2))
+    folder = tmp_path / name
+    first, _ = write_stac(folder, ABOUT, "Surveys", item("r2", day=2))
     before = first.read_bytes()
-    write_stac(tmp_path, ABOUT, "Surveys", item("r1", day=1, placed=False))
-    write_stac(tmp_path, ABOUT, "Surveys", item("r3", day=3))
+    write_stac(folder, ABOUT, "Surveys", item("r1", day=1, placed=False))
+    write_stac(folder, ABOUT, "Surveys", item("r3", day=3))
     assert first.read_bytes() == before
-    content = read(tmp_path / COLLECTION)
+    assert [one["href"] for one in read(first)["links"]] == ["../collection.json"] * 3
+    content = read(folder / COLLECTION)
     links = [link["href"] for link in content["links"] if link["rel"] == "item"]
     assert links == ["./r1/r1.json", "./r2/r2.json", "./r3/r3.json"]
     assert content["extent"]["temporal"]["interval"] == [["2026-05-01T10:00:00Z", "2026-05-03T11:00:00Z"]]
     assert content["extent"]["spatial"]["bbox"] == [read(first)["bbox"]]
-    assert sorted(path.name for path in tmp_path.iterdir()) == [COLLECTION, "r1", "r2", "r3"]
+    assert sorted(path.name for path in folder.iterdir()) == [COLLECTION, "r1", "r2", "r3"]
 
 
 def test_links_are_relative(tmp_path: Path) -> None:
