@@ -5,6 +5,7 @@ Find stores and runs among other files, and check that a folder can be an archiv
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import math
@@ -182,6 +183,9 @@ def _open_folder(path: Path, *, create: bool, write: bool) -> None:
         probe = path / f".probe-{os.getpid()}-{secrets.token_hex(4)}"
         try:
             probe.write_bytes(b"written to see whether this can be written to")
+        except OSError as error:
+            if create or error.errno not in (errno.ENOSPC, errno.EDQUOT):  # gc frees the space of a full disk
+                raise
         finally:
             with suppress(OSError):
                 probe.unlink(missing_ok=True)
