@@ -23,8 +23,10 @@ def main(arguments: list[str] | None = None) -> None:
     # Sums that are split among threads round differently: results of one seed would depend on the number of cores.
     # numpy reads the variable when a verb first imports it.
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
-    for stream in (sys.stdout, sys.stderr):  # a terminal may lack a character
-        if isinstance(stream, io.TextIOWrapper):
+    for name in ("stdin", "stdout", "stderr"):
+        if (stream := getattr(sys, name)) is None:  # closed: its descriptor must not become that of a file
+            setattr(sys, name, open(os.devnull, "r+"))  # noqa: SIM115 - until the process ends
+        elif isinstance(stream, io.TextIOWrapper):  # a terminal may lack a character
             stream.reconfigure(errors="replace")
     gc.set_threshold(10_000, 20, 20)  # with Python's own, garbage collection takes a third of the time of imports
     with terminable(last=arguments is None):

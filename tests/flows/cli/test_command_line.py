@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import sys
 from functools import reduce
 from typing import Any
 
@@ -90,6 +91,18 @@ def test_printed_json_is_json(capsys: pytest.CaptureFixture[str]) -> None:
     content: dict[str, Any] = {"a": float("nan"), "b": [1.5, float("inf")], "name": "ü"}
     print_json(content)
     assert json.loads(capsys.readouterr().out, parse_constant=pytest.fail) == {"a": None, "b": [1.5, None], "name": "ü"}
+
+
+def test_closed_streams_are_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A service may start without them; a file that is opened later must not take the place of one."""
+    for name in ("stdin", "stdout", "stderr"):
+        monkeypatch.setattr(sys, name, None)
+    with pytest.raises(SystemExit) as left:
+        cli.main(["--version"])
+    assert left.value.code == 0
+    for stream in (sys.stdin, sys.stdout, sys.stderr):
+        assert stream.name == os.devnull
+        stream.close()
 
 
 @pytest.mark.parametrize("verb", VERBS)
