@@ -127,6 +127,8 @@ def run_export(
         raise
     except OSError as error:
         raise ArchiveError(f"cannot export to {out}: {error.strerror}; choose another --out") from error
+    except UnicodeEncodeError as error:  # of GDAL
+        raise ArchiveError(f"cannot export to {out}: expected a name in UTF-8; choose another --out") from error
     placed = opened.geobox is not None
     if not placed:
         console.print("[dim]note: neither a rig pose nor the scene has a place on the earth; images have no CRS[/]")
