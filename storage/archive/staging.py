@@ -47,14 +47,14 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 _ADVICE = {
     errno.ENOSPC: "the disk is full: free some space and run again",
     errno.EDQUOT: "the disk quota is used up: free some space and run again",
-    errno.EROFS: "the file system is read-only: mount it for writing or choose another --out",
-    errno.EACCES: "permission is denied: change the folder's rights or choose another --out",
-    errno.EPERM: "permission is denied: change the folder's rights or choose another --out",
+    errno.EROFS: "the file system is read-only: mount it for writing or choose another folder",
+    errno.EACCES: "permission is denied: change the folder's rights or choose another folder",
+    errno.EPERM: "permission is denied: change the folder's rights or choose another folder",
     errno.EIO: "the disk reports an error: check the disk, then run again",
-    errno.EFBIG: "a file may not grow so large here: raise ulimit -f, or choose an --out on another file system",
+    errno.EFBIG: "a file may not grow so large here: raise ulimit -f, or choose a folder on another file system",
     errno.EMFILE: "too many files are open: raise ulimit -n",
     errno.ENAMETOOLONG: "the name is too long for this file system: give a shorter one",
-    errno.ENOLCK: "the file system has no locks: choose an --out on a local disk",
+    errno.ENOLCK: "the file system has no locks: choose a folder on a local disk",
     errno.ELOOP: "a link stands where a file of its own belongs: see where it leads, remove it and run again",
 }
 
