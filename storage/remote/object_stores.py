@@ -34,6 +34,8 @@ _PART = re.compile(r"[A-Za-z0-9_.=+-]+")
 _MEANINGS = (  # parts of a store's answers: their meaning and what to do
     (("NoSuchBucket",), "there is no such bucket: create it, or check its name, AWS_REGION and AWS_ENDPOINT_URL"),
     (("169.254.16",), "there are no credentials: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"),
+    (("RequestTimeTooSkewed",), "the clock of this machine is wrong: set it and run again"),
+    (("status code: 5", "status code: 429"), "it is overloaded or has a fault: run again later"),
     (
         ("HeaderMalformed", "PermanentRedirect", "301 Moved", "redirect without LOCATION"),
         "the bucket is in another region: set AWS_REGION",

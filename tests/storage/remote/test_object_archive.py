@@ -293,7 +293,9 @@ def test_addresses_of_other_kinds_are_no_folders(text: str, tmp_path: Path, monk
 @pytest.mark.parametrize(
     ("answer", "words"),
     [
-        ("Server returned non-2xx status code: 503 Service Unavailable: SlowDown", "503 Service Unavailable"),
+        ("Server returned non-2xx status code: 503 Service Unavailable: SlowDown", "run again later"),
+        ("Server returned non-2xx status code: 418 I'm a teapot", "418 I'm a teapot"),
+        ("403 Forbidden: <Error><Code>RequestTimeTooSkewed</Code></Error>", "the clock of this machine is wrong"),
         ("HTTP error: request or response body error", "check the network"),
         ("Received redirect without LOCATION", "set AWS_REGION"),
         ("The AWS Access Key Id does not exist: InvalidAccessKeyId", "check the credentials"),
