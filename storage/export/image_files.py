@@ -60,14 +60,14 @@ def write_cog(path: Path, image: CogImage, blocks: Blocks) -> None:
     Classes get a colour table, and their names as tags of the band and as GDAL's category names in ``NAME.aux.xml``.
     Raises ArchiveError: the disk refuses or changes the numbers.
     """
+    rasterio = importlib.import_module("rasterio")  # not in the block: Ctrl-C would leave it without `errors`
     try:
-        _write_cog(path, image, blocks)
-    except importlib.import_module("rasterio").errors.RasterioError as error:
+        _write_cog(rasterio, path, image, blocks)
+    except rasterio.errors.RasterioError as error:
         raise ArchiveError(f"{path} cannot be written: {error}; is there space on the disk?") from error
 
 
-def _write_cog(path: Path, image: CogImage, blocks: Blocks) -> None:
-    rasterio = importlib.import_module("rasterio")
+def _write_cog(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> None:
     copy = importlib.import_module("rasterio.shutil").copy
     sidecar = f"{path.name}.aux.xml"
     with written_aside(path.parent, [path.name] if image.legend is None else [path.name, sidecar]) as aside:

@@ -6,7 +6,9 @@ import importlib
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
+from unittest.mock import Mock
 from xml.etree import ElementTree
 
 import numpy as np
@@ -52,6 +54,13 @@ def rows_of(values: NDArray[Any]) -> Iterator[tuple[int, NDArray[Any]]]:
 def class_image(geobox: GeoBox) -> CogImage:
     """Return a file of classes."""
     return CogImage(geobox, "uint8", ("class",), UNLABELLED, LEGEND, {"run": "r1"})
+
+
+def test_ctrl_c_while_gdal_is_imported_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The next import of the package succeeds without the modules that the first had loaded."""
+    monkeypatch.setattr(importlib, "import_module", Mock(side_effect=[KeyboardInterrupt, ModuleType("rasterio")]))
+    with pytest.raises(KeyboardInterrupt):
+        write_cog(tmp_path / "a.tif", class_image(on_map(FEW, "EPSG:32632")), [])
 
 
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:25832", "EPSG:3035", "EPSG:32733"])
