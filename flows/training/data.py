@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import os
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -48,6 +49,12 @@ SEASON_HOURS = (9, 15)  # true solar time
 _SCOUTED = "scouting-"  # prefix of the names of scouted fields
 _GOLDEN, _SILVER = 0.6180339887, 0.4142135624  # steps that cover a circle evenly
 Report = Callable[[str, float, str], None]  # activity, fraction done, figure
+
+
+def check_out(out: Path) -> None:
+    """Raise SettingsError unless weights can be written to ``out``, before minutes are spent."""
+    if out.is_dir() or not (out.parent.is_dir() and os.access(out.parent, os.W_OK)):
+        raise SettingsError(f"-o {out}: expected the name of a file in a folder that exists and can be written")
 
 
 @dataclass(frozen=True)

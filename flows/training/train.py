@@ -14,7 +14,7 @@ import numpy as np
 from rich.console import Console
 
 from flows.terminal.progress import one_after_the_other, table
-from flows.training.data import Report, TrainingData, masks_contain, open_training_data, read_farm_name
+from flows.training.data import Report, TrainingData, check_out, masks_contain, open_training_data, read_farm_name
 from flows.training.figures import (
     FEW_PIXELS,
     better_reading,
@@ -65,8 +65,7 @@ def train_weights(
     output path, sizes that do not fit, or an unavailable device.
     """
     checkpoint = request.out.with_name(request.out.name + ".checkpoint")
-    if not request.out.parent.is_dir() or request.out.is_dir():
-        raise SettingsError(f"-o {request.out}: expected the name of a file in a folder that exists")
+    check_out(request.out)
     load_checkpoint(checkpoint)  # a damaged one fails before minutes are spent
     begun = None if request.start is None else load_weights(request.start)
     device, settings = choose_device(request.device), request.settings

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from flows.terminal.progress import one_after_the_other
-from flows.training.data import Report
+from flows.training.data import Report, check_out
 from flows.training.observed_scenes import observe_finely
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.spectral import LineSpec
@@ -73,8 +73,7 @@ def train_temporal(request: TemporalRequest, report: Report = lambda what, done,
             f"--train-temporal {request.dataset}: expected farm, the only data set with several days of one land. "
             "Weights without a temporal reader use the more confident of prior map and visit"
         )
-    if not request.out.parent.is_dir() or request.out.is_dir():
-        raise SettingsError(f"-o {request.out}: expected the name of a file in a folder that exists")
+    check_out(request.out)
     weights = load_weights(request.weights)
     if weights.class_names != CLASSES:
         raise SettingsError(

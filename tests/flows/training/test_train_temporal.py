@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -93,10 +94,14 @@ def test_the_command_trains_judges_and_says_how(tmp_path: Path, monkeypatch: pyt
     [
         ("frames", "x.safetensors", "expected farm, the only data set with several days of one land"),
         ("farm", "no/x.safetensors", "expected the name of a file in a folder that exists"),
+        ("farm", "x.safetensors", "in a folder that exists and can be written"),
     ],
 )
-def test_what_cannot_be_trained_is_refused(tmp_path: Path, dataset: str, out: str, why: str) -> None:
-    """Other data than the farm, and a place that is not there, before anything is looked at."""
+def test_what_cannot_be_trained_is_refused(
+    tmp_path: Path, dataset: str, out: str, why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Other data than the farm, and a place that is not there or read-only, before anything is looked at."""
+    monkeypatch.setattr(os, "access", lambda path, mode: path != tmp_path)
     with pytest.raises(SettingsError, match=why):
         train_temporal(TemporalRequest(dataset, shipped_weights(), tmp_path / out))
 
