@@ -64,6 +64,8 @@ def format_refusal(error: BaseException) -> str | None:
             f"memory ran out: {cause}{allowed}. Make room or raise the limit, or ask for less: a smaller scene, fewer "
             f"--bands, less --memory, fewer --workers"
         )
+    if isinstance(error, FileNotFoundError) and error.errno and error.filename is None:  # of os.getcwd
+        return "the current folder was removed: change to another folder and run again"
     if isinstance(error, OSError) and (advice := disk_advice(error)) is not None:
         where = f" {error.filename}" if error.filename else ""
         return f"the system refused to read or write{where}: {advice}"
