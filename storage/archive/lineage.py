@@ -148,6 +148,8 @@ def find_product(catalogue: Catalogue, text: str) -> str | Run:
         return found[0]
     if found:
         raise ArchiveError(f"{text} begins {len(found)} stores: {_some(found)}; give more of it")
+    if newest is not None and text in products:
+        raise ArchiveError(f"the {text} of {newest.uri} lacks its store {wanted}; run verify --repair on the archive")
     near = difflib.get_close_matches(text, products, n=1)
     if near:
         known = f"did you mean {near[0]}?"

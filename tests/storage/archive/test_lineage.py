@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 
 from pipeline.errors import ArchiveError
 from storage.archive.archive import Archive
+from storage.archive.keys import in_text
 from storage.archive.lineage import (
     ABSENT,
     Catalogue,
@@ -198,11 +200,13 @@ def test_a_version_before_is_of_the_same_scene_and_can_be_read(tmp_path: Path, a
         ("runs/none", "there is no run none"),
         ("class_mop", "did you mean class_map"),
         ("xyz", "products of the newest run: class_map, mosaic"),
+        ("mosaic", "the mosaic of runs/.* lacks its store stages/.*; run verify --repair"),
     ],
 )
 def test_what_is_no_product_is_refused(tmp_path: Path, text: str, words: str) -> None:
-    """With the nearest that there is."""
+    """With the nearest that there is; a product whose store has gone is told from a wrong name."""
     small_survey(Archive.open(tmp_path))
+    shutil.rmtree(tmp_path / str(in_text(Catalogue.read(tmp_path).runs[-1].products["mosaic"])))
     with pytest.raises(ArchiveError, match=words):
         find_product(Catalogue.read(tmp_path), text)
 
