@@ -62,7 +62,7 @@ def refusing(path: Path) -> Iterator[None]:
 
 def read_about(path: Path, kind: str) -> dict[str, Any]:
     """Read the description of a file of a ``kind``, without torch. Raises WeightsError: it is damaged, or another."""
-    with refusing(path), safe_open(path, framework="np") as file:
+    with refusing(path), path.open("rb"), safe_open(path, framework="np") as file:  # which takes refusal for absence
         about = json.loads((file.metadata() or {}).get(ABOUT, "{}"))
         if (written := about.get("format", "no format mark")) != kind:
             made = dict(about.get("record") or {}).get("command")

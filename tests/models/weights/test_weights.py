@@ -6,6 +6,7 @@ import json
 import struct
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -131,6 +132,13 @@ def test_tensors_that_cannot_be_are_refused_by_name(saved: Path, name: str, chan
         tensors[name] = change(tensor)
     _rewritten(saved, _about(saved), tensors)
     with pytest.raises(WeightsError, match=words):
+        load_weights(saved)
+
+
+def test_a_file_without_rights_is_not_called_missing(saved: Path, monkeypatch: pytest.MonkeyPatch):
+    """The library for its format says that there is no such file."""
+    monkeypatch.setattr(Path, "open", Mock(side_effect=PermissionError(13, "Permission denied", str(saved))))
+    with pytest.raises(WeightsError, match="Permission denied"):
         load_weights(saved)
 
 
