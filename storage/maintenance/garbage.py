@@ -18,6 +18,7 @@ from storage.archive.lineage import Catalogue
 from storage.archive.staging import MANIFEST_NAME, refusals
 
 DAY_S = 86400.0
+_CURE = "restore this folder from a copy, or delete it and with it the stores that only it names"
 IN_USE = "the archive is in use: run gc again when it is free"
 What = Literal["store", "files", "leftover"]  # files: raw lines that the setting `keep` of a run does not keep
 
@@ -122,10 +123,10 @@ def _obstacle(archive: Archive, catalogue: Catalogue, kept: Iterable[str]) -> st
     """Return why no store may be removed: a damaged manifest may name stores to keep; else None."""
     for path in without_manifest(archive.root):
         if path.parent.name == "runs" and path.is_dir():
-            return f"no store is removed: runs/{path.name} has lost its {MANIFEST_NAME}; its stores are not known"
+            return f"no store is removed: runs/{path.name} has lost its {MANIFEST_NAME}; {_CURE}"
     for run in catalogue.runs:
         if run.problem is not None and not run.names:
-            return f"no store is removed: the stores of {run.uri} are not known ({run.problem})"
+            return f"no store is removed: the stores of {run.uri} are not known ({run.problem}); {_CURE}"
     for uri in sorted(kept):
         if (problem := catalogue.stores[uri].problem) is not None:
             return f"no store is removed: the inputs of {uri} are not known ({problem}); run verify --repair"

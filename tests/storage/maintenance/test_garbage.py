@@ -141,6 +141,7 @@ def test_no_store_goes_where_a_run_cannot_tell_what_it_names(archive: Archive, v
         assert (found.obstacle, len(found.removals)) == (None, 3)
         return
     assert found.obstacle.startswith(f"no store is removed: the stores of runs/{small.run.name} are not known")
+    assert "; restore this folder from a copy, or delete it" in found.obstacle
     (small.run / victim).unlink()
     found = clear_up(archive, keep_days=0)
     assert "has lost its manifest.json" in found.obstacle
