@@ -112,8 +112,7 @@ def write_stac(folder: Path, collection_id: str, description: str, item: Item) -
     for path in sorted(folder.glob("*/*.json")):  # earlier exports, each in the folder of its own name
         if path.stem == path.parent.name and path.stem != item.id:
             try:
-                href = f"/{path.relative_to(folder)}"
-                items.append(pystac.Item.from_dict(_load(path), href=href, preserve_dict=False))
+                items.append(pystac.Item.from_dict(_load(path), href=f"/{path.relative_to(folder)}"))
             except (pystac.STACError, pystac.STACTypeError, KeyError, TypeError, ValueError) as error:
                 raise ArchiveError(f"{path} is no STAC item: {error}; remove its folder and export again") from error
     items.sort(key=lambda one: (str(one.datetime), one.id))
