@@ -165,7 +165,8 @@ def open_folder(path: Path, *, create: bool, write: bool) -> None:
     except ArchiveError:
         raise
     except OSError as error:  # at the door whatever the system answers means that this is no place for an archive
-        raise ArchiveError(f"cannot use {path} as an archive: {error.strerror}; choose another --out") from error
+        cure = "choose another --out, or SPECTRALZOOM_WORK for the working copy of a bucket"
+        raise ArchiveError(f"cannot use {path} as an archive: {error.strerror}; {cure}") from error
 
 
 def _open_folder(path: Path, *, create: bool, write: bool) -> None:
