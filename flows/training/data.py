@@ -177,8 +177,7 @@ def split_labels(
             f"mask {train_mask}: class {unknown} is none of the labels' {sorted(numbers)}; correct the mask classes"
         )
     index = np.array([UNLABELLED, *(numbers[number] for number in classes[:highest])], np.uint8)
-    wanted = index[np.maximum(mask, 0)]
-    return _split(scene.labels, wanted == scene.labels)
+    return _split(scene.labels, scene.labels == index[np.maximum(mask, 0)])
 
 
 def _split(labels: NDArray[np.uint8], trains: NDArray[np.bool_]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:

@@ -314,14 +314,8 @@ def rectify(
 
     def build(path: Path) -> None:
         """Write mosaic and the record of each sweep's lines."""
-        recipe = MosaicRecipe(
-            signal,
-            camera,
-            PixelGrid.of_scene(frame.grid),
-            resampling,
-            geolocation=geolocation,
-            registration=registration,
-        )
+        grid = PixelGrid.of_scene(frame.grid)
+        recipe = MosaicRecipe(signal, camera, grid, resampling, geolocation=geolocation, registration=registration)
         writer = mosaic_of_sweeps(path, signal, frame)
         write_mosaic(recipe, writer, memory=memory, pool=pool, report=report)
         writer.blank(frame.missing)
