@@ -61,8 +61,8 @@ def expected_score(counts: Floats, bias: Floats, error: float = LEAST_ERROR) -> 
     """
     area = counts.sum(axis=1)
     iou = scipy.special.expit(_logit(iou_per_class(counts)) + bias)
-    doubt = (1 - _odds(iou, SURE_IOU, 4)) * (1 - _odds(area / max(area.sum(), 1.0), LARGE, 2))
-    there = _odds(area, THERE_PX, 2) * (1 - doubt)
+    plausible = 1 - (1 - _odds(iou, SURE_IOU, 4)) * (1 - _odds(area / max(area.sum(), 1.0), LARGE, 2))
+    there = _odds(area, THERE_PX, 2) * plausible
     number = float(there.sum())
     if not number > 0:
         return ExpectedScore(math.nan, math.nan, np.full(len(area), np.nan))
