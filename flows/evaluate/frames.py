@@ -10,7 +10,7 @@ import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,14 +103,12 @@ class Candidate:
 
     def pixels_of(self, scene: RasterScene) -> str | None:
         """Return the packed mask of a scene's training pixels; None for all pixels."""
-        pixels: str | None = self.split.get("pixels", {}).get(scene.key)
-        return pixels
+        return cast(str | None, self.split.get("pixels", {}).get(scene.key))
 
     @property
     def split(self) -> dict[str, Any]:
         """Return the training, validation and held-out scenes of the record."""
-        split: dict[str, Any] = self.described.record.get("split", {})
-        return split
+        return cast(dict[str, Any], self.described.record.get("split", {}))
 
     def validated_on(self, scene: RasterScene) -> bool:
         """Return whether the scene was one for validation; older files record only names, and give False."""

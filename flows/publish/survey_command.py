@@ -76,12 +76,10 @@ def _survey(settings: Settings, console: Console) -> RunRef:
             with _prefect_server(settings.out):
                 state = survey_flow.survey(asked, return_state=True)
                 wait_until_recorded(state.state_details.flow_run_id)
-                found: RunRef = state.result()
-                return found
+                return state.result()
         except ServerUnavailable as error:
             console.print(f"[yellow]{escape(str(error))}; the survey runs with --engine plain[/]")
-    plain: RunRef = survey_flow.survey.fn(asked)
-    return plain
+    return survey_flow.survey.fn(asked)
 
 
 @contextmanager

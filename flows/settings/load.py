@@ -12,7 +12,7 @@ from dataclasses import MISSING
 from datetime import UTC, datetime, timedelta
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, cast, get_args, get_origin, get_type_hints
 
 from pydantic import Field, PlainValidator, TypeAdapter, ValidationError
 
@@ -60,8 +60,7 @@ class Declared:
     @property
     def about(self) -> dict[str, Any]:
         """Return unit, source and example."""
-        about: dict[str, Any] = self.item.metadata["json_schema_extra"]
-        return about
+        return cast(dict[str, Any], self.item.metadata["json_schema_extra"])
 
     @property
     def choices(self) -> tuple[str, ...]:

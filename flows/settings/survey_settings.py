@@ -120,9 +120,7 @@ class ZoneChoice:
 
 def source_of(scene: str) -> str:
     """Return the default of the setting ``source`` for a scene."""
-    if scene == RIG_FIELD:
-        return RIG
-    return SIM if scene in BUILT_IN_SCENES else RASTER
+    return RIG if scene == RIG_FIELD else SIM if scene in BUILT_IN_SCENES else RASTER
 
 
 def table(about: str, make: type[Any] | None) -> Any:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import cast
 
 import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
@@ -60,8 +61,7 @@ class TokenAttention(nn.Module):
         b, n, d = x.shape
         q, k, v = self.qkv(x).view(b, n, 3, self.heads, d // self.heads).permute(2, 0, 3, 1, 4)
         mixed = F.scaled_dot_product_attention(self.query_norm(q), self.key_norm(k), v)
-        joined: Tensor = self.out(mixed.transpose(1, 2).reshape(b, n, d))
-        return joined
+        return cast(Tensor, self.out(mixed.transpose(1, 2).reshape(b, n, d)))
 
 
 class EncoderBlock(nn.Module):
@@ -76,8 +76,7 @@ class EncoderBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         x = x + self.attention(self.norm1(x))
-        mixed: Tensor = x + self.mlp(self.norm2(x))
-        return mixed
+        return cast(Tensor, x + self.mlp(self.norm2(x)))
 
 
 class Encoder(nn.Module):
@@ -92,8 +91,7 @@ class Encoder(nn.Module):
         """Encode tokens, (B, N, d) -> (B, N, d)."""
         for block in self.blocks:
             x = block(x)
-        encoded: Tensor = self.norm(x)
-        return encoded
+        return cast(Tensor, self.norm(x))
 
 
 def cut(image: Tensor, patch: int) -> Tensor:
@@ -140,8 +138,7 @@ class Residual(nn.Module):
         self.conv = nn.Conv2d(channels, channels, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
-        mixed: Tensor = x + self.conv(F.gelu(self.norm(x)))
-        return mixed
+        return cast(Tensor, x + self.conv(F.gelu(self.norm(x))))
 
 
 class Stem(nn.Module):
@@ -264,8 +261,7 @@ class Segmenter(nn.Module):
         places = torch.cartesian_prod(torch.arange(rows), torch.arange(columns)).double() + 0.5
         if origin is not None:
             places = places + origin.cpu().double()[:, None]
-        coded: Tensor = grid.flatten(2).transpose(1, 2) + code_2d(places, self.config.dim).to(grid.device)
-        return coded
+        return grid.flatten(2).transpose(1, 2) + code_2d(places, self.config.dim).to(grid.device)
 
     def read_patches(self, overview: Overview, patches: Tensor, patch_index: Tensor) -> Tensor:
         """Return logits (B, K, classes, p, p) of patches (B, K, J + PLANES, p, p) at ``patch_index`` (B, K)."""

@@ -13,7 +13,7 @@ from contextlib import suppress
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, cast
 
 from pipeline.errors import IncompleteStoreError
 from storage.archive.staging import MANIFEST_NAME, file_hash, files_below, sync_path
@@ -208,8 +208,7 @@ def read_table(path: Path) -> dict[str, Any]:
     problem = "is in no manifest" if entry is None else file_problem(path, entry, hashes=True)
     if problem is not None:
         raise IncompleteStoreError(f"{path} {problem}; {CURE}")
-    table: dict[str, Any] = json.loads(path.read_bytes())
-    return table
+    return cast(dict[str, Any], json.loads(path.read_bytes()))
 
 
 def write_table(path: Path, content: Mapping[str, Any]) -> None:

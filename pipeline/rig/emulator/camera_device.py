@@ -15,7 +15,7 @@ import threading
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -346,8 +346,7 @@ class _FilesInMemory(AbstractedFS):  # type: ignore[misc]
 
     @property
     def device(self) -> CameraDevice:
-        device: CameraDevice = self.cmd_channel.device
-        return device
+        return cast(CameraDevice, self.cmd_channel.device)
 
     def ftp2fs(self, path: str) -> str:
         return str(self.ftpnorm(path))
