@@ -204,7 +204,7 @@ def show_plan(content: dict[str, Any], console: Console) -> None:
 
 def scan_table(scans: Mapping[str, Any]) -> Table:
     """Return the best uniform scans of other time budgets as a table: seconds, raw bytes and expected score."""
-    named = {"this survey": scans["taken"], "reference": scans["reference"]}
+    named = {"this survey": scans["taken"], "cheapest near the best": scans["reference"]}
     every = scans["candidates"][:: math.ceil(len(scans["candidates"]) / MOST_SCANS)]
     rows = {one["seconds"]: one for one in (*every, *named.values()) if one is not None}
     cells = [

@@ -353,6 +353,7 @@ _FORMATS: Mapping[str, Callable[[Any], str]] = {
     **dict.fromkeys(("run", "crs", "reason", "not_predicted"), str),
     "days": format_days,
     "hectares": format_area,
+    "reference": lambda scan: f"cheapest near the best {_scan(scan)}",
     "shift_px": lambda px: f"shifted by {math.hypot(*px):.0f} px" if any(px) else "",
     "put_aside": lambda value: f"not used: {value}",
     "multiply_adds": lambda did: f"multiply-adds {format_percent(did['done'] / did['everything'])} of full resolution",
@@ -369,5 +370,5 @@ _FORMATS: Mapping[str, Callable[[Any], str]] = {
 _VALUES: Mapping[str, Callable[[Any], str]] = {
     **dict.fromkeys(("fraction", "patches_touched", "rate", "agreement", "expected_wrong"), format_percent),
     **dict.fromkeys(("miou", "error"), format_points),
-    **dict.fromkeys(("taken", "best_in_time", "reference"), _scan),
+    **dict.fromkeys(("taken", "best_in_time"), _scan),
 }

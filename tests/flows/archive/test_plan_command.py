@@ -217,6 +217,8 @@ def test_a_zoomed_farm_may_take_every_line_and_read_every_patch(tmp_path: Path) 
     assert captured["value"] == pytest.approx(found["scans"]["candidates"][-1]["bytes_raw"], rel=0.03)
     assert not work["at_most"]
     assert work["known_from"].endswith("million with every patch")
+    show_plan(found, Console(file=(shown := io.StringIO()), width=160))
+    assert "cheapest near the best" in shown.getvalue()  # not the reference, which is every line at 100 ms
 
 
 def test_a_part_of_a_field_promises_no_score_and_reads_what_it_captures(settings: Settings, tmp_path: Path) -> None:

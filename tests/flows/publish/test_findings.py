@@ -106,8 +106,8 @@ def test_a_score_that_may_be_any_is_not_predicted(survey_png: Survey, weights: P
 def test_scans_promise_what_their_record_can_say(spread: float, unknown: float, words: str) -> None:
     """A score with its spread; none of scenes that differ too much, nor of a field that the weights do not know."""
     scan = {"step": 1, "exposure_ms": 25.0, "seconds": 9.0, "expected_miou": 0.927, "expected_spread": spread}
-    found = {"scans": {"taken": scan}, "unknown": {"pixels": 1, "fraction": unknown, "rate": 0.01}}
-    assert re.search(words, dict(finding_rows(found))["uniform scans"])
+    found = {"scans": {"taken": scan, "reference": scan}, "unknown": {"pixels": 1, "fraction": unknown, "rate": 0.01}}
+    assert re.search(f"cheapest near the best {words}", dict(finding_rows(found))["uniform scans"])
 
 
 def test_words_of_a_memory_tell_change_beyond_what_maps_differ_by() -> None:
