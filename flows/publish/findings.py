@@ -214,14 +214,13 @@ def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
     count. A score with too large an error is not predicted.
     """
     settings, step = run.settings, run.settings.scan_step
-    memory = prior_map_figures(ref.path)
     if (
         run.map_scores is None
         or step is None
         or not run.plan.plain
         or settings.extent != EXTENT_WHOLE
         or run.settings.macs is not None
-        or (memory is not None and memory["put_aside"] is None)
+        or ((memory := prior_map_figures(ref.path)) is not None and memory["put_aside"] is None)
     ):
         return None
     names = run.described.class_names

@@ -171,6 +171,7 @@ class SurveyRun(CaptureRun):
     ood_detector: OodPart | None = None  # None: no class unknown
     notes: tuple[str, ...] = ()
     refused: str | None = None  # why this machine cannot run a survey that is only planned
+    outside: bool = False  # of the conditions of the training
 
     @property
     def weights(self) -> Weights:
@@ -189,8 +190,8 @@ class SurveyRun(CaptureRun):
 
     @property
     def map_scores(self) -> MapScores | None:
-        """Return the calibration of expected scores; None where the weights have none."""
-        return None if self.described.ood_detector is None else self.described.ood_detector.map_scores
+        """Return the calibration of expected scores; None where the weights have none, or outside of their training."""
+        return None if self.outside or self.described.ood_detector is None else self.described.ood_detector.map_scores
 
     @property
     def model_key(self) -> dict[str, Any]:
@@ -428,6 +429,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
         ood_detector=ood_detector,
         notes=(*notes, *zones.notes, *planned.notes, *prior_notes, *outside, *label_notes),
         refused=refused,
+        outside=bool(outside),
     )
 
 

@@ -84,6 +84,14 @@ def test_a_plain_scan_is_told_what_its_map_scores_by_itself(survey_png: Survey, 
     assert words in dict(finding_rows(receipt))["expected mIoU"]
 
 
+def test_no_score_is_expected_outside_of_the_training_data(survey_png: Survey, weights: Path, tmp_path: Path) -> None:
+    """Its calibration is of scenes with the bands of the training."""
+    flags = {"weights": str(_judged(weights, tmp_path, SCORES.as_dict())), "effects": "none", "scan_step": "1"}
+    receipt: Any = survey_png(tmp_path / "a", **flags, budget=None, wavelengths="690,700,710").receipt
+    assert any("outside of the training data" in note for note in receipt["settings"]["notes"])
+    assert "expected" not in receipt
+
+
 def test_a_score_that_may_be_any_is_not_predicted(survey_png: Survey, weights: Path, tmp_path: Path) -> None:
     """Weights whose maps were off by 37 points: the receipt has no score, and says why."""
     content = SCORES.as_dict() | {"error": [[0.371, 0.371]]}
