@@ -185,7 +185,7 @@ def choose_scan(
         fastest = min(scans, key=lambda scan: scan.seconds)
         raise BudgetError(
             f"no uniform scan that the weights know ends within --seconds {seconds:g}; the least is "
-            f"{fastest.seconds:.1f} s ({fastest.words})"
+            f"{fastest.seconds + 0.005:.2f} s ({fastest.words})"
         )
     if not goals:
         best = max(scan.expected[MIOU] for scan in paid)
@@ -201,7 +201,7 @@ def choose_scan(
     cheapest = min(reaching, key=lambda scan: scan.price)
     if seconds is not None and cheapest.seconds > seconds:
         raise BudgetError(
-            f"--goal takes {cheapest.seconds:.1f} s ({cheapest.words}), --seconds is {seconds:g}; give more"
+            f"--goal takes {cheapest.seconds + 0.005:.2f} s ({cheapest.words}), --seconds is {seconds:g}; give more"
         )
     return cheapest
 
