@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -15,7 +16,6 @@ from flows.settings.survey_settings import RASTER, SignalChoice
 from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
 from flows.tasks.stages.capture import RIG_RECORD
 from flows.tasks.stages.placement import MOSAIC, MOSAIC_STEP, SIGNAL_RECORD
-from flows.terminal.figures import format_bytes
 from pipeline.errors import BudgetError, IncompleteStoreError, SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.readings import MOST_VALUE, readings_alone
@@ -85,7 +85,7 @@ class KeptBytes:
                 return step
         raise BudgetError(
             f"--kept-bytes {self.most} is too small for the scores of lines and mosaic, which take at least "
-            f"{format_bytes(least)}; give more"
+            f"{math.ceil(least)}; give more"
         )
 
 
