@@ -20,6 +20,7 @@ from flows.settings.survey_settings import (
     ALWAYS,
     AUTO,
     BUILT_IN_SCENES,
+    NEVER,
     OF_A_CAMERA,
     OF_A_PART,
     OF_A_VIEW,
@@ -132,6 +133,7 @@ OF_THE_RUN = (
 )
 OF_ZOOM = ("seconds", "scan_step")  # settings of a uniform scan that a first pass has too
 BUILT_IN_WEIGHTS = "farm"
+UNIFORM_ADVICE = "give --seconds or --scan-step, without --budget and --zoom always, or leave it out"
 FLAGS = {  # of settings in tables; other keys of tables have none
     **{"camera.exposure_ms": "exposure_ms", "sky.light": "sky", "sky.light_fraction": "light_fraction"},
     **{f"zones.{name}": name for name in ("area", "no_go", "plots", "plots_name")},
@@ -189,7 +191,7 @@ def load_settings(
         if isinstance(inner, Mapping):
             table[name] = {**recorded.pop(name, {}), **inner}
     requested = {**(usual or {}), **recorded, **table}
-    for wrong in _contradictions(stated, origin, zooms=requested.get("zoom") == ALWAYS):
+    for wrong in _contradictions(stated, origin, zoom=requested.get("zoom")):
         raise SettingsError(wrong)
     passes = any(
         name in stated and (origin.get(name) == "flag" or table[name] != SURVEY[name].item.default)
@@ -314,8 +316,9 @@ def anchor_paths(table: dict[str, object], folder: Path) -> dict[str, object]:
     return anchored
 
 
-def _contradictions(stated: set[str], origin: Mapping[str, str], *, zooms: bool) -> Iterator[str]:
+def _contradictions(stated: set[str], origin: Mapping[str, str], *, zoom: object) -> Iterator[str]:
     """Yield errors: settings that choose different scans."""
+    zooms = zoom == ALWAYS
 
     def named(names: Iterable[str]) -> list[str]:
         return [place_of(key, origin.get(key)) for key in names if key in stated]
@@ -323,6 +326,8 @@ def _contradictions(stated: set[str], origin: Mapping[str, str], *, zooms: bool)
     uniform = named(key for key in UNIFORM if not (zooms and key in OF_ZOOM))
     if zooms and uniform:
         yield f"{uniform[0]} selects one uniform scan of the field, --zoom always two passes; leave one out"
+    if zoom == NEVER and {"zoom", "budget"} <= stated:
+        yield f"{named(['budget'])[0]} asks for two passes, --zoom never for one uniform scan; leave one out"
     passes = named(key for key in OF_TWO_PASSES if not (key in OF_CHOOSING and "macs" in stated))
     if uniform and passes:
         yield (
@@ -470,11 +475,11 @@ def _limit_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]
     if settings.kept_bytes is not None and settings.is_map:
         yield f"{at('kept_bytes')} is for a uniform scan, and the scene {settings.scene} is a raster: leave it out"
     elif settings.kept_bytes is not None and not settings.plain:
-        yield f"{at('kept_bytes')} is for a uniform scan: give --seconds or --scan-step too, or leave it out"
+        yield f"{at('kept_bytes')} is for a uniform scan: {UNIFORM_ADVICE}"
     if settings.macs is None:
         return
     if not settings.plain:
-        yield f"{at('macs')} is for a raster or a uniform scan: give --seconds or --scan-step too, or leave it out"
+        yield f"{at('macs')} is for a raster or a uniform scan: {UNIFORM_ADVICE}"
     if settings.extent != EXTENT_WHOLE:
         yield f"{at('macs')} chooses among the patches of a whole field, {at('extent')} covers a part: leave one out"
 

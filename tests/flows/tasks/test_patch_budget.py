@@ -113,6 +113,7 @@ def test_numbers_are_limits_too() -> None:
         ({"macs": "a lot"}, BudgetError, "such as 25%"),
         ({"macs": True}, BudgetError, "such as 25%"),
         ({"macs": "50%", "scan_step": None}, SettingsError, "is for a raster or a uniform scan.*give --seconds"),
+        ({"macs": "50%", "scan_step": None, "budget": 0.5}, SettingsError, "without --budget and --zoom always"),
         ({"macs": "50%", "extent": "0:1-9"}, SettingsError, "a whole field, 'extent' covers a part"),
     ],
 )
