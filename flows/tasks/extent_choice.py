@@ -164,7 +164,7 @@ def _best_extent(layout: PassLayout, extent_gains: ExtentGains, seconds: float) 
         )
     if not found:
         raise BudgetError(
-            f"--seconds {seconds:g} is below the minimum scan time of {min(least):.1f} s; give at least that"
+            f"--seconds {seconds:g} is below the minimum scan time of {min(least) + 0.005:.2f} s; give at least that"
         )
     best = max(extent.expected_gain for _, _, extent in found)
     near = [one for one in found if one[2].expected_gain >= best - LOSS]
