@@ -257,8 +257,8 @@ class Settings:
     )
     macs: Compute | None = stated(
         None,
-        "MAC budget, as a fraction of full-resolution inference (25%) or as a number (4e9); regions with the highest"
-        " expected gain come first, the rest is segmented from binned pixels",
+        "MAC budget, as a fraction of full-resolution inference (25%) or as a number (4e9), beside the fusion of a"
+        " prior map; regions with the highest expected gain come first, the rest is segmented from binned pixels",
         example="25%",
     )
     expected_loss: float = stated(
