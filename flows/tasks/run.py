@@ -320,9 +320,7 @@ class SurveyRun(CaptureRun):
         """
         aside = None if memory is None else memory["put_aside"]
         done = self.costs.of_map(patch_index)
-        scored = (
-            self.least_gain is not None and self.plan.plain
-        )  # while the map is drawn, which reads the overview once
+        scored = self.least_gain is not None and self.plan.plain  # while drawn, which reads the overview once
         if scored:
             done = replace(done, score=self.costs.score(self.settings.policy))
         elif self.chooses:
