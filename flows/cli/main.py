@@ -26,7 +26,7 @@ def main(arguments: list[str] | None = None) -> None:
     for name in ("stdin", "stdout", "stderr"):
         if (stream := getattr(sys, name)) is None:  # closed: its descriptor must not become that of a file
             setattr(sys, name, open(os.devnull, "r+"))  # noqa: PTH123, SIM115
-        elif isinstance(stream, io.TextIOWrapper):  # a terminal may lack a character
+        elif isinstance(stream, io.TextIOWrapper) and stream.writable():  # a terminal may lack a character
             stream.reconfigure(errors="replace")
     gc.set_threshold(10_000, 20, 20)  # with Python's own, garbage collection takes a third of the time of imports
     with terminable(last=arguments is None):

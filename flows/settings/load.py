@@ -20,7 +20,6 @@ from flows.settings.survey_settings import (
     ALWAYS,
     AUTO,
     BUILT_IN_SCENES,
-    NEVER,
     OF_A_CAMERA,
     OF_A_PART,
     OF_A_VIEW,
@@ -191,7 +190,7 @@ def load_settings(
         if isinstance(inner, Mapping):
             table[name] = {**recorded.pop(name, {}), **inner}
     requested = {**(usual or {}), **recorded, **table}
-    for wrong in _contradictions(stated, origin, zoom=requested.get("zoom")):
+    for wrong in _contradictions(stated, origin, zooms=requested.get("zoom") == ALWAYS):
         raise SettingsError(wrong)
     passes = any(
         name in stated and (origin.get(name) == "flag" or table[name] != SURVEY[name].item.default)
@@ -316,9 +315,8 @@ def anchor_paths(table: dict[str, object], folder: Path) -> dict[str, object]:
     return anchored
 
 
-def _contradictions(stated: set[str], origin: Mapping[str, str], *, zoom: object) -> Iterator[str]:
+def _contradictions(stated: set[str], origin: Mapping[str, str], *, zooms: bool) -> Iterator[str]:
     """Yield errors: settings that choose different scans."""
-    zooms = zoom == ALWAYS
 
     def named(names: Iterable[str]) -> list[str]:
         return [place_of(key, origin.get(key)) for key in names if key in stated]
@@ -326,8 +324,6 @@ def _contradictions(stated: set[str], origin: Mapping[str, str], *, zoom: object
     uniform = named(key for key in UNIFORM if not (zooms and key in OF_ZOOM))
     if zooms and uniform:
         yield f"{uniform[0]} selects one uniform scan of the field, --zoom always two passes; leave one out"
-    if zoom == NEVER and {"zoom", "budget"} <= stated:
-        yield f"{named(['budget'])[0]} asks for two passes, --zoom never for one uniform scan; leave one out"
     passes = named(key for key in OF_TWO_PASSES if not (key in OF_CHOOSING and "macs" in stated))
     if uniform and passes:
         yield (

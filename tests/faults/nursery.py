@@ -22,7 +22,7 @@ from types import TracebackType
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
-ADVICE = ("run again", "--out", "free space", "ulimit")
+ADVICE = ("run again", "--out", "another folder", "free space", "ulimit")
 
 
 @dataclass(frozen=True)

@@ -161,7 +161,7 @@ def test_surveys_go_on_after_one_that_fails(
     assert ended.errors[0].startswith(f"{files[1]}: ")
     assert f"survey 3 of 3: {files[2]}" in ended.err.replace("\n", "")
     archive = Archive.open(tmp_path / "archive")
-    assert [run.name.partition("-")[2] for run in archive.runs()] == ["farm"] * 2
+    assert [run.name.split("-")[1] for run in archive.runs()] == ["farm"] * 2  # farm-2 within one second
     assert command_line("survey", files[0], tmp_path / "d.toml").code == 2
     assert len(archive.runs()) == 2
 

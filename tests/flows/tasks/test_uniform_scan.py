@@ -120,7 +120,6 @@ def test_a_plan_tells_the_scan_of_a_goal(flags_png: Flags, recorded: Path, tmp_p
         ({"goal": "0"}, SettingsError, r"above 0 and at most 100"),
         ({"seconds": "nan"}, SettingsError, r"--seconds must be a number from 0\.1"),
         ({"seconds": "5", "budget": "0.5"}, SettingsError, r"--seconds asks for one uniform scan .* --budget is for"),
-        ({"budget": "0.5", "zoom": "never"}, SettingsError, r"--budget asks for two passes, --zoom never for one"),
         ({"seconds": "5", "scan_step": "2"}, SettingsError, r"--scan-step makes it: leave one out"),
         ({"seconds": "5", "camera.exposure_ms": "5"}, SettingsError, r"starts at 6 ms.*--scan-step"),
         ({"scan_exposure_ms": "25"}, SettingsError, r"give --scan-step too"),
