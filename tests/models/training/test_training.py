@@ -34,9 +34,11 @@ SETTINGS = TrainingSettings(steps=6, batch=2, crop=16, learning_rate=3e-3)
 SHIFT = np.zeros(2, np.float32)
 
 
-def test_training_learns():
-    """Forty small steps bring the loss of two easily told classes down to less than a third."""
-    losses: list[float] = []
+def test_training_learns(monkeypatch: pytest.MonkeyPatch):
+    """Forty small steps bring the loss of two easily told classes down to less than a third, and memory goes back."""
+    losses, freed = list[float](), list[None]()
+    monkeypatch.setattr(training, "FREED_EVERY", 15)
+    monkeypatch.setattr(training, "give_back_freed_memory", lambda: freed.append(None))
     scene, settings = block_example(64, 16), replace(SETTINGS, steps=40, crop=32, learning_rate=1e-2)
     model, summary = train(CONFIG, [scene], SHIFT, settings, lambda now: losses.append(now.loss))
     batch = CropSampler([scene], 8, 32).draw(8, np.random.default_rng(0), SHIFT)
@@ -44,7 +46,7 @@ def test_training_learns():
     with torch.no_grad():
         last = batch_loss(model, batch, weight, np.random.default_rng(0), phase_at(0.0), soft_dice=False)
     assert last < losses[0] / 3
-    assert (summary["steps"], summary["skipped_steps"]) == (40, 0)
+    assert (summary["steps"], summary["skipped_steps"], len(freed)) == (40, 0, 2)
     assert not model.training
 
 
