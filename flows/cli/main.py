@@ -49,8 +49,7 @@ def _run(arguments: list[str]) -> int:
     except KeyboardInterrupt as error:
         what, code = ("terminated", TERMINATED) if isinstance(error, Terminated) else ("interrupted", INTERRUPTED)
         resumes = next(iter(arguments), "") in GOES_ON and not any("train-temporal" in word for word in arguments)
-        resume = "; run the same command to resume" if resumes else ""
-        stderr.print(f"{what}{resume}", highlight=False)
+        stderr.print(what + ("; run the same command to resume" if resumes else ""), highlight=False)
         return code
     except BrokenPipeError:
         return 1

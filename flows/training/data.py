@@ -177,7 +177,11 @@ def split_labels(
             f"mask {train_mask}: class {unknown} is none of the labels' {sorted(numbers)}; correct the mask classes"
         )
     index = np.array([UNLABELLED, *(numbers[number] for number in classes[:highest])], np.uint8)
-    return _split(scene.labels, scene.labels == index[np.maximum(mask, 0)])
+    trains, named = scene.labels == index[np.maximum(mask, 0)], (mask > 0) & (scene.labels != UNLABELLED)
+    if named.any() and (agree := trains[named].mean()) < 0.5:
+        known = f"mask {train_mask} has the class of the labels in {agree:.0%} of its pixels"
+        raise SceneError(f"{known}; give mask classes: the labels' number of each number of the mask, from 1 on")
+    return _split(scene.labels, trains)
 
 
 def _split(labels: NDArray[np.uint8], trains: NDArray[np.bool_]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:

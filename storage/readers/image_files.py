@@ -79,9 +79,8 @@ def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> Cub
         height, width, count = file.height, file.width, len(keep) * len(pages)
         void = _void(file, alpha)
         geobox, where = place_of_file(file)
-        known, of_bands = (
-            (Bands(), ()) if len(pages) > 1 else _bands_of(file, keep, [kinds[band] for band in keep], path)
-        )
+        one = len(pages) == 1
+        known, of_bands = _bands_of(file, keep, [kinds[band] for band in keep], path) if one else (Bands(), ())
         notes = [*notes, *([] if alpha is None else [ALPHA_NOTE]), *where, *of_bands]
         scale, offset = (np.tile([of[band] for band in keep], len(pages)) for of in (file.scales, file.offsets))
         picture, colours = driver not in _CALLED, None
@@ -115,7 +114,7 @@ def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> Cub
             bands=known,
             nodata=nodata,
             geobox=geobox,
-            bad_bands=tuple(place for place, band in enumerate(keep) if band in bad) if len(pages) == 1 else (),
+            bad_bands=tuple(place for place, band in enumerate(keep) if band in bad) if one else (),
             void=void,
             notes=tuple(notes),
         )

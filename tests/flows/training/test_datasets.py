@@ -70,10 +70,11 @@ def test_a_mask_splits_the_labels(tmp_path: Path) -> None:
         (2, [9], "goes up to 2, but only 1 mask classes"),
         (2, [9, 5], r"class 5 is none of the labels' \[4, 9\]"),
         (2**40, None, r"class 1 is none of the labels' \[4, 9\]"),
+        (2, [9, 4], "the class of the labels in 0% of its pixels; give mask classes"),
     ],
 )
 def test_masks_that_do_not_fit(tmp_path: Path, mask: int, classes: list[int] | None, words: str) -> None:
-    """Too few mask classes, classes that the labels lack and stray numbers, however large, are refused at once."""
+    """Too few mask classes, classes that the labels lack or do not have there, and stray numbers are refused."""
     np.save(tmp_path / "a.npy", np.ones((1, 2, 1)))
     np.save(tmp_path / "gt.npy", np.array([[4, 9]]))
     np.save(tmp_path / "mask.npy", np.array([[1, mask]]))
