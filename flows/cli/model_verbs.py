@@ -85,8 +85,11 @@ class TrainFlags(SceneFlags):
     columns
         Number of spectral features per pixel, for any camera. Default: 24 for built-in scenes, 48 for files.
     start
-        Weights from which the training starts, at a third of the learning rate. Bands, classes and sizes must be
-        theirs, and DATASET must contain the scenes that they know. The result is the mean of both networks.
+        Weights from which the training starts. Bands, classes and sizes must be theirs, and DATASET must contain the
+        scenes that they know. The result is the mean of both networks, or the trained one where it reads the
+        validation scenes better.
+    learning_rate
+        Highest learning rate. Default: 0.0015, or a third of it with --start.
     train_temporal
         Weights to which only a temporal reader is added, for surveys with --prior. The training starts from the
         reader that they have. It takes --scenes, --steps, --minutes, --seed and --validation; it does not resume. It
@@ -121,6 +124,7 @@ class TrainFlags(SceneFlags):
     overview_width: int = TrainRequest.overview_width
     columns: int | None = None
     start: Path | None = None
+    learning_rate: float | None = None
     train_temporal: Path | None = None
     dim: int = 64
     layers: int = 3
@@ -139,6 +143,7 @@ class TrainFlags(SceneFlags):
 
     def request(self, dataset: str, out: Path, command: str) -> TrainRequest:
         """Return the request of a training of all weights. Raises SettingsError: numbers are invalid."""
+        usual = TrainingSettings.learning_rate / (3 if self.start else 1)
         settings = TrainingSettings(
             steps=self.steps,
             minutes=self.minutes,
@@ -146,7 +151,7 @@ class TrainFlags(SceneFlags):
             crop=CROPS_PX[bool(built_in_laws(dataset))] if self.crop is None else self.crop,
             batch=self.batch,
             darkest_ms=self.min_exposure_ms,
-            learning_rate=TrainingSettings.learning_rate / (3 if self.start else 1),
+            learning_rate=usual if self.learning_rate is None else self.learning_rate,
         )
         return TrainRequest(
             dataset,

@@ -32,7 +32,7 @@ from models.network.spectral import LineSpec
 from models.reading.inference import coarse_prediction_of_columns, map_of_columns
 from models.training.capture_augmentation import REFERENCE_MS, STEPS, CaptureAugmentation
 from models.training.examples import Example
-from models.training.train import LabelledPixels, with_discriminants
+from models.training.train import LabelledPixels, halfway, with_discriminants
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 
@@ -157,23 +157,32 @@ def _parts(weights: Weights, example: Example) -> tuple[SceneGrid, NDArray[np.ui
 
 
 FEW_PIXELS = 50_000  # labelled pixels of a training, below which no reading is reliably the best
+WITH_BEGUN = "mean with the weights before"
 READINGS = MappingProxyType({"network": 1.0, "mean of both": 0.5, "linear discriminants": 0.0})  # network's fraction
 
 
 def better_reading(
-    weights: Weights, start: Mapping[str, Any], validation: Sequence[Example], *, few: bool
+    weights: Weights,
+    start: Mapping[str, Any],
+    validation: Sequence[Example],
+    *,
+    few: bool,
+    begun: Weights | None = None,
 ) -> tuple[Weights, dict[str, Any]]:
     """Choose between the trained network, its initial linear discriminants and the mean of their logits.
 
-    With ``few`` labelled pixels it is the mean, as few validation pixels cannot tell. Else the best by mIoU of the
-    validation scenes, or the network without one. Returns the weights, and all scores.
+    Beside them is the mean with weights that the training has ``begun`` from. With ``few`` labelled pixels it is the
+    mean of logits, as few validation pixels cannot tell. Else the best by mIoU of the validation scenes; without one
+    the mean with the weights before, or the network. Returns the weights, and all scores.
     """
     readings = {
         name: replace(weights, segmenter=with_discriminants(weights.segmenter, start, fraction))
         for name, fraction in READINGS.items()
     }
+    if begun is not None:
+        readings[WITH_BEGUN] = replace(weights, segmenter=halfway(begun.segmenter, weights.segmenter))
     scores = {name: _miou(one, validation) for name, one in readings.items()} if validation else {}
-    best = max(scores, key=lambda name: scores[name], default="network")  # the network on a tie
+    best = max(scores, key=lambda name: scores[name], default="network" if begun is None else WITH_BEGUN)
     kept = "mean of both" if few else best
     return readings[kept], {"miou": scores, "kept": kept}
 

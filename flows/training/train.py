@@ -31,7 +31,7 @@ from models.network.spectral import Normalisation
 from models.training.capture_augmentation import REFERENCE_MS
 from models.training.examples import measured_normalisation
 from models.training.ood_fit import fit_ood
-from models.training.train import PIXELS, LabelledPixels, Progress, halfway, linear_discriminants, train
+from models.training.train import PIXELS, LabelledPixels, Progress, linear_discriminants, train
 from models.weights.checksummed_files import load_checkpoint
 from models.weights.files import (
     CALIBRATION,
@@ -188,12 +188,11 @@ def _learned(
         checkpoint=checkpoint,
         device=device,
     )
-    if begun is not None:
-        model = halfway(begun.segmenter, model)
     weights = Weights(model, common.basis, normalisation, common.names, common.colours).on(device)
     frames, found = scenes.validation.examples, dict[str, Any]()
     labelled = sum(int(np.count_nonzero(one.labels != UNLABELLED)) for one in examples)
-    weights, found["readings"] = better_reading(weights, start, frames, few=begun is None and labelled < FEW_PIXELS)
+    few = begun is None and labelled < FEW_PIXELS
+    weights, found["readings"] = better_reading(weights, start, frames, few=few, begun=begun)
     if frames:
         found["baselines"] = judge_baselines(examples, frames, config.classes, seed, report)
         report("validating", 0.0, f"{len(frames)} scenes")
@@ -223,6 +222,7 @@ def check_counts(request: TrainRequest) -> None:
     counts = {
         "--steps": settings.steps,
         "--minutes": settings.minutes,
+        "--learning-rate": settings.learning_rate,
         "--batch": settings.batch,
         "--crop": settings.crop,
         "--scenes": request.scenes,

@@ -272,12 +272,12 @@ def test_whitening_knows_the_noise_of_short_exposures(folder: Path, out: Path):
 
 
 def test_training_goes_on_from_a_file(folder: Path, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The normalisation stays, a step begins at the first network, and the result is halfway between both."""
-    train_weights(_request(folder, out, validation=1, command="first"))
+    """The normalisation stays, a step begins at the first network; without validation the result is halfway."""
+    train_weights(_request(folder, out, validation=0, command="first"))
     trained = flow.train
     ends: list[Any] = []
     monkeypatch.setattr(flow, "train", lambda *given, **options: ends.append(trained(*given, **options)) or ends[0])
-    request = _request(folder, tmp_path / "b.safetensors", validation=1, start=out, settings=replace(SETTINGS, seed=1))
+    request = _request(folder, tmp_path / "b.safetensors", validation=0, start=out, settings=replace(SETTINGS, seed=1))
     record = train_weights(request)
     first, second = load_weights(out), load_weights(tmp_path / "b.safetensors")
     assert record["started_from"] == "first"
@@ -287,6 +287,18 @@ def test_training_goes_on_from_a_file(folder: Path, out: Path, tmp_path: Path, m
         torch.testing.assert_close(after, before, atol=0.01, rtol=0)
         torch.testing.assert_close(halfway, (before + after) / 2)
     assert not torch.equal(after, before)
+
+
+@pytest.mark.parametrize(("better", "kept"), [(0, "network"), (3, "mean with the weights before")])
+def test_a_training_that_goes_on_keeps_what_validation_scores_best(
+    folder: Path, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, better: int, kept: str
+) -> None:
+    """The trained network, or the mean of its weights and those before."""
+    train_weights(_request(folder, out, validation=1))
+    scores = iter(np.eye(4)[better])
+    monkeypatch.setattr(figures, "_miou", lambda *judged: float(next(scores)))
+    record = train_weights(_request(folder, tmp_path / "b.safetensors", validation=1, start=out))
+    assert record["readings"]["kept"] == kept
 
 
 def test_a_training_that_goes_on_may_have_more_scenes(folder: Path, out: Path, tmp_path: Path) -> None:
@@ -301,6 +313,7 @@ def test_a_training_that_goes_on_learns_more_slowly(out: Path) -> None:
     anew, on = (TrainFlags(start=start).request("farm", out, "") for start in (None, Path("first.safetensors")))
     assert 3 * on.settings.learning_rate == pytest.approx(anew.settings.learning_rate)
     assert (anew.start, on.start) == (None, Path("first.safetensors"))
+    assert TrainFlags(learning_rate=2e-3).request("farm", out, "").settings.learning_rate == 2e-3
 
 
 @pytest.mark.parametrize(
