@@ -138,7 +138,7 @@ def test_another_machine_clears_outlived_raw_lines_in_a_bucket(
         ended = json.loads(command_line("gc", bucket, "--json").out)
     assert [removal["uri"].split("/")[1] for removal in ended["removals"]] == ["capture"] * 2  # coarse and fine lines
     assert raw() == {"manifest.json"}
-    monkeypatch.delenv("SPECTRALZOOM_WORK")
+    monkeypatch.setenv("SPECTRALZOOM_WORK", str(tmp_path / "work"))
     assert states(survey_png(bucket, keep="raw 7d", **NARROW).receipt) <= CACHED
     assert raw() == {"manifest.json"}
     assert command_line("verify", bucket).code == 0
