@@ -157,7 +157,7 @@ def _parts(weights: Weights, example: Example) -> tuple[SceneGrid, NDArray[np.ui
 
 
 FEW_PIXELS = 50_000  # labelled pixels of a training, below which no reading is reliably the best
-WITH_BEGUN = "mean with the weights before"
+WITH_START = "mean with --start"
 READINGS = MappingProxyType({"network": 1.0, "mean of both": 0.5, "linear discriminants": 0.0})  # network's fraction
 
 
@@ -171,18 +171,18 @@ def better_reading(
 ) -> tuple[Weights, dict[str, Any]]:
     """Choose between the trained network, its initial linear discriminants and the mean of their logits.
 
-    Beside them is the mean with weights that the training has ``begun`` from. With ``few`` labelled pixels it is the
-    mean of logits, as few validation pixels cannot tell. Else the best by mIoU of the validation scenes; without one
-    the mean with the weights before, or the network. Returns the weights, and all scores.
+    A training from weights, ``begun``, also has the mean of both networks. With ``few`` labelled pixels the mean of the
+    logits is kept, as few validation pixels cannot tell. Else it is the best by mIoU of the validation scenes; without
+    one it is the mean of both networks, or the network. Returns the weights, and all scores.
     """
     readings = {
         name: replace(weights, segmenter=with_discriminants(weights.segmenter, start, fraction))
         for name, fraction in READINGS.items()
     }
     if begun is not None:
-        readings[WITH_BEGUN] = replace(weights, segmenter=halfway(begun.segmenter, weights.segmenter))
+        readings[WITH_START] = replace(weights, segmenter=halfway(begun.segmenter, weights.segmenter))
     scores = {name: _miou(one, validation) for name, one in readings.items()} if validation else {}
-    best = max(scores, key=lambda name: scores[name], default="network" if begun is None else WITH_BEGUN)
+    best = max(scores, key=lambda name: scores[name], default="network" if begun is None else WITH_START)
     kept = "mean of both" if few else best
     return readings[kept], {"miou": scores, "kept": kept}
 

@@ -314,7 +314,7 @@ def halfway(start: Segmenter, trained: Segmenter) -> Segmenter:
     mean = copy.deepcopy(trained)
     with torch.no_grad():
         for own, before in zip(mean.parameters(), start.parameters(), strict=True):
-            own.lerp_(before, 0.5)
+            own.lerp_(before.to(own.device), 0.5)
     return mean
 
 

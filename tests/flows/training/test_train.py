@@ -289,7 +289,7 @@ def test_training_goes_on_from_a_file(folder: Path, out: Path, tmp_path: Path, m
     assert not torch.equal(after, before)
 
 
-@pytest.mark.parametrize(("better", "kept"), [(0, "network"), (3, "mean with the weights before")])
+@pytest.mark.parametrize(("better", "kept"), [(0, "network"), (3, "mean with --start")])
 def test_a_training_that_goes_on_keeps_what_validation_scores_best(
     folder: Path, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, better: int, kept: str
 ) -> None:
