@@ -61,8 +61,6 @@ def test_ls_shows_runs_and_stores(two_budgets: Path, capsys: pytest.CaptureFixtu
     assert content["stages"]["rectify"][0]["key"] in out
     assert format_bytes(first["own_bytes"]) in out
     assert f"2 runs, 17 stores, {format_bytes(content['bytes'])}, {format_bytes(shared)} shared by several runs" in out
-    ls(two_budgets)
-    out = capsys.readouterr().out
     assert max(map(len, out.splitlines())) <= 80
     assert "age" in out
 

@@ -216,11 +216,7 @@ WORDS = {
     "a data set without weights": (2, "farm", "give --weights FILE to judge weights on this data set, or a run"),
     "an archive without a run": (2, "ARCHIVE", "such as evaluate .*archive latest, to judge its map"),
     "a run with weights": (2, "ARCHIVE latest --weights w.safetensors", JUDGED),
-    "a run with shares": (
-        2,
-        "ARCHIVE latest --fractions 0.1",
-        "--fractions is for weights that are judged on a data set",
-    ),
+    "a run by shares": (2, "ARCHIVE latest --fractions 0.1", "--fractions is for weights that are judged on a data"),
     "a run with a folder": (2, "ARCHIVE latest -o out", "--out is for weights"),
     "weights with controls": (2, "farm --weights w --controls", "--controls is for a run of an archive"),
     "no such run": (1, "ARCHIVE 2020-gone", "there is no run 2020-gone in this archive; there is runs/"),

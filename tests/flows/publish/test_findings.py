@@ -84,14 +84,6 @@ def test_a_plain_scan_is_told_what_its_map_scores_by_itself(survey_png: Survey, 
     assert words in dict(finding_rows(receipt))["expected mIoU"]
 
 
-def test_no_score_is_expected_outside_of_the_training_data(survey_png: Survey, weights: Path, tmp_path: Path) -> None:
-    """Its calibration is of scenes with the bands of the training."""
-    flags = {"weights": str(_judged(weights, tmp_path, SCORES.as_dict())), "effects": "none", "scan_step": "1"}
-    receipt: Any = survey_png(tmp_path / "a", **flags, budget=None, wavelengths="690,700,710").receipt
-    assert any("outside of the training data" in note for note in receipt["settings"]["notes"])
-    assert "expected" not in receipt
-
-
 def test_a_score_that_may_be_any_is_not_predicted(survey_png: Survey, weights: Path, tmp_path: Path) -> None:
     """Weights whose maps were off by 37 points: the receipt has no score, and says why."""
     content = SCORES.as_dict() | {"error": [[0.371, 0.371]]}
@@ -130,22 +122,25 @@ def test_words_of_a_memory_tell_change_beyond_what_maps_differ_by() -> None:
 
 
 @pytest.mark.parametrize(
-    "flags",
-    [{"budget": None, "scan_step": "2"}, {"budget": None, "scan_step": "1", "macs": "80%"}],
-    ids=["another step", "read in part"],
+    ("limit", "flags"),
+    [
+        (1e6, {"scan_step": "2"}),
+        (1e6, {"scan_step": "1", "macs": "80%"}),
+        (1e6, {"scan_step": "1", "wavelengths": "690,700,710"}),
+        (0.2, {"scan_step": "1"}),
+    ],
+    ids=["another step", "read in part", "other bands", "much unknown"],
 )
-def test_unknown_maps_have_no_findings(survey_png: Survey, weights: Path, tmp_path: Path, flags: dict[str, str | None]):
-    """A step that was not measured, a scan of which a part alone is read."""
-    path = _judged(weights, tmp_path, SCORES.as_dict())
-    assert "expected" not in survey_png(tmp_path / "a", weights=str(path), effects="none", **flags).receipt
-
-
-def test_nothing_is_told_of_a_field_that_the_weights_do_not_know(survey_png: Survey, weights: Path, tmp_path: Path):
-    """Where most of it is unknown the probabilities of the rest say nothing."""
-    path = _judged(weights, tmp_path, SCORES.as_dict(), limit=0.2)
-    receipt: Any = survey_png(tmp_path / "a", weights=str(path), effects="none", budget=None, scan_step="1").receipt
-    assert 0.2 < receipt["unknown"]["fraction"] < 1
+def test_no_score_is_expected_of_other_maps(
+    survey_png: Survey, weights: Path, tmp_path: Path, limit: float, flags: dict[str, str]
+) -> None:
+    """The calibration is of whole scans of one step, of scenes with the bands of the training and known spectra."""
+    path = _judged(weights, tmp_path, SCORES.as_dict(), limit)
+    receipt: Any = survey_png(tmp_path / "a", weights=str(path), effects="none", budget=None, **flags).receipt
     assert "expected" not in receipt
+    assert limit > 1 or 0.2 < receipt["unknown"]["fraction"] < 1
+    beyond = any("outside of the training data" in note for note in receipt["settings"]["notes"])
+    assert beyond == ("wavelengths" in flags)
 
 
 def test_a_table_that_is_none_is_refused_with_its_file(survey_png: Survey, weights: Path, tmp_path: Path):

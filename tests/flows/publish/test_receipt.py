@@ -8,6 +8,8 @@ import io
 import json
 import re
 from dataclasses import asdict
+from functools import reduce
+from operator import getitem
 
 import numpy as np
 import pytest
@@ -99,27 +101,30 @@ def test_receipt_has_the_fields_of_the_design_and_reads_back():
 
 
 @pytest.mark.parametrize(
-    "path",
+    ("path", "wrong"),
     [
-        ("versions",),
-        ("stages", 0, "key"),
-        ("savings", "patches"),
-        ("data_bytes", "kept"),
-        ("savings", "lines", "full_is"),
-        ("savings", "multiply_adds", "score"),
-        ("accuracy", "gap_closed"),
-        ("accuracy", "none", "miou"),
-        ("accuracy", "controls", "random", "spread"),
+        (("versions",), None),
+        (("stages", 0, "key"), None),
+        (("savings", "patches"), None),
+        (("data_bytes", "kept"), None),
+        (("savings", "lines", "full_is"), None),
+        (("savings", "multiply_adds", "score"), None),
+        (("accuracy", "gap_closed"), None),
+        (("accuracy", "none", "miou"), None),
+        (("accuracy", "controls", "random", "spread"), None),
+        (("stages", 1, "state"), "done"),
+        (("savings", "lines", "full_is"), "guessed"),
     ],
 )
-def test_missing_field_is_named(path):
-    """Taking any one field away is found, with its place."""
+def test_what_is_not_of_the_design_is_named(path, wrong):
+    """A field that is missing with its place, and another word for a stage's state or a figure's origin."""
     broken: dict = copy.deepcopy(dict(make_receipt()))
-    part = broken
-    for name in path[:-1]:
-        part = part[name]
-    del part[path[-1]]
-    with pytest.raises(ShapeError, match=rf"{path[-1]} is missing"):
+    part = reduce(getitem, path[:-1], broken)
+    if wrong is None:
+        del part[path[-1]]
+    else:
+        part[path[-1]] = wrong
+    with pytest.raises(ShapeError, match=rf"{path[-1]} is {'missing' if wrong is None else 'not of the design'}"):
         check_receipt(broken)
 
 
@@ -134,16 +139,8 @@ def test_maps_without_the_prior_map_are_not_compared() -> None:
         assert ("the overview alone gives" in format_score(receipt)) == (why is not None)
 
 
-def test_words_outside_the_design_are_refused():
-    """A stage has one of four states, a full figure one of two origins; a judged map has its accuracy."""
-    for path, wrong in ((("stages", 1, "state"), "done"), (("savings", "lines", "full_is"), "guessed")):
-        broken: dict = copy.deepcopy(make_receipt())
-        part = broken
-        for name in path[:-1]:
-            part = part[name]
-        part[path[-1]] = wrong
-        with pytest.raises(ShapeError, match=rf"{path[-1]} is not of the design"):
-            check_receipt(broken)
+def test_accuracy_belongs_to_a_map_that_is_judged():
+    """Neither comes without the other."""
     with pytest.raises(ShapeError, match="accuracy and judged belong to a map that is judged"):
         check_receipt({**make_receipt(labels=False), "accuracy_is": "judged"})
 

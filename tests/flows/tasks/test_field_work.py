@@ -21,7 +21,7 @@ from models.reading.regions import plan_regions
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
 from storage.archive.keys import StageRef
-from storage.arrays.class_maps import ClassNames, create_class_map, create_probabilities, load_class_map
+from storage.arrays.class_maps import ClassNames, create_class_map, create_probabilities
 from storage.arrays.layout import consolidate_stores
 from storage.arrays.mosaics import load_attention
 from storage.parallel.pool import WorkerPool
@@ -99,16 +99,6 @@ def test_regions_choose_patches_by_the_classes_of_the_field(
     whole = _draw(run.work, run, stages, tmp_path / "one", least)
     assert (regions == whole) == (overviews == 16)  # one of two regions has other classes
     assert regions != _contents(_store(stages, "segment").path / MAP)
-
-
-def test_every_pool_draws_the_same_regions(surveyed: Surveyed, tmp_path: Path) -> None:
-    """Two at a time or one after the other, the bytes are the same; every pixel has a class."""
-    run, stages = surveyed
-    one = _draw(_work(run, WorkerPool(workers=1), 0), run, stages, tmp_path / "one")
-    assert one == _draw(_work(run, WorkerPool(workers=2), 0), run, stages, tmp_path / "two")
-    found = load_class_map(tmp_path / "one" / MAP)
-    assert found.classes.max() < len(found.names)
-    assert np.isfinite(found.confidence).all()
 
 
 @pytest.mark.parametrize("policy", ["gain", "entropy", "sobel"])

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.errors import IncompleteStoreError
 from storage.arrays.georeference import AngularGrid
 from storage.arrays.mosaics import MosaicWriter, open_mosaic
 from tests.storage.plain_mosaic import plain_writer, write_values
@@ -62,11 +61,7 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Stored:
 
 @pytest.mark.parametrize(
     ("rows", "columns", "heights"),
-    [
-        (slice(None), slice(None), [64, 64, 22]),
-        (slice(10, 130), slice(5, 60), [54, 64, 2]),
-        (slice(70, 71), slice(0, 1), [1]),
-    ],
+    [(*np.s_[:, :], [64, 64, 22]), (*np.s_[10:130, 5:60], [54, 64, 2]), (*np.s_[70:71, :1], [1])],
 )
 def test_strips_make_the_window(stored: Stored, rows: slice, columns: slice, heights: list[int]) -> None:
     """They end where shards do, and together are what is stored there."""
@@ -86,9 +81,3 @@ def test_brightness_is_the_mean_over_bands(stored: Stored, factor: int) -> None:
         if np.isfinite(cell).mean() >= 0.5:
             expected[y, x] = np.nanmean(cell)
     np.testing.assert_allclose(found, expected, atol=1e-5)
-
-
-def test_a_folder_that_is_no_mosaic_is_refused(stored: Stored) -> None:
-    """With its path."""
-    with pytest.raises(IncompleteStoreError, match="cannot be read"):
-        open_mosaic(stored[0] / "none.zarr")

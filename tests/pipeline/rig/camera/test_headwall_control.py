@@ -11,7 +11,7 @@ from pipeline.errors import RigError, SettingsError
 from pipeline.rig.camera import headwall_camera
 from pipeline.rig.camera.headwall_camera import HeadwallCamera, ReplyReader, response_of
 from pipeline.rig.device_settings import ControlPatience, FileServer, check_times
-from pipeline.rig.transports import Clock, DeviceRefused, StateUnknown
+from pipeline.rig.transports import DeviceRefused, StateUnknown
 from tests.pipeline.rig.in_process import ManualClock
 from tests.pipeline.rig.scripted import Pair, Reply, ScriptedTransport
 
@@ -128,24 +128,18 @@ def test_capture_without_a_reply() -> None:
 def test_capture_that_is_interrupted() -> None:
     """Ctrl-C while the reply is awaited leaves captures frozen, since one may run."""
     with talk([(CAPTURE, b"")]) as control:
-        control.clock.sleep = Interrupting(control.clock)  # type: ignore[method-assign]
+        sleep = control.clock.sleep
+
+        def interrupted(seconds: float) -> None:
+            if seconds > 1:
+                raise KeyboardInterrupt
+            sleep(seconds)
+
+        control.clock.sleep = interrupted  # type: ignore[method-assign]
         with pytest.raises(KeyboardInterrupt):
             control.capture(500, prefix="f1")
         with pytest.raises(StateUnknown, match="a capture was sent and not acknowledged"):
             control.capture(500, prefix="f1")
-
-
-class Interrupting:
-    """Sleeping that a person ends, once there is something to wait for."""
-
-    def __init__(self, clock: Clock) -> None:
-        self._sleep = clock.sleep
-
-    def __call__(self, seconds: float) -> None:
-        """Sleep, or be interrupted."""
-        if seconds > 1:
-            raise KeyboardInterrupt
-        self._sleep(seconds)
 
 
 def test_stale_bytes_are_dropped(caplog: pytest.LogCaptureFixture) -> None:
