@@ -256,7 +256,7 @@ def test_a_prescription_ends_at_borders(posed: Products, crs: str, box: tuple[fl
 
 
 def test_a_survey_without_a_place_has_what_needs_none(surveyed_png: Any, tmp_path: Path) -> None:
-    """Polygons on the camera's angles, no GeoJSON, no hectares; doses and metres are refused with what is missing."""
+    """Polygons on the camera's angles, no GeoJSON; doses and metres are refused with what is missing."""
     archive, out, needs_none = tmp_path / "archive", tmp_path / "out", {"polygons": True, "reflectance": True}
     one_picture = exported(archive, out, surveyed_png(archive).receipt, indices="VARI", **needs_none)
     found = geopandas.read_file(one_picture.file("polygons"))
@@ -265,10 +265,6 @@ def test_a_survey_without_a_place_has_what_needs_none(surveyed_png: Any, tmp_pat
     transform = one_picture.store("class_map").attrs["spatial:transform"]
     pixels = one_picture.store("class_map")["classes"].size
     assert found.area.sum() == pytest.approx(pixels * transform[0] ** 2, rel=0.01)
-    with one_picture.file("areas").open() as text:
-        table = list(csv.DictReader(text))
-    assert {row["hectares"] for row in table} == {""}
-    assert sum(int(row["pixels"]) for row in table) == pixels
     with pytest.raises(SettingsError, match=r"metres, and the run has no place .* \[pose\]"):
         exported(archive, out / "no", {}, prescription="class_1=1")
     words = r"ExG wants reflectance \(0 to 1\), and the values .* choose an index of ratios"

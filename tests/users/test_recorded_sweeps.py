@@ -355,21 +355,22 @@ def test_ingest_names_the_survey_as_the_next_step(
     assert digest_of_map(tmp_path / "a", json.loads(surveyed.out)) == digest_of_map(tmp_path / "b", of_files.receipt)
 
 
-def test_an_ingested_image_is_surveyed_as_a_scene(command_line: CommandLine, tmp_path: Path) -> None:
-    """A picture of whole numbers is no recording of a camera."""
-    Image.fromarray(np.zeros((16, 24, 3), np.uint8)).save(tmp_path / "a.png")
-    ended = command_line("ingest", tmp_path / "a.png", tmp_path / "store")
-    assert f"next: spectralzoom survey --scene {tmp_path / 'a.png'} --weights" in ended.err
-
-
-@pytest.mark.parametrize(("given", "words"), [(("--wavelengths", "500,600"), "500,600"), ((), "NM,NM,...")])
+@pytest.mark.parametrize(
+    ("name", "given", "words"),
+    [
+        ("a.npy", ("--wavelengths", "500,600"), " --wavelengths 500,600"),
+        ("a.npy", (), " --wavelengths NM,NM,..."),
+        ("a.png", (), ""),
+    ],
+)
 def test_the_next_step_names_wavelengths_that_a_file_lacks(
-    given: tuple[str, ...], words: str, command_line: CommandLine, tmp_path: Path
+    name: str, given: tuple[str, ...], words: str, command_line: CommandLine, tmp_path: Path
 ) -> None:
-    """Those that were given, or a place for them."""
+    """Those that were given, or a place for them; a picture of whole numbers is a scene as it is, and no recording."""
     np.save(tmp_path / "a.npy", np.zeros((16, 24, 2), np.float32))
-    ended = command_line("ingest", tmp_path / "a.npy", tmp_path / "store", *given)
-    assert f"--scene {tmp_path / 'a.npy'} --wavelengths {words} --weights" in ended.err
+    Image.fromarray(np.zeros((16, 24, 3), np.uint8)).save(tmp_path / "a.png")
+    ended = command_line("ingest", tmp_path / name, tmp_path / "store", *given)
+    assert f"next: spectralzoom survey --scene {tmp_path / name}{words} --weights" in ended.err
 
 
 def test_a_rigs_run_is_reprocessed_from_raw(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights: Path) -> None:

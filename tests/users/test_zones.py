@@ -27,11 +27,8 @@ from tests.users.zone_sketches import sketch
 pytestmark = pytest.mark.usefixtures("no_effects")
 AREA = shapely.Polygon([(20, 8), (118, 10), (110, 62), (24, 60)])
 NO_GO = shapely.box(50, 24, 58, 33)
-PLOTS = {
-    "north": shapely.box(24, 12, 100, 36),
-    "south": shapely.box(24, 36, 100, 60),
-    "away": shapely.box(400, 0, 410, 9),
-}
+SHAPES = {"north": (24, 12, 100, 36), "south": (24, 36, 100, 60), "away": (400, 0, 410, 9)}
+PLOTS = {name: shapely.box(*corners) for name, corners in SHAPES.items()}
 POSE = {"lon_deg": 7.6, "lat_deg": 51.96, "height_m": 30, "heading_deg": 20, "tilt_deg": 35}
 NARROW = {"camera.samples": 64, "budget": "1"}
 
@@ -197,27 +194,23 @@ def test_polygons_in_any_crs_are_the_same_zones(opened: Opened, tmp_path: Path) 
 
 
 @pytest.mark.parametrize(
-    ("shape", "crs", "pose", "words"),
+    ("kind", "box", "crs", "pose", "words"),
     [
-        (shapely.box(300, 0, 400, 50), None, False, "expected some in x 0 to 128.*got x 300 to 400"),
-        (shapely.box(10.1, 10.1, 10.3, 10.3), None, False, "smaller than a pixel"),
-        (shapely.box(7.5, 51.9, 7.7, 52), 4326, False, r"WGS 84.*give the rig's \[pose\]"),
-        (shapely.box(8.5, 51.9, 8.7, 52), 4326, True, "x 7.6.*got x 8.5 to 8.7"),
+        ("area", (300, 0, 400, 50), None, None, "expected some in x 0 to 128.*got x 300 to 400"),
+        ("area", (10.1, 10.1, 10.3, 10.3), None, None, "smaller than a pixel"),
+        ("area", (7.5, 51.9, 7.7, 52), 4326, None, r"WGS 84.*give the rig's \[pose\]"),
+        ("area", (8.5, 51.9, 8.7, 52), 4326, POSE, "x 7.6.*got x 8.5 to 8.7"),
+        ("no_go", (0, 0, 200, 200), None, None, "nothing is left to survey"),
     ],
-    ids=["beside", "tiny", "no place", "another farm"],
+    ids=["beside", "tiny", "no place", "another farm", "all of it"],
 )
-def test_a_wrong_area_is_refused(opened: Opened, tmp_path: Path, shape: Any, crs: Any, pose: bool, words: str) -> None:
-    """One message with both extents, or what is missing."""
-    path = sketch(tmp_path / ("area.gpkg" if crs else "area.geojson"), {"a": shape}, crs)
+def test_a_wrong_zone_is_refused(
+    opened: Opened, tmp_path: Path, kind: str, box: Any, crs: int | None, pose: Any, words: str
+) -> None:
+    """One message with both extents, or what is missing; a no-go zone over everything leaves no empty map."""
+    path = sketch(tmp_path / ("zone.gpkg" if crs else "zone.geojson"), {"a": shapely.box(*box)}, crs)
     with pytest.raises(ZoneError, match=words):
-        opened(zones={"area": path}, pose=POSE if pose else None)
-
-
-def test_zones_that_leave_nothing_are_refused(opened: Opened, tmp_path: Path) -> None:
-    """A no-go zone over all of the area is a mistake, not an empty map."""
-    path = sketch(tmp_path / "all.geojson", {"all": shapely.box(0, 0, 200, 200)})
-    with pytest.raises(ZoneError, match="nothing is left to survey"):
-        opened(zones={"no_go": path})
+        opened(zones={kind: path}, pose=pose)
 
 
 def test_a_no_go_zone_beside_the_field_is_told(opened: Opened, tmp_path: Path) -> None:

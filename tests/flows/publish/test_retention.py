@@ -87,22 +87,14 @@ def test_outlived_lines_go(archive: Archive, capsys: pytest.CaptureFixture[str])
 
 
 @pytest.mark.usefixtures("no_effects", "later")
-def test_lines_that_another_run_keeps_stay(archive: Archive, survey_png: Survey) -> None:
-    """The strictest of the runs that name them counts, for gc and for a survey that finds them."""
+@pytest.mark.parametrize(("first", "then"), [("raw", "signal"), ("signal", "raw")])
+def test_lines_stay_as_long_as_a_run_keeps_them(archive: Archive, survey_png: Survey, first: str, then: str) -> None:
+    """The strictest counts, for gc and for a survey that finds them; what none keeps goes, and is captured again."""
     there = raw_uris(archive)
-    survey_png(archive.root, keep="raw", accuracy=False)
+    survey_png(archive.root, keep=first, accuracy=False)
+    assert raw_uris(archive) == (there if first == "raw" else set())
     assert clear_raw_lines(archive).removals == []
-    survey_png(archive.root, keep="signal", accuracy=False)
-    assert raw_uris(archive) == there
-
-
-@pytest.mark.usefixtures("no_effects", "later")
-def test_lines_that_no_run_keeps_go_with_the_next_survey(archive: Archive, survey_png: Survey) -> None:
-    """It finds the lines of a run whose week is over; one that keeps them captures them again."""
-    there = raw_uris(archive)
-    survey_png(archive.root, keep="signal", accuracy=False)
-    assert raw_uris(archive) == set()
-    survey_png(archive.root, keep="raw", accuracy=False)
+    survey_png(archive.root, keep=then, accuracy=False)
     assert raw_uris(archive) == there
 
 

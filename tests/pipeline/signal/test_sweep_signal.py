@@ -146,21 +146,14 @@ def test_rare_spectra_come_back_within_a_quarter_deviation() -> None:
     assert max(np.abs(off[place]).max() for place in places) <= RESIDUAL_STEP / 2 + 1e-3
 
 
-def test_one_altered_score_is_found() -> None:
-    """One score a step off: its line differs, and no other does."""
-    lines = made_lines()
-    stored, _ = condense(lines)
-    stored.scores[77, 13, 1] += 1
-    assert differing_lines(lines, stored, CAMERA) == [77]
-
-
 def test_lines_that_changed_or_were_lost_are_found() -> None:
-    """A raw line that is another one now, and spectra stored as unusable that are not, are named by their lines."""
+    """A raw line that is another one now, one score a step off, one spectrum lost: their lines and no others."""
     lines = made_lines()
     stored, _ = condense(lines)
     stored.quality[149, 0] = UNUSABLE
+    stored.scores[77, 13, 1] += 1
     lines.raw[66] = lines.raw[0]
-    assert differing_lines(lines, stored, CAMERA) == [66, 149]
+    assert differing_lines(lines, stored, CAMERA) == [66, 77, 149]
 
 
 def test_saturated_spectra_are_restored_or_unusable() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -105,18 +106,18 @@ def test_negative_values_are_no_class_unless_one_has_them(tmp_path: Path, classe
     assert len(found.notes) == ("lost" not in classes)
 
 
-def test_colours_for_classes_of_numbers_are_refused(tmp_path: Path) -> None:
-    """The message shows a colour, not the number that it is packed into."""
-    Image.fromarray(np.full((2, 2, 3), (0, 120, 0), np.uint8)).save(tmp_path / "a.png")
-    with pytest.raises(SceneError, match=r"have colours, such as \[0, 120, 0\], and the classes are numbers"):
-        load_labels(tmp_path / "a.png", (2, 2), classes={"soil": 1})
-
-
-def test_unlabelled_cannot_be_a_class(tmp_path: Path) -> None:
-    """One number cannot mean a class and no class."""
-    np.save(tmp_path / "a.npy", np.zeros((3, 4), int))
-    with pytest.raises(SceneError, match="value 0 as unlabelled and as class soil"):
-        load_labels(tmp_path / "a.npy", (3, 4), classes={"soil": 0}, unlabelled=0)
+@pytest.mark.parametrize(
+    ("pixel", "unlabelled", "words"),
+    [
+        ((0, 120, 0), None, r"have colours, such as \[0, 120, 0\], and the classes are numbers"),  # no packed number
+        (0, 1, "value 1 as unlabelled and as class soil"),
+    ],
+)
+def test_classes_that_labels_cannot_have_are_refused(tmp_path: Path, pixel: Any, unlabelled: Any, words: str) -> None:
+    """Numbers of classes for labels in colours, and one number for a class and for no class."""
+    Image.fromarray(np.full((2, 2, np.size(pixel)), pixel, np.uint8).squeeze()).save(tmp_path / "a.png")
+    with pytest.raises(SceneError, match=words):
+        load_labels(tmp_path / "a.png", (2, 2), classes={"soil": 1}, unlabelled=unlabelled)
 
 
 def test_names_that_all_know_have_their_colour() -> None:
