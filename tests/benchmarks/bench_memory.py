@@ -54,12 +54,8 @@ def view_farm(seed: int, day: int, how: tuple[int, float], noise: int) -> Seen:
     return Seen(observation, np.asarray(scene.labels, np.uint8))
 
 
-def rows() -> list[Row]:
+def rows() -> Iterator[Row]:
     """Fraction of the gap that the prior map closes after a week."""
-    return list(_revisits())
-
-
-def _revisits() -> Iterator[Row]:
     closed, worst, reader = list[float](), list[float](), load_reader(shipped_weights())
     for day in DAYS:
         scores: dict[str, list[float]] = {"old": [], "quick": [], "fused": [], "full": []}

@@ -81,7 +81,7 @@ def rows(weights: Sequence[Path] = ()) -> list[Row]:
     split = _open(folder)
     with tempfile.TemporaryDirectory() as name:
         found = [one for path in weights or (_trained(folder, Path(name)),) for one in _through_camera(folder, path)]
-    seen = replace(split, values=_seen_by_camera(folder))
+    seen = replace(split, values=exposed(_scene(folder), 0))
     table = _compared(found, _peers(seen, "camera"))
     return table + _compared([] if weights else _of_the_file(folder, split), _peers(split, "file"))
 
@@ -211,14 +211,14 @@ def _scene(folder: Path) -> RasterScene:
     return scene_of_file(load_data_set(folder / SCENE).load(Path(SCENE).stem), LineCamera())
 
 
-def _seen_by_camera(folder: Path) -> Values:
-    """One fine exposure of the scene, (y, x, band), as training's fine look has it before its columns."""
+def exposed(scene: RasterScene, seed: int | Sequence[int]) -> Values:
+    """One fine exposure of a scene, (y, x, band), as training's fine look has it before its columns."""
     from models.training.examples import electrons_of
     from pipeline.geometry.camera import LineCamera, expose, footprint
 
-    scene, camera = _scene(folder), LineCamera()
+    camera = LineCamera()
     electrons = electrons_of(scene, footprint(np.asarray(scene.planes, np.float32), camera), camera)
-    values = expose(electrons, camera, step=1, rng=np.random.default_rng(0))
+    values = expose(electrons, camera, step=1, rng=np.random.default_rng(seed))
     return np.asarray(values * (scene.white_reference / scene.white_reference_electrons), np.float32)
 
 

@@ -138,18 +138,14 @@ def score(seed: int, share: float, light: float, swaths: int, seconds: float, wa
     return 100 * float(accuracy["miou"])
 
 
-def planner_zooms(light: float, swaths: int, seconds: float) -> bool:
-    """Return whether the planner takes two passes; the decision does not depend on the land."""
-    with tempfile.TemporaryDirectory() as out:
-        return open_run(asked(0, light, swaths, seconds, PLANNER, out), planning=True).settings.zooms
-
-
 def cells(seeds: Sequence[int] = SEEDS) -> Iterator[Cell]:
     """Yield every regime with its scores."""
     for light, exposure_ms, share in itertools.product(LIGHTS, EXPOSURES_MS, SHARES):
         seconds = 1 + SWATHS * (SETUP_S + LINES * exposure_ms * 1e-3 / light)
         scores = {way: [score(seed, share, light, SWATHS, seconds, way) for seed in seeds] for way in WAYS}
-        yield Cell(light, share, seconds, scores, planner_zooms(light, SWATHS, seconds))
+        with tempfile.TemporaryDirectory() as out:  # the planner's decision does not depend on the land
+            run = open_run(asked(0, light, SWATHS, seconds, PLANNER, out), planning=True)
+        yield Cell(light, share, seconds, scores, run.settings.zooms)
 
 
 def rows(picture: Path | None = None) -> list[Row]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench_pines import SCENE, WINDOW
+from bench_pines import SCENE, WINDOW, exposed
 from measure import Row, data_folder, not_run
 from numpy.typing import NDArray
 
@@ -24,9 +24,8 @@ from flows.training.data import TrainingData, load_data_set, open_training_data
 from flows.training.train import train_weights
 from models.evaluation.metrics import confusion, mean_iou, overall_accuracy
 from models.reading.inference import segment
-from models.training.examples import electrons_of
 from models.weights.files import Weights, load_weights
-from pipeline.geometry.camera import LineCamera, expose, footprint
+from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED
 
 DOWN, ACROSS, FOLDS = 5, 4, 3
@@ -106,16 +105,14 @@ def _pixels(data: TrainingData, names: Sequence[str], weights: Weights, seed: in
     """Return (pixel, band) means of labelled pixels as the camera sees them, and their classes (pixel,)."""
     from scipy.ndimage import uniform_filter
 
-    values, classes, camera = [], [], LineCamera()
+    values, classes = [], []
     for name in names:
         scene = data.scene(name)
-        electrons = electrons_of(scene, footprint(np.asarray(scene.planes, np.float32), camera), camera)
-        seen = expose(electrons, camera, step=1, rng=np.random.default_rng([seed, int(name)]))
-        seen = seen * (scene.white_reference / scene.white_reference_electrons)
         labels = scene.labels
         assert labels is not None
         assert scene.class_names == weights.class_names
-        values.append(uniform_filter(seen, (WINDOW, WINDOW, 1), mode="nearest")[labels != UNLABELLED])
+        seen = uniform_filter(exposed(scene, [seed, int(name)]), (WINDOW, WINDOW, 1), mode="nearest")
+        values.append(seen[labels != UNLABELLED])
         classes.append(labels[labels != UNLABELLED])
     return np.concatenate(values), np.concatenate(classes)
 

@@ -54,12 +54,8 @@ def rows() -> list[Row]:
     with tempfile.TemporaryDirectory() as folder:
         for name, path in other_fields(Path(folder)):
             for scan_pass in ("every line, 100 ms", "every line, 5 ms"):
-                fraction = (
-                    100
-                    * _survey(
-                        {"scene": str(path), "source": "sim", "weights": str(WEIGHTS), **PROBES[scan_pass]}, "auto"
-                    )["fraction"]
-                )
+                given = {"scene": str(path), "source": "sim", "weights": str(WEIGHTS), **PROBES[scan_pass]}
+                fraction = 100 * _survey(given, "auto")["fraction"]
                 found.append(Row(f"{name}, {scan_pass}: unknown", f"{fraction:.1f} %", ">= 90 %", fraction >= 90))
                 print(f"{found[-1].what}: {found[-1].figure}", flush=True)
     return found if PINES.is_dir() else [*found, not_run("Indian Pines at the farm's brightness", PINES)]

@@ -94,11 +94,8 @@ def _try(name: str, path: Path, before: Content, called: str, found: Flips) -> N
 def _alike(one: Content, other: Content) -> bool:
     if one[0] != other[0] or one[1].keys() != other[1].keys():
         return False
-    return all(_bits(value) == _bits(other[1][name]) for name, value in one[1].items())
-
-
-def _bits(tensor: torch.Tensor) -> tuple[object, ...]:
-    return tensor.dtype, tuple(tensor.shape), tensor.detach().contiguous().numpy().tobytes()
+    bits = lambda tensor: (tensor.dtype, tensor.shape, tensor.detach().contiguous().numpy().tobytes())  # noqa: E731
+    return all(bits(value) == bits(other[1][name]) for name, value in one[1].items())
 
 
 def _written(folder: Path) -> dict[str, Path]:

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from flows.evaluate.frames import ObservedFrame, observe_frame, open_frames
-from models.weights.files import Weights, load_weights, save_weights
+from flows.evaluate.frames import open_frames
+from models.weights.files import save_weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.scenes.scene import RasterScene
 from tests.models.conftest import make_weights
@@ -51,9 +51,3 @@ def scene_at(data: Path, name: str = "001") -> RasterScene:
     """One frame of the field."""
     opened = open_frames(str(data), (name,), None, LineCamera(), {})
     return opened.scene(opened.train[0])
-
-
-def observed_passes(data: Path, path: Path, seed: int = 0) -> tuple[ObservedFrame, Weights]:
-    """The first frame as small weights see it."""
-    weights = load_weights(write_weights(path, seed))
-    return observe_frame(scene_at(data), "001", weights, LineCamera(), 0), weights

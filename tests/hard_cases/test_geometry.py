@@ -20,12 +20,6 @@ from tests.pipeline.geometry.paper_equations import line_rotation
 PRECISIONS = [np.float64, np.float32]
 
 
-def around_the_rim(precision: type, count: int = 720) -> np.ndarray:
-    """Positions of radius 1 in every direction."""
-    turn = np.linspace(0, 2 * np.pi, count)
-    return np.stack([np.cos(turn), np.sin(turn)], axis=-1).astype(precision)
-
-
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("angle", [1e-3, 1e-6, 1e-12, 1e-18])
 def test_a_view_towards_the_camera_keeps_its_digits(precision: type, angle: float):
@@ -57,7 +51,9 @@ def test_a_view_straight_back_has_a_normal_but_no_position():
 @pytest.mark.parametrize("towards", [0.0, 2.0])
 def test_one_bit_either_side_of_the_rim_is_still_the_rim(precision: type, towards: float):
     """Radius 1 + and - 1 ulp goes to a ray and back without an error or a lost digit."""
-    rim = np.nextafter(around_the_rim(precision), towards * around_the_rim(precision), dtype=precision)
+    turn = np.linspace(0, 2 * np.pi, 720)
+    around = np.stack([np.cos(turn), np.sin(turn)], axis=-1).astype(precision)
+    rim = np.nextafter(around, towards * around, dtype=precision)
     for position in (rim, np.array([[np.nextafter(precision(1), precision(towards)), 0]], precision)):
         back = direction_to_position(position_to_direction(position))
         assert np.abs(back - position).max() < 16 * np.finfo(precision).eps

@@ -30,19 +30,6 @@ SHA256 = {
 }
 
 
-def known_map() -> FieldMap:
-    """Three pictures, with words that mean no good."""
-    numbers = np.zeros((HEIGHT, WIDTH), np.uint8)
-    numbers[:, WIDTH // 2 :] = 1
-    picture = layer_address(numbers, np.array([[120, 80, 40], [20, 200, 60]], np.uint8))
-    layers = [
-        MapLayer("True colour", picture, shown=True),
-        MapLayer("Class map", picture, shown=True),
-        MapLayer("Truth", picture, opacity=0.5),
-    ]
-    return FieldMap((WIDTH, HEIGHT), layers, [{"name": f"crop{BAD}", "fraction": "50 %", "colour": "#14c83c"}])
-
-
 @pytest.fixture(scope="module")
 def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
     """One browser for all tests of this file."""
@@ -52,14 +39,20 @@ def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The report of a map that is known by heart."""
+    """The report of a map that is known by heart: three pictures, with words that mean no good."""
+    numbers = np.zeros((HEIGHT, WIDTH), np.uint8)
+    numbers[:, WIDTH // 2 :] = 1
+    shown = layer_address(numbers, np.array([[120, 80, 40], [20, 200, 60]], np.uint8))
+    layers = [MapLayer("True colour", shown, shown=True), MapLayer("Class map", shown, shown=True)]
+    layers.append(MapLayer("Truth", shown, opacity=0.5))
+    field = FieldMap((WIDTH, HEIGHT), layers, [{"name": f"crop{BAD}", "fraction": "50 %", "colour": "#14c83c"}])
     receipt = make_receipt()
     receipt["survey"] = f"field{BAD}"
     file = io.BytesIO()
     Image.new("L", (1800, 1400), 128).save(file, "PNG")
     picture = file.getvalue()
     path = tmp_path_factory.mktemp("report") / "report.html"
-    path.write_text(render_report(receipt, picture, [Picture(picture, "a picture")], field=known_map()), "utf-8")
+    path.write_text(render_report(receipt, picture, [Picture(picture, "a picture")], field=field), "utf-8")
     return path
 
 

@@ -20,7 +20,7 @@ from pipeline.simulator.render import EFFECTS, expected_light
 from pipeline.simulator.rig_model import Air, Rig
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
-from pipeline.simulator.selection.choice import Decision, decide
+from pipeline.simulator.selection.choice import decide
 from pipeline.simulator.selection.survey_probe import probe_scene
 from tests.benchmarks.effects.bench_simulator import cheap_effects
 from tests.pipeline.simulator.bound_trials import DRAWN, Trial, trials
@@ -120,7 +120,13 @@ def _of_rig(scene: RasterScene, name: str, rig: Rig) -> list[Row]:
 
     clocks = time_in_turn({way: partial(image, chosen) for way, chosen in ways.items()}, rounds=3)
     return [
-        _tolerance_row(name, apart, decision),
+        Row(
+            f"farm 1024 x 1280 x 270, {name}, auto at {TOLERANCE} sigma: greatest change of light",
+            f"{apart['auto']:.3g} sigma, bound {decision.error:.3g}",
+            f"<= {TOLERANCE} sigma",
+            apart["auto"] <= decision.error <= TOLERANCE,
+            f"everything on, cheap: {apart['cheap']:.2g} sigma",
+        ),
         _cpu_row(name, "cheap", clocks),
         _cpu_row(name, "exact", clocks),
         Row(f"farm, {name}: probe and choice of effects, processor time", f"{probed:.1f} s and {decided:.2f} s"),
@@ -131,16 +137,6 @@ def _of_rig(scene: RasterScene, name: str, rig: Rig) -> list[Row]:
 def _apart(light: Sequence[Radiance], exact: Sequence[Radiance], rig: Rig) -> float:
     pairs = zip(light, exact, strict=True)
     return max(float((np.abs(one - other) / noise_electrons(other, rig)).max()) for one, other in pairs)
-
-
-def _tolerance_row(name: str, apart: Mapping[str, float], decision: Decision) -> Row:
-    return Row(
-        f"farm 1024 x 1280 x 270, {name}, auto at {TOLERANCE} sigma: greatest change of light",
-        f"{apart['auto']:.3g} sigma, bound {decision.error:.3g}",
-        f"<= {TOLERANCE} sigma",
-        apart["auto"] <= decision.error <= TOLERANCE,
-        f"everything on, cheap: {apart['cheap']:.2g} sigma",
-    )
 
 
 def _cpu_row(name: str, against: str, clocks: Mapping[str, Timing]) -> Row:

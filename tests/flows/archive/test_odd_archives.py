@@ -28,16 +28,6 @@ def list_file(small: Small, lead: str) -> None:
     rewrite(manifest, files=listed | {lead: {"sha256": "0" * 64, "size": len(SECRET)}})
 
 
-def rest_on(small: Small, lead: str) -> None:
-    """A store was made of something elsewhere."""
-    rewrite(small.mosaic.path / "manifest.json", inputs=[lead, f"capture/{lead}"])
-
-
-def call_itself(small: Small, lead: str) -> None:
-    """A store says that it is another stage's, elsewhere."""
-    rewrite(small.mosaic.path / "manifest.json", stage=lead, key=lead)
-
-
 def name_products(small: Small, lead: str) -> None:
     """A run's products, stages and what it rests on lie elsewhere."""
     receipt = json.loads((small.run / "receipt.json").read_text())
@@ -50,7 +40,12 @@ def name_products(small: Small, lead: str) -> None:
     rewrite(small.run / "manifest.json", files={"receipt.json": entry}, rests_on=rests_on)
 
 
-CHANGES = (list_file, rest_on, call_itself, name_products)
+CHANGES = (
+    list_file,
+    lambda small, lead: rewrite(small.mosaic.path / "manifest.json", inputs=[lead, f"capture/{lead}"]),
+    lambda small, lead: rewrite(small.mosaic.path / "manifest.json", stage=lead, key=lead),
+    name_products,
+)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from flows.cli.main import main
 from flows.evaluate.command import evaluate_weights, print_evaluation, run_evaluate
-from flows.evaluate.frames import EvaluateRequest, open_candidates
+from flows.evaluate.frames import EvaluateRequest, observe_frame, open_candidates
 from flows.evaluate.judge import ORACLE, collect_row, difference, judge_frame, seeds_of, summarise
 from flows.training.data import farm_test_data, pack_mask
 from flows.training.train import train_weights
@@ -26,7 +26,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.render import USUAL
 from pipeline.simulator.scenes.farm.farm_plan import CLASSES
 from tests.flows.evaluate.conftest import Judged
-from tests.flows.small_fields import FRAMES, QUICK, observed_passes, scene_at, write_weights
+from tests.flows.small_fields import FRAMES, QUICK, scene_at, write_weights
 from tests.models.conftest import make_weights
 
 
@@ -175,7 +175,8 @@ def test_one_frame_has_accuracies_over_its_pixels(
     request = EvaluateRequest(str(data), weights, frames=("001",), **QUICK)
     row = run_evaluate(request, Console(stderr=True))["rows"][0]
     assert kept == [True]
-    scan_pass, loaded = observed_passes(data, tmp_path / "w.safetensors")
+    loaded = load_weights(weights[0])
+    scan_pass = observe_frame(scene_at(data), "001", loaded, LineCamera(), 0)
     counts = np.array(judge_frame(TRIAL, scan_pass, loaded)["rows"][0]["counts"])
     assert row["pixel_accuracy"] == overall_accuracy(counts)
     assert row["average_accuracy"] == average_accuracy(counts)

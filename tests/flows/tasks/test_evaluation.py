@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -25,7 +24,6 @@ from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive.archive import Archive
-from storage.archive.keys import StageRef
 from tests.flows.publish.test_receipt import make_receipt
 
 OFF = np.array([2.2, -1.4])  # along the line and the scan [px]
@@ -51,21 +49,13 @@ def test_a_false_class_is_listed_with_its_pixels() -> None:
     assert found["miou"] == pytest.approx(5 / 6)
 
 
-def _registration(archive: Path, record: dict[str, Any]) -> StageRef:
-    """A published registration."""
-
-    def build(path: Path) -> None:
-        (path / "registration.json").write_text(json.dumps(record))
-
-    return Archive.open(archive).produce("register", build, version=1, params={})[0]
-
-
 def test_labels_are_moved_as_the_map_lies(tmp_path: Path) -> None:
     """The offset is that of the sweep which registration held."""
     scene = raster_from_values(np.ones((8, 8, 1)), LineCamera(), name="t", wavelength_nm=np.array([500.0]))
     errors = PointingErrors(9.0, 4)
     source = SimulatedSource(scene, Rig(), pointing=errors)
-    off = evaluation.map_offset(source, [_registration(tmp_path, {"reference": "coarse-3"})])
+    build = lambda path: (path / "registration.json").write_text('{"reference": "coarse-3"}')  # noqa: E731
+    off = evaluation.map_offset(source, [Archive.open(tmp_path).produce("register", build, version=1, params={})[0]])
     np.testing.assert_array_equal(off, errors.offset("coarse-3"))
     assert (evaluation.map_offset(source, []) == 0).all()
 

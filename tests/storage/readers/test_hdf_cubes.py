@@ -138,16 +138,6 @@ def test_prisma_reflectance(tmp_path: Path) -> None:
     assert "a PRISMA product of level 2D; 2 bands without a wavelength are left out" in scene.provenance
 
 
-def cf_dataset(dims: tuple[str, ...] = ("y", "x", "wl"), unit: str = "nm", scale: float = 1.0) -> xr.Dataset:
-    """Return a cube with wavelengths and a place, as rioxarray writes it."""
-    order = [("y", "x", "wl").index(dim) for dim in dims]
-    values = CUBE.transpose(order) * 0.25 + 3
-    data = xr.DataArray(values, dims=dims, name="radiance", attrs={"units": "W m-2 sr-1 um-1"}).to_dataset()
-    x, y = CORNER[0] + 1 + 2 * np.arange(6), CORNER[1] - 1 - 2 * np.arange(7)
-    data = data.assign_coords(wl=("wl", NM * scale, {"units": unit}), x=x, y=y)
-    return data.rio.write_crs(32632).rio.write_coordinate_system()
-
-
 @pytest.mark.parametrize(
     ("dims", "unit", "scale"),
     [(("y", "x", "wl"), "nm", 1.0), (("wl", "y", "x"), "micrometer", 1e-3), (("y", "wl", "x"), "m", 1e-9)],
@@ -156,9 +146,12 @@ def test_cf_files(tmp_path: Path, dims: tuple[str, ...], unit: str, scale: float
     """Any order of axes and unit of wavelengths give one scene: packed values, place and units."""
     path = tmp_path / "cube.nc"
     packing = {"dtype": "i2", "scale_factor": 0.25, "add_offset": 3.0, "_FillValue": -1}
-    data = cf_dataset(dims, unit, scale)
-    data["wl"].attrs["standard_name"] = "radiation_wavelength"
-    data.to_netcdf(path, engine="h5netcdf", encoding={"radiance": packing})
+    values = CUBE.transpose([("y", "x", "wl").index(dim) for dim in dims]) * 0.25 + 3
+    data = xr.DataArray(values, dims=dims, name="radiance", attrs={"units": "W m-2 sr-1 um-1"}).to_dataset()
+    x, y = CORNER[0] + 1 + 2 * np.arange(6), CORNER[1] - 1 - 2 * np.arange(7)
+    about_bands = {"units": unit, "standard_name": "radiation_wavelength"}
+    data = data.assign_coords(wl=("wl", NM * scale, about_bands), x=x, y=y).rio.write_crs(32632)
+    data.rio.write_coordinate_system().to_netcdf(path, engine="h5netcdf", encoding={"radiance": packing})
     scene = load_scene_file(path)
     with xr.open_dataset(path, engine="h5netcdf") as read:
         np.testing.assert_allclose(scene.values, read["radiance"].transpose("y", "x", "wl").values, rtol=1e-6)
@@ -220,16 +213,10 @@ NO_CUBE_AXES = xr.Dataset({"rain": (("level", "lat", "lon"), CUBE.astype(float))
             partial(NO_CUBE_AXES.to_netcdf, engine="h5netcdf"),
             r"has dims level, lat, lon; expected y, x, band \(or band, y, x\); rename them",
         ),
-        (
-            partial(hold, name="name", value="nothing"),
-            "has no array of numbers with the axes y, x and band; it has none",
-        ),
+        (partial(hold, name="name", value="none"), "has no array of numbers with the axes y, x and band; it has none"),
         (lost_attribute, "cannot be read as NetCDF or HDF5: KeyError: .*L2ScaleSwirMax"),
         (partial(prisma_file, **SHORT_LISTS), r"expected one size \(y, x\) and \[3, 3\] bands, as it has wavelengths"),
-        (
-            partial(hold, name=LEVEL_1, value=np.ones((7, 4, 6), np.uint16)),
-            "is no PRISMA product of level 2B, 2C or 2D",
-        ),
+        (partial(hold, name=LEVEL_1, value=np.ones((7, 4, 6), "u2")), "is no PRISMA product of level 2B, 2C or 2D"),
     ],
 )
 def test_bad_files_end_in_one_message(write: Any, words: str, tmp_path: Path) -> None:

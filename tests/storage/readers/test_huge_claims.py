@@ -148,18 +148,13 @@ def test_images_that_claim_too_much(tmp_path: Path, side: int) -> None:
             read_all(tmp_path / name)
 
 
-def hollow_tiff(path: Path, side: int, tile: int) -> None:
-    """A TIFF that says its size, and holds nothing."""
-    told = {(256, 257): (4, side), (258,): (3, 8), (259, 262, 277): (3, 1), (322, 323): (4, tile), (324, 325): (4, 0)}
-    entries = [(tag, *one) for tags, one in told.items() for tag in tags]
-    body = b"".join(struct.pack("<HHII", tag, kind, 1, value) for tag, kind, value in entries)
-    path.write_bytes(b"II*\0" + struct.pack("<IH", 8, len(entries)) + body + bytes(4))
-
-
 @pytest.mark.parametrize(("side", "tile"), [(2_000_000_000, 2_000_000_000), (60_000, 60_000), (1_000_000, 512)])
 def test_tiffs_that_claim_too_much(tmp_path: Path, side: int, tile: int) -> None:
     """A TIFF of a few bytes with the size of a country is refused."""
-    hollow_tiff(tmp_path / "a.tif", side, tile)
+    told = {(256, 257): (4, side), (258,): (3, 8), (259, 262, 277): (3, 1), (322, 323): (4, tile), (324, 325): (4, 0)}
+    entries = [(tag, *one) for tags, one in told.items() for tag in tags]
+    body = b"".join(struct.pack("<HHII", tag, kind, 1, value) for tag, kind, value in entries)
+    (tmp_path / "a.tif").write_bytes(b"II*\0" + struct.pack("<IH", 8, len(entries)) + body + bytes(4))
     with little_memory(), pytest.raises(SceneError, match=r"bytes of numbers, and|cannot be read"):
         read_all(tmp_path / "a.tif")
 

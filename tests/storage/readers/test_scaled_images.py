@@ -5,13 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import rasterio
 from affine import Affine
-from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from storage.readers.open_cubes import open_cube
@@ -21,21 +19,13 @@ RNG = np.random.default_rng(9)
 REVERSIBLE = {"QUALITY": "100", "REVERSIBLE": "YES"}
 
 
-def write_jp2(path: Path, values: NDArray[np.uint16], pixel_m: float = 10.0, **about: Any) -> Path:
-    """A lossless JPEG 2000 of (band, y, x) values on a map."""
-    count, height, width = values.shape
-    place = {"crs": "EPSG:32632", "transform": Affine(pixel_m, 0, 600_000, 0, -pixel_m, 5_700_000)}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    known = {"driver": "JP2OpenJPEG", "count": count, "height": height, "width": width, "dtype": "uint16"}
-    with rasterio.open(path, "w", **known, **place, **REVERSIBLE, **about) as file:
-        file.write(values)
-    return path
-
-
 def test_jpeg_2000(tmp_path: Path) -> None:
     """Numbers and place as rasterio gives them, whole and by lines; wavelengths have to be stated."""
     values = RNG.integers(1, 60_000, (3, 70, 50)).astype(np.uint16)
-    path = write_jp2(tmp_path / "a.jp2", values)
+    path = tmp_path / "a.jp2"
+    place = {"crs": "EPSG:32632", "transform": Affine(10, 0, 600_000, 0, -10, 5_700_000)}
+    with rasterio.open(path, "w", "JP2OpenJPEG", 50, 70, 3, dtype="uint16", **place, **REVERSIBLE) as file:
+        file.write(values)
     source = open_cube(path)
     assert source.geobox is not None
     np.testing.assert_array_equal(np.concatenate([source.read(0, 64), source.read(64, 70)]), np.moveaxis(values, 0, -1))

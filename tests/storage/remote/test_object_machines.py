@@ -6,7 +6,6 @@ import errno
 import json
 import os
 import time
-from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
@@ -222,20 +221,14 @@ def test_what_is_brought_while_it_is_made_here_is_kept(machine: Machine) -> None
 
     def build(path: Path) -> None:
         (path / "a.bin").write_bytes(b"mine")
-        ref, _ = machine(SECOND).produce("rectify", _writing(b"theirs"), version=1, params={})
+        theirs = lambda path: (path / "a.bin").write_bytes(b"theirs")  # noqa: E731
+        ref, _ = machine(SECOND).produce("rectify", theirs, version=1, params={})
         beside = machine(FIRST).find("rectify", ref.key)
         read.append((beside.path / "a.bin").stat().st_ino)
 
     ref, _ = mine.produce("rectify", build, version=1, params={})
     assert (ref.path / "a.bin").read_bytes() == b"theirs"
     assert read == [(ref.path / "a.bin").stat().st_ino]
-
-
-def _writing(content: bytes) -> Callable[[Path], None]:
-    def build(path: Path) -> None:
-        (path / "a.bin").write_bytes(content)
-
-    return build
 
 
 def test_what_one_machine_cleared_another_makes_again(machine: Machine) -> None:

@@ -6,15 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
-from pipeline.rig.device_settings import ControlPatience, FileServer
-from pipeline.rig.emulator.camera_device import CameraDevice
-from tests.pipeline.rig.in_process import InProcessCameraLine, ManualClock
-
-
-def control_of(device: CameraDevice, clock: ManualClock) -> HeadwallCamera:
-    """A control client of an emulated camera in this process."""
-    line = lambda: InProcessCameraLine(device, clock, "emulated:8100")  # noqa: E731
-    return HeadwallCamera(line, FileServer(), clock=clock, patience=ControlPatience(5.0, 2))
 
 
 def wait_for(camera: HeadwallCamera, at_most_s: float) -> None:

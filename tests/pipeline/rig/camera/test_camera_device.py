@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from pipeline.rig.camera.headwall_camera import HeadwallCamera
+from pipeline.rig.device_settings import ControlPatience, FileServer
 from pipeline.rig.emulator.camera_device import CameraConnection, CameraDevice
-from tests.pipeline.rig.camera.camera_line import LinesOf, control_of
-from tests.pipeline.rig.in_process import ManualClock
+from tests.pipeline.rig.camera.camera_line import LinesOf
+from tests.pipeline.rig.in_process import InProcessCameraLine, ManualClock
 
 CAPTURE = b'capture({"prefix": "", "maxCubes": 1, "maxFramesPerCube": 5})'
 PROMPT = b"\r\nhpi> "
@@ -48,7 +50,8 @@ def test_frames_pass_with_time() -> None:
     """A capture runs for its frames' time; what is over by then is in the files."""
     clock = ManualClock()
     device = CameraDevice(LinesOf(), clock)
-    control = control_of(device, clock)
+    line = lambda: InProcessCameraLine(device, clock, "emulated:8100")  # noqa: E731
+    control = HeadwallCamera(line, FileServer(), clock=clock, patience=ControlPatience(5.0, 2))
     folder = control.capture(60).folder
     clock.sleep(0.3)
     assert control.is_capturing()

@@ -96,24 +96,19 @@ def test_killed_process_is_gone_on_with(mark: bytes):
         assert len(rig.captures) == 1
 
 
-def lose_an_edge(rig: SmallRig) -> None:
-    """Take one pulse from the mirror's trigger input, once."""
-    whole, left = rig.emulated.mirror.pulses, [1]
-
-    def fewer(from_s: float, to_s: float) -> NDArray[np.float64]:
-        found = whole(from_s, to_s)
-        if len(found) > 3 and left:
-            left.pop()
-            return np.delete(found, 3)
-        return found
-
-    rig.emulated.mirror.pulses = fewer
-
-
 def test_lost_edge_is_seen_and_the_lines_taken_again():
     """The mirror's index tells that it stepped once less: none of these lines is believed."""
     with small_rig() as rig:
-        lose_an_edge(rig)
+        whole, left = rig.emulated.mirror.pulses, [1]
+
+        def fewer(from_s: float, to_s: float) -> NDArray[np.float64]:
+            found = whole(from_s, to_s)
+            if len(found) > 3 and left:
+                left.pop()
+                return np.delete(found, 3)
+            return found
+
+        rig.emulated.mirror.pulses = fewer
         assert_same(list(rig.source().lines(FINE)))
         assert len(rig.captures) == 2
 

@@ -30,17 +30,6 @@ from tests.pipeline.simulator.made_up_effects import RIG, even_probe
 NM = np.linspace(400.0, 1000.0, 25)
 
 
-def spectra_probe(spectra: np.ndarray, unit_e: float):
-    """A probe in a unit that is the same everywhere."""
-    return even_probe(
-        unit="dn",
-        wavelength_nm=NM,
-        level=spectra.max(axis=0) / unit_e,
-        spectral_slope=steepest_difference(spectra, NM).max(axis=0) / unit_e,
-        unit_least_dn=unit_e / RIG.camera.electrons_per_dn,
-    )
-
-
 @pytest.mark.parametrize("seed", range(10))
 def test_spectra_behind_gains_are_no_steeper_than_said(seed: int):
     """Random spectra, two random gains and added light; the greatest gains are taken off."""
@@ -48,7 +37,13 @@ def test_spectra_behind_gains_are_no_steeper_than_said(seed: int):
     spectra, first, second = rng.uniform(50, 100, (4, 25)), rng.uniform(0.5, 1.5, (3, 25)), rng.uniform(0.1, 1, (3, 25))
     added = rng.uniform(0, 20, (3, 25))
     ranges = [GainRange.of(first, uneven=1.0), replace(GainRange.of(second, uneven=1.0), added_e=added.max(axis=0))]
-    after = light_after(spectra_probe(spectra, 5.0), RIG, ranges)
+    probe = even_probe(
+        wavelength_nm=NM,
+        level=spectra.max(axis=0) / 5,
+        spectral_slope=steepest_difference(spectra, NM).max(axis=0) / 5,
+        unit_least_dn=5 / RIG.camera.electrons_per_dn,
+    )
+    after = light_after(probe, RIG, ranges)
     greatest = np.maximum(first.max(axis=0), 1).max()
     for way in range(3):
         light = spectra * first[way] * second[way] + added[way]
