@@ -138,10 +138,8 @@ def _over_linear(natural: Turned, flat: Turned) -> list[Row]:
 def _beside_spline(natural: Turned) -> Row:
     smooth = spline(natural)
     clocks = time_in_turn({"ours": _call(natural, "catmull-rom"), "spline": smooth.call}, ROUNDS)
-    ours, theirs = (
-        ns_of(clocks["ours"], natural.truth.size),
-        ns_of(clocks["spline"], smooth.bands * len(natural.truth)),
-    )
+    ours = ns_of(clocks["ours"], natural.truth.size)
+    theirs = ns_of(clocks["spline"], smooth.bands * len(natural.truth))
     errors = natural.error(_call(natural, "catmull-rom")()[0]), natural.error(smooth.by_pixel(smooth.call()))
     return Row(
         "catmull-rom beside the order-3 spline",

@@ -76,11 +76,7 @@ CASES = {
     "labels as JPEG": (1, SURVEY + "field.png --labels labels.jpg", "different colours.*JPEG.* PNG"),
     "the picture as labels": (1, SURVEY + "field.png --labels field.png", "is this the picture itself"),
     "labels of a farm": (2, "survey --labels two_classes.png --engine plain --out never", "brings its own"),
-    "colour that is no class": (
-        1,
-        TRAIN + "no_class",
-        r"colour \[9, 9, 9\], which is no class.* add it to \[classes\]",
-    ),
+    "colour of no class": (1, TRAIN + "no_class", r"colour \[9, 9, 9\], which is no class.* add it to \[classes\]"),
     # weights
     "name too long": (1, SURVEY + "x" * 5000 + ".png", "cannot be the name of a file"),
     "labels of a long name": (1, SURVEY + "field.png --labels " + "x" * 300 + ".png", "name is too long"),
@@ -158,12 +154,7 @@ WORKS = {  # what is read, with which wavelengths, as what (y, x, band), and wha
     "some NaN": ("holes.npy", NM, (12, 16, 5), "missing samples: 60 of 960"),
     "two axes": ("plane.npy", "550", (12, 16, 1), ""),
     "one cube beside vectors": ("one_cube.mat", NM, (12, 16, 5), r"array cube of the file, which also has wl \(1, 5\)"),
-    "wavelengths beside the cube": (
-        "with_nm.mat",
-        None,
-        (12, 16, 5),
-        "the array wavelengths, without a unit, read by their size",
-    ),
+    "nm beside it": ("with_nm.mat", None, (12, 16, 5), "the array wavelengths, without a unit, read by their size"),
     "MATLAB 7.3": ("seven.mat", NM, (12, 16, 5), ""),
     "named variable": ("two_cubes.mat:north", NM, (12, 16, 5), ""),
     "step of a series": ("series.npy:1", NM, (12, 16, 5), ""),

@@ -33,11 +33,8 @@ def test_the_example_of_a_pose_shows_the_farm_as_large_as_it_says() -> None:
     common = {name: told[name] for name in ("lon_deg", "lat_deg", "heading_deg", "tilt_deg")}
     (block,) = re.findall(r"```toml\n(\[pose\].*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
     own = scale_of_pixels(shape, camera.ifov_rad, FARM_PIXEL_M)
-    for asked in (
-        {**common, "height_m": told["height_m"]},
-        {**common, "range_m": told["range_m"]},
-        tomllib.loads(block)["pose"],
-    ):
+    from_settings = [{**common, name: told[name]} for name in ("height_m", "range_m")]
+    for asked in (*from_settings, tomllib.loads(block)["pose"]):
         seen = scale_of_view(GroundView(RigPose(**asked), camera.ifov_rad), shape)
         assert seen.pixel_m == pytest.approx(FARM_PIXEL_M, rel=0.01)
         assert seen.hectares == pytest.approx(own.hectares, rel=0.03)

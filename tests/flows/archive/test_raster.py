@@ -172,14 +172,7 @@ def test_a_second_visit_goes_on_from_the_first(surveyed: Raster, scene_files: Pa
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [
-        ("seconds", 5),
-        ("budget", 0.5),
-        ("effects", "all"),
-        ("camera.samples", 64),
-        ("extent", "0:0-4"),
-        ("pointing_px", 1),
-    ],
+    {"seconds": 5, "budget": 0.5, "effects": "all", "camera.samples": 64, "extent": "0:0-4", "pointing_px": 1}.items(),
 )
 def test_a_setting_of_a_camera_is_refused(scene_files: Path, name: str, value: object) -> None:
     """Beside a raster one message names it, and says how to have the simulated rig look at the file."""

@@ -166,10 +166,7 @@ def test_amounts_have_units():
             {"scene": "farm@3"},
             "no scene farm@3: give one of farm, farm@2, scouting, .*, or a file; --seed has the seed",
         ),
-        (
-            {"scene": "a.png", "kept_bytes": "8 MB"},
-            "'kept_bytes' is for a uniform scan, and .* a.png is a raster: leave",
-        ),
+        ({"scene": "a.png", "kept_bytes": "8MB"}, "'kept_bytes' is for a uniform scan, .* a.png is a raster: leave"),
         ({"camera": 3}, "must be a table"),
         ({"camera": {"dark_dn": 5000}}, "leaves no room"),
         ({"detector": {"full_well_e": 5000}}, "full pixels would count as valid"),

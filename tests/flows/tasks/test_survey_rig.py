@@ -230,22 +230,10 @@ def test_survey_over_a_pty_and_sockets_gives_the_same_lines(tmp_path: Path):
 
 BAD: dict[str, tuple[dict[str, Any], str]] = {
     "unknown key": ({"rig.prot": "/dev/ttyUSB0"}, r"unknown setting .*prot.*did you mean 'rig.port'"),
-    "axes that are none": (
-        {"rig.mirror_axes": "x,x"},
-        r"'rig.mirror_axes' must be one of x,y  x,-y .* -y,-x; got 'x,x'",
-    ),
-    "memory too large": (
-        {"source": "rig", "cost.vector_pairs": 9000},
-        r"cost.vector_pairs = 9000: .* at most 8191 pairs",
-    ),
-    "field without size": (
-        {"source": "rig", "scene": "field", "bands": None, "size": None, "weights": "x"},
-        r"give its size",
-    ),
-    "field without rig": (
-        {"scene": "field", "source": "sim", "bands": None},
-        r"scene 'field' is what stands before a rig",
-    ),
+    "axes": ({"rig.mirror_axes": "x,x"}, r"'rig.mirror_axes' must be one of x,y  x,-y .* -y,-x; got 'x,x'"),
+    "memory": ({"source": "rig", "cost.vector_pairs": 9000}, r"cost.vector_pairs = 9000: .* at most 8191 pairs"),
+    "size": ({"source": "rig", "scene": "field", "bands": None, "size": None, "weights": "x"}, r"give its size"),
+    "no rig": ({"scene": "field", "source": "sim", "bands": None}, r"scene 'field' is what stands before a rig"),
 }
 
 

@@ -47,10 +47,8 @@ def test_a_patch_is_read_by_its_own_pixels_and_the_overview_of_them():
     moved, other = model.read_overview(IMAGE), patches.clone()
     moved.features[..., 8:16, 8:16] += 1  # under patch 13
     other[:, 1] += 1
-    for changed, which in (
-        (model.read_patches(moved, patches, numbers), 2),
-        (model.read_patches(overview, other, numbers), 1),
-    ):
+    for seen, which in (((moved, patches), 2), ((overview, other), 1)):
+        changed = model.read_patches(*seen, numbers)
         assert [number for number in range(3) if (changed - read)[0, number].abs().max() > 1e-4] == [which]
 
 

@@ -154,10 +154,7 @@ def _lines_apart(distance_px: float) -> RecordedSweep:
             r"\(binning 1, step 1\), and sweep scan-0 from -39.5 to 39.5 px on 0 px",
         ),
         (Sweep("fine-0", "fine", "x", 20.0, -9.5, 4), r"line 0 of sweep fine-0 was never captured: .* swath at 20 px"),
-        (
-            Sweep("fine-0", "fine", "y", 0.0, -9.5, 4),
-            "lie along y, those of the recording along x; plan sweeps along x",
-        ),
+        (Sweep("fine", "fine", "y", 0.0, -9.5, 4), "lie along y, those of the recording along x; plan sweeps along x"),
     ],
 )
 def test_a_line_that_was_never_taken_is_named(asked: Sweep, message: str) -> None:

@@ -76,10 +76,7 @@ def test_one_table_for_several_cubes_and_for_parts_of_one(tmp_path: Path) -> Non
     [
         ("", "is empty; give a header and a row for each line"),
         ("mirror_x,mirror_y\n", "has no row below its header"),
-        (
-            "mirror_x,mirror_y,roll\n0,0,0\n",
-            f"the column 'roll', which is not known; accepted are {', '.join(ACCEPTED)}",
-        ),
+        ("mirror_x,mirror_y,roll\n0,0,0\n", f"column 'roll', which is not known; accepted are {', '.join(ACCEPTED)}"),
         ("mirror_x,mirror_x\n0,0\n", "has the column 'mirror_x' twice"),
         ("mirror_x\n0\n", "one kind of pointing, but mirror_y is missing"),
         ("time\n0\n", "one kind of pointing, but it has none"),

@@ -74,11 +74,7 @@ def test_a_geotiff_keeps_its_place(tmp_path: Path) -> None:
     points = [GroundControlPoint(0, 0, 7, 52), GroundControlPoint(6, 0, 7, 51.9), GroundControlPoint(0, 7, 7.1, 52)]
     write(tmp_path / "c.tif", gcps=points, crs="EPSG:4326").close()
     write(tmp_path / "d.tif", crs="EPSG:25832").close()
-    notes = {
-        "b": "a transform and no CRS",
-        "c": "ground control points, which are not read",
-        "d": "a CRS and no transform",
-    }
+    notes = {"b": "a transform and no CRS", "c": "control points, which are not read", "d": "a CRS and no transform"}
     for name, words in notes.items():
         scene = load_scene_file(tmp_path / f"{name}.tif", wavelengths=NM)
         assert scene.geobox is None

@@ -42,10 +42,8 @@ def running(clock: ManualClock, trigger: pro.Trigger = pro.Trigger.OFF) -> Mirro
         }
         do(device, pro.set_values({channel.vector(name): value for name, value in values.items()}))
     run: dict[int, pro.Value] = {pro.X.input: pro.X.vector_system, pro.Y.input: pro.Y.vector_system}
-    do(
-        device,
-        pro.set_values({**run, pro.X.vector(pro.VectorRegister.RUN): 1, pro.Y.vector(pro.VectorRegister.RUN): 1}),
-    )
+    run |= {channel.vector(pro.VectorRegister.RUN): 1 for channel in (pro.X, pro.Y)}
+    do(device, pro.set_values(run))
     return device
 
 
@@ -102,12 +100,8 @@ def test_the_log_holds_the_positions() -> None:
     """Rows at the set rate from the run command on; it keeps them when it is stopped."""
     clock = ManualClock(3.0)
     device = running(clock)
-    chosen: dict[int, pro.Value] = {
-        pro.log_slot(0): pro.FEEDBACK_X,
-        pro.log_slot(1): pro.FEEDBACK_Y,
-        pro.LOG_RATE: 1000.0,
-    }
-    do(device, pro.set_values(chosen))
+    chosen: dict[int, pro.Value] = {pro.log_slot(0): pro.FEEDBACK_X, pro.log_slot(1): pro.FEEDBACK_Y}
+    do(device, pro.set_values({**chosen, pro.LOG_RATE: 1000.0}))
     do(device, pro.set_values({pro.LOG_RUN: 1}))
     clock.sleep(0.0995)
     do(device, pro.set_values({pro.LOG_RUN: 0}))

