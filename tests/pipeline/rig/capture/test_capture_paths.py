@@ -9,18 +9,9 @@ import pytest
 
 from pipeline.errors import SettingsError
 from pipeline.geometry.scan import Sweep
+from pipeline.rig import capture_paths
 from pipeline.rig.camera.camera_cubes import CapturedLines
 from pipeline.rig.camera.camera_texts import LineTimes
-from pipeline.rig.capture_paths import (
-    REFERENCES,
-    Announced,
-    CaptureRecord,
-    UnusableCaptureError,
-    announced,
-    capture_prefix,
-    locate_lines,
-    next_path,
-)
 from pipeline.rig.mirror_controller import MotionLog
 from tests.pipeline.rig.small_rig import CAMERA, COARSE, FINE
 
@@ -28,7 +19,7 @@ from tests.pipeline.rig.small_rig import CAMERA, COARSE, FINE
 def test_prefix_of_a_sweep_is_readable() -> None:
     """Short numbers stand there as they are."""
     sweep = Sweep("coarse-0", "coarse", "y", -31.5, 0.5, 96, 16, 16)
-    assert capture_prefix(sweep) == "coarse-0_cy-31p5_0p5_96x16x16_0"
+    assert capture_paths.capture_prefix(sweep) == "coarse-0_cy-31p5_0p5_96x16x16_0"
 
 
 def test_every_sweep_comes_back() -> None:
@@ -39,29 +30,30 @@ def test_every_sweep_comes_back() -> None:
         swath, start = (float(rng.choice([one, -0.5, -0.0, 7.0, 1e300])) for one in odd)
         turned = Sweep(f"fine-{number:03d}", "fine", "y", swath, start, int(rng.integers(1, 3000)), 4, 4)
         sweep = turned if number % 2 else replace(turned, kind="coarse", along="x")
-        told = Announced(sweep, int(rng.integers(sweep.lines)))
-        prefix = capture_prefix(*vars(told).values())
-        assert announced(prefix) == told
-        assert str(announced(prefix)) == str(told)  # the sign of zero
+        told = capture_paths.Announced(sweep, int(rng.integers(sweep.lines)))
+        prefix = capture_paths.capture_prefix(*vars(told).values())
+        assert capture_paths.announced(prefix) == told
+        assert str(capture_paths.announced(prefix)) == str(told)  # the sign of zero
 
 
 @pytest.mark.parametrize(
-    "prefix", ["", "field", REFERENCES, "a_cx0_0_0x1x1_0", "a_cx0_0_5x1x1_5", "a_cz0_0_5x1x1_0", "a_cx0_0_5x1_0"]
+    "prefix",
+    ["", "field", capture_paths.REFERENCES, "a_cx0_0_0x1x1_0", "a_cx0_0_5x1x1_5", "a_cz0_0_5x1x1_0", "a_cx0_0_5x1_0"],
 )
 def test_other_prefixes_announce_nothing(prefix: str) -> None:
     """Names that others gave, and sweeps that cannot be."""
-    assert announced(prefix) is None
+    assert capture_paths.announced(prefix) is None
 
 
 @pytest.mark.parametrize("name", ["a b", "é", "x" * 120])
 def test_names_that_no_folder_has_are_refused(name: str) -> None:
     """Before anything is sent."""
     with pytest.raises(SettingsError, match="letters, digits"):
-        capture_prefix(Sweep(name, "fine", "x", 0.0, 0.0, 5))
+        capture_paths.capture_prefix(Sweep(name, "fine", "x", 0.0, 0.0, 5))
 
 
-PATH = next_path(FINE, 3, CAMERA, vector_pairs=7, triggered=True)  # lines 3 to 9
-TAKEN = CaptureRecord(FINE, 3, 9, "/captured/x", True, (0.0, 0.1), (0.1, 0.2), index_at_end=6)
+PATH = capture_paths.next_path(FINE, 3, CAMERA, vector_pairs=7, triggered=True)  # lines 3 to 9
+TAKEN = capture_paths.CaptureRecord(FINE, 3, 9, "/captured/x", True, (0.0, 0.1), (0.1, 0.2), index_at_end=6)
 
 
 def frames(numbers: list[int], lost: int = 0, first: int = 0) -> CapturedLines:
@@ -71,65 +63,65 @@ def frames(numbers: list[int], lost: int = 0, first: int = 0) -> CapturedLines:
     return CapturedLines(np.zeros((len(told), 48, 3), np.uint16), first, times, lost=lost)
 
 
-def test_dropped_frame_is_a_line_without_a_row():
-    """Frame 2 is missing: the rows behind it belong to the lines that they were taken for."""
-    located = locate_lines(frames([0, 1, 3, 4, 5]), PATH, TAKEN, CAMERA)
-    assert located.row.tolist() == [0, 1, -1, 2, 3, 4]
-    assert [located.is_valid(line) for line in range(6)] == [True, True, False, True, True, True]
-    np.testing.assert_array_equal(located.positions.position, PATH.middle[[0, 1, 3, 4, 5]].astype(np.float64))
-
-
-def test_numbers_count_from_the_captures_first_frame():
-    """A camera that numbers frames since it was switched on."""
-    located = locate_lines(frames([70, 71, 72, 73, 74, 75], first=70), PATH, TAKEN, CAMERA)
-    assert located.row.tolist() == list(range(6))
-
-
-def test_lines_lost_at_the_end_are_not_given():
-    """What a cube promises and does not hold is left for another capture, though the mirror stepped for it."""
-    located = locate_lines(frames([0, 1, 2, 3], lost=2), PATH, TAKEN, CAMERA)
-    assert located.row.tolist() == [0, 1, 2, 3]
+@pytest.mark.parametrize(
+    ("seen", "row"),
+    [
+        (frames([0, 1, 3, 4, 5]), [0, 1, -1, 2, 3, 4]),
+        (frames([70, 71, 72, 73, 74, 75], first=70), [0, 1, 2, 3, 4, 5]),
+        (frames([0, 1, 2, 3], lost=2), [0, 1, 2, 3]),
+    ],
+    ids=["frame 2 dropped", "counted from 70", "two lost at the end"],
+)
+def test_rows_belong_to_the_lines_that_they_were_taken_for(seen: CapturedLines, row: list[int]):
+    """By their numbers from the capture's first frame; what a cube promises and does not hold is left out."""
+    located = capture_paths.locate_lines(seen, PATH, TAKEN, CAMERA)
+    there = np.array(row) >= 0
+    assert located.row.tolist() == row
+    assert [located.is_valid(line) for line in range(len(row))] == there.tolist()
+    np.testing.assert_array_equal(located.positions.position, PATH.middle[: len(row)][there].astype(np.float64))
 
 
 def test_whole_capture_without_an_index_is_in_order():
     """As many rows as lines leave no doubt; fewer do."""
     unnumbered = frames([-1] * 6)
-    assert locate_lines(unnumbered, PATH, TAKEN, CAMERA).row.tolist() == list(range(6))
-    with pytest.raises(UnusableCaptureError, match="fetch frameIndex"):
-        locate_lines(frames([-1] * 5), PATH, replace(TAKEN, index_at_end=None), CAMERA)
+    assert capture_paths.locate_lines(unnumbered, PATH, TAKEN, CAMERA).row.tolist() == list(range(6))
+    with pytest.raises(capture_paths.UnusableCaptureError, match="fetch frameIndex"):
+        capture_paths.locate_lines(frames([-1] * 5), PATH, replace(TAKEN, index_at_end=None), CAMERA)
 
 
 @pytest.mark.parametrize(("sweep", "last"), [(FINE, 6), (COARSE, 8)], ids=lambda value: getattr(value, "kind", ""))
 def test_mirror_that_stepped_otherwise_is_not_believed(sweep: Sweep, last: int):
     """One edge too few or too many, in a coarse line's four cells too: which lines are off is not known."""
-    path = next_path(sweep, 2, CAMERA, vector_pairs=12, triggered=True)
+    path = capture_paths.next_path(sweep, 2, CAMERA, vector_pairs=12, triggered=True)
     count = last // sweep.step
-    taken = CaptureRecord(sweep, 2, 2 + count, "/captured/x", True, (0.0, 0.1), (0.1, 0.2), index_at_end=last)
+    taken = capture_paths.CaptureRecord(
+        sweep, 2, 2 + count, "/captured/x", True, (0.0, 0.1), (0.1, 0.2), index_at_end=last
+    )
     seen = frames(list(range(count)))
-    assert locate_lines(seen, path, taken, CAMERA).row.tolist() == list(range(count))
+    assert capture_paths.locate_lines(seen, path, taken, CAMERA).row.tolist() == list(range(count))
     for index in (0, last - 3, last - 2, last - 1, last + 1):
         words = rf"stands at cell {index} of its path, after {count} frames cell {last} was expected"
-        with pytest.raises(UnusableCaptureError, match=words):
-            locate_lines(seen, path, replace(taken, index_at_end=index), CAMERA)
+        with pytest.raises(capture_paths.UnusableCaptureError, match=words):
+            capture_paths.locate_lines(seen, path, replace(taken, index_at_end=index), CAMERA)
 
 
 def test_a_log_gives_the_positions():
     """The log gives the positions, not the times of the commands."""
-    path = next_path(FINE, 3, CAMERA, vector_pairs=6, triggered=False)
+    path = capture_paths.next_path(FINE, 3, CAMERA, vector_pairs=6, triggered=False)
     log = MotionLog(np.zeros((1000, 2), np.float32), 1000.0, started_s=0.06, start_error_s=0.04)
-    taken = CaptureRecord(FINE, 3, 9, "/captured/x", False, (5.0, 5.1), (0.1, 0.2), log=log)
-    tied = locate_lines(frames(list(range(6))), path, taken, CAMERA).positions
+    taken = capture_paths.CaptureRecord(FINE, 3, 9, "/captured/x", False, (5.0, 5.1), (0.1, 0.2), log=log)
+    tied = capture_paths.locate_lines(frames(list(range(6))), path, taken, CAMERA).positions
     assert tied.method == "log"
     assert tied.valid.all()
 
 
 def test_paths_take_whole_lines():
     """A line's held positions are never parted, and the lead-in cell has its room."""
-    path = next_path(COARSE, 2, CAMERA, vector_pairs=12, triggered=True)
+    path = capture_paths.next_path(COARSE, 2, CAMERA, vector_pairs=12, triggered=True)
     assert (path.first, path.stop, path.cells.shape) == (2, 4, (9, 2))
     assert path.cells[0].tolist() == path.cells[1].tolist()
     assert path.frames_at(8) == 2
     assert path.frames_at(7) is None
-    free = next_path(COARSE, 2, CAMERA, vector_pairs=13, triggered=False)
+    free = capture_paths.next_path(COARSE, 2, CAMERA, vector_pairs=13, triggered=False)
     assert free.cells.shape == (12, 2)
     assert free.rate_hz == 40.0
