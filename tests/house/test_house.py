@@ -11,15 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tests.house import journey
-from tests.house.source_tree import (
-    circles,
-    imported_in_functions,
-    inlinable,
-    parameters_of_type,
-    shared_class_names,
-    statements,
-)
+from tests.house import journey, source_tree
 
 TREES = {
     Path("pipeline/one.py"): ast.parse("import pipeline.two\nclass Line: ..."),
@@ -30,20 +22,20 @@ TREES = {
 
 def test_faults_of_a_tree_are_found() -> None:
     """A circle through a function, the import in it, and a name that two classes have."""
-    (circle,) = circles(TREES)
+    (circle,) = source_tree.circles(TREES)
     assert set(circle.split(" -> ")) == {"pipeline.one", "pipeline.two"}
-    assert imported_in_functions(TREES) == {"pipeline/two.py": {"pipeline"}}
-    assert shared_class_names(TREES) == {"Line": 2}
+    assert source_tree.imported_in_functions(TREES) == {"pipeline/two.py": {"pipeline"}}
+    assert source_tree.shared_class_names(TREES) == {"Line": 2}
 
 
 def test_small_functions_and_settings_are_counted() -> None:
     """A function that is called once, one that is called twice, one with a decorator, one that is long."""
     text = "def a(s: Settings): b()\ndef b(): c(); c()\ndef c(x: Settings | None): pass\n@d\ndef e(): pass\n"
     tree = {Path("pipeline/one.py"): ast.parse(text + "def f(): pass; pass\na(1); e(); f()")}
-    assert inlinable(tree, 1) == ["a"]
-    assert sorted(inlinable(tree, 2)) == ["a", "b", "f"]
-    assert parameters_of_type(tree, "Settings") == 2
-    assert statements(tree) == 15
+    assert source_tree.inlinable(tree, 1) == ["a"]
+    assert sorted(source_tree.inlinable(tree, 2)) == ["a", "b", "f"]
+    assert source_tree.parameters_of_type(tree, "Settings") == 2
+    assert source_tree.statements(tree) == 15
 
 
 @pytest.mark.parametrize(

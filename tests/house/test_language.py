@@ -8,14 +8,6 @@ from pathlib import Path
 import pytest
 
 from tests.house import language
-from tests.house.language import (
-    Sentence,
-    broken_rules,
-    names_without_unit,
-    sentences_of_code,
-    sentences_of_page,
-    violations,
-)
 
 EXCEPTIONS: set[tuple[str, str]] = set()  # (path, beginning of the sentence) that may break a rule
 MOST_EXCEPTIONS = 30
@@ -23,7 +15,7 @@ MOST_EXCEPTIONS = 30
 
 def rules_of(text: str, kind: str = "page") -> list[str]:
     """Return the numbers of the rules that a sentence breaks."""
-    return [rule[0] for rule in broken_rules(Sentence(Path("one.md"), 1, kind, text))]
+    return [rule[0] for rule in language.broken_rules(language.Sentence(Path("one.md"), 1, kind, text))]
 
 
 @pytest.mark.parametrize(
@@ -58,21 +50,21 @@ def test_sentences_of_a_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     prose = "# Of it\n<!-- Of it -->\nOne [two](three.md) four. Five\nsix.\n\n- Seven.\n- Eight,\n  nine.\n"
     (tmp_path / "page.md").write_text(f"{prose}\n| Of it |\n```sh\nOf it\n```\n")
     monkeypatch.setattr(language, "ROOT", tmp_path)
-    found = [(one.line, one.text) for one in sentences_of_page(Path("page.md"))]
+    found = [(one.line, one.text) for one in language.sentences_of_page(Path("page.md"))]
     assert found == [(3, "One two four."), (3, "Five six."), (6, "Seven."), (7, "Eight, nine.")]
 
 
 def test_sentences_of_code() -> None:
     """Docstrings, strings of four words or more, and f-strings with their gaps."""
     code = 'def f(n):\n    """Return it.\n\n    None.\n    """\n    raise E(f"got {n} lines of sweeps", "one")\n'
-    found = [(one.kind, one.text) for one in sentences_of_code(Path("one.py"), ast.parse(code))]
+    found = [(one.kind, one.text) for one in language.sentences_of_code(Path("one.py"), ast.parse(code))]
     assert found == [("docstring", "Return it."), ("docstring", "None."), ("message", "got {} lines of sweeps")]
 
 
 def test_numbers_have_units() -> None:
     """A plain number of a known quantity ends with its unit; arrays and other names are free."""
     tree = ast.parse("def f(exposure: float, exposure_ms: float, wavelength: NDArray, timeout: float | None): ...")
-    assert [name for _, name in names_without_unit(Path("one.py"), tree)] == ["exposure", "timeout"]
+    assert [name for _, name in language.names_without_unit(Path("one.py"), tree)] == ["exposure", "timeout"]
 
 
 def test_all_texts_keep_the_rules() -> None:
@@ -80,7 +72,7 @@ def test_all_texts_keep_the_rules() -> None:
     assert len(EXCEPTIONS) <= MOST_EXCEPTIONS
     wrong = [
         f"{one.path}:{one.line}: rule {rule}: {one.text}"
-        for one, rule in violations()
+        for one, rule in language.violations()
         if not any(one.path.as_posix() == path and one.text.startswith(begin) for path, begin in EXCEPTIONS)
     ]
     assert wrong == []

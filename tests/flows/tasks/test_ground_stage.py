@@ -21,16 +21,7 @@ from pipeline.ground.map_grid import GroundGrid
 from pipeline.ground.view import RigPose, pixel_places
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
-from storage.arrays.class_maps import (
-    ClassMap,
-    ClassNames,
-    create_probabilities,
-    load_class_map,
-    packed_probabilities,
-    write_changes,
-    write_changes_tile,
-    write_probabilities_tile,
-)
+from storage.arrays import class_maps
 from storage.arrays.georeference import AngularGrid
 from storage.arrays.ground_maps import GroundMap, load_ground_map
 from tests.storage.plain_mosaic import write_values
@@ -40,7 +31,7 @@ Stores = tuple[StageRef, StageRef]
 POSE = RigPose(lon_deg=9.5, lat_deg=52.1, heading_deg=25.0, tilt_deg=50.0, height_m=14.0)
 SHAPE = (120, 160)
 FIELD: Any = SimpleNamespace(shape=SHAPE, geobox=None, pixel_m=None)
-LEGEND = ClassNames(("weed", "crop"), np.array([[255, 0, 0], [0, 255, 0]], np.uint8))
+LEGEND = class_maps.ClassNames(("weed", "crop"), np.array([[255, 0, 0], [0, 255, 0]], np.uint8))
 
 
 @dataclass(frozen=True)
@@ -68,15 +59,15 @@ def believe(folder: Path, age_days: np.ndarray, old_class: np.ndarray | None = N
     """Write class probabilities of these ages (y, x), NaN where nothing is known; of a later visit with changes."""
     values = np.where(np.isnan(age_days)[..., None], np.nan, np.log([0.5, 0.5])).astype(np.float32)
     path = folder / "class_probabilities.zarr"
-    create_probabilities(path, SHAPE, LEGEND, goes_on=old_class is not None)
+    class_maps.create_probabilities(path, SHAPE, LEGEND, goes_on=old_class is not None)
     for top in range(0, SHAPE[0], 64):
         rows = slice(top, top + 64)
-        packed, light = packed_probabilities(values[rows]), np.ones(SHAPE, np.float32)[rows]
-        write_probabilities_tile(path, (top, 0), packed, age_days[rows], light)
+        packed, light = class_maps.packed_probabilities(values[rows]), np.ones(SHAPE, np.float32)[rows]
+        class_maps.write_probabilities_tile(path, (top, 0), packed, age_days[rows], light)
         if old_class is not None:
-            write_changes_tile(path, (top, 0), old_class[rows])
+            class_maps.write_changes_tile(path, (top, 0), old_class[rows])
     if old_class is not None:
-        write_changes(path, patch_fractions(old_class), 8)
+        class_maps.write_changes(path, patch_fractions(old_class), 8)
 
 
 def patch_fractions(old_class: np.ndarray) -> np.ndarray:
@@ -97,7 +88,7 @@ def stores(tmp_path: Path) -> Stores:
     classes[:, 80:] = 1
     classes[:30, 80:] = UNLABELLED
     confidence = np.where(classes == UNLABELLED, np.nan, 0.25 + 0.5 * (classes == 1)).astype(np.float32)
-    found = ClassMap(classes, confidence, LEGEND.names, LEGEND.colours)
+    found = class_maps.ClassMap(classes, confidence, LEGEND.names, LEGEND.colours)
     write_class_map(tmp_path / "map" / "class_map.zarr", found)
     believe(tmp_path / "map", np.zeros(SHAPE, np.float32))
     values = np.linspace(0.1, 0.9, SHAPE[0])[:, None, None] * np.ones((*SHAPE, 4))
@@ -118,7 +109,7 @@ def test_what_is_unknown_has_no_confidence_on_the_map_either(run: Run, stores: S
     classes[40:70:3, 50:90:3] = 1
     confidence = np.where(classes == 1, np.nan, 0.9).astype(np.float32)
     legend = (("crop", "unknown"), np.array([[0, 255, 0], [255, 0, 255]], np.uint8))
-    write_class_map(tmp_path / "out_of_range" / "class_map.zarr", ClassMap(classes, confidence, *legend))
+    write_class_map(tmp_path / "out_of_range" / "class_map.zarr", class_maps.ClassMap(classes, confidence, *legend))
     believe(tmp_path / "out_of_range", np.where(classes == 1, np.nan, 0).astype(np.float32))
     found = load_ground_map(draw(run, (StageRef("segment", "s", tmp_path / "out_of_range"), stores[1])).path / STORE)
     assert (found.classes == 1).sum() > 50
@@ -164,7 +155,7 @@ def test_age_and_changes_are_those_of_the_pixel_that_is_shown(run: Run, stores: 
     age = 0.125 * rng.integers(0, 400, SHAPE).astype(np.float32)
     age[rng.random(SHAPE) < 0.1] = np.nan
     old = np.where(rng.random(SHAPE) < rng.random((1, SHAPE[1])), UNLABELLED, rng.integers(0, 2, SHAPE))
-    write_class_map(tmp_path / "later" / "class_map.zarr", load_class_map(stores[0].path / "class_map.zarr"))
+    write_class_map(tmp_path / "later" / "class_map.zarr", class_maps.load_class_map(stores[0].path / "class_map.zarr"))
     believe(tmp_path / "later", age, old.astype(np.uint8))
     ref = draw(run, (StageRef("segment", "l", tmp_path / "later"), stores[1]))
     found = load_ground_map(ref.path / STORE)

@@ -18,17 +18,6 @@ from flows.settings.load import load_settings
 from flows.tradeoff import stages
 from flows.tradeoff.command import tradeoff
 from flows.tradeoff.entries import Tradeoff, measure_tradeoff
-from flows.tradeoff.stages import (
-    EXACT,
-    PERIODS_PX,
-    RECTIFY,
-    SEGMENT,
-    SIMULATE,
-    SURVEY,
-    TOLERANCES,
-    draw_waves,
-    plan_every_fraction,
-)
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 
@@ -40,17 +29,19 @@ def errors(entry: Tradeoff, state: object) -> dict[object, float]:
 
 def test_waves_and_noise_are_what_they_claim():
     """Periods of 4 to 40 px, the same for a seed; a tenth of shot and read noise."""
-    waves = draw_waves(3, 64, PERIODS_PX)
+    waves = stages.draw_waves(3, 64, stages.PERIODS_PX)
     period = 1 / np.hypot(*waves.frequency.T)
     assert 4 <= period.min() <= period.max() <= 40
-    np.testing.assert_array_equal(waves.at(np.ones((1, 2))), draw_waves(3, 64, PERIODS_PX).at(np.ones((1, 2))))
+    np.testing.assert_array_equal(
+        waves.at(np.ones((1, 2))), stages.draw_waves(3, 64, stages.PERIODS_PX).at(np.ones((1, 2)))
+    )
     electrons = LineCamera().full_scale_e / 2
     assert stages.NOISE * 0.2 * electrons == pytest.approx(math.sqrt(electrons + 20**2))
 
 
 def test_errors_of_kernels_are_those_known():
     """Kernels err by their taps (erratum E10)."""
-    found = [point.error for point in measure_tradeoff(RECTIFY, repeats=1).points]
+    found = [point.error for point in measure_tradeoff(stages.RECTIFY, repeats=1).points]
     assert found == pytest.approx((0.24, 0.093, 0.029), rel=0.03)
 
 
@@ -58,18 +49,18 @@ def test_what_is_chosen_keeps_its_bound_and_the_bound_its_tolerance(monkeypatch)
     """Exact errs by nothing, and every tolerance by no more than it says."""
     monkeypatch.setattr(stages, "LAND_SHAPE", (96, 640))
     monkeypatch.setattr(stages, "LINES", 1)
-    state = SIMULATE.prepare(0)
-    found = errors(SIMULATE, state)
-    bounds = {one: state.decisions[one].error for one in SIMULATE.settings}
-    assert found[EXACT] == bounds[EXACT] == 0
-    assert all(found[one] <= bounds[one] <= one for one in TOLERANCES)
-    assert found[TOLERANCES[-1]] > 0
+    state = stages.SIMULATE.prepare(0)
+    found = errors(stages.SIMULATE, state)
+    bounds = {one: state.decisions[one].error for one in stages.SIMULATE.settings}
+    assert found[stages.EXACT] == bounds[stages.EXACT] == 0
+    assert all(found[one] <= bounds[one] <= one for one in stages.TOLERANCES)
+    assert found[stages.TOLERANCES[-1]] > 0
 
 
 def test_more_patches_draw_a_better_map(monkeypatch):
     """The map of every patch errs least, that of none most."""
     monkeypatch.setattr(stages, "FARM_SHAPE", (96, 128))
-    found = errors(SEGMENT, SEGMENT.prepare(0))
+    found = errors(stages.SEGMENT, stages.SEGMENT.prepare(0))
     assert 0 < found[1.0] < found[0.0] < 1
 
 
@@ -79,7 +70,7 @@ def test_own_scenes_are_measured_by_their_labels(
     """A raster by fractions of its patches, and by some scans of the simulated rig."""
     few = {name: scan for name, scan in stages.SCANS.items() if scan == stages.PART_OF}
     monkeypatch.setattr(stages, "SCANS", few)
-    monkeypatch.setattr(stages, "SURVEY", replace(SURVEY, settings=(*few, *stages.PARTS)))
+    monkeypatch.setattr(stages, "SURVEY", replace(stages.SURVEY, settings=(*few, *stages.PARTS)))
     scene = str(tmp_path / "scene.png")
     for name, to in (("scene.png", "scene.png"), ("labels.png", "scene_labels.png")):
         with Image.open(scene_files / name) as whole:
@@ -99,4 +90,4 @@ def test_a_scene_without_labels_has_no_tradeoff(scene_files: Path, weights: Path
     """One message that says what is missing."""
     shutil.copy(scene_files / "scene.png", tmp_path / "bare.png")
     with pytest.raises(SceneError, match="has no labels by which a map could be judged; lay a label file beside it"):
-        plan_every_fraction(0, str(tmp_path / "bare.png"), weights)
+        stages.plan_every_fraction(0, str(tmp_path / "bare.png"), weights)

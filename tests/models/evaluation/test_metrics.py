@@ -10,20 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from models.evaluation import metrics
-from models.evaluation.metrics import (
-    agreement,
-    average_accuracy,
-    calibration_error,
-    confidence_counts,
-    confusion,
-    false_pixels,
-    gap_closed,
-    iou_per_class,
-    kappa,
-    labelled_classes,
-    mean_iou,
-    overall_accuracy,
-)
 from pipeline.errors import ShapeError
 
 PAIRS = st.lists(st.tuples(st.sampled_from([0, 1, 2, 3, 255]), st.integers(0, 3)), max_size=60)
@@ -38,11 +24,11 @@ def _maps(pairs: list[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray]:
 def test_counts_of_parts_add_up(pairs: list[tuple[int, int]], cut: int):
     """The count of a map is that of its parts together, and its sum the number of labelled pixels."""
     labels, drawn = _maps(pairs)
-    whole = confusion(labels, drawn, 4)
-    parts = confusion(labels[:cut], drawn[:cut], 4) + confusion(labels[cut:], drawn[cut:], 4)
+    whole = metrics.confusion(labels, drawn, 4)
+    parts = metrics.confusion(labels[:cut], drawn[:cut], 4) + metrics.confusion(labels[cut:], drawn[cut:], 4)
     assert (whole == parts).all()
     with mock.patch.object(metrics, "PIXELS_AT_ONCE", 7):
-        assert (confusion(labels, drawn, 4) == whole).all()
+        assert (metrics.confusion(labels, drawn, 4) == whole).all()
     assert whole.sum() == np.count_nonzero(labels != 255)
 
 
@@ -51,9 +37,9 @@ def test_names_of_classes_do_not_matter(pairs: list[tuple[int, int]], names: lis
     """Renumbering the classes permutes the IoU and leaves every mean as it is."""
     labels, drawn = _maps(pairs)
     renamed = np.append(names, [255] * 252).astype(np.uint8)
-    before, after = confusion(labels, drawn, 4), confusion(renamed[labels], renamed[drawn], 4)
-    assert iou_per_class(after)[names] == pytest.approx(iou_per_class(before), nan_ok=True)
-    for mean in (mean_iou, overall_accuracy, average_accuracy, kappa):
+    before, after = metrics.confusion(labels, drawn, 4), metrics.confusion(renamed[labels], renamed[drawn], 4)
+    assert metrics.iou_per_class(after)[names] == pytest.approx(metrics.iou_per_class(before), nan_ok=True)
+    for mean in (metrics.mean_iou, metrics.overall_accuracy, metrics.average_accuracy, metrics.kappa):
         assert mean(after) == pytest.approx(mean(before), nan_ok=True)
 
 
@@ -62,36 +48,36 @@ def test_iou_is_that_of_pixel_sets(pairs: list[tuple[int, int]]):
     """Each class's IoU is the size of its two pixel sets' intersection over their union's, NaN without a label."""
     labels, drawn = _maps(pairs)
     labels, drawn = labels[labels != 255], drawn[labels != 255]
-    for number, iou in enumerate(iou_per_class(confusion(labels, drawn, 4))):
+    for number, iou in enumerate(metrics.iou_per_class(metrics.confusion(labels, drawn, 4))):
         both, either = ((labels == number) & (drawn == number)).sum(), ((labels == number) | (drawn == number)).sum()
         assert iou == pytest.approx(both / either if (labels == number).any() else np.nan, nan_ok=True)
 
 
 def test_a_worked_case():
     """Six pixels by hand: 4 right; IoU 2/3, 1/3 and 1/2; half of what chance leaves is agreed."""
-    counts = confusion(np.array([0, 0, 1, 1, 2, 2]), np.array([0, 0, 1, 0, 2, 1]), 3)
+    counts = metrics.confusion(np.array([0, 0, 1, 1, 2, 2]), np.array([0, 0, 1, 0, 2, 1]), 3)
     assert counts.tolist() == [[2, 0, 0], [1, 1, 0], [0, 1, 1]]
-    assert iou_per_class(counts) == pytest.approx([2 / 3, 1 / 3, 1 / 2])
-    assert mean_iou(counts) == pytest.approx(0.5)
-    assert overall_accuracy(counts) == pytest.approx(2 / 3)
-    assert average_accuracy(counts) == pytest.approx(2 / 3)
-    assert kappa(counts) == pytest.approx((2 / 3 - 1 / 3) / (2 / 3))
+    assert metrics.iou_per_class(counts) == pytest.approx([2 / 3, 1 / 3, 1 / 2])
+    assert metrics.mean_iou(counts) == pytest.approx(0.5)
+    assert metrics.overall_accuracy(counts) == pytest.approx(2 / 3)
+    assert metrics.average_accuracy(counts) == pytest.approx(2 / 3)
+    assert metrics.kappa(counts) == pytest.approx((2 / 3 - 1 / 3) / (2 / 3))
 
 
 def test_agreement_by_chance_has_no_kappa():
     """A map drawn without looking has kappa 0, a perfect one 1, and one class alone none at all."""
     chance = np.outer([30, 70], [40, 60])
-    assert kappa(chance) == pytest.approx(0)
-    assert kappa(np.diag([3, 4])) == 1
-    assert np.isnan(kappa(np.array([[5, 0], [0, 0]])))
+    assert metrics.kappa(chance) == pytest.approx(0)
+    assert metrics.kappa(np.diag([3, 4])) == 1
+    assert np.isnan(metrics.kappa(np.array([[5, 0], [0, 0]])))
 
 
 def test_a_class_shown_where_the_labels_have_none_is_false():
     """It has no IoU and its pixels are told; they lower the class they were taken from."""
-    counts = confusion(np.array([0, 0, 0, 1]), np.array([0, 0, 2, 1]), 3)
-    assert iou_per_class(counts) == pytest.approx([2 / 3, 1, np.nan], nan_ok=True)
-    assert false_pixels(counts).tolist() == [0, 0, 1]
-    assert agreement(counts) == pytest.approx({"miou": (2 / 3 + 1) / 2, "overall_accuracy": 3 / 4})
+    counts = metrics.confusion(np.array([0, 0, 0, 1]), np.array([0, 0, 2, 1]), 3)
+    assert metrics.iou_per_class(counts) == pytest.approx([2 / 3, 1, np.nan], nan_ok=True)
+    assert metrics.false_pixels(counts).tolist() == [0, 0, 1]
+    assert metrics.agreement(counts) == pytest.approx({"miou": (2 / 3 + 1) / 2, "overall_accuracy": 3 / 4})
 
 
 LABELLED = st.lists(st.tuples(st.integers(0, 2), st.integers(0, 4)), min_size=1, max_size=60)  # classes 3, 4: false
@@ -104,10 +90,10 @@ def test_better_in_every_class_is_better_in_the_mean(pairs: list[tuple[int, int]
     touched, to = (np.array(column)[: len(labels)] for column in zip(*spoilt, strict=True))
     false = ~np.isin(better, labels)
     worse = np.where(touched & ((better == labels) | (false & (to != labels))), to, better)
-    one, other = confusion(labels, better, 5), confusion(labels, worse, 5)
-    held = labelled_classes(one)
-    assert (iou_per_class(one)[held] >= iou_per_class(other)[held]).all()
-    assert mean_iou(one) >= mean_iou(other) - 1e-12
+    one, other = metrics.confusion(labels, better, 5), metrics.confusion(labels, worse, 5)
+    held = metrics.labelled_classes(one)
+    assert (metrics.iou_per_class(one)[held] >= metrics.iou_per_class(other)[held]).all()
+    assert metrics.mean_iou(one) >= metrics.mean_iou(other) - 1e-12
 
 
 @given(LABELLED, st.data())
@@ -119,40 +105,40 @@ def test_stray_pixels_cost_their_own_class_alone(pairs: list[tuple[int, int]], d
     drawn[stray] = data.draw(st.sampled_from([3, 4]))
     present = np.unique(labels)
     lost = sum(np.isin(np.flatnonzero(labels == number), stray).mean() for number in present)
-    counts = confusion(labels, drawn, 5)
-    assert mean_iou(counts) == pytest.approx(1 - lost / len(present))
-    assert false_pixels(counts).sum() == len(stray)
+    counts = metrics.confusion(labels, drawn, 5)
+    assert metrics.mean_iou(counts) == pytest.approx(1 - lost / len(present))
+    assert metrics.false_pixels(counts).sum() == len(stray)
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.int16, np.int64])
 def test_maps_of_any_integer_type_are_counted(kind: type):
     """Classes up to 254 do not overflow the type they come in."""
     labels = np.array([254, 200, 255 if kind is np.uint8 else 3, 254]).astype(kind)
-    assert confusion(labels, np.array([254, 200, 3, 200], np.uint8), 255)[254].sum() == 2
+    assert metrics.confusion(labels, np.array([254, 200, 3, 200], np.uint8), 255)[254].sum() == 2
 
 
 def test_a_map_of_another_size_is_refused():
     """The message names both sizes."""
     with pytest.raises(ShapeError, match=r"labels are \(2, 3\), the class map is \(3, 2\)"):
-        confusion(np.zeros((2, 3), int), np.zeros((3, 2), int), 2)
+        metrics.confusion(np.zeros((2, 3), int), np.zeros((3, 2), int), 2)
 
 
 def test_a_gap_of_less_than_a_point_is_not_closed():
     """The fraction of a way is given only where every patch is better than none by one point of mIoU or more."""
-    assert gap_closed(0.6, 0.5, 0.7) == pytest.approx(0.5)
-    assert gap_closed(0.4, 0.5, 0.3) is None
-    assert gap_closed(0.8, 0.5, 0.7) == pytest.approx(1.5)
-    assert gap_closed(0.505, 0.5, 0.509) is None
-    assert gap_closed(0.5, float("nan"), 0.7) is None
+    assert metrics.gap_closed(0.6, 0.5, 0.7) == pytest.approx(0.5)
+    assert metrics.gap_closed(0.4, 0.5, 0.3) is None
+    assert metrics.gap_closed(0.8, 0.5, 0.7) == pytest.approx(1.5)
+    assert metrics.gap_closed(0.505, 0.5, 0.509) is None
+    assert metrics.gap_closed(0.5, float("nan"), 0.7) is None
 
 
 def test_calibration_error_is_how_far_confidence_lies_beside_what_is_right():
     """Sure and right, sure and wrong, unsure by halves; counts of two maps add up, and no pixel has no error."""
     nine = np.full(10, 0.9)
     right = np.arange(10) < 9
-    assert calibration_error(confidence_counts(nine, right)) == pytest.approx(0, abs=1e-12)
-    assert calibration_error(confidence_counts(nine, ~right)) == pytest.approx(0.8)
-    assert calibration_error(confidence_counts(np.array([0.0, 1.0]), np.array([False, True]))) == 0
-    both = confidence_counts(nine, ~right) + confidence_counts(np.full(30, 0.5), np.arange(30) < 15)
-    assert calibration_error(both) == pytest.approx(0.8 * 10 / 40)
-    assert np.isnan(calibration_error(confidence_counts(np.empty(0), np.empty(0, bool))))
+    assert metrics.calibration_error(metrics.confidence_counts(nine, right)) == pytest.approx(0, abs=1e-12)
+    assert metrics.calibration_error(metrics.confidence_counts(nine, ~right)) == pytest.approx(0.8)
+    assert metrics.calibration_error(metrics.confidence_counts(np.array([0.0, 1.0]), np.array([False, True]))) == 0
+    both = metrics.confidence_counts(nine, ~right) + metrics.confidence_counts(np.full(30, 0.5), np.arange(30) < 15)
+    assert metrics.calibration_error(both) == pytest.approx(0.8 * 10 / 40)
+    assert np.isnan(metrics.calibration_error(metrics.confidence_counts(np.empty(0), np.empty(0, bool))))

@@ -9,18 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from models.evaluation import placement
 from models.evaluation.metrics import agreement, confusion, mean_iou
-from models.evaluation.placement import (
-    LEAST_GAINS,
-    RANDOM_DRAWS,
-    CascadeTable,
-    Placements,
-    ReadTwice,
-    gain_sums,
-    oracle_gain,
-    placement_figures,
-    run_controls,
-)
 from models.reading.inference import coarse_prediction_of_columns, segment
 from models.weights.files import Weights
 from pipeline.geometry.grid import SceneGrid
@@ -48,14 +38,14 @@ def test_the_gain_is_the_loss_that_all_patches_take_away(tiny: Maker):
         return full.reshape(rows, 8, columns, 8).mean(axis=(1, 3)).ravel()
 
     expected = loss(np.empty(0, np.intp)) - loss(grid.every_patch())
-    assert oracle_gain(weights, seen, fine, labels) == pytest.approx(expected, abs=1e-4)
+    assert placement.oracle_gain(weights, seen, fine, labels) == pytest.approx(expected, abs=1e-4)
 
 
 def test_what_has_no_label_has_no_gain(tiny: Maker):
     """A patch without a labelled pixel gains nothing, and one half labelled half as much at most."""
     weights, _, seen, fine, labels = _two_classes(tiny, 20, 30)
     labels[:8, :8] = 255
-    gain = oracle_gain(weights, seen, fine, labels)
+    gain = placement.oracle_gain(weights, seen, fine, labels)
     assert gain[0] == 0
     assert gain.any()
     assert (np.abs(gain) <= 5).all()
@@ -66,21 +56,23 @@ def test_the_oracle_captures_all_of_its_own_gain(values: list[float], count: int
     """The patches with the most gain have a ratio of 1, where there is any to be had, and no others have more."""
     gain = np.array(values)
     chosen = np.argsort(-gain, kind="stable")[:count]
-    own, best = gain_sums(gain, chosen)
+    own, best = placement.gain_sums(gain, chosen)
     assert own == pytest.approx(best)
-    last, _ = gain_sums(gain, np.arange(len(chosen)))
+    last, _ = placement.gain_sums(gain, np.arange(len(chosen)))
     assert last <= best + 1e-9
 
 
-def _scene(weights: Weights) -> ReadTwice:
+def _scene(weights: Weights) -> placement.ReadTwice:
     coarse_pass, _ = scene_columns(weights, 30, 45)
     labels = np.random.default_rng(2).integers(0, 3, (30, 45)).astype(np.uint8)
     labels[:3] = 255
-    return ReadTwice.of(weights, coarse_prediction_of_columns(weights, coarse_pass.columns, coarse_pass.grid), labels)
+    return placement.ReadTwice.of(
+        weights, coarse_prediction_of_columns(weights, coarse_pass.columns, coarse_pass.grid), labels
+    )
 
 
-def _run(weights: Weights, fraction: float = 0.35, seed: int = 0) -> Placements:
-    return run_controls(_scene(weights), weights.config.classes, fraction=fraction, seed=seed)
+def _run(weights: Weights, fraction: float = 0.35, seed: int = 0) -> placement.Placements:
+    return placement.run_controls(_scene(weights), weights.config.classes, fraction=fraction, seed=seed)
 
 
 def test_a_mix_of_two_maps_is_the_map_of_those_patches(tiny: Maker):
@@ -102,7 +94,7 @@ def test_every_row_counts_every_labelled_pixel(tiny: Maker):
     rows = _run(tiny())
     assert {int(counts.sum()) for draws in rows.values() for counts in draws} == {27 * 45}
     assert list(rows) == ["none", "all", "gain", "entropy", "sobel", "random"]
-    assert len(rows["random"]) == RANDOM_DRAWS
+    assert len(rows["random"]) == placement.RANDOM_DRAWS
 
 
 def test_random_rows_follow_the_seed(tiny: Maker):
@@ -121,7 +113,9 @@ def _counts(right: int) -> np.ndarray:
 def test_figures_of_a_worked_case():
     """Both means and the pixels' accuracy, the fraction of the gap, and mean and spread of the random placements."""
     draws = [_counts(62), _counts(66), _counts(64)]
-    rows = placement_figures({"none": [_counts(60)], "all": [_counts(90)], "entropy": [_counts(80)], "random": draws})
+    rows = placement.placement_figures(
+        {"none": [_counts(60)], "all": [_counts(90)], "entropy": [_counts(80)], "random": draws}
+    )
     none, every, entropy = (mean_iou(_counts(right)) for right in (60, 90, 80))
     closed = (entropy - none) / (every - none)
     assert rows["entropy"] == {**agreement(_counts(80)), "spread": None, "gap_closed": closed}
@@ -134,7 +128,7 @@ def test_figures_of_a_worked_case():
 def test_one_draw_has_no_spread_and_a_small_gap_no_fraction():
     """What cannot be said is None."""
     one = [_counts(60)]
-    rows = placement_figures({"none": one, "all": one, "sobel": [_counts(61)], "random": one})
+    rows = placement.placement_figures({"none": one, "all": one, "sobel": [_counts(61)], "random": one})
     assert rows["random"] == {**agreement(_counts(60)), "spread": None, "gap_closed": None}
     assert rows["sobel"] == {**agreement(_counts(61)), "spread": None, "gap_closed": None}
 
@@ -142,12 +136,12 @@ def test_one_draw_has_no_spread_and_a_small_gap_no_fraction():
 FOUR = np.array([[0.6, 0.3], [0.05, 0.0]])
 
 
-def _four_patches() -> ReadTwice:
+def _four_patches() -> placement.ReadTwice:
     """Four patches of 2 px: the overview is wrong on each but the last, which the full network gets wrong."""
     labels = np.repeat(np.repeat(np.array([[0, 1], [1, 0]], np.uint8), 2, 0), 2, 1)
     overview, full = 1 - labels, labels.copy()
     overview[2:, 2:], full[2:, 2:] = 0, 1
-    return ReadTwice(overview, full, {"gain": FOUR}, labels, SceneGrid(4, 4, 2))
+    return placement.ReadTwice(overview, full, {"gain": FOUR}, labels, SceneGrid(4, 4, 2))
 
 
 def test_chosen_patches_are_read_in_full() -> None:
@@ -162,8 +156,8 @@ def test_everything_read_includes_what_gets_worse() -> None:
 
 def test_losses_stand_beside_fractions() -> None:
     """Relative to everything read; the patch that a full reading spoils is better left alone."""
-    table = CascadeTable.judged([_four_patches()], 2)
-    assert table.least_gain == LEAST_GAINS
+    table = placement.CascadeTable.judged([_four_patches()], 2)
+    assert table.least_gain == placement.LEAST_GAINS
     assert table.fraction[0] == 0.75
     assert table.fraction[-1] == 0.25
     assert table.loss[0] < 0 < table.loss[-1]
@@ -175,7 +169,7 @@ def test_losses_stand_beside_fractions() -> None:
 )
 def test_the_highest_gain_within_a_loss(loss: float, gain: float, fraction: float) -> None:
     """Between two rows by the logarithm of the gain, and so is the fraction of patches; none beyond the last."""
-    table = CascadeTable((0.01, 0.02, 0.03, 0.04), (-0.1, 0.0, 0.2, 0.3), (0.9, 0.5, 0.3, 0.1))
+    table = placement.CascadeTable((0.01, 0.02, 0.03, 0.04), (-0.1, 0.0, 0.2, 0.3), (0.9, 0.5, 0.3, 0.1))
     found = table.within(loss)
     assert found == pytest.approx(gain)
     assert table.fraction_at(gain) == pytest.approx(fraction)
@@ -184,6 +178,6 @@ def test_the_highest_gain_within_a_loss(loss: float, gain: float, fraction: floa
 
 def test_a_worse_row_ends_the_search() -> None:
     """Noise of few scenes does not open a higher gain behind it."""
-    found = CascadeTable((0.01, 0.02, 0.03), (0.0, 0.5, 0.1), (0.9, 0.5, 0.3)).within(0.2)
+    found = placement.CascadeTable((0.01, 0.02, 0.03), (0.0, 0.5, 0.1), (0.9, 0.5, 0.3)).within(0.2)
     assert found is not None
     assert 0.01 < found < 0.02

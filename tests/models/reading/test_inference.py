@@ -11,17 +11,6 @@ import torch
 from models.network.sizes import TOKEN_PX
 from models.network.spectral import LineSpec, with_planes
 from models.reading import inference
-from models.reading.inference import (
-    FAINTER,
-    CoarsePass,
-    CoarsePrediction,
-    coarse_prediction_of_columns,
-    draw,
-    map_of_columns,
-    read_coarse_pass,
-    read_coarse_prediction,
-    segment,
-)
 from models.weights.files import Weights, with_record
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid
@@ -36,10 +25,10 @@ def _values(height: int, width: int, bands: int = len(NM)) -> np.ndarray:
     return np.random.default_rng(0).uniform(0.1, 0.5, (height, width, bands)).astype(np.float32)
 
 
-def _seen(weights: Weights, height: int = 32, width: int = 48) -> tuple[CoarsePrediction, np.ndarray]:
+def _seen(weights: Weights, height: int = 32, width: int = 48) -> tuple[inference.CoarsePrediction, np.ndarray]:
     """The overview of a scene of noise, and other noise for every patch."""
     coarse_pass, fine = scene_columns(weights, height, width)
-    return read_coarse_prediction(weights, coarse_pass), fine
+    return inference.read_coarse_prediction(weights, coarse_pass), fine
 
 
 def test_a_map_without_a_patch_is_the_overviews(tiny: Maker):
@@ -47,12 +36,12 @@ def test_a_map_without_a_patch_is_the_overviews(tiny: Maker):
     weights = tiny()
     seen, fine = _seen(weights, 37, 53)
     expected = seen.probability[:37, :53]
-    drawn = segment(weights, seen, fine[:0], NONE, every_class=True)
+    drawn = inference.segment(weights, seen, fine[:0], NONE, every_class=True)
     assert drawn.confidence == pytest.approx(expected.max(axis=-1), abs=1e-6)
     assert (drawn.classes == expected.argmax(axis=-1)).all()
     assert drawn.log_probability is not None
     assert np.exp(drawn.log_probability) == pytest.approx(expected, abs=1e-6)
-    softer = segment(with_record(weights, calibration={"temperature": 2.0}), seen, fine[:0], NONE)
+    softer = inference.segment(with_record(weights, calibration={"temperature": 2.0}), seen, fine[:0], NONE)
     rooted = np.sqrt(expected)
     assert softer.confidence == pytest.approx((rooted / rooted.sum(axis=-1, keepdims=True)).max(axis=-1), abs=1e-6)
     assert (softer.classes == drawn.classes).all()
@@ -64,7 +53,7 @@ def test_a_patch_changes_its_own_pixels_alone(tiny: Maker):
     seen, fine = _seen(weights)
     patch_index = np.array([15, 3])
     without, drawn, moved, again = (
-        segment(weights, seen, fine[which], numbers).confidence
+        inference.segment(weights, seen, fine[which], numbers).confidence
         for which, numbers in (([], NONE), ([0, 1], patch_index), ([1, 0], patch_index), ([1, 0], patch_index[::-1]))
     )
     for one, other in ((without, drawn), (drawn, moved)):
@@ -79,10 +68,10 @@ def test_chunks_do_not_show(tiny: Maker, most: int, monkeypatch: pytest.MonkeyPa
     weights = tiny()
     seen, fine = _seen(weights)
     patch_index = np.random.default_rng(1).permutation(24)[:15]
-    whole = segment(weights, seen, fine[patch_index], patch_index)
+    whole = inference.segment(weights, seen, fine[patch_index], patch_index)
     monkeypatch.setattr(inference, "PATCHES_AT_ONCE", most)
     monkeypatch.setattr(inference, "ROWS_DRAWN", most)
-    drawn = segment(weights, seen, fine[patch_index], patch_index)
+    drawn = inference.segment(weights, seen, fine[patch_index], patch_index)
     assert (drawn.classes == whole.classes).all()
     assert np.abs(drawn.confidence - whole.confidence).max() <= 1e-6
 
@@ -98,12 +87,12 @@ def test_a_region_is_drawn_as_training_saw_crops(tiny: Maker, patch: int, origin
     coarse_pass, fine = scene_columns(weights, 64, 128)
     moved, patch_index = replace(coarse_pass, origin=origin, capture=DARK), np.array([1, 0])
     other = LineSpec(0.5)
-    drawn = segment(weights, moved, fine[patch_index], patch_index, capture=other)
+    drawn = inference.segment(weights, moved, fine[patch_index], patch_index, capture=other)
     detail = np.zeros((64, 128, 4), np.float32)
     for (y, x), own in zip(coarse_pass.grid.patch_origin(patch_index), fine[patch_index], strict=True):
         detail[y : y + patch, x : x + patch] = own
     images = (
-        torch.from_numpy(with_planes(*one, fainter=FAINTER)).permute(2, 0, 1)[None]
+        torch.from_numpy(with_planes(*one, fainter=inference.FAINTER)).permute(2, 0, 1)[None]
         for one in ((coarse_pass.columns, DARK), (detail, other))
     )
     model, numbers = weights.segmenter, torch.from_numpy(patch_index)[None]
@@ -111,7 +100,7 @@ def test_a_region_is_drawn_as_training_saw_crops(tiny: Maker, patch: int, origin
         places = torch.tensor([origin]).double() * patch / TOKEN_PX
         logits = model.composite(*model(*images, numbers, places), numbers)
     assert np.abs(drawn.confidence - logits[0].softmax(dim=0).amax(dim=0).numpy()).max() <= 1e-5
-    here = segment(weights, replace(moved, origin=(0, 0)), fine[patch_index], patch_index, capture=other)
+    here = inference.segment(weights, replace(moved, origin=(0, 0)), fine[patch_index], patch_index, capture=other)
     assert (drawn.confidence == here.confidence).all() == (origin == (0, 0))
 
 
@@ -120,7 +109,7 @@ def test_a_prediction_keeps_its_overview(tiny: Maker, monkeypatch: pytest.Monkey
     weights = tiny()
     seen, fine = _seen(weights)
     monkeypatch.setattr(weights.segmenter, "read_overview", lambda *given: pytest.fail("read"))
-    segment(weights, seen, fine[:1], np.array([0]))
+    inference.segment(weights, seen, fine[:1], np.array([0]))
 
 
 @pytest.mark.parametrize(
@@ -139,7 +128,7 @@ def test_a_patch_that_cannot_be_is_refused_before_anything_is_read(
     coarse_pass, fine = scene_columns(weights, 32, 48)
     monkeypatch.setattr(weights.segmenter, "read_overview", lambda *given: pytest.fail("read"))
     with pytest.raises(ShapeError, match=words):
-        segment(weights, coarse_pass, fine[: len(numbers)], np.array(numbers))
+        inference.segment(weights, coarse_pass, fine[: len(numbers)], np.array(numbers))
 
 
 @pytest.mark.parametrize("bands", [NM, NM[:3]])
@@ -147,8 +136,8 @@ def test_a_look_in_swaths_is_the_look_at_once(tiny: Maker, bands: np.ndarray):
     """Rows of the mosaic that come some at a time give the very same columns, with bands for all of them or not."""
     weights, grid = tiny(), SceneGrid(37, 53, 8)
     values = _values(37, 53, len(bands))
-    whole = read_coarse_pass(weights, [values], bands, grid)
-    parts = read_coarse_pass(weights, np.split(values, [1, 9]), bands, grid)
+    whole = inference.read_coarse_pass(weights, [values], bands, grid)
+    parts = inference.read_coarse_pass(weights, np.split(values, [1, 9]), bands, grid)
     assert (parts.columns == whole.columns).all()
     assert whole.columns[:37, :53] == pytest.approx(weights.columns(values, bands), abs=1e-6)
     added = len(whole.columns) - 37
@@ -160,12 +149,12 @@ def test_a_scene_is_read_in_full_by_its_columns(tiny: Maker):
     weights = tiny()
     coarse_pass, _ = scene_columns(weights, 32, 48)
     every = coarse_pass.grid.every_patch()
-    image = coarse_prediction_of_columns(weights, coarse_pass.columns, coarse_pass.grid, DARK)
-    drawn, log_probability = map_of_columns(weights, coarse_pass.columns, coarse_pass.grid, DARK)
-    own = segment(weights, image, image.patches(every), every)
+    image = inference.coarse_prediction_of_columns(weights, coarse_pass.columns, coarse_pass.grid, DARK)
+    drawn, log_probability = inference.map_of_columns(weights, coarse_pass.columns, coarse_pass.grid, DARK)
+    own = inference.segment(weights, image, image.patches(every), every)
     assert (drawn.confidence == own.confidence).all()
     assert np.exp(log_probability).max(axis=-1) == pytest.approx(own.confidence, abs=1e-6)
-    brighter, _ = map_of_columns(weights, coarse_pass.columns, coarse_pass.grid)
+    brighter, _ = inference.map_of_columns(weights, coarse_pass.columns, coarse_pass.grid)
     assert np.abs(brighter.confidence - drawn.confidence).max() > 1e-4
 
 
@@ -173,9 +162,9 @@ def test_a_scene_is_read_in_full_by_its_columns(tiny: Maker):
 def test_a_token_dead_in_most_of_its_pixels_is_left_out(more: int):
     """With half of its pixels dead a token is read, with one more it is not; holes take the mean of their patch."""
     weights, grid, values = plain_weights(), SceneGrid(60, 64, 8), _values(60, 64)
-    whole = read_coarse_pass(weights, [values], NM, grid).columns
+    whole = inference.read_coarse_pass(weights, [values], NM, grid).columns
     values[:16, :32], values[16, :more], values[41:43, 50:53] = np.nan, np.inf, -np.inf
-    seen = read_coarse_pass(weights, [values], NM, grid)
+    seen = inference.read_coarse_pass(weights, [values], NM, grid)
     assert seen.living.tolist() == [not more, True, True, True]
     hole = np.zeros((64, 64), bool)
     hole[:16, :32], hole[16, :more], hole[41:43, 50:53] = True, True, True
@@ -194,7 +183,9 @@ def test_a_patch_dead_in_most_of_its_pixels_counts_as_not_captured(tiny: Maker, 
     weights = tiny()
     seen, fine = _seen(weights)
     fine[5].reshape(64, 4)[:dead] = np.nan
-    drawn, without = (segment(weights, seen, fine[which], np.array(which)).confidence for which in ([4, 5, 6], [4, 6]))
+    drawn, without = (
+        inference.segment(weights, seen, fine[which], np.array(which)).confidence for which in ([4, 5, 6], [4, 6])
+    )
     changed = (drawn != without).reshape(4, 8, 6, 8).any(axis=(1, 3))
     assert np.flatnonzero(changed).tolist() == [5] * counts
 
@@ -203,9 +194,9 @@ def test_a_patch_dead_in_most_of_its_pixels_counts_as_not_captured(tiny: Maker, 
 def test_logits_that_are_not_finite_give_no_class(value: float):
     """255 and NaN there, and what is beside is drawn as ever."""
     logits = noise(0, 3, 70, 5)
-    whole = draw(logits.clone())
+    whole = inference.draw(logits.clone())
     logits[1, 66, 2] = value
-    drawn = draw(logits)
+    drawn = inference.draw(logits)
     assert (drawn.classes[66, 2], np.isnan(drawn.confidence[66, 2])) == (255, True)
     beside = np.ones((70, 5), bool)
     beside[66, 2] = False
@@ -215,7 +206,7 @@ def test_logits_that_are_not_finite_give_no_class(value: float):
 
 def test_what_was_never_dead_has_no_mask(tiny: Maker):
     """Where every pixel lives no token is left out, and nothing is filled."""
-    seen = read_coarse_pass(tiny(), [_values(30, 31)], NM, SceneGrid(30, 31, 8))
+    seen = inference.read_coarse_pass(tiny(), [_values(30, 31)], NM, SceneGrid(30, 31, 8))
     assert (seen.living, seen.filled, seen.out_of_range) == (None, None, None)
     assert seen.seen_columns is seen.columns
-    assert CoarsePass(seen.grid, seen.columns).capture == LineSpec()
+    assert inference.CoarsePass(seen.grid, seen.columns).capture == LineSpec()

@@ -13,66 +13,57 @@ import torch
 from models.network.sizes import TemporalSizes
 from models.network.temporal_reader import TemporalReader
 from models.reading.ood import OodDetector
-from models.weights.files import (
-    TrainedOn,
-    add_ood,
-    add_reader,
-    describe_weights,
-    load_ood,
-    load_reader,
-    load_weights,
-    save_weights,
-)
+from models.weights import files
 from pipeline.errors import WeightsError
 from tests.models.conftest import make_weights
 from tests.models.reading.test_ood import some_limits
 
-SEEN = TrainedOn(10, (400.0, 1000.0), (3.0, 100.0), 48, ("a", "b"), (96, 300), (15.0, 60.0), 0.12)
+SEEN = files.TrainedOn(10, (400.0, 1000.0), (3.0, 100.0), 48, ("a", "b"), (96, 300), (15.0, 60.0), 0.12)
 
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     """A file of small weights."""
-    save_weights(make_weights(), tmp_path / "own.safetensors")
+    files.save_weights(make_weights(), tmp_path / "own.safetensors")
     return tmp_path / "own.safetensors"
 
 
 def with_ood(path: Path) -> None:
     """Add what is familiar to the weights."""
-    columns = describe_weights(path).config.columns
+    columns = files.describe_weights(path).config.columns
     one = np.eye(columns)
     measured = OodDetector(np.zeros((1, columns)), one[None], 0.1 * one[None], 0.1 * one, some_limits(), 10)
-    add_ood(path, measured, SEEN, {"scenes": 48})
+    files.add_ood(path, measured, SEEN, {"scenes": 48})
 
 
 def with_reader(path: Path, **changed: int) -> None:
     """Add a reader of prior maps."""
-    config = describe_weights(path).config
+    config = files.describe_weights(path).config
     sizes = {"classes": config.classes, "columns": config.columns, "width": 8}
     built = TemporalReader(TemporalSizes(**{**sizes, "coarse_width": 4, **changed}))
-    add_reader(path, path, built, {"seed": 1})
+    files.add_reader(path, path, built, {"seed": 1})
 
 
 def test_what_is_added_is_read_and_leaves_the_weights_as_they_were(path: Path) -> None:
     """Both parts come back in any order; each has a key of its own, which adding it again does not change."""
-    bare, weights = describe_weights(path), load_weights(path)
+    bare, weights = files.describe_weights(path), files.load_weights(path)
     assert (bare.ood_detector, bare.reader) == (None, None)
     for add in (with_ood, with_reader, with_ood):
         add(path)
-    told = describe_weights(path)
+    told = files.describe_weights(path)
     assert told.key == bare.key
     assert (told.ood_detector.trained_on, told.ood_detector.record) == (SEEN, {"scenes": 48})
     assert told.reader.record == {"seed": 1}
-    key, reader = told.reader.key, load_reader(path)
-    add_reader(path, path, reader, {"seed": 1})
-    again = describe_weights(path)
+    key, reader = told.reader.key, files.load_reader(path)
+    files.add_reader(path, path, reader, {"seed": 1})
+    again = files.describe_weights(path)
     assert (again.reader.key, again.ood_detector) == (key, told.ood_detector)
-    assert load_ood(path).limits.steps == (1, 2)
-    for name, tensor in load_weights(path).segmenter.state_dict().items():
+    assert files.load_ood(path).limits.steps == (1, 2)
+    for name, tensor in files.load_weights(path).segmenter.state_dict().items():
         torch.testing.assert_close(weights.segmenter.state_dict()[name], tensor, rtol=0, atol=0)
 
 
-@pytest.mark.parametrize(("load", "words"), [(load_ood, "--validation"), (load_reader, "--train-temporal")])
+@pytest.mark.parametrize(("load", "words"), [(files.load_ood, "--validation"), (files.load_reader, "--train-temporal")])
 def test_a_part_that_is_not_there_says_how_it_is_made(path: Path, load: Callable[[Path], object], words: str) -> None:
     """The message names the file and the command."""
     with pytest.raises(WeightsError, match=rf"own\.safetensors.*spectralzoom train DATASET {words}"):
@@ -81,11 +72,11 @@ def test_a_part_that_is_not_there_says_how_it_is_made(path: Path, load: Callable
 
 def test_what_training_saw_is_read_as_it_was_told() -> None:
     """With and without what is not known."""
-    bare = TrainedOn(3, (460.0, 640.0), (100.0, 100.0), 2, ("a", "b"))
-    assert [TrainedOn.read(one.as_dict()) for one in (SEEN, bare)] == [SEEN, bare]
+    bare = files.TrainedOn(3, (460.0, 640.0), (100.0, 100.0), 2, ("a", "b"))
+    assert [files.TrainedOn.read(one.as_dict()) for one in (SEEN, bare)] == [SEEN, bare]
 
 
-@pytest.mark.parametrize(("add", "load"), [(with_ood, load_ood), (with_reader, load_reader)])
+@pytest.mark.parametrize(("add", "load"), [(with_ood, files.load_ood), (with_reader, files.load_reader)])
 def test_every_flipped_bit_is_told(path: Path, add: Callable[[Path], None], load: Callable[[Path], object]) -> None:
     """Of a part's own tensors and of the description, in a message that names the file and says what to do."""
     add(path)
@@ -112,25 +103,25 @@ def test_a_reader_for_others_is_refused(path: Path, changed: dict[str, int], why
     """Other columns or classes than the weights have; and a width that is damage."""
     with_reader(path, **changed)
     with pytest.raises(WeightsError, match=why):
-        load_reader(path)
+        files.load_reader(path)
 
 
 def test_numbers_that_are_none_are_refused(path: Path) -> None:
     """A NaN among the tensors."""
     with_reader(path)
-    found = load_reader(path)
+    found = files.load_reader(path)
     with torch.no_grad():
         found.gates[0] = torch.nan
-    add_reader(path, path, found, {})
+    files.add_reader(path, path, found, {})
     with pytest.raises(WeightsError, match="not finite"):
-        load_reader(path)
+        files.load_reader(path)
 
 
 def test_what_was_read_stays_where_the_file_is_written_over(path: Path) -> None:
     """Copied onto while a survey reads with them, weights, reader and limits are still those that were checked."""
     with_ood(path)
     with_reader(path)
-    weights, told, numbers = load_weights(path), load_ood(path), load_reader(path).state_dict()
+    weights, told, numbers = files.load_weights(path), files.load_ood(path), files.load_reader(path).state_dict()
     kept = told.read.copy(), weights.normalisation.whitening.copy()
     before = {name: one.clone() for name, one in numbers.items()}
     with path.open("r+b") as opened:

@@ -5,18 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipeline.geometry import mirror
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import (
-    REST_TANGENT,
-    Mounting,
-    direction_to_normal,
-    direction_to_position,
-    direction_to_scene,
-    normal_to_device,
-    normal_to_position,
-    position_to_direction,
-    scene_to_direction,
-)
 from pipeline.geometry.scan import CostModel, Sweep, device_range, memory_loads
 from tests.pipeline.geometry.paper_equations import (
     LINE_MODELS,
@@ -34,7 +24,7 @@ IFOV = CAMERA.ifov_rad
 
 def paper_position(normal: np.ndarray) -> np.ndarray:
     """Equation (7), X = n_x / sin 25 deg [E2]: right at rest and at the rim, up to 6.40 deg (1056 px) wrong between."""
-    return normal_to_device(normal)[..., :2] / np.sin(np.deg2rad(25.0))
+    return mirror.normal_to_device(normal)[..., :2] / np.sin(np.deg2rad(25.0))
 
 
 def slope_rotation(position: np.ndarray) -> np.ndarray:
@@ -62,18 +52,18 @@ def stable_normal(direction: np.ndarray) -> np.ndarray:
 
 def optical_deg(position: np.ndarray) -> float:
     """How far the device deflects along X. [deg]"""
-    return float(np.rad2deg(np.arctan(position[0] * REST_TANGENT)))
+    return float(np.rad2deg(np.arctan(position[0] * mirror.REST_TANGENT)))
 
 
 def aim(xi_px: object, eta_px: object) -> np.ndarray:
     """Exact positions that look at scene points, beyond the rim too."""
     tangents = np.stack(np.broadcast_arrays(xi_px, eta_px), axis=-1) * IFOV
-    return unlimited_position(direction_to_normal(scene_to_direction(tangents)))
+    return unlimited_position(mirror.direction_to_normal(mirror.scene_to_direction(tangents)))
 
 
 def viewed(position: np.ndarray) -> np.ndarray:
     """Scene points (xi, eta) that positions look at. [px]"""
-    return direction_to_scene(position_to_direction(position)) / IFOV
+    return mirror.direction_to_scene(mirror.position_to_direction(position)) / IFOV
 
 
 def sweep_of_1450(xi_px: float) -> np.ndarray:
@@ -83,7 +73,7 @@ def sweep_of_1450(xi_px: float) -> np.ndarray:
 
 def turn_of(position: np.ndarray) -> np.ndarray:
     """Exact rotation of the line at positions. [rad]"""
-    return line_rotation(position_to_direction(position))
+    return line_rotation(mirror.position_to_direction(position))
 
 
 @pytest.mark.parametrize(
@@ -100,22 +90,24 @@ def turn_of(position: np.ndarray) -> np.ndarray:
 def test_e1_e2_positions_differ_as_tabulated(tilt, x, eq7, error_deg, error_px, product_deg, product_px):
     """Equation (7), code seen in public and equation (1) read with the tilt, against the device's coordinate."""
     normal, px = tilted(tilt), np.deg2rad(1) / IFOV
-    assert [normal_to_position(normal)[0], paper_position(normal)[0]] == pytest.approx([x, eq7], abs=6e-5)
+    assert [mirror.normal_to_position(normal)[0], paper_position(normal)[0]] == pytest.approx([x, eq7], abs=6e-5)
     off = optical_deg(paper_position(normal)) - 2 * tilt
     assert [off, off * px] == pytest.approx([error_deg, error_px], abs=0.5 if off > 9 else 0.6)
     assert off == pytest.approx(error_deg, abs=0.006)
-    device = normal_to_device(normal)
-    off = optical_deg(device[2] * device[:2] / REST_TANGENT) - 2 * tilt  # n_x n_z / tan 50 deg, as public code has it
+    device = mirror.normal_to_device(normal)
+    off = (
+        optical_deg(device[2] * device[:2] / mirror.REST_TANGENT) - 2 * tilt
+    )  # n_x n_z / tan 50 deg, as public code has it
     assert off == pytest.approx(product_deg, abs=0.06)
     assert off * px == pytest.approx(product_px, abs=0.6)
-    mechanical = device[:2] / device[2] / REST_TANGENT  # equation (1), theta read as the mirror's own tilt
+    mechanical = device[:2] / device[2] / mirror.REST_TANGENT  # equation (1), theta read as the mirror's own tilt
     assert optical_deg(mechanical) == pytest.approx(tilt, abs=1e-12)
 
 
 def test_e2_asking_for_a_step_gives_another():
     """With equation (7) 100 px become 141, 1280 px along the line 1792, and two axes bend: xi 4800 -> (5479, 163)."""
     reached = {
-        asked: viewed(paper_position(direction_to_normal(scene_to_direction(np.array(asked) * IFOV))))
+        asked: viewed(paper_position(mirror.direction_to_normal(mirror.scene_to_direction(np.array(asked) * IFOV))))
         for asked in ((100, 0), (0, 100), (0, 1280), (4800, 0))
     }
     assert reached[100, 0][0] == pytest.approx(141, abs=0.5)
@@ -135,7 +127,7 @@ def test_e3_the_corner_of_the_field_is_out_of_reach():
 
 def test_e4_the_papers_matrix_turns_the_ray_round():
     """With the normal of equation (4), R i = -o: i and o point from the mirror, and o = (2 n n^T - I) i."""
-    o = scene_to_direction([[0.2, -0.4], [0.0, 0.0], [-0.5, 0.6]])
+    o = mirror.scene_to_direction([[0.2, -0.4], [0.0, 0.0], [-0.5, 0.6]])
     n = paper_normal(o)
     turned = (np.eye(3) - 2 * n[..., :, None] * n[..., None, :]) @ [0.0, 0.0, 1.0]
     assert turned == pytest.approx(-o, abs=1e-15)
@@ -187,9 +179,10 @@ def test_e8_the_slope_is_wrong_by_up_to_twelve_and_a_half_degrees():
     position = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     radius = np.linalg.norm(position, axis=-1)
     position, radius = position[radius <= 1], radius[radius <= 1]
-    off = np.rad2deg(np.abs(straight_slope_rotation(*viewed(position).T, CAMERA) - turn_of(position)))
+    xi, eta = viewed(position).T
+    off = np.rad2deg(np.abs(straight_slope_rotation(xi, eta, CAMERA) - turn_of(position)))
     assert off.max() == pytest.approx(12.5, abs=0.06)
-    assert off[radius <= np.tan(np.deg2rad(25)) / REST_TANGENT].max() == pytest.approx(4.4, abs=0.06)
+    assert off[radius <= np.tan(np.deg2rad(25)) / mirror.REST_TANGENT].max() == pytest.approx(4.4, abs=0.06)
     near = straight_slope_rotation(1.0, 0.0, CAMERA) / turn_of(aim(1.0, 0.0))
     assert near == pytest.approx(0.7071, abs=1e-4)
 
@@ -197,9 +190,9 @@ def test_e8_the_slope_is_wrong_by_up_to_twelve_and_a_half_degrees():
 def test_e8_the_slope_is_ill_conditioned():
     """40 urad of noise: 47 deg rms by slope, 1.8e-2 px by position; %.6f: 1.6 px by slope, 7.5e-5 px by position."""
     exact = sweep_of_1450(1000.0)
-    normal = direction_to_normal(position_to_direction(exact))
+    normal = mirror.direction_to_normal(mirror.position_to_direction(exact))
     shaken = normal + np.random.default_rng(0).normal(0, 40e-6, normal.shape)
-    noisy = normal_to_position(shaken / np.linalg.norm(shaken, axis=-1, keepdims=True))
+    noisy = mirror.normal_to_position(shaken / np.linalg.norm(shaken, axis=-1, keepdims=True))
 
     def rms(of: np.ndarray) -> float:
         return float(np.sqrt(np.mean(of**2)))
@@ -221,7 +214,7 @@ def test_e8_the_slope_is_ill_conditioned():
 @pytest.mark.parametrize(("xi_px", "seed_deg", "psi_deg"), [(0, 90.0, 0.0), (500, 87.9, 3.0), (2365, 79.7, 13.6)])
 def test_e9_the_slope_is_vertical_on_the_rigs_own_path(xi_px: float, seed_deg: float, psi_deg: float):
     """With the axes of code seen in public the scan runs along Y: -atan(dY/dX) is near 90 deg, lines hardly turn."""
-    mounted = Mounting(axes="y,-x").to_device(aim(xi_px, np.array([-0.5, 0.5])))
+    mounted = mirror.Mounting(axes="y,-x").to_device(aim(xi_px, np.array([-0.5, 0.5])))
     assert np.abs(np.rad2deg(slope_rotation(mounted))) == pytest.approx(seed_deg, abs=0.06)
     assert np.rad2deg(turn_of(aim(xi_px, 0.0))) == pytest.approx(psi_deg, abs=0.06)
 
@@ -243,8 +236,8 @@ def test_e11_speed_needs_the_pitch_and_the_frame_period():
     paper = sensor_mm / CAMERA.focal_length_mm * 30.0 / (CAMERA.exposure_ms * 1e-3)
     assert paper / (IFOV * 30.0 / frame_s) == pytest.approx(640)
     for tilt, axis in ((IFOV / 2 * E1, 1), (IFOV / np.sqrt(2) * np.array([0.0, 1, 0]), 0)):
-        moved = position_to_direction(normal_to_position((E3 + tilt) / np.linalg.norm(E3 + tilt)))
-        assert np.abs(direction_to_scene(moved) / IFOV)[axis] == pytest.approx(1, abs=1e-6)
+        moved = mirror.position_to_direction(mirror.normal_to_position((E3 + tilt) / np.linalg.norm(E3 + tilt)))
+        assert np.abs(mirror.direction_to_scene(moved) / IFOV)[axis] == pytest.approx(1, abs=1e-6)
 
 
 def test_e12_e13_rates_are_in_hertz_and_times_have_overheads():
@@ -296,7 +289,7 @@ def test_e18_counts_of_the_table_and_jumps_of_the_encoding():
 def greatest_errors(field_deg: float) -> list[float]:
     """Greatest error of each line model at the line ends, over the disk that reaches ``field_deg`` along X. [px]"""
     turn = np.linspace(0, 2 * np.pi, 60, endpoint=False)
-    radius = np.tan(np.deg2rad(field_deg)) / REST_TANGENT * np.array([1.0, 0.8, 0.4])
+    radius = np.tan(np.deg2rad(field_deg)) / mirror.REST_TANGENT * np.array([1.0, 0.8, 0.4])
     position = radius[:, None, None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
     greatest = np.zeros(len(LINE_MODELS))
     for swath, centre in viewed(position.reshape(-1, 2)):
@@ -326,8 +319,8 @@ def test_line_models_err_as_tabulated(field_deg: float, px: tuple[float, ...]):
 def test_lines_turn_and_stretch_over_the_field():
     """10240 x 10240 px: psi is 14.5 deg on average and 37.0 at most, mean tan 0.265; lines stretch by up to 1.26."""
     side = np.linspace(-5120, 5120, 257)
-    direction = scene_to_direction(np.stack(np.meshgrid(side, side), axis=-1) * IFOV)
-    psi, normal = np.abs(line_rotation(direction)), direction_to_normal(direction)
+    direction = mirror.scene_to_direction(np.stack(np.meshgrid(side, side), axis=-1) * IFOV)
+    psi, normal = np.abs(line_rotation(direction)), mirror.direction_to_normal(direction)
     assert np.rad2deg([psi.mean(), psi.max()]) == pytest.approx([14.5, 37.0], abs=0.06)
     assert np.tan(psi).mean() == pytest.approx(0.265, abs=5e-4)
     assert (0.5 / np.abs(normal[..., 0] * normal[..., 2])).max() == pytest.approx(1.26, abs=0.005)
@@ -335,7 +328,7 @@ def test_lines_turn_and_stretch_over_the_field():
 
 def test_six_decimals_are_enough_to_point():
     """1e-6 in XY moves the view by at most 0.0115 px."""
-    rest = direction_to_position(scene_to_direction([0.0, 0.0]))
+    rest = mirror.direction_to_position(mirror.scene_to_direction([0.0, 0.0]))
     step = [np.linalg.norm(viewed(rest + d) - viewed(rest)) for d in ((1e-6, 0.0), (0.0, 1e-6))]
-    assert step == pytest.approx([1e-6 * REST_TANGENT / IFOV, 1e-6 * 0.8427 / IFOV], rel=1e-3)
+    assert step == pytest.approx([1e-6 * mirror.REST_TANGENT / IFOV, 1e-6 * 0.8427 / IFOV], rel=1e-3)
     assert max(step) < 0.0115

@@ -10,21 +10,13 @@ from pyproj import Proj
 
 from pipeline.errors import PoseError
 from pipeline.geometry.grid import UNLABELLED
+from pipeline.ground import map_grid
 from pipeline.ground.field_places import PosedField
-from pipeline.ground.map_grid import (
-    GroundGrid,
-    ground_grid,
-    image_at,
-    median_footprint_m,
-    median_sink,
-    nearest_at,
-    round_step,
-)
 from pipeline.ground.view import pixel_places
 from tests.pipeline.ground.test_view import view
 
 
-def whole(grid: GroundGrid) -> np.ndarray:
+def whole(grid: map_grid.GroundGrid) -> np.ndarray:
     """Scene pixels of all of a map."""
     return grid.scene_pixels(slice(0, grid.shape[0]), slice(0, grid.shape[1]))
 
@@ -35,7 +27,7 @@ def whole(grid: GroundGrid) -> np.ndarray:
 def test_every_pixel_of_the_field_is_on_the_map(pose: dict[str, float]):
     """The centres of the scene's border pixels fall on the map, and none of the map lies far outside the field."""
     shape = (160, 200)
-    grid = ground_grid(view(**pose), shape)
+    grid = map_grid.ground_grid(view(**pose), shape)
     y, x = pixel_places(shape)
     corners = np.array([[y[0], x[0]], [y[0], x[-1]], [y[-1], x[0]], [y[-1], x[-1]]])
     place = grid.frame.ground_to_map(grid.frame.view.scene_to_ground(corners))
@@ -51,7 +43,7 @@ def test_every_pixel_of_the_field_is_on_the_map(pose: dict[str, float]):
 def test_mapped_area_is_the_sum_of_the_pixels_footprints(pose: dict[str, float]):
     """Map pixels seen, times the ground that each stands for, are the closed form's area of the field."""
     shape = (300, 260)
-    grid = ground_grid(view(**pose), shape)
+    grid = map_grid.ground_grid(view(**pose), shape)
     rig, areal_scale = grid.frame.view.pose, Proj(grid.frame.crs).get_factors
     pixel_m2 = grid.geobox.resolution.x**2 / areal_scale(rig.lon_deg, rig.lat_deg).areal_scale
     exact = np.nansum(PosedField(grid).pixel_areas_m2(slice(None), slice(None)))
@@ -60,7 +52,7 @@ def test_mapped_area_is_the_sum_of_the_pixels_footprints(pose: dict[str, float])
 
 def test_a_map_pixel_shows_the_scene_pixel_that_sees_it():
     """Forward from the scene pixel given by the geolocation grid, the ray ends in the map pixel's centre."""
-    grid = ground_grid(view(slope_deg=5.0), (80, 120))
+    grid = map_grid.ground_grid(view(slope_deg=5.0), (80, 120))
     pixels = whole(grid)
     row, column = (int(at) for at in np.argwhere(np.isfinite(pixels[..., 0]))[1234])
     place = pixels[row, column] - (np.array([80, 120]) - 1) / 2
@@ -72,7 +64,7 @@ def test_a_map_pixel_shows_the_scene_pixel_that_sees_it():
 @pytest.mark.parametrize("pose", [{}, {"lat_deg": 85.0}, {"lat_deg": -79.0, "slope_deg": 12.0}])
 def test_places_between_tie_points_are_the_exact_ones(pose: dict[str, float], step: float, bound: float):
     """Linear between exact places every 32 pixels, map pixels lie where PROJ puts them, in parts of a pixel."""
-    grid = ground_grid(view(**({"height_m": 1000.0, "tilt_deg": 80.0} | pose)), (900, 900), resolution_m=step)
+    grid = map_grid.ground_grid(view(**({"height_m": 1000.0, "tilt_deg": 80.0} | pose)), (900, 900), resolution_m=step)
     rows, columns = (slice(size // 3, size // 3 + 75) for size in grid.shape)
     x, y = (np.arange(part.start, part.stop) + 0.5 for part in (columns, rows))
     affine = grid.geobox.affine
@@ -84,16 +76,16 @@ def test_places_between_tie_points_are_the_exact_ones(pose: dict[str, float], st
 def test_resolution_is_the_median_footprint_rounded():
     """The default lies within a ratio of 1.16 of the median footprint; one asked for is kept."""
     rig = view()
-    median = median_footprint_m(rig, (200, 200))
-    step = ground_grid(rig, (200, 200)).geobox.resolution.x
+    median = map_grid.median_footprint_m(rig, (200, 200))
+    step = map_grid.ground_grid(rig, (200, 200)).geobox.resolution.x
     assert abs(np.log(step / median)) < np.log(1.16)
-    assert step == round_step(step) == float(f"{step:.1e}")
-    assert ground_grid(rig, (200, 200), resolution_m=0.0123).geobox.resolution.x == pytest.approx(0.0123)
+    assert step == map_grid.round_step(step) == float(f"{step:.1e}")
+    assert map_grid.ground_grid(rig, (200, 200), resolution_m=0.0123).geobox.resolution.x == pytest.approx(0.0123)
 
 
 def test_grids_of_two_days_fraction_their_pixels():
     """A rig moved by a metre has another map, with pixels at the same multiples of the resolution."""
-    here, there = (ground_grid(view(lat_deg=52.1 + shift), (90, 90)) for shift in (0.0, 1e-5))
+    here, there = (map_grid.ground_grid(view(lat_deg=52.1 + shift), (90, 90)) for shift in (0.0, 1e-5))
     offset = (here.geobox.affine.f - there.geobox.affine.f) / here.geobox.resolution.x
     assert offset == pytest.approx(round(offset), abs=1e-4)
     assert abs(offset) > 10
@@ -101,28 +93,28 @@ def test_grids_of_two_days_fraction_their_pixels():
 
 def test_far_pixels_are_left_out_and_counted():
     """Towards the horizon a pixel covers ever more: the map ends, and all pixels are accounted for."""
-    grid = ground_grid(view(tilt_deg=0.5), (400, 300))
+    grid = map_grid.ground_grid(view(tilt_deg=0.5), (400, 300))
     counts = grid.counts()
     assert all(count > 0 for count in counts.values())
     assert sum(counts.values()) == 400 * 300
     assert grid.shape[0] * grid.shape[1] < 1.4 * 8 * 400 * 300  # rounded
-    assert grid.least_sink == pytest.approx(median_sink(grid.frame.view, (400, 300)) / 4)
+    assert grid.least_sink == pytest.approx(map_grid.median_sink(grid.frame.view, (400, 300)) / 4)
     nearest_sky = np.nanmin(whole(grid)[..., 0]) - 199.5
     side = np.sqrt(grid.frame.view.area_m2([nearest_sky, 0.0]))
-    assert side == pytest.approx(8 * median_footprint_m(grid.frame.view, (400, 300)), rel=0.2)
+    assert side == pytest.approx(8 * map_grid.median_footprint_m(grid.frame.view, (400, 300)), rel=0.2)
 
 
 def test_a_resolution_too_fine_for_memory_is_refused():
     """The message names the finest that goes, and the median footprint."""
     with pytest.raises(PoseError, match=r"resolution_m = 1e-05 .* 64 times the scene's .*; use 0\.\d+ or more"):
-        ground_grid(view(), (100, 100), resolution_m=1e-5)
+        map_grid.ground_grid(view(), (100, 100), resolution_m=1e-5)
 
 
 def test_the_nearest_pixel_is_read_and_no_other():
     """Halves of pixels belong to them up to the border; NaN has no class."""
     classes = np.arange(12, dtype=np.uint8).reshape(3, 4)
     places = np.array([[[-0.5, -0.5], [0.49, 0.51], [2.5, 3.5], [np.nan, 1.0]]])
-    assert nearest_at(classes, places, UNLABELLED).tolist() == [[0, 1, 11, UNLABELLED]]
+    assert map_grid.nearest_at(classes, places, UNLABELLED).tolist() == [[0, 1, 11, UNLABELLED]]
 
 
 @given(seed=st.integers(0, 2**16), factor=st.integers(1, 9), rows=st.integers(1, 20), columns=st.integers(1, 20))
@@ -133,8 +125,8 @@ def test_a_patch_is_read_at_every_pixel_of_it(seed: int, factor: int, rows: int,
     places = rng.uniform(-0.5, [rows - 0.5, columns - 0.5], (5, 4, 2))
     places[0, 0] = np.nan
     fine = patch_index.repeat(factor, axis=0).repeat(factor, axis=1)[:rows, :columns]
-    found = nearest_at(patch_index, places, np.nan, factor=factor)
-    np.testing.assert_array_equal(found, nearest_at(fine, places, np.nan))
+    found = map_grid.nearest_at(patch_index, places, np.nan, factor=factor)
+    np.testing.assert_array_equal(found, map_grid.nearest_at(fine, places, np.nan))
     assert found.dtype == np.float32
     assert np.isnan(found[0, 0])
 
@@ -144,9 +136,9 @@ def test_images_are_read_between_their_pixels():
     y, x = (np.arange(size) for size in (5, 6))
     ramp = (y[:, None] * 2 + x).astype(np.float32)[..., None]
     places = np.array([[[0.75, 1.5], [4.4, 2.0], [np.nan, np.nan]]])
-    found = image_at(ramp, places)[0, :, 0]
+    found = map_grid.image_at(ramp, places)[0, :, 0]
     assert found[:2] == pytest.approx([3.0, 10.0], abs=1e-5)
     assert np.isnan(found[2])
     ramp[0, 0] = np.nan
-    assert np.isnan(image_at(ramp, np.array([[[0.0, 0.0]]]))).all()
-    assert image_at(ramp, np.array([[[0.0, 0.75]]]))[0, 0, 0] == pytest.approx(1.0)
+    assert np.isnan(map_grid.image_at(ramp, np.array([[[0.0, 0.0]]]))).all()
+    assert map_grid.image_at(ramp, np.array([[[0.0, 0.75]]]))[0, 0, 0] == pytest.approx(1.0)

@@ -10,18 +10,9 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import ArchiveError
+from storage.archive import lineage
 from storage.archive.archive import Archive
 from storage.archive.keys import in_text
-from storage.archive.lineage import (
-    ABSENT,
-    Catalogue,
-    Change,
-    changes_between,
-    find_product,
-    flatten,
-    rests_on,
-    version_before,
-)
 from storage.archive.records import Run
 from storage.remote.opening import verify_archive
 from tests.storage.small_archive import flip, rewrite, small_survey
@@ -30,10 +21,10 @@ from tests.storage.small_archive import flip, rewrite, small_survey
 def test_inputs_and_dependents_are_followed_all_the_way(tmp_path: Path, archive: Archive) -> None:
     """A map rests on its mosaic and, through it and directly, on the raw lines."""
     small = small_survey(archive)
-    catalogue = Catalogue.read(tmp_path)
+    catalogue = lineage.Catalogue.read(tmp_path)
     assert catalogue.ancestors([small.map.uri]) == {small.mosaic.uri, small.raw.uri}
     assert catalogue.inputs_first(catalogue.stores) == [small.raw.uri, small.mosaic.uri, small.map.uri]
-    assert [ref.uri for ref in rests_on(tmp_path, [small.mosaic])] == [small.raw.uri, small.mosaic.uri]
+    assert [ref.uri for ref in lineage.rests_on(tmp_path, [small.mosaic])] == [small.raw.uri, small.mosaic.uri]
     assert [run.folder for run in catalogue.named_by(small.raw.uri)] == [small.run]
     assert catalogue.roles(small.raw.uri) == {"capture_coarse"}
 
@@ -52,7 +43,7 @@ def test_any_manifest_can_be_read_or_is_told_damaged(tmp_path: Path, archive: Ar
     """Nothing a manifest says ends in a traceback, or in reading a file elsewhere."""
     small = small_survey(archive)
     (small.mosaic.path / "manifest.json").write_text(content)
-    catalogue = Catalogue.read(tmp_path)
+    catalogue = lineage.Catalogue.read(tmp_path)
     problem = catalogue.stores[small.mosaic.uri].problem
     assert problem.startswith("manifest.json is damaged")
     assert catalogue.inputs_of(small.mosaic.uri) == []
@@ -66,23 +57,23 @@ def test_odd_inputs_are_borne(tmp_path: Path, archive: Archive, inputs: object) 
     small = small_survey(archive)
     odd = {"inputs": inputs, "params": 3, "created": None, "libraries": []}
     rewrite(small.map.path / "manifest.json", **odd)
-    catalogue = Catalogue.read(tmp_path)
-    assert version_before(catalogue, small.map.uri) is None
+    catalogue = lineage.Catalogue.read(tmp_path)
+    assert lineage.version_before(catalogue, small.map.uri) is None
     assert all(isinstance(one.uri, str) for one in verify_archive(archive))
 
 
 def test_what_changed_is_followed_to_where_it_began(tmp_path: Path, archive: Archive) -> None:
     """The map has another mosaic, which has another kernel; the version before is that of the same scene and part."""
     first, _, second = (small_survey(archive, kernel=kernel) for kernel in ("bilinear", "nearest", "catmull-rom"))
-    catalogue = Catalogue.read(tmp_path)
-    before = version_before(catalogue, second.map.uri)
+    catalogue = lineage.Catalogue.read(tmp_path)
+    before = lineage.version_before(catalogue, second.map.uri)
     assert before.ref != first.map
-    changes = changes_between(catalogue, before, catalogue.stores[second.map.uri])
+    changes = lineage.changes_between(catalogue, before, catalogue.stores[second.map.uri])
     assert changes == [
-        Change("segment", "input", "rectify", catalogue.inputs_of(before.ref.uri)[0], second.mosaic.uri),
-        Change("rectify", "parameter", "kernel", "nearest", "catmull-rom"),
+        lineage.Change("segment", "input", "rectify", catalogue.inputs_of(before.ref.uri)[0], second.mosaic.uri),
+        lineage.Change("rectify", "parameter", "kernel", "nearest", "catmull-rom"),
     ]
-    assert version_before(catalogue, first.map.uri) is None
+    assert lineage.version_before(catalogue, first.map.uri) is None
 
 
 def test_versions_and_libraries_count_as_changes(tmp_path: Path, archive: Archive) -> None:
@@ -90,14 +81,14 @@ def test_versions_and_libraries_count_as_changes(tmp_path: Path, archive: Archiv
     for key, version, params in (("one", 1, {"a": {"b": 1}, "c": 2}), ("two", 2, {"a": {"b": 3}, "d": [1, 2]})):
         with archive.publish("segment", key, version=version, params=params):
             pass
-    catalogue = Catalogue.read(tmp_path)
+    catalogue = lineage.Catalogue.read(tmp_path)
     one, two = (catalogue.stores[f"stages/segment/{key}"] for key in ("one", "two"))
-    assert version_before(catalogue, "stages/segment/two") == one
-    assert [(c.kind, c.name, c.old, c.new) for c in changes_between(catalogue, one, two)] == [
+    assert lineage.version_before(catalogue, "stages/segment/two") == one
+    assert [(c.kind, c.name, c.old, c.new) for c in lineage.changes_between(catalogue, one, two)] == [
         ("version", "stage", "1", "2"),
         ("parameter", "a.b", 1, 3),
-        ("parameter", "c", 2, ABSENT),
-        ("parameter", "d", ABSENT, [1, 2]),
+        ("parameter", "c", 2, lineage.ABSENT),
+        ("parameter", "d", lineage.ABSENT, [1, 2]),
     ]
 
 
@@ -110,7 +101,7 @@ def test_raw_lines_of_which_nobody_says_their_origin_are_the_only_copy(tmp_path:
         pass
 
     def only() -> list[str]:
-        catalogue = Catalogue.read(tmp_path)
+        catalogue = lineage.Catalogue.read(tmp_path)
         return [uri.rpartition("/")[2] for uri in catalogue.stores if catalogue.is_only_copy(uri)]
 
     assert only() == ["bare", "rig"]
@@ -123,7 +114,7 @@ def test_raw_lines_of_which_nobody_says_their_origin_are_the_only_copy(tmp_path:
 
 def test_nested_parameters_have_dotted_names() -> None:
     """Lists of tables by number, lists of numbers as one value."""
-    assert flatten({"a": {"b": 1}, "s": [{"x": 1}, {"x": 2}], "l": [1, 2], "e": {}}) == {
+    assert lineage.flatten({"a": {"b": 1}, "s": [{"x": 1}, {"x": 2}], "l": [1, 2], "e": {}}) == {
         "a.b": 1,
         "s[0].x": 1,
         "s[1].x": 2,
@@ -135,12 +126,12 @@ def test_nested_parameters_have_dotted_names() -> None:
 def test_products_go_by_many_names(tmp_path: Path, archive: Archive) -> None:
     """Address, address of a file in it, stage and key, beginning of a key, run, and name in the newest run."""
     small = small_survey(archive)
-    catalogue = Catalogue.read(tmp_path)
+    catalogue = lineage.Catalogue.read(tmp_path)
     key = small.map.key
     for text in (small.map.uri, f"{small.map.uri}/class_map.zarr/", f"segment/{key}", key, key[:8], "class_map"):
-        assert find_product(catalogue, text) == small.map.uri
+        assert lineage.find_product(catalogue, text) == small.map.uri
     for text in (small.run.name, f"runs/{small.run.name}", f"runs/{small.run.name}/receipt.json"):
-        found = find_product(catalogue, text)
+        found = lineage.find_product(catalogue, text)
         assert isinstance(found, Run)
         assert found.folder == small.run
 
@@ -150,25 +141,25 @@ def test_a_stage_narrows_the_beginning_of_a_key(tmp_path: Path, archive: Archive
     for stage, key in (("rectify", "abcd1"), ("segment", "abcd1"), ("segment", "abcd2"), ("segment", "abce3")):
         with archive.publish(stage, key):
             pass
-    catalogue = Catalogue.read(tmp_path)
+    catalogue = lineage.Catalogue.read(tmp_path)
     for text in ("rectify/abcd", "stages/rectify/abcd", "stages/rectify/abcd1"):
-        assert find_product(catalogue, text) == "stages/rectify/abcd1"
-    assert find_product(catalogue, "abce") == "stages/segment/abce3"
+        assert lineage.find_product(catalogue, text) == "stages/rectify/abcd1"
+    assert lineage.find_product(catalogue, "abce") == "stages/segment/abce3"
     with pytest.raises(ArchiveError, match=r"segment/abcd begins 2 stores: .*abcd1, stages/segment/abcd2; give more"):
-        find_product(catalogue, "segment/abcd")
+        lineage.find_product(catalogue, "segment/abcd")
     with pytest.raises(ArchiveError, match="abcd begins 3 stores"):
-        find_product(catalogue, "abcd")
+        lineage.find_product(catalogue, "abcd")
 
 
 def test_a_products_name_is_of_the_newest_run_that_can_be_read(tmp_path: Path, archive: Archive) -> None:
     """A damaged one after it does not hide it."""
     made = [small_survey(archive, seed=seed) for seed in range(3)]
-    catalogue = Catalogue.read(tmp_path)
-    assert find_product(catalogue, "class_map") == made[2].map.uri
-    assert isinstance(newest := find_product(catalogue, "latest"), Run)
+    catalogue = lineage.Catalogue.read(tmp_path)
+    assert lineage.find_product(catalogue, "class_map") == made[2].map.uri
+    assert isinstance(newest := lineage.find_product(catalogue, "latest"), Run)
     assert newest.folder == made[2].run
     flip(made[2].run / "receipt.json")
-    assert find_product(Catalogue.read(tmp_path), "class_map") == made[1].map.uri
+    assert lineage.find_product(lineage.Catalogue.read(tmp_path), "class_map") == made[1].map.uri
 
 
 def test_a_version_before_is_of_the_same_scene_and_can_be_read(tmp_path: Path, archive: Archive) -> None:
@@ -184,8 +175,8 @@ def test_a_version_before_is_of_the_same_scene_and_can_be_read(tmp_path: Path, a
         with archive.publish("segment", key, params=params):
             pass
     flip(tmp_path / "stages/segment/bad1/manifest.json", at=30)
-    catalogue = Catalogue.read(tmp_path)
-    before = [version_before(catalogue, f"stages/segment/{key}") for key in ("new1", "oth1", "old2", "old1")]
+    catalogue = lineage.Catalogue.read(tmp_path)
+    before = [lineage.version_before(catalogue, f"stages/segment/{key}") for key in ("new1", "oth1", "old2", "old1")]
     assert [one and one.ref.key for one in before] == ["old2", "old1", "old1", None]
 
 
@@ -206,9 +197,9 @@ def test_a_version_before_is_of_the_same_scene_and_can_be_read(tmp_path: Path, a
 def test_what_is_no_product_is_refused(tmp_path: Path, text: str, words: str) -> None:
     """With the nearest that there is; a product whose store has gone is told from a wrong name."""
     small_survey(Archive.open(tmp_path))
-    shutil.rmtree(tmp_path / str(in_text(Catalogue.read(tmp_path).runs[-1].products["mosaic"])))
+    shutil.rmtree(tmp_path / str(in_text(lineage.Catalogue.read(tmp_path).runs[-1].products["mosaic"])))
     with pytest.raises(ArchiveError, match=words):
-        find_product(Catalogue.read(tmp_path), text)
+        lineage.find_product(lineage.Catalogue.read(tmp_path), text)
 
 
 @pytest.mark.parametrize("well", [False, True])
@@ -220,7 +211,7 @@ def test_a_damaged_receipt_names_what_its_manifest_recorded(tmp_path: Path, arch
         receipt.write_text(receipt.read_text().replace('"seed": 0', '"seed": 7'))
     else:
         flip(receipt)
-    (run,) = Catalogue.read(tmp_path).runs
+    (run,) = lineage.Catalogue.read(tmp_path).runs
     assert (run.receipt, run.settings) == ({}, {})
     assert "receipt.json has changed since it was published" in str(run.problem)
     assert run.names == {small.raw.uri, small.mosaic.uri, small.map.uri}
@@ -231,9 +222,9 @@ def test_settings_are_those_of_the_manifest_where_it_has_any(tmp_path: Path, arc
     with archive.new_run("farm") as draft:
         draft.write_file("receipt.json", json.dumps({"settings": {"seed": 1}}))
         draft.publish(settings={"seed": 2})
-    assert Catalogue.read(tmp_path).runs[0].settings == {"seed": 2}
+    assert lineage.Catalogue.read(tmp_path).runs[0].settings == {"seed": 2}
     flip(archive.runs()[0] / "receipt.json")
-    assert Catalogue.read(tmp_path).runs[0].settings == {"seed": 2}
+    assert lineage.Catalogue.read(tmp_path).runs[0].settings == {"seed": 2}
 
 
 def test_a_run_that_is_no_table_is_borne(tmp_path: Path, archive: Archive) -> None:
@@ -241,5 +232,5 @@ def test_a_run_that_is_no_table_is_borne(tmp_path: Path, archive: Archive) -> No
     for receipt in ("[1, 2]", '{"stages": [3, {"key": 4}], "products": 5, "settings": null}', '"text"'):
         with archive.new_run("odd") as draft:
             draft.write_file("receipt.json", receipt)
-    catalogue = Catalogue.read(tmp_path)
+    catalogue = lineage.Catalogue.read(tmp_path)
     assert [(run.names, run.products, run.settings) for run in catalogue.runs] == [(frozenset(), {}, {})] * 3

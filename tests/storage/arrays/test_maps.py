@@ -14,22 +14,14 @@ from pyproj import CRS
 
 from pipeline.errors import IncompleteStoreError, PoseError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
-from storage.arrays.class_maps import (
-    CONFIDENCE_STEP,
-    ClassMap,
-    ClassNames,
-    class_counts,
-    create_class_map,
-    load_class_map,
-    write_class_tile,
-)
+from storage.arrays import class_maps
 from storage.arrays.georeference import ON_THE_MAP, AngularGrid, load_geobox, map_attributes, map_coordinates
 from storage.arrays.ground_maps import BLOCK, GroundMapWriter, load_ground_map
 from storage.arrays.layout import NO_CLASS, SHARD_COLUMNS, SHARD_ROWS, blank_pixels, create_group, write_image
 from tests.storage.small_archive import write_class_map
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
-LEGEND = ClassNames(("sugar beet", "bare soil"), np.array([[10, 200, 30], [120, 90, 60]], np.uint8))
+LEGEND = class_maps.ClassNames(("sugar beet", "bare soil"), np.array([[10, 200, 30], [120, 90, 60]], np.uint8))
 
 
 def begin(path: Path, shape: tuple[int, int] = (100, 90), *, goes_on: bool = False) -> GroundMapWriter:
@@ -243,39 +235,41 @@ def _drawn() -> tuple[np.ndarray, np.ndarray]:
 def test_tiles_in_any_order_are_the_map_at_once(tmp_path: Path) -> None:
     """Not a byte tells whether a map was written at once or in whole shards."""
     (classes, confidence), grid = _drawn(), AngularGrid(1e-4, SHAPE)
-    write_class_map(tmp_path / "one.zarr", ClassMap(classes, confidence, LEGEND.names, LEGEND.colours, grid))
-    create_class_map(tmp_path / "tiles.zarr", SHAPE, LEGEND, grid=grid)
-    begun = load_class_map(tmp_path / "tiles.zarr")
+    write_class_map(tmp_path / "one.zarr", class_maps.ClassMap(classes, confidence, LEGEND.names, LEGEND.colours, grid))
+    class_maps.create_class_map(tmp_path / "tiles.zarr", SHAPE, LEGEND, grid=grid)
+    begun = class_maps.load_class_map(tmp_path / "tiles.zarr")
     assert (begun.classes == 255).all()  # what is not written yet
     assert np.isnan(begun.confidence).all()
     for rows, columns in [((64, 150), (640, 700)), ((0, 64), (0, 700)), ((64, 150), (0, 640))]:
         part = np.s_[slice(*rows), slice(*columns)]
-        write_class_tile(tmp_path / "tiles.zarr", (rows[0], columns[0]), classes[part], confidence[part])
+        class_maps.write_class_tile(tmp_path / "tiles.zarr", (rows[0], columns[0]), classes[part], confidence[part])
     assert _contents(tmp_path / "one.zarr") == _contents(tmp_path / "tiles.zarr")
 
 
 def test_what_a_tile_lacks_is_told(tmp_path: Path) -> None:
     """A class without a name, and a map that is not there."""
-    create_class_map(tmp_path / "c.zarr", (20, 30), LEGEND)
+    class_maps.create_class_map(tmp_path / "c.zarr", (20, 30), LEGEND)
     ones = np.ones((20, 30), np.uint8)
     with pytest.raises(ShapeError, match="class 2 is in the map, but only 2 classes have names"):
-        write_class_tile(tmp_path / "c.zarr", (0, 0), 2 * ones, ones.astype(np.float32))
+        class_maps.write_class_tile(tmp_path / "c.zarr", (0, 0), 2 * ones, ones.astype(np.float32))
     with pytest.raises(IncompleteStoreError, match=r"none\.zarr cannot be read"):
-        write_class_tile(tmp_path / "none.zarr", (0, 0), ones, ones.astype(np.float32))
+        class_maps.write_class_tile(tmp_path / "none.zarr", (0, 0), ones, ones.astype(np.float32))
 
 
 def test_classes_are_taken_from_pixels_and_from_no_other(tmp_path: Path) -> None:
     """In whichever shards they lie; a map of which none is taken keeps its bytes."""
     classes, confidence = _drawn()
-    write_class_map(tmp_path / "m.zarr", ClassMap(classes, confidence, LEGEND.names, LEGEND.colours))
+    write_class_map(tmp_path / "m.zarr", class_maps.ClassMap(classes, confidence, LEGEND.names, LEGEND.colours))
     before, where = _contents(tmp_path / "m.zarr"), np.zeros(SHAPE, np.bool_)
     blank_pixels(tmp_path / "m.zarr", where, NO_CLASS)
     assert _contents(tmp_path / "m.zarr") == before
     where[60:70, 630:650], where[149, 699] = True, True
     blank_pixels(tmp_path / "m.zarr", where, NO_CLASS)
-    found = load_class_map(tmp_path / "m.zarr")
+    found = class_maps.load_class_map(tmp_path / "m.zarr")
     np.testing.assert_array_equal(found.classes, np.where(where, 255, classes))
-    np.testing.assert_allclose(found.confidence, np.where(where, np.nan, confidence), atol=CONFIDENCE_STEP / 2)
+    np.testing.assert_allclose(
+        found.confidence, np.where(where, np.nan, confidence), atol=class_maps.CONFIDENCE_STEP / 2
+    )
 
 
 def test_class_map_round_trip(tmp_path: Path) -> None:
@@ -284,12 +278,12 @@ def test_class_map_round_trip(tmp_path: Path) -> None:
     classes[0, :9] = 255
     confidence = np.where(classes == 255, np.nan, 0.75).astype(np.float32)
     colours = np.array([[0, 0, 0], [0, 255, 0], [255, 0, 0]], np.uint8)
-    made = ClassMap(classes, confidence, ("bare soil", "crop", "weed"), colours, AngularGrid(1e-4, (50, 70)))
+    made = class_maps.ClassMap(classes, confidence, ("bare soil", "crop", "weed"), colours, AngularGrid(1e-4, (50, 70)))
     write_class_map(tmp_path / "c.zarr", made)
-    found = load_class_map(tmp_path / "c.zarr")
+    found = class_maps.load_class_map(tmp_path / "c.zarr")
     np.testing.assert_array_equal(found.classes, classes)
     np.testing.assert_array_equal(found.colours, colours)
-    assert class_counts(found.classes, 2).tolist() == [(classes == 0).sum(), (classes == 1).sum()]
+    assert class_maps.class_counts(found.classes, 2).tolist() == [(classes == 0).sum(), (classes == 1).sum()]
     assert found.names == ("bare soil", "crop", "weed")
     with xr.open_zarr(tmp_path / "c.zarr", consolidated=False) as data:
         assert data["classes"].attrs["flag_meanings"] == "bare_soil crop weed"

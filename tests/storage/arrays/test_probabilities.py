@@ -12,24 +12,10 @@ from hypothesis import strategies as st
 
 from models.reading.prior_map import FAINTEST as FAINTEST_BELIEVED
 from pipeline.errors import IncompleteStoreError
-from storage.arrays.class_maps import (
-    FAINTEST,
-    LEAST,
-    NOTHING,
-    STEP,
-    UNLIKELY,
-    ClassNames,
-    ProbabilityStore,
-    create_probabilities,
-    drop_changes,
-    packed_probabilities,
-    write_changes,
-    write_changes_tile,
-    write_probabilities_tile,
-)
+from storage.arrays import class_maps
 from storage.arrays.layout import open_group, write_image
 
-LEGEND = ClassNames(("soil", "maize", "weed"), np.arange(9, dtype=np.uint8).reshape(3, 3))
+LEGEND = class_maps.ClassNames(("soil", "maize", "weed"), np.arange(9, dtype=np.uint8).reshape(3, 3))
 SHAPE = (70, 50)
 
 
@@ -46,10 +32,10 @@ def drawn(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def stored(path: Path, seed: int = 0) -> Path:
     """A class probabilities of two tiles."""
     values, ages, light = drawn(seed)
-    create_probabilities(path, SHAPE, LEGEND)
+    class_maps.create_probabilities(path, SHAPE, LEGEND)
     for top, bottom in ((0, 64), (64, 70)):
-        write_probabilities_tile(
-            path, (top, 0), packed_probabilities(values[top:bottom]), ages[top:bottom], light[top:bottom]
+        class_maps.write_probabilities_tile(
+            path, (top, 0), class_maps.packed_probabilities(values[top:bottom]), ages[top:bottom], light[top:bottom]
         )
     return path
 
@@ -58,11 +44,13 @@ def test_visits_of_every_hour_do_not_stop_the_clock(tmp_path: Path) -> None:
     """Three days of them make a pixel three days older, and its light fades by the hour."""
     values, age, light = drawn(0)
     age, light = np.zeros_like(age), np.ones_like(light)
-    create_probabilities(tmp_path / "visits.zarr", SHAPE, LEGEND)
-    packed = packed_probabilities(values)
+    class_maps.create_probabilities(tmp_path / "visits.zarr", SHAPE, LEGEND)
+    packed = class_maps.packed_probabilities(values)
     for _ in range(72):
-        write_probabilities_tile(tmp_path / "visits.zarr", (0, 0), packed, age + 1 / 24, light * np.float32(0.998))
-        _, age, light = ProbabilityStore(tmp_path / "visits.zarr").read()
+        class_maps.write_probabilities_tile(
+            tmp_path / "visits.zarr", (0, 0), packed, age + 1 / 24, light * np.float32(0.998)
+        )
+        _, age, light = class_maps.ProbabilityStore(tmp_path / "visits.zarr").read()
     np.testing.assert_allclose(age, 3, atol=1e-3)
     np.testing.assert_allclose(light, 0.998**72, rtol=0.01)
 
@@ -72,7 +60,7 @@ def test_what_is_read_was_written_within_half_a_step(tmp_path_factory: pytest.Te
     """The likeliest class stays where no other is within a step; ages and light stay as they are, NaN where unknown."""
     path = stored(tmp_path_factory.mktemp("class_probabilities") / "class_probabilities.zarr", seed)
     values, ages, light = drawn(seed)
-    found, days, shown = ProbabilityStore(path).read()
+    found, days, shown = class_maps.ProbabilityStore(path).read()
     known = slice(3, None)
     assert np.isnan(found[:3]).all()
     assert np.isnan(days[:3]).all()
@@ -80,21 +68,21 @@ def test_what_is_read_was_written_within_half_a_step(tmp_path_factory: pytest.Te
     np.testing.assert_allclose(shown, light)
     np.testing.assert_allclose(np.exp(found[known]).sum(axis=-1), 1, atol=1e-5)
     first, second = np.sort(values[known], axis=-1)[..., -1], np.sort(values[known], axis=-1)[..., -2]
-    clear = first - second > STEP
+    clear = first - second > class_maps.STEP
     np.testing.assert_array_equal(found[known].argmax(axis=-1)[clear], values[known].argmax(axis=-1)[clear])
-    told = values[known] > LEAST
-    assert np.abs(found[known] - values[known])[told].max() < 1.5 * STEP
-    np.testing.assert_allclose(found[known][~told], UNLIKELY, atol=STEP)
+    told = values[known] > class_maps.LEAST
+    assert np.abs(found[known] - values[known])[told].max() < 1.5 * class_maps.STEP
+    np.testing.assert_allclose(found[known][~told], class_maps.UNLIKELY, atol=class_maps.STEP)
 
 
 def test_the_faintest_probabilities_is_the_faintest_that_is_stored() -> None:
     """Models and stores import nothing of each other, and mean the same least probability."""
-    assert FAINTEST == FAINTEST_BELIEVED
+    assert class_maps.FAINTEST == FAINTEST_BELIEVED
 
 
 def test_a_part_is_read_alone(tmp_path: Path) -> None:
     """Some rows and columns are those of the whole."""
-    store = ProbabilityStore(stored(tmp_path / "class_probabilities.zarr"))
+    store = class_maps.ProbabilityStore(stored(tmp_path / "class_probabilities.zarr"))
     whole, part = store.read(), store.read(slice(10, 66), slice(7, 9))
     for one, other in zip(whole, part, strict=True):
         np.testing.assert_array_equal(one[10:66, 7:9], other)
@@ -111,18 +99,18 @@ def test_xarray_unpacks_it(tmp_path: Path) -> None:
     assert opened.log_probability.dims == ("y", "x", "class")
     assert opened.age.attrs["units"] == "days"
     assert np.isnan(opened.log_probability.values[:3]).all()
-    told = np.where(values[3:] < LEAST, UNLIKELY, values[3:])
-    np.testing.assert_allclose(opened.log_probability.values[3:], told, atol=STEP / 2 + 1e-4)
+    told = np.where(values[3:] < class_maps.LEAST, class_maps.UNLIKELY, values[3:])
+    np.testing.assert_allclose(opened.log_probability.values[3:], told, atol=class_maps.STEP / 2 + 1e-4)
     np.testing.assert_allclose(opened.age.values[3:].astype(float), ages[3:], rtol=1e-6)
 
 
 def test_changes_are_there_once_written(tmp_path: Path) -> None:
     """A first visit has none."""
-    assert ProbabilityStore(stored(tmp_path / "first.zarr")).changes() is None
+    assert class_maps.ProbabilityStore(stored(tmp_path / "first.zarr")).changes() is None
     path, old = gone_on(tmp_path / "later.zarr")
-    assert ProbabilityStore(path).changes() is None
-    write_changes(path, np.array([[0.0, 0.5]], np.float32), 16)
-    found = ProbabilityStore(path).changes()
+    assert class_maps.ProbabilityStore(path).changes() is None
+    class_maps.write_changes(path, np.array([[0.0, 0.5]], np.float32), 16)
+    found = class_maps.ProbabilityStore(path).changes()
     assert (found.fraction.tolist(), found.patch_px) == ([[0.0, 0.5]], 16)
     np.testing.assert_array_equal(found.old_class, old)
 
@@ -130,16 +118,16 @@ def test_changes_are_there_once_written(tmp_path: Path) -> None:
 def gone_on(path: Path) -> tuple[Path, np.ndarray]:
     """A class probabilities that goes on from an earlier one, and what some of its pixels were."""
     old = np.random.default_rng(1).choice(np.array([0, 2, 255], np.uint8), SHAPE)
-    create_probabilities(path, SHAPE, LEGEND, goes_on=True)
+    class_maps.create_probabilities(path, SHAPE, LEGEND, goes_on=True)
     for top, bottom in ((0, 64), (64, 70)):
-        write_changes_tile(path, (top, 0), old[top:bottom])
+        class_maps.write_changes_tile(path, (top, 0), old[top:bottom])
     return path, old
 
 
 def test_what_pixels_were_is_kept_with_its_names(tmp_path: Path) -> None:
     """Written in tiles; plain xarray reads whole numbers and CF flags, 255 where nothing changed."""
     path, old = gone_on(tmp_path / "class_probabilities.zarr")
-    np.testing.assert_array_equal(ProbabilityStore(path).old_class(), old)
+    np.testing.assert_array_equal(class_maps.ProbabilityStore(path).old_class(), old)
     with xr.open_zarr(path, consolidated=False) as opened:
         found = opened["changed_from"]
         np.testing.assert_array_equal(found.values, old)
@@ -151,35 +139,37 @@ def test_what_pixels_were_is_kept_with_its_names(tmp_path: Path) -> None:
 def test_a_first_probabilities_has_nothing_that_pixels_were(tmp_path: Path) -> None:
     """Nor has one that goes on from none after all; tiles of either are refused."""
     first, (dropped, old) = stored(tmp_path / "first.zarr"), gone_on(tmp_path / "dropped.zarr")
-    drop_changes(dropped)
+    class_maps.drop_changes(dropped)
     for path in (first, dropped):
-        assert ProbabilityStore(path).old_class() is None
+        assert class_maps.ProbabilityStore(path).old_class() is None
         with pytest.raises(IncompleteStoreError, match="changed_from"):
-            write_changes_tile(path, (0, 0), old[:64])
+            class_maps.write_changes_tile(path, (0, 0), old[:64])
     assert not list(dropped.rglob("*changed_from*"))
 
 
 def test_a_store_that_is_not_there_is_refused(tmp_path: Path) -> None:
     """By its place."""
     with pytest.raises(IncompleteStoreError, match="cannot be read"):
-        ProbabilityStore(tmp_path / "none.zarr")
+        class_maps.ProbabilityStore(tmp_path / "none.zarr")
     write_image(
         open_group(stored(tmp_path / "old.zarr"), "r+"), "log2_light", ("y", "x"), np.zeros(SHAPE, np.uint8), {}
     )
     with pytest.raises(IncompleteStoreError, match=r"has packed light, .*; reprocess computes it again"):
-        ProbabilityStore(tmp_path / "old.zarr")
+        class_maps.ProbabilityStore(tmp_path / "old.zarr")
 
 
 def test_certainty_is_not_mistaken_for_nothing(tmp_path: Path) -> None:
     """A probability of 1 is stored below the byte that stands for nothing known."""
     path = tmp_path / "class_probabilities.zarr"
-    create_probabilities(path, (4, 4), LEGEND)
+    class_maps.create_probabilities(path, (4, 4), LEGEND)
     sure = np.full((4, 4, 3), -50.0, np.float32)
     sure[..., 1] = 0.0
-    write_probabilities_tile(path, (0, 0), packed_probabilities(sure), *np.full((2, 4, 4), 1e9, np.float32))
-    found, days, light = ProbabilityStore(path).read()
+    class_maps.write_probabilities_tile(
+        path, (0, 0), class_maps.packed_probabilities(sure), *np.full((2, 4, 4), 1e9, np.float32)
+    )
+    found, days, light = class_maps.ProbabilityStore(path).read()
     assert (found.argmax(axis=-1) == 1).all()
     assert np.exp(found[..., 1]).min() > 0.99
     assert np.isfinite(days).all()
     assert light.min() > 30
-    assert NOTHING == 255
+    assert class_maps.NOTHING == 255

@@ -18,17 +18,9 @@ from pipeline.signal.calibrate import calibrate
 from pipeline.signal.components import Components
 from pipeline.signal.condense import RESIDUAL_STEP, CondensedSweep, Condenser, ResidualLaw, differing_lines
 from pipeline.signal.subspace import SignalStatistics, find_components
+from storage.arrays import signal_cubes
 from storage.arrays.cubes import SweepHeader
 from storage.arrays.layout import LARGEST_SHORT, read_array
-from storage.arrays.signal_cubes import (
-    LineRows,
-    RestoredCube,
-    SignalCube,
-    SignalCubeWriter,
-    open_lines,
-    open_signal_cube,
-    open_signal_cubes,
-)
 from storage.readers.recordings import RESTORED, open_recording
 from tests.pipeline.signal.made_spectra import CAMERA, DARK, GAIN, MadeLines, field_of, raw_of
 from tests.storage.small_archive import flip
@@ -47,7 +39,7 @@ def lines_of(bands: int = BANDS, signal: float = 30.0) -> MadeLines:
 
 def store(
     path: Path, lines: MadeLines, *, step: float = 1.0, largest: float | None = None
-) -> tuple[SignalCube, CondensedSweep]:
+) -> tuple[signal_cubes.SignalCube, CondensedSweep]:
     """Condense lines and store them."""
     values, valid = calibrate(lines.raw, lines.references, saturated_dn=4095, position=lines.position)
     found = SignalStatistics(values.shape[2], values[..., 0].size)
@@ -57,16 +49,18 @@ def store(
     header = SweepHeader(lines.sweep, lines.references, bands, np.full(len(bands), 5.0), "sim", "2026-05-01T10:00:00")
     origin = np.zeros(len(bands)) if found.origin is None else found.origin
     reach = components.largest(found.largest + np.abs(origin - np.nan_to_num(components.mean)))
-    writer = SignalCubeWriter(path, header, components, step=step, largest=reach if largest is None else largest)
+    writer = signal_cubes.SignalCubeWriter(
+        path, header, components, step=step, largest=reach if largest is None else largest
+    )
     law = ResidualLaw.learned(found.spectra, components)
     done = Condenser(components, law, CAMERA, 1e-3, step).sweep(lines, writer.write)
     x, y = lines.position.T
-    facts = LineRows(lines.time_s, x, y, np.full(len(x), 100.0), lines.valid_line)
+    facts = signal_cubes.LineRows(lines.time_s, x, y, np.full(len(x), 100.0), lines.valid_line)
     writer.close(facts, done.rare, done.residuals)
-    return open_signal_cube(path), done
+    return signal_cubes.open_signal_cube(path), done
 
 
-def common(cube: SignalCube) -> NDArray[np.bool_]:
+def common(cube: signal_cubes.SignalCube) -> NDArray[np.bool_]:
     """Spectra that are not rare, (line, sample)."""
     found = np.ones(cube.shape[:2], np.bool_)
     found[cube.rare] = False
@@ -86,7 +80,7 @@ def test_what_is_stored_comes_back(tmp_path: Path) -> None:
     assert list(zip(*(part.tolist() for part in cube.rare), strict=True)) == RARE == [tuple(p) for p in done.rare]
     assert cube.simulation is None
     np.testing.assert_allclose(cube.components.axes @ cube.components.axes.T, np.eye(cube.shape[2]), atol=1e-9)
-    assert [one.sweep.name for one in open_signal_cubes(tmp_path)] == ["fine-0"]
+    assert [one.sweep.name for one in signal_cubes.open_signal_cubes(tmp_path)] == ["fine-0"]
 
 
 @pytest.mark.parametrize("step", [0.5, 1.0])
@@ -142,10 +136,10 @@ def test_no_line_of_the_store_differs(tmp_path: Path) -> None:
     assert differing_lines(lines, cube, CAMERA) == []
     scores = zarr.open_group(tmp_path / "fine-0.zarr", mode="r+")["scores"]
     scores[2, 99, 41] += 1
-    assert differing_lines(lines, open_signal_cube(tmp_path / "fine-0.zarr"), CAMERA) == [99]
+    assert differing_lines(lines, signal_cubes.open_signal_cube(tmp_path / "fine-0.zarr"), CAMERA) == [99]
 
 
-READS: dict[str, Callable[[SignalCube], object]] = {
+READS: dict[str, Callable[[signal_cubes.SignalCube], object]] = {
     "scores": lambda cube: cube.read(),
     "rare_residual": lambda cube: cube.spectra(0, 130),
 }
@@ -160,16 +154,16 @@ def test_a_flipped_bit_is_named(tmp_path: Path, name: str) -> None:
     chunk = next(path for path in (tmp_path / "fine-0.zarr" / name / "c").rglob("*") if path.is_file())
     flip(chunk, chunk.stat().st_size // 2)
     with pytest.raises(IncompleteStoreError, match=rf"/{name} cannot be read"):
-        READS[name](open_signal_cube(tmp_path / "fine-0.zarr"))
+        READS[name](signal_cubes.open_signal_cube(tmp_path / "fine-0.zarr"))
 
 
 def test_a_store_that_was_not_closed_is_incomplete(tmp_path: Path) -> None:
     """Without line facts there is no sweep."""
     lines = lines_of()
     header = SweepHeader(lines.sweep, lines.references, np.linspace(400, 1000, BANDS))
-    SignalCubeWriter(tmp_path / "a.zarr", header, Components.empty(BANDS), step=1.0, largest=1.0)
+    signal_cubes.SignalCubeWriter(tmp_path / "a.zarr", header, Components.empty(BANDS), step=1.0, largest=1.0)
     with pytest.raises(IncompleteStoreError, match="mirror_x"):
-        open_signal_cube(tmp_path / "a.zarr")
+        signal_cubes.open_signal_cube(tmp_path / "a.zarr")
 
 
 @pytest.mark.parametrize("by_mirror", [False, True])
@@ -181,8 +175,8 @@ def test_restored_lines_are_raw_numbers(tmp_path: Path, by_mirror: bool) -> None
     raw = np.rint((lines.raw.astype(float) - DARK) * light + DARK).astype(np.uint16)
     lines = replace(lines, raw=raw)
     cube, _ = store(tmp_path / "fine-0.zarr", lines)
-    restored = open_lines(tmp_path / "fine-0.zarr")
-    assert isinstance(restored, RestoredCube)
+    restored = signal_cubes.open_lines(tmp_path / "fine-0.zarr")
+    assert isinstance(restored, signal_cubes.RestoredCube)
     assert open_recording(tmp_path / "fine-0.zarr").notes == (RESTORED,)
     numbers = restored.read()
     assert (numbers.dtype, numbers.shape, restored.shape) == (np.uint16, raw.shape, raw.shape)
@@ -201,7 +195,7 @@ def test_restored_lines_count_unusable_spectra_as_saturated(tmp_path: Path) -> N
     lines = lines_of()
     lines.raw[7, 9] = 4095
     store(tmp_path / "fine-0.zarr", lines)
-    numbers = open_lines(tmp_path / "fine-0.zarr").read(0, 10)
+    numbers = signal_cubes.open_lines(tmp_path / "fine-0.zarr").read(0, 10)
     assert np.argwhere((numbers == 65_535).all(axis=2)).tolist() == [[7, 9]]
     _, valid = calibrate(numbers, lines.references, saturated_dn=4095)
     assert np.argwhere(~valid).tolist() == [[7, 9]]
@@ -225,7 +219,7 @@ def test_lines_without_light_are_stored(tmp_path: Path) -> None:
     assert not cube.usable.any()
     assert np.isnan(cube.spectra(0, 130)).all()
     assert cube.read(0, 5).shape == (5, 70, 0)
-    assert (open_lines(tmp_path / "fine-0.zarr").read() == 65_535).all()
+    assert (signal_cubes.open_lines(tmp_path / "fine-0.zarr").read() == 65_535).all()
 
 
 @pytest.mark.parametrize(("largest", "kind"), [(LARGEST_SHORT, "int16"), (LARGEST_SHORT + 1, "int32")])
@@ -235,14 +229,14 @@ def test_scores_beyond_16_bits_are_stored_in_32(tmp_path: Path, largest: float, 
     header = SweepHeader(lines.sweep, lines.references, np.linspace(400, 1000, BANDS))
     axes = np.eye(2, BANDS)
     components = Components(np.zeros(BANDS), axes, np.ones(BANDS))
-    writer = SignalCubeWriter(tmp_path / "a.zarr", header, components, step=1.0, largest=largest)
+    writer = signal_cubes.SignalCubeWriter(tmp_path / "a.zarr", header, components, step=1.0, largest=largest)
     scores = np.random.default_rng(0).uniform(-largest, largest, (*SHAPE, 2)).astype(np.float32)
     writer.write(0, scores, np.zeros(SHAPE, np.uint8))
     steps = np.array([[70_000, -3], [0, 9]]).repeat(BANDS // 2, axis=1).astype(np.int32)
     x, y = lines.position.T
-    facts = LineRows(lines.time_s, x, y, np.full(len(x), 100.0), lines.valid_line)
+    facts = signal_cubes.LineRows(lines.time_s, x, y, np.full(len(x), 100.0), lines.valid_line)
     writer.close(facts, np.array([[0, 1], [5, 6]]), steps)
-    cube = open_signal_cube(tmp_path / "a.zarr")
+    cube = signal_cubes.open_signal_cube(tmp_path / "a.zarr")
     assert cube.read().dtype == kind
     np.testing.assert_array_equal(cube.read(), np.rint(scores))
     off = cube.spectra(0, 1)[0, 1] - components.restore(cube.read(0, 1)[0, 1])
@@ -254,7 +248,7 @@ def test_a_score_beyond_its_type_is_cut_off_and_does_not_wrap(tmp_path: Path) ->
     lines = lines_of()
     header = SweepHeader(lines.sweep, lines.references, np.linspace(400, 1000, BANDS))
     components = Components(np.zeros(BANDS), np.eye(1, BANDS), np.ones(BANDS))
-    writer = SignalCubeWriter(tmp_path / "a.zarr", header, components, step=1.0, largest=100.0)
+    writer = signal_cubes.SignalCubeWriter(tmp_path / "a.zarr", header, components, step=1.0, largest=100.0)
     scores = np.zeros((1, 70, 1), np.float32)
     scores[0, :2, 0] = 40_000, -1e9
     writer.write(0, scores, np.zeros((1, 70), np.uint8))

@@ -11,20 +11,7 @@ from scipy import stats
 
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
-from pipeline.simulator.effects.counting import (
-    CHIP_SAMPLES,
-    DARK_CURRENT,
-    DEFECTS,
-    MOST_VARIATION,
-    QUANTISATION,
-    READ_NOISE,
-    SATURATION,
-    SHOT,
-    dead_elements,
-    divergence,
-    hot_electrons,
-    warmth,
-)
+from pipeline.simulator.effects import counting
 from pipeline.simulator.effects.probe import Probe, Unit
 from pipeline.simulator.readout import read_out
 from pipeline.simulator.rig_model import Detector, Rig
@@ -49,8 +36,8 @@ def apart(wide: float, narrow: float) -> float:
 def test_a_bright_scene_needs_shot_noise_and_no_read_noise() -> None:
     """At 10,000 e- 20 e- of read noise make 100 e- into 102 e-."""
     bright = probe(10_000, 10_000)
-    assert SHOT.bound(bright, RIG).value > TOLERANCE
-    bound = READ_NOISE.bound(bright, RIG)
+    assert counting.SHOT.bound(bright, RIG).value > TOLERANCE
+    bound = counting.READ_NOISE.bound(bright, RIG)
     assert bound.value == pytest.approx(0.019, abs=1e-3)
     assert bound.value < TOLERANCE
     assert bound.why == "20 e- beside at least 100 e- of shot noise make 102 e-"
@@ -59,10 +46,12 @@ def test_a_bright_scene_needs_shot_noise_and_no_read_noise() -> None:
 def test_a_dim_scene_at_1_s_needs_dark_current() -> None:
     """200 e- beside 24 e- of noise; a cooled sensor at 100 ms does without."""
     slow = replace(RIG, camera=LineCamera(exposure_ms=1000.0))
-    bound = DARK_CURRENT.bound(probe(200, 400), slow)
+    bound = counting.DARK_CURRENT.bound(probe(200, 400), slow)
     assert bound.value > 8
     assert bound.why == "200 e- in 1000 ms at 25 deg C, beside 24.5 e- of noise"
-    assert DARK_CURRENT.bound(probe(200, 400), Rig(detector=Detector(temperature_deg_c=-30.0))).value < TOLERANCE
+    assert (
+        counting.DARK_CURRENT.bound(probe(200, 400), Rig(detector=Detector(temperature_deg_c=-30.0))).value < TOLERANCE
+    )
 
 
 @pytest.mark.parametrize("unit", ["sigma", "dn"])
@@ -72,7 +61,7 @@ def test_noise_bounds_are_the_total_variation(unit: Unit, darkest: float, bright
     rig = Rig(detector=Detector(dark_e_per_s=0.0))
     levels = np.linspace(darkest, brightest, 7)
     seen = probe(darkest, brightest, unit)
-    for effect, without in ((SHOT, np.full(7, 20.0)), (READ_NOISE, np.sqrt(levels))):
+    for effect, without in ((counting.SHOT, np.full(7, 20.0)), (counting.READ_NOISE, np.sqrt(levels))):
         total = np.sqrt(levels + 400)
         scale = total / 5 if unit == "dn" else np.ones(7)
         found = max(apart(a, b) * one for a, b, one in zip(total, without, scale, strict=True))
@@ -81,22 +70,22 @@ def test_noise_bounds_are_the_total_variation(unit: Unit, darkest: float, bright
 
 def test_the_bound_of_the_cheap_draw_is_stated_for_a_patch() -> None:
     """A number errs by sqrt(divergence) of a sigma at most; a patch of 1e6 by the variation that is said."""
-    bound = SHOT.bound(probe(100, 10_000), RIG, "gaussian")
-    assert bound.value <= 2 * MOST_VARIATION / np.sqrt(CHIP_SAMPLES)
-    assert bound.value >= np.sqrt(divergence(np.geomspace(1, 1e5, 500), 20.0)).max()
+    bound = counting.SHOT.bound(probe(100, 10_000), RIG, "gaussian")
+    assert bound.value <= 2 * counting.MOST_VARIATION / np.sqrt(counting.CHIP_SAMPLES)
+    assert bound.value >= np.sqrt(counting.divergence(np.geomspace(1, 1e5, 500), 20.0)).max()
     assert "1e+06 numbers have a total variation of at most 0.05" in bound.why
     assert "exact below 0 e-, without read noise 681 e-" in bound.why
-    assert SHOT.bound(probe(100, 10_000), RIG, "exact").value == 0
+    assert counting.SHOT.bound(probe(100, 10_000), RIG, "exact").value == 0
 
 
 def test_defects_of_bands_that_are_not_used_do_not_matter() -> None:
     """A sensor without defects, or whose masks are empty, has a bound of 0."""
-    assert DEFECTS.bound(probe(100, 1000), RIG).value == 0
+    assert counting.DEFECTS.bound(probe(100, 1000), RIG).value == 0
     few = Rig(detector=Detector(dead_fraction=1e-9, hot_fraction=1e-9))
-    assert not dead_elements(few, 3).any()
-    assert not hot_electrons(few, 3).any()
-    assert DEFECTS.bound(probe(100, 1000), few).value == 0
-    assert not hot_electrons(Rig(detector=Detector(hot_fraction=0.1, noiseless=True)), 3).any()
+    assert not counting.dead_elements(few, 3).any()
+    assert not counting.hot_electrons(few, 3).any()
+    assert counting.DEFECTS.bound(probe(100, 1000), few).value == 0
+    assert not counting.hot_electrons(Rig(detector=Detector(hot_fraction=0.1, noiseless=True)), 3).any()
 
 
 def test_more_defects_keep_those_there_were() -> None:
@@ -105,34 +94,34 @@ def test_more_defects_keep_those_there_were() -> None:
         Rig(detector=Detector(dead_fraction=fraction, hot_fraction=fraction, unit=unit))
         for fraction, unit in ((0.01, 0), (0.05, 0), (0.05, 1))
     )
-    assert (dead_elements(many, 20) >= dead_elements(few, 20)).all()
-    assert not np.array_equal(dead_elements(many, 20), dead_elements(other, 20))
-    assert not np.array_equal(dead_elements(many, 20), hot_electrons(many, 20) > 0)
+    assert (counting.dead_elements(many, 20) >= counting.dead_elements(few, 20)).all()
+    assert not np.array_equal(counting.dead_elements(many, 20), counting.dead_elements(other, 20))
+    assert not np.array_equal(counting.dead_elements(many, 20), counting.hot_electrons(many, 20) > 0)
 
 
 @pytest.mark.parametrize("unit", ["sigma", "dn"])
 def test_a_bright_roof_saturates(unit: Unit) -> None:
     """Six deviations below full scale the bound is 0; above it is what is clipped."""
     well = LineCamera().full_scale_e
-    assert SATURATION.bound(probe(100, well - 6.2 * np.sqrt(well + 400) - 20, unit), RIG).value == 0
-    bound = SATURATION.bound(probe(100, 30_000, unit), RIG)
+    assert counting.SATURATION.bound(probe(100, well - 6.2 * np.sqrt(well + 400) - 20, unit), RIG).value == 0
+    bound = counting.SATURATION.bound(probe(100, 30_000, unit), RIG)
     lost = 30_000 + 20 - well
     scale = 5.0 if unit == "dn" else np.sqrt(30_400)
     assert lost / scale < bound.value
     assert "above the limit of 2.02e+04 e-" in bound.why
     ideal = Rig(detector=Detector(noiseless=True))
-    assert SATURATION.bound(replace(probe(100, 30_000, unit), unit_least_dn=0.29), ideal).value == pytest.approx(
-        (lost - 20) / 5 / 0.29
-    )
+    assert counting.SATURATION.bound(
+        replace(probe(100, 30_000, unit), unit_least_dn=0.29), ideal
+    ).value == pytest.approx((lost - 20) / 5 / 0.29)
     small = Rig(detector=Detector(full_well_e=5000))
-    assert SATURATION.bound(probe(100, 6000), small).value > 0
-    assert SATURATION.bound(probe(100, 6000), RIG).value == 0
+    assert counting.SATURATION.bound(probe(100, 6000), small).value > 0
+    assert counting.SATURATION.bound(probe(100, 6000), RIG).value == 0
 
 
 def test_quantisation_is_half_a_dn() -> None:
     """In units of the smallest noise, or one DN; and rounding changes no number by more."""
-    assert QUANTISATION.bound(probe(100, 1000, "dn"), RIG).value == 0.5
-    assert QUANTISATION.bound(probe(0, 1000), RIG).value == pytest.approx(0.5 / 4)
+    assert counting.QUANTISATION.bound(probe(100, 1000, "dn"), RIG).value == 0.5
+    assert counting.QUANTISATION.bound(probe(0, 1000), RIG).value == pytest.approx(0.5 / 4)
     light: NDArray[np.float32] = np.random.default_rng(0).uniform(0, 9000, (6, 640, 3)).astype(np.float32)
     dn = light / 5 + 64
     assert np.abs(read_out(light, block_of(RIG, NM), {}) - dn).max() <= 0.5
@@ -143,7 +132,7 @@ def test_quantisation_is_half_a_dn() -> None:
 )
 def test_warmth_by_hand(deg_c: float, factor: float) -> None:
     """Worked with a pocket calculator: at -80 deg C (193.15 / 298.15)^1.5 exp(21.629 - 34.114) = 1.97e-6."""
-    assert warmth(deg_c) == pytest.approx(factor, rel=3e-3)
+    assert counting.warmth(deg_c) == pytest.approx(factor, rel=3e-3)
 
 
 @pytest.mark.parametrize("deg_c", [-80.5, 51.0])

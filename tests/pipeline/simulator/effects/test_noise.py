@@ -10,17 +10,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from pipeline.simulator.compiled_loops import draw_pairs, read_merged
-from pipeline.simulator.effects.counting import (
-    CHIP_SAMPLES,
-    MOST_VARIATION,
-    PIECE,
-    chip_variation,
-    divergence,
-    least_expected,
-    normal_deviates,
-    photon_counts,
-    rounded_counts,
-)
+from pipeline.simulator.effects import counting
 
 DRAWS = 200_000
 DARK_DN = 1000.0
@@ -30,7 +20,7 @@ Radiance = NDArray[np.float32]
 
 def deviates(count: int = DRAWS, seed: int = 0) -> Radiance:
     """Standard normal numbers of one seed."""
-    return normal_deviates(np.random.Generator(np.random.Philox(seed)), count)
+    return counting.normal_deviates(np.random.Generator(np.random.Philox(seed)), count)
 
 
 def even(level: float, count: int = DRAWS) -> Radiance:
@@ -72,8 +62,8 @@ def test_deviates_are_normal() -> None:
 
 def test_deviates_do_not_go_together() -> None:
     """Neither neighbours nor the two of a pair, nor their squares, are correlated."""
-    drawn = deviates(2 * PIECE)
-    for lag in (1, 2, PIECE // 2, PIECE):
+    drawn = deviates(2 * counting.PIECE)
+    for lag in (1, 2, counting.PIECE // 2, counting.PIECE):
         one, other = drawn[:-lag], drawn[lag:]
         assert abs(np.corrcoef(one, other)[0, 1]) < 4 / np.sqrt(len(one))
         assert abs(np.corrcoef(one**2, other**2)[0, 1]) < 4 / np.sqrt(len(one))
@@ -83,7 +73,7 @@ def test_deviates_do_not_go_together() -> None:
 def test_exact_counts_are_poisson(level: float) -> None:
     """Chi-square at 1e-3; mean and variance over the level within 3 sigma of 1."""
     level = float(np.float32(level))
-    counts = photon_counts(even(level), deviates(seed=int(level)))
+    counts = counting.photon_counts(even(level), deviates(seed=int(level)))
     assert poisson_fit(counts, level) > 1e-3
     assert abs(counts.mean(dtype=np.float64) / level - 1) < 3 / np.sqrt(DRAWS * level)
     assert abs(counts.var(dtype=np.float64) / level - 1) < max(0.01, 3 * np.sqrt((2 + 1 / level) / DRAWS))
@@ -93,7 +83,7 @@ def test_exact_counts_are_poisson(level: float) -> None:
 @given(level=st.floats(2**-7, 2.0**17, width=32), z=st.floats(-6.5, 6.5, width=32))
 def test_exact_counts_are_the_quantile(level: float, z: float) -> None:
     """The count is the least k with F(k) >= Phi(z)."""
-    (count,) = photon_counts(even(level, 1), even(z, 1))
+    (count,) = counting.photon_counts(even(level, 1), even(z, 1))
     below, upto = stats.poisson.cdf([count - 1, count], level), stats.norm.cdf(z)
     above, least = stats.poisson.sf([count - 1, count], level), stats.norm.sf(z)
     slack = 1e-9  # relative, of the nearer tail
@@ -104,24 +94,24 @@ def test_exact_counts_are_the_quantile(level: float, z: float) -> None:
 def test_counts_of_hardly_any_and_very_much_light() -> None:
     """0, negative and tiny light give 0; 1e9 and more give finite numbers near what is expected."""
     light = np.array([0, -3, 1e-30, 1e9, 1e20], np.float32)
-    counts = photon_counts(light, np.array([5, 5, 5, 1, 1], np.float32))
+    counts = counting.photon_counts(light, np.array([5, 5, 5, 1, 1], np.float32))
     np.testing.assert_allclose(counts, [0, 0, 0, 1e9 + 1e4**1.125, 1e20], rtol=1e-6)
-    assert not photon_counts(light[:3], even(6.7, 3)).any()
+    assert not counting.photon_counts(light[:3], even(6.7, 3)).any()
 
 
 def test_more_light_gives_no_fewer_counts() -> None:
     """One deviate, rising light: counts never fall, through small and large means."""
     light = np.geomspace(0.1, 1e5, 20_001).astype(np.float32)
     for z in (-4.0, -1.0, 0.0, 0.7, 5.0):
-        assert (np.diff(photon_counts(light, even(z, len(light)))) >= 0).all()
+        assert (np.diff(counting.photon_counts(light, even(z, len(light)))) >= 0).all()
 
 
 @pytest.mark.parametrize("level", [700.0, 1000.0, 3000.0, 10_000.0, 60_000.0])
 def test_rounded_counts_are_poisson_where_the_bound_holds(level: float) -> None:
     """From the least expected electrons on, 2e5 draws pass the test of the exact ones, and hardly one differs."""
-    assert level >= least_expected(0.0)
+    assert level >= counting.least_expected(0.0)
     z = deviates(seed=int(level))
-    counts, exact = rounded_counts(even(level), z), photon_counts(even(level), z)
+    counts, exact = counting.rounded_counts(even(level), z), counting.photon_counts(even(level), z)
     assert poisson_fit(counts, level) > 1e-3
     assert np.abs(counts - exact).max() <= 1
     assert abs(counts.var(dtype=np.float64) / level - 1) < max(0.01, 3 * np.sqrt(2 / DRAWS))
@@ -142,14 +132,14 @@ def test_loops_are_their_formulae() -> None:
 
     Where they stand beside a half, float32 tells: less than one number in a hundred is 1 off.
     """
-    count = 3 * PIECE + 8
+    count = 3 * counting.PIECE + 8
     words = np.random.SFC64(4).random_raw(count // 2).view(np.uint32)
     words[:4] = [0, 1, 2**32 - 1, 2**31]
     drawn = np.empty(count, np.float32)
-    draw_pairs(words, PIECE, drawn)
+    draw_pairs(words, counting.PIECE, drawn)
     wanted = []
-    for start in range(0, count, PIECE):
-        radius, turn = np.split(words[start : start + PIECE].astype(np.float64), 2)
+    for start in range(0, count, counting.PIECE):
+        radius, turn = np.split(words[start : start + counting.PIECE].astype(np.float64), 2)
         radius, turn = np.sqrt(-2 * np.log((radius + 0.5) / 2**32)), turn * (2 * np.pi / 2**32)
         wanted += [radius * np.cos(turn), radius * np.sin(turn)]
     np.testing.assert_allclose(drawn, np.concatenate(wanted), atol=2e-5)
@@ -187,7 +177,7 @@ def merged_chances(level: float, read: float, edges: NDArray[np.float64]) -> NDA
         (level, read)
         for read in (5.0, 10.0, 20.0, 40.0)
         for level in (2.0, 40.0, 200.0, 700.0, 5000.0)
-        if level >= least_expected(read)
+        if level >= counting.least_expected(read)
     ],
 )
 def test_divergence_bounds_the_distributions(level: float, read: float) -> None:
@@ -199,14 +189,16 @@ def test_divergence_bounds_the_distributions(level: float, read: float) -> None:
     p, q = np.diff(exact), np.diff(merged_chances(level, read, edges))
     met = p > 1e-14
     found = float(((q - p)[met] ** 2 / p[met]).sum())
-    assert found <= 1.2 * float(divergence(np.array(level), read)) + 1e-12
+    assert found <= 1.2 * float(counting.divergence(np.array(level), read)) + 1e-12
 
 
 def test_least_expected_keeps_a_patch_within_its_variation() -> None:
     """At the default read noise cheap draws serve any light; without, from some 700 e- on; the bound is kept."""
-    assert least_expected(20.0) == 0
-    assert 600 < least_expected(0.0) < 3000
+    assert counting.least_expected(20.0) == 0
+    assert 600 < counting.least_expected(0.0) < 3000
     for read in (0.0, 1.0, 5.0, 20.0):
-        assert chip_variation(read) <= MOST_VARIATION
-    light = np.array(least_expected(0.0))
-    assert np.sqrt(CHIP_SAMPLES * divergence(light, 0.0)) / 2 == pytest.approx(MOST_VARIATION, rel=0.01)
+        assert counting.chip_variation(read) <= counting.MOST_VARIATION
+    light = np.array(counting.least_expected(0.0))
+    assert np.sqrt(counting.CHIP_SAMPLES * counting.divergence(light, 0.0)) / 2 == pytest.approx(
+        counting.MOST_VARIATION, rel=0.01
+    )

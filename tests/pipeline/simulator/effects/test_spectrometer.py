@@ -6,16 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from pipeline.simulator.effects.spectrometer import (
-    PRNU,
-    RESPONSE,
-    SMILE,
-    STRAY_LIGHT,
-    STRIPING,
-    missing_variance,
-    wavelength_shift,
-    widen_bands,
-)
+from pipeline.simulator.effects import spectrometer
 from pipeline.simulator.rig_model import Detector, Rig
 from tests.pipeline.simulator.spectral_light import SAMPLES, block_of, probe_of, random_light, rig_with, units, worst
 
@@ -26,11 +17,11 @@ VARIANCE_OF_6 = 36 / (8 * np.log(2))
 def test_kernel_has_the_missing_variance_on_uneven_bands(fwhm_nm):
     """No weight below 0, sum 1, mean 0 and the variance to 1e-6, however few bands a width spans."""
     nm = 400 + np.cumsum(np.random.default_rng(0).uniform(1, 3, 60))
-    rows = widen_bands(np.eye(60), nm, np.full(60, fwhm_nm), 6.0).T  # (band made, band taken)
+    rows = spectrometer.widen_bands(np.eye(60), nm, np.full(60, fwhm_nm), 6.0).T  # (band made, band taken)
     way = nm - nm[:, None]
     np.testing.assert_allclose(rows.sum(axis=1), 1, atol=1e-6)
     np.testing.assert_allclose((rows * way).sum(axis=1), 0, atol=1e-5)
-    wanted = missing_variance(6.0, np.array([fwhm_nm]), 1)[0]
+    wanted = spectrometer.missing_variance(6.0, np.array([fwhm_nm]), 1)[0]
     np.testing.assert_allclose((rows * way**2).sum(axis=1)[15:45], wanted, rtol=1e-5, atol=1e-5)
     assert rows.min() > -1e-7
 
@@ -39,7 +30,7 @@ def test_narrow_line_becomes_a_gaussian_of_6_nm():
     """A line of 2 nm on bands 0.5 nm apart gets 6 nm at half its height and keeps its area."""
     nm = np.arange(450, 550.5, 0.5)
     line = np.exp(-4 * np.log(2) * ((nm - 500) / 2) ** 2)
-    made = widen_bands(line, nm, np.full(len(nm), 2.0), 6.0)
+    made = spectrometer.widen_bands(line, nm, np.full(len(nm), 2.0), 6.0)
     np.testing.assert_allclose(made, np.exp(-4 * np.log(2) * ((nm - 500) / 6) ** 2) / 3, atol=2e-3)
     np.testing.assert_allclose(made.sum(), line.sum(), rtol=1e-6)
 
@@ -49,21 +40,17 @@ def test_straight_spectra_and_both_ends_stay():
     wavelength, light = random_light(1)
     narrow = np.full(90, 1.0)
     straight = 3 * wavelength
-    np.testing.assert_allclose(widen_bands(straight, wavelength, narrow, 6.0), straight, rtol=1e-6)
-    made = widen_bands(light, wavelength, narrow, 6.0)
+    np.testing.assert_allclose(spectrometer.widen_bands(straight, wavelength, narrow, 6.0), straight, rtol=1e-6)
+    made = spectrometer.widen_bands(light, wavelength, narrow, 6.0)
     np.testing.assert_allclose(made[..., [0, -1]], light[..., [0, -1]], rtol=1e-6)
 
 
 def test_nothing_where_bands_are_wide_or_not_known():
     """Light itself comes back, and the bound of 0 says which of the two it is."""
     wavelength, light = random_light(2)
-    for fwhm, word in (
-        (np.full(90, 6.0), "6 nm wide already"),
-        (None, "not known"),
-        (np.full(90, np.nan), "not known"),
-    ):
-        assert RESPONSE.change(light, block_of(rig_with(), wavelength, fwhm_nm=fwhm), "exact") is light
-        bound = RESPONSE.bound(probe_of(light, wavelength, fwhm_nm=fwhm), rig_with())
+    for fwhm, word in ((np.full(90, 6), "6 nm wide already"), (None, "not known"), (np.full(90, np.nan), "not known")):
+        assert spectrometer.RESPONSE.change(light, block_of(rig_with(), wavelength, fwhm_nm=fwhm), "exact") is light
+        bound = spectrometer.RESPONSE.bound(probe_of(light, wavelength, fwhm_nm=fwhm), rig_with())
         assert bound.value == 0
         assert word in bound.why
 
@@ -74,9 +61,9 @@ def test_one_or_two_bands_stay(bands):
     nm = np.linspace(500, 510, bands)
     light = np.full((2, 3, bands), 7, np.float32)
     light[..., -1] = 9
-    made = widen_bands(light, nm, np.zeros(bands), 6.0)
+    made = spectrometer.widen_bands(light, nm, np.zeros(bands), 6.0)
     np.testing.assert_allclose(made, light)
-    assert RESPONSE.bound(probe_of(light, nm, fwhm_nm=np.zeros(bands)), rig_with()).value == 0
+    assert spectrometer.RESPONSE.bound(probe_of(light, nm, fwhm_nm=np.zeros(bands)), rig_with()).value == 0
 
 
 def test_steep_step_is_bounded_by_its_slope():
@@ -85,25 +72,25 @@ def test_steep_step_is_bounded_by_its_slope():
     light = np.where(wavelength < 450, 100, 5000).astype(np.float32) * np.ones((1, 2, 1), np.float32)
     fwhm = np.zeros(101)
     probe = probe_of(light, wavelength, fwhm_nm=fwhm)
-    bound = RESPONSE.bound(probe, rig_with()).value
-    made = RESPONSE.change(light, block_of(rig_with(), wavelength, range(1), fwhm_nm=fwhm), "exact")
+    bound = spectrometer.RESPONSE.bound(probe, rig_with()).value
+    made = spectrometer.RESPONSE.change(light, block_of(rig_with(), wavelength, range(1), fwhm_nm=fwhm), "exact")
     assert worst(made, light, "sigma") <= bound
     steepest = 4900 / units(light, "sigma").min()
     np.testing.assert_allclose(bound, steepest * np.sqrt(VARIANCE_OF_6), rtol=1e-6)
-    assert RESPONSE.bound(probe, rig_with(), "exact").value == 0
+    assert spectrometer.RESPONSE.bound(probe, rig_with(), "exact").value == 0
 
 
 def bent(light, wavelength, smile_nm, **more):
     """Light after smile."""
     block = block_of(rig_with(light.shape[1], smile_nm=smile_nm), wavelength, **more)
-    return SMILE.change(light.copy(), block, "cubic")
+    return spectrometer.SMILE.change(light.copy(), block, "cubic")
 
 
 def test_shift_is_0_at_the_centre_and_smile_at_both_ends():
     """641 samples: 0 in the middle, a quarter half way, all at the ends; one sample is all centre."""
-    shift = wavelength_shift(641, 0.3)
+    shift = spectrometer.wavelength_shift(641, 0.3)
     np.testing.assert_allclose(shift[[0, 160, 320, 480, 640]], [0.3, 0.075, 0, 0.075, 0.3])
-    assert wavelength_shift(1, 0.3) == [0]
+    assert spectrometer.wavelength_shift(1, 0.3) == [0]
 
 
 @pytest.mark.parametrize(("smile_nm", "sign"), [(0.5, 1), (-0.5, -1)])
@@ -150,24 +137,24 @@ def test_smile_detectors_do_not_mix():
 def test_off_where_there_is_nothing_to_bend():
     """One band, a straight slit, or a flat spectrum: bound 0 with a reason, and light stays as it is."""
     one, light = np.array([550.0]), np.full((6, SAMPLES, 1), 900, np.float32)
-    bound = SMILE.bound(probe_of(light, one), rig_with())
+    bound = spectrometer.SMILE.bound(probe_of(light, one), rig_with())
     assert bound.value == 0
     assert "single band" in bound.why
     np.testing.assert_array_equal(bent(light, one, 0.3), light)
     wavelength, varied = random_light(0)
-    assert SMILE.bound(probe_of(varied, wavelength), rig_with(smile_nm=0.0)).value == 0
+    assert spectrometer.SMILE.bound(probe_of(varied, wavelength), rig_with(smile_nm=0.0)).value == 0
     flat = np.full_like(varied, 700)
-    assert SMILE.bound(probe_of(flat, wavelength), rig_with()).value == 0
+    assert spectrometer.SMILE.bound(probe_of(flat, wavelength), rig_with()).value == 0
 
 
 def scattered(light, variant="halo", **optics):
     """Light after scattering; the optics' numbers start with stray_."""
     rig = rig_with(light.shape[1], **{f"stray_{name}": value for name, value in optics.items()})
     wavelength = np.linspace(400, 1000, light.shape[2])
-    return STRAY_LIGHT.change(light.copy(), block_of(rig, wavelength, range(len(light))), variant)
+    return spectrometer.STRAY_LIGHT.change(light.copy(), block_of(rig, wavelength, range(len(light))), variant)
 
 
-@pytest.mark.parametrize("variant", STRAY_LIGHT.variants)
+@pytest.mark.parametrize("variant", spectrometer.STRAY_LIGHT.variants)
 @pytest.mark.parametrize("halo_px", [3.0, 64.0, 1e4])
 def test_all_light_is_kept_in_each_line(variant, halo_px):
     """What leaves a sample lands on the same line's detector, also at its edges, and no light falls below 0."""
@@ -201,7 +188,7 @@ RIG = Rig()
 
 def test_gains_have_the_spread_that_is_stated() -> None:
     """1 % an element, 0.2 % a column; of mean 1; nothing shared between the two."""
-    elements, columns = PRNU.gains(RIG, 270), STRIPING.gains(RIG, 1)
+    elements, columns = spectrometer.PRNU.gains(RIG, 270), spectrometer.STRIPING.gains(RIG, 1)
     assert elements.shape == (640, 270)
     assert elements.mean() == pytest.approx(1, abs=1e-4)
     assert elements.std() == pytest.approx(0.01, rel=0.02)
@@ -211,12 +198,14 @@ def test_gains_have_the_spread_that_is_stated() -> None:
 
 def test_gains_belong_to_the_unit() -> None:
     """Another sensor has others; more bands have the same."""
-    assert not np.array_equal(PRNU.gains(RIG, 5), PRNU.gains(Rig(detector=Detector(unit=1)), 5))
-    np.testing.assert_array_equal(PRNU.gains(RIG, 9)[:, :5], PRNU.gains(RIG, 5))
+    assert not np.array_equal(
+        spectrometer.PRNU.gains(RIG, 5), spectrometer.PRNU.gains(Rig(detector=Detector(unit=1)), 5)
+    )
+    np.testing.assert_array_equal(spectrometer.PRNU.gains(RIG, 9)[:, :5], spectrometer.PRNU.gains(RIG, 5))
 
 
 def test_gains_never_fall_below_0() -> None:
     """A spread of 50 % leaves elements without response, none with less."""
-    gains = PRNU.gains(Rig(detector=Detector(prnu_std=0.5)), 50)
+    gains = spectrometer.PRNU.gains(Rig(detector=Detector(prnu_std=0.5)), 50)
     assert gains.min() == 0
     assert gains.max() > 2
