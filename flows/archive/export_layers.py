@@ -290,12 +290,11 @@ def _picture(run: ExportedRun) -> Layer:
     stored, ref = open_image(run.path("mosaic"), "coverage"), run.store("mosaic")
     assert ref is not None
     geobox = geobox_of(run, stored)
-    image = CogImage(geobox, "uint8", RGB, 0, tags=layer_tags(run, "mosaic", geobox))
 
     def rows() -> Rows:
         yield 0, np.nan_to_num(np.rint(colours_of(ref))).astype(np.uint8)
 
-    return Layer("rgb", title, roles, image, rows)
+    return Layer("rgb", title, roles, CogImage(geobox, "uint8", RGB, 0, tags=layer_tags(run, "mosaic", geobox)), rows)
 
 
 def prior_map_layers(run: ExportedRun) -> list[Layer]:

@@ -112,8 +112,7 @@ class MosaicView:
             last = min(first + at_once, height)
             out = np.full((last - first, width, len(bands)), np.nan, np.float32)
             for _, columns in map_blocks((last - first, width), (last - first, COLUMNS_AT_ONCE)):
-                pixels = self.ground.scene_pixels(slice(first, last), columns)
-                out[:, columns] = _window_at(self.mosaic, pixels, bands)
+                out[:, columns] = _window_at(self.mosaic, self.ground.scene_pixels(slice(first, last), columns), bands)
             yield first, out
 
 

@@ -144,15 +144,6 @@ class TrainFlags(SceneFlags):
     def request(self, dataset: str, out: Path, command: str) -> TrainRequest:
         """Return the request of a training of all weights. Raises SettingsError: numbers are invalid."""
         usual = TrainingSettings.learning_rate / (3 if self.start else 1)
-        settings = TrainingSettings(
-            steps=self.steps,
-            minutes=self.minutes,
-            seed=self.seed,
-            crop=CROPS_PX[bool(built_in_laws(dataset))] if self.crop is None else self.crop,
-            batch=self.batch,
-            darkest_ms=self.min_exposure_ms,
-            learning_rate=usual if self.learning_rate is None else self.learning_rate,
-        )
         return TrainRequest(
             dataset,
             out,
@@ -165,7 +156,15 @@ class TrainFlags(SceneFlags):
             self.overview_width,
             tokens={"dim": self.dim, "layers": self.layers, "heads": self.heads, "mlp_ratio": self.mlp_ratio},
             choices=self.choices(),
-            settings=settings,
+            settings=TrainingSettings(
+                steps=self.steps,
+                minutes=self.minutes,
+                seed=self.seed,
+                crop=CROPS_PX[bool(built_in_laws(dataset))] if self.crop is None else self.crop,
+                batch=self.batch,
+                darkest_ms=self.min_exposure_ms,
+                learning_rate=usual if self.learning_rate is None else self.learning_rate,
+            ),
             command=command,
             device=self.device,
             start=self.start,

@@ -195,10 +195,9 @@ def find_map(run: SurveyRun, ref: StageRef, drawn: ClassMap) -> dict[str, Any]:
         found["unknown"] = {"pixels": count, "fraction": fraction, "rate": rate}
     if run.zones.left_out is not None:
         unclassed &= ~run.zones.left_out
-    unread = read_table(path)["px"] if (path := ref.path / OUT_OF_RANGE).is_file() else 0
     pixels = {
         "scene_without_a_value": run.scene.filled_px,
-        "px_no_reading": unread,
+        "px_no_reading": read_table(path)["px"] if (path := ref.path / OUT_OF_RANGE).is_file() else 0,
         "map_without_a_class": int(np.count_nonzero(unclassed)),
     }
     if any(pixels.values()):

@@ -170,7 +170,6 @@ def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str) -> Receipt:
         stores["attention"] = f"{products['segment'].uri}/{READING}"
     files = ("receipt.json", "quicklook.png", "report.html", *([PLOTS_FILE] if run.zones.plots is not None else []))
     unjudged: AccuracyIs = "pending" if run.settings.accuracy else "left out"
-    accuracy_is = "judged" if accuracy is not None else unjudged if run.scene.labelled else "without labels"
     versions = {"python": platform.python_version()}
     for name in LIBRARIES:
         with suppress(PackageNotFoundError):  # run from a source tree that is not installed
@@ -196,7 +195,7 @@ def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str) -> Receipt:
             run, plan, read_in_full(products["score"], products["segment"]), prior_map_figures(products["segment"].path)
         ),
         data_bytes=open_account(run, plan),
-        accuracy_is=accuracy_is,
+        accuracy_is="judged" if accuracy is not None else unjudged if run.scene.labelled else "without labels",
         judged=None if accuracy is None else now(),
         accuracy=accuracy,
         training_scene=seen_in_training(run.scene, run.described),
@@ -219,8 +218,7 @@ def _savings(
     """Return the costs against the full scan; for a raster those of the model alone."""
     if run.raster is not None:
         return _model_savings(run, read, memory)
-    done = [*run.plan.coarse, *plan.sweeps]
-    entries = capture_savings(done, run.plan.full, run.camera, run.grid)
+    entries = capture_savings([*run.plan.coarse, *plan.sweeps], run.plan.full, run.camera, run.grid)
     capture = SavingEntry(run.plan.coarse_s + plan.seconds, run.plan.full_s).as_dict()
     if (uniform := run.scans.reference) is not None:  # the cheapest scan with nearly the best score
         capture |= {"uniform": uniform.seconds, "uniform_scan": uniform.words}
@@ -244,7 +242,6 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan) -> Quickl
     """Return the data of the quicklook, with three bands, without its note."""
     bands, _ = choose_bands(run.scene.wavelength_nm)
     chosen = list(bands)
-    mosaic = open_mosaic(products.mosaic.path / "mosaic.zarr")
     decided = products["segment"].path / READING
     attention = load_attention(decided if decided.exists() else products["score"].path / READING)
     changed = attention.changed
@@ -258,7 +255,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan) -> Quickl
         policy=run.settings.policy if run.chooses else None,
         scan=run.plan.plain,
         raster=run.raster is not None,
-        rectified=mosaic.thinned(thinned(found.classes)[0].step, chosen),
+        rectified=open_mosaic(products.mosaic.path / "mosaic.zarr").thinned(thinned(found.classes)[0].step, chosen),
         wavelength_nm=run.scene.wavelength_nm[chosen],
         score=attention.score if changed is None else np.where(attention.rank >= 0, changed, np.nan),
         changed=changed is not None,

@@ -283,8 +283,7 @@ def lay_out_passes(
         return layout, layout.plan(None), settings, ()
     every = layout.uniform(1)
     why = "have no record of scans to choose by" if content is None else "know no scan of this exposure or shorter"
-    note = f"every line is captured: the weights {why}"
-    return every, every.plan(None), replace(settings, scan_step=1), (note,)
+    return every, every.plan(None), replace(settings, scan_step=1), (f"every line is captured: the weights {why}",)
 
 
 def zoom_may_pay(layout: PassLayout, scans: ScanChoice, settings: Settings) -> bool:

@@ -340,8 +340,7 @@ class SurveyRun(CaptureRun):
         settings, everything = self.settings, self.kept_patches
         limits = {"macs": settings.macs, "least_gain": self.least_gain, "expected_loss": settings.expected_loss}
         costs = {"done": self.work_done(patch_index, memory).total, "everything": self.costs.of_map(everything).total}
-        figures = {"patches": len(patch_index), "of_patches": len(everything), "multiply_adds": costs}
-        return {"asked": limits, **figures}
+        return {"asked": limits, "patches": len(patch_index), "of_patches": len(everything), "multiply_adds": costs}
 
     @property
     def kept_patches(self) -> NDArray[np.intp]:

@@ -92,10 +92,9 @@ def scatter_points(seed: int) -> Scattered:
     """Draw samples of waves, and points at least 2 px inside, in the row order of a geolocation grid."""
     waves, rng = draw_waves(seed, BANDS, PERIODS_PX), np.random.default_rng([seed, 1])
     grid = np.argwhere(np.ones((SIDE, SIDE), bool)).astype(np.float64)
-    samples = waves.at(grid).astype(np.float32).reshape(SIDE, SIDE, BANDS)
     coordinates = rng.uniform(2, SIDE - 3, (POINTS, 2))
     coordinates = coordinates[np.lexsort((coordinates[:, 1], np.floor(coordinates[:, 0])))]
-    return Scattered(samples, coordinates, waves.at(coordinates))
+    return Scattered(waves.at(grid).astype(np.float32).reshape(SIDE, SIDE, BANDS), coordinates, waves.at(coordinates))
 
 
 ELECTRONS = LineCamera().full_scale_e / 2

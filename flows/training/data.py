@@ -230,8 +230,7 @@ def _names(images: Sequence[Path]) -> dict[str, Path]:
 
     Names keep their endings only if they are not unique without.
     """
-    numbers = [scene_number(image) or "" for image in images]
-    for names in (numbers, [image.stem for image in images]):
+    for names in ([scene_number(image) or "" for image in images], [image.stem for image in images]):
         if all(names) and len(set(names)) == len(images):
             return dict(zip(names, images, strict=True))
     return {image.name: image for image in images}
@@ -419,8 +418,7 @@ def scene_notes(empty: Sequence[str], regridded: Sequence[str], negative: Sequen
         " the images' pixels by nearest neighbour"
     )
     dark = f"most values of {listed_scenes(negative)} are negative, thus without light; add an offset to the scene.toml"
-    kinds = ((empty, left_out), (regridded, moved), (negative, dark))
-    return tuple(note for names, note in kinds if names)
+    return tuple(note for names, note in ((empty, left_out), (regridded, moved), (negative, dark)) if names)
 
 
 def trained_pixels(scene: RasterScene) -> NDArray[np.bool_]:

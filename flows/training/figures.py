@@ -216,6 +216,5 @@ def judge_baselines(
         report("fitting baseline classifiers", len(found) / 2, name)
         with warnings.catch_warnings(action="ignore", category=ConvergenceWarning):  # nearly converged suffices
             classifier.fit(learnt.features, learnt.labels)
-        drawn = classifier.predict(judged.features).astype(np.uint8)
-        found[name] = mean_iou(confusion(judged.labels, drawn, classes))
+        found[name] = mean_iou(confusion(judged.labels, classifier.predict(judged.features).astype(np.uint8), classes))
     return found

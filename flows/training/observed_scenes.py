@@ -75,8 +75,7 @@ def observe_finely(
     """Scan a farm by every line; return columns on the basis, (y, x, column), and their noise."""
     rig, cost = Rig(camera), CostModel()
     _, full, _ = cheapest_full(grid, camera, cost)
-    clock = sweep_starts(full, camera, cost)
-    source = SimulatedSource(scene, rig, seed, chosen_effects(scene, rig, full), clock=clock)
+    source = SimulatedSource(scene, rig, seed, chosen_effects(scene, rig, full), clock=sweep_starts(full, camera, cost))
     matrix, _ = basis.matrix(scene.wavelength_nm)
     columns, spectra = _columns(source, full, grid, matrix)
     return columns, replace(noise_of(scene, matrix, camera), spectra=spectra if len(matrix) > FEW_BANDS else None)
@@ -91,10 +90,9 @@ def _columns(
     source: SimulatedSource, sweeps: Sequence[Sweep], grid: SceneGrid, matrix: Columns
 ) -> tuple[Columns, SceneSpectra]:
     """Return the rectified pass on the basis, (y, x, column), and the moments of its spectra."""
-    taken = [_Taken(source, sweep) for sweep in sweeps]
     bands, rows = len(matrix), list[Columns]()
     count, total, products = 0, np.zeros(bands), np.zeros((bands, bands))
-    for part in mosaic_rows(taken, source.camera, grid, rows=_ROWS):
+    for part in mosaic_rows([_Taken(source, sweep) for sweep in sweeps], source.camera, grid, rows=_ROWS):
         rows.append(project(part, matrix))
         some = part[::2, ::2].reshape(-1, bands).astype(np.float64)
         count, total, products = count + len(some), total + some.sum(axis=0), products + some.T @ some

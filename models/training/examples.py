@@ -101,8 +101,7 @@ def measured_normalisation(observations: list[Example], exposure_ms: float = REF
 
 def normalised(seen: Example, normalisation: Normalisation, reached: NDArray[np.bool_]) -> Example:
     """Normalise the columns of a scene."""
-    columns = np.clip(normalisation.apply(seen.columns, reached), -60000, 60000).astype(np.float16)
-    return replace(seen, columns=columns)
+    return replace(seen, columns=np.clip(normalisation.apply(seen.columns, reached), -60000, 60000).astype(np.float16))
 
 
 @dataclass(frozen=True)

@@ -131,8 +131,7 @@ class Trainer:
             group["lr"] = self.settings.learning_rate * rate_at(done)
         phase = phase_at(done)
         fewer = phase.larger if self.sampler.size(phase.larger) > self.sampler.size() else 1  # in large scenes
-        count = max(1, self.settings.batch // fewer)
-        batch = self.sampler.draw(count, self.rng, self.gain_shift, larger=phase.larger)
+        batch = self.sampler.draw(max(1, self.settings.batch // fewer), self.rng, self.gain_shift, larger=phase.larger)
         if not (batch.labels != UNLABELLED).any():  # decay and momentum alone would move the weights
             course.step, course.unlabelled = course.step + 1, course.unlabelled + 1
             return

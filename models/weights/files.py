@@ -218,8 +218,7 @@ def add_ood(weights: Path, ood_detector: OodDetector, trained_on: TrainedOn, rec
 
 def add_reader(weights: Path, out: Path, reader: TemporalReader, record: Mapping[str, Any]) -> None:
     """Write the weights of a file with a temporal reader to ``out``. Raises as `add_ood`."""
-    about = {"sizes": asdict(reader.sizes), "record": dict(record)}
-    _add_part(weights, out, READER, about, dict(reader.state_dict()))
+    _add_part(weights, out, READER, {"sizes": asdict(reader.sizes), "record": dict(record)}, dict(reader.state_dict()))
 
 
 def _add_part(source: Path, out: Path, part: str, about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:

@@ -78,9 +78,8 @@ class LineCamera:
 
     def pixel_slopes(self, binning: int = 1) -> NDArray[np.float64]:
         """Return the tangent k_y/k_z of each (binned) sample's ray, (sample,) float64."""
-        count = self.samples // binning
         centre = (self.samples - 1) / 2
-        middle = (np.arange(count, dtype=np.float64) + 0.5) * binning - 0.5
+        middle = (np.arange(self.samples // binning, dtype=np.float64) + 0.5) * binning - 0.5
         return (middle - centre) * self.ifov_rad
 
     def sample_at(self, slopes: NDArray[np.float64], binning: int = 1) -> NDArray[np.float64]:

@@ -172,8 +172,7 @@ def scene_to_sweep(sweep: Sweep, camera: LineCamera, along_px: ArrayLike, scan_p
 
 def sweep_to_scene(sweep: Sweep, camera: LineCamera) -> tuple[Floats, Floats]:
     """Return the scene points of every sample at mid exposure: along and scan, (line, sample) each [px]."""
-    slopes = camera.pixel_slopes(sweep.binning)
-    return points_of_scan(sweep.swath_px, camera, sweep.line_px()[:, None], slopes[None, :])
+    return points_of_scan(sweep.swath_px, camera, sweep.line_px()[:, None], camera.pixel_slopes(sweep.binning)[None, :])
 
 
 @dataclass(frozen=True)

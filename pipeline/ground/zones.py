@@ -42,9 +42,8 @@ def on_field(shape: BaseGeometry, crs: pyproj.CRS | None, place: FieldPlace) -> 
 
 def extent_deg(shape: BaseGeometry, crs: pyproj.CRS) -> tuple[float, float, float, float]:
     """Return the west, south, east and north of a polygon [deg], for messages."""
-    to_globe = pyproj.Transformer.from_crs(crs, WGS84, always_xy=True)
     places = shapely.get_coordinates(shape)
-    lon, lat = to_globe.transform(places[:, 0], places[:, 1])
+    lon, lat = pyproj.Transformer.from_crs(crs, WGS84, always_xy=True).transform(places[:, 0], places[:, 1])
     return float(np.min(lon)), float(np.min(lat)), float(np.max(lon)), float(np.max(lat))
 
 

@@ -57,13 +57,12 @@ class PatchRows:
         down, across = np.divmod(patch_index, grid.patch_shape[1])
         rank, many = (down, grid.patch_shape[0]) if sweeps[0].along == "x" else (across, grid.patch_shape[1])
         nearest = _nearest_sweep(sweeps, grid, camera, patch_index)
-        row = np.where(nearest >= 0, nearest * many + rank, -1)
         first, stop = np.zeros((2, len(sweeps), many), np.intp)
         for number, sweep in enumerate(sweeps):
             for place in np.unique(rank[nearest == number]).tolist():
                 lines = lines_showing(sweep, grid, camera, patch_index[(nearest == number) & (rank == place)])
                 first[number, place], stop[number, place] = lines or (0, 0)
-        return PatchRows(tuple(sweeps), row, first, stop)
+        return PatchRows(tuple(sweeps), np.where(nearest >= 0, nearest * many + rank, -1), first, stop)
 
     @cached_property
     def there(self) -> NDArray[np.bool_]:

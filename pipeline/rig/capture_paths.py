@@ -113,11 +113,10 @@ def lines_by_time(
     valid = usable & (middle_s >= scan_path.time_s[0]) & (middle_s <= scan_path.time_s[-1])
     if not valid.all():
         notes.append(f"without a time, or outside of the {method}'s: {np.count_nonzero(~valid)} of {len(valid)} lines")
-    found = np.where(valid[:, None], _at(scan_path, middle_s), np.nan)
     unknown_s = float(np.ptp(began_s) + np.ptp(capture_s)) / 2
     px = _apart_px(scan_path, camera, (middle_s[valid], middle_s[valid] + unknown_s))
     notes.append(f"software timing: a constant line offset of about {px:.2g} px remains")
-    return LinePositions(found, valid, method, px, tuple(notes))
+    return LinePositions(np.where(valid[:, None], _at(scan_path, middle_s), np.nan), valid, method, px, tuple(notes))
 
 
 def _at(scan_path: MirrorScanPath, time_s: Floats) -> Floats:

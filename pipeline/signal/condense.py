@@ -164,10 +164,9 @@ def find_rare(ratio: NDArray[np.float32], law: ResidualLaw, false_alarm: float) 
         if lines > ratio.shape[0] or samples > ratio.shape[1]:
             continue
         size = lines * samples
-        mean = uniform_filter(filled, (lines, samples))
         high = np.zeros(ratio.shape, np.float32)
         within = tuple(slice(side // 2, (side // 2 - side + 1) or None) for side in (lines, samples))
-        high[within] = mean[within] > _limit(law.freedom * size, part / size)
+        high[within] = uniform_filter(filled, (lines, samples))[within] > _limit(law.freedom * size, part / size)
         if high.any():  # all spectra of the window that the mark came from
             back = tuple(-1 if side % 2 == 0 else 0 for side in (lines, samples))
             rare |= known & (uniform_filter(high, (lines, samples), mode="constant", origin=back) > 0.5 / size)

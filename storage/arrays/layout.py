@@ -56,8 +56,7 @@ def create_group(
     """Create a Zarr v3 store with its coordinates at ``path``, which must not exist."""
     if isinstance(path, Path):
         path.parent.mkdir(parents=True, exist_ok=True)
-    about = {"Conventions": "CF-1.12", "title": title, **attributes}
-    group = zarr.create_group(path, zarr_format=3, attributes=about)
+    group = zarr.create_group(path, zarr_format=3, attributes={"Conventions": "CF-1.12", "title": title, **attributes})
     for name, one in (coordinates or {}).items():
         write_small(group, name, *one)
     return group
@@ -133,8 +132,7 @@ def write_small(
     group: zarr.Group, name: str, dims: Sequence[str], values: NDArray[Any], attributes: Mapping[str, Any]
 ) -> None:
     """Store a small array in one chunk."""
-    spec = ArraySpec(tuple(dims), values.shape, values.dtype.str, values.shape)
-    array = create_array(group, name, spec, attributes)
+    array = create_array(group, name, ArraySpec(tuple(dims), values.shape, values.dtype.str, values.shape), attributes)
     if values.size:
         array[...] = values
 

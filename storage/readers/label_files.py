@@ -111,8 +111,7 @@ def match_folder(folder: Path) -> MatchedFiles:
                 f" say which files are labels in a {SETTINGS_NAME}"
             )
         owner[label] = image
-    alone = tuple(entry for entry in pictures if entry not in set(labels.values()))
-    return MatchedFiles(tuple(images), labels, alone)
+    return MatchedFiles(tuple(images), labels, tuple(entry for entry in pictures if entry not in set(labels.values())))
 
 
 def find_label(scene: Path) -> Path | None:

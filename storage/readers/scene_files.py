@@ -140,10 +140,9 @@ def with_stated_values(source: CubeSource, address: str | Path) -> CubeSource:
     settings = find_scene_settings(split_variable(address)[0])
     values = FileValues.of(source, list(range(source.shape[2])), settings)
     stated = () if settings.nodata is None else (f"{SETTINGS_NAME} nodata {settings.nodata!r}",)
-    nodata = source.nodata if settings.nodata is None else settings.nodata
     scaling = " ".join(filter(None, (source.scaling, *stated, values.scaling)))
     if not values.scaling:
-        return replace(source, nodata=nodata, scaling=scaling)
+        return replace(source, nodata=source.nodata if settings.nodata is None else settings.nodata, scaling=scaling)
     if source.dark is not None or source.white is not None:
         raise SceneError(
             f"{settings.path} has a scale or offset, and {address} dark or white frames, so its numbers are stored as "
@@ -224,8 +223,7 @@ def _labels_of(
             raise
         return None, (f"the labels beside the scene are left out: {error}",), by_name
     how = f"classes from {settings.path}" if settings.classes else f"{len(found.names)} classes as found in the file"
-    note = f"labels from {address}{', found by its name' if by_name else ''}, {how}"
-    return found, (note, *found.notes), by_name
+    return found, (f"labels from {address}{', found by its name' if by_name else ''}, {how}", *found.notes), by_name
 
 
 def load_field_labels(address: str | Path, shape: tuple[int, int]) -> tuple[Labels, tuple[str, ...]]:

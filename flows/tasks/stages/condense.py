@@ -191,8 +191,7 @@ def _write_sweeps(
 
         done.append(condenser.sweep(cube, writer.write, part))
         x, y = cube.position.T
-        facts = LineRows(cube.time_s, x, y, cube.exposure_ms, cube.valid_line)
-        writer.close(facts, done[-1].rare, done[-1].residuals)
+        writer.close(LineRows(cube.time_s, x, y, cube.exposure_ms, cube.valid_line), done[-1].rare, done[-1].residuals)
     return done
 
 

@@ -102,8 +102,7 @@ def create_maps(path: Path, gains: PatchGains, unknown: UnknownRule | None, *, g
     """Create empty stores of class map and class probabilities; return the names of the classes."""
     frame, weights = gains.frame, gains.work.weights.load()
     legend, shape = ClassNames(weights.class_names, weights.class_colours), (frame.grid.height, frame.grid.width)
-    shown = legend if unknown is None else with_unknown(legend)
-    create_class_map(path / MAP, shape, shown, grid=frame.angular_grid())
+    create_class_map(path / MAP, shape, legend if unknown is None else with_unknown(legend), grid=frame.angular_grid())
     create_probabilities(path / PROBABILITIES, shape, legend, grid=frame.angular_grid(), goes_on=goes_on)
     return legend.names
 
@@ -149,7 +148,6 @@ def _prior_map_figures(
 
     Changed pixels exceed the expected difference of two maps of the same ground; all differing pixels are counted too.
     """
-    agreement = None if comparison is None or np.isnan(comparison.agreement) else comparison.agreement
     put_aside = TURNED if comparison is None else ANOTHER_FIELD if comparison.is_of_another_field else None
     compared = 0 if comparison is None else int(comparison.changed.sum())
     differing, expected, pairs = 0, 0.0, list[tuple[int, int, str, str]]()
@@ -165,7 +163,7 @@ def _prior_map_figures(
         "run": prior.run,
         "days": prior.days,
         "reader": "none" if reader is None else reader.key,
-        "agreement": agreement,
+        "agreement": None if comparison is None or np.isnan(comparison.agreement) else comparison.agreement,
         "put_aside": put_aside,
         "shift_px": list(whole_pixels(lies)),
         "turned_deg": lies.turned_deg,

@@ -371,10 +371,9 @@ def solve_sweeps(
     if wrong.any():
         kept = np.repeat(~wrong, 2)
         answer = _robust(system[kept], measured[kept], error[kept])
-    residual = (measured - system @ answer).reshape(-1, 2)
     ends = zip(names, answer.reshape(-1, 2, 2), halves, strict=True)
     shifts = tuple(SweepShift(name, offset, drift / half) for name, (offset, drift), half in ends)
-    return SweepShifts(shifts, residual, held, untied)
+    return SweepShifts(shifts, (measured - system @ answer).reshape(-1, 2), held, untied)
 
 
 def tied_to(windows: Sequence[WindowShift], sweep: int, sweeps: int) -> frozenset[int]:

@@ -105,8 +105,7 @@ class EmulatedCapture:
         )
         if bands and len(self.wavelength_nm) == bands:
             header += "wavelength = {\n" + ",\n".join(f"{value:.17g}" for value in self.wavelength_nm) + "\n}\n"
-        data = np.ascontiguousarray(frames.transpose(0, 2, 1), "<u2").tobytes()
-        return {name: data, f"{name}.hdr": header.encode()}
+        return {name: np.ascontiguousarray(frames.transpose(0, 2, 1), "<u2").tobytes(), f"{name}.hdr": header.encode()}
 
 
 class CameraDevice:

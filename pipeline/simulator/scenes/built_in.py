@@ -103,10 +103,9 @@ def scouting_plan(seed: int, shape: tuple[int, int] = FARM_SHAPE, *, day: int, h
     """Plan the field; raises what `farm_plan` does."""
     check_land(seed, shape)
     rng = stream(seed, "scouted field")
-    parcel = Parcel(np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]]) * np.array(land_size(shape)) / 2)
     use = SCOUTED[rng.integers(len(SCOUTED))]
     field = replace(
-        plan_field(rng, parcel, use),
+        plan_field(rng, Parcel(np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]]) * np.array(land_size(shape)) / 2), use),
         row_angle_deg=float(rng.uniform(0, 180)),
         tramlines=draw_tramlines(rng),
         late_days=float(rng.uniform(-3, 3)) + (0.0 if CROPS[use].lodging else EARLY),

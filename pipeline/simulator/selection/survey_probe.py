@@ -180,13 +180,12 @@ def _patches(sweep: Sweep, camera: LineCamera, line: Floats, sample: Floats) -> 
     patch, binning = _patch_steps(sweep.binning), sweep.binning
     middle = sample if binning == 1 else (sample + 0.5) / binning - 0.5
     sums = np.rint(middle[:, None] + patch[:, 0]).ravel()
-    lines = (line[:, None] + patch[:, 1]).ravel()
     numbers = (sums[:, None] * binning + np.arange(binning)).ravel()
     slopes = np.asarray((numbers - (camera.samples - 1) / 2) * camera.ifov_rad, np.float64)
     count = len(slopes)
     return SampleViews(
         np.full(count, sweep.swath_px),
-        sweep.start_px + np.repeat(lines, binning),
+        sweep.start_px + np.repeat((line[:, None] + patch[:, 1]).ravel(), binning),
         slopes,
         np.full(count, sweep.along == "y"),
         binning,

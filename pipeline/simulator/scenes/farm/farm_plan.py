@@ -139,8 +139,7 @@ class Painting:
 
 def moist_soil(plan: FarmPlan, here: Ground, wetter: float = 0.0) -> Mixture:
     """Return bare soil with its water; clods throw longer shadows under a lower sun, up to a third of the pixel."""
-    water = plan.moisture + wetter + 0.035 * here.moisture + 0.008 * here.tuft
-    wet = wet_fraction(np.clip(water, 0.02, 0.45))
+    wet = wet_fraction(np.clip(plan.moisture + wetter + 0.035 * here.moisture + 0.008 * here.tuft, 0.02, 0.45))
     low = min(float(np.hypot(*plan.sun.cast)), 3.0)
     shade = np.asarray(np.clip(low * (0.07 + 0.04 * here.grain + 0.01 * here.tuft), 0, 0.33), np.float32)
     return {"soil_dry": (1 - wet) * (1 - shade), "soil_wet": wet * (1 - shade), "shade": shade}

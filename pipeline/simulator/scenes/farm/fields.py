@@ -76,9 +76,8 @@ def paint_fields(work: Painting, lodging: Field | None = None) -> None:
         index, cover, centres = parcel_pixels(field.parcel, plan.shape)
         if not index.size:
             continue
-        here = work.ground.at(index)
         down = np.zeros(index.size, np.float32) if lodging is None else _lodged(lodging.ravel()[index], field, plan.day)
-        content = _content(work, stream(plan.seed, f"paint {number}"), field, centres, (here, down))
+        content = _content(work, stream(plan.seed, f"paint {number}"), field, centres, (work.ground.at(index), down))
         work.canvas.add(index, cover, *content)
 
 
@@ -158,8 +157,7 @@ def _stubble_field(rows: Rows, field: FieldPlan, here: Ground, soil: Mixture, da
     grey = np.float32(1 - np.exp(-days / 70))
     mixture: Mixture = {name: part * (1 - straw - green) for name, part in soil.items()}
     mixture |= {"straw": straw * (1 - grey), "straw_grey": straw * grey, "grass_green": green}
-    content = Content(mixture, {"stubble": straw + green, "soil": 1 - straw - green})
-    return _with_wheel_marks(content, field, rows, soil)
+    return _with_wheel_marks(Content(mixture, {"stubble": straw + green, "soil": 1 - straw - green}), field, rows, soil)
 
 
 def _meadow(rows: Rows, field: FieldPlan, here: Ground, days: float, day: int) -> Content:
