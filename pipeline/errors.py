@@ -1,4 +1,4 @@
-"""Define the errors of the package, and escape control characters in text from files and devices.
+"""Define the errors of the package, and write names and text from files and devices into messages.
 
 A message names the wrong value, what is allowed, and what to do.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 _LAYOUT = "\n\t"  # control characters that stay
 _DIRECTION = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
@@ -35,6 +35,11 @@ def is_visible(character: str) -> bool:
         return False
     tag = "\U000e0000" <= character <= "\U000e007f"
     return not tag and unicodedata.category(character) not in ("Cc", "Cs", "Zl", "Zp")
+
+
+def list_some(names: Sequence[str], most: int = 5) -> str:
+    """Return the first names, and how many there are beyond them."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 class PipelineError(Exception):

@@ -16,15 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.tasks.scene import check_labels, judged_labels, seen_in_training
-from flows.training.data import (
-    TrainingData,
-    alike_notes,
-    farm_test_data,
-    listed_scenes,
-    only_class,
-    open_training_data,
-    scene_notes,
-)
+from flows.training.data import TrainingData, alike_notes, farm_test_data, only_class, open_training_data, scene_notes
 from flows.training.observed_scenes import observe_scene
 from models.evaluation.metrics import DRAWS
 from models.network.machine import PROCESSOR
@@ -34,7 +26,7 @@ from models.reading.inference import CoarsePrediction, coarse_prediction_of_colu
 from models.training.examples import normalised
 from models.weights.checksummed_files import refusing
 from models.weights.files import Description, Weights, describe_weights
-from pipeline.errors import EmptySceneError, SceneError, SettingsError
+from pipeline.errors import EmptySceneError, SceneError, SettingsError, list_some
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.simulator.scenes.built_in import built_in_laws
@@ -255,7 +247,7 @@ def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[
     notes = [*alike_notes(alike), *scene_notes(empty, regridded)]
     if validated:
         notes.append(
-            f"the training chose reading, calibration and thresholds by {listed_scenes(validated)}: scores of these"
+            f"the training chose reading, calibration and thresholds by {list_some(validated)}: scores of these"
             " validation frames may be too good; --frames names others"
         )
     return Jobs(frames, left_out, tuple(notes))

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.terminal.figures import counted
-from pipeline.errors import SceneError, SettingsError
+from pipeline.errors import SceneError, SettingsError, list_some
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.simulator.scenes.built_in import SCOUTING_LAW, built_in_laws, built_in_scene
@@ -399,25 +399,20 @@ def alike_notes(alone: Mapping[str, str]) -> tuple[str, ...]:
     for name, kind in alone.items():
         by_class.setdefault(kind, []).append(name)
     return tuple(
-        f"all labels are {kind} in {listed_scenes(names)}; if its value in the label files stands for no class, write"
+        f"all labels are {kind} in {list_some(names)}; if its value in the label files stands for no class, write"
         " unlabelled = VALUE into the scene.toml"
         for kind, names in by_class.items()
     )
 
 
-def listed_scenes(names: Sequence[str]) -> str:
-    """Format the first of some names, and the number of the others."""
-    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
-
-
 def scene_notes(empty: Sequence[str], regridded: Sequence[str], negative: Sequence[str] = ()) -> tuple[str, ...]:
     """Return notes on scenes without any value, with labels on another grid, and with mostly negative values."""
-    left_out = f"{counted(len(empty), 'scene')} without any value left out: {listed_scenes(empty)}"
+    left_out = f"{counted(len(empty), 'scene')} without any value left out: {list_some(empty)}"
     moved = (
-        f"labels of {listed_scenes(regridded)} have another place, CRS or pixels than their images: they are brought to"
+        f"labels of {list_some(regridded)} have another place, CRS or pixels than their images: they are brought to"
         " the images' pixels by nearest neighbour"
     )
-    dark = f"most values of {listed_scenes(negative)} are negative, thus without light; add an offset to the scene.toml"
+    dark = f"most values of {list_some(negative)} are negative, thus without light; add an offset to the scene.toml"
     return tuple(note for names, note in ((empty, left_out), (regridded, moved), (negative, dark)) if names)
 
 

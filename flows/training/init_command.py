@@ -21,7 +21,7 @@ from flows.cli.app import AsJson, Switch, stderr
 from flows.terminal.figures import counted
 from flows.terminal.processes import DONE, writing
 from flows.terminal.progress import StageProgress, put_out
-from pipeline.errors import PipelineError, SceneError, SeriesError, SettingsError
+from pipeline.errors import PipelineError, SceneError, SeriesError, SettingsError, list_some
 from pipeline.geometry.grid import UNLABELLED
 from storage.archive.whole_files import write_whole
 from storage.readers.cube_sources import CubeSource
@@ -225,12 +225,11 @@ def _show(record: dict[str, Any], console: Console) -> None:
     """Print the findings, what is missing, the file, and the next command."""
     height, width, bands = record["shape"]
     images = counted(record["images"], "image")
-    names = ", ".join(one["name"] for one in record["classes"][:8])
-    more = f" and {len(record['classes']) - 8} more" if len(record["classes"]) > 8 else ""
+    names = list_some([one["name"] for one in record["classes"]], 8)
     first = record["first"]
     lines = [
         f"{images}, {record['labelled']} with labels; the first has {height} x {width} px, {bands} bands",
-        *([f"classes: {names}{more}"] if names else []),
+        *([f"classes: {names}"] if names else []),
         *(f"note: {note}" for note in record["notes"]),
         *(f"missing: {one}" for one in record["unseen"]),
         f"written: {record['file']}",

@@ -11,16 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.terminal.figures import counted
-from flows.training.data import (
-    Report,
-    TrainingData,
-    alike_notes,
-    listed_scenes,
-    only_class,
-    pack_mask,
-    scene_notes,
-    trained_pixels,
-)
+from flows.training.data import Report, TrainingData, alike_notes, only_class, pack_mask, scene_notes, trained_pixels
 from flows.training.observed_scenes import observe_scene
 from models.network.machine import PROCESSOR
 from models.network.sizes import SegmenterConfig
@@ -28,7 +19,7 @@ from models.network.spectral import Normalisation, SpectralBasis
 from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
 from models.training.examples import Example, normalised
 from models.training.train import TrainingSettings
-from pipeline.errors import EmptySceneError, SceneError, SettingsError
+from pipeline.errors import EmptySceneError, SceneError, SettingsError, list_some
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.simulator.scenes.built_in import built_in_laws
@@ -110,9 +101,7 @@ def observe_all(
     """Image training and validation scenes. Raises SceneError: none, a single class, or other bands or classes."""
     common, train = _imaged(request, data, data.train, "imaging scenes", report, tell)
     if common is None:
-        raise SceneError(
-            f"{request.dataset} has no scene to train on: no value anywhere in {listed_scenes(data.train)}"
-        )
+        raise SceneError(f"{request.dataset} has no scene to train on: no value anywhere in {list_some(data.train)}")
     _, validation = _imaged(request, data, data.validation, "imaging validation scenes", report, tell, common, train)
     return Scenes(common, train, validation)
 
@@ -173,7 +162,7 @@ def _imaged(
     if unfit:
         tell(
             f"{counted(len(unfit), 'validation scene')} left out, without a labelled pixel or with the image of a"
-            f" training scene: {listed_scenes(unfit)}"
+            f" training scene: {list_some(unfit)}"
         )
     return common, found
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Literal
 
-from pipeline.errors import PipelineError, RigError
+from pipeline.errors import PipelineError, RigError, list_some
 from pipeline.rig.camera.camera_files import log_in
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.drivers import CameraDriver, MirrorDriver
@@ -132,9 +132,7 @@ def _move(mirror: MirrorDriver, clock: Clock, rows: list[CheckRow]) -> None:
 
 
 def _listing(camera: HeadwallCamera) -> str:
-    names = [file.name for file in camera.list_files("/")]
-    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
-    return f"{', '.join(names[:MOST_NAMED])}{more}" if names else "nothing there"
+    return list_some([file.name for file in camera.list_files("/")], MOST_NAMED) or "nothing there"
 
 
 def _row(rows: list[CheckRow], device: Device, asked: str, ask: Callable[[], str]) -> None:

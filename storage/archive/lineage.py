@@ -14,7 +14,7 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Any, Literal
 
-from pipeline.errors import ArchiveError
+from pipeline.errors import ArchiveError, list_some
 from storage.archive.keys import StageRef, in_text, published_runs, published_stores
 from storage.archive.records import Run, Store, read_run, read_store
 from storage.archive.staging import MANIFEST_NAME, check_name
@@ -132,7 +132,7 @@ def find_product(catalogue: Catalogue, text: str) -> str | Run:
         return runs[-1]
     if name != text:
         there = [run.uri for run in reversed(catalogue.runs)]
-        raise ArchiveError(f"there is no run {name} in this archive; there is {_some(there) or 'none'}")
+        raise ArchiveError(f"there is no run {name} in this archive; there is {list_some(there, 3) or 'none'}")
     newest = next((run for run in reversed(catalogue.runs) if run.products), None)
     products = {} if newest is None else newest.products
     address = products.get(text, text)
@@ -147,7 +147,7 @@ def find_product(catalogue: Catalogue, text: str) -> str | Run:
     if len(found) == 1:
         return found[0]
     if found:
-        raise ArchiveError(f"{text} begins {len(found)} stores: {_some(found)}; give more of it")
+        raise ArchiveError(f"{text} begins {len(found)} stores: {list_some(found, 3)}; give more of it")
     if newest is not None and text in products:
         raise ArchiveError(f"the {text} of {newest.uri} lacks its store {wanted}; run verify --repair on the archive")
     near = difflib.get_close_matches(text, products, n=1)
@@ -156,12 +156,8 @@ def find_product(catalogue: Catalogue, text: str) -> str | Run:
     elif products:
         known = f"products of the newest run: {', '.join(products)}"
     else:
-        known = f"no run has products; there is {_some(sorted(catalogue.stores)) or 'nothing in it'}"
+        known = f"no run has products; there is {list_some(sorted(catalogue.stores), 3) or 'nothing in it'}"
     raise ArchiveError(f"{text!r} is no product, store or run of this archive; {known}")
-
-
-def _some(names: list[str]) -> str:
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 ABSENT = "(none)"

@@ -36,7 +36,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from pipeline.errors import RigError
+from pipeline.errors import RigError, list_some
 from pipeline.rig.transports import NotKept
 from pipeline.source import Line
 from storage.archive.keys import plain
@@ -182,9 +182,7 @@ class Spool:
 
 def line_values(numbers: Sequence[int]) -> str:
     """Return the numbers of lines for a message: the first few, and how many follow."""
-    named = ", ".join(str(number) for number in numbers[:MOST_NAMED])
-    more = f" and {len(numbers) - MOST_NAMED} more" if len(numbers) > MOST_NAMED else ""
-    return f"line{'s' if len(numbers) > 1 else ''} {named}{more}"
+    return f"line{'s' if len(numbers) > 1 else ''} {list_some(list(map(str, numbers)), MOST_NAMED)}"
 
 
 @contextmanager

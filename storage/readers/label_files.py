@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.errors import SceneError
+from pipeline.errors import SceneError, list_some
 from pipeline.lazy import GeoBox
 from storage.readers.labels import Labels, found_classes, load_labels
 from storage.readers.open_cubes import CUBE_ENDINGS
@@ -141,9 +141,7 @@ def folders_within(folder: Path) -> str:
 
 def listed_names(paths: Iterable[Path]) -> str:
     """Return the first names, and how many there are beyond them."""
-    names = [path.name for path in paths]
-    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
-    return ", ".join(names[:SHOWN]) + more
+    return list_some([path.name for path in paths], SHOWN)
 
 
 def is_store(entry: Path) -> bool:
