@@ -36,8 +36,7 @@ def beyond_range(values: NDArray[Any], most: float = MOST_VALUE) -> NDArray[np.b
     kind = values.dtype
     if not values.size or kind.kind not in "fiu" or (kind.kind in "iu" and np.iinfo(kind).max <= most):
         return None
-    low, high = values.min(), values.max()
-    if -most <= low and high <= most:
+    if -most <= values.min() and values.max() <= most:
         return None
     found: NDArray[np.bool_] = (values > most) | (values < -most)
     return found if found.any() else None

@@ -278,8 +278,11 @@ def verdict(archive: Archive, findings: list[Finding]) -> dict[str, Any]:
     }
     if bad:
         plan = plan_repair(archive, bad, versions=versions())
-        surveys = [{"run": run.uri, "command": command(settings, archive.name)} for run, settings in plan.surveys]
-        content |= {"to_remake": list(plan.remade), "hopeless": plan.hopeless, "surveys": surveys}
+        content |= {
+            "to_remake": list(plan.remade),
+            "hopeless": plan.hopeless,
+            "surveys": [{"run": run.uri, "command": command(settings, archive.name)} for run, settings in plan.surveys],
+        }
     return content
 
 

@@ -173,8 +173,9 @@ def _index(view: MosaicView, index: SpectralIndex, bands: Sequence[int], white: 
     wave = read_bands(open_group(view.run.path("mosaic")))[0][list(bands)].tolist()
     taken = ", ".join(f"{band.symbol} {nm:.1f} nm" for band, nm in zip(index.bands, wave, strict=True))
     tags = {"index": index.name, "bands": taken, "reference": index.reference}
-    about = layer_tags(view.run, "mosaic", view.geobox) | tags
-    image = CogImage(view.geobox, "float32", (index.name,), np.nan, tags=about)
+    image = CogImage(
+        view.geobox, "float32", (index.name,), np.nan, tags=layer_tags(view.run, "mosaic", view.geobox) | tags
+    )
 
     def rows() -> Rows:
         for first, values in view.rows(bands):

@@ -302,9 +302,13 @@ def _score(run: SurveyRun) -> Estimate:
 
 
 def _kept(run: SurveyRun, captured: float) -> Estimate:
-    pixels, bands = math.prod(run.scene.shape), len(run.scene.wavelength_nm)
-    is_farm = run.settings.scene in BUILT_IN_SCENES
-    kept = estimated_bytes(pixels, bands, captured, is_farm=is_farm, most=run.settings.kept_bytes)
+    kept = estimated_bytes(
+        math.prod(run.scene.shape),
+        len(run.scene.wavelength_nm),
+        captured,
+        is_farm=run.settings.scene in BUILT_IN_SCENES,
+        most=run.settings.kept_bytes,
+    )
     if run.settings.keep == KEEP_SIGNAL:
         return Estimate(kept, KEPT_FROM)
     return Estimate(kept + captured, f"{KEPT_FROM}, and raw lines as they are captured", at_most=True)

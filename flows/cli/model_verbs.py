@@ -58,8 +58,11 @@ class SceneFlags:
 
     def choices(self) -> dict[str, Any]:
         """Return the choices of files and bands of one scene. Raises SettingsError: numbers are invalid."""
-        bands, wavelengths = parse_wholes(self.bands, "--bands"), parse_numbers(self.wavelengths, "--wavelengths")
-        return {"labels": self.labels, "bands": bands, "wavelengths": wavelengths}
+        return {
+            "labels": self.labels,
+            "bands": parse_wholes(self.bands, "--bands"),
+            "wavelengths": parse_numbers(self.wavelengths, "--wavelengths"),
+        }
 
 
 @dataclass(frozen=True, kw_only=True)

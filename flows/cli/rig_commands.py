@@ -230,10 +230,13 @@ def _ending(event: threading.Event) -> Iterator[threading.Event]:
 
 def _write_survey(out: Path, settings: Settings, table: dict[str, object]) -> None:
     """Write the settings of a survey of the emulated rig, with its table [rig]."""
-    size = None if settings.size is None else f"{settings.size[0]}x{settings.size[1]}"
     names = ("scene", "size", "day", "hour", "bands", "wavelengths", "seed", "effects", "tol", "source")
     wanted = {name: getattr(settings, name) for name in names}
-    wanted |= {"size": size, "tol": str(settings.tol), "source": "rig"}
+    wanted |= {
+        "size": None if settings.size is None else f"{settings.size[0]}x{settings.size[1]}",
+        "tol": str(settings.tol),
+        "source": "rig",
+    }
     given = [f"{key} = {as_toml(value)}" for key, value in wanted.items() if value is not None]
     described = settings.to_dict()
     parts = {name: cast("dict[str, object]", described[name]) for name in EMULATED}

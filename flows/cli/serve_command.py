@@ -83,7 +83,6 @@ def serve(
     schedule = schedule_of(cron, every, timezone)
     served = load_fields(fields, out)
     archives = {one.settings.out: open_archive(one.settings.out).root for one in served}
-    home = next(iter(archives.values())) / ".prefect"
     try:
         with terminable(), ExitStack() as held:
             for name, root in archives.items():
@@ -94,7 +93,7 @@ def serve(
                     )
                 held.callback(release)
             shared = "PREFECT_API_URL" in os.environ
-            pages = _start_server(home, port, held)
+            pages = _start_server(next(iter(archives.values())) / ".prefect", port, held)
             # Prefect's runner keeps the code that it starts in /tmp/runner_storage, which its first user could replace
             tempfile.tempdir = held.enter_context(
                 tempfile.TemporaryDirectory(prefix="spectralzoom-runner-", ignore_cleanup_errors=True)
@@ -280,8 +279,10 @@ def _prepare(deployments: Sequence[Any], *, shared: bool) -> None:
             ([StateType.PENDING, StateType.RUNNING], crashed, None),
             ([StateType.CANCELLING], gone, None),
         ):
-            state = filters.FlowRunFilterState(type=filters.FlowRunFilterStateType(any_=kinds))
-            left = filters.FlowRunFilter(state=state, expected_start_time=when)
+            left = filters.FlowRunFilter(
+                state=filters.FlowRunFilterState(type=filters.FlowRunFilterStateType(any_=kinds)),
+                expected_start_time=when,
+            )
             while found := client.read_flow_runs(**own, flow_run_filter=left):  # a page at a time
                 for run in found:
                     client.set_flow_run_state(run.id, ended, force=True)

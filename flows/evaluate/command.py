@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
@@ -24,7 +23,7 @@ from flows.evaluate.frames import (
 from flows.evaluate.judge import ENDS, Record, judge_frame, seeds_of, summarise
 from flows.terminal.figures import counted, format_count, format_percent, format_points
 from flows.terminal.processes import writing
-from flows.terminal.progress import StageProgress, on_stdout, table
+from flows.terminal.progress import StageProgress, put_out, table
 from flows.training.data import TrainingData
 from models.evaluation.metrics import LEVEL
 from models.network.machine import choose_device, keep_freed_memory
@@ -44,10 +43,7 @@ def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = 
     """Judge with progress on ``console``; print the figures as a table or JSON, and write them to the folder."""
     with StageProgress(console) as progress:
         content = evaluate_weights(request, progress.show)
-    if as_json:
-        sys.stdout.write(to_json(content))
-    else:
-        print_evaluation(content, on_stdout())
+    put_out(content, print_evaluation, as_json=as_json)
     for note in content["data_notes"]:
         console.print(f"note: {note}", markup=False, soft_wrap=True)
     for path in content["files"]:

@@ -67,9 +67,11 @@ def checked_request(request: EvaluateRequest) -> EvaluateRequest:
     for flag, value, least in (("--seed", request.seed, 0), ("--draws", request.draws, 1)):
         if value < least:
             raise SettingsError(f"{flag} must be at least {least}, got {value}")
-    fractions = tuple(sorted({fraction for fraction in request.fractions if 0 < fraction < 1}))
-    policies = tuple(dict.fromkeys(name for name in request.policies if name != "oracle"))
-    return replace(request, fractions=fractions, policies=policies)
+    return replace(
+        request,
+        fractions=tuple(sorted({fraction for fraction in request.fractions if 0 < fraction < 1})),
+        policies=tuple(dict.fromkeys(name for name in request.policies if name != "oracle")),
+    )
 
 
 FARM_TEST_SCENES = 4

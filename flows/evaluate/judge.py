@@ -131,8 +131,9 @@ def difference(row: Row, other: Row | None, request: EvaluateRequest) -> Record 
     """Return the paired interval of one row minus another, over their frames; None without another."""
     if other is None or other is row:
         return None
-    seeds = row.of_seed, other.of_seed
-    found = paired_interval(row.counts, other.counts, seeds=seeds, draws=request.draws, seed=request.seed)
+    found = paired_interval(
+        row.counts, other.counts, seeds=(row.of_seed, other.of_seed), draws=request.draws, seed=request.seed
+    )
     return {**asdict(found), "frames": row.counts.shape[1]}
 
 

@@ -100,9 +100,11 @@ def find_ground(
     geobox = run.scene.geobox if posed is None else posed.geobox
     if geobox is None:
         return {}
-    side = pixel_side_m(geobox) if posed is None else abs(float(geobox.resolution.x))
-    shape = [int(size) for size in geobox.shape]
-    figures: dict[str, Any] = {"crs": crs_name(geobox), "resolution_m": side, "shape": shape}
+    figures: dict[str, Any] = {
+        "crs": crs_name(geobox),
+        "resolution_m": pixel_side_m(geobox) if posed is None else abs(float(geobox.resolution.x)),
+        "shape": [int(size) for size in geobox.shape],
+    }
     place, drawn = run.zones.place, found.classes != UNLABELLED
     figures |= {"older_ha": older_hectares(place, np.where(drawn, probabilities.age(), np.nan))}
     if (old_class := differing_now(probabilities)) is not None:

@@ -114,8 +114,11 @@ def draw_ground(found: GroundMap) -> bytes:
     """Draw picture and class map side by side as PNG: north up, axes in metres, hectares in the legend."""
     box = found.geobox.boundingbox
     extent = (0.0, box.right - box.left, 0.0, box.top - box.bottom)
-    size = (GROUND_IN, GROUND_IN / 2 * min(max(extent[3] / extent[1], 0.4), 1.6) + 1.1)
-    figure = Figure(figsize=size, dpi=GROUND_DPI, layout="constrained")
+    figure = Figure(
+        figsize=(GROUND_IN, GROUND_IN / 2 * min(max(extent[3] / extent[1], 0.4), 1.6) + 1.1),
+        dpi=GROUND_DPI,
+        layout="constrained",
+    )
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
     thin = slice(None, None, -(-max(found.classes.shape) // GROUND_MOST_PX))
     seen = found.picture[thin, thin].any(axis=-1, keepdims=True)

@@ -67,8 +67,10 @@ def policy(names: tuple[str, ...]) -> str:
 
 def render_page(template: str, carries: tuple[str, ...] = (), **facts: Any) -> str:
     """Render an HTML template; text of ``facts`` that is no `Markup` is escaped. ``carries`` are the page's scripts."""
-    scripts = Markup("\n").join(Markup("<script>{}</script>").format(Markup(part(name))) for name in carries)
-    own = {"policy": policy(carries), "scripts": scripts}
+    own = {
+        "policy": policy(carries),
+        "scripts": Markup("\n").join(Markup("<script>{}</script>").format(Markup(part(name))) for name in carries),
+    }
     return visible(_environment(markdown=False).get_template(template).render(facts | own))
 
 

@@ -302,9 +302,12 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
         found["memory"] = memory
     if run.settings.extent != EXTENT_WHOLE:
         expected = {} if run.extent is None else asdict(run.extent)
-        remembers = memory is not None and memory["put_aside"] is None
-        touched = len(plan.patch_index) / max(len(run.kept_patches), 1)
-        found["extent"] = {"lines": run.settings.extent, "patches_touched": touched, "remembers": remembers, **expected}
+        found["extent"] = {
+            "lines": run.settings.extent,
+            "patches_touched": len(plan.patch_index) / max(len(run.kept_patches), 1),
+            "remembers": memory is not None and memory["put_aside"] is None,
+            **expected,
+        }
     passes = {"coarse": products.get("register_coarse"), "fine": products.get("register_fine")}
     pointing = {name: _pointing(ref) for name, ref in passes.items() if ref is not None}
     if "fine" in pointing:

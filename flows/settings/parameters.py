@@ -134,8 +134,11 @@ def at_due_time(settings: Settings, due: datetime) -> Settings:
 
     The farm has the day of the due time in this machine's time zone. Stated values of visit, day and prior are kept.
     """
-    visit = settings.visit or due.astimezone(UTC).isoformat().replace("+00:00", "Z")
-    requested = replace(settings, visit=visit, prior="latest" if settings.prior == "auto" else settings.prior)
+    requested = replace(
+        settings,
+        visit=settings.visit or due.astimezone(UTC).isoformat().replace("+00:00", "Z"),
+        prior="latest" if settings.prior == "auto" else settings.prior,
+    )
     if requested.source == "sim" and requested.scene in BUILT_IN_SCENES and requested.day is None:
         return replace(requested, day=due.astimezone().timetuple().tm_yday)
     return requested

@@ -76,9 +76,8 @@ class Drawing:
         weights, mosaic, chosen = self.weights.load(), open_mosaic(self.mosaic.path / "mosaic.zarr"), self.chosen
         seen = coarse_region(weights, self.mosaic, region, self.capture)
         if self.choice is not None:
-            overview = None
-            if self.choice.overviews is not None:
-                overview = load_overview(overview_file(self.choice.overviews, region), weights)
+            folder = self.choice.overviews
+            overview = None if folder is None else load_overview(overview_file(folder, region), weights)
             seen = predicted = read_coarse_prediction(weights, seen, overview)
             gain, here = gain_of(class_errors(seen)[:, 0], self.choice.class_pixels), region.numbers_here(chosen)
             chosen = chosen[(here >= 0) & (gain[here] >= self.choice.least_gain)]

@@ -80,8 +80,7 @@ def find_prior(
     for run in _before(archive, settings, name, scene_key):
         found = _usable(archive, run, settings, grid, class_names)
         if isinstance(found, Prior):
-            notes = (f"prior map: {run.folder.name}, {found.days:.3g} days earlier",)
-            return found, _unusable(runs_by_reason) + notes
+            return found, (*_unusable(runs_by_reason), f"prior map: {run.folder.name}, {found.days:.3g} days earlier")
         runs_by_reason.setdefault(found, []).append(run.folder.name)
     why = "none of its earlier runs can be one" if runs_by_reason else "this is its first visit"
     return None, (*_unusable(runs_by_reason), f"{name} has no prior map: {why}")

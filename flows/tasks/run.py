@@ -338,9 +338,15 @@ class SurveyRun(CaptureRun):
     ) -> dict[str, Any]:
         """Return limits, patches and multiply-adds of the full network, for receipts."""
         settings, everything = self.settings, self.kept_patches
-        limits = {"macs": settings.macs, "least_gain": self.least_gain, "expected_loss": settings.expected_loss}
-        costs = {"done": self.work_done(patch_index, memory).total, "everything": self.costs.of_map(everything).total}
-        return {"asked": limits, "patches": len(patch_index), "of_patches": len(everything), "multiply_adds": costs}
+        return {
+            "asked": {"macs": settings.macs, "least_gain": self.least_gain, "expected_loss": settings.expected_loss},
+            "patches": len(patch_index),
+            "of_patches": len(everything),
+            "multiply_adds": {
+                "done": self.work_done(patch_index, memory).total,
+                "everything": self.costs.of_map(everything).total,
+            },
+        }
 
     @property
     def kept_patches(self) -> NDArray[np.intp]:

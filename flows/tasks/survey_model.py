@@ -61,13 +61,12 @@ class SurveyModel:
 
     def check_bands(self, wavelength_nm: NDArray[np.floating]) -> None:
         """Check that the bands overlap the spectral range of the weights. Raises WeightsError: they do not."""
-        weights = self.described
-        _, reached = weights.basis.matrix(wavelength_nm)
+        basis = self.described.basis
+        _, reached = basis.matrix(wavelength_nm)
         if not reached.any():
-            low, high = weights.basis.low_nm, weights.basis.high_nm
             raise WeightsError(
-                f"the weights {self.path.name} are for {low:.0f}-{high:.0f} nm; the scene's bands lie at"
-                f" {wavelength_nm.min():.0f}-{wavelength_nm.max():.0f} nm: use weights trained on such data"
+                f"the weights {self.path.name} are for {basis.low_nm:.0f}-{basis.high_nm:.0f} nm; the scene's bands lie"
+                f" at {wavelength_nm.min():.0f}-{wavelength_nm.max():.0f} nm: use weights trained on such data"
             )
 
     @property

@@ -323,8 +323,11 @@ SEGMENT = Tradeoff(
 
 def survey_tradeoff(scene: str, weights: Path) -> Tradeoff:
     """Return the trade-off of `survey` on a given scene, captured by the simulated rig."""
-    words = f"labels of {Path(scene).name}, captured by the simulated rig; parts by expected gain"
-    return replace(SURVEY, prepare=lambda seed: plan_every_way(seed, scene, weights), reference=words)
+    return replace(
+        SURVEY,
+        prepare=lambda seed: plan_every_way(seed, scene, weights),
+        reference=f"labels of {Path(scene).name}, captured by the simulated rig; parts by expected gain",
+    )
 
 
 def segment_tradeoff(scene: str, weights: Path) -> Tradeoff:

@@ -142,8 +142,9 @@ def _scanned(
     """Simulate a uniform scan of a scene and segment it in full; return counts of the map and its confidence."""
     assert example.noise is not None
     grid, labels = _parts(weights, example)
-    device = weights.segmenter.device
-    scan = augmentation.scanned(example.columns, example.noise, light=light, step=step, rng=rng, device=device)
+    scan = augmentation.scanned(
+        example.columns, example.noise, light=light, step=step, rng=rng, device=weights.segmenter.device
+    )
     drawn, every_class = map_of_columns(weights, scan, grid, LineSpec(light, step))
     valid = (labels != UNLABELLED) & np.isfinite(drawn.confidence)
     sure = confidence_counts(drawn.confidence[valid], drawn.classes[valid] == labels[valid])

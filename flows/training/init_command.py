@@ -290,7 +290,6 @@ def draft_scene(address: str | Path, report: Report = lambda done, name: None) -
     first, series = _named_step(address if alone else found.images[0])
     source = with_wavelengths(open_cube(first), first, None)
     found, unseen = _shared_labels(found, source.shape[:2]), list[str]()
-    classes = _classes(found, source.shape[2], unseen, report)
     # one file may have the labels of all images; else names find them
     of_all = set(found.labels.values())
     label_path = os.path.relpath(of_all.pop(), folder) if len(of_all) == 1 and not found.bare else ""
@@ -299,7 +298,7 @@ def draft_scene(address: str | Path, report: Report = lambda done, name: None) -
         first=str(first),
         cube=source,
         only_label=Path(label_path).as_posix() if label_path and label_path.isprintable() else None,
-        classes=classes,
+        classes=_classes(found, source.shape[2], unseen, report),
         notes=(*series, *source.notes),
         unseen=tuple(unseen),
         has_steps=bool(series),

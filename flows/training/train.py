@@ -191,8 +191,9 @@ def _learned(
     weights = Weights(model, common.basis, normalisation, common.names, common.colours).on(device)
     frames, found = scenes.validation.examples, dict[str, Any]()
     labelled = sum(int(np.count_nonzero(one.labels != UNLABELLED)) for one in examples)
-    few = begun is None and labelled < FEW_PIXELS
-    weights, found["readings"] = better_reading(weights, start, frames, few=few, begun=begun)
+    weights, found["readings"] = better_reading(
+        weights, start, frames, few=begun is None and labelled < FEW_PIXELS, begun=begun
+    )
     if frames:
         found["baselines"] = judge_baselines(examples, frames, config.classes, seed, report)
         report("validating", 0.0, f"{len(frames)} scenes")

@@ -82,8 +82,11 @@ def placement_figures(rows: Placements) -> dict[str, dict[str, Any]]:
             continue
         each = [agreement(counts) for counts in draws]
         means = {name: float(np.mean([one[name] for one in each])) for name in each[0]}
-        spread = float(np.std([one["miou"] for one in each], ddof=1)) if len(each) > 1 else None
-        found[policy] = {**means, "spread": spread, "gap_closed": gap_closed(means["miou"], none, every)}
+        found[policy] = {
+            **means,
+            "spread": float(np.std([one["miou"] for one in each], ddof=1)) if len(each) > 1 else None,
+            "gap_closed": gap_closed(means["miou"], none, every),
+        }
     return found
 
 

@@ -39,12 +39,6 @@ class SpectralBasis:
         distinct = len(np.unique(wavelength))
         return SpectralBasis(float(wavelength.min()), float(wavelength.max()), min(most_columns, distinct))
 
-    @property
-    def spacing_nm(self) -> float:
-        """Return the distance of neighbouring column centres [nm]; a single column covers all wavelengths."""
-        span = self.high_nm - self.low_nm
-        return span / (self.columns - 1) if self.columns > 1 else max(span, LONGEST_NM)
-
     def matrix(self, wavelength_nm: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Return weights from bands to columns, (band, column), and which columns a band reaches, (column,).
 
@@ -55,7 +49,9 @@ class SpectralBasis:
         """
         wavelength = checked_wavelengths(wavelength_nm, len(wavelength_nm))
         centres = np.linspace(self.low_nm, self.high_nm, self.columns)
-        distance = (wavelength[:, None] - centres[None, :]) / self.spacing_nm
+        span_nm = self.high_nm - self.low_nm
+        apart_nm = span_nm / (self.columns - 1) if self.columns > 1 else max(span_nm, LONGEST_NM)  # one covers all
+        distance = (wavelength[:, None] - centres[None, :]) / apart_nm
         bump = np.where(np.abs(distance) <= REACH, np.exp(-0.5 * (distance / 0.5) ** 2), 0.0)
         weight = bump * band_widths(wavelength)[:, None]
         total = weight.sum(axis=0)

@@ -106,10 +106,15 @@ class RecordedPasses:
         for one in self.source.sweeps:
             scan_px = one.tangents[one.valid_line, 1] / self.source.camera.ifov_rad
             low, high = float(np.nanmin(scan_px)), float(np.nanmax(scan_px))
-            lines = int((high - low) // like.step) + 1
-            start = low - (like.positions - 1) / 2
-            name = f"{like.name.rpartition('-')[0]}-{len(found)}"
-            found.append(replace(like, name=name, swath_px=one.sweep.swath_px, start_px=start, lines=lines))
+            found.append(
+                replace(
+                    like,
+                    name=f"{like.name.rpartition('-')[0]}-{len(found)}",
+                    swath_px=one.sweep.swath_px,
+                    start_px=low - (like.positions - 1) / 2,
+                    lines=int((high - low) // like.step) + 1,
+                )
+            )
         return found
 
     def _exposure_ms(self, sweep: Sweep) -> float | None:

@@ -50,8 +50,7 @@ class LineTable:
         points = np.flatnonzero(~whole & placed.touches(self.shape))
         flat, joint = self._usable_taps(placed.chosen(points))
         total = reduce(np.add, joint.T)  # tap by tap, in the order of `weighted_rows`
-        index, weight = torch.from_numpy(flat), torch.from_numpy(joint)
-        fraction[points] = self._read(index, weight, total, out, points)
+        fraction[points] = self._read(torch.from_numpy(flat), torch.from_numpy(joint), total, out, points)
 
     def _read_whole(self, placed: Windows, out: Floats32, at: Rows | None = None) -> Floats32:
         """Write points whose windows lie wholly on usable samples."""

@@ -42,9 +42,8 @@ class Components:
     def white(self, values: NDArray[np.floating]) -> Scores:
         """Return whitened spectra of scene values (..., band); 0 in bands without any value."""
         lit = np.isfinite(self.mean)
-        scale = np.where(lit, 1 / np.where(lit, self.noise, 1), 0).astype(np.float32)
         found = np.asarray(values - np.nan_to_num(self.mean).astype(np.float32), np.float32)
-        found *= scale
+        found *= np.where(lit, 1 / np.where(lit, self.noise, 1), 0).astype(np.float32)
         if not lit.all():
             found[..., ~lit] = 0
         return found

@@ -160,8 +160,7 @@ class CondensedSignal:
         image = np.full((len(usable), self.samples), np.nan, np.float32)
         for part in cuts(len(usable), BLOCK_LINES):
             scores = self.lines.read(part.start, part.stop).astype(np.float32) * np.float32(self._condensed.step)
-            seen = self._condensed.usable[part] & usable[part, None]
-            image[part] = np.where(seen, scores @ weights + offset, np.nan)
+            image[part] = np.where(self._condensed.usable[part] & usable[part, None], scores @ weights + offset, np.nan)
         return image
 
 

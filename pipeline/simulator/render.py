@@ -78,10 +78,12 @@ def expected_light(scene: RasterScene, block: SweepBlock, chosen: Mapping[Any, s
     """
     choice = Choice.of(chosen)
     steps = [views.flat() for views in _views(block, choice, scene.shape)]
-    exposure_ratio = block.rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS
     moments, names = tuple(choice.doing("moments")), tuple(map(choice.variant, ("slit", "smear", "rotation")))
     light = _sampler(block.rig, block.sweep, block.wavelength_nm.tobytes(), moments, names).scan_pass(
-        scene, steps, along_y=block.sweep.along == "y", exposure_ratio=exposure_ratio
+        scene,
+        steps,
+        along_y=block.sweep.along == "y",
+        exposure_ratio=block.rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS,
     )
     light = light.reshape(len(block.lines), -1, light.shape[1])
     pending: Radiance | None = None

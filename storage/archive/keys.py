@@ -66,8 +66,11 @@ def plain(value: object) -> Any:
     if isinstance(value, np.ndarray):
         if value.dtype.kind == "O":
             raise ArchiveError("an array of objects cannot be part of a key; give numbers")
-        content = hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
-        return {"dtype": value.dtype.str, "shape": list(value.shape), "sha256": content}
+        return {
+            "dtype": value.dtype.str,
+            "shape": list(value.shape),
+            "sha256": hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest(),
+        }
     if is_dataclass(value) and not isinstance(value, type):
         return {one.name: plain(getattr(value, one.name)) for one in fields(value)}
     if isinstance(value, Mapping):

@@ -171,8 +171,10 @@ def create_probabilities(
 
 def old_class_flags(legend: ClassNames) -> dict[str, Any]:
     """Return CF's flag attributes of an image of the previous classes."""
-    words = f"class remembered, where the map is sure of another one; {UNLABELLED} everywhere else"
-    return {**class_flags(legend.names, legend.colours), "long_name": words}
+    return {
+        **class_flags(legend.names, legend.colours),
+        "long_name": f"class remembered, where the map is sure of another one; {UNLABELLED} everywhere else",
+    }
 
 
 def packed_probabilities(log_probability: Floats) -> NDArray[np.uint8]:

@@ -98,9 +98,9 @@ def _npz_arrays(path: Path) -> dict[str, FileArray]:
                     shape, _, kind = (formats.read_array_header_1_0 if old else formats.read_array_header_2_0)(stream)
                 if not kind.hasobject:
                     ratio = 1 if member.compress_type == zipfile.ZIP_STORED else DEFLATE_RATIO
-                    where, load_it = f"{path}:{member.filename}", partial(load, member)
-                    one = _whole(where, shape, kind, load_it, member.compress_size, ratio)
-                    found[member.filename.removesuffix(".npy")] = one
+                    found[member.filename.removesuffix(".npy")] = _whole(
+                        f"{path}:{member.filename}", shape, kind, partial(load, member), member.compress_size, ratio
+                    )
     return found
 
 
@@ -229,8 +229,7 @@ def other_place(arrays: Arrays, cube: ArrayCube, shape: tuple[int, int, int]) ->
         texts = [arrays[f"{folder}/{name}"][()] for name in ("Map_Info", "EPSG Code")]
         info, code = (str(np.asarray(text).astype(np.str_).reshape(-1)[0]) for text in texts)
         return place_or_note(lambda: _place_of_neon(info, code, shape[:2]))
-    names = {name.rpartition("/")[2].lower() for name, array in arrays.items() if array.ndim == 2}
-    if "glt_x" in names:
+    if "glt_x" in {name.rpartition("/")[2].lower() for name, array in arrays.items() if array.ndim == 2}:
         return None, (
             "its pixels are in the sensor's own geometry and have no map grid; for a place on the earth, write it"
             " orthorectified by its geolocation grids (glt_x, glt_y) first",

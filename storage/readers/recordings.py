@@ -278,8 +278,9 @@ def _timed(
     camera = _exposing(camera, exposures)
     if periods and abs(periods[0] - camera.frame_ms) > SAME_PERIOD * camera.frame_ms:
         period = max(periods[0], camera.exposure_ms)
-        rate = max(camera.max_rate_hz, 1000 / period)
-        camera = replace(camera, readout_ms=period - camera.exposure_ms, max_rate_hz=rate)
+        camera = replace(
+            camera, readout_ms=period - camera.exposure_ms, max_rate_hz=max(camera.max_rate_hz, 1000 / period)
+        )
         notes.append(f"lines follow each other every {period:.6g} ms, by their times")
     return camera
 

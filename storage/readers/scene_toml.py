@@ -222,5 +222,4 @@ def _table(path: Path) -> NDArray[np.float64]:
 
 
 def _listed(values: NDArray[np.float64]) -> str:
-    shown = ", ".join(f"{value:g}" for value in values[:6])
-    return shown + (f", ... ({values.size})" if values.size > 6 else "")
+    return ", ".join(f"{value:g}" for value in values[:6]) + (f", ... ({values.size})" if values.size > 6 else "")

@@ -79,9 +79,13 @@ def evaluate(
             scene = ReadTwice(readings[0], readings[1], scores, judged, gains.frame.grid)
             fraction, found = control_placements(gains, scene, len(drawn.names), patches, seed=seed)
             none, every = (map_figures(names, found[which][0]) for which in ("none", "all"))
-            gap = gap_closed(result["miou"], none["miou"], every["miou"])
-            compared = {"controls": placement_figures(found), "controls_fraction": fraction}
-            result |= {"none": none, "all": every, "gap_closed": gap, **compared}
+            result |= {
+                "none": none,
+                "all": every,
+                "gap_closed": gap_closed(result["miou"], none["miou"], every["miou"]),
+                "controls": placement_figures(found),
+                "controls_fraction": fraction,
+            }
         (path / RECORD).write_text(to_json(result), encoding="utf-8")  # JSON without NaN
 
     params = {**model_key, "labels": array_digest(labels), "controls": controls, **source_key}

@@ -162,9 +162,13 @@ def all_seen(grid: SceneGrid, sweeps: Sequence[Sweep], camera: LineCamera, *, pa
 def kept_within(budget: PatchBudget, scores: Scores, scan_plan: FinePlan) -> FinePlan:
     """Return the plan of a uniform scan with the patches that the budget pays for."""
     chosen = budget.choose(scores)
-    reason = f"{scan_plan.reason}; the full network reads {len(chosen)} of {len(budget.patch_index)} patches"
     finite = np.where(np.isfinite(scores), scores, 0.0)
-    return replace(scan_plan, patch_index=np.sort(chosen), reason=reason, expected_gain=float(finite[chosen].sum()))
+    return replace(
+        scan_plan,
+        patch_index=np.sort(chosen),
+        reason=f"{scan_plan.reason}; the full network reads {len(chosen)} of {len(budget.patch_index)} patches",
+        expected_gain=float(finite[chosen].sum()),
+    )
 
 
 def load_plan(attention: StageRef) -> FinePlan:

@@ -176,14 +176,17 @@ def _write_sweeps(
     done = []
     for number, (cube, condenser) in enumerate(sweeps):
         mean = np.nan_to_num(condenser.components.mean)
-        largest = condenser.components.largest(found.largest + np.abs(origin - mean))
         out, first = path / f"{cube.sweep.name}.zarr", sweeps[0][0]
         shutil.rmtree(out, ignore_errors=True)
-        shared = first.sweep.name if number and cube.references.same_as(first.references) else None
         bands = cube.wavelength_nm, cube.fwhm_nm
         header = SweepHeader(cube.sweep, cube.references, *bands, cube.source, cube.started, cube.simulation)
         writer = SignalCubeWriter(
-            out, header, condenser.components, step=condenser.step, largest=largest, frames_of=shared
+            out,
+            header,
+            condenser.components,
+            step=condenser.step,
+            largest=condenser.components.largest(found.largest + np.abs(origin - mean)),
+            frames_of=first.sweep.name if number and cube.references.same_as(first.references) else None,
         )
 
         def part(fraction: float, number: int = number) -> None:

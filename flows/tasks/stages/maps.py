@@ -91,11 +91,14 @@ def segment(
     params["least_gain"] = least_gain
     if prior is None:
         return Wanted(build, params, [mosaic, attention])
-    shifts = [list(scan_pass.shift_px) for scan_pass in prior.scan_passes]
     known: dict[str, Any] = {"days": prior.days, "day_of_year": prior.day_of_year, "classes": list(prior.classes)}
     known["reader"] = None if reader is None else reader.key
     earlier = [prior.probabilities, *(one.mosaic for one in prior.scan_passes)]
-    return Wanted(build, {**params, **known, "shifts": shifts}, [mosaic, attention, *earlier])
+    return Wanted(
+        build,
+        {**params, **known, "shifts": [list(scan_pass.shift_px) for scan_pass in prior.scan_passes]},
+        [mosaic, attention, *earlier],
+    )
 
 
 def create_maps(path: Path, gains: PatchGains, unknown: UnknownRule | None, *, goes_on: bool) -> tuple[str, ...]:
@@ -211,9 +214,13 @@ def ground(
                 images[OLD_CLASS] = nearest_at(changes.old_class, pixels, UNLABELLED)
             return images
 
-        legend, goes_on = ClassNames(found.names, found.colours), changes is not None
-        about = {"rig_pose": asdict(grid.frame.view.pose), "scene_pixels": grid.counts()}
-        writer = GroundMapWriter(path / STORE, grid.geobox, legend, about=about, goes_on=goes_on)
+        writer = GroundMapWriter(
+            path / STORE,
+            grid.geobox,
+            ClassNames(found.names, found.colours),
+            about={"rig_pose": asdict(grid.frame.view.pose), "scene_pixels": grid.counts()},
+            goes_on=changes is not None,
+        )
         for rows, columns in map_blocks(grid.shape, BLOCK):
             writer.write_block(rows, columns, shown(grid.scene_pixels(rows, columns)))
             report(rows.stop / grid.shape[0])

@@ -128,8 +128,10 @@ class SceneView:
             return self.source.rig
         exposure, period = times_ms
         rate = max(camera.max_rate_hz, 1000 / period)
-        changed = replace(camera, exposure_ms=exposure, readout_ms=period - exposure, max_rate_hz=rate)
-        return replace(self.source.rig, camera=changed)
+        return replace(
+            self.source.rig,
+            camera=replace(camera, exposure_ms=exposure, readout_ms=period - exposure, max_rate_hz=rate),
+        )
 
 
 def _runs(number: Ints, alike: NDArray[np.bool_]) -> Iterator[slice]:
@@ -189,13 +191,12 @@ class SceneCamera(CameraDevice):
     def _scene_lines(self, middle_s: Floats) -> Raw:
         """Return the raw lines (line, sample, band) of exposures by their mid times."""
         capture = next(one for one in reversed(self.captures) if one.began_s <= middle_s[0])
-        times_ms = capture.exposure_s * 1e3, capture.period_s * 1e3
         known = announced(_prefix(capture)) or Announced(AT_REST, 0)
         step = known.sweep.positions  # positions during each exposure
         moments = (np.arange(step) + 0.5) * (capture.exposure_s / step)
         held = self.mirror.positions(middle_s[:, None] - capture.exposure_s / 2 + moments)
         whole_began_s = capture.began_s - known.first * capture.period_s  # as if taken in one capture
-        return self.view.lines(known.sweep, held, times_ms, whole_began_s)
+        return self.view.lines(known.sweep, held, (capture.exposure_s * 1e3, capture.period_s * 1e3), whole_began_s)
 
 
 def _prefix(capture: EmulatedCapture) -> str:

@@ -233,10 +233,9 @@ def _gaussian(shift: Floats, variance: Floats) -> Transfer:
 
 def _passed(kernels: Kernels, own: Floats) -> Transfer:
     """Return the transmission of waves by kernels behind slit and pixel, (wave, kernel)."""
-    left = kernels.variance - THINNED * (kernels.level**2 - 1)
     seen = {level: _seen_at(level) for level in set(kernels.level.tolist())}
     through = own[:, None] * np.stack([seen[level] for level in kernels.level.tolist()], axis=1)
-    return through * _gaussian(kernels.shift, left)
+    return through * _gaussian(kernels.shift, kernels.variance - THINNED * (kernels.level**2 - 1))
 
 
 def _wanted(moments: Floats, own: Floats) -> Transfer:

@@ -133,10 +133,18 @@ def _menu(effect: Effect, probe: Probe, rig: Rig, present: bool, gain: float) ->
 
 
 def _is_present(effect: Effect, probe: Probe, rig: Rig) -> bool:
-    bright = max(probe.brightest_e, rig.camera.full_scale_e)
     ones, both = np.ones(len(probe.wavelength_nm)), np.ones((2, len(probe.wavelength_nm)))
-    loud = replace(probe, level=ones, span=ones, slope=both, curvature=both)
-    loud = replace(loud, spectral_slope=ones, brightest_e=bright, slit_errors={})
+    bright = max(probe.brightest_e, rig.camera.full_scale_e)
+    loud = replace(
+        probe,
+        level=ones,
+        span=ones,
+        slope=both,
+        curvature=both,
+        spectral_slope=ones,
+        brightest_e=bright,
+        slit_errors={},
+    )
     greatest = max(effect.bound(loud, rig, OFF).value, effect.bound(probe, rig, OFF).value)
     return effect.name in ALWAYS_ON or greatest > 0
 
@@ -198,12 +206,11 @@ def light_read(probe: Probe, rig: Rig, gains: Sequence[GainRange]) -> Probe:
 
     Each sample is counted by the greatest product of the gains, or by the least.
     """
-    least = math.prod(float(np.minimum(one.least, 1.0).min(initial=1.0)) for one in gains)
     greatest = math.prod(float(np.maximum(one.greatest, 1.0).max(initial=1.0)) for one in gains)
     after = light_after(probe, rig, gains)
     return replace(
         after,
         level=after.level * error_growth(probe, rig, None, greatest),
         brightest_e=after.brightest_e * greatest,
-        darkest_e=probe.darkest_e * least,
+        darkest_e=probe.darkest_e * math.prod(float(np.minimum(one.least, 1.0).min(initial=1.0)) for one in gains),
     )

@@ -255,7 +255,6 @@ def crown_shadows(
         dy = (np.arange(top, bottom + 1) - y0)[: shape[0] - top, None]
         dx = (np.arange(left, right + 1) - x0)[None, : shape[1] - left]
         far = np.hypot((dy * along[0] + dx * along[1]) / reach, (dx * along[0] - dy * along[1]) / width)
-        cover = np.clip((1 - far) * width + 0.5, 0, 1)
         window = covered[top : top + dy.size, left : left + dx.size]
-        np.maximum(window, cover.astype(np.float32), out=window)
+        np.maximum(window, np.clip((1 - far) * width + 0.5, 0, 1).astype(np.float32), out=window)
     return covered
