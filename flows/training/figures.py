@@ -163,12 +163,7 @@ READINGS = MappingProxyType({"network": 1.0, "mean of both": 0.5, "linear discri
 
 
 def better_reading(
-    weights: Weights,
-    start: Mapping[str, Any],
-    validation: Sequence[Example],
-    *,
-    few: bool,
-    begun: Weights | None = None,
+    weights: Weights, start: Mapping[str, Any], validation: Sequence[Example], *, few: bool, begun: Weights | None
 ) -> tuple[Weights, dict[str, Any]]:
     """Choose between the trained network, its initial linear discriminants and the mean of their logits.
 

@@ -318,10 +318,7 @@ def halfway(start: Segmenter, trained: Segmenter) -> Segmenter:
 
 
 def run_identity(
-    config: SegmenterConfig,
-    examples: list[Example],
-    settings: TrainingSettings,
-    start: Mapping[str, Tensor] | None = None,
+    config: SegmenterConfig, examples: list[Example], settings: TrainingSettings, start: Mapping[str, Tensor] | None
 ) -> str:
     """Return the hash of everything that a run depends on, which identifies its checkpoints."""
     digest = hashlib.sha256(json.dumps([asdict(config), asdict(settings)], sort_keys=True).encode())

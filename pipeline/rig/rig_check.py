@@ -25,7 +25,6 @@ SQUARE = ((0.03, 0.03), (0.03, -0.03), (-0.03, -0.03), (-0.03, 0.03))  # within 
 FAR = 0.02  # of the disk's radius: errors of a position from which on it is wrong
 SETTLE_S = 2.0
 LOG_HZ, LOGGED = 1000.0, 8
-MOST_NAMED = 5  # entries of a listing
 CONNECT = "connect"
 
 
@@ -132,7 +131,7 @@ def _move(mirror: MirrorDriver, clock: Clock, rows: list[CheckRow]) -> None:
 
 
 def _listing(camera: HeadwallCamera) -> str:
-    return list_some([file.name for file in camera.list_files("/")], MOST_NAMED) or "nothing there"
+    return list_some([file.name for file in camera.list_files("/")]) or "nothing there"
 
 
 def _row(rows: list[CheckRow], device: Device, asked: str, ask: Callable[[], str]) -> None:
