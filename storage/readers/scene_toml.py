@@ -153,7 +153,8 @@ def settle_wavelengths(
         fitting = _fit(values, chosen, file_bands, own, f"{settings.path}: wavelengths_nm for {path}")
         return Bands(fitting, None, f"wavelengths from {settings.path}")
     if settings.wavelengths_file is not None and settings.path is not None:
-        return _from_file(settings.path.parent / settings.wavelengths_file, settings.dropped_bands, chosen, file_bands)
+        listed = settings.path.parent / settings.wavelengths_file
+        return _from_file(listed, settings.dropped_bands, chosen, file_bands, path)
     if known.wavelength_nm is not None and len(known.wavelength_nm) == file_bands:
         centre = check_wavelengths(known.wavelength_nm, str(path))[chosen]
         return Bands(centre, None if known.fwhm_nm is None else known.fwhm_nm[chosen], known.origin)
@@ -184,7 +185,7 @@ def _fit(
     return np.array([known[band] for band in chosen], np.float64)
 
 
-def _from_file(path: Path, dropped: Sequence[int], chosen: list[int], file_bands: int) -> Bands:
+def _from_file(path: Path, dropped: Sequence[int], chosen: list[int], file_bands: int, image: Path) -> Bands:
     """Return the rows of nm and FWHM, without the dropped ones (counted from 1)."""
     table = _table(path)
     bad = [row for row in dropped if not 1 <= row <= len(table)]
@@ -194,7 +195,8 @@ def _from_file(path: Path, dropped: Sequence[int], chosen: list[int], file_bands
     if len(kept) != file_bands:
         raise WavelengthError(
             f"{path} has {len(table)} rows, {len(set(dropped))} of them dropped, which leaves {len(kept)} wavelengths "
-            f"for {file_bands} bands; correct dropped_bands in scene.toml"
+            f"for the {file_bands} band{'s' * (file_bands != 1)} of {image}; correct dropped_bands in scene.toml, or give "
+            "the file of the scene if that is another one"
         )
     centre = check_wavelengths(kept[:, 0], str(path))[chosen]
     widths = kept[:, 1] if kept.shape[1] > 1 else None
