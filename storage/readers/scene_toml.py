@@ -195,8 +195,8 @@ def _from_file(path: Path, dropped: Sequence[int], chosen: list[int], file_bands
     if len(kept) != file_bands:
         raise WavelengthError(
             f"{path} has {len(table)} rows, {len(set(dropped))} of them dropped, which leaves {len(kept)} wavelengths "
-            f"for the {file_bands} band{'s' * (file_bands != 1)} of {image}; correct dropped_bands in scene.toml, or give "
-            "the file of the scene if that is another one"
+            f"for the {file_bands} band{'s' * (file_bands != 1)} of {image}; correct dropped_bands in scene.toml, or "
+            "give the file of the scene if that is another one"
         )
     centre = check_wavelengths(kept[:, 0], str(path))[chosen]
     widths = kept[:, 1] if kept.shape[1] > 1 else None
