@@ -6,11 +6,6 @@ import sys
 from importlib import metadata
 from pathlib import Path
 
-from docutils import nodes
-from docutils.statemachine import StringList
-from sphinx.application import Sphinx
-from sphinx.util.docutils import SphinxDirective
-
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
@@ -29,6 +24,7 @@ html_title = "SpectralZoom"
 html_copy_source = False
 html_show_sphinx = False
 
+myst_enable_extensions = ["substitution"]
 myst_heading_anchors = 3  # links such as own-data.md#labels, which are checked
 suppress_warnings = ["config.cache"]
 
@@ -51,23 +47,4 @@ def stage_table() -> str:
     )
 
 
-TABLES = {"settings": settings_table, "stages": stage_table}
-
-
-class Generated(SphinxDirective):
-    """Parses the Markdown of one of `TABLES` where a page names it, headings included."""
-
-    required_arguments = 1
-
-    def run(self) -> list[nodes.Node]:
-        """Give the table's nodes."""
-        lines = TABLES[self.arguments[0]]().splitlines()
-        holder = nodes.Element()
-        self.state.nested_parse(StringList(lines, source=self.arguments[0]), 0, holder, match_titles=True)
-        return holder.children
-
-
-def setup(app: Sphinx) -> dict[str, bool]:
-    """Make the directive known."""
-    app.add_directive("generated", Generated)
-    return {"parallel_read_safe": True}
+myst_substitutions = {"settings": settings_table(), "stages": stage_table()}
