@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from importlib import metadata
-from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-
-from flows.settings.documents import settings_table  # noqa: E402
-from flows.tasks.open_survey import STAGES  # noqa: E402
+from flows.settings.documents import settings_table
+from flows.tasks.open_survey import STAGES
 
 project = "SpectralZoom"
 version = release = metadata.version("spectralzoom")
@@ -40,8 +35,7 @@ nitpick_ignore_regex = [("py:.*", ".*")]
 
 def stage_table() -> str:
     """Markdown: every stage in the order of a survey, from the records that the survey itself runs by."""
-    head = "| stage | on terminals | stored as, version |\n|---|---|---|\n"
-    return head + "".join(
+    return "| stage | on terminals | stored as, version |\n|---|---|---|\n" + "".join(
         f"| `{one.name}` | {one.title} | `stages/{one.product.name}`, {one.product.version} |\n"
         for one in STAGES.values()
     )

@@ -15,11 +15,7 @@ _UNSEEN = "\u00ad\u061c\u200b\u200e\u200f\u2060\ufeff"  # marks of direction, an
 _SUSPECT = re.compile(r"[^\n\t\x20-\x7e\u00a1-\u00ac\u00ae-\u02ff\u0370-\u058f\u2010-\u2027\u2030-\u205e\u4e00-\u9fff]")
 
 
-def _escaped(character: str) -> str:
-    return character.encode("unicode_escape").decode("ascii")
-
-
-def visible(text: str, escaped: Callable[[str], str] = _escaped) -> str:
+def visible(text: str, escaped: Callable[[str], str] = lambda one: one.encode("unicode_escape").decode("ascii")) -> str:
     r"""Return text with escapes (``\x1b``, ``\u202e``) for control characters, marks of direction and unseen ones.
 
     Line ends, tabs and the letters of all scripts stay, also the joiners that some scripts need.

@@ -153,8 +153,9 @@ def settle_wavelengths(
         fitting = _fit(values, chosen, file_bands, own, f"{settings.path}: wavelengths_nm for {path}")
         return Bands(fitting, None, f"wavelengths from {settings.path}")
     if settings.wavelengths_file is not None and settings.path is not None:
-        listed = settings.path.parent / settings.wavelengths_file
-        return _from_file(listed, settings.dropped_bands, chosen, file_bands, path)
+        return _from_file(
+            settings.path.parent / settings.wavelengths_file, settings.dropped_bands, chosen, file_bands, path
+        )
     if known.wavelength_nm is not None and len(known.wavelength_nm) == file_bands:
         centre = check_wavelengths(known.wavelength_nm, str(path))[chosen]
         return Bands(centre, None if known.fwhm_nm is None else known.fwhm_nm[chosen], known.origin)
