@@ -273,3 +273,20 @@ class Mounting:
 
 
 STRAIGHT = Mounting()
+
+
+def wire_positions(positions: ArrayLike, mounting: Mounting = STRAIGHT) -> NDArray[np.float32]:
+    """Return positions (position, 2) as float32 for the wire; rounding moves none of them beyond the rim.
+
+    Positions of a mirror mounted straight become those of the device in its ``mounting``. Raises ShapeError: they have
+    another shape, or there is none. Raises PoseError: one is not finite or lies beyond the rim.
+    """
+    exact = np.array(positions)
+    if exact.ndim != 2 or exact.shape[1:] != (2,) or not len(exact):
+        raise ShapeError(f"a path needs positions as (position, 2), at least one, got shape {exact.shape}")
+    exact = check_reach(exact).astype(np.float64)
+    exact /= np.maximum(np.hypot(exact[:, :1], exact[:, 1:]), 1)  # the slack that check_reach allows
+    rounded: NDArray[np.float32] = exact.astype(np.float32)
+    beyond = np.hypot(*rounded.astype(np.float64).T) > 1
+    rounded[beyond] = np.nextafter(rounded[beyond], np.float32(0))
+    return rounded if mounting == STRAIGHT else wire_positions(mounting.to_device(rounded))

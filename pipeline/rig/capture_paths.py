@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from pipeline.errors import RigError, SettingsError
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import direction_to_scene, position_to_direction
+from pipeline.geometry.mirror import direction_to_scene, position_to_direction, wire_positions
 from pipeline.geometry.scan import Axis, Sweep, exposing, line_positions, memory_loads, sweep_positions
 from pipeline.rig.camera.camera_cubes import CapturedLines
-from pipeline.rig.mirror_controller import MotionLog, wire_positions
+from pipeline.rig.mirror_controller import MotionLog
 
 Floats = NDArray[Any]  # float64
 Ints = NDArray[np.int64]

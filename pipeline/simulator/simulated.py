@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
 from pipeline.geometry.camera import LineCamera, bin_samples
+from pipeline.geometry.mirror import wire_positions
 from pipeline.geometry.scan import CostModel, Sweep, exposing, line_positions, memory_loads
 from pipeline.simulator.effects.counting import DEFECTS, dead_elements, hot_electrons
 from pipeline.simulator.effects.effect import OFF, SweepBlock
@@ -29,6 +30,7 @@ from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from pipeline.source import AT_REST, Line, References
 
 Raw = NDArray[np.uint16]
+REFERENCE_FRAMES = 32  # of whole numbers, of which a dark or white frame is the mean
 BLOCK_LINES = 16  # rendered at a time: 11 MB of light with 640 samples and 270 bands
 Frame = NDArray[np.float32]
 SEEN = frozenset({RESPONSE.name, SMILE.name, PRNU.name, STRIPING.name})  # by light of the white reference
@@ -88,7 +90,7 @@ class SimulatedSource:
 
     def lines_of(self, sweep: Sweep, numbers: range) -> list[Line]:
         """Return some lines of the sweep, as `lines` does. Threads may ask at the same time."""
-        camera, middle = exposing(self.camera, sweep), line_positions(sweep, self.camera)
+        camera, middle = exposing(self.camera, sweep), wire_positions(line_positions(sweep, self.camera))
         return [
             Line(
                 number=number,
@@ -123,7 +125,7 @@ class SimulatedSweep:
 
     @property
     def position(self) -> NDArray[np.float64]:
-        return line_positions(self.sweep, self.source.camera)
+        return wire_positions(line_positions(self.sweep, self.source.camera)).astype(np.float64)
 
     @property
     def time_s(self) -> NDArray[np.float64]:
@@ -211,7 +213,7 @@ def check_binning(sweep: Sweep, camera: LineCamera) -> None:
 
 
 def take_references(scene: RasterScene, rig: Rig, choice: Choice, sweep: Sweep) -> References:
-    """Return mean dark and white frames (sample, band) with the sweep's binning, free of noise. [DN]
+    """Return means of dark and white frames (sample, band) with the sweep's binning, free of noise. [DN]
 
     The white frame is scaled from a shorter exposure, so that it does not saturate. It is taken with the mirror at
     rest, by the light of the survey's start. Dead and hot elements count as bad; the white reference's values are in
@@ -240,12 +242,16 @@ def take_references(scene: RasterScene, rig: Rig, choice: Choice, sweep: Sweep) 
     if (response := choice.variant(RESPONSE.name)) != OFF:
         white_reference = RESPONSE.change(white_reference[None, None], block, response)[0, 0]
     return References(
-        dark=_binned(dark, sweep.binning),
-        white=_binned(dark + seen / np.float32(rig.camera.electrons_per_dn), sweep.binning),
+        dark=_binned(_mean_of_frames(dark), sweep.binning),
+        white=_binned(_mean_of_frames(dark + seen / np.float32(rig.camera.electrons_per_dn)), sweep.binning),
         white_reference=white_reference,
         bad=bad,
         by_mirror=choice.variant(VIGNETTING.name) != OFF,
     )
+
+
+def _mean_of_frames(frame: Frame) -> Frame:
+    return np.asarray(np.floor(frame.astype(np.float64) * REFERENCE_FRAMES + 0.5) / REFERENCE_FRAMES, np.float32)
 
 
 def _binned(frame: Frame, binning: int) -> Frame:

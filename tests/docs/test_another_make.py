@@ -75,7 +75,7 @@ class Program:
         for name, folder in self.runs.items():
             self._save(name, self.line.camera().fetch(folder, KeptInMemory()).values)
             if name.startswith(REFERENCES):
-                both = seen.view.references((seen.exposure_ms, seen.period_ms), 32)
+                both = seen.view.references((seen.exposure_ms, seen.period_ms))
                 for kind, frames in both.items():
                     self._save(f"{name}_{kind.removesuffix('Reference')}", frames)
         self.runs.clear()

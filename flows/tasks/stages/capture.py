@@ -32,7 +32,7 @@ from storage.arrays.cubes import STATISTICS, RawCubeWriter, SweepHeader
 from storage.arrays.spool import Spool
 from storage.parallel.pool import WorkerPool
 
-RAW = Product("capture", version=12)
+RAW = Product("capture", version=13)
 RIG_RECORD = "rig.json"  # record of a rig's captures, beside the cubes
 
 

@@ -31,22 +31,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import RigError, SettingsError
-from pipeline.geometry.mirror import STRAIGHT, Mounting, direction_to_scene, position_to_direction
+from pipeline.geometry.mirror import STRAIGHT, Mounting, direction_to_scene, position_to_direction, wire_positions
 from pipeline.geometry.scan import Sweep, sweep_positions
 from pipeline.rig.capture_paths import REFERENCES, Announced, announced
 from pipeline.rig.device_settings import Pulses
 from pipeline.rig.emulator.camera_device import CameraDevice, CameraServer, EmulatedCapture, Floats, Ints, Raw
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.mirror_controller import wire_positions
 from pipeline.rig.transports import BITS_PER_BYTE, SYSTEM_CLOCK, Clock, Closing
 from pipeline.simulator.effects.effect import Aim, Bound, SweepBlock
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.render import Choice
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.simulated import SimulatedSource, render_lines
+from pipeline.simulator.simulated import REFERENCE_FRAMES, SimulatedSource, render_lines
 from pipeline.source import AT_REST
-
-REFERENCE_FRAMES = 32
 
 
 @dataclass(frozen=True)
@@ -105,13 +102,10 @@ class SceneView:
         number = np.rint((scan - sweep.start_px - (sweep.positions - 1) / 2) / sweep.step)
         return np.asarray(np.clip(number, 0, sweep.lines - 1).astype(np.int64))
 
-    def references(self, times_ms: tuple[float, float], frames: int) -> dict[str, Raw]:
-        """Return dark and white frames (frame, sample, band) whose means are the source's.
-
-        The means agree to half of 1 / ``frames`` DN.
-        """
+    def references(self, times_ms: tuple[float, float]) -> dict[str, Raw]:
+        """Return dark and white frames (frame, sample, band) whose means are the source's."""
         taken = replace(self.source, rig=self._rig(times_ms)).references(AT_REST)
-        dither = ((np.arange(frames) + 0.5) / frames)[:, None, None]
+        dither = ((np.arange(REFERENCE_FRAMES) + 0.5) / REFERENCE_FRAMES)[:, None, None]
         return {
             name: np.clip(np.floor(mean[None] + dither), 0, 65535).astype(np.uint16)
             for name, mean in (("darkReference", taken.dark), ("whiteReference", taken.white))
@@ -185,7 +179,7 @@ class SceneCamera(CameraDevice):
     def _begun(self, folder: str, frames: int) -> EmulatedCapture:
         capture = super()._begun(folder, frames)
         if _prefix(capture) == REFERENCES:
-            capture.references = self.view.references((self.exposure_ms, self.period_ms), REFERENCE_FRAMES)
+            capture.references = self.view.references((self.exposure_ms, self.period_ms))
         return capture
 
     def _scene_lines(self, middle_s: Floats) -> Raw:

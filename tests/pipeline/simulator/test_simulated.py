@@ -70,11 +70,11 @@ def test_a_sweep_of_its_own_exposure_is_as_by_a_camera_that_has_it(exposure_ms: 
 
 
 def test_line_says_when_and_where() -> None:
-    """Times are of mid exposure, a frame apart, and positions those of the scan."""
+    """Times are of mid exposure, a frame apart, and positions those of the scan, as float32 on the wire."""
     lines = list(source_of(np.ones((40, 40, 1))).lines(SWEEP))
     np.testing.assert_allclose([line.time_s for line in lines], 0.05 + 0.1 * np.arange(40))
     positions = [(line.mirror_x, line.mirror_y) for line in lines]
-    np.testing.assert_array_equal(positions, line_positions(SWEEP, CAMERA))
+    np.testing.assert_array_equal(positions, line_positions(SWEEP, CAMERA).astype(np.float32))
     assert {line.exposure_ms for line in lines} == {100.0}
 
 
@@ -209,9 +209,10 @@ def test_binned_frames_are_sums() -> None:
 
 
 def test_frames_show_dark_current_and_gains() -> None:
-    """The dark frame has the mean dark current, the white frame both gains of every element."""
+    """The dark frame has the mean dark current, the white frame both gains of every element, in 32nds of a number."""
     found = white_reference_source_of("dark-current", "prnu", "striping").references(WHITE_REFERENCE_SWEEP)
-    np.testing.assert_allclose(found.dark, 64 + dark_electrons(RIG), rtol=1e-6)
+    np.testing.assert_allclose(found.dark, 64 + dark_electrons(RIG), rtol=0, atol=1 / 64)
+    np.testing.assert_array_equal(found.white * 32 % 1, 0)
     gains = PRNU.gains(RIG, BANDS) * STRIPING.gains(RIG, BANDS)
     np.testing.assert_allclose(found.white - found.dark, gains * even_scene().white_reference_electrons, rtol=1e-4)
 

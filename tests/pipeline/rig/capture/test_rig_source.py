@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 
 from pipeline.errors import RigError
-from pipeline.geometry.mirror import Mounting
+from pipeline.geometry.mirror import Mounting, wire_positions
 from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.rig.camera.camera_files import KeptInMemory
 from pipeline.rig.capture_runner import CaptureJournal
-from pipeline.rig.mirror_controller import wire_positions
 from pipeline.rig.pro_mode import Command
 from pipeline.source import Line
 from tests.pipeline.rig.small_rig import (

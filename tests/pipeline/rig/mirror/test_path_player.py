@@ -8,8 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import PoseError, RigError, ShapeError
+from pipeline.geometry.mirror import wire_positions
 from pipeline.rig.device_settings import Patience, ReadBack
-from pipeline.rig.mirror_controller import ProLink, frames_to_check, upload, wire_positions
+from pipeline.rig.mirror_controller import ProLink, frames_to_check, upload
 from pipeline.rig.pro_mode import Command, Frame, FrameReader, encode, read_vector
 from pipeline.rig.transports import BITS_PER_BYTE, DeadlinePassed, Wire
 from tests.pipeline.rig.in_process import ManualClock

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
+from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect, wire_positions
 from pipeline.geometry.scan import Sweep, line_positions, points_of_scan, sweep_to_scene
 from pipeline.simulator.effects.air import PARALLAX, WIND
 from pipeline.simulator.effects.effect import SweepBlock
@@ -157,9 +157,9 @@ def test_mirror_looks_beside_and_reports_the_plan():
     moved = replace(POINTING_ERRORS_SWEEP, swath_px=float(along), start_px=start_px, name="moved")
     seen = SimulatedSweep(source_of(errors), POINTING_ERRORS_SWEEP)
     np.testing.assert_allclose(seen.read(0, 40), SimulatedSweep(source_of(None), moved).read(0, 40), atol=1)
-    np.testing.assert_array_equal(seen.position, line_positions(POINTING_ERRORS_SWEEP, CAMERA))
+    np.testing.assert_array_equal(seen.position, wire_positions(line_positions(POINTING_ERRORS_SWEEP, CAMERA)))
     line = next(source_of(errors).lines(POINTING_ERRORS_SWEEP))
-    assert line.mirror_x == line_positions(POINTING_ERRORS_SWEEP, CAMERA)[0, 0]
+    assert line.mirror_x == seen.position[0, 0]
 
 
 MIRROR_EFFECTS_CAMERA = LineCamera(samples=64, exposure_ms=4.0)
