@@ -87,7 +87,8 @@ def prior_map(prior: Prior | None, drawn: StageRef, receipt: Receipt) -> PriorMa
 def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: PriorMapField | None) -> FieldMap:
     """Return the map of a run; ``shown`` are the data of its quicklook."""
     thin = thinned(shown.class_map)
-    palette = palette_bytes(shown.class_colours)
+    palette = np.tile(np.rint(255 * np.array(UNLABELLED_COLOUR)).astype(np.uint8), (256, 1))
+    palette[: len(shown.class_colours)] = shown.class_colours
 
     def classes(image: NDArray[np.integer]) -> str:
         return layer_address(image[thin].astype(np.uint8), palette)
@@ -141,13 +142,6 @@ def error_address(class_map: NDArray[np.integer], labels: NDArray[np.integer]) -
     judged = (class_map != UNLABELLED) & (labels != UNLABELLED)
     colours = [(0, 0, 0, 0), *(np.rint(255 * np.array(to_rgba(one))) for one in ERROR_COLOURS.values())]
     return layer_address(np.where(judged, 1 + (class_map != labels), 0).astype(np.uint8), np.array(colours, np.uint8))
-
-
-def palette_bytes(colours: NDArray[np.integer]) -> Bytes:
-    """Return the (256, 3) colours of class numbers; all beyond the classes are grey."""
-    palette = np.tile(np.rint(255 * np.array(UNLABELLED_COLOUR)).astype(np.uint8), (256, 1))
-    palette[: len(colours)] = colours
-    return palette
 
 
 def layer_address(numbers: Bytes, colours: Bytes) -> str:

@@ -67,20 +67,16 @@ def settings_table() -> str:
     parts = []
     for title, keys in {"": {k: v for k, v in SURVEY.items() if k not in TABLES}, **TABLES}.items():
         heading = f"## [{title}]\n\n{SURVEY[title].item.metadata['description']}\n\n" if title else ""
+        shown = {MISSING: "to be given", None: "", "": ""}
         rows = [
-            f"| `{name}` | {_default(one)} | {'' if one.kind is str else one.expected} | {about(one, choices=False)} |"
+            f"| `{name}` | {shown.get(one.item.default, f'`{toml_value(one)}`')} | "
+            f"{'' if one.kind is str else one.expected} | {about(one, choices=False)} |"
             for name, one in keys.items()
         ]
         parts.append(
             heading + "\n".join(["| key | default | allowed values | meaning |", "|---|---|---|---|", *rows]) + "\n"
         )
     return "\n".join(parts)
-
-
-def _default(one: Declared) -> str:
-    if one.item.default is MISSING:
-        return "to be given"
-    return "" if one.item.default in (None, "") else f"`{toml_value(one)}`"
 
 
 if __name__ == "__main__":

@@ -122,11 +122,12 @@ class Spool:
 
     def blocks(self, size: int = SYNC_LINES) -> Iterator[list[Line]]:
         """Yield the lines in blocks of ``size``; the last may be shorter. A damaged line is not valid."""
+        nothing, unknown = np.zeros((self.samples, self.bands), np.uint16), (float("nan"),) * 4
         with self.path.open("rb") as file:
             file.seek(len(self._head))
             for first in range(0, self.count, size):
-                numbers = range(first, min(first + size, self.count))
-                yield [self._line(number, file.read(self._size)) or self._lost(number) for number in numbers]
+                read = [self._line(one, file.read(self._size)) for one in range(first, min(first + size, self.count))]
+                yield [line or Line(n, nothing, *unknown, valid=False) for n, line in enumerate(read, first)]
 
     def close(self) -> None:
         """Close the file; appended lines stay."""
@@ -164,10 +165,6 @@ class Spool:
         found, mirror_x, mirror_y, time_s, exposure_ms, valid = _FACTS.unpack(facts)
         values = np.frombuffer(data, "<u2").reshape(self.samples, self.bands).astype(np.uint16)
         return Line(number, values, mirror_x, mirror_y, time_s, exposure_ms, valid) if found == number else None
-
-    def _lost(self, number: int) -> Line:
-        nothing, unknown = np.zeros((self.samples, self.bands), np.uint16), float("nan")
-        return Line(number, nothing, unknown, unknown, unknown, unknown, valid=False)
 
     def _crc(self, facts: bytes, data: bytes | memoryview) -> bytes:
         return _CRC.pack(zlib.crc32(data, zlib.crc32(facts, self._seed)))

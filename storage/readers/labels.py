@@ -175,9 +175,11 @@ def load_codes(
         clear = source.void & ~np.isin(codes, [*map(_code, classes)])
         codes[clear] = NO_VALUE
         notes += [f"{clear.sum()} px of the label file are transparent or masked: unlabelled"] if clear.any() else []
-    if geobox is not None and own is not None and not _is_same_grid(own, geobox):
-        codes, regridded = _on_grid(codes, own, geobox, address), True
-        notes.append(f"labels {address} have another grid than the scene: they are resampled by nearest neighbour")
+    if geobox is not None and own is not None:
+        shift = shift_px(geobox, own) if own.crs == geobox.crs and own.shape == geobox.shape else None
+        if shift is None or max(map(abs, shift)) > OFF_GRID_PX:
+            codes, regridded = _on_grid(codes, own, geobox, address), True
+            notes.append(f"labels {address} have another grid than the scene: they are resampled by nearest neighbour")
     return LabelCodes(codes, of_colours, tuple(notes), regridded)
 
 
@@ -200,11 +202,6 @@ def _whole_numbers(values: NDArray[Any], address: str | Path, *, by_number: bool
         f"labels {address} have shape {values.shape} and type {values.dtype}; expected whole numbers (y, x) or colours "
         f"(y, x, 3) of 8 bits"
     )
-
-
-def _is_same_grid(own: GeoBox, scene: GeoBox) -> bool:
-    shift = shift_px(scene, own) if own.crs == scene.crs else None
-    return shift is not None and max(map(abs, shift)) <= OFF_GRID_PX and own.shape == scene.shape
 
 
 def _on_grid(codes: NDArray[np.int64], own: GeoBox, grid: GeoBox, address: str | Path) -> NDArray[np.int64]:
