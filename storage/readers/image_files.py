@@ -77,21 +77,12 @@ def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> Cub
         keep = [band for band in range(file.count) if band != alpha]
         kind = np.result_type(*(np.dtype(file.dtypes[band]) for band in keep or [0]))
         height, width, count = file.height, file.width, len(keep) * len(pages)
-        void = _void(file, alpha)
         geobox, where = place_of_file(file)
         one = len(pages) == 1
         known, of_bands = _bands_of(file, keep, [kinds[band] for band in keep], path) if one else (Bands(), ())
         notes = [*notes, *([] if alpha is None else [ALPHA_NOTE]), *where, *of_bands]
         scale, offset = (np.tile([of[band] for band in keep], len(pages)) for of in (file.scales, file.offsets))
-        picture, colours = driver not in _CALLED, None
-        nodata = None if "NODATA_VALUES" in file.tags() else file.nodata  # a colour is in the mask
-        if picture and kinds == ["palette"] and not palette:
-            listed, count = np.zeros((256, 4), np.uint8), 3
-            for number, colour in file.colormap(1).items():
-                listed[number] = colour
-            clear, colours, nodata = listed[file.read(1), 3] == 0, listed[:, :3], None
-            void = clear if clear.any() else None
-            known, notes = _of_colours(RGB_NM), ["colours looked up in the image's palette"]
+        at_once = height if driver not in _CALLED else block[0] if driver == "JP2OpenJPEG" else 1
 
         def read_rows(first: int, last: int) -> NDArray[Any]:
             """Return some rows, (y, x, band) (SceneError: they are damaged)."""
@@ -99,36 +90,52 @@ def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> Cub
             for page in pages:
                 with _opened(path, page) as opened:
                     planes.append(opened.read([band + 1 for band in keep], window=((first, last), (0, width))))
-            numbers = np.ascontiguousarray(np.moveaxis(np.concatenate(planes), 0, -1), kind)
-            return numbers if colours is None else colours[numbers[..., 0]]
+            return np.ascontiguousarray(np.moveaxis(np.concatenate(planes), 0, -1), kind)
 
-        at_once = height if picture else block[0] if driver == "JP2OpenJPEG" else 1
-        read = read_by_chunks(read_rows, height, at_once)
         bad = set(bad_bands(_file_tags(file).get("bbl"), file.count))
         source = CubeSource(
             name=path.name,
             shape=(height, width, count),
             dtype=kind,
-            read=read,
+            read=read_by_chunks(read_rows, height, at_once),
             files=(path,),
             bands=known,
-            nodata=nodata,
+            nodata=None if "NODATA_VALUES" in file.tags() else file.nodata,  # a colour is in the mask
             geobox=geobox,
             bad_bands=tuple(place for place, band in enumerate(keep) if band in bad) if one else (),
-            void=void,
+            void=_void(file, alpha),
             notes=tuple(notes),
         )
+        if driver not in _CALLED and kinds == ["palette"] and not palette:
+            source = _coloured(source, file)
+    read, void = source.read, source.void
     if scaled and void is not None and not void.all():
         source = replace(
             source,
             dtype=np.dtype(np.float32),
             read=lambda first, last: np.where(
-                void[first:last, :, None], np.float32(np.nan), read(first, last).astype(np.float32)
+                void[first:last, :, None], np.float32(np.nan), np.float32(read(first, last))
             ),
         )
-    if scaled and not ((scale == 1).all() and (offset == 0).all()):
-        source = rescaled(source, scale, offset, source.nodata)
-    return source
+    plain = not scaled or ((scale == 1).all() and (offset == 0).all())
+    return source if plain else rescaled(source, scale, offset, source.nodata)
+
+
+def _coloured(source: CubeSource, file: Any) -> CubeSource:
+    """Return the colours (y, x, 3) of a palette's numbers; clear ones are void."""
+    listed = np.zeros((256, 4), np.uint8)
+    for number, colour in file.colormap(1).items():
+        listed[number] = colour
+    clear = listed[file.read(1), 3] == 0
+    return replace(
+        source,
+        shape=(*source.shape[:2], 3),
+        read=lambda first, last: listed[source.read(first, last)[..., 0], :3],
+        bands=_of_colours(RGB_NM),
+        nodata=None,
+        void=clear if clear.any() else None,
+        notes=("colours looked up in the image's palette",),
+    )
 
 
 def rescaled(
