@@ -24,6 +24,8 @@ from models.reading.ood import OodDetector
 from models.reading.prior_map import (
     CurrentVisit,
     TemporalAgreement,
+    as_captured,
+    changed_fractions,
     changed_from,
     compare,
     first_probabilities,
@@ -101,22 +103,21 @@ class Drawing:
         else:
             prior_map = self.memory.of(region, weights)
             after = fuse(prior_map, observation, self.weights.load_reader())
-            if unknown is not None:  # the classes say nothing of them: no earlier class, and no age that grows
-                for image in (after.log_probability, after.age_days):
-                    image[unknown] = np.nan
-                after.light[unknown] = 0
+            if unknown is not None:  # the classes say nothing of them
+                after.log_probability[unknown], after.light[unknown] = np.nan, 0
             classes, confidence = after.classes()
             comparison = compare(prior_map, observation, after, region.kept_here)
-            old = changed_from(prior_map, after)
+            old, after = changed_from(prior_map, after), as_captured(prior_map, after)
         if self.unknown is not None and unknown is not None:
             classes[unknown], confidence[unknown] = self.unknown.number, np.nan
+            after.log_probability[unknown], after.age_days[unknown] = np.nan, 0  # they are captured
         reading = None
         if self.choice is not None:
             read, changed = np.zeros(gain.shape, np.bool_), np.zeros(gain.shape, np.float32)
             read[patch_index] = True
             before = predicted.probability.argmax(axis=-1)[: region.grid.height, : region.grid.width]
             other = (drawn.classes != before) & (drawn.classes != UNLABELLED)
-            changed[patch_index] = patch_pixels(region.grid, other)[patch_index].mean(axis=(1, 2))
+            changed[patch_index] = changed_fractions(other, region.grid).ravel()[patch_index]
             kept = region.crop_patches
             reading = FullReading(kept(gain), kept(read), kept(changed))
         unread = 0 if seen.out_of_range is None else int(np.count_nonzero(region.crop(seen.out_of_range)))
@@ -139,9 +140,13 @@ class Drawing:
             log_probability = np.where(away[..., None], np.float32(np.nan), log_probability)
         if not shown.all():
             log_probability = np.where(shown[..., None], log_probability, np.float32(np.nan))
+        own_light = np.zeros(seen.grid.padded_shape, np.float32)
+        for spec in seen.capture.specs:
+            here = seen.capture.where(spec)
+            own_light[... if here is None else here] = spec.light / spec.step**2
         light, step, _ = seen.capture.usual
         coarse = seen.columns[:0] if self.memory is None else pooled(seen.seen_columns)
-        return CurrentVisit(log_probability, shown, coarse, light, int(step))
+        return CurrentVisit(log_probability, shown, coarse, light, int(step), own_light[: len(shown), : shown.shape[1]])
 
     def _shown(self, region: Region, mosaic: Mosaic) -> NDArray[np.bool_]:
         """Return the pixels (y, x) of a region that were captured.
@@ -153,8 +158,9 @@ class Drawing:
         if not self.part:
             return covered
         reached = patch_pixels(region.grid, covered)
-        reached &= reached.mean(axis=(1, 2), keepdims=True) >= ENOUGH_SEEN
         (rows, columns), p = region.grid.patch_shape, region.grid.patch
+        enough = ENOUGH_SEEN * region.grid.valid_fraction().reshape(-1, 1, 1)  # of a patch at the border of the field
+        reached &= reached.mean(axis=(1, 2), keepdims=True) >= enough
         pixels = reached.reshape(rows, columns, p, p).swapaxes(1, 2).reshape(rows * p, columns * p)
         return np.ascontiguousarray(pixels[: region.grid.height, : region.grid.width])
 

@@ -14,7 +14,7 @@ from flows.tasks.capture_plan import PassLayout
 from flows.tasks.prior_maps import Prior
 from flows.terminal.figures import format_percent
 from models.reading.expected_errors import Floats, PatchExpectedErrors
-from models.reading.prior_map import COME_TRUE, ClassProbabilities, PriorMap, carried, in_classes
+from models.reading.prior_map import COME_TRUE, HALO, ClassProbabilities, PriorMap, carried, in_classes
 from models.weights.files import Description, load_reader
 from pipeline.errors import BudgetError, NothingToMend, SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid, cuts
@@ -33,7 +33,7 @@ from storage.arrays.class_maps import ProbabilityStore
 Mask = NDArray[np.bool_]
 SWATH_PATCHES = 4  # rows of patches whose class probabilities are read at a time
 POORER = 0.05  # mIoU below the best scan: poorer scans would degrade the prior map
-DUE = 1e3  # weight of patches that are too old, relative to the gain of the whole field
+DUE = 1e3  # gain of a patch that is too old: that of all others together is at most 1
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class ExtentGains:
 
     def expected_gain(self, gains: Floats) -> Floats:
         """Return gains with patches that are too old first; without any gain, older patches first."""
-        expected_gain = gains + np.where(self.due, DUE * max(float(gains.sum()), LOSS), 0.0)
+        expected_gain = gains + np.where(self.due, DUE, 0.0)
         if expected_gain.any():
             return expected_gain
         return np.where(self.shown, LOSS * (1 + np.nan_to_num(self.expected_errors.age_days, posinf=1e6)), 0.0)
@@ -156,7 +156,7 @@ def _best_extent(layout: PassLayout, extent_gains: ExtentGains, seconds: float) 
             times = RunTimes.of_scan(rows.sweeps, camera, cost, exposure_ms)
             extent = choose_runs(rows, expected_gain, times, seconds=seconds)
             found += [] if extent is None else [(step, exposure_ms, extent)]
-            least.append(cheapest_row_seconds(rows, camera, cost, exposure_ms))
+            least.append(cheapest_row_seconds(rows, expected_gain, camera, cost, exposure_ms))
     if not least:
         raise SettingsError(
             f"camera.exposure_ms = {camera.exposure_ms:g} is too short for a partial scan; give a longer one, or leave"
@@ -178,7 +178,9 @@ def _swaths(
     store, high = ProbabilityStore(prior.probabilities.path / "class_probabilities.zarr"), SWATH_PATCHES * grid.patch
     read = None if weights.reader is None else load_reader(path)
     for rows in cuts(grid.height, high):
-        probabilities, age, light = store.read(rows)
+        first, last = max(rows.start - HALO, 0), min(rows.stop + HALO, grid.height)
+        probabilities, age, light = store.read(slice(first, last))
         before = ClassProbabilities(in_classes(probabilities, prior.classes), age, light)
         today = carried(PriorMap(before, None, prior.days, prior.day_of_year), read)
-        yield today.log_probability, today.age_days
+        own = slice(rows.start - first, rows.stop - first)
+        yield today.log_probability[own], today.age_days[own]

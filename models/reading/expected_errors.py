@@ -29,7 +29,7 @@ def expected_error_of(log_probability: NDArray[np.floating]) -> Floats:
 class PatchExpectedErrors:
     """Pixels of each patch by their likeliest class and expected error, and the age of the oldest ones.
 
-    One class more than the map has is for pixels of which nothing is known.
+    One class more than the map has is for pixels without probabilities.
     """
 
     pixels: NDArray[np.float32]  # (patch, class + 1, step) counts
@@ -59,8 +59,11 @@ class PatchExpectedErrors:
             down, across = (np.arange(size) // grid.patch for size in (len(probabilities), grid.width))
             patch_number = down[:, None] * columns + across  # of each pixel, from the first of the strip
             here = slice(first, first + math.ceil(len(probabilities) / grid.patch))
-            known = np.isfinite(probabilities[..., 0])
-            wrong = np.where(known, come_true, 1.0) * expected_error_of(probabilities)
+            known = ~np.isnan(probabilities).all(axis=-1)
+            captured = np.isfinite(
+                age
+            )  # without probabilities: it belongs to no class, as a new capture would say again
+            wrong = np.where(known, come_true, np.where(captured, 0.0, 1.0)) * expected_error_of(probabilities)
             step = np.minimum(np.searchsorted(edges, wrong), STEPS - 1)
             place = np.where(known, np.nan_to_num(probabilities, nan=-np.inf).argmax(axis=-1), classes) * STEPS + step
             asked = np.True_ if left_out is None else ~left_out[top : top + len(probabilities)]
@@ -68,7 +71,7 @@ class PatchExpectedErrors:
             sums += np.bincount(place[counts], wrong[counts], minlength=sums.size)
             place = place + patch_number * sums.size
             pixels[here] = np.bincount(place[counts], minlength=pixels[here].size).reshape(pixels[here].shape)
-            known_age = np.where(asked & np.isfinite(age), age, -np.inf)
+            known_age = np.where(asked & captured, age, -np.inf)
             np.maximum.at(ages[here].reshape(-1), patch_number.ravel(), known_age.ravel())
             top += len(probabilities)
         age_days = np.where(ages < 0, np.inf, ages).ravel()

@@ -1,14 +1,15 @@
 """Fuse the prior map of a field with the current visit, pixel by pixel.
 
 The temporal reader of the weights weighs both. Without a reader the more confident of the two is taken. Pixels that
-the visit did not capture keep their prior map, which fades with its age.
+the visit did not capture are mapped by their prior map, which fades with its age. What is stored of them for the next
+visit are the probabilities of their last capture, so that the number of visits since then changes nothing.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from models.evaluation.expected_scores import expected_counts
 from models.evaluation.metrics import confusion, kappa, overall_accuracy
 from models.network.sizes import CELL_PX
-from pipeline.geometry.grid import UNLABELLED
+from pipeline.geometry.grid import UNLABELLED, SceneGrid, patch_pixels
 from pipeline.lazy import Tensor, torch
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ BLOCK_PX = 16  # a side: differences are taken as equal within a block, and as i
 ERRORS_BEYOND = 2.0  # standard errors above the expected difference of two maps of the same ground
 ROWS = 128  # fused at a time
 DAYS_A_YEAR = 365.25
-SEEN_PX = 3  # reach of the reader around a pixel, beside three coarse pixels
+HALO = 10  # reach of the reader around a pixel: three coarse pixels and 3 px, in whole coarse pixels
 LEAST_AGREEMENT, LEAST_KAPPA = 0.5, 0.35  # below both a prior map is of another field
 Floats = NDArray[np.float32]
 
@@ -43,8 +44,8 @@ class ClassProbabilities:
     """Class probabilities of a field, or of a part of it, after a visit."""
 
     log_probability: Floats  # (y, x, class)
-    age_days: Floats  # (y, x) since the last capture
-    light: Floats  # (y, x) exposure of all captures, in reference exposures a pixel; 0 without a capture
+    age_days: Floats  # (y, x) since the last capture; NaN without one
+    light: Floats  # (y, x) sum of all captures, older ones weigh less: reference exposures over squared line spacing
 
     def classes(self) -> tuple[NDArray[np.uint8], Floats]:
         """Return the most probable class of each pixel and its probability; 255 and NaN for unknown pixels."""
@@ -65,8 +66,13 @@ class CurrentVisit:
     log_probability: Floats  # (y, x, class); NaN for unknown pixels
     seen: NDArray[np.bool_]  # (y, x) pixels that were captured
     coarse: Floats  # (y / 2, x / 2, column) by `pooled`; NaN without a capture
-    light: float  # exposure of a line as a fraction of the reference
-    step: int  # line spacing [px]
+    light: float  # exposure of most lines as a fraction of the reference
+    step: int  # spacing of most lines [px]
+    own_light: Floats | None = None  # (y, x) light / step^2 of each pixel's capture; None where all have the same
+
+    def light_of(self, rows: slice) -> Floats | float:
+        """Return light / step^2 of some rows."""
+        return self.light / self.step**2 if self.own_light is None else self.own_light[rows]
 
 
 @dataclass(frozen=True)
@@ -101,22 +107,21 @@ def pooled(columns: Floats) -> Floats:
 def first_probabilities(observation: CurrentVisit) -> ClassProbabilities:
     """Return the class probabilities of a field without a prior map: those of the current visit."""
     kept = np.maximum(observation.log_probability, np.float32(FAINTEST))  # NaN stays
-    light = np.where(observation.seen, observation.light / observation.step**2, 0).astype(np.float32)
-    return ClassProbabilities(kept, _ages(kept, np.zeros(observation.seen.shape, np.float32)), light)
+    light = np.where(observation.seen, observation.light_of(np.s_[:]), 0).astype(np.float32)
+    return ClassProbabilities(kept, np.where(_finite(kept), np.float32(0), np.float32(np.nan)), light)
 
 
 def fuse(prior_map: PriorMap, observation: CurrentVisit, reader: TemporalReader | None) -> ClassProbabilities:
     """Return the class probabilities of today, from a prior map and the current visit.
 
-    A pixel without a prior map takes the visit. A pixel without a visit keeps the prior map.
+    A pixel without a prior map takes the visit. A pixel without a visit takes the prior map, faded by its age.
     """
     today = observation.log_probability
     y = len(today)
     kept, ages, light = np.empty_like(today), *np.empty((2, *observation.seen.shape), np.float32)
-    s = CELL_PX
-    high, halo = max(ROWS // s, 1) * s, -(-(3 * s + SEEN_PX) // s) * s
+    high = max(ROWS // CELL_PX, 1) * CELL_PX
     for top in range(0, y, high):  # limits the memory of intermediate arrays
-        first, last, stop = max(top - halo, 0), min(top + high + halo, y), min(top + high, y)
+        first, last, stop = max(top - HALO, 0), min(top + high + HALO, y), min(top + high, y)
         part, own = _fused(prior_map, observation, reader, slice(first, last)), slice(top - first, stop - first)
         kept[top:stop], ages[top:stop], light[top:stop] = part.log_probability[own], part.age_days[own], part.light[own]
     return ClassProbabilities(kept, ages, light)
@@ -142,42 +147,45 @@ def _fused(
     before, today = prior_map.probabilities.log_probability[rows], observation.log_probability[rows]
     known, shown = _finite(before), _finite(today)
     seen = observation.seen[rows] & shown
-    age = np.nan_to_num(prior_map.probabilities.age_days[rows], nan=0.0) + np.float32(prior_map.days)
+    age = prior_map.probabilities.age_days[rows] + np.float32(prior_map.days)
+    days = np.nan_to_num(age, nan=0.0)
     flat = np.float32(-math.log(before.shape[-1]))
     old, new = (_normalised(np.where(where[..., None], one, flat)) for where, one in ((known, before), (seen, today)))
     left = np.float32(math.exp(-prior_map.days / LIGHT_FADES_DAYS))
     rests_on = np.where(known, prior_map.probabilities.light[rows] * left, 0).astype(np.float32)
     if reader is None:
-        after = _more_confident(old, new, seen, age)
+        after = _more_confident(old, new, seen, days)
     else:
-        images = old, np.where(seen[..., None], new, 0), seen, age, rests_on
-        after = _phased_in(old, _read(reader, prior_map, observation, images, rows), seen, prior_map.days)
+        images = old, np.where(seen[..., None], new, 0), seen, days, rests_on
+        after = _phased_in(old, _read(reader, prior_map, observation, images, rows), seen, days)
     after = np.where(known[..., None], after, today)  # the visit alone; NaN where that is unknown too
     kept = np.maximum(after, np.float32(FAINTEST)).astype(np.float32)
-    own_light = np.where(seen, observation.light / observation.step**2, 0).astype(np.float32)
-    return ClassProbabilities(kept, _ages(kept, np.where(seen | ~known, 0, age)), rests_on + own_light)
+    own_light = np.where(seen, observation.light_of(rows), 0).astype(np.float32)
+    return ClassProbabilities(kept, np.where(seen, np.float32(0), age), rests_on + own_light)
 
 
-def _phased_in(old: Floats, after: Floats, seen: NDArray[np.bool_], days: float) -> Floats:
+def as_captured(prior_map: PriorMap, after: ClassProbabilities) -> ClassProbabilities:
+    """Return what is stored for the next visit: pixels that this one did not capture are as at their last capture."""
+    before, older = prior_map.probabilities.log_probability, after.age_days[..., None] > 0
+    return replace(after, log_probability=np.where(older, before, after.log_probability))
+
+
+def _phased_in(old: Floats, after: Floats, seen: NDArray[np.bool_], days: Floats) -> Floats:
     """Return the reader's output (y, x, class), phased in over the first day in pixels without a capture.
 
     The reader was trained on visits that are days apart.
     """
-    fraction = min(days / SETTLED_DAYS, 1.0)
-    if fraction == 1:
+    fraction = np.where(seen, 1, np.minimum(days / np.float32(SETTLED_DAYS), 1))[..., None]
+    if (fraction == 1).all():
         return after
-    mixed = np.log((1 - fraction) * np.exp(old) + fraction * np.exp(after)).astype(np.float32)
-    return np.where(seen[..., None], after, mixed)
+    return np.where(fraction == 1, after, np.log((1 - fraction) * np.exp(old) + fraction * np.exp(after))).astype(
+        np.float32
+    )
 
 
 def _normalised(log_probability: Floats) -> Floats:
     """Return log-probabilities (..., class) of probabilities that sum to 1."""
     return np.asarray(log_probability - np.log(np.exp(log_probability).sum(axis=-1, keepdims=True)))
-
-
-def _ages(log_probability: Floats, age_days: Floats) -> Floats:
-    """Return ages, NaN for unknown pixels."""
-    return np.where(np.isfinite(log_probability[..., 0]), age_days, np.nan).astype(np.float32)
 
 
 def in_classes(log_probability: Floats, numbers: Sequence[int]) -> Floats:
@@ -319,15 +327,14 @@ def compare(
 
 
 def changed_from(prior_map: PriorMap, after: ClassProbabilities) -> NDArray[np.uint8]:
-    """Return the earlier class of pixels (y, x) whose prior map and map are confident of two classes; else 255."""
+    """Return the earlier class of captured pixels (y, x) whose prior map and map are confident of two; else 255."""
     before, now = prior_map.probabilities.log_probability, after.log_probability
     (old, old_sure), (new, new_sure) = map(likeliest, (before, now))
     sure = np.minimum(old_sure, new_sure) > math.log(CERTAIN)  # NaN is not
-    return np.where(sure & (old != new), old, UNLABELLED).astype(np.uint8)
+    return np.where(sure & (old != new) & (after.age_days == 0), old, UNLABELLED).astype(np.uint8)
 
 
-def changed_fractions(old: NDArray[np.uint8], patch: int) -> Floats:
-    """Return the fraction of changed pixels of each patch (patch_y, patch_x), from ``old`` of `changed_from`."""
-    y, x = (-(-size // patch) * patch for size in old.shape)
-    padded = np.pad(old != UNLABELLED, [(0, y - old.shape[0]), (0, x - old.shape[1])])
-    return np.asarray(padded.reshape(y // patch, patch, x // patch, patch).mean(axis=(1, 3), dtype=np.float32))
+def changed_fractions(changed: NDArray[np.bool_], grid: SceneGrid) -> Floats:
+    """Return the fraction of each patch's pixels on the scene that changed, (patch_y, patch_x), from (y, x)."""
+    fractions = patch_pixels(grid, changed).mean(axis=(1, 2)).reshape(grid.patch_shape)
+    return np.asarray(fractions / grid.valid_fraction(), np.float32)

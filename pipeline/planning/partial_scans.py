@@ -237,11 +237,14 @@ def _best_runs(
     return best[1]
 
 
-def cheapest_row_seconds(rows: PatchRows, camera: LineCamera, cost: CostModel, exposure_ms: float) -> float:
-    """Return the seconds of the fastest capture of a single row of patches; inf if no line shows any."""
+def cheapest_row_seconds(
+    rows: PatchRows, expected_gain: Floats, camera: LineCamera, cost: CostModel, exposure_ms: float
+) -> float:
+    """Return the seconds of the fastest capture of a single row of patches with a gain; inf if no line shows any."""
+    gaining = rows.sums(expected_gain) > 0
     prices = [
         cost.seconds([replace(sweep, lines=int(lines[there].min()), exposure_ms=exposure_ms)], camera)
-        for sweep, lines, there in zip(rows.sweeps, rows.stop - rows.first, rows.there, strict=True)
+        for sweep, lines, there in zip(rows.sweeps, rows.stop - rows.first, gaining, strict=True)
         if there.any()
     ]
     return min(prices, default=math.inf)

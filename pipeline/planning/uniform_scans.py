@@ -155,7 +155,7 @@ def exposures_between(shortest: float, longest: float) -> list[float]:
 def longest_exposure(
     seconds: float, sweeps: Sequence[Sweep], camera: LineCamera, cost: CostModel, shortest: float, longest: float
 ) -> float | None:
-    """Return the longest exposure of such sweeps that ends in time, to .1 ms; None if none does."""
+    """Return the longest exposure of such sweeps that ends in time, to .1 ms or ``shortest``; None if none does."""
 
     def taken_s(exposure_ms: float) -> float:
         return cost.seconds([replace(sweep, exposure_ms=exposure_ms) for sweep in sweeps], camera)
@@ -167,7 +167,7 @@ def longest_exposure(
     while low < high:  # bisection, since time is not linear at the camera's highest rate
         middle = (low + high + 1) // 2
         low, high = (middle, high) if taken_s(middle / scale) <= seconds else (low, middle - 1)
-    return low / scale
+    return low / scale if taken_s(low / scale) <= seconds else shortest
 
 
 def choose_scan(

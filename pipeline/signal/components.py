@@ -25,6 +25,7 @@ class Components:
     axes: Floats  # (component, band) orthonormal rows
     noise: Floats  # (band,) standard deviation of one spectrum's noise [scene value]; the step of few bands
     covariance: Floats | None = None  # (band, band) of spectra of few bands, which predicts missing ones
+    spread: Floats | None = None  # (component,) mean square of the field's scores, which bounds those of missing bands
 
     @classmethod
     def empty(cls, bands: int) -> Components:

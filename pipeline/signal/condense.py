@@ -19,7 +19,7 @@ from pipeline.geometry.grid import cuts
 from pipeline.geometry.scan import Sweep
 from pipeline.readings import SIGMA_OF_MEDIAN
 from pipeline.signal.calibrate import Bools, calibrate, judge_elements, missing_bands
-from pipeline.signal.components import Components, Scores
+from pipeline.signal.components import Components, Floats, Scores
 from pipeline.signal.lines import BLOCK_LINES, CondensedLines
 from pipeline.signal.subspace import SignalStatistics
 from pipeline.source import Line, References, SweepLines
@@ -53,9 +53,10 @@ class ScoredLines:
 def score_lines(values: NDArray[np.float32], valid: Bools, components: Components) -> ScoredLines:
     """Project (line, sample, band) scene values onto components, by the bands that `calibrate` calls valid.
 
-    A spectrum with missing bands gets the scores of least squares over its other bands. Spectra of few bands have a
-    known covariance: there a missing band takes its expected value. ``valid`` is (line, sample) or (line, sample,
-    band).
+    A spectrum with missing bands gets the scores of least squares over its other bands, which are drawn to the field's
+    mean as far as the field's scores scatter about it: neighbouring bands that are missing leave some scores unknown.
+    Spectra of few bands have a known covariance: there a missing band takes its expected value. ``valid`` is (line,
+    sample) or (line, sample, band).
     """
     lit, count = np.isfinite(components.mean), len(components)
     bands = int(lit.sum())
@@ -71,7 +72,7 @@ def score_lines(values: NDArray[np.float32], valid: Bools, components: Component
             scores[broken], residual[broken] = components.white(spectra) @ axes, 0
         else:
             white = np.where(there, components.white(values[broken]), np.float32(0))
-            scores[broken], residual[broken] = _least_squares(white, there, axes, bands)
+            scores[broken], residual[broken] = _least_squares(white, there, axes, bands, components.spread)
         seen = there.sum(axis=1)
         quality[broken] = np.where(2 * seen < bands, UNUSABLE, np.where(seen < bands, PARTIAL, quality[broken]))
     unusable = quality == UNUSABLE
@@ -98,17 +99,22 @@ def _projected(values: NDArray[np.float32], components: Components) -> tuple[Sco
     return scores.reshape(*values.shape[:-1], len(components)), left.reshape(values.shape[:-1])
 
 
-def _least_squares(white: Scores, there: Bools, axes: Scores, bands: int) -> tuple[Scores, Scores]:
+def _least_squares(
+    white: Scores, there: Bools, axes: Scores, bands: int, spread: Floats | None
+) -> tuple[Scores, Scores]:
     """Return scores (n, component) and residuals (n,) of whitened spectra (n, band), by their valid bands.
 
+    ``spread`` (component,) is the mean square of a score: the most probable ones of normal laws. Without it any is as
+    likely.
     Missing bands count as noise in the residual, so that it has the spread of a whole spectrum's.
     """
     count = axes.shape[1]
+    prior = np.diag(np.full(count, 1e-6) if spread is None else 1 / np.maximum(spread, 1.0))
     products = (axes[:, :, None] * axes[:, None, :]).reshape(len(axes), -1)
     scores, residual = np.empty((len(white), count), np.float32), np.empty(len(white), np.float32)
     for part in cuts(len(white), 4096):
         gram = (there[part].astype(np.float32) @ products).reshape(-1, count, count).astype(np.float64)
-        gram += 1e-6 * np.eye(count)
+        gram += prior
         scores[part] = np.linalg.solve(gram, (white[part] @ axes).astype(np.float64)[..., None])[..., 0]
         rest = np.where(there[part], white[part] - scores[part] @ axes.T, 0)
         left = np.einsum("nb,nb->n", rest, rest) + np.minimum(bands - there[part].sum(axis=1), bands - count)

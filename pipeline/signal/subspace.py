@@ -216,7 +216,15 @@ def find_components(found: SignalStatistics, *, false_alarm: float = 0.01, least
     loadings[:, lit] = axes.T
     deviations = np.full(found.bands, np.nan)
     deviations[lit] = sigma
-    return Components(mean, loadings, deviations)
+    return with_spread(Components(mean, loadings, deviations), found)
+
+
+def with_spread(components: Components, found: SignalStatistics) -> Components:
+    """Return components with the mean square of each score over a field."""
+    lit = np.isfinite(components.mean)
+    covariance = _covariance(found.single, found.total, found.count)[0][np.ix_(lit, lit)]
+    rows = components.axes[:, lit] / components.noise[lit]
+    return replace(components, spread=np.einsum("kb,bc,kc->k", rows, covariance, rows))
 
 
 def components_of_field(
@@ -241,7 +249,7 @@ def components_of_field(
     length, rows = np.linalg.svd(bumps - (bumps @ known.T) @ known, full_matrices=False)[1:]
     axes = np.zeros((np.count_nonzero(length > LACKING), components.bands))
     axes[:, lit] = rows[length > LACKING]
-    return replace(components, axes=np.concatenate([components.axes, axes]))
+    return with_spread(replace(components, axes=np.concatenate([components.axes, axes])), found)
 
 
 def bands_alone(found: SignalStatistics, unit: Floats | float | None = None) -> Components:
@@ -351,7 +359,10 @@ def with_shared(components: Components, residuals: Values, false_alarm: float) -
     every[:, : axes.shape[1]] = axes
     rows = np.zeros((every.shape[1], components.bands))
     rows[:, lit] = every.T
-    return Components(components.mean, rows, components.noise)
+    spread = components.spread
+    if spread is not None:  # rare spectra may lie anywhere
+        spread = np.pad(spread, (0, len(rows) - len(spread)), constant_values=np.max(spread, initial=1.0))
+    return Components(components.mean, rows, components.noise, spread=spread)
 
 
 def noise_edge(values: Floats, ratio: float, false_alarm: float) -> float:

@@ -196,13 +196,17 @@ def write_components(group: zarr.Group, components: Components) -> None:
     write_small(group, "mean", ("band",), components.mean, {"long_name": "mean scene value", **about})
     noise = {"long_name": "standard deviation of one spectrum's noise", **about}
     write_small(group, "noise", ("band",), components.noise, noise)
+    if components.spread is not None:
+        spread = {"long_name": "mean square of the scores of the field", "units": "1"}
+        write_small(group, "spread", ("component",), components.spread, spread)
 
 
 def read_components(group: zarr.Group) -> Components:
     """Read what `write_components` stored."""
     rows, mean, noise = (read_array(group, name).astype(np.float64) for name in ("axes", "mean", "noise"))
     lit = np.isfinite(noise)
-    return Components(mean, np.where(lit, rows / np.where(lit, noise, 1), 0) if len(rows) else rows, noise)
+    axes = np.where(lit, rows / np.where(lit, noise, 1), 0) if len(rows) else rows
+    return Components(mean, axes, noise, spread=read_array(group, "spread") if "spread" in group else None)
 
 
 def step_of(group: zarr.Group, said: str = "scale_factor") -> float:

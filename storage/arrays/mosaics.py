@@ -117,7 +117,7 @@ class MosaicWriter:
     def write_captures(self, specs: Sequence[Sequence[float]], number: NDArray[np.integer[Any]]) -> None:
         """Store the kind of capture of each pixel: ``number`` (y, x) is an index into ``specs``, which may repeat."""
         kinds = list(dict.fromkeys(map(tuple, specs)))
-        of_spec = np.array([kinds.index(tuple(one)) for one in specs], np.uint8)
+        of_spec = np.array([kinds.index(tuple(one)) for one in specs], np.min_scalar_type(max(len(kinds) - 1, 0)))
         about = {"long_name": "kind of capture", "units": "1", "kinds": [list(one) for one in kinds]}
         write_image(self.group, CAPTURES, ("y", "x"), of_spec[number], about)
 

@@ -41,7 +41,7 @@ from storage.arrays.ground_maps import BLOCK, GroundMapWriter
 from storage.arrays.layout import NO_CLASS, blank_pixels
 from storage.arrays.mosaics import Attention, choose_bands, develop, open_mosaic, stretch, write_attention
 
-CLASS_MAP = Product("segment", version=23, files=(MAP, PROBABILITIES), by_weights=True)
+CLASS_MAP = Product("segment", version=24, files=(MAP, PROBABILITIES), by_weights=True)
 OUT_OF_RANGE = "out_of_range.json"  # beside a map with values out of range
 MOST_TURN_PX = 12.0  # greatest offset of the corners by rotation, at which a prior map is used
 
@@ -119,8 +119,8 @@ def finish_maps(path: Path, gains: PatchGains, *, compared: bool) -> None:
     if left_out is not None:
         blank_pixels(path / MAP, left_out, NO_CLASS)
     if (old_class := ProbabilityStore(probabilities).old_class()) is not None:
-        patch = gains.frame.grid.patch
-        write_changes(probabilities, changed_fractions(old_class, patch), patch)
+        grid = gains.frame.grid
+        write_changes(probabilities, changed_fractions(old_class != UNLABELLED, grid), grid.patch)
 
 
 def attention_of(reading: FullReading, policy: str) -> Attention:

@@ -53,8 +53,8 @@ REGISTRATION, TIE_POINTS = "registration.json", "geolocation.zarr"
 SIGNAL_RECORD = "signal.json"  # of compressed sweeps; a copy lies beside their mosaic
 POINTING = Product("register", version=2, files=(REGISTRATION,))
 GEOLOCATION = Product("locate", version=3, files=(TIE_POINTS,))
-MOSAIC = Product("rectify", version=5, files=("mosaic.zarr",))
-MERGED = Product("rectify_fine", version=3, files=("mosaic.zarr",))
+MOSAIC = Product("rectify", version=6, files=("mosaic.zarr",))
+MERGED = Product("rectify_fine", version=4, files=("mosaic.zarr",))
 MOSAIC_STEP = 0.5  # quantisation step, relative to the sweeps: resampled scores have less noise
 KERNEL_GAIN = 2.0  # greatest overshoot of the kernels
 

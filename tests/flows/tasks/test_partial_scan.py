@@ -7,10 +7,12 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import xarray as xr
 from PIL import Image
 from rich.console import Console
@@ -18,8 +20,15 @@ from rich.console import Console
 from flows.archive.plan_command import plan_content
 from flows.archive.reprocess_command import run_reprocess
 from flows.settings.load import load_settings
+from flows.tasks import extent_choice
+from flows.tasks.drawing import Drawing
 from flows.tasks.extent_choice import ExtentGains
+from flows.tasks.patch_budget import SHARD
+from models.network.sizes import TemporalSizes
+from models.network.temporal_reader import TemporalReader
 from models.reading.expected_errors import PatchExpectedErrors
+from models.reading.prior_map import ClassProbabilities, PriorMap, carried
+from models.reading.regions import plan_regions
 from pipeline.errors import BudgetError, NothingToMend, PipelineError, SettingsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.uniform_scans import ScanPerformance
@@ -182,6 +191,37 @@ def test_of_what_is_sure_enough_nothing_is_looked_at(
     assert surveyed.receipt["settings"]["skip_below_error"] == 0.001
 
 
+def test_lines_that_cover_a_field_capture_its_border(recorded: Path) -> None:
+    """Patches that hang over the border are captured where lines cover what there is of them."""
+    grid, covered = SceneGrid(100, 103, 16), np.ones((100, 103), np.uint8)
+    (region,) = plan_regions(grid, SHARD)
+    mosaic: Any = SimpleNamespace(coverage=lambda rows, columns: covered[rows, columns])
+    missing: Any = None
+    drawing = Drawing(missing, missing, missing, missing, part=True)
+    assert drawing._shown(region, mosaic).all()
+    covered[96:] = 0
+    assert not drawing._shown(region, mosaic)[96:].any()
+
+
+def test_a_prior_map_of_today_does_not_depend_on_the_rows_read_at_once(
+    visits: tuple[Path, Any, Any], recorded: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The reader sees around a pixel, so that rows are read with their neighbours."""
+    reader = TemporalReader(TemporalSizes(2, 4, width=8, coarse_width=4)).eval()
+    torch.nn.init.normal_(reader.leave.weight, std=0.3)
+    monkeypatch.setattr(extent_choice, "load_reader", lambda path: reader)
+    probabilities = np.log(np.random.default_rng(1).dirichlet(np.ones(2), (96, 64))).astype(np.float32)
+    images = probabilities, np.full((96, 64), 2, np.float32), np.ones((96, 64), np.float32)
+    store: Any = SimpleNamespace(read=lambda rows: tuple(image[rows] for image in images))
+    monkeypatch.setattr(extent_choice, "ProbabilityStore", lambda path: store)
+    prior: Any = SimpleNamespace(probabilities=SimpleNamespace(path=Path()), classes=(0, 1), days=5.0, day_of_year=None)
+    weights: Any = SimpleNamespace(reader="there")
+    parts = [part for part, _ in extent_choice._swaths(prior, SceneGrid(96, 64, 4), weights, recorded)]
+    assert len(parts) > 1
+    whole = carried(PriorMap(ClassProbabilities(*images), None, 5.0), reader).log_probability
+    np.testing.assert_allclose(np.concatenate(parts), whole, atol=1e-5)
+
+
 def test_nothing_is_worth_more_than_what_is_due() -> None:
     """A patch that is due counts more than all that the others gain; without gains the oldest counts most."""
     grid = SceneGrid(4, 16, 4)
@@ -194,6 +234,8 @@ def test_nothing_is_worth_more_than_what_is_due() -> None:
     gains = wanted.gains(1, 25.0)
     assert (gains > 0).all()
     assert wanted.expected_gain(gains)[1] > 10 * wanted.expected_gain(gains)[[0, 2, 3]].sum()
+    darker = wanted.gains(4, 6.0)  # what is due counts alike by every scan: the one that takes more of it is chosen
+    assert wanted.expected_gain(gains)[1] - gains[1] == wanted.expected_gain(darker)[1] - darker[1]
     nobody = replace(wanted, due=np.zeros(4, bool))
     assert np.array_equal(nobody.expected_gain(gains), gains)
     assert np.argsort(nobody.expected_gain(np.zeros(4))).tolist() == [0, 1, 2, 3]

@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,10 @@ from flows.survey import draw_class_map, survey
 from flows.tasks.captures import plan_capture
 from flows.tasks.open_survey import OpenSurvey
 from flows.tasks.stage import Product, Stage, Wanted
+from flows.tasks.stages.condense import SignalChoice, components_of
 from pipeline.errors import ArchiveError
+from pipeline.signal.subspace import SignalStatistics
+from pipeline.source import References
 from storage.archive.archive import Archive
 from storage.archive.records import read_run
 from storage.arrays.cubes import open_raw_cube
@@ -38,6 +42,19 @@ def test_a_store_of_an_input_that_was_cleared_meanwhile_is_not_published(tmp_pat
     with pytest.raises(ArchiveError, match="another survey has cleared an input of rectify meanwhile"):
         one.produce(archive, Wanted(lambda folder: archive.clear(given) and None, {}, [given]))
     assert archive.refs("rectify") == []
+
+
+@pytest.mark.parametrize("order", [(1.0, 16.0), (16.0, 1.0)], ids=["short pass first", "long pass first"])
+def test_few_bands_are_kept_in_the_steps_of_the_longest_exposure(order: tuple[float, float]) -> None:
+    """One number of a long exposure is a smaller scene value than one of a short: no pass loses a number."""
+    found, lit = SignalStatistics(4, 64), np.ones((8, 8), np.bool_)
+    found.add(np.random.default_rng(0).uniform(0.1, 0.9, (8, 8, 4)).astype(np.float32), lit)
+    frames = [
+        References(np.zeros((8, 4), np.float32), np.full((8, 4), 100 * one, np.float32), np.ones(4, np.float32))
+        for one in order
+    ]
+    cubes: Any = [SimpleNamespace(references=one, wavelength_nm=np.arange(4.0)) for one in frames]
+    np.testing.assert_allclose(components_of(found, cubes, SignalChoice()).noise, 1 / 1600)
 
 
 @pytest.mark.usefixtures("no_effects")

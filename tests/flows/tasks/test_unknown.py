@@ -113,7 +113,7 @@ def test_of_unknown_pixels_nothing_is_believed(both: tuple[Path, Path, dict[str,
 def test_a_later_visit_goes_on_from_such_a_map(
     both: tuple[Path, Path, dict[str, Any]], survey_png: Survey, judging: Maker, tmp_path: Path
 ) -> None:
-    """What is unknown today is so whatever is remembered there; no earlier class or age of it stays."""
+    """What is unknown today is so whatever is remembered there: it has no class, and was captured today."""
     shutil.copytree(both[1], tmp_path, dirs_exist_ok=True)
     before = set(tmp_path.glob("stages/segment/*"))
     flags = {"visit": "later", "seed": "1", "prior": "latest", **NARROW}
@@ -123,8 +123,8 @@ def test_a_later_visit_goes_on_from_such_a_map(
     found = xr.open_zarr(store / "class_map.zarr", consolidated=False)["classes"].values
     assert (found == 3).sum() == receipt["unknown"]["pixels"] > 0
     after = xr.open_zarr(store / "class_probabilities.zarr", consolidated=False)
-    for values in (after["age"].values, after["log_probability"].values[..., 0]):
-        np.testing.assert_array_equal(np.isnan(values), found == 3)
+    np.testing.assert_array_equal(np.isnan(after["log_probability"].values[..., 0]), found == 3)
+    assert not after["age"].values.any()
 
 
 def test_a_map_of_nothing_known_says_what_to_do(survey_png: Survey, judging: Maker, tmp_path: Path) -> None:

@@ -51,11 +51,30 @@ def test_pixels_of_which_nothing_is_known_are_of_no_class_and_do_not_come_true()
     """Half a field of two equal classes: each pixel gains as a part of a class twice as large, the rest in the mean."""
     probabilities = np.full((8, 12, 3), np.nan, np.float32)
     probabilities[:4, :8], probabilities[:4, 4:8] = believed(0.8, shape=(4, 8)), believed(0.8, shape=(4, 4), kind=1)
-    errors = PatchExpectedErrors.of([(probabilities, np.zeros((8, 12)))], GRID, 3, come_true=0.5)
+    never = np.where(np.isnan(probabilities[..., 0]), np.nan, 0.0)
+    errors = PatchExpectedErrors.of([(probabilities, never)], GRID, 3, come_true=0.5)
     assert errors.wrong_pixels() == pytest.approx([1.6, 1.6, *[16 * 2 / 3] * 4], rel=1e-5)
     gain = errors.expected_gain(np.array([0.0, 0.06, 0.5]))
     assert gain[:2] == pytest.approx([0.1 / 6, 0.04 / 6], rel=1e-4)
     assert gain[2:] == pytest.approx((2 / 3 - 0.03) / 6, rel=1e-5)
+
+
+def test_what_was_captured_and_belongs_to_no_class_gains_nothing() -> None:
+    """A pond was captured a week ago: a new capture would say the same again. It becomes too old like the rest."""
+    probabilities = believed(0.8)
+    probabilities[:4, :4] = np.nan
+    errors = PatchExpectedErrors.of([(probabilities, np.full((8, 12), 7.0))], GRID, 3)
+    gain = errors.expected_gain(np.zeros(3))
+    assert gain[0] == 0
+    assert (gain[1:] > 0).all()
+    assert (errors.age_days == 7).all()
+
+
+def test_a_pixel_that_is_sure_of_its_class_is_known() -> None:
+    """Another class may have no probability that a float32 holds."""
+    probabilities = believed(1 - 1e-7, kind=1)
+    probabilities[..., 0] = -np.inf
+    assert not PatchExpectedErrors.of([(probabilities, np.zeros((8, 12)))], GRID, 3).pixels[:, 3].any()
 
 
 @given(st.integers(1, 2), st.integers(0, 2**32 - 1))

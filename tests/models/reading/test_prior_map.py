@@ -21,6 +21,7 @@ from models.reading.prior_map import (
     CurrentVisit,
     PriorMap,
     TemporalAgreement,
+    as_captured,
     carried,
     changed_fractions,
     changed_from,
@@ -31,6 +32,7 @@ from models.reading.prior_map import (
     in_classes,
     pooled,
 )
+from pipeline.geometry.grid import UNLABELLED, SceneGrid
 
 CLASSES, COLUMNS = 3, 4
 SHAPE = (24, 20)
@@ -277,7 +279,7 @@ def test_a_harvest_overnight_is_seen() -> None:
     assert not found.is_of_another_field  # soil between the rows is as it was
     assert found.changed[1, 0] == np.count_nonzero(rows) == found.changed.sum() - np.trace(found.changed)
     np.testing.assert_array_equal(
-        changed_fractions(changed_from(memory, after), 5)[:4], np.full((4, 4), 0.4, np.float32)
+        changed_fractions(changed_from(memory, after) != UNLABELLED, SceneGrid(*SHAPE, 5)), np.float32(0.4)
     )
 
 
@@ -341,7 +343,35 @@ def test_a_patch_counts_its_pixels_of_another_class() -> None:
     memory = PriorMap(ClassProbabilities(before, *np.zeros((2, 8, 16), np.float32)), None, 1.0)
     old = changed_from(memory, ClassProbabilities(now, *np.zeros((2, 8, 16), np.float32)))
     np.testing.assert_array_equal(old, np.where(now.argmax(axis=-1) == 1, np.where(np.arange(16) < 8, 0, 255), 255))
-    np.testing.assert_array_equal(changed_fractions(old, 8), [[0.125, 0.0]])
+    np.testing.assert_array_equal(changed_fractions(old != UNLABELLED, SceneGrid(8, 16, 8)), [[0.125, 0.0]])
+
+
+def test_a_patch_over_the_border_counts_its_pixels_on_the_scene() -> None:
+    """A field of 20 x 20 px that changed everywhere changed by 1 in all four patches of 16 px."""
+    assert (changed_fractions(np.ones((20, 20), np.bool_), SceneGrid(20, 20, 16)) == 1).all()
+
+
+@READERS
+@given(seed=seeds, visits=st.integers(2, 6))
+def test_visits_elsewhere_change_nothing(reader: TemporalReader | None, seed: int, visits: int) -> None:
+    """What is believed of a pixel after some days is the same, however often others were captured meanwhile."""
+    memory = replace(a_prior_map(np.random.default_rng(seed), days=28.0), coarse=None)
+    once, probabilities = carried(memory, reader), memory.probabilities
+    for _ in range(visits):
+        part = PriorMap(probabilities, None, 28.0 / visits)
+        shown = carried(part, reader)
+        probabilities = as_captured(part, shown)
+    np.testing.assert_allclose(shown.log_probability, once.log_probability, atol=1e-3)
+    np.testing.assert_allclose(shown.age_days, once.age_days, rtol=1e-5)
+
+
+def test_each_pixel_has_the_light_of_its_own_lines() -> None:
+    """Of lines that were captured again, closer together, more light is known than of the rest."""
+    light = np.where(np.arange(SHAPE[1]) < np.full(SHAPE, 7), np.float32(0.8), np.float32(0.00625))
+    visit = replace(an_observation(np.random.default_rng(1)), own_light=light)
+    for found in (first_probabilities(visit).light, fuse(a_prior_map(np.random.default_rng(2)), visit, None).light):
+        assert found[:, :7].min() > 0.79
+        assert found[:, 7:].max() < 0.03
 
 
 @READERS

@@ -165,12 +165,23 @@ def test_a_patch_that_two_swaths_show_is_of_the_nearer(along: Axis) -> None:
     assert (own <= off.min(axis=1) + 1).all()  # lines are turned by a pixel at most
 
 
+def test_the_least_seconds_are_those_of_a_row_that_gains() -> None:
+    """A shorter row outside of zones is no scan: its seconds would be refused again."""
+    gain = np.zeros(len(ROWS.row))
+    assert cheapest_row_seconds(ROWS, gain, CAMERA, COST, EXPOSURE_MS) == np.inf
+    for patch in (0, len(gain) // 2, len(gain) - 1):
+        gain[:] = np.arange(len(gain)) == patch
+        least = cheapest_row_seconds(ROWS, gain, CAMERA, COST, EXPOSURE_MS)
+        assert partial_scan(gain, least) is not None
+        assert partial_scan(gain, 0.999 * least) is None
+
+
 @given(worths, st.floats(0.02, 1.2))
 def test_looks_end_in_time_and_are_worth_what_they_show(expected_gain: np.ndarray, fraction: float) -> None:
     """Seconds are those of the cost model, at most those given; the worth is that of the rows the lines show."""
     scan_pass = partial_scan(expected_gain, fraction * WHOLE_S)
     if scan_pass is None:
-        assert cheapest_row_seconds(ROWS, CAMERA, COST, EXPOSURE_MS) > fraction * WHOLE_S
+        assert cheapest_row_seconds(ROWS, expected_gain, CAMERA, COST, EXPOSURE_MS) > fraction * WHOLE_S
         return
     sweeps = sweeps_of_runs(ROWS.sweeps, scan_pass.runs)
     assert scan_pass.seconds == COST.seconds(sweeps, CAMERA) <= fraction * WHOLE_S

@@ -21,6 +21,7 @@ from pipeline.planning.uniform_scans import (
     REFERENCE_LOSS,
     ScanPerformance,
     choose_scan,
+    longest_exposure,
     priced_scan,
     reference_scan,
     uniform_scans,
@@ -93,6 +94,12 @@ def test_a_scan_ends_in_time_and_no_longer_exposure_would(seconds: float) -> Non
     assert chosen.seconds <= seconds
     more = uniform_scans(RECORD, SWEEPS, CAMERA, COST, 270, seconds=2 * seconds)
     assert choose_scan(more, 2 * seconds).expected[MIOU] >= chosen.expected[MIOU] - LOSS
+
+
+def test_the_longest_exposure_in_time_may_be_the_shortest_there_is() -> None:
+    """Rounded to the next tenth of a millisecond it would end too late."""
+    seconds = priced_scan(RECORD, SWEEPS[1], CAMERA, COST, 270, 16.23).seconds
+    assert longest_exposure(seconds, SWEEPS[1], CAMERA, COST, 16.23, 100.0) == 16.23
 
 
 def test_nothing_is_spent_that_does_not_pay() -> None:

@@ -41,13 +41,15 @@ def test_tiles_and_rows_store_the_same(tmp_path: Path) -> None:
 
 
 def test_each_pixel_keeps_its_capture_of_hundreds_of_sweeps(tmp_path: Path) -> None:
-    """Sweeps of the same exposure and spacing are one kind."""
+    """Sweeps of the same exposure and spacing are one kind; there may be more kinds than a byte holds."""
     first, later = (0.1, 4.0), (0.5, 1.0)
     number = np.tile(np.arange(SHAPE[1]) % 300, (SHAPE[0], 1))
     writer(tmp_path / "mosaic.zarr").write_captures([first] * 16 + [later] * 284, number)
     found = open_mosaic(tmp_path / "mosaic.zarr").captures()
     assert found[0] == [first, later]
     np.testing.assert_array_equal(found[1], number >= 16)
+    writer(tmp_path / "many.zarr").write_captures([(1 + sweep, 1.0) for sweep in range(300)], number)
+    np.testing.assert_array_equal(open_mosaic(tmp_path / "many.zarr").captures()[1], number)
 
 
 @pytest.fixture(scope="module")

@@ -228,7 +228,7 @@ def test_scores_beyond_16_bits_are_stored_in_32(tmp_path: Path, largest: float, 
     lines = lines_of()
     header = SweepHeader(lines.sweep, lines.references, np.linspace(400, 1000, BANDS))
     axes = np.eye(2, BANDS)
-    components = Components(np.zeros(BANDS), axes, np.ones(BANDS))
+    components = Components(np.zeros(BANDS), axes, np.ones(BANDS), spread=np.array([9.0, 4.0]))
     writer = signal_cubes.SignalCubeWriter(tmp_path / "a.zarr", header, components, step=1.0, largest=largest)
     scores = np.random.default_rng(0).uniform(-largest, largest, (*SHAPE, 2)).astype(np.float32)
     writer.write(0, scores, np.zeros(SHAPE, np.uint8))
@@ -238,6 +238,7 @@ def test_scores_beyond_16_bits_are_stored_in_32(tmp_path: Path, largest: float, 
     writer.close(facts, np.array([[0, 1], [5, 6]]), steps)
     cube = signal_cubes.open_signal_cube(tmp_path / "a.zarr")
     assert cube.read().dtype == kind
+    np.testing.assert_array_equal(cube.components.spread, [9.0, 4.0])
     np.testing.assert_array_equal(cube.read(), np.rint(scores))
     off = cube.spectra(0, 1)[0, 1] - components.restore(cube.read(0, 1)[0, 1])
     np.testing.assert_array_equal(off[2:], steps[0, 2:] * RESIDUAL_STEP)
