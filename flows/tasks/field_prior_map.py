@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.tasks.field_work import coarse_region
-from flows.tasks.prior_maps import EarlierRun
+from flows.tasks.prior_maps import REACH_PX, EarlierRun
 from models.network.sizes import CELL_PX
 from models.network.spectral import LineSpec
 from models.reading.prior_map import ClassProbabilities, PriorMap, in_classes, pooled
@@ -22,7 +22,6 @@ from storage.archive.keys import StageRef
 from storage.arrays.class_maps import ProbabilityStore
 from storage.arrays.mosaics import open_mosaic
 
-REACH_PX = 64.0  # greatest shift of a prior map that is found
 LEAST_SHIFT_PX = 2.0  # accuracy of the registration of two visits
 Gap = tuple[int, int]  # pixels before the first and after the last
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -13,15 +14,20 @@ from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
 from flows.settings.values import EXTENT_PART, EXTENT_WHOLE
 from pipeline.errors import IncompleteStoreError, SettingsError
 from pipeline.geometry.grid import SceneGrid
+from pipeline.ground.georeference import shift_px
+from pipeline.lazy import GeoBox
 from pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
+from pipeline.simulator.scenes.scene import RasterScene
 from storage.archive.archive import Archive, run_stem
 from storage.archive.keys import StageRef, published_runs
 from storage.archive.manifests import read_table
 from storage.archive.records import Run, read_run
 from storage.arrays.class_maps import ProbabilityStore
+from storage.arrays.georeference import load_geobox
 
 NONE, LATEST, AUTO = "none", "latest", "auto"
 NEWEST_RUNS = 60  # newest runs of a field that are searched for the previous visit
+REACH_PX = 64.0  # greatest shift of a prior map that is found
 MOST_EARLIER = 12  # earlier visits that show a field which was captured in parts
 PROBABILITIES = "class_probabilities"  # a product of runs
 MEMORY = "prior_map.json"  # beside a map: the figures of its prior map
@@ -58,9 +64,9 @@ class Prior:
 
 
 def find_prior(
-    archive: Archive, settings: Settings, name: str, grid: SceneGrid, class_names: tuple[str, ...], scene_key: str
+    archive: Archive, settings: Settings, name: str, grid: SceneGrid, class_names: tuple[str, ...], scene: RasterScene
 ) -> tuple[Prior | None, tuple[str, ...]]:
-    """Return the run of the prior map of a survey of ``name``, or None, and notes. ``scene_key`` identifies its light.
+    """Return the run of the prior map of a survey of ``name``, or None, and notes.
 
     It is the run with the last capture before this visit, among the newest runs of the field. The time of publication
     does not count. Raises SettingsError: the named run cannot be a prior map.
@@ -71,14 +77,14 @@ def find_prior(
         folder = archive.root / "runs" / Path(settings.prior).name
         why = "there is no such run in the archive"
         if folder.is_dir():
-            found = _usable(archive, read_run(folder), settings, grid, class_names)
+            found = _usable(archive, read_run(folder), settings, grid, class_names, scene.geobox)
             if isinstance(found, Prior):
                 return found, ()
             why = found
         raise SettingsError(f"--prior {settings.prior}: {why}; give another run, latest or none")
     runs_by_reason: dict[str, list[str]] = {}
-    for run in _before(archive, settings, name, scene_key):
-        found = _usable(archive, run, settings, grid, class_names)
+    for run in _before(archive, settings, name, scene.key):
+        found = _usable(archive, run, settings, grid, class_names, scene.geobox)
         if isinstance(found, Prior):
             return found, (*_unusable(runs_by_reason), f"prior map: {run.folder.name}, {found.days:.3g} days earlier")
         runs_by_reason.setdefault(found, []).append(run.folder.name)
@@ -118,7 +124,7 @@ def _before(archive: Archive, settings: Settings, name: str, scene_key: str) -> 
 
 
 def _usable(
-    archive: Archive, run: Run, settings: Settings, grid: SceneGrid, class_names: tuple[str, ...]
+    archive: Archive, run: Run, settings: Settings, grid: SceneGrid, class_names: tuple[str, ...], geobox: GeoBox | None
 ) -> Prior | str:
     """Return the run as a prior, or the reason why it cannot be one."""
     if run.problem is not None:
@@ -131,11 +137,17 @@ def _usable(
         if probabilities is None or mosaic is None:
             return "its stores were cleared; reprocess computes them again"
         store = ProbabilityStore(probabilities.path / "class_probabilities.zarr")
-        names = store.legend.names
+        names, before = store.legend.names, load_geobox(probabilities.path / "class_map.zarr")
     except IncompleteStoreError as error:
         return f"{error}"
     if store.shape != (grid.height, grid.width):
         return f"it has {store.shape[1]} x {store.shape[0]} px, this field has {grid.width} x {grid.height}"
+    if before is not None and geobox is not None:
+        shift = shift_px(geobox, before) if before.crs == geobox.crs else None
+        if shift is None:
+            return "it has another coordinate system, pixel size or direction than this scene"
+        if math.hypot(*shift) > REACH_PX:
+            return f"it shows another place: its corner lies {math.hypot(*shift):.0f} px from that of this scene"
     camera, optics = run.settings["camera"], ("pitch_um", "focal_length_mm")
     if any(camera[part] != getattr(settings.camera, part) for part in optics):
         return "its camera has another pitch or focal length"

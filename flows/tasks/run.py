@@ -391,7 +391,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     name, found = settings.name or Path(scene.name).stem, None
     if settings.extent == EXTENT_PART:  # the prior map chooses the lines
         archive = open_archive(settings.out) if archive is None and is_archive(settings.out) else archive
-        asked = (settings, name, grid, described.class_names, scene.key)
+        asked = (settings, name, grid, described.class_names, scene)
         found = (None, ()) if archive is None else find_prior(archive, *asked)
     passes = None if recorded is None else recorded.passes
     planned = _PlannedCapture(settings)
@@ -407,7 +407,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     archive = open_archive(settings.out) if archive is None else archive
     if raster is not None and not planning:
         outside += other_unit(raster, scene.wavelength_nm, model.load(), path)
-    prior, prior_notes = found or find_prior(archive, settings, name, grid, described.class_names, scene.key)
+    prior, prior_notes = found or find_prior(archive, settings, name, grid, described.class_names, scene)
     if settings.prior != AUTO:  # a receipt names the run
         settings = replace(settings, prior=NONE if prior is None else prior.run)
     return SurveyRun(

@@ -30,9 +30,11 @@ Numbers = NDArray[np.intp]
 BLOCK_LINES = 64  # read at a time
 SWATH_PX = 1.0  # largest distance of a planned swath from the recorded one
 REACH_STEPS = 0.75  # largest distance of a planned line from a recorded one, in recorded line spacings,
-PLANNED_REACH = 0.5  # or in planned line spacings, where that is more
+PLANNED_REACH = (
+    0.8  # or in planned line spacings, where that is more: the last recorded line serves a plan that ends there
+)
 FINE_ENOUGH = 1.5  # largest ratio of recorded to planned line spacing
-SAME_PX = 1e-6  # distances that differ by less are equal; the first line is chosen then
+SAME_PX = 1e-4  # distances that differ by less are equal, as positions are float32; the first line is chosen then
 
 
 @dataclass(frozen=True)

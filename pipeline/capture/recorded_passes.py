@@ -112,7 +112,7 @@ class RecordedPasses:
                     name=f"{like.name.rpartition('-')[0]}-{len(found)}",
                     swath_px=one.sweep.swath_px,
                     start_px=low - (like.positions - 1) / 2,
-                    lines=int((high - low) // like.step) + 1,
+                    lines=round((high - low) / like.step) + 1,
                 )
             )
         return found

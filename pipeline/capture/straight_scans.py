@@ -50,6 +50,7 @@ def angles_to_positions(angles_deg: Floats) -> tuple[Floats, NDArray[np.bool_]]:
 
 MOST_BEND = 1 / 16  # largest distance of line centres from their swath, as a fraction of a line's length
 MOST_BACK = 8.0  # line spacings that a scan may go back before it counts as turned
+UNEVEN, MOST_EVEN = 0.1, 0.9  # of the line spacing, and fraction of the lines of a scan with gaps that keep to it
 STANDING_PX = 1e-3  # a scan that moves less from line to line stands still
 STATED_DIGITS = 6  # of derived coordinates [px], so that a planned sweep comes back as it was
 FLAT_PX = 0.01  # largest stretch or shift at the ends of a line without a mirror
@@ -62,6 +63,7 @@ class StraightScan:
     sweep: Sweep
     distance_px: float  # of consecutive lines; ``sweep.step`` is the nearest whole number from 1
     backward: bool  # lines were taken against the scan axis
+    note: str = ""  # on a gap
 
 
 def fit_sweep(
@@ -75,9 +77,10 @@ def fit_sweep(
 ) -> StraightScan:
     """Derive the sweep of positions (line, 2): swath, start and step by medians, which outliers do not move.
 
-    The line spacing is the median over pairs half the scan apart, the start the median of the remainders. The binning
-    is ``camera.samples`` over the ``samples`` of a recorded line. Coordinates are rounded to 1e-6 px. A backward scan
-    gets the sweep of the same lines forward.
+    The line spacing is the median over pairs half the scan apart. A gap moves it: where nearly all consecutive lines
+    are as far apart, their distance is taken. The start is the median of the remainders. The binning is
+    ``camera.samples`` over the ``samples`` of a recorded line. Coordinates are rounded to 1e-6 px. A backward scan gets
+    the sweep of the same lines forward.
 
     Raises SceneError: there are fewer than two valid lines, the samples do not divide the camera's, the scan stands
     still or turns back, or line centres are not on a straight line. Raises PoseError: a valid position is beyond the
@@ -95,6 +98,12 @@ def fit_sweep(
     across, scan = (direction_to_scene(position_to_direction(position[lines])) / camera.ifov_rad).T
     half = len(lines) // 2
     distance = float(np.median((scan[half:] - scan[:-half]) / (lines[half:] - lines[:-half])))
+    steps = np.diff(scan) / np.diff(lines)
+    near, note = float(np.median(steps)), ""
+    even = np.abs(steps - near) <= UNEVEN * abs(near)
+    if abs(near) > STANDING_PX and even.mean() > MOST_EVEN and abs(distance - near) > UNEVEN * abs(near):
+        distance, at = near, int(np.argmax(np.abs(steps)))
+        note = f"{name}: lines {lines[at]} and {lines[at + 1]} lie {abs(scan[at + 1] - scan[at]):.4g} px apart"
     if abs(distance) < STANDING_PX:
         raise SceneError(
             f"sweep {name} stands still: its lines move by {abs(distance):.2g} px from one to the next; give the "
@@ -129,7 +138,7 @@ def fit_sweep(
         step=step,
         binning=binning,
     )
-    return StraightScan(sweep, abs(distance), distance < 0)
+    return StraightScan(sweep, abs(distance), distance < 0, note)
 
 
 def _stated(value: float) -> float:

@@ -157,11 +157,18 @@ def repair(
         for uri in plan.remade:
             archive.discard(archive.ref(*uri.split("/")[1:]))
     there, repeated = {run.uri for run in Catalogue.read(archive.root).runs} | set(plan.broken_runs), dict[str, str]()
-    for run, settings in plan.surveys:
+    surveys = {_settings_text(run): (run.uri, settings) for run, settings in plan.surveys}
+
+    def run_again(text: str) -> None:
+        uri, settings = surveys[text]
+        repeated.pop(text, None)
         try:
-            repeated[_settings_text(run)] = rerun({name: value for name, value in settings.items() if name != "notes"})
+            repeated[text] = rerun({name: value for name, value in settings.items() if name != "notes"})
         except PipelineError as error:
-            done.failed[run.uri] = str(error)
+            done.failed[uri] = str(error)
+
+    for text in surveys:
+        run_again(text)
     catalogue = Catalogue.read(archive.root)
     for uri in plan.remade:
         if uri in catalogue.stores:
@@ -171,6 +178,8 @@ def repair(
         else:
             done.failed[uri] = "; ".join(done.failed.values()) or "its survey ran again without building it"
     for uri, text in plan.broken_runs.items():
+        if repeated.get(text) in plan.broken_runs:  # another damaged run of this survey has taken it
+            run_again(text)
         if text in repeated:  # its survey has run again
             archive.drop_run(uri)
             if repeated[text] not in there:

@@ -150,7 +150,9 @@ def reference_files(stem: Path, stated: Mapping[str, Path | None]) -> dict[str, 
     files: dict[str, Path | None] = {}
     for kind in FRAMES:
         beside = [stem.with_name(f"{stem.name}.{kind}{ending}") for ending in (".hdr", ".npy")]
-        file = stated.get(kind) or next((one for one in beside if one.is_file()), None)
+        if (file := stated.get(kind)) is not None and not file.exists():
+            raise SceneError(f"there is no file {file}; check the name (seen from {Path.cwd()})")
+        file = file or next((one for one in beside if one.is_file()), None)
         files[kind] = find_reference(stem.parent, kind) if file is None and kind in ("dark", "white") else file
     return files
 

@@ -351,11 +351,10 @@ def _find_gaps(
         raise EmptySceneError(f"{path} holds no finite number in the bands used; choose others")
     if not seen.all():
         without, rest = (
-            bands_text([band for band, there in zip(chosen, seen, strict=True) if there == wanted])
-            for wanted in (False, True)
+            [int(band) for band, there in zip(chosen, seen, strict=True) if there == wanted] for wanted in (False, True)
         )
-        take = f"take the others: bands = [{rest}] in a scene.toml beside it, or survey --bands {rest}"
-        raise SceneError(f"{path} has no value anywhere in bands {without} (from 0); {take}")
+        take = f"take the others: bands = {rest} in a scene.toml beside it, or survey --bands {bands_text(rest)}"
+        raise SceneError(f"{path} has no value anywhere in bands {bands_text(without)} (from 0); {take}")
     if absent:
         notes.append(f"missing samples: {absent} of {missing.size * len(chosen)}")
     return missing, filled_px, void, tuple(notes)

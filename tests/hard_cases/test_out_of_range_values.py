@@ -95,6 +95,14 @@ def test_the_bound_is_inclusive_and_knows_every_kind(kind: Any) -> None:
         assert (found.count, found.place, float(found.value)) == (1, (1, 2, 3), 2 * MOST_VALUE)
 
 
+def test_half_floats_reach_no_bound_but_infinity() -> None:
+    """Their largest number is 65 504: they are compared without a warning, and infinite ones are marked."""
+    values = np.array([[[65504.0, -65504.0, np.inf, np.nan]]], np.float16)
+    assert beyond_range(values).tolist() == [[[False, False, True, False]]]
+    assert beyond_range(values[..., :2]) is None
+    assert np.isnan(readings_alone(values, MOST_VALUE)).tolist() == [[[False, False, True, True]]]
+
+
 def test_readings_stay_the_same_array() -> None:
     """No copy is made where there is nothing to take out, and NaN stays NaN where there is."""
     values = np.array([[1.0, np.nan, -5.0]], np.float32)

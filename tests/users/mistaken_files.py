@@ -137,6 +137,7 @@ def _folders(here: Path, picture: np.ndarray) -> None:
     folder("season", {"2024-05-01/field.png": picture, "2024-06-01/field.png": picture})
     folder("one_of_each", {"corrected.png": picture, "site_gt.png": mask})
     folder("soil", {**two, "labels/001.png": mask * 0, "labels/002.png": mask * 0})
+    folder("unlabelled", {**two, "labels/001.png": mask * 0, "labels/002.png": mask * 0}, "unlabelled = 0\n")
     folder("soft", {**two, "labels/001.png": picture, "labels/002.png": mask})
     folder("sizes", {**two, "labels/001.png": mask, "labels/002.png": mask[:9]})
     folder("bare", two)

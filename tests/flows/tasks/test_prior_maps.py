@@ -13,6 +13,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+import rasterio
 import torch
 import xarray as xr
 from PIL import Image
@@ -136,7 +137,8 @@ def test_a_run_captured_after_the_visit_is_refused(twice: tuple[Path, Any, Any])
 def found_prior(out: Path, visit: str, prior: str) -> tuple[str, float] | None:
     """Name and days of the run that a visit to north goes on from."""
     settings = load_settings(None, {"prior": prior, "visit": visit})
-    found, _ = memory.find_prior(Archive.open(out), settings, "north", SceneGrid(96, 128, 8), CLASSES, "scene")
+    scene: Any = Mock(key="scene", geobox=None)
+    found, _ = memory.find_prior(Archive.open(out), settings, "north", SceneGrid(96, 128, 8), CLASSES, scene)
     return found and (found.run, found.days)
 
 
@@ -157,6 +159,32 @@ def test_a_field_of_another_size_is_no_memory(visited: Path, survey_png: Survey,
     assert "cannot be the prior map: it has 128 x 96 px, this field has 96 x 64" in words
     assert "north has no prior map" in words
     assert "memory" not in published.receipt
+
+
+@pytest.mark.parametrize(
+    ("east_m", "epsg", "why"),
+    [
+        (0.0, 32632, None),
+        (40.0, 32632, None),
+        (1000.0, 32632, "it shows another place: its corner lies 100 px"),
+        (0.0, 32633, "it has another coordinate system, pixel size or direction"),
+    ],
+)
+def test_a_map_of_another_place_is_no_prior_map(
+    visited: Path, survey_png: Survey, tmp_path: Path, east_m: float, epsg: int, why: str | None
+) -> None:
+    """Tiles of one mosaic look alike: what their files say of their places counts."""
+    for name, east, code in (("here", 0.0, 32632), ("there", east_m, epsg)):
+        values = np.moveaxis(patchy_scene((96, 128), 3, seed=1)[0].astype(np.uint8), -1, 0)
+        place = {"crs": f"EPSG:{code}", "transform": rasterio.Affine(10.0, 0, 4e5 + east, 0, -10.0, 5e6)}
+        kind: dict[str, Any] = {"driver": "GTiff", "height": 96, "width": 128, "count": len(values), "dtype": "uint8"}
+        with rasterio.open(tmp_path / f"{name}.tif", "w", **kind, **place) as file:
+            file.write(values)
+    flags = {"labels": None, "name": "tile", "prior": "latest"}
+    survey_png(visited, **{**UNIFORM, **flags}, scene=str(tmp_path / "here.tif"), visit=FIRST)
+    words, run = words_of(visited, survey_png, **flags, scene=str(tmp_path / "there.tif"), visit=LATER)
+    assert ("memory" in run.receipt) == (why is None)
+    assert why is None or why in words
 
 
 def test_another_field_under_the_same_name_is_put_aside(visited: Path, survey_png: Survey, tmp_path: Path) -> None:

@@ -176,7 +176,7 @@ def test_a_plan_is_cut_to_what_was_recorded() -> None:
     inside = replace(lower, name="fine", lines=10)
     assert recorded.cut_to_recorded(inside) == inside
     assert recorded.cut_to_recorded(replace(inside, swath_px=64.0)) is None
-    with pytest.raises(NotRecordedError, match="line 8 of sweep coarse-0 was never captured: it lies at -8 px"):
+    with pytest.raises(NotRecordedError, match="line 9 of sweep coarse-0 was never captured: it lies at -4 px"):
         next(recorded.lines(replace(beyond, start_px=-41.5, lines=21)))
 
 

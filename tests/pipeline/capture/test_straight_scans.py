@@ -51,6 +51,16 @@ def test_noise_and_spikes_do_not_move_the_sweep() -> None:
     assert abs(found.distance_px - 1) < 1e-3
 
 
+def test_a_gap_does_not_move_the_line_spacing() -> None:
+    """A camera that paused for 20 px in the middle has lines 1 px apart all the same; the gap is told."""
+    sweep = Sweep("s", "fine", "x", 0.0, -42.0, 84)
+    position = np.delete(line_positions(sweep, CAMERA), np.s_[30:50], axis=0)
+    found = fit_sweep(position, CAMERA, name="s", samples=640)
+    assert (found.sweep.step, found.sweep.lines) == (1, 64)
+    assert found.distance_px == pytest.approx(1, abs=1e-6)
+    assert found.note == "s: lines 29 and 30 lie 21 px apart"
+
+
 @pytest.mark.parametrize(
     ("along", "scan", "message"),
     [

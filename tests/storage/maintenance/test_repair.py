@@ -14,7 +14,7 @@ from pipeline.errors import ArchiveError, SceneError
 from storage.archive.archive import Archive
 from storage.maintenance.verification import Repaired, plan_repair, repair
 from storage.remote.opening import verify_archive
-from tests.storage.small_archive import Small, flip, small_survey
+from tests.storage.small_archive import Small, flip, settings, small_survey
 
 VERSIONS = {"capture": 1, "rectify": 1, "segment": 1}
 
@@ -53,6 +53,21 @@ def test_only_what_is_broken_is_made_again(archive: Archive) -> None:
     after = _moments(archive)
     assert {uri for uri in after if after[uri] != before[uri]} == set(done.remade)
     assert len(archive.runs()) == 2  # the repetition is gone
+    assert _bad(archive) == []
+
+
+def test_two_damaged_runs_of_one_command_keep_their_names(archive: Archive) -> None:
+    """A survey that was repeated has two runs with the same settings: each comes back under its own name."""
+    for _ in range(2):
+        with archive.new_run("farm") as draft:
+            draft.write_file("receipt.json", json.dumps({"settings": settings(kernel="bilinear")}))
+            draft.write_file("quicklook.png", b"picture")
+    runs = archive.runs()
+    for run in runs:
+        flip(run / "quicklook.png")
+    done = _repair(archive)
+    assert done.complete
+    assert archive.runs() == runs
     assert _bad(archive) == []
 
 
