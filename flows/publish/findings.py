@@ -107,17 +107,11 @@ def find_ground(
     }
     place, drawn = run.zones.place, found.classes != UNLABELLED
     figures |= {"older_ha": older_hectares(place, np.where(drawn, probabilities.age(), np.nan))}
-    if (old_class := differing_now(probabilities)) is not None:
+    if (old_class := probabilities.old_class()) is not None:
         changes = [] if memory is None else memory["changes"]
         beyond = {(old, new): changed / differing for changed, differing, old, new in changes}
         figures |= {"changes_ha": changed_hectares(place, old_class, found, beyond)}
     return {"ground": figures}
-
-
-def differing_now(probabilities: ProbabilityStore) -> NDArray[np.uint8] | None:
-    """Return the previous class of (y, x) pixels that this visit captured and that differ, else 255; None at first."""
-    old_class = probabilities.old_class()
-    return None if old_class is None else np.where(probabilities.age() == 0, old_class, np.uint8(UNLABELLED))
 
 
 def older_hectares(place: FieldPlace, age_days: NDArray[np.float32]) -> dict[str, float]:

@@ -19,16 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.publish.field_map import FieldMap, block_of, field_map, prior_map
-from flows.publish.findings import (
-    PLOTS_FILE,
-    differing_now,
-    field_figures,
-    find_areas,
-    find_ground,
-    find_map,
-    find_zones,
-    plots_csv,
-)
+from flows.publish.findings import PLOTS_FILE, field_figures, find_areas, find_ground, find_map, find_zones, plots_csv
 from flows.publish.panels import draw_ground, draw_spectra, thinned
 from flows.publish.quicklook import QuicklookData, draw_quicklook
 from flows.publish.receipt import AccuracyIs, Facts, Receipt, build_receipt, check_receipt, with_accuracy
@@ -267,7 +258,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan) -> Quickl
         class_colours=found.colours,
         truth=run.labels,
         confidence=np.ascontiguousarray(found.confidence[thinned(found.classes)]),
-        was=None if memory is None or memory["put_aside"] else differing_now(ProbabilityStore(drawn)),
+        was=None if memory is None or memory["put_aside"] else ProbabilityStore(drawn).old_class(),
         days=0.0 if memory is None else memory["days"],
     )
 

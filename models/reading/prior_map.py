@@ -1,8 +1,8 @@
 """Fuse the prior map of a field with the current visit, pixel by pixel.
 
 The temporal reader of the weights weighs both. Without a reader the more confident of the two is taken. Pixels that
-the visit did not capture are mapped by their prior map, which fades with its age. What is stored of them for the next
-visit are the probabilities of their last capture, so that the number of visits since then changes nothing.
+the visit did not capture are mapped by their prior map, which fades with its age. The next visit starts from the
+probabilities of their last capture: the number of visits since then changes nothing.
 """
 
 from __future__ import annotations

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
 
-from flows.publish.findings import changed_hectares, differing_now, older_hectares
+from flows.publish.findings import changed_hectares, older_hectares
 from flows.publish.receipt_table import finding_rows
 from models.evaluation.expected_scores import MapScores, expected_counts, expected_score
 from models.weights.files import MAP_SCORES
@@ -44,12 +43,6 @@ def test_changed_hectares_are_told_from_class_to_class() -> None:
     beyond = {("soil", "crop"): 1.0, ("soil", "unknown"): 0.5}
     found = changed_hectares(PLACE, old, ClassMap(now, np.ones(now.shape, np.float32), *legend), beyond)
     assert [(round(area, 6), *pair) for area, *pair in found] == [(0.02, "soil", "crop"), (0.005, "soil", "unknown")]
-
-
-def test_only_captured_pixels_differ() -> None:
-    """The others only have an aged prior map."""
-    store = SimpleNamespace(old_class=lambda: np.uint8([[1, 1, 255]]), age=lambda: np.float32([[0, 7, 0]]))
-    assert differing_now(store).tolist() == [[1, UNLABELLED, UNLABELLED]]
 
 
 def test_rows_have_hectares_and_changes_where_they_are_known() -> None:

@@ -346,6 +346,16 @@ def test_a_patch_counts_its_pixels_of_another_class() -> None:
     np.testing.assert_array_equal(changed_fractions(old != UNLABELLED, SceneGrid(8, 16, 8)), [[0.125, 0.0]])
 
 
+def test_only_captured_pixels_change() -> None:
+    """The map of the others is an aged prior map: another class of it is no observation."""
+    rng = np.random.default_rng(3)
+    told = [np.log(np.where(np.arange(3) == one, 0.98, 0.01)) * np.ones((*SHAPE, 1)) for one in (0, 1)]
+    before, after = (ClassProbabilities(one.astype(np.float32), *np.zeros((2, *SHAPE), np.float32)) for one in told)
+    seen = rng.random(SHAPE) < 0.5
+    aged = replace(after, age_days=np.where(seen, 0, 7).astype(np.float32))
+    np.testing.assert_array_equal(changed_from(PriorMap(before, None, 7.0), aged) == 0, seen)
+
+
 def test_a_patch_over_the_border_counts_its_pixels_on_the_scene() -> None:
     """A field of 20 x 20 px that changed everywhere changed by 1 in all four patches of 16 px."""
     assert (changed_fractions(np.ones((20, 20), np.bool_), SceneGrid(20, 20, 16)) == 1).all()
