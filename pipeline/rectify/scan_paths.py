@@ -85,7 +85,13 @@ def make_scan_paths(
     scan, across, lines = line_centres(position, camera, usable, shift_px)
     if not len(lines):
         return ()
-    step = _usual_step(scan, lines, camera.ifov_rad * binning) if step_px is None else step_px * camera.ifov_rad
+    if step_px is None:
+        apart, steps = camera.ifov_rad * binning, np.abs(np.diff(scan)) / np.diff(lines)
+        steps = steps[steps > STANDING_STEPS * apart]
+        # The lower median: of one step and one gap, the step.
+        step = float(np.percentile(steps, 50, method="lower")) if len(steps) else apart
+    else:
+        step = step_px * camera.ifov_rad
     bends = np.abs(np.diff(scan, 2))  # of a position's own noise: sqrt 6 times its standard deviation
     noise = float(np.median(bends)) * SIGMA_OF_MEDIAN / 6**0.5 if len(bends) else 0.0
     runs = _runs(scan, max(GAP_STEPS * step, NOISE_SIGMAS * noise), DWELL_STEPS * step)
@@ -113,14 +119,6 @@ def line_centres(
     if shift_px is not None:
         tangent = tangent + shift_px[lines] * camera.ifov_rad
     return tangent[:, 1], tangent[:, 0], lines
-
-
-def _usual_step(scan: Floats, lines: NDArray[np.intp], apart: float) -> float:
-    """Return the median distance of consecutive lines that move; ``apart`` if none moves."""
-    steps = np.abs(np.diff(scan)) / np.diff(lines)
-    steps = steps[steps > STANDING_STEPS * apart]
-    # The lower median: of one step and one gap, the step.
-    return float(np.percentile(steps, 50, method="lower")) if len(steps) else apart
 
 
 def _runs(scan: Floats, most_back: float, still: float) -> list[slice]:

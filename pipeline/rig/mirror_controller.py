@@ -202,12 +202,6 @@ def read_cells(link: ProLink, register: int, start: int, count: int) -> bytes:
     )
 
 
-def hold_values(x: float, y: float) -> dict[int, pro.Value]:
-    """Return the registers that send both channels to a position, hold it and end any path; they fill one frame."""
-    follow = {**pro.X.followed(pro.X.static_system), **pro.Y.followed(pro.Y.static_system)}
-    return {pro.X.static_xy: float(x), pro.Y.static_xy: float(y), **follow, **_run_values(0)}
-
-
 def _run_values(run: int) -> dict[int, pro.Value]:
     """Return the registers that start (1) or halt (0) the vector units of both channels, in one frame."""
     return {channel.vector(pro.VectorRegister.RUN): run for channel in (pro.X, pro.Y)}
@@ -299,8 +293,11 @@ class MirrorController(Closing):
         Raises PoseError: the position is outside the disk; no byte is sent. Raises RigError: the status forbids motion.
         Raises StateUnknown: it was not acknowledged, or an earlier motion was not.
         """
-        target = wire_positions([(x, y)], self.rig.mounting)[0]
-        self._move(hold_values(*target), f"going to {target[0]:.6g}; {target[1]:.6g}")
+        to_x, to_y = map(float, wire_positions([(x, y)], self.rig.mounting)[0])
+        follow = {**pro.X.followed(pro.X.static_system), **pro.Y.followed(pro.Y.static_system)}
+        # all registers fill one frame: both channels go there, hold it, and end any path
+        values = {pro.X.static_xy: to_x, pro.Y.static_xy: to_y, **follow, **_run_values(0)}
+        self._move(values, f"going to {to_x:.6g}; {to_y:.6g}")
 
     def settle(self, within_s: float) -> None:
         """Wait until the mirror is at rest; RigError where it is not, or the device trimmed the target to the rim."""

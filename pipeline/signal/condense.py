@@ -53,9 +53,10 @@ class ScoredLines:
 def score_lines(values: NDArray[np.float32], valid: Bools, components: Components) -> ScoredLines:
     """Project (line, sample, band) scene values onto components, by the bands that `calibrate` calls valid.
 
-    A spectrum with missing bands gets the most probable scores by its other bands and the scatter of the field's scores.
-    Least squares alone would leave some scores unknown where neighbouring bands are missing. Spectra of few bands have a known covariance: there a missing band takes its expected value. ``valid`` is (line,
-    sample) or (line, sample, band).
+    A spectrum with missing bands gets the most probable scores by its other bands and the scatter of the field's
+    scores. Least squares alone would leave some scores unknown where neighbouring bands are missing. Spectra of few
+    bands have a known covariance: there a missing band takes its expected value. ``valid`` is (line, sample) or (line,
+    sample, band).
     """
     lit, count = np.isfinite(components.mean), len(components)
     bands = int(lit.sum())

@@ -200,7 +200,8 @@ def _bands_of(cube: ArrayCube, arrays: Arrays, count: int) -> Bands:
         return Bands()
     centres = np.asarray(arrays[found][...], np.float64).ravel()
     unit = _unit(arrays[found].attrs)
-    scale = _scale(unit, float(centres.max()))
+    known = {**dict.fromkeys(NANOMETRES, 1.0), **dict.fromkeys(MICROMETRES, 1000.0), **dict.fromkeys(METRES, 1e9)}
+    scale = (1000.0 if centres.max() <= 20 else 1.0) if unit in UNSAID else known.get(unit)  # [nm]
     if scale is None or not (np.isfinite(centres) & (centres > 0)).all():
         return Bands()
     source = f"in {unit}" if unit not in UNSAID else "without a unit, read by their size"
@@ -357,13 +358,6 @@ def _as_stored(numbers: NDArray[Any], stored: np.dtype[Any]) -> NDArray[Any]:
 
 def _number(value: object) -> float | None:
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
-
-
-def _scale(unit: str, largest: float) -> float | None:
-    """Return the size of a unit in nm, without a unit by the largest value; None if it is no length."""
-    if unit in UNSAID:
-        return 1000.0 if largest <= 20 else 1.0
-    return 1.0 if unit in NANOMETRES else 1000.0 if unit in MICROMETRES else 1e9 if unit in METRES else None
 
 
 def _unit(attributes: Mapping[str, Any]) -> str:

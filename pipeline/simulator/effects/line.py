@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -132,20 +131,13 @@ class Smear(Effect):
         if variance == 0:
             return Bound(0.0, "the mirror stands still while a line is exposed")
         both = np.zeros(probe.slope.shape)
-        held = ((ways + np.arange(ways.shape[1])).var(axis=1) for ways in _courses(probe.sweeps, rig))
-        both[1] = max(variance, max((float(one.max()) for one in held), default=0.0))
+        both[1] = variance
+        for sweep in {(one.lines, one.step): one for one in probe.sweeps if one.lines and one.positions > 1}.values():
+            numbers = np.arange(sweep.lines)  # the held positions beside their plan, (line, step) [px]
+            held = transient(rig, sweep, numbers) + beside_plan(rig.mirror.positions_per_line, sweep.step, numbers)
+            both[1] = np.maximum(both[1], (held + np.arange(held.shape[1])).var(axis=1).max())
         ways = 2 if variant == FOLDED else 1
         return Bound(ways * probe.blurred(both), f"the mirror moves {most} px in an exposure")
-
-
-def _courses(sweeps: tuple[Sweep, ...], rig: Rig) -> Iterator[Floats]:
-    """Yield the paths of held positions beside their plan, (line, step) [px].
-
-    There is one for each kind of sweep that holds several positions a line.
-    """
-    for sweep in {(one.lines, one.step): one for one in sweeps if one.lines and one.positions > 1}.values():
-        numbers = np.arange(sweep.lines)
-        yield transient(rig, sweep, numbers) + beside_plan(rig.mirror.positions_per_line, sweep.step, numbers)
 
 
 def smeared_positions(block: SweepBlock, variant: str) -> Floats:

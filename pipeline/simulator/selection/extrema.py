@@ -146,17 +146,15 @@ class Ranking:
 
     def best(self, most: int) -> Floats:
         """Return the best of each kind in turns, none twice, (place, 2) rows and columns."""
-        best = [_worst_first(np.concatenate(some, axis=1), most) for some in self._offers.values()]
-        ranked = [list(zip(*places[1:].astype(int).tolist(), strict=True)) for places in best]
+        ranked = []
+        for some in self._offers.values():
+            places = np.concatenate(some, axis=1)  # (row, place): measure, and where they lie
+            if places.shape[1] > most:
+                places = places[:, places[0] >= np.partition(places[0], -most)[-most]]
+            first = places[1:, np.lexsort(places[::-1])[::-1][:most]].astype(int)
+            ranked.append(list(zip(*first.tolist(), strict=True)))
         found = dict.fromkeys(place for rank in zip_longest(*ranked) for place in rank if place is not None)
         return np.array(list(found)[:most], np.float64).reshape(-1, 2)
-
-
-def _worst_first(places: Floats, most: int) -> Floats:
-    """Return the first places by measure and then by location, (row, place): measure, and where they lie."""
-    if places.shape[1] > most:
-        places = places[:, places[0] >= np.partition(places[0], -most)[-most]]
-    return places[:, np.lexsort(places[::-1])[::-1][:most]]
 
 
 @dataclass(frozen=True)
