@@ -281,7 +281,7 @@ def verdict(archive: Archive, findings: list[Finding]) -> dict[str, Any]:
         content |= {
             "to_remake": list(plan.remade),
             "hopeless": plan.hopeless,
-            "surveys": [{"run": run.uri, "command": command(settings, archive.name)} for run, settings in plan.surveys],
+            "surveys": [{"run": run.uri, "command": command(run.settings, archive.name)} for run in plan.surveys],
         }
     return content
 

@@ -199,8 +199,11 @@ def load_settings(
     passes |= requested.get("zoom") == ALWAYS and requested.get("seconds") is None
     if passes and not _is_map(requested) and not any(requested.get(name) is not None for name in (*UNIFORM, "budget")):
         requested["budget"] = USUAL_BUDGET
-    if requested.get("prior", AUTO) != AUTO and "extent" not in stated and _may_choose_a_part(requested):
-        requested["extent"] = EXTENT_PART
+    if requested.get("prior", AUTO) not in (AUTO, "none") and "extent" not in stated and not _is_map(requested):
+        others = {"sweeps", "kept_bytes", "pointing_px", "macs", *UNIFORM} - {"seconds"}
+        chosen = any(requested.get(name) is not None for name in others) or requested.get("zoom") == ALWAYS
+        if requested.get("seconds") is not None and not chosen:  # the prior map can choose the lines of a revisit
+            requested["extent"] = EXTENT_PART
     return parse_settings(requested, origin)
 
 
@@ -224,15 +227,6 @@ def _read_table(path: str | Path | None, flags: Mapping[str, object]) -> tuple[d
             table[head or key] = {**inner, tail: value} if head and isinstance(inner, Mapping) else value
             origin[key] = "flag"
     return table, origin
-
-
-def _may_choose_a_part(requested: Mapping[str, object]) -> bool:
-    """Return whether a revisit with a time budget and no other limit can choose its lines by the prior map."""
-    others = {"sweeps", "kept_bytes", "pointing_px", "macs", *UNIFORM} - {"seconds"}
-    chosen = any(requested.get(name) is not None for name in others) or requested.get("zoom") == ALWAYS
-    return (
-        requested.get("seconds") is not None and requested["prior"] != "none" and not chosen and not _is_map(requested)
-    )
 
 
 def _is_map(table: Mapping[str, object]) -> bool:

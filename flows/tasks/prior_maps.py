@@ -15,7 +15,6 @@ from flows.settings.values import EXTENT_PART, EXTENT_WHOLE
 from pipeline.errors import IncompleteStoreError, SettingsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.ground.georeference import shift_px
-from pipeline.lazy import GeoBox
 from pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
 from pipeline.simulator.scenes.scene import RasterScene
 from storage.archive.archive import Archive, run_stem
@@ -77,14 +76,14 @@ def find_prior(
         folder = archive.root / "runs" / Path(settings.prior).name
         why = "there is no such run in the archive"
         if folder.is_dir():
-            found = _usable(archive, read_run(folder), settings, grid, class_names, scene.geobox)
+            found = _usable(archive, read_run(folder), settings, grid, class_names, scene)
             if isinstance(found, Prior):
                 return found, ()
             why = found
         raise SettingsError(f"--prior {settings.prior}: {why}; give another run, latest or none")
     runs_by_reason: dict[str, list[str]] = {}
     for run in _before(archive, settings, name, scene.key):
-        found = _usable(archive, run, settings, grid, class_names, scene.geobox)
+        found = _usable(archive, run, settings, grid, class_names, scene)
         if isinstance(found, Prior):
             return found, (*_unusable(runs_by_reason), f"prior map: {run.folder.name}, {found.days:.3g} days earlier")
         runs_by_reason.setdefault(found, []).append(run.folder.name)
@@ -124,7 +123,7 @@ def _before(archive: Archive, settings: Settings, name: str, scene_key: str) -> 
 
 
 def _usable(
-    archive: Archive, run: Run, settings: Settings, grid: SceneGrid, class_names: tuple[str, ...], geobox: GeoBox | None
+    archive: Archive, run: Run, settings: Settings, grid: SceneGrid, class_names: tuple[str, ...], scene: RasterScene
 ) -> Prior | str:
     """Return the run as a prior, or the reason why it cannot be one."""
     if run.problem is not None:
@@ -142,8 +141,8 @@ def _usable(
         return f"{error}"
     if store.shape != (grid.height, grid.width):
         return f"it has {store.shape[1]} x {store.shape[0]} px, this field has {grid.width} x {grid.height}"
-    if before is not None and geobox is not None:
-        shift = shift_px(geobox, before) if before.crs == geobox.crs else None
+    if before is not None and scene.geobox is not None:
+        shift = shift_px(scene.geobox, before) if before.crs == scene.geobox.crs else None
         if shift is None:
             return "it has another coordinate system, pixel size or direction than this scene"
         if math.hypot(*shift) > REACH_PX:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from functools import cached_property
@@ -459,10 +459,13 @@ def _open_source(
 ) -> tuple[FieldSource, SimulatedSource, RasterPixels | None]:
     """Return the source of lines, the simulated rig, and the pixels of a raster; all fit the memory."""
     simulated = make_source(scene, settings)
+    source: FieldSource = SimulatedField(simulated)
     if recorded is not None:
-        source: FieldSource = recorded.field
-    else:
-        source = field_source(scene, settings, simulated, (*plan.coarse, *plan.full))
+        source = recorded.field
+    elif settings.is_map:
+        source = FieldSource()
+    elif settings.source == RIG:
+        source = rig_field.rig_field(scene, settings, (*plan.coarse, *plan.full))
     if pixels is None:
         check_memory(simulated, grid, plan, settings.memory, settings.pool)
         return source, simulated, None
@@ -549,15 +552,6 @@ def _scene_for(
             f"--mask {settings.mask} is {size} px (y, x), the scene is {scene.shape}; give one of its size"
         )
     return pixels, scene, notes, label_notes
-
-
-def field_source(
-    scene: RasterScene, settings: Settings, simulated: SimulatedSource, planned: Sequence[Sweep]
-) -> FieldSource:
-    """Return the source of lines. Raises what `flows.tasks.rig_field.rig_field` raises."""
-    if settings.is_map:
-        return FieldSource()
-    return rig_field.rig_field(scene, settings, planned) if settings.source == RIG else SimulatedField(simulated)
 
 
 def noise_seed(settings: Settings) -> int:

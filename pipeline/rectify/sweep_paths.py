@@ -66,19 +66,15 @@ def sweep_paths(
     """Judge the lines of sweeps; ``found`` are a registration's corrections, by the sweeps' names."""
     paths = []
     for lines in sweeps:
-        name, numbers = lines.sweep.name, number_lines(lines.time_s, _period_s(lines, camera))
+        name, period_s = lines.sweep.name, exposing(camera, lines.sweep).frame_ms * 1e-3
+        if lines.source == "recorded":  # lines may be selected from a recording
+            apart = np.diff(lines.time_s[np.isfinite(lines.time_s)])
+            period_s = float(np.median(apart[apart > 0])) if (apart > 0).any() else period_s
         one = (found or {}).get(name, {"offset_px": (0.0, 0.0), "drift_px_per_line": (0.0, 0.0), "gain": None})
         shift = SweepShift(name, np.array(one["offset_px"]), np.array(one["drift_px_per_line"]))
         gain = None if one["gain"] is None else np.array(one["gain"], np.float32)
-        paths.append(SweepPath(lines, numbers, shift, gain))
+        paths.append(SweepPath(lines, number_lines(lines.time_s, period_s), shift, gain))
     return paths
-
-
-def _period_s(lines: StoredLines, camera: LineCamera) -> float:
-    """Return the time from line to line: the camera's, or the median for lines selected from a recording."""
-    apart = np.diff(lines.time_s[np.isfinite(lines.time_s)]) if lines.source == "recorded" else np.zeros(0)
-    rising = apart[apart > 0]
-    return float(np.median(rising)) if len(rising) else exposing(camera, lines.sweep).frame_ms * 1e-3
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ from pipeline.geometry.grid import cuts
 from pipeline.geometry.scan import Sweep
 from pipeline.readings import SIGMA_OF_MEDIAN
 from pipeline.signal.calibrate import Bools, calibrate, judge_elements, missing_bands
-from pipeline.signal.components import Components, Floats, Scores
+from pipeline.signal.components import Components, Scores
 from pipeline.signal.lines import BLOCK_LINES, CondensedLines
 from pipeline.signal.subspace import SignalStatistics
 from pipeline.source import Line, References, SweepLines
@@ -66,13 +66,12 @@ def score_lines(values: NDArray[np.float32], valid: Bools, components: Component
     broken = ~np.isfinite(left) if valid.ndim == 2 else ~np.isfinite(left) | ~valid[..., lit].all(axis=2)
     if (broken & (quality == WHOLE)).any():
         there = np.isfinite(values[broken]) & lit & (valid[broken] if valid.ndim == 3 else valid[broken][:, None])
-        axes = components.axes.T.astype(np.float32)
         if components.covariance is not None:
             spectra = components.completed(np.where(there, values[broken], np.float32(np.nan)))
-            scores[broken], residual[broken] = components.white(spectra) @ axes, 0
+            scores[broken], residual[broken] = components.white(spectra) @ components.axes.T.astype(np.float32), 0
         else:
             white = np.where(there, components.white(values[broken]), np.float32(0))
-            scores[broken], residual[broken] = _least_squares(white, there, axes, bands, components.spread)
+            scores[broken], residual[broken] = _least_squares(white, there, components)
         seen = there.sum(axis=1)
         quality[broken] = np.where(2 * seen < bands, UNUSABLE, np.where(seen < bands, PARTIAL, quality[broken]))
     unusable = quality == UNUSABLE
@@ -99,16 +98,14 @@ def _projected(values: NDArray[np.float32], components: Components) -> tuple[Sco
     return scores.reshape(*values.shape[:-1], len(components)), left.reshape(values.shape[:-1])
 
 
-def _least_squares(
-    white: Scores, there: Bools, axes: Scores, bands: int, spread: Floats | None
-) -> tuple[Scores, Scores]:
+def _least_squares(white: Scores, there: Bools, components: Components) -> tuple[Scores, Scores]:
     """Return scores (n, component) and residuals (n,) of whitened spectra (n, band), by their valid bands.
 
-    ``spread`` (component,) is the mean square of a score: the most probable ones of normal laws. Without it any is as
-    likely.
+    With the components' spread they are the most probable scores of normal laws; without it any is as likely.
     Missing bands count as noise in the residual, so that it has the spread of a whole spectrum's.
     """
-    count = axes.shape[1]
+    axes, spread, count = components.axes.T.astype(np.float32), components.spread, len(components)
+    bands = int(np.isfinite(components.mean).sum())
     prior = np.diag(np.full(count, 1e-6) if spread is None else 1 / np.maximum(spread, 1.0))
     products = (axes[:, :, None] * axes[:, None, :]).reshape(len(axes), -1)
     scores, residual = np.empty((len(white), count), np.float32), np.empty(len(white), np.float32)

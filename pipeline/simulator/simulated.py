@@ -242,18 +242,16 @@ def take_references(scene: RasterScene, rig: Rig, choice: Choice, sweep: Sweep) 
     if (response := choice.variant(RESPONSE.name)) != OFF:
         white_reference = RESPONSE.change(white_reference[None, None], block, response)[0, 0]
     return References(
-        dark=_binned(_mean_of_frames(dark), sweep.binning),
-        white=_binned(_mean_of_frames(dark + seen / np.float32(rig.camera.electrons_per_dn)), sweep.binning),
+        dark=_binned(dark, sweep.binning),
+        white=_binned(dark + seen / np.float32(rig.camera.electrons_per_dn), sweep.binning),
         white_reference=white_reference,
         bad=bad,
         by_mirror=choice.variant(VIGNETTING.name) != OFF,
     )
 
 
-def _mean_of_frames(frame: Frame) -> Frame:
-    return np.asarray(np.floor(frame.astype(np.float64) * REFERENCE_FRAMES + 0.5) / REFERENCE_FRAMES, np.float32)
-
-
 def _binned(frame: Frame, binning: int) -> Frame:
-    count = len(frame) // binning
+    """Return sums of samples of a frame, the mean of frames of whole numbers."""
+    count, frames = len(frame) // binning, frame.astype(np.float64) * REFERENCE_FRAMES
+    frame = (np.floor(frames + 0.5) / REFERENCE_FRAMES).astype(np.float32)
     return np.asarray(frame[: count * binning].reshape(count, binning, -1).sum(axis=1))

@@ -103,7 +103,7 @@ class RepairPlan:
 
     remade: tuple[str, ...]  # damaged or missing stores
     hopeless: dict[str, str]  # damaged stores that stay, with the reason
-    surveys: tuple[tuple[Run, dict[str, Any]], ...]  # a run for each different settings, and the settings
+    surveys: tuple[Run, ...]  # a run for each different settings
     broken_runs: dict[str, str]  # run folders that are damaged -> canonical settings, empty where not known
 
 
@@ -136,7 +136,7 @@ def plan_repair(archive: Archive, findings: Iterable[Finding], *, versions: Mapp
     runs |= {uri: "" for uri in bad if uri.startswith("runs/") and uri not in runs}
     affected = [run for run in catalogue.runs if run.uri in runs or run.names & broken]
     surveys = {text: run for run in affected if (text := _settings_text(run))}
-    return RepairPlan(tuple(ordered), hopeless, tuple((run, run.settings) for run in surveys.values()), runs)
+    return RepairPlan(tuple(ordered), hopeless, tuple(surveys.values()), runs)
 
 
 def repair(
@@ -157,15 +157,14 @@ def repair(
         for uri in plan.remade:
             archive.discard(archive.ref(*uri.split("/")[1:]))
     there, repeated = {run.uri for run in Catalogue.read(archive.root).runs} | set(plan.broken_runs), dict[str, str]()
-    surveys = {_settings_text(run): (run.uri, settings) for run, settings in plan.surveys}
+    surveys = {_settings_text(run): run for run in plan.surveys}
 
     def run_again(text: str) -> None:
-        uri, settings = surveys[text]
         repeated.pop(text, None)
         try:
-            repeated[text] = rerun({name: value for name, value in settings.items() if name != "notes"})
+            repeated[text] = rerun({name: value for name, value in surveys[text].settings.items() if name != "notes"})
         except PipelineError as error:
-            done.failed[uri] = str(error)
+            done.failed[surveys[text].uri] = str(error)
 
     for text in surveys:
         run_again(text)

@@ -107,7 +107,10 @@ def score(
         if second_pass is not None:
             return scores, second_pass.plan(scores)
         assert budget is not None
-        return scores, kept_within(budget, scores, scanned)
+        chosen = budget.choose(scores)
+        reason = f"{scanned.reason}; the full network reads {len(chosen)} of {len(budget.patch_index)} patches"
+        gain = float(np.where(np.isfinite(scores), scores, 0.0)[chosen].sum())
+        return scores, replace(scanned, patch_index=np.sort(chosen), reason=reason, expected_gain=gain)
 
     def build(path: Path) -> None:
         """Write score and rank of every patch, and the plan."""
@@ -157,18 +160,6 @@ def all_seen(grid: SceneGrid, sweeps: Sequence[Sweep], camera: LineCamera, *, pa
         patch_index = np.flatnonzero(patches_shown(list(sweeps), grid, camera))
     what = "a part of the field was" if part else "the field was"
     return FinePlan([], patch_index, 0.0, 0.0, "scan", f"{what} scanned once: {scan}")
-
-
-def kept_within(budget: PatchBudget, scores: Scores, scan_plan: FinePlan) -> FinePlan:
-    """Return the plan of a uniform scan with the patches that the budget pays for."""
-    chosen = budget.choose(scores)
-    finite = np.where(np.isfinite(scores), scores, 0.0)
-    return replace(
-        scan_plan,
-        patch_index=np.sort(chosen),
-        reason=f"{scan_plan.reason}; the full network reads {len(chosen)} of {len(budget.patch_index)} patches",
-        expected_gain=float(finite[chosen].sum()),
-    )
 
 
 def load_plan(attention: StageRef) -> FinePlan:

@@ -33,7 +33,7 @@ VERSIONS = {**versions(), ingest_command.STAGE: ingest_command.VERSION}
 RECORD = Path(__file__).with_name("stage_digests.json")
 # who looks at what: runs bring it, no stage names it
 LIGHT = ("farm_scene", "scouting_scene", "raster_from_values", "make_source")
-BESIDES = {"effects": LIGHT, "capture": (*LIGHT, "field_source"), "evaluate": ("judged_labels",)}
+BESIDES = {"effects": LIGHT, "capture": (*LIGHT, "_open_source"), "evaluate": ("judged_labels",)}
 ROOTS = {ingest_command.STAGE: ("run_ingest",)}
 for _one in STAGES.values():
     _function = f"{_one.wants.__module__}.{_one.wants.__name__}"
