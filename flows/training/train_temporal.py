@@ -37,7 +37,7 @@ SHAPE = (512, 640)  # (y, x) of a land
 LANDS, FIRST_SEED, JUDGED_SEED = 40, 200_000, 300_000
 VISITS = 5  # of each land
 DAYS, LAST_DAY = (95, 290), 318  # of the year: of first visits, and of any
-SPRING_DAY, SPRING_COUNTS = 135, 2  # lands first visited before it, when most changes, count so often
+SPRING, IN_SPRING = (95, 135), 0.4  # days when most changes, and the fraction of lands first visited then in any case
 GAPS = (0, 1, 1, 2, 3, 3, 5, 6, 6, 7, 7, 10, 14)  # days between two
 HOURS = (9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0)
 SPACINGS = {1: 0.3, 2: 0.5, 4: 0.2}  # line spacing [px] -> fraction of the passes
@@ -86,14 +86,13 @@ def train_temporal(request: TemporalRequest, report: Report = lambda what, done,
         report("visiting lands", number / request.lands, f"land {seed}")
         rng = np.random.default_rng([request.settings.seed, seed])
         lands.append([_visit(weights, augmentation, request.shape, seed, *moment, rng) for moment in _moments(rng)])
-    spring = [land for land in lands if land[0].moment < SPRING_DAY]
 
     def progress(now: Progress) -> None:
         report("training", now.done, f"step {now.step}, loss {now.loss:.3f}")
 
     known = describe_weights(request.weights).reader
     start = None if known is None else load_reader(request.weights)
-    reader, steps = train_reader(lands + (SPRING_COUNTS - 1) * spring, request.settings, progress, start=start)
+    reader, steps = train_reader(lands, request.settings, progress, start=start)
     record = {
         "command": request.command,
         "lands": [FIRST_SEED + number for number in range(request.lands)],
@@ -108,7 +107,7 @@ def train_temporal(request: TemporalRequest, report: Report = lambda what, done,
 
 def _moments(rng: np.random.Generator) -> list[tuple[int, float]]:
     """Draw days of the year with hours, in ascending order."""
-    days = [int(rng.integers(*DAYS))]
+    days = [int(rng.integers(*(SPRING if rng.random() < IN_SPRING else DAYS)))]
     while len(days) < VISITS:
         days.append(min(days[-1] + int(rng.choice(GAPS)), LAST_DAY))
     return sorted((day, float(rng.choice(HOURS))) for day in days)
