@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from pipeline.rig import pro_mode as pro
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.mirror_controller import hold_values
 from tests.pipeline.rig.in_process import ManualClock
 
 PATH = np.array([(0.1, 0.0), (0.2, 0.1), (0.3, -0.1), (0.2, 0.2)], np.float32).astype(float)
@@ -89,7 +88,8 @@ def test_status_while_it_moves() -> None:
     clock = ManualClock()
     device = MirrorDevice(clock)
     device.receive(b"GOPROCRC\r\n")
-    do(device, pro.set_values(hold_values(0.5, 0.0)))
+    follow = {**pro.X.followed(pro.X.static_system), **pro.Y.followed(pro.Y.static_system)}
+    do(device, pro.set_values({pro.X.static_xy: 0.5, pro.Y.static_xy: 0.0, **follow}))
     assert device.state.status() == pro.Status.NOT_STABLE
     clock.sleep(1.0)
     assert device.state.status() == pro.Status(0)
