@@ -36,8 +36,7 @@ def beyond_range(values: NDArray[Any], most: float = MOST_VALUE) -> NDArray[np.b
     kind = values.dtype
     if not values.size or kind.kind not in "fiu" or (kind.kind in "iu" and np.iinfo(kind).max <= most):
         return None
-    if kind.kind == "f":
-        most = min(most, float(np.finfo(kind).max))
+    most = min(most, float(np.finfo(kind).max)) if kind.kind == "f" else most
     if -most <= values.min() and values.max() <= most:
         return None
     found: NDArray[np.bool_] = (values > most) | (values < -most)

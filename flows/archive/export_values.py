@@ -146,21 +146,23 @@ def spectral_layers(run: ExportedRun, choice: ProductChoice) -> list[Layer]:
                 "an index of ratios, such as NDVI or PRI, or write the factor to reflectance into the scene.toml "
                 "beside the scene (scale = 0.0001 if 10000 is white) and survey it again"
             )
-    layers = []
-    if choice.flags.reflectance:
-        wave, width = read_bands(open_group(view.run.path("mosaic")))
-        image = CogImage(
-            view.geobox,
-            "float32",
-            tuple(f"{centre:.1f} nm" for centre in wave.tolist()),
-            np.nan,
-            tags={**layer_tags(view.run, "mosaic", view.geobox), "values": _format_value(white)},
-            wavelength_nm=wave.tolist(),
-            fwhm_nm=None if width is None else width.tolist(),
-        )
-        title, every = f"{len(wave)} bands: {_format_value(white)}", range(len(wave))
-        layers.append(Layer("reflectance", title, ("data", "reflectance"), image, lambda: view.rows(every), "1"))
+    layers = [_reflectance(view, white)] if choice.flags.reflectance else []
     return layers + [_index(view, index, bands, white) for index, bands in zip(choice.indices, picked, strict=True)]
+
+
+def _reflectance(view: MosaicView, white: float) -> Layer:
+    wave, width = read_bands(open_group(view.run.path("mosaic")))
+    image = CogImage(
+        view.geobox,
+        "float32",
+        tuple(f"{centre:.1f} nm" for centre in wave.tolist()),
+        np.nan,
+        tags={**layer_tags(view.run, "mosaic", view.geobox), "values": _format_value(white)},
+        wavelength_nm=wave.tolist(),
+        fwhm_nm=None if width is None else width.tolist(),
+    )
+    title = f"{len(wave)} bands: {_format_value(white)}"
+    return Layer("reflectance", title, ("data", "reflectance"), image, lambda: view.rows(range(len(wave))), "1")
 
 
 def _format_value(white: float) -> str:

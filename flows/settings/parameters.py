@@ -88,8 +88,11 @@ class SurveySettings(BaseModel):
     def of(cls, settings: Settings) -> SurveySettings:
         """Return settings as parameters; within this process they keep the password."""
         table = anchor_paths(settings.to_dict(), Path.cwd())
-        usual = Settings().to_dict() | {"source": AUTO}
-        changed = {name: _changed(value, usual.get(name)) for name, value in table.items() if value != usual.get(name)}
+        usual: dict[str, Any] = Settings().to_dict() | {"source": AUTO}
+        changed: dict[str, Any] = {name: value for name, value in table.items() if value != usual.get(name)}
+        for name, value in changed.items():  # of a table only the keys that differ
+            if isinstance(value, dict) and isinstance(usual.get(name), dict):
+                changed[name] = {key: one for key, one in value.items() if one != usual[name].get(key)}
         made: SurveySettings = cls.model_construct(**changed)
         made._settings = settings
         return made
@@ -120,13 +123,6 @@ class SurveySettings(BaseModel):
         """Return the field's name, or its scene's."""
         requested = self.settings()
         return requested.name or Path(requested.scene).stem
-
-
-def _changed(value: Any, usual: Any) -> Any:
-    """Return the keys of a table that differ from the defaults; other values unchanged."""
-    if not isinstance(value, dict) or not isinstance(usual, dict):
-        return value
-    return {key: one for key, one in value.items() if one != usual.get(key)}
 
 
 def at_due_time(settings: Settings, due: datetime) -> Settings:

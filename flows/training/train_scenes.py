@@ -169,8 +169,7 @@ def _imaged(
 
 def _common(request: TrainRequest, scene: RasterScene) -> Common:
     if not scene.class_names:
-        why = f"no pixel of {scene.name} has a class"
-        raise SceneError(f"{request.dataset}: {why}; correct its labels, or 'unlabelled' in scene.toml")
+        raise SceneError(f"{scene.name} has no pixel with a class; correct its labels, or 'unlabelled' in scene.toml")
     if len(scene.class_names) < 2:
         notes = alike_notes({scene.name: scene.class_names[0]})
         raise SceneError(f"{request.dataset}: training needs two or more classes, and {notes[0]}")

@@ -60,9 +60,7 @@ class PatchExpectedErrors:
             patch_number = down[:, None] * columns + across  # of each pixel, from the first of the strip
             here = slice(first, first + math.ceil(len(probabilities) / grid.patch))
             known = ~np.isnan(probabilities).all(axis=-1)
-            captured = np.isfinite(
-                age
-            )  # without probabilities: it belongs to no class, as a new capture would say again
+            captured = np.isfinite(age)  # and without probabilities of no class: another capture would gain nothing
             wrong = np.where(known, come_true, np.where(captured, 0.0, 1.0)) * expected_error_of(probabilities)
             step = np.minimum(np.searchsorted(edges, wrong), STEPS - 1)
             place = np.where(known, np.nan_to_num(probabilities, nan=-np.inf).argmax(axis=-1), classes) * STEPS + step

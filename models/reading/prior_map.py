@@ -34,7 +34,7 @@ BLOCK_PX = 16  # a side: differences are taken as equal within a block, and as i
 ERRORS_BEYOND = 2.0  # standard errors above the expected difference of two maps of the same ground
 ROWS = 128  # fused at a time
 DAYS_A_YEAR = 365.25
-HALO = 10  # reach of the reader around a pixel: three coarse pixels and 3 px, in whole coarse pixels
+HALO = 5 * CELL_PX  # reach of the reader around a pixel, three coarse pixels and 3 px, in whole coarse pixels
 LEAST_AGREEMENT, LEAST_KAPPA = 0.5, 0.35  # below both a prior map is of another field
 Floats = NDArray[np.float32]
 
@@ -178,9 +178,8 @@ def _phased_in(old: Floats, after: Floats, seen: NDArray[np.bool_], days: Floats
     fraction = np.where(seen, 1, np.minimum(days / np.float32(SETTLED_DAYS), 1))[..., None]
     if (fraction == 1).all():
         return after
-    return np.where(fraction == 1, after, np.log((1 - fraction) * np.exp(old) + fraction * np.exp(after))).astype(
-        np.float32
-    )
+    mixed = np.log((1 - fraction) * np.exp(old) + fraction * np.exp(after)).astype(np.float32)
+    return np.where(fraction == 1, after, mixed)
 
 
 def _normalised(log_probability: Floats) -> Floats:

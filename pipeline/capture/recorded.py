@@ -237,7 +237,13 @@ class RecordedSource:
         """
         place, line = np.full((2, sweep.lines), -1)
         best = np.full(sweep.lines, np.inf)
-        able = [number for number in group if self._can_serve(sweep, self.sweeps[number])]
+        able = [  # on the planned swath, with its binning and fine enough lines
+            number
+            for number, one in ((number, self.sweeps[number]) for number in group)
+            if (one.sweep.along, one.sweep.binning) == (sweep.along, sweep.binning)
+            and abs(one.sweep.swath_px - sweep.swath_px) <= SWATH_PX
+            and one.line_distance / self.camera.ifov_rad <= FINE_ENOUGH * sweep.step
+        ]
         for usable in (True, False):
             open_lines = place < 0
             for number in able:
@@ -251,15 +257,6 @@ class RecordedSource:
                 better = open_lines & (distance <= reach) & (distance < best - SAME_PX)
                 place[better], line[better], best[better] = number, candidates[near[better]], distance[better]
         return place, line, best
-
-    def _can_serve(self, sweep: Sweep, one: RecordedSweep) -> bool:
-        """Return whether a recorded sweep lies on a planned one's swath, with its binning and fine enough lines."""
-        return (
-            one.sweep.along == sweep.along
-            and one.sweep.binning == sweep.binning
-            and abs(one.sweep.swath_px - sweep.swath_px) <= SWATH_PX
-            and one.line_distance / self.camera.ifov_rad <= FINE_ENOUGH * sweep.step
-        )
 
     def _refuse(self, sweep: Sweep, place: Numbers) -> NoReturn:
         """Raise NotRecordedError for the first planned line without a recorded one; ``place`` is -1 there."""

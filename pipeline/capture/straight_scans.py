@@ -77,10 +77,8 @@ def fit_sweep(
 ) -> StraightScan:
     """Derive the sweep of positions (line, 2): swath, start and step by medians, which outliers do not move.
 
-    The line spacing is the median over pairs half the scan apart. A gap moves it: where nearly all consecutive lines
-    are as far apart, their distance is taken. The start is the median of the remainders. The binning is
-    ``camera.samples`` over the ``samples`` of a recorded line. Coordinates are rounded to 1e-6 px. A backward scan gets
-    the sweep of the same lines forward.
+    The start is the median of the remainders. The binning is ``camera.samples`` over the ``samples`` of a recorded
+    line. Coordinates are rounded to 1e-6 px. A backward scan gets the sweep of the same lines forward.
 
     Raises SceneError: there are fewer than two valid lines, the samples do not divide the camera's, the scan stands
     still or turns back, or line centres are not on a straight line. Raises PoseError: a valid position is beyond the
@@ -96,14 +94,26 @@ def fit_sweep(
     if len(lines) < 2:
         raise SceneError(f"sweep {name} has {len(lines)} valid lines, and a scan takes at least 2; leave it out")
     across, scan = (direction_to_scene(position_to_direction(position[lines])) / camera.ifov_rad).T
-    half = len(lines) // 2
-    distance = float(np.median((scan[half:] - scan[:-half]) / (lines[half:] - lines[:-half])))
-    steps = np.diff(scan) / np.diff(lines)
-    near, note = float(np.median(steps)), ""
-    even = np.abs(steps - near) <= UNEVEN * abs(near)
-    if abs(near) > STANDING_PX and even.mean() > MOST_EVEN and abs(distance - near) > UNEVEN * abs(near):
-        distance, at = near, int(np.argmax(np.abs(steps)))
-        note = f"{name}: lines {lines[at]} and {lines[at + 1]} lie {abs(scan[at + 1] - scan[at]):.4g} px apart"
+    distance, note = line_spacing(scan, lines)
+    _check_path(name, lines, across, scan, distance, MOST_BEND * camera.samples)
+    step = max(round(abs(distance)), 1)
+    first = float(np.median(scan - distance * lines))
+    lowest = min(first, first + distance * (len(position) - 1))
+    sweep = Sweep(
+        name,
+        "fine" if step == binning == 1 else "coarse",
+        along,
+        swath_px=_stated(float(np.median(across))),
+        start_px=_stated(lowest - (step - 1) / 2),
+        lines=len(position),
+        step=step,
+        binning=binning,
+    )
+    return StraightScan(sweep, abs(distance), distance < 0, note)
+
+
+def _check_path(name: str, lines: NDArray[np.intp], across: Floats, scan: Floats, distance: float, most: float) -> None:
+    """Refuse line centres [px] that stand still, turn back or bend by more than ``most`` (SceneError)."""
     if abs(distance) < STANDING_PX:
         raise SceneError(
             f"sweep {name} stands still: its lines move by {abs(distance):.2g} px from one to the next; give the "
@@ -117,7 +127,6 @@ def fit_sweep(
             "own, by a column 'sweep' in the pointing table"
         )
     swath, bend = float(np.median(across)), np.abs(across - np.median(across))
-    most = MOST_BEND * camera.samples
     if bend.max() > most:
         worst = int(np.argmax(bend))
         raise SceneError(
@@ -125,20 +134,22 @@ def fit_sweep(
             f"{swath:.4g} px, and at most {most:g} px are allowed; cut the scan into straighter parts by a column "
             "'sweep', or mark single wrong lines with valid = 0"
         )
-    step = max(round(abs(distance)), 1)
-    first = float(np.median(scan - distance * lines))
-    lowest = min(first, first + distance * (len(position) - 1))
-    sweep = Sweep(
-        name,
-        "fine" if step == binning == 1 else "coarse",
-        along,
-        swath_px=_stated(swath),
-        start_px=_stated(lowest - (step - 1) / 2),
-        lines=len(position),
-        step=step,
-        binning=binning,
-    )
-    return StraightScan(sweep, abs(distance), distance < 0, note)
+
+
+def line_spacing(scan: Floats, lines: NDArray[np.intp]) -> tuple[float, str]:
+    """Return the signed distance of consecutive lines [px], and a note on a gap.
+
+    It is the median over pairs half the scan apart, which averages noise. A gap moves that: where nearly all
+    consecutive lines are as far apart, their distance is taken.
+    """
+    half, steps = len(lines) // 2, np.diff(scan) / np.diff(lines)
+    distance = float(np.median((scan[half:] - scan[:-half]) / (lines[half:] - lines[:-half])))
+    near = float(np.median(steps))
+    even = float(np.mean(np.abs(steps - near) <= UNEVEN * abs(near)))
+    if abs(near) > STANDING_PX and even > MOST_EVEN and abs(distance - near) > UNEVEN * abs(near):
+        at = int(np.argmax(np.abs(steps)))
+        return near, f"lines {lines[at]} and {lines[at + 1]} lie {abs(scan[at + 1] - scan[at]):.4g} px apart"
+    return distance, ""
 
 
 def _stated(value: float) -> float:

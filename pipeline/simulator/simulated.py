@@ -251,7 +251,7 @@ def take_references(scene: RasterScene, rig: Rig, choice: Choice, sweep: Sweep) 
 
 
 def _binned(frame: Frame, binning: int) -> Frame:
-    """Return sums of samples of a frame, the mean of frames of whole numbers."""
+    """Return a frame with summed samples, rounded as a mean of `REFERENCE_FRAMES` frames of whole numbers is."""
     count, frames = len(frame) // binning, frame.astype(np.float64) * REFERENCE_FRAMES
     frame = (np.floor(frames + 0.5) / REFERENCE_FRAMES).astype(np.float32)
     return np.asarray(frame[: count * binning].reshape(count, binning, -1).sum(axis=1))

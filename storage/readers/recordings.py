@@ -314,7 +314,7 @@ def _sweeps_of(
         sweep: Sweep = replace(scan.sweep, exposure_ms=None if exposed == camera.exposure_ms else exposed)
         if abs(scan.distance_px - sweep.step) > 1e-3 * sweep.step:
             notes.append(f"{name}: lines lie {scan.distance_px:.6g} px apart")
-        notes += [scan.note] if scan.note else []
+        notes += [f"{name}: {scan.note}"] if scan.note else []
         lines = position, time_s[own], exposure_ms[own], valid[own]
         sweeps.append(RecordedSweep(sweep, references, *lines, _line_reader(source, own)))
     return sweeps

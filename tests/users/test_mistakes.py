@@ -100,7 +100,7 @@ CASES = {
     "labels without a class": (
         1,
         TRAIN + "unlabelled",
-        "no pixel of .* has a class; correct its labels, or 'unlabelled'",
+        "has no pixel with a class; correct its labels, or 'unlabelled'",
     ),
     "soft labels": (1, TRAIN + "soft", "at most 64.* hard edges"),
     "scenes of other bands": (1, TRAIN + "other_bands", "other bands"),

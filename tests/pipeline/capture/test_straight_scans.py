@@ -58,7 +58,7 @@ def test_a_gap_does_not_move_the_line_spacing() -> None:
     found = fit_sweep(position, CAMERA, name="s", samples=640)
     assert (found.sweep.step, found.sweep.lines) == (1, 64)
     assert found.distance_px == pytest.approx(1, abs=1e-6)
-    assert found.note == "s: lines 29 and 30 lie 21 px apart"
+    assert found.note == "lines 29 and 30 lie 21 px apart"
 
 
 @pytest.mark.parametrize(
