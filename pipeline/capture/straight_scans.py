@@ -113,7 +113,7 @@ def fit_sweep(
 
 
 def _check_path(name: str, lines: NDArray[np.intp], across: Floats, scan: Floats, distance: float, most: float) -> None:
-    """Refuse line centres [px] that stand still, turn back or bend by more than ``most`` (SceneError)."""
+    """Refuse lines ``distance`` apart that stand still, turn back or bend by more than ``most`` [px] (SceneError)."""
     if abs(distance) < STANDING_PX:
         raise SceneError(
             f"sweep {name} stands still: its lines move by {abs(distance):.2g} px from one to the next; give the "
