@@ -112,16 +112,16 @@ def fit_sweep(
     return StraightScan(sweep, abs(distance), distance < 0, note)
 
 
-def _check_path(name: str, lines: NDArray[np.intp], across: Floats, scan: Floats, distance: float, most: float) -> None:
-    """Refuse lines ``distance`` apart that stand still, turn back or bend by more than ``most`` [px] (SceneError)."""
-    if abs(distance) < STANDING_PX:
+def _check_path(name: str, lines: NDArray[np.intp], across: Floats, scan: Floats, apart_px: float, most: float) -> None:
+    """Refuse lines ``apart_px`` apart that stand still, turn back or bend by more than ``most`` [px] (SceneError)."""
+    if abs(apart_px) < STANDING_PX:
         raise SceneError(
-            f"sweep {name} stands still: its lines move by {abs(distance):.2g} px from one to the next; give the "
+            f"sweep {name} stands still: its lines move by {abs(apart_px):.2g} px from one to the next; give the "
             "positions of a scan, with one sweep for each way that it goes"
         )
-    way = scan if distance > 0 else -scan
+    way = scan if apart_px > 0 else -scan
     back = np.maximum.accumulate(way) - way
-    if (turned := back > MOST_BACK * abs(distance)).any():
+    if (turned := back > MOST_BACK * abs(apart_px)).any():
         raise SceneError(
             f"sweep {name} turns back at line {lines[np.argmax(turned)]}; give each way of the scan a sweep of its "
             "own, by a column 'sweep' in the pointing table"
