@@ -44,7 +44,7 @@ class QuicklookData:
 
     survey: str
     seed: int
-    about: str  # how the field was captured
+    about: str  # how and when the field was captured
     policy: str | None  # of the choice of patches; None where all are segmented at full resolution
     rectified: NDArray[np.floating]  # (y, x, band) of the pixels `thinned`, NaN where nothing was captured
     wavelength_nm: NDArray[np.floating]  # (band,)
@@ -57,7 +57,6 @@ class QuicklookData:
     class_colours: NDArray[np.integer]  # (class, 3) 0..255
     truth: NDArray[np.integer] | None = None  # (y, x), 255 unlabelled
     confidence: NDArray[np.floating] | None = None  # (y, x) 0..1 of the pixels `thinned`, shown without labels
-    note: str = ""  # at the end of the title line, such as the accuracy
     changed: bool = False  # ``score`` is the fraction of a patch's pixels that the full network changed, NaN elsewhere
     scan: bool = False  # a uniform scan
     raster: bool = False  # without lines
@@ -86,7 +85,7 @@ def _compose(data: QuicklookData) -> Figure:
     page = 18.0 if len(counts) != 2 else min(18.0, 12.5 / (tallness * sum(1 / count for count in counts)))
     tall = [min(max(page * tallness / count, 1.1), 12.0) + 0.9 for count in counts]  # with words above
     figure = Figure(figsize=(page, sum(tall) + 1.6), dpi=_DPI, layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.08))
-    about = [data.survey, f"{width} × {height} px", data.about, f"seed {data.seed}", data.note]  # noqa: RUF001
+    about = [data.survey, f"{width} × {height} px", data.about, f"seed {data.seed}"]  # noqa: RUF001
     title = fill("   ·   ".join(filter(None, about)), int(page * TITLE_LETTERS))
     figure.suptitle(title, x=0.01, ha="left", size=15, weight="bold")
     panels = iter((_draw_rectified, _draw_attention, _draw_classes, _draw_truth))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import platform
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -102,9 +102,9 @@ def load_receipt(folder: Path) -> Receipt:
 
 @dataclass(frozen=True)
 class _Drawn:
-    """Pictures of a survey that stay as they are when its accuracy is added, and the data of its quicklook."""
+    """Pictures of a survey, which stay as they are when its accuracy is added."""
 
-    shown: QuicklookData
+    quicklook: bytes
     pictures: tuple[Picture, ...]
     field: FieldMap
 
@@ -121,7 +121,7 @@ def _draw(survey: OpenSurvey, plan: FinePlan, receipt: Receipt) -> _Drawn:
     if (spectra := draw_spectra(open_mosaic(products.mosaic.path / "mosaic.zarr"), drawn)) is not None:
         pictures.append(Picture(spectra, SPECTRA_CAPTION))
     field = field_map(run, plan, shown, prior_map(run.prior, products["segment"], receipt))
-    return _Drawn(shown, tuple(pictures), field)
+    return _Drawn(draw_quicklook(shown), tuple(pictures), field)
 
 
 def _publish(survey: OpenSurvey, draft: RunDraft, plan: FinePlan, receipt: Receipt) -> Published:
@@ -130,20 +130,14 @@ def _publish(survey: OpenSurvey, draft: RunDraft, plan: FinePlan, receipt: Recei
     drawn = _DRAWN.pop(survey, None) or _draw(survey, plan, receipt)
     if not draft.extends:
         _DRAWN[survey] = drawn
-    accuracy, moment = receipt.get("accuracy"), run.settings.moment
-    notes = [] if moment is None else [f"day {moment[0]}, {moment[1]:g} h"]  # the end of the picture's title line
-    if accuracy is not None and accuracy["miou"] is not None:
-        where = " on a scene of the training" if "training_scene" in receipt else ""
-        notes.append(f"mIoU {100 * accuracy['miou']:.1f} %{where}")
-    quicklook = draw_quicklook(replace(drawn.shown, note="   ·   ".join(notes)))
-    draft.write_file("quicklook.png", quicklook)
+    draft.write_file("quicklook.png", drawn.quicklook)
     if "plots" in receipt:
         draft.write_file(PLOTS_FILE, plots_csv(receipt["plots"]))
     receipt = publish_counted(
         run.archive,
         draft,
         receipt,
-        lambda told: render_report(told, quicklook, drawn.pictures, captured_again=again, field=drawn.field),
+        lambda told: render_report(told, drawn.quicklook, drawn.pictures, captured_again=again, field=drawn.field),
         rests_on=run.archive.manifest_hashes(products.values()),
         of_earlier=() if run.prior is None else run.archive.manifest_hashes(run.prior.stores),
         written=survey.take_written(),
@@ -230,7 +224,9 @@ def _model_savings(run: SurveyRun, read: NDArray[np.intp], memory: Mapping[str, 
 
 
 def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan) -> QuicklookData:
-    """Return the data of the quicklook, with three bands, without its note."""
+    """Return the data of the quicklook, with three bands."""
+    moment = run.settings.moment
+    when = "" if moment is None else f"; day {moment[0]}, {moment[1]:g} h"
     bands, _ = choose_bands(run.scene.wavelength_nm)
     chosen = list(bands)
     decided = products["segment"].path / READING
@@ -242,7 +238,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan) -> Quickl
     return QuicklookData(
         survey=run.name,
         seed=run.settings.seed,
-        about=_format_asked(run, plan),
+        about=f"{_format_asked(run, plan)}{when}",
         policy=run.settings.policy if run.chooses else None,
         scan=run.plan.plain,
         raster=run.raster is not None,

@@ -5,7 +5,7 @@ A spectrum whose residual exceeds noise by a chi-square test, alone or with its 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -219,29 +219,18 @@ def residual_steps(
 
 
 class LineStatistics:
-    """Add a sweep's lines to the statistics of a field as they arrive, 64 at a time."""
+    """Add a sweep's lines to the statistics of a field as they arrive, a block at a time."""
 
     def __init__(self, found: SignalStatistics, sweep: Sweep, references: References, camera: LineCamera) -> None:
         self._found, self._elements = found, judge_elements(references)
         self._saturated = float(camera.full_scale_dn * sweep.binning)
-        self._waiting: list[Line] = []
 
-    def add(self, line: Line) -> None:
-        """Add the next line."""
-        self._waiting.append(line)
-        if len(self._waiting) == BLOCK_LINES:
-            self.flush()
-
-    def flush(self) -> None:
-        """Add the lines that wait for a block of 64."""
-        if not self._waiting:
-            return
-        raw = np.stack([line.data for line in self._waiting])
-        at = np.array([(line.mirror_x, line.mirror_y) if line.valid else (np.nan, np.nan) for line in self._waiting])
+    def add(self, lines: Sequence[Line], raw: NDArray[np.uint16]) -> None:
+        """Add the next lines, at most 64, whose raw numbers are ``raw`` (line, sample, band)."""
+        at = np.array([(line.mirror_x, line.mirror_y) if line.valid else (np.nan, np.nan) for line in lines])
         values, valid = calibrate(raw, self._elements, saturated_dn=self._saturated, position=at)
-        there = np.array([line.valid for line in self._waiting])
+        there = np.array([line.valid for line in lines])
         self._found.add(values, valid & there.reshape(-1, *[1] * (valid.ndim - 1)))
-        self._waiting.clear()
 
 
 @dataclass(frozen=True, eq=False)

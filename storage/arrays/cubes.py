@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
@@ -61,9 +61,17 @@ class SweepHeader:
 
 
 class RawCubeWriter:
-    """Write a sweep's lines as they come, 64 at a time, each into one shard. Use as a context manager."""
+    """Write a sweep's lines as they come, 64 at a time, each into one shard. Use as a context manager.
 
-    def __init__(self, path: Path, header: SweepHeader) -> None:
+    ``passed_on`` is called with every block that was written: its lines, and their numbers (line, sample, band).
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        header: SweepHeader,
+        passed_on: Callable[[Sequence[Line], NDArray[np.uint16]], None] = lambda lines, raw: None,
+    ) -> None:
         self._header = header
         self._group = create_group(path, f"raw sweep {header.sweep.name}", header.attributes)
         bands = write_bands(self._group, header.wavelength_nm, header.fwhm_nm)
@@ -72,6 +80,7 @@ class RawCubeWriter:
         spec = image_spec(("line", "sample", "band"), header.shape, "<u2", whole=True)
         self._dn = create_array(self._group, "dn", spec, about, packing=RAW_PACKING)
         write_references(self._group, header.references)
+        self._passed_on = passed_on
         self._waiting: list[Line] = []
         self._facts: list[tuple[float, float, float, float, bool]] = []
 
@@ -107,6 +116,7 @@ class RawCubeWriter:
             first = self._waiting[0].number
             block = np.stack([line.data for line in self._waiting])
             self._dn[first : first + len(block)] = block
+            self._passed_on(self._waiting, block)
             self._waiting.clear()
 
 

@@ -107,25 +107,21 @@ class SweepRecorder:
         header = SweepHeader(sweep, references, self.wavelength_nm, self.fwhm_nm, source.name, simulation=effects)
         samples, bands = references.dark.shape
         about = {"sweep": asdict(sweep), **self.source_key}
+        statistics = LineStatistics(found, sweep, references, self.camera)
         with (
             Spool.open(folder, samples, bands, header=about, name=sweep.name) as spool,
-            RawCubeWriter(path / f"{sweep.name}.zarr", header) as cube,
+            RawCubeWriter(path / f"{sweep.name}.zarr", header, statistics.add) as cube,
         ):
-            statistics = LineStatistics(found, sweep, references, self.camera)
 
             def take(line: Line) -> None:
                 spool.append(line)
                 cube.write([line])
-                statistics.add(line)
                 taken(spool.count)
 
             for block in spool.blocks():
                 cube.write(block)
-                for line in block:
-                    statistics.add(line)
             taken(spool.count)
             take_lines(source, sweep, take, self.pool, first=spool.count)
-            statistics.flush()
 
 
 Take = Callable[[Line], None]

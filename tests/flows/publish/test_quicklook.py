@@ -152,7 +152,7 @@ def test_class_colours_are_exact(tmp_path: Path) -> None:
 
 
 def test_a_long_title_stays_within_the_picture() -> None:
-    """It is wrapped, so that the note at its end is seen."""
+    """It is wrapped, so that its end is seen."""
     with mpl.rc_context(quicklook._STYLE):
         figure = quicklook._compose(replace(make_data(96, 128), about="every line, 25 ms; " * 8))
         FigureCanvasAgg(figure).draw()

@@ -20,6 +20,7 @@ from pipeline.signal.condense import (
     differing_lines,
     whole_steps,
 )
+from pipeline.signal.lines import BLOCK_LINES
 from pipeline.signal.subspace import SignalStatistics, find_components
 from pipeline.source import Line
 from tests.pipeline.signal.made_spectra import CAMERA, MadeLines, field_of, raw_of
@@ -62,9 +63,11 @@ def statistics_of_lines(lines: MadeLines) -> SignalStatistics:
     """What the lines tell while they arrive."""
     found = SignalStatistics(lines.raw.shape[2], lines.raw.shape[0] * lines.raw.shape[1])
     taker = LineStatistics(found, lines.sweep, lines.references, CAMERA)
-    for number, (data, at) in enumerate(zip(lines.raw, lines.position, strict=True)):
-        taker.add(Line(number, data, *at, 0.1 * number, 100.0, bool(lines.valid_line[number])))
-    taker.flush()
+    facts = zip(lines.raw, lines.position, lines.valid_line, strict=True)
+    taken = [Line(n, data, *at, 0.1 * n, 100.0, bool(valid)) for n, (data, at, valid) in enumerate(facts)]
+    for first in range(0, len(taken), BLOCK_LINES):
+        block = slice(first, first + BLOCK_LINES)
+        taker.add(taken[block], lines.raw[block])
     return found
 
 
