@@ -107,29 +107,3 @@ else:
     shapely = deferred("shapely")
     spyndex = deferred("spyndex")
     torch = deferred("torch")
-__all__ = [
-    "BaseGeometry",
-    "GeoBox",
-    "Once",
-    "Tensor",
-    "dask",
-    "dask_distributed",
-    "deferred",
-    "geopandas",
-    "h5py",
-    "odc_crs",
-    "odc_geo_xr",
-    "odc_geobox",
-    "odc_warp",
-    "prosail",
-    "pvlib",
-    "pyogrio",
-    "pyproj",
-    "rasterio",
-    "rasterio_features",
-    "rasterio_warp",
-    "safetensors_torch",
-    "shapely",
-    "spyndex",
-    "torch",
-]

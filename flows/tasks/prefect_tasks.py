@@ -44,22 +44,6 @@ else:
     prefect_settings = deferred("prefect.settings")
     prefect_task_run = deferred("prefect.runtime.task_run")
     uvicorn = deferred("uvicorn")
-__all__ = [
-    "prefect",
-    "prefect_artifacts",
-    "prefect_cache_policies",
-    "prefect_client",
-    "prefect_concurrency",
-    "prefect_context",
-    "prefect_deployments",
-    "prefect_exceptions",
-    "prefect_filters",
-    "prefect_handlers",
-    "prefect_server",
-    "prefect_settings",
-    "prefect_task_run",
-    "uvicorn",
-]
 
 
 RETRY_DELAY_S = 2.0
