@@ -76,7 +76,7 @@ def _kind_of(panels: QuicklookData) -> object:
     there = panels.truth is None, panels.confidence is None, panels.class_colours is None
     holes = tuple(bool(np.isnan(shown).any()) for shown in (panels.rectified, panels.score))
     none = np.size(panels.patch_index) == 0
-    return "picture", panels.class_map.shape, panels.wavelength_nm.shape, panels.class_names, there, holes, none
+    return "picture", panels.class_map.shape, panels.class_names, there, holes, none
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from flows.publish.panels import UNLABELLED_COLOUR, data_address, thinned, webp
-from flows.publish.quicklook import QuicklookData, colours_of
+from flows.publish.quicklook import QuicklookData
 from flows.publish.receipt import Receipt
 from flows.publish.receipt_table import format_days
 from flows.tasks.prior_maps import Prior
@@ -25,7 +25,7 @@ from pipeline.planning.fine_pass import FinePlan
 from storage.archive.keys import StageRef
 from storage.arrays.class_maps import ProbabilityStore, class_counts
 from storage.arrays.layout import open_group, read_array
-from storage.arrays.mosaics import choose_bands
+from storage.arrays.mosaics import develop
 
 QUALITY = 80  # of a photograph as WebP
 LEVELS = 50  # of a colour ramp; the next number is transparent
@@ -93,9 +93,8 @@ def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: Prio
     def classes(image: NDArray[np.integer]) -> str:
         return layer_address(image[thin].astype(np.uint8), palette)
 
-    title = choose_bands(shown.wavelength_nm)[1].capitalize()
-    colours = np.rint(255 * colours_of(shown, shown.rectified)).astype(np.uint8)
-    layers = [MapLayer(title, data_address(webp(Image.fromarray(colours), quality=QUALITY)), shown=True)]
+    picture = Image.fromarray(np.rint(255 * develop(shown.rectified, shown.caption)).astype(np.uint8))
+    layers = [MapLayer(shown.caption.capitalize(), data_address(webp(picture, quality=QUALITY)), shown=True)]
     layers.append(MapLayer("Class map", classes(shown.class_map), shown=True))
     if shown.confidence is not None:
         layers.append(MapLayer("Confidence, dark 0 to bright 1", _ramp_address(shown.confidence, 1.0)))

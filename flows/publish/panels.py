@@ -89,11 +89,11 @@ def class_palette(colours: NDArray[np.integer]) -> NDArray[np.float32]:
     return np.asarray(colours, np.float32) / np.float32(255)
 
 
-def class_rgb(classes: NDArray[np.integer], palette: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return a class map as a picture (y, x, 3); numbers without a colour, such as 255, are light grey."""
+def class_rgb(classes: NDArray[np.integer], colours: NDArray[np.integer]) -> NDArray[np.float32]:
+    """Return the pixels `thinned` of a class map as a picture (y, x, 3); numbers without a colour are light grey."""
     table = np.tile(np.asarray(UNLABELLED_COLOUR, np.float32), (256, 1))
-    table[: len(palette)] = palette
-    return np.asarray(table[np.clip(classes, 0, UNLABELLED)])
+    table[: len(colours)] = class_palette(colours)
+    return np.asarray(table[np.clip(classes[thinned(classes)], 0, UNLABELLED)])
 
 
 def outline(chosen: NDArray[np.bool_], patch_px: int, shape: tuple[int, int]) -> list[list[tuple[float, float]]]:

@@ -31,7 +31,7 @@ from flows.publish.panels import (
 from flows.terminal.figures import format_percent
 from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.class_maps import class_counts
-from storage.arrays.mosaics import choose_bands, develop, stretch
+from storage.arrays.mosaics import develop
 
 HEAT_ALPHA = 0.72  # of scores over the field
 TITLE_LETTERS = 7.5  # to an inch of a line
@@ -46,8 +46,8 @@ class QuicklookData:
     seed: int
     about: str  # how and when the field was captured
     policy: str | None  # of the choice of patches; None where all are segmented at full resolution
-    rectified: NDArray[np.floating]  # (y, x, band) of the pixels `thinned`, NaN where nothing was captured
-    wavelength_nm: NDArray[np.floating]  # (band,)
+    rectified: NDArray[np.floating]  # (y, x, 3) of the pixels `thinned`, NaN where nothing was captured
+    caption: str  # of these three bands, by `choose_bands`
     score: NDArray[np.floating]  # (row, column) of the padded grid's patches; NaN or -inf without a score
     patch_px: int
     patch_index: NDArray[np.integer]  # chosen, in order of rank
@@ -103,22 +103,12 @@ def _draw_rectified(axes: Axes, data: QuicklookData) -> None:
     if data.was is not None:
         changed = data.was[thinned(data.was)] != UNLABELLED
         grey = np.repeat((0.25 + 0.6 * grey_of(data.rectified))[..., None], 3, axis=-1)
-        classes = class_rgb(data.class_map[thinned(data.class_map)], class_palette(data.class_colours))
-        _show(axes, data, np.where(changed[..., None], classes, grey).astype(np.float32), interpolation="nearest")
+        shown = np.where(changed[..., None], class_rgb(data.class_map, data.class_colours), grey)
+        _show(axes, data, shown.astype(np.float32), interpolation="nearest")
         words = f"{np.count_nonzero(data.was != UNLABELLED)} px captured now differ from {data.days:.3g} days before"
         return _caption(axes, "1  Differing", words)
-    _, words = choose_bands(data.wavelength_nm)
-    _show(axes, data, colours_of(data, data.rectified))
-    return _caption(axes, "1  Raster" if data.raster else "1  Rectified", words)
-
-
-def colours_of(data: QuicklookData, image: NDArray[np.generic]) -> NDArray[np.float32]:
-    """Return three bands of lines or field as colours: true colours on one scale, others stretched by band."""
-    bands, words = choose_bands(data.wavelength_nm)
-    chosen = list(bands)
-    if words.startswith("true colour"):
-        return develop(image[..., chosen], data.rectified[..., chosen])
-    return stretch(image[..., chosen])
+    _show(axes, data, develop(data.rectified, data.caption))
+    return _caption(axes, "1  Raster" if data.raster else "1  Rectified", data.caption)
 
 
 def _draw_attention(axes: Axes, data: QuicklookData) -> None:
@@ -171,12 +161,7 @@ def _score_range(score: NDArray[np.floating]) -> tuple[NDArray[np.float64], floa
 
 
 def _draw_classes(axes: Axes, data: QuicklookData) -> None:
-    _show(
-        axes,
-        data,
-        class_rgb(data.class_map[thinned(data.class_map)], class_palette(data.class_colours)),
-        interpolation="nearest",
-    )
+    _show(axes, data, class_rgb(data.class_map, data.class_colours), interpolation="nearest")
     most = max(data.class_map.shape[1] / 4, 1)  # of a bar of a round number of pixels
     length = max(step * 10 ** int(np.log10(most)) for step in (1, 2, 5) if step * 10 ** int(np.log10(most)) <= most)
     axes.add_artist(AnchoredSizeBar(axes.transData, length, f"{length} px", "lower left", borderpad=0.5))
@@ -186,12 +171,7 @@ def _draw_classes(axes: Axes, data: QuicklookData) -> None:
 def _draw_truth(axes: Axes, data: QuicklookData) -> None:
     """Draw the labels; without labels the confidence."""
     if data.truth is not None:
-        _show(
-            axes,
-            data,
-            class_rgb(data.truth[thinned(data.truth)], class_palette(data.class_colours)),
-            interpolation="nearest",
-        )
+        _show(axes, data, class_rgb(data.truth, data.class_colours), interpolation="nearest")
         labelled = (data.truth != UNLABELLED) & (data.class_map != UNLABELLED)
         right = np.count_nonzero(labelled & (data.truth == data.class_map)) / max(int(np.count_nonzero(labelled)), 1)
         words = f"labelled pixels correct: {100 * right:.1f} %" if labelled.any() else "no pixel is labelled"

@@ -227,8 +227,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan) -> Quickl
     """Return the data of the quicklook, with three bands."""
     moment = run.settings.moment
     when = "" if moment is None else f"; day {moment[0]}, {moment[1]:g} h"
-    bands, _ = choose_bands(run.scene.wavelength_nm)
-    chosen = list(bands)
+    bands, caption = choose_bands(run.scene.wavelength_nm)
     decided = products["segment"].path / READING
     attention = load_attention(decided if decided.exists() else products["score"].path / READING)
     changed = attention.changed
@@ -242,8 +241,8 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan) -> Quickl
         policy=run.settings.policy if run.chooses else None,
         scan=run.plan.plain,
         raster=run.raster is not None,
-        rectified=open_mosaic(products.mosaic.path / "mosaic.zarr").thinned(thinned(found.classes)[0].step, chosen),
-        wavelength_nm=run.scene.wavelength_nm[chosen],
+        rectified=open_mosaic(products.mosaic.path / "mosaic.zarr").thinned(thinned(found.classes)[0].step, [*bands]),
+        caption=caption,
         score=attention.score if changed is None else np.where(attention.rank >= 0, changed, np.nan),
         changed=changed is not None,
         patch_px=run.grid.patch,

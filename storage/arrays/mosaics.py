@@ -300,13 +300,15 @@ def stretch(image: NDArray[np.generic]) -> NDArray[np.float32]:
     return shown
 
 
-def develop(image: NDArray[np.generic], field: NDArray[np.generic]) -> NDArray[np.float32]:
-    """Return scene values as a picture (y, x, 3) float32 0..1 in true colours, with one scale for all bands."""
-    known = np.asarray(field, np.float32)
-    known = known[np.isfinite(known)]
+def develop(image: NDArray[np.generic], caption: str) -> NDArray[np.float32]:
+    """Return three bands as a picture (y, x, 3) float32 0..1, with the ``caption`` of `choose_bands`.
+
+    True colours have one scale; other bands are stretched each.
+    """
+    values = np.asarray(image, np.float32)
+    known = values[np.isfinite(values)] if caption.startswith("true colour") else values[:0]
     if not known.size or not (white := float(np.percentile(known, 99))) > 0:
         return stretch(image)
     middle = float(np.clip(np.median(known) / white, 1e-3, 0.999))
     power = float(np.clip(np.log(MID_GREY) / np.log(middle), 0.45, 1.0))
-    values = np.asarray(image, np.float32)
     return np.where(np.isfinite(values), np.clip(values / white, 0, 1) ** power, np.float32(0.86))

@@ -39,7 +39,7 @@ from storage.arrays.class_maps import (
 )
 from storage.arrays.ground_maps import BLOCK, GroundMapWriter
 from storage.arrays.layout import NO_CLASS, blank_pixels
-from storage.arrays.mosaics import Attention, choose_bands, develop, open_mosaic, stretch, write_attention
+from storage.arrays.mosaics import Attention, choose_bands, develop, open_mosaic, write_attention
 
 CLASS_MAP = Product("segment", version=24, files=(MAP, PROBABILITIES), by_weights=True)
 OUT_OF_RANGE = "out_of_range.json"  # beside a map with values out of range
@@ -240,7 +240,6 @@ def ground(
 def colours_of(mosaic: StageRef) -> NDArray[np.float32]:
     """Return three bands of a mosaic as a picture (y, x, 3) in 1..255; NaN where nothing was captured."""
     seen = open_mosaic(mosaic.path / "mosaic.zarr")
-    bands, band_choice = choose_bands(seen.wavelength_nm)
+    bands, caption = choose_bands(seen.wavelength_nm)
     values = np.concatenate([seen.spectra(strip, bands) for strip in seen.row_blocks()])
-    tones = develop(values, values) if band_choice.startswith("true colour") else stretch(values)
-    return np.where(np.isfinite(values), 1 + 254 * tones, np.nan).astype(np.float32)
+    return np.where(np.isfinite(values), 1 + 254 * develop(values, caption), np.nan).astype(np.float32)

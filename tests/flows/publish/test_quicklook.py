@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from flows.publish import panels, quicklook
-from flows.publish.panels import class_palette, class_rgb, outline
+from flows.publish.panels import class_rgb, outline
 from flows.publish.quicklook import QuicklookData, _draw_attention, draw_quicklook
 from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.mosaics import choose_bands
@@ -22,7 +22,7 @@ from storage.arrays.mosaics import choose_bands
 WAVES = np.linspace(400, 1000, 61)
 
 
-def make_data(height: int, width: int, bands: int = 5, *, patch: int = 16) -> QuicklookData:
+def make_data(height: int, width: int, *, patch: int = 16) -> QuicklookData:
     """A small survey of noise with every optional part."""
     rng = np.random.default_rng(0)
     rows, columns = -(-height // (4 * patch)) * 4, -(-width // (4 * patch)) * 4
@@ -31,8 +31,8 @@ def make_data(height: int, width: int, bands: int = 5, *, patch: int = 16) -> Qu
         seed=1,
         about="budget 0.5",
         policy="entropy",
-        rectified=rng.random((height, width, bands), np.float32),
-        wavelength_nm=np.linspace(450, 900, bands),
+        rectified=rng.random((height, width, 3), np.float32),
+        caption="true colour, 640 / 550 / 460 nm",
         score=rng.random((rows, columns)),
         patch_px=patch,
         patch_index=np.array([0, 1], np.intp),
@@ -94,7 +94,7 @@ def test_colours_of_bands_and_of_pixels_without_a_class():
         (np.array([800.0]), ((0, 0, 0), "grey, 800 nm")),
     ):
         assert choose_bands(waves) == told
-    picture = class_rgb(np.array([[0, 9, 255]], np.uint8), class_palette(np.array([[230, 159, 0], [0, 158, 115]])))
+    picture = class_rgb(np.array([[0, 9, 255]], np.uint8), np.array([[230, 159, 0], [0, 158, 115]]))
     np.testing.assert_array_equal(picture[0, 1], picture[0, 2])
     assert (picture[0, 0] != picture[0, 1]).any()
 
