@@ -114,6 +114,12 @@ class ArchiveError(PipelineError, OSError):
     """The archive cannot be read or written."""
 
 
+class NoRunError(ArchiveError, KeyError):
+    """An archive has no run of a name."""
+
+    exit_code = 2
+
+
 class IncompleteStoreError(PipelineError, LookupError):
     """A store has no valid manifest, or its content does not match it."""
 

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import ArchiveError, IncompleteStoreError
+from pipeline.errors import IncompleteStoreError, NoRunError
 from pipeline.lazy import deferred
 from storage.archive.archive import Archive
+from storage.archive.keys import LATEST
 from storage.archive.records import Run, read_run
 from storage.arrays.layout import damage_named
 from storage.readers.recordings import LINE_PRODUCTS
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
 else:
     spectra = deferred("spectralzoom.spectra")
     xarray = deferred("xarray")  # takes a second to import
-
-LATEST = "latest"
 
 
 def open(archive: str | Path) -> OpenedArchive:
@@ -70,20 +69,13 @@ class OpenedArchive(Mapping[str, "OpenedRun"]):
 
     @property
     def latest(self) -> OpenedRun:
-        """The run published last. Raises ArchiveError without a run."""
+        """The run published last. Raises NoRunError without one."""
         return self[LATEST]
 
     def __getitem__(self, name: str) -> OpenedRun:
-        folders = {folder.name: folder for folder in self._archive.runs()}
         if not isinstance(name, str):
             raise NoRunError(f"a run is named by text, got {name!r}")
-        if not folders:
-            raise ArchiveError(f"{self.name} has no published run; survey into it first")
-        called = next(reversed(folders)) if name == LATEST else name.removeprefix("runs/").rstrip("/")
-        if called not in folders:
-            known = ", ".join(list(folders)[-5:])
-            raise NoRunError(f"{self.name} has no run {name!r}; its latest are {known}")
-        return OpenedRun(self._archive, folders[called])
+        return OpenedRun(self._archive, self._archive.run_folder(name))
 
     def __iter__(self) -> Iterator[str]:
         return (folder.name for folder in reversed(self._archive.runs()))
@@ -93,10 +85,6 @@ class OpenedArchive(Mapping[str, "OpenedRun"]):
 
     def __repr__(self) -> str:
         return "\n".join([f"spectralzoom archive {self.name}, {len(self)} runs", *(f"  {name}" for name in self)])
-
-
-class NoRunError(ArchiveError, KeyError):
-    """An archive has no run of a name."""
 
 
 class OpenedRun:

@@ -25,7 +25,7 @@ from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.georeference import zoomed_out
 from pipeline.products.indices import SpectralIndex, find_index
 from storage.archive.archive import Archive
-from storage.archive.keys import StageRef
+from storage.archive.keys import LATEST, StageRef
 from storage.archive.records import RECEIPT, read_run, read_store
 from storage.arrays.class_maps import OLD_CLASS, ClassNames, ProbabilityStore, legend_of
 from storage.arrays.georeference import grid_of, load_geobox
@@ -103,7 +103,6 @@ def choose_products(flags: ProductFlags) -> ProductChoice:
 
 Rows = Iterator[tuple[int, NDArray[Any]]]
 RGB = ("red", "green", "blue")
-LATEST = "latest"
 PROBABILITIES = "class_probabilities"
 
 
@@ -177,16 +176,9 @@ class ExportedRun:
 def open_exported(archive: Archive, name: str | None) -> ExportedRun:
     """Return a run by name or address, else the latest.
 
-    Raises SettingsError: there is none. Raises IncompleteStoreError: its receipt cannot be read.
+    Raises NoRunError: there is none. Raises IncompleteStoreError: its receipt cannot be read.
     """
-    runs = archive.runs()
-    if not runs:
-        raise SettingsError(f"{archive.name} has no published run; survey into it first")
-    called = LATEST if name is None else name.rstrip("/").removeprefix("runs/")
-    folder = runs[-1] if called == LATEST else next((run for run in runs if run.name == called), None)
-    if folder is None:
-        known = ", ".join(run.name for run in runs[-5:])
-        raise SettingsError(f"{archive.name} has no run {name!r}; its latest are {known}")
+    folder = archive.run_folder(name or LATEST)
     run = read_run(folder)
     if run.problem is not None:
         raise IncompleteStoreError(f"{folder} is damaged: {run.problem}; run verify on the archive")

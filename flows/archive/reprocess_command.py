@@ -43,7 +43,7 @@ from models.weights.files import describe_weights
 from pipeline.errors import ArchiveError, PipelineError, SceneError, SettingsError, WeightsError
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
-from storage.archive.lineage import LATEST, Catalogue, find_product
+from storage.archive.lineage import Catalogue
 from storage.archive.records import Run, read_run
 from storage.parallel.pool import THREADS, WorkerPool
 from storage.remote.opening import open_archive
@@ -185,13 +185,12 @@ def run_judge(
     """Judge a run's map and add its accuracy to the run; return its receipt.
 
     ``name`` may be `latest`; ``controls`` and ``labels`` are those of the survey if None. A run that has
-    its accuracy already stays as it is. Raises ArchiveError: there is no such run, or it is damaged or incomplete;
-    SceneError, WeightsError: scene, labels or weights are not those of the run, or there are no labels.
+    its accuracy already stays as it is. Raises NoRunError; ArchiveError: the run is damaged or incomplete; SceneError,
+    WeightsError: scene, labels or weights are not those of the run, or there are no labels.
     """
     opened = open_archive(archive, create=False)
     catalogue = Catalogue.read(opened.root)
-    found = find_product(catalogue, name if name == LATEST else f"runs/{name.rstrip('/').removeprefix('runs/')}")
-    assert isinstance(found, Run)
+    found = read_run(opened.run_folder(name))
     receipt = load_receipt(found.folder)
     settings = replace(asked_again(found, opened.name, None), accuracy=True)
     if controls is not None:

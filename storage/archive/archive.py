@@ -21,8 +21,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import ArchiveError, IncompleteStoreError
+from pipeline.errors import ArchiveError, IncompleteStoreError, NoRunError
 from storage.archive.keys import (
+    LATEST,
     StageRef,
     in_text,
     open_folder,
@@ -400,6 +401,16 @@ class Archive:
     def runs(self) -> list[Path]:
         """Return the folders of the published runs, oldest first."""
         return published_runs(self.root)
+
+    def run_folder(self, name: str) -> Path:
+        """Return the folder of a published run by name, address or ``latest``. Raises NoRunError."""
+        folders, called = self.runs(), name.rstrip("/").removeprefix("runs/")
+        folder = next((one for one in reversed(folders) if called in (one.name, LATEST)), None)
+        if folder is None:
+            known = ", ".join(one.name for one in folders[-5:])
+            there = f"has no run {name!r}; its latest are {known}" if folders else "has no run; survey into it first"
+            raise NoRunError(f"{self.name} {there}")
+        return folder
 
     def spool_folder(self, key: str) -> Path:
         """Return the folder for the lines of a running capture; unlike a staged store it outlives the process."""

@@ -88,6 +88,7 @@ def array_digest(array: NDArray[np.generic]) -> str:
 
 
 STORE_URI = re.compile(r"stages/([^/\s]+)/([^/\s]+)")
+LATEST = "latest"  # the newest run
 SECOND = len("20261120T101701")  # of a run's name: when it was begun
 
 

@@ -14,8 +14,8 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Any, Literal
 
-from pipeline.errors import ArchiveError, list_some
-from storage.archive.keys import StageRef, in_text, published_runs, published_stores
+from pipeline.errors import ArchiveError, NoRunError, list_some
+from storage.archive.keys import LATEST, StageRef, in_text, published_runs, published_stores
 from storage.archive.records import Run, Store, read_run, read_store
 from storage.archive.staging import MANIFEST_NAME, check_name
 
@@ -115,13 +115,11 @@ def rests_on(root: Path, refs: Iterable[StageRef]) -> list[StageRef]:
     return [found[uri] for uri in sorted(found)]
 
 
-LATEST = "latest"  # the newest run
-
-
 def find_product(catalogue: Catalogue, text: str) -> str | Run:
     """Return the address of a store that is there, or a run.
 
-    Raises ArchiveError: nothing or more than one product has this name, or the name is not allowed.
+    Raises NoRunError: there is no such run; ArchiveError: nothing or more than one product has this name, or the name
+    is not allowed.
     """
     parts = text.rstrip("/").split("/")
     for part in parts:
@@ -132,7 +130,7 @@ def find_product(catalogue: Catalogue, text: str) -> str | Run:
         return runs[-1]
     if name != text:
         there = [run.uri for run in reversed(catalogue.runs)]
-        raise ArchiveError(f"there is no run {name} in this archive; there is {list_some(there, 3) or 'none'}")
+        raise NoRunError(f"there is no run {name} in this archive; there is {list_some(there, 3) or 'none'}")
     newest = next((run for run in reversed(catalogue.runs) if run.products), None)
     products = {} if newest is None else newest.products
     address = products.get(text, text)

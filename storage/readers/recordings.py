@@ -429,16 +429,11 @@ def _named_run(address: str | Path) -> tuple[str, str | None] | None:
 def _run_with_cubes(address: str, name: str | None) -> tuple[Archive, Run, list[Path]]:
     """Return a run of an archive with its raw cubes: the named one, or the newest that has any."""
     archive = open_archive(address, create=False, write=False)
-    folders = archive.runs()
-    if name is not None and name not in [folder.name for folder in folders]:
-        known = ", ".join(folder.name for folder in folders[-5:]) or "none"
-        raise ArchiveError(f"{archive.name} has no run {name!r}; its latest are {known}")
-    for folder in reversed(folders):
-        if name in (None, folder.name):
-            run = read_run(folder)
-            stores = [archive.locate(uri) for uri in stores_of_lines(run.products, archive.is_there)]
-            cubes = [path for store in stores for path in sorted(store.glob("*.zarr"))]
-            if cubes:
-                return archive, run, cubes
+    for folder in reversed(archive.runs()) if name is None else [archive.run_folder(name)]:
+        run = read_run(folder)
+        stores = [archive.locate(uri) for uri in stores_of_lines(run.products, archive.is_there)]
+        cubes = [path for store in stores for path in sorted(store.glob("*.zarr"))]
+        if cubes:
+            return archive, run, cubes
     which = "no run" if name is None else f"the run {name}"
     raise ArchiveError(f"{archive.name}: {which} has raw cubes; survey into the archive first, or name another run")

@@ -13,7 +13,8 @@ import pytest
 import rioxarray  # noqa: F401 - registers the accessor that users have
 
 import spectralzoom
-from spectralzoom.opened import NoRunError, OpenedRun
+from pipeline.errors import NoRunError
+from spectralzoom.opened import OpenedRun
 from storage.arrays.class_maps import load_class_map
 from storage.arrays.ground_maps import load_geobox
 from tests.conftest import WeightsMaker

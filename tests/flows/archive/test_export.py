@@ -24,7 +24,7 @@ from flows.archive.export_layers import ExportedRun
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
-from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
+from pipeline.errors import ArchiveError, IncompleteStoreError, NoRunError, SettingsError
 from pipeline.ground.view import RigPose
 from storage.archive.archive import Archive
 from storage.readers.envi_files import open_envi_cube
@@ -250,10 +250,10 @@ def test_exported_again_nothing_changes(posed: Exported) -> None:
 
 def test_runs_and_places_that_are_none_are_refused(posed: Exported, tmp_path: Path) -> None:
     """Runs that there are are named; a place in the archive or below a file is told; the archive verifies."""
-    with pytest.raises(SettingsError, match=f"no run 'x'; its latest are .*{posed.id}"):
+    with pytest.raises(NoRunError, match=f"no run 'x'; its latest are .*{posed.id}"):
         run_export(posed.archive, "x", tmp_path / "out", envi=False, console=QUIET)
     Archive.open(tmp_path / "empty")
-    with pytest.raises(SettingsError, match="has no published run; survey into it first"):
+    with pytest.raises(NoRunError, match="has no run; survey into it first"):
         run_export(tmp_path / "empty", None, tmp_path / "out", envi=False, console=QUIET)
     assert not (tmp_path / "out").exists()
     with pytest.raises(SettingsError, match="lies in the archive"):

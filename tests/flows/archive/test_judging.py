@@ -219,7 +219,7 @@ WORDS = {
     "a run by shares": (2, "ARCHIVE latest --fractions 0.1", "--fractions is for weights that are judged on a data"),
     "a run with a folder": (2, "ARCHIVE latest -o out", "--out is for weights"),
     "weights with controls": (2, "farm --weights w --controls", "--controls is for a run of an archive"),
-    "no such run": (1, "ARCHIVE 2020-gone", "there is no run 2020-gone in this archive; there is runs/"),
+    "no such run": (2, "ARCHIVE 2020-gone", "has no run '2020-gone'; its latest are "),
 }
 
 
