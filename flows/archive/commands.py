@@ -28,7 +28,7 @@ from pipeline.lazy import deferred
 from storage.archive.archive import Archive
 from storage.archive.keys import in_text
 from storage.archive.lineage import Catalogue, changes_between, find_product, version_before
-from storage.archive.records import Run
+from storage.archive.records import Run, moment_of
 from storage.archive.whole_files import to_json
 from storage.maintenance.garbage import DAY_S, clear_up
 from storage.maintenance.verification import Finding, plan_repair, repair
@@ -209,10 +209,8 @@ def _run_state(catalogue: Catalogue, run: Run) -> str:
 
 
 def _age_s(created: str, now: datetime) -> float | None:
-    try:
-        return (now - datetime.fromisoformat(created)).total_seconds()
-    except (ValueError, TypeError):
-        return None
+    made = moment_of(created)
+    return None if made is None else (now - made).total_seconds()
 
 
 def explanation(archive: Archive, product: str) -> dict[str, Any]:

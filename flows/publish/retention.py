@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
+from datetime import datetime
 
 from flows.settings.values import parse_keep, raw_days
 from flows.tasks.stages.condense import SIGNAL, SIGNAL_FINE, raw_differs
@@ -16,7 +16,7 @@ from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.camera import LineCamera
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
-from storage.archive.records import Run, Store
+from storage.archive.records import Run, Store, moment_of
 from storage.maintenance.garbage import DAY_S, IN_USE, Removal
 from storage.readers.recordings import LINE_PRODUCTS
 
@@ -103,13 +103,13 @@ def _whole(catalogue: Catalogue, run: Run, product: str) -> Store | None:
 
 def is_outlived(run: Run, now: datetime) -> bool:
     """Return whether the raw lines of a run have expired; False where that is not known."""
+    made = moment_of(run.created)
     try:
         days = raw_days(parse_keep(run.settings["keep"]))
-        made = datetime.fromisoformat(run.created)
     except (KeyError, ValueError):
         return False
-    made = made if made.tzinfo else made.replace(tzinfo=UTC)
-    return run.problem is None and (days <= 0 or (now - made).total_seconds() >= days * DAY_S)
+    old = made is not None and (days <= 0 or (now - made).total_seconds() >= days * DAY_S)
+    return run.problem is None and old
 
 
 def _removal(one: OutlivedLines) -> Removal:

@@ -44,7 +44,7 @@ from pipeline.rig.device_settings import MOST_PAIRS
 from pipeline.setting_fields import format_number, span_of
 from pipeline.simulator.scenes.built_in import SCOUTING_NAMES
 from pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
-from storage.archive.records import Run
+from storage.archive.records import Run, moment_of
 from storage.archive.staging import read_toml
 from storage.readers.recordings import find_recorded_run
 from storage.remote.opening import is_archive
@@ -486,19 +486,13 @@ def time_of_visit(run: Run) -> str | None:
 
     A day of a built-in scene counts in the year of the run. The moment is in ISO 8601 in UTC; None: nothing is known.
     """
-    named, began = _moment(run.settings.get("visit")), _moment(run.receipt.get("started")) or _moment(run.created)
-    if named is not None or began is None or run.settings.get("scene") not in BUILT_IN_SCENES:
-        return named or began
-    day, hour = (run.settings.get(name) for name in ("day", "hour"))
+    named, began = moment_of(run.settings.get("visit")), moment_of(run.receipt.get("started")) or moment_of(run.created)
+    found = named or began
     with suppress(TypeError, ValueError, OverflowError):
-        grown = timedelta(days=(USUAL_DAY if day is None else day) - 1, hours=USUAL_HOUR if hour is None else hour)
-        return (datetime(int(began[:4]), 1, 1, tzinfo=UTC) + grown).isoformat()
-    return began
-
-
-def _moment(value: object) -> str | None:
-    """Return a moment in ISO 8601 in UTC; None for anything else."""
-    with suppress(ValueError, OverflowError):
-        found = datetime.fromisoformat(value) if isinstance(value, str) else None
-        return None if found is None else found.replace(tzinfo=found.tzinfo or UTC).astimezone(UTC).isoformat()
+        if named is None and began is not None and run.settings.get("scene") in BUILT_IN_SCENES:
+            day, hour = (run.settings.get(name) for name in ("day", "hour"))
+            grown = timedelta(days=(USUAL_DAY if day is None else day) - 1, hours=USUAL_HOUR if hour is None else hour)
+            found = datetime(began.astimezone(UTC).year, 1, 1, tzinfo=UTC) + grown
+    with suppress(OverflowError):
+        return None if found is None else found.astimezone(UTC).isoformat()
     return None

@@ -68,9 +68,8 @@ class ExtentGains:
 
     def gains(self, step: int, exposure_ms: float) -> Floats:
         """Return the expected gain in mIoU of each patch, (patch,)."""
-        expected = self.record.expected(step, exposure_ms)
-        iou = np.array([expected.get(name, expected[MIOU]) for name in self.class_names])
-        return np.where(self.shown, self.expected_errors.expected_gain((1 - iou) / (1 + iou)), 0.0)
+        rates = self.record.error_rates(step, exposure_ms, self.class_names)
+        return np.where(self.shown, self.expected_errors.expected_gain(rates), 0.0)
 
     def expected_gain(self, gains: Floats) -> Floats:
         """Return gains with patches that are too old first; without any gain, older patches first."""

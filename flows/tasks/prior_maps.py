@@ -20,7 +20,7 @@ from pipeline.simulator.scenes.scene import RasterScene
 from storage.archive.archive import Archive, run_stem
 from storage.archive.keys import StageRef, published_runs
 from storage.archive.manifests import read_table
-from storage.archive.records import Run, read_run
+from storage.archive.records import Run, moment_of, read_run
 from storage.arrays.class_maps import ProbabilityStore
 from storage.arrays.georeference import load_geobox
 
@@ -191,7 +191,7 @@ def _days_since(run: Run, visit: str | None, moment: tuple[int, float] | None) -
     The dates of both visits count, with their times if both have one. Else day and hour of a built-in scene count, else
     whole days of the clock.
     """
-    then, now = (_called_moment(one) for one in (run.settings.get("visit"), visit))
+    then, now = (moment_of(one) for one in (run.settings.get("visit"), visit))
     if then is not None and now is not None:
         if min(len(str(one)) for one in (run.settings.get("visit"), visit)) <= len("2026-06-01"):  # a date alone
             return float((now.date() - then.date()).days)
@@ -203,13 +203,13 @@ def _days_since(run: Run, visit: str | None, moment: tuple[int, float] | None) -
             for given, usual in zip(before, (USUAL_DAY, USUAL_HOUR), strict=True)
         )
         return moment[0] - day + (moment[1] - hour) / 24
-    created = _called_moment(run.created)
+    created = moment_of(run.created)
     return 0.0 if created is None else float((datetime.now(UTC).date() - created.date()).days)
 
 
 def _day_of_year(settings: Settings) -> float | None:
     """Return the day of the year of a visit: by the date it is called by, else by the built-in scene's day."""
-    called = _called_moment(settings.visit)
+    called = moment_of(settings.visit)
     if called is not None:
         return float(called.timetuple().tm_yday)
     return None if settings.moment is None else float(settings.moment[0])
@@ -219,12 +219,3 @@ def prior_map_figures(store: Path) -> dict[str, Any] | None:
     """Return the figures of the prior map of a stored map; None for a first visit."""
     record = store / MEMORY
     return dict(read_table(record)) if record.is_file() else None
-
-
-def _called_moment(text: Any) -> datetime | None:
-    """Return the date of a visit that is named in ISO 8601; None for other names."""
-    try:
-        found = datetime.fromisoformat(text) if isinstance(text, str) else None
-    except ValueError:
-        return None
-    return None if found is None else found.replace(tzinfo=found.tzinfo or UTC)

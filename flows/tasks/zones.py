@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -16,12 +16,10 @@ from pipeline.ground.field_places import FieldPlace, NoPlace, PlacedPicture, Pos
 from pipeline.ground.map_grid import ground_grid
 from pipeline.ground.view import GroundView
 from pipeline.ground.zones import FieldZones, extent_deg, field_zones, on_field, pixels_inside
-from pipeline.lazy import BaseGeometry, pyproj
+from pipeline.lazy import BaseGeometry
 from pipeline.simulator.scenes.scene import RasterScene
 from storage.archive.keys import array_digest
-from storage.readers.polygons import GEOJSON, ZoneFile, read_zones
-
-WGS84 = 4326  # CRS of GeoJSON (RFC 7946), on a georeferenced field
+from storage.readers.polygons import ZoneFile, crs_on, read_zones
 
 
 @dataclass(frozen=True)
@@ -110,18 +108,10 @@ def _read(source: str, place: FieldPlace, notes: list[str], named_by: str | None
     """Read a file of polygons with its CRS; pixels on a field without georeference."""
     found = read_zones(source, named_by=named_by)
     notes += found.notes
-    if place.crs is None and found.crs is not None:
-        raise ZoneError(
-            f"{source} is in {found.crs.name}, and this field has no georeference: give the rig's [pose], a "
-            "georeferenced scene, or polygons in pixels of the scene as GeoJSON without a CRS"
-        )
-    if place.crs is None:
+    crs = crs_on(place, found.crs, source, ZoneError)
+    if crs is None:
         notes.append(f"{source} is in pixels of the scene, x to the right and y down from its upper left corner")
-    elif found.crs is None and not source.lower().endswith(GEOJSON):
-        raise ZoneError(f"{source} has no CRS; save it with one (a shapefile needs a .prj file)")
-    elif found.crs is None:
-        return ZoneFile(source, pyproj.CRS.from_epsg(WGS84), found.shapes, found.notes)
-    return found
+    return replace(found, crs=crs)
 
 
 def _format_beside(found: ZoneFile, place: FieldPlace) -> str:

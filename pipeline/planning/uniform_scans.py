@@ -95,6 +95,12 @@ class ScanPerformance:
         """Return the scores of a scan of a step and exposure within the table."""
         return {name: self.between(table, step, exposure_ms) for name, table in self.scores.items()}
 
+    def error_rates(self, step: int, exposure_ms: float, class_names: Sequence[str]) -> NDArray[np.float64]:
+        """Return (1 - IoU) / (1 + IoU) of each class in a scan; a class that the table lacks has the mean IoU."""
+        expected = self.expected(step, exposure_ms)
+        iou = np.array([expected.get(name, expected[MIOU]) for name in class_names])
+        return np.asarray((1 - iou) / (1 + iou))
+
     def between(self, table: NDArray[np.float64], step: int, exposure_ms: float) -> float:
         """Return a table's value for a step, interpolated over the logarithm of the exposure."""
         return float(np.interp(math.log(exposure_ms), np.log(self.exposures_ms), table[self.steps.index(step)]))

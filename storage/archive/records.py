@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -19,6 +21,14 @@ from storage.archive.staging import MANIFEST_NAME, file_hash
 RECEIPT = "receipt.json"
 State = Literal["ran", "cached", "skipped", "failed"]  # of a stage of a run
 RESTS_ON = "rests_on"  # in a run's manifest: address of a store or of an input of it -> SHA-256 of its manifest.json
+
+
+def moment_of(text: object) -> datetime | None:
+    """Return a moment in ISO 8601, in UTC if it names no zone; None for anything else."""
+    with suppress(ValueError):
+        found = datetime.fromisoformat(text) if isinstance(text, str) else None
+        return None if found is None else found.replace(tzinfo=found.tzinfo or UTC)
+    return None
 
 
 @dataclass(frozen=True)

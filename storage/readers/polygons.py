@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import SceneError, ZoneError
+from pipeline.errors import PipelineError, SceneError, ZoneError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.field_places import FieldPlace, NoPlace, PlacedPicture
 from pipeline.ground.georeference import WGS84
@@ -247,21 +247,31 @@ def _index_of(word: str, classes: dict[str, ClassValue], unlabelled: ClassValue 
     return values.index(int(word)) if word.isdecimal() and int(word) in values else None
 
 
+def crs_on(
+    place: FieldPlace, crs: pyproj.CRS | None, address: str | Path, error: type[PipelineError]
+) -> pyproj.CRS | None:
+    """Return the CRS of polygons on a field: WGS 84 for GeoJSON without one; None: they are in pixels of the scene.
+
+    Raises ``error``: the field has no georeference and the polygons have one, or the other way round.
+    """
+    if place.crs is None and crs is not None:
+        raise error(
+            f"{address} is in {crs.name}, and this field has no georeference: give the rig's [pose], a scene with a CRS"
+            " and a transform, or polygons in pixels of the scene as GeoJSON without a CRS"
+        )
+    if place.crs is None or crs is not None:
+        return crs
+    if split_layer(address)[0].suffix.lower() not in GEOJSON:
+        raise error(f"{address} has no CRS; save it with one (a shapefile needs a .prj file)")
+    return pyproj.CRS.from_epsg(WGS84)
+
+
 def _moved(layer: PolygonLayer, place: FieldPlace, address: str | Path) -> list[BaseGeometry]:
     """Return the polygons in pixels of the scene, clipped to it.
 
     Raises SceneError: none lies on the scene, or their CRS does not fit.
     """
-    crs = layer.crs
-    if place.crs is None and crs is not None:
-        raise SceneError(
-            f"labels {address} are in {crs.name}, and the scene does not say where it lies: give the scene a CRS and a"
-            " transform, or the polygons in pixels of the scene as GeoJSON without a CRS"
-        )
-    if place.crs is not None and crs is None:
-        if split_layer(address)[0].suffix.lower() not in GEOJSON:
-            raise SceneError(f"labels {address} do not say their CRS; save them with one (a shapefile has a .prj)")
-        crs = pyproj.CRS.from_epsg(WGS84)
+    crs = crs_on(place, layer.crs, address, SceneError)
     moved = [polygons_of(on_field(shape, crs, place)) for shape in layer.shapes]
     if all(one.is_empty or not one.intersects(NoPlace(place.shape).outline) for one in moved):
         given = np.array([shape.bounds for shape in layer.shapes])

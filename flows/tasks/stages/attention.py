@@ -22,7 +22,7 @@ from pipeline.geometry.grid import SceneGrid, patch_pixels
 from pipeline.geometry.scan import Sweep, exposing
 from pipeline.planning.coverage import patches_shown
 from pipeline.planning.fine_pass import FinePlan, SecondPass
-from pipeline.planning.uniform_scans import MIOU, ScanPerformance, format_scan
+from pipeline.planning.uniform_scans import ScanPerformance, format_scan
 from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table, write_table
 from storage.arrays.mosaics import Attention, chosen_patches, open_mosaic, write_attention
@@ -143,9 +143,7 @@ def gain_by_record(
     class_names = gains.work.weights.load().class_names
 
     def gain_of(step: int, exposure_ms: float) -> Scores:
-        expected = record.expected(step, exposure_ms)
-        iou = np.array([expected.get(name, expected[MIOU]) for name in class_names])
-        return gains.within_zones(errors.expected_gain((1 - iou) / (1 + iou)))
+        return gains.within_zones(errors.expected_gain(record.error_rates(step, exposure_ms, class_names)))
 
     return errors.wrong_pixels(), second_pass.best(record, gain_of)
 
