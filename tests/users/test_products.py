@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -15,7 +15,6 @@ import pyproj
 import pytest
 import rasterio
 import shapely
-import xarray as xr
 from affine import Affine
 from isoxml.converter.np_grid import to_numpy_array
 from isoxml.util.isoxml_io import isoxml_from_path
@@ -35,6 +34,7 @@ from pipeline.products.indices import find_index
 from storage.archive.archive import Archive
 from storage.arrays.class_maps import ClassNames
 from storage.arrays.mosaics import open_mosaic
+from tests.exported_run import Exported
 from tests.prior_work import without_effects
 from tests.storage.export.stac_rules import core_problems, extension_problems, is_cog
 from tests.users.test_georeference import SHAPE, TURNED, corners_px, survey, write_geotiff
@@ -45,33 +45,14 @@ BANDS = ",".join(map(str, range(5, 270, 11)))
 FLAGS = {"reflectance": True, "indices": "NDVI,SAVI", "polygons": True, "prescription": "track=2.5,wheat_a=1"}
 
 
-@dataclass(frozen=True)
-class Products:
-    """A survey's archive and run, and the folder with its products."""
-
-    archive: Path
-    receipt: dict[str, Any]
-    answer: dict[str, Any]
-    out: Path
-
-    def file(self, key: str) -> Path:
-        """One exported file."""
-        return self.out / str(self.answer["files"][key])
-
-    def store(self, product: str) -> xr.Dataset:
-        """A store of the archive."""
-        path = self.archive / self.receipt["products"][product]
-        return xr.open_zarr(path, consolidated=False, mask_and_scale=False)
-
-
-def exported(archive: Path, out: Path, receipt: Any, **flags: Any) -> Products:
+def exported(archive: Path, out: Path, receipt: Any, **flags: Any) -> Exported:
     """What these flags export of an archive's newest run."""
     choice = choose_products(ProductFlags(**flags))
-    return Products(archive, receipt, run_export(archive, None, out, False, QUIET, choice), out)
+    return Exported(archive, receipt, out, run_export(archive, None, out, False, QUIET, choice))
 
 
 @pytest.fixture(scope="module")
-def posed(tmp_path_factory: pytest.TempPathFactory) -> Products:
+def posed(tmp_path_factory: pytest.TempPathFactory) -> Exported:
     """A small farm with a pose, so high that a pixel sees about a metre, and all of its products."""
     archive, out = tmp_path_factory.mktemp("products") / "field", tmp_path_factory.mktemp("maps").resolve()
     given = {"size": "192x128", "bands": BANDS, "budget": "0.9", "engine": "plain", "seed": "1"}
@@ -82,7 +63,7 @@ def posed(tmp_path_factory: pytest.TempPathFactory) -> Products:
     return exported(archive, out, published.receipt, **FLAGS, cell=3.0)
 
 
-def test_reflectance_lies_on_the_map_with_its_wavelengths(posed: Products) -> None:
+def test_reflectance_lies_on_the_map_with_its_wavelengths(posed: Exported) -> None:
     """A COG in the map's CRS: the mosaic, resampled as the ground map is; bands named as GDAL does; NaN is nodata."""
     ground, mosaic = posed.store("ground_map"), posed.store("mosaic")
     assert is_cog(posed.file("reflectance"))
@@ -104,7 +85,7 @@ def test_reflectance_lies_on_the_map_with_its_wavelengths(posed: Products) -> No
     np.testing.assert_allclose([1000 * float(tags["FWHM_UM"]) for tags in imagery], mosaic["fwhm"].values, rtol=1e-6)
 
 
-def test_indices_are_their_formula_of_the_reflectance(posed: Products) -> None:
+def test_indices_are_their_formula_of_the_reflectance(posed: Exported) -> None:
     """NDVI of the file's own bands, pixel by pixel; NaN where a band has no value or both are dark."""
     with rasterio.open(posed.file("reflectance")) as file:
         cube, wave = np.moveaxis(file.read(), 0, -1), [float(file.tags(band)["wavelength"]) for band in file.indexes]
@@ -117,7 +98,7 @@ def test_indices_are_their_formula_of_the_reflectance(posed: Products) -> None:
     assert np.isfinite(wanted).mean() > 0.2
 
 
-def test_polygons_are_the_map_without_gap_or_overlap(posed: Products) -> None:
+def test_polygons_are_the_map_without_gap_or_overlap(posed: Exported) -> None:
     """Drawn again they are the class map; GeoPackage in its CRS, GeoJSON in longitude and latitude (RFC 7946)."""
     found = geopandas.read_file(posed.file("polygons"))
     assert found.crs.to_epsg() == 32632
@@ -137,7 +118,7 @@ def test_polygons_are_the_map_without_gap_or_overlap(posed: Products) -> None:
     np.testing.assert_allclose(degrees.to_crs(32632).area, found.area, rtol=1e-3)
 
 
-def _classes_of_polygons(posed: Products) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
+def _classes_of_polygons(posed: Exported) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
     """Centres of the map's pixels and their classes, by the polygons that hold them."""
     ground = posed.store("ground_map")
     a, _, c, _, e, f = ground.attrs["spatial:transform"]
@@ -146,7 +127,7 @@ def _classes_of_polygons(posed: Products) -> tuple[np.ndarray, np.ndarray, np.nd
     return x, y, ground["classes"].values, ground.attrs["class_names"]
 
 
-def test_prescribed_cells_hold_the_dose_of_their_classes(posed: Products) -> None:
+def test_prescribed_cells_hold_the_dose_of_their_classes(posed: Exported) -> None:
     """By another count: the greatest dose of the pixels whose centres lie in a cell is the least that it gets."""
     cells = geopandas.read_file(posed.file("prescription"))
     assert cells.crs.to_epsg() == 32632
@@ -164,7 +145,7 @@ def test_prescribed_cells_hold_the_dose_of_their_classes(posed: Products) -> Non
     assert shapely.contains_xy(covered, x[classes != 255], y[classes != 255]).all()
 
 
-def test_task_data_hold_what_the_map_says(posed: Products) -> None:
+def test_task_data_hold_what_the_map_says(posed: Exported) -> None:
     """Read by another library: each cell's dose against the pixels whose longitude and latitude lie in it."""
     task_data, numbers = isoxml_from_path(posed.file("task_data"))
     (grid,) = task_data.tasks[0].grids
@@ -188,7 +169,7 @@ def test_task_data_hold_what_the_map_says(posed: Products) -> None:
     assert (doses[ndimage.maximum_filter(total, 3) == 0] == 0).all()  # a cell may have a part of a pixel
 
 
-def test_a_table_of_areas_adds_up(posed: Products) -> None:
+def test_a_table_of_areas_adds_up(posed: Exported) -> None:
     """Pixels of the map, hectares of the receipt, fractions of 1, errors by the labels."""
     with posed.file("areas").open() as text:
         table = list(csv.DictReader(text))
@@ -204,9 +185,9 @@ def test_a_table_of_areas_adds_up(posed: Products) -> None:
     assert by_labels.sum() == posed.receipt["accuracy"]["pixels"]
 
 
-def test_the_catalogue_names_every_product(posed: Products) -> None:
+def test_the_catalogue_names_every_product(posed: Exported) -> None:
     """A valid item whose assets are there: products, and the sheet of areas."""
-    item = json.loads(Path(posed.answer["item"]).read_text())
+    item = posed.item()
     assert core_problems(Path(posed.answer["item"])) == []
     assert extension_problems(item) == []
     wanted = {"reflectance", "NDVI", "SAVI", "polygons", "polygons_geojson", "prescription", "task_data", "areas"}
@@ -232,7 +213,7 @@ def test_the_catalogue_names_every_product(posed: Products) -> None:
         ({"indices": "NDVI,NDMI"}, "NDMI wants Short-wave Infrared"),
     ],
 )
-def test_the_impossible_is_refused_first(posed: Products, tmp_path: Path, flags: dict[str, Any], words: str) -> None:
+def test_the_impossible_is_refused_first(posed: Exported, tmp_path: Path, flags: dict[str, Any], words: str) -> None:
     """One message that says what was expected; the folder stays empty."""
     with pytest.raises((SettingsError, WavelengthError), match=words):
         exported(posed.archive, tmp_path / "out", {}, **flags)
@@ -247,7 +228,7 @@ def test_the_impossible_is_refused_first(posed: Products, tmp_path: Path, flags:
         ("EPSG:4326", (179.9997, 10, 180.0003, 10.0005), "across 180 degrees of longitude"),
     ],
 )
-def test_a_prescription_ends_at_borders(posed: Products, crs: str, box: tuple[float, ...], words: str) -> None:
+def test_a_prescription_ends_at_borders(posed: Exported, crs: str, box: tuple[float, ...], words: str) -> None:
     """Of UTM, and of longitudes."""
     run = Mock(wraps=open_exported(Archive.open(posed.archive), None), map_product="class_map")
     run.geobox = GeoBox.from_bbox(box, crs=crs, shape=(4, 4))
@@ -306,7 +287,7 @@ def test_products_lie_where_their_scene_lies(tmp_path: Path, weights: Path, crs:
     task_data, numbers = isoxml_from_path(done.file("task_data"))
     (grid,) = task_data.tasks[0].grids
     lowest = float(grid.minimum_east_position), float(grid.minimum_north_position)
-    assert lowest == pytest.approx(json.loads(Path(done.answer["item"]).read_text())["bbox"][:2], abs=1e-5)
+    assert lowest == pytest.approx(done.item()["bbox"][:2], abs=1e-5)
     assert 9 < lowest[0] < 10
     assert (to_numpy_array(numbers[grid.filename], grid) > 0).any()
 

@@ -6,7 +6,7 @@ import io
 import json
 import re
 import shutil
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -21,7 +21,6 @@ from rich.console import Console
 
 from flows.archive.export_command import run_export
 from flows.archive.export_layers import ExportedRun
-from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from pipeline.errors import ArchiveError, IncompleteStoreError, NoRunError, SettingsError
@@ -29,40 +28,13 @@ from pipeline.ground.view import RigPose
 from storage.archive.archive import Archive
 from storage.readers.envi_files import open_envi_cube
 from storage.remote.opening import verify_archive
+from tests.exported_run import Exported
 from tests.prior_work import without_effects
 from tests.storage.export.stac_rules import core_problems, extension_problems, is_cog
 from tests.storage.small_archive import flip
 
 POSE = RigPose(lon_deg=9.5, lat_deg=52.1, heading_deg=25.0, tilt_deg=50.0, height_m=14.0)
 QUIET = Console(quiet=True)
-
-
-@dataclass(frozen=True)
-class Exported:
-    """A survey, its archive, and what its export gave."""
-
-    published: Published
-    archive: Path
-    out: Path
-    answer: dict[str, Any]
-
-    @property
-    def id(self) -> str:
-        """The run's name."""
-        return self.published.folder.name
-
-    def file(self, key: str) -> Path:
-        """One exported file."""
-        return self.out / str(self.answer["files"][key])
-
-    def store(self, product: str) -> xr.Dataset:
-        """A store of the archive, as a stranger opens it."""
-        return xr.open_zarr(self.archive / self.published.receipt["products"][product], consolidated=False)
-
-    def item(self) -> dict[str, Any]:
-        """The STAC item."""
-        found: dict[str, Any] = json.loads(Path(self.answer["item"]).read_text())
-        return found
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +46,7 @@ def exports(tmp_path_factory: pytest.TempPathFactory) -> list[Exported]:
     with without_effects():
         published = [run_survey(settings, QUIET), run_survey(replace(settings, pose=POSE), QUIET)]
     return [
-        Exported(one, archive, out, run_export(archive, one.folder.name, out, envi=True, console=QUIET))
+        Exported(archive, one.receipt, out, run_export(archive, one.folder.name, out, envi=True, console=QUIET))
         for one in published
     ]
 
@@ -121,7 +93,7 @@ def test_with_a_pose_images_lie_where_the_zarr_store_lies(posed: Exported) -> No
 def test_without_a_pose_images_lie_on_angles(plain: Exported) -> None:
     """No CRS, the Zarr store's own transform in radians, its values, and a tag that says so."""
     store = xr.open_zarr(
-        plain.archive / plain.published.receipt["products"]["class_map"], consolidated=False, mask_and_scale=False
+        plain.archive / plain.receipt["products"]["class_map"], consolidated=False, mask_and_scale=False
     )
     for key, array in (("class_map", "classes"), ("confidence", "confidence")):
         with rasterio.open(plain.file(key)) as file:
@@ -148,8 +120,8 @@ def test_images_say_what_they_show_and_of_which_run(exports: list[Exported], num
         tags = file.tags()
     product = ("class_map", "ground_map")[number]
     assert tags["run"] == done.id
-    assert tags["product"] == done.published.receipt["products"][product]
-    assert tags["surveyed"] == f"{done.published.receipt['started'][:4]}-06-21T11:00:00+00:00"  # of the built-in farm
+    assert tags["product"] == done.receipt["products"][product]
+    assert tags["surveyed"] == f"{done.receipt['started'][:4]}-06-21T11:00:00+00:00"  # of the built-in farm
     assert tags["TIFFTAG_SOFTWARE"].startswith("spectralzoom ")
 
 
@@ -158,7 +130,7 @@ def test_images_say_what_they_show_and_of_which_run(exports: list[Exported], num
 def test_cubes_are_the_archives_bit_for_bit(exports: list[Exported], number: int) -> None:
     """Sweeps through this project's ENVI reader are the Zarr stores' numbers."""
     done = exports[number]
-    mosaic, products = done.store("mosaic"), done.published.receipt["products"]
+    mosaic, products = done.store("mosaic"), done.receipt["products"]
     stores = {}
     for product in ("raw_coarse", "raw_fine"):
         for path in (done.archive / products[product]).glob("*.zarr"):
@@ -213,7 +185,7 @@ def test_rigs_observe_while_they_run(tmp_path: Path, source: str, visit: str | N
 
 def test_items_say_when_where_and_how(plain: Exported, posed: Exported) -> None:
     """The time of the visit, here of the built-in farm; lineage of the receipt; geometry and CRS only with a pose."""
-    receipt, item = posed.published.receipt, posed.item()
+    receipt, item = posed.receipt, posed.item()
     about = item["properties"]
     assert about["datetime"] == about["end_datetime"] == f"{receipt['started'][:4]}-06-21T11:00:00Z"
     assert about["processing:software"] == receipt["versions"]
@@ -269,7 +241,7 @@ def test_runs_and_places_that_are_none_are_refused(posed: Exported, tmp_path: Pa
 def test_a_store_that_is_gone_is_named(posed: Exported, tmp_path: Path) -> None:
     """Which product it is and what to do; what was written before it stays, and no catalogue names it."""
     archive, out = Path(shutil.copytree(posed.archive, tmp_path / "field-a")), tmp_path / "out"
-    shutil.rmtree((archive / posed.published.receipt["products"]["mosaic"]).parent)
+    shutil.rmtree((archive / posed.receipt["products"]["mosaic"]).parent)
     with pytest.raises(IncompleteStoreError, match=r"the mosaic of run .* does not; run its survey again"):
         run_export(archive, posed.id, out, envi=False, console=QUIET)
     assert not (out / "collection.json").exists()
@@ -286,7 +258,7 @@ def test_leftovers_of_a_killed_export_go(posed: Exported, tmp_path: Path) -> Non
 def test_what_cannot_be_believed_is_named_and_gives_no_image(posed: Exported, tmp_path: Path) -> None:
     """A flipped bit: what it is, what to do, and no image of it."""
     archive = Path(shutil.copytree(posed.archive, tmp_path / "field-a"))
-    classes = archive / posed.published.receipt["products"]["ground_map"] / "classes"
+    classes = archive / posed.receipt["products"]["ground_map"] / "classes"
     flip(next(path for path in sorted(classes.rglob("*")) if path.is_file() and path.name != "zarr.json"), at=40)
     with pytest.raises(IncompleteStoreError, match=r"ground_map.*classes"):
         run_export(archive, posed.id, tmp_path / "out", envi=False, console=QUIET)

@@ -4,25 +4,23 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import rasterio
-import xarray as xr
 from PIL import Image
 from rich.console import Console
 
 import models.reading.prior_map as prior_map
 from flows.archive.export_command import run_export
-from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from models.weights.files import load_weights, save_weights, with_record
 from pipeline.ground.view import RigPose
 from tests.conftest import RGB_NM, patchy_scene
+from tests.exported_run import Exported
 from tests.prior_work import without_effects
 from tests.storage.export.stac_rules import is_cog
 
@@ -32,30 +30,6 @@ SHAPE, PATCH = (96, 128), 8
 MEMORY = ("age", "changed", "changed_from")
 VISITS = ("2026-06-01T10:00:00Z", "2026-06-04T10:00:00Z")
 PLACES = ("georeferenced", "posed")
-
-
-@dataclass(frozen=True)
-class Visited:
-    """Two visits to a field of which a part was harvested between them, and the exports of both."""
-
-    runs: list[Published]
-    out: Path
-    answers: list[dict[str, Any]]
-
-    def store(self, product: str) -> xr.Dataset:
-        """A store of the later visit, as plain xarray opens it."""
-        archive = self.runs[1].folder.parents[1]
-        return xr.open_zarr(archive / self.runs[1].receipt["products"][product], consolidated=False)
-
-    def image(self, key: str) -> np.ndarray:
-        """An exported image of the later visit, as rasterio reads it."""
-        with rasterio.open(self.file(key)) as file:
-            found: np.ndarray = file.read(1)
-            return found
-
-    def file(self, key: str) -> Path:
-        """An exported file of the later visit."""
-        return self.out / str(self.answers[1]["files"][key])
 
 
 def harvested(folder: Path, place: str) -> Iterator[Path]:
@@ -77,7 +51,7 @@ def harvested(folder: Path, place: str) -> Iterator[Path]:
 
 
 @pytest.fixture(scope="module", params=PLACES)
-def visited(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, weights: Path) -> Visited:
+def visited(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, weights: Path) -> list[Exported]:
     """Both visits, the later one three days after the first by some lines of a swath: much is not looked at."""
     folder = tmp_path_factory.mktemp(request.param)
     archive, out = folder / "archive", folder / "maps"
@@ -94,41 +68,41 @@ def visited(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
             settings = load_settings(None, given | asked)
             posed = replace(settings, pose=POSE) if request.param == "posed" else settings
             runs.append(run_survey(posed, QUIET))
-    answers = [run_export(archive, run.folder.name, out, envi=False, console=QUIET) for run in runs]
-    return Visited(runs, out, answers)
+    return [
+        Exported(archive, run.receipt, out, run_export(archive, run.folder.name, out, envi=False, console=QUIET))
+        for run in runs
+    ]
 
 
-def test_a_first_visit_exports_ages_alone(visited: Visited) -> None:
+def test_a_first_visit_exports_ages_alone(visited: list[Exported]) -> None:
     """All that it saw was looked at that day."""
-    files = visited.answers[0]["files"]
-    assert set(MEMORY) & set(files) == {"age"}
-    with rasterio.open(visited.out / files["age"]) as file:
-        found = file.read(1)
+    assert set(MEMORY) & set(visited[0].answer["files"]) == {"age"}
+    found = visited[0].image("age")
     assert set(np.unique(found[np.isfinite(found)]).tolist()) == {0.0}
 
 
-def test_images_are_the_stores_numbers(visited: Visited) -> None:
+def test_images_are_the_stores_numbers(visited: list[Exported]) -> None:
     """Ages in days, NaN where nothing is known; what pixels were with the names of classes; cloud-optimised."""
-    posed = "ground_map" in visited.runs[1].receipt["products"]
-    store = visited.store("ground_map" if posed else "class_probabilities")
+    later = visited[1]
+    store = later.store("ground_map" if "ground_map" in later.receipt["products"] else "class_probabilities")
     for key in MEMORY:
-        assert is_cog(visited.file(key))
-        np.testing.assert_array_equal(visited.image(key), store[key].values)
+        assert is_cog(later.file(key))
+        np.testing.assert_array_equal(later.image(key), store[key].values)
     assert {0.0, 3.0} == set(np.unique(store["age"].values[np.isfinite(store["age"].values)]).tolist())
     assert (store["changed_from"].values != 255).any()
-    with rasterio.open(visited.file("age")) as file:
+    with rasterio.open(later.file("age")) as file:
         assert np.isnan(file.nodata)
         assert file.dtypes == ("float32",)
-    with rasterio.open(visited.file("changed_from")) as file:
+    with rasterio.open(later.file("changed_from")) as file:
         names = store.attrs["class_names"]
         assert [file.tags(1)[f"CLASS_{number}"] for number in range(len(names))] == names
 
 
-def test_images_lie_where_the_class_map_lies(visited: Visited) -> None:
+def test_images_lie_where_the_class_map_lies(visited: list[Exported]) -> None:
     """Same CRS and corner, of the fraction of patches of the field too; its pixels are as large as patches there."""
     grids = {}
     for key in ("class_map", *MEMORY):
-        with rasterio.open(visited.file(key)) as file:
+        with rasterio.open(visited[1].file(key)) as file:
             grids[key] = file.crs, file.transform, file.shape
     crs, transform, shape = grids["class_map"]
     assert grids["age"] == grids["changed_from"] == grids["class_map"]
@@ -138,19 +112,22 @@ def test_images_lie_where_the_class_map_lies(visited: Visited) -> None:
     assert grids["changed"][1].almost_equals(there)
 
 
-def test_receipt_and_page_have_the_hectares(visited: Visited) -> None:
+def test_receipt_and_page_have_the_hectares(visited: list[Exported]) -> None:
     """Where the field has a place they are the ground of the pixels that changed, or are old, by plain xarray."""
-    first, later = (run.receipt for run in visited.runs)
+    first, later = (run.receipt for run in visited)
     if "ground" not in later:
         assert "ground_map" not in later["products"]
         return
     assert "changes_ha" not in first["ground"]
     assert set(first["ground"]["older_ha"].values()) == {0.0}
     posed = "ground_map" in later["products"]
-    store = visited.store("ground_map" if posed else "class_probabilities")
+    store = visited[1].store("ground_map" if posed else "class_probabilities")
     pixel_ha, slack = store.attrs["spatial:transform"][0] ** 2 / 1e4, 0.05 if posed else 1e-3  # footprints' borders
     changes, older = later["ground"]["changes_ha"], later["ground"]["older_ha"]
-    names, drawn = store.attrs["class_names"], visited.store("ground_map" if posed else "class_map")["classes"].values
+    names, drawn = (
+        store.attrs["class_names"],
+        visited[1].store("ground_map" if posed else "class_map")["classes"].values,
+    )
     there = store["changed_from"].values.astype(int) * 1000 + drawn
     wanted = {
         (old, new): (there == 1000 * names.index(old) + names.index(new)).sum() * pixel_ha * beyond / differing
@@ -160,6 +137,6 @@ def test_receipt_and_page_have_the_hectares(visited: Visited) -> None:
     assert {(old, new): area for area, old, new in changes} == pytest.approx(wanted, rel=slack)
     assert older["1"] == pytest.approx((store["age"].values > 1).sum() * pixel_ha, rel=slack)
     assert older["7"] == 0
-    page = (visited.runs[1].folder / "report.html").read_text(encoding="utf-8")
+    page = (visited[1].archive / "runs" / visited[1].id / "report.html").read_text(encoding="utf-8")
     assert re.search("changed [0-9.]+ .*: class \\d to class \\d", page)
     assert "captured longer ago than 1 day" in page

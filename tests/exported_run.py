@@ -1,0 +1,46 @@
+"""A run of an archive and what was exported of it, read as a stranger reads both."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rasterio
+import xarray as xr
+
+
+@dataclass(frozen=True)
+class Exported:
+    """The archive, the run's receipt, and folder and answer of its export."""
+
+    archive: Path
+    receipt: Any
+    out: Path
+    answer: dict[str, Any]
+
+    @property
+    def id(self) -> str:
+        """The run's name."""
+        return str(self.answer["run"])
+
+    def file(self, key: str) -> Path:
+        """One exported file."""
+        return self.out / str(self.answer["files"][key])
+
+    def image(self, key: str) -> np.ndarray:
+        """The first band of an exported image."""
+        with rasterio.open(self.file(key)) as file:
+            found: np.ndarray = file.read(1)
+            return found
+
+    def store(self, product: str, **how: Any) -> xr.Dataset:
+        """A store of the archive."""
+        return xr.open_zarr(self.archive / self.receipt["products"][product], consolidated=False, **how)
+
+    def item(self) -> dict[str, Any]:
+        """The STAC item."""
+        found: dict[str, Any] = json.loads(Path(self.answer["item"]).read_text())
+        return found
