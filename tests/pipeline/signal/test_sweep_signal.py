@@ -136,19 +136,6 @@ def test_scores_are_stored_in_steps(step: float) -> None:
     assert differing_lines(lines, stored, CAMERA) == []
 
 
-def test_rare_spectra_come_back_within_a_quarter_deviation() -> None:
-    """Single spectra in every block, the last one too, are found in order and restored to a quarter of the noise."""
-    lines = made_lines()
-    places = [(3, 7), (63, 39), (64, 0), (149, 20)]
-    for number, (line, sample) in enumerate(places):
-        lines.raw[line, sample, number::2] += 200
-    stored, done = condense(lines)
-    assert [tuple(place) for place in done.rare.tolist()] == places
-    assert done.residuals.shape == (4, BANDS)
-    off = (stored.restored(done) - values_of(lines)) / stored.components.noise
-    assert max(np.abs(off[place]).max() for place in places) <= RESIDUAL_STEP / 2 + 1e-3
-
-
 def test_lines_that_changed_or_were_lost_are_found() -> None:
     """A raw line that is another one now, one score a step off, one spectrum lost: their lines and no others."""
     lines = made_lines()
@@ -199,18 +186,6 @@ def test_dead_columns_and_elements() -> None:
     assert np.flatnonzero(unusable.all(axis=0)).tolist() == [8]
     assert unusable.sum() == 150
     assert (done.known, done.saturated) == (150 * 39, 0)
-    assert differing_lines(lines, stored, CAMERA) == []
-
-
-def test_all_dark_lines() -> None:
-    """A white frame that is no brighter than the dark one: no component, no usable spectrum, and no line differs."""
-    lines = made_lines()
-    references = replace(lines.references, white=lines.references.dark)
-    lines = replace(lines, references=references)
-    stored, done = condense(lines)
-    assert (len(stored.components), done.known, done.rare.shape) == (0, 0, (0, 2))
-    assert (stored.quality == UNUSABLE).all()
-    assert done.residuals.shape == (0, BANDS)
     assert differing_lines(lines, stored, CAMERA) == []
 
 
