@@ -30,6 +30,7 @@ from tests.object_server import bucket, machine, s3_server  # noqa: F401 - fixtu
 from tests.prior_work import remember, with_effects, without_effects
 from tests.zarr_at_once import close_loops, work_at_once
 
+QUIET = Console(quiet=True)
 RGB_NM = (640.0, 550.0, 460.0)
 CLASSES = ("class_0", "class_1", "class_2")  # as a label file of the numbers 0..2 names them
 
@@ -177,7 +178,7 @@ def survey_png(scene_files: Path, flags_png: Flags) -> Survey:
     def survey(out: Path, console: Console | None = None, **flags: Any) -> Published:
         labels = str(scene_files / "labels.png")
         given = flags_png(out, labels=labels, engine="plain", budget="0.8", controls=False)
-        return run_survey(load_settings(None, given | flags), console or Console(quiet=True))
+        return run_survey(load_settings(None, given | flags), console or QUIET)
 
     return survey
 

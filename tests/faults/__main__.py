@@ -19,7 +19,6 @@ sys.path[0] = str(Path(__file__).resolve().parents[2])  # not this folder: its m
 from tests.faults.fault_table import HEADINGS, rows_of, run_table  # noqa: E402
 
 PLACES = {
-    "flips": "checksummed_flips:archive_rows",
     "headers": "mutated_files:header_rows",
     "files": "mutated_files:file_rows",
     "disk_full": "disk_full:full_rows",
@@ -27,7 +26,7 @@ PLACES = {
     "many_writers": "many_writers:rows",
     "lost_lines": "lost_lines:rows",
     "growing_files": "growing_files:rows",
-    "checksummed_flips": "checksummed_flips:weight_rows",
+    "checksummed_flips": "checksummed_flips:rows",
 }
 FAULTS = {name: rows_of(f"tests.faults.{place}") for name, place in PLACES.items()}
 

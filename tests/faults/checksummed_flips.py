@@ -1,13 +1,11 @@
-"""One bit flipped in what is checksummed: ``python tests/faults flips checksummed_flips``.
+"""One bit flipped in what is checksummed: ``python tests/faults checksummed_flips``.
 
-Of an archive each flip must be found by verify, with the store's or run's address. A reader of weights or of the state
-of a training run may refuse the file, in one message, or give what was written, bit by bit: never other numbers.
+A reader of weights or of the state of a training run may refuse the file, in one message, or give what was written, bit
+by bit: never other numbers. Flips in an archive are in `tests/storage/maintenance/test_verification.py`.
 """
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,11 +18,8 @@ import torch
 from models.weights.checksummed_files import load_checkpoint, save_checkpoint
 from models.weights.files import describe_weights, load_weights, save_weights
 from pipeline.errors import WeightsError
-from storage.archive.archive import Archive
 from tests.conftest import RGB_NM, random_weights
 from tests.faults.fault_table import Clock, Row, reported_wrong
-from tests.faults.nursery import ROOT
-from tests.faults.small_survey import problems
 
 RUN = "the run's identity"
 Content = tuple[Any, Mapping[str, torch.Tensor]]  # everything beside the tensors, and the tensors
@@ -108,7 +103,7 @@ def _written(folder: Path) -> dict[str, Path]:
     return {"weights": weights, "checkpoint": state}
 
 
-def weight_rows(quick: bool) -> Sequence[Row]:
+def rows(quick: bool) -> Sequence[Row]:
     clock, count = Clock(), 60 if quick else 2000
     with tempfile.TemporaryDirectory() as place:
         found = flip_bits(count, Path(place))
@@ -117,37 +112,3 @@ def weight_rows(quick: bool) -> Sequence[Row]:
     demanded = "refused in one message, or the numbers that were written"
     met = not found.wrong and found.tried == count
     return [Row("a bit flips in weights", injected, count, demanded, words, met, clock.seconds)]
-
-
-# --- an archive -------------------------------------------------------------------------------------------------------
-
-
-def flip_archive(root: Path, flips: int, seed: int = 0) -> list[str]:
-    """Flip one bit at random places, one at a time, and put it back; gives those that verify does not name."""
-    archive = Archive.open(root, create=False, write=False)
-    folders = [ref.path for ref in archive.refs()] + archive.runs()
-    files = sorted(path for folder in folders for path in folder.rglob("*") if path.is_file() and path.stat().st_size)
-    rng, wrong = Random(seed), list[str]()
-    for path in rng.choices(files, [path.stat().st_size for path in files], k=flips):
-        whole = path.read_bytes()
-        place, bit = rng.randrange(len(whole)), rng.randrange(8)
-        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << bit]) + whole[place + 1 :])
-        inside = path.relative_to(root)
-        try:
-            found = problems(root)
-        finally:
-            path.write_bytes(whole)
-        if not any(inside.is_relative_to(problem.split()[0]) for problem in found):
-            wrong.append(f"{inside}, byte {place}, bit {bit}: {found or 'not found'}")
-    return wrong + problems(root)
-
-
-def archive_rows(quick: bool) -> Sequence[Row]:
-    clock, count = Clock(), 20 if quick else 200
-    survey = "survey --scene farm --size 256x256 --budget 0.5 --no-controls --engine plain --out"
-    with tempfile.TemporaryDirectory(prefix="flips-") as place:
-        command = [sys.executable, "-m", "flows.cli.main", *survey.split(), place]
-        subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
-        wrong = flip_archive(Path(place), count)
-    injected, demanded = "one bit of a random file of an archive", "each found by verify, and named"
-    return [Row("a bit flips", injected, count, demanded, reported_wrong(wrong), not wrong, clock.seconds)]

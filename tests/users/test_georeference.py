@@ -17,7 +17,6 @@ import xarray as xr
 from affine import Affine
 from odc.geo.geobox import GeoBox
 from rasterio.enums import ColorInterp
-from rich.console import Console
 
 import models.reading.prior_map as prior_map
 from flows.archive.export_command import run_export
@@ -27,7 +26,7 @@ from flows.settings.load import load_settings
 from pipeline.ground.georeference import pixel_rows_m2
 from storage.arrays.mosaics import open_mosaic
 from storage.remote.opening import open_archive, verify_archive
-from tests.conftest import RGB_NM, patchy_scene
+from tests.conftest import QUIET, RGB_NM, patchy_scene
 from tests.prior_work import without_effects
 
 SHAPE = (52, 70)
@@ -39,7 +38,6 @@ EVERY_STORE = (
 )
 UNCOUNTED = ("rgb", "rare")  # rare spectra are found by their line and sample
 GAP = np.s_[:20, :24]
-QUIET = Console(quiet=True)
 PIXELS = patchy_scene(SHAPE, 3, seed=4)[0].astype(np.uint8)  # (y, x, band) of a field of three classes
 
 

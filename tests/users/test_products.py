@@ -19,7 +19,6 @@ from affine import Affine
 from isoxml.converter.np_grid import to_numpy_array
 from isoxml.util.isoxml_io import isoxml_from_path
 from odc.geo.geobox import GeoBox
-from rich.console import Console
 from scipy import ndimage
 
 from flows.archive.export_command import run_export
@@ -34,13 +33,13 @@ from pipeline.products.indices import find_index
 from storage.archive.archive import Archive
 from storage.arrays.class_maps import ClassNames
 from storage.arrays.mosaics import open_mosaic
+from tests.conftest import QUIET
 from tests.exported_run import Exported
 from tests.prior_work import without_effects
 from tests.storage.export.stac_rules import core_problems, extension_problems, is_cog
 from tests.users.test_georeference import SHAPE, TURNED, corners_px, survey, write_geotiff
 
 POSE = RigPose(lon_deg=9.5, lat_deg=52.1, heading_deg=25.0, tilt_deg=50.0, height_m=1400.0)
-QUIET = Console(quiet=True)
 BANDS = ",".join(map(str, range(5, 270, 11)))
 FLAGS = {"reflectance": True, "indices": "NDVI,SAVI", "polygons": True, "prescription": "track=2.5,wheat_a=1"}
 

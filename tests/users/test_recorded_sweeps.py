@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
-from rich.console import Console
 
 import storage.readers.recordings
 from flows.archive.reprocess_command import run_reprocess
@@ -37,7 +36,7 @@ from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
 from storage.arrays.mosaics import open_mosaic
 from storage.export.image_files import write_recorded_files
 from storage.remote.opening import verify_archive
-from tests.conftest import Survey, WeightsMaker, patchy_scene, random_weights
+from tests.conftest import QUIET, Survey, WeightsMaker, patchy_scene, random_weights
 from tests.flows.conftest import CommandLine, be_version, command_line
 from tests.flows.tasks.test_survey_rig import emulated
 from tests.flows.tasks.test_uniform_scan import RECORD
@@ -46,7 +45,6 @@ from tests.storage.readers.test_recordings import write_envi_cube
 
 __all__ = ["command_line"]
 pytestmark = pytest.mark.usefixtures("no_effects")
-QUIET = Console(quiet=True)
 FullScan = tuple[Path, Published, Path]  # archive, run, sweeps as files
 Pushbroom = tuple[Path, NDArray[np.uint16]]  # files of a straight scan, and its numbers
 SIZE = (128, 96)  # x, y

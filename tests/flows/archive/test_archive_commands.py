@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rich.console import Console
 
 from flows.archive.commands import command, contents, explain, gc, ls, run_verify
 from flows.settings.load import load_settings, parse_settings
@@ -19,11 +18,10 @@ from flows.terminal.processes import DONE, FAILED, PARTLY
 from pipeline.errors import ArchiveError
 from storage.archive.archive import Archive
 from storage.archive.whole_files import to_json
+from tests.conftest import QUIET
 from tests.storage.small_archive import flip, small_survey
 
 pytestmark = pytest.mark.usefixtures("no_effects")
-
-QUIET = Console(quiet=True)
 
 
 @pytest.fixture

@@ -24,17 +24,14 @@ from flows.archive.export_layers import ExportedRun
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from pipeline.errors import ArchiveError, IncompleteStoreError, NoRunError, SettingsError
-from pipeline.ground.view import RigPose
 from storage.archive.archive import Archive
 from storage.readers.envi_files import open_envi_cube
 from storage.remote.opening import verify_archive
-from tests.exported_run import Exported
+from tests.conftest import QUIET
+from tests.exported_run import POSE, Exported
 from tests.prior_work import without_effects
 from tests.storage.export.stac_rules import core_problems, extension_problems, is_cog
 from tests.storage.small_archive import flip
-
-POSE = RigPose(lon_deg=9.5, lat_deg=52.1, heading_deg=25.0, tilt_deg=50.0, height_m=14.0)
-QUIET = Console(quiet=True)
 
 
 @pytest.fixture(scope="module")

@@ -11,21 +11,17 @@ import numpy as np
 import pytest
 import rasterio
 from PIL import Image
-from rich.console import Console
 
 import models.reading.prior_map as prior_map
 from flows.archive.export_command import run_export
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from models.weights.files import load_weights, save_weights, with_record
-from pipeline.ground.view import RigPose
-from tests.conftest import RGB_NM, patchy_scene
-from tests.exported_run import Exported
+from tests.conftest import QUIET, RGB_NM, patchy_scene
+from tests.exported_run import POSE, Exported
 from tests.prior_work import without_effects
 from tests.storage.export.stac_rules import is_cog
 
-POSE = RigPose(lon_deg=9.5, lat_deg=52.1, heading_deg=25.0, tilt_deg=50.0, height_m=14.0)
-QUIET = Console(quiet=True)
 SHAPE, PATCH = (96, 128), 8
 MEMORY = ("age", "changed", "changed_from")
 VISITS = ("2026-06-01T10:00:00Z", "2026-06-04T10:00:00Z")

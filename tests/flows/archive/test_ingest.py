@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import xarray as xr
 from numpy.typing import NDArray
-from rich.console import Console
 
 import flows.archive.ingest_command
 from flows.archive.ingest_command import run_ingest
@@ -19,6 +18,7 @@ from pipeline.errors import ArchiveError, SceneError
 from storage.archive.archive import Archive
 from storage.readers.scene_files import load_scene_file
 from storage.remote.opening import verify_archive
+from tests.conftest import QUIET
 
 NM = "wavelength units = um\nwavelength = {0.45, 0.55, 0.65}\nfwhm = {0.01, 0.01, 0.02}\n"
 KINDS = {"u1": 1, "i2": 2, "i4": 3, "f4": 4, "f8": 5, "u2": 12}
@@ -37,7 +37,7 @@ def write_envi(path: Path, values: NDArray[Any], *, lines: int | None = None, mo
 
 def ingest(source: Path | str, archive: Path, **flags: Any) -> dict[str, Any]:
     """Ingest without showing anything."""
-    return run_ingest(str(source), archive, Console(quiet=True), **flags)
+    return run_ingest(str(source), archive, QUIET, **flags)
 
 
 def opened(record: dict[str, Any]) -> xr.Dataset:

@@ -11,7 +11,6 @@ from typing import Any
 from unittest.mock import Mock
 
 import pytest
-from rich.console import Console
 
 from flows.archive.reprocess_command import run_reprocess
 from flows.publish.receipt import is_pending
@@ -19,14 +18,13 @@ from flows.tasks.open_survey import STAGES
 from flows.tasks.stages import accuracy as evaluation
 from models.weights.files import save_weights
 from storage.archive.archive import Archive
-from tests.conftest import RGB_NM, Survey, random_weights
+from tests.conftest import QUIET, RGB_NM, Survey, random_weights
 from tests.flows.conftest import CommandLine, act_instead, be_version, problems, turned
 from tests.receipts import comparable, receipts
 from tests.storage.small_archive import flip
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 
-QUIET = Console(quiet=True)
 Refuse = Callable[[Path, Path, pytest.MonkeyPatch], None]
 
 

@@ -23,7 +23,7 @@ from flows.terminal.figures import format_seconds
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive.archive import Archive
-from tests.conftest import Flags
+from tests.conftest import QUIET, Flags
 from tests.flows.conftest import be_version, python
 
 pytestmark = pytest.mark.usefixtures("no_effects")
@@ -183,7 +183,7 @@ def test_a_raster_has_estimates(settings: Settings, tmp_path: Path) -> None:
     assert found["bytes_kept"]["known_from"] == KEPT_FROM
     assert found["miou"]["value"] is None
     assert found["miou"]["known_from"] == "no scene was kept for validation when the weights were trained"
-    receipt = run_survey(asked, Console(quiet=True)).receipt
+    receipt = run_survey(asked, QUIET).receipt
     assert found["multiply_adds"]["value"] == receipt["savings"]["multiply_adds"]["done"]
 
 

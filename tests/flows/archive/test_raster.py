@@ -14,7 +14,6 @@ import rasterio
 import xarray
 from affine import Affine
 from numpy.typing import NDArray
-from rich.console import Console
 
 from flows.archive.export_command import run_export
 from flows.archive.export_layers import ProductFlags, choose_products
@@ -26,9 +25,8 @@ from pipeline.geometry.grid import block_means
 from storage.archive.archive import Archive
 from storage.arrays.mosaics import open_mosaic
 from storage.remote.opening import verify_archive
-from tests.conftest import RGB_NM, WeightsMaker, patchy_scene
+from tests.conftest import QUIET, RGB_NM, WeightsMaker, patchy_scene
 
-QUIET = Console(quiet=True)
 CORNER = Affine(0.5, 0, 500_000, 0, -0.5, 5_400_000)
 UTM = "EPSG:32632"
 Raster = Callable[..., Any]

@@ -19,14 +19,12 @@ from flows.terminal.processes import DONE, FAILED, PARTLY
 from pipeline.errors import SettingsError, WeightsError
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
-from tests.conftest import Survey, WeightsMaker
+from tests.conftest import QUIET, Survey, WeightsMaker
 from tests.flows.conftest import be_version, turned
 from tests.prior_work import without_effects
 from tests.storage.small_archive import flip
 
 pytestmark = pytest.mark.usefixtures("no_effects")
-
-QUIET = Console(quiet=True)
 
 
 @pytest.fixture(scope="module")

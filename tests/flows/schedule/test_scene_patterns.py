@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from rich.console import Console
 
 from flows.cli.serve_command import load_fields
 from flows.publish.survey_command import run_survey
@@ -19,6 +18,7 @@ from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
 from flows.tasks.scene import scene_of_visit
 from pipeline.errors import NoSceneYet, NothingToMend, SettingsError, WeightsError
+from tests.conftest import QUIET
 
 JUNE = datetime(2026, 6, 1, 12, tzinfo=UTC)
 
@@ -59,7 +59,7 @@ def test_a_scene_that_is_no_pattern_stays(tmp_path: Path) -> None:
 
 def test_the_newest_that_was_not_surveyed_is_taken_until_there_is_none(tmp_path: Path, weights: Path) -> None:
     """By the time it was written; label files are none. Then the latest run stands, until another file comes."""
-    folder, quiet = tmp_path / "scenes", Console(quiet=True)
+    folder, quiet = tmp_path / "scenes", QUIET
     with pytest.raises(NoSceneYet, match="no file yet that --scene"):
         scene_of_visit(asked(tmp_path, "{new}.png"), JUNE)
     write_scene(folder, "z.png", 1)

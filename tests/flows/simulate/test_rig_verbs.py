@@ -14,12 +14,12 @@ from pathlib import Path
 
 import pytest
 import serial
-from rich.console import Console
 
 from flows.cli.rig_commands import emulated_settings, run_emulate
 from flows.settings.load import load_settings
 from pipeline.rig.emulator.emulated_rig import FastClock, ServedRig
 from pipeline.rig.pro_mode import Command
+from tests.conftest import QUIET
 from tests.flows.conftest import CommandLine
 from tests.pipeline.rig.camera_faults import FaultyRig
 from tests.pipeline.rig.mirror_faults import make_fault
@@ -125,9 +125,7 @@ def test_emulated_rig_is_checked_by_the_file_that_it_writes(command_line: Comman
     ended, codes = threading.Event(), []
 
     def emulate() -> None:
-        codes.append(
-            run_emulate(settings, Console(quiet=True), baud=0, speed=20.0, out=file, as_json=True, ended=ended)
-        )
+        codes.append(run_emulate(settings, QUIET, baud=0, speed=20.0, out=file, as_json=True, ended=ended))
 
     thread = threading.Thread(target=emulate)
     thread.start()

@@ -18,17 +18,17 @@ from flows.tasks.zones import place_of_field
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.field_places import PosedField
 from pipeline.ground.map_grid import GroundGrid
-from pipeline.ground.view import RigPose, pixel_places
+from pipeline.ground.view import pixel_places
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.arrays import class_maps
 from storage.arrays.georeference import AngularGrid
 from storage.arrays.ground_maps import GroundMap, load_ground_map
+from tests.exported_run import POSE
 from tests.storage.plain_mosaic import write_values
 from tests.storage.small_archive import write_class_map
 
 Stores = tuple[StageRef, StageRef]
-POSE = RigPose(lon_deg=9.5, lat_deg=52.1, heading_deg=25.0, tilt_deg=50.0, height_m=14.0)
 SHAPE = (120, 160)
 FIELD: Any = SimpleNamespace(shape=SHAPE, geobox=None, pixel_m=None)
 LEGEND = class_maps.ClassNames(("weed", "crop"), np.array([[255, 0, 0], [0, 255, 0]], np.uint8))

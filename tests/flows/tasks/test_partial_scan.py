@@ -33,7 +33,7 @@ from pipeline.errors import BudgetError, NothingToMend, PipelineError, SettingsE
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.uniform_scans import ScanPerformance
 from storage.archive.records import read_run
-from tests.conftest import Survey, WeightsMaker, patchy_scene
+from tests.conftest import QUIET, Survey, WeightsMaker, patchy_scene
 from tests.flows.conftest import CommandLine
 from tests.prior_work import without_effects
 
@@ -121,7 +121,7 @@ def test_the_same_visit_finds_its_own_lines(visited: Path, visits: Any, survey_p
 
 def test_better_weights_read_the_lines_that_were_taken(visited: Path, visits: Any, make_weights: WeightsMaker) -> None:
     """Reprocessing makes both visits again, of the light that there is, whatever these weights would have looked at."""
-    run_reprocess(visited, Console(quiet=True), weights=make_weights(scans=RECORD, width=4))
+    run_reprocess(visited, QUIET, weights=make_weights(scans=RECORD, width=4))
     runs = [read_run(path) for path in sorted(visited.glob("runs/*"))]
     before, again = (run for run in runs if run.settings["extent"] == visits[2].receipt["settings"]["extent"])
     assert again.receipt["products"]["class_map"] != before.receipt["products"]["class_map"]
@@ -137,7 +137,7 @@ def test_of_a_field_that_nobody_knows_all_is_looked_at(survey_png: Survey, recor
     assert "extent" not in first.receipt
     assert first.receipt["settings"]["extent"] == "whole"
     again = Path(shutil.copy(recorded, tmp_path / "same.safetensors"))
-    assert run_reprocess(tmp_path / "archive", Console(quiet=True), weights=again) == 0
+    assert run_reprocess(tmp_path / "archive", QUIET, weights=again) == 0
 
 
 def test_what_is_due_is_looked_at_first(visited: Path, visits: Any, survey_png: Survey, recorded: Path) -> None:

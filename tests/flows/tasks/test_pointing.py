@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from flows.publish.receipt_table import finding_rows
 from flows.publish.survey_command import run_survey
@@ -22,6 +21,7 @@ from pipeline.planning.coverage import full_sweeps, reach_px
 from pipeline.planning.fine_pass import every_nth
 from pipeline.simulator.effects.pointing import PointingErrors
 from storage.arrays.mosaics import open_mosaic
+from tests.conftest import QUIET
 from tests.flows.conftest import FEW_BANDS
 from tests.prior_work import without_effects
 
@@ -44,7 +44,7 @@ def surveyed(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], 
         "engine": "plain",
     }
     with without_effects():
-        found = run_survey(load_settings(None, flags), Console(quiet=True)).receipt
+        found = run_survey(load_settings(None, flags), QUIET).receipt
     return json.loads(json.dumps(found)), archive
 
 

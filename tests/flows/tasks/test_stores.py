@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import xarray as xr
 import zarr
-from rich.console import Console
 
 from flows.publish.publishing import clear_raw, publish
 from flows.publish.survey_command import run_survey
@@ -30,7 +29,7 @@ from pipeline.source import References
 from storage.archive.archive import Archive
 from storage.archive.records import read_run
 from storage.arrays.cubes import open_raw_cube
-from tests.conftest import Survey
+from tests.conftest import QUIET, Survey
 
 
 def test_a_store_of_an_input_that_was_cleared_meanwhile_is_not_published(tmp_path: Path) -> None:
@@ -88,7 +87,7 @@ def test_raw_is_stored_once_and_as_uint16(tmp_path: Path) -> None:
     """Every captured line is in one array, and under no other name; no spool is left; what is derived is smaller."""
     flags = {"scene": "farm", "size": "192x160", "engine": "plain", "controls": False, "budget": "0.95", "keep": "raw"}
     bands, root = ",".join(map(str, range(5, 265, 10))), tmp_path / "archive"  # as many as light with a spectrum needs
-    published = run_survey(load_settings(None, {**flags, "bands": bands, "out": str(root)}), Console(quiet=True))
+    published = run_survey(load_settings(None, {**flags, "bands": bands, "out": str(root)}), QUIET)
     arrays = list(_arrays(root))
     named = [getattr(array.metadata, "dimension_names", None) or () for _, array in arrays]
     by_line = [one for one, names in zip(arrays, named, strict=True) if {"line", "band"} <= set(names)]

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import xarray as xr
 from PIL import Image
-from rich.console import Console
 
 from flows.publish.receipt import check_receipt
 from flows.publish.run_folder import Published
@@ -35,7 +34,7 @@ from storage.archive.archive import Archive
 from storage.arrays.class_maps import ClassMap, load_class_map
 from storage.arrays.mosaics import open_mosaic
 from storage.remote.opening import verify_archive
-from tests.conftest import CLASSES, RGB_NM, patchy_scene, random_weights
+from tests.conftest import CLASSES, QUIET, RGB_NM, patchy_scene, random_weights
 from tests.flows.conftest import FEW_BANDS, Page
 from tests.models.conftest import coarse_prediction
 from tests.receipts import comparable
@@ -73,7 +72,7 @@ def farm(tmp_path_factory: pytest.TempPathFactory) -> Done:
     out = tmp_path_factory.mktemp("farm")
     size = {"size": f"{FARM[1]}x{FARM[0]}", "bands": FEW_BANDS}
     flags = {**size, "budget": "0.9", "engine": "plain", "out": str(out), "seed": "1"}
-    return Done(run_survey(load_settings(None, flags), Console(quiet=True)), out)
+    return Done(run_survey(load_settings(None, flags), QUIET), out)
 
 
 def test_receipt_has_every_field(farm: Done) -> None:
@@ -295,7 +294,7 @@ def test_two_passes_share_components_of_rare_spectra(tmp_path: Path, monkeypatch
     size = {"size": "128x112", "camera.samples": 192, "bands": ",".join(map(str, range(4, 270, 3)))}
     flags = {"zoom": "always", "seconds": "4", "effects": "none", "accuracy": "false", "engine": "plain"}
     found = load_settings(None, {"scene": "farm", "out": str(tmp_path), **size, **flags})
-    done = Done(run_survey(found, Console(quiet=True)), tmp_path)
+    done = Done(run_survey(found, QUIET), tmp_path)
     assert done.receipt["plan"]["lines"] > 0
     assert grown[-1][0] < grown[-1][1]
     assert {cube["scores"].shape[0] for cube in done.sweeps()} == {grown[-1][1]}

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 import zarr
-from rich.console import Console
 
 import flows.tasks.prefect_tasks
 import flows.tasks.rig_field
@@ -36,13 +35,12 @@ from storage.archive.archive import Archive
 from storage.arrays.class_maps import load_class_map
 from storage.arrays.cubes import open_raw_cube
 from storage.remote.opening import verify_archive
-from tests.conftest import patchy_scene
+from tests.conftest import QUIET, patchy_scene
 from tests.pipeline.rig.camera_faults import CameraFault, FaultyRig
 from tests.pipeline.rig.in_process import InProcessRig, ManualClock
 from tests.pipeline.simulator.small_scenes import effects_on
 from tests.prior_work import without_effects
 
-QUIET = Console(quiet=True)
 SMALL: dict[str, Any] = {
     "size": "128x128",
     "bands": "40,90,150,200",

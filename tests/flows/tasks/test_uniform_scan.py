@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import xarray as xr
 from PIL import Image
-from rich.console import Console
 
 from flows.archive.plan_command import plan_content
 from flows.archive.reprocess_command import run_reprocess
@@ -19,7 +18,7 @@ from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from flows.tasks.run import SurveyRun, open_run
 from pipeline.errors import BudgetError, SettingsError, WeightsError
-from tests.conftest import Flags, Survey, WeightsMaker
+from tests.conftest import QUIET, Flags, Survey, WeightsMaker
 from tests.prior_work import with_effects
 
 RECORD = {
@@ -32,7 +31,6 @@ RECORD = {
 }
 pytestmark = pytest.mark.usefixtures("no_effects")
 
-QUIET = Console(quiet=True)
 BY_HAND: dict[str, Any] = {"budget": None, "scan_step": "2", "scan_exposure_ms": "25", "accuracy": False}
 
 

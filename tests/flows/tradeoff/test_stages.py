@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from rich.console import Console
 
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
@@ -20,6 +19,7 @@ from flows.tradeoff.command import tradeoff
 from flows.tradeoff.entries import Tradeoff, measure_tradeoff
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
+from tests.conftest import QUIET
 
 
 def errors(entry: Tradeoff, state: object) -> dict[object, float]:
@@ -81,7 +81,7 @@ def test_own_scenes_are_measured_by_their_labels(
     assert scans["stage"] == "survey"
     assert all(0 <= point["error"] <= 1 and point["cost"] > 0 for one in (parts, scans) for point in one["points"])
     asked = {"scene": scene, "weights": str(weights), "out": str(tmp_path / "a")}
-    surveyed = run_survey(load_settings(None, asked), Console(quiet=True))
+    surveyed = run_survey(load_settings(None, asked), QUIET)
     errors = {point["setting"]: point["error"] for point in parts["points"]}
     assert errors[1.0] == pytest.approx(1 - surveyed.receipt["accuracy"]["miou"], abs=1e-3)
 

@@ -34,6 +34,7 @@ from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.simulator.scenes.scene import RasterScene
+from tests.conftest import QUIET
 from tests.flows.small_fields import write_field
 
 SETTINGS = TrainingSettings(steps=1, batch=1, crop=16)
@@ -386,4 +387,4 @@ def test_scenes_that_cannot_validate_are_left_out(folder: Path, out: Path, tmp_p
 def test_exposures_that_no_look_has_are_refused(folder: Path, out: Path, darkest_ms: float):
     """Above the exposure that scenes are looked at with, or none at all: one message with the limits."""
     with pytest.raises(SettingsError, match=r"--min-exposure-ms must be above 0 and at most 100"):
-        run_train(_request(folder, out, settings=replace(SETTINGS, darkest_ms=darkest_ms)), Console(quiet=True))
+        run_train(_request(folder, out, settings=replace(SETTINGS, darkest_ms=darkest_ms)), QUIET)

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from rich.console import Console
 
 import flows.training.train_temporal as remember
 from flows.cli.model_verbs import TrainFlags, run_training
@@ -22,6 +21,7 @@ from models.training.temporal import PastPass, TemporalTraining, Visit, train_re
 from models.weights.files import describe_weights, load_reader
 from pipeline.errors import SettingsError
 from pipeline.simulator.render import USUAL
+from tests.conftest import QUIET
 
 QUICK = TemporalTraining(minutes=0.5, steps=2, batch=2, crop=64, visits=2)
 
@@ -77,7 +77,7 @@ def test_the_command_trains_judges_and_says_how(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(remember, "JUDGED_AFTER", (3,))
     out, weights = tmp_path / "farm.safetensors", shipped_weights()
     request = TemporalRequest("farm", weights, out, 1, 1, (128, 192), QUICK, "spectralzoom train")
-    record = run_remember(request, Console(quiet=True))
+    record = run_remember(request, QUIET)
     found = describe_weights(out).reader
     assert describe_weights(out).key == describe_weights(weights).key
     assert dict(found.record) == record
@@ -133,4 +133,4 @@ def test_flags_are_checked_before_the_first_visit(tmp_path: Path, flags: dict[st
     """Counts, and flags of a training of all weights."""
     asked = TrainFlags(train_temporal=shipped_weights(), **flags)
     with pytest.raises(SettingsError, match=words):
-        run_training("farm", tmp_path / "w.safetensors", asked, "", Console(quiet=True))
+        run_training("farm", tmp_path / "w.safetensors", asked, "", QUIET)
