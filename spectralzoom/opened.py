@@ -16,9 +16,8 @@ from pipeline.errors import IncompleteStoreError, NoRunError
 from pipeline.lazy import deferred
 from storage.archive.archive import Archive
 from storage.archive.keys import LATEST
-from storage.archive.records import Run, read_run
+from storage.archive.records import LINE_PRODUCTS, Run, read_run
 from storage.arrays.layout import damage_named
-from storage.readers.recordings import LINE_PRODUCTS
 from storage.remote.opening import open_archive
 
 if TYPE_CHECKING:

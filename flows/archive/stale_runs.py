@@ -7,7 +7,7 @@ from pathlib import Path, PurePath
 
 from flows.publish.receipt import is_pending
 from flows.settings.load import load_settings, of_this_version, parse_settings
-from flows.settings.survey_settings import BUILT_IN_SCENES, OF_THE_MACHINE, RECORDED, Settings
+from flows.settings.survey_settings import BUILT_IN_SCENES, OF_THE_MACHINE, RASTER, RECORDED, RIG, SIM, Settings
 from flows.tasks.open_survey import STAGES, versions
 from flows.tasks.survey_model import weights_path
 from models.weights.files import describe_weights
@@ -75,6 +75,15 @@ def from_raw_cubes(catalogue: Catalogue, run: Run, settings: Settings) -> Settin
     return load_settings(None, {name: value for name, value in {**asked, **kept}.items() if value is not None})
 
 
+def can_capture(run: Run) -> bool:
+    """Return whether the lines or pixels of a run can be captured or read again; a rig would show another day."""
+    try:
+        settings = asked_again(run, run.folder.parents[1], None)
+    except PipelineError:
+        return False
+    return settings.source != RIG and _is_there(settings)
+
+
 def _is_there(settings: Settings) -> bool:
     """Return whether the files of a recording or of a scene still exist; True for a rig."""
     if settings.source == RECORDED:
@@ -83,7 +92,7 @@ def _is_there(settings: Settings) -> bool:
         except PipelineError:
             return False
         return True
-    is_file = settings.source == "sim" and settings.scene not in BUILT_IN_SCENES
+    is_file = settings.source in (SIM, RASTER) and settings.scene not in BUILT_IN_SCENES
     return not is_file or split_variable(settings.scene)[0].exists()
 
 

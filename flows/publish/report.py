@@ -39,8 +39,8 @@ from flows.publish.receipt_table import (
 from flows.tasks.scores import error_matrix, format_false_classes
 from flows.terminal.figures import format_bytes, format_percent, format_points, format_seconds
 from pipeline.errors import visible
+from storage.archive.records import LINE_PRODUCTS
 from storage.readers.open_cubes import split_variable
-from storage.readers.recordings import LINE_PRODUCTS
 
 LEAFLET = "vendor/leaflet-1.9.4"  # leafletjs.com, BSD-2-Clause: unchanged from npm's registry
 MAP_SCRIPTS = (f"{LEAFLET}/leaflet.js", "scripts/field_map.js")

@@ -16,9 +16,8 @@ from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.camera import LineCamera
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
-from storage.archive.records import Run, Store, moment_of
+from storage.archive.records import LINE_PRODUCTS, Run, Store, moment_of
 from storage.maintenance.garbage import DAY_S, IN_USE, Removal
-from storage.readers.recordings import LINE_PRODUCTS
 
 PRESENT = {one.name: str(one.version) for one in (SIGNAL, SIGNAL_FINE)}
 

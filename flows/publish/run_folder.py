@@ -44,13 +44,12 @@ from pipeline.planning.uniform_scans import MIOU, format_scan
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table
-from storage.archive.records import RECEIPT, read_run
+from storage.archive.records import LINE_PRODUCTS, RECEIPT, read_run
 from storage.archive.run_folders import RunDraft
 from storage.archive.whole_files import to_json
 from storage.arrays.class_maps import ProbabilityStore, load_class_map
 from storage.arrays.ground_maps import load_ground_map
 from storage.arrays.mosaics import choose_bands, load_attention, open_mosaic
-from storage.readers.recordings import LINE_PRODUCTS
 
 SPECTRA_CAPTION = "Mean spectra of the classes as mapped."
 REPORT = "report.html"

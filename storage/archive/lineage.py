@@ -7,7 +7,7 @@ problem, a missing input a bare key.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from graphlib import TopologicalSorter
@@ -16,10 +16,11 @@ from typing import Any, Literal
 
 from pipeline.errors import ArchiveError, NoRunError, list_some
 from storage.archive.keys import LATEST, StageRef, in_text, published_runs, published_stores
-from storage.archive.records import Run, Store, read_run, read_store
+from storage.archive.records import LINE_PRODUCTS, Run, Store, read_run, read_store
 from storage.archive.staging import MANIFEST_NAME, check_name
 
 RAW_STAGES = ("capture", "ingest")
+RASTER_ROLE = "condense_raster"  # the stage that reads the pixels of a raster
 
 
 @dataclass(frozen=True)
@@ -45,9 +46,24 @@ class Catalogue:
         return found
 
     def inputs_of(self, uri: str) -> list[str]:
-        """Return the addresses of a store's inputs; a key without a store stays a bare key."""
+        """Return the addresses of a store's inputs; a key without a store stays a bare key.
+
+        Without a manifest, those of condensed lines are the raw lines of the runs that name them.
+        """
         store = self.stores.get(uri)
-        return [] if store is None else [self.by_key.get(given, [given])[0] for given in store.inputs]
+        if store is None or store.problem is not None:
+            return self._raw_of.get(uri, [])
+        return [self.by_key.get(given, [given])[0] for given in store.inputs]
+
+    @cached_property
+    def _raw_of(self) -> dict[str, list[str]]:
+        found: dict[str, list[str]] = {}
+        for run in self.runs:
+            for names in LINE_PRODUCTS.items():
+                raw, condensed = (in_text(run.products.get(name, "")) for name in names)
+                if raw is not None and condensed is not None:
+                    found.setdefault(condensed, []).append(raw)
+        return found
 
     def ancestors(self, uris: Iterable[str]) -> set[str]:
         """Return all inputs of these stores, direct and indirect, without themselves; missing ones as bare keys."""
@@ -89,16 +105,21 @@ class Catalogue:
                 found.setdefault(row["key"], set()).add(row["name"])
         return found
 
-    def is_only_copy(self, uri: str) -> bool:
-        """Return whether a store holds raw lines that cannot be captured again; simulated ones can."""
-        if uri.split("/")[1] not in RAW_STAGES:
-            return False
+    def is_only_copy(self, uri: str, can_capture: Callable[[Run], bool] = lambda run: run.simulated) -> bool:
+        """Return whether a store cannot be made again: lines and pixels of a run that cannot capture them again.
+
+        So is a store that was made of such lines, if they were cleared away or are missing.
+        """
+        if uri.partition("/")[2].partition("/")[0] not in RAW_STAGES and RASTER_ROLE not in self.roles(uri):
+            known = {one: self.stores.get(one) for one in self.inputs_of(uri)}
+            gone = [one for one, store in known.items() if store is None or store.cleared]
+            return any(self.is_only_copy(one, can_capture) for one in gone)
         runs, store = self.named_by(uri), self.stores.get(uri)
-        if runs and not all(run.simulated for run in runs if run.settings):
-            return True
+        if asked := [run for run in runs if run.settings]:
+            return not all(map(can_capture, asked))
         params = {} if store is None else store.params
         known = params.get("source", "sim" if "effects" in params else "rig") == "sim"
-        return not (known or any(run.simulated for run in runs))
+        return not known
 
 
 def rests_on(root: Path, refs: Iterable[StageRef]) -> list[StageRef]:

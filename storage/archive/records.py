@@ -20,6 +20,7 @@ from storage.archive.staging import MANIFEST_NAME, file_hash
 
 RECEIPT = "receipt.json"
 State = Literal["ran", "cached", "skipped", "failed"]  # of a stage of a run
+LINE_PRODUCTS = {"raw_coarse": "signal_coarse", "raw_fine": "signal_fine"}  # of a run: raw lines, and condensed ones
 RESTS_ON = "rests_on"  # in a run's manifest: address of a store or of an input of it -> SHA-256 of its manifest.json
 
 

@@ -1,7 +1,7 @@
 """Verify an archive: compare every byte with its manifest, and every manifest with its seal; and repair it.
 
-A repair removes damaged stores, and runs the surveys again that name them. Raw lines of a rig cannot be made again, nor
-can stores of another version of a stage: they stay.
+A repair removes damaged stores, and runs the surveys again that name them. Lines of a rig cannot be captured again, nor
+can stores of another version of a stage be made: they stay.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from pipeline.errors import ArchiveError, PipelineError
+from pipeline.errors import ArchiveError, IncompleteStoreError, PipelineError
 from storage.archive.archive import Archive
 from storage.archive.keys import canonical_json, without_manifest
 from storage.archive.lineage import Catalogue
@@ -122,37 +122,56 @@ class Repaired:
         return not (self.plan.hopeless or self.failed)
 
 
-def plan_repair(archive: Archive, findings: Iterable[Finding], *, versions: Mapping[str, int | str]) -> RepairPlan:
-    """Return the repairs for these findings; ``versions`` are the present ones of the stages."""
+def plan_repair(
+    archive: Archive,
+    findings: Iterable[Finding],
+    *,
+    versions: Mapping[str, int | str],
+    can_capture: Callable[[Run], bool] = lambda run: run.simulated,
+) -> RepairPlan:
+    """Return the repairs for these findings.
+
+    ``versions`` are the present ones of the stages; ``can_capture`` tells whether a run can capture its lines again.
+    """
     catalogue = Catalogue.read(archive.root)
     bad = [one.uri for one in findings if one.kind in ("broken", "missing")]
     stores = [uri for uri in bad if uri.startswith("stages/") and uri.count("/") == 2]
     hopeless = dict.fromkeys((uri for uri in bad if "/" not in uri), "its stage and settings are not known")
-    hopeless |= {uri: why for uri in stores if (why := _hopeless(catalogue, uri, versions))}
+    hopeless |= {uri: why for uri in stores if (why := _hopeless(catalogue, uri, versions, can_capture))}
+    lost = {uri for uri in stores if uri in hopeless and catalogue.inputs_of(uri) and not _is_found(archive, uri)}
+    for uri in set(stores) - set(hopeless):  # a survey would capture what it does not find
+        if (named := catalogue.named_by(uri)) and all(run.names & lost for run in named):
+            needed = ", ".join(sorted(named[0].names & lost))
+            hopeless[uri] = f"its survey needs {needed}, which is damaged: restore that first"
     broken = set(stores) - set(hopeless)
     ordered = [uri for uri in reversed(catalogue.inputs_first(broken)) if uri in catalogue.stores]
     ordered += sorted(broken - set(ordered))
     runs = {run.uri: _settings_text(run) for run in catalogue.runs if run.uri in bad}
     runs |= {uri: "" for uri in bad if uri.startswith("runs/") and uri not in runs}
-    affected = [run for run in catalogue.runs if run.uri in runs or run.names & broken]
+    affected = [run for run in catalogue.runs if (run.uri in runs or run.names & broken) and not run.names & lost]
     surveys = {text: run for run in affected if (text := _settings_text(run))}
     return RepairPlan(tuple(ordered), hopeless, tuple(surveys.values()), runs)
 
 
 def repair(
-    archive: Archive, findings: Iterable[Finding], rerun: Rerun, *, versions: Mapping[str, int | str]
+    archive: Archive,
+    findings: Iterable[Finding],
+    rerun: Rerun,
+    *,
+    versions: Mapping[str, int | str],
+    can_capture: Callable[[Run], bool] = lambda run: run.simulated,
 ) -> Repaired:
     """Remove the damaged stores, and run the surveys again that name them.
 
     ``findings`` are those of `verify_archive`. ``rerun`` runs a survey into this archive by its settings. A damaged run
     is published again under its name; the repetition of an undamaged one is removed. ``versions`` are the present ones
-    of the stages; stores of other versions stay. Raises ArchiveError: another process uses the archive, or the disk or
-    bucket refuses.
+    of the stages; stores of other versions stay, and so do those of lines that a run cannot capture again. Raises
+    ArchiveError: another process uses the archive, or the disk or bucket refuses.
     """
     with archive.in_use(alone=True) as alone:
         if not alone:
             raise ArchiveError(f"{archive.name} is in use; run verify --repair again when the survey there has ended")
-        plan = plan_repair(archive, findings, versions=versions)
+        plan = plan_repair(archive, findings, versions=versions, can_capture=can_capture)
         done = Repaired(plan)
         for uri in plan.remade:
             archive.discard(archive.ref(*uri.split("/")[1:]))
@@ -186,18 +205,28 @@ def repair(
                 repeated[text] = uri
             done.remade.append(uri)
         else:
-            words = f"its {RECEIPT} or the settings in it cannot be read: run that survey again by hand"
+            words = f"its {RECEIPT} cannot be read, or its lines are lost: run that survey again by hand"
             done.failed.setdefault(uri, words)
     for uri in set(repeated.values()) - there:
         archive.drop_run(uri)
     return done
 
 
-def _hopeless(catalogue: Catalogue, uri: str, versions: Mapping[str, int | str]) -> str:
+def _is_found(archive: Archive, uri: str) -> bool:
+    """Return whether a survey finds a store, as far as sizes tell."""
+    try:
+        return archive.find(*uri.split("/")[1:]) is not None
+    except IncompleteStoreError:
+        return False
+
+
+def _hopeless(
+    catalogue: Catalogue, uri: str, versions: Mapping[str, int | str], can_capture: Callable[[Run], bool]
+) -> str:
     """Return why a store cannot be built again; empty where it can."""
     store, stage = catalogue.stores.get(uri), uri.split("/")[1]
-    if catalogue.is_only_copy(uri):
-        return "raw lines cannot be captured again: restore them from a copy. Undamaged lines can still be read"
+    if catalogue.is_only_copy(uri, can_capture):
+        return "its lines cannot be captured again: restore it from a copy. Undamaged lines can still be read"
     if stage not in versions:
         return f"there is no stage {stage}: take it out of the archive"
     if store is not None and store.version and store.version != str(versions[stage]):

@@ -36,7 +36,7 @@ from pipeline.lazy import GeoBox
 from storage.archive.archive import Archive
 from storage.archive.keys import array_digest, store_at
 from storage.archive.manifests import check_files, manifest_sha256
-from storage.archive.records import Run, read_run, read_store
+from storage.archive.records import LINE_PRODUCTS, Run, read_run, read_store
 from storage.archive.staging import MANIFEST_NAME
 from storage.arrays.layout import array_of, open_group
 from storage.arrays.signal_cubes import RestoredCube, open_lines
@@ -61,7 +61,6 @@ from storage.remote.opening import is_archive, open_archive
 
 SAME_PERIOD = 0.01
 RESTORED = "the raw lines were deleted: these are restored from the stored signal"
-LINE_PRODUCTS = {"raw_coarse": "signal_coarse", "raw_fine": "signal_fine"}  # of a run: raw lines, and condensed ones
 
 
 def stores_of_lines(products: Mapping[str, str], is_there: Callable[[str], bool]) -> list[str]:

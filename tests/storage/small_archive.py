@@ -37,9 +37,9 @@ def small_survey(
 ) -> Small:
     """Make (or find) the stores of one survey, and a run that rests on them where ``named``."""
     light = {"scene": "farm", "seed": seed, **({"effects": ["shot"]} if simulated else {"source": "rig"})}
-    raw = _store(archive, "capture", light, [])
-    mosaic = _store(archive, "rectify", {"grid": {"height": 8, "width": 8}, "kernel": kernel}, [raw])
-    drawn = _store(archive, "segment", {"weights": "w0"}, [mosaic, raw])
+    raw = make_store(archive, "capture", light, [])
+    mosaic = make_store(archive, "rectify", {"grid": {"height": 8, "width": 8}, "kernel": kernel}, [raw])
+    drawn = make_store(archive, "segment", {"weights": "w0"}, [mosaic, raw])
     if not named:
         return Small(raw, mosaic, drawn)
     receipt = {
@@ -54,7 +54,9 @@ def small_survey(
     return Small(raw, mosaic, drawn, folder)
 
 
-def _store(archive: Archive, stage: str, params: dict[str, Any], inputs: list[StageRef]) -> StageRef:
+def make_store(archive: Archive, stage: str, params: dict[str, Any], inputs: list[StageRef]) -> StageRef:
+    """Make (or find) one store of a file."""
+
     def build(path: Path) -> None:
         (path / "data.bin").write_bytes(json.dumps([stage, params]).encode() * 40)
 

@@ -18,10 +18,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 import storage.readers.recordings
+from flows.archive.commands import run_verify
 from flows.archive.reprocess_command import run_reprocess
 from flows.publish.run_folder import Published, load_receipt
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
+from flows.terminal.processes import DONE, FAILED
 from models.weights.files import save_weights
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED, block_means
@@ -42,6 +44,7 @@ from tests.flows.tasks.test_survey_rig import emulated
 from tests.flows.tasks.test_uniform_scan import RECORD
 from tests.prior_work import without_effects
 from tests.storage.readers.test_recordings import write_envi_cube
+from tests.storage.small_archive import flip
 
 __all__ = ["command_line"]
 pytestmark = pytest.mark.usefixtures("no_effects")
@@ -400,6 +403,23 @@ def test_a_recording_whose_files_moved_is_reprocessed(
     again = load_receipt(Archive.open(archive).runs()[-1])
     fresh = survey_sweeps(tmp_path / "b", tmp_path / "elsewhere" / "scan.hdr", weights=str(other))
     assert digest_of_map(archive, again) == digest_of_map(tmp_path / "b", fresh.receipt)
+
+
+def test_a_repair_reads_a_recording_again_while_its_files_are_there(
+    tmp_path: Path, pushbroom: Pushbroom, weights: Path
+) -> None:
+    """Without them the damaged signal, whose raw lines were cleared, is the only copy: it stays as it is."""
+    folder, _ = pushbroom
+    survey_sweeps(tmp_path / "a", folder / "scan.hdr", weights=str(weights))
+    (chunk, *_) = sorted((tmp_path / "a").glob("stages/condense/*/*.zarr/scores/c/0/0/0"))
+    flip(chunk, 40)
+    rotten = chunk.read_bytes()
+    folder.rename(tmp_path / "elsewhere")
+    assert run_verify(tmp_path / "a", QUIET, remake=True) == FAILED
+    assert chunk.read_bytes() == rotten
+    (tmp_path / "elsewhere").rename(folder)
+    assert run_verify(tmp_path / "a", QUIET, remake=True) == DONE
+    assert {finding.kind for finding in verify_archive(Archive.open(tmp_path / "a"))} == {"whole"}
 
 
 def test_labels_judge_the_map_of_a_recording(tmp_path: Path, pushbroom: Pushbroom, weights: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from pipeline.errors import ArchiveError, SceneError
 from storage.archive.archive import Archive
 from storage.maintenance.verification import Repaired, plan_repair, repair
 from storage.remote.opening import verify_archive
-from tests.storage.small_archive import Small, flip, settings, small_survey
+from tests.storage.small_archive import Small, flip, make_store, settings, small_survey
 
 VERSIONS = {"capture": 1, "rectify": 1, "segment": 1}
 
@@ -98,13 +99,43 @@ def test_raw_lines_of_a_rig_stay_with_all_that_was_made_of_them(archive: Archive
     flip(small.raw.path / "data.bin")
     done = _repair(archive, lambda settings: pytest.fail("nothing to run"))
     assert not done.complete
-    assert "raw lines cannot be captured again" in done.plan.hopeless[small.raw.uri]
+    assert "its lines cannot be captured again" in done.plan.hopeless[small.raw.uri]
     assert _moments(archive) == before
     assert _bad(archive) == [small.raw.uri]
     flip(small.map.path / "data.bin")
     done = _repair(archive, lambda settings: _run(small_survey(archive, simulated=False)))
     assert done.remade == [small.map.uri]
     assert _bad(archive) == [small.raw.uri]
+
+
+@pytest.mark.parametrize("how", ["flip", "short", "manifest", "gone"])
+def test_condensed_lines_whose_raw_lines_were_cleared_stay(archive: Archive, how: str) -> None:
+    """They are the only copy. A map is made of them as long as a survey finds them: it never captures another day."""
+    light, asked = {"scene": "farm", "source": "rig"}, settings(source="rig")
+    raw = make_store(archive, "capture", light, [])
+    signal = make_store(archive, "condense", {}, [raw])
+    drawn = make_store(archive, "segment", {}, [signal])
+    products = {"raw_coarse": raw.uri, "signal_coarse": signal.uri, "class_map": f"{drawn.uri}/class_map.zarr"}
+    with archive.new_run("farm") as draft:
+        draft.write_file("receipt.json", json.dumps({"settings": asked, "products": products}))
+        draft.publish(settings=asked, rests_on=archive.manifest_hashes([drawn]))
+    archive.clear(raw)
+    flip(drawn.path / "data.bin")
+    if how == "gone":
+        shutil.rmtree(signal.path)
+    elif how == "short":
+        (signal.path / "data.bin").write_bytes(b"x")
+    else:
+        flip(signal.path / {"flip": "data.bin", "manifest": "manifest.json"}[how], at=30)
+    before = {path: path.read_bytes() for path in (archive.root / "stages").rglob("*.*")}
+    again = Mock(side_effect=lambda asked: make_store(archive, "segment", {}, [signal]) and "runs/x")
+    done = repair(archive, verify_archive(archive), again, versions={**VERSIONS, "condense": 1})
+    assert "its lines cannot be captured again" in done.plan.hopeless[signal.uri]
+    assert done.remade == ([drawn.uri] if how == "flip" else [])
+    assert again.called == (how == "flip")
+    if how != "flip":
+        assert drawn.uri in done.plan.hopeless
+        assert before == {path: path.read_bytes() for path in (archive.root / "stages").rglob("*.*")}
 
 
 @pytest.mark.parametrize("error", [SceneError("no scene farm.png; give the file"), KeyboardInterrupt()])
