@@ -18,7 +18,7 @@ from storage.archive.records import Run, Store
 from storage.readers.open_cubes import split_variable
 from storage.readers.recordings import find_raw_cubes, stores_of_lines
 
-OF_THE_SURVEY = ("labels", "weights", "memory", "accuracy", "prior")  # settings that raw cubes do not contain
+OF_THE_SURVEY = ("labels", "weights", "memory", "accuracy", "controls", "prior", "keep")  # not in raw cubes
 
 
 def called(run: Run) -> str:

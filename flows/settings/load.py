@@ -125,10 +125,10 @@ TABLES = {
     if isinstance(one.kind, type) and dataclasses.is_dataclass(one.kind)
 }
 
-OF_THE_PLAN = ("zoom", *UNIFORM, *OF_TWO_PASSES, "macs", "scan_exposure_ms", "extent")
+OF_THE_PLAN = ("zoom", *UNIFORM, *OF_TWO_PASSES, "macs", "scan_exposure_ms", "extent", "kept_bytes")
 OF_THE_RUN = (
     *("camera", "cost", "rig", "pose", "map", "zones", "resampling", "pointing_px", "seed", "sky", "weights"),
-    "unknown",
+    *("unknown", "expected_loss", "signal"),
 )
 OF_ZOOM = ("seconds", "scan_step")  # settings of a uniform scan that a first pass has too
 BUILT_IN_WEIGHTS = "farm"

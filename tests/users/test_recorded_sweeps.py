@@ -205,11 +205,13 @@ def test_lines_of_a_run_have_the_date_of_its_visit(full_scan: FullScan) -> None:
 
 
 def test_a_repeated_run_has_its_reference(tmp_path: Path, survey_png: Survey, make_weights: WeightsMaker) -> None:
-    """That of two exposures has the camera's own for the full scan, as when it was captured."""
+    """That of two exposures has the camera's own for the full scan, as when it was captured, and what it was asked."""
     asked: dict[str, Any] = {"weights": str(make_weights(scans=RECORD)), "zoom": "always", "seconds": "15"}
-    run = survey_png(tmp_path / "sim", budget=None, keep="raw", **NARROW, **asked)
+    own = {"expected_loss": 0, "signal.step": 2}
+    run = survey_png(tmp_path / "sim", budget=None, keep="raw", **NARROW, **asked, **own)
     assert run.receipt["settings"]["coarse_exposure_ms"] < 100
     again = survey_sweeps(tmp_path / "again", run.folder).receipt
+    assert [again["settings"][name] for name in ("expected_loss", "signal")] == [0, run.receipt["settings"]["signal"]]
     assert again["recording"]["full_scan_s"] == run.receipt["savings"]["capture_s"]["full"]
     scan = survey_sweeps(tmp_path / "scan", run.folder, seconds=15).receipt  # of shorter exposures
     assert scan["scans"]["taken"]["seconds"] == pytest.approx(scan["savings"]["capture_s"]["done"])
@@ -401,6 +403,7 @@ def test_a_recording_whose_files_moved_is_reprocessed(
     other = make_weights(dim=24)
     assert run_reprocess(archive, QUIET, weights=other) == 0
     again = load_receipt(Archive.open(archive).runs()[-1])
+    assert again["settings"]["keep"] == "raw"
     fresh = survey_sweeps(tmp_path / "b", tmp_path / "elsewhere" / "scan.hdr", weights=str(other))
     assert digest_of_map(archive, again) == digest_of_map(tmp_path / "b", fresh.receipt)
 
