@@ -3,8 +3,9 @@
     from flows.settings.parameters import SurveySettings
     from flows.survey import survey
 
-    survey(SurveySettings(scene="farm", seconds=25))                              # once, now
-    survey.serve("north", cron="0 6 * * *", parameters={"settings": {...}})       # every day at six
+    if __name__ == "__main__":  # Prefect imports the program of a served flow again for every run
+        survey(SurveySettings(scene="farm", seconds=25))                          # once, now
+        survey.serve("north", cron="0 6 * * *", parameters={"settings": {...}})   # every day at six
 
 Every step is a task that takes and returns addresses of stores, not arrays. Existing stores are not computed again, so
 that a stopped survey resumes. `survey.fn` runs the same steps without a server.

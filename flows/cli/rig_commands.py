@@ -24,7 +24,7 @@ from flows.cli.app import AsJson, OutFolder, Switch, stderr
 from flows.cli.simulate_command import open_simulation
 from flows.cli.survey_verbs import NO_RENDERING_FLAGS, RenderingFlags, by_setting
 from flows.settings.documents import as_toml
-from flows.settings.load import load_settings
+from flows.settings.load import anchor_paths, load_settings
 from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
 from flows.tasks.stages.effects import choose_effects, chosen_effects
 from flows.terminal.processes import DONE, FAILED, PARTLY
@@ -230,15 +230,15 @@ def _ending(event: threading.Event) -> Iterator[threading.Event]:
 
 def _write_survey(out: Path, settings: Settings, table: dict[str, object]) -> None:
     """Write the settings of a survey of the emulated rig, with its table [rig]."""
-    names = ("scene", "size", "day", "hour", "bands", "wavelengths", "seed", "effects", "tol", "source")
-    wanted = {name: getattr(settings, name) for name in names}
+    names = ("size", "day", "hour", "interest", "bands", "wavelengths", "seed", "effects", "tol", "source")
+    described = anchor_paths(settings.to_dict(), Path.cwd())
+    wanted = {name: described[name] for name in ("scene", "labels")} | {name: getattr(settings, name) for name in names}
     wanted |= {
         "size": None if settings.size is None else f"{settings.size[0]}x{settings.size[1]}",
         "tol": str(settings.tol),
         "source": "rig",
     }
     given = [f"{key} = {as_toml(value)}" for key, value in wanted.items() if value is not None]
-    described = settings.to_dict()
     parts = {name: cast("dict[str, object]", described[name]) for name in EMULATED}
     known = {name: {key: one for key, one in part.items() if one is not None} for name, part in parts.items()}
     tables = [_toml_table(name, values) for name, values in {**known, "rig": table}.items()]

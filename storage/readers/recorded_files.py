@@ -126,7 +126,7 @@ def with_bits(
         most = int(lines.max(initial=0, where=good & (lines != void)))
         file = reference_files(cube.folder / cube.name, stated)["white"]
         white = cube.source.white if file is None else load_frame(file)[0]
-        if white is not None:
+        if white is not None and white.shape == cube.source.shape[1:]:  # `find_references` refuses others
             most = max(most, int(white[np.isfinite(white) & good].max(initial=0)))
         full = camera.full_scale_dn * max(camera.samples // cube.source.shape[1], 1)
         needed = (most * camera.full_scale_dn // full).bit_length()

@@ -29,7 +29,7 @@ AT_ONCE = 8  # transfers in parallel
 PART_BYTES = 8 << 20  # of the parts of a large object
 RETRIES = 6  # of one request, in about ten seconds
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-_ADDRESS = re.compile(r"s3:/+([^/]*)/*(.*)")  # also as a path has it, which makes one slash of two
+_ADDRESS = re.compile(r"s3:/{1,2}([^/]*)/*(.*)")  # also as a path has it, which makes one slash of two
 _PART = re.compile(r"[A-Za-z0-9_.=+-]+")
 _MEANINGS = (  # parts of a store's answers: their meaning and what to do
     (("NoSuchBucket",), "there is no such bucket: create it, or check its name, AWS_REGION and AWS_ENDPOINT_URL"),

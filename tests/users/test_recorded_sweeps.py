@@ -304,6 +304,7 @@ POSITIONS = {"fewer rows": range(95), "lines far apart": range(0, 9 * 96, 9)}  #
 BAD = {  # flags, and the message
     "fewer rows": ("", "has 95 rows for scan, fewer than its 96 lines; give one row for each line"),
     "lines far apart": ("", "the lines of the recording lie 9 px .* apart, and a uniform scan may have up to 8 px"),
+    "a frame of other bands": ("--white two.hdr", r"is \(64, 2\) \(sample, band\), the cube \(64, 3\); give one"),
     "frames exchanged": ("--dark scan.white.hdr --white scan.dark.hdr", "is nowhere brighter than its dark frame"),
     "no such table": ("--pointing nowhere.csv", "there is no pointing table .*nowhere.csv"),
     "no such recording": ("--sweeps nowhere", "there is no recording nowhere; check the name"),
@@ -325,6 +326,7 @@ def test_bad_input_gives_one_message(
     """By the command line: one message with value and remedy, no traceback, and no archive."""
     (folder, _), (flags, message) = pushbroom, BAD[mistake]
     monkeypatch.chdir(folder)
+    write_envi_cube(folder / "two", np.full((1, 64, 2), 3500, np.uint16), ".img", wavelength="{640, 550}")
     if mistake in POSITIONS:
         table(folder, "position_px", [str(position) for position in POSITIONS[mistake]])
     asked = ["--engine", "plain", *([] if "--out" in flags else ["--out", "a"]), "--weights", weights]

@@ -10,13 +10,15 @@ import threading
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 import serial
 
-from flows.cli.rig_commands import emulated_settings, run_emulate
-from flows.settings.load import load_settings
+from flows.cli.rig_commands import _write_survey, emulated_settings, run_emulate
+from flows.cli.survey_verbs import RenderingFlags
+from flows.settings.load import SURVEY, TABLES, load_settings
 from pipeline.rig.emulator.emulated_rig import FastClock, ServedRig
 from pipeline.rig.pro_mode import Command
 from tests.conftest import QUIET
@@ -119,7 +121,8 @@ def test_a_driver_that_cannot_be_imported_is_refused(command_line: CommandLine, 
 def test_emulated_rig_is_checked_by_the_file_that_it_writes(command_line: CommandLine, tmp_path: Path) -> None:
     """The file is a survey's settings of the same rig: both devices are where it says, until the emulation ends."""
     file = tmp_path / "emulated.toml"
-    wanted: dict[str, object] = {"size": "64x48", "bands": "40,90", "effects": "all", "seed": "3"}
+    wanted: dict[str, object] = {"scene": "scouting", "size": "64x48", "bands": "40,90", "effects": "all", "seed": "3"}
+    wanted |= {"interest": "0.5", "day": "150", "hour": "9.5", "sky.light_fraction": "0.4"}
     wanted |= {"rig.mirror_axes": "y,-x", "camera.samples": "320", "detector.noiseless": True, "optics.focus_m": 40.0}
     settings = emulated_settings(None, wanted)
     ended, codes = threading.Event(), []
@@ -136,15 +139,25 @@ def test_emulated_rig_is_checked_by_the_file_that_it_writes(command_line: Comman
         assert written.simulated_rig == settings.simulated_rig
         rig = written.rig
         assert (rig.provenance, rig.mirror_axes) == ("emulated", "y,-x")
-        told = tomllib.loads(file.read_text())
-        expected = {"scene": "farm", "size": "64x48", "bands": [40, 90], "seed": 3, "source": "rig"}
-        assert {key: told[key] for key in expected} == expected
+        of_the_light = {one.name for one in fields(RenderingFlags)} & (set(SURVEY) - set(TABLES))
+        assert {"seed", "interest", "hour"} <= of_the_light
+        for name in ("scene", "size", *of_the_light):
+            assert getattr(written, name) == getattr(settings, name)
+        assert written.source == "rig"
         assert command_line("rig", "check", file).code == 0
     finally:
         ended.set()
         thread.join()
     assert codes == [0]
     assert command_line("rig", "check", file).code == 1
+
+
+def test_emulated_scene_is_found_from_every_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Relative names of a file start at its folder, those of flags at the current one."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "there").mkdir()
+    _write_survey(tmp_path / "there" / "x.toml", load_settings(None, {"scene": "x.png", "source": "sim"}), {})
+    assert load_settings(tmp_path / "there" / "x.toml").scene == str(tmp_path / "x.png")
 
 
 def test_emulation_ends_in_order() -> None:

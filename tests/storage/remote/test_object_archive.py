@@ -246,7 +246,7 @@ def test_a_published_store_opens_with_plain_zarr(bucket: str, machine: Machine) 
     np.testing.assert_array_equal(group["values"][:], np.eye(40))
 
 
-@pytest.mark.parametrize("text", ["s3://", "s3://ok/../x", "s3://bucket/a//b", "s3://bucket/a b"])
+@pytest.mark.parametrize("text", ["s3://", "s3:///bucket", "s3://ok/../x", "s3://bucket/a//b", "s3://bucket/a b"])
 def test_addresses_that_are_none_are_refused(text: str) -> None:
     """A prefix is of plain letters and cannot climb."""
     assert is_remote(text)
