@@ -536,6 +536,11 @@ def open_object_archive(text: str | Path, *, create: bool = True, write: bool = 
 def _find_mark(objects: Objects, *, create: bool) -> None:
     """Check the mark of an archive, or write it with ``create``; refuse a store without conditional puts."""
     name = objects.place.url
+    if create and objects.read(MARK) is None and objects.listing("stages") and objects.read(MARK) is None:
+        raise ArchiveError(
+            f"{name} has stages and no {MARK}: this is no archive of a bucket, maybe a copy of one in a folder, whose "
+            "stores lie otherwise; choose another --out"
+        )
     if create and objects.create(MARK, MARK_TEXT):
         if objects.create(MARK, MARK_TEXT):
             raise ArchiveError(

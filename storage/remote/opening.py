@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from pipeline.errors import ArchiveError
 from storage.archive.archive import Archive
 from storage.maintenance.verification import Finding, Progress, verify_everything
 from storage.remote.object_archive import MARK, ObjectArchive, open_object_archive
@@ -14,10 +15,16 @@ def open_archive(address: str | Path, *, create: bool = True, write: bool = True
     """Open the archive at a folder or ``s3://bucket/prefix``, or create it with ``create``.
 
     Raises ArchiveError: the path is a file, is missing, or cannot be written to (``write``), or obstore is not
-    installed; SettingsError: the address on S3 is not valid.
+    installed, or the objects of a bucket were copied to a folder or the other way round; SettingsError: the address on
+    S3 is not valid.
     """
     if is_remote(address):
         return open_object_archive(address, create=create, write=write)
+    if (Path(address) / MARK).is_file():
+        raise ArchiveError(
+            f"{address} is a copy of the objects of a bucket, where stores lie otherwise than in a folder: put them "
+            "back into a bucket to use them"
+        )
     return Archive.open(address, create=create, write=write)
 
 

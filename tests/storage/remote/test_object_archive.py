@@ -304,6 +304,22 @@ def test_what_a_store_answers_is_told_in_words(bucket: str, answer: str, words: 
         raise GenericError(answer)
 
 
+def test_copies_between_bucket_and_folder_are_no_archives(bucket: str, machine: Machine, tmp_path: Path) -> None:
+    """Stores lie otherwise there: nothing is verified, repaired or continued in such a copy."""
+    ref, _ = make(machine(FIRST))
+    objects = Objects(parse_place(bucket))
+    for path in objects.listing():
+        (tmp_path / "copy" / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "copy" / path).write_bytes(objects.read(path) or b"")
+    with pytest.raises(ArchiveError, match="is a copy of the objects of a bucket"):
+        open_archive(tmp_path / "copy", create=False)
+    other = Objects(parse_place(f"{bucket}-folder"))
+    other.create(f"{ref.uri}/manifest.json", b"{}")
+    with pytest.raises(ArchiveError, match=r"has stages and no archive\.json"):
+        open_archive(f"{bucket}-folder")
+    assert other.read("archive.json") is None
+
+
 @pytest.mark.parametrize("create", [True, False])
 def test_what_has_another_mark_is_no_archive(bucket: str, machine: Machine, create: bool) -> None:
     """Such as a network's page for guests, which answers everything, or an archive of a later version."""
