@@ -51,45 +51,45 @@ def survey(settings: SurveySettings, capture_deployment: str | None = None) -> R
     ------
     PipelineError : what is wrong, what is allowed, and what to do.
     """
-    plan = plan_capture(settings)
-    if isinstance(plan, RunRef):  # nothing has to be captured
-        return plan
-    plan.capture_deployment = capture_deployment
-    with plan.at_work():
-        draw_class_map(plan)
-        return clear_raw(plan, judge(plan, publish(plan)))
+    opened = plan_capture(settings)
+    if isinstance(opened, RunRef):  # nothing has to be captured
+        return opened
+    opened.capture_deployment = capture_deployment
+    with opened.at_work():
+        draw_class_map(opened)
+        return clear_raw(opened, judge(opened, publish(opened)))
 
 
-def draw_class_map(plan: OpenSurvey) -> None:
-    """Run the stages from the first pass to the class map, and store their products in the plan."""
-    if plan.is_map:  # no capture
-        mosaic = condense_raster(plan)
-        class_map = segment(plan, mosaic, score(plan, mosaic))
+def draw_class_map(opened: OpenSurvey) -> None:
+    """Run the stages from the first pass to the class map, and store their products in it."""
+    if opened.is_map:  # no capture
+        mosaic = condense_raster(opened)
+        class_map = segment(opened, mosaic, score(opened, mosaic))
     else:
-        mosaic, class_map = _draw_captured(plan)
-    if plan.on_the_ground:
-        ground(plan, class_map, mosaic)
+        mosaic, class_map = _draw_captured(opened)
+    if opened.on_the_ground:
+        ground(opened, class_map, mosaic)
 
 
-def _draw_captured(plan: OpenSurvey) -> tuple[StageRef, StageRef]:
+def _draw_captured(opened: OpenSurvey) -> tuple[StageRef, StageRef]:
     """Capture the field in one or two passes, and segment it; return mosaic and class map."""
-    effects = choose_effects(plan)
-    signal = captured_signal(plan, "coarse", effects)
-    seams = register_coarse(plan, signal) if plan.registers else None
-    mosaic = first_mosaic(plan, signal, locate(plan, signal, seams), seams)
-    request = score(plan, mosaic)
-    if plan.goes_back(request):  # second pass
-        signal = captured_signal(plan, "fine", request, effects)
-        seams = register_fine(plan, signal, mosaic) if plan.registers else None
-        mosaic = rectify_fine(plan, signal, seams)
-    return mosaic, segment(plan, mosaic, request)
+    effects = choose_effects(opened)
+    signal = captured_signal(opened, "coarse", effects)
+    seams = register_coarse(opened, signal) if opened.registers else None
+    mosaic = first_mosaic(opened, signal, locate(opened, signal, seams), seams)
+    request = score(opened, mosaic)
+    if opened.goes_back(request):  # second pass
+        signal = captured_signal(opened, "fine", request, effects)
+        seams = register_fine(opened, signal, mosaic) if opened.registers else None
+        mosaic = rectify_fine(opened, signal, seams)
+    return mosaic, segment(opened, mosaic, request)
 
 
-def judge(plan: OpenSurvey, run: RunRef) -> RunRef:
+def judge(opened: OpenSurvey, run: RunRef) -> RunRef:
     """Evaluate a published class map if there are labels; this is not part of the survey's cost."""
     if not run.pending:
         return run
-    return as_task(add_accuracy, "add_accuracy")(plan, run, evaluate(plan, *plan.products.judged))
+    return as_task(add_accuracy, "add_accuracy")(opened, run, evaluate(opened, *opened.products.judged))
 
 
 @flow(name="capture", flow_run_name="capture-{settings.name_of_run}", validate_parameters=True, persist_result=False)
@@ -114,15 +114,15 @@ def capture(
     -------
     The address of the stored sweeps.
     """
-    plan = plan_capture(settings if rig_file is None else settings.with_rig_of(rig_file))
-    if isinstance(plan, RunRef):
-        return plan.uri
-    with plan.at_work():
+    opened = plan_capture(settings if rig_file is None else settings.with_rig_of(rig_file))
+    if isinstance(opened, RunRef):
+        return opened.uri
+    with opened.at_work():
         parts = [address.split("/") for address in inputs or []]
         if any(len(part) != 3 for part in parts) or (sweeps == "fine" and len(parts) != 2):
             raise SettingsError(
                 f"inputs = {inputs}: expected addresses stages/STAGE/KEY of stores; a fine pass needs those of its "
                 "scores and of its effects"
             )
-        known = [plan.run.archive.ref(*part[1:]) for part in parts]
-        return capture_pass(plan, sweeps, *(known or [choose_effects(plan)])).uri
+        known = [opened.run.archive.ref(*part[1:]) for part in parts]
+        return capture_pass(opened, sweeps, *(known or [choose_effects(opened)])).uri

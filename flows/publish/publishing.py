@@ -33,68 +33,68 @@ NOT_ASKED = ("notes", "out", "engine", *OF_THE_MACHINE)  # settings without an e
 WIDTH_PX = 800  # of the picture in the text
 
 
-def publish(plan: OpenSurvey) -> RunRef:
+def publish(survey: OpenSurvey) -> RunRef:
     """Publish the run of a class map, with its accuracy if that is in the archive; in a flow as a task."""
-    return as_task(_publish, "publish")(plan, *plan.products.values())
+    return as_task(_publish, "publish")(survey, *survey.products.values())
 
 
-def _publish(plan: OpenSurvey, *products: StageRef) -> RunRef:
-    stopped = _stopped_run(plan)
+def _publish(survey: OpenSurvey, *products: StageRef) -> RunRef:
+    stopped = _stopped_run(survey)
     if stopped is not None:
-        plan.observer.note(f"published before: {stopped.folder}; its accuracy is added to it")
+        survey.observer.note(f"published before: {stopped.folder}; its accuracy is added to it")
         return stopped
-    judged = plan.run.scene.labelled and plan.run.settings.accuracy
-    if judged and _accuracy_is_stored(plan):
-        plan(evaluate.name, *plan.products.judged)
+    judged = survey.run.scene.labelled and survey.run.settings.accuracy
+    if judged and _accuracy_is_stored(survey):
+        survey(evaluate.name, *survey.products.judged)
         judged = False
-    _clear_first_mosaic(plan)
-    published = publish_run(plan)
+    _clear_first_mosaic(survey)
+    published = publish_run(survey)
     if judged:
-        plan.observer.note(f"published: {published.folder}; accuracy follows")
-    _show_artifact(plan, published)
+        survey.observer.note(f"published: {published.folder}; accuracy follows")
+    _show_artifact(survey, published)
     return _ref(published, pending=judged)
 
 
-def add_accuracy(plan: OpenSurvey, run: RunRef, accuracy: StageRef) -> RunRef:
+def add_accuracy(survey: OpenSurvey, run: RunRef, accuracy: StageRef) -> RunRef:
     """Replace a published run by one with its accuracy."""
-    draft = plan.run.archive.extend_run(run.name)
+    draft = survey.run.archive.extend_run(run.name)
     assert draft is not None
     with draft:
-        published = extend_with_accuracy(plan, draft, accuracy)
-    _show_artifact(plan, published)
+        published = extend_with_accuracy(survey, draft, accuracy)
+    _show_artifact(survey, published)
     return _ref(published)
 
 
-def clear_raw(plan: OpenSurvey, run: RunRef) -> RunRef:
+def clear_raw(survey: OpenSurvey, run: RunRef) -> RunRef:
     """Compare and clear the raw lines that the settings do not keep; in a flow as a task."""
-    if plan.run.settings.keep != KEEP_SIGNAL or not plan.products.there(*PASSES):
+    if survey.run.settings.keep != KEEP_SIGNAL or not survey.products.there(*PASSES):
         return run
-    return as_task(_clear_raw, "clear_raw")(plan, run)
+    return as_task(_clear_raw, "clear_raw")(survey, run)
 
 
-def _clear_raw(plan: OpenSurvey, run: RunRef) -> RunRef:
-    archive, passes = plan.run.archive, [plan.products[name] for name in PASSES if name in plan.products]
-    if not plan.products.signals or any(archive.find(raw.stage, raw.key) is None for raw in passes):
+def _clear_raw(survey: OpenSurvey, run: RunRef) -> RunRef:
+    archive, passes = survey.run.archive, [survey.products[name] for name in PASSES if name in survey.products]
+    if not survey.products.signals or any(archive.find(raw.stage, raw.key) is None for raw in passes):
         return run  # cleared before
     archive.refresh()
     catalogue = Catalogue.read(archive.root)
     others = [one for raw in passes for one in catalogue.named_by(raw.uri) if not is_outlived(one, archive.now())]
     kept = f"{others[0].uri} keeps them" if others else None
-    why = kept or raw_differs(passes, plan.products.signals[0], plan.run.camera)
+    why = kept or raw_differs(passes, survey.products.signals[0], survey.run.camera)
     if any(archive.find(raw.stage, raw.key) is None for raw in passes):
         return run  # cleared meanwhile, by another survey
     if why is not None:
-        plan.observer.note(f"raw lines stay: {why}")
+        survey.observer.note(f"raw lines stay: {why}")
         return run
     for raw in passes:
         archive.clear(raw, wait=False)
     return run
 
 
-def _clear_first_mosaic(plan: OpenSurvey) -> None:
+def _clear_first_mosaic(survey: OpenSurvey) -> None:
     """Clear the mosaic of the first pass, whose lines are in that of both passes."""
-    archive, first = plan.run.archive, plan.products.get("rectify")
-    if first is None or "rectify_fine" not in plan.products or plan.registers:  # fine sweeps are registered on it
+    archive, first = survey.run.archive, survey.products.get("rectify")
+    if first is None or "rectify_fine" not in survey.products or survey.registers:  # fine sweeps are registered on it
         return
     archive.refresh()
     if not any(run.products.get("mosaic", "").startswith(first.uri) for run in Catalogue.read(archive.root).runs):
@@ -105,45 +105,45 @@ def _ref(published: Published, *, pending: bool = False) -> RunRef:
     return RunRef(f"runs/{published.folder.name}", published.folder, published.captured_again, pending)
 
 
-def _accuracy_is_stored(plan: OpenSurvey) -> bool:
+def _accuracy_is_stored(survey: OpenSurvey) -> bool:
     try:
         one = STAGES[evaluate.name]
-        return one.find(plan.run.archive, one.wants(plan.run, *plan.products.judged)) is not None
+        return one.find(survey.run.archive, one.wants(survey.run, *survey.products.judged)) is not None
     except Exception:  # the evaluation reports the error, after the run is published
         return False
 
 
-def _stopped_run(plan: OpenSurvey) -> RunRef | None:
+def _stopped_run(survey: OpenSurvey) -> RunRef | None:
     """Return the run that the same survey published before it was stopped; None without one, or if it is locked."""
-    for folder in reversed(plan.run.archive.runs()):
-        if not _is_stopped(plan, read_run(folder)):
+    for folder in reversed(survey.run.archive.runs()):
+        if not _is_stopped(survey, read_run(folder)):
             continue
-        draft = plan.run.archive.extend_run(folder.name, wait=False)
+        draft = survey.run.archive.extend_run(folder.name, wait=False)
         if draft is not None:
             draft.abandon()  # it was free
-            if _is_stopped(plan, read_run(folder)):  # and not judged since
+            if _is_stopped(survey, read_run(folder)):  # and not judged since
                 return RunRef(f"runs/{folder.name}", folder, pending=True)
     return None
 
 
-def _is_stopped(plan: OpenSurvey, run: Run) -> bool:
+def _is_stopped(survey: OpenSurvey, run: Run) -> bool:
     if run.problem is not None or not is_pending(run.receipt):
         return False
-    stores = {name: one.key for name, one in plan.records.items()}
+    stores = {name: one.key for name, one in survey.records.items()}
     found = {str(row.get("name")): row.get("key") for row in run.stages}
     asked = (
         canonical_json(json.loads(to_json({name: value for name, value in given.items() if name not in NOT_ASKED})))
-        for given in (run.settings, asked_settings(plan.run))
+        for given in (run.settings, asked_settings(survey.run))
     )
     return found == stores and len(set(asked)) == 1
 
 
-def _show_artifact(plan: OpenSurvey, published: Published) -> None:
+def _show_artifact(survey: OpenSurvey, published: Published) -> None:
     """Create the artifact of a run in the present flow: score, picture, findings, and where its files are."""
     if not inside_flow():
         return
-    letters = (letter if letter.isalnum() and letter.isascii() else "-" for letter in plan.run.name.lower())
-    key, where = "".join(letters).strip("-"), f"{plan.run.archive.name}/runs/{published.folder.name}"
+    letters = (letter if letter.isalnum() and letter.isascii() else "-" for letter in survey.run.name.lower())
+    key, where = "".join(letters).strip("-"), f"{survey.run.archive.name}/runs/{published.folder.name}"
     with suppress(Exception):  # without a server the archive has everything
         text = render_markdown(
             "survey.md",

@@ -95,77 +95,77 @@ def _due_time() -> datetime | None:
     return datetime.fromisoformat(flow_run.expected_start_time.isoformat()).replace(microsecond=0)
 
 
-def capture_pass(plan: OpenSurvey, sweeps: str, *inputs: StageRef) -> StageRef:
+def capture_pass(survey: OpenSurvey, sweeps: str, *inputs: StageRef) -> StageRef:
     """Return the stored sweeps of a pass, ``coarse`` or ``fine``; capture them if the archive lacks them.
 
-    The deployment that the plan names captures them, else this machine. Raises SettingsError: there is no such pass;
+    The deployment that the survey names captures them, else this machine. Raises SettingsError: there is no such pass;
     RigError, ArchiveError: the deployment failed.
     """
     if sweeps not in PASSES:
         raise SettingsError(f"there is no pass {sweeps!r}: expected {' or '.join(PASSES)}")
-    if plan.capture_deployment is not None:
-        as_task(_captured_elsewhere, "capture_elsewhere")(plan, sweeps, *inputs)
-    plan.hold_rig(PASSES[sweeps], *inputs)
-    return PASSES[sweeps](plan, *inputs)
+    if survey.capture_deployment is not None:
+        as_task(_captured_elsewhere, "capture_elsewhere")(survey, sweeps, *inputs)
+    survey.hold_rig(PASSES[sweeps], *inputs)
+    return PASSES[sweeps](survey, *inputs)
 
 
-def captured_signal(plan: OpenSurvey, sweeps: str, *inputs: StageRef) -> StageRef:
+def captured_signal(survey: OpenSurvey, sweeps: str, *inputs: StageRef) -> StageRef:
     """Return the condensed sweeps of a pass; capture only what the archive lacks. Raises as `capture_pass`."""
-    condense, stage, archive = CONDENSED[sweeps], PASSES[sweeps], plan.run.archive
-    before = plan.products.there("capture_coarse") if sweeps == "fine" else []
+    condense, stage, archive = CONDENSED[sweeps], PASSES[sweeps], survey.run.archive
+    before = survey.products.there("capture_coarse") if sweeps == "fine" else []
     found = None
     with suppress(IncompleteStoreError):  # an incomplete input is an error of the capture
-        raw = archive.ref(stage.product.name, stage.key(stage.wants(plan.run, *inputs)))
-        found = condense.find(archive, condense.wants(plan.run, raw, *before))
+        raw = archive.ref(stage.product.name, stage.key(stage.wants(survey.run, *inputs)))
+        found = condense.find(archive, condense.wants(survey.run, raw, *before))
     if found is None:
         if before and not archive.is_there(before[0].uri):  # raw lines were deleted
-            capture_pass(plan, "coarse", inputs[-1])
-        return condense(plan, capture_pass(plan, sweeps, *inputs), *before)
-    settings = plan.run.settings
+            capture_pass(survey, "coarse", inputs[-1])
+        return condense(survey, capture_pass(survey, sweeps, *inputs), *before)
+    settings = survey.run.settings
     if settings.keep == KEEP_RAW and settings.source != RIG and archive.find(raw.stage, raw.key) is None:
-        capture_pass(plan, sweeps, *inputs)  # an earlier run deleted the raw lines that this one keeps
+        capture_pass(survey, sweeps, *inputs)  # an earlier run deleted the raw lines that this one keeps
     elif archive.is_known(raw):
-        plan.take_as_found(stage.name, raw, *inputs)
-    return condense(plan, raw, *before)
+        survey.take_as_found(stage.name, raw, *inputs)
+    return condense(survey, raw, *before)
 
 
-def first_mosaic(plan: OpenSurvey, *inputs: StageRef | None) -> StageRef:
+def first_mosaic(survey: OpenSurvey, *inputs: StageRef | None) -> StageRef:
     """Return the mosaic of the first pass; one that was cleared after the second pass is not made again."""
-    archive, given = plan.run.archive, [ref for ref in inputs if ref is not None]
+    archive, given = survey.run.archive, [ref for ref in inputs if ref is not None]
     with suppress(IncompleteStoreError):  # an incomplete input is an error of the stage
-        mosaic = archive.ref(rectify.product.name, rectify.key(rectify.wants(plan.run, *given)))
+        mosaic = archive.ref(rectify.product.name, rectify.key(rectify.wants(survey.run, *given)))
         cleared = archive.is_known(mosaic) and archive.find(mosaic.stage, mosaic.key) is None
-        request = score.find(archive, score.wants(plan.run, mosaic)) if cleared else None
-        if request is not None and plan.goes_back(request):
-            plan.take_as_found(rectify.name, mosaic, *given)
+        request = score.find(archive, score.wants(survey.run, mosaic)) if cleared else None
+        if request is not None and survey.goes_back(request):
+            survey.take_as_found(rectify.name, mosaic, *given)
             return mosaic
-    return rectify(plan, *given)
+    return rectify(survey, *given)
 
 
-def _captured_elsewhere(plan: OpenSurvey, sweeps: str, *inputs: StageRef) -> str:
+def _captured_elsewhere(survey: OpenSurvey, sweeps: str, *inputs: StageRef) -> str:
     """Run the deployment for captures, and return the address of the stored sweeps."""
-    assert plan.capture_deployment is not None
+    assert survey.capture_deployment is not None
     parameters: dict[str, Any] = {
-        "settings": SurveySettings.planned(plan.run.settings).model_dump(exclude_none=True),
+        "settings": SurveySettings.planned(survey.run.settings).model_dump(exclude_none=True),
         "sweeps": sweeps,
         "inputs": [ref.uri for ref in inputs],
     }
     try:
-        run: Any = prefect_deployments.run_deployment(plan.capture_deployment, parameters=parameters)
+        run: Any = prefect_deployments.run_deployment(survey.capture_deployment, parameters=parameters)
     except (prefect_exceptions.ObjectNotFound, ValueError):  # ValueError: no FLOW/NAME
         raise RigError(
-            f"there is no deployment {plan.capture_deployment!r} on the Prefect server; expected FLOW/NAME of one: "
+            f"there is no deployment {survey.capture_deployment!r} on the Prefect server; expected FLOW/NAME of one: "
             "deploy it, or correct capture_deployment"
         ) from None
     if run.state is None or not run.state.is_completed():
         why = "it did not end" if run.state is None else run.state.message or run.state.name
-        raise RigError(f"the deployment {plan.capture_deployment} did not capture the {sweeps} pass: {why}")
+        raise RigError(f"the deployment {survey.capture_deployment} did not capture the {sweeps} pass: {why}")
     stage = PASSES[sweeps]
-    wanted = stage.wants(plan.run, *inputs)
-    ref = plan.run.archive.ref(stage.product.name, stage.key(wanted))
-    if stage.find(plan.run.archive, wanted) is None:
+    wanted = stage.wants(survey.run, *inputs)
+    ref = survey.run.archive.ref(stage.product.name, stage.key(wanted))
+    if stage.find(survey.run.archive, wanted) is None:
         raise ArchiveError(
-            f"the deployment {plan.capture_deployment} captured the {sweeps} pass, but {ref.uri} is not in "
-            f"{plan.run.archive.name}: both machines need the same archive and settings"
+            f"the deployment {survey.capture_deployment} captured the {sweeps} pass, but {ref.uri} is not in "
+            f"{survey.run.archive.name}: both machines need the same archive and settings"
         )
     return ref.uri
