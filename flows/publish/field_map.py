@@ -73,8 +73,8 @@ def prior_map(prior: Prior | None, drawn: StageRef, receipt: Receipt) -> PriorMa
 
     ``drawn`` is the store of the class map and the class probabilities.
     """
-    memory = receipt.get("memory")
-    if memory is None or prior is None or memory["put_aside"]:
+    figures = receipt.get("prior_map")
+    if figures is None or prior is None or figures["put_aside"]:
         return None
     names = np.full(256, UNLABELLED, np.uint8)
     for number, earlier in enumerate(prior.classes):

@@ -94,7 +94,7 @@ def find_ground(
     posed: GroundMap | None,
     found: ClassMap,
     probabilities: ProbabilityStore,
-    memory: Mapping[str, Any] | None,
+    prior: Mapping[str, Any] | None,
 ) -> dict[str, Any]:
     """Return ``ground``: grid, changes against the prior map, and old areas. Empty without a georeference."""
     geobox = run.scene.geobox if posed is None else posed.geobox
@@ -108,7 +108,7 @@ def find_ground(
     place, drawn = run.zones.place, found.classes != UNLABELLED
     figures |= {"older_ha": older_hectares(place, np.where(drawn, probabilities.age(), np.nan))}
     if (old_class := probabilities.old_class()) is not None:
-        changes = [] if memory is None else memory["changes"]
+        changes = [] if prior is None else prior["changes"]
         beyond = {(old, new): changed / differing for changed, differing, old, new in changes}
         figures |= {"changes_ha": changed_hectares(place, old_class, found, beyond)}
     return {"ground": figures}
@@ -215,7 +215,7 @@ def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
         or not run.plan.plain
         or settings.extent != EXTENT_WHOLE
         or run.settings.macs is not None
-        or ((memory := prior_map_figures(ref.path)) is not None and memory["put_aside"] is None)
+        or ((prior := prior_map_figures(ref.path)) is not None and prior["put_aside"] is None)
     ):
         return None
     names = run.described.class_names

@@ -137,7 +137,7 @@ class ReceiptFields(_Part):
     extent: Facts | None = None  # which part of a field with a prior map was captured, and what was expected of it
     signal: Facts | None = None  # of captured spectra: which fraction has saturated bands
     kept: Facts | None = None  # of a uniform scan that is kept and read in part: patches, costs of all
-    memory: Facts | None = None  # what became of the prior map
+    prior_map: Facts | None = None  # what became of the prior map
     pointing: Facts | None = None  # where the mirror may look beside the plan
     lines: Facts | None = None  # sweeps with lines lost, repeated, out of order or invalid
     areas: dict[str, dict[str, float]] | None = None  # px of each class; ha where something says how large a pixel is

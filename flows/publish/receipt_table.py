@@ -116,8 +116,8 @@ def format_score(receipt: Mapping[str, Any]) -> str:
 
 def shown_accuracy(receipt: Mapping[str, Any]) -> Mapping[str, Any] | None:
     """Return the accuracy; after a revisit without the maps to compare, which lack the prior map."""
-    accuracy, memory = receipt.get("accuracy"), receipt.get("memory")
-    if accuracy is None or memory is None or memory["put_aside"] is not None:
+    accuracy, prior = receipt.get("accuracy"), receipt.get("prior_map")
+    if accuracy is None or prior is None or prior["put_aside"] is not None:
         return accuracy
     return {**accuracy, "none": NOT_JUDGED, "all": NOT_JUDGED, "controls": {}, "gap_closed": None}
 
@@ -147,7 +147,7 @@ def print_summary(receipt: Receipt, console: Console, *, verbose: bool = False) 
     columns = ("", "this survey", "reference", "fraction")
     console.print(table(columns, cells, whole=columns[1:]))
     console.print(escape(format_reference(receipt)))
-    for name, words in finding_rows({part: receipt.get(part) for part in ("signal", "memory")}):
+    for name, words in finding_rows({part: receipt.get(part) for part in ("signal", "prior_map")}):
         console.print(escape(f"{name}: {words}"), soft_wrap=True)  # numbers have spaces
     if not verbose:
         return
@@ -327,7 +327,7 @@ _SHOWN: Mapping[str, tuple[str, Sequence[str]]] = {
     "signal": ("signal", ("saturated",)),
     "extent": ("captured", ("lines", "patches_touched", "expected_wrong", "due_left")),
     "kept": ("at full resolution", ("patches", "multiply_adds")),
-    "memory": (
+    "prior_map": (
         "prior map",
         (
             *("run", "days", "shift_px", "turned_deg", "put_aside", "agreement"),

@@ -196,12 +196,10 @@ def asked_settings(run: SurveyRun) -> dict[str, object]:
     return {**anchor_paths(run.settings.to_dict(), Path.cwd()), "notes": list(run.notes)}
 
 
-def _savings(
-    run: SurveyRun, plan: FinePlan, read: NDArray[np.intp], memory: Mapping[str, Any] | None
-) -> dict[str, Any]:
+def _savings(run: SurveyRun, plan: FinePlan, read: NDArray[np.intp], prior: Mapping[str, Any] | None) -> dict[str, Any]:
     """Return the costs against the full scan; for a raster those of the model alone."""
     if run.raster is not None:
-        return _model_savings(run, read, memory)
+        return _model_savings(run, read, prior)
     entries = capture_savings([*run.plan.coarse, *plan.sweeps], run.plan.full, run.camera, run.grid)
     capture = SavingEntry(run.plan.coarse_s + plan.seconds, run.plan.full_s).as_dict()
     if (uniform := run.scans.reference) is not None:  # the cheapest scan with nearly the best score
@@ -209,13 +207,13 @@ def _savings(
     return {
         **{name: entry.as_dict() for name, entry in entries.items()},
         "capture_s": capture,
-        **_model_savings(run, read, memory),
+        **_model_savings(run, read, prior),
     }
 
 
-def _model_savings(run: SurveyRun, read: NDArray[np.intp], memory: Mapping[str, Any] | None) -> dict[str, Any]:
+def _model_savings(run: SurveyRun, read: NDArray[np.intp], prior: Mapping[str, Any] | None) -> dict[str, Any]:
     """Return the patches segmented at full resolution and the multiply-adds, against those of every patch."""
-    did, scan = run.work_done(read, memory), run.costs.of_map(run.kept_patches)
+    did, scan = run.work_done(read, prior), run.costs.of_map(run.kept_patches)
     return {
         "patches": SavingEntry(len(read), len(run.kept_patches)).as_dict(),
         "multiply_adds": {**SavingEntry(did.total, scan.total).as_dict(), **asdict(did)},
@@ -232,7 +230,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan) -> Quickl
     changed = attention.changed
     found = load_class_map(products["segment"].path / "class_map.zarr")
     order = np.argsort(attention.rank.ravel(), kind="stable")
-    memory, drawn = prior_map_figures(products["segment"].path), products["segment"].path / "class_probabilities.zarr"
+    prior, drawn = prior_map_figures(products["segment"].path), products["segment"].path / "class_probabilities.zarr"
     return QuicklookData(
         survey=run.name,
         seed=run.settings.seed,
@@ -252,8 +250,8 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan) -> Quickl
         class_colours=found.colours,
         truth=run.labels,
         confidence=np.ascontiguousarray(found.confidence[thinned(found.classes)]),
-        was=None if memory is None or memory["put_aside"] else ProbabilityStore(drawn).old_class(),
-        days=0.0 if memory is None else memory["days"],
+        was=None if prior is None or prior["put_aside"] else ProbabilityStore(drawn).old_class(),
+        days=0.0 if prior is None else prior["days"],
     )
 
 
@@ -272,7 +270,7 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     plan = load_plan(products["score"])
     figures: dict[str, Any] = {"kind": plan.kind, "reason": plan.reason, "lines": plan.lines, "seconds": plan.seconds}
     found: dict[str, Any] = {"field": field_figures(run, plan), "plan": figures}
-    memory = prior_map_figures(products["segment"].path)
+    prior = prior_map_figures(products["segment"].path)
     if run.recorded is not None:
         found["recording"] = {
             "sweeps": str(run.settings.sweeps),
@@ -282,15 +280,15 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
             "full_scan_s": run.settings.cost.seconds(run.plan.full, run.camera),
         }
     if run.chooses and (run.plan.plain or run.least_gain is not None):
-        found["kept"] = run.reading_figures(read_in_full(products["score"], products["segment"]), memory)
-    if memory is not None:
-        found["memory"] = memory
+        found["kept"] = run.reading_figures(read_in_full(products["score"], products["segment"]), prior)
+    if prior is not None:
+        found["prior_map"] = prior
     if run.settings.extent != EXTENT_WHOLE:
         expected = {} if run.extent is None else asdict(run.extent)
         found["extent"] = {
             "lines": run.settings.extent,
             "patches_touched": len(plan.patch_index) / max(len(run.kept_patches), 1),
-            "remembers": memory is not None and memory["put_aside"] is None,
+            "uses_prior_map": prior is not None and prior["put_aside"] is None,
             **expected,
         }
     passes = {"coarse": products.get("register_coarse"), "fine": products.get("register_fine")}
@@ -304,7 +302,7 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     posed = next((load_ground_map(ref.path / STORE) for ref in products.there("ground")), None)
     probabilities = ProbabilityStore(class_map.path / "class_probabilities.zarr")
     found |= find_areas(run, posed, drawn)
-    found |= find_ground(run, posed, drawn, probabilities, memory) | find_zones(run, drawn)
+    found |= find_ground(run, posed, drawn, probabilities, prior) | find_zones(run, drawn)
     found |= find_map(run, class_map, drawn)
     if run.raster is not None:
         return found

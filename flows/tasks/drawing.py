@@ -57,7 +57,7 @@ class Drawing:
     mosaic: StageRef
     attention: StageRef  # whose ranks say which patches are read in detail
     capture: LineSpec  # of the mosaic's pixels, where it does not say so itself
-    memory: FieldPriorMap | None = None  # prior map of the field
+    prior_map: FieldPriorMap | None = None  # prior map of the field
     left_out: NDArray[np.bool_] | None = None  # (y, x) pixels of which zones have no map drawn
     unknown: UnknownRule | None = None  # which pixels are called unknown
     part: bool = False  # whether the scan covers a part of the field; the rest is that of the prior map
@@ -66,7 +66,7 @@ class Drawing:
     @property
     def inputs(self) -> list[StageRef]:
         """Return the stores that workers read."""
-        return [self.mosaic, self.attention, *(() if self.memory is None else self.memory.inputs)]
+        return [self.mosaic, self.attention, *(() if self.prior_map is None else self.prior_map.inputs)]
 
     @property
     def chosen(self) -> NDArray[np.int64]:
@@ -85,7 +85,7 @@ class Drawing:
             chosen = chosen[(here >= 0) & (gain[here] >= self.choice.least_gain)]
         patch_index, columns = seen_patches(chosen, seen, region)
         drawn = segment(weights, seen, columns, patch_index, every_class=True)
-        del columns  # a memory takes their room
+        del columns  # a prior map takes their room
         shown = self._shown(region, mosaic)
         assert drawn.log_probability is not None
         unknown = None
@@ -96,18 +96,18 @@ class Drawing:
         observation = self._observation(region, drawn.log_probability, shown, seen)
         classes, confidence = drawn.classes, drawn.confidence
         comparison, old = None, None
-        if self.memory is None:
+        if self.prior_map is None:
             after = first_probabilities(observation)
             if not shown.all():
                 classes, confidence = after.classes()
         else:
-            prior_map = self.memory.of(region, weights)
-            after = fuse(prior_map, observation, self.weights.load_reader())
+            local = self.prior_map.of(region, weights)
+            after = fuse(local, observation, self.weights.load_reader())
             if unknown is not None:  # the classes say nothing of them
                 after.log_probability[unknown], after.light[unknown] = np.nan, 0
             classes, confidence = after.classes()
-            comparison = compare(prior_map, observation, after, region.kept_here)
-            old, after = changed_from(prior_map, after), as_captured(prior_map, after)
+            comparison = compare(local, observation, after, region.kept_here)
+            old, after = changed_from(local, after), as_captured(local, after)
         if self.unknown is not None and unknown is not None:
             classes[unknown], confidence[unknown] = self.unknown.number, np.nan
             after.log_probability[unknown], after.age_days[unknown] = np.nan, 0  # they are captured
@@ -145,7 +145,7 @@ class Drawing:
             here = seen.capture.where(spec)
             own_light[... if here is None else here] = spec.light / spec.step**2
         light, step, _ = seen.capture.usual
-        coarse = seen.columns[:0] if self.memory is None else pooled(seen.seen_columns)
+        coarse = seen.columns[:0] if self.prior_map is None else pooled(seen.seen_columns)
         return CurrentVisit(log_probability, shown, coarse, light, int(step), own_light[: len(shown), : shown.shape[1]])
 
     def _shown(self, region: Region, mosaic: Mosaic) -> NDArray[np.bool_]:

@@ -29,7 +29,7 @@ NEWEST_RUNS = 60  # newest runs of a field that are searched for the previous vi
 REACH_PX = 64.0  # greatest shift of a prior map that is found
 MOST_EARLIER = 12  # earlier visits that show a field which was captured in parts
 PROBABILITIES = "class_probabilities"  # a product of runs
-MEMORY = "prior_map.json"  # beside a map: the figures of its prior map
+PRIOR_FIGURES = "prior_map.json"  # beside a map: the figures of its prior map
 TURNED, ANOTHER_FIELD = "turned", "another field"  # reasons to put a prior map aside
 OF_THE_LIGHT = (  # settings that two runs of the same captured light share
     *("scene", "source", "seed", "size", "visit", "day", "hour", "effects", "pointing_px"),
@@ -164,15 +164,15 @@ def _earlier_runs(archive: Archive, run: Run) -> Iterator[EarlierRun]:
     """Yield the earlier visits of a run that captured a part of the field, with their shifts."""
     down, across = 0, 0
     for _ in range(MOST_EARLIER - 1):
-        memory = run.receipt.get("memory")
+        figures = run.receipt.get("prior_map")
         if (
             run.settings.get("extent", EXTENT_WHOLE) == EXTENT_WHOLE
-            or memory is None
-            or memory["put_aside"] is not None
+            or figures is None
+            or figures["put_aside"] is not None
         ):
             return
-        down, across = (sum(both) for both in zip((down, across), memory["shift_px"], strict=True))
-        run = read_run(archive.root / "runs" / memory["run"])
+        down, across = (sum(both) for both in zip((down, across), figures["shift_px"], strict=True))
+        run = read_run(archive.root / "runs" / figures["run"])
         parts = run.products.get("mosaic", "").split("/")
         if run.problem is not None or len(parts) < 3:
             return
@@ -217,5 +217,5 @@ def _day_of_year(settings: Settings) -> float | None:
 
 def prior_map_figures(store: Path) -> dict[str, Any] | None:
     """Return the figures of the prior map of a stored map; None for a first visit."""
-    record = store / MEMORY
+    record = store / PRIOR_FIGURES
     return dict(read_table(record)) if record.is_file() else None

@@ -313,28 +313,28 @@ class SurveyRun(CaptureRun):
         """Return the settings of the map on the ground."""
         return self.settings.map
 
-    def work_done(self, patch_index: NDArray[np.integer], memory: Mapping[str, Any] | None = None) -> MultiplyAdds:
+    def work_done(self, patch_index: NDArray[np.integer], prior: Mapping[str, Any] | None = None) -> MultiplyAdds:
         """Count multiply-adds of the map with these patches at full resolution, and of the scores if used.
 
-        ``memory`` are the figures of the prior map. One of another field is put aside, and the map drawn again.
+        ``prior`` are the figures of the prior map. One of another field is put aside, and the map drawn again.
         """
-        aside = None if memory is None else memory["put_aside"]
+        aside = None if prior is None else prior["put_aside"]
         done = self.costs.of_map(patch_index)
         scored = self.least_gain is not None and self.plan.plain  # while drawn, which reads the overview once
         if scored:
             done = replace(done, score=self.costs.score(self.settings.policy))
         elif self.chooses:
             done = self.costs.with_scores(patch_index, self.settings.policy)
-        if memory is not None and aside == ANOTHER_FIELD:
+        if prior is not None and aside == ANOTHER_FIELD:
             every = self.costs.of_map(self.kept_patches)
-            before = every.detail * memory["patches_read"] // max(len(self.kept_patches), 1)
+            before = every.detail * prior["patches_read"] // max(len(self.kept_patches), 1)
             done = MultiplyAdds(done.overview + every.overview, done.score * (2 if scored else 1), done.detail + before)
         if self.prior is None or self.reader is None or aside == TURNED:
             return done
         return replace(done, detail=done.detail + self.reader.sizes.multiply_adds(self.grid.height * self.grid.width))
 
     def reading_figures(
-        self, patch_index: NDArray[np.integer], memory: Mapping[str, Any] | None = None
+        self, patch_index: NDArray[np.integer], prior: Mapping[str, Any] | None = None
     ) -> dict[str, Any]:
         """Return limits, patches and multiply-adds of the full network, for receipts."""
         settings, everything = self.settings, self.kept_patches
@@ -343,7 +343,7 @@ class SurveyRun(CaptureRun):
             "patches": len(patch_index),
             "of_patches": len(everything),
             "multiply_adds": {
-                "done": self.work_done(patch_index, memory).total,
+                "done": self.work_done(patch_index, prior).total,
                 "everything": self.costs.of_map(everything).total,
             },
         }

@@ -14,7 +14,7 @@ from flows.settings.survey_settings import MapChoice
 from flows.tasks.drawing import MAP, PROBABILITIES, Drawing, FullReading, UnknownRule, draw_field
 from flows.tasks.field_prior_map import FieldPriorMap, prior_map_lies, whole_pixels
 from flows.tasks.field_work import region_params
-from flows.tasks.prior_maps import ANOTHER_FIELD, MEMORY, TURNED, Prior
+from flows.tasks.prior_maps import ANOTHER_FIELD, PRIOR_FIGURES, TURNED, Prior
 from flows.tasks.stage import Product, Report, Wanted, stage
 from flows.tasks.stages.attention import READING, PatchGains
 from models.reading.prior_map import TemporalAgreement, changed_fractions
@@ -69,17 +69,17 @@ def segment(
     def build(path: Path) -> None:
         """Write class map and class probabilities; again without the prior map if it does not agree."""
         lies = FieldShift() if prior is None else prior_map_lies(prior.scan_passes, mosaic)
-        memory = None if prior is None else memory_of(prior, lies, grid)
-        names = create_maps(path, gains, unknown, goes_on=memory is not None)
-        drawing = Drawing(work.weights, mosaic, attention, gains.capture, memory, left_out, unknown, part)
+        stored = None if prior is None else field_prior_map(prior, lies, grid)
+        names = create_maps(path, gains, unknown, goes_on=stored is not None)
+        drawing = Drawing(work.weights, mosaic, attention, gains.capture, stored, left_out, unknown, part)
         drawn = draw_field(work, drawing, path, least_gain, report)
         if prior is not None:
             figures = _prior_map_figures(prior, reader, names, lies, drawn.comparison)
             before = drawing.chosen if drawn.reading is None else np.flatnonzero(drawn.reading.read)
-            write_table(path / MEMORY, figures | {"patches_read": len(before)})
+            write_table(path / PRIOR_FIGURES, figures | {"patches_read": len(before)})
             if figures["put_aside"] is not None and drawn.comparison is not None:
                 drop_changes(path / PROBABILITIES)
-                drawn = draw_field(work, replace(drawing, memory=None), path, least_gain, report)
+                drawn = draw_field(work, replace(drawing, prior_map=None), path, least_gain, report)
         if drawn.reading is not None:
             write_attention(path / READING, attention_of(drawn.reading, gains.policy))
         if drawn.unread_px:
@@ -132,7 +132,7 @@ def attention_of(reading: FullReading, policy: str) -> Attention:
     return Attention(reading.gain, rank.reshape(reading.gain.shape), policy, reading.changed)
 
 
-def memory_of(prior: Prior, lies: FieldShift, grid: SceneGrid) -> FieldPriorMap | None:
+def field_prior_map(prior: Prior, lies: FieldShift, grid: SceneGrid) -> FieldPriorMap | None:
     """Return the prior map with its shift; None where the field is rotated too far."""
     if lies.edge_px((grid.height, grid.width)) > MOST_TURN_PX:
         return None

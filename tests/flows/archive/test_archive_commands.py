@@ -154,7 +154,7 @@ def test_a_repair_that_could_do_some_of_it_says_so(archive: Path, capsys: pytest
     for path in (opened.refs("rectify_fine")[0].path / "lines.json", archive / "stages/ingest/cube/data.bin"):
         flip(path)
     content = _json(capsys, lambda: run_verify(archive, QUIET, remake=True, as_json=True), PARTLY)
-    assert "restore them from a copy" in content["repair"]["hopeless"]["stages/ingest/cube"]
+    assert "restore it from a copy" in content["repair"]["hopeless"]["stages/ingest/cube"]
     content = _json(capsys, lambda: run_verify(archive, QUIET, remake=True, as_json=True), FAILED)
     assert [one["uri"] for one in content["problems"]] == ["stages/ingest/cube"]
 

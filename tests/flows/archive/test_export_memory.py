@@ -127,7 +127,7 @@ def test_receipt_and_page_have_the_hectares(visited: list[Exported]) -> None:
     there = store["changed_from"].values.astype(int) * 1000 + drawn
     wanted = {
         (old, new): (there == 1000 * names.index(old) + names.index(new)).sum() * pixel_ha * beyond / differing
-        for beyond, differing, old, new in later["memory"]["changes"]
+        for beyond, differing, old, new in later["prior_map"]["changes"]
     }  # beyond what two maps of the same ground differ by
     assert wanted
     assert {(old, new): area for area, old, new in changes} == pytest.approx(wanted, rel=slack)

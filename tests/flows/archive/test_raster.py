@@ -165,7 +165,7 @@ def test_a_second_visit_goes_on_from_the_first(surveyed: Raster, scene_files: Pa
     """What the raster of before left is remembered."""
     surveyed(scene_files / "scene.png", visit="2026-06-01T10:00:00Z", prior="latest")
     later = surveyed(scene_files / "scene.png", visit="2026-06-04T10:00:00Z", prior="latest", macs="80%")
-    assert later.receipt["memory"]["days"] == 3
+    assert later.receipt["prior_map"]["days"] == 3
 
 
 @pytest.mark.parametrize(

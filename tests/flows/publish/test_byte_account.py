@@ -104,7 +104,7 @@ def test_a_revisit_does_not_count_the_visit_before(survey_png: Survey, tmp_path:
     """The stores whose map is the prior map belong to that visit; both together are what the archive has."""
     root, flags = tmp_path / "archive", {"budget": None, "scan_step": "2", "prior": "latest", "accuracy": False}
     visits = [survey_png(root, **flags, visit=f"2026-06-0{day}T10:00:00Z") for day in (1, 8)]
-    assert visits[1].receipt["memory"]["days"] == 7
+    assert visits[1].receipt["prior_map"]["days"] == 7
     accounts = [told(visit.folder) for visit in visits]
     everything = walked(root / "stages", root / "runs") - walked(root / "stages" / "capture")
     assert sum(one["kept"] for one in accounts) == everything

@@ -107,10 +107,10 @@ def test_words_of_a_memory_tell_change_beyond_what_maps_differ_by() -> None:
     """Where about as many pixels differ as of two maps of the same ground, none has changed."""
     memory = {"run": "r", "days": 3.0, "differing_px": 950, "expected_differing_px": 810, "changed_px": 0}
     words = "r; 3.0 days earlier; differing 950 px; expected differing 810 px"
-    assert dict(finding_rows({"memory": memory}))["prior map"] == words
-    changed = dict(finding_rows({"memory": memory | {"changed_px": 700}}))["prior map"]
+    assert dict(finding_rows({"prior_map": memory}))["prior map"] == words
+    changed = dict(finding_rows({"prior_map": memory | {"changed_px": 700}}))["prior map"]
     assert changed == f"{words}; changed 700 px"
-    same = dict(finding_rows({"memory": memory | {"differing_px": 0}}))["prior map"]
+    same = dict(finding_rows({"prior_map": memory | {"differing_px": 0}}))["prior map"]
     assert same == words.replace("950", "0")
 
 

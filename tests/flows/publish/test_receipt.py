@@ -132,7 +132,7 @@ def test_maps_without_the_prior_map_are_not_compared() -> None:
     """After a revisit neither the sentence nor the page has them; with a rejected prior map both do."""
     receipt = make_receipt()
     for why in (None, "turned"):
-        receipt["memory"] = {"put_aside": why}
+        receipt["prior_map"] = {"put_aside": why}
         text = render_report(receipt, b"")
         told = [words in text for words in ("overview alone", "by random", "recovered", ">full resolution every")]
         assert told == 4 * [why is not None]

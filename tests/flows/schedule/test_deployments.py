@@ -109,7 +109,7 @@ def test_a_run_is_a_visit_of_its_due_time_and_goes_on_from_the_newest(north: Any
     assert [state.name for state in states] == ["Completed", "Completed"]
     asked = settings_of(Path(north.settings.out))
     assert [one["visit"] for one in asked] == ["2026-06-01T04:00:00Z", "2026-06-02T04:00:00Z"]
-    memories = [read_run(folder).receipt.get("memory") for folder in Archive.open(north.settings.out).runs()]
+    memories = [read_run(folder).receipt.get("prior_map") for folder in Archive.open(north.settings.out).runs()]
     assert [memory is None for memory in memories] == [True, False]
 
 

@@ -93,7 +93,7 @@ def test_a_part_is_looked_at_and_the_rest_remembered(visits: tuple[Path, Any, An
     before, now = (product(out, one, "class_map").classes.values for one in (first, part))
     assert (now != 255).all()
     assert (now == before)[age > 0].mean() > 0.95  # what fades may tip where two classes were nearly as likely
-    assert part.receipt["memory"]["put_aside"] is None
+    assert part.receipt["prior_map"]["put_aside"] is None
 
 
 def test_receipt_and_page_say_what_was_looked_at(visits: tuple[Path, Any, Any]) -> None:
@@ -114,7 +114,7 @@ def test_the_same_visit_finds_its_own_lines(visited: Path, visits: Any, survey_p
     """Asked again it goes on from the visit before it, as it did, and captures nothing."""
     again = survey_png(visited, **PART, visit=LATER, weights=str(recorded))
     assert again.receipt["settings"]["extent"] == visits[2].receipt["settings"]["extent"]
-    assert again.receipt["memory"]["run"] == visits[1].folder.name
+    assert again.receipt["prior_map"]["run"] == visits[1].folder.name
     states = {stage["name"]: stage["state"] for stage in again.receipt["stages"]}
     assert states["capture_coarse"] == states["segment"] == "cached"
 
@@ -248,7 +248,7 @@ def test_without_a_memory_unseen_is_no_class(visited: Path, survey_png: Survey, 
     Image.fromarray(labels).save(tmp_path / "labels.png")
     scene = {"scene": str(tmp_path / "other.png"), "labels": str(tmp_path / "labels.png")}
     other = survey_png(visited, **PART, **scene, visit=LAST, weights=str(recorded))
-    assert other.receipt["memory"]["put_aside"] == "another field"
+    assert other.receipt["prior_map"]["put_aside"] == "another field"
     assert "the rest is unchanged" not in (other.folder / "report.html").read_text(encoding="utf-8")
     classes = product(visited, other, "class_map").classes.values
     assert 1 - other.receipt["extent"]["patches_touched"] <= (classes == 255).mean() < 1

@@ -70,7 +70,7 @@ def words_of(out: Path, survey_png: Survey, **flags: Any) -> tuple[str, Any]:
 def test_a_first_look_has_nothing_to_go_on_from(twice: tuple[Path, Any, Any]) -> None:
     """Asked for the latest it says none, keeps what it believes, and all of that is new."""
     out, first, _ = twice
-    assert "memory" not in first.receipt
+    assert "prior_map" not in first.receipt
     assert first.receipt["settings"]["prior"] == "none"
     assert "north has no prior map: this is its first visit" in first.receipt["settings"]["notes"]
     probabilities = xr.open_zarr(out / first.receipt["products"]["class_probabilities"], consolidated=False)
@@ -83,7 +83,7 @@ def test_a_first_look_has_nothing_to_go_on_from(twice: tuple[Path, Any, Any]) ->
 def test_a_later_look_goes_on_from_the_one_before(twice: tuple[Path, Any, Any]) -> None:
     """Receipt, page and manifest name it; the days between are those of the visits."""
     out, first, later = twice
-    memory = later.receipt["memory"]
+    memory = later.receipt["prior_map"]
     assert (memory["run"], memory["days"], memory["put_aside"]) == (first.folder.name, 3.0, None)
     assert later.receipt["settings"]["prior"] == first.folder.name
     assert memory["agreement"] > 0.9  # it is the same picture with other noise
@@ -103,7 +103,7 @@ def test_a_later_look_goes_on_from_the_one_before(twice: tuple[Path, Any, Any]) 
 def test_by_hand_nothing_is_remembered_unless_asked(visited: Path, survey_png: Survey) -> None:
     """The default of a survey is none, and its map that of a first look, found and not made again."""
     published = survey_png(visited, **UNIFORM, visit=LATER)
-    assert "memory" not in published.receipt
+    assert "prior_map" not in published.receipt
     fresh = survey_png(visited, **UNIFORM, visit=FIRST)
     (row,) = (stage for stage in fresh.receipt["stages"] if stage["name"] == "segment")
     assert row["state"] == "cached"
@@ -148,7 +148,7 @@ def test_other_light_under_the_same_path_is_another_visit(survey_png: Survey, tm
     for seed, earlier in ((1, False), (2, True), (2, True)):
         Image.fromarray(patchy_scene((96, 128), 3, seed=seed)[0].astype(np.uint8)).save(tmp_path / "week.png")
         _, published = words_of(tmp_path / "archive", survey_png, **flags)
-        assert ("memory" in published.receipt) == earlier
+        assert ("prior_map" in published.receipt) == earlier
 
 
 def test_a_field_of_another_size_is_no_memory(visited: Path, survey_png: Survey, tmp_path: Path) -> None:
@@ -158,7 +158,7 @@ def test_a_field_of_another_size_is_no_memory(visited: Path, survey_png: Survey,
     words, published = words_of(visited, survey_png, **flags)
     assert "cannot be the prior map: it has 128 x 96 px, this field has 96 x 64" in words
     assert "north has no prior map" in words
-    assert "memory" not in published.receipt
+    assert "prior_map" not in published.receipt
 
 
 @pytest.mark.parametrize(
@@ -183,7 +183,7 @@ def test_a_map_of_another_place_is_no_prior_map(
     flags = {"labels": None, "name": "tile", "prior": "latest"}
     survey_png(visited, **{**UNIFORM, **flags}, scene=str(tmp_path / "here.tif"), visit=FIRST)
     words, run = words_of(visited, survey_png, **flags, scene=str(tmp_path / "there.tif"), visit=LATER)
-    assert ("memory" in run.receipt) == (why is None)
+    assert ("prior_map" in run.receipt) == (why is None)
     assert why is None or why in words
 
 
@@ -193,12 +193,12 @@ def test_another_field_under_the_same_name_is_put_aside(visited: Path, survey_pn
     flags = {"scene": str(tmp_path / "other.png"), "labels": None, "visit": "2026-06-07T10:00:00Z"}
     words, wrong = words_of(visited, survey_png, **flags, prior="latest")
     alone = survey_png(tmp_path / "alone", **{**UNIFORM, **flags})
-    assert wrong.receipt["memory"]["put_aside"] == "another field"
+    assert wrong.receipt["prior_map"]["put_aside"] == "another field"
     assert "not used: another field" in words
     cost, once = (run.receipt["savings"]["multiply_adds"] for run in (wrong, alone))  # the map was drawn twice
     assert cost["overview"] == 2 * once["overview"]
     patches = once["detail"] / alone.receipt["savings"]["patches"]["done"]
-    assert cost["detail"] == pytest.approx(once["detail"] + wrong.receipt["memory"]["patches_read"] * patches)
+    assert cost["detail"] == pytest.approx(once["detail"] + wrong.receipt["prior_map"]["patches_read"] * patches)
     np.testing.assert_array_equal(class_map(visited, wrong), class_map(tmp_path / "alone", alone))
     probabilities = xr.open_zarr(visited / wrong.receipt["products"]["class_probabilities"], consolidated=False)
     assert float(probabilities.age.max()) == 0.0
@@ -211,7 +211,7 @@ def test_what_was_cleared_is_gone_on_without(visited: Path, twice: Any, survey_p
     shutil.rmtree((visited / later.receipt["products"]["class_probabilities"]).parent)
     words, published = words_of(visited, survey_png, visit="2026-06-07T10:00:00Z", prior="latest")
     assert f"{later.folder.name} cannot be the prior map: its stores were cleared" in words
-    assert published.receipt["memory"]["run"] == first.folder.name
+    assert published.receipt["prior_map"]["run"] == first.folder.name
     shutil.rmtree((visited / first.receipt["products"]["class_probabilities"]).parent)
     shutil.rmtree((visited / published.receipt["products"]["class_probabilities"]).parent)
     words, published = words_of(visited, survey_png, visit="2026-06-08T10:00:00Z", prior="latest")
@@ -224,7 +224,7 @@ def test_other_classes_are_found_by_their_names(visited: Path, survey_png: Surve
     other = make_weights(names=("class_2", "class_0", "class_1", "more"))
     flags = {"weights": str(other), "labels": None, "visit": "2026-06-07T10:00:00Z", "prior": "latest"}
     published = survey_png(visited, **{**UNIFORM, **flags})
-    assert published.receipt["memory"]["days"] == 3.0
+    assert published.receipt["prior_map"]["days"] == 3.0
     strangers = make_weights(names=("a", "b", "c"))
     words, published = words_of(
         visited, survey_png, **{**flags, "weights": str(strangers), "visit": "2026-06-06T10:00:00Z"}
@@ -240,7 +240,7 @@ def test_visits_are_reprocessed_in_order(visited: Path, twice: Any, make_weights
     runs = [read_run(path) for path in sorted(visited.glob("runs/*"))]
     again = [run for run in runs if run.folder.name not in (twice[1].folder.name, twice[2].folder.name)]
     assert [run.settings["prior"] for run in again] == ["none", again[0].folder.name]
-    assert again[1].receipt["memory"]["run"] == again[0].folder.name
+    assert again[1].receipt["prior_map"]["run"] == again[0].folder.name
     content = io.StringIO()
     run_reprocess(visited, Console(file=content, width=300), weights=weights)
     assert len(list(visited.glob("runs/*"))) == 4  # nothing is left to be done
@@ -255,7 +255,7 @@ def test_a_reader_in_the_weights_is_used(visited: Path, survey_png: Survey, weig
     add_reader(own, own, reader, {})
     flags = {**UNIFORM, "visit": "2026-06-07T10:00:00Z", "prior": "latest", "weights": str(own)}
     published = survey_png(visited, **flags)
-    assert len(published.receipt["memory"]["reader"]) == 20
+    assert len(published.receipt["prior_map"]["reader"]) == 20
     first = survey_png(tmp_path / "alone", **{**flags, "prior": "none"})
     decode = [one.receipt["savings"]["multiply_adds"]["detail"] for one in (published, first)]
     assert decode[0] - decode[1] == reader.sizes.multiply_adds(96 * 128)
@@ -275,11 +275,11 @@ def test_a_rig_that_was_moved_between_two_parts_is_noticed(survey_png: Survey, t
     middle = survey_png(out, **before, visit=LATER, extent="0:0-20")
     words, later = words_of(out, survey_png, **now, visit="2026-06-07T10:00:00Z", extent="0:40-64")
     assert "shifted by 23 px" in words
-    assert later.receipt["memory"]["run"] == middle.folder.name
-    assert later.receipt["memory"]["shift_px"] == [12, -20]
+    assert later.receipt["prior_map"]["run"] == middle.folder.name
+    assert later.receipt["prior_map"]["shift_px"] == [12, -20]
     back = survey_png(out, **before, visit="2026-06-08T10:00:00Z", extent="0:16-46")  # the first visit alone knows most
-    assert back.receipt["memory"]["run"] == later.folder.name
-    assert back.receipt["memory"]["shift_px"] == pytest.approx([-12, 20], abs=1)
+    assert back.receipt["prior_map"]["run"] == later.folder.name
+    assert back.receipt["prior_map"]["shift_px"] == pytest.approx([-12, 20], abs=1)
 
 
 def test_a_rig_that_was_turned_is_noticed(survey_png: Survey, tmp_path: Path) -> None:
@@ -294,8 +294,8 @@ def test_a_rig_that_was_turned_is_noticed(survey_png: Survey, tmp_path: Path) ->
     survey_png(tmp_path / "a", **flags, scene=str(tmp_path / "before.png"), visit=FIRST)
     now = {"labels": None, "scene": str(tmp_path / "now.png"), "visit": LATER, "prior": "latest"}
     words, later = words_of(tmp_path / "a", survey_png, **now)
-    assert later.receipt["memory"]["put_aside"] == "turned"
-    assert abs(later.receipt["memory"]["turned_deg"]) == pytest.approx(4.0, abs=0.3)
+    assert later.receipt["prior_map"]["put_aside"] == "turned"
+    assert abs(later.receipt["prior_map"]["turned_deg"]) == pytest.approx(4.0, abs=0.3)
     assert re.search("turned -?(3.9|4|4.0)[0-9]* degrees; not used: turned", words)
 
 
@@ -320,6 +320,6 @@ def test_two_visits_at_once_are_both_kept(visited: Path, twice: Any, survey_png:
     with ThreadPoolExecutor(2) as pool:
         both = list(pool.map(lambda visit: survey_png(visited, **UNIFORM, visit=visit, prior="latest"), at))
     assert both[0].folder != both[1].folder
-    assert both[0].receipt["memory"]["run"] == twice[2].folder.name
-    assert both[1].receipt["memory"]["run"] in {twice[2].folder.name, both[0].folder.name}
+    assert both[0].receipt["prior_map"]["run"] == twice[2].folder.name
+    assert both[1].receipt["prior_map"]["run"] in {twice[2].folder.name, both[0].folder.name}
     assert not problems(visited)

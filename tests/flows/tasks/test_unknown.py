@@ -118,7 +118,7 @@ def test_a_later_visit_goes_on_from_such_a_map(
     before = set(tmp_path.glob("stages/segment/*"))
     flags = {"visit": "later", "seed": "1", "prior": "latest", **NARROW}
     receipt = survey_png(tmp_path, weights=str(judging(0.5)), **flags).receipt
-    assert receipt["memory"]["put_aside"] is None
+    assert receipt["prior_map"]["put_aside"] is None
     (store,) = set(tmp_path.glob("stages/segment/*")) - before
     found = xr.open_zarr(store / "class_map.zarr", consolidated=False)["classes"].values
     assert (found == 3).sum() == receipt["unknown"]["pixels"] > 0
