@@ -19,7 +19,7 @@ from storage.archive.keys import LATEST, StageRef, in_text, published_runs, publ
 from storage.archive.records import LINE_PRODUCTS, Run, Store, read_run, read_store
 from storage.archive.staging import MANIFEST_NAME, check_name
 
-RAW_STAGES = ("capture", "ingest")
+CAPTURED, INGESTED = "capture", "ingest"  # stages of lines as they came
 RASTER_ROLE = "condense_raster"  # the stage that reads the pixels of a raster
 
 
@@ -110,7 +110,10 @@ class Catalogue:
 
         So is a store that was made of such lines, if they were cleared away or are missing.
         """
-        if uri.partition("/")[2].partition("/")[0] not in RAW_STAGES and RASTER_ROLE not in self.roles(uri):
+        stage = uri.partition("/")[2].partition("/")[0]
+        if stage == INGESTED:  # runs read it, and do not make it
+            return True
+        if stage != CAPTURED and RASTER_ROLE not in self.roles(uri):
             known = {one: self.stores.get(one) for one in self.inputs_of(uri)}
             gone = [one for one, store in known.items() if store is None or store.cleared]
             return any(self.is_only_copy(one, can_capture) for one in gone)
@@ -118,8 +121,7 @@ class Catalogue:
         if asked := [run for run in runs if run.settings]:
             return not all(map(can_capture, asked))
         params = {} if store is None else store.params
-        known = params.get("source", "sim" if "effects" in params else "rig") == "sim"
-        return not known
+        return bool(params.get("source", "sim" if "effects" in params else "rig") != "sim")
 
 
 def rests_on(root: Path, refs: Iterable[StageRef]) -> list[StageRef]:

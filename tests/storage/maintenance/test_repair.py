@@ -138,6 +138,18 @@ def test_condensed_lines_whose_raw_lines_were_cleared_stay(archive: Archive, how
         assert before == {path: path.read_bytes() for path in (archive.root / "stages").rglob("*.*")}
 
 
+def test_an_ingested_cube_stays_whatever_its_runs_can_capture(archive: Archive) -> None:
+    """Surveys read it and cannot make it, of simulated rigs too."""
+    cube = make_store(archive, "ingest", {}, [])
+    asked = settings(scene=str(cube.path))
+    archive.new_run("farm").publish(settings=asked, rests_on=archive.manifest_hashes([cube]))
+    flip(cube.path / "data.bin")
+    versions = {**VERSIONS, "ingest": 1}
+    done = repair(archive, verify_archive(archive), Mock(), versions=versions, can_capture=lambda run: True)
+    assert list(done.plan.hopeless) == [cube.uri]
+    assert cube.path.exists()
+
+
 @pytest.mark.parametrize("error", [SceneError("no scene farm.png; give the file"), KeyboardInterrupt()])
 def test_what_could_not_be_made_again_is_named_by_the_next_verify(archive: Archive, error: BaseException) -> None:
     """The scene has gone, or the repair was broken off: once that is mended the same command makes it."""
