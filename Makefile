@@ -74,16 +74,16 @@ paper: $(BIN)/.ok-dev
 
 FAULTS ?=
 
-# Runs the fault-injection tests of the archive (FAULTS="disk_full flips" selects some). Half an hour.
+# Runs the fault-injection tests of the archive (FAULTS="disk_full files" selects some). Half an hour.
 # `make test` runs a quick part of each.
 faults: $(BIN)/.ok-dev
 	OMP_NUM_THREADS=1 $(BIN)/python tests/faults $(FAULTS)
 
-SOAK ?=
+KILLS ?= 100
 
-# Runs surveys that are killed at random moments and run again, which must end in the same maps (SOAK="--quick").
+# Kills surveys at random moments (KILLS=100) and runs them again, which must end in the same stores.
 soak: $(BIN)/.ok-dev
-	OMP_NUM_THREADS=1 $(BIN)/python tests/soak $(SOAK)
+	KILLS=$(KILLS) OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q tests/faults/test_stopped.py -k killed_survey
 
 # Writes names and versions to constraints.txt. With a CPU wheel of torch, pip does not resolve the accelerator's
 # packages; their lines stay unchanged.

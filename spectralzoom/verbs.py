@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import threadpoolctl
+from pydantic import TypeAdapter, ValidationError
 
 import spectralzoom.opened as opened
 from flows.archive.plan_command import plan_content
@@ -36,7 +37,6 @@ else:
 Asked = str | Path | Mapping[str, Any] | None  # a settings file, a table of settings, or keywords alone
 Told = Callable[[str, float, float], None]
 USUAL = {"engine": "plain"}  # a Prefect server starts only on request
-FILES = ("out", "start", "train_temporal")
 
 
 def survey(settings: Asked = None, *, progress: Told | None = None, quiet: bool = True, **flags: Any) -> OpenedRun:
@@ -207,13 +207,17 @@ def _judge(
 
 
 def _flags(kind: type[Any], verb: str, given: Mapping[str, Any], **more: Any) -> Any:
-    """Return the flags of a verb from keywords, with lists as text. Raises SettingsError: an unknown keyword."""
+    """Return the flags of a verb from keywords, with lists as text.
+
+    Raises SettingsError: an unknown keyword, or a value of another type.
+    """
     known = [one.name for one in fields(kind)]
     for name, value in given.items():
         if name not in known:
             raise SettingsError(f"{verb} has no {name!r}; it has {', '.join(sorted(known))}")
-        if isinstance(value, list | tuple):
-            more[name] = ",".join(map(str, value))
-        else:
-            more[name] = Path(value) if name in FILES and value is not None else value
-    return kind(**more)
+        more[name] = ",".join(map(str, value)) if isinstance(value, list | tuple) else value
+    try:
+        return TypeAdapter(kind).validate_python(more)
+    except ValidationError as error:
+        wrong = error.errors()[0]
+        raise SettingsError(f"{verb}: {wrong['loc'][0]} = {wrong['input']!r}: {wrong['msg']}") from None

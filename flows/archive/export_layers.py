@@ -86,7 +86,7 @@ def choose_products(flags: ProductFlags) -> ProductChoice:
             raise SettingsError(f"--{name} {given!r} names nothing; give names with commas, or leave it out")
     doses = {}
     for part in split_list(flags.prescription):
-        name, _, number = part.partition("=")
+        name, _, number = part.rpartition("=")
         if not re.fullmatch(r"\s*\d+(\.\d*)?|\s*\.\d+", number) or not name.strip():
             raise SettingsError(
                 f"--prescription expects classes with numbers, weed=2.5, got {part!r}; numbers are 0 or more, without "

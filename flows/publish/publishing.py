@@ -21,6 +21,7 @@ from flows.settings.values import KEEP_SIGNAL
 from flows.tasks.open_survey import STAGES, OpenSurvey, RunRef
 from flows.tasks.prefect_tasks import as_task, inside_flow, prefect_artifacts
 from flows.tasks.stages.accuracy import evaluate
+from flows.tasks.stages.attention import load_plan
 from flows.tasks.stages.capture import capture_coarse, capture_fine
 from flows.tasks.stages.condense import raw_differs
 from storage.archive.keys import StageRef, canonical_json
@@ -49,6 +50,9 @@ def _publish(survey: OpenSurvey, *products: StageRef) -> RunRef:
         judged = False
     _clear_first_mosaic(survey)
     published = publish_run(survey)
+    plan = load_plan(survey.products["score"])
+    if not (survey.run.plan.plain or plan.sweeps):
+        survey.observer.note(f"no second pass: {plan.reason}")
     if judged:
         survey.observer.note(f"published: {published.folder}; accuracy follows")
     _show_artifact(survey, published)

@@ -111,6 +111,8 @@ def format_score(receipt: Mapping[str, Any]) -> str:
     expected = receipt.get("expected") or {}
     if predicted := format_prediction(expected.get("miou"), expected.get("error")):
         return f"Expected mIoU {predicted} of 100, estimated from the map's own probabilities.{later}"
+    if receipt.get("accuracy_is") == "left out":
+        return "The accuracy was left out; `spectralzoom evaluate ARCHIVE RUN` adds it."
     return later.strip() or "The score is not known: there are no labels."
 
 

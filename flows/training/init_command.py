@@ -41,9 +41,10 @@ from storage.readers.label_files import (
 from storage.readers.labels import MixedLabelsError
 from storage.readers.open_cubes import open_cube, open_labels, split_variable, with_wavelengths
 from storage.readers.polygons import is_polygon_file
-from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings
+from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, load_scene_settings
 
 TITLES = {"extent": "reading labels"}
+NOTHING_KNOWN = SceneSettings()
 Report = Callable[[float, str], None]  # progress, 0..1, and the name of the file
 
 
@@ -57,7 +58,7 @@ def init(source: str, *, force: Switch = False, as_json: AsJson = False) -> int:
     source
         A folder of images with their labels, or one image or cube.
     force
-        Replace an existing file, which is kept as scene.toml.old.
+        Replace an existing file, which is kept as scene.toml.old; its class_attribute and unlabelled stay.
     """
     put_out(run_init(source, stderr, force=force), _show, as_json=as_json)
     return DONE
@@ -71,15 +72,19 @@ def run_init(source: str, console: Console, *, force: bool = False) -> dict[str,
     """
     place, _ = split_variable(source)
     path = (place if place.is_dir() and not is_store(place) else place.parent) / SETTINGS_NAME
+    known = NOTHING_KNOWN
+    with suppress(PipelineError):  # a file that cannot be read is replaced
+        before = load_scene_settings(path) if force and path.exists() else NOTHING_KNOWN
+        known = SceneSettings(class_attribute=before.class_attribute, unlabelled=before.unlabelled)
     with writing(path.parent, "folder"), _set_aside(path, force=force):
         with StageProgress(console, TITLES) as progress:
-            draft = draft_scene(source, lambda done, name: progress.show("extent", done, name, ended=done == 1))
+            draft = draft_scene(source, known, lambda done, name: progress.show("extent", done, name, ended=done == 1))
         parts = [
             [
                 f"# Properties of {counted(len(draft.files.images), 'image')} by `spectralzoom init`.",
                 "# Any line may be changed or removed; text after a # is a comment.",
             ],
-            _label_lines(draft),
+            _label_lines(draft, known),
             _wavelength_lines(draft),
             _value_lines(draft),
             _class_lines(draft),
@@ -88,7 +93,10 @@ def run_init(source: str, console: Console, *, force: bool = False) -> dict[str,
     found, bands = draft.files, draft.cube.bands
     count = draft.cube.shape[2]
     first = f"write the {count} wavelengths into {path}: wavelengths_nm or wavelengths_file, as its lines say"
-    again = shlex.join(["spectralzoom", "init", source, "--force"]) if found.labels and not draft.classes else None
+    if found.labels and not draft.classes:
+        first, again = f"repair these label files, or write what is missing into {path}", ["init", source, "--force"]
+    else:
+        first, again = "" if bands.wavelength_nm is not None else first, []
     return {
         "file": str(path),
         "images": len(found.images),
@@ -100,8 +108,8 @@ def run_init(source: str, console: Console, *, force: bool = False) -> dict[str,
         "classes": [{"name": one.name, "value": one.value, "fraction": one.fraction} for one in draft.classes],
         "notes": list(draft.notes),
         "unseen": _unseen(draft),
-        "first": "repair these label files" if again else None if bands.wavelength_nm is not None else first,
-        "next": again or _next(source, draft),
+        "first": first or None,
+        "next": shlex.join(["spectralzoom", *again]) if again else _next(source, draft),
     }
 
 
@@ -125,17 +133,21 @@ def _set_aside(path: Path, *, force: bool) -> Iterator[None]:
         raise
 
 
-def _label_lines(draft: SceneDraft) -> list[str]:
+def _label_lines(draft: SceneDraft, known: SceneSettings) -> list[str]:
     images, labels = draft.files.images, draft.files.labels
     if not labels:
         return ['# labels = "labels/{name}.png"   # no label files were found: {name} is an image\'s name']
+    kept = [] if known.class_attribute is None else [f"class_attribute = {_quoted(known.class_attribute)}"]
+    if known.unlabelled is not None:
+        kept.append(f"unlabelled = {_value(known.unlabelled)}")
     if draft.only_label is None:
         pair = next(iter(labels.items()))
         return [
+            *kept,
             f"# labels of {len(labels)} of {len(images)} images were found by their names: {_printable(pair[0].name)}"
-            f" has {_printable(pair[1].name)}"
+            f" has {_printable(pair[1].name)}",
         ]
-    return [f"labels = {_quoted(draft.only_label)}   # of all images"]
+    return [*kept, f"labels = {_quoted(draft.only_label)}   # of all images"]
 
 
 def _wavelength_lines(draft: SceneDraft) -> list[str]:
@@ -171,7 +183,7 @@ def _class_lines(draft: SceneDraft) -> list[str]:
     classes = draft.classes
     if not classes:
         return []
-    guess = [one for one in classes if one.value in (0, 255, (0, 0, 0), (255, 255, 255))]
+    guess = [one.value for one in classes if one.value in (0, 255, (0, 0, 0), (255, 255, 255))]
     lines = [
         f"# unlabelled = {_value(one)}   # if it means no class: remove the #, and its line below" for one in guess[:1]
     ]
@@ -179,11 +191,11 @@ def _class_lines(draft: SceneDraft) -> list[str]:
     if all(is_polygon_file(label) for label in draft.files.labels.values()):
         parts = "name = number; polygons have the name or the number"
     lines += ["", f"[classes]   # with its fraction of the labelled pixels: {parts}"]
-    return lines + [f"{_key(one.name)} = {_value(one)}   # {one.fraction:.1%}" for one in classes]
+    return lines + [f"{_key(one.name)} = {_value(one.value)}   # {one.fraction:.1%}" for one in classes]
 
 
-def _value(one: FoundClass) -> str:
-    return str(one.value) if isinstance(one.value, int) else str(list(one.value))
+def _value(value: ClassValue) -> str:
+    return str(value) if isinstance(value, int) else str(list(value))
 
 
 def _key(name: str) -> str:
@@ -268,8 +280,10 @@ class SceneDraft:
     has_steps: bool  # the first is one step of a series
 
 
-def draft_scene(address: str | Path, report: Report = lambda done, name: None) -> SceneDraft:
-    """Inspect the images and labels of a folder, or one file and its labels.
+def draft_scene(
+    address: str | Path, known: SceneSettings = NOTHING_KNOWN, report: Report = lambda done, name: None
+) -> SceneDraft:
+    """Inspect the images and labels of a folder, or one file and its labels, by what is ``known`` of the labels.
 
     The first image is read, of others only the size; all label files are read. Raises SceneError: there is no image, or
     the first one cannot be read; labels may belong to several images, or have mixed values.
@@ -298,7 +312,7 @@ def draft_scene(address: str | Path, report: Report = lambda done, name: None) -
         first=str(first),
         cube=source,
         only_label=Path(label_path).as_posix() if label_path and label_path.isprintable() else None,
-        classes=_classes(found, source.shape[2], unseen, report),
+        classes=_classes(found, source.shape[2], known, unseen, report),
         notes=(*series, *source.notes),
         unseen=tuple(unseen),
         has_steps=bool(series),
@@ -325,9 +339,11 @@ def _shared_labels(found: MatchedFiles, shape: tuple[int, ...]) -> MatchedFiles:
     return found
 
 
-def _classes(found: MatchedFiles, bands: int, unseen: list[str], report: Report) -> tuple[FoundClass, ...]:
+def _classes(
+    found: MatchedFiles, bands: int, settings: SceneSettings, unseen: list[str], report: Report
+) -> tuple[FoundClass, ...]:
     """Return all classes of the label files; ``unseen`` gets notes on files that cannot be used."""
-    counts, used, settings = Counter[str](), list[Path](), SceneSettings()
+    counts, used = Counter[str](), list[Path]()
     for number, (image, label) in enumerate(found.labels.items()):
         report(number / len(found.labels), label.name)
         try:

@@ -26,7 +26,7 @@ from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentati
 from models.training.examples import BRIGHTNESS, CropSampler, Example
 from models.training.objective import batch_loss, class_weights, phase_at
 from models.weights.checksummed_files import load_checkpoint, save_checkpoint
-from pipeline.errors import PipelineError
+from pipeline.errors import PipelineError, SceneError
 from pipeline.geometry.grid import UNLABELLED
 
 KEEP_EVERY_S = 120.0  # between checkpoints
@@ -237,9 +237,14 @@ def linear_discriminants(pixels: LabelledPixels, classes: int) -> dict[str, Tens
     """Fit linear discriminants with shrinkage; return them as tensors of the segmenter's ``spectral`` layer.
 
     A class without a pixel gets the logit `ABSENT`. With pixels of a single class all classes are equally likely.
+    Raises SceneError: there are as few pixels as classes.
     """
     weight, bias = np.zeros((classes, pixels.features.shape[1])), np.full(classes, ABSENT)
     known = np.unique(pixels.labels)
+    if 1 < len(known) >= len(pixels.labels):
+        raise SceneError(
+            f"{len(pixels.labels)} labelled pixels of {len(known)} classes are too few; label more of each"
+        )
     if len(known) > 1:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "Only one sample available", UserWarning)  # of a class of one pixel

@@ -7,6 +7,8 @@ A run is published once its map is drawn; stopped while the map is judged it is 
 
 from __future__ import annotations
 
+import os
+import random
 import shutil
 import signal
 import time
@@ -32,7 +34,8 @@ PLACES = {  # function and call before which a survey is stopped that has its ma
     "after the run has changed": ("storage.archive.run_folders:remove_tree", 2, signal.SIGKILL),
 }
 ADDED = "after the run has changed"
-MOMENTS = (0.28, 0.98)  # of the time it takes
+KILLS = int(os.environ.get("KILLS", "0"))  # at more moments, by `make soak`
+MOMENTS = (0.28, 0.98, *(random.Random(0).uniform(0.05, 1.05) for _ in range(KILLS)))  # of the time it takes
 
 
 def told(ended: Ended) -> bool:

@@ -35,7 +35,9 @@ def cells(name: str, kind: str) -> list[dict[str, Any]]:
 
 @pytest.mark.usefixtures("drawing")
 @pytest.mark.parametrize("name", NAMES)
-def test_every_cell_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_cell_runs(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """As a page's blocks do, in this process: a kernel and all that it loads would cost more than the surveys."""
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {"__name__": name}
@@ -43,6 +45,8 @@ def test_every_cell_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     with without_effects():
         for number, cell in enumerate(cells(name, "code")):
             exec(compile("".join(cell["source"]), f"{name}.ipynb, cell {number}", "exec", dont_inherit=True), names)
+            shown = [output for output in cell["outputs"] if output.get("name") == "stdout"]
+            assert bool(capsys.readouterr().out) == bool(shown), f"cell {number} prints other than what is shown of it"
     drawn = [axes for number in plt.get_fignums() for axes in plt.figure(number).axes]
     assert all(axes.images or any(len(line.get_xdata()) for line in axes.lines) or axes.collections for axes in drawn)
     assert len(drawn) >= 3

@@ -89,8 +89,8 @@ def test_init_asks_to_repair_labels_of_another_size(tmp_path: Path, command_line
     for name, size in (("001", 32), ("001_mask", 24)):
         Image.fromarray(np.eye(size, dtype=np.uint8)).save(tmp_path / f"{name}.png")
     told = json.loads(command_line("init", tmp_path, "--json").out)
-    assert told["first"] == "repair these label files"
     assert told["next"].split()[1:] == ["init", str(tmp_path), "--force"]
+    assert told["first"] == f"repair these label files, or write what is missing into {tmp_path / 'scene.toml'}"
 
 
 def test_training_leaves_out_and_says_so(made: Path, tmp_path: Path, command_line: Any) -> None:

@@ -219,6 +219,11 @@ def test_the_impossible_is_refused_first(posed: Exported, tmp_path: Path, flags:
     assert not (tmp_path / "out").exists()
 
 
+def test_a_class_may_have_an_equals_sign() -> None:
+    """The dose stands behind the last one."""
+    assert choose_products(ProductFlags(prescription="a=1=2.5,b=1")).doses == {"a=1": 2.5, "b": 1.0}
+
+
 @pytest.mark.parametrize(
     ("crs", "box", "words"),
     [

@@ -180,6 +180,8 @@ def test_what_cannot_be_is_one_error(make_weights: WeightsMaker, tmp_path: Path)
         spectralzoom.open(tmp_path / "nowhere")
     with pytest.raises(spectralzoom.Error, match=r"train has no 'stepps'; it has .*steps"):
         spectralzoom.train("farm", tmp_path / "x.safetensors", stepps=2)
+    with pytest.raises(spectralzoom.Error, match=r"train: steps = 'many': .* integer"):
+        spectralzoom.train("farm", tmp_path / "x.safetensors", steps="many")
     with pytest.raises(spectralzoom.Error, match="needs weights=FILE"):
         spectralzoom.evaluate("farm")
     with pytest.raises(spectralzoom.Error, match="evaluate has no 'fraction'"):

@@ -41,7 +41,7 @@ from storage.arrays.ground_maps import BLOCK, GroundMapWriter
 from storage.arrays.layout import NO_CLASS, blank_pixels
 from storage.arrays.mosaics import Attention, choose_bands, develop, open_mosaic, write_attention
 
-CLASS_MAP = Product("segment", version=24, files=(MAP, PROBABILITIES), by_weights=True)
+CLASS_MAP = Product("segment", version=25, files=(MAP, PROBABILITIES), by_weights=True)
 OUT_OF_RANGE = "out_of_range.json"  # beside a map with values out of range
 MOST_TURN_PX = 12.0  # greatest offset of the corners by rotation, at which a prior map is used
 
@@ -150,18 +150,20 @@ def _prior_map_figures(
     """Return the figures of a prior map: agreement with this visit, and pixels that changed from class to class.
 
     Changed pixels exceed the expected difference of two maps of the same ground; all differing pixels are counted too.
+    One that is put aside has no counts but the compared pixels.
     """
     put_aside = TURNED if comparison is None else ANOTHER_FIELD if comparison.is_of_another_field else None
-    compared = 0 if comparison is None else int(comparison.changed.sum())
-    differing, expected, pairs = 0, 0.0, list[tuple[int, int, str, str]]()
+    counts: dict[str, int | None] = dict.fromkeys(("differing_px", "expected_differing_px", "changed_px"))
+    compared, pairs = 0 if comparison is None else int(comparison.changed.sum()), list[tuple[int, int, str, str]]()
     if comparison is not None and put_aside is None:
         beyond = comparison.beyond
-        differing = compared - int(np.trace(comparison.changed))
-        expected = float(comparison.expected.sum() - np.trace(comparison.expected))
         pairs = [
             (int(beyond[old, new]), int(comparison.changed[old, new]), names[old], names[new])
             for old, new in np.argwhere(beyond)
         ]
+        counts["differing_px"] = compared - int(np.trace(comparison.changed))
+        counts["expected_differing_px"] = round(float(comparison.expected.sum() - np.trace(comparison.expected)))
+        counts["changed_px"] = sum(one for one, _, _, _ in pairs)
     return {
         "run": prior.run,
         "days": prior.days,
@@ -171,9 +173,7 @@ def _prior_map_figures(
         "shift_px": list(whole_pixels(lies)),
         "turned_deg": lies.turned_deg,
         "compared_px": compared,
-        "differing_px": differing,
-        "expected_differing_px": round(expected),
-        "changed_px": sum(beyond for beyond, _, _, _ in pairs),
+        **counts,
         "changes": [list(pair) for pair in sorted(pairs, reverse=True)],
     }
 

@@ -178,6 +178,7 @@ def test_the_details_have_stages_and_effects():
     ("found", "words"),
     [
         ({}, "The score is not known: there are no labels."),
+        ({"accuracy_is": "left out"}, "The accuracy was left out; `spectralzoom evaluate ARCHIVE RUN` adds it."),
         ({"expected": {"miou": 0.94, "error": 0.02}}, "Expected mIoU 94.0 ± 2.0 of 100, estimated from the map's own"),
         ({"expected": {"miou": 0.94, "error": 0.4}, "accuracy_is": "pending"}, "is added later."),
         ({"unknown": {"fraction": 0.5}, "expected": {"miou": 0.9, "error": 0.0}}, "Unknown: 50 % of the map. These"),

@@ -194,6 +194,8 @@ def test_another_field_under_the_same_name_is_put_aside(visited: Path, survey_pn
     words, wrong = words_of(visited, survey_png, **flags, prior="latest")
     alone = survey_png(tmp_path / "alone", **{**UNIFORM, **flags})
     assert wrong.receipt["prior_map"]["put_aside"] == "another field"
+    assert {wrong.receipt["prior_map"][name] for name in ("differing_px", "changed_px")} == {None}
+    assert "differing" not in words
     assert "not used: another field" in words
     cost, once = (run.receipt["savings"]["multiply_adds"] for run in (wrong, alone))  # the map was drawn twice
     assert cost["overview"] == 2 * once["overview"]

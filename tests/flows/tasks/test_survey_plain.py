@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import re
 from dataclasses import dataclass, replace
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from PIL import Image
+from rich.console import Console
 
 from flows.publish.receipt import check_receipt
 from flows.publish.run_folder import Published
@@ -165,7 +167,9 @@ def test_a_first_mosaic_that_another_run_publishes_stays(survey_png: Any, tmp_pa
 @pytest.mark.usefixtures("no_effects")
 def test_without_later_lines_the_first_pass_is_read_in_full(survey_png: Any, weights: Path, tmp_path: Path) -> None:
     """A budget that pays for the first pass alone gives the map of a uniform scan of these lines."""
-    done = Done(survey_png(tmp_path, budget="0.45"), tmp_path)
+    said = Console(file=io.StringIO(), width=400)
+    done = Done(survey_png(tmp_path, said, budget="0.45"), tmp_path)
+    assert "note: no second pass: no " in said.file.getvalue()
     assert done.published.captured_again == 0
     mosaic = open_mosaic(tmp_path / done.receipt["products"]["mosaic"])
     drawn = done.open("class_map")["classes"].values

@@ -26,6 +26,7 @@ from models.training.train import (
     train,
     with_discriminants,
 )
+from pipeline.errors import SceneError
 from pipeline.geometry.grid import SceneGrid
 from tests.models.conftest import Maker, block_example
 
@@ -181,6 +182,12 @@ def test_a_class_of_one_pixel_has_discriminants() -> None:
     labels = np.repeat([0, 1, 2], [20, 19, 1]).astype(np.uint8)
     start = linear_discriminants(LabelledPixels(features, labels), 3)
     assert all(torch.isfinite(one).all() for one in start.values())
+
+
+def test_as_few_pixels_as_classes_are_refused() -> None:
+    """The message counts both."""
+    with pytest.raises(SceneError, match="2 labelled pixels of 2 classes are too few; label more of each"):
+        linear_discriminants(LabelledPixels(np.eye(2, dtype=np.float32), np.array([0, 2], np.uint8)), 3)
 
 
 def test_discriminants_do_not_rely_on_the_light() -> None:

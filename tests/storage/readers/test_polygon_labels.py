@@ -14,9 +14,10 @@ import shapely
 from affine import Affine
 
 from flows.training.data import load_data_set
-from flows.training.init_command import draft_scene
+from flows.training.init_command import draft_scene, run_init
 from pipeline.errors import SceneError
 from storage.readers.scene_files import load_scene_file
+from tests.conftest import QUIET
 
 pytestmark = pytest.mark.filterwarnings("ignore:'crs' was not provided")
 PLACE = Affine(2, 0, 400_000, 0, -2, 5_700_000)
@@ -152,6 +153,19 @@ def test_a_folder_of_scenes(tmp_path: Path) -> None:
     scene(tmp_path, "c.tif")
     with pytest.raises(SceneError, match=r"some labels are polygons .* and some are pictures"):
         _ = load_data_set(tmp_path).classes
+
+
+def test_init_again_keeps_the_attribute_that_it_asked_for(tmp_path: Path) -> None:
+    """The folder whose polygons have an attribute of their own: write it down, run the command again, train."""
+    written(scene(tmp_path).with_suffix(".gpkg"), culture=["wheat", "maize"])
+    asked = run_init(str(tmp_path), QUIET)
+    assert "class_attribute" in asked["unseen"][0]
+    assert "--force" in asked["next"]
+    (tmp_path / "scene.toml").write_text('class_attribute = "culture"\n')
+    told = run_init(str(tmp_path), QUIET, force=True)
+    assert [one["name"] for one in told["classes"]] == ["maize", "wheat"]
+    assert "train" in told["next"]
+    assert load_data_set(tmp_path).load("field").class_names == ("maize", "wheat")
 
 
 @pytest.mark.parametrize(
