@@ -249,7 +249,7 @@ def _check_same(catalogue: Catalogue, found: Run, products: Products, run: Surve
         raise SceneError(
             f"the scene {run.settings.scene} is not the one that {found.uri} captured; restore it, or survey again"
         )
-    if run.weights_key != catalogue.stores[products["segment"].uri].params.get("weights"):
+    if run.described.key != catalogue.stores[products["segment"].uri].params.get("weights"):
         raise WeightsError(
             f"the weights {run.settings.weights or 'that come with SpectralZoom'} are not those of the map of"
             f" {found.uri}; restore those, or reprocess with these"

@@ -179,11 +179,6 @@ class SurveyRun(CaptureRun):
         return self.load()
 
     @property
-    def weights_key(self) -> str:
-        """Return the hash of the weights."""
-        return self.described.key
-
-    @property
     def reader(self) -> ReaderPart | None:
         """Return the temporal reader of the weights; None where they have none."""
         return self.described.reader
@@ -197,7 +192,7 @@ class SurveyRun(CaptureRun):
     def model_key(self) -> dict[str, Any]:
         """Return the parameters of stages that use the weights."""
         return {
-            "weights": self.weights_key,
+            "weights": self.described.key,
             **({} if self.settings.device == PROCESSOR else {"device": self.settings.device}),
         }
 

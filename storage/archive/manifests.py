@@ -106,7 +106,7 @@ def listed_bytes(manifest: Mapping[str, Any]) -> int:
 
 def made_bytes(manifest: Mapping[str, Any]) -> int:
     """Return the size of all files as they were published, including cleared ones."""
-    size = _table(manifest.get(CLEARED)).get("bytes_before")
+    size = as_table(manifest.get(CLEARED)).get("bytes_before")
     return size if isinstance(size, int) else listed_bytes(manifest)
 
 
@@ -124,12 +124,13 @@ def is_cleared(manifest: Mapping[str, Any]) -> bool:
 
 def manifests_before(manifest: Mapping[str, Any]) -> list[str]:
     """Return the SHA-256 of a run's manifests before it was extended, oldest first."""
-    found = _table(manifest.get(EXTENDED)).get("manifests")
+    found = as_table(manifest.get(EXTENDED)).get("manifests")
     return [one for one in found if isinstance(one, str)] if isinstance(found, list) else []
 
 
-def _table(value: object) -> Mapping[str, Any]:
-    return value if isinstance(value, Mapping) else {}
+def as_table(value: object) -> dict[str, Any]:
+    """Return a value of a damaged or foreign manifest if it is a table, else an empty one."""
+    return value if isinstance(value, dict) else {}
 
 
 def extended_facts(before: Mapping[str, Any], sha256: str) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from storage.archive.keys import StageRef, in_text
-from storage.archive.manifests import is_cleared, listed_bytes, try_manifest
+from storage.archive.manifests import as_table, is_cleared, listed_bytes, try_manifest
 from storage.archive.staging import MANIFEST_NAME, file_hash
 
 RECEIPT = "receipt.json"
@@ -63,12 +63,12 @@ class Store:
     @property
     def params(self) -> dict[str, Any]:
         """Parameters that it was made with."""
-        return _table(self.facts.get("params"))
+        return as_table(self.facts.get("params"))
 
     @property
     def libraries(self) -> dict[str, Any]:
         """Libraries that it was made with, and their versions."""
-        return _table(self.facts.get("libraries"))
+        return as_table(self.facts.get("libraries"))
 
     @property
     def inputs(self) -> list[str]:
@@ -109,7 +109,7 @@ class Run:
     @cached_property
     def names(self) -> frozenset[str]:
         """Return the addresses of its stores and of all their inputs; empty where its manifest is damaged."""
-        named = {uri for uri in _table(self.facts.get(RESTS_ON)) if in_text(uri) == uri}
+        named = {uri for uri in as_table(self.facts.get(RESTS_ON)) if in_text(uri) == uri}
         return frozenset(named | self._ingested() if named else named)
 
     def _ingested(self) -> set[str]:
@@ -125,12 +125,12 @@ class Run:
     @property
     def settings(self) -> dict[str, Any]:
         """Return the settings of the survey, from the manifest or else from the receipt."""
-        return _table(self.facts.get("settings")) or _table(self.receipt.get("settings"))
+        return as_table(self.facts.get("settings")) or as_table(self.receipt.get("settings"))
 
     @property
     def products(self) -> dict[str, str]:
         """Names and addresses of its products."""
-        return {name: uri for name, uri in _table(self.receipt.get("products")).items() if isinstance(uri, str)}
+        return {name: uri for name, uri in as_table(self.receipt.get("products")).items() if isinstance(uri, str)}
 
     @property
     def stages(self) -> list[dict[str, Any]]:
@@ -176,13 +176,9 @@ def _receipt(folder: Path, facts: Mapping[str, Any]) -> tuple[dict[str, Any], st
     try:
         if file_hash(path) != entry["sha256"]:
             return {}, f"{RECEIPT} has changed since it was published (its SHA-256 differs)"
-        return _table(json.loads(path.read_bytes())), None
+        return as_table(json.loads(path.read_bytes())), None
     except (OSError, ValueError, RecursionError) as error:
         return {}, f"{RECEIPT} cannot be read: {error.strerror if isinstance(error, OSError) else error}"
-
-
-def _table(value: object) -> dict[str, Any]:
-    return value if isinstance(value, dict) else {}
 
 
 def _text(value: object) -> str:

@@ -175,11 +175,8 @@ def score_spec(dims: tuple[str, str, str], shape: tuple[int, int, int], largest:
     """Return the layout of scores (component, row, column) of at most ``largest`` steps."""
     count, rows, columns = shape
     chunk = (max(count, 1), min(SCORE_CHUNK, max(rows, 1)), min(SCORE_CHUNK, max(columns, 1)))
-    whole = (
-        -(-min(size, most) // part) * part
-        for size, most, part in zip((rows, columns), (SHARD_ROWS, SHARD_COLUMNS), chunk[1:], strict=True)
-    )
-    return ArraySpec(dims, shape, integers_for(largest), chunk, (chunk[0], *whole))
+    shard = (_whole_chunks(min(rows, SHARD_ROWS), chunk[1]), _whole_chunks(min(columns, SHARD_COLUMNS), chunk[2]))
+    return ArraySpec(dims, shape, integers_for(largest), chunk, (chunk[0], *shard))
 
 
 def steps_within(scores: NDArray[np.floating], step: float, kind: np.dtype[Any]) -> NDArray[np.floating]:

@@ -49,8 +49,7 @@ def test_what_is_no_device_is_refused_with_those_that_are() -> None:
 
 def test_a_map_of_another_device_is_another_store() -> None:
     """Its last bits may differ; stores of the processor keep the keys that they had."""
-    keys = [
-        SurveyRun.model_key.fget(SimpleNamespace(settings=SimpleNamespace(device=name), weights_key="w"))  # type: ignore[attr-defined]
-        for name in ("cpu", "cuda")
-    ]
+    described = SimpleNamespace(key="w")
+    runs = [SimpleNamespace(settings=SimpleNamespace(device=name), described=described) for name in ("cpu", "cuda")]
+    keys = [SurveyRun.model_key.fget(run) for run in runs]  # type: ignore[attr-defined]
     assert keys == [{"weights": "w"}, {"weights": "w", "device": "cuda"}]
