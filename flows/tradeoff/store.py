@@ -1,7 +1,7 @@
 """The trade-off of storing lines: condensed spectra beside other methods.
 
-The other methods are binned bands, rounded numbers, pcodec, ZFP, principal components without whitening, and those
-as JPEG 2000 (Du & Fowler 2007). Each gives scene values back, which are rectified and read as in a survey.
+The other methods are binned bands, pcodec of exact and of rounded numbers, principal components without whitening, and
+those as JPEG 2000 (Du & Fowler 2007). Each gives scene values back, which are rectified and read as in a survey.
 """
 
 from __future__ import annotations
@@ -61,7 +61,6 @@ FEWER = (8, 6, 4)  # components
 BINS = (2, 4, 8, 17)  # bands
 ROUNDED = (0.25, 0.5, 1.0)  # deviations of the noise
 RATES = (1.0, 2.0, 4.0)  # bytes a spectrum
-TOLERANCES = (4.0, 8.0, 16.0)  # largest error of a sample, in deviations of the noise
 BLOCK_LINES = 64
 JP2_DRIVER = "JP2OpenJPEG"
 JP2_STEP = 0.25  # of scores before JPEG 2000 [deviations of the noise]
@@ -292,13 +291,6 @@ def bin_bands(scan: ScanLines, width: int) -> KeptLines:
     return KeptLines(size, lambda: scan.lines.calibrated(np.asarray(array[...], np.float32) @ weights))
 
 
-def round_numbers(scan: ScanLines, step: float) -> KeptLines:
-    """Store raw numbers in whole steps, each a fraction of its band's noise."""
-    unit, steps = _in_steps(scan, step)
-    size, array = numbers_in_memory(steps)
-    return KeptLines(size + unit.nbytes, lambda: scan.lines.calibrated(np.asarray(array[...]) * unit))
-
-
 def _in_steps(scan: ScanLines, step: float) -> tuple[Values, NDArray[np.unsignedinteger[Any]]]:
     """Return the step of each band (band,) and raw numbers in whole steps."""
     unit = (step * scan.noise_dn).astype(np.float32)
@@ -316,14 +308,6 @@ def pack_pcodec(scan: ScanLines, step: float | None) -> KeptLines:
         return scan.lines.calibrated(pcodec.standalone.simple_decompress(packed).reshape(numbers.shape) * unit)
 
     return KeptLines(len(packed) + unit.nbytes, restore)
-
-
-def compress_zfp(scan: ScanLines, tolerance: float) -> KeptLines:
-    """Store raw numbers over each band's noise by ZFP, within a tolerance."""
-    zfpy = importlib.import_module("zfpy")
-    unit = scan.noise_dn.astype(np.float32)
-    packed: bytes = zfpy.compress_numpy(scan.lines.data / unit, tolerance=tolerance)
-    return KeptLines(len(packed) + unit.nbytes, lambda: scan.lines.calibrated(zfpy.decompress_numpy(packed) * unit))
 
 
 def keep_principal(scan: ScanLines, step: float) -> KeptLines:
@@ -406,20 +390,15 @@ _PCODEC: Mapping[Setting, Callable[[ScanLines], KeptLines]] = {
     "pcodec, exact": partial(pack_pcodec, step=None),
     **{f"pcodec, rounded {step:g}": partial(pack_pcodec, step=step) for step in ROUNDED},
 }
-_ZFP: Mapping[Setting, Callable[[ScanLines], KeptLines]] = {
-    f"ZFP, tolerance {most:g}": partial(compress_zfp, tolerance=most) for most in TOLERANCES
-}
 WAYS: Mapping[Setting, Callable[[ScanLines], KeptLines]] = {
     "raw": keep_raw,
     **{f"condensed, step {step:g}": partial(condense, step=step) for step in STEPS},
     **{f"fewer components, {most}": partial(condense, step=1.0, most=most) for most in FEWER},
     **{f"binned, {width} bands": partial(bin_bands, width=width) for width in BINS},
-    **{f"rounded, {step:g}": partial(round_numbers, step=step) for step in ROUNDED},
-    **(_PCODEC if importlib.util.find_spec("pcodec") else {}),  # packages of the extra `bench`
+    **(_PCODEC if importlib.util.find_spec("pcodec") else {}),  # of the extra `bench`
     **{f"PCA, step {step:g}": partial(keep_principal, step=step) for step in STEPS},
     **{f"PCA, JPEG 2000, {rate:g} B": partial(compress_jpeg2000, rate=rate, raw=True) for rate in RATES},
     **{f"condensed, JPEG 2000, {rate:g} B": partial(compress_jpeg2000, rate=rate, raw=False) for rate in RATES},
-    **(_ZFP if importlib.util.find_spec("zfpy") else {}),
 }
 
 
