@@ -143,7 +143,7 @@ def test_areas_are_told_without_a_place(surveyed: Raster, tmp_path: Path, pixel_
 
 
 def test_an_export_has_the_rasters_own_pixels(surveyed: Raster, make_weights: WeightsMaker, tmp_path: Path) -> None:
-    """Reflectance and NDVI are the file's by rasterio, on its grid and CRS; so are classes and confidence."""
+    """Reflectance and NDVI are the file's by rasterio, on its grid and CRS."""
     values = (patchy_scene((50, 70), 3, seed=7)[0] / 255).astype(np.float32)
     source = write_tif(tmp_path / "field.tif", values)
     published = surveyed(source, wavelengths="670,550,800", weights=str(make_weights((550.0, 670.0, 800.0))))
@@ -157,8 +157,6 @@ def test_an_export_has_the_rasters_own_pixels(surveyed: Raster, make_weights: We
     ndvi = (values[..., 2] - values[..., 0]) / (values[..., 2] + values[..., 0])
     with rasterio.open(folder / "NDVI.tif") as exported:
         assert np.sqrt(np.mean((exported.read(1) - ndvi) ** 2)) < 0.01
-    with rasterio.open(folder / "class_map.tif") as exported:
-        assert (exported.crs, exported.transform, exported.shape) == (own.crs, own.transform, own.shape)
 
 
 def test_a_second_visit_goes_on_from_the_first(surveyed: Raster, scene_files: Path) -> None:
