@@ -144,8 +144,7 @@ def test_an_ingested_cube_stays_whatever_its_runs_can_capture(archive: Archive) 
     asked = settings(scene=str(cube.path))
     archive.new_run("farm").publish(settings=asked, rests_on=archive.manifest_hashes([cube]))
     flip(cube.path / "data.bin")
-    versions = {**VERSIONS, "ingest": 1}
-    done = repair(archive, verify_archive(archive), Mock(), versions=versions, can_capture=lambda run: True)
+    done = repair(archive, verify_archive(archive), Mock(), versions={"ingest": 1}, can_capture=lambda run: True)
     assert list(done.plan.hopeless) == [cube.uri]
     assert cube.path.exists()
 
