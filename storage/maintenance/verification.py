@@ -138,17 +138,19 @@ def plan_repair(
     stores = [uri for uri in bad if uri.startswith("stages/") and uri.count("/") == 2]
     hopeless = dict.fromkeys((uri for uri in bad if "/" not in uri), "its stage and settings are not known")
     hopeless |= {uri: why for uri in stores if (why := _hopeless(catalogue, uri, versions, can_capture))}
-    lost = {uri for uri in stores if uri in hopeless and catalogue.inputs_of(uri) and not _is_found(archive, uri)}
-    for uri in set(stores) - set(hopeless):  # a survey would capture what it does not find
-        if (named := catalogue.named_by(uri)) and all(run.names & lost for run in named):
-            needed = ", ".join(sorted(named[0].names & lost))
-            hopeless[uri] = f"its survey needs {needed}, which is damaged: restore that first"
+    missed = {uri for uri in stores if uri in hopeless and catalogue.inputs_of(uri) and not _is_found(archive, uri)}
+    there = [(uri, one) for uri, one in catalogue.stores.items() if uri not in stores]
+    missed |= {uri for uri, one in there if one.version != str(versions.get(one.ref.stage))}
+    stuck = {run.uri: min(run.names & missed) for run in catalogue.runs if run.names & missed and not can_capture(run)}
+    for uri in set(stores) - set(hopeless):  # its survey would capture what it does not find
+        if (named := catalogue.named_by(uri)) and all(run.uri in stuck for run in named):
+            hopeless[uri] = f"its survey needs {stuck[named[0].uri]}, which is damaged or of another version"
     broken = set(stores) - set(hopeless)
     ordered = [uri for uri in reversed(catalogue.inputs_first(broken)) if uri in catalogue.stores]
     ordered += sorted(broken - set(ordered))
     runs = {run.uri: _settings_text(run) for run in catalogue.runs if run.uri in bad}
     runs |= {uri: "" for uri in bad if uri.startswith("runs/") and uri not in runs}
-    affected = [run for run in catalogue.runs if (run.uri in runs or run.names & broken) and not run.names & lost]
+    affected = [run for run in catalogue.runs if (run.uri in runs or run.names & broken) and run.uri not in stuck]
     surveys = {text: run for run in affected if (text := _settings_text(run))}
     return RepairPlan(tuple(ordered), hopeless, tuple(surveys.values()), runs)
 
