@@ -47,8 +47,9 @@ def main(arguments: Sequence[str]) -> int:
     print(aligned([("what", "is", "where"), *figures()], (52, 10, 60)))
     if "--journey" in arguments:
         passed = journey()
-        print(f"\nA simulated line passes {len(passed)} files from the command to the class map:")
-        print("\n".join(passed))
+        camera = sum(file.startswith("pipeline/simulator/") for file in passed)
+        words = f"{len(passed) - camera} files from the command to the map, and {camera} that simulate the camera"
+        print(f"\nA line passes {words}:", *passed, sep="\n")
     return 0
 
 
