@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
 from pipeline.errors import PoseError, RigError, ShapeError
 from pipeline.geometry.mirror import mirror_throughput
@@ -285,7 +285,7 @@ def _off_neighbours(response: Floats, noise: Floats) -> Bools:
     """Return elements whose response is missing or odd beside their neighbours'."""
     size = min(WINDOW, len(response))
     around = (max(size - 1 + size % 2, 1), 1)  # an odd number of samples
-    local: Floats = ndimage.median_filter(_without_gaps(response), around, mode="reflect")
+    local: Floats = scipy.ndimage.median_filter(_without_gaps(response), around, mode="reflect")
     least = np.maximum(LIT_SIGMAS * noise, LIT_FRACTION * _median(response, axis=0))
     judged = np.isfinite(response) & (local > least)
     relative = np.full(response.shape, np.nan)
@@ -299,7 +299,7 @@ def _off_neighbours(response: Floats, noise: Floats) -> Bools:
         return dead
     # Beyond the nearest neighbours as well; two odd elements side by side do not hide each other.
     filled = _without_gaps(response)
-    low, high = (ndimage.rank_filter(filled, rank, (NEAR, 1), mode="reflect") for rank in (2, -3))
+    low, high = (scipy.ndimage.rank_filter(filled, rank, (NEAR, 1), mode="reflect") for rank in (2, -3))
     beyond = (response < low * (1 - ODD_FRACTION)) | (response > high * (1 + ODD_FRACTION))
     odd: Bools = (np.abs(off) > ODD_SIGMAS * spread) & beyond
     return dead | odd

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter
-from scipy.special import chdtri
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import cuts
@@ -169,16 +168,20 @@ def find_rare(ratio: NDArray[np.float32], law: ResidualLaw, false_alarm: float) 
         size = lines * samples
         high = np.zeros(ratio.shape, np.float32)
         within = tuple(slice(side // 2, (side // 2 - side + 1) or None) for side in (lines, samples))
-        high[within] = uniform_filter(filled, (lines, samples))[within] > _limit(law.freedom * size, part / size)
+        high[within] = scipy.ndimage.uniform_filter(filled, (lines, samples))[within] > _limit(
+            law.freedom * size, part / size
+        )
         if high.any():  # all spectra of the window that the mark came from
             back = tuple(-1 if side % 2 == 0 else 0 for side in (lines, samples))
-            rare |= known & (uniform_filter(high, (lines, samples), mode="constant", origin=back) > 0.5 / size)
+            rare |= known & (
+                scipy.ndimage.uniform_filter(high, (lines, samples), mode="constant", origin=back) > 0.5 / size
+            )
     return rare
 
 
 def _limit(freedom: float, false_alarm: float) -> float:
     """Return the mean square of noise, over its expectation, that is exceeded with a probability."""
-    return float(chdtri(freedom, min(false_alarm, 0.5)) / freedom)
+    return float(scipy.special.chdtri(freedom, min(false_alarm, 0.5)) / freedom)
 
 
 def whole_steps(scores: NDArray[np.floating], step: float) -> NDArray[np.floating]:

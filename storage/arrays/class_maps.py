@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import zarr
 from numpy.typing import NDArray
 
 from pipeline.errors import IncompleteStoreError, ShapeError
 from pipeline.geometry.grid import UNLABELLED, cuts
+from pipeline.lazy import zarr
 from storage.arrays.georeference import AngularGrid, create_placed_group, grid_of
 from storage.arrays.layout import (
     MAP_PACKING,

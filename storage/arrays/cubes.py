@@ -9,11 +9,11 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-import zarr
 from numpy.typing import NDArray
 
 from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.scan import Sweep
+from pipeline.lazy import zarr
 from pipeline.signal.subspace import SignalStatistics
 from pipeline.source import Line, References
 from storage.arrays.layout import (

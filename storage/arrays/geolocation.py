@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zarr
 from numpy.typing import NDArray
 
+from pipeline.lazy import zarr
 from pipeline.rectify.placed import TieTable
 from pipeline.rectify.scan_paths import ScanPath
 from storage.archive.keys import KEY_LENGTH

@@ -13,12 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zarr
 from affine import Affine
 
 from pipeline.errors import PoseError
 from pipeline.ground.georeference import zoomed_out
-from pipeline.lazy import GeoBox, odc_crs, odc_geo_xr, odc_geobox
+from pipeline.lazy import GeoBox, odc_crs, odc_geo_xr, odc_geobox, zarr
 from storage.arrays.layout import SmallArray, create_group, damage_named, open_group
 
 GRID_MAPPING = "spatial_ref"

@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zarr
 from numpy.typing import NDArray
 
 from pipeline.errors import IncompleteStoreError, ShapeError
 from pipeline.ground.field_places import M2_PER_HECTARE
-from pipeline.lazy import GeoBox
+from pipeline.lazy import GeoBox, zarr
 from storage.arrays.class_maps import (
     CHANGED,
     CONFIDENCE,

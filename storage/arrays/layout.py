@@ -14,20 +14,18 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from threading import Lock
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
-import zarr
 from numpy.typing import NDArray
-from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec, TransposeCodec
-from zarr.storage import MemoryStore
 
 from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.grid import UNLABELLED
+from pipeline.lazy import zarr, zarr_codecs, zarr_storage
 from pipeline.signal.components import Components
 from pipeline.signal.condense import whole_steps
 
-StorePlace = Path | MemoryStore  # where a store lies
+StorePlace: TypeAlias = "Path | zarr_storage.MemoryStore"  # where a store lies
 CHUNK_PX = 32
 SHARD_ROWS = 64
 SHARD_COLUMNS = 640
@@ -110,7 +108,7 @@ def create_array(
     Its bytes are packed channel after channel, and its files lie in one folder.
     """
     kind, (codec, level) = np.dtype(spec.dtype), packing
-    shuffle = BloscShuffle.shuffle if flat else BloscShuffle.bitshuffle
+    shuffle = zarr_codecs.BloscShuffle.shuffle if flat else zarr_codecs.BloscShuffle.bitshuffle
     fill: Any = np.nan if kind.kind == "f" else attributes.get("_FillValue", attributes.get("nodata", 0))
     return group.create_array(
         name,
@@ -121,8 +119,11 @@ def create_array(
         fill_value=bool(fill) if kind.kind == "b" else fill,
         dimension_names=spec.dims,
         attributes=dict(attributes),
-        filters=(TransposeCodec(order=(2, 0, 1)),) if flat and len(spec.shape) == 3 else None,
-        compressors=(BloscCodec(cname=codec, clevel=level, shuffle=shuffle, typesize=kind.itemsize), Crc32cCodec()),
+        filters=(zarr_codecs.TransposeCodec(order=(2, 0, 1)),) if flat and len(spec.shape) == 3 else None,
+        compressors=(
+            zarr_codecs.BloscCodec(cname=codec, clevel=level, shuffle=shuffle, typesize=kind.itemsize),
+            zarr_codecs.Crc32cCodec(),
+        ),
         chunk_key_encoding={"name": "default", "separator": "." if flat else "/"},
         config={"write_empty_chunks": packing == RAW_PACKING},  # spares a comparison of every number with the fill
     )
@@ -275,7 +276,7 @@ def numbers_in_memory(values: NDArray[Any]) -> tuple[int, zarr.Array[Any]]:
     """Store integers (line, sample, band) in memory, in chunks of raw lines; return the bytes and the array."""
     held: dict[str, Any] = {}
     spec = image_spec(("line", "sample", "band"), values.shape, values.dtype.str)
-    array = create_array(zarr.create_group(MemoryStore(store_dict=held), zarr_format=3), "dn", spec, {})
+    array = create_array(zarr.create_group(zarr_storage.MemoryStore(store_dict=held), zarr_format=3), "dn", spec, {})
     array[...] = values
     return bytes_held(held, "dn"), array
 

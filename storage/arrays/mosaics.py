@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zarr
 from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import block_means, cuts
+from pipeline.lazy import zarr
 from pipeline.signal.components import Components, broad_weights
 from storage.arrays.georeference import AngularGrid, create_placed_group, grid_of
 from storage.arrays.layout import (

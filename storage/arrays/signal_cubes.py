@@ -17,11 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zarr
 from numpy.typing import NDArray
-from zarr.storage import MemoryStore
 
 from pipeline.geometry.mirror import mirror_throughput
+from pipeline.lazy import zarr, zarr_storage
 from pipeline.signal.calibrate import judge_elements
 from pipeline.signal.components import Components
 from pipeline.signal.condense import RESIDUAL_STEP, UNUSABLE
@@ -266,7 +265,7 @@ class SignalCubeInMemory:
 
     def __init__(self, header: SweepHeader, components: Components, *, step: float, largest: float) -> None:
         self._held: dict[str, Any] = {}
-        self._store = MemoryStore(store_dict=self._held)
+        self._store = zarr_storage.MemoryStore(store_dict=self._held)
         self.writer = SignalCubeWriter(self._store, header, components, step=step, largest=largest)
 
     @property
