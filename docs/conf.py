@@ -10,14 +10,12 @@ from flows.tasks.open_survey import STAGES
 project = "SpectralZoom"
 version = release = metadata.version("spectralzoom")
 copyright = "Apache-2.0"
-language = "en"
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 exclude_patterns = ["_build"]
 html_theme = "furo"
 html_title = "SpectralZoom"
 html_copy_source = False
-html_show_sphinx = False
 
 myst_enable_extensions = ["substitution"]
 myst_heading_anchors = 3  # links such as own-data.md#labels, which are checked

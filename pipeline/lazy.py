@@ -83,9 +83,6 @@ if TYPE_CHECKING:
     import shapely
     import spyndex
     import torch
-    import zarr
-    import zarr.codecs as zarr_codecs
-    import zarr.storage as zarr_storage
     from odc.geo.geobox import GeoBox
     from shapely.geometry.base import BaseGeometry
     from torch import Tensor
@@ -110,6 +107,3 @@ else:
     shapely = deferred("shapely")
     spyndex = deferred("spyndex")
     torch = deferred("torch")
-    zarr = deferred("zarr")
-    zarr_codecs = deferred("zarr.codecs")
-    zarr_storage = deferred("zarr.storage")

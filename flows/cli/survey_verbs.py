@@ -84,8 +84,6 @@ def survey(*settings: Path, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = Fal
     """
     every, code = [load_settings(file, by_setting(flags)) for file in settings or (None,)], 0
     for number, requested in enumerate(every):
-        if number:
-            survey_command.free_memory()
         if len(every) > 1:
             stderr.print(f"survey {number + 1} of {len(every)}: {settings[number]}", markup=False, soft_wrap=True)
         try:

@@ -309,11 +309,6 @@ def _changes(changes: Sequence[Sequence[Any]]) -> str:
     return f"changed {format_area(sum(area for area, _, _ in changes))}: {', '.join(most)}"
 
 
-def _older(areas: Mapping[str, float]) -> str:
-    older = [f"{counted(int(days), 'day')} {format_area(area)}" for days, area in areas.items() if area]
-    return f"captured longer ago than {', '.join(older)}" if older else ""
-
-
 def _scan(scan: Mapping[str, Any]) -> str:
     words = f"{format_scan(scan['step'], scan['exposure_ms'])}, {scan['seconds']:.1f} s"
     predicted = format_prediction(scan["expected_miou"], scan.get("expected_spread"))
@@ -361,7 +356,9 @@ _FORMATS: Mapping[str, Callable[[Any], str]] = {
     "multiply_adds": lambda did: f"multiply-adds {format_percent(did['done'] / did['everything'])} of full resolution",
     "ha": lambda areas: ", ".join(f"{spaced(name)} {format_area(area)}" for name, area in areas.items() if area),
     "changes_ha": _changes,
-    "older_ha": _older,
+    "older_ha": lambda areas: ", ".join(
+        f"{format_area(ha)} captured longer ago than {counted(int(days), 'day')}" for days, ha in areas.items() if ha
+    ),
     "sweeps": lambda sweeps: f"corrected by up to {max(math.hypot(*one) for one in sweeps.values()):.1f} px",
     "saturated": lambda fraction: (
         f"{format_percent(fraction)} of the spectra have bands that are saturated or without data. They are restored "

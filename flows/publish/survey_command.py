@@ -44,6 +44,8 @@ def run_survey(settings: Settings, console: Console, *, verbose: bool = False, s
 
     Raises PipelineError: of the flow; NothingToMend: the expected error of an earlier map is small enough.
     """
+    gc.collect()
+    give_back_freed_memory()  # of a survey before
     use_one_thread()
     keep_freed_memory()
     with StageProgress(console, TITLES) as progress:
@@ -57,12 +59,6 @@ def run_survey(settings: Settings, console: Console, *, verbose: bool = False, s
     if summary:
         show_published(published, settings.out, console, verbose=verbose)
     return published
-
-
-def free_memory() -> None:
-    """Give the memory of the survey before back to the system."""
-    gc.collect()
-    give_back_freed_memory()
 
 
 def _survey(settings: Settings, console: Console) -> RunRef:

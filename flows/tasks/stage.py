@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import wraps
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,13 +79,6 @@ class Wanted:
     shown: bool = True  # on terminals; False if there is nothing to decide or compute
 
 
-class Survey(Protocol):
-    """Opened survey that runs a stage by name, or only plans it."""
-
-    def __call__(self, stage: str, /, *inputs: StageRef) -> StageRef:
-        """Return the store of a stage with these inputs."""
-
-
 @dataclass(frozen=True)
 class Stage:
     """One stage; ``wants`` takes the run and the input stores, and returns the request for its store."""
@@ -98,7 +91,7 @@ class Stage:
     retries: int  # by Prefect, after an OSError
     named: str | None  # name in receipts, where another stage has the same product
 
-    def __call__(self, survey: Survey, *inputs: StageRef | None) -> StageRef:
+    def __call__(self, survey: Callable[..., StageRef], *inputs: StageRef | None) -> StageRef:
         """Return the store of the stage, from the archive or built; a task inside a Prefect flow.
 
         Inputs that are None are ignored. Inside a flow, an OSError is retried ``retries`` times.
@@ -151,7 +144,7 @@ class Stage:
         return ref, built
 
 
-def run_stage(survey: Survey, stage: str, *inputs: StageRef) -> StageRef:
+def run_stage(survey: Callable[..., StageRef], stage: str, *inputs: StageRef) -> StageRef:
     """Run a stage of a survey by name."""
     return survey(stage, *inputs)
 

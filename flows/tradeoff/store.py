@@ -57,7 +57,6 @@ EXPOSURE_MS = 10.0
 BLOCK_PX = 64  # to a side, over which residuals are averaged
 ROWS = 64  # that are rectified at a time
 STEPS = (0.5, 1.0, 2.0, 3.0)  # deviations of the noise
-FEWER = (8, 6, 4)  # components
 BINS = (2, 4, 8, 17)  # bands
 ROUNDED = (0.25, 0.5, 1.0)  # deviations of the noise
 RATES = (1.0, 2.0, 4.0)  # bytes a spectrum
@@ -234,19 +233,15 @@ def keep_raw(scan: ScanLines) -> KeptLines:
     return KeptLines(size, lambda: scan.lines.calibrated(np.asarray(array[...])))
 
 
-def condense(scan: ScanLines, step: float, most: int | None = None) -> KeptLines:
-    """Condense the lines as a survey does; with ``most`` keep only that many components."""
+def condense(scan: ScanLines, step: float) -> KeptLines:
+    """Condense the lines as a survey does."""
     choice, statistics = SignalChoice(), _statistics(calibrated_blocks(scan.lines, scan.camera), scan)
     components = find_components(statistics, false_alarm=choice.false_alarm, least=choice.least)
-    if most is not None:
-        components = replace(components, axes=components.axes[:most])
     law = ResidualLaw.learned(statistics.spectra, components)
     condenser = Condenser(components, law, scan.camera, choice.rare_spectra, step)
     kept, condensed = _condensed(scan, condenser, statistics)
-    if most is None:
-        better = with_shared_directions(condenser, [condensed], statistics, choice.false_alarm)
-        kept = kept if better is None else _condensed(scan, better, statistics)[0]
-    return kept
+    better = with_shared_directions(condenser, [condensed], statistics, choice.false_alarm)
+    return kept if better is None else _condensed(scan, better, statistics)[0]
 
 
 Block = tuple[int, Values, NDArray[np.bool_]]  # first line, values (line, sample, band), valid (line, sample)
@@ -291,17 +286,13 @@ def bin_bands(scan: ScanLines, width: int) -> KeptLines:
     return KeptLines(size, lambda: scan.lines.calibrated(np.asarray(array[...], np.float32) @ weights))
 
 
-def _in_steps(scan: ScanLines, step: float) -> tuple[Values, NDArray[np.unsignedinteger[Any]]]:
-    """Return the step of each band (band,) and raw numbers in whole steps."""
-    unit = (step * scan.noise_dn).astype(np.float32)
-    steps = np.rint(scan.lines.data / unit).astype(np.uint32)
-    return unit, steps.astype(np.uint16) if steps.max() <= np.iinfo(np.uint16).max else steps
-
-
 def pack_pcodec(scan: ScanLines, step: float | None) -> KeptLines:
     """Store raw numbers by pcodec, exactly or in whole steps, each a fraction of its band's noise."""
     pcodec = importlib.import_module("pcodec")
-    unit, numbers = (np.ones(1, np.float32), scan.lines.data) if step is None else _in_steps(scan, step)
+    unit, numbers = np.ones(1, np.float32), scan.lines.data
+    if step is not None:
+        unit = (step * scan.noise_dn).astype(np.float32)
+        numbers = np.rint(numbers / unit).astype(np.uint32)
     packed: bytes = pcodec.standalone.simple_compress(numbers.ravel(), pcodec.ChunkConfig())
 
     def restore() -> Values:
@@ -393,7 +384,6 @@ _PCODEC: Mapping[Setting, Callable[[ScanLines], KeptLines]] = {
 WAYS: Mapping[Setting, Callable[[ScanLines], KeptLines]] = {
     "raw": keep_raw,
     **{f"condensed, step {step:g}": partial(condense, step=step) for step in STEPS},
-    **{f"fewer components, {most}": partial(condense, step=1.0, most=most) for most in FEWER},
     **{f"binned, {width} bands": partial(bin_bands, width=width) for width in BINS},
     **(_PCODEC if importlib.util.find_spec("pcodec") else {}),  # of the extra `bench`
     **{f"PCA, step {step:g}": partial(keep_principal, step=step) for step in STEPS},

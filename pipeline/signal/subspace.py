@@ -209,7 +209,9 @@ def find_components(found: SignalStatistics, *, false_alarm: float = 0.01, least
     for _ in range(NOISE_ROUNDS if len(lit) > FEW_BANDS and found.count >= 4 * len(lit) else 0):
         scale = np.outer(sigma, sigma)
         axes = _axes(found, covariance / scale, lit, scale, false_alarm, least)
-        sigma = sigma * _left_over(covariance / scale, axes)
+        rest = np.eye(len(lit)) - axes @ axes.T
+        left = np.einsum("ij,jk,ik->i", rest, covariance / scale, rest)  # variance of the components' residuals
+        sigma = sigma * np.sqrt(np.clip(left / np.maximum(np.diag(rest), 1e-3), 0.25, 4.0))
     scale = np.outer(sigma, sigma)
     axes = _axes(found, covariance / scale, lit, scale, false_alarm, least)
     loadings = np.zeros((axes.shape[1], found.bands))
@@ -298,13 +300,6 @@ def _unpredicted(covariance: Floats, band: int) -> float:
     near = near[near != band]
     weights = np.linalg.lstsq(covariance[np.ix_(near, near)], covariance[near, band], rcond=1e-10)[0]
     return float(np.sqrt(max(covariance[band, band] - covariance[band, near] @ weights, 0.0)))
-
-
-def _left_over(white: Floats, axes: Floats) -> Floats:
-    """Return the standard deviation of the components' residuals of whitened bands, over that of unit noise."""
-    rest = np.eye(len(white)) - axes @ axes.T
-    left = np.einsum("ij,jk,ik->i", rest, white, rest)
-    return np.asarray(np.sqrt(np.clip(left / np.maximum(np.diag(rest), 1e-3), 0.25, 4.0)))
 
 
 def _axes(

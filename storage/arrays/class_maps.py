@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from pipeline.errors import IncompleteStoreError, ShapeError
 from pipeline.geometry.grid import UNLABELLED, cuts
-from pipeline.lazy import zarr
 from storage.arrays.georeference import AngularGrid, create_placed_group, grid_of
 from storage.arrays.layout import (
     MAP_PACKING,
@@ -32,6 +31,7 @@ from storage.arrays.layout import (
     tile_place,
     write_counts,
     write_image,
+    zarr,
 )
 
 CONFIDENCE = {"long_name": "probability of the class given", "units": "1", "valid_range": [0.0, 1.0]}

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.scan import Sweep
-from pipeline.lazy import zarr
 from pipeline.signal.subspace import SignalStatistics
 from pipeline.source import Line, References
 from storage.arrays.layout import (
@@ -29,6 +28,7 @@ from storage.arrays.layout import (
     write_bands,
     write_counts,
     write_small,
+    zarr,
 )
 
 _LINE_COORDINATES = "time mirror_x mirror_y exposure_ms valid_line"

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.lazy import zarr
 from pipeline.rectify.placed import TieTable
 from pipeline.rectify.scan_paths import ScanPath
 from storage.archive.keys import KEY_LENGTH
-from storage.arrays.layout import create_group, damage_named, open_group, read_array, write_image, write_small
+from storage.arrays.layout import create_group, damage_named, open_group, read_array, write_image, write_small, zarr
 
 Tables = Mapping[str, Sequence[tuple[ScanPath, TieTable]]]
 

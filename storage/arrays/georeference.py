@@ -17,8 +17,8 @@ from affine import Affine
 
 from pipeline.errors import PoseError
 from pipeline.ground.georeference import zoomed_out
-from pipeline.lazy import GeoBox, odc_crs, odc_geo_xr, odc_geobox, zarr
-from storage.arrays.layout import SmallArray, create_group, damage_named, open_group
+from pipeline.lazy import GeoBox, odc_crs, odc_geo_xr, odc_geobox
+from storage.arrays.layout import SmallArray, create_group, damage_named, open_group, zarr
 
 GRID_MAPPING = "spatial_ref"
 # on every image: CF's link to the grid mapping, and the same as a coordinate, so that plain xarray takes it for one

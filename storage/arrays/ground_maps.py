@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import IncompleteStoreError, ShapeError
 from pipeline.ground.field_places import M2_PER_HECTARE
-from pipeline.lazy import GeoBox, zarr
+from pipeline.lazy import GeoBox
 from storage.arrays.class_maps import (
     CHANGED,
     CONFIDENCE,
@@ -33,6 +33,7 @@ from storage.arrays.layout import (
     image_spec,
     open_group,
     read_array,
+    zarr,
 )
 
 PICTURE = "picture"

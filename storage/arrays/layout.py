@@ -14,16 +14,23 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from threading import Lock
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.lazy import zarr, zarr_codecs, zarr_storage
+from pipeline.lazy import deferred
 from pipeline.signal.components import Components
 from pipeline.signal.condense import whole_steps
+
+if TYPE_CHECKING:
+    import zarr
+    import zarr.codecs as zarr_codecs
+    import zarr.storage as zarr_storage
+else:  # a sixth of a second, which commands on manifests do not need
+    zarr, zarr_codecs, zarr_storage = map(deferred, ("zarr", "zarr.codecs", "zarr.storage"))
 
 StorePlace: TypeAlias = "Path | zarr_storage.MemoryStore"  # where a store lies
 CHUNK_PX = 32

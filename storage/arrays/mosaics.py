@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import block_means, cuts
-from pipeline.lazy import zarr
 from pipeline.signal.components import Components, broad_weights
 from storage.arrays.georeference import AngularGrid, create_placed_group, grid_of
 from storage.arrays.layout import (
@@ -35,6 +34,7 @@ from storage.arrays.layout import (
     write_components,
     write_counts,
     write_image,
+    zarr,
 )
 
 CAPTURES = "capture"  # array of a mosaic whose pixels were captured in several ways

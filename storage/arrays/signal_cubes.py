@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.mirror import mirror_throughput
-from pipeline.lazy import zarr, zarr_storage
 from pipeline.signal.calibrate import judge_elements
 from pipeline.signal.components import Components
 from pipeline.signal.condense import RESIDUAL_STEP, UNUSABLE
@@ -53,6 +52,8 @@ from storage.arrays.layout import (
     write_components,
     write_counts,
     write_small,
+    zarr,
+    zarr_storage,
 )
 
 FRAMES_OF = "frames_of"  # attribute: the sweep beside it that holds the dark and white frames of both

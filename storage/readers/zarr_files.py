@@ -29,9 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from pipeline.lazy import zarr
 from storage.arrays.georeference import GRID_MAPPING, ON_THE_MAP, grid_mapping, map_attributes
-from storage.arrays.layout import create_array, create_group, image_spec, write_bands, write_counts, write_small
+from storage.arrays.layout import create_array, create_group, image_spec, write_bands, write_counts, write_small, zarr
 from storage.readers.array_cubes import Arrays, FileArray
 from storage.readers.cube_sources import BLOCK_LINES, CubeSource, LineFacts
 

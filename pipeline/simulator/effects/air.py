@@ -150,7 +150,9 @@ class Parallax(Displacement):
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by the slope times the greatest displacement: at a line's ends, at the nearest or farthest surface."""
-        fraction = greatest_fraction(rig.air)
+        air, fraction = rig.air, 0.0  # greatest displacement a px of distance from the line's centre
+        if air.distance_m is not None:
+            fraction = air.lever_m * float(np.abs(closeness(air, np.array([-1.0, 1.0])) - 1 / air.distance_m).max())
         if fraction == 0 or not probe.sweeps:
             return Bound(0.0, "all of the scene is at one distance")
         half = np.zeros(2)  # greatest way from a line's centre to its ends, slit and pixel included
@@ -181,13 +183,6 @@ def closeness(air: Air, row: Floats) -> Floats:
         return np.where(row < 0, far, near)
     fraction = (np.clip(row, -1, 1) + 1) / 2
     return far * (1 - fraction) + near * fraction
-
-
-def greatest_fraction(air: Air) -> float:
-    """Return the greatest displacement per px of distance from the line's centre."""
-    if air.distance_m is None:
-        return 0.0
-    return air.lever_m * float(np.abs(closeness(air, np.array([-1.0, 1.0])) - 1 / air.distance_m).max())
 
 
 def reach_m(rig: Rig) -> tuple[float, float] | None:
