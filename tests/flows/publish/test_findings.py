@@ -54,7 +54,7 @@ def test_rows_have_hectares_and_changes_where_they_are_known() -> None:
     assert finding_rows({"ground": GROUND | {"older_ha": {"1": 0.0}}}) == [("on the ground", first)]
     ((_, words),) = finding_rows({"ground": GROUND | later})
     changed = "changed 0.5 ha: crop to bare soil 0.5 ha, weed to crop 4 m²"
-    assert words == f"{first}; {changed}; captured longer ago than 1 day 0.25 ha"
+    assert words == f"{first}; {changed}; 0.25 ha captured longer ago than 1 day"
 
 
 def _judged(weights: Path, folder: Path, content: dict[str, Any], limit: float = 1e6) -> Path:
