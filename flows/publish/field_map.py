@@ -127,7 +127,9 @@ def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: Prio
             "fraction": format_percent(fraction),
             "colour": "#" + bytes(colour.tolist()).hex(),
         }
-        for name, fraction, colour in zip((*shown.class_names, "no class"), covered, palette, strict=False)
+        for name, fraction, colour in zip(
+            (*shown.class_names, "no class, of the field:"), covered, palette, strict=False
+        )
         if fraction
     ]
     return FieldMap((shown.class_map.shape[1], shown.class_map.shape[0]), layers, rows, errors)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -219,7 +220,7 @@ class CaptureRunner:
         began, wanted = clock.now(), exposing(self._camera, taken.sweep).scan_seconds(taken.stop - taken.first)
         until, stopped = began + wanted + SLACK_S, False
         while camera.is_capturing():
-            self._say(f"capturing: {clock.now() - began:.0f} of {wanted:.0f} s")
+            self._say(f"capturing: {clock.now() - began:.0f} of {math.ceil(wanted)} s")
             if clock.now() >= until:
                 if stopped:
                     raise RigError(
