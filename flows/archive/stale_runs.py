@@ -9,6 +9,7 @@ from flows.publish.receipt import is_pending
 from flows.settings.load import load_settings, of_this_version, parse_settings
 from flows.settings.survey_settings import BUILT_IN_SCENES, OF_THE_MACHINE, RASTER, RECORDED, RIG, SIM, Settings
 from flows.tasks.open_survey import STAGES, versions
+from flows.tasks.recorded_field import open_recorded
 from flows.tasks.survey_model import weights_path
 from models.weights.files import describe_weights
 from pipeline.errors import PipelineError, SettingsError, WeightsError
@@ -16,7 +17,7 @@ from storage.archive.keys import canonical_json
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run, Store
 from storage.readers.open_cubes import split_variable
-from storage.readers.recordings import find_raw_cubes, stores_of_lines
+from storage.readers.recordings import stores_of_lines
 
 OF_THE_SURVEY = ("labels", "weights", "memory", "accuracy", "controls", "prior", "keep")  # not in raw cubes
 
@@ -68,7 +69,7 @@ def from_raw_cubes(catalogue: Catalogue, run: Run, settings: Settings) -> Settin
     if not stores or any(one is None or one.problem is not None or one.cleared for one in stores):
         return settings
     is_old = settings.source in ("rig", RECORDED) and bool(stale_stores(catalogue, raw, None))
-    if not is_old and _is_there(settings):
+    if not is_old and _is_there(run, settings):
         return settings
     asked = {"sweeps": f"{settings.out}/{run.uri}", "out": settings.out, "engine": settings.engine}
     kept = {name: getattr(settings, name) for name in OF_THE_SURVEY}
@@ -81,17 +82,17 @@ def can_capture(run: Run) -> bool:
         settings = asked_again(run, run.folder.parents[1], None)
     except PipelineError:
         return False
-    return settings.source != RIG and _is_there(settings)
+    return settings.source != RIG and _is_there(run, settings)
 
 
-def _is_there(settings: Settings) -> bool:
-    """Return whether the files of a recording or of a scene still exist; True for a rig."""
+def _is_there(run: Run, settings: Settings) -> bool:
+    """Return whether the recording of a run, or the files of its scene, still exist; True for a rig."""
     if settings.source == RECORDED:
         try:
-            find_raw_cubes(str(settings.sweeps))
+            scene, _ = open_recorded(settings).scene()
         except PipelineError:
             return False
-        return True
+        return scene.in_light(settings.sky.fraction_of_clear).key == run.receipt.get("scene")  # not another recording
     is_file = settings.source in (SIM, RASTER) and settings.scene not in BUILT_IN_SCENES
     return not is_file or split_variable(settings.scene)[0].exists()
 

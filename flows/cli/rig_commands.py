@@ -156,7 +156,7 @@ def emulate(
     baud
         Speed of the serial port [baud]; 0: no limit, like USB.
     speed
-        Speed of the rig's clock, as a multiple of real time.
+        Speed of the rig's clock, as a multiple of real time. With `pulses = "none"` only 1 gives lines a position.
     out
         Settings file (TOML) to write, for `survey` and `rig check`.
     """

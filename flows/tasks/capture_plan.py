@@ -204,9 +204,10 @@ def choose_uniform_scan(
     content = weights.record.get("scans")
     if content is None:
         if layout.step is None and plain:
+            by_hand = "--scan-step" + ("" if settings.source == RECORDED else " and --scan-exposure-ms")
             raise WeightsError(
-                f"the weights {path.name} have no record of uniform scans to choose by: give --scan-step and "
-                "--scan-exposure-ms, or train weights with --min-exposure-ms 3 and validation scenes"
+                f"the weights {path.name} have no record of uniform scans to choose by: give {by_hand}, or train "
+                "weights with --min-exposure-ms 3 and validation scenes"
             )
         return ScanChoice()
     record = ScanPerformance.read(content, settings.sky.fraction_of_clear)

@@ -92,7 +92,8 @@ def fit_sweep(
         )
     lines = np.arange(len(position)) if valid is None else np.flatnonzero(valid)
     if len(lines) < 2:
-        raise SceneError(f"sweep {name} has {len(lines)} valid lines, and a scan takes at least 2; leave it out")
+        what = f"sweep {name} has too few valid lines ({len(lines)}), a scan takes at least 2"
+        raise SceneError(f"{what}: leave it out, record more lines, or survey its file with --scene")
     across, scan = (direction_to_scene(position_to_direction(position[lines])) / camera.ifov_rad).T
     distance, note = line_spacing(scan, lines)
     _check_path(name, lines, across, scan, distance, MOST_BEND * camera.samples)

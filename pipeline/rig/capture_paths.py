@@ -293,8 +293,8 @@ def _positions(
         if index is not None and path.frames_at(index) != taken_in_all:
             raise RigError(
                 f"the mirror stands at cell {index} of its path, after {taken_in_all} frames cell "
-                f"{taken_in_all * path.sweep.positions} was expected: edges were lost, or are not one per position "
-                "(see pulses in [rig])"
+                f"{taken_in_all * path.sweep.positions} was expected: edges were lost, are not one per position "
+                "(see pulses in [rig]), or the capture was stopped"
             )
         return lines_by_trigger(frames, path.middle.astype(np.float64), counted=index is not None)
     if taken.log is not None and len(taken.log.position) > 1:

@@ -177,7 +177,7 @@ def upload(link: ProLink, cells: bytes, read_back: ReadBack) -> None:
         if read_cells(link, pro.VECTOR_MEMORY, start, len(sent) // pro.CELL) != sent:
             raise RigError(
                 f"cells {start} to {start + len(sent) // pro.CELL} of the vector memory on {link.wire.port} hold other "
-                "values than were sent; nothing was moved: load the path again"
+                "values than were sent; nothing was moved: run again"
             )
 
 

@@ -176,6 +176,9 @@ class RigSource:
                 known = self._known_references(runner, folders[exposure_ms]) if exposure_ms in folders else None
                 if not known:
                     self._journal.record_references(runner.capture_at_rest(REFERENCES, exposure_ms), exposure_ms)
+                    known = self._known_references(runner, folders[exposure_ms])
+                if not known:  # an emptied camera used the name of a folder whose files are held
+                    self._journal.record_references(runner.capture_at_rest(REFERENCES, exposure_ms), exposure_ms)
                     known = self._whole_references(runner, folders[exposure_ms])
                 self._whole[folders[exposure_ms]] = known
         whole = self._whole[folders[exposure_ms]]

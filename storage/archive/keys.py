@@ -169,13 +169,13 @@ def open_folder(path: Path, *, create: bool, write: bool) -> None:
     except ArchiveError:
         raise
     except OSError as error:  # at the door whatever the system answers means that this is no place for an archive
-        cure = "choose another --out, or SPECTRALZOOM_WORK for the working copy of a bucket"
+        cure = "choose another folder, or SPECTRALZOOM_WORK for the working copy of a bucket"
         raise ArchiveError(f"cannot use {path} as an archive: {error.strerror}; {cure}") from error
 
 
 def _open_folder(path: Path, *, create: bool, write: bool) -> None:
     if path.exists() and not path.is_dir():
-        cure = "choose another --out" if create else "check the name"
+        cure = "choose another folder" if create else "check the name"
         raise ArchiveError(f"{path} is a file, expected a folder for the archive; {cure}")
     if not (path / "stages").is_dir():
         if not create:

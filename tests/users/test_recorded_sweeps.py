@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shlex
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -413,7 +414,7 @@ def test_a_recording_whose_files_moved_is_reprocessed(
 def test_a_repair_reads_a_recording_again_while_its_files_are_there(
     tmp_path: Path, pushbroom: Pushbroom, weights: Path
 ) -> None:
-    """Without them the damaged signal, whose raw lines were cleared, is the only copy: it stays as it is."""
+    """Without them, or with another recording there, the damaged signal of cleared lines stays: it is the only copy."""
     folder, _ = pushbroom
     survey_sweeps(tmp_path / "a", folder / "scan.hdr", weights=str(weights))
     (chunk, *_) = sorted((tmp_path / "a").glob("stages/condense/*/*.zarr/scores/c/0/0/0"))
@@ -421,7 +422,10 @@ def test_a_repair_reads_a_recording_again_while_its_files_are_there(
     rotten = chunk.read_bytes()
     folder.rename(tmp_path / "elsewhere")
     assert run_verify(tmp_path / "a", QUIET, remake=True) == FAILED
+    shutil.copytree(tmp_path / "elsewhere", folder, copy_function=shutil.copy)  # later files count as another recording
+    assert run_verify(tmp_path / "a", QUIET, remake=True) == FAILED
     assert chunk.read_bytes() == rotten
+    shutil.rmtree(folder)
     (tmp_path / "elsewhere").rename(folder)
     assert run_verify(tmp_path / "a", QUIET, remake=True) == DONE
     assert {finding.kind for finding in verify_archive(Archive.open(tmp_path / "a"))} == {"whole"}

@@ -89,7 +89,7 @@ def as_folder(response: Any) -> str:
 def as_truth(response: Any) -> bool:
     """Return whether a capture runs; RigError where the response does not say."""
     if not isinstance(response, bool):
-        raise RigError(f"expected true or false from the camera, got {response!r:.100}")
+        raise RigError(f"expected true or false from the camera, got {response!r:.100}; restart its server")
     return response
 
 

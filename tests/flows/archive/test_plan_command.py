@@ -64,8 +64,7 @@ def test_the_survey_does_what_the_plan_said(settings: Settings, archive: Path, s
         assert row.key in (None, done[name]["key"]), name
         if row.state != "blocked":  # a store that waits may turn out to be there
             assert row.state == done[name]["state"].replace("ran", "to run"), name
-    again = _plan(settings, archive, resampling="nearest")
-    assert all(row.state in ("cached", "skipped") for row in again.values())
+    assert all(row.state in ("cached", "skipped") for row in _plan(settings, archive, resampling="nearest").values())
 
 
 def test_without_an_archive_the_plan_makes_none(settings: Settings, tmp_path: Path) -> None:

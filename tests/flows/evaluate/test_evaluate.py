@@ -47,8 +47,7 @@ def test_every_row_is_there(judged: Judged):
     assert content["frames"] == list(FRAMES)
     assert [one["frames"] for one in content["weights"]] == [3, 3]
     assert {path.name for path in folder.iterdir()} == {"evaluation.json"}
-    kept = json.loads((folder / "evaluation.json").read_text())
-    assert kept["rows"][1]["miou"] == content["rows"][1]["miou"]
+    assert json.loads((folder / "evaluation.json").read_text())["rows"][1]["miou"] == content["rows"][1]["miou"]
     row = _row(content, "entropy", 0.25)
     assert row["miou"] == pytest.approx(np.mean(row["by_seed"]))
     assert row["spread"] == pytest.approx(np.std(row["by_seed"], ddof=1))

@@ -164,10 +164,11 @@ def test_the_end_of_a_survey_fits_the_terminal():
     assert [format_area(hectares) for hectares in (2.5, 0.1, 0.0999, 0.0012)] == ["2.5 ha", "0.1 ha", "999 m²", "12 m²"]
 
 
-def test_the_details_have_stages_and_effects():
+def test_the_details_have_stages_effects_and_lost_lines():
     """A stage that was skipped has no row."""
-    receipt = make_receipt()
+    receipt = {**make_receipt(), "lines": {"scan-0": {"invalid": 41}}}
     receipt["stages"][1]["state"] = "skipped"
+    assert "sweep scan-0: lines left out: 41 invalid" in printed(receipt)
     text = printed(receipt, verbose=True)
     for words in ("samples on the field", "capture", "asked for", "Effects computed: 1 of 1"):
         assert words in text, words

@@ -72,8 +72,7 @@ def test_flags_and_files_say_the_same(toml):
 
 def test_the_example_says_every_default():
     """It is what `python -m flows.settings.documents > survey.example.toml` makes, and valid."""
-    found = load_settings(EXAMPLE)
-    assert replace(found, out=Settings.out) == Settings()
+    assert replace(load_settings(EXAMPLE), out=Settings.out) == Settings()
     assert EXAMPLE.read_text(encoding="utf-8") == example_toml()
     lines = [line.removeprefix("# ") for line in EXAMPLE.read_text(encoding="utf-8").splitlines()]
     named = {line.partition("=")[0].strip() for line in lines if "=" in line}

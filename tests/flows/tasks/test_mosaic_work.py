@@ -84,8 +84,7 @@ def test_memory_says_how_many_tiles_at_a_time(tmp_path: Path, cubes: list[Signal
     """With memory for one tile only one is made at a time, whatever is allowed; a byte less and none is."""
     work = recipe_of(cubes)
     least = write_mosaic(work, mosaic_at(tmp_path / "a.zarr"), memory=PLENTY, pool=ONE).projected
-    tight = write_mosaic(work, mosaic_at(tmp_path / "b.zarr"), memory=least, pool=THREE)
-    assert tight.workers == 1
+    assert write_mosaic(work, mosaic_at(tmp_path / "b.zarr"), memory=least, pool=THREE).workers == 1
     with pytest.raises(SettingsError, match=r"projected memory \d+ MiB exceeds --memory \d+ MiB: one tile of 64 x 640"):
         write_mosaic(work, mosaic_at(tmp_path / "c.zarr"), memory=least - 1)
 

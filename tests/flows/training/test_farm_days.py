@@ -76,8 +76,7 @@ def test_the_usual_day_of_a_farm_is_one_field(tmp_path: Path) -> None:
         _publish(archive, key, scene="farm@2", day=172),
         _publish(archive, key.replace("172", "173"), scene="farm@2", day=173),
     ]
-    newest = newest_runs(Catalogue.read(tmp_path))
-    assert [run.folder.name for run in newest] == made[1:]
+    assert [run.folder.name for run in newest_runs(Catalogue.read(tmp_path))] == made[1:]
     again = [asked_again(run, tmp_path, None) for run in Catalogue.read(tmp_path).runs]
     assert [(one.scene, one.day) for one in again] == [("farm", None), (FARM_LAW, 172), (FARM_LAW, 173)]
 

@@ -170,8 +170,7 @@ def test_losses_stand_beside_fractions() -> None:
 def test_the_highest_gain_within_a_loss(loss: float, gain: float, fraction: float) -> None:
     """Between two rows by the logarithm of the gain, and so is the fraction of patches; none beyond the last."""
     table = placement.CascadeTable((0.01, 0.02, 0.03, 0.04), (-0.1, 0.0, 0.2, 0.3), (0.9, 0.5, 0.3, 0.1))
-    found = table.within(loss)
-    assert found == pytest.approx(gain)
+    assert table.within(loss) == pytest.approx(gain)
     assert table.fraction_at(gain) == pytest.approx(fraction)
     assert table.within(-0.5) is None
 

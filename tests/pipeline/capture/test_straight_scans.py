@@ -79,7 +79,7 @@ def test_what_is_no_straight_scan_is_refused(along: np.ndarray, scan: np.ndarray
 def test_too_few_lines_and_odd_samples_are_refused() -> None:
     """One valid line is no scan, and 500 samples are no part of 640."""
     position = line_positions(Sweep("s", "fine", "x", 0.0, 0.0, 4), CAMERA)
-    with pytest.raises(SceneError, match="has 1 valid lines"):
+    with pytest.raises(SceneError, match=r"has too few valid lines \(1\)"):
         fit_sweep(position, CAMERA, name="s", samples=640, valid=np.arange(4) == 2)
     with pytest.raises(SceneError, match=r"lines of 500 samples, no whole part of the camera's 640"):
         fit_sweep(position, CAMERA, name="s", samples=500)

@@ -144,7 +144,7 @@ def test_what_cannot_be_an_archive(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     for name, create, words in (
         ("file", True, "is a file, expected a folder"),
-        ("file/archive", True, "Not a directory; choose another --out, or SPECTRALZOOM_WORK for"),
+        ("file/archive", True, "Not a directory; choose another folder, or SPECTRALZOOM_WORK for"),
         ("none", False, "is not there"),
         ("folder", False, "no archive"),
     ):

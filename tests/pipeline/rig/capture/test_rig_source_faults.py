@@ -238,9 +238,10 @@ def test_capture_by_its_own_clock_is_not_counted():
         assert [one["method"] for one in source.record["captures"]] == ["command"]
 
 
-@pytest.mark.parametrize("earlier", [0, 3], ids=["fewer folders than before", "folders of the same names"])
-def test_camera_that_was_emptied_in_between_is_gone_on_with(earlier: int):
+@pytest.mark.parametrize("held", ["of a later folder", "as it is", "of another file"])
+def test_camera_that_was_emptied_in_between_is_gone_on_with(held: str):
     """Its disk was cleared, or it is another: frames and lines that it has no more are taken again."""
+    earlier = 0 if held == "of a later folder" else 3
     kept = KeptInMemory()
     with small_rig() as rig:
         source = rig.source(kept)
@@ -248,6 +249,8 @@ def test_camera_that_was_emptied_in_between_is_gone_on_with(earlier: int):
         for _ in range(earlier):
             list(rig.source().lines(COARSE))
         killed_amid(rig, kept)
+    if held == "of another file":
+        kept.files["/captured/references_000000/whiteReference"][-1] ^= 1
     with small_rig() as rig:
         for _ in range(3 - earlier):
             list(rig.source().lines(COARSE))
