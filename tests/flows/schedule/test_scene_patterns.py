@@ -43,7 +43,8 @@ def test_the_date_of_the_visit_names_the_file(tmp_path: Path) -> None:
     """In any form of strftime; whatever its name says beside it."""
     names = {"{date:%Y-%m-%d}.png": "2026-06-01.png", "T32_{date:%Y%m%d}_{new}.png": "T32_20260601_b.png"}
     for pattern, name in names.items():
-        assert scene_of_visit(asked(tmp_path, pattern), JUNE).scene == str(write_scene(tmp_path / "scenes", name))
+        wanted = write_scene(tmp_path / "scenes", name)
+        assert scene_of_visit(asked(tmp_path, pattern), JUNE).scene == str(wanted)
     with pytest.raises(NoSceneYet, match=r"no file .*2026-06-02.png yet, which --scene .*date"):
         scene_of_visit(asked(tmp_path, "{date:%Y-%m-%d}.png"), JUNE.replace(day=2))
 
