@@ -30,13 +30,6 @@ napoleon_custom_sections = ["Raises", "Returns"]  # in words: napoleon wants eac
 # Docstrings name more than the reference lists, and types of numpy and xarray, whose pages are not at hand.
 nitpick_ignore_regex = [("py:.*", ".*")]
 
-
-def stage_table() -> str:
-    """Markdown: every stage in the order of a survey, from the records that the survey itself runs by."""
-    return "| stage | on terminals | stored as, version |\n|---|---|---|\n" + "".join(
-        f"| `{one.name}` | {one.title} | `stages/{one.product.name}`, {one.product.version} |\n"
-        for one in STAGES.values()
-    )
-
-
-myst_substitutions = {"settings": settings_table(), "stages": stage_table()}
+head = "| stage | on terminals | stored as, version |\n|---|---|---|\n"  # rows are in the order of a survey
+rows = [f"| `{n}` | {s.title} | `stages/{s.product.name}`, {s.product.version} |\n" for n, s in STAGES.items()]
+myst_substitutions = {"settings": settings_table(), "stages": head + "".join(rows)}

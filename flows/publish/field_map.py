@@ -30,6 +30,7 @@ from storage.arrays.mosaics import develop
 QUALITY = 80  # of a photograph as WebP
 LEVELS = 50  # of a colour ramp; the next number is transparent
 DIFFERS_RGB, PATCH_RGB = (196, 38, 46), (0, 190, 200)
+NO_CLASS = "no class, of the field:"  # other fractions of the legend are of the pixels that have one
 ERROR_COLOURS = {"right": "#c9d3c4", "wrong": "#c4262e"}  # of labelled pixels
 Bytes = NDArray[np.uint8]
 
@@ -119,7 +120,7 @@ def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: Prio
         pixels = patch_index.repeat(p, axis=0).repeat(p, axis=1)[: run.grid.height, : run.grid.width]
         layers.append(MapLayer("Captured again", layer_address(pixels[thin], table), opacity=0.6))
     counts = class_counts(shown.class_map, len(shown.class_names))
-    beyond = 1 - counts.sum() / max(shown.class_map.size, 1)  # of the field; classes are of what has one, as in tables
+    beyond = 1 - counts.sum() / max(shown.class_map.size, 1)
     covered = np.append(counts / max(counts.sum(), 1), beyond)
     rows = [
         {
@@ -127,9 +128,7 @@ def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: Prio
             "fraction": format_percent(fraction),
             "colour": "#" + bytes(colour.tolist()).hex(),
         }
-        for name, fraction, colour in zip(
-            (*shown.class_names, "no class, of the field:"), covered, palette, strict=False
-        )
+        for name, fraction, colour in zip((*shown.class_names, NO_CLASS), covered, palette, strict=False)
         if fraction
     ]
     return FieldMap((shown.class_map.shape[1], shown.class_map.shape[0]), layers, rows, errors)

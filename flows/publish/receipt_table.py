@@ -138,9 +138,6 @@ def headline(receipt: Receipt, captured_again: float | None = None) -> str:
     return " ".join(sentences)
 
 
-AT_THE_END = ("signal", "lines", "prior_map")
-
-
 def print_summary(receipt: Receipt, console: Console, *, verbose: bool = False) -> None:
     """Print the score, the leading savings and their reference, saturation, lost lines, and the state of a prior map.
 
@@ -152,7 +149,8 @@ def print_summary(receipt: Receipt, console: Console, *, verbose: bool = False) 
     columns = ("", "this survey", "reference", "fraction")
     console.print(table(columns, cells, whole=columns[1:]))
     console.print(escape(format_reference(receipt)))
-    for name, words in finding_rows({part: receipt[part] for part in AT_THE_END if receipt.get(part)}):
+    told = {part: receipt[part] for part in ("signal", "lines", "prior_map") if receipt.get(part)}
+    for name, words in finding_rows(told):
         console.print(escape(f"{name}: {words}"), soft_wrap=True)  # numbers have spaces
     if not verbose:
         return

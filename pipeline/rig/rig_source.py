@@ -174,12 +174,11 @@ class RigSource:
         if folders.get(exposure_ms, "") not in self._whole:
             with self.session() as runner:
                 known = self._known_references(runner, folders[exposure_ms]) if exposure_ms in folders else None
-                if not known:
-                    self._journal.record_references(runner.capture_at_rest(REFERENCES, exposure_ms), exposure_ms)
-                    known = self._known_references(runner, folders[exposure_ms])
-                if not known:  # an emptied camera used the name of a folder whose files are held
-                    self._journal.record_references(runner.capture_at_rest(REFERENCES, exposure_ms), exposure_ms)
-                    known = self._whole_references(runner, folders[exposure_ms])
+                for read in (self._known_references, self._whole_references):
+                    if not known:  # again where an emptied camera used the name of a folder whose files are held
+                        self._journal.record_references(runner.capture_at_rest(REFERENCES, exposure_ms), exposure_ms)
+                        known = read(runner, folders[exposure_ms])
+                assert known is not None
                 self._whole[folders[exposure_ms]] = known
         whole = self._whole[folders[exposure_ms]]
         bad = None if whole.bad is None or not whole.bad.any() else _sums(whole.bad, sweep.binning) > 0

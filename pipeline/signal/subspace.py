@@ -380,16 +380,12 @@ def noise_edge(values: Floats, ratio: float, false_alarm: float) -> float:
 
 @cache
 def _law_spreads() -> tuple[Floats, Floats]:
-    tries = np.geomspace(1e-3, 1.0, 200)
-    return tries, np.array([_law_spread(one) for one in tries])
-
-
-def _law_spread(spread: float) -> float:
-    """Return the distance of the lowest tenth from the median of the Marchenko-Pastur law, over the median."""
-    low, high = (1 - spread) ** 2, (1 + spread) ** 2
-    angle = (np.arange(2000) + 0.5) / 2000 * np.pi
-    at = (low + high) / 2 - (high - low) / 2 * np.cos(angle)
-    mass = np.cumsum(np.sin(angle) ** 2 / at)
-    part = mass / mass[-1]
-    middle, tenth = (float(np.interp(level, part, at)) for level in (0.5, 0.1))
-    return float((middle - tenth) / middle)
+    """Return spreads of the Marchenko-Pastur law, and how far its lowest tenth is below its median, over the median."""
+    tries, angle, found = np.geomspace(1e-3, 1.0, 200), (np.arange(2000) + 0.5) / 2000 * np.pi, list[float]()
+    for spread in tries:
+        low, high = (1 - spread) ** 2, (1 + spread) ** 2
+        at = (low + high) / 2 - (high - low) / 2 * np.cos(angle)
+        mass = np.cumsum(np.sin(angle) ** 2 / at)
+        middle, tenth = np.interp([0.5, 0.1], mass / mass[-1], at)
+        found.append((middle - tenth) / middle)
+    return tries, np.array(found)
