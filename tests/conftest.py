@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from rich.console import Console
 
+from flows.publish import survey_command
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
@@ -106,9 +108,13 @@ def prior_work(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def no_waiting_for_the_disk() -> Iterator[None]:
-    """Files of tests need not outlive a power cut: a survey asks 300 times to be put on the disk, and waits for it."""
+    """Files of tests need not outlive a power cut: a survey asks 300 times to be put on the disk, and waits for it.
+
+    Nor does a survey search all that tests hold in memory for what one before it left.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda descriptor: None)
+        patch.setattr(survey_command, "gc", SimpleNamespace(collect=int))
         yield
 
 

@@ -36,8 +36,8 @@ def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:
         files[path.relative_to(folder).as_posix()] = {"sha256": file_hash(path), "size": path.stat().st_size}
     known = {"created": datetime.now(UTC).isoformat(timespec="milliseconds"), "libraries": library_versions()}
     content = {**known, **facts, "files": files, "format": FORMAT}
-    manifest, checksummed = folder / MANIFEST_NAME, content | {"seal": _seal(content)}
-    manifest.write_text(_text(checksummed), encoding="utf-8")
+    manifest = folder / MANIFEST_NAME
+    manifest.write_text(sealed_text(content), encoding="utf-8")
     sync_path(manifest)
     for inner in sorted(path for path in folder.rglob("*") if path.is_dir()):
         sync_path(inner)
@@ -72,8 +72,9 @@ def parse_manifest(written: bytes) -> tuple[dict[str, Any], str | None]:
         content = json.loads(text)
         if not isinstance(content, dict) or not isinstance(content.get("files"), dict):
             raise TypeError("it lists no files")
-        rest = {name: value for name, value in content.items() if name != "seal"}
-        if content.get("seal") != _seal(rest) or text != _text(content):
+        before, _, after = text.partition(f'\n "seal": "{content.get("seal")}"')
+        sealed = before + after[1:] if after.startswith(",") else before[:-1] + after  # with the comma of its line
+        if content.get("seal") != hashlib.sha256(sealed.encode()).hexdigest():
             raise ValueError("it has changed since it was published: its seal does not fit")
         for name, entry in content["files"].items():
             parts = PurePosixPath(name).parts
@@ -182,12 +183,13 @@ def file_problem(path: Path, entry: Mapping[str, Any], *, hashes: bool) -> str |
     return None
 
 
-def _text(content: Mapping[str, Any]) -> str:
-    return json.dumps(content, indent=1, sort_keys=True, allow_nan=False) + "\n"
+def sealed_text(content: Mapping[str, Any]) -> str:
+    """Return the text of a manifest with its seal, the SHA-256 of the text without it."""
 
+    def text(values: Mapping[str, Any]) -> str:
+        return json.dumps(values, indent=1, sort_keys=True, allow_nan=False) + "\n"
 
-def _seal(content: Mapping[str, Any]) -> str:
-    return hashlib.sha256(_text(content).encode()).hexdigest()
+    return text({**content, "seal": hashlib.sha256(text(content).encode()).hexdigest()})
 
 
 @cache

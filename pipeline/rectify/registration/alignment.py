@@ -420,12 +420,16 @@ def field_shift(now: NDArray[np.floating], before: NDArray[np.floating], *, reac
     Offsets are searched up to ``reach_px``. The result is no motion if the windows do not agree: for fields without
     texture, or with changes everywhere.
     """
+    divided = min(now.shape) >= WINDOWS * LEAST_WINDOW_PX
+    there = _of_windows(now, before) if divided else []
+    count, lies = _agreed(there, np.zeros(2), now.shape, AGREE_PX)
+    if count == WINDOWS**2:  # no other start can convince more windows
+        return lies
     whole = pair_shift(now, before, prior_px=reach_px)
-    start = np.rint(whole.shift) if whole.status == "found" else np.zeros(2)
-    if min(now.shape) < WINDOWS * LEAST_WINDOW_PX:
+    if not divided:
         return FieldShift((float(whole.shift[0]), float(whole.shift[1]))) if whole.status == "found" else FieldShift()
+    start = np.rint(whole.shift) if whole.status == "found" else np.zeros(2)
     found = _of_windows(now, scipy.ndimage.shift(before, start, order=0, cval=np.nan)) if start.any() else []
-    there = _of_windows(now, before)
     for within in (AGREE_PX, LOOSELY_PX):
         both = (_agreed(pairs, at, now.shape, within) for pairs, at in ((there, np.zeros(2)), (found, start)))
         count, lies = max(both, key=lambda one: one[0])

@@ -17,8 +17,8 @@ from pipeline.geometry.camera import LineCamera
 
 SMALL = (96, 160)
 BLOCK, MIOU = "mean of 64² [σ]", "mIoU [%]"  # noqa: RUF001
-STEPS = tuple(f"condensed, step {step:g}" for step in store.STEPS)
-ROUNDED = tuple(f"pcodec, rounded {step:g}" for step in store.ROUNDED)
+STEPS = tuple(f"condensed, step {step:g}" for step in store.STEPS[::3])
+ROUNDED = tuple(f"pcodec, rounded {step:g}" for step in store.ROUNDED[::2])
 PRINCIPAL = ("PCA, step 0.5", "PCA, step 3")
 PACKED = ("PCA, JPEG 2000, 2 B", "condensed, JPEG 2000, 2 B")
 
