@@ -89,7 +89,8 @@ def check_camera(connect: Callable[[], CameraDriver]) -> list[CheckRow]:
         else:
             rows.append(CheckRow("camera", "whether it captures", "no capture runs"))
         if isinstance(camera, HeadwallCamera):
-            _row(rows, "camera", "list its files", partial(_listing, camera))
+            files = camera.list_files
+            _row(rows, "camera", "list its files", lambda: list_some([one.name for one in files("/")]) or "none")
     except RigError as error:
         rows.append(failed("camera", CONNECT, error))
     finally:
@@ -128,10 +129,6 @@ def _move(mirror: MirrorDriver, clock: Clock, rows: list[CheckRow]) -> None:
             rows.append(CheckRow("mirror", asked, words, "fail", mend))
         else:
             rows.append(CheckRow("mirror", asked, words))
-
-
-def _listing(camera: HeadwallCamera) -> str:
-    return list_some([file.name for file in camera.list_files("/")]) or "nothing there"
 
 
 def _row(rows: list[CheckRow], device: Device, asked: str, ask: Callable[[], str]) -> None:
