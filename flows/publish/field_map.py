@@ -149,7 +149,7 @@ def layer_address(numbers: Bytes, colours: Bytes) -> str:
     table = np.zeros((256, 4), np.uint8)
     table[:, 3] = 255
     table[: len(colours), : colours.shape[1]] = colours
-    return data_address(webp(Image.fromarray(table[numbers]), lossless=True))
+    return data_address(webp(Image.fromarray(table[numbers]), lossless=True, quality=0))
 
 
 def _ramp_address(values: NDArray[np.floating], most: float) -> str:

@@ -52,7 +52,7 @@ def png(figure: Figure, exact: ArrayLike = ()) -> bytes:
     drawn = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
     kept = np.reshape(exact, (-1, 3))[: COLOURS // 2].astype(np.uint8)
     others = COLOURS - len(kept)
-    rough = Image.fromarray(drawn).convert("RGB").quantize(others, dither=Image.Dither.NONE)
+    rough = Image.fromarray(drawn).convert("RGB").quantize(others, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
     numbers, packed, palette = np.array(rough), drawn.view(np.uint32)[..., 0], rough.getpalette() or []
     for number, colour in enumerate(kept, others):
         numbers[packed == np.array([*colour, 255], np.uint8).view(np.uint32)] = number
