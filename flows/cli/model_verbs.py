@@ -111,7 +111,7 @@ class TrainFlags(SceneFlags):
         Crops per step; half as many, of twice the area, in the last 30 % of the steps.
     min_exposure_ms
         Shortest exposure [ms]: augments training with simulated noise of exposures up to 100 ms and line spacings of
-        1, 2 and 4 px. With validation scenes, the weights record the scan performance, which `survey --seconds` needs.
+        1 to 8 px. With validation scenes, the weights record the scan performance, which `survey --seconds` needs.
     train_mask
         For one scene: mask image of the training pixels; 0 excludes a pixel.
     mask_classes

@@ -49,9 +49,9 @@ def check(
     move: Switch = False,
     as_json: AsJson = False,
 ) -> int:
-    """Connect to mirror and camera, read their state, and report problems with remedies. Nothing moves.
+    """Connect to mirror and camera, read their state, and report problems with remedies.
 
-    Exit code: 0 without problems, 3 if one of two devices works, else 1.
+    Exit code: 0 without problems, 3 if one of two devices works, 2 for a wrong setting or file, else 1.
 
     Parameters
     ----------

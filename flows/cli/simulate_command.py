@@ -57,7 +57,7 @@ def simulate(
     out
         Archive for the raw cubes: a folder, or s3://bucket/prefix.
     coarse
-        Simulate the coarse sweep instead: every fourth line, samples summed by four.
+        Simulate the coarse sweep instead: every fourth line.
     settings
         Settings file (TOML) with the tables [camera], [optics], [mirror], [detector], [air] and [sky]. Flags override
         it.

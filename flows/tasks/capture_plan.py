@@ -206,8 +206,8 @@ def choose_uniform_scan(
         if layout.step is None and plain:
             by_hand = "--scan-step" + ("" if settings.source == RECORDED else " and --scan-exposure-ms")
             raise WeightsError(
-                f"the weights {path.name} have no record of uniform scans to choose by: give {by_hand}, or train "
-                "weights with --min-exposure-ms 3 and validation scenes"
+                f"the weights {path.name} have no record of uniform scans to choose by: give {by_hand} instead of "
+                "--seconds and --goal, or train weights with --min-exposure-ms 3 and validation scenes"
             )
         return ScanChoice()
     record = ScanPerformance.read(content, settings.sky.fraction_of_clear)
@@ -232,12 +232,13 @@ def choose_uniform_scan(
         chosen = priced_scan(record, sweeps[layout.step], camera, cost, bands, exposure_ms)
     elif plain and layout.step is None:
         if not scans:
-            offered = f"camera.exposure_ms = {camera.exposure_ms:g}"
+            offered, longer = f"camera.exposure_ms = {camera.exposure_ms:g}", "longer exposures, or "
             if recorded_ms is not None:
-                offered = f"recorded lines of {', '.join(f'{one:g}' for one in sorted({*recorded_ms.values()}))} ms"
+                exposures = ", ".join(f"{one:g}" for one in sorted({*recorded_ms.values()}))
+                offered, longer = f"recorded lines of {exposures} ms", ""
             raise SettingsError(
                 f"{offered}: the scan performance of the weights starts at "
-                f"{record.exposures_ms[0]:g} ms; choose the scan with --scan-step"
+                f"{record.exposures_ms[0]:g} ms; give {longer}--scan-step instead of --seconds and --goal"
             )
         chosen = choose_scan(scans, settings.seconds, goals)
     elif settings.undecided and scans and not settings.zooms:

@@ -32,6 +32,7 @@ from storage.arrays.class_maps import ProbabilityStore
 
 Mask = NDArray[np.bool_]
 SWATH_PATCHES = 4  # rows of patches whose class probabilities are read at a time
+WHOLE = "--extent whole --scan-step N without --seconds"
 POORER = 0.05  # mIoU below the best scan: poorer scans would degrade the prior map
 DUE = 1e3  # gain of a patch that is too old: that of all others together is at most 1
 
@@ -101,8 +102,8 @@ def choose_extent(
     content, grid = weights.record.get("scans"), layout.grid
     if content is None:
         raise WeightsError(
-            f"the weights {path.name} have no record of uniform scans to choose a part of the field by: leave --extent "
-            "out, or train weights with --min-exposure-ms 3 and validation scenes"
+            f"the weights {path.name} have no record of uniform scans to choose a part of the field by: capture all of "
+            f"it ({WHOLE}), or train weights with --min-exposure-ms 3 and validation scenes"
         )
     swaths, classes = _swaths(prior, grid, weights, path), len(weights.class_names)
     expected_errors = PatchExpectedErrors.of(
@@ -158,8 +159,8 @@ def _best_extent(layout: PassLayout, extent_gains: ExtentGains, seconds: float) 
             least.append(cheapest_row_seconds(rows, expected_gain, camera, cost, exposure_ms))
     if not least:
         raise SettingsError(
-            f"camera.exposure_ms = {camera.exposure_ms:g} is too short for a partial scan; give a longer one, or leave"
-            " --extent out"
+            f"camera.exposure_ms = {camera.exposure_ms:g} is too short for a partial scan; give a longer one, or"
+            f" capture all of the field ({WHOLE})"
         )
     if not found:
         raise BudgetError(

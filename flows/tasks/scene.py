@@ -233,7 +233,7 @@ def _some_bands(scene: RasterScene, bands: tuple[int, ...]) -> RasterScene:
     """Return the scene with some of its bands. Raises SettingsError: it has no such band."""
     count, chosen = len(scene.wavelength_nm), list(bands)
     if not all(0 <= band < count for band in bands):
-        raise SettingsError(f"--bands {','.join(map(str, bands))}: the built-in farm has bands 0 to {count - 1}")
+        raise SettingsError(f"--bands {','.join(map(str, bands))}: the scene has bands 0 to {count - 1}")
     return replace(
         scene,
         key=f"{scene.key}/only={','.join(map(str, bands))}",

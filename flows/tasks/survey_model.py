@@ -81,7 +81,7 @@ class SurveyModel:
         if unknown not in (UNKNOWN_AUTO, UNKNOWN_OFF) and self.described.ood_detector is None:
             raise WeightsError(
                 f"--unknown {unknown}: {self.path.name} has no out-of-distribution detector; train weights with "
-                "validation scenes (spectralzoom train DATASET --validation 3), or leave --unknown out"
+                "validation scenes (spectralzoom train DATASET -o my.safetensors --validation 3), or leave it out"
             )
         return None if unknown == UNKNOWN_OFF else self.described.ood_detector
 
@@ -95,7 +95,7 @@ def weights_path(settings: Settings) -> Path:
         return Path(str(settings.weights))
     if settings.weights is None and settings.scene not in BUILT_IN_SCENES:
         raise SettingsError(
-            f"--weights is missing: the weights that come with SpectralZoom know the built-in farm only;"
+            f"--weights is missing: the weights that come with SpectralZoom know farm and scouting only;"
             f" train some for {settings.scene} with: spectralzoom train DATASET -o my.safetensors"
         )
     return shipped_weights()
@@ -134,7 +134,7 @@ def beyond_training(
         shortest = (one if settings.plain else min(usual, other)) * scene.light_fraction
         if shortest < DARKER * least and not settings.is_map:  # a raster has no exposures
             under = "" if scene.light_fraction == 1 else " under a clear sky, by their light"
-            found.append(f"exposures of {shortest:g} ms{under} (training: {least:g} ms and more)")
+            found.append(f"exposures of {shortest:g} ms{under} (training: {least:g} ms and more, by --min-exposure-ms)")
         pixel_m, known_m = None, trained.ground_pixel_m
         if settings.scene in BUILT_IN_SCENES:
             pixel_m = FARM_PIXEL_M  # independent of the pose

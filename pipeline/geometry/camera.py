@@ -33,7 +33,7 @@ class LineCamera:
     exposure_ms: float = stated(100.0, "Exposure of a line", "ms", 0.5, 10_000)
     readout_ms: float = stated(0.0, "Time after an exposure before the next one begins", "ms", 0, 100_000)
     max_rate_hz: float = stated(350.0, "Most lines in a second", "Hz", 0.1, 100_000)
-    bits: int = stated(12, "Bits of the converter; sums of neighbours in a coarse pass must fit 16", "", 8, 16)
+    bits: int = stated(12, "Bits of the converter", "", 8, 16)
     electrons_per_dn: float = assumed(5.0, "Electrons for one DN", "", 1e-3, 1e4)
     read_noise_e: float = assumed(20.0, "Standard deviation of the read noise, in electrons", "", 0, 1e4)
     dark_dn: float = assumed(64.0, "Level of the converter without light", "", 0, 16_383)

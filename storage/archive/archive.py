@@ -111,8 +111,8 @@ class Archive:
             check_files(self.root / uri, hashes=False)
             if is_cleared(read_manifest(self.root / uri)):
                 raise IncompleteStoreError(
-                    f"{self.name}/{uri}: its files were cleared away by gc. Run its survey again (explain prints the"
-                    " command): only cleared stores are built again"
+                    f"{self.name}/{uri}: its files were cleared away. Run its survey again, for raw lines with"
+                    " --keep raw (explain prints the command of the run): only cleared stores are built again"
                 )
         return self.root / address
 

@@ -141,8 +141,7 @@ def rests_on(root: Path, refs: Iterable[StageRef]) -> list[StageRef]:
 def find_product(catalogue: Catalogue, text: str) -> str | Run:
     """Return the address of a store that is there, or a run.
 
-    Raises NoRunError: there is no such run; ArchiveError: nothing or more than one product has this name, or the name
-    is not allowed.
+    Raises NoRunError: nothing has this name; ArchiveError: more than one product has it, or it is not allowed.
     """
     parts = text.rstrip("/").split("/")
     for part in parts:
@@ -178,7 +177,7 @@ def find_product(catalogue: Catalogue, text: str) -> str | Run:
         known = f"products of the newest run: {', '.join(products)}"
     else:
         known = f"no run has products; there is {list_some(sorted(catalogue.stores), 3) or 'nothing in it'}"
-    raise ArchiveError(f"{text!r} is no product, store or run of this archive; {known}")
+    raise NoRunError(f"{text!r} is no product, store or run of this archive; {known}")
 
 
 ABSENT = "(none)"

@@ -37,7 +37,7 @@ def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:
     known = {"created": datetime.now(UTC).isoformat(timespec="milliseconds"), "libraries": library_versions()}
     content = {**known, **facts, "files": files, "format": FORMAT}
     manifest = folder / MANIFEST_NAME
-    manifest.write_text(sealed_text(content), encoding="utf-8")
+    manifest.write_text(manifest_text(content), encoding="utf-8")
     sync_path(manifest)
     for inner in sorted(path for path in folder.rglob("*") if path.is_dir()):
         sync_path(inner)
@@ -73,8 +73,8 @@ def parse_manifest(written: bytes) -> tuple[dict[str, Any], str | None]:
         if not isinstance(content, dict) or not isinstance(content.get("files"), dict):
             raise TypeError("it lists no files")
         before, _, after = text.partition(f'\n "seal": "{content.get("seal")}"')
-        sealed = before + after[1:] if after.startswith(",") else before[:-1] + after  # with the comma of its line
-        if content.get("seal") != hashlib.sha256(sealed.encode()).hexdigest():
+        plain = before + after[1:] if after.startswith(",") else before[:-1] + after  # with the comma of its line
+        if content.get("seal") != hashlib.sha256(plain.encode()).hexdigest():
             raise ValueError("it has changed since it was published: its seal does not fit")
         for name, entry in content["files"].items():
             parts = PurePosixPath(name).parts
@@ -183,13 +183,14 @@ def file_problem(path: Path, entry: Mapping[str, Any], *, hashes: bool) -> str |
     return None
 
 
-def sealed_text(content: Mapping[str, Any]) -> str:
+def manifest_text(content: Mapping[str, Any]) -> str:
     """Return the text of a manifest with its seal, the SHA-256 of the text without it."""
 
     def text(values: Mapping[str, Any]) -> str:
         return json.dumps(values, indent=1, sort_keys=True, allow_nan=False) + "\n"
 
-    return text({**content, "seal": hashlib.sha256(text(content).encode()).hexdigest()})
+    checksummed = {**content, "seal": hashlib.sha256(text(content).encode()).hexdigest()}
+    return text(checksummed)
 
 
 @cache

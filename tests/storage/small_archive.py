@@ -10,7 +10,7 @@ from typing import Any
 
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
-from storage.archive.manifests import sealed_text
+from storage.archive.manifests import manifest_text
 from storage.arrays.class_maps import ClassMap, ClassNames, create_class_map, write_class_tile
 from storage.remote.opening import verify_archive
 
@@ -73,7 +73,7 @@ def flip(path: Path, at: int = -3, bit: int = 2) -> None:
 def rewrite(path: Path, **facts: Any) -> None:
     """Change what a manifest says, under a seal that fits."""
     content = {name: value for name, value in json.loads(path.read_text()).items() if name != "seal"} | facts
-    path.write_text(sealed_text(content))
+    path.write_text(manifest_text(content))
 
 
 def grow_old(ref: StageRef, days: float) -> None:

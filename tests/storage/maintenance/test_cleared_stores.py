@@ -64,7 +64,7 @@ def test_a_reader_of_what_was_cleared_is_told_what_to_do(archive: Archive) -> No
     """No file is looked for that is not there."""
     small = small_survey(archive)
     cleared(archive)
-    with pytest.raises(IncompleteStoreError, match=r"cleared away by gc\. Run its survey again"):
+    with pytest.raises(IncompleteStoreError, match=r"cleared away\. Run its survey again, for raw lines with --keep"):
         archive.locate(f"{small.mosaic.uri}/mosaic.zarr")
 
 
