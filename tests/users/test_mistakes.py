@@ -128,7 +128,7 @@ CASES = {
     "init twice": (2, "init bad_key", "bad_key/scene.toml exists.*--force"),
     # archives
     "folder that is no archive": (1, "export apart -o maps", "apart"),
-    "unknown run": (1, "explain kept yesterday", "yesterday"),
+    "unknown run": (2, "explain kept yesterday", "yesterday"),
     "run of what is no archive": (1, "evaluate empty latest", "no archive"),
     "wavelengths of a farm": (2, "survey --wavelengths 460 --engine plain --out never", "brings its own"),
     "evaluation without weights": (2, "evaluate apart", "give --weights FILE"),
