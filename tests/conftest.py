@@ -107,11 +107,8 @@ def prior_work(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def no_waiting_for_the_disk() -> Iterator[None]:
-    """Files of tests need not outlive a power cut: a survey asks 300 times to be put on the disk, and waits for it.
-
-    Nor does a survey search all that tests hold in memory for what one before it left.
-    """
+def no_waiting() -> Iterator[None]:
+    """No survey waits until files are on the disk, 300 times, or searches for garbage in all that tests hold."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda descriptor: None)
         patch.setattr(survey_command, "gc", SimpleNamespace(collect=int))

@@ -106,9 +106,8 @@ def test_workers_that_cannot_read_the_bucket_are_one_message(bucket: str, comman
     """The message says that it is a worker's, and what is wrong there."""
     with workers(1, {"AWS_ENDPOINT_URL": "http://127.0.0.1:9", THREADS_OF: "1"}) as address:
         ended = command_line("survey", "--out", bucket, *SMALL, "--scheduler", address)
-    words = "it does not answer: check the network and AWS_ENDPOINT_URL"
     assert ended.code == 2
-    assert re.fullmatch(rf".*--scheduler tcp:\S+: a worker cannot read the archive\. .*{words}", ended.errors[-1])
+    assert re.fullmatch(r".*--scheduler tcp:\S+: a worker cannot read the archive.* not answer: .*", ended.errors[-1])
 
 
 def test_another_machine_clears_outlived_raw_lines_in_a_bucket(

@@ -242,8 +242,7 @@ def test_a_moved_field_is_found(seed: int, down: int, across: int) -> None:
 def test_a_turned_field_is_found(seed: int, degrees: float) -> None:
     """To a fifth of a degree, about its middle."""
     field = textured(seed, (180, 210))
-    turned = rotate(field, degrees, reshape=False, order=3)
-    found = field_shift(cut(turned), cut(field), reach_px=REACH)
+    found = field_shift(cut(rotate(field, degrees, reshape=False, order=3)), cut(field), reach_px=REACH)
     assert abs(found.turned_deg) == pytest.approx(abs(degrees), abs=0.2)
     assert np.hypot(*found.shift) < 1.0
 
@@ -256,8 +255,15 @@ def test_what_changed_in_places_moves_nothing(seed: int) -> None:
     now[:, :50] = cut(textured(seed + 50))[:, :50]
     now += rng.normal(0, 0.1 * now.std(), now.shape)
     found = field_shift(now, cut(field), reach_px=REACH)
-    assert np.hypot(*found.shift) < 0.3
-    assert found.edge_px(SIZE) < 0.5
+    assert max(np.hypot(*found.shift) / 0.3, found.edge_px(SIZE) / 0.5) < 1
+
+
+def test_the_motion_of_most_windows_is_that_of_the_field() -> None:
+    """Four of nine windows, faint ones, stayed where they were."""
+    still = (np.indices((240, 240)) < 160).all(axis=0)
+    now = gaussian_filter(np.random.default_rng(0).normal(size=still.shape), 2) * np.where(still, 0.2, 1)
+    before = np.where(still, now, np.roll(now, -24, axis=1))
+    np.testing.assert_allclose(field_shift(now, before, reach_px=32).shift, (0, 24), atol=0.1)
 
 
 @pytest.mark.parametrize("now", [np.full(SIZE, np.nan), np.ones(SIZE), cut(textured(8))])
