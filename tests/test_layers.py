@@ -119,13 +119,8 @@ def test_storage_stores() -> None:
 
 def test_a_survey_calibrates_in_one_place() -> None:
     """What is rectified and registered is never a raw number: `pipeline.signal.lines` has read and calibrated it."""
-    wrong = [
-        f"{path} imports {name}"
-        for path, tree in source().items()
-        for name in imported(tree)
-        if name.startswith("pipeline.signal.calibrate") and path.parts[:2] == ("pipeline", "rectify")
-    ]
-    assert wrong == []
+    trees = [tree for path, tree in source().items() if path.parts[:2] == ("pipeline", "rectify")]
+    assert not [name for tree in trees for name in imported(tree) if name.startswith("pipeline.signal.calibrate")]
 
 
 def test_heavy_packages_stay_with_their_owner() -> None:
@@ -178,9 +173,8 @@ def test_every_file_has_a_user() -> None:
 
 def test_files_say_at_their_heads_what_they_need() -> None:
     """What takes long to load is deferred at a file's head; functions import only what the table gives a reason for."""
-    assert imported_in_functions(source()) == {
-        path: set(packages.split()) for path, (packages, _) in IN_FUNCTIONS.items()
-    }
+    known = {path: set(packages.split()) for path, (packages, _) in IN_FUNCTIONS.items()}
+    assert imported_in_functions(source()) == known
 
 
 def test_folders_can_be_held_in_mind() -> None:
@@ -216,8 +210,7 @@ def test_packages_are_those_of_this_folder() -> None:
 def test_what_is_imported_is_declared() -> None:
     """Every package from outside that the source imports stands in pyproject.toml."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    extras = project["optional-dependencies"]
-    wanted = project["dependencies"] + extras["s3"]
+    wanted = project["dependencies"] + project["optional-dependencies"]["s3"]
     declared = {re.split(r"[\[<>=~! ]", item, maxsplit=1)[0].lower() for item in wanted}
     outside = {name.split(".")[0] for tree in source().values() for name in imported(tree)}
     outside -= {*ROOMS, *sys.stdlib_module_names}
@@ -226,9 +219,7 @@ def test_what_is_imported_is_declared() -> None:
 
 def test_walk_finds_what_it_looks_for() -> None:
     """The checks above see imports inside functions, reads in class bodies and defaults, and not in functions."""
-    tree = ast.parse(
-        "import os\nclass A:\n    x = os.getenv('A')\ndef f(y=open('b')):\n    import zarr\n    open('c')\n"
-    )
+    tree = ast.parse("import os\nclass A:\n x = os.getenv('A')\ndef f(y=open('b')):\n import zarr\n open('c')\n")
     assert list(imported(tree)) == ["os", "zarr"]
     assert sorted(called_name(node) for node in at_import(tree) if isinstance(node, ast.Call)) == ["getenv", "open"]
 

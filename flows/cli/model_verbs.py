@@ -103,8 +103,6 @@ class TrainFlags(SceneFlags):
         Number of transformer layers.
     heads
         Number of attention heads; a divisor of --dim.
-    mlp_ratio
-        Hidden width of the MLPs, as a multiple of --dim.
     crop
         Size of the crops [px]. Default: 256 for the farm, 384 for files.
     batch
@@ -132,7 +130,6 @@ class TrainFlags(SceneFlags):
     dim: int = 64
     layers: int = 3
     heads: int = 4
-    mlp_ratio: int = 3
     crop: int | None = None
     batch: int = TrainingSettings.batch
     min_exposure_ms: float = TrainingSettings.darkest_ms
@@ -157,7 +154,7 @@ class TrainFlags(SceneFlags):
             self.columns,
             self.width,
             self.overview_width,
-            tokens={"dim": self.dim, "layers": self.layers, "heads": self.heads, "mlp_ratio": self.mlp_ratio},
+            tokens={"dim": self.dim, "layers": self.layers, "heads": self.heads},
             choices=self.choices(),
             settings=TrainingSettings(
                 steps=self.steps,

@@ -220,22 +220,11 @@ def run_train(request: TrainRequest, console: Console) -> dict[str, Any]:
 def check_counts(request: TrainRequest) -> None:
     """Raise SettingsError for a count or size that is not positive, or an exposure beyond the reference."""
     settings = request.settings
-    counts = {
-        "--steps": settings.steps,
-        "--minutes": settings.minutes,
-        "--learning-rate": settings.learning_rate,
-        "--batch": settings.batch,
-        "--crop": settings.crop,
-        "--scenes": request.scenes,
-        "--patch": request.patch,
-        "--width": request.width,
-        "--overview-width": request.overview_width,
-        "--columns": request.columns,
-        **{"--" + name.replace("_", "-"): size for name, size in request.tokens.items()},
-    }
-    for name, value in counts.items():
+    counts = {name: getattr(settings, name) for name in ("steps", "minutes", "learning_rate", "batch", "crop")}
+    counts |= {name: getattr(request, name) for name in ("scenes", "patch", "width", "overview_width", "columns")}
+    for name, value in {**counts, **request.tokens}.items():
         if value is not None and not value > 0:
-            raise SettingsError(f"{name} must be above 0, got {value}")
+            raise SettingsError(f"--{name.replace('_', '-')} must be above 0, got {value}")
     for name, number in {"--validation": request.validation, "--seed": settings.seed}.items():
         if number is not None and number < 0:
             raise SettingsError(f"{name} must be 0 or more, got {number}")

@@ -25,6 +25,7 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.simulator.scenes.built_in import built_in_laws
 from pipeline.simulator.scenes.scene import RasterScene
 
+DEEP_PATCH_PX = 32  # of frames of 512 px and more, whose objects are larger than a token
 COLUMNS = {True: 24, False: 48}  # spectral features: of built-in scenes, and of files
 
 
@@ -41,7 +42,7 @@ class TrainRequest:
     columns: int | None = None  # of spectral features; None: 24 of built-in scenes, 48 of files
     width: int = 20
     overview_width: int = 8
-    tokens: dict[str, Any] = field(default_factory=dict)  # dim, layers, heads, mlp_ratio
+    tokens: dict[str, Any] = field(default_factory=dict)  # dim, layers, heads
     choices: dict[str, Any] = field(default_factory=dict)  # of load_data_set: labels, bands, wavelengths, masks
     settings: TrainingSettings = field(default_factory=TrainingSettings)
     camera: LineCamera = field(default_factory=LineCamera)
@@ -197,6 +198,7 @@ def network_config(request: TrainRequest, common: Common) -> SegmenterConfig:
             patch=common.patch,
             width=request.width,
             overview_width=request.overview_width,
+            deep=common.patch >= DEEP_PATCH_PX,
             **request.tokens,
         )
     except ValueError as error:

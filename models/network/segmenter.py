@@ -144,10 +144,13 @@ class Residual(nn.Module):
 class Stem(nn.Module):
     """Encoder of a U-Net: an image to features at every level, each half as large as the last."""
 
-    def __init__(self, inputs: int, widths: list[int]) -> None:
+    def __init__(self, inputs: int, widths: list[int], deep: bool = False) -> None:
         super().__init__()
         self.enter = nn.Conv2d(inputs, widths[0], 1)
-        self.blocks = nn.ModuleList(Residual(width) for width in widths)
+        self.blocks = nn.ModuleList(
+            nn.Sequential(Residual(width), Residual(width)) if deep and level > 1 else Residual(width)
+            for level, width in enumerate(widths)
+        )
         self.down = nn.ModuleList(nn.Conv2d(upper, lower, 2, stride=2) for upper, lower in pairwise(widths))
 
     def forward(self, image: Tensor) -> list[Tensor]:
@@ -194,16 +197,16 @@ class Segmenter(nn.Module):
         super().__init__()
         self.config = config
         inputs, dim = config.columns + PLANES, config.dim
-        widths = level_widths(config.overview_width, TOKEN_PX)
-        self.overview_stem = Stem(inputs, widths)
+        widths = level_widths(config.overview_width, TOKEN_PX, config.deep)
+        self.overview_stem = Stem(inputs, widths, config.deep)
         self.to_token = nn.Conv2d(widths[-1], dim, BOTTOM, stride=BOTTOM)
         self.encoder = Encoder(dim, config.layers, config.heads, config.mlp_ratio)
         self.from_token = nn.Conv2d(dim, widths[-1] * BOTTOM**2, 1)
         self.overview_head = Head(widths)
         self.overview_classes = nn.Conv2d(config.overview_width, config.classes, 1)
         self.spectral = nn.Conv2d(config.columns, config.classes, 1)  # linear classifier that the U-Net corrects
-        widths = level_widths(config.width, config.patch)
-        self.full_stem = Stem(inputs + config.overview_width, widths)
+        widths = level_widths(config.width, config.patch, config.deep)
+        self.full_stem = Stem(inputs + config.overview_width, widths, config.deep)
         self.full_head = Head(widths)
         self.full_classes = nn.Conv2d(config.width, config.classes, 1)
         with torch.no_grad():

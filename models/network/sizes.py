@@ -31,18 +31,16 @@ CELL_PX = 2  # pixels a side of the spectral features of the temporal reader
 AROUND_PX = 5  # pixels a side whose mean spectrum the spectral classifier reads
 TOKEN_PX = 32  # pixels a side that a token stands for
 PLANES = 3  # beside the spectral features of a pixel: exposure, line spacing, binned samples
-OTHERS = (
-    7  # inputs of the temporal reader beside probabilities: seen, age, light before, light, line spacing, season (2)
-)
+OTHERS = 7  # inputs of the temporal reader beside probabilities: seen, age, both lights, line spacing, season (2)
 GATES = 3  # of the temporal reader: weight of prior map, weight of visit, weight of both against the prior map
 
 
-def level_widths(width: int, patch: int) -> list[int]:
-    """Return the channels of each level, from full resolution down to ``BOTTOM`` px: width, 2 width, then 3 width."""
+def level_widths(width: int, patch: int, deep: bool = False) -> list[int]:
+    """Return the channels of each level, down to ``BOTTOM`` px: 1, 2, 3 and 3 widths, or 1, 2, 4 and 8 if ``deep``."""
     levels = (patch // BOTTOM).bit_length()
     if patch < BOTTOM or patch != BOTTOM << (levels - 1):
         raise ShapeError(f"a patch must be {BOTTOM} px times a power of two, got {patch}; choose 8, 16 or 32")
-    return [width * min(level + 1, 3) for level in range(levels)]
+    return [width * (2**level if deep else min(level + 1, 3)) for level in range(levels)]
 
 
 @dataclass(frozen=True)
@@ -58,6 +56,7 @@ class SegmenterConfig:
     layers: int = 3
     heads: int = 4
     mlp_ratio: int = 3
+    deep: bool = False  # for large frames: more channels and blocks at low levels
 
     def __post_init__(self) -> None:
         for name in ("classes", *MOST):
@@ -114,23 +113,24 @@ def multiply_adds(
     """
     basis = bands * config.columns
     rows, columns = (-(-size // TOKEN_PX) for size in grid.padded_shape)
-    tokens, cell, p = rows * columns, TOKEN_PX**2, config.patch
+    tokens, cell, p, deep = rows * columns, TOKEN_PX**2, config.patch, config.deep
     inputs, pixels = config.columns + PLANES, math.prod(grid.padded_shape)
-    bottom = 2 * level_widths(config.overview_width, TOKEN_PX)[-1] * BOTTOM**2 * config.dim  # to a token and back
-    overview = cell * config.columns * config.classes + _pyramid(inputs, config.overview_width, TOKEN_PX) + bottom
+    lowest = level_widths(config.overview_width, TOKEN_PX, deep)[-1] * BOTTOM**2
+    spectral, bottom = cell * config.columns * config.classes, 2 * lowest * config.dim  # to a token and back
+    overview = spectral + _pyramid(inputs, config.overview_width, TOKEN_PX, deep) + bottom
     drawn = pixels * (basis + config.overview_width * config.classes)
     patch = p * p * (apart * basis + config.width * config.classes) + _pyramid(
-        inputs + config.overview_width, config.width, p
+        inputs + config.overview_width, config.width, p, deep
     )
     dim = config.dim  # tokens read each other: L ((4 + 2 r) d^2 N + 2 N^2 d)
     read = config.layers * ((4 + 2 * config.mlp_ratio) * dim * dim * tokens + 2 * tokens * tokens * dim)
     return MultiplyAdds(tokens * overview + drawn + read, score, patches * patch)
 
 
-def _pyramid(inputs: int, width: int, size: int) -> int:
-    """Stem and head of a cell of ``size`` px: the way in, two residual blocks a level, and the ways between levels."""
-    levels = [(channels, (size >> i) ** 2) for i, channels in enumerate(level_widths(width, size))]
-    blocks = sum(18 * channels * channels * pixels for channels, pixels in levels)
-    blocks -= 9 * levels[-1][0] ** 2 * levels[-1][1]  # the lowest level has one
+def _pyramid(inputs: int, width: int, size: int, deep: bool) -> int:
+    """Stem and head of a cell of ``size`` px: the way in, residual blocks, and the ways between levels."""
+    levels = [(channels, (size >> i) ** 2) for i, channels in enumerate(level_widths(width, size, deep))]
+    blocks = sum((3 if deep and i > 1 else 2) * 9 * c**2 * pixels for i, (c, pixels) in enumerate(levels))
+    blocks -= 9 * levels[-1][0] ** 2 * levels[-1][1]  # the lowest level has none on the way up
     between = sum(8 * upper * lower * pixels for (upper, _), (lower, pixels) in pairwise(levels))
     return inputs * width * size**2 + blocks + between

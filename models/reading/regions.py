@@ -157,7 +157,8 @@ def region_bytes(config: SegmenterConfig, region: Region, patch_index: int, band
     p, (y, x) = config.patch, region.grid.padded_shape
     inputs = config.columns + PLANES
     overview, full = (
-        FEATURE_COPIES * sum(channels / 4**level for level, channels in enumerate(level_widths(width, size)))
+        FEATURE_COPIES
+        * sum(channels / 4**level for level, channels in enumerate(level_widths(width, size, config.deep)))
         for width, size in ((config.overview_width, TOKEN_PX), (config.width, p))
     )
     drawn = MAP_COPIES * config.classes

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+import torch.nn.functional as F  # noqa: N812 - its usual name
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -28,6 +29,7 @@ from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 
 NOISY = 0.25  # fraction of crops with added noise
 BRIGHTNESS = 0.04  # standard deviation of the factor of a crop's light
+ZOOMED, ZOOMS = 0.7, (-0.6, 0.5)  # fraction of crops that are zoomed, if any; octaves of their pixels
 HALO, STRIP_ROWS = 8, 64  # rows around a strip that its footprint reaches; most rows of a strip
 
 
@@ -115,24 +117,24 @@ class Batch:
 
 
 class CropSampler:
-    """Draw random crops: place, flips, transposition, brightness and noise."""
+    """Draw random crops: place, scale, flips, transposition, brightness and noise."""
 
     def __init__(
         self,
         examples: list[Example],
         patch: int,
         crop: int,
-        *,
         noise: float = 0.0,
+        zoomed: bool = False,
         augmentation: CaptureAugmentation | None = None,
         device: str = PROCESSOR,
     ) -> None:
         """Set up the crops. ``noise`` [spreads of the columns] is the largest added without an ``augmentation``.
 
-        The scenes stay on the ``device``, where crops are made.
+        With ``zoomed`` most crops are enlarged or reduced. The scenes stay on the ``device``, where crops are made.
         """
         self.smallest: int = min(min(example.labels.shape) for example in examples)
-        self.examples, self.patch, self.crop, self.noise = examples, patch, crop, noise
+        self.examples, self.patch, self.crop, self.noise, self.zoomed = examples, patch, crop, noise, zoomed
         self.augmentation, self.device = augmentation, device
         self.columns = [torch.from_numpy(example.columns).to(device) for example in examples]
         areas = np.array([np.count_nonzero(example.labels != UNLABELLED) for example in examples], np.float64)
@@ -156,9 +158,12 @@ class CropSampler:
     ) -> tuple[Tensor, Tensor, Tensor]:
         number = int(rng.choice(len(self.examples), p=self.fraction))
         example = self.examples[number]
+        zoom = 2 ** rng.uniform(*ZOOMS) if self.zoomed and rng.random() < ZOOMED else 1.0
+        side = min(round(size * zoom), *example.labels.shape)
+        nearest = ((np.arange(size) + 0.5) * side / size).astype(int)
         for _ in range(20):  # until the crop has a label
-            y, x = (int(rng.integers(0, side - size + 1)) for side in example.labels.shape)
-            labels = example.labels[y : y + size, x : x + size]
+            y, x = (int(rng.integers(0, most - side + 1)) for most in example.labels.shape)
+            labels = example.labels[y + nearest[:, None], x + nearest]
             if (labels != UNLABELLED).any():
                 break
         gain = float(rng.normal(1.0, BRIGHTNESS))
@@ -168,7 +173,11 @@ class CropSampler:
             turned = image.transpose(0, 1) if transpose else image
             return turned.flip([axis for axis, back in enumerate(flipped) if back])
 
-        plain = turn(self.columns[number][y : y + size, x : x + size]).float()
+        seen = self.columns[number][y : y + side, x : x + side].float()
+        if side != size:
+            planes = F.interpolate(seen.permute(2, 0, 1)[None], (size, size), mode="bilinear", antialias=True)
+            seen = planes[0].permute(1, 2, 0).contiguous()
+        plain = turn(seen)
         columns = plain * gain + beside(plain, (gain - 1) * gain_shift)
         if self.augmentation is not None and example.noise is not None:
             image, detail = self.augmentation.draw(columns, example.noise, rng)

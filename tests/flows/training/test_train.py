@@ -24,9 +24,10 @@ from flows.training import train as flow
 from flows.training.data import TrainingData
 from flows.training.figures import judge_baselines
 from flows.training.train import run_train, train_weights
-from flows.training.train_scenes import TrainRequest, suggested_patch
+from flows.training.train_scenes import Common, TrainRequest, network_config, suggested_patch
 from models.evaluation.metrics import mean_iou
 from models.evaluation.placement import ReadTwice
+from models.network.spectral import SpectralBasis
 from models.training.examples import Example
 from models.training.train import TrainingSettings
 from models.weights.files import TrainedOn, describe_weights, load_weights
@@ -61,18 +62,15 @@ def test_the_record_tells_what_was_trained_on(folder: Path, out: Path, tmp_path:
     """Scenes kept for validation or held out are not among those that the weights were trained on."""
     record = train_weights(_request(folder, out, validation=1, hold_out=("003",)))
     split = record["split"]
-    assert len(split["train"]) == 2
-    assert len(split["validation"]) == 1
+    assert (len(split["train"]), len(split["validation"])) == (2, 1)
     assert not set(split["train"]) & {*split["validation"], "003"}
-    assert split["held_out"] == ["003"]
-    assert record["training"]["steps"] == 1
+    assert (split["held_out"], record["training"]["steps"]) == (["003"], 1)
     assert load_weights(tmp_path / "w.safetensors").record["split"] == split
 
 
 def test_new_weights_say_what_they_saw_and_know_what_is_ood(tmp_path: Path):
     """By scenes kept for validation; measured again by the command, the same; without such scenes nothing of it."""
-    names = tuple(f"{number:03}" for number in range(1, 5))
-    field, out = write_field(tmp_path / "field", (32, 32), names), tmp_path / "w.safetensors"
+    field, out = write_field(tmp_path / "field", (32, 32), ("001", "002", "003", "004")), tmp_path / "w.safetensors"
     record = train_weights(_request(field, out, validation=1))
     told = TrainedOn.read(load_weights(out).record["trained_on"])
     assert (told.scenes, told.exposure_ms, told.day) == (3, (100.0, 100.0), None)
@@ -121,8 +119,11 @@ def test_scenes_of_other_bands_are_not_mixed(folder: Path, out: Path, monkeypatc
     [((512, 640), True, 16), ((1024, 1280), False, 32), ((300, 900), False, 16), ((145, 145), False, 8)],
 )
 def test_patches_follow_the_size_of_scenes(shape: tuple[int, int], built_in: bool, patch: int):
-    """Small scenes get small patches, so that there are patches to choose from."""
+    """Small scenes get small patches, so that there are patches to choose from, and large frames a deep network."""
+    nm = np.linspace(500, 800, 4)
+    common = Common(SpectralBasis.spanning(nm), ("a", "b"), np.zeros((2, 3), np.uint8), patch, nm)
     assert suggested_patch(shape, built_in=built_in) == patch
+    assert network_config(TrainRequest("d", Path()), common).deep == (min(shape) >= 512 and not built_in)
 
 
 def test_training_shows_the_figures_of_validation(folder: Path, out: Path):
@@ -198,12 +199,10 @@ def test_a_survey_says_that_a_scene_was_trained_on(folder: Path, out: Path) -> N
 
 def test_pixels_trained_on_are_not_judged(out: Path, tmp_path: Path) -> None:
     """With a training mask the survey of the same file counts the other labelled pixels alone."""
-    rng = np.random.default_rng(4)
-    labels = rng.integers(1, 3, (40, 40)).astype(np.uint8)
-    mask = np.where(np.arange(40)[:, None] < 10, labels, 0).astype(np.uint8)
+    labels = np.random.default_rng(4).integers(1, 3, (40, 40)).astype(np.uint8)
     np.save(tmp_path / "cube.npy", (labels[..., None] * np.ones(4)).astype(np.float32))
     np.save(tmp_path / "labels.npy", labels)
-    np.save(tmp_path / "mask.npy", mask)
+    np.save(tmp_path / "mask.npy", np.where(np.arange(40)[:, None] < 10, labels, 0).astype(np.uint8))
     given = {"labels": str(tmp_path / "labels.npy"), "wavelengths": [500, 600, 700, 800]}
     choices = {**given, "train_mask": str(tmp_path / "mask.npy")}
     train_weights(_request(tmp_path / "cube.npy", out, choices=choices))
@@ -246,8 +245,7 @@ def test_weights_for_short_exposures_have_a_record_of_plain_scans(folder: Path, 
     tables = [scans["miou"], *scans["per_class_iou"].values()]
     assert all(np.shape(table) == (4, 5) and np.min(table) >= 0 and np.max(table) <= 1 for table in tables)
     assert np.shape(scans["spread"]) == (4, 5)
-    ood_detector = describe_weights(out).ood_detector
-    scores = ood_detector.map_scores
+    scores = describe_weights(out).ood_detector.map_scores
     assert (scores.steps, scores.exposures_ms, scores.scenes) == ((1, 2, 4, 8), (6.0, 12.0, 25.0, 50.0, 100.0), 2)
     assert np.abs(scores.bias).max() > 0.01
     assert "scans" not in train_weights(_request(folder, out, validation=2))

@@ -15,7 +15,7 @@ from pipeline.geometry.grid import SceneGrid
 
 @pytest.mark.parametrize(
     ("sizes", "patch_index"),
-    [({"patch": 16}, 7), ({"patch": 8, "overview_width": 12}, 1), ({"patch": 32, "dim": 32, "layers": 1}, 3)],
+    [({"patch": 16}, 7), ({"patch": 8, "overview_width": 12}, 1), ({"patch": 32, "layers": 1, "deep": True}, 3)],
 )
 @pytest.mark.parametrize("width", [96, 104])  # with patches of 8 px, a part of the last tokens
 def test_closed_form_equals_the_counter(sizes: dict[str, int], patch_index: int, width: int) -> None:
