@@ -21,7 +21,6 @@ from pipeline.lazy import Tensor, safetensors_torch, torch
 KEY_DIGITS = 20
 ABOUT = "about"  # name of the text in the file
 TENSORS, SEAL = "tensors", "seal"  # entries of the description: hashes of the tensors, and its own
-# errors of reading damaged or forged content; the last two are those of a network that does not fit its tensors
 DAMAGED = (SafetensorError, OSError, KeyError, TypeError, ValueError, RecursionError, RuntimeError)
 CHECKPOINT = "spectralzoom-checkpoint/2"
 
@@ -53,7 +52,8 @@ def refusing(path: Path) -> Iterator[None]:
     except WeightsError:
         raise
     except DAMAGED as error:
-        why = " ".join(str(error).split())[:300]
+        other = type(error) in (TypeError, RuntimeError)  # of sizes and layers that this version does not know
+        why = "its network is of another version" if other else " ".join(str(error).split())[:300]
         raise WeightsError(
             f"cannot read {path}: {why}; restore a copy of it, name another file, or move it elsewhere and train or "
             "measure it again"
