@@ -53,7 +53,7 @@ def refusing(path: Path) -> Iterator[None]:
         raise
     except DAMAGED as error:
         other = type(error) in (TypeError, RuntimeError)  # of sizes and layers that this version does not know
-        why = "its network is of another version" if other else " ".join(str(error).split())[:300]
+        why = "it is of another version" if other else " ".join(str(error).split())[:300]
         raise WeightsError(
             f"cannot read {path}: {why}; restore a copy of it, name another file, or move it elsewhere and train or "
             "measure it again"

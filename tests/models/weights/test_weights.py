@@ -95,8 +95,8 @@ def test_another_format_is_named(saved: Path):
     ("changes", "words"),
     [
         ({"classes": 1}, "2 to 255 classes, got 1"),
-        ({"depth": 3}, "its network is of another version"),
-        ({"dim": 32}, "its network is of another version"),
+        ({"depth": 3}, "it is of another version"),
+        ({"dim": 32}, "it is of another version"),
         ({"columns": 7}, "a basis of 4 columns from 400 to 1000 nm, expected 7"),
         ({"layers": 10_000_000}, "layers of a segmenter must be at least 1 and at most 256"),
         ({"dim": 2**40}, "dim of a segmenter must be at least 1 and at most 16384"),
@@ -116,7 +116,7 @@ def test_sizes_that_do_not_fit_are_named(saved: Path, changes: dict[str, Any], w
     [
         ("normalisation.centre", None, r"w\.safetensors: .*normalisation.centre"),
         ("class_colours", None, r"w\.safetensors: .*class_colours"),
-        ("full_classes.bias", None, r"w\.safetensors: its network is of another version"),
+        ("full_classes.bias", None, r"w\.safetensors: it is of another version"),
         ("full_classes.bias", lambda one: one * torch.nan, "bias has numbers that are not finite"),
         ("full_classes.bias", lambda one: one + torch.inf, "bias has numbers that are not finite"),
         ("full_classes.bias", torch.Tensor.half, "is of torch"),
