@@ -204,8 +204,7 @@ class Layer:
 def map_layers(run: ExportedRun) -> list[Layer]:
     """Return the class map, its confidence, the expected gain of the patches, and a picture."""
     product = run.map_product
-    legend = legend_of(open_group(run.path(product)))
-    roles = ("data", "confidence")
+    legend, roles = legend_of(open_group(run.path(product))), ("data", "confidence")
     return [
         image_layer(run, product, "classes", "class_map", "Class map", nodata=UNLABELLED, legend=legend, band="class"),
         image_layer(run, product, "confidence", "confidence", "Probability of the class given", roles=roles, unit="1"),

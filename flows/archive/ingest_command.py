@@ -84,8 +84,7 @@ def run_ingest(
         check_name(name)
     with console.status("opening the source"):
         found = with_wavelengths(open_cube(source, dark=dark, white=white), source, wavelengths)
-        cube = with_stated_values(found, source)
-        opened = open_archive(archive)
+        cube, opened = with_stated_values(found, source), open_archive(archive)
         opened.reclaim()  # of a killed ingest
     with opened.in_use(), StageProgress(console, TITLES) as progress:
         before = _stamps(cube)

@@ -42,8 +42,7 @@ def field_figures(run: SurveyRun, fine: FinePlan | None) -> dict[str, Any]:
     zones, and hectares per hour refer to all capture time. A raster has neither capture time nor lines.
     """
     scale, fine_s = run.zones.place.scale(run.camera.ifov_rad), run.plan.fine_s if fine is None else fine.seconds
-    seconds = run.plan.coarse_s + fine_s
-    kept = _kept(run, scale)
+    seconds, kept = run.plan.coarse_s + fine_s, _kept(run, scale)
     footprint, captured = scale.footprint, run.raster is None
     camera_s = {"coarse": run.plan.coarse_s, "fine": fine_s, "all": seconds, "full_scan": run.plan.full_s}
     lines = {

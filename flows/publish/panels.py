@@ -157,8 +157,7 @@ def draw_spectra(mosaic: Mosaic, found: ClassMap) -> bytes | None:
     spectra = class_spectra(mosaic, found.classes, len(found.names))
     if len(mosaic.wavelength_nm) < LEAST_BANDS or not np.isfinite(spectra).any():
         return None
-    names = [name.replace("_", " ") for name in found.names]
-    palette = class_palette(found.colours)
+    names, palette = [name.replace("_", " ") for name in found.names], class_palette(found.colours)
     with mpl.rc_context({**STYLE, "font.size": 9}):
         figure = Figure(figsize=(9, 3.6), dpi=110, layout="constrained", facecolor=PAPER)
         axes = figure.subplots()

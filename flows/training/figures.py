@@ -203,8 +203,7 @@ def judge_baselines(
     rng = np.random.default_rng([seed, 0xBA5])
     if not validation or len(np.unique((learnt := LabelledPixels.drawn(train, rng)).labels)) < 2:
         return None
-    judged = LabelledPixels.drawn(validation, rng)
-    found = dict[str, float]()
+    judged, found = LabelledPixels.drawn(validation, rng), dict[str, float]()
     for name, classifier in {
         "logistic regression": LogisticRegression(max_iter=200),
         "random forest": RandomForestClassifier(100, min_samples_leaf=2, random_state=seed),

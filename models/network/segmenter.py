@@ -227,8 +227,7 @@ class Segmenter(nn.Module):
         ``image`` is the input of the overview, ``detail`` that of the full network. ``patch_index`` (B, K) are int64
         patch numbers, ``origin`` (B, 2) the tokens above and left of a crop.
         """
-        overview = self.read_overview(image, origin)
-        cells = cut(detail, self.config.patch)
+        overview, cells = self.read_overview(image, origin), cut(detail, self.config.patch)
         index = patch_index[:, :, None, None, None].expand(-1, -1, *cells.shape[2:])
         return overview.logits, self.read_patches(overview, cells.gather(1, index), patch_index)
 
@@ -272,8 +271,7 @@ class Segmenter(nn.Module):
         p = self.config.patch
         if k == 0:  # convolutions have no backward pass of an empty batch
             return overview.logits.new_zeros(b, 0, self.config.classes, p, p)
-        across = overview.logits.shape[-1] // p
-        within = torch.arange(p, device=patch_index.device)
+        across, within = overview.logits.shape[-1] // p, torch.arange(p, device=patch_index.device)
         y = (patch_index // across * p)[..., None] + within  # (B, K, p)
         x = (patch_index % across * p)[..., None] + within
         scene = torch.arange(b, device=patch_index.device)[:, None, None, None]

@@ -162,8 +162,7 @@ class Normalisation:
         there = reached & np.isfinite(normal)
         if there.all():
             return np.asarray(normal @ self.whitening, np.float32)
-        known = np.where(there, normal, np.float32(0))
-        alike = (there == reached).all(axis=-1)
+        known, alike = np.where(there, normal, np.float32(0)), (there == reached).all(axis=-1)
         self._complete(known, alike, reached)
         partly = ~alike & there.any(axis=-1)  # a pixel without a column keeps the medians
         for pattern in np.unique(there[partly], axis=0):

@@ -131,8 +131,7 @@ def _learn(reader: TemporalReader, visits: Sequence[_Batch], weight: Tensor, rng
     start, factor = visits[0], CELL_PX
     state, coarse = start.observation, start.coarse
     age = torch.zeros_like(start.seen)
-    rests_on = age + _light_a_pixel(start)
-    total = 0.0
+    rests_on, total = age + _light_a_pixel(start), 0.0
     for now in visits[1:]:
         age, rests_on = age + now.days, rests_on * torch.exp(-now.days / LIGHT_FADES_DAYS)
         small = now.seen[:, :, factor // 2 :: factor, factor // 2 :: factor]

@@ -108,8 +108,9 @@ class Trainer:
             {"params": [p for p in parameters if p.ndim <= 1], "weight_decay": 0.0},
         ]
         self.optimiser = torch.optim.AdamW(groups, settings.learning_rate)
-        crop, noise = settings.crop, settings.noise
-        self.sampler = CropSampler(examples, config.patch, crop, noise, config.deep, augmentation, device)
+        self.sampler = CropSampler(
+            examples, config.patch, settings.crop, settings.noise, config.deep, augmentation, device
+        )
         self.weight = class_weights([one.labels for one in examples], config.classes, settings.weight_cap).to(device)
         self.course = Course()
         self._started, self._worked = time.monotonic(), time.process_time()
