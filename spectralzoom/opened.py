@@ -161,7 +161,11 @@ class OpenedRun:
         exposure of each line are coordinates.
         """
         names = [name for name in LINE_PRODUCTS.values() if name in self.receipt["products"]]
-        stores = [path for name in names for path in sorted(self._place(name).glob("*.zarr"))]
+        stores = [
+            path
+            for name in names
+            for path in sorted(self._archive.locate(self.receipt["products"][name]).glob("*.zarr"))
+        ]
         return {path.stem: spectra.open_lazy_lines(path) for path in stores}
 
     @property
@@ -191,7 +195,7 @@ class OpenedRun:
                     f"the raw lines of {self.name} were cleared away once they were condensed; `lines` has their"
                     " signal. A survey with keep = raw keeps raw lines"
                 )
-        folders = [self._place(name) for name in names]
+        folders = [self._archive.locate(self.receipt["products"][name]) for name in names]
         return {one.stem: open_labelled(one) for folder in folders for one in sorted(folder.glob("*.zarr"))}
 
     @property
@@ -207,10 +211,9 @@ class OpenedRun:
         return open_labelled(self._place(product))
 
     def _place(self, product: str) -> Path:
-        where = self.receipt["products"].get(product)
-        if where is None:
+        if product not in self.products:
             raise IncompleteStoreError(f"the run {self.name} has no {product}. It has {', '.join(self.products)}")
-        return self._archive.locate(where)
+        return self._archive.locate(self.receipt["products"][product])
 
     def __repr__(self) -> str:
         score = (self.receipt.get("accuracy") or {}).get("miou")

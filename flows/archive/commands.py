@@ -276,7 +276,7 @@ def verdict(archive: Archive, findings: list[Finding]) -> dict[str, Any]:
         "problems": [asdict(finding) for finding in bad],
     }
     if bad:
-        plan = plan_repair(archive, bad, versions=versions())
+        plan = plan_repair(archive, bad, versions=versions(), can_capture=can_capture)
         content |= {
             "to_remake": list(plan.remade),
             "hopeless": plan.hopeless,
@@ -381,7 +381,7 @@ def show_explanation(content: dict[str, Any], console: Console) -> None:
     for node in content["lineage"]:
         console.print(_branch(node, None))
     if run is None:
-        _say(console, f"named by {', '.join(content['runs']) or 'no run: gc will remove it'}")
+        _say(console, f"named by {', '.join(content['runs']) or 'no run: gc --dry-run lists what it would remove'}")
         _show_changes(content, console)
 
 

@@ -34,7 +34,7 @@ from storage.arrays.class_maps import class_counts
 from storage.arrays.mosaics import develop
 
 HEAT_ALPHA = 0.72  # of scores over the field
-TITLE_LETTERS = 7.5  # to an inch of a line
+TITLE_LETTERS, CAPTION_LETTERS, WORD_LETTERS = 7.5, 8.5, 9.5  # to an inch of a line
 MOST_LETTERS = 60  # of a class in the legend
 
 
@@ -92,7 +92,7 @@ def _compose(data: QuicklookData) -> Figure:
     rows = figure.subfigures(len(counts), 1, height_ratios=tall, squeeze=False).ravel()
     for row, count in zip(rows, counts, strict=True):
         for axes in row.subplots(1, count, squeeze=False).ravel():
-            axes.set_anchor("N")  # to align the captions of a row
+            axes.set_anchor("NW")  # captions of a row are aligned, and as wide as their panel's part of the page
             next(panels)(axes, data)
     _draw_legend(figure, data, max(1, int(page / 2.9)))
     return figure
@@ -219,11 +219,14 @@ def _frame(axes: Axes, shape: tuple[int, ...]) -> None:
 
 
 def _caption(axes: Axes, title: str, words: str) -> None:
-    """Write a bold title over a line of words."""
-    axes.set_title(f"{title}\n")
-    placed: Any = {"xycoords": "axes fraction", "textcoords": "offset points"}
+    """Write a bold title over words, both in lines of the panel's part of the page."""
+    grid: Any = axes.get_gridspec()
+    width = axes.figure.bbox.width / _DPI / grid.ncols
+    lines = fill(words, int(width * WORD_LETTERS))
+    axes.set_title(fill(title, int(width * CAPTION_LETTERS)) + "\n" * (1 + lines.count("\n")))
+    placed: Any = {"xycoords": "axes fraction", "textcoords": "offset points", "va": "bottom"}
     # Long captions do not narrow the panel.
-    axes.annotate(words, (0, 1), (0, 7), color=MUTED, size=12, **placed).set_in_layout(False)
+    axes.annotate(lines, (0, 1), (0, 4), color=MUTED, size=12, **placed).set_in_layout(False)
 
 
 def _heat_key(image: AxesImage, ends: tuple[str, str]) -> None:

@@ -151,12 +151,17 @@ def test_class_colours_are_exact(tmp_path: Path) -> None:
     assert {(140, 94, 60), (0, 158, 115), (200, 30, 90), (219, 219, 214)} <= found
 
 
-def test_a_long_title_stays_within_the_picture() -> None:
-    """It is wrapped, so that its end is seen."""
+@pytest.mark.parametrize(("height", "width"), [(96, 128), (480, 300), (256, 64)])
+def test_long_words_stay_within_the_picture(height: int, width: int) -> None:
+    """Title and captions are wrapped, so that their ends are seen and none lies over the next panel."""
     with mpl.rc_context(quicklook._STYLE):
-        figure = quicklook._compose(replace(make_data(96, 128), about="every line, 25 ms; " * 8))
-        FigureCanvasAgg(figure).draw()
+        data = replace(make_data(height, width), about="every line, 25 ms; " * 8, changed=True)
+        FigureCanvasAgg(figure := quicklook._compose(data)).draw()
     assert figure._suptitle.get_window_extent().x1 <= figure.bbox.width
+    for row in figure.subfigs:
+        ends = [*(axes.bbox.x0 for axes in row.axes[1:]), figure.bbox.x1]
+        for axes, end in zip(row.axes, ends, strict=True):
+            assert all(one.get_window_extent().x1 <= end for one in (axes._left_title, *axes.texts))
 
 
 def test_a_legend_of_long_names_lies_within_the_picture():

@@ -130,14 +130,6 @@ def test_rare_classes_weigh_more():
     assert class_weights([labels], 3, 2.0).max() == 2
 
 
-def test_some_draws_go_by_chance():
-    """Then the patch of the highest entropy may be left out."""
-    overview = torch.zeros(1, 3, 64, 64)
-    overview[:, 0, :, 8:] = 30.0
-    drawn = [draw_patches(overview, CONFIG, np.random.default_rng(seed), phase_at(0.0)) for seed in range(60)]
-    assert any(0 not in row for row in drawn)
-
-
 def test_late_in_a_run_most_draws_go_by_entropy():
     """Half of them in the first phase, four of five in the last."""
     overview = torch.zeros(1, 3, 64, 64)
