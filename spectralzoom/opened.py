@@ -161,12 +161,7 @@ class OpenedRun:
         exposure of each line are coordinates.
         """
         names = [name for name in LINE_PRODUCTS.values() if name in self.receipt["products"]]
-        stores = [
-            path
-            for name in names
-            for path in sorted(self._archive.locate(self.receipt["products"][name]).glob("*.zarr"))
-        ]
-        return {path.stem: spectra.open_lazy_lines(path) for path in stores}
+        return {path.stem: spectra.open_lazy_lines(path) for path in self._sweeps_of(names)}
 
     @property
     def attention(self) -> xarray.Dataset:
@@ -195,8 +190,11 @@ class OpenedRun:
                     f"the raw lines of {self.name} were cleared away once they were condensed; `lines` has their"
                     " signal. A survey with keep = raw keeps raw lines"
                 )
+        return {path.stem: open_labelled(path) for path in self._sweeps_of(names)}
+
+    def _sweeps_of(self, names: list[str]) -> list[Path]:
         folders = [self._archive.locate(self.receipt["products"][name]) for name in names]
-        return {one.stem: open_labelled(one) for folder in folders for one in sorted(folder.glob("*.zarr"))}
+        return [path for folder in folders for path in sorted(folder.glob("*.zarr"))]
 
     @property
     def products(self) -> tuple[str, ...]:

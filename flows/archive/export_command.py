@@ -100,8 +100,7 @@ def run_export(
     cannot be written; IncompleteStoreError: a store is missing or damaged.
     """
     opened = open_exported(open_archive(archive, create=False, write=False), run)
-    out = check_outside(out, opened.archive.root)
-    surveys = opened.archive.root.name
+    out, surveys = check_outside(out, opened.archive.root), opened.archive.root.name
     collection_id = clean_id(surveys, "surveys")
     check_zones(opened, choice)
     layers = [*map_layers(opened), *prior_map_layers(opened), *spectral_layers(opened, choice)]

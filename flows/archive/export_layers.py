@@ -262,8 +262,7 @@ def patch_layer(run: ExportedRun, product: str, array: str, name: str, title: st
     scene = grid_of(open_image(run.path("class_map"), "classes").about)
     if scene is None:
         raise IncompleteStoreError(f"the class map of run {run.id} does not say its grid; run its survey again")
-    shape = (stored.shape[0], stored.shape[1])
-    fine = load_geobox(run.path("class_map"))
+    shape, fine = (stored.shape[0], stored.shape[1]), load_geobox(run.path("class_map"))
     geobox = angular_geobox(replace(scene, factor=patch), shape) if fine is None else zoomed_out(fine, patch, shape)
     policy = {"policy": str(stored.about.get("policy", ""))} if product == "attention" else {}
     tags = {**layer_tags(run, product, geobox), **policy, "patch_px": str(patch)}

@@ -118,8 +118,7 @@ def collect_row(seeds: Runs, policy: str, fraction: float) -> Row:
         if (row["policy"], row["fraction"]) == (policy, fraction)
     ]
     order = sorted({frame for _, frame, row in found if np.any(row["counts"])})
-    draws = 1 + max(row["draw"] for _, _, row in found)
-    classes = len(found[0][2]["counts"])
+    draws, classes = 1 + max(row["draw"] for _, _, row in found), len(found[0][2]["counts"])
     counts = np.zeros((len(seeds) * draws, len(order), classes, classes), np.int64)
     for number, frame, row in found:
         if frame in order:
@@ -168,8 +167,7 @@ def summarise(runs: Runs, class_names: Sequence[str], request: EvaluateRequest) 
 def _accuracy(row: Row, class_names: Sequence[str]) -> Record:
     each = row.over_runs(mean_iou)
     drawn = [each[row.of_seed == number] for number in np.unique(row.of_seed)]
-    seeds = np.array([_mean(some) for some in drawn])
-    classes = row.over_runs(iou_per_class)
+    seeds, classes = np.array([_mean(some) for some in drawn]), row.over_runs(iou_per_class)
     false = row.over_runs(false_pixels).mean(axis=0).tolist()  # of a run
     return {
         "frames": row.counts.shape[1],

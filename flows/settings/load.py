@@ -182,6 +182,8 @@ def load_settings(
     if table.get("source") == SURVEY["source"].item.default:
         del table["source"]
     stated = {key for key, value in table.items() if value is not None}
+    listed = stated - {key for key, place in origin.items() if place == "flag"}  # a file may list defaults
+    stated -= {key for key in listed & {*OF_TWO_PASSES} if table[key] == SURVEY[key].item.default}
     if "sweeps" in stated and not isinstance(table["sweeps"], str | Path):
         raise SettingsError(f"{place_of('sweeps', origin.get('sweeps'))} must be a path, got {table['sweeps']!r}")
     recorded = usual_of_recording(table) if "sweeps" in stated else {}
@@ -192,13 +194,10 @@ def load_settings(
     requested = {**(usual or {}), **recorded, **table}
     for wrong in _contradictions(stated, origin, zooms=requested.get("zoom") == ALWAYS):
         raise SettingsError(wrong)
-    passes = any(
-        name in stated and (origin.get(name) == "flag" or table[name] != SURVEY[name].item.default)
-        for name in OF_TWO_PASSES
-    )
-    passes |= requested.get("zoom") == ALWAYS and requested.get("seconds") is None
-    if passes and not _is_map(requested) and not any(requested.get(name) is not None for name in (*UNIFORM, "budget")):
-        requested["budget"] = USUAL_BUDGET
+    zooms = requested.get("zoom") == ALWAYS and requested.get("seconds") is None
+    limits = {"budget", *UNIFORM} - ({"scan_step"} if zooms else set())  # which is then that of the first pass
+    if (zooms or stated & {*OF_TWO_PASSES}) and all(requested.get(name) is None for name in limits):
+        requested |= {} if _is_map(requested) else {"budget": USUAL_BUDGET}
     if requested.get("prior", AUTO) not in (AUTO, "none") and "extent" not in stated and not _is_map(requested):
         others = {"sweeps", "kept_bytes", "pointing_px", "macs", *UNIFORM} - {"seconds"}
         chosen = any(requested.get(name) is not None for name in others) or requested.get("zoom") == ALWAYS
@@ -441,6 +440,8 @@ def _recorded_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[s
 
 def _extent_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]:
     """Yield errors: settings of a partial scan without one, or that contradict it."""
+    if settings.extent != EXTENT_WHOLE and (settings.zooms or settings.goal is not None):
+        yield f"{at('extent')} is for one uniform scan without a goal; leave it out, or goal, zoom and budget"
     if settings.extent == EXTENT_PART and settings.seconds is None:
         yield f"{at('extent')} = 'part' needs a time budget: give --seconds too"
     if settings.extent not in (EXTENT_WHOLE, EXTENT_PART) and settings.scan_step is None:

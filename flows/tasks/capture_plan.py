@@ -276,7 +276,7 @@ def lay_out_passes(
             exposure_ms = first.exposure_ms if layout.recorded is None else None  # recorded lines have their own
             layout = replace(layout, first_step=first.step, coarse_exposure_ms=exposure_ms)
             settings = replace(settings, coarse_exposure_ms=exposure_ms)
-        settings = replace(settings, scan_step=None if settings.budget is not None else layout.first_step)
+        settings = replace(settings, scan_step=layout.first_step if settings.zoom == ALWAYS else None)
         return layout, layout.plan(settings.budget, settings.seconds), settings, notes
     if chosen is not None and (layout.step is None or (layout.recorded is not None and not layout.as_taken)):
         layout = replace(layout, step=chosen.step, exposure_ms=chosen.exposure_ms)

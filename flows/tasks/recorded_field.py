@@ -15,7 +15,7 @@ from flows.tasks.scene import FieldSource
 from pipeline.capture.recorded import RecordedSource
 from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.capture.straight_scans import covered_field
-from pipeline.errors import SceneError
+from pipeline.errors import SceneError, SettingsError
 from pipeline.lazy import GeoBox, Once
 from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster
 from pipeline.source import Source
@@ -105,7 +105,9 @@ def open_recorded(settings: Settings) -> OpenedRecording:
     source = recording.source(shape)
     camera, geobox = recording.camera, None
     if (run := find_recorded_run(str(settings.sweeps))) is not None:  # its full scan has the exposure of its camera
-        camera = replace(camera, exposure_ms=settings.camera.exposure_ms)
+        camera = replace(camera, exposure_ms=float(run.run.settings["camera"]["exposure_ms"]))
+        if camera.exposure_ms != settings.camera.exposure_ms:
+            raise SettingsError("camera.exposure_ms is for a camera, and recorded lines have their own: leave it out")
         geobox = run.geobox if run.shape == shape and settings.pose is None else None
     settings = replace(settings, camera=camera, size=shape[::-1])
     if settings.scan == RECORDED:

@@ -184,9 +184,7 @@ def _common(request: TrainRequest, scene: RasterScene) -> Common:
 
 def suggested_patch(shape: tuple[int, int], *, built_in: bool) -> int:
     """Return the patch size for scenes of this shape: 16 for the farm, 32 for frames, less for small scenes."""
-    if built_in:
-        return 16
-    return 32 if min(shape) >= 512 else 16 if min(shape) >= 256 else 8
+    return 16 if built_in or 256 <= min(shape) < 512 else 32 if min(shape) >= 512 else 8
 
 
 def network_config(request: TrainRequest, common: Common) -> SegmenterConfig:

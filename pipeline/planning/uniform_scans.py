@@ -200,7 +200,7 @@ def choose_scan(
     if not reaching:
         told = " and ".join(
             f"{'' if name == MIOU else f'{name}='}{100 * least:g}, where the best scan has "
-            f"{100 * max(scan.expected[name] for scan in scans):.1f}"
+            f"{math.floor(1000 * max(scan.expected[name] for scan in scans)) / 10}"
             for name, least in goals.items()
         )
         raise BudgetError(f"no scan of these weights reaches --goal {told}; ask for less")

@@ -26,7 +26,7 @@ from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from flows.terminal.processes import DONE, FAILED
 from models.weights.files import save_weights
-from pipeline.errors import SceneError
+from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.grid import UNLABELLED, block_means
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.rig_model import Rig
@@ -217,6 +217,8 @@ def test_a_repeated_run_has_its_reference(tmp_path: Path, survey_png: Survey, ma
     scan = survey_sweeps(tmp_path / "scan", run.folder, seconds=15).receipt  # of shorter exposures
     assert scan["scans"]["taken"]["seconds"] == pytest.approx(scan["savings"]["capture_s"]["done"])
     assert scan["settings"]["scan_exposure_ms"] < 100
+    with pytest.raises(SettingsError, match=r"camera\.exposure_ms is for a camera, and recorded lines have their own"):
+        survey_sweeps(tmp_path / "own", run.folder, **{"camera.exposure_ms": 10})
 
 
 def raw_cubes(full_scan: FullScan) -> list[Path]:

@@ -73,6 +73,7 @@ def test_flags_and_files_say_the_same(toml):
 def test_the_example_says_every_default():
     """It is what `python -m flows.settings.documents > survey.example.toml` makes, and valid."""
     assert replace(load_settings(EXAMPLE), out=Settings.out) == Settings()
+    assert [load_settings(EXAMPLE, one).plain for one in ({"seconds": "5"}, {"policy": "gain"})] == [True, False]
     assert EXAMPLE.read_text(encoding="utf-8") == example_toml()
     lines = [line.removeprefix("# ") for line in EXAMPLE.read_text(encoding="utf-8").splitlines()]
     named = {line.partition("=")[0].strip() for line in lines if "=" in line}

@@ -119,6 +119,8 @@ def test_a_plan_tells_the_scan_of_a_goal(flags_png: Flags, recorded: Path, tmp_p
         ({"seconds": "nan"}, SettingsError, r"--seconds must be a number from 0\.1"),
         ({"seconds": "5", "budget": "0.5"}, SettingsError, r"--seconds asks for one uniform scan .* --budget is for"),
         ({"seconds": "5", "scan_step": "2"}, SettingsError, r"--scan-step makes it: leave one out"),
+        ({"seconds": "5", "extent": "part", "goal": "88"}, SettingsError, r"--extent is for one uniform scan without"),
+        ({"seconds": "5", "extent": "part", "zoom": "always"}, SettingsError, r"or goal, zoom and budget"),
         ({"seconds": "5", "camera.exposure_ms": "5"}, SettingsError, r"starts at 6 ms.*--scan-step"),
         ({"scan_exposure_ms": "25"}, SettingsError, r"give --scan-step too"),
         ({"scan_step": "0"}, SettingsError, r"--scan-step must be a whole number from 1 to 8"),
@@ -144,9 +146,7 @@ def test_nothing_is_expected_of_a_scan_beyond_the_record(
 
 def test_weights_without_a_record_scan_by_hand_alone(survey_png: Survey, tmp_path: Path) -> None:
     """Old weights: seconds are refused with what to do instead, and a scan by hand has no expectation."""
-    with pytest.raises(
-        WeightsError, match=r"no record of uniform scans.*--scan-step and --scan-exposure-ms.*validation scenes"
-    ):
+    with pytest.raises(WeightsError, match=r"no record of uniform scans.*--scan-step and .*validation scenes"):
         survey_png(tmp_path / "none", budget=None, seconds="5")
     published = survey_png(tmp_path / "by hand", budget=None, scan_step="4")
     assert "scans" not in published.receipt
@@ -322,7 +322,7 @@ def test_the_choice_is_the_plan_that_one_may_ask_for(tmp_path: Path) -> None:
 
 def test_the_line_spacing_of_the_first_pass_may_be_given(tmp_path: Path) -> None:
     """Its exposure is then the best one for that spacing; without it the weights choose every 4th line."""
-    given, usual = (planned(tmp_path, **WIDE, zoom="always", **step) for step in ({"scan_step": "8"}, {}))
-    assert (given.settings.scan_step, usual.settings.scan_step) == (8, 4)
-    assert given.plan.coarse_s < usual.plan.coarse_s
-    assert given.plan.coarse_s + given.plan.fine_s == pytest.approx(27)
+    steps = {"scan_step": "8"}, {}, {"scan_step": "8", "seconds": None, "budget": "0.5"}
+    given, usual, half = (planned(tmp_path, **{**WIDE, "zoom": "always", **one}) for one in steps)
+    assert [run.settings.scan_step for run in (given, usual, half)] == [8, 4, 8]
+    assert given.plan.coarse_s < usual.plan.coarse_s < given.plan.coarse_s + given.plan.fine_s == pytest.approx(27)
