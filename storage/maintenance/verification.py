@@ -127,7 +127,7 @@ def plan_repair(
     findings: Iterable[Finding],
     *,
     versions: Mapping[str, int | str],
-    can_capture: Callable[[Run], bool] = lambda run: run.simulated,
+    can_capture: Callable[[Run], bool],
 ) -> RepairPlan:
     """Return the repairs for these findings.
 
@@ -161,7 +161,7 @@ def repair(
     rerun: Rerun,
     *,
     versions: Mapping[str, int | str],
-    can_capture: Callable[[Run], bool] = lambda run: run.simulated,
+    can_capture: Callable[[Run], bool],
 ) -> Repaired:
     """Remove the damaged stores, and run the surveys again that name them.
 

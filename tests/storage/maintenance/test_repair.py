@@ -24,11 +24,11 @@ def _bad(archive: Archive) -> list[str]:
     return [one.uri for one in verify_archive(archive) if one.problem is not None]
 
 
-def _repair(archive: Archive, rerun: Callable[[dict[str, Any]], str] | None = None) -> Repaired:
+def _repair(archive: Archive, how: Callable[[dict[str, Any]], str] | None = None) -> Repaired:
     def again(settings: dict[str, Any]) -> str:
         return _run(small_survey(archive, seed=settings["seed"], kernel=settings["kernel"]))
 
-    return repair(archive, verify_archive(archive), rerun or again, versions=VERSIONS)
+    return repair(archive, verify_archive(archive), how or again, versions=VERSIONS, can_capture=lambda r: r.simulated)
 
 
 def _run(small: Small) -> str:
@@ -129,7 +129,8 @@ def test_condensed_lines_whose_raw_lines_were_cleared_stay(archive: Archive, how
         flip(signal.path / {"flip": "data.bin", "manifest": "manifest.json"}[how], at=30)
     before = {path: path.read_bytes() for path in (archive.root / "stages").rglob("*.*")}
     again = Mock(side_effect=lambda asked: make_store(archive, "segment", {}, [signal]) and "runs/x")
-    done = repair(archive, verify_archive(archive), again, versions={**VERSIONS, "condense": 1 + (how == "old")})
+    versions: Any = {**VERSIONS, "condense": 1 + (how == "old")}
+    done = repair(archive, verify_archive(archive), again, versions=versions, can_capture=lambda run: False)
     assert how == "old" or "its lines cannot be captured again" in done.plan.hopeless[signal.uri]
     assert done.remade == ([drawn.uri] if how == "flip" else [])
     assert again.called == (how == "flip")
@@ -224,11 +225,10 @@ def test_stores_of_a_version_no_longer_made_stay(archive: Archive) -> None:
     """This version would make something else."""
     small = small_survey(archive)
     flip(small.raw.path / "data.bin")
-    plan = plan_repair(archive, verify_archive(archive), versions=VERSIONS | {"segment": 2})
-    assert plan.remade == (small.raw.uri,)
-    plan = plan_repair(archive, verify_archive(archive), versions=VERSIONS | {"capture": 2})
-    assert plan.remade == ()
-    assert "made by version 1 of the stage capture, which is now 2" in plan.hopeless[small.raw.uri]
+    found, newer = verify_archive(archive), ({"segment": 2}, {"capture": 2})
+    one, other = (plan_repair(archive, found, versions=VERSIONS | new, can_capture=bool) for new in newer)
+    assert (one.remade, other.remade) == ((small.raw.uri,), ())
+    assert "made by version 1 of the stage capture, which is now 2" in other.hopeless[small.raw.uri]
 
 
 def test_a_damaged_run_is_run_again(archive: Archive) -> None:
