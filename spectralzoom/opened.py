@@ -17,7 +17,7 @@ from pipeline.lazy import deferred
 from storage.archive.archive import Archive
 from storage.archive.keys import LATEST
 from storage.archive.records import LINE_PRODUCTS, Run, read_run
-from storage.arrays.layout import damage_named
+from storage.arrays.layout import damage_named, open_group
 from storage.remote.opening import open_archive
 
 if TYPE_CHECKING:
@@ -228,8 +228,9 @@ def open_labelled(path: Path) -> xarray.Dataset:
     so that ``to_netcdf`` and ``to_zarr`` write them. Raises IncompleteStoreError: the store is missing or damaged.
     """
     with damage_named(str(path)):
+        store = open_group(path).store  # xarray takes a path with :: for a chain of file systems
         opened = xarray.open_dataset(
-            path, engine="zarr", consolidated=False, mask_and_scale=False, chunks=None, cache=False
+            store, engine="zarr", consolidated=False, mask_and_scale=False, chunks=None, cache=False
         )
         opened = _in_shards(opened)
     bare = {name: np.arange(size) for name, size in opened.sizes.items() if name not in opened.variables}  # as rgb

@@ -87,7 +87,7 @@ def find_prior(
         if isinstance(found, Prior):
             return found, (*_unusable(runs_by_reason), f"prior map: {run.folder.name}, {found.days:.3g} days earlier")
         runs_by_reason.setdefault(found, []).append(run.folder.name)
-    why = "none of its earlier runs can be one" if runs_by_reason else "this is its first visit"
+    why = "none of its earlier runs can be one" if runs_by_reason else "the archive has no earlier visit"
     return None, (*_unusable(runs_by_reason), f"{name} has no prior map: {why}")
 
 

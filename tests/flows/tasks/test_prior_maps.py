@@ -72,7 +72,7 @@ def test_a_first_look_has_nothing_to_go_on_from(twice: tuple[Path, Any, Any]) ->
     out, first, _ = twice
     assert "prior_map" not in first.receipt
     assert first.receipt["settings"]["prior"] == "none"
-    assert "north has no prior map: this is its first visit" in first.receipt["settings"]["notes"]
+    assert "north has no prior map: the archive has no earlier visit" in first.receipt["settings"]["notes"]
     probabilities = xr.open_zarr(out / first.receipt["products"]["class_probabilities"], consolidated=False)
     assert float(probabilities.age.max()) == 0.0
     assert "changed" not in probabilities
