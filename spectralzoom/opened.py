@@ -228,7 +228,7 @@ def open_labelled(path: Path) -> xarray.Dataset:
     so that ``to_netcdf`` and ``to_zarr`` write them. Raises IncompleteStoreError: the store is missing or damaged.
     """
     with damage_named(str(path)):
-        store = open_group(path).store  # xarray takes a path with :: for a chain of file systems
+        store: Any = open_group(path).store  # xarray takes a path with :: for a chain of file systems
         opened = xarray.open_dataset(
             store, engine="zarr", consolidated=False, mask_and_scale=False, chunks=None, cache=False
         )

@@ -122,8 +122,7 @@ class Planner(OpenSurvey):
         self.products[stage] = ref
 
     def _forecast(self, stage: Stage, wanted: Wanted) -> tuple[StageForecast, StageRef]:
-        key = stage.key(wanted)
-        found = stage.find(self.run.archive, wanted)
+        key, found = stage.key(wanted), stage.find(self.run.archive, wanted)
         if found is not None:
             return StageForecast(stage.name, "cached", key), found
         ref = store_at(self.run.archive.root, stage.product.name, key)

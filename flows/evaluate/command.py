@@ -65,8 +65,7 @@ def evaluate_weights(request: EvaluateRequest, show: Show = lambda what, done, w
         with writing(request.out):
             request.out.mkdir(parents=True, exist_ok=True)  # fails before minutes are spent
     jobs = sort_frames(request, data, candidates, show)
-    runs = _judge_frames(request, data, candidates, jobs.frames, show)
-    names = [*jobs.frames, *jobs.left_out]
+    runs, names = _judge_frames(request, data, candidates, jobs.frames, show), [*jobs.frames, *jobs.left_out]
     asked = {name: getattr(request, name) for name in ("fractions", "policies", "seed", "draws")}
     content = {
         "dataset": data.law,

@@ -217,8 +217,7 @@ def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
         or ((prior := prior_map_figures(ref.path)) is not None and prior["put_aside"] is None)
     ):
         return None
-    names = run.described.class_names
-    store = ProbabilityStore(ref.path / "class_probabilities.zarr")
+    names, store = run.described.class_names, ProbabilityStore(ref.path / "class_probabilities.zarr")
     high = SHARD_ROWS * int(np.clip(STRIP_PX // (SHARD_ROWS * store.shape[1]), 1, 4))
     strips = (store.read(rows)[0] for rows in cuts(store.shape[0], high))
     exposure_ms = (settings.scan_exposure_ms or run.camera.exposure_ms) * run.scene.light_fraction

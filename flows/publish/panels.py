@@ -78,8 +78,7 @@ def data_address(content: bytes) -> str:
 def grey_of(image: NDArray[np.floating]) -> NDArray[np.float32]:
     """Return the brightness (y, x) of a field, 0..1: the mean of its bands, stretched."""
     known = np.isfinite(image)
-    total = np.where(known, image, 0).sum(axis=-1, dtype=np.float32)
-    count = known.sum(axis=-1)
+    total, count = np.where(known, image, 0).sum(axis=-1, dtype=np.float32), known.sum(axis=-1)
     mean = np.divide(total, count, out=np.full(total.shape, np.nan, np.float32), where=count > 0)
     return stretch(mean[..., None])[..., 0]
 
@@ -98,8 +97,7 @@ def class_rgb(classes: NDArray[np.integer], colours: NDArray[np.integer]) -> NDA
 
 def outline(chosen: NDArray[np.bool_], patch_px: int, shape: tuple[int, int]) -> list[list[tuple[float, float]]]:
     """Return the border of some patches as segments ((x, y), (x, y)) in scene px, clipped to the (y, x) ``shape``."""
-    padded = np.pad(chosen, 1)
-    limit = np.array([shape[1], shape[0]], np.float64)
+    padded, limit = np.pad(chosen, 1), np.array([shape[1], shape[0]], np.float64)
     segments = []
     for axis in (0, 1):
         row, column = np.nonzero(np.diff(padded, axis=axis))

@@ -49,8 +49,7 @@ def _publish(survey: OpenSurvey, *products: StageRef) -> RunRef:
         survey(evaluate.name, *survey.products.judged)
         judged = False
     _clear_first_mosaic(survey)
-    published = publish_run(survey)
-    plan = load_plan(survey.products["score"])
+    published, plan = publish_run(survey), load_plan(survey.products["score"])
     if not (survey.run.plan.plain or plan.sweeps):
         survey.observer.note(f"no second pass: {plan.reason}")
     if judged:

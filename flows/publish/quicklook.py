@@ -191,8 +191,7 @@ def _draw_confidence(axes: Axes, data: QuicklookData, title: str, why: str = "")
 
 
 def _draw_legend(figure: Figure, data: QuicklookData, columns: int) -> None:
-    palette = class_palette(data.class_colours)
-    counts = class_counts(data.class_map, len(data.class_names))
+    palette, counts = class_palette(data.class_colours), class_counts(data.class_map, len(data.class_names))
     marks = [Patch(facecolor=tuple(colour), edgecolor="#555555", linewidth=0.6) for colour in palette]
     words = zip(data.class_names, map(format_percent, counts / max(int(counts.sum()), 1)), strict=True)
     names = [f"{name.replace('_', ' ')[:MOST_LETTERS]}  {fraction}" for name, fraction in words]

@@ -370,8 +370,7 @@ def publish_counted(
     facts: dict[str, Any] = {"survey": receipt["survey"], "settings": receipt["settings"], "rests_on": rests_on}
     products, drops_raw = receipt["products"], receipt["settings"]["keep"] == KEEP_SIGNAL
     others = {*of_earlier, *(products[name] for name in LINE_PRODUCTS if drops_raw and name in products)}
-    stores = archive.sizes(uri for uri in rests_on if uri not in others)
-    moved = archive.take_moved()
+    stores, moved = archive.sizes(uri for uri in rests_on if uri not in others), archive.take_moved()
     before, longest, folder = receipt["data_bytes"], {RECEIPT: 0, REPORT: 0}, 0
     while True:
         told = {

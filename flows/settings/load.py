@@ -293,8 +293,7 @@ def of_this_version(stored: Mapping[str, Any]) -> dict[str, Any]:
 
 def anchor_paths(table: dict[str, object], folder: Path) -> dict[str, object]:
     """Return the settings of a file with relative paths that start at its folder."""
-    named = {*BUILT_IN_SCENES, RIG_FIELD}
-    anchored = dict(table)
+    named, anchored = {*BUILT_IN_SCENES, RIG_FIELD}, dict(table)
     for key in PATHS:
         head, _, tail = key.rpartition(".")
         inner = anchored.get(head) if head else anchored

@@ -374,8 +374,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     settings = replace(settings, device=choose_device(settings.device))
     path = weights_path(settings)
     model = SurveyModel.open(path, settings.device, settings.unknown, planning=planning)
-    described = model.described
-    refused = farm_refusal(settings)
+    described, refused = model.described, farm_refusal(settings)
     if refused is not None and not planning:
         raise SettingsError(refused)
     pixels, scene, notes, label_notes = _scene_for(model, settings, recorded, planning=planning)

@@ -219,8 +219,7 @@ def farm_refusal(settings: Settings) -> str | None:
     if settings.scene not in BUILT_IN_SCENES or settings.shape is None:
         return None
     height, width = settings.shape
-    needed = FARM_BYTES + height * width * FARM_BYTES_PER_PX
-    there = machine_bytes()
+    needed, there = FARM_BYTES + height * width * FARM_BYTES_PER_PX, machine_bytes()
     if needed <= there:
         return None
     return (

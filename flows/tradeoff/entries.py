@@ -176,8 +176,7 @@ def mark_pareto(points: Sequence[Point]) -> tuple[Point, ...]:
     """Mark the points of the Pareto front: no other is at least as good in error and cost and better in one."""
 
     def beaten(point: Point) -> bool:
-        own = (point.error, point.cost)
-        pairs = [(other.error, other.cost) for other in points]
+        own, pairs = (point.error, point.cost), [(other.error, other.cost) for other in points]
         return any(pair[0] <= own[0] and pair[1] <= own[1] and pair != own for pair in pairs)
 
     return tuple(replace(point, pareto=math.isfinite(point.error) and not beaten(point)) for point in points)

@@ -123,8 +123,7 @@ def train_weights(
 
 def _trained_on(data: TrainingData, scenes: Scenes, darkest_ms: float) -> TrainedOn:
     """Return the ranges of the training data; season, sun and scale are known for built-in farms alone."""
-    nm = scenes.common.wavelength_nm
-    exposures = (darkest_ms, max(darkest_ms, data.camera.exposure_ms))
+    nm, exposures = scenes.common.wavelength_nm, (darkest_ms, max(darkest_ms, data.camera.exposure_ms))
     span, bands_nm = (float(nm.min()), float(nm.max())), tuple(nm.tolist())
     trained = TrainedOn(len(nm), span, exposures, len(data.train), scenes.common.names, bands_nm=bands_nm)
     if data.files is not None:

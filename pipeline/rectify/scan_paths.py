@@ -19,6 +19,7 @@ from pipeline.readings import SIGMA_OF_MEDIAN
 STANDING_STEPS = 1e-3  # a mirror that moves less than this stands still
 DWELL_STEPS = 0.25  # lines closer than this show the same place
 GAP_STEPS = 1.5  # a wider distance misses a line; a smaller step back is noise
+UNPLANNED_STEPS = 1.25  # lines this far apart were not taken as the plan, in whole pixels, says
 NOISE_SIGMAS = 6.0  # a step back of less than this much of the path's own noise is no turn
 EVEN_STEPS = 1e-7  # a path this straight and even has a closed form
 LEAST_FRAMES = 3  # fewer cannot show which stamp is wild
@@ -76,7 +77,8 @@ def make_scan_paths(
 
     ``position`` is (line, 2) mirror X and Y at mid exposure. ``shift_px`` (line, 2) are pointing corrections along the
     line and along the scan, added to the line centres. ``step_px`` is the planned distance of the lines. None takes the
-    median of the path's own steps, or the width of a sample of ``binning`` px for a path that stands still.
+    median of the path's own steps, or the width of a sample of ``binning`` px for a path that stands still. So does a
+    recording whose lines are farther apart than the whole pixels of its plan.
 
     Returns the scan paths in order of capture; none if no line is usable.
 
@@ -85,13 +87,11 @@ def make_scan_paths(
     scan, across, lines = line_centres(position, camera, usable, shift_px)
     if not len(lines):
         return ()
-    if step_px is None:
-        apart, steps = camera.ifov_rad * binning, np.abs(np.diff(scan)) / np.diff(lines)
-        steps = steps[steps > STANDING_STEPS * apart]
-        # The lower median: of one step and one gap, the step.
-        step = float(np.percentile(steps, 50, method="lower")) if len(steps) else apart
-    else:
-        step = step_px * camera.ifov_rad
+    apart, steps = camera.ifov_rad * (step_px or binning), np.abs(np.diff(scan)) / np.diff(lines)
+    steps = steps[steps > STANDING_STEPS * apart]
+    # The lower median: of one step and one gap, the step.
+    own = float(np.percentile(steps, 50, method="lower")) if len(steps) else apart
+    step = own if step_px is None or UNPLANNED_STEPS < own / apart < GAP_STEPS else apart
     bends = np.abs(np.diff(scan, 2))  # of a position's own noise: sqrt 6 times its standard deviation
     noise = float(np.median(bends)) * SIGMA_OF_MEDIAN / 6**0.5 if len(bends) else 0.0
     runs = _runs(scan, max(GAP_STEPS * step, NOISE_SIGMAS * noise), DWELL_STEPS * step)

@@ -55,8 +55,9 @@ class SweepPath:
         return place(self.lines, camera, grid=grid, usable=self.usable, shift_px=self.shift_px, gain=self.gain)
 
     def facts(self) -> dict[str, int]:
-        """Count lines that were lost, sent twice or out of order."""
+        """Count lines that were lost, sent twice or out of order; a rig's lost lines are rows that are not valid."""
         counts = {name: getattr(self.numbers, name) for name in ("lost", "repeated", "backward")}
+        counts["lost"] *= self.lines.source != "rig"  # which pauses while it loads positions
         return counts | {"invalid": int(np.count_nonzero(~self.lines.valid_line))}
 
 

@@ -333,6 +333,8 @@ def significant_axes(covariance: Floats, spectra: int, false_alarm: float, *, kn
     neighbours share a part of their noise. ``known`` directions have been taken out of the covariance.
     """
     bands = len(covariance)
+    if known >= bands:
+        return np.zeros((bands, 0))
     values, vectors = np.linalg.eigh(covariance)
     edge = noise_edge(np.maximum(values[known:], 0), min(1.0, bands / max(spectra, 1)), false_alarm)
     count = int(np.count_nonzero(values > edge))

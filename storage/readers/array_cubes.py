@@ -131,8 +131,8 @@ def cube_source(
 ) -> CubeSource:
     """Return the cube with its lines, bands and place; ``guard`` turns errors of reading into SceneError.
 
-    Lines of an array with scale or offset are float32, NaN where there is no value. Raises SceneError: the cube claims
-    more than its file or the memory can hold.
+    Lines of an array with scale or offset are float32, NaN where there is no value. So are whole numbers with a valid
+    range but no fill value. Raises SceneError: the cube claims more than its file or the memory can hold.
     """
     array, order, moment = cube.array, cube.order, cube.moment
     part = [BLOCK_LINES if axis == order[0] else size for axis, size in enumerate(array.shape)]
@@ -140,12 +140,13 @@ def cube_source(
         part[moment[0]] = 1
     array.check(part)
     scale, offset = (_number(array.attrs.get(name)) for name in ("scale_factor", "add_offset"))
-    plain = scale in (None, 1.0) and offset in (None, 0.0)
     unsigned = array.dtype.kind == "i" and str(array.attrs.get("_Unsigned", "")).lower() == "true"
     stored = np.dtype(f"u{array.dtype.itemsize}") if unsigned else array.dtype.newbyteorder("=")
     missing = _missing(array.attrs, stored)
     fill, (low, high) = missing[0] if missing else None, _valid_range(array.attrs, stored)
     checked = len(missing) > 1 or (low, high) != (-np.inf, np.inf)
+    plain = scale in (None, 1.0) and offset in (None, 0.0)
+    plain = plain and (stored.kind == "f" or fill is not None or not checked)  # whole numbers have no NaN
     sizes = [int(array.shape[axis]) for axis in order]
 
     def read(start: int, stop: int) -> NDArray[Any]:
@@ -164,7 +165,7 @@ def cube_source(
         if not plain:
             values = unpacked(native, 1.0 if scale is None else scale, offset or 0.0, fill)
             return np.where(out, np.float32(np.nan), values) if checked else values
-        return native if fill is None or np.isnan(fill) or not out.any() else np.where(out, stored.type(fill), native)
+        return np.where(out, stored.type(np.nan if fill is None else fill), native) if out.any() else native
 
     dims = cube.dims[order[0]], cube.dims[order[1]]
     geobox, notes = place_or_note(lambda: find_geobox(attributes, arrays, (sizes[0], sizes[1]), dims))

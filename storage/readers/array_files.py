@@ -108,16 +108,19 @@ def _mat_arrays(path: Path) -> dict[str, FileArray]:
     """List the arrays of numbers of a .mat file of versions 4 to 7."""
     scipy_io = importlib.import_module("scipy.io")
 
-    def load(name: str) -> NDArray[Any]:
+    def load(name: str, kind: str) -> NDArray[Any]:
         with _mapped(path) as content:
-            return np.asarray(scipy_io.loadmat(content, variable_names=[name])[name])
+            values = np.asarray(scipy_io.loadmat(content, variable_names=[name])[name])
+        if np.iscomplexobj(values):
+            raise SceneError(f"{path}:{name} holds complex numbers, expected real ones; write their absolute values")
+        return values.astype(_MATLAB[kind], copy=False)  # whole doubles may be stored as bytes
 
     with warnings.catch_warnings(), _mapped(path) as content:
         warnings.simplefilter("ignore")  # of repeated names
         listed = scipy_io.whosmat(content)
     size, ratio = path.stat().st_size, 8 * DEFLATE_RATIO  # a double may be one byte
     return {
-        name: _whole(f"{path}:{name}", shape, np.dtype(_MATLAB[kind]), partial(load, name), size, ratio)
+        name: _whole(f"{path}:{name}", shape, np.dtype(_MATLAB[kind]), partial(load, name, kind), size, ratio)
         for name, shape, kind in listed
         if kind in _MATLAB
     }

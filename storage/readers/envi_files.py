@@ -228,7 +228,7 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
     for start, part in parts.items():
         valid[start : start + len(part.values)] = True
         known = finite_number(part.header.settings.get(_EXPOSURE, ""))
-        if known is not None:
+        if known is not None and known > 0:
             exposure = np.full(height, np.nan) if exposure is None else exposure
             exposure[start : start + len(part.values)] = known
     with_bands = next((one for one in cubes if one.header.wavelength_nm is not None), None)
@@ -265,7 +265,7 @@ def _timed(lines: LineFacts, times: LineTimes) -> LineFacts:
     """Add the times of frame indices."""
     lines = replace(lines, frame=times.frame)
     known = times.stamp_us >= 0
-    if not known.any():
+    if not known.any() or not np.ptp(times.stamp_us[known]):  # a camera without a clock repeats its stamp
         return lines
     return replace(lines, time_s=np.where(known, (times.stamp_us - times.stamp_us[known][0]) * 1e-6, np.nan))
 

@@ -181,6 +181,7 @@ def load_frame(address: str | Path) -> tuple[NDArray[np.float32], tuple[Path, ..
     else:
         source = open_cube(address)
         values = source.read(0, source.shape[0])
+    values = values.astype(np.uint8) if values.dtype.kind == "b" else values  # of a bad frame
     if values.dtype.kind not in "uif":
         raise SceneError(f"{path} holds {values.dtype}, expected the real numbers of a reference frame")
     frame = values[None] if values.ndim == 2 else values

@@ -300,10 +300,13 @@ class PointingTable:
         time_s = exposure_ms = None
         if "time" in self.columns:  # may be NaN for invalid lines
             time_s = self.columns["time"][rows]
-            known = np.flatnonzero(np.isfinite(time_s))
-            stuck = np.zeros(lines, np.bool_)
-            stuck[known[1:]] = np.diff(time_s[known]) <= 0
+            known, stuck = np.flatnonzero(valid), np.zeros(lines, np.bool_)
+            part_of = np.array([self.sweep[row] if self.sweep else "" for row in rows[known]])
+            stuck[known[1:]] = (np.diff(time_s[known]) <= 0) & (part_of[1:] == part_of[:-1])
             self._refuse(rows, stuck, "time", "expected a time after that of the line before [s]")
+            before = np.maximum.accumulate(np.where(valid, time_s, -np.inf))
+            after = np.minimum.accumulate(np.where(valid, time_s, np.inf)[::-1])[::-1]
+            time_s = np.where(valid | ((before < time_s) & (time_s < after)), time_s, np.nan)
         if "exposure_ms" in self.columns:
             exposure_ms = _filled(self.columns["exposure_ms"][rows], valid)
             self._refuse(rows, exposure_ms <= 0, "exposure_ms", "expected a time above 0 ms")
@@ -343,9 +346,10 @@ class PointingTable:
 
 
 def _filled(values: Floats, valid: NDArray[np.bool_]) -> Floats:
-    """Return the values, with unknown ones of invalid lines interpolated."""
-    known = valid | np.isfinite(values)
-    at = np.arange(len(values))
+    """Return the values; those of invalid lines that are unknown, or far beyond those of valid lines, interpolated."""
+    low, high, at = values[valid].min(), values[valid].max(), np.arange(len(values))
+    beyond = (high - low) / valid.sum() * (1 + (~valid).sum())  # lines before the first valid one lie so far off
+    known = valid | ((values >= low - beyond) & (values <= high + beyond))
     return values if known.all() else np.interp(at, at[known], values[known])
 
 

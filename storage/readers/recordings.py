@@ -271,7 +271,7 @@ def _timed(
         times = cube.source.lines.time_s if one is None or one.time_s is None else one.time_s
         if times is not None and np.count_nonzero(np.isfinite(times)) > 1:
             at = np.flatnonzero(np.isfinite(times))
-            periods.append(float(np.median(np.diff(times[at]) / np.diff(at))) * 1e3)
+            periods += [one for one in [float(np.median(np.diff(times[at]) / np.diff(at))) * 1e3] if one > 0]
     if not exposures and periods and periods[0] < camera.exposure_ms:  # an exposure ends before the next one begins
         exposures = [periods[0]]
     camera = _exposing(camera, exposures)

@@ -66,8 +66,7 @@ def evaluate(
 
     def build(path: Path) -> None:
         """Write the figures of the map and, with controls, of the overview, a full reading and other placements."""
-        drawn = load_class_map(class_map.path / "class_map.zarr")
-        names = gains.work.weights.load().class_names
+        drawn, names = load_class_map(class_map.path / "class_map.zarr"), gains.work.weights.load().class_names
         judged = np.where(drawn.classes == UNLABELLED, np.uint8(UNLABELLED), labels)  # only pixels with a class
         counts = confusion(judged, drawn.classes, len(drawn.names))  # includes the class unknown
         result: dict[str, Any] = map_figures(names, counts) | {"confusion": counts.tolist()}

@@ -44,8 +44,8 @@ from storage.arrays.signal_cubes import LineRows, SignalCubeWriter, open_signal_
 from storage.arrays.spool import line_values
 from storage.readers.scene_files import RasterPixels
 
-SIGNAL = Product("condense", version=4)
-SIGNAL_FINE = Product("condense_fine", version=5)
+SIGNAL = Product("condense", version=5)
+SIGNAL_FINE = Product("condense_fine", version=6)
 SHARED_FRACTION = 2e-3  # of rare spectra, from which on a component takes less space than residuals
 COARSER = (1.5, 2.0, 3.0, 4.0, 6.0)  # quantisation steps for a limit of bytes [standard deviations of the noise]
 SAMPLED_BLOCKS = 8  # of lines, to estimate bytes
@@ -162,7 +162,7 @@ def with_shared_directions(
 
 def components_of(found: SignalStatistics, cubes: Sequence[RawCube], choice: SignalChoice) -> Components:
     """Return the components of a pass; few bands are kept as they are, in steps of one DN of the longest exposure."""
-    if found.bands > FEW_BANDS or not found.count:
+    if np.count_nonzero(found.lit) > FEW_BANDS or not found.count:
         bands = cubes[0].wavelength_nm if cubes else np.zeros(found.bands)  # a pass without sweeps
         return components_of_field(found, bands, false_alarm=choice.false_alarm, least=choice.least)
     return bands_alone(found, reduce(np.fmin, (number_values(cube.references) for cube in cubes)))
@@ -221,7 +221,7 @@ def _lines_differ(passes: Sequence[StageRef], signal: StageRef, camera: LineCame
         return "the sweeps of the signal are not those of the raw lines"
     found = reduce(SignalStatistics.merged, (read_statistics(raw.path) for raw in passes))
     whole = len(cubes) == len(of_sweep)
-    few = components_of(found, cubes, SignalChoice()) if found.bands <= FEW_BANDS and whole else None
+    few = components_of(found, cubes, SignalChoice()) if np.count_nonzero(found.lit) <= FEW_BANDS and whole else None
     for cube in cubes:
         stored = of_sweep[cube.sweep]
         wrong = differing_lines(cube, stored, camera, few)

@@ -52,9 +52,9 @@ from storage.parallel.pool import RESERVED_BYTES, THREADS, WorkerPool, memory_re
 REGISTRATION, TIE_POINTS = "registration.json", "geolocation.zarr"
 SIGNAL_RECORD = "signal.json"  # of compressed sweeps; a copy lies beside their mosaic
 POINTING = Product("register", version=2, files=(REGISTRATION,))
-GEOLOCATION = Product("locate", version=3, files=(TIE_POINTS,))
-MOSAIC = Product("rectify", version=6, files=("mosaic.zarr",))
-MERGED = Product("rectify_fine", version=4, files=("mosaic.zarr",))
+GEOLOCATION = Product("locate", version=4, files=(TIE_POINTS,))
+MOSAIC = Product("rectify", version=7, files=("mosaic.zarr",))
+MERGED = Product("rectify_fine", version=5, files=("mosaic.zarr",))
 MOSAIC_STEP = 0.5  # quantisation step, relative to the sweeps: resampled scores have less noise
 KERNEL_GAIN = 2.0  # greatest overshoot of the kernels
 
@@ -269,8 +269,7 @@ def locate(
     signal: StageRef, registration: StageRef | None = None, *, camera: LineCamera, frame: FieldFrame, report: Report
 ) -> Wanted:
     """Compute the geolocation grid, which all surveys along the same path share."""
-    grid = PixelGrid.of_scene(frame.grid)
-    sweeps = open_sweeps(signal, registration, camera)
+    grid, sweeps = PixelGrid.of_scene(frame.grid), open_sweeps(signal, registration, camera)
     params = {
         "camera": {name: getattr(camera, name) for name in ("samples", "pitch_um", "focal_length_mm")},
         "grid": asdict(grid),

@@ -44,16 +44,19 @@ def test_a_store_of_an_input_that_was_cleared_meanwhile_is_not_published(tmp_pat
 
 
 @pytest.mark.parametrize("order", [(1.0, 16.0), (16.0, 1.0)], ids=["short pass first", "long pass first"])
-def test_few_bands_are_kept_in_the_steps_of_the_longest_exposure(order: tuple[float, float]) -> None:
-    """One number of a long exposure is a smaller scene value than one of a short: no pass loses a number."""
-    found, lit = SignalStatistics(4, 64), np.ones((8, 8), np.bool_)
-    found.add(np.random.default_rng(0).uniform(0.1, 0.9, (8, 8, 4)).astype(np.float32), lit)
-    frames = [
-        References(np.zeros((8, 4), np.float32), np.full((8, 4), 100 * one, np.float32), np.ones(4, np.float32))
-        for one in order
-    ]
-    cubes: Any = [SimpleNamespace(references=one, wavelength_nm=np.arange(4.0)) for one in frames]
-    np.testing.assert_allclose(components_of(found, cubes, SignalChoice()).noise, 1 / 1600)
+@pytest.mark.parametrize("dark", [0, 5])
+def test_few_bands_are_kept_in_the_steps_of_the_longest_exposure(order: tuple[float, float], dark: int) -> None:
+    """One number of a long exposure is a smaller scene value than one of a short: no pass loses a number.
+
+    Bands without light do not count.
+    """
+    found, lit = SignalStatistics(4 + dark, 64), np.append(np.ones(4, np.float32), np.full(dark, np.nan, np.float32))
+    found.add(np.random.default_rng(0).uniform(0.1, 0.9, (8, 8, 1)).astype(np.float32) * lit, np.ones((8, 8), np.bool_))
+    zero = np.zeros((8, 4 + dark), np.float32)
+    white = zero + 100 * np.nan_to_num(lit)
+    frames = [References(zero, one * white, np.ones(4 + dark, np.float32)) for one in order]
+    cubes: Any = [SimpleNamespace(references=one, wavelength_nm=np.arange(4.0 + dark)) for one in frames]
+    np.testing.assert_allclose(components_of(found, cubes, SignalChoice()).noise, lit / 1600)
 
 
 @pytest.mark.usefixtures("no_effects")

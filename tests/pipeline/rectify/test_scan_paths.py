@@ -120,6 +120,13 @@ def test_a_pace_off_the_plan_is_still_even() -> None:
     np.testing.assert_allclose(uneven.width, CAMERA.ifov_rad, rtol=1e-9)
 
 
+def test_recorded_lines_far_apart_leave_no_gap() -> None:
+    """The plan of a recording has whole pixels: lines 1.45 px apart, with noise, are 1 px apart there."""
+    scan = 1.45 * np.arange(60.0) + np.random.default_rng(0).normal(0, 0.04, 60)
+    (scan_path,) = make_scan_paths(aim(0.0, scan), CAMERA, step_px=1.0)
+    assert scan_path.seen.all()
+
+
 def test_line_out_of_reach_is_named() -> None:
     """A usable line beyond the disk or without a position raises with its number; one that is not usable does not."""
     position = aim(0.0, np.arange(6.0))

@@ -104,3 +104,12 @@ def test_corrections_come_back_by_name() -> None:
     assert one.gain.tolist() == [2.0]
     assert other.gain is None
     assert not other.shift_px.any()
+
+
+@pytest.mark.parametrize(("source", "lost"), [("sim", 3), ("rig", 0)])
+def test_pauses_of_a_rig_are_no_lost_lines(source: str, lost: int) -> None:
+    """A rig stops while it loads positions; its lost lines are rows that are not valid."""
+    lines = PlaceLines(RUN, source)
+    lines.time_s[10:] += 0.3
+    (path,) = sweep_paths([lines], CAMERA)
+    assert path.facts()["lost"] == lost

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -353,3 +354,4 @@ def test_residuals_of_noise_share_nothing() -> None:
     components = find_components(statistics_of(made.values), least=1)
     residuals = np.random.default_rng(4).normal(0, 3, (400, 40)).astype(np.float32)
     assert len(with_shared(components, residuals, 0.001)) == 3
+    assert len(with_shared(replace(components, axes=np.eye(40)), residuals, 0.001)) == 40  # no direction is left

@@ -262,11 +262,21 @@ def test_numbers_mean_what_xarray_reads(tmp_path: Path, stored: Any, about: dict
     np.testing.assert_allclose(found[0, :, 0], read, rtol=1e-6)
 
 
-def test_without_a_scale_numbers_out_of_range_are_the_fill_value(tmp_path: Path) -> None:
-    """Whole numbers stay whole."""
+@pytest.mark.parametrize(
+    ("stored", "about", "kind", "read"),
+    [
+        (np.int16, {"_FillValue": np.int16(-9), "valid_range": np.int16([0, 100])}, np.int16, [0, -9, -9, -9]),
+        (np.int16, {"valid_range": np.int16([0, 100])}, np.float32, [0, np.nan, np.nan, np.nan]),
+        (np.float32, {"_FillValue": np.float32("nan"), "missing_value": -3.0}, np.float32, [0, 101, np.nan, -9]),
+    ],
+)
+def test_without_a_scale_numbers_out_of_range_are_no_value(
+    tmp_path: Path, stored: type, about: dict[str, Any], kind: type, read: list[float]
+) -> None:
+    """Whole numbers stay whole if one of them is the fill value."""
     with h5py.File(tmp_path / "a.nc", "w") as file:
-        file["values"] = np.int16([0, 101, -3, -9]).reshape(1, 4, 1)
-        file["values"].attrs.update({"_FillValue": np.int16(-9), "valid_range": np.int16([0, 100])})
+        file["values"] = stored([0, 101, -3, -9]).reshape(1, 4, 1)
+        file["values"].attrs.update(about)
     cube = open_cube(f"{tmp_path / 'a.nc'}:values")
-    assert (cube.dtype, cube.nodata) == (np.int16, -9)
-    assert cube.read(0, 1)[0, :, 0].tolist() == [0, -9, -9, -9]
+    assert cube.dtype == kind
+    np.testing.assert_array_equal(cube.read(0, 1)[0, :, 0], read)

@@ -52,6 +52,13 @@ def test_parts_in_order_of_their_frames(tmp_path: Path, lines: NDArray[np.uint16
     assert len(source.files) == 9
 
 
+def test_stamps_that_never_change_are_no_times(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
+    """A camera without a clock repeats one stamp."""
+    write_part(tmp_path, "raw_0", lines)
+    (tmp_path / "frameIndex_0.txt").write_text("\n".join(["Frame#\tTimestamp", *(f"{n}\t7" for n in range(30))]))
+    assert open_cube(tmp_path).lines.time_s is None
+
+
 def test_lines_in_no_file_are_flagged(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
     """A part that is cut off, or not there, leaves lines between; the last one's lost lines stand at the end."""
     write_part(tmp_path, "raw_0", lines[:6], lines=10)

@@ -49,9 +49,10 @@ def test_angles_become_positions(tmp_path: Path) -> None:
     np.testing.assert_allclose(one.position, np.stack([expected, [0, 0]], axis=-1), atol=1e-12)
 
 
-def test_lines_that_are_not_valid_need_no_numbers(tmp_path: Path) -> None:
+@pytest.mark.parametrize("line", [",,,0,", "99,-99,0,0,-1"])
+def test_lines_that_are_not_valid_need_no_numbers(tmp_path: Path, line: str) -> None:
     """Their positions are made up between their neighbours, their times stay unknown."""
-    text = "mirror_x,mirror_y,time,valid,exposure_ms\n0.1,0,0.1,1,5\n,,,0,\n0.3,0.2,0.3,true,7\n"
+    text = f"mirror_x,mirror_y,time,valid,exposure_ms\n0.1,0,0.1,1,5\n{line}\n0.3,0.2,0.3,true,7\n"
     found = load_pointing_table(_table(tmp_path, text)).of_cube("c", 3)
     np.testing.assert_allclose(found.position, [[0.1, 0], [0.2, 0.1], [0.3, 0.2]])
     assert found.valid.tolist() == [True, False, True]
@@ -61,7 +62,7 @@ def test_lines_that_are_not_valid_need_no_numbers(tmp_path: Path) -> None:
 
 def test_one_table_for_several_cubes_and_for_parts_of_one(tmp_path: Path) -> None:
     """Rows belong to the cube that they name; of a lone cube of another name they tell the sweeps."""
-    text = "sweep,position_px\na,0\na,1\nb,5\nb,4\nb,3\n"
+    text = "sweep,position_px,time\na,0,0\na,1,1\nb,5,0\nb,4,1\nb,3,2\n"
     table = load_pointing_table(_table(tmp_path, text))
     assert table.of_cube("a", 2).position[:, 0].tolist() == [0, 1]
     assert table.of_cube("b", 3).position[:, 0].tolist() == [5, 4, 3]

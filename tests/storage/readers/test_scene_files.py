@@ -45,6 +45,18 @@ def test_every_kind_of_cube_file_gives_the_same_values(tmp_path: Path, cube: NDA
     np.testing.assert_array_equal(scene.wavelength_nm, NM)
 
 
+def test_doubles_that_matlab_keeps_as_bytes_are_read(tmp_path: Path) -> None:
+    """MATLAB stores whole doubles in fewer bytes; complex numbers are refused."""
+    values = np.arange(60, dtype=np.uint8).reshape(4, 5, 3)
+    path = _save(tmp_path / "a.mat", values)
+    content = bytearray(path.read_bytes())
+    content[144] = 6  # the class of the array: double in place of uint8
+    path.write_bytes(content)
+    np.testing.assert_array_equal(load_scene_file(path, wavelengths=NM[:3]).values, values)
+    with pytest.raises(SceneError, match="holds complex numbers"):
+        load_scene_file(_save(tmp_path / "b.mat", values * 1j), wavelengths=NM[:3])
+
+
 def test_bands_and_wavelengths_follow_the_flags(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
     """Wavelengths are stated for the chosen bands or for all; order is kept."""
     path = _save(tmp_path / "a.npy", cube)
