@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.tree import Tree
 
-from flows.archive.stale_runs import can_capture
+from flows.archive.stale_runs import can_capture, weights_now
 from flows.cli.app import ArchiveName, AsJson, Switch, stderr
 from flows.publish.receipt import is_pending
 from flows.publish.retention import RawClearance, clear_raw_lines
@@ -142,7 +142,7 @@ def run_verify(archive: str | Path, console: Console, *, remake: bool = False, a
         done = survey_command.run_survey(parse_settings(here), console, summary=False)
         return f"runs/{done.folder.name}"  # `repair` renames or removes it
 
-    done = repair(opened, bad, survey_again, versions=versions(), can_capture=can_capture)
+    done = repair(opened, bad, survey_again, versions=versions(), can_capture=can_capture, weights_of=weights_now)
     kept = {name: getattr(done, name) for name in ("remade", "dropped", "failed", "complete")}
     content["repair"] = {**kept, "hopeless": done.plan.hopeless}
     put_out(content, show_repair, as_json=as_json)
@@ -276,7 +276,7 @@ def verdict(archive: Archive, findings: list[Finding]) -> dict[str, Any]:
         "problems": [asdict(finding) for finding in bad],
     }
     if bad:
-        plan = plan_repair(archive, bad, versions=versions(), can_capture=can_capture)
+        plan = plan_repair(archive, bad, versions=versions(), can_capture=can_capture, weights_of=weights_now)
         content |= {
             "to_remake": list(plan.remade),
             "hopeless": plan.hopeless,

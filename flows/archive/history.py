@@ -21,7 +21,7 @@ from flows.tasks.scores import score_of
 from flows.terminal.figures import counted, format_area, format_percent
 from flows.terminal.processes import DONE
 from flows.terminal.progress import print_json
-from pipeline.errors import ArchiveError, PipelineError, SettingsError, ShapeError, visible
+from pipeline.errors import PipelineError, SettingsError, ShapeError, visible
 from pipeline.lazy import deferred
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
@@ -85,14 +85,14 @@ def report(archive: ArchiveName, *, field: str | None = None, out: OutFile, as_j
 def read_history(archive: Archive, field: str | None = None) -> FieldHistory:
     """Return the history of a field, or of the only one.
 
-    Raises ArchiveError: no field has this name, or there are several.
+    Raises SettingsError: no field has this name, or there are several.
     """
     catalogue = Catalogue.read(archive.root)
     names = sorted({called(run) for run in catalogue.runs})
     name = names[0] if field is None and len(names) == 1 else field
     if name not in names:
         which = f"no field of {archive.name} is called {name!r}" if name else f"{archive.name} has {len(names)} fields"
-        raise ArchiveError(f"{which}; give --field with one of: {', '.join(names) or 'none'}")
+        raise SettingsError(f"{which}; give --field with one of: {', '.join(names) or 'none'}")
     runs = sorted((run for run in catalogue.runs if called(run) == name), key=lambda run: str(time_of_visit(run)))
     legend = None
     with suppress(KeyError, OSError, PipelineError):  # the map was deleted

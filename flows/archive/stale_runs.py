@@ -12,7 +12,7 @@ from flows.tasks.open_survey import STAGES, versions
 from flows.tasks.recorded_field import open_recorded
 from flows.tasks.survey_model import weights_path
 from models.weights.files import describe_weights
-from pipeline.errors import PipelineError, SettingsError, WeightsError
+from pipeline.errors import PipelineError, SettingsError
 from storage.archive.keys import canonical_json
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run, Store
@@ -127,11 +127,16 @@ def stale_stores(catalogue: Catalogue, uris: set[str], weights: str | None) -> s
     return {uri for uri in uris if is_stale(catalogue.stores.get(uri))}
 
 
+def weights_now(run: Run, settings: Settings | None = None) -> str | None:
+    """Return the key of the weights that the survey of a run takes now; None where they cannot be read."""
+    try:
+        return describe_weights(weights_path(settings or asked_again(run, run.folder.parents[1], None))).key
+    except (OSError, PipelineError):
+        return None
+
+
 def is_current(catalogue: Catalogue, run: Run, settings: Settings) -> bool:
     """Return whether a run is whole and its survey would find all of its stores, by versions and weights alone."""
-    try:
-        weights = describe_weights(weights_path(settings)).key
-    except (OSError, SettingsError, WeightsError):
-        weights = None
+    weights = weights_now(run, settings)
     complete = run.problem is None and all(row.get("state") != "failed" for row in run.stages)
     return complete and not is_pending(run.receipt) and not stale_stores(catalogue, set(run.names), weights)

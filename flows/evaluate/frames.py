@@ -146,7 +146,7 @@ def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
 def open_frames(
     dataset: str, frames: tuple[str, ...], scenes: int | None, camera: LineCamera, choices: dict[str, Any]
 ) -> TrainingData:
-    """Return the data with the frames to judge in ``train``. Raises SettingsError, or SceneError: no such frame."""
+    """Return the data with the frames to judge in ``train``. Raises SettingsError: no such frame, too."""
     built_in = bool(built_in_laws(dataset))
     data = open_training_data(dataset, 0, 1 if built_in else scenes, camera, **choices)
     if built_in:
@@ -156,7 +156,7 @@ def open_frames(
         data = farm_test_data(count, camera, dataset)
     unknown = [name for name in frames if name not in data.train]
     if unknown:
-        raise SceneError(f"{dataset} has no frame {', '.join(unknown)}; it has {', '.join(data.train)}")
+        raise SettingsError(f"{dataset} has no frame {', '.join(unknown)}; it has {', '.join(data.train)}")
     names = tuple(name for name in data.train if not frames or name in frames)
     return TrainingData(data.law, names, (), (), data.camera, data.files, data.notes)
 

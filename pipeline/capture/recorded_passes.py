@@ -58,10 +58,13 @@ class RecordedPasses:
         return found
 
     def full_scan(self, planned: Sequence[Sweep]) -> list[Sweep]:
-        """Return the full scan that savings are stated against: the recording's own, else the planned one."""
+        """Return the full scan that savings are stated against: the recording's own, else the planned one.
+
+        Its exposure is the camera's, as in every other survey.
+        """
         every_line = [one.sweep for one in self.source.sweeps if one.sweep.step == one.sweep.binning == 1]
         own = every_line if len(self._kinds) == 1 else []
-        return self.served(planned) or own or list(planned)
+        return [replace(one, exposure_ms=None) for one in self.served(planned) or own or planned]
 
     def first_pass(self, planned: Sequence[Sweep]) -> list[Sweep]:
         """Return the planned sweeps of a first pass or a uniform scan, cut to the recorded lines.

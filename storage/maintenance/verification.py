@@ -128,16 +128,18 @@ def plan_repair(
     *,
     versions: Mapping[str, int | str],
     can_capture: Callable[[Run], bool],
+    weights_of: Callable[[Run], str | None],
 ) -> RepairPlan:
     """Return the repairs for these findings.
 
-    ``versions`` are the present ones of the stages; ``can_capture`` tells whether a run can capture its lines again.
+    ``versions`` are the present ones of the stages; ``can_capture`` tells whether a run can capture its lines again,
+    ``weights_of`` the key of the weights that its survey takes now.
     """
     catalogue = Catalogue.read(archive.root)
     bad = [one.uri for one in findings if one.kind in ("broken", "missing")]
     stores = [uri for uri in bad if uri.startswith("stages/") and uri.count("/") == 2]
     hopeless = dict.fromkeys((uri for uri in bad if "/" not in uri), "its stage and settings are not known")
-    hopeless |= {uri: why for uri in stores if (why := _hopeless(catalogue, uri, versions, can_capture))}
+    hopeless |= {uri: why for uri in stores if (why := _hopeless(catalogue, uri, versions, can_capture, weights_of))}
     missed = {uri for uri in stores if uri in hopeless and catalogue.inputs_of(uri) and not _is_found(archive, uri)}
     there = [(uri, one) for uri, one in catalogue.stores.items() if uri not in stores]
     missed |= {uri for uri, one in there if one.version != str(versions.get(one.ref.stage))}
@@ -162,18 +164,19 @@ def repair(
     *,
     versions: Mapping[str, int | str],
     can_capture: Callable[[Run], bool],
+    weights_of: Callable[[Run], str | None],
 ) -> Repaired:
     """Remove the damaged stores, and run the surveys again that name them.
 
     ``findings`` are those of `verify_archive`. ``rerun`` runs a survey into this archive by its settings. A damaged run
-    is published again under its name; the repetition of an undamaged one is removed. ``versions`` are the present ones
-    of the stages; stores of other versions stay, and so do those of lines that a run cannot capture again. Raises
+    is published again under its name; the repetition of an undamaged one is removed. Stores made of other ``versions``
+    or weights than the present ones stay, and so do those of lines that a run cannot capture again. Raises
     ArchiveError: another process uses the archive, or the disk or bucket refuses.
     """
     with archive.in_use(alone=True) as alone:
         if not alone:
             raise ArchiveError(f"{archive.name} is in use; run verify --repair again when the survey there has ended")
-        plan = plan_repair(archive, findings, versions=versions, can_capture=can_capture)
+        plan = plan_repair(archive, findings, versions=versions, can_capture=can_capture, weights_of=weights_of)
         done = Repaired(plan)
         for uri in plan.remade:
             archive.discard(archive.ref(*uri.split("/")[1:]))
@@ -223,20 +226,28 @@ def _is_found(archive: Archive, uri: str) -> bool:
 
 
 def _hopeless(
-    catalogue: Catalogue, uri: str, versions: Mapping[str, int | str], can_capture: Callable[[Run], bool]
+    catalogue: Catalogue,
+    uri: str,
+    versions: Mapping[str, int | str],
+    can_capture: Callable[[Run], bool],
+    weights_of: Callable[[Run], str | None],
 ) -> str:
-    """Return why a store cannot be built again; empty where it can."""
-    store, stage = catalogue.stores.get(uri), uri.split("/")[1]
+    """Return why a store cannot be built again; empty where it can. Its key has the versions of all its inputs."""
     if catalogue.is_only_copy(uri, can_capture):
         return "its lines cannot be captured again: restore it from a copy. Undamaged lines can still be read"
-    if stage not in versions:
+    if (stage := uri.split("/")[1]) not in versions:
         return f"there is no stage {stage}: take it out of the archive"
-    if store is not None and store.version and store.version != str(versions[stage]):
-        now = versions[stage]
-        return f"made by version {store.version} of the stage {stage}, which is now {now}: reprocess builds it again"
+    made_of = [one for key in (uri, *sorted(catalogue.ancestors([uri]))) if (one := catalogue.stores.get(key))]
+    for one in made_of:
+        name, now = one.ref.stage, str(versions.get(one.ref.stage, one.version))
+        if one.version not in ("", now):
+            return f"made by version {one.version} of the stage {name}, which is now {now}: reprocess builds it again"
     runs = catalogue.named_by(uri)
     if runs and not any(run.settings for run in runs):
         return f"the settings of {runs[-1].uri}, which names it, cannot be read: run that survey again by hand"
+    weights = {one.params["weights"] for one in made_of if "weights" in one.params}
+    if runs and weights and weights.isdisjoint(map(weights_of, runs)):
+        return "made by weights that its survey does not find any more: reprocess builds it again"
     return ""
 
 

@@ -215,6 +215,7 @@ def test_a_repeated_run_has_its_reference(tmp_path: Path, survey_png: Survey, ma
     assert [again["settings"][name] for name in ("expected_loss", "signal")] == [0, run.receipt["settings"]["signal"]]
     assert again["recording"]["full_scan_s"] == run.receipt["savings"]["capture_s"]["full"]
     scan = survey_sweeps(tmp_path / "scan", run.folder, seconds=15).receipt  # of shorter exposures
+    assert scan["savings"]["capture_s"]["full"] == run.receipt["savings"]["capture_s"]["full"]
     assert scan["scans"]["taken"]["seconds"] == pytest.approx(scan["savings"]["capture_s"]["done"])
     assert scan["settings"]["scan_exposure_ms"] < 100
     with pytest.raises(SettingsError, match=r"camera\.exposure_ms is for a camera, and recorded lines have their own"):

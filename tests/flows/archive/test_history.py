@@ -109,8 +109,8 @@ def test_scores_on_a_scene_of_the_training_are_marked() -> None:
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [
-        ("--field nrth -o {0}/x.html", 1, "no field of .* is called 'nrth'; give --field with one of: north, south"),
-        ("-o {0}/x.html", 1, "has 2 fields; give --field with one of: north, south"),
+        ("--field nrth -o {0}/x.html", 2, "no field of .* is called 'nrth'; give --field with one of: north, south"),
+        ("-o {0}/x.html", 2, "has 2 fields; give --field with one of: north, south"),
         ("-o {0}", 2, "is a folder, expected the file to write"),
         ("-o {0}/x.pdf", 2, "expected a page's name that ends in .html"),
         ("-o {1}/x.html", 2, "lies in the archive"),

@@ -18,6 +18,7 @@ from storage.remote.opening import verify_archive
 from tests.storage.small_archive import Small, flip, make_store, settings, small_survey
 
 VERSIONS = {"capture": 1, "rectify": 1, "segment": 1}
+NOW: dict[str, Any] = {"versions": VERSIONS, "can_capture": lambda run: run.simulated, "weights_of": lambda run: "w0"}
 
 
 def _bad(archive: Archive) -> list[str]:
@@ -28,7 +29,7 @@ def _repair(archive: Archive, how: Callable[[dict[str, Any]], str] | None = None
     def again(settings: dict[str, Any]) -> str:
         return _run(small_survey(archive, seed=settings["seed"], kernel=settings["kernel"]))
 
-    return repair(archive, verify_archive(archive), how or again, versions=VERSIONS, can_capture=lambda r: r.simulated)
+    return repair(archive, verify_archive(archive), how or again, **NOW)
 
 
 def _run(small: Small) -> str:
@@ -130,7 +131,8 @@ def test_condensed_lines_whose_raw_lines_were_cleared_stay(archive: Archive, how
     before = {path: path.read_bytes() for path in (archive.root / "stages").rglob("*.*")}
     again = Mock(side_effect=lambda asked: make_store(archive, "segment", {}, [signal]) and "runs/x")
     versions: Any = {**VERSIONS, "condense": 1 + (how == "old")}
-    done = repair(archive, verify_archive(archive), again, versions=versions, can_capture=lambda run: False)
+    given = NOW | {"versions": versions, "can_capture": lambda run: False}
+    done = repair(archive, verify_archive(archive), again, **given)
     assert how == "old" or "its lines cannot be captured again" in done.plan.hopeless[signal.uri]
     assert done.remade == ([drawn.uri] if how == "flip" else [])
     assert again.called == (how == "flip")
@@ -145,7 +147,8 @@ def test_an_ingested_cube_stays_whatever_its_runs_can_capture(archive: Archive) 
     asked = settings(scene=str(cube.path))
     archive.new_run("farm").publish(settings=asked, rests_on=archive.manifest_hashes([cube]))
     flip(cube.path / "data.bin")
-    done = repair(archive, verify_archive(archive), Mock(), versions={"ingest": 1}, can_capture=lambda run: True)
+    given = NOW | {"versions": {"ingest": 1}, "can_capture": lambda run: True}
+    done = repair(archive, verify_archive(archive), Mock(), **given)
     assert list(done.plan.hopeless) == [cube.uri]
     assert cube.path.exists()
 
@@ -221,14 +224,25 @@ def test_what_was_never_of_the_archive_is_not_thrown_away(tmp_path: Path, archiv
     assert not done.complete
 
 
-def test_stores_of_a_version_no_longer_made_stay(archive: Archive) -> None:
-    """This version would make something else."""
-    small = small_survey(archive)
-    flip(small.raw.path / "data.bin")
-    found, newer = verify_archive(archive), ({"segment": 2}, {"capture": 2})
-    one, other = (plan_repair(archive, found, versions=VERSIONS | new, can_capture=bool) for new in newer)
-    assert (one.remade, other.remade) == ((small.raw.uri,), ())
-    assert "made by version 1 of the stage capture, which is now 2" in other.hopeless[small.raw.uri]
+@pytest.mark.parametrize(
+    ("store", "newer", "why"),
+    [
+        ("raw", {"versions": VERSIONS | {"segment": 2}}, ""),
+        ("raw", {"versions": VERSIONS | {"capture": 2}}, "made by version 1 of the stage capture, which is now 2"),
+        ("map", {"versions": VERSIONS | {"capture": 2}}, "made by version 1 of the stage capture, which is now 2"),
+        ("map", {"weights_of": lambda run: "w1"}, "made by weights that its survey does not find any more"),
+        ("mosaic", {"weights_of": lambda run: "w1"}, ""),
+    ],
+)
+def test_stores_that_a_survey_would_not_make_again_stay(
+    archive: Archive, store: str, newer: dict[str, Any], why: str
+) -> None:
+    """Other versions, also of inputs, and other weights make stores of other keys."""
+    ref = getattr(small_survey(archive), store)
+    flip(ref.path / "data.bin")
+    plan = plan_repair(archive, verify_archive(archive), **NOW | newer)
+    assert plan.remade == (() if why else (ref.uri,))
+    assert why in plan.hopeless.get(ref.uri, "")
 
 
 def test_a_damaged_run_is_run_again(archive: Archive) -> None:
