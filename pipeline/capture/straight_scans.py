@@ -188,8 +188,7 @@ def covered_field(sweeps: Sequence[Sweep], tangents: Sequence[Floats], camera: L
     if end - begin < 1:
         raise SceneError("the swaths of the recording have no part of the scan in common; state the field's size in px")
     low, high = min(parts) + ends[0], max(parts) + ends[1]
-    size = (int(end - begin + 1e-6), int(high - low + 1e-6))
-    centre = ((begin + end) / 2, (low + high) / 2)
+    size, centre = (int(end - begin + 1e-6), int(high - low + 1e-6)), ((begin + end) / 2, (low + high) / 2)
     if axes == {"y"}:
         size, centre = size[::-1], centre[::-1]
     return CoveredField(size, centre)

@@ -188,12 +188,10 @@ def expose(
 
 def _convolve(image: NDArray[np.floating], kernel: NDArray[np.float64], axis: int) -> NDArray[np.float32]:
     """Convolve along one axis with the edge pixel repeated outside."""
-    half = len(kernel) // 2
-    pad = [(0, 0)] * image.ndim
+    half, pad = len(kernel) // 2, [(0, 0)] * image.ndim
     pad[axis] = (half, half)
     padded = np.pad(image.astype(np.float32, copy=False), pad, mode="edge")
-    size = image.shape[axis]
-    out = np.zeros(image.shape, np.float32)
+    size, out = image.shape[axis], np.zeros(image.shape, np.float32)
     for offset, weight in enumerate(kernel):
         out += np.float32(weight) * np.take(padded, range(offset, offset + size), axis=axis)
     return out

@@ -171,8 +171,7 @@ def camera_slope(along: Floats, scan: Floats, across: ArrayLike, centre: Floats)
 
 def _one_minus_z(o: Floats) -> Floats:
     """Return 1 - o_z of unit vectors without cancellation; PoseError where it is 0."""
-    z = o[..., 2]
-    across = o[..., 0] ** 2 + o[..., 1] ** 2
+    z, across = o[..., 2], o[..., 0] ** 2 + o[..., 1] ** 2
     _refuse((o[..., 0] == 0) & (o[..., 1] == 0) & (z > 0), o, "is the camera's own ray, which no mirror makes")
     return np.where(z > 0, across / (1 + np.maximum(z, 0)), 1 - z)
 

@@ -195,8 +195,7 @@ class PosedField:
 
     @property
     def outline(self) -> BaseGeometry:
-        seen = shapely.segmentize(self._seen(0.0), max(self.shape) / EDGE_PARTS)
-        frame = self.grid.frame
+        seen, frame = shapely.segmentize(self._seen(0.0), max(self.shape) / EDGE_PARTS), self.grid.frame
         return shapely.transform(seen, lambda points: frame.ground_to_map(self.view.scene_to_ground(points[:, ::-1])))
 
     def _seen(self, border_px: float) -> BaseGeometry:

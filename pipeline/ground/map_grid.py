@@ -301,8 +301,7 @@ def image_at(image: NDArray[np.float32], pixels: Floats) -> NDArray[np.float32]:
     if not known.any():
         return out
     inside = np.clip(pixels[known], 0, np.array(image.shape[:2]) - 1)  # the border pixels' outer halves
-    first = np.floor(inside.min(axis=0)).astype(int)
-    last = np.ceil(inside.max(axis=0)).astype(int) + 1
+    first, last = np.floor(inside.min(axis=0)).astype(int), np.ceil(inside.max(axis=0)).astype(int) + 1
     window = np.ascontiguousarray(image[first[0] : last[0], first[1] : last[1]])
     valid: NDArray[np.bool_] = np.all(np.isfinite(window), axis=2)
     out[known] = resample(np.where(valid[..., None], window, 0), valid, inside - first, "bilinear")[0]

@@ -93,8 +93,7 @@ class GroundView:
     def axes(self) -> Floats:
         """Return (3, 3) view, right and down as rows, in east, north, up."""
         heading, tilt, roll = np.deg2rad([self.pose.heading_deg, self.pose.tilt_deg, self.pose.roll_deg])
-        away = np.array([np.sin(heading), np.cos(heading), 0.0])
-        up = np.array([0.0, 0.0, 1.0])
+        away, up = np.array([np.sin(heading), np.cos(heading), 0.0]), np.array([0.0, 0.0, 1.0])
         view = np.cos(tilt) * away - np.sin(tilt) * up
         right = np.array([np.cos(heading), -np.sin(heading), 0.0])
         down = -np.sin(tilt) * away - np.cos(tilt) * up

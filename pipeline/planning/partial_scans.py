@@ -186,8 +186,7 @@ def _filled(rows: PatchRows, values: Floats, times: RunTimes, seconds: float, sc
         if run is None:
             continue
         runs = tuple(sorted([*beside, (number, *run)]))
-        gain = float(values[rows.within(runs)].sum())
-        taken_s = times.seconds(runs)
+        gain, taken_s = float(values[rows.within(runs)].sum()), times.seconds(runs)
         if gain > best.expected_gain and taken_s <= seconds:
             best = PartialScan(runs, taken_s, gain)
     return best

@@ -129,8 +129,7 @@ def _listed(name: str) -> SpectralIndex:
     about, bands, constants = spyndex.indices[name], [], {}
     for symbol in about.bands:
         if symbol in spyndex.bands:
-            band = spyndex.bands[symbol]
-            centre = _centre_nm(name, symbol)
+            band, centre = spyndex.bands[symbol], _centre_nm(name, symbol)
             bands.append(IndexBand(symbol, band.long_name, centre, band.min_wavelength, band.max_wavelength))
         elif symbol.startswith(LAMBDA):  # of a band that the index itself may not want, as red in FDI
             constants[symbol] = _centre_nm(name, symbol.removeprefix(LAMBDA))

@@ -104,8 +104,7 @@ def _knot_and_sample(curve: KnotCurve, camera: LineCamera, a: Floats, b: Floats,
         np.multiply(centre - scan_path.scan[0], 1 / scan_path.width, out=found[:, 0])
         found[:, 1] = camera.sample_at(camera_slope(a, b, across, centre), binning)
         return found
-    found = np.full((len(a), 2), np.nan)
-    knot = _find_knots(curve, a, b, SETTLED_PX * camera.ifov_rad)
+    found, knot = np.full((len(a), 2), np.nan), _find_knots(curve, a, b, SETTLED_PX * camera.ifov_rad)
     settled = np.isfinite(knot)
     centre, _, wandered, _ = curve.at(knot[settled])
     found[settled, 0] = knot[settled]
@@ -170,8 +169,7 @@ def _bisect(curve: KnotCurve, a: Floats, b: Floats, rough: Floats) -> Floats:
     """Halve the interval between two knots on either side of the centre, nearest to a rough start; NaN without one."""
     _, _, across, _ = curve.at(rough)
     rough = curve.rough_knot(line_centre(a, b, across))
-    known = np.isfinite(rough)
-    found = np.full_like(a, np.nan)
+    known, found = np.isfinite(rough), np.full_like(a, np.nan)
     a, b, rough = a[known], b[known], rough[known]
     knots = np.clip(np.floor(rough)[:, None] + np.arange(-SEARCH_KNOTS, SEARCH_KNOTS + 2), -1, len(curve.scan_path))
     beyond = np.stack([_miss(curve, a, b, column)[0] for column in knots.T], axis=-1)

@@ -100,8 +100,7 @@ def _by_band(
     """Return mixtures at points where a part has no value in some bands; the others count there."""
     values = np.stack([part.values[points] for part in parts])
     counts = np.where(np.isnan(values), 0, weights[..., None])
-    total = reduce(np.add, counts)
-    mixed = np.where(counts > 0, values, 0) * counts
+    total, mixed = reduce(np.add, counts), np.where(counts > 0, values, 0) * counts
     found: NDArray[np.floating] = np.full(total.shape, np.nan)
     np.divide(reduce(np.add, mixed), total, out=found, where=total > 0)
     return found

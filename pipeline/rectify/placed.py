@@ -122,8 +122,7 @@ def tie_table(
         if bound <= tolerance_px and min(kept) > 0:
             rows, columns = ((size - 1) // tie + 2 for size in kept)
             tie_points = exact(0, tie, (rows, columns))
-            corners = _corners(tie_points)
-            ends = np.array([len(scan_path), samples]) - 0.5
+            corners, ends = _corners(tie_points), np.array([len(scan_path), samples]) - 0.5
             cells = ((corners.max(axis=0) >= -0.5) & (corners.min(axis=0) <= ends)).all(axis=-1)  # with points of it
             bound = SAFETY * (bound + _tie_bound(tie_points, cells))
             if bound <= tolerance_px:

@@ -82,8 +82,7 @@ def mosaic_rows(sweeps: Sequence[SweepLines], camera: LineCamera, grid: SceneGri
 
     Yields (row, x, band) float32 with NaN where no line reached.
     """
-    pixels = PixelGrid.of_scene(grid)
-    placed = [place(lines, camera) for lines in sweeps]
+    pixels, placed = PixelGrid.of_scene(grid), [place(lines, camera) for lines in sweeps]
     columns = slice(0, pixels.shape[1])
     reach = column_reach(placed, camera, pixels, columns)
     for part in cuts(pixels.shape[0], rows):
@@ -165,8 +164,7 @@ def _blocks_of(placed: Sequence[PlacedSweep], tile: Tile) -> dict[tuple[int, int
             knots = slice(0, 0) if near is None else near.knots(tile.rows)
             if near is None or knots.start == knots.stop:
                 continue
-            members = member_lines(scan_path, knots)
-            held = held_samples(one.lines, near.samples)
+            members, held = member_lines(scan_path, knots), held_samples(one.lines, near.samples)
             for number in line_blocks(slice(int(members.min()), int(members.max()) + 1)):
                 blocks[sweep, number, held.start, held.stop] = BLOCK_LINES * (held.stop - held.start) * bands * 2
     return blocks

@@ -127,8 +127,7 @@ def _runs(scan: Floats, most_back: float, still: float) -> list[slice]:
     The first line within ``still`` of the turn ends its part; later lines at the turn begin the next.
     """
     runs = []
-    up = scan - np.minimum.accumulate(scan) > most_back
-    down = np.maximum.accumulate(scan) - scan > most_back
+    up, down = scan - np.minimum.accumulate(scan) > most_back, np.maximum.accumulate(scan) - scan > most_back
     first, rising = 0, bool(up.any() and (not down.any() or np.argmax(up) < np.argmax(down)))
     while first < len(scan):
         way = scan[first:] if rising else -scan[first:]

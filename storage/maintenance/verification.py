@@ -132,8 +132,8 @@ def plan_repair(
 ) -> RepairPlan:
     """Return the repairs for these findings.
 
-    ``versions`` are the present ones of the stages; ``can_capture`` tells whether a run can capture its lines again,
-    ``weights_of`` the key of the weights that its survey takes now.
+    ``versions`` are the present ones of the stages. ``can_capture`` tells whether a run can capture its lines again;
+    ``weights_of`` gives the key of the weights that its survey takes now.
     """
     catalogue = Catalogue.read(archive.root)
     bad = [one.uri for one in findings if one.kind in ("broken", "missing")]

@@ -7,16 +7,15 @@ from collections.abc import Callable
 import numpy as np
 from measure import Row
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
 
 from pipeline.rectify.registration.alignment import PairShift, pair_shift
+from tests.pipeline.rectify.made_views import ROW_PX, row_views, wave_views
 
 Floats = NDArray[np.float64]
 Peer = Callable[[Floats, Floats], Floats]
 
 SHAPE = (512, 64)
 PRIOR_PX = 26.0
-ROW_PX = 12.0
 
 
 def rows() -> list[Row]:
@@ -97,47 +96,6 @@ def _opencv(reference: Floats, moving: Floats) -> Floats:
     # Copies, for it puts the window on what it is given where the size needs no padding.
     (right, down), _ = cv2.phaseCorrelate(reference.copy(), moving.copy(), window)
     return np.array([-down, -right])
-
-
-def wave_views(
-    seed: int, shape: tuple[int, int], shift: Floats, snr: float, periods: tuple[float, float]
-) -> tuple[Floats, Floats]:
-    """Sixty random waves with periods spread evenly in log; ``snr`` is the deviation over that of the noise."""
-    rng = np.random.default_rng(seed)
-    period = np.exp(rng.uniform(*np.log(periods), 60))
-    turn, phase = rng.uniform(0, 2 * np.pi, (2, 60))
-    y, x = np.arange(shape[0])[:, None], np.arange(shape[1])[None, :]
-
-    def view(dy: float, dx: float) -> Floats:
-        seen = np.zeros(shape)
-        for down, right, start in zip(np.sin(turn) / period, np.cos(turn) / period, phase, strict=True):
-            seen += np.cos(2 * np.pi * (down * (y + dy) + right * (x + dx)) + start)
-        return seen / np.sqrt(30) + rng.normal(size=shape) / snr
-
-    return view(0.0, 0.0), view(*shift)
-
-
-def row_views(seed: int, shape: tuple[int, int], shift: Floats, snr: float, gaps: float) -> tuple[Floats, Floats]:
-    """Crop rows 12 px apart along the first axis, a fraction ``gaps`` of their length bare; shifts of up to 50 px."""
-    rng = np.random.default_rng(seed)
-    stand = np.ones((int(shape[1] / ROW_PX) + 12, shape[0] + 120))
-    for row in stand:
-        start = 0
-        while start < len(row):
-            stop = start + int(rng.integers(5, 40))
-            row[start:stop] = rng.random() >= gaps
-            start = stop
-    stand = gaussian_filter1d(stand, 1.2, axis=1)
-    first = rng.uniform(0, ROW_PX)
-
-    def view(dy: float, dx: float) -> Floats:
-        along, across = np.arange(shape[0]) + dy + 60, np.arange(shape[1]) + dx + 60 - first
-        plants = np.exp(-0.5 * ((across[None, :] - ROW_PX * np.arange(len(stand))[:, None]) / 2.5) ** 2)
-        lengths = np.stack([np.interp(along, np.arange(stand.shape[1]), row) for row in stand])
-        seen = lengths.T @ plants
-        return seen / seen.std() + rng.normal(size=shape) / snr
-
-    return view(0.0, 0.0), view(*shift)
 
 
 PEERS: dict[str, Peer] = {"skimage": _skimage, "cv2.phaseCorrelate": _opencv}

@@ -187,8 +187,7 @@ def _correlate(first: Floats, second: Floats, reach: int) -> tuple[Floats, Float
     variance = at_shifts(2, 0) - sums[0] ** 2 / count, at_shifts(0, 2) - sums[1] ** 2 / count
     usable = (common >= LEAST_FRACTION * common.max()) & (common > 0)
     usable &= np.minimum(*variance) > FLAT_SPREAD * count
-    correlation = np.full(common.shape, -1.0)
-    covariance = at_shifts(1, 1) - sums[0] * sums[1] / count
+    correlation, covariance = np.full(common.shape, -1.0), at_shifts(1, 1) - sums[0] * sums[1] / count
     correlation[usable] = covariance[usable] / np.sqrt(variance[0][usable] * variance[1][usable])
     return correlation, common
 
@@ -245,8 +244,7 @@ def _least_squares(one: Floats, other: Floats, kept: NDArray[np.bool_], shift: F
         answer, *_ = np.linalg.lstsq(system.T @ system, system.T @ target, rcond=SINGULAR)
         if answer[2] <= 0:  # a negative image is no match
             return None
-        change = answer[:2] / answer[2]
-        left = target - system @ answer
+        change, left = answer[:2] / answer[2], target - system @ answer
         if np.abs(change).max() < SETTLED_PX:
             break
         shift = shift + np.clip(change, -1, 1)

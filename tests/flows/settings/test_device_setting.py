@@ -9,7 +9,6 @@ import pytest
 
 from flows.evaluate.command import evaluate_weights
 from flows.evaluate.frames import EvaluateRequest
-from flows.settings.load import load_settings
 from flows.tasks.run import SurveyRun
 from flows.tasks.survey_model import shipped_weights
 from flows.training.train import train_weights
@@ -39,12 +38,6 @@ def test_trainings_and_evaluations_refuse_it_too(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match=REFUSED):
         evaluate_weights(EvaluateRequest("farm", (shipped_weights(),), device="mps"))
     assert list(tmp_path.iterdir()) == []
-
-
-def test_what_is_no_device_is_refused_with_those_that_are() -> None:
-    """As any setting of some words."""
-    with pytest.raises(SettingsError, match="--device must be one of auto, cpu, cuda, mps; got 'gpu'"):
-        load_settings(None, {"device": "gpu"})
 
 
 def test_a_map_of_another_device_is_another_store() -> None:

@@ -171,6 +171,7 @@ def test_amounts_have_units():
         ({"camera": {"dark_dn": 5000}}, "leaves no room"),
         ({"detector": {"full_well_e": 5000}}, "full pixels would count as valid"),
         ({"out": " "}, "text that is not empty"),
+        ({"device": "gpu"}, "'device' must be one of auto, cpu, cuda, mps; got 'gpu'"),
         ({"out": "a\0b"}, "text without a null character"),
         ({"pose": {"lat_deg": 52.1, "tilt_deg": 40}}, r"\[pose\] lacks lon_deg, heading_deg; give every one"),
         ({"pose": POSE | {"range_m": 20}}, r"\[pose\]: .* height_m or range_m, one of the two; got height_m = 12"),

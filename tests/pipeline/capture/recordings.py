@@ -13,6 +13,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+from pipeline.source import Line
 from tests.pipeline.simulator.small_scenes import image_scene
 
 CAMERA = replace(LineCamera(), samples=64)
@@ -55,3 +56,11 @@ def record(source: SimulatedSource, sweep: Sweep, counted: Counted | None = None
 def recorded_source(source: SimulatedSource, sweeps: Sequence[RecordedSweep]) -> RecordedSource:
     """A source over recorded sweeps of the simulated rig's field."""
     return RecordedSource(sweeps, source.camera, source.wavelength_nm, source.field_shape)
+
+
+def assert_same_lines(found: list[Line], expected: list[Line]) -> None:
+    """Lines are equal bit for bit, with number, position, time, exposure and whether they are valid."""
+    assert len(found) == len(expected)
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one.data, other.data)
+        assert replace(one, data=other.data) == other

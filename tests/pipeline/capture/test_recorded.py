@@ -12,16 +12,16 @@ from hypothesis import strategies as st
 from pipeline.capture.recorded import RecordedSweep, nearest_line
 from pipeline.errors import NotRecordedError
 from pipeline.geometry.scan import Sweep, line_positions
-from pipeline.source import Line, References
-from tests.pipeline.capture.recordings import CAMERA, FULL, Counted, record, recorded_source, simulated
-
-
-def assert_same_lines(found: list[Line], expected: list[Line]) -> None:
-    """Lines are equal bit for bit, with number, position, time, exposure and whether they are valid."""
-    assert len(found) == len(expected)
-    for one, other in zip(found, expected, strict=True):
-        np.testing.assert_array_equal(one.data, other.data)
-        assert replace(one, data=other.data) == other
+from pipeline.source import References
+from tests.pipeline.capture.recordings import (
+    CAMERA,
+    FULL,
+    Counted,
+    assert_same_lines,
+    record,
+    recorded_source,
+    simulated,
+)
 
 
 def assert_same_references(found: References, expected: References) -> None:

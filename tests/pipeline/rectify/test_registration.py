@@ -19,45 +19,10 @@ from pipeline.rectify.registration.alignment import (
     pair_shift,
     solve_sweeps,
 )
+from tests.pipeline.rectify.made_views import row_views, wave_views
 
-Field = tuple[np.ndarray, np.ndarray]
 SIZE = (120, 150)
 REACH = 12.0
-
-
-def waves(seed: int, shape: tuple[int, int], shift: np.ndarray, snr: float, periods: tuple[float, float]) -> Field:
-    """Two views of random waves, the second ``shift`` beside the first, each with noise of its own."""
-    rng = np.random.default_rng(seed)
-    period = np.exp(rng.uniform(*np.log(periods), 40))
-    turn, phase = rng.uniform(0, 2 * np.pi, (2, 40))
-    y, x = np.mgrid[: shape[0], : shape[1]].astype(float)
-
-    def view(dy: float, dx: float) -> np.ndarray:
-        cycles = ((y + dy)[..., None] * np.sin(turn) + (x + dx)[..., None] * np.cos(turn)) / period
-        return np.cos(2 * np.pi * cycles + phase).sum(axis=2) / np.sqrt(20) + rng.normal(size=shape) / snr
-
-    return view(0, 0), view(*shift)
-
-
-def crop_rows(seed: int, shape: tuple[int, int], shift: np.ndarray, gaps: float, snr: float = 50) -> Field:
-    """Two views of rows 12 px apart, a fraction ``gaps`` of their length bare."""
-    rng = np.random.default_rng(seed)
-    count, length = shape[1] // 12 + 12, shape[0] + 120
-    stand = np.ones((count, length))
-    for row in stand:
-        for start in range(0, length, 20):
-            row[start : start + int(rng.integers(8, 20))] = rng.random() >= gaps
-    stand = gaussian_filter1d(stand, 1.2, axis=1)
-
-    def view(dy: float, dx: float) -> np.ndarray:
-        along, across = np.arange(shape[0]) + dy + 60, np.arange(shape[1]) + dx + 60
-        out = rng.normal(size=shape) / snr
-        for number, row in enumerate(stand):
-            plant = np.exp(-0.5 * ((across - 12 * number) / 2.5) ** 2)
-            out += 3 * np.outer(np.interp(along, np.arange(length), row), plant)
-        return out
-
-    return view(0, 0), view(*shift)
 
 
 @pytest.mark.parametrize("periods", [(4, 40), (40, 400)])
@@ -65,14 +30,13 @@ def test_narrow_overlaps_are_registered_to_a_tenth(periods: tuple[float, float])
     """Over 64 px at a signal to noise of 50 the shift is found to 0.03 px, fine texture or broad."""
     for seed in range(2):
         shift = np.random.default_rng(seed).uniform(-6, 6, 2)
-        found = pair_shift(*waves(seed, (512, 64), shift, 50, periods), prior_px=7)
-        assert found.status == "found"
+        found = pair_shift(*wave_views(seed, (512, 64), shift, 50, periods), prior_px=7)
         np.testing.assert_allclose(found.shift, shift, atol=0.03)
 
 
 def test_gain_and_offset_do_not_matter():
     """A view lit differently gives the same shift."""
-    one, other = waves(3, (128, 64), np.array([2.3, -1.6]), 50, (6, 40))
+    one, other = wave_views(3, (128, 64), np.array([2.3, -1.6]), 50, (6, 40))
     plain, lit = pair_shift(one, other, prior_px=4), pair_shift(one, 7 + 0.2 * other, prior_px=4)
     np.testing.assert_allclose(lit.shift, plain.shift, atol=1e-6)
 
@@ -92,8 +56,7 @@ def test_crop_rows_with_gaps_are_never_off_by_a_row():
     """The bare places tell which row is which; a shift of up to two rows is found right."""
     for seed in range(5):
         shift = np.random.default_rng(seed).uniform(-25, 25, 2)
-        found = pair_shift(*crop_rows(seed, (256, 64), shift, gaps=0.2), prior_px=26)
-        assert found.status == "found"
+        found = pair_shift(*row_views(seed, (256, 64), shift, 50, 0.2), prior_px=26)
         np.testing.assert_allclose(found.shift, shift, atol=0.1)
 
 
@@ -102,7 +65,7 @@ def test_rows_without_gaps_are_undecidable(turned: bool):
     """Purely periodic rows are not guessed, whichever way they run and whatever the noise."""
     for seed, snr in enumerate((50, 50, 5, 1)):
         shift = np.random.default_rng(seed).uniform(-25, 25, 2)
-        views = crop_rows(seed, (256, 64), shift, gaps=0, snr=snr)
+        views = row_views(seed, (256, 64), shift, snr, 0)
         found = pair_shift(*(view.T if turned else view for view in views), prior_px=26)
         assert found.status == "undecidable"
         assert np.isnan(found.shift).all()
@@ -112,7 +75,7 @@ def test_error_is_the_scatter_of_the_shift():
     """Over noisy views of one overlap the stated error is the scatter found, to a third; the peak is a correlation."""
     shift = np.array([2.3, -1.4])
     drawn = np.random.default_rng(9)
-    clean = waves(3, (96, 96), shift, np.inf, (8, 60))
+    clean = wave_views(3, (96, 96), shift, np.inf, (8, 60))
     found = [pair_shift(*(view + drawn.normal(0, 0.5, view.shape) for view in clean), prior_px=5) for _ in range(40)]
     scatter = np.sqrt(np.mean([(each.shift - shift) ** 2 for each in found], axis=0))
     np.testing.assert_allclose(np.mean([each.error_px for each in found], axis=0), scatter, rtol=0.35)
@@ -123,7 +86,7 @@ def test_error_is_the_scatter_of_the_shift():
 def test_negative_of_an_image_is_no_likeness():
     """An overlap that one sweep shows bright where the other shows it dark is not registered."""
     for seed in range(2):
-        one, other = waves(seed, (128, 96), np.array([1.2, -0.7]), 50, (30, 300))
+        one, other = wave_views(seed, (128, 96), np.array([1.2, -0.7]), 50, (30, 300))
         assert pair_shift(one, other, prior_px=4).status == "found"
         assert pair_shift(one, -other, prior_px=4).status == "undecidable"
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.camera import LineCamera, expose, footprint
 from pipeline.geometry.scan import Sweep
 from pipeline.lazy import Once
 from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE
@@ -21,11 +21,15 @@ from pipeline.simulator.optics.kernel_fit import Moments
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Optics, Rig
 from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster
-from tests.pipeline.simulator.small_scenes import image_scene, made_scene
+from pipeline.simulator.simulated import sweep_block
+from tests.pipeline.simulator.small_scenes import effects_on, image_scene, made_scene
 
 SIZE = 96
 NM = np.array([400.0, 550.0, 700.0, 1000.0])
 RIG = Rig(camera=LineCamera(samples=48), optics=Optics(keystone_px=0.4), air=Air(distance_m=120.0))
+CAMERA = LineCamera()
+OPTICS = effects_on("rotation", "slit", "smear")
+SWEEP = Sweep("s", "fine", "x", swath_px=0.0, start_px=-19.5, lines=40)
 BLURS: tuple[Effect, ...] = (DIFFRACTION, DEFOCUS, ABERRATION, KEYSTONE)
 Y, X = np.mgrid[:SIZE, :SIZE] - (SIZE - 1) / 2
 PICTURES = {
@@ -245,3 +249,29 @@ def test_gains_and_changes_run_in_the_order_given() -> None:
     last = expected_light(scene, block, {Nudge("change"): "only", Nudge("gain"): "only"})
     np.testing.assert_allclose(first, plain * gain + 7, rtol=1e-6)
     np.testing.assert_allclose(last, (plain + 7) * gain, rtol=1e-6)
+
+
+def test_flat_scene_gives_flat_lines() -> None:
+    """At any pose a flat scene gives each sample the same electrons but for the mirror, by exposure."""
+    scene = image_scene(np.full((30, 30, 2), 4.0), CAMERA, [400.0, 900.0])
+    far = Sweep("far", "coarse", "y", swath_px=2000.0, start_px=-3000.0, lines=5, step=4, binning=4)
+    expected = np.broadcast_to(4 * scene.electrons, (5, 640, 2))
+    for camera, times in ((CAMERA, 1), (replace(CAMERA, exposure_ms=250.0), 2.5)):
+        light = expected_light(scene, sweep_block(scene, Rig(camera), far, range(5)), OPTICS)
+        np.testing.assert_allclose(light, times * expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("step", [1, 4])
+def test_undeflected_sweep_is_the_operator_on_the_grid(step: int) -> None:
+    """Around the undeflected direction lines equal the closed-form operator that training uses, slit and smear."""
+    rng, (y, x), values = np.random.default_rng(0), np.mgrid[:40, :640], np.ones((40, 640, 1))
+    for _ in range(12):  # waves of 6 to 60 px
+        fy, fx = rng.normal(size=2) / rng.uniform(6, 60)
+        values += 0.03 * np.cos(2 * np.pi * (fy * y + fx * x) + rng.uniform(0, 6))[..., None]
+    scene = image_scene(values, CAMERA, [400.0])
+    sweep = replace(SWEEP, lines=40 // step, step=step)
+    lines = expected_light(scene, sweep_block(scene, Rig(CAMERA), sweep, range(sweep.lines)), OPTICS)
+    exact = replace(CAMERA, electrons_per_dn=1.0, bits=16)  # four of its samples still fit uint16
+    viewed = expose(footprint(values.astype(np.float32) * scene.electrons, exact), exact, step=step, rng=None)
+    binned = lines.reshape(sweep.lines, 640 // step, step, 1).mean(axis=2)
+    assert np.abs(binned - viewed).max() < 0.02 * viewed.std()

@@ -85,17 +85,6 @@ def test_one_table_for_several_cubes_and_for_parts_of_one(tmp_path: Path) -> Non
         ("angle_deg\nten\n", "row 2: angle_deg = 'ten' is no number"),
         ("angle_deg;time\n1,5;0\n", r"row 2: angle_deg = '1,5' is no number; write numbers with a decimal point"),
         ("angle_deg,time\n1\n", "row 2 has 1 cells, its header 2"),
-    ],
-)
-def test_a_table_that_cannot_be_read_says_why(tmp_path: Path, text: str, message: str) -> None:
-    """Columns and cells: each fault has its own message."""
-    with pytest.raises(SceneError, match=re.escape(message)):
-        load_pointing_table(_table(tmp_path, text))
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
         ("angle_deg\n0\n1\n", "has 2 rows for cube, fewer than its 3 lines"),
         ("angle_deg\n0\n1\n2\n3\n", "has 4 rows for cube, more than its 3 lines"),
         (
@@ -119,8 +108,8 @@ def test_a_table_that_cannot_be_read_says_why(tmp_path: Path, text: str, message
         ("angle_deg,line\n0,0\n1,2\n2,2\n", "row 3: line = 2, expected each of 0 to 2 once"),
     ],
 )
-def test_rows_that_do_not_fit_the_lines_say_why(tmp_path: Path, text: str, message: str) -> None:
-    """Numbers of rows, range, order and unknown values: the first wrong row is named."""
+def test_a_table_that_cannot_be_used_says_why(tmp_path: Path, text: str, message: str) -> None:
+    """Columns, cells, numbers of rows, range, order and unknown values: the first wrong row is named."""
     with pytest.raises(SceneError, match=re.escape(message)):
         load_pointing_table(_table(tmp_path, text)).of_cube("cube", 3)
 
