@@ -60,7 +60,7 @@ notebooks: $(BIN)/.ok
 	$(PIP) nbclient ipykernel
 	$(BIN)/python -c "$$RENDER" docs/notebooks/*.ipynb
 
-# Compares every goal with its peers (BENCH="geometry planning" selects some), then prints error against time.
+# Compares every goal with its peers (BENCH="geometry resample" selects some), then prints error against time.
 bench: $(BIN)/.ok-dev
 	OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks $(BENCH); crashed=$$?; \
 		OMP_NUM_THREADS=1 $(BIN)/spectralzoom tradeoff && exit $$crashed

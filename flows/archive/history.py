@@ -17,6 +17,7 @@ from flows.archive.stale_runs import called, generations
 from flows.cli.app import ArchiveName, AsJson, OutFile, check_outside, stderr
 from flows.publish.receipt import check_receipt
 from flows.settings.load import time_of_visit
+from flows.settings.survey_settings import BUILT_IN_SCENES
 from flows.tasks.scores import score_of
 from flows.terminal.figures import counted, format_area, format_percent
 from flows.terminal.processes import DONE
@@ -97,9 +98,11 @@ def read_history(archive: Archive, field: str | None = None) -> FieldHistory:
     legend = None
     with suppress(KeyError, OSError, PipelineError):  # the map was deleted
         legend = legend_of(open_group(archive.locate(runs[-1].products["class_map"])))
-    every = ((number, run) for number, some in enumerate(generations(catalogue)) for run in some)
-    newest = {(number, time_of_visit(run)): run.uri for number, run in every}.values()
-    return FieldHistory(str(name), archive.name, [_row(run, run.uri not in newest) for run in runs], legend)
+    newest: dict[tuple[int, str | None], str] = {}
+    for number, some in enumerate(generations(catalogue)):  # of one visit; a built-in scene grows without a new name
+        for run in some:
+            newest[number, time_of_visit(run) if run.settings.get("scene") in BUILT_IN_SCENES else None] = run.uri
+    return FieldHistory(str(name), archive.name, [_row(run, run.uri not in newest.values()) for run in runs], legend)
 
 
 def _row(run: Run, replaced: bool) -> Row:

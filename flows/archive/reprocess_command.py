@@ -28,6 +28,7 @@ from flows.cli.app import ArchiveName, AsJson, Scheduler, Switch, Workers, stder
 from flows.publish.receipt import Receipt
 from flows.publish.run_folder import extend_with_accuracy, load_receipt
 from flows.publish.survey_command import run_survey, show_published
+from flows.settings.load import time_of_visit
 from flows.settings.survey_settings import Settings
 from flows.tasks.open_survey import STAGES, TITLES, OpenSurvey, Products, versions
 from flows.tasks.prefect_tasks import Observer
@@ -127,6 +128,7 @@ def reprocess_fields(
                 else:
                     folder = (survey or _survey)(settings, console)
                     row |= {"new": folder.name, "state": "ran", **_scores(read_run(folder).receipt, "after")}
+                    renewed.pop(folder.name, None)  # a run that was stopped may be older than the one that it renews
                     renewed[old] = folder.name  # the same where a run got the accuracy that it lacked
             except PipelineError as error:
                 row |= {"message": str(error)}
@@ -144,6 +146,8 @@ def _settings_of(
     """
     here: dict[str, Any] = {"scheduler": pool.scheduler, "workers": pool.workers}
     settings = replace(asked_again(run, archive, weights), **here)
+    if settings.is_map and settings.visit is None:  # the visits of a raster stay as far apart as they were
+        settings = replace(settings, visit=time_of_visit(run))
     prior = settings.prior
     while (newer := renewed.get(prior, prior)) != prior:
         prior = newer

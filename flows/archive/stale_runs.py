@@ -7,16 +7,16 @@ from pathlib import Path, PurePath
 
 from flows.publish.receipt import is_pending
 from flows.settings.load import load_settings, of_this_version, parse_settings
-from flows.settings.survey_settings import BUILT_IN_SCENES, OF_THE_MACHINE, RASTER, RECORDED, RIG, SIM, Settings
+from flows.settings.survey_settings import BUILT_IN_SCENES, OF_THE_MACHINE, RECORDED, RIG, Settings
 from flows.tasks.open_survey import STAGES, versions
 from flows.tasks.recorded_field import open_recorded
+from flows.tasks.scene import open_map, open_scene
 from flows.tasks.survey_model import weights_path
 from models.weights.files import describe_weights
 from pipeline.errors import PipelineError, SettingsError
 from storage.archive.keys import canonical_json
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run, Store
-from storage.readers.open_cubes import split_variable
 from storage.readers.recordings import stores_of_lines
 
 OF_THE_SURVEY = ("labels", "weights", "memory", "accuracy", "controls", "prior", "keep")  # not in raw cubes
@@ -86,15 +86,17 @@ def can_capture(run: Run) -> bool:
 
 
 def _is_there(run: Run, settings: Settings) -> bool:
-    """Return whether the recording of a run, or the files of its scene, still exist; True for a rig."""
-    if settings.source == RECORDED:
-        try:
-            scene, _ = open_recorded(settings).scene()
-        except PipelineError:
-            return False
-        return scene.in_light(settings.sky.fraction_of_clear).key == run.receipt.get("scene")  # not another recording
-    is_file = settings.source in (SIM, RASTER) and settings.scene not in BUILT_IN_SCENES
-    return not is_file or split_variable(settings.scene)[0].exists()
+    """Return whether the recording or scene file of a run still shows the same; True for a rig and built-in scenes."""
+    if settings.source == RIG or (settings.source != RECORDED and settings.scene in BUILT_IN_SCENES):
+        return True
+    try:
+        if settings.source == RECORDED:
+            scene = open_recorded(settings).scene()[0].in_light(settings.sky.fraction_of_clear)
+        else:
+            scene = open_map(settings)[1] if settings.is_map else open_scene(settings)[0]
+    except PipelineError:
+        return False
+    return scene.key == run.receipt.get("scene")
 
 
 def is_called(run: Run, pattern: str) -> bool:

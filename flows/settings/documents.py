@@ -17,7 +17,7 @@ WIDTH = 120
 COLUMN = 38  # of the help in the example
 HEAD = """\
 # Settings of one survey: spectralzoom survey survey.example.toml
-# Each line states the default. Flags of the same name override it. Relative paths start at this file's folder.
+# Each line states the default, or an example behind a #. Flags override it. Relative paths start at this folder.
 """
 
 

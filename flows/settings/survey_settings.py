@@ -114,7 +114,7 @@ class ZoneChoice:
         None, "Plots, same formats; the receipt has area, classes and confidence of each", example="plots.gpkg:plots"
     )
     plots_name: str | None = stated(
-        None, "Attribute with the plot names; default: name, plot, plot_id, id or label", example="name"
+        None, "Attribute with the plot names; default: name, plot, id, label or the like", example="name"
     )
 
 
@@ -169,8 +169,8 @@ class Settings:
     )
     scene: str = stated(
         "farm",
-        "Scene: farm or scouting (built in; --seed gives another), or a file: PNG, JPEG, BMP, GeoTIFF, .npy, .npz,"
-        " .mat, ENVI, Zarr. Patterns for repeated visits: {date:%Y-%m-%d}.tif, {new}.tif (newest one not yet surveyed)",
+        "Scene: farm or scouting (built in; --seed gives another), or a file: PNG, GeoTIFF, ENVI, Zarr and others."
+        " Patterns for repeated visits: {date:%Y-%m-%d}.tif, {new}.tif (newest one not yet surveyed)",
     )
     labels: str | None = stated(
         None, "Label image on the scene's pixels (class colours or numbers); enables accuracy", example="labels.png"
@@ -258,7 +258,7 @@ class Settings:
     macs: Compute | None = stated(
         None,
         "MAC budget, as a fraction of full-resolution inference (25%) or as a number (4e9), beside the fusion of a"
-        " prior map; regions with the highest expected gain come first, the rest is segmented from binned pixels",
+        " prior map; patches with the highest expected gain come first, the rest is the overview",
         example="25%",
     )
     expected_loss: float = stated(
@@ -272,7 +272,9 @@ class Settings:
         None, "Exposure of the first pass; default: the camera's, or optimised", "ms", 0.5, 10_000, example=25.0
     )
     policy: Policy = stated("gain", "Policy that ranks patches, for the second pass or --macs")
-    mask: str | None = stated(None, "Image of patches to capture again, for policy mask", example="mask.png")
+    mask: str | None = stated(
+        None, "Image of patches to capture again, or to read, for policy mask", example="mask.png"
+    )
     weights: str | None = stated(
         None,
         "Model weights (.safetensors); farm: the built-in weights, the default for built-in scenes",

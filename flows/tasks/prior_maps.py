@@ -73,8 +73,7 @@ def find_prior(
     if settings.prior in (NONE, AUTO):
         return None, ()
     if settings.prior != LATEST:
-        folder = archive.root / "runs" / Path(settings.prior).name
-        why = "there is no such run in the archive"
+        folder, why = archive.root / "runs" / Path(settings.prior).name, "there is no such run in the archive"
         if folder.is_dir():
             found = _usable(archive, read_run(folder), settings, grid, class_names, scene)
             if isinstance(found, Prior):
@@ -191,7 +190,8 @@ def _days_since(run: Run, visit: str | None, moment: tuple[int, float] | None) -
     The dates of both visits count, with their times if both have one. Else day and hour of a built-in scene count, else
     whole days of the clock.
     """
-    then, now = (moment_of(one) for one in (run.settings.get("visit"), visit))
+    began = None if run.settings.get("scene") in BUILT_IN_SCENES else run.receipt.get("started")
+    then, now = moment_of(run.settings.get("visit") or began), moment_of(visit)
     if then is not None and now is not None:
         if min(len(str(one)) for one in (run.settings.get("visit"), visit)) <= len("2026-06-01"):  # a date alone
             return float((now.date() - then.date()).days)

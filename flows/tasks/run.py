@@ -387,8 +387,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
         archive = open_archive(settings.out) if archive is None and is_archive(settings.out) else archive
         asked = (settings, name, grid, described.class_names, scene)
         found = (None, ()) if archive is None else find_prior(archive, *asked)
-    passes = None if recorded is None else recorded.passes
-    planned = _PlannedCapture(settings)
+    passes, planned = None if recorded is None else recorded.passes, _PlannedCapture(settings)
     if pixels is None:
         prior = None if found is None else found[0]
         planned = _plan_capture(settings, scene, zones, path, described, prior, passes, planning=planning)

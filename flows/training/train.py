@@ -103,7 +103,6 @@ def train_weights(
     if scans is not None:
         record["scans"] = scans[0]
     save_weights(with_record(weights.on(PROCESSOR), **record), request.out)
-    checkpoint.unlink(missing_ok=True)
     about = {"command": request.command, **({} if scans is None else {MAP_SCORES: scans[1].as_dict()})}
     try:
         ood_detector = fit_ood(
@@ -118,6 +117,7 @@ def train_weights(
         add_ood(request.out, ood_detector, trained, about)
     except SceneError as error:
         record["familiar"] = f"no pixel will be classified as unknown: {error}"
+    checkpoint.unlink(missing_ok=True)
     return record
 
 

@@ -59,8 +59,7 @@ def expected_score(counts: Floats, bias: Floats, error: float = LEAST_ERROR) -> 
 
     NaN where no class has a pixel.
     """
-    area = counts.sum(axis=1)
-    iou = scipy.special.expit(_logit(iou_per_class(counts)) + bias)
+    area, iou = counts.sum(axis=1), scipy.special.expit(_logit(iou_per_class(counts)) + bias)
     plausible = 1 - (1 - _odds(iou, SURE_IOU, 4)) * (1 - _odds(area / max(area.sum(), 1.0), LARGE, 2))
     there = _odds(area, THERE_PX, 2) * plausible
     number = float(there.sum())
@@ -85,8 +84,7 @@ def fitted_bias(maps: Sequence[ScoredMap]) -> Floats:
 
     Scenes are weighted by their expected pixels of the class; a class that is rare in all of them has a smaller bias.
     """
-    expected = np.stack([one.expected for one in maps])
-    counts = np.stack([one.counts for one in maps])
+    expected, counts = np.stack([one.expected for one in maps]), np.stack([one.counts for one in maps])
     weight = np.minimum(expected.sum(axis=-1), SURE_PX) * labelled_classes(counts)
     true, predicted = (_logit(iou_per_class(one)) for one in (counts, expected))
     return np.asarray(((true - predicted) * weight).sum(axis=0) / (weight.sum(axis=0) + SURE_PX))

@@ -104,8 +104,7 @@ def kappa(counts: Counts) -> float:
     total = counts.sum()
     if not total:
         return float("nan")
-    agreed = np.trace(counts) / total
-    chance = float((counts.sum(axis=0) / total) @ (counts.sum(axis=1) / total))
+    agreed, chance = np.trace(counts) / total, float((counts.sum(axis=0) / total) @ (counts.sum(axis=1) / total))
     return float((agreed - chance) / (1 - chance)) if chance < 1 else float("nan")
 
 

@@ -48,8 +48,7 @@ class SpectralBasis:
         Raises WavelengthError for a wavelength that is not finite, or outside 200-3000 nm (micrometres?).
         """
         wavelength = checked_wavelengths(wavelength_nm, len(wavelength_nm))
-        centres = np.linspace(self.low_nm, self.high_nm, self.columns)
-        span_nm = self.high_nm - self.low_nm
+        centres, span_nm = np.linspace(self.low_nm, self.high_nm, self.columns), self.high_nm - self.low_nm
         apart_nm = span_nm / (self.columns - 1) if self.columns > 1 else max(span_nm, LONGEST_NM)  # one covers all
         distance = (wavelength[:, None] - centres[None, :]) / apart_nm
         bump = np.where(np.abs(distance) <= REACH, np.exp(-0.5 * (distance / 0.5) ** 2), 0.0)
@@ -77,8 +76,7 @@ def project(values: NDArray[np.floating], matrix: NDArray[np.float32]) -> NDArra
 def _project_finite(values: NDArray[np.float32], matrix: NDArray[np.float32]) -> NDArray[np.float32]:
     """Project (pixel, band) -> (pixel, column) by the finite bands alone."""
     living = np.isfinite(values)
-    weight = living.astype(np.float32) @ matrix
-    whole = matrix.sum(axis=0) > 0
+    weight, whole = living.astype(np.float32) @ matrix, matrix.sum(axis=0) > 0
     total = np.where(living, values, np.float32(0)) @ matrix
     mean: NDArray[np.float32] = np.divide(total, weight, out=np.zeros_like(weight), where=weight > 0)
     mean[(weight <= 0) & whole] = np.nan

@@ -99,8 +99,7 @@ def pooled(columns: Floats) -> Floats:
     whole = np.pad(columns, [(0, y), (0, x), (0, 0)], mode="edge") if y or x else columns
     parts = np.stack([whole[i::CELL_PX, j::CELL_PX] for i in range(CELL_PX) for j in range(CELL_PX)])
     known = np.isfinite(parts)
-    sums = np.where(known, parts, np.float32(0)).sum(axis=0)
-    count = known.sum(axis=0, dtype=np.float32)
+    sums, count = np.where(known, parts, np.float32(0)).sum(axis=0), known.sum(axis=0, dtype=np.float32)
     return np.where(count > 0, sums / np.maximum(count, 1), np.float32(np.nan))
 
 
@@ -148,8 +147,7 @@ def _fused(
     known, shown = _finite(before), _finite(today)
     seen = observation.seen[rows] & shown
     age = prior_map.probabilities.age_days[rows] + np.float32(prior_map.days)
-    days = np.nan_to_num(age, nan=0.0)
-    flat = np.float32(-math.log(before.shape[-1]))
+    days, flat = np.nan_to_num(age, nan=0.0), np.float32(-math.log(before.shape[-1]))
     old, new = (_normalised(np.where(where[..., None], one, flat)) for where, one in ((known, before), (seen, today)))
     left = np.float32(math.exp(-prior_map.days / LIGHT_FADES_DAYS))
     rests_on = np.where(known, prior_map.probabilities.light[rows] * left, 0).astype(np.float32)

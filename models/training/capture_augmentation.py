@@ -49,8 +49,7 @@ class ColumnNoise:
     ) -> ColumnNoise:
         """Return the noise of weights (band, column); an electron at the reference exposure has a value of (band,)."""
         weight, value = matrix.astype(np.float64), value_of_electron.astype(np.float64)
-        shot = (weight**2).T @ value
-        read = (weight * (read_noise_e * value[:, None]) ** 2).T @ weight
+        shot, read = (weight**2).T @ value, (weight * (read_noise_e * value[:, None]) ** 2).T @ weight
         return ColumnNoise(shot, read)
 
     def correlation(self) -> Matrix:

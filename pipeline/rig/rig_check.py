@@ -127,8 +127,8 @@ def _move(mirror: MirrorDriver, clock: Clock, rows: list[CheckRow]) -> None:
         if not off <= FAR:
             mend = "it is not where it was sent: look at the mirror head and its cable before it moves again"
             rows.append(CheckRow("mirror", asked, words, "fail", mend))
-        else:
-            rows.append(CheckRow("mirror", asked, words))
+            return
+        rows.append(CheckRow("mirror", asked, words))
 
 
 def _row(rows: list[CheckRow], device: Device, asked: str, ask: Callable[[], str]) -> None:

@@ -24,6 +24,7 @@ from typing import Any
 from pipeline.errors import ArchiveError, IncompleteStoreError, NoRunError
 from storage.archive.keys import (
     LATEST,
+    SECOND,
     StageRef,
     in_text,
     open_folder,
@@ -340,7 +341,9 @@ class Archive:
                 if path.suffix in (".json", ".html"):
                     content = content.replace(before.name.encode(), name.encode())
                 draft.write_file(path.name, content)
-            draft.publish(rests_on=rests_on, **{key: value for key, value in manifest.items() if key not in own})
+            facts = {key: value for key, value in manifest.items() if key not in own}
+            begun = datetime.strptime(name[:SECOND], "%Y%m%dT%H%M%S").replace(tzinfo=UTC)  # runs are sorted by it
+            draft.publish(rests_on=rests_on, **facts | {"created": begun.isoformat(timespec="milliseconds")})
         self.drop_run(uri)
 
     def _named_draft(self, run_id: str) -> RunDraft:

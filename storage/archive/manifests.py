@@ -35,8 +35,7 @@ def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:
         sync_path(path)
         files[path.relative_to(folder).as_posix()] = {"sha256": file_hash(path), "size": path.stat().st_size}
     known = {"created": datetime.now(UTC).isoformat(timespec="milliseconds"), "libraries": library_versions()}
-    content = {**known, **facts, "files": files, "format": FORMAT}
-    manifest = folder / MANIFEST_NAME
+    content, manifest = {**known, **facts, "files": files, "format": FORMAT}, folder / MANIFEST_NAME
     manifest.write_text(manifest_text(content), encoding="utf-8")
     sync_path(manifest)
     for inner in sorted(path for path in folder.rglob("*") if path.is_dir()):

@@ -120,12 +120,15 @@ class Run:
             parts = path.relative_to(root).parts if path.is_relative_to(root) else ()
             if parts[:2] == ("stages", "ingest") and len(parts) > 2:
                 found.add("/".join(parts[:3]))
+            _, there, key = _text(self.settings.get(name)).rpartition("/stages/ingest/")
+            if there and in_text(uri := f"stages/ingest/{key.split('/')[0]}") == uri:  # of a bucket or a moved archive
+                found.add(uri)
         return found
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Return the settings of the survey, from the manifest or else from the receipt."""
-        return as_table(self.facts.get("settings")) or as_table(self.receipt.get("settings"))
+        """Return the settings of the survey, from the receipt or else, rounded, from the manifest."""
+        return as_table(self.receipt.get("settings")) or as_table(self.facts.get("settings"))
 
     @property
     def products(self) -> dict[str, str]:

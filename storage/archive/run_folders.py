@@ -104,8 +104,7 @@ class RunDraft:
 
     def _write_manifest(self, rests_on: Mapping[str, str] | None, facts: Mapping[str, Any]) -> None:
         """Write the manifest; its size depends on files and facts alone."""
-        final = self.published
-        content = {"run": self.id, "rests_on": dict(rests_on or {}), **plain(facts)}
+        final, content = self.published, {"run": self.id, "rests_on": dict(rests_on or {}), **plain(facts)}
         if self.extends:
             content |= extended_facts(read_manifest(final), manifest_sha256(final))
         write_manifest(self.folder, content)

@@ -113,8 +113,7 @@ class RawCubeWriter:
 
     def _flush(self) -> None:
         if self._waiting:
-            first = self._waiting[0].number
-            block = np.stack([line.data for line in self._waiting])
+            first, block = self._waiting[0].number, np.stack([line.data for line in self._waiting])
             self._dn[first : first + len(block)] = block
             self._passed_on(self._waiting, block)
             self._waiting.clear()

@@ -195,8 +195,7 @@ def steps_within(scores: NDArray[np.floating], step: float, kind: np.dtype[Any])
 
 def write_components(group: zarr.Group, components: Components) -> None:
     """Store the components that restore spectra."""
-    about = {"coordinates": "wavelength", "units": "1"}
-    rows = components.axes * np.nan_to_num(components.noise)
+    about, rows = {"coordinates": "wavelength", "units": "1"}, components.axes * np.nan_to_num(components.noise)
     write_small(group, "axes", ("component", "band"), rows, {"long_name": "scene value of a score of 1", **about})
     write_small(group, "mean", ("band",), components.mean, {"long_name": "mean scene value", **about})
     noise = {"long_name": "standard deviation of one spectrum's noise", **about}

@@ -111,8 +111,7 @@ class SignalCubeWriter:
 
     def write(self, first: int, scores: NDArray[np.floating], quality: NDArray[np.uint8]) -> None:
         """Store (line, sample, component) scores from a line on, a multiple of 64."""
-        steps = steps_within(scores, self._step, self._scores.dtype)
-        stop = first + len(scores)
+        steps, stop = steps_within(scores, self._step, self._scores.dtype), first + len(scores)
         if steps.shape[2]:
             self._scores[:, first:stop] = np.ascontiguousarray(steps.transpose(2, 0, 1)).astype(self._scores.dtype)
         self._seen[first:stop] = quality

@@ -229,8 +229,7 @@ class FetchedFiles:
 
     def append(self, name: str, data: bytes) -> None:
         """Add bytes at the end. Raises NotKept: the disk refuses; a part that was written is removed again."""
-        path = self._path(name)
-        before = self.size(name)
+        path, before = self._path(name), self.size(name)
         try:
             if not before:
                 self.folder.mkdir(parents=True, exist_ok=True)

@@ -213,8 +213,7 @@ def write_recorded_files(cube: RawCube, folder: Path) -> Path:
         for first in range(0, cube.shape[0], SHARD_ROWS):
             yield first, cube.read(first, min(first + SHARD_ROWS, cube.shape[0]))
 
-    header = folder / f"{name}.hdr"
-    bands = EnviFile(cube.shape, "u2", cube.wavelength_nm, cube.fwhm_nm)
+    header, bands = folder / f"{name}.hdr", EnviFile(cube.shape, "u2", cube.wavelength_nm, cube.fwhm_nm)
     axis, what = {"line axis": cube.sweep.along}, "restored" if isinstance(cube, RestoredCube) else "raw"
     write_envi(
         header, replace(bands, description=f"{what} numbers of sweep {name}", ending=".bil", more=axis), blocks()

@@ -16,7 +16,7 @@ from storage.archive.archive import Archive
 from storage.archive.keys import canonical_json, without_manifest
 from storage.archive.lineage import Catalogue
 from storage.archive.manifests import broken_files, listed_bytes, try_manifest
-from storage.archive.records import RECEIPT, Run
+from storage.archive.records import RECEIPT, Run, moment_of, read_run
 from storage.archive.staging import MANIFEST_NAME
 
 Progress = Callable[[str, float], None]  # address being read, fraction of all bytes
@@ -203,7 +203,10 @@ def repair(
     for uri, text in plan.broken_runs.items():
         if repeated.get(text) in plan.broken_runs:  # another damaged run of this survey has taken it
             run_again(text)
-        if text in repeated:  # its survey has run again
+        before = read_run(archive.root / uri).names
+        if text in repeated and before and before.isdisjoint(read_run(archive.root / repeated[text]).names):
+            done.failed[uri] = "its scene shows something else by now: restore the file"
+        elif text in repeated:  # its survey has run again
             archive.drop_run(uri)
             if repeated[text] not in there:
                 archive.rename_run(repeated[text], uri)
@@ -248,6 +251,10 @@ def _hopeless(
     weights = {one.params["weights"] for one in made_of if "weights" in one.params}
     if runs and weights and weights.isdisjoint(map(weights_of, runs)):
         return "made by weights that its survey does not find any more: reprocess builds it again"
+    dated = any(moment_of(run.settings.get("visit")) or run.settings.get("day") for run in runs)
+    for name, known in (("device", False), ("days", dated)):  # of this machine, or from the prior map until today
+        if not known and any(name in one.params for one in made_of):
+            return f"its {name} would be others today: run its survey again by hand"
     return ""
 
 

@@ -199,8 +199,7 @@ def _bands_of(cube: ArrayCube, arrays: Arrays, count: int) -> Bands:
         found = axis
     if found is None:
         return Bands()
-    centres = np.asarray(arrays[found][...], np.float64).ravel()
-    unit = _unit(arrays[found].attrs)
+    centres, unit = np.asarray(arrays[found][...], np.float64).ravel(), _unit(arrays[found].attrs)
     known = {**dict.fromkeys(NANOMETRES, 1.0), **dict.fromkeys(MICROMETRES, 1000.0), **dict.fromkeys(METRES, 1e9)}
     scale = (1000.0 if centres.max() <= 20 else 1.0) if unit in UNSAID else known.get(unit)  # [nm]
     if scale is None or not (np.isfinite(centres) & (centres > 0)).all():

@@ -159,8 +159,7 @@ def _hdf_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
         """Add an array of numbers, or a single text such as NEON's map info."""
         if not isinstance(item, h5py.Dataset) or item.external or item.is_virtual or item.shape is None:
             return
-        about = _plain(item.attrs)
-        is_text = item.dtype.kind in "SO" and not item.ndim
+        about, is_text = _plain(item.attrs), item.dtype.kind in "SO" and not item.ndim
         if (item.dtype.kind in "buif" or is_text) and not str(about.get("NAME", "")).startswith(_ONLY_A_DIMENSION):
             attributes, chunks = {**about, **_as_cf(about, item)}, item.chunks or (1,) * item.ndim
             where, read = f"{path}:{name}", partial(_read, path, name)

@@ -182,8 +182,7 @@ def read_by_chunks(read: ReadLines, lines: int, chunk_lines: int) -> ReadLines:
 
 def scene_lines(source: CubeSource, start: int, stop: int) -> NDArray[Any]:
     """Return lines (line, sample, band) as scene values: over the white reference if both frames are known."""
-    raw = source.read(start, stop)
-    valid = source.valid[start:stop]
+    raw, valid = source.read(start, stop), source.valid[start:stop]
     if source.dark is None or source.white is None:
         if valid.all():
             return raw

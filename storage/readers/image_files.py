@@ -160,8 +160,7 @@ def rescaled(
 @contextmanager
 def _opened(path: Path, image: str = "") -> Iterator[Any]:
     """Open the first or another image of a file (SceneError: it is damaged, or of another kind)."""
-    rasterio = importlib.import_module("rasterio")
-    driver = _DRIVERS[path.suffix.lower()]
+    rasterio, driver = importlib.import_module("rasterio"), _DRIVERS[path.suffix.lower()]
     with warnings.catch_warnings(), rasterio.Env(**_STRICT):
         warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
         with (

@@ -289,8 +289,7 @@ def _sweeps_of(
 ) -> list[RecordedSweep]:
     """Return the sweep of one cube, or the sweeps that its pointing table cuts it into."""
     source = cube.source
-    valid = source.valid & pointing.valid
-    time_s = _middle_s(source, pointing.time_s, camera, notes)
+    valid, time_s = source.valid & pointing.valid, _middle_s(source, pointing.time_s, camera, notes)
     known_ms = source.lines.exposure_ms if pointing.exposure_ms is None else pointing.exposure_ms
     if known_ms is None:
         notes.append(f"{cube.name}: nothing says the exposure: {camera.exposure_ms:g} ms is assumed")

@@ -187,8 +187,7 @@ def _chosen_bands(
         good = [band for band in range(count) if band not in set(bad)]
         if len(good) == count or not good:
             return list(range(count)), ()
-        everything = bands_text(range(count))
-        left_out = bands_text(sorted(bad))
+        everything, left_out = bands_text(range(count)), bands_text(sorted(bad))
         return good, (f"bands {left_out} are left out: the file marks them as bad; --bands {everything} takes all",)
     wrong = [band for band in chosen if not 0 <= band < count]
     if wrong or not chosen:

@@ -205,6 +205,10 @@ class ObjectArchive(Archive):
                 if standing in manifests_before(read_manifest(self.root / uri)):  # something was added to it
                     self._upload(uri, first=False)
 
+    def is_there(self, uri: str) -> bool:
+        """Return whether a store has its files, by its manifest in the bucket."""
+        return (uri in self._standing or self._find(uri) or self._is_whole(uri)) and super().is_there(uri)
+
     # --- the whole of it ----------------------------------------------------------------------------------------------
 
     def mirror(self) -> None:
@@ -380,8 +384,7 @@ class ObjectArchive(Archive):
     def _fetch_files(self, uri: str, only: Iterable[str] | None = None) -> None:
         """Fetch the missing files (``only`` these names), each checked by its hash."""
         folder = self.root / uri
-        manifest = read_manifest(folder)
-        place = _files_at(uri, (folder / MANIFEST_NAME).read_bytes())
+        manifest, place = read_manifest(folder), _files_at(uri, (folder / MANIFEST_NAME).read_bytes())
 
         with self._locked(f"fetch-{uri.replace('/', '-')}"), self._aside() as aside:
 

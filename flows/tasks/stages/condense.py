@@ -172,8 +172,7 @@ def _write_sweeps(
     path: Path, sweeps: Sequence[tuple[RawCube, Condenser]], found: SignalStatistics, report: Report
 ) -> list[CondensedSweep]:
     """Write scores and residuals of every sweep."""
-    origin = np.zeros(found.bands) if found.origin is None else found.origin
-    done = []
+    origin, done = np.zeros(found.bands) if found.origin is None else found.origin, []
     for number, (cube, condenser) in enumerate(sweeps):
         mean = np.nan_to_num(condenser.components.mean)
         out, first = path / f"{cube.sweep.name}.zarr", sweeps[0][0]

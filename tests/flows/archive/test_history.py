@@ -46,9 +46,10 @@ def test_runs_are_one_history(archive: Path) -> None:
 def test_a_visit_that_was_surveyed_again_is_one_point(tmp_path: Path) -> None:
     """Of the newest run of its visit and scene; other scenes and other moments are visits of their own."""
     archive = Archive.open(tmp_path)
-    for scene, visit in (("a", "2026-06-01"), ("a", "2026-06-08"), ("b", "2026-06-01"), ("a", "2026-06-01")):
+    for scene, visit in (("a", None), ("a", "2026-06-08"), ("b", "2026-06-01"), ("a", None)):
         with archive.new_run("north") as draft:
-            draft.write_file("receipt.json", json.dumps({"survey": "north", "scene": scene}))
+            started = f"2026-05-{len(archive.runs()) + 10}T08:00:00Z"
+            draft.write_file("receipt.json", json.dumps({"survey": "north", "scene": scene, "started": started}))
             draft.publish(survey="north", settings={"visit": visit})
     history = read_history(archive)
     assert [row["replaced"] for row in history.runs] == [True, False, False, False]

@@ -21,7 +21,7 @@ from pipeline.simulator.scenes.scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Line
 from storage.parallel.pool import WorkerPool
-from tests.pipeline.capture.recordings import assert_same_lines
+from tests.pipeline.capture.recordings import assert_same
 from tests.pipeline.simulator.small_scenes import effects_on
 
 CAMERA = LineCamera(samples=48)
@@ -62,13 +62,13 @@ def test_neither_pool_nor_blocks_change_a_number(
     """With every effect on, in blocks of 1, 7, 64 and all lines, with nothing remembered from before."""
     monkeypatch.setattr(simulated, "BLOCK_LINES", size)
     render._sampler.cache_clear()
-    assert_same_lines(taken(source_of(), WorkerPool(scheduler, workers), at_once=size), expected)
+    assert_same(taken(source_of(), WorkerPool(scheduler, workers), at_once=size), expected)
 
 
 @pytest.mark.parametrize("first", [23, 69, 70])
 def test_a_capture_goes_on_from_any_line(expected: list[Line], first: int) -> None:
     """The lines are those of an unbroken capture; after the last there is none."""
-    assert_same_lines(taken(source_of(), TWO, first), expected[first:])
+    assert_same(taken(source_of(), TWO, first), expected[first:])
 
 
 def test_blocks_wait_for_earlier_ones(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -58,7 +58,7 @@ def recorded_source(source: SimulatedSource, sweeps: Sequence[RecordedSweep]) ->
     return RecordedSource(sweeps, source.camera, source.wavelength_nm, source.field_shape)
 
 
-def assert_same_lines(found: list[Line], expected: list[Line]) -> None:
+def assert_same(found: list[Line], expected: list[Line]) -> None:
     """Lines are equal bit for bit, with number, position, time, exposure and whether they are valid."""
     assert len(found) == len(expected)
     for one, other in zip(found, expected, strict=True):

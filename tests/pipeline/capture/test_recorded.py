@@ -13,15 +13,7 @@ from pipeline.capture.recorded import RecordedSweep, nearest_line
 from pipeline.errors import NotRecordedError
 from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.source import References
-from tests.pipeline.capture.recordings import (
-    CAMERA,
-    FULL,
-    Counted,
-    assert_same_lines,
-    record,
-    recorded_source,
-    simulated,
-)
+from tests.pipeline.capture.recordings import CAMERA, FULL, Counted, assert_same, record, recorded_source, simulated
 
 
 def assert_same_references(found: References, expected: References) -> None:
@@ -37,8 +29,8 @@ def test_a_recorded_copy_of_a_sweep_gives_its_lines(sweep: Sweep) -> None:
     source = simulated()
     recorded = recorded_source(source, [record(source, sweep)])
     lines = list(source.lines(sweep))
-    assert_same_lines(list(recorded.lines(sweep)), lines)
-    assert_same_lines(list(recorded.lines(sweep, 17)), lines[17:])
+    assert_same(list(recorded.lines(sweep)), lines)
+    assert_same(list(recorded.lines(sweep, 17)), lines[17:])
     assert_same_references(recorded.references(sweep), source.references(sweep))
 
 
@@ -62,7 +54,7 @@ def test_fine_lines_of_a_full_scan_are_found_by_their_place() -> None:
     recorded = recorded_source(source, [record(source, FULL, counted)])
     found = list(recorded.lines(Sweep("fine-0", "fine", "x", 0.0, -9.5, 12)))
     expected = list(source.lines(FULL))[30:42]
-    assert_same_lines([replace(line, number=line.number + 30) for line in found], expected)
+    assert_same([replace(line, number=line.number + 30) for line in found], expected)
     assert counted.numbers == list(range(30, 42))
     list(recorded.lines(Sweep("fine-1", "fine", "x", 0.0, -1.5, 8)))
     assert counted.numbers[12:] == list(range(38, 46))
@@ -75,7 +67,7 @@ def test_a_recorded_coarse_sweep_wins_over_the_full_scan() -> None:
     recorded = recorded_source(source, [record(source, FULL), record(source, coarse)])
     part = Sweep("planned", "coarse", "x", 0.0, -31.5, 10, step=4)
     expected = [replace(line, number=line.number - 2) for line in source.lines(coarse)][2:12]
-    assert_same_lines(list(recorded.lines(part)), expected)
+    assert_same(list(recorded.lines(part)), expected)
 
 
 def test_a_backward_scan_gives_rising_times() -> None:

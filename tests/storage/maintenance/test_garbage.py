@@ -186,12 +186,13 @@ def test_a_negative_age_is_refused(tmp_path: Path) -> None:
             clear_up(Archive.open(tmp_path), keep_days=days)
 
 
-def test_an_ingested_cube_that_a_run_surveyed_stays(archive: Archive) -> None:
+@pytest.mark.parametrize("place", ["", "s3://bucket/prefix"], ids=["folder", "bucket"])
+def test_an_ingested_cube_that_a_run_surveyed_stays(archive: Archive, place: str) -> None:
     """Its survey names it as its scene and cannot be repeated without it."""
     small = small_survey(archive)
     with archive.publish("ingest", "cube") as staged:
         (staged.path / "data.bin").write_bytes(b"light")
-    settings = {"scene": str(archive.root / "stages" / "ingest" / "cube")}
+    settings = {"scene": f"{place or archive.root}/stages/ingest/cube"}
     archive.new_run("field").publish(settings=settings, rests_on=archive.manifest_hashes([small.map]))
     assert clear_up(archive, keep_days=0, raw_too=True).removals == ()
     assert problems(archive) == []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 
 from pipeline.errors import ArchiveError, SceneError
 from storage.archive.archive import Archive
+from storage.archive.records import read_run
 from storage.maintenance.verification import Repaired, plan_repair, repair
 from storage.remote.opening import verify_archive
 from tests.storage.small_archive import Small, flip, make_store, settings, small_survey
@@ -70,7 +72,21 @@ def test_two_damaged_runs_of_one_command_keep_their_names(archive: Archive) -> N
     done = _repair(archive)
     assert done.complete
     assert archive.runs() == runs
+    for run in runs:  # its date is that of its name
+        assert re.sub(r"\D", "", read_run(run).created).startswith(run.name[:8] + run.name[9:15])
     assert _bad(archive) == []
+
+
+def test_a_repetition_of_another_scene_replaces_no_run(archive: Archive) -> None:
+    """The file of its scene was written over: nothing that it was made of is made again."""
+    with archive.new_run("farm") as draft:
+        draft.write_file("receipt.json", json.dumps({"settings": settings()}))
+        draft.write_file("quicklook.png", b"picture")
+        run = draft.publish(rests_on=archive.manifest_hashes([small_survey(archive, named=False).map]))
+    flip(run / "quicklook.png")
+    done = _repair(archive, lambda asked: _run(small_survey(archive, seed=7)))
+    assert "its scene shows something else by now" in done.failed[f"runs/{run.name}"]
+    assert archive.runs() == [run]
 
 
 @pytest.mark.parametrize("how", ["flip", "manifest", "lost", "gone"])
@@ -234,9 +250,7 @@ def test_what_was_never_of_the_archive_is_not_thrown_away(tmp_path: Path, archiv
         ("mosaic", {"weights_of": lambda run: "w1"}, ""),
     ],
 )
-def test_stores_that_a_survey_would_not_make_again_stay(
-    archive: Archive, store: str, newer: dict[str, Any], why: str
-) -> None:
+def test_what_would_not_be_made_again_stays(archive: Archive, store: str, newer: dict[str, Any], why: str) -> None:
     """Other versions, also of inputs, and other weights make stores of other keys."""
     ref = getattr(small_survey(archive), store)
     flip(ref.path / "data.bin")

@@ -270,10 +270,8 @@ def test_numbers_mean_what_xarray_reads(tmp_path: Path, stored: Any, about: dict
         (np.float32, {"_FillValue": np.float32("nan"), "missing_value": -3.0}, np.float32, [0, 101, np.nan, -9]),
     ],
 )
-def test_without_a_scale_numbers_out_of_range_are_no_value(
-    tmp_path: Path, stored: type, about: dict[str, Any], kind: type, read: list[float]
-) -> None:
-    """Whole numbers stay whole if one of them is the fill value."""
+def test_numbers_out_of_range_are_no_value(tmp_path: Path, stored: Any, about: Any, kind: Any, read: Any) -> None:
+    """Without a scale whole numbers stay whole if one of them is the fill value."""
     with h5py.File(tmp_path / "a.nc", "w") as file:
         file["values"] = stored([0, 101, -3, -9]).reshape(1, 4, 1)
         file["values"].attrs.update(about)

@@ -49,6 +49,15 @@ def test_gc_gives_a_store_back_that_a_run_named_meanwhile(machine: Machine, monk
     assert problems(archive) == []
 
 
+def test_files_that_another_machine_cleared_are_not_there(machine: Machine) -> None:
+    """A working copy has an older manifest of them."""
+    archive = machine(FIRST)
+    small, _ = small_survey(archive), machine(SECOND, create=False)
+    archive.clear(small.raw)
+    other = machine(SECOND, create=False)
+    assert (other.is_there(small.raw.uri), other.is_there(small.map.uri)) == (False, True)
+
+
 def test_gc_leaves_what_another_machine_puts_back(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     """A run that names a store is published after gc's last look at the runs: the publisher's store stays."""
     archive = machine(FIRST)
