@@ -13,7 +13,7 @@ from flows.tasks.recorded_field import open_recorded
 from flows.tasks.scene import open_map, open_scene
 from flows.tasks.survey_model import weights_path
 from models.weights.files import describe_weights
-from pipeline.errors import PipelineError, SettingsError
+from pipeline.errors import PipelineError, SceneError, SettingsError
 from storage.archive.keys import canonical_json
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run, Store
@@ -60,16 +60,21 @@ def _recorded_run(catalogue: Catalogue, run: Run) -> Run:
 def from_raw_cubes(catalogue: Catalogue, run: Run, settings: Settings) -> Settings:
     """Return settings that survey a run's own raw cubes as a recording, where its source cannot be read again.
 
-    That is the case if the stage of captures has another version, or if the files of a recording or scene are gone. The
-    settings stay as they are otherwise, and if the raw cubes are gone too. Raises SettingsError, BudgetError: as
-    `asked_again`.
+    That is the case if the stage of captures has another version, or if the files of a recording or scene are gone or
+    changed. The settings stay as they are otherwise. Raises SettingsError, BudgetError: as `asked_again`; SceneError:
+    the raw cubes are gone too.
     """
     raw = set(stores_of_lines(run.products, lambda uri: uri in catalogue.stores and not catalogue.stores[uri].cleared))
     stores = [catalogue.stores.get(uri) for uri in raw]
+    is_there = _is_there(run, settings)
     if not stores or any(one is None or one.problem is not None or one.cleared for one in stores):
-        return settings
-    is_old = settings.source in ("rig", RECORDED) and bool(stale_stores(catalogue, raw, None))
-    if not is_old and _is_there(run, settings):
+        if is_there:
+            return settings
+        raise SceneError(
+            f"what {run.uri} showed is gone or shows something else by now; restore its scene or recording"
+        )
+    is_old = settings.source in (RIG, RECORDED) and bool(stale_stores(catalogue, raw, None))
+    if not is_old and is_there:
         return settings
     asked = {"sweeps": f"{settings.out}/{run.uri}", "out": settings.out, "engine": settings.engine}
     kept = {name: getattr(settings, name) for name in OF_THE_SURVEY}

@@ -67,8 +67,7 @@ class TemporalReader(nn.Module):
         change = (coarse_now - coarse_before) * comparable
         below = F.gelu(self.coarse_enter(torch.cat([coarse_now * comparable, change, comparable], dim=1)))
         below = F.gelu(self.coarse_leave(below))
-        below = F.interpolate(below, scale_factor=float(CELL_PX), mode="nearest")
-        today = observation * seen
+        below, today = F.interpolate(below, scale_factor=float(CELL_PX), mode="nearest"), observation * seen
         taken = torch.cat([torch.stack([light.log(), step.log2()], dim=1), season], dim=1)[:, :, None, None]
         scaled = [(part / 4).clamp(-FAINT / 4, 0) for part in (prior_map, today)]
         known = rests_on.clamp(min=LEAST_LIGHT).log() / 2

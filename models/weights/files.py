@@ -208,8 +208,7 @@ def add_ood(weights: Path, ood_detector: OodDetector, trained_on: TrainedOn, rec
 
     Raises WeightsError: the file cannot be read or written.
     """
-    limits = ood_detector.limits
-    arrays = {name: getattr(ood_detector, name) for name in OF_COMPONENTS}
+    limits, arrays = ood_detector.limits, {name: getattr(ood_detector, name) for name in OF_COMPONENTS}
     arrays |= {name: getattr(limits, name) for name in OF_LIMITS}
     tensors = {name: torch.from_numpy(np.ascontiguousarray(one, np.float32)) for name, one in arrays.items()}
     about = {"bands": ood_detector.bands, "steps": list(limits.steps), "trained_on": trained_on.as_dict()}

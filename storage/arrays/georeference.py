@@ -204,8 +204,7 @@ def find_geobox(
     crs, numbers = odc_crs.CRS(said), str(mapping.get("GeoTransform", "")).split()
     if len(numbers) == 6:
         upright = Affine.from_gdal(*map(float, numbers))
-        flipped = upright * Affine(1, 0, 0, 0, -1, shape[0])
-        axes = _transform_of_axes(arrays, dims)
+        flipped, axes = upright * Affine(1, 0, 0, 0, -1, shape[0]), _transform_of_axes(arrays, dims)
         # GDAL stores netCDF from the bottom up, with the GeoTransform of the image upright.
         bottom_up = axes is not None and axes.almost_equals(flipped, _EVEN * abs(upright.e))
         return odc_geobox.GeoBox(shape, flipped if bottom_up else upright, crs)

@@ -248,6 +248,8 @@ def _hopeless(
     runs = catalogue.named_by(uri)
     if runs and not any(run.settings for run in runs):
         return f"the settings of {runs[-1].uri}, which names it, cannot be read: run that survey again by hand"
+    if runs and not any(can_capture(run) or run.settings.get("source") == "rig" for run in runs):
+        return "what its runs showed is gone or shows something else by now: restore their scene or recording"
     weights = {one.params["weights"] for one in made_of if "weights" in one.params}
     if runs and weights and weights.isdisjoint(map(weights_of, runs)):
         return "made by weights that its survey does not find any more: reprocess builds it again"

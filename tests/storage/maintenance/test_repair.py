@@ -246,6 +246,7 @@ def test_what_was_never_of_the_archive_is_not_thrown_away(tmp_path: Path, archiv
         ("raw", {"versions": VERSIONS | {"segment": 2}}, ""),
         ("raw", {"versions": VERSIONS | {"capture": 2}}, "made by version 1 of the stage capture, which is now 2"),
         ("map", {"versions": VERSIONS | {"capture": 2}}, "made by version 1 of the stage capture, which is now 2"),
+        ("map", {"can_capture": lambda run: False}, "what its runs showed is gone or shows something else by now"),
         ("map", {"weights_of": lambda run: "w1"}, "made by weights that its survey does not find any more"),
         ("mosaic", {"weights_of": lambda run: "w1"}, ""),
     ],
