@@ -100,7 +100,7 @@ class TrainFlags(SceneFlags):
     dim
         Token width of the transformer.
     layers
-        Number of transformer layers.
+        Number of transformer layers. Default: 3, or 1 for frames of 512 px and more.
     heads
         Number of attention heads; a divisor of --dim.
     crop
@@ -128,7 +128,7 @@ class TrainFlags(SceneFlags):
     learning_rate: float | None = None
     train_temporal: Path | None = None
     dim: int = 64
-    layers: int = 3
+    layers: int | None = None
     heads: int = 4
     crop: int | None = None
     batch: int = TrainingSettings.batch
@@ -154,7 +154,7 @@ class TrainFlags(SceneFlags):
             self.columns,
             self.width,
             self.overview_width,
-            tokens={"dim": self.dim, "layers": self.layers, "heads": self.heads},
+            tokens={"dim": self.dim, "heads": self.heads} | ({} if self.layers is None else {"layers": self.layers}),
             choices=self.choices(),
             settings=TrainingSettings(
                 steps=self.steps,

@@ -189,6 +189,8 @@ def suggested_patch(shape: tuple[int, int], *, built_in: bool) -> int:
 
 def network_config(request: TrainRequest, common: Common) -> SegmenterConfig:
     """Return the sizes of the network. Raises SettingsError where they do not fit each other."""
+    deep = common.patch >= DEEP_PATCH_PX
+    usual = {"layers": 1 if deep else SegmenterConfig.layers}
     try:
         return SegmenterConfig(
             classes=len(common.names),
@@ -196,8 +198,8 @@ def network_config(request: TrainRequest, common: Common) -> SegmenterConfig:
             patch=common.patch,
             width=request.width,
             overview_width=request.overview_width,
-            deep=common.patch >= DEEP_PATCH_PX,
-            **request.tokens,
+            deep=deep,
+            **usual | request.tokens,
         )
     except ValueError as error:
         raise SettingsError(f"{error}; choose another --patch, --dim or --heads") from error

@@ -148,7 +148,7 @@ class Stem(nn.Module):
         super().__init__()
         self.enter = nn.Conv2d(inputs, widths[0], 1)
         self.blocks = nn.ModuleList(
-            nn.Sequential(Residual(width), Residual(width)) if deep and level > 1 else Residual(width)
+            nn.Sequential(*(Residual(width) for _ in range(level))) if deep else Residual(width)
             for level, width in enumerate(widths)
         )
         self.down = nn.ModuleList(nn.Conv2d(upper, lower, 2, stride=2) for upper, lower in pairwise(widths))
@@ -168,10 +168,12 @@ class Stem(nn.Module):
 class Head(nn.Module):
     """Decoder of a U-Net: features of each level to features of each pixel."""
 
-    def __init__(self, widths: list[int]) -> None:
+    def __init__(self, widths: list[int], deep: bool = False) -> None:
         super().__init__()
         self.up = nn.ModuleList(nn.Conv2d(lower, 4 * upper, 1) for upper, lower in pairwise(widths))
-        self.blocks = nn.ModuleList(Residual(width) for width in widths[:-1])
+        self.blocks = nn.ModuleList(
+            nn.Identity() if deep and not level else Residual(width) for level, width in enumerate(widths[:-1])
+        )
 
     def forward(self, features: list[Tensor]) -> Tensor:
         """Combine the features of each level, finest first, (B, c, y, x) -> (B, width, y, x) of the finest."""
@@ -202,11 +204,11 @@ class Segmenter(nn.Module):
         self.to_token = nn.Conv2d(widths[-1], dim, BOTTOM, stride=BOTTOM)
         self.encoder = Encoder(dim, config.layers, config.heads, config.mlp_ratio)
         self.from_token = nn.Conv2d(dim, widths[-1] * BOTTOM**2, 1)
-        self.overview_head = Head(widths)
+        self.overview_head = Head(widths, config.deep)
         self.overview_classes = nn.Conv2d(config.overview_width, config.classes, 1)
         self.spectral = nn.Conv2d(config.columns, config.classes, 1)  # linear classifier that the U-Net corrects
-        widths = level_widths(config.width, config.patch, config.deep)
-        self.full_stem = Stem(inputs + config.overview_width, widths, config.deep)
+        widths = level_widths(config.width, config.patch)
+        self.full_stem = Stem(inputs + config.overview_width, widths)
         self.full_head = Head(widths)
         self.full_classes = nn.Conv2d(config.width, config.classes, 1)
         with torch.no_grad():

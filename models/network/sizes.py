@@ -56,7 +56,7 @@ class SegmenterConfig:
     layers: int = 3
     heads: int = 4
     mlp_ratio: int = 3
-    deep: bool = False  # for large frames: more channels and blocks at low levels
+    deep: bool = False  # an overview for large frames: channels and blocks where pixels are few, none at the finest
 
     def __post_init__(self) -> None:
         for name in ("classes", *MOST):
@@ -120,7 +120,7 @@ def multiply_adds(
     overview = spectral + _pyramid(inputs, config.overview_width, TOKEN_PX, deep) + bottom
     drawn = pixels * (basis + config.overview_width * config.classes)
     patch = p * p * (apart * basis + config.width * config.classes) + _pyramid(
-        inputs + config.overview_width, config.width, p, deep
+        inputs + config.overview_width, config.width, p, deep=False
     )
     dim = config.dim  # tokens read each other: L ((4 + 2 r) d^2 N + 2 N^2 d)
     read = config.layers * ((4 + 2 * config.mlp_ratio) * dim * dim * tokens + 2 * tokens * tokens * dim)
@@ -130,7 +130,7 @@ def multiply_adds(
 def _pyramid(inputs: int, width: int, size: int, deep: bool) -> int:
     """Stem and head of a cell of ``size`` px: the way in, residual blocks, and the ways between levels."""
     levels = [(channels, (size >> i) ** 2) for i, channels in enumerate(level_widths(width, size, deep))]
-    blocks = sum((3 if deep and i > 1 else 2) * 9 * c**2 * pixels for i, (c, pixels) in enumerate(levels))
+    blocks = sum((i + min(i, 1) if deep else 2) * 9 * c**2 * pixels for i, (c, pixels) in enumerate(levels))
     blocks -= 9 * levels[-1][0] ** 2 * levels[-1][1]  # the lowest level has none on the way up
     between = sum(8 * upper * lower * pixels for (upper, _), (lower, pixels) in pairwise(levels))
     return inputs * width * size**2 + blocks + between

@@ -157,9 +157,8 @@ def region_bytes(config: SegmenterConfig, region: Region, patch_index: int, band
     p, (y, x) = config.patch, region.grid.padded_shape
     inputs = config.columns + PLANES
     overview, full = (
-        FEATURE_COPIES
-        * sum(channels / 4**level for level, channels in enumerate(level_widths(width, size, config.deep)))
-        for width, size in ((config.overview_width, TOKEN_PX), (config.width, p))
+        FEATURE_COPIES * sum(channels / 4**level for level, channels in enumerate(level_widths(width, size, deep)))
+        for width, size, deep in ((config.overview_width, TOKEN_PX, config.deep), (config.width, p, False))
     )
     drawn = MAP_COPIES * config.classes
     chunk = min(PATCHES_AT_ONCE, patch_index) * p**2 * (full + inputs + config.overview_width)

@@ -21,6 +21,7 @@ from models.training.examples import Batch
 from pipeline.geometry.grid import UNLABELLED
 
 OVERVIEW_WEIGHT = 0.6  # the map with patches has 1
+PATCHED = 0.1  # of the steps of deep networks, whose full network corrects little and costs as much as the rest
 FRACTIONS = ((0.1, 0.2), (0.25, 0.35), (0.5, 0.25), (1.0, 0.2))  # (of the patches, probability)
 
 
@@ -55,17 +56,19 @@ def class_weights(labels: Iterable[NDArray[np.uint8]], classes: int, cap: float)
 def batch_loss(
     model: Segmenter, batch: Batch, weight: Tensor, rng: np.random.Generator, phase: Phase, *, soft_dice: bool
 ) -> Tensor:
-    """Return the loss of one batch: of the map with patches, and of the overview."""
+    """Return the loss of one batch: of the map with patches, and of the overview; in most steps of the latter alone."""
     overview = model.read_overview(batch.image, batch.origin)
+
+    def loss_of(logits: Tensor) -> Tensor:
+        return map_loss(logits, pixel_losses(logits, batch.labels), batch.labels, weight, soft_dice=soft_dice)
+
+    if model.config.deep and rng.random() >= PATCHED:
+        return loss_of(overview.logits)
     patch_index = draw_patches(overview.logits.detach(), model.config, rng, phase)
     cells = cut(batch.detail, model.config.patch)
     chosen = cells.gather(1, patch_index[:, :, None, None, None].expand(-1, -1, *cells.shape[2:]))
     drawn = model.composite(overview.logits, model.read_patches(overview, chosen, patch_index), patch_index)
-    of_map, of_overview = (
-        map_loss(logits, pixel_losses(logits, batch.labels), batch.labels, weight, soft_dice=soft_dice)
-        for logits in (drawn, overview.logits)
-    )
-    return of_map + OVERVIEW_WEIGHT * of_overview
+    return loss_of(drawn) + OVERVIEW_WEIGHT * loss_of(overview.logits)
 
 
 def draw_patches(overview: Tensor, config: SegmenterConfig, rng: np.random.Generator, phase: Phase) -> Tensor:
@@ -100,6 +103,5 @@ def map_loss(logits: Tensor, losses: Tensor, labels: Tensor, weight: Tensor, *, 
     probability = logits.float().softmax(dim=1) * labelled[:, None]
     truth = F.one_hot(labels.where(labelled, 0), logits.shape[1]).permute(0, 3, 1, 2) * labelled[:, None]
     both = (probability * truth).sum(dim=(0, 2, 3))
-    size = probability.sum(dim=(0, 2, 3)) + truth.sum(dim=(0, 2, 3))
-    present = truth.sum(dim=(0, 2, 3)) > 0
+    size, present = probability.sum(dim=(0, 2, 3)) + truth.sum(dim=(0, 2, 3)), truth.sum(dim=(0, 2, 3)) > 0
     return loss + 0.5 * (1 - 2 * both[present] / (size[present] + 1)).mean()

@@ -144,6 +144,17 @@ def test_late_in_a_run_most_draws_go_by_entropy():
     assert 0.7 < first(0.9) < 0.95
 
 
+@pytest.mark.parametrize(("deep", "least", "most"), [(False, 1.0, 1.0), (True, 0.04, 0.2)])
+def test_deep_networks_read_patches_in_few_steps(deep: bool, least: float, most: float):
+    """The full network of a deep one learns in about a tenth of the steps, that of others in every step."""
+    model, rng, weight = Segmenter(replace(CONFIG, deep=deep)), np.random.default_rng(0), torch.ones(3)
+    batch = CropSampler([block_example()], 8, 32).draw(1, rng, SHIFT)
+    losses = [batch_loss(model, batch, weight, rng, phase_at(0.0), soft_dice=False) for _ in range(100)]
+    bias = model.full_classes.bias
+    read = [torch.autograd.grad(loss, bias, allow_unused=True)[0] is not None for loss in losses]
+    assert least <= np.mean(read) <= most
+
+
 def test_unlabelled_pixels_have_no_say():
     """What is predicted at unlabelled pixels changes neither the loss nor its gradient elsewhere."""
     labels = torch.randint(0, 3, (1, 8, 8), generator=torch.Generator().manual_seed(0))
