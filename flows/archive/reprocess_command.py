@@ -28,7 +28,6 @@ from flows.cli.app import ArchiveName, AsJson, Scheduler, Switch, Workers, stder
 from flows.publish.receipt import Receipt
 from flows.publish.run_folder import extend_with_accuracy, load_receipt
 from flows.publish.survey_command import run_survey, show_published
-from flows.settings.load import time_of_visit
 from flows.settings.survey_settings import Settings
 from flows.tasks.open_survey import STAGES, TITLES, OpenSurvey, Products, versions
 from flows.tasks.prefect_tasks import Observer
@@ -146,8 +145,6 @@ def _settings_of(
     """
     here: dict[str, Any] = {"scheduler": pool.scheduler, "workers": pool.workers}
     settings = replace(asked_again(run, archive, weights), **here)
-    if settings.is_map and settings.visit is None:  # the visits of a raster stay as far apart as they were
-        settings = replace(settings, visit=time_of_visit(run))
     prior = settings.prior
     while (newer := renewed.get(prior, prior)) != prior:
         prior = newer

@@ -190,8 +190,7 @@ def _days_since(run: Run, visit: str | None, moment: tuple[int, float] | None) -
     The dates of both visits count, with their times if both have one. Else day and hour of a built-in scene count, else
     whole days of the clock.
     """
-    began = None if run.settings.get("scene") in BUILT_IN_SCENES else run.receipt.get("started")
-    then, now = moment_of(run.settings.get("visit") or began), moment_of(visit)
+    then, now = (moment_of(one) for one in (run.settings.get("visit"), visit))
     if then is not None and now is not None:
         if min(len(str(one)) for one in (run.settings.get("visit"), visit)) <= len("2026-06-01"):  # a date alone
             return float((now.date() - then.date()).days)

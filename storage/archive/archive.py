@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -342,8 +342,10 @@ class Archive:
                     content = content.replace(before.name.encode(), name.encode())
                 draft.write_file(path.name, content)
             facts = {key: value for key, value in manifest.items() if key not in own}
-            begun = datetime.strptime(name[:SECOND], "%Y%m%dT%H%M%S").replace(tzinfo=UTC)  # runs are sorted by it
-            draft.publish(rests_on=rests_on, **facts | {"created": begun.isoformat(timespec="milliseconds")})
+            with suppress(ValueError):  # of a folder that was renamed by hand
+                begun = datetime.strptime(name[:SECOND], "%Y%m%dT%H%M%S").replace(tzinfo=UTC)  # runs are sorted by it
+                facts["created"] = begun.isoformat(timespec="milliseconds")
+            draft.publish(rests_on=rests_on, **facts)
         self.drop_run(uri)
 
     def _named_draft(self, run_id: str) -> RunDraft:
