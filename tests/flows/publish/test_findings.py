@@ -69,7 +69,7 @@ def test_a_plain_scan_is_told_what_its_map_scores_by_itself(survey_png: Survey, 
     (store,) = (tmp_path / "a").glob("stages/segment/*/class_probabilities.zarr")
     said = xr.open_zarr(store, consolidated=False)["log_probability"].values
     said = said - np.log(np.exp(said).sum(axis=-1, keepdims=True))
-    told = expected_score(expected_counts([said], len(CLASSES)), BIAS, 0.01)
+    told = expected_score(expected_counts([said], len(CLASSES)), BIAS, 0.01, 1, 100.0)
     assert receipt["expected"]["miou"] == pytest.approx(told.miou, abs=1e-5)
     assert receipt["expected"]["error"] == pytest.approx(told.error, abs=1e-5)
     assert set(receipt["expected"]["per_class_iou"]) <= set(CLASSES)

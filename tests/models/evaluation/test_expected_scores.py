@@ -18,7 +18,7 @@ from models.evaluation.expected_scores import (
 )
 from models.evaluation.metrics import confusion, iou_per_class, mean_iou
 
-CLASSES = 4
+CLASSES, PLAIN = 4, (LEAST_ERROR, 1, 100.0)
 SEEDS = st.integers(0, 2**32 - 1)
 
 
@@ -71,7 +71,7 @@ def test_a_map_that_is_as_sure_as_it_may_be_expects_what_it_scores(seed: int):
     """Where labels are drawn by the probabilities, the IoU expected is the IoU but for chance."""
     one = _scored(seed)
     assert np.abs(iou_per_class(one.expected) - iou_per_class(one.counts)).max() < 0.06
-    told = expected_score(one.expected, np.zeros(CLASSES))
+    told = expected_score(one.expected, np.zeros(CLASSES), *PLAIN)
     assert abs(told.miou - mean_iou(one.counts)) < 0.04
 
 
@@ -80,9 +80,9 @@ def test_maps_that_are_too_sure_or_not_enough_are_put_right(hotter: float):
     """What other maps of the same kind were off by is taken off: a third of the error is left at most."""
     maps, other = [_scored(seed, hotter) for seed in range(6)], _scored(77, hotter)
     bias, truth = fitted_bias(maps), mean_iou(other.counts)
-    off = expected_score(other.expected, np.zeros(CLASSES)).miou - truth
+    off = expected_score(other.expected, np.zeros(CLASSES), *PLAIN).miou - truth
     assert abs(off) > 0.03
-    assert abs(expected_score(other.expected, bias).miou - truth) < abs(off) / 3
+    assert abs(expected_score(other.expected, bias, *PLAIN).miou - truth) < abs(off) / 3
     assert (bias > 0).all() == (hotter < 1)
 
 
@@ -94,50 +94,50 @@ def test_a_class_that_no_scene_has_is_not_put_right():
     assert fitted_bias([ScoredMap(counts, one.expected)])[2] == 0
 
 
-@pytest.mark.parametrize(("mapped", "half"), [(0, 156.0), (2, 100.0)])
-def test_a_class_of_few_pixels_counts_by_the_odds_that_it_is_there(mapped: int, half: float):
-    """One expected pixel of a class moves the mean by next to nothing; 100 by half, scattered ones at 1.6 %."""
+@pytest.mark.parametrize(
+    ("mapped", "half", "step", "exposure_ms"), [(0, 4738.0, 1, 100.0), (2, 8.94, 1, 100.0), (2, 28.8, 4, 3.0)]
+)
+def test_a_class_of_few_pixels_counts_by_its_probability(mapped: int, half: float, step: int, exposure_ms: float):
+    """One expected pixel hardly moves the mean; more count by half: scattered or sure, and by a quick, wide scan."""
     counts = np.diag([5000.0, 5000.0, 0.0])
-    base = expected_score(counts, np.zeros(3))
+    base = expected_score(counts, np.zeros(3), LEAST_ERROR, step, exposure_ms)
     assert base.miou > 0.99
     means, errors = [], []
     for pixels in (1.0, half, 5000.0):
         some = counts.copy()
         some[2, mapped] = pixels  # scattered: all of them mapped as something else
-        told = expected_score(some, np.zeros(3))
+        told = expected_score(some, np.zeros(3), LEAST_ERROR, step, exposure_ms)
         means.append(told.miou)
         errors.append(told.error)
         assert np.isfinite(told.per_class_iou[2]) == (pixels > half)
-    of_class = 0.995 if mapped else 0.005
+    of_class, first = (0.995, 0.995) if mapped else (0.005, 5000 / (5000 + half))
     assert means[0] == pytest.approx(base.miou, abs=1e-3)
-    assert means[1] == pytest.approx((2 * base.miou + 0.5 * of_class) / 2.5, abs=0.02)
+    assert means[1] == pytest.approx((first + 0.995 + 0.5 * of_class) / 2.5, abs=1e-3)
     assert (means[2] > 0.99) == bool(mapped)
     assert errors[1] > 4 * errors[0]
 
 
 def test_of_nothing_nothing_is_expected():
     """Without a pixel the score is NaN, not 0."""
-    told = expected_score(np.zeros((3, 3)), np.zeros(3))
+    told = expected_score(np.zeros((3, 3)), np.zeros(3), *PLAIN)
     assert np.isnan(told.miou)
     assert np.isnan(told.error)
 
 
 def test_one_scene_tells_of_no_error_but_the_least():
     """A single map is put right by itself, and nobody takes its error for none."""
-    assert error_of_passes([_scored(1)]) == LEAST_ERROR
+    assert error_of_passes([_scored(1)], 1, 100.0) == LEAST_ERROR
 
 
 def test_the_error_of_looks_is_judged_by_the_other_scenes():
     """No map is put right by itself: of two, each by the bias of the other, worked out by hand."""
     one, other = _scored(1, 0.5), _scored(2, 2.0)
-    off = [
-        expected_score(a.expected, fitted_bias([b]), 0.0).miou - mean_iou(a.counts)
-        for a, b in ((one, other), (other, one))
-    ]
-    explained = [expected_score(a.expected, fitted_bias([b]), 0.0).error for a, b in ((one, other), (other, one))]
+    pairs = ((one, other), (other, one))
+    told = [(a, expected_score(a.expected, fitted_bias([b]), 0.0, 1, 100.0)) for a, b in pairs]
+    off, explained = [said.miou - mean_iou(a.counts) for a, said in told], [said.error for _, said in told]
     by_hand = np.sqrt(np.mean(np.square(off) - np.square(explained)))
     assert by_hand > 0.05
-    assert error_of_passes([one, other]) == pytest.approx(by_hand)
+    assert error_of_passes([one, other], 1, 100.0) == pytest.approx(by_hand)
 
 
 def _scores() -> MapScores:
@@ -160,11 +160,11 @@ def test_exposures_between_are_between_by_their_logarithm():
     """Half of the way from 4 to 64 ms is 16 ms; the ends are what was measured."""
     scores, counts = _scores(), _scored(50).expected
     first, middle, last = (scores.expected(counts, 2, ms) for ms in (4.0, 16.0, 64.0))
-    assert first.miou == expected_score(counts, scores.bias[1, 0], scores.error[1, 0]).miou
+    assert first.miou == expected_score(counts, scores.bias[1, 0], scores.error[1, 0], 2, 4.0).miou
     assert middle.miou == pytest.approx((first.miou + last.miou) / 2, abs=0.005)
     assert middle.miou != last.miou
     rounded = scores.expected(counts, 2, 3.96)  # of an exposure, to a tenth of a millisecond
-    assert rounded.miou == first.miou
+    assert rounded.miou == pytest.approx(first.miou, abs=1e-6)
 
 
 @pytest.mark.parametrize(("step", "exposure_ms"), [(4, 16.0), (1, 3.9), (1, 65.0)])

@@ -134,8 +134,7 @@ def test_a_gap_of_less_than_a_point_is_not_closed():
 
 def test_calibration_error_is_how_far_confidence_lies_beside_what_is_right():
     """Sure and right, sure and wrong, unsure by halves; counts of two maps add up, and no pixel has no error."""
-    nine = np.full(10, 0.9)
-    right = np.arange(10) < 9
+    nine, right = np.full(10, 0.9), np.arange(10) < 9
     assert metrics.calibration_error(metrics.confidence_counts(nine, right)) == pytest.approx(0, abs=1e-12)
     assert metrics.calibration_error(metrics.confidence_counts(nine, ~right)) == pytest.approx(0.8)
     assert metrics.calibration_error(metrics.confidence_counts(np.array([0.0, 1.0]), np.array([False, True]))) == 0
