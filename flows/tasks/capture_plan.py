@@ -15,7 +15,7 @@ from flows.settings.survey_settings import ALWAYS, AUTO, NEVER, RECORDED, Settin
 from flows.settings.values import EXTENT_WHOLE, parse_extent_runs, parse_goals
 from models.weights.files import Description
 from pipeline.capture.recorded_passes import RecordedPasses
-from pipeline.errors import BudgetError, NotRecordedError, SettingsError, WeightsError
+from pipeline.errors import BudgetError, NotRecordedError, PoseError, SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, CostModel, Sweep, exposing
@@ -171,7 +171,7 @@ class PassLayout:
         if overlap >= line:
             raise SettingsError(
                 f"--pointing-px {off:g}: sweeps would have to overlap by {overlap:g} px of a line of {line} px; "
-                f"give less than {(line - rest) / 2:g}"
+                + (f"give less than {(line - rest) / 2:g}" if line > rest else "lines are too short to register them")
             )
         return overlap
 
@@ -200,8 +200,7 @@ def choose_uniform_scan(
     SettingsError: the weights lack the class of a goal, or the table starts at longer exposures than the camera's;
     PoseError: the field exceeds the mirror's range.
     """
-    plain = settings.plain
-    content = weights.record.get("scans")
+    plain, content = settings.plain, weights.record.get("scans")
     if content is None:
         if layout.step is None and plain:
             by_hand = "--scan-step" + ("" if settings.source == RECORDED else " and --scan-exposure-ms")
@@ -217,9 +216,10 @@ def choose_uniform_scan(
             known = ", ".join(one for one in record.scores if one != MIOU)
             raise SettingsError(f"--goal {name}={100 * goals[name]:g}: no class of the weights; give one of {known}")
     camera, cost = layout.camera, layout.cost
-    sweeps: dict[int, list[Sweep]] = {}  # by line spacing; of a recording, those that its lines contain
+    sweeps: dict[int, list[Sweep]] = {}  # by line spacing: those that fit the field, or that recorded lines contain
     for step in (one for one in record.steps if one <= camera.samples):
-        with nullcontext() if layout.recorded is None else suppress(NotRecordedError):
+        needed = layout.recorded is None and step == (layout.step or 1)
+        with nullcontext() if needed else suppress(SettingsError, PoseError, NotRecordedError):
             sweeps[step] = layout.uniform(step, layout.exposure_ms).sweeps()[1]
     recorded_ms = None  # by line spacing: recorded lines have exposures of their own
     if layout.recorded is not None:

@@ -14,7 +14,7 @@ from flows.settings.survey_settings import MOST_STEP, RECORDED, Settings
 from flows.tasks.scene import FieldSource
 from pipeline.capture.recorded import RecordedSource
 from pipeline.capture.recorded_passes import RecordedPasses
-from pipeline.capture.straight_scans import covered_field
+from pipeline.capture.straight_scans import EDGE_PX, covered_field
 from pipeline.errors import SceneError, SettingsError
 from pipeline.lazy import GeoBox, Once
 from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster
@@ -132,7 +132,7 @@ def _field_shape(
     sweeps, tangents = [one.sweep for one in recording.sweeps], [one.tangents for one in recording.sweeps]
     covered = covered_field(sweeps, tangents, recording.camera)
     height, width = (
-        size - 2 * int(np.ceil(abs(off) - 1e-6)) for size, off in zip(covered.shape, covered.centre_px, strict=True)
+        int(size - 2 * abs(off) + EDGE_PX) for size, off in zip(covered.shape, covered.centre_px, strict=True)
     )
     y, x = covered.centre_px
     if min(height, width) < 1:

@@ -106,7 +106,7 @@ class RecordedPasses:
         if not planned or len(self._kinds) > 1:  # runs of a fine pass are no scan of the field
             return []
         like, found = planned[0], list[Sweep]()
-        for one in self.source.sweeps:
+        for one in (some for some in self.source.sweeps if some.valid_line.any()):
             scan_px = one.tangents[one.valid_line, 1] / self.source.camera.ifov_rad
             low, high = float(np.nanmin(scan_px)), float(np.nanmax(scan_px))
             found.append(

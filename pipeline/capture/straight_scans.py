@@ -48,6 +48,7 @@ def angles_to_positions(angles_deg: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     return positions, reached
 
 
+EDGE_PX = 0.05  # of their pixel that the outermost lines and samples of a field may lack
 MOST_BEND = 1 / 16  # largest distance of line centres from their swath, as a fraction of a line's length
 MOST_BACK = 8.0  # line spacings that a scan may go back before it counts as turned
 UNEVEN, MOST_EVEN = 0.1, 0.9  # of the line spacing, and fraction of the lines of a scan with gaps that keep to it
@@ -177,18 +178,23 @@ def covered_field(sweeps: Sequence[Sweep], tangents: Sequence[Floats], camera: L
     if len(axes) != 1:
         raise SceneError("the recording has lines along x and along y; state the field's size in px")
     ends = np.array([-0.5, 0.5]) * camera.samples
-    parts: dict[float, list[tuple[float, float]]] = {}
+    parts, across = dict[int, list[tuple[float, float]]](), list[float]()
     for sweep, centres in zip(sweeps, tangents, strict=True):
         known = centres[np.isfinite(centres).all(axis=1)] / camera.ifov_rad
+        if not len(known):
+            continue
         outer = np.array([known[:, 1].min(), known[:, 1].max()])[:, None]
         _, seen = points_of_scan(sweep.swath_px, camera, outer, ends * camera.ifov_rad)
+        across.append(sweep.swath_px)
         parts.setdefault(round(sweep.swath_px), []).append((float(seen[0].max()), float(seen[1].min())))
+    if not parts:
+        raise SceneError("no line of the recording has a position; capture it again, or correct its pointing")
     begin = max(min(low for low, _ in part) for part in parts.values()) - 0.5
     end = min(max(high for _, high in part) for part in parts.values()) + 0.5
     if end - begin < 1:
         raise SceneError("the swaths of the recording have no part of the scan in common; state the field's size in px")
-    low, high = min(parts) + ends[0], max(parts) + ends[1]
-    size, centre = (int(end - begin + 1e-6), int(high - low + 1e-6)), ((begin + end) / 2, (low + high) / 2)
+    low, high = min(across) + ends[0], max(across) + ends[1]
+    size, centre = (int(end - begin + EDGE_PX), int(high - low + EDGE_PX)), ((begin + end) / 2, (low + high) / 2)
     if axes == {"y"}:
         size, centre = size[::-1], centre[::-1]
     return CoveredField(size, centre)

@@ -96,16 +96,16 @@ def _metres_of_units(geobox: GeoBox, column: Any, row: Any) -> Floats:
     """Return the geocentric step (..., X, Y or Z, x or y) [m] of one unit of the map, at places in pixels."""
     assert geobox.crs is not None
     crs = pyproj.CRS.from_wkt(geobox.crs.to_wkt())
-    degrees, ellipsoid = crs.geodetic_crs, crs.get_geod()
-    assert degrees is not None
+    geodetic, ellipsoid = crs.geodetic_crs, crs.get_geod()
+    assert geodetic is not None
     assert ellipsoid is not None
-    to_degrees = pyproj.Transformer.from_crs(crs, degrees, always_xy=True)
+    to_geodetic = pyproj.Transformer.from_crs(crs, geodetic, always_xy=True)
     a, b, c, d, e, f = geobox.affine[:6]
     x, y = a * column + b * row + c, d * column + e * row + f
     step = STEP_M / (crs.axis_info[0].unit_conversion_factor * (ellipsoid.a if crs.is_geographic else 1.0))
 
     def place(dx: float, dy: float) -> Floats:
-        lon, lat = np.radians(to_degrees.transform(x + dx, y + dy))
+        lon, lat = np.multiply(to_geodetic.transform(x + dx, y + dy), geodetic.axis_info[0].unit_conversion_factor)
         normal = ellipsoid.a / np.sqrt(1 - ellipsoid.es * np.sin(lat) ** 2)  # radius of curvature
         across = normal * np.cos(lat)
         places = across * np.cos(lon), across * np.sin(lon), (1 - ellipsoid.es) * normal * np.sin(lat)

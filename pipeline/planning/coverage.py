@@ -26,6 +26,7 @@ from pipeline.geometry.scan import (
 TAPS_BEFORE, TAPS_AFTER = 1, 2  # lines that the resampling kernel reads beside the one at or before a point
 BYTES_PER_SAMPLE = 2  # raw samples are uint16
 ROUNDING_PX = 1e-6
+BEYOND = "beyond the mirror's range; use a smaller scene or a smaller angle per pixel"
 _PROBES = 65  # scan positions at which a swath's reach is computed; it changes by 1e-3 px between two
 
 
@@ -153,21 +154,23 @@ def _swath_centres(
 
     A swath's reach depends on its place, since the line's image is stretched away from the axis. Hence the fixed-point
     iteration; it moves swaths by less than 1 % and converges at once.
+
+    Raises PoseError: no number of swaths covers the field, which is far beyond the mirror's range.
     """
     low, high = field
-    count = 0
-    while True:
-        count += 1
+    most = 2 + int(4 * (high - low) / (camera.samples // binning * binning - least_overlap))
+    for count in range(1, most + 1):
         centres = low + (np.arange(count) + 0.5) * (high - low) / count
         for _ in range(8):
             reach = np.stack([reach_px(float(centre), scan, camera, binning) for centre in centres])
             width = reach[:, 1] - reach[:, 0]
             overlap = (width.sum() - (high - low)) / count
-            if overlap < least_overlap - ROUNDING_PX:
+            if not overlap >= least_overlap - ROUNDING_PX:
                 break
             centres = low - overlap / 2 + np.concatenate([[0.0], np.cumsum(width - overlap)[:-1]]) - reach[:, 0]
         else:
             return centres
+    raise PoseError(f"a field of {high - low:g} px across the swaths is {BEYOND}")
 
 
 def reach_px(swath: float, scan: int, camera: LineCamera, binning: int) -> NDArray[np.float64]:
@@ -186,6 +189,8 @@ def _scan_range(swath: float, seen: NDArray[np.float64], scan: int, camera: Line
     """
     origin = (step - 1 - (scan - 1)) / 2  # centre of the first (coarse) row
     centres, _ = scan_of_points(swath, camera, seen[:, None], origin + step * np.array([0, -(-scan // step) - 1]))
+    if not np.isfinite(centres).all():
+        raise PoseError(f"a field of {scan:g} px along the scan is {BEYOND}")
     # The line through a point moves one way with either coordinate, so the corners hold the extremes.
     first = int(np.floor((centres.min() - origin) / step + ROUNDING_PX)) - TAPS_BEFORE
     last = int(np.floor((centres.max() - origin) / step + ROUNDING_PX)) + TAPS_AFTER

@@ -99,8 +99,7 @@ def _knot_and_sample(curve: KnotCurve, camera: LineCamera, a: Floats, b: Floats,
     scan_path = curve.scan_path
     if curve.even:
         across = np.float64(scan_path.across[len(scan_path) // 2])
-        centre = line_centre(a, b, across)
-        found = np.empty((len(a), 2))
+        centre, found = line_centre(a, b, across), np.empty((len(a), 2))
         np.multiply(centre - scan_path.scan[0], 1 / scan_path.width, out=found[:, 0])
         found[:, 1] = camera.sample_at(camera_slope(a, b, across, centre), binning)
         return found

@@ -211,7 +211,8 @@ def next_path(sweep: Sweep, first: int, camera: LineCamera, *, vector_pairs: int
 
     Raises SettingsError: the positions of one line do not fit the memory. Raises PoseError: one is beyond the disk.
     """
-    stop = first + memory_loads([replace(sweep, lines=sweep.lines - first)], vector_pairs - LEAD)[0].parts[0].lines[1]
+    rest, lead = [replace(sweep, lines=sweep.lines - first)], LEAD if triggered else 0
+    stop = first + memory_loads(rest, vector_pairs, lead=lead)[0].parts[0].lines[1]
     return path_of(sweep, (first, stop), camera, triggered=triggered)
 
 
@@ -272,14 +273,18 @@ def locate_lines(captured: CapturedLines, path: CapturePath, taken: CaptureRecor
         number = np.arange(held)
     else:
         raise UnusableCaptureError(f"{taken.folder}: no line has a frame number; fetch frameIndex")
+    if not ((number >= 0) & (number < path.lines)).any():
+        raise UnusableCaptureError(f"{taken.folder}: frameIndex has no number of the {path.lines} frames of its files")
     exposed = exposing(camera, path.sweep)
     frames = FrameTimes(number, captured.times.stamp_us, exposed.exposure_ms, exposed.frame_ms)
     try:
         tied = _positions(frames, path, taken, camera, total=held + captured.lost)
     except RigError as error:
         raise UnusableCaptureError(f"{taken.folder}: {error}") from error
-    row = np.full(min(int(number.max()) + 1, path.lines), -1, np.int64)
     rows = np.flatnonzero((number >= 0) & (number < path.lines))
+    placed = rows if tied.method == "trigger" else rows[tied.valid[rows]]  # lines after the log's end are taken again
+    row = np.full(int(number[placed].max(initial=-1)) + 1, -1, np.int64)
+    rows = rows[number[rows] < len(row)]
     row[number[rows]] = rows
     return LocatedLines(row, tied, frames.stamp_us)
 

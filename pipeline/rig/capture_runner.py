@@ -94,8 +94,8 @@ class CaptureJournal:
         self._write({"what": "references", "folder": folder, **exposure})
 
     def origin_us(self, sweep: Sweep, stamp_us: int | None = None) -> int | None:
-        """Return the stamp of the sweep's line 0; the first one given is recorded."""
-        if stamp_us is not None and sweep.name not in self._origins:
+        """Return the stamp of the sweep's line 0; one that is given is recorded."""
+        if stamp_us is not None and self._origins.get(sweep.name) != stamp_us:
             self._write({"what": "origin", "sweep": sweep.name, "stamp_us": stamp_us})
         return self._origins.get(sweep.name)
 

@@ -141,7 +141,7 @@ class RigSource:
         line, barren = first, 0
         with self.session() as runner:
             while line < sweep.lines:
-                before, reason = line, "its files end there"
+                before, reason = line, "its files or positions end there"
                 held = self._journal.holding(sweep, line)
                 if held is None:
                     pulses = self.rig.pulses  # they step through the sweep if there is one per position

@@ -82,8 +82,7 @@ def inside(shape: shapely.Geometry) -> np.ndarray[Any, np.dtype[np.bool_]]:
 
 def test_the_map_is_that_of_the_area_without_the_no_go_zones(kept_to: tuple[Path, Published]) -> None:
     """Inside every pixel has a class and a confidence, elsewhere none has."""
-    found = drawn(*kept_to)
-    wanted = inside(AREA) & ~inside(NO_GO)
+    found, wanted = drawn(*kept_to), inside(AREA) & ~inside(NO_GO)
     classed = found.classes != UNLABELLED
     assert (classed != wanted).sum() <= 2 * (NO_GO.length + AREA.length) / 100  # on the border alone, if at all
     assert np.array_equal(classed, np.isfinite(found.confidence))
@@ -197,12 +196,13 @@ def test_polygons_in_any_crs_are_the_same_zones(opened: Opened, tmp_path: Path) 
     ("kind", "box", "crs", "pose", "words"),
     [
         ("area", (300, 0, 400, 50), None, None, "expected some in x 0 to 128.*got x 300 to 400"),
+        ("plots", (-3.5, 0, -0.5, 50), None, None, "do not lie on the field"),
         ("area", (10.1, 10.1, 10.3, 10.3), None, None, "smaller than a pixel"),
         ("area", (7.5, 51.9, 7.7, 52), 4326, None, r"WGS 84.*give the rig's \[pose\]"),
         ("area", (8.5, 51.9, 8.7, 52), 4326, POSE, "x 7.6.*got x 8.5 to 8.7"),
         ("no_go", (0, 0, 200, 200), None, None, "nothing is left to survey"),
     ],
-    ids=["beside", "tiny", "no place", "another farm", "all of it"],
+    ids=["beside", "at the border", "tiny", "no place", "another farm", "all of it"],
 )
 def test_a_wrong_zone_is_refused(
     opened: Opened, tmp_path: Path, kind: str, box: Any, crs: int | None, pose: Any, words: str

@@ -179,7 +179,7 @@ def _prior_map_figures(
 
 
 STORE = "ground_map.zarr"
-GROUND = Product("ground", version=4, files=(STORE,))
+GROUND = Product("ground", version=5, files=(STORE,))
 
 
 @stage("ground", "map in a projected CRS", GROUND)

@@ -341,14 +341,14 @@ def times_of_lines(index: FrameIndex, first_frame: int, lines: int, lost: int = 
     as the file has lines, with or without the ``lost`` ones at its end. Then it lists these lines, whatever the
     numbers: the camera dropped the others. An index of a later file that begins at 0 counts from that file's start.
     """
-    if len(index.frame) in (lines, lines + lost):
-        dropped = int(index.frame[-1] - index.frame[0]) + 1 - len(index.frame)
+    frame = index.frame + (first_frame if index.frame[0] == 0 else 0)
+    if len(frame) in (lines, lines + lost):
+        dropped = int(frame[-1] - frame[0]) + 1 - len(frame)
         notes = (f"{dropped} frames between the first and the last were dropped by the camera",) if dropped else ()
-        return LineTimes(index.frame[:lines], index.stamp_us[:lines], notes)
-    found = LineTimes.unknown(lines)
-    place = index.frame - (0 if index.frame[0] == 0 else first_frame)
+        return LineTimes(frame[:lines], index.stamp_us[:lines], notes)
+    found, place = LineTimes.unknown(lines), frame - first_frame
     inside = (place >= 0) & (place < lines)
-    found.frame[place[inside]] = index.frame[inside]
+    found.frame[place[inside]] = frame[inside]
     found.stamp_us[place[inside]] = index.stamp_us[inside]
     known, beyond = int(np.count_nonzero(inside)), int(np.count_nonzero(~inside))
     findings: tuple[str, ...] = () if known == lines else (f"the frame index has the time of {known} of {lines} lines",)

@@ -77,8 +77,7 @@ class SceneView:
         ``held`` are (line, step, 2) positions of the device during each exposure, ``times_ms`` exposure and frame
         period. Drifts count from ``started_s``, the sweep's start, unless the source's own clock has it.
         """
-        sweep = replace(sweep, binning=1)
-        rig = self._rig(times_ms)
+        sweep, rig = replace(sweep, binning=1), self._rig(times_ms)
         position = self.mounting.to_model(held)
         number = self.numbers(sweep, position)
         planned = sweep_positions(sweep, rig.camera)[number]

@@ -263,8 +263,7 @@ def raster_from_values(
             " no data, or give the values in a larger unit"
         )
     planes = np.ascontiguousarray(values, dtype=np.float32)
-    bright = _bright_value(planes, name)
-    missing = _missing_pixels(planes)
+    bright, missing = _bright_value(planes, name), _missing_pixels(planes)
     if missing is not None and labels is not None:
         labels = np.where(missing, np.uint8(UNLABELLED), labels)
     planes, filled = _fill_by_median(planes)

@@ -120,8 +120,7 @@ def test_what_is_unknown_has_no_confidence_on_the_map_either(run: Run, stores: S
 def test_map_and_picture_lie_where_the_rays_end(run: Run, stores: Stores) -> None:
     """Each scene pixel's class is found where its ray meets the ground; the mosaic's ramp rises towards the rig."""
     ref = draw(run, stores)
-    found = load_ground_map(ref.path / STORE)
-    grid = run.ground_grid
+    found, grid = load_ground_map(ref.path / STORE), run.ground_grid
     y, x = pixel_places(SHAPE)
     points = np.stack(np.meshgrid(y[10:-10:9], x[10:-10:9], indexing="ij"), axis=-1).reshape(-1, 2)
     places = grid.frame.ground_to_map(grid.frame.view.scene_to_ground(points))
@@ -183,8 +182,7 @@ def test_a_first_look_has_ages_and_no_changes(run: Run, stores: Stores) -> None:
 def test_the_store_has_hectares_and_where_it_was_seen_from(run: Run, stores: Stores) -> None:
     """Areas are sums of footprints at any resolution; plain xarray reads pose, counts of pixels and CRS."""
     ref = draw(replace(run, settings=Settings(pose=POSE, map=MapChoice(resolution_m=0.02))), stores)
-    areas = load_ground_map(ref.path / STORE).areas
-    grid = run.ground_grid
+    areas, grid = load_ground_map(ref.path / STORE).areas, run.ground_grid
     exact = grid.frame.view.area_m2(np.stack(np.meshgrid(*pixel_places(SHAPE), indexing="ij"), axis=-1))
     assert areas["weed"]["m2"] == pytest.approx(exact[:, :80].sum(), rel=1e-12)
     assert areas["crop"]["m2"] == pytest.approx(exact[30:, 80:].sum(), rel=1e-12)

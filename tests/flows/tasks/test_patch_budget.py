@@ -98,8 +98,7 @@ def test_the_least_that_a_refusal_names_is_the_least() -> None:
 
 def test_numbers_are_limits_too() -> None:
     """Half of everything, given as a number, buys what 50 % does; a number that is too small is told the least."""
-    half = _budget(macs="50%")
-    one = np.linspace(1, 2, PATCHES)
+    half, one = _budget(macs="50%"), np.linspace(1, 2, PATCHES)
     np.testing.assert_array_equal(_budget(macs=str(half.everything // 2)).choose(one), half.choose(one))
     with pytest.raises(BudgetError, match=r"the least is --\S+ \d+$"):
         _asked(macs="10")

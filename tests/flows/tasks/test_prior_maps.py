@@ -241,8 +241,7 @@ def test_other_classes_are_found_by_their_names(visited: Path, survey_png: Surve
 
 def test_visits_are_reprocessed_in_order(visited: Path, twice: Any, make_weights: WeightsMaker) -> None:
     """With other weights the second visit goes on from the first as it was made again, not as it was."""
-    weights = make_weights(width=4)
-    told = io.StringIO()
+    weights, told = make_weights(width=4), io.StringIO()
     run_reprocess(visited, Console(file=told, width=300), weights=weights)
     runs = [read_run(path) for path in sorted(visited.glob("runs/*"))]
     again = [run for run in runs if run.folder.name not in (twice[1].folder.name, twice[2].folder.name)]
@@ -292,8 +291,7 @@ def test_a_rig_that_was_moved_between_two_parts_is_noticed(survey_png: Survey, t
 def test_a_rig_that_was_turned_is_noticed(survey_png: Survey, tmp_path: Path) -> None:
     """By four degrees: its memory is put aside, and receipt and page say by how much."""
     values, _ = patchy_scene((300, 320), 3, seed=6)
-    soft = gaussian_filter(values, (1.5, 1.5, 0))
-    there = np.s_[2:290, 8:312]
+    soft, there = gaussian_filter(values, (1.5, 1.5, 0)), np.s_[2:290, 8:312]
     images = {"before": soft[there], "now": rotate(soft, 4.0, reshape=False, order=1, mode="nearest")[there]}
     for name, image in images.items():
         Image.fromarray(np.clip(image, 0, 255).astype(np.uint8)).save(tmp_path / f"{name}.png")

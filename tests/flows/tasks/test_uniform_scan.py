@@ -244,6 +244,17 @@ def test_all_scenes_need_no_flag(weights: Path, tmp_path: Path, shape: tuple[int
         assert any("every line is captured" in note for note in published.receipt["settings"]["notes"])
 
 
+def test_spacings_that_do_not_fit_are_no_candidates(tmp_path: Path) -> None:
+    """Every 8th line of 640 px cannot overlap by 712 px: others are offered, and it is refused if asked for."""
+    farm = {"scene": "farm", "size": "160x128", "out": str(tmp_path), "pointing_px": "100"}
+    scans = plan_content(load_settings(None, farm | {"scan_step": "1"}))["scans"]
+    assert {one["step"] for one in scans["candidates"]} == {1, 2, 4}
+    with pytest.raises(SettingsError, match="overlap by 712 px of a line of 640 px; give less than 64"):
+        open_run(load_settings(None, farm | {"scan_step": "8"}), planning=True)
+    with pytest.raises(SettingsError, match="a line of 64 px; lines are too short"):
+        open_run(load_settings(None, farm | {"camera.samples": "64"}), planning=True)
+
+
 def test_candidates_are_those_of_the_weights_that_would_read_them(tmp_path: Path) -> None:
     """The farm has two files of weights: plan names one reference, whatever was asked for."""
     farm = {"scene": "farm", "size": "160x128", "out": str(tmp_path)}

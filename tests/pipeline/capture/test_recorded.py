@@ -113,8 +113,7 @@ def test_a_lost_line_serves_only_where_no_other_does() -> None:
 
 def test_a_line_that_serves_twice_is_valid_once() -> None:
     """Recorded lines 1.25 px apart serve a plan of 1 px; where two planned lines share one, it counts once."""
-    source = simulated()
-    wide = _lines_apart(1.25)
+    source, wide = simulated(), _lines_apart(1.25)
     found = list(recorded_source(source, [wide]).lines(Sweep("fine-0", "fine", "x", 0.0, -10.0, 10)))
     places = [line.mirror_x for line in found]
     assert len(set(places)) == sum(line.valid for line in found) < 10

@@ -53,6 +53,9 @@ def test_a_pass_is_laid_on_the_recorded_swaths() -> None:
         found.line_px(), -39.5 + 4 * np.arange(21), atol=1e-5
     )  # the last recorded line serves the last
     assert passes.full_scan([FULL]) == [ASIDE]
+    blank = replace(record(simulated(), replace(ASIDE, name="blank", swath_px=30.0)), valid_line=np.zeros(80, bool))
+    source = recorded_source(simulated(), [*passes.source.sweeps, blank])
+    assert RecordedPasses(source).first_pass([COARSE]) == [found]  # no line of the other swath is valid
 
 
 def test_lines_that_serve_twice_count_once() -> None:

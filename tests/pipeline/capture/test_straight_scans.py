@@ -107,6 +107,12 @@ def test_the_covered_field_of_one_straight_scan_is_its_size() -> None:
     np.testing.assert_allclose(found.centre_px, (59.5, 0.0), atol=1e-6)
     turned = covered_field([replace(sweep, along="y")], [tangents], CAMERA)
     assert turned.shape == (640, 100)
+    beside = replace(sweep, swath_px=0.4)  # its lines are turned by less than can be seen
+    tangents = direction_to_scene(position_to_direction(line_positions(beside, CAMERA)))
+    found = covered_field([sweep, beside], [np.full((4, 2), np.nan), tangents], CAMERA)  # one without a position
+    assert (found.shape, round(found.centre_px[1], 6)) == ((100, 640), 0.4)
+    with pytest.raises(SceneError, match="no line of the recording has a position"):
+        covered_field([sweep], [np.full((4, 2), np.nan)], CAMERA)
 
 
 def test_swaths_without_a_common_part_are_refused() -> None:

@@ -41,8 +41,7 @@ def test_frames_are_never_faster_than_the_camera(exposure: float, readout: float
 @pytest.mark.parametrize("binning", [1, 2, 3, 4, 7])
 def test_binned_rays_are_the_middle_of_theirs(binning: int):
     """A binned sample looks along the mean slope of those it sums; all lie about the axis when none is dropped."""
-    fine = CAMERA.pixel_slopes()
-    count = CAMERA.samples // binning
+    fine, count = CAMERA.pixel_slopes(), CAMERA.samples // binning
     expected = fine[: count * binning].reshape(count, binning).mean(axis=1)
     assert CAMERA.pixel_slopes(binning) == pytest.approx(expected, abs=1e-16)
     assert fine.sum() == pytest.approx(0, abs=1e-12)

@@ -123,8 +123,7 @@ def test_throughput_follows_the_tilt():
     """x0.72 to 1.21 over the field of 10240 x 10240 px, x0.48 to 1.33 over the disk, exactly 1 at rest."""
     side = np.linspace(-5120, 5120, 201) * 105.714e-6
     normals = direction_to_normal(scene_to_direction(np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)))
-    field = -normals[:, 2] * np.sqrt(2)
-    turn = np.linspace(0, 2 * np.pi, 721)
+    field, turn = -normals[:, 2] * np.sqrt(2), np.linspace(0, 2 * np.pi, 721)
     rim = mirror_throughput(np.stack([np.cos(turn), np.sin(turn)], axis=-1))
     assert (field.min(), field.max()) == pytest.approx((0.72, 1.21), abs=0.006)
     assert (rim.min(), rim.max()) == pytest.approx((0.48, 1.33), abs=0.005)

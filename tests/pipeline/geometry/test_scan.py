@@ -85,8 +85,7 @@ def test_sweeps_out_of_reach_are_refused():
 
 def test_price_counts_lines_setups_and_reloads():
     """Two sweeps of 1000 coarse lines hold 8000 positions: six reloads beside lines and set-ups."""
-    cost = CostModel()
-    path = sweep(lines=1000, step=4)
+    cost, path = CostModel(), sweep(lines=1000, step=4)
     assert cost.setup_seconds(LineCamera(readout_ms=5)) == pytest.approx(0.05 + 0.2 + 2 * 0.105)
     assert cost.seconds([path, path], CAMERA) == pytest.approx(200 + 2 * 0.45 + 6 * 1.6)
     assert cost.seconds([], CAMERA) == 0

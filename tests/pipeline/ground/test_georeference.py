@@ -15,6 +15,7 @@ from pipeline.ground.georeference import is_in_metres, pixel_rows_m2, pixel_side
 
 PLACES = {32632: (8.0, 51.0), 3857: (8.0, 60.0), 3035: (8.0, 51.0), 4326: (8.0, 51.0), 2263: (-74.0, 40.7)}
 PLACES |= {6933: (8.0, 51.0), 3413: (0.0, 90.0)}  # stretched to equal areas; a corner at the pole
+PLACES |= {27572: (2.5, 47.0)}  # of a datum in grads
 
 
 def box(epsg: int, step: float, turn: float = 20, shape: tuple[int, int] = (300, 400)) -> GeoBox:
@@ -46,7 +47,7 @@ def test_areas_are_those_of_the_ellipsoid(epsg: int, step: float) -> None:
 
 def test_a_metre_of_the_map_is_one_on_the_ground_or_not() -> None:
     """Within 1 % in every direction: neither where a projection stretches both, nor one on the cost of the other."""
-    assert [epsg for epsg in PLACES if is_in_metres(box(epsg, 1e-4))] == [32632, 3035]
+    assert [epsg for epsg in PLACES if is_in_metres(box(epsg, 1e-4))] == [32632, 3035, 27572]
 
 
 @given(st.integers(1, 70), st.integers(1, 70), st.sampled_from([1, 2, 4, 8]), st.floats(-180, 180))

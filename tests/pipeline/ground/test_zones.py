@@ -76,8 +76,7 @@ def test_less_than_a_pixel_is_touched_and_holds_no_centre() -> None:
 def test_the_way_to_a_map_and_back_is_none(crs: int) -> None:
     """A polygon in pixels, brought to the ground and to another CRS, comes back to its pixels."""
     place, drawn = posed(), shapely.segmentize(shapely.Polygon([(5, 5), (70, 8), (60, 50), (9, 44)]), 1)
-    frame = place.grid.frame
-    middle = np.array([SHAPE[1], SHAPE[0]]) / 2
+    frame, middle = place.grid.frame, np.array([SHAPE[1], SHAPE[0]]) / 2
     on_map = shapely.transform(
         drawn, lambda at: frame.ground_to_map(place.view.scene_to_ground((at - middle)[:, ::-1]))
     )

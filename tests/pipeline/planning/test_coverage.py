@@ -78,6 +78,9 @@ def test_fields_beyond_the_mirror_are_refused():
         full_sweeps(grid, CAMERA, "x")
     with pytest.raises(PoseError, match="beyond the mirror's range"):
         cheapest_full(SceneGrid(24_000, 24_000, 32), CAMERA, COST)
+    for shape in ((1024, 1280), (4000, 64)):  # neither any number of swaths of such a lens, nor any line, reaches them
+        with pytest.raises(PoseError, match="beyond the mirror's range"):
+            cheapest_full(SceneGrid(*shape, 16), LineCamera(focal_length_mm=3.0), COST)
 
 
 @pytest.mark.parametrize("along", ["x", "y"])

@@ -26,8 +26,7 @@ FINE_NM = np.arange(400.0, 1000.0, 5.0)
 )
 def test_an_index_is_its_papers_formula_of_the_nearest_bands(name: str, nm: dict[float, float], value: float) -> None:
     """Worked out by hand; every other band of the cube holds what would spoil it."""
-    index = find_index(name)
-    cube = np.full((1, 2, len(FINE_NM)), 0.9)
+    index, cube = find_index(name), np.full((1, 2, len(FINE_NM)), 0.9)
     for centre, level in nm.items():
         cube[..., centre == FINE_NM] = level
     bands = list(pick_bands(index, FINE_NM))

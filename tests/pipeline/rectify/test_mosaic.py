@@ -74,8 +74,7 @@ def test_a_band_without_a_value_is_the_other_sweeps() -> None:
 
 def test_a_point_alone_is_summed_as_among_others() -> None:
     """One point of one band in many sweeps, some without a value, is mixed in the order in which many points are."""
-    rng = np.random.default_rng(5)
-    full = np.ones(40, np.float32)
+    rng, full = np.random.default_rng(5), np.ones(40, np.float32)
     parts = [
         MosaicPart(
             np.where(rng.random((40, 1)) < 0.3, np.nan, rng.random((40, 1))).astype(np.float32),

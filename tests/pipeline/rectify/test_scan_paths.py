@@ -156,8 +156,7 @@ def test_numbers_are_those_of_the_lines_that_came(lines: list[int], pace: float,
 @given(st.integers(0, 99), st.integers(3, 40))
 def test_copies_and_wild_stamps_change_no_other_line(seed: int, lines: int) -> None:
     """A frame sent again and a single wild stamp are marked; the others keep the numbers that they had."""
-    rng = np.random.default_rng(seed)
-    time = np.arange(float(lines))
+    rng, time = np.random.default_rng(seed), np.arange(float(lines))
     again = rng.integers(0, lines)
     sent = np.insert(time, again + 1, time[again])
     sent = np.insert(sent, rng.integers(1, lines - 1), rng.choice([-50.0, 1e6]))

@@ -302,8 +302,7 @@ class CellLost(Fault):
         memory, cells = device.state.memory, slice(offset // CELL, (offset + length) // CELL)
         if register != VECTOR_MEMORY or not self.chance.comes():
             return None
-        before = memory[cells].copy()
-        reply = device.carry_out(request)
+        before, reply = memory[cells].copy(), device.carry_out(request)
         differing = np.flatnonzero(memory[cells] != before)
         if differing.size:
             place = self.chance.random.choice(differing.tolist())

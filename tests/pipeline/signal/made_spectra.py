@@ -36,8 +36,7 @@ def field_of(
     seed: int, shape: tuple[int, int] = (96, 96), bands: int = 40, materials: int = 3, signal: float = 30.0
 ) -> Field:
     """Materials that vary over some px, each by ``signal`` deviations of a band's noise, around a value of 1."""
-    rng = np.random.default_rng(seed)
-    noise = np.linspace(4, 10, bands) * GAIN
+    rng, noise = np.random.default_rng(seed), np.linspace(4, 10, bands) * GAIN
     clean = np.ones((*shape, bands))
     for _ in range(materials):
         amount, spectrum = gaussian_filter(rng.normal(size=shape), 4), gaussian_filter(rng.normal(size=bands), 2)

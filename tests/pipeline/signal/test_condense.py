@@ -117,8 +117,7 @@ def test_many_components_and_few_bands_left_mark_nothing() -> None:
     """Half of the bands saturated and half as many components: few degrees of freedom make nothing rare."""
     made = field_of(6, bands=30, materials=9)
     found = statistics_of(made.values)
-    law = find_components(found)
-    valid = np.ones(made.values.shape, np.bool_)
+    law, valid = find_components(found), np.ones(made.values.shape, np.bool_)
     valid[40:60, :, 1::2] = False
     assert not marked(made.values, found, law, valid).any()
 
@@ -228,8 +227,7 @@ def test_planted_spectra_are_marked(condensed: tuple, shape: tuple[int, int], si
 def test_neighbours_are_found_together_that_none_shows_alone(condensed: tuple) -> None:
     """.7 deviations a band: a pixel of it is nearly never rare, most of the blocks and lines of 8 are."""
     made, found, law = condensed
-    rng = np.random.default_rng(9)
-    kept = {}
+    rng, kept = np.random.default_rng(9), {}
     for name, shape in SHAPES.items():
         values, there = made.values.copy(), np.zeros(made.values.shape[:2], np.bool_)
         for line, sample in np.ndindex(6, 6):

@@ -108,8 +108,7 @@ def test_a_bright_field_has_no_more_components(signal: float) -> None:
 
 def test_a_weak_component_that_neighbours_share_is_found() -> None:
     """3 % of one pixel's noise variance, spread over some px, no single spectrum shows: the means of 4 x 4 do."""
-    made = field_of(5, (192, 192))
-    rng = np.random.default_rng(6)
+    made, rng = field_of(5, (192, 192)), np.random.default_rng(6)
     direction = rng.normal(size=40)
     direction /= np.linalg.norm(direction)
     amount = gaussian_filter(rng.normal(size=(192, 192)), 5)
@@ -123,8 +122,7 @@ def test_a_weak_component_that_neighbours_share_is_found() -> None:
 @pytest.mark.parametrize("bands", [12, 32])
 def test_noise_alone_gives_no_more_components_than_stated(bands: int) -> None:
     """Of 120 fields of noise at most so many have a component that a rate of 10 % exceeds once in a thousand times."""
-    noise = np.linspace(1, 3, bands)
-    alarms = 0
+    noise, alarms = np.linspace(1, 3, bands), 0
     for seed in range(TRIALS):
         values = with_noise(np.full((48, 48, bands), 100.0), noise, seed)
         alarms += len(find_components(statistics_of(values), least=0, false_alarm=FALSE_ALARM)) > 0
@@ -203,8 +201,7 @@ def test_small_fields_keep_a_weak_difference_of_a_small_part() -> None:
 def test_large_fields_keep_what_is_proved() -> None:
     """Half a million spectra are enough for the test alone."""
     found, wavelength = statistics_of(field_of(2, bands=60).values), np.linspace(400, 900, 60)
-    proved = len(find_components(found, least=4))
-    counts = []
+    proved, counts = len(find_components(found, least=4)), []
     for found.expected in (SMALL_FIELD - 1, SMALL_FIELD):
         counts.append(len(components_of_field(found, wavelength, false_alarm=0.01, least=4)))
     assert counts[0] > counts[1] == proved

@@ -55,8 +55,7 @@ class Tile:
 def random_tile(number: int, focus_m: float | None = None) -> Tile:
     """Give the tile of a number, always the same; kinds take turns. ``focus_m``: of a scene 40 m away; None: sharp."""
     rng = np.random.default_rng([17, number])
-    kind = KINDS[number % len(KINDS)]
-    size = TILE_PX + 2 * EDGE_PX
+    kind, size = KINDS[number % len(KINDS)], TILE_PX + 2 * EDGE_PX
     values = np.full((size, size), rng.choice([0.0, 0.1, 0.5]))
     values[EDGE_PX:-EDGE_PX, EDGE_PX:-EDGE_PX] = _drawn(rng, kind, float(values[0, 0]))
     nm = float(rng.uniform(450, 1000))

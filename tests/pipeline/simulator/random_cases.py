@@ -76,8 +76,7 @@ class Case:
 def random_case(number: int) -> Case:
     """Give the case of a number, always the same."""
     rng = np.random.default_rng([6, number])
-    rig = random_rig(rng)
-    upright = bool(rng.random() < 0.3)
+    rig, upright = random_rig(rng), bool(rng.random() < 0.3)
     scene = _scene(rng, rig.camera, upright=upright, long_px=LONG_PX)
     far = float(rng.choice([0.0, rng.uniform(-LONG_PX / 2 + 40, LONG_PX / 2 - 40)]))
     step = int(rng.choice([1, 1, 1, 4]))

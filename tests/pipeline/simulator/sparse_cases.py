@@ -25,8 +25,7 @@ KINDS = (*IN_BANDS, "beside fields", "beside points", "bright line", "pixel")
 def sparse_case(number: int) -> Case:
     """Give the case of a number, always the same; kinds take turns."""
     rng = np.random.default_rng([11, number])
-    kind = KINDS[number % len(KINDS)]
-    rig = random_rig(rng)
+    kind, rig = KINDS[number % len(KINDS)], random_rig(rng)
     samples = rig.camera.samples
     if kind in IN_BANDS:
         values = _cube(rng, kind)

@@ -31,8 +31,7 @@ def random_light(seed: int, bands: int = 90, samples: int = SAMPLES, lines: int 
     """Wavelengths [nm] at uneven distances, and patches of a few spectra with edges and absorption lines [e-]."""
     rng = np.random.default_rng(seed)
     wavelength = 400 + np.cumsum(rng.uniform(1.5, 3.0, bands))
-    place = wavelength[None, :]
-    spectra = np.full((4, bands), 300.0)
+    place, spectra = wavelength[None, :], np.full((4, bands), 300.0)
     for _ in range(5):
         centre, width = rng.uniform(400, 620, (4, 1)), np.exp(rng.uniform(np.log(2), np.log(80), (4, 1)))
         spectra = spectra + rng.uniform(0, 3000, (4, 1)) / (1 + np.exp(-(place - centre) / width))

@@ -232,8 +232,7 @@ class Nudge:
 
 def test_aims_and_displacements_move_the_view() -> None:
     """Near rest an aim and a displacement by whole px show the neighbouring lines' samples."""
-    scene = grainy()
-    sweep = replace(NEAR, swath_px=0.0, start_px=-20.0)
+    scene, sweep = grainy(), replace(NEAR, swath_px=0.0, start_px=-20.0)
     plain = expected_light(scene, block_of(scene, sweep, range(16)), {SLIT: "3x1"})[:, 310:330]
     for do in ("aim", "displaced"):
         moved = expected_light(scene, block_of(scene, sweep, range(2, 16)), {Nudge(do): "only", SLIT: "3x1"})

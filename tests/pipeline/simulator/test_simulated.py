@@ -190,8 +190,7 @@ def test_calibration_takes_out_what_it_sees(names: tuple[str, ...]) -> None:
 
     The names, then the raw numbers with none of them, are not the same: there was something to take out.
     """
-    source = white_reference_source_of(*names)
-    sweep = WHITE_REFERENCE_SWEEP
+    source, sweep = white_reference_source_of(*names), WHITE_REFERENCE_SWEEP
     raw, position = source.render(sweep, range(sweep.lines)), line_positions(sweep, WHITE_REFERENCE_CAMERA)
     values, _ = calibrate(raw, source.references(sweep), saturated_dn=65535 * sweep.binning, position=position)
     np.testing.assert_allclose(values, 0.4, atol=2e-4)

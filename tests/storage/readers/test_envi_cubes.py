@@ -178,8 +178,7 @@ def test_what_is_no_text(tmp_path: Path) -> None:
 
 def test_headers_of_real_instruments(real_data: Path) -> None:
     """All 42 headers are read or refused with the reason; none is misread silently."""
-    refused = {}
-    read = {}
+    refused, read = {}, {}
     for path in sorted((real_data / "envi_headers").glob("*.hdr")):
         try:
             read[path.name] = load_envi_header(path)

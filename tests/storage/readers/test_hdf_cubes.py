@@ -85,8 +85,7 @@ def neon_file(path: Path, **about: Any) -> None:
 def test_neon_reflectance(tmp_path: Path) -> None:
     """Divided by its scale, without the number for no data, on the grid of its map info."""
     neon_file(tmp_path / "NEON_SERC.h5")
-    scene = load_scene_file(tmp_path / "NEON_SERC.h5")
-    expected = CUBE / 10000
+    scene, expected = load_scene_file(tmp_path / "NEON_SERC.h5"), CUBE / 10000
     expected[1, 1] = np.nan
     np.testing.assert_allclose(scene.values, expected, rtol=1e-6)
     np.testing.assert_array_equal(scene.wavelength_nm, NM)

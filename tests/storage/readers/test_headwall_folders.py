@@ -63,8 +63,7 @@ def test_lines_in_no_file_are_flagged(tmp_path: Path, lines: NDArray[np.uint16])
     """A part that is cut off, or not there, leaves lines between; the last one's lost lines stand at the end."""
     write_part(tmp_path, "raw_0", lines[:6], lines=10)
     write_part(tmp_path, "raw_10", lines[10:20], lines=12)
-    source = open_cube(tmp_path)
-    missing = [6, 7, 8, 9, 20, 21]
+    source, missing = open_cube(tmp_path), [6, 7, 8, 9, 20, 21]
     assert source.shape[0] == 22
     assert np.flatnonzero(~source.lines.valid).tolist() == missing
     np.testing.assert_array_equal(source.read(0, 22)[source.lines.valid], lines[[*range(6), *range(10, 20)]])
@@ -176,22 +175,24 @@ def test_no_frame_at_all(tmp_path: Path, text: str) -> None:
             ("1 frames between the first and the last were dropped by the camera",),
         ),
         # the index of a later part that counts from 0 counts from the part's own start
-        ({0: 10, 1: 20}, (2000, 3), 0, [0, 1, -1], None),
+        ({0: 10, 1: 20}, (2000, 3), 0, [2000, 2001, -1], ("the frame index has the time of 2 of 3 lines",)),
+        ({0: 10, 1: 20, 2: 30}, (2000, 3), 0, [2000, 2001, 2002], ()),
         # a file that lost its last line still has its lines in order, where frames had been dropped before
-        ({0: 10, 1: 20, 3: 40, 4: 50}, (0, 3), 1, [0, 1, 3], None),
+        (
+            {0: 10, 1: 20, 3: 40, 4: 50},
+            (0, 3),
+            1,
+            [0, 1, 3],
+            ("1 frames between the first and the last were dropped by the camera",),
+        ),
     ],
 )
 def test_times_of_lines(
-    tmp_path: Path,
-    frames: dict[int, int],
-    first: tuple[int, int],
-    lost: int,
-    found: list[int],
-    notes: tuple[str, ...] | None,
+    tmp_path: Path, frames: dict[int, int], first: tuple[int, int], lost: int, found: list[int], notes: tuple[str, ...]
 ) -> None:
     """Whatever the camera dropped and the file lost, each line has the time of its own frame, or none."""
     index = load_frame_index(_index(tmp_path, "f t\n" + "".join(f"{frame} {at}\n" for frame, at in frames.items())))
     times = times_of_lines(index, *first, lost=lost)
-    assert times.stamp_us.tolist() == [frames.get(frame, -1) for frame in found]
-    if notes is not None:
-        assert (times.frame.tolist(), times.notes) == (found, notes)
+    own = first[0] if 0 in frames else 0
+    assert times.stamp_us.tolist() == [frames.get(frame - own, -1) for frame in found]
+    assert (times.frame.tolist(), times.notes) == (found, notes)

@@ -195,8 +195,7 @@ def dig_ponds(work: Painting) -> None:
 def crowns_of(work: Painting) -> Points:
     """Return the crowns of hedges and of trees beside the lines: y, x and radius, (n, 3)."""
     plan = work.plan
-    rng = stream(plan.seed, "trees")
-    trees = [np.zeros((0, 3))]
+    rng, trees = stream(plan.seed, "trees"), [np.zeros((0, 3))]
     for border in [border for border, _ in plan.borders]:
         count = rng.poisson(border.length / 320)
         step = (border.end - border.start) / max(border.length, 1e-9)
@@ -244,8 +243,7 @@ def crown_shadows(
     A crown is ``radius`` wide and 0.9 ``radius`` high each way about a point 1.2 ``radius`` above the ground. Its
     shadow is an ellipse; the darker one counts where shadows meet.
     """
-    covered = scratch(shape)
-    length = float(np.hypot(*sun.cast))
+    covered, length = scratch(shape), float(np.hypot(*sun.cast))
     along = sun.cast / length
     middles = centres + 1.2 * radius[:, None] * sun.cast + (np.array(shape) - 1) / 2
     for (y0, x0), width in zip(middles, radius, strict=True):

@@ -87,6 +87,8 @@ def test_whole_capture_without_an_index_is_in_order():
     assert capture_paths.locate_lines(unnumbered, PATH, TAKEN, CAMERA).row.tolist() == list(range(6))
     with pytest.raises(capture_paths.UnusableCaptureError, match="fetch frameIndex"):
         capture_paths.locate_lines(frames([-1] * 5), PATH, replace(TAKEN, index_at_end=None), CAMERA)
+    with pytest.raises(capture_paths.UnusableCaptureError, match="has no number of the 6 frames"):
+        capture_paths.locate_lines(frames(list(range(1000, 1006))), PATH, TAKEN, CAMERA)
 
 
 @pytest.mark.parametrize(("sweep", "last"), [(FINE, 6), (COARSE, 8)], ids=lambda value: getattr(value, "kind", ""))
@@ -106,13 +108,15 @@ def test_mirror_that_stepped_otherwise_is_not_believed(sweep: Sweep, last: int):
 
 
 def test_a_log_gives_the_positions():
-    """The log gives the positions, not the times of the commands."""
+    """The log gives the positions, not the times of the commands; lines behind its end are left to another capture."""
     path = capture_paths.next_path(FINE, 3, CAMERA, vector_pairs=6, triggered=False)
     log = MotionLog(np.zeros((1000, 2), np.float32), 1000.0, started_s=0.06, start_error_s=0.04)
     taken = capture_paths.CaptureRecord(FINE, 3, 9, "/captured/x", False, (5.0, 5.1), (0.1, 0.2), log=log)
     tied = capture_paths.locate_lines(frames(list(range(6))), path, taken, CAMERA).positions
     assert tied.method == "log"
     assert tied.valid.all()
+    short = replace(taken, log=replace(log, position=log.position[:400]))
+    assert capture_paths.locate_lines(frames(list(range(6))), path, short, CAMERA).row.tolist() == [0, 1, 2]
 
 
 def test_paths_take_whole_lines():
@@ -122,6 +126,8 @@ def test_paths_take_whole_lines():
     assert path.cells[0].tolist() == path.cells[1].tolist()
     assert path.frames_at(8) == 2
     assert path.frames_at(7) is None
-    free = capture_paths.next_path(COARSE, 2, CAMERA, vector_pairs=13, triggered=False)
+    with pytest.raises(SettingsError, match=r"memory 4 pairs; give cost\.vector_pairs of at least 5"):
+        capture_paths.next_path(COARSE, 2, CAMERA, vector_pairs=4, triggered=True)
+    free = capture_paths.next_path(COARSE, 2, CAMERA, vector_pairs=12, triggered=False)
     assert free.cells.shape == (12, 2)
     assert free.rate_hz == 40.0

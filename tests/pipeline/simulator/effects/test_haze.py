@@ -98,8 +98,7 @@ def clear_sky(**what: float) -> tuple[np.ndarray, np.ndarray]:
 def test_water_is_spectrl2s() -> None:
     """A way with 3 cm of water passes what SPECTRL2's atmosphere with 3 cm does, at its own wavelengths."""
     nm, wet = clear_sky(precipitable_water=3.0)
-    dry = clear_sky()[1]
-    known = (nm >= 570) & (nm <= 1040)
+    dry, known = clear_sky()[1], (nm >= 570) & (nm <= 1040)
     rig = replace(SHARP, air=Air(vapour_g_per_m3=3e4 / AIR_MASS_M))
     oxygen = transmission(np.array([AIR_MASS_M]), replace(SHARP, air=Air(vapour_g_per_m3=0.0)), nm[known])[0]
     passed = transmission(np.array([AIR_MASS_M]), rig, nm[known])[0] / oxygen

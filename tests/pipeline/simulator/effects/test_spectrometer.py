@@ -38,8 +38,7 @@ def test_narrow_line_becomes_a_gaussian_of_6_nm():
 def test_straight_spectra_and_both_ends_stay():
     """A straight spectrum is kept up to its ends; the first and last band of any spectrum keep their light."""
     wavelength, light = random_light(1)
-    narrow = np.full(90, 1.0)
-    straight = 3 * wavelength
+    narrow, straight = np.full(90, 1.0), 3 * wavelength
     np.testing.assert_allclose(spectrometer.widen_bands(straight, wavelength, narrow, 6.0), straight, rtol=1e-6)
     made = spectrometer.widen_bands(light, wavelength, narrow, 6.0)
     np.testing.assert_allclose(made[..., [0, -1]], light[..., [0, -1]], rtol=1e-6)

@@ -104,8 +104,7 @@ def test_box_is_the_mean_of_the_kernel(width: float) -> None:
 def test_gaussian_is_that_of_many_steps(held: int) -> None:
     """Kernels with Gaussians are means of the sharp one over thousands of even steps."""
     step = np.arange(-8, 8, 0.002)
-    fraction = np.exp(-(step**2) / 2)
-    variance = np.array([0.0, 0.08, 0.5])
+    fraction, variance = np.exp(-(step**2) / 2), np.array([0.0, 0.08, 0.5])
     distance, weight = blurred_weight(2.7, variance, held)
     some = slice(0, len(distance), 37)
     for one, row in zip(variance, weight[:, some], strict=True):
@@ -122,8 +121,7 @@ def test_table_is_the_kernel_at_any_place_and_scale(width: float, blur: float, s
     weight, places = np.empty((2, table.taps, 1), np.float32), np.full((2, 1, 1), off, np.float32)
     for kernel in range(2):
         read_weights(table, kernel, np.full((2, 1), scale), places, 0, 0, weight[kernel])
-    weight = weight[..., 0].T
-    apart = table.left + off - np.arange(table.taps)
+    weight, apart = weight[..., 0].T, table.left + off - np.arange(table.taps)
     distance, kernels = blurred_weight(width * scale, variance * scale**2)
     wanted = np.stack([np.interp(apart, distance, kernel, 0.0, 0.0) for kernel in kernels], axis=1)
     np.testing.assert_allclose(weight.sum(axis=0), 1, atol=1e-6)

@@ -82,8 +82,7 @@ def test_nothing_in_the_image_exceeds_the_probe(seed: int) -> None:
     """Levels, spans, differences of neighbours and of variants of the slit stay below 1.05 of the probe's."""
     scene = mixed(seed)
     sweep = replace(SWEEP, swath_px=40.0 * (seed % 3), start_px=-30.0 + seed)
-    probe = probe_scene(scene, RIG, [sweep])
-    light = seen(scene, sweep)
+    probe, light = probe_scene(scene, RIG, [sweep]), seen(scene, sweep)
     noise = noise_electrons(light, RIG)
     level = (light / noise).max(axis=(0, 1))
     assert (level <= 1.03 * probe.level).all()
@@ -103,8 +102,7 @@ def test_nothing_in_the_image_exceeds_the_probe(seed: int) -> None:
 @pytest.mark.parametrize(("swath", "seed"), [(300.0, 0), (900.0, 1)])
 def test_turned_lines_do_not_exceed_what_the_probe_measured(seed: int, swath: float) -> None:
     """At strips far from the middle, where lines are turned by 3 and 8 deg, each keeps its bound beside all blurs."""
-    scene = mixed(seed, (80, 2000))
-    sweep = replace(SWEEP, swath_px=swath)
+    scene, sweep = mixed(seed, (80, 2000)), replace(SWEEP, swath_px=swath)
     probe = probe_scene(scene, RIG, [sweep])
     light = seen(scene, sweep, "9x3", BLURS)
     noise = noise_electrons(light, RIG)
@@ -138,8 +136,7 @@ def test_no_stored_sum_exceeds_its_probe(binning: int, along: str) -> None:
     """Sums' levels, and what a sample on either side changes of them, are within 1.05 of the probe for the binning."""
     scene = mixed(binning, (96, 110))
     sweep = replace(SWEEP, along=along, binning=binning, start_px=-20.0, lines=41)
-    probe = probe_scene(scene, RIG, [sweep])
-    light = seen(scene, sweep)
+    probe, light = probe_scene(scene, RIG, [sweep]), seen(scene, sweep)
     noise = noise_electrons(stored_mean(light, binning), RIG, binning)
     level = (stored_mean(light, binning) / noise).max(axis=(0, 1))
     assert (level <= 1.03 * probe.level).all()
