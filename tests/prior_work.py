@@ -45,8 +45,7 @@ def remember(folder: Path, put: Callable[[object, str, Any], None] = setattr) ->
         path = folder / hashlib.sha256(repr(question).encode()).hexdigest()
         if path.exists():
             return pickle.loads(path.read_bytes())
-        found = work_out()
-        fresh = path.with_suffix(f".{os.getpid()}")
+        found, fresh = work_out(), path.with_suffix(f".{os.getpid()}")
         fresh.write_bytes(pickle.dumps(found))
         fresh.replace(path)
         return found

@@ -41,8 +41,7 @@ def paper(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 def test_one_sharp_edge_wins_by_maximum_and_fine_texture_by_mean(paper: ModuleType) -> None:
     """The paper pools edges by maximum, the project by mean: they choose different patches of the same image."""
-    grid = SceneGrid(16, 16, 8)
-    image = np.zeros((16, 16, 1), np.float32)
+    grid, image = SceneGrid(16, 16, 8), np.zeros((16, 16, 1), np.float32)
     image[4, 4] = 5.0  # one bright pixel in patch 0
     image[8:, 8:] = np.indices((8, 8)).sum(axis=0)[..., None] // 2 % 2  # texture all over patch 3
     seen = CoarsePrediction(grid, image, np.full((16, 16, 2), 0.5, np.float32))
@@ -97,8 +96,7 @@ def test_the_command_judges_a_folder(
         Image.fromarray(values.astype(np.uint8)).save(data / "images" / f"00{number}.png")
         Image.fromarray(labels).save(data / "labels" / f"00{number}.png")
     arguments = ["--data", str(data), "--steps", "2", "--patch", "8", "--patches", "4,16"]
-    checked = paper.rows(arguments)
-    printed = capsys.readouterr().out
+    checked, printed = paper.rows(arguments), capsys.readouterr().out
     assert [row.what.rpartition(" ")[2] for row in checked] == ["256", "512", "1024"]
     lines = [" ".join(line.split()) for line in printed.splitlines()]
     for start in ("Baseline 256", "Baseline 1024", "ED, maximum 4", "ED, mean 16", "TA (here gain) 4", "ideal* 16"):

@@ -51,8 +51,7 @@ def write_areas(run: ExportedRun, path: Path) -> None:
         sums += np.bincount(classes[known], sure[known], 256)
         sure_pixels += np.bincount(classes[known], minlength=256)
     confidence = np.where(sure_pixels > 0, sums / np.maximum(sure_pixels, 1), np.nan)
-    pixels = counts[: len(names)]
-    areas = hectares_of_classes(run.receipt)
+    pixels, areas = counts[: len(names)], hectares_of_classes(run.receipt)
     hectares = None if areas is None else np.array([areas.get(name, 0.0) for name in names], np.float64)
     fraction = pixels / max(pixels.sum(), 1) if hectares is None else hectares / (hectares.sum() or 1.0)
     own = np.full(len(names), np.nan) if hectares is None else hectares

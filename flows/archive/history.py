@@ -93,7 +93,8 @@ def read_history(archive: Archive, field: str | None = None) -> FieldHistory:
     name = names[0] if field is None and len(names) == 1 else field
     if name not in names:
         which = f"no field of {archive.name} is called {name!r}" if name else f"{archive.name} has {len(names)} fields"
-        raise SettingsError(f"{which}; give --field with one of: {', '.join(names) or 'none'}")
+        advice = f"give --field with one of: {', '.join(names)}" if names else "survey into it first"
+        raise SettingsError(f"{which}; {advice}")
     runs = sorted((run for run in catalogue.runs if called(run) == name), key=lambda run: str(time_of_visit(run)))
     legend = None
     with suppress(KeyError, OSError, PipelineError):  # the map was deleted

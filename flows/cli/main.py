@@ -6,14 +6,12 @@ import gc
 import io
 import os
 import sys
-import tempfile
-import traceback
 
 from cyclopts import CycloptsError
 
 from flows.cli.app import GOES_ON, VERBS, build_app, say, stderr
-from flows.terminal.processes import TERMINATED, Terminated, format_refusal, place_caches, terminable
-from pipeline.errors import PipelineError, SettingsError
+from flows.terminal.processes import TERMINATED, Terminated, format_failure, place_caches, terminable
+from pipeline.errors import SettingsError
 
 INTERRUPTED = 130
 
@@ -43,9 +41,6 @@ def _run(arguments: list[str]) -> int:
         what = str(error).partition(" Available commands:")[0].rstrip(".")  # the help lists all commands
         say(f"{what}; see {' '.join(('spectralzoom', *(error.command_chain or ())))} --help")
         return SettingsError.exit_code
-    except PipelineError as error:
-        say(str(error))
-        return error.exit_code
     except KeyboardInterrupt as error:
         what, code = ("terminated", TERMINATED) if isinstance(error, Terminated) else ("interrupted", INTERRUPTED)
         resumes = next(iter(arguments), "") in GOES_ON and not any("train-temporal" in word for word in arguments)
@@ -54,13 +49,9 @@ def _run(arguments: list[str]) -> int:
     except BrokenPipeError:
         return 1
     except Exception as error:
-        if (refused := format_refusal(error)) is not None:
-            say(refused)
-            return 1
-        with tempfile.NamedTemporaryFile("w", prefix="spectralzoom-", suffix=".log", delete=False) as file:
-            traceback.print_exc(file=file)
-        say(f"{type(error).__name__}: {error}; this is a defect of SpectralZoom: please report {file.name}")
-        return 1
+        message, code = format_failure(error)
+        say(message)
+        return code
     return code if isinstance(code, int) else 0
 
 

@@ -72,10 +72,10 @@ def check(
     mirror_asked, camera_asked = both or port is not None, both or camera is not None
     rows: list[CheckRow] = []
     if mirror_asked:
-        with stderr.status(f"asking the mirror at {rig.port}"):
+        with stderr.status(f"asking the mirror at {escape(rig.port)}"):
             rows += check_mirror(partial(open_mirror_driver, rig, wanted.cost.vector_pairs), SYSTEM_CLOCK, move=move)
     if camera_asked:
-        with stderr.status(f"asking the camera at {rig.host}"):
+        with stderr.status(f"asking the camera at {escape(rig.host)}"):
             rows += check_camera(partial(open_camera_driver, rig))
     asked: dict[Device, bool] = {"mirror": mirror_asked, "camera": camera_asked}
     good = [works(rows, device) for device, is_asked in asked.items() if is_asked]

@@ -12,9 +12,9 @@ from cyclopts import Parameter
 from flows.cli.app import AsJson, say, stderr
 from flows.settings.documents import about, toml_value
 from flows.settings.load import FLAGS, SURVEY, TABLES, load_settings
-from flows.settings.survey_settings import Settings
+from flows.terminal.processes import format_failure
 from flows.terminal.progress import print_json
-from pipeline.errors import NothingToMend, PipelineError
+from pipeline.errors import NothingToMend
 from pipeline.lazy import deferred
 
 if TYPE_CHECKING:
@@ -75,7 +75,8 @@ NO_RENDERING_FLAGS = RenderingFlags()
 def survey(*settings: Path, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = False, verbose: Verbose = False) -> int:
     """Survey a field: capture it in one or two passes, map its classes, and publish a receipt and a report.
 
-    If a survey fails, the next ones still run. The exit code is that of the last failure.
+    If a survey fails, the next ones still run. The exit code is that of the last failure. With --json several surveys
+    are the list `surveys`, with `settings` and `error` of one that failed.
 
     Parameters
     ----------
@@ -83,27 +84,21 @@ def survey(*settings: Path, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = Fal
         Settings files (TOML), surveyed one after the other; flags override each. Default: none.
     """
     every, code = [load_settings(file, by_setting(flags)) for file in settings or (None,)], 0
+    printed: list[dict[str, Any]] = []
     for number, requested in enumerate(every):
         if len(every) > 1:
             stderr.print(f"survey {number + 1} of {len(every)}: {settings[number]}", markup=False, soft_wrap=True)
         try:
-            _survey(requested, as_json=as_json, verbose=verbose)
-        except PipelineError as error:
-            if len(every) == 1:
+            printed.append(survey_command.run_survey(requested, stderr, verbose=verbose).receipt)
+        except NothingToMend as skipped:
+            printed.append({"captured": False, "run": skipped.run, "why": str(skipped)})
+            stderr.print(f"{skipped}", markup=False, soft_wrap=True)
+        except Exception as error:
+            if len(every) == 1 or isinstance(error, BrokenPipeError):
                 raise
-            say(f"{settings[number]}: {error}")
-            code = error.exit_code
+            message, code = format_failure(error)
+            say(f"{settings[number]}: {message}")
+            printed.append({"settings": str(settings[number]), "error": message})
+    if as_json:
+        print_json(printed[0] if len(every) == 1 else {"surveys": printed})
     return code
-
-
-def _survey(requested: Settings, *, as_json: bool, verbose: bool) -> None:
-    """Survey one field, and print its receipt ``as_json``, or why nothing was captured."""
-    try:
-        published = survey_command.run_survey(requested, stderr, verbose=verbose)
-    except NothingToMend as skipped:
-        if as_json:
-            print_json({"captured": False, "run": skipped.run, "why": str(skipped)})
-        stderr.print(f"{skipped}", markup=False, soft_wrap=True)
-    else:
-        if as_json:
-            print_json(published.receipt)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
@@ -21,7 +22,7 @@ from flows.evaluate.frames import (
     sort_frames,
 )
 from flows.evaluate.judge import ENDS, Record, judge_frame, seeds_of, summarise
-from flows.terminal.figures import counted, format_count, format_percent, format_points
+from flows.terminal.figures import DASH, counted, format_count, format_percent, format_points
 from flows.terminal.processes import writing
 from flows.terminal.progress import StageProgress, put_out, table
 from flows.training.data import TrainingData
@@ -47,7 +48,7 @@ def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = 
     for note in content["data_notes"]:
         console.print(f"note: {note}", markup=False, soft_wrap=True)
     for path in content["files"]:
-        console.print(path, soft_wrap=True)
+        console.print(path, markup=False, soft_wrap=True)
     return content
 
 
@@ -144,7 +145,7 @@ def _accuracy(content: dict[str, Any]) -> Table:
             format_points(row["miou"]) + ("" if spread is None else f" ±{100 * spread:.1f}"),
             format_points(row["pixel_accuracy"]),
             format_points(row["average_accuracy"]),
-            f"{row['kappa']:.2f}",
+            DASH if math.isnan(row["kappa"]) else f"{row['kappa']:.2f}",
             format_difference(row["against_all"]),
             format_difference(row["against_random"]),
             format_percent(row["captured_gain"]),

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import base64
 import io
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import matplotlib as mpl
@@ -45,10 +48,19 @@ def thinned(image: NDArray[np.generic]) -> tuple[slice, slice]:
     return (slice(None, None, -(-max(image.shape) // MOST_PX)),) * 2
 
 
+@contextmanager
+def boxes_for_letters() -> Iterator[None]:
+    """Draw a box for a letter that the font lacks, without a warning."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph", UserWarning)
+        yield
+
+
 def png(figure: Figure, exact: ArrayLike = ()) -> bytes:
     """Return a figure as PNG of 256 colours, with these ``exact`` ones (n, 3) among them, at most half of all."""
     canvas, file = FigureCanvasAgg(figure), io.BytesIO()
-    canvas.draw()  # type: ignore[no-untyped-call]
+    with boxes_for_letters():
+        canvas.draw()  # type: ignore[no-untyped-call]
     drawn = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
     kept = np.reshape(exact, (-1, 3))[: COLOURS // 2].astype(np.uint8)
     others = COLOURS - len(kept)

@@ -21,6 +21,7 @@ from flows.publish.panels import (
     MUTED,
     STYLE,
     UNLABELLED_COLOUR,
+    boxes_for_letters,
     class_palette,
     class_rgb,
     grey_of,
@@ -201,8 +202,9 @@ def _draw_legend(figure: Figure, data: QuicklookData, columns: int) -> None:
         names.append("unlabelled")
     for count in range(min(columns, len(names)), 0, -1):  # fewer columns for long names
         legend = figure.legend(marks, names, loc="outside lower center", ncol=count, frameon=False, fontsize=13)
-        if legend.get_window_extent().width <= figure.bbox.width:
-            return
+        with boxes_for_letters():
+            if legend.get_window_extent().width <= figure.bbox.width:
+                return
         if count > 1:
             legend.remove()
 

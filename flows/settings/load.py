@@ -108,8 +108,7 @@ class Declared:
 
 def _declared(make: type[Any]) -> dict[str, Declared]:
     own = {datetime: Annotated[datetime, PlainValidator(parse_moment)]}
-    hints = get_type_hints(make, include_extras=True)
-    found = {}
+    hints, found = get_type_hints(make, include_extras=True), {}
     for item in dataclasses.fields(make):
         hint = hints[item.name]
         if get_origin(hint) in (types.UnionType, Union):

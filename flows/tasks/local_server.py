@@ -21,6 +21,7 @@ from importlib import resources
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from urllib.parse import quote
 
 from flows.tasks.prefect_tasks import (
     prefect,
@@ -98,13 +99,15 @@ def _using(home: Path, port: int, *, schedules: bool) -> Iterator[str]:
         create_database(home / "prefect.db")
     except (sqlite3.Error, OSError) as error:
         raise ServerUnavailable(f"the Prefect server has no database in {home} ({error})") from error
+    file = str(home / "prefect.db")
+    file = f"file:{quote(file)}?uri=true" if "?" in file else file  # the address would end at a question mark
     services = {} if schedules else {f"PREFECT_SERVER_SERVICES_{name}_ENABLED": "false" for name in OF_SCHEDULES}
     api = f"http://{HOST}:{port}/api"
     wanted = {
         **services,
         **(place_pages() if schedules else {"PREFECT_SERVER_UI_ENABLED": "false"}),
         "PREFECT_API_URL": api,
-        "PREFECT_API_DATABASE_CONNECTION_URL": f"sqlite+aiosqlite:///{home / 'prefect.db'}",
+        "PREFECT_API_DATABASE_CONNECTION_URL": f"sqlite+aiosqlite:///{file}",
         "PREFECT_SERVER_CONCURRENCY_LEASE_STORAGE": LEASES,  # they outlive a killed server, which frees the rig again
         "PREFECT_API_BLOCKS_REGISTER_ON_START": "true" if schedules else "false",
         "PREFECT_SERVER_API_AUTH_STRING": password,

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from flows.terminal.figures import format_count, format_points, known_number, spaced
+from storage.arrays.class_maps import unknown_name
 
 MOST_ERROR = 0.1  # standard deviation of an expected mIoU, above which it is not shown
 NOT_JUDGED: Mapping[str, Any] = {"miou": None, "per_class_iou": {}}  # of a map that was not drawn
@@ -88,8 +89,8 @@ def error_matrix(accuracy: Mapping[str, Any]) -> ErrorMatrix | None:
     """Return the confusion matrix of a receipt's accuracy as a table; None where the receipt has none."""
     if not (counts := accuracy.get("confusion")):
         return None
-    size = len(counts)
-    names = [*_by_class(accuracy), "unknown"][:size]
+    size, known = len(counts), list(_by_class(accuracy))
+    names = [*known, unknown_name(known)][:size]
     label, mapped = [sum(row) for row in counts], [sum(row[one] for row in counts) for one in range(size)]
     columns = [one for one in range(size) if label[one]]
     rows = [

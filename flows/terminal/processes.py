@@ -11,12 +11,13 @@ import shutil
 import signal
 import tempfile
 import threading
+import traceback
 from collections.abc import Iterator, Mapping, MutableMapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 
-from pipeline.errors import ArchiveError, SettingsError
+from pipeline.errors import ArchiveError, PipelineError, SettingsError
 from storage.archive.staging import disk_advice
 
 DONE, FAILED, PARTLY = 0, 1, 3  # exit codes
@@ -70,6 +71,17 @@ def format_refusal(error: BaseException) -> str | None:
         where = f" {error.filename}" if error.filename else ""
         return f"the system refused to read or write{where}: {advice}"
     return None
+
+
+def format_failure(error: Exception) -> tuple[str, int]:
+    """Return the message for any error, and its exit code; the traceback of a defect is written to a file."""
+    if isinstance(error, PipelineError):
+        return str(error), error.exit_code
+    if (refused := format_refusal(error)) is not None:
+        return refused, 1
+    with tempfile.NamedTemporaryFile("w", prefix="spectralzoom-", suffix=".log", delete=False) as file:
+        traceback.print_exception(error, file=file)
+    return f"{type(error).__name__}: {error}; this is a defect of SpectralZoom: please report {file.name}", 1
 
 
 @contextmanager

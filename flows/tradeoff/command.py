@@ -74,7 +74,7 @@ def tradeoff(
     with writing(out):
         (out / "tradeoff.json").write_text(to_json(content), encoding="utf-8")
         (out / "tradeoff.png").write_bytes(png(tradeoff_figure(results)))
-    stderr.print(f"{out / 'tradeoff.json'}\n{out / 'tradeoff.png'}", soft_wrap=True)
+    stderr.print(f"{out / 'tradeoff.json'}\n{out / 'tradeoff.png'}", markup=False, soft_wrap=True)
     if as_json:
         print_json(content)
     return 0

@@ -174,9 +174,7 @@ def measure_tradeoff(tradeoff: Tradeoff, *, repeats: int | None = None, seed: in
 
 def mark_pareto(points: Sequence[Point]) -> tuple[Point, ...]:
     """Mark the points of the Pareto front: no other is at least as good in error and cost and better in one."""
-
-    def beaten(point: Point) -> bool:
-        own, pairs = (point.error, point.cost), [(other.error, other.cost) for other in points]
-        return any(pair[0] <= own[0] and pair[1] <= own[1] and pair != own for pair in pairs)
-
-    return tuple(replace(point, pareto=math.isfinite(point.error) and not beaten(point)) for point in points)
+    pairs = [(point.error, point.cost) for point in points]
+    beaten = [any(a <= error and b <= cost and (a, b) != (error, cost) for a, b in pairs) for error, cost in pairs]
+    kept = [math.isfinite(error) and not worse for (error, _), worse in zip(pairs, beaten, strict=True)]
+    return tuple(replace(point, pareto=one) for point, one in zip(points, kept, strict=True))

@@ -241,7 +241,8 @@ def asked_command() -> str:
 
 def _print_figures(record: dict[str, Any], request: TrainRequest, console: Console) -> None:
     out = request.out
-    console.print(f"weights: {out} ({out.stat().st_size / 1e6:.1f} MB), {record['training']['steps']} steps")
+    size_mb, steps = out.stat().st_size / 1e6, record["training"]["steps"]
+    console.print(f"weights: {out} ({size_mb:.1f} MB), {steps} steps", markup=False, soft_wrap=True)
     if "familiar" in record:
         console.print(record["familiar"], markup=False, soft_wrap=True)
     readings, figures = record["readings"], record["validation"]
@@ -260,6 +261,7 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
             "no scene was kept for validation; to judge the weights on other scenes: "
             f"{shlex.join(['spectralzoom', 'evaluate', str(on), '--weights', str(out)])}"
             + ("" if left or len(record["split"]["train"]) < 2 else "; or train with some held out: --hold-out NAMES"),
+            markup=False,
             soft_wrap=True,
         )
         if request.settings.darkest_ms < REFERENCE_MS:

@@ -79,8 +79,7 @@ def train_temporal(request: TemporalRequest, report: Report = lambda what, done,
         raise SettingsError(
             f"--train-temporal {request.weights}: expected weights of the farm's classes, {', '.join(CLASSES)}"
         )
-    augmentation = CaptureAugmentation(weights.normalisation)
-    lands = []
+    augmentation, lands = CaptureAugmentation(weights.normalisation), []
     for number in range(request.lands):
         seed = FIRST_SEED + number
         report("visiting lands", number / request.lands, f"land {seed}")
@@ -123,8 +122,7 @@ def _visit(
     rng: np.random.Generator,
 ) -> Visit:
     """Return a land on a day, as scans drawn at random show it."""
-    seen = _Land.observed(weights, shape, seed, day, hour, rng)
-    drawn = []
+    seen, drawn = _Land.observed(weights, shape, seed, day, hour, rng), []
     for _ in range(PASSES):
         step = int(rng.choice(list(SPACINGS), p=list(SPACINGS.values())))
         exposure_ms = float(np.exp(rng.uniform(np.log(DARKEST_MS), np.log(BRIGHTEST_MS))))

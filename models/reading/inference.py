@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -168,7 +169,9 @@ def read_coarse_prediction(
 
 def save_overview(path: Path, overview: Overview) -> None:
     """Store features and logits of an overview."""
-    np.save(path, torch.cat([overview.features, overview.logits], dim=1).cpu().numpy())
+    content = io.BytesIO()  # an error that numpy has with a file does not say that the disk is full
+    np.save(content, torch.cat([overview.features, overview.logits], dim=1).cpu().numpy())
+    path.write_bytes(content.getbuffer())
 
 
 def load_overview(path: Path, weights: Weights) -> Overview | None:

@@ -25,10 +25,11 @@ RESTS_ON = "rests_on"  # in a run's manifest: address of a store or of an input 
 
 
 def moment_of(text: object) -> datetime | None:
-    """Return a moment in ISO 8601, in UTC if it names no zone; None for anything else."""
-    with suppress(ValueError):
-        found = datetime.fromisoformat(text) if isinstance(text, str) else None
-        return None if found is None else found.replace(tzinfo=found.tzinfo or UTC)
+    """Return the moment in ISO 8601 that is a text or its first word, in UTC if it names no zone; else None."""
+    for words in (text, text.partition(" ")[0]) if isinstance(text, str) else ():
+        with suppress(ValueError):
+            found = datetime.fromisoformat(words)
+            return found.replace(tzinfo=found.tzinfo or UTC)
     return None
 
 

@@ -24,7 +24,7 @@ def written_aside(folder: Path, names: Sequence[str]) -> Iterator[Path]:
     When the block fails, ``folder`` is unchanged. Raises ArchiveError: the folder is or lies below a file, or the disk
     refuses.
     """
-    with refusals(folder, "export to"):
+    with refusals(folder, "write to"):
         make_folder(folder)
         with tempfile.TemporaryDirectory(prefix=_PREFIX, suffix=PART_SUFFIX, dir=folder) as aside:
             with _disk_errors(Path(aside)):

@@ -67,10 +67,15 @@ class ClassNames:
 UNKNOWN, UNKNOWN_COLOUR = "unknown", (200, 0, 200)
 
 
+def unknown_name(names: Sequence[str]) -> str:
+    """Return the name of the class of out-of-distribution pixels, which none of the other classes has."""
+    return UNKNOWN if UNKNOWN not in names else f"{UNKNOWN}_spectrum"
+
+
 def with_unknown(legend: ClassNames) -> ClassNames:
     """Return the classes and one more, for out-of-distribution pixels."""
-    name = UNKNOWN if UNKNOWN not in legend.names else f"{UNKNOWN}_spectrum"
-    return ClassNames((*legend.names, name), np.vstack([legend.colours, np.array([UNKNOWN_COLOUR], np.uint8)]))
+    names, colour = (*legend.names, unknown_name(legend.names)), np.array([UNKNOWN_COLOUR], np.uint8)
+    return ClassNames(names, np.vstack([legend.colours, colour]))
 
 
 def create_class_map(

@@ -148,8 +148,7 @@ class SignalCube(StoredSweep):
     @cached_property
     def references(self) -> References:
         """Dark and white frames."""
-        shared = self.group.attrs.get(FRAMES_OF)
-        group = self.group
+        shared, group = self.group.attrs.get(FRAMES_OF), self.group
         if shared is not None and self.path is not None:
             group = open_group(self.path.with_name(f"{shared}.zarr"))
         return read_references(group)

@@ -41,8 +41,7 @@ def verify_everything(
 
     ``problems_of`` reads one published folder whose files lie elsewhere, as in a bucket.
     """
-    read_again = problems_of or _problems
-    catalogue = Catalogue.read(root)
+    read_again, catalogue = problems_of or _problems, Catalogue.read(root)
     places = [(uri, store.ref.path, store.size) for uri, store in catalogue.stores.items()]
     places += [(run.uri, run.folder, listed_bytes(run.facts) if run.facts else 0) for run in catalogue.runs]
     total, done = sum(size for *_, size in places) or 1, 0

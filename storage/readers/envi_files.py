@@ -262,8 +262,7 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
 
 def _timed(lines: LineFacts, times: LineTimes) -> LineFacts:
     """Add the times of frame indices."""
-    lines = replace(lines, frame=times.frame)
-    known = times.stamp_us >= 0
+    lines, known = replace(lines, frame=times.frame), times.stamp_us >= 0
     if not known.any() or not np.ptp(times.stamp_us[known]):  # a camera without a clock repeats its stamp
         return lines
     return replace(lines, time_s=np.where(known, (times.stamp_us - times.stamp_us[known][0]) * 1e-6, np.nan))

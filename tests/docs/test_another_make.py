@@ -122,8 +122,7 @@ def folder_rig(folder: Path) -> Iterator[tuple[RigSource, CameraDriver, Program]
 def test_the_pages_camera_takes_a_sweep(tmp_path: Path) -> None:
     """Every line comes, placed by the mirror's log, with the numbers of its file and the references beside it."""
     with folder_rig(tmp_path / "incoming") as (source, _, _):
-        found = list(source.lines(FINE))
-        references = source.references(FINE)
+        found, references = list(source.lines(FINE)), source.references(FINE)
         (told,) = source.record["captures"]
     assert [line.number for line in found] == list(range(FINE.lines))
     assert all(line.valid for line in found)

@@ -36,8 +36,7 @@ class Rot:
 def flip_journal(flips: int, seed: int = 0) -> Rot:
     """Flip bits of a rig's journal: a capture is held as it was, or not at all; the loss is told."""
     kept = KeptInMemory()
-    journal = CaptureJournal(kept)
-    truth = []
+    journal, truth = CaptureJournal(kept), []
     for number in range(8):
         times = (float(number), number + 0.5)
         taken = CaptureRecord(SWEEP, 5 * number, 5 * number + 5, f"/captured/a_{number}", True, times, times)

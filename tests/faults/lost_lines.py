@@ -140,8 +140,7 @@ def _left(content: bytes, synced: int, fate: str, chance: random.Random) -> byte
 def try_power(cuts: int, folder: Path, seed: int = 0) -> Losses:
     """Cut the power at random moments of one capture, and go on from what each leaves."""
     chance, found = random.Random(seed), Losses()
-    moments = record(folder / "whole")
-    truth = _contents(folder / "whole")
+    moments, truth = record(folder / "whole"), _contents(folder / "whole")
     for number in range(cuts):
         moment, place = chance.choice(moments), folder / str(number)
         place.mkdir()

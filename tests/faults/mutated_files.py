@@ -95,8 +95,7 @@ def mutate_header(text: str, rng: random.Random) -> str:
     """One to four random changes of a header's text: its values, keys, lines, characters."""
     for _ in range(rng.randint(1, 4)):
         lines = text.split("\n")
-        at = rng.randrange(len(lines))
-        change = rng.randrange(9)
+        at, change = rng.randrange(len(lines)), rng.randrange(9)
         if change == 0 and "=" in lines[at]:
             lines[at] = f"{lines[at].split('=')[0]}= {rng.choice(WORDS)}"
         elif change == 1:

@@ -101,6 +101,5 @@ def test_26_losses_of_half_precision_add_up_in_single(kind: torch.dtype):
 def test_26_counts_do_not_round():
     """2^24 + 1 pixels of one class, where float32 stops counting, keep their last one in the accuracy."""
     counts = np.array([[2**24 + 1, 0], [1, 2**31]], np.int64)
-    first = (2**24 + 1) / (2**24 + 2)
-    second = 2**31 / (2**31 + 1)
+    first, second = (2**24 + 1) / (2**24 + 2), 2**31 / (2**31 + 1)
     assert mean_iou(counts) == pytest.approx((first + second) / 2, rel=1e-12)

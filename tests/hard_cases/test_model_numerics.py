@@ -353,8 +353,7 @@ def test_30_a_checkpoint_reads_other_bands(tmp_path: Path):
     """Weights that were saved read any number of bands."""
     weights, path = plain_weights(), tmp_path / "w.safetensors"
     save_weights(weights, path)
-    loaded = load_weights(path)
-    grid = SceneGrid(16, 16, 8)
+    loaded, grid = load_weights(path), SceneGrid(16, 16, 8)
     for bands in (1, 3, 200):
         seen = coarse_prediction(loaded, np.full((16, 16, bands), 0.3), np.linspace(500, 900, bands), grid)
         assert np.isfinite(seen.probability).all()

@@ -69,8 +69,7 @@ def test_step_edge():
 def test_corner_of_two_edges_is_enough():
     """A step edge that turns a corner fixes both directions."""
     y, x = np.mgrid[:256, :80].astype(float)
-    rng = np.random.default_rng(5)
-    views = []
+    rng, views = np.random.default_rng(5), []
     for down, right in ((0.0, 0.0), (3.4, -2.2)):
         left, below = (1 / (1 + np.exp(-part / 1.5)) for part in (x + right - 40, y + down - 128))
         views.append(left * below + rng.normal(size=x.shape) / 50)

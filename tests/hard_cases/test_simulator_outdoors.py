@@ -127,8 +127,7 @@ def test_scene_that_reaches_to_the_horizon_keeps_every_bound(relief: str) -> Non
     found = left_out(TEXTURE, rig)
     for change, counted in found.values():
         assert change <= counted < math.inf
-    block = block_of(TEXTURE, rig)
-    along = np.array([[-31.5, 31.5]])
+    block, along = block_of(TEXTURE, rig), np.array([[-31.5, 31.5]])
     moved, _ = PARALLAX.displaced(block, along, np.full((1, 2), -29.5), "exact")
     lever = air.lever_m * (0 if relief == "flat" else -1 / 30)
     np.testing.assert_allclose(moved, lever * along, atol=1e-12)

@@ -37,8 +37,7 @@ def has_pixels(value: Any, deep: bool = True) -> bool:
     """Whether a value is, holds in a sequence or has as a field an array of as many numbers as a line."""
     shape = getattr(value, "shape", None)
     if isinstance(shape, tuple) and hasattr(value, "dtype"):
-        sizes = [size for size in shape if isinstance(size, int)]
-        count = 1
+        sizes, count = [size for size in shape if isinstance(size, int)], 1
         for size in sizes:
             count *= size
         return len(sizes) > 1 and count >= LINE

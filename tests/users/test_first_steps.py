@@ -19,6 +19,7 @@ from PIL import Image
 
 from flows.settings.load import load_settings
 from pipeline.errors import SettingsError
+from storage.archive.records import moment_of
 from storage.readers.scene_files import load_scene_file
 from tests.flows.conftest import command_line
 from tests.storage.readers.test_label_grids import write
@@ -167,11 +168,12 @@ def test_init_says_why_not(tmp_path: Path, command_line: Any, monkeypatch: pytes
 
 def test_a_date_of_a_visit_has_one_form() -> None:
     """Days between visits are counted by dates in one form, which the message shows; other words are taken."""
-    for visit in ("01.06.2026", "6/1/2026", "2026-6-1", "01.06.2026 noon"):
-        with pytest.raises(SettingsError, match=r"visit must be text, or a date as YYYY-MM-DD"):
+    for visit in ("01.06.2026", "6/1/2026", "2026-6-1", "01.06.2026 noon", "2026-06-10T25:00", "0026-06-10"):
+        with pytest.raises(SettingsError, match=r"visit must be text, or begin with a date as YYYY-MM-DD"):
             load_settings(None, {"scene": "farm", "visit": visit})
     for visit in ("first of June", "2026-06-01T10:00:00Z", "v1.2.3"):
         assert load_settings(None, {"scene": "farm", "visit": visit}).visit == visit
+    assert moment_of("2026-06-01 morning") == moment_of("2026-06-01")
 
 
 # --- a disk that refuses ----------------------------------------------------------------------------------------------
@@ -194,6 +196,6 @@ def test_an_export_that_the_disk_refuses(surveyed_png: Any, tmp_path: Path, comm
     surveyed_png(archive)
     with small_files(600):
         ended = command_line("export", archive, "-o", out)
-    ended.refused(1, r"cannot export to .*a file may not grow so large here.*nothing published was changed")
+    ended.refused(1, r"cannot write to .*a file may not grow so large here.*nothing published was changed")
     assert [path.name for path in out.rglob("*") if path.is_file()] == [".export.lock"]
     assert command_line("export", archive, "-o", out).code == 0

@@ -141,8 +141,7 @@ def test_a_selection_takes_the_memory_of_a_selection(tmp_path: Path) -> None:
     assert cube[0, 0].values.shape == (bands,)
     for chosen, most in ((cube[..., 3], 3), (cube[5, 7], 0.3), (cube[100:110, 50:60], 0.3)):
         tracemalloc.start()
-        values = chosen.values
-        peak = tracemalloc.get_traced_memory()[1]
+        values, peak = chosen.values, tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         assert peak < values.nbytes + most * 1e6
     assert cube.nbytes == side * side * bands * 4

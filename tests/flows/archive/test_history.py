@@ -11,6 +11,7 @@ import pytest
 
 from flows.archive.history import FieldHistory, _draw_areas, read_history, render_history
 from flows.settings.load import time_of_visit
+from pipeline.errors import SettingsError
 from storage.archive.archive import Archive
 from storage.archive.records import Run
 from tests.flows.conftest import Page
@@ -41,6 +42,12 @@ def test_runs_are_one_history(archive: Path) -> None:
         receipt = json.loads((archive / row["run"] / "receipt.json").read_text())
         assert row["miou"] == receipt["accuracy"]["miou"]
         assert row["capture_s"] == receipt["savings"]["capture_s"]["done"]
+
+
+def test_an_archive_without_runs_has_no_history(tmp_path: Path) -> None:
+    """The message says what to do first."""
+    with pytest.raises(SettingsError, match="has 0 fields; survey into it first"):
+        read_history(Archive.open(tmp_path))
 
 
 def test_a_visit_that_was_surveyed_again_is_one_point(tmp_path: Path) -> None:

@@ -79,8 +79,7 @@ def _captures(archive: Path) -> list[str]:
 
 def test_nothing_has_changed_in_fields_however_they_are_chosen(surveyed: Path, reprocess: Reprocess) -> None:
     """By name, pattern or scene file; a name that is none is refused; the newest run of a field counts."""
-    newest = Archive.open(surveyed).runs()[-1].name
-    rows = reprocess(surveyed)
+    newest, rows = Archive.open(surveyed).runs()[-1].name, reprocess(surveyed)
     assert [(row["field"], row["state"]) for row in rows] == [("turned", "skipped"), ("scene", "skipped")]
     assert rows[1]["old"] == newest
     run_reprocess(surveyed, QUIET)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -159,6 +160,9 @@ def test_surveys_go_on_after_one_that_fails(
     ended = command_line("survey", *files, "--bands", FEW_BANDS, "--no-accuracy", "--json")
     assert (ended.code, len(ended.errors)) == (2, 1)
     assert ended.errors[0].startswith(f"{files[1]}: ")
+    told = json.loads(ended.out)["surveys"]
+    assert [one.get("survey") for one in told] == ["farm", None, "farm"]
+    assert (told[1]["settings"], f"{files[1]}: {told[1]['error']}") == (str(files[1]), ended.errors[0])
     assert f"survey 3 of 3: {files[2]}" in ended.err.replace("\n", "")
     archive = Archive.open(tmp_path / "archive")
     assert [run.name.split("-")[1] for run in archive.runs()] == ["farm"] * 2  # farm-2 within one second

@@ -101,8 +101,7 @@ def test_folds_are_judged_each_on_its_own_frames(data: Path, tmp_path: Path):
 
 def test_folds_that_kept_frames_for_validation_are_one_seed(data: Path, tmp_path: Path):
     """What one of them held out another validated on: each is judged on its own; alone, on both."""
-    keys = {name: scene_at(data, name).key for name in FRAMES}
-    paths = []
+    keys, paths = {name: scene_at(data, name).key for name in FRAMES}, []
     for number, (kept, validated, trained) in enumerate((("001", "002", "003"), ("002", "001", "003"))):
         split = {"train": {trained: keys[trained]}, "held_out": [kept], "validation": {validated: keys[validated]}}
         paths.append(write_weights(tmp_path / f"{number}.safetensors", number, data="field", split=split))

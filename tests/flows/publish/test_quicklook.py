@@ -47,8 +47,9 @@ def make_data(height: int, width: int, *, patch: int = 16) -> QuicklookData:
 
 @pytest.mark.parametrize(("height", "width"), [(96, 128), (20, 300), (300, 20), (1, 1)])
 def test_picture_has_a_readable_size(tmp_path: Path, height, width):
-    """Any proportions give a page of 800 to 2000 px a side, mostly covered."""
-    (tmp_path / "q.png").write_bytes(draw_quicklook(make_data(height, width)))
+    """Any proportions give a page of 800 to 2000 px a side, mostly covered; letters that no font has are boxes."""
+    data = replace(make_data(height, width), class_names=("soil", "甜菜", r"$\weeds_{$"))
+    (tmp_path / "q.png").write_bytes(draw_quicklook(data))
     with Image.open(tmp_path / "q.png") as image:
         assert 1200 <= image.width <= 1800
         assert 600 <= image.height <= 2000

@@ -60,6 +60,14 @@ def test_a_server_without_a_place_for_its_database_is_unavailable(tmp_path: Path
         pass
 
 
+def test_a_question_mark_in_the_path_ends_no_address(tmp_path: Path) -> None:
+    """The database lies in its folder, and a file of the name before the mark stays as it was."""
+    (tmp_path / "field").write_text("mine")
+    with local_server(tmp_path / "field?1"):
+        assert (tmp_path / "field?1/prefect.db").stat().st_size > 100_000
+    assert ((tmp_path / "field").read_text(), len([*tmp_path.iterdir()])) == ("mine", 2)
+
+
 def test_the_schema_is_what_migrations_leave(tmp_path: Path) -> None:
     """Statement by statement, in any order: migrations leave constraints and indices in another one each time."""
 

@@ -77,8 +77,7 @@ def test_the_command_trains_judges_and_says_how(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(remember, "JUDGED_AFTER", (3,))
     out, weights = tmp_path / "farm.safetensors", shipped_weights()
     request = TemporalRequest("farm", weights, out, 1, 1, (128, 192), QUICK, "spectralzoom train")
-    record = run_remember(request, QUIET)
-    found = describe_weights(out).reader
+    record, found = run_remember(request, QUIET), describe_weights(out).reader
     assert describe_weights(out).key == describe_weights(weights).key
     assert dict(found.record) == record
     started_from = describe_weights(weights).reader

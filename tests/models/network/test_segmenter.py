@@ -134,8 +134,7 @@ def test_the_temporal_reader_costs_what_the_counter_counts() -> None:
 
 def test_each_patch_costs_the_same_and_the_overview_none_of_it() -> None:
     """What the policy took is added; columns are made of each band, again for patches that were captured apart."""
-    config = SegmenterConfig(classes=5)
-    grid = SceneGrid(250, 256, 16)
+    config, grid = SegmenterConfig(classes=5), SceneGrid(250, 256, 16)
     one, many, bare = (multiply_adds(config, grid, *given, score=9) for given in ((1, 270), (20, 270), (20, 0)))
     assert one.overview == many.overview == bare.overview + 256**2 * 270 * config.columns
     assert 20 * one.detail == many.detail == bare.detail

@@ -51,8 +51,7 @@ def test_patches_lie_where_the_field_has_them(field: tuple[int, int, int]):
     times = np.zeros(len(patch_index), int)
     for region in plan_regions(grid, SHARD, most_px=(64, 640), halo=40):
         numbers = region.numbers_here(patch_index)
-        inside = numbers >= 0
-        kept = np.zeros(grid.patch_shape, np.bool_)
+        inside, kept = numbers >= 0, np.zeros(grid.patch_shape, np.bool_)
         kept[region.kept_patches.rows, region.kept_patches.columns] = True
         assert (inside == kept.ravel()).all()
         times += inside

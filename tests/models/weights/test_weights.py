@@ -188,8 +188,7 @@ def test_a_description_that_was_changed_is_refused(saved: Path):
 
 def test_a_header_of_petabytes_is_refused_unread(saved: Path):
     """A tensor of 3.6 PB that the file has not: refused before memory is asked for."""
-    about = json.dumps(_about(saved))
-    size = 900 * 10**12
+    about, size = json.dumps(_about(saved)), 900 * 10**12
     header = {"__metadata__": {"about": about}, "a": {"dtype": "F32", "shape": [size], "data_offsets": [0, 4 * size]}}
     text = json.dumps(header).encode()
     saved.write_bytes(len(text).to_bytes(8, "little") + text + bytes(64))

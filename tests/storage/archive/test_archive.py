@@ -39,8 +39,7 @@ def test_a_store_is_found_with_its_manifest(tmp_path: Path) -> None:
     """Before, nothing; afterwards the files, their hashes and the facts."""
     archive = Archive.open(tmp_path / "archive")
     assert archive.find("mosaic", "abc") is None
-    path = _publish(archive)
-    ref = archive.find("mosaic", "abc")
+    path, ref = _publish(archive), archive.find("mosaic", "abc")
     assert (ref.uri, ref.path) == ("stages/mosaic/abc", path)
     manifest = archive.manifest(ref)
     assert (manifest["version"], manifest["params"], manifest["inputs"]) == (3, {"tol": 0.1}, ["k0"])

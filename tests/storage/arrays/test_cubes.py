@@ -83,8 +83,7 @@ def test_raw_cube_refuses_to_end_early(tmp_path: Path) -> None:
 
 def _calibrated(tmp_path: Path) -> tuple[Path, SweepHeader, list[Line]]:
     """A stored sweep of 130 lines whose references have all that references can have."""
-    header = _header(130, 9, 4)
-    rng = np.random.default_rng(4)
+    header, rng = _header(130, 9, 4), np.random.default_rng(4)
     flat = rng.uniform(0.9, 1.1, (9, 4)).astype(np.float32)
     bad = np.zeros((9, 4), np.bool_)
     bad[3, 1] = True

@@ -113,8 +113,7 @@ def test_classes_have_colours_and_names(tmp_path: Path) -> None:
     """Colour table, tags, and GDAL's own category names, which a VRT made by GDAL repeats."""
     write_cog(tmp_path / "a.tif", class_image(on_map(FEW)), rows_of(classes_of(FEW)))
     with rasterio.open(tmp_path / "a.tif") as file:
-        table = file.colormap(1)
-        tags = file.tags(1)
+        table, tags = file.colormap(1), file.tags(1)
     assert [table[number][:3] for number in range(3)] == [tuple(colour) for colour in LEGEND.colours.tolist()]
     assert [tags[f"CLASS_{number}"] for number in range(3)] == list(LEGEND.names)
     assert tags["flag_meanings"] == "sugar_beet soil_&_stones maïs"

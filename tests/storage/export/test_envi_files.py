@@ -45,8 +45,7 @@ def numbers(code: int, seed: int = 0) -> NDArray[Any]:
 
 def written_by_spy(folder: Path, code: int, interleave: str, order: str, **about: Any) -> tuple[Path, NDArray[Any]]:
     """A header by SPy with a random cube beside it, and the cube."""
-    values = numbers(code)
-    header = folder / "a.hdr"
+    values, header = numbers(code), folder / "a.hdr"
     envi.save_image(str(header), values, interleave=interleave, byteorder=order, ext=".img", metadata=about, force=True)
     return header, values
 

@@ -70,8 +70,7 @@ def test_a_reader_of_what_was_cleared_is_told_what_to_do(archive: Archive) -> No
 
 def test_a_store_that_is_cleared_while_checked_is_whole(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
     """By a survey beside it: neither its reader nor verify takes it for damaged."""
-    small = small_survey(archive)
-    problem = manifests.file_problem
+    small, problem = small_survey(archive), manifests.file_problem
 
     def clear_first(path: Path, *given: Any, **options: Any) -> str | None:
         archive.clear(small.mosaic)

@@ -111,8 +111,7 @@ def test_broken_raw_lines_of_the_simulator_are_made_again(archive: Archive, how:
 
 def test_raw_lines_of_a_rig_stay_with_all_that_was_made_of_them(archive: Archive) -> None:
     """They cannot be had again; a broken map beside them is made again of them."""
-    small = small_survey(archive, simulated=False)
-    before = _moments(archive)
+    small, before = small_survey(archive, simulated=False), _moments(archive)
     flip(small.raw.path / "data.bin")
     done = _repair(archive, lambda settings: pytest.fail("nothing to run"))
     assert not done.complete

@@ -95,8 +95,7 @@ def extend(archive: Archive, name: str, content: str) -> None:
 def test_a_survey_sees_runs_of_other_machines(machine: Machine) -> None:
     """Those that were there when it opened the archive, and after a refresh those that came since."""
     archive = machine(FIRST)
-    runs = [small_survey(archive).run.name]
-    opened = machine(SECOND)
+    runs, opened = [small_survey(archive).run.name], machine(SECOND)
     assert [folder.name for folder in opened.runs()] == runs
     runs.append(small_survey(archive, seed=1).run.name)
     opened.refresh()
