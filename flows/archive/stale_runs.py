@@ -65,8 +65,7 @@ def from_raw_cubes(catalogue: Catalogue, run: Run, settings: Settings) -> Settin
     the raw cubes are gone too.
     """
     raw = set(stores_of_lines(run.products, lambda uri: uri in catalogue.stores and not catalogue.stores[uri].cleared))
-    stores = [catalogue.stores.get(uri) for uri in raw]
-    is_there = _is_there(run, settings)
+    stores, is_there = [catalogue.stores.get(uri) for uri in raw], _is_there(run, settings)
     if not stores or any(one is None or one.problem is not None or one.cleared for one in stores):
         if is_there:
             return settings

@@ -169,8 +169,7 @@ def _ground_m2(run: SurveyRun, kept: NDArray[np.bool_]) -> float | None:
 def plots_csv(plots: Sequence[Mapping[str, Any]]) -> str:
     """Return the figures of all plots as CSV, one row for each plot; unknown cells are empty."""
     names = list(plots[0]["fractions"]) if plots else []
-    head = ["plot", "pixels", "mapped_pixels", "area_m2", "confidence"]
-    text = io.StringIO()
+    head, text = ["plot", "pixels", "mapped_pixels", "area_m2", "confidence"], io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow([*head, *(f"fraction_{name}" for name in names)])
     for plot in plots:

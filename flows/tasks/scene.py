@@ -249,8 +249,7 @@ def check_labels(scene: RasterScene, weights: Description) -> tuple[str, ...]:
         return ()
     missing = [name for name in scene.class_names if name not in weights.class_names]
     if missing:
-        known = ", ".join(weights.class_names)
-        hint = "use weights for these"
+        known, hint = ", ".join(weights.class_names), "use weights for these"
         if (found := re.fullmatch(r"class_(\d+)|colour_([0-9a-f]{6})", missing[0])) is not None:  # it has no name
             value = found[1] or list(bytes.fromhex(found[2]))
             hint += (

@@ -237,8 +237,7 @@ def _show(record: dict[str, Any], console: Console) -> None:
     """Print the findings, what is missing, the file, and the next command."""
     height, width, bands = record["shape"]
     images = counted(record["images"], "image")
-    names = list_some([one["name"] for one in record["classes"]], 8)
-    first = record["first"]
+    names, first = list_some([one["name"] for one in record["classes"]], 8), record["first"]
     lines = [
         f"{images}, {record['labelled']} with labels; the first has {height} x {width} px, {bands} bands",
         *([f"classes: {names}"] if names else []),

@@ -142,8 +142,7 @@ def paired_interval(
     difference = float((_means(first, once) - _means(second, once))[0])
     if frames < 2:
         return Interval(difference, None, None)
-    times = _drawn(frames, draws, [seed, 0xB007])
-    changes = []
+    times, changes = _drawn(frames, draws, [seed, 0xB007]), []
     for counts, of in zip((first, second), of_runs, strict=True):
         trainings = int(of.max()) + 1
         changes.append(_means(counts, times, _drawn(trainings, draws, [seed, 0x5EED, trainings])[:, of]))

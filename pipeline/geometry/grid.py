@@ -78,8 +78,7 @@ def pad_by_reflection(image: NDArray[np.generic], shape: tuple[int, int]) -> NDA
     grown = image
     for axis, size in enumerate(shape):
         while grown.shape[axis] < size:
-            have = grown.shape[axis]
-            pad = [(0, 0)] * image.ndim
+            have, pad = grown.shape[axis], [(0, 0)] * image.ndim
             pad[axis] = (0, size - have if have < 2 else min(size - have, have - 1))
             grown = np.pad(grown, pad, mode="edge" if have < 2 else "reflect")
     return grown

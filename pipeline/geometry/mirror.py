@@ -163,8 +163,7 @@ def camera_slope(along: Floats, scan: Floats, across: ArrayLike, centre: Floats)
     :func:`line_centre` for the same point.
     """
     c = np.asarray(across, _kept(along, scan, across))
-    r = np.sqrt(1 + c * c + centre * centre)
-    ahead = 1 + along * c + scan * centre
+    r, ahead = np.sqrt(1 + c * c + centre * centre), 1 + along * c + scan * centre
     slope: Floats = (along * r - (ahead - scan * r) * c / (r - centre)) / ahead
     return slope
 

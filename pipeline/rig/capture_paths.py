@@ -11,6 +11,7 @@ line 0. ``p`` is the decimal point.
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -51,6 +52,27 @@ class MirrorScanPath:
 def played_scan_path(position: Floats, rate_hz: float) -> MirrorScanPath:
     """Return the scan path of positions (held, 2) that are each held for 1 / ``rate_hz``, one after the other."""
     return MirrorScanPath(np.repeat(np.arange(len(position) + 1), 2)[1:-1] / rate_hz, np.repeat(position, 2, axis=0))
+
+
+def _followed(logged: MirrorScanPath, played: MirrorScanPath, begin_s: float, off_s: float) -> MirrorScanPath:
+    """Return the played path as the mirror followed it: at the time and place that bring it nearest to its log.
+
+    The path begins at ``begin_s`` of the log's time, give or take ``off_s`` and two positions. A log has few samples a
+    position, and is linear between them. It is returned itself if it is half a step or more off the path.
+    """
+    held_s = float(played.time_s[1] - played.time_s[0])
+    reach_s = off_s + 2 * held_s
+    shifts = begin_s + np.linspace(-reach_s, reach_s, 2 * STEPS_A_POSITION * math.ceil(reach_s / held_s) + 1)
+    off = [logged.position - _at(played, logged.time_s - shift) for shift in shifts]
+    rms = [float(np.sqrt(np.mean(np.var(one, axis=0)))) for one in off]
+    best = int(np.argmin(rms))
+    steps = np.linalg.norm(np.diff(played.position[::2], axis=0), axis=1)
+    if not len(steps) or rms[best] >= float(np.median(steps)) / 2:
+        return logged
+    ends = logged.time_s[[0, -1]]
+    time_s = np.concatenate([ends[:1], np.clip(played.time_s + shifts[best], *ends), ends[1:]])
+    position = played.position[[0, *range(len(played.position)), -1]] + off[best].mean(axis=0)
+    return MirrorScanPath(time_s, position)
 
 
 @dataclass(frozen=True)
@@ -114,7 +136,8 @@ def lines_by_time(
     if not valid.all():
         notes.append(f"without a time, or outside of the {method}'s: {np.count_nonzero(~valid)} of {len(valid)} lines")
     unknown_s = float(np.ptp(began_s) + np.ptp(capture_s)) / 2
-    px = _apart_px(scan_path, camera, (middle_s[valid], middle_s[valid] + unknown_s))
+    ramps = MirrorScanPath(*((one[:-1] + one[1:]) / 2 for one in (scan_path.time_s, scan_path.position)))
+    px = _apart_px(ramps, camera, (middle_s[valid], middle_s[valid] + unknown_s))  # a step may lie between any two
     notes.append(f"software timing: a constant line offset of about {px:.2g} px remains")
     return LinePositions(np.where(valid[:, None], _at(scan_path, middle_s), np.nan), valid, method, px, tuple(notes))
 
@@ -132,6 +155,7 @@ def _apart_px(scan_path: MirrorScanPath, camera: LineCamera, times: tuple[Floats
     return float(np.sqrt(np.mean(np.sum((one - other) ** 2, axis=-1))) / camera.ifov_rad)
 
 
+STEPS_A_POSITION = 20  # of time, in which a played path is laid on the mirror's log
 LEAD = 1  # cells before the first line's: a triggered unit plays its first cell at the run command, assumed
 REFERENCES = "references"  # prefix of a capture for the dark and white frames in its folder
 _NUMBER = r"(-?\d+(?:p\d+)?(?:e-?\d+)?)"
@@ -302,10 +326,12 @@ def _positions(
                 "(see pulses in [rig]), or the capture was stopped"
             )
         return lines_by_trigger(frames, path.middle.astype(np.float64), counted=index is not None)
+    played = played_scan_path(path.cells.astype(np.float64), path.rate_hz)
     if taken.log is not None and len(taken.log.position) > 1:
         times_s = np.arange(len(taken.log.position)) / taken.log.rate_hz
         began_s = (taken.log.started_s - taken.log.start_error_s, taken.log.started_s)
         logged = MirrorScanPath(times_s, taken.log.position.astype(np.float64))
-        return lines_by_time(frames, camera, logged, began_s, taken.capture_s, "log")
-    played = played_scan_path(path.cells.astype(np.float64), path.rate_hz)
+        begin_s = float(np.mean(taken.run_s) - np.mean(began_s))
+        followed = _followed(logged, played, begin_s, float(np.ptp(taken.run_s) + np.ptp(began_s)))
+        return lines_by_time(frames, camera, followed, began_s, taken.capture_s, "log")
     return lines_by_time(frames, camera, played, taken.run_s, taken.capture_s, "command")

@@ -197,7 +197,8 @@ class CaptureRunner:
                 capture = self.devices.camera.capture(path.lines, prefix=prefix)
             else:
                 most_hz = (self._rig.log_samples - 1) / (exposed.scan_seconds(path.lines) + SLACK_S)
-                steering.start_log(min(self._rig.log_rate_hz, most_hz))  # it must hold the whole capture
+                log_hz = min(self._rig.log_rate_hz, most_hz)  # it must hold the whole capture
+                steering.start_log(log_hz)
                 capture = self.devices.camera.capture(path.lines, prefix=prefix)
                 run_s = self._run(path)
             at_s = (capture.sent_s, capture.acknowledged_s)
@@ -207,6 +208,7 @@ class CaptureRunner:
         if taken.triggered:
             taken = replace(taken, index_at_end=steering.index())
         else:
+            self.devices.clock.sleep(2 / log_hz)  # the log's last sample must be later than the last line
             taken = replace(taken, log=steering.read_log())
         steering.halt()
         return self._journal.record_end(taken)

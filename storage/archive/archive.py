@@ -157,8 +157,7 @@ class Archive:
         final = self.root / ref.uri
         facts = {"stage": stage, "key": key, "version": version, "params": plain(params or {}), "inputs": plain(inputs)}
         with refusals(self.root, "write to the archive"), self._locked(f"{stage}-{key}"):
-            done = self.find(stage, key) is not None
-            part = final.with_name(key + PART_SUFFIX)
+            done, part = self.find(stage, key) is not None, final.with_name(key + PART_SUFFIX)
             remove_tree(part)
             part.mkdir(parents=True)
             try:

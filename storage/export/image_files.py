@@ -68,8 +68,7 @@ def write_cog(path: Path, image: CogImage, blocks: Blocks) -> None:
 
 
 def _write_cog(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> None:
-    copy = importlib.import_module("rasterio.shutil").copy
-    sidecar = f"{path.name}.aux.xml"
+    copy, sidecar = importlib.import_module("rasterio.shutil").copy, f"{path.name}.aux.xml"
     with written_aside(path.parent, [path.name] if image.legend is None else [path.name, sidecar]) as aside:
         plain, made = aside / "plain.tif", aside / path.name
         _write_plain(rasterio, plain, image, blocks)

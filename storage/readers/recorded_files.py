@@ -284,8 +284,7 @@ class PointingTable:
             )
         if "line" in self.columns:
             order = np.argsort(self.columns["line"][rows], kind="stable")
-            wrong = self.columns["line"][rows][order] != np.arange(lines)
-            rows = rows[order]
+            wrong, rows = self.columns["line"][rows][order] != np.arange(lines), rows[order]
             self._refuse(rows, wrong, "line", f"expected each of 0 to {lines - 1} once")
         valid = np.ones(lines, np.bool_)
         if "valid" in self.columns:

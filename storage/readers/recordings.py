@@ -295,8 +295,7 @@ def _sweeps_of(
         notes.append(f"{cube.name}: nothing says the exposure: {camera.exposure_ms:g} ms is assumed")
         known_ms = np.full(source.shape[0], camera.exposure_ms)
     exposure_ms = np.where(np.isfinite(known_ms), known_ms, np.nanmedian(known_ms))
-    white = np.asarray(given.white_reference, np.float32)
-    stem = cube.folder / cube.name
+    white, stem = np.asarray(given.white_reference, np.float32), cube.folder / cube.name
     references = find_references(source, stem, camera, notes, stated=given.frames, white_reference=white)
     names = (cube.name,) if pointing.part is None else tuple(name for name in dict.fromkeys(pointing.part) if name)
     fields = load_envi_header(find_envi_pair(cube.path)[0]).fields if reader_of(cube.path) == "envi" else {}

@@ -121,8 +121,7 @@ def test_init_sees_the_dates_of_a_series(tmp_path: Path, command_line: Any) -> N
     """An array of five dates beside LULC.npy is a series with labels; the next command takes one of its dates."""
     np.save(tmp_path / "LULC.npy", CLASSES)
     np.save(tmp_path / "series.npy", np.stack([image() for _ in range(5)]).astype(np.float32))
-    ended = command_line("init", tmp_path)
-    series = tmp_path / "series.npy"
+    ended, series = command_line("init", tmp_path), tmp_path / "series.npy"
     assert f"note: {series} has 5 steps of time; each is a scene, {series}:0 to {series}:4" in ended.out
     assert f"then: spectralzoom train {series}:0 " in ended.out
 

@@ -159,8 +159,7 @@ def mean_frame(lines: NDArray[np.integer]) -> MeanFrame:
     """
     if lines.ndim != 3 or not lines.size:
         raise ShapeError(f"expected at least one frame (line, sample, band), got {lines.shape}; capture the reference")
-    count = len(lines)
-    stuck = lines.min(axis=0) == lines.max(axis=0)
+    count, stuck = len(lines), lines.min(axis=0) == lines.max(axis=0)
     if count < FRAMES_FOR_STUCK or stuck.mean() > 0.5:  # most elements have some noise
         stuck = np.zeros(stuck.shape, np.bool_)
     return MeanFrame((lines.sum(axis=0, dtype=np.int64) / count).astype(np.float32), stuck)

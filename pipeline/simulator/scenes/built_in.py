@@ -154,12 +154,10 @@ def _weeds_within(plan: FarmPlan, cover: Field) -> dict[str, Points]:
     """Return weeds that grow densely under a cover: y, x and radius (n, 3) by spectrum."""
     if not cover.any():
         return {}
-    middle = (np.array(cover.shape) - 1) / 2
-    there = np.argwhere(cover)
+    middle, there = (np.array(cover.shape) - 1) / 2, np.argwhere(cover)
     (top, left), (bottom, right) = there.min(axis=0) - middle - 1, there.max(axis=0) - middle + 1
     box = Parcel(np.array([[top, left], [top, right], [bottom, right], [bottom, left]]))
-    rng = stream(plan.seed, "weeds of patches")
-    kept = {}
+    rng, kept = stream(plan.seed, "weeds of patches"), {}
     for name, plants in field_weeds(rng, replace(plan.fields[0], parcel=box, weeds=DENSE), plan.day).items():
         y, x = np.clip(np.rint(plants[:, :2] + middle), 0, np.array(cover.shape) - 1).astype(int).T
         kept[name] = plants[rng.uniform(size=len(plants)) < cover[y, x]]

@@ -131,8 +131,7 @@ def test_a_revisit_shows_what_changed(monkeypatch: pytest.MonkeyPatch, tmp_path:
     words, shown = list[tuple[str, str]](), Mock(wraps=quicklook._show)
     monkeypatch.setattr(quicklook, "_caption", lambda axes, title, text: words.append((title, text)))
     monkeypatch.setattr(quicklook, "_show", shown)
-    data = make_data(96, 128)
-    was = np.full((96, 128), 255, np.uint8)
+    data, was = make_data(96, 128), np.full((96, 128), 255, np.uint8)
     was[5:7, 10:20] = 1
     now = np.where(was == 255, data.class_map, 0).astype(np.uint8)
     (tmp_path / "picture.png").write_bytes(draw_quicklook(replace(data, was=was, days=7.0, class_map=now)))

@@ -108,8 +108,7 @@ def test_hardly_any_runs_of_two_swaths_are_worth_more(seed: int, fraction: float
     scan_pass = partial_scan(expected_gain, given_s, rows, WIDER, cost)
     assert scan_pass is not None
     sums, setup_s = rows.sums(expected_gain), cost.setup_seconds(exposing(WIDER, rows.sweeps[0]))
-    line_s = exposing(WIDER, rows.sweeps[0]).frame_ms * 1e-3
-    options = []
+    line_s, options = exposing(WIDER, rows.sweeps[0]).frame_ms * 1e-3, []
     for values, first, stop in zip(sums, rows.first, rows.stop, strict=True):
         pairs = [(begin, end - 1) for begin, end in combinations(range(len(values) + 1), 2)]
         runs = [(setup_s + line_s * (stop[end] - first[begin]), values[begin : end + 1].sum()) for begin, end in pairs]
@@ -156,8 +155,7 @@ def test_rows_worth_the_same_are_looked_at_as_far_as_time_goes() -> None:
 @pytest.mark.parametrize("along", ["x", "y"])
 def test_a_patch_that_two_swaths_show_is_of_the_nearer(along: Axis) -> None:
     """By how far its middle lies from the middle of their lines."""
-    rows = rows_of(along)
-    patch_index = GRID.every_patch()
+    rows, patch_index = rows_of(along), GRID.every_patch()
     middle = GRID.patch_origin(patch_index) + GRID.patch / 2 - np.array([GRID.height, GRID.width]) / 2
     across = middle[:, "yx".index(along)]
     off = np.abs(across[:, None] - np.array([sweep.swath_px for sweep in rows.sweeps]))

@@ -93,8 +93,7 @@ def test_ratio_is_not_moved_by_noise_or_by_what_moved():
 
 def test_drift_between_captured_sweeps_is_taken_out():
     """Two simulated sweeps, one lit 20 % more and redder, agree to 0.5 % in every band once gains are in."""
-    camera = LineCamera(samples=120)
-    rng = np.random.default_rng(3)
+    camera, rng = LineCamera(samples=120), np.random.default_rng(3)
     values = np.kron(rng.uniform(0.3, 1, (15, 26, 8)), np.ones((8, 8, 1)))
     scene = raster_from_values(values, camera, name="t", wavelength_nm=np.linspace(400, 1000, 8))
     source = SimulatedSource(scene, Rig(camera), 0, effects_on("rotation", "shot", "read-noise"))

@@ -73,8 +73,7 @@ def test_rows_without_gaps_are_undecidable(turned: bool):
 
 def test_error_is_the_scatter_of_the_shift():
     """Over noisy views of one overlap the stated error is the scatter found, to a third; the peak is a correlation."""
-    shift = np.array([2.3, -1.4])
-    drawn = np.random.default_rng(9)
+    shift, drawn = np.array([2.3, -1.4]), np.random.default_rng(9)
     clean = wave_views(3, (96, 96), shift, np.inf, (8, 60))
     found = [pair_shift(*(view + drawn.normal(0, 0.5, view.shape) for view in clean), prior_px=5) for _ in range(40)]
     scatter = np.sqrt(np.mean([(each.shift - shift) ** 2 for each in found], axis=0))

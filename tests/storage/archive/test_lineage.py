@@ -20,8 +20,7 @@ from tests.storage.small_archive import flip, rewrite, small_survey
 
 def test_inputs_and_dependents_are_followed_all_the_way(tmp_path: Path, archive: Archive) -> None:
     """A map rests on its mosaic and, through it and directly, on the raw lines."""
-    small = small_survey(archive)
-    catalogue = lineage.Catalogue.read(tmp_path)
+    small, catalogue = small_survey(archive), lineage.Catalogue.read(tmp_path)
     assert catalogue.ancestors([small.map.uri]) == {small.mosaic.uri, small.raw.uri}
     assert catalogue.inputs_first(catalogue.stores) == [small.raw.uri, small.mosaic.uri, small.map.uri]
     assert [ref.uri for ref in lineage.rests_on(tmp_path, [small.mosaic])] == [small.raw.uri, small.mosaic.uri]
@@ -125,8 +124,7 @@ def test_nested_parameters_have_dotted_names() -> None:
 
 def test_products_go_by_many_names(tmp_path: Path, archive: Archive) -> None:
     """Address, address of a file in it, stage and key, beginning of a key, run, and name in the newest run."""
-    small = small_survey(archive)
-    catalogue = lineage.Catalogue.read(tmp_path)
+    small, catalogue = small_survey(archive), lineage.Catalogue.read(tmp_path)
     key = small.map.key
     for text in (small.map.uri, f"{small.map.uri}/class_map.zarr/", f"segment/{key}", key, key[:8], "class_map"):
         assert lineage.find_product(catalogue, text) == small.map.uri

@@ -89,7 +89,6 @@ def test_digest_leaves_out_what_does_not() -> None:
     assert len(plain) == 20
     assert plain == path_digest(position, np.ones(5, np.bool_), -np.zeros((5, 2)))
     assert plain == path_digest(np.asfortranarray(position))
-    usable = np.arange(5) != 2
-    lost = position.copy()
+    usable, lost = np.arange(5) != 2, position.copy()
     lost[2] = np.nan
     assert path_digest(lost, usable) == path_digest(position, usable)

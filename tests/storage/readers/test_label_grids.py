@@ -115,8 +115,7 @@ def test_labels_of_another_place(tmp_path: Path) -> None:
 
 def test_a_training_mask_on_another_grid(tmp_path: Path) -> None:
     """A mask of where to train is brought to the scene's pixels as well."""
-    path = image(tmp_path)
-    south_up = Affine(1, 0, WEST, 0, 1, NORTH - SIDE)
+    path, south_up = image(tmp_path), Affine(1, 0, WEST, 0, 1, NORTH - SIDE)
     labels = write(tmp_path / "truth.tif", np.ascontiguousarray(CLASSES[::-1]), south_up)
     mask = write(tmp_path / "mask.tif", np.where(CLASSES == 1, 1, 0).astype(np.uint8)[::-1].copy(), south_up)
     data = load_data_set(path, labels=labels, train_mask=mask)

@@ -86,8 +86,7 @@ def _content(
 ) -> Content:
     here, down = ground
     land, crop = field.land_on(work.plan.day), field.crop
-    salt = int(rng.integers(2**31))
-    rows = rows_of(rng, field, centres)
+    salt, rows = int(rng.integers(2**31)), rows_of(rng, field, centres)
     if land.phase == "grass":
         return _meadow(rows, field, here, land.days, work.plan.day)
     soil = moist_soil(work.plan, here, field.wetter)
@@ -300,15 +299,13 @@ def field_weeds(rng: np.random.Generator, field: FieldPlan, day: int) -> dict[st
     radius = np.append(radius, rng.uniform(1.0, 2.0, single))
     emergence = np.append(emergence, rng.uniform(110, 190, single))
     turned = np.full(count + single, days_since_turned(field.use, day, field.late_days))
-    age = (day - emergence) % YEAR_DAYS
-    land = field.land_on(day)
+    age, land = (day - emergence) % YEAR_DAYS, field.land_on(day)
     cut = np.where((age > land.days) & (land.phase in ("grass", "stubble")), 0.5, 1.0)  # saw mowing or harvest
     alive = (age < turned) & (age < 170)  # tillage kills a weed, and so does its age; it grows to 63 % in 22 days
     size = radius * np.where(alive, 1 - np.exp(-age / 22), 0.0) * cut
     flowers = (kinds == "mustard") & (age >= FLOWERING[0]) & (age < FLOWERING[1])
     spectra = np.where(flowers, "blossom", np.where(kinds == "mustard", "weed_leafy", kinds))
-    seen = size > SEEN_PX
-    plants = np.column_stack([places, size])
+    seen, plants = size > SEEN_PX, np.column_stack([places, size])
     return {str(name): plants[seen & (spectra == name)] for name in np.unique(spectra[seen])}
 
 

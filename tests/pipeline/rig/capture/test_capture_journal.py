@@ -38,8 +38,7 @@ def test_latest_capture_of_a_line_counts() -> None:
 def test_folder_whose_name_comes_again_is_the_latest() -> None:
     """A camera that was emptied counts its folders anew: the new capture counts, is not spent, and is tied anew."""
     kept = KeptInMemory()
-    journal = CaptureJournal(kept)
-    again = replace(ONE, run_s=(7.0, 7.1))
+    journal, again = CaptureJournal(kept), replace(ONE, run_s=(7.0, 7.1))
     journal.record_capture(ONE)
     journal.record_positions(ONE, tied(1.0), ())
     journal.record_spent(ONE, "gone")
