@@ -85,20 +85,22 @@ def survey(*settings: Path, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = Fal
     """
     every, code = [load_settings(file, by_setting(flags)) for file in settings or (None,)], 0
     printed: list[dict[str, Any]] = []
-    for number, requested in enumerate(every):
-        if len(every) > 1:
-            stderr.print(f"survey {number + 1} of {len(every)}: {settings[number]}", markup=False, soft_wrap=True)
-        try:
-            printed.append(survey_command.run_survey(requested, stderr, verbose=verbose).receipt)
-        except NothingToMend as skipped:
-            printed.append({"captured": False, "run": skipped.run, "why": str(skipped)})
-            stderr.print(f"{skipped}", markup=False, soft_wrap=True)
-        except Exception as error:
-            if len(every) == 1 or isinstance(error, BrokenPipeError):
-                raise
-            message, code = format_failure(error)
-            say(f"{settings[number]}: {message}")
-            printed.append({"settings": str(settings[number]), "error": message})
-    if as_json:
-        print_json(printed[0] if len(every) == 1 else {"surveys": printed})
+    try:
+        for number, requested in enumerate(every):
+            if len(every) > 1:
+                stderr.print(f"survey {number + 1} of {len(every)}: {settings[number]}", markup=False, soft_wrap=True)
+            try:
+                printed.append(survey_command.run_survey(requested, stderr, verbose=verbose).receipt)
+            except NothingToMend as skipped:
+                printed.append({"captured": False, "run": skipped.run, "why": str(skipped)})
+                stderr.print(f"{skipped}", markup=False, soft_wrap=True)
+            except Exception as error:
+                if len(every) == 1 or isinstance(error, BrokenPipeError):
+                    raise
+                message, code = format_failure(error)
+                say(f"{settings[number]}: {message}")
+                printed.append({"settings": str(settings[number]), "error": message})
+    finally:  # also after Ctrl-C
+        if as_json and printed:
+            print_json(printed[0] if len(every) == 1 else {"surveys": printed})
     return code

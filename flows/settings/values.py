@@ -21,7 +21,7 @@ from pipeline.setting_fields import format_number, numbers_of
 from pipeline.simulator.effects.probe import Unit
 from pipeline.simulator.render import BY_NAME
 from pipeline.simulator.selection.choice import named_effects
-from storage.archive.records import moment_of
+from storage.archive.records import YEARS, moment_of
 from storage.archive.staging import is_name
 from storage.parallel.pool import WorkerPool
 
@@ -33,8 +33,7 @@ UNKNOWN_AUTO, UNKNOWN_OFF = "auto", "off"
 LEAST_UNKNOWN, MOST_UNKNOWN = 0.05, 5.0  # percent
 _DAYS = {"h": 1 / 24, "d": 1.0, "w": 7.0}  # by unit
 _BYTES = TypeAdapter(ByteSize)
-_DATE = re.compile(r"\d{1,4}([./-])\d{1,2}\1\d{1,4}(\s|$)|\d{4}-\d\d-\d\d")
-YEARS = range(1900, 2201)  # of a visit
+_DATE = re.compile(r"\d{1,4}([./-])\d{1,2}\1\d{1,4}(\s|$)|\d{4}-\d\d-\d\d(?!\d)")
 
 
 @dataclass(frozen=True)
@@ -68,8 +67,7 @@ def parse_name(value: object) -> str:
 def parse_visit(value: object) -> str:
     """Return the text of a visit, without spaces around it; a date at its begin has the form YYYY-MM-DD."""
     text = parse_text(value).strip()
-    moment = moment_of(text)
-    if (moment is None and _DATE.match(text)) or (moment is not None and moment.year not in YEARS):
+    if _DATE.match(text) and moment_of(text) is None:
         raise ValueError(
             f"must be text, or begin with a date as YYYY-MM-DD from {YEARS[0]} to {YEARS[-1]}; got {value!r}"
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.errors import BudgetError, NotRecordedError, PoseError, SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import Axis, CostModel, Sweep, exposing
+from pipeline.geometry.scan import Axis, CostModel, Sweep, exposing, memory_loads
 from pipeline.planning.coverage import cheapest_full, full_sweeps, sweeps_over, uniform_sweeps, with_margin
 from pipeline.planning.fine_pass import FIRST_STEP, FIRST_STEPS, every_nth, lines_between, merged_ms
 from pipeline.planning.partial_scans import sweeps_of_runs
@@ -218,9 +218,11 @@ def choose_uniform_scan(
     camera, cost = layout.camera, layout.cost
     sweeps: dict[int, list[Sweep]] = {}  # by line spacing: those that fit the field, or that recorded lines contain
     for step in (one for one in record.steps if one <= camera.samples):
-        needed = layout.recorded is None and step == (layout.step or 1)
-        with nullcontext() if needed else suppress(SettingsError, PoseError, NotRecordedError):
-            sweeps[step] = layout.uniform(step, layout.exposure_ms).sweeps()[1]
+        others = (SettingsError, PoseError) if step != (layout.step or min(record.steps)) else ()
+        with suppress(*others if layout.recorded is None else (NotRecordedError,)):
+            found = layout.uniform(step, layout.exposure_ms).sweeps()[1]
+            memory_loads(found, cost.vector_pairs)  # raises where the mirror cannot hold a line
+            sweeps[step] = found
     recorded_ms = None  # by line spacing: recorded lines have exposures of their own
     if layout.recorded is not None:
         recorded_ms = {step: exposing(camera, found[0]).exposure_ms for step, found in sweeps.items()}

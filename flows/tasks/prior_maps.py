@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, time
 from pathlib import Path
 from typing import Any
 
@@ -192,7 +192,7 @@ def _days_since(run: Run, visit: str | None, moment: tuple[int, float] | None) -
     """
     then, now = (moment_of(one) for one in (run.settings.get("visit"), visit))
     if then is not None and now is not None:
-        if min(len(str(one)) for one in (run.settings.get("visit"), visit)) <= len("2026-06-01"):  # a date alone
+        if time.min in (then.time(), now.time()):  # a date alone
             return float((now.date() - then.date()).days)
         return (now - then).total_seconds() / 86400
     if moment is not None and run.settings.get("scene") in BUILT_IN_SCENES:

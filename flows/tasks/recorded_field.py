@@ -129,8 +129,8 @@ def _field_shape(
     """Return the size (y, x) of the field around the direction at rest, as stated or covered; and notes."""
     if stated is not None:
         return stated, ()
-    sweeps, tangents = [one.sweep for one in recording.sweeps], [one.tangents for one in recording.sweeps]
-    covered = covered_field(sweeps, tangents, recording.camera)
+    tangents = [np.where(one.valid_line[:, None], one.tangents, np.nan) for one in recording.sweeps]
+    covered = covered_field([one.sweep for one in recording.sweeps], tangents, recording.camera)
     height, width = (
         int(size - 2 * abs(off) + EDGE_PX) for size, off in zip(covered.shape, covered.centre_px, strict=True)
     )

@@ -82,7 +82,7 @@ def open_zones(files: ZoneChoice, place: FieldPlace, grid: SceneGrid) -> SurveyZ
     def read(source: str, *, named_by: str | None = None, needed: bool = True) -> dict[str, BaseGeometry]:
         found = _read(source, place, notes, named_by)
         shapes = {name: on_field(one, found.crs, place) for name, one in found.shapes.items()}
-        if not any(one.intersects(NoPlace(shape).outline) for one in shapes.values()):
+        if not any(one.intersection(NoPlace(shape).outline).area > 0 for one in shapes.values()):
             if needed:
                 raise ZoneError(_format_beside(found, place))
             notes.append(_format_beside(found, place))

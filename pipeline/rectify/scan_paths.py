@@ -165,8 +165,7 @@ def _dwell_starts(scan: Floats, reach: float) -> NDArray[np.intp]:
     """Return first members of the groups of lines that lie less than ``reach`` beyond the first of their group."""
     if (np.diff(scan) >= reach).all():
         return np.arange(len(scan))
-    starts = [0]
-    following = np.searchsorted(scan, scan + reach)
+    starts, following = [0], np.searchsorted(scan, scan + reach)
     while (start := int(following[starts[-1]])) < len(scan):
         starts.append(start)
     return np.array(starts, np.intp)
@@ -181,8 +180,7 @@ def _with_stand_ins(
     empty = np.flatnonzero(~seen)
     before = np.searchsorted(at, empty) - 1
     nearest = np.where(empty - at[before] <= at[np.minimum(before + 1, len(at) - 1)] - empty, before, before + 1)
-    members = np.empty(sizes.sum(), np.intp)
-    real = np.repeat(seen, sizes)
+    members, real = np.empty(sizes.sum(), np.intp), np.repeat(seen, sizes)
     members[real] = lines
     members[~real] = lines[(np.cumsum(counts) - counts)[nearest]]
     return members, np.cumsum(sizes) - sizes
@@ -208,8 +206,7 @@ def number_lines(time_s: Floats, frame_s: float) -> LineNumbers:
     long. So one wild stamp costs one line, also at either end. A late frame is used, with the position at its own time.
     ``frame_s`` is the planned frame period.
     """
-    known = np.isfinite(time_s)
-    first = np.zeros(len(time_s), np.bool_)
+    known, first = np.isfinite(time_s), np.zeros(len(time_s), np.bool_)
     first[np.unique(time_s, return_index=True)[1]] = True
     repeated = int((known & ~first).sum())
     fresh = np.flatnonzero(known & first)

@@ -58,21 +58,23 @@ def _followed(logged: MirrorScanPath, played: MirrorScanPath, begin_s: float, of
     """Return the played path as the mirror followed it: at the time and place that bring it nearest to its log.
 
     The path begins at ``begin_s`` of the log's time, give or take ``off_s`` and two positions. A log has few samples a
-    position, and is linear between them. It is returned itself if it is half a step or more off the path.
+    position, and is linear between them. It is returned itself if any sample lies more than a step and a half beside.
     """
     held_s = float(played.time_s[1] - played.time_s[0])
-    reach_s = off_s + 2 * held_s
-    shifts = begin_s + np.linspace(-reach_s, reach_s, 2 * STEPS_A_POSITION * math.ceil(reach_s / held_s) + 1)
-    off = [logged.position - _at(played, logged.time_s - shift) for shift in shifts]
-    rms = [float(np.sqrt(np.mean(np.var(one, axis=0)))) for one in off]
-    best = int(np.argmin(rms))
-    steps = np.linalg.norm(np.diff(played.position[::2], axis=0), axis=1)
-    if not len(steps) or rms[best] >= float(np.median(steps)) / 2:
+    wide, fine = math.ceil(off_s / held_s + 2), np.linspace(-1, 1, 2 * STEPS_A_POSITION + 1)
+    for steps in (np.arange(-wide, wide + 1), fine):
+        shifts = begin_s + steps * held_s
+        spread = np.array([np.var(logged.position - _at(played, logged.time_s - one), axis=0).sum() for one in shifts])
+        alike = spread <= spread.min() + 1e-6 * np.ptp(spread)  # with one sample a position, many shifts are
+        begin_s = float(shifts[alike].mean())
+    off = logged.position - _at(played, logged.time_s - begin_s)
+    beside = np.median(off, axis=0)
+    step = np.linalg.norm(np.diff(played.position[::2], axis=0), axis=1)
+    if not len(step) or np.linalg.norm(off - beside, axis=1).max() > MOST_STEPS_OFF * np.median(step):
         return logged
     ends = logged.time_s[[0, -1]]
-    time_s = np.concatenate([ends[:1], np.clip(played.time_s + shifts[best], *ends), ends[1:]])
-    position = played.position[[0, *range(len(played.position)), -1]] + off[best].mean(axis=0)
-    return MirrorScanPath(time_s, position)
+    time_s = np.concatenate([ends[:1], np.clip(played.time_s + begin_s, *ends), ends[1:]])
+    return MirrorScanPath(time_s, played.position[[0, *range(len(played.position)), -1]] + beside)
 
 
 @dataclass(frozen=True)
@@ -156,6 +158,7 @@ def _apart_px(scan_path: MirrorScanPath, camera: LineCamera, times: tuple[Floats
 
 
 STEPS_A_POSITION = 20  # of time, in which a played path is laid on the mirror's log
+MOST_STEPS_OFF = 1.5  # of any sample of a mirror that followed: those in a move are up to one step beside
 LEAD = 1  # cells before the first line's: a triggered unit plays its first cell at the run command, assumed
 REFERENCES = "references"  # prefix of a capture for the dark and white frames in its folder
 _NUMBER = r"(-?\d+(?:p\d+)?(?:e-?\d+)?)"

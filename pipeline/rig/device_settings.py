@@ -107,7 +107,7 @@ class SurveyRig:
     log_rate_hz: float = stated(
         10000.0, "Highest rate of measured positions; without pulses they place the lines", "Hz", 0.1, 10_000
     )
-    log_samples: int = assumed(2000, "Samples that the controller's log holds", "", 1, 16_383)  # not published
+    log_samples: int = assumed(2000, "Samples that the controller's log holds", "", 10, 16_383)  # not published
     mirror_driver: str = stated(
         "",
         "Driver of a mirror of another make, as module:function; by default that of the MR-E-2",

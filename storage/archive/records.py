@@ -6,6 +6,7 @@ A damaged manifest gives a record with a ``problem``; values of another type tha
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -19,17 +20,20 @@ from storage.archive.manifests import as_table, is_cleared, listed_bytes, try_ma
 from storage.archive.staging import MANIFEST_NAME, file_hash
 
 RECEIPT = "receipt.json"
+YEARS, _DAY = range(1900, 2201), re.compile(r"^\d{4}-\d\d-\d\d(?!\d)")
 State = Literal["ran", "cached", "skipped", "failed"]  # of a stage of a run
 LINE_PRODUCTS = {"raw_coarse": "signal_coarse", "raw_fine": "signal_fine"}  # of a run: raw lines, and condensed ones
 RESTS_ON = "rests_on"  # in a run's manifest: address of a store or of an input of it -> SHA-256 of its manifest.json
 
 
 def moment_of(text: object) -> datetime | None:
-    """Return the moment in ISO 8601 that is a text or its first word, in UTC if it names no zone; else None."""
-    for words in (text, text.partition(" ")[0]) if isinstance(text, str) else ():
+    """Return the moment or day in ISO 8601 at the begin of a text, in UTC if it names no zone; else None."""
+    if not isinstance(text, str) or not (words := text.split()):
+        return None
+    for some in (" ".join(words), " ".join(words[:2]), words[0], *_DAY.findall(words[0])):
         with suppress(ValueError):
-            found = datetime.fromisoformat(words)
-            return found.replace(tzinfo=found.tzinfo or UTC)
+            found = datetime.fromisoformat(some)
+            return found.replace(tzinfo=found.tzinfo or UTC) if found.year in YEARS else None
     return None
 
 

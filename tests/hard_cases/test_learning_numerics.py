@@ -88,8 +88,7 @@ def test_26_losses_of_half_precision_add_up_in_single(kind: torch.dtype):
     generator = torch.Generator().manual_seed(0)
     logits = torch.randn(1, 3, 250, 400, generator=generator).to(kind)
     labels = torch.randint(0, 3, (1, 250, 400), generator=generator)
-    weight = torch.tensor([1.0, 2.0, 0.5])
-    losses = pixel_losses(logits, labels)
+    weight, losses = torch.tensor([1.0, 2.0, 0.5]), pixel_losses(logits, labels)
     assert losses.dtype == torch.float32
     exact = nn.functional.cross_entropy(logits.double(), labels, weight.double())
     assert float(map_loss(logits, losses, labels, weight, soft_dice=False)) == pytest.approx(float(exact), rel=1e-5)

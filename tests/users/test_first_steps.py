@@ -167,12 +167,13 @@ def test_init_says_why_not(tmp_path: Path, command_line: Any, monkeypatch: pytes
 
 def test_a_date_of_a_visit_has_one_form() -> None:
     """Days between visits are counted by dates in one form, which the message shows; other words are taken."""
-    for visit in ("01.06.2026", "6/1/2026", "2026-6-1", "01.06.2026 noon", "2026-06-10T25:00", "0026-06-10"):
+    for visit in ("01.06.2026", "6/1/2026", "2026-6-1", "01.06.2026 noon", "2026-13-10b", "0026-06-10"):
         with pytest.raises(SettingsError, match=r"visit must be text, or begin with a date as YYYY-MM-DD"):
             load_settings(None, {"scene": "farm", "visit": visit})
-    for visit in ("first of June", "2026-06-01T10:00:00Z", "v1.2.3"):
+    for visit in ("first of June", "2026-06-01T10:00:00Z", "v1.2.3", "2026-05-04_2", "10010101"):
         assert load_settings(None, {"scene": "farm", "visit": visit}).visit == visit
-    assert moment_of("2026-06-01 morning") == moment_of("2026-06-01")
+    assert moment_of("2026-06-01 morning") == moment_of("2026-06-01_2") == moment_of("2026-06-01T25:00")
+    assert moment_of("2026-06-01 08:00 north") == moment_of("2026-06-01T08:00:00Z")
 
 
 # --- a disk that refuses ----------------------------------------------------------------------------------------------

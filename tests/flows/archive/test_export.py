@@ -229,7 +229,7 @@ def test_runs_and_places_that_are_none_are_refused(posed: Exported, tmp_path: Pa
         run_export(posed.archive, None, posed.archive / "export", envi=False, console=QUIET)
     (tmp_path / "file").write_text("mine")
     for out in (tmp_path / "file", tmp_path / "file" / "below", tmp_path / "not UTF-8 \udcff"):
-        with pytest.raises(ArchiveError, match=r"cannot write to .*; choose another --out"):
+        with pytest.raises(ArchiveError, match=r"cannot export to .*; choose another --out"):
             run_export(posed.archive, None, out, envi=False, console=QUIET)
     assert (tmp_path / "file").read_text() == "mine"
     assert all(finding.problem is None for finding in verify_archive(Archive.open(posed.archive)))

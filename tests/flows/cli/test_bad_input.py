@@ -170,6 +170,16 @@ def test_surveys_go_on_after_one_that_fails(
     assert len(archive.runs()) == 2
 
 
+def test_receipts_of_finished_surveys_are_printed_after_an_interrupt(
+    command_line: CommandLine, monkeypatch: pytest.MonkeyPatch, field_file: Callable[..., Path]
+) -> None:
+    """Ctrl-C in the second survey: the JSON object has the first."""
+    published = Mock(side_effect=[Mock(receipt={"survey": "a"}), KeyboardInterrupt])
+    monkeypatch.setattr("flows.publish.survey_command.run_survey", published)
+    ended = command_line("survey", field_file("a"), field_file("b"), "--json")
+    assert (ended.code, json.loads(ended.out)) == (130, {"surveys": [{"survey": "a"}]})
+
+
 def test_interrupted_survey_says_how_to_go_on(
     folder: Path, command_line: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -148,8 +148,7 @@ def test_one_wrong_window_hardly_moves_the_rest():
 
 def test_turn_of_the_line_is_part_of_the_model():
     """A window that sees a line's end tells the offset of its centre, not of the place that the end sees."""
-    turn = np.array([[1.0, 0.0], [0.034, 1.0]])
-    shift = np.array([50.0, -20.0])
+    turn, shift = np.array([[1.0, 0.0], [0.034, 1.0]]), np.array([50.0, -20.0])
     windows = [
         WindowShift(0, 1, (line, line), np.stack([np.eye(2), turn]), turn @ shift, np.full(2, 0.05))
         for line in (100.0, 900.0)

@@ -150,8 +150,7 @@ def test_a_run_of_missing_bands_is_restored_within_noise(missing: int) -> None:
     found = statistics_of(made.values)
     law = components_of_field(found, np.linspace(400, 1000, 60), false_alarm=0.01, least=4)
     assert len(law) > 20
-    run = np.s_[20 : 20 + missing]
-    valid = np.ones(made.values.shape, np.bool_)
+    run, valid = np.s_[20 : 20 + missing], np.ones(made.values.shape, np.bool_)
     valid[..., run] = False
     off = (law.restore(score_lines(made.values, valid, law).scores) - made.clean)[..., run] / law.noise[run]
     assert np.sqrt(np.mean(off**2)) < 1

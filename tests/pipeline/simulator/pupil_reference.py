@@ -58,8 +58,7 @@ def random_tile(number: int, focus_m: float | None = None) -> Tile:
     kind, size = KINDS[number % len(KINDS)], TILE_PX + 2 * EDGE_PX
     values = np.full((size, size), rng.choice([0.0, 0.1, 0.5]))
     values[EDGE_PX:-EDGE_PX, EDGE_PX:-EDGE_PX] = _drawn(rng, kind, float(values[0, 0]))
-    nm = float(rng.uniform(450, 1000))
-    electrons = float(rng.uniform(5e3, 2e4))
+    nm, electrons = float(rng.uniform(450, 1000)), float(rng.uniform(5e3, 2e4))
     scene = made_scene(values[..., None], np.array([[electrons]]), [nm])
     air = Air() if focus_m is None else Air(distance_m=40.0)
     optics = Optics(aberration_px=float(rng.uniform(0, 0.4)), keystone_px=float(rng.uniform(0, 0.4)))

@@ -47,8 +47,7 @@ def test_a_store_is_found_and_fetched_elsewhere(machine: Machine) -> None:
 
 def test_a_second_writer_takes_what_stands(bucket: str, machine: Machine) -> None:
     """Of two machines that make one key at a time one publishes; both end with its store, whatever they had made."""
-    archives = [machine(FIRST), machine(SECOND)]
-    together = threading.Barrier(2)
+    archives, together = [machine(FIRST), machine(SECOND)], threading.Barrier(2)
 
     def publish(number: int) -> StageRef:
         def build(path: Path) -> None:

@@ -96,8 +96,7 @@ def _span(corners: Points, angle: float) -> tuple[float, float]:
 
 def clip_polygon(corners: Points, cut: tuple[float, float, float]) -> Points:
     """Return part of a convex polygon where ny y + nx x >= offset, (m, 2); m may be 0."""
-    height = corners @ np.array(cut[:2]) - cut[2]
-    kept = []
+    height, kept = corners @ np.array(cut[:2]) - cut[2], []
     for here, there, a, b in zip(corners, np.roll(corners, -1, axis=0), height, np.roll(height, -1), strict=True):
         if a >= 0:
             kept.append(here)
@@ -157,12 +156,10 @@ def parcel_pixels(parcel: Parcel, shape: tuple[int, int]) -> tuple[NDArray[np.in
 def band_pixels(border: Border, reach: float, shape: tuple[int, int]) -> Band:
     """Return the pixels within ``reach`` of a line, and a little more at its ends, row by row or column by column."""
     step = (border.end - border.start) / max(border.length, 1e-9)
-    major = int(abs(step[1]) >= abs(step[0]))
-    middle = (np.array(shape) - 1) / 2
+    major, middle = int(abs(step[1]) >= abs(step[0])), (np.array(shape) - 1) / 2
     ends = np.sort([border.start[major], border.end[major]]) + middle[major]
     count = np.clip([np.floor(ends[0]), np.ceil(ends[1]) + 1], 0, shape[major])
-    m = np.arange(*count.astype(int))
-    slope = step[1 - major] / step[major]
+    m, slope = np.arange(*count.astype(int)), step[1 - major] / step[major]
     centre = border.start[1 - major] + (m - middle[major] - border.start[major]) * slope + middle[1 - major]
     width = int(np.ceil(reach / abs(step[major]))) + 1
     k = np.rint(centre)[:, None].astype(int) + np.arange(-width, width + 1)

@@ -24,8 +24,7 @@ def test_parcels_fraction_the_land() -> None:
 
 def test_coverage_is_area() -> None:
     """Coverage summed over the pixels is the polygon's area, whatever its angle."""
-    square = np.array([[-40.0, -40], [-40, 40], [40, 40], [40, -40]])
-    cuts = []
+    square, cuts = np.array([[-40.0, -40], [-40, 40], [40, 40], [40, -40]]), []
     for angle in (0.3, 1.7, 2.9, 4.4):
         cuts.append((float(np.cos(angle)), float(np.sin(angle)), -20.0))
         square = clip_polygon(square, cuts[-1])
