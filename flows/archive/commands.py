@@ -223,8 +223,7 @@ def explanation(archive: Archive, product: str) -> dict[str, Any]:
     found = find_product(catalogue, product)
     if isinstance(found, Run):
         below = set[str]().union(*(catalogue.ancestors([uri]) for uri in found.names))
-        shown = set[str]()
-        row = _run_row(catalogue, found, archive.kept_bytes(found))
+        shown, row = set[str](), _run_row(catalogue, found, archive.kept_bytes(found))
         row |= {"problem": found.problem, "command": command(found.settings, archive.name)}
         trees = [_tree(catalogue, uri, shown) for uri in sorted(found.names - below)]
         return {"archive": archive.name, "product": found.uri, "run": row, "lineage": trees}

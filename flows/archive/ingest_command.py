@@ -87,8 +87,7 @@ def run_ingest(
         cube, opened = with_stated_values(found, source), open_archive(archive)
         opened.reclaim()  # of a killed ingest
     with opened.in_use(), StageProgress(console, TITLES) as progress:
-        before = _stamps(cube)
-        files = hash_files(cube, lambda done: progress.show("read", done))
+        before, files = _stamps(cube), hash_files(cube, lambda done: progress.show("read", done))
         progress.show("read", 1.0, ended=True)
 
         def build(path: Path) -> None:

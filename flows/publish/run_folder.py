@@ -227,8 +227,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan) -> Quickl
     bands, caption = choose_bands(run.scene.wavelength_nm)
     decided = products["segment"].path / READING
     attention = load_attention(decided if decided.exists() else products["score"].path / READING)
-    changed = attention.changed
-    found = load_class_map(products["segment"].path / "class_map.zarr")
+    changed, found = attention.changed, load_class_map(products["segment"].path / "class_map.zarr")
     order = np.argsort(attention.rank.ravel(), kind="stable")
     prior, drawn = prior_map_figures(products["segment"].path), products["segment"].path / "class_probabilities.zarr"
     return QuicklookData(

@@ -259,8 +259,7 @@ def draw_field(
             report=lambda done: report(begun + (1 - begun) * done),
             inputs=work.inputs,
         )
-    compared = [part.comparison for part in parts if part.comparison is not None]
-    reading = None
+    compared, reading = [part.comparison for part in parts if part.comparison is not None], None
     if least_gain is not None:
         shape = field.regions[0].field.patch_shape
         reading = FullReading(np.zeros(shape), np.zeros(shape, np.bool_), np.zeros(shape, np.float32))

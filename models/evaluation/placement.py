@@ -59,8 +59,7 @@ def oracle_gain(
 def _losses(logits: NDArray[np.float32], truth: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Return the cross-entropy of each pixel, (patch, class, y, x) -> (patch, y, x); 0 if unlabelled."""
     labelled = truth != UNLABELLED
-    index = np.where(labelled, truth, 0).astype(np.intp)[:, None]
-    exact = logits.astype(np.float64)
+    index, exact = np.where(labelled, truth, 0).astype(np.intp)[:, None], logits.astype(np.float64)
     loss = scipy.special.logsumexp(exact, axis=1) - np.take_along_axis(exact, index, axis=1)[:, 0]
     return np.where(labelled, loss, 0.0)
 

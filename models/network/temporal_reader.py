@@ -63,8 +63,7 @@ class TemporalReader(nn.Module):
         `models.reading.prior_map.season_of` returns it. ``coarse_before`` and ``coarse_now`` (B, column, y / s, x / s)
         are spectral features. ``comparable`` (B, 1, y / s, x / s) is 1 where both may be compared.
         """
-        size = prior_map.shape[-2:]
-        change = (coarse_now - coarse_before) * comparable
+        size, change = prior_map.shape[-2:], (coarse_now - coarse_before) * comparable
         below = F.gelu(self.coarse_enter(torch.cat([coarse_now * comparable, change, comparable], dim=1)))
         below = F.gelu(self.coarse_leave(below))
         below, today = F.interpolate(below, scale_factor=float(CELL_PX), mode="nearest"), observation * seen

@@ -60,8 +60,7 @@ def observe(
     labels = np.full(grid.padded_shape, UNLABELLED, np.uint8)
     labels[: grid.height, : grid.width] = scene.labels
     rows, width = grid.padded_shape
-    strip = math.gcd(rows, STRIP_ROWS)
-    columns = np.empty((rows, width, basis.columns), np.float32)
+    strip, columns = math.gcd(rows, STRIP_ROWS), np.empty((rows, width, basis.columns), np.float32)
     exposure = camera.exposure_ms / DEFAULT_EXPOSURE_MS
     scale = (scene.white_reference / (scene.white_reference_electrons * exposure)).astype(np.float32)
     for top, stream in zip(range(0, rows, strip), rng.spawn(rows // strip), strict=True):

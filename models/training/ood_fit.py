@@ -48,8 +48,7 @@ def fit_ood(
             "no scene was kept for validation, which the false-alarm rate needs; train with --validation 1 or more"
         )
     rng = np.random.default_rng([seed, 0xFA3])
-    augmentation = CaptureAugmentation(normalisation, darkest_ms=darkest_ms)
-    gathered = []
+    augmentation, gathered = CaptureAugmentation(normalisation, darkest_ms=darkest_ms), []
     for number, example in enumerate(train):
         gathered += _drawn_spectra(example, normalisation, rng, SPECTRA // len(train) + 1)
         report(0.3 * (number + 1) / len(train))

@@ -143,8 +143,7 @@ def _learn(reader: TemporalReader, visits: Sequence[_Batch], weight: Tensor, rng
         torch.autograd.backward(loss)
         total += float(loss.detach()) / (len(visits) - 1)
         state = found.detach().clamp(min=FAINTEST)
-        state = state - state.logsumexp(dim=1, keepdim=True)
-        age = age.where(now.seen == 0, 0)
+        state, age = state - state.logsumexp(dim=1, keepdim=True), age.where(now.seen == 0, 0)
         rests_on = rests_on + now.seen * _light_a_pixel(now)
         coarse = now.coarse.where(small > 0, coarse)
     return total

@@ -117,8 +117,7 @@ def _catmull_rom_pieces(knots: Floats, alone: float) -> Floats:
     before, after = (alone, alone) if not reach else (knots[reach] - knots[0], knots[-1] - knots[-1 - reach])
     before, after = before / max(reach, 1), after / max(reach, 1)
     padded = np.concatenate([[knots[0] - before], knots, [knots[-1] + after]])
-    tangent = np.concatenate([[before], (padded[2:] - padded[:-2]) / 2, [after]])
-    step = np.diff(padded)
+    tangent, step = np.concatenate([[before], (padded[2:] - padded[:-2]) / 2, [after]]), np.diff(padded)
     pieces = np.stack(
         [padded[:-1], tangent[:-1], 3 * step - 2 * tangent[:-1] - tangent[1:], tangent[:-1] + tangent[1:] - 2 * step]
     )

@@ -133,8 +133,7 @@ def _read_frame(data: bytes) -> Frame | Damaged:
     """Read the bytes between two boundaries."""
     first, *rest = data.split(b"\x7d")
     plain = first + b"".join(bytes((part[0] ^ TURNED,)) + part[1:] for part in rest if part)
-    size = len(plain) - _HEAD - _CRC
-    escaped = all(part[:1] in (b"\x5d", b"\x5e") for part in rest)
+    size, escaped = len(plain) - _HEAD - _CRC, all(part[:1] in (b"\x5d", b"\x5e") for part in rest)
     if not escaped or not 0 <= size <= MOST_PAYLOAD or plain[2] != size:
         return Damaged(data)
     body, check = plain[:-_CRC], int.from_bytes(plain[-_CRC:], "little")

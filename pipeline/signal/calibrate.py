@@ -82,8 +82,7 @@ def judge_elements(references: References) -> Elements:
     span = references.white - references.dark
     if references.flat is not None:
         span = np.where(references.flat > 0, span * references.flat, np.nan)
-    gain = np.full(span.shape, np.nan, np.float32)
-    known = np.isfinite(span) & (span > 0)
+    gain, known = np.full(span.shape, np.nan, np.float32), np.isfinite(span) & (span > 0)
     with np.errstate(over="ignore"):
         np.divide(np.broadcast_to(references.white_reference, span.shape), span, out=gain, where=known)
     bad = np.zeros(gain.shape, np.bool_) if references.bad is None else references.bad
@@ -115,8 +114,7 @@ def number_values(references: References) -> Floats:
 def _fill_of(wanted: Bools, good: Bools) -> Fill:
     """Find the good neighbours of each wanted element in its band; elements without one nearby are left out."""
     samples, width = good.shape
-    bands = np.flatnonzero(wanted.any(axis=0) & good.any(axis=0))
-    number = np.arange(samples)[:, None]
+    bands, number = np.flatnonzero(wanted.any(axis=0) & good.any(axis=0)), np.arange(samples)[:, None]
     below = np.maximum.accumulate(np.where(good[:, bands], number, -samples - FILL_REACH), axis=0)
     above = np.minimum.accumulate(np.where(good[:, bands], number, 2 * samples + FILL_REACH)[::-1], axis=0)[::-1]
     sample, column = np.nonzero(wanted[:, bands])
@@ -159,8 +157,7 @@ def calibrate(
     Raises PoseError: positions are needed and missing, or one lies beyond the mirror's rim.
     """
     elements = _judged(raw, references)
-    line_gain = _line_gain(raw, elements.references, position)
-    valid = _valid(raw, elements, saturated_dn)
+    line_gain, valid = _line_gain(raw, elements.references, position), _valid(raw, elements, saturated_dn)
     if line_gain is not None:
         valid[~np.isfinite(line_gain)] = False
     return _scene_values(raw, elements, line_gain), valid
@@ -186,8 +183,7 @@ def _line_gain(raw: NDArray[np.integer[Any]], references: References, position: 
     if position is None:
         raise PoseError("the white frame was taken at rest (by_mirror), which needs the lines' mirror positions")
     at = np.asarray(position, np.float64)
-    known = np.isfinite(at).all(axis=1)
-    gain = np.full(len(raw), np.nan, np.float32)
+    known, gain = np.isfinite(at).all(axis=1), np.full(len(raw), np.nan, np.float32)
     gain[known] = 1 / mirror_throughput(at[known])
     return gain
 
@@ -287,8 +283,7 @@ def _off_neighbours(response: Floats, noise: Floats) -> Bools:
     around = (max(size - 1 + size % 2, 1), 1)  # an odd number of samples
     local: Floats = scipy.ndimage.median_filter(_without_gaps(response), around, mode="reflect")
     least = np.maximum(LIT_SIGMAS * noise, LIT_FRACTION * _median(response, axis=0))
-    judged = np.isfinite(response) & (local > least)
-    relative = np.full(response.shape, np.nan)
+    judged, relative = np.isfinite(response) & (local > least), np.full(response.shape, np.nan)
     np.divide(response, local, out=relative, where=judged)
     dead = judged & (relative < LEAST_RESPONSE)
     off = np.where(dead, np.nan, relative - 1)

@@ -165,8 +165,7 @@ def find_rare(ratio: NDArray[np.float32], law: ResidualLaw, false_alarm: float) 
     for lines, samples in JOINT:
         if lines > ratio.shape[0] or samples > ratio.shape[1]:
             continue
-        size = lines * samples
-        high = np.zeros(ratio.shape, np.float32)
+        size, high = lines * samples, np.zeros(ratio.shape, np.float32)
         within = tuple(slice(side // 2, (side // 2 - side + 1) or None) for side in (lines, samples))
         high[within] = scipy.ndimage.uniform_filter(filled, (lines, samples))[within] > _limit(
             law.freedom * size, part / size
@@ -261,8 +260,7 @@ class Condenser:
         count, samples = len(lines.valid_line), len(lines.references.dark)
         ratio, missing = np.empty((count, samples), np.float32), np.zeros((count, samples), np.int32)
         for first, values, valid in calibrated_blocks(lines, self.camera):
-            block = slice(first, first + len(values))
-            seen = score_lines(values, valid, self.components)
+            block, seen = slice(first, first + len(values)), score_lines(values, valid, self.components)
             store(first, seen.scores, seen.quality)
             ratio[block] = seen.residual / self.law.expected(seen.scores)
             if not valid.all():
@@ -310,8 +308,7 @@ def differing_lines(
     """
     wrong = list[int]()
     for first, values, valid in calibrated_blocks(lines, camera):
-        last = first + len(values)
-        seen = score_lines(values, valid, components or stored.components)
+        last, seen = first + len(values), score_lines(values, valid, components or stored.components)
         off = np.abs(stored.read(first, last) * np.float32(stored.step) - seen.scores)
         usable = seen.quality != UNUSABLE
         most = 0.5 if stored.step <= 1 else 1  # see `whole_steps`

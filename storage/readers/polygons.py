@@ -182,8 +182,7 @@ def load_polygon_labels(
             f"labels {address}: no pixel's centre lies in a polygon that has a class; give polygons larger than a"
             f" pixel, with a value of {attribute}"
         )
-    shared = int(np.count_nonzero(index != _burn(burnt[::-1], shape)))
-    lacking = names.count("")
+    shared, lacking = int(np.count_nonzero(index != _burn(burnt[::-1], shape))), names.count("")
     notes = (
         f"{len(burnt)} polygons by their attribute {attribute}",
         *layer.notes,

@@ -168,8 +168,7 @@ def _correlate(first: Floats, second: Floats, reach: int) -> tuple[Floats, Float
 
     Shifts with too little in common, or without variance there, get a correlation of -1.
     """
-    size = [scipy.fft.next_fast_len(n + min(reach, n), real=True) for n in first.shape]
-    spectra = []
+    size, spectra = [scipy.fft.next_fast_len(n + min(reach, n), real=True) for n in first.shape], []
     for image in (first, second):
         seen = np.isfinite(image)
         values = np.where(seen, image, 0.0)

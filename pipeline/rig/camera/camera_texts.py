@@ -86,8 +86,7 @@ def _pairs(lines: list[str], where: str, notes: list[str]) -> Iterator[tuple[str
 
 def _braced(value: str, lines: list[str], number: int, where: str, notes: list[str]) -> tuple[str, int]:
     """Return the content of a value in braces, and the number of the line after its end."""
-    parts = [value]
-    depth = _depth(value)
+    parts, depth = [value], _depth(value)
     end = number
     while depth > 0 and end < len(lines):
         parts.append(lines[end])

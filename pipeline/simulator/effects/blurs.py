@@ -87,8 +87,7 @@ def airy_gaussians() -> tuple[Floats, Floats]:
     light.
     """
     size, u = np.geomspace(0.1, 160.0, 24), np.concatenate([np.geomspace(1e-3, 0.02, 30), np.linspace(0.03, 1.5, 150)])
-    weight = 1 / (1 + (u / 0.5) ** 4)
-    passed = np.exp(-2 * (np.pi * np.outer(u, size)) ** 2)
+    weight, passed = 1 / (1 + (u / 0.5) ** 4), np.exp(-2 * (np.pi * np.outer(u, size)) ** 2)
     system = np.concatenate([passed * weight[:, None], np.full((1, len(size)), 1e3)])
     fraction = scipy.optimize.nnls(system, np.append(pupil_contrast(u) * weight, 1e3))[0]
     held = fraction > 0

@@ -41,8 +41,7 @@ def find_extrema(scene: RasterScene, camera: LineCamera, sweeps: Sequence[Sweep]
     spectra = scene.electrons * np.float32(camera.exposure_ms / DEFAULT_EXPOSURE_MS)
     optics = PixelOptics.of(camera, sweeps[0].binning, tuple(sorted({sweep.along == "y" for sweep in sweeps})))
     tile = max(8, math.ceil(math.sqrt(scene.shape[0] * scene.shape[1] / _TILES)))
-    ranking = Ranking()
-    own_planes = spectra.ndim == 1
+    ranking, own_planes = Ranking(), spectra.ndim == 1
     if own_planes and len(spectra) > CHOSEN_BANDS:
         bands = telling_bands(scene, spectra, optics, tile, ranking)
         kinds = np.searchsorted([one.stop for one in band_groups(len(spectra))], bands, side="right").tolist()

@@ -97,8 +97,7 @@ def _options_of(probe: Probe, rig: Rig, effects: Sequence[Effect]) -> list[Menu]
         for effect, there in zip(effects, present, strict=True)
     ]
     blurs = [effect for effect, there in zip(effects, present, strict=True) if there and hasattr(effect, "moments")]
-    blurred = math.fsum(blur.bound(probe, rig).value for blur in blurs)
-    menus = []
+    blurred, menus = math.fsum(blur.bound(probe, rig).value for blur in blurs), []
     for place, effect in enumerate(effects):
         arriving = probe
         if hasattr(effect, "change") or hasattr(effect, "gain"):

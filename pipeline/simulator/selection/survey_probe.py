@@ -136,8 +136,7 @@ def views_of_places(places: Floats, scene: RasterScene, camera: LineCamera, swee
     A place that no sweep sees is looked at as if the lines and samples of the least oblique continued. All sweeps sum
     as many samples to a number.
     """
-    centred = places - (np.array(scene.shape) - 1) / 2
-    found = []
+    centred, found = places - (np.array(scene.shape) - 1) / 2, []
     for along_y in (False, True):
         numbers = [number for number, sweep in enumerate(sweeps) if (sweep.along == "y") == along_y]
         oblique = sorted(numbers, key=lambda number: -abs(sweeps[number].swath_px))
@@ -157,8 +156,7 @@ def _first_seeing(
     """Return the number of the first sweep that sees each place, or nearly; -1 where none does."""
     found = np.full(len(along), -1)
     for number in order:
-        left = np.flatnonzero(found < 0)
-        held = _held(sweeps[number])
+        left, held = np.flatnonzero(found < 0), _held(sweeps[number])
         line, sample = scene_to_sweep(held, camera, along[left], scan[left]).T
         with np.errstate(invalid="ignore"):  # places that no ray reaches
             inside = (line > -2) & (line < held.lines + 1) & (sample > -3) & (sample < camera.samples + 2)

@@ -317,8 +317,7 @@ def _clustered(rng: np.random.Generator, field: FieldPlan, count: int) -> Points
     angle = np.deg2rad(field.row_angle_deg)
     ahead, aside = np.array([np.sin(angle), np.cos(angle)]), np.array([np.cos(angle), -np.sin(angle)])
     thrown = rng.normal(0, ALONG_PX, (count, 1)) * ahead + rng.normal(0, ASIDE_PX, (count, 1)) * aside
-    near = parents[rng.integers(len(parents), size=count)] + thrown
-    inside = np.ones(count, bool)
+    near, inside = parents[rng.integers(len(parents), size=count)] + thrown, np.ones(count, bool)
     for ny, nx, offset in field.parcel.cuts:
         inside &= near @ np.array([ny, nx]) > offset
     return np.where((inside & (rng.uniform(size=count) < CLUSTERED))[:, None], near, places)

@@ -192,8 +192,7 @@ def disc_pixels(
     for rows in cuts(shape[0], ROWS_AT_ONCE):
         near = np.flatnonzero((places[:, 0] + radius > rows.start - 1) & (places[:, 0] - radius < rows.stop))
         place, reach = places[near, :, None, None], int(np.ceil(radius[near].max(initial=0.0) + 1))
-        offset = np.arange(-reach, reach + 1)
-        base = np.rint(place).astype(int)
+        offset, base = np.arange(-reach, reach + 1), np.rint(place).astype(int)
         y = base[:, 0] + offset[:, None] + np.zeros_like(offset)
         x = base[:, 1] + offset + np.zeros_like(offset)[:, None]
         cover = edge(radius[near, None, None] - np.hypot(y - place[:, 0], x - place[:, 1]))
@@ -356,8 +355,7 @@ def land_on(use: str, day: float, late: float) -> Land:
 def canopy_cover(crop: Crop, age: ArrayLike) -> NDArray[np.float64]:
     """Return the fraction of the ground under plants, brown ones included, by days since emergence; 0 before."""
     first, growth, last = crop.cover
-    days = np.asarray(age, np.float64)
-    half_way = np.log(last / (2 * first)) / growth
+    days, half_way = np.asarray(age, np.float64), np.log(last / (2 * first)) / growth
     early = first * np.exp(growth * np.minimum(days, half_way))
     late = last - 0.25 * last**2 / first * np.exp(-growth * np.maximum(days, 0))
     return np.where(days < 0, 0.0, np.where(days < half_way, early, late))
