@@ -61,8 +61,7 @@ def test_rows_are_maps_of_chosen_patches_and_cost_the_closed_form(paper: ModuleT
     config = weights.config
     grid = SceneGrid(64, 64, config.patch)
     columns = np.random.default_rng(0).standard_normal((64, 64, config.columns)).astype(np.float32)
-    read = paper.read_scene(weights, columns, labels, grid, 2)
-    chosen = np.array([1, 6, 10])
+    read, chosen = paper.read_scene(weights, columns, labels, grid, 2), np.array([1, 6, 10])
     fine = patches_of(columns, grid.patch)[chosen]
     drawn = segment(weights, read.seen, fine, chosen, capture=LineSpec()).classes
     assert (read.counts(chosen) == paper.confusion(labels, drawn, config.classes)).all()

@@ -81,8 +81,7 @@ class Program:
         self.runs.clear()
 
     def _save(self, name: str, values: np.ndarray[Any, Any]) -> None:
-        fps = 1000 / self.line.rig.camera.period_ms
-        path = str(self.folder / f"{name}.hdr")
+        fps, path = 1000 / self.line.rig.camera.period_ms, str(self.folder / f"{name}.hdr")
         envi.save_image(path, values, dtype=np.uint16, interleave="bil", ext="raw", force=True, metadata={"fps": fps})
 
 

@@ -135,8 +135,7 @@ def refuse_places(subject: Subject, count: int, seed: int = 0) -> Refusals:
 def _refuse_one(subject: Subject, at: int, name: str, lasting: bool, found: Refusals) -> None:
     out, log = subject.folder / f"refused-{at}", subject.folder / f"refused-{at}.calls"
     about = {"root": str(out), "at": at, "number": ERRORS[name], "lasting": lasting, "log": str(log)}
-    ended = subject.nursery.run(words(out), "refuse", **about)
-    hit = logged_calls(log)
+    ended, hit = subject.nursery.run(words(out), "refuse", **about), logged_calls(log)
     call, path = hit[0][1:] if hit else ("none", "")
     found.met_at.update((call, name))
     found.told += ended.told

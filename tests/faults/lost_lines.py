@@ -166,8 +166,7 @@ def _go_on(place: Path, appended: int, found: Losses) -> Iterator[str]:
 def try_kills(kills: int, folder: Path, seed: int = 0) -> Losses:
     """Kill captures at random moments, and compare what they had appended with what is there."""
     chance, found = random.Random(seed), Losses()
-    command = [sys.executable, "-c", WRITER]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command, environment = [sys.executable, "-c", WRITER], {**os.environ, "PYTHONPATH": str(ROOT)}
     for number in range(kills):
         place = folder / f"killed-{number}"
         with subprocess.Popen([*command, str(place)], cwd=ROOT, env=environment, stdout=subprocess.PIPE) as process:

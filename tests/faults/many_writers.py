@@ -89,8 +89,7 @@ def rows(quick: bool = False) -> list[Row]:
     rounds = 1 if quick else ROUNDS
     with tempfile.TemporaryDirectory(prefix="writers-") as name, Nursery(Path(name)) as nursery:
         subject = prepare(nursery)
-        both = dict(subject.truth)
-        other = nursery.run(words(subject.folder / "other", *OTHER))
+        both, other = dict(subject.truth), nursery.run(words(subject.folder / "other", *OTHER))
         assert other.code == 0, other.text
         both |= stored(subject.folder / "other")
         cases = [

@@ -66,8 +66,7 @@ class Child:
 
     def wait(self) -> Ended:
         """How it ended, once it has."""
-        code = int(self._nursery.ask({"wait": self.pid}))
-        place = self._log.with_suffix(".place")
+        code, place = int(self._nursery.ask({"wait": self.pid})), self._log.with_suffix(".place")
         ended = Ended(
             code,
             time.monotonic() - self._began,

@@ -59,8 +59,7 @@ def test_references_that_cannot_be(changed: dict[str, float]) -> None:
 @pytest.mark.parametrize(("samples", "bands"), [(1, 1), (1, 10), (12, 1), (2, 2)])
 def test_smallest_sizes(samples: int, bands: int) -> None:
     """One line, one sample and one band calibrate like any; with nothing to fill from a bad element is out."""
-    references = frames(samples, bands)
-    raw = np.full((1, samples, bands), 1060, np.uint16)
+    references, raw = frames(samples, bands), np.full((1, samples, bands), 1060, np.uint16)
     values, valid = calibrate(raw, references, saturated_dn=FULL)
     np.testing.assert_allclose(values, (1060 - 60.5) / 2000, rtol=1e-6)
     assert valid.all()

@@ -60,8 +60,7 @@ def test_14_two_classes_learn():
     """There is no mask_norm, which is a sign for two classes: the logits have values of any size, and gradients."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        model = Segmenter(SegmenterConfig(**SIZES))
-        image = torch.randn(1, 4 + PLANES, 32, 32)
+        model, image = Segmenter(SegmenterConfig(**SIZES)), torch.randn(1, 4 + PLANES, 32, 32)
     labels, none = (image[:, 0] > 0).long(), torch.zeros(1, 0, dtype=torch.int64)
     logits = model.composite(*model(image, image, none, torch.zeros(1, 2)), none)
     loss = map_loss(logits, pixel_losses(logits, labels), labels, torch.ones(2), soft_dice=True)

@@ -264,8 +264,7 @@ def test_22_a_scene_alike_everywhere_scores_alike():
     grid = SceneGrid(36, 50, 8)
     columns, probability = (np.full((*grid.padded_shape, n), of, np.float32) for n, of in ((4, 0.3), (3, 1 / 3)))
     seen = CoarsePrediction(grid, columns, probability)
-    fraction = seen.grid.valid_fraction().ravel()
-    scores = score_patches("entropy", seen)
+    fraction, scores = seen.grid.valid_fraction().ravel(), score_patches("entropy", seen)
     assert np.ptp(scores[fraction == 1]) <= 1e-6
     ranked = fraction[select_patches(scores, len(scores))]
     assert (np.diff(ranked) <= 0).all()
@@ -308,8 +307,7 @@ def test_24_wavelengths_in_another_unit_are_refused(nm: list[float]):
 
 def test_25_certainty_has_no_entropy():
     """A probability of 0 adds 0: no NaN, and never less than 0 in float32."""
-    sure = np.eye(4, dtype=np.float32)
-    tiny = np.array([[1.0, 1e-45, 0, 0]], np.float32)
+    sure, tiny = np.eye(4, dtype=np.float32), np.array([[1.0, 1e-45, 0, 0]], np.float32)
     entropy = pixel_entropy(np.concatenate([sure, tiny]))
     assert np.isfinite(entropy).all()
     assert entropy.min() >= 0
@@ -326,8 +324,7 @@ def test_27_corrections_of_nothing_and_of_everything(size: float):
     logits, patches = model(image, image, numbers, PLACE)
     under = cut(logits, 8)[:, numbers[0]]
     assert torch.equal(patches, under) if size == 0 else (patches.argmax(dim=2) == 1).all()
-    labels = torch.full((1, 32, 32), 2)
-    drawn = model.composite(logits, patches, numbers)
+    labels, drawn = torch.full((1, 32, 32), 2), model.composite(logits, patches, numbers)
     assert drawn.softmax(dim=1).isfinite().all()
     map_loss(drawn, pixel_losses(drawn, labels), labels, torch.ones(3), soft_dice=True).backward()
     assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())

@@ -68,8 +68,7 @@ def test_an_out_of_range_value_is_as_if_not_captured(value: float, y: int, x: in
 def test_columns_that_no_reading_gives_are_dead(value: float) -> None:
     """Given normalised already, to the overview or to the map, they count as NaN does."""
     columns = np.random.default_rng(3).normal(0, 1, (*GRID.padded_shape, 4)).astype(np.float32)
-    patches = np.random.default_rng(4).normal(0, 1, (2, 8, 8, 4)).astype(np.float32)
-    found = []
+    patches, found = np.random.default_rng(4).normal(0, 1, (2, 8, 8, 4)).astype(np.float32), []
     for one in (value, np.nan):
         coarse, fine = columns.copy(), patches.copy()
         coarse[4, 6, 2], fine[1, 3, 5, 0] = one, one

@@ -134,8 +134,7 @@ def test_init_names_the_wavelengths_that_its_next_command_needs(
     monkeypatch.chdir(tmp_path)
     np.save(tmp_path / "field.npy", image().astype(np.float32))
     np.save(tmp_path / "field_labels.npy", CLASSES)
-    told = json.loads(command_line("init", ".", "--json").out)
-    toml = tmp_path / "scene.toml"
+    told, toml = json.loads(command_line("init", ".", "--json").out), tmp_path / "scene.toml"
     assert (
         told["first"] == "write the 3 wavelengths into scene.toml: wavelengths_nm or wavelengths_file, as its lines say"
     )

@@ -46,8 +46,7 @@ def restored(scores: NDArray[np.float32]) -> NDArray[np.float64]:
 @pytest.fixture(scope="module")
 def sweep(tmp_path_factory: pytest.TempPathFactory) -> Restored:
     """A condensed sweep with two rare spectra and one that is unusable, and what it is to give."""
-    path = tmp_path_factory.mktemp("sweep") / "coarse-0.zarr"
-    rng = np.random.default_rng(1)
+    path, rng = tmp_path_factory.mktemp("sweep") / "coarse-0.zarr", np.random.default_rng(1)
     frames = References(np.zeros((SAMPLES, BANDS)), np.ones((SAMPLES, BANDS)), np.ones(BANDS))
     header = SweepHeader(Sweep("coarse-0", "coarse", "x", 0.0, 0.0, LINES), frames, WAVELENGTHS, None, "test")
     scores = rng.normal(0, 20, (LINES, SAMPLES, COUNT)).astype(np.float32)

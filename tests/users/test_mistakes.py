@@ -182,8 +182,7 @@ def test_what_is_no_mistake_works(case: str, files: Path) -> None:
 
 def test_a_step_is_that_step(files: Path) -> None:
     """Steps are counted from 0, and of the first axis; a store has them wherever its axis of time is."""
-    nm = [float(one) for one in NM.split(",")]
-    cube = np.load(files / "cube.npy")
+    nm, cube = [float(one) for one in NM.split(",")], np.load(files / "cube.npy")
     for address, more in {"series.npy:2": 2, "series.npz:1": 1, "series.zarr:1": 1}.items():
         np.testing.assert_array_equal(load_scene_file(f"{files}/{address}", wavelengths=nm).values, cube + more)
 
@@ -208,6 +207,5 @@ FOLDERS = {  # names of scenes and of their labels
 def test_images_find_their_labels_by_name(folder: str, files: Path) -> None:
     """Equal names, words such as _mask, capitals; what is hidden or has no image is nobody's scene."""
     data = load_data_set(files / folder)
-    found = {name: data.label_files.get(name) for name in data.names}
-    root = files / folder
+    found, root = {name: data.label_files.get(name) for name in data.names}, files / folder
     assert {name: path and path.relative_to(root).as_posix() for name, path in found.items()} == FOLDERS[folder]

@@ -62,8 +62,7 @@ PASSES: dict[str, dict[str, Any]] = {
 
 def field() -> RasterScene:
     """A field of three classes before the emulated rig."""
-    camera = load_settings(None, dict(NARROW)).camera
-    values = patchy_scene(SIZE[::-1], 3, 1)[0]
+    camera, values = load_settings(None, dict(NARROW)).camera, patchy_scene(SIZE[::-1], 3, 1)[0]
     return raster_from_values(values, camera, name="x", wavelength_nm=np.array([640.0, 550.0, 460.0]))
 
 
@@ -261,8 +260,7 @@ def test_a_straight_scan_is_a_recording(
     width, height = published.receipt["settings"]["size"]
     assert (width, height) == (64, 96)
     seen = open_mosaic(tmp_path / "a" / published.receipt["products"]["mosaic"])
-    mosaic = block_means(seen.values(), 4)
-    light = (values.astype(np.float64) - 60) / (3500 - 60)
+    mosaic, light = block_means(seen.values(), 4), (values.astype(np.float64) - 60) / (3500 - 60)
     light = light[::-1] if column == "position_px" else light
     coarse = light.reshape(24, 4, 16, 4, 3).mean(axis=(1, 3))
     inner = (slice(2, 20), slice(2, 14))

@@ -181,8 +181,7 @@ def test_polygons_in_any_crs_are_the_same_zones(opened: Opened, tmp_path: Path) 
     place = opened(pose=POSE).zones.place
     west, south, east, north = place.outline.bounds
     half = shapely.intersection(place.outline, shapely.box(west, (south + north) / 2, east, north))
-    fine = geopandas.GeoSeries([half], crs=place.crs).segmentize((east - west) / 500)
-    masks = []
+    fine, masks = geopandas.GeoSeries([half], crs=place.crs).segmentize((east - west) / 500), []
     for name, crs in (("utm.gpkg", 32632), ("globe.geojson", 4326), ("web.shp", 3857), ("laea.gpkg", 3035)):
         path = sketch(tmp_path / name, {"half": fine.to_crs(crs).iloc[0]}, crs)
         found = opened(pose=POSE, zones={"area": path}).zones.kept

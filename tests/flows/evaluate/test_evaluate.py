@@ -40,8 +40,7 @@ TRIAL = EvaluateRequest("field", (), fractions=(0.5,), policies=(), draws=10)
 def test_every_row_is_there(judged: Judged):
     """Every policy at every fraction, with means of the seeds and their spread; and the files of the folder."""
     request, content = judged
-    folder = request.out
-    keys = [(row["policy"], row["fraction"]) for row in content["rows"]]
+    folder, keys = request.out, [(row["policy"], row["fraction"]) for row in content["rows"]]
     policies = [(policy, fraction) for policy in ("entropy", "random", ORACLE) for fraction in (0.25, 0.5)]
     assert keys == [("none", 0.0), *policies, ("all", 1.0)]
     assert content["frames"] == list(FRAMES)
@@ -69,8 +68,7 @@ def test_costs_stand_beside_all_and_the_oracle_has_all_the_gain(judged: Judged):
 
 def test_frames_trained_on_are_left_out(data: Path, tmp_path: Path):
     """Weights that a training made are judged on what it held out or kept for validation."""
-    settings = TrainingSettings(steps=1, batch=1, crop=16)
-    out = tmp_path / "w.safetensors"
+    settings, out = TrainingSettings(steps=1, batch=1, crop=16), tmp_path / "w.safetensors"
     train_weights(TrainRequest(str(data), out, ("003",), 1, patch=8, width=4, settings=settings))
     split = load_weights(out).record["split"]
     content = evaluate_weights(EvaluateRequest(str(data), (out,), **QUICK))

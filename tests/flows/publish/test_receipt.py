@@ -222,8 +222,7 @@ def test_page_loads_nothing_from_anywhere():
 
 def test_words_are_escaped():
     """A survey, a class, a policy and a setting with markup in their names stay words."""
-    receipt = copy.deepcopy(make_receipt())
-    bad = '<script>alert("1")</script>&'
+    receipt, bad = copy.deepcopy(make_receipt()), '<script>alert("1")</script>&'
     receipt["survey"] = receipt["settings"]["scene"] = receipt["settings"]["out"] = receipt["stages"][0]["name"] = bad
     receipt["versions"] = {bad: bad}
     receipt["accuracy"]["per_class_iou"] = {bad: 0.5}

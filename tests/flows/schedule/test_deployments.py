@@ -186,8 +186,7 @@ def test_two_fields_that_are_due_at_once_take_turns_at_the_rig(tmp_path: Path) -
     """By Prefect's limit the second waits; without it the rig's own lock refuses it."""
     from prefect import flow
 
-    archive = Archive.open(tmp_path / "archive")
-    usual = load_settings(None, {"scene": "farm"})
+    archive, usual = Archive.open(tmp_path / "archive"), load_settings(None, {"scene": "farm"})
     rig = replace(usual, source="rig", rig=replace(usual.rig, port=f"/dev/ttyTURNS{os.getpid()}"))
     run = SimpleNamespace(settings=rig, archive=archive, name="x")
     held: list[tuple[float, float]] = []

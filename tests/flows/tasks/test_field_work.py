@@ -203,6 +203,5 @@ def test_a_moved_memory_has_no_seams_between_regions(surveyed: Surveyed) -> None
     (field,) = plan_regions(run.grid, SHARD)
     whole = before.of(field, run.weights).coarse
     for region in plan_regions(run.grid, SHARD, most_px=MOST_PX, halo=16):
-        part = before.of(region, run.weights).coarse
-        here = region.read.over(CELL_PX)
+        part, here = before.of(region, run.weights).coarse, region.read.over(CELL_PX)
         np.testing.assert_array_equal(part, whole[here.rows, here.columns])

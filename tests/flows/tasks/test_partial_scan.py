@@ -224,8 +224,7 @@ def test_a_prior_map_of_today_does_not_depend_on_the_rows_read_at_once(
 
 def test_nothing_is_worth_more_than_what_is_due() -> None:
     """A patch that is due counts more than all that the others gain; without gains the oldest counts most."""
-    grid = SceneGrid(4, 16, 4)
-    probabilities = np.log([0.6, 0.4]) * np.ones((4, 16, 1))
+    grid, probabilities = SceneGrid(4, 16, 4), np.log([0.6, 0.4]) * np.ones((4, 16, 1))
     age = np.repeat([[1.0, 2.0, 3.0, 4.0]], 4, axis=0).repeat(4, axis=1)
     expected_errors = PatchExpectedErrors.of([(probabilities, age)], grid, 2)
     record, all_patches = ScanPerformance.read(RECORD), np.ones(4, bool)

@@ -126,8 +126,7 @@ def command(words: list[Any]) -> Ended:
 @pytest.mark.parametrize("stage", OF_THIS)
 def test_a_stage_that_fails_is_one_message(stage: str, walk: Walk) -> None:
     """The words of the error, or of a bug in which file its traceback is; the archive holds the stores before it."""
-    before = list(OF_THIS)[: list(OF_THIS).index(stage)]
-    trial = walk.trials[stage]
+    before, trial = list(OF_THIS)[: list(OF_THIS).index(stage)], walk.trials[stage]
     assert (trial.ended.code, trial.ended.out, len(trial.ended.errors)) == (1, "", 1)
     assert "Traceback" not in trial.ended.err
     assert trial.problems == []

@@ -34,8 +34,7 @@ from tests.conftest import QUIET, Survey
 
 def test_a_store_of_an_input_that_was_cleared_meanwhile_is_not_published(tmp_path: Path) -> None:
     """What a survey beside it cleared reads as nodata, so the store would hold wrong numbers."""
-    archive = Archive.open(tmp_path / "archive", create=True)
-    product = Product("rectify", 1)
+    archive, product = Archive.open(tmp_path / "archive", create=True), Product("rectify", 1)
     given, _ = archive.produce("capture", lambda folder: (folder / "a").write_text("a") and None, version=1, params={})
     one = Stage("rectify", "", product, lambda: None, None, 0, None)  # type: ignore[arg-type, return-value]
     with pytest.raises(ArchiveError, match="another survey has cleared an input of rectify meanwhile"):

@@ -112,8 +112,7 @@ def test_every_line_is_the_simulated_one(tmp_path: Path, monkeypatch: pytest.Mon
     settings = small_settings(tmp_path / "rig", source="rig", visit="first", engine="prefect", keep="raw")
     with emulated(settings, effects, monkeypatch):
         published = run_survey(settings, QUIET)
-    expected = rows_of(tmp_path / "sim", simulated)
-    found = rows_of(tmp_path / "rig", published)
+    expected, found = rows_of(tmp_path / "sim", simulated), rows_of(tmp_path / "rig", published)
     assert list(found) == list(expected)
     assert len({name.split()[0] for name in found}) == 2
     for name, rows in expected.items():

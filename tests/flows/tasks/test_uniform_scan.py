@@ -178,8 +178,7 @@ def _step(out: Path) -> float:
 
 def test_scores_keep_to_a_limit(scanned: tuple[Path, Any], survey_png: Survey, recorded: Path, tmp_path: Path) -> None:
     """Coarser steps are taken, as few as suffice; raw lines are cleared."""
-    every = _scores_bytes(scanned[0])
-    flags = {**BY_HAND, "weights": str(recorded)}
+    every, flags = _scores_bytes(scanned[0]), {**BY_HAND, "weights": str(recorded)}
     with with_effects():  # as the other has them
         survey_png(tmp_path / "half", **flags, kept_bytes=str(int(0.6 * every)))
         survey_png(tmp_path / "enough", **flags, kept_bytes=str(2 * every))

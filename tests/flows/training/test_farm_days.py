@@ -69,8 +69,7 @@ def _publish(archive: Archive, key: str, **settings: Any) -> str:
 
 def test_the_usual_day_of_a_farm_is_one_field(tmp_path: Path) -> None:
     """By either name of the farm, and whether the day is named or not; another day is another field."""
-    archive = Archive.open(tmp_path)
-    key = "farm@2/seed=0/day=172/shape=8x8/hour=11/bands=9"
+    archive, key = Archive.open(tmp_path), "farm@2/seed=0/day=172/shape=8x8/hour=11/bands=9"
     made = [
         _publish(archive, key, scene="farm"),
         _publish(archive, key, scene="farm@2", day=172),
@@ -125,8 +124,7 @@ def test_training_sees_the_farm_through_the_rig(bands: tuple[int, ...]) -> None:
     assert 0.01 * plain.columns.std() < np.abs(seen.columns - plain.columns).mean() < 0.2 * plain.columns.std()
     assert (seen.noise.spectra is not None) == (bands != BANDS)
     if seen.noise.spectra is not None:
-        spectra = seen.noise.spectra
-        mean = seen.columns[:64, :96].mean(axis=(0, 1))
+        spectra, mean = seen.noise.spectra, seen.columns[:64, :96].mean(axis=(0, 1))
         np.testing.assert_allclose(spectra.condensing(1.0).mean, mean, rtol=0.02)
         sigma = np.sqrt(np.sum(spectra.noise(1.0), axis=0))
         power = np.linalg.eigvalsh(spectra.covariance / np.outer(sigma, sigma))

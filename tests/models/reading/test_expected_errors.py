@@ -82,8 +82,7 @@ def test_swaths_say_what_the_whole_says(high: int, seed: int) -> None:
     """Read some rows of patches at a time, counts, ages and expected errors are those of the field at once."""
     rng = np.random.default_rng(seed)
     probabilities = np.log(rng.dirichlet(np.ones(3), (8, 12))).astype(np.float32)
-    age = np.where(rng.random((8, 12)) < 0.1, np.nan, rng.random((8, 12)) * 30)
-    rows = 4 * high
+    age, rows = np.where(rng.random((8, 12)) < 0.1, np.nan, rng.random((8, 12)) * 30), 4 * high
     swaths = [(probabilities[top : top + rows], age[top : top + rows]) for top in range(0, 8, rows)]
     whole, parts = (PatchExpectedErrors.of(one, GRID, 3) for one in ([(probabilities, age)], swaths))
     assert np.array_equal(whole.pixels, parts.pixels)

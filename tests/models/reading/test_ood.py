@@ -54,8 +54,7 @@ def test_the_distance_is_that_of_mahalanobis(seed: int, light: float, readings: 
     """In float64, by a solution with the whole covariance, of spectra whose component is known."""
     ood_detector = some_ood(seed)
     pixels = spectra_of(ood_detector, 20, seed)
-    noise = (ood_detector.shot / light + ood_detector.read / light**2) / readings
-    wanted = []
+    noise, wanted = (ood_detector.shot / light + ood_detector.read / light**2) / readings, []
     for number, pixel in enumerate(pixels):
         apart = pixel - ood_detector.centres[number // 20]
         spread = ood_detector.covariance[number // 20] + noise[number // 20]

@@ -210,8 +210,7 @@ def test_a_fresh_reader_weighs_both_witnesses_by_its_gates() -> None:
     reader = TemporalReader(TemporalSizes(CLASSES, COLUMNS)).eval()
     old, new = (np.exp(one.log_probability.astype(np.float64)) for one in (memory.probabilities, coarse_pass))
     old /= old.sum(axis=-1, keepdims=True)
-    product = old ** (1 / (1 + math.exp(-2.2))) * new**0.5
-    replaced = 1 / (1 + math.e)
+    product, replaced = old ** (1 / (1 + math.exp(-2.2))) * new**0.5, 1 / (1 + math.e)
     expected = (1 - replaced) * old + replaced * product / product.sum(axis=-1, keepdims=True)
     found = fuse(memory, coarse_pass, reader).log_probability
     np.testing.assert_allclose(np.exp(found), np.maximum(expected, math.exp(FAINTEST)), atol=1e-5)

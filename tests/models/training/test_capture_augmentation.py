@@ -166,8 +166,7 @@ def test_a_first_pass_stares_at_its_rows(monkeypatch: pytest.MonkeyPatch, step: 
     """Without areas every ``step``-th row is read as it is, from any first row, and those between are interpolated."""
     monkeypatch.setattr(capture_augmentation, "AREAS", (1.0,))
     augmentation, _ = _augmentation()
-    image = np.random.default_rng(1).normal(size=(32, 5, 12)).astype(np.float32)
-    begun = set()
+    image, begun = np.random.default_rng(1).normal(size=(32, 5, 12)).astype(np.float32), set()
     for seed in range(40):
         seen = _seen(augmentation.interlaced, image, SILENT, step=step, rng=np.random.default_rng(seed))
         same = np.isclose(seen[..., :12], image, atol=1e-4).all(axis=(1, 2))

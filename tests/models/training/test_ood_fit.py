@@ -20,8 +20,7 @@ PLAIN = Normalisation(*(np.zeros(COLUMNS, np.float32), np.ones(COLUMNS, np.float
 
 def scene(seed: int, side: int = 48) -> Example:
     """Two classes of Gaussian spectra in halves, one of them rare, with the noise of a camera."""
-    rng = np.random.default_rng(seed)
-    labels = np.zeros((side, side), np.uint8)
+    rng, labels = np.random.default_rng(seed), np.zeros((side, side), np.uint8)
     labels[:, -side // 8 :] = 1
     labels[:2, :2] = 255
     middles = np.array([[1.0, 2.0, 3.0], [3.0, 2.0, 1.0], [50.0, 50.0, 50.0]])

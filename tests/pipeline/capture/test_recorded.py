@@ -27,8 +27,7 @@ def assert_same_references(found: References, expected: References) -> None:
 def test_a_recorded_copy_of_a_sweep_gives_its_lines(sweep: Sweep) -> None:
     """Lines and references are those of the recorded source, bit for bit."""
     source = simulated()
-    recorded = recorded_source(source, [record(source, sweep)])
-    lines = list(source.lines(sweep))
+    recorded, lines = recorded_source(source, [record(source, sweep)]), list(source.lines(sweep))
     assert_same(list(recorded.lines(sweep)), lines)
     assert_same(list(recorded.lines(sweep, 17)), lines[17:])
     assert_same_references(recorded.references(sweep), source.references(sweep))
@@ -62,8 +61,7 @@ def test_fine_lines_of_a_full_scan_are_found_by_their_place() -> None:
 
 def test_a_recorded_coarse_sweep_wins_over_the_full_scan() -> None:
     """Of two sweeps that can serve a request, the one with its very lines does."""
-    source = simulated()
-    coarse = Sweep("recorded coarse", "coarse", "x", 0.0, -39.5, 20, step=4)
+    source, coarse = simulated(), Sweep("recorded coarse", "coarse", "x", 0.0, -39.5, 20, step=4)
     recorded = recorded_source(source, [record(source, FULL), record(source, coarse)])
     part = Sweep("planned", "coarse", "x", 0.0, -31.5, 10, step=4)
     expected = [replace(line, number=line.number - 2) for line in source.lines(coarse)][2:12]

@@ -33,8 +33,7 @@ def test_a_planned_pass_is_cut_where_the_recording_ends() -> None:
 
 def test_a_recorded_line_serves_the_end_of_a_plan_once() -> None:
     """A plan half a pixel beside the recording has a line more; a single line, and lines in between, stay."""
-    passes = passes_over(FULL)
-    beside = replace(FULL, start_px=-40.0, lines=81)
+    passes, beside = passes_over(FULL), replace(FULL, start_px=-40.0, lines=81)
     (found,) = passes.full_scan([beside])
     assert (found.lines, found.start_px) == (80, -39.0)
     assert passes.first_pass([beside]) == [found]

@@ -39,8 +39,7 @@ def test_a_planned_sweep_comes_back(swath: int, start: int, lines: int, shape: t
 
 def test_noise_and_spikes_do_not_move_the_sweep() -> None:
     """With 0.7 px of noise and a tenth of the lines lost the sweep is found to a fifth of a pixel."""
-    sweep = Sweep("s", "fine", "x", 320.0, -400.0, 800)
-    rng = np.random.default_rng(2)
+    sweep, rng = Sweep("s", "fine", "x", 320.0, -400.0, 800), np.random.default_rng(2)
     position = shifted_position(line_positions(sweep, CAMERA), rng.normal(0, 0.7, (800, 2)), CAMERA)
     valid = rng.random(800) > 0.1
     position[~valid] = 0.0
@@ -128,8 +127,7 @@ def test_swaths_without_a_common_part_are_refused() -> None:
 @pytest.mark.parametrize("extent_px", [100.0, 5000.0, 40000.0])
 def test_lines_of_a_scan_without_a_mirror_are_parallel(extent_px: float) -> None:
     """Every sample lies within 0.011 px of where a parallel line has it, and the scan is as long as it was."""
-    flat = flat_camera(CAMERA, extent_px)
-    scan = np.linspace(-extent_px, extent_px, 9)
+    flat, scan = flat_camera(CAMERA, extent_px), np.linspace(-extent_px, extent_px, 9)
     tangents = direction_to_scene(position_to_direction(flat_positions(scan, flat))) / flat.ifov_rad
     np.testing.assert_allclose(tangents, np.stack([np.zeros(9), scan], axis=-1), atol=1e-6)
     along, across = points_of_scan(0.0, flat, scan[:, None], flat.pixel_slopes())

@@ -114,7 +114,6 @@ def test_a_look_is_the_mean_of_footprints_over_the_smear():
     """Without noise a coarse pixel is the block mean of the fine look, to the rounding of DN."""
     electrons = np.random.default_rng(0).uniform(100, 15_000, (16, 24, 3))
     camera = replace(CAMERA, bits=14, electrons_per_dn=1.0)
-    fine = scan_pass(electrons, camera, step=1)
-    coarse = scan_pass(electrons, camera, step=4)
+    fine, coarse = scan_pass(electrons, camera, step=1), scan_pass(electrons, camera, step=4)
     blocks = fine.reshape(4, 4, 6, 4, 3).mean(axis=(1, 3))
     assert coarse == pytest.approx(blocks, abs=1.0)

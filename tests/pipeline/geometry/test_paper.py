@@ -231,8 +231,7 @@ def test_e9_repeated_positions_have_no_slope():
 
 def test_e11_speed_needs_the_pitch_and_the_frame_period():
     """Equation (8) with the whole sensor is 640 times the speed; the mirror's own rates are 1/2 and 1/sqrt 2 of it."""
-    sensor_mm = CAMERA.samples * CAMERA.pitch_um * 1e-3
-    frame_s = CAMERA.frame_ms * 1e-3
+    sensor_mm, frame_s = CAMERA.samples * CAMERA.pitch_um * 1e-3, CAMERA.frame_ms * 1e-3
     paper = sensor_mm / CAMERA.focal_length_mm * 30.0 / (CAMERA.exposure_ms * 1e-3)
     assert paper / (IFOV * 30.0 / frame_s) == pytest.approx(640)
     for tilt, axis in ((IFOV / 2 * E1, 1), (IFOV / np.sqrt(2) * np.array([0.0, 1, 0]), 0)):

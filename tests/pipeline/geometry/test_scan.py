@@ -39,8 +39,7 @@ def sweep(**changes: object) -> Sweep:
 @pytest.mark.parametrize(("swath", "start"), [(0.0, -1200.0), (2500.0, -4000.0), (-4500.0, 3500.0)])
 def test_sample_points_equal_rays_reflected_by_the_mirror(swath: float, start: float):
     """The closed form of a line's points agrees with position, normal and reflection to 1e-9 px."""
-    path = sweep(swath_px=swath, start_px=start, lines=40)
-    slopes = CAMERA.pixel_slopes()
+    path, slopes = sweep(swath_px=swath, start_px=start, lines=40), CAMERA.pixel_slopes()
     rays = np.stack([np.zeros_like(slopes), slopes, np.ones_like(slopes)], axis=-1)
     normals = position_to_normal(line_positions(path, CAMERA))
     seen = direction_to_scene(reflect(rays[None], normals[:, None])) / CAMERA.ifov_rad

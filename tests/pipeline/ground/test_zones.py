@@ -137,8 +137,7 @@ def test_pixels_of_degrees_have_their_area_on_the_ellipsoid() -> None:
 @given(polygons, polygons)
 def test_no_patch_that_a_no_go_zone_touches_is_worth_anything(area: Any, no_go: Any) -> None:
     """Nor one outside of the area; a patch wholly inside and untouched counts in full."""
-    grid = SceneGrid(*SHAPE, 8)
-    barred = pixels_inside([no_go], SHAPE, touched=True)
+    grid, barred = SceneGrid(*SHAPE, 8), pixels_inside([no_go], SHAPE, touched=True)
     found = field_zones(pixels_inside([area], SHAPE), barred)
     if found is None:
         return

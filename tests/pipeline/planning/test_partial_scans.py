@@ -73,8 +73,7 @@ def test_every_patch_is_in_a_row_whose_lines_show_it(along: Axis, step: int) -> 
 @given(worths, st.floats(0.02, 1.2))
 def test_no_run_of_the_same_sweep_is_worth_more_in_its_seconds(expected_gain: np.ndarray, fraction: float) -> None:
     """Each chosen run is worth most of all runs of its sweep that have as many lines or fewer."""
-    scan_pass = partial_scan(expected_gain, fraction * WHOLE_S)
-    sums = ROWS.sums(expected_gain)
+    scan_pass, sums = partial_scan(expected_gain, fraction * WHOLE_S), ROWS.sums(expected_gain)
     for number, first, stop in () if scan_pass is None else scan_pass.runs:
         firsts, stops, values = ROWS.first[number], ROWS.stop[number], sums[number]
         taken = values[(firsts >= first) & (stops <= stop)].sum()

@@ -81,8 +81,7 @@ def test_coarse_pass_is_registered_in_scene_pixels():
     """Lines 2 px apart of binned samples give corrections in px of the scene, as fine ones do."""
     pointing = PointingErrors(offset_px=6, seed=5)
     scan = uniform_sweeps(GRID, CAMERA, "x", step=2, overlap_px=84)
-    sweeps = [replace(sweep, binning=2) for sweep in scan]
-    source = source_of(pointing)
+    sweeps, source = [replace(sweep, binning=2) for sweep in scan], source_of(pointing)
     broad = [BroadSweep.read(SimulatedSweep(source, sweep), CAMERA) for sweep in sweeps]
     found = register_sweeps(broad, CAMERA, prior_px=8, window_px=300)
     held = pointing.offset(found.reference or "")
@@ -95,8 +94,7 @@ def test_coarse_pass_is_registered_in_scene_pixels():
 
 def test_windows_lie_where_both_sweeps_look():
     """Every window's corners are seen by both of its sweeps, except where lines end."""
-    sweeps = full_sweeps(GRID, CAMERA, "x", overlap_px=84)
-    source = source_of()
+    sweeps, source = full_sweeps(GRID, CAMERA, "x", overlap_px=84), source_of()
     broad = [BroadSweep.read(SimulatedSweep(source, sweep), CAMERA) for sweep in sweeps]
     images = place_images(broad, no_shifts([sweep.name for sweep in sweeps]), CAMERA)
     windows = overlap_windows(images, window_px=100)
@@ -159,8 +157,7 @@ def test_turn_is_how_places_move_with_the_swath():
     """Far off the axis the turn says where a sample looks when its strip lies a little further along."""
     sweep = Sweep("s", "fine", "x", 1500.0, -900.0, 3)
     broad = BroadSweep.read(SimulatedSweep(source_of(), sweep), CAMERA)
-    image = PlacedImage(broad, CAMERA, np.zeros((3, 2)))
-    slope = CAMERA.pixel_slopes()[140]
+    image, slope = PlacedImage(broad, CAMERA, np.zeros((3, 2))), CAMERA.pixel_slopes()[140]
     (here,), (there,) = (
         np.stack(points_of_scan(1500.0 + step, CAMERA, np.array([-899.0]), np.array([slope])), axis=-1)
         for step in (-0.5, 0.5)

@@ -37,8 +37,7 @@ def by_hand(values: np.ndarray, valid: np.ndarray, at: np.ndarray, kernel: Kerne
 def test_is_the_sum_written_out(kernel: Kernel, by_element: bool) -> None:
     """Masks by sample and by element give what the sums written out give, band by band, at the borders too."""
     rng = np.random.default_rng(11)
-    values = rng.random((9, 8, 5), np.float32)
-    valid = rng.random((9, 8)) > 0.1
+    values, valid = rng.random((9, 8, 5), np.float32), rng.random((9, 8)) > 0.1
     if by_element:
         valid = valid[..., None] & (rng.random((9, 8, 5)) > 0.1)
     values[~valid] = np.nan
@@ -88,8 +87,7 @@ def test_result_does_not_depend_on_the_blocks(kernel: Kernel, bands: int) -> Non
 
 def test_dwell_is_the_mean_of_its_valid_lines() -> None:
     """Lines of one dwell are averaged sample by sample over what is valid; a line alone comes back bit by bit."""
-    values = np.random.default_rng(18).random((6, 3, 2), np.float32)
-    valid = np.ones((6, 3), bool)
+    values, valid = np.random.default_rng(18).random((6, 3, 2), np.float32), np.ones((6, 3), bool)
     values[2, 1], valid[2, 1] = np.nan, False
     valid[4:, 0] = False
     merged, known = merge_lines(values, valid, np.array([0, 1, 4]))

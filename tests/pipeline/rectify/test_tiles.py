@@ -125,8 +125,7 @@ def test_cutting_a_tile_into_runs_changes_no_bit(monkeypatch: pytest.MonkeyPatch
 @pytest.mark.parametrize("kind", [Taken, Cropped])
 def test_a_block_of_lines_is_read_once_down_a_column(kind: type[Taken]) -> None:
     """In the order of the tiles, with the cache that they are projected to need, nothing is read twice in a column."""
-    grid = PixelGrid((3010.0, -4770.0), 1, (160, 120))
-    lines = taken(TURNED, kind=kind)
+    grid, lines = PixelGrid((3010.0, -4770.0), 1, (160, 120)), taken(TURNED, kind=kind)
     placed = [place(lines, CAMERA)]
     for tiles in (plan_tiles(placed, CAMERA, grid, (32, 120)), plan_tiles(placed, CAMERA, grid, (32, 60))[:5]):
         lines.asked.clear()
@@ -142,8 +141,7 @@ def test_raw_lines_are_projected_as_they_are_held(kind: type[Taken]) -> None:
     """A tile holds no more raw lines than projected: whole ones of a sweep read so, else whole chunks of samples."""
     grid = PixelGrid((3010.0, -4770.0), 1, (160, 120))
     placed = [place(taken(TURNED, kind=kind), CAMERA)]
-    tiles = plan_tiles(placed, CAMERA, grid, (32, 20))
-    whole = LineCache(2**30)
+    tiles, whole = plan_tiles(placed, CAMERA, grid, (32, 20)), LineCache(2**30)
     for tile in tiles:
         alone = LineCache(2**30)
         for cache in (alone, whole):
@@ -156,8 +154,7 @@ def test_raw_lines_are_projected_as_they_are_held(kind: type[Taken]) -> None:
 @settings(max_examples=25, deadline=None)
 def test_reach_is_never_too_little(row: int, column: int, height: int, width: int) -> None:
     """All knots and samples at which pixels are looked up, with a margin for taps, are among those foretold."""
-    grid = PixelGrid(CORNER, 1, (400, 400))
-    placed = place(taken(TURNED, bands=1), CAMERA)
+    grid, placed = PixelGrid(CORNER, 1, (400, 400)), place(taken(TURNED, bands=1), CAMERA)
     rows, columns = slice(row, row + height), slice(column, column + width)
     scan_path = placed.scan_paths[0][0]
     at = placed.coordinates(0, CAMERA, grid, rows, columns).reshape(-1, 2)
@@ -213,8 +210,7 @@ def test_a_dead_line_leaves_its_own_row_empty(placed_by_it: bool) -> None:
 
 def test_lines_that_are_missing_count_nothing() -> None:
     """Beside a lost line a point is what the kernel's other lines say: the line that stands in for it has no weight."""
-    whole = taken(Sweep("straight", "fine", "x", 0.0, -30.0, 60))
-    came = np.arange(60) != 30
+    whole, came = taken(Sweep("straight", "fine", "x", 0.0, -30.0, 60)), np.arange(60) != 30
     rows = {name: getattr(whole, name)[came] for name in ("raw", "position", "valid_line")}
     lines = replace(whole, sweep=replace(whole.sweep, lines=59), **rows)
     seen, coverage = in_tiles([place(lines, CAMERA)], PixelGrid((-0.7, -59.5), 1, (1, 120)), (64, 640))

@@ -95,8 +95,7 @@ class MadeLines:
     def of(cls, raw: NDArray[np.uint16], bad: Bools | None = None, *, by_mirror: bool = False) -> MadeLines:
         """Lines of a detector whose elements are all alike."""
         lines, *frame = raw.shape
-        dark = np.full(frame, DARK, np.float32)
-        white = np.ones(frame[1], np.float32)
+        dark, white = np.full(frame, DARK, np.float32), np.ones(frame[1], np.float32)
         return cls(raw, np.ones(lines, np.bool_), References(dark, dark + 1 / GAIN, white, bad, by_mirror=by_mirror))
 
     @property

@@ -129,8 +129,7 @@ def test_bad_elements_change_nothing_else(bad: NDArray[np.bool_], seed: int) -> 
 
 def test_flat_and_mirror_divide() -> None:
     """The flat divides its column, the throughput its line: twice the light through a mirror is the same scene."""
-    raw = np.full((2, 4, 3), 560, np.uint16)
-    flat = np.ones((4, 3), np.float32)
+    raw, flat = np.full((2, 4, 3), 560, np.uint16), np.ones((4, 3), np.float32)
     flat[2] = 0.5
     position = np.array([[0.0, 0.0], [0.3, -0.2]])
     references = replace(frames(), flat=flat, by_mirror=True)
@@ -141,8 +140,7 @@ def test_flat_and_mirror_divide() -> None:
 
 def test_lines_without_a_position_are_out() -> None:
     """Where the light depends on the mirror a line whose position is unknown is NaN and invalid; none is an error."""
-    raw = np.full((2, 4, 3), 560, np.uint16)
-    references = replace(frames(), by_mirror=True)
+    raw, references = np.full((2, 4, 3), 560, np.uint16), replace(frames(), by_mirror=True)
     values, valid = calibrate(raw, references, saturated_dn=4095, position=[[0.0, 0.0], [np.nan, 0.0]])
     assert np.isnan(values[1]).all()
     assert valid.tolist() == [[True] * 4, [False] * 4]

@@ -132,8 +132,7 @@ def test_lines_without_light_are_unusable() -> None:
 def test_one_of_two_bands_is_enough() -> None:
     """Half of two bands is one: the one that was seen comes back, and the other as both go together in the field."""
     made = field_of(1, bands=2, materials=1)
-    law = find_components(statistics_of(made.values))
-    valid = np.ones((1, 2, 2), np.bool_)
+    law, valid = find_components(statistics_of(made.values)), np.ones((1, 2, 2), np.bool_)
     valid[0, 1, 0] = False
     seen = score_lines(made.values[:1, :2], valid, law)
     back = law.restore(seen.scores)[0, 1]
@@ -165,8 +164,7 @@ def test_the_law_follows_shot_noise() -> None:
     found = statistics_of(values)
     components = find_components(found)
     law, seen = ResidualLaw.learned(found.spectra, components), scored(values, components)
-    ratio = seen.residual / law.expected(seen.scores)
-    bright = level[..., 0] > np.median(level)
+    ratio, bright = seen.residual / law.expected(seen.scores), level[..., 0] > np.median(level)
     assert seen.residual[bright].mean() > 1.05 * seen.residual[~bright].mean()
     assert ratio[bright].mean() == pytest.approx(ratio[~bright].mean(), rel=0.02)
 

@@ -148,8 +148,7 @@ def test_noise_is_estimated_in_bands_of_different_units() -> None:
 
 def test_pixels_without_data_say_nothing_of_the_noise_of_few_bands() -> None:
     """More than half of the field is missing, and the noise of four bands is that of the rest."""
-    made = field_of(0, (128, 128), 4, 1)
-    valid = np.broadcast_to(np.arange(128) >= 72, (128, 128))
+    made, valid = field_of(0, (128, 128), 4, 1), np.broadcast_to(np.arange(128) >= 72, (128, 128))
     np.testing.assert_allclose(find_components(statistics_of(made.values, valid)).noise, made.noise, rtol=0.08)
 
 

@@ -149,8 +149,7 @@ def test_lines_that_changed_or_were_lost_are_found() -> None:
 def test_saturated_spectra_are_restored_or_unusable() -> None:
     """Some bands at full scale: quality 1, values from the others. All bands: quality 2. Neither spoils the field."""
     lines = made_lines()
-    before = find_components(statistics_of_lines(lines))
-    values = values_of(lines)
+    before, values = find_components(statistics_of_lines(lines)), values_of(lines)
     lines.raw[20, 10:14, ::3] = CAMERA.full_scale_dn
     lines.raw[80, 5] = CAMERA.full_scale_dn
     stored, done = condense(lines)

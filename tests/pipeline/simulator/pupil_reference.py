@@ -63,8 +63,7 @@ def random_tile(number: int, focus_m: float | None = None) -> Tile:
     air = Air() if focus_m is None else Air(distance_m=40.0)
     optics = Optics(aberration_px=float(rng.uniform(0, 0.4)), keystone_px=float(rng.uniform(0, 0.4)))
     rig = Rig(LineCamera(samples=64), optics if focus_m is None else replace(optics, focus_m=focus_m), air=air)
-    step = int(rng.choice([1, 1, 1, 2]))
-    start = float(rng.uniform(-TILE_PX / 2, TILE_PX / 2))
+    step, start = int(rng.choice([1, 1, 1, 2])), float(rng.uniform(-TILE_PX / 2, TILE_PX / 2))
     sweep = Sweep("tile", "fine" if step == 1 else "coarse", "x", float(rng.uniform(-20, 20)), start, 1, step)
     return Tile(kind, scene, rig, sweep, np.sort(rng.choice(64, SAMPLES, replace=False)))
 
@@ -125,8 +124,7 @@ def _transfer(run: Floats, turn: Floats, rig: Rig, nm: Floats, normal: Floats, w
     steep = (n_y * run + n_x * turn) / n_z
     contrast = np.interp(waves * np.sqrt(run**2 + turn**2 + steep**2), *autocorrelation(), right=0.0)
     blur = np.exp(-2 * np.pi**2 * rig.optics.aberration_px**2 * (run**2 + turn**2))
-    shift = np.exp(2j * np.pi * float(keystone_shift(rig, nm)[0]) * run)
-    disc = 1.0
+    shift, disc = np.exp(2j * np.pi * float(keystone_shift(rig, nm)[0]) * run), 1.0
     if rig.air.distance_m is not None:
         apart = abs(1 / rig.air.distance_m - 1 / rig.optics.focus_m)
         wide = rig.optics.aperture_mm * 1e-3 * apart / rig.camera.ifov_rad

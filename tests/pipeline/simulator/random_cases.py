@@ -79,8 +79,7 @@ def random_case(number: int) -> Case:
     rig, upright = random_rig(rng), bool(rng.random() < 0.3)
     scene = _scene(rng, rig.camera, upright=upright, long_px=LONG_PX)
     far = float(rng.choice([0.0, rng.uniform(-LONG_PX / 2 + 40, LONG_PX / 2 - 40)]))
-    step = int(rng.choice([1, 1, 1, 4]))
-    count = int(rng.integers(LINES[0], LINES[1] + 1))
+    step, count = int(rng.choice([1, 1, 1, 4])), int(rng.integers(LINES[0], LINES[1] + 1))
     axis = "y" if upright else "x"
     kind = "fine" if step == 1 else "coarse"
     sweeps = tuple(

@@ -59,8 +59,7 @@ def probe_of(
 ) -> Probe:
     """Summary of all samples of some lines."""
     signal, one = np.asarray(light, np.float64), units(light, unit)
-    most = tuple(range(light.ndim - 1))
-    none = np.zeros((2, len(wavelength_nm)))
+    most, none = tuple(range(light.ndim - 1)), np.zeros((2, len(wavelength_nm)))
     return Probe(
         unit=unit,
         sweeps=(sweep,),

@@ -85,8 +85,7 @@ def test_sweep_that_shows_nothing_of_the_mosaic_is_empty() -> None:
     """Without a usable line, beside the field, or on a mosaic that holds nothing, there is nothing to compare."""
     source = SimulatedSource(textured(), Rig(CAMERA), 0, effects_on("rotation"))
     broad = BroadSweep.read(SimulatedSweep(source, sweep_of()), CAMERA)
-    blind = replace(broad, usable=np.zeros(140, bool))
-    mosaic = brightness(textured())
+    blind, mosaic = replace(broad, usable=np.zeros(140, bool)), brightness(textured())
     assert anchor_sweep(blind, CAMERA, GRID, mosaic, prior_px=8).found.status == "empty"
     assert anchor_sweep(broad, CAMERA, GRID, np.full_like(mosaic, np.nan), prior_px=8).found.status == "empty"
     beside = BroadSweep.read(SimulatedSweep(source, sweep_of(swath=400.0)), CAMERA)

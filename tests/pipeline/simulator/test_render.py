@@ -105,8 +105,7 @@ def test_light_of_a_sweep_is_kept(picture: str, chosen: dict[Any, str], swath: f
 @pytest.mark.parametrize("level", [2, 4, 16, 64])
 def test_thinned_scenes_keep_their_light(level: int) -> None:
     """What the far tails look at: a spot anywhere between the pixels that are left has as much light as before."""
-    rng = np.random.default_rng(level)
-    planes = np.zeros((700, 600, 3), np.float32)
+    rng, planes = np.random.default_rng(level), np.zeros((700, 600, 3), np.float32)
     planes[rng.integers(250, 400, 3), rng.integers(250, 350, 3), range(3)] = 1.0
     found = SceneRaster.of(planes).thinned(level)
     assert found.min() >= 0
@@ -134,8 +133,7 @@ def test_tails_of_diffraction_reach_as_far_as_the_pupil_says() -> None:
     """
     rig = Rig(camera=LineCamera(samples=16))
     values = np.repeat((np.arange(801) > 400)[None, :, None] * np.ones((400, 1, 4)), 1, axis=2)
-    scene = image_scene(values, rig.camera, NM)
-    px = np.array([10, 20, 35, 50])
+    scene, px = image_scene(values, rig.camera, NM), np.array([10, 20, 35, 50])
     sweeps = [Sweep("s", "fine", "x", swath_px=-float(x), start_px=0.0, lines=1) for x in px]
     light = np.concatenate([seen(scene, sweep, {SLIT: "1x1", DIFFRACTION: "airy"}, rig)[:, 8] for sweep in sweeps])
     waves = NM * 1e-9 / 15e-3 / rig.camera.ifov_rad
@@ -177,8 +175,7 @@ def test_diagonal_scene_is_that_of_its_matrix() -> None:
     """A scene with a plane of its own in each band gives what its diagonal matrix of electrons gives."""
     diagonal = image_scene(np.random.default_rng(1).uniform(0, 1, (60, 50, 4)), CAMERA, np.linspace(400, 1000, 4))
     light = SceneRadiance(np.diag(diagonal.electrons), diagonal.white_reference_electrons)
-    full = replace(diagonal, light=Once.of(light))
-    chosen = {**PLAIN, Widening(): "only"}
+    full, chosen = replace(diagonal, light=Once.of(light)), {**PLAIN, Widening(): "only"}
     one, other = (expected_light(s, block_of(s, NEAR, range(12, 16)), chosen) for s in (diagonal, full))
     np.testing.assert_allclose(one, other, rtol=1e-5, atol=0.05)
 

@@ -151,8 +151,7 @@ def test_light_goes_with_the_clock() -> None:
     """A sweep that starts an hour after sunrise's light is brighter; references are of the survey's start."""
     scene = image_scene(np.full((8, 8, 3), 0.1), CAMERA, [500.0, 600.0, 700.0])
     rig = Rig(CAMERA, sky=Sky(started=datetime(2025, 6, 21, 5, tzinfo=UTC)))
-    chosen = effects_on("rotation", "drift")
-    sweep = Sweep("a", "fine", "x", 0.0, 0.0, 2)
+    chosen, sweep = effects_on("rotation", "drift"), Sweep("a", "fine", "x", 0.0, 0.0, 2)
     now = SimulatedSource(scene, rig, chosen=chosen)
     later = replace(now, clock={"a": 3600.0, "b": 0.0})
     assert (later.started_s(sweep), later.started_s(replace(sweep, name="c")), now.started_s(sweep)) == (3600, 0, 0)

@@ -26,8 +26,7 @@ GRID = AngularGrid(1.057e-4, (100, 70))
 def _header(lines: int, samples: int, bands: int, started: str | None = None) -> SweepHeader:
     frame = np.arange(samples * bands, dtype=np.float32).reshape(samples, bands)
     references = References(frame, frame + 1000, np.full(bands, 0.9, np.float32))
-    sweep = Sweep("fine-0", "fine", "y", 12.5, -40.0, lines)
-    fwhm = np.full(bands, 5.0)
+    sweep, fwhm = Sweep("fine-0", "fine", "y", 12.5, -40.0, lines), np.full(bands, 5.0)
     return SweepHeader(sweep, references, np.linspace(400, 1000, bands), fwhm, source="sim", started=started)
 
 
@@ -84,8 +83,7 @@ def test_raw_cube_refuses_to_end_early(tmp_path: Path) -> None:
 def _calibrated(tmp_path: Path) -> tuple[Path, SweepHeader, list[Line]]:
     """A stored sweep of 130 lines whose references have all that references can have."""
     header, rng = _header(130, 9, 4), np.random.default_rng(4)
-    flat = rng.uniform(0.9, 1.1, (9, 4)).astype(np.float32)
-    bad = np.zeros((9, 4), np.bool_)
+    flat, bad = rng.uniform(0.9, 1.1, (9, 4)).astype(np.float32), np.zeros((9, 4), np.bool_)
     bad[3, 1] = True
     header = replace(header, references=replace(header.references, bad=bad, flat=flat, by_mirror=True))
     lines = _lines(header)

@@ -79,8 +79,7 @@ def test_flipped_bit_is_cut_off_and_nothing_before_it(tmp_path: Path, rotten: st
     """Only bytes before the part with the flipped bit are held; the camera gives the rest again."""
     chance, name = random.Random(7), "/captured/a/raw_0"
     parts = [chance.randbytes(chance.randint(1, 40)) for _ in range(12)]
-    truth = b"".join(parts)
-    ends = [0, *itertools.accumulate(len(part) for part in parts)]
+    truth, ends = b"".join(parts), [0, *itertools.accumulate(len(part) for part in parts)]
     before = FetchedFiles(tmp_path / "whole")
     for part in parts:
         before.append(name, part)

@@ -44,8 +44,7 @@ def store(
     values, valid = calibrate(lines.raw, lines.references, saturated_dn=4095, position=lines.position)
     found = SignalStatistics(values.shape[2], values[..., 0].size)
     found.add(values, valid)
-    components = find_components(found)
-    bands = np.linspace(400, 1000, values.shape[2])
+    components, bands = find_components(found), np.linspace(400, 1000, values.shape[2])
     header = SweepHeader(lines.sweep, lines.references, bands, np.full(len(bands), 5.0), "sim", "2026-05-01T10:00:00")
     origin = np.zeros(len(bands)) if found.origin is None else found.origin
     reach = components.largest(found.largest + np.abs(origin - np.nan_to_num(components.mean)))
@@ -90,8 +89,7 @@ def test_plain_zarr_restores_the_spectra(tmp_path: Path, step: float) -> None:
     group = zarr.open_group(tmp_path / "fine-0.zarr", mode="r")
     scores, axes, mean = (np.asarray(group[name][...], np.float32) for name in ("scores", "axes", "mean"))
     step = np.float32(group["scores"].attrs["scale_factor"])
-    spectra = scores.transpose(1, 2, 0) * step @ axes + mean
-    found = cube.spectra(0, 130)
+    spectra, found = scores.transpose(1, 2, 0) * step @ axes + mean, cube.spectra(0, 130)
     np.testing.assert_array_equal(spectra[common(cube)], found[common(cube)])
     assert (spectra != found)[~common(cube)].any(axis=1).all()
 
@@ -169,8 +167,7 @@ def test_a_store_that_was_not_closed_is_incomplete(tmp_path: Path) -> None:
 @pytest.mark.parametrize("by_mirror", [False, True])
 def test_restored_lines_are_raw_numbers(tmp_path: Path, by_mirror: bool) -> None:
     """They lie within the noise of the raw ones, nearer to what they would be without noise; rare ones within 2 DN."""
-    made = field_of(4, SHAPE, BANDS)
-    lines = MadeLines.of(lines_of().raw, by_mirror=by_mirror)
+    made, lines = field_of(4, SHAPE, BANDS), MadeLines.of(lines_of().raw, by_mirror=by_mirror)
     light = mirror_throughput(lines.position)[:, None, None] if by_mirror else 1.0
     raw = np.rint((lines.raw.astype(float) - DARK) * light + DARK).astype(np.uint16)
     lines = replace(lines, raw=raw)

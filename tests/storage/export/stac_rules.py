@@ -84,8 +84,7 @@ def _together(table: Mapping[str, Any]) -> Iterator[str]:
 
 def core_problems(path: Path) -> list[str]:
     """Return what STAC's own schemas, which pystac brings, say of an item or a collection."""
-    content = json.loads(path.read_text(encoding="utf-8"))
-    schemas = get_local_schema_cache()
+    content, schemas = json.loads(path.read_text(encoding="utf-8")), get_local_schema_cache()
     known = Registry().with_resources([(name, Resource.from_contents(schema)) for name, schema in schemas.items()])
     kind = "collection" if content.get("type") == "Collection" else "item"
     schema = schemas[f"https://schemas.stacspec.org/v1.1.0/{kind}-spec/json-schema/{kind}.json"]

@@ -34,8 +34,7 @@ NAMES = ["blue 1", "blue 2", "green", "edge", "last"]
 
 def numbers(code: int, seed: int = 0) -> NDArray[Any]:
     """Random numbers over the whole range of an ENVI type, (line, sample, band); of those that float some are not."""
-    kind = np.dtype(DATA_TYPES[code])
-    rng = np.random.default_rng(100 * code + seed)
+    kind, rng = np.dtype(DATA_TYPES[code]), np.random.default_rng(100 * code + seed)
     if kind.kind in "ui":
         return np.frombuffer(rng.bytes(int(np.prod(SHAPE)) * kind.itemsize), kind).reshape(SHAPE).copy()
     values = rng.normal(0, 1e6, SHAPE) + (1j * rng.normal(0, 1, SHAPE) if kind.kind == "c" else 0)
@@ -119,8 +118,7 @@ def test_what_headers_say_of_bands(tmp_path: Path) -> None:
 def test_rasterio_reads_the_same(tmp_path: Path, dtype: str) -> None:
     """GDAL's reader agrees on values, bands and wavelengths."""
     code = next(code for code, name in DATA_TYPES.items() if name == dtype)
-    values = numbers(code)
-    file = EnviFile(SHAPE, dtype, np.array(NM), np.array(WIDTHS))
+    values, file = numbers(code), EnviFile(SHAPE, dtype, np.array(NM), np.array(WIDTHS))
     with rasterio.open(write_envi(tmp_path / "a.hdr", file, in_blocks(values))) as found:
         np.testing.assert_array_equal(np.moveaxis(found.read(), 0, -1), values)
         assert found.count == 5

@@ -35,8 +35,7 @@ def test_a_shared_input_stays(archive: Archive) -> None:
 
 def test_young_stores_stay_with_what_they_rest_on(archive: Archive) -> None:
     """A survey under way has made a map of old raw lines: neither goes."""
-    small = small_survey(archive, named=False)
-    other = small_survey(archive, seed=5, named=False)
+    small, other = small_survey(archive, named=False), small_survey(archive, seed=5, named=False)
     for ref in (small.raw, small.mosaic, other.raw, other.mosaic, other.map):
         grow_old(ref, days=3)
     plan = plan_clearance(archive, keep_days=2)

@@ -52,8 +52,7 @@ def emit_file(path: Path) -> NDArray[np.float32]:
 
 def test_emit_reflectance(tmp_path: Path) -> None:
     """Values, wavelengths, widths and bad bands as EMIT says them; a note says that there is no map grid."""
-    values = emit_file(tmp_path / "emit.nc")
-    source = open_cube(tmp_path / "emit.nc")
+    values, source = emit_file(tmp_path / "emit.nc"), open_cube(tmp_path / "emit.nc")
     assert (source.shape, source.nodata, source.bad_bands) == ((7, 6, 5), -9999.0, (2,))
     scene = load_scene_file(tmp_path / "emit.nc")
     np.testing.assert_array_equal(scene.wavelength_nm, NM[[0, 1, 3, 4]])

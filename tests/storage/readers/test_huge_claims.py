@@ -104,8 +104,7 @@ def test_pickles_in_arrays_and_packs(tmp_path: Path) -> None:
 def test_mat_arrays_that_claim_too_much(tmp_path: Path) -> None:
     """Axes beyond what the file can hold are refused, in both versions; so are arrays never written."""
     scipy.io.savemat(tmp_path / "a.mat", {"cube": np.ones((3, 4, 5), np.uint8)})
-    whole = (tmp_path / "a.mat").read_bytes()
-    sizes = struct.pack("<iii", 3, 4, 5)
+    whole, sizes = (tmp_path / "a.mat").read_bytes(), struct.pack("<iii", 3, 4, 5)
     assert sizes in whole
     (tmp_path / "a.mat").write_bytes(whole.replace(sizes, struct.pack("<iii", 30_000, 40_000, 50_000)))
     with h5py.File(tmp_path / "b.mat", "w", userblock_size=512) as file:

@@ -64,8 +64,7 @@ def test_labels_seven_metres_beside_the_image(tmp_path: Path) -> None:
 
 def test_labels_in_another_crs(tmp_path: Path) -> None:
     """Labels in degrees lie on their ground to a pixel at borders of classes."""
-    path = image(tmp_path)
-    to_metres = Transformer.from_crs(4326, 32632, always_xy=True)
+    path, to_metres = image(tmp_path), Transformer.from_crs(4326, 32632, always_xy=True)
     to_degrees = Transformer.from_crs(32632, 4326, always_xy=True)
     west, south, east, north = to_degrees.transform_bounds(WEST - 5, NORTH - SIDE - 5, WEST + SIDE + 5, NORTH + 5)
     grid = Affine((east - west) / 200, 0, west, 0, (south - north) / 200, north)
@@ -127,8 +126,7 @@ def test_a_training_mask_on_another_grid(tmp_path: Path) -> None:
 @pytest.mark.parametrize("turned", [False, True])
 def test_no_data_of_a_label_file_is_no_class(tmp_path: Path, turned: bool) -> None:
     """The file's no-data value is unlabelled, on its own grid and on another; a note counts its pixels."""
-    path = image(tmp_path)
-    codes = np.where(CLASSES == 3, np.uint8(255), CLASSES)
+    path, codes = image(tmp_path), np.where(CLASSES == 3, np.uint8(255), CLASSES)
     grid = (codes[::-1].copy(), Affine(1, 0, WEST, 0, 1, NORTH - SIDE)) if turned else (codes, NORTH_UP)
     write(tmp_path / "field_labels.tif", *grid, nodata=255)
     scene = load_scene_file(path)

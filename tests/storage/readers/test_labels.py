@@ -42,8 +42,7 @@ def test_an_unknown_colour_is_counted(tmp_path: Path) -> None:
 @pytest.mark.parametrize("ending", ["npy", "mat", "png"])
 def test_numbers_become_indices(tmp_path: Path, ending: str) -> None:
     """Numbers of a .npy, .mat or grey PNG give indices; the unlabelled number gives 255."""
-    codes = np.array([[0, 7, 3], [3, 3, 7]], np.uint8)
-    path = tmp_path / f"a.{ending}"
+    codes, path = np.array([[0, 7, 3], [3, 3, 7]], np.uint8), tmp_path / f"a.{ending}"
     if ending == "npy":
         np.save(path, codes)
     elif ending == "mat":

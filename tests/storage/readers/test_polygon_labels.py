@@ -112,8 +112,7 @@ def test_overlaps_and_gaps(tmp_path: Path) -> None:
     """The later polygon counts, and a note says how many pixels; a polygon without a value is left out."""
     shapes = [WEST, WEST.buffer(-2, join_style="mitre"), EAST]
     path = written(tmp_path / "a.gpkg", shapes, crop=["wheat", "maize", None])
-    found = load_scene_file(scene(tmp_path), labels=path)
-    expected = np.where(TRUTH == 1, 1, NONE)
+    found, expected = load_scene_file(scene(tmp_path), labels=path), np.where(TRUTH == 1, 1, NONE)
     expected[1:9, 1:3] = 0
     np.testing.assert_array_equal(found.labels, expected)
     assert "16 px lie in polygons of several classes: the later polygon counts" in found.provenance

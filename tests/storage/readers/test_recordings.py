@@ -172,8 +172,7 @@ def test_a_scan_without_a_mirror_by_its_positions(
 
 def test_a_table_cuts_one_cube_into_sweeps(files: Path, tmp_path: Path) -> None:
     """Forward and backward ways of one cube become two sweeps; lines of neither are left out."""
-    cube = open_raw_cube(tmp_path / "raw" / "scan-0.zarr")
-    rows = ["mirror_x,mirror_y,sweep"]
+    cube, rows = open_raw_cube(tmp_path / "raw" / "scan-0.zarr"), ["mirror_x,mirror_y,sweep"]
     for number in range(80):
         x, y = cube.position[number if number < 42 else 80 - number].tolist()
         rows.append(f"{x!r},{y!r},{'there' if number < 40 else '' if number < 42 else 'back'}")
@@ -302,8 +301,7 @@ def test_a_headwall_folder_is_a_recording(tmp_path: Path) -> None:
 
 def test_the_key_of_a_recording_is_its_content(files: Path, tmp_path: Path) -> None:
     """It is the same under another address, and another for other numbers, bits, pointing or frames."""
-    key = open_recording(files, CAMERA).key()
-    moved = files.rename(tmp_path / "moved")
+    key, moved = open_recording(files, CAMERA).key(), files.rename(tmp_path / "moved")
     assert open_recording(moved, CAMERA).key() == open_recording(moved / "scan-0.hdr", CAMERA).key() == key
     np.save(tmp_path / "dark.npy", np.full((64, 3), 7.0))
     keys = [key, open_recording(moved, CAMERA, RecordedWith(dark=tmp_path / "dark.npy")).key()]

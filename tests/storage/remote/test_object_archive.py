@@ -192,8 +192,7 @@ def test_gc_takes_what_no_run_names_and_broken_off_uploads(machine: Machine) -> 
     archive.objects.write("stages/rectify/half/0123456789abcdef/a.bin", b"half")
     opened = machine(SECOND, create=False)
     assert [removal.what for removal in clear_up(opened, keep_days=1).removals] == []
-    planned = clear_up(opened, keep_days=0, dry_run=True)
-    done = clear_up(opened, keep_days=0)
+    planned, done = clear_up(opened, keep_days=0, dry_run=True), clear_up(opened, keep_days=0)
     assert done == planned
     gone_uris = [gone.map.uri, gone.mosaic.uri, gone.raw.uri, "stages/rectify/half/0123456789abcdef"]
     assert [removal.uri for removal in done.removals] == gone_uris

@@ -36,8 +36,7 @@ TOO_LONG = b'configure({"exposure": 6, "framePeriod": 5})'
 def test_bytes_of_every_command(sent: bytes, end: bytes, reply: bytes | None) -> None:
     """Each command gives its bytes after its own echo, in one piece or byte by byte."""
     for size in (1, len(sent + end)):
-        talk = CameraConnection(CameraDevice(LinesOf(), ManualClock()))
-        came = b""
+        talk, came = CameraConnection(CameraDevice(LinesOf(), ManualClock())), b""
         for at in range(0, len(sent + end), size):
             chunks, goes_on = talk.feed((sent + end)[at : at + size])
             assert goes_on

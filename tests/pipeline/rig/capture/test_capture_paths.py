@@ -74,8 +74,7 @@ def frames(numbers: list[int], lost: int = 0, first: int = 0) -> CapturedLines:
 )
 def test_rows_belong_to_the_lines_that_they_were_taken_for(seen: CapturedLines, row: list[int]):
     """By their numbers from the capture's first frame; what a cube promises and does not hold is left out."""
-    located = capture_paths.locate_lines(seen, PATH, TAKEN, CAMERA)
-    there = np.array(row) >= 0
+    located, there = capture_paths.locate_lines(seen, PATH, TAKEN, CAMERA), np.array(row) >= 0
     assert located.row.tolist() == row
     assert [located.is_valid(line) for line in range(len(row))] == there.tolist()
     np.testing.assert_array_equal(located.positions.position, PATH.middle[: len(row)][there].astype(np.float64))

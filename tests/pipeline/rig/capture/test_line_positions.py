@@ -78,8 +78,7 @@ def test_a_played_position_is_held() -> None:
 
 def test_dropped_frames() -> None:
     """Frames that were dropped, numbered or not, do not move the others."""
-    whole = frames()
-    kept = np.concatenate([np.arange(50), np.arange(53, LINES)])
+    whole, kept = frames(), np.concatenate([np.arange(50), np.arange(53, LINES)])
     numbered = replace(whole, number=whole.number[kept], stamp_us=whole.stamp_us[kept])
     found = by_log(numbered, scan_path())
     check_truth(found, kept)

@@ -88,8 +88,7 @@ def test_lines_are_those_where_the_mirror_is() -> None:
     with connected() as (pair, _):
         folder = pair.play(replace(FINE, start_px=FINE.start_px + 2, lines=FINE.lines - 2), told=FINE)
         np.testing.assert_array_equal(pair.lines(folder), planned(FINE, range(2, FINE.lines)))
-    source = small_source(chosen=QUIET)
-    beside = replace(FINE, swath_px=FINE.swath_px + 0.5)
+    source, beside = small_source(chosen=QUIET), replace(FINE, swath_px=FINE.swath_px + 0.5)
     with connected(source) as (pair, _):
         found = pair.lines(pair.play(beside, told=FINE)).astype(int)
     assert np.abs(found - planned(beside, range(FINE.lines), source)).max() <= 1

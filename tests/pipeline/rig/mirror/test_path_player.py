@@ -158,7 +158,6 @@ def test_an_upload_takes_the_wire_time(read_back: ReadBack, fraction: float):
     """
     memory = Memory()
     upload(link(memory), path(1500), read_back)
-    plain_s = 300 * (52 + 7) * 10 / BAUD
-    wire_s = memory.passed * BITS_PER_BYTE / BAUD
+    plain_s, wire_s = 300 * (52 + 7) * 10 / BAUD, memory.passed * BITS_PER_BYTE / BAUD
     assert wire_s == pytest.approx(plain_s * (1 + fraction), rel=0.02)
     assert memory.clock.now() == pytest.approx(wire_s)

@@ -25,8 +25,7 @@ from tests.pipeline.simulator.small_scenes import made_scene
 
 def test_a_ridge_changes_by_as_much_as_is_bounded():
     """At the top of a ridge a blur takes its slope times the mean way of the light: no bound of slopes may be less."""
-    ridge = steep_probe((3.0, 0.0), curvature=(1e9, 0.0))
-    x = np.linspace(-1, 1, 200_001)
+    ridge, x = steep_probe((3.0, 0.0), curvature=(1e9, 0.0)), np.linspace(-1, 1, 200_001)
     gauss, half_disc = np.exp(-((8 * x) ** 2) / 2), np.sqrt(1 - x**2)
     by_lens = 3.0 * 0.4 * np.average(np.abs(8 * x), weights=gauss)
     assert ABERRATION.bound(ridge, Rig(optics=Optics(aberration_px=0.4))).value == pytest.approx(by_lens, rel=1e-4)

@@ -59,8 +59,7 @@ def test_a_dim_scene_at_1_s_needs_dark_current() -> None:
 def test_noise_bounds_are_the_total_variation(unit: Unit, darkest: float, brightest: float) -> None:
     """At no sample do distributions with and without differ by more; at the worst one they differ by as much."""
     rig = Rig(detector=Detector(dark_e_per_s=0.0))
-    levels = np.linspace(darkest, brightest, 7)
-    seen = probe(darkest, brightest, unit)
+    levels, seen = np.linspace(darkest, brightest, 7), probe(darkest, brightest, unit)
     for effect, without in ((counting.SHOT, np.full(7, 20.0)), (counting.READ_NOISE, np.sqrt(levels))):
         total = np.sqrt(levels + 400)
         scale = total / 5 if unit == "dn" else np.ones(7)
@@ -104,8 +103,7 @@ def test_a_bright_roof_saturates(unit: Unit) -> None:
     """Six deviations below full scale the bound is 0; above it is what is clipped."""
     well = LineCamera().full_scale_e
     assert counting.SATURATION.bound(probe(100, well - 6.2 * np.sqrt(well + 400) - 20, unit), RIG).value == 0
-    bound = counting.SATURATION.bound(probe(100, 30_000, unit), RIG)
-    lost = 30_000 + 20 - well
+    bound, lost = counting.SATURATION.bound(probe(100, 30_000, unit), RIG), 30_000 + 20 - well
     scale = 5.0 if unit == "dn" else np.sqrt(30_400)
     assert lost / scale < bound.value
     assert "above the limit of 2.02e+04 e-" in bound.why

@@ -77,8 +77,7 @@ def test_few_kernels_pass_what_the_pupil_passes(aperture_mm: float, keystone_px:
     blurs = Moments.together(
         [blur.moments(rig, nm, blur.variants[0]) for blur in (DIFFRACTION, ABERRATION, KEYSTONE)], len(nm)
     )
-    found = fold((rig.camera.slit_px, 1.0), (1, 1), 1, blurs)
-    rng = np.random.default_rng(0)
+    found, rng = fold((rig.camera.slit_px, 1.0), (1, 1), 1, blurs), np.random.default_rng(0)
     frequency, turn = rng.uniform(0.0, 0.8, 200), rng.uniform(0, np.pi, 200)
     frequency[:60], frequency[60:90] = rng.uniform(0.1, 0.2, 60), rng.uniform(0.002, 0.03, 30)
     along, scan = (frequency * way(turn) for way in (np.cos, np.sin))

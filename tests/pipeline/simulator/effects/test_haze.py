@@ -127,8 +127,7 @@ def test_relief_between_knots() -> None:
     """Each sample's own distance gives the transmission of that distance to 1e-4."""
     rig = rig_with(SLOPING)
     block = block_of(rig, range(0, 60, 59))
-    gain = ABSORPTION.gain(block, "range")
-    row = block.scan_px / ((block.shape[0] - 1) / 2)
+    gain, row = ABSORPTION.gain(block, "range"), block.scan_px / ((block.shape[0] - 1) / 2)
     metres = 1 / (1 / 100 * (1 - row) / 2 + 1 / 10 * (1 + row) / 2)
     assert gain.shape == (2, 640, BANDS)
     np.testing.assert_allclose(gain[:, 1], transmission(metres, rig, WAVELENGTH), atol=1e-4)

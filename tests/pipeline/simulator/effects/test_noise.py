@@ -52,8 +52,7 @@ def poisson_fit(counts: Radiance, level: float) -> float:
 
 def test_deviates_are_normal() -> None:
     """A million deviates in a thousand classes; mean, variance, skew and kurtosis."""
-    drawn = deviates(1_000_000)
-    edges = stats.norm.ppf(np.arange(1, 1000) / 1000)
+    drawn, edges = deviates(1_000_000), stats.norm.ppf(np.arange(1, 1000) / 1000)
     assert fit(drawn, edges, np.full(1000, 1e-3)) > 1e-3
     z = drawn.astype(np.float64)
     for moment, truth, sd in ((1, 0, 1), (2, 1, 2**0.5), (3, 0, 15**0.5), (4, 3, 96**0.5)):

@@ -129,8 +129,7 @@ def test_no_point_of_a_line_moves_farther(swath_px: float):
     """Shifts of 5 px in any direction move no point of any line by more than the bound, and some nearly so."""
     sweep = Sweep("a", "fine", "x", swath_px, -1500.0, 301, step=10)
     plan = np.stack(points_of_scan(swath_px, CAMERA, sweep.line_px()[:, None], CAMERA.pixel_slopes()))
-    bound = np.array(at_line_ends([sweep], CAMERA, 3.0, 4.0))
-    most = np.zeros(2)
+    bound, most = np.array(at_line_ends([sweep], CAMERA, 3.0, 4.0)), np.zeros(2)
     for along, scan in ((3, 4), (3, -4), (-3, 4), (-3, -4)):
         beside = points_of_scan(swath_px + along, CAMERA, sweep.line_px()[:, None] + scan, CAMERA.pixel_slopes())
         most = np.maximum(most, np.abs(np.stack(beside) - plan).max(axis=(1, 2)))

@@ -43,8 +43,7 @@ def test_spectra_behind_gains_are_no_steeper_than_said(seed: int):
         spectral_slope=steepest_difference(spectra, NM).max(axis=0) / 5,
         unit_least_dn=5 / RIG.camera.electrons_per_dn,
     )
-    after = light_after(probe, RIG, ranges)
-    greatest = np.maximum(first.max(axis=0), 1).max()
+    after, greatest = light_after(probe, RIG, ranges), np.maximum(first.max(axis=0), 1).max()
     for way in range(3):
         light = spectra * first[way] * second[way] + added[way]
         assert (steepest_difference(light, NM) / 5 <= greatest * after.spectral_slope + 1e-9).all()
@@ -125,8 +124,7 @@ def test_means_are_those_of_the_sums_that_are_stored(binning: int, samples: int,
 @given(binning=st.integers(1, 16), signal=st.floats(0, 1e6), noiseless=st.booleans())
 def test_noise_of_a_sum_is_that_of_its_samples_together(binning: int, signal: float, noiseless: bool) -> None:
     """Variances add up: the sum has root n times the noise of a sample, so its mean has a root n-th of it."""
-    rig = Rig(detector=Detector(noiseless=noiseless))
-    light = np.full(1, signal, np.float32)
+    rig, light = Rig(detector=Detector(noiseless=noiseless)), np.full(1, signal, np.float32)
     of_sum = binning * noise_electrons(light, rig, binning)
     np.testing.assert_allclose(of_sum, np.sqrt(binning) * noise_electrons(light, rig), rtol=1e-6)
 

@@ -118,8 +118,7 @@ def test_the_mean_dark_frame_is_that_of_many_lines(dark_dn: float, exposure_ms: 
     mean = read_out(np.zeros((64, 640, BANDS), np.float32), block, ALL_EXACT).mean(axis=0)
     expected = dark_frame(block, ALL_EXACT)
     assert (expected.max() == 4095) == (exposure_ms == 500)
-    fine = expected < 4000
-    sd = np.sqrt((expected - dark_dn) * 5 + 400) / 5 / 8
+    fine, sd = expected < 4000, np.sqrt((expected - dark_dn) * 5 + 400) / 5 / 8
     assert np.abs((mean - expected) / sd)[fine].max() < 5.5
     assert abs((mean - expected)[fine].mean()) < 0.05
 

@@ -57,8 +57,7 @@ def test_nothing_where_bands_are_wide_or_not_known():
 @pytest.mark.parametrize("bands", [1, 2])
 def test_one_or_two_bands_stay(bands):
     """Without a band on either side nothing can be averaged."""
-    nm = np.linspace(500, 510, bands)
-    light = np.full((2, 3, bands), 7, np.float32)
+    nm, light = np.linspace(500, 510, bands), np.full((2, 3, bands), 7, np.float32)
     light[..., -1] = 9
     made = spectrometer.widen_bands(light, nm, np.zeros(bands), 6.0)
     np.testing.assert_allclose(made, light)

@@ -135,8 +135,7 @@ def fine_light(scene: RasterScene, block: SweepBlock, moved: Any, blurs: dict[An
     """Electrons (line, every tenth sample, band) of a diagonal scene; ``moved`` displaces points."""
     rig, bands = block.rig, len(block.wavelength_nm)
     ifov, size = rig.camera.ifov_rad, scene.shape if block.sweep.along == "y" else scene.shape[::-1]
-    normals = position_to_normal(block.middle)[:, None]
-    centres = block.slopes[::10, None]
+    normals, centres = position_to_normal(block.middle)[:, None], block.slopes[::10, None]
     found = np.zeros((len(block.lines), len(centres), bands))
     for band, (shift, variance) in enumerate(zip(*_moments(block, blurs), strict=True)):
         if band and not blurs:

@@ -51,8 +51,7 @@ def test_a_low_sun_is_redder() -> None:
     """At 5 deg green has lost more than the near infrared; at 20 deg green has fallen by more than the sine."""
     sky = replace(EQUINOX, started=datetime(2026, 3, 20, 15, 0, tzinfo=UTC))
     seconds = np.arange(0, 4 * 3600, 60.0)
-    height = sun_elevation_deg(sky, seconds)
-    light = relative_daylight(sky, BANDS, seconds)
+    height, light = sun_elevation_deg(sky, seconds), relative_daylight(sky, BANDS, seconds)
     low = light[np.abs(height - 5).argmin()]
     assert low[1] < 0.8 * low[3]
     twenty = np.abs(height - 20).argmin()
@@ -64,8 +63,7 @@ def test_night_is_dark_and_finite(hour: int) -> None:
     """Through a day from any hour the light is finite and 0 exactly with the sun down, the start's sun down or not."""
     sky = replace(EQUINOX, started=datetime(2026, 3, 20, hour, tzinfo=UTC))
     seconds = np.arange(0, 86400, 300.0)
-    light = relative_daylight(sky, BANDS, seconds)
-    height = sun_elevation_deg(sky, seconds)
+    light, height = relative_daylight(sky, BANDS, seconds), sun_elevation_deg(sky, seconds)
     assert np.isfinite(light).all()
     assert (light[height < -0.1] == 0).all()
     assert (light[height > 0.1] > 0).all()

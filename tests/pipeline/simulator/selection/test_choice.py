@@ -100,8 +100,7 @@ def test_asking_by_name_switches_on_those_and_no_others(effects: list[MadeUp], t
 @given(made_up(5), st.floats(1e-3, 5))
 def test_at_least_half_of_what_can_be_saved_is_saved(effects: list[MadeUp], tolerance: float):
     """The rule's worst case against an enumeration of all options."""
-    decision = decide(PROBE, RIG, effects, tolerance)
-    menus = list_options(PROBE, RIG, effects)
+    decision, menus = decide(PROBE, RIG, effects, tolerance), list_options(PROBE, RIG, effects)
     ways = [menu.variants if menu.name == "quantisation" else (*menu.variants, menu.off) for menu in menus]
     fitting = (way for way in itertools.product(*ways) if math.fsum(one.error for one in way) <= tolerance)
     least = min(math.fsum(one.cost_ns for one in way) for way in fitting)

@@ -80,8 +80,7 @@ def test_wave_has_its_slope_and_curvature(along: str) -> None:
 @pytest.mark.parametrize("seed", [0, 1, 11])
 def test_nothing_in_the_image_exceeds_the_probe(seed: int) -> None:
     """Levels, spans, differences of neighbours and of variants of the slit stay below 1.05 of the probe's."""
-    scene = mixed(seed)
-    sweep = replace(SWEEP, swath_px=40.0 * (seed % 3), start_px=-30.0 + seed)
+    scene, sweep = mixed(seed), replace(SWEEP, swath_px=40.0 * (seed % 3), start_px=-30.0 + seed)
     probe, light = probe_scene(scene, RIG, [sweep]), seen(scene, sweep)
     noise = noise_electrons(light, RIG)
     level = (light / noise).max(axis=(0, 1))
@@ -103,8 +102,7 @@ def test_nothing_in_the_image_exceeds_the_probe(seed: int) -> None:
 def test_turned_lines_do_not_exceed_what_the_probe_measured(seed: int, swath: float) -> None:
     """At strips far from the middle, where lines are turned by 3 and 8 deg, each keeps its bound beside all blurs."""
     scene, sweep = mixed(seed, (80, 2000)), replace(SWEEP, swath_px=swath)
-    probe = probe_scene(scene, RIG, [sweep])
-    light = seen(scene, sweep, "9x3", BLURS)
+    probe, light = probe_scene(scene, RIG, [sweep]), seen(scene, sweep, "9x3", BLURS)
     noise = noise_electrons(light, RIG)
     for variant in (*SLIT.variants[1:], "off"):
         change = np.abs(seen(scene, sweep, variant, BLURS) - light) / noise
@@ -141,16 +139,14 @@ def test_no_stored_sum_exceeds_its_probe(binning: int, along: str) -> None:
     level = (stored_mean(light, binning) / noise).max(axis=(0, 1))
     assert (level <= 1.03 * probe.level).all()
     assert (level >= 0.9 * probe.level).all()
-    steps = np.abs(np.diff(light, axis=0))
-    least = np.minimum(noise[1:], noise[:-1])
+    steps, least = np.abs(np.diff(light, axis=0)), np.minimum(noise[1:], noise[:-1])
     assert (stored_mean(steps, binning) / least).max() <= 1.05 * probe.slope[1].max()
     assert probe.binning == binning
 
 
 def test_a_bright_sum_counts_by_the_root_of_its_samples() -> None:
     """Of an even scene the level in sigmas of a sum of 4 is twice that of a sample, in DN 4 times."""
-    scene = scene_of(np.full((50, 60, 1), 3.0))
-    four = replace(SWEEP, binning=4)
+    scene, four = scene_of(np.full((50, 60, 1), 3.0)), replace(SWEEP, binning=4)
     for unit, growth in (("sigma", 2.0), ("dn", 4.0)):
         probes = [probe_scene(scene, RIG, [sweep], unit) for sweep in (SWEEP, four)]
         assert probes[1].level[0] == pytest.approx(growth * probes[0].level[0], rel=1e-4)
