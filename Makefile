@@ -18,10 +18,12 @@ export DO_NOT_TRACK = 1
 setup: $(BIN)/.ok
 
 # A small survey checks the installation, and compiles what surveys import: larger ones then begin at once.
+# The pip that comes with Python 3.11 takes twice as long to resolve pinned versions as a new one.
 # Debian without python3-venv has no ensurepip: create a bare environment, then install pip with the system's pip.
 $(BIN)/.ok: pyproject.toml constraints.txt
 	$(PY) -m venv $(VENV) 2>/dev/null || { $(PY) -m venv --without-pip $(VENV) \
 		&& $(PY) -m pip --python $(BIN)/python install -q pip; }
+	$(PIP) -U pip
 	$(PIP) -e .
 	small=$$(mktemp -d); PYTHONDONTWRITEBYTECODE= $(BIN)/spectralzoom survey --scene farm --size 64x64 --seconds 2 \
 		--out $$small/archive > $$small/log 2>&1 || { cat $$small/log; exit 1; }; rm -rf $$small

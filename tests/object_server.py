@@ -1,4 +1,7 @@
-"""An S3 server on loopback: moto's, in a thread of this process, with one bucket."""
+"""An S3 server on loopback: moto's, in a thread of this process, with one bucket.
+
+It is S3 alone: moto's server for all services looks for the right one at every request, which took half of its time.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import logging
 from collections.abc import Callable, Iterator
 from itertools import count
 from pathlib import Path
+from threading import Thread
 from typing import TYPE_CHECKING
 
 import pytest
@@ -22,21 +26,24 @@ _numbers = count()
 def s3_server() -> Iterator[str]:
     """Endpoint of a server with an empty bucket; skips where moto or obstore is not installed."""
     pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
-    server_of = pytest.importorskip("moto.server", reason="moto[s3,server] is not installed (extra dev)")
+    moto = pytest.importorskip("moto.moto_server.werkzeug_app", reason="moto[s3,server] is not installed (extra dev)")
     import boto3
+    from werkzeug.serving import make_server
 
     logging.getLogger("werkzeug").setLevel(logging.ERROR)
-    server = server_of.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-    server.start()
-    host, port = server.get_host_and_port()
-    url = f"http://{host}:{port}"
+    server = make_server("127.0.0.1", 0, moto.create_backend_app("s3"), True, request_handler=moto.MotoRequestHandler)
+    thread = Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    url = f"http://127.0.0.1:{server.server_port}"
     client = boto3.client(
         "s3", endpoint_url=url, aws_access_key_id="key", aws_secret_access_key="secret", region_name="us-east-1"
     )
     client.create_bucket(Bucket=BUCKET)
     client.close()
     yield url
-    server.stop()
+    server.shutdown()
+    thread.join()
+    server.server_close()
 
 
 @pytest.fixture

@@ -253,7 +253,7 @@ class Cluster:
             if not pool.elsewhere:
                 self._own = start(pool.count)
             place = pool.scheduler if pool.elsewhere else self._own
-            self.client: Any = dask_distributed.Client(place, timeout=ANSWER_S, set_as_default=False)  # type: ignore[no-untyped-call]
+            self.client: Any = dask_distributed.Client(place, timeout=ANSWER_S, set_as_default=False)
         except (OSError, TimeoutError, ValueError, RuntimeError) as error:
             expected = "expected a dask scheduler there, none answered" if pool.elsewhere else "no processes start"
             raise SettingsError(
@@ -325,7 +325,7 @@ def start(workers: int) -> Any:
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         with dask.config.set({"distributed.nanny.pre-spawn-environ": _ENVIRONMENT}):
-            return make_cluster(  # type: ignore[no-untyped-call]
+            return make_cluster(
                 n_workers=workers,
                 threads_per_worker=1,
                 memory_limit=None,

@@ -31,9 +31,7 @@ BUILD = "import sys; from setuptools import build_meta; print(getattr(build_meta
 USED = """
 import json, sys
 import spectralzoom
-from models.weights.files import load_weights
-run = spectralzoom.survey(scene="field.png", source="sim", weights="mine.safetensors", budget=0.8, effects="none",
-    camera={"samples": 320}, out=sys.argv[1])
+run = spectralzoom.survey(scene="field.png", weights="mine.safetensors", out=sys.argv[1])
 print(json.dumps([spectralzoom.__version__, spectralzoom.__file__, str(run.report)]))
 """
 
