@@ -148,19 +148,13 @@ def _find_knots(curve: KnotCurve, a: Floats, b: Floats, tolerance: float) -> Flo
 def _miss(curve: KnotCurve, a: Floats, b: Floats, knot: Floats) -> tuple[Floats, Floats]:
     """Return how far the curve lies beyond the centre that the point needs, and the slope of this over the knots."""
     scan, scan_slope, across, across_slope = curve.at(knot)
-    need, need_slope = _centre_and_slope(a, b, across)
-    return scan - need, scan_slope - need_slope * across_slope
-
-
-def _centre_and_slope(a: Floats, b: Floats, c: Floats) -> tuple[Floats, Floats]:
-    """Return :func:`pipeline.geometry.mirror.line_centre` and its derivative by c."""
-    reach = 1 + a * a - (a - c) ** 2
+    # the need is `pipeline.geometry.mirror.line_centre` of ``across``: d reach = 2 (a - c), d product = 2 c - a
+    reach = 1 + a * a - (a - across) ** 2
     reach = np.where(reach > 0, reach, np.nan)
     root = np.sqrt(reach + b * b)
-    product, grown = c * (c - a), (b + root) / reach
-    # d reach = 2 (a - c), d product = 2 c - a
-    slope = (2 * c - a) * grown + product * 2 * (a - c) * (0.5 / root - grown) / reach
-    return b + product * grown, slope
+    product, grown = across * (across - a), (b + root) / reach
+    need_slope = (2 * across - a) * grown + product * 2 * (a - across) * (0.5 / root - grown) / reach
+    return scan - (b + product * grown), scan_slope - need_slope * across_slope
 
 
 def _bisect(curve: KnotCurve, a: Floats, b: Floats, rough: Floats) -> Floats:

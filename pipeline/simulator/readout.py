@@ -29,7 +29,6 @@ from pipeline.simulator.effects.counting import (
     normal_deviates,
     photon_counts,
     rounded_counts,
-    well_reached,
 )
 from pipeline.simulator.effects.effect import OFF, Radiance, SweepBlock
 from pipeline.simulator.render import Choice
@@ -145,8 +144,9 @@ class Readout:
     @cached_property
     def full_well_e(self) -> float | None:
         """Return the electrons that an element holds; None where the converter ends first, or saturation is off."""
-        on = self._variant(SATURATION.name) != OFF and well_reached(self.block.rig, self.read_noise_e)
-        return self.block.rig.detector.full_well_e if on else None
+        well_e, camera = self.block.rig.detector.full_well_e, self.block.rig.camera
+        end_e = (camera.full_scale_dn + 1 - camera.dark_dn) * camera.electrons_per_dn + 8 * self.read_noise_e
+        return well_e if self._variant(SATURATION.name) != OFF and well_e < end_e else None
 
     @cached_property
     def _merges(self) -> bool:

@@ -165,15 +165,10 @@ class Archive:
                 if not done:
                     consolidate_stores(part)
                     write_manifest(part, facts)
-                    self._put_in_place(part, final)
+                    # a store whose files were cleared away is still there
+                    (take_its_place if final.exists() else rename_into_place)(part, final)
             finally:
                 remove_tree(part)
-
-    def _put_in_place(self, part: Path, final: Path) -> None:
-        if final.exists():  # its files were cleared away
-            take_its_place(part, final)
-        else:
-            rename_into_place(part, final)
 
     def produce(
         self,

@@ -8,13 +8,14 @@ components have chunks of 64 x 64 px.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache, lru_cache, wraps
 from itertools import product
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,6 +101,12 @@ def tile_place(origin: Sequence[int], size: Sequence[int]) -> tuple[slice, slice
     return slice(origin[0], origin[0] + size[0]), slice(origin[1], origin[1] + size[1])
 
 
+@cache
+def _zarr_type(kind: np.dtype[Any]) -> Any:
+    """Return Zarr's record of a type; to find it, Zarr tries one type after the other."""
+    return zarr.dtype.parse_dtype(kind, zarr_format=3)
+
+
 def create_array(
     group: zarr.Group,
     name: str,
@@ -120,7 +127,7 @@ def create_array(
     return group.create_array(
         name,
         shape=spec.shape,
-        dtype=kind,
+        dtype=_zarr_type(kind),
         chunks=tuple(max(size, 1) for size in spec.chunk),
         shards=None if spec.shard is None else tuple(max(size, 1) for size in spec.shard),
         fill_value=bool(fill) if kind.kind == "b" else fill,
@@ -243,6 +250,25 @@ def open_group(path: StorePlace, mode: Literal["r", "r+"] = "r") -> zarr.Group:
     """Open a store (IncompleteStoreError: there is none, or its metadata is damaged)."""
     with damage_named(str(path)):
         return zarr.open_group(path, mode=mode, zarr_format=3, use_consolidated=False)
+
+
+Opener = TypeVar("Opener", bound=Callable[[Any], Any])
+
+
+def opened_once(open_store: Opener) -> Opener:
+    """Decorate a function that opens a store: the result is kept while the metadata of the store stay as they are.
+
+    Published stores never change, and opening one reads a dozen arrays. Stores in memory are opened each time.
+    """
+    kept = lru_cache(16)(lambda path, *stamp: open_store(path))
+
+    @wraps(open_store)
+    def open_or_recall(path: StorePlace) -> Any:
+        if not isinstance(path, Path) or not (file := path / "zarr.json").is_file():
+            return open_store(path)
+        return kept(path, file.stat().st_ino, file.stat().st_mtime_ns)
+
+    return cast(Opener, open_or_recall)
 
 
 def array_of(group: zarr.Group, name: str) -> zarr.Array[Any]:

@@ -23,6 +23,7 @@ from storage.arrays.layout import (
     create_group,
     image_spec,
     open_group,
+    opened_once,
     read_array,
     read_bands,
     read_components,
@@ -219,6 +220,7 @@ class Mosaic:
             first = below
 
 
+@opened_once
 def open_mosaic(path: Path) -> Mosaic:
     """Open a mosaic. Raises IncompleteStoreError where it is missing or damaged."""
     group = open_group(path)

@@ -43,6 +43,7 @@ from storage.arrays.layout import (
     damage_named,
     integers_for,
     open_group,
+    opened_once,
     read_array,
     read_components,
     score_spec,
@@ -205,6 +206,7 @@ def read_coordinates(
     return {name: (dims[name], read_array(group, name), dict(there[name].attrs)) for name in names if name in there}
 
 
+@opened_once
 def open_signal_cube(path: StorePlace) -> SignalCube:
     """Open a condensed sweep. Raises IncompleteStoreError: there is none, it was not closed, or it is damaged."""
     group = open_group(path)

@@ -291,13 +291,6 @@ class Saturation(Effect):
         return Bound(probe.added(over, camera.electrons_per_dn), why)
 
 
-def well_reached(rig: Rig, read_noise_e: float) -> bool:
-    """Return whether a well overflows before the converter ends, 8 deviations of the read noise counted in."""
-    camera = rig.camera
-    end_e = (camera.full_scale_dn + 1 - camera.dark_dn) * camera.electrons_per_dn
-    return rig.detector.full_well_e < end_e + 8 * read_noise_e
-
-
 @dataclass(frozen=True)
 class Shot(Effect):
     """Poisson counts. ``gaussian`` has their first three cumulants, and takes the read noise into the same draw.

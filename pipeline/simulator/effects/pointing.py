@@ -172,13 +172,9 @@ def pointing_field(unit: int, position: Floats) -> Floats:
 
 def _course(rig: Rig, sweep: Sweep, position: Floats) -> Floats:
     """Return shift (line, 2) of lines at some positions of a sweep. [px]"""
-    return rig.mirror.hysteresis_px * scan_sign(sweep) * pointing_field(rig.detector.unit, position)
-
-
-def scan_sign(sweep: Sweep) -> float:
-    """Return 1 for a scan towards greater coordinates (or one that stands still), -1 for one that comes back."""
     held = sweep.held_px().ravel()
-    return -1.0 if len(held) > 1 and held[-1] < held[0] else 1.0
+    sign = -1.0 if len(held) > 1 and held[-1] < held[0] else 1.0  # 1 too where the mirror stands still
+    return rig.mirror.hysteresis_px * sign * pointing_field(rig.detector.unit, position)
 
 
 def _along_and_scan(rig: Rig) -> tuple[float, float]:

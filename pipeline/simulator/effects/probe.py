@@ -121,13 +121,6 @@ def fixed_variance(rig: Rig) -> float:
     return camera.read_noise_e**2 + camera.electrons_per_dn**2 / 12
 
 
-def unit_electrons(light_e: Floats, probe: Probe, rig: Rig) -> Floats:
-    """Return the unit of the probe at some light [e-]; what does not follow the light is the smallest unit met."""
-    if probe.unit == "sigma" and not rig.detector.noiseless:
-        return np.sqrt((np.maximum(light_e, 0.0) + fixed_variance(rig)) / probe.binning)
-    return np.full_like(light_e, probe.unit_least_dn * rig.camera.electrons_per_dn)
-
-
 @dataclass(frozen=True)
 class GainRange:
     """Factors of light that a gain has anywhere in a survey, (band,) each.

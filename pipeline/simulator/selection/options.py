@@ -23,7 +23,7 @@ import numpy as np
 
 from pipeline.errors import SettingsError
 from pipeline.simulator.effects.effect import OFF, Effect
-from pipeline.simulator.effects.probe import GainRange, Probe, fixed_variance, rising_gaps, unit_electrons
+from pipeline.simulator.effects.probe import GainRange, Probe, fixed_variance, rising_gaps
 from pipeline.simulator.rig_model import Rig
 
 SAFETY = 1.2  # maxima are read off a sample of the scene, derivatives off differences
@@ -187,12 +187,12 @@ def light_after(probe: Probe, rig: Rig, gains: Iterable[GainRange], blurred: flo
         added = added + one.added_e
     ratio = unit_ratio(probe, rig, float(least.min(initial=1.0)))
     unit_e = probe.unit_least_dn * rig.camera.electrons_per_dn / ratio
-    follows = probe.unit == "sigma" and not rig.detector.noiseless
     apart = float((2 * blurred + ratio * (1 - kept) * probe.level + added / unit_e).max(initial=0.0))
-    gaps = rising_gaps(probe.wavelength_nm)
+    gaps, follows = rising_gaps(probe.wavelength_nm), probe.unit == "sigma" and not rig.detector.noiseless
+    own_e = np.sqrt((np.maximum(added, 0.0) + fixed_variance(rig)) / probe.binning) if follows else unit_e
     return replace(
         probe,
-        level=probe.level + added / (unit_electrons(added, probe, rig) if follows else unit_e),
+        level=probe.level + added / own_e,
         spectral_slope=probe.spectral_slope + (apart / gaps.min() if gaps.size else 0.0),
         brightest_e=probe.brightest_e + float(added.max(initial=0.0)),
         darkest_e=probe.darkest_e * max(1 - uneven, 0.0),

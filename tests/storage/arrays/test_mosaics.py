@@ -83,3 +83,14 @@ def test_brightness_is_the_mean_over_bands(stored: Stored, factor: int) -> None:
         if np.isfinite(cell).mean() >= 0.5:
             expected[y, x] = np.nanmean(cell)
     np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_a_store_is_opened_once_and_again_where_another_takes_its_place(tmp_path: Path) -> None:
+    """As when `verify --repair` makes it anew."""
+    path = tmp_path / "mosaic.zarr"
+    writer(path)
+    first = open_mosaic(path)
+    assert open_mosaic(path) is first
+    path.rename(tmp_path / "old.zarr")
+    plain_writer(path, SHAPE, np.array([500.0, 700.0]))
+    assert open_mosaic(path).wavelength_nm.tolist() == [500.0, 700.0]
