@@ -323,6 +323,7 @@ _SHOWN: Mapping[str, tuple[str, Sequence[str]]] = {
     "plan": ("plan", ("reason", "lines")),
     "recording": ("recording", ("lines_read", "lines_recorded", "passes_s", "full_scan_s")),
     "signal": ("signal", ("saturated",)),
+    "pixels": ("pixels", ("px_no_reading", "map_without_a_class")),
     "extent": ("captured", ("lines", "patches_touched", "expected_wrong", "due_left")),
     "kept": ("at full resolution", ("patches", "multiply_adds")),
     "prior_map": (
@@ -365,6 +366,8 @@ _FORMATS: Mapping[str, Callable[[Any], str]] = {
         f"{format_percent(fraction)} of the spectra have bands that are saturated or without data. They are restored "
         "from the others; where fewer than half are left, the spectrum is unknown. A shorter exposure avoids saturation"
     ),
+    "px_no_reading": lambda px: f"{format_count(px)} px with values out of the range of the weights",
+    "map_without_a_class": lambda px: f"{format_count(px)} px without a class",
     "too_narrow": lambda value: f"{counted(len(value), 'overlap')} too narrow to compare",
 }
 _VALUES: Mapping[str, Callable[[Any], str]] = {

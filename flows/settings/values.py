@@ -9,7 +9,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, date, datetime
 from typing import Annotated
 
 from pydantic import ByteSize, PlainValidator, TypeAdapter, ValidationError
@@ -49,6 +49,8 @@ class Tolerance:
 
 def parse_text(value: object) -> str:
     """Return text that is not empty."""
+    if isinstance(value, date):  # of a TOML file
+        return value.isoformat()
     if not isinstance(value, str) or not value.strip():
         raise ValueError(f"must be text that is not empty, got {value!r}")
     if "\0" in value:

@@ -119,14 +119,17 @@ class PassLayout:
         if limit_s is not None:
             fine_s = limit_s - coarse_s
             if fine_s < 0:
-                limit = f"--seconds {seconds:g}" if budget is None else f"a --budget of {budget:g}, {limit_s:.1f} s,"
+                limit = f"--seconds {seconds:g}" if budget is None else f"a --budget of {budget:g}, {limit_s:.2f} s,"
                 fixed = self.cost.seconds([replace(one, lines=0) for one in coarse], self.camera)
-                free = self.coarse_exposure_ms is None and self.recorded is None and fixed < limit_s
-                shorter = ", a shorter --coarse-exposure-ms" if free else ""
+                ways = ["give more"] if budget is None or coarse_s <= full_s else []
+                stated = budget is not None or self.coarse_exposure_ms is None  # not the shortest for --seconds
+                shorter = stated and self.recorded is None and fixed < limit_s
+                ways += ["give a shorter --coarse-exposure-ms"] if shorter else []
+                left_out = "--zoom never" if budget is None else "without --budget, --policy and --coarse-exposure-ms"
                 raise BudgetError(
                     f"{limit} is below the time of the first pass of every {self.first_step}th line, "
-                    f"{coarse_s + 0.01:.2f} s of the full scan's {full_s:.1f} s; "
-                    f"give more{shorter}, or take one uniform scan"
+                    f"{coarse_s + 0.01:.2f} s of the full scan's {full_s:.2f} s; "
+                    f"{', '.join([*ways, f'or take one uniform scan ({left_out})'])}"
                 )
         margin, plain = 2 * self.pointing_px, budget is None and seconds is None
         return CapturePlan(along, coarse, full, coarse_s, full_s, fine_s, margin, plain=plain, by_record=by_record)

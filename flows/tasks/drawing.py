@@ -87,6 +87,8 @@ class Drawing:
         drawn = segment(weights, seen, columns, patch_index, every_class=True)
         del columns  # a prior map takes their room
         shown = self._shown(region, mosaic)
+        if seen.out_of_range is not None:
+            shown &= ~seen.out_of_range
         assert drawn.log_probability is not None
         unknown = None
         if self.unknown is not None:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from datetime import UTC, datetime, time
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ NEWEST_RUNS = 60  # newest runs of a field that are searched for the previous vi
 REACH_PX = 64.0  # greatest shift of a prior map that is found
 MOST_EARLIER = 12  # earlier visits that show a field which was captured in parts
 PROBABILITIES = "class_probabilities"  # a product of runs
+_WITH_TIME = re.compile(r"\s*[\dW-]+[^\d-]\d\d")  # a date and an hour, in ISO 8601
 PRIOR_FIGURES = "prior_map.json"  # beside a map: the figures of its prior map
 TURNED, ANOTHER_FIELD = "turned", "another field"  # reasons to put a prior map aside
 OF_THE_LIGHT = (  # settings that two runs of the same captured light share
@@ -190,9 +192,10 @@ def _days_since(run: Run, visit: str | None, moment: tuple[int, float] | None) -
     The dates of both visits count, with their times if both have one. Else day and hour of a built-in scene count, else
     whole days of the clock.
     """
-    then, now = (moment_of(one) for one in (run.settings.get("visit"), visit))
+    named = run.settings.get("visit"), visit
+    then, now = map(moment_of, named)
     if then is not None and now is not None:
-        if time.min in (then.time(), now.time()):  # a date alone
+        if not all(_WITH_TIME.match(str(one)) for one in named):
             return float((now.date() - then.date()).days)
         return (now - then).total_seconds() / 86400
     if moment is not None and run.settings.get("scene") in BUILT_IN_SCENES:

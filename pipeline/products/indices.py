@@ -22,7 +22,8 @@ Floats = NDArray[np.float32]
 
 DARK_FRACTION = 0.01  # of white: pixels with a darker mean of bands have no index
 NARROW_NM = 10.0  # largest distance of a band from the wavelength of a narrow one
-MOST_REFLECTANCE = 1.5  # a cube with one value in a hundred above this is not reflectance
+# A cube is reflectance if one value in a hundred is above a number from the first of these to the second.
+LEAST_REFLECTANCE, MOST_REFLECTANCE = 0.02, 1.5
 LAMBDA = "lambda"  # prefix of a band's wavelength in a formula
 CONSTANTS = {"SAVI": {"L": 0.5}}  # instead of a default that belongs to another index
 PAPERS_NM = {  # centres of the papers instead of a satellite's
@@ -202,5 +203,5 @@ def index_values(
 def white_level(values: NDArray[np.floating]) -> float:
     """Return the white level of a cube's values: 1 for reflectance, else their 99th percentile."""
     known = values[np.isfinite(values)]
-    bright = float(np.percentile(known, 99)) if known.size else 0.0
-    return 1.0 if bright <= MOST_REFLECTANCE else bright
+    bright = float(np.percentile(known, 99)) if known.size else 1.0
+    return 1.0 if LEAST_REFLECTANCE <= bright <= MOST_REFLECTANCE else bright

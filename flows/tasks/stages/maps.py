@@ -41,7 +41,7 @@ from storage.arrays.ground_maps import BLOCK, GroundMapWriter
 from storage.arrays.layout import NO_CLASS, blank_pixels
 from storage.arrays.mosaics import Attention, choose_bands, develop, open_mosaic, write_attention
 
-CLASS_MAP = Product("segment", version=25, files=(MAP, PROBABILITIES), by_weights=True)
+CLASS_MAP = Product("segment", version=26, files=(MAP, PROBABILITIES), by_weights=True)
 OUT_OF_RANGE = "out_of_range.json"  # beside a map with values out of range
 MOST_TURN_PX = 12.0  # greatest offset of the corners by rotation, at which a prior map is used
 

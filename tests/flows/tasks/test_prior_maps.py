@@ -120,6 +120,7 @@ def test_by_hand_nothing_is_remembered_unless_asked(visited: Path, survey_png: S
         ("2026-06-02T22:00:00Z", False, 1, 1.5),  # taken in late
         ("2026-06-04T12:00:00+02:00", False, 2, 0.0),  # at the same moment as the other
         ("2026-06-09T10:00:00Z", True, 1, 8.0),
+        ("2026-06-03T00:00:00Z", False, 1, 38 / 24),
         ("2026-06-04", False, 2, 0.0),  # a date alone is a day and not its midnight
     ],
 )

@@ -17,6 +17,7 @@ from PIL import Image
 from rich.console import Console
 
 from flows.publish.receipt import check_receipt
+from flows.publish.receipt_table import finding_rows
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
@@ -270,15 +271,15 @@ def test_no_data_that_nobody_stated_ends_a_survey(survey_png: Any, tmp_path: Pat
 
 @pytest.mark.usefixtures("no_effects")
 def test_readings_that_the_weights_cannot_take_are_counted(survey_png: Any, tmp_path: Path) -> None:
-    """Weights for numbers a million times smaller: no pixel can be read, which the receipt says."""
+    """Weights for numbers a million times smaller: no pixel can be read or gets a class, which the receipt says."""
     weights = random_weights(RGB_NM, CLASSES)
     small = replace(weights.normalisation, centre=np.zeros(3, np.float32), spread=np.full(3, 1e-4, np.float32))
     save_weights(replace(weights, normalisation=small), tmp_path / "w.safetensors")
     scene = _scene(tmp_path / "s", None)
     found = _survey(survey_png, scene, weights=str(tmp_path / "w.safetensors"), policy="sobel")
     pixels = found.receipt["pixels"]
-    assert pixels["px_no_reading"] == 64 * 96
-    assert pixels["map_without_a_class"] == 0
+    assert pixels["px_no_reading"] == pixels["map_without_a_class"] == 64 * 96
+    assert "px with values out of the range of the weights" in dict(finding_rows(found.receipt))["pixels"]
     store = scene.parent / "a" / Path(found.receipt["products"]["class_map"]).parent
     assert json.loads((store / "out_of_range.json").read_text())["px"] == 64 * 96
 

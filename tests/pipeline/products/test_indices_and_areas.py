@@ -72,6 +72,7 @@ def test_an_index_of_ratios_needs_no_reflectance() -> None:
     assert white_level(np.linspace(0, 1.2, 500)) == 1.0
     assert white_level(np.linspace(0, 255, 500)) > 250
     assert white_level(np.full(4, np.nan)) == 1.0
+    assert white_level(np.linspace(0, 0.01, 500)) < 0.01  # radiance
 
 
 # Olofsson et al. 2014, table 8: rows are mapped classes there, columns what the reference says

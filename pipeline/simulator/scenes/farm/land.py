@@ -312,7 +312,7 @@ def sun_over_farm(day: int, hour: float) -> Sun:
     [1] Spencer, "Fourier series representation of the position of the sun", Search 2 (5), 1971.
     """
     if not 1 <= day <= YEAR_DAYS:
-        raise SceneError(f"the farm's day is 1 to {YEAR_DAYS}, counted from 1 January, got {day}")
+        raise SceneError(f"the day is 1 to {YEAR_DAYS}, counted from 1 January, got {day}")
     year = 2 * np.pi * (day - 1) / 365
     declination = 0.006918 - 0.399912 * np.cos(year) + 0.070257 * np.sin(year) - 0.006758 * np.cos(2 * year)
     declination = declination + 0.000907 * np.sin(2 * year) - 0.002697 * np.cos(3 * year) + 0.00148 * np.sin(3 * year)
@@ -323,7 +323,7 @@ def sun_over_farm(day: int, hour: float) -> Sun:
     elevation = float(np.degrees(np.arcsin(np.clip(up, -1, 1))))
     if not elevation >= LOWEST_SUN_DEG:  # refuses NaN
         raise SceneError(
-            f"at hour {hour:g} of day {day} the sun stands at {elevation:.1f} degrees, the farm needs at least "
+            f"at hour {hour:g} of day {day} the sun stands at {elevation:.1f} degrees, the scene needs at least "
             f"{LOWEST_SUN_DEG:g}; take an hour nearer to 12"
         )
     return Sun(float(np.degrees(np.arctan2(east, north)) % 360), elevation)
