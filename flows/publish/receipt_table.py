@@ -18,7 +18,6 @@ from flows.terminal.figures import (
     format_area,
     format_bytes,
     format_count,
-    format_megabytes,
     format_metres,
     format_percent,
     format_points,
@@ -67,7 +66,7 @@ def saving_rows(receipt: Mapping[str, Any]) -> list[dict[str, Any]]:
         if (one := savings.get(name)) is not None
     ]
     full = account["reference"]
-    show_bytes = format_bytes if full < LEAST_REFERENCE else format_megabytes
+    show_bytes = format_bytes if full < LEAST_REFERENCE else lambda size: f"{three_digits(size / 1e6)} MB"
     for name, label in BYTE_LABELS.items():
         done = account[name]
         if done or name != "moved_bucket":

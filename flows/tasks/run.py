@@ -324,9 +324,11 @@ class SurveyRun(CaptureRun):
             every = self.costs.of_map(self.kept_patches)
             before = every.detail * prior["patches_read"] // max(len(self.kept_patches), 1)
             done = MultiplyAdds(done.overview + every.overview, done.score * (2 if scored else 1), done.detail + before)
-        if self.prior is None or self.reader is None or aside == TURNED:
+        if self.prior is None or self.reader is None:
             return done
-        return replace(done, detail=done.detail + self.reader.sizes.multiply_adds(self.grid.height * self.grid.width))
+        times = (self.extent is not None) + (aside != TURNED)  # to choose the lines of a partial scan, and for the map
+        each = self.reader.sizes.multiply_adds(self.grid.height * self.grid.width)
+        return replace(done, detail=done.detail + times * each)
 
     def reading_figures(
         self, patch_index: NDArray[np.integer], prior: Mapping[str, Any] | None = None

@@ -34,11 +34,6 @@ def format_bytes(count: float | None) -> str:
     return f"{size:.3g} {units[-1]}"
 
 
-def format_megabytes(count: float | None) -> str:
-    """Return bytes in MB, for columns of comparable numbers."""
-    return f"{three_digits(count / 1e6)} MB" if _known(count) else DASH
-
-
 def format_count(count: float | None) -> str:
     """Return a whole number with thin spaces by thousands, from ten million on in million, billion, 10^12."""
     if not _known(count):

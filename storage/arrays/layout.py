@@ -101,10 +101,7 @@ def tile_place(origin: Sequence[int], size: Sequence[int]) -> tuple[slice, slice
     return slice(origin[0], origin[0] + size[0]), slice(origin[1], origin[1] + size[1])
 
 
-@cache
-def _zarr_type(kind: np.dtype[Any]) -> Any:
-    """Return Zarr's record of a type; to find it, Zarr tries one type after the other."""
-    return zarr.dtype.parse_dtype(kind, zarr_format=3)
+_zarr_type = cache(lambda kind: zarr.dtype.parse_dtype(kind, zarr_format=3))  # Zarr tries one type after the other
 
 
 def create_array(

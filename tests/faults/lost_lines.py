@@ -144,8 +144,7 @@ def try_power(cuts: int, folder: Path, seed: int = 0) -> Losses:
     for number in range(cuts):
         moment, place = chance.choice(moments), folder / str(number)
         place.mkdir()
-        fates = cut_power(folder / "whole", moment, place, chance)
-        wrong = list(_go_on(place, moment.appended, found))
+        fates, wrong = cut_power(folder / "whole", moment, place, chance), list(_go_on(place, moment.appended, found))
         if _contents(place) != truth:
             wrong.append("not the undisturbed bytes after going on")
         found.wrong += [f"{moment.appended} lines, {fates}: {one}" for one in wrong]

@@ -211,8 +211,7 @@ def try_files(count: int, seed: int = 0) -> dict[str, Tally]:
     """Mutate ``count`` files, each format in turn, read each, and say how it went."""
     tallies = {name: Tally() for name in FORMATS}
     with tempfile.TemporaryDirectory() as place:
-        sources = {name: Path(place, f"s{number}") for number, name in enumerate(FORMATS)}
-        addresses = {}
+        sources, addresses = {name: Path(place, f"s{number}") for number, name in enumerate(FORMATS)}, {}
         for name, make in FORMATS.items():
             sources[name].mkdir()
             addresses[name] = make(sources[name])
@@ -244,8 +243,7 @@ def file_rows(quick: bool = False) -> Sequence[Row]:
         for one in found.values():
             tally.add(Tally(**one))
     words = [*crashed, tally.words(), f"a process of {BATCH} grew by {grown / 1e6:.0f} MB at most"]
-    met = not crashed and not tally.wrong
-    injected = "random changes in files of every kind that is ingested"
+    met, injected = not crashed and not tally.wrong, "random changes in files of every kind that is ingested"
     demanded = "a cube or one clear error, soon, in bounded memory"
     return [Row("mutated files", injected, count, demanded, "; ".join(words), met, clock.seconds)]
 

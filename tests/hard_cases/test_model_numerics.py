@@ -106,8 +106,7 @@ def test_5_no_patch_is_the_overview_bit_by_bit():
     """With K = 0 training's forward, the overview and the survey's map come from one and the same logits."""
     weights, grid = plain_weights(), SceneGrid(48, 64, 8)
     seen = coarse_prediction_of_columns(weights, noise(0, 48, 64, 4).numpy(), grid)
-    image = torch.from_numpy(with_planes(seen.columns, LineSpec())).permute(2, 0, 1)[None]
-    model = weights.segmenter
+    image, model = torch.from_numpy(with_planes(seen.columns, LineSpec())).permute(2, 0, 1)[None], weights.segmenter
     logits, patches = model(image, image, NONE, PLACE)
     whole = model.composite(logits, patches, NONE)
     assert torch.equal(whole, logits)

@@ -88,8 +88,7 @@ def test_where_nothing_can_be_kept_loops_run_all_the_same() -> None:
 
 def test_two_processes_compile_at_once(file: Path) -> None:
     """Both come to their end over one cold folder, and leave it whole."""
-    command = [sys.executable, "-c", ASK, str(file.parent)]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command, environment = [sys.executable, "-c", ASK, str(file.parent)], {**os.environ, "PYTHONPATH": str(ROOT)}
     both = [subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) for _ in range(2)]
     assert [one.communicate()[1] for one in both] == ["", ""]
     assert doubled(opened(file)) == [0, 2, 4]

@@ -33,8 +33,7 @@ def rows(quick: bool) -> list[Row]:
     size, address, clock = QUICK_SIZE if quick else SIZE, f"s3://{BUCKET}/field", Clock()
     with tempfile.TemporaryDirectory(prefix="bucket-") as name, cluster(Path(name)) as (scheduler, workers):
         given = ("--size", size, "--out", address, "--scheduler", scheduler, "--no-accuracy")
-        peaks = survey(workers, *given)
-        kept = sum(open_archive(address).sizes(["stages", "runs"]).values())
+        peaks, kept = survey(workers, *given), sum(open_archive(address).sizes(["stages", "runs"]).values())
     memory, small = ", ".join(f"{peak / 2**30:.1f}" for peak in peaks), max(peaks) <= MOST_GIB * 2**30
     how = f"farm of {size} px, {WORKERS} workers: survey, workers"
     return [

@@ -31,8 +31,7 @@ PRODUCTS = ("raw_coarse", "raw_fine", "mosaic", "class_map")
 
 def rows(quick: bool) -> list[Row]:
     """Both surveys, and whether they are equal."""
-    clock = Clock()
-    scene = ["--scene", "farm", "--size", QUICK_SIZE if quick else SIZE, "--seed", "7"]
+    clock, scene = Clock(), ["--scene", "farm", "--size", QUICK_SIZE if quick else SIZE, "--seed", "7"]
     scene += ["--bands", QUICK_BANDS] if quick else []
     with tempfile.TemporaryDirectory(prefix="survey-rig-") as name:
         folder = Path(name)

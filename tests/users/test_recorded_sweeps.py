@@ -197,8 +197,7 @@ def test_a_scan_as_taken_is_compared_with_all_of_its_lines(tmp_path: Path, full_
 
 def test_lines_of_a_run_have_the_date_of_its_visit(full_scan: FullScan) -> None:
     """So exports, histories and prior maps date them by their capture; a visit that is asked for comes first."""
-    sweeps = str(full_scan[1].folder)
-    captured = datetime.fromisoformat(full_scan[1].receipt["started"])
+    sweeps, captured = str(full_scan[1].folder), datetime.fromisoformat(full_scan[1].receipt["started"])
     visit = load_settings(None, {"sweeps": sweeps}).visit
     assert datetime.fromisoformat(visit) == captured
     assert load_settings(None, {"sweeps": sweeps, "visit": "mine"}).visit == "mine"

@@ -74,7 +74,7 @@ REFUSED = {
     "seconds below the fastest first pass": (
         2,
         "--scene farm --size 160x128 --weights farm --zoom always --seconds 1",
-        r"--seconds 1 is below .* first pass of every 8th line, 1\.92 s of the full scan's 15\.15 s; give more, or take",
+        r"--seconds 1 is below .* first pass of every 8th line, 1\.92 s of the full scan's 15\.15 s; give more",
     ),
     "farm beyond memory": (2, "--scene farm --size 60000x60000", "takes about .* GB of memory, this machine has"),
     "memory for no process": (

@@ -70,8 +70,7 @@ def test_frames_trained_on_are_left_out(data: Path, tmp_path: Path):
     """Weights that a training made are judged on what it held out or kept for validation."""
     settings, out = TrainingSettings(steps=1, batch=1, crop=16), tmp_path / "w.safetensors"
     train_weights(TrainRequest(str(data), out, ("003",), 1, patch=8, width=4, settings=settings))
-    split = load_weights(out).record["split"]
-    content = evaluate_weights(EvaluateRequest(str(data), (out,), **QUICK))
+    split, content = load_weights(out).record["split"], evaluate_weights(EvaluateRequest(str(data), (out,), **QUICK))
     assert content["weights"][0]["left_out"] == sorted(split["train"])
     assert content["frames"] == sorted({"003", *split["validation"]})
     assert content["left_out"] == sorted(split["train"])
@@ -226,8 +225,7 @@ def test_weights_without_a_common_frame_are_one_seed() -> None:
     row, less = collect_row([joined], "none", 0.0), collect_row([joined, part], "none", 0.0)
     assert less.counts.shape == (2, 3, 2, 2)
     assert not less.counts[1, 2].any()
-    found = difference(row, less, TRIAL)
-    wanted = row.over_runs(mean_iou).mean() - less.over_runs(mean_iou).mean()
+    found, wanted = difference(row, less, TRIAL), row.over_runs(mean_iou).mean() - less.over_runs(mean_iou).mean()
     assert (found["difference"], found["frames"]) == (pytest.approx(wanted), 3)
 
 

@@ -24,7 +24,9 @@ from flows.tasks import extent_choice
 from flows.tasks.drawing import Drawing
 from flows.tasks.extent_choice import ExtentGains
 from flows.tasks.patch_budget import SHARD
-from models.network.sizes import TemporalSizes
+from flows.tasks.prior_maps import TURNED
+from flows.tasks.run import SurveyRun
+from models.network.sizes import MultiplyAdds, TemporalSizes
 from models.network.temporal_reader import TemporalReader
 from models.reading.expected_errors import PatchExpectedErrors
 from models.reading.prior_map import ClassProbabilities, PriorMap, carried
@@ -283,3 +285,14 @@ def test_what_cannot_be_looked_at_is_refused_in_a_sentence(
     with pytest.raises(error, match=told):
         survey_png(visits[0], **{**PART, "visit": LAST, "weights": str(recorded), **flags})
     assert sorted(visits[0].rglob("*")) == before
+
+
+def test_the_reader_counts_for_the_choice_of_lines_and_for_the_map() -> None:
+    """It reads the whole prior map for either; a prior map that is turned is not read for the map."""
+    reader, read = SimpleNamespace(sizes=TemporalSizes(2, 4)), MultiplyAdds(5, 0, 7)
+    run: Any = SimpleNamespace(costs=SimpleNamespace(of_map=lambda index: read), least_gain=None, chooses=False)
+    run.prior, run.reader, run.grid = "there", reader, SceneGrid(96, 64, 4)
+    each = reader.sizes.multiply_adds(96 * 64)
+    for extent, aside, times in ((None, None, 1), ("chosen", None, 2), ("chosen", TURNED, 1), (None, TURNED, 0)):
+        run.extent = extent
+        assert SurveyRun.work_done(run, np.arange(3), {"put_aside": aside}).detail == 7 + times * each

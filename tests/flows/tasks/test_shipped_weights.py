@@ -38,8 +38,7 @@ def weights() -> Weights:
 def placements(weights: Weights) -> Placements:
     """Placements judged on a farm that training has not seen, through the exact rays of the simulated rig."""
     camera, scene = LineCamera(), farm_scene(41, SHAPE)
-    grid = SceneGrid(*SHAPE, weights.config.patch)
-    source = SimulatedSource(scene, Rig(camera), 41)
+    grid, source = SceneGrid(*SHAPE, weights.config.patch), SimulatedSource(scene, Rig(camera), 41)
     sweeps = [SimulatedSweep(source, sweep) for sweep in full_sweeps(grid, camera, "x")]
     seen = coarse_of_sweeps(sweeps, camera, source.wavelength_nm, grid, weights)
     twice = ReadTwice.of(weights, seen, np.asarray(scene.labels))

@@ -39,8 +39,7 @@ def some_ood(seed: int = 0, components: int = 3, **changed: Any) -> OodDetector:
 
 def spectra_of(ood_detector: OodDetector, count: int, seed: int = 1, light: float = 1.0) -> np.ndarray:
     """Spectra drawn from the components, in their order, with the noise of the light."""
-    rng = np.random.default_rng(seed)
-    noise = ood_detector.shot / light + ood_detector.read / light**2
+    rng, noise = np.random.default_rng(seed), ood_detector.shot / light + ood_detector.read / light**2
     drawn = [
         rng.multivariate_normal(m, c + n, count)
         for m, c, n in zip(ood_detector.centres, ood_detector.covariance, noise, strict=True)
@@ -81,8 +80,7 @@ def test_fewer_bands_are_read_as_noisier_ones() -> None:
 
 def test_a_pixel_without_columns_is_not_unknown() -> None:
     """It was not captured, which is another thing; what was, however far away, is."""
-    ood_detector = some_ood()
-    pixels = np.array([[np.nan] * COLUMNS, [np.inf] * COLUMNS, [1e6] * COLUMNS])
+    ood_detector, pixels = some_ood(), np.array([[np.nan] * COLUMNS, [np.inf] * COLUMNS, [1e6] * COLUMNS])
     told = ood_detector.unknown(pixels, rate=0.005, capture=LineSpec(binned=4), bands=10)
     assert told.tolist() == [False, False, True]
     assert ood_detector.unknown(pixels[:0], rate=0.005, capture=LineSpec(), bands=10).shape == (0,)

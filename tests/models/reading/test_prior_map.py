@@ -123,8 +123,7 @@ def test_the_reader_has_its_say_as_the_day_goes_by(seed: int, days: float) -> No
     """Each pixel that nobody looked at lies as far between its memory and what a whole day would have made of it."""
     rng = np.random.default_rng(seed)
     reader, memory = a_reader(seed), a_prior_map(rng, days=days)
-    before = np.exp(memory.probabilities.log_probability)
-    after = np.exp(carried(memory, reader).log_probability)
+    before, after = np.exp(memory.probabilities.log_probability), np.exp(carried(memory, reader).log_probability)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(prior_map, "SETTLED_DAYS", 1e-9)
         whole = np.exp(carried(replace(memory, days=max(days, 1e-9)), reader).log_probability)
@@ -195,8 +194,7 @@ def test_coarse_looks_that_cannot_be_compared_change_nothing() -> None:
     rng = np.random.default_rng(9)
     memory, coarse_pass, reader = a_prior_map(rng), an_observation(rng), a_reader(5)
     other = replace(coarse_pass, coarse=rng.normal(size=coarse_pass.coarse.shape).astype(np.float32))
-    blind = replace(memory, coarse=None)
-    nothing = replace(memory, coarse=np.full_like(coarse_pass.coarse, np.nan))
+    blind, nothing = replace(memory, coarse=None), replace(memory, coarse=np.full_like(coarse_pass.coarse, np.nan))
     found = [fuse(one, seen, reader).log_probability for one in (blind, nothing) for seen in (coarse_pass, other)]
     for one in found[1:]:
         np.testing.assert_array_equal(one, found[0])

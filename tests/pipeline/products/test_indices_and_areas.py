@@ -84,8 +84,7 @@ HECTARES_A_PIXEL = 0.09
 def test_the_stratified_estimate_is_that_of_its_paper() -> None:
     """Deforestation: 21158 ha with a 95 % interval of 6158 ha, as printed there."""
     fractions, errors = stratified_fractions(MAPPED, EXAMPLE.T)
-    hectares = fractions * 1e7 * HECTARES_A_PIXEL
-    intervals = 1.96 * errors * 1e7 * HECTARES_A_PIXEL
+    hectares, intervals = fractions * 1e7 * HECTARES_A_PIXEL, 1.96 * errors * 1e7 * HECTARES_A_PIXEL
     assert hectares[0] == pytest.approx(21_158, abs=1)
     assert intervals[0] == pytest.approx(6_158, abs=2)
     assert hectares.sum() == pytest.approx(900_000)

@@ -129,8 +129,7 @@ def test_scores_are_stored_in_steps(step: float) -> None:
     """What comes back lies as near to the raw values as the noise, and rounding by a step, allow; nothing is rare."""
     lines = made_lines()
     stored, done = condense(lines, step)
-    off = (stored.restored(done) - values_of(lines)) / stored.components.noise
-    count = len(stored.components)
+    off, count = (stored.restored(done) - values_of(lines)) / stored.components.noise, len(stored.components)
     assert np.mean(off**2) == pytest.approx((BANDS - count * (1 - step**2 / 12)) / BANDS, rel=0.05)
     assert (len(done.rare), done.known) == (0, 150 * 40)
     assert differing_lines(lines, stored, CAMERA) == []

@@ -148,8 +148,7 @@ PLAIN = {ROTATION: "rays", SMEAR: "positions", SLIT: "3x1"}
 def grainy(bands: int = 5, seed: int = 0) -> RasterScene:
     """A raster of 3 components, different at every pixel, mixed to ``bands``."""
     rng = np.random.default_rng(seed)
-    planes = rng.uniform(0, 1, (90, 110, 3)).astype(np.float32)
-    wavelength = np.linspace(400, 1000, bands)
+    planes, wavelength = rng.uniform(0, 1, (90, 110, 3)).astype(np.float32), np.linspace(400, 1000, bands)
     electrons = rng.uniform(1e3, 9e3, (3, bands)).astype(np.float32)
     return made_scene(planes, electrons, wavelength)
 
@@ -264,8 +263,7 @@ def test_undeflected_sweep_is_the_operator_on_the_grid(step: int) -> None:
     for _ in range(12):  # waves of 6 to 60 px
         fy, fx = rng.normal(size=2) / rng.uniform(6, 60)
         values += 0.03 * np.cos(2 * np.pi * (fy * y + fx * x) + rng.uniform(0, 6))[..., None]
-    scene = image_scene(values, CAMERA, [400.0])
-    sweep = replace(SWEEP, lines=40 // step, step=step)
+    scene, sweep = image_scene(values, CAMERA, [400.0]), replace(SWEEP, lines=40 // step, step=step)
     lines = expected_light(scene, sweep_block(scene, Rig(CAMERA), sweep, range(sweep.lines)), OPTICS)
     exact = replace(CAMERA, electrons_per_dn=1.0, bits=16)  # four of its samples still fit uint16
     viewed = expose(footprint(values.astype(np.float32) * scene.electrons, exact), exact, step=step, rng=None)

@@ -84,8 +84,7 @@ def shifted(header: Path, offset: int) -> None:
 @pytest.mark.parametrize("code", CODES)
 def test_what_is_written_is_read(tmp_path: Path, code: int) -> None:
     """Every type: SPy and this project read the numbers and bands again."""
-    values = numbers(code)
-    file = EnviFile(SHAPE, DATA_TYPES[code], np.array(NM), np.array(WIDTHS), "two {x}")
+    values, file = numbers(code), EnviFile(SHAPE, DATA_TYPES[code], np.array(NM), np.array(WIDTHS), "two {x}")
     data = write_envi(tmp_path / "a.hdr", file, in_blocks(values))
     assert data == tmp_path / "a.img"
     np.testing.assert_array_equal(as_spy_reads(tmp_path / "a.hdr"), values)
@@ -131,8 +130,7 @@ def test_a_large_cube_is_written_in_little_memory(tmp_path: Path) -> None:
     block = np.ones((64, *shape[1:]), np.uint16)
     blocks = ((first, block[: min(64, shape[0] - first)]) for first in range(0, shape[0], 64))
     tracemalloc.start()
-    data = write_envi(tmp_path / "a.hdr", EnviFile(shape, "u2"), blocks)
-    peak = tracemalloc.get_traced_memory()[1]
+    data, peak = write_envi(tmp_path / "a.hdr", EnviFile(shape, "u2"), blocks), tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert data.stat().st_size == 2 * int(np.prod(shape))
     assert peak < 3 * block.nbytes

@@ -31,7 +31,7 @@ from pipeline.simulator.scenes.farm.land import (
     sun_over_farm,
     visible_area,
 )
-from pipeline.simulator.scenes.farm.spectra import MATERIALS, wet_fraction
+from pipeline.simulator.scenes.farm.spectra import MATERIALS, MOISTURE_EXPONENT
 from pipeline.simulator.scenes.scratch import scratch
 
 _COLOURS = {
@@ -139,7 +139,9 @@ class Painting:
 
 def moist_soil(plan: FarmPlan, here: Ground, wetter: float = 0.0) -> Mixture:
     """Return bare soil with its water; clods throw longer shadows under a lower sun, up to a third of the pixel."""
-    wet = wet_fraction(np.clip(plan.moisture + wetter + 0.035 * here.moisture + 0.008 * here.tuft, 0.02, 0.45))
+    # by volume in the topsoil; the exponential law of [3] in `spectra` has one exponent for all bands
+    moisture = np.clip(plan.moisture + wetter + 0.035 * here.moisture + 0.008 * here.tuft, 0.02, 0.45)
+    wet = np.asarray(1 - np.exp(-MOISTURE_EXPONENT * moisture), np.float32)
     low = min(float(np.hypot(*plan.sun.cast)), 3.0)
     shade = np.asarray(np.clip(low * (0.07 + 0.04 * here.grain + 0.01 * here.tuft), 0, 0.33), np.float32)
     return {"soil_dry": (1 - wet) * (1 - shade), "soil_wet": wet * (1 - shade), "shade": shade}

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from pipeline.errors import WavelengthError
 from pipeline.geometry.camera import LineCamera
@@ -146,14 +146,6 @@ def spectral_library(bands: int, materials: tuple[str, ...] = MATERIALS) -> Spec
     for part in parts:
         part.setflags(write=False)
     return SpectralLibrary(*parts)
-
-
-def wet_fraction(moisture: ArrayLike) -> NDArray[np.float32]:
-    """Return the fraction of the wet soil's spectrum by water in the topsoil (by volume), from 0 to below 1.
-
-    The exponential law of [3] with one exponent for all bands, so that bare soil lies on one line.
-    """
-    return np.asarray(1 - np.exp(-MOISTURE_EXPONENT * np.maximum(moisture, 0)), np.float32)
 
 
 def band_response(wavelength_nm: Spectrum, fwhm_nm: Spectrum) -> NDArray[np.float64]:

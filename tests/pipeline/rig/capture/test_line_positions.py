@@ -134,8 +134,7 @@ def test_commands_count_from_the_logs_own_start() -> None:
 
 def test_by_trigger() -> None:
     """One position a frame number; frames without one, and those beyond the path, are not valid."""
-    path = sweep(np.arange(8) / 10)
-    told = replace(frames(6), number=np.array([0, 1, -1, 3, 6, 99]))
+    path, told = sweep(np.arange(8) / 10), replace(frames(6), number=np.array([0, 1, -1, 3, 6, 99]))
     found = lines_by_trigger(told, path, counted=True)
     np.testing.assert_array_equal(found.position[found.valid], path[[0, 1, 3, 6]])
     assert found.valid.tolist() == [True, True, False, True, True, False]

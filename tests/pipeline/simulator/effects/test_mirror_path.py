@@ -84,8 +84,7 @@ def test_settling_takes_the_way_back_away():
 @given(st.floats(0.01, 10.0), st.floats(0.5, 1000.0), st.floats(0.1, 500.0), st.floats(0.0, 1.0), st.integers(1, 5))
 def test_any_mirror_is_finite_and_within_its_bound(damping: float, ms: float, hz: float, settled: float, step: int):
     """Stiff or slack, no NaN; and the change of a wave stays below the bound."""
-    of_mirror = rig(ms, damping=damping, natural_hz=hz, settled_s=settled)
-    sweep = replace(SWEEP, lines=30, step=step)
+    of_mirror, sweep = rig(ms, damping=damping, natural_hz=hz, settled_s=settled), replace(SWEEP, lines=30, step=step)
     numbers, places = np.arange(30), np.linspace(0, 2 * np.pi, 25)[:, None]
     shift, held = transient(of_mirror, sweep, numbers), np.arange(step)
     assert np.isfinite(shift).all()
@@ -97,8 +96,7 @@ def test_any_mirror_is_finite_and_within_its_bound(damping: float, ms: float, hz
 @given(st.floats(0.05, 40.0), st.integers(1, 5), st.integers(1, 4))
 def test_parts_are_means_of_the_held_positions(positions: float, step: int, parts: int):
     """Each part has the mean of what the mirror holds in it, taken here at many moments."""
-    found = beside_plan(positions, step, np.arange(7), parts)
-    moment = (np.arange(4000) + 0.5) / 4000
+    found, moment = beside_plan(positions, step, np.arange(7), parts), (np.arange(4000) + 0.5) / 4000
     for line in (0, 6):
         time = line * step + (np.arange(step * parts)[:, None] + moment) / parts
         held = np.floor(positions * time) / positions + 0.5 / positions - 0.5

@@ -51,8 +51,7 @@ def test_bare_aluminium_by_fresnel():
 def test_incidence_is_that_of_the_mirror():
     """The factor follows the angle whose cosine is -n_z, at any place of the field."""
     block = SweepBlock(RIG, sweep_at(-2300, 1700, 50), range(50), NM, (640, 640))
-    incidence = np.arccos(-block.normals[:, 2])
-    at_rest = reflectance("aluminium", NM, np.radians([45.0]))
+    incidence, at_rest = np.arccos(-block.normals[:, 2]), reflectance("aluminium", NM, np.radians([45.0]))
     np.testing.assert_allclose(factors(block.sweep), reflectance("aluminium", NM, incidence) / at_rest, rtol=1e-6)
 
 

@@ -29,8 +29,7 @@ _COSTS = st.sampled_from((0.0, 0.3, 1.0, 7.7, 24.7)) | st.floats(0, 30)
 @st.composite
 def made_up(draw: st.DrawFn, most: int = 6) -> list[MadeUp]:
     """Some effects, quantisation perhaps among them, with up to three variants each."""
-    names = draw(st.lists(st.sampled_from([*"abcdefgh", "quantisation"]), unique=True, max_size=most))
-    effects = []
+    names, effects = draw(st.lists(st.sampled_from([*"abcdefgh", "quantisation"]), unique=True, max_size=most)), []
     for name in names:
         cheap = [(f"v{i}", draw(_BOUNDS), draw(_COSTS)) for i in range(draw(st.integers(0, 2)))]
         effects.append(MadeUp(name, draw(_BOUNDS), (("exact", 0.0, draw(_COSTS)), *cheap)))
@@ -169,8 +168,7 @@ def test_of_several_binnings_the_worst_counts():
 
 def test_a_gain_that_only_darkens_does_not_multiply_errors():
     """A shadow states its own range; what it takes, left out, counts by the smaller noise of the shadow."""
-    rig = Rig(sky=Sky(cloud_fraction=0.5))
-    slope = even_probe(slope=np.ones((2, 1)), brightest_e=1e4, darkest_e=1e4)
+    rig, slope = Rig(sky=Sky(cloud_fraction=0.5)), even_probe(slope=np.ones((2, 1)), brightest_e=1e4, darkest_e=1e4)
     shift, cloud = (menu.off.error for menu in list_options(slope, rig, [Shift("shift", 0.1), CLOUD]))
     assert shift == pytest.approx(0.1 * SAFETY)
     assert cloud == pytest.approx(0.5 * SAFETY * math.sqrt((1e4 + 402.083) / (5e3 + 402.083)), rel=1e-6)
