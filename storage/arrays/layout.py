@@ -260,12 +260,12 @@ def opened_once(open_store: Opener) -> Opener:
     kept = lru_cache(16)(lambda path, *stamp: open_store(path))
 
     @wraps(open_store)
-    def open_or_recall(path: StorePlace) -> Any:
+    def open_if_changed(path: StorePlace) -> Any:
         if not isinstance(path, Path) or not (file := path / "zarr.json").is_file():
             return open_store(path)
         return kept(path, file.stat().st_ino, file.stat().st_mtime_ns)
 
-    return cast(Opener, open_or_recall)
+    return cast(Opener, open_if_changed)
 
 
 def array_of(group: zarr.Group, name: str) -> zarr.Array[Any]:
