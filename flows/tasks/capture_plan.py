@@ -122,8 +122,8 @@ class PassLayout:
                 limit = f"--seconds {seconds:g}" if budget is None else f"a --budget of {budget:g}, {limit_s:.2f} s,"
                 fixed = self.cost.seconds([replace(one, lines=0) for one in coarse], self.camera)
                 ways = ["give more"] if budget is None or coarse_s <= full_s else []
-                own = budget is not None or self.coarse_exposure_ms is None  # else it is the shortest, for --seconds
-                ways += ["give a shorter --coarse-exposure-ms"] * (own and self.recorded is None and fixed < limit_s)
+                longer = budget is not None or self.coarse_exposure_ms is None  # than the shortest, for --seconds
+                ways += ["give a shorter --coarse-exposure-ms"] * (longer and self.recorded is None and fixed < limit_s)
                 left_out = "--zoom never" if budget is None else "without --budget, --policy and --coarse-exposure-ms"
                 raise BudgetError(
                     f"{limit} is below the time of the first pass of every {self.first_step}th line, "

@@ -22,8 +22,7 @@ Floats = NDArray[np.float32]
 
 DARK_FRACTION = 0.01  # of white: pixels with a darker mean of bands have no index
 NARROW_NM = 10.0  # largest distance of a band from the wavelength of a narrow one
-# A cube is reflectance if one value in a hundred is above a number from the first of these to the second.
-LEAST_REFLECTANCE, MOST_REFLECTANCE = 0.02, 1.5
+LEAST_REFLECTANCE, MOST_REFLECTANCE = 0.02, 1.5  # of a cube of reflectance the 99th percentile lies between these
 LAMBDA = "lambda"  # prefix of a band's wavelength in a formula
 CONSTANTS = {"SAVI": {"L": 0.5}}  # instead of a default that belongs to another index
 PAPERS_NM = {  # centres of the papers instead of a satellite's

@@ -165,10 +165,12 @@ class Archive:
                 if not done:
                     consolidate_stores(part)
                     write_manifest(part, facts)
-                    # a store whose files were cleared away is still there
-                    (take_its_place if final.exists() else rename_into_place)(part, final)
+                    self._put_in_place(part, final)
             finally:
                 remove_tree(part)
+
+    def _put_in_place(self, part: Path, final: Path) -> None:
+        (take_its_place if final.exists() else rename_into_place)(part, final)  # there where its files were cleared
 
     def produce(
         self,
