@@ -366,6 +366,7 @@ _FORMATS: Mapping[str, Callable[[Any], str]] = {
         "from the others; where fewer than half are left, the spectrum is unknown. A shorter exposure avoids saturation"
     ),
     "px_no_reading": lambda px: f"{format_count(px)} px with values out of the range of the weights",
+    "map_without_a_class": lambda px: f"{format_count(px)} px without a class",
     "too_narrow": lambda value: f"{counted(len(value), 'overlap')} too narrow to compare",
 }
 _VALUES: Mapping[str, Callable[[Any], str]] = {

@@ -192,8 +192,7 @@ def _days_since(run: Run, visit: str | None, moment: tuple[int, float] | None) -
     The dates of both visits count, with their times if both have one. Else day and hour of a built-in scene count, else
     whole days of the clock.
     """
-    named = run.settings.get("visit"), visit
-    then, now = map(moment_of, named)
+    then, now = map(moment_of, named := (run.settings.get("visit"), visit))
     if then is not None and now is not None:
         if not all(_WITH_TIME.match(str(one)) for one in named):
             return float((now.date() - then.date()).days)
