@@ -14,7 +14,7 @@ from flows.tasks.capture_plan import PassLayout
 from flows.tasks.prior_maps import Prior
 from flows.terminal.figures import format_percent
 from models.reading.expected_errors import Floats, PatchExpectedErrors
-from models.reading.prior_map import COME_TRUE, HALO, ClassProbabilities, PriorMap, carried, in_classes
+from models.reading.prior_map import COME_TRUE, EVERY_PX, HALO, ClassProbabilities, PriorMap, carried, in_classes
 from models.weights.files import Description, load_reader
 from pipeline.errors import BudgetError, NothingToMend, SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid, cuts
@@ -174,13 +174,17 @@ def _best_extent(layout: PassLayout, extent_gains: ExtentGains, seconds: float) 
 def _swaths(
     prior: Prior, grid: SceneGrid, weights: Description, path: Path
 ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-    """Yield class probabilities of the prior map at the time of the visit, and their ages, in blocks of rows."""
+    """Yield class probabilities of the prior map at the time of the visit, and their ages, in blocks of rows.
+
+    Probabilities are those of the nearest pixel among every second row and column.
+    """
     store, high = ProbabilityStore(prior.probabilities.path / "class_probabilities.zarr"), SWATH_PATCHES * grid.patch
     read = None if weights.reader is None else load_reader(path)
+    across = np.arange(grid.width) // EVERY_PX
     for rows in cuts(grid.height, high):
-        first, last = max(rows.start - HALO, 0), min(rows.stop + HALO, grid.height)
+        first, last = max(rows.start - EVERY_PX * HALO, 0), min(rows.stop + EVERY_PX * HALO, grid.height)
         probabilities, age, light = store.read(slice(first, last))
-        before = ClassProbabilities(in_classes(probabilities, prior.classes), age, light)
-        today = carried(PriorMap(before, None, prior.days, prior.day_of_year), read)
-        own = slice(rows.start - first, rows.stop - first)
-        yield today.log_probability[own], today.age_days[own]
+        sampled = (part[::EVERY_PX, ::EVERY_PX] for part in (in_classes(probabilities, prior.classes), age, light))
+        today = carried(PriorMap(ClassProbabilities(*sampled), None, prior.days, prior.day_of_year), read)
+        own = np.arange(rows.start, rows.stop) - first
+        yield today.log_probability[own[:, None] // EVERY_PX, across], age[own] + np.float32(prior.days)

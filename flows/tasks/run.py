@@ -46,6 +46,7 @@ from models.evaluation.placement import CascadeTable
 from models.network.machine import PROCESSOR, choose_device
 from models.network.sizes import MultiplyAdds
 from models.network.spectral import LineSpec
+from models.reading.prior_map import EVERY_PX
 from models.reading.regions import plan_regions
 from models.weights.checksummed_files import SEAL
 from models.weights.files import CASCADE, Description, OodPart, ReaderPart, Weights
@@ -326,9 +327,10 @@ class SurveyRun(CaptureRun):
             done = MultiplyAdds(done.overview + every.overview, done.score * (2 if scored else 1), done.detail + before)
         if self.prior is None or self.reader is None:
             return done
-        times = (self.extent is not None) + (aside != TURNED)  # to choose the lines of a partial scan, and for the map
-        each = self.reader.sizes.multiply_adds(self.grid.height * self.grid.width)
-        return replace(done, detail=done.detail + times * each)
+        pixels = (aside != TURNED) * self.grid.height * self.grid.width
+        if self.extent is not None:  # its lines were chosen by the prior map
+            pixels += -(-self.grid.height // EVERY_PX) * -(-self.grid.width // EVERY_PX)
+        return replace(done, detail=done.detail + self.reader.sizes.multiply_adds(pixels))
 
     def reading_figures(
         self, patch_index: NDArray[np.integer], prior: Mapping[str, Any] | None = None

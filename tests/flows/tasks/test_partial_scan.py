@@ -208,20 +208,23 @@ def test_lines_that_cover_a_field_capture_its_border(recorded: Path) -> None:
 def test_a_prior_map_of_today_does_not_depend_on_the_rows_read_at_once(
     visits: tuple[Path, Any, Any], recorded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The reader sees around a pixel, so that rows are read with their neighbours."""
+    """Every second pixel is read, with the neighbours that the reader sees; each age is a pixel's own."""
     reader = TemporalReader(TemporalSizes(2, 4, width=8, coarse_width=4)).eval()
     torch.nn.init.normal_(reader.leave.weight, std=0.3)
     monkeypatch.setattr(extent_choice, "load_reader", lambda path: reader)
-    probabilities = np.log(np.random.default_rng(1).dirichlet(np.ones(2), (96, 64))).astype(np.float32)
-    images = probabilities, np.full((96, 64), 2, np.float32), np.ones((96, 64), np.float32)
+    rng = np.random.default_rng(1)
+    probabilities = np.log(rng.dirichlet(np.ones(2), (95, 63))).astype(np.float32)
+    images = probabilities, rng.uniform(1, 9, (95, 63)).astype(np.float32), np.ones((95, 63), np.float32)
     store: Any = SimpleNamespace(read=lambda rows: tuple(image[rows] for image in images))
     monkeypatch.setattr(extent_choice, "ProbabilityStore", lambda path: store)
     prior: Any = SimpleNamespace(probabilities=SimpleNamespace(path=Path()), classes=(0, 1), days=5.0, day_of_year=None)
     weights: Any = SimpleNamespace(reader="there")
-    parts = [part for part, _ in extent_choice._swaths(prior, SceneGrid(96, 64, 4), weights, recorded)]
+    parts, ages = zip(*extent_choice._swaths(prior, SceneGrid(95, 63, 4), weights, recorded), strict=True)
     assert len(parts) > 1
-    whole = carried(PriorMap(ClassProbabilities(*images), None, 5.0), reader).log_probability
-    np.testing.assert_allclose(np.concatenate(parts), whole, atol=1e-5)
+    assert np.array_equal(np.concatenate(ages), images[1] + 5)
+    every = ClassProbabilities(*(image[::2, ::2] for image in images))
+    whole = carried(PriorMap(every, None, 5.0), reader).log_probability.repeat(2, axis=0).repeat(2, axis=1)
+    np.testing.assert_allclose(np.concatenate(parts), whole[:95, :63], atol=1e-5)
 
 
 def test_nothing_is_worth_more_than_what_is_due() -> None:
@@ -288,11 +291,17 @@ def test_what_cannot_be_looked_at_is_refused_in_a_sentence(
 
 
 def test_the_reader_counts_for_the_choice_of_lines_and_for_the_map() -> None:
-    """It reads the whole prior map for either; a prior map that is turned is not read for the map."""
+    """A quarter of the prior map chooses the lines; a prior map that is turned is not read for the map."""
     reader, read = SimpleNamespace(sizes=TemporalSizes(2, 4)), MultiplyAdds(5, 0, 7)
     run: Any = SimpleNamespace(costs=SimpleNamespace(of_map=lambda index: read), least_gain=None, chooses=False)
-    run.prior, run.reader, run.grid = "there", reader, SceneGrid(96, 64, 4)
-    each = reader.sizes.multiply_adds(96 * 64)
-    for extent, aside, times in ((None, None, 1), ("chosen", None, 2), ("chosen", TURNED, 1), (None, TURNED, 0)):
+    run.prior, run.reader, run.grid = "there", reader, SceneGrid(95, 63, 4)
+    map_px, choice_px = 95 * 63, 48 * 32
+    for extent, aside, pixels in (
+        (None, None, map_px),
+        ("chosen", None, map_px + choice_px),
+        ("chosen", TURNED, choice_px),
+        (None, TURNED, 0),
+    ):
         run.extent = extent
-        assert SurveyRun.work_done(run, np.arange(3), {"put_aside": aside}).detail == 7 + times * each
+        done = SurveyRun.work_done(run, np.arange(3), {"put_aside": aside}).detail
+        assert done == 7 + reader.sizes.multiply_adds(pixels)
