@@ -132,8 +132,10 @@ def serve(choices: Path) -> None:
         *("flows.cli.main", "flows.publish.run_folder", "flows.publish.survey_command", "flows.survey"),
         *("flows.cli.survey_verbs", "flows.archive.commands", "matplotlib.backends.backend_agg"),
         *("models.network.segmenter", "rich.status", "safetensors.torch", "scipy.optimize", "tests.faults.injection"),
+        *("pipeline.signal.compiled_loops", "pipeline.simulator.compiled_loops", "rasterio", "skimage.color"),
     ):
         importlib.import_module(name)
+    importlib.import_module("PIL.Image").init()  # reads its formats
     importlib.import_module("tests.prior_work").remember(choices)
     gc.freeze()  # else each child looks through all of it for what may go, and copies it from its parent by that
     for line in sys.stdin:

@@ -156,32 +156,6 @@ def test_a_shared_server_keeps_the_fields_of_others(north: Any) -> None:
     assert reprocessing("/data/a b", shared=True).name == "data-a-b"
 
 
-def test_a_rig_is_free_again_when_the_server_of_its_survey_was_killed(tmp_path: Path) -> None:
-    """Its lease outlives the server, and the next server takes it back when it has run out."""
-    port, leases = free_port(), tmp_path / "concurrency_leases"
-
-    def asked() -> Any:
-        password = tuple((tmp_path / "password").read_text().strip().split(":", 1))
-        return httpx.Client(base_url=f"http://127.0.0.1:{port}/api/v2/concurrency_limits", auth=password)
-
-    with server_process(tmp_path, port), asked() as client:
-        client.post("/", json={"name": RIG_LIMIT, "limit": 1}).raise_for_status()
-        wanted = {"names": [RIG_LIMIT], "slots": 1, "lease_duration": LEASE_S}
-        while (
-            taken := client.post("/increment-with-lease", json=wanted)
-        ).status_code == httpx.codes.SERVICE_UNAVAILABLE:
-            time.sleep(0.5)  # another service of the server holds the database
-        taken.raise_for_status()
-        assert client.get(f"/{RIG_LIMIT}").json()["active_slots"] == 1
-    for file in leases.glob("*.json"):  # a minute later
-        file.write_text(re.sub(r'"20\d\d-', '"2020-', file.read_text()))
-    with server_process(tmp_path, port), asked() as client:
-        end = time.monotonic() + PATIENCE_S
-        while client.get(f"/{RIG_LIMIT}").json()["active_slots"]:
-            assert time.monotonic() < end
-            time.sleep(0.5)
-
-
 def test_two_fields_that_are_due_at_once_take_turns_at_the_rig(tmp_path: Path) -> None:
     """By Prefect's limit the second waits; without it the rig's own lock refuses it."""
     from prefect import flow
@@ -332,10 +306,20 @@ def test_the_automation_tells_of_a_failed_run(north: Any, tmp_path: Path, schedu
     assert "no settings file" in found["why"]
 
 
+def take_rig(limits: httpx.Client) -> None:
+    """Take the one place at the rig, as a survey does."""
+    wanted = {"names": [RIG_LIMIT], "slots": 1, "lease_duration": LEASE_S}
+    while (taken := limits.post("/increment-with-lease", json=wanted)).status_code == httpx.codes.SERVICE_UNAVAILABLE:
+        time.sleep(0.5)  # another service of the server holds the database
+    taken.raise_for_status()
+    assert limits.get(f"/{RIG_LIMIT}").json()["active_slots"] == 1
+
+
 def test_a_serve_goes_on_when_its_killed_server_is_back(field_file: Callable[..., Path], tmp_path: Path) -> None:
     """A run after that ends well; SIGTERM then ends it with one sentence and pauses the schedule.
 
-    It is started as a shell starts what goes on in the background, which ignores SIGINT.
+    A lease of the rig outlives the server, and the next server takes it back when it has run out. The serve is started
+    as a shell starts what goes on in the background, which ignores SIGINT.
     """
     from prefect.deployments import run_deployment
     from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary_settings
@@ -348,21 +332,29 @@ def test_a_serve_goes_on_when_its_killed_server_is_back(field_file: Callable[...
         environment |= {"PREFECT_CLIENT_MAX_RETRIES": "0"}  # else it asks for minutes before it gives up
         words = ["sh", "-c", "trap '' INT; exec \"$@\"", "sh", sys.executable, "-m", "flows.cli.main"]
         words += ["serve", str(file), "--every", "365d"]
+        user, _, secret = password.partition(":")
         with (
             temporary_settings({PREFECT_API_URL: api, PREFECT_API_AUTH_STRING: password}),
+            httpx.Client(base_url=f"{api}/v2/concurrency_limits", auth=(user, secret)) as limits,
             (tmp_path / "said").open("w") as said,
             subprocess.Popen(words, cwd=ROOT, env=environment, stderr=said) as process,
         ):
             try:
                 wait_for("survey/north")
+                take_rig(limits)
                 server.kill()
                 server.wait()
+                for lease in (home / "concurrency_leases").glob("*.json"):  # a minute later
+                    lease.write_text(re.sub(r'"20\d\d-', '"2020-', lease.read_text()))
                 end = time.monotonic() + PATIENCE_S
                 while "does not answer" not in (tmp_path / "said").read_text() and time.monotonic() < end:
                     time.sleep(0.2)
                 with server_process(home, port):
                     run: Any = run_deployment("survey/north", timeout=PATIENCE_S, poll_interval=0.5)
                     assert run.state.is_completed()
+                    while limits.get(f"/{RIG_LIMIT}").json()["active_slots"]:
+                        assert time.monotonic() < end
+                        time.sleep(0.5)
                     process.terminate()
                     assert process.wait(PATIENCE_S) == 0
                     with client() as asked:
