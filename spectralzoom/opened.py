@@ -232,16 +232,8 @@ def open_labelled(path: Path) -> xarray.Dataset:
         opened = xarray.open_dataset(
             store, engine="zarr", consolidated=False, mask_and_scale=False, chunks=None, cache=False
         )
-        opened = _in_shards(opened)
+        for name, one in opened.data_vars.items():
+            blocks = one.encoding.get("shards") or one.encoding.get("chunks") or one.shape
+            opened = opened.assign({name: one.chunk(dict(zip(one.dims, blocks, strict=True)))})
     bare = {name: np.arange(size) for name, size in opened.sizes.items() if name not in opened.variables}  # as rgb
     return spectra.by_wavelength(spectra.with_plain_attributes(opened.assign_coords(bare)))
-
-
-def _in_shards(opened: xarray.Dataset) -> xarray.Dataset:
-    """Return the arrays as dask arrays with a block for each file; coordinates stay."""
-
-    def split(one: xarray.DataArray) -> xarray.DataArray:
-        blocks = one.encoding.get("shards") or one.encoding.get("chunks") or one.shape
-        return one.chunk(dict(zip(one.dims, blocks, strict=True)))
-
-    return opened.assign({name: split(one) for name, one in opened.data_vars.items()})

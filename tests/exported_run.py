@@ -1,4 +1,4 @@
-"""A run of an archive and what was exported of it, read as a stranger reads both."""
+"""A run of an archive and its exported files, read by independent libraries."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ POSE = RigPose(lon_deg=9.5, lat_deg=52.1, heading_deg=25.0, tilt_deg=50.0, heigh
 
 @dataclass(frozen=True)
 class Exported:
-    """The archive, the run's receipt, and folder and answer of its export."""
+    """The archive, the run's receipt, and the folder and answer of its export."""
 
     archive: Path
     receipt: Any
@@ -27,24 +27,24 @@ class Exported:
 
     @property
     def id(self) -> str:
-        """The run's name."""
+        """Return the run's name."""
         return str(self.answer["run"])
 
     def file(self, key: str) -> Path:
-        """One exported file."""
+        """Return the path of an exported file."""
         return self.out / str(self.answer["files"][key])
 
     def image(self, key: str) -> np.ndarray:
-        """The first band of an exported image."""
+        """Return the first band of an exported image."""
         with rasterio.open(self.file(key)) as file:
             found: np.ndarray = file.read(1)
             return found
 
     def store(self, product: str, **how: Any) -> xr.Dataset:
-        """A store of the archive."""
+        """Open a store of the archive."""
         return xr.open_zarr(self.archive / self.receipt["products"][product], consolidated=False, **how)
 
     def item(self) -> dict[str, Any]:
-        """The STAC item."""
+        """Return the STAC item."""
         found: dict[str, Any] = json.loads(Path(self.answer["item"]).read_text())
         return found

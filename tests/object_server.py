@@ -1,6 +1,6 @@
-"""An S3 server on loopback: moto's, in a thread of this process, with one bucket.
+"""Run an S3 server on loopback: moto, in a thread of this process, with one bucket.
 
-It is S3 alone: moto's server for all services looks for the right one at every request, which took half of its time.
+It serves S3 only: moto's server for all services selects a service at each request, which took half of its time.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _numbers = count()
 
 @pytest.fixture(scope="session")
 def s3_server() -> Iterator[str]:
-    """Endpoint of a server with an empty bucket; skips where moto or obstore is not installed."""
+    """Yield the endpoint of a server with an empty bucket; skip if moto or obstore is not installed."""
     pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
     moto = pytest.importorskip("moto.moto_server.werkzeug_app", reason="moto[s3,server] is not installed (extra dev)")
     import boto3
@@ -48,7 +48,7 @@ def s3_server() -> Iterator[str]:
 
 @pytest.fixture
 def bucket(s3_server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Address of an archive that is not there yet, reached by the environment; working copies below ``tmp_path``."""
+    """Return the address of a new archive in the bucket; set the environment for it, with copies below ``tmp_path``."""
     for name in ("AWS_SESSION_TOKEN", "AWS_PROFILE", "AWS_DEFAULT_REGION", "AWS_ENDPOINT_URL_S3"):
         monkeypatch.delenv(name, raising=False)
     for name, value in {**KEYS, "AWS_ENDPOINT_URL": s3_server}.items():
@@ -59,7 +59,7 @@ def bucket(s3_server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> s
 
 @pytest.fixture
 def machine(bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., ObjectArchive]:
-    """Open the bucket's archive as a machine, by its name, with a working copy of its own."""
+    """Return a function that opens the bucket's archive as a named machine with its own working copy."""
     from storage.remote.object_archive import open_object_archive
 
     def open_as(name: str, *, create: bool = True, write: bool = True) -> ObjectArchive:

@@ -1,9 +1,9 @@
-"""What takes most of a small survey's time and is the same for the same question, remembered.
+"""Remember the slow, repeatable parts of small surveys: the choice of effects and the drawing of pictures.
 
-Only what is pure is kept: the look at the scene that a choice of effects rests on, and the choice, which each process
-remembers by itself. Of pictures one of each kind is drawn and packed, and stands
-for all of that kind. Stores, receipt and run are made each time. Tests that ask nothing of effects have no scene
-looked at: `without_effects`.
+Only pure functions are kept: the probes of a scene that the choice of effects needs, and the choice, which each process
+remembers by itself. One picture of each kind is drawn and packed, and stands for all pictures of that kind. Stores,
+receipt and run are made each time. Tests that do not depend on effects skip the probes:
+`without_effects`.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ REMEMBERING: dict[str, tuple[ModuleType, Any]] = {}
 
 
 def remember(folder: Path, put: Callable[[object, str, Any], None] = setattr) -> None:
-    """Have surveys look each question up in a folder, which several processes may share, before they work it out."""
+    """Make surveys look up results in a folder, which processes may share, before they compute them."""
     folder.mkdir(parents=True, exist_ok=True)
 
     def known(question: object, work_out: Callable[[], Any]) -> Any:
@@ -71,7 +71,7 @@ def remember(folder: Path, put: Callable[[object, str, Any], None] = setattr) ->
 
 
 def _kind_of(panels: QuicklookData) -> object:
-    """What decides how a picture is drawn, but for the numbers that it shows."""
+    """Return the properties that decide how a picture is drawn, without the values that it shows."""
     there = panels.truth is None, panels.confidence is None, panels.class_colours is None
     holes = tuple(bool(np.isnan(shown).any()) for shown in (panels.rectified, panels.score))
     none = np.size(panels.patch_index) == 0
@@ -80,7 +80,7 @@ def _kind_of(panels: QuicklookData) -> object:
 
 @contextmanager
 def without_effects() -> Iterator[None]:
-    """Surveys look at no scene and simulate no effect but those that their settings name, in any of their variants."""
+    """Skip the probes of scenes; surveys simulate only effects that their settings name, in any of their variants."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(effect_choice, "probe_survey", lambda scene, rig, planned, unit, cost: _any_probes(unit))
         patch.setattr(
@@ -93,7 +93,7 @@ def without_effects() -> Iterator[None]:
 
 @contextmanager
 def with_effects() -> Iterator[None]:
-    """Surveys choose their effects as they do where nothing else is said."""
+    """Let surveys choose their effects automatically, as by default."""
     with pytest.MonkeyPatch.context() as patch:
         for name, (module, remembering) in REMEMBERING.items():
             patch.setattr(module, name, remembering)
@@ -102,7 +102,7 @@ def with_effects() -> Iterator[None]:
 
 @cache
 def _any_probes(unit: Any) -> Any:
-    """What a look at the smallest scene finds, for decisions that no test reads."""
+    """Return the probes of the smallest scene, for decisions that no test reads."""
     camera = LineCamera()
     scene = raster_from_values(np.full((32, 32, 3), 0.5), camera, name="t", wavelength_nm=np.linspace(460, 640, 3))
     sweeps = uniform_sweeps(SceneGrid(32, 32, 8), camera, "x", step=4)

@@ -1,4 +1,4 @@
-"""Receipts of an archive's runs, and what two runs of the same seed and settings must agree on in them."""
+"""Receipts of an archive's runs, and their parts that two runs of the same seed and settings have in common."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from typing import Any
 from flows.publish.receipt import Receipt, check_receipt
 from storage.archive.archive import Archive
 
-# what another run of the same seed has otherwise
+# differs between runs of the same seed
 OF_ONE_RUN = ("wall_s", "cpu_s", "peak_rss_bytes", "state", "manifest_sha256")
 
 
 def receipts(out: Path) -> list[Any]:
-    """What the runs of an archive say, oldest first."""
+    """Return the checked receipts of an archive's runs, oldest first."""
     return [check_receipt(json.loads((run / "receipt.json").read_text())) for run in Archive.open(out).runs()]
 
 
 def comparable(receipt: Receipt) -> dict[str, Any]:
-    """Return what two runs of the same seed and settings must agree on.
+    """Return the parts of a receipt that are equal in two runs of the same seed and settings.
 
-    Without times, memory, the archive's place, bytes of files that hold times, whether a stage was read or made, hashes
-    of manifests (which hold their times), and the addresses of the products (their names stay).
+    It leaves out times, memory, the archive's path, the states of stages, and bytes of files that contain times.
+    Hashes of manifests (which contain times) and addresses of products are left out too; product names stay.
     """
     same = _without(receipt, ("started", "finished", "judged"))
     same["settings"] = _without(receipt["settings"], ("out",))

@@ -1,4 +1,4 @@
-"""The benchmark runner: one table, goals missed are told, a crash is named and does not stop the others."""
+"""The benchmark runner: one table, a list of missed goals; a crash is named and does not stop other benchmarks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def rows():
 
 
 def run_copy(folder: Path, *arguments: str, crash: bool = False) -> subprocess.CompletedProcess[str]:
-    """Run the table on made-up benchmarks in a folder of their own."""
+    """Run the table on made-up benchmarks in a separate folder."""
     place = folder / "tests" / "benchmarks"
     place.mkdir(parents=True, exist_ok=True)
     for name in ("__main__.py", "measure.py"):
@@ -30,8 +30,8 @@ def run_copy(folder: Path, *arguments: str, crash: bool = False) -> subprocess.C
     return subprocess.run(command, capture_output=True, text=True, cwd=folder, check=False)
 
 
-def test_a_missed_goal_is_printed_and_is_no_failure(tmp_path: Path) -> None:
-    """All rows stand in the table, the missed one also below it; Markdown holds the same. Other names are refused."""
+def test_a_missed_goal_is_printed_and_the_exit_code_is_0(tmp_path: Path) -> None:
+    """The table has all rows, and Markdown the same; missed goals follow; an unknown benchmark is refused."""
     done = run_copy(tmp_path, "--markdown", "table.md")
     assert done.returncode == 0, done.stderr
     assert "1 of 2 goals met; missed: fast | enough" in done.stdout
@@ -42,8 +42,8 @@ def test_a_missed_goal_is_printed_and_is_no_failure(tmp_path: Path) -> None:
     assert "no benchmark speed; there are: good" in run_copy(tmp_path, "speed").stderr
 
 
-def test_a_crash_is_named_and_the_others_go_on(tmp_path: Path) -> None:
-    """The crashed benchmark comes first, the good one's table still follows, and the exit code is 1."""
+def test_a_crash_is_named_and_other_benchmarks_run(tmp_path: Path) -> None:
+    """The crashed benchmark comes first, the good one's table follows, and the exit code is 1."""
     done = run_copy(tmp_path, crash=True)
     assert done.returncode == 1
     assert "bad: crashed; the others go on" in done.stdout

@@ -1,4 +1,4 @@
-"""The house's rules that imports can show: direction, one owner for each heavy package, no circle, small rooms."""
+"""Rules of the source tree that imports show: direction, one owner of each heavy package, no circle, small folders."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ DISTRIBUTIONS = {
 FILE_MODULES = {"pathlib", "shutil", "tempfile", "glob", "io", "fileinput"}
 READS = {"open", "read_text", "read_bytes", "getenv", "load_dotenv", "read_csv", "loadtxt", "load_file"}
 MOST_FILES = 25  # in a folder
-MOST_LINES = 8  # of what is clear without a docstring
-IN_FUNCTIONS = {  # file -> packages that a function of it imports, and why no file's head does
+MOST_LINES = 8  # of a definition that is clear without a docstring
+IN_FUNCTIONS = {  # file -> packages that a function of it imports, and the reason
     "flows/publish/publishing.py": ("PIL", "for Prefect's pages alone"),
     "storage/remote/object_stores.py": ("obstore", "an extra: that it is missing is told"),
 }
@@ -60,7 +60,7 @@ IN_FUNCTIONS = {  # file -> packages that a function of it imports, and why no f
 
 @pytest.fixture(scope="module", autouse=True)
 def _trees_are_no_garbage() -> Iterator[None]:
-    """They are half a million nodes: no search looks through them, neither now nor, for they go, in the tests after."""
+    """Exclude the syntax trees (half a million nodes) from garbage collection, and drop them after these tests."""
     gc.disable()
     yield
     source.cache_clear()
@@ -69,7 +69,7 @@ def _trees_are_no_garbage() -> Iterator[None]:
 
 
 def at_import(tree: ast.Module) -> Iterator[ast.AST]:
-    """Nodes that run when the module is imported: all but the bodies of functions."""
+    """Yield the nodes that run when the module is imported: all but the bodies of functions."""
     waiting: list[ast.AST] = list(tree.body)
     while waiting:
         node = waiting.pop()
@@ -81,12 +81,12 @@ def at_import(tree: ast.Module) -> Iterator[ast.AST]:
 
 
 def called_name(node: ast.Call) -> str:
-    """The last part of what is called."""
+    """Return the last part of a called name."""
     return node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
 
 
 def test_imports_go_one_way() -> None:
-    """spectralzoom -> flows -> models | storage -> pipeline, models and storage apart; no import is relative."""
+    """The order is spectralzoom -> flows -> models | storage -> pipeline; no import is relative."""
     wrong = [
         f"{path} imports {name}"
         for path, tree in source().items()
@@ -97,8 +97,8 @@ def test_imports_go_one_way() -> None:
     assert wrong == []
 
 
-def test_storage_stores() -> None:
-    """It rectifies and calibrates nothing: of `rectify` it knows what it writes down, of `signal` what files need."""
+def test_storage_imports_only_listed_modules_of_rectify_and_signal() -> None:
+    """Storage neither rectifies nor calibrates; it imports the types that it stores and the names that files need."""
     known = {
         "storage/arrays/geolocation.py": {"pipeline.rectify.placed", "pipeline.rectify.scan_paths"},
         "storage/arrays/layout.py": {f"pipeline.signal.{one}" for one in ("components", "condense")},
@@ -117,14 +117,14 @@ def test_storage_stores() -> None:
     assert found == known
 
 
-def test_a_survey_calibrates_in_one_place() -> None:
-    """What is rectified and registered is never a raw number: `pipeline.signal.lines` has read and calibrated it."""
+def test_rectify_imports_no_calibration() -> None:
+    """Rectification and registration get lines that `pipeline.signal.lines` has read and calibrated, no raw numbers."""
     trees = [tree for path, tree in source().items() if path.parts[:2] == ("pipeline", "rectify")]
     assert not [name for tree in trees for name in imported(tree) if name.startswith("pipeline.signal.calibrate")]
 
 
 def test_heavy_packages_stay_with_their_owner() -> None:
-    """A heavy package is imported in its owner's folder alone; `pipeline.lazy` only says that it loads late."""
+    """A heavy package is imported only in its owner's folder; `pipeline.lazy` only defers its loading."""
     wrong = [
         f"{path} imports {name}"
         for path, tree in source().items()
@@ -137,7 +137,7 @@ def test_heavy_packages_stay_with_their_owner() -> None:
 
 
 def test_nothing_is_read_at_import() -> None:
-    """Importing a module reads no file, no environment and no settings."""
+    """Modules read no file, environment variable or setting outside of functions."""
     wrong = [
         f"{path}:{node.lineno}"
         for path, tree in source().items()
@@ -149,7 +149,7 @@ def test_nothing_is_read_at_import() -> None:
 
 
 def test_pipeline_opens_no_files() -> None:
-    """Arrays (or a device's bytes) in, arrays out: only the rig and arrays of large simulated scenes need files."""
+    """Arrays or a device's bytes come in, arrays go out; only the rig and large simulated scenes need files."""
     known = {path: tree for path, tree in source().items() if path.parts[0] == "pipeline" and path.parts[1] != "rig"}
     numeric = {path: tree for path, tree in known.items() if path.name != "scratch.py"}
     assert [path for path, tree in numeric.items() if FILE_MODULES & {n.split(".")[0] for n in imported(tree)}] == []
@@ -158,38 +158,38 @@ def test_pipeline_opens_no_files() -> None:
     assert [f"{path}:{node.lineno}" for path, node in calls if called_name(node) in opening] == []
 
 
-def test_no_file_imports_itself_in_a_circle() -> None:
-    """Every file stands above all that it imports, within functions and for type checkers too."""
+def test_imports_form_no_circle() -> None:
+    """Imports within functions and for type checkers count too."""
     assert circles(source()) == []
 
 
 def test_every_file_has_a_user() -> None:
-    """Another file imports it, or names it as what is loaded when it is asked for; but what others begin with."""
+    """Another file imports it or names it for lazy loading; the only exception is the module of the script."""
     known = {module_name(path) for path in source() if path.name != "__init__.py"}
     used = set[str]().union(*(imported_files(path, tree, known) for path, tree in source().items()))
     named = {node.value for tree in source().values() for node in nodes(tree) if isinstance(node, ast.Constant)}
-    assert known - used - named == {"flows.cli.main"}  # of the script
+    assert known - used - named == {"flows.cli.main"}  # the module of the script
 
 
-def test_files_say_at_their_heads_what_they_need() -> None:
-    """What takes long to load is deferred at a file's head; functions import only what the table gives a reason for."""
+def test_imports_are_at_the_top_of_files() -> None:
+    """Slow packages are deferred there; a function imports only the packages that the table lists with a reason."""
     known = {path: set(packages.split()) for path, (packages, _) in IN_FUNCTIONS.items()}
     assert imported_in_functions(source()) == known
 
 
-def test_folders_can_be_held_in_mind() -> None:
-    """No folder of the house or of its tests has more files than a person can hold in mind."""
+def test_no_folder_has_too_many_files() -> None:
+    """The limit for source and tests is the number of files that a person can keep in mind."""
     count = files_by_folder([*source(), *files_of_tests()])
     assert {folder: files for folder, files in count.items() if files > MOST_FILES} == {}
 
 
 def test_class_names_are_unique() -> None:
-    """Whoever reads the name of a class knows which one is meant."""
+    """A class name identifies one class of the source."""
     assert shared_class_names(source()) == {}
 
 
-def test_what_is_public_says_what_it_does() -> None:
-    """A public function, method or class of more lines than are read at a glance has a docstring."""
+def test_long_public_definitions_have_a_docstring() -> None:
+    """The rule holds for public functions, methods and classes of more than 8 lines."""
     silent = [
         f"{path}:{node.lineno} {node.name}"
         for path, tree in source().items()
@@ -199,16 +199,16 @@ def test_what_is_public_says_what_it_does() -> None:
     assert silent == []
 
 
-def test_packages_are_those_of_this_folder() -> None:
-    """An import takes the rooms of this project, not packages of the same name from elsewhere."""
+def test_packages_are_imported_from_this_checkout() -> None:
+    """Packages of the same name from elsewhere must not be tested."""
     for room in ROOMS:
         module = importlib.import_module(room)
         assert module.__file__ is not None
         assert Path(module.__file__).resolve() == ROOT / room / "__init__.py"
 
 
-def test_what_is_imported_is_declared() -> None:
-    """Every package from outside that the source imports stands in pyproject.toml."""
+def test_imported_packages_are_declared() -> None:
+    """pyproject.toml lists every third-party package that the source imports, with those of the extra s3."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     wanted = project["dependencies"] + project["optional-dependencies"]["s3"]
     declared = {re.split(r"[\[<>=~! ]", item, maxsplit=1)[0].lower() for item in wanted}
@@ -217,14 +217,14 @@ def test_what_is_imported_is_declared() -> None:
     assert {DISTRIBUTIONS.get(name, name) for name in outside} <= declared
 
 
-def test_walk_finds_what_it_looks_for() -> None:
-    """The checks above see imports inside functions, reads in class bodies and defaults, and not in functions."""
+def test_nested_imports_and_reads_at_import_are_found() -> None:
+    """The checks see imports in functions, and reads in class bodies and defaults, but not reads in functions."""
     tree = ast.parse("import os\nclass A:\n x = os.getenv('A')\ndef f(y=open('b')):\n import zarr\n open('c')\n")
     assert list(imported(tree)) == ["os", "zarr"]
     assert sorted(called_name(node) for node in at_import(tree) if isinstance(node, ast.Call)) == ["getenv", "open"]
 
 
-def test_walk_finds_what_is_public() -> None:
-    """Methods are seen, and functions in functions, but nothing whose own name begins with an underscore."""
+def test_public_definitions_are_found() -> None:
+    """Methods and nested functions count, but no definition whose own name begins with an underscore."""
     tree = ast.parse("class A:\n    def b(self): ...\n    def _c(self):\n        def d(): ...\n")
     assert [node.name for node in public(tree)] == ["A", "b", "d"]

@@ -1,4 +1,4 @@
-"""The paper's tables by a command: how patches are pooled and chosen, what rows cost, and a run on a toy data set."""
+"""The command for the paper's tables: pooling and choice of patches, costs of rows, and a run on a toy data set."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ crop = 1
 
 @pytest.fixture
 def paper(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """The command's module."""
+    """Return the module of the command."""
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     return importlib.import_module("bench_paper")
 
 
 def test_one_sharp_edge_wins_by_maximum_and_fine_texture_by_mean(paper: ModuleType) -> None:
-    """The paper pools edges by maximum, the project by mean: they choose different patches of the same image."""
+    """The paper pools edges by maximum, the project by mean; they choose different patches of the same image."""
     grid, image = SceneGrid(16, 16, 8), np.zeros((16, 16, 1), np.float32)
     image[4, 4] = 5.0  # one bright pixel in patch 0
-    image[8:, 8:] = np.indices((8, 8)).sum(axis=0)[..., None] // 2 % 2  # texture all over patch 3
+    image[8:, 8:] = np.indices((8, 8)).sum(axis=0)[..., None] // 2 % 2  # texture in all of patch 3
     seen = CoarsePrediction(grid, image, np.full((16, 16, 2), 0.5, np.float32))
     by_maximum = paper.patch_maxima(PIXEL_SCORES["sobel"].of(seen), grid)
     assert by_maximum[0] == pytest.approx(10.0)
@@ -51,8 +51,8 @@ def test_one_sharp_edge_wins_by_maximum_and_fine_texture_by_mean(paper: ModuleTy
     assert select_patches(score_patches("sobel", seen), 1).tolist() == [3]
 
 
-def test_rows_are_maps_of_chosen_patches_and_cost_the_closed_form(paper: ModuleType) -> None:
-    """A row's counts are those of `segment`, ideal patches lower its errors one by one, and multiply-adds agree."""
+def test_rows_have_the_counts_and_multiply_adds_of_their_patches(paper: ModuleType) -> None:
+    """Counts equal those of `segment`, each ideal patch removes its errors, and multiply-adds equal the closed form."""
     values, labels = patchy_scene((64, 64), len(BANDS_NM), 0)
     scene = raster_from_values(
         values, paper.CAMERA, name="a", wavelength_nm=np.array(BANDS_NM), labels=labels, class_names=CLASSES
@@ -80,10 +80,10 @@ def test_rows_are_maps_of_chosen_patches_and_cost_the_closed_form(paper: ModuleT
     assert fine_row.multiply_adds == [multiply_adds(config, grid, patches, len(BANDS_NM)).total]
 
 
-def test_the_command_judges_a_folder(
+def test_the_command_trains_and_evaluates_on_a_folder(
     paper: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Frames of 64 x 64 px are trained on and judged; the tables have both inputs, and the claim a row for each."""
+    """Frames have 64 x 64 px; the claim has a row for each of three image sizes; a second run gives equal figures."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     data, rng = tmp_path / "toy", np.random.default_rng(0)
     for name in ("images", "labels"):
@@ -100,6 +100,6 @@ def test_the_command_judges_a_folder(
     lines = [" ".join(line.split()) for line in printed.splitlines()]
     for start in ("Baseline 256", "Baseline 1024", "ED, maximum 4", "ED, mean 16", "TA (here gain) 4", "ideal* 16"):
         assert any(line.startswith(start) for line in lines), start
-    again = paper.rows(arguments)  # by the weights that it kept
+    again = paper.rows(arguments)  # with the weights that it kept
     assert [row.figure for row in again] == [row.figure for row in checked]
     assert "to train on" not in capsys.readouterr().err

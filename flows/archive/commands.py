@@ -330,7 +330,7 @@ def show_contents(content: dict[str, Any], console: Console) -> None:
 
 
 def _shown_run(run: Mapping[str, Any]) -> list[str]:
-    scene, miou = PurePath(str(run["scene"] or DASH)).name, known_number(run["miou"])
+    miou = known_number(run["miou"])
     asked = [DASH if run[name] is None else str(run[name]) for name in ("seed", "budget")]
     state = run["state"] if run["state"] == "there" else f"[bold red]{escape(run['state'])}[/]"
     learned = "" if run["training_scene"] is None or miou is None else "*"
@@ -339,7 +339,7 @@ def _shown_run(run: Mapping[str, Any]) -> list[str]:
         format_bytes(run["own_bytes"]),
         _age(run["age_s"]),
     ]
-    return [*map(escape, (run["id"], scene, *asked)), *figures, state]
+    return [*map(escape, (run["id"], PurePath(str(run["scene"] or DASH)).name, *asked)), *figures, state]
 
 
 def _shown_stores(stage: str, stores: Sequence[Mapping[str, Any]]) -> Iterator[list[str]]:

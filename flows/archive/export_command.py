@@ -186,22 +186,22 @@ def _export_sweeps(export: Export, console: Console) -> None:
             header = write_recorded_files(lines := open_lines(path), export.folder / "sweeps")
         if restored := isinstance(lines, RestoredCube):
             console.print(f'[dim]note: {name}: {RESTORED}; keep = "raw" keeps the lines of the next survey[/]')
-        data, table = header.with_suffix(".bil"), header.with_name(f"{name}.pointing.csv")
         export.add(
             f"{name}_envi",
-            data,
+            header.with_suffix(".bil"),
             f"{'Restored' if restored else 'Raw'} numbers of {name}",
             ENVI_NUMBERS,
             ["data"],
             **export.projection(),
         )
         export.add(f"{name}_envi_header", header, f"{name} as ENVI, header", "text/plain", ["metadata"])
+        table = header.with_name(f"{name}.pointing.csv")
         export.add(f"{name}_pointing", table, f"Pointing of the lines of {name}", CSV, ["metadata"])
 
 
 def _add_stores(export: Export) -> None:
     """Add the archive's own stores and the run's files to the catalogue."""
-    run, root = export.run, export.run.archive.root
+    run = export.run
     for product, title in {
         "mosaic": "Mosaic of all passes",
         "class_map": "Class map and confidence on the camera's grid",
@@ -210,7 +210,7 @@ def _add_stores(export: Export) -> None:
     }.items():
         if run.store(product) is not None and (product != "ground_map" or run.geobox is not None):
             box = None if product == "attention" else load_geobox(run.path(product))
-            path = root / run.receipt["products"][product]
+            path = run.archive.root / run.receipt["products"][product]
             export.add(f"{product}_zarr", path, title, ZARR, ["data"], **export.projection(box))
     for sweep in run.sweeps():
         title, roles = ("Raw sweep", ["data", "raw"]) if (sweep / "dn").is_dir() else ("Signal of sweep", ["data"])

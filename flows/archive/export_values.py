@@ -54,10 +54,10 @@ def write_areas(run: ExportedRun, path: Path) -> None:
     pixels, areas = counts[: len(names)], hectares_of_classes(run.receipt)
     hectares = None if areas is None else np.array([areas.get(name, 0.0) for name in names], np.float64)
     fraction = pixels / max(pixels.sum(), 1) if hectares is None else hectares / (hectares.sum() or 1.0)
-    own = np.full(len(names), np.nan) if hectares is None else hectares
-    confusion, estimate = run.receipt.get("accuracy", {}).get("confusion"), (np.full(len(names), np.nan),) * 2
-    if confusion is not None:
-        estimate = stratified_fractions(fraction, confusion)
+    unknown = np.full(len(names), np.nan)
+    own = unknown if hectares is None else hectares
+    confusion = run.receipt.get("accuracy", {}).get("confusion")
+    estimate = (unknown, unknown) if confusion is None else stratified_fractions(fraction, confusion)
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(COLUMNS)

@@ -55,9 +55,9 @@ class ClassRaster:
     def of(cls, run: ExportedRun) -> ClassRaster:
         """Read the classes of the map's store."""
         stored = open_image(run.path(run.map_product), "classes")
-        names, colours = stored.about["class_names"], np.array(stored.about["class_colours"], np.uint8)
+        colours = np.array(stored.about["class_colours"], np.uint8).reshape(-1, 3)
         classes = np.concatenate([rows for _, rows in stored.rows()])
-        legend = ClassNames(tuple(names), colours.reshape(-1, 3))
+        legend = ClassNames(tuple(stored.about["class_names"]), colours)
         return cls(classes, legend, Affine(*stored.about["spatial:transform"]), run.geobox)
 
 
@@ -90,7 +90,8 @@ def write_zones(run: ExportedRun, folder: Path, choice: ProductChoice, add: Add)
 
 def _write_polygons(run: ExportedRun, raster: ClassRaster, folder: Path, add: Add) -> None:
     """Write the outline of each region along the sides of its pixels."""
-    known, crs = raster.classes != UNLABELLED, None if raster.geobox is None else str(raster.geobox.crs)
+    crs = None if raster.geobox is None else str(raster.geobox.crs)
+    known = raster.classes != UNLABELLED
     found = list(rasterio_features.shapes(raster.classes, mask=known, transform=raster.transform))
     polygons, numbers = [shapely.geometry.shape(outline) for outline, _ in found], [int(one) for _, one in found]
     columns = {
@@ -111,9 +112,10 @@ def _write_prescription(run: ExportedRun, raster: ClassRaster, folder: Path, cho
     """Write cells along the north of the map in metres as polygons, and cells in degrees as task data."""
     assert raster.geobox is not None
     assert raster.geobox.crs is not None
-    crs, unit, (west, south, east, north) = raster.geobox.crs, choice.unit, _bounds(raster.geobox, WGS84)
+    unit = choice.unit
+    west, south, east, north = _bounds(raster.geobox, WGS84)
     in_metres = is_in_metres(raster.geobox)
-    plane = crs if in_metres else CRS.utm((west + east) / 2, (south + north) / 2)
+    plane = raster.geobox.crs if in_metres else CRS.utm((west + east) / 2, (south + north) / 2)
     side = abs(raster.geobox.affine.determinant) ** 0.5 if in_metres else pixel_side_m(raster.geobox)
     cell_m = choice.flags.cell or max(CELL_M, round(side, 3))  # no smaller than a pixel
     cells = GeoBox.from_bbox(_bounds(raster.geobox, plane), crs=plane, resolution=cell_m)

@@ -111,7 +111,7 @@ def _row(run: Run, replaced: bool) -> Row:
     with suppress(ShapeError):
         receipt = check_receipt(run.receipt)
     areas: Mapping[str, Mapping[str, float]] = receipt.get("areas") or {}
-    unit, counts = "ha" if "ha" in areas else "fraction", areas.get("px", {})
+    counts = areas.get("px", {})
     return {
         "run": run.uri,
         "replaced": replaced,
@@ -122,7 +122,7 @@ def _row(run: Run, replaced: bool) -> Row:
         "training_scene": receipt.get("training_scene"),
         "capture_s": (receipt["savings"].get("capture_s") or {}).get("done") if receipt else None,
         "areas": areas.get("ha", {name: count / sum(counts.values()) for name, count in counts.items() if count}),
-        "unit": unit,
+        "unit": "ha" if "ha" in areas else "fraction",
         "problem": run.problem,
     }
 

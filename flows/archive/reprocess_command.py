@@ -115,9 +115,9 @@ def reprocess_fields(
             old = run.folder.name
             title = f"{number} of {len(wanted)}: {called(run)} ({old})"
             console.print(f"[bold]reprocess {escape(title)}[/]", soft_wrap=True)
-            begun, before = time.perf_counter(), _scores(run.receipt, "before")
+            begun = time.perf_counter()
             row = {"field": called(run), "scene": run.settings.get("scene"), "old": old, "new": None}
-            row |= {"state": "failed", "message": None, **before, **_scores({}, "after")}
+            row |= {"state": "failed", "message": None, **_scores(run.receipt, "before"), **_scores({}, "after")}
             try:
                 settings = _settings_of(catalogue, run, str(archive), weights, pool, renewed)
                 if settings is None:
@@ -125,7 +125,7 @@ def reprocess_fields(
                 elif dry_run:
                     row |= {"state": "would run"}
                 else:
-                    folder = (survey or _survey)(settings, console)
+                    folder = survey(settings, console) if survey else run_survey(settings, console).folder
                     row |= {"new": folder.name, "state": "ran", **_scores(read_run(folder).receipt, "after")}
                     renewed.pop(folder.name, None)  # a run that was stopped may be older than the one that it renews
                     renewed[old] = folder.name  # the same where a run got the accuracy that it lacked
@@ -151,10 +151,6 @@ def _settings_of(
     if prior == settings.prior and is_current(catalogue, run, settings):
         return None
     return replace(from_raw_cubes(catalogue, run, replace(settings, prior=prior)), **here)
-
-
-def _survey(settings: Settings, console: Console) -> Path:
-    return run_survey(settings, console).folder
 
 
 def _scores(receipt: Mapping[str, Any], when: str) -> dict[str, float | None]:

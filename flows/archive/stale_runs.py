@@ -33,8 +33,14 @@ def generations(catalogue: Catalogue) -> list[list[Run]]:
     A run without a readable receipt is a field of its own.
     """
     found: dict[str, list[Run]] = {}
+    by_name = {one.folder.name: one for one in catalogue.runs}
     for run in catalogue.runs:
-        lit = _recorded_run(catalogue, run)
+        lit = run
+        while lit.settings.get("source") == RECORDED:  # perhaps the raw cubes of another run
+            place, _, name = str(lit.settings.get("sweeps")).rpartition("/runs/")
+            if not place or name == lit.folder.name or name not in by_name:
+                break
+            lit = by_name[name]
         asked = [lit.settings.get(name) for name in ("source", "visit")]
         found.setdefault(canonical_json([called(run), lit.receipt.get("scene", run.uri), *asked]), []).append(run)
     return list(found.values())
@@ -46,17 +52,6 @@ def newest_runs(catalogue: Catalogue) -> list[Run]:
     return [run for run in catalogue.runs if run.uri in newest]
 
 
-def _recorded_run(catalogue: Catalogue, run: Run) -> Run:
-    """Return the run whose raw cubes a run has as its recording, else the run itself."""
-    by_name = {one.folder.name: one for one in catalogue.runs}
-    while run.settings.get("source") == RECORDED:
-        place, _, name = str(run.settings.get("sweeps")).rpartition("/runs/")
-        if not place or name == run.folder.name or name not in by_name:
-            return run
-        run = by_name[name]
-    return run
-
-
 def from_raw_cubes(catalogue: Catalogue, run: Run, settings: Settings) -> Settings:
     """Return settings that survey a run's own raw cubes as a recording, where its source cannot be read again.
 
@@ -65,7 +60,8 @@ def from_raw_cubes(catalogue: Catalogue, run: Run, settings: Settings) -> Settin
     the raw cubes are gone too.
     """
     raw = set(stores_of_lines(run.products, lambda uri: uri in catalogue.stores and not catalogue.stores[uri].cleared))
-    stores, is_there = [catalogue.stores.get(uri) for uri in raw], _is_there(run, settings)
+    stores = [catalogue.stores.get(uri) for uri in raw]
+    is_there = _is_there(run, settings)
     if not stores or any(one is None or one.problem is not None or one.cleared for one in stores):
         if is_there:
             return settings

@@ -66,7 +66,7 @@ def evaluate_weights(request: EvaluateRequest, show: Show = lambda what, done, w
         with writing(request.out):
             request.out.mkdir(parents=True, exist_ok=True)  # fails before minutes are spent
     jobs = sort_frames(request, data, candidates, show)
-    runs, names = _judge_frames(request, data, candidates, jobs.frames, show), [*jobs.frames, *jobs.left_out]
+    runs = _judge_frames(request, data, candidates, jobs.frames, show)
     asked = {name: getattr(request, name) for name in ("fractions", "policies", "seed", "draws")}
     content = {
         "dataset": data.law,
@@ -76,7 +76,7 @@ def evaluate_weights(request: EvaluateRequest, show: Show = lambda what, done, w
                 "key": one.key,
                 "frames": len(covers := jobs.covered(number)),
                 "covers": covers,
-                "left_out": sorted(set(names) - set(covers)),
+                "left_out": sorted({*jobs.frames, *jobs.left_out} - set(covers)),
             }
             for number, one in enumerate(candidates)
         ],

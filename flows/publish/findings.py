@@ -20,7 +20,7 @@ from flows.tasks.stages.maps import OUT_OF_RANGE
 from flows.terminal.figures import format_points
 from models.evaluation.expected_scores import expected_counts
 from pipeline.geometry.grid import UNLABELLED, cuts
-from pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, FieldScale, areas_by_number
+from pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, areas_by_number
 from pipeline.ground.georeference import crs_name, pixel_side_m
 from pipeline.ground.zones import figures_of_plot
 from pipeline.planning.fine_pass import FinePlan
@@ -41,8 +41,12 @@ def field_figures(run: SurveyRun, fine: FinePlan | None) -> dict[str, Any]:
     Without a planned fine pass, ``fine``, its seconds are those that the budget leaves. Hectares are those within the
     zones, and hectares per hour refer to all capture time. A raster has neither capture time nor lines.
     """
-    scale, fine_s = run.zones.place.scale(run.camera.ifov_rad), run.plan.fine_s if fine is None else fine.seconds
-    seconds, kept = run.plan.coarse_s + fine_s, _kept(run, scale)
+    scale = run.zones.place.scale(run.camera.ifov_rad)
+    fine_s = run.plan.fine_s if fine is None else fine.seconds
+    seconds = run.plan.coarse_s + fine_s
+    kept = scale
+    if run.zones.kept is not None and scale.area_m2 is not None:
+        kept = replace(scale, area_m2=_ground_m2(run, run.zones.kept.kept))  # the area within the zones
     footprint, captured = scale.footprint, run.raster is None
     camera_s = {"coarse": run.plan.coarse_s, "fine": fine_s, "all": seconds, "full_scan": run.plan.full_s}
     lines = {
@@ -65,13 +69,6 @@ def field_figures(run: SurveyRun, fine: FinePlan | None) -> dict[str, Any]:
         "lines": lines if captured else None,
         "hectares_per_hour": kept.hectares_per_hour(seconds) if captured and not run.part else None,
     }
-
-
-def _kept(run: SurveyRun, scale: FieldScale) -> FieldScale:
-    """Return the scale with the area within the zones."""
-    if run.zones.kept is None or scale.area_m2 is None:
-        return scale
-    return replace(scale, area_m2=_ground_m2(run, run.zones.kept.kept))
 
 
 def find_areas(run: SurveyRun, posed: GroundMap | None, drawn: ClassMap) -> dict[str, Any]:
@@ -104,8 +101,9 @@ def find_ground(
         "resolution_m": pixel_side_m(geobox) if posed is None else abs(float(geobox.resolution.x)),
         "shape": [int(size) for size in geobox.shape],
     }
-    place, drawn = run.zones.place, found.classes != UNLABELLED
-    figures |= {"older_ha": older_hectares(place, np.where(drawn, probabilities.age(), np.nan))}
+    place = run.zones.place
+    age_days = np.where(found.classes != UNLABELLED, probabilities.age(), np.nan)
+    figures |= {"older_ha": older_hectares(place, age_days)}
     if (old_class := probabilities.old_class()) is not None:
         changes = [] if prior is None else prior["changes"]
         beyond = {(old, new): changed / differing for changed, differing, old, new in changes}

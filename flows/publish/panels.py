@@ -167,15 +167,15 @@ def draw_spectra(mosaic: Mosaic, found: ClassMap) -> bytes | None:
     spectra = class_spectra(mosaic, found.classes, len(found.names))
     if len(mosaic.wavelength_nm) < LEAST_BANDS or not np.isfinite(spectra).any():
         return None
-    names, palette = [name.replace("_", " ") for name in found.names], class_palette(found.colours)
+    palette = class_palette(found.colours)
     with mpl.rc_context({**STYLE, "font.size": 9}):
         figure = Figure(figsize=(9, 3.6), dpi=110, layout="constrained", facecolor=PAPER)
         axes = figure.subplots()
         axes.set_facecolor(PAPER)
-        for name, spectrum, colour in zip(names, spectra, palette, strict=False):
+        for name, spectrum, colour in zip(found.names, spectra, palette, strict=False):
             if (known := np.isfinite(spectrum)).any():
                 nm, curve = curve_with_gaps(mosaic.wavelength_nm[known], spectrum[known])
-                axes.plot(nm, curve, color=colour, linewidth=1.2, label=name, **DOTS)
+                axes.plot(nm, curve, color=colour, linewidth=1.2, label=name.replace("_", " "), **DOTS)
         axes.set(xlabel="wavelength [nm]", ylabel="value of the scene")
         axes.legend(loc="best", ncols=2, fontsize=7, frameon=False)
         return png(figure, found.colours)

@@ -15,7 +15,7 @@ from flows.publish.receipt import is_pending
 from flows.publish.receipt_table import finding_rows, headline
 from flows.publish.report import render_markdown
 from flows.publish.retention import is_outlived
-from flows.publish.run_folder import Published, asked_settings, extend_with_accuracy, publish_run
+from flows.publish.run_folder import Published, asked_settings, extend_with_accuracy, make_receipt, publish_draft
 from flows.settings.survey_settings import OF_THE_MACHINE
 from flows.settings.values import KEEP_SIGNAL
 from flows.tasks.open_survey import STAGES, OpenSurvey, RunRef
@@ -49,7 +49,9 @@ def _publish(survey: OpenSurvey, *products: StageRef) -> RunRef:
         survey(evaluate.name, *survey.products.judged)
         judged = False
     _clear_first_mosaic(survey)
-    published, plan = publish_run(survey), load_plan(survey.products["score"])
+    plan = load_plan(survey.products["score"])
+    with survey.run.archive.new_run(survey.run.name) as draft:
+        published = publish_draft(survey, draft, plan, make_receipt(survey, plan, f"runs/{draft.id}"))
     if not (survey.run.plan.plain or plan.sweeps):
         survey.observer.note(f"no second pass: {plan.reason}")
     if judged:

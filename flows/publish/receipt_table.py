@@ -59,12 +59,12 @@ def saving_rows(receipt: Mapping[str, Any]) -> list[dict[str, Any]]:
 
     A raster has no capture. Bytes are in MB, so that rows compare, unless the reference is smaller than a tenth of one.
     """
-    savings, account = receipt["savings"], receipt["data_bytes"]
     rows = [
         {"label": label, "done": show(one["done"]), "full": show(one["full"]), "ratio": one["ratio"]}
         for name, (label, show) in COST_LABELS.items()
-        if (one := savings.get(name)) is not None
+        if (one := receipt["savings"].get(name)) is not None
     ]
+    account = receipt["data_bytes"]
     full = account["reference"]
     show_bytes = format_bytes if full < LEAST_REFERENCE else lambda size: f"{three_digits(size / 1e6)} MB"
     for name, label in BYTE_LABELS.items():
@@ -101,8 +101,8 @@ def format_score(receipt: Mapping[str, Any]) -> str:
         score = (
             f"mIoU {format_points(accuracy['miou'])} of 100 against the labels{scene} ({right} % of pixels correct)."
         )
-        plan, compared = receipt.get("plan", {}), accuracy["none"]["miou"] is not None
-        alone = not compared or (plan.get("kind") in ("scan", "raster") and "kept" not in receipt)
+        plan = receipt.get("plan", {})
+        alone = accuracy["none"]["miou"] is None or (plan.get("kind") in ("scan", "raster") and "kept" not in receipt)
         return f"{score} {format_worst_class(accuracy, alone=alone)}".rstrip()
     if is_foreign(receipt):
         return f"Unknown: {format_percent(receipt['unknown']['fraction'])} of the map. {FOREIGN_WORDS}."

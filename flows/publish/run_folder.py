@@ -65,13 +65,6 @@ class Published:
     captured_again: float | None  # fraction of patches captured at full resolution; None for a uniform scan
 
 
-def publish_run(survey: OpenSurvey) -> Published:
-    """Publish a run folder with receipt.json, quicklook.png and report.html."""
-    plan = load_plan(survey.products["score"])
-    with survey.run.archive.new_run(survey.run.name) as draft:
-        return _publish(survey, draft, plan, make_receipt(survey, plan, f"runs/{draft.id}"))
-
-
 def extend_with_accuracy(survey: OpenSurvey, draft: RunDraft, accuracy: StageRef) -> Published:
     """Replace a published run by one with its accuracy.
 
@@ -88,7 +81,7 @@ def extend_with_accuracy(survey: OpenSurvey, draft: RunDraft, accuracy: StageRef
         settings={name: asked[name] for name in names},
         judged=now(),
     )
-    return _publish(survey, draft, load_plan(survey.products["score"]), receipt)
+    return publish_draft(survey, draft, load_plan(survey.products["score"]), receipt)
 
 
 def load_receipt(folder: Path) -> Receipt:
@@ -123,7 +116,8 @@ def _draw(survey: OpenSurvey, plan: FinePlan, receipt: Receipt) -> _Drawn:
     return _Drawn(draw_quicklook(shown), tuple(pictures), field)
 
 
-def _publish(survey: OpenSurvey, draft: RunDraft, plan: FinePlan, receipt: Receipt) -> Published:
+def publish_draft(survey: OpenSurvey, draft: RunDraft, plan: FinePlan, receipt: Receipt) -> Published:
+    """Publish a draft as a run folder with receipt.json, quicklook.png and report.html."""
     run, products = survey.run, survey.products
     again = None if run.plan.plain else len(plan.patch_index) / len(run.grid.every_patch())
     drawn = _DRAWN.pop(survey, None) or _draw(survey, plan, receipt)
@@ -213,10 +207,10 @@ def _savings(run: SurveyRun, plan: FinePlan, read: NDArray[np.intp], prior: Mapp
 
 def _model_savings(run: SurveyRun, read: NDArray[np.intp], prior: Mapping[str, Any] | None) -> dict[str, Any]:
     """Return the patches segmented at full resolution and the multiply-adds, against those of every patch."""
-    did, scan = run.work_done(read, prior), run.costs.of_map(run.kept_patches)
+    did = run.work_done(read, prior)
     return {
         "patches": SavingEntry(len(read), len(run.kept_patches)).as_dict(),
-        "multiply_adds": {**SavingEntry(did.total, scan.total).as_dict(), **asdict(did)},
+        "multiply_adds": {**SavingEntry(did.total, run.costs.of_map(run.kept_patches).total).as_dict(), **asdict(did)},
     }
 
 
@@ -369,7 +363,8 @@ def publish_counted(
     facts: dict[str, Any] = {"survey": receipt["survey"], "settings": receipt["settings"], "rests_on": rests_on}
     products, drops_raw = receipt["products"], receipt["settings"]["keep"] == KEEP_SIGNAL
     others = {*of_earlier, *(products[name] for name in LINE_PRODUCTS if drops_raw and name in products)}
-    stores, moved = archive.sizes(uri for uri in rests_on if uri not in others), archive.take_moved()
+    stores = archive.sizes(uri for uri in rests_on if uri not in others)
+    moved = archive.take_moved()
     before, longest, folder = receipt["data_bytes"], {RECEIPT: 0, REPORT: 0}, 0
     while True:
         told = {

@@ -31,8 +31,8 @@ def about(one: Declared, *, choices: bool = True) -> str:
 
 def toml_value(one: Declared) -> str:
     """Return the default of a setting, or an example value, as TOML."""
-    default, example = one.item.default, one.about["example"]
-    return as_toml(default if example is None else example)
+    example = one.about["example"]
+    return as_toml(one.item.default if example is None else example)
 
 
 def as_toml(value: object) -> str:

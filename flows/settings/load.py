@@ -292,12 +292,12 @@ def of_this_version(stored: Mapping[str, Any]) -> dict[str, Any]:
 
 def anchor_paths(table: dict[str, object], folder: Path) -> dict[str, object]:
     """Return the settings of a file with relative paths that start at its folder."""
-    named, anchored = {*BUILT_IN_SCENES, RIG_FIELD}, dict(table)
+    anchored = dict(table)
     for key in PATHS:
         head, _, tail = key.rpartition(".")
         inner = anchored.get(head) if head else anchored
         value = inner.get(tail) if isinstance(inner, Mapping) else None
-        if isinstance(value, str) and value and value not in named and "://" not in value:
+        if isinstance(value, str) and value and value not in (*BUILT_IN_SCENES, RIG_FIELD) and "://" not in value:
             try:
                 path = str(folder / Path(value).expanduser())
             except RuntimeError:

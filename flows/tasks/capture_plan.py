@@ -149,11 +149,12 @@ class PassLayout:
         axes: tuple[Axis, ...] = ("x", "y") if recorded is None else recorded.axes
         along, full, _ = cheapest_full(grid, camera, cost, overlap_px=self._overlap(1), cut=cut, axes=axes)
         if self.step is not None:
-            step, overlap, exposure_ms = self.step, self._overlap(self.step), self.exposure_ms
-            scan_passes = uniform_sweeps(grid, camera, along, step=step, exposure_ms=exposure_ms, overlap_px=overlap)
+            scan_passes = uniform_sweeps(
+                grid, camera, along, step=self.step, exposure_ms=self.exposure_ms, overlap_px=self._overlap(self.step)
+            )
         else:
-            overlap, exposure_ms = self._overlap(self.first_step), self.coarse_exposure_ms
-            scan_passes = every_nth(full_sweeps(grid, camera, along, overlap_px=overlap), self.first_step, exposure_ms)
+            swept = full_sweeps(grid, camera, along, overlap_px=self._overlap(self.first_step))
+            scan_passes = every_nth(swept, self.first_step, self.coarse_exposure_ms)
         scan_passes = cut(scan_passes)
         if self.extent != EXTENT_WHOLE:
             scan_passes = sweeps_of_runs(scan_passes, parse_extent_runs(self.extent))
@@ -229,7 +230,8 @@ def choose_uniform_scan(
     if layout.recorded is not None:
         recorded_ms = {step: exposing(camera, found[0]).exposure_ms for step, found in sweeps.items()}
     scans = uniform_scans(record, sweeps, camera, cost, bands, seconds=settings.seconds, recorded_ms=recorded_ms)
-    chosen, exposure_ms = None, (recorded_ms or {}).get(layout.step or 0) or layout.exposure_ms or camera.exposure_ms
+    chosen = None
+    exposure_ms = (recorded_ms or {}).get(layout.step or 0) or layout.exposure_ms or camera.exposure_ms
     if layout.extent != EXTENT_WHOLE:  # the table is for whole fields
         pass
     elif layout.step in sweeps and record.knows(exposure_ms):

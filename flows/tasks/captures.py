@@ -9,6 +9,7 @@ from contextvars import ContextVar
 from dataclasses import replace
 from datetime import datetime
 from typing import Any
+from uuid import uuid4
 
 from flows.settings.parameters import SurveySettings, at_due_time
 from flows.settings.survey_settings import RIG, Settings
@@ -150,8 +151,11 @@ def _captured_elsewhere(survey: OpenSurvey, sweeps: str, *inputs: StageRef) -> s
         "sweeps": sweeps,
         "inputs": [ref.uri for ref in inputs],
     }
+    once = uuid4().hex  # the client repeats a request that got no answer: it starts no second capture
     try:
-        run: Any = prefect_deployments.run_deployment(survey.capture_deployment, parameters=parameters)
+        run: Any = prefect_deployments.run_deployment(
+            survey.capture_deployment, parameters=parameters, idempotency_key=once
+        )
     except (prefect_exceptions.ObjectNotFound, ValueError):  # ValueError: no FLOW/NAME
         raise RigError(
             f"there is no deployment {survey.capture_deployment!r} on the Prefect server; expected FLOW/NAME of one: "

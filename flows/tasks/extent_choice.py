@@ -178,10 +178,10 @@ def _swaths(
 
     Probabilities are those of the nearest pixel among every second row and column.
     """
-    store, high = ProbabilityStore(prior.probabilities.path / "class_probabilities.zarr"), SWATH_PATCHES * grid.patch
+    store = ProbabilityStore(prior.probabilities.path / "class_probabilities.zarr")
     read = None if weights.reader is None else load_reader(path)
     across = np.arange(grid.width) // EVERY_PX
-    for rows in cuts(grid.height, high):
+    for rows in cuts(grid.height, SWATH_PATCHES * grid.patch):
         first, last = max(rows.start - EVERY_PX * HALO, 0), min(rows.stop + EVERY_PX * HALO, grid.height)
         probabilities, age, light = store.read(slice(first, last))
         sampled = (part[::EVERY_PX, ::EVERY_PX] for part in (in_classes(probabilities, prior.classes), age, light))

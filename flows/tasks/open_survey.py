@@ -174,9 +174,9 @@ class OpenSurvey:
         if built:
             self._written += bytes_below(self.run.archive.root / ref.uri)
         watch(stage, state, 1.0)
-        record, title = self.records[stage], TITLES[stage]
+        record = self.records[stage]
         took = "found" if record.wall_s is None else f"{record.wall_s:.1f} s"
-        self.observer.log(f"{title}: {took}, {(record.bytes_out or 0) / 1e6:.1f} MB, {ref.uri}")
+        self.observer.log(f"{TITLES[stage]}: {took}, {(record.bytes_out or 0) / 1e6:.1f} MB, {ref.uri}")
         return ref
 
     def take_as_found(self, stage: str, ref: StageRef, *inputs: StageRef) -> None:

@@ -103,12 +103,12 @@ def _unusable(runs_by_reason: dict[str, list[str]]) -> tuple[str, ...]:
 def _before(archive: Archive, settings: Settings, name: str, scene_key: str) -> Iterator[Run]:
     """Return the newest runs of a field with class probabilities, the last captured before this visit first."""
     found: list[tuple[float, int, Run]] = []
-    part, asked = run_stem(name), anchor_paths(settings.to_dict(), Path.cwd())
+    asked = anchor_paths(settings.to_dict(), Path.cwd())
     # The prior map may choose the extent: then the extent does not identify the light.
     chosen = ("extent", "scan_step", "scan_exposure_ms") if settings.extent == EXTENT_PART else ()
     light = [key for key in OF_THE_LIGHT if key not in chosen]
     for number, folder in enumerate(reversed(published_runs(archive.root))):
-        if part not in folder.name:  # no receipt has to be read for that
+        if run_stem(name) not in folder.name:  # no receipt has to be read for that
             continue
         run = read_run(folder)
         if run.receipt.get("survey") == name and PROBABILITIES in run.products:
@@ -148,8 +148,8 @@ def _usable(
             return "it has another coordinate system, pixel size or direction than this scene"
         if math.hypot(*shift) > REACH_PX:
             return f"it shows another place: its corner lies {math.hypot(*shift):.0f} px from that of this scene"
-    camera, optics = run.settings["camera"], ("pitch_um", "focal_length_mm")
-    if any(camera[part] != getattr(settings.camera, part) for part in optics):
+    camera = run.settings["camera"]
+    if any(camera[part] != getattr(settings.camera, part) for part in ("pitch_um", "focal_length_mm")):
         return "its camera has another pitch or focal length"
     classes = tuple(names.index(one) if one in names else -1 for one in class_names)
     if all(number < 0 for number in classes):

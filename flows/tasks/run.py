@@ -251,11 +251,11 @@ class SurveyRun(CaptureRun):
     @property
     def capture(self) -> LineSpec:
         """Return line spacing and light of the first pass or of the uniform scan."""
-        settings, light = self.settings, self.light.light
+        settings = self.settings
         exposure_ms, step = settings.scan_exposure_ms, settings.scan_step or 1
         if not self.plan.plain:
             exposure_ms, step = settings.coarse_exposure_ms, self.plan.coarse[0].step
-        return LineSpec(light * (exposure_ms or self.camera.exposure_ms) / self.camera.exposure_ms, step)
+        return LineSpec(self.light.light * (exposure_ms or self.camera.exposure_ms) / self.camera.exposure_ms, step)
 
     @property
     def light(self) -> LineSpec:
@@ -265,7 +265,8 @@ class SurveyRun(CaptureRun):
     @property
     def gains(self) -> PatchGains:
         """Return the expected gain of patches by the policy of the settings."""
-        settings, mask = self.settings, None if self.settings.mask is None else load_labels_array(self.settings.mask)
+        settings = self.settings
+        mask = None if settings.mask is None else load_labels_array(settings.mask)
         return PatchGains(self.frame, self.zones, self.work, self.capture, settings.policy, settings.seed, mask)
 
     @property

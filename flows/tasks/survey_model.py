@@ -180,7 +180,8 @@ def other_unit(
 
 def _season(moment: tuple[int, float] | None, trained: TrainedOn, *, now: bool) -> list[str]:
     """Return notes on day (of a rig: today) and sun elevation outside of the training data."""
-    found, day = [], moment[0] if moment else datetime.now(UTC).timetuple().tm_yday if now else None
+    found = []
+    day = moment[0] if moment else datetime.now(UTC).timetuple().tm_yday if now else None
     if day is not None and trained.day is not None:
         first, last = trained.day
         if not first - DAYS <= day <= last + DAYS:

@@ -90,9 +90,9 @@ class Scattered:
 
 def scatter_points(seed: int) -> Scattered:
     """Draw samples of waves, and points at least 2 px inside, in the row order of a geolocation grid."""
-    waves, rng = draw_waves(seed, BANDS, PERIODS_PX), np.random.default_rng([seed, 1])
+    waves = draw_waves(seed, BANDS, PERIODS_PX)
     grid = np.argwhere(np.ones((SIDE, SIDE), bool)).astype(np.float64)
-    coordinates = rng.uniform(2, SIDE - 3, (POINTS, 2))
+    coordinates = np.random.default_rng([seed, 1]).uniform(2, SIDE - 3, (POINTS, 2))
     coordinates = coordinates[np.lexsort((coordinates[:, 1], np.floor(coordinates[:, 0])))]
     return Scattered(waves.at(grid).astype(np.float32).reshape(SIDE, SIDE, BANDS), coordinates, waves.at(coordinates))
 
@@ -255,14 +255,14 @@ def open_field(seed: int, scene: str | None, weights: Path | None, source: str) 
 def plan_every_way(seed: int, scene: str | None = None, weights: Path | None = None) -> PlannedField:
     """Scan a farm or another scene by every uniform scan, and read parts of one of them."""
     run = open_field(seed, scene, weights, "sim")
-    camera, cost, source = run.camera, run.settings.cost, run.simulated
+    camera, cost = run.camera, run.settings.cost
     grid = SceneGrid(*run.scene.shape, run.described.config.patch)
     along, _, _ = cheapest_full(grid, camera, cost)
     passes: dict[Setting, PlannedPass] = {}
     for words, (step, exposure_ms) in SCANS.items():
         sweeps = uniform_sweeps(grid, camera, along, step=step, exposure_ms=exposure_ms)
         scan = LineSpec(exposure_ms / DEFAULT_EXPOSURE_MS, step)
-        passes[words] = uniform_pass(run.weights, source, sweeps, grid, cost, scan)
+        passes[words] = uniform_pass(run.weights, run.simulated, sweeps, grid, cost, scan)
     whole = passes[format_scan(*PART_OF)]
     scores = score_patches(POLICY, whole.coarse)
     for words, fraction in PARTS.items():

@@ -281,8 +281,8 @@ def bin_bands(scan: ScanLines, width: int) -> KeptLines:
     count = np.diff(np.append(first, bands))
     sums = np.add.reduceat(scan.lines.data, first, axis=2, dtype=np.uint32)
     size, array = numbers_in_memory(np.rint(sums / count.astype(np.float32)).astype(np.uint16))
-    middle, each = first + (count - 1) / 2, np.eye(len(first))
-    weights = np.stack([np.interp(np.arange(bands), middle, one) for one in each]).astype(np.float32)
+    middle = first + (count - 1) / 2
+    weights = np.stack([np.interp(np.arange(bands), middle, one) for one in np.eye(len(first))]).astype(np.float32)
     return KeptLines(size, lambda: scan.lines.calibrated(np.asarray(array[...], np.float32) @ weights))
 
 
@@ -322,12 +322,12 @@ def _scored(scan: ScanLines, *, raw: bool) -> tuple[Components, Values]:
     choice, statistics = SignalChoice(), _statistics(calibrated_blocks(scan.lines, scan.camera), scan)
     components = find_components(statistics, false_alarm=choice.false_alarm, least=choice.least)
     if raw:
-        rank, statistics = len(components), _statistics(_raw_blocks(scan), scan)
+        statistics = _statistics(_raw_blocks(scan), scan)
         assert statistics.origin is not None
         mean = statistics.total / statistics.count
         axes = np.linalg.eigh(statistics.single / statistics.count - np.outer(mean, mean))[1][:, ::-1]
         noise = np.full(statistics.bands, np.sqrt(np.mean(scan.noise_dn**2)))
-        components = Components(statistics.origin + mean, axes[:, :rank].T, noise)
+        components = Components(statistics.origin + mean, axes[:, : len(components)].T, noise)
     blocks = _raw_blocks(scan) if raw else calibrated_blocks(scan.lines, scan.camera)
     return components, np.concatenate([score_lines(values, valid, components).scores for _, values, valid in blocks])
 

@@ -123,9 +123,10 @@ def train_weights(
 
 def _trained_on(data: TrainingData, scenes: Scenes, darkest_ms: float) -> TrainedOn:
     """Return the ranges of the training data; season, sun and scale are known for built-in farms alone."""
-    nm, exposures = scenes.common.wavelength_nm, (darkest_ms, max(darkest_ms, data.camera.exposure_ms))
-    span, bands_nm = (float(nm.min()), float(nm.max())), tuple(nm.tolist())
-    trained = TrainedOn(len(nm), span, exposures, len(data.train), scenes.common.names, bands_nm=bands_nm)
+    nm = scenes.common.wavelength_nm
+    span = float(nm.min()), float(nm.max())
+    exposures = darkest_ms, max(darkest_ms, data.camera.exposure_ms)
+    trained = TrainedOn(len(nm), span, exposures, len(data.train), scenes.common.names, bands_nm=tuple(nm.tolist()))
     if data.files is not None:
         return trained
     moments = [read_farm_name(name)[1:] for name in data.train]
@@ -241,8 +242,8 @@ def asked_command() -> str:
 
 def _print_figures(record: dict[str, Any], request: TrainRequest, console: Console) -> None:
     out = request.out
-    size_mb, steps = out.stat().st_size / 1e6, record["training"]["steps"]
-    console.print(f"weights: {out} ({size_mb:.1f} MB), {steps} steps", markup=False, soft_wrap=True)
+    steps = record["training"]["steps"]
+    console.print(f"weights: {out} ({out.stat().st_size / 1e6:.1f} MB), {steps} steps", markup=False, soft_wrap=True)
     if "familiar" in record:
         console.print(record["familiar"], markup=False, soft_wrap=True)
     readings, figures = record["readings"], record["validation"]

@@ -69,19 +69,14 @@ def project(values: NDArray[np.floating], matrix: NDArray[np.float32]) -> NDArra
         seen = np.asarray(exact @ matrix, np.float32)
     broken = ~np.isfinite(exact).all(axis=-1)
     if broken.any():
-        seen[broken] = _project_finite(exact[broken], matrix)
+        living = np.isfinite(exact[broken])
+        weight = living.astype(np.float32) @ matrix
+        total = np.where(living, exact[broken], np.float32(0)) @ matrix
+        mean = np.divide(total, weight, out=np.zeros_like(weight), where=weight > 0)
+        mean[(weight <= 0) & (matrix.sum(axis=0) > 0)] = np.nan
+        mean[2 * living.sum(axis=1) < len(matrix)] = np.nan
+        seen[broken] = mean
     return seen
-
-
-def _project_finite(values: NDArray[np.float32], matrix: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Project (pixel, band) -> (pixel, column) by the finite bands alone."""
-    living = np.isfinite(values)
-    weight, whole = living.astype(np.float32) @ matrix, matrix.sum(axis=0) > 0
-    total = np.where(living, values, np.float32(0)) @ matrix
-    mean: NDArray[np.float32] = np.divide(total, weight, out=np.zeros_like(weight), where=weight > 0)
-    mean[(weight <= 0) & whole] = np.nan
-    mean[2 * living.sum(axis=1) < values.shape[1]] = np.nan
-    return mean
 
 
 def checked_wavelengths(wavelength_nm: NDArray[np.floating], bands: int) -> NDArray[np.float64]:

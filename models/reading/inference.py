@@ -248,7 +248,8 @@ def map_of_columns(
 
     Raises as `segment`.
     """
-    patch_index, seen = grid.every_patch(), coarse_prediction_of_columns(weights, columns, grid, capture)
+    patch_index = grid.every_patch()
+    seen = coarse_prediction_of_columns(weights, columns, grid, capture)
     drawn = segment(weights, seen, seen.patches(patch_index), patch_index, every_class=True)
     assert drawn.log_probability is not None
     return drawn, drawn.log_probability

@@ -121,7 +121,8 @@ def fuse(prior_map: PriorMap, observation: CurrentVisit, reader: TemporalReader 
     high = max(ROWS // CELL_PX, 1) * CELL_PX
     for top in range(0, y, high):  # limits the memory of intermediate arrays
         first, last, stop = max(top - HALO, 0), min(top + high + HALO, y), min(top + high, y)
-        part, own = _fused(prior_map, observation, reader, slice(first, last)), slice(top - first, stop - first)
+        part = _fused(prior_map, observation, reader, slice(first, last))
+        own = slice(top - first, stop - first)
         kept[top:stop], ages[top:stop], light[top:stop] = part.log_probability[own], part.age_days[own], part.light[own]
     return ClassProbabilities(kept, ages, light)
 
@@ -134,10 +135,10 @@ CARRIED_AS_BY = (0.05, 2)  # light and line spacing for the reader without a vis
 def carried(prior_map: PriorMap, reader: TemporalReader | None) -> ClassProbabilities:
     """Return the class probabilities of today without a visit."""
     shape = prior_map.probabilities.log_probability.shape
-    s, columns = CELL_PX, 1 if reader is None else reader.sizes.columns
-    unseen, coarse = np.zeros(shape[:2], np.bool_), (-(-shape[0] // s), -(-shape[1] // s), columns)
+    columns = 1 if reader is None else reader.sizes.columns
+    coarse = (-(-shape[0] // CELL_PX), -(-shape[1] // CELL_PX), columns)
     nothing, features = (np.full(size, np.nan, np.float32) for size in (shape, coarse))
-    return fuse(prior_map, CurrentVisit(nothing, unseen, features, *CARRIED_AS_BY), reader)
+    return fuse(prior_map, CurrentVisit(nothing, np.zeros(shape[:2], np.bool_), features, *CARRIED_AS_BY), reader)
 
 
 def _fused(
@@ -165,8 +166,8 @@ def _fused(
 
 def as_captured(prior_map: PriorMap, after: ClassProbabilities) -> ClassProbabilities:
     """Return what is stored for the next visit: pixels that this one did not capture are as at their last capture."""
-    before, older = prior_map.probabilities.log_probability, after.age_days[..., None] > 0
-    return replace(after, log_probability=np.where(older, before, after.log_probability))
+    before = prior_map.probabilities.log_probability
+    return replace(after, log_probability=np.where(after.age_days[..., None] > 0, before, after.log_probability))
 
 
 def _phased_in(old: Floats, after: Floats, seen: NDArray[np.bool_], days: Floats) -> Floats:
@@ -192,10 +193,10 @@ def in_classes(log_probability: Floats, numbers: Sequence[int]) -> Floats:
     A new class gets the probability of one class of a uniform distribution. That of removed classes is spread over all
     classes.
     """
-    new, kept = np.array(numbers) < 0, np.exp(log_probability[..., list(numbers)])
+    kept = np.exp(log_probability[..., list(numbers)])
     removed = np.setdiff1d(np.arange(log_probability.shape[-1]), numbers)
     spread = np.exp(log_probability[..., removed]).sum(axis=-1, keepdims=True) / len(numbers)
-    return _normalised(np.log(np.where(new, 1 / len(numbers), kept) + spread)).astype(np.float32)
+    return _normalised(np.log(np.where(np.array(numbers) < 0, 1 / len(numbers), kept) + spread)).astype(np.float32)
 
 
 def faded(log_probability: Floats, age_days: Floats) -> Floats:

@@ -100,7 +100,8 @@ def components(pixels: Spectra, classes: Classes, seed: int) -> tuple[Exact, Exa
     middles = []
     for number in np.unique(classes):
         own = exact[classes == number]
-        count, rng = min(OF_A_CLASS, 1 + len(own) // (4 * columns)), np.random.default_rng(seed + int(number))
+        count = min(OF_A_CLASS, 1 + len(own) // (4 * columns))
+        rng = np.random.default_rng(seed + int(number))
         middles.append(scipy.cluster.vq.kmeans2(own, count, minit="++", rng=rng)[0])
     first = np.concatenate(middles)
     near = (exact @ first.T - 0.5 * (first**2).sum(axis=1)).argmax(axis=1)

@@ -85,8 +85,8 @@ class OodPart:
     @staticmethod
     def read(key: str, about: Mapping[str, Any]) -> OodPart:
         """Read an entry of a description. Raises KeyError, TypeError or ValueError for an invalid one."""
-        trained_on, steps = TrainedOn.read(about[TRAINED_ON]), tuple(map(int, about["steps"]))
-        found = OodPart(key, trained_on, steps, int(about["bands"]), about["record"])
+        trained_on = TrainedOn.read(about[TRAINED_ON])
+        found = OodPart(key, trained_on, tuple(map(int, about["steps"])), int(about["bands"]), about["record"])
         _ = found.map_scores  # raises for invalid ones
         return found
 

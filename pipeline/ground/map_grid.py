@@ -104,17 +104,13 @@ class MapFrame:
         lon, lat = self._on_map.transform(place[..., 0], place[..., 1], direction="INVERSE")
         level = np.full_like(np.asarray(lon, np.float64), self.view.pose.elevation_m)
         point = _stacked(self._around_foot.transform(lon, lat, level))
-        up = self._vertical(np.asarray(lon), np.asarray(lat))
-        rise = -(point @ self.view.normal) / (up @ self.view.normal)
-        return point + rise[..., None] * up
-
-    def _vertical(self, lon_deg: Floats, lat_deg: Floats) -> Floats:
-        """Return (..., 3) normals of the ellipsoid at other places, in east, north, up of the foot."""
-        away = np.deg2rad(lon_deg - self.view.pose.lon_deg)
-        lat, foot = np.deg2rad(lat_deg), np.deg2rad(self.view.pose.lat_deg)
-        north = np.sin(lat) * np.cos(foot) - np.cos(lat) * np.sin(foot) * np.cos(away)
-        up = np.sin(lat) * np.sin(foot) + np.cos(lat) * np.cos(foot) * np.cos(away)
-        return np.stack([np.cos(lat) * np.sin(away), north, up], axis=-1)
+        away = np.deg2rad(np.asarray(lon) - self.view.pose.lon_deg)
+        here, foot = np.deg2rad(np.asarray(lat)), np.deg2rad(self.view.pose.lat_deg)
+        north = np.sin(here) * np.cos(foot) - np.cos(here) * np.sin(foot) * np.cos(away)
+        up = np.sin(here) * np.sin(foot) + np.cos(here) * np.cos(foot) * np.cos(away)
+        vertical: Floats = np.stack([np.cos(here) * np.sin(away), north, up], axis=-1)  # the ellipsoid's normals
+        rise = -(point @ self.view.normal) / (vertical @ self.view.normal)
+        return point + rise[..., None] * vertical
 
     @cached_property
     def _around_foot(self) -> pyproj.Transformer:
@@ -168,7 +164,8 @@ class GroundGrid:
         Exact every ``TIE`` pixels and linear between. A map curves against the ground's plane with about the earth's
         radius R. So the error is TIE^2 resolution / 8 R of a pixel: 1e-6 at 5 cm, 2e-5 at 1 m (tested).
         """
-        affine, cuts = self.geobox.affine, (-(-(part.stop - part.start) // TIE) + 1 for part in (rows, columns))
+        affine = self.geobox.affine
+        cuts = (-(-(part.stop - part.start) // TIE) + 1 for part in (rows, columns))
         row, column = (np.linspace(part.start, part.stop, cut) for part, cut in zip((rows, columns), cuts, strict=True))
         x, y = np.meshgrid(affine.c + affine.a * column, affine.f + affine.e * row)
         exact = self.frame.map_to_ground(np.stack([x, y], axis=-1))
@@ -176,8 +173,8 @@ class GroundGrid:
 
     def counts(self) -> dict[str, int]:
         """Count the scene's pixels that the map shows, that meet the ground beyond its reach, and that meet none."""
-        view, total = self.frame.view, self.scene_shape[0] * self.scene_shape[1]
-        near, ground = (view.count_ground(self.scene_shape, sink) for sink in (self.least_sink, LEAST_SINK))
+        total = self.scene_shape[0] * self.scene_shape[1]
+        near, ground = (self.frame.view.count_ground(self.scene_shape, sink) for sink in (self.least_sink, LEAST_SINK))
         return {"mapped_px": near, "beyond_reach_px": ground - near, "no_ground_px": total - ground}
 
 

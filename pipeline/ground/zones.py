@@ -153,12 +153,12 @@ def figures_of_plot(
     mapped, ground = inside & (drawn != UNLABELLED), place.pixel_areas_m2(rows, columns)
     weight = np.where(mapped, 1.0 if ground is None else np.nan_to_num(ground), 0.0)
     by_class, total = np.bincount(drawn[mapped], weight[mapped], len(names)), float(weight.sum())
-    count, sure = int(mapped.sum()), confidence[rows, columns][mapped]
+    sure = confidence[rows, columns][mapped]
     sure = sure[np.isfinite(sure)]  # unknown pixels have no confidence
     return PlotFigures(
         plot,
         int(inside.sum()),
-        count,
+        int(mapped.sum()),
         None if ground is None else total,
         float(sure.mean(dtype=np.float64)) if sure.size else None,
         {name: float(one) / total if total else None for name, one in zip(names, by_class, strict=True)},

@@ -89,7 +89,8 @@ class SecondPass:
     @cached_property
     def rows(self) -> PatchRows:
         """Return the rows of patches of the field in these sweeps: with the margin, from old line to old line."""
-        found, margin, apart = PatchRows.of(self.swaths, self.grid, self.camera), math.ceil(self.margin_px), self._apart
+        found = PatchRows.of(self.swaths, self.grid, self.camera)
+        margin, apart = math.ceil(self.margin_px), self._apart
         lines = np.array([sweep.lines for sweep in self.swaths])[:, None]
         first = np.maximum(found.first - margin, 0) // apart * apart
         stop = np.minimum(-(-(found.stop + margin - 1) // apart) * apart + 1, lines)
@@ -131,11 +132,11 @@ class SecondPass:
         A recording offers its own exposures. ``gain_of`` returns the (patch,) gains of lines of a spacing, for the mean
         exposure [ms] of old and new lines.
         """
-        first, (shortest, longest) = self.first_pass[0], record.offered_ms(self.camera)
+        first = self.first_pass[0]
+        shortest, longest = record.offered_ms(self.camera)
         first_ms, plans = exposing(self.camera, first).exposure_ms, list[FinePlan]()
-        known = (
-            first.step in record.steps
-        )  # lines that score less than those of the first pass would replace better ones
+        # Lines that score less than those of the first pass would replace better ones.
+        known = first.step in record.steps
         least = record.expected(first.step, float(np.clip(first_ms, shortest, longest)))[MIOU] if known else 0.0
         for step in (step for step in record.steps if step < first.step):
             every = lines_between(self.full, self._between, step=step)

@@ -144,7 +144,8 @@ def priced_scan(
     exposure_ms: float,
 ) -> UniformScan:
     """Return one scan with its costs and scores, by its sweeps and an exposure, of a step that the record has."""
-    step, exposed = sweeps[0].step, [replace(sweep, exposure_ms=exposure_ms) for sweep in sweeps]
+    step = sweeps[0].step
+    exposed = [replace(sweep, exposure_ms=exposure_ms) for sweep in sweeps]
     size, expected = raw_bytes(exposed, camera, bands), record.expected(step, exposure_ms)
     spread = None if record.spread is None else record.between(record.spread, step, exposure_ms)
     return UniformScan(step, exposure_ms, cost.seconds(exposed, camera), size, expected, spread)

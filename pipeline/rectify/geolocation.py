@@ -103,7 +103,8 @@ def _knot_and_sample(curve: KnotCurve, camera: LineCamera, a: Floats, b: Floats,
         np.multiply(centre - scan_path.scan[0], 1 / scan_path.width, out=found[:, 0])
         found[:, 1] = camera.sample_at(camera_slope(a, b, across, centre), binning)
         return found
-    found, knot = np.full((len(a), 2), np.nan), _find_knots(curve, a, b, SETTLED_PX * camera.ifov_rad)
+    found = np.full((len(a), 2), np.nan)
+    knot = _find_knots(curve, a, b, SETTLED_PX * camera.ifov_rad)
     settled = np.isfinite(knot)
     centre, _, wandered, _ = curve.at(knot[settled])
     found[settled, 0] = knot[settled]
@@ -117,7 +118,8 @@ def _catmull_rom_pieces(knots: Floats, alone: float) -> Floats:
     before, after = (alone, alone) if not reach else (knots[reach] - knots[0], knots[-1] - knots[-1 - reach])
     before, after = before / max(reach, 1), after / max(reach, 1)
     padded = np.concatenate([[knots[0] - before], knots, [knots[-1] + after]])
-    tangent, step = np.concatenate([[before], (padded[2:] - padded[:-2]) / 2, [after]]), np.diff(padded)
+    tangent = np.concatenate([[before], (padded[2:] - padded[:-2]) / 2, [after]])
+    step = np.diff(padded)
     pieces = np.stack(
         [padded[:-1], tangent[:-1], 3 * step - 2 * tangent[:-1] - tangent[1:], tangent[:-1] + tangent[1:] - 2 * step]
     )

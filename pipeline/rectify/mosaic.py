@@ -49,7 +49,10 @@ def mosaic(parts: Sequence[MosaicPart]) -> tuple[NDArray[np.float32], NDArray[np
 
     The result is (n, band) float32, NaN where no sweep reached, and (n,) how many sweeps did.
     """
-    parts = _closest(parts)
+    if len({part.step for part in parts}) > 1:
+        steps = np.stack([np.where(part.weight > 0, part.step, np.inf) for part in parts])
+        beyond = steps > steps.min(axis=0)
+        parts = [replace(part, weight=np.where(far, 0, part.weight)) for part, far in zip(parts, beyond, strict=True)]
     reached = [part.weight > 0 for part in parts]
     coverage: NDArray[np.intp] = np.sum(reached, axis=0, dtype=np.intp)
     for part, here in zip(parts, reached, strict=True):
@@ -62,17 +65,6 @@ def mosaic(parts: Sequence[MosaicPart]) -> tuple[NDArray[np.float32], NDArray[np
         blended[alone] = part.values[alone]
     _blend_shared(blended, parts, np.flatnonzero(coverage > 1))
     return blended, coverage
-
-
-def _closest(parts: Sequence[MosaicPart]) -> Sequence[MosaicPart]:
-    """Set the weight of parts to 0 where another part has closer lines."""
-    if len({part.step for part in parts}) == 1:
-        return parts
-    steps = np.stack([np.where(part.weight > 0, part.step, np.inf) for part in parts])
-    closest = steps.min(axis=0)
-    return [
-        replace(part, weight=np.where(step > closest, 0, part.weight)) for part, step in zip(parts, steps, strict=True)
-    ]
 
 
 def _blend_shared(blended: NDArray[np.float32], parts: Sequence[MosaicPart], points: NDArray[np.intp]) -> None:

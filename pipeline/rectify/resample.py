@@ -102,7 +102,8 @@ def _table(values: Values, valid: NDArray[np.bool_], kernel: Kernel) -> LineTabl
         usable = np.asarray(valid.any(axis=2))
         if not (valid.all(axis=2) == usable).all():
             flat = valid.reshape(rows.shape)
-            rows, elements = np.where(flat, rows, np.float32(0)), torch.from_numpy(flat.astype(np.float32))
+            rows = np.where(flat, rows, np.float32(0))
+            elements = torch.from_numpy(flat.astype(np.float32))
         valid = usable
     # read-only memory is fine: nothing here writes to it
     terms = torch.from_numpy(rows if rows.flags.writeable else np.asarray(Unlocked(rows)))

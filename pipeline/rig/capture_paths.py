@@ -122,7 +122,8 @@ def lines_by_time(
     command and the first frame is unknown, so a constant offset of the lines remains; registration corrects it. Raises
     RigError: the stamps go back.
     """
-    usable, notes = (frames.number >= 0) & (frames.stamp_us >= 0), [*_dropped(frames.number)]
+    usable = (frames.number >= 0) & (frames.stamp_us >= 0)
+    notes = [*_dropped(frames.number)]
     since_first_s = frames.number * frames.period_ms * 1e-3
     if usable.any():
         first = int(np.flatnonzero(usable)[0])
@@ -238,8 +239,8 @@ def next_path(sweep: Sweep, first: int, camera: LineCamera, *, vector_pairs: int
 
     Raises SettingsError: the positions of one line do not fit the memory. Raises PoseError: one is beyond the disk.
     """
-    rest, lead = [replace(sweep, lines=sweep.lines - first)], LEAD if triggered else 0
-    stop = first + memory_loads(rest, vector_pairs, lead=lead)[0].parts[0].lines[1]
+    rest = [replace(sweep, lines=sweep.lines - first)]
+    stop = first + memory_loads(rest, vector_pairs, lead=LEAD if triggered else 0)[0].parts[0].lines[1]
     return path_of(sweep, (first, stop), camera, triggered=triggered)
 
 
@@ -321,7 +322,8 @@ def _positions(
 ) -> LinePositions:
     """Return the positions of lines by trigger edges, else by the mirror's log, else by the commands' times."""
     if taken.triggered:
-        taken_in_all, index = max(total, int(frames.number.max()) + 1), taken.index_at_end
+        taken_in_all = max(total, int(frames.number.max()) + 1)
+        index = taken.index_at_end
         if index is not None and path.frames_at(index) != taken_in_all:
             raise RigError(
                 f"the mirror stands at cell {index} of its path, after {taken_in_all} frames cell "

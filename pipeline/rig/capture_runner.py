@@ -219,7 +219,8 @@ class CaptureRunner:
         Raises RigError: it does not end after the stop.
         """
         camera, clock = self.devices.camera, self.devices.clock
-        began, wanted = clock.now(), exposing(self._camera, taken.sweep).scan_seconds(taken.stop - taken.first)
+        began = clock.now()
+        wanted = exposing(self._camera, taken.sweep).scan_seconds(taken.stop - taken.first)
         until, stopped = began + wanted + SLACK_S, False
         while camera.is_capturing():
             self._say(f"capturing: {clock.now() - began:.0f} of {math.ceil(wanted)} s")
@@ -265,9 +266,9 @@ class CaptureRunner:
         self._times_ms = times_ms
 
     def _run(self, path: CapturePath) -> tuple[float, float]:
-        clock, trigger = self.devices.clock, Trigger.RISING_EDGE if path.triggered else Trigger.OFF
+        clock = self.devices.clock
         sent = clock.now()
-        self.devices.steering.run(path.rate_hz, trigger)
+        self.devices.steering.run(path.rate_hz, Trigger.RISING_EDGE if path.triggered else Trigger.OFF)
         return sent, clock.now()
 
     @contextmanager

@@ -96,16 +96,10 @@ def judge_elements(references: References) -> Elements:
     return Elements(references, gain, out, lit, fill)
 
 
-def missing_bands(references: References) -> NDArray[np.intp]:
-    """Return how many bands of each sample are not valid in any line, (sample,)."""
-    elements = judge_elements(references)
-    whole = (elements.out | ~elements.lit).all(axis=1)
-    return np.asarray(np.where(whole, elements.out.shape[1], elements.out.sum(axis=1)))
-
-
 def number_values(references: References) -> Floats:
     """Return the scene value of one DN, (band,): the median over the samples; NaN of bands without light."""
-    gain, known = judge_elements(references).gain.astype(np.float64), np.full(references.dark.shape[1], np.nan)
+    gain = judge_elements(references).gain.astype(np.float64)
+    known = np.full(references.dark.shape[1], np.nan)
     lit = np.isfinite(gain).any(axis=0)
     known[lit] = np.abs(np.nanmedian(gain[:, lit], axis=0))
     return known
@@ -114,7 +108,8 @@ def number_values(references: References) -> Floats:
 def _fill_of(wanted: Bools, good: Bools) -> Fill:
     """Find the good neighbours of each wanted element in its band; elements without one nearby are left out."""
     samples, width = good.shape
-    bands, number = np.flatnonzero(wanted.any(axis=0) & good.any(axis=0)), np.arange(samples)[:, None]
+    bands = np.flatnonzero(wanted.any(axis=0) & good.any(axis=0))
+    number = np.arange(samples)[:, None]
     below = np.maximum.accumulate(np.where(good[:, bands], number, -samples - FILL_REACH), axis=0)
     above = np.minimum.accumulate(np.where(good[:, bands], number, 2 * samples + FILL_REACH)[::-1], axis=0)[::-1]
     sample, column = np.nonzero(wanted[:, bands])
@@ -157,7 +152,8 @@ def calibrate(
     Raises PoseError: positions are needed and missing, or one lies beyond the mirror's rim.
     """
     elements = _judged(raw, references)
-    line_gain, valid = _line_gain(raw, elements.references, position), _valid(raw, elements, saturated_dn)
+    line_gain = _line_gain(raw, elements.references, position)
+    valid = _valid(raw, elements, saturated_dn)
     if line_gain is not None:
         valid[~np.isfinite(line_gain)] = False
     return _scene_values(raw, elements, line_gain), valid
@@ -189,8 +185,8 @@ def _line_gain(raw: NDArray[np.integer[Any]], references: References, position: 
 
 
 def _scene_values(raw: NDArray[np.integer[Any]], elements: Elements, line_gain: Floats32 | None) -> Floats32:
-    fill, frames = elements.fill, (elements.references.dark, elements.gain)
-    dark, gain = (np.ascontiguousarray(frame, np.float32) for frame in frames)
+    fill = elements.fill
+    dark, gain = (np.ascontiguousarray(frame, np.float32) for frame in (elements.references.dark, elements.gain))
     gains = np.ones(len(raw), np.float32) if line_gain is None else line_gain
     if raw.dtype == np.uint16:
         values = np.empty(raw.shape, np.float32)

@@ -17,7 +17,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import cuts
 from pipeline.geometry.scan import Sweep
 from pipeline.readings import SIGMA_OF_MEDIAN
-from pipeline.signal.calibrate import Bools, calibrate, judge_elements, missing_bands
+from pipeline.signal.calibrate import Bools, calibrate, judge_elements
 from pipeline.signal.components import Components, Scores
 from pipeline.signal.lines import BLOCK_LINES, CondensedLines
 from pipeline.signal.subspace import SignalStatistics
@@ -260,13 +260,17 @@ class Condenser:
         count, samples = len(lines.valid_line), len(lines.references.dark)
         ratio, missing = np.empty((count, samples), np.float32), np.zeros((count, samples), np.int32)
         for first, values, valid in calibrated_blocks(lines, self.camera):
-            block, seen = slice(first, first + len(values)), score_lines(values, valid, self.components)
+            block = slice(first, first + len(values))
+            seen = score_lines(values, valid, self.components)
             store(first, seen.scores, seen.quality)
             ratio[block] = seen.residual / self.law.expected(seen.scores)
             if not valid.all():
                 missing[block] = (~valid).sum(axis=2) if valid.ndim == 3 else values.shape[2] * ~valid
             report((first + len(values)) / count)
-        saturated = int((missing > missing_bands(lines.references))[lines.valid_line].sum())
+        elements = judge_elements(lines.references)
+        without = (elements.out | ~elements.lit).all(axis=1)  # samples with no band that is valid in any line
+        never = np.where(without, elements.out.shape[1], elements.out.sum(axis=1))
+        saturated = int((missing > never)[lines.valid_line].sum())
         rare = find_rare(ratio, self.law, self.false_alarm)
         residuals = [np.zeros((0, self.components.bands), np.int32)]  # of rare spectra, from their rounded scores
         blocks = set((np.flatnonzero(rare.any(axis=1)) // BLOCK_LINES).tolist())  # their lines are read again
@@ -286,7 +290,8 @@ def calibrated_blocks(
 
     A line that is not valid because its position is unknown keeps its values. A lost line holds zeros, which are out.
     """
-    elements, saturated = judge_elements(lines.references), float(camera.full_scale_dn * lines.sweep.binning)
+    elements = judge_elements(lines.references)
+    saturated = float(camera.full_scale_dn * lines.sweep.binning)
     for part in cuts(len(lines.valid_line), BLOCK_LINES):
         if chosen is not None and part.start // BLOCK_LINES not in chosen:
             continue
@@ -308,7 +313,8 @@ def differing_lines(
     """
     wrong = list[int]()
     for first, values, valid in calibrated_blocks(lines, camera):
-        last, seen = first + len(values), score_lines(values, valid, components or stored.components)
+        last = first + len(values)
+        seen = score_lines(values, valid, components or stored.components)
         off = np.abs(stored.read(first, last) * np.float32(stored.step) - seen.scores)
         usable = seen.quality != UNUSABLE
         most = 0.5 if stored.step <= 1 else 1  # see `whole_steps`

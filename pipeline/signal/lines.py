@@ -67,8 +67,8 @@ class Signal:
         whole = len(self.elements.fill.element) > 0
         elements = self.elements if whole else self.elements.part(samples)
         raw = _raw_of(read, numbers, slice(0, self.samples) if whole else samples)
-        saturated, position = full_scale_dn * self.lines.sweep.binning, self.lines.position[numbers]
-        values, valid = calibrate(raw, elements, saturated_dn=saturated, position=position)
+        saturated = full_scale_dn * self.lines.sweep.binning
+        values, valid = calibrate(raw, elements, saturated_dn=saturated, position=self.lines.position[numbers])
         if whole:
             values, valid = values[:, samples], valid[:, samples]
         return values, valid & self.lines.valid_line[numbers].reshape(-1, *[1] * (valid.ndim - 1))

@@ -383,7 +383,9 @@ def noise_edge(values: Floats, ratio: float, false_alarm: float) -> float:
 @cache
 def _law_spreads() -> tuple[Floats, Floats]:
     """Return spreads of the Marchenko-Pastur law, and how far its lowest tenth is below its median, over the median."""
-    tries, angle, found = np.geomspace(1e-3, 1.0, 200), (np.arange(2000) + 0.5) / 2000 * np.pi, list[float]()
+    tries = np.geomspace(1e-3, 1.0, 200)
+    angle = (np.arange(2000) + 0.5) / 2000 * np.pi
+    found = list[float]()
     for spread in tries:
         low, high = (1 - spread) ** 2, (1 + spread) ** 2
         at = (low + high) / 2 - (high - low) / 2 * np.cos(angle)

@@ -76,14 +76,12 @@ class Readout:
 
     def numbers(self, light: Radiance, number: int) -> NDArray[np.uint16]:
         """Return the converter's numbers of one line's light, (sample, band) [e-]."""
-        if not self._merges:
+        cheap = self._variant(SHOT.name) not in (OFF, EXACT) and self.read_noise_e >= LEAST_MERGED_READ_E
+        if not cheap or self.full_well_e is not None:  # shot and read noise are draws of their own
             return self.converted(self.electrons(light, number))
         seen = np.ascontiguousarray(light if self.dead is None else np.where(self.dead, 0, light), np.float32)
-        deviate, camera, raw = (
-            self._deviates(SHOT.name, number),
-            self.block.rig.camera,
-            np.empty(light.shape, np.uint16),
-        )
+        deviate = self._deviates(SHOT.name, number)
+        camera, raw = self.block.rig.camera, np.empty(light.shape, np.uint16)
         finite = compiled_loops.read_merged(
             *(seen.reshape(-1), np.ravel(np.asarray(self.added, np.float32)), deviate.reshape(-1), self.read_noise_e),
             *(camera.electrons_per_dn, camera.dark_dn, camera.full_scale_dn, raw.reshape(-1)),
@@ -147,12 +145,6 @@ class Readout:
         well_e, camera = self.block.rig.detector.full_well_e, self.block.rig.camera
         end_e = (camera.full_scale_dn + 1 - camera.dark_dn) * camera.electrons_per_dn + 8 * self.read_noise_e
         return well_e if self._variant(SATURATION.name) != OFF and well_e < end_e else None
-
-    @cached_property
-    def _merges(self) -> bool:
-        """Return whether shot and read noise come of one draw."""
-        cheap = self._variant(SHOT.name) not in (OFF, EXACT)
-        return cheap and self.read_noise_e >= LEAST_MERGED_READ_E and self.full_well_e is None
 
     def _expected(self, light: Radiance, number: int) -> Radiance:
         """Return electrons that a line's elements expect, (sample, band) (SceneError: one is not finite)."""

@@ -104,20 +104,18 @@ def expected_light(scene: RasterScene, block: SweepBlock, chosen: Mapping[Any, s
     return light
 
 
-def held_positions(block: SweepBlock, choice: Choice) -> Floats:
-    """Return what the mirror holds in each exposure, aims included, (line, step, 2); each for as long as the others."""
+def _views(block: SweepBlock, choice: Choice, shape: tuple[int, int]) -> Iterator[RayViews]:
+    """Yield where the samples look at each held position, (line, sample) each. [px of the scene]
+
+    The mirror holds each position, aims included, for as long as the others.
+    """
     position = smeared_positions(block, choice.variant("smear"))
     for aim, variant in choice.doing("aim"):
         shift = aim.aim(block, variant)
         if shift.shape[1] not in (1, position.shape[1]) and block.sweep.positions > 1:  # its course is not followed
             shift = shift.mean(axis=1, keepdims=True)
         position = shifted_position(position, shift, block.rig.camera)
-    return position
-
-
-def _views(block: SweepBlock, choice: Choice, shape: tuple[int, int]) -> Iterator[RayViews]:
-    """Yield where the samples look at each held position, (line, sample) each. [px of the scene]"""
-    position, ifov = held_positions(block, choice), block.rig.camera.ifov_rad
+    ifov = block.rig.camera.ifov_rad
     size = shape if block.sweep.along == "y" else shape[::-1]
     displacements = list(choice.doing("displaced"))
     for step in range(position.shape[1]):

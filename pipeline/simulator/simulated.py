@@ -90,7 +90,8 @@ class SimulatedSource:
 
     def lines_of(self, sweep: Sweep, numbers: range) -> list[Line]:
         """Return some lines of the sweep, as `lines` does. Threads may ask at the same time."""
-        camera, middle = exposing(self.camera, sweep), wire_positions(line_positions(sweep, self.camera))
+        camera = exposing(self.camera, sweep)
+        middle = wire_positions(line_positions(sweep, self.camera))
         return [
             Line(
                 number=number,

@@ -36,10 +36,12 @@ from storage.archive.keys import (
 )
 from storage.archive.lineage import rests_on
 from storage.archive.manifests import (
+    CLEARED,
+    as_table,
     check_files,
     cleared_facts,
     is_cleared,
-    made_bytes,
+    listed_bytes,
     manifest_sha256,
     read_manifest,
     try_manifest,
@@ -197,7 +199,9 @@ class Archive:
 
     def stored_bytes(self, ref: StageRef) -> int:
         """Return the size of a store's files as they were published; cleared files count too."""
-        return made_bytes(self.manifest(ref))
+        manifest = self.manifest(ref)
+        size = as_table(manifest.get(CLEARED)).get("bytes_before")
+        return size if isinstance(size, int) else listed_bytes(manifest)
 
     def manifest_hash(self, ref: StageRef) -> str:
         """Return the SHA-256 of a store's manifest.json, and so of every byte of the store."""
@@ -330,7 +334,7 @@ class Archive:
         """
         before, name = self.root / uri, Path(to).name
         manifest = read_manifest(before)
-        rests_on, own = manifest["rests_on"], {"run", "rests_on", "files", "format", "seal"}
+        own = {"run", "rests_on", "files", "format", "seal"}
         with self._named_draft(name) as draft:
             for path in files_below(before):
                 content = path.read_bytes()
@@ -341,7 +345,7 @@ class Archive:
             with suppress(ValueError):  # of a folder that was renamed by hand
                 begun = datetime.strptime(name[:SECOND], "%Y%m%dT%H%M%S").replace(tzinfo=UTC)  # runs are sorted by it
                 facts["created"] = begun.isoformat(timespec="milliseconds")
-            draft.publish(rests_on=rests_on, **facts)
+            draft.publish(rests_on=manifest["rests_on"], **facts)
         self.drop_run(uri)
 
     def _named_draft(self, run_id: str) -> RunDraft:

@@ -117,9 +117,9 @@ class Catalogue:
             known = {one: self.stores.get(one) for one in self.inputs_of(uri)}
             gone = [one for one, store in known.items() if store is None or store.cleared]
             return any(self.is_only_copy(one, can_capture) for one in gone)
-        runs, store = self.named_by(uri), self.stores.get(uri)
-        if asked := [run for run in runs if run.settings]:
+        if asked := [run for run in self.named_by(uri) if run.settings]:
             return not all(map(can_capture, asked))
+        store = self.stores.get(uri)
         params = {} if store is None else store.params
         return bool(params.get("source", "sim" if "effects" in params else "rig") != "sim")
 

@@ -35,8 +35,8 @@ def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:
         sync_path(path)
         files[path.relative_to(folder).as_posix()] = {"sha256": file_hash(path), "size": path.stat().st_size}
     known = {"created": datetime.now(UTC).isoformat(timespec="milliseconds"), "libraries": library_versions()}
-    content, manifest = {**known, **facts, "files": files, "format": FORMAT}, folder / MANIFEST_NAME
-    manifest.write_text(manifest_text(content), encoding="utf-8")
+    manifest = folder / MANIFEST_NAME
+    manifest.write_text(manifest_text({**known, **facts, "files": files, "format": FORMAT}), encoding="utf-8")
     sync_path(manifest)
     for inner in sorted(path for path in folder.rglob("*") if path.is_dir()):
         sync_path(inner)
@@ -102,12 +102,6 @@ def manifest_sha256(folder: Path) -> str:
 def listed_bytes(manifest: Mapping[str, Any]) -> int:
     """Return the size of all files that a manifest lists."""
     return sum(entry["size"] for entry in manifest["files"].values())
-
-
-def made_bytes(manifest: Mapping[str, Any]) -> int:
-    """Return the size of all files as they were published, including cleared ones."""
-    size = as_table(manifest.get(CLEARED)).get("bytes_before")
-    return size if isinstance(size, int) else listed_bytes(manifest)
 
 
 def cleared_facts(before: Mapping[str, Any]) -> dict[str, Any]:

@@ -104,9 +104,9 @@ class RunDraft:
 
     def _write_manifest(self, rests_on: Mapping[str, str] | None, facts: Mapping[str, Any]) -> None:
         """Write the manifest; its size depends on files and facts alone."""
-        final, content = self.published, {"run": self.id, "rests_on": dict(rests_on or {}), **plain(facts)}
+        content = {"run": self.id, "rests_on": dict(rests_on or {}), **plain(facts)}
         if self.extends:
-            content |= extended_facts(read_manifest(final), manifest_sha256(final))
+            content |= extended_facts(read_manifest(self.published), manifest_sha256(self.published))
         write_manifest(self.folder, content)
 
     def abandon(self) -> None:

@@ -74,8 +74,8 @@ def unknown_name(names: Sequence[str]) -> str:
 
 def with_unknown(legend: ClassNames) -> ClassNames:
     """Return the classes and one more, for out-of-distribution pixels."""
-    names, colour = (*legend.names, unknown_name(legend.names)), np.array([UNKNOWN_COLOUR], np.uint8)
-    return ClassNames(names, np.vstack([legend.colours, colour]))
+    colours = np.vstack([legend.colours, np.array([UNKNOWN_COLOUR], np.uint8)])
+    return ClassNames((*legend.names, unknown_name(legend.names)), colours)
 
 
 def create_class_map(

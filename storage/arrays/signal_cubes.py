@@ -149,10 +149,10 @@ class SignalCube(StoredSweep):
     @cached_property
     def references(self) -> References:
         """Dark and white frames."""
-        shared, group = self.group.attrs.get(FRAMES_OF), self.group
+        shared = self.group.attrs.get(FRAMES_OF)
         if shared is not None and self.path is not None:
-            group = open_group(self.path.with_name(f"{shared}.zarr"))
-        return read_references(group)
+            return read_references(open_group(self.path.with_name(f"{shared}.zarr")))
+        return read_references(self.group)
 
     @property
     def shape(self) -> tuple[int, int, int]:

@@ -68,7 +68,7 @@ def write_cog(path: Path, image: CogImage, blocks: Blocks) -> None:
 
 
 def _write_cog(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> None:
-    copy, sidecar = importlib.import_module("rasterio.shutil").copy, f"{path.name}.aux.xml"
+    sidecar = f"{path.name}.aux.xml"
     with written_aside(path.parent, [path.name] if image.legend is None else [path.name, sidecar]) as aside:
         plain, made = aside / "plain.tif", aside / path.name
         _write_plain(rasterio, plain, image, blocks)
@@ -79,7 +79,7 @@ def _write_cog(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> No
             "BLOCKSIZE": str(TILE),
             "NUM_THREADS": "1",
         }
-        copy(str(plain), str(made), driver="COG", **options)
+        importlib.import_module("rasterio.shutil").copy(str(plain), str(made), driver="COG", **options)
         with rasterio.open(plain) as wanted, rasterio.open(made) as found:
             same = all(  # tile by tile: a tile holds every band
                 np.array_equal(

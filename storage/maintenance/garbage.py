@@ -70,7 +70,13 @@ def clear_up(
             for number, removal in enumerate(plan.removals):
                 if progress is not None:
                     progress(removal, number / len(plan.removals))
-                if _remove(archive, removal):
+                if removal.what == "store":
+                    path = archive.root / removal.uri
+                    ref = StageRef(path.parent.name, path.name, path)
+                    removed = archive.discard(ref, wait=False, unnamed=True)
+                else:
+                    removed = archive.drop_leftover(removal.uri)
+                if removed:  # else another process holds it
                     gone.append(removal)
             for lock in archive.root.glob(".locks/*-*.lock"):  # of stores and runs, which nobody makes meanwhile
                 lock.unlink(missing_ok=True)
@@ -131,11 +137,3 @@ def _obstacle(archive: Archive, catalogue: Catalogue, kept: Iterable[str]) -> st
         if (problem := catalogue.stores[uri].problem) is not None:
             return f"no store is removed: the inputs of {uri} are not known ({problem}); run verify --repair"
     return None
-
-
-def _remove(archive: Archive, removal: Removal) -> bool:
-    """Remove one thing; False where another process holds it."""
-    if removal.what == "store":
-        path = archive.root / removal.uri
-        return archive.discard(StageRef(path.parent.name, path.name, path), wait=False, unnamed=True)
-    return archive.drop_leftover(removal.uri)

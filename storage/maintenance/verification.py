@@ -41,7 +41,7 @@ def verify_everything(
 
     ``problems_of`` reads one published folder whose files lie elsewhere, as in a bucket.
     """
-    read_again, catalogue = problems_of or _problems, Catalogue.read(root)
+    catalogue = Catalogue.read(root)
     places = [(uri, store.ref.path, store.size) for uri, store in catalogue.stores.items()]
     places += [(run.uri, run.folder, listed_bytes(run.facts) if run.facts else 0) for run in catalogue.runs]
     total, done = sum(size for *_, size in places) or 1, 0
@@ -50,13 +50,19 @@ def verify_everything(
         if progress is not None:
             progress(uri, done / total)
         done += size
-        problems = list(read_again(path))
+        problems = list((problems_of or _problems)(path))
         if not path.exists() and not catalogue.named_by(uri):
             continue  # gc or a repair has cleared it away since
         found += [Finding(uri, problem, "broken") for problem in problems]
         if not problems:
             found.append(Finding(uri, None))
-    return [*found, *_without_manifest(root), *_missing(catalogue)]
+    for path in without_manifest(root):
+        uri = path.relative_to(root).as_posix()
+        if path.is_dir():
+            found.append(Finding(uri, f"{MANIFEST_NAME} is missing", "broken"))
+        else:
+            found.append(Finding(uri, "expected a folder with a manifest; take it out of the archive", "stray"))
+    return [*found, *_missing(catalogue)]
 
 
 def _problems(folder: Path) -> Iterator[str]:
@@ -68,15 +74,6 @@ def _problems(folder: Path) -> Iterator[str]:
     found = [f"{name} {problem}" for name, problem in broken_files(folder, manifest, hashes=True)]
     changed = found and try_manifest(folder)[0] != manifest  # cleared meanwhile, or made anew
     yield from _problems(folder) if changed else found
-
-
-def _without_manifest(root: Path) -> Iterator[Finding]:
-    for path in without_manifest(root):
-        uri = path.relative_to(root).as_posix()
-        if path.is_dir():
-            yield Finding(uri, f"{MANIFEST_NAME} is missing", "broken")
-        else:
-            yield Finding(uri, "expected a folder with a manifest; take it out of the archive", "stray")
 
 
 def _missing(catalogue: Catalogue) -> Iterator[Finding]:
@@ -179,7 +176,8 @@ def repair(
         done = Repaired(plan)
         for uri in plan.remade:
             archive.discard(archive.ref(*uri.split("/")[1:]))
-    there, repeated = {run.uri for run in Catalogue.read(archive.root).runs} | set(plan.broken_runs), dict[str, str]()
+    there = {run.uri for run in Catalogue.read(archive.root).runs} | set(plan.broken_runs)
+    repeated: dict[str, str] = {}
     surveys = {_settings_text(run): run for run in plan.surveys}
 
     def run_again(text: str) -> None:

@@ -142,11 +142,11 @@ def check_picture(shape: tuple[int, ...], where: object) -> None:
     """Refuse a scene of one band that is a table of spectra (SceneError)."""
     if max(shape) < max(MOST_UNEVEN * min(shape), 1000):
         return
-    bands, turned = min(shape), ".T" if shape[0] < shape[1] else ""
+    turned = ".T" if shape[0] < shape[1] else ""
     raise SceneError(
         f"{where} is a table of {shape[0]} x {shape[1]} numbers, expected a picture (y, x) or a cube (y, x, band)."
-        f" If its {'columns' if turned else 'rows'} are spectra, store a cube: "
-        f"numpy.reshape(values{turned}, (height, width, {bands}), order='F'), or order='C' if pixels go along the rows"
+        f" If its {'columns' if turned else 'rows'} are spectra, store a cube: numpy.reshape(values{turned}, "
+        f"(height, width, {min(shape)}), order='F'), or order='C' if pixels go along the rows"
     )
 
 
@@ -161,9 +161,10 @@ def _hdf_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
             return
         about, is_text = _plain(item.attrs), item.dtype.kind in "SO" and not item.ndim
         if (item.dtype.kind in "buif" or is_text) and not str(about.get("NAME", "")).startswith(_ONLY_A_DIMENSION):
-            attributes, chunks = {**about, **_as_cf(about, item)}, item.chunks or (1,) * item.ndim
-            where, read = f"{path}:{name}", partial(_read, path, name)
-            arrays[name] = FileArray(where, item.shape, item.dtype, attributes, read, chunks, stored)
+            attributes = {**about, **_as_cf(about, item)}
+            chunks = item.chunks or (1,) * item.ndim
+            read = partial(_read, path, name)
+            arrays[name] = FileArray(f"{path}:{name}", item.shape, item.dtype, attributes, read, chunks, stored)
 
     with h5py.File(path, "r") as file:
         file.visititems(visit)  # follows hard links alone

@@ -67,7 +67,8 @@ def open_envi_cube(path: str | Path) -> EnviCube:
         raise SceneError(f"{header_path} describes a spectral library, expected a cube (line, sample, band)")
     size, item = data_path.stat().st_size - header.offset, header.dtype.itemsize
     samples, bands, line_bytes = header.samples, header.bands, header.line_bytes
-    promised, whole = size // line_bytes if header.lines is None else header.lines, size // line_bytes
+    whole = size // line_bytes
+    promised = whole if header.lines is None else header.lines
     if header.interleave == "bsq":  # only lines of the last band are missing
         whole = max(size - (bands - 1) * promised * samples * item, 0) // (samples * item)
     held = min(promised, max(whole, 0))

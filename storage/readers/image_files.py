@@ -76,7 +76,7 @@ def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> Cub
         alpha = kinds.index("alpha") if "alpha" in kinds else None
         keep = [band for band in range(file.count) if band != alpha]
         kind = np.result_type(*(np.dtype(file.dtypes[band]) for band in keep or [0]))
-        height, width, count = file.height, file.width, len(keep) * len(pages)
+        height, width = file.height, file.width
         geobox, where = place_of_file(file)
         one = len(pages) == 1
         known, of_bands = _bands_of(file, keep, [kinds[band] for band in keep], path) if one else (Bands(), ())
@@ -95,7 +95,7 @@ def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> Cub
         bad = set(bad_bands(_file_tags(file).get("bbl"), file.count))
         source = CubeSource(
             name=path.name,
-            shape=(height, width, count),
+            shape=(height, width, len(keep) * len(pages)),
             dtype=kind,
             read=read_by_chunks(read_rows, height, at_once),
             files=(path,),

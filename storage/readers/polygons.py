@@ -208,7 +208,8 @@ def _labels_in(address: str | Path) -> PolygonLayer:
 
 def _classes_in(layer: PolygonLayer, address: str | Path, settings: SceneSettings) -> tuple[str, list[str]]:
     """Return the class attribute and each polygon's value of it, empty without one."""
-    by_word, stated = {name.lower(): name for name in reversed(layer.fields)}, settings.class_attribute
+    by_word = {name.lower(): name for name in reversed(layer.fields)}
+    stated = settings.class_attribute
     found = next((by_word[word] for word in CLASS_ATTRIBUTES if word in by_word), None) if stated is None else stated
     if found is None or found not in layer.fields:
         wanted = "an attribute that says the class" if stated is None else f"the attribute {stated!r}"

@@ -283,8 +283,8 @@ class PointingTable:
                 "line, with valid = 0 for those to be left out"
             )
         if "line" in self.columns:
-            order = np.argsort(self.columns["line"][rows], kind="stable")
-            wrong, rows = self.columns["line"][rows][order] != np.arange(lines), rows[order]
+            rows = rows[np.argsort(self.columns["line"][rows], kind="stable")]
+            wrong = self.columns["line"][rows] != np.arange(lines)
             self._refuse(rows, wrong, "line", f"expected each of 0 to {lines - 1} once")
         valid = np.ones(lines, np.bool_)
         if "valid" in self.columns:

@@ -222,7 +222,7 @@ def _open_files(path: Path, camera: LineCamera, given: RecordedWith) -> Recordin
 
 def _point(cube: RecordedFile, given: RecordedWith, notes: list[str], *, alone: bool) -> LinePointing | None:
     """Return the pointing of a cube by the file given, else by one with the cube's name, else None."""
-    file, lines = given.pointing, cube.source.shape[0]
+    file = given.pointing
     if file is not None and file.is_dir():
         folder, names = file, [f"{cube.name}{middle}{end}" for middle in ("", ".pointing") for end in ENDINGS]
         file = next((folder / name for name in names if (folder / name).is_file()), None)
@@ -235,7 +235,7 @@ def _point(cube: RecordedFile, given: RecordedWith, notes: list[str], *, alone: 
     if not file.is_file():
         raise SceneError(f"there is no pointing table {file}; check the name (seen from {Path.cwd()})")
     notes.append(f"{cube.name}: pointing from {file.name}")
-    return load_pointing_table(file).of_cube(cube.name, lines, given.mounting, alone=alone)
+    return load_pointing_table(file).of_cube(cube.name, cube.source.shape[0], given.mounting, alone=alone)
 
 
 def _without_mirror(
@@ -295,7 +295,8 @@ def _sweeps_of(
         notes.append(f"{cube.name}: nothing says the exposure: {camera.exposure_ms:g} ms is assumed")
         known_ms = np.full(source.shape[0], camera.exposure_ms)
     exposure_ms = np.where(np.isfinite(known_ms), known_ms, np.nanmedian(known_ms))
-    white, stem = np.asarray(given.white_reference, np.float32), cube.folder / cube.name
+    white = np.asarray(given.white_reference, np.float32)
+    stem = cube.folder / cube.name
     references = find_references(source, stem, camera, notes, stated=given.frames, white_reference=white)
     names = (cube.name,) if pointing.part is None else tuple(name for name in dict.fromkeys(pointing.part) if name)
     fields = load_envi_header(find_envi_pair(cube.path)[0]).fields if reader_of(cube.path) == "envi" else {}

@@ -148,8 +148,8 @@ def with_stated_values(source: CubeSource, address: str | Path) -> CubeSource:
             f"{settings.path} has a scale or offset, and {address} dark or white frames, so its numbers are stored as "
             "they are; remove scale and offset from the scene.toml"
         )
-    kind, notes = np.dtype(np.float32), (*source.notes, *values.notes(Path(SETTINGS_NAME))[0])
-    return replace(source, read=values.read, dtype=kind, nodata=None, scaling=scaling, notes=notes)
+    notes = (*source.notes, *values.notes(Path(SETTINGS_NAME))[0])
+    return replace(source, read=values.read, dtype=np.dtype(np.float32), nodata=None, scaling=scaling, notes=notes)
 
 
 def _light_hash(
@@ -161,9 +161,9 @@ def _light_hash(
     """
     assert light.wavelength_nm is not None
     widths = None if light.fwhm_nm is None else light.fwhm_nm.tolist()
-    nodata, void = values.nodata if values.assumed and used else stated, values.void
+    nodata = values.nodata if values.assumed and used else stated
     more = [] if nodata is None else [f"nodata {nodata!r}"]
-    more += [] if void is None else [f"void {hashlib.sha256(np.packbits(void).tobytes()).hexdigest()}"]
+    more += [] if values.void is None else [f"void {hashlib.sha256(np.packbits(values.void).tobytes()).hexdigest()}"]
     more += [one for one in (values.source.scaling, values.scaling) if one]
     return _digest(content, variable, values.bands, light.wavelength_nm.tolist(), widths, *more)
 

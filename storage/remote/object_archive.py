@@ -409,7 +409,8 @@ class ObjectArchive(Archive):
     def _upload(self, uri: str, *, first: bool) -> None:
         """Upload a folder's files, then its manifest; ``first`` by a conditional put, else in place of the old one."""
         folder, objects = self.root / uri, self.objects
-        text, files = (folder / MANIFEST_NAME).read_bytes(), read_manifest(folder)["files"]
+        text = (folder / MANIFEST_NAME).read_bytes()
+        files = read_manifest(folder)["files"]
         check_files(folder, hashes=True)
         place, there = _files_at(uri, text), objects.listing(uri)
         sizes = {path: one.size for path, one in there.items()}

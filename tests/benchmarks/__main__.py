@@ -1,7 +1,7 @@
-"""Run the benchmarks beside this file and print one table: python tests/benchmarks [name ...] [--markdown FILE].
+"""Run the benchmarks in this folder and print one table: python tests/benchmarks [name ...] [--markdown FILE].
 
-A name is what follows bench_. A goal that is missed is printed like one that is met; a benchmark that crashes is named,
-the others go on, and the exit code is 1.
+A name is the part of the file name after bench_. Missed goals are printed too. A benchmark that crashes is named, the
+others still run, and the exit code is 1.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-# Before numpy and torch are loaded: one thread, as the figures are meant.
+# One thread, set before numpy and torch are loaded, as all figures are for one thread.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 HERE = Path(__file__).resolve().parent
@@ -30,7 +30,7 @@ MET = {True: "yes", False: "NO", None: "-"}
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the benchmarks asked for, or all; print the table and write it as Markdown where asked."""
+    """Run the requested benchmarks, or all; print the table, and write it as Markdown if a file is given."""
     parser = argparse.ArgumentParser(prog="python tests/benchmarks", description="Benchmarks with goals and peers.")
     parser.add_argument("names", nargs="*", help="benchmarks to run, as in bench_NAME.py; all where none is given")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the table as Markdown as well")
@@ -77,7 +77,7 @@ def _summarise(tables: dict[str, Sequence[Row]], failed: Sequence[str]) -> None:
 
 
 def _machine() -> str:
-    """Processor, cores, load and versions, on one line."""
+    """Return processor, cores, load and versions in one line."""
     from flows.tradeoff.entries import describe_machine, mean_load
 
     it: dict[str, Any] = describe_machine(threads=1)

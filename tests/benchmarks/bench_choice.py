@@ -1,7 +1,7 @@
-"""Share of the patches that a policy reads in full for a mean loss of .3 points, by one threshold for all fields.
+"""Fraction of patches that a policy reads in full for a mean loss of 0.3 points, with one threshold for all fields.
 
-Half of the fields are farms, half are fields of scouting; all are on odd days, which no training saw. Each is read as
-captured with 100 ms, and as simulated with 10 ms.
+Half of the fields are farms, half are scouting fields, all on odd days, which are not in the training data. Each one
+is read as captured with 100 ms, and as simulated with 10 ms.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def fields() -> list[ReadTwice]:
 
 
 def losses(scenes: list[ReadTwice], policy: str, least: float) -> tuple[float, list[float]]:
-    """Return the share of patches at or above a threshold, and the loss of mIoU of each field."""
+    """Return the fraction of patches at or above a threshold, and the loss of mIoU of each field."""
     chosen = [scene.scores[policy] >= least for scene in scenes]
     classes = int(max(scene.full.max() for scene in scenes)) + 1
     full = [mean_iou(scene.counts(np.ones_like(some), classes)) for scene, some in zip(scenes, chosen, strict=True)]

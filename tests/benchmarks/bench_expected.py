@@ -1,8 +1,8 @@
-"""Expected scores of uniform scans of 16 farms and 16 fields of scouting, each by the calibration of the other 31.
+"""Expected scores of uniform scans of 16 farms and 16 scouting fields, each by the calibration of the other 31 scenes.
 
-These are the validation scenes of `train farm@2,scouting@1 --validation 32`, which no training of the shipped weights
-saw. `python tests/benchmarks/bench_expected.py` also fits the numbers of `PRESENT` anew. With a file of weights behind
-it, it writes the calibration table of all scenes into the file. It takes twenty minutes of one core.
+These are the validation scenes of `train farm@2,scouting@1 --validation 32`, which are not in the training data of the
+shipped weights. `python tests/benchmarks/bench_expected.py` also refits the numbers of `PRESENT`. For each file of
+weights that is given, it writes the calibration table of all scenes into the file. It takes twenty minutes of one core.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from pipeline.geometry.grid import SceneGrid
 SCENES, SEED, DARKEST_MS, GOAL = 32, 4, 3.0, 0.85
 SCANS = [(step, light * REFERENCE_MS) for step in STEPS for light in SCAN_EXPOSURES]
 LIKELIEST = (-3.92, 1.32, 0.89, 0.48, 0.87)  # numbers of `PRESENT` by the likelihood of presence: the start of the fit
-HUBER, HELD, OF_EIGHT = 3.0, 0.02, 0.3  # points of larger errors; weight of the start, and of lines 8 px apart
+HUBER, HELD, OF_EIGHT = 3.0, 0.02, 0.3  # limit of linear errors [points]; weight of the start, and of lines 8 px apart
 Scans = dict[tuple[int, float], ScoredMap]
 
 
@@ -58,18 +58,18 @@ def scenes() -> dict[str, Scans]:
 
 
 def calibration(names: Sequence[str]) -> MapScores:
-    """Fit the calibration table to some scenes."""
+    """Fit the calibration table to the given scenes."""
     return MapScores.fitted({scan: [scenes()[name][scan] for name in names] for scan in SCANS})
 
 
 def rows() -> list[Row]:
-    """Return the errors of the scenes of each kind, by lines 1, 2 and 4 px apart."""
+    """Return the errors of the scenes of each kind, for line spacings of 1, 2 and 4 px."""
     off: dict[str, list[tuple[float, float]]] = {"farms": [], "scouting": []}
     for name, maps in scenes().items():
         scores = calibration([other for other in scenes() if other != name])
         for (step, exposure_ms), one in maps.items():
             told = scores.expected(one.expected, step, exposure_ms)
-            if step < 8 and told is not None and told.error <= 0.1:  # else it is not given
+            if step < 8 and told is not None and told.error <= 0.1:  # else the survey does not give it
                 error = 100 * (told.miou - mean_iou(one.counts)), 100 * told.error
                 off["scouting" if name.startswith("scouting") else "farms"].append(error)
     found = []
@@ -82,7 +82,7 @@ def rows() -> list[Row]:
 
 
 def present() -> tuple[float, ...]:
-    """Fit the numbers of `PRESENT`: least errors of the mIoU, the largest of them linearly."""
+    """Fit the numbers of `PRESENT`: the least error of the mIoU, with large errors counted linearly (Huber)."""
     known = list(scenes())
     bias = {
         (name, scan): fitted_bias([scenes()[one][scan] for one in known if one != name])

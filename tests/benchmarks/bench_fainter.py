@@ -1,6 +1,6 @@
-"""What it brings to state short exposures as fainter than they are: factors of the octaves.
+"""Gain from treating short exposures as fainter than they are: factors on the light's octaves.
 
-Farms 51 to 53 chose the factor `FAINTER`; farms 0 and 41 to 43 check it.
+Farms 51 to 53 gave the factor `FAINTER`; farms 0 and 41 to 43 check it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ SEEDS, SECONDS, FACTORS = (51, 52, 53, 0, 41, 42, 43), (8, 12, 16, 25), (1.0, FA
 
 
 def scores(seed: int, seconds: float) -> list[float]:
-    """Return the mIoU [%] of one scan by each factor, every patch read in full."""
+    """Return the mIoU [%] of one scan for each factor, with every patch read in full."""
     found = []
     with tempfile.TemporaryDirectory() as out:
         asked = {"scene": "farm", "seed": seed, "seconds": seconds, "expected_loss": 0, "engine": "plain", "out": out}
@@ -29,7 +29,7 @@ def scores(seed: int, seconds: float) -> list[float]:
         for factor in FACTORS:
             with mock.patch("models.reading.inference.FAINTER", factor):
                 found.append(100 * float(run_survey(settings, Console(quiet=True)).receipt["accuracy"]["miou"]))
-            for stage in ("segment", "evaluate"):  # their keys do not say the factor
+            for stage in ("segment", "evaluate"):  # their keys do not contain the factor
                 shutil.rmtree(Path(out) / "stages" / stage)
     return found
 

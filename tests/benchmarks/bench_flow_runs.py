@@ -1,4 +1,4 @@
-"""What Prefect adds to a survey: processor time of the command with and without it, as whole processes in turn."""
+"""Processor time that Prefect adds to a survey: the whole command with and without it, in turn."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ SURVEY = ("survey", "--scene", "farm", "--size", "64x64", "--scan-step", "1", "-
 
 
 def rows() -> list[Row]:
-    """On an archive that has no server's files yet, and on one that has; stages are stored, so that they cost alike."""
+    """Measure an archive without a server's files, and one with them; stages are stored, so that they cost the same."""
     with tempfile.TemporaryDirectory() as name:
         archive = Path(name) / "archive"
         (Path(name) / "prefect").mkdir()
-        (Path(name) / "prefect" / "__init__.py").write_text(WITHOUT)  # in its place for --engine plain: no import of it
-        for engine in ("plain", "prefect"):  # stores, compiled loops and bytecode are there before anything is timed
+        (Path(name) / "prefect" / "__init__.py").write_text(WITHOUT)  # instead of Prefect for --engine plain: no import
+        for engine in ("plain", "prefect"):  # make stores, compiled loops and bytecode before the timing
             _processor_s(archive, engine)
         new: list[float] = []
         used: list[float] = []
@@ -46,7 +46,7 @@ def _row(what: str, spent: list[float], goal_s: float) -> Row:
 
 
 def _processor_s(archive: Path, engine: str) -> float:
-    """User and system seconds of one command, with all that it starts."""
+    """Return the user and system seconds of one command and its children."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     command = [sys.executable, "-m", "flows.cli.main", *SURVEY, "--engine", engine, "--out", str(archive)]
     found_first = {"PYTHONPATH": str(archive.parent)} if engine == "plain" else {}

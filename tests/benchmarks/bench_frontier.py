@@ -1,12 +1,12 @@
-"""The map that a survey draws in its seconds, beside what anybody would do with them: uniform scans, exposed shorter.
+"""The map of `survey --seconds` compared with uniform scans of shorter exposures or wider line spacings.
 
-A uniform scan takes every line, every second or every fourth, not binned, with one exposure; its whole picture is read.
-`survey --seconds` takes the one that the weights' record promises most of: it stands beside all that were tried. Farms
-that training never saw, each with noise of its own. Below stands how far what each map says of itself lies from what
-it scores.
+A uniform scan takes every line, every second or every fourth, without binning, with one exposure. All patches are read.
+`survey --seconds` takes the scan with the highest expected mIoU in the weights' record, and is compared with all tried
+scans. The farms are not in the training data, and each has its own noise. The last rows compare the expected mIoU of
+all maps with the measured one.
 
-`python tests/benchmarks/bench_frontier.py 1280x1024` draws the map of `survey --seconds` alone, on larger farms;
-with a file of weights behind it by these.
+`python tests/benchmarks/bench_frontier.py 1280x1024` draws only the map of `survey --seconds`, on larger farms,
+by the shipped weights or by a file of weights.
 """
 
 from __future__ import annotations
@@ -43,17 +43,17 @@ SHAPE, SEEDS = (512, 640), (1, 2, 3)
 CAMERA, COST = LineCamera(), CostModel()
 STEPS = (1, 2, 4)
 EXPOSURES_MS = (100.0, 70.0, 50.0, 35.0, 25.0, 17.0, 14.0, 12.0, 10.0, 8.0, 6.0, 5.0, 4.0, 3.0)
-FEWER_MS = (100.0, 25.0, 10.0, 6.0, 3.0)  # of fields of scouting
+FEWER_MS = (100.0, 25.0, 10.0, 6.0, 3.0)  # of scouting fields
 SECONDS = (3.5, 5.0, 8.0, 15.0, 28.0)  # of surveys that choose their scan
-SLACK = 0.3  # points of mIoU that such a survey may lie below the best uniform scan tried
-LARGE = {107.0: 95.2, 56.0: 95.0, 29.0: 94.3, 20.5: 93.3, 14.0: 91.5, 10.0: 89.0, 8.0: 85.0}  # of 1280 x 1024: goals
+SLACK = 0.3  # points of mIoU that such a survey may be below the best uniform scan
+LARGE = {107.0: 95.2, 56.0: 95.0, 29.0: 94.3, 20.5: 93.3, 14.0: 91.5, 10.0: 89.0, 8.0: 85.0}  # goals for 1280 x 1024 px
 BANDS = 270
-RMS, WITHIN, HELD = 0.85, 1.645, 0.9  # goals of what maps say of themselves; 90 % lie within so many of their errors
+RMS, WITHIN, HELD = 0.85, 1.645, 0.9  # goals of the expected mIoU; 90 % are within so many standard errors
 
 
 @dataclass(frozen=True)
 class PlanMap:
-    """A map by a plan: seconds of the camera, mIoU, and what it says of itself, in percent."""
+    """Results of a plan: seconds of the camera, measured mIoU, expected mIoU and its error, in percent."""
 
     seconds: float
     miou: float
@@ -61,11 +61,11 @@ class PlanMap:
     error: float = np.nan
 
 
-Judged = list[PlanMap]  # of each farm
+Judged = list[PlanMap]  # one for each farm
 
 
 def rows() -> list[Row]:
-    """Every plan by its seconds; a survey's goal is the best uniform scan that takes no longer."""
+    """Return every plan by its seconds; a survey's goal is the best uniform scan of at most the same seconds."""
     plain = {
         format_scan(step, exposure_ms): [_plain(seed, step, exposure_ms) for seed in SEEDS]
         for step in STEPS
@@ -89,14 +89,14 @@ def rows() -> list[Row]:
 
 
 def _beside(plain: Mapping[str, Judged], what: str, one: Judged) -> tuple[float, Row]:
-    """Seconds and the row of a survey whose goal is the best uniform scan that takes no longer, less some slack."""
+    """Return a survey's seconds and row; the goal is the best uniform scan of at most the same seconds, less SLACK."""
     best, by = max((_mean(other), said) for said, other in plain.items() if _seconds(other) <= _seconds(one) + 1e-9)
     goal = f">= {best - SLACK:.1f}, {by}, less {SLACK:g}"
     return _seconds(one), Row(what, _figure(one), goal, _mean(one) >= best - SLACK)
 
 
 def _told_row(where: str, maps: Judged) -> Row:
-    """How far what maps say of themselves lies from what they score."""
+    """Return the row that compares the expected mIoU of maps with their measured mIoU."""
     off = np.array([one.expected - one.miou for one in maps])
     held = np.abs(off) <= WITHIN * np.array([one.error for one in maps])
     rms = float(np.sqrt(np.mean(off**2)))
@@ -106,7 +106,7 @@ def _told_row(where: str, maps: Judged) -> Row:
 
 
 def large_rows(shape: tuple[int, int], goals: dict[float, float], weights: Weights) -> Iterator[Row]:
-    """The map of `survey --seconds` on farms of (y, x) px, for each of the seconds, beside a goal in mIoU."""
+    """Yield the rows of `survey --seconds` on farms of (y, x) px, each with its goal in mIoU."""
     for seconds, goal in goals.items():
         scan = chosen_scan(shape, seconds, weights)
         judged = [
@@ -118,12 +118,12 @@ def large_rows(shape: tuple[int, int], goals: dict[float, float], weights: Weigh
 
 @cache
 def shipped() -> Weights:
-    """The weights that come with SpectralZoom."""
+    """Return the weights that come with SpectralZoom."""
     return load_weights(shipped_weights())
 
 
 def chosen_scan(shape: tuple[int, int], seconds: float, weights: Weights | None = None) -> UniformScan:
-    """The scan that a survey of so many seconds takes, by the weights for uniform scans or others."""
+    """Return the scan that a survey of these seconds takes, by the shipped weights or others."""
     weights = weights or shipped()
     grid = SceneGrid(*shape, weights.config.patch)
     along, _, _ = cheapest_full(grid, CAMERA, COST)
@@ -152,7 +152,7 @@ def _figure(judged: Judged) -> str:
 
 @cache
 def scores() -> MapScores:
-    """How what maps by the shipped weights expect of themselves came true."""
+    """Return the calibration of the expected mIoU of the shipped weights."""
     ood_detector = describe_weights(shipped_weights()).ood_detector
     assert ood_detector is not None
     assert ood_detector.map_scores is not None
@@ -161,14 +161,14 @@ def scores() -> MapScores:
 
 @cache
 def _plain(seed: int, step: int, exposure_ms: float) -> PlanMap:
-    """The map of a farm's uniform scan."""
+    """Return the results of a farm's uniform scan."""
     return map_of(farm_scene(seed, SHAPE, camera=CAMERA), seed, step, exposure_ms)
 
 
 def scanned(
     scene: RasterScene, weights: Weights, seed: int, step: int, exposure_ms: float
 ) -> tuple[PlannedPass, DrawnMap]:
-    """A uniform scan of a scene, and the map of it with every patch read."""
+    """Scan a scene uniformly; return the pass and its map with every patch read in full."""
     grid, rig = SceneGrid(*scene.shape, weights.config.patch), Rig(CAMERA)
     along, _, _ = cheapest_full(grid, CAMERA, COST)
     sweeps = uniform_sweeps(grid, CAMERA, along, step=step, exposure_ms=exposure_ms)
@@ -180,7 +180,7 @@ def scanned(
 
 
 def map_of(scene: RasterScene, seed: int, step: int, exposure_ms: float, weights: Weights | None = None) -> PlanMap:
-    """The map of a scene's uniform scan; what it says of itself by the house's own weights alone."""
+    """Return the results of a uniform scan; the expected mIoU is known only for the shipped weights."""
     others, weights = weights is not None, weights or shipped()
     scan_pass, drawn = scanned(scene, weights, seed, step, exposure_ms)
     assert scene.labels is not None
@@ -194,7 +194,7 @@ def map_of(scene: RasterScene, seed: int, step: int, exposure_ms: float, weights
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Draw maps of larger farms, WIDTHxHEIGHT, by some weights, and print them beside their goals."""
+    """Draw maps of larger farms, WIDTHxHEIGHT, by the given weights, and print them with their goals."""
     size, *others = arguments
     width, height = (int(side) for side in size.split("x"))
     for row in large_rows((height, width), LARGE, load_weights(Path(others[0])) if others else shipped()):

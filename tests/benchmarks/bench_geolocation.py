@@ -1,4 +1,4 @@
-"""Lookup: error against reflected rays and time a pixel, beside the nearest sample out of a KD-tree."""
+"""Geolocation grid: error against reflected rays, and time per pixel compared with the nearest sample of a KD-tree."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Floats = NDArray[np.float64]
 
 
 def rows() -> list[Row]:
-    """Error and time of the ties."""
+    """Return the rows for error and time of the tie points."""
     tangents = np.stack(np.broadcast_arrays(SWATH, np.arange(float(LINES))), axis=-1) * CAMERA.ifov_rad
     (scan_path,) = make_scan_paths(direction_to_position(scene_to_direction(tangents)), CAMERA, step_px=1.0)
     truth = _by_reflected_rays(path_geolocation(scan_path, CAMERA, _pixels(), along="x"))
@@ -52,7 +52,7 @@ def _pixels(**grid: Any) -> Floats:
 
 
 def _samples() -> Floats:
-    """Where every sample of every line looks, (line * sample, 2) y and x [px]: what the tree is built of."""
+    """Return the scene position of every sample of every line, (line * sample, 2) y and x [px], for the tree."""
     x, y = points_of_scan(SWATH, CAMERA, np.arange(float(LINES))[:, None], CAMERA.pixel_slopes()[None, :])
     return np.stack([y, x], axis=-1).reshape(-1, 2)
 
@@ -77,7 +77,7 @@ def _whole(table: TieTable) -> Floats:
 
 
 def _see(at: Floats) -> Floats:
-    """Points (..., 2) that the camera's rays at knot and sample meet: mirror, normal, reflection, one by one."""
+    """Return the points (..., 2) that the camera's rays at knot and sample meet, by mirror, normal and reflection."""
     tangents = np.stack(np.broadcast_arrays(SWATH, at[..., 0]), axis=-1) * CAMERA.ifov_rad
     normal = position_to_normal(direction_to_position(scene_to_direction(tangents)))
     slope = (at[..., 1] + 0.5 - CAMERA.samples / 2) * CAMERA.ifov_rad
@@ -86,7 +86,7 @@ def _see(at: Floats) -> Floats:
 
 
 def _by_reflected_rays(start: Floats) -> Floats:
-    """Knots and samples whose reflected rays meet the pixels, by Newton with differences: the forward model alone."""
+    """Return knots and samples whose reflected rays meet the pixels, by Newton steps on the forward model alone."""
     at, pixels, h = start.copy(), _pixels(), 0.5
     for _ in range(2):
         miss = _see(at) - pixels
@@ -100,7 +100,7 @@ def _by_reflected_rays(start: Floats) -> Floats:
 
 
 def _worst(found: Floats, truth: Floats) -> float:
-    """Greatest error [px]; infinite where pixels of one are not in the other, but for rounding at a sweep's edge."""
+    """Return the largest error [px]; infinite if other pixels are covered, except for rounding at a sweep's edge."""
     apart = np.isfinite(found) != np.isfinite(truth)
     return float(np.nanmax(np.abs(found - truth))) if apart.mean() < 1e-4 else np.inf
 

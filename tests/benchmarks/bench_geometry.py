@@ -1,4 +1,4 @@
-"""Geometry: the round trip over the mirror's disk, the line's rotation, and the paper's own forms beside them."""
+"""Geometry: the round trip over the mirror's disk and the line's rotation, compared with the paper's equations."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ def _disk(count: int, seed: int = 0) -> NDArray[np.float64]:
 
 
 def _angle(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
-    """Greatest angle between unit vectors. [rad]"""
+    """Return the largest angle between unit vectors. [rad]"""
     return float(np.linalg.norm(a.astype(np.float64) - b, axis=-1).max())
 
 
 def _round_trip(precision: type, goal: float) -> Row:
     position = _disk(COUNT).astype(precision)
     back = direction_to_position(position_to_direction(position))
-    # Both ends pulled in alike, for rounding may have put them beyond the rim in float64.
+    # Both ends are scaled by the same factor, as rounding may have put them beyond the rim in float64.
     ends = [position_to_direction(0.999999 * end.astype(np.float64)) for end in (position, back)]
     found = _angle(*ends)
     return Row(
@@ -55,7 +55,7 @@ def _round_trip(precision: type, goal: float) -> Row:
 
 
 def _paper_round_trip() -> float:
-    """Greatest angle between what is asked and what the device does with the paper's position."""
+    """Return the largest angle between the requested direction and that of the paper's position on the device."""
     asked = position_to_direction(_disk(2000) * 0.95)
     reached = paper_position(direction_to_normal(asked))
     kept = np.hypot(*reached.T) <= 1
@@ -76,7 +76,7 @@ def _fifty_digits() -> Row:
 
 
 def _rotation() -> list[Row]:
-    """The line's rotation against finite differences of reflected rays, and the paper's slope beside it."""
+    """Compare the line's rotation with finite differences of reflected rays, and with the paper's slope."""
     position = _disk(20_000)
     psi = line_rotation(position_to_direction(position))
     ends = reflect(np.array([[[0.0, -1e-5, 1.0]], [[0.0, 1e-5, 1.0]]]), position_to_normal(position)[None])
@@ -102,7 +102,7 @@ def _rotation() -> list[Row]:
 
 
 def _noise() -> tuple[float, float]:
-    """Line-end error by pose [px] and slope error [deg], rms, of 1450 lines over 1280 px with shaken normals."""
+    """Return rms errors of line ends by pose [px] and of slopes [deg]: 1450 lines over 1280 px with noisy normals."""
     eta = np.linspace(-640, 640, 1450) * IFOV
     direction = np.stack([np.ones_like(eta), np.full_like(eta, 1000 * IFOV), eta], axis=-1)
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)

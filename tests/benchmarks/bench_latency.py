@@ -1,4 +1,4 @@
-"""How long a rig waits between its last coarse line and the first position of the fine pass, on one emulated here."""
+"""Time from the last coarse line of an emulated rig to the first requested position of the fine pass."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PX, MOST_S = 2560, 5.0
 
 @dataclass
 class Moments:
-    """When what happened, by the wall clock."""
+    """Times of events on the wall clock."""
 
     last_exposure: float = 0.0
     last_line: float = 0.0
@@ -30,12 +30,12 @@ class Moments:
 
     @property
     def waited_s(self) -> float:
-        """From the last coarse line in the spool to the first position that is sent for a fine one."""
+        """Return the time from the last coarse line in the spool to the first position that is sent for a fine line."""
         return self.first_request - self.last_line
 
     @property
     def read_s(self) -> float:
-        """From the camera's last coarse exposure to its line in the spool."""
+        """Return the time from the camera's last coarse exposure to its line in the spool."""
         return self.last_line - self.last_exposure
 
 
@@ -50,7 +50,7 @@ def rows() -> list[Row]:
 
 
 def measure(px: int) -> Moments:
-    """Survey a farm through an emulated rig as far as the first fine position."""
+    """Survey a farm through an emulated rig until the first fine position."""
     from flows.settings.load import load_settings
 
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
@@ -66,12 +66,12 @@ def measure(px: int) -> Moments:
 
 
 class _AskedError(Exception):
-    """The fine pass was asked for: the rest of the survey is not measured."""
+    """Raised at the first fine path: the rest of the survey is not measured."""
 
 
 @contextmanager
 def _watched(moments: Moments) -> Iterator[None]:
-    """Take the time of exposures, lines and the first path of a fine sweep."""
+    """Record the times of exposures, lines and the first path of a fine sweep."""
     from pipeline.rig.capture_runner import CaptureRunner
     from storage.arrays.spool import Spool
 

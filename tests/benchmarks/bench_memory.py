@@ -1,7 +1,7 @@
-"""What a prior map is worth a week later: the fraction of the gap between a quick scan and a full one that it closes.
+"""Value of a prior map after a week: the fraction of the gap between a quick scan and a full one that it closes.
 
-A first visit takes every line with 25 ms. A week later a quick scan takes every second line with 5 ms, and a full scan
-of the same day stands beside it. Farms that no training saw, each with noise of its own, in three seasons.
+A first visit takes every line with 25 ms. A week later a quick scan takes every second line with 5 ms, and is compared
+with a full scan of the same day. The farms are not in the training data, each with its own noise, in three seasons.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from models.weights.files import load_reader
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 
 HOUR = 11.0
-ANEW, QUICK = (1, 25.0), (2, 5.0)  # step and exposure [ms]
+ANEW, QUICK = (1, 25.0), (2, 5.0)  # line spacing [px] and exposure [ms]
 FARMS, DAYS, LATER = range(71, 79), (110, 172, 255), 7  # days of April, June and September
-GOAL, LEAST, WORSE = 65, 45, -1  # mean and least fraction of the gap [%]; points that a class may lose
-LARGE_PX = 1000  # of 327 680
+GOAL, LEAST, WORSE = 65, 45, -1  # goals of the mean and least fraction [%]; points that a class may lose
+LARGE_PX = 1000  # px of a large class, of 327 680
 Classes = NDArray[np.uint8]
 
 
@@ -37,16 +37,16 @@ class Seen:
 
     @property
     def alone(self) -> Classes:
-        """The map of this scan alone."""
+        """Return the map of this scan alone."""
         return first_probabilities(self.observation).classes()[0]
 
     def counts(self, classes: Classes) -> NDArray[np.int64]:
-        """Confusion of a map of that day."""
+        """Return the confusion matrix of a map of that day."""
         return confusion(self.labels, classes, len(shipped().class_names))
 
 
 def view_farm(seed: int, day: int, how: tuple[int, float], noise: int) -> Seen:
-    """Scan a farm as it is on a day, read by the shipped weights."""
+    """Scan a farm on a given day, and read it by the shipped weights."""
     (step, exposure_ms), scene = how, farm_scene(seed, SHAPE, camera=CAMERA, day=day, hour=HOUR)
     scan_pass, drawn = scanned(scene, shipped(), seed + 1000 * day + 100_000_000 * noise, step, exposure_ms)
     assert drawn.log_probability is not None
@@ -56,7 +56,7 @@ def view_farm(seed: int, day: int, how: tuple[int, float], noise: int) -> Seen:
 
 
 def rows() -> Iterator[Row]:
-    """Fraction of the gap that the prior map closes after a week."""
+    """Yield the fraction of the gap that the prior map closes after a week."""
     closed, worst, large, reader = list[float](), list[float](), list[float](), load_reader(shipped_weights())
     for day in DAYS:
         scores: dict[str, list[float]] = {"old": [], "quick": [], "fused": [], "full": []}

@@ -1,10 +1,10 @@
-"""Print tables II and III of the paper: a coarse image, K patches read in full, and the map that both give.
+"""Print tables II and III of the paper: a coarse image, K patches read in full, and the resulting map.
 
-The fine image is reduced to 1/4 and 1/2 of its side by area means, 1024 to 256 and 512 px. The network reads that
-overview. A policy chooses K patches, which are read from fine pixels. Labels judge the map.
+The overview reads the fine image at 1/4 and 1/2 of its side, as area means: 1024 to 256 and 512 px.
+A policy chooses K patches, which are read from fine pixels. The map is scored by the labels.
 
-`make paper` runs it: the built-in farm, and CWFID where the data is there. PAPER="--data FOLDER" takes a folder of
-images, labels and scene.toml in their place, such as RANUS or HyKo; --help lists the other flags.
+`make paper` runs it for the built-in farm, and for CWFID if its data exist. PAPER="--data FOLDER" replaces them by a
+folder of images, labels and scene.toml, such as RANUS or HyKo; --help lists the other flags.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ from pipeline.geometry.grid import UNLABELLED, SceneGrid, patch_pixels
 from pipeline.planning.coverage import select_patches
 
 COUNTS = (100, 200, 300, 400, 500)
-NAMES = {4: "256", 2: "512", 1: "1024"}  # of inputs, by fine pixels to a coarse one
+NAMES = {4: "256", 2: "512", 1: "1024"}  # of inputs, by fine pixels a side of a coarse one
 HELD_OUT = ("002", "007", "012", "017", "020", "025", "033", "037", "041", "045", "050", "053", "057")  # of CWFID
 STEPS = 300
-POLICIES = {  # the paper's name, what computes it, and how a patch is pooled
+POLICIES = {  # the paper's name, the policy, and the pooling of a patch
     "ED, maximum": ("sobel", "maximum"),
     "ED, mean": ("sobel", "mean"),
     "SA (entropy), maximum": ("entropy", "maximum"),
@@ -60,7 +60,7 @@ Scores = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Readings:
-    """Maps of a scene by the overview alone and with every patch read in full; any choice of patches lies between."""
+    """A scene's maps by the overview alone and with every patch read in full; each choice of patches combines both."""
 
     seen: CoarsePrediction
     overview: NDArray[np.uint8]  # (y, x)
@@ -88,13 +88,13 @@ class Readings:
 
 
 def patch_maxima(pixels: Scores, grid: SceneGrid) -> Scores:
-    """Return the greatest score of each patch's pixels on the scene, (patch,)."""
+    """Return the greatest score of each patch's pixels within the scene, (patch,)."""
     greatest: Scores = patch_pixels(grid, pixels[: grid.height, : grid.width]).max(axis=(1, 2))
     return greatest
 
 
 def read_scene(weights: Weights, columns: Image, labels: NDArray[np.uint8], grid: SceneGrid, factor: int) -> Readings:
-    """Read normalised columns of the padded grid by an overview of coarse pixels, and all patches from fine ones."""
+    """Read normalised columns of the padded grid: the overview from coarse pixels, all patches from fine ones."""
     capture, every = LineSpec(step=factor, binned=factor), grid.every_patch()
     seen = coarse_prediction_of_columns(weights, coarse_image(columns, factor), grid, capture)
     fine = patches_of(columns, grid.patch)[every]
@@ -115,12 +115,12 @@ class Tally:
         return 100 * float(np.mean([of(np.sum(draw, axis=0)) for draw in zip(*self.counts, strict=True)]))
 
     def spread(self, of: Callable[[NDArray[np.int64]], float]) -> float:
-        """Return the standard deviation between scenes [%]; 0 of one alone."""
+        """Return the standard deviation between scenes [%]; 0 for a single scene."""
         each = [np.mean([of(counts) for counts in draws]) for draws in self.counts]
         return 100 * float(np.std(each, ddof=1)) if len(each) > 1 else 0.0
 
     def cells(self) -> tuple[str, ...]:
-        """Give the row's columns."""
+        """Return the row's columns."""
         right = [f"{self.figure(of):.1f} ±{self.spread(of):.1f}" for of in (mean_iou, overall_accuracy)]
         return *right, f"{np.mean(self.patches):.0f}", f"{np.mean(self.multiply_adds) / 1e9:.1f}"
 
@@ -129,7 +129,7 @@ Tallies = dict[tuple[int, str, str], Tally]  # by input, policy, and K
 
 
 def judge(data: DataSet, counts: Sequence[int], say: Say) -> Tallies:
-    """Judge every row on every scene."""
+    """Evaluate every row on every scene."""
     found: Tallies = {}
     config = data.weights.config
     for number, (name, make) in enumerate(data.scenes.items()):
@@ -164,7 +164,7 @@ def judge(data: DataSet, counts: Sequence[int], say: Say) -> Tallies:
 
 
 def table(data: DataSet, found: Tallies, counts: Sequence[int]) -> str:
-    """Set the rows in the paper's layout: both inputs side by side."""
+    """Format the rows in the paper's layout, with both inputs side by side."""
     head = ("mIoU [%]", "right [%]", "patches", "MACs")
     first = next(iter(POLICIES))
     lines = [tuple(cell for factor in INPUTS for cell in (f"1024 to {NAMES[factor]}", *head))]
@@ -192,7 +192,7 @@ def claims(data: DataSet, found: Tallies) -> list[Row]:
 
 
 def rows(arguments: Sequence[str] = ()) -> list[Row]:
-    """Print both tables and give the check of the claim."""
+    """Print both tables, and return the rows that check the claim."""
     asked = parser().parse_args(arguments)
     say = partial(print, file=sys.stderr, flush=True)
     keep_freed_memory()
@@ -216,7 +216,7 @@ def rows(arguments: Sequence[str] = ()) -> list[Row]:
 
 
 def parser() -> argparse.ArgumentParser:
-    """Return the flags."""
+    """Return the parser of the flags."""
     made = argparse.ArgumentParser(prog="make paper", description="Tables II and III of the paper.")
     made.add_argument("--data", type=Path, metavar="FOLDER", help="judge a folder of images, labels and scene.toml")
     made.add_argument("--weights", type=Path, metavar="FILE", help="weights of the folder, or of CWFID; else trained")

@@ -1,10 +1,10 @@
-"""Indian Pines, trained and judged on halves of the same fields: the segmenter beside LDA, SVM and random forest.
+"""Indian Pines, trained and tested on halves of the same fields: the segmenter against LDA, SVM and random forest.
 
-Two inputs, the same for everyone: the spectra of the file as they are, and what the simulated camera makes of them (its
-blur and noise), which is what surveys and `spectralzoom train` see. The peers read every band, pixel by pixel and
-averaged over 5 x 5 px; their settings are chosen on the training pixels alone, one half of each field against the
-other, as the test halves lie. bench_pines.py --weights FILE judges weights of the command instead of training some;
---halves trains on one half of the training fields and judges on the other, to choose settings.
+All methods read the spectra of the file, and those of the simulated camera with blur and noise, as in surveys and
+`spectralzoom train`. The peers read every band, as single pixels and as means of 5 x 5 px. Their
+settings are chosen on the training pixels alone, one half of each field against the other, like the test halves.
+`bench_pines.py --weights FILE` evaluates given weights instead of training some. `--halves` trains on one half of the
+training fields and evaluates on the other, to choose settings.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 SCENE, MASK = "Indian_pines_corrected.npy", "indianpines_disjoint_dset.mat"
 MASK_CLASSES = (2, 3, 5, 6, 8, 10, 11, 12, 14, 1, 4, 7, 9, 13, 15, 16)  # classes of the labels by the mask's numbers
-WINDOW = 5  # px a side, averaged for the second round of the peers
+WINDOW = 5  # px a side of the means in the second round of the peers
 FRACTIONS = (0.0, 0.1, 0.2, 0.35, 1.0)  # of the patches, by entropy
 STEPS = 300
 
@@ -49,7 +49,7 @@ Labels = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Split:
-    """The scene with the labels to train on and those to be judged by, 255 elsewhere."""
+    """The scene with training labels and test labels, 255 elsewhere."""
 
     values: Values  # (y, x, band)
     train: Labels
@@ -59,7 +59,7 @@ class Split:
 
 @dataclass(frozen=True)
 class Result:
-    """What one way of drawing the map reaches on the test pixels, and what it took."""
+    """Test counts of one method, and its processor time."""
 
     name: str
     counts: NDArray[np.int64]
@@ -69,12 +69,12 @@ class Result:
 
     @property
     def figures(self) -> tuple[float, float, float]:
-        """Overall accuracy, average accuracy, kappa."""
+        """Return overall accuracy, average accuracy and kappa."""
         return overall_accuracy(self.counts), average_accuracy(self.counts), kappa(self.counts)
 
 
 def rows(weights: Sequence[Path] = ()) -> list[Row]:
-    """Every way, best peer on the same input as the goal of ours. Without ``weights`` ours is trained first."""
+    """Return a row for each method; our goal is the best peer on the same input. Without weights, ours is trained."""
     folder = data_folder("indian_pines")
     if not (folder / SCENE).is_file():
         return [not_run("Indian Pines, disjoint halves", folder)]
@@ -87,7 +87,7 @@ def rows(weights: Sequence[Path] = ()) -> list[Row]:
 
 
 def rows_of_halves() -> list[Row]:
-    """The segmenter trained on one half of each training field and judged on the other, and the other way round."""
+    """Train on one half of each training field and evaluate on the other, in both directions."""
     folder = data_folder("indian_pines")
     split, found = _open(folder), list[Row]()
     half = halves(split.train)
@@ -130,7 +130,7 @@ def _open(folder: Path) -> Split:
 
 
 def halves(labels: Labels) -> NDArray[np.int64]:
-    """Cut every connected field of one class in two across its longer side: 0 and 1, -1 where nothing is labelled."""
+    """Cut each connected field of one class in two across its longer side: 0 and 1, -1 for unlabelled pixels."""
     from scipy.ndimage import label
 
     half = np.full(labels.shape, -1)
@@ -212,7 +212,7 @@ def _scene(folder: Path) -> RasterScene:
 
 
 def exposed(scene: RasterScene, seed: int | Sequence[int]) -> Values:
-    """One fine exposure of a scene, (y, x, band), as training's fine look has it before its columns."""
+    """Return a fine exposure of a scene, (y, x, band), as the fine pass of the training before its columns."""
     from models.training.examples import electrons_of
     from pipeline.geometry.camera import LineCamera, expose, footprint
 
@@ -235,7 +235,7 @@ def _through_camera(folder: Path, path: Path) -> list[Result]:
 
 
 def _of_the_file(folder: Path, split: Split) -> list[Result]:
-    """The segmenter trained on the spectra of the file."""
+    """Train the segmenter on the spectra of the file, and return its results."""
     from flows.training.figures import READINGS
     from flows.training.train_scenes import COLUMNS
     from models.network.sizes import SegmenterConfig
@@ -267,7 +267,7 @@ def _of_the_file(folder: Path, split: Split) -> list[Result]:
 
 
 def _judged(source: str, weights: Weights, seen: CoarsePrediction, fine: Values, labels: Labels) -> list[Result]:
-    """The map with several fractions of the patches, by entropy."""
+    """Return the results with several fractions of the patches, chosen by entropy."""
     from models.network.machine import one_thread
     from models.policies.policies import score_patches
     from models.reading.inference import coarse_prediction_of_columns, segment

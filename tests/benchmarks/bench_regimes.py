@@ -1,14 +1,14 @@
-"""Where zooming pays: lines captured again where they promise most, beside the best uniform scan of the same seconds.
+"""Regimes in which zooming pays: lines captured again at the highest expected gain, against the best uniform scan.
 
-A land is a rectangle of a farm in a meadow; the rectangle's share of the field is what a survey is after.
-Light is a fraction of a clear sky's. Swaths are sweeps side by side: a camera with fewer samples makes the field larger
-in the mirror's terms. Seconds are those of the full scan's lines in an exposure, and set-ups.
-Three ways in the same seconds: the best uniform scan; every 4th or 8th line first, then the lines of highest expected
-gain (zoomed); and the same with the rectangle's patches known (ideal), in the exposure that shows all of them. The
-planner takes one of the first two before it has seen the field.
+A land is a rectangle of a farm in a meadow; the rectangle is the part of the field that the survey is interested in.
+Light is a fraction of a clear sky's. Swaths are adjacent sweeps: a camera with fewer samples makes the field larger for
+the mirror. Seconds are those of the full scan's lines at an exposure, with set-up times.
+Three surveys use the same seconds. The first is the best uniform scan; the second (zoomed) takes every 4th or 8th line,
+then the lines of highest expected gain. The third (ideal) knows the rectangle's patches, in the exposure that shows all
+of them. The planner chooses the first or second before it sees the field.
 
-`python tests/benchmarks/bench_regimes.py PICTURE` also draws the map of regimes; with `other` in its place it compares
-fields and seconds with which nothing was chosen.
+`python tests/benchmarks/bench_regimes.py PICTURE` also draws the map of regimes. `other` instead of PICTURE compares
+fields and seconds that were not used for any choice.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ from pipeline.simulator.scenes.scene import Drawn, RasterScene, SceneRaster
 
 SEEDS, SIZE = (61, 62, 63), "640x512"
 LIGHTS, SHARES, SWATHS = (1.0, 0.25), (1.0, 0.25, 0.0625), 8
-EXPOSURES_MS = (1.25, 2.5, 5.0)  # of every line in full light, by which seconds are stated
+EXPOSURES_MS = (1.25, 2.5, 5.0)  # exposure of every line in full light; seconds are stated by it
 LINES, SETUP_S = 515, 2.0  # of one swath of the full scan
 WAYS, PLANNER = ("never", "always", "ideal"), "auto"
 UNSEEN = (71, 72, 73)
-OTHER = (  # light, share of interest, swaths, seconds, farms
+OTHER = (  # light, fraction of interest, swaths, seconds, farms
     *((1.0, share, 8, 27.3, UNSEEN) for share in (1 / 16, 1.0)),
     *((light, 1 / 16, 8, seconds, UNSEEN) for light, seconds in ((1.0, 22.1), (1.0, 37.6))),
     *((0.25, 1 / 16, 8, seconds, UNSEEN) for seconds in (37.6, 58.2, 99.4)),
@@ -58,12 +58,12 @@ OTHER = (  # light, share of interest, swaths, seconds, farms
     *((light, share, 4, seconds, SEEDS) for light, seconds in ((1.0, 14.2), (1 / 16, 91.4)) for share in (1 / 16, 1.0)),
     *((light, share, 1, seconds, SEEDS) for light, seconds in ((1.0, 4.3), (1 / 16, 23.6)) for share in SHARES),
 )
-GOALS = {1.0: -0.3, 0.25: -0.3, 0.0625: 3.0}  # points over the uniform scan, in the mean of a share's cells
+GOALS = {1.0: -0.3, 0.25: -0.3, 0.0625: 3.0}  # points over the uniform scan, mean over a fraction's cells
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A regime, the mIoU [%] by each way, a seed each, and whether the planner zooms."""
+    """A regime with the mIoU [%] of each survey by seed, and the planner's decision to zoom."""
 
     light: float
     share: float
@@ -72,18 +72,18 @@ class Cell:
     zooms: bool
 
     def gain(self, way: str) -> float:
-        """Return the mean of the points over the uniform scan."""
+        """Return the mean gain over the uniform scan [points]."""
         way = way if way != PLANNER else "always" if self.zooms else "never"
         return float(np.mean(self.scores[way]) - np.mean(self.scores["never"]))
 
     @property
     def missed(self) -> float:
-        """Return by how many points the planner is below the better of both scans."""
+        """Return the points by which the planner is below the better of both scans."""
         return max(0.0, self.gain("always")) - self.gain(PLANNER)
 
 
 def land(seed: int, shape: tuple[int, int], share: float, **given: Any) -> tuple[RasterScene, NDArray[np.bool_]]:
-    """Return a farm whose rectangle of a share lies in a meadow, and which pixels (y, x) are the rectangle's."""
+    """Return a farm whose rectangle lies in a meadow, and the mask (y, x) of the rectangle's pixels."""
     farm, inside = farm_scene(seed, shape, **given), np.ones(shape, np.bool_)
     if share < 1:
         inside[...] = False
@@ -107,7 +107,7 @@ def land(seed: int, shape: tuple[int, int], share: float, **given: Any) -> tuple
 
 @contextmanager
 def known(inside: NDArray[np.bool_]) -> Iterator[None]:
-    """Have later lines follow the pixels that a survey is after, in the longest exposure that shows all of them."""
+    """Make fine passes follow the rectangle's pixels, in the longest exposure that shows all of them."""
 
     def best(self: SecondPass, record: Any, gain_of: Any) -> FinePlan:
         gain = patch_pixels(self.grid, inside.astype(np.float64)).mean(axis=(1, 2))
@@ -151,7 +151,7 @@ def cells(seeds: Sequence[int] = SEEDS) -> Iterator[Cell]:
 
 
 def rows(picture: Path | None = None) -> list[Row]:
-    """Return a row for every cell, and the means of each share beside the goals."""
+    """Return a row for every cell, and the mean of each fraction with its goal."""
     found, measured = [], list[Cell]()
     for cell in cells():
         measured.append(cell)
@@ -176,7 +176,7 @@ def rows(picture: Path | None = None) -> list[Row]:
 
 
 def print_other() -> None:
-    """Print a row of the table in docs/measurements/accuracy.md for each of `OTHER`."""
+    """Print a row of the table in docs/measurements/accuracy.md for each entry of `OTHER`."""
     for light, share, swaths, seconds, farms in OTHER:
         uniform, zoomed = ([score(one, share, light, swaths, seconds, way) for one in farms] for way in WAYS[:2])
         words = [", ".join(f"{one:.1f}" for one in scores) for scores in (uniform, zoomed)]
@@ -186,7 +186,7 @@ def print_other() -> None:
 
 
 def draw(measured: Sequence[Cell], picture: Path) -> None:
-    """Draw the gain over the best uniform scan, for each way, light, seconds, share and field."""
+    """Draw the gain over the best uniform scan for each survey, light, seconds, and fraction of interest."""
     ways = {PLANNER: "planner", "always": "zoomed", "ideal": "known place"}
     figure = Figure((10, 3), dpi=150, layout="constrained")
     shares, lights = ([str(Fraction(one)) for one in each] for each in (SHARES, LIGHTS))

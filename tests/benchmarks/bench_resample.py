@@ -1,4 +1,4 @@
-"""Resampling: cost beside a copy of the same rows, beside other libraries, and beside the order-3 spline."""
+"""Resampling: cost against a copy of the same rows, against other libraries, and against the order-3 spline."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ KERNELS: dict[Kernel, tuple[int, str]] = {
     "catmull-rom": (3, "cubic"),
 }
 BLOCK = 2048
-ALIKE = 1.001  # errors that differ by less are those of rounding
+ALIKE = 1.001  # errors within this ratio differ by rounding only
 ROUNDS = 3
-TILES = 3  # in a row, as a worker does them
+TILES = 3  # in a row, as in a worker
 
 
 def rows() -> list[Row]:
@@ -32,7 +32,7 @@ def rows() -> list[Row]:
     torch.set_num_threads(1)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what the other libraries warn of
+            warnings.simplefilter("ignore")  # warnings of the other libraries
             natural, flat = turned_waves(1), turned_waves(0)
             beside = [row for kernel in KERNELS for row in _beside_peers(kernel, natural, flat)]
             beside += [*_over_linear(natural, flat), _beside_spline(natural)]
@@ -47,7 +47,7 @@ def _call(scene: Turned, kernel: Kernel) -> Callable[[], Any]:
 
 
 def _take(scene: Turned, out: NDArray[np.float32]) -> Callable[[], None]:
-    """Copy each point's nearest row in blocks; mode="clip", for numpy copies once more in its default."""
+    """Copy each point's nearest row in blocks; with mode="clip", as numpy's default mode makes one more copy."""
     table = scene.samples.reshape(-1, scene.samples.shape[2])
     line, sample = np.rint(scene.coordinates).astype(np.intp).T
     index = line * scene.samples.shape[1] + sample
@@ -60,7 +60,7 @@ def _take(scene: Turned, out: NDArray[np.float32]) -> Callable[[], None]:
 
 
 def _over_take(scene: Turned) -> list[Row]:
-    """Each kernel over a copy of the same rows, on a sweep larger than the cache and on one that stays in it."""
+    """Compare each kernel with a copy of the same rows, on a sweep larger than the cache and on one that fits."""
     out = np.empty(scene.truth.shape, np.float32)
     calls = {"take": _take(scene, out)} | {kernel: _call(scene, kernel) for kernel in KERNELS}
     clocks = time_in_turn({name: _often(call, TILES) for name, call in calls.items()}, 7)
@@ -76,7 +76,7 @@ def _over_take(scene: Turned) -> list[Row]:
 
 
 def _over_take_cached(scene: Turned) -> Row:
-    """A corner of the sweep again and again: np.take then copies from cache to cache, which 16 taps cannot follow."""
+    """Repeat a corner of the sweep: np.take then copies from cache to cache, and 16 taps are slower than that."""
     middle, near = slice(100, 156), (np.abs(scene.coordinates - 127.5) < 20).all(axis=1)
     samples, coordinates = np.ascontiguousarray(scene.samples[middle, middle]), scene.coordinates[near] - middle.start
     small = replace(scene, samples=samples, coordinates=coordinates, truth=scene.truth[near])
@@ -100,7 +100,7 @@ def _often(call: Callable[[], Any], times: int) -> Callable[[], None]:
 
 
 def _beside_peers(kernel: Kernel, natural: Turned, flat: Turned) -> list[Row]:
-    """Time and error of one order; ours writes to fresh memory, also beside those that are given some."""
+    """Compare time and error of one order; ours allocates its output, even if a peer gets a buffer."""
     order, name = KERNELS[kernel]
     others = peers(natural, order)
     clocks = time_in_turn({"ours": _call(natural, kernel)} | {peer.name: peer.call for peer in others}, ROUNDS)
@@ -118,7 +118,7 @@ def _beside_peers(kernel: Kernel, natural: Turned, flat: Turned) -> list[Row]:
 
 
 def _over_linear(natural: Turned, flat: Turned) -> list[Row]:
-    """Catmull-Rom beside cv2's linear."""
+    """Compare Catmull-Rom with cv2's linear kernel."""
     found = []
     for what, scene in (("amplitude as period", natural), ("all waves alike", flat)):
         linear = peers(scene, 1, only="cv2.remap")[0]
@@ -153,7 +153,7 @@ def _listed(figures: Mapping[str, float], form: str) -> str:
 
 
 def _prepared(others: Sequence[Peer], scene: Turned) -> str:
-    """What is not in the times: the building of an index, per output pixel."""
+    """Return the times that are not counted, for building an index, per output pixel."""
     before = {f"{peer.name}'s index": peer.prepare for peer in others if peer.prepare}
     if not before:
         return ""

@@ -1,4 +1,4 @@
-"""Seams: accuracy of registration, and crop rows that alias."""
+"""Seams: accuracy of registration, and crop rows that cause aliasing."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def _opencv(reference: Floats, moving: Floats) -> Floats:
     import cv2
 
     window = cv2.createHanningWindow(reference.shape[::-1], cv2.CV_64F)
-    # Copies, for it puts the window on what it is given where the size needs no padding.
+    # Copies, as it applies the window in place if the size needs no padding.
     (right, down), _ = cv2.phaseCorrelate(reference.copy(), moving.copy(), window)
     return np.array([-down, -right])
 

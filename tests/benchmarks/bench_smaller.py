@@ -1,11 +1,11 @@
-"""Ours with a part of the patches read in full, beside smaller networks that read everything, at equal multiply-adds.
+"""Our network with a part of the patches read in full, against smaller full networks of equal multiply-adds.
 
-All are trained as long, from discriminants of their own, on the same farms in full light. Other farms judge them once.
-A step takes 1 s of one core; with 400 steps everything scores 82.6, with 1200 89.9. An accelerator takes 15 minutes.
-`python tests/benchmarks/bench_smaller.py 20` trains for 20 steps in place of `STEPS`.
+All have the same number of training steps, their own discriminants, and the same farms in full light; other farms test.
+A step takes 1 s of one core; all patches score 82.6 with 400 steps, 89.9 with 1200. An accelerator takes 15 minutes.
+`python tests/benchmarks/bench_smaller.py 20` trains for 20 steps instead of `STEPS`.
 
-`python tests/benchmarks/bench_smaller.py cut 2300` cuts smaller networks out of the shipped weights instead, and trains
-them on. Ours is as shipped. Fields of both scenes judge that no training saw; forty minutes of a core for each network.
+`python tests/benchmarks/bench_smaller.py cut 2300` instead cuts smaller networks out of the shipped weights and trains
+them further; ours is as shipped. Test fields are not in the training data. It takes 40 minutes of a core a network.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.simulator.scenes.built_in import SCOUTING_LAW
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW
 
-STEPS, TRAINED_ON, JUDGED = 3000, 24, 6  # steps, and farms
+STEPS, TRAINED_ON, JUDGED = 3000, 24, 6  # steps, farms for training, farms for testing
 Sizes = tuple[int, int, int]
 OURS: Sizes = (8, 20, 64)  # channels of the overview and of the full network, and the token width
 SMALLER: tuple[Sizes, ...] = ((8, 16, 64), (10, 10, 64), (6, 12, 64), (12, 12, 64), (6, 8, 48), (4, 8, 32))
@@ -51,19 +51,19 @@ PATCHES = int(np.prod(GRID.patch_shape))
 
 
 def cost(config: SegmenterConfig, patches: int = PATCHES) -> float:
-    """Return multiply-adds a pixel, with so many patches read in full."""
+    """Return the multiply-adds a pixel with this number of patches read in full."""
     return multiply_adds(config, GRID, patches, config.columns).total / (GRID.height * GRID.width)
 
 
 def request(sizes: Sizes, settings: TrainingSettings) -> TrainRequest:
-    """Return the request of a training of such a network."""
+    """Return the request to train a network of these sizes."""
     overview_width, width, dim = sizes
     tokens = {"dim": dim}
     return TrainRequest("farm", Path(), width=width, overview_width=overview_width, tokens=tokens, settings=settings)
 
 
 def trained(asked: TrainRequest, scenes: Scenes, normalisation: Normalisation) -> list[ReadTwice]:
-    """Train a network; return the judged farms, read by its overview and in full."""
+    """Train a network; return the test farms, read by its overview and in full."""
     common, examples, rng = scenes.common, scenes.train.examples, np.random.default_rng([0x1DA])
     config, shift = network_config(asked, common), normalisation.gain_shift
     start = linear_discriminants(LabelledPixels.drawn(examples, rng).brightened(shift, rng), config.classes)
@@ -81,7 +81,7 @@ def score(judged: list[ReadTwice], classes: int, policy: str, fraction: float = 
 
 
 def beside(smaller: str, config: SegmenterConfig, own: list[float], peer: list[float]) -> Row:
-    """Return the row of a smaller network: scores of ours with as many multiply-adds, all fields first, and of it."""
+    """Return the row that compares ours with a smaller network at equal multiply-adds; scores have all fields first."""
     ahead, *by_field = np.subtract(own, peer)
     figure = f"{own[0]:.2f} ({ahead:+.2f}; fields {min(by_field):+.1f} to {max(by_field):+.1f})"
     what = f"ours at {cost(config):.0f} a pixel, {cost(config) / TODAY:.0%} of today's"
@@ -89,7 +89,7 @@ def beside(smaller: str, config: SegmenterConfig, own: list[float], peer: list[f
 
 
 def rows(steps: int = STEPS) -> list[Row]:
-    """Return a row for each smaller network: ours ahead of it at its multiply-adds."""
+    """Return a row for each smaller network: our lead at its multiply-adds."""
     settings = TrainingSettings(steps=steps, minutes=600.0)
     asked, data = request(OURS, settings), open_training_data("farm", JUDGED, TRAINED_ON, LineCamera())
     scenes = observe_all(asked, data, lambda what, done, figure: None)
@@ -115,11 +115,11 @@ def rows(steps: int = STEPS) -> list[Row]:
 
 
 CUT: tuple[Sizes, ...] = ((8, 12, 64), (12, 12, 64))
-CUT_ON, CUT_RATE, DARKEST_MS = 176, 6e-4, 3.0  # scenes, learning rate, shortest exposure of crops
+CUT_ON, CUT_RATE, DARKEST_MS = 176, 6e-4, 3.0  # scenes, learning rate, shortest exposure of crops [ms]
 
 
 def cut_rows(steps: int, trained_on: int = CUT_ON) -> list[Row]:
-    """Return a row for each network that is cut out of the shipped weights and trained on: ours ahead of it."""
+    """Return a row for each network that is cut out of the shipped weights and trained further: our lead over it."""
     shipped, camera = load_weights(shipped_weights()), LineCamera()
     settings = TrainingSettings(steps=steps, minutes=600.0, learning_rate=CUT_RATE, seed=5, darkest_ms=DARKEST_MS)
     laws = f"{FARM_LAW},{SCOUTING_LAW}"
@@ -152,7 +152,7 @@ def cut_rows(steps: int, trained_on: int = CUT_ON) -> list[Row]:
 
 
 def cut(model: Segmenter, config: SegmenterConfig) -> dict[str, Tensor]:
-    """Return tensors of a network of other widths: channels with the largest weights stay, new ones begin at random."""
+    """Return tensors of a network of other widths: channels with the largest weights are kept, new ones are random."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(7)
         made = Segmenter(config).state_dict()
@@ -196,7 +196,7 @@ def cut(model: Segmenter, config: SegmenterConfig) -> dict[str, Tensor]:
 
 
 def _strongest(old: Mapping[str, Tensor], part: str, level: int, most: int) -> Tensor:
-    """Return the channels of a level with the largest weights, in their order; all where there are no more."""
+    """Return the channels of a level with the largest weights, in ascending order, at most ``most``."""
     own = [
         weight
         for name, weight in old.items()

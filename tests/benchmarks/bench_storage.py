@@ -1,4 +1,4 @@
-"""Storage: our layout beside plain zarr-python, the spool's fraction of a core, a survey that runs again."""
+"""Storage: our layout against plain zarr-python, the spool's fraction of a core, and a repeated survey."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def rows() -> list[Row]:
 
 
 def _raw() -> NDArray[np.uint16]:
-    """Counts with shot noise on a smooth signal, (line, sample, band)."""
+    """Return counts with shot noise on a smooth signal, (line, sample, band)."""
     smooth = 1500 + 1000 * np.sin(np.linspace(0, 6, SAMPLES))[:, None] * np.cos(np.linspace(0, 3, BANDS))
     rng = np.random.default_rng(0)
     block = rng.poisson(np.broadcast_to(smooth, (SHARD_ROWS, SAMPLES, BANDS))).astype(np.uint16)
@@ -39,7 +39,7 @@ def _raw() -> NDArray[np.uint16]:
 
 
 def _against_zarr(folder: Path, raw: NDArray[np.uint16]) -> list[Row]:
-    """A raw cube written 64 lines at a time and read whole, by our writer and reader and by zarr alone."""
+    """Compare our writer and reader with zarr alone, on a raw cube written 64 lines at a time and read whole."""
     lines = [Line(number, data, 0.0, 1e-4 * number, 0.1 * number, 100.0) for number, data in enumerate(raw)]
     frame = np.zeros((SAMPLES, BANDS), np.float32)
     references = References(frame, frame + 1000, np.ones(BANDS, np.float32))
@@ -75,7 +75,7 @@ def _against_zarr(folder: Path, raw: NDArray[np.uint16]) -> list[Row]:
 
 
 def _spool(folder: Path, raw: NDArray[np.uint16]) -> Row:
-    """Lines appended one by one as fast as the spool takes them; a rig brings one every 10 ms."""
+    """Append lines one by one at the spool's highest rate; a rig sends one every 10 ms."""
     lines = [Line(n, raw[n % LINES], 0.0, 0.0, n / RATE_HZ, 10.0) for n in range(SPOOLED)]
     slowest = 0.0
     with Spool.open(folder / "spool", SAMPLES, BANDS, header={"sweep": "bench"}) as spool:
@@ -97,7 +97,7 @@ def _spool(folder: Path, raw: NDArray[np.uint16]) -> Row:
 
 
 def _warm(folder: Path) -> Row:
-    """A finished survey asked for again: what its stages take beside what they took."""
+    """Repeat a finished survey, and compare the time of its stages with that of the first run."""
     from rich.console import Console
 
     from flows.publish.survey_command import run_survey

@@ -1,8 +1,8 @@
-"""Twenty small labelled tiles, as a user brings them: `spectralzoom train` beside classifiers of scikit-learn.
+"""Twenty small labelled tiles of a user: `spectralzoom train` against classifiers of scikit-learn.
 
-Indian Pines is cut into 5 x 4 tiles of 29 x 36 px and 200 bands. Three times a third of them is held out and judged;
-the rest trains, by the command with --validation 0. The peers read every band of the same camera's image, averaged over
-5 x 5 px of a tile.
+Indian Pines is cut into 5 x 4 tiles of 29 x 36 px and 200 bands. Three times, a third of them is held out for testing,
+and the rest trains, by the command with --validation 0. The peers read every band of the same camera's image, as means
+of 5 x 5 px of a tile.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Counts = NDArray[np.int64]
 
 
 def rows() -> list[Row]:
-    """Every fold and all together: mIoU and overall accuracy of the network and of the best classifiers."""
+    """Return mIoU and overall accuracy of the network and the classifiers, for every fold and for all together."""
     folder = data_folder("indian_pines")
     if not (folder / SCENE).is_file():
         return [not_run("20 tiles of Indian Pines", folder)]
@@ -58,7 +58,7 @@ def _row(what: str, counts: dict[str, Counts], words: str) -> Row:
 
 
 def write_tiles(folder: Path, out: Path) -> None:
-    """Write the scene's tiles as files that `train` reads: ``images``, ``labels`` and ``scene.toml``."""
+    """Write the scene's tiles as files for `train`: ``images``, ``labels`` and ``scene.toml``."""
     cube, labels = np.load(folder / SCENE), np.load(folder / "Indian_pines_gt.npy")
     rows, columns = cube.shape[0] // DOWN, cube.shape[1] // ACROSS
     for name in ("images", "labels"):
@@ -73,7 +73,7 @@ def write_tiles(folder: Path, out: Path) -> None:
 
 
 def judge_fold(tiles: Path, fold: int) -> dict[str, Counts]:
-    """Train on two thirds of the tiles; return confusion counts on the others, by the network and each classifier."""
+    """Train on two thirds of the tiles; return confusion counts of the others, by the network and each classifier."""
     held = tuple(f"{tile:02}" for tile in range(fold, DOWN * ACROSS, FOLDS))
     out = tiles.parent / f"{tiles.name}-{fold}.safetensors"
     train_weights(TrainFlags(seed=fold, hold_out=",".join(held), validation=0).request(str(tiles), out, "bench_tiles"))
@@ -92,7 +92,7 @@ def judge_fold(tiles: Path, fold: int) -> dict[str, Counts]:
 def judge_classifiers(
     data: TrainingData, names: Sequence[str], held: Sequence[str], weights: Weights, seed: int
 ) -> dict[str, Counts]:
-    """Fit classifiers to every labelled pixel of some tiles; return their counts on the held-out ones."""
+    """Fit classifiers to every labelled pixel of the training tiles; return their counts on the held-out ones."""
     learnt, judged = (_pixels(data, some, weights, seed) for some in (names, held))
     found = {}
     for name, classifier in _classifiers().items():
@@ -102,7 +102,7 @@ def judge_classifiers(
 
 
 def _pixels(data: TrainingData, names: Sequence[str], weights: Weights, seed: int) -> tuple[Any, Any]:
-    """Return (pixel, band) means of labelled pixels as the camera sees them, and their classes (pixel,)."""
+    """Return (pixel, band) means of labelled pixels in the camera's image, and their classes (pixel,)."""
     from scipy.ndimage import uniform_filter
 
     values, classes = [], []

@@ -1,8 +1,8 @@
-"""What the class unknown costs on farms that training never saw, and how much of other fields it finds.
+"""Cost of the class unknown on farms that are not in the training data, and its detection rate on other fields.
 
-Farms of other seeds and days than any that weights or limits were made with, looked at in three ways; each map is drawn
-with the class and without it, of the same lines. Other fields have spectra that no farm has: invented ones, a farm's in
-shuffled bands, grey boards, and Indian Pines (AVIRIS, of the data folder) brought to the farm's brightness.
+The farms have other seeds and days than the training of weights and limits. Each is scanned in three ways, and each map
+is drawn with the class and without it, from the same lines. Other fields have spectra that no farm has. These are made
+up, a farm's in shuffled bands, grey boards, and Indian Pines (AVIRIS, in the data folder) at the farm's brightness.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ Judged = dict[str, float]
 
 
 def rows() -> list[Row]:
-    """Unknown pixels of known and of other fields, in percent: mean (least - most)."""
+    """Return the unknown pixels of farms and of other fields, in percent: mean (least - most)."""
     found = []
     for name, scan_pass in PROBES.items():
         judged = [_farm(seed, day, scan_pass) for seed in SEEDS for day in DAYS]
@@ -66,7 +66,7 @@ def _figure(values: list[float], unit: str) -> str:
 
 
 def _farm(seed: int, day: int, scan_pass: dict[str, Any]) -> Judged:
-    """A farm's fraction of unknown pixels, the change of its mIoU [points], and the processor time of both maps."""
+    """Return a farm's fraction of unknown pixels, its change of mIoU [points], and the processor times of both maps."""
     given = {"scene": "farm", "size": SIZE, "seed": seed, "day": day, **scan_pass}
     with tempfile.TemporaryDirectory() as out:
         without, with_it = (_survey({**given, "out": out}, word) for word in ("off", "auto"))
@@ -88,7 +88,7 @@ def _survey(given: dict[str, Any], unknown: str) -> Judged:
 
 
 def other_fields(folder: Path) -> Iterator[tuple[str, Path]]:
-    """Fields with spectra that no farm has, as files with their wavelengths beside them."""
+    """Yield fields with spectra that no farm has, as files with their wavelengths."""
     rng = np.random.default_rng(0)
     middle, width, height = (rng.uniform(*span, (7, 3, 1)) for span in ((400, 1000), (40, 150), (0.05, 0.4)))
     bumps = height * np.exp(-0.5 * ((BANDS_NM - middle) / width) ** 2)  # (spectrum, bump, band)
@@ -108,7 +108,7 @@ def other_fields(folder: Path) -> Iterator[tuple[str, Path]]:
 
 
 def _picture(spectra: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
-    """Patches of the spectra with soft shades and edges, as a photograph has them, (y, x, band)."""
+    """Return patches of the spectra with soft shades and edges, like a photograph, (y, x, band)."""
     fields = np.stack([scipy.ndimage.gaussian_filter(rng.standard_normal((256, 320)), 12) for _ in spectra], axis=-1)
     fraction = scipy.special.softmax(400 * fields, axis=-1)
     shade = 1 + 4 * scipy.ndimage.gaussian_filter(rng.standard_normal((256, 320)), 8)[..., None]
@@ -116,7 +116,7 @@ def _picture(spectra: NDArray[np.float64], rng: np.random.Generator) -> NDArray[
 
 
 def _pines(source: Path, folder: Path) -> Path:
-    """The file of the set at the farm's brightness, with a description of its bands."""
+    """Write the data set scaled to the farm's brightness, with the wavelengths of its bands."""
     values = np.load(source / "Indian_pines_corrected.npy").astype(np.float32)
     lines = (source / "92AV3C.spc").read_text().splitlines()
     head = next(number for number, line in enumerate(lines) if line.split()[:1] and line.split()[0][0].isdigit())

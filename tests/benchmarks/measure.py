@@ -1,4 +1,4 @@
-"""How the benchmarks measure: processor time of calls in turn on one thread, memory, and rows of one table."""
+"""Measurements of the benchmarks: processor time of calls in turn on one thread, memory, and the rows of a table."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the table. ``met`` is None where there is no goal."""
+    """One row of the table. ``met`` is None if there is no goal."""
 
     what: str
     figure: str
@@ -32,41 +32,41 @@ class Row:
 
 
 def data_folder(name: str) -> Path:
-    """Give where a real data set lies, there or not: in $SPECTRALZOOM_DATA, or in shared/data beside the checkout."""
+    """Return the folder of a real data set, which may be absent: $SPECTRALZOOM_DATA, or shared/data by the checkout."""
     return Path(os.environ.get("SPECTRALZOOM_DATA", ROOT.parent / "shared" / "data")) / name
 
 
 def not_run(what: str, folder: Path) -> Row:
-    """Say that a row needs data that is not there."""
+    """Return a row for a benchmark whose data are missing."""
     return Row(what, f"not run: no {folder}, set SPECTRALZOOM_DATA")
 
 
 def time_in_turn(calls: Mapping[str, Callable[[], object]], rounds: int = 5) -> dict[str, Timing]:
-    """Time calls round by round, after one untimed run of each, every round beginning with another one."""
+    """Time calls round by round, after one untimed run of each; every round begins with another call."""
     for call in calls.values():
         call()
     return in_turn(calls, rounds)
 
 
 def ns_of(clock: Timing, values: float) -> float:
-    """Least processor time of a value. [ns]"""
+    """Return the least processor time per value. [ns]"""
     return clock.cpu_min_s / values * 1e9
 
 
 def alone(call: Callable[..., T], *given: object) -> T:
-    """Call in a process of its own, whose memory and settings are not those of other benchmarks."""
+    """Call a function in a separate process, with its own memory and settings."""
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         return pool.submit(call, *given).result()
 
 
 def peak_bytes() -> int:
-    """Highest resident memory of this process; ``getrusage`` would count what it was started from as well."""
+    """Return the peak resident memory of this process; ``getrusage`` would include its parent's."""
     lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) * 1024
 
 
 def aligned(cells: Sequence[Sequence[str]], most: Sequence[int]) -> str:
-    """Rows of texts, the first of them headings, in aligned columns; longer texts are folded inside their own."""
+    """Return rows of texts, the first of them headings, in aligned columns; longer texts are wrapped."""
     widths = [min(width, max(len(line[column]) for line in cells)) for column, width in enumerate(most)]
     lines = []
     for cell in cells:
@@ -80,6 +80,6 @@ def aligned(cells: Sequence[Sequence[str]], most: Sequence[int]) -> str:
 
 
 def markdown_lines(cells: Sequence[Sequence[str]]) -> list[str]:
-    """The same as lines of a table of Markdown."""
+    """Return the rows as lines of a Markdown table."""
     lines = [f"| {' | '.join(text.replace('|', chr(92) + '|') for text in row)} |" for row in cells]
     return [lines[0], "|" + "---|" * len(cells[0]), *lines[1:]]

@@ -1,6 +1,6 @@
-"""Scenes and weights of the paper's tables: farms at four bands and at all, and folders of frames with labels.
+"""Scenes and weights of the paper's tables: farms with four bands and with all, and folders of labelled frames.
 
-Networks that are trained here see what the paper's camera takes: an overview of area means, and fine patches.
+Networks that are trained here see the images of the paper's camera: area means for the overview, and fine patches.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance
 
 SIDE, INPUTS = 1024, (4, 2)  # px; fine pixels a side of a coarse one
 FARM_SEEDS, TAUGHT_FARMS = (51, 52, 53), 12
-FOUR_NM = (450.0, 550.0, 650.0, 850.0)  # near the middles of the paper's RGB and near infrared
+FOUR_NM = (450.0, 550.0, 650.0, 850.0)  # near the centres of the paper's RGB and near-infrared bands
 PATCH = 16
 CAMERA = LineCamera()
 Image = NDArray[np.float32]
@@ -43,7 +43,7 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class DataSet:
-    """Scenes to judge, one at a time, with the weights that read them."""
+    """Scenes for an evaluation, made one at a time, with the weights that read them."""
 
     name: str
     weights: Weights
@@ -57,7 +57,7 @@ def coarse_image(columns: Image, factor: int) -> Image:
 
 
 class PaperCaptures(CaptureAugmentation):
-    """Shows crops as the paper takes them: area means to the overview, fine pixels to the full network."""
+    """Train with the images of the paper: area means for the overview, fine pixels for the full network."""
 
     def draw(self, columns: Tensor, noise: ColumnNoise, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
         factor, fine = int(rng.choice((1, *INPUTS))), with_capture(columns, LineSpec().planes)
@@ -66,7 +66,7 @@ class PaperCaptures(CaptureAugmentation):
 
 
 def trained(name: str, scenes: Mapping[str, Callable[[], RasterScene]], patch: int, steps: int, say: Say) -> Weights:
-    """Train a network of its own, or take it from the temporary folder where that was done before."""
+    """Train a network, or load it from the temporary folder if it is there."""
     key = hashlib.sha256(repr((name, sorted(scenes), patch, steps)).encode()).hexdigest()[:12]
     path = Path(tempfile.gettempdir()) / "spectralzoom-paper" / f"{key}.safetensors"
     try:
@@ -96,7 +96,7 @@ def trained(name: str, scenes: Mapping[str, Callable[[], RasterScene]], patch: i
 
 
 def with_bands(scene: RasterScene, wanted_nm: Sequence[float]) -> RasterScene:
-    """Return a scene of the bands nearest to some wavelengths alone."""
+    """Return a scene with only the bands nearest to the given wavelengths."""
     at = [int(np.abs(scene.wavelength_nm - one).argmin()) for one in wanted_nm]
     light = SceneRadiance(scene.electrons[:, at], scene.white_reference_electrons[at])
     return replace(
@@ -109,7 +109,7 @@ def with_bands(scene: RasterScene, wanted_nm: Sequence[float]) -> RasterScene:
 
 
 def farm_four(steps: int, say: Say, side: int = SIDE, seeds: Sequence[int] = FARM_SEEDS) -> DataSet:
-    """Give farms at four bands, by weights trained on other farms."""
+    """Return farms with four bands, and weights trained on other farms."""
 
     def taught(name: str) -> RasterScene:
         seed, day, hour = read_farm_name(name)
@@ -124,14 +124,14 @@ def farm_four(steps: int, say: Say, side: int = SIDE, seeds: Sequence[int] = FAR
 
 
 def farm_all(side: int = SIDE, seeds: Sequence[int] = FARM_SEEDS) -> DataSet:
-    """Give the same farms at all bands, by the shipped weights."""
+    """Return the same farms with all bands, and the shipped weights."""
     weights = load_weights(ROOT / "models" / "shipped" / "farm.safetensors")
     scenes = {f"{seed}": partial(farm_scene, seed, (side, side), camera=CAMERA) for seed in seeds}
     return DataSet("farm, 270 bands", weights, scenes)
 
 
 def folder(path: Path, held_out: Sequence[str], steps: int, patch: int, say: Say, given: Path | None) -> DataSet:
-    """Give a folder's frames: those held out, every third where none is named, by weights of the others."""
+    """Return the held-out frames of a folder, by default every third, and weights of the other frames."""
     files = load_data_set(path)
     held_out = held_out or files.names[1::3]
     scenes = {name: partial(lambda name: scene_of_file(files.load(name), CAMERA), name) for name in files.names}

@@ -1,4 +1,4 @@
-"""One small field, surveyed twice, as the pages speak of it: every page begins with a copy of it."""
+"""One small field, surveyed twice: the tests of each page begin with a copy of it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SETTINGS = (
     'name = "{name}"\nsource = "sim"\nscene = "field.png"\nlabels = "labels.png"\nweights = "mine.safetensors"\n'
     "budget = 0.8\n{camera}"
 )
-CAMERA = "[camera]\nsamples = 320\n"  # a narrow one: most of a small survey's time goes into samples beside the field
+CAMERA = "[camera]\nsamples = 320\n"  # narrow, as most time of a small survey goes into samples outside of the field
 CLASSES = 'labels = "labels/{number}_labels.png"\n[classes]\nclass_0 = 0\nclass_1 = 1\nclass_2 = 2\n'
 HEADER = "ENVI\nsamples = 40\nlines = 24\nbands = 3\ndata type = 4\ninterleave = bip\nbyte order = 0\n"
 
@@ -29,7 +29,7 @@ def surveyed(
     make_weights: WeightsMaker,
     survey_png: Survey,
 ) -> Path:
-    """A folder with pictures, labels, a cube, weights, settings of two fields, and the archive of two surveys."""
+    """Return a folder with pictures, labels, a cube, weights, settings of two fields, and an archive of two surveys."""
     folder = tmp_path_factory.mktemp("surveyed")
     for name, source in {"field.png": "scene.png", "labels.png": "labels.png"}.items():
         shutil.copy(scene_files / source, folder / name)
@@ -42,7 +42,7 @@ def surveyed(
         image, colours = values.astype(np.uint8), np.array([(0, 0, 0), (0, 255, 0), (255, 0, 0)], np.uint8)
         pictures = {
             **{f"fields/images/{number}_image.png": image, f"fields/labels/{number}_labels.png": labels},
-            **{f"meadow/images/{number}.png": image, f"meadow/masks/{number}.png": colours[labels]},  # nothing is told
+            **{f"meadow/images/{number}.png": image, f"meadow/masks/{number}.png": colours[labels]},  # no scene.toml
         }
         for path, picture in pictures.items():
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
@@ -60,7 +60,7 @@ def surveyed(
 
 @pytest.fixture
 def place(surveyed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A copy of that folder, which is the current one."""
+    """Return a copy of that folder as the current directory."""
     folder = shutil.copytree(surveyed, tmp_path / "place")
     monkeypatch.chdir(folder)
     return folder

@@ -1,4 +1,4 @@
-"""The pages of this project, and what is in them: fenced blocks with their marks, links, headings and named paths."""
+"""The pages of this project and their parts: fenced blocks with marks, links, headings and named paths."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _HEADING = re.compile(r"^#{1,6} (?P<words>.+)$", re.MULTILINE)
 
 @dataclass(frozen=True)
 class Block:
-    """One fenced block: where it begins, its language, its text, and what the comment before it says of its test."""
+    """One fenced block: its place, language, text, and the mark in the comment before it."""
 
     page: Path
     line: int  # of its first line of text
@@ -33,19 +33,19 @@ class Block:
 
     @property
     def place(self) -> str:
-        """Page and line, for messages."""
+        """Return page and line, for messages."""
         return f"{self.page.relative_to(ROOT)}:{self.line}"
 
     @property
     def file(self) -> str | None:
-        """The file that it is, where its first line says so: ``# scene.toml``."""
+        """Return the file name in the block's first line, such as ``# scene.toml``."""
         found = re.match(r"# (\S+\.(?:py|toml))$", self.text.partition("\n")[0])
         return None if found is None else found[1]
 
 
 @cache
 def blocks_of(page: Path) -> tuple[Block, ...]:
-    """Every fenced block of a page, in order."""
+    """Return every fenced block of a page, in order."""
     lines = page.read_text(encoding="utf-8").splitlines()
     found, number = [], 0
     while number < len(lines):
@@ -63,24 +63,24 @@ def blocks_of(page: Path) -> tuple[Block, ...]:
 
 @cache
 def prose_of(page: Path) -> str:
-    """A page without its fenced blocks and comments."""
+    """Return a page without its fenced blocks and comments."""
     text = re.sub(r"<!--.*?-->", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
     return re.sub(r"^(`{3,})[^\n]*\n.*?^\1$", "", text, flags=re.DOTALL | re.MULTILINE)
 
 
 def links_of(page: Path) -> list[str]:
-    """Where its links and pictures lead."""
+    """Return the targets of a page's links and pictures."""
     return [found["target"] for found in _LINK.finditer(_CODE.sub("", prose_of(page)))]
 
 
 def named_code(page: Path) -> list[str]:
-    """What stands in backticks in its prose."""
+    """Return the words in backticks in a page's prose."""
     return [found[0].strip("`") for found in _CODE.finditer(prose_of(page))]
 
 
 @cache
 def anchors_of(page: Path) -> frozenset[str]:
-    """The anchors of its headings, as GitHub and MyST make them."""
+    """Return the anchors of a page's headings, as GitHub and MyST make them."""
     text = prose_of(page) + (settings_table() if page.name == "settings.md" else "")
     words = (found["words"] for found in _HEADING.finditer(text))
     return frozenset(re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in words)

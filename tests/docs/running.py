@@ -1,14 +1,14 @@
-"""How a block of a page is run: commands in this process, Python with the names of its page, TOML by its loader.
+"""Run the blocks of a page: commands in this process, Python with the names of its page, TOML by its loader.
 
-The comment before a block says what is other than written, `<!-- test: WORDS -->`:
+The comment before a block, `<!-- test: WORDS -->`, changes how it is run:
 
-    with FLAGS      the flags are added to each command: smaller, and nobody waits for a server; FEW are bands of the
+    with FLAGS      add the flags to each command: a smaller size, or no wait for a server; FEW stands for bands of the
                     farm that suffice for its weights
-    parses          not run: every command's words are read by its own parser, every target and file is there
+    parses          do not run: parse the words of every command, and check that targets and files exist
     bucket          s3://bucket/prefix is an archive on the S3 server of the tests
-    tree FLAGS      run, in one process, with a copy of the four folders to which the page's files and changes were
-                    added; the flags are added to the first command
-    meanwhile       begun, and ended once the page is through; the others begin when the file after -o is there
+    tree FLAGS      run in one process with a copy of the four folders, to which the page's files and changes were
+                    added; add the flags to the first command
+    meanwhile       start, and end after the page; other blocks wait for the file after -o
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from tests.docs.pages import ROOT, Block
 from tests.flows.conftest import FEW_BANDS
 
 COMMANDS, TREE = ("sh",), ("pipeline", "models", "storage", "flows")
-SHOWN = ("text",)  # what programs print, and pictures made of letters: nothing to run
+SHOWN = ("text",)  # program output and pictures of letters: nothing to run
 BUILT = ("{toctree}", "{eval-rst}")  # run by `make docs`
 BUCKET = "s3://bucket/prefix"
 BEGUN_WITHIN_S = 120.0
@@ -54,15 +54,15 @@ for words in json.loads(sys.argv[1]):
 
 @dataclass
 class Reader:
-    """Somebody who goes through one page and does what it says, in a folder of their own."""
+    """A reader who goes through one page and follows its blocks in a folder."""
 
     folder: Path
     bucket: str | None = None
     names: dict[str, Any] = field(default_factory=lambda: {"__name__": "page"})
-    left: ExitStack = field(default_factory=ExitStack)  # ends what was begun
+    left: ExitStack = field(default_factory=ExitStack)  # ends the processes that were started
 
     def follow(self, block: Block) -> None:
-        """Do what one block says; AssertionError names it where that does not work."""
+        """Run one block; raise AssertionError with its place if it fails."""
         word, _, rest = block.mark.partition(" ")
         if block.language in (*SHOWN, *BUILT):
             assert not block.mark, f"{block.place}: nothing of a {block.language} block is tested"
@@ -83,11 +83,11 @@ class Reader:
 
     @property
     def tree(self) -> Path:
-        """A copy of the four folders that a page may add to."""
+        """Return a copy of the four folders that a page may add to."""
         root = self.folder / "tree"
         if not root.exists():
             for name in TREE:
-                shutil.copytree(ROOT / name, root / name)  # with bytecode, which is good for files of the same dates
+                shutil.copytree(ROOT / name, root / name)  # with bytecode, valid for files of the same dates
         return root
 
     def _command(self, block: Block, command: str, word: str, rest: str) -> None:
@@ -98,7 +98,7 @@ class Reader:
             return
         assert program == "spectralzoom", f"{block.place}: only spectralzoom is run; say what is to parse"
         if word == "tree":
-            return  # run together
+            return  # all are run together
         flags = shlex.split(rest.replace("FEW", FEW_BANDS))
         given = [found for one in (*words[1:], *flags) for found in self._matching(one)]
         if word == "bucket":
@@ -111,13 +111,13 @@ class Reader:
             assert code == 0, f"{block.place}: {command} ended with {code}"
 
     def _matching(self, word: str) -> list[str]:
-        """Names that a word with stars stands for, as a shell gives them; the word itself where there are none."""
+        """Expand the stars of a word as a shell does; return the word itself if it has none or no file matches."""
         if "*" not in word:
             return [word]
         return sorted(path.relative_to(self.folder).as_posix() for path in self.folder.glob(word)) or [word]
 
     def _elsewhere(self, block: Block, flags: str) -> None:
-        """Run the commands with the copy of the folders, in a process of its own."""
+        """Run the commands with the copy of the folders, in a separate process."""
         first, *others = [shlex.split(command)[1:] for command in commands_of(block)]
         environment = {**os.environ, "PYTHONPATH": str(self.tree)}
         command = [sys.executable, "-c", EACH, json.dumps([[*first, *shlex.split(flags)], *others])]
@@ -125,7 +125,7 @@ class Reader:
         assert ended.returncode == 0, f"{block.place}: {ended.stderr[-2000:]}"
 
     def _begin(self, block: Block, words: list[str]) -> None:
-        """Begin what goes on until it is told to end."""
+        """Start a command that runs until the page ends."""
         made = self.folder / words[words.index("-o") + 1]
         command = [str(Path(sys.executable).with_name("spectralzoom")), *words]
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=self.folder)
@@ -149,7 +149,7 @@ class Reader:
         exec(code, self.names)
 
     def _add(self, block: Block, text: str) -> None:
-        """Put a file of the page into the copy of the folders, where there is none of that name."""
+        """Add a file of the page to the copy of the folders; a file of that name must not exist there."""
         assert block.file is not None
         path = self.tree / block.file
         assert path.parent.is_dir(), f"{block.place}: there is no folder {path.parent.relative_to(self.tree)}"
@@ -157,7 +157,7 @@ class Reader:
         path.write_text(text, encoding="utf-8")
 
     def _change(self, block: Block) -> None:
-        """Change a file of the copy as a diff says, whose first line names it; each part fits in one place."""
+        """Apply a diff to the file of the copy that its first line names; each part must match exactly one place."""
         first, _, rest = block.text.partition("\n")
         path = self.tree / first.removeprefix("--- ")
         text = path.read_text(encoding="utf-8")
@@ -171,7 +171,7 @@ class Reader:
         path.write_text(text, encoding="utf-8")
 
     def _toml(self, block: Block) -> None:
-        """Load it as a scene.toml, or as settings; by the name in its first line it stays for later blocks."""
+        """Load a block as scene.toml or as settings; a file name in its first line keeps it for later blocks."""
         path = self.folder / (block.file or f"line-{block.line}.toml")
         path.write_text(block.text, encoding="utf-8")
         if path.name == "scene.toml":
@@ -181,7 +181,7 @@ class Reader:
 
 
 def run_here(words: list[str]) -> int:
-    """Run the command line in this process; gives the exit code."""
+    """Run the command line in this process and return the exit code."""
     try:
         main(words)
     except SystemExit as ended:
@@ -190,7 +190,7 @@ def run_here(words: list[str]) -> int:
 
 
 def commands_of(block: Block) -> list[str]:
-    """The commands of a block: lines put together, comments gone, variables that it sets filled in."""
+    """Return the commands of a block: continued lines joined, comments removed, variables filled in."""
     text, known, found = block.text.replace("\\\n", " "), {"DATA": "data"}, []
     for line in text.splitlines():
         bare = shlex.join(shlex.split(Template(line).safe_substitute(known), comments=True))
@@ -203,7 +203,7 @@ def commands_of(block: Block) -> list[str]:
 
 
 def check_words(words: list[str], place: str) -> None:
-    """Refuse a command that cannot be meant: an unknown verb or flag, target, file or benchmark."""
+    """Refuse a command with an unknown verb, flag, target, file or benchmark."""
     program, *given = [Path(words[0]).name, *words[1:]]
     if program == "spectralzoom":
         build_app(listed=False).parse_args(given, exit_on_error=False, print_error=False)
@@ -218,7 +218,7 @@ def check_words(words: list[str], place: str) -> None:
 
 
 def check_python(program: str, given: list[str], place: str) -> None:
-    """A module or file that is there; of benchmarks those that are."""
+    """Check that a module, file or benchmark exists."""
     if given[0] == "-m":
         assert importlib.util.find_spec(given[1]) is not None, f"{place}: there is no module {given[1]}"
         return

@@ -1,4 +1,4 @@
-"""The camera that how-to/second-rig.md builds takes a sweep beside the emulated mirror."""
+"""The camera that how-to/second-rig.md builds takes a sweep with the emulated mirror."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from tests.pipeline.rig.in_process import InProcessRig, ManualClock
 from tests.pipeline.rig.small_rig import CAMERA, FINE, small_source
 
 MODULE = "folder_camera"
-PX = 11275  # about as many as a unit of the disk has
+PX = 11275  # about the pixels of a unit on the disk
 
 
 class SharedClock(ManualClock):
-    """A clock whose waiting lets another program work."""
+    """A clock whose sleep lets another program work."""
 
     program: Program | None = None
 
@@ -44,7 +44,7 @@ class SharedClock(ManualClock):
 
 @dataclass
 class Program:
-    """The camera's own program, as the page describes it: it sees by the emulated camera, and writes ENVI by SPy."""
+    """The camera's program as the page describes it: it captures by the emulated camera and writes ENVI by SPy."""
 
     folder: Path
     line: InProcessRig
@@ -52,7 +52,7 @@ class Program:
     runs: dict[str, str] = field(default_factory=dict)  # folders of the emulated camera, by names of captures
 
     def work(self) -> None:
-        """Take requests, and drop what is captured."""
+        """Take new requests, and save finished captures."""
         if self.busy:
             return
         self.busy = True
@@ -87,7 +87,7 @@ class Program:
 
 @pytest.fixture
 def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """The page's code as a file that can be imported."""
+    """Write the page's code as an importable module for one test."""
     (block,) = (block for block in blocks_of(DOCS / "how-to" / "second-rig.md") if block.file == f"{MODULE}.py")
     path = tmp_path / "code" / f"{MODULE}.py"
     path.parent.mkdir()
@@ -99,7 +99,7 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 @contextmanager
 def folder_rig(folder: Path) -> Iterator[tuple[RigSource, CameraDriver, Program]]:
-    """The emulated mirror beside the page's camera, whose program watches ``folder``."""
+    """Yield a source of the emulated mirror and the page's camera, the camera, and its program in ``folder``."""
     folder.mkdir()
     clock = SharedClock(50.0)
     settings = SurveyRig(camera_driver=f"{MODULE}:open_camera", host=str(folder), log_samples=16_000)
@@ -118,8 +118,8 @@ def folder_rig(folder: Path) -> Iterator[tuple[RigSource, CameraDriver, Program]
 
 
 @pytest.mark.usefixtures("module")
-def test_the_pages_camera_takes_a_sweep(tmp_path: Path) -> None:
-    """Every line comes, placed by the mirror's log, with the numbers of its file and the references beside it."""
+def test_the_camera_of_the_page_takes_a_sweep(tmp_path: Path) -> None:
+    """All lines are valid, within 3 px by the mirror's log, and have values and references of the camera's files."""
     with folder_rig(tmp_path / "incoming") as (source, _, _):
         found, references = list(source.lines(FINE)), source.references(FINE)
         (told,) = source.record["captures"]
@@ -138,8 +138,8 @@ def test_the_pages_camera_takes_a_sweep(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("module")
-def test_a_program_that_does_not_run_is_one_message(tmp_path: Path) -> None:
-    """Its request is withdrawn, so that nothing is captured later; a capture that is not there is named."""
+def test_a_camera_program_that_does_not_run_ends_in_one_message(tmp_path: Path) -> None:
+    """The request is withdrawn, so that no late capture follows; fetching a missing capture names it."""
     with folder_rig(tmp_path / "incoming") as (_, camera, program):
         program.busy = True
         camera.configure(100.0, 110.0)
@@ -162,8 +162,8 @@ BROKEN = {
 
 @pytest.mark.usefixtures("module")
 @pytest.mark.parametrize("name", BROKEN)
-def test_a_driver_that_is_none_is_refused_in_one_message(name: str) -> None:
-    """The setting, its value, why, and what is expected."""
+def test_an_invalid_driver_is_refused_in_one_message(name: str) -> None:
+    """The message has the setting, its value, the reason and the expected value."""
     value, words = BROKEN[name]
     with pytest.raises(SettingsError, match=rf"rig.mirror_driver = '{value}' {words}"):
         open_mirror_driver(SurveyRig(mirror_driver=value), 1500)

@@ -1,4 +1,4 @@
-"""The pages hold what they promise: every block runs, every link and path leads somewhere, README stays short."""
+"""Pages are correct: every block runs, every link and path exists, and the README is short."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from tests.docs.running import Reader
 from tests.prior_work import with_effects, without_effects
 
 WITH_BLOCKS = [page for page in PAGES if blocks_of(page)]
-OF_EFFECTS = {DOCS / "background" / "simulator.md"}  # pages that show which effects are chosen; others need no choice
+OF_EFFECTS = {DOCS / "background" / "simulator.md"}  # pages that show the automatic choice of effects; others skip it
 README_LINES = 130
 PATH = re.compile(
     r"(?:pipeline|models|storage|flows|tests|docs|\.ci)(?:/[\w.-]+)*/?|[\w-]+\.(?:md|toml|yaml|txt)|Makefile"
 )
-OF_USERS = {"scene.toml", "emulated.toml", "field.toml", "survey.toml", "north.toml"}  # pages have people write them
+OF_USERS = {"scene.toml", "emulated.toml", "field.toml", "survey.toml", "north.toml"}  # written by users of the pages
 
 
 def named(page: Path) -> str:
-    """A page's name in messages."""
+    """Return a page's name for messages."""
     return page.relative_to(ROOT).as_posix()
 
 
 @pytest.mark.parametrize("page", WITH_BLOCKS, ids=named)
 def test_every_block_runs(page: Path, place: Path, request: pytest.FixtureRequest) -> None:
-    """From top to bottom, in a folder with a small survey in it."""
+    """Blocks run from top to bottom, in a folder with a small survey."""
     blocks = blocks_of(page)
     bucket = request.getfixturevalue("bucket") if any(one.mark == "bucket" for one in blocks) else None
     reader = Reader(place, bucket)
@@ -38,8 +38,8 @@ def test_every_block_runs(page: Path, place: Path, request: pytest.FixtureReques
 
 
 @pytest.mark.parametrize("page", LINKED, ids=named)
-def test_links_lead_somewhere(page: Path) -> None:
-    """Files and anchors are there; addresses of the web are well formed, and not asked."""
+def test_links_have_existing_targets(page: Path) -> None:
+    """Files and anchors exist; web addresses are well-formed https and are not requested."""
     wrong = []
     for target in links_of(page):
         parts = urlsplit(target)
@@ -53,19 +53,19 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=named)
-def test_named_paths_are_there(page: Path) -> None:
-    """A path of the repository in backticks is one: what was renamed shows here."""
+def test_named_paths_exist(page: Path) -> None:
+    """Each path of the repository in backticks exists, so a renamed file is found here."""
     named_paths = {word.split("::")[0] for word in named_code(page) if PATH.fullmatch(word)} - OF_USERS
     assert [path for path in sorted(named_paths) if not (ROOT / path).exists()] == []
 
 
 def test_readme_is_short() -> None:
-    """What takes longer stands in docs."""
+    """The limit is README_LINES; longer texts belong into docs."""
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= README_LINES
 
 
-def test_rooms_of_the_table_are_those_of_the_tree() -> None:
-    """Every folder named in the first table of architecture is there, and no room is left out."""
+def test_the_table_of_folders_matches_the_source_tree() -> None:
+    """Every folder in the first table of architecture.md exists, and no package is missing."""
     page = (DOCS / "reference" / "architecture.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `(\w+)` \| (.*) \|$", page, re.M)
     assert [top for top, _ in rows] == ["pipeline", "models", "storage", "flows"]

@@ -1,6 +1,6 @@
-"""Run the faults beside this file and print one table: python tests/faults [name ...] [--quick] [--markdown FILE].
+"""Run the faults in this folder and print one table: python tests/faults [name ...] [--quick] [--markdown FILE].
 
-A demand that is not met is printed like one that is, the others go on, and the exit code is 1.
+A requirement that is not met is printed in the table, the other faults still run, and the exit code is 1.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-# Before numpy and torch are loaded: one thread, as the figures are meant.
+# One thread, set before numpy and torch are loaded, as all figures are for one thread.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
-sys.path[0] = str(Path(__file__).resolve().parents[2])  # not this folder: its modules go by their full names
+sys.path[0] = str(Path(__file__).resolve().parents[2])  # not this folder: its modules are imported by their full names
 
 from tests.faults.fault_table import HEADINGS, rows_of, run_table  # noqa: E402
 
@@ -32,7 +32,7 @@ FAULTS = {name: rows_of(f"tests.faults.{place}") for name, place in PLACES.items
 
 
 def main(arguments: Sequence[str]) -> int:
-    logging.disable(logging.WARNING)  # what is put right stands in the table
+    logging.disable(logging.WARNING)  # the table lists what is repaired
     return run_table(arguments, "python tests/faults", "fault", FAULTS, FAULTS, HEADINGS)
 
 

@@ -1,7 +1,7 @@
-"""One bit flipped in what is checksummed: ``python tests/faults checksummed_flips``.
+"""Flip one bit in a checksummed file: ``python tests/faults checksummed_flips``.
 
-A reader of weights or of the state of a training run may refuse the file, in one message, or give what was written, bit
-by bit: never other numbers. Flips in an archive are in `tests/storage/maintenance/test_verification.py`.
+A reader of weights or of a training checkpoint must refuse the file in one message, or return the written values bit by
+bit. `tests/storage/maintenance/test_verification.py` flips bits in an archive.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tests.conftest import RGB_NM, random_weights
 from tests.faults.fault_table import Clock, Row, reported_wrong
 
 RUN = "the run's identity"
-Content = tuple[Any, Mapping[str, torch.Tensor]]  # everything beside the tensors, and the tensors
+Content = tuple[Any, Mapping[str, torch.Tensor]]  # everything except the tensors, and the tensors
 Read = Callable[[Path], Content]
 
 
@@ -44,16 +44,16 @@ READERS: dict[str, Read] = {"weights": _weights, "checkpoint": _state}
 
 @dataclass
 class Flips:
-    """How readings of flipped files ended."""
+    """Count the results of reading files with a flipped bit."""
 
     tried: int = 0
     refused: int = 0
-    same: int = 0  # what was written, bit by bit: the flip changed a space, or nothing that is read
+    same: int = 0  # the written values: the flip changed a space, or a byte that is not read
     wrong: list[str] = field(default_factory=list)
 
 
 def flip_bits(count: int, folder: Path, seed: int = 0) -> Flips:
-    """Flip ``count`` single bits, half of them among the numbers, each in a fresh copy of a file, and read it."""
+    """Flip ``count`` single bits, half of them in the tensors, each in a fresh copy of a file, and read it."""
     folder.mkdir(parents=True, exist_ok=True)
     written, rng, found = _written(folder), Random(seed), Flips()
     before = {name: read(written[name]) for name, read in READERS.items()}
@@ -78,7 +78,7 @@ def _try(name: str, path: Path, before: Content, called: str, found: Flips) -> N
         found.refused += 1
         if str(path) not in str(error) or "\n" in str(error):
             found.wrong.append(f"{called}: refused with {str(error)[:200]!r}")
-    except Exception as error:  # whatever else a reader may raise is the defect that is looked for
+    except Exception as error:  # any other exception is the defect that this test searches for
         found.wrong.append(f"{called}: {type(error).__name__}: {str(error)[:200]}")
     else:
         found.same += 1

@@ -1,4 +1,4 @@
-"""One small survey that nothing has disturbed, for all tests here."""
+"""One small undisturbed survey for all tests of this folder."""
 
 from __future__ import annotations
 
@@ -12,6 +12,6 @@ from tests.faults.small_survey import Subject, prepare
 
 @pytest.fixture(scope="session")
 def subject(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Subject]:
-    """A small survey to disturb, and where to run it."""
+    """Yield a small survey to disturb, with the process that runs it."""
     with Nursery(tmp_path_factory.mktemp("faults")) as nursery:
         yield prepare(nursery)

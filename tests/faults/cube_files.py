@@ -1,6 +1,6 @@
-"""Small files of every kind that is ingested, to be mutated, and one reading of a file that may be anything.
+"""Small files of every format that `ingest` reads, to be mutated, and one reading of an arbitrary file.
 
-A reading has a limit of time, and its memory is traced.
+A reading has a time limit, and its memory is traced.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from storage.export.image_files import EnviFile, write_envi
 from storage.readers.open_cubes import open_cube
 
 SHAPE = (20, 12, 5)
-LONGEST_S = 30  # then it counts as hanging
+LONGEST_S = 30  # longer readings count as hanging
 
 
 def _cube() -> Any:
@@ -146,12 +146,12 @@ FORMATS: dict[str, Callable[[Path], str]] = {
 
 
 class TookTooLongError(Exception):
-    """A file kept its reader busy."""
+    """The reading of a file took longer than its limit."""
 
 
 @contextmanager
 def at_most(seconds: int) -> Iterator[None]:
-    """Raise TookTooLongError inside the block when it has run so long; for the main thread."""
+    """Raise TookTooLongError in the block after so many seconds; only in the main thread."""
 
     def ring(signum: int, frame: FrameType | None) -> None:
         raise TookTooLongError(f"more than {seconds} s")
@@ -167,16 +167,16 @@ def at_most(seconds: int) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Reading:
-    """How the opening and reading of one source ended."""
+    """The result of opening and reading one source."""
 
-    refused: str | None  # the error's class, where it was one with words
-    wrong: str | None  # what no reading may do
+    refused: str | None  # class of an error that has a message
+    wrong: str | None  # a result that no reading may have
     seconds: float
     peak_bytes: int
 
 
 def try_reading(address: Path) -> Reading:
-    """Open a source and read the first and the last lines that it holds."""
+    """Open a source, and read its first and last lines."""
     tracemalloc.start()
     begun, refused, wrong = time.monotonic(), None, None
     try:

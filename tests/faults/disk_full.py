@@ -1,10 +1,10 @@
-"""Let the disk run full under a survey, or refuse it calls: ``python tests/faults disk_full refused_writes``.
+"""Fill the disk during a survey, or refuse its system calls: ``python tests/faults disk_full refused_writes``.
 
-The archive lies on a small tmpfs, which is filled up at a chosen place; then it grows, and the same command runs again.
-Where no tmpfs can be mounted, the calls are refused from the inside instead, and the table says so.
+The archive is on a small tmpfs, which is filled up at a chosen file. Then it grows, and the same command runs again.
+If no tmpfs can be mounted, the calls are refused inside of the process instead, and the table says so.
 
-Rights do not hinder root, so other refusals are of calls, from the inside: whatever changes something in the archive,
-by whichever library, counts as a place. Places are drawn at random over a whole survey, each with a random error.
+File permissions do not stop root, so other errors are raised inside of the process, at any call that changes the
+archive, by any library. Calls are drawn at random over a whole survey, each with a random error.
 """
 
 from __future__ import annotations
@@ -26,24 +26,24 @@ from tests.faults.nursery import Ended, Nursery
 from tests.faults.small_survey import Subject, prepare, words, wrong_after_fault, wrong_after_rerun
 
 EACH, PLACES = 5, 150
-LARGE = 64 << 20  # bytes: more than a survey takes
-KINDS = ("spool", "segment", "segment manifest", "run")  # of files that are written
+LARGE = 64 << 20  # bytes: more than a survey needs
+KINDS = ("spool", "segment", "segment manifest", "run")  # of written files
 FULL = "disk is full"
-# Functions of ours that a full disk is met in.
+# Functions of this project that meet a full disk.
 WHERE = {"spool": "capture._capture", "manifest": "manifests.write_manifest"}
 
 
 @dataclass
 class Refusals:
-    """What came of disks that refuse."""
+    """Count the results of surveys on disks that refuse writes."""
 
-    met_at: Counter[str] = field(default_factory=Counter)  # what was being written, or the call's and the error's name
-    told: int = 0  # one clear message, exit 1
-    done: int = 0  # the survey fitted, or could do without: exit 0
+    met_at: Counter[str] = field(default_factory=Counter)  # kind of the written file, or names of call and error
+    told: int = 0  # one clear message, exit code 1
+    done: int = 0  # the survey had enough space, or did not need the call: exit code 0
     wrong: list[str] = field(default_factory=list)
 
     def words(self) -> str:
-        """The figures."""
+        """Return the figures as text."""
         places = ", ".join(f"{name} {count}" for name, count in sorted(self.met_at.items()))
         return (
             f"{self.told} failed with one message, {self.done} ended well; {reported_wrong(self.wrong)} (at: {places})"
@@ -54,7 +54,7 @@ class Refusals:
 
 
 def can_mount() -> bool:
-    """Whether this process may mount a tmpfs."""
+    """Return whether this process may mount a tmpfs."""
     with tempfile.TemporaryDirectory() as name:
         done = subprocess.run(["mount", "-t", "tmpfs", "none", name], capture_output=True, check=False).returncode == 0
         if done:
@@ -64,7 +64,7 @@ def can_mount() -> bool:
 
 @contextmanager
 def small_disk(folder: Path, size: int) -> Iterator[Path]:
-    """A tmpfs of ``size`` bytes while the block runs."""
+    """Mount a tmpfs of ``size`` bytes for the block."""
     folder.mkdir()
     subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "none", str(folder)], check=True)
     try:
@@ -75,7 +75,7 @@ def small_disk(folder: Path, size: int) -> Iterator[Path]:
 
 
 def fill_at_places(subject: Subject, each: int, *, mounted: bool, seed: int = 0) -> Refusals:
-    """Fill the disk ``each`` times while each kind of file is written, and run again on a larger one."""
+    """Fill the disk ``each`` times while each kind of file is written, and rerun the survey on a larger disk."""
     found, chance = Refusals(), random.Random(seed)
     counts = Counter(label(path) for _, call, path in subject.changing_calls if call == "open")
     for name in KINDS:
@@ -95,7 +95,7 @@ def fill_at_places(subject: Subject, each: int, *, mounted: bool, seed: int = 0)
 
 
 def _judge(subject: Subject, out: Path, ended: Ended, name: str, found: Refusals) -> None:
-    """Look at the archive after the survey failed, let the disk grow, and look again after the rerun."""
+    """Check the archive after the failure, enlarge the disk, and check again after a rerun."""
     wrong = wrong_after_fault(subject, out)
     if not (ended.told and FULL in ended.message):
         wrong.append(f"exit {ended.code}, {ended.message[-200:]}")
@@ -124,7 +124,7 @@ def full_rows(quick: bool = False) -> list[Row]:
 
 
 def refuse_places(subject: Subject, count: int, seed: int = 0) -> Refusals:
-    """Refuse at a random place in each of ``count`` parts of a survey, and run every survey again without."""
+    """Refuse one random call in each of ``count`` parts of a survey, and rerun each survey without the fault."""
     chance, found = random.Random(seed), Refusals()
     for part in range(count):
         at = 1 + int((part + chance.random()) * len(subject.changing_calls) / count)
@@ -143,7 +143,7 @@ def _refuse_one(subject: Subject, at: int, name: str, lasting: bool, found: Refu
     wrong = wrong_after_fault(subject, out)
     if not hit or not (ended.told or ended.code == 0):
         wrong.append(f"exit {ended.code}, {ended.message[-300:]}")
-    # One run after the rerun, unless the refusal came when the run was published already.
+    # One run after the rerun, unless the run was already published at the refusal.
     published = ended.code == 0 or not hit or Path(path).name == "runs" or "runs-" in path or "use.lock" in path
     again = subject.nursery.run(words(out))
     wrong += wrong_after_rerun(subject, out, again, runs=None if published else 1)

@@ -1,4 +1,4 @@
-"""The failure table: what was done to an archive, what was demanded and what came, in rows, and how they are set."""
+"""The failure table: rows with the injected fault, the requirement and the result, and their layout."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ WIDTHS = (22, 36, 6, 40, 44, 3, 5)
 
 @dataclass(frozen=True)
 class Row:
-    """One fault: ``count`` is how often it was injected, ``met`` whether what was found is what was demanded."""
+    """One fault: ``count`` is the number of injections, ``met`` whether the requirement is met."""
 
     fault: str
     injected: str
@@ -30,20 +30,20 @@ class Row:
 
     @property
     def cells(self) -> tuple[str, ...]:
-        """The row in words, in the order of ``HEADINGS``."""
+        """Return the row as text, in the order of ``HEADINGS``."""
         *words, met, seconds = astuple(self)
         return (*map(str, words), "yes" if met else "NO", f"{seconds:.0f}")
 
 
 class Clock:
-    """Seconds since it was made."""
+    """Seconds since the clock was made."""
 
     def __init__(self) -> None:
         self._began = time.monotonic()
 
     @property
     def seconds(self) -> float:
-        """Seconds by now."""
+        """Return the seconds until now."""
         return time.monotonic() - self._began
 
 
@@ -51,7 +51,7 @@ Rows = Callable[[bool], Sequence[Row]]  # quick or in full
 
 
 def reported_wrong(wrong: Sequence[str]) -> str:
-    """How many demands were not met, and the first three."""
+    """Return the number of unmet requirements, and the first three."""
     return f"{len(wrong)} wrong{': ' + '; '.join(wrong[:3]) if wrong else ''}"
 
 
@@ -63,9 +63,9 @@ def run_table(
     usual: Iterable[str],
     headings: Sequence[str],
 ) -> int:
-    """Make the rows asked for, or the usual ones; print the table, and write it as Markdown where asked.
+    """Make the requested rows, or the usual ones; print the table, and write it as Markdown if a file is given.
 
-    A demand that is not met is printed like one that is, the others go on, and the exit code is 1.
+    A requirement that is not met is printed in the table, the other rows follow, and the exit code is 1.
     """
     parser = argparse.ArgumentParser(prog=prog, description=f"One table of every {what} that is asked for.")
     parser.add_argument("names", nargs="*", help=f"of {', '.join(tables)}; by default {', '.join(usual)}")
@@ -83,7 +83,7 @@ def run_table(
         except Exception:
             traceback.print_exc()
             rows = [Row(name, "", 0, "that it can be tried", "crashed; the others went on", False, clock.seconds)]
-        found += [replace(row, met=row.met and row.count > 0) for row in rows]  # nothing tried is nothing shown
+        found += [replace(row, met=row.met and row.count > 0) for row in rows]  # a row without a try shows nothing
         print("\n".join(f"{row.fault}: {row.found}" for row in rows), flush=True)
     cells = [headings, *(row.cells for row in found)]
     print(f"\n{aligned(cells, WIDTHS)}")
@@ -95,7 +95,7 @@ def run_table(
 
 
 def rows_of(place: str) -> Rows:
-    """The rows of ``module`` or ``module:function``, which is imported when they are asked for."""
+    """Return the rows of ``module`` or ``module:function``, which is imported at the first call."""
     module, _, name = place.partition(":")
 
     def rows(quick: bool) -> Sequence[Row]:

@@ -1,6 +1,6 @@
-"""Bits that flip in a rig's journal, which only grows: ``python tests/faults growing_files``.
+"""Flip bits in a rig's journal, which only grows: ``python tests/faults growing_files``.
 
-It is opened again as a rig would. Demanded: no other capture, no defect, every other capture kept.
+The journal is opened again as by a rig. It must give no wrong capture and no defect, and lose at most one capture.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ SWEEP = Sweep("fine-0", "fine", "x", 0.0, -7.5, 40)
 
 @dataclass
 class Rot:
-    """What came of the flips. ``told`` counts those of which anything is said."""
+    """Count the results of the flips. ``told`` counts flips that the journal reports as damage."""
 
     flips: int = 0
     told: int = 0
     wrong: list[str] = field(default_factory=list)
 
     def words(self) -> str:
-        """The figures."""
+        """Return the figures as text."""
         return f"{self.told} of {self.flips} told; {reported_wrong(self.wrong)}"
 
 
 def flip_journal(flips: int, seed: int = 0) -> Rot:
-    """Flip bits of a rig's journal: a capture is held as it was, or not at all; the loss is told."""
+    """Flip bits of a rig's journal: each capture must be unchanged or missing; count the reported damage."""
     kept = KeptInMemory()
     journal, truth = CaptureJournal(kept), []
     for number in range(8):

@@ -1,6 +1,6 @@
-"""Faults put into a process from the inside: calls of the system that are refused, ends before a call.
+"""Inject faults into a process from the inside: refused system calls, and signals before a call.
 
-Every function here is called once, in a process that does nothing else and ends soon: nothing is put back.
+Each function is called once, in a process that only runs this fault and soon ends, so no function is restored.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 def refuse(
     root: str, at: int, number: int, *, lasting: bool = False, log: str | None = None, kind: str | None = None
 ) -> None:
-    """Let the ``at``-th call (from 1) that changes something below ``root`` fail with error ``number``.
+    """Let the ``at``-th call (from 1) that changes a file below ``root`` fail with error ``number``.
 
-    With ``lasting`` so do all later ones; ``at`` 0 refuses nothing. A write that is refused has written its first half.
-    ``log`` is written to when a call is refused, and with ``at`` 0 after every one: how many there were, and which.
-    With a ``kind`` only calls count that open a file of it, see `label`.
+    With ``lasting``, all later calls fail too; ``at`` 0 refuses no call. A refused write has written its first half.
+    ``log`` gets each refused call, or with ``at`` 0 every call: its number, name and path.
+    With a ``kind``, only calls count that open a file of this kind, see `label`.
     """
     watch = _Watch(Path(root).absolute(), at, number, lasting, log)
     watch.kind = kind
@@ -38,7 +38,7 @@ def refuse(
 
 
 def fill_disk(root: str, at: int, kind: str) -> None:
-    """Take all that is left of the disk of ``root`` just before the ``at``-th file of a ``kind`` is opened to write."""
+    """Fill the disk of ``root`` just before the ``at``-th file of a ``kind`` is opened for writing."""
     watch = _Watch(Path(root).absolute(), at, 0, False, None)
     watch.kind = kind
     watch.fill = Path(root).absolute().parent / "ballast"
@@ -46,9 +46,9 @@ def fill_disk(root: str, at: int, kind: str) -> None:
 
 
 def end_at(root: str, at: int, number: int, log: str | None = None) -> None:
-    """Send this process a signal just before the ``at``-th call (from 1) that changes something below ``root``.
+    """Send this process a signal just before the ``at``-th call (from 1) that changes a file below ``root``.
 
-    ``log`` is as of `refuse`.
+    ``log`` is that of `refuse`.
     """
     watch = _Watch(Path(root).absolute(), at, 0, False, log)
     watch.ending = number
@@ -71,7 +71,7 @@ def end_before(place: str, number: int, call: int = 1) -> None:
 
 
 def label(path: Path) -> str | None:
-    """What a file of an archive belongs to: a stage's store or manifest, the spool, the run; None for locks."""
+    """Return the kind of an archive's file: store or manifest of a stage, spool or run; None for locks."""
     first, *rest = path.parts or ("",)
     if first not in ("spool", "stages", "runs"):
         return None
@@ -84,12 +84,12 @@ def label(path: Path) -> str | None:
 def _install(watch: _Watch) -> None:
     for name in _CALLS.split():
         setattr(os, name, watch.around(name, getattr(os, name)))
-    # The io module calls the system from C, its twin in Python goes through os: so every library's files are seen.
+    # The io module calls the system from C, but its Python version calls os: so the files of every library are seen.
     builtins.open = io.open = _pyio.open
 
 
 class _Watch:
-    """Counts calls, from any thread."""
+    """Count calls of all threads."""
 
     fill: Path | None = None  # file to fill the disk with, instead of refusing
     ending: int | None = None  # signal to send this process, instead of refusing
@@ -102,7 +102,7 @@ class _Watch:
         self._log = None if log is None else os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
 
     def around(self, name: str, call: Callable[..., Any]) -> Callable[..., Any]:
-        """The call, with the fault before it."""
+        """Return the call with the fault before it."""
 
         def guarded(*given: Any, **named: Any) -> Any:
             path = self._path(name, given, named)
@@ -133,7 +133,7 @@ class _Watch:
         except OSError:
             return None
         if name == "mkdir" and Path(path).is_dir():
-            return None  # answered before anything is written
+            return None  # fails before any change
         return path if path.startswith(self._root) else None
 
     def _due(self, name: str, path: str) -> bool:
@@ -157,11 +157,11 @@ def _fill(ballast: Path) -> None:
                 size //= 2  # the last page takes what a larger piece could not
 
 
-_ON_FILES = {"write", "fsync", "fdatasync", "ftruncate"}  # errors of these carry no name
+_ON_FILES = {"write", "fsync", "fdatasync", "ftruncate"}  # errors of these have no file name
 
 
 def logged_calls(log: Path) -> list[tuple[int, str, str]]:
-    """What `refuse` wrote into its log: number, name and path of calls."""
+    """Return the entries in the log of `refuse`: number, name and path of calls."""
     lines = log.read_text().splitlines() if log.exists() else []
     parts = (line.split(" ", 2) for line in lines)
     return [(int(count), name, path) for count, name, path in parts]

@@ -1,7 +1,7 @@
-"""Count the lines that a capture loses when it dies: ``python tests/faults lost_lines``.
+"""Count the lines that a capture loses when it is killed: ``python tests/faults lost_lines``.
 
-A killed process loses nothing that it had written: the system has it. When the power fails, a file is what the disk
-was last asked to keep, and of what came after anything: cut off, zeros, other bytes.
+A killed process loses no written line, as the system has it. After a power failure a file has its last synced bytes.
+Later bytes may be missing, cut off, zero or random.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ with Spool.open(Path(sys.argv[1]), SAMPLES, BANDS, header=HEADER) as spool:
 
 @dataclass(frozen=True)
 class Moment:
-    """A capture at one moment: how many lines it has appended, and bytes of its file, as written and as synced."""
+    """A moment of a capture: number of appended lines, and bytes of its file, written and synced."""
 
     appended: int
     written: int
@@ -55,13 +55,13 @@ class Moment:
 
 @dataclass
 class Losses:
-    """What came of killing and of cutting the power."""
+    """Count the results of killed processes and power failures."""
 
-    lost: Counter[int] = field(default_factory=Counter)  # lines -> how often so many were lost
+    lost: Counter[int] = field(default_factory=Counter)  # lines lost -> number of cases
     wrong: list[str] = field(default_factory=list)
 
     def words(self) -> str:
-        """The figures."""
+        """Return the figures as text."""
         each = sorted(self.lost.elements()) or [0]
         at = [each[len(each) * fraction // 100] for fraction in (50, 90)]
         return (
@@ -71,19 +71,19 @@ class Losses:
 
 
 def line(number: int) -> Line:
-    """The line of this number, always the same."""
+    """Return the line of this number, with the same values on each call."""
     data = np.random.default_rng(number).integers(0, 4096, (SAMPLES, BANDS), dtype=np.uint16)
     return Line(number, data, 0.0, 1e-3 * number, 0.01 * number, 10.0)
 
 
 def fill(spool: Spool, upto: int) -> None:
-    """Go on with a capture up to so many lines."""
+    """Continue a capture up to so many lines."""
     while spool.count < upto:
         spool.append(line(spool.count))
 
 
 def record(folder: Path) -> list[Moment]:
-    """Capture undisturbed, and note what was appended and synced before and after each line and each sync."""
+    """Capture without a fault, and record the appended and synced data before and after each line and each sync."""
     moments: list[Moment] = []
     path = folder / "lines.lines"
     real, synced, appended = os.fdatasync, 0, 0
@@ -111,9 +111,9 @@ def record(folder: Path) -> list[Moment]:
 
 
 def cut_power(whole: Path, moment: Moment, folder: Path, chance: random.Random) -> str:
-    """Make what a disk may hold after the power failed at a moment; says what became of the file's last bytes."""
+    """Write a file as a power failure at this moment may leave it; return what happened to its last bytes."""
     content = (whole / "lines.lines").read_bytes()
-    begun = content.index(b"\n") + 1  # the header is on the disk before the first line
+    begun = content.index(b"\n") + 1  # the header is synced before the first line
     fate = chance.choice(FATES)
     left = _left(content[: moment.written], max(moment.synced, begun), fate, chance)
     (folder / "lines.lines").write_bytes(left)
@@ -121,7 +121,7 @@ def cut_power(whole: Path, moment: Moment, folder: Path, chance: random.Random) 
 
 
 def _left(content: bytes, synced: int, fate: str, chance: random.Random) -> bytes:
-    """One file after the power failed: the bytes that were synced, and something for those that were not."""
+    """Return the file after a power failure: its synced bytes, and a possible result for the others."""
     safe, rest = content[:synced], content[synced:]
     if fate == "cut off":
         return safe
@@ -131,14 +131,14 @@ def _left(content: bytes, synced: int, fate: str, chance: random.Random) -> byte
         return safe + bytes(len(rest))
     if fate == "other bytes":
         return safe + chance.randbytes(len(rest))
-    if fate == "some pages":  # whole blocks of the disk arrive in any order
+    if fate == "some pages":  # whole blocks of the disk are written in any order
         blocks = [rest[start : start + 512] for start in range(0, len(rest), 512)]
         return safe + b"".join(block if chance.random() < 0.5 else bytes(len(block)) for block in blocks)
     return content
 
 
 def try_power(cuts: int, folder: Path, seed: int = 0) -> Losses:
-    """Cut the power at random moments of one capture, and go on from what each leaves."""
+    """Cut the power at random moments of one capture, and resume from each resulting file."""
     chance, found = random.Random(seed), Losses()
     moments, truth = record(folder / "whole"), _contents(folder / "whole")
     for number in range(cuts):
@@ -163,13 +163,13 @@ def _go_on(place: Path, appended: int, found: Losses) -> Iterator[str]:
 
 
 def try_kills(kills: int, folder: Path, seed: int = 0) -> Losses:
-    """Kill captures at random moments, and compare what they had appended with what is there."""
+    """Kill captures at random moments, and compare the appended lines with the stored ones."""
     chance, found = random.Random(seed), Losses()
     command, environment = [sys.executable, "-c", WRITER], {**os.environ, "PYTHONPATH": str(ROOT)}
     for number in range(kills):
         place = folder / f"killed-{number}"
         with subprocess.Popen([*command, str(place)], cwd=ROOT, env=environment, stdout=subprocess.PIPE) as process:
-            told = process.stdout.read(8)  # the first line is there
+            told = process.stdout.read(8)  # the first line is stored
             time.sleep(chance.uniform(0.0, 0.1))
             process.send_signal(signal.SIGKILL)
             told += process.stdout.read()

@@ -1,7 +1,7 @@
-"""Several processes write one archive at once: ``python tests/faults many_writers``.
+"""Let several processes write one archive at the same time: ``python tests/faults many_writers``.
 
-The same survey two and four times; surveys that share their first stages; and one that is killed in the middle while
-others wait for what it was making.
+The cases are two and four equal surveys, surveys with common first stages, and a survey that is killed while
+others wait for its stages.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ OTHER = ("--policy", "sobel")  # shares the coarse pass, the geolocation grid an
 
 @dataclass
 class Writings:
-    """What came of writing together."""
+    """Count the results of simultaneous writers."""
 
-    waited: int = 0  # processes that were given what another made
+    waited: int = 0  # processes that used a stage of another process
     wrong: list[str] = field(default_factory=list)
 
     def words(self, rounds: int) -> str:
-        """The figures."""
+        """Return the figures as text."""
         return f"{rounds} archives, {self.waited} times one was given what another made; {reported_wrong(self.wrong)}"
 
 
@@ -45,7 +45,7 @@ def write_together(
     *,
     kill: bool = False,
 ) -> None:
-    """Start surveys within a moment of each other, kill the first half-way where asked, and look at the archive."""
+    """Start surveys at nearly the same time, kill the first one if asked, and check the archive."""
     children = []
     for more in commands:
         children.append(subject.nursery.start(words(out, *more)))
@@ -55,7 +55,7 @@ def write_together(
         time.sleep(chance.uniform(0.0, subject.whole_s))
         children[0].kill()
     ended = [child.wait() for child in children]
-    given = [one for one in ended if "% cached" in one.text and "% ran" in one.text]  # a stage that it had asked for
+    given = [one for one in ended if "% cached" in one.text and "% ran" in one.text]  # a stage that it had requested
     found.waited += sum("waiting for another run" in one.text or one in given for one in ended)
     wrong += [f"exit {one.code}: {one.message[-200:]}" for one in ended[int(kill) :] if one.code != 0]
     if kill:
@@ -67,7 +67,7 @@ def write_together(
         wrong.append(f"other than undisturbed: {', '.join(odd)}")
     runs = len(Archive.open(out, create=False, write=False).runs())
     good = sum(one.code == 0 for one in ended)
-    listed_then_killed = int(kill and ended[0].code != 0)  # the kill may fall between the listing and the exit
+    listed_then_killed = int(kill and ended[0].code != 0)  # the kill may come between the listing and the exit
     if not good <= runs <= good + listed_then_killed:
         wrong.append(f"{runs} runs are listed, {good} ended well")
     found.wrong += wrong
@@ -76,7 +76,7 @@ def write_together(
 
 
 def _left(out: Path, *, killed: bool) -> list[str]:
-    """Folders that nobody works on any more; those of a killed process the next run reclaims."""
+    """Return unfinished folders that are left; those of a killed process are reclaimed first, as by the next run."""
     if killed:
         Archive.open(out).reclaim()
     parts = [path.relative_to(out).as_posix() for path in out.rglob("*.part")]
@@ -85,7 +85,7 @@ def _left(out: Path, *, killed: bool) -> list[str]:
 
 
 def rows(quick: bool = False) -> list[Row]:
-    """Two and four of the same survey, surveys that share stages, and one killed while others wait."""
+    """Return the rows for two and four equal surveys, for common stages, and for a killed writer."""
     rounds = 1 if quick else ROUNDS
     with tempfile.TemporaryDirectory(prefix="writers-") as name, Nursery(Path(name)) as nursery:
         subject = prepare(nursery)

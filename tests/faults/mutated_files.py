@@ -1,7 +1,7 @@
-"""Mutated files of every kind that is ingested: each gives a cube or one clear error, soon, and in bounded memory.
+"""Mutate files of every ingested format: each must give a cube or one clear error, soon, in bounded memory.
 
-``python tests/faults headers files``: values, keys, lines and characters of ENVI headers, real and made; bytes that are
-flipped, overwritten, cut, doubled and moved in small files of each format. The cube is opened and read.
+``python tests/faults headers files`` changes values, keys, lines and characters of ENVI headers, real and made. It also
+flips, overwrites, cuts, doubles and moves bytes in small files of each format. Each cube is opened and read.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from tests.faults.cube_files import FORMATS, try_reading
 from tests.faults.fault_table import Clock, Row, reported_wrong
 from tests.faults.nursery import ROOT
 
-BATCH = 500  # mutations a process
-RATIO = 1100  # zlib's: files that pack numbers may hold this many times their bytes
-SPARE_BYTES = 24 << 20  # what libraries take when they are first used
+BATCH = 500  # mutations in one process
+RATIO = 1100  # zlib's limit: compressed files may hold this many times their bytes
+SPARE_BYTES = 24 << 20  # memory that libraries need at their first use
 LARGEST_DATA = 200_000  # bytes
-SPARE_OF_HEADERS = 1 << 20  # what Python itself takes, whatever the files hold
+SPARE_OF_HEADERS = 1 << 20  # memory that Python itself needs
 TIMES_HEADER = 80  # a header's text becomes lines, fields, words and numbers
 ODD_NUMBERS = (0, 1, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 1 << 20, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFE, 0xFFFFFFFF)
 ODD_BYTES = (b"\x89HDF", b"PK\3\4", b"-1", b"1e9", b"9" * 12, b"..", b"../../x", b"null", b"{}", b"[[[[", b"nan")
@@ -55,7 +55,7 @@ HAND_MADE = (
 
 @dataclass
 class Tally:
-    """How the readings of one kind of file ended."""
+    """Count the results of reading one kind of file."""
 
     read: int = 0
     refused: int = 0
@@ -64,7 +64,7 @@ class Tally:
     wrong: list[str] = field(default_factory=list)
 
     def add(self, other: Tally) -> None:
-        """Count another one's with this one's."""
+        """Add the counts of another tally."""
         self.read += other.read
         self.refused += other.refused
         self.slowest_s = max(self.slowest_s, other.slowest_s)
@@ -72,14 +72,14 @@ class Tally:
         self.wrong += other.wrong
 
     def words(self) -> str:
-        """The figures."""
+        """Return the figures as text."""
         return (
             f"{self.read} read, {self.refused} refused, {reported_wrong(self.wrong)}; slowest "
             f"{self.slowest_s * 1000:.0f} ms, {self.most_bytes / 1e6:.1f} MB at most"
         )
 
     def try_one(self, address: Path, most_bytes: int, called: str) -> None:
-        """Open one source and read its first and last lines, in so much memory."""
+        """Open one source, read its first and last lines, and check the peak memory."""
         found = try_reading(address)
         wrong = [] if found.wrong is None else [f"{called}: {found.wrong}"]
         if found.peak_bytes > most_bytes:
@@ -92,7 +92,7 @@ class Tally:
 
 
 def mutate_header(text: str, rng: random.Random) -> str:
-    """One to four random changes of a header's text: its values, keys, lines, characters."""
+    """Return a header's text with one to four random changes of values, keys, lines and characters."""
     for _ in range(rng.randint(1, 4)):
         lines = text.split("\n")
         at, change = rng.randrange(len(lines)), rng.randrange(9)
@@ -120,7 +120,7 @@ def mutate_header(text: str, rng: random.Random) -> str:
 
 
 def small(text: str, rng: random.Random) -> str:
-    """The same header for a cube of a few lines and samples, so that a small file can hold it."""
+    """Return the header for a cube of a few lines and samples, which fits into a small file."""
     lines = text.split("\n")
     for key, most in (("samples", 6), ("lines", 12)):
         lines = _set(lines, key, str(rng.randint(1, most)))
@@ -128,7 +128,7 @@ def small(text: str, rng: random.Random) -> str:
 
 
 def data_for(text: str, rng: random.Random) -> bytes:
-    """Bytes that hold what a header promises, some fewer or more of them, or any number where it promises nothing."""
+    """Return as many bytes as the header needs, or slightly other sizes; random sizes for an invalid header."""
     try:
         header = parse_envi_header(text)
         row = header.samples * header.bands * header.dtype.itemsize
@@ -144,12 +144,12 @@ def _set(lines: list[str], key: str, word: str) -> list[str]:
 
 
 def try_headers(count: int, folder: Path | None, seed: int = 0) -> Tally:
-    """Mutate ``count`` headers, read each with a data file of a few KB beside it, and say how it went."""
+    """Mutate ``count`` headers, read each with a data file of a few KB, and return the counts."""
     rng, tally, real = random.Random(seed), Tally(), [] if folder is None else sorted(folder.glob("*.hdr"))
     texts = [*HAND_MADE, *(path.read_bytes().decode("latin-1") for path in real)]
     with tempfile.TemporaryDirectory() as name:
         header = Path(name) / "a.hdr"
-        for text in texts:  # what reads them is imported before memory is measured
+        for text in texts:  # readers are imported before memory is measured
             header.with_suffix(".bin").write_bytes(data_for(text, random.Random(seed)))
             header.write_bytes(text.encode("latin-1"))
             try_reading(header)
@@ -164,7 +164,7 @@ def try_headers(count: int, folder: Path | None, seed: int = 0) -> Tally:
 
 
 def real_headers() -> Path | None:
-    """Folder of headers that instruments wrote, or None."""
+    """Return the folder of headers that instruments wrote, or None."""
     root = Path(os.environ.get("SPECTRALZOOM_DATA", Path(__file__).parents[3] / "shared" / "data"))
     return root / "envi_headers" if (root / "envi_headers").is_dir() else None
 
@@ -181,7 +181,7 @@ def header_rows(quick: bool = False) -> list[Row]:
 
 
 def mutate(content: bytes, rng: random.Random) -> bytes:
-    """One to four random changes of bits, bytes, numbers and words, cuts and doubled parts; most near the beginning."""
+    """Return the content with one to four random changes of bits, bytes, numbers and length; most near its start."""
     for _ in range(rng.randint(1, 4)):
         size = len(content)
         at = rng.randrange(min(size, 200) if rng.random() < 0.6 else size) if size else 0
@@ -208,7 +208,7 @@ def mutate(content: bytes, rng: random.Random) -> bytes:
 
 
 def try_files(count: int, seed: int = 0) -> dict[str, Tally]:
-    """Mutate ``count`` files, each format in turn, read each, and say how it went."""
+    """Mutate ``count`` files, each format in turn, read each, and return the counts."""
     tallies = {name: Tally() for name in FORMATS}
     with tempfile.TemporaryDirectory() as place:
         sources, addresses = {name: Path(place, f"s{number}") for number, name in enumerate(FORMATS)}, {}
@@ -229,7 +229,7 @@ def try_files(count: int, seed: int = 0) -> dict[str, Tally]:
 
 
 def file_rows(quick: bool = False) -> Sequence[Row]:
-    """One row for all formats; files are tried in processes of ``BATCH``, so that a crash is seen."""
+    """Return one row for all formats; each batch of ``BATCH`` files has its own process, so that a crash is found."""
     clock, count = Clock(), 100 if quick else 5000
     tally, crashed, grown = Tally(), list[str](), 0
     for seed in range(-(-count // BATCH)):
@@ -249,7 +249,7 @@ def file_rows(quick: bool = False) -> Sequence[Row]:
 
 
 def _part(count: int, seed: int) -> None:
-    try_files(len(FORMATS), seed + 10**6)  # libraries are loaded before anything is measured
+    try_files(len(FORMATS), seed + 10**6)  # libraries are loaded before memory is measured
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     found: dict[str, Any] = {name: asdict(tally) for name, tally in try_files(count, seed).items()}
     found["grown"] = 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)

@@ -1,7 +1,7 @@
-"""Surveys in processes of their own that start in no time: one process imports everything and forks a child for each.
+"""Run surveys in separate processes that start fast: one process imports all modules and forks a child for each.
 
-A child can be given a fault, a function of `tests.faults.injection` that is called before it begins. What it prints is
-kept, and where an error comes from: a fault that is not met where it was meant shows.
+A child can get a fault, a function of `tests.faults.injection` that is called before the command. The child's output is
+kept with the functions that its error passed, so a fault at a wrong place is noticed.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ ADVICE = ("run again", "--out", "another folder", "free space", "ulimit")
 
 @dataclass(frozen=True)
 class Ended:
-    """How a child ended. ``text`` is what it printed, ``place`` where its error was raised in our own code."""
+    """The result of a child. ``text`` is its output, ``place`` the functions of this project that its error passed."""
 
     code: int
     seconds: float
@@ -36,7 +36,7 @@ class Ended:
 
     @property
     def told(self) -> bool:
-        """Whether it failed with one message that says what to do, and nothing else that is meant for developers."""
+        """Return whether it failed with exactly one message that advises the user, without a traceback."""
         errors = [line for line in self.text.splitlines() if line.startswith("error: ")]
         return (
             self.code == 1
@@ -48,24 +48,24 @@ class Ended:
 
     @property
     def message(self) -> str:
-        """The error that the user reads, or all that was printed."""
+        """Return the error message for the user, or the whole output."""
         errors = [line for line in self.text.splitlines() if line.startswith("error: ")]
         return errors[-1] if errors else self.text.strip()
 
 
 class Child:
-    """A command under way."""
+    """A running command."""
 
     def __init__(self, nursery: Nursery, pid: int, log: Path) -> None:
         self.pid = pid
         self._nursery, self._log, self._began = nursery, log, time.monotonic()
 
     def kill(self) -> None:
-        """End it with SIGKILL; a child that ended by itself is not harmed, it is not yet waited for."""
+        """Send SIGKILL; it does not harm a child that has ended already, as it is still to be waited for."""
         os.kill(self.pid, signal.SIGKILL)
 
     def wait(self) -> Ended:
-        """How it ended, once it has."""
+        """Wait for the end and return the result."""
         code, place = int(self._nursery.ask({"wait": self.pid})), self._log.with_suffix(".place")
         ended = Ended(
             code,
@@ -79,7 +79,7 @@ class Child:
 
 
 class Nursery:
-    """Starts commands; use as a context manager. ``folder`` is where commands run and where their words are kept."""
+    """Start commands; use as a context manager. ``folder`` is their working directory and holds their output."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -103,18 +103,18 @@ class Nursery:
         self._process.stdout.close()
 
     def start(self, words: Iterable[str], fault: str | None = None, **arguments: Any) -> Child:
-        """Begin a command of the command line, with a fault and what that is told."""
+        """Start a command of the command line, with a fault and its arguments."""
         self._number += 1
         log = self.folder / f"child-{self._number}.log"
         request = {"words": list(words), "fault": fault, "arguments": arguments, "log": str(log)}
         return Child(self, int(self.ask(request | {"folder": str(self.folder)})), log)
 
     def run(self, words: Iterable[str], fault: str | None = None, **arguments: Any) -> Ended:
-        """Begin a command and wait for its end."""
+        """Start a command and wait for its end."""
         return self.start(words, fault, **arguments).wait()
 
     def ask(self, request: dict[str, Any]) -> str:
-        """Send one request and give its answer."""
+        """Send one request and return its answer."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         print(json.dumps(request), file=self._process.stdin, flush=True)
@@ -127,7 +127,7 @@ class Nursery:
 
 
 def serve(choices: Path) -> None:
-    """Fork a child for each request on stdin, or wait for one; what effects they choose is remembered in a folder."""
+    """Fork a child for each request on stdin, or wait for one; a folder keeps the children's choices of effects."""
     for name in (
         *("flows.cli.main", "flows.publish.run_folder", "flows.publish.survey_command", "flows.survey"),
         *("flows.cli.survey_verbs", "flows.archive.commands", "matplotlib.backends.backend_agg"),
@@ -135,9 +135,9 @@ def serve(choices: Path) -> None:
         *("pipeline.signal.compiled_loops", "pipeline.simulator.compiled_loops", "rasterio", "skimage.color"),
     ):
         importlib.import_module(name)
-    importlib.import_module("PIL.Image").init()  # reads its formats
+    importlib.import_module("PIL.Image").init()  # loads its formats
     importlib.import_module("tests.prior_work").remember(choices)
-    gc.freeze()  # else each child looks through all of it for what may go, and copies it from its parent by that
+    gc.freeze()  # else each child's garbage collection copies all of it from its parent
     for line in sys.stdin:
         request = json.loads(line)
         if "wait" in request:
@@ -150,7 +150,7 @@ def serve(choices: Path) -> None:
 
 
 def _live(request: dict[str, Any]) -> None:
-    """Run one command to its end, and never come back."""
+    """Run one command to its end, and exit the process."""
     code = 70
     try:
         log = os.open(request["log"], os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
@@ -171,7 +171,7 @@ def _live(request: dict[str, Any]) -> None:
 
 
 def _keep_place(path: Path) -> None:
-    """When the command line tells of an error, note the functions of ours that it came through."""
+    """Record the functions of this project that an error passed when the command line reports it."""
     cli = importlib.import_module("flows.cli.main")
     say, descriptor = cli.say, os.open(path, os.O_WRONLY | os.O_CREAT, 0o644)
 

@@ -1,4 +1,4 @@
-"""The survey that faults are tried on: it takes half a second, with every stage that stores something."""
+"""The survey for the fault tests: it takes half a second and has every stage that stores data."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.conftest import RGB_NM, patchy_scene, random_weights
 from tests.faults.injection import logged_calls
 from tests.faults.nursery import Ended, Nursery
 
-SETTINGS = "[camera]\nsamples = 128\n"  # most of a small survey's time goes into samples beside the field
+SETTINGS = "[camera]\nsamples = 128\n"  # most time of a small survey goes into samples outside of the field
 SURVEY = (
     "survey camera.toml --source sim --scene scene.png --labels labels.png --weights weights.safetensors "
     "--engine plain --no-controls --budget 0.95 --effects shot --keep raw"
@@ -27,9 +27,9 @@ Stored = dict[str, dict[str, str]]  # address of a store -> SHA-256 of each of i
 
 @dataclass(frozen=True)
 class Subject:
-    """A survey to disturb, a nursery to run it in, and what an undisturbed one left.
+    """A survey to disturb, the nursery that runs it, and the stores of an undisturbed run.
 
-    ``changing_calls`` are all calls by which it changes its archive: number, name, and path below the archive.
+    ``changing_calls`` are all calls that change its archive: number, name, and path below the archive.
     """
 
     nursery: Nursery
@@ -39,21 +39,21 @@ class Subject:
 
     @property
     def folder(self) -> Path:
-        """Where archives and scratch files go."""
+        """Return the folder of archives and scratch files."""
         return self.nursery.folder
 
     def surveyed(self, out: Path) -> None:
-        """Leave there what the undisturbed survey left."""
+        """Copy the archive of the undisturbed survey."""
         shutil.copytree(self.folder / UNDISTURBED, out)
 
 
 def words(out: Path, *more: str) -> list[str]:
-    """The survey's command into an archive; flags given later win."""
+    """Return the survey's command into an archive; later flags take precedence."""
     return [*SURVEY.split(), "--out", str(out), *more]
 
 
 def prepare(nursery: Nursery) -> Subject:
-    """Write scene, labels and weights into the nursery's folder, and survey once undisturbed."""
+    """Write scene, labels and weights into the nursery's folder, and run the survey undisturbed."""
     folder = nursery.folder
     values, labels = patchy_scene((48, 64), 3, seed=1)
     Image.fromarray(values.astype(np.uint8)).save(folder / "scene.png")
@@ -62,7 +62,7 @@ def prepare(nursery: Nursery) -> Subject:
     (folder / "camera.toml").write_text(SETTINGS)
     counted, out, log = folder / "counted", folder / UNDISTURBED, folder / "counted.calls"
     first = nursery.run(words(counted), "refuse", root=str(counted), at=0, number=0, log=str(log))
-    ended = nursery.run(words(out))  # the first alone works out which effects there are
+    ended = nursery.run(words(out))  # only the first run computes the choice of effects
     for one in (first, ended):
         assert one.code == 0, f"the undisturbed survey failed: {one.text}"
     calls = [(number, name, Path(path).relative_to(counted)) for number, name, path in logged_calls(log)]
@@ -72,7 +72,7 @@ def prepare(nursery: Nursery) -> Subject:
 
 
 def stored(archive: Path) -> Stored:
-    """Hash of every file of every published store, by address; nothing where there is no archive yet."""
+    """Return the hashes of all files of every published store, by address; empty if there is no archive yet."""
     if not (archive / "stages").is_dir():
         return {}
     opened = Archive.open(archive, create=False, write=False)
@@ -83,7 +83,7 @@ def stored(archive: Path) -> Stored:
 
 
 def problems(archive: Path) -> list[str]:
-    """What `verify` finds; nothing where there is no archive yet."""
+    """Return the problems that `verify` finds; empty if there is no archive yet."""
     if not (archive / "stages").is_dir():
         return []
     opened = Archive.open(archive, create=False, write=False)
@@ -91,7 +91,7 @@ def problems(archive: Path) -> list[str]:
 
 
 def wrong_after_fault(subject: Subject, archive: Path, before: Stored | None = None) -> list[str]:
-    """What is not as it should be where something failed: damage, stores that are lost, stores that are other."""
+    """Return the errors in an archive after a fault: damage, lost stores and changed stores."""
     now = stored(archive)
     return [
         *problems(archive),
@@ -101,7 +101,7 @@ def wrong_after_fault(subject: Subject, archive: Path, before: Stored | None = N
 
 
 def wrong_after_rerun(subject: Subject, archive: Path, ended: Ended, *, runs: int | None = None) -> list[str]:
-    """What is not as it should be where the same command was run again: everything is there, nothing else is."""
+    """Return the errors in an archive after a rerun: every store must be complete, without leftovers."""
     if ended.code != 0:
         return [f"the rerun failed: {ended.message}"]
     left = [path.relative_to(archive).as_posix() for path in archive.rglob("*.part")]

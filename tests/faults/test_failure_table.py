@@ -1,4 +1,4 @@
-"""A quick part of the failure table; the whole is ``python tests/faults``."""
+"""A quick part of the failure table; ``python tests/faults`` makes the whole."""
 
 from __future__ import annotations
 
@@ -14,33 +14,33 @@ from tests.faults.small_survey import Subject, stored
 
 
 @pytest.mark.parametrize(("count", "code"), [(0, 1), (1, 0)])
-def test_a_row_that_tried_nothing_is_not_met(count: int, code: int) -> None:
-    """Nothing of nothing differs; that shows nothing."""
+def test_a_row_without_tries_is_not_met(count: int, code: int) -> None:
+    """A comparison of 0 items finds no difference and proves nothing, so the exit code is 1."""
     row = Row("lines", "compared", count, "equal", f"0 of {count} differ", True, 0.0)
     assert run_table(["lines"], "", "", {"lines": lambda quick: [row]}, (), HEADINGS) == code
 
 
-def test_disk_full_under_spool_manifest_and_run(subject: Subject) -> None:
-    """One message, an archive that verifies, and a rerun on a larger disk that is bit-identical."""
+def test_a_full_disk_ends_in_one_message_and_a_rerun_completes(subject: Subject) -> None:
+    """The disk fills at each kind of file; the archive verifies, and the rerun on a larger disk is bit-identical."""
     mounted = disk_full.can_mount()
     found = disk_full.fill_at_places(subject, 1, mounted=mounted)
     assert found.wrong == []
     assert found.told == len(disk_full.KINDS)
 
 
-def test_writes_refused_at_random_calls(subject: Subject) -> None:
-    """Wherever in a survey, by whichever library, and whether once or for good."""
+def test_a_refused_call_ends_in_one_message_and_a_rerun_completes(subject: Subject) -> None:
+    """The calls are random, of any library, and refused once or from then on."""
     found = disk_full.refuse_places(subject, 3, seed=3)
     assert found.wrong == []
     assert found.told >= 2
     assert len(subject.changing_calls) > 500
-    # Writes of Zarr count too: else nothing would be refused where most is written.
+    # Zarr's writes must count too, as they are the most.
     names = {name for _, name, _ in subject.changing_calls}
     assert {"open", "write", "fsync", "fdatasync", "mkdir", "rename", "replace", "unlink"} <= names
 
 
-def test_two_writers_and_one_killed(subject: Subject) -> None:
-    """The others end well, with one copy of everything."""
+def test_two_writers_share_stores_and_survive_a_kill(subject: Subject) -> None:
+    """All others exit with 0, and the archive has one copy of each store."""
     found = many_writers.Writings()
     for number, kill in enumerate((False, True)):
         out = subject.folder / f"together-{number}"
@@ -48,39 +48,39 @@ def test_two_writers_and_one_killed(subject: Subject) -> None:
     assert found.wrong == []
 
 
-def test_power_fails_in_a_capture(tmp_path: Path) -> None:
-    """At most the lines since the last sync are lost, and the capture goes on to the same bytes."""
+def test_a_power_failure_loses_at_most_64_lines(tmp_path: Path) -> None:
+    """Only lines since the last sync are lost, and the resumed capture has the same bytes."""
     found = lost_lines.try_power(30, tmp_path, seed=1)
     assert found.wrong == []
     assert 0 < max(found.lost) <= 64
 
 
-def test_capture_killed(tmp_path: Path) -> None:
-    """No line that was appended is lost."""
+def test_a_killed_capture_loses_no_line(tmp_path: Path) -> None:
+    """The system keeps every line that was appended before SIGKILL."""
     found = lost_lines.try_kills(2, tmp_path, seed=1)
     assert found.wrong == []
     assert set(found.lost) == {0}
 
 
-def test_bits_flipped_in_weights_and_checkpoints(tmp_path: Path) -> None:
-    """Each is refused in one message, or read as it was written."""
+def test_flipped_bits_in_weights_and_checkpoints_are_refused(tmp_path: Path) -> None:
+    """Each flip is refused in one message, or the file is read with its written values."""
     found = checksummed_flips.flip_bits(150, tmp_path, seed=1)
     assert found.wrong == []
     assert found.tried == found.refused + found.same == 150
     assert found.refused > 100
 
 
-def test_mutated_headers_end_well() -> None:
-    """Each header gives a cube or one clear error, soon, in about the memory that the files take."""
+def test_mutated_headers_give_a_cube_or_one_error() -> None:
+    """Each reading ends within 30 s, in memory bounded by the size of its files."""
     found = mutated_files.try_headers(300, mutated_files.real_headers(), seed=1)
     assert found.wrong == []
-    assert found.read > 20  # else nothing but the first check was tried
+    assert found.read > 20  # else only the first check was tested
     assert found.refused > 20
 
 
-@pytest.mark.filterwarnings("ignore::Warning")  # decoders may warn of what they then refuse
-def test_mutated_files_end_well() -> None:
-    """Each file gives a cube or one clear error, soon, in memory bounded by its size."""
+@pytest.mark.filterwarnings("ignore::Warning")  # decoders may warn before they refuse
+def test_mutated_files_give_a_cube_or_one_error() -> None:
+    """Each reading ends within 30 s, in memory bounded by the size of its files."""
     found = mutated_files.try_files(8 * len(FORMATS), seed=7).values()
     assert [line for tally in found for line in tally.wrong] == []
     assert min(tally.read + tally.refused for tally in found) == 8
@@ -88,8 +88,8 @@ def test_mutated_files_end_well() -> None:
     assert sum(tally.read for tally in found) > 20
 
 
-def test_a_fault_that_is_not_survived_is_seen(subject: Subject) -> None:
-    """The judges find damage: a store of other bytes, one that is lost, and an error without advice."""
+def test_the_checks_find_damage(subject: Subject) -> None:
+    """They find a cut store, a lost store, and an error without advice."""
     out = subject.folder / "damaged"
     subject.surveyed(out)
     before = stored(out)

@@ -1,8 +1,8 @@
-"""Stopped by SIGTERM or SIGKILL: one sentence where it can be said, nothing lost, and the same command goes on.
+"""A survey that SIGTERM or SIGKILL stops loses no stored data, and the same command resumes it.
 
-Killed at random moments, what was published verifies, what was spooled is there, and the rerun goes on.
+After a kill at a random moment, published stores verify, and the rerun completes.
 
-A run is published once its map is drawn; stopped while the map is judged it is there, and its accuracy is added later.
+A run is published once its map is drawn; if it is stopped during the evaluation, its accuracy is added later.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from tests.faults.small_survey import Subject, problems, stored, words, wrong_af
 from tests.receipts import comparable, receipts
 
 GOING_ON = "terminated; run the same command to resume"
-SYNC = 60  # of a survey's files, before which it is stopped
+SYNC = 60  # sync calls before the survey is stopped
 CODES = {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: TERMINATED}
 BEGUN = ("flows.tasks.stages.accuracy:load_class_map", 1)
-PLACES = {  # function and call before which a survey is stopped that has its map, and with what
+PLACES = {  # function, its call before which a survey with a map is stopped, and the signal
     "before the map is looked at": (*BEGUN, signal.SIGTERM),
     "in the controls": ("flows.tasks.stages.accuracy:run_controls", 1, signal.SIGKILL),
     "stored and not added": ("flows.publish.publishing:extend_with_accuracy", 1, signal.SIGKILL),
     "after the run has changed": ("storage.archive.run_folders:remove_tree", 2, signal.SIGKILL),
 }
 ADDED = "after the run has changed"
-KILLS = int(os.environ.get("KILLS", "0"))  # at more moments, by `make soak`
-MOMENTS = (0.28, 0.98, *(random.Random(0).uniform(0.05, 1.05) for _ in range(KILLS)))  # of the time it takes
+KILLS = int(os.environ.get("KILLS", "0"))  # more moments, for `make soak`
+MOMENTS = (0.28, 0.98, *(random.Random(0).uniform(0.05, 1.05) for _ in range(KILLS)))  # as fractions of its time
 
 
 def told(ended: Ended) -> bool:
-    """Whether a command ended by SIGTERM with its one sentence, and nothing else but progress."""
+    """Return whether a command ended by SIGTERM with its one sentence, and otherwise only progress."""
     lines = ended.text.strip().splitlines()
     return (
         ended.code == TERMINATED
@@ -48,8 +48,8 @@ def told(ended: Ended) -> bool:
     )
 
 
-def test_a_survey_that_is_terminated(subject: Subject, tmp_path: Path) -> None:
-    """What was published verifies, and the same command ends as if nothing had been."""
+def test_a_terminated_survey_is_resumed_by_the_same_command(subject: Subject, tmp_path: Path) -> None:
+    """Its published stores verify, and the rerun completes with the stores of an undisturbed survey."""
     out = tmp_path / "archive"
     ended = subject.nursery.run(
         words(out), "end_before", place="storage.archive.manifests:sync_path", number=signal.SIGTERM, call=SYNC
@@ -64,7 +64,7 @@ def test_a_survey_that_is_terminated(subject: Subject, tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def mapped(subject: Subject) -> Path:
-    """The archive of a survey that was killed when it began to judge its map."""
+    """Return the archive of a survey that was killed at the start of its evaluation."""
     out = subject.folder / "mapped"
     ended = stopped(subject, out, *BEGUN, signal.SIGKILL)
     assert ended.code == -signal.SIGKILL, ended.text
@@ -72,26 +72,26 @@ def mapped(subject: Subject) -> Path:
 
 
 def asked(out: Path) -> list[str]:
-    """The survey, with controls."""
+    """Return the command of the survey with controls."""
     return [word for word in words(out) if word != "--no-controls"]
 
 
 def stopped(subject: Subject, out: Path, place: str, call: int, number: int) -> Ended:
-    """The survey, stopped."""
+    """Run the survey and stop it before a call."""
     return subject.nursery.run(asked(out), "end_before", place=place, call=call, number=number)
 
 
 @pytest.fixture(scope="module")
 def whole(subject: Subject) -> Any:
-    """The receipt of the same survey, left alone."""
+    """Return the receipt of the same survey without a fault."""
     assert subject.nursery.run(asked(subject.folder / "whole")).code == 0
     (receipt,) = receipts(subject.folder / "whole")
     return receipt
 
 
 @pytest.mark.parametrize("place", PLACES)
-def test_its_accuracy_is_added(subject: Subject, whole: Any, mapped: Path, tmp_path: Path, place: str) -> None:
-    """Stopped again anywhere, it verifies and is as it was or has it; then it says what an undisturbed one says."""
+def test_a_rerun_adds_the_accuracy(subject: Subject, whole: Any, mapped: Path, tmp_path: Path, place: str) -> None:
+    """A second stop leaves the run valid, with or without its accuracy; the rerun gives the undisturbed receipt."""
     out, (name, call, number) = tmp_path / "archive", PLACES[place]
     shutil.copytree(mapped, out)
     (first,) = receipts(out)
@@ -103,7 +103,7 @@ def test_its_accuracy_is_added(subject: Subject, whole: Any, mapped: Path, tmp_p
     again = subject.nursery.run(asked(out))
     assert again.code == 0, again.text
     found = receipts(out)
-    assert len(found) == (2 if place == ADDED else 1)  # a survey of which nothing is missing is a run of its own
+    assert len(found) == (2 if place == ADDED else 1)  # a survey with nothing missing is a new run
     for receipt in found:
         assert comparable(receipt) == comparable(whole)
         assert list(receipt) == list(whole)
@@ -116,12 +116,12 @@ def test_its_accuracy_is_added(subject: Subject, whole: Any, mapped: Path, tmp_p
 
 
 @pytest.mark.parametrize("moment", MOMENTS)
-def test_killed_survey_goes_on(subject: Subject, tmp_path: Path, moment: float) -> None:
-    """Killed at any moment: every store verifies; the same command ends with the bytes of an undisturbed run."""
+def test_a_killed_survey_is_resumed(subject: Subject, tmp_path: Path, moment: float) -> None:
+    """Every store verifies after the kill, and the rerun has the bytes of an undisturbed survey."""
     child = subject.nursery.start(words(tmp_path))
     time.sleep(moment * subject.whole_s)
     child.kill()
-    assert child.wait().code in (-signal.SIGKILL, 0)  # a faster run than the first may have ended before
+    assert child.wait().code in (-signal.SIGKILL, 0)  # a run that is faster than the first may have ended
     before = stored(tmp_path)
     assert wrong_after_fault(subject, tmp_path) == []
     assert wrong_after_rerun(subject, tmp_path, subject.nursery.run(words(tmp_path))) == []

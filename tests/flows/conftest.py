@@ -1,4 +1,4 @@
-"""The command line in this process, a Prefect in a folder of its own, and archives of tiny surveys to look at."""
+"""The command line in this process, Prefect with a folder of its own, and archives of tiny surveys."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from tests.flows.small_fields import write_field
 from tests.prior_work import without_effects
 
 CommandLine = Callable[..., "Ended"]
-FEW_BANDS = ",".join(map(str, range(4, 270, 9)))  # of the farm: the fewest that reach all the shipped weights' columns
+FEW_BANDS = ",".join(map(str, range(4, 270, 9)))  # of the farm: the fewest that give all the shipped weights' columns
 
 
 @dataclass(frozen=True)
 class Ended:
-    """How a command ended and what it wrote."""
+    """Exit code and output of a command."""
 
     code: int
     out: str
@@ -41,29 +41,29 @@ class Ended:
 
     @property
     def errors(self) -> list[str]:
-        """The messages that begin with ``error:``."""
+        """Return the messages that begin with ``error:``."""
         return [line.removeprefix("error: ") for line in self.err.splitlines() if line.startswith("error: ")]
 
     def refused(self, code: int, pattern: str) -> None:
-        """It ended with this code, one message that matches, and no traceback."""
+        """Assert that the command ended with this code, one message that matches, and no traceback."""
         assert (self.code, len(self.errors)) == (code, 1), self.err
         assert re.search(pattern, self.errors[0]), self.errors[0]
         assert "Traceback" not in self.err
 
 
 def problems(out: Path) -> list[str]:
-    """What a full verification of an archive finds."""
+    """Return the problems that a full verification of an archive finds."""
     return [f"{one.uri} {one.problem}" for one in verify_archive(Archive.open(out)) if one.problem]
 
 
 def class_map(out: Path) -> np.ndarray:
-    """The one class map of an archive."""
+    """Return the only class map of an archive."""
     (ref,) = Archive.open(out).refs("segment")
     return load_class_map(ref.path / "class_map.zarr").classes
 
 
 class Page(HTMLParser):
-    """A page whose tags close in order: its links, what else it would load from elsewhere, and its own scripts."""
+    """Parser of a page that checks the order of closing tags; collects links, loaded addresses and scripts."""
 
     def __init__(self, page: str) -> None:
         super().__init__()
@@ -76,40 +76,40 @@ class Page(HTMLParser):
         assert not self.open
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Remember addresses; tags without an end are not open, frames and scripts of elsewhere are none of ours."""
+        """Collect addresses; void tags are not opened, and frames and external scripts are refused."""
         assert tag not in ("link", "iframe")
-        data = tag == "script" and ("type", "application/json") in attrs  # which does not run
+        data = tag == "script" and ("type", "application/json") in attrs  # data does not run
         assert tag != "script" or data or not attrs
         found = [str(value) for name, value in attrs if name in ("src", "href", "srcset", "action", "xlink:href")]
         if tag == "a":
             self.links += found
-        self.loaded += [one for one in found if tag != "a" and not one.startswith("#")]  # but for parts of the page
+        self.loaded += [one for one in found if tag != "a" and not one.startswith("#")]  # except parts of the page
         if tag not in ("meta", "img", "input"):
             self.open.append("data" if data else tag)
 
     def handle_data(self, data: str) -> None:
-        """Keep what runs."""
+        """Collect the text of scripts."""
         if self.open and self.open[-1] == "script":
             self.scripts.append(data)
 
     def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Nothing is open after it."""
+        """Collect addresses and close the tag at once."""
         self.handle_starttag(tag, attrs)
         if tag not in ("meta", "img", "input"):
             self.open.pop()
 
     def handle_endtag(self, tag: str) -> None:
-        """The innermost open tag closes."""
+        """Assert that the innermost open tag closes."""
         assert self.open.pop() in (tag, "data" if tag == "script" else tag)
 
 
-RECORDED_S = 30.0  # in which a server has heard of a task that ended
+RECORDED_S = 30.0  # time for a server to record the end of a task
 
 
 def newest_run(flow: str, count: int) -> tuple[Any, dict[str, Any]]:
-    """The newest run of a flow, and its ``count`` task runs by their names, as soon as the server has them ended.
+    """Return the newest run of a flow and its ``count`` task runs by name, as soon as the server has them ended.
 
-    It hears of tasks by events, of the last one after the flow has ended.
+    The server records tasks by events, the last one after the flow has ended.
     """
     from prefect.client.orchestration import get_client
     from prefect.client.schemas.filters import (
@@ -123,7 +123,7 @@ def newest_run(flow: str, count: int) -> tuple[Any, dict[str, Any]]:
 
     with get_client(sync_client=True) as client:
         named = FlowFilter(name=FlowFilterName(any_=[flow]))
-        begun = FlowRunFilter(start_time=FlowRunFilterStartTime(is_null_=False))  # others have deployments here
+        begun = FlowRunFilter(start_time=FlowRunFilterStartTime(is_null_=False))  # other runs have deployments here
         (run,) = client.read_flow_runs(
             flow_filter=named, flow_run_filter=begun, sort=FlowRunSort.START_TIME_DESC, limit=1
         )
@@ -138,26 +138,26 @@ def newest_run(flow: str, count: int) -> tuple[Any, dict[str, Any]]:
 
 
 def turned(scene: Path, to: Path) -> Path:
-    """Write a picture turned by half a circle: another field of the same size."""
+    """Write a picture turned by 180 degrees, as another field of the same size, and return its path."""
     with Image.open(scene) as image:
         image.transpose(Image.Transpose.ROTATE_180).save(to)
     return to
 
 
 def python(code: str, *words: object, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run code of this project in a process of its own."""
+    """Run code of this project in another process and return the result."""
     known = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2]), **environment}
     command = [sys.executable, "-c", code, *map(str, words)]
     return subprocess.run(command, env=known, capture_output=True, text=True, check=False)
 
 
 def act_instead(patch: pytest.MonkeyPatch, name: str, wants: Callable[..., Any]) -> None:
-    """Have a stage want something else."""
+    """Replace the function by which a stage requests its store."""
     patch.setitem(STAGES, name, replace(STAGES[name], wants=wants))
 
 
 def be_version(patch: pytest.MonkeyPatch, product: str, version: int) -> None:
-    """Have all stages of a product write another version of it."""
+    """Make all stages of a product write another version of it."""
     for name, stage in list(STAGES.items()):
         if stage.product.name == product:
             patch.setitem(STAGES, name, replace(stage, product=replace(stage.product, version=version)))
@@ -165,7 +165,7 @@ def be_version(patch: pytest.MonkeyPatch, product: str, version: int) -> None:
 
 @pytest.fixture
 def command_line(capfd: pytest.CaptureFixture[str]) -> CommandLine:
-    """Run ``spectralzoom`` with the given words in this process."""
+    """Return a function that runs ``spectralzoom`` with the given words in this process."""
 
     def run(*words: object) -> Ended:
         capfd.readouterr()
@@ -178,7 +178,7 @@ def command_line(capfd: pytest.CaptureFixture[str]) -> CommandLine:
 
 @pytest.fixture(scope="session", autouse=True)
 def prefect_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Prefect's files in a folder of their own. Set before any test imports it, as it reads its settings only then."""
+    """Yield a folder for Prefect's files, set before the first import of Prefect, which reads its settings once."""
     home = tmp_path_factory.mktemp("prefect")
     with pytest.MonkeyPatch.context() as patch:
         for name, value in {**QUIET, "PREFECT_HOME": str(home)}.items():
@@ -188,14 +188,14 @@ def prefect_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.fixture(scope="module")
 def server(prefect_home: Path) -> Iterator[str]:
-    """A Prefect server that all flows of a module share, and the address of its API."""
+    """Yield the API address of a Prefect server that all flows of a module share."""
     with local_server(prefect_home) as api:
         yield api
 
 
 @pytest.fixture
 def field_file(tmp_path: Path, flags_png: Flags) -> Callable[..., Path]:
-    """Write a field's settings, with other lines before them."""
+    """Return a function that writes a field's settings, with other lines before them."""
 
     def write(stem: str = "north", lines: str = "", **changes: str | None) -> Path:
         values = flags_png(tmp_path / "archive", budget="0.8") | changes
@@ -209,7 +209,7 @@ def field_file(tmp_path: Path, flags_png: Flags) -> Callable[..., Path]:
 
 @pytest.fixture(scope="session")
 def two_budgets(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) -> Path:
-    """An archive of two surveys of one scene with different budgets, 0.8 and 0.7; not to be changed."""
+    """Return an archive of two surveys of one scene with budgets of 0.8 and 0.7; do not change it."""
     folder = tmp_path_factory.mktemp("two_budgets") / "archive"
     with without_effects():
         for budget in ("0.8", "0.7"):
@@ -219,12 +219,12 @@ def two_budgets(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) ->
 
 @pytest.fixture(scope="session")
 def one_survey(tmp_path_factory: pytest.TempPathFactory, surveyed_png: Survey) -> tuple[Path, Any]:
-    """An archive with one survey of the small picture, not to be changed, and what it published."""
+    """Return an archive with one survey of the small picture and its run; do not change it."""
     out = tmp_path_factory.mktemp("one_survey") / "archive"
     return out, surveyed_png(out)
 
 
 @pytest.fixture(scope="session")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of three small frames that all evaluations judge on."""
+    """Return a folder of three small frames for all evaluations."""
     return write_field(tmp_path_factory.mktemp("evaluate") / "field")

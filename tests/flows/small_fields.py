@@ -1,4 +1,4 @@
-"""A folder of three small labelled frames, small weights to judge on them, and what every quick evaluation asks for."""
+"""Three small labelled frames, small weights to judge on them, and the options of a quick evaluation."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ QUICK: dict[str, Any] = {"fractions": (0.25, 0.5), "policies": ("entropy", "rand
 
 
 def write_field(root: Path, size: tuple[int, int] = (24, 40), names: Sequence[str] = FRAMES, *, seed: int = 0) -> Path:
-    """Frames of two classes."""
+    """Write frames of two classes and return their folder."""
     rng = np.random.default_rng(seed)
     for folder in ("images", "annotations"):
         (root / folder).mkdir(parents=True)
@@ -38,16 +38,16 @@ def write_field(root: Path, size: tuple[int, int] = (24, 40), names: Sequence[st
 
 
 def write_weights(path: Path, seed: int = 0, **record: Any) -> Path:
-    """Small random weights for the field's two classes."""
+    """Write small random weights for the field's two classes and return their path."""
     made = make_weights(seed, classes=2, columns=3)
     for name, tensor in made.segmenter.state_dict().items():
         if name.endswith("classes.weight"):
-            tensor *= 0.01  # else logits are in the hundreds, and gains all at their clip
+            tensor *= 0.01  # else logits are in the hundreds, and all gains at their limit
     save_weights(replace(made, class_names=NAMES, record={"seed": seed, **record}), path)
     return path
 
 
 def scene_at(data: Path, name: str = "001") -> RasterScene:
-    """One frame of the field."""
+    """Return one frame of the field."""
     opened = open_frames(str(data), (name,), None, LineCamera(), {})
     return opened.scene(opened.train[0])

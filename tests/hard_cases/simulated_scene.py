@@ -1,4 +1,4 @@
-"""Small scenes and rigs for the simulator's hard cases, and what leaving out each effect changes."""
+"""Small scenes and rigs for the simulator's hard cases, and the change from leaving out each effect."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from pipeline.simulator.selection.options import acts_on_light
 from pipeline.simulator.simulated import sweep_block
 from tests.pipeline.simulator.small_scenes import made_scene
 
-ROUNDING = 4e-6  # of the light over its noise: sums of float32 in another order
+ROUNDING = 4e-6  # times the light over its noise: float32 sums in another order
 CAMERA = LineCamera(samples=64)
 RIG = Rig(camera=CAMERA)
 SWEEP = Sweep("s", "fine", "x", swath_px=0.0, start_px=-15.5, lines=30)
 NOON = datetime(2026, 6, 21, 11, 20, tzinfo=UTC)
-PROBES: dict[tuple[Any, ...], Probe] = {}  # made already: most of a small decision is its look at the scene
-EVERYTHING = Rig(  # that a rig may have
+PROBES: dict[tuple[Any, ...], Probe] = {}  # cache: a small decision spends most of its time on the probe
+EVERYTHING = Rig(  # every part that a rig may have
     camera=CAMERA,
     mirror=MirrorMotion(positions_per_line=0.7, repeatability_urad=40.0, hysteresis_px=2.0, drift_px_per_min=1.0),
     detector=Detector(dead_fraction=0.01, hot_fraction=0.01),
@@ -40,27 +40,27 @@ EVERYTHING = Rig(  # that a rig may have
 
 
 def scene_of(values: NDArray[np.floating], electrons: float = 5000.0) -> RasterScene:
-    """A scene whose value 1 gives so many electrons in every band; the bands are 6 nm wide."""
+    """Return a scene whose value 1 gives ``electrons`` in every band; the bands are 6 nm wide."""
     bands = values.shape[2]
     return made_scene(values, np.full(bands, electrons), np.linspace(450, 850, bands), fwhm_nm=np.full(bands, 6.0))
 
 
 def block_of(scene: RasterScene, rig: Rig, lines: range = range(0, 30, 5), sweep: Sweep = SWEEP) -> SweepBlock:
-    """Some lines of a sweep."""
+    """Return some lines of a sweep as a block."""
     return sweep_block(scene, rig, sweep, lines)
 
 
 @contextmanager
 def looking_at_less() -> Iterator[None]:
-    """Probes look at no more of a scene than small sweeps see of it."""
+    """Limit the samples of probes, within the context, to about those of a small sweep."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(survey_probe, "MOST_SAMPLES", 3000)  # of a sweep's 2000 or so, some seen twice
+        patch.setattr(survey_probe, "MOST_SAMPLES", 3000)  # a sweep has about 2000: some are sampled twice
         patch.setattr(survey_probe, "FINEST_SAMPLES", 300)
         yield
 
 
 def probed(scene: RasterScene, rig: Rig, sweep: Sweep = SWEEP) -> Probe:
-    """What the decision sees of a sweep, looked at once however many tolerances or tests ask."""
+    """Return the probe of a sweep, cached for all tolerances and tests."""
     asked = scene.planes.tobytes(), scene.planes.shape, scene.electrons.tobytes(), rig, sweep
     if asked not in PROBES:
         with looking_at_less():
@@ -69,14 +69,14 @@ def probed(scene: RasterScene, rig: Rig, sweep: Sweep = SWEEP) -> Probe:
 
 
 def decided(scene: RasterScene, rig: Rig, tolerance: float = 0.1, sweep: Sweep = SWEEP) -> Decision:
-    """What the rule makes of a scene and a rig."""
+    """Return the decision for a scene and a rig."""
     return decide(probed(scene, rig, sweep), rig, EFFECTS, tolerance)
 
 
 def left_out(scene: RasterScene, rig: Rig) -> dict[str, tuple[float, float]]:
-    """Change and what the decision counts for it: by every effect of the light when it is off, and by ``all`` as taken.
+    """Return change and bound of each effect of the light that is switched off, and of the whole decision (``all``).
 
-    Changes are over the noise of each sample of a few lines, beside all other effects in their exact variants.
+    Changes are in units of the noise of each sample, over a few lines; all other effects are exact.
     """
     decision, block = decided(scene, rig), block_of(scene, rig)
     exact = expected_light(scene, block, decision.exact)

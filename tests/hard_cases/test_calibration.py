@@ -1,4 +1,4 @@
-"""Hard cases of the calibration: what the detector, the light and the references can do wrong."""
+"""Hard cases of the calibration: faults of the detector, the light and the references."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ FULL = 4095
 
 
 def frames(samples: int = 12, bands: int = 10) -> References:
-    """References with a dark of 60.5 DN, a white of 2060.5 DN and a white reference of 1."""
+    """Return references with a dark of 60.5 DN, a white of 2060.5 DN and a white reference of 1."""
     dark = np.full((samples, bands), 60.5, np.float32)
     return References(dark, dark + 2000, np.ones(bands, np.float32))
 
 
-def test_sum_saturated_in_part() -> None:
-    """The two limits of the docstring: n F finds a sum saturated throughout, n (F - 1) + 1 one that must be in part."""
+def test_sum_with_saturated_samples_is_invalid() -> None:
+    """The docstring's limits: n F marks sums saturated throughout, n (F - 1) + 1 also sums saturated in part."""
     sums = np.array([4 * FULL, 4 * (FULL - 1) + 1, 4 * (FULL - 1)], np.uint16)
     raw = np.broadcast_to(sums[None, :, None], (1, 3, 2))
     assert calibrate(raw, frames(3, 2), saturated_dn=4 * FULL)[1].tolist() == [[False, True, True]]
@@ -28,8 +28,8 @@ def test_sum_saturated_in_part() -> None:
 
 
 @pytest.mark.parametrize("kind", ["flagged", "unflagged"])
-def test_dead_column(kind: str) -> None:
-    """A column without response is invalid and invents nothing, be it known as bad or not; its neighbours stay."""
+def test_dead_column_is_invalid(kind: str) -> None:
+    """A column without response is NaN and invalid, flagged as bad or not; its neighbours stay valid."""
     references = frames()
     references.white[5] = references.dark[5]
     if kind == "flagged":
@@ -47,8 +47,8 @@ NO_SENSE = [
 
 
 @pytest.mark.parametrize("changed", [*NOT_FINITE, *NO_SENSE], ids=str)
-def test_references_that_cannot_be(changed: dict[str, float]) -> None:
-    """An element that is not finite, or has white below dark or near to it or a flat not positive, is out, alone."""
+def test_element_with_impossible_references_is_invalid(changed: dict[str, float]) -> None:
+    """Non-finite frames, a white below or close to the dark, or a flat of 0 or less invalidate that element alone."""
     references = replace(frames(), flat=np.ones((12, 10), np.float32))
     for frame, value in changed.items():
         getattr(references, frame)[3, 7] = value
@@ -57,8 +57,8 @@ def test_references_that_cannot_be(changed: dict[str, float]) -> None:
 
 
 @pytest.mark.parametrize(("samples", "bands"), [(1, 1), (1, 10), (12, 1), (2, 2)])
-def test_smallest_sizes(samples: int, bands: int) -> None:
-    """One line, one sample and one band calibrate like any; with nothing to fill from a bad element is out."""
+def test_smallest_frames_calibrate(samples: int, bands: int) -> None:
+    """One line, one sample and one band calibrate like any other; if all elements are bad, all values are NaN."""
     references, raw = frames(samples, bands), np.full((1, samples, bands), 1060, np.uint16)
     values, valid = calibrate(raw, references, saturated_dn=FULL)
     np.testing.assert_allclose(values, (1060 - 60.5) / 2000, rtol=1e-6)

@@ -1,8 +1,8 @@
-"""Numerical hard cases of what a camera did not see: rows 17 and 18 of the design's table are in the names.
+"""Numerical hard cases of dead pixels: the numbers in the names, 17 and 18, are rows of the design's table.
 
-Pixels that a survey's mirror missed take the first pass's columns before they come here; what these rows say holds for
-dead pixels, whose captured values are not numbers. tests/models/reading has the rest: what fills them, what they are
-told as; test_out_of_range_values that their content reaches nobody.
+Pixels that a survey's mirror missed get the first pass's columns earlier. These rows cover dead pixels, whose captured
+values are not finite. `tests/models/reading` checks how they are filled and labelled.
+`test_out_of_range_values` checks that their values affect no result.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ def _scene(height: int, width: int, seed: int = 0) -> np.ndarray:
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize(("dead", "lives"), [(1, True), (4, True), (5, False), (9, False)])
-def test_17_a_pixel_dead_in_most_of_its_bands_is_dead(dead: int, lives: bool, bad: float):
-    """Up to half of the bands may be lost: a flat spectrum stays flat; with more the pixel is nothing at all."""
+def test_17_pixel_with_most_bands_dead_is_nan(dead: int, lives: bool, bad: float):
+    """With up to half of the bands dead a flat spectrum keeps its columns to 0.3; with more the pixel is NaN."""
     weights, values = plain_weights(), np.full((2, 9), 0.35, np.float32)
     values[1, np.random.default_rng(0).permutation(9)[:dead]] = bad
     whole, broken = weights.columns(values, NM)
     assert np.isnan(broken).tolist() == [not lives] * 4
     if lives:
-        assert broken == pytest.approx(whole, abs=0.3)  # the columns are 0.5 from the median; exact where a band lives
+        assert broken == pytest.approx(whole, abs=0.3)  # the columns are 0.5 from the median; exact with a live band
 
 
 @pytest.mark.parametrize("size", [8, 32])
-def test_18_dead_pixels_show_within_a_token_alone_but_for_attention(size: int):
-    """A dead patch or token, of a network whose tokens say nothing, changes nothing farther away than a token."""
+def test_18_dead_pixels_affect_at_most_the_next_token(size: int):
+    """With the tokens' output set to 0, a dead patch or token changes nothing farther away than one token."""
     weights, grid, values = plain_weights(), SceneGrid(128, 128, 8), _scene(128, 128)
     with torch.no_grad():
         for parameter in weights.segmenter.from_token.parameters():
@@ -55,8 +55,8 @@ def test_18_dead_pixels_show_within_a_token_alone_but_for_attention(size: int):
     assert np.abs(dead - whole)[~beside].max() > 0.01
 
 
-def test_18_holes_in_a_coarse_look_take_no_further_copy_of_it():
-    """A look with a dead pixel in every patch is made in the memory of one without, but for a mask."""
+def test_18_dead_pixels_in_a_coarse_pass_need_no_copy():
+    """A dead pixel in every patch adds less than half of the columns' size to the peak memory of a coarse pass."""
     weights, peaks = plain_weights(), []
     for bad in (0.3, np.nan):
         values = _scene(256, 256)
@@ -71,8 +71,8 @@ def test_18_holes_in_a_coarse_look_take_no_further_copy_of_it():
     assert peaks[1] < peaks[0] + 0.5 * seen.columns.nbytes
 
 
-def test_18_a_scene_all_dead_still_has_scores():
-    """Where nothing was seen at all every policy's scores are finite."""
+def test_18_fully_dead_scene_has_finite_scores():
+    """The policies gain, entropy and sobel score a scene without any valid pixel."""
     seen = coarse_prediction(plain_weights(), np.full((32, 32, 9), np.nan), NM, SceneGrid(32, 32, 8))
     for policy in ("gain", "entropy", "sobel"):
         assert np.isfinite(score_patches(policy, seen)).all()

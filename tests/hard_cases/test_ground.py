@@ -1,4 +1,4 @@
-"""Poses at the edge: nadir, horizon, sky, poles, date line, steep slopes, one pixel, and what is no number."""
+"""Poses at their limits: nadir, horizon, sky, slopes, poles, date line, and a scene of one pixel."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ IFOV = 7.4e-3 / 70
 
 
 def view(**changes: Any) -> GroundView:
-    """A rig 12 m up that looks down at 40 deg, or as changed."""
+    """Return a rig 12 m above the ground that looks down at 40 deg, with ``changes``."""
     given = {"lon_deg": 9.5, "lat_deg": 52.1, "heading_deg": 0.0, "tilt_deg": 40.0, "height_m": 12.0}
     return GroundView(RigPose(**(given | changes)), IFOV)
 
 
-def test_nadir_has_no_heading_of_its_own_but_keeps_the_rigs():
-    """Straight down, the image's upper edge points where the rig heads, and every pixel is square."""
+def test_nadir_view_keeps_the_heading_of_the_rig():
+    """At nadir the image's upper edge points along the rig's heading, and pixels are square."""
     rig = view(tilt_deg=90.0, heading_deg=70.0)
     up = rig.scene_to_ground([-1000, 0])
     assert np.rad2deg(np.arctan2(up[0], up[1])) == pytest.approx(70.0)
@@ -33,16 +33,16 @@ def test_nadir_has_no_heading_of_its_own_but_keeps_the_rigs():
     assert rig.ground_to_scene(rig.scene_to_ground([0, 0])) == pytest.approx([0, 0], abs=1e-9)
 
 
-def test_the_horizon_itself_is_no_ground():
-    """A ray that runs level or up is NaN, both ways; one a hair below the horizon is finite."""
+def test_ray_at_or_above_the_horizon_meets_no_ground():
+    """Level and upward rays are NaN in both directions; a ray 0.001 px below the horizon is finite."""
     rig = view(tilt_deg=0.0)
     assert np.isnan(rig.scene_to_ground([[0, 0], [0, 500], [-1, 0]])).all()
     assert np.isfinite(rig.scene_to_ground([1e-3, 0])).all()
     assert np.isnan(rig.ground_to_scene([[0, -5, 0], [0, 0, 0], [3, 0, 12]])).all()
 
 
-def test_a_field_of_sky_is_refused_with_its_pose():
-    """Nothing to map: the message names tilt and height, and what to do."""
+def test_field_without_ground_is_refused_with_its_pose():
+    """The message names tilt, height and the remedy; a range needs a view that meets the ground."""
     with pytest.raises(PoseError, match=r"no ray of the field meets the ground .*tilt_deg -20, height_m 12.*tilt it"):
         ground_grid(view(tilt_deg=-20.0), (64, 64))
     with pytest.raises(PoseError, match="a range needs a view direction that meets the ground"):
@@ -50,8 +50,8 @@ def test_a_field_of_sky_is_refused_with_its_pose():
 
 
 @pytest.mark.parametrize("slope", [30.0, 45.0])
-def test_a_slope_that_falls_away_hides_its_ground(slope: float):
-    """Ground that falls as steeply as the rays is not met; seen from the other side it fills the field."""
+def test_ground_that_falls_as_steeply_as_the_rays_is_not_met(slope: float):
+    """At 30 deg half of the field and at 45 deg all of it has no ground; facing the slope, the field is full."""
     away = view(tilt_deg=30.0, slope_deg=slope, aspect_deg=0.0)
     if slope > 30:
         with pytest.raises(PoseError, match="slope_deg 45"):
@@ -62,8 +62,8 @@ def test_a_slope_that_falls_away_hides_its_ground(slope: float):
 
 
 @pytest.mark.parametrize(("lat", "epsg"), [(85.3, 5041), (89.9999, 5041), (90.0, 5041), (-88.0, 5042), (-90.0, 5042)])
-def test_near_a_pole_the_map_is_stereographic(lat: float, epsg: int):
-    """UTM ends at 84 N and 80 S; the default goes on, up to the pole itself, and areas stay true."""
+def test_map_near_a_pole_is_stereographic(lat: float, epsg: int):
+    """Beyond UTM's limits, 84 N and 80 S, the default is stereographic up to the pole, and areas agree to 1 %."""
     shape = (120, 90)
     grid = ground_grid(view(lat_deg=lat), shape)
     assert grid.geobox.crs.epsg == epsg
@@ -73,16 +73,16 @@ def test_near_a_pole_the_map_is_stereographic(lat: float, epsg: int):
 
 
 @pytest.mark.parametrize(("lon", "heading"), [(179.99999, 90.0), (-179.99999, -90.0), (180.0, 90.0), (-180.0, 0.0)])
-def test_the_date_line_is_no_border(lon: float, heading: float):
-    """A field across it is one small map in the rig's zone, as large as the same field elsewhere."""
+def test_field_across_the_date_line_is_one_map(lon: float, heading: float):
+    """The map lies in the rig's zone and is as large as that of the same field elsewhere."""
     across = ground_grid(view(lon_deg=lon, lat_deg=-17.0, heading_deg=heading), (100, 100))
     here = ground_grid(view(lon_deg=170.5, lat_deg=-17.0, heading_deg=heading), (100, 100))
-    assert np.abs(np.array(across.shape) - here.shape).max() <= 8  # the zone's meridians turn it a little
+    assert np.abs(np.array(across.shape) - here.shape).max() <= 8  # meridian convergence rotates it slightly
     assert np.isfinite(whole(across)[..., 0]).mean() == pytest.approx(np.isfinite(whole(here)[..., 0]).mean(), abs=0.1)
 
 
-def test_one_pixel_is_a_map():
-    """A scene of one pixel has a footprint, a grid, and its class on it."""
+def test_scene_of_one_pixel_has_a_map():
+    """One pixel covers 1 to 6 pixels of the map, all within half a pixel, and counts as mapped."""
     grid = ground_grid(view(), (1, 1))
     places = whole(grid)[..., 0]
     assert 1 <= np.isfinite(places).sum() <= 6

@@ -1,4 +1,4 @@
-"""Numerical hard cases of what is learned and counted: rows 4, 13, 14, 16 and 26 of the design's table."""
+"""Numerical hard cases of training and metrics: rows 4, 13, 14, 16 and 26 of the design's table."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ def _example(labels: np.ndarray) -> Example:
     return Example("e", rng.normal(0, 1, (*labels.shape, 4)).astype(np.float16), labels, labels.shape)
 
 
-def test_4_a_crop_without_a_label_is_no_step():
-    """Where no pixel of a batch is labelled no weight moves, not even by decay; the step is counted."""
+def test_4_step_without_labels_changes_no_weight():
+    """Weight decay does not act either; the steps count as unlabelled, not as skipped."""
     labels = np.full((64, 64), UNLABELLED, np.uint8)
     labels[0, 0] = 1
     trainer = Trainer(SegmenterConfig(**SIZES), [_example(labels)], NO_SHIFT, SETTINGS)
     trainer.sampler.examples = [_example(np.full((64, 64), UNLABELLED, np.uint8))]
     before = [parameter.clone() for parameter in trainer.model.parameters()]
-    for _ in range(4):  # three in a row are no failure
+    for _ in range(4):  # three in a row do not fail
         trainer.step(0.5)
     assert all(torch.equal(a, b) for a, b in zip(before, trainer.model.parameters(), strict=True))
     assert trainer.summary()["steps"] == trainer.summary()["unlabelled_steps"] == 4
@@ -44,8 +44,8 @@ def test_4_a_crop_without_a_label_is_no_step():
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-30, 1e-6])
-def test_13_norms_of_nothing_are_nothing(size: float):
-    """There is no cosine decoder; the norms that there are give 0 for zero tokens, with bounded gradients."""
+def test_13_norms_of_zero_tokens_are_zero(size: float):
+    """There is no cosine decoder; the existing norms give 0 for zero tokens, with bounded gradients."""
     attention, norm = TokenAttention(16, 2), ChannelNorm(8)
     pixels, tokens = torch.full((1, 8, 2, 2), size).requires_grad_(), torch.full((1, 3, 8), size).requires_grad_()
     for x, layer in ((pixels, norm), (tokens, attention.query_norm), (tokens, attention.key_norm)):
@@ -56,8 +56,8 @@ def test_13_norms_of_nothing_are_nothing(size: float):
         assert gradient.abs().max() <= 1001  # 1 / sqrt(1e-6), and rounding
 
 
-def test_14_two_classes_learn():
-    """There is no mask_norm, which is a sign for two classes: the logits have values of any size, and gradients."""
+def test_14_segmenter_with_two_classes_has_gradients():
+    """There is no mask_norm, which is a sign for two classes: logits have values of any size, and gradients."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         model, image = Segmenter(SegmenterConfig(**SIZES)), torch.randn(1, 4 + PLANES, 32, 32)
@@ -74,7 +74,7 @@ def test_14_two_classes_learn():
 
 
 def test_16_columns_far_from_zero_keep_their_scale():
-    """Normalisation takes medians, never a difference of squares: 4096.1 with a spread of 0.1 comes out as spread 1."""
+    """Normalisation uses medians, not a difference of squares: 4096.1 with a spread of 0.1 becomes a spread of 1."""
     sample = (4096.1 + np.random.default_rng(0).normal(0, 0.1, (5000, 3))).astype(np.float32)
     normalisation = Normalisation.measured(sample)
     assert (normalisation.spread > 0).all()
@@ -82,8 +82,8 @@ def test_16_columns_far_from_zero_keep_their_scale():
 
 
 @pytest.mark.parametrize("kind", [torch.bfloat16, torch.float16])
-def test_26_losses_of_half_precision_add_up_in_single(kind: torch.dtype):
-    """The mean over 1e5 pixels whose logits are in 16 bits is that of the same numbers in float64 to 1e-5."""
+def test_26_loss_of_half_precision_logits_sums_in_float32(kind: torch.dtype):
+    """The mean over 1e5 pixels with 16-bit logits matches float64 to 1e-5, and with soft Dice to 1e-4."""
     generator = torch.Generator().manual_seed(0)
     logits = torch.randn(1, 3, 250, 400, generator=generator).to(kind)
     labels = torch.randint(0, 3, (1, 250, 400), generator=generator)
@@ -96,8 +96,8 @@ def test_26_losses_of_half_precision_add_up_in_single(kind: torch.dtype):
     assert float(rough) == pytest.approx(float(fine), rel=1e-4)
 
 
-def test_26_counts_do_not_round():
-    """2^24 + 1 pixels of one class, where float32 stops counting, keep their last one in the accuracy."""
+def test_26_large_pixel_counts_do_not_round():
+    """2^24 + 1 pixels of one class, where float32 stops counting, keep their last pixel in the mean IoU."""
     counts = np.array([[2**24 + 1, 0], [1, 2**31]], np.int64)
     first, second = (2**24 + 1) / (2**24 + 2), 2**31 / (2**31 + 1)
     assert mean_iou(counts) == pytest.approx((first + second) / 2, rel=1e-12)

@@ -1,4 +1,4 @@
-"""Numerical hard cases of the models; numbers in the names are the rows of the design's table."""
+"""Numerical hard cases of the models; the numbers in the names are the rows of the design's table."""
 
 from __future__ import annotations
 
@@ -45,15 +45,15 @@ def _image(height: int, width: int, batch: int = 1, seed: int = 0) -> Tensor:
 
 @pytest.fixture
 def threads() -> Iterator[None]:
-    """Give torch its number of threads back."""
+    """Restore torch's number of threads after the test."""
     before = torch.get_num_threads()
     yield
     torch.set_num_threads(before)
 
 
 @torch.inference_mode()
-def test_1_a_scene_without_a_living_token_is_finite():
-    """A scene of which no token lives has an overview, and patches can be read after it."""
+def test_1_scene_without_live_tokens_is_finite():
+    """The overview is finite if all tokens are dead, and so are patches that are read after it."""
     model, image, dead = make_network(layers=2), _image(64, 96), torch.zeros(6, dtype=torch.bool)
     nothing = model.read_overview(image, None, dead)
     assert nothing.logits.isfinite().all()
@@ -63,23 +63,23 @@ def test_1_a_scene_without_a_living_token_is_finite():
 
 @torch.inference_mode()
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -1e30])
-def test_2_what_a_dead_token_holds_does_not_leak(bad: float):
-    """Whatever stands in a token that is left out, the transformer says the same of all others."""
+def test_2_values_of_a_dead_token_do_not_leak(bad: float):
+    """NaN, infinity or -1e30 in a dead token changes the transformer's output for all other tokens by at most 1e-6."""
     model, image, said = make_network(layers=2), _image(64, 96), list[Tensor]()
     living, spoiled = torch.tensor([True, True, False, True, True, True]), image.clone()
-    spoiled[..., 15:17, 79:81] = bad  # convolutions take it to the border of the token
+    spoiled[..., 15:17, 79:81] = bad  # convolutions spread it to the token's border
     model.from_token.register_forward_hook(lambda module, given, out: said.append(given[0].flatten(2)))
     overviews = [model.read_overview(one, None, living) for one in (image, spoiled)]
     assert (said[0] - said[1]).abs().max() <= 1e-6
     assert said[0][..., living].std() > 0.1
-    apart = (overviews[0].logits - overviews[1].logits)[..., :57].abs()  # and 7 px beyond
+    apart = (overviews[0].logits - overviews[1].logits)[..., :57].abs()  # 7 px and more from the dead token
     assert apart.max() <= 1e-6
 
 
 @torch.inference_mode()
 @pytest.mark.parametrize("count", [0, 3])
-def test_3_no_images_give_no_maps(count: int):
-    """The whole segmenter takes a batch of no scene, with and without patches, of parts of tokens too."""
+def test_3_empty_batch_gives_empty_maps(count: int):
+    """A batch of no scene passes the whole segmenter, with and without patches, also for sizes of partial tokens."""
     model, numbers = make_network(layers=2), torch.zeros(0, count, dtype=torch.int64)
     image = torch.zeros(0, 4 + PLANES, 32, 48)
     logits, patches = model(image, image, numbers, torch.zeros(0, 2))
@@ -90,8 +90,8 @@ def test_3_no_images_give_no_maps(count: int):
 
 @pytest.mark.parametrize("images", [0, 2])
 @pytest.mark.parametrize("soft_dice", [False, True])
-def test_4_nothing_labelled_is_no_loss(images: int, soft_dice: bool):
-    """Without a labelled pixel, or with weights that are all 0, the loss is 0 and its gradient is 0."""
+def test_4_batch_without_labels_has_zero_loss(images: int, soft_dice: bool):
+    """Without a labelled pixel, or with weights of 0 for all labelled ones, the loss and its gradient are 0."""
     logits = noise(0, images, 3, 4, 4).requires_grad_()
     for value, weight in ((255, torch.ones(3)), (1, torch.zeros(3)), (1, torch.tensor([1.0, 0.0, 1.0]))):
         labels = torch.full((images, 4, 4), value)
@@ -102,8 +102,8 @@ def test_4_nothing_labelled_is_no_loss(images: int, soft_dice: bool):
 
 
 @torch.inference_mode()
-def test_5_no_patch_is_the_overview_bit_by_bit():
-    """With K = 0 training's forward, the overview and the survey's map come from one and the same logits."""
+def test_5_map_without_patches_is_the_overview():
+    """With K = 0 training's forward pass, the overview and the survey's map come from the same logits, bit by bit."""
     weights, grid = plain_weights(), SceneGrid(48, 64, 8)
     seen = coarse_prediction_of_columns(weights, noise(0, 48, 64, 4).numpy(), grid)
     image, model = torch.from_numpy(with_planes(seen.columns, LineSpec())).permute(2, 0, 1)[None], weights.segmenter
@@ -118,8 +118,8 @@ def test_5_no_patch_is_the_overview_bit_by_bit():
 
 
 @torch.inference_mode()
-def test_6_every_patch_in_any_order_is_one_map():
-    """With K = all the order in which a policy ranked the patches does not show, and no pixel is the overview's."""
+def test_6_map_of_all_patches_ignores_their_order():
+    """With K = all, the order changes no logit by more than 1e-5, and no pixel keeps the overview's logits."""
     model, image, maps = make_network(layers=2), _image(32, 48), []
     for seed in range(3):
         order = torch.randperm(24, generator=torch.Generator().manual_seed(seed))[None]
@@ -130,14 +130,14 @@ def test_6_every_patch_in_any_order_is_one_map():
 
 
 @pytest.mark.parametrize("fraction", [-0.01, 1.01, float("nan")])
-def test_7_fractions_of_patches_that_cannot_be_are_refused(fraction: float):
-    """The message names the fraction and the patches that there are."""
+def test_7_fraction_of_patches_outside_0_to_1_is_refused(fraction: float):
+    """The message names the fraction, NaN included, and the number of patches."""
     with pytest.raises(ValueError, match=rf"from 0 to 1, got {fraction} \(of 24 patches\)"):
         frame_patches(np.zeros(24), fraction)
 
 
-def test_8_ties_go_to_the_lowest_patch():
-    """Equal scores keep the order of the patches, and a larger choice begins with the smaller one."""
+def test_8_equal_scores_select_the_lowest_patch():
+    """Equal scores keep the order of the patches, and a larger selection starts with the smaller one."""
     assert select_patches(np.zeros(256), 5).tolist() == [0, 1, 2, 3, 4]
     assert select_patches(np.array([3, 2, 3, 2, 1, 3]), 2).tolist() == [0, 2]
     score = np.random.default_rng(0).integers(0, 4, 60).astype(float)
@@ -145,26 +145,26 @@ def test_8_ties_go_to_the_lowest_patch():
     assert all((more[:-1] == less).all() for less, more in pairwise(choices))
 
 
-def test_9_a_dead_score_never_wins():
-    """Infinite worth comes first; NaN and minus infinity come last, together, by number."""
+def test_9_nan_scores_are_selected_last():
+    """An infinite score comes first; NaN and minus infinity come last, together, by patch number."""
     score = np.array([np.nan, 1.0, -np.inf, np.inf, 2.0, np.nan])
     assert select_patches(score, 6).tolist() == [3, 4, 1, 0, 2, 5]
 
 
-def test_10_a_patch_given_twice_is_refused():
-    """A choice names each patch once; where a caller does not, nothing is added up or overwritten: it is told which."""
+def test_10_duplicate_patch_is_refused():
+    """A selection lists each patch once; the error names the duplicate, so that no patch is summed or overwritten."""
     with pytest.raises(ValueError, match="patch 4 is given more than once"):
         check_patch_index(np.array([4, 1, 4]), SceneGrid(37, 53, 8))
 
 
 @torch.inference_mode()
 @pytest.mark.parametrize("size", [(32, 32), (64, 96), (96, 128)])
-def test_11_bfloat16_agrees(size: tuple[int, int]):
-    """Autocast to bfloat16 adds no more error than its rounding, and no class changes where one leads by 0.1.
+def test_11_bfloat16_agrees_with_float32(size: tuple[int, int]):
+    """Autocast to bfloat16 adds only its rounding error, and no class changes where one leads by 0.1.
 
     A layer rounds input, weights and output, each by at most u = 2^-8 of its size, with a standard deviation below
-    u / sqrt(3). Independent errors of ``depth`` layers add up to u sqrt(depth). How large a single error may be differs
-    between processors: they sum in other orders and fuse other layers.
+    u / sqrt(3). Independent errors of ``depth`` layers add up to u sqrt(depth). Single errors differ between
+    processors, which sum in other orders and fuse other layers.
     """
     model, image, numbers = make_network(layers=2), _image(*size), torch.arange(0, size[0] * size[1] // 64, 3)[None]
     exact = model.composite(*model(image, image, numbers, PLACE), numbers)
@@ -181,13 +181,13 @@ def test_11_bfloat16_agrees(size: tuple[int, int]):
 @torch.inference_mode()
 @pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16])
 def test_11_attention_stays_finite_in_half_precision(kind: torch.dtype):
-    """Normalised queries and keys keep the logits of inputs of 300 finite in 16 bits."""
+    """Normalised queries and keys keep attention finite in 16 bits, for inputs of 300."""
     encoder, x = _encoder().to(kind), (300 * noise(0, 1, 8, 16)).to(kind)
     assert encoder(x).isfinite().all()
 
 
 @torch.inference_mode()
-def test_12_a_tile_far_out_has_the_codes_of_its_field():
+def test_12_position_codes_of_a_distant_tile_are_exact():
     """The origin of a tile is added in float64: codes of its tokens are exact to 1e-6 at 1e7 tokens."""
     origin, read = np.array([9_999_997, 10_000_000.25]), list[Tensor]()
     model = make_network(layers=2, dim=32)
@@ -202,20 +202,20 @@ def test_12_a_tile_far_out_has_the_codes_of_its_field():
 
 
 @pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16])
-def test_12_places_in_half_precision_are_refused(kind: torch.dtype):
-    """Half precision cannot hold the number of a patch; the message says which kind came."""
+def test_12_positions_in_half_precision_are_refused(kind: torch.dtype):
+    """Half precision cannot hold the number of a patch; the message names the type."""
     with pytest.raises(ValueError, match=f"got {kind}"):
         code_2d(torch.zeros(3, 2, dtype=kind), 16)
 
 
 @pytest.mark.parametrize("value", [0.0, 0.3, 4096.1, 1e-20])
-def test_15_a_constant_band_is_exactly_zero(value: float):
-    """A column without variance is 0 after normalisation, alone or beside others, in any order."""
+def test_15_constant_band_normalises_to_zero(value: float):
+    """A column without variance is exactly 0 alone, and 0 to 1e-5 beside other columns, in any order of them."""
     sample = np.random.default_rng(0).normal(0.5, 0.1, (500, 4)).astype(np.float32)
     sample[:, 1] = value
     normalisation = Normalisation.measured(sample)
     normal = normalisation.apply(sample, np.ones(4, bool))
-    assert normal[:, 1] == pytest.approx(0, abs=1e-5)  # whitening mixes in nothing of the others
+    assert normal[:, 1] == pytest.approx(0, abs=1e-5)  # whitening mixes in no other column
     alone = Normalisation.measured(sample[:, [1, 1]])
     assert not alone.apply(sample[:, [1, 1]], np.ones(2, bool)).any()
     order = [1, 3, 0, 2]
@@ -223,14 +223,14 @@ def test_15_a_constant_band_is_exactly_zero(value: float):
     assert permuted == pytest.approx(normal[:, order], abs=1e-4)
 
 
-def test_15_a_sample_of_one_pixel_is_finite():
-    """One pixel has no spread and becomes 0."""
+def test_15_single_pixel_normalises_to_zero():
+    """One pixel has no spread, so its normalised values are 0."""
     normalisation = Normalisation.measured(np.array([[0.2, 0.7]]))
     assert not normalisation.apply(np.array([[0.2, 0.7]], np.float32), np.ones(2, bool)).any()
 
 
-def test_19_what_is_not_there_is_no_number():
-    """A class in neither map is NaN and not averaged; with nothing labelled every figure is NaN, of 0 pixels."""
+def test_19_metrics_without_data_are_nan():
+    """A class in neither map is NaN and not averaged; without labels every metric is NaN, for 0 pixels."""
     counts = confusion(np.array([0, 0, 1, 255]), np.array([0, 1, 1, 2]), 4)
     assert np.isnan(iou_per_class(counts)).tolist() == [False, False, True, True]
     assert mean_iou(counts) == pytest.approx(0.5)
@@ -240,15 +240,15 @@ def test_19_what_is_not_there_is_no_number():
 
 
 @pytest.mark.parametrize(("label", "guess"), [(8, 0), (254, 0), (0, 8), (0, 255)])
-def test_20_numbers_that_are_no_class_are_refused(label: int, guess: int):
-    """A label or prediction outside the classes is an error, not a wrapped index."""
+def test_20_class_numbers_out_of_range_are_refused(label: int, guess: int):
+    """A label or prediction outside of the classes is an error, not a wrapped index."""
     with pytest.raises(ValueError, match=r"none of the 8 classes 0\.\.7"):
         confusion(np.array([label], np.uint8), np.array([guess], np.uint8), 8)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (37, 53), (100, 31)])
-def test_21_any_size_gives_its_own_map(size: tuple[int, int]):
-    """Scenes that do not divide are padded and cropped back, from one pixel on."""
+def test_21_map_has_the_size_of_the_scene(size: tuple[int, int]):
+    """Scenes that patches do not divide evenly are padded and cropped back, from one pixel upwards."""
     weights, grid = plain_weights(), SceneGrid(*size, 8)
     values = np.random.default_rng(0).uniform(0.1, 0.5, (*size, 5))
     seen = coarse_prediction(weights, values, np.linspace(450, 950, 5), grid)
@@ -258,8 +258,8 @@ def test_21_any_size_gives_its_own_map(size: tuple[int, int]):
     assert drawn.classes.max() < 3
 
 
-def test_22_a_scene_alike_everywhere_scores_alike():
-    """Whole patches score equal to 1e-6, at the border too; partly filled ones rank by their pixels on the scene."""
+def test_22_uniform_scene_has_equal_scores():
+    """Whole patches score equal to 1e-6, at the border too; partly filled patches rank by their pixels in the scene."""
     grid = SceneGrid(36, 50, 8)
     columns, probability = (np.full((*grid.padded_shape, n), of, np.float32) for n, of in ((4, 0.3), (3, 1 / 3)))
     seen = CoarsePrediction(grid, columns, probability)
@@ -271,10 +271,10 @@ def test_22_a_scene_alike_everywhere_scores_alike():
 
 
 @torch.inference_mode()
-def test_23_a_scene_reads_alike_alone_and_in_a_batch():
-    """Batch-mates, the size of the batch and the order of patches do not show beyond float32's rounding.
+def test_23_map_does_not_depend_on_the_batch():
+    """Other scenes, the batch size and the order of patches change logits only by float32's rounding.
 
-    Some processors multiply matrices of another size in another order: 1.2e-6 was seen.
+    Some processors multiply matrices of another size in another order: a difference of 1.2e-6 was observed.
     """
     model, image, detail = make_network(layers=2), _image(32, 64, 8), _image(32, 64, 8, 1)
     places = torch.arange(16).view(8, 2)
@@ -290,8 +290,8 @@ def test_23_a_scene_reads_alike_alone_and_in_a_batch():
 
 
 @torch.inference_mode()
-def test_23_tokens_in_another_order_say_the_same():
-    """Places are told by codes alone: the transformer of permuted tokens is that of the tokens, permuted."""
+def test_23_transformer_is_equivariant_to_token_order():
+    """Only the codes carry positions: permuted tokens give the permuted output."""
     encoder, tokens = _encoder(), noise(0, 2, 12, 16)
     order = torch.randperm(12, generator=torch.Generator().manual_seed(1))
     assert (encoder(tokens[:, order]) - encoder(tokens)[:, order]).abs().max() <= 2e-6
@@ -299,22 +299,22 @@ def test_23_tokens_in_another_order_say_the_same():
 
 @pytest.mark.parametrize("nm", [[0.45, 0.65], [450.0, 3001.0], [199.0, 450.0], [np.nan, 450.0]])
 def test_24_wavelengths_in_another_unit_are_refused(nm: list[float]):
-    """Micrometres and numbers outside 200-3000 nm are a ValueError that says so."""
+    """Micrometres, NaN and values outside of 200-3000 nm raise a ValueError that names the range."""
     with pytest.raises(ValueError, match="outside 200-3000 nm"):
         coarse_prediction(plain_weights(), np.zeros((16, 16, 2)), np.array(nm), SceneGrid(16, 16, 8))
 
 
-def test_25_certainty_has_no_entropy():
-    """A probability of 0 adds 0: no NaN, and never less than 0 in float32."""
+def test_25_entropy_of_certain_pixels_is_0():
+    """A probability of 0 adds 0: the entropy is never NaN, and neither below 0 nor above it in float32."""
     sure, tiny = np.eye(4, dtype=np.float32), np.array([[1.0, 1e-45, 0, 0]], np.float32)
     entropy = pixel_entropy(np.concatenate([sure, tiny]))
-    assert np.isfinite(entropy).all()
     assert entropy.min() >= 0
+    assert entropy.max() <= 1e-40
 
 
 @pytest.mark.parametrize("size", [0.0, 1e30])
-def test_27_corrections_of_nothing_and_of_everything(size: float):
-    """A full network that says nothing leaves the overview as it is; huge logits replace it. Gradients stay finite."""
+def test_27_zero_and_huge_corrections_keep_gradients_finite(size: float):
+    """A full network with zero output leaves the overview unchanged; logits of 1e30 replace it."""
     model, image, numbers = make_network(layers=2), _image(32, 32), torch.tensor([[0, 5]])
     with torch.no_grad():
         for parameter in model.full_classes.parameters():
@@ -331,8 +331,8 @@ def test_27_corrections_of_nothing_and_of_everything(size: float):
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_29_bad_steps_are_counted_and_end_a_run(value: float, monkeypatch: pytest.MonkeyPatch):
-    """A loss that is not finite is skipped and counted; three in a row stop the run."""
+def test_29_steps_with_non_finite_loss_are_skipped_and_end_a_run(value: float, monkeypatch: pytest.MonkeyPatch):
+    """Such steps are counted; three in a row stop the training."""
     labels = np.zeros((16, 16), np.uint8)
     example = Example("e", np.zeros((16, 16, 4), np.float16), labels, (16, 16))
     config, settings = SegmenterConfig(**SMALL), TrainingSettings(steps=4, batch=1, crop=16)
@@ -345,8 +345,8 @@ def test_29_bad_steps_are_counted_and_end_a_run(value: float, monkeypatch: pytes
         train(config, [example], np.zeros(4, np.float32), settings)
 
 
-def test_30_a_checkpoint_reads_other_bands(tmp_path: Path):
-    """Weights that were saved read any number of bands."""
+def test_30_saved_weights_read_any_number_of_bands(tmp_path: Path):
+    """Weights from a file give finite probabilities for scenes of 1, 3 and 200 bands."""
     weights, path = plain_weights(), tmp_path / "w.safetensors"
     save_weights(weights, path)
     loaded, grid = load_weights(path), SceneGrid(16, 16, 8)
@@ -355,8 +355,8 @@ def test_30_a_checkpoint_reads_other_bands(tmp_path: Path):
         assert np.isfinite(seen.probability).all()
 
 
-def test_31_one_and_two_threads_choose_the_same_patches(threads: None):
-    """The same scene gives the same plan on 1 and 2 threads, and no global stream is touched."""
+def test_31_one_and_two_threads_select_the_same_patches(threads: None):
+    """All four policies give the same plan on 1 and 2 threads; torch's global random state stays unchanged."""
     weights, grid = plain_weights(), SceneGrid(96, 96, 8)
     columns = noise(0, 96, 96, 4).numpy()
     before, plans = torch.random.get_rng_state(), []

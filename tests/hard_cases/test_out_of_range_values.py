@@ -1,4 +1,4 @@
-"""Hard cases of values: numbers that no sensor gives, from the bound to the end of float32, infinite or none."""
+"""Hard cases of values that no sensor gives: from the limit to the largest float32, infinite and NaN."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ def _alike(one: tuple[CoarsePrediction, DrawnMap], other: tuple[CoarsePrediction
 @example(value=np.float32(1e30), y=3, x=3, bands=set(range(7)), at=True)
 @example(value=np.float32(1e18), y=3, x=3, bands=set(range(7)), at=True)
 @example(value=np.float32(1e30), y=3, x=3, bands=set(range(7)), at=False)
-def test_an_out_of_range_value_is_as_if_not_captured(value: float, y: int, x: int, bands: set[int], at: bool) -> None:
-    """A pixel of what the overview reads or of a patch, in some bands or all: every bit is as with NaN in its place."""
+def test_out_of_range_value_counts_as_nan(value: float, y: int, x: int, bands: set[int], at: bool) -> None:
+    """In some or all bands of a pixel, of the overview's input or of a patch, it gives the bits of NaN."""
     out_of_range, hole = (VALUES if at else FINE).copy(), (VALUES if at else FINE).copy()
     place = (y, x, sorted(bands)) if at else (y % len(PATCHES), y % 8, x % 8, sorted(bands))
     out_of_range[place], hole[place] = value, np.nan
@@ -65,8 +65,8 @@ def test_an_out_of_range_value_is_as_if_not_captured(value: float, y: int, x: in
 
 
 @pytest.mark.parametrize("value", [10 * MOST_COLUMN, 1e18, 1e30, FAR, np.inf, -np.inf])
-def test_columns_that_no_reading_gives_are_dead(value: float) -> None:
-    """Given normalised already, to the overview or to the map, they count as NaN does."""
+def test_out_of_range_columns_count_as_nan(value: float) -> None:
+    """Columns that arrive already normalised, for the overview or for the map, are checked too."""
     columns = np.random.default_rng(3).normal(0, 1, (*GRID.padded_shape, 4)).astype(np.float32)
     patches, found = np.random.default_rng(4).normal(0, 1, (2, 8, 8, 4)).astype(np.float32), []
     for one in (value, np.nan):
@@ -78,12 +78,12 @@ def test_columns_that_no_reading_gives_are_dead(value: float) -> None:
     assert np.isfinite(found[0][0].probability).all()
 
 
-# --- the rule itself --------------------------------------------------------------------------------------------------
+# --- the range check itself -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64, np.int64, np.uint32, np.uint16, np.uint8, bool])
-def test_the_bound_is_inclusive_and_knows_every_kind(kind: Any) -> None:
-    """Values up to 1e9 are readings in any type; short whole numbers cannot be larger."""
+def test_range_limit_is_inclusive_for_every_type(kind: Any) -> None:
+    """Values up to 1e9 are in range in any type; integers of at most 16 bits cannot exceed it."""
     values = np.ones((2, 3, 4), kind)
     assert beyond_range(values) is None
     if np.dtype(kind).itemsize > 2:
@@ -94,16 +94,16 @@ def test_the_bound_is_inclusive_and_knows_every_kind(kind: Any) -> None:
         assert (found.count, found.place, float(found.value)) == (1, (1, 2, 3), 2 * MOST_VALUE)
 
 
-def test_half_floats_reach_no_bound_but_infinity() -> None:
-    """Their largest number is 65 504: they are compared without a warning, and infinite ones are marked."""
+def test_float16_is_out_of_range_only_if_infinite() -> None:
+    """The largest float16 is 65 504: comparison raises no warning, and only infinite values are marked."""
     values = np.array([[[65504.0, -65504.0, np.inf, np.nan]]], np.float16)
     assert beyond_range(values).tolist() == [[[False, False, True, False]]]
     assert beyond_range(values[..., :2]) is None
     assert np.isnan(readings_alone(values, MOST_VALUE)).tolist() == [[[False, False, True, True]]]
 
 
-def test_readings_stay_the_same_array() -> None:
-    """No copy is made where there is nothing to take out, and NaN stays NaN where there is."""
+def test_values_in_range_are_returned_without_a_copy() -> None:
+    """An out-of-range value becomes NaN in the result, and NaN stays NaN."""
     values = np.array([[1.0, np.nan, -5.0]], np.float32)
     assert readings_alone(values, 10.0) is values
     np.testing.assert_array_equal(readings_alone(values, 2.0), [[1.0, np.nan, np.nan]])

@@ -1,4 +1,4 @@
-"""Hard paths: whatever mirror and clock did, each line is used once and where it lies, or not at all."""
+"""Hard scan paths: repeated, standing, turning and lost lines are each used once at their place, or not at all."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ SWATH = 2600.0
 
 
 def points_between(first: float, last: float, count: int = 400) -> np.ndarray:
-    """Points (n, 2) that lines between two scan places see, in the middle half of the line."""
+    """Return points (n, 2) that lines between two scan positions see, in the middle half of the line."""
     rng = np.random.default_rng(7)
     x, y = points_of_scan(SWATH, CAMERA, rng.uniform(first, last, count), rng.uniform(-0.016, 0.016, count))
     return np.stack([y, x], axis=-1)
 
 
-def test_repeated_positions_are_averaged() -> None:
-    """One to four lines at one place make one knot of just these lines, and no step of 0."""
+def test_lines_at_one_position_form_one_knot() -> None:
+    """Groups of one to four lines make 40 uniform knots, each of exactly its own lines; no step has length 0."""
     scan = np.repeat(np.arange(40.0), [2, 3, 4, 1] * 10)
     (scan_path,) = make_scan_paths(aim(SWATH, scan), CAMERA)
     assert scan_path.uniform
@@ -30,9 +30,9 @@ def test_repeated_positions_are_averaged() -> None:
     assert np.diff(scan_path.starts, append=100).tolist() == [2, 3, 4, 1] * 10
 
 
-def test_stop_while_turning_leaves_no_empty_run() -> None:
-    """Lines that stand still where the path turns and where it ends belong to a knot; no run is empty or NaN."""
-    drift = 1e-9 * np.arange(6)  # which of the lines that stand is the highest must not matter
+def test_lines_that_stand_still_belong_to_a_knot() -> None:
+    """Lines that stand at the turn and at the end are all used: both paths have 30 knots and finite coordinates."""
+    drift = 1e-9 * np.arange(6)  # any of the standing lines may be the highest
     scan = np.concatenate([np.arange(30.0), 29 + drift, np.arange(28.0, -1, -1), np.zeros(5)])
     scan_paths = make_scan_paths(aim(SWATH, scan), CAMERA)
     assert [len(scan_path) for scan_path in scan_paths] == [30, 30]
@@ -42,8 +42,8 @@ def test_stop_while_turning_leaves_no_empty_run() -> None:
         assert np.isfinite(path_geolocation(scan_path, CAMERA, points_between(-0.4, 29.4), along="x")).all()
 
 
-def test_mirror_that_never_moves_is_one_line() -> None:
-    """A sweep that stands still is one knot of all its lines, as wide as a sample."""
+def test_sweep_at_rest_is_one_line() -> None:
+    """All lines of a mirror at rest form one knot that is as wide as one binned sample."""
     (scan_path,) = make_scan_paths(aim(SWATH, np.full(20, 5.0)), CAMERA, binning=2)
     assert len(scan_path) == 1
     np.testing.assert_array_equal(scan_path.lines, np.arange(20))
@@ -52,8 +52,8 @@ def test_mirror_that_never_moves_is_one_line() -> None:
     np.testing.assert_array_equal(np.isfinite(found[:, 0]), [True, True, False, False])
 
 
-def test_one_line() -> None:
-    """One line is its own track: half a line to both sides, and its values there."""
+def test_single_line_covers_half_a_line_to_both_sides() -> None:
+    """Points within half a line of the line are found; no line, or no usable line, makes no path."""
     (scan_path,) = make_scan_paths(aim(SWATH, np.array([7.0])), CAMERA)
     found = path_geolocation(scan_path, CAMERA, np.array([[6.51, SWATH], [7.0, SWATH], [7.6, SWATH]]), along="x")
     np.testing.assert_allclose(found, [[-0.49, 319.5], [0, 319.5], [np.nan, np.nan]], atol=1e-6)
@@ -62,8 +62,8 @@ def test_one_line() -> None:
 
 
 @pytest.mark.parametrize(("samples", "binning"), [(1, 1), (640, 640), (1, 2)])
-def test_one_sample(samples: int, binning: int) -> None:
-    """A camera of one sample, by itself or by binning, is looked up; one binned away altogether sees nothing."""
+def test_camera_with_one_sample_has_a_geolocation(samples: int, binning: int) -> None:
+    """One sample, native or binned from 640, is found; a single sample that binning by 2 drops shows nothing."""
     camera = LineCamera(samples=samples)
     (scan_path,) = make_scan_paths(aim(SWATH, np.arange(10.0)), camera, binning=binning)
     x, y = points_of_scan(SWATH, camera, 4.0, np.array([0, 0.4 * samples, 700]) * camera.ifov_rad)
@@ -73,8 +73,8 @@ def test_one_sample(samples: int, binning: int) -> None:
     np.testing.assert_array_equal(np.isfinite(found[:, 1]), expected)
 
 
-def test_lost_frames_are_a_gap_with_nothing_in_it() -> None:
-    """Where 12 frames are lost nothing is found from half a step beyond the last line, and up to there all is."""
+def test_lost_frames_leave_a_gap_without_geolocation() -> None:
+    """Twelve lost frames leave NaN from half a step beyond the last line; all points outside of the gap are found."""
     scan = np.concatenate([np.arange(30.0), np.arange(42.0, 80)])
     numbers = number_lines(scan * 0.1, 0.1)
     assert numbers.lost == 12

@@ -1,4 +1,4 @@
-"""Hard cases of resampling: band counts, long sweeps, NaN, step edges, few pixels, positions, threads."""
+"""Hard cases of resampling: band counts, long sweeps, NaN, step edges, few pixels, float32 positions, threads."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ KERNELS: tuple[Kernel, ...] = ("catmull-rom", "bilinear", "nearest")
 
 
 def ramp(lines: int, samples: int, bands: int = 1) -> np.ndarray:
-    """Values that grow by 1 along a line, by 10 from line to line, by 1000 from band to band, (line, sample, band)."""
+    """Return values (line, sample, band) that grow by 1 a sample, by 10 a line and by 1000 a band."""
     line, sample, band = np.ogrid[:lines, :samples, :bands]
     values: np.ndarray = (10.0 * line + sample + 1000.0 * band).astype(np.float32)
     return values
@@ -24,8 +24,8 @@ def ramp(lines: int, samples: int, bands: int = 1) -> np.ndarray:
 
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("bands", [1, 2, 128, 129, 270, 512, 513, 939])
-def test_every_band_count_is_read_to_its_last_band(kernel: Kernel, bands: int) -> None:
-    """All bands of a cube have the weights that one band alone has, for any count and both kinds of numbers."""
+def test_bands_of_a_cube_match_the_same_band_alone(kernel: Kernel, bands: int) -> None:
+    """With 1 to 939 bands, the first, middle and last band of a uint16 cube match that band alone as float32."""
     values = np.random.default_rng(bands).integers(0, 60_000, (7, 6, bands), dtype=np.uint16)
     at = np.random.default_rng(1).uniform(0, 5, (30, 2))
     out, fraction = resample(values, np.ones((7, 6), bool), at, kernel)
@@ -37,8 +37,8 @@ def test_every_band_count_is_read_to_its_last_band(kernel: Kernel, bands: int) -
 
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("lines", [32_766, 32_767, 32_768, 40_000])
-def test_long_sweeps_are_read_to_their_last_line(kernel: Kernel, lines: int) -> None:
-    """Line numbers around the limit of 16 bits are lines like any other."""
+def test_line_numbers_beyond_16_bits_are_resampled_exactly(kernel: Kernel, lines: int) -> None:
+    """Sweeps of 32 766 to 40 000 lines return exact values at their first, middle and last lines."""
     values, valid = ramp(lines, 4), np.ones((lines, 4), bool)
     at = np.array([[lines - 1, 3], [lines - 1, 0], [lines - 3, 2], [lines // 2, 1], [32_766 - 3, 2]])
     out, _ = resample(values, valid, at, kernel)
@@ -46,7 +46,7 @@ def test_long_sweeps_are_read_to_their_last_line(kernel: Kernel, lines: int) -> 
 
 
 def test_fraction_is_never_above_one() -> None:
-    """Where only taps of negative weight are lost, what is left weighs more than all: it counts as all."""
+    """If only taps of negative weight are invalid, the valid taps sum to more than 1; the fraction is limited to 1."""
     valid = np.ones((9, 9), bool)
     valid[:, [2, 5]] = False
     out, fraction = resample(np.full((9, 9, 1), 40, np.float32), valid, np.array([[4, 3.5]]))
@@ -56,14 +56,14 @@ def test_fraction_is_never_above_one() -> None:
 
 @pytest.mark.parametrize("kind", [np.float32, np.uint16])
 def test_nearest_rounds_halves_up(kind: type[np.generic]) -> None:
-    """Half-way points take the next pixel throughout: none is taken twice and none is left out."""
+    """Positions halfway between pixels take the next pixel, so no pixel is taken twice or left out."""
     at = np.array([[0.5, 0], [1.5, 0], [2.5, 0], [3, 0.5], [3, 1.5]])
     out, _ = resample(ramp(6, 4).astype(kind), np.ones((6, 4), bool), at, "nearest")
     assert out[:, 0].tolist() == [10, 20, 30, 31, 32]
 
 
-def test_unmarked_nan_band_stays_on_its_own() -> None:
-    """A band without light is NaN in a valid sample: it stays NaN and touches no other band."""
+def test_nan_band_of_valid_samples_affects_no_other_band() -> None:
+    """A band without light is NaN in valid samples: it stays NaN, the other bands are finite, the fraction is 1."""
     values = ramp(6, 6, 3)
     values[..., 1] = np.nan
     out, fraction = resample(values, np.ones((6, 6), bool), np.array([[2.5, 2.5], [5, 5]]))
@@ -73,7 +73,7 @@ def test_unmarked_nan_band_stays_on_its_own() -> None:
 
 
 def test_overshoot_at_a_step_is_kept() -> None:
-    """Between black and white Catmull-Rom leaves the range of uint16 on both sides; nothing wraps around."""
+    """At a step from 0 to 65 535 Catmull-Rom overshoots the uint16 range on both sides; no value wraps around."""
     values = np.zeros((8, 8, 1), np.uint16)
     values[:, 4:] = 65_535
     at = np.stack([np.full(57, 3.5), np.linspace(0, 7, 57)], axis=1)
@@ -85,8 +85,8 @@ def test_overshoot_at_a_step_is_kept() -> None:
 
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("kind", [np.float32, np.uint16])
-def test_block_without_any_point(kernel: Kernel, kind: type[np.generic]) -> None:
-    """A block of the grid that no line reaches is empty without a warning."""
+def test_positions_without_a_line_give_nan(kernel: Kernel, kind: type[np.generic]) -> None:
+    """A block of the grid that no line reaches is NaN with a fraction of 0, and raises no warning."""
     values = ramp(5, 5, 3).astype(kind)
     at = np.array([[np.nan, np.nan], [np.nan, 2], [np.inf, 1], [-np.inf, -np.inf], [1e300, 0]])
     out, fraction = resample(values, np.ones((5, 5), bool), at, kernel)
@@ -95,8 +95,8 @@ def test_block_without_any_point(kernel: Kernel, kind: type[np.generic]) -> None
     assert not fraction.any()
 
 
-def test_positions_keep_what_float32_loses() -> None:
-    """At line 32 768 a float32 position moves in steps of 1/256 px; in float64 a thousandth of one is there."""
+def test_float64_positions_keep_offsets_that_float32_loses() -> None:
+    """At line 32 768 float32 positions are rounded to 1/256 px; float64 positions keep offsets of 1e-5 and 1e-3 px."""
     values = np.tile(np.array([[[0.0]], [[1.0]]], np.float32), (16_386, 5, 1))
     at = np.array([[32_768 + 1e-5, 2], [32_768 + 1e-3, 2], [32_768.3, 2]])
     out, _ = resample(values, np.ones(values.shape[:2], bool), at, "bilinear")
@@ -107,8 +107,8 @@ def test_positions_keep_what_float32_loses() -> None:
 
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("shape", [(1, 6), (6, 1), (1, 1), (2, 2), (3, 3)])
-def test_fewer_pixels_than_taps(kernel: Kernel, shape: tuple[int, int]) -> None:
-    """One line, one sample and less than a kernel of either: centres come back, a pixel beyond there is nothing."""
+def test_images_smaller_than_the_kernel_return_their_pixels(kernel: Kernel, shape: tuple[int, int]) -> None:
+    """Images of one line, one sample or up to 3 x 3 px return their values at centres; outside the fraction is 0."""
     values, valid = ramp(*shape, 2), np.ones(shape, bool)
     centres = np.argwhere(valid).astype(float)
     out, fraction = resample(values, valid, centres, kernel)
@@ -119,8 +119,8 @@ def test_fewer_pixels_than_taps(kernel: Kernel, shape: tuple[int, int]) -> None:
         assert not resample(values, valid, beyond, kernel)[1].any()
 
 
-def test_threads_at_once_do_not_disturb_each_other() -> None:
-    """Four threads that resample at once get what one gets, read-only memory included, and leave torch's threads."""
+def test_concurrent_threads_give_the_results_of_one_thread() -> None:
+    """Four threads also read read-only memory and leave torch's thread count unchanged."""
     rng = np.random.default_rng(3)
     values, valid = rng.random((40, 40, 70), np.float32), rng.random((40, 40, 70)) > 0.001
     values.flags.writeable = False
@@ -141,8 +141,8 @@ def test_threads_at_once_do_not_disturb_each_other() -> None:
             np.testing.assert_array_equal(part[1], wanted[1])
 
 
-def test_new_threads_find_the_count_that_the_process_set() -> None:
-    """A worker's thread begins with the process's number of torch threads, before and after it resampled."""
+def test_new_threads_inherit_the_torch_thread_count() -> None:
+    """A worker thread has the process's number of torch threads before and after it resamples."""
     values, valid, at = ramp(9, 9), np.ones((9, 9), bool), np.full((10, 2), 4.5)
 
     def work() -> tuple[int, int]:

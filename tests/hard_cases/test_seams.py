@@ -1,4 +1,4 @@
-"""Hard overlaps: nothing in common, nothing to see, rows without end, one edge, holes, and shifts out of reach."""
+"""Hard overlaps for registration: empty, flat, periodic, one edge, holes, and shifts beyond the prior."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Field = tuple[np.ndarray, np.ndarray]
 
 
 def texture(seed: int, shape: tuple[int, int], down: int = 0, right: int = 0) -> Field:
-    """Two cuts of one random image, a whole shift apart, with noise of 2 %."""
+    """Return two crops of one random image, shifted by whole pixels, with noise of 2 %."""
     rng = np.random.default_rng(seed)
     whole = gaussian_filter(rng.normal(size=(shape[0] + 160, shape[1] + 160)), 1.5)
     whole /= whole.std()
@@ -22,8 +22,8 @@ def texture(seed: int, shape: tuple[int, int], down: int = 0, right: int = 0) ->
 
 
 @pytest.mark.parametrize("fill", [np.nan, np.inf])
-def test_empty_overlap(fill: float):
-    """Where one sweep saw nothing, or both never the same pixel within the prior, the overlap is empty."""
+def test_overlap_without_common_pixels_is_empty(fill: float):
+    """One sweep without values is enough, and so are two sweeps without a common pixel within the prior."""
     one, other = texture(0, (100, 60))
     assert pair_shift(one, np.full_like(other, fill), prior_px=5).status == "empty"
     one[:, 20:], other[:, :40] = fill, fill
@@ -31,8 +31,8 @@ def test_empty_overlap(fill: float):
 
 
 @pytest.mark.parametrize("level", [0.0, 1.0, 1e-30, 3e4])
-def test_flat_overlap(level: float):
-    """A constant overlap is flat, with noise on it or without."""
+def test_constant_overlap_is_flat(level: float):
+    """A constant image is flat without noise, with noise of 2 %, and against a texture."""
     flat = np.full((200, 64), level)
     assert pair_shift(flat, flat, prior_px=10).status == "flat"
     noise = np.random.default_rng(1).normal(size=(2, 200, 64)) * (level or 1.0) / 50
@@ -41,8 +41,8 @@ def test_flat_overlap(level: float):
 
 
 @pytest.mark.parametrize("period", [4.0, 12.0, 12.37, 31.0])
-def test_periodic_texture(period: float):
-    """A pattern that repeats in both directions within the prior is undecidable at any period, noise or none."""
+def test_periodic_texture_is_undecidable(period: float):
+    """The pattern repeats in both directions within the prior, with periods of 4 to 31 px, with and without noise."""
     y, x = np.mgrid[:256, :128].astype(float)
     for noise in (0.0, 0.02, 0.3):
         rng = np.random.default_rng(2)
@@ -55,8 +55,8 @@ def test_periodic_texture(period: float):
         assert found.status == "undecidable"
 
 
-def test_step_edge():
-    """One straight edge fixes the shift across it and leaves the one along it open: undecidable."""
+def test_single_straight_edge_is_undecidable():
+    """One straight edge fixes the shift across it and leaves the shift along it open."""
     rng = np.random.default_rng(4)
     y, x = np.mgrid[:256, :80].astype(float)
     for across in (x, y - 88, (x + y) / np.sqrt(2) - 90):
@@ -66,8 +66,8 @@ def test_step_edge():
         assert pair_shift(*noisy, prior_px=10).status == "undecidable"
 
 
-def test_corner_of_two_edges_is_enough():
-    """A step edge that turns a corner fixes both directions."""
+def test_corner_of_two_edges_fixes_the_shift():
+    """A step edge that turns a corner fixes both directions to 0.05 px."""
     y, x = np.mgrid[:256, :80].astype(float)
     rng, views = np.random.default_rng(5), []
     for down, right in ((0.0, 0.0), (3.4, -2.2)):
@@ -76,8 +76,8 @@ def test_corner_of_two_edges_is_enough():
     np.testing.assert_allclose(pair_shift(*views, prior_px=10).shift, [3.4, -2.2], atol=0.05)
 
 
-def test_nan_inside_the_overlap():
-    """Holes and lost lines of either image count nothing; what lies in them does not matter."""
+def test_non_finite_pixels_in_the_overlap_are_ignored():
+    """Holes and lost lines of either image reduce the pixel count; the shift stays right to 0.02 px."""
     one, other = texture(6, (256, 80), 5, -2)
     clean = pair_shift(one, other, prior_px=8)
     one[100:108], other[:, 30:33], other[7, 60] = np.nan, np.nan, np.inf
@@ -87,8 +87,8 @@ def test_nan_inside_the_overlap():
     assert found.pixels < clean.pixels
 
 
-def test_shift_beyond_the_prior():
-    """A shift that the prior rules out is not found, nor is another found in its place."""
+def test_shift_beyond_the_prior_is_undecidable():
+    """A prior of 10 px finds neither the shift of 14 px nor a wrong one; a prior of 16 px finds it."""
     for seed in range(4):
         views = texture(seed, (256, 96), 14, 0)
         assert pair_shift(*views, prior_px=10).status == "undecidable"
@@ -96,16 +96,16 @@ def test_shift_beyond_the_prior():
 
 
 @pytest.mark.parametrize("lines", [1, 2, 8])
-def test_one_common_line(lines: int):
-    """One line in common, or a few, is too little to tell a shift from; nothing fails."""
+def test_few_common_lines_are_undecidable(lines: int):
+    """One, two or eight common lines are too few for a shift; without a common line the overlap may also be empty."""
     one, other = texture(7, (100, 64), 1, 2)
     assert pair_shift(one[:lines], other[:lines], prior_px=10).status == "undecidable"
     one[lines:], other[: 100 - lines] = np.nan, np.nan
     assert pair_shift(one, other, prior_px=0).status in ("undecidable", "empty")
 
 
-def test_single_pixel_and_integer_types():
-    """One pixel is no overlap to tell anything from, and float32 images give what float64 ones give."""
+def test_single_pixel_is_flat_and_float32_agrees_with_float64():
+    """One pixel contains no shift; float32 images give the shift of float64 images to 1e-4 px."""
     assert pair_shift(np.ones((1, 1)), np.ones((1, 1)), prior_px=3).status == "flat"
     one, other = texture(8, (128, 64), 3, 1)
     half = pair_shift(one.astype(np.float32), other.astype(np.float32), prior_px=5)

@@ -1,4 +1,4 @@
-"""Hard cases of the light of the simulator: none, one bright point, a slit without width, one number, tolerances."""
+"""Hard cases of the simulator's light: black, one bright point, a slit without width, one sample, tolerance limits."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TEXTURE = np.random.default_rng(0).uniform(0.2, 1, (60, 80, 3))
 
 
 def test_black_scene_without_dark_current_has_no_shot_noise() -> None:
-    """It is unseen at any tolerance but 0, and the raw numbers are the dark level and read noise."""
+    """At a tolerance of 0.1 shot noise is ``unseen``; raw numbers average the dark level of 64 DN."""
     rig = replace(RIG, detector=Detector(dark_e_per_s=0.0))
     decision = decided(scene_of(0 * TEXTURE), rig)
     assert {one.name: one.reason for one in decision.taken}["shot"] == "unseen"
@@ -32,9 +32,9 @@ def test_black_scene_without_dark_current_has_no_shot_noise() -> None:
 
 @pytest.mark.parametrize("slit_um", [0.0, 20.0])
 def test_point_source_keeps_every_bound(slit_um: float) -> None:
-    """One bright pixel in the dark: what is left out, effect by effect, is finite and within what was counted."""
+    """One bright pixel on black: leaving out each effect changes the light by a finite amount within its bound."""
     values = np.zeros((60, 80, 2))
-    values[29, 39] = 1.0  # line 15 looks there
+    values[29, 39] = 1.0  # line 15 points there
     rig = replace(RIG, camera=replace(CAMERA, slit_um=slit_um))
     found = left_out(scene_of(values), rig)
     assert {"diffraction", "aberration", "slit", "keystone"} <= set(found)
@@ -43,8 +43,8 @@ def test_point_source_keeps_every_bound(slit_um: float) -> None:
         assert change <= counted < math.inf
 
 
-def test_one_number_is_a_scan() -> None:
-    """A scene of one pixel seen by one sample in one line and one band, with everything on, has no detail."""
+def test_scene_of_one_pixel_can_be_scanned() -> None:
+    """One sample of one line in one band, every part on, is finite; effects that need detail have an error of 0."""
     scene, rig = scene_of(np.ones((1, 1, 1))), replace(EVERYTHING, camera=LineCamera(samples=1))
     sweep = replace(SWEEP, lines=1)
     decision = decided(scene, rig, 0.0, sweep)
@@ -56,7 +56,7 @@ def test_one_number_is_a_scan() -> None:
 
 
 def test_zero_width_slit_is_the_limit_of_a_narrow_one() -> None:
-    """Without a width, light is that of a slit of 1e-6 um in every variant, and the decision keeps its tolerance."""
+    """A slit of 0 um gives the light of 1e-6 um in every variant, and leaving out each effect keeps its bound."""
     scene = scene_of(TEXTURE)
     none, narrow = (replace(RIG, camera=replace(CAMERA, slit_um=width)) for width in (0.0, 1e-6))
     for variant in SLIT.variants:
@@ -68,8 +68,8 @@ def test_zero_width_slit_is_the_limit_of_a_narrow_one() -> None:
 
 
 @pytest.mark.parametrize("tolerance", [5e-324, 1e-300, 1e300])
-def test_tolerances_next_to_0_and_infinity_are_kept(tolerance: float) -> None:
-    """The least and the greatest numbers that there are decide like 0, but for what is not seen, and like infinity."""
+def test_extreme_tolerances_are_kept(tolerance: float) -> None:
+    """Errors stay within 5e-324, 1e-300 and 1e300; the fixed pattern (PRNU) is on for the first two only."""
     scene = scene_of(np.ones((60, 80, 3)))
     decision = decided(scene, replace(RIG, optics=Optics(stray_fraction=0.0)), tolerance)
     assert decision.error <= tolerance

@@ -1,4 +1,4 @@
-"""Hard cases of the simulator's mirror and weather: damping 1, stiff steps, sunset and night, endless distance."""
+"""Hard cases of the simulator's mirror and weather: damping 1, stiff mirrors, sunset, night, infinite distance."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ NIGHT = Sky(started=datetime(2026, 6, 21, 23, 20, tzinfo=UTC))
 
 
 def moving(exposure_ms: float, **mirror: float) -> Rig:
-    """A rig whose mirror moves otherwise."""
+    """Return a rig with another exposure and other mirror settings."""
     return replace(RIG, camera=replace(CAMERA, exposure_ms=exposure_ms), mirror=MirrorMotion(**mirror))
 
 
 @cache
 def damped(damping: float) -> tuple[NDArray[np.float32], Decision]:
-    """Light with the lag at 3 ms lines, and what is decided."""
+    """Return the light with lag at 3 ms lines, and the decision."""
     rig = moving(3.0, damping=damping)
     return expected_light(TEXTURE, block_of(TEXTURE, rig), {LAG: "exact", ROTATION: "rays"}), decided(TEXTURE, rig)
 
 
 @pytest.mark.parametrize("damping", [1 - 1.2e-16, 1 + 2.3e-16, 1 - 1e-9])
 def test_critical_damping_is_the_limit_from_both_sides(damping: float) -> None:
-    """At damping 1 and a hair beside it light, bound and decision are alike, and lag is on at 3 ms lines."""
+    """Close to damping 1, light, choice and error match those at damping 1, and lag is on at 3 ms lines."""
     (light, decision), (limit, critical) = damped(damping), damped(1.0)
     assert damping != 1
     np.testing.assert_allclose(light, limit, rtol=1e-5)
@@ -56,14 +56,14 @@ def test_critical_damping_is_the_limit_from_both_sides(damping: float) -> None:
     ("natural_hz", "damping", "exposure_ms"),
     [(1e5, 10.0, 1000.0), (1e5, 0.01, 3.0), (5.0, 0.01, 100.0), (0.1, 10.0, 3.0)],
 )
-def test_mirrors_stiff_and_slack_keep_every_bound(natural_hz: float, damping: float, exposure_ms: float) -> None:
-    """From a lag of nothing to one of 10,000 px, where lines lie turned otherwise than planned."""
+def test_stiff_and_slow_mirrors_keep_every_bound(natural_hz: float, damping: float, exposure_ms: float) -> None:
+    """Lags range from 0 to 10,000 px, where lines have another rotation than planned."""
     for change, counted in left_out(TEXTURE, moving(exposure_ms, damping=damping, natural_hz=natural_hz)).values():
         assert change <= counted < math.inf
 
 
-def test_light_goes_out_at_the_horizon() -> None:
-    """Before sunset there is light, the less the later; from sunset on there is none, and only noise is read."""
+def test_light_ends_at_sunset() -> None:
+    """Light decreases until sunset and is 0 for the 4 h after it; raw numbers without noise are then the dark level."""
     rig = replace(RIG, sky=EVENING)
     seconds, levels = np.arange(3600.0), []
     sunset_s = float(seconds[sun_elevation_deg(EVENING, seconds) <= 0][0])
@@ -79,8 +79,8 @@ def test_light_goes_out_at_the_horizon() -> None:
 
 
 @pytest.mark.parametrize("variant", DRIFT.variants)
-def test_survey_into_the_night_loses_all_of_its_light(variant: str) -> None:
-    """Left out, drift errs by the whole level; it is on, and no variant errs by more than that."""
+def test_drift_of_a_survey_into_the_night_is_bounded_by_the_level(variant: str) -> None:
+    """Leaving out drift errs by the whole level, and no variant by more; drift is on, with an error within 0.1."""
     rig = replace(RIG, sky=EVENING)
     probe = replace(probed(FLAT, rig), seconds=2 * 3600.0)
     assert DRIFT.bound(probe, rig).value == pytest.approx(probe.level.max())
@@ -92,7 +92,7 @@ def test_survey_into_the_night_loses_all_of_its_light(variant: str) -> None:
 
 @pytest.mark.parametrize("sky", [NIGHT, replace(EVENING, started=datetime(2026, 6, 21, 19, 50, tzinfo=UTC))])
 def test_survey_in_the_dark_keeps_every_bound(sky: Sky) -> None:
-    """By night and at sunset, with clouds, a hot spot and air: all light is finite, and within what was counted."""
+    """At night and at sunset, with clouds, a hot spot and air, changes are finite and within their bounds."""
     rig = replace(RIG, sky=replace(sky, cloud_fraction=0.5, hot_spot=0.2), air=Air(distance_m=300.0))
     found = left_out(TEXTURE, rig)
     assert {"drift", "cloud", "brdf", "path-radiance"} <= set(found)
@@ -102,15 +102,15 @@ def test_survey_in_the_dark_keeps_every_bound(sky: Sky) -> None:
 
 @cache
 def seen_from(distance_m: float, focus_m: float) -> tuple[NDArray[np.float32], Decision]:
-    """Light with everything on and exact, and what is decided."""
+    """Return the light with all effects exact, and the decision."""
     rig = replace(RIG, air=Air(distance_m=distance_m, wind_amplitude_m=0.1), optics=Optics(focus_m=focus_m))
     decision = decided(TEXTURE, rig)
     return expected_light(TEXTURE, block_of(TEXTURE, rig), decision.exact), decision
 
 
 @pytest.mark.parametrize("focus_m", [30.0, math.inf])
-def test_distance_goes_to_infinity_without_a_jump(focus_m: float) -> None:
-    """Beyond the air's end light and decision are those of infinity, where nothing but the air is left to see."""
+def test_very_large_distance_equals_infinity(focus_m: float) -> None:
+    """Light and error at 1e300 m match those at infinity; path radiance is on, and defocus with the focus at 30 m."""
     (light, decision), (limit, endless) = seen_from(1e300, focus_m), seen_from(math.inf, focus_m)
     assert np.isfinite(limit).all()
     np.testing.assert_allclose(light, limit, rtol=1e-5)
@@ -121,7 +121,7 @@ def test_distance_goes_to_infinity_without_a_jump(focus_m: float) -> None:
 
 @pytest.mark.parametrize("relief", ["flat", "step"])
 def test_scene_that_reaches_to_the_horizon_keeps_every_bound(relief: str) -> None:
-    """Its farthest part at infinity: the ends of lines there lie a lever over the distance off, and all is finite."""
+    """The farthest part lies at infinity: after a step, parallax there is the lever over the scene's 30 m."""
     air = Air(distance_m=30.0, nearest_m=20.0, farthest_m=math.inf, relief=relief)  # type: ignore[arg-type]
     rig = replace(RIG, air=air)
     found = left_out(TEXTURE, rig)
@@ -134,14 +134,14 @@ def test_scene_that_reaches_to_the_horizon_keeps_every_bound(relief: str) -> Non
 
 
 def test_flat_scene_at_infinity_shows_no_turbulence() -> None:
-    """Infinite ways through the air and a slope of 0 are no NaN: unseen."""
+    """An infinite path and a slope of 0 give a bound of 0, not NaN."""
     rig = replace(RIG, air=Air(distance_m=math.inf))
     assert math.isfinite(turbulence_px(rig))
     assert TURBULENCE.bound(probed(FLAT, rig), rig).value == 0
 
 
-def test_turbulence_turns_the_ends_of_lines() -> None:
-    """Looking beside the plan turns a line of 640 samples: the bound of leaving out rotation counts that."""
+def test_bound_of_rotation_includes_turbulence() -> None:
+    """Turbulence moves the view off the plan and so rotates a line of 640 samples, by more than 0.05 sigma."""
     air = Air(distance_m=300.0, visibility_km=1e6, airlight_fraction=0.0, vapour_g_per_m3=0.0)
     rig = Rig(air=air, optics=Optics(focus_m=300.0, aberration_px=0.0, stray_fraction=0.0))
     scene = scene_of(np.random.default_rng(0).uniform(0.2, 1, (60, 680, 1)))

@@ -1,7 +1,7 @@
-"""The choice of effects over permitted settings: it ends, and what it leaves out keeps its bounds as it is stored.
+"""The choice of effects for permitted settings: it ends, and stored numbers keep the bounds of the effects left out.
 
-Scenes from black to far beyond saturation, exposures from the shortest to the longest, 1 to 16 samples summed, bands at
-any wavelengths, with noise and without.
+Scenes are black to far beyond saturation, exposures shortest to longest, sums of 1 to 16 samples, bands at any
+wavelengths, with noise and without.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ PATTERNS = ("black", "even", "rows", "columns", "checkers", "pixel", "disc", "no
 
 @dataclass(frozen=True)
 class Asked:
-    """Settings of a scan, as a user may give them."""
+    """Settings of a scan that a user may choose."""
 
     pattern: str = "rows"
     exposure_ms: float = 10_000.0
@@ -44,12 +44,12 @@ class Asked:
     seed: int = 0
 
     def rig(self) -> Rig:
-        """A narrow one, so that it is fast."""
+        """Return a narrow rig, for speed."""
         camera = LineCamera(samples=64, exposure_ms=self.exposure_ms, read_noise_e=self.read_noise_e)
         return Rig(camera, detector=Detector(noiseless=self.noiseless), air=Air(distance_m=self.distance_m))
 
     def scene(self) -> RasterScene:
-        """A pattern from 0 to 1 in every band, or over four decades."""
+        """Return a pattern from 0 to 1 in every band, or over four decades."""
         y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
         rng = np.random.default_rng(self.seed)
         plane = {
@@ -87,8 +87,8 @@ ASKED = st.builds(
 @example(Asked(pattern="columns", binning=14, noiseless=True))
 @example(Asked(exposure_ms=0.5, binning=1, wavelengths=(300.0, 1760.0), tolerance=1e-3, read_noise_e=0.0))
 @example(Asked(exposure_ms=9780.0, binning=1, wavelengths=(529.3, 998.0), tolerance=1e-3, distance_m=10.0))
-def test_every_permitted_setting_is_decided_within_its_bounds(asked: Asked) -> None:
-    """None ends in an error of ours: no broken bound, no number that is not finite, no warning."""
+def test_decision_for_permitted_settings_keeps_its_bounds(asked: Asked) -> None:
+    """No setting ends in a broken bound, a non-finite number or a warning."""
     scene, rig = asked.scene(), asked.rig()
     sweeps = (
         Sweep("coarse-0", "coarse", "x", 0.0, -20.0, SHAPE[0] // 4, 4, asked.binning),

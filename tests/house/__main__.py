@@ -1,6 +1,6 @@
-"""Print the figures that design rules are held against: python tests/house [--journey | --language [PATH]].
+"""Print the figures that design rules limit: python tests/house [--journey | --language [PATH]].
 
-With --journey a small survey is run as well, to find the files that a simulated line passes; it takes half a minute.
+With --journey a small survey runs too, to find the files that a simulated line passes; it takes half a minute.
 With --language every sentence is printed that breaks a rule of plain English, in all files or those below PATH.
 """
 
@@ -14,7 +14,7 @@ from pathlib import Path
 
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
-sys.path[0] = str(Path(__file__).resolve().parents[2])  # not this folder: its modules go by their full names
+sys.path[0] = str(Path(__file__).resolve().parents[2])  # not this folder: its modules are imported by their full names
 
 from tests.benchmarks.measure import aligned  # noqa: E402
 from tests.house.language import violations  # noqa: E402
@@ -33,13 +33,13 @@ from tests.house.source_tree import (  # noqa: E402
     statements,
 )
 
-FEW = 3  # statements, at most, of a function that says little more than its name
+FEW = 3  # statements, at most, of a function that adds little to its name
 SHORT = 60  # lines, below which a file is short
 SURVEY = ("survey", "--scene", "farm", "--size", "192x160", "--seconds", "6", "--engine", "plain")
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Print the table, and below it the files that a line passes where they are asked for; or the broken rules."""
+    """Print the table, and with flags the files that a line passes, or the broken rules of language."""
     if "--language" in arguments:
         for sentence, rule in violations("".join(arguments[1:2])):
             print(f"{sentence.path}:{sentence.line}: {sentence.kind}, rule {rule}\n    {sentence.text}")
@@ -54,7 +54,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def figures() -> Iterator[tuple[str, str, str]]:
-    """What, how much, and where: of source and tests."""
+    """Yield name, value and places of each figure of source and tests."""
     lines = {path: len(lines_of(path)) for path in source()}
     by_room = {room: sum(count for path, count in lines.items() if path.parts[0] == room) for room in ROOMS}
     yield "source lines", str(sum(lines.values())), ", ".join(f"{room} {count}" for room, count in by_room.items())
@@ -83,7 +83,7 @@ def figures() -> Iterator[tuple[str, str, str]]:
 
 
 def journey() -> list[str]:
-    """Run a small survey; give the files that pixels pass on their way to its class map."""
+    """Run a small survey; return the files that pixels pass on their way to its class map."""
     from flows.cli.main import main as run
     from tests.house.journey import passed_files
 

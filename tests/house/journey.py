@@ -1,8 +1,8 @@
-"""The files that a simulated line passes from the command to the class map, found while a small survey runs.
+"""Find the files that a simulated line passes from the command to the class map, during a small survey.
 
-A file is passed where it stands on the stack as a function of the house takes or gives pixels: an array of two axes or
-more with at least as many numbers as one line of the camera has, by itself, in a sequence, or as a field of what is
-handed over. What is worked out of lines (tables, looks, class probabilities, the map) is pixels too.
+A file is passed if it is on the stack when a function of the source takes or returns pixels. Pixels are an array of two
+axes or more with at least as many numbers as one line of the camera. They are passed as a value, in a sequence, or as a
+field of a value. Results from lines (tables, passes, class probabilities, the map) are pixels too.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from typing import Any
 from tests.house.source_tree import ROOMS, ROOT
 
 LINE = 640  # numbers: the samples of a line in one band
-FIRST = 4  # of a sequence that are looked at
-MAP_DRAWN = ("flows/tasks/stages/maps.py", "build")  # whose return is the end of the way
+FIRST = 4  # items of a sequence that are checked
+MAP_DRAWN = ("flows/tasks/stages/maps.py", "build")  # its return is the end of the way
 
 
 @cache
 def file_of(code: CodeType) -> str | None:
-    """The file of the house that code stands in, from the root; None of code from elsewhere."""
+    """Return the source file that holds the code, relative to the root; None for code from elsewhere."""
     path = Path(code.co_filename)
     if not path.is_relative_to(ROOT):
         return None
@@ -34,7 +34,7 @@ def file_of(code: CodeType) -> str | None:
 
 
 def has_pixels(value: Any, deep: bool = True) -> bool:
-    """Whether a value is, holds in a sequence or has as a field an array of as many numbers as a line."""
+    """Return whether a value is, contains or has as a field an array with as many numbers as a line."""
     shape = getattr(value, "shape", None)
     if isinstance(shape, tuple) and hasattr(value, "dtype"):
         sizes, count = [size for size in shape if isinstance(size, int)], 1
@@ -48,7 +48,7 @@ def has_pixels(value: Any, deep: bool = True) -> bool:
 
 @contextmanager
 def passed_files() -> Iterator[set[str]]:
-    """Collect the files that pixels pass while the block runs, until the map is drawn; in threads begun in it too."""
+    """Collect the files that pixels pass during the block until the map is drawn, in this thread and in new ones."""
     passed: set[str] = set()
     drawn = threading.Event()
 

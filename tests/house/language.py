@@ -12,17 +12,17 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from tests.house.source_tree import ROOT, Documented, nodes, source
+from tests.house.source_tree import ROOT, Documented, files_of_tests, nodes, source
 
 MOST_WORDS = 25  # in a sentence
 MOST_NUMBERS = 2  # in a sentence
 LEAST_WORDS = 4  # of a string that counts as a message
 OPENERS = "what of where by beside which how who whoever whom whose"  # no sentence begins with one of these
-PHRASES = (  # no text that people read has one of these
+PHRASES = (  # no text has one of these
     "nobody|anybody|somebody|everybody|whoever|no more (?!than)|promises?|believes?|believed|(?:is|are|was|were) told|"
     "tells? of|told of|goes on|go on|went on|as before|lets? go of|(?:says?|said) of|in the place of"
 )
-HISTORY = (  # for the changelog and the log of measurements alone
+HISTORY = (  # only for the changelog and the log of measurements
     "no longer|formerly|former|used to|earlier versions?|the network before|weights before|"
     "(?:measured|trained) on 20\\d\\d|before 20\\d\\d|20\\d\\d-\\d\\d-\\d\\d"
 )
@@ -145,9 +145,11 @@ def pages() -> list[Path]:
 
 @cache
 def sentences() -> list[Sentence]:
-    """Return every sentence of pages and code."""
+    """Return every sentence of pages and code, and of the docstrings of tests."""
     found = [one for path in pages() for one in sentences_of_page(path)]
-    return found + [one for path, tree in source().items() for one in sentences_of_code(path, tree)]
+    found += [one for path, tree in source().items() for one in sentences_of_code(path, tree)]
+    tests = ((path, ast.parse((ROOT / path).read_text(encoding="utf-8"))) for path in files_of_tests())
+    return found + [one for each in tests for one in sentences_of_code(*each) if one.kind == "docstring"]
 
 
 def violations(under: str = "") -> Iterator[tuple[Sentence, str]]:

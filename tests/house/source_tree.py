@@ -1,4 +1,4 @@
-"""The source files of the house as syntax trees, and what can be read off them: lines, imports, circles, names."""
+"""The source files as syntax trees, and their figures: lines, imports, circles, names."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ Documented = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
 
 @cache
 def source() -> dict[Path, ast.Module]:
-    """The syntax tree of every source file of the house, by its path from the root."""
+    """Return the syntax tree of every source file, by its path from the root."""
     found = sorted(path for room in ROOMS for path in (ROOT / room).rglob("*.py"))
     return {path.relative_to(ROOT): ast.parse(path.read_text(encoding="utf-8"), str(path)) for path in found}
 
 
 def files_of_tests() -> list[Path]:
-    """Every file of the tests, by its path from the root."""
+    """Return every file of the tests, by its path from the root."""
     return sorted(path.relative_to(ROOT) for path in (ROOT / "tests").rglob("*.py"))
 
 
 @cache
 def nodes(tree: ast.AST) -> list[ast.AST]:
-    """All nodes of a tree, walked once for every rule."""
+    """Return all nodes of a tree, walked once for all rules."""
     return list(ast.walk(tree))
 
 
 @cache
 def late_packages() -> dict[str, str]:
-    """Packages that `pipeline.lazy` defers for all, and those of types, by their names there."""
+    """Return the packages that `pipeline.lazy` defers, and those of its types, by their names there."""
     tree = ast.parse((ROOT / LAZY).read_text(encoding="utf-8"))
     inner = [node for block in tree.body if isinstance(block, ast.If) for node in block.body]
     types = {
@@ -47,7 +47,7 @@ def late_packages() -> dict[str, str]:
 
 
 def imported(tree: ast.AST) -> Iterator[str]:
-    """Names of all modules imported anywhere in the file, those for type checkers and deferred ones included."""
+    """Yield the names of all modules that a file imports, also for type checkers or deferred."""
     for node in nodes(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -58,7 +58,7 @@ def imported(tree: ast.AST) -> Iterator[str]:
 
 
 def imported_in_functions(trees: Trees) -> dict[str, set[str]]:
-    """Packages that functions import, by the file that these stand in."""
+    """Return the packages that functions import, by file."""
     found: dict[str, set[str]] = {}
     for path, tree in trees.items():
         inner = [node for node in nodes(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
@@ -68,12 +68,12 @@ def imported_in_functions(trees: Trees) -> dict[str, set[str]]:
 
 
 def module_name(path: Path) -> str:
-    """The name that a file is imported by."""
+    """Return the name by which a file is imported."""
     return ".".join(path.with_suffix("").parts).removesuffix(".__init__")
 
 
 def imported_files(path: Path, tree: ast.Module, known: set[str]) -> set[str]:
-    """Modules of the house that a file names, ``from package import module`` included."""
+    """Return the modules of the source that a file imports, also by ``from package import module``."""
     names = set(imported(tree))
     for node in nodes(tree):
         if isinstance(node, ast.ImportFrom):
@@ -82,7 +82,7 @@ def imported_files(path: Path, tree: ast.Module, known: set[str]) -> set[str]:
 
 
 def circles(trees: Trees) -> list[str]:
-    """Files that import each other in a circle, within functions and for type checkers too."""
+    """Return the circles of files that import each other, also within functions and for type checkers."""
     known = {module_name(path) for path in trees if path.name != "__init__.py"}
     graph = {module_name(path): imported_files(path, tree, known) for path, tree in trees.items()}
     found = []
@@ -97,18 +97,18 @@ def circles(trees: Trees) -> list[str]:
 
 
 def files_by_folder(paths: Iterable[Path]) -> Counter[str]:
-    """How many files every folder has."""
+    """Return the number of files in every folder."""
     return Counter(path.parent.as_posix() for path in paths)
 
 
 def shared_class_names(trees: Trees) -> dict[str, int]:
-    """Names that more than one class has."""
+    """Return the class names that are used more than once, with their counts."""
     names = Counter(node.name for tree in trees.values() for node in nodes(tree) if isinstance(node, ast.ClassDef))
     return {name: count for name, count in names.items() if count > 1}
 
 
 def statements(trees: Trees) -> int:
-    """Return how many statements the files have."""
+    """Return the number of statements in the files."""
     return sum(isinstance(node, ast.stmt) for tree in trees.values() for node in nodes(tree))
 
 
@@ -134,7 +134,7 @@ def inlinable(trees: Trees, most: int) -> list[str]:
 
 
 def parameters_of_type(trees: Trees, name: str) -> int:
-    """Return how many parameters of functions are annotated as a type of this name."""
+    """Return the number of parameters that are annotated with a type of this name."""
     parameters = (
         given.annotation
         for one in functions(trees)
@@ -145,10 +145,10 @@ def parameters_of_type(trees: Trees, name: str) -> int:
 
 
 def public(tree: ast.AST) -> Iterator[Documented]:
-    """Functions and classes whose names begin with no underscore, wherever they stand: in others too."""
+    """Return the functions and classes whose names do not begin with an underscore, also nested ones."""
     return (node for node in nodes(tree) if isinstance(node, Documented) and not node.name.startswith("_"))
 
 
 def lines_of(path: Path) -> list[str]:
-    """The lines of a file of the house, by its path from the root."""
+    """Return the lines of a file, by its path from the root."""
     return (ROOT / path).read_text(encoding="utf-8").splitlines()

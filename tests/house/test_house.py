@@ -1,4 +1,4 @@
-"""The house's figures: trees in which something is wrong show it, and arrays are followed up the stack."""
+"""The figures of the source: faults of made-up trees are found, and arrays are followed up the stack."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ TREES = {
 }
 
 
-def test_faults_of_a_tree_are_found() -> None:
-    """A circle through a function, the import in it, and a name that two classes have."""
+def test_circles_inner_imports_and_shared_names_are_found() -> None:
+    """The tree has a circle through an import in a function, and two classes of one name."""
     (circle,) = source_tree.circles(TREES)
     assert set(circle.split(" -> ")) == {"pipeline.one", "pipeline.two"}
     assert source_tree.imported_in_functions(TREES) == {"pipeline/two.py": {"pipeline"}}
     assert source_tree.shared_class_names(TREES) == {"Line": 2}
 
 
-def test_small_functions_and_settings_are_counted() -> None:
-    """A function that is called once, one that is called twice, one with a decorator, one that is long."""
+def test_inlinable_functions_settings_and_statements_are_counted() -> None:
+    """Functions that are called twice, decorated or longer than the limit are not inlinable."""
     text = "def a(s: Settings): b()\ndef b(): c(); c()\ndef c(x: Settings | None): pass\n@d\ndef e(): pass\n"
     tree = {Path("pipeline/one.py"): ast.parse(text + "def f(): pass; pass\na(1); e(); f()")}
     assert source_tree.inlinable(tree, 1) == ["a"]
@@ -50,13 +50,13 @@ def test_small_functions_and_settings_are_counted() -> None:
         (SimpleNamespace(held=SimpleNamespace(values=np.zeros((1, 640)))), False),
     ],
 )
-def test_pixels_are_arrays_as_large_as_a_line(value: object, pixels: bool) -> None:
-    """By themselves, in a sequence, or as a field; vectors and small tables are none."""
+def test_arrays_as_large_as_a_line_are_pixels(value: object, pixels: bool) -> None:
+    """They count as a value, in a sequence, or as a field; vectors and small tables do not count."""
     assert journey.has_pixels(value) == pixels
 
 
-def test_files_on_the_stack_are_passed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Who calls what takes pixels is passed, who only takes numbers is not, nor is what comes after the map."""
+def test_files_on_the_stack_are_collected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The caller of a function that takes pixels counts; functions of numbers, and calls after the map, do not."""
     sources = {
         "command": "def run(lines, build, count):\n    count(3)\n    build(lines)\n    count(lines)",
         "maps": "def build(lines):\n    return lines",

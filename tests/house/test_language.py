@@ -1,4 +1,4 @@
-"""Pages, docstrings and messages keep the rules of plain English, and the check finds each broken rule."""
+"""Pages, docstrings and messages follow the rules of plain English, and the check finds each broken rule."""
 
 from __future__ import annotations
 
@@ -35,18 +35,18 @@ def rules_of(text: str, kind: str = "page") -> list[str]:
     ],
 )
 def test_a_broken_rule_is_found(text: str, rules: list[str]) -> None:
-    """Each rule by a sentence that breaks it, and by one that seems to."""
+    """Each rule has a sentence that breaks it, and some have one that only seems to."""
     assert rules_of(text) == rules
 
 
-def test_a_message_may_be_a_fragment() -> None:
-    """The end of a message that begins in lower case is no sentence; one that begins in upper case is."""
+def test_a_lower_case_message_may_be_a_fragment() -> None:
+    """A message that begins in lower case may begin with "of"; one that begins in upper case may not."""
     assert rules_of("of {} rows", "message") == []
     assert rules_of("Of {} rows", "message") == ["1"]
 
 
-def test_sentences_of_a_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Code, tables, headings and comments have none; items of a list are apart; links are their text."""
+def test_a_page_is_split_into_sentences(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Code, tables, headings and comments are skipped; list items are separate; links become their text."""
     prose = "# Of it\n<!-- Of it -->\nOne [two](three.md) four. Five\nsix.\n\n- Seven.\n- Eight,\n  nine.\n"
     (tmp_path / "page.md").write_text(f"{prose}\n| Of it |\n```sh\nOf it\n```\n")
     monkeypatch.setattr(language, "ROOT", tmp_path)
@@ -54,21 +54,21 @@ def test_sentences_of_a_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert found == [(3, "One two four."), (3, "Five six."), (6, "Seven."), (7, "Eight, nine.")]
 
 
-def test_sentences_of_code() -> None:
-    """Docstrings, strings of four words or more, and f-strings with their gaps."""
+def test_code_is_split_into_sentences() -> None:
+    """Docstrings, strings of four words or more, and f-strings with gaps are found."""
     code = 'def f(n):\n    """Return it.\n\n    None.\n    """\n    raise E(f"got {n} lines of sweeps", "one")\n'
     found = [(one.kind, one.text) for one in language.sentences_of_code(Path("one.py"), ast.parse(code))]
     assert found == [("docstring", "Return it."), ("docstring", "None."), ("message", "got {} lines of sweeps")]
 
 
-def test_numbers_have_units() -> None:
-    """A plain number of a known quantity ends with its unit; arrays and other names are free."""
+def test_numbers_without_units_are_found() -> None:
+    """A plain number of a known quantity needs a unit in its name; arrays and other names do not."""
     tree = ast.parse("def f(exposure: float, exposure_ms: float, wavelength: NDArray, timeout: float | None): ...")
     assert [name for _, name in language.names_without_unit(Path("one.py"), tree)] == ["exposure", "timeout"]
 
 
-def test_all_texts_keep_the_rules() -> None:
-    """`python tests/house --language` prints nothing but the few sentences that are listed here."""
+def test_all_texts_follow_the_rules() -> None:
+    """`python tests/house --language` prints only the sentences of EXCEPTIONS."""
     assert len(EXCEPTIONS) <= MOST_EXCEPTIONS
     wrong = [
         f"{one.path}:{one.line}: rule {rule}: {one.text}"

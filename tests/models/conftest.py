@@ -1,4 +1,4 @@
-"""A segmenter small enough for tests, with weights of its own for every term that starts from zero."""
+"""A segmenter that is small enough for tests, with random weights for every term that starts from zero."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Maker = Callable[..., Weights]
 
 
 def noise(seed: int, *shape: int) -> Tensor:
-    """Seeded normal numbers."""
+    """Return seeded normal numbers."""
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
@@ -47,7 +47,7 @@ def coarse_prediction(
 
 
 def scene_columns(weights: Weights, height: int, width: int, seed: int = 0) -> tuple[CoarsePass, np.ndarray]:
-    """A look at a scene of noise, and other noise for every patch of its padded grid."""
+    """Return a pass over a scene of noise, and other noise for every patch of its padded grid."""
     p, columns = weights.config.patch, weights.config.columns
     grid, rng = SceneGrid(height, width, p), np.random.default_rng(seed)
     coarse_pass = CoarsePass(grid, rng.standard_normal((*grid.padded_shape, columns), np.float32))
@@ -55,7 +55,7 @@ def scene_columns(weights: Weights, height: int, width: int, seed: int = 0) -> t
 
 
 def block_example(size: int = 32, block: int = 8) -> Example:
-    """Two classes in blocks, told apart by the first column, with noise in the second."""
+    """Return two classes in blocks, separated by the first column, with noise in the second."""
     rng = np.random.default_rng(4)
     labels = np.kron(rng.integers(0, 2, (size // block, size // block)), np.ones((block, block))).astype(np.uint8)
     columns = np.stack([2.0 * labels - 1, rng.normal(0, 1, labels.shape)], axis=-1)
@@ -63,7 +63,7 @@ def block_example(size: int = 32, block: int = 8) -> Example:
 
 
 def killed_after(step: int) -> Callable[[Progress], None]:
-    """A report that ends the process, as far as training can tell, after some steps."""
+    """Return a progress report that interrupts training after some steps."""
 
     def report(now: Progress) -> None:
         if now.step == step:
@@ -73,7 +73,7 @@ def killed_after(step: int) -> Callable[[Progress], None]:
 
 
 def make_network(seed: int = 0, **sizes: Any) -> Segmenter:
-    """A small network of the given sizes; whatever training starts from zero is drawn too, so that nothing is idle."""
+    """Return a small network of the given sizes; terms that start from zero are drawn too, so that none is idle."""
     with torch.random.fork_rng(devices=[]), torch.no_grad():
         torch.manual_seed(seed)
         model = Segmenter(SegmenterConfig(**{**SMALL, **sizes})).eval()
@@ -84,14 +84,14 @@ def make_network(seed: int = 0, **sizes: Any) -> Segmenter:
 
 
 def plain_weights(**sizes: Any) -> Weights:
-    """Those of two layers, with columns of one scale that have no correlation."""
+    """Return weights of two layers, with columns of one scale and no correlation."""
     made = make_weights(**{"layers": 2, **sizes})
     one = np.ones(made.config.columns, np.float32)
     return replace(made, normalisation=Normalisation(0.3 * one, 0.1 * one, np.diag(one)))
 
 
 def make_weights(seed: int = 0, **sizes: Any) -> Weights:
-    """Random weights of a segmenter of these sizes."""
+    """Return random weights of a segmenter of these sizes."""
     model = make_network(seed, **sizes)
     columns = model.config.columns
     centre, spread = np.linspace(0.2, 0.4, columns), np.linspace(0.05, 0.1, columns)
@@ -108,5 +108,5 @@ def make_weights(seed: int = 0, **sizes: Any) -> Weights:
 
 @pytest.fixture
 def tiny() -> Maker:
-    """Maker of small random weights: ``tiny(seed, classes=..., patch=...)``."""
+    """Return the maker of small random weights: ``tiny(seed, classes=..., patch=...)``."""
     return make_weights

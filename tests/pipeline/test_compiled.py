@@ -1,4 +1,4 @@
-"""Compiled loops: kept for the next process, and compiled anew where nothing can be kept or what was kept is spoilt."""
+"""Compiled loops: stored for the next process, and compiled again if the cache is missing or damaged."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ assert made.tolist() == [0.0, 2.0, 4.0]
 
 
 def doubled(module: ModuleType) -> list[float]:
-    """What the loop of a module makes of 0, 1, 2; the array that it reads cannot be written to."""
+    """Return the module's result for 0, 1, 2; the input array is read-only."""
     some, made = np.arange(3.0), np.empty(3)
     some.setflags(write=False)
     module.double(some, made)
@@ -44,7 +44,7 @@ def doubled(module: ModuleType) -> list[float]:
 
 
 def opened(file: Path) -> ModuleType:
-    """The module of a file, imported anew."""
+    """Return the module of a file, imported again."""
     spec = importlib.util.spec_from_file_location("doubling", file)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -53,15 +53,15 @@ def opened(file: Path) -> ModuleType:
 
 @pytest.fixture
 def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A file with one loop, beside which its code is kept."""
+    """Return a file with one loop, whose compiled code will be stored next to it."""
     monkeypatch.setattr(numba.config, "CACHE_DIR", "")
     found = tmp_path / "doubling.py"
     found.write_text(LOOP)
     return found
 
 
-def test_code_is_kept_beside_its_file(file: Path) -> None:
-    """The first import compiles and keeps, the next one finds."""
+def test_compiled_code_is_stored_next_to_its_file(file: Path) -> None:
+    """The first import compiles and stores the code, the next one reads it."""
     assert doubled(opened(file)) == [0, 2, 4]
     kept = {one: one.stat().st_mtime_ns for one in file.parent.rglob("*.nb?")}
     assert {one.suffix for one in kept} == {".nbi", ".nbc"}
@@ -71,23 +71,23 @@ def test_code_is_kept_beside_its_file(file: Path) -> None:
 
 @pytest.mark.parametrize("suffix", ["nbi", "nbc"])
 @pytest.mark.parametrize("rest", [b"", b"\x80no pickle"])
-def test_spoilt_code_is_compiled_anew(file: Path, suffix: str, rest: bytes) -> None:
-    """Files that a full disk or a cut wire left empty or torn refuse nobody."""
+def test_damaged_code_is_compiled_again(file: Path, suffix: str, rest: bytes) -> None:
+    """A full disk or an interrupted transfer may leave such files empty or torn."""
     opened(file)
     (spoilt,) = file.parent.rglob(f"*.{suffix}")
     spoilt.write_bytes(rest)
     assert doubled(opened(file)) == [0, 2, 4]
 
 
-def test_where_nothing_can_be_kept_loops_run_all_the_same() -> None:
-    """Code of no file, as that of a folder that cannot be written, is compiled for this process alone."""
+def test_loops_run_without_a_cache() -> None:
+    """Code without a file, like that in a folder that is not writable, is compiled for this process only."""
     module = ModuleType("doubling")
     exec(compile(LOOP, "<nowhere>", "exec"), module.__dict__)
     assert doubled(module) == [0, 2, 4]
 
 
-def test_two_processes_compile_at_once(file: Path) -> None:
-    """Both come to their end over one cold folder, and leave it whole."""
+def test_two_processes_may_compile_at_once(file: Path) -> None:
+    """Two processes finish without errors in one empty cache folder, and leave it intact."""
     command, environment = [sys.executable, "-c", ASK, str(file.parent)], {**os.environ, "PYTHONPATH": str(ROOT)}
     both = [subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) for _ in range(2)]
     assert [one.communicate()[1] for one in both] == ["", ""]
@@ -95,14 +95,14 @@ def test_two_processes_compile_at_once(file: Path) -> None:
 
 
 def test_other_types_are_refused() -> None:
-    """One signature is compiled, and nothing else behind the caller's back."""
+    """Only the declared signature is compiled."""
     module = ModuleType("doubling")
     exec(compile(LOOP, "<nowhere>", "exec"), module.__dict__)
     with pytest.raises(TypeError, match="No matching definition"):
         module.double(np.arange(3, dtype=np.float32), np.empty(3))
 
 
-def test_an_error_of_the_loop_is_told() -> None:
-    """What cannot be compiled is not taken for a cache that cannot be written."""
+def test_a_compilation_error_is_reported() -> None:
+    """Code that cannot be compiled is not mistaken for a cache that cannot be written."""
     with pytest.raises(numba.TypingError):
         compiled(DOUBLES)(lambda one: one.nothing_like_it)

@@ -1,4 +1,4 @@
-"""Text as people may be shown it: what steers a terminal or turns words round stands as escapes."""
+"""Text made safe for display: characters that control a terminal or the direction of text become escapes."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ anything = st.text(st.characters())  # surrogates included
 
 
 @given(anything)
-def test_nothing_is_left_that_steers(text: str) -> None:
-    """No control character but lines and tabs, no mark of direction, no half of a pair; and once is enough."""
+def test_visible_text_has_no_control_characters(text: str) -> None:
+    """Line ends and tabs stay; direction marks and surrogates are escaped. A second pass changes nothing."""
     shown = visible(text)
     assert all(letter in "\n\t" or unicodedata.category(letter) not in ("Cc", "Cs") for letter in shown)
     assert not any(unicodedata.bidirectional(letter) in ("RLO", "LRO", "RLE", "LRE", "RLI", "LRI") for letter in shown)
@@ -24,8 +24,8 @@ def test_nothing_is_left_that_steers(text: str) -> None:
     shown.encode("utf-8")
 
 
-def test_every_character_is_judged_by_one_rule() -> None:
-    """The quick way over what most text is made of leaves just what the rule leaves."""
+def test_every_character_follows_one_rule() -> None:
+    """The fast path for common text accepts exactly the characters that the rule accepts."""
     codes = [
         *range(0x3100),
         *range(0x3100, sys.maxunicode + 1, 13),
@@ -49,12 +49,12 @@ def test_every_character_is_judged_by_one_rule() -> None:
         ("Acker Süd, 麦田, حقل, می‌خواهم, 🌾\n\tweed", "Acker Süd, 麦田, حقل, می‌خواهم, 🌾\n\tweed"),
     ],
 )
-def test_by_hand(text: str, shown: str) -> None:
-    """Escapes as Python writes them; letters of all scripts and their joiners stay."""
+def test_visible_text_has_the_escapes_of_python(text: str, shown: str) -> None:
+    """Letters of all scripts, their joiners and emoji stay."""
     assert visible(text) == shown
 
 
 @pytest.mark.parametrize("kind", [PipelineError, SceneError, RigError, ArchiveError, IncompleteStoreError])
-def test_errors_are_visible(kind: type[PipelineError]) -> None:
-    """Whatever file or device an error quotes, its words can be printed."""
+def test_error_messages_are_visible(kind: type[PipelineError]) -> None:
+    """Control characters that an error quotes from a file or device are escaped."""
     assert str(kind("greeted with '\x1b]0;x\x07'")) == "greeted with '\\x1b]0;x\\x07'"

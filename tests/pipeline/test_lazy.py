@@ -1,4 +1,4 @@
-"""A value that is made when it is first asked for."""
+"""A value that is computed at its first use."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import pytest
 from pipeline.lazy import Once
 
 
-def test_a_value_is_made_once_whoever_asks() -> None:
-    """Threads that ask at the same time get the same value, of one making."""
+def test_threads_share_one_computation() -> None:
+    """Eight threads that request a value at the same time get the same one, computed once."""
     make, together = Mock(side_effect=object), threading.Barrier(8)
     once = Once(make)
 
@@ -27,8 +27,8 @@ def test_a_value_is_made_once_whoever_asks() -> None:
     assert make.call_count == len(set(found)) == 1
 
 
-def test_what_fails_is_asked_for_again() -> None:
-    """An error reaches who asked, and the next one tries anew; nothing is a value too."""
+def test_a_failed_computation_is_retried() -> None:
+    """The error reaches the caller, and the next call computes again. None is a valid value."""
     once: Once[None] = Once(Mock(side_effect=[ValueError("not yet"), None]))
     with pytest.raises(ValueError, match="not yet"):
         once()

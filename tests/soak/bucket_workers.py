@@ -1,7 +1,7 @@
-"""A survey into a bucket, by two workers that share no folder with it: from sweeps to class map.
+"""Survey into a bucket with two workers that share no folder, from sweeps to class map.
 
-The bucket is moto's, in a process of its own; each worker has a working copy of its own, as on another machine. The
-field has 105 million px of 270 bands, quick 1.3 million.
+The bucket is moto's, in a separate process; each worker has a separate working copy, as on another machine. The
+field has 105 million px of 270 bands, or 1.3 million px with --quick.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ EVERY_S, BEGUN_WITHIN_S = 1.0, 60.0
 
 
 def rows(quick: bool) -> list[Row]:
-    """Memory of the survey and its workers, and bytes kept."""
+    """Return the rows of the memory of the survey and its workers, and of the bytes kept."""
     size, address, clock = QUICK_SIZE if quick else SIZE, f"s3://{BUCKET}/field", Clock()
     with tempfile.TemporaryDirectory(prefix="bucket-") as name, cluster(Path(name)) as (scheduler, workers):
         given = ("--size", size, "--out", address, "--scheduler", scheduler, "--no-accuracy")
@@ -44,7 +44,7 @@ def rows(quick: bool) -> list[Row]:
 
 @contextmanager
 def cluster(folder: Path) -> Iterator[tuple[str, list[int]]]:
-    """Start a bucket and workers, which end with the block; yield the scheduler's address and the workers' numbers."""
+    """Start a bucket and workers for the block; yield the scheduler's address and the workers' process ids."""
     ports = [free_port(), free_port()]
     os.environ.update(KEYS, AWS_ENDPOINT_URL=f"http://127.0.0.1:{ports[0]}", SPECTRALZOOM_WORK=str(folder / "survey"))
     scheduler = f"tcp://127.0.0.1:{ports[1]}"
@@ -67,7 +67,7 @@ def cluster(folder: Path) -> Iterator[tuple[str, list[int]]]:
 
 
 def free_port() -> int:
-    """Return a port that nobody listens at."""
+    """Return a free port."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         return int(free.getsockname()[1])
 
@@ -90,7 +90,7 @@ def create_bucket() -> None:
 
 
 def survey(workers: list[int], *words: str) -> list[int]:
-    """Survey; return the peak memory [bytes] of this survey and of each worker."""
+    """Run a survey; return the peak memory [bytes] of the survey and of each worker."""
     with subprocess.Popen([sys.executable, "-m", "flows.cli.main", *SURVEY, *words], cwd=ROOT) as process:
         of = [process.pid, *workers]
         peaks = [0] * len(of)

@@ -1,7 +1,7 @@
-"""A whole survey through an emulated rig in processes of their own, and the simulated one of the same scene beside it.
+"""Compare a survey through an emulated rig, in separate processes, with the simulated survey of the same scene.
 
-The rig is `spectralzoom rig emulate` behind a pty and sockets, checked by `rig check` first. The surveys share scene,
-seed, effects and budget: their raw lines and their maps are to be equal, bit for bit.
+The rig is `spectralzoom rig emulate` behind a pty and sockets; `rig check` checks it first. The surveys share scene,
+seed, effects and budget, so their raw lines and their maps must be equal, bit for bit.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ PRODUCTS = ("raw_coarse", "raw_fine", "mosaic", "class_map")
 
 
 def rows(quick: bool) -> list[Row]:
-    """Both surveys, and whether they are equal."""
+    """Return the rows of the rig check and of the comparison of both surveys."""
     clock, scene = Clock(), ["--scene", "farm", "--size", QUICK_SIZE if quick else SIZE, "--seed", "7"]
     scene += ["--bands", QUICK_BANDS] if quick else []
     with tempfile.TemporaryDirectory(prefix="survey-rig-") as name:
@@ -50,7 +50,7 @@ def rows(quick: bool) -> list[Row]:
 
 @contextmanager
 def emulated(file: Path, scene: Sequence[str]) -> Iterator[Path]:
-    """Have a rig, and the settings of a survey of it, while the block runs; then it ends as by Ctrl-C."""
+    """Start an emulated rig for the block and yield the settings of a survey of it; end it as by Ctrl-C."""
     words = [sys.executable, "-m", "flows.cli.main", "rig", "emulate", *scene, "--speed", "10", "--out", str(file)]
     with subprocess.Popen(words, cwd=ROOT, stdout=subprocess.DEVNULL) as process:
         try:
@@ -64,20 +64,20 @@ def emulated(file: Path, scene: Sequence[str]) -> Iterator[Path]:
 
 
 def run(*words: str) -> str:
-    """Run a command to its end, and return what it prints; progress goes on to stderr."""
+    """Run a command to its end and return its output; progress appears on stderr."""
     print(f"  {' '.join(words)}", file=sys.stderr, flush=True)
     command_line = [sys.executable, "-m", "flows.cli.main", *words]
     return subprocess.run(command_line, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True).stdout
 
 
 def survey(archive: Path, *words: str) -> dict[str, str]:
-    """Survey into an archive, and return the SHA-256 of the values of each product, read with xarray alone."""
+    """Survey into an archive; return the SHA-256 of the values of each product, read with xarray alone."""
     products, found = json.loads(run(SURVEY[0], *words, *SURVEY[1:], "--out", str(archive)))["products"], {}
     for one in PRODUCTS:
         folder, digest = archive / products[one], hashlib.sha256()
         for path in sorted(folder.glob("*.zarr")) or [folder]:
             with xr.open_zarr(path, consolidated=False) as opened:
-                for name in ["dn"] if "dn" in opened else sorted(opened.variables):  # lines have times of their own
+                for name in ["dn"] if "dn" in opened else sorted(opened.variables):  # times of lines differ
                     digest.update(np.ascontiguousarray(opened[name].values).tobytes())
         found[one] = digest.hexdigest()[:16]
     return found

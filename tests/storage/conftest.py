@@ -1,4 +1,4 @@
-"""An archive that is empty yet, and a small cube."""
+"""Fixtures: an empty archive and a small cube."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from storage.archive.archive import Archive
 
 @pytest.fixture
 def cube() -> NDArray[np.uint16]:
-    """A small cube, (7, 9, 5) uint16."""
+    """Return a small cube, (7, 9, 5) uint16."""
     return np.random.default_rng(3).integers(0, 4096, (7, 9, 5), dtype=np.uint16)
 
 
 @pytest.fixture
 def archive(tmp_path: Path) -> Archive:
-    """An archive in a folder, empty yet."""
+    """Return an empty archive in a folder."""
     return Archive.open(tmp_path)

@@ -1,4 +1,4 @@
-"""Mosaics and condensed sweeps whose components are the bands: values go in and come out as they are."""
+"""Helpers that write mosaics and condensed sweeps whose components are the bands: values are read as written."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from storage.arrays.georeference import AngularGrid
 from storage.arrays.mosaics import MosaicWriter
 from storage.arrays.signal_cubes import LineRows, SignalCubeWriter
 
-STEP = 2.0**-12  # of values: powers of two, so that what is a multiple of them comes back exactly
+STEP = 2.0**-12  # of values: a power of two, so that its multiples are stored exactly
 
 
 def band_components(bands: int) -> Components:
-    """A component a band, of mean 0 and noise 1."""
+    """Return one component per band, of mean 0 and noise 1."""
     return Components(np.zeros(bands), np.eye(bands), np.ones(bands))
 
 
@@ -39,7 +39,7 @@ def write_values(
     grid: AngularGrid | None = None,
     **more: Any,
 ) -> NDArray[np.float32]:
-    """Store (y, x, band) values, NaN where nothing was seen, and return them as they are stored."""
+    """Store (y, x, band) values, NaN where nothing was captured, and return them as they are stored."""
     writer = plain_writer(path, values.shape[:2], wavelength_nm, grid, **more)
     writer.write_rows(0, values, np.isfinite(values).all(axis=2))
     stored: NDArray[np.float32] = (np.rint(values / STEP) * STEP).astype(np.float32)

@@ -1,4 +1,4 @@
-"""An archive of small surveys without any science: stores that rest on each other, and runs that name them."""
+"""Helpers that write small surveys without sensor data: stores that depend on each other, and runs that name them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DAY_S = 86400
 
 @dataclass(frozen=True)
 class Small:
-    """Stores of one survey: raw lines, a mosaic made of them, a map made of both; the run that names it, if any."""
+    """Stores of one survey: raw lines, their mosaic, a map of both, and the run that names them, if any."""
 
     raw: StageRef
     mosaic: StageRef
@@ -28,7 +28,7 @@ class Small:
 
 
 def settings(seed: int = 0, **more: Any) -> dict[str, Any]:
-    """What a receipt says of the survey."""
+    """Return the survey's settings as a receipt holds them."""
     return {"scene": "farm", "source": "sim", "seed": seed, "budget": 0.5, **more}
 
 
@@ -55,7 +55,7 @@ def small_survey(
 
 
 def make_store(archive: Archive, stage: str, params: dict[str, Any], inputs: list[StageRef]) -> StageRef:
-    """Make (or find) one store of a file."""
+    """Make (or find) a store of one file."""
 
     def build(path: Path) -> None:
         (path / "data.bin").write_bytes(json.dumps([stage, params]).encode() * 40)
@@ -64,14 +64,14 @@ def make_store(archive: Archive, stage: str, params: dict[str, Any], inputs: lis
 
 
 def flip(path: Path, at: int = -3, bit: int = 2) -> None:
-    """Let one bit of a file rot."""
+    """Flip one bit of a file."""
     content = bytearray(path.read_bytes())
     content[at] ^= 1 << bit
     path.write_bytes(content)
 
 
 def rewrite(path: Path, **facts: Any) -> None:
-    """Change what a manifest says, under a seal that fits."""
+    """Change facts of a manifest and write a valid checksum."""
     content = {name: value for name, value in json.loads(path.read_text()).items() if name != "seal"} | facts
     path.write_text(manifest_text(content))
 
@@ -85,11 +85,11 @@ def grow_old(ref: StageRef, days: float) -> None:
 
 
 def problems(archive: Archive) -> list[str]:
-    """What verify finds."""
+    """Return the problems that `verify` finds."""
     return [f"{one.uri} {one.problem}" for one in verify_archive(archive) if one.problem is not None]
 
 
 def write_class_map(path: Path, found: ClassMap) -> None:
-    """Store a class map at once, as stages do tile by tile."""
+    """Store a whole class map at once; stages write it tile by tile."""
     create_class_map(path, found.classes.shape, ClassNames(found.names, found.colours), grid=found.grid)
     write_class_tile(path, (0, 0), found.classes, found.confidence)

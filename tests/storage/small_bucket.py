@@ -1,4 +1,4 @@
-"""An archive in a bucket as two machines see it, and stores of two files in it."""
+"""Helpers for an archive in a bucket that two machines share: stores of two files, and damaged objects."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.remote.object_archive import ObjectArchive
 
-Machine = Callable[..., ObjectArchive]  # of the fixture: opens the archive, by the name of a machine
-FIRST, SECOND = "first", "second"  # two machines, by the folder of their working copies
+Machine = Callable[..., ObjectArchive]  # type of the fixture: it opens the archive for a named machine
+FIRST, SECOND = "first", "second"  # the folders of the working copies of two machines
 
 
 def make(archive: Archive, content: bytes = b"light", **params: int) -> tuple[StageRef, bool]:
@@ -25,12 +25,12 @@ def make(archive: Archive, content: bytes = b"light", **params: int) -> tuple[St
 
 
 def rot(archive: ObjectArchive, name: str, at: int = -1) -> None:
-    """Let one bit of an object flip."""
+    """Flip one bit of an object."""
     content = bytearray(archive.objects.read(name) or b"")
     content[at] ^= 4
     archive.objects.write(name, bytes(content))
 
 
 def object_of(archive: ObjectArchive, ref: StageRef, file: str) -> str:
-    """The object that holds a file of a store."""
+    """Return the name of the object that holds a file of a store."""
     return next(name for name in archive.objects.listing(ref.uri) if name.endswith(f"/{file}"))

@@ -1,4 +1,4 @@
-"""A page in headless Chromium, driven by its debugging protocol: clicks, keys, touches, prints, pictures."""
+"""Drive a page in headless Chromium by its debugging protocol: clicks, keys, touches, prints, pictures."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PATIENCE_S = 15.0
 
 
 class Tab:
-    """One page at a time, at a size of one's choice. Whatever it asked the network for is in ``asked``."""
+    """Show one page at a time, in a window of a chosen size. ``asked`` lists the addresses of its network requests."""
 
     def __init__(self, line: ClientConnection) -> None:
         self._line, self._number = line, 0
@@ -37,7 +37,7 @@ class Tab:
             self.call(f"{domain}.enable")
 
     def call(self, method: str, **words: Any) -> dict[str, Any]:
-        """Ask the browser for something and wait for its answer."""
+        """Send a command to the browser and return its answer."""
         self._number += 1
         self._line.send(json.dumps({"id": self._number, "method": method, "params": words}))
         while True:
@@ -57,7 +57,7 @@ class Tab:
             self.troubles.append(facts["entry"]["text"])
 
     def run(self, script: str) -> Any:
-        """What a script of one expression gives."""
+        """Return the value of a script of one expression."""
         found = self.call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in found, found["exceptionDetails"]
         return found["result"].get("value")
@@ -91,14 +91,14 @@ class Tab:
         self.call("Input.dispatchKeyEvent", type="keyUp", key=name, code=name, windowsVirtualKeyCode=code)
 
     def pdf(self) -> bytes:
-        """The page as it prints on A4."""
+        """Return the page as a PDF, as it prints on A4."""
         found = self.call("Page.printToPDF", paperWidth=8.27, paperHeight=11.69, printBackground=True)
         return base64.b64decode(found["data"])
 
 
 @contextmanager
 def chromium(profile: Path) -> Iterator[Tab]:
-    """A browser without a past, and its one tab."""
+    """Start a browser with an empty profile and yield its one tab."""
     assert CHROMIUM is not None
     words = [CHROMIUM, *QUIETLY, f"--user-data-dir={profile}", "about:blank"]
     with subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:

@@ -1,4 +1,4 @@
-"""The files of somebody who has data of their own and makes every mistake with them, beside a good picture."""
+"""Write the files of users with their own data: one for each common mistake, and a correct picture."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ RNG = np.random.default_rng(7)
 
 
 def write_files(here: Path) -> None:
-    """Put one file of each mistake into a folder, and folders of pictures with their labels."""
+    """Write one file for each mistake into a folder, and folders of pictures with their labels."""
     picture = RNG.integers(0, 255, (24, 32, 3), dtype=np.uint8)
     cube = RNG.uniform(0, 1, CUBE).astype(np.float32)
     _pictures(here, picture)

@@ -1,4 +1,4 @@
-"""What is delivered works outside of the checkout: a wheel, the same from an sdist, for users without a home."""
+"""Packages work outside of the checkout: a wheel, the same wheel built from an sdist, and users without a home."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ print(json.dumps([spectralzoom.__version__, spectralzoom.__file__, str(run.repor
 
 
 def run(words: Sequence[str | Path], cwd: Path, environment: Mapping[str, str] | None = None) -> str:
-    """What a command prints; AssertionError with its words where it fails."""
+    """Return the output of a command; raise AssertionError with its messages if it fails."""
     given = [str(word) for word in words]
     ended = subprocess.run(given, cwd=cwd, env=environment, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr[-3000:]
@@ -47,7 +47,7 @@ def run(words: Sequence[str | Path], cwd: Path, environment: Mapping[str, str] |
 
 
 def may_be_nobody(python: Path) -> bool:
-    """Whether this user may become another, who can run this interpreter."""
+    """Return whether this process may switch to another user who can run this interpreter."""
     if os.geteuid() != 0 or shutil.which("setpriv") is None:
         return False
     words = [*AS_NOBODY, str(python), "-c", "import ctypes, decimal, lzma, ssl"]
@@ -56,7 +56,7 @@ def may_be_nobody(python: Path) -> bool:
 
 @pytest.fixture(scope="module")
 def ground() -> Iterator[Path]:
-    """A folder that every user of the machine may enter, as pytest's are not."""
+    """Yield a folder that every user of the machine may enter, unlike pytest's folders."""
     with tempfile.TemporaryDirectory(prefix="spectralzoom-delivery-") as folder:
         Path(folder).chmod(0o755)
         yield Path(folder)
@@ -64,7 +64,7 @@ def ground() -> Iterator[Path]:
 
 @pytest.fixture(scope="module")
 def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of what git has of the packages, away from the checkout; what lies beside it is not built from."""
+    """Return a copy of the packages' files in git, outside of the checkout, so that the build uses no other files."""
     copy = tmp_path_factory.mktemp("tree")
     listed = run(["git", "ls-files", "-co", "--exclude-standard", *PACKAGES, *BESIDE], ROOT).splitlines()
     for name in filter(lambda one: (ROOT / one).exists(), listed):
@@ -75,7 +75,7 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def wheel(tree: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel that pip makes of an sdist."""
+    """Return the wheel that is built from an sdist."""
     made = tmp_path_factory.mktemp("dist")
     sdist = run([sys.executable, "-c", BUILD, "build_sdist", made], tree).splitlines()[-1]
     with tarfile.open(made / sdist) as packed:
@@ -87,7 +87,7 @@ def wheel(tree: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def installed(wheel: Path, ground: Path) -> Path:
-    """A new environment that has the wheel, and of this one what it depends on: nothing of the checkout."""
+    """Return the programs of a new environment: the wheel with this environment's dependencies, not the checkout."""
     venv.create(ground / "env", symlinks=True)
     (packages,) = (ground / "env").glob("lib/python*/site-packages")
     (packages / "dependencies.pth").write_text(sysconfig.get_path("purelib"))  # whose own .pth files are not read
@@ -96,8 +96,8 @@ def installed(wheel: Path, ground: Path) -> Path:
     return ground / "env" / "bin"
 
 
-def test_the_wheel_holds_what_the_packages_hold(tree: Path, wheel: Path) -> None:
-    """Every file of the packages, weights and templates too, is in it byte by byte, and nothing else is."""
+def test_the_wheel_contains_exactly_the_files_of_the_packages(tree: Path, wheel: Path) -> None:
+    """The wheel contains every file of the packages, with weights and templates, byte by byte, and no other file."""
     with zipfile.ZipFile(wheel) as packed:
         found = {name: packed.read(name) for name in packed.namelist() if ".dist-info/" not in name}
     there = (path for name in PACKAGES for path in (tree / name).rglob("*") if path.is_file())
@@ -107,7 +107,7 @@ def test_the_wheel_holds_what_the_packages_hold(tree: Path, wheel: Path) -> None
 
 
 def test_the_wheel_needs_no_home(installed: Path, ground: Path, scene_files: Path, make_weights: WeightsMaker) -> None:
-    """Command and package run from it, where nothing but the archive can be written, and no variable is set."""
+    """Command and package run without HOME, and only the archive and the folder of temporary files are writable."""
     place, archive, temporary = (ground / name for name in ("place", "archive", "tmp"))
     for folder in (place, archive, temporary):
         folder.mkdir()
@@ -128,8 +128,8 @@ def test_the_wheel_needs_no_home(installed: Path, ground: Path, scene_files: Pat
     assert not list(temporary.glob("spectralzoom-*"))  # caches of libraries end with the process
 
 
-def test_the_container_takes_every_package() -> None:
-    """What the image is built from is what the wheel is, and what it runs is the first visit of `make survey`."""
+def test_the_container_copies_every_package() -> None:
+    """The image copies the files of the wheel, and its command is the first visit of `make survey`."""
     text = (ROOT / "Containerfile").read_text(encoding="utf-8")
     copied = [word for line in re.findall(r"^COPY (?!--from)(.*) \S+$", text, re.MULTILINE) for word in line.split()]
     assert set(copied) == {*PACKAGES, *BESIDE, "constraints.txt"}
@@ -141,8 +141,8 @@ def test_the_container_takes_every_package() -> None:
     build_app(listed=False).parse_args(words, exit_on_error=False, print_error=False)
 
 
-def test_the_shell_reads_what_completes_words(tmp_path: Path) -> None:
-    """Every verb and its flags are in a script that bash completes by."""
+def test_bash_completes_the_flags_of_a_verb(tmp_path: Path) -> None:
+    """The completion script contains every verb, and bash completes `survey --budg` to `--budget`."""
     script = tmp_path / "script"
     with pytest.raises(SystemExit) as ended:
         main(["completion", "--shell", "bash", "--output", str(script)])

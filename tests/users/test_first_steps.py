@@ -1,4 +1,4 @@
-"""Files and disks that people with data of their own met first: one message that says what to do, or it works."""
+"""Typical first problems of users with their own data: one message names the remedy, or the command works."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ CLASSES = np.kron(RNG.integers(0, 2, (4, 4)), np.ones((8, 8))).astype(np.uint8)
 
 
 def image() -> NDArray[np.int16]:
-    """Three bands of noise on classes, another one each time."""
+    """Return three bands of noise on the classes, different on each call."""
     return (CLASSES[..., None] * 60 + RNG.integers(1, 40, (32, 32, 3))).astype(np.int16)
 
 
 # --- values -----------------------------------------------------------------------------------------------------------
 
 
-def test_minus_9999_that_nothing_declares_is_no_data(tmp_path: Path) -> None:
-    """It is missing, and a note says so; a stated no-data value keeps it; scenes without it are as they were."""
+def test_undeclared_minus_9999_is_read_as_nodata(tmp_path: Path) -> None:
+    """Samples of -9999 become NaN and a note counts them; a stated nodata value keeps them as values."""
     values = image()
     values[:6] = -9999
     path = write(tmp_path / "a.tif", values)
@@ -60,7 +60,7 @@ def test_minus_9999_that_nothing_declares_is_no_data(tmp_path: Path) -> None:
 
 @pytest.fixture
 def tiles(tmp_path: Path) -> Path:
-    """Four labelled tiles; the second is no data everywhere, the third mostly negative."""
+    """Return four labelled tiles; the second is nodata everywhere, and the values of the third are mostly negative."""
     (folder := tmp_path / "tiles").mkdir()
     (folder / "scene.toml").write_text("wavelengths_nm = [460, 550, 640]\n")
     for number in range(1, 5):
@@ -70,8 +70,8 @@ def tiles(tmp_path: Path) -> Path:
     return folder
 
 
-def test_a_tile_without_any_value_is_left_out(tiles: Path, tmp_path: Path, command_line: Any) -> None:
-    """Training and evaluation go on without it, and a note names it; alone it is refused by its name."""
+def test_training_leaves_out_a_tile_without_values(tiles: Path, tmp_path: Path, command_line: Any) -> None:
+    """Training and evaluation name it in a note; if no other tile is left, training is refused with the tile's name."""
     out = tmp_path / "w.safetensors"
     ended = command_line("train", tiles, "-o", out, "--hold-out", "004", *SMALL)
     assert ended.code == 0, ended.err
@@ -87,8 +87,8 @@ def test_a_tile_without_any_value_is_left_out(tiles: Path, tmp_path: Path, comma
 
 
 @pytest.mark.parametrize("held_out", [False, True])
-def test_the_advised_evaluation_is_not_refused(tiles: Path, tmp_path: Path, command_line: Any, held_out: bool) -> None:
-    """Where all scenes were trained on it asks for others; where some were held out, its command runs."""
+def test_the_advised_evaluation_command_works(tiles: Path, tmp_path: Path, command_line: Any, held_out: bool) -> None:
+    """If all scenes were used in training, the advice asks for others; with held-out scenes, its command runs."""
     out = tmp_path / "w.safetensors"
     ended = command_line("train", tiles, "-o", out, *(["--hold-out", "004"] if held_out else []), *SMALL)
     said = " ".join(ended.err.split())
@@ -102,8 +102,8 @@ def test_the_advised_evaluation_is_not_refused(tiles: Path, tmp_path: Path, comm
 # --- init -------------------------------------------------------------------------------------------------------------
 
 
-def test_init_takes_a_land_cover_file_for_the_labels_of_all_dates(tmp_path: Path, command_line: Any) -> None:
-    """Five dates and LULC.npy are five images with one file of labels, and train as init says."""
+def test_init_uses_a_land_cover_file_as_labels_of_all_dates(tmp_path: Path, command_line: Any) -> None:
+    """Five dates and LULC.npy are five images with one label file, and the advised training runs."""
     np.save(tmp_path / "LULC.npy", CLASSES)
     for month in range(5, 10):
         np.save(tmp_path / f"2024-{month:02d}-01.npy", image().astype(np.float32))
@@ -117,8 +117,8 @@ def test_init_takes_a_land_cover_file_for_the_labels_of_all_dates(tmp_path: Path
     assert trained.code == 0, trained.err
 
 
-def test_init_sees_the_dates_of_a_series(tmp_path: Path, command_line: Any) -> None:
-    """An array of five dates beside LULC.npy is a series with labels; the next command takes one of its dates."""
+def test_init_finds_the_dates_of_a_series(tmp_path: Path, command_line: Any) -> None:
+    """An array of five dates beside LULC.npy is a series with labels; the advised command uses its first date."""
     np.save(tmp_path / "LULC.npy", CLASSES)
     np.save(tmp_path / "series.npy", np.stack([image() for _ in range(5)]).astype(np.float32))
     ended, series = command_line("init", tmp_path), tmp_path / "series.npy"
@@ -130,7 +130,7 @@ def test_init_sees_the_dates_of_a_series(tmp_path: Path, command_line: Any) -> N
 def test_init_names_the_wavelengths_that_its_next_command_needs(
     tmp_path: Path, command_line: Any, monkeypatch: pytest.MonkeyPatch, way: str
 ) -> None:
-    """Each of the two lines that it tells to fill in makes the command that it advises run."""
+    """The advised command runs after either of the two lines for wavelengths is filled in."""
     monkeypatch.chdir(tmp_path)
     np.save(tmp_path / "field.npy", image().astype(np.float32))
     np.save(tmp_path / "field_labels.npy", CLASSES)
@@ -147,8 +147,8 @@ def test_init_names_the_wavelengths_that_its_next_command_needs(
 
 
 @pytest.mark.parametrize("there", [False, True])
-def test_init_says_why_not(tmp_path: Path, command_line: Any, monkeypatch: pytest.MonkeyPatch, there: bool) -> None:
-    """On a disk that is read-only the message says so, with --force too, and a file that is there stays."""
+def test_init_on_readonly_disk(tmp_path: Path, command_line: Any, monkeypatch: pytest.MonkeyPatch, there: bool) -> None:
+    """The message says that the disk is read-only, also with --force, and an existing scene.toml stays."""
     Image.fromarray(image().astype(np.uint8)).save(tmp_path / "a.png")
     if there:
         (tmp_path / "scene.toml").write_text("nodata = 1\n")
@@ -164,8 +164,8 @@ def test_init_says_why_not(tmp_path: Path, command_line: Any, monkeypatch: pytes
 # --- words ------------------------------------------------------------------------------------------------------------
 
 
-def test_a_date_of_a_visit_has_one_form() -> None:
-    """Days between visits are counted by dates in one form, which the message shows; other words are taken."""
+def test_the_date_of_a_visit_has_one_format() -> None:
+    """Days between visits are counted from dates of one format, which the error names; other text is allowed."""
     for visit in ("01.06.2026", "6/1/2026", "2026-6-1", "01.06.2026 noon", "2026-13-10b", "0026-06-10"):
         with pytest.raises(SettingsError, match=r"visit must be text, or begin with a date as YYYY-MM-DD"):
             load_settings(None, {"scene": "farm", "visit": visit})
@@ -180,7 +180,7 @@ def test_a_date_of_a_visit_has_one_form() -> None:
 
 @contextmanager
 def small_files(most: int) -> Iterator[None]:
-    """No file may grow beyond so many bytes, whoever writes it: what GDAL is refused, it does not tell."""
+    """Limit the size of all files of this process; GDAL reports no error for the writes that the limit refuses."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (most, before[1]))
     try:
@@ -189,8 +189,8 @@ def small_files(most: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-def test_an_export_that_the_disk_refuses(surveyed_png: Any, tmp_path: Path, command_line: Any) -> None:
-    """One message that says what the disk said, nothing of GDAL's, and nothing left behind; with space it works."""
+def test_an_export_to_a_full_disk_ends_in_one_message(surveyed_png: Any, tmp_path: Path, command_line: Any) -> None:
+    """The message gives the disk's error without GDAL's, and no file is left; with space the export works."""
     archive, out = tmp_path / "archive", tmp_path / "maps"
     surveyed_png(archive)
     with small_files(600):

@@ -1,4 +1,4 @@
-"""A scene that lies on the earth, surveyed: where every product of it lies, by readers that are not this project's."""
+"""Surveys of a georeferenced scene: the positions of all products, as independent readers find them."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ PIXELS = patchy_scene(SHAPE, 3, seed=4)[0].astype(np.uint8)  # (y, x, band) of a
 
 
 def write_geotiff(path: Path, transform: Affine, *, gap: bool = False, crs: str = "EPSG:32632") -> Path:
-    """A GeoTIFF of the field, with its wavelengths in tags; with a gap, one that is transparent there."""
+    """Write a GeoTIFF of the field with wavelengths in its tags and, if `gap` is set, a transparent corner."""
     values = np.moveaxis(PIXELS, -1, 0)
     count = len(values) + gap
     profile = {"driver": "GTiff", "height": SHAPE[0], "width": SHAPE[1], "count": count, "dtype": "uint8"}
@@ -85,7 +85,7 @@ def survey(scene: Path, weights: Path, out: Path, **flags: Any) -> Published:
 
 
 def opened(run: Published, product: str) -> xr.Dataset:
-    """A store of the run by plain xarray, which has nothing to warn of."""
+    """Open a store of the run by plain xarray; a warning is an error."""
     archive = run.folder.parent.parent
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -93,15 +93,15 @@ def opened(run: Published, product: str) -> xr.Dataset:
 
 
 def corners_px(found: Any, wanted: Affine, shape: tuple[int, int]) -> float:
-    """How far the corners of an image lie from where they should, in its pixels."""
+    """Return the largest distance of an image's corners from their expected positions, in its pixels."""
     rows, columns = shape
     corners = np.array([(0, 0), (columns, 0), (0, rows), (columns, rows)]).T
     return float(np.hypot(*(~wanted * (found * corners) - corners)).max())
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_products_lie_where_the_scene_does(tmp_path: Path, weights: Path, kind: str) -> None:
-    """Stores by odc-geo and rioxarray, exports by GDAL: all corners within 0.1 px of the source's; it verifies."""
+def test_products_have_the_position_of_their_scene(tmp_path: Path, weights: Path, kind: str) -> None:
+    """All corners lie within 0.1 px of the source's, in stores (odc-geo, rioxarray) and exports (GDAL)."""
     scene, transform = KINDS[kind](tmp_path)
     run = survey(scene, weights, tmp_path / "archive")
     for product, name in (("class_map", "classes"), ("mosaic", "scores")):
@@ -122,8 +122,8 @@ def test_products_lie_where_the_scene_does(tmp_path: Path, weights: Path, kind: 
     assert not [one for one in verify_archive(open_archive(tmp_path / "archive")) if one.problem]
 
 
-def test_transparent_pixels_are_no_data_to_the_end(tmp_path: Path, weights: Path) -> None:
-    """They are 255 in the map, NaN in the mosaic, outside of areas and scores, and no place to look at."""
+def test_transparent_pixels_are_nodata_in_every_product(tmp_path: Path, weights: Path) -> None:
+    """They are 255 in the map, NaN in the mosaic, not counted in areas, and patches without other pixels score 0."""
     run = survey(write_geotiff(tmp_path / "a.tif", NORTH_UP, gap=True), weights, tmp_path / "archive", budget=1)
     mosaic = open_mosaic(tmp_path / "archive" / run.receipt["products"]["mosaic"])
     with opened(run, "class_map") as drawn:
@@ -147,9 +147,9 @@ def test_transparent_pixels_are_no_data_to_the_end(tmp_path: Path, weights: Path
         assert (attention["score"].values[:2, :3] == 0).all()  # patches of 8 px without a pixel of the scene
 
 
-def test_pixels_now_transparent_did_not_change(tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """To a second visit they are as old as nothing, whatever was put in their place to look at; others did change."""
-    for name in ("CERTAIN", "SURE"):  # untrained weights are sure of nothing: what they say is taken for sure
+def test_transparent_pixels_did_not_change(tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """If pixels become transparent before the second visit, they have no age and no change; other pixels do change."""
+    for name in ("CERTAIN", "SURE"):  # untrained weights are sure of nothing: every class counts as sure
         monkeypatch.setattr(prior_map, name, 1e-6)
     for name in ("first", "later"):
         (tmp_path / name).mkdir()
@@ -166,8 +166,8 @@ def test_pixels_now_transparent_did_not_change(tmp_path: Path, weights: Path, mo
     assert np.isnan(age).sum() == age[GAP].size
 
 
-def test_a_place_is_in_the_keys_of_what_carries_it(tmp_path: Path, weights: Path) -> None:
-    """Mosaic and map of a scene with a place have it in their keys; those of one without are as they would be."""
+def test_keys_of_mosaic_and_map_contain_the_georeference(tmp_path: Path, weights: Path) -> None:
+    """Mosaic and map of a scene without a georeference have neither the parameter nor a CRS."""
     bare = tmp_path / "bare.npy"
     np.save(bare, PIXELS)
     run = survey(bare, weights, tmp_path / "archive", wavelengths="640,550,460")
@@ -183,8 +183,8 @@ def test_a_place_is_in_the_keys_of_what_carries_it(tmp_path: Path, weights: Path
 
 
 @pytest.mark.parametrize("transform", [NORTH_UP, TURNED])
-def test_lines_keep_their_place_where_the_scene_is_gone(tmp_path: Path, weights: Path, transform: Affine) -> None:
-    """Surveyed as a recording of its own lines, a field has its CRS and hectares; another part of it has none."""
+def test_lines_keep_the_georeference_of_their_scene(tmp_path: Path, weights: Path, transform: Affine) -> None:
+    """The CRS and the hectares are kept after the scene file is deleted; another part of the field has no hectares."""
     scene = write_geotiff(tmp_path / "a.tif", transform)
     before = survey(scene, weights, tmp_path / "archive", budget=None, scan_step=1, keep="raw")
     scene.unlink()
@@ -199,8 +199,8 @@ def test_lines_keep_their_place_where_the_scene_is_gone(tmp_path: Path, weights:
     assert "ha" not in again(size="32x32").receipt["areas"]
 
 
-def test_a_pose_is_the_one_place_of_a_run(tmp_path: Path, weights: Path) -> None:
-    """With a pose the scene's own place is set aside, and a note says so."""
+def test_a_pose_replaces_the_georeference_of_the_scene(tmp_path: Path, weights: Path) -> None:
+    """A note says so, and only the ground map has a CRS."""
     scene = write_geotiff(tmp_path / "a.tif", NORTH_UP)
     pose = {"lon_deg": 7.6, "lat_deg": 51.96, "height_m": 30, "heading_deg": 20, "tilt_deg": 35}
     run = survey(scene, weights, tmp_path / "archive", **{f"pose.{name}": value for name, value in pose.items()})
@@ -209,8 +209,8 @@ def test_a_pose_is_the_one_place_of_a_run(tmp_path: Path, weights: Path) -> None
     assert "spatial_ref" in opened(run, "ground_map")
 
 
-def test_every_store_opens_without_a_word(tmp_path: Path, weights: Path) -> None:
-    """Axes have coordinates with units, a band is found by its wavelength, and classes are whole numbers."""
+def test_every_store_opens_in_xarray_without_a_warning(tmp_path: Path, weights: Path) -> None:
+    """Axes have coordinates with units, and a band is found by its wavelength."""
     run = survey(write_geotiff(tmp_path / "a.tif", NORTH_UP), weights, tmp_path / "archive", keep="raw", budget=1)
     for product in EVERY_STORE:
         address = run.receipt["products"][product]
@@ -229,8 +229,8 @@ def test_every_store_opens_without_a_word(tmp_path: Path, weights: Path) -> None
     assert swapped["wavelength"].values.tolist() == [460, 640]
 
 
-def test_a_real_scene_goes_from_file_to_export(tmp_path: Path, real_data: Path, make_weights: Any) -> None:
-    """The georeferenced rgbn.tif: map, areas and exports lie where its tiles do."""
+def test_a_georeferenced_file_is_surveyed_and_exported(tmp_path: Path, real_data: Path, make_weights: Any) -> None:
+    """Class map, areas and exports of rgbn.tif have the position and size of the source."""
     scene = real_data / "rgbn" / "rgbn_suba.tif"
     if not scene.is_file():
         pytest.skip(f"there is no {scene}")

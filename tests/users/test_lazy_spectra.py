@@ -1,4 +1,4 @@
-"""Lines and cubes as xarray: what is asked for is restored, chunk by chunk, and nothing is read before."""
+"""Lines and cubes as lazy xarray arrays: only the requested values are read and restored, chunk by chunk."""
 
 from __future__ import annotations
 
@@ -31,21 +31,21 @@ RARE = np.array([[3, 5], [66, 80]])
 
 
 def law() -> Components:
-    """Four components of twelve bands."""
+    """Return four components of twelve bands."""
     rng = np.random.default_rng(5)
     axes = np.linalg.qr(rng.normal(size=(BANDS, COUNT)))[0].T
     return Components(rng.uniform(1, 2, BANDS), axes, rng.uniform(0.01, 0.02, BANDS))
 
 
 def restored(scores: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Spectra by the words of the page: scores * step @ axes + mean."""
+    """Return spectra by the formula of the documentation: scores * step @ axes + mean."""
     components = law()
     return np.rint(scores / STEP) * STEP @ (components.axes * components.noise) + components.mean
 
 
 @pytest.fixture(scope="module")
 def sweep(tmp_path_factory: pytest.TempPathFactory) -> Restored:
-    """A condensed sweep with two rare spectra and one that is unusable, and what it is to give."""
+    """Write a compressed sweep with two rare spectra and an unusable one; return its path and the expected values."""
     path, rng = tmp_path_factory.mktemp("sweep") / "coarse-0.zarr", np.random.default_rng(1)
     frames = References(np.zeros((SAMPLES, BANDS)), np.ones((SAMPLES, BANDS)), np.ones(BANDS))
     header = SweepHeader(Sweep("coarse-0", "coarse", "x", 0.0, 0.0, LINES), frames, WAVELENGTHS, None, "test")
@@ -66,7 +66,7 @@ def sweep(tmp_path_factory: pytest.TempPathFactory) -> Restored:
 
 @pytest.fixture(scope="module")
 def mosaic(tmp_path_factory: pytest.TempPathFactory) -> Restored:
-    """A mosaic of two shards across, a corner of which nothing saw, and what it is to give."""
+    """Write a mosaic of two shards in x, with an uncovered corner; return its path and the expected values."""
     path = tmp_path_factory.mktemp("mosaic") / "mosaic.zarr"
     scores = np.random.default_rng(2).normal(0, 20, (70, 700, COUNT)).astype(np.float32)
     seen = np.ones((70, 700), np.bool_)
@@ -76,7 +76,7 @@ def mosaic(tmp_path_factory: pytest.TempPathFactory) -> Restored:
 
 
 def test_lines_are_restored_with_rare_spectra(sweep: Restored) -> None:
-    """Every line and band, NaN where unusable, with what is known of each line beside it."""
+    """Every line and band is restored, NaN where unusable; coordinates give time, mirror and exposure of each line."""
     path, values = sweep
     lines = open_lazy_lines(path)
     assert (lines.dims, lines.dtype) == (("line", "sample", "band"), np.float32)
@@ -87,8 +87,8 @@ def test_lines_are_restored_with_rare_spectra(sweep: Restored) -> None:
     np.testing.assert_allclose(red.values, values[..., np.abs(WAVELENGTHS - 660).argmin()], rtol=1e-5)
 
 
-def test_a_cube_is_restored(mosaic: Restored) -> None:
-    """In blocks of whole shards, NaN where nothing was seen, a coordinate on every axis."""
+def test_a_mosaic_is_restored_in_blocks_of_whole_shards(mosaic: Restored) -> None:
+    """Pixels without coverage are NaN, and every axis has a coordinate."""
     path, values = mosaic
     cube = open_lazy_mosaic(path)
     assert (cube.dims, cube.chunks) == (("y", "x", "band"), ((64, 6), (640, 60), (BANDS,)))
@@ -106,10 +106,10 @@ PLACES = st.one_of(
 
 
 @given(st.sampled_from(["sweep", "mosaic"]), PLACES, PLACES, st.integers(0, BANDS - 1) | st.just(slice(None, None, -1)))
-def test_any_selection_is_that_of_all_values(
+def test_any_selection_equals_the_same_selection_of_all_values(
     sweep: Restored, mosaic: Restored, which: str, row: Any, column: Any, band: Any
 ) -> None:
-    """Numbers, slices of any step and lists of places, before dask and through it."""
+    """Rows and columns take integers, slices of any step and lists; bands an integer or the reversed axis."""
     path, values = sweep if which == "sweep" else mosaic
     opened = (open_lazy_lines if which == "sweep" else open_lazy_mosaic)(path)
     wanted = dict(zip(opened.dims, (row, column, band), strict=True))
@@ -117,8 +117,8 @@ def test_any_selection_is_that_of_all_values(
     np.testing.assert_allclose(opened.isel(wanted).values, expected.values, rtol=1e-5)
 
 
-def test_nothing_is_read_before_it_is_asked(sweep: Restored, mosaic: Restored, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Opening reads coordinates alone, in less than .2 s."""
+def test_opening_reads_only_coordinates(sweep: Restored, mosaic: Restored, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Opening takes less than 0.2 s, and one requested value reads the scores once."""
     heard = Mock(wraps=layout.read_array)
     for module in ("storage.arrays.mosaics", "storage.arrays.signal_cubes"):
         monkeypatch.setattr(f"{module}.read_array", heard)
@@ -130,8 +130,8 @@ def test_nothing_is_read_before_it_is_asked(sweep: Restored, mosaic: Restored, m
     assert [call.args[1] for call in heard.call_args_list].count("scores") == 2
 
 
-def test_a_selection_takes_the_memory_of_a_selection(tmp_path: Path) -> None:
-    """One band of a cube of 48 MB, and one spectrum, restore no other."""
+def test_a_selection_needs_only_its_own_memory(tmp_path: Path) -> None:
+    """One band of a cube of 48 MB, one spectrum or a small window is restored without the rest."""
     side, bands = 640, 30
     components = Components(np.ones(bands), np.eye(bands)[:2], np.ones(bands))
     writer = MosaicWriter(tmp_path / "mosaic.zarr", (side, side), components, np.linspace(400, 900, bands), largest=9)

@@ -1,4 +1,4 @@
-"""Mistakes of people with data of their own: each ends in one message that says what to do, or simply works."""
+"""Mistakes of users with their own data: each ends in one message that names the remedy, or the file is read."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ BANDS = f" --wavelengths {NM}"
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory, weights: Path) -> Path:
-    """A folder with every mistaken file."""
+    """Return a folder with every mistaken file."""
     here = tmp_path_factory.mktemp("mistakes")
     write_files(here)
     shutil.copy(weights, here / "w.safetensors")
@@ -138,7 +138,7 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_mistakes_are_one_message(case: str, files: Path, command_line: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One line that says what to do, the right exit code, no traceback, and nothing written."""
+    """The line names the remedy, the exit code is right, there is no traceback, and no file is written."""
     code, words, message = CASES[case]
     monkeypatch.chdir(files)
     before = sorted(files.rglob("*"))
@@ -146,7 +146,7 @@ def test_mistakes_are_one_message(case: str, files: Path, command_line: Any, mon
     assert sorted(files.rglob("*")) == before
 
 
-WORKS = {  # what is read, with which wavelengths, as what (y, x, band), and what is said of it
+WORKS = {  # address, wavelengths, shape (y, x, band), and the expected note
     "upper-case ending": ("FIELD_2.PNG", None, (24, 32, 3), ""),
     "spaces": ("a field.png", None, (24, 32, 3), ""),
     "umlauts": ("Rüben.png", None, (24, 32, 3), ""),
@@ -171,8 +171,8 @@ WORKS = {  # what is read, with which wavelengths, as what (y, x, band), and wha
 
 
 @pytest.mark.parametrize("case", WORKS)
-def test_what_is_no_mistake_works(case: str, files: Path) -> None:
-    """It is read as it is, and what was assumed is said."""
+def test_unusual_but_valid_files_are_read(case: str, files: Path) -> None:
+    """The values have the expected shape, and a note states each assumption."""
     address, listed, shape, words = WORKS[case]
     nm = None if listed is None else [float(one) for one in listed.split(",")]
     scene = load_scene_file(f"{files}/{address}", wavelengths=nm)
@@ -180,19 +180,19 @@ def test_what_is_no_mistake_works(case: str, files: Path) -> None:
     assert re.search(words, "; ".join(scene.provenance))
 
 
-def test_a_step_is_that_step(files: Path) -> None:
-    """Steps are counted from 0, and of the first axis; a store has them wherever its axis of time is."""
+def test_a_time_step_is_read_by_its_number(files: Path) -> None:
+    """Steps count from 0, in .npy, .npz and Zarr."""
     nm, cube = [float(one) for one in NM.split(",")], np.load(files / "cube.npy")
     for address, more in {"series.npy:2": 2, "series.npz:1": 1, "series.zarr:1": 1}.items():
         np.testing.assert_array_equal(load_scene_file(f"{files}/{address}", wavelengths=nm).values, cube + more)
 
 
-def test_a_mark_at_the_beginning_of_settings_is_read(files: Path) -> None:
-    """Editors of Windows write a byte order mark."""
+def test_a_byte_order_mark_in_a_settings_file_is_ignored(files: Path) -> None:
+    """Windows editors write a byte order mark (BOM) at the beginning of a file."""
     assert load_settings(files / "bom.toml").budget == 0.8
 
 
-FOLDERS = {  # names of scenes and of their labels
+FOLDERS = {  # names of scenes and of their label files
     "apart": {"001": "labels/001.png", "002": "labels/002.png"},
     "beside": {"A 1": "A 1_mask.png", "b": "B_labels.PNG"},
     "lacking": {"001": "masks/001.png", "002": None},
@@ -205,7 +205,7 @@ FOLDERS = {  # names of scenes and of their labels
 
 @pytest.mark.parametrize("folder", FOLDERS)
 def test_images_find_their_labels_by_name(folder: str, files: Path) -> None:
-    """Equal names, words such as _mask, capitals; what is hidden or has no image is nobody's scene."""
+    """Suffixes such as _mask and case do not matter; hidden files and labels without an image are ignored."""
     data = load_data_set(files / folder)
     found, root = {name: data.label_files.get(name) for name in data.names}, files / folder
     assert {name: path and path.relative_to(root).as_posix() for name, path in found.items()} == FOLDERS[folder]

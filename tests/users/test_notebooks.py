@@ -1,4 +1,4 @@
-"""The notebooks: every cell runs from top to bottom, and what GitHub shows of them is what they are."""
+"""The notebooks: every cell runs from top to bottom, and is stored with its outputs."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ MOST_BYTES = 200_000
 
 @pytest.fixture
 def drawing() -> Iterator[None]:
-    """No figure is left open."""
+    """Draw without a display and close all figures at the end."""
     plt.switch_backend("Agg")
     yield
     plt.close("all")
 
 
 def cells(name: str, kind: str) -> list[dict[str, Any]]:
-    """Cells of a notebook, of one kind."""
+    """Return the cells of a notebook of one kind."""
     content = json.loads((FOLDER / f"{name}.ipynb").read_text(encoding="utf-8"))
     return [cell for cell in content["cells"] if cell["cell_type"] == kind]
 
@@ -38,7 +38,7 @@ def cells(name: str, kind: str) -> list[dict[str, Any]]:
 def test_every_cell_runs(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As a page's blocks do, in this process: a kernel and all that it loads would cost more than the surveys."""
+    """The cells run in this process, like a page's blocks: a kernel and its imports take longer than the surveys."""
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {"__name__": name}
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
@@ -53,8 +53,8 @@ def test_every_cell_runs(
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_it_is_shown_with_what_it_gave(name: str) -> None:
-    """Rendered by `make notebooks`: small, in order, without an error, with pictures, and links that lead somewhere."""
+def test_a_notebook_is_stored_with_its_outputs(name: str) -> None:
+    """`make notebooks` rendered it: small, cells in order, no errors, two pictures, and links to existing files."""
     assert (FOLDER / f"{name}.ipynb").stat().st_size < MOST_BYTES
     code = cells(name, "code")
     assert [cell["execution_count"] for cell in code] == list(range(1, len(code) + 1))

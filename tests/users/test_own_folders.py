@@ -1,4 +1,4 @@
-"""A folder of pictures and labels becomes a scene.toml, weights and a survey, without anybody reading the source."""
+"""A folder of pictures and labels becomes a scene.toml, weights and a survey with the commands' messages alone."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ SMALL = ["--steps", "1", "--dim", "16", "--layers", "1", "--heads", "2", "--batc
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folders of somebody with data of their own; tests copy what they change."""
+    """Return the folders of a user with their own data; tests copy or restore what they change."""
     here = tmp_path_factory.mktemp("folders")
     write_files(here)
     return here
 
 
 @pytest.mark.parametrize("folder", ["apart", "beside", "lacking", "tiles", "hidden", "one_of_each"])
-def test_what_init_writes_reads_as_the_folder_did(folder: str, made: Path, command_line: Any) -> None:
-    """With its scene.toml every image has the labels that it had by its name, in the same classes."""
+def test_the_scene_toml_of_init_reads_like_the_folder(folder: str, made: Path, command_line: Any) -> None:
+    """With the written scene.toml every image keeps the labels found by name, in the same classes."""
     path = made / folder
     before = load_data_set(path)
     seen = {name: before.load(name).labels for name in before.label_files}
@@ -54,8 +54,8 @@ def test_what_init_writes_reads_as_the_folder_did(folder: str, made: Path, comma
     assert json.loads(ended.out)["next"].startswith("spectralzoom train ")
 
 
-def test_init_keeps_what_is_there(made: Path, command_line: Any) -> None:
-    """A scene.toml goes aside with --force, and stays where none is written."""
+def test_init_keeps_an_existing_scene_toml(made: Path, command_line: Any) -> None:
+    """With --force init renames it to scene.toml.old; if init fails, the file stays unchanged."""
     (made / "bad_key" / "labels").mkdir()
     for name in ("001", "002"):
         Image.fromarray(np.eye(32, dtype=np.uint8)[:24]).save(made / "bad_key" / "labels" / f"{name}.png")
@@ -68,8 +68,8 @@ def test_init_keeps_what_is_there(made: Path, command_line: Any) -> None:
     assert (made / "soft" / "scene.toml").read_text() == "nodata = 0\n"
 
 
-def test_init_tells_what_it_could_not_see(made: Path, command_line: Any) -> None:
-    """Images without labels, labels without images, other sizes and bands, one class, and unknown wavelengths."""
+def test_init_lists_unusable_files_and_missing_facts(made: Path, command_line: Any) -> None:
+    """It lists images without labels, labels without images, other sizes or bands, a single class, no wavelengths."""
     for folder, words in {
         "lacking": ["labels of 1 image, left out", "the image of 1 label file: 009.png"],
         "sizes": ["002.png are 9 x 32 px, the scene is 24 x 32 px"],
@@ -84,8 +84,8 @@ def test_init_tells_what_it_could_not_see(made: Path, command_line: Any) -> None
     (made / "scene.toml").unlink()
 
 
-def test_init_asks_to_repair_labels_of_another_size(tmp_path: Path, command_line: Any) -> None:
-    """Without a label that fits, the next step is the same command again."""
+def test_init_asks_for_repair_of_labels_of_another_size(tmp_path: Path, command_line: Any) -> None:
+    """If no label file fits, the next step is the same command with --force."""
     for name, size in (("001", 32), ("001_mask", 24)):
         Image.fromarray(np.eye(size, dtype=np.uint8)).save(tmp_path / f"{name}.png")
     told = json.loads(command_line("init", tmp_path, "--json").out)
@@ -93,8 +93,8 @@ def test_init_asks_to_repair_labels_of_another_size(tmp_path: Path, command_line
     assert told["first"] == f"repair these label files, or write what is missing into {tmp_path / 'scene.toml'}"
 
 
-def test_training_leaves_out_and_says_so(made: Path, tmp_path: Path, command_line: Any) -> None:
-    """Scenes without labels are no part of it; tiles that lack a class are, in the classes of all tiles."""
+def test_training_notes_the_scenes_that_it_leaves_out(made: Path, tmp_path: Path, command_line: Any) -> None:
+    """Scenes without labels are left out; tiles that lack a class are kept, with the classes of all tiles."""
     out = tmp_path / "mine.safetensors"
     ended = command_line("train", made / "lacking", "-o", out, *SMALL)
     assert ended.code == 0
@@ -105,8 +105,8 @@ def test_training_leaves_out_and_says_so(made: Path, tmp_path: Path, command_lin
     assert {scene.class_names for scene in map(data.scene, data.train)} == {("class_0", "class_1", "class_2")}
 
 
-def test_training_and_judging_say_that_labels_lay_elsewhere(tmp_path: Path, command_line: Any) -> None:
-    """Labels of some frames begin 7 m beside their images: one note names these, in training and in an evaluation."""
+def test_training_and_evaluation_note_shifted_labels(tmp_path: Path, command_line: Any) -> None:
+    """Labels of two frames begin 7 m east of their images; one note in training and one in evaluation name them."""
     (folder := tmp_path / "field").mkdir()
     (folder / "scene.toml").write_text("wavelengths_nm = [800]\n")
     classes = np.kron(np.random.default_rng(1).integers(0, 2, (4, 4)), np.ones((8, 8))).astype(np.uint8)
@@ -122,8 +122,8 @@ def test_training_and_judging_say_that_labels_lay_elsewhere(tmp_path: Path, comm
     assert re.findall(r"note: labels of (.*) have another place", judged.err) == ["003"]
 
 
-def test_labels_that_nobody_stated_are_left_out_where_the_weights_know_others(made: Path) -> None:
-    """Found by their name and of other classes they refuse no survey: a note says so; of the same, they judge."""
+def test_a_survey_leaves_out_found_labels_of_other_classes(made: Path) -> None:
+    """Labels found by name with other classes than the weights' are left out with a note; equal ones are used."""
     scene = str(made / "apart" / "images" / "001.png")
     settings = load_settings(None, {"scene": scene, "weights": "mine.safetensors"})
     (made / "apart" / "scene.toml").unlink(missing_ok=True)
@@ -134,8 +134,8 @@ def test_labels_that_nobody_stated_are_left_out_where_the_weights_know_others(ma
 
 
 @pytest.mark.parametrize("folder", ["sizes", "soft", "several"])
-def test_labels_that_nobody_stated_refuse_no_survey(folder: str, made: Path) -> None:
-    """Of another size, of mixed colours, or several: what lies beside a scene is left out of its survey with a note."""
+def test_unusable_found_labels_do_not_refuse_a_survey(folder: str, made: Path) -> None:
+    """Labels of another size, of mixed colours or in several files are left out of the survey with a note."""
     (made / folder / "scene.toml").unlink(missing_ok=True)
     scene = next(path for path in sorted((made / folder).rglob("00*.png")) if "002" in path.name or folder != "sizes")
     scene = scene.parent.parent / "images" / scene.name if scene.parent.name == "labels" else scene
@@ -146,8 +146,8 @@ def test_labels_that_nobody_stated_refuse_no_survey(folder: str, made: Path) -> 
         load_scene_file(scene)
 
 
-def test_frames_of_one_class_are_told_when_weights_are_judged(made: Path, weights: Path) -> None:
-    """An evaluation asks whether the value of that class stands for none."""
+def test_an_evaluation_notes_frames_of_a_single_class(made: Path, weights: Path) -> None:
+    """The note asks whether the value of that class means unlabelled."""
     candidates, choices = open_candidates((weights,)), {"labels": None, "bands": None, "wavelengths": None}
     data = open_frames(str(made / "soil"), (), None, LineCamera(), choices)
     jobs = sort_frames(EvaluateRequest(str(made / "soil"), (weights,)), data, candidates, lambda *words: None)

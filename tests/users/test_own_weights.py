@@ -1,4 +1,4 @@
-"""Weights trained on tiles of one's own, and what a survey by them says: of scenes they learned from, of bands."""
+"""Surveys by weights that were trained on the user's tiles: notes on training scenes and on bands."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PLAIN = ["--engine", "plain", "--no-controls"]
 
 
 def write_tile(folder: Path, number: int) -> None:
-    """Write a tile of three classes in 13 bands, and its labels, side by side with those before it."""
+    """Write a tile of three classes in 13 bands with its labels; tiles lie side by side by number."""
     rng = np.random.default_rng(number)
     labels = (np.add.outer(np.arange(SIDE) + 3 * number, np.arange(SIDE)) // 8 % 3).astype(np.uint8)
     spectra = np.stack([np.linspace(300, 3000, 13), np.linspace(2500, 500, 13), 1500 + 500 * np.sin(np.arange(13))])
@@ -60,17 +60,17 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def survey(command_line: Any, made: Path, scene: object, out: Path, *words: str) -> tuple[str, dict[str, Any]]:
-    """Survey a scene; what the terminal says in one line, and the receipt."""
+    """Survey a scene; return the terminal's output as one line, and the receipt."""
     ended = command_line("survey", "--scene", scene, "--weights", made / "w.safetensors", "--out", out, *PLAIN, *words)
     assert ended.code == 0, ended.err
     folder = open_archive(out).latest.folder
     return " ".join((ended.out + ended.err).split()), json.loads((folder / "receipt.json").read_text())
 
 
-def test_a_score_on_a_scene_of_the_training_says_so_in_words(made: Path, tmp_path: Path, command_line: Any) -> None:
-    """Terminal, report and receipt say it, and ls marks the score; of a scene that was kept from training they do not.
+def test_a_score_on_a_training_scene_is_marked(made: Path, tmp_path: Path, command_line: Any) -> None:
+    """Terminal, report, receipt and `ls` mark the score of a training scene, and not that of a validation scene.
 
-    The file is known by what it holds: under another name, and in other bands.
+    The scene is recognized by its content: it has another file name and fewer bands here.
     """
     scene = tmp_path / "other name.tif"
     shutil.copy(made / "field" / "images" / "t1.tif", scene)
@@ -87,24 +87,24 @@ def test_a_score_on_a_scene_of_the_training_says_so_in_words(made: Path, tmp_pat
     assert "*" not in command_line("ls", tmp_path / "b").out
 
 
-def test_what_training_writes_of_13_bands_opens(made: Path) -> None:
-    """No band reaches a column between 1610 and 2190 nm, so that its variance is 0; it is familiar all the same."""
+def test_the_detector_of_13_band_weights_loads(made: Path) -> None:
+    """No band reaches a column between 1610 and 2190 nm, so its variance is near 0; all distances are finite."""
     familiar = load_ood(made / "w.safetensors")
     assert np.linalg.eigvalsh(familiar.covariance).min() < 1e-5 * np.linalg.eigvalsh(familiar.covariance).max()
     for light in familiar.limits.light:
         assert np.isfinite(familiar.lit(float(light)).distance(familiar.centres)).all()
 
 
-def test_the_bands_of_the_training_are_within_the_training(made: Path, tmp_path: Path, command_line: Any) -> None:
-    """No note of columns that training itself did not reach; other bands still bring one, of those that it did."""
+def test_bands_of_the_training_bring_no_note(made: Path, tmp_path: Path, command_line: Any) -> None:
+    """The note counts only spectral features that training reached; a survey of fewer bands brings it."""
     said, _ = survey(command_line, made, made / "field" / "images" / "t0.tif", tmp_path / "a")
     assert "spectral features" not in said
     said, _ = survey(command_line, made, made / "field" / "images" / "t0.tif", tmp_path / "a", "--bands", "0-8")
     assert "the bands cover 5 of the weights' 12 spectral features" in said
 
 
-def test_what_a_run_left_is_written_as_netcdf_and_zarr(made: Path, tmp_path: Path, command_line: Any) -> None:
-    """Every product of a scene with a place, by plain xarray; rioxarray finds the CRS in what was written."""
+def test_products_of_a_run_are_written_as_netcdf_and_zarr(made: Path, tmp_path: Path, command_line: Any) -> None:
+    """Plain xarray writes every product of a georeferenced scene; rioxarray finds the CRS in the written files."""
     survey(command_line, made, made / "field" / "images" / "t0.tif", tmp_path / "a")
     run = open_archive(tmp_path / "a").latest
     run.class_map.to_netcdf(tmp_path / "map.nc")

@@ -1,4 +1,4 @@
-"""What a sprayer, a QGIS project or a spreadsheet takes of a survey, read again by programs that did not write it."""
+"""Products for a sprayer, a QGIS project or a spreadsheet, read by programs that did not write them."""
 
 from __future__ import annotations
 
@@ -45,25 +45,25 @@ FLAGS = {"reflectance": True, "indices": "NDVI,SAVI", "polygons": True, "prescri
 
 
 def exported(archive: Path, out: Path, receipt: Any, **flags: Any) -> Exported:
-    """What these flags export of an archive's newest run."""
+    """Export the newest run of an archive with the given flags."""
     choice = choose_products(ProductFlags(**flags))
     return Exported(archive, receipt, out, run_export(archive, None, out, False, QUIET, choice))
 
 
 @pytest.fixture(scope="module")
 def posed(tmp_path_factory: pytest.TempPathFactory) -> Exported:
-    """A small farm with a pose, so high that a pixel sees about a metre, and all of its products."""
+    """Return a small farm with a pose, at a height that gives pixels of about a metre, with all of its products."""
     archive, out = tmp_path_factory.mktemp("products") / "field", tmp_path_factory.mktemp("maps").resolve()
     given = {"size": "192x128", "bands": BANDS, "budget": "0.9", "engine": "plain", "seed": "1"}
-    given["unknown"] = "off"  # of these bands the weights of 270 know little
+    given["unknown"] = "off"  # with these bands the 270-band weights call many pixels unknown
     settings = load_settings(None, {**given, "out": str(archive), "controls": False})
     with without_effects():
         published = run_survey(replace(settings, pose=POSE), QUIET)
     return exported(archive, out, published.receipt, **FLAGS, cell=3.0)
 
 
-def test_reflectance_lies_on_the_map_with_its_wavelengths(posed: Exported) -> None:
-    """A COG in the map's CRS: the mosaic, resampled as the ground map is; bands named as GDAL does; NaN is nodata."""
+def test_the_reflectance_file_has_the_grid_of_the_map_and_wavelengths(posed: Exported) -> None:
+    """It is a COG of the mosaic on the ground map's grid; bands are described as in GDAL, and NaN is nodata."""
     ground, mosaic = posed.store("ground_map"), posed.store("mosaic")
     assert is_cog(posed.file("reflectance"))
     scene, about = posed.store("class_map"), posed.store("class_map").attrs["angular_grid"]
@@ -84,8 +84,8 @@ def test_reflectance_lies_on_the_map_with_its_wavelengths(posed: Exported) -> No
     np.testing.assert_allclose([1000 * float(tags["FWHM_UM"]) for tags in imagery], mosaic["fwhm"].values, rtol=1e-6)
 
 
-def test_indices_are_their_formula_of_the_reflectance(posed: Exported) -> None:
-    """NDVI of the file's own bands, pixel by pixel; NaN where a band has no value or both are dark."""
+def test_an_index_follows_its_formula(posed: Exported) -> None:
+    """NDVI equals the formula on the file's own bands; it is NaN if a band has no value or both are dark."""
     with rasterio.open(posed.file("reflectance")) as file:
         cube, wave = np.moveaxis(file.read(), 0, -1), [float(file.tags(band)["wavelength"]) for band in file.indexes]
     near, red = (int(np.argmin(np.abs(np.array(wave) - nm))) for nm in (832.8, 664.6))
@@ -97,8 +97,8 @@ def test_indices_are_their_formula_of_the_reflectance(posed: Exported) -> None:
     assert np.isfinite(wanted).mean() > 0.2
 
 
-def test_polygons_are_the_map_without_gap_or_overlap(posed: Exported) -> None:
-    """Drawn again they are the class map; GeoPackage in its CRS, GeoJSON in longitude and latitude (RFC 7946)."""
+def test_polygons_cover_the_map_without_gap_or_overlap(posed: Exported) -> None:
+    """Rasterized, they equal the class map; GeoPackage in its CRS, GeoJSON in longitude and latitude (RFC 7946)."""
     found = geopandas.read_file(posed.file("polygons"))
     assert found.crs.to_epsg() == 32632
     ground = posed.store("ground_map")
@@ -118,7 +118,7 @@ def test_polygons_are_the_map_without_gap_or_overlap(posed: Exported) -> None:
 
 
 def _classes_of_polygons(posed: Exported) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
-    """Centres of the map's pixels and their classes, by the polygons that hold them."""
+    """Return the centres of the map's pixels, their classes and the class names."""
     ground = posed.store("ground_map")
     a, _, c, _, e, f = ground.attrs["spatial:transform"]
     rows, columns = ground["classes"].shape
@@ -126,8 +126,8 @@ def _classes_of_polygons(posed: Exported) -> tuple[np.ndarray, np.ndarray, np.nd
     return x, y, ground["classes"].values, ground.attrs["class_names"]
 
 
-def test_prescribed_cells_hold_the_dose_of_their_classes(posed: Exported) -> None:
-    """By another count: the greatest dose of the pixels whose centres lie in a cell is the least that it gets."""
+def test_prescription_cells_hold_the_dose_of_their_classes(posed: Exported) -> None:
+    """A cell's dose is at least the highest dose of the pixel centres inside, and at most that within 1.5 m around."""
     cells = geopandas.read_file(posed.file("prescription"))
     assert cells.crs.to_epsg() == 32632
     assert set(cells.dose) == {0.0, 1.0, 2.5}
@@ -144,8 +144,8 @@ def test_prescribed_cells_hold_the_dose_of_their_classes(posed: Exported) -> Non
     assert shapely.contains_xy(covered, x[classes != 255], y[classes != 255]).all()
 
 
-def test_task_data_hold_what_the_map_says(posed: Exported) -> None:
-    """Read by another library: each cell's dose against the pixels whose longitude and latitude lie in it."""
+def test_task_data_match_the_class_map(posed: Exported) -> None:
+    """Another library reads the grid: cells that are mostly wheat hold its dose, cells without pixels hold 0."""
     task_data, numbers = isoxml_from_path(posed.file("task_data"))
     (grid,) = task_data.tasks[0].grids
     doses = to_numpy_array(numbers[grid.filename], grid) / 10_000
@@ -168,8 +168,8 @@ def test_task_data_hold_what_the_map_says(posed: Exported) -> None:
     assert (doses[ndimage.maximum_filter(total, 3) == 0] == 0).all()  # a cell may have a part of a pixel
 
 
-def test_a_table_of_areas_adds_up(posed: Exported) -> None:
-    """Pixels of the map, hectares of the receipt, fractions of 1, errors by the labels."""
+def test_the_table_of_areas_is_consistent_with_map_and_receipt(posed: Exported) -> None:
+    """Pixels are those of the map, hectares those of the receipt, fractions sum to 1, errors are not negative."""
     with posed.file("areas").open() as text:
         table = list(csv.DictReader(text))
     names = [row["class"] for row in table]
@@ -184,8 +184,8 @@ def test_a_table_of_areas_adds_up(posed: Exported) -> None:
     assert by_labels.sum() == posed.receipt["accuracy"]["pixels"]
 
 
-def test_the_catalogue_names_every_product(posed: Exported) -> None:
-    """A valid item whose assets are there: products, and the sheet of areas."""
+def test_the_catalogue_lists_every_product(posed: Exported) -> None:
+    """The STAC item is valid, and the files of its assets exist."""
     item = posed.item()
     assert core_problems(Path(posed.answer["item"])) == []
     assert extension_problems(item) == []
@@ -212,15 +212,15 @@ def test_the_catalogue_names_every_product(posed: Exported) -> None:
         ({"indices": "NDVI,NDMI"}, "NDMI wants Short-wave Infrared"),
     ],
 )
-def test_the_impossible_is_refused_first(posed: Exported, tmp_path: Path, flags: dict[str, Any], words: str) -> None:
-    """One message that says what was expected; the folder stays empty."""
+def test_impossible_flags_are_refused_first(posed: Exported, tmp_path: Path, flags: dict[str, Any], words: str) -> None:
+    """One message names the expected value before any file is written, and no output folder is made."""
     with pytest.raises((SettingsError, WavelengthError), match=words):
         exported(posed.archive, tmp_path / "out", {}, **flags)
     assert not (tmp_path / "out").exists()
 
 
-def test_a_class_may_have_an_equals_sign() -> None:
-    """The dose stands behind the last one."""
+def test_a_class_name_may_contain_an_equals_sign() -> None:
+    """The dose follows the last equals sign."""
     assert choose_products(ProductFlags(prescription="a=1=2.5,b=1")).doses == {"a=1": 2.5, "b": 1.0}
 
 
@@ -232,16 +232,16 @@ def test_a_class_may_have_an_equals_sign() -> None:
         ("EPSG:4326", (179.9997, 10, 180.0003, 10.0005), "across 180 degrees of longitude"),
     ],
 )
-def test_a_prescription_ends_at_borders(posed: Exported, crs: str, box: tuple[float, ...], words: str) -> None:
-    """Of UTM, and of longitudes."""
+def test_a_prescription_over_a_border_is_refused(posed: Exported, crs: str, box: tuple[float, ...], words: str) -> None:
+    """The borders are the limits of UTM in latitude and the longitude of 180 degrees."""
     run = Mock(wraps=open_exported(Archive.open(posed.archive), None), map_product="class_map")
     run.geobox = GeoBox.from_bbox(box, crs=crs, shape=(4, 4))
     with pytest.raises(SettingsError, match=words):
         check_zones(run, choose_products(ProductFlags(prescription="weed=1")))
 
 
-def test_a_survey_without_a_place_has_what_needs_none(surveyed_png: Any, tmp_path: Path) -> None:
-    """Polygons on the camera's angles, no GeoJSON; doses and metres are refused with what is missing."""
+def test_a_survey_without_a_place_exports_polygons_and_ratio_indices(surveyed_png: Any, tmp_path: Path) -> None:
+    """Polygons are in camera angles, without GeoJSON; doses and reflectance indices are refused with the reason."""
     archive, out, needs_none = tmp_path / "archive", tmp_path / "out", {"polygons": True, "reflectance": True}
     one_picture = exported(archive, out, surveyed_png(archive).receipt, indices="VARI", **needs_none)
     found = geopandas.read_file(one_picture.file("polygons"))
@@ -267,8 +267,8 @@ def test_a_survey_without_a_place_has_what_needs_none(surveyed_png: Any, tmp_pat
     ],
     ids=["turned", "in degrees", "beyond 180 degrees", "web mercator"],
 )
-def test_products_lie_where_their_scene_lies(tmp_path: Path, weights: Path, crs: str, transform: Affine) -> None:
-    """Corners of indices and polygons to 0.1 px, in its CRS; cells are square in metres; a gap gets no dose."""
+def test_products_have_the_position_of_their_scene(tmp_path: Path, weights: Path, crs: str, transform: Affine) -> None:
+    """Corners are right to 0.1 px in the scene's CRS; cells are square in metres; a gap gets no dose."""
     run = survey(write_geotiff(tmp_path / "a.tif", transform, gap=True, crs=crs), weights, tmp_path / "archive")
     flags = {"polygons": True, "indices": "VARI", "prescription": "class_1=2", "cell": 0.5}
     done = exported(tmp_path / "archive", tmp_path / "out", run.receipt, **flags)
@@ -299,7 +299,7 @@ def test_products_lie_where_their_scene_lies(tmp_path: Path, weights: Path, crs:
 @pytest.mark.parametrize("turned_deg", [0, 15, 30, 45])
 @pytest.mark.parametrize("pixel_m", [0.1, 0.5, 2.0])
 def test_no_pixel_gets_less_than_its_dose(turned_deg: float, pixel_m: float) -> None:
-    """Single pixels of weed on a turned map: the cell of each has its dose."""
+    """On a rotated map, the cell of every single weed pixel has the weed's dose."""
     rng, shape = np.random.default_rng(1), (120, 150)
     classes = (rng.random(shape) < 0.005).astype(np.uint8)
     place = Affine.translation(400_000, 5_750_000) * Affine.rotation(turned_deg) * Affine.scale(pixel_m, -pixel_m)
@@ -310,11 +310,11 @@ def test_no_pixel_gets_less_than_its_dose(turned_deg: float, pixel_m: float) -> 
     row, column = np.nonzero(classes)
     x, y = ~cells.affine * (place * (column + 0.5, row + 0.5))
     assert (dose[y.astype(int), x.astype(int)] == 2).all()
-    assert (dose == 0).any() or pixel_m < 0.5  # small fields are full of weed
+    assert (dose == 0).any() or pixel_m < 0.5  # small fields have weeds in every cell
 
 
-def test_cells_of_coarse_pixels_are_the_field(tmp_path: Path, weights: Path) -> None:
-    """Of pixels of 30 m on multiples of their side, by default a cell a pixel; the gap of a corner gets none."""
+def test_cells_of_coarse_pixels_cover_the_field(tmp_path: Path, weights: Path) -> None:
+    """With pixels of 30 m on multiples of 30 m, each pixel is one cell by default; the gap in a corner has none."""
     scene = write_geotiff(tmp_path / "a.tif", Affine(30, 0, 534_240, 0, -30, 5_772_330), gap=True)
     survey(scene, weights, tmp_path / "archive")
     done = exported(tmp_path / "archive", tmp_path / "out", {}, polygons=True, prescription="class_1=2,class_2=1")

@@ -1,4 +1,4 @@
-"""The package spectralzoom: what somebody types first in Python, and what xarray then knows of it."""
+"""The package spectralzoom: the first calls in Python, and their results in xarray."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Heard = dict[str, list[float]]
 
 @pytest.fixture(scope="module")
 def asked(scene_files: Path, weights: Path) -> dict[str, object]:
-    """What a small survey is asked for, on a rig that stands somewhere, as a table of settings."""
+    """Return the settings of a small survey with a pose, as a table."""
     files = {"scene": scene_files / "scene.png", "labels": str(scene_files / "labels.png"), "weights": weights}
     quick = {"camera": {"samples": 320}, "budget": 0.8, "accuracy": False, "controls": False}
     return {**files, "source": "sim", "pose": POSE, **quick}
@@ -35,7 +35,7 @@ def asked(scene_files: Path, weights: Path) -> dict[str, object]:
 
 @pytest.fixture(scope="module")
 def surveyed(asked: dict[str, object], tmp_path_factory: pytest.TempPathFactory) -> tuple[OpenedRun, Heard]:
-    """A run, and what was heard of its stages."""
+    """Return a run, and the progress values of each stage."""
     heard: Heard = defaultdict(list)
     out = tmp_path_factory.mktemp("api") / "archive"
     with without_effects():
@@ -45,20 +45,20 @@ def surveyed(asked: dict[str, object], tmp_path_factory: pytest.TempPathFactory)
 
 @pytest.fixture(scope="module")
 def run(surveyed: tuple[OpenedRun, Heard]) -> OpenedRun:
-    """The run alone."""
+    """Return the run alone."""
     return surveyed[0]
 
 
-def test_importing_it_loads_nothing_of_weight() -> None:
-    """Names are there, what is behind them is loaded when it is called."""
+def test_importing_the_package_loads_no_heavy_library() -> None:
+    """All names are listed at once; torch, numpy and xarray are loaded by the first call that needs them."""
     code = "import sys, spectralzoom; print(*dir(spectralzoom)); print({'torch', 'numpy', 'xarray'} & set(sys.modules))"
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ended.stdout.splitlines() == [" ".join(spectralzoom.__all__), "set()"]
     assert all(getattr(spectralzoom, name) for name in spectralzoom.__all__)
 
 
-def test_opening_an_archive_takes_no_torch(run: OpenedRun) -> None:
-    """Whoever looks at maps does not wait for a network."""
+def test_opening_an_archive_does_not_load_torch(run: OpenedRun) -> None:
+    """Opening a map must not wait for the import of torch."""
     code = (
         "import sys, spectralzoom; print(spectralzoom.open(sys.argv[1]).latest.class_map.dtype, 'torch' in sys.modules)"
     )
@@ -67,7 +67,7 @@ def test_opening_an_archive_takes_no_torch(run: OpenedRun) -> None:
 
 
 def test_runs_are_found_by_name_and_the_latest_comes_first(run: OpenedRun, tmp_path: Path) -> None:
-    """A mapping; `latest` is the first of it."""
+    """`runs` is a mapping, and `latest` is its first value; an unknown name raises KeyError with the latest names."""
     for name in (run.name, "29990101T000000-later"):
         shutil.copytree(run.folder, tmp_path / "archive" / "runs" / name)
     (tmp_path / "archive" / "stages").mkdir()
@@ -81,8 +81,8 @@ def test_runs_are_found_by_name_and_the_latest_comes_first(run: OpenedRun, tmp_p
     assert issubclass(NoRunError, spectralzoom.Error)
 
 
-def test_classes_are_those_of_the_store(run: OpenedRun) -> None:
-    """Numbers stay uint8 with their meanings, also where there is no class."""
+def test_class_map_and_confidence_are_those_of_the_store(run: OpenedRun) -> None:
+    """Classes stay uint8 with their names; 255 is nodata."""
     found = run.class_map
     stored = load_class_map(Path(run.archive_name) / run.receipt["products"]["class_map"])
     assert (found.dtype, found.attrs["nodata"]) == (np.uint8, 255)
@@ -91,19 +91,19 @@ def test_classes_are_those_of_the_store(run: OpenedRun) -> None:
     np.testing.assert_array_equal(run.confidence, stored.confidence)
 
 
-def test_mosaic_and_map_share_their_pixels(run: OpenedRun) -> None:
-    """Their places are equal, so that xarray joins both by coordinates."""
+def test_mosaic_and_class_map_share_their_coordinates(run: OpenedRun) -> None:
+    """Their coordinates are equal, so xarray aligns both."""
     classes, mosaic = run.class_map, run.mosaic
     for axis in ("y", "x"):
         np.testing.assert_array_equal(mosaic[axis].values, classes[axis].values)
         assert mosaic[axis].attrs["units"] == "rad"
-    joined = mosaic.where(classes == int(classes[0, 0]))  # what has other coordinates is left out
+    joined = mosaic.where(classes == int(classes[0, 0]))  # pixels with other coordinates would be left out
     assert joined.shape == mosaic.shape
     assert np.isfinite(joined.values[0, 0]).all()
 
 
-def test_the_map_on_the_ground_has_its_crs(run: OpenedRun) -> None:
-    """By rioxarray's convention, with the transform that the store was written with."""
+def test_the_ground_map_has_its_crs(run: OpenedRun) -> None:
+    """The CRS follows rioxarray's convention, and the transform is that of the store."""
     drawn = run.ground_map
     geobox = load_geobox(Path(run.archive_name) / run.receipt["products"]["ground_map"])
     assert drawn["classes"].dtype == np.uint8
@@ -112,32 +112,32 @@ def test_the_map_on_the_ground_has_its_crs(run: OpenedRun) -> None:
     assert np.allclose(np.array(here[:6]), np.array(geobox.affine[:6]), atol=0.1 * abs(geobox.affine.a))
 
 
-def test_progress_rises_to_the_end_of_every_stage(surveyed: tuple[OpenedRun, Heard]) -> None:
-    """Each stage that ran is told of, from where it is to all of it, and nothing is printed."""
+def test_progress_rises_to_1_in_every_stage(surveyed: tuple[OpenedRun, Heard]) -> None:
+    """Each stage that ran reports rising fractions that end at 1."""
     run, heard = surveyed
     ran = {row["name"] for row in run.receipt["stages"] if row["state"] == "ran"}
     assert ran <= set(heard)
     assert all(fractions == sorted(fractions) and fractions[-1] == 1 for fractions in heard.values())
 
 
-def test_it_is_quiet(asked: dict[str, object], run: OpenedRun, capfd: pytest.CaptureFixture[str]) -> None:
-    """What is stored is read again, a run is published, and nobody hears of it."""
+def test_surveying_prints_nothing(asked: dict[str, object], run: OpenedRun, capfd: pytest.CaptureFixture[str]) -> None:
+    """A survey of stored results publishes a new run without output on stdout or stderr."""
     again = spectralzoom.survey(asked, out=run.archive_name)
     assert {row["state"] for row in again.receipt["stages"]} <= {"cached", "skipped"}
     assert again.name != run.name
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_plan_knows_what_is_stored(asked: dict[str, object], run: OpenedRun, tmp_path: Path) -> None:
-    """With the arguments of a survey that ran there is nothing to make; elsewhere there is, and nothing is written."""
+def test_a_plan_counts_only_missing_stores(asked: dict[str, object], run: OpenedRun, tmp_path: Path) -> None:
+    """The arguments of a finished survey have nothing to make; for a new archive there is, and no file is written."""
     assert spectralzoom.plan(asked, out=run.archive_name)["to_make"] == 0
     elsewhere = spectralzoom.plan(asked, out=tmp_path / "archive")
     assert elsewhere["to_make"] > 5
     assert not (tmp_path / "archive").exists()
 
 
-def test_keywords_win_over_a_file(asked: dict[str, object], tmp_path: Path) -> None:
-    """A table in a keyword changes its own keys alone."""
+def test_keywords_override_a_settings_file(asked: dict[str, object], tmp_path: Path) -> None:
+    """A table in a keyword changes only its own keys."""
     (tmp_path / "survey.toml").write_text("budget = 0.3\nengine = 'plain'\n[camera]\nsamples = 320\nbits = 10\n")
     same = {"source": "sim", "scene": asked["scene"], "weights": asked["weights"], "out": tmp_path / "archive"}
     with pytest.raises(spectralzoom.Error, match=r"'camera.bits' must be a whole number from 8 to 16"):
@@ -147,16 +147,16 @@ def test_keywords_win_over_a_file(asked: dict[str, object], tmp_path: Path) -> N
         spectralzoom.plan(tmp_path / "survey.toml", **same, camera={"bits": 12})
 
 
-def test_a_run_is_judged_when_asked(run: OpenedRun) -> None:
-    """Its scores are given, and stand in its receipt from then on."""
+def test_evaluate_adds_accuracy_to_a_run(run: OpenedRun) -> None:
+    """The scores are returned, and are then in the run's receipt."""
     assert "accuracy" not in run.receipt
     scores = spectralzoom.evaluate(run)
     assert 0 <= scores["overall_accuracy"] <= 1
     assert run.receipt["accuracy"] == scores
 
 
-def test_weights_are_trained_and_judged(tmp_path: Path) -> None:
-    """Two steps on three frames make a file that can be judged on the one that it was not trained on."""
+def test_weights_are_trained_and_evaluated(tmp_path: Path) -> None:
+    """Two steps on frames of a small field give weights that are evaluated on the held-out frame."""
     heard: set[str] = set()
     small = {"dim": 16, "layers": 1, "heads": 2, "crop": 16, "batch": 1, "patch": 4}
     data, told = write_field(tmp_path / "field", (32, 32)), lambda stage, done, total: heard.add(stage)
@@ -171,8 +171,8 @@ def test_weights_are_trained_and_judged(tmp_path: Path) -> None:
     assert {"training", "imaging scenes"} <= heard
 
 
-def test_what_cannot_be_is_one_error(make_weights: WeightsMaker, tmp_path: Path) -> None:
-    """Every mistake of a caller raises the one class that the package shows, in the words of the command line."""
+def test_every_mistake_raises_the_error_of_the_package(make_weights: WeightsMaker, tmp_path: Path) -> None:
+    """Mistakes of a caller raise spectralzoom.Error with the command line's messages."""
     out = tmp_path / "archive"
     with pytest.raises(spectralzoom.Error, match="did you mean 'budget'"):
         spectralzoom.survey(budjet=0.5, out=out)

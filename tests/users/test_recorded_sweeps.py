@@ -1,4 +1,4 @@
-"""Somebody surveys sweeps that were taken before: the same map as the rig's own, fewer lines, and what goes wrong."""
+"""Surveys of recorded sweeps: the same map as the rig's own survey, fewer lines read, and clear errors."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ pytestmark = pytest.mark.usefixtures("no_effects")
 FullScan = tuple[Path, Published, Path]  # archive, run, sweeps as files
 Pushbroom = tuple[Path, NDArray[np.uint16]]  # files of a straight scan, and its numbers
 SIZE = (128, 96)  # x, y
-NARROW = {"camera.samples": 80}  # two strips for the field
+NARROW = {"camera.samples": 80}  # two swaths for the field
 PASSES: dict[str, dict[str, Any]] = {
     "two passes": {"budget": 0.8, "policy": "entropy"},
     "lines down the field": {"scan_step": 1, "camera.samples": 96},
@@ -61,13 +61,13 @@ PASSES: dict[str, dict[str, Any]] = {
 
 
 def field() -> RasterScene:
-    """A field of three classes before the emulated rig."""
+    """Return a field of three classes for the emulated rig."""
     camera, values = load_settings(None, dict(NARROW)).camera, patchy_scene(SIZE[::-1], 3, 1)[0]
     return raster_from_values(values, camera, name="x", wavelength_nm=np.array([640.0, 550.0, 460.0]))
 
 
 def rig_settings(out: Path, weights: Path, **asked: Any) -> Any:
-    """Settings of a survey of the field through the rig."""
+    """Return settings of a survey of the field through the rig."""
     told = {
         **{"source": "rig", "scene": "field", "size": f"{SIZE[0]}x{SIZE[1]}", "wavelengths": "640,550,460"},
         **{"rig.port": f"rig-{os.getpid()}", "rig.pulses": "position", "visit": "first", "engine": "plain"},
@@ -82,7 +82,7 @@ def survey_sweeps(out: Path, sweeps: Path | str, **asked: Any) -> Published:
 
 
 def digest_of_map(out: Path, receipt: Mapping[str, Any]) -> tuple[str, str]:
-    """Hashes of class numbers and confidences."""
+    """Return hashes of class numbers and confidences."""
     found = load_class_map(out / receipt["products"]["class_map"])
     return array_digest(np.asarray(found.classes)), array_digest(np.asarray(found.confidence))
 
@@ -98,7 +98,7 @@ def write_sweeps(out: Path, published: Published, folder: Path) -> Path:
 
 @pytest.mark.parametrize("asked", PASSES.values(), ids=PASSES)
 def test_sweeps_of_the_rig_give_its_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, asked: dict[str, Any]) -> None:
-    """Written as ENVI and CSV and surveyed as a recording, or out of the archive itself: the class map by hash."""
+    """The class map's hash is the same from ENVI and CSV files, and from the raw cubes of the archive."""
     weights, made = tmp_path / "reflectance.safetensors", random_weights((640.0, 550.0, 460.0))
     centre, spread = (np.full_like(made.normalisation.centre, level) for level in (0.3, 0.05))
     save_weights(replace(made, normalisation=replace(made.normalisation, centre=centre, spread=spread)), weights)
@@ -126,7 +126,7 @@ def test_sweeps_of_the_rig_give_its_map(tmp_path: Path, monkeypatch: pytest.Monk
 
 @contextmanager
 def counted_lines(patch: pytest.MonkeyPatch) -> Iterator[set[tuple[str, int]]]:
-    """Count every line of a file or raw cube that is read as numbers, at the reader."""
+    """Yield the set of the lines that are read as numbers from files or raw cubes."""
     read: set[tuple[str, int]] = set()
     real = storage.readers.recordings._line_reader
 
@@ -146,17 +146,17 @@ def counted_lines(patch: pytest.MonkeyPatch) -> Iterator[set[tuple[str, int]]]:
 
 @pytest.fixture(scope="module")
 def full_scan(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) -> FullScan:
-    """A full scan of the session's picture by the simulated rig: its archive, its run, and its sweeps as files."""
+    """Return a full scan of the session's picture by the simulated rig: archive, run, and sweeps as files."""
     folder = tmp_path_factory.mktemp("recorded")
     with without_effects():
         published = survey_png(folder / "sim", budget=None, scan_step="1", keep="raw", **NARROW)
     return folder / "sim", published, write_sweeps(folder / "sim", published, folder / "sweeps")
 
 
-def test_a_budget_reads_only_the_lines_that_it_asks_for(
+def test_a_budget_reads_only_the_requested_lines(
     tmp_path: Path, full_scan: FullScan, weights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of a recorded full scan two passes read their own lines and no other; the receipt says what zooming saves."""
+    """Two passes read only their own lines of a recorded full scan; the receipt counts them against all lines."""
     _, _, sweeps = full_scan
     with counted_lines(monkeypatch) as read:
         published = survey_sweeps(tmp_path / "a", sweeps, weights=str(weights), budget=0.6, keep="raw")
@@ -177,8 +177,8 @@ def test_a_budget_reads_only_the_lines_that_it_asks_for(
     assert (lines["done"], lines["full"]) == (asked, recorded)
 
 
-def test_seconds_count_the_recorded_exposures(tmp_path: Path, full_scan: FullScan, make_weights: WeightsMaker) -> None:
-    """Both passes are planned with the exposure of the lines, not with a shorter one of the weights' table."""
+def test_plans_use_the_recorded_exposure(tmp_path: Path, full_scan: FullScan, make_weights: WeightsMaker) -> None:
+    """Both passes use the exposure of the recorded lines, not a shorter one from the weights' table."""
     asked = {"weights": str(make_weights(scans=RECORD)), "seconds": 15, "zoom": "always", "keep": "raw"}
     receipt = survey_sweeps(tmp_path / "a", full_scan[2], **asked).receipt
     assert receipt["recording"]["passes_s"] <= 15
@@ -186,8 +186,8 @@ def test_seconds_count_the_recorded_exposures(tmp_path: Path, full_scan: FullSca
     assert "100 ms" in receipt["plan"]["reason"]
 
 
-def test_a_scan_as_taken_is_compared_with_all_of_its_lines(tmp_path: Path, full_scan: FullScan, weights: Path) -> None:
-    """An area of interest limits the map: the lines beside it are read, and the reference has them too."""
+def test_a_recorded_scan_is_compared_with_all_of_its_lines(tmp_path: Path, full_scan: FullScan, weights: Path) -> None:
+    """An area of interest limits only the map: all lines are read and count in the reference, so savings are 1."""
     corner = {"type": "Polygon", "coordinates": [[[0, 0], [30, 0], [30, 30], [0, 30], [0, 0]]]}
     (tmp_path / "area.json").write_text(json.dumps(corner))
     asked = {"weights": str(weights), "zones.area": str(tmp_path / "area.json")}
@@ -195,16 +195,16 @@ def test_a_scan_as_taken_is_compared_with_all_of_its_lines(tmp_path: Path, full_
     assert [savings[name]["ratio"] for name in ("lines", "samples", "capture_s")] == [1, 1, 1]
 
 
-def test_lines_of_a_run_have_the_date_of_its_visit(full_scan: FullScan) -> None:
-    """So exports, histories and prior maps date them by their capture; a visit that is asked for comes first."""
+def test_recorded_lines_of_a_run_have_its_date(full_scan: FullScan) -> None:
+    """Exports, histories and prior maps then use the date of capture; an explicit visit takes precedence."""
     sweeps, captured = str(full_scan[1].folder), datetime.fromisoformat(full_scan[1].receipt["started"])
     visit = load_settings(None, {"sweeps": sweeps}).visit
     assert datetime.fromisoformat(visit) == captured
     assert load_settings(None, {"sweeps": sweeps, "visit": "mine"}).visit == "mine"
 
 
-def test_a_repeated_run_has_its_reference(tmp_path: Path, survey_png: Survey, make_weights: WeightsMaker) -> None:
-    """That of two exposures has the camera's own for the full scan, as when it was captured, and what it was asked."""
+def test_a_survey_of_a_run_keeps_its_reference(tmp_path: Path, survey_png: Survey, make_weights: WeightsMaker) -> None:
+    """Although the coarse pass was shorter, the full scan has the camera's exposure, and settings are kept."""
     asked: dict[str, Any] = {"weights": str(make_weights(scans=RECORD)), "zoom": "always", "seconds": "15"}
     own = {"expected_loss": 0, "signal.step": 2}
     run = survey_png(tmp_path / "sim", budget=None, keep="raw", **NARROW, **asked, **own)
@@ -212,7 +212,7 @@ def test_a_repeated_run_has_its_reference(tmp_path: Path, survey_png: Survey, ma
     again = survey_sweeps(tmp_path / "again", run.folder).receipt
     assert [again["settings"][name] for name in ("expected_loss", "signal")] == [0, run.receipt["settings"]["signal"]]
     assert again["recording"]["full_scan_s"] == run.receipt["savings"]["capture_s"]["full"]
-    scan = survey_sweeps(tmp_path / "scan", run.folder, seconds=15).receipt  # of shorter exposures
+    scan = survey_sweeps(tmp_path / "scan", run.folder, seconds=15).receipt  # with shorter exposures
     assert scan["savings"]["capture_s"]["full"] == run.receipt["savings"]["capture_s"]["full"]
     assert scan["scans"]["taken"]["seconds"] == pytest.approx(scan["savings"]["capture_s"]["done"])
     assert scan["settings"]["scan_exposure_ms"] < 100
@@ -221,13 +221,13 @@ def test_a_repeated_run_has_its_reference(tmp_path: Path, survey_png: Survey, ma
 
 
 def raw_cubes(full_scan: FullScan) -> list[Path]:
-    """Stores of the sweeps of the full scan."""
+    """Return the stores of the sweeps of the full scan."""
     archive, published, _ = full_scan
     return sorted((archive / published.receipt["products"]["raw_coarse"]).glob("*.zarr"))
 
 
 def write_pushbroom(folder: Path, values: NDArray[np.uint16]) -> Path:
-    """A cube (line, sample, band) of a straight scan as ENVI, with dark and white frames and no pointing."""
+    """Write the cube (line, sample, band) of a straight scan as ENVI, with dark and white frames, without pointing."""
     folder.mkdir()
     dark, white = (np.full((1, *values.shape[1:]), level, np.uint16) for level in (60, 3500))
     for name, numbers in (("scan", values), ("scan.dark", dark), ("scan.white", white)):
@@ -237,16 +237,16 @@ def write_pushbroom(folder: Path, values: NDArray[np.uint16]) -> Path:
 
 @pytest.fixture
 def pushbroom(tmp_path: Path) -> Pushbroom:
-    """A straight scan of 96 lines of 64 samples, and its numbers."""
+    """Return the files of a straight scan of 96 lines of 64 samples, and its numbers."""
     values = (patchy_scene((96, 64), 3, 3)[0] * 12 + 60).astype(np.uint16)
     return write_pushbroom(tmp_path / "drone", values), values
 
 
 @pytest.mark.parametrize(("column", "place"), [(None, None), ("position_px", lambda line: 200.0 - line)])
-def test_a_straight_scan_is_a_recording(
+def test_a_straight_scan_is_surveyed_as_a_recording(
     tmp_path: Path, pushbroom: Pushbroom, weights: Path, column: str | None, place: Any
 ) -> None:
-    """Drone, stage or conveyor: by pixels a line, or, as the run says, taken to be even."""
+    """A scan by drone, stage or conveyor has a position for each line, or a note says that its lines are even."""
     folder, values = pushbroom
     asked = {}
     if column is not None:
@@ -268,7 +268,7 @@ def test_a_straight_scan_is_a_recording(
 
 
 def test_a_line_may_have_fewer_samples_than_a_scan_has_steps(tmp_path: Path, make_weights: WeightsMaker) -> None:
-    """Scans of more steps than samples are not offered: they were refused for an overlap that nobody asked for."""
+    """Scans of more steps than samples are not offered, as their overlap would refuse the survey."""
     folder = write_pushbroom(tmp_path / "drone", np.full((96, 1, 3), 900, np.uint16))
     receipt = survey_sweeps(tmp_path / "a", folder / "scan.hdr", weights=str(make_weights(scans=RECORD))).receipt
     assert receipt["settings"]["size"] == [1, 96]
@@ -280,10 +280,10 @@ def table(folder: Path, header: str, rows: Sequence[str]) -> None:
 
 
 @pytest.mark.parametrize("by_value", [False, True])
-def test_what_no_valid_line_captured_has_no_class(
+def test_pixels_without_a_valid_line_have_no_class(
     tmp_path: Path, pushbroom: Pushbroom, weights: Path, by_value: bool
 ) -> None:
-    """A third of the lines is not valid: nodata in the map, without a probability, and the receipt counts it."""
+    """A third of the lines is invalid: their pixels have neither class nor confidence, and the receipt counts them."""
     folder, values = pushbroom
     if by_value:
         values[40:72] = 7
@@ -297,11 +297,11 @@ def test_what_no_valid_line_captured_has_no_class(
     assert not lost[:38].any()
     assert np.isnan(found.confidence[lost]).all()
     assert (receipt["pixels"]["map_without_a_class"], receipt.get("signal")) == (lost.sum(), None)
-    known = 96 if by_value else 64  # what lines hold is not known before they are read
+    known = 96 if by_value else 64  # ignored values are found only when the lines are read
     assert [receipt["recording"][name] for name in ("lines_read", "lines_recorded")] == [known, known]
 
 
-POSITIONS = {"fewer rows": range(95), "lines far apart": range(0, 9 * 96, 9)}  # of the lines, beside the cube
+POSITIONS = {"fewer rows": range(95), "lines far apart": range(0, 9 * 96, 9)}  # of the lines, in the pointing table
 BAD = {  # flags, and the message
     "fewer rows": ("", "has 95 rows for scan, fewer than its 96 lines; give one row for each line"),
     "lines far apart": ("", "the lines of the recording lie 9 px .* apart, and a uniform scan may have up to 8 px"),
@@ -324,7 +324,7 @@ BAD = {  # flags, and the message
 def test_bad_input_gives_one_message(
     command_line: CommandLine, monkeypatch: pytest.MonkeyPatch, pushbroom: Pushbroom, weights: Path, mistake: str
 ) -> None:
-    """By the command line: one message with value and remedy, no traceback, and no archive."""
+    """The command prints one message with value and remedy, no traceback, and writes no archive."""
     (folder, _), (flags, message) = pushbroom, BAD[mistake]
     monkeypatch.chdir(folder)
     write_envi_cube(folder / "two", np.full((1, 64, 2), 3500, np.uint16), ".img", wavelength="{640, 550}")
@@ -333,12 +333,12 @@ def test_bad_input_gives_one_message(
     asked = ["--engine", "plain", *([] if "--out" in flags else ["--out", "a"]), "--weights", weights]
     sweeps = [] if "--sweeps" in flags else ["--sweeps", "scan.hdr"]
     ended = command_line("survey", *sweeps, *asked, *flags.split())
-    ended.refused(2 if ended.code == 2 else 1, message)  # 2 where settings alone are wrong
+    ended.refused(2 if ended.code == 2 else 1, message)  # 2 if the settings alone are wrong
     assert not [path for path in (folder / "a", folder / "stages") if path.exists()]
 
 
-def test_source_without_sweeps(command_line: CommandLine, tmp_path: Path) -> None:
-    """A recording has to lie somewhere."""
+def test_source_recorded_needs_sweeps(command_line: CommandLine, tmp_path: Path) -> None:
+    """Without --sweeps the command is refused, and the message names the flag."""
     command_line("survey", "--source", "recorded", "--scene", "field", "--out", tmp_path / "a").refused(
         2, "source = 'recorded' reads sweeps that were taken before; give --sweeps"
     )
@@ -347,7 +347,7 @@ def test_source_without_sweeps(command_line: CommandLine, tmp_path: Path) -> Non
 def test_ingest_names_the_survey_as_the_next_step(
     command_line: CommandLine, tmp_path: Path, pushbroom: Pushbroom, weights: Path
 ) -> None:
-    """Its next command surveys the stored cube with the frames that were stored with it."""
+    """The named command surveys the stored cube with the stored frames, and gives the map of the original files."""
     folder, _ = pushbroom
     frames = ("--dark", folder / "scan.dark.hdr", "--white", folder / "scan.white.hdr")
     ended = command_line("ingest", folder / "scan.hdr", tmp_path / "store", *frames)
@@ -369,18 +369,18 @@ def test_ingest_names_the_survey_as_the_next_step(
         ("a.png", (), ""),
     ],
 )
-def test_the_next_step_names_wavelengths_that_a_file_lacks(
+def test_the_next_step_names_missing_wavelengths(
     name: str, given: tuple[str, ...], words: str, command_line: CommandLine, tmp_path: Path
 ) -> None:
-    """Those that were given, or a place for them; a picture of whole numbers is a scene as it is, and no recording."""
+    """The command has the given wavelengths or a placeholder; a picture is surveyed as a scene without them."""
     np.save(tmp_path / "a.npy", np.zeros((16, 24, 2), np.float32))
     Image.fromarray(np.zeros((16, 24, 3), np.uint8)).save(tmp_path / "a.png")
     ended = command_line("ingest", tmp_path / name, tmp_path / "store", *given)
     assert f"next: spectralzoom survey --scene {tmp_path / name}{words} --weights" in ended.err
 
 
-def test_a_rigs_run_is_reprocessed_from_raw(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights: Path) -> None:
-    """Once captures have a newer version the rig is not asked: the same map, once, and nothing is left to do."""
+def test_a_rig_survey_is_reprocessed_from_raw(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights: Path) -> None:
+    """After a new version of the capture, the archive's lines give the same map without the rig, and only once."""
     archive = tmp_path / "rig"
     with emulated(rig_settings(archive, weights, keep="raw"), {}, monkeypatch, scene=field()):
         published = run_survey(rig_settings(archive, weights, keep="raw", scan_step=2), QUIET)
@@ -395,10 +395,10 @@ def test_a_rigs_run_is_reprocessed_from_raw(tmp_path: Path, monkeypatch: pytest.
     assert len(Archive.open(archive).runs()) == 2
 
 
-def test_a_recording_whose_files_moved_is_reprocessed(
+def test_a_recording_is_reprocessed_after_its_files_moved(
     tmp_path: Path, pushbroom: Pushbroom, weights: Path, make_weights: WeightsMaker
 ) -> None:
-    """New weights read the raw cubes that the archive has of it."""
+    """New weights read the archive's raw cubes, and give the same map as the moved files."""
     folder, _ = pushbroom
     archive = tmp_path / "a"
     survey_sweeps(archive, folder / "scan.hdr", weights=str(weights), keep="raw")
@@ -411,10 +411,8 @@ def test_a_recording_whose_files_moved_is_reprocessed(
     assert digest_of_map(archive, again) == digest_of_map(tmp_path / "b", fresh.receipt)
 
 
-def test_a_repair_reads_a_recording_again_while_its_files_are_there(
-    tmp_path: Path, pushbroom: Pushbroom, weights: Path
-) -> None:
-    """Without them, or with another recording there, the damaged signal of cleared lines stays: it is the only copy."""
+def test_a_repair_needs_the_files_of_its_recording(tmp_path: Path, pushbroom: Pushbroom, weights: Path) -> None:
+    """Without them, or with another recording there, the damaged signal is kept, as it is the only copy."""
     folder, _ = pushbroom
     survey_sweeps(tmp_path / "a", folder / "scan.hdr", weights=str(weights))
     (chunk, *_) = sorted((tmp_path / "a").glob("stages/condense/*/*.zarr/scores/c/0/0/0"))
@@ -431,8 +429,8 @@ def test_a_repair_reads_a_recording_again_while_its_files_are_there(
     assert {finding.kind for finding in verify_archive(Archive.open(tmp_path / "a"))} == {"whole"}
 
 
-def test_labels_judge_the_map_of_a_recording(tmp_path: Path, pushbroom: Pushbroom, weights: Path) -> None:
-    """Labels on the field's pixels give accuracy; those of another size are refused."""
+def test_labels_of_a_recording_give_accuracy(tmp_path: Path, pushbroom: Pushbroom, weights: Path) -> None:
+    """Labels must have the size of the field; those of another size are refused."""
     folder, _ = pushbroom
     Image.fromarray(patchy_scene((96, 64), 3, 3)[1]).save(tmp_path / "labels.png")
     labels = str(tmp_path / "labels.png")
@@ -443,8 +441,8 @@ def test_labels_judge_the_map_of_a_recording(tmp_path: Path, pushbroom: Pushbroo
         survey_sweeps(tmp_path / "b", folder / "scan.hdr", weights=str(weights), labels=labels)
 
 
-def test_swaths_of_ones_own_are_surveyed_in_two_passes(tmp_path: Path, weights: Path) -> None:
-    """A recording whose strips lie where no plan would put them: both passes go along these strips."""
+def test_recorded_swaths_are_surveyed_in_two_passes(tmp_path: Path, weights: Path) -> None:
+    """The swaths lie at positions that no plan would choose, and both passes use exactly these."""
     own = [Sweep(f"mine-{at}", "fine", "x", at, -52.5, 106) for at in (-35.0, 4.0, 38.0)]
     camera = load_settings(None, dict(NARROW)).camera
     source = SimulatedSource(field(), Rig(camera), seed=3)
@@ -467,8 +465,8 @@ def test_swaths_of_ones_own_are_surveyed_in_two_passes(tmp_path: Path, weights: 
     assert np.isfinite(open_mosaic(tmp_path / "a" / published.receipt["products"]["mosaic"]).values()).mean() > 0.99
 
 
-def test_numbers_of_sixteen_bits_are_surveyed_and_found_again(tmp_path: Path, weights: Path) -> None:
-    """The camera of the receipt has the bits and the period of the recording, and can be asked for again."""
+def test_a_16_bit_recording_is_surveyed_and_reprocessed(tmp_path: Path, weights: Path) -> None:
+    """The receipt's camera has the bits and the line period of the recording, and reprocessing finds nothing to do."""
     values = (patchy_scene((96, 64), 3, 3)[0] * 200 + 60).astype(np.uint16)
     folder = write_pushbroom(tmp_path / "drone", values)
     table(folder, "time,position_px", [f"{3.5 * line},{line}" for line in range(96)])

@@ -1,4 +1,4 @@
-"""The map of a report, in a real browser: its layers, keys, a phone and paper; nothing of the data runs."""
+"""The map of a report in a real browser: layers, keys, phone and paper; the page runs no script from the data."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ SHA256 = {
 
 @pytest.fixture(scope="module")
 def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
-    """One browser for all tests of this file."""
+    """Yield one browser tab for all tests of this file."""
     with chromium(tmp_path_factory.mktemp("chromium")) as found:
         yield found
 
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The report of a map that is known by heart: three pictures, with words that mean no good."""
+    """Write the report of a known map with three layers and malicious HTML in its texts; return its path."""
     numbers = np.zeros((HEIGHT, WIDTH), np.uint8)
     numbers[:, WIDTH // 2 :] = 1
     shown = layer_address(numbers, np.array([[120, 80, 40], [20, 200, 60]], np.uint8))
@@ -57,14 +57,14 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def opened(tab: Tab, page: Path) -> Tab:
-    """The report on a desk."""
+    """Open the report in a window of desktop size."""
     tab.open(page, ready=READY)
     return tab
 
 
 @needs_browser
-def test_layers_are_switched(opened: Tab) -> None:
-    """What is off is not on the map."""
+def test_layers_are_switched_on_and_off(opened: Tab) -> None:
+    """A layer that is off is not on the map; the truth is drawn with opacity 0.5."""
     assert opened.run(f"{BOXES}.map((one) => one.checked)") == [True, True, False]
     assert opened.run(SHOWN) == 2
     opened.run(f"{BOXES}.filter((one) => !one.checked).forEach((one) => one.click())")
@@ -74,7 +74,7 @@ def test_layers_are_switched(opened: Tab) -> None:
 
 @needs_browser
 def test_keys_move_the_map(opened: Tab) -> None:
-    """Plus zooms, an arrow pans."""
+    """The plus key zooms in, and the right arrow pans."""
     opened.run("document.getElementById('map').focus()")
     zoom = opened.run("map.getZoom()")
     opened.key("+", 187)
@@ -86,8 +86,8 @@ def test_keys_move_the_map(opened: Tab) -> None:
 
 @needs_browser
 @pytest.mark.parametrize("width", [900, 1024, 1100, 1440])
-def test_savings_are_whole_and_the_layers_closed(tab: Tab, page: Path, width: int) -> None:
-    """All columns lie within their card, and the box of the layers covers little of the map."""
+def test_savings_fit_and_layers_are_closed(tab: Tab, page: Path, width: int) -> None:
+    """All columns fit into their card, and the closed layer box is less than 100 px wide."""
     tab.open(page, (width, 900), ready=READY)
     assert tab.run(
         "[...document.querySelectorAll('#savings .wide')].every((one) => one.scrollWidth <= one.clientWidth)"
@@ -96,8 +96,8 @@ def test_savings_are_whole_and_the_layers_closed(tab: Tab, page: Path, width: in
 
 
 @needs_browser
-def test_on_a_phone_nothing_is_cut(tab: Tab, page: Path) -> None:
-    """The page is as wide as the window, scores are seen without scrolling."""
+def test_the_report_fits_a_phone(tab: Tab, page: Path) -> None:
+    """The page is 390 px wide like the window, and scores are visible without scrolling."""
     tab.open(page, (390, 844), ready=READY, touch=True)
     assert tab.run("document.documentElement.scrollWidth") == 390
     outside = "(one) => one.getBoundingClientRect().right > 390"
@@ -107,8 +107,8 @@ def test_on_a_phone_nothing_is_cut(tab: Tab, page: Path) -> None:
 
 
 @needs_browser
-def test_on_paper_nothing_is_cut(opened: Tab) -> None:
-    """The quicklook stands for the map, no table is wider than the page, and pages are full."""
+def test_the_report_fits_paper(opened: Tab) -> None:
+    """The quicklook replaces the map, no table is wider than the page, and the PDF has 2 to 4 pages."""
     opened.call("Emulation.setDeviceMetricsOverride", width=690, height=900, deviceScaleFactor=1, mobile=False)
     opened.call("Emulation.setEmulatedMedia", media="print")
     try:
@@ -122,8 +122,8 @@ def test_on_paper_nothing_is_cut(opened: Tab) -> None:
 
 
 @needs_browser
-def test_nothing_is_loaded_and_nothing_of_the_data_runs(opened: Tab, page: Path) -> None:
-    """But for the page's own scripts, which its policy names; nothing is asked of the network."""
+def test_the_page_loads_nothing_and_runs_no_foreign_script(opened: Tab, page: Path) -> None:
+    """The content security policy allows only the page's own scripts; there is no network request."""
     elsewhere = [one for one in opened.asked if not one.startswith(("data:image/", page.as_uri()))]
     assert elsewhere == []
     assert opened.troubles == []
@@ -135,8 +135,8 @@ def test_nothing_is_loaded_and_nothing_of_the_data_runs(opened: Tab, page: Path)
     assert any("Content Security Policy" in one for one in opened.troubles)
 
 
-def test_the_library_is_as_it_was_made() -> None:
-    """Each of its files has the bytes that its makers published."""
+def test_the_bundled_leaflet_is_unchanged() -> None:
+    """Each of its files has the SHA-256 of the published release."""
     for name, known in SHA256.items():
         assert name.startswith(LEAFLET)
         assert hashlib.sha256(files("flows.publish").joinpath(name).read_bytes()).hexdigest() == known

@@ -1,4 +1,4 @@
-"""The scale of things: the same ground pixel and hectares in settings, plans, pages, receipts and words."""
+"""The ground pixel and the hectares are the same in settings, plans, pages, receipts and texts."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from tests.users.zone_sketches import sketch
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "ground-and-zones.md"
 
 
-def test_the_example_of_a_pose_shows_the_farm_as_large_as_it_says() -> None:
-    """Settings' example, by height and by range, and the page of the ground see the farm's own ground pixel."""
+def test_example_poses_see_the_farms_ground_pixel() -> None:
+    """The settings' examples, by height and by range, and the page on the ground agree within 1 % (hectares 3 %)."""
     shape, camera = (1024, 1280), LineCamera()
     told = {one.name: one.metadata["json_schema_extra"]["example"] for one in fields(RigPose)}
     common = {name: told[name] for name in ("lon_deg", "lat_deg", "heading_deg", "tilt_deg")}
@@ -40,23 +40,23 @@ def test_the_example_of_a_pose_shows_the_farm_as_large_as_it_says() -> None:
         assert seen.hectares == pytest.approx(own.hectares, rel=0.03)
 
 
-def test_the_farm_says_how_large_it_is() -> None:
-    """Without a pose, by its own ground pixel."""
+def test_the_farm_has_its_own_scale() -> None:
+    """Without a pose the farm's own ground pixel gives its hectares."""
     scene = farm_scene(1, (20, 50), bands=2)
     scale = place_of_field(load_settings(), scene).scale(LineCamera().ifov_rad)
     assert (scale.pixel_m, scale.hectares) == (FARM_PIXEL_M, pytest.approx(20 * 50 * FARM_PIXEL_M**2 / 1e4))
 
 
-def test_a_receipt_says_no_metres_where_nobody_knows(surveyed_png: Survey, tmp_path: Path) -> None:
-    """A picture without a place is told by its angles alone."""
+def test_a_receipt_without_a_place_has_no_metres(surveyed_png: Survey, tmp_path: Path) -> None:
+    """A picture without a place is described in pixels and view angles only."""
     receipt = surveyed_png(tmp_path / "archive").receipt
     assert receipt["field"]["ground_pixel_m"] is None
     assert receipt["field"]["size_px"] == [128, 96]
     assert dict(finding_rows(receipt))["field"] == "view 0.775 x 0.581 degrees"
 
 
-def test_words_are_those_of_the_figures() -> None:
-    """Field, ground pixel and pace stand in one row."""
+def test_the_field_row_has_the_values_of_the_receipt() -> None:
+    """View, range, hectares, ground pixel and pace are in one row."""
     field = {
         "view_deg": [7.74, 6.2],
         "ground_pixel_m": 0.12,
@@ -73,7 +73,7 @@ DOWN = {"pose.lon_deg": 7.6, "pose.lat_deg": 51.96, "pose.height_m": 100, "pose.
 
 @pytest.mark.usefixtures("no_effects")
 def test_hectares_are_those_of_the_area(flags_png: Flags, tmp_path: Path) -> None:
-    """With an area of interest the ground, and what is scanned in an hour, is that of the area."""
+    """Half of the field as area of interest halves the hectares and gives a kept fraction of 0.5."""
     asked = flags_png(tmp_path, budget="0.8") | DOWN
     whole = plan_content(load_settings(None, asked))["field"]
     place = {"type": "name", "properties": {"name": "EPSG:32632"}}

@@ -1,4 +1,4 @@
-"""Area of interest, no-go zones and plots: a survey keeps to them from its lines to its areas, and says so."""
+"""Area of interest, no-go zones and plots limit a survey from its lines to its areas, and the receipt lists them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ NARROW = {"camera.samples": 64, "budget": "1"}
 
 
 def drawn(out: Path, published: Published) -> ClassMap:
-    """The class map of a run."""
+    """Return the class map of a run."""
     return load_class_map(out / published.receipt["products"]["class_map"])
 
 
@@ -43,7 +43,7 @@ Opened = Callable[..., SurveyRun]
 
 @pytest.fixture
 def opened(scene_files: Path, weights: Path, tmp_path: Path) -> Opened:
-    """Open a survey of the small picture with such settings, without running it."""
+    """Return a function that opens a survey of the small picture with given settings, without running it."""
 
     def open_with(**given: Any) -> SurveyRun:
         basic = {"scene": str(scene_files / "scene.png"), "source": "sim", "weights": str(weights), "engine": "plain"}
@@ -55,7 +55,7 @@ def opened(scene_files: Path, weights: Path, tmp_path: Path) -> Opened:
 
 @pytest.fixture(scope="module")
 def zones(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Files of an area, a no-go zone and plots, in pixels."""
+    """Return files of an area, a no-go zone and plots, in pixels."""
     folder = tmp_path_factory.mktemp("zones")
     return {
         "zones.area": sketch(folder / "area.geojson", {"field": AREA}),
@@ -68,29 +68,29 @@ def zones(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 def kept_to(
     survey_png: Survey, zones: dict[str, str], tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, Published]:
-    """A survey that keeps to all of them."""
+    """Return the archive and the run of a survey with the area, the no-go zone and the plots."""
     out = tmp_path_factory.mktemp("kept") / "archive"
     with without_effects():
         return out, survey_png(out, **NARROW, **zones)
 
 
 def inside(shape: shapely.Geometry) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """Pixels of the picture whose centres lie in a polygon, by shapely alone."""
+    """Return a mask of the pixels whose centres lie in a polygon, by shapely alone."""
     x, y = np.meshgrid(np.arange(128) + 0.5, np.arange(96) + 0.5)
     return np.asarray(shapely.contains_xy(shape, x, y))
 
 
-def test_the_map_is_that_of_the_area_without_the_no_go_zones(kept_to: tuple[Path, Published]) -> None:
-    """Inside every pixel has a class and a confidence, elsewhere none has."""
+def test_the_class_map_covers_the_area_without_the_no_go_zones(kept_to: tuple[Path, Published]) -> None:
+    """Pixels there have a class and a confidence; all other pixels have neither."""
     found, wanted = drawn(*kept_to), inside(AREA) & ~inside(NO_GO)
     classed = found.classes != UNLABELLED
-    assert (classed != wanted).sum() <= 2 * (NO_GO.length + AREA.length) / 100  # on the border alone, if at all
+    assert (classed != wanted).sum() <= 2 * (NO_GO.length + AREA.length) / 100  # on the border only, if at all
     assert np.array_equal(classed, np.isfinite(found.confidence))
     assert not classed[inside(NO_GO)].any()
 
 
-def test_no_patch_outside_or_in_a_no_go_zone_is_asked_for(kept_to: tuple[Path, Published]) -> None:
-    """Scores there are 0, no rank is given, and no patch is cut that touches a no-go zone."""
+def test_patches_outside_or_in_a_no_go_zone_are_never_chosen(kept_to: tuple[Path, Published]) -> None:
+    """Their score is 0 and they have no rank; a patch that touches a no-go zone is excluded as a whole."""
     out, published = kept_to
     products = published.receipt["products"]
     attention = load_attention(out / products["attention"])
@@ -106,8 +106,8 @@ def test_no_patch_outside_or_in_a_no_go_zone_is_asked_for(kept_to: tuple[Path, P
     assert (attention.score.ravel()[barred] == 0).all()
 
 
-def test_lines_off_the_area_are_left(kept_to: tuple[Path, Published], opened: Opened, zones: dict[str, str]) -> None:
-    """Coarse pass, full scan and reference of the reading are of the area: all take less than for the field."""
+def test_lines_outside_are_left_out(kept_to: tuple[Path, Published], opened: Opened, zones: dict[str, str]) -> None:
+    """Coarse pass, full scan and the reference of the reading cover the area only, and cost less than the field's."""
     rest = {"camera": {"samples": 64}, "budget": 1.0}
     run = opened(zones={name.partition(".")[2]: path for name, path in zones.items()}, **rest)
     kept = run.plan
@@ -118,14 +118,14 @@ def test_lines_off_the_area_are_left(kept_to: tuple[Path, Published], opened: Op
     assert kept_to[1].receipt["savings"]["capture_s"]["full"] == pytest.approx(kept.full_s)
 
 
-def test_accuracy_is_of_the_area(kept_to: tuple[Path, Published]) -> None:
-    """The pixels that were judged are those that have a class."""
+def test_accuracy_counts_the_pixels_of_the_area(kept_to: tuple[Path, Published]) -> None:
+    """The number of evaluated pixels is the number of pixels with a class."""
     found = drawn(*kept_to)
     assert kept_to[1].receipt["accuracy"]["pixels"] == (found.classes != UNLABELLED).sum()
 
 
-def test_plots_are_told_in_receipt_and_csv(kept_to: tuple[Path, Published]) -> None:
-    """Shares sum to 1, pixels are those of the map, and a plot beside the field has none."""
+def test_plots_are_listed_in_receipt_and_csv(kept_to: tuple[Path, Published]) -> None:
+    """Fractions, pixels and confidence are those of the map; a plot outside of the field has 0 pixels."""
     _, published = kept_to
     found, table = drawn(*kept_to), pandas.read_csv(published.folder / "plots.csv").set_index("plot")
     rows = {row["plot"]: row for row in published.receipt["plots"]}
@@ -142,8 +142,8 @@ def test_plots_are_told_in_receipt_and_csv(kept_to: tuple[Path, Published]) -> N
     assert "north" in (published.folder / "report.html").read_text(encoding="utf-8")
 
 
-def test_nothing_is_believed_of_what_was_left_out(kept_to: tuple[Path, Published]) -> None:
-    """What the next visit remembers has no class where zones left pixels out."""
+def test_excluded_pixels_have_no_class_probabilities(kept_to: tuple[Path, Published]) -> None:
+    """The prior map for the next visit has neither class nor age where the zones exclude pixels."""
     out, published = kept_to
     values, age, _ = ProbabilityStore(out / published.receipt["products"]["class_probabilities"]).read()
     classed = drawn(*kept_to).classes != UNLABELLED
@@ -151,10 +151,10 @@ def test_nothing_is_believed_of_what_was_left_out(kept_to: tuple[Path, Published
     assert np.array_equal(np.isfinite(age), classed)
 
 
-def test_a_visit_with_zones_keeps_the_memory_of_the_rest(
+def test_a_visit_with_zones_keeps_the_prior_map_outside_of_them(
     survey_png: Survey, surveyed_png: Survey, zones: dict[str, str], tmp_path: Path
 ) -> None:
-    """What was known outside of the area is known afterwards, and no look counts there."""
+    """Outside of the area the classes stay those of the prior map, and no pass is counted."""
     first = surveyed_png(tmp_path)
     second = survey_png(tmp_path, visit="second", prior="latest", accuracy=False, **zones)
     before, after = (
@@ -167,8 +167,8 @@ def test_a_visit_with_zones_keeps_the_memory_of_the_rest(
     assert (after[2][away] <= before[2][away] + 1e-6).all()
 
 
-def test_a_zone_of_the_whole_field_changes_no_bit(survey_png: Survey, surveyed_png: Survey, tmp_path: Path) -> None:
-    """Every store has the key that it has without zones: nothing is made."""
+def test_an_area_of_the_whole_field_changes_no_key(survey_png: Survey, surveyed_png: Survey, tmp_path: Path) -> None:
+    """Every store has its key without zones, so the survey makes no new store."""
     surveyed_png(tmp_path / "archive")
     area = sketch(tmp_path / "all.geojson", {"all": shapely.box(-5, -5, 200, 200)})
     published = survey_png(tmp_path / "archive", **{"zones.area": area})
@@ -176,8 +176,8 @@ def test_a_zone_of_the_whole_field_changes_no_bit(survey_png: Survey, surveyed_p
     assert "zones" not in published.receipt
 
 
-def test_polygons_in_any_crs_are_the_same_zones(opened: Opened, tmp_path: Path) -> None:
-    """The far half of the field on the ground in metres, degrees and with axes north before east: one mask."""
+def test_polygons_in_any_crs_give_the_same_mask(opened: Opened, tmp_path: Path) -> None:
+    """The far half of the field is given in metres, in degrees, in web Mercator and in LAEA (axes north, east)."""
     place = opened(pose=POSE).zones.place
     west, south, east, north = place.outline.bounds
     half = shapely.intersection(place.outline, shapely.box(west, (south + north) / 2, east, north))
@@ -188,7 +188,7 @@ def test_polygons_in_any_crs_are_the_same_zones(opened: Opened, tmp_path: Path) 
         masks.append(found.kept)
     assert 0.2 < masks[0].mean() < 0.8
     differ = [(mask != masks[0]).sum() for mask in masks]
-    assert max(differ) <= 16  # of 12 288: datums are half a millimetre apart there and back, a pixel has 7
+    assert max(differ) <= 16  # of 12 288: datums differ by half a millimetre after a round trip, a pixel has 7
 
 
 @pytest.mark.parametrize(
@@ -203,30 +203,30 @@ def test_polygons_in_any_crs_are_the_same_zones(opened: Opened, tmp_path: Path) 
     ],
     ids=["beside", "at the border", "tiny", "no place", "another farm", "all of it"],
 )
-def test_a_wrong_zone_is_refused(
+def test_a_zone_off_the_field_or_over_all_of_it_is_refused(
     opened: Opened, tmp_path: Path, kind: str, box: Any, crs: int | None, pose: Any, words: str
 ) -> None:
-    """One message with both extents, or what is missing; a no-go zone over everything leaves no empty map."""
+    """The message gives both extents or what is missing; a no-go zone over the whole field gives no empty map."""
     path = sketch(tmp_path / ("zone.gpkg" if crs else "zone.geojson"), {"a": shapely.box(*box)}, crs)
     with pytest.raises(ZoneError, match=words):
         opened(zones={kind: path}, pose=pose)
 
 
-def test_a_no_go_zone_beside_the_field_is_told(opened: Opened, tmp_path: Path) -> None:
-    """It may belong to another field of the farm: a note with both extents, and the survey goes on."""
+def test_a_no_go_zone_off_the_field_is_noted(opened: Opened, tmp_path: Path) -> None:
+    """It may belong to another field of the farm, so the survey runs, with a note of both extents."""
     run = opened(zones={"no_go": sketch(tmp_path / "n.geojson", {"n": shapely.box(200, 0, 210, 9)})})
     assert run.zones.kept is None
     assert any("do not lie on the field" in note for note in run.notes)
 
 
-def test_a_name_without_plots_is_refused() -> None:
-    """The message says which flag is missing."""
+def test_plots_name_without_plots_is_refused() -> None:
+    """The message names the missing flag."""
     with pytest.raises(SettingsError, match="give --plots FILE too"):
         load_settings(None, {"zones.plots_name": "variety"})
 
 
-def test_paths_of_zones_start_at_the_settings_file(tmp_path: Path) -> None:
-    """As every path in it does, with the layer of a GeoPackage kept."""
+def test_paths_of_zones_are_relative_to_the_settings_file(tmp_path: Path) -> None:
+    """The layer of a GeoPackage is kept, and an unset zone stays None."""
     (tmp_path / "s.toml").write_text('[zones]\narea = "area.geojson"\nplots = "plots.gpkg:trial"\n')
     zones = load_settings(tmp_path / "s.toml").zones
     assert (zones.area, zones.plots) == (str(tmp_path / "area.geojson"), str(tmp_path / "plots.gpkg:trial"))

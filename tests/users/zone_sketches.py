@@ -1,4 +1,4 @@
-"""Polygons as users have them: files of named outlines in any coordinates."""
+"""Write polygons as users have them: files of named outlines in any coordinates."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from shapely.geometry.base import BaseGeometry
 
 
 def sketch(path: Path, shapes: Mapping[str, BaseGeometry], crs: Any = None, **choices: Any) -> str:
-    """Write polygons by name, in pixels where there is no CRS; gives the path as a setting."""
+    """Write polygons by name, in pixels if there is no CRS; return the path as a setting."""
     if crs is None:
         features = [
             {"type": "Feature", "properties": {"name": name}, "geometry": shape.__geo_interface__}

@@ -27,7 +27,7 @@ from models.evaluation.metrics import (
     iou_per_class,
     kappa,
 )
-from models.evaluation.placement import CONTROL_FRACTION, Placements, ReadTwice, placement_figures, run_controls
+from models.evaluation.placement import CONTROL_FRACTION, ReadTwice, placement_figures, run_controls
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.geometry.scan import Axis
 from pipeline.simulator.effects.pointing import PointingErrors
@@ -76,7 +76,10 @@ def evaluate(
             readings = np.where(drawn.classes == len(names), drawn.classes, readings)  # unknown in all
             patches = read_in_full(attention, class_map) if chooses else None
             scene = ReadTwice(readings[0], readings[1], scores, judged, gains.frame.grid)
-            fraction, found = control_placements(gains, scene, len(drawn.names), patches, seed=seed)
+            zoned = gains.zones.fractions
+            among = np.ones(len(scene.grid.every_patch()), np.bool_) if zoned is None else zoned > 0
+            fraction = CONTROL_FRACTION if patches is None else len(patches) / max(int(among.sum()), 1)
+            found = run_controls(scene, len(drawn.names), fraction=fraction, seed=seed, among=among)
             none, every = (map_figures(names, found[which][0]) for which in ("none", "all"))
             result |= {
                 "none": none,
@@ -89,16 +92,6 @@ def evaluate(
 
     params = {**model_key, "labels": array_digest(labels), "controls": controls, **source_key}
     return Wanted(build, params, [mosaic, attention, class_map, *sources])
-
-
-def control_placements(
-    gains: PatchGains, scene: ReadTwice, classes: int, patch_index: NDArray[np.intp] | None, *, seed: int
-) -> tuple[float, Placements]:
-    """Judge other placements of as many fine patches as the map has, or of the usual fraction; return that fraction."""
-    fractions = gains.zones.fractions
-    among = np.ones(len(scene.grid.every_patch()), np.bool_) if fractions is None else fractions > 0
-    fraction = CONTROL_FRACTION if patch_index is None else len(patch_index) / max(int(among.sum()), 1)
-    return fraction, run_controls(scene, classes, fraction=fraction, seed=seed, among=among)
 
 
 def map_offset(simulated: SimulatedSource, pointing: Sequence[StageRef]) -> NDArray[np.float64]:

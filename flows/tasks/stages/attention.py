@@ -46,13 +46,13 @@ class PatchGains:
     @property
     def key(self) -> dict[str, Any]:
         """Return the parameters of the gains."""
-        grid, sees = self.frame.grid, self.policy in SEEING_POLICIES
+        grid = self.frame.grid
         return {
             "grid": asdict(grid),
             "policy": self.policy,
             "seed": self.seed if self.policy == "random" else None,
             "mask": None if self.mask is None else array_digest(self.mask),
-            **(region_params(grid) | {"capture": list(self.capture)} if sees else {}),
+            **(region_params(grid) | {"capture": list(self.capture)} if self.policy in SEEING_POLICIES else {}),
             **self.zones.key,
         }
 

@@ -77,8 +77,8 @@ class SweepRecorder:
             found = SignalStatistics(len(self.wavelength_nm), sum(one.lines for one in sweeps) * self.camera.samples)
             before, manifest = 0, load_manifest(inputs[-1]) if self.source.simulates else None
             report(0.0)  # before the first line, which takes a rig some time
-            folder, lit = self.archive.spool_folder(key), self.source.lit(chosen_effects(inputs[-1]), clock)
-            with lit.opened(folder) as source:
+            folder = self.archive.spool_folder(key)
+            with self.source.lit(chosen_effects(inputs[-1]), clock).opened(folder) as source:
                 for sweep in sweeps:
 
                     def taken(count: int, before: int = before) -> None:

@@ -64,14 +64,14 @@ def segment(
 
     With ``least_gain``, patches are chosen here, by their expected gain.
     """
-    grid, left_out, work = gains.frame.grid, gains.zones.left_out, gains.work
+    grid, work = gains.frame.grid, gains.work
 
     def build(path: Path) -> None:
         """Write class map and class probabilities; again without the prior map if it does not agree."""
         lies = FieldShift() if prior is None else prior_map_lies(prior.scan_passes, mosaic)
         stored = None if prior is None else field_prior_map(prior, lies, grid)
         names = create_maps(path, gains, unknown, goes_on=stored is not None)
-        drawing = Drawing(work.weights, mosaic, attention, gains.capture, stored, left_out, unknown, part)
+        drawing = Drawing(work.weights, mosaic, attention, gains.capture, stored, gains.zones.left_out, unknown, part)
         drawn = draw_field(work, drawing, path, least_gain, report)
         if prior is not None:
             figures = _prior_map_figures(prior, reader, names, lies, drawn.comparison)
@@ -154,7 +154,8 @@ def _prior_map_figures(
     """
     put_aside = TURNED if comparison is None else ANOTHER_FIELD if comparison.is_of_another_field else None
     counts: dict[str, int | None] = dict.fromkeys(("differing_px", "expected_differing_px", "changed_px"))
-    compared, pairs = 0 if comparison is None else int(comparison.changed.sum()), list[tuple[int, int, str, str]]()
+    compared = 0 if comparison is None else int(comparison.changed.sum())
+    pairs: list[tuple[int, int, str, str]] = []
     if comparison is not None and put_aside is None:
         beyond = comparison.beyond
         pairs = [

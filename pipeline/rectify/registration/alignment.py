@@ -168,7 +168,8 @@ def _correlate(first: Floats, second: Floats, reach: int) -> tuple[Floats, Float
 
     Shifts with too little in common, or without variance there, get a correlation of -1.
     """
-    size, spectra = [scipy.fft.next_fast_len(n + min(reach, n), real=True) for n in first.shape], []
+    size = [scipy.fft.next_fast_len(n + min(reach, n), real=True) for n in first.shape]
+    spectra = []
     for image in (first, second):
         seen = np.isfinite(image)
         values = np.where(seen, image, 0.0)
@@ -186,7 +187,8 @@ def _correlate(first: Floats, second: Floats, reach: int) -> tuple[Floats, Float
     variance = at_shifts(2, 0) - sums[0] ** 2 / count, at_shifts(0, 2) - sums[1] ** 2 / count
     usable = (common >= LEAST_FRACTION * common.max()) & (common > 0)
     usable &= np.minimum(*variance) > FLAT_SPREAD * count
-    correlation, covariance = np.full(common.shape, -1.0), at_shifts(1, 1) - sums[0] * sums[1] / count
+    covariance = at_shifts(1, 1) - sums[0] * sums[1] / count
+    correlation = np.full(common.shape, -1.0)
     correlation[usable] = covariance[usable] / np.sqrt(variance[0][usable] * variance[1][usable])
     return correlation, common
 
@@ -213,22 +215,19 @@ def _refine(first: Floats, second: Floats, integer: NDArray[np.intp]) -> _Fit | 
         if kept.sum() < LEAST_SIDE_PX**2 / 4:
             return None
         one, other = (np.where(both, image - image[both].mean(), 0.0) for image in (one, other))
-        fit = _least_squares(_smoothed(one), _smoothed(other), kept, _phase_shift(one, other))
+        # Start by phase correlation under a Hann window [2], not normalised: noise has equal amplitudes.
+        window = np.outer(*(np.hanning(size + 2)[1:-1] for size in one.shape))
+        start, *_ = skimage.registration.phase_cross_correlation(  # type: ignore[no-untyped-call]
+            one * window, other * window, normalization=None, upsample_factor=UPSAMPLE
+        )
+        start = np.asarray(np.clip(start, -REALIGN_PX, REALIGN_PX))
+        fit = _least_squares(_smoothed(one), _smoothed(other), kept, start)
         if fit is None:
             return None
         if np.abs(fit.shift).max() <= REALIGN_PX:
             return replace(fit, shift=integer + fit.shift)
         integer = integer + np.rint(fit.shift).astype(np.intp)
     return None
-
-
-def _phase_shift(one: Floats, other: Floats) -> Floats:
-    """Return the shift by phase correlation under a Hann window [2], not normalised: noise has equal amplitudes."""
-    window = np.outer(*(np.hanning(size + 2)[1:-1] for size in one.shape))
-    shift, *_ = skimage.registration.phase_cross_correlation(  # type: ignore[no-untyped-call]
-        one * window, other * window, normalization=None, upsample_factor=UPSAMPLE
-    )
-    return np.asarray(np.clip(shift, -REALIGN_PX, REALIGN_PX))
 
 
 def _least_squares(one: Floats, other: Floats, kept: NDArray[np.bool_], shift: Floats) -> _Fit | None:

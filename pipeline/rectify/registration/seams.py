@@ -131,7 +131,8 @@ def _measure_windows(
         pitch = one.broad.sweep.step  # the distance of the pass's lines
         along, scan = (np.arange(low, high, pitch) for low, high in (window.along_px, window.scan_px))
         found = pair_shift(one.seen_at(along, scan), other.seen_at(along, scan), prior_px=reach_px / pitch)
-        measured, middle = None, [(low + high) / 2 for low, high in (window.along_px, window.scan_px)]
+        measured = None
+        middle = [(low + high) / 2 for low, high in (window.along_px, window.scan_px)]
         if found.status == "found":
             here, there = one.line_and_turn(*middle), other.line_and_turn(*middle)
             if here is not None and there is not None:

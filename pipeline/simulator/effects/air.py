@@ -310,7 +310,11 @@ class PathRadiance(LightChange):
         if reach is None:
             return Bound(0.0, "the scene has no distance")
         lost = -np.expm1(-extinction_per_m(rig.air, probe.wavelength_nm) * reach[1])
-        worst = float((_contrast(probe, rig) * lost).max(initial=0.0))
+        contrast = probe.level  # at most the greater of both, over the unit
+        if probe.white_e is not None:
+            horizon = rig.air.airlight_fraction * probe.white_e * np.maximum(DRIFT.gain_range(probe, rig).greatest, 1.0)
+            contrast = np.maximum(probe.level, horizon / (probe.unit_least_dn * rig.camera.electrons_per_dn))
+        worst = float((contrast * lost).max(initial=0.0))
         most = f"at most {lost.max(initial=0.0):.2%} of the light"
         return Bound(worst, f"air takes {most} and adds its own, over {format_reach(reach)}")
 
@@ -366,14 +370,6 @@ def rayleigh_per_m(wavelength_nm: Floats) -> Floats:
     """
     micron = wavelength_nm * 1e-3
     return 1 / (micron**4 * (115.6406 - 1.3366 / micron**2)) / AIR_MASS_M
-
-
-def _contrast(probe: Probe, rig: Rig) -> Floats:
-    """Bound the difference of a signal and the light of endless air by the greater of both, over the unit, (band,)."""
-    if probe.white_e is None:
-        return probe.level
-    horizon = rig.air.airlight_fraction * probe.white_e * np.maximum(DRIFT.gain_range(probe, rig).greatest, 1.0)
-    return np.maximum(probe.level, horizon / (probe.unit_least_dn * rig.camera.electrons_per_dn))
 
 
 ABSORPTION, PATH_RADIANCE = Absorption(), PathRadiance()

@@ -126,7 +126,8 @@ class Defocus(Blur):
     cost_ns = MappingProxyType({"disc": 5.7})  # of seven points
 
     def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
-        none, (along, scan) = np.zeros((2, len(wavelength_nm))), defocus_px(rig, rig.air.distance_m, normal).tolist()
+        none = np.zeros((2, len(wavelength_nm)))
+        along, scan = defocus_px(rig, rig.air.distance_m, normal).tolist()
         return Moments(none, none, disc=(along, scan))
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:

@@ -101,10 +101,10 @@ def noise_electrons(signal: NDArray[np.floating], rig: Rig, binning: int = 1) ->
 
     ``signal`` is the mean of ``binning`` samples, each with noise of its own, and the noise is that of the mean.
     """
-    camera, quantised = rig.camera, rig.camera.electrons_per_dn**2 / 12
+    quantised = rig.camera.electrons_per_dn**2 / 12
     if rig.detector.noiseless:
         return np.full_like(signal, np.sqrt(quantised / binning))
-    noise: Radiance = np.sqrt(np.maximum(signal, 0) + np.float32(camera.read_noise_e**2 + quantised))
+    noise: Radiance = np.sqrt(np.maximum(signal, 0) + np.float32(rig.camera.read_noise_e**2 + quantised))
     return noise if binning == 1 else noise / np.float32(np.sqrt(binning))
 
 

@@ -103,10 +103,8 @@ class SceneSampler:
             light[:] = 0
             self._gather(pixels, steps, light[None], np.zeros(kernels, np.intp), gains)
             return light
-        gains, mixing = (
-            np.ones((kernels, components), np.float32),
-            _Mixing.of(fractions, self.footprint.between, spectra),
-        )
+        gains = np.ones((kernels, components), np.float32)
+        mixing = _Mixing.of(fractions, self.footprint.between, spectra)
         at_once = max(MOST_PARTS // (kernels * components), 1)
         for first in range(0, count, at_once):
             chunk = slice(first, min(first + at_once, count))
@@ -181,7 +179,11 @@ def kernels_of(footprint: Footprint) -> compiled_loops.PartedKernels:
     variance = np.array(variance + about[:, None], order="C")
     between = slit**2 / 12 * (1 - 1 / across**2) + float((points[1] ** 2).mean())
     shift = np.array(footprint.shift, np.float32, order="C")
-    return compiled_loops.PartedKernels(shift, variance, between, part_places(footprint))
+    turn = ((np.arange(across) + 0.5) / across - 0.5) * slit
+    run = ((np.arange(along) + 0.5) / along - 0.5) * pixel
+    boxes = np.stack([np.repeat(turn, along), np.tile(run, across)])  # across and along, in px of the camera
+    parts = (boxes[:, :, None] + points[::-1, None]).reshape(2, -1).astype(np.float32)  # boxes at a disc's points
+    return compiled_loops.PartedKernels(shift, variance, between, parts)
 
 
 def place_parts(footprint: Footprint, views: RayViews) -> tuple[Floats, Radiance]:
@@ -196,12 +198,3 @@ def place_parts(footprint: Footprint, views: RayViews) -> tuple[Floats, Radiance
     for kernel in range(footprint.kernels):
         compiled_loops.place_parts(table, beside, kernel, kernels, scale[kernel], off[kernel])
     return scale, off
-
-
-def part_places(footprint: Footprint) -> Radiance:
-    """Return the middles of the parts, (2, part) across and along, in px of the camera: of boxes at a disc's points."""
-    across, along = footprint.parts
-    turn = ((np.arange(across) + 0.5) / across - 0.5) * footprint.box[0]
-    run = ((np.arange(along) + 0.5) / along - 0.5) * footprint.box[1]
-    boxes, points = np.stack([np.repeat(turn, along), np.tile(run, across)]), disc_points(footprint.disc)[0][::-1]
-    return (boxes[:, :, None] + points[:, None]).reshape(2, -1).astype(np.float32)

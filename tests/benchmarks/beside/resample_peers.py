@@ -1,4 +1,4 @@
-"""Other libraries that resample an image: each read at the points of one rotated grid, in the layout it likes best."""
+"""Other libraries that resample an image: each reads the points of one rotated grid, in its fastest layout."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from numpy.typing import NDArray
 
 from flows.tradeoff.stages import draw_waves
 
-SIDE, BANDS, EDGE = 256, 270, 176  # of the sweep; of the output grid, which lies inside it when turned
+SIDE, BANDS, EDGE = 256, 270, 176  # px of the sweep; bands; px of the output grid, which stays inside when rotated
 TURN_DEG = 14.0
-CRS, ORIGIN_M = "EPSG:32631", (500_000.0, 5_000_000.0)  # one metre a pixel, for what wants to be on the Earth
-FEW = 18  # bands of the libraries that take one at a time and long for each
+CRS, ORIGIN_M = "EPSG:32631", (500_000.0, 5_000_000.0)  # one metre a pixel, for libraries that need georeferenced data
+FEW = 18  # bands for slow libraries that take one band at a time
 
 
 @dataclass(frozen=True)
 class Peer:
-    """One library: what is timed, how its result becomes (y * x, band), and of how many bands."""
+    """One library: its timed call, the function that gives its result as (y * x, band), and its number of bands."""
 
     name: str
     call: Callable[[], Any]
     by_pixel: Callable[[Any], NDArray[np.float32]]
     bands: int
-    prepare: Callable[[], object] | None = None  # the index it builds first
+    prepare: Callable[[], object] | None = None  # builds its index first
 
 
 @dataclass(frozen=True)
 class Turned:
-    """A sweep of waves and a grid turned against it; ``truth`` is what the waves are at the grid's points."""
+    """A sweep of waves and a grid rotated against it; ``truth`` has the waves' values at the grid's points."""
 
     samples: NDArray[np.float32]  # (line, sample, band)
     coordinates: NDArray[np.float64]  # (y * x, 2) line and sample
@@ -40,19 +40,19 @@ class Turned:
 
     @property
     def planes(self) -> NDArray[np.float32]:
-        """The sweep band by band, (band, line, sample)."""
+        """Return the sweep band by band, (band, line, sample)."""
         return np.ascontiguousarray(np.moveaxis(self.samples, 2, 0))
 
     def error(self, out: NDArray[np.floating]) -> float:
-        """Root mean square error over the standard deviation, of the first bands, which all libraries give."""
+        """Return the RMSE over the standard deviation, for the first bands, which all libraries give."""
         truth = self.truth[:, :FEW]
         return float(np.sqrt(np.mean((out[:, :FEW] - truth) ** 2)) / np.std(truth))
 
 
 def turned_waves(falloff: float, bands: int = BANDS) -> Turned:
-    """Waves of 4 to 40 px, sampled on a sweep, with a grid turned by 14 degrees about the middle.
+    """Return waves of 4 to 40 px, sampled on a sweep, with a grid rotated by 14 degrees about the centre.
 
-    Their amplitude is the period to the power of ``falloff``: 1 as in pictures of natural scenes, 0 for all alike.
+    The amplitude is the period to the power of ``falloff``: 1 as in images of natural scenes, 0 for equal amplitudes.
     """
     waves = draw_waves(0, bands, (4.0, 40.0))
     size = np.linalg.norm(waves.frequency, axis=1)[:, None] ** -falloff
@@ -68,7 +68,7 @@ def turned_waves(falloff: float, bands: int = BANDS) -> Turned:
 
 
 def peers(scene: Turned, order: int, only: str | None = None) -> list[Peer]:
-    """Each library at one order (0 nearest, 1 linear, 3 cubic convolution), or ``only`` one of them."""
+    """Return each library at one order (0 nearest, 1 linear, 3 cubic convolution), or ``only`` one of them."""
     makers = {
         "cv2.remap": _cv2_remap,
         "torch grid_sample": _grid_sample,
@@ -86,7 +86,7 @@ def peers(scene: Turned, order: int, only: str | None = None) -> list[Peer]:
 
 
 def spline(scene: Turned) -> Peer:
-    """The order-3 spline of scipy, its filter counted."""
+    """Return scipy's order-3 spline, with its prefilter in the time."""
     return _map_coordinates(scene, 3)
 
 
@@ -95,7 +95,7 @@ def _by_pixel(planes: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _cv2_remap(scene: Turned, order: int) -> Peer:
-    """The sweep parted into groups of bands beforehand, the result joined, for that is what the others give."""
+    """Split the sweep into groups of bands before the timing; the result is joined, as the other libraries give it."""
     parts, joined = cv2_parts(scene, order), np.empty((EDGE, EDGE, BANDS), np.float32)
     return Peer(
         "cv2.remap", lambda: np.concatenate(parts(), axis=2, out=joined), lambda _: joined.reshape(-1, BANDS), BANDS
@@ -103,7 +103,7 @@ def _cv2_remap(scene: Turned, order: int) -> Peer:
 
 
 def cv2_parts(scene: Turned, order: int) -> Callable[[], list[NDArray[np.float32]]]:
-    """cv2.remap by groups of bands: 90 are faster than 4 and 1 where it takes as many, for cubic 4 than 1."""
+    """Return cv2.remap by groups of bands: 90 are faster than 4 and 1 if it takes as many; for cubic 4 than 1."""
     import cv2
 
     cv2.setNumThreads(1)
@@ -167,11 +167,11 @@ def _rasterio_reproject(scene: Turned, order: int) -> Peer:
     kernel = {0: Resampling.nearest, 1: Resampling.bilinear, 3: Resampling.cubic}[order]
     planes, out = scene.planes, np.zeros((BANDS, EDGE, EDGE), np.float32)
     (yy, yx, y0), (xy, xx, x0) = scene.affine
-    # Its coordinates count from the corner of the first pixel, y upwards.
+    # Its coordinates start at the corner of the first pixel, with y upwards.
     grid = Affine(xx, xy, x0 + 0.5 - (xx + xy) / 2, -yx, -yy, -(y0 + 0.5 - (yx + yy) / 2))
     origin, down = Affine.translation(*ORIGIN_M), Affine.scale(1, -1)
     place = {"src_transform": origin @ down, "dst_transform": origin @ grid, "src_crs": CRS, "dst_crs": CRS}
-    # A turned grid seems coarser to GDAL, which then widens its kernels: three times slower, and less exact.
+    # To GDAL a rotated grid seems coarser, so it widens its kernels: three times slower, and less exact.
     same_scale = {"XSCALE": 1, "YSCALE": 1}
     return Peer(
         "rasterio reproject",
@@ -182,7 +182,7 @@ def _rasterio_reproject(scene: Turned, order: int) -> Peer:
 
 
 def _pyresample(scene: Turned, order: int) -> Peer:
-    """The grid is an area of metres, the sweep a swath of longitudes and latitudes."""
+    """Return pyresample, nearest or bilinear: the grid is an area in metres, the sweep a swath in degrees."""
     from pyresample import kd_tree
     from pyresample.bilinear import NumpyBilinearResampler  # type: ignore[attr-defined]
 
@@ -205,7 +205,7 @@ def _swath_and_area(scene: Turned) -> tuple[Any, Any]:
 
     pixel = np.argwhere(np.ones((SIDE, SIDE), bool))
     back = np.linalg.inv(scene.affine[:, :2])
-    y, x = (back @ (pixel - scene.affine[:, 2]).T).reshape(2, SIDE, SIDE)  # where the sweep's pixels lie on the grid
+    y, x = (back @ (pixel - scene.affine[:, 2]).T).reshape(2, SIDE, SIDE)  # positions of the sweep's pixels on the grid
     east, north = ORIGIN_M
     lon, lat = pyproj.Transformer.from_crs(CRS, "EPSG:4326", always_xy=True).transform(east + x, north - y)
     extent = (east - 0.5, north - EDGE + 0.5, east + EDGE - 0.5, north + 0.5)

@@ -1,4 +1,4 @@
-"""Effects: bounds against measured changes over random scenes and rigs, and what the choice of effects saves."""
+"""Effects: bounds against measured changes over random scenes and rigs, and savings by the choice of effects."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ from tests.pipeline.simulator.pupil_reference import distances, random_tile
 from tests.pipeline.simulator.random_cases import Case, random_case
 from tests.pipeline.simulator.sparse_cases import sparse_case
 
-CASES = range(1000, 1200)  # none of them was looked at while bounds were made
+CASES = range(1000, 1200)  # none of them was used while the bounds were developed
 SPARSE_CASES = range(1000, 1070)
 TILES = 100
 MOST_LOOSE = 6.0  # median of bound over measured change
-MOST_BINNING = 8  # every case is stored as samples, and in sums of 2 to so many
+MOST_BINNING = 8  # every case is stored as samples, and in sums of 2 up to this number
 TOLERANCE = 0.1
 LEAST_SAVED = 3.0
-LINES = range(504, 520)  # of the farm's sweeps that are timed
+LINES = range(504, 520)  # timed lines of the farm's sweeps
 RIGS = {"rig at rest": Rig(), "rig 30 m away": Rig(air=Air(distance_m=30.0))}
 
 
 def rows() -> list[Row]:
-    """Bounds by effect and variant, then tolerance and processor time of the farm."""
+    """Return the bounds by effect and variant, then tolerance and processor time on the farm."""
     sparse = _bounds({number: sparse_case(number) for number in SPARSE_CASES}, "scenes of which looks see little")
     return [
         *_bounds({number: random_case(number) for number in CASES}, "random scenes and rigs"),
@@ -51,7 +51,7 @@ def rows() -> list[Row]:
 
 
 def _pupil() -> list[Row]:
-    """How far everything on is from the pupil's own integral."""
+    """Return the distances between all effects enabled and the pupil integral."""
     found = []
     for what, focus_m in (("sharp", None), ("40 m away, focused at infinity", math.inf)):
         far = np.sort(np.concatenate([distances(random_tile(number, focus_m)) for number in range(TILES)]))

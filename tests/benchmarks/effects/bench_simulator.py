@@ -1,4 +1,4 @@
-"""Simulator: a sweep of a large farm, rendered and read out as decided at a tenth of the noise, beside all effects."""
+"""Simulator: a sweep of a large farm, with effects chosen at a tenth of the noise, against all effects."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ BLURS: dict[Effect, str] = {DIFFRACTION: "airy", ABERRATION: "gaussian", KEYSTON
 
 @dataclass(frozen=True)
 class Survey:
-    """The scene, how it is swept, and what was decided for it."""
+    """The scene, its sweeps, and the chosen effects."""
 
     scene: RasterScene
     rig: Rig
@@ -42,7 +42,7 @@ class Survey:
     decision: Decision
 
     def blocks(self) -> list[SweepBlock]:
-        """Lines in the middle of one half of an outer sweep, some at a time."""
+        """Return blocks of lines in the middle of one half of an outer sweep."""
         exposures = self.rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS
         white = self.scene.white_reference_electrons.astype(np.float64) * exposures
         first = SIZE // 4 - LINES // 2
@@ -53,12 +53,12 @@ class Survey:
 
     @property
     def values(self) -> int:
-        """Px times bands of all blocks."""
+        """Return the number of pixels times bands of all blocks."""
         return LINES * self.rig.camera.samples * len(self.scene.wavelength_nm)
 
 
 def rows() -> list[Row]:
-    """Rate, fraction of a copy, savings, memory; and what the footprint's variants cost and miss."""
+    """Return rate, ratio to a copy, savings and memory, then cost and error of the footprint's variants."""
     survey = _survey()
     decision, blocks = survey.decision, survey.blocks()
     cheap = cheap_effects(decision)
@@ -118,7 +118,7 @@ def _simulated(survey: Survey, chosen: dict[Effect, str], blocks: list[SweepBloc
 
 
 def cheap_effects(decision: Decision) -> dict[Effect, str]:
-    """Everything that the rig has, each in the cheapest variant whose own error is a tenth of the tolerance at most."""
+    """Return all effects of the rig, each in its cheapest variant with an error of at most a tenth of the tolerance."""
     found: dict[Effect, str] = {}
     for menu in (one.menu for one in decision.taken if one.menu.present):
         within = [option for option in menu.variants if option.error <= 0.1 * decision.tolerance]
@@ -128,7 +128,7 @@ def cheap_effects(decision: Decision) -> dict[Effect, str]:
 
 
 def _take(survey: Survey) -> Callable[[], None]:
-    """Copy as many rows of bands as there are samples, out of a table larger than the cache."""
+    """Return a call that copies as many rows of bands as there are samples, from a table larger than the cache."""
     bands, samples = len(survey.scene.wavelength_nm), survey.rig.camera.samples
     table = np.random.default_rng(0).random((60_000, bands), np.float32)
     index = np.random.default_rng(1).integers(0, len(table) - samples, LINES)[:, None] + np.arange(samples)
@@ -142,7 +142,7 @@ def _take(survey: Survey) -> Callable[[], None]:
 
 
 def _footprints(survey: Survey) -> list[Row]:
-    """Cost and error of each variant of the slit, sharp and with the rig's blurs, at the corner of the survey."""
+    """Return cost and error of each variant of the slit, without and with the rig's blurs, at the survey's corner."""
     middle = survey.blocks()[0]
     corner = replace(middle, lines=range(AT_ONCE))
     found = []

@@ -1,9 +1,9 @@
-"""Planted spectra: does the condensed signal keep what a matched filter finds in raw lines at the same rate of alarms?
+"""Planted spectra: does the stored signal keep the detections of a matched filter at the same false-alarm rate?
 
-1000 spectra a size and strength, each with a smooth signature of its own over all bands, are added to a small farm's
-raw lines and to Indian Pines. Components are those of the field without them, as of one rare thing in a large field.
-The filter knows the signature, the field's mean and its covariance; its limit is the one that a field without planted
-spectra passes once, which is what noise may mark as rare. Kept is what the filter finds in restored spectra.
+For each size and strength, 1000 spectra with smooth signatures over all bands are added to a small farm's raw lines and
+to Indian Pines. Components are those of the field without them, as for one rare object in a large field. The filter
+knows the signature, and the field's mean and covariance. Its threshold is passed once in a field without planted
+spectra, like the noise limit of rare spectra. A detection is kept if the filter finds it in restored spectra.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ from pipeline.signal.subspace import SignalStatistics, find_components
 from storage.arrays.cubes import open_raw_cubes
 
 SHAPES = {"1 px": (1, 1), "2 x 2 px": (2, 2), "line of 8 px": (1, 8)}
-STRENGTHS = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)  # deviations of the noise a band; the goal holds from 1 on
-PLANTED, APART, SMOOTH = 1000, 16, 8  # of each kind; px between places; bands that a signature is smooth over
-ALARMS = 1.0  # spectra of a field
-LIMITS = 24  # signatures that the filter's limit is learned of
+STRENGTHS = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)  # standard deviations of the noise a band; the goal holds from 1 on
+PLANTED, APART, SMOOTH = 1000, 16, 8  # of each kind; px between places; bands over which a signature is smooth
+ALARMS = 1.0  # false alarms in a field
+LIMITS = 24  # signatures by which the filter's threshold is set
 FARM = ("--scene", "farm", "--seed", "11", "--size", "512x384", "--seconds", "12")
 
 Values = NDArray[np.float32]
@@ -57,7 +57,7 @@ class Condensed:
 
 
 def rows() -> list[Row]:
-    """Every size and strength on both fields."""
+    """Return the rows of every size and strength on both fields."""
     with tempfile.TemporaryDirectory() as folder:
         found = list(_table(_condensed("farm", _farm_values(Path(folder)))))
     pines = data_folder("indian_pines") / "Indian_pines_corrected.npy"
@@ -67,7 +67,7 @@ def rows() -> list[Row]:
 
 
 def _farm_values(folder: Path) -> Values:
-    """Scene values of all lines of a small survey of the farm; NaN where they may not be used."""
+    """Return scene values of all lines of a small survey of the farm; NaN if unusable."""
     command = [sys.executable, "-m", "flows.cli.main", "survey", *FARM, "--out", str(folder), "--engine", "plain"]
     subprocess.run([*command, "--no-accuracy", "--keep", "raw"], cwd=ROOT, check=True, capture_output=True)
     (capture,) = (folder / "stages" / "capture").iterdir()
@@ -113,20 +113,20 @@ def _table(field: Condensed) -> Iterator[Row]:
 
 
 def _signatures(count: int, noise: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
-    """Smooth spectra (count, band) whose mean square in the noise's variance is 1."""
+    """Return smooth spectra (count, band) with a mean square of 1 relative to the noise variance."""
     shape = gaussian_filter1d(rng.normal(size=(count, len(noise))), SMOOTH, axis=1)
     shape /= np.sqrt(np.mean(shape**2, axis=1, keepdims=True))
     return np.asarray(shape * np.nan_to_num(noise))
 
 
 def _filters(field: Condensed, signatures: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Weights (n, band) of matched filters whose output on the field has a variance of 1."""
+    """Return the weights (n, band) of matched filters with an output variance of 1 on the field."""
     white = signatures @ field.whitening
     return np.asarray(white / np.linalg.norm(white, axis=1, keepdims=True) @ field.whitening)
 
 
 def _limit(field: Condensed, shape: tuple[int, int], rng: np.random.Generator) -> float:
-    """What the filter gives once in the field, summed over a shape; the median of some signatures."""
+    """Return the filter's maximum over the field, summed over a shape; the median of some signatures."""
     filters = _filters(field, _signatures(LIMITS, field.components.noise, rng)).astype(np.float32)
     clean = np.nan_to_num(field.values - np.nan_to_num(field.components.mean).astype(np.float32))
     maps = clean @ filters.T
@@ -137,7 +137,7 @@ def _limit(field: Condensed, shape: tuple[int, int], rng: np.random.Generator) -
 def _trial(
     field: Condensed, shape: tuple[int, int], strength: float, limit: float, rng: np.random.Generator
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_], float]:
-    """Of each planted place: found in raw lines, found in restored ones, rare in all its px; farthest rare value."""
+    """Return for each planted place: found in raw lines, in restored ones, all px rare; and the largest rare error."""
     found, kept, marked, error = list[bool](), list[bool](), list[bool](), 0.0
     mean = np.nan_to_num(field.components.mean)
     while len(found) < PLANTED:
@@ -165,7 +165,7 @@ def _trial(
 def _places(
     ratio: Values, shape: tuple[int, int], rng: np.random.Generator
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Lines and samples (place, px) of shapes that do not touch and lie on usable spectra."""
+    """Return lines and samples (place, px) of shapes that do not touch and lie on usable spectra."""
     top, left = rng.integers(0, APART - max(shape), 2)
     down = np.arange(top, ratio.shape[0] - shape[0], APART)
     across = np.arange(left, ratio.shape[1] - shape[1], APART)

@@ -1,4 +1,4 @@
-"""ls, gc, explain and verify on the archive of a real, tiny survey: what they print, and what they leave."""
+"""ls, gc, explain and verify on the archive of real, tiny surveys: their output and their effects."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.usefixtures("no_effects")
 
 @pytest.fixture
 def archive(two_budgets: Path, tmp_path: Path) -> Path:
-    """A copy of it."""
+    """Return a copy of an archive with two budgets."""
     return Path(shutil.copytree(two_budgets, tmp_path / "archive"))
 
 
@@ -38,7 +38,7 @@ def _json(capsys: pytest.CaptureFixture[str], run: Callable[[], int], code: int 
 
 
 def test_ls_shows_runs_and_stores(two_budgets: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """As JSON with figures; for people with units, in 80 columns, into a pipe as well."""
+    """JSON has plain figures; the table has units and fits 80 columns, also in a pipe."""
     content = _json(capsys, lambda: ls(two_budgets, as_json=True))
     first, second = content["runs"]
     assert (first["survey"], first["budget"], second["budget"], first["seed"]) == ("scene", 0.8, 0.7, 0)
@@ -64,7 +64,7 @@ def test_ls_shows_runs_and_stores(two_budgets: Path, capsys: pytest.CaptureFixtu
 
 
 def test_an_empty_and_a_damaged_archive_are_listed(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """What is damaged or lost is said where it would have stood."""
+    """A damaged or missing item is reported at its place in the list."""
     Archive.open(archive.parent / "empty")
     assert ls(archive.parent / "empty") == DONE
     assert "no runs" in capsys.readouterr().out
@@ -79,8 +79,8 @@ def test_an_empty_and_a_damaged_archive_are_listed(archive: Path, capsys: pytest
     assert "no store is removed" in capsys.readouterr().out
 
 
-def test_explain_shows_lineage_and_what_changed(two_budgets: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The second map differs by its budget, which the plan turned into other sweeps."""
+def test_explain_shows_lineage_and_changes(two_budgets: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The second map differs by its budget, from which the plan made other sweeps."""
     content = _json(capsys, lambda: explain(two_budgets, "class_map", as_json=True))
     (top,) = content["lineage"]
     assert (top["stage"], top["called"]) == ("segment", ["segment"])
@@ -97,8 +97,8 @@ def test_explain_shows_lineage_and_what_changed(two_budgets: Path, capsys: pytes
     assert "fine_s" in out
 
 
-def test_captures_and_runs_are_explained(two_budgets: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Coarse and fine sweeps are not versions of each other; a run has its command, and each store once."""
+def test_explain_covers_captures_and_runs(two_budgets: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Coarse and fine sweeps are not versions of each other; a run has its command, and shows each store once."""
     assert _json(capsys, lambda: explain(two_budgets, "raw_coarse", as_json=True))["before"] is None
     explain(two_budgets, "raw_coarse")
     assert "no other version" in capsys.readouterr().out
@@ -117,8 +117,8 @@ def test_captures_and_runs_are_explained(two_budgets: Path, capsys: pytest.Captu
     assert len(whole) == 1  # lines that were condensed twice are shown once
 
 
-def test_explain_bears_damage_and_circles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A lineage is shown as far as it can be read."""
+def test_explain_shows_damaged_and_circular_lineage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It shows the lineage as far as it can be read."""
     archive = Archive.open(tmp_path)
     small = small_survey(archive)
     flip(small.raw.path / "manifest.json", at=40)
@@ -137,8 +137,8 @@ def test_explain_bears_damage_and_circles(tmp_path: Path, capsys: pytest.Capture
         explain(tmp_path, "../../etc/passwd")
 
 
-def test_a_repair_that_could_do_some_of_it_says_so(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """What is not of the archive is left to people, and so is raw light of a rig: done in part."""
+def test_a_partial_repair_is_reported(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Foreign files and raw lines of a rig cannot be repaired; the exit code is that of a partial success."""
     opened = Archive.open(archive)
     flip(opened.refs("rectify_fine")[0].path / "lines.json")
     (archive / "stages" / "notes.txt").write_text("mine")
@@ -159,8 +159,8 @@ def test_a_repair_that_could_do_some_of_it_says_so(archive: Path, capsys: pytest
     assert [one["uri"] for one in content["problems"]] == ["stages/ingest/cube"]
 
 
-def test_what_is_gone_counts_as_broken(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A store that a run names, and a run whose receipt is empty: no store has to be made anew for it."""
+def test_missing_stores_and_empty_receipts_count_as_damaged(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A run with an empty receipt needs no store to be made again."""
     run = next(archive.glob("runs/*"))
     (run / "receipt.json").write_text("")
     assert run_verify(archive, QUIET) == FAILED
@@ -170,8 +170,8 @@ def test_what_is_gone_counts_as_broken(archive: Path, capsys: pytest.CaptureFixt
     assert content["checked"] - content["whole"] == 2
 
 
-def test_commands_ask_for_the_settings_again(tmp_path: Path) -> None:
-    """Only what differs from the defaults; tables are pointed at."""
+def test_commands_repeat_the_settings_of_a_run(tmp_path: Path) -> None:
+    """They have the differences from the defaults only; tables are mentioned in a comment."""
     flags = {"scene": "farm", "size": "640x512", "bands": "3,4", "controls": False, "camera.exposure_ms": 50}
     told = command({**load_settings(None, flags).to_dict(), "notes": ["x"]}, "archive")
     assert told == ("spectralzoom survey --bands 3,4 --no-controls --size 640x512  # with [camera] as in its receipt")
@@ -193,7 +193,7 @@ def test_commands_ask_for_the_settings_again(tmp_path: Path) -> None:
     ],
 )
 def test_commands_name_scans_that_a_survey_accepts(chosen: dict[str, Any], told: str) -> None:
-    """The settings of a receipt have what the weights chose beside what was asked for."""
+    """The settings of a receipt have both the request and the choice of the weights."""
     source = {"source": "recorded", "scene": "field"} if "sweeps" in chosen else {}
     words = command(parse_settings({**source, **chosen}).to_dict(), "archive").split()[2:]
     assert told in " ".join(words)

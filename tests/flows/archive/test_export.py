@@ -36,7 +36,7 @@ from tests.storage.small_archive import flip
 
 @pytest.fixture(scope="module")
 def exports(tmp_path_factory: pytest.TempPathFactory) -> list[Exported]:
-    """One archive with the same farm twice, without a pose and with one; both exported into one folder."""
+    """Return exports of one farm, without a pose and with one, from one archive into one folder."""
     archive, out = tmp_path_factory.mktemp("surveys") / "field #ä", tmp_path_factory.mktemp("exports").resolve()
     flags = {"size": "128x96", "bands": "20,60,100,150,200", "budget": "0.9", "engine": "plain", "keep": "raw"}
     settings = load_settings(None, {**flags, "out": str(archive), "controls": False, "seed": "1"})
@@ -50,19 +50,19 @@ def exports(tmp_path_factory: pytest.TempPathFactory) -> list[Exported]:
 
 @pytest.fixture
 def plain(exports: list[Exported]) -> Exported:
-    """The survey without a pose."""
+    """Return the survey without a pose."""
     return exports[0]
 
 
 @pytest.fixture
 def posed(exports: list[Exported]) -> Exported:
-    """The survey with a pose."""
+    """Return the survey with a pose."""
     return exports[1]
 
 
 @pytest.mark.parametrize("number", [0, 1])
 def test_images_are_cloud_optimised_and_attention_keeps_its_patches(exports: list[Exported], number: int) -> None:
-    """All checks of the layout pass; one pixel a patch, from the scene's corner on, with the store's scores."""
+    """The attention image has one pixel a patch, from the scene's corner on, with the scores of the store."""
     assert all(is_cog(exports[number].file(key)) for key in ("class_map", "confidence", "attention", "rgb"))
     done = exports[number]
     score, scene = done.store("attention")["score"].values, done.store("class_map").attrs["spatial:transform"]
@@ -75,8 +75,8 @@ def test_images_are_cloud_optimised_and_attention_keeps_its_patches(exports: lis
         assert file.tags()["policy"] == "gain"
 
 
-def test_with_a_pose_images_lie_where_the_zarr_store_lies(posed: Exported) -> None:
-    """Rasterio's CRS, transform and values are those that plain xarray and odc.geo read from the map's store."""
+def test_images_with_a_pose_have_the_grid_of_the_store(posed: Exported) -> None:
+    """CRS, transform and values by rasterio equal those that xarray and odc.geo read from the map's store."""
     store = posed.store("ground_map")
     box = store.odc.geobox
     for key, array in (("class_map", "classes"), ("confidence", "confidence"), ("rgb", "picture")):
@@ -87,8 +87,8 @@ def test_with_a_pose_images_lie_where_the_zarr_store_lies(posed: Exported) -> No
             np.testing.assert_array_equal(np.moveaxis(file.read(), 0, -1).reshape(wanted.shape), wanted)
 
 
-def test_without_a_pose_images_lie_on_angles(plain: Exported) -> None:
-    """No CRS, the Zarr store's own transform in radians, its values, and a tag that says so."""
+def test_images_without_a_pose_have_angular_coordinates(plain: Exported) -> None:
+    """They have no CRS, the store's transform in radians, its values, and a tag that says so."""
     store = xr.open_zarr(
         plain.archive / plain.receipt["products"]["class_map"], consolidated=False, mask_and_scale=False
     )
@@ -108,8 +108,8 @@ def test_without_a_pose_images_lie_on_angles(plain: Exported) -> None:
 
 
 @pytest.mark.parametrize("number", [0, 1])
-def test_images_say_what_they_show_and_of_which_run(exports: list[Exported], number: int) -> None:
-    """Names of classes in the file; run, product, time and program in the tags."""
+def test_images_have_class_names_and_their_run(exports: list[Exported], number: int) -> None:
+    """The tags also have product, time and program."""
     done = exports[number]
     names = done.store("class_map").attrs["class_names"]
     with rasterio.open(done.file("class_map")) as file:
@@ -122,10 +122,10 @@ def test_images_say_what_they_show_and_of_which_run(exports: list[Exported], num
     assert tags["TIFFTAG_SOFTWARE"].startswith("spectralzoom ")
 
 
-@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")  # cubes lie on the camera's grid
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")  # cubes are on the camera's grid
 @pytest.mark.parametrize("number", [0, 1])
-def test_cubes_are_the_archives_bit_for_bit(exports: list[Exported], number: int) -> None:
-    """Sweeps through this project's ENVI reader are the Zarr stores' numbers."""
+def test_cubes_equal_the_archive_bit_by_bit(exports: list[Exported], number: int) -> None:
+    """Sweeps read by this project's ENVI reader have the values of the Zarr stores."""
     done = exports[number]
     mosaic, products = done.store("mosaic"), done.receipt["products"]
     stores = {}
@@ -143,7 +143,7 @@ def test_cubes_are_the_archives_bit_for_bit(exports: list[Exported], number: int
 
 
 def test_the_catalogue_is_valid_and_leads_to_every_file(exports: list[Exported]) -> None:
-    """STAC's schemas accept it, pystac walks it, and every address leads to a file or store that is there."""
+    """STAC's schemas accept it, pystac reads it, and every address is an existing file or store."""
     path = Path(exports[0].answer["collection"])
     assert core_problems(path) == []
     collection = pystac.Collection.from_file(str(path))
@@ -171,8 +171,8 @@ def test_the_catalogue_is_valid_and_leads_to_every_file(exports: list[Exported])
         ("raster", None, ("2026-06-21T08:00:00Z", "2026-06-21T08:05:00Z")),
     ],
 )
-def test_rigs_observe_while_they_run(tmp_path: Path, source: str, visit: str | None, observed: tuple[str, str]) -> None:
-    """Its visit is named by the date; a run of another date used its lines again. A file has the time of its visit."""
+def test_rigs_have_the_time_of_a_run(tmp_path: Path, source: str, visit: str | None, observed: tuple[str, str]) -> None:
+    """A rig's time is that of its run, unless the visit names another date; a file's time is that of its visit."""
     receipt: Any = {"source": source, "started": "2026-06-21T08:00:00Z", "finished": "2026-06-21T08:05:00Z"}
     archive = Archive.open(tmp_path)
     draft = archive.new_run("field")
@@ -180,8 +180,8 @@ def test_rigs_observe_while_they_run(tmp_path: Path, source: str, visit: str | N
     assert ExportedRun(archive, draft.publish(settings={"visit": visit}), receipt).observed == observed
 
 
-def test_items_say_when_where_and_how(plain: Exported, posed: Exported) -> None:
-    """The time of the visit, here of the built-in farm; lineage of the receipt; geometry and CRS only with a pose."""
+def test_items_have_time_place_and_lineage(plain: Exported, posed: Exported) -> None:
+    """The time is that of the farm's visit; geometry and CRS are present with a pose only."""
     receipt, item = posed.receipt, posed.item()
     about = item["properties"]
     assert about["datetime"] == about["end_datetime"] == f"{receipt['started'][:4]}-06-21T11:00:00Z"
@@ -199,11 +199,11 @@ def test_items_say_when_where_and_how(plain: Exported, posed: Exported) -> None:
     assert "no rig pose" in plain.item()["properties"]["description"]
 
 
-SHARED = ("collection.json", ".export.lock")  # of all runs in a folder
+SHARED = ("collection.json", ".export.lock")  # shared by all runs in a folder
 
 
-def test_exported_again_nothing_changes(posed: Exported) -> None:
-    """The latest run without a name, into another folder beside the archive: the same bytes, and nothing else."""
+def test_a_second_export_has_the_same_bytes(posed: Exported) -> None:
+    """The latest run, without its name and into another folder, gives the same files."""
     copy = posed.out.parent / "again"
     answer = run_export(posed.archive, None, copy, envi=True, console=QUIET)
     assert answer["run"] == posed.id
@@ -217,8 +217,8 @@ def test_exported_again_nothing_changes(posed: Exported) -> None:
     assert changed == []
 
 
-def test_runs_and_places_that_are_none_are_refused(posed: Exported, tmp_path: Path) -> None:
-    """Runs that there are are named; a place in the archive or below a file is told; the archive verifies."""
+def test_missing_runs_and_bad_folders_are_refused(posed: Exported, tmp_path: Path) -> None:
+    """The message lists runs, or names the place in the archive or below a file; the archive still verifies."""
     with pytest.raises(NoRunError, match=f"no run 'x'; its latest are .*{posed.id}"):
         run_export(posed.archive, "x", tmp_path / "out", envi=False, console=QUIET)
     Archive.open(tmp_path / "empty")
@@ -235,8 +235,8 @@ def test_runs_and_places_that_are_none_are_refused(posed: Exported, tmp_path: Pa
     assert all(finding.problem is None for finding in verify_archive(Archive.open(posed.archive)))
 
 
-def test_a_store_that_is_gone_is_named(posed: Exported, tmp_path: Path) -> None:
-    """Which product it is and what to do; what was written before it stays, and no catalogue names it."""
+def test_a_missing_store_is_reported(posed: Exported, tmp_path: Path) -> None:
+    """The message has product and remedy, and no catalogue is written."""
     archive, out = Path(shutil.copytree(posed.archive, tmp_path / "field-a")), tmp_path / "out"
     shutil.rmtree((archive / posed.receipt["products"]["mosaic"]).parent)
     with pytest.raises(IncompleteStoreError, match=r"the mosaic of run .* does not; run its survey again"):
@@ -244,16 +244,16 @@ def test_a_store_that_is_gone_is_named(posed: Exported, tmp_path: Path) -> None:
     assert not (out / "collection.json").exists()
 
 
-def test_leftovers_of_a_killed_export_go(posed: Exported, tmp_path: Path) -> None:
-    """With the next export of the run, by whichever of its names."""
+def test_leftovers_of_a_killed_export_are_removed(posed: Exported, tmp_path: Path) -> None:
+    """The next export of the run removes them; the run may be named with its folder."""
     for folder in (tmp_path, tmp_path / posed.id):
         (folder / ".export-x.part").mkdir(parents=True)
     assert run_export(posed.archive, f"runs/{posed.id}/", tmp_path, envi=False, console=QUIET)["run"] == posed.id
     assert not list(tmp_path.rglob("*.part"))
 
 
-def test_what_cannot_be_believed_is_named_and_gives_no_image(posed: Exported, tmp_path: Path) -> None:
-    """A flipped bit: what it is, what to do, and no image of it."""
+def test_a_damaged_store_gives_no_image(posed: Exported, tmp_path: Path) -> None:
+    """After a flipped bit the message names store and array."""
     archive = Path(shutil.copytree(posed.archive, tmp_path / "field-a"))
     classes = archive / posed.receipt["products"]["ground_map"] / "classes"
     flip(next(path for path in sorted(classes.rglob("*")) if path.is_file() and path.name != "zarr.json"), at=40)
@@ -262,8 +262,8 @@ def test_what_cannot_be_believed_is_named_and_gives_no_image(posed: Exported, tm
     assert not list((tmp_path / "out").rglob("*.tif"))
 
 
-def test_restored_sweeps_say_so(surveyed_png: Any, tmp_path: Path) -> None:
-    """Where the raw lines were deleted: a note, the header and the catalogue."""
+def test_restored_sweeps_are_marked(surveyed_png: Any, tmp_path: Path) -> None:
+    """The raw lines were deleted: a note, the header and the catalogue say so."""
     surveyed_png(tmp_path / "archive")
     console = Console(file=io.StringIO(), width=200)
     answer = run_export(tmp_path / "archive", None, tmp_path / "out", envi=True, console=console)

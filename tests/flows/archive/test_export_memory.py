@@ -1,4 +1,4 @@
-"""Exports of a field that is remembered: ages and changes, on the field's pixels and on the map, by other readers."""
+"""Exports of a field with a prior map: ages and changes, on field pixels and on the ground, by other readers."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PLACES = ("georeferenced", "posed")
 
 
 def harvested(folder: Path, place: str) -> Iterator[Path]:
-    """The field before and after: of its lower right corner the mirror image is there."""
+    """Yield the field before and after: later, its lower right corner is turned by 180 degrees."""
     values, _ = patchy_scene(SHAPE, 3, seed=5)
     later = values.copy()
     later[54:, 64:] = values[54:, 64:][::-1, ::-1]
@@ -48,16 +48,16 @@ def harvested(folder: Path, place: str) -> Iterator[Path]:
 
 @pytest.fixture(scope="module", params=PLACES)
 def visited(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, weights: Path) -> list[Exported]:
-    """Both visits, the later one three days after the first by some lines of a swath: much is not looked at."""
+    """Return both visits; the later one, after three days, captured some lines of a swath only."""
     folder = tmp_path_factory.mktemp(request.param)
     archive, out = folder / "archive", folder / "maps"
-    sharp = with_record(load_weights(weights), calibration={"temperature": 0.2})  # maps that hardly differ by chance
+    sharp = with_record(load_weights(weights), calibration={"temperature": 0.2})  # maps that rarely differ by chance
     save_weights(sharp, folder / "sharp.safetensors")
     given = {"weights": str(folder / "sharp.safetensors"), "engine": "plain", "out": str(archive), "accuracy": False}
     given |= {"name": "north", "wavelengths": ",".join(map(str, RGB_NM)), "prior": "latest", "camera.samples": 64}
     runs = []
     with without_effects(), pytest.MonkeyPatch.context() as patch:
-        for name in ("CERTAIN", "SURE"):  # untrained weights are sure of nothing: what they say is taken for sure
+        for name in ("CERTAIN", "SURE"):  # untrained weights are never certain: their classes are taken as certain
             patch.setattr(prior_map, name, 1e-6)
         for scene, visit, extent in zip(harvested(folder, request.param), VISITS, ("whole", "1:40-90"), strict=True):
             asked = {"scene": str(scene), "source": "sim", "visit": visit, "scan_step": 1, "extent": extent}
@@ -71,14 +71,14 @@ def visited(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
 
 
 def test_a_first_visit_exports_ages_alone(visited: list[Exported]) -> None:
-    """All that it saw was looked at that day."""
+    """All valid pixels have age 0, and there are no images of changes."""
     assert set(MEMORY) & set(visited[0].answer["files"]) == {"age"}
     found = visited[0].image("age")
     assert set(np.unique(found[np.isfinite(found)]).tolist()) == {0.0}
 
 
-def test_images_are_the_stores_numbers(visited: list[Exported]) -> None:
-    """Ages in days, NaN where nothing is known; what pixels were with the names of classes; cloud-optimised."""
+def test_images_have_the_values_of_the_store(visited: list[Exported]) -> None:
+    """Ages are in days, NaN where unknown; old classes have names; all images are cloud-optimised."""
     later = visited[1]
     store = later.store("ground_map" if "ground_map" in later.receipt["products"] else "class_probabilities")
     for key in MEMORY:
@@ -94,8 +94,8 @@ def test_images_are_the_stores_numbers(visited: list[Exported]) -> None:
         assert [file.tags(1)[f"CLASS_{number}"] for number in range(len(names))] == names
 
 
-def test_images_lie_where_the_class_map_lies(visited: list[Exported]) -> None:
-    """Same CRS and corner, of the fraction of patches of the field too; its pixels are as large as patches there."""
+def test_images_have_the_grid_of_the_class_map(visited: list[Exported]) -> None:
+    """The fraction of changed pixels has the same CRS and corner; on the field its pixels are patches."""
     grids = {}
     for key in ("class_map", *MEMORY):
         with rasterio.open(visited[1].file(key)) as file:
@@ -109,7 +109,7 @@ def test_images_lie_where_the_class_map_lies(visited: list[Exported]) -> None:
 
 
 def test_receipt_and_page_have_the_hectares(visited: list[Exported]) -> None:
-    """Where the field has a place they are the ground of the pixels that changed, or are old, by plain xarray."""
+    """With a place they are the area of changed or old pixels, as plain xarray reads them."""
     first, later = (run.receipt for run in visited)
     if "ground" not in later:
         assert "ground_map" not in later["products"]
@@ -128,7 +128,7 @@ def test_receipt_and_page_have_the_hectares(visited: list[Exported]) -> None:
     wanted = {
         (old, new): (there == 1000 * names.index(old) + names.index(new)).sum() * pixel_ha * beyond / differing
         for beyond, differing, old, new in later["prior_map"]["changes"]
-    }  # beyond what two maps of the same ground differ by
+    }  # beyond the difference of two maps of the same ground
     assert wanted
     assert {(old, new): area for area, old, new in changes} == pytest.approx(wanted, rel=slack)
     assert older["1"] == pytest.approx((store["age"].values > 1).sum() * pixel_ha, rel=slack)

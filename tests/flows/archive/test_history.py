@@ -1,4 +1,4 @@
-"""A field's history: rows of its runs, a page that loads nothing, an index with links that lead somewhere."""
+"""A field's history: rows of its runs, and a page that loads nothing and links to existing reports."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BAD = '<script>alert("1")</script>&'
 
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory: pytest.TempPathFactory, survey_png: Any) -> Path:
-    """Two surveys of one field, by their due times or other names, and one of another."""
+    """Return an archive of one field with two surveys, by time or another name of the visit, and of another field."""
     root = tmp_path_factory.mktemp("history") / "archive"
     survey_png(root, name="north", visit=f"b {BAD}")
     survey_png(root, name="north", visit="2026-06-01T10:00:00Z")
@@ -31,8 +31,8 @@ def archive(tmp_path_factory: pytest.TempPathFactory, survey_png: Any) -> Path:
     return root
 
 
-def test_runs_are_one_history(archive: Path) -> None:
-    """Visits stand by their due times, else by the start of the survey; fractions add up to the map."""
+def test_a_history_has_the_runs_of_one_field(archive: Path) -> None:
+    """Visits are in order of their time, else of the start of the survey; class fractions add up to 1."""
     north = read_history(Archive.open(archive), "north")
     assert [row["visit"] for row in north.runs] == ["2026-06-01T10:00:00Z", f"b {BAD}"]
     assert north.runs[0]["visited"] == "2026-06-01T10:00:00+00:00"
@@ -45,13 +45,13 @@ def test_runs_are_one_history(archive: Path) -> None:
 
 
 def test_an_archive_without_runs_has_no_history(tmp_path: Path) -> None:
-    """The message says what to do first."""
+    """The message says to survey first."""
     with pytest.raises(SettingsError, match="has 0 fields; survey into it first"):
         read_history(Archive.open(tmp_path))
 
 
-def test_a_visit_that_was_surveyed_again_is_one_point(tmp_path: Path) -> None:
-    """Of the newest run of its visit and scene; other scenes and other moments are visits of their own."""
+def test_a_visit_surveyed_again_is_one_point(tmp_path: Path) -> None:
+    """The newest run of visit and scene counts; other scenes and times are other visits."""
     archive = Archive.open(tmp_path)
     for scene, visit in (("a", None), ("a", "2026-06-08"), ("b", "2026-06-01"), ("a", None)):
         with archive.new_run("north") as draft:
@@ -78,14 +78,14 @@ def test_a_visit_that_was_surveyed_again_is_one_point(tmp_path: Path) -> None:
     ],
 )
 def test_a_visit_has_the_day_of_its_farm(settings: dict[str, Any], visited: str) -> None:
-    """The name of a visit comes first; scenes of files have the time of their survey."""
+    """The time in a visit's name takes precedence; scenes from files have the time of their survey."""
     facts = {"created": "2026-11-23T00:00:00Z", "settings": settings}
     run = Run(Path("x"), facts, {"started": "2026-11-22T08:00:00Z"}, None)
     assert str(time_of_visit(run)).startswith(visited)
 
 
-def test_pages_load_nothing_and_lead_to_reports(archive: Path, command_line: Any, tmp_path: Path) -> None:
-    """Without a script, every word escaped; each link is a file that is there, the chart is data of the page."""
+def test_pages_load_nothing_and_link_to_reports(archive: Path, command_line: Any, tmp_path: Path) -> None:
+    """There is no script and all text is escaped; each link is an existing file, and the chart is data in the page."""
     page = tmp_path / "pages" / "history.html"
     ended = command_line("report", archive, "--field", "north", "-o", page)
     assert ended.code == 0, ended.err
@@ -101,8 +101,8 @@ def test_pages_load_nothing_and_lead_to_reports(archive: Path, command_line: Any
     assert all(words in text for words in ("2026-06-01 10:00", "Class areas"))
 
 
-def test_scores_on_a_scene_of_the_training_are_marked() -> None:
-    """In the table, with a note below it; a run without a valid receipt has a row of dashes."""
+def test_scores_on_training_scenes_are_marked() -> None:
+    """The table has an asterisk, with a note below."""
     row = {"run": "runs/x", "created": "2026-06-01T10:00:00Z", "visited": None, "visit": None, "capture_s": None}
     row |= {"replaced": False, "unit": "fraction", "areas": {}, "miou": 0.5, "overall_accuracy": None}
     pages = [
@@ -124,9 +124,9 @@ def test_scores_on_a_scene_of_the_training_are_marked() -> None:
         ("-o {1}/x.html", 2, "lies in the archive"),
     ],
 )
-def test_a_report_that_cannot_be_written(
+def test_impossible_reports_are_refused(
     archive: Path, command_line: Any, tmp_path: Path, words: str, code: int, message: str
 ) -> None:
-    """One message, the exit code, and no file."""
+    """One message comes with the exit code, and no file is written."""
     command_line("report", archive, *words.format(tmp_path, archive).split()).refused(code, message)
     assert not list(tmp_path.glob("*.html"))

@@ -1,4 +1,4 @@
-"""Ingest: what a file holds becomes one immutable store, once; killed or refused it leaves nothing."""
+"""Ingest: the content of a file becomes one immutable store, once; a refused ingest leaves nothing."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ KINDS = {"u1": 1, "i2": 2, "i4": 3, "f4": 4, "f8": 5, "u2": 12}
 
 
 def write_envi(path: Path, values: NDArray[Any], *, lines: int | None = None, more: str = NM) -> Path:
-    """Write (line, sample, band) values as BIL with their header; give the header."""
+    """Write (line, sample, band) values as BIL with their header; return the header."""
     promised = len(values) if lines is None else lines
     path.with_suffix(".hdr").write_text(
         f"ENVI\nsamples = {values.shape[1]}\nlines = {promised}\nbands = {values.shape[2]}\n"
@@ -36,24 +36,24 @@ def write_envi(path: Path, values: NDArray[Any], *, lines: int | None = None, mo
 
 
 def ingest(source: Path | str, archive: Path, **flags: Any) -> dict[str, Any]:
-    """Ingest without showing anything."""
+    """Ingest without output and return the record."""
     return run_ingest(str(source), archive, QUIET, **flags)
 
 
 def opened(record: dict[str, Any]) -> xr.Dataset:
-    """The stored cube as plain xarray reads it."""
+    """Return the stored cube, read with plain xarray."""
     with xr.open_zarr(Path(record["path"]) / "cube.zarr", consolidated=False) as found:
         return found.load()
 
 
 @pytest.fixture
 def raw() -> NDArray[np.uint16]:
-    """Numbers of 150 lines, more than two blocks, (150, 40, 3) uint16."""
+    """Return values of 150 lines, more than two blocks: (150, 40, 3) uint16."""
     return np.random.default_rng(0).integers(0, 4096, (150, 40, 3), dtype=np.uint16)
 
 
-def test_all_that_is_known_is_stored(tmp_path: Path, raw: NDArray[np.uint16]) -> None:
-    """Numbers, wavelengths, line facts, references and where they came from open with plain xarray."""
+def test_ingest_stores_values_and_metadata(tmp_path: Path, raw: NDArray[np.uint16]) -> None:
+    """Plain xarray reads values, wavelengths, times, references, files and headers."""
     folder = tmp_path / "flight 7"
     folder.mkdir()
     write_envi(folder / "raw_0", raw[:100])
@@ -91,8 +91,8 @@ def test_all_that_is_known_is_stored(tmp_path: Path, raw: NDArray[np.uint16]) ->
         ("f8", 100, "f4"),
     ],
 )
-def test_types(tmp_path: Path, kind: str, high: int, stored: str) -> None:
-    """Numbers of 8 and 16 bits stay as they are; the rest are float32. No number changes."""
+def test_ingest_keeps_every_value(tmp_path: Path, kind: str, high: int, stored: str) -> None:
+    """Integers of 8 and 16 bits keep their type; all other types become float32."""
     values = np.random.default_rng(1).integers(0, max(high, 0) + 1, (70, 5, 3)).astype(kind)
     values[69, 0, 0] = high
     data = opened(ingest(write_envi(tmp_path / "a.img", values), tmp_path / "archive"))
@@ -101,7 +101,7 @@ def test_types(tmp_path: Path, kind: str, high: int, stored: str) -> None:
 
 
 def test_the_same_content_is_stored_once(tmp_path: Path, raw: NDArray[np.uint16]) -> None:
-    """Neither name nor place of the files counts; a name that is stated, other bytes or other wavelengths do."""
+    """Name and folder of the files do not count; a given name, other bytes, wavelengths or dark frames do."""
     archive = tmp_path / "archive"
     first = ingest(write_envi(tmp_path / "a.img", raw), archive)
     (tmp_path / "elsewhere").mkdir()
@@ -116,8 +116,8 @@ def test_the_same_content_is_stored_once(tmp_path: Path, raw: NDArray[np.uint16]
     assert len({record["key"] for record in [first, *others]}) == 5
 
 
-def test_what_was_ingested_is_a_scene(tmp_path: Path, raw: NDArray[np.uint16]) -> None:
-    """A store of an ingest is a scene by its folder, and can be ingested again with all that is known of it."""
+def test_an_ingested_store_is_a_scene(tmp_path: Path, raw: NDArray[np.uint16]) -> None:
+    """Its folder is a scene, and can be ingested again with all metadata."""
     record = ingest(write_envi(tmp_path / "a.img", raw[:20], lines=22), tmp_path / "archive")
     scene = load_scene_file(record["path"])
     np.testing.assert_array_equal(scene.values[:20], raw[:20])
@@ -128,8 +128,8 @@ def test_what_was_ingested_is_a_scene(tmp_path: Path, raw: NDArray[np.uint16]) -
     assert again["lost_lines"] == 2
 
 
-def test_a_stated_scale_holds_for_the_store(tmp_path: Path, raw: NDArray[np.uint16]) -> None:
-    """The store surveys as the file beside its scene.toml does: scaled, and without a value where there is no data."""
+def test_the_scale_of_scene_toml_is_stored(tmp_path: Path, raw: NDArray[np.uint16]) -> None:
+    """The store reads as the file with its scene.toml does: scaled, and with nodata as NaN."""
     numbers = raw.astype(np.int16)
     numbers[3, 4], numbers[5] = -1, -9999
     path = write_envi(tmp_path / "a.img", numbers)
@@ -146,8 +146,8 @@ def test_a_stated_scale_holds_for_the_store(tmp_path: Path, raw: NDArray[np.uint
     assert "values are the file's times 0.0001 plus -0.1, as scene.toml says" in record["notes"]
 
 
-def test_a_scale_of_raw_numbers_is_refused(tmp_path: Path, raw: NDArray[np.uint16]) -> None:
-    """Dark and white frames belong to numbers as the camera gave them."""
+def test_a_scale_with_a_dark_frame_is_refused(tmp_path: Path, raw: NDArray[np.uint16]) -> None:
+    """Dark and white frames need values as the camera gave them."""
     path, dark = write_envi(tmp_path / "a.img", raw), write_envi(tmp_path / "dark.img", raw[:1] // 8)
     (tmp_path / "scene.toml").write_text("scale = 0.0001\n")
     with pytest.raises(SceneError, match=r"scene.toml has a scale .*remove scale and offset"):
@@ -155,16 +155,16 @@ def test_a_scale_of_raw_numbers_is_refused(tmp_path: Path, raw: NDArray[np.uint1
 
 
 @pytest.mark.parametrize("name", ["../out", "/tmp/x", "", "a.part"])
-def test_names_that_lead_elsewhere(tmp_path: Path, raw: NDArray[np.uint16], name: str) -> None:
-    """A name that is a path is refused before anything is made."""
+def test_names_with_a_path_are_refused(tmp_path: Path, raw: NDArray[np.uint16], name: str) -> None:
+    """The error comes before an archive is made."""
     header = write_envi(tmp_path / "a.img", raw)
     with pytest.raises(ArchiveError, match="cannot be a name in an archive"):
         ingest(header, tmp_path / "archive", name=name)
     assert not (tmp_path / "archive").exists()
 
 
-def test_a_source_that_then_changes(tmp_path: Path, raw: NDArray[np.uint16], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Files that change while they are read are not kept."""
+def test_a_changing_source_is_refused(tmp_path: Path, raw: NDArray[np.uint16], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files that change while they are read leave no store."""
     header = write_envi(tmp_path / "a.img", raw)
     real = flows.archive.ingest_command.write_ingested_cube
 

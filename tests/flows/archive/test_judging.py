@@ -1,4 +1,4 @@
-"""When a map is judged: after its run is published, later by `evaluate ARCHIVE RUN`, or not at all."""
+"""The accuracy of a map: added after its run is published, later by `evaluate ARCHIVE RUN`, or left out."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ Refuse = Callable[[Path, Path, pytest.MonkeyPatch], None]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where scene, labels and weights lie, as receipts name them."""
+    """Return the folder of scene, labels and weights, as receipts name it."""
     return tmp_path_factory.mktemp("files")
 
 
 @pytest.fixture
 def scene(folder: Path, scene_files: Path, weights: Path) -> Path:
-    """The folder, with its files as they were."""
+    """Return the folder with its original files."""
     return lay_files(folder, scene_files, weights)
 
 
 def lay_files(folder: Path, scene_files: Path, weights: Path) -> Path:
-    """Put scene, labels and weights into a folder, whatever is there."""
+    """Copy scene, labels and weights into a folder, over existing files, and return the folder."""
     for path in (scene_files / "scene.png", scene_files / "labels.png"):
         shutil.copy(path, folder)
     shutil.copy(weights, folder / "w.safetensors")
@@ -49,38 +49,38 @@ def lay_files(folder: Path, scene_files: Path, weights: Path) -> Path:
 
 
 def words_of(folder: Path) -> dict[str, str]:
-    """What a survey is asked for."""
+    """Return the settings of a survey."""
     files = {"scene": "scene.png", "labels": "labels.png", "weights": "w.safetensors"}
     return {name: str(folder / file) for name, file in files.items()}
 
 
 @pytest.fixture
 def survey(survey_png: Any, scene: Path, out: Path) -> Survey:
-    """Survey the scene of the folder into the archive of the test."""
+    """Return a function that surveys the scene of the folder into the archive of the test."""
     return lambda **flags: survey_png(out, **{**words_of(scene), **flags})
 
 
 @pytest.fixture
 def out(tmp_path: Path) -> Path:
-    """The archive of the test."""
+    """Return the archive of the test."""
     return tmp_path / "archive"
 
 
 @pytest.fixture(scope="module")
 def surveyed(survey_png: Any, folder: Path, scene_files: Path, weights: Path) -> Path:
-    """The archive of a survey that was asked to leave accuracy out, not to be changed."""
+    """Return the archive of a survey that left out its accuracy; do not change it."""
     survey_png(folder / "archive", **words_of(lay_files(folder, scene_files, weights)), accuracy=False)
     return folder / "archive"
 
 
 @pytest.fixture
 def unjudged(surveyed: Path, scene: Path, out: Path) -> Path:
-    """A copy of it."""
+    """Return a copy of it."""
     return Path(shutil.copytree(surveyed, out))
 
 
 def break_off(survey: Survey, monkeypatch: pytest.MonkeyPatch, **flags: Any) -> None:
-    """Survey, and break off when the map is about to be judged."""
+    """Survey, and interrupt it when the map is about to be judged."""
     with monkeypatch.context() as patch:
         patch.setattr(evaluation, "load_class_map", Mock(side_effect=KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
@@ -88,7 +88,7 @@ def break_off(survey: Survey, monkeypatch: pytest.MonkeyPatch, **flags: Any) -> 
 
 
 def test_a_run_is_published_before_it_is_judged(survey: Survey, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """While the map is looked at the run is there and says so; then it is the same run, and has its accuracy."""
+    """During the evaluation the run is valid and its accuracy pending; afterwards the same run has it."""
     real, seen = STAGES["evaluate"], list[Any]()
 
     def looking(*given: Any) -> Any:
@@ -112,8 +112,8 @@ def test_a_run_is_published_before_it_is_judged(survey: Survey, out: Path, monke
     assert receipts(out) == [published.receipt]
 
 
-def test_reprocess_adds_what_a_stopped_survey_lacks(survey: Survey, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The field is not as it would become: its run is judged, and no other is made."""
+def test_reprocess_judges_runs_of_stopped_surveys(survey: Survey, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It judges the existing run and makes no other."""
     break_off(survey, monkeypatch)
     for _ in range(2):
         assert run_reprocess(out, QUIET) == 0
@@ -122,10 +122,10 @@ def test_reprocess_adds_what_a_stopped_survey_lacks(survey: Survey, out: Path, m
     assert problems(out) == []
 
 
-def test_a_run_that_is_being_judged_is_left_alone(
+def test_a_run_under_evaluation_is_not_judged_twice(
     survey: Survey, out: Path, monkeypatch: pytest.MonkeyPatch, command_line: CommandLine
 ) -> None:
-    """The same survey publishes a run of its own meanwhile, and `evaluate` says who is at it."""
+    """The same survey publishes another run, and `evaluate` reports the other process."""
     break_off(survey, monkeypatch)
     archive = Archive.open(out)
     (run,) = archive.runs()
@@ -136,8 +136,8 @@ def test_a_run_that_is_being_judged_is_left_alone(
     assert [is_pending(one) for one in receipts(out)] == [True, False]
 
 
-def test_what_was_left_out_is_added_later(unjudged: Path, survey: Survey, command_line: CommandLine) -> None:
-    """Accuracy first, then controls, each to the same run: its receipt is that of a survey that was asked for both."""
+def test_evaluate_adds_accuracy_and_controls(unjudged: Path, survey: Survey, command_line: CommandLine) -> None:
+    """The receipt then equals that of a survey with both."""
     (run,) = Archive.open(unjudged).runs()
     ended = command_line("evaluate", unjudged, run.name, "--json")
     assert (ended.code, ended.errors) == (0, [])
@@ -156,7 +156,7 @@ def test_what_was_left_out_is_added_later(unjudged: Path, survey: Survey, comman
 def test_labels_may_come_later(
     survey: Survey, scene: Path, out: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A run without any is judged by those that are given, with a path that can be read from anywhere."""
+    """A run without labels is judged with the given ones, and records their absolute path."""
     survey(labels=None)
     monkeypatch.chdir(scene)
     ended = command_line("evaluate", out, "latest")
@@ -196,10 +196,10 @@ REFUSED: dict[str, tuple[Refuse, str]] = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_cannot_be_judged_is_refused(
+def test_runs_that_cannot_be_judged_are_refused(
     case: str, unjudged: Path, scene: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One message, and the run stays as it was."""
+    """There is one message, and the run is unchanged."""
     spoil, message = REFUSED[case]
     spoil(scene, unjudged, monkeypatch)
     (run,) = Archive.open(unjudged).runs()
@@ -222,7 +222,7 @@ WORDS = {
 
 
 @pytest.mark.parametrize("case", WORDS)
-def test_words_that_mean_neither_are_refused(case: str, surveyed: Path, command_line: CommandLine) -> None:
-    """One message that says which of the two wants what, or which runs there are."""
+def test_flags_of_the_other_form_are_refused(case: str, surveyed: Path, command_line: CommandLine) -> None:
+    """One message names the form that takes the flag, or the existing runs."""
     code, words, message = WORDS[case]
     command_line("evaluate", *words.replace("ARCHIVE", str(surveyed)).split()).refused(code, message)

@@ -1,4 +1,4 @@
-"""Archives of strangers: verbs stay inside, read what they can, and refuse the rest."""
+"""Untrusted archives: commands stay inside, read the valid part, and refuse the rest."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ LEADS = ("../../../secret", "/etc/passwd", "stages/../../secret", "secret\0", ".
 
 
 def list_file(small: Small, lead: str) -> None:
-    """A store lists a file that is no file of its own."""
+    """Make a store list a file outside of it."""
     manifest = small.mosaic.path / "manifest.json"
     listed = json.loads(manifest.read_text())["files"]
     rewrite(manifest, files=listed | {lead: {"sha256": "0" * 64, "size": len(SECRET)}})
 
 
 def name_products(small: Small, lead: str) -> None:
-    """A run's products, stages and what it rests on lie elsewhere."""
+    """Point a run's products, stages and dependencies outside of the archive."""
     receipt = json.loads((small.run / "receipt.json").read_text())
     receipt["products"] = {"class_map": lead, "mosaic": f"stages/rectify/{lead}"}
     receipt["stages"] = [{"name": lead, "key": lead, "state": "ran", "manifest_sha256": "0" * 64}]
@@ -52,15 +52,15 @@ CHANGES = (
     ("change", "lead"),
     [(one, lead) for number, one in enumerate(CHANGES) for lead in (LEADS[number], LEADS[-1 - number])],
 )
-def test_no_verb_leaves_the_archive(
+def test_no_command_leaves_the_archive(
     tmp_path: Path,
     change: Callable[[Small, str], None],
     lead: str,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Each verb ends with an answer or one message; what lies beside the archive stays, and none of it is shown."""
-    no_server = Mock(side_effect=ServerUnavailable("none here"))  # else each repair waits for one
+    """Each command ends with output or one message; files beside the archive stay, and are not shown."""
+    no_server = Mock(side_effect=ServerUnavailable("none here"))  # else each repair waits for a server
     monkeypatch.setattr(survey_command, "_prefect_server", no_server)
     root = tmp_path / "archive"
     change(small_survey(Archive.open(root), simulated=False), lead)

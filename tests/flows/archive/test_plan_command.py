@@ -1,4 +1,4 @@
-"""The plan of a survey says beforehand what the survey then does, and changes nothing."""
+"""The plan of a survey: it predicts the states of stages and changes nothing."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ WAITS = {"locate": "condense_coarse", "rectify": "locate", "score": "rectify", "
 
 @pytest.fixture(scope="module")
 def settings(scene_files: Path, flags_png: Flags) -> Settings:
-    """Those of the small picture with labels; each plan names its own archive."""
+    """Return settings of the small picture with labels; each plan names its own archive."""
     labels = str(scene_files / "labels.png")
     flags = flags_png("archive", labels=labels, engine="plain", budget="0.8", controls=False)
     return load_settings(None, flags)
@@ -41,7 +41,7 @@ def settings(scene_files: Path, flags_png: Flags) -> Settings:
 
 @pytest.fixture
 def archive(one_survey: tuple[Path, Any], tmp_path: Path) -> Path:
-    """A copy of an archive with one survey."""
+    """Return a copy of an archive with one survey."""
     return Path(shutil.copytree(one_survey[0], tmp_path / "archive"))
 
 
@@ -54,21 +54,21 @@ def _tree(root: Path) -> dict[str, tuple[int, int]]:
     return {str(path): (path.stat().st_size, path.stat().st_mtime_ns) for path in root.rglob("*")}
 
 
-def test_the_survey_does_what_the_plan_said(settings: Settings, archive: Path, survey_png: Any) -> None:
-    """What is said to be cached or skipped is so, with the same key; what is to run or blocked is made."""
+def test_the_survey_follows_the_plan(settings: Settings, archive: Path, survey_png: Any) -> None:
+    """Cached and skipped stages are so in the survey, with the same key; planned and blocked stages run."""
     planned = _plan(settings, archive, resampling="nearest")
     receipt = survey_png(archive, resampling="nearest").receipt
     done = {stage["name"]: stage for stage in receipt["stages"]}
     assert list(planned) == list(done)
     for name, row in planned.items():
         assert row.key in (None, done[name]["key"]), name
-        if row.state != "blocked":  # a store that waits may turn out to be there
+        if row.state != "blocked":  # a blocked store may prove to be cached
             assert row.state == done[name]["state"].replace("ran", "to run"), name
     assert all(row.state in ("cached", "skipped") for row in _plan(settings, archive, resampling="nearest").values())
 
 
-def test_without_an_archive_the_plan_makes_none(settings: Settings, tmp_path: Path) -> None:
-    """The first capture is to run and has its key; what reads a store waits for it, by name."""
+def test_a_plan_makes_no_archive(settings: Settings, tmp_path: Path) -> None:
+    """The first capture has a key and is to run; later stages wait for a store, by name."""
     planned = _plan(settings, tmp_path / "none")
     assert not list(tmp_path.iterdir())
     assert planned["choose_effects"].state == "to run"
@@ -77,8 +77,8 @@ def test_without_an_archive_the_plan_makes_none(settings: Settings, tmp_path: Pa
     assert {name: planned[name].why for name in WAITS} == {name: f"waits for {on}" for name, on in WAITS.items()}
 
 
-def test_planning_leaves_an_archive_alone(settings: Settings, archive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every file and folder, the spool of a broken capture too; not one line of light is asked for."""
+def test_a_plan_changes_no_file(settings: Settings, archive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The spool of an interrupted capture stays too, and no line is captured."""
     key = _plan(settings, archive)["capture_coarse"].key
     (archive / "spool" / str(key)).mkdir(parents=True)
     (archive / "spool" / str(key) / "lines").write_bytes(b"light")
@@ -90,10 +90,10 @@ def test_planning_leaves_an_archive_alone(settings: Settings, archive: Path, mon
     assert _plan(settings, archive, seed=9)["capture_coarse"].state == "to run"
 
 
-def test_only_what_differs_is_to_be_made(
+def test_a_plan_has_only_changed_stages_to_run(
     settings: Settings, archive: Path, make_weights: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Other weights need the cleared mosaic of the first pass; a newer stage leaves what it was made of."""
+    """Other weights need the cleared mosaic of the first pass; a new stage version keeps the stages before it."""
     other = _plan(settings, archive, weights=str(make_weights(layers=2)))
     assert [other[name].state for name in ("locate", "rectify", "score")] == ["cached", "to run", "to run"]
     be_version(monkeypatch, "rectify_fine", 99)
@@ -102,7 +102,7 @@ def test_only_what_differs_is_to_be_made(
 
 
 def test_a_field_beyond_memory_is_planned(settings: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Neither its ground nor its spectra; the plan says what the survey says when it refuses."""
+    """The plan renders no field and no spectra, and shows the survey's refusal."""
     refuse = Mock(side_effect=AssertionError("the plan looked at the field"))
     monkeypatch.setattr("pipeline.simulator.scenes.farm.farm_scene._draw", refuse)
     monkeypatch.setattr("pipeline.simulator.scenes.farm.farm_scene.spectral_library", refuse)
@@ -122,15 +122,15 @@ def test_a_field_beyond_memory_is_planned(settings: Settings, tmp_path: Path, mo
     assert not list(tmp_path.iterdir())
 
 
-def test_a_plan_loads_neither_torch_nor_figures_nor_maps() -> None:
-    """They take seconds: whoever needs one has it deferred."""
+def test_a_plan_imports_no_heavy_library() -> None:
+    """Their import takes seconds, so it is deferred to their first use."""
     heavy = {"torch", "matplotlib", "xarray", "odc.geo", "rasterio", "scipy.stats", "pandas", "prefect", "distributed"}
     code = "import sys, flows.cli.main, flows.archive.plan_command; print(*sys.modules)"
     assert not heavy & set(python(code).stdout.split())
 
 
-def test_a_damaged_store_blocks_what_needs_it(settings: Settings, archive: Path, tmp_path: Path) -> None:
-    """With the archive's own words; an archive that is a file is refused as a survey refuses it."""
+def test_a_damaged_store_blocks_later_stages(settings: Settings, archive: Path, tmp_path: Path) -> None:
+    """The reason is the archive's own message; a file in place of an archive is refused."""
     store = Archive(archive).refs("rectify_fine")[0]
     (store.path / "lines.json").unlink()
     planned = _plan(settings, archive)
@@ -143,8 +143,8 @@ def test_a_damaged_store_blocks_what_needs_it(settings: Settings, archive: Path,
 
 
 @pytest.mark.parametrize("change", [('"', "x"), ("1", "2")], ids=["no JSON", "another number"])
-def test_a_damaged_plan_is_a_block(settings: Settings, archive: Path, survey_png: Any, change: tuple[str, str]) -> None:
-    """The plan says so and goes on; the survey stops there with one message, and captures nothing by it."""
+def test_damaged_plan_stops_survey(settings: Settings, archive: Path, survey_png: Any, change: tuple[str, str]) -> None:
+    """The survey stops there with one message."""
     (path,) = archive.glob("stages/score/*/plan.json")
     path.write_text(path.read_text().replace(*change))
     fine = _plan(settings, archive)["capture_fine"]
@@ -165,8 +165,8 @@ MEASURED = {  # pixels, bands, bytes captured, farm or not: bytes kept
 
 
 @pytest.mark.parametrize("field", MEASURED, ids=str)
-def test_the_estimate_of_bytes_kept_is_within_what_it_says(field: tuple[int, int, int, bool]) -> None:
-    """Surveys of files kept half to twice of it, those of farms are nearer; a limit of the scores lowers it."""
+def test_the_estimate_of_bytes_kept_has_its_stated_error(field: tuple[int, int, int, bool]) -> None:
+    """Files kept 0.5 to 2 times the estimate, farms within 1.4 times; a limit of the scores lowers it."""
     pixels, bands, captured, is_farm = field
     estimate = estimated_bytes(pixels, bands, captured, is_farm=is_farm)
     within = 1.4 if is_farm else 2.0
@@ -175,7 +175,7 @@ def test_the_estimate_of_bytes_kept_is_within_what_it_says(field: tuple[int, int
 
 
 def test_a_raster_has_estimates(settings: Settings, tmp_path: Path) -> None:
-    """Each has its source; a score that no record has is None; the multiply-adds are those of the survey."""
+    """Each has its source; without scan performance the mIoU is None; multiply-adds are those of the survey."""
     asked = replace(settings, source="raster", budget=None, out=str(tmp_path / "archive"))
     found = plan_content(asked)["estimate"]
     assert list(found) == ["bytes_kept", "multiply_adds", "miou"]
@@ -186,8 +186,8 @@ def test_a_raster_has_estimates(settings: Settings, tmp_path: Path) -> None:
     assert found["multiply_adds"]["value"] == receipt["savings"]["multiply_adds"]["done"]
 
 
-def test_estimates_of_a_capture_are_what_it_takes_at_most(settings: Settings, archive: Path, tmp_path: Path) -> None:
-    """Of two passes seconds, bytes and multiply-adds; once the fine pass is planned just those of the survey."""
+def test_estimates_of_a_capture_are_upper_bounds(settings: Settings, archive: Path, tmp_path: Path) -> None:
+    """They hold for seconds, bytes and multiply-adds of two passes, and are exact once the fine pass is planned."""
     (folder,) = (archive / "runs").iterdir()
     receipt = json.loads((folder / "receipt.json").read_text())
     told = {
@@ -208,7 +208,7 @@ def test_estimates_of_a_capture_are_what_it_takes_at_most(settings: Settings, ar
 
 
 def test_a_zoomed_farm_may_take_every_line_and_read_every_patch(tmp_path: Path) -> None:
-    """The second pass may take short exposures, so that 8 s are enough for all lines; patches are an expectation."""
+    """With short exposures 8 s suffice for all lines in the second pass; patches are an expectation."""
     farm = {"scene": "farm", "size": "160x128", "zoom": "always", "seconds": "8", "out": str(tmp_path)}
     found = plan_content(load_settings(None, farm))
     captured, work = found["estimate"]["bytes_captured"], found["estimate"]["multiply_adds"]
@@ -220,8 +220,8 @@ def test_a_zoomed_farm_may_take_every_line_and_read_every_patch(tmp_path: Path) 
     assert "cheapest near the best" in shown.getvalue()  # not the reference, which is every line at 100 ms
 
 
-def test_a_part_of_a_field_promises_no_score_and_reads_what_it_captures(settings: Settings, tmp_path: Path) -> None:
-    """Patches beside the lines keep the prior map; how good that is no record of scans says."""
+def test_a_partial_scan_has_no_expected_miou_and_reads_captured_patches(settings: Settings, tmp_path: Path) -> None:
+    """Other patches keep the prior map, and scan performance does not cover their accuracy."""
     one_scan = {"budget": None, "scan_step": 1, "out": str(tmp_path)}
     whole, part = (plan_content(replace(settings, extent=one, **one_scan))["estimate"] for one in ("whole", "0:0-20"))
     assert part["multiply_adds"]["value"] < 0.5 * whole["multiply_adds"]["value"]

@@ -1,4 +1,4 @@
-"""Surveys of rasters: their own pixels in every product, without a camera; read back by other readers."""
+"""Surveys of rasters: their own pixels in every product, without a camera; checked with other readers."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Raster = Callable[..., Any]
 
 @pytest.fixture
 def surveyed(tmp_path: Path, weights: Path) -> Raster:
-    """Survey a file as a raster on the plain engine; keywords change flags."""
+    """Return a function that surveys a file as a raster on the plain engine; keywords change flags."""
 
     def survey(scene: object, **flags: Any) -> Any:
         given = {"scene": str(scene), "weights": str(weights), "engine": "plain", "out": str(tmp_path / "archive")}
@@ -44,7 +44,7 @@ def surveyed(tmp_path: Path, weights: Path) -> Raster:
 
 
 def write_tif(path: Path, values: NDArray[Any], place: Affine | None = CORNER, **about: Any) -> Path:
-    """Write (y, x, band) values as GeoTIFF in UTM, or without a place."""
+    """Write (y, x, band) values as GeoTIFF in UTM, or without a place; return its path."""
     placed = {} if place is None else {"transform": place, "crs": UTM}
     height, width, count = values.shape
     size = {"height": height, "width": width, "count": count, "dtype": values.dtype.name}
@@ -56,19 +56,19 @@ def write_tif(path: Path, values: NDArray[Any], place: Affine | None = CORNER, *
 
 
 def whole(published: Any, archive: Path, factor: int = 4) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Read the stored pixels of a run, (y, x, band), and their coarse means."""
+    """Return the stored pixels of a run, (y, x, band), and their coarse means."""
     mosaic = open_mosaic(archive / published.receipt["products"]["mosaic"])
     return mosaic.values(), block_means(mosaic.values(), factor)
 
 
 def rounding(values: NDArray[Any]) -> float:
-    """Return what stored values may lie off by: nothing of whole numbers, else a small part of their spread."""
+    """Return the largest error of stored values: none for integers, else a small part of their spread."""
     return 1e-3 if (values == np.rint(values)).all() else 0.05 * float(np.nanstd(values))
 
 
 @pytest.mark.parametrize(("shape", "kind"), [((33, 47), np.float32), ((1, 40), np.uint8), ((5, 3), np.uint16)])
-def test_stores_hold_the_file(surveyed: Raster, tmp_path: Path, kind: type[np.generic], shape: tuple[int, int]) -> None:
-    """Pixels are the file's numbers but for rounding, whole numbers exactly, and coarse values are their means."""
+def test_stores_equal_files(surveyed: Raster, tmp_path: Path, kind: type[np.generic], shape: tuple[int, int]) -> None:
+    """Stored pixels are equal up to rounding, integers exactly, and coarse values are their means."""
     values = patchy_scene(shape, 3, seed=4)[0].astype(kind)
     write_tif(tmp_path / "field.tif", values)
     published = surveyed(tmp_path / "field.tif", wavelengths="640,550,460")
@@ -81,11 +81,11 @@ def test_stores_hold_the_file(surveyed: Raster, tmp_path: Path, kind: type[np.ge
             np.testing.assert_allclose(mean, block.mean(axis=(0, 1)), atol=rounding(values) + 1e-4)
 
 
-def test_what_has_no_value_stays_without_one(surveyed: Raster, tmp_path: Path) -> None:
-    """A pixel without a band has no class and no value; a single missing band is what the others let expect."""
+def test_nodata_stays_nodata(surveyed: Raster, tmp_path: Path) -> None:
+    """A pixel without any band has no class and no value; a single missing band is filled from the others."""
     values = patchy_scene((40, 56), 3, seed=3)[0]
-    values[8:20, 8:30] = -9999  # nothing is known
-    values[30, 40, 1] = -9999  # of one band
+    values[8:20, 8:30] = -9999  # no band has a value
+    values[30, 40, 1] = -9999  # one band has no value
     write_tif(tmp_path / "gaps.tif", values, nodata=-9999)
     published = surveyed(tmp_path / "gaps.tif", wavelengths="640,550,460")
     image, mosaic = whole(published, tmp_path / "archive")
@@ -101,8 +101,8 @@ def test_what_has_no_value_stays_without_one(surveyed: Raster, tmp_path: Path) -
     assert np.asarray(classes["classes"])[30, 40] != 255
 
 
-def test_a_receipt_of_a_raster_tells_of_no_camera(surveyed: Raster, scene_files: Path, tmp_path: Path) -> None:
-    """No seconds, no lines: its savings are bytes kept and multiply-adds, against keeping and reading all pixels."""
+def test_a_receipt_of_a_raster_has_no_camera_figures(surveyed: Raster, scene_files: Path, tmp_path: Path) -> None:
+    """Without seconds and lines, its savings are bytes kept and multiply-adds relative to all pixels."""
     published = surveyed(scene_files / "scene.png", labels=str(scene_files / "labels.png"), macs="80%")
     receipt = published.receipt
     assert receipt["source"] == receipt["settings"]["source"] == "raster"
@@ -116,8 +116,8 @@ def test_a_receipt_of_a_raster_tells_of_no_camera(surveyed: Raster, scene_files:
 
 
 @pytest.mark.parametrize("pixel_m", [None, 10.0])
-def test_areas_are_told_without_a_place(surveyed: Raster, tmp_path: Path, pixel_m: float | None) -> None:
-    """Pixels and percent of each class, of all that have one; hectares once scene.toml says how large a pixel is."""
+def test_areas_need_no_geographic_place(surveyed: Raster, tmp_path: Path, pixel_m: float | None) -> None:
+    """Classes have pixels and percent; hectares need the size of a pixel in scene.toml."""
     write_tif(tmp_path / "field.tif", patchy_scene((32, 40), 3, 0)[0], None)
     (tmp_path / "scene.toml").write_text("" if pixel_m is None else f"pixel_m = {pixel_m}\n")
     published = surveyed(tmp_path / "field.tif", wavelengths=",".join(map(str, RGB_NM)))
@@ -143,7 +143,7 @@ def test_areas_are_told_without_a_place(surveyed: Raster, tmp_path: Path, pixel_
 
 
 def test_an_export_has_the_rasters_own_pixels(surveyed: Raster, make_weights: WeightsMaker, tmp_path: Path) -> None:
-    """Reflectance and NDVI are the file's by rasterio, on its grid and CRS."""
+    """Reflectance and NDVI are the file's as rasterio reads it, on its grid and CRS."""
     values = (patchy_scene((50, 70), 3, seed=7)[0] / 255).astype(np.float32)
     source = write_tif(tmp_path / "field.tif", values)
     published = surveyed(source, wavelengths="670,550,800", weights=str(make_weights((550.0, 670.0, 800.0))))
@@ -159,8 +159,8 @@ def test_an_export_has_the_rasters_own_pixels(surveyed: Raster, make_weights: We
         assert np.sqrt(np.mean((exported.read(1) - ndvi) ** 2)) < 0.01
 
 
-def test_a_second_visit_goes_on_from_the_first(surveyed: Raster, scene_files: Path) -> None:
-    """What the raster of before left is remembered."""
+def test_a_second_visit_uses_the_first_as_prior_map(surveyed: Raster, scene_files: Path) -> None:
+    """The first visit was three days before."""
     surveyed(scene_files / "scene.png", visit="2026-06-01T10:00:00Z", prior="latest")
     later = surveyed(scene_files / "scene.png", visit="2026-06-04T10:00:00Z", prior="latest", macs="80%")
     assert later.receipt["prior_map"]["days"] == 3
@@ -171,14 +171,14 @@ def test_a_second_visit_goes_on_from_the_first(surveyed: Raster, scene_files: Pa
     {"seconds": 5, "budget": 0.5, "effects": "all", "camera.samples": 64, "extent": "0:0-4", "pointing_px": 1}.items(),
 )
 def test_a_setting_of_a_camera_is_refused(scene_files: Path, name: str, value: object) -> None:
-    """Beside a raster one message names it, and says how to have the simulated rig look at the file."""
+    """For a raster one message names the setting, and the source with which the rig scans the file."""
     flag = f"'{name}'" if "." in name else "--" + name.replace("_", "-")
     with pytest.raises(SettingsError, match=rf"{flag} is of a camera, .* leave it out, or give --source sim"):
         load_settings(None, {"scene": str(scene_files / "scene.png"), name: value})
 
 
-def test_a_raster_larger_than_its_memory(surveyed: Raster, tmp_path: Path) -> None:
-    """Its rows are read in blocks; where not one fits, one message says what to give."""
+def test_a_raster_beyond_the_memory_is_refused(surveyed: Raster, tmp_path: Path) -> None:
+    """Rows are read in blocks; the message says that not even one block fits."""
     values = np.zeros((64, 4096, 3), np.uint8)
     write_tif(tmp_path / "wide.tif", values + np.arange(64, dtype=np.uint8)[:, None, None])
     with pytest.raises(SettingsError, match=r"exceeds --memory 512 MiB: 8 rows of a raster of 4096 px"):
@@ -186,8 +186,8 @@ def test_a_raster_larger_than_its_memory(surveyed: Raster, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("address", ["tiles", "tiles/*.tif"])
-def test_tiles_have_to_be_one_file(surveyed: Raster, tmp_path: Path, address: str) -> None:
-    """A folder or a pattern is refused; what the message says makes one file of them."""
+def test_tiles_are_refused(surveyed: Raster, tmp_path: Path, address: str) -> None:
+    """A folder or a pattern is refused; the message has the command that merges the tiles."""
     (tmp_path / "tiles").mkdir()
     write_tif(tmp_path / "tiles" / "a.tif", patchy_scene((16, 16), 3, seed=1)[0])
     with pytest.raises(SceneError, match=r"make one file first: rio merge tiles/\*\.tif field\.tif"):

@@ -1,4 +1,4 @@
-"""reprocess: fields of real, tiny surveys once more: what is found, what is made, what goes on after a break."""
+"""reprocess: fields of real, tiny surveys again: cached stages, new runs, and failures."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from rich.console import Console
 
 from flows.archive import stale_runs as generations
 from flows.archive.commands import run_verify
-from flows.archive.reprocess_command import _survey, run_reprocess
+from flows.archive.reprocess_command import run_reprocess
+from flows.publish.survey_command import run_survey
 from flows.settings.survey_settings import Settings
 from flows.terminal.processes import DONE, FAILED, PARTLY
 from pipeline.errors import SettingsError, WeightsError
@@ -29,7 +30,7 @@ pytestmark = pytest.mark.usefixtures("no_effects")
 
 @pytest.fixture(scope="module")
 def surveyed(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey, scene_files: Path) -> Path:
-    """Two fields, scene (two budgets) and turned, on an archive that is not to be changed."""
+    """Return an archive of two fields, scene (two budgets) and turned; do not change it."""
     folder = tmp_path_factory.mktemp("reprocessed")
     scenes = [turned(scene_files / "scene.png", folder / "turned.png"), scene_files / "scene.png"]
     with without_effects():
@@ -40,18 +41,18 @@ def surveyed(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey, scene
 
 @pytest.fixture
 def archive(surveyed: Path, tmp_path: Path) -> Path:
-    """A copy of it."""
+    """Return a copy of it."""
     return Path(shutil.copytree(surveyed, tmp_path / "archive"))
 
 
 @pytest.fixture
 def other(make_weights: WeightsMaker) -> Path:
-    """Weights with other classes."""
+    """Return weights with other classes."""
     return make_weights(names=("class_0", "class_1", "class_2", "more"))
 
 
 class Reprocess:
-    """Runs the command and reads its summary."""
+    """Runner of the command that reads its summary."""
 
     def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
         self.capsys = capsys
@@ -63,13 +64,13 @@ class Reprocess:
         return fields
 
     def states(self, *words: Any, **wishes: Any) -> list[tuple[str, str]]:
-        """Field and state."""
+        """Return field and state of each row."""
         return [(row["field"], row["state"]) for row in self(*words, **wishes)]
 
 
 @pytest.fixture
 def reprocess(capsys: pytest.CaptureFixture[str]) -> Reprocess:
-    """The command in this process."""
+    """Return the command in this process."""
     return Reprocess(capsys)
 
 
@@ -77,8 +78,8 @@ def _captures(archive: Path) -> list[str]:
     return [ref.uri for ref in Archive.open(archive).refs("capture")]
 
 
-def test_nothing_has_changed_in_fields_however_they_are_chosen(surveyed: Path, reprocess: Reprocess) -> None:
-    """By name, pattern or scene file; a name that is none is refused; the newest run of a field counts."""
+def test_unchanged_fields_are_skipped(surveyed: Path, reprocess: Reprocess) -> None:
+    """Fields are chosen by name, pattern or scene file; an unknown name is refused; the newest run counts."""
     newest, rows = Archive.open(surveyed).runs()[-1].name, reprocess(surveyed)
     assert [(row["field"], row["state"]) for row in rows] == [("turned", "skipped"), ("scene", "skipped")]
     assert rows[1]["old"] == newest
@@ -95,8 +96,8 @@ def test_nothing_has_changed_in_fields_however_they_are_chosen(surveyed: Path, r
             run_reprocess(surveyed, QUIET, dry_run=True, **wishes)
 
 
-def test_new_weights_make_a_generation_beside_the_old(archive: Path, other: Path, reprocess: Reprocess) -> None:
-    """The coarse light is found, old runs stay, and the same command again has nothing to do."""
+def test_new_weights_add_runs_and_keep_old_ones(archive: Path, other: Path, reprocess: Reprocess) -> None:
+    """Coarse lines are cached, and the same command again skips all fields."""
     before = [path.name for path in Archive.open(archive).runs()]
     coarse = {run.products["raw_coarse"] for run in Catalogue.read(archive).runs}
     rows = reprocess(archive, weights=other)
@@ -114,10 +115,10 @@ def test_new_weights_make_a_generation_beside_the_old(archive: Path, other: Path
     assert run_verify(archive, QUIET) == DONE
 
 
-def test_a_run_that_gets_its_accuracy_stays_the_prior_map_of_later_ones(
+def test_a_run_that_gets_its_accuracy_remains_a_prior_map(
     archive: Path, other: Path, reprocess: Reprocess, scene_files: Path, survey_png: Survey
 ) -> None:
-    """A survey that was killed before its accuracy publishes no other run when it is surveyed again."""
+    """Repeating a survey that was killed before its accuracy publishes no other run."""
     first = Archive.open(archive).runs()[0]
     asked: list[Settings] = []
 
@@ -130,8 +131,8 @@ def test_a_run_that_gets_its_accuracy_stays_the_prior_map_of_later_ones(
     assert asked[-1].prior == first.name
 
 
-def test_a_newer_stage_replaces_an_older(archive: Path, reprocess: Reprocess, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A raised version makes it and what follows anew; light is not captured again."""
+def test_a_new_stage_version_runs_again(archive: Path, reprocess: Reprocess, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The stage and those after it run again; no line is captured again."""
     light = _captures(archive)
     be_version(monkeypatch, "segment", 99)
     assert reprocess.states(archive, dry_run=True) == [("turned", "would run"), ("scene", "would run")]
@@ -140,21 +141,21 @@ def test_a_newer_stage_replaces_an_older(archive: Path, reprocess: Reprocess, mo
     assert _captures(archive) == light
 
 
-def test_one_field_fails_and_the_others_are_done(archive: Path, other: Path, reprocess: Reprocess) -> None:
-    """With the message in its row; where none works the exit code says so."""
+def test_a_failed_field_does_not_stop_the_others(archive: Path, other: Path, reprocess: Reprocess) -> None:
+    """Its row has the message; the exit code tells if all fields failed."""
 
     def picky(settings: Settings, console: Console) -> Path:
         if "turned" in settings.scene:
             raise WeightsError("these do not fit")
-        return _survey(settings, console)
+        return run_survey(settings, console).folder
 
     rows = reprocess(archive, PARTLY, survey=picky, weights=other)
     assert [(row["state"], row["message"]) for row in rows] == [("failed", "these do not fit"), ("ran", None)]
     assert reprocess.states(archive, FAILED, survey=picky, weights=other, field="turned") == [("turned", "failed")]
 
 
-def test_damaged_fields_are_surveyed_again(archive: Path, reprocess: Reprocess) -> None:
-    """A run that lacks a store is made whole by a newer one; what is damaged is left to verify --repair."""
+def test_fields_with_missing_stores_are_surveyed_again(archive: Path, reprocess: Reprocess) -> None:
+    """A missing store leads to a new run; a damaged one is left to verify --repair."""
     newest = Catalogue.read(archive).runs[-1]
     store = archive / newest.products["class_map"].rpartition("/")[0]
     manifest = (store / "manifest.json").read_bytes()
@@ -166,16 +167,16 @@ def test_damaged_fields_are_surveyed_again(archive: Path, reprocess: Reprocess) 
     assert reprocess.states(archive) == [("turned", "skipped"), ("scene", "ran")]
 
 
-def test_a_run_without_settings_is_told(archive: Path, reprocess: Reprocess) -> None:
-    """Damaged as it is, nobody knows what it asked for; the others are done."""
+def test_a_run_without_settings_is_reported(archive: Path, reprocess: Reprocess) -> None:
+    """Its manifest is damaged, so its settings are unknown; the other fields are processed."""
     flip(Archive.open(archive).runs()[0] / "manifest.json", at=40)
     rows = reprocess(archive, PARTLY)
     assert sorted(row["state"] for row in rows) == ["failed", "skipped"]
     assert any("cannot be read" in str(row["message"]) for row in rows)
 
 
-def test_a_run_is_current_only_where_all_of_it_is_there(archive: Path) -> None:
-    """With its own folder and without a stage that failed; what it asked for stands in its manifest too."""
+def test_a_run_is_current_only_if_it_is_complete(archive: Path) -> None:
+    """It needs a valid receipt and no failed stage; its settings are in the manifest, too."""
     run = Catalogue.read(archive).runs[-1]
     settings = generations.asked_again(run, archive, None)
     assert generations.is_current(Catalogue.read(archive), run, settings)
@@ -187,8 +188,8 @@ def test_a_run_is_current_only_where_all_of_it_is_there(archive: Path) -> None:
     assert not generations.is_current(Catalogue.read(archive), damaged, settings)
 
 
-def test_fields_are_told_apart_by_what_they_asked_for_and_are_called(surveyed: Path, tmp_path: Path) -> None:
-    """Runs that do not tell are fields of their own; only the star stands for other letters."""
+def test_fields_differ_by_scene_and_name(surveyed: Path, tmp_path: Path) -> None:
+    """Each run without a scene is a field of its own; only the star is a wildcard."""
     (one, _) = generations.newest_runs(Catalogue.read(surveyed))
     odd = dataclasses.replace(one, receipt={**one.receipt, "survey": "field[1]?.png"})
     for pattern in ("field[1]?.png", "*[1]*", "*"):

@@ -1,4 +1,4 @@
-"""Bad input at the command line: one clear message (or it works), the right exit code, the archive as it was."""
+"""Bad input at the command line: one clear message or success, the right exit code, and an unchanged archive."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from tests.flows.conftest import FEW_BANDS, CommandLine, act_instead, class_map,
 
 NM = "460,500,550,600,620,640"
 RAN = "Report: "
-CAMERA = "[camera]\nsamples = 64\n"  # a narrow one: most of a small survey's time goes into samples beside the field
+CAMERA = "[camera]\nsamples = 64\n"  # narrow: most of a small survey's time goes into samples outside of the field
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory, scene_files: Path, weights: Path, make_weights: Any) -> Path:
-    """Unusual files beside usual ones."""
+    """Return a folder of usual and unusual files."""
     here = tmp_path_factory.mktemp("bad")
     for path in scene_files.iterdir():
         shutil.copy(path, here)
@@ -43,13 +43,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory, scene_files: Path, weights:
 
 @pytest.fixture(scope="module")
 def surveyed(folder: Path, surveyed_png: Any) -> Path:
-    """An archive with one survey in it."""
+    """Return an archive with one survey."""
     surveyed_png(folder / "archive")
     return folder / "archive"
 
 
 def contents(root: Path) -> dict[str, bytes | None] | None:
-    """Every file and folder below, or None where there is nothing."""
+    """Return every file and folder below a path, or None if it does not exist."""
     if not root.exists():
         return None
     return {str(path.relative_to(root)): path.read_bytes() if path.is_file() else None for path in root.rglob("*")}
@@ -86,7 +86,7 @@ REFUSED = {
 
 
 def survey_words(more: str, out: str = "archive") -> list[str]:
-    """A survey that works, with flags added or put in the place of its own."""
+    """Return a working survey command with flags added or replaced."""
     words = ["--scene", "scene.png", "--source", "sim", "--weights", "w.safetensors", "--engine", "plain"]
     words += ["--out", out, "--no-controls"]
     given = more.split()
@@ -98,10 +98,10 @@ def survey_words(more: str, out: str = "archive") -> list[str]:
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_refused_with_one_message(
+def test_bad_input_is_refused_with_one_message(
     case: str, folder: Path, surveyed: Path, command_line: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The right exit code, one line that says what to do, no traceback, and no trace in the archive, old or new."""
+    """The exit code is right, the message has a remedy, there is no traceback, and no archive is made or changed."""
     code, words, message = REFUSED[case]
     monkeypatch.chdir(folder)
     before = contents(surveyed)
@@ -126,7 +126,7 @@ WORKS = {
 def test_unusual_input_works(
     case: str, folder: Path, tmp_path: Path, command_line: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The survey ends with 0, says what it assumed, every pixel with a value has a class, the archive verifies."""
+    """The survey exits with 0 and notes its assumptions; every pixel with a value has a class; the archive verifies."""
     words, says = WORKS[case]
     monkeypatch.chdir(folder)
     flags = "--effects", "rotation,shot", "camera.toml"
@@ -139,10 +139,10 @@ def test_unusual_input_works(
     assert set(np.unique(drawn)) <= {0, 1, 2, 255}
 
 
-def test_without_a_valid_spectrum_there_is_one_message(
+def test_a_survey_without_a_valid_spectrum_is_refused(
     folder: Path, tmp_path: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A dark current that fills every pixel: what was captured stays."""
+    """The dark current saturates every pixel; the captured lines are kept."""
     monkeypatch.chdir(folder)
     (tmp_path / "hot.toml").write_text(f"{CAMERA}[detector]\ndark_e_per_s = 1e9\n")
     words = survey_words("--scan-step 1 --effects dark-current,shot", str(tmp_path / "archive"))
@@ -151,10 +151,10 @@ def test_without_a_valid_spectrum_there_is_one_message(
     assert Archive.open(tmp_path / "archive").refs("capture")
 
 
-def test_surveys_go_on_after_one_that_fails(
+def test_later_surveys_run_after_a_failed_one(
     command_line: CommandLine, field_file: Callable[..., Path], tmp_path: Path
 ) -> None:
-    """The message has the file of the survey that failed, and the exit code is its; a file that is none stops all."""
+    """The message names the file of the failed survey, whose exit code is used; a missing file stops all surveys."""
     few = {"scene": "farm", "size": "32x32", "source": None, "weights": None, "budget": None, "engine": "plain"}
     files = [field_file(stem, seconds=seconds, **few) for stem, seconds in (("a", "9"), ("b", "0.1"), ("c", "9"))]
     ended = command_line("survey", *files, "--bands", FEW_BANDS, "--no-accuracy", "--json")
@@ -173,17 +173,17 @@ def test_surveys_go_on_after_one_that_fails(
 def test_receipts_of_finished_surveys_are_printed_after_an_interrupt(
     command_line: CommandLine, monkeypatch: pytest.MonkeyPatch, field_file: Callable[..., Path]
 ) -> None:
-    """Ctrl-C in the second survey: the JSON object has the first."""
+    """After Ctrl-C in the second survey the JSON object has the first one."""
     published = Mock(side_effect=[Mock(receipt={"survey": "a"}), KeyboardInterrupt])
     monkeypatch.setattr("flows.publish.survey_command.run_survey", published)
     ended = command_line("survey", field_file("a"), field_file("b"), "--json")
     assert (ended.code, json.loads(ended.out)) == (130, {"surveys": [{"survey": "a"}]})
 
 
-def test_interrupted_survey_says_how_to_go_on(
+def test_an_interrupted_survey_resumes(
     folder: Path, command_line: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Ctrl-C in a stage ends with 130 and one line; the same command goes on with what was captured."""
+    """Ctrl-C in a stage exits with 130 and one line; the same command then uses the stored lines."""
     real = STAGES["score"]
     monkeypatch.chdir(folder)
     act_instead(monkeypatch, "score", Mock(side_effect=KeyboardInterrupt))

@@ -1,4 +1,4 @@
-"""The command line's own process: what it settles before anything is computed."""
+"""The process of the command line: threads, help, usage errors and signals."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ except SystemExit:
 """
 
 
-def test_a_process_begins_with_one_thread_and_ends_as_it_would_have() -> None:
-    """Sums split among threads round otherwise; SIGTERM has no effect once the exit code stands."""
+def test_a_process_has_one_thread_and_ignores_a_late_sigterm() -> None:
+    """Sums over threads round differently; SIGTERM at the end does not change the exit code."""
     ended = python(ONE_THREAD, OPENBLAS_NUM_THREADS="2")
     assert (ended.returncode, ended.stdout.split()[-1]) == (0, "1"), ended.stderr
     ended = python(ENDING)
@@ -38,14 +38,14 @@ def test_a_process_begins_with_one_thread_and_ends_as_it_would_have() -> None:
 
 
 def _flags(verb: str) -> dict[str, str | None]:
-    """What a verb takes, and what its help says of each."""
+    """Return the flags of a command, each with its help."""
     named = reduce(lambda found, word: found[word], verb.split(), build_app(listed=False))
     found = named.assemble_argument_collection(parse_docstring=True)
     return {argument.name: argument.parameter.help for argument in found if argument.name != "*"}
 
 
-def test_help_lists_every_verb_and_loads_none(capsys: pytest.CaptureFixture[str]) -> None:
-    """With the first sentence of each verb's own help; a verb's own help is whole."""
+def test_help_lists_every_command_and_imports_none(capsys: pytest.CaptureFixture[str]) -> None:
+    """The list has the first sentence of each command's help; a command's own help is complete."""
     script = (
         "import sys\nfrom flows.cli.main import main\ntry:\n    main(sys.argv[1:])\nfinally:\n    print(*sys.modules)"
     )
@@ -53,21 +53,21 @@ def test_help_lists_every_verb_and_loads_none(capsys: pytest.CaptureFixture[str]
     shown, loaded = ended.stdout.rsplit("\n", 2)[0], ended.stdout.split()
     assert not {"numpy", "torch", "prefect", "matplotlib", *VERBS.values()} & set(loaded)
     assert all(verb.split()[0] in shown for verb in VERBS)
-    assert "that they were not" in " ".join(shown.split())  # of evaluate
+    assert "that they were not" in " ".join(shown.split())  # from the help of evaluate
     with pytest.raises(SystemExit):
         cli.main(["train", "--help"])
     assert "OUT.checkpoint" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("verb", ["survey", "plan"])
-def test_a_survey_can_be_planned_by_its_own_words(verb: str) -> None:
-    """Every setting that is in no table has its flag, in both verbs."""
+def test_survey_and_plan_have_a_flag_for_every_setting(verb: str) -> None:
+    """Settings in tables are the exception."""
     assert {f"--{name.replace('_', '-')}" for name in {*SURVEY, *IN_TABLES} - set(TABLES)} <= set(_flags(verb))
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_every_flag_says_what_it_is(verb: str) -> None:
-    """Nobody has to guess."""
+def test_every_flag_has_help(verb: str) -> None:
+    """No help text is empty."""
     assert [name for name, words in _flags(verb).items() if not words] == []
 
 
@@ -78,23 +78,23 @@ def test_every_flag_says_what_it_is(verb: str) -> None:
         (["survey", "--budgt", "1"], "Unknown option: --budgt. Did you mean --budget?; see spectralzoom survey --help"),
     ],
 )
-def test_a_wrong_word_is_one_line(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """With the nearest right one, or why it went, and where all of them stand; no list that is cut off."""
+def test_a_misspelt_word_gives_one_line(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """It names the most similar word and the help; the line is not cut off."""
     with pytest.raises(SystemExit) as ended:
         cli.main(words)
     assert ended.value.code == 2
     assert capsys.readouterr().err == f"error: {message}\n"
 
 
-def test_printed_json_is_json(capsys: pytest.CaptureFixture[str]) -> None:
-    """What is not finite has no place in it."""
+def test_printed_json_is_valid(capsys: pytest.CaptureFixture[str]) -> None:
+    """NaN and infinity become null."""
     content: dict[str, Any] = {"a": float("nan"), "b": [1.5, float("inf")], "name": "ü"}
     print_json(content)
     assert json.loads(capsys.readouterr().out, parse_constant=pytest.fail) == {"a": None, "b": [1.5, None], "name": "ü"}
 
 
 def test_closed_streams_are_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A service may start without them; a file that is opened later must not take the place of one."""
+    """A service may start without them; a file opened later must not get the number of one."""
     for name in ("stdin", "stdout", "stderr"):
         monkeypatch.setattr(sys, name, None)
     with pytest.raises(SystemExit) as left:
@@ -106,8 +106,8 @@ def test_closed_streams_are_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_sigterm_ends_any_verb(verb: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """143 and one sentence, which says whether the same command goes on; afterwards SIGTERM is what it was before."""
+def test_sigterm_ends_commands(verb: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """It exits with 143 and one sentence, which tells if the command can resume; then the old handler is restored."""
 
     def terminated() -> None:
         os.kill(os.getpid(), signal.SIGTERM)

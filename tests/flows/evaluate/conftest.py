@@ -1,4 +1,4 @@
-"""One evaluation that several tests look at."""
+"""An evaluation that several tests share."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Judged = tuple[EvaluateRequest, dict[str, Any]]
 
 @pytest.fixture(scope="package")
 def judged(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Judged:
-    """What was asked for, and an evaluation of two seeds."""
+    """Return a request and its evaluation with the weights of two seeds."""
     folder = tmp_path_factory.mktemp("out")
     weights = tuple(write_weights(folder / f"w{seed}.safetensors", seed) for seed in (0, 1))
     request = EvaluateRequest(str(data), weights, folder / "out", **QUICK)

@@ -1,4 +1,4 @@
-"""`spectralzoom evaluate`: which frames are judged, what the figures hold and what is refused."""
+"""`spectralzoom evaluate`: the frames that it judges, the figures that it writes and the input that it refuses."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def _row(content: dict[str, Any], policy: str, fraction: float) -> dict[str, Any
 TRIAL = EvaluateRequest("field", (), fractions=(0.5,), policies=(), draws=10)
 
 
-def test_every_row_is_there(judged: Judged):
-    """Every policy at every fraction, with means of the seeds and their spread; and the files of the folder."""
+def test_evaluation_has_a_row_per_policy_and_fraction(judged: Judged):
+    """Rows hold the mean over the seeds and its spread; the folder holds evaluation.json alone."""
     request, content = judged
     folder, keys = request.out, [(row["policy"], row["fraction"]) for row in content["rows"]]
     policies = [(policy, fraction) for policy in ("entropy", "random", ORACLE) for fraction in (0.25, 0.5)]
@@ -54,8 +54,8 @@ def test_every_row_is_there(judged: Judged):
     assert row["against_all"]["low"] <= row["against_all"]["difference"] <= row["against_all"]["high"]
 
 
-def test_costs_stand_beside_all_and_the_oracle_has_all_the_gain(judged: Judged):
-    """More patches cost more; what uses labels is marked, and captures all there is to gain."""
+def test_costs_are_relative_to_all_patches_and_the_oracle_captures_all_gain(judged: Judged):
+    """More patches cost more; the oracle's row is marked as one that uses labels."""
     _, content = judged
     cost = {fraction: _row(content, "entropy", fraction)["cost"] for fraction in (0.25, 0.5)}
     for column in ("patches", "multiply_adds"):
@@ -67,7 +67,7 @@ def test_costs_stand_beside_all_and_the_oracle_has_all_the_gain(judged: Judged):
 
 
 def test_frames_trained_on_are_left_out(data: Path, tmp_path: Path):
-    """Weights that a training made are judged on what it held out or kept for validation."""
+    """Trained weights are judged on the frames that were held out or kept for validation."""
     settings, out = TrainingSettings(steps=1, batch=1, crop=16), tmp_path / "w.safetensors"
     train_weights(TrainRequest(str(data), out, ("003",), 1, patch=8, width=4, settings=settings))
     split, content = load_weights(out).record["split"], evaluate_weights(EvaluateRequest(str(data), (out,), **QUICK))
@@ -80,8 +80,8 @@ def test_frames_trained_on_are_left_out(data: Path, tmp_path: Path):
         evaluate_weights(EvaluateRequest(str(data), (out,), frames=FRAMES))
 
 
-def test_folds_are_judged_each_on_its_own_frames(data: Path, tmp_path: Path):
-    """With frames left out in turn every frame is judged by the weights that did not see it."""
+def test_each_fold_is_judged_on_its_own_frames(data: Path, tmp_path: Path):
+    """In cross-validation, the fold that did not train on a frame judges it."""
     scenes = {name: scene_at(data, name).key for name in FRAMES}
     first = write_weights(tmp_path / "a.safetensors", 0, split={"train": {"001": scenes["001"]}})
     second = write_weights(tmp_path / "b.safetensors", 1, split={"train": {n: scenes[n] for n in ("002", "003")}})
@@ -97,7 +97,7 @@ def test_folds_are_judged_each_on_its_own_frames(data: Path, tmp_path: Path):
 
 
 def test_folds_that_kept_frames_for_validation_are_one_seed(data: Path, tmp_path: Path):
-    """What one of them held out another validated on: each is judged on its own; alone, on both."""
+    """One fold held out the frame on which the other validated; a single fold is judged on both frames."""
     keys, paths = {name: scene_at(data, name).key for name in FRAMES}, []
     for number, (kept, validated, trained) in enumerate((("001", "002", "003"), ("002", "001", "003"))):
         split = {"train": {trained: keys[trained]}, "held_out": [kept], "validation": {validated: keys[validated]}}
@@ -110,8 +110,8 @@ def test_folds_that_kept_frames_for_validation_are_one_seed(data: Path, tmp_path
     assert "thresholds by 002: scores of these" in " ".join(alone["data_notes"])
 
 
-def test_files_that_leave_different_pixels_are_not_compared(data: Path, tmp_path: Path):
-    """With masks of their own two files would be judged on different pixels of one frame: refused."""
+def test_weights_with_different_training_pixels_of_a_frame_are_refused(data: Path, tmp_path: Path):
+    """Their training masks differ, so they would be judged on different pixels of one frame."""
     scene = scene_at(data)
     halves = [np.zeros(scene.shape, bool) for _ in range(2)]
     halves[0][:12], halves[1][12:] = True, True
@@ -130,8 +130,8 @@ def test_files_that_leave_different_pixels_are_not_compared(data: Path, tmp_path
     assert sum(content["support"].values()) == 12 * 40
 
 
-def test_frames_trained_on_are_known_in_other_bands(data: Path, tmp_path: Path):
-    """By the content of their files, whatever bands are read, here or in the training."""
+def test_training_frames_are_recognised_in_other_bands(data: Path, tmp_path: Path):
+    """The content of the files identifies a frame, not the bands that are read."""
     split = {"train": {"001": "of other bands"}, "content": list(scene_at(data).content)}
     quick = {**QUICK, "policies": (), "fractions": ()}
     weights = (write_weights(tmp_path / "w.safetensors", split=split),)
@@ -139,7 +139,7 @@ def test_frames_trained_on_are_known_in_other_bands(data: Path, tmp_path: Path):
 
 
 def test_frames_without_a_label_are_refused(data: Path, tmp_path: Path):
-    """Where the mask of the training took every label there is nothing to judge by."""
+    """The training mask took every label, so no labelled pixel is left to judge."""
     scene = scene_at(data)
     split = {"train": {"001": scene.key}, "pixels": {scene.key: pack_mask(np.ones(scene.shape, bool))}}
     weights = (write_weights(tmp_path / "w.safetensors", split=split),)
@@ -148,7 +148,7 @@ def test_frames_without_a_label_are_refused(data: Path, tmp_path: Path):
 
 
 def test_weights_that_cannot_be_judged_together_are_refused(tmp_path: Path):
-    """A record that is none of a camera, the same file twice, and other classes."""
+    """A camera record of another version, the same weights twice and different classes are refused."""
     (one,) = open_candidates((write_weights(tmp_path / "w.safetensors", camera={"lens": 1}),))
     with pytest.raises(WeightsError, match=r"cannot read .*it is of another version"):
         _ = one.camera
@@ -160,10 +160,10 @@ def test_weights_that_cannot_be_judged_together_are_refused(tmp_path: Path):
         open_candidates((first, again))
 
 
-def test_one_frame_has_accuracies_over_its_pixels(
+def test_one_frame_alone_has_overall_and_average_accuracy_and_kappa(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    """Overall and average accuracy and kappa stand in the table of one frame alone; freed memory is kept."""
+    """The table of one frame shows them; the command keeps freed memory for reuse."""
     kept: list[bool] = []
     monkeypatch.setattr("flows.evaluate.command.keep_freed_memory", lambda: kept.append(True))
     weights = (write_weights(tmp_path / "w.safetensors"),)
@@ -181,8 +181,8 @@ def test_one_frame_has_accuracies_over_its_pixels(
     assert all(word in shown for word in ("overall", "average", "kappa", "captured"))
 
 
-def test_records_count_by_their_pixels():
-    """In any order."""
+def test_miou_of_frames_comes_from_their_summed_counts():
+    """The order of the frames has no effect."""
     rng = np.random.default_rng(0)
     records = [_record(f"{number:03d}", rng) for number in range(4)]
     there, back = (summarise([order], ("a", "b"), TRIAL) for order in (records, records[::-1]))
@@ -191,8 +191,8 @@ def test_records_count_by_their_pixels():
     assert there["rows"][0]["miou"] == mean_iou(whole.counts.sum(axis=(0, 1)))
 
 
-def test_a_class_that_no_label_has_is_told_apart(judged: Judged, capsys: pytest.CaptureFixture[str]):
-    """Rows are means over the classes of all frames' labels; a false class has pixels and no IoU."""
+def test_a_class_without_labels_has_false_pixels_and_no_iou(judged: Judged, capsys: pytest.CaptureFixture[str]):
+    """The mean is taken over the classes of all frames' labels."""
     counts = [[[8, 0, 2], [1, 9, 0], [0, 0, 0]], [[7, 3, 0], [0, 10, 0], [0, 0, 0]]]
     records = [_record("001", np.random.default_rng(0)), _record("002", np.random.default_rng(0))]
     for record, one in zip(records, counts, strict=True):
@@ -217,7 +217,7 @@ def _record(name: str, rng: np.random.Generator) -> dict[str, Any]:
 
 
 def test_weights_without_a_common_frame_are_one_seed() -> None:
-    """Folds of one training are joined, weights that share a frame are seeds; what none judged is not counted."""
+    """Folds of one training are joined and weights that share a frame are seeds; frames not judged have zero counts."""
     rng = np.random.default_rng(0)
     runs = [[_record(name, rng) for name in names] for names in ("ab", "c", "abc", "")]
     assert seeds_of(runs) == [[0, 1], [2]]
@@ -229,8 +229,8 @@ def test_weights_without_a_common_frame_are_one_seed() -> None:
     assert (found["difference"], found["frames"]) == (pytest.approx(wanted), 3)
 
 
-def test_the_farm_is_judged_on_seeds_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Small built-in fields, neither trained on nor shown, noisy."""
+def test_the_farm_is_judged_on_test_seeds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The built-in fields of the test data have seeds of their own, apart from training."""
     monkeypatch.setattr("flows.training.data.FARM_SHAPE", (32, 48))
     monkeypatch.setattr("flows.training.observed_scenes.chosen_effects", lambda *_: USUAL)  # choosing takes seconds
     made, weights = make_weights(classes=len(CLASSES), columns=6), tmp_path / "w.safetensors"
@@ -252,15 +252,15 @@ def test_the_farm_is_judged_on_seeds_of_its_own(tmp_path: Path, monkeypatch: pyt
         ({"frames": ("099",)}, "has no frame 099; it has 001, 002, 003"),
     ],
 )
-def test_what_cannot_be_is_refused(data: Path, tmp_path: Path, change: dict[str, Any], words: str):
-    """The message names the flag, or the frames that there are."""
+def test_invalid_requests_are_refused(data: Path, tmp_path: Path, change: dict[str, Any], words: str):
+    """The message names the flag, or lists the existing frames."""
     request = EvaluateRequest(str(data), (write_weights(tmp_path / "w.safetensors"),), **QUICK)
     with pytest.raises(SettingsError, match=words):
         evaluate_weights(replace(request, **change))
 
 
 def test_figures_are_printed(judged: Judged, data: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path):
-    """Rows, classes and what the figures mean, from what was kept; with --json one object on stdout."""
+    """Rows, classes and notes are printed from the stored evaluation; --json prints one object on stdout."""
     run_evaluate(judged[0], Console(stderr=True))
     shown = capsys.readouterr()
     for words in ("oracle*", "MACs", "crop", "uses labels", "paired bootstrap"):

@@ -1,4 +1,4 @@
-"""The account of bytes of a run: each figure is counted again by walking folders, and shown where people look."""
+"""The byte account of a run: the size of files in folders confirms each figure, and terminal and page show it."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ PNG = b"\x89PNG\r\n\x1a\nnot a real picture"
 
 
 def walked(*folders: Path) -> int:
-    """Bytes of all files in folders, as `find -type f` lists them."""
+    """Return the bytes of all files in folders, as `find -type f` lists them."""
     return sum(path.stat().st_size for folder in folders for path in folder.rglob("*") if path.is_file())
 
 
 def told(folder: Path) -> dict[str, Any]:
-    """The account in the receipt of a run's folder."""
+    """Return the account in the receipt of a run's folder."""
     account: dict[str, Any] = json.loads((folder / "receipt.json").read_text())["data_bytes"]
     return account
 
 
 @pytest.fixture
 def spooled(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Bytes of each spool when it is removed."""
+    """Return a list that gets the bytes of each spool when it is removed."""
     found: list[int] = []
     drop = Archive.drop_spool
 
@@ -49,17 +49,17 @@ def spooled(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 @pytest.fixture
 def published(survey_png: Survey, tmp_path: Path) -> Published:
-    """A survey of the small picture into an archive of its own."""
+    """Return a survey of the small picture in an archive of its own."""
     return survey_png(tmp_path / "archive", accuracy=False)
 
 
 @pytest.mark.parametrize(("keep", "budget"), [("raw", "0.45"), ("signal", "0.8")])
-def test_the_account_of_a_survey_is_what_lies_in_its_folders(
+def test_the_account_of_a_survey_matches_its_folders(
     spooled: list[int], survey_png: Survey, tmp_path: Path, keep: str, budget: str
 ) -> None:
-    """Kept and written by walking the archive, captured by the lines; nothing is moved.
+    """Kept and written bytes are those of files, captured bytes those of lines; nothing is moved.
 
-    Raw lines that are cleared after the publication are written and not kept, and so is the mosaic of a first pass.
+    Raw lines and a first pass's mosaic, cleared after the publication, count as written and not as kept.
     """
     root = tmp_path / "archive"
     published = survey_png(root, accuracy=False, keep=keep, budget=budget)
@@ -73,22 +73,22 @@ def test_the_account_of_a_survey_is_what_lies_in_its_folders(
     assert keep == "signal" or account["written"] == account["kept"] + sum(spooled)
     assert account["moved_bucket"] == 0
     assert account["reference"] >= 96 * 128 * 3 * 2  # a line has all samples of the camera
-    assert 0 < account["captured"] < sum(spooled)  # a spool has numbers, times and checksums beside the lines
+    assert 0 < account["captured"] < sum(spooled)  # a spool has values, times and checksums of the lines
     assert account["captured"] > 0.9 * sum(spooled)
     (listed,) = contents(Archive.open(root))["runs"]
     assert listed["bytes"] == walked(root / "stages", root / "runs")
     assert problems(root) == []
 
 
-def test_an_accuracy_that_is_added_is_in_the_account(survey_png: Survey, tmp_path: Path) -> None:
-    """The published run is counted again: with its stores of the judging, and all files of the folder as it is then."""
+def test_the_account_includes_an_added_accuracy(survey_png: Survey, tmp_path: Path) -> None:
+    """The published run is counted again, with the stores of the evaluation and the new files of its folder."""
     root = tmp_path / "archive"
     account = told(survey_png(root).folder)
     assert account["kept"] == walked(root / "stages", root / "runs") - walked(root / "stages" / "capture")
     assert account["written"] > account["kept"]  # the folder was written twice
 
 
-def test_what_is_found_counts_as_kept_not_as_written(published: Published, survey_png: Survey, tmp_path: Path) -> None:
+def test_cached_stores_count_as_kept_not_as_written(published: Published, survey_png: Survey, tmp_path: Path) -> None:
     """A second run of the same survey writes its folder alone, and keeps the stores of the first."""
     root = tmp_path / "archive"
     again = survey_png(root, accuracy=False)
@@ -100,8 +100,8 @@ def test_what_is_found_counts_as_kept_not_as_written(published: Published, surve
     assert account["captured"] == first["captured"]  # its passes are the same
 
 
-def test_a_revisit_does_not_count_the_visit_before(survey_png: Survey, tmp_path: Path) -> None:
-    """The stores whose map is the prior map belong to that visit; both together are what the archive has."""
+def test_a_visit_does_not_count_the_one_before(survey_png: Survey, tmp_path: Path) -> None:
+    """The stores of its prior map belong to the visit before; both accounts add up to the archive."""
     root, flags = tmp_path / "archive", {"budget": None, "scan_step": "2", "prior": "latest", "accuracy": False}
     visits = [survey_png(root, **flags, visit=f"2026-06-0{day}T10:00:00Z") for day in (1, 8)]
     assert visits[1].receipt["prior_map"]["days"] == 7
@@ -113,7 +113,7 @@ def test_a_revisit_does_not_count_the_visit_before(survey_png: Survey, tmp_path:
 def test_a_run_in_a_bucket_counts_its_objects(
     bucket: str, spooled: list[int], survey_png: Survey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Kept are the objects in the bucket; moved what went there, and on another machine what it had to fetch."""
+    """Kept bytes are the bucket's objects; moved bytes are sent, and on another machine also fetched."""
     from storage.remote.object_stores import Objects, parse_place
 
     account = told(survey_png(bucket, accuracy=False).folder)
@@ -121,8 +121,8 @@ def test_a_run_in_a_bucket_counts_its_objects(
     counted = ("stages/", "stages/capture/")  # raw lines are cleared after the publication
     stores = sum(size for path, size in sizes.items() if path.startswith(counted[0]) and counted[1] not in path)
     assert account["kept"] == stores + sum(size for path, size in sizes.items() if path.startswith("runs/"))
-    sent = account["written"] - sum(spooled)  # with the raw lines that were cleared away after publication
-    assert account["kept"] < sent <= account["moved_bucket"] < 1.2 * sent  # manifests are read besides
+    sent = account["written"] - sum(spooled)  # with the raw lines that were cleared after the publication
+    assert account["kept"] < sent <= account["moved_bucket"] < 1.2 * sent  # manifests are read in addition
     monkeypatch.setenv("SPECTRALZOOM_WORK", str(tmp_path / "elsewhere"))
     other = survey_png(bucket, accuracy=False)
     again = told(other.folder)
@@ -133,11 +133,11 @@ def test_a_run_in_a_bucket_counts_its_objects(
 
 
 @pytest.mark.parametrize("stores", [899, 99_000, 999_400, 9_999_999_000])
-def test_the_figure_of_a_folder_that_holds_it(stores: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where a digit more of it makes the folder larger, or shorter words make the page smaller, it holds as well."""
+def test_the_account_includes_its_own_receipt(stores: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It stays exact if a further digit makes the folder larger, or shorter text makes the page smaller."""
     archive = Archive.open(tmp_path / "archive")
-    monkeypatch.setattr(archive, "sizes", lambda uris: {"stages/capture/ab12": stores})  # which the run built
-    widths = iter(range(100_000, 0, -1))  # a page that gets shorter whenever it is asked for
+    monkeypatch.setattr(archive, "sizes", lambda uris: {"stages/capture/ab12": stores})  # the run built these
+    widths = iter(range(100_000, 0, -1))  # a page that gets shorter at each call
     with archive.new_run("north") as draft:
         publish_counted(archive, draft, make_receipt(), lambda receipt: "x" * next(widths), rests_on={})
     (folder,) = archive.runs()
@@ -145,8 +145,8 @@ def test_the_figure_of_a_folder_that_holds_it(stores: int, tmp_path: Path, monke
     assert told(folder)["written"] == 7_000_000 + walked(folder)
 
 
-def test_terminal_and_page_show_megabytes_against_one_reference() -> None:
-    """A row each, with its fraction of the reference."""
+def test_terminal_and_page_show_bytes_against_the_reference() -> None:
+    """Kept, captured and written bytes have a row each, with their fraction of the reference."""
     rows = [row for row in saving_rows(make_receipt()) if row["label"].startswith("bytes")]
     assert [(row["label"], row["done"], row["full"], row["ratio"]) for row in rows] == [
         ("bytes kept", "1.5 MB", "4 MB", 0.375),
@@ -160,7 +160,7 @@ def test_terminal_and_page_show_megabytes_against_one_reference() -> None:
 
 
 def test_a_tiny_field_has_no_absurd_percentage() -> None:
-    """Where the camera gave 384 bytes, rows are in bytes and kB, and what is kept is so many times as much."""
+    """For 384 captured bytes the rows have B and kB, and kept bytes are given as a multiple."""
     told = {"captured": 384, "written": 655_553, "kept": 655_553, "moved_bucket": 0, "reference": 384}
     receipt = make_receipt()
     receipt["data_bytes"] |= told

@@ -1,4 +1,4 @@
-"""Findings of a run: what changed and what is old on the ground, in words; what a map says of itself."""
+"""Findings of a run: changes and ages on the ground, and the score that a map expects of itself."""
 
 from __future__ import annotations
 
@@ -21,32 +21,32 @@ from storage.arrays.class_maps import ClassMap
 from tests.conftest import CLASSES, Survey
 from tests.flows.tasks.test_unknown import add_judgement
 
-PLACE = NoPlace((2, 4), pixel_m=10.0)  # a hundredth of a hectare a pixel
+PLACE = NoPlace((2, 4), pixel_m=10.0)  # a pixel is a hundredth of a hectare
 GROUND: dict[str, Any] = {"crs": "EPSG:32632", "resolution_m": 0.12}
 BIAS = np.array([-0.4, 0.1, 0.0])
 SCORES = MapScores((1,), (50.0, 100.0), np.stack([[0 * BIAS, BIAS]]), np.array([[0.02, 0.01]]), 4)
 
 
-def test_hectares_are_older_than_days_and_not_as_old() -> None:
-    """A look of exactly so many days ago is not longer ago; what was never looked at is of no age."""
+def test_older_hectares_exclude_the_exact_age() -> None:
+    """A pixel of exactly 1 or 7 days is not older than that; pixels without an age do not count."""
     age = np.array([[0.0, 1.0, 1.125, 7.0], [7.125, 30.0, 400.0, np.nan]], np.float32)
     found = older_hectares(PLACE, age)
     np.testing.assert_allclose([found[days] for days in ("1", "7", "30")], [0.05, 0.03, 0.01])
 
 
-def test_changed_hectares_are_told_from_class_to_class() -> None:
-    """Largest first, as far as two maps would not differ anyway; a pixel without a class today counts nothing."""
+def test_changed_hectares_are_listed_by_pair_of_classes() -> None:
+    """Largest ones come first, scaled by the part beyond chance; pixels without a class today are left out."""
     now = np.array([[0, 0, 1, 1], [2, UNLABELLED, 2, 2]], np.uint8)
     old = np.array([[1, 255, 0, 0], [0, 0, 255, 255]], np.uint8)
-    names = "soil", "crop", "unknown", *(f"class_{number}" for number in range(3, 16))  # a pair is 255, too
+    names = "soil", "crop", "unknown", *(f"class_{number}" for number in range(3, 16))  # one pair has the number 255
     legend = names, np.zeros((16, 3), np.uint8)
     beyond = {("soil", "crop"): 1.0, ("soil", "unknown"): 0.5}
     found = changed_hectares(PLACE, old, ClassMap(now, np.ones(now.shape, np.float32), *legend), beyond)
     assert [(round(area, 6), *pair) for area, *pair in found] == [(0.02, "soil", "crop"), (0.005, "soil", "unknown")]
 
 
-def test_rows_have_hectares_and_changes_where_they_are_known() -> None:
-    """Hectares of classes that the map has; changes with their classes; days with older hectares."""
+def test_findings_have_hectares_changes_and_ages() -> None:
+    """Classes of no area are left out; changes name both classes, and ages have hectares."""
     areas = {"px": {"bare_soil": 30}, "ha": {"bare_soil": 0.3, "crop": 0.1, "weed": 0.0}}
     assert finding_rows({"areas": areas}) == [("classes", "bare soil 0.3 ha, crop 0.1 ha")]
     later = {"changes_ha": [[0.5, "crop", "bare_soil"], [0.0004, "weed", "crop"]], "older_ha": {"1": 0.25, "7": 0.0}}
@@ -58,12 +58,12 @@ def test_rows_have_hectares_and_changes_where_they_are_known() -> None:
 
 
 def _judged(weights: Path, folder: Path, content: dict[str, Any], limit: float = 1e6) -> Path:
-    """A copy of the tiny weights beside which stands how what their maps expect came true."""
+    """Write a copy of the tiny weights with the calibration of their expected scores, and return its path."""
     return add_judgement(weights, folder / "judged.safetensors", limit, {MAP_SCORES: content})
 
 
-def test_a_plain_scan_is_told_what_its_map_scores_by_itself(survey_png: Survey, weights: Path, tmp_path: Path):
-    """By the stored class probabilities, as another reader opens it, and the bias of its exposure; in words too."""
+def test_a_uniform_scan_has_the_expected_score_of_its_map(survey_png: Survey, weights: Path, tmp_path: Path):
+    """It follows from the stored class probabilities and the bias of its exposure."""
     path = _judged(weights, tmp_path, SCORES.as_dict())
     receipt: Any = survey_png(tmp_path / "a", weights=str(path), effects="none", budget=None, scan_step="1").receipt
     (store,) = (tmp_path / "a").glob("stages/segment/*/class_probabilities.zarr")
@@ -77,8 +77,8 @@ def test_a_plain_scan_is_told_what_its_map_scores_by_itself(survey_png: Survey, 
     assert words in dict(finding_rows(receipt))["expected mIoU"]
 
 
-def test_a_score_that_may_be_any_is_not_predicted(survey_png: Survey, weights: Path, tmp_path: Path) -> None:
-    """Weights whose maps were off by 37 points: the receipt has no score, and says why."""
+def test_an_uncertain_expected_score_is_left_out(survey_png: Survey, weights: Path, tmp_path: Path) -> None:
+    """Maps of these weights were off by 37 points: the receipt has no score, and the findings say why."""
     content = SCORES.as_dict() | {"error": [[0.371, 0.371]]}
     path = _judged(weights, tmp_path, content)
     receipt: Any = survey_png(tmp_path / "a", weights=str(path), effects="none", budget=None, scan_step="1").receipt
@@ -96,15 +96,15 @@ def test_a_score_that_may_be_any_is_not_predicted(survey_png: Survey, weights: P
     ],
     ids=["known", "spread too wide", "all of it unknown"],
 )
-def test_scans_promise_what_their_record_can_say(spread: float, unknown: float, words: str) -> None:
-    """A score with its spread; none of scenes that differ too much, nor of a field that the weights do not know."""
+def test_scans_show_expected_miou_if_it_is_reliable(spread: float, unknown: float, words: str) -> None:
+    """It is left out if scenes differ too much, or if the weights do not know the field."""
     scan = {"step": 1, "exposure_ms": 25.0, "seconds": 9.0, "expected_miou": 0.927, "expected_spread": spread}
     found = {"scans": {"taken": scan, "reference": scan}, "unknown": {"pixels": 1, "fraction": unknown, "rate": 0.01}}
     assert re.search(f"cheapest near the best {words}", dict(finding_rows(found))["uniform scans"])
 
 
-def test_words_of_a_memory_tell_change_beyond_what_maps_differ_by() -> None:
-    """Where about as many pixels differ as of two maps of the same ground, none has changed."""
+def test_changes_from_a_prior_map_exceed_the_expected_difference() -> None:
+    """Two maps of unchanged ground differ in some pixels, and such a number is no change."""
     memory = {"run": "r", "days": 3.0, "differing_px": 950, "expected_differing_px": 810, "changed_px": 0}
     words = "r; 3.0 days earlier; differing 950 px; expected differing 810 px"
     assert dict(finding_rows({"prior_map": memory}))["prior map"] == words
@@ -124,10 +124,10 @@ def test_words_of_a_memory_tell_change_beyond_what_maps_differ_by() -> None:
     ],
     ids=["another step", "read in part", "other bands", "much unknown"],
 )
-def test_no_score_is_expected_of_other_maps(
+def test_maps_outside_of_the_calibration_have_no_expected_score(
     survey_png: Survey, weights: Path, tmp_path: Path, limit: float, flags: dict[str, str]
 ) -> None:
-    """The calibration is of whole scans of one step, of scenes with the bands of the training and known spectra."""
+    """It covers full readings of scans of one step, with the training's bands and known spectra."""
     path = _judged(weights, tmp_path, SCORES.as_dict(), limit)
     receipt: Any = survey_png(tmp_path / "a", weights=str(path), effects="none", budget=None, **flags).receipt
     assert "expected" not in receipt
@@ -136,8 +136,8 @@ def test_no_score_is_expected_of_other_maps(
     assert beyond == ("wavelengths" in flags)
 
 
-def test_a_table_that_is_none_is_refused_with_its_file(survey_png: Survey, weights: Path, tmp_path: Path):
-    """The file is named, and what to do."""
+def test_a_malformed_score_table_is_refused(survey_png: Survey, weights: Path, tmp_path: Path):
+    """The message names the file and the cause."""
     path = _judged(weights, tmp_path, SCORES.as_dict() | {"error": [[0.1]]})
     with pytest.raises(WeightsError, match=r"cannot read .*judged\.safetensors: .*scans"):
         survey_png(tmp_path / "a", weights=str(path), effects="none", budget=None, scan_step="1")

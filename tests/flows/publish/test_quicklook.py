@@ -1,4 +1,4 @@
-"""The quicklook: a readable PNG for any size, and the parts that it is made of."""
+"""The quicklook: a readable PNG for any size, and its parts."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ WAVES = np.linspace(400, 1000, 61)
 
 
 def make_data(height: int, width: int, *, patch: int = 16) -> QuicklookData:
-    """A small survey of noise with every optional part."""
+    """Return a small survey of noise with every optional part."""
     rng = np.random.default_rng(0)
     rows, columns = -(-height // (4 * patch)) * 4, -(-width // (4 * patch)) * 4
     return QuicklookData(
@@ -47,7 +47,7 @@ def make_data(height: int, width: int, *, patch: int = 16) -> QuicklookData:
 
 @pytest.mark.parametrize(("height", "width"), [(96, 128), (20, 300), (300, 20), (1, 1)])
 def test_picture_has_a_readable_size(tmp_path: Path, height, width):
-    """Any proportions give a page of 800 to 2000 px a side, mostly covered; letters that no font has are boxes."""
+    """Any proportions give 1200 to 1800 x 600 to 2000 px, also with letters that the font lacks."""
     data = replace(make_data(height, width), class_names=("soil", "甜菜", r"$\weeds_{$"))
     (tmp_path / "q.png").write_bytes(draw_quicklook(data))
     with Image.open(tmp_path / "q.png") as image:
@@ -57,14 +57,14 @@ def test_picture_has_a_readable_size(tmp_path: Path, height, width):
 
 @pytest.mark.parametrize("score", [-np.inf, np.inf, 0.0])
 def test_scores_without_a_range_are_drawn(score):
-    """Scores that are all alike or not finite do not stop the picture."""
+    """Scores that are all equal or infinite do not stop the picture."""
     data, figure = make_data(64, 64), Figure(figsize=(8, 6))
     _draw_attention(figure.add_subplot(), replace(data, score=np.full_like(data.score, score)))
     FigureCanvasAgg(figure).draw()
 
 
-def test_pictures_of_less_and_of_the_same(tmp_path: Path):
-    """No truth, patch, block or score still make a picture; the same data give the same bytes."""
+def test_pictures_need_no_optional_part_and_are_reproducible(tmp_path: Path):
+    """Truth, patches, blocks and finite scores may be absent; the same data give the same bytes."""
     for name in ("one", "two"):
         (tmp_path / name).write_bytes(draw_quicklook(make_data(32, 48)))
     assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
@@ -85,7 +85,7 @@ def test_pictures_of_less_and_of_the_same(tmp_path: Path):
 
 
 def test_colours_of_bands_and_of_pixels_without_a_class():
-    """The bands nearest 640, 550 and 460 nm, sorted or not, else the ends and the middle; 255 is grey."""
+    """Bands nearest to 640, 550 and 460 nm are shown in any order, else ends and middle; no class is grey."""
     assert choose_bands(WAVES)[0] == (24, 15, 6)
     order = np.random.default_rng(0).permutation(61)
     assert choose_bands(WAVES[order])[0] == tuple(np.argsort(order)[[24, 15, 6]])
@@ -101,7 +101,7 @@ def test_colours_of_bands_and_of_pixels_without_a_class():
 
 
 def test_outline_is_the_border_of_the_patches():
-    """Two neighbours have one common border of six sides, cut off at the scene's edge."""
+    """Two neighbours have one common border of six sides, cut off at the edge of the scene."""
     chosen = np.zeros((3, 4), bool)
     chosen[0, 0] = chosen[0, 1] = True
     segments = np.array(outline(chosen, 10, (25, 15)))
@@ -112,8 +112,8 @@ def test_outline_is_the_border_of_the_patches():
 
 
 @pytest.mark.parametrize("confident", [True, False])
-def test_a_plain_scan_shows_how_sure_its_map_is(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, confident):
-    """In the place of where it captured again, which it did not."""
+def test_a_uniform_scan_shows_the_confidence_of_its_map(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, confident):
+    """It replaces the panel of lines that were captured again."""
     words = []
     monkeypatch.setattr(quicklook, "_caption", lambda axes, title, text: words.append((title, text)))
     data = make_data(96, 128)
@@ -126,8 +126,8 @@ def test_a_plain_scan_shows_how_sure_its_map_is(monkeypatch: pytest.MonkeyPatch,
     assert "2  Captured again" not in told
 
 
-def test_a_revisit_shows_what_changed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Pixels that changed have today's colours, the others are grey; the caption counts them and tells the days."""
+def test_a_later_visit_shows_the_changes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Changed pixels have the colours of today's classes, others are grey; the caption has their number and days."""
     words, shown = list[tuple[str, str]](), Mock(wraps=quicklook._show)
     monkeypatch.setattr(quicklook, "_caption", lambda axes, title, text: words.append((title, text)))
     monkeypatch.setattr(quicklook, "_show", shown)
@@ -152,8 +152,8 @@ def test_class_colours_are_exact(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("height", "width"), [(96, 128), (480, 300), (256, 64)])
-def test_long_words_stay_within_the_picture(height: int, width: int) -> None:
-    """Title and captions are wrapped, so that their ends are seen and none lies over the next panel."""
+def test_long_titles_stay_within_the_picture(height: int, width: int) -> None:
+    """Titles and captions are wrapped, so none is cut off or overlaps the next panel."""
     with mpl.rc_context(quicklook._STYLE):
         data = replace(make_data(height, width), about="every line, 25 ms; " * 8, changed=True)
         FigureCanvasAgg(figure := quicklook._compose(data)).draw()
@@ -164,7 +164,7 @@ def test_long_words_stay_within_the_picture(height: int, width: int) -> None:
             assert all(one.get_window_extent().x1 <= end for one in (axes._left_title, *axes.texts))
 
 
-def test_a_legend_of_long_names_lies_within_the_picture():
+def test_a_legend_of_long_names_stays_within_the_picture():
     figure = Figure(figsize=(15, 6), layout="constrained")
     names = tuple(f"buildings_grass_trees_and_drives_{number}" for number in range(16))
     colours = np.zeros((16, 3), np.uint8)
@@ -174,7 +174,7 @@ def test_a_legend_of_long_names_lies_within_the_picture():
 
 
 def test_a_large_field_is_drawn_from_every_nth_pixel(monkeypatch: pytest.MonkeyPatch):
-    """The map is thinned for the picture; axes are those of the whole field."""
+    """The map is thinned for the picture; the axes are those of the whole field."""
     monkeypatch.setattr(panels, "MOST_PX", 64)
     data = make_data(96, 128)
     given = {"rectified": data.rectified[::2, ::2], "confidence": None, "truth": None}

@@ -1,4 +1,4 @@
-"""The receipt: complete, in order, fit for JSON, the same for the same seed; shown as a table and as a page."""
+"""The receipt: complete, in order and valid JSON; shown as a table and as a page."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ from tests.flows.conftest import Page
 
 
 def scored(miou: float, overall: float, **per_class: float | None) -> dict[str, object]:
-    """What a map of no class that the truth lacks is worth."""
+    """Return the scores of a map without false classes."""
     return {"miou": miou, "overall_accuracy": overall, "per_class_iou": per_class, "false_classes": {}}
 
 
 def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:
-    """A receipt with hand-made figures; every path of the design is in it."""
+    """Return a receipt with made-up figures that has every field of the design."""
     saving = {"done": 50, "full": 100, "ratio": 0.5, "full_is": "predicted"}
     savings: dict[str, object] = {name: dict(saving) for name in reversed(COSTS)}
     savings["multiply_adds"] = {**saving, "overview": 20, "score": 1, "detail": 29}
     savings["capture_s"] = {"done": 104.0, "full": 209.0, "ratio": 104 / 209, "full_is": "predicted"}
-    accuracy = {  # the map shows wheat, of which the truth has none
+    accuracy = {  # the map shows wheat, but the labels have none
         "miou": np.float32(0.75),
         "overall_accuracy": 0.934,
         "per_class_iou": {"soil": 0.9, "bare_weed": 0.6, "wheat": float("nan")},
@@ -62,7 +62,7 @@ def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:
         **{"cost_s": 1.5, "exact_cost_s": 9.0, "saved_s": 7.5},
     }
     stages = [
-        StageRecord("capture", "ab12", "ran", wall, wall, 10**9, 0, 10**8, f"{wall:064}"),  # a manifest holds times
+        StageRecord("capture", "ab12", "ran", wall, wall, 10**9, 0, 10**8, f"{wall:064}"),  # a manifest has times
         StageRecord("rectify", "cd34", "cached"),
     ]
     return build_receipt(
@@ -89,7 +89,7 @@ def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:
 
 
 def test_receipt_has_the_fields_of_the_design_and_reads_back():
-    """In the design's order, accuracy or none; what is not finite is null; the text gives the same receipt."""
+    """Fields are in order, with accuracy or without; non-finite numbers become null, and JSON reads back equal."""
     receipt = make_receipt()
     before = "survey source scene seed started finished versions settings stages savings data_bytes accuracy effects"
     assert " ".join(receipt) == f"{before} effects_total products"
@@ -117,8 +117,8 @@ def test_receipt_has_the_fields_of_the_design_and_reads_back():
         (("savings", "lines", "full_is"), "guessed"),
     ],
 )
-def test_what_is_not_of_the_design_is_named(path, wrong):
-    """A field that is missing with its place, and another word for a stage's state or a figure's origin."""
+def test_invalid_fields_are_named(path, wrong):
+    """A missing field has its place in the message; so have unknown states and origins of a figure."""
     broken: dict = copy.deepcopy(dict(make_receipt()))
     part = reduce(getitem, path[:-1], broken)
     if wrong is None:
@@ -130,7 +130,7 @@ def test_what_is_not_of_the_design_is_named(path, wrong):
 
 
 def test_maps_without_the_prior_map_are_not_compared() -> None:
-    """After a revisit neither the sentence nor the page has them; with a rejected prior map both do."""
+    """A visit with a prior map has no comparison in sentence and page; with a rejected prior map it has one."""
     receipt = make_receipt()
     for why in (None, "turned"):
         receipt["prior_map"] = {"put_aside": why}
@@ -140,21 +140,21 @@ def test_maps_without_the_prior_map_are_not_compared() -> None:
         assert ("the overview alone gives" in format_score(receipt)) == (why is not None)
 
 
-def test_accuracy_belongs_to_a_map_that_is_judged():
-    """Neither comes without the other."""
+def test_a_judged_map_needs_an_accuracy():
+    """The state `judged` without an accuracy is refused."""
     with pytest.raises(ShapeError, match="accuracy and judged belong to a map that is judged"):
         check_receipt({**make_receipt(labels=False), "accuracy_is": "judged"})
 
 
 def printed(receipt: Receipt, width: int = 100, *, verbose: bool = False) -> str:
-    """The end of a survey as a terminal of so many columns shows it."""
+    """Return the end of a survey as a terminal of this width shows it."""
     console = Console(file=io.StringIO(), width=width)
     print_summary(receipt, console, verbose=verbose)
     return console.file.getvalue()
 
 
-def test_the_end_of_a_survey_fits_the_terminal():
-    """Score, seconds, bytes kept and multiply-adds against the reference, in at most 13 lines of 80 columns."""
+def test_the_summary_of_a_survey_fits_the_terminal():
+    """At most 13 lines of 80 columns give score, seconds, bytes kept and multiply-adds against the reference."""
     lines = printed(make_receipt(), 80).rstrip().splitlines()
     assert len(lines) <= 13
     assert max(map(len, lines)) <= 80
@@ -166,7 +166,7 @@ def test_the_end_of_a_survey_fits_the_terminal():
 
 
 def test_the_details_have_stages_effects_and_lost_lines():
-    """A stage that was skipped has no row."""
+    """A skipped stage has no row."""
     receipt = {**make_receipt(), "lines": {"scan-0": {"invalid": 41}}}
     receipt["stages"][1]["state"] = "skipped"
     assert "sweep scan-0: lines left out: 41 invalid" in printed(receipt)
@@ -187,14 +187,14 @@ def test_the_details_have_stages_effects_and_lost_lines():
     ],
 )
 def test_a_map_without_labels_has_its_own_estimate(found: dict, words: str):
-    """None where the error leaves nearly everything open, or where the weights do not fit the field."""
+    """There is none if the error is too large, or if the weights do not fit the field."""
     text = format_score({**make_receipt(labels=False), **found})
     assert words in text
     assert ("mIoU" in text) == ("Expected" in words)
 
 
 def test_headline_is_one_paragraph_with_the_figures():
-    """Score, worst class of the labels, capture time, fraction captured again; nothing on what was not judged."""
+    """It has score, worst class, capture time and fraction captured again; without labels it has no score."""
     assert headline(make_receipt(), 0.23) == (
         "mIoU 75.0 of 100 against the labels (93.4 % of pixels correct). Its worst class is bare weed with 60.0: the"
         " overview alone gives 20.0, a full reading 80.0. Capture time: 104 s (50 % of the reference, 209 s). Captured"
@@ -206,8 +206,8 @@ def test_headline_is_one_paragraph_with_the_figures():
 PNG = b"\x89PNG\r\n\x1a\nnot a real picture"
 
 
-def test_page_loads_nothing_from_anywhere():
-    """Every address is data of the page, the quicklook the bytes given; no script, no import, no link."""
+def test_page_loads_nothing_from_elsewhere():
+    """Every address is data in the page, the quicklook has the given bytes; there are no scripts, imports or links."""
     page = render_report(make_receipt(), PNG, [Picture(PNG, "spectra")])
     loaded = Page(page).loaded
     assert len(loaded) == 2
@@ -220,8 +220,8 @@ def test_page_loads_nothing_from_anywhere():
     assert base64.b64decode(source.partition(",")[2]) == PNG
 
 
-def test_words_are_escaped():
-    """A survey, a class, a policy and a setting with markup in their names stay words."""
+def test_names_are_escaped():
+    """Markup in the names of a survey, class, policy and setting stays text."""
     receipt, bad = copy.deepcopy(make_receipt()), '<script>alert("1")</script>&'
     receipt["survey"] = receipt["settings"]["scene"] = receipt["settings"]["out"] = receipt["stages"][0]["name"] = bad
     receipt["versions"] = {bad: bad}
@@ -236,7 +236,7 @@ def test_words_are_escaped():
 
 
 def test_page_has_the_figures():
-    """Savings, accuracy, settings and versions; without a truth nothing of accuracy; dollar signs survive."""
+    """It has savings, accuracy, settings and versions; without labels it has no accuracy; dollar signs are kept."""
     page = render_report(make_receipt(), PNG, captured_again=0.23)
     figures = ("104 s", "50 %", "75.0", "93.4", "56.2 ± 1.2", "67 %", "budget", "torch", "Class by class")
     for words in (*figures, "this survey wheat 2 px", "2 of 3 classes are in the labels"):
@@ -250,7 +250,7 @@ def test_page_has_the_figures():
 
 
 def test_the_cheapest_good_scan_is_named():
-    """The weights' scan performance table has it; without a table there is none."""
+    """Its time and settings come from the scan performance of the weights; without it there is no such line."""
     receipt = make_receipt()
     assert "uniform scan" not in printed(receipt)
     receipt["savings"]["capture_s"] |= {"uniform": 40.0, "uniform_scan": "every line, 17 ms"}
@@ -259,7 +259,7 @@ def test_the_cheapest_good_scan_is_named():
 
 
 def test_a_report_begins_with_map_savings_and_score():
-    """Effects, stages, settings and versions are folded behind everything else."""
+    """Stages and the sections after them are folded at the end."""
     page = render_report(make_receipt(), PNG, field=FieldMap((2, 2), [], []))
     order = ('class="lead">mIoU 75.0', 'id="field"', 'id="savings"', 'id="areas"', 'id="files"', '<details id="stages"')
     places = [page.index(words) for words in order]
@@ -267,7 +267,7 @@ def test_a_report_begins_with_map_savings_and_score():
 
 
 def test_a_report_has_the_confusion_matrix() -> None:
-    """By hand: user's accuracy beside each mapped class, producer's below each label, kappa; none without counts."""
+    """User's accuracy stands beside each mapped class, producer's below each label, then kappa; values by hand."""
     receipt = make_receipt()
     assert "Confusion matrix" not in render_report(receipt, b"")
     receipt["accuracy"] |= {"confusion": [[8, 2, 1], [1, 6, 1], [0, 0, 0]], "kappa": 0.4875}
@@ -282,7 +282,7 @@ def test_a_report_has_the_confusion_matrix() -> None:
 
 
 def test_a_report_names_the_file_of_the_scene() -> None:
-    """By its name, not by the hash of what it holds; a variable of it and its folders are left out."""
+    """It has the file's name without folders and variable, and not the hash of its content."""
     receipt = make_receipt()
     receipt["scene"] = "9f86d081884c7d65"
     receipt["settings"]["scene"] = "/data/fields/north.mat:cube"
@@ -292,7 +292,7 @@ def test_a_report_names_the_file_of_the_scene() -> None:
 
 
 def test_a_report_links_the_products() -> None:
-    """Seen from its own folder, in letters that a browser takes; neither raw lines, which may go, nor the report."""
+    """Links are relative to its folder and escaped; raw lines, which may be cleared, and the report have none."""
     receipt = make_receipt()
     receipt["products"] = {
         **{"raw_coarse": "stages/capture/ab/lines", "class_map": "stages/segment/cd/class_map.zarr"},
@@ -304,7 +304,7 @@ def test_a_report_links_the_products() -> None:
 
 
 def test_the_effects_of_the_simulator_are_folded() -> None:
-    """Their table opens on a click; nothing of it where nothing was simulated."""
+    """Their table opens on a click; without simulated effects there is none."""
     page = render_report(make_receipt(), PNG)
     folded = page.partition('<details id="effects"><summary>Simulated effects</summary>')[2]
     assert "asked for: shot noise" in folded.partition("</details>")[0]
@@ -314,7 +314,7 @@ def test_the_effects_of_the_simulator_are_folded() -> None:
 
 
 def test_an_error_map_stands_beside_the_scores() -> None:
-    """By hand: right, wrong, without a label and without a class; none in a report without labels."""
+    """Pixels are right, wrong, or transparent without label or class; without labels there is no error map."""
     classes, labels = np.array([[0, 1], [2, 255]], np.uint8), np.array([[0, 0], [255, 1]], np.uint8)
     address = error_address(classes, labels)
     with Image.open(io.BytesIO(base64.b64decode(address.partition(",")[2]))) as opened:
@@ -329,8 +329,8 @@ def test_an_error_map_stands_beside_the_scores() -> None:
 
 
 @pytest.mark.parametrize(("scored_s", "words"), [(0.7, "between the passes took 1.2 s, beside"), (None, "")])
-def test_the_decision_between_passes_is_told(scored_s: float | None, words: str) -> None:
-    """As the time of the stages between; not where one of them was stored before."""
+def test_the_time_between_passes_is_reported(scored_s: float | None, words: str) -> None:
+    """It is the sum of the stages between them, and left out if one of them was cached."""
     times = {"capture_coarse": 9.0, "rectify": 0.5, "score": scored_s, "capture_fine": 9.0}
     stages = [{"name": name, "wall_s": seconds} for name, seconds in times.items()]
     receipt = {"savings": {"capture_s": {}}, "settings": {"camera": {"exposure_ms": 100}}, "stages": stages}

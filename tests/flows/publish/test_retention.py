@@ -1,4 +1,4 @@
-"""Raw lines go when the settings of their runs say so, once each was compared with what was condensed of it."""
+"""Raw lines are cleared by the `keep` setting of their runs, after comparison with the condensed signal."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.storage.small_archive import flip
 
 @pytest.fixture(scope="module")
 def surveyed(survey_png: Survey, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An archive of one survey that keeps its raw lines for a week; not to be changed."""
+    """Return an archive of one survey that keeps its raw lines for a week; do not change it."""
     root = tmp_path_factory.mktemp("retention") / "archive"
     with without_effects():
         survey_png(root, keep="raw 7d", accuracy=False)
@@ -35,29 +35,29 @@ def surveyed(survey_png: Survey, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 @pytest.fixture
 def archive(surveyed: Path, tmp_path: Path) -> Archive:
-    """A copy of it."""
+    """Return a copy of it."""
     return Archive.open(shutil.copytree(surveyed, tmp_path / "archive"))
 
 
 @pytest.fixture
 def later(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The clock of the archive is eight days ahead."""
+    """Set the clock of the archive eight days ahead."""
     monkeypatch.setattr(Archive, "now", lambda self: datetime.now(UTC) + timedelta(days=8))
 
 
 def raw_uris(archive: Archive) -> set[str]:
-    """Addresses of raw lines that are there."""
+    """Return the addresses of raw lines in the archive."""
     return {ref.uri for ref in archive.refs() if ref.stage.startswith("capture") and archive.is_there(ref.uri)}
 
 
 def of_gc(capsys: pytest.CaptureFixture[str], root: Path, **flags: Any) -> tuple[int, dict[str, Any]]:
-    """Exit code and content of `gc --json`."""
+    """Return exit code and content of `gc --json`."""
     code = gc(root, as_json=True, **flags)
     return code, json.loads(capsys.readouterr().out)
 
 
-def test_lines_stay_for_their_time(archive: Archive, capsys: pytest.CaptureFixture[str]) -> None:
-    """Within the week nothing goes, and nothing would."""
+def test_raw_lines_stay_for_their_time(archive: Archive, capsys: pytest.CaptureFixture[str]) -> None:
+    """Within the week gc and its dry run remove nothing."""
     there = raw_uris(archive)
     assert len(there) == 2
     for dry_run in (True, False):
@@ -66,8 +66,8 @@ def test_lines_stay_for_their_time(archive: Archive, capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.usefixtures("later")
-def test_outlived_lines_go(archive: Archive, capsys: pytest.CaptureFixture[str]) -> None:
-    """A dry run tells them with bytes and reason; then they go, the archive is whole, and lines are read as before."""
+def test_expired_raw_lines_are_cleared(archive: Archive, capsys: pytest.CaptureFixture[str]) -> None:
+    """A dry run lists them with the reason; gc clears them, and the archive is valid with the same condensed lines."""
     run = spectralzoom.open(archive.root).latest
     before, there = {n: one.values for n, one in run.lines.items()}, raw_uris(archive)
     code, planned = of_gc(capsys, archive.root, dry_run=True)
@@ -88,8 +88,8 @@ def test_outlived_lines_go(archive: Archive, capsys: pytest.CaptureFixture[str])
 
 @pytest.mark.usefixtures("no_effects", "later")
 @pytest.mark.parametrize(("first", "then"), [("raw", "signal"), ("signal", "raw")])
-def test_lines_stay_as_long_as_a_run_keeps_them(archive: Archive, survey_png: Survey, first: str, then: str) -> None:
-    """The strictest counts, for gc and for a survey that finds them; what none keeps goes, and is captured again."""
+def test_raw_lines_stay_while_any_run_keeps_them(archive: Archive, survey_png: Survey, first: str, then: str) -> None:
+    """The longest setting counts, for gc and for a survey; lines that no run keeps are cleared and captured again."""
     there = raw_uris(archive)
     survey_png(archive.root, keep=first, accuracy=False)
     assert raw_uris(archive) == (there if first == "raw" else set())
@@ -99,22 +99,22 @@ def test_lines_stay_as_long_as_a_run_keeps_them(archive: Archive, survey_png: Su
 
 
 @pytest.mark.usefixtures("no_effects")
-def test_what_a_killed_survey_left_goes(survey_png: Survey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With `keep = signal` at once, whatever the age."""
+def test_raw_of_a_killed_survey_is_cleared(survey_png: Survey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With `keep = signal` they are cleared at once, at any age."""
     with monkeypatch.context() as patch:
         patch.setattr("flows.survey.clear_raw", lambda plan, run: run)
         survey_png(tmp_path / "archive", accuracy=False)
     archive = Archive.open(tmp_path / "archive")
     there = raw_uris(archive)
     assert there
-    monkeypatch.setattr(Archive, "now", lambda self: datetime.now(UTC) - timedelta(minutes=2))  # a bucket's clock
+    monkeypatch.setattr(Archive, "now", lambda self: datetime.now(UTC) - timedelta(minutes=2))  # the clock of a bucket
     assert {one.uri for one in clear_raw_lines(archive).removals} == there
     assert raw_uris(archive) == set()
 
 
 @pytest.mark.usefixtures("later")
-def test_lines_of_an_older_signal_stay_and_say_so(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They cannot be compared with a signal of an earlier version; reprocess makes it anew."""
+def test_raw_lines_of_an_older_signal_version_are_kept(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They cannot be compared with a signal of another version; the reason advises to run reprocess."""
     there = raw_uris(archive)
     monkeypatch.setattr("flows.publish.retention.PRESENT", {"condense": "99", "condense_fine": "99"})
     for dry_run in (True, False):
@@ -126,8 +126,8 @@ def test_lines_of_an_older_signal_stay_and_say_so(archive: Archive, monkeypatch:
 
 
 @pytest.mark.usefixtures("later")
-def test_lines_that_were_not_condensed_are_never_touched(archive: Archive) -> None:
-    """As those of a rig whose survey broke off, or of an earlier version."""
+def test_raw_lines_without_a_signal_are_kept(archive: Archive) -> None:
+    """Such lines are left by an interrupted survey of a rig, or by another version."""
     for ref in (*archive.refs("condense"), *archive.refs("condense_fine")):
         shutil.rmtree(ref.path)
     there = raw_uris(archive)
@@ -137,7 +137,7 @@ def test_lines_that_were_not_condensed_are_never_touched(archive: Archive) -> No
 
 @pytest.mark.usefixtures("later")
 def test_a_flipped_bit_keeps_raw_lines(archive: Archive, capsys: pytest.CaptureFixture[str]) -> None:
-    """What was condensed is read to its last byte before: the damaged store keeps its lines, others go."""
+    """The signal is read to its last byte before: lines of the damaged store are kept, others are cleared."""
     files = archive.root.glob("stages/condense/*/coarse-0.zarr/scores/c/**/*")
     flip(max(files, key=lambda path: path.stat().st_size), at=5)
     code, done = of_gc(capsys, archive.root)
@@ -148,8 +148,8 @@ def test_a_flipped_bit_keeps_raw_lines(archive: Archive, capsys: pytest.CaptureF
 
 
 @pytest.mark.usefixtures("later")
-def test_lines_that_differ_stay(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One score that is off by one step: the reason names the sweep and its line."""
+def test_raw_lines_that_differ_from_the_signal_are_kept(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One changed score suffices; the reason names the sweep and its line."""
     read = signal_cubes.SignalCube.read
 
     def off(self: signal_cubes.SignalCube, start: int = 0, stop: int | None = None) -> Any:
@@ -165,8 +165,8 @@ def test_lines_that_differ_stay(archive: Archive, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.usefixtures("later")
-def test_nothing_goes_while_a_survey_works(archive: Archive) -> None:
-    """It may be reading the very lines."""
+def test_gc_clears_nothing_during_a_survey(archive: Archive) -> None:
+    """The survey may be reading these lines."""
     there = raw_uris(archive)
     with archive.in_use():
         assert clear_raw_lines(archive).obstacle == IN_USE

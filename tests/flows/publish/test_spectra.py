@@ -1,4 +1,4 @@
-"""Mean spectra of classes: means by hand, and curves that stop at removed bands."""
+"""Mean spectra of classes, and curves with gaps at removed bands."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ AVIRIS = 400 + 10.0 * np.arange(220)
 
 
 def small_mosaic(path: Path, bands: int = 8) -> Mosaic:
-    """Two pixels by two, of one component that is 1 in every band; the last pixel was not seen."""
+    """Return a mosaic of two by two pixels with one component that is 1 in every band; the last pixel is nodata."""
     law = Components(np.full(bands, 5.0), np.full((1, bands), 1.0), np.ones(bands))
     writer = MosaicWriter(path, (2, 2), law, 400 + 10.0 * np.arange(bands))
     scores = np.array([[[1.0], [3.0]], [[7.0], [np.nan]]], np.float32)
@@ -27,7 +27,7 @@ def small_mosaic(path: Path, bands: int = 8) -> Mosaic:
 
 
 def test_a_class_has_the_mean_spectrum_of_its_pixels(tmp_path: Path) -> None:
-    """By hand: scores 1 and 3 of class 0, 7 of class 1, above a mean of 5; no pixel of class 2 is seen."""
+    """Values by hand: scores 1 and 3 of class 0, 7 of class 1, plus a mean of 5; class 2 has no valid pixel."""
     classes = np.array([[0, 0], [1, 2]], np.uint8)
     spectra = class_spectra(small_mosaic(tmp_path / "mosaic.zarr"), classes, 3)
     assert spectra[0].tolist() == [7.0] * 8
@@ -43,8 +43,8 @@ def test_a_class_has_the_mean_spectrum_of_its_pixels(tmp_path: Path) -> None:
         ([*range(1430, 1480, 10), *range(1890, 2030, 10)], [(1420, 1480), (1880, 2030)]),
     ],
 )
-def test_a_curve_stops_where_bands_were_removed(removed_nm: list[int], ends_nm: list[tuple[int, int]]) -> None:
-    """One gap for each run of removed bands, between its two neighbours; in any order of bands."""
+def test_a_curve_has_a_gap_at_removed_bands(removed_nm: list[int], ends_nm: list[tuple[int, int]]) -> None:
+    """Each run of removed bands has one gap, between its two neighbours, in any order of bands."""
     kept = np.setdiff1d(AVIRIS, removed_nm)
     nm, curve = curve_with_gaps(kept[::-1], 2 * kept[::-1])
     (gaps,) = np.nonzero(np.isnan(nm))
@@ -60,14 +60,14 @@ def test_a_curve_stops_where_bands_were_removed(removed_nm: list[int], ends_nm: 
         [480, 550, 650, 730, 840],
     ],
 )
-def test_a_curve_of_bands_as_they_came_is_whole(wavelength_nm: list[float]) -> None:
-    """Bands of a satellite lie apart by design; a second detector has wider ones."""
+def test_a_curve_of_unevenly_spaced_bands_has_no_gap(wavelength_nm: list[float]) -> None:
+    """A satellite's bands are far apart by design, and a second detector has wider bands."""
     nm, _ = curve_with_gaps(np.array(wavelength_nm), np.ones(len(wavelength_nm)))
     assert np.isfinite(nm).all()
 
 
 def test_few_bands_have_no_curve(tmp_path: Path) -> None:
-    """A photograph of three bands has none, eight bands have a picture."""
+    """Three bands have no picture of spectra, eight bands have one."""
     found = ClassMap(
         np.zeros((2, 2), np.uint8), np.ones((2, 2), np.float32), ("soil",), np.array([[120, 80, 40]], np.uint8)
     )

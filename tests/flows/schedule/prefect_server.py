@@ -1,4 +1,4 @@
-"""A Prefect server in a process of its own, which a test can kill."""
+"""A Prefect server in another process, which a test can kill."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def free_port() -> int:
 
 @contextmanager
 def server_process(home: Path, port: int) -> Iterator[subprocess.Popen[str]]:
-    """Have a Prefect server in a process of its own, on a port; killed at the end."""
+    """Yield the process of a Prefect server on a port; it is killed at the end."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
     words = [sys.executable, "-c", SERVES, str(home), str(port)]
     environment |= {

@@ -55,31 +55,31 @@ pytestmark = pytest.mark.usefixtures("no_effects", "scheduling")
 
 @pytest.fixture(scope="module")
 def scheduling(prefect_home: Path) -> Iterator[str]:
-    """A server that plans and watches deployments, and the address of its API."""
+    """Yield the API address of a server that schedules and watches deployments."""
     with local_server(prefect_home / "scheduling", schedules=True) as api:
         yield api
 
 
 @pytest.fixture
 def north(field_file: Callable[..., Path]) -> Any:
-    """The field north, which is due at six in Berlin."""
+    """Return the field north, due at six in Berlin."""
     return load_fields([field_file("north", source="raster", budget=None)])[0]
 
 
 def deployed(field: Any) -> Any:
-    """The id of a field's deployment on the server."""
+    """Return the id of a field's deployment on the server."""
     return field.deployment(schedule_of("0 6 * * *", None, "Europe/Berlin")).apply()
 
 
 def client() -> Any:
-    """A client of the server."""
+    """Return a client of the server."""
     from prefect.client.orchestration import get_client
 
     return get_client(sync_client=True)
 
 
 def planned(deployment: Any, due: datetime, parameters: Mapping[str, Any] | None = None) -> Any:
-    """A run of a deployment that is due at a moment."""
+    """Return a run of a deployment, due at a given time."""
     from prefect.states import Scheduled
 
     with client() as asked:
@@ -89,7 +89,7 @@ def planned(deployment: Any, due: datetime, parameters: Mapping[str, Any] | None
 
 
 def run_here(run: Any) -> Any:
-    """Run it by Prefect's engine in this process, as a runner does in one of its own; gives the state."""
+    """Run it with Prefect's engine in this process, as a runner does in its own; return the state."""
     from prefect.flow_engine import run_flow
 
     from flows.survey import survey
@@ -98,12 +98,12 @@ def run_here(run: Any) -> Any:
 
 
 def settings_of(out: Path) -> list[dict[str, Any]]:
-    """The settings that an archive's runs were asked for, oldest first."""
+    """Return the requested settings of an archive's runs, oldest first."""
     return [dict(read_run(folder).settings) for folder in Archive.open(out).runs()]
 
 
-def test_a_run_is_a_visit_of_its_due_time_and_goes_on_from_the_newest(north: Any) -> None:
-    """Whenever it really begins; the first finds no earlier run."""
+def test_a_run_has_its_due_time_as_visit_and_the_newest_prior_map(north: Any) -> None:
+    """The actual start does not matter; the first run finds no earlier one."""
     deployment = deployed(north)
     states = [run_here(planned(deployment, DUE.replace(day=day))) for day in (1, 2)]
     assert [state.name for state in states] == ["Completed", "Completed"]
@@ -113,15 +113,15 @@ def test_a_run_is_a_visit_of_its_due_time_and_goes_on_from_the_newest(north: Any
     assert [memory is None for memory in memories] == [True, False]
 
 
-def test_what_a_killed_serve_left_is_ended_when_it_is_served_again(north: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What waited is cancelled, what ran has crashed and gives its place back; what is to come or not ours stays."""
+def test_serve_ends_the_runs_of_a_killed_serve(north: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Late runs are cancelled and started ones crash, which frees the limit; future runs and other flows stay."""
     from prefect import flow
     from prefect.client.orchestration import SyncPrefectClient
     from prefect.states import Cancelling, Pending, Running
 
     @flow(persist_result=False)
     def another() -> None:
-        """A flow of somebody else."""
+        """Do nothing, as a flow of another project."""
 
     made = north.deployment(schedule_of("0 6 * * *", None, "Europe/Berlin"))
     again = reprocessing(str(north.settings.out))
@@ -146,7 +146,7 @@ def test_what_a_killed_serve_left_is_ended_when_it_is_served_again(north: Any, m
 
 
 def test_a_shared_server_keeps_the_fields_of_others(north: Any) -> None:
-    """A field of another archive under the same name is refused, and reprocessing is named by the archive."""
+    """A field of another archive with the same name is refused; the reprocessing is named after its archive."""
     schedule = schedule_of(None, timedelta(hours=1))
     north.deployment(schedule).apply()
     _prepare([north.deployment(schedule), reprocessing("/data/a b", shared=True)], shared=True)
@@ -156,8 +156,8 @@ def test_a_shared_server_keeps_the_fields_of_others(north: Any) -> None:
     assert reprocessing("/data/a b", shared=True).name == "data-a-b"
 
 
-def test_two_fields_that_are_due_at_once_take_turns_at_the_rig(tmp_path: Path) -> None:
-    """By Prefect's limit the second waits; without it the rig's own lock refuses it."""
+def test_two_fields_due_at_once_use_the_rig_in_turn(tmp_path: Path) -> None:
+    """Prefect's limit makes the second wait; the rig's own lock would refuse it."""
     from prefect import flow
 
     archive, usual = Archive.open(tmp_path / "archive"), load_settings(None, {"scene": "farm"})
@@ -190,7 +190,7 @@ def test_two_fields_that_are_due_at_once_take_turns_at_the_rig(tmp_path: Path) -
 
 @contextmanager
 def serving(api: str, name: str) -> Iterator[None]:
-    """Serve a flow as a deployment: each run is a process of its own."""
+    """Serve a flow as a deployment, with each run in a process of its own."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "PREFECT_RUNNER_POLL_FREQUENCY": "1", "PREFECT_API_URL": api}
     with subprocess.Popen([sys.executable, "-c", SERVES, name], cwd=ROOT, env=environment) as process:
         try:
@@ -201,7 +201,7 @@ def serving(api: str, name: str) -> Iterator[None]:
 
 
 def wait_for(name: str) -> None:
-    """Wait until the server knows a deployment."""
+    """Wait until a deployment is on the server."""
     from prefect.exceptions import ObjectNotFound
 
     end = time.monotonic() + PATIENCE_S
@@ -216,7 +216,7 @@ def wait_for(name: str) -> None:
 
 
 def test_rig_and_reader_are_two_deployments(field_file: Callable[..., Path], tmp_path: Path, scheduling: str) -> None:
-    """One process takes the sweeps, another reads them from the same archive; the map is that of one plain survey."""
+    """One process captures the sweeps, another reads them from the archive; the stores equal those of one survey."""
     from flows.settings.parameters import SurveySettings
     from flows.survey import survey
 
@@ -242,7 +242,7 @@ def test_rig_and_reader_are_two_deployments(field_file: Callable[..., Path], tmp
 
 
 def prefect_cli(folder: Path, *words: str) -> str:
-    """Run Prefect's command line in a folder; gives what it says."""
+    """Run Prefect's command line in a folder and return its output."""
     command = [sys.executable, "-m", "prefect", *words]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -250,7 +250,7 @@ def prefect_cli(folder: Path, *words: str) -> str:
 
 
 def test_the_file_of_deployments_is_complete(scheduling: str) -> None:
-    """`prefect deploy --all --no-prompt` makes all three, with schedule, pools and limits, and parameters that fit."""
+    """`prefect deploy --all --no-prompt` makes three deployments, with schedule, pools, limits and valid parameters."""
     from prefect.client.schemas.actions import WorkPoolCreate
 
     from flows.archive.reprocess_flow import reprocess
@@ -272,8 +272,8 @@ def test_the_file_of_deployments_is_complete(scheduling: str) -> None:
     reprocess.validate_parameters(archive.parameters)
 
 
-def test_the_automation_tells_of_a_failed_run(north: Any, tmp_path: Path, scheduling: str) -> None:
-    """The file is accepted with the id of a block, and a run that fails posts what it failed by."""
+def test_the_automation_reports_a_failed_run(north: Any, tmp_path: Path, scheduling: str) -> None:
+    """Prefect accepts the file with the id of a block, and a failed run posts its error."""
     from prefect.blocks.webhook import Webhook
 
     told: Queue[dict[str, Any]] = Queue()
@@ -292,8 +292,9 @@ def test_the_automation_tells_of_a_failed_run(north: Any, tmp_path: Path, schedu
     try:
         block = Webhook(url=f"http://127.0.0.1:{listener.server_port}/").save("surveys", overwrite=True)
         text = (ROOT / "automation.yaml").read_text(encoding="utf-8")
-        assert yaml.safe_load(text)["actions"][0]["block_document_id"] in text
-        (tmp_path / "automation.yaml").write_text(text.replace("00000000-0000-0000-0000-000000000000", str(block)))
+        unset = yaml.safe_load(text)["actions"][0]["block_document_id"]
+        assert set(unset) == {"0", "-"}
+        (tmp_path / "automation.yaml").write_text(text.replace(unset, str(block)))
         prefect_cli(tmp_path, "automation", "create", "--from-file", "automation.yaml")
         settings = {"settings_file": str(tmp_path / "gone.toml")}
         state = run_here(planned(deployed(north), DUE, {"settings": settings}))
@@ -307,19 +308,19 @@ def test_the_automation_tells_of_a_failed_run(north: Any, tmp_path: Path, schedu
 
 
 def take_rig(limits: httpx.Client) -> None:
-    """Take the one place at the rig, as a survey does."""
+    """Take the only slot of the rig's limit, as a survey does."""
     wanted = {"names": [RIG_LIMIT], "slots": 1, "lease_duration": LEASE_S}
     while (taken := limits.post("/increment-with-lease", json=wanted)).status_code == httpx.codes.SERVICE_UNAVAILABLE:
-        time.sleep(0.5)  # another service of the server holds the database
+        time.sleep(0.5)  # another service of the server locks the database
     taken.raise_for_status()
     assert limits.get(f"/{RIG_LIMIT}").json()["active_slots"] == 1
 
 
-def test_a_serve_goes_on_when_its_killed_server_is_back(field_file: Callable[..., Path], tmp_path: Path) -> None:
-    """A run after that ends well; SIGTERM then ends it with one sentence and pauses the schedule.
+def test_serve_resumes_after_the_server_restarts(field_file: Callable[..., Path], tmp_path: Path) -> None:
+    """A later run completes; SIGTERM then ends serve with one sentence and pauses the schedule.
 
-    A lease of the rig outlives the server, and the next server takes it back when it has run out. The serve is started
-    as a shell starts what goes on in the background, which ignores SIGINT.
+    A lease of the rig outlives the server, and the restarted server frees it after its expiry. Serve starts as a
+    shell's background job, which ignores SIGINT.
     """
     from prefect.deployments import run_deployment
     from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary_settings
@@ -329,7 +330,7 @@ def test_a_serve_goes_on_when_its_killed_server_is_back(field_file: Callable[...
         password, api = (home / "password").read_text().strip(), f"http://127.0.0.1:{port}/api"
         environment = {**os.environ, "PYTHONPATH": str(ROOT), "PREFECT_RUNNER_POLL_FREQUENCY": "1"}
         environment |= {"PREFECT_API_URL": api, "PREFECT_API_AUTH_STRING": password}
-        environment |= {"PREFECT_CLIENT_MAX_RETRIES": "0"}  # else it asks for minutes before it gives up
+        environment |= {"PREFECT_CLIENT_MAX_RETRIES": "0"}  # else it retries for minutes
         words = ["sh", "-c", "trap '' INT; exec \"$@\"", "sh", sys.executable, "-m", "flows.cli.main"]
         words += ["serve", str(file), "--every", "365d"]
         user, _, secret = password.partition(":")

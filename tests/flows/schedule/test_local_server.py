@@ -1,6 +1,6 @@
-"""Prefect's server in this process: whom it answers, and the database that it begins with.
+"""Prefect's server in this process: its access control and its initial database.
 
-`python tests/flows/schedule/test_local_server.py` writes the database's schema anew, for another version of Prefect.
+`python tests/flows/schedule/test_local_server.py` writes the database's schema for another version of Prefect.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ asyncio.run(provide_database_interface().create_db())
 
 
 def migrated_schema(folder: Path) -> str:
-    """The schema that Prefect's own migrations leave, as SQL; in a process of its own settings."""
+    """Return the schema from Prefect's own migrations, as SQL, made in a process with its own settings."""
     file = folder / "migrated.db"
     settings = {"PREFECT_API_DATABASE_CONNECTION_URL": f"sqlite+aiosqlite:///{file}", "PREFECT_HOME": str(folder)}
     subprocess.run([sys.executable, "-c", MIGRATE], env={**os.environ, **settings}, check=True)
@@ -40,7 +40,7 @@ def migrated_schema(folder: Path) -> str:
 
 
 def answer(url: str, **headers: str) -> int:
-    """The status of an answer."""
+    """Return the HTTP status of a request."""
     try:
         with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=30) as found:
             return int(found.status)
@@ -49,27 +49,27 @@ def answer(url: str, **headers: str) -> int:
 
 
 def test_the_schema_is_of_the_pinned_version() -> None:
-    """A newer Prefect migrates it; the file is to be written anew with it."""
+    """A newer Prefect would migrate it; write the file again for that version."""
     assert SCHEMA.read_text().startswith(HEAD.format(metadata.version("prefect")))
 
 
 def test_a_server_without_a_place_for_its_database_is_unavailable(tmp_path: Path) -> None:
-    """As on a full disk: surveys then run without it."""
+    """This happens on a full disk; surveys then run without a server."""
     (tmp_path / "home").write_text("a file")
     with pytest.raises(ServerUnavailable, match="the Prefect server has no database"), local_server(tmp_path / "home"):
         pass
 
 
-def test_a_question_mark_in_the_path_ends_no_address(tmp_path: Path) -> None:
-    """The database lies in its folder, and a file of the name before the mark stays as it was."""
+def test_a_question_mark_in_the_path_is_no_query(tmp_path: Path) -> None:
+    """The database is in that folder, and a file with the name before the mark is unchanged."""
     (tmp_path / "field").write_text("mine")
     with local_server(tmp_path / "field?1"):
         assert (tmp_path / "field?1/prefect.db").stat().st_size > 100_000
     assert ((tmp_path / "field").read_text(), len([*tmp_path.iterdir()])) == ("mine", 2)
 
 
-def test_the_schema_is_what_migrations_leave(tmp_path: Path) -> None:
-    """Statement by statement, in any order: migrations leave constraints and indices in another one each time."""
+def test_the_schema_equals_that_of_the_migrations(tmp_path: Path) -> None:
+    """Statements are compared in any order, as each migration writes constraints and indices in another one."""
 
     def statements(text: str) -> list[list[str]]:
         return sorted(sorted(line.strip(" ,") for line in one.splitlines()) for one in text.strip().split(";\n"))
@@ -77,8 +77,8 @@ def test_the_schema_is_what_migrations_leave(tmp_path: Path) -> None:
     assert statements(migrated_schema(tmp_path)) == statements(SCHEMA.read_text())
 
 
-def test_the_server_wants_a_password(server: str) -> None:
-    """A request without one is refused; health alone is for everybody."""
+def test_the_server_needs_a_password(server: str) -> None:
+    """A request without one is refused; only the health address needs none."""
     assert answer(f"{server}/admin/version") == 401
     assert answer(f"{server}/health") == 200
 

@@ -1,4 +1,4 @@
-"""One rig, one holder: whoever asks, from whichever account, folder for temporary files or archive."""
+"""The lock of a rig: one holder for all accounts, temporary folders and archives of a machine."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from flows.tasks.rig_field import rig_to_oneself
 from pipeline.errors import RigError
 
 ROOT = Path(__file__).parents[3]
-PORT = f"/dev/ttyTEST{os.getpid()}"  # two runs of these tests on one machine are two rigs
+PORT = f"/dev/ttyTEST{os.getpid()}"  # two runs of these tests on one machine use two rigs
 TAKES = """
 import sys
 from flows.tasks.rig_field import rig_to_oneself
@@ -33,7 +33,7 @@ except OSError:
 
 @contextmanager
 def takers(folder: Path, count: int) -> Iterator[list[tuple[subprocess.Popen[str], bool]]]:
-    """Processes that take the rig one after the other, each with another TMPDIR; of other users, where that may be."""
+    """Yield processes that try to take the rig in turn, each with another TMPDIR and HOME."""
     tried: list[tuple[subprocess.Popen[str], bool]] = []
     try:
         for number in range(count):
@@ -51,13 +51,13 @@ def takers(folder: Path, count: int) -> Iterator[list[tuple[subprocess.Popen[str
 
 
 def assert_held(port: str) -> None:
-    """Somebody holds a rig."""
+    """Assert that another process or block holds a rig."""
     with pytest.raises(RigError, match=r"is in use by another survey; wait until that has ended"), rig_to_oneself(port):
         pass
 
 
-def test_three_users_with_folders_of_their_own(tmp_path: Path) -> None:
-    """With another TMPDIR each, one of three has the rig, and it is free once that one is killed."""
+def test_one_of_three_processes_holds_the_rig(tmp_path: Path) -> None:
+    """Each has another TMPDIR; the rig is free once its holder is killed."""
     with takers(tmp_path, 3) as tried:
         assert [took for _, took in tried] == [True, False, False]
         assert_held(PORT)
@@ -68,8 +68,8 @@ def test_three_users_with_folders_of_their_own(tmp_path: Path) -> None:
             assert_held(PORT)
 
 
-def test_locks_are_of_the_port(tmp_path: Path) -> None:
-    """A link to the device is the device; long addresses are told apart."""
+def test_a_lock_belongs_to_the_port(tmp_path: Path) -> None:
+    """A link to the device has the lock of the device; long addresses that differ at the end have two locks."""
     (tmp_path / "tty").touch()
     (tmp_path / "by-id").symlink_to(tmp_path / "tty")
     with rig_to_oneself(str(tmp_path / "tty")):
@@ -81,7 +81,7 @@ def test_locks_are_of_the_port(tmp_path: Path) -> None:
 
 
 def test_a_rig_that_cannot_be_locked_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where the kernel refuses for another reason than that it is held, there is one message and no rig."""
+    """The kernel refuses the lock for a reason other than a holder; there is one message."""
     monkeypatch.setattr(rig_field.socket, "socket", Mock(side_effect=PermissionError(1, "Operation not permitted")))
     with (
         pytest.raises(RigError, match=r"cannot lock the rig .*: Operation not permitted; .* need Linux"),

@@ -1,4 +1,4 @@
-"""Scenes that each visit names anew: by its date, or the newest that was not surveyed."""
+"""Scenes with another file at each visit: by its date, or the newest that was not surveyed."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ JUNE = datetime(2026, 6, 1, 12, tzinfo=UTC)
 
 
 def write_scene(folder: Path, name: str, written_s: float = 0.0) -> Path:
-    """Write a small picture, as if so many seconds after the others."""
+    """Write a small picture with a modification time so many seconds after the others; return its path."""
     folder.mkdir(exist_ok=True)
     values = np.random.default_rng(len(name)).integers(0, 255, (32, 40, 3), dtype=np.uint8)
     Image.fromarray(values).save(folder / name)
@@ -40,7 +40,7 @@ def asked(tmp_path: Path, pattern: str, **more: Any) -> Settings:
 
 
 def test_the_date_of_the_visit_names_the_file(tmp_path: Path) -> None:
-    """In any form of strftime; whatever its name says beside it."""
+    """Any strftime format is allowed, and {new} stands for the rest of the name."""
     names = {"{date:%Y-%m-%d}.png": "2026-06-01.png", "T32_{date:%Y%m%d}_{new}.png": "T32_20260601_b.png"}
     for pattern, name in names.items():
         wanted = write_scene(tmp_path / "scenes", name)
@@ -49,16 +49,16 @@ def test_the_date_of_the_visit_names_the_file(tmp_path: Path) -> None:
         scene_of_visit(asked(tmp_path, "{date:%Y-%m-%d}.png"), JUNE.replace(day=2))
 
 
-def test_a_scene_that_is_no_pattern_stays(tmp_path: Path) -> None:
-    """Braces are letters of a file's name as well."""
+def test_a_scene_without_a_pattern_is_kept(tmp_path: Path) -> None:
+    """Braces may be part of a file's name."""
     settings = asked(tmp_path, "field{1}.png")
     assert scene_of_visit(settings, JUNE) is settings
     with pytest.raises(SettingsError, match=r"braces are \{date:%Y-%m-%d\} or \{new\}"):
         scene_of_visit(asked(tmp_path, "{date:%Y}/{field}.png"), JUNE)
 
 
-def test_the_newest_that_was_not_surveyed_is_taken_until_there_is_none(tmp_path: Path, weights: Path) -> None:
-    """By the time it was written; label files are none. Then the latest run stands, until another file comes."""
+def test_new_scenes_are_surveyed_newest_first_until_none_is_left(tmp_path: Path, weights: Path) -> None:
+    """Order is by modification time without label files; then the latest run remains until another file comes."""
     folder, quiet = tmp_path / "scenes", QUIET
     with pytest.raises(NoSceneYet, match="no file yet that --scene"):
         scene_of_visit(asked(tmp_path, "{new}.png"), JUNE)
@@ -76,10 +76,10 @@ def test_the_newest_that_was_not_surveyed_is_taken_until_there_is_none(tmp_path:
     assert scene_of_visit(asked(tmp_path, "{new}.png", **more), JUNE).scene == str(later)
 
 
-def test_a_schedule_begins_before_there_is_a_scene(
+def test_a_schedule_may_begin_without_a_scene(
     field_file: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """It says so; weights that cannot be used are refused at once."""
+    """A message says so; unusable weights are refused at once."""
     pattern = {"scene": str(tmp_path / "scenes" / "{new}.png"), "source": None, "budget": None}
     (field,) = load_fields([field_file("north", **pattern)])
     assert field.settings.scene == pattern["scene"]

@@ -1,4 +1,4 @@
-"""Serving fields: what is refused before anything runs, the deployments that are made, and how it is stopped."""
+"""Serving fields: requests refused before anything runs, and the deployments of fields."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ BAD = {
 
 @pytest.mark.parametrize("case", BAD)
 def test_refused_before_serving(case: str, field_file: Callable[..., Path], tmp_path: Path, command_line: Any) -> None:
-    """One clear message and the right exit code; no server is left."""
+    """One clear message comes with the right exit code; no server is left."""
     names, words, code, message = BAD[case]
     field_file("north")
     field_file("typo", lines='sceene = "x"')
@@ -47,8 +47,8 @@ def test_refused_before_serving(case: str, field_file: Callable[..., Path], tmp_
     assert not (tmp_path / "archive" / ".prefect").exists()
 
 
-def test_two_serves_on_one_archive(field_file: Callable[..., Path], tmp_path: Path, command_line: Any) -> None:
-    """The second is refused while the first serves."""
+def test_a_second_serve_is_refused(field_file: Callable[..., Path], tmp_path: Path, command_line: Any) -> None:
+    """The lock of the first serve is held."""
     file = field_file()
     release = take_lock(Archive.open(tmp_path / "archive").root / ".locks" / "serve.lock", wait=False)
     assert release is not None
@@ -65,7 +65,7 @@ def test_two_serves_on_one_archive(field_file: Callable[..., Path], tmp_path: Pa
         (None, ("--port", 70000), "--port 70000 cannot be used"),
     ],
 )
-def test_a_server_that_cannot_be_had(
+def test_serve_without_a_server_is_refused(
     url: str | None,
     words: Sequence[object],
     message: str,
@@ -73,7 +73,7 @@ def test_a_server_that_cannot_be_had(
     command_line: Any,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """One message, before anything is said to be served."""
+    """One message comes before anything is reported as served."""
     if url is not None:
         monkeypatch.setenv("PREFECT_API_URL", url)
     ended = command_line("serve", field_file(), "--every", "30m", *words)
@@ -82,7 +82,7 @@ def test_a_server_that_cannot_be_had(
 
 
 def test_a_field_is_a_deployment_of_the_survey(field_file: Callable[..., Path], tmp_path: Path) -> None:
-    """Its parameters name file, field and archive and pass the flow's own checks; a second run is cancelled."""
+    """Its parameters have file, field and archive and pass the flow's checks; a second run at a time is cancelled."""
     from flows.archive.reprocess_flow import deployment
     from flows.survey import survey
 

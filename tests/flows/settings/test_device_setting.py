@@ -1,4 +1,4 @@
-"""The device that networks compute on, as a setting of surveys, trainings and evaluations."""
+"""The device for the networks, as a setting of surveys, trainings and evaluations."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ def _no_such_device(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torch.backends.mps.is_available", lambda: False)
 
 
-def test_a_survey_on_a_device_that_is_not_there_is_refused(survey_png: Survey, tmp_path: Path) -> None:
-    """Before anything is captured or stored."""
+def test_a_survey_on_an_absent_device_is_refused(survey_png: Survey, tmp_path: Path) -> None:
+    """The error comes before an archive is made."""
     with pytest.raises(SettingsError, match=REFUSED):
         survey_png(tmp_path / "out", device="mps")
     assert not (tmp_path / "out").exists()
 
 
-def test_trainings_and_evaluations_refuse_it_too(tmp_path: Path) -> None:
-    """Before a scene is looked at."""
+def test_trainings_and_evaluations_refuse_an_absent_device(tmp_path: Path) -> None:
+    """They write no file."""
     with pytest.raises(SettingsError, match=REFUSED):
         train_weights(TrainRequest("farm", tmp_path / "w.safetensors", device="mps"))
     with pytest.raises(SettingsError, match=REFUSED):
@@ -41,7 +41,7 @@ def test_trainings_and_evaluations_refuse_it_too(tmp_path: Path) -> None:
 
 
 def test_a_map_of_another_device_is_another_store() -> None:
-    """Its last bits may differ; stores of the processor keep the keys that they had."""
+    """Its last bits may differ; the key of a map from the processor names no device."""
     described = SimpleNamespace(key="w")
     runs = [SimpleNamespace(settings=SimpleNamespace(device=name), described=described) for name in ("cpu", "cuda")]
     keys = [SurveyRun.model_key.fget(run) for run in runs]  # type: ignore[attr-defined]

@@ -1,4 +1,4 @@
-"""Settings: defaults, precedence, and every mistake refused with its place and its cure."""
+"""Settings: defaults, precedence, and errors that name place and remedy."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ POSE = {"lon_deg": 9.5, "lat_deg": 52.1, "heading_deg": 30, "tilt_deg": 40, "hei
 
 @pytest.fixture
 def toml(tmp_path: Path):
-    """Write text as a survey's file and give its path."""
+    """Return a function that writes text as a survey's file and returns its path."""
 
     def write(text: str) -> Path:
         path = tmp_path / "survey.toml"
@@ -43,7 +43,7 @@ def toml(tmp_path: Path):
 
 
 def test_defaults_and_parts_are_read_back():
-    """No file and no flag gives the design's defaults; every part is read back; effects are those that exist."""
+    """Without file and flags the defaults of the design hold; every table and the list of all effects parse."""
     found = load_settings()
     assert found == Settings()
     assert (found.scene, found.budget, found.policy, found.memory) == ("farm", None, "gain", 4 * 2**30)
@@ -53,8 +53,8 @@ def test_defaults_and_parts_are_read_back():
     assert parse_settings({"effects": every}).effects == every
 
 
-def test_flags_and_files_say_the_same(toml):
-    """Flags win over the file, commas are lists, and relative paths of a file start at its folder."""
+def test_flags_and_files_give_the_same_settings(toml):
+    """Flags override the file, commas make lists, and relative paths of a file start at its folder."""
     path = toml('budget = 0.4\npolicy = "sobel"\n[camera]\nexposure_ms = 50\nbits = 10\n')
     found = load_settings(path, {"budget": "0.3", "camera.exposure_ms": 20, "seed": None})
     assert (found.budget, found.policy, found.seed) == (0.3, "sobel", 0)
@@ -70,8 +70,8 @@ def test_flags_and_files_say_the_same(toml):
     assert (one.shape, one.effects) == ((20, 300), "slit,shot")
 
 
-def test_the_example_says_every_default():
-    """It is what `python -m flows.settings.documents > survey.example.toml` makes, and valid."""
+def test_the_example_file_has_every_default():
+    """It is valid and equals the output of `python -m flows.settings.documents > survey.example.toml`."""
     assert replace(load_settings(EXAMPLE), out=Settings.out) == Settings()
     assert [load_settings(EXAMPLE, one).plain for one in ({"seconds": "5"}, {"policy": "gain"})] == [True, False]
     assert EXAMPLE.read_text(encoding="utf-8") == example_toml()
@@ -84,7 +84,7 @@ def test_the_example_says_every_default():
 
 
 def test_documents_have_every_setting_with_its_default():
-    """A line of help each, in as many cells everywhere, and a default that its own range does not refuse."""
+    """Each has one row of help with equal cells, and a default within its own range."""
     rows = [line.split(" | ") for line in settings_table().splitlines() if line.startswith("| `")]
     assert [row[0].strip("| `") for row in rows] == [
         *(name for name in SURVEY if name not in TABLES),
@@ -108,14 +108,14 @@ def test_documents_have_every_setting_with_its_default():
     ],
 )
 def test_unknown_key_is_refused_with_the_nearest(toml, line, near):
-    """A misspelt key is named together with the file and the key that was probably meant."""
+    """A misspelt key is reported with the file and the most similar key."""
     with pytest.raises(SettingsError, match=rf"unknown setting.*survey\.toml; did you mean {near}"):
         load_settings(toml(line))
 
 
 @pytest.mark.parametrize("budget", ["abc", 0, "0", -1, 1.5, float("nan"), True, float("inf"), [0.5]])
 def test_budget_out_of_range_is_refused(budget):
-    """A budget is a fraction above 0 and at most 1; anything else says so and exits with 2."""
+    """A budget is a fraction above 0 and at most 1; the error says so and exits with 2."""
     with pytest.raises(BudgetError, match="above 0 and at most 1, got") as caught:
         load_settings(flags={"budget": budget})
     assert caught.value.exit_code == 2
@@ -123,7 +123,7 @@ def test_budget_out_of_range_is_refused(budget):
 
 
 def test_amounts_have_units():
-    """50% of a scan is 0.5, and 1 is all of it; binary and decimal units of bytes are told apart."""
+    """50% of a scan is 0.5, and 1 is all of it; binary and decimal units of bytes differ."""
     found = parse_settings({"budget": "50%", "memory": "1.5gib", "kept_bytes": None})
     assert (found.budget, found.memory) == (0.5, 3 * 2**29)
     found = parse_settings({"budget": 1, "memory": "500 MB"})
@@ -179,13 +179,13 @@ def test_amounts_have_units():
     ],
 )
 def test_wrong_values_are_refused(table, words):
-    """Each wrong value is refused by a message that says what is wanted."""
+    """The message for each wrong value gives the allowed values."""
     with pytest.raises(SettingsError, match=words):
         parse_settings(table)
 
 
 def test_a_pose_and_its_map_are_read(toml):
-    """Without the tables there is no pose; those of the example are valid without their comment signs."""
+    """Without the tables there is no pose; those of the example file are valid once uncommented."""
     found = load_settings(toml("[pose]\nlon_deg = -3.25\nlat_deg = 57\nheading_deg = 350\ntilt_deg = 20\nrange_m = 40"))
     assert found.pose == RigPose(lon_deg=-3.25, lat_deg=57.0, heading_deg=350.0, tilt_deg=20.0, range_m=40.0)
     assert (found.map, Settings().pose) == (MapChoice(), None)
@@ -202,7 +202,7 @@ def test_a_pose_and_its_map_are_read(toml):
 
 
 def test_a_rig_is_read_from_its_tables(toml):
-    """Every table becomes its part of the rig; without them it is the rig at rest in calm, clear air."""
+    """Every table sets its part of the rig; without tables it is the rig at rest in calm, clear air."""
     assert Settings().simulated_rig == Rig()
     found = load_settings(
         toml(
@@ -229,13 +229,13 @@ def test_a_rig_is_read_from_its_tables(toml):
     ],
 )
 def test_a_tolerance_has_a_unit(given, wanted):
-    """Sigmas of the noise, or DN; what is written of it reads back the same."""
+    """The unit is sigmas of the noise, or DN; the text of a tolerance parses to the same value."""
     found = parse_settings({"tol": given}).tol
     assert found == wanted
     assert parse_settings({"tol": str(found)}).tol == wanted
 
 
-def test_file_that_cannot_be_read_is_one_message(toml, tmp_path):
+def test_an_unreadable_file_is_refused(toml, tmp_path):
     """A missing file, a folder and broken TOML are settings errors with the path."""
     with pytest.raises(SettingsError, match=r"no settings file .*nowhere\.toml"):
         load_settings(tmp_path / "nowhere.toml")
@@ -256,7 +256,7 @@ def test_file_that_cannot_be_read_is_one_message(toml, tmp_path):
     tolerance=st.builds(Tolerance, st.floats(0), st.sampled_from(["sigma", "dn"])),
 )
 def test_receipt_settings_read_back_the_same(budget, seed, bands, memory, exposure, slew, posed, tolerance):
-    """`parse_settings` undoes `to_dict`, so that a receipt's settings can be run again."""
+    """`parse_settings` inverts `to_dict`, so that the settings of a receipt can be used again."""
     settings = Settings(
         budget=budget,
         seed=seed,
@@ -286,22 +286,22 @@ def test_receipt_settings_read_back_the_same(budget, seed, bands, memory, exposu
         ({"prior": "none"}, "whole"),
     ],
 )
-def test_a_revisit_within_seconds_chooses_a_part(more: dict[str, str], extent: str) -> None:
-    """Another choice of lines, or none of the memory, leaves it the whole field."""
+def test_a_prior_map_and_seconds_select_a_partial_scan(more: dict[str, str], extent: str) -> None:
+    """Without prior map, or with another choice of lines, the whole field is captured."""
     assert load_settings(None, {"scene": "farm", "seconds": "8", "prior": "latest", **more}).extent == extent
 
 
 @pytest.mark.parametrize("asked", [{"seconds": 12}, {"goal": "90"}, {"seconds": 12, "kept_bytes": "50MB"}])
 def test_planned_settings_are_parameters_of_another_machine(asked: dict[str, Any], weights: Path) -> None:
-    """The chosen scan stands for the time or goal that it was chosen by."""
+    """The chosen scan replaces the time or goal that selected it."""
     given = load_settings(None, {"scene": "farm", "size": "640x512", **asked})
     planned = replace(given, scan_step=2, scan_exposure_ms=6.0)
     there = SurveySettings(**SurveySettings.planned(planned).model_dump(exclude_none=True)).settings()
     assert (there.scan_step, there.scan_exposure_ms, there.kept_bytes) == (2, 6.0, planned.kept_bytes)
 
 
-def test_a_stated_default_is_the_default() -> None:
-    """prior = auto, stated or not, leaves the extent as it is."""
+def test_an_explicit_default_changes_nothing() -> None:
+    """prior = auto, set or not, keeps the extent."""
     asked = {"scene": "farm", "seconds": 5}
     assert load_settings(None, asked) == load_settings(None, {**asked, "prior": "auto"})
     assert load_settings(None, {**asked, "prior": "latest"}).extent == "part"

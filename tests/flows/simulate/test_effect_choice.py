@@ -1,4 +1,4 @@
-"""Effects: what the stage that decides on them keeps."""
+"""The stage that chooses the simulated effects, and the record of its choice."""
 
 from __future__ import annotations
 
@@ -21,34 +21,34 @@ from storage.archive.keys import StageRef
 
 Decided = tuple[Path, StageRef]  # an archive, and the decision in it
 ASKED = "rotation,vignetting,shot,read-noise"
-CAMERA = {"camera.samples": 160}  # as wide as the small picture: all of what else it sees takes its time
+CAMERA = {"camera.samples": 160}  # as wide as the small picture: every further sample takes time
 
 
 def choose(run: CaptureRun) -> StageRef:
-    """The stage's store, made in the run's archive."""
+    """Return the stage's store, made in the run's archive."""
     return choose_effects.produce(run.archive, choose_effects.wants(run))[0]
 
 
 def key_of(run: CaptureRun) -> str:
-    """The key that the stage asks for, without making anything."""
+    """Return the key that the stage requests, without making a store."""
     return choose_effects.key(choose_effects.wants(run))
 
 
 def opened(scene_files: Path, out: Path, **flags: Any) -> CaptureRun:
-    """A simulation of the small picture."""
+    """Return a simulation of the small picture."""
     given = {"scene": str(scene_files / "scene.png"), "source": "sim", "out": str(out), "effects": ASKED}
     return open_simulation(load_settings(None, given | CAMERA | flags))[0]
 
 
 @pytest.fixture(scope="module")
 def decided(scene_files: Path, tmp_path_factory: pytest.TempPathFactory) -> Decided:
-    """An archive with a decision, and its store."""
+    """Return an archive with the stage's store, and that store."""
     out = tmp_path_factory.mktemp("decided")
     return out, choose(opened(scene_files, out))
 
 
-def test_the_manifest_and_the_source_have_what_was_decided(decided: Decided, scene_files: Path) -> None:
-    """Every effect in the chain's order, those left out within their bounds; the source has variants and clock."""
+def test_manifest_and_source_have_the_chosen_effects(decided: Decided, scene_files: Path) -> None:
+    """The manifest lists every effect in order, with its bound; the source gets variants and clock."""
     manifest = load_manifest(decided[1])
     rows = {row["name"]: row for row in manifest["effects"]}
     assert list(rows) == [effect.name for effect in EFFECTS]
@@ -64,8 +64,8 @@ def test_the_manifest_and_the_source_have_what_was_decided(decided: Decided, sce
     assert list(chosen_effects(decided[1])) == [effect for effect, _ in source.choice.effects]
 
 
-def test_a_stored_decision_draws_nothing(scene_files: Path, decided: Decided, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No probe; not one point of the scene is asked for."""
+def test_a_stored_choice_reads_no_scene(scene_files: Path, decided: Decided, monkeypatch: pytest.MonkeyPatch) -> None:
+    """There is no probe, and no pixel of the scene is read."""
     refuse = Mock(side_effect=AssertionError("the scene was looked at"))
     run = opened(scene_files, decided[0], budget="0.9", policy="random")
     monkeypatch.setattr(SceneRaster, "thinned", refuse)
@@ -86,14 +86,14 @@ def test_a_stored_decision_draws_nothing(scene_files: Path, decided: Decided, mo
     ],
     ids=str,
 )
-def test_what_the_decision_depends_on_is_its_key(scene_files: Path, decided: Decided, flags: dict[str, Any]) -> None:
-    """Tolerance with its unit, what was asked, seed, camera and rig."""
+def test_the_key_follows_the_inputs_of_the_choice(scene_files: Path, decided: Decided, flags: dict[str, Any]) -> None:
+    """Inputs are the tolerance with its unit, the requested effects, seed, camera, optics and sky."""
     assert key_of(opened(scene_files, decided[0])) == decided[1].key
     assert key_of(opened(scene_files, decided[0], **flags)) != decided[1].key
 
 
-def test_effects_that_this_version_does_not_know_are_refused(monkeypatch: pytest.MonkeyPatch, decided: Decided) -> None:
-    """By name."""
+def test_effects_unknown_to_this_version_are_refused(monkeypatch: pytest.MonkeyPatch, decided: Decided) -> None:
+    """The message names the effect."""
     row = {"name": "glare", "state": "on", "variant": "exact"}
     monkeypatch.setattr(effect_choice, "load_manifest", lambda effects: {"effects": [row]})
     with pytest.raises(IncompleteStoreError, match="the effect glare, exact, which this version does not know"):

@@ -1,4 +1,4 @@
-"""Noise off: what a survey stores is the scene convolved with the slit, the pixel and the coarse pass's smear."""
+"""A survey without noise stores the scene convolved with the slit, the pixel and the coarse pass's smear."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from storage.arrays.signal_cubes import open_signal_cubes
 from tests.conftest import Survey, WeightsMaker
 
 SLIT_PX = LineCamera().slit_px
-SAMPLES = 192  # of a line; a narrow camera is quick to simulate
+SAMPLES = 192  # samples of a line; a narrow camera is quick to simulate
 BOUND = 0.005  # of the scene's standard deviation
 
 
 @dataclass(frozen=True)
 class Waves:
-    """Plane waves around 0.5: two bands, evenly spread periods, heights growing with the period."""
+    """Plane waves around 0.5: two bands, evenly spaced periods, amplitudes proportional to the period."""
 
     shape: tuple[int, int]
     frequency: NDArray[np.float64]  # (wave, 2) of y and x [1/px]
@@ -31,31 +31,31 @@ class Waves:
     height: NDArray[np.float64]
 
     def values(self, y: NDArray[np.float64], x: NDArray[np.float64], left: Any = 1.0) -> NDArray[np.float64]:
-        """Values at (y, x) positions, (..., 2), each wave damped to what is ``left`` of it."""
+        """Return values at (y, x) positions, (..., 2); each wave is multiplied by its fraction ``left``."""
         turns = np.multiply.outer(y, self.frequency[:, 0]) + np.multiply.outer(x, self.frequency[:, 1])
         waves = np.cos(2 * np.pi * turns + self.phase) * self.height * left
         return 0.5 + np.stack([waves[..., ::2].sum(axis=-1), waves[..., 1::2].sum(axis=-1)], axis=-1)
 
     def raster(self) -> NDArray[np.float64]:
-        """The scene's pixels."""
+        """Return the scene's pixels."""
         return self.values(*np.mgrid[: self.shape[0], : self.shape[1]].astype(float))
 
     def seen(self, along: str) -> NDArray[np.float64]:
-        """What the footprint leaves of the waves, in closed form, at the scene's pixels."""
+        """Return the waves behind the footprint, in closed form, at the scene's pixels."""
         scan, line = self.frequency.T if along == "x" else self.frequency.T[::-1]
         left = through(scan, SLIT_PX) * through(line, 1.0)
         return self.values(*np.mgrid[: self.shape[0], : self.shape[1]].astype(float), left)
 
 
 def through(frequency: NDArray[np.float64], width: float) -> NDArray[np.float64]:
-    """What a box leaves, at pixel centres, of waves that are linear between pixels: with all their images, in phase."""
+    """Return the gain of a box, at pixel centres, for waves linear between pixels: with all images, in phase."""
     images = frequency + np.arange(-200, 201)[:, None]
     left: NDArray[np.float64] = (np.sinc(images) ** 2 * np.sinc(images * width)).sum(axis=0)
     return left
 
 
 def waves(shape: tuple[int, int], shortest_px: float, longest_px: float) -> Waves:
-    """Twelve waves in seeded directions."""
+    """Return twelve waves of seeded directions."""
     rng = np.random.default_rng(11)
     period, angle = np.linspace(shortest_px, longest_px, 12), rng.uniform(0, np.pi, 12)
     frequency = np.stack([np.sin(angle), np.cos(angle)], axis=1) / period[:, None]
@@ -63,16 +63,16 @@ def waves(shape: tuple[int, int], shortest_px: float, longest_px: float) -> Wave
 
 
 def error_fraction(got: NDArray[np.floating], truth: NDArray[np.floating]) -> float:
-    """Rms error over the standard deviation of the truth, the worse of the two bands; NaN in ``got`` is left out."""
+    """Return the RMS error over the truth's standard deviation, the worse of two bands; NaN in ``got`` is left out."""
     spread = truth.std(axis=(0, 1))
     return float((np.sqrt(np.nanmean((got - truth) ** 2, axis=(0, 1))) / spread).max())
 
 
 @pytest.mark.parametrize(("shape", "along"), [((96, 128), "x"), ((160, 96), "y")])
-def test_survey_is_the_scene_through_the_footprint(
+def test_survey_equals_the_scene_behind_the_footprint(
     shape: tuple[int, int], along: str, survey_png: Survey, make_weights: WeightsMaker, tmp_path: Path
 ) -> None:
-    """Waves of 4 to 40 px: the mosaic equals the convolved pixels, and the waves' own closed form inside."""
+    """For waves of 4 to 40 px the mosaic equals the convolved pixels, and inside it the waves' closed form."""
     scene, archive = waves(shape, 4, 40), tmp_path / "archive"
     np.save(tmp_path / "waves.npy", scene.raster())
     flags = {"labels": None, "wavelengths": "500,700", "weights": str(make_weights((500.0, 700.0))), "budget": None}
@@ -84,6 +84,6 @@ def test_survey_is_the_scene_through_the_footprint(
     pixels = convolve1d(blurred, footprint_kernel(1.0), axis="yx".index(along), mode="nearest")  # along the line
     assert np.isfinite(mosaic).all()
     assert error_fraction(mosaic, pixels) < BOUND
-    inner = np.s_[8:-8, 8:-8]  # at its border the scene ends, the waves go on
+    inner = np.s_[8:-8, 8:-8]  # the scene ends at its border, but the waves do not
     assert error_fraction(mosaic[inner], scene.seen(along)[inner]) < BOUND
-    assert error_fraction(mosaic, scene.raster()) > 4 * BOUND  # the bound tells footprints apart
+    assert error_fraction(mosaic, scene.raster()) > 4 * BOUND  # the bound distinguishes footprints

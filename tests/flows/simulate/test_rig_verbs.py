@@ -33,19 +33,19 @@ NOWHERE = "127.0.0.1:1:1"
 
 @contextmanager
 def served(*faults: str) -> Iterator[ServedRig]:
-    """An emulated rig behind ports, whose faults strike at the first occasion."""
+    """Yield an emulated rig behind ports, whose faults occur at the first occasion."""
     struck = [make_fault(name, at=0) for name in faults]
     with FaultyRig(small_source(), FastClock(20.0), mirror_faults=struck).serve() as rig:
         yield rig
 
 
 def still(rig: ServedRig) -> bool:
-    """Whether the mirror was told nothing but its mode."""
+    """Return whether the mirror received no command but that of its mode."""
     return not any(request.command in SETS for request in rig.rig.mirror.requests)
 
 
-def test_settings_file_says_where_both_are(command_line: CommandLine, tmp_path: Path) -> None:
-    """Flags win over it; the square is gone round on request, and the record is one JSON object."""
+def test_rig_check_reads_addresses_from_a_settings_file(command_line: CommandLine, tmp_path: Path) -> None:
+    """Flags override it; --move drives the square and returns to 0; 0, and --json prints one object."""
     with served() as rig:
         file = tmp_path / "field.toml"
         file.write_text(
@@ -62,8 +62,8 @@ def test_settings_file_says_where_both_are(command_line: CommandLine, tmp_path: 
         assert not still(rig)
 
 
-def test_one_of_two_devices_is_partly(command_line: CommandLine) -> None:
-    """A camera that cannot be reached beside a mirror that works: 3; a port that is not shared, or alone: 1."""
+def test_rig_check_exits_with_3_if_one_of_two_devices_fails(command_line: CommandLine) -> None:
+    """An unreachable camera beside a working mirror gives 3; a port in use, or a single failed device, gives 1."""
     with served() as rig, serial.Serial(rig.port, exclusive=True):
         ended = command_line("rig", "check", "--port", rig.port)
         assert ended.code == 1
@@ -95,13 +95,13 @@ def test_one_of_two_devices_is_partly(command_line: CommandLine) -> None:
         ("emulate", "--seed", "x"),
     ],
 )
-def test_usage_errors(command_line: CommandLine, words: tuple[str, ...]) -> None:
-    """One message and exit code 2, before anything is drawn or connected."""
+def test_usage_errors_exit_with_2(command_line: CommandLine, words: tuple[str, ...]) -> None:
+    """One message is printed before anything is rendered or connected."""
     command_line("rig", *words).refused(2, "")
 
 
-def test_rig_in_order(command_line: CommandLine) -> None:
-    """A table of what was asked and came, and nothing moved."""
+def test_rig_check_of_a_working_rig_moves_nothing(command_line: CommandLine) -> None:
+    """It prints a table of requests and replies, and exits with 0."""
     with served() as rig:
         camera = f"{rig.host}:{rig.camera_port}:{rig.file_port}"
         ended = command_line("rig", "check", "--port", rig.port, "--camera", camera)
@@ -112,14 +112,14 @@ def test_rig_in_order(command_line: CommandLine) -> None:
 
 
 def test_a_driver_that_cannot_be_imported_is_refused(command_line: CommandLine, tmp_path: Path) -> None:
-    """One message with the setting and its value, exit code 2."""
+    """One message has the setting and its value; the exit code is 2."""
     file = tmp_path / "field.toml"
     file.write_text('[rig]\nmirror_driver = "nowhere:open_it"\n')
     command_line("rig", "check", file).refused(2, "rig.mirror_driver = 'nowhere:open_it' cannot be imported")
 
 
-def test_emulated_rig_is_checked_by_the_file_that_it_writes(command_line: CommandLine, tmp_path: Path) -> None:
-    """The file is a survey's settings of the same rig: both devices are where it says, until the emulation ends."""
+def test_rig_check_reads_the_file_of_an_emulated_rig(command_line: CommandLine, tmp_path: Path) -> None:
+    """The file has the survey settings of that rig; both devices answer there until the emulation ends."""
     file = tmp_path / "emulated.toml"
     wanted: dict[str, object] = {"scene": "scouting", "size": "64x48", "bands": "40,90", "effects": "all", "seed": "3"}
     wanted |= {"interest": "0.5", "day": "150", "hour": "9.5", "sky.light_fraction": "0.4"}
@@ -153,15 +153,15 @@ def test_emulated_rig_is_checked_by_the_file_that_it_writes(command_line: Comman
 
 
 def test_emulated_scene_is_found_from_every_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Relative names of a file start at its folder, those of flags at the current one."""
+    """Relative names in a file start at its folder, those of flags at the current folder."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "there").mkdir()
     _write_survey(tmp_path / "there" / "x.toml", load_settings(None, {"scene": "x.png", "source": "sim"}), {})
     assert load_settings(tmp_path / "there" / "x.toml").scene == str(tmp_path / "x.png")
 
 
-def test_emulation_ends_in_order() -> None:
-    """At Ctrl-C: exit code 0, and the port is gone."""
+def test_emulation_ends_at_ctrl_c() -> None:
+    """The exit code is 0, and the port is gone."""
     words = ["rig", "emulate", "--size", "48x48", "--bands", "40", "--effects", "all"]
     with subprocess.Popen(
         [sys.executable, "-m", "flows.cli.main", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

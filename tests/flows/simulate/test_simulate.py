@@ -1,4 +1,4 @@
-"""`spectralzoom simulate`: a scan as raw cubes, its manifest as table and JSON, a scan broken off, words refused."""
+"""`spectralzoom simulate`: raw cubes, their manifest as table and JSON, an interrupted scan, and refused input."""
 
 from __future__ import annotations
 
@@ -21,36 +21,36 @@ from pipeline.simulator.simulated import SimulatedSource
 from tests.flows.conftest import python
 
 ASKED = "rotation,vignetting,shot,read-noise"
-SAMPLES = 192  # of a line; a narrow camera is quick to simulate
+SAMPLES = 192  # samples of a line; a narrow camera is quick to simulate
 
 
 def narrow(folder: Path) -> list[str]:
-    """Flags that name settings of a narrow camera, which are written to a folder."""
+    """Write settings of a narrow camera to a folder and return the flags that name them."""
     file = folder / "camera.toml"
     file.write_text(f"[camera]\nsamples = {SAMPLES}\n")
     return ["--settings", str(file)]
 
 
 def words(scene_files: Path, out: Path, *more: str) -> list[str]:
-    """A command that scans the small picture coarsely."""
+    """Return a command that scans the small picture coarsely."""
     given = ["-o", str(out), "--coarse", "--effects", ASKED, *narrow(out.parent)]
     return ["simulate", str(scene_files / "scene.png"), *given, *more]
 
 
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where the scan of this module lies."""
+    """Return the archive for the scan of this module."""
     return tmp_path_factory.mktemp("simulated") / "scan"
 
 
 @pytest.fixture
 def scan(command_line: Any, scene_files: Path, archive: Path) -> Any:
-    """The scan's record; made by the first test that asks, found by the others."""
+    """Return the scan's record; the first test makes the scan, the others find it."""
     return json.loads(command_line(*words(scene_files, archive, "--json")).out)
 
 
-def test_the_cubes_are_there_with_their_manifest(scan: Any, archive: Path) -> None:
-    """Every cube opens with plain xarray and says how it was made; the record has the figures of all."""
+def test_simulated_cubes_have_a_manifest(scan: Any, archive: Path) -> None:
+    """Every cube opens with plain xarray and records its effects; the scan's record has the figures of all cubes."""
     (cube,) = [xr.open_zarr(archive / name, consolidated=False) for name in scan["cubes"]]
     assert cube["dn"].dims == ("line", "sample", "band")
     assert scan["lines"] == cube.sizes["line"]
@@ -59,10 +59,10 @@ def test_the_cubes_are_there_with_their_manifest(scan: Any, archive: Path) -> No
     assert [row["name"] for row in scan["effects"]] == [effect.name for effect in EFFECTS]
 
 
-def test_a_scan_that_is_there_draws_nothing(
+def test_a_stored_scan_reads_no_scene(
     scan: Any, command_line: Any, scene_files: Path, archive: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is cached, with the same cubes; the table is shown nevertheless, an effect a row and the sums below."""
+    """It is cached, with the same cubes; the table is printed all the same, one effect a row and the sums below."""
     monkeypatch.setattr(SceneRaster, "thinned", Mock(side_effect=AssertionError("the scene was looked at")))
     ended = command_line(*words(scene_files, archive))
     assert (ended.code, ended.out) == (0, "")
@@ -76,7 +76,7 @@ def test_a_scan_that_is_there_draws_nothing(
 
 
 @pytest.mark.parametrize("workers", ["1", "2"])
-def test_a_broken_scan_goes_on_where_it_was(
+def test_an_interrupted_scan_resumes_at_its_line(
     command_line: Any,
     scene_files: Path,
     tmp_path: Path,
@@ -85,7 +85,7 @@ def test_a_broken_scan_goes_on_where_it_was(
     monkeypatch: pytest.MonkeyPatch,
     workers: str,
 ) -> None:
-    """Lines that were taken are not taken again, and the cube is the same: another day two workers may render it."""
+    """Captured lines are not captured again and the cube is the same, also with two workers for the rest."""
     real, firsts = SimulatedSource.lines, []
 
     def breaking(self: SimulatedSource, sweep: Any, first: int = 0) -> Iterator[Any]:
@@ -116,16 +116,16 @@ def test_a_broken_scan_goes_on_where_it_was(
         (["--size", "64x64"], "size is for built-in scenes"),
     ],
 )
-def test_wrong_is_refused(command_line: Any, scene_files: Path, tmp_path: Path, flags: list[str], message: str) -> None:
-    """One message, exit code 2, no archive."""
+def test_bad_flag_refused(command_line: Any, scene_files: Path, tmp_path: Path, flags: list[str], message: str) -> None:
+    """There is one message, the exit code is 2, and no archive is made."""
     command_line("simulate", scene_files / "scene.png", "-o", tmp_path / "none", *flags).refused(2, message)
     assert not (tmp_path / "none").exists()
 
 
 def test_unusual_files_are_scanned_or_refused(command_line: Any, tmp_path: Path) -> None:
-    """One band, sixty full wells beside dark rows; pixels without a value are refused.
+    """One band and 10 s of exposure are scanned; pixels without a value are refused.
 
-    A scan is decided by its own sweeps: of a first pass, whose lines stare, smear is no effect.
+    The scan's own sweeps decide on effects: lines of a first pass are stationary, so smear is absent.
     """
     np.save(tmp_path / "one.npy", np.random.default_rng(0).uniform(0.1, 1, (20, 30, 1)).astype(np.float32))
     out = tmp_path / "scan"
@@ -165,8 +165,8 @@ assert "torch" not in sys.modules
 """
 
 
-def test_no_scan_waits_for_torch(tmp_path: Path) -> None:
-    """It takes seconds to load, and with all effects on nothing of a scan is computed by it."""
+def test_simulate_does_not_import_torch(tmp_path: Path) -> None:
+    """Its import takes seconds, and no effect needs it."""
     np.save(tmp_path / "some.npy", np.random.default_rng(0).uniform(0.1, 1, (20, 30, 3)).astype(np.float32))
     flags = ["-o", str(tmp_path / "scan"), "--coarse", "--effects", "all", "--wavelengths", "460,550,650"]
     ended = python(WITHOUT, "simulate", tmp_path / "some.npy", *narrow(tmp_path), *flags)
@@ -181,7 +181,7 @@ TOTAL |= {"on": 1, "off": 1, "saved_s": 1.0}
 
 @pytest.mark.parametrize("width", [72, 100])
 def test_the_table_fits_the_terminal(width: int) -> None:
-    """Figures are never broken; effects that are absent have no row."""
+    """Figures are not wrapped; absent effects have no row."""
     said = io.StringIO()
     absent = ROW | {"name": "wind", "state": "off", "reason": "absent", "magnitude": "the air is calm"}
     long = ROW | {"name": "thermal-drift", "variant": "positions", "magnitude": "a way of words " * 12}

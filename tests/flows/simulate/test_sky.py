@@ -1,4 +1,4 @@
-"""The sky over a survey: overcast, exposures gather less light, scans expose longer, and the network knows of it."""
+"""The sky over a survey: less light under clouds, longer exposures, and the light in the network's input."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ SMALL: dict[str, Any] = {"scene": "scouting", "size": "96x64", "bands": "20,80,1
         ({"scene": "field.png", "sky.light": "overcast"}, "--sky is of a camera, and the scene field.png is a raster"),
     ],
 )
-def test_wrong_skies_are_refused(flags: dict[str, Any], words: str) -> None:
-    """With the flag, what came and what it may be."""
+def test_bad_sky_settings_are_refused(flags: dict[str, Any], words: str) -> None:
+    """The message has the flag, its value and the allowed values."""
     with pytest.raises(SettingsError) as found:
         load_settings(None, SMALL | {"size": None, "bands": None} | flags)
     assert str(found.value).startswith(words)
 
 
 def test_a_sky_is_a_fraction_of_the_light() -> None:
-    """An eighth under an overcast sky, or what is said; the scene's key has it, and none under a clear one."""
+    """An overcast sky leaves an eighth, or the given fraction; the scene's key has it, but not for a clear sky."""
     given = [{}, {"sky.light": "overcast"}, {"sky.light": "overcast", "sky.light_fraction": 0.5}]
     clear, overcast, half = (open_scene(load_settings(None, SMALL | one))[0] for one in given)
     assert [one.light_fraction for one in (clear, overcast, half)] == [1.0, 0.125, 0.5]
@@ -44,15 +44,15 @@ def test_a_sky_is_a_fraction_of_the_light() -> None:
 
 
 def test_a_field_at_night_is_noted() -> None:
-    """Where the sun stands below the horizon when the survey begins."""
+    """The sun is 15 degrees below the horizon at the start of the survey."""
     noon, night = ({"sky": {"started": f"2026-06-01T{hour}:00:00Z"}} for hour in (12, "00"))
     assert open_scene(load_settings(None, SMALL | noon))[1] == ()
     (note,) = open_scene(load_settings(None, SMALL | night))[1]
     assert note == "the sun is 15 degrees below the horizon at sky.started: the field is dark"
 
 
-def test_under_clouds_scans_expose_longer(tmp_path: Path) -> None:
-    """The scan taken without a limit has the light of the one under a clear sky; the network reads both alike."""
+def test_scans_expose_longer_under_clouds(tmp_path: Path) -> None:
+    """Without a time limit the expected mIoU is that of a clear sky; within 4 s it is lower."""
     planned = {"scene": "scouting", "size": "160x128", "out": str(tmp_path)}
     for asked, same in (({}, True), ({"seconds": 4}, False)):
         clear, dim = (
@@ -72,7 +72,7 @@ def test_under_clouds_scans_expose_longer(tmp_path: Path) -> None:
 
 
 def test_a_scan_by_hand_scores_by_its_light(tmp_path: Path) -> None:
-    """200 ms under an overcast sky are expected to score what 25 ms do under a clear one."""
+    """200 ms under an overcast sky have the expected score of 25 ms under a clear one."""
     planned = {"scene": "scouting", "size": "160x128", "out": str(tmp_path), "scan_step": 2}
     asked = ({"scan_exposure_ms": 25}, {"scan_exposure_ms": 200, "sky.light": "overcast"})
     clear, dim = (open_run(load_settings(None, planned | one), planning=True) for one in asked)

@@ -1,12 +1,12 @@
-"""What a stage's code is: every definition that its functions reach over the four packages, and a digest of it.
+"""Code of a stage: every definition that its functions reach over the four packages, and a digest of it.
 
 Names are followed from definition to definition (functions, classes, constants of a module): through imports, base
-classes, decorators, default values and annotations. A class is reached as a whole, and with the first definition of a
-module come its statements that register something. The digest is made of syntax alone: neither layout, comments and
-docstrings nor the file in which a definition stands are part of it.
+classes, decorators, default values and annotations. A class is reached as a whole. The first definition of a module
+brings the module's registering statements. The digest uses syntax alone: layout, comments, docstrings and the file of a
+definition are no part of it.
 
-What no syntax tells is not followed: modules imported by a name made at run time, and who implements a protocol. Such
-code is reached by roots of its own.
+Modules imported by a name made at run time and implementations of a protocol are not followed. Such code needs roots of
+its own.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-RECORD = "stage"  # decorates a function with what is said of it: no byte that it stores depends on that
+RECORD = "stage"  # decorates a function with its record: no stored byte depends on it
 PACKAGES = ("flows", "models", "pipeline", "storage")
 COMPREHENSIONS = ast.ListComp | ast.SetComp | ast.DictComp | ast.GeneratorExp
 FUNCTIONS = ast.FunctionDef | ast.AsyncFunctionDef
@@ -30,7 +30,7 @@ Target = tuple[str, str]  # a module by its dotted name, and a definition in it;
 
 
 def read_packages(root: Path) -> dict[str, str]:
-    """Read every file of the four packages below a folder: its text, by the module's dotted name."""
+    """Return the text of every file of the four packages below a folder, by the module's dotted name."""
     texts = {}
     for file in sorted(file for package in PACKAGES for file in (root / package).rglob("*.py")):
         parts = file.relative_to(root).with_suffix("").parts
@@ -51,7 +51,7 @@ class Sources:
                 gc.enable()
 
     def edited(self, path: str, text: str) -> Sources:
-        """Give these sources with another text of one module that binds the same names; no other is parsed again."""
+        """Return these sources with another text of one module that binds the same names; no other is parsed again."""
         changed = copy(self)
         changed.modules = self.modules | {path: Module(self, path, ast.parse(text))}
         if changed.modules[path].names != self.modules[path].names:
@@ -59,7 +59,7 @@ class Sources:
         return changed
 
     def named(self, name: str) -> Target:
-        """Find the only definition of that name: ``score``, or ``stages.score`` where several modules have one.
+        """Return the only definition of that name: ``score``, or ``stages.score`` if several modules have one.
 
         Raises
         ------
@@ -73,12 +73,12 @@ class Sources:
         return found[0], short
 
     def names(self, target: Target) -> set[Target]:
-        """What a definition names, and what its module registers when it is imported."""
+        """Return the names that a definition uses and those that its module registers on import."""
         module = self.modules[target[0]]
         return {*module.registering, *(to for one in module.defined[target[1]] for to in one.named)}
 
     def closure(self, roots: Iterable[str], barriers: Collection[str] = ()) -> set[Target]:
-        """Give every definition that the roots reach without passing one of the barriers."""
+        """Return every definition that the roots reach without passing one of the barriers."""
         ends = {self.named(name) for name in barriers}
         found, waiting = set[Target](), [self.named(name) for name in roots]
         while waiting:
@@ -89,12 +89,12 @@ class Sources:
         return found
 
     def digest(self, closure: Iterable[Target]) -> str:
-        """Hash of what the definitions say, whichever modules they stand in."""
+        """Return a hash of the definitions' syntax, whatever their modules."""
         said = sorted((name, one.dump) for path, name in closure for one in self.modules[path].defined[name])
         return hashlib.sha256(repr(said).encode()).hexdigest()[:20]
 
     def resolve(self, dotted: str) -> tuple[str, set[Target]]:
-        """Follow a dotted name through imports: what it is called where it is defined, and what that reaches."""
+        """Follow a dotted name through imports; return its name where it is defined, and the definitions it reaches."""
         parts = dotted.split(".")
         for count in range(len(parts), 0, -1):
             module, rest = self.modules.get(".".join(parts[:count])), parts[count:]
@@ -110,7 +110,7 @@ class Sources:
 
 
 class Module:
-    """What the names at the top of one file stand for."""
+    """Names at the top of one file, with their definitions."""
 
     def __init__(self, sources: Sources, path: str, tree: ast.Module) -> None:
         self.sources, self.path = sources, path
@@ -140,17 +140,17 @@ class Module:
 
     @cached_property
     def names(self) -> dict[str, str]:
-        """The dotted name that each name at the top of the file stands for."""
+        """Return the dotted name of each name at the top of the file."""
         return self.imported | {name: f"{self.path}.{name}" for name in self.defined}
 
     @cached_property
     def registering(self) -> list[Target]:
-        """What acts on others once this module is imported: bare statements, and what our own functions decorate."""
+        """Return the definitions that act on import: bare statements, and those decorated by our own functions."""
         return [(self.path, name) for name, ones in self.defined.items() if not name or any(x.registers for x in ones)]
 
 
 class Definition:
-    """One statement at the top of a file: its syntax without what has no effect, and what it names."""
+    """One statement at the top of a file: its syntax without parts that have no effect, and the names it uses."""
 
     def __init__(self, module: Module, node: ast.stmt) -> None:
         self._module, self._node = module, node
@@ -160,7 +160,7 @@ class Definition:
 
     @property
     def registers(self) -> bool:
-        """Whether a function of the four packages decorates it."""
+        """Return whether a function of the four packages decorates it."""
         known, resolve = self._module.names, self._module.sources.resolve
         parts = (name.partition(".") for name in self._decorators)
         return any(resolve(f"{known[head]}{dot}{rest}")[1] for head, dot, rest in parts if head in known)
@@ -172,17 +172,17 @@ class Definition:
 
     @property
     def dump(self) -> str:
-        """The syntax, in which everything imported is called as where it is defined."""
+        """Return the syntax, in which every import has the name of its definition."""
         return self._bare[0]
 
     @property
     def named(self) -> set[Target]:
-        """The definitions that it names."""
+        """Return the definitions whose names it uses."""
         return self._bare[1]
 
 
 def _imports(nodes: Iterable[ast.AST]) -> Iterator[tuple[str, str]]:
-    """Names that imports bind, each with the dotted name that it stands for."""
+    """Yield the names that imports bind, each with its dotted name."""
     for node in nodes:
         match node:
             case ast.ImportFrom(module=module, names=names):
@@ -194,7 +194,7 @@ def _imports(nodes: Iterable[ast.AST]) -> Iterator[tuple[str, str]]:
 
 
 def _same_scope(nodes: Iterable[ast.AST]) -> Iterator[ast.AST]:
-    """Nodes with all that is in them, but for the inside of functions, classes and comprehensions."""
+    """Yield nodes and their children, without the inside of functions, classes and comprehensions."""
     for node in nodes:
         yield node
         if not isinstance(node, SCOPES):
@@ -202,7 +202,7 @@ def _same_scope(nodes: Iterable[ast.AST]) -> Iterator[ast.AST]:
 
 
 def _bound(nodes: Iterable[ast.AST]) -> set[str]:
-    """Names that the nodes of one scope bind, imports apart."""
+    """Return the names that the nodes of one scope bind, without imports."""
     found: set[str] = set()
     for node in nodes:
         match node:
@@ -224,7 +224,7 @@ def _parameters(node: ast.arguments) -> set[str]:
 
 
 class _Bare(ast.NodeTransformer):
-    """Drops docstrings and imports, calls what is imported as where it is defined, and notes what is named."""
+    """Transformer that drops docstrings and imports, gives imports the name of their definition, and records names."""
 
     def __init__(self, module: Module) -> None:
         self.named: set[Target] = set()
@@ -256,14 +256,14 @@ class _Bare(ast.NodeTransformer):
         return node
 
     def _within(self, names: Mapping[str, str | None], node: ast.AST) -> ast.AST:
-        """Visit what is in a node that has names of its own."""
+        """Visit the inside of a node that has names of its own."""
         self._scopes.append(names)
         self.generic_visit(node)
         self._scopes.pop()
         return node
 
     def _function(self, node: ast.FunctionDef | ast.AsyncFunctionDef) -> ast.AST:
-        """Its body sees its own names first; decorators, default values and annotations do not."""
+        """Visit the body with its own names first, but decorators, default values and annotations without them."""
         body = ast.Module(node.body, [])
         node.body = []
         self.generic_visit(node)
@@ -281,7 +281,7 @@ class _Bare(ast.NodeTransformer):
         return self._called(node, inner.id, names) if isinstance(inner, ast.Name) else self.generic_visit(node)
 
     def _called(self, node: ast.Name | ast.Attribute, name: str, attributes: Iterable[str]) -> ast.AST:
-        """Give what is read of a global or imported name by the name that it has where it is defined."""
+        """Return a global or imported name, as read, under the name of its definition."""
         scope = next((scope for scope in reversed(self._scopes) if name in scope), None)
         dotted = self._module.names.get(name) if scope is None else scope[name]
         if dotted is None:

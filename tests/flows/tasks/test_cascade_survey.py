@@ -1,4 +1,4 @@
-"""Surveys in which the full network reads the patches that promise enough, and the overview the rest."""
+"""Surveys in which the full network reads the patches of sufficient expected gain, and the overview the rest."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from models.weights.files import CASCADE, save_weights
 from tests.conftest import RGB_NM, Flags, Survey, random_weights
 from tests.prior_work import without_effects
 
-SCAN: dict[str, Any] = {"budget": None, "scan_step": "1", "camera.samples": 160}  # few beside the field
+SCAN: dict[str, Any] = {"budget": None, "scan_step": "1", "camera.samples": 160}  # few samples outside of the field
 TABLE = CascadeTable((0.02, 0.05, 0.15, 0.2), (0.0, 0.001, 0.003, 0.2), (0.9, 0.8, 0.4, 0.1))
 
 pytestmark = pytest.mark.usefixtures("no_effects")
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.usefixtures("no_effects")
 
 @pytest.fixture(scope="module")
 def judged(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Tiny weights that know what reading a part loses."""
+    """Return tiny weights with a table of the loss when a part is read."""
     path, tiny = tmp_path_factory.mktemp("weights") / "weights.safetensors", random_weights(RGB_NM)
     save_weights(replace(tiny, record={**tiny.record, CASCADE: asdict(TABLE)}), path)
     return path
@@ -33,7 +33,7 @@ def judged(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def cascade(judged: Path, survey_png: Survey, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
-    """A survey of these weights that asks for nothing; not to be changed."""
+    """Return archive and receipt of a survey with these weights and no flag; do not change it."""
     out = tmp_path_factory.mktemp("cascade")
     with without_effects():
         return out, survey_png(out, **SCAN, weights=str(judged)).receipt
@@ -47,8 +47,8 @@ def _classes(out: Path, receipt: Any) -> np.ndarray:
     return _open(out, receipt, "class_map")["classes"].values
 
 
-def test_the_loss_that_is_allowed_says_what_gain_is_enough(cascade: tuple[Path, Any]) -> None:
-    """By the weights' table, .3 points without a flag; patches of as much are read, ranked by it, and none of less."""
+def test_the_allowed_loss_sets_the_smallest_gain(cascade: tuple[Path, Any]) -> None:
+    """Without a flag 0.3 points are allowed: patches of 0.15 and more are read in order of gain, and no others."""
     out, receipt = cascade
     attention = _open(out, receipt, "attention")
     gain, rank = attention["score"].values.ravel(), attention["rank"].values.ravel()
@@ -59,8 +59,8 @@ def test_the_loss_that_is_allowed_says_what_gain_is_enough(cascade: tuple[Path, 
     assert (np.diff(gain[np.argsort(rank)][rank.size - np.count_nonzero(rank >= 0) :]) <= 0).all()
 
 
-def test_each_patch_has_the_map_of_its_reading(cascade: tuple[Path, Any], survey_png: Survey, tmp_path: Path) -> None:
-    """Read patches are those of a survey that reads everything; elsewhere the two maps may differ."""
+def test_read_patches_equal_a_full_reading(cascade: tuple[Path, Any], survey_png: Survey, tmp_path: Path) -> None:
+    """The other patches come from the overview, and some differ."""
     out, receipt = cascade
     weights = str(receipt["settings"]["weights"])
     everything = survey_png(tmp_path, **SCAN, weights=weights, expected_loss="0").receipt
@@ -81,16 +81,16 @@ def test_each_patch_has_the_map_of_its_reading(cascade: tuple[Path, Any], survey
         ({"macs": "90%"}, None),
     ],
 )
-def test_what_is_asked_for_comes_first(
+def test_flags_override_the_allowed_loss(
     judged: Path, flags_png: Flags, tmp_path: Path, flags: dict[str, str], least: float | None
 ) -> None:
-    """A gain or multiply-adds by hand, another loss."""
+    """An expected loss sets another smallest gain; a loss of 0 and multiply-adds set none."""
     content = plan_content(load_settings(None, flags_png(tmp_path, weights=str(judged), scan_step="1", **flags)))
     asked = content.get("kept", {"asked": {"least_gain": None}})["asked"]
     assert asked["least_gain"] == (least if least is None else pytest.approx(least))
 
 
-def test_a_plan_tells_how_much_is_likely_to_be_read(judged: Path, flags_png: Flags, tmp_path: Path) -> None:
-    """By the fraction that scenes kept from training had."""
+def test_a_plan_estimates_the_patches_to_read(judged: Path, flags_png: Flags, tmp_path: Path) -> None:
+    """It uses the fraction that scenes kept from training had, 0.4."""
     kept = plan_content(load_settings(None, flags_png(tmp_path, weights=str(judged), scan_step="1")))["kept"]
     assert kept["patches"] == round(0.4 * kept["of_patches"])

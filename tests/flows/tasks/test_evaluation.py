@@ -1,4 +1,4 @@
-"""What a map scores: labels and controls where the map looks, and figures read from receipts."""
+"""The score of a map: labels and controls at its offset, and figures from receipts."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ OFF = np.array([2.2, -1.4])  # along the line and the scan [px]
 
 
 @pytest.mark.parametrize(("along", "down", "right"), [("x", -1, 2), ("y", 2, -1)])
-def test_labels_move_to_where_the_map_shows_them(along: str, down: int, right: int) -> None:
-    """The map's pixel p shows what lies at p + offset, to the nearest pixel; beyond the labels nothing is known."""
+def test_labels_are_shifted_by_the_offset_of_the_map(along: str, down: int, right: int) -> None:
+    """The map's pixel p shows the field at p + offset, to the nearest pixel; outside of the labels is nodata."""
     labels = np.arange(30, dtype=np.uint8).reshape(5, 6)
     moved = evaluation.moved_labels(labels, OFF, along)  # type: ignore[arg-type]
     for row, column in np.ndindex(5, 6):
@@ -41,7 +41,7 @@ def test_labels_move_to_where_the_map_shows_them(along: str, down: int, right: i
 
 
 def test_a_false_class_is_listed_with_its_pixels() -> None:
-    """What a map shows and the labels lack has pixels and no IoU, and does not count in the mean."""
+    """A class in the map that the labels lack has pixels and no IoU, and does not count in the mean."""
     labels, drawn = np.array([0, 0, 0, 1, UNLABELLED], np.uint8), np.array([0, 0, 2, 1, 2], np.uint8)
     found = evaluation.map_figures(("soil", "crop", "tree"), confusion(labels, drawn, 3))
     assert found["false_classes"] == {"tree": 1}
@@ -49,8 +49,8 @@ def test_a_false_class_is_listed_with_its_pixels() -> None:
     assert found["miou"] == pytest.approx(5 / 6)
 
 
-def test_labels_are_moved_as_the_map_lies(tmp_path: Path) -> None:
-    """The offset is that of the sweep which registration held."""
+def test_the_offset_of_a_map_is_that_of_the_reference_sweep(tmp_path: Path) -> None:
+    """Without registration the offset is zero."""
     scene = raster_from_values(np.ones((8, 8, 1)), LineCamera(), name="t", wavelength_nm=np.array([500.0]))
     errors = PointingErrors(9.0, 4)
     source = SimulatedSource(scene, Rig(), pointing=errors)
@@ -60,8 +60,8 @@ def test_labels_are_moved_as_the_map_lies(tmp_path: Path) -> None:
     assert (evaluation.map_offset(source, []) == 0).all()
 
 
-def test_corrections_are_found_and_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two sweeps lit differently meet in the middle; offset, drift and gain reach their sweep alone."""
+def test_light_gains_and_path_corrections_are_per_sweep(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two sweeps in different light meet halfway; offset, drift and gain apply to their own sweep."""
     ratio = LightRatio(0, 1, np.log([4.0, 4.0]), np.zeros(2))
     monkeypatch.setattr(placement, "overlap_light", lambda *_: [ratio])
     placed: Any = [SimpleNamespace(lines=SimpleNamespace(sweep=SimpleNamespace(name=name))) for name in "ab"]
@@ -79,8 +79,8 @@ def test_corrections_are_found_and_read(monkeypatch: pytest.MonkeyPatch) -> None
     assert other.gain is None
 
 
-def test_a_receipt_gives_its_own_figures():
-    """Its score; the worst class of the truth; and each map that shows a false class, with its pixels."""
+def test_receipts_give_score_worst_class_and_false_classes():
+    """The worst class is one of the labels; each map with a false class is listed with its pixels."""
     assert score_of(make_receipt()) == {"miou": 0.75, "overall_accuracy": 0.934}
     accuracy: Any = copy.deepcopy(make_receipt()["accuracy"])
     assert worst_class(accuracy) == ("bare_weed", 0.2, 0.6, 0.8)
@@ -94,8 +94,8 @@ def test_a_receipt_gives_its_own_figures():
     assert format_false_classes(accuracy) == ""
 
 
-def test_labels_are_judged_in_the_order_of_the_weights_classes() -> None:
-    """Pixels without a label stay so."""
+def test_labels_are_reordered_to_the_classes_of_the_weights() -> None:
+    """Pixels without a label keep none."""
     labels = np.array([[0, 1, UNLABELLED]], np.uint8)
     scene: Any = SimpleNamespace(labels=labels, class_names=("b", "a"), shape=(1, 3), clear_key="")
     weights: Any = SimpleNamespace(class_names=("a", "b"), record={})

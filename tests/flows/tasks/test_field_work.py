@@ -1,4 +1,4 @@
-"""Scores and map of a field, region by region: the same as of the whole field wherever regions see all of it."""
+"""Scores and map of a field by regions: equal to those of the whole field if the regions' halo covers it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ ALL_PX = 96  # a halo that reaches over the whole field
 
 @pytest.fixture(scope="module")
 def surveyed(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey, flags_png: Flags) -> Surveyed:
-    """A survey of scene.png that keeps the mosaic of the first pass, and the folder of its stages."""
+    """Return a survey of scene.png that keeps the mosaic of the first pass, and the folder of its stages."""
     out = tmp_path_factory.mktemp("field") / "archive"
     with mock.patch("flows.publish.publishing._clear_first_mosaic"):
         survey_png(out)
@@ -47,7 +47,7 @@ def _store(stages: Path, stage: str) -> StageRef:
 
 
 def _mosaics(stages: Path) -> list[StageRef]:
-    """The mosaics of both passes, the coarse one first."""
+    """Return the mosaics of both passes, the coarse one first."""
     return [_store(stages, name) for name in ("rectify", "rectify_fine")]
 
 
@@ -58,7 +58,7 @@ def _work(run: SurveyRun, pool: WorkerPool, halo: int) -> FieldWork:
 def _draw(
     work: FieldWork, run: SurveyRun, stages: Path, out: Path, least_gain: float | None = None
 ) -> dict[str, bytes]:
-    """The bytes of the map that this work draws into a new folder."""
+    """Return the bytes of the map that this work writes into a new folder."""
     legend = ClassNames(run.weights.class_names, run.weights.class_colours)
     out.mkdir()
     create_class_map(out / MAP, run.scene.shape, legend, grid=run.frame.angular_grid())
@@ -66,7 +66,7 @@ def _draw(
     drawing = Drawing(work.weights, _mosaics(stages)[1], _store(stages, "score"), run.capture)
     draw_field(work, drawing, out, least_gain, lambda done: None)
     assert sorted(path.name for path in out.iterdir()) == [MAP, PROBABILITIES]  # no overview is left
-    consolidate_stores(out)  # as a store is published
+    consolidate_stores(out)  # as published stores are
     return _contents(out / MAP)
 
 
@@ -75,8 +75,8 @@ def _contents(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("pool", [WorkerPool(workers=1), WorkerPool(workers=2)], ids=["one", "two"])
-def test_regions_that_see_the_field_draw_the_fields_map(surveyed: Surveyed, tmp_path: Path, pool: WorkerPool) -> None:
-    """With a halo over everything, to the byte, whoever draws them; the stage's own map is that of one region."""
+def test_regions_with_a_full_halo_give_the_same_map(surveyed: Surveyed, tmp_path: Path, pool: WorkerPool) -> None:
+    """The bytes are equal for one and two workers; the stage's own map is that of one region."""
     run, stages = surveyed
     stored = _contents(_store(stages, "segment").path / MAP)
     assert len(_work(run, pool, ALL_PX).regions) == 2
@@ -88,7 +88,7 @@ def test_regions_that_see_the_field_draw_the_fields_map(surveyed: Surveyed, tmp_
 def test_regions_choose_patches_by_the_classes_of_the_field(
     surveyed: Surveyed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, overviews: int, stored: bool
 ) -> None:
-    """With a halo over everything they choose as one region does."""
+    """With a halo over the whole field they choose as one region does."""
     run, stages = surveyed
     gain = run.work.score("gain", _mosaics(stages)[1], run.capture, lambda done: None)
     least = float(np.quantile(gain, 0.7)) + 1e-9
@@ -102,8 +102,8 @@ def test_regions_choose_patches_by_the_classes_of_the_field(
 
 
 @pytest.mark.parametrize("policy", ["gain", "entropy", "sobel"])
-def test_scores_of_regions_make_those_of_the_field(surveyed: Surveyed, policy: str) -> None:
-    """With a halo over everything they are equal, patch by patch, and the stage's own where it used that policy."""
+def test_scores_of_regions_equal_those_of_the_field(surveyed: Surveyed, policy: str) -> None:
+    """The halo covers the field; the stage's own scores are the same for its policy."""
     run, stages = surveyed
     mosaic = _mosaics(stages)[0]
     whole = run.work.score(policy, mosaic, run.capture, lambda done: None)
@@ -114,7 +114,7 @@ def test_scores_of_regions_make_those_of_the_field(surveyed: Surveyed, policy: s
 
 
 def test_edges_need_one_patch_of_halo(surveyed: Surveyed) -> None:
-    """With one coarse patch regions give the field's own edges."""
+    """With a halo of 32 px, regions give the sobel scores of the field."""
     run, stages = surveyed
     mosaic = _mosaics(stages)[0]
     whole = run.work.score("sobel", mosaic, run.capture, lambda done: None)
@@ -123,8 +123,8 @@ def test_edges_need_one_patch_of_halo(surveyed: Surveyed) -> None:
     )
 
 
-def test_work_travels_with_its_weights(surveyed: Surveyed, tmp_path: Path) -> None:
-    """A worker reads what travelled, whatever lies at the path of the weights there."""
+def test_pickled_work_contains_its_weights(surveyed: Surveyed, tmp_path: Path) -> None:
+    """A worker uses the weights that were sent, whatever file is at their path."""
     run, stages = surveyed
     copy, work = tmp_path / "w.safetensors", run.work
     copy.write_bytes(work.weights.path.read_bytes())
@@ -140,8 +140,8 @@ def test_work_travels_with_its_weights(surveyed: Surveyed, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("pool", "words"), [(WorkerPool(), "the process itself"), (WorkerPool("processes"), "each of two proc")]
 )
-def test_too_little_memory_is_refused_first(surveyed: Surveyed, tmp_path: Path, pool: WorkerPool, words: str) -> None:
-    """The message says what a region takes and the least memory that does, and that much is enough."""
+def test_too_little_memory_is_refused(surveyed: Surveyed, tmp_path: Path, pool: WorkerPool, words: str) -> None:
+    """The message gives the memory of a region and the minimum, and that minimum suffices."""
     work = replace(surveyed[0].work, pool=pool, memory=300 * 2**20)
     with pytest.raises(SettingsError, match=rf"exceeds --memory 300 MiB: .*96 x 128 px.*{words}") as refused:
         work.pool_for(np.arange(192), 3)
@@ -149,8 +149,8 @@ def test_too_little_memory_is_refused_first(surveyed: Surveyed, tmp_path: Path, 
     replace(work, memory=least * 2**20).pool_for(np.arange(192), 3)
 
 
-def test_no_more_regions_at_a_time_than_memory_holds(surveyed: Surveyed) -> None:
-    """A worker pool shrinks to what fits, and stays as it is where all of it does."""
+def test_simultaneous_regions_fit_into_the_memory(surveyed: Surveyed) -> None:
+    """A worker pool shrinks to fit, and keeps its size if all of it fits."""
     work = replace(surveyed[0].work, pool=WorkerPool(workers=7))
     assert work.pool_for(np.arange(9), 3) is work.pool
     pools = [replace(work, memory=size * 2**20).pool_for(np.arange(9), 3).workers for size in (516, 520, 600)]
@@ -159,7 +159,7 @@ def test_no_more_regions_at_a_time_than_memory_holds(surveyed: Surveyed) -> None
 
 
 def test_weights_that_changed_are_refused(tmp_path: Path, weights: Path) -> None:
-    """A worker that finds another file than the survey began with does not draw with it."""
+    """A worker does not use another file than the survey began with."""
     copy = tmp_path / "w.safetensors"
     copy.write_bytes(weights.read_bytes())
     with pytest.raises(WeightsError, match=r"w\.safetensors have changed since the survey began"):
@@ -167,14 +167,14 @@ def test_weights_that_changed_are_refused(tmp_path: Path, weights: Path) -> None
 
 
 @pytest.mark.parametrize("size", [(640, 640), (641, 90), (90, 641)])
-def test_only_keys_of_fields_that_are_cut_know_of_regions(size: tuple[int, int]) -> None:
-    """What was stored of a field up to the limit is found again; a larger one is another result than read whole."""
+def test_keys_contain_regions_for_divided_fields_only(size: tuple[int, int]) -> None:
+    """Stores of fields up to 640 px keep their keys; a larger field gives another result in regions."""
     assert bool(region_params(SceneGrid(*size, 16))) == (max(size) > 640)
 
 
 @pytest.mark.parametrize("shift", [(0, 0), (8, -20), (-500, 3), (-3, 500)])
-def test_a_memory_is_moved_and_leaves_nothing_behind(surveyed: Surveyed, shift: tuple[int, int]) -> None:
-    """What lay at a pixel lies ``shift`` further, in fine and coarse pixels alike, and nothing where it came from."""
+def test_a_shifted_prior_map_is_nodata_at_its_old_place(surveyed: Surveyed, shift: tuple[int, int]) -> None:
+    """Values move by ``shift`` in fine and coarse pixels alike; pixels without a source are NaN."""
     run, stages = surveyed
     probabilities, mosaic = _store(stages, "segment"), _mosaics(stages)[0]
     (region,) = plan_regions(run.grid, SHARD)
@@ -195,8 +195,8 @@ def test_a_memory_is_moved_and_leaves_nothing_behind(surveyed: Surveyed, shift: 
         np.testing.assert_array_equal(now, expected)
 
 
-def test_a_moved_memory_has_no_seams_between_regions(surveyed: Surveyed) -> None:
-    """Features come from beyond a region's halo, wherever the field has them."""
+def test_a_shifted_prior_map_has_no_seams_between_regions(surveyed: Surveyed) -> None:
+    """Features come from outside of a region's halo, as far as the field has them."""
     run, stages = surveyed
     probabilities, mosaic = _store(stages, "segment"), _mosaics(stages)[0]
     before = FieldPriorMap(probabilities, mosaic, 1.0, None, tuple(range(len(run.weights.class_names))), (40, -8))

@@ -1,4 +1,4 @@
-"""The ground stage: a posed survey's map in the archive, with hectares; nothing without a pose."""
+"""The ground stage: the map of a survey with a pose, stored in the archive with areas in hectares."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ LEGEND = class_maps.ClassNames(("weed", "crop"), np.array([[255, 0, 0], [0, 255,
 
 @dataclass(frozen=True)
 class Run:
-    """As much of a survey as the stage needs."""
+    """Stand-in for a survey, with what the stage needs."""
 
     archive: Archive
     settings: Settings = field(default_factory=lambda: Settings(pose=POSE))
@@ -44,19 +44,19 @@ class Run:
 
     @property
     def ground_grid(self) -> GroundGrid:
-        """The grid that the settings ask for."""
+        """Return the grid that the settings ask for."""
         place = place_of_field(self.settings, FIELD)
         assert isinstance(place, PosedField)
         return place.grid
 
     @property
     def map_choice(self) -> MapChoice:
-        """The map of the settings."""
+        """Return the map settings."""
         return self.settings.map
 
 
 def believe(folder: Path, age_days: np.ndarray, old_class: np.ndarray | None = None) -> None:
-    """Write class probabilities of these ages (y, x), NaN where nothing is known; of a later visit with changes."""
+    """Write class probabilities of these ages (y, x), NaN where unknown; with old classes, those of a later visit."""
     values = np.where(np.isnan(age_days)[..., None], np.nan, np.log([0.5, 0.5])).astype(np.float32)
     path = folder / "class_probabilities.zarr"
     class_maps.create_probabilities(path, SHAPE, LEGEND, goes_on=old_class is not None)
@@ -71,19 +71,19 @@ def believe(folder: Path, age_days: np.ndarray, old_class: np.ndarray | None = N
 
 
 def patch_fractions(old_class: np.ndarray) -> np.ndarray:
-    """(15, 20) fractions of pixels that changed, of patches of 8 px."""
+    """Return (15, 20) fractions of changed pixels in patches of 8 px."""
     return (old_class != UNLABELLED).reshape(15, 8, 20, 8).mean(axis=(1, 3), dtype=np.float32)
 
 
 @pytest.fixture
 def run(tmp_path: Path) -> Run:
-    """A posed survey of a small field."""
+    """Return a survey of a small field with a pose."""
     return Run(Archive.open(tmp_path / "archive"))
 
 
 @pytest.fixture
 def stores(tmp_path: Path) -> Stores:
-    """A class map of two halves, the right one unknown in its upper part, and a mosaic that brightens down."""
+    """Return stores of a class map of two halves, the upper right nodata, and of a mosaic that brightens downwards."""
     classes = np.zeros(SHAPE, np.uint8)
     classes[:, 80:] = 1
     classes[:30, 80:] = UNLABELLED
@@ -99,12 +99,12 @@ def stores(tmp_path: Path) -> Stores:
 
 
 def draw(run: Run, stores: Stores) -> StageRef:
-    """Run the stage as an engine would."""
+    """Run the stage as an engine does and return its store."""
     return ground.produce(run.archive, ground.wants(run, *stores))[0]
 
 
-def test_what_is_unknown_has_no_confidence_on_the_map_either(run: Run, stores: Stores, tmp_path: Path) -> None:
-    """Single pixels of the class unknown among pixels that are sure: none is lent the confidence of those beside it."""
+def test_unknown_pixels_have_no_confidence_on_the_ground_map(run: Run, stores: Stores, tmp_path: Path) -> None:
+    """Single unknown pixels get no confidence or age from their neighbours."""
     classes = np.zeros(SHAPE, np.uint8)
     classes[40:70:3, 50:90:3] = 1
     confidence = np.where(classes == 1, np.nan, 0.9).astype(np.float32)
@@ -117,8 +117,8 @@ def test_what_is_unknown_has_no_confidence_on_the_map_either(run: Run, stores: S
     np.testing.assert_array_equal(np.isnan(found.age_days), found.classes != 0)
 
 
-def test_map_and_picture_lie_where_the_rays_end(run: Run, stores: Stores) -> None:
-    """Each scene pixel's class is found where its ray meets the ground; the mosaic's ramp rises towards the rig."""
+def test_map_and_picture_follow_the_rays_to_the_ground(run: Run, stores: Stores) -> None:
+    """Each scene pixel's class is at the end of its ray; the picture brightens towards the rig, as the mosaic does."""
     ref = draw(run, stores)
     found, grid = load_ground_map(ref.path / STORE), run.ground_grid
     y, x = pixel_places(SHAPE)
@@ -142,14 +142,14 @@ def test_map_and_picture_lie_where_the_rays_end(run: Run, stores: Stores) -> Non
 
 
 def field_pixels(run: Run, found: GroundMap) -> tuple[np.ndarray, np.ndarray]:
-    """Whether each pixel of a map is in the field, and the row and column of the field's pixel that it shows."""
+    """Return the mask of map pixels within the field, and row and column of the field's pixel that each shows."""
     places = run.ground_grid.scene_pixels(*(slice(0, size) for size in found.classes.shape))
     seen = np.isfinite(places[..., 0])
     return seen, np.floor(places[seen] + 0.5).astype(int).T
 
 
-def test_age_and_changes_are_those_of_the_pixel_that_is_shown(run: Run, stores: Stores, tmp_path: Path) -> None:
-    """Of a second visit: days, changed fraction and old class are no blend of neighbours; the unknown is NaN."""
+def test_age_and_changes_come_from_the_nearest_pixel(run: Run, stores: Stores, tmp_path: Path) -> None:
+    """Days, changed fraction and old class are not interpolated; outside of the field they are nodata."""
     rng = np.random.default_rng(3)
     age = 0.125 * rng.integers(0, 400, SHAPE).astype(np.float32)
     age[rng.random(SHAPE) < 0.1] = np.nan
@@ -167,8 +167,8 @@ def test_age_and_changes_are_those_of_the_pixel_that_is_shown(run: Run, stores: 
     assert (found.old_class[~seen] == UNLABELLED).all()
 
 
-def test_a_first_look_has_ages_and_no_changes(run: Run, stores: Stores) -> None:
-    """All that is seen was looked at today; to plain xarray there is nothing about a change."""
+def test_a_first_visit_has_ages_and_no_changes(run: Run, stores: Stores) -> None:
+    """Every pixel of the field has age 0; the store has no variable for changes."""
     ref = draw(run, stores)
     found = load_ground_map(ref.path / STORE)
     seen, _ = field_pixels(run, found)
@@ -179,8 +179,8 @@ def test_a_first_look_has_ages_and_no_changes(run: Run, stores: Stores) -> None:
         assert content["age"].attrs["units"] == "days"
 
 
-def test_the_store_has_hectares_and_where_it_was_seen_from(run: Run, stores: Stores) -> None:
-    """Areas are sums of footprints at any resolution; plain xarray reads pose, counts of pixels and CRS."""
+def test_the_store_has_areas_pose_and_crs(run: Run, stores: Stores) -> None:
+    """Areas are sums of footprints at any resolution; plain xarray reads pose, pixel counts and CRS."""
     ref = draw(replace(run, settings=Settings(pose=POSE, map=MapChoice(resolution_m=0.02))), stores)
     areas, grid = load_ground_map(ref.path / STORE).areas, run.ground_grid
     exact = grid.frame.view.area_m2(np.stack(np.meshgrid(*pixel_places(SHAPE), indexing="ij"), axis=-1))
@@ -195,7 +195,7 @@ def test_the_store_has_hectares_and_where_it_was_seen_from(run: Run, stores: Sto
 
 
 def test_the_key_follows_pose_and_map(run: Run, stores: Stores) -> None:
-    """The same pose finds its store; another tilt or resolution makes another."""
+    """The same pose finds its store; another tilt or resolution makes a new one."""
     changed = [
         run.settings,
         replace(run.settings, pose=replace(POSE, tilt_deg=51.0)),

@@ -1,4 +1,4 @@
-"""Mosaics from disk to disk: the same bytes however many workers, bounded memory, progress."""
+"""Mosaics from disk to disk: the same bytes for any number of workers, and bounded memory."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ ONE, TWO, THREE = (WorkerPool(workers=count) for count in (1, 2, 3))
 
 @pytest.fixture(scope="module")
 def cubes(tmp_path_factory: pytest.TempPathFactory) -> list[SignalCube]:
-    """Two stored sweeps of noise, side by side."""
+    """Return two stored sweeps of noise, side by side."""
     folder, rng = tmp_path_factory.mktemp("raw"), np.random.default_rng(8)
     frame = (CAMERA.samples, len(BANDS))
     references = References(np.zeros(frame, np.float32), np.full(frame, 2000, np.float32), np.ones(3, np.float32))
@@ -49,12 +49,12 @@ def cubes(tmp_path_factory: pytest.TempPathFactory) -> list[SignalCube]:
 
 @dataclass(frozen=True)
 class KillOnce(TileMaker):
-    """A maker that ends its process the first time."""
+    """Tile maker that kills its own process at the first call."""
 
     folder: str = ""
 
     def __call__(self, place: Place) -> tuple[np.ndarray, np.ndarray]:
-        """As a maker's, once somebody was killed."""
+        """Kill the process if none was killed yet; then make the tile."""
         if not (Path(self.folder) / "killed").exists():
             (Path(self.folder) / "killed").touch()
             os.kill(os.getpid(), signal.SIGKILL)
@@ -62,26 +62,26 @@ class KillOnce(TileMaker):
 
 
 def recipe_of(cubes: list[SignalCube]) -> MosaicRecipe:
-    """Both sweeps by the folder that they lie in."""
+    """Return the recipe of a mosaic of both sweeps, by their folder."""
     folder = Path(str(cubes[0].group.store_path.store.root)).parent
     return MosaicRecipe(StageRef("condense", "key", folder), CAMERA, GRID)
 
 
 def mosaic_at(path: Path) -> MosaicWriter:
-    """An empty mosaic on the grid."""
+    """Return a writer of an empty mosaic on the grid."""
     return plain_writer(path, GRID.shape, BANDS)
 
 
 def digest_of(folder: Path) -> str:
-    """Hash of all files of a store, names included."""
+    """Return a hash of all files of a store and their names."""
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     return hashlib.sha256(
         b"".join(f"{path.relative_to(folder)}".encode() + path.read_bytes() for path in files)
     ).hexdigest()
 
 
-def test_memory_says_how_many_tiles_at_a_time(tmp_path: Path, cubes: list[SignalCube]) -> None:
-    """With memory for one tile only one is made at a time, whatever is allowed; a byte less and none is."""
+def test_memory_limits_the_tiles_at_a_time(tmp_path: Path, cubes: list[SignalCube]) -> None:
+    """Memory for one tile allows one worker of three; one byte less is refused."""
     work = recipe_of(cubes)
     least = write_mosaic(work, mosaic_at(tmp_path / "a.zarr"), memory=PLENTY, pool=ONE).projected
     assert write_mosaic(work, mosaic_at(tmp_path / "b.zarr"), memory=least, pool=THREE).workers == 1
@@ -90,14 +90,14 @@ def test_memory_says_how_many_tiles_at_a_time(tmp_path: Path, cubes: list[Signal
 
 
 def test_an_error_in_a_tile_ends_the_work(tmp_path: Path, cubes: list[SignalCube]) -> None:
-    """What goes wrong in a worker is raised where the work was asked for."""
+    """An error in a worker is raised at the caller."""
     other = plain_writer(tmp_path / "m.zarr", GRID.shape, BANDS[:2])
     with pytest.raises(ShapeError, match="a tile of the mosaic has the shape"):
         write_mosaic(recipe_of(cubes), other, memory=PLENTY, pool=TWO)
 
 
-def test_killed_workers_harm_nothing(tmp_path: Path, cubes: list[SignalCube], monkeypatch: pytest.MonkeyPatch) -> None:
-    """kill -9 of a process that makes tiles: the mosaic is that of an undisturbed thread."""
+def test_killed_workers_do_no_harm(tmp_path: Path, cubes: list[SignalCube], monkeypatch: pytest.MonkeyPatch) -> None:
+    """After kill -9 of a process that makes tiles, the mosaic equals that of an undisturbed thread."""
     write_mosaic(recipe_of(cubes), mosaic_at(tmp_path / "a.zarr"), memory=PLENTY, pool=ONE)
     monkeypatch.setattr("flows.tasks.stages.placement.TileMaker", partial(KillOnce, folder=str(tmp_path)))
     with WorkerPool("processes", 2).open() as pool:
@@ -107,8 +107,8 @@ def test_killed_workers_harm_nothing(tmp_path: Path, cubes: list[SignalCube], mo
     assert digest_of(tmp_path / "m.zarr") == digest_of(tmp_path / "a.zarr")
 
 
-def test_a_worker_lets_tiles_go(cubes: list[SignalCube]) -> None:
-    """Raw lines are kept from tile to tile of a mosaic, and no longer than the process is at tiles."""
+def test_a_worker_frees_its_raw_lines(cubes: list[SignalCube]) -> None:
+    """They stay in memory from tile to tile of a mosaic, until free_tiles."""
     maker = TileMaker(recipe_of(cubes).open, 2**24)
     maker((slice(0, 64), slice(0, 640)))
     lines = weakref.ref(opened_tiles(maker)[1])
@@ -117,8 +117,8 @@ def test_a_worker_lets_tiles_go(cubes: list[SignalCube]) -> None:
     assert lines() is None
 
 
-def test_memory_of_workers_elsewhere_is_not_counted(tmp_path: Path, cubes: list[SignalCube]) -> None:
-    """They lie on other machines; here the least memory refuses nothing."""
+def test_memory_of_workers_on_other_machines_is_not_counted(tmp_path: Path, cubes: list[SignalCube]) -> None:
+    """On a cluster the smallest memory setting refuses nothing."""
     work = MosaicWork([place(cube, CAMERA, grid=GRID) for cube in cubes], CAMERA, GRID)
     elsewhere = WorkerPool("tcp://127.0.0.1:9")
     tiles = plan_tiles(work.placed, CAMERA, GRID, (64, 640))

@@ -1,4 +1,4 @@
-"""A survey into a bucket: the same map as in a folder, nothing twice, on this machine or another."""
+"""A survey into a bucket: the map equals that of a folder, and no stage runs twice, on any machine."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ pytestmark = pytest.mark.usefixtures("no_effects")
 
 SMALL = ("--size", "96x64", "--bands", FEW_BANDS, "--no-controls", "--engine", "plain")
 CACHED = {"cached"}
-NARROW: dict[str, Any] = {"camera.samples": 160}  # few beside the field
+NARROW: dict[str, Any] = {"camera.samples": 160}  # few outside of the field
 OF_THIS = set(STAGES) - {"register_coarse", "register_fine", "ground", "condense_raster"}
 
 
 def states(receipt: dict[str, object]) -> set[str]:
-    """What became of the stages."""
+    """Return the states of the stages."""
     rows = receipt["stages"]
     assert isinstance(rows, list)
     assert {row["name"] for row in rows} == OF_THIS
@@ -49,18 +49,18 @@ def states(receipt: dict[str, object]) -> set[str]:
 
 
 def map_of(archive: Archive, published: Published) -> NDArray[np.uint8]:
-    """The class map that a survey left."""
+    """Return the class map of a survey."""
     return load_class_map(archive.locate(published.receipt["products"]["class_map"])).classes
 
 
-def test_a_rerun_makes_nothing_and_moves_next_to_nothing(
+def test_a_rerun_finds_every_stage_in_the_bucket(
     bucket: str, survey_png: Survey, surveyed_png: Survey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The map is that of a folder; here, and on a machine that has nothing yet, a rerun finds every stage."""
+    """The map equals that of a folder; a rerun here fetches nothing, and one on an empty machine computes nothing."""
     fetched: list[str] = []
     save = Objects.save
     monkeypatch.setattr(Objects, "save", lambda self, name, path: (fetched.append(name), save(self, name, path))[1])
-    with with_effects():  # as the survey beside it has them
+    with with_effects():  # the survey for comparison has them
         first = survey_png(bucket)
     beside = map_of(open_archive(tmp_path / "folder"), surveyed_png(tmp_path / "folder"))
     np.testing.assert_array_equal(map_of(open_archive(bucket), first), beside)
@@ -74,7 +74,7 @@ def test_a_rerun_makes_nothing_and_moves_next_to_nothing(
     archive = open_archive(bucket)
     assert isinstance(archive, ObjectArchive)
     raw = {name.rpartition("/")[2] for name in archive.objects.listing("stages/capture")}
-    assert raw == {"manifest.json"}  # raw lines were cleared in the bucket, and neither machine took or sent them again
+    assert raw == {"manifest.json"}  # raw lines were cleared in the bucket; neither machine captured or sent them again
     np.testing.assert_array_equal(map_of(open_archive(bucket), elsewhere), beside)
     monkeypatch.setenv("SPECTRALZOOM_WORK", str(tmp_path / "a desk"))
     run = spectralzoom.open(bucket).latest
@@ -92,7 +92,7 @@ def workers(count: int, environment: dict[str, str]) -> Iterator[str]:
 def test_workers_read_the_bucket_themselves(
     bucket: str, survey_png: Survey, surveyed_png: Survey, tmp_path: Path
 ) -> None:
-    """Two workers with a working copy of their own fetch what they read, and the map is that of a folder."""
+    """Two workers with a working copy of their own fetch their input, and the map equals that of a folder."""
     there = {"SPECTRALZOOM_WORK": str(tmp_path / "there"), THREADS_OF: "1"}
     with workers(2, there) as address, with_effects():
         published = survey_png(bucket, scheduler=address)
@@ -102,18 +102,18 @@ def test_workers_read_the_bucket_themselves(
     assert fetched == {"condense", "locate", "rectify", "condense_fine", "rectify_fine", "score"}
 
 
-def test_workers_that_cannot_read_the_bucket_are_one_message(bucket: str, command_line: CommandLine) -> None:
-    """The message says that it is a worker's, and what is wrong there."""
+def test_workers_without_access_to_the_bucket_are_reported(bucket: str, command_line: CommandLine) -> None:
+    """One message names the worker and the cause."""
     with workers(1, {"AWS_ENDPOINT_URL": "http://127.0.0.1:9", THREADS_OF: "1"}) as address:
         ended = command_line("survey", "--out", bucket, *SMALL, "--scheduler", address)
     assert ended.code == 2
     assert re.fullmatch(r".*--scheduler tcp:\S+: a worker cannot read the archive.* not answer: .*", ended.errors[-1])
 
 
-def test_another_machine_clears_outlived_raw_lines_in_a_bucket(
+def test_another_machine_clears_expired_raw_lines_in_a_bucket(
     bucket: str, survey_png: Survey, command_line: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They stay for their days; then gc compares and clears them; no survey sends them."""
+    """Raw lines stay for 7 days; then gc clears them, and no later survey sends them."""
     survey_png(bucket, keep="raw 7d", **NARROW)
 
     def raw() -> set[str]:
@@ -135,10 +135,10 @@ def test_another_machine_clears_outlived_raw_lines_in_a_bucket(
     assert command_line("verify", bucket).code == 0
 
 
-def test_verbs_read_an_archive_in_a_bucket(
+def test_commands_read_an_archive_in_a_bucket(
     bucket: str, command_line: CommandLine, scene_files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every verb on archives takes s3://bucket/prefix in place of a folder."""
+    """Every command on archives accepts s3://bucket/prefix as a folder."""
     monkeypatch.chdir(tmp_path)
     assert command_line("plan", "--out", bucket, *SMALL[:5]).code == 0
     ended = command_line("survey", "--out", bucket, *SMALL, "--json")
@@ -172,23 +172,23 @@ def test_verbs_read_an_archive_in_a_bucket(
     assets = json.loads(item.read_text())["assets"]
     assert {"report", "quicklook", "receipt", "mosaic_zarr"} <= set(assets)
     assert isinstance(archive, ObjectArchive)
-    there = " ".join(f"{bucket}/{name}" for name in archive.objects.listing())  # not the working copy, which may go
+    there = " ".join(f"{bucket}/{name}" for name in archive.objects.listing())  # not the working copy: it is temporary
     assert all(one["href"] in there or (item.parent / one["href"]).is_file() for one in assets.values())
     assert receipt["settings"]["out"] == bucket
 
 
 def rot_mosaic(address: str) -> None:
-    """Let a bit of the mosaic's numbers flip in the bucket."""
+    """Flip a bit of the mosaic's values in the bucket."""
     archive = open_archive(address)
     assert isinstance(archive, ObjectArchive)
     name = next(name for name in archive.objects.listing("stages/rectify_fine") if "/scores/c/" in name)
     rot(archive, name, 100)
 
 
-def test_a_flipped_bit_is_named_and_made_again(
+def test_a_flipped_bit_is_reported_and_repaired(
     bucket: str, survey_png: Survey, command_line: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """verify names store and array; --repair takes this machine's working copy, and another machine surveys again."""
+    """verify names store and array; --repair uses this machine's working copy, and another machine surveys again."""
     published = survey_png(bucket, **NARROW)
     before = map_of(open_archive(bucket), published)
     rot_mosaic(bucket)
@@ -209,8 +209,8 @@ def test_a_flipped_bit_is_named_and_made_again(
     np.testing.assert_array_equal(map_of(open_archive(bucket), published), before)
 
 
-def test_unreachable_buckets_are_told(bucket: str, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No traceback, a cause and what to do; the exit code is 1, and 2 for an address that is none."""
+def test_missing_buckets_are_reported(bucket: str, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The message has cause and remedy; the exit code is 1, and 2 for an invalid address."""
     missing = command_line("survey", "--out", "s3://no-such-bucket/x", *SMALL)
     assert missing.code == 1
     assert "there is no such bucket: create it" in missing.errors[0]

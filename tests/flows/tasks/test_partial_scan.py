@@ -1,4 +1,4 @@
-"""A visit that looks at a part of a field: at the lines that promise most, the rest is as it is remembered."""
+"""Partial scans: the lines of highest expected gain are captured, and the rest comes from the prior map."""
 
 from __future__ import annotations
 
@@ -56,13 +56,13 @@ FIRST, LATER, LAST = "2026-06-01T10:00:00Z", "2026-06-04T10:00:00Z", "2026-06-07
 
 @pytest.fixture(scope="module")
 def recorded(make_weights: WeightsMaker) -> Path:
-    """Tiny weights with a record of uniform scans."""
+    """Return tiny weights with scan performance."""
     return make_weights(scans=RECORD)
 
 
 @pytest.fixture(scope="module")
 def visits(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey, recorded: Path) -> tuple[Path, Any, Any]:
-    """A whole look at a field, and one at a part of it three days later; not to be changed."""
+    """Return an archive, a visit to a whole field and a partial scan three days later; do not change it."""
     out = tmp_path_factory.mktemp("visits") / "archive"
     with without_effects():
         first = survey_png(out, **WHOLE, visit=FIRST, weights=str(recorded))
@@ -71,35 +71,35 @@ def visits(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey, recorde
 
 @pytest.fixture
 def visited(visits: tuple[Path, Any, Any], tmp_path: Path) -> Path:
-    """A copy of that archive."""
+    """Return a copy of that archive."""
     return Path(shutil.copytree(visits[0], tmp_path / "archive"))
 
 
 def product(out: Path, published: Any, name: str) -> xr.Dataset:
-    """A store of a run."""
+    """Return a store of a run."""
     return xr.open_zarr(out / published.receipt["products"][name], consolidated=False)
 
 
-def test_a_part_is_looked_at_and_the_rest_remembered(visits: tuple[Path, Any, Any]) -> None:
-    """In its seconds; where lines went the map is of today, elsewhere three days old, and it is whole."""
+def test_a_partial_scan_maps_the_rest_from_the_prior_map(visits: tuple[Path, Any, Any]) -> None:
+    """The scan keeps its seconds; captured patches have age 0, the others 3 days, and every pixel has a class."""
     out, first, part = visits
     scan_pass, age = part.receipt["extent"], product(out, part, "class_probabilities").age.values
     assert 0.1 < scan_pass["patches_touched"] < 0.9
-    assert part.receipt["settings"]["scan_step"] < 4  # lines that are cheaper, and poorer than what is remembered
+    assert part.receipt["settings"]["scan_step"] < 4  # cheaper lines, and less accurate than the prior map
     assert part.receipt["savings"]["capture_s"]["done"] == pytest.approx(scan_pass["seconds"])
     assert scan_pass["seconds"] <= 2.1
     assert sorted(np.unique(age)) == [0.0, 3.0]
     assert (age == 0).mean() == pytest.approx(scan_pass["patches_touched"], abs=0.15)
     reached = product(out, part, "mosaic").coverage.values > 0
-    assert reached[age == 0].all()  # what is filled in at the edge of the part is no look
+    assert reached[age == 0].all()  # pixels filled in at the edge of the part do not count as captured
     before, now = (product(out, one, "class_map").classes.values for one in (first, part))
     assert (now != 255).all()
-    assert (now == before)[age > 0].mean() > 0.95  # what fades may tip where two classes were nearly as likely
+    assert (now == before)[age > 0].mean() > 0.95  # ageing may flip two classes nearly as likely
     assert part.receipt["prior_map"]["put_aside"] is None
 
 
-def test_receipt_and_page_say_what_was_looked_at(visits: tuple[Path, Any, Any]) -> None:
-    """Lines, share, and what was expected of them; beside a plan that names the part."""
+def test_receipt_and_page_describe_the_captured_part(visits: tuple[Path, Any, Any]) -> None:
+    """They hold its lines and expected gain; the plan's reason and the notes name the part."""
     _, _, part = visits
     scan_pass = part.receipt["extent"]
     assert part.receipt["settings"]["extent"] == scan_pass["lines"]
@@ -107,13 +107,13 @@ def test_receipt_and_page_say_what_was_looked_at(visits: tuple[Path, Any, Any]) 
     page = (part.folder / "report.html").read_text(encoding="utf-8")
     assert f"lines {scan_pass['lines']}; " in page
     assert "a part of the field was scanned once: every" in part.receipt["plan"]["reason"]
-    assert "this one: " not in page  # the record tells of scans of all, which remember nothing
+    assert "this one: " not in page  # scan performance is of scans of the whole field, without prior map
     notes = part.receipt["settings"]["notes"]
     assert any("lines of highest expected gain" in note and "expected error is" in note for note in notes)
 
 
-def test_the_same_visit_finds_its_own_lines(visited: Path, visits: Any, survey_png: Survey, recorded: Path) -> None:
-    """Asked again it goes on from the visit before it, as it did, and captures nothing."""
+def test_same_partial_visit_captures_nothing(visited: Path, visits: Any, survey_png: Survey, recorded: Path) -> None:
+    """It has the same extent and the same prior map, and its stages are cached."""
     again = survey_png(visited, **PART, visit=LATER, weights=str(recorded))
     assert again.receipt["settings"]["extent"] == visits[2].receipt["settings"]["extent"]
     assert again.receipt["prior_map"]["run"] == visits[1].folder.name
@@ -121,8 +121,8 @@ def test_the_same_visit_finds_its_own_lines(visited: Path, visits: Any, survey_p
     assert states["capture_coarse"] == states["segment"] == "cached"
 
 
-def test_better_weights_read_the_lines_that_were_taken(visited: Path, visits: Any, make_weights: WeightsMaker) -> None:
-    """Reprocessing makes both visits again, of the light that there is, whatever these weights would have looked at."""
+def test_reprocessing_a_partial_scan_uses_stored_lines(visited: Path, visits: Any, make_weights: WeightsMaker) -> None:
+    """New weights change the map but not the lines, even if they would choose others."""
     run_reprocess(visited, QUIET, weights=make_weights(scans=RECORD, width=4))
     runs = [read_run(path) for path in sorted(visited.glob("runs/*"))]
     before, again = (run for run in runs if run.settings["extent"] == visits[2].receipt["settings"]["extent"])
@@ -130,8 +130,8 @@ def test_better_weights_read_the_lines_that_were_taken(visited: Path, visits: An
     assert again.receipt["products"]["raw_coarse"] == before.receipt["products"]["raw_coarse"]
 
 
-def test_of_a_field_that_nobody_knows_all_is_looked_at(survey_png: Survey, recorded: Path, tmp_path: Path) -> None:
-    """Said, and the seconds buy a uniform scan of it."""
+def test_partial_scan_without_prior_map_scans_everything(survey_png: Survey, recorded: Path, tmp_path: Path) -> None:
+    """A message says so, and the seconds pay for a uniform scan."""
     text = io.StringIO()
     flags = {**PART, "seconds": "5", "weights": str(recorded), "max_age": "14", "skip_below_error": "0.02"}
     first = survey_png(tmp_path / "archive", console=Console(file=text, width=300), **flags)
@@ -142,8 +142,8 @@ def test_of_a_field_that_nobody_knows_all_is_looked_at(survey_png: Survey, recor
     assert run_reprocess(tmp_path / "archive", QUIET, weights=again) == 0
 
 
-def test_what_is_due_is_looked_at_first(visited: Path, visits: Any, survey_png: Survey, recorded: Path) -> None:
-    """With --max-age the lines that the visit before left out, and the notes count them."""
+def test_patches_beyond_max_age_come_first(visited: Path, visits: Any, survey_png: Survey, recorded: Path) -> None:
+    """With --max-age, lines over patches that the visit before left out are captured; notes and page count them."""
     flags = {**PART, "seconds": "1.95", "max_age": "8", "weights": str(recorded)}
     part = survey_png(visited, **flags, visit=LAST)
     due, scan_pass = product(visited, visits[2], "class_probabilities").age.values == 3.0, part.receipt["extent"]
@@ -156,8 +156,8 @@ def test_what_is_due_is_looked_at_first(visited: Path, visits: Any, survey_png: 
     assert f"due left {scan_pass['due_left']}" in page
 
 
-def test_places_without_data_are_never_due(survey_png: Survey, recorded: Path, tmp_path: Path) -> None:
-    """A map of yesterday is younger than --max-age wherever the field has values."""
+def test_patches_without_data_are_never_due(survey_png: Survey, recorded: Path, tmp_path: Path) -> None:
+    """The field has values in 96 of 128 columns; yesterday's map is younger than --max-age there."""
     values = np.random.default_rng(0).uniform(50, 200, (96, 128, 3))
     values[:, 96:] = np.nan
     np.save(tmp_path / "scene.npy", values)
@@ -168,10 +168,10 @@ def test_places_without_data_are_never_due(survey_png: Survey, recorded: Path, t
     assert found.receipt["extent"]["due"] == 0
 
 
-def test_of_what_is_sure_enough_nothing_is_looked_at(
+def test_a_visit_below_the_expected_error_is_skipped(
     visited: Path, survey_png: Survey, recorded: Path, scene_files: Path, command_line: CommandLine
 ) -> None:
-    """Said with the run whose map stands; nothing is captured or published, and a look is planned nevertheless."""
+    """Nothing is captured or published, and the message names the run whose map remains; plan still gives lines."""
     runs = sorted(visited.glob("runs/*"))
     flags = {**PART, "visit": LAST, "weights": str(recorded)}
     asked = {
@@ -194,7 +194,7 @@ def test_of_what_is_sure_enough_nothing_is_looked_at(
 
 
 def test_lines_that_cover_a_field_capture_its_border(recorded: Path) -> None:
-    """Patches that hang over the border are captured where lines cover what there is of them."""
+    """Patches that cross the border count as captured if lines cover their part within the field."""
     grid, covered = SceneGrid(100, 103, 16), np.ones((100, 103), np.uint8)
     (region,) = plan_regions(grid, SHARD)
     mosaic: Any = SimpleNamespace(coverage=lambda rows, columns: covered[rows, columns])
@@ -205,10 +205,10 @@ def test_lines_that_cover_a_field_capture_its_border(recorded: Path) -> None:
     assert not drawing._shown(region, mosaic)[96:].any()
 
 
-def test_a_prior_map_of_today_does_not_depend_on_the_rows_read_at_once(
+def test_a_prior_map_read_in_swaths_equals_the_whole_one(
     visits: tuple[Path, Any, Any], recorded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every second pixel is read, with the neighbours that the reader sees; each age is a pixel's own."""
+    """Every second pixel is read, with the neighbours in the reader's window; each age belongs to its pixel."""
     reader = TemporalReader(TemporalSizes(2, 4, width=8, coarse_width=4)).eval()
     torch.nn.init.normal_(reader.leave.weight, std=0.3)
     monkeypatch.setattr(extent_choice, "load_reader", lambda path: reader)
@@ -227,8 +227,8 @@ def test_a_prior_map_of_today_does_not_depend_on_the_rows_read_at_once(
     np.testing.assert_allclose(np.concatenate(parts), whole[:95, :63], atol=1e-5)
 
 
-def test_nothing_is_worth_more_than_what_is_due() -> None:
-    """A patch that is due counts more than all that the others gain; without gains the oldest counts most."""
+def test_due_patches_have_the_highest_expected_gain() -> None:
+    """A due patch outweighs ten times the sum of the others; without gains the oldest patches rank highest."""
     grid, probabilities = SceneGrid(4, 16, 4), np.log([0.6, 0.4]) * np.ones((4, 16, 1))
     age = np.repeat([[1.0, 2.0, 3.0, 4.0]], 4, axis=0).repeat(4, axis=1)
     expected_errors = PatchExpectedErrors.of([(probabilities, age)], grid, 2)
@@ -238,15 +238,15 @@ def test_nothing_is_worth_more_than_what_is_due() -> None:
     gains = wanted.gains(1, 25.0)
     assert (gains > 0).all()
     assert wanted.expected_gain(gains)[1] > 10 * wanted.expected_gain(gains)[[0, 2, 3]].sum()
-    darker = wanted.gains(4, 6.0)  # what is due counts alike by every scan: the one that takes more of it is chosen
+    darker = wanted.gains(4, 6.0)  # due patches count alike for every scan: the one with more of them is chosen
     assert wanted.expected_gain(gains)[1] - gains[1] == wanted.expected_gain(darker)[1] - darker[1]
     nobody = replace(wanted, due=np.zeros(4, bool))
     assert np.array_equal(nobody.expected_gain(gains), gains)
     assert np.argsort(nobody.expected_gain(np.zeros(4))).tolist() == [0, 1, 2, 3]
 
 
-def test_without_a_memory_unseen_is_no_class(visited: Path, survey_png: Survey, recorded: Path, tmp_path: Path) -> None:
-    """A memory of another field is put aside, and where nobody looked nothing is said of this one."""
+def test_pixels_without_a_source_are_nodata(visited: Path, survey_png: Survey, recorded: Path, tmp_path: Path) -> None:
+    """The prior map of another field is put aside, so pixels outside of the captured part are nodata."""
     values, labels = patchy_scene((96, 128), 3, seed=77)
     Image.fromarray(values.astype(np.uint8)).save(tmp_path / "other.png")
     Image.fromarray(labels).save(tmp_path / "labels.png")
@@ -277,13 +277,13 @@ def test_without_a_memory_unseen_is_no_class(visited: Path, survey_png: Survey, 
         ({"pointing_px": "4"}, SettingsError, "registration .* needs all"),
         ({"extent": "whole", "max_age": 14}, SettingsError, "--max-age is for a partial scan"),
         ({"max_age": "a while"}, SettingsError, "--max-age must be a number from 0.04 to 3660 d"),
-        ({"seconds": "1"}, BudgetError, r"is below the minimum scan time of 1\.\d\d s"),  # which suffices
+        ({"seconds": "1"}, BudgetError, r"is below the minimum scan time of 1\.\d\d s"),  # this minimum suffices
     ],
 )
-def test_what_cannot_be_looked_at_is_refused_in_a_sentence(
+def test_impossible_partial_scans_are_refused(
     visits: Any, survey_png: Survey, recorded: Path, flags: dict[str, Any], error: type[PipelineError], told: str
 ) -> None:
-    """Before anything is captured, with what to do."""
+    """The error says what to do and comes before anything is captured."""
     before = sorted(visits[0].rglob("*"))
     with pytest.raises(error, match=told):
         survey_png(visits[0], **{**PART, "visit": LAST, "weights": str(recorded), **flags})
@@ -291,7 +291,7 @@ def test_what_cannot_be_looked_at_is_refused_in_a_sentence(
 
 
 def test_the_reader_counts_for_the_choice_of_lines_and_for_the_map() -> None:
-    """A quarter of the prior map chooses the lines; a prior map that is turned is not read for the map."""
+    """The choice reads a quarter of the prior map's pixels; a turned prior map is not read for the map."""
     reader, read = SimpleNamespace(sizes=TemporalSizes(2, 4)), MultiplyAdds(5, 0, 7)
     run: Any = SimpleNamespace(costs=SimpleNamespace(of_map=lambda index: read), least_gain=None, chooses=False)
     run.prior, run.reader, run.grid = "there", reader, SceneGrid(95, 63, 4)

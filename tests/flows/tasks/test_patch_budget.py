@@ -1,4 +1,4 @@
-"""Budgets of multiply-adds and bytes for a uniform scan: the patches that they buy, the costs, the refusals."""
+"""Budgets of multiply-adds for a uniform scan: the patches that they pay for, their costs, and refused budgets."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ def _budget(**limits: object) -> PatchBudget:
 
 
 @given(scores, st.floats(40, 99), st.sampled_from(["gain", "sobel"]))
-def test_no_budget_is_exceeded_or_left_unspent(given_scores: NDArray[np.float64], macs: float, policy: str) -> None:
-    """Multiply-adds with the scores are within their fraction; one patch more is beyond it."""
+def test_budgets_are_spent_and_not_exceeded(given_scores: NDArray[np.float64], macs: float, policy: str) -> None:
+    """Multiply-adds, with those of the scores, stay within the fraction; one patch more would exceed it."""
     budget = _budget(macs=f"{macs}%", policy=policy)
     bought, promising = budget.choose(given_scores), np.argsort(-given_scores)[: np.count_nonzero(given_scores > 0)]
 
@@ -58,22 +58,22 @@ def test_no_budget_is_exceeded_or_left_unspent(given_scores: NDArray[np.float64]
 
 @given(scores, st.floats(40, 99), st.floats(40, 99))
 def test_a_larger_budget_buys_all_of_a_smaller_one(given_scores: NDArray[np.float64], one: float, other: float) -> None:
-    """Choices are nested."""
+    """The patches of the smaller budget are the first ones of the larger."""
     less, more = (_budget(macs=f"{percent}%").choose(given_scores) for percent in sorted((one, other)))
     np.testing.assert_array_equal(less, more[: len(less)])
 
 
 @pytest.mark.parametrize("worthless", [0.0, -1.0, np.nan, -np.inf])
-def test_what_promises_nothing_is_not_bought(worthless: float) -> None:
-    """Whatever the budget pays for: a field of which all is known is read from its means alone; inf comes first."""
+def test_patches_without_gain_are_not_read(worthless: float) -> None:
+    """Zero, negative and NaN scores are left out even within the budget; infinity ranks first."""
     given_scores = np.full(PATCHES, worthless)
     assert len(_budget(macs="90%").choose(given_scores)) == 0
     given_scores[[3, 7]] = 0.5, np.inf
     assert _budget(macs="90%").choose(given_scores).tolist() == [7, 3]
 
 
-def test_zones_leave_fewer_patches_to_fraction() -> None:
-    """Only patches of which zones leave something are chosen, and shares are of reading those."""
+def test_zones_limit_patches_and_their_fraction() -> None:
+    """Only patches within the zones are chosen, and fractions refer to those patches."""
     shown = np.arange(PATCHES) < PATCHES // 2
     budget = _asked(shown, macs="80%")
     assert budget.everything < _budget(macs="80%").everything
@@ -81,13 +81,13 @@ def test_zones_leave_fewer_patches_to_fraction() -> None:
 
 
 @pytest.mark.parametrize("limits", [{"macs": "100%"}, {"macs": "1e12"}])
-def test_who_pays_for_everything_chooses_nothing(limits: dict[str, str]) -> None:
-    """Then no patch is scored either: the scan is read whole, as without a budget."""
+def test_a_budget_for_everything_makes_no_choice(limits: dict[str, str]) -> None:
+    """The scan is read whole and no patch is scored, as without a budget."""
     assert _asked(**limits) is None
 
 
-def test_the_least_that_a_refusal_names_is_the_least() -> None:
-    """What it names is enough, and a little less is refused again."""
+def test_a_refusal_names_the_smallest_budget() -> None:
+    """The named fraction is accepted, and 0.01 % less is refused."""
     with pytest.raises(BudgetError, match=r"--macs 0\.5% .*the least is") as refused:
         _asked(macs="0.5%")
     least = str(refused.value).split()[-1]
@@ -96,8 +96,8 @@ def test_the_least_that_a_refusal_names_is_the_least() -> None:
         _asked(macs=f"{float(least.removesuffix('%')) - 0.01:.2f}%")
 
 
-def test_numbers_are_limits_too() -> None:
-    """Half of everything, given as a number, buys what 50 % does; a number that is too small is told the least."""
+def test_a_budget_may_be_a_number_of_multiply_adds() -> None:
+    """Half of all multiply-adds chooses the same patches as 50 %; a number too small is refused with the minimum."""
     half, one = _budget(macs="50%"), np.linspace(1, 2, PATCHES)
     np.testing.assert_array_equal(_budget(macs=str(half.everything // 2)).choose(one), half.choose(one))
     with pytest.raises(BudgetError, match=r"the least is --\S+ \d+$"):
@@ -116,14 +116,14 @@ def test_numbers_are_limits_too() -> None:
         ({"macs": "50%", "extent": "0:1-9"}, SettingsError, "a whole field, 'extent' covers a part"),
     ],
 )
-def test_what_is_no_budget_is_refused_in_words(limits: dict[str, object], error: type[Exception], words: str) -> None:
-    """The message says what it must be, or what to leave out."""
+def test_invalid_budgets_are_refused(limits: dict[str, object], error: type[Exception], words: str) -> None:
+    """The message gives the allowed form, or the flag to leave out."""
     with pytest.raises(error, match=words):
         _asked(**limits)
 
 
-def test_a_part_of_the_scan_is_read_in_detail(survey_png: Survey, tmp_path: Path) -> None:
-    """The patches read are the best ones; receipt and page tell what they take, and what everything would have."""
+def test_the_best_patches_are_read_within_the_budget(survey_png: Survey, tmp_path: Path) -> None:
+    """Receipt and page give the multiply-adds done and those of everything."""
     published = survey_png(tmp_path, **SCAN, macs="80%", policy="sobel", controls=True)
     (attention,) = tmp_path.glob("stages/score/*/attention.zarr")
     patch_index = json.loads(attention.with_name("plan.json").read_text())["patch_index"]
@@ -145,8 +145,8 @@ def test_a_part_of_the_scan_is_read_in_detail(survey_png: Survey, tmp_path: Path
     assert "captured again" not in page
 
 
-def test_a_plan_tells_what_the_budgets_pay_for(flags_png: Flags, tmp_path: Path) -> None:
-    """Before the first line: the most patches, and what they take."""
+def test_a_plan_shows_the_patches_of_the_budget(flags_png: Flags, tmp_path: Path) -> None:
+    """Before the first line is captured it gives the maximum of patches and their multiply-adds."""
     content = plan_content(load_settings(None, flags_png(tmp_path, scan_step="1", macs="80%")))
     costs = content["kept"]["multiply_adds"]
     assert 0.75 < costs["done"] / costs["everything"] <= 0.8
@@ -154,7 +154,7 @@ def test_a_plan_tells_what_the_budgets_pay_for(flags_png: Flags, tmp_path: Path)
 
 
 def test_a_large_field_is_counted_region_by_region() -> None:
-    """Sixteen times the field takes as many fields and their halos, of which only the overview reads more."""
+    """16 times the field reads 16 times the detail; halos raise the overview by less than 10 %."""
     small, large = (
         costs.of_map(costs.grid.every_patch())
         for costs in (replace(COSTS, grid=SceneGrid(side, side, 16)) for side in (2560, 10240))
@@ -164,7 +164,7 @@ def test_a_large_field_is_counted_region_by_region() -> None:
 
 
 def test_a_zoomed_survey_reads_the_overview_twice(tmp_path: Path) -> None:
-    """Once to choose lines, once with all lines; a uniform scan reads it once, while the map is drawn."""
+    """It reads it to choose lines and again with all lines; a uniform scan reads it once, for the map."""
     flags = {"scene": "farm", "size": "320x256", "seconds": "12", "out": str(tmp_path)}
     never, always = (
         open_run(load_settings(None, {**flags, "zoom": zoom}), planning=True) for zoom in ("never", "always")
@@ -174,8 +174,8 @@ def test_a_zoomed_survey_reads_the_overview_twice(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("policy", "scan_passes"), [("gain", 2), ("entropy", 2), ("sobel", 1), ("random", 1)])
-def test_a_policy_that_asks_the_overview_reads_it_once_more(policy: str, scan_passes: int) -> None:
-    """The map reads it anyway, from what is stored; scores of the coarse prediction read it before that."""
+def test_policies_on_the_overview_read_it_once_more(policy: str, scan_passes: int) -> None:
+    """Gain and entropy score the coarse prediction before the map is read; sobel and random do not."""
     score = score_multiply_adds(policy, COSTS.config, COSTS.grid)
     done = COSTS.with_scores(np.array([3, 8]), policy)
     closed = multiply_adds(COSTS.config, COSTS.grid, 2, COSTS.bands, score=score)

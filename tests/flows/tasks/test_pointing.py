@@ -1,4 +1,4 @@
-"""A mirror that looks beside the plan: what is laid out for it, found, put right and told."""
+"""Pointing errors of the mirror: overlaps for them, their registration, their correction, and the report."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ OFF_PX, SEED = 6.0, 0
 
 @pytest.fixture(scope="module")
 def surveyed(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
-    """Receipt and archive of a farm in two strips, seen by such a mirror."""
+    """Return receipt and archive of a farm in two swaths, captured with pointing errors."""
     archive = tmp_path_factory.mktemp("pointing")
     flags = {
         "scene": "farm",
         "size": "768x448",
         "bands": FEW_BANDS,
-        "effects": "rotation,slit,smear,vignetting,shot,read-noise",  # without blur, lines far apart are not alike
+        "effects": "rotation,slit,smear,vignetting,shot,read-noise",  # without blur: lines far apart are not alike
         "seed": str(SEED),
         "budget": "0.7",
         "pointing_px": str(OFF_PX),
@@ -48,14 +48,14 @@ def surveyed(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], 
     return json.loads(json.dumps(found)), archive
 
 
-def test_sweeps_are_put_right_by_seams_and_on_the_mosaic(surveyed: tuple[dict[str, Any], Path]) -> None:
-    """What registration finds beside the sweep it held is what the simulator got wrong, within half a pixel."""
+def test_registration_finds_the_simulated_pointing_errors(surveyed: tuple[dict[str, Any], Path]) -> None:
+    """Offsets relative to the reference sweep are within 0.5 px of the simulated ones, in coarse and fine passes."""
     pointing, errors = surveyed[0]["pointing"], PointingErrors(OFF_PX, SEED)
     coarse = pointing["coarse"]
     assert len(coarse["sweeps"]) > 1
     for name, offset in coarse["sweeps"].items():
         assert np.abs(errors.offset(name) - errors.offset(coarse["held"]) - offset).max() < 0.5
-    assert coarse["residual_rms_px"] is None  # windows are no more than unknowns: that they fit says nothing
+    assert coarse["residual_rms_px"] is None  # at most as many windows as unknowns: the residual means nothing
     held = errors.offset(coarse["held"])
     told = {
         name: offset for name, offset in pointing["fine"]["sweeps"].items() if name not in pointing["fine"]["not_found"]
@@ -65,8 +65,8 @@ def test_sweeps_are_put_right_by_seams_and_on_the_mosaic(surveyed: tuple[dict[st
         assert np.abs(errors.offset(name) - held - offset).max() < 0.5
 
 
-def test_what_the_mirror_missed_is_told_and_detail_still_helps(surveyed: tuple[dict[str, Any], Path]) -> None:
-    """Patches seen in part are counted, either pass has its row, and with patches the map is better than without."""
+def test_partly_seen_patches_are_counted_and_detail_still_helps(surveyed: tuple[dict[str, Any], Path]) -> None:
+    """Each pass has its row in the findings, and patches raise the mIoU above that of the coarse map."""
     receipt, archive = surveyed
     detail = open_mosaic(archive / receipt["products"]["mosaic"])
     kinds, number = detail.captures() or ([], np.zeros(detail.shape))
@@ -80,7 +80,7 @@ def test_what_the_mirror_missed_is_told_and_detail_still_helps(surveyed: tuple[d
 
 
 def found_of(**told: Any) -> dict[str, Any]:
-    """What a survey says of one pass."""
+    """Return the part of a receipt about the pointing of a coarse pass."""
     nothing: dict[str, Any] = {"held": "a", "sweeps": {"a": [0.0, 0.0]}, "residual_rms_px": None}
     nothing |= {"not_found": [], "too_narrow": []}
     return {"pointing": {"prior_px": 5.0, "coarse": {**nothing, **told}}}
@@ -104,8 +104,8 @@ TOLD: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("case", TOLD)
-def test_every_finding_has_its_words(case: str) -> None:
-    """One sweep, corrections, residuals, what could not be told and what was missed are each said once."""
+def test_findings_on_pointing_are_one_sentence(case: str) -> None:
+    """Corrections, residuals, sweeps not found, narrow overlaps and partly seen patches each appear once."""
     told, words = TOLD[case]
     assert finding_rows(found_of(**told)) == [("pointing, coarse", words)]
 
@@ -115,14 +115,14 @@ OFF = 20.0
 
 
 def shared_px(sweeps: list[Sweep]) -> float:
-    """The least that neighbouring strips share [px]."""
+    """Return the smallest overlap of neighbouring swaths [px]."""
     camera = parse_settings({}).camera
     reach = [one.swath_px + reach_px(one.swath_px, GRID.height, camera, one.binning) for one in sweeps]
     return min(float(left[1] - right[0]) for left, right in pairwise(reach))
 
 
-def test_either_pass_overlaps_and_reaches_by_what_it_needs() -> None:
-    """Neighbours that look as far apart as they can share 64 px, and both ends of the field are seen."""
+def test_both_passes_have_overlap_and_margin_for_pointing_errors() -> None:
+    """Neighbours with the largest errors still share 64 px, and both ends of the field are captured."""
     plan = PassLayout.of(parse_settings({"pointing_px": OFF, "budget": 1.0}), GRID).plan(1.0)
     assert plan.along == "x"
     assert plan.margin_px == 2 * OFF
@@ -135,8 +135,8 @@ def test_either_pass_overlaps_and_reaches_by_what_it_needs() -> None:
         assert held[-1, -1] >= GRID.height / 2 + 2 * OFF
 
 
-def test_a_mirror_that_is_believed_costs_nothing() -> None:
-    """Neither overlaps nor margins nor words; overlaps of a whole line are refused with what could be put right."""
+def test_zero_pointing_error_adds_no_overlap() -> None:
+    """Margins and findings are absent too; an overlap of a whole line is refused with the largest allowed error."""
     settings = parse_settings({"budget": 1.0})
     plan = PassLayout.of(settings, GRID).plan(None if settings.plain else settings.budget)
     assert plan.full == full_sweeps(GRID, settings.camera, plan.along)

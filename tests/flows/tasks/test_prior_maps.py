@@ -1,4 +1,4 @@
-"""A field that is remembered: what later visits go on from, what becomes of a wrong memory, and who keeps it."""
+"""Surveys with prior maps: their choice, their rejection when they do not fit, and their storage."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ FIRST, LATER = "2026-06-01T10:00:00Z", "2026-06-04T10:00:00Z"
 
 @pytest.fixture(scope="module")
 def twice(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) -> tuple[Path, Any, Any]:
-    """Two visits to one field, three days apart; not to be changed."""
+    """Return an archive with two visits to one field, three days apart, and both runs; do not change it."""
     out = tmp_path_factory.mktemp("twice") / "archive"
     with without_effects():
         first = survey_png(out, **UNIFORM, visit=FIRST, prior="latest")
@@ -56,24 +56,24 @@ def twice(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) -> tuple
 
 @pytest.fixture
 def visited(twice: tuple[Path, Any, Any], tmp_path: Path) -> Path:
-    """A copy of that archive."""
+    """Return a copy of that archive."""
     return Path(shutil.copytree(twice[0], tmp_path / "archive"))
 
 
 def class_map(out: Path, published: Any) -> np.ndarray:
-    """Classes of a run's map."""
+    """Return the classes of a run's map."""
     return np.asarray(xr.open_zarr(out / published.receipt["products"]["class_map"], consolidated=False).classes.values)
 
 
 def words_of(out: Path, survey_png: Survey, **flags: Any) -> tuple[str, Any]:
-    """What a survey says on the terminal, in one line, and the run."""
+    """Return the terminal output of a survey, joined into one line, and the run."""
     text = io.StringIO()
     published = survey_png(out, console=Console(file=text, width=400), **{**UNIFORM, **flags})
     return " ".join(text.getvalue().split()), published
 
 
-def test_a_first_look_has_nothing_to_go_on_from(twice: tuple[Path, Any, Any]) -> None:
-    """Asked for the latest it says none, keeps what it believes, and all of that is new."""
+def test_a_first_visit_has_no_prior_map(twice: tuple[Path, Any, Any]) -> None:
+    """With `latest` and no earlier visit a note says so; the stored class probabilities have age 0 and no changes."""
     out, first, _ = twice
     assert "prior_map" not in first.receipt
     assert first.receipt["settings"]["prior"] == "none"
@@ -82,11 +82,11 @@ def test_a_first_look_has_nothing_to_go_on_from(twice: tuple[Path, Any, Any]) ->
     assert float(probabilities.age.max()) == 0.0
     assert "changed" not in probabilities
     agree = np.nan_to_num(probabilities.log_probability.values, nan=-9).argmax(axis=-1) == class_map(out, first)
-    assert agree.mean() > 0.95  # but for classes less than a step apart, which these weights often are
+    assert agree.mean() > 0.95  # except for classes closer than one step, which these weights often give
 
 
-def test_a_later_look_goes_on_from_the_one_before(twice: tuple[Path, Any, Any]) -> None:
-    """Receipt, page and manifest name it; the days between are those of the visits."""
+def test_a_later_visit_uses_the_one_before_as_prior_map(twice: tuple[Path, Any, Any]) -> None:
+    """Receipt, page and manifest name the earlier run; its age is the days between the visits."""
     out, first, later = twice
     memory = later.receipt["prior_map"]
     assert (memory["run"], memory["days"], memory["put_aside"]) == (first.folder.name, 3.0, None)
@@ -105,8 +105,8 @@ def test_a_later_look_goes_on_from_the_one_before(twice: tuple[Path, Any, Any]) 
     np.testing.assert_array_equal(probabilities.changed.values, there)
 
 
-def test_by_hand_nothing_is_remembered_unless_asked(visited: Path, survey_png: Survey) -> None:
-    """The default of a survey is none, and its map that of a first look, found and not made again."""
+def test_a_survey_uses_no_prior_map_by_default(visited: Path, survey_png: Survey) -> None:
+    """Its map is that of a first visit, so the stage is cached."""
     published = survey_png(visited, **UNIFORM, visit=LATER)
     assert "prior_map" not in published.receipt
     fresh = survey_png(visited, **UNIFORM, visit=FIRST)
@@ -117,17 +117,17 @@ def test_by_hand_nothing_is_remembered_unless_asked(visited: Path, survey_png: S
 @pytest.mark.parametrize(
     ("visit", "named", "before", "days"),
     [
-        ("2026-06-02T22:00:00Z", False, 1, 1.5),  # taken in late
+        ("2026-06-02T22:00:00Z", False, 1, 1.5),  # captured before the later visit, but entered after it
         ("2026-06-04T12:00:00+02:00", False, 2, 0.0),  # at the same moment as the other
         ("2026-06-09T10:00:00Z", True, 1, 8.0),
         ("2026-06-03T00:00:00Z", False, 1, 38 / 24),
-        ("2026-06-04", False, 2, 0.0),  # a date alone is a day and not its midnight
+        ("2026-06-04", False, 2, 0.0),  # a date alone means the day and not its midnight
     ],
 )
-def test_the_prior_map_is_the_last_before_the_visit_or_the_one_named(
+def test_the_prior_map_is_the_last_before_the_visit_or_the_named_one(
     twice: tuple[Path, Any, Any], visit: str, named: bool, before: int, days: float
 ) -> None:
-    """A run that is not there ends in one message."""
+    """The name of a missing run ends in one message."""
     run = twice[before].folder.name
     assert found_prior(twice[0], visit, run if named else "latest") == (run, days)
     with pytest.raises(SettingsError, match=r"--prior nobody: there is no such run in the archive; give another run"):
@@ -135,21 +135,21 @@ def test_the_prior_map_is_the_last_before_the_visit_or_the_one_named(
 
 
 def test_a_run_captured_after_the_visit_is_refused(twice: tuple[Path, Any, Any]) -> None:
-    """Plants do not shrink: a map of a later day would say how the field will be."""
+    """Plants do not shrink: a map of a later day would give away the field's future."""
     with pytest.raises(SettingsError, match=r"it was captured 2 days after this visit; give another run, latest or"):
         found_prior(twice[0], "2026-06-02", twice[2].folder.name)
 
 
 def found_prior(out: Path, visit: str, prior: str) -> tuple[str, float] | None:
-    """Name and days of the run that a visit to north goes on from."""
+    """Return name and age in days of the prior map that a visit to north uses."""
     settings = load_settings(None, {"prior": prior, "visit": visit})
     scene: Any = Mock(key="scene", geobox=None)
     found, _ = memory.find_prior(Archive.open(out), settings, "north", SceneGrid(96, 128, 8), CLASSES, scene)
     return found and (found.run, found.days)
 
 
-def test_other_light_under_the_same_path_is_another_visit(survey_png: Survey, tmp_path: Path) -> None:
-    """A file that was written anew, though all settings are equal; read again it is not the prior map of itself."""
+def test_a_changed_file_of_the_same_path_is_another_visit(survey_png: Survey, tmp_path: Path) -> None:
+    """All settings are equal; a file that is surveyed again is not the prior map of itself."""
     flags: dict[str, Any] = {**UNIFORM, "scene": str(tmp_path / "week.png"), "labels": None, "prior": "latest"}
     for seed, earlier in ((1, False), (2, True), (2, True)):
         Image.fromarray(patchy_scene((96, 128), 3, seed=seed)[0].astype(np.uint8)).save(tmp_path / "week.png")
@@ -157,8 +157,8 @@ def test_other_light_under_the_same_path_is_another_visit(survey_png: Survey, tm
         assert ("prior_map" in published.receipt) == earlier
 
 
-def test_a_field_of_another_size_is_no_memory(visited: Path, survey_png: Survey, tmp_path: Path) -> None:
-    """Under the same name: said, and looked at as for the first time."""
+def test_a_map_of_another_size_is_no_prior_map(visited: Path, survey_png: Survey, tmp_path: Path) -> None:
+    """The field has the same name; a note says why, and the survey runs as a first visit."""
     Image.fromarray(patchy_scene((64, 96), 3, seed=1)[0].astype(np.uint8)).save(tmp_path / "small.png")
     flags = {"scene": str(tmp_path / "small.png"), "labels": None, "visit": "2026-06-07T10:00:00Z", "prior": "latest"}
     words, published = words_of(visited, survey_png, **flags)
@@ -179,7 +179,7 @@ def test_a_field_of_another_size_is_no_memory(visited: Path, survey_png: Survey,
 def test_a_map_of_another_place_is_no_prior_map(
     visited: Path, survey_png: Survey, tmp_path: Path, east_m: float, epsg: int, why: str | None
 ) -> None:
-    """Tiles of one mosaic look alike: what their files say of their places counts."""
+    """Tiles of one mosaic look alike, so the coordinates in their files decide."""
     for name, east, code in (("here", 0.0, 32632), ("there", east_m, epsg)):
         values = np.moveaxis(patchy_scene((96, 128), 3, seed=1)[0].astype(np.uint8), -1, 0)
         place = {"crs": f"EPSG:{code}", "transform": rasterio.Affine(10.0, 0, 4e5 + east, 0, -10.0, 5e6)}
@@ -193,8 +193,8 @@ def test_a_map_of_another_place_is_no_prior_map(
     assert why is None or why in words
 
 
-def test_another_field_under_the_same_name_is_put_aside(visited: Path, survey_png: Survey, tmp_path: Path) -> None:
-    """Its map is the one of a survey without memory, and receipt and page say why."""
+def test_a_prior_map_of_another_field_is_put_aside(visited: Path, survey_png: Survey, tmp_path: Path) -> None:
+    """The map equals that of a survey without prior map, and receipt and terminal give the reason."""
     Image.fromarray(patchy_scene((96, 128), 3, seed=77)[0].astype(np.uint8)).save(tmp_path / "other.png")
     flags = {"scene": str(tmp_path / "other.png"), "labels": None, "visit": "2026-06-07T10:00:00Z"}
     words, wrong = words_of(visited, survey_png, **flags, prior="latest")
@@ -203,7 +203,7 @@ def test_another_field_under_the_same_name_is_put_aside(visited: Path, survey_pn
     assert {wrong.receipt["prior_map"][name] for name in ("differing_px", "changed_px")} == {None}
     assert "differing" not in words
     assert "not used: another field" in words
-    cost, once = (run.receipt["savings"]["multiply_adds"] for run in (wrong, alone))  # the map was drawn twice
+    cost, once = (run.receipt["savings"]["multiply_adds"] for run in (wrong, alone))  # the map was computed twice
     assert cost["overview"] == 2 * once["overview"]
     patches = once["detail"] / alone.receipt["savings"]["patches"]["done"]
     assert cost["detail"] == pytest.approx(once["detail"] + wrong.receipt["prior_map"]["patches_read"] * patches)
@@ -213,8 +213,8 @@ def test_another_field_under_the_same_name_is_put_aside(visited: Path, survey_pn
     assert not {"changed", "changed_from"} & set(probabilities)
 
 
-def test_what_was_cleared_is_gone_on_without(visited: Path, twice: Any, survey_png: Survey) -> None:
-    """The visit before that is taken, and where none is left the look is a first one; both are said."""
+def test_cleared_prior_maps_are_skipped(visited: Path, twice: Any, survey_png: Survey) -> None:
+    """The visit before is used instead; if none is left, the survey runs as a first visit. A note reports either."""
     _, first, later = twice
     shutil.rmtree((visited / later.receipt["products"]["class_probabilities"]).parent)
     words, published = words_of(visited, survey_png, visit="2026-06-07T10:00:00Z", prior="latest")
@@ -227,8 +227,8 @@ def test_what_was_cleared_is_gone_on_without(visited: Path, twice: Any, survey_p
     assert "north has no prior map: none of its earlier runs can be one" in words
 
 
-def test_other_classes_are_found_by_their_names(visited: Path, survey_png: Survey, make_weights: WeightsMaker) -> None:
-    """Weights that call classes in another order, and know one more, go on from the memory of the others."""
+def test_prior_map_classes_are_matched_by_name(visited: Path, survey_png: Survey, make_weights: WeightsMaker) -> None:
+    """Weights with another order and one more class use the prior map; weights without a common class do not."""
     other = make_weights(names=("class_2", "class_0", "class_1", "more"))
     flags = {"weights": str(other), "labels": None, "visit": "2026-06-07T10:00:00Z", "prior": "latest"}
     published = survey_png(visited, **{**UNIFORM, **flags})
@@ -241,7 +241,7 @@ def test_other_classes_are_found_by_their_names(visited: Path, survey_png: Surve
 
 
 def test_visits_are_reprocessed_in_order(visited: Path, twice: Any, make_weights: WeightsMaker) -> None:
-    """With other weights the second visit goes on from the first as it was made again, not as it was."""
+    """With new weights, the prior map of the second visit is the reprocessed first visit."""
     weights, told = make_weights(width=4), io.StringIO()
     run_reprocess(visited, Console(file=told, width=300), weights=weights)
     runs = [read_run(path) for path in sorted(visited.glob("runs/*"))]
@@ -250,11 +250,11 @@ def test_visits_are_reprocessed_in_order(visited: Path, twice: Any, make_weights
     assert again[1].receipt["prior_map"]["run"] == again[0].folder.name
     content = io.StringIO()
     run_reprocess(visited, Console(file=content, width=300), weights=weights)
-    assert len(list(visited.glob("runs/*"))) == 4  # nothing is left to be done
+    assert len(list(visited.glob("runs/*"))) == 4  # nothing is left to do
 
 
 def test_a_reader_in_the_weights_is_used(visited: Path, survey_png: Survey, weights: Path, tmp_path: Path) -> None:
-    """Its key stands in the receipt and its multiply-adds count; one for others ends the survey before it begins."""
+    """Its key is in the receipt and its multiply-adds count; a reader for another network ends the survey at once."""
     own = Path(shutil.copy(weights, tmp_path / "own.safetensors"))
     config = load_weights(own).config
     reader = TemporalReader(TemporalSizes(config.classes, config.columns, 8, 4))
@@ -271,8 +271,8 @@ def test_a_reader_in_the_weights_is_used(visited: Path, survey_png: Survey, weig
         survey_png(visited, **flags)
 
 
-def test_a_rig_that_was_moved_between_two_parts_is_noticed(survey_png: Survey, tmp_path: Path) -> None:
-    """Where they share nothing today's lines are laid onto those of the visit before the last."""
+def test_a_rig_moved_between_two_partial_visits_is_detected(survey_png: Survey, tmp_path: Path) -> None:
+    """Without a common part, today's lines are registered to the visit before the last."""
     out, (values, _) = tmp_path / "archive", patchy_scene((160, 192), 3, seed=5)
     flags = {**UNIFORM, "labels": None, "prior": "latest"}
     before, now = ({**flags, "scene": str(tmp_path / f"{name}.png")} for name in ("before", "now"))
@@ -284,13 +284,13 @@ def test_a_rig_that_was_moved_between_two_parts_is_noticed(survey_png: Survey, t
     assert "shifted by 23 px" in words
     assert later.receipt["prior_map"]["run"] == middle.folder.name
     assert later.receipt["prior_map"]["shift_px"] == [12, -20]
-    back = survey_png(out, **before, visit="2026-06-08T10:00:00Z", extent="0:16-46")  # the first visit alone knows most
+    back = survey_png(out, **before, visit="2026-06-08T10:00:00Z", extent="0:16-46")  # the first visit covers most
     assert back.receipt["prior_map"]["run"] == later.folder.name
     assert back.receipt["prior_map"]["shift_px"] == pytest.approx([-12, 20], abs=1)
 
 
-def test_a_rig_that_was_turned_is_noticed(survey_png: Survey, tmp_path: Path) -> None:
-    """By four degrees: its memory is put aside, and receipt and page say by how much."""
+def test_a_rig_turned_by_four_degrees_is_detected(survey_png: Survey, tmp_path: Path) -> None:
+    """The prior map is put aside; receipt and terminal give the angle."""
     values, _ = patchy_scene((300, 320), 3, seed=6)
     soft, there = gaussian_filter(values, (1.5, 1.5, 0)), np.s_[2:290, 8:312]
     images = {"before": soft[there], "now": rotate(soft, 4.0, reshape=False, order=1, mode="nearest")[there]}
@@ -305,8 +305,8 @@ def test_a_rig_that_was_turned_is_noticed(survey_png: Survey, tmp_path: Path) ->
     assert re.search("turned -?(3.9|4|4.0)[0-9]* degrees; not used: turned", words)
 
 
-def test_a_thousand_visits_cost_as_much_as_sixty(visited: Path, twice: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """However many runs a field has, the newest alone are read; those of other fields not at all."""
+def test_finding_a_prior_map_reads_the_newest_runs(visited: Path, twice: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With 70 more visits, only the newest runs of this field are read."""
     _, first, later = twice
     for number in range(70):
         for name, source in (("north", later), ("south", first)):
@@ -320,8 +320,8 @@ def test_a_thousand_visits_cost_as_much_as_sixty(visited: Path, twice: Any, monk
     assert {call.args[0].name.rpartition("-")[2] for call in counted.call_args_list} == {"north"}
 
 
-def test_two_visits_at_once_are_both_kept(visited: Path, twice: Any, survey_png: Survey) -> None:
-    """Neither waits for the other or goes on from it half made: both are published, and rest on finished runs."""
+def test_two_simultaneous_visits_are_both_published(visited: Path, twice: Any, survey_png: Survey) -> None:
+    """Neither waits for the other; the prior map of each is a finished run."""
     at = ["2026-06-09T10:00:00Z", "2026-06-09T11:00:00Z"]
     with ThreadPoolExecutor(2) as pool:
         both = list(pool.map(lambda visit: survey_png(visited, **UNIFORM, visit=visit, prior="latest"), at))
@@ -332,7 +332,7 @@ def test_two_visits_at_once_are_both_kept(visited: Path, twice: Any, survey_png:
 
 
 def _image(seed: int, told: float) -> NDArray[np.float32]:
-    """(y, x, column), of which a fraction is told."""
+    """Return an image (y, x, column) of which about a fraction has values; the rest is NaN."""
     rng = np.random.default_rng(seed)
     image = rng.normal(size=(6, 8, 2)).astype(np.float32)
     image[rng.random((6, 8)) > told] = np.nan
@@ -340,8 +340,8 @@ def _image(seed: int, told: float) -> NDArray[np.float32]:
 
 
 @given(seed=st.integers(0, 99), count=st.integers(1, 4))
-def test_of_a_place_the_newest_look_counts(seed: int, count: int) -> None:
-    """Each pixel is that of the first image that tells it, and nothing is told that none of them does."""
+def test_merged_images_take_each_pixel_from_the_newest(seed: int, count: int) -> None:
+    """Each pixel comes from the first image with a value there, and is NaN if no image has one."""
     images = [_image(seed + number, told=0.4) for number in range(count)]
     whole = laid_together(iter(images))
     for y, x in np.ndindex(6, 8):
@@ -349,8 +349,8 @@ def test_of_a_place_the_newest_look_counts(seed: int, count: int) -> None:
         np.testing.assert_array_equal(whole[y, x], telling[0] if telling else [np.nan, np.nan])
 
 
-def test_older_looks_are_read_only_where_newer_ones_lack_something() -> None:
-    """A field that was looked at as a whole costs one picture, however many there are."""
+def test_older_images_are_not_read_when_the_newest_is_complete() -> None:
+    """A field that was captured as a whole costs one image, however many visits there are."""
     whole = _image(0, told=1.0)
 
     def images() -> Iterator[NDArray[np.float32]]:
@@ -362,8 +362,8 @@ def test_older_looks_are_read_only_where_newer_ones_lack_something() -> None:
 
 
 @given(down=st.integers(-9, 9), across=st.integers(-9, 9), seed=st.integers(0, 9))
-def test_what_is_moved_and_moved_back_lacks_its_edge_alone(down: int, across: int, seed: int) -> None:
-    """Every pixel that stayed within is where it was, the others are unknown."""
+def test_shifting_there_and_back_loses_the_edge_alone(down: int, across: int, seed: int) -> None:
+    """Pixels that stayed within the image keep their place; the others are NaN."""
     image = _image(seed, told=1.0)
     back = shifted(shifted(image, (down, across)), (-down, -across))
     stayed = np.zeros((6, 8), bool)

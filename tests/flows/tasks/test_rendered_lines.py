@@ -1,4 +1,4 @@
-"""Lines rendered ahead: the same whoever renders them in whatever blocks, in order, few at a time, errors in turn."""
+"""Lines rendered in parallel: equal for every pool and block size, in order, few at a time, with errors in order."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ TWO = WorkerPool("threads", 2)
 
 
 def source_of(*effects: str) -> SimulatedSource:
-    """A rig before a small scene of three bands, with some exact effects, or with all that there are."""
+    """Return a rig in front of a small scene of three bands, with these exact effects or with all effects."""
     values = np.random.default_rng(1).random((60, 90, 3))
     scene = raster_from_values(values, CAMERA, name="t", wavelength_nm=np.linspace(450, 850, 3))
     return SimulatedSource(scene, Rig(CAMERA), seed=5, chosen=effects_on(*(effects or BY_NAME)))
 
 
 def taken(source: SimulatedSource, pool: WorkerPool, first: int = 0, at_once: int = 16) -> list[Line]:
-    """All lines from the first on."""
+    """Return all lines from the first on."""
     lines: list[Line] = []
     take_lines(source, SWEEP, lines.append, pool, first=first, at_once=at_once)
     return lines
@@ -45,34 +45,34 @@ def taken(source: SimulatedSource, pool: WorkerPool, first: int = 0, at_once: in
 
 @pytest.fixture(scope="module")
 def expected() -> list[Line]:
-    """What the source gives by itself."""
+    """Return the lines that the source gives without a pool."""
     return list(source_of().lines(SWEEP))
 
 
 @pytest.mark.parametrize(
     ("scheduler", "workers", "size"),
-    [  # worker pools without this process's memory, even of a scheduler that is not there, leave it to threads here
+    [  # pools without this process's memory, even with an absent scheduler, use threads here
         *(("threads", 1, 64), ("threads", 2, 1), ("threads", 2, 70), ("threads", 5, 7)),
         *(("processes", 2, 16), ("tcp://192.0.2.1:8786", 2, 16)),
     ],
 )
-def test_neither_pool_nor_blocks_change_a_number(
+def test_pool_and_block_size_change_no_value(
     expected: list[Line], monkeypatch: pytest.MonkeyPatch, scheduler: str, workers: int, size: int
 ) -> None:
-    """With every effect on, in blocks of 1, 7, 64 and all lines, with nothing remembered from before."""
+    """Every effect is on, and the sampler's cache is empty."""
     monkeypatch.setattr(simulated, "BLOCK_LINES", size)
     render._sampler.cache_clear()
     assert_same(taken(source_of(), WorkerPool(scheduler, workers), at_once=size), expected)
 
 
 @pytest.mark.parametrize("first", [23, 69, 70])
-def test_a_capture_goes_on_from_any_line(expected: list[Line], first: int) -> None:
-    """The lines are those of an unbroken capture; after the last there is none."""
+def test_a_capture_resumes_at_any_line(expected: list[Line], first: int) -> None:
+    """The lines equal those of an unbroken capture; after the last line there is none."""
     assert_same(taken(source_of(), TWO, first), expected[first:])
 
 
 def test_blocks_wait_for_earlier_ones(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first ends last of those begun: the others wait for it, and only one more is begun than there are workers."""
+    """The first block ends last: the others wait for it, and one block more than there are workers is begun."""
     real, others, begun = SimulatedSource.lines_of, threading.Semaphore(0), []
 
     def unfair(self: SimulatedSource, sweep: Sweep, numbers: range) -> list[Line]:
@@ -91,8 +91,8 @@ def test_blocks_wait_for_earlier_ones(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("workers", [2, 4])
-def test_an_error_comes_when_it_is_its_turn(monkeypatch: pytest.MonkeyPatch, workers: int) -> None:
-    """Lines before the first block that fails are taken, and its error is told: no later one's."""
+def test_errors_are_raised_in_the_order_of_blocks(monkeypatch: pytest.MonkeyPatch, workers: int) -> None:
+    """Lines before the first block that fails are taken; then the error of that block is raised."""
     real: Callable[..., list[Line]] = SimulatedSource.lines_of
 
     def failing(self: SimulatedSource, sweep: Sweep, numbers: range) -> list[Line]:
@@ -108,8 +108,8 @@ def test_an_error_comes_when_it_is_its_turn(monkeypatch: pytest.MonkeyPatch, wor
 
 
 @pytest.mark.parametrize("error", [RigError("disk full"), KeyboardInterrupt()])
-def test_nothing_is_rendered_after_lines_are_refused(error: BaseException) -> None:
-    """A full disk or Ctrl-C at a line ends the capture there, and no thread goes on."""
+def test_rendering_stops_when_a_line_is_refused(error: BaseException) -> None:
+    """A full disk or Ctrl-C at a line ends the capture there, and no thread is left."""
     lines, before = [], threading.active_count()
 
     def take(line: Line) -> None:
@@ -123,8 +123,8 @@ def test_nothing_is_rendered_after_lines_are_refused(error: BaseException) -> No
     assert threading.active_count() == before
 
 
-def test_every_visit_has_noise_of_its_own() -> None:
-    """Also every day and hour of a farm, and pointing errors; the usual day has the seed of the settings."""
+def test_every_visit_has_its_own_seed() -> None:
+    """So have every day and hour of a farm, and pointing errors; the default day has the seed of the settings."""
     asked = ({}, {"visit": "a"}, {"visit": "b"}, {"day": "179"}, {"day": "179", "visit": "a"}, {"hour": "9"})
     given, scene = {"scene": "farm", "seed": "7", "pointing_px": "2"}, source_of().scene
     sources = [make_source(scene, load_settings(None, given | one)) for one in (*asked, {"day": "172"})]

@@ -1,4 +1,4 @@
-"""The weights that come with SpectralZoom are small and good."""
+"""The shipped weights: their size, their record and their accuracy."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, farm_scene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 
 PATH = shipped_weights()
-SHAPE = (512, 640)  # smaller farms hold too few pixels of rare classes to rank placements by them
+SHAPE = (512, 640)  # smaller farms have too few pixels of rare classes to rank policies
 
 
 @pytest.fixture(scope="module")
 def weights() -> Weights:
-    """The shipped weights."""
+    """Return the shipped weights."""
     return load_weights(PATH)
 
 
 def placements(weights: Weights) -> Placements:
-    """Placements judged on a farm that training has not seen, through the exact rays of the simulated rig."""
+    """Return the placements of all policies on a farm outside of the training, through the rig's exact rays."""
     camera, scene = LineCamera(), farm_scene(41, SHAPE)
     grid, source = SceneGrid(*SHAPE, weights.config.patch), SimulatedSource(scene, Rig(camera), 41)
     sweeps = [SimulatedSweep(source, sweep) for sweep in full_sweeps(grid, camera, "x")]
@@ -45,8 +45,8 @@ def placements(weights: Weights) -> Placements:
     return run_controls(twice, weights.config.classes, fraction=0.35, seed=41)
 
 
-def test_file_is_small_and_tells_its_making(weights: Weights) -> None:
-    """The key that its products know, at most 3 MB; command, seed, law of the data, figures of scenes and scans."""
+def test_file_is_small_and_has_a_training_record(weights: Weights) -> None:
+    """It has the known key and at most 3 MB; the record has command, seed, data, validation and scan performance."""
     assert describe_weights(PATH).key == "916c1d7c050485d932b9"
     assert PATH.stat().st_size <= 3e6
     assert weights.record["command"].startswith("spectralzoom train farm@2,scouting@1")
@@ -60,22 +60,22 @@ def test_file_is_small_and_tells_its_making(weights: Weights) -> None:
 
 
 @pytest.mark.parametrize("asked", [{"budget": "0.5"}, {"scan_step": "4"}, {"seconds": "9"}, {}])
-def test_one_file_reads_every_capture(asked: dict[str, str]) -> None:
-    """One's own are taken for all."""
+def test_one_file_is_the_default_for_every_capture(asked: dict[str, str]) -> None:
+    """Weights of the user replace it for all captures."""
     assert weights_path(load_settings(None, asked)) == shipped_weights()
     assert weights_path(load_settings(None, {**asked, "weights": "mine.safetensors"})) == Path("mine.safetensors")
 
 
-def test_seconds_that_no_scan_ends_in_are_refused(tmp_path: Path) -> None:
-    """With the least."""
+def test_seconds_below_every_scan_are_refused(tmp_path: Path) -> None:
+    """The message has the minimum; no archive is made."""
     asked = load_settings(None, {"seconds": "0.5", "size": "640x512", "out": str(tmp_path / "a")})
     with pytest.raises(BudgetError, match=r"--seconds 0.5; the least is .*every 8th line"):
         open_run(asked)
     assert not (tmp_path / "a").exists()
 
 
-def test_a_full_reading_where_the_map_is_unsure_beats_chance(weights: Weights) -> None:
-    """At K = 35 % expected gain is above random by more than its spread, and most of the way to all."""
+def test_reading_by_expected_gain_beats_random_patches(weights: Weights) -> None:
+    """With K = 35 % its mIoU exceeds random by more than the spread, and closes over 70 % of the gap to all."""
     controls = placements(weights)
     rows = placement_figures(controls)
     assert rows["gain"]["miou"] > rows["random"]["miou"] + rows["random"]["spread"]

@@ -1,4 +1,4 @@
-"""Every stage of a survey fails once, by its words or by a bug: message, exit code, archive, and the next run."""
+"""Each stage of a survey fails once, with an error or a bug: message, exit code, archive, and the next run."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ from tests.flows.conftest import Ended, class_map, newest_run, problems
 pytestmark = pytest.mark.usefixtures("no_effects")
 
 NOT_HERE = ("register_coarse", "register_fine", "ground", "condense_raster")
-OF_THIS = [name for name in STAGES if name not in NOT_HERE]  # a survey in two passes by a mirror that is believed
+OF_THIS = [name for name in STAGES if name not in NOT_HERE]  # a survey in two passes without pointing errors
 CAPTURES = ("capture_coarse", "capture_fine")
 NO_REPLY = "no reply from the camera after 2 s; is it on?"
-BUG = "rectify"  # the stage that fails by one
+BUG = "rectify"  # the stage that fails with a bug
 FULL_DISK = "cannot write to the archive: no space left; make room"
 
 
 def refusal(stage: str) -> RigError | ArchiveError:
-    """What a device says of a capture, and a disk of any other stage."""
+    """Return the error of a device for a capture, and that of a full disk for any other stage."""
     return RigError(NO_REPLY) if stage in CAPTURES else ArchiveError(FULL_DISK)
 
 
 def altered(stage: str, built: Callable[[], None], tried: Callable[[], None] = lambda: None) -> Stage:
-    """The stage, with something done when it is asked for, and when its files are written and not yet published."""
+    """Return the stage with one call at its start, and one when its files are written but not yet published."""
     real = STAGES[stage]
 
     def wants(*given: Any) -> Wanted:
@@ -59,7 +59,7 @@ def altered(stage: str, built: Callable[[], None], tried: Callable[[], None] = l
 
 
 def failing(stage: str, error: Exception, tried: Callable[[], None] = lambda: None) -> Stage:
-    """The stage, failing when its files are written and not yet published."""
+    """Return the stage with a failure when its files are written but not yet published."""
 
     def broken() -> None:
         raise error
@@ -69,7 +69,7 @@ def failing(stage: str, error: Exception, tried: Callable[[], None] = lambda: No
 
 @dataclass(frozen=True)
 class Trial:
-    """What was left when a stage had failed: how the command ended, keys of stores, and what is wrong with them."""
+    """Result of a failed stage: the end of the command, the keys of the stores, and the problems in the archive."""
 
     ended: Ended
     keys: frozenset[str]
@@ -78,21 +78,21 @@ class Trial:
 
 @dataclass
 class Walk:
-    """One archive on which the same survey was asked for until every stage had failed; then it went through."""
+    """Archive with a survey that was repeated until every stage had failed once, and then completed."""
 
     undisturbed: Path
     out: Path
     keys: dict[str, str]  # of each stage that makes a store, of the undisturbed survey
     trials: dict[str, Trial]
     builds: Counter[str]
-    last: dict[str, str]  # states of the run that nothing disturbed
+    last: dict[str, str]  # states of the completed run
 
 
 @pytest.fixture(scope="module")
 def walk(
     tmp_path_factory: pytest.TempPathFactory, survey_png: Any, surveyed_png: Any, scene_files: Path, weights: Path
 ) -> Walk:
-    """The same command again and again, each stage in turn failing: one by a bug, the others by their words."""
+    """Repeat one command while each stage fails in turn, one with a bug, the others with errors; return the result."""
     folder = tmp_path_factory.mktemp("failures")
     receipt = surveyed_png(folder / "undisturbed").receipt
     keys = {stage["name"]: stage["key"] for stage in receipt["stages"] if stage["state"] == "ran"}
@@ -124,8 +124,8 @@ def command(words: list[Any]) -> Ended:
 
 
 @pytest.mark.parametrize("stage", OF_THIS)
-def test_a_stage_that_fails_is_one_message(stage: str, walk: Walk) -> None:
-    """The words of the error, or of a bug in which file its traceback is; the archive holds the stores before it."""
+def test_a_failed_stage_gives_one_message(stage: str, walk: Walk) -> None:
+    """It is the error, or for a bug the file with the traceback; the archive has the stores of earlier stages."""
     before, trial = list(OF_THIS)[: list(OF_THIS).index(stage)], walk.trials[stage]
     assert (trial.ended.code, trial.ended.out, len(trial.ended.errors)) == (1, "", 1)
     assert "Traceback" not in trial.ended.err
@@ -139,8 +139,8 @@ def test_a_stage_that_fails_is_one_message(stage: str, walk: Walk) -> None:
         assert told == str(refusal(stage))
 
 
-def test_the_survey_goes_on_as_if_nothing_had_been(walk: Walk) -> None:
-    """Each store was begun twice, once to fail; the run at last reads all but the last, and draws the map."""
+def test_a_survey_completes_after_failures(walk: Walk) -> None:
+    """Each store was built twice, once to fail; the last run computes only map and evaluation."""
     assert walk.builds == dict.fromkeys(walk.keys, 2)
     assert {name for name, state in walk.last.items() if state == "ran"} == {"segment", "evaluate"}
     np.testing.assert_array_equal(class_map(walk.out), class_map(walk.undisturbed))
@@ -150,10 +150,10 @@ def test_the_survey_goes_on_as_if_nothing_had_been(walk: Walk) -> None:
     assert not [*walk.out.rglob("*.part"), *walk.out.glob("spool/*")]
 
 
-def test_a_run_that_cannot_be_drawn_is_not_published(
+def test_a_run_without_a_quicklook_is_not_published(
     walk: Walk, tmp_path: Path, survey_png: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Pictures and receipt come after the last stage: without them there is no run; the next one reads every store."""
+    """Quicklook and receipt follow the last stage; the next run reads every store."""
     out = Path(shutil.copytree(walk.undisturbed, tmp_path / "archive"))
     before = Archive.open(out).runs()
     with monkeypatch.context() as broken:
@@ -169,12 +169,12 @@ def test_a_run_that_cannot_be_drawn_is_not_published(
 @pytest.mark.parametrize(
     ("stage", "after", "tries"), [("capture_coarse", "choose_effects", 3), ("condense_coarse", "capture_coarse", 1)]
 )
-def test_a_stage_that_fails_by_prefect(
+def test_a_stage_that_fails_in_prefect_has_a_failed_task(
     stage: str, after: str, tries: int, server: str, survey_png: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Task and flow are Failed with the message, the task named by stage and field; a device was asked again.
+    """Task and flow are Failed with the message; a device gets three tries.
 
-    Prefect draws an arrow to it, from what it is made of.
+    Prefect draws an arrow to the task from its input.
     """
     tried: list[str] = []
     error = refusal(stage)
@@ -197,8 +197,8 @@ def test_a_stage_that_fails_by_prefect(
     assert problems(tmp_path) == []
 
 
-def test_a_reprocessing_that_fails(server: str, walk: Walk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It ends Failed and says why; the next one makes what was missing, and completes."""
+def test_failed_reprocessing_resumes(server: str, walk: Walk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The flow is Failed with the reason; the next one makes the missing store and completes."""
     from flows.archive.reprocess_flow import reprocess
 
     out = Path(shutil.copytree(walk.undisturbed, tmp_path / "archive"))

@@ -1,7 +1,7 @@
-"""A stage's code does not change without its version: what an archive holds would otherwise pass for the new result.
+"""Check that a stage's code changes with its version alone; else an archive would pass off old stores as new results.
 
-After a change, either raise the version of the stage's product, beside the stage (that of ingest in its command) or,
-where the change has no effect on what the stage writes, keep it; then record the code as it is:
+After a change, raise the version of the stage's product, beside the stage (that of ingest in its command).
+If the change has no effect on the output of the stage, keep the version. Then record the current code:
 
     python tests/flows/tasks/test_stage_versions.py
 """
@@ -31,14 +31,14 @@ from tests.flows.tasks.stage_closure import Sources, Target, read_packages  # no
 
 VERSIONS = {**versions(), ingest_command.STAGE: ingest_command.VERSION}
 RECORD = Path(__file__).with_name("stage_digests.json")
-# who looks at what: runs bring it, no stage names it
+# sources of the lines: runs bring them, no stage names them
 LIGHT = ("farm_scene", "scouting_scene", "raster_from_values", "make_source")
 BESIDES = {"effects": LIGHT, "capture": (*LIGHT, "_open_source"), "evaluate": ("judged_labels",)}
 ROOTS = {ingest_command.STAGE: ("run_ingest",)}
 for _one in STAGES.values():
     _function = f"{_one.wants.__module__}.{_one.wants.__name__}"
     ROOTS[_one.product.name] = (*ROOTS.get(_one.product.name, BESIDES.get(_one.product.name, ())), _function)
-OF_RUNS = ("LineCamera", "SceneGrid", "AngularGrid", "CapturePlan")  # roots of every stage that is given a run
+OF_RUNS = ("LineCamera", "SceneGrid", "AngularGrid", "CapturePlan")  # roots of every stage that gets a run
 BARRIERS = {
     "Product": "the numbers that this test compares with",
     "Settings": "values, which stand in the keys; what acts on them is reached where it does",
@@ -56,13 +56,13 @@ BARRIERS = {
 
 @cache
 def sources() -> Sources:
-    """The code as it is."""
+    """Return the current code."""
     return Sources(read_packages(ROOT))
 
 
 @pytest.fixture(scope="module", autouse=True)
 def _code_is_no_garbage() -> Iterator[None]:
-    """It is half a million nodes: no search looks through them, neither now nor, for they go, in the tests after."""
+    """Keep the collector off the half million nodes of the code, and drop them before the next tests."""
     gc.disable()
     yield
     sources.cache_clear()
@@ -70,22 +70,22 @@ def _code_is_no_garbage() -> Iterator[None]:
 
 
 def digest_of(stage: str, code: Sources) -> str:
-    """Hash of all code that the stage reaches."""
+    """Return a hash of all code that the stage reaches."""
     return code.digest(closure_of(stage, code))
 
 
 def closure_of(stage: str, code: Sources) -> set[Target]:
-    """Every definition that decides what the stage writes."""
+    """Return every definition that affects the output of the stage."""
     return code.closure([*ROOTS[stage], *(OF_RUNS if stage != ingest_command.STAGE else ())], BARRIERS)
 
 
 def record() -> dict[str, dict[str, int | str]]:
-    """Version and digest of every stage, as the code is."""
+    """Return version and digest of every stage for the current code."""
     return {stage: {"version": VERSIONS[stage], "digest": digest_of(stage, sources())} for stage in sorted(VERSIONS)}
 
 
-def test_an_edited_constant_concerns_the_stages_that_reach_it() -> None:
-    """Every stage is watched; how many dead pixels are filled in matters to those that show fields to the model."""
+def test_an_edited_constant_changes_the_stages_that_reach_it() -> None:
+    """MOST_DEAD, for the filling of dead pixels, changes the stages that run the model and no others."""
     assert set(ROOTS) == set(VERSIONS)
     module, name = sources().named("MOST_DEAD")
     texts = read_packages(ROOT)
@@ -97,8 +97,8 @@ def test_an_edited_constant_concerns_the_stages_that_reach_it() -> None:
 
 
 @pytest.mark.parametrize("stage", sorted(VERSIONS))
-def test_code_changed_means_version_raised(stage: str) -> None:
-    """The code behind each stage is the code that its version was recorded for."""
+def test_stage_code_matches_its_recorded_version(stage: str) -> None:
+    """Changed code needs a raised version or a new record."""
     recorded = json.loads(RECORD.read_text())[stage]
     now = {"version": VERSIONS[stage], "digest": digest_of(stage, sources())}
     assert now == recorded, (
@@ -106,8 +106,8 @@ def test_code_changed_means_version_raised(stage: str) -> None:
     )
 
 
-def test_every_barrier_stands_in_a_way() -> None:
-    """A barrier that no stage meets any more goes."""
+def test_every_barrier_is_reached() -> None:
+    """Barriers that no stage reaches must be removed."""
     named = {to for stage in ROOTS for target in closure_of(stage, sources()) for to in sources().names(target)}
     assert {sources().named(barrier) for barrier in BARRIERS} <= named
 
@@ -122,13 +122,13 @@ def test_every_barrier_stands_in_a_way() -> None:
         "rectify": ("mosaic_tile", "LineCache", "MosaicWriter"),
     }.items(),
 )
-def test_code_is_watched_however_it_is_reached(stage: str, names: tuple[str, ...]) -> None:
-    """What a stage calls through others is part of its code: the model's inside, the rig's drivers."""
+def test_indirectly_called_code_belongs_to_a_stage(stage: str, names: tuple[str, ...]) -> None:
+    """The inside of the model and the drivers of the rig are examples."""
     assert {sources().named(name) for name in names} <= closure_of(stage, sources())
 
 
-def test_words_beside_the_code_concern_no_stage() -> None:
-    """Docstrings and comments may come and change."""
+def test_comments_and_docstrings_change_no_digest() -> None:
+    """Other docstrings and a new comment leave the digest of segment as it was."""
     module, _ = sources().named("Segmenter")
     text = read_packages(ROOT)[module]
     reworded = sources().edited(module, "# A comment.\n" + re.sub(r'"""\w+ ', '"""Hand over ', text))
@@ -136,8 +136,8 @@ def test_words_beside_the_code_concern_no_stage() -> None:
 
 
 @pytest.mark.parametrize("absent", [("condense_raster", "rectify"), ("rectify", "rectify_fine")])
-def test_every_stage_says_once_what_receipts_call_its_store(absent: tuple[str, ...]) -> None:
-    """No two stages share a name in receipts, but for the mosaics of the first pass and of both passes."""
+def test_store_names_in_receipts_are_unique(absent: tuple[str, ...]) -> None:
+    """The exception is the mosaic of the first pass and that of both passes, so each case leaves out one of them."""
     ran = [one for name, one in STAGES.items() if name not in absent]
     named = [one.addresses(StageRef(one.product.name, "abc", Path())) for one in ran]
     assert all(named)
@@ -145,8 +145,8 @@ def test_every_stage_says_once_what_receipts_call_its_store(absent: tuple[str, .
 
 
 @pytest.mark.parametrize("name", STAGES)
-def test_a_survey_has_what_its_stages_need(name: str) -> None:
-    """Each name behind the star of a stage is an attribute of a run, or a setting."""
+def test_a_survey_has_the_arguments_of_its_stages(name: str) -> None:
+    """Each keyword argument of a stage is an attribute of a run or a setting."""
     run, settings = ({*dir(kind), *kind.__dataclass_fields__} for kind in (SurveyRun, Settings))
     assert set(needs_of(STAGES[name].wants)) <= run | settings
 

@@ -1,4 +1,4 @@
-"""What a survey leaves in an archive: raw lines once, the same stores by processes, and after lines were lost."""
+"""The stores of a survey in an archive: raw lines once, equal stores from processes, and cleared inputs."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ from storage.arrays.cubes import open_raw_cube
 from tests.conftest import QUIET, Survey
 
 
-def test_a_store_of_an_input_that_was_cleared_meanwhile_is_not_published(tmp_path: Path) -> None:
-    """What a survey beside it cleared reads as nodata, so the store would hold wrong numbers."""
+def test_a_store_whose_input_was_cleared_meanwhile_is_not_published(tmp_path: Path) -> None:
+    """Lines that another survey cleared read as nodata, so the store would hold wrong values."""
     archive, product = Archive.open(tmp_path / "archive", create=True), Product("rectify", 1)
     given, _ = archive.produce("capture", lambda folder: (folder / "a").write_text("a") and None, version=1, params={})
     one = Stage("rectify", "", product, lambda: None, None, 0, None)  # type: ignore[arg-type, return-value]
@@ -44,8 +44,8 @@ def test_a_store_of_an_input_that_was_cleared_meanwhile_is_not_published(tmp_pat
 
 @pytest.mark.parametrize("order", [(1.0, 16.0), (16.0, 1.0)], ids=["short pass first", "long pass first"])
 @pytest.mark.parametrize("dark", [0, 5])
-def test_few_bands_are_kept_in_the_steps_of_the_longest_exposure(order: tuple[float, float], dark: int) -> None:
-    """One number of a long exposure is a smaller scene value than one of a short: no pass loses a number.
+def test_few_bands_are_stored_in_steps_of_the_longest_exposure(order: tuple[float, float], dark: int) -> None:
+    """One DN of a long exposure is a smaller scene value than one of a short exposure, so no pass loses a DN.
 
     Bands without light do not count.
     """
@@ -59,8 +59,8 @@ def test_few_bands_are_kept_in_the_steps_of_the_longest_exposure(order: tuple[fl
 
 
 @pytest.mark.usefixtures("no_effects")
-def test_what_a_run_names_that_another_survey_published_meanwhile_stays(tmp_path: Path) -> None:
-    """Raw lines that it keeps, and the mosaic of a first pass to which it adds no second one."""
+def test_stores_of_another_run_are_not_cleared(tmp_path: Path) -> None:
+    """Another survey kept these raw lines and published the first pass's mosaic without a second pass."""
     np.save(tmp_path / "nothing.npy", np.zeros((96, 96), np.float32))
     bands = ",".join(map(str, range(5, 265, 40)))
     given: dict[str, Any] = {"scene": "farm", "size": (96, 96), "bands": bands, "out": str(tmp_path / "archive")}
@@ -78,17 +78,17 @@ def test_what_a_run_names_that_another_survey_published_meanwhile_stays(tmp_path
 
 
 def _arrays(root: Path) -> Iterator[tuple[Path, zarr.Array[Any]]]:
-    """Every array of every store, with its folder."""
+    """Yield the folder of every array of every store, and the array."""
     for about in sorted((root / "stages").rglob("zarr.json")):
         if json.loads(about.read_text())["node_type"] == "array":
             yield about.parent, zarr.open_array(about.parent, mode="r")
 
 
 @pytest.mark.usefixtures("no_effects")
-def test_raw_is_stored_once_and_as_uint16(tmp_path: Path) -> None:
-    """Every captured line is in one array, and under no other name; no spool is left; what is derived is smaller."""
+def test_raw_lines_are_stored_once_and_as_uint16(tmp_path: Path) -> None:
+    """Every captured line is in one array, under one name; the spool is empty; derived arrays are smaller."""
     flags = {"scene": "farm", "size": "192x160", "engine": "plain", "controls": False, "budget": "0.95", "keep": "raw"}
-    bands, root = ",".join(map(str, range(5, 265, 10))), tmp_path / "archive"  # as many as light with a spectrum needs
+    bands, root = ",".join(map(str, range(5, 265, 10))), tmp_path / "archive"  # as many as a spectrum of light needs
     published = run_survey(load_settings(None, {**flags, "bands": bands, "out": str(root)}), QUIET)
     arrays = list(_arrays(root))
     named = [getattr(array.metadata, "dimension_names", None) or () for _, array in arrays]
@@ -101,7 +101,7 @@ def test_raw_is_stored_once_and_as_uint16(tmp_path: Path) -> None:
     assert [path for path in (root / "spool").rglob("*") if path.is_file()] == []
     raw = {path for path, _ in by_line}
     assert not [path for path, array in arrays if array.dtype == np.uint16 and path not in raw]
-    for kind in ("condense", "condense_fine", "rectify_fine"):  # no derived array has every band of a pixel
+    for kind in ("condense", "condense_fine", "rectify_fine"):  # no derived array has all bands of a pixel
         scores = [array for path, array in arrays if path.match(f"stages/{kind}/*/*.zarr/scores")]
         assert scores, kind
         assert all(array.shape[0] < by_line[0][1].shape[2] for array in scores), kind
@@ -113,7 +113,7 @@ def test_raw_is_stored_once_and_as_uint16(tmp_path: Path) -> None:
 
 
 def test_processes_make_the_same_archive(tmp_path: Path, survey_png: Survey, surveyed_png: Survey) -> None:
-    """A whole survey by two processes publishes the same keys and bytes as one by threads; then xarray reads them."""
+    """A survey with two processes writes the same keys and bytes as one with threads, and xarray opens the map."""
     roots = tmp_path / "threads", tmp_path / "processes"
     surveyed_png(roots[0])
     survey_png(roots[1], scheduler="processes", workers=2)
@@ -121,7 +121,7 @@ def test_processes_make_the_same_archive(tmp_path: Path, survey_png: Survey, sur
         {
             path.relative_to(root): hashlib.sha256(path.read_bytes()).hexdigest()
             for path in (root / "stages").rglob("*")
-            if path.is_file() and path.name != "manifest.json"  # times
+            if path.is_file() and path.name != "manifest.json"  # has times
         }
         for root in roots
     ]

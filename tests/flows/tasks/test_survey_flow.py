@@ -1,4 +1,4 @@
-"""The flow of a survey: the order of its steps, its parameters, and what Prefect's pages show of it."""
+"""The flow of a survey: the order of its steps, its parameters, and its display in Prefect."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ from tests.flows.conftest import act_instead, newest_run
 from tests.prior_work import with_effects
 
 pytestmark = pytest.mark.usefixtures("no_effects")
-NARROW: dict[str, Any] = {"camera.samples": 160}  # few beside the field
+NARROW: dict[str, Any] = {"camera.samples": 160}  # few outside of the field
 
 
 class UnmadeRef(StageRef):
-    """Address of a store that nobody made: it has no key."""
+    """Address of a store that does not exist: it has no key."""
 
     uri = ""
 
     def __getattribute__(self, name: str) -> Any:
-        """Refuse the key."""
+        """Raise for the key."""
         if name == "key":
             raise IncompleteStoreError("it was not made")
         return super().__getattribute__(name)
 
 
 class Noted:
-    """An opened survey of an empty archive that notes which stage is asked for with which inputs."""
+    """Open survey of an empty archive that records the inputs of each requested stage."""
 
     capture_deployment = None
     run = SimpleNamespace(archive=SimpleNamespace(ref=UnmadeRef, is_there=lambda uri: True))
@@ -62,21 +62,21 @@ class Noted:
         return not self.uniform
 
     def __call__(self, stage: str, *inputs: StageRef) -> StageRef:
-        """Note the names of the stages that left the inputs."""
+        """Record the names of the stages that wrote the inputs."""
         self.steps[stage] = [ref.stage for ref in inputs]
         self.products[stage] = UnmadeRef(stage, "", Path())
         return self.products[stage]
 
 
 def steps(**facts: bool) -> dict[str, list[str]]:
-    """Stages of a survey in their order, each with those that it is made of."""
+    """Return the stages of a survey in order, each with its input stages."""
     noted: Any = Noted(**facts)
     draw_class_map(noted)
     return dict(noted.steps)
 
 
-def test_a_survey_that_zooms_captures_again() -> None:
-    """Later lines follow from the plan, are condensed with the first ones, and the map is drawn of all of them."""
+def test_a_zoomed_survey_captures_again() -> None:
+    """Requested lines follow from the plan and are condensed with the first ones; the map uses both passes."""
     found = steps()
     assert list(found) == [
         *("choose_effects", "capture_coarse", "condense_coarse", "locate", "rectify", "score"),
@@ -89,15 +89,15 @@ def test_a_survey_that_zooms_captures_again() -> None:
 
 
 def test_a_uniform_scan_has_no_second_pass() -> None:
-    """The map is drawn of the one scan's mosaic."""
+    """The map is made from the mosaic of the one scan."""
     found = steps(uniform=True)
     assert not [name for name in found if name.endswith("_fine")]
     assert found["segment"] == ["rectify", "score"]
 
 
 @pytest.mark.parametrize(("uniform", "passes"), [(True, ["coarse"]), (False, ["coarse", "fine"])])
-def test_a_mosaic_is_placed_by_the_registration_of_its_own_pass(uniform: bool, passes: list[str]) -> None:
-    """What was found of the other pass's pointing has no part in it."""
+def test_a_mosaic_uses_the_registration_of_its_own_pass(uniform: bool, passes: list[str]) -> None:
+    """The registration of the other pass is no input of it."""
     found = steps(registers=True, uniform=uniform)
     assert [name for name in found if name.startswith("register")] == [f"register_{one}" for one in passes]
     assert found["locate"] == ["condense_coarse", "register_coarse"]
@@ -105,13 +105,13 @@ def test_a_mosaic_is_placed_by_the_registration_of_its_own_pass(uniform: bool, p
     assert found.get("rectify_fine") == (None if uniform else ["condense_fine", "register_fine"])
 
 
-def test_a_posed_survey_is_drawn_on_the_ground() -> None:
-    """The map on the ground is made of the class map and the mosaic."""
+def test_a_survey_with_a_pose_has_a_ground_map() -> None:
+    """The ground map is made from the class map and the mosaic."""
     assert steps(on_the_ground=True)["ground"] == ["segment", "rectify_fine"]
 
 
 def test_a_raster_is_neither_captured_nor_rectified() -> None:
-    """Its own pixels take the place of capture, geolocation grid and mosaic."""
+    """Its own pixels replace capture, geolocation grid and mosaic."""
     assert list(steps(is_map=True)) == ["condense_raster", "score", "segment"]
 
 
@@ -127,7 +127,7 @@ SETTINGS = [
 
 @pytest.mark.parametrize("given", SETTINGS)
 def test_parameters_are_the_settings(given: dict[str, object]) -> None:
-    """What a server keeps of a run's parameters asks for the same settings, with absolute paths."""
+    """Parameters stored by a server give the same settings, with absolute paths."""
     settings = load_settings(None, given)
     parameters = SurveySettings.of(settings)
     assert parameters.settings() is settings
@@ -139,27 +139,27 @@ def test_parameters_are_the_settings(given: dict[str, object]) -> None:
 
 
 def test_a_password_is_no_parameter() -> None:
-    """A server keeps the parameters of its runs."""
+    """A server stores the parameters of its runs, so the password is left out and refused."""
     settings = load_settings(None, {"source": "rig", "rig.password": "secret-4711"})
     assert "secret-4711" not in SurveySettings.of(settings).model_dump_json()
     with pytest.raises(ValidationError, match=r"rig\.password"):
         SurveySettings(rig={"password": "secret-4711"})
 
 
-def test_the_rig_of_a_pass_is_that_of_its_own_machine(tmp_path: Path) -> None:
-    """Ports and passwords stand in a file there; all else is what the survey asks for."""
+def test_a_capture_uses_the_rig_of_its_own_machine(tmp_path: Path) -> None:
+    """Ports and passwords come from a file there, all else from the survey; a contradiction is refused."""
     (tmp_path / "rig.toml").write_text('[rig]\nport = "/dev/ttyRIG"\npassword = "secret-4711"\n')
     asked = SurveySettings(source="rig", scene="field", size="64x64", wavelengths="500,600", seconds=5)
     here = asked.with_rig_of(str(tmp_path / "rig.toml")).settings()
     assert (here.rig.port, here.rig.password) == ("/dev/ttyRIG", "secret-4711")
     assert replace(here, rig=asked.settings().rig) == asked.settings()
-    (tmp_path / "rig.toml").write_text("[rig]\nwhite_reference = 0.99\n")  # else the survey looks for other lines
+    (tmp_path / "rig.toml").write_text("[rig]\nwhite_reference = 0.99\n")  # else the survey expects other lines
     with pytest.raises(SettingsError, match=r"rig.white_reference is 0.99 in .*rig.toml and 1.0 in the .* survey"):
         asked.with_rig_of(str(tmp_path / "rig.toml"))
 
 
 def test_a_wrong_parameter_is_refused_with_the_message_of_the_command_line() -> None:
-    """Before a run is begun."""
+    """The error comes before a run begins."""
     with pytest.raises(ValidationError, match="fraction of the full scan's seconds, above 0 and at most 1, got 3"):
         SurveySettings(budget=3)
     with pytest.raises(ValidationError, match=r"unknown setting .*did you mean 'budget'"):
@@ -168,13 +168,13 @@ def test_a_wrong_parameter_is_refused_with_the_message_of_the_command_line() -> 
 
 @pytest.mark.parametrize(("sweeps", "inputs"), [("fine", None), ("coarse", ["rectify/0123"])])
 def test_wrong_inputs_of_a_pass_are_refused(field_file: Any, sweeps: str, inputs: list[str] | None) -> None:
-    """Of a pass on its own, as a deployment runs it."""
+    """The capture runs on its own, as a deployment does."""
     with pytest.raises(SettingsError, match=r"inputs = .*: expected addresses stages/STAGE/KEY of stores"):
         capture.fn(SurveySettings(settings_file=str(field_file())), sweeps=sweeps, inputs=inputs)
 
 
 def test_every_setting_is_a_described_field_of_the_form() -> None:
-    """Prefect makes its form of the flow's parameters."""
+    """Prefect makes its form from the parameters of the flow."""
     from flows.settings.load import SURVEY
 
     schema = survey_flow.survey.parameters.definitions["SurveySettings"]["properties"]
@@ -183,12 +183,12 @@ def test_every_setting_is_a_described_field_of_the_form() -> None:
 
 
 def test_prefect_makes_the_stores_of_plain(survey_png: Any, surveyed_png: Any, tmp_path: Path, server: str) -> None:
-    """Keys, savings and accuracy are those of plain; tasks have the edges, logs and artifacts of the mission."""
+    """Keys, savings and accuracy are equal; tasks have their edges, logs and artifacts."""
     from prefect.client.orchestration import get_client
     from prefect.client.schemas.filters import ArtifactFilter, ArtifactFilterFlowRunId, LogFilter, LogFilterFlowRunId
     from prefect.logging.handlers import APILogHandler
 
-    with with_effects():  # as the other has them
+    with with_effects():  # the plain survey has them too
         flow = survey_png(tmp_path / "flow", engine="prefect").receipt
     plain = surveyed_png(tmp_path / "plain").receipt
     assert [stage["key"] for stage in flow["stages"]] == [stage["key"] for stage in plain["stages"]]
@@ -220,29 +220,29 @@ STEPS = ("plan_capture", "publish", "add_accuracy", "clear_raw")
 
 
 def edges(tasks: dict[str, Any], name: str) -> set[str]:
-    """Names of the tasks that a task got something from."""
+    """Return the names of the tasks from which a task got an input."""
     by_id = {one.id: key.removesuffix("-scene") for key, one in tasks.items()}
     given = (one for some in tasks[f"{name}-scene"].task_inputs.values() for one in some)
     return {by_id[one.id] for one in given if hasattr(one, "id")}
 
 
 def prefect_variables() -> dict[str, str]:
-    """The settings of Prefect in the environment; other libraries set theirs when they are imported."""
+    """Return Prefect's settings in the environment; other libraries set theirs on import."""
     return {name: value for name, value in os.environ.items() if name.startswith("PREFECT")}
 
 
 def opened_surveys() -> set[int]:
-    """The scenes and grids that are in memory."""
+    """Return the ids of the survey runs in memory."""
     gc.collect()
     return {id(one) for one in gc.get_objects() if type(one) is SurveyRun}
 
 
 def test_a_survey_has_a_server_of_its_own(survey_png: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its files lie in the archive, and nothing of it is left in the environment."""
+    """The server's files are in the archive, and the environment is unchanged afterwards."""
     monkeypatch.delenv("PREFECT_API_URL", raising=False)
     before, opened = prefect_variables(), opened_surveys()
     survey_png(tmp_path, engine="prefect", **NARROW)
-    assert opened_surveys() <= opened  # nothing of it stays in memory
+    assert opened_surveys() <= opened  # no run stays in memory
     assert (tmp_path / ".prefect" / "prefect.db").exists()
     assert prefect_variables() == before
 
@@ -250,15 +250,15 @@ def test_a_survey_has_a_server_of_its_own(survey_png: Any, tmp_path: Path, monke
 def test_without_a_server_the_survey_runs_plain(
     survey_png: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """One line says that a server cannot start, and the survey runs without it."""
+    """The server cannot start, and every stage runs without it."""
     refuse = Mock(side_effect=ServerUnavailable("the Prefect server did not start (no port)"))
     monkeypatch.setattr(survey_command, "_prefect_server", refuse)
     found = survey_png(tmp_path, engine="prefect", **NARROW).receipt
     assert {stage["state"] for stage in found["stages"]} == {"ran"}
 
 
-def test_a_named_server_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is named, with its address."""
+def test_a_named_server_that_does_not_answer_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The message has its address."""
     monkeypatch.setenv("PREFECT_API_URL", "http://127.0.0.1:9/api")
     with pytest.raises(ServerUnavailable, match=r"no Prefect server answers at http://127\.0\.0\.1:9/api"):  # noqa: SIM117
         with survey_command._prefect_server("x"):
@@ -266,7 +266,7 @@ def test_a_named_server_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_sigterm_in_a_stage(field_file: Any, server: str, monkeypatch: pytest.MonkeyPatch, command_line: Any) -> None:
-    """143 and one sentence, whatever Prefect makes of it; the same command continues."""
+    """SIGTERM gives exit code 143 and one sentence, despite Prefect's own handling; the same command resumes."""
     real, file = STAGES["rectify"], field_file()
 
     def terminated(*given: Any) -> None:

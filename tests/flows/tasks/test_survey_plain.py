@@ -1,4 +1,4 @@
-"""The whole survey on the plain engine: receipt, stores as a stranger opens them, report, and pixels of no value."""
+"""A whole survey on the plain engine: receipt, stores read with plain xarray, report, and pixels without a value."""
 
 from __future__ import annotations
 
@@ -49,29 +49,29 @@ FARM = (128, 192)
 
 @dataclass(frozen=True)
 class Done:
-    """A survey and the archive that it left."""
+    """Survey and its archive."""
 
     published: Published
     archive: Path
 
     @property
     def receipt(self) -> Any:
-        """The receipt."""
+        """Return the receipt."""
         return self.published.receipt
 
     def open(self, product: str) -> xr.Dataset:
-        """A product as a stranger opens it: plain xarray, nothing of this project."""
+        """Return a product, opened with plain xarray and no code of this project."""
         return xr.open_zarr(self.archive / self.receipt["products"][product], consolidated=False)
 
     def sweeps(self) -> list[xr.Dataset]:
-        """Every condensed sweep."""
+        """Return all condensed sweeps."""
         found = sorted((self.archive / self.receipt["products"]["signal_fine"]).glob("*.zarr"))
         return [xr.open_zarr(path, consolidated=False) for path in found]
 
 
 @pytest.fixture(scope="module")
 def farm(tmp_path_factory: pytest.TempPathFactory) -> Done:
-    """The built-in scene, small, with the weights that are shipped and with controls."""
+    """Return a survey of a small built-in farm with the shipped weights and controls."""
     out = tmp_path_factory.mktemp("farm")
     size = {"size": f"{FARM[1]}x{FARM[0]}", "bands": FEW_BANDS}
     flags = {**size, "budget": "0.9", "engine": "plain", "out": str(out), "seed": "1"}
@@ -79,7 +79,7 @@ def farm(tmp_path_factory: pytest.TempPathFactory) -> Done:
 
 
 def test_receipt_has_every_field(farm: Done) -> None:
-    """The built-in scene's receipt is whole: stages in order, all ran, accuracy with controls, effects."""
+    """The stages are in order and all ran; accuracy has controls, and effects stay within the tolerance of 0.1."""
     receipt = check_receipt(farm.receipt)
     states = {stage["name"]: stage["state"] for stage in receipt["stages"]}
     assert states == dict.fromkeys(STAGES, "ran")
@@ -87,7 +87,7 @@ def test_receipt_has_every_field(farm: Done) -> None:
     assert all(stage["wall_s"] > 0 and stage["peak_rss_bytes"] > 0 for stage in ran)
     for stage in ran:
         (manifest,) = farm.archive.glob(f"stages/*/{stage['key']}/manifest.json")
-        if stage["name"] not in ("capture_coarse", "capture_fine", "rectify"):  # cleared away since
+        if stage["name"] not in ("capture_coarse", "capture_fine", "rectify"):  # these are cleared by now
             assert stage["manifest_sha256"] == hashlib.sha256(manifest.read_bytes()).hexdigest()
     assert set(receipt["accuracy"]["controls"]) == {"gain", "entropy", "sobel", "random"}
     assert 0 <= receipt["accuracy"]["miou"] <= 1
@@ -96,8 +96,8 @@ def test_receipt_has_every_field(farm: Done) -> None:
     assert 0 < farm.published.captured_again < 1
 
 
-def test_all_maps_of_a_receipt_are_judged_over_the_classes_of_the_truth(farm: Done) -> None:
-    """This map, none and all have an IoU for the same classes and null for the others, in the store as well."""
+def test_all_maps_of_a_receipt_have_iou_for_the_classes_of_the_labels(farm: Done) -> None:
+    """This map, none and all have null for the other classes, and the stored file has no NaN."""
     accuracy: Any = farm.receipt["accuracy"]
     (stored,) = farm.archive.glob("stages/evaluate/*/accuracy.json")
     assert "NaN" not in stored.read_text()
@@ -111,7 +111,7 @@ def test_all_maps_of_a_receipt_are_judged_over_the_classes_of_the_truth(farm: Do
 
 
 def test_savings_add_up_and_ranks_follow_the_scores(farm: Done) -> None:
-    """Ratios are done over full and capture keeps the budget; of captured patches scores fall with the rank."""
+    """Ratios are done over full and the capture keeps its budget; scores of chosen patches fall with their rank."""
     savings = farm.receipt["savings"]
     for name, entry in savings.items():
         assert entry["ratio"] == pytest.approx(entry["done"] / entry["full"]), name
@@ -128,8 +128,8 @@ def test_savings_add_up_and_ranks_follow_the_scores(farm: Done) -> None:
     assert (np.diff(score[ordered]) <= 0).all()
 
 
-def test_savings_are_those_of_the_stored_cubes(farm: Done) -> None:
-    """Lines, samples on the scene and bytes are the cubes'; seconds are the cost model's price of either pass."""
+def test_savings_match_the_stored_cubes(farm: Done) -> None:
+    """Lines, samples on the scene and bytes come from the cubes; seconds are the cost model's for both passes."""
     savings, cubes = farm.receipt["savings"], farm.sweeps()
     shape = tuple(farm.open("class_map").sizes[axis] for axis in ("y", "x"))
     sweeps = [Sweep(**cube.attrs["sweep"]) for cube in cubes]
@@ -144,7 +144,7 @@ def test_savings_are_those_of_the_stored_cubes(farm: Done) -> None:
 
 
 def test_second_run_is_read_from_the_archive(survey_png: Any, surveyed_png: Any, tmp_path: Path) -> None:
-    """The same command again runs no stage, gives the same products, and publishes a run of its own."""
+    """The same command runs no stage, gives the same products, and publishes another run."""
     first, second = surveyed_png(tmp_path).receipt, survey_png(tmp_path).receipt
     states = [stage["state"] for stage in second["stages"] if stage["name"] in STAGES]
     assert states == ["cached"] * len(STAGES)
@@ -156,8 +156,8 @@ def test_second_run_is_read_from_the_archive(survey_png: Any, surveyed_png: Any,
     assert {path.name for some in cleared for path in tmp_path.glob(some)} == {"manifest.json"}
 
 
-def test_a_first_mosaic_that_another_run_publishes_stays(survey_png: Any, tmp_path: Path) -> None:
-    """A survey of the first pass alone has it as its mosaic; a longer one in the same archive leaves it there."""
+def test_a_first_mosaic_of_another_run_is_kept(survey_png: Any, tmp_path: Path) -> None:
+    """A survey of the first pass alone publishes it; a longer survey in the same archive does not clear it."""
     alone = Done(survey_png(tmp_path, budget="0.45"), tmp_path)
     survey_png(tmp_path)
     assert np.isfinite(alone.open("mosaic")["scores"].values).all()
@@ -167,7 +167,7 @@ def test_a_first_mosaic_that_another_run_publishes_stays(survey_png: Any, tmp_pa
 
 @pytest.mark.usefixtures("no_effects")
 def test_without_later_lines_the_first_pass_is_read_in_full(survey_png: Any, weights: Path, tmp_path: Path) -> None:
-    """A budget that pays for the first pass alone gives the map of a uniform scan of these lines."""
+    """A budget for the first pass alone gives the map of a uniform scan of these lines."""
     said = Console(file=io.StringIO(), width=400)
     done = Done(survey_png(tmp_path, said, budget="0.45"), tmp_path)
     assert "note: no second pass: no " in said.file.getvalue()
@@ -183,7 +183,7 @@ def test_without_later_lines_the_first_pass_is_read_in_full(survey_png: Any, wei
 
 
 @pytest.mark.usefixtures("no_effects")
-def test_what_is_not_judged_is_left_out(surveyed_png: Any, survey_png: Any, scene_files: Path, tmp_path: Path) -> None:
+def test_uncomputed_scores_are_left_out(surveyed_png: Any, survey_png: Any, scene_files: Path, tmp_path: Path) -> None:
     """Without controls the map alone is judged; without labels there is no accuracy."""
     accuracy = surveyed_png(tmp_path / "picture").receipt["accuracy"]
     assert accuracy["controls"] == {}
@@ -198,8 +198,8 @@ def test_what_is_not_judged_is_left_out(surveyed_png: Any, survey_png: Any, scen
     assert stored.tolist() == [float(word) for word in nm.split(",")]
 
 
-def test_products_are_where_the_receipt_says_and_open_from_disk(farm: Done) -> None:
-    """Addresses are relative; the report asks the network for nothing; the quicklook is of useful size."""
+def test_products_exist_at_their_addresses(farm: Done) -> None:
+    """Addresses are relative, the report loads nothing from the network, and the quicklook has at least 600 px."""
     for name, address in farm.receipt["products"].items():
         assert (farm.archive / address).exists(), name
     assert (farm.published.folder / "receipt.json").read_text().startswith('{\n  "survey": "farm"')
@@ -223,7 +223,7 @@ GAP = np.s_[20:31, 40:60]  # of 64 x 96 px
 
 
 def _scene(folder: Path, fill: float | None, toml: str = "") -> Path:
-    """A scene with a hole of ``fill``, labels beside it; whole where ``fill`` is None."""
+    """Write a scene with a hole of value ``fill``, or without a hole if it is None, and its labels."""
     folder.mkdir()
     values, labels = patchy_scene((64, 96), 3, seed=4)
     if fill is not None:
@@ -244,8 +244,8 @@ def _map(survey: Any, scene: Path) -> ClassMap:
 
 
 @pytest.mark.usefixtures("no_effects")
-def test_no_data_neither_darkens_nor_becomes_a_class(survey_png: Any, tmp_path: Path) -> None:
-    """The hole alone has none, the rest of the field is as light as without it, and the receipt counts the pixels."""
+def test_nodata_has_no_class_and_does_not_darken(survey_png: Any, tmp_path: Path) -> None:
+    """The hole alone is nodata, over 90 % of the other classes stay, and the receipt counts the pixels."""
     stated, whole = _scene(tmp_path / "stated", 1e30, "nodata = 1e30"), _scene(tmp_path / "whole", None)
     one, plain = (_survey(survey_png, scene) for scene in (stated, whole))
     drawn = _map(one, stated)
@@ -257,11 +257,11 @@ def test_no_data_neither_darkens_nor_becomes_a_class(survey_png: Any, tmp_path: 
     assert one.receipt["pixels"] == {"scene_without_a_value": count, "px_no_reading": 0, "map_without_a_class": count}
     assert one.receipt["accuracy"]["pixels"] == 64 * 96 - count
     assert "pixels" not in plain.receipt
-    assert (_map(plain, whole).classes == drawn.classes)[~gap].mean() > 0.9  # light is what it was
+    assert (_map(plain, whole).classes == drawn.classes)[~gap].mean() > 0.9  # the brightness is unchanged
 
 
-def test_no_data_that_nobody_stated_ends_a_survey(survey_png: Any, tmp_path: Path) -> None:
-    """In one message with its place, before anything is captured."""
+def test_undeclared_nodata_ends_a_survey(survey_png: Any, tmp_path: Path) -> None:
+    """One message gives its place, before anything is captured."""
     scene = _scene(tmp_path / "s", 1e30)
     said = r"scene.npy has 1e\+30 at y 20, x 40, band 0, .* write nodata = 1e\+30 into a"
     with pytest.raises(SceneError, match=said):
@@ -270,8 +270,8 @@ def test_no_data_that_nobody_stated_ends_a_survey(survey_png: Any, tmp_path: Pat
 
 
 @pytest.mark.usefixtures("no_effects")
-def test_readings_that_the_weights_cannot_take_are_counted(survey_png: Any, tmp_path: Path) -> None:
-    """Weights for numbers a million times smaller: no pixel can be read or gets a class, which the receipt says."""
+def test_pixels_out_of_the_range_of_the_weights_are_counted(survey_png: Any, tmp_path: Path) -> None:
+    """These weights are for values a million times smaller, so no pixel gets a class, and the receipt says so."""
     weights = random_weights(RGB_NM, CLASSES)
     small = replace(weights.normalisation, centre=np.zeros(3, np.float32), spread=np.full(3, 1e-4, np.float32))
     save_weights(replace(weights, normalisation=small), tmp_path / "w.safetensors")
@@ -285,7 +285,7 @@ def test_readings_that_the_weights_cannot_take_are_counted(survey_png: Any, tmp_
 
 
 def test_two_passes_share_components_of_rare_spectra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rare spectra of both passes add components; then both passes are written again by all of them."""
+    """Rare spectra of both passes add components, and both passes are then stored with all components."""
     grown: list[list[int]] = []
 
     def watched(components: Components, residuals: Any, false_alarm: float) -> Components:

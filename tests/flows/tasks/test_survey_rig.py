@@ -1,4 +1,4 @@
-"""A survey through an emulated rig: the class map of the simulated source, and bad input told in one message."""
+"""A survey through an emulated rig: it gives the class map of the simulated source, and bad input gets one message."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ SMALL: dict[str, Any] = {
 
 
 def small_settings(out: Path, **changed: Any) -> Settings:
-    """Settings of a tiny survey; the port is of this process, as two tests may look through rigs at a time."""
+    """Return settings of a tiny survey; the port names this process, as two tests may use rigs at the same time."""
     return load_settings(None, {**SMALL, "rig.port": f"rig-{os.getpid()}", "out": str(out), **changed})
 
 
@@ -62,7 +62,7 @@ def small_settings(out: Path, **changed: Any) -> Settings:
 def emulated(
     settings: Settings, effects: Any, patch: pytest.MonkeyPatch, *, scene: RasterScene | None = None
 ) -> Iterator[FaultyRig]:
-    """Devices of surveys are emulated ones before a scene, the settings' by default, with effects."""
+    """Yield an emulated rig, with effects, as the devices of surveys; its scene is that of the settings by default."""
     seen = open_scene(settings)[0] if scene is None else scene
     source = replace(make_source(seen, settings), chosen=effects)
     whole = FaultyRig(source, ManualClock(10.0), wired=settings.rig.pulses)
@@ -76,24 +76,24 @@ def emulated(
 
 
 def coarse_captures(rig: EmulatedRig) -> int:
-    """How often the camera was told to take coarse lines."""
+    """Return the number of capture commands for coarse lines that the camera received."""
     return sum(said.startswith("capture(") and "coarse" in said for said in rig.camera.commands)
 
 
 def class_map_of(published: Published, out: Path) -> np.ndarray[Any, Any]:
-    """The survey's map, (y, x)."""
+    """Return the classes of the survey's map, (y, x)."""
     classes = load_class_map(out / published.receipt["products"]["class_map"]).classes
     return np.asarray(classes)
 
 
 def arrays_of(archive: Path, published: Published, product: str) -> dict[str, bytes]:
-    """The numbers of a store's arrays, by name, read with zarr alone."""
+    """Return the bytes of a store's arrays by name, read with zarr alone."""
     group = zarr.open_group(archive / published.receipt["products"][product], mode="r")
     return {name: np.asarray(array[...]).tobytes() for name, array in group.arrays()}
 
 
 def rows_of(archive: Path, published: Published) -> dict[str, Any]:
-    """Numbers of all lines of a survey, by stage and sweep."""
+    """Return the values of all lines of a survey, by stage and sweep."""
     found = {}
     for name, folder in published.receipt["products"].items():
         for path in sorted((archive / folder).glob("*.zarr")) if name.startswith("raw_") else ():
@@ -104,9 +104,9 @@ def rows_of(archive: Path, published: Published) -> dict[str, Any]:
     return found
 
 
-def test_every_line_is_the_simulated_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By Prefect: coarse sweep, attention, plan and fine sweeps give each line of the simulated survey, and its map."""
-    with without_effects():  # but for those that it names
+def test_the_rig_gives_the_lines_of_the_simulation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A survey by Prefect has equal raw lines in coarse and fine sweeps, equal mosaic and equal class map."""
+    with without_effects():  # except those that it names
         simulated = run_survey(small_settings(tmp_path / "sim", visit="first", keep="raw"), QUIET)
     effects = chosen_effects(next(ref for ref in Archive.open(tmp_path / "sim").refs("effects")))
     settings = small_settings(tmp_path / "rig", source="rig", visit="first", engine="prefect", keep="raw")
@@ -124,16 +124,16 @@ def test_every_line_is_the_simulated_one(tmp_path: Path, monkeypatch: pytest.Mon
         assert rig == sim, product
 
 
-def test_a_mounting_that_does_not_reach_the_field_is_refused_first(tmp_path: Path) -> None:
-    """Before anything moves: the mirror's rest lies where its range ends before the field does."""
+def test_a_mounting_that_cannot_reach_the_field_is_refused(tmp_path: Path) -> None:
+    """The mirror's range ends before the field does; the error comes before anything moves."""
     beside = {"rig.mirror_offset_x": 0.5, "rig.mirror_offset_y": 0.5, "size": "6400x6400"}
     with pytest.raises(PoseError, match=r"as mounted \(offset 0.5; 0.5\), .* outside the unit disk"):
         open_run(small_settings(tmp_path, source="rig", **beside), planning=True)
 
 
 @pytest.mark.usefixtures("no_effects")
-def test_a_rig_as_the_defaults_have_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """No pulses and no CRC: every line lies where the mirror's log measured it, and the map is nearly the simulated."""
+def test_a_rig_with_default_settings_is_surveyed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Without pulses and CRC the mirror's log gives line positions; over 90 % of the map equals the simulation."""
     usual = SurveyRig()
     told = {"rig.pulses": usual.pulses, "rig.with_crc": usual.with_crc, "effects": "none", "keep": "raw"}
     settings = small_settings(tmp_path, source="rig", visit="first", **told)
@@ -148,10 +148,10 @@ def test_a_rig_as_the_defaults_have_it(tmp_path: Path, monkeypatch: pytest.Monke
     assert alike.mean() > 0.9, alike.mean()
 
 
-def test_visits_are_captured_and_broken_ones_gone_on_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """A survey whose camera goes away is gone on with by the same command; another visit is captured anew.
+def test_a_broken_visit_resumes_and_a_new_one_is_captured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """After the camera failed, the same command resumes the survey; another visit is captured again.
 
-    The receipt says that nothing was simulated and holds no password; files of the camera go with the spool.
+    The receipt has no simulated effects and no password; the camera's files go with the spool.
     """
     settings = small_settings(tmp_path, source="rig", visit="first", **{"rig.password": "secret", "budget": 0.5})
     with emulated(settings, {}, monkeypatch) as rig:
@@ -174,7 +174,7 @@ def test_visits_are_captured_and_broken_ones_gone_on_with(tmp_path: Path, monkey
         assert coarse_captures(rig) == 2
         run_survey(replace(settings, name="west"), QUIET)  # another field of the same settings
         assert coarse_captures(rig) == 3
-        run_survey(replace(settings, rig=replace(settings.rig, mirror_axes="-x,-y")), QUIET)  # mounted otherwise
+        run_survey(replace(settings, rig=replace(settings.rig, mirror_axes="-x,-y")), QUIET)  # another mounting
         assert coarse_captures(rig) == 4
         white = replace(settings, rig=replace(settings.rig, white_reference=0.5))  # another calibration
         assert run_survey(white, QUIET).receipt["products"]["mosaic"] != published.receipt["products"]["mosaic"]
@@ -182,7 +182,7 @@ def test_visits_are_captured_and_broken_ones_gone_on_with(tmp_path: Path, monkey
 
 
 def test_field_without_a_picture_is_surveyed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights: Path):
-    """A field of which only size and bands are known: what the rig sees of it is mapped, and nothing judged."""
+    """Only size and bands of the field are known: the rig's lines are mapped, and no accuracy is computed."""
     told = {"scene": "field", "bands": None, "wavelengths": "640,550,460", "weights": str(weights), "effects": None}
     settings = small_settings(tmp_path, source="rig", **told)
     values, nm = patchy_scene((128, 128), 3, 1)[0], np.array([640.0, 550.0, 460.0])
@@ -191,11 +191,11 @@ def test_field_without_a_picture_is_surveyed(tmp_path: Path, monkeypatch: pytest
         published = run_survey(settings, QUIET)
     assert len(np.unique(class_map_of(published, tmp_path))) > 1
     assert published.receipt["scene"].startswith("field/")
-    assert published.receipt["settings"]["visit"]  # the date, so that a later survey is another look
+    assert published.receipt["settings"]["visit"]  # the date, so that a later survey is another visit
 
 
 def test_survey_over_a_pty_and_sockets_gives_the_same_lines(tmp_path: Path):
-    """Devices behind a real pty, a control socket and FTP, their clock sped up: every line is the simulated one."""
+    """Devices behind a real pty, a control socket and FTP with a fast clock give the simulated lines."""
     asked = {"source": "rig", "visit": "first", "budget": 0.5, "keep": "raw"}
     settings = small_settings(tmp_path, **asked)
     scene, _ = open_scene(settings)
@@ -223,7 +223,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
 
 @pytest.mark.parametrize(("changed", "message"), BAD.values(), ids=BAD)
 def test_bad_setting_is_refused_in_one_message(tmp_path: Path, changed: dict[str, Any], message: str, weights: Path):
-    """What cannot be meant is refused before a device is opened, with what it should be; no archive is made."""
+    """The message comes before a device is opened and says what is allowed; no archive is made."""
     told = {**changed, **({"weights": str(weights)} if "weights" in changed else {})}
     with pytest.raises(SettingsError, match=message):
         run_survey(small_settings(tmp_path / "out", **told), QUIET)

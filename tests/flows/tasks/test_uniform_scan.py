@@ -1,4 +1,4 @@
-"""A survey of one uniform scan: what is captured, stored, read and told; how scans and two passes are chosen."""
+"""A survey of one uniform scan: capture, storage, reading and report; the choice between scans and two passes."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ BY_HAND: dict[str, Any] = {"budget": None, "scan_step": "2", "scan_exposure_ms":
 
 @pytest.fixture(scope="module")
 def recorded(make_weights: WeightsMaker) -> Path:
-    """Tiny weights with a record of uniform scans."""
+    """Return tiny weights with scan performance."""
     return make_weights(scans=RECORD)
 
 
 @pytest.fixture(scope="module")
 def scanned(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey, recorded: Path) -> tuple[Path, Any]:
-    """One survey by hand of every second line, 25 ms."""
+    """Return archive and run of a survey of every second line with 25 ms, set by hand."""
     out = tmp_path_factory.mktemp("scanned")
     with with_effects():  # noise has scores of its own size
         return out, survey_png(out, **BY_HAND, weights=str(recorded))
@@ -53,8 +53,8 @@ def _store(out: Path, name: str) -> xr.Dataset:
     return xr.open_zarr(path, consolidated=False)
 
 
-def test_the_field_is_seen_once_and_whole(scanned: tuple[Path, Any]) -> None:
-    """One pass of unbinned lines 2 px apart, a patch of every patch, and seconds that are those of these lines."""
+def test_a_uniform_scan_covers_the_field_once(scanned: tuple[Path, Any]) -> None:
+    """One pass of unbinned lines 2 px apart covers every patch, in the seconds of these lines."""
     out, published = scanned
     cubes = [xr.open_zarr(path, consolidated=False) for path in out.glob("stages/condense/*/*.zarr")]
     assert {value for cube in cubes for value in cube["exposure_ms"].values.tolist()} == {25.0}
@@ -67,8 +67,8 @@ def test_the_field_is_seen_once_and_whole(scanned: tuple[Path, Any]) -> None:
     assert published.receipt["savings"]["patches"]["ratio"] == 1
 
 
-def test_receipt_and_pages_tell_a_scan(scanned: tuple[Path, Any]) -> None:
-    """What was taken and expected, the best in the same seconds, and no word of looking twice."""
+def test_receipt_and_page_describe_the_scan(scanned: tuple[Path, Any]) -> None:
+    """They give its expected mIoU and the best scan of the same seconds; nothing on the page is about a second pass."""
     _, published = scanned
     receipt, page = published.receipt, (published.folder / "report.html").read_text(encoding="utf-8")
     assert receipt["plan"]["kind"] == "scan"
@@ -84,7 +84,7 @@ def test_receipt_and_pages_tell_a_scan(scanned: tuple[Path, Any]) -> None:
 
 
 def test_seconds_choose_a_scan(survey_png: Survey, recorded: Path, make_weights: WeightsMaker, tmp_path: Path) -> None:
-    """It ends in time, the settings say what was chosen, and read again by other weights the light is found."""
+    """The scan ends in time and the settings name it; reprocessing with other weights uses the stored lines."""
     published = survey_png(tmp_path, budget=None, seconds="4", weights=str(recorded))
     settings, done = published.receipt["settings"], published.receipt["savings"]["capture_s"]["done"]
     assert 3.5 < done <= 4
@@ -101,8 +101,8 @@ def test_seconds_choose_a_scan(survey_png: Survey, recorded: Path, make_weights:
     assert {one["name"]: one["state"] for one in again["stages"]}["capture_coarse"] == "cached"
 
 
-def test_a_plan_tells_the_scan_of_a_goal(flags_png: Flags, recorded: Path, tmp_path: Path) -> None:
-    """Its expected mIoU reaches the goal; the reference is nearly the best."""
+def test_a_plan_shows_the_scan_for_a_goal(flags_png: Flags, recorded: Path, tmp_path: Path) -> None:
+    """Its expected mIoU reaches the goal; that of the reference is at most 0.5 points lower."""
     told = plan_content(load_settings(None, flags_png(tmp_path, weights=str(recorded), goal="88")))["scans"]
     assert told["taken"]["expected_miou"] >= 0.88
     assert told["reference"]["expected_miou"] >= told["taken"]["expected_miou"] - 0.005
@@ -126,26 +126,26 @@ def test_a_plan_tells_the_scan_of_a_goal(flags_png: Flags, recorded: Path, tmp_p
         ({"scan_step": "0"}, SettingsError, r"--scan-step must be a whole number from 1 to 8"),
     ],
 )
-def test_what_no_scan_can_do_is_refused_in_a_sentence(
+def test_impossible_requests_are_refused(
     survey_png: Survey, recorded: Path, tmp_path: Path, given: dict[str, str], error: type[Exception], words: str
 ) -> None:
-    """One message says what was asked, what there is, and what to do; nothing is left in the archive."""
+    """One message gives the value, the limits and a remedy; no archive is made."""
     with pytest.raises(error, match=words):
         survey_png(tmp_path / "out", **{"budget": None, "weights": str(recorded)} | given)
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(("exposure_ms", "told"), [("6", True), ("5", False), ("100", True), ("101", False)])
-def test_nothing_is_expected_of_a_scan_beyond_the_record(
+def test_a_scan_beyond_the_scan_performance_has_no_expected_miou(
     flags_png: Flags, recorded: Path, tmp_path: Path, exposure_ms: str, told: bool
 ) -> None:
-    """By hand any exposure may be taken; one beside those that were judged has no expectation."""
+    """Any exposure may be set by hand; exposures outside of 6 to 100 ms have no expected mIoU."""
     given = flags_png(tmp_path, weights=str(recorded), scan_step="2", scan_exposure_ms=exposure_ms)
     assert (plan_content(load_settings(None, given))["scans"]["taken"] is not None) == told
 
 
-def test_weights_without_a_record_scan_by_hand_alone(survey_png: Survey, tmp_path: Path) -> None:
-    """Old weights: seconds are refused with what to do instead, and a scan by hand has no expectation."""
+def test_weights_without_scan_performance_scan_by_hand(survey_png: Survey, tmp_path: Path) -> None:
+    """--seconds is refused with an alternative, and a scan set by hand has no expected mIoU."""
     with pytest.raises(WeightsError, match=r"no record of uniform scans.*--scan-step and .*validation scenes"):
         survey_png(tmp_path / "none", budget=None, seconds="5")
     published = survey_png(tmp_path / "by hand", budget=None, scan_step="4")
@@ -154,8 +154,8 @@ def test_weights_without_a_record_scan_by_hand_alone(survey_png: Survey, tmp_pat
     assert published.receipt["plan"]["reason"] == "the field was scanned once: every 4th line, 100 ms"
 
 
-def test_a_receipt_tells_of_saturated_spectra(survey_png: Survey, tmp_path: Path) -> None:
-    """An exposure that is too long for the bright part of a field: the fraction is that of the raw lines."""
+def test_a_receipt_has_the_fraction_of_saturated_spectra(survey_png: Survey, tmp_path: Path) -> None:
+    """The exposure is too long for the bright part of the field; the fraction equals that of the raw lines."""
     given = BY_HAND | {"scan_exposure_ms": "200", "keep": "raw"}
     published = survey_png(tmp_path, **given)
     (cube,) = (xr.open_zarr(path, consolidated=False) for path in tmp_path.glob("stages/capture/*/*.zarr"))
@@ -167,7 +167,7 @@ def test_a_receipt_tells_of_saturated_spectra(survey_png: Survey, tmp_path: Path
 
 
 def _scores_bytes(out: Path) -> int:
-    """Bytes of the scores of lines and mosaic."""
+    """Return the bytes of the scores of lines and mosaic."""
     return sum(one.stat().st_size for one in out.glob("stages/*/*/*.zarr/scores/c/**/*") if one.is_file())
 
 
@@ -177,9 +177,9 @@ def _step(out: Path) -> float:
 
 
 def test_scores_keep_to_a_limit(scanned: tuple[Path, Any], survey_png: Survey, recorded: Path, tmp_path: Path) -> None:
-    """Coarser steps are taken, as few as suffice; raw lines are cleared."""
+    """The quantisation step grows only if needed; raw lines are cleared."""
     every, flags = _scores_bytes(scanned[0]), {**BY_HAND, "weights": str(recorded)}
-    with with_effects():  # as the other has them
+    with with_effects():  # the other survey has them too
         survey_png(tmp_path / "half", **flags, kept_bytes=str(int(0.6 * every)))
         survey_png(tmp_path / "enough", **flags, kept_bytes=str(2 * every))
     assert _scores_bytes(tmp_path / "half") <= 0.65 * every
@@ -188,8 +188,8 @@ def test_scores_keep_to_a_limit(scanned: tuple[Path, Any], survey_png: Survey, r
     assert _step(tmp_path / "enough") == 1
 
 
-def test_a_limit_that_nothing_fits_leaves_the_raw_lines(survey_png: Survey, recorded: Path, tmp_path: Path) -> None:
-    """What was captured stays, and the least that the message says suffices."""
+def test_a_limit_too_small_keeps_the_raw_lines(survey_png: Survey, recorded: Path, tmp_path: Path) -> None:
+    """The lines stay in the archive, and the minimum in the message suffices."""
     flags = {"budget": None, "scan_step": "4", "weights": str(recorded), "kept_bytes": "1kB"}
     with pytest.raises(BudgetError, match=r"--kept-bytes 1000 is too small .* at least \d+;") as refused:
         survey_png(tmp_path, **flags)
@@ -204,14 +204,14 @@ def test_a_limit_that_nothing_fits_leaves_the_raw_lines(survey_png: Survey, reco
         ({"source": "sim", "budget": "0.5"}, "a uniform scan: give --seconds or --scan-step, without --budget"),
     ],
 )
-def test_a_limit_without_lines_of_a_uniform_scan_is_refused(given: dict[str, str], words: str) -> None:
-    """Two passes and rasters are kept otherwise."""
+def test_kept_bytes_needs_a_uniform_scan(given: dict[str, str], words: str) -> None:
+    """Two passes and rasters have no such limit."""
     with pytest.raises(SettingsError, match=f"--kept-bytes is for {words}"):
         load_settings(None, {"scene": "field.png", "kept_bytes": "8MB", **given})
 
 
 def test_without_a_flag_the_cheapest_good_scan_is_taken(survey_png: Survey, recorded: Path, tmp_path: Path) -> None:
-    """The settings of the receipt say which it was; its seconds are told beside those of every line."""
+    """It is the reference, within 0.5 points of the best; the receipt gives its step and seconds."""
     receipt = survey_png(tmp_path, weights=str(recorded), budget=None).receipt
     taken, capture = receipt["scans"]["taken"], receipt["savings"]["capture_s"]
     assert taken == receipt["scans"]["reference"]
@@ -222,8 +222,8 @@ def test_without_a_flag_the_cheapest_good_scan_is_taken(survey_png: Survey, reco
 
 
 @pytest.mark.parametrize(("name", "value"), [("policy", "gain"), ("coarse_exposure_ms", "20")])
-def test_what_only_two_passes_have_asks_for_them(recorded: Path, name: str, value: str) -> None:
-    """A flag that a uniform scan would not use is not passed over in silence."""
+def test_flags_of_two_passes_select_two_passes(recorded: Path, name: str, value: str) -> None:
+    """A flag without a use in a uniform scan is not ignored."""
     flags = {"scene": "farm", "weights": str(recorded)}
     assert load_settings(None, {**flags, name: value}).budget == 0.5
     assert load_settings(None, flags).undecided
@@ -231,8 +231,8 @@ def test_what_only_two_passes_have_asks_for_them(recorded: Path, name: str, valu
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (32, 32)])
 @pytest.mark.parametrize("source", ["raster", "sim"])
-def test_all_scenes_need_no_flag(weights: Path, tmp_path: Path, shape: tuple[int, ...], source: str) -> None:
-    """However small, of one band too: a map of its size; for a camera every line is a scan that always pays."""
+def test_scenes_of_any_size_need_no_flag(weights: Path, tmp_path: Path, shape: tuple[int, ...], source: str) -> None:
+    """A scene of one pixel or one band gets a map of its size; with a camera every line is captured."""
     values = np.random.default_rng(0).integers(0, 255, shape, dtype=np.uint8)
     Image.fromarray(values).save(tmp_path / "scene.png")
     flags = {"scene": str(tmp_path / "scene.png"), "weights": str(weights), "source": source, "engine": "plain"}
@@ -244,7 +244,7 @@ def test_all_scenes_need_no_flag(weights: Path, tmp_path: Path, shape: tuple[int
 
 
 def test_spacings_that_do_not_fit_are_no_candidates(tmp_path: Path) -> None:
-    """Every 8th line of 640 px cannot overlap by 712 px: others are offered, and it is refused if asked for."""
+    """Every 8th line of 640 px cannot overlap by 712 px: it is no candidate, and refused on request."""
     farm = {"scene": "farm", "size": "160x128", "out": str(tmp_path), "pointing_px": "100"}
     scans = plan_content(load_settings(None, farm | {"scan_step": "1"}))["scans"]
     assert {one["step"] for one in scans["candidates"]} == {1, 2, 4}
@@ -254,8 +254,8 @@ def test_spacings_that_do_not_fit_are_no_candidates(tmp_path: Path) -> None:
         open_run(load_settings(None, farm | {"camera.samples": "64"}), planning=True)
 
 
-def test_candidates_are_those_of_the_weights_that_would_read_them(tmp_path: Path) -> None:
-    """The farm has two files of weights: plan names one reference, whatever was asked for."""
+def test_candidates_of_a_farm_share_one_reference(tmp_path: Path) -> None:
+    """The reference is the same for every request, and the expected mIoU rises with the seconds."""
     farm = {"scene": "farm", "size": "160x128", "out": str(tmp_path)}
     asked = ({}, {"budget": "0.8"}, {"scan_step": "4"})
     told = [plan_content(load_settings(None, farm | more))["scans"] for more in asked]
@@ -263,11 +263,11 @@ def test_candidates_are_those_of_the_weights_that_would_read_them(tmp_path: Path
     assert told[0]["taken"] == told[0]["reference"]
     scores = [one["expected_miou"] for one in told[0]["candidates"]]
     assert len(scores) > 4
-    assert scores == sorted(scores)  # by ascending seconds
+    assert scores == sorted(scores)  # in order of ascending seconds
 
 
-def test_a_faster_coarse_pass_leaves_its_seconds_to_the_fine_one(survey_png: Any, tmp_path: Path) -> None:
-    """Cubes say which exposure a line had; the budget is the same, and the fine pass gets what the coarse one saves."""
+def test_a_faster_coarse_pass_gives_its_seconds_to_the_fine_pass(survey_png: Any, tmp_path: Path) -> None:
+    """The budget is the same; the cubes hold the exposure of each pass."""
     usual = survey_png(tmp_path / "usual", budget="0.6").receipt
     fast = survey_png(tmp_path / "fast", budget="0.6", coarse_exposure_ms="25").receipt
     found = (tmp_path / "fast").glob("stages/condense*/*/*.zarr")
@@ -287,11 +287,11 @@ def test_a_faster_coarse_pass_leaves_its_seconds_to_the_fine_one(survey_png: Any
     assert all(one["done"] <= 0.6 * one["full"] for one in seconds)
 
 
-WIDE = {"camera.samples": "80", "seconds": "27"}  # eight swaths; the usual camera covers the field by one
+WIDE = {"camera.samples": "80", "seconds": "27"}  # eight swaths; the default camera covers the field with one
 
 
 def planned(out: Path, **flags: str) -> SurveyRun:
-    """An opened survey of the farm."""
+    """Return an opened survey of the farm."""
     return open_run(load_settings(None, {"scene": "farm", "size": "640x512", "out": str(out), **flags}), planning=True)
 
 
@@ -314,24 +314,24 @@ def planned(out: Path, **flags: str) -> SurveyRun:
     ids=str,
 )
 def test_two_passes_are_taken_on_wide_fields_in_short_times(tmp_path: Path, flags: dict[str, str], zooms: bool) -> None:
-    """The settings of the run say which way was taken, and no limit of a uniform scan is dropped."""
+    """The settings of the run name the choice, and no limit of a uniform scan is dropped."""
     run = planned(tmp_path, **flags)
     assert (run.settings.zoom, run.plan.plain) == ("always" if zooms else "never", not zooms)
-    exposures = {sweep.exposure_ms for sweep in run.planned}  # for which simulated effects are chosen
+    exposures = {sweep.exposure_ms for sweep in run.planned}  # simulated effects are chosen for these
     assert (len(exposures) >= 3) if zooms else (run.planned == tuple(run.plan.coarse))
     assert (run.scans.chosen is None) == zooms
     assert any(note.startswith("two passes: every 4th line") for note in run.notes) == zooms
 
 
-def test_the_choice_is_the_plan_that_one_may_ask_for(tmp_path: Path) -> None:
-    """First pass and time left are those of `--zoom always`; a receipt's settings plan the same again."""
+def test_the_chosen_plan_equals_that_of_zoom_always(tmp_path: Path) -> None:
+    """First pass and remaining time are those of `--zoom always`, and so are the settings of the run."""
     chosen, asked = planned(tmp_path, **WIDE), planned(tmp_path, **WIDE, zoom="always")
     assert (chosen.plan, chosen.settings) == (asked.plan, asked.settings)
     assert chosen.plan.coarse_s + chosen.plan.fine_s == pytest.approx(27)
 
 
 def test_the_line_spacing_of_the_first_pass_may_be_given(tmp_path: Path) -> None:
-    """Its exposure is then the best one for that spacing; without it the weights choose every 4th line."""
+    """The exposure is the best for that spacing; by default the weights choose every 4th line."""
     steps = {"scan_step": "8"}, {}, {"scan_step": "8", "seconds": None, "budget": "0.5"}
     given, usual, half = (planned(tmp_path, **{**WIDE, "zoom": "always", **one}) for one in steps)
     assert [run.settings.scan_step for run in (given, usual, half)] == [8, 4, 8]

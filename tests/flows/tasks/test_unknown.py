@@ -1,4 +1,4 @@
-"""The class unknown in a survey: which pixels get it, what is told of them, and what stays as it was without it."""
+"""The class `unknown` in a survey: its pixels, their score, and equal results without the detector."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from tests.conftest import CLASSES, RGB_NM, Survey
 
 SEEN = TrainedOn(3, (460.0, 640.0), (3.0, 100.0), 2, CLASSES, (96, 300), (24.0, 60.0), 0.12)
 Maker = Callable[[float], Path]
-# one scan, and fewer samples beside the field
+# one scan, and fewer samples outside of the field
 NARROW: dict[str, Any] = {"effects": "none", "camera.samples": 160, "budget": None, "scan_step": 1}
 
 
 def add_judgement(weights: Path, path: Path, limit: float, tables: dict[str, Any]) -> Path:
-    """A copy of weights that knows spectra up to a squared distance from the middle, with tables beside that."""
+    """Write a copy of weights whose detector accepts squared distances to a limit, with tables; return its path."""
     shutil.copy(weights, path)
     one, table = np.eye(3), np.full((1, 1, 2), limit)
     limits = Limits(np.array([0.001, 0.05]), np.ones(1), (1,), table)
@@ -44,7 +44,7 @@ def add_judgement(weights: Path, path: Path, limit: float, tables: dict[str, Any
 
 @pytest.fixture(scope="module")
 def judging(weights: Path, tmp_path_factory: pytest.TempPathFactory) -> Maker:
-    """Maker of copies of the tiny weights to which spectra up to a squared distance from the middle are familiar."""
+    """Return a maker of copies of the tiny weights whose detector accepts spectra within a squared distance."""
     return lambda limit: add_judgement(weights, tmp_path_factory.mktemp("judging") / "w.safetensors", limit, {})
 
 
@@ -62,15 +62,15 @@ def _files(out: Path, kind: str) -> dict[str, bytes]:
 def both(
     tmp_path_factory: pytest.TempPathFactory, survey_png: Survey, judging: Maker
 ) -> tuple[Path, Path, dict[str, Any]]:
-    """The same survey with the class unknown and without; the receipt of the first."""
+    """Return archives of the same survey with and without the class unknown, and the receipt of the first."""
     path, out, plain = judging(0.5), tmp_path_factory.mktemp("with"), tmp_path_factory.mktemp("without")
     receipt = survey_png(out, weights=str(path), **NARROW).receipt
     survey_png(plain, weights=str(path), unknown="off", **NARROW)
     return out, plain, dict(receipt)
 
 
-def test_out_of_range_pixels_get_a_class_of_their_own(both: tuple[Path, Path, dict[str, Any]]) -> None:
-    """Behind those of the weights and without a confidence; all others have what they have without it."""
+def test_out_of_distribution_pixels_are_unknown(both: tuple[Path, Path, dict[str, Any]]) -> None:
+    """Unknown comes after the classes of the weights and has no confidence; the other pixels keep their classes."""
     out, plain, receipt = both
     found, before = (_stored(one, "class_map") for one in (out, plain))
     classes, shown = found["classes"].values, before["classes"].values
@@ -84,8 +84,8 @@ def test_out_of_range_pixels_get_a_class_of_their_own(both: tuple[Path, Path, di
     assert receipt["unknown"] == {"pixels": int(unknown.sum()), "fraction": float(unknown.mean()), "rate": 0.001}
 
 
-def test_unknown_pixels_count_as_wrong_and_are_no_class_of_the_mean(both: tuple[Path, Path, dict[str, Any]]) -> None:
-    """The truth has three classes, and the map is judged over these."""
+def test_unknown_pixels_count_as_wrong_and_not_in_the_mean(both: tuple[Path, Path, dict[str, Any]]) -> None:
+    """The labels have three classes, and the mIoU is over these."""
     accuracy = both[2]["accuracy"]
     assert list(accuracy["per_class_iou"]) == list(CLASSES)
     assert accuracy["miou"] == pytest.approx(np.mean(list(accuracy["per_class_iou"].values())))
@@ -94,26 +94,26 @@ def test_unknown_pixels_count_as_wrong_and_are_no_class_of_the_mean(both: tuple[
     assert accuracy["overall_accuracy"] <= 1 - accuracy["unknown_px"] / accuracy["pixels"]
 
 
-def test_without_it_every_bit_is_kept(
+def test_maps_without_a_detector_keep_every_byte(
     both: tuple[Path, Path, dict[str, Any]], survey_png: Survey, weights: Path, tmp_path: Path
 ) -> None:
-    """Switched off, and by weights without a record of familiar spectra: the same keys, and the same bytes."""
+    """Keys and bytes are equal with the detector switched off and with weights that have none."""
     survey_png(tmp_path, weights=str(weights), **NARROW)
     assert _files(tmp_path, "segment") == _files(both[1], "segment")
     assert not set(_files(both[0], "segment")) & set(_files(both[1], "segment"))
 
 
-def test_of_unknown_pixels_nothing_is_believed(both: tuple[Path, Path, dict[str, Any]]) -> None:
-    """What was seen says nothing of the classes; a later look takes its own word."""
+def test_unknown_pixels_have_no_class_probabilities(both: tuple[Path, Path, dict[str, Any]]) -> None:
+    """Their probabilities are NaN, so a later visit uses its own."""
     out, _, _ = both
     probabilities, classes = _stored(out, "class_probabilities"), _stored(out, "class_map")["classes"].values
     np.testing.assert_array_equal(np.isnan(probabilities["log_probability"].values).all(axis=-1), classes == 3)
 
 
-def test_a_later_visit_goes_on_from_such_a_map(
+def test_a_prior_map_gives_unknown_pixels_no_class(
     both: tuple[Path, Path, dict[str, Any]], survey_png: Survey, judging: Maker, tmp_path: Path
 ) -> None:
-    """What is unknown today is so whatever is remembered there: it has no class, and was captured today."""
+    """A pixel unknown today is so whatever the prior map has; it has no probabilities, and its age is 0."""
     shutil.copytree(both[1], tmp_path, dirs_exist_ok=True)
     before = set(tmp_path.glob("stages/segment/*"))
     flags = {"visit": "later", "seed": "1", "prior": "latest", **NARROW}
@@ -127,8 +127,8 @@ def test_a_later_visit_goes_on_from_such_a_map(
     assert not after["age"].values.any()
 
 
-def test_a_map_of_nothing_known_says_what_to_do(survey_png: Survey, judging: Maker, tmp_path: Path) -> None:
-    """Receipt, report, quicklook and accuracy; the sentence names the way out."""
+def test_an_entirely_unknown_map_names_the_remedy(survey_png: Survey, judging: Maker, tmp_path: Path) -> None:
+    """Receipt and report advise training or --unknown off; the mIoU is 0."""
     published = survey_png(tmp_path, weights=str(judging(1e-6)), **NARROW)
     receipt: Any = published.receipt
     assert receipt["unknown"]["fraction"] == 1
@@ -140,10 +140,10 @@ def test_a_map_of_nothing_known_says_what_to_do(survey_png: Survey, judging: Mak
     assert json.loads((published.folder / "receipt.json").read_text())["unknown"]["pixels"] == 96 * 128
 
 
-def test_pixels_without_a_value_have_no_class_rather_than_an_unknown_one(
+def test_pixels_without_a_value_are_nodata_and_not_unknown(
     survey_png: Survey, judging: Maker, scene_files: Path, tmp_path: Path
 ) -> None:
-    """None at all, where everything else is unknown."""
+    """All other pixels of the map are unknown."""
     values = np.load(scene_files / "cube.npy")[..., :3]
     values[:8, :8] = np.nan
     np.save(tmp_path / "holes.npy", values)
@@ -155,13 +155,13 @@ def test_pixels_without_a_value_have_no_class_rather_than_an_unknown_one(
 
 
 @pytest.mark.parametrize(("flags", "rate"), [({}, None), ({"unknown": "1%"}, 0.01), ({"zoom": "never"}, 0.001)])
-def test_the_default_of_a_zoomed_survey_is_off(flags: dict[str, str], rate: float | None) -> None:
-    """Detectors do not know merged passes; a stated rate is used all the same."""
+def test_unknown_is_off_by_default_in_zoomed_surveys(flags: dict[str, str], rate: float | None) -> None:
+    """The detector is not fitted to merged passes; an explicit rate still applies."""
     assert load_settings(None, {"zoom": "always", "seconds": "9", **flags}).unknown_rate == rate
 
 
-def test_a_rate_needs_weights_that_were_measured(survey_png: Survey, weights: Path, tmp_path: Path) -> None:
-    """With the command that measures them; nothing is left behind."""
+def test_an_unknown_rate_needs_weights_with_a_detector(survey_png: Survey, weights: Path, tmp_path: Path) -> None:
+    """The message has the training option that fits one; no archive is made."""
     with pytest.raises(WeightsError, match=r"--unknown 1%: .* has no out-of-distribution detector.* --validation 3"):
         survey_png(tmp_path / "out", weights=str(weights), unknown="1%")
     assert not (tmp_path / "out").exists()
@@ -173,8 +173,8 @@ def _notes(weights: Path, nm: tuple[float, ...] = RGB_NM, seen: TrainedOn = SEEN
 
 
 @given(st.integers(96, 300), st.floats(3.0, 100.0))
-def test_a_survey_within_training_has_no_note(weights: Path, day: int, exposure_ms: float) -> None:
-    """Whatever the day and the light."""
+def test_a_survey_within_the_training_range_has_no_note(weights: Path, day: int, exposure_ms: float) -> None:
+    """Days 96 to 300 and exposures of 3 to 100 ms are within the training's."""
     assert _notes(weights, day=day, hour=12, scan_step=1, scan_exposure_ms=exposure_ms) == ()
 
 
@@ -189,8 +189,8 @@ def test_a_survey_within_training_has_no_note(weights: Path, day: int, exposure_
         ({"seen": replace(SEEN, ground_pixel_m=0.01)}, r"GSD of 12 cm \(training: 1 cm\)"),
     ],
 )
-def test_what_training_did_not_see_is_told_in_one_note(weights: Path, flags: dict[str, Any], words: str) -> None:
-    """With what it saw, and what to do."""
+def test_conditions_beyond_the_training_get_one_note(weights: Path, flags: dict[str, Any], words: str) -> None:
+    """It gives the training's range and the command to train."""
     (note,) = _notes(weights, **flags)
     assert re.search(words, note), note
     assert "spectralzoom train DATASET -o" in note

@@ -1,4 +1,4 @@
-"""Processes: caches for users without a home, words for what a machine refuses, and a survey within narrow limits."""
+"""Processes: cache folders without a home, messages for refused resources, and a survey within narrow limits."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ import pytest
 from flows.terminal.processes import format_refusal, place_caches, place_pages
 from pipeline.errors import SettingsError
 
-NOWHERE = "/proc/nonexistent"  # where not even root can write
+NOWHERE = "/proc/nonexistent"  # not even root can write here
 
 
 @pytest.fixture
 def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder for temporary files."""
+    """Return an empty folder that is set as the folder for temporary files."""
     folder = tmp_path / "temporary"
     folder.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(folder))
     return folder
 
 
-def test_a_home_is_used_as_ever(tmp_path: Path, temporary: Path) -> None:
-    """Where ~/.cache or XDG_CACHE_HOME can be written nothing is named and nothing made elsewhere."""
+def test_writable_home_or_cache_folder_is_kept(tmp_path: Path, temporary: Path) -> None:
+    """A writable ~/.cache or XDG_CACHE_HOME leaves the environment unchanged and makes no other folder."""
     for environment in ({"HOME": str(tmp_path)}, {"HOME": NOWHERE, "XDG_CACHE_HOME": str(tmp_path / "a" / "b")}):
         before = dict(environment)
         assert place_caches(environment) is None
@@ -40,8 +40,8 @@ def test_a_home_is_used_as_ever(tmp_path: Path, temporary: Path) -> None:
 @pytest.mark.parametrize(
     "environment", [{"HOME": NOWHERE}, {"HOME": NOWHERE, "XDG_CACHE_HOME": NOWHERE}, {"HOME": "here"}]
 )
-def test_without_one_they_are_in_a_temporary_folder(environment: dict[str, str], temporary: Path) -> None:
-    """Which only this user may enter; those who were told a place keep it."""
+def test_caches_without_a_home_are_in_a_temporary_folder(environment: dict[str, str], temporary: Path) -> None:
+    """Only this user may enter the folder; caches that have a folder of their own keep it."""
     environment = environment | {"MPLCONFIGDIR": "/elsewhere"}
     folder = place_caches(environment)
     assert folder.parent == temporary
@@ -51,8 +51,8 @@ def test_without_one_they_are_in_a_temporary_folder(environment: dict[str, str],
     assert environment["MPLCONFIGDIR"] == "/elsewhere"
 
 
-def test_users_without_anything_are_told(temporary: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """A home that is not there as on Debian; where nothing can be written, what to set."""
+def test_missing_home_is_replaced_or_reported(temporary: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Without a passwd entry HOME becomes /nonexistent; without a writable folder the error names XDG_CACHE_HOME."""
     monkeypatch.setattr(pwd, "getpwuid", lambda number: {}[number])
     environment: dict[str, str] = {}
     assert place_caches(environment) is not None
@@ -62,8 +62,8 @@ def test_users_without_anything_are_told(temporary: Path, monkeypatch: pytest.Mo
         place_caches({"HOME": NOWHERE})
 
 
-def test_pages_of_prefect_are_unpacked_where_that_is_possible(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Beside its code, or in the cache folder."""
+def test_prefect_pages_are_unpacked_into_a_writable_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They stay beside Prefect's code if that folder is writable, else go into the cache folder."""
     environment = {"XDG_CACHE_HOME": str(tmp_path)}
     monkeypatch.setattr(os, "access", lambda *_: True)
     assert place_pages(environment) == {}
@@ -91,8 +91,8 @@ ROOT = Path(__file__).parents[3]
         (ZeroDivisionError("division by zero"), None),
     ],
 )
-def test_words(error: Exception, words: str | None) -> None:
-    """What was refused and what to do; other errors stay what they are."""
+def test_refused_resources_get_a_message(error: Exception, words: str | None) -> None:
+    """The message names the refused resource and a remedy; other errors get none."""
     found = format_refusal(error)
     assert found is None if words is None else words in str(found)
 
@@ -101,8 +101,8 @@ def test_words(error: Exception, words: str | None) -> None:
     ("limit", "words"),
     [("ulimit -v 999999", "error: memory ran out: "), ("ulimit -f 100", "may not grow so large here: raise ulimit -f")],
 )
-def test_a_survey_within_narrow_limits(tmp_path: Path, limit: str, words: str) -> None:
-    """An address space of 1 GB, files of 100 kB: one message, exit code 1, and no report of a defect."""
+def test_survey_within_narrow_limits_fails_with_one_message(tmp_path: Path, limit: str, words: str) -> None:
+    """Limits are 1 GB of address space or files of 100 kB: exit code 1, and no report of a defect."""
     survey = (
         f"{sys.executable} -m flows.cli.main survey --scene farm --size 64x64 --effects all --engine plain "
         f"--out {tmp_path / 'a'}"

@@ -1,4 +1,4 @@
-"""What reaches terminal, log and pages: progress, and names and devices' words as escapes, whatever prints them."""
+"""Output on terminal, in log and pages: progress, and control characters in names or device messages as escapes."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ HOSTILE = "field\x1b]0;owned\x07\x1b[2J\u202egnp.map\x9b31m\u2028\udcff"
 SHOWN = "field\\x1b]0;owned\\x07\\x1b[2J\\u202egnp.map\\x9b31m\\u2028\\udcff"
 
 
-def test_nothing_that_is_printed_steers_the_terminal() -> None:
-    """Styles and borders are the console's own; in the words no control character is left."""
+def test_printed_text_has_no_control_characters() -> None:
+    """Styles and borders come from the console itself."""
     rows = Table("name")
     rows.add_row(escape(HOSTILE))
     for thing in (escape(HOSTILE), rows, [HOSTILE]):
@@ -38,7 +38,7 @@ def test_nothing_that_is_printed_steers_the_terminal() -> None:
 
 
 def test_bars_and_json_show_names_as_escapes() -> None:
-    """A bar moves the cursor itself, nothing else does; JSON reads back as it was."""
+    """A bar writes cursor movements of its own only; JSON with escapes reads back unchanged."""
     file = io.StringIO()
     with Progress(console=Terminal(file=file, width=200, force_terminal=True, color_system=None)) as bars:
         bars.add_task(escape(HOSTILE), total=1)
@@ -61,7 +61,7 @@ def _history(words: str) -> FieldHistory:
 
 
 def test_pages_show_names_as_escapes() -> None:
-    """Words beside a name are not turned round by it, and nothing in them is markup."""
+    """A name cannot reverse the text beside it, and HTML in a name is not markup."""
     text = render_history(_history(HOSTILE), "runs")
     assert all(is_visible(letter) for letter in text)
     assert text.count(SHOWN) >= 3
@@ -69,7 +69,7 @@ def test_pages_show_names_as_escapes() -> None:
 
 
 def test_prefects_pages_show_names_as_escapes() -> None:
-    """The text of a survey has them, with its markup off."""
+    """Prefect's Markdown page of a survey shows escapes, and Markdown in a name is not markup."""
     words = HOSTILE + "<b>[x](y)`|"
     text = render_markdown(
         "survey.md", survey=words, headline=words, picture="", findings=[words], where="archive/runs/x_1"
@@ -80,7 +80,7 @@ def test_prefects_pages_show_names_as_escapes() -> None:
 
 
 def test_a_command_names_a_hostile_file_in_escapes(command_line: Any, tmp_path: Path) -> None:
-    """The message of a verb quotes what it was given."""
+    """The error message quotes the file's name without control characters."""
     ended = command_line("survey", tmp_path / "north\x1b[31m\u202e.toml")
     assert (ended.code, len(ended.errors)) == (2, 1)
     assert "north\\x1b[31m\\u202e.toml" in ended.err
@@ -88,7 +88,7 @@ def test_a_command_names_a_hostile_file_in_escapes(command_line: Any, tmp_path: 
 
 
 def test_every_console_is_a_terminal() -> None:
-    """No verb prints past it: consoles are made in one module, and pages escape by one function."""
+    """One module makes every console and one function escapes every page, so no command bypasses them."""
     root = Path(__file__).parents[3] / "flows"
     made: list[str] = []
     for path in root.rglob("*.py"):
@@ -104,7 +104,7 @@ TERMINAL = {"force_terminal": True, "color_system": None, "width": 160}
 
 
 def progress_of(steps: Callable[[StageProgress], None], **console: Any) -> str:
-    """What is written while stages go on; in a log, unless the console is a terminal."""
+    """Return the text that a progress display writes during the steps; console options can make it a terminal."""
     out = io.StringIO()
     with StageProgress(Console(file=out, **console), {"rectify": "mosaic"}) as progress:
         steps(progress)
@@ -112,7 +112,7 @@ def progress_of(steps: Callable[[StageProgress], None], **console: Any) -> str:
 
 
 def test_a_log_gets_one_line_when_a_stage_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where there is no terminal nothing is drawn over; of a long stage the words come with the line that is due."""
+    """A log has no redrawn lines; during a long stage its message comes with the next due line."""
 
     def steps(progress: StageProgress) -> None:
         for done in (0.1, 0.5, 0.9):
@@ -129,15 +129,15 @@ def test_a_log_gets_one_line_when_a_stage_ends(monkeypatch: pytest.MonkeyPatch) 
 
 
 @pytest.mark.parametrize("console", [{}, TERMINAL], ids=["log", "terminal"])
-def test_words_of_a_scene_are_not_markup(console: dict[str, Any]) -> None:
-    """A name in square brackets is shown, not read as a style."""
+def test_scene_names_are_not_markup(console: dict[str, Any]) -> None:
+    """A name in square brackets is shown as it is and not read as a style."""
     assert "[red]field[/]" in progress_of(lambda one: one.show("looking", 1.0, "[red]field[/]", ended=True), **console)
     bar = progress_of(lambda one: one.show("looking", 0.5, "[red]field[/]"), **TERMINAL)
     assert "[red]field[/]" in bar
 
 
-def test_words_go_beside_the_stage_that_runs() -> None:
-    """What is said while nothing counts stands beside the stage that runs, and nowhere once that has ended."""
+def test_messages_stand_beside_the_running_stage() -> None:
+    """Messages before the first stage or after the last one are not shown."""
 
     def steps(progress: StageProgress) -> None:
         progress.say("before any stage")
@@ -151,8 +151,8 @@ def test_words_go_beside_the_stage_that_runs() -> None:
     assert found == [False, False, True, True]
 
 
-def test_time_left_stands_behind_the_words(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a stage that runs, as a training does for long, and no longer of one that has ended; in a log as well."""
+def test_time_left_follows_the_message(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Terminal and log show it for a running stage; an ended stage has none."""
     monkeypatch.setattr("rich.progress.Task.time_remaining", 75.0)
     monkeypatch.setattr("flows.terminal.progress.LINE_EVERY_S", -1.0)
     log = progress_of(lambda one: one.show("rectify", 0.5, "step 28"))
@@ -165,7 +165,7 @@ def test_time_left_stands_behind_the_words(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_a_narrow_terminal_keeps_bars_and_times() -> None:
-    """In 80 columns words stand where the time left would, cut off at the end of the line; nothing else gives way."""
+    """In 80 columns the message takes the place of the time left and is cut at the end of the line; the bar stays."""
 
     def steps(progress: StageProgress) -> None:
         progress.show("what lines turned by 90 degrees would show", 0.5)
@@ -181,5 +181,5 @@ def test_a_narrow_terminal_keeps_bars_and_times() -> None:
     [(0, "0"), (0.0823, "0.0823"), (12.83, "12.8"), (280.4, "280"), (999.6, "1 000"), (43712, "43 700")],
 )
 def test_figures_of_any_size_have_three_digits(value: float, words: str) -> None:
-    """No exponent however many hectares an hour there are."""
+    """Large figures, such as hectares an hour, have no exponent."""
     assert three_digits(value).replace("\u202f", " ") == words

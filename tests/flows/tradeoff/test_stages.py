@@ -1,4 +1,4 @@
-"""The measures of the stages: their errors are those known of resampling, simulating and segmenting."""
+"""Trade-offs of the stages: errors of resampling, simulation and segmentation have their known values."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from tests.conftest import QUIET
 
 
 def errors(entry: Tradeoff, state: object) -> dict[object, float]:
-    """Error of every setting."""
+    """Return the error of every setting."""
     return {setting: entry.judge(state, setting, entry.run(state, setting)).error for setting in entry.settings}
 
 
-def test_waves_and_noise_are_what_they_claim():
-    """Periods of 4 to 40 px, the same for a seed; a tenth of shot and read noise."""
+def test_waves_and_noise_have_the_stated_values():
+    """Periods are 4 to 40 px and equal for a seed; the noise is a tenth of shot and read noise."""
     waves = stages.draw_waves(3, 64, stages.PERIODS_PX)
     period = 1 / np.hypot(*waves.frequency.T)
     assert 4 <= period.min() <= period.max() <= 40
@@ -39,14 +39,14 @@ def test_waves_and_noise_are_what_they_claim():
     assert stages.NOISE * 0.2 * electrons == pytest.approx(math.sqrt(electrons + 20**2))
 
 
-def test_errors_of_kernels_are_those_known():
-    """Kernels err by their taps (erratum E10)."""
+def test_kernels_have_their_known_errors():
+    """Errors of the kernels depend on their taps (erratum E10)."""
     found = [point.error for point in measure_tradeoff(stages.RECTIFY, repeats=1).points]
     assert found == pytest.approx((0.24, 0.093, 0.029), rel=0.03)
 
 
-def test_what_is_chosen_keeps_its_bound_and_the_bound_its_tolerance(monkeypatch):
-    """Exact errs by nothing, and every tolerance by no more than it says."""
+def test_chosen_effects_keep_bound_and_tolerance(monkeypatch):
+    """The exact choice has no error; for others the error is within its bound and the bound within its tolerance."""
     monkeypatch.setattr(stages, "LAND_SHAPE", (96, 640))
     monkeypatch.setattr(stages, "LINES", 1)
     state = stages.SIMULATE.prepare(0)
@@ -57,17 +57,17 @@ def test_what_is_chosen_keeps_its_bound_and_the_bound_its_tolerance(monkeypatch)
     assert found[stages.TOLERANCES[-1]] > 0
 
 
-def test_more_patches_draw_a_better_map(monkeypatch):
-    """The map of every patch errs least, that of none most."""
+def test_reading_all_patches_gives_a_better_map(monkeypatch):
+    """Its error is below that of a map without patches."""
     monkeypatch.setattr(stages, "FARM_SHAPE", (96, 128))
     found = errors(stages.SEGMENT, stages.SEGMENT.prepare(0))
     assert 0 < found[1.0] < found[0.0] < 1
 
 
-def test_own_scenes_are_measured_by_their_labels(
+def test_trade_offs_of_a_labelled_scene_are_measured(
     scene_files: Path, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A raster by fractions of its patches, and by some scans of the simulated rig."""
+    """A raster gets the fractions of its patches and some scans of the simulated rig."""
     few = {name: scan for name, scan in stages.SCANS.items() if scan == stages.PART_OF}
     monkeypatch.setattr(stages, "SCANS", few)
     monkeypatch.setattr(stages, "SURVEY", replace(stages.SURVEY, settings=(*few, *stages.PARTS)))
@@ -87,7 +87,7 @@ def test_own_scenes_are_measured_by_their_labels(
 
 
 def test_a_scene_without_labels_has_no_tradeoff(scene_files: Path, weights: Path, tmp_path: Path) -> None:
-    """One message that says what is missing."""
+    """One message asks for a label file beside the scene."""
     shutil.copy(scene_files / "scene.png", tmp_path / "bare.png")
     with pytest.raises(SceneError, match="has no labels by which a map could be judged; lay a label file beside it"):
         stages.plan_every_fraction(0, str(tmp_path / "bare.png"), weights)

@@ -1,4 +1,4 @@
-"""Ways to keep the lines of a scan: what each gives back, in how many bytes, and what is refused."""
+"""Formats for the lines of a scan: their errors, their bytes, and refused scenes."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ PACKED = ("PCA, JPEG 2000, 2 B", "condensed, JPEG 2000, 2 B")
 
 @pytest.fixture(scope="module")
 def farm() -> ScanLines:
-    """Lines of a small farm."""
+    """Return the lines of a small farm."""
     return scan_farm(3, SMALL, LineCamera(samples=192))
 
 
 @pytest.fixture(scope="module")
 def points(farm: ScanLines) -> dict[str, Point]:
-    """Ways of each family on those lines, by their names."""
+    """Return the points of formats of each family on these lines, by name."""
     settings = ("raw", *STEPS, *ROUNDED, *PRINCIPAL, *PACKED, "binned, 17 bands")
     found = measure_tradeoff(replace(STORE, prepare=lambda seed: farm, settings=settings), repeats=1)
     return {str(point.setting): point for point in found.points}
 
 
 def cube_of(path: Path, shape: tuple[int, int, int] = (24, 24, 12), offset: float = 0.0) -> str:
-    """Write whole numbers of two materials with noise, as a raster without labels."""
+    """Write integers of two materials with noise, as a raster without labels; return its path."""
     rng = np.random.default_rng(0)
     spectra = np.linspace(800, 2000, shape[2])[None] * np.array([[1.0], [1.4]])
     values = spectra[(np.arange(shape[0]) > 9).astype(int)][:, None] + rng.normal(0, 9, shape)
@@ -48,7 +48,7 @@ def cube_of(path: Path, shape: tuple[int, int, int] = (24, 24, 12), offset: floa
 
 
 def test_bytes_fall_with_the_step_and_the_error_grows(points: dict[str, Point]) -> None:
-    """Condensed spectra, rounded numbers and principal components alike."""
+    """This holds for condensed spectra, rounded values and principal components."""
     for family in (STEPS, ROUNDED, PRINCIPAL):
         rows = [points[name] for name in family]
         sizes, errors = [row.cost for row in rows], [row.error for row in rows]
@@ -57,8 +57,8 @@ def test_bytes_fall_with_the_step_and_the_error_grows(points: dict[str, Point]) 
         assert len({*sizes}) == len({*errors}) == len(rows)
 
 
-def test_raw_lines_err_by_their_noise_and_components_by_little_of_it(points: dict[str, Point]) -> None:
-    """One deviation, by the light of the simulator; ten components of 270 hold a twentieth of the noise's variance."""
+def test_raw_lines_have_the_error_of_their_noise_and_components_less(points: dict[str, Point]) -> None:
+    """Raw lines err by one sigma of the simulator; ten components of 270 hold a twentieth of the noise variance."""
     assert points["raw"].error == pytest.approx(1, abs=0.01)
     fine = points[STEPS[0]]
     assert fine.error < 0.3
@@ -66,21 +66,21 @@ def test_raw_lines_err_by_their_noise_and_components_by_little_of_it(points: dic
     assert points["binned, 17 bands"].beside[BLOCK] > 1 > points["raw"].beside[BLOCK]
 
 
-def test_the_map_is_drawn_of_what_comes_back(points: dict[str, Point]) -> None:
-    """Nearly that of raw lines from fine components, a poorer one of wide bins."""
+def test_maps_are_made_from_the_restored_lines(points: dict[str, Point]) -> None:
+    """Fine components give a map within 5 points of raw lines; wide bins lose more than 5."""
     assert 0 < points["binned, 17 bands"].beside[MIOU] < points["raw"].beside[MIOU] - 5
     assert points[STEPS[0]].beside[MIOU] == pytest.approx(points["raw"].beside[MIOU], abs=5)
 
 
-def test_packed_spectra_take_few_bytes_and_err_by_less_than_noise(points: dict[str, Point]) -> None:
-    """Components as JPEG 2000 keep their rate and err by less than the noise."""
+def test_jpeg_2000_takes_few_bytes(points: dict[str, Point]) -> None:
+    """PCA and condensed spectra take less than a quarter of raw bytes; condensed ones err by less than the noise."""
     pca, condensed = (points[name] for name in PACKED)
     assert max(pca.cost, condensed.cost) < points["raw"].cost / 4
     assert condensed.error < 1
 
 
-def test_lossless_ways_give_raw_lines_back(farm: ScanLines) -> None:
-    """Raw lines to the last bit; rounding errs by half a step at most."""
+def test_lossless_formats_restore_the_raw_lines(farm: ScanLines) -> None:
+    """They are equal to the last bit; rounding errs by at most half a step."""
     for name in ("raw", "pcodec, exact"):
         np.testing.assert_array_equal(WAYS[name](farm).restore(), farm.values)
     unit = 0.5 * farm.noise_dn.astype(np.float32)
@@ -89,7 +89,7 @@ def test_lossless_ways_give_raw_lines_back(farm: ScanLines) -> None:
 
 
 def test_a_raster_is_measured_by_its_own_pixels(tmp_path: Path) -> None:
-    """Its raw row has no error, its figures no map without weights, and its noise is estimated."""
+    """Its raw row has no error, it has no mIoU without weights, and its noise is estimated."""
     entry = replace(store_tradeoff(cube_of(tmp_path / "cube.npy"), None), settings=("raw", *STEPS))
     raw, *condensed = measure_tradeoff(entry, repeats=1).points
     assert raw.error == raw.beside[BLOCK] == 0
@@ -99,7 +99,7 @@ def test_a_raster_is_measured_by_its_own_pixels(tmp_path: Path) -> None:
 
 
 def test_scenes_that_do_not_fit_are_refused(tmp_path: Path) -> None:
-    """Another stage has no scene, one without the other says nothing, and numbers with parts are no raw ones."""
+    """Other stages take no scene, scene and weights need each other, and fractional values are no raw DN."""
     weights = Path("w.safetensors")
     for stage, scene, read_by in (
         ("rectify", "cube.npy", weights),
@@ -113,8 +113,8 @@ def test_scenes_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         scan_raster(cube_of(tmp_path / "cube.npy", offset=0.5), None)
 
 
-def test_blocks_are_averaged_whole() -> None:
-    """Means of each, the rest left out; a smaller image is one block."""
+def test_block_means_use_whole_blocks() -> None:
+    """Partial blocks are left out; a smaller image is one block."""
     values = np.arange(4 * 6, dtype=np.float32).reshape(4, 6, 1)
     np.testing.assert_array_equal(block_means_of(values, 2)[..., 0], [[3.5, 5.5, 7.5], [15.5, 17.5, 19.5]])
     assert block_means_of(values, 5).shape == (1, 1, 1)

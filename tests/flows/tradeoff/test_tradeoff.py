@@ -1,4 +1,4 @@
-"""Trade-offs: what is timed and judged, which points win, and how they are shown."""
+"""Trade-offs: timing, scores, Pareto points and their display."""
 
 from __future__ import annotations
 
@@ -23,34 +23,34 @@ from storage.archive.whole_files import to_json
 
 
 def make_point(error: float, cost: float, setting: str = "s") -> Point:
-    """A point of a setting."""
+    """Return a point of a setting."""
     return Point(setting, error, cost, cost, 1.0)
 
 
 class Clock:
-    """Stands for the time module: time passes only where a test lets it, on the wall twice as fast."""
+    """Stand-in for the time module: time passes only when a test asks for it, and twice as fast on the wall."""
 
     def __init__(self) -> None:
         self.cpu_s = 0.0
 
     def process_time(self) -> float:
-        """Processor seconds."""
+        """Return processor seconds."""
         return self.cpu_s
 
     def perf_counter(self) -> float:
-        """Wall seconds."""
+        """Return wall seconds."""
         return 2 * self.cpu_s
 
 
 @pytest.fixture(autouse=True)
 def uncollected(monkeypatch):
-    """Skip the collection of garbage before each run, which takes most of the time here."""
+    """Skip the garbage collection before each run, which would take most of the time here."""
     monkeypatch.setattr(tradeoff_module.gc, "collect", lambda: 0)
 
 
 @pytest.fixture
 def clock(monkeypatch):
-    """The clock that trade-offs are timed by."""
+    """Return the clock that times trade-offs."""
     stands_in = Clock()
     monkeypatch.setattr(tradeoff_module, "time", stands_in)
     return stands_in
@@ -69,13 +69,13 @@ SERIES = Tradeoff(
 
 
 def spend(clock, seconds):
-    """Let time pass, and give an error of 0."""
+    """Let time pass and return an error of 0."""
     clock.cpu_s += seconds
     return Figures(0.0)
 
 
 def test_every_setting_is_judged_and_runs_in_turn():
-    """A series that stops errs by its remainder; rounds start at another setting each."""
+    """A truncated series has the error of its remainder; each round starts at another setting."""
     for point in measure_tradeoff(SERIES, repeats=1).points:
         assert point.error == pytest.approx(1 / float(point.setting), rel=1e-3)
     seen: list[float] = []
@@ -84,14 +84,14 @@ def test_every_setting_is_judged_and_runs_in_turn():
     assert seen == [1, 2, 3, 1, 2, 3, 2, 3, 1]
 
 
-def test_a_first_setting_without_a_cost_leaves_no_ratio():
+def test_a_first_setting_of_no_cost_gives_no_ratio():
     """A cube of one value takes no bytes."""
     free = replace(SERIES, settings=(1.0, 2.0), judge=lambda truth, terms, out: Figures(0.0, cost=terms - 1))
     assert [math.isnan(one.ratio) for one in measure_tradeoff(free, repeats=1).points] == [True, True]
 
 
-def test_least_times_are_the_cost(clock):
-    """A machine that halts for a while does not raise the cost."""
+def test_the_cost_is_the_shortest_time(clock):
+    """A machine that pauses for a while does not raise the cost."""
     turns = iter((1.0, 1.0, 2.0, 4.0, 2.0, 2.0, 3.0, 9.0))  # the second round begins with the second setting
     halting = replace(
         SERIES, settings=(1.0, 2.0), run=lambda truth, terms: spend(clock, next(turns)), judge=lambda *_: Figures(0.0)
@@ -101,7 +101,7 @@ def test_least_times_are_the_cost(clock):
 
 
 def test_settings_run_on_one_thread():
-    """Torch has one thread while settings run, and those it had before afterwards."""
+    """Torch has one thread while settings run, and its old number afterwards."""
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     try:
@@ -114,8 +114,8 @@ def test_settings_run_on_one_thread():
         torch.set_num_threads(before)
 
 
-def test_only_run_is_timed_unless_another_cost_is_judged(clock):
-    """Preparing and judging take no time; a cost that is judged replaces the time."""
+def test_only_the_run_is_timed(clock):
+    """Preparation and judging do not count; a cost from judging replaces the time."""
     timed = replace(
         SERIES,
         settings=(1.0, 4.0),
@@ -131,8 +131,8 @@ def test_only_run_is_timed_unless_another_cost_is_judged(clock):
 
 
 @given(st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), min_size=1, max_size=12))
-def test_pareto_points_are_those_that_nobody_beats(pairs):
-    """Marked points do not beat each other, and every other point is beaten by a marked one."""
+def test_pareto_points_are_not_dominated(pairs):
+    """No marked point dominates another, and a marked point dominates every other point."""
     points = mark_pareto([make_point(error, price) for error, price in pairs])
     front = {(point.error, point.cost) for point in points if point.pareto}
     assert front
@@ -142,7 +142,7 @@ def test_pareto_points_are_those_that_nobody_beats(pairs):
 
 
 def test_result_is_json_and_names_the_machine():
-    """With load, threads and versions; neither NaN nor infinity is in it."""
+    """It has load, threads and versions; NaN and infinity become null."""
     points = (make_point(math.nan, 1.0), make_point(math.inf, 1.0), make_point(0.5, 1.0))
     found = json.loads(to_json(asdict(replace(measure_tradeoff(SERIES, repeats=1), points=points))))
     assert {"processor", "cores", "threads", "versions", "load_before"} <= set(found["machine"])
@@ -150,14 +150,14 @@ def test_result_is_json_and_names_the_machine():
 
 
 def printed(result: Result, width: int = 140) -> str:
-    """The table as a terminal shows it."""
+    """Return the table as a terminal shows it."""
     console = Console(file=io.StringIO(), width=width)
     print_tradeoff(result, console)
     return console.file.getvalue()
 
 
-def test_table_goes_from_the_most_exact_setting_down():
-    """What errs least comes first; 80 columns cut neither a setting's name nor a further figure."""
+def test_the_table_begins_with_the_smallest_error():
+    """80 columns cut neither the name of a setting nor another figure."""
     figured = replace(
         SERIES, judge=lambda truth, terms, out: Figures(1 / terms, 2.5, {"squared": 0.0625}), cost="pages of paper"
     )
@@ -170,7 +170,7 @@ def test_table_goes_from_the_most_exact_setting_down():
 
 
 def test_the_default_is_marked() -> None:
-    """In the table, in the figure and in the JSON, and nothing where no setting is one."""
+    """Table, figure and JSON mark it; without a default nothing is marked."""
     result = measure_tradeoff(replace(SERIES, default=16000.0), repeats=1)
     assert "16000.0 (default)" in printed(result)
     assert printed(result).count("(default)") == 1
@@ -180,8 +180,8 @@ def test_the_default_is_marked() -> None:
     assert "(default)" not in printed(measure_tradeoff(SERIES, repeats=1))
 
 
-def test_figure_tells_winners_from_beaten():
-    """Winners are filled, the beaten hollow; a family is one line, its members named at their points."""
+def test_the_figure_distinguishes_pareto_points():
+    """They are filled, the others hollow; a family is one line with its members named at their points."""
     told = (("scan, 1 ms", 0.0, 2.0), ("scan, 2 ms", 1e-3, 1.0), ("two passes, half", 0.5, 3.0))
     points = mark_pareto([make_point(error, cost, name) for name, error, cost in told])
     figure = tradeoff_figure([replace(measure_tradeoff(SERIES, repeats=1), points=points, level=("half", 0.5))])
@@ -193,8 +193,8 @@ def test_figure_tells_winners_from_beaten():
     assert [text.get_text() for text in axes.get_legend().get_texts()] == ["scan", "two passes"]
 
 
-def test_a_wrong_stage_or_folder_is_refused_before_anything_is_measured(tmp_path, monkeypatch):
-    """An unknown stage names those there are, a file in the folder's place is named, and no setting ran."""
+def test_a_wrong_stage_or_folder_is_refused_before_measuring(tmp_path, monkeypatch):
+    """The message lists the stages, or names the file in place of the folder."""
     monkeypatch.setitem(command.TRADEOFFS, "series", replace(SERIES, prepare=lambda seed: pytest.fail("measured")))
     (tmp_path / "taken").write_text("")
     with pytest.raises(ArchiveError, match=r"cannot write to .*taken: .*; choose another --out"):
@@ -204,8 +204,8 @@ def test_a_wrong_stage_or_folder_is_refused_before_anything_is_measured(tmp_path
 
 
 @pytest.mark.parametrize("errors", [(0.0, 0.1, 3.0), (0.0, 0.0), (math.inf, 0.5), (math.nan, math.nan)])
-def test_plots_take_errors_of_zero_and_none_at_all(tmp_path, errors):
-    """Exact settings and failed ones neither stop the plot nor warn."""
+def test_plots_accept_zero_and_non_finite_errors(tmp_path, errors):
+    """Exact and failed settings neither stop the plot nor warn."""
     points = mark_pareto([make_point(error, 1.0 + number) for number, error in enumerate(errors)])
     result = replace(measure_tradeoff(SERIES, repeats=1), points=points, level=("half", 0.5))
     assert png(tradeoff_figure([result] * 4)).startswith(b"\x89PNG")

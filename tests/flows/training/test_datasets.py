@@ -1,4 +1,4 @@
-"""Data sets name their scenes, hold some out, and split one scene by a mask."""
+"""Data sets: names of scenes, held-out scenes, and the split of one scene by a mask."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _folder(root: Path) -> Path:
 
 
 def test_scenes_are_named_by_number(tmp_path: Path) -> None:
-    """Each image is a scene with its own labels; those held out are named."""
+    """Each image is a scene with its own labels; held-out scenes are listed by name."""
     data = load_data_set(_folder(tmp_path), hold_out=["010"])
     assert data.names == ("003", "010", "021")
     assert data.held_out == ("010",)
@@ -39,7 +39,7 @@ def test_scenes_are_named_by_number(tmp_path: Path) -> None:
 
 
 def test_all_scenes_cannot_be_held_out(tmp_path: Path) -> None:
-    """None would be left to train on."""
+    """Holding out all three scenes would leave none to train on."""
     _folder(tmp_path)
     with pytest.raises(SceneError, match="leaves none to train on"):
         load_data_set(tmp_path, hold_out=["003", "010", "021"])
@@ -73,8 +73,8 @@ def test_a_mask_splits_the_labels(tmp_path: Path) -> None:
         (2, [9, 4], "the class of the labels in 0% of its pixels; give mask classes"),
     ],
 )
-def test_masks_that_do_not_fit(tmp_path: Path, mask: int, classes: list[int] | None, words: str) -> None:
-    """Too few mask classes, classes that the labels lack or do not have there, and stray numbers are refused."""
+def test_masks_that_do_not_fit_are_refused(tmp_path: Path, mask: int, classes: list[int] | None, words: str) -> None:
+    """Too few mask classes, classes that the labels lack or have elsewhere, and stray numbers are refused."""
     np.save(tmp_path / "a.npy", np.ones((1, 2, 1)))
     np.save(tmp_path / "gt.npy", np.array([[4, 9]]))
     np.save(tmp_path / "mask.npy", np.array([[1, mask]]))
@@ -85,8 +85,8 @@ def test_masks_that_do_not_fit(tmp_path: Path, mask: int, classes: list[int] | N
         data.load("a", "train")
 
 
-def test_indian_pines_disjoint_mask(real_data: Path) -> None:
-    """5,528 pixels train, the labelled rest of 10,249 tests."""
+def test_indian_pines_splits_by_the_disjoint_mask(real_data: Path) -> None:
+    """5,528 pixels are for training and the rest of the 10,249 labelled pixels for the test."""
     folder = real_data / "indian_pines"
     mask = folder / "indianpines_disjoint_dset.mat"
     data = load_data_set(folder / "Indian_pines_corrected.npy", train_mask=mask, mask_classes=MASK_TO_CLASS)

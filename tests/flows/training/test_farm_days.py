@@ -1,4 +1,4 @@
-"""The farm that grows, through the settings: one land on all days, keys that tell them, and what learns from it."""
+"""The farm with its season: one land on all days, keys that name the day, and training on these days."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from pipeline.simulator.scenes.scene import RasterScene
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 
-LINES = ("track", "water")  # classes of what no day moves
+LINES = ("track", "water")  # classes that are at the same place on all days
 BANDS = (20, 60, 110, 160, 210, 250)
 
 
@@ -37,13 +37,13 @@ def _settings(**table: Any) -> Settings:
 
 
 def _lines(scene: RasterScene) -> np.ndarray[Any, Any]:
-    """Where tracks and water lie."""
+    """Return the mask of tracks and water."""
     assert scene.labels is not None
     return np.isin(scene.labels, [CLASSES.index(name) for name in LINES])
 
 
-def test_two_days_of_a_field_are_one_land() -> None:
-    """Tracks and ditches lie where they lay; what grows has changed; day and hour stand in the key."""
+def test_two_days_of_a_field_share_one_land() -> None:
+    """Tracks and ditches keep their place and more than 10 % of the labels change; the key holds day and hour."""
     june, april = (open_scene(_settings(seed=5, day=day))[0] for day in (172, 100))
     there, then = _lines(june), _lines(april)
     assert np.count_nonzero(there & then) > 0.8 * np.count_nonzero(there | then) > 1000
@@ -55,7 +55,7 @@ def test_two_days_of_a_field_are_one_land() -> None:
 
 
 def test_night_is_refused() -> None:
-    """The sun has to be up."""
+    """The sun must be above the horizon: 3 o'clock on day 355 is refused."""
     with pytest.raises(SceneError, match="sun"):
         open_scene(_settings(day=355, hour=3))
 
@@ -67,8 +67,8 @@ def _publish(archive: Archive, key: str, **settings: Any) -> str:
         return draft.id
 
 
-def test_the_usual_day_of_a_farm_is_one_field(tmp_path: Path) -> None:
-    """By either name of the farm, and whether the day is named or not; another day is another field."""
+def test_the_default_day_of_a_farm_is_one_field(tmp_path: Path) -> None:
+    """Both names of the farm, with the day named or left out, are one field; another day is another field."""
     archive, key = Archive.open(tmp_path), "farm@2/seed=0/day=172/shape=8x8/hour=11/bands=9"
     made = [
         _publish(archive, key, scene="farm"),
@@ -81,7 +81,7 @@ def test_the_usual_day_of_a_farm_is_one_field(tmp_path: Path) -> None:
 
 
 def test_training_days_cover_the_season() -> None:
-    """Each month from April to October has some, with enough sun, none of them judged on; names are read back."""
+    """Each month from April to October has training days with enough sun; test days and seeds differ; names parse."""
     data = open_training_data("farm", 3, None, LineCamera())
     learnt = [read_farm_name(name) for name in data.train]
     judged = [read_farm_name(name) for name in (*data.validation, *farm_test_data(4, LineCamera()).train)]
@@ -98,7 +98,7 @@ def test_training_days_cover_the_season() -> None:
 
 
 def test_training_mixes_built_in_scenes() -> None:
-    """Named with commas, each law has its part of the scenes, on days when crops stand, and test scenes of its own."""
+    """For names with commas each law gives a part of the scenes, on days with crops, and has test scenes of its own."""
     data = open_training_data("farm@2, scouting", None, 7, LineCamera())
     assert data.law == "farm@2,scouting@1"
     scouted = [name for name in data.train if name.startswith("scouting-")]
@@ -113,8 +113,8 @@ def test_training_mixes_built_in_scenes() -> None:
 
 
 @pytest.mark.parametrize("bands", [BANDS, tuple(range(0, 270, 5))])
-def test_training_sees_the_farm_through_the_rig(bands: tuple[int, ...]) -> None:
-    """Beside the footprint and the noise alone, blur and shading count, by little. Surveys condense many bands."""
+def test_training_scenes_have_the_effects_of_the_rig(bands: tuple[int, ...]) -> None:
+    """Blur and shading change the columns a little beyond footprint and noise; many bands come with a noise model."""
     scene, camera = open_scene(_settings(seed=5, size="96x64", bands=bands))[0], LineCamera(samples=96)
     grid, basis = SceneGrid(*scene.shape, 8), SpectralBasis.spanning(scene.wavelength_nm, 6)
     seen = observe_scene(scene, camera, grid, basis, np.random.default_rng(3))
@@ -133,15 +133,15 @@ def test_training_sees_the_farm_through_the_rig(bands: tuple[int, ...]) -> None:
 
 
 @pytest.mark.parametrize(("size", "measured"), [("1280x1024", 1.42e9), ("2560x2048", 1.57e9)])
-def test_a_machine_too_small_for_a_farm_is_told(size: str, measured: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By what a survey of it took; one with a tenth more is enough."""
+def test_a_farm_larger_than_the_memory_is_refused(size: str, measured: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine with the measured bytes of a survey is too small; 10 % more suffice."""
     for there, refused in ((measured, True), (1.1 * measured, False)):
         monkeypatch.setattr("flows.tasks.scene.machine_bytes", lambda there=there: int(there))
         assert (farm_refusal(_settings(size=size)) is not None) == refused
 
 
-def test_validation_scenes_have_noise_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each scene is imaged from a stream that no other scene has, of training or of validation."""
+def test_each_scene_has_a_noise_stream_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No two scenes of training or validation share a random stream."""
     streams: list[int] = []
 
     def imaged(scene: RasterScene, camera: LineCamera, grid: SceneGrid, basis: SpectralBasis, rng: Any) -> None:

@@ -1,4 +1,4 @@
-"""Training as a flow: what is refused before the first look, what the record says was trained on, who is told."""
+"""Training as a flow: input refused before imaging, the record of the training data, and messages to the user."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ SETTINGS = TrainingSettings(steps=1, batch=1, crop=16)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four frames of 16 x 16 px with two classes."""
+    """Return a folder with four frames of 16 x 16 px and two classes."""
     return write_field(tmp_path_factory.mktemp("frames") / "field", (16, 16), ("001", "002", "003", "004"))
 
 
 @pytest.fixture
 def out(tmp_path: Path) -> Path:
-    """Where the weights of a test go."""
+    """Return the path for the weights of a test."""
     return tmp_path / "w.safetensors"
 
 
@@ -58,8 +58,8 @@ def _request(folder: Path, out: Path, **choices: Any) -> TrainRequest:
     return TrainRequest(str(folder), out, **sizes)
 
 
-def test_the_record_tells_what_was_trained_on(folder: Path, out: Path, tmp_path: Path):
-    """Scenes kept for validation or held out are not among those that the weights were trained on."""
+def test_the_record_lists_the_training_scenes(folder: Path, out: Path, tmp_path: Path):
+    """Scenes kept for validation or held out are not among them."""
     record = train_weights(_request(folder, out, validation=1, hold_out=("003",)))
     split = record["split"]
     assert (len(split["train"]), len(split["validation"])) == (2, 1)
@@ -68,8 +68,8 @@ def test_the_record_tells_what_was_trained_on(folder: Path, out: Path, tmp_path:
     assert load_weights(tmp_path / "w.safetensors").record["split"] == split
 
 
-def test_new_weights_say_what_they_saw_and_know_what_is_ood(tmp_path: Path):
-    """By scenes kept for validation; measured again by the command, the same; without such scenes nothing of it."""
+def test_new_weights_have_a_training_record_and_an_ood_detector(tmp_path: Path):
+    """Validation scenes fit the detector; without such scenes the weights have none, and a note says so."""
     field, out = write_field(tmp_path / "field", (32, 32), ("001", "002", "003", "004")), tmp_path / "w.safetensors"
     record = train_weights(_request(field, out, validation=1))
     told = TrainedOn.read(load_weights(out).record["trained_on"])
@@ -82,17 +82,17 @@ def test_new_weights_say_what_they_saw_and_know_what_is_ood(tmp_path: Path):
 
 
 @pytest.mark.parametrize("sizes", [{"patch": 24}, {"tokens": {"dim": 18}}])
-def test_networks_that_cannot_be_are_refused_before_the_first_look(
+def test_impossible_network_sizes_are_refused_before_imaging(
     folder: Path, out: Path, sizes: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ):
-    """No scene is imaged for sizes that do not fit."""
+    """No scene is imaged for sizes that do not fit together."""
     monkeypatch.setattr(train_scenes, "observe_scene", lambda *given, **named: pytest.fail("a scene was looked at"))
     with pytest.raises(SettingsError, match="choose another --patch, --dim or --heads"):
         train_weights(_request(folder, out, **sizes))
 
 
-def test_a_folder_in_the_place_of_the_weights_is_named(out: Path, capsys: pytest.CaptureFixture[str]):
-    """One message before any scene is read, and the exit code of usage."""
+def test_a_folder_as_output_file_is_refused(out: Path, capsys: pytest.CaptureFixture[str]):
+    """One message comes before any scene is read, with the exit code of a usage error."""
     out.mkdir()
     with pytest.raises(SystemExit) as left:
         main(["train", "nowhere", "-o", str(out)])
@@ -100,8 +100,8 @@ def test_a_folder_in_the_place_of_the_weights_is_named(out: Path, capsys: pytest
     assert "w.safetensors: expected the name of a file" in " ".join(capsys.readouterr().err.split())
 
 
-def test_scenes_of_other_bands_are_not_mixed(folder: Path, out: Path, monkeypatch: pytest.MonkeyPatch):
-    """One camera's scenes make one set of weights: the scene that differs is named."""
+def test_scenes_of_different_bands_are_not_mixed(folder: Path, out: Path, monkeypatch: pytest.MonkeyPatch):
+    """One set of weights needs the bands of one camera; the message names the scene that differs."""
     load, known = flow.open_training_data(str(folder), 0, None, LineCamera()).scene, set[str]()
 
     def scene(data: object, name: str) -> RasterScene:
@@ -118,8 +118,8 @@ def test_scenes_of_other_bands_are_not_mixed(folder: Path, out: Path, monkeypatc
     ("shape", "built_in", "patch"),
     [((512, 640), True, 16), ((1024, 1280), False, 32), ((300, 900), False, 16), ((145, 145), False, 8)],
 )
-def test_patches_follow_the_size_of_scenes(shape: tuple[int, int], built_in: bool, patch: int):
-    """Small scenes get small patches, so that there are patches to choose from, and large frames a deep network."""
+def test_patch_size_follows_the_scene_size(shape: tuple[int, int], built_in: bool, patch: int):
+    """Small scenes get small patches, to have enough to choose from; large frames get the deep network."""
     nm = np.linspace(500, 800, 4)
     common = Common(SpectralBasis.spanning(nm), ("a", "b"), np.zeros((2, 3), np.uint8), patch, nm)
     assert suggested_patch(shape, built_in=built_in) == patch
@@ -127,7 +127,7 @@ def test_patches_follow_the_size_of_scenes(shape: tuple[int, int], built_in: boo
 
 
 def test_training_shows_the_figures_of_validation(folder: Path, out: Path):
-    """The table has a row for each placement."""
+    """The table has a row per policy, the baselines and the readings with their mIoU."""
     shown, rows = io.StringIO(), {"none", "random", "sobel", "entropy", "gain", "all"}
     request = _request(folder, out, validation=1)
     judged = run_train(request, Console(file=shown, width=100))["validation"]
@@ -146,7 +146,7 @@ def test_training_shows_the_figures_of_validation(folder: Path, out: Path):
 def test_few_labels_give_the_mean_of_network_and_discriminants(
     folder: Path, out: Path, monkeypatch: pytest.MonkeyPatch, few: int, validation: int, kept: str | None
 ) -> None:
-    """With more labels the reading that validation scenes score best is kept, and without scenes the network."""
+    """With more labels the reading with the best validation score is kept; without validation scenes, the network."""
     monkeypatch.setattr(flow, "FEW_PIXELS", few)
     readings = train_weights(_request(folder, out, validation=validation))["readings"]
     scores = readings["miou"]
@@ -154,7 +154,7 @@ def test_few_labels_give_the_mean_of_network_and_discriminants(
 
 
 def test_counts_of_validation_scenes_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each row is judged on all scenes together, and each random draw with the same draw of the others."""
+    """A row's score uses the summed counts of all scenes; the i-th random draws of all scenes are summed together."""
     counts = [np.diag([number, 9]) + np.array([[0, 1], [number, 0]]) for number in range(1, 5)]
     scenes = iter(
         {"none": counts[:1], "all": counts[1:2], "gain": counts[2:3], "random": [counts[at], counts[3]]}
@@ -169,8 +169,8 @@ def test_counts_of_validation_scenes_add_up(monkeypatch: pytest.MonkeyPatch) -> 
     assert found["random"]["spread"] == pytest.approx(np.std(draws, ddof=1))
 
 
-def test_classifiers_beside_a_training_know_spectra_that_differ() -> None:
-    """Two classes far apart are told apart, two of one law no better than by chance; one alone says nothing."""
+def test_baselines_separate_classes_of_different_spectra() -> None:
+    """Distant classes score above 0.95, classes of one distribution near chance; a single class gives none."""
     rng, labels = np.random.default_rng(0), np.repeat(np.arange(2, dtype=np.uint8), 20)[:, None].repeat(40, 1)
     values = rng.normal(0, 1, (40, 40, 3))
 
@@ -185,8 +185,8 @@ def test_classifiers_beside_a_training_know_spectra_that_differ() -> None:
     assert judged(values, np.zeros_like(labels)) is None
 
 
-def test_a_survey_says_that_a_scene_was_trained_on(folder: Path, out: Path) -> None:
-    """The accuracy on a training scene comes with a warning, that on a held-out one does not."""
+def test_a_survey_warns_of_a_training_scene(folder: Path, out: Path) -> None:
+    """A held-out scene gets no warning."""
     train_weights(_request(folder, out, hold_out=("002",), validation=0))
     notes = {}
     for number in ("001", "002"):
@@ -197,8 +197,8 @@ def test_a_survey_says_that_a_scene_was_trained_on(folder: Path, out: Path) -> N
     assert "a training scene" not in notes["002"]
 
 
-def test_pixels_trained_on_are_not_judged(out: Path, tmp_path: Path) -> None:
-    """With a training mask the survey of the same file counts the other labelled pixels alone."""
+def test_training_pixels_are_not_judged(out: Path, tmp_path: Path) -> None:
+    """After training with a mask, the survey of the same file keeps the labels outside of the mask only."""
     labels = np.random.default_rng(4).integers(1, 3, (40, 40)).astype(np.uint8)
     np.save(tmp_path / "cube.npy", (labels[..., None] * np.ones(4)).astype(np.float32))
     np.save(tmp_path / "labels.npy", labels)
@@ -220,8 +220,8 @@ def test_pixels_trained_on_are_not_judged(out: Path, tmp_path: Path) -> None:
         (1.0, [500, 600, 700], "no band near 800 nm"),
     ],
 )
-def test_surveys_tell_of_unlike_scenes(factor: float, bands: list[int], note: str, out: Path, tmp_path: Path) -> None:
-    """In its unit or in its bands; a scene of the training's kind is surveyed without a note."""
+def test_surveys_warn_of_unlike_scenes(factor: float, bands: list[int], note: str, out: Path, tmp_path: Path) -> None:
+    """The unit or the bands differ; a scene like those of the training gets no note."""
     labels = np.random.default_rng(4).choice([1, 2], (40, 40), p=[0.3, 0.7]).astype(np.uint8)
     values = (labels[..., None] * np.ones(4)).astype(np.float32)
     np.save(tmp_path / "cube.npy", values)
@@ -235,8 +235,8 @@ def test_surveys_tell_of_unlike_scenes(factor: float, bands: list[int], note: st
     assert bool(note) == ("of the training" in notes)
 
 
-def test_weights_for_short_exposures_have_a_record_of_plain_scans(folder: Path, out: Path):
-    """mIoU by step and exposure from the darkest up, and beside it what maps expect; else none."""
+def test_weights_for_short_exposures_have_scan_performance(folder: Path, out: Path):
+    """It holds mIoU and expected scores by step and exposure; other trainings have none."""
     settings = replace(SETTINGS, darkest_ms=6.0)
     record = train_weights(_request(folder, out, validation=2, settings=settings))
     scans = describe_weights(out).record["scans"]
@@ -253,16 +253,16 @@ def test_weights_for_short_exposures_have_a_record_of_plain_scans(folder: Path, 
 
 
 @pytest.mark.parametrize(("darkest_ms", "said"), [(3.0, True), (100.0, False)])
-def test_weights_that_will_choose_no_scan_say_so(folder: Path, out: Path, darkest_ms: float, said: bool):
-    """Short exposures without scenes to judge scans on: told as training ends, not first by a survey."""
+def test_missing_scan_performance_is_reported_after_training(folder: Path, out: Path, darkest_ms: float, said: bool):
+    """Short exposures without validation scenes are reported at the end of training, not first by a survey."""
     shown, settings = io.StringIO(), replace(SETTINGS, darkest_ms=darkest_ms)
     request = _request(folder, out, validation=0, settings=settings)
     run_train(request, Console(file=shown, width=100))
     assert ("the file has no scan performance" in shown.getvalue()) == said
 
 
-def test_whitening_knows_the_noise_of_short_exposures(folder: Path, out: Path):
-    """Weights that are to read short exposures make less of directions that noise would hide."""
+def test_whitening_uses_the_noise_of_short_exposures(folder: Path, out: Path):
+    """Weights for short exposures give less weight to directions in which noise dominates."""
     sizes = []
     for darkest_ms in (100.0, 3.0):
         train_weights(_request(folder, out, validation=0, settings=replace(SETTINGS, darkest_ms=darkest_ms)))
@@ -270,8 +270,8 @@ def test_whitening_knows_the_noise_of_short_exposures(folder: Path, out: Path):
     assert sizes[1] < sizes[0]
 
 
-def test_training_goes_on_from_a_file(folder: Path, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The normalisation stays, a step begins at the first network; without validation the result is halfway."""
+def test_training_resumes_from_a_file(folder: Path, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Normalisation stays and the first step starts at the old network; without validation the mean of both is kept."""
     train_weights(_request(folder, out, validation=0, command="first"))
     trained = flow.train
     ends: list[Any] = []
@@ -289,10 +289,10 @@ def test_training_goes_on_from_a_file(folder: Path, out: Path, tmp_path: Path, m
 
 
 @pytest.mark.parametrize(("better", "kept"), [(0, "network"), (3, "mean with --start")])
-def test_a_training_that_goes_on_keeps_what_validation_scores_best(
+def test_continued_training_keeps_the_best_by_validation(
     folder: Path, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, better: int, kept: str
 ) -> None:
-    """The trained network, or the mean of its weights and those before."""
+    """The candidates are the trained network and the mean of its weights and the old ones."""
     train_weights(_request(folder, out, validation=1))
     scores = iter(np.eye(4)[better])
     monkeypatch.setattr(figures, "_miou", lambda *judged: float(next(scores)))
@@ -300,15 +300,15 @@ def test_a_training_that_goes_on_keeps_what_validation_scores_best(
     assert record["readings"]["kept"] == kept
 
 
-def test_a_training_that_goes_on_may_have_more_scenes(folder: Path, out: Path, tmp_path: Path) -> None:
-    """Its record names them all."""
+def test_continued_training_may_have_more_scenes(folder: Path, out: Path, tmp_path: Path) -> None:
+    """Its record names the scenes of both trainings."""
     first = train_weights(_request(folder, out, validation=1))["split"]
     second = train_weights(_request(folder, tmp_path / "b.safetensors", validation=0, start=out))["split"]
     assert second["train"].items() > first["train"].items()
 
 
-def test_a_training_that_goes_on_learns_more_slowly(out: Path) -> None:
-    """At a third of the rate, from the file that the flag names."""
+def test_continued_training_has_a_lower_learning_rate(out: Path) -> None:
+    """Its rate is a third unless a flag sets it; `--start` names the file."""
     anew, on = (TrainFlags(start=start).request("farm", out, "") for start in (None, Path("first.safetensors")))
     assert 3 * on.settings.learning_rate == pytest.approx(anew.settings.learning_rate)
     assert (anew.start, on.start) == (None, Path("first.safetensors"))
@@ -324,15 +324,15 @@ def test_a_training_that_goes_on_learns_more_slowly(out: Path) -> None:
         ({"width": 8}, "sizes of the network"),
     ],
 )
-def test_a_training_cannot_go_on_from_another(folder: Path, out: Path, changed: dict[str, Any], what: str) -> None:
-    """Bands and sizes are those of the first training, and no scene of it is missing: one message says what is not."""
+def test_continued_training_refuses_changed_input(folder: Path, out: Path, changed: dict[str, Any], what: str) -> None:
+    """One message names the difference: missing training scenes, other bands or other network sizes."""
     train_weights(_request(folder, out, validation=1))
     with pytest.raises(SettingsError, match=f"its training had other {what}; give its data set and options"):
         train_weights(_request(folder, out.with_name("b.safetensors"), **{"validation": 1, "start": out, **changed}))
 
 
-def test_a_training_cannot_go_on_with_other_scenes_of_the_same_names(folder: Path, out: Path, tmp_path: Path) -> None:
-    """Scenes are told by their content: else the first ones would judge a network that knows them."""
+def test_continued_training_refuses_other_scenes_of_the_same_names(folder: Path, out: Path, tmp_path: Path) -> None:
+    """Content identifies scenes; else validation could use scenes of the first training."""
     train_weights(_request(folder, out, validation=0))
     other = write_field(tmp_path / "field", (16, 16), ("001", "002", "003", "004"), seed=9)
     with pytest.raises(SettingsError, match="other training scenes"):
@@ -340,8 +340,8 @@ def test_a_training_cannot_go_on_with_other_scenes_of_the_same_names(folder: Pat
 
 
 @pytest.mark.parametrize(("rows", "held"), [(8, False), (12, True), (None, True)])
-def test_a_training_goes_on_with_all_its_pixels(out: Path, tmp_path: Path, rows: int | None, held: bool) -> None:
-    """Another mask must contain the first one; without a mask every pixel is trained on."""
+def test_continued_training_needs_all_first_pixels(out: Path, tmp_path: Path, rows: int | None, held: bool) -> None:
+    """A new mask must contain the first one; without a mask every pixel is trained on."""
     labels = np.random.default_rng(4).integers(1, 3, (16, 16)).astype(np.uint8)
     np.save(tmp_path / "cube.npy", (labels[..., None] * np.ones(4)).astype(np.float32))
     np.save(tmp_path / "labels.npy", labels)
@@ -366,7 +366,7 @@ def test_a_training_goes_on_with_all_its_pixels(out: Path, tmp_path: Path, rows:
 
 @pytest.mark.parametrize("unfit", ["copy", "unlabelled"])
 def test_scenes_that_cannot_validate_are_left_out(folder: Path, out: Path, tmp_path: Path, unfit: str) -> None:
-    """One without a label judges nothing, a copy of a training scene too well; without another one none is judged."""
+    """A scene without labels cannot judge, and a copy of a training scene scores too high."""
     field = tmp_path / "field"
     shutil.copytree(folder, field)
     if unfit == "copy":
@@ -382,7 +382,7 @@ def test_scenes_that_cannot_validate_are_left_out(folder: Path, out: Path, tmp_p
 
 
 @pytest.mark.parametrize("darkest_ms", [0.0, -1.0, 200.0, float("nan")])
-def test_exposures_that_no_look_has_are_refused(folder: Path, out: Path, darkest_ms: float):
-    """Above the exposure that scenes are looked at with, or none at all: one message with the limits."""
+def test_impossible_minimum_exposures_are_refused(folder: Path, out: Path, darkest_ms: float):
+    """One message gives the limits: above 0 and at most the 100 ms of the training images."""
     with pytest.raises(SettingsError, match=r"--min-exposure-ms must be above 0 and at most 100"):
         run_train(_request(folder, out, settings=replace(SETTINGS, darkest_ms=darkest_ms)), QUIET)

@@ -1,4 +1,4 @@
-"""What maps are likely to score by what they say of themselves."""
+"""Expected scores of maps, computed from their own probabilities."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 def _map(seed: int, pixels: int = 4000, *, hotter: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """Log-probabilities (pixel, class), and labels drawn by them; the map says them ``hotter`` times as surely."""
+    """Return labels and log-probabilities (pixel, class) of a map whose confidence is ``hotter`` times too high."""
     rng = np.random.default_rng(seed)
     logits = rng.normal(size=(pixels, CLASSES)) * 3
     true = np.exp(logits) / np.exp(logits).sum(axis=1, keepdims=True)
@@ -40,7 +40,7 @@ def _scored(seed: int, hotter: float = 1.0) -> ScoredMap:
 
 @given(SEEDS, st.integers(0, 200))
 def test_expected_counts_of_parts_add_up(seed: int, cut: int):
-    """Counts of a map are those of its parts together, one for each pixel, whatever the cut."""
+    """Counts of a map are the sum of its parts' counts, one for each pixel, wherever it is cut."""
     said, _ = _map(seed, 200)
     whole = expected_counts([said], CLASSES)
     assert np.allclose(whole, expected_counts([said[:cut], said[cut:]], CLASSES))
@@ -48,8 +48,8 @@ def test_expected_counts_of_parts_add_up(seed: int, cut: int):
 
 
 @given(SEEDS)
-def test_what_nothing_is_known_of_is_left_out(seed: int):
-    """Pixels without a probability, NaN or minus infinity, count for nothing."""
+def test_pixels_without_probabilities_are_left_out(seed: int):
+    """NaN in all classes, or minus infinity in one, excludes the pixel."""
     said, _ = _map(seed, 50)
     said[::5], said[1::5, 2] = np.nan, -np.inf
     kept = np.isfinite(said).all(axis=1)
@@ -57,8 +57,8 @@ def test_what_nothing_is_known_of_is_left_out(seed: int):
 
 
 @given(SEEDS)
-def test_columns_are_those_of_the_map(seed: int):
-    """What is mapped as a class is as many pixels as the map shows of it; ties go to the first."""
+def test_expected_counts_sum_to_the_mapped_pixels(seed: int):
+    """Each column sums to the pixels mapped as its class; ties go to the first class."""
     said, _ = _map(seed, 300)
     said[0] = np.log(1 / CLASSES)
     shown = np.bincount(said.argmax(axis=1), minlength=CLASSES)
@@ -67,8 +67,8 @@ def test_columns_are_those_of_the_map(seed: int):
 
 @settings(max_examples=20)
 @given(SEEDS)
-def test_a_map_that_is_as_sure_as_it_may_be_expects_what_it_scores(seed: int):
-    """Where labels are drawn by the probabilities, the IoU expected is the IoU but for chance."""
+def test_a_calibrated_map_expects_its_true_score(seed: int):
+    """If labels are drawn by the probabilities, IoU is within 0.06 of the expected IoU, and mIoU within 0.04."""
     one = _scored(seed)
     assert np.abs(iou_per_class(one.expected) - iou_per_class(one.counts)).max() < 0.06
     told = expected_score(one.expected, np.zeros(CLASSES), *PLAIN)
@@ -76,8 +76,8 @@ def test_a_map_that_is_as_sure_as_it_may_be_expects_what_it_scores(seed: int):
 
 
 @pytest.mark.parametrize("hotter", [0.5, 2.0])
-def test_maps_that_are_too_sure_or_not_enough_are_put_right(hotter: float):
-    """What other maps of the same kind were off by is taken off: a third of the error is left at most."""
+def test_fitted_bias_corrects_miscalibrated_maps(hotter: float):
+    """The bias of other maps of the same kind leaves a third of the error at most."""
     maps, other = [_scored(seed, hotter) for seed in range(6)], _scored(77, hotter)
     bias, truth = fitted_bias(maps), mean_iou(other.counts)
     off = expected_score(other.expected, np.zeros(CLASSES), *PLAIN).miou - truth
@@ -86,8 +86,8 @@ def test_maps_that_are_too_sure_or_not_enough_are_put_right(hotter: float):
     assert (bias > 0).all() == (hotter < 1)
 
 
-def test_a_class_that_no_scene_has_is_not_put_right():
-    """Its bias is 0, as is that of one which maps show by mistake alone."""
+def test_an_absent_class_has_no_bias():
+    """The bias of a class without labels is 0, even if maps show it by mistake."""
     one = _scored(3)
     counts = one.counts.copy()
     counts[2] = 0
@@ -98,7 +98,7 @@ def test_a_class_that_no_scene_has_is_not_put_right():
     ("mapped", "half", "step", "exposure_ms"), [(0, 4738.0, 1, 100.0), (2, 8.94, 1, 100.0), (2, 28.8, 4, 3.0)]
 )
 def test_a_class_of_few_pixels_counts_by_its_probability(mapped: int, half: float, step: int, exposure_ms: float):
-    """One expected pixel hardly moves the mean; more count by half: scattered or sure, and by a quick, wide scan."""
+    """One expected pixel hardly moves the mean; ``half`` pixels count half: scattered, sure, or by a quick scan."""
     counts = np.diag([5000.0, 5000.0, 0.0])
     base = expected_score(counts, np.zeros(3), LEAST_ERROR, step, exposure_ms)
     assert base.miou > 0.99
@@ -117,20 +117,20 @@ def test_a_class_of_few_pixels_counts_by_its_probability(mapped: int, half: floa
     assert errors[1] > 4 * errors[0]
 
 
-def test_of_nothing_nothing_is_expected():
-    """Without a pixel the score is NaN, not 0."""
+def test_an_empty_map_has_no_expected_score():
+    """Without a pixel, score and error are NaN, not 0."""
     told = expected_score(np.zeros((3, 3)), np.zeros(3), *PLAIN)
     assert np.isnan(told.miou)
     assert np.isnan(told.error)
 
 
-def test_one_scene_tells_of_no_error_but_the_least():
-    """A single map is put right by itself, and nobody takes its error for none."""
+def test_the_error_of_one_scene_is_the_least_error():
+    """A single map is corrected by itself, which must not count as an error of 0."""
     assert error_of_passes([_scored(1)], 1, 100.0) == LEAST_ERROR
 
 
-def test_the_error_of_looks_is_judged_by_the_other_scenes():
-    """No map is put right by itself: of two, each by the bias of the other, worked out by hand."""
+def test_the_error_of_passes_is_cross_validated():
+    """Each of two maps is corrected by the bias of the other; the result is that worked out by hand."""
     one, other = _scored(1, 0.5), _scored(2, 2.0)
     pairs = ((one, other), (other, one))
     told = [(a, expected_score(a.expected, fitted_bias([b]), 0.0, 1, 100.0)) for a, b in pairs]
@@ -147,8 +147,8 @@ def _scores() -> MapScores:
     return MapScores.fitted(scan_passes)
 
 
-def test_scores_come_back_from_a_record():
-    """What is written down is read again, rounded."""
+def test_scores_round_trip_through_a_record():
+    """The record rounds bias and error."""
     scores = _scores()
     again = MapScores.read(scores.as_dict())
     assert (again.steps, again.exposures_ms, again.scenes) == ((1, 2), (4.0, 64.0), 3)
@@ -156,28 +156,28 @@ def test_scores_come_back_from_a_record():
     assert np.allclose(again.error, scores.error, atol=1e-5)
 
 
-def test_exposures_between_are_between_by_their_logarithm():
-    """Half of the way from 4 to 64 ms is 16 ms; the ends are what was measured."""
+def test_scores_are_interpolated_by_the_logarithm_of_exposure():
+    """16 ms lies halfway between 4 and 64 ms; the scores at the ends are those measured."""
     scores, counts = _scores(), _scored(50).expected
     first, middle, last = (scores.expected(counts, 2, ms) for ms in (4.0, 16.0, 64.0))
     assert first.miou == expected_score(counts, scores.bias[1, 0], scores.error[1, 0], 2, 4.0).miou
     assert middle.miou == pytest.approx((first.miou + last.miou) / 2, abs=0.005)
     assert middle.miou != last.miou
-    rounded = scores.expected(counts, 2, 3.96)  # of an exposure, to a tenth of a millisecond
+    rounded = scores.expected(counts, 2, 3.96)  # exposures are rounded to a tenth of a millisecond
     assert rounded.miou == pytest.approx(first.miou, abs=1e-6)
 
 
 @pytest.mark.parametrize(("step", "exposure_ms"), [(4, 16.0), (1, 3.9), (1, 65.0)])
-def test_nothing_is_said_of_looks_beyond_those_measured(step: int, exposure_ms: float):
-    """Another step, a darker and a lighter exposure have no score; neither have maps of other classes."""
+def test_scans_beyond_those_measured_have_no_score(step: int, exposure_ms: float):
+    """Other line spacings, shorter and longer exposures, and maps of other classes have no expected score."""
     scores = _scores()
     assert scores.expected(_scored(50).expected, step, exposure_ms) is None
     assert scores.expected(np.eye(CLASSES + 1), 1, 16.0) is None
 
 
 @pytest.mark.parametrize("part", ["steps", "exposures_ms", "bias", "error", "scenes"])
-def test_a_record_that_lacks_a_part_is_none(part: str):
-    """Each part is needed, and tables have to be of the steps and exposures."""
+def test_an_incomplete_record_is_refused(part: str):
+    """Each part is needed, and tables have to fit the steps and exposures."""
     content = _scores().as_dict()
     with pytest.raises(KeyError, match=part):
         MapScores.read({name: value for name, value in content.items() if name != part})

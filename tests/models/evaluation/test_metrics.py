@@ -1,4 +1,4 @@
-"""Confusion counts, and what follows from them."""
+"""Confusion counts, and the scores computed from them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def _maps(pairs: list[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray]:
 
 @given(PAIRS, st.integers(0, 60))
 def test_counts_of_parts_add_up(pairs: list[tuple[int, int]], cut: int):
-    """The count of a map is that of its parts together, and its sum the number of labelled pixels."""
+    """Counts of a map are the sum of its parts' counts, and their total is the number of labelled pixels."""
     labels, drawn = _maps(pairs)
     whole = metrics.confusion(labels, drawn, 4)
     parts = metrics.confusion(labels[:cut], drawn[:cut], 4) + metrics.confusion(labels[cut:], drawn[cut:], 4)
@@ -33,8 +33,8 @@ def test_counts_of_parts_add_up(pairs: list[tuple[int, int]], cut: int):
 
 
 @given(PAIRS, st.permutations(range(4)))
-def test_names_of_classes_do_not_matter(pairs: list[tuple[int, int]], names: list[int]):
-    """Renumbering the classes permutes the IoU and leaves every mean as it is."""
+def test_renumbering_classes_changes_no_mean(pairs: list[tuple[int, int]], names: list[int]):
+    """The IoU of the classes is permuted; mIoU, accuracies and kappa stay."""
     labels, drawn = _maps(pairs)
     renamed = np.append(names, [255] * 252).astype(np.uint8)
     before, after = metrics.confusion(labels, drawn, 4), metrics.confusion(renamed[labels], renamed[drawn], 4)
@@ -45,7 +45,7 @@ def test_names_of_classes_do_not_matter(pairs: list[tuple[int, int]], names: lis
 
 @given(PAIRS)
 def test_iou_is_that_of_pixel_sets(pairs: list[tuple[int, int]]):
-    """Each class's IoU is the size of its two pixel sets' intersection over their union's, NaN without a label."""
+    """The IoU of a class is the intersection of its two pixel sets over their union; without a label it is NaN."""
     labels, drawn = _maps(pairs)
     labels, drawn = labels[labels != 255], drawn[labels != 255]
     for number, iou in enumerate(metrics.iou_per_class(metrics.confusion(labels, drawn, 4))):
@@ -53,8 +53,8 @@ def test_iou_is_that_of_pixel_sets(pairs: list[tuple[int, int]]):
         assert iou == pytest.approx(both / either if (labels == number).any() else np.nan, nan_ok=True)
 
 
-def test_a_worked_case():
-    """Six pixels by hand: 4 right; IoU 2/3, 1/3 and 1/2; half of what chance leaves is agreed."""
+def test_scores_of_six_pixels_are_those_worked_out_by_hand():
+    """Four pixels are right; IoU is 2/3, 1/3 and 1/2, and kappa is half of the agreement that chance leaves."""
     counts = metrics.confusion(np.array([0, 0, 1, 1, 2, 2]), np.array([0, 0, 1, 0, 2, 1]), 3)
     assert counts.tolist() == [[2, 0, 0], [1, 1, 0], [0, 1, 1]]
     assert metrics.iou_per_class(counts) == pytest.approx([2 / 3, 1 / 3, 1 / 2])
@@ -64,16 +64,16 @@ def test_a_worked_case():
     assert metrics.kappa(counts) == pytest.approx((2 / 3 - 1 / 3) / (2 / 3))
 
 
-def test_agreement_by_chance_has_no_kappa():
-    """A map drawn without looking has kappa 0, a perfect one 1, and one class alone none at all."""
+def test_kappa_is_0_for_agreement_by_chance():
+    """A perfect map has kappa 1, and a single class has none."""
     chance = np.outer([30, 70], [40, 60])
     assert metrics.kappa(chance) == pytest.approx(0)
     assert metrics.kappa(np.diag([3, 4])) == 1
     assert np.isnan(metrics.kappa(np.array([[5, 0], [0, 0]])))
 
 
-def test_a_class_shown_where_the_labels_have_none_is_false():
-    """It has no IoU and its pixels are told; they lower the class they were taken from."""
+def test_a_class_without_labels_is_false():
+    """Its pixels are counted as false and lower the class that they were taken from; its own IoU is NaN."""
     counts = metrics.confusion(np.array([0, 0, 0, 1]), np.array([0, 0, 2, 1]), 3)
     assert metrics.iou_per_class(counts) == pytest.approx([2 / 3, 1, np.nan], nan_ok=True)
     assert metrics.false_pixels(counts).tolist() == [0, 0, 1]
@@ -85,7 +85,7 @@ LABELLED = st.lists(st.tuples(st.integers(0, 2), st.integers(0, 4)), min_size=1,
 
 @given(LABELLED, st.lists(st.tuples(st.booleans(), st.integers(0, 4)), min_size=60, max_size=60))
 def test_better_in_every_class_is_better_in_the_mean(pairs: list[tuple[int, int]], spoilt: list[tuple[bool, int]]):
-    """A map whose every class is at least as good has no lower mean, whatever false classes either map shows."""
+    """A map that is at least as good in every class has no lower mIoU, whatever false classes either map shows."""
     labels, better = _maps(pairs)
     touched, to = (np.array(column)[: len(labels)] for column in zip(*spoilt, strict=True))
     false = ~np.isin(better, labels)
@@ -97,8 +97,8 @@ def test_better_in_every_class_is_better_in_the_mean(pairs: list[tuple[int, int]
 
 
 @given(LABELLED, st.data())
-def test_stray_pixels_cost_their_own_class_alone(pairs: list[tuple[int, int]], data: st.DataObject):
-    """Right pixels turned into a false class lower the mean by their fraction of their class, over the classes."""
+def test_false_pixels_lower_only_their_own_class(pairs: list[tuple[int, int]], data: st.DataObject):
+    """The mIoU falls by their fraction of their class, divided by the number of classes."""
     labels, _ = _maps(pairs)
     drawn = labels.copy()
     stray = data.draw(st.lists(st.integers(0, len(labels) - 1), unique=True))
@@ -112,19 +112,19 @@ def test_stray_pixels_cost_their_own_class_alone(pairs: list[tuple[int, int]], d
 
 @pytest.mark.parametrize("kind", [np.uint8, np.int16, np.int64])
 def test_maps_of_any_integer_type_are_counted(kind: type):
-    """Classes up to 254 do not overflow the type they come in."""
+    """Classes up to 254 do not overflow their type."""
     labels = np.array([254, 200, 255 if kind is np.uint8 else 3, 254]).astype(kind)
     assert metrics.confusion(labels, np.array([254, 200, 3, 200], np.uint8), 255)[254].sum() == 2
 
 
 def test_a_map_of_another_size_is_refused():
-    """The message names both sizes."""
+    """The error names both sizes."""
     with pytest.raises(ShapeError, match=r"labels are \(2, 3\), the class map is \(3, 2\)"):
         metrics.confusion(np.zeros((2, 3), int), np.zeros((3, 2), int), 2)
 
 
-def test_a_gap_of_less_than_a_point_is_not_closed():
-    """The fraction of a way is given only where every patch is better than none by one point of mIoU or more."""
+def test_gap_closed_needs_a_gap_of_one_point():
+    """The fraction is given only if reading every patch is better than reading none by one point of mIoU or more."""
     assert metrics.gap_closed(0.6, 0.5, 0.7) == pytest.approx(0.5)
     assert metrics.gap_closed(0.4, 0.5, 0.3) is None
     assert metrics.gap_closed(0.8, 0.5, 0.7) == pytest.approx(1.5)
@@ -132,8 +132,8 @@ def test_a_gap_of_less_than_a_point_is_not_closed():
     assert metrics.gap_closed(0.5, float("nan"), 0.7) is None
 
 
-def test_calibration_error_is_how_far_confidence_lies_beside_what_is_right():
-    """Sure and right, sure and wrong, unsure by halves; counts of two maps add up, and no pixel has no error."""
+def test_calibration_error_compares_confidence_with_accuracy():
+    """An error of 0.8 in 10 of 40 pixels gives 0.2; counts of two maps add up; without a pixel the error is NaN."""
     nine, right = np.full(10, 0.9), np.arange(10) < 9
     assert metrics.calibration_error(metrics.confidence_counts(nine, right)) == pytest.approx(0, abs=1e-12)
     assert metrics.calibration_error(metrics.confidence_counts(nine, ~right)) == pytest.approx(0.8)

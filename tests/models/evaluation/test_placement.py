@@ -1,4 +1,4 @@
-"""The gain oracle, what placements are worth beside it, and the rows of other placements."""
+"""The gain oracle, the gain of placements relative to it, and the rows of other placements."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def _two_classes(tiny: Maker, height: int = 24, width: int = 32):
     return weights, coarse_pass.grid, seen, fine, labels
 
 
-def test_the_gain_is_the_loss_that_all_patches_take_away(tiny: Maker):
-    """With two classes a map's confidence gives its loss: the gain is the difference of the two maps' losses."""
+def test_oracle_gain_is_the_loss_that_patches_remove(tiny: Maker):
+    """With two classes a map's confidence gives its loss: the gain is the overview's loss less the full map's."""
     weights, grid, seen, fine, labels = _two_classes(tiny)
 
     def loss(patch_index: np.ndarray) -> np.ndarray:
@@ -41,8 +41,8 @@ def test_the_gain_is_the_loss_that_all_patches_take_away(tiny: Maker):
     assert placement.oracle_gain(weights, seen, fine, labels) == pytest.approx(expected, abs=1e-4)
 
 
-def test_what_has_no_label_has_no_gain(tiny: Maker):
-    """A patch without a labelled pixel gains nothing, and one half labelled half as much at most."""
+def test_an_unlabelled_patch_has_no_gain(tiny: Maker):
+    """A patch without a labelled pixel has a gain of exactly 0, and no gain exceeds 5."""
     weights, _, seen, fine, labels = _two_classes(tiny, 20, 30)
     labels[:8, :8] = 255
     gain = placement.oracle_gain(weights, seen, fine, labels)
@@ -53,7 +53,7 @@ def test_what_has_no_label_has_no_gain(tiny: Maker):
 
 @given(st.lists(st.integers(-16, 24).map(lambda n: n / 8), min_size=1, max_size=20), st.integers(0, 20))
 def test_the_oracle_captures_all_of_its_own_gain(values: list[float], count: int):
-    """The patches with the most gain have a ratio of 1, where there is any to be had, and no others have more."""
+    """The patches with the highest gains reach the largest sum, and no others exceed it."""
     gain = np.array(values)
     chosen = np.argsort(-gain, kind="stable")[:count]
     own, best = placement.gain_sums(gain, chosen)
@@ -75,8 +75,8 @@ def _run(weights: Weights, fraction: float = 0.35, seed: int = 0) -> placement.P
     return placement.run_controls(_scene(weights), weights.config.classes, fraction=fraction, seed=seed)
 
 
-def test_a_mix_of_two_maps_is_the_map_of_those_patches(tiny: Maker):
-    """A patch's pixels do not depend on which other patches are read: a segmentation of some gives the same counts."""
+def test_mixing_two_maps_equals_segmenting_the_patches(tiny: Maker):
+    """A patch's pixels do not depend on which other patches are read, so both give the same counts."""
     weights = tiny()
     coarse_pass, _ = scene_columns(weights, 30, 45)
     seen = coarse_prediction_of_columns(weights, coarse_pass.columns, coarse_pass.grid)
@@ -89,7 +89,7 @@ def test_a_mix_of_two_maps_is_the_map_of_those_patches(tiny: Maker):
 
 
 def test_every_row_counts_every_labelled_pixel(tiny: Maker):
-    """Each placement draws the whole scene, with as many patches as the fraction of the valid ones says."""
+    """Each placement segments the whole scene; the random one does so several times."""
     rows = _run(tiny())
     assert {int(counts.sum()) for draws in rows.values() for counts in draws} == {27 * 45}
     assert list(rows) == ["none", "all", "gain", "entropy", "sobel", "random"]
@@ -109,8 +109,8 @@ def _counts(right: int) -> np.ndarray:
     return np.array([[right, 100 - right], [100 - right, right]])
 
 
-def test_figures_of_a_worked_case():
-    """Both means and the pixels' accuracy, the fraction of the gap, and mean and spread of the random placements."""
+def test_placement_figures_are_those_worked_out_by_hand():
+    """The figures are mIoU, accuracy, the closed fraction of the gap, and mean and spread of the random draws."""
     draws = [_counts(62), _counts(66), _counts(64)]
     rows = placement.placement_figures(
         {"none": [_counts(60)], "all": [_counts(90)], "entropy": [_counts(80)], "random": draws}
@@ -125,7 +125,7 @@ def test_figures_of_a_worked_case():
 
 
 def test_one_draw_has_no_spread_and_a_small_gap_no_fraction():
-    """What cannot be said is None."""
+    """Figures that cannot be computed are None."""
     one = [_counts(60)]
     rows = placement.placement_figures({"none": one, "all": one, "sobel": [_counts(61)], "random": one})
     assert rows["random"] == {**agreement(_counts(60)), "spread": None, "gap_closed": None}
@@ -136,7 +136,7 @@ FOUR = np.array([[0.6, 0.3], [0.05, 0.0]])
 
 
 def _four_patches() -> placement.ReadTwice:
-    """Four patches of 2 px: the overview is wrong on each but the last, which the full network gets wrong."""
+    """Return four patches of 2 px: the overview is wrong on all but the last, the full network on the last."""
     labels = np.repeat(np.repeat(np.array([[0, 1], [1, 0]], np.uint8), 2, 0), 2, 1)
     overview, full = 1 - labels, labels.copy()
     overview[2:, 2:], full[2:, 2:] = 0, 1
@@ -144,17 +144,17 @@ def _four_patches() -> placement.ReadTwice:
 
 
 def test_chosen_patches_are_read_in_full() -> None:
-    """By hand: one patch is right from the overview, each other one once it is read in full."""
+    """Two patches are read and become right; the third stays wrong, and the last is right by the overview."""
     np.testing.assert_array_equal(_four_patches().counts(FOUR >= 0.3, 2), [[8, 0], [4, 4]])
 
 
-def test_everything_read_includes_what_gets_worse() -> None:
+def test_reading_every_patch_includes_what_gets_worse() -> None:
     """The last patch is right by the overview, and wrong by the full network."""
     np.testing.assert_array_equal(_four_patches().counts(np.ones((2, 2), np.bool_), 2), [[4, 4], [0, 8]])
 
 
-def test_losses_stand_beside_fractions() -> None:
-    """Relative to everything read; the patch that a full reading spoils is better left alone."""
+def test_cascade_table_has_losses_and_fractions() -> None:
+    """Losses are relative to reading everything; leaving out a patch that a full reading spoils is a negative loss."""
     table = placement.CascadeTable.judged([_four_patches()], 2)
     assert table.least_gain == placement.LEAST_GAINS
     assert table.fraction[0] == 0.75
@@ -166,8 +166,8 @@ def test_losses_stand_beside_fractions() -> None:
     ("loss", "gain", "fraction"),
     [(0.0, 0.02, 0.5), (0.1, math.sqrt(0.02 * 0.03), 0.4), (0.2, 0.03, 0.3), (1.0, 0.04, 0.1)],
 )
-def test_the_highest_gain_within_a_loss(loss: float, gain: float, fraction: float) -> None:
-    """Between two rows by the logarithm of the gain, and so is the fraction of patches; none beyond the last."""
+def test_cascade_table_finds_the_highest_gain_within_a_loss(loss: float, gain: float, fraction: float) -> None:
+    """Gain and fraction are interpolated by the logarithm of the gain; below the least loss there is none."""
     table = placement.CascadeTable((0.01, 0.02, 0.03, 0.04), (-0.1, 0.0, 0.2, 0.3), (0.9, 0.5, 0.3, 0.1))
     assert table.within(loss) == pytest.approx(gain)
     assert table.fraction_at(gain) == pytest.approx(fraction)
@@ -175,7 +175,7 @@ def test_the_highest_gain_within_a_loss(loss: float, gain: float, fraction: floa
 
 
 def test_a_worse_row_ends_the_search() -> None:
-    """Noise of few scenes does not open a higher gain behind it."""
+    """Noise of few scenes must not select a higher gain behind it."""
     found = placement.CascadeTable((0.01, 0.02, 0.03), (0.0, 0.5, 0.1), (0.9, 0.5, 0.3)).within(0.2)
     assert found is not None
     assert 0.01 < found < 0.02

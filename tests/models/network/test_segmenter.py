@@ -1,4 +1,4 @@
-"""The segmenter and its layers: what overview and patches may depend on, composites, and multiply-adds."""
+"""The segmenter and its layers: dependencies of overview and patches, composites, and multiply-adds."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ IMAGE = noise(0, 1, 4 + PLANES, 64, 96)  # 2 x 3 tokens, 8 x 12 patches
 
 @torch.inference_mode()
 @pytest.mark.parametrize("size", [(1, 1), (37, 53), (64, 65)])
-def test_an_image_of_parts_of_tokens_is_read_as_one_that_goes_on(size: tuple[int, int]):
-    """Any size has an overview of its own, which is that of the image with its border repeated up to whole tokens."""
+def test_partial_tokens_are_read_with_a_repeated_border(size: tuple[int, int]):
+    """An image of any size has the overview of the same image padded with its border to whole tokens."""
     model, image = make_network(), IMAGE[..., : size[0], : size[1]]
     whole = F.pad(image, (0, -size[1] % 32, 0, -size[0] % 32), mode="replicate")
     own, expected = model.read_overview(image), model.read_overview(whole)
@@ -33,7 +33,7 @@ def test_an_image_of_parts_of_tokens_is_read_as_one_that_goes_on(size: tuple[int
 
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 9), (40, 7)])
-def test_means_around_a_pixel_leave_out_what_is_beyond_the_border(size: tuple[int, int]):
+def test_means_around_a_pixel_ignore_what_is_beyond_the_border(size: tuple[int, int]):
     image, reach = noise(1, 1, 3, *size), AROUND_PX // 2
     for y, x in np.ndindex(size):
         around = image[..., max(0, y - reach) : y + reach + 1, max(0, x - reach) : x + reach + 1]
@@ -41,8 +41,8 @@ def test_means_around_a_pixel_leave_out_what_is_beyond_the_border(size: tuple[in
 
 
 @torch.inference_mode()
-def test_a_patch_is_read_by_its_own_pixels_and_the_overview_of_them():
-    """Neither other patches nor their order nor the overview elsewhere changes it; what it shows and lies on does."""
+def test_a_patch_depends_on_its_own_pixels_and_overview_only():
+    """Other patches, their order and the overview elsewhere do not change it."""
     model, numbers = make_network(), torch.tensor([[5, 95, 13]])
     overview, patches = model.read_overview(IMAGE), cut(IMAGE.flip(2), 8)[:, numbers[0]]
     read = model.read_patches(overview, patches, numbers)
@@ -57,8 +57,8 @@ def test_a_patch_is_read_by_its_own_pixels_and_the_overview_of_them():
 
 
 @torch.inference_mode()
-def test_a_composite_holds_patches_where_numbers_say():
-    """Captured patches show their patch, all else the logits of the overview, each scene its own; none: all of it."""
+def test_composite_places_patches_by_their_numbers():
+    """All other pixels have the overview's logits; each scene has its own patches, and there may be none."""
     model, overview, fine = make_network(), noise(0, 2, 3, 16, 32), noise(1, 2, 3, 3, 8, 8)
     patch_index, expected = torch.tensor([[0, 5, 7], [6, 1, 2]]), overview.clone()
     for scene in range(2):
@@ -69,8 +69,8 @@ def test_a_composite_holds_patches_where_numbers_say():
     assert torch.equal(model.composite(overview, fine[:, :0], patch_index[:, :0]), overview)
 
 
-def test_every_parameter_learns():
-    """The loss of a map with some patches has a gradient in every parameter."""
+def test_every_parameter_has_a_gradient():
+    """The loss is that of a map with some patches."""
     model, numbers = make_network(layers=2), torch.tensor([[3, 0, 9]])
     logits, patches = model(IMAGE, IMAGE, numbers, torch.zeros(1, 2))
     model.composite(logits, patches, numbers).square().mean().backward()
@@ -80,8 +80,8 @@ def test_every_parameter_learns():
 
 @torch.inference_mode()
 @pytest.mark.parametrize("patch", [4, 8, 32, 64])
-def test_an_image_comes_back_at_its_size(patch: int):
-    """Features of every level, finest first, down to 4 px, and the width per pixel again."""
+def test_stem_and_head_keep_the_size_of_an_image(patch: int):
+    """The stem has features of every level, finest first, down to 4 px; the head has the width per pixel."""
     widths = level_widths(8, patch)
     assert widths[:3] == [8, 16, 24][: len(widths)]
     features = Stem(5, widths)(torch.zeros(3, 5, patch, 2 * patch))
@@ -93,8 +93,8 @@ def test_an_image_comes_back_at_its_size(patch: int):
 
 
 @given(st.integers(1, 3), st.integers(1, 4), st.sampled_from([1, 4]))
-def test_patches_lie_row_by_row_and_make_the_image_again(rows: int, columns: int, patch: int):
-    """Cut and joined an image is what it was; the second patch lies right of the first."""
+def test_cut_and_joined_patches_make_the_image_again(rows: int, columns: int, patch: int):
+    """Patches are in order of rows: the second lies right of the first."""
     image = torch.arange(2 * 3 * rows * columns * patch**2).view(2, 3, rows * patch, columns * patch)
     cells = cut(image, patch)
     assert torch.equal(joined(cells, columns), image)
@@ -107,7 +107,7 @@ def test_patches_lie_row_by_row_and_make_the_image_again(rows: int, columns: int
     [({"patch": 16}, 7), ({"patch": 8, "overview_width": 12}, 1), ({"patch": 32, "layers": 1, "deep": True}, 3)],
 )
 @pytest.mark.parametrize("width", [96, 104])  # with patches of 8 px, a part of the last tokens
-def test_closed_form_equals_the_counter(sizes: dict[str, int], patch_index: int, width: int) -> None:
+def test_multiply_adds_equal_the_counter(sizes: dict[str, int], patch_index: int, width: int) -> None:
     """The closed form counts just what torch counts while the model runs."""
     config = SegmenterConfig(classes=5, columns=6, **sizes)
     grid = SceneGrid(64, width, config.patch)
@@ -120,8 +120,8 @@ def test_closed_form_equals_the_counter(sizes: dict[str, int], patch_index: int,
     assert multiply_adds(config, grid, patch_index, 0).total == counter.get_total_flops() / 2
 
 
-def test_the_temporal_reader_costs_what_the_counter_counts() -> None:
-    """Its closed form too, of fine and coarse pixels."""
+def test_multiply_adds_of_the_temporal_reader_equal_the_counter() -> None:
+    """The closed form covers fine and coarse pixels."""
     sizes = TemporalSizes(classes=5, columns=6)
     fine, coarse = torch.zeros(1, 1, 16, 24), torch.zeros(1, 6, 16 // CELL_PX, 24 // CELL_PX)
     scores, one, counter = fine.expand(1, 5, 16, 24), torch.ones(1), FlopCounterMode(display=False)
@@ -132,8 +132,8 @@ def test_the_temporal_reader_costs_what_the_counter_counts() -> None:
     assert sizes.multiply_adds(16 * 24) == counter.get_total_flops() / 2
 
 
-def test_each_patch_costs_the_same_and_the_overview_none_of_it() -> None:
-    """What the policy took is added; columns are made of each band, again for patches that were captured apart."""
+def test_multiply_adds_are_proportional_to_patches() -> None:
+    """Columns are computed from each band, again for patches captured separately; those of the policy are added."""
     config, grid = SegmenterConfig(classes=5), SceneGrid(250, 256, 16)
     one, many, bare = (multiply_adds(config, grid, *given, score=9) for given in ((1, 270), (20, 270), (20, 0)))
     assert one.overview == many.overview == bare.overview + 256**2 * 270 * config.columns
@@ -143,8 +143,8 @@ def test_each_patch_costs_the_same_and_the_overview_none_of_it() -> None:
     assert many.total == many.overview + many.detail + 9
 
 
-def test_edges_go_through_all_columns_once() -> None:
-    """Each column more adds one multiply-add a pixel."""
+def test_sobel_adds_one_multiply_add_per_column() -> None:
+    """With 24 columns instead of 2 it takes 22 more per pixel."""
     grid = SceneGrid(256, 256, 16)
     few, many = (score_multiply_adds("sobel", SegmenterConfig(5, columns), grid) for columns in (2, 24))
     assert many - few == 22 * 256 * 256

@@ -1,4 +1,4 @@
-"""The spectral stem: any bands in any order onto columns, and their normalisation."""
+"""The spectral stem: projection of any bands in any order onto columns, and their normalisation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ BANDS = st.lists(st.sampled_from(range(400, 1001, 3)), min_size=1, max_size=40) 
 
 @given(BANDS, st.randoms(use_true_random=False))
 def test_bands_in_any_order_give_the_same_columns(nanometres: list[int], random):
-    """Permuting bands together with their wavelengths (descending ones, repeats) changes no column."""
+    """Permuting bands together with their wavelengths, also repeated ones, changes no column."""
     order = list(range(len(nanometres)))
     random.shuffle(order)
     wavelength, values = np.array(nanometres, float), np.cos(np.arange(len(nanometres)))
@@ -34,7 +34,7 @@ def test_reached_columns_keep_a_flat_spectrum(nanometres: list[int]):
 
 
 def test_fifteen_and_270_bands_give_columns_of_one_scale():
-    """A smooth spectrum reads alike through few and many bands, because a band counts by the stretch it stands for."""
+    """A band is weighted by its spectral interval, so a smooth spectrum gives nearly the same columns."""
 
     def columns(bands: int) -> np.ndarray:
         wavelength = np.linspace(400, 1000, bands)
@@ -45,7 +45,7 @@ def test_fifteen_and_270_bands_give_columns_of_one_scale():
 
 @pytest.mark.parametrize("wavelength", [[550.0], [550.0, 550.0, 550.0]])
 def test_a_single_wavelength_has_weight_one(wavelength: list[float]):
-    """One band alone, or one given several times, carries its column alone."""
+    """One band, or one given several times, determines its column alone."""
     assert band_widths(np.array(wavelength)).sum() == pytest.approx(1)
     matrix, reached = SpectralBasis.spanning(np.array(wavelength)).matrix(np.array(wavelength))
     assert reached.tolist() == [True]
@@ -58,13 +58,13 @@ def _sample() -> np.ndarray:
 
 
 def test_normalised_columns_are_uncorrelated():
-    """Columns that nearly repeat each other come out with unit variance and no correlation."""
+    """Columns that nearly repeat each other get unit variance and no correlation."""
     normal = Normalisation.measured(_sample()).apply(_sample(), np.ones(5, bool))
     assert np.cov(normal.T) == pytest.approx(np.eye(5), abs=0.02)
 
 
 def test_more_light_is_a_gain_and_a_shift():
-    """Light brighter by a fraction e multiplies normalised columns by 1 + e and adds e times the gain shift."""
+    """A fraction e more light multiplies normalised columns by 1 + e and adds e times the gain shift."""
     normalisation, reached = Normalisation.measured(_sample()), np.ones(5, bool)
     bright = normalisation.apply(_sample() * 1.1, reached)
     expected = normalisation.apply(_sample(), reached) * 1.1 + 0.1 * normalisation.gain_shift
@@ -72,8 +72,8 @@ def test_more_light_is_a_gain_and_a_shift():
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_what_is_missing_counts_as_what_the_others_let_expect(bad: float):
-    """A value that is not finite enters as a column that no band reaches; without any value it is the median's."""
+def test_missing_values_are_predicted_from_the_others(bad: float):
+    """A value that is not finite counts as a column that no band reaches; without any value the median is taken."""
     normalisation, known = Normalisation.measured(_sample()), np.array([True, True, False, False, True])
     broken = np.stack([np.full(5, 0.4), np.where(known, 0.5, bad), np.full(5, bad)])
     found = normalisation.apply(broken, np.ones(5, bool))
@@ -82,8 +82,8 @@ def test_what_is_missing_counts_as_what_the_others_let_expect(bad: float):
     assert not found[2].any()
 
 
-def test_unreached_columns_are_what_the_others_let_expect():
-    """A column that nearly repeats its neighbours is told by them: left out, the result is nearly what it was."""
+def test_unreached_columns_are_predicted_by_regression():
+    """The error of a column that nearly repeats its neighbours is that of a least-squares fit, within 2 %."""
     sample, reached = _sample(), np.array([True, True, False, True, True])
     normalisation = Normalisation.measured(sample)
     normal = (sample - normalisation.centre) / normalisation.spread
@@ -96,12 +96,12 @@ def test_unreached_columns_are_what_the_others_let_expect():
 
 
 @given(st.floats(0.01, 1), st.floats(1, 16), st.floats(1, 16), st.integers(0, 2))
-def test_planes_are_0_at_the_reference_and_grow_with_what_it_lacks(light: float, step: float, binned: float, at: int):
-    """Half the exposure adds a quarter, twice the spacing or the samples a half, each to its own plane alone."""
+def test_capture_planes_are_0_at_the_reference(light: float, step: float, binned: float, at: int):
+    """Half the exposure adds a quarter, twice the spacing or binning a half, each to its own plane alone."""
     here, factor = LineSpec(light, step, binned), [1.0, 1.0, 1.0]
     factor[at] = 0.5 if at == 0 else 2.0
     more = LineSpec(light * factor[0], step * factor[1], binned * factor[2])
     assert more.planes - here.planes == pytest.approx(np.eye(3)[at] * [0.25, 0.5, 0.5], abs=1e-5)
     assert (here.planes >= 0).all()
     assert not LineSpec().planes.any()
-    assert not LineSpec(light=4.0).planes.any()  # what is better than the reference counts as that
+    assert not LineSpec(light=4.0).planes.any()  # a capture better than the reference counts as the reference

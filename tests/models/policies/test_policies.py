@@ -1,4 +1,4 @@
-"""Attention policies: what each sees, and borders of the scene."""
+"""Attention policies: their scores of patches, also at the border of the scene."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from pipeline.geometry.grid import SceneGrid
 
 
 def _coarse_prediction(height: int = 32, width: int = 48, patch: int = 8) -> CoarsePrediction:
-    """A flat scene of which the coarse prediction is equally unsure everywhere."""
+    """Return the coarse prediction of a flat scene, equally unsure everywhere."""
     grid = SceneGrid(height, width, patch)
     columns, probability = (np.full((*grid.padded_shape, n), 1 / n, np.float32) for n in (3, 4))
     return CoarsePrediction(grid, columns, probability)
 
 
 @pytest.mark.parametrize("classes", [2, 5, 12])
-def test_entropy_runs_from_none_to_the_log_of_classes(classes: int):
-    """Certainty is 0 without a NaN, equal chances are ln(classes), and order does not count."""
+def test_entropy_ranges_from_0_to_the_log_of_classes(classes: int):
+    """Certainty gives 0 without a NaN, equal probabilities give ln(classes), and the order does not count."""
     sure, even = np.eye(classes)[0], np.full(classes, 1 / classes)
     assert pixel_entropy(np.stack([sure, even])) == pytest.approx([0, np.log(classes)])
     drawn = np.random.default_rng(0).dirichlet(np.ones(classes), 20)
@@ -31,21 +31,21 @@ def test_entropy_runs_from_none_to_the_log_of_classes(classes: int):
 
 
 def _of_classes(*probability: tuple[float, ...], filled: NDArray[np.bool_] | None = None) -> CoarsePrediction:
-    """Patches of one pixel in a row, each with its own probabilities."""
+    """Return patches of one pixel in a row, each with its own probabilities."""
     grid, shown = SceneGrid(1, len(probability), 1), np.array([probability], np.float32)
     return CoarsePrediction(grid, shown, shown, filled=filled)
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(2, 6))
 def test_the_mean_gain_is_the_mean_error_of_classes(seed: int, classes: int):
-    """Of each class with enough of the scene: the expected fraction of its pixels that has another class."""
+    """A class's error is the expected fraction of its pixels that has another class; no class is rare here."""
     shown = np.random.default_rng(seed).dirichlet(np.ones(classes), 400)
     of_class = (shown * (1 - shown)).sum(axis=0) / shown.sum(axis=0)
     assert score_patches("gain", _of_classes(*shown)).mean() == pytest.approx(of_class.mean(), rel=1e-4)
 
 
 def test_an_error_in_a_rare_class_counts_more():
-    """A tenth of the area counts nine times as much as the rest; what is sure counts nothing."""
+    """Errors are divided by their class's fraction of the scene; patches without doubt score 0."""
     seen = _of_classes(*[(1.0, 0.0, 0.0)] * 89, *[(0.0, 1.0, 0.0)] * 9, (0.5, 0.0, 0.5), (0.0, 0.5, 0.5))
     scores = score_patches("gain", seen)
     assert not scores[:-2].any()
@@ -54,13 +54,13 @@ def test_an_error_in_a_rare_class_counts_more():
 
 
 def test_the_weight_of_a_class_has_a_limit():
-    """A class of a thousandth of the scene counts as one of `LEAST_FRACTION`, and as a part of a class."""
+    """A class of a thousandth of the scene counts as one of `LEAST_FRACTION`, and as a part of a class in the mean."""
     scores = score_patches("gain", _of_classes(*[(1.0, 0.0)] * 499, (0.5, 0.5)))
     assert scores[-1] == pytest.approx((0.25 / 0.999 + 0.25 / LEAST_FRACTION) / (1 + 0.001 / LEAST_FRACTION), rel=1e-4)
 
 
-def test_pixels_without_data_have_no_share():
-    """Fractions are those of pixels with data; without any, all classes have the same."""
+def test_pixels_without_data_do_not_count_in_fractions():
+    """Class fractions are those of pixels with data; without any, all classes have the same."""
     shown = [(0.5, 0.5), (0.5, 0.5), (1.0, 0.0)]
     alone, every = (_of_classes(*shown, filled=np.array([[False, False, lost]])) for lost in (True, False))
     assert score_patches("gain", alone)[0] == pytest.approx(0.5)
@@ -69,8 +69,8 @@ def test_pixels_without_data_have_no_share():
     assert score_patches("gain", nothing) == pytest.approx([0.5, 0.5, 0])
 
 
-def test_entropy_looks_where_the_coarse_prediction_is_unsure():
-    """The patch over unsure pixels scores highest, by the mean over its own pixels."""
+def test_entropy_scores_unsure_pixels():
+    """A patch scores by the mean over its own pixels; patches without unsure pixels score 0."""
     seen = _coarse_prediction()
     seen.probability[...] = [1, 0, 0, 0]
     seen.probability[8:16, 16:24] = [0.5, 0.5, 0, 0]  # the patch at row 1, column 2
@@ -80,7 +80,7 @@ def test_entropy_looks_where_the_coarse_prediction_is_unsure():
     assert not scores.any()
 
 
-def test_sobel_looks_at_edges():
+def test_sobel_scores_edges():
     """A step between two columns of patches scores in both and nowhere else."""
     seen = _coarse_prediction()
     seen.columns[:, :16] = 0.1
@@ -97,7 +97,7 @@ def test_random_follows_its_seed():
 
 
 def test_a_mask_is_averaged_over_each_patch():
-    """A mask of the scene's size, grey or colour, scores patches by its mean over their pixels on the scene."""
+    """The mask may be grey or colour; one of another size than the scene is refused."""
     mask = np.random.default_rng(2).integers(0, 256, (32, 48), dtype=np.uint8)
     expected = mask.reshape(4, 8, 6, 8).mean(axis=(1, 3)).ravel()
     assert score_patches("mask", _coarse_prediction(), mask=mask) == pytest.approx(expected)
@@ -110,7 +110,7 @@ def test_a_mask_is_averaged_over_each_patch():
 @pytest.mark.parametrize("policy", POLICIES)
 @pytest.mark.parametrize("size", [(37, 53), (1, 1), (8, 8), (33, 16), (1, 40)])
 def test_every_patch_has_a_finite_score(policy: str, size: tuple[int, int]):
-    """The same each time, for any size of the scene."""
+    """Scores are the same each time, for any size of the scene."""
     seen = _coarse_prediction(*size)
     seen.columns[...] = np.random.default_rng(3).random(seen.columns.shape)
     scores = score_patches(policy, seen, mask=np.ones(size))
@@ -121,16 +121,16 @@ def test_every_patch_has_a_finite_score(policy: str, size: tuple[int, int]):
 
 
 @pytest.mark.parametrize("policy", ["entropy", "mask", "gain"])
-def test_a_border_patch_is_worth_its_fraction(policy: str):
-    """On a scene alike everywhere a patch scores in proportion to its pixels on the scene."""
+def test_a_border_patch_scores_by_its_fraction(policy: str):
+    """On a uniform scene a patch scores in proportion to its pixels on the scene."""
     seen = _coarse_prediction(37, 53)
     scores = score_patches(policy, seen, mask=np.full((37, 53), np.log(4)))
     level = 0.75 if policy == "gain" else np.log(4)
     assert scores == pytest.approx(level * seen.grid.valid_fraction().ravel(), abs=1e-6)
 
 
-def test_a_class_of_a_region_may_be_frequent_elsewhere():
-    """What counts is how frequent a class is in the field: the parts of a field score as they do together."""
+def test_class_fractions_are_those_of_the_field():
+    """Parts of a field score as they do together; a class that is rare in one may be frequent in another."""
     shown = np.random.default_rng(1).dirichlet((8, 1, 1), 12)
     field, parts = _of_classes(*shown), [class_errors(_of_classes(*some)) for some in (shown[:4], shown[4:])]
     pixels = np.concatenate(parts)[:, 1].sum(axis=0)

@@ -1,4 +1,4 @@
-"""How doubtful what is remembered is: hand-worked numbers, strips, and pixels of which nothing is known."""
+"""Expected errors of a prior map: values worked out by hand, row blocks, and unknown pixels."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ GRID = SceneGrid(8, 12, 4)
 
 
 def believed(sure: float, classes: int = 3, shape: tuple[int, int] = (8, 12), kind: int = 0) -> np.ndarray:
-    """Log-probabilities of a field that is believed to be of one class, so surely."""
+    """Return log-probabilities of a field of one class with this certainty."""
     probabilities = np.full((*shape, classes), np.log((1 - sure) / (classes - 1)), np.float32)
     probabilities[..., kind] = np.log(sure)
     return probabilities
 
 
-def test_a_expected_error_is_what_certainty_leaves() -> None:
-    """Sure by 0.9, it is 0.1; of what is not known any class is as likely, two in three wrong of three classes."""
+def test_expected_error_is_one_minus_certainty() -> None:
+    """Certainty 0.9 gives 0.1; an unknown pixel of three classes is wrong in two of three cases."""
     probabilities = believed(0.9)
     probabilities[0, 0] = np.nan
     expected_error = expected_error_of(probabilities)
@@ -29,8 +29,8 @@ def test_a_expected_error_is_what_certainty_leaves() -> None:
     assert expected_error[0, 0] == pytest.approx(2 / 3)
 
 
-def test_a_look_is_worth_what_it_mends_of_each_class() -> None:
-    """Half of a class of 48 px is wrong by 0.4 and a look by 0.1: 0.5 x 0.3 of one class of two, over two patches."""
+def test_expected_gain_is_the_corrected_error_of_each_class() -> None:
+    """Half of a class of 48 px is wrong by 0.4, a pass by 0.1. Two patches gain 0.5 x 0.3 of one class of two."""
     probabilities = believed(0.999)
     probabilities[:4, :6], probabilities[4:] = believed(0.6, shape=(4, 6)), believed(0.999, shape=(4, 12), kind=1)
     expected_errors = PatchExpectedErrors.of([(probabilities, np.zeros((8, 12)))], GRID, 3)
@@ -40,15 +40,15 @@ def test_a_look_is_worth_what_it_mends_of_each_class() -> None:
     assert expected_gain[0] == pytest.approx(2 * expected_gain[1])
 
 
-def test_a_look_that_sees_worse_than_is_remembered_is_worth_nothing() -> None:
-    """However much of the field it shows; and no less than is remembered is worth nothing too."""
+def test_a_pass_no_better_than_the_prior_map_has_no_gain() -> None:
+    """A pass with more or equal expected errors gains nothing, however much of the field it shows."""
     expected_errors = PatchExpectedErrors.of([(believed(0.95), np.zeros((8, 12)))], GRID, 3)
     assert not expected_errors.expected_gain(np.full(3, 0.2)).any()
     assert expected_errors.expected_gain(np.full(3, 0.05)).sum() == pytest.approx(0, abs=1e-6)
 
 
-def test_pixels_of_which_nothing_is_known_are_of_no_class_and_do_not_come_true() -> None:
-    """Half a field of two equal classes: each pixel gains as a part of a class twice as large, the rest in the mean."""
+def test_unknown_pixels_belong_to_no_class() -> None:
+    """Known pixels gain as parts of a class twice as large, others by the mean; `come_true` scales known errors."""
     probabilities = np.full((8, 12, 3), np.nan, np.float32)
     probabilities[:4, :8], probabilities[:4, 4:8] = believed(0.8, shape=(4, 8)), believed(0.8, shape=(4, 4), kind=1)
     never = np.where(np.isnan(probabilities[..., 0]), np.nan, 0.0)
@@ -59,8 +59,8 @@ def test_pixels_of_which_nothing_is_known_are_of_no_class_and_do_not_come_true()
     assert gain[2:] == pytest.approx((2 / 3 - 0.03) / 6, rel=1e-5)
 
 
-def test_what_was_captured_and_belongs_to_no_class_gains_nothing() -> None:
-    """A pond was captured a week ago: a new capture would say the same again. It becomes too old like the rest."""
+def test_a_captured_pixel_without_a_class_has_no_gain() -> None:
+    """A pond that was captured a week ago would look the same again. It ages like the rest."""
     probabilities = believed(0.8)
     probabilities[:4, :4] = np.nan
     errors = PatchExpectedErrors.of([(probabilities, np.full((8, 12), 7.0))], GRID, 3)
@@ -70,16 +70,16 @@ def test_what_was_captured_and_belongs_to_no_class_gains_nothing() -> None:
     assert (errors.age_days == 7).all()
 
 
-def test_a_pixel_that_is_sure_of_its_class_is_known() -> None:
-    """Another class may have no probability that a float32 holds."""
+def test_a_certain_pixel_is_known() -> None:
+    """The probability of another class may be too small for a float32."""
     probabilities = believed(1 - 1e-7, kind=1)
     probabilities[..., 0] = -np.inf
     assert not PatchExpectedErrors.of([(probabilities, np.zeros((8, 12)))], GRID, 3).pixels[:, 3].any()
 
 
 @given(st.integers(1, 2), st.integers(0, 2**32 - 1))
-def test_swaths_say_what_the_whole_says(high: int, seed: int) -> None:
-    """Read some rows of patches at a time, counts, ages and expected errors are those of the field at once."""
+def test_row_blocks_equal_the_whole_field(high: int, seed: int) -> None:
+    """Read in some rows of patches at a time, counts, ages and expected errors are those of the field at once."""
     rng = np.random.default_rng(seed)
     probabilities = np.log(rng.dirichlet(np.ones(3), (8, 12))).astype(np.float32)
     age, rows = np.where(rng.random((8, 12)) < 0.1, np.nan, rng.random((8, 12)) * 30), 4 * high
@@ -92,8 +92,8 @@ def test_swaths_say_what_the_whole_says(high: int, seed: int) -> None:
         assert one.expected_wrong() == pytest.approx(expected_error_of(probabilities).mean())
 
 
-def test_pixels_that_nobody_asks_for_do_not_count() -> None:
-    """Outside of zones and without data: neither their errors nor their ages; a patch of them alone has no age."""
+def test_left_out_pixels_do_not_count() -> None:
+    """Left-out pixels add neither errors nor ages; a patch of them alone has an infinite age."""
     probabilities, age, left_out = believed(0.9), np.ones((8, 12)), np.zeros((8, 12), np.bool_)
     left_out[:4, :5], probabilities[:, :6], age[0, 4] = True, np.nan, 50.0
     asked = PatchExpectedErrors.of([(probabilities, age)], GRID, 3, left_out=left_out)

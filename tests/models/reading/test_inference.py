@@ -1,4 +1,4 @@
-"""A trained segmenter on one scene: sizes, places, captures, strips, and pixels without a value."""
+"""A segmenter on one scene: sizes, positions, captures, row blocks, and pixels without a value."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ def _values(height: int, width: int, bands: int = len(NM)) -> np.ndarray:
 
 
 def _seen(weights: Weights, height: int = 32, width: int = 48) -> tuple[inference.CoarsePrediction, np.ndarray]:
-    """The overview of a scene of noise, and other noise for every patch."""
+    """Return the overview of a scene of noise, and other noise for every patch."""
     coarse_pass, fine = scene_columns(weights, height, width)
     return inference.read_coarse_prediction(weights, coarse_pass), fine
 
 
-def test_a_map_without_a_patch_is_the_overviews(tiny: Maker):
-    """Confidence and classes are those of its probabilities, on the scene, softened by the weights' temperature."""
+def test_a_map_without_patches_equals_the_overview(tiny: Maker):
+    """Confidence and classes are those of its probabilities, softened by the weights' temperature."""
     weights = tiny()
     seen, fine = _seen(weights, 37, 53)
     expected = seen.probability[:37, :53]
@@ -47,8 +47,8 @@ def test_a_map_without_a_patch_is_the_overviews(tiny: Maker):
     assert (softer.classes == drawn.classes).all()
 
 
-def test_a_patch_changes_its_own_pixels_alone(tiny: Maker):
-    """Bit by bit all others are the overview's; of patches exchanged both change, whatever the order they come in."""
+def test_a_patch_changes_only_its_own_pixels(tiny: Maker):
+    """All others are the overview's, bit by bit; exchanged patches both change, and their order does not matter."""
     weights = tiny()
     seen, fine = _seen(weights)
     patch_index = np.array([15, 3])
@@ -63,8 +63,8 @@ def test_a_patch_changes_its_own_pixels_alone(tiny: Maker):
 
 
 @pytest.mark.parametrize("most", [1, 7])
-def test_chunks_do_not_show(tiny: Maker, most: int, monkeypatch: pytest.MonkeyPatch):
-    """However many patches are read at a time, classes are the same and confidence differs by 1e-6 at most."""
+def test_patches_read_at_a_time_do_not_change_the_map(tiny: Maker, most: int, monkeypatch: pytest.MonkeyPatch):
+    """Classes are the same, and confidence differs by 1e-6 at most."""
     weights = tiny()
     seen, fine = _seen(weights)
     patch_index = np.random.default_rng(1).permutation(24)[:15]
@@ -78,10 +78,10 @@ def test_chunks_do_not_show(tiny: Maker, most: int, monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.parametrize("patch", [8, 32, 64])
 @pytest.mark.parametrize("origin", [(0, 0), (8, 40)])
-def test_a_region_is_drawn_as_training_saw_crops(tiny: Maker, patch: int, origin: tuple[int, int]):
-    """What is drawn is the composite that the loss of training is taken of, at the same places, by both captures.
+def test_a_region_is_segmented_like_a_training_crop(tiny: Maker, patch: int, origin: tuple[int, int]):
+    """The map is the composite that the training loss uses, at the same places, with both captures.
 
-    Exposures alone are stated as fainter.
+    Only exposures are stated as fainter.
     """
     weights = tiny(patch=patch)
     coarse_pass, fine = scene_columns(weights, 64, 128)
@@ -105,7 +105,7 @@ def test_a_region_is_drawn_as_training_saw_crops(tiny: Maker, patch: int, origin
 
 
 def test_a_prediction_keeps_its_overview(tiny: Maker, monkeypatch: pytest.MonkeyPatch):
-    """A map of a prediction does not read the scene again."""
+    """Segmenting a prediction does not read the scene again."""
     weights = tiny()
     seen, fine = _seen(weights)
     monkeypatch.setattr(weights.segmenter, "read_overview", lambda *given: pytest.fail("read"))
@@ -120,10 +120,10 @@ def test_a_prediction_keeps_its_overview(tiny: Maker, monkeypatch: pytest.Monkey
         ([4, 1, 4], "patch 4 is given more"),
     ],
 )
-def test_a_patch_that_cannot_be_is_refused_before_anything_is_read(
+def test_invalid_patches_are_refused_before_reading(
     tiny: Maker, numbers: list[int], words: str, monkeypatch: pytest.MonkeyPatch
 ):
-    """One outside the scene is named, and one that is given twice."""
+    """The error names a patch outside of the scene, or one that is given twice."""
     weights = tiny()
     coarse_pass, fine = scene_columns(weights, 32, 48)
     monkeypatch.setattr(weights.segmenter, "read_overview", lambda *given: pytest.fail("read"))
@@ -132,8 +132,8 @@ def test_a_patch_that_cannot_be_is_refused_before_anything_is_read(
 
 
 @pytest.mark.parametrize("bands", [NM, NM[:3]])
-def test_a_look_in_swaths_is_the_look_at_once(tiny: Maker, bands: np.ndarray):
-    """Rows of the mosaic that come some at a time give the very same columns, with bands for all of them or not."""
+def test_a_pass_in_row_blocks_equals_the_whole(tiny: Maker, bands: np.ndarray):
+    """Rows of the mosaic in several blocks give the very same columns, whether bands reach all of them or not."""
     weights, grid = tiny(), SceneGrid(37, 53, 8)
     values = _values(37, 53, len(bands))
     whole = inference.read_coarse_pass(weights, [values], bands, grid)
@@ -144,8 +144,8 @@ def test_a_look_in_swaths_is_the_look_at_once(tiny: Maker, bands: np.ndarray):
     assert (whole.columns[37:] == whole.columns[35 : 35 - added : -1]).all()  # the pad is a mirror image
 
 
-def test_a_scene_is_read_in_full_by_its_columns(tiny: Maker):
-    """By the overview and all patches; a capture of other light gives another map."""
+def test_map_of_columns_reads_every_patch(tiny: Maker):
+    """The map equals a segmentation with all patches; a capture of other light gives another map."""
     weights = tiny()
     coarse_pass, _ = scene_columns(weights, 32, 48)
     every = coarse_pass.grid.every_patch()
@@ -160,7 +160,7 @@ def test_a_scene_is_read_in_full_by_its_columns(tiny: Maker):
 
 @pytest.mark.parametrize("more", [0, 1])
 def test_a_token_dead_in_most_of_its_pixels_is_left_out(more: int):
-    """With half of its pixels dead a token is read, with one more it is not; holes take the mean of their patch."""
+    """A token with half of its pixels dead is read, with one more it is not; dead pixels take their patch's mean."""
     weights, grid, values = plain_weights(), SceneGrid(60, 64, 8), _values(60, 64)
     whole = inference.read_coarse_pass(weights, [values], NM, grid).columns
     values[:16, :32], values[16, :more], values[41:43, 50:53] = np.nan, np.inf, -np.inf
@@ -169,17 +169,17 @@ def test_a_token_dead_in_most_of_its_pixels_is_left_out(more: int):
     hole = np.zeros((64, 64), bool)
     hole[:16, :32], hole[16, :more], hole[41:43, 50:53] = True, True, True
     assert (seen.columns[~hole] == whole[~hole]).all()
-    assert not seen.columns[:16, :32].any()  # nothing of these patches lives
+    assert not seen.columns[:16, :32].any()  # every pixel of these patches is dead
     beside = whole[40:48, 48:56][~hole[40:48, 48:56]].mean(axis=0)
     assert seen.columns[41:43, 50:53] == pytest.approx(np.broadcast_to(beside, (2, 3, 4)), abs=1e-5)
     assert (np.isnan(seen.seen_columns).all(axis=-1) == hole).all()
     assert seen.out_of_range is not None
-    assert np.count_nonzero(seen.out_of_range) == more + 6  # captured, and no readings
+    assert np.count_nonzero(seen.out_of_range) == more + 6  # captured, but no readings
 
 
 @pytest.mark.parametrize(("dead", "counts"), [(32, True), (33, False), (64, False)])
 def test_a_patch_dead_in_most_of_its_pixels_counts_as_not_captured(tiny: Maker, dead: int, counts: bool):
-    """The map is that without it, and other patches are drawn at their own places."""
+    """The map is then that without the patch; a patch with half of its pixels dead is read."""
     weights = tiny()
     seen, fine = _seen(weights)
     fine[5].reshape(64, 4)[:dead] = np.nan
@@ -192,7 +192,7 @@ def test_a_patch_dead_in_most_of_its_pixels_counts_as_not_captured(tiny: Maker, 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_logits_that_are_not_finite_give_no_class(value: float):
-    """255 and NaN there, and what is beside is drawn as ever."""
+    """The pixel gets class 255 and confidence NaN; all other pixels stay the same."""
     logits = noise(0, 3, 70, 5)
     whole = inference.draw(logits.clone())
     logits[1, 66, 2] = value
@@ -204,8 +204,8 @@ def test_logits_that_are_not_finite_give_no_class(value: float):
     assert (drawn.confidence[beside] == whole.confidence[beside]).all()
 
 
-def test_what_was_never_dead_has_no_mask(tiny: Maker):
-    """Where every pixel lives no token is left out, and nothing is filled."""
+def test_a_pass_without_dead_pixels_has_no_mask(tiny: Maker):
+    """No token is left out, and no pixel is filled."""
     seen = inference.read_coarse_pass(tiny(), [_values(30, 31)], NM, SceneGrid(30, 31, 8))
     assert (seen.living, seen.filled, seen.out_of_range) == (None, None, None)
     assert seen.seen_columns is seen.columns

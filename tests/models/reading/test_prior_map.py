@@ -1,4 +1,4 @@
-"""What is known of a field after a look: laws of the memory with a reader and without, and of what changed."""
+"""The prior map of a field: its fusion with a visit, with and without a temporal reader, and changes."""
 
 from __future__ import annotations
 
@@ -40,25 +40,25 @@ seeds = st.integers(0, 2**16)
 
 
 def log_probabilities(rng: np.random.Generator, shape: tuple[int, int] = SHAPE) -> NDArray[np.float32]:
-    """Probabilities of classes drawn anew for each pixel, from sure to unsure."""
+    """Return log-probabilities of classes drawn for each pixel, from sure to unsure."""
     logits = rng.normal(0, 2, (*shape, CLASSES))
     return np.asarray(logits - np.log(np.exp(logits).sum(axis=-1, keepdims=True)), np.float32)
 
 
 def an_observation(rng: np.random.Generator, shape: tuple[int, int] = SHAPE) -> CurrentVisit:
-    """A look in detail at all of a field."""
+    """Return a visit that captured a whole field in detail."""
     coarse = rng.normal(size=(*(-(-side // CELL_PX) for side in shape), COLUMNS)).astype(np.float32)
     return CurrentVisit(log_probabilities(rng, shape), np.ones(shape, np.bool_), coarse, 0.05, 2)
 
 
 def a_prior_map(rng: np.random.Generator, shape: tuple[int, int] = SHAPE, days: float = 3.0) -> PriorMap:
-    """What was seen some days ago."""
+    """Return the prior map that a visit left some days ago."""
     coarse_pass = an_observation(rng, shape)
     return PriorMap(first_probabilities(coarse_pass), coarse_pass.coarse, days)
 
 
 def a_reader(seed: int = 0) -> TemporalReader:
-    """A reader as chance made it, in which nothing is idle."""
+    """Return a temporal reader with random weights, none of them idle."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         reader = TemporalReader(TemporalSizes(CLASSES, COLUMNS, width=8, coarse_width=4)).eval()
@@ -70,7 +70,7 @@ READERS = pytest.mark.parametrize("reader", [None, a_reader()], ids=["without a 
 
 
 def test_exposure_of_visits_adds_up_and_fades() -> None:
-    """After 30 days one e-th of the earlier exposure is left, and lines 2 px apart give a quarter of theirs."""
+    """After 30 days 1/e of the earlier exposure is left; lines 2 px apart give a quarter of theirs."""
     rng, seen = np.random.default_rng(1), np.arange(SHAPE[1]) < np.full(SHAPE, 7)
     visit = replace(an_observation(rng), light=0.4, seen=seen)
     after = fuse(a_prior_map(rng, days=30.0), visit, None)
@@ -79,8 +79,8 @@ def test_exposure_of_visits_adds_up_and_fades() -> None:
 
 @READERS
 @given(seed=seeds)
-def test_probabilities_stay_probabilities(reader: TemporalReader | None, seed: int) -> None:
-    """What is believed sums to 1 but for what the faintest classes are raised by, and is never fainter than is kept."""
+def test_fused_probabilities_sum_to_1(reader: TemporalReader | None, seed: int) -> None:
+    """Only raising the faintest classes to the stored minimum adds to the sum."""
     rng = np.random.default_rng(seed)
     after = fuse(a_prior_map(rng), an_observation(rng), reader)
     assert after.log_probability.min() >= np.float32(FAINTEST)
@@ -91,8 +91,8 @@ def test_probabilities_stay_probabilities(reader: TemporalReader | None, seed: i
 
 @READERS
 @given(seed=seeds)
-def test_ages_count_days_where_nobody_looked(reader: TemporalReader | None, seed: int) -> None:
-    """A pixel that was looked at is new, one that was not is older by the days between."""
+def test_ages_grow_where_pixels_are_not_captured(reader: TemporalReader | None, seed: int) -> None:
+    """A captured pixel has age 0; any other is older by the days between."""
     rng = np.random.default_rng(seed)
     memory, coarse_pass = a_prior_map(rng), an_observation(rng)
     seen = rng.random(SHAPE) < 0.5
@@ -106,8 +106,8 @@ def test_ages_count_days_where_nobody_looked(reader: TemporalReader | None, seed
 
 @READERS
 @given(seed=seeds)
-def test_a_memory_of_this_minute_is_left_alone_where_nobody_looked(reader: TemporalReader | None, seed: int) -> None:
-    """No time went by and nothing was seen: what is believed stays, but for rounding; what was seen is weighed."""
+def test_a_fresh_prior_map_stays_where_pixels_are_not_captured(reader: TemporalReader | None, seed: int) -> None:
+    """After 0 days its probabilities are the same but for rounding; captured pixels change."""
     rng = np.random.default_rng(seed)
     memory, coarse_pass = a_prior_map(rng, days=0.0), an_observation(rng)
     seen = rng.random(SHAPE) < 0.5
@@ -119,8 +119,8 @@ def test_a_memory_of_this_minute_is_left_alone_where_nobody_looked(reader: Tempo
 
 
 @given(seed=seeds, days=st.floats(0, 0.99))
-def test_the_reader_has_its_say_as_the_day_goes_by(seed: int, days: float) -> None:
-    """Each pixel that nobody looked at lies as far between its memory and what a whole day would have made of it."""
+def test_the_reader_is_phased_in_over_the_first_day(seed: int, days: float) -> None:
+    """A pixel that was not captured moves from the prior map to the reader's result in proportion to the time."""
     rng = np.random.default_rng(seed)
     reader, memory = a_reader(seed), a_prior_map(rng, days=days)
     before, after = np.exp(memory.probabilities.log_probability), np.exp(carried(memory, reader).log_probability)
@@ -131,8 +131,8 @@ def test_the_reader_has_its_say_as_the_day_goes_by(seed: int, days: float) -> No
 
 
 @READERS
-def test_one_that_knows_nothing_takes_the_other(reader: TemporalReader | None) -> None:
-    """Where the memory is empty today's look stands, where the look is the memory does; both empty: nothing."""
+def test_unknown_pixels_take_the_other_source(reader: TemporalReader | None) -> None:
+    """A visit fills an empty prior map, and the other way round; a pixel that is empty in both stays unknown."""
     rng = np.random.default_rng(4)
     memory, coarse_pass = a_prior_map(rng), an_observation(rng)
     before, today = memory.probabilities.log_probability.copy(), coarse_pass.log_probability.copy()
@@ -150,8 +150,8 @@ def test_one_that_knows_nothing_takes_the_other(reader: TemporalReader | None) -
     assert (after.classes()[0][4:8] == 255).all()
 
 
-def test_a_surer_look_speaks_against_a_memory_and_a_doubtful_one_does_not() -> None:
-    """Without a reader 0.99 for another class wins over 0.9, 0.6 does not; two that agree are surer together."""
+def test_a_confident_visit_overrules_the_prior_map() -> None:
+    """Without a reader 0.99 for another class wins over 0.9, and 0.6 does not; two that agree are surer together."""
     before = np.log(np.array([[[0.9, 0.05, 0.05]] * 3], np.float32))
     today = np.log(np.array([[[0.005, 0.99, 0.005], [0.2, 0.6, 0.2], [0.8, 0.1, 0.1]]], np.float32))
     coarse = np.zeros((1, 1, COLUMNS), np.float32)
@@ -163,16 +163,16 @@ def test_a_surer_look_speaks_against_a_memory_and_a_doubtful_one_does_not() -> N
     assert after.classes()[1][0, 2] == pytest.approx(0.9 * 0.8 / (0.9 * 0.8 + 2 * 0.05 * 0.1))
 
 
-def test_a_memory_is_worth_nothing_in_the_end() -> None:
-    """After many years all classes are as likely; at once nothing has faded."""
+def test_a_prior_map_fades_to_equal_probabilities() -> None:
+    """After many years all classes are equally likely; after 0 days nothing has faded."""
     told = log_probabilities(np.random.default_rng(1))
     np.testing.assert_allclose(faded(told, np.full(SHAPE, 1e5, np.float32)), -math.log(CLASSES), atol=1e-6)
     np.testing.assert_allclose(faded(told, np.zeros(SHAPE, np.float32)), np.maximum(told, FAINTEST), atol=1e-5)
 
 
 @pytest.mark.parametrize("shape", [(80, 36), (33, 21), (7, 5)])
-def test_swaths_of_rows_read_the_same_as_the_whole(monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int]) -> None:
-    """However few rows are read at a time, and whatever is left of a coarse pixel at the border."""
+def test_row_blocks_are_fused_like_the_whole(monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int]) -> None:
+    """The field is read 8 rows at a time, and its border may cut a coarse pixel."""
     rng = np.random.default_rng(7)
     memory, coarse_pass, reader = a_prior_map(rng, shape), an_observation(rng, shape), a_reader(3)
     whole = fuse(memory, coarse_pass, reader)
@@ -180,8 +180,8 @@ def test_swaths_of_rows_read_the_same_as_the_whole(monkeypatch: pytest.MonkeyPat
     np.testing.assert_allclose(fuse(memory, coarse_pass, reader).log_probability, whole.log_probability, atol=2e-5)
 
 
-def test_a_reader_sees_means_of_the_pixels_that_are_known() -> None:
-    """Of each 2 x 2, be it of a part at the border; NaN of those of which nothing is known, column by column."""
+def test_pooled_columns_are_means_of_known_pixels() -> None:
+    """Each 2 x 2 block is averaged, also partial ones at the border; a column without a known pixel is NaN."""
     columns = np.arange(30, dtype=np.float32).reshape(3, 5, 2)
     columns[0, 1], columns[1, 2, 0], columns[:2, 2:4, 1] = np.nan, np.inf, np.nan
     nan = math.nan
@@ -189,8 +189,8 @@ def test_a_reader_sees_means_of_the_pixels_that_are_known() -> None:
     np.testing.assert_allclose(pooled(columns), np.array(expected, np.float32), rtol=1e-6)
 
 
-def test_coarse_looks_that_cannot_be_compared_change_nothing() -> None:
-    """Without the coarse pass of before, or where it has no value, today's may be anything."""
+def test_coarse_columns_without_a_counterpart_are_ignored() -> None:
+    """Without the earlier coarse columns, or where they are NaN, those of the current visit may be anything."""
     rng = np.random.default_rng(9)
     memory, coarse_pass, reader = a_prior_map(rng), an_observation(rng), a_reader(5)
     other = replace(coarse_pass, coarse=rng.normal(size=coarse_pass.coarse.shape).astype(np.float32))
@@ -201,8 +201,8 @@ def test_coarse_looks_that_cannot_be_compared_change_nothing() -> None:
     assert not np.array_equal(fuse(memory, coarse_pass, reader).log_probability, found[0])
 
 
-def test_a_fresh_reader_weighs_both_witnesses_by_its_gates() -> None:
-    """Untaught: .73 of the memory, .27 of its product to the power .9 with the look to the power .5."""
+def test_an_untrained_reader_weighs_both_sources_by_its_gates() -> None:
+    """The result is .73 of the prior map, and .27 of its product to the power .9 with the visit to the power .5."""
     rng = np.random.default_rng(2)
     memory, coarse_pass = a_prior_map(rng, days=0.0), an_observation(rng)
     reader = TemporalReader(TemporalSizes(CLASSES, COLUMNS)).eval()
@@ -215,8 +215,8 @@ def test_a_fresh_reader_weighs_both_witnesses_by_its_gates() -> None:
 
 
 @given(seed=seeds, order=st.permutations(range(CLASSES)))
-def test_classes_find_their_numbers(seed: int, order: list[int]) -> None:
-    """Brought to another order and back probabilities are the same, and NaN stays."""
+def test_reordering_classes_and_back_changes_nothing(seed: int, order: list[int]) -> None:
+    """Probabilities move with their classes, and NaN stays."""
     told = log_probabilities(np.random.default_rng(seed))
     told[0, 0] = np.nan
     there = in_classes(told, order)
@@ -225,16 +225,16 @@ def test_classes_find_their_numbers(seed: int, order: list[int]) -> None:
     assert np.isnan(there[0, 0]).all()
 
 
-def test_a_removed_class_says_little_of_a_new_one() -> None:
-    """Where a class went that was almost certain, no other class is; without a removed one a new one is uniform."""
+def test_a_removed_class_leaves_the_others_uncertain() -> None:
+    """A removed class of 0.998 does not make another certain; with none removed, a new class starts uniform."""
     before = np.log(np.array([[[0.001, 0.001, 0.998]]], np.float32))
     np.testing.assert_allclose(np.exp(in_classes(before, (0, 1, -1)))[0, 0], [0.25, 0.25, 0.5], atol=1e-3)
     np.testing.assert_allclose(np.exp(in_classes(before, (0, 1)))[0, 0], [0.5, 0.5], atol=1e-6)
     np.testing.assert_allclose(np.exp(in_classes(before, (2, 1, 0, -1)))[0, 0, 3], 0.25 / 1.25, atol=1e-6)
 
 
-def test_another_field_is_known_by_its_agreement() -> None:
-    """The same field agrees with itself; one with its classes drawn anew is another; nothing in common says nothing."""
+def test_another_field_is_detected_by_its_agreement() -> None:
+    """A field agrees with itself, not with classes drawn anew; with no common pixel nothing is detected."""
     rng = np.random.default_rng(11)
     memory = a_prior_map(rng)
     same = CurrentVisit(memory.probabilities.log_probability, np.ones(SHAPE, np.bool_), memory.coarse, 1.0, 1)  # type: ignore[arg-type]
@@ -248,8 +248,8 @@ def test_another_field_is_known_by_its_agreement() -> None:
     assert not unseen.is_of_another_field
 
 
-def test_a_field_of_one_class_is_no_other_field() -> None:
-    """Where everything is one class in memory and look alike chance would agree as well: they agree."""
+def test_a_field_of_one_class_is_not_another_field() -> None:
+    """Chance would agree as well if prior map and visit have one class everywhere, but they do agree."""
     told = np.log(np.tile(np.array([0.98, 0.01, 0.01], np.float32), (*SHAPE, 1)))
     coarse_pass = CurrentVisit(told, np.ones(SHAPE, np.bool_), np.zeros((12, 10, COLUMNS), np.float32), 1.0, 1)
     memory = PriorMap(first_probabilities(coarse_pass), None, 1.0)
@@ -257,15 +257,15 @@ def test_a_field_of_one_class_is_no_other_field() -> None:
 
 
 def sure_of(classes: NDArray[np.integer], how: float) -> CurrentVisit:
-    """A look in detail that gives every pixel of (y, x) its class with the same probability."""
+    """Return a visit in detail that gives every pixel of (y, x) its class with the same probability."""
     told = np.full((*classes.shape, CLASSES), (1 - how) / (CLASSES - 1), np.float32)
     np.put_along_axis(told, np.asarray(classes, np.intp)[..., None], how, axis=-1)
     coarse = np.zeros((*(side // CELL_PX for side in classes.shape), COLUMNS), np.float32)
     return CurrentVisit(np.log(told), np.ones(classes.shape, np.bool_), coarse, 0.05, 2)
 
 
-def test_a_harvest_overnight_is_seen() -> None:
-    """Of rows of a crop, two of every five columns, a sure look finds none: soil is drawn, and those rows changed."""
+def test_a_harvest_overnight_is_detected() -> None:
+    """A confident visit finds soil in two of every five columns, where a crop was: exactly these pixels changed."""
     rows = np.zeros(SHAPE, np.uint8)
     rows[:, np.arange(SHAPE[1]) % 5 < 2] = 1
     before, today = sure_of(rows, 0.99), sure_of(np.zeros(SHAPE, np.uint8), 0.98)
@@ -273,7 +273,7 @@ def test_a_harvest_overnight_is_seen() -> None:
     after = fuse(memory, today, None)
     assert not after.classes()[0].any()
     found = compare(memory, today, after, np.s_[:, :])
-    assert not found.is_of_another_field  # soil between the rows is as it was
+    assert not found.is_of_another_field  # soil between the rows did not change
     assert found.changed[1, 0] == np.count_nonzero(rows) == found.changed.sum() - np.trace(found.changed)
     np.testing.assert_array_equal(
         changed_fractions(changed_from(memory, after) != UNLABELLED, SceneGrid(*SHAPE, 5)), np.float32(0.4)
@@ -281,7 +281,7 @@ def test_a_harvest_overnight_is_seen() -> None:
 
 
 def two_maps(seed: int, truth: tuple[NDArray[np.int64], NDArray[np.int64]], noise: float) -> TemporalAgreement:
-    """Maps of two days' ground whose confidences are right: noise added to each class's own signal, and Bayes."""
+    """Compare maps of two days whose confidences are right: each class's own signal plus noise, and Bayes."""
     rng, size = np.random.default_rng(seed), 3
 
     def look(classes: NDArray[np.int64]) -> NDArray[np.float32]:
@@ -298,8 +298,8 @@ def two_maps(seed: int, truth: tuple[NDArray[np.int64], NDArray[np.int64]], nois
 
 @pytest.mark.parametrize("noise", [0.3, 0.45, 0.6])
 @pytest.mark.parametrize("seed", range(3))
-def test_two_maps_of_the_same_ground_tell_no_change(seed: int, noise: float) -> None:
-    """Though up to one pixel in ten differs; the number that differ is the one expected of the confidences."""
+def test_two_maps_of_the_same_ground_show_no_change(seed: int, noise: float) -> None:
+    """Up to one pixel in ten differs, about as many as the confidences let expect."""
     ground = np.random.default_rng(seed).integers(0, 3, (8, 8)).repeat(32, 0).repeat(32, 1)
     found = two_maps(seed, (ground, ground), noise)
     differing = found.changed.sum() - np.trace(found.changed)
@@ -309,8 +309,8 @@ def test_two_maps_of_the_same_ground_tell_no_change(seed: int, noise: float) -> 
     assert not found.beyond.any()
 
 
-def test_change_is_told_beyond_what_maps_differ_by() -> None:
-    """A felled quarter: from forest to grass, most pixels that both maps are sure of, and no other pair."""
+def test_change_is_reported_beyond_expected_differences() -> None:
+    """In a felled quarter, 80 % or more of the pixels that went from forest to grass are reported, and no others."""
     ground = np.random.default_rng(1).integers(1, 3, (8, 8)).repeat(32, 0).repeat(32, 1)
     ground[:128, :128] = 0
     felled = np.where(ground == 0, 1, ground)
@@ -319,8 +319,8 @@ def test_change_is_told_beyond_what_maps_differ_by() -> None:
     assert found.beyond.sum() == found.beyond[0, 1]
 
 
-def test_a_field_under_snow_is_no_field_that_is_remembered() -> None:
-    """Where a look is sure of one class that the memory has nowhere, the memory would only do harm: put aside."""
+def test_a_field_under_snow_counts_as_another_field() -> None:
+    """The visit is sure of a class that the prior map has nowhere, so the prior map would only do harm."""
     rows = np.arange(SHAPE[1]) % 5 < 2
     before, snow = sure_of(np.broadcast_to(rows, SHAPE), 0.99), sure_of(np.full(SHAPE, 2), 0.9)
     memory = PriorMap(first_probabilities(before), before.coarse, 1.0)
@@ -329,8 +329,8 @@ def test_a_field_under_snow_is_no_field_that_is_remembered() -> None:
     assert found.is_of_another_field
 
 
-def test_a_patch_counts_its_pixels_of_another_class() -> None:
-    """Sure pixels alone: 8 of 64 of one patch changed, in the next as many that nobody is sure of."""
+def test_changed_fraction_counts_confident_pixels_only() -> None:
+    """In one patch 8 of 64 pixels changed; in the next as many are unsure and do not count."""
     sure, other, expected_error = (
         np.log(np.array(one, np.float32)) for one in ([0.9, 0.05, 0.05], [0.05, 0.9, 0.05], [0.4, 0.5, 0.1])
     )
@@ -344,7 +344,7 @@ def test_a_patch_counts_its_pixels_of_another_class() -> None:
 
 
 def test_only_captured_pixels_change() -> None:
-    """The map of the others is an aged prior map: another class of it is no observation."""
+    """The map of the others is an aged prior map, so another class there is no observation."""
     rng = np.random.default_rng(3)
     told = [np.log(np.where(np.arange(3) == one, 0.98, 0.01)) * np.ones((*SHAPE, 1)) for one in (0, 1)]
     before, after = (ClassProbabilities(one.astype(np.float32), *np.zeros((2, *SHAPE), np.float32)) for one in told)
@@ -354,14 +354,14 @@ def test_only_captured_pixels_change() -> None:
 
 
 def test_a_patch_over_the_border_counts_its_pixels_on_the_scene() -> None:
-    """A field of 20 x 20 px that changed everywhere changed by 1 in all four patches of 16 px."""
+    """A field of 20 x 20 px that changed everywhere has a changed fraction of 1 in all four patches of 16 px."""
     assert (changed_fractions(np.ones((20, 20), np.bool_), SceneGrid(20, 20, 16)) == 1).all()
 
 
 @READERS
 @given(seed=seeds, visits=st.integers(2, 6))
-def test_visits_elsewhere_change_nothing(reader: TemporalReader | None, seed: int, visits: int) -> None:
-    """What is believed of a pixel after some days is the same, however often others were captured meanwhile."""
+def test_visits_elsewhere_do_not_change_a_pixel(reader: TemporalReader | None, seed: int, visits: int) -> None:
+    """Probabilities after 28 days are the same, however often other pixels were captured meanwhile."""
     memory = replace(a_prior_map(np.random.default_rng(seed), days=28.0), coarse=None)
     once, probabilities = carried(memory, reader), memory.probabilities
     for _ in range(visits):
@@ -373,7 +373,7 @@ def test_visits_elsewhere_change_nothing(reader: TemporalReader | None, seed: in
 
 
 def test_each_pixel_has_the_light_of_its_own_lines() -> None:
-    """Of lines that were captured again, closer together, more light is known than of the rest."""
+    """Pixels of lines that were captured again, closer together, have more light than the rest."""
     light = np.where(np.arange(SHAPE[1]) < np.full(SHAPE, 7), np.float32(0.8), np.float32(0.00625))
     visit = replace(an_observation(np.random.default_rng(1)), own_light=light)
     for found in (first_probabilities(visit).light, fuse(a_prior_map(np.random.default_rng(2)), visit, None).light):
@@ -383,8 +383,8 @@ def test_each_pixel_has_the_light_of_its_own_lines() -> None:
 
 @READERS
 @given(seed=seeds)
-def test_a_memory_that_nobody_looks_at_is_carried(reader: TemporalReader | None, seed: int) -> None:
-    """It is what recalling it by a look that sees nothing gives: as sure of itself as before or less, and older."""
+def test_a_prior_map_without_a_visit_is_carried(reader: TemporalReader | None, seed: int) -> None:
+    """The prior map gets older; without a reader it keeps its classes and does not gain confidence."""
     memory = a_prior_map(np.random.default_rng(seed))
     today = carried(memory, reader)
     assert np.allclose(np.exp(today.log_probability).sum(axis=-1), 1, atol=1e-4)

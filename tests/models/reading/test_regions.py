@@ -1,4 +1,4 @@
-"""Regions of a field: whole shards, tokens and patches, nothing left out, nothing twice."""
+"""Regions of a field: whole shards, tokens and patches that cover each pixel once."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ FIELDS = [(700, 1300, 16), (2561, 90, 32), (1000, 2000, 8), (64, 641, 16), (300,
 @pytest.mark.parametrize("field", FIELDS)
 @pytest.mark.parametrize("halo", [0, 1, 32, 80])
 def test_regions_cover_a_field_once(field: tuple[int, int, int], halo: int):
-    """Every pixel and every patch is kept by one region; borders inside are those of shards, tokens and patches.
+    """Every pixel and patch is kept by one region; borders inside are those of shards, tokens and patches.
 
-    What is read around a region is at least the halo, and begins with a whole token and patch.
+    The area read around a region exceeds it by at least the halo, and begins with a whole token and patch.
     """
     grid = SceneGrid(*field)
     pixels, patch_index = np.zeros((grid.height, grid.width), int), np.zeros(grid.patch_shape, int)
@@ -44,8 +44,8 @@ def _edges(box: Box) -> tuple[tuple[int, int], tuple[int, int]]:
 
 
 @pytest.mark.parametrize("field", FIELDS)
-def test_patches_lie_where_the_field_has_them(field: tuple[int, int, int]):
-    """A patch's first pixel in a region is its first pixel in the field; only the region that keeps it numbers it."""
+def test_patches_of_a_region_keep_their_place_in_the_field(field: tuple[int, int, int]):
+    """The first pixel of a patch is the same in the region and the field; only the region that keeps it numbers it."""
     grid = SceneGrid(*field)
     patch_index = np.arange(int(np.prod(grid.patch_shape)))
     times = np.zeros(len(patch_index), int)
@@ -61,12 +61,12 @@ def test_patches_lie_where_the_field_has_them(field: tuple[int, int, int]):
 
 
 @pytest.mark.parametrize("field", FIELDS)
-def test_cropped_parts_make_the_field(field: tuple[int, int, int]):
-    """Images and patches that regions keep, put side by side, are those of the field."""
+def test_cropped_regions_make_the_field(field: tuple[int, int, int]):
+    """Images and patches that regions keep equal those of the field at the same place."""
     grid = SceneGrid(*field)
     image = np.arange(grid.height * grid.width).reshape(grid.height, grid.width)
     patch_index = np.arange(np.prod(grid.patch_shape)).reshape(grid.patch_shape)
-    padded = np.pad(patch_index, (0, 16), constant_values=-1)  # that of a region may go on beyond that of the field
+    padded = np.pad(patch_index, (0, 16), constant_values=-1)  # a region's patches may extend beyond the field
     for region in plan_regions(grid, SHARD, most_px=(64, 640), halo=32):
         (top, left), (rows, columns) = region.origin, region.grid.patch_shape
         kept = region.crop(image[region.read.rows, region.read.columns])
@@ -75,8 +75,8 @@ def test_cropped_parts_make_the_field(field: tuple[int, int, int]):
         assert (own == patch_index[region.kept_patches.rows, region.kept_patches.columns]).all()
 
 
-def test_memory_is_that_of_a_region_not_of_the_field():
-    """Sixteen times the field takes what its largest region takes; patches add to it."""
+def test_memory_depends_on_the_region_not_on_the_field():
+    """Sixteen times the field needs the memory of its largest region; patches add to it."""
     config = SegmenterConfig(classes=3)
     need = [
         max(region_bytes(config, region, 1000, 270) for region in plan_regions(SceneGrid(side, side, 16), SHARD))

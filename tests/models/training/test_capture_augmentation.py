@@ -1,4 +1,4 @@
-"""Noise of columns by exposure, against draws of the camera's own law, and whitening that knows it."""
+"""Capture augmentation: noise of columns by exposure against the camera's own law, and whitening with noise."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def _noise(read_noise_e: float = 20.0) -> ColumnNoise:
 
 
 @pytest.mark.parametrize("light", [1.0, 0.12])
-def test_variance_is_that_of_the_camera(light: float) -> None:
-    """Shot and read noise that the camera draws, projected onto columns, have the variance and correlation said."""
+def test_covariance_is_that_of_camera_noise(light: float) -> None:
+    """Shot and read noise of the camera, projected onto columns, have the predicted variance and correlation."""
     camera = LineCamera(electrons_per_dn=0.5, bits=14)  # finer than its noise, so that rounding adds nothing
     electrons = np.broadcast_to((0.3 * WHITE_REFERENCE_E * light).astype(np.float32), (200, 100, 60))
     seen = expose(electrons, camera, step=1, rng=np.random.default_rng(2)) / (WHITE_REFERENCE_E * light)
@@ -48,8 +48,8 @@ def test_more_light_is_less_noise(light: float) -> None:
     assert (two < one / 2).all()
 
 
-def test_whitening_leaves_alone_what_noise_hides() -> None:
-    """A direction whose variance noise exceeds is made smaller, by what noise adds; others stay as they are."""
+def test_whitening_does_not_amplify_noise() -> None:
+    """A direction with as much noise as signal is reduced by the root of two; others keep unit variance."""
     rng = np.random.default_rng(1)
     sample = rng.normal(size=(50_000, 2)) * [1.0, 1.0] @ np.array([[1.0, 1.0], [0.1, -0.1]])
     plain, told = Normalisation.measured(sample), Normalisation.measured(sample, np.diag([0.02, 0.02]))
@@ -75,7 +75,7 @@ SILENT = ColumnNoise(np.zeros(12), np.zeros((12, 12)))
 
 
 def _silent_scan(augmentation: CaptureAugmentation, columns: np.ndarray, step: int, light: float = 1.0) -> np.ndarray:
-    """A scan in which nothing is drawn by chance."""
+    """Return a scan without random noise."""
     return _seen(augmentation.scan, columns, SILENT, light=light, step=step, rng=np.random.default_rng(0))
 
 
@@ -83,8 +83,8 @@ def _seen(capture: Any, columns: np.ndarray, *args: Any, **choices: Any) -> np.n
     return capture(torch.from_numpy(columns.copy()), *args, **choices).numpy()
 
 
-def test_rows_between_lines_are_interpolated_by_their_cubic() -> None:
-    """A row between lines sees four of them by Catmull-Rom; a row of a line is that line, and the border repeats."""
+def test_rows_between_lines_are_interpolated_by_catmull_rom() -> None:
+    """A row between lines depends on four of them; a row of a line equals that line, and the border repeats."""
     lines = np.zeros((8, 1, 1), np.float32)
     lines[4] = 1
     t = 0.25
@@ -101,8 +101,8 @@ def test_rows_between_lines_are_interpolated_by_their_cubic() -> None:
 
 
 @pytest.mark.parametrize("step", [1, 2, 4, 8])
-def test_a_scan_shows_means_as_wide_as_its_lines(step: int) -> None:
-    """In full light every line is read as it is, what is alike stays, ramps stay ramps, and rows of a line mix."""
+def test_a_scan_averages_the_rows_of_each_line(step: int) -> None:
+    """Without noise ramps stay ramps, and the order of the rows within a line does not matter."""
     augmentation, _ = _augmentation()
     ramp = np.broadcast_to(0.02 * np.arange(128)[:, None, None], (128, 2, 12)).astype(np.float32)
     inner = slice(3 * step, -3 * step)
@@ -117,10 +117,10 @@ def test_a_scan_shows_means_as_wide_as_its_lines(step: int) -> None:
 
 
 @pytest.mark.parametrize(("light", "step"), [(0.25, 1), (0.1, 2), (0.05, 4), (1.0, 4)])
-def test_a_scan_is_as_noisy_as_its_light_makes_it(light: float, step: int) -> None:
-    """What is added to a line is the law's variance at its light less what its pixels already had at the reference.
+def test_noise_of_a_scan_follows_its_light(light: float, step: int) -> None:
+    """The variance added to a line is the law's at its light less what its pixels already had at the reference.
 
-    A line of several pixels is read once, for all of them; rows between lines have the noise of those they are of.
+    A line of several pixels is read once for all of them; rows between lines have the noise of these lines.
     """
     augmentation, normalisation = _augmentation()
     noise, unwhiten = _noise(), np.linalg.inv(normalisation.whitening.astype(np.float64))
@@ -137,7 +137,7 @@ def test_a_scan_is_as_noisy_as_its_light_makes_it(light: float, step: int) -> No
 
 
 def _captures(planes: np.ndarray) -> list[LineSpec]:
-    """The captures of an image, by its planes."""
+    """Return the captures of an image, by its planes."""
     logarithms = np.unique(planes.reshape(-1, 3), axis=0) * [4, 2, 2]
     return [LineSpec(2**-light, round(2**step), round(2**binned)) for light, step, binned in logarithms]
 
@@ -162,8 +162,8 @@ def test_uniform_scans_have_every_spacing_and_light(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize("step", [2, 4, 8])
-def test_a_first_pass_stares_at_its_rows(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
-    """Without areas every ``step``-th row is read as it is, from any first row, and those between are interpolated."""
+def test_a_first_pass_keeps_its_own_rows(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
+    """Without areas every ``step``-th row is read unchanged; the first of them may be any row."""
     monkeypatch.setattr(capture_augmentation, "AREAS", (1.0,))
     augmentation, _ = _augmentation()
     image, begun = np.random.default_rng(1).normal(size=(32, 5, 12)).astype(np.float32), set()
@@ -194,11 +194,11 @@ def test_later_lines_lie_between_those_of_the_first_pass(monkeypatch: pytest.Mon
     for light in (0.5, 0.05):
         rows = (seen[..., 12:] == LineSpec(light, closer).planes).all(axis=(1, 2))
         told = _noise().variance(np.full(12, 0.3), light) - _noise().variance(np.full(12, 0.3), 1.0)
-        np.testing.assert_allclose(values[rows].var(axis=1).max(axis=0), told, rtol=0.15)  # rows of lines have most
+        np.testing.assert_allclose(values[rows].var(axis=1).max(axis=0), told, rtol=0.15)  # rows of lines have the most
 
 
 def _spectra(rng: np.random.Generator, sizes: tuple[float, ...], light: float) -> tuple[np.ndarray, SceneSpectra]:
-    """Noiseless spectra (200, 100, band) about .3 in smooth directions of some deviations of the noise, and moments."""
+    """Return noiseless spectra (200, 100, band) about .3, in smooth directions of some times the noise, and moments."""
     bumps = np.exp(-0.5 * ((BANDS - np.linspace(430, 970, len(sizes))[:, None]) / 60) ** 2)
     sigma = np.sqrt(0.3 * light * WHITE_REFERENCE_E + 20.0**2) / (light * WHITE_REFERENCE_E)
     axes = np.linalg.qr(bumps.T)[0].T * np.array(sizes)[:, None] * sigma
@@ -208,9 +208,9 @@ def _spectra(rng: np.random.Generator, sizes: tuple[float, ...], light: float) -
 
 @pytest.mark.parametrize(("light", "rtol"), [(0.1, 0.04), (0.5, 0.25)])
 def test_a_condensed_crop_has_the_noise_of_a_condensed_survey(light: float, rtol: float) -> None:
-    """Spectra with noise in all bands, projected onto their components and rounded, give the same columns.
+    """Noisy spectra, projected onto their components and rounded, give columns of the same covariance.
 
-    Weak components in bright light are worse: columns of the reference exposure have noise too.
+    Weak components in bright light fit worse: columns of the reference exposure have noise too.
     """
     rng = np.random.default_rng(3)
     augmentation, normalisation = _augmentation()
@@ -231,7 +231,7 @@ def test_a_condensed_crop_has_the_noise_of_a_condensed_survey(light: float, rtol
 
 @pytest.mark.parametrize(("least_power", "left"), [(0.01, 5), (0.5, 4), (40.0, 4)])
 def test_a_condensed_crop_keeps_components_above_a_power(least_power: float, left: int) -> None:
-    """The fifth direction goes if its power is below; four always stay."""
+    """The fifth component is dropped if its power is below the limit; four always stay."""
     rng, light = np.random.default_rng(4), 0.1
     augmentation, normalisation = _augmentation()
     spectra, moments = _spectra(rng, (30.0, 5.0, 3.0, 2.0, 0.5), light)
@@ -242,8 +242,8 @@ def test_a_condensed_crop_keeps_components_above_a_power(least_power: float, lef
     assert np.count_nonzero(power > 1e-6 * power[-1]) == left
 
 
-def test_later_lines_of_an_area_lie_in_the_components_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lines of several exposures share the components of the first pass."""
+def test_later_lines_share_the_components_of_the_first_pass(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lines of several exposures vary in the same four directions."""
     monkeypatch.setattr(capture_augmentation, "AREAS", (0.0, 1.0))
     rng = np.random.default_rng(6)
     augmentation, normalisation = _augmentation()

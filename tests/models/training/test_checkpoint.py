@@ -1,4 +1,4 @@
-"""Training that was killed goes on: what a checkpoint holds, and whose it is."""
+"""Checkpoints: killed training resumes, and checkpoints of other runs and damaged ones are not used."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ SHIFT = np.zeros(2, np.float32)
 
 
 def example(seed: int = 1) -> Example:
-    """A small scene of noise with labels by its sign."""
+    """Return a small scene of noise with labels by its sign."""
     columns = np.random.default_rng(seed).normal(0, 1, (32, 32, 2))
     return Example("e", columns.astype(np.float16), (columns[..., 0] > 0).astype(np.uint8), (32, 32))
 
 
-def test_a_killed_run_goes_on_to_the_same_weights(tmp_path: Path) -> None:
-    """Killed after step 4 and started again, training takes the steps that are left and ends where it would have."""
+def test_killed_training_resumes_to_the_same_weights(tmp_path: Path) -> None:
+    """Started again after it was killed at step 5, training takes steps 5 and 6 and ends with the same weights."""
     file, steps = tmp_path / "c", []
     undisturbed, _ = train(CONFIG, [example()], SHIFT, SETTINGS)
     with pytest.raises(KeyboardInterrupt):
@@ -43,7 +43,7 @@ def test_a_killed_run_goes_on_to_the_same_weights(tmp_path: Path) -> None:
 
 
 def test_another_run_starts_from_the_beginning(tmp_path: Path) -> None:
-    """A checkpoint of other settings, or of other scenes, is not gone on from."""
+    """A checkpoint of other settings, or of other scenes, is not used."""
     file = tmp_path / "c"
     with pytest.raises(KeyboardInterrupt):
         train(CONFIG, [example()], SHIFT, SETTINGS, killed_after(4), checkpoint=file, keep_every_s=0)
@@ -59,7 +59,7 @@ def test_another_run_starts_from_the_beginning(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("damage", ["cut", "tensor", "description", "other", "empty", "earlier"])
 def test_a_damaged_checkpoint_is_refused(tmp_path: Path, damage: str) -> None:
-    """Neither gone on from nor written over: one message says where it lies, and that deleting it begins anew."""
+    """The checkpoint is neither used nor overwritten; the error names the file and what to do."""
     file = tmp_path / "c"
     save_checkpoint(file, "x", {"course": {"step": 4}}, {"a": torch.ones(100)})
     raw = file.read_bytes()

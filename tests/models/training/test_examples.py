@@ -1,4 +1,4 @@
-"""Training data: labelled scenes as the camera shows them, and random crops of them."""
+"""Training data: labelled scenes as the camera captures them, and random crops of them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _observed(scene: RasterScene, camera: LineCamera = CAMERA, seed: int = 0) ->
     return observe(scene, camera, SceneGrid(*scene.shape, 8), basis, np.random.default_rng(seed))
 
 
-def test_the_look_is_the_cameras_own():
+def test_observed_columns_are_those_of_the_camera():
     """Columns are the spectral columns of the camera's reflectances of the whole padded scene."""
     bright = replace(CAMERA, electrons_per_dn=1e6, read_noise_e=0.0)  # so much light that noise is below rounding
     scene = _scene((32, 48), bright)
@@ -43,8 +43,8 @@ def test_the_look_is_the_cameras_own():
     assert seen.columns == pytest.approx(expected, abs=3e-3)
 
 
-def test_the_look_at_a_padded_scene():
-    """Columns and labels have the padded size; what was added is unlabelled and mirrors the scene."""
+def test_observed_scenes_are_padded_by_mirroring():
+    """Columns and labels have the padded size; the added pixels are unlabelled and mirror the scene."""
     scene = _scene((36, 50))
     seen = _observed(scene)
     assert seen.columns.shape == (40, 56, 6)
@@ -55,8 +55,8 @@ def test_the_look_at_a_padded_scene():
     assert np.abs(seen.columns[36:40] - seen.columns[34:30:-1]).mean() < 0.1
 
 
-def test_scenes_without_labels_teach_nothing():
-    """A scene without labels, and examples without one labelled pixel, are refused."""
+def test_scenes_without_labels_are_refused():
+    """Examples without one labelled pixel are refused as well."""
     with pytest.raises(SceneError, match="scene s has no labels"):
         _observed(replace(_scene(), raster=SceneRaster.of(_scene().planes)))
     blank = Example("e", np.zeros((32, 32, 1), np.float16), np.full((32, 32), 255, np.uint8), (32, 32))
@@ -65,13 +65,13 @@ def test_scenes_without_labels_teach_nothing():
 
 
 def _example(shape: tuple[int, int], name: str = "e") -> Example:
-    """An example whose one column is the label plus 1."""
+    """Return an example whose one column is the label plus 1."""
     labels = np.random.default_rng(len(name)).integers(0, 5, shape).astype(np.uint8)
     return Example(name, (labels[..., None] + 1).astype(np.float16), labels, shape)
 
 
-def test_crops_show_one_place_to_both_networks():
-    """However a crop is turned, its pixels and labels belong together and share one brightness, at the reference."""
+def test_both_networks_see_the_same_crop():
+    """However a crop is turned, pixels and labels stay together and share one brightness, at the reference."""
     sampler = CropSampler([_example((64, 96)), _example((48, 48), "other")], 8, 32)
     batch = sampler.draw(12, np.random.default_rng(3), np.zeros(1, np.float32))
     columns, labels = batch.image[:, 0].numpy(), batch.labels.numpy()
@@ -82,8 +82,8 @@ def test_crops_show_one_place_to_both_networks():
     assert not batch.image[:, 1:].any()  # the planes of the reference
 
 
-def test_zoomed_crops_keep_labels_beside_their_pixels():
-    """They show 0.66 to 1.41 times as many pixels: stripes of 16 px have 11 to 24. Only borders of stripes mix."""
+def test_zoomed_crops_keep_labels_aligned():
+    """Crops show 0.66 to 1.41 times as many pixels: stripes of 16 px have 11 to 24. Only borders of stripes mix."""
     stripes = np.repeat(np.arange(8, dtype=np.uint8), 16)[None].repeat(128, axis=0)
     example = Example("e", (stripes[..., None] + 1).astype(np.float16), stripes, stripes.shape)
     batch = CropSampler([example], 8, 64, zoomed=True).draw(40, np.random.default_rng(0), np.zeros(1, np.float32))
@@ -98,7 +98,7 @@ def test_zoomed_crops_keep_labels_beside_their_pixels():
     [(8, 48, 16, 32), (8, 48, 400, 32), (16, 64, 70, 64), (8, 24, 16, 16), (8, 24, 400, 24), (64, 128, 100, 64)],
 )
 def test_crops_are_whole_cells_within_the_smallest_scene(patch: int, smallest: int, crop: int, size: int):
-    """The wished size is brought down to whole tokens and patches, and never below one; patches of smaller scenes."""
+    """The size is reduced to whole tokens and patches, but never below one; smaller scenes give whole patches."""
     sampler = CropSampler([_example((128, 192)), _example((smallest, 160))], patch, crop)
     batch = sampler.draw(2, np.random.default_rng(0), np.zeros(1, np.float32))
     assert batch.labels.shape == (2, size, size)
@@ -106,7 +106,7 @@ def test_crops_are_whole_cells_within_the_smallest_scene(patch: int, smallest: i
     assert batch.origin.shape == (2, 2)
 
 
-def test_crops_follow_the_labels():
+def test_crops_contain_labelled_pixels():
     """Scenes are drawn by their labelled area, and a crop without a label is drawn again."""
     dark = replace(_example((64, 64)), labels=np.full((64, 64), 255, np.uint8))
     corner = np.full((64, 64), 255, np.uint8)
@@ -116,8 +116,8 @@ def test_crops_follow_the_labels():
     assert (labels == 4).flatten(1).any(dim=1).all()
 
 
-def test_crops_of_scenes_whose_noise_is_known_are_shown_as_captures():
-    """By the augmentation: their planes are those of shorter exposures; of a scene without noise they stay 0."""
+def test_crops_are_augmented_if_their_noise_is_known():
+    """Planes of these crops are those of shorter exposures; planes of a scene without noise stay 0."""
     plain = Normalisation(np.zeros(1, np.float32), np.ones(1, np.float32), np.eye(1, dtype=np.float32))
     noise = ColumnNoise(np.full(1, 1e-4), np.full((1, 1), 1e-4))
     for known in (noise, None):

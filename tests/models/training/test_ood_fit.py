@@ -1,4 +1,4 @@
-"""What is measured as familiar: known rates on scenes of Gaussian spectra, and what cannot be measured."""
+"""Fitting the out-of-distribution detector and the temperature on scenes of Gaussian spectra."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PLAIN = Normalisation(*(np.zeros(COLUMNS, np.float32), np.ones(COLUMNS, np.float
 
 
 def scene(seed: int, side: int = 48) -> Example:
-    """Two classes of Gaussian spectra in halves, one of them rare, with the noise of a camera."""
+    """Return a scene of two classes of Gaussian spectra, one of them rare, with the noise of a camera."""
     rng, labels = np.random.default_rng(seed), np.zeros((side, side), np.uint8)
     labels[:, -side // 8 :] = 1
     labels[:2, :2] = 255
@@ -29,8 +29,8 @@ def scene(seed: int, side: int = 48) -> Example:
     return Example(f"{seed}", columns.astype(np.float16), labels, labels.shape, noise)
 
 
-def test_known_spectra_are_unknown_at_the_rate_that_is_stated() -> None:
-    """On scenes that nothing was measured on, bright or dark; others are, and so is what had no label."""
+def test_known_spectra_are_unknown_at_the_stated_rate() -> None:
+    """The scenes were not used for the fit; spectra of no class, also of unlabelled pixels, are unknown."""
     ood_detector = fit_ood(
         [scene(i) for i in range(4)], [scene(i) for i in range(10, 13)], PLAIN, darkest_ms=3.0, bands=9, seed=0
     )
@@ -42,7 +42,7 @@ def test_known_spectra_are_unknown_at_the_rate_that_is_stated() -> None:
 
 
 def test_every_capture_that_training_shows_has_limits() -> None:
-    """Each spacing and light, down to the darkest; one spacing and light alone of scenes whose noise is not known."""
+    """Limits cover each spacing and light, down to the darkest; without known noise only one of each."""
     given = [scene(0)], [scene(1, 40)], PLAIN
     limits = fit_ood(*given, darkest_ms=12.0, bands=9, seed=0).limits
     assert (limits.steps, limits.light.tolist()) == ((1, 2, 4, 8), [0.12, 0.25, 0.5, 1.0])
@@ -53,14 +53,14 @@ def test_every_capture_that_training_shows_has_limits() -> None:
     assert (bare.steps, bare.light.tolist(), bare.fine.shape) == ((1,), [1.0], (1, 1, 7))
 
 
-def test_a_scene_to_measure_the_rate_on_is_needed() -> None:
-    """Nobody could say otherwise how often a known pixel is called unknown."""
+def test_fit_needs_validation_scenes() -> None:
+    """Without them the rate of known pixels that are called unknown cannot be measured."""
     with pytest.raises(SceneError, match="no scene was kept"):
         fit_ood([scene(0)], [], PLAIN, darkest_ms=3.0, bands=9, seed=0)
 
 
-def test_columns_that_repeat_each_other_have_a_covariance() -> None:
-    """One that can be inverted, and the middles are those of the data; a class of one pixel is no obstacle."""
+def test_repeated_columns_have_an_invertible_covariance() -> None:
+    """The centres are those of the data; a class of one pixel is allowed."""
     rng = np.random.default_rng(0)
     one = rng.normal(0, 1, (400, 1))
     pixels = np.concatenate([one, one, np.ones((400, 1))], axis=1).astype(np.float32)
@@ -72,7 +72,7 @@ def test_columns_that_repeat_each_other_have_a_covariance() -> None:
 
 
 def judged(sharpness: float, seed: int = 0) -> JudgedMap:
-    """Maps whose labels are drawn from the probabilities, told ``sharpness`` times as sure as they are."""
+    """Return maps whose labels are drawn from the probabilities, with logits ``sharpness`` times as large."""
     rng = np.random.default_rng(seed)
     logits = rng.normal(0, 2, (6000, 4))
     odds = np.exp(logits) / np.exp(logits).sum(axis=1, keepdims=True)
@@ -81,8 +81,8 @@ def judged(sharpness: float, seed: int = 0) -> JudgedMap:
     return JudgedMap((told - np.log(np.exp(told).sum(axis=1, keepdims=True))).astype(np.float32), labels)
 
 
-def test_a_map_too_sure_of_itself_gets_the_temperature_that_it_lacks() -> None:
-    """About the factor that it was too sure by, and its error falls; which class is likeliest stays."""
+def test_temperature_corrects_the_confidence_of_maps() -> None:
+    """The temperature is within 10 % of the factor of the logits, and the calibration error falls below 0.02."""
     told = judge_confidence([judged(2.5)], seed=0)
     assert told["temperature"] == pytest.approx(2.5, rel=0.1)
     assert told["expected_error"] < 0.02 < told["expected_error_before"]

@@ -1,4 +1,4 @@
-"""Training: what is drawn, what is lost, what is skipped, and that equal seeds give equal weights."""
+"""Training: crops and patches, losses, skipped steps, discriminants, and equal weights from equal seeds."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ SETTINGS = TrainingSettings(steps=6, batch=2, crop=16, learning_rate=3e-3)
 SHIFT = np.zeros(2, np.float32)
 
 
-def test_training_learns(monkeypatch: pytest.MonkeyPatch):
-    """Forty small steps bring the loss of two easily told classes down to less than a third, and memory goes back."""
+def test_training_reduces_the_loss(monkeypatch: pytest.MonkeyPatch):
+    """Forty small steps bring the loss of two separable classes below a third; freed memory is given back twice."""
     losses, freed = list[float](), list[None]()
     monkeypatch.setattr(training, "FREED_EVERY", 15)
     monkeypatch.setattr(training, "give_back_freed_memory", lambda: freed.append(None))
@@ -51,8 +51,8 @@ def test_training_learns(monkeypatch: pytest.MonkeyPatch):
     assert not model.training
 
 
-def test_what_was_trained_at_the_reference_alone_reads_every_capture_alike(tiny: Maker):
-    """Nothing is learned of planes that are 0 in every crop: their kernels stay 0, and the map is the same."""
+def test_training_at_the_reference_ignores_capture_planes(tiny: Maker):
+    """Planes that are 0 in every crop keep kernels of 0, so that every capture gives the same map."""
     scene = block_example()
     model, _ = train(CONFIG, [scene], SHIFT, SETTINGS)
     assert not any(stem.enter.weight[:, 2 : 2 + PLANES].any() for stem in (model.overview_stem, model.full_stem))
@@ -61,8 +61,8 @@ def test_what_was_trained_at_the_reference_alone_reads_every_capture_alike(tiny:
     assert (usual == dark).all()
 
 
-def test_equal_seeds_give_equal_weights_and_leave_global_streams_alone():
-    """Weights follow from the settings, to rounding; torch's and numpy's own streams are as they were."""
+def test_equal_seeds_give_equal_weights():
+    """The weights are equal up to rounding; the global random streams of torch and numpy do not change."""
     torch_before, numpy_before = torch.random.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
     first, same, other = (
         train(CONFIG, [block_example()], SHIFT, replace(SETTINGS, seed=seed))[0] for seed in (3, 3, 4)
@@ -71,13 +71,13 @@ def test_equal_seeds_give_equal_weights_and_leave_global_streams_alone():
     assert (np.random.get_state()[1] == numpy_before).all()  # noqa: NPY002
     weights = [torch.cat([value.flatten() for value in model.parameters()]) for model in (first, same, other)]
     apart = [(weights[0] - other).norm() for other in weights[1:]]
-    assert apart[0] < 1e-3 * apart[1]  # sums differ in the last bit with where memory lies
+    assert apart[0] < 1e-3 * apart[1]  # sums differ in the last bit with the memory layout
     assert not first.training
 
 
 @pytest.mark.parametrize(("crop", "first", "last"), [(48, 32, (2, 64)), (64, 64, (4, 64)), (16, 32, (4, 32))])
 def test_batches_halve_where_crops_grow(crop: int, first: int, last: tuple[int, int], monkeypatch: pytest.MonkeyPatch):
-    """The last phase has larger crops and fewer of them; where scenes have no larger ones, as many as before."""
+    """The last phase has larger crops and fewer of them; if scenes have no larger ones, their number stays."""
     trainer = training.Trainer(CONFIG, [block_example(64)], SHIFT, replace(SETTINGS, batch=4, crop=crop))
     sizes, loss = [], training.batch_loss
     monkeypatch.setattr(
@@ -91,8 +91,8 @@ def test_batches_halve_where_crops_grow(crop: int, first: int, last: tuple[int, 
     assert sizes == [(4, first), last]
 
 
-def test_minutes_end_a_run(monkeypatch: pytest.MonkeyPatch):
-    """A run over its time stops, and the summary counts the steps that were taken."""
+def test_training_stops_at_its_time_limit(monkeypatch: pytest.MonkeyPatch):
+    """The summary counts the steps that were taken."""
     clock = iter(range(0, 10_000, 30))
     monkeypatch.setattr(training.time, "monotonic", lambda: next(clock))
     seen: list[Progress] = []
@@ -101,8 +101,8 @@ def test_minutes_end_a_run(monkeypatch: pytest.MonkeyPatch):
     assert seen[-1].done == pytest.approx(0.8)
 
 
-def test_a_gradient_that_is_none_is_no_step():
-    """A finite loss with an infinite gradient leaves every weight as it was."""
+def test_an_infinite_gradient_is_no_step():
+    """The loss is finite, and every weight stays as it was."""
     model = Segmenter(CONFIG)
     optimiser = torch.optim.AdamW(model.parameters(), 0.1)
     before = torch.nn.utils.parameters_to_vector(model.parameters()).clone()
@@ -112,15 +112,15 @@ def test_a_gradient_that_is_none_is_no_step():
     assert training._step(model, optimiser, model.to_token.bias.square().sum() + model.to_token.bias.sum())
 
 
-def test_the_rate_warms_up_and_falls():
-    """From 5 % to all of the rate over the first twentieth, then down to 1 %."""
+def test_learning_rate_warms_up_and_falls():
+    """The rate rises from 5 % to 100 % over the first twentieth, then falls to 1 %."""
     assert [rate_at(done) for done in (0.0, 0.025, 0.05, 1.0)] == pytest.approx([0.05, 0.525, 1.0, 0.01])
     falling = [rate_at(done) for done in np.linspace(0.05, 1, 50)]
     assert falling == sorted(falling, reverse=True)
 
 
 def test_rare_classes_weigh_more():
-    """Weights go by one over the root of the fraction, with mean 1 over pixels; a class without a pixel has none."""
+    """Weights are 1 over the root of the fraction, with mean 1 over pixels; a class without a pixel has weight 0."""
     labels = np.full((10, 10), 255, np.uint8)
     labels[:8], labels[8:9, :8], labels[9:, :0] = 0, 1, 2
     weight = class_weights([labels], 3, 100.0).numpy()
@@ -130,8 +130,8 @@ def test_rare_classes_weigh_more():
     assert class_weights([labels], 3, 2.0).max() == 2
 
 
-def test_late_in_a_run_most_draws_go_by_entropy():
-    """Half of them in the first phase, four of five in the last."""
+def test_most_patches_of_a_late_phase_are_drawn_by_entropy():
+    """In the first phase half of them are, in the last four of five."""
     overview = torch.zeros(1, 3, 64, 64)
     overview[:, 0] = 30.0
     overview[:, :, :8, :8] = 0.0  # unsure in patch 0 alone
@@ -146,7 +146,7 @@ def test_late_in_a_run_most_draws_go_by_entropy():
 
 @pytest.mark.parametrize(("deep", "least", "most"), [(False, 1.0, 1.0), (True, 0.04, 0.2)])
 def test_deep_networks_read_patches_in_few_steps(deep: bool, least: float, most: float):
-    """The full network of a deep one learns in about a tenth of the steps, that of others in every step."""
+    """The full network of a deep segmenter learns in about a tenth of the steps, that of others in every step."""
     model, rng, weight = Segmenter(replace(CONFIG, deep=deep)), np.random.default_rng(0), torch.ones(3)
     batch = CropSampler([block_example()], 8, 32).draw(1, rng, SHIFT)
     losses = [batch_loss(model, batch, weight, rng, phase_at(0.0), soft_dice=False) for _ in range(100)]
@@ -155,8 +155,8 @@ def test_deep_networks_read_patches_in_few_steps(deep: bool, least: float, most:
     assert least <= np.mean(read) <= most
 
 
-def test_unlabelled_pixels_have_no_say():
-    """What is predicted at unlabelled pixels changes neither the loss nor its gradient elsewhere."""
+def test_unlabelled_pixels_do_not_change_the_loss():
+    """Logits of unlabelled pixels have no gradient, and other logits there give the same loss."""
     labels = torch.randint(0, 3, (1, 8, 8), generator=torch.Generator().manual_seed(0))
     labels[:, 2:5] = 255
     logits = torch.randn(1, 3, 8, 8, generator=torch.Generator().manual_seed(1)).requires_grad_()
@@ -169,8 +169,8 @@ def test_unlabelled_pixels_have_no_say():
     assert same.item() == pytest.approx(loss.item(), abs=1e-6)
 
 
-def test_discriminants_of_absent_classes_are_out_of_reach():
-    """Two of three classes have pixels: each is told by its own channel, and the third is never the likeliest."""
+def test_absent_classes_are_never_the_likeliest():
+    """Two of three classes have pixels and are separated; the third has a logit of -20 everywhere."""
     rng, labels = np.random.default_rng(0), np.repeat(np.array([0, 2], np.uint8), 50)
     features = (rng.normal(0, 1, (100, 4)) + 5 * labels[:, None]).astype(np.float32)
     found = linear_discriminants(LabelledPixels(features, labels), 3)
@@ -180,7 +180,7 @@ def test_discriminants_of_absent_classes_are_out_of_reach():
 
 
 def test_a_class_of_one_pixel_has_discriminants() -> None:
-    """Without a warning of the library."""
+    """All discriminants are finite, and the library gives no warning."""
     features = np.random.default_rng(1).normal(size=(40, 3)).astype(np.float32)
     labels = np.repeat([0, 1, 2], [20, 19, 1]).astype(np.uint8)
     start = linear_discriminants(LabelledPixels(features, labels), 3)
@@ -188,13 +188,13 @@ def test_a_class_of_one_pixel_has_discriminants() -> None:
 
 
 def test_as_few_pixels_as_classes_are_refused() -> None:
-    """The message counts both."""
+    """The error counts both."""
     with pytest.raises(SceneError, match="2 labelled pixels of 2 classes are too few; label more of each"):
         linear_discriminants(LabelledPixels(np.eye(2, dtype=np.float32), np.array([0, 2], np.uint8)), 3)
 
 
-def test_discriminants_do_not_rely_on_the_light() -> None:
-    """A feature that tells classes at one brightness alone has little weight; one that brightness leaves has all."""
+def test_discriminants_do_not_rely_on_brightness() -> None:
+    """A feature that depends on brightness loses its weight; one that does not keeps it."""
     rng, labels = np.random.default_rng(0), np.repeat(np.array([0, 1], np.uint8), 500)
     features = (rng.normal(0, 0.1, (1000, 2)) + 1.5 * labels[:, None]).astype(np.float32)
     shift = np.array([100.0, 0.0], np.float32)  # twice the light moves the first feature by so much
@@ -207,8 +207,8 @@ def test_discriminants_do_not_rely_on_the_light() -> None:
     assert weights[1][0] < 0.05 * weights[1][1]
 
 
-def test_discriminants_of_dark_trainings_are_fitted_to_dark_pixels() -> None:
-    """Their logits are far smaller than those of bright pixels, which are as many; scenes without noise stay bright."""
+def test_discriminants_are_fitted_to_dark_pixels() -> None:
+    """Weights for dark crops are less than half of those for bright ones; scenes without known noise stay bright."""
     plain = Normalisation(np.zeros(2, np.float32), np.ones(2, np.float32), np.eye(2, dtype=np.float32))
     augmentation, silent = CaptureAugmentation(plain, darkest_ms=3.0), block_example(64, 16)
     noisy = replace(silent, noise=ColumnNoise(np.zeros(2), 0.01 * np.eye(2)))
@@ -224,7 +224,7 @@ def test_discriminants_of_dark_trainings_are_fitted_to_dark_pixels() -> None:
 
 @pytest.mark.parametrize("fraction", [0.0, 0.5, 1.0])
 def test_logits_mix_with_those_of_discriminants(fraction: float) -> None:
-    """By the fraction, of the overview and of patches; the network stays as it is."""
+    """The fraction applies to the overview and to patches; the network stays as it is."""
     own = Segmenter(SegmenterConfig(3, 4, patch=8, width=8, dim=16, layers=1, heads=2))
     with torch.no_grad():
         for parameter in own.parameters():
@@ -240,8 +240,8 @@ def test_logits_mix_with_those_of_discriminants(fraction: float) -> None:
     torch.testing.assert_close(alone[0][0, :, 8, 8], told)
 
 
-def test_a_network_halfway_has_the_mean_of_each_weight() -> None:
-    """Neither network changes."""
+def test_halfway_network_has_the_mean_of_each_weight() -> None:
+    """Both networks themselves stay as they are."""
     one, other = (Segmenter(SegmenterConfig(3, 4, patch=8, width=8, dim=16, layers=1, heads=2)) for _ in range(2))
     before = [parameter.clone() for parameter in (*one.parameters(), *other.parameters())]
     mean = halfway(one, other)

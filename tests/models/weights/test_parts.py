@@ -1,4 +1,4 @@
-"""Parts of a file of weights, familiar and reader: what is added is read, what is damaged or unfit is refused."""
+"""Parts of a weights file, detector and reader: added parts are read; damaged or unfit ones are refused."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ SEEN = files.TrainedOn(10, (400.0, 1000.0), (3.0, 100.0), 48, ("a", "b"), (96, 3
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    """A file of small weights."""
+    """Return the path of a file of small weights."""
     files.save_weights(make_weights(), tmp_path / "own.safetensors")
     return tmp_path / "own.safetensors"
 
 
 def with_ood(path: Path) -> None:
-    """Add what is familiar to the weights."""
+    """Add an out-of-distribution detector to the weights."""
     columns = files.describe_weights(path).config.columns
     one = np.eye(columns)
     measured = OodDetector(np.zeros((1, columns)), one[None], 0.1 * one[None], 0.1 * one, some_limits(), 10)
@@ -37,15 +37,15 @@ def with_ood(path: Path) -> None:
 
 
 def with_reader(path: Path, **changed: int) -> None:
-    """Add a reader of prior maps."""
+    """Add a temporal reader to the weights."""
     config = files.describe_weights(path).config
     sizes = {"classes": config.classes, "columns": config.columns, "width": 8}
     built = TemporalReader(TemporalSizes(**{**sizes, "coarse_width": 4, **changed}))
     files.add_reader(path, path, built, {"seed": 1})
 
 
-def test_what_is_added_is_read_and_leaves_the_weights_as_they_were(path: Path) -> None:
-    """Both parts come back in any order; each has a key of its own, which adding it again does not change."""
+def test_added_parts_leave_the_weights_unchanged(path: Path) -> None:
+    """Both parts are read in any order; each has a key of its own, which adding it again does not change."""
     bare, weights = files.describe_weights(path), files.load_weights(path)
     assert (bare.ood_detector, bare.reader) == (None, None)
     for add in (with_ood, with_reader, with_ood):
@@ -64,21 +64,21 @@ def test_what_is_added_is_read_and_leaves_the_weights_as_they_were(path: Path) -
 
 
 @pytest.mark.parametrize(("load", "words"), [(files.load_ood, "--validation"), (files.load_reader, "--train-temporal")])
-def test_a_part_that_is_not_there_says_how_it_is_made(path: Path, load: Callable[[Path], object], words: str) -> None:
-    """The message names the file and the command."""
+def test_the_error_of_a_missing_part_names_the_command(path: Path, load: Callable[[Path], object], words: str) -> None:
+    """The error names the file and the command that makes the part."""
     with pytest.raises(WeightsError, match=rf"own\.safetensors.*spectralzoom train DATASET {words}"):
         load(path)
 
 
-def test_what_training_saw_is_read_as_it_was_told() -> None:
-    """With and without what is not known."""
+def test_training_description_round_trips() -> None:
+    """Optional values may be missing."""
     bare = files.TrainedOn(3, (460.0, 640.0), (100.0, 100.0), 2, ("a", "b"))
     assert [files.TrainedOn.read(one.as_dict()) for one in (SEEN, bare)] == [SEEN, bare]
 
 
 @pytest.mark.parametrize(("add", "load"), [(with_ood, files.load_ood), (with_reader, files.load_reader)])
-def test_every_flipped_bit_is_told(path: Path, add: Callable[[Path], None], load: Callable[[Path], object]) -> None:
-    """Of a part's own tensors and of the description, in a message that names the file and says what to do."""
+def test_every_flipped_bit_is_found(path: Path, add: Callable[[Path], None], load: Callable[[Path], object]) -> None:
+    """The bits are drawn from the part's own tensors and from the description; the error names the file."""
     add(path)
     whole, rng = path.read_bytes(), np.random.default_rng(0)
     size = 8 + int.from_bytes(whole[:8], "little")
@@ -99,15 +99,15 @@ def test_every_flipped_bit_is_told(path: Path, add: Callable[[Path], None], load
     ("changed", "why"),
     [({"columns": 5}, "for another network"), ({"classes": 8}, "for another network"), ({"width": 2048}, "4 wide")],
 )
-def test_a_reader_for_others_is_refused(path: Path, changed: dict[str, int], why: str) -> None:
-    """Other columns or classes than the weights have; and a width that is damage."""
+def test_a_reader_that_does_not_fit_is_refused(path: Path, changed: dict[str, int], why: str) -> None:
+    """The reader has other columns or classes than the weights, or a width that can only be damage."""
     with_reader(path, **changed)
     with pytest.raises(WeightsError, match=why):
         files.load_reader(path)
 
 
-def test_numbers_that_are_none_are_refused(path: Path) -> None:
-    """A NaN among the tensors."""
+def test_a_reader_with_nan_is_refused(path: Path) -> None:
+    """One number of its tensors is NaN."""
     with_reader(path)
     found = files.load_reader(path)
     with torch.no_grad():
@@ -117,8 +117,8 @@ def test_numbers_that_are_none_are_refused(path: Path) -> None:
         files.load_reader(path)
 
 
-def test_what_was_read_stays_where_the_file_is_written_over(path: Path) -> None:
-    """Copied onto while a survey reads with them, weights, reader and limits are still those that were checked."""
+def test_loaded_weights_survive_overwriting_the_file(path: Path) -> None:
+    """During a survey another file may be copied onto it: weights, reader and limits stay those that were checked."""
     with_ood(path)
     with_reader(path)
     weights, told, numbers = files.load_weights(path), files.load_ood(path), files.load_reader(path).state_dict()

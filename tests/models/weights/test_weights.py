@@ -1,4 +1,4 @@
-"""Weights on disk: what is written comes back, and what is damaged is named."""
+"""Files of weights are read as written, and damage is named."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.models.conftest import Maker
 
 
 def _about(path: Path) -> dict[str, Any]:
-    """What a file says of itself, without its hashes."""
+    """Return the description in a file, without its hashes."""
     raw = path.read_bytes()
     (size,) = struct.unpack("<Q", raw[:8])
     about: dict[str, Any] = json.loads(json.loads(raw[8 : 8 + size])["__metadata__"]["about"])
@@ -35,12 +35,12 @@ def _rewritten(path: Path, about: dict[str, Any], tensors: dict[str, torch.Tenso
 
 @pytest.fixture
 def saved(tiny: Maker, tmp_path: Path) -> Path:
-    """A file of small weights."""
+    """Return the path of a file of small weights."""
     save_weights(tiny(), tmp_path / "w.safetensors")
     return tmp_path / "w.safetensors"
 
 
-def test_everything_comes_back_bit_by_bit(tiny: Maker, saved: Path):
+def test_weights_round_trip_bit_by_bit(tiny: Maker, saved: Path):
     """Parameters, basis, normalisation, classes, colours and record are those that were saved."""
     before, after, described = tiny(), load_weights(saved), describe_weights(saved)
     old, new = before.segmenter.state_dict(), after.segmenter.state_dict()
@@ -56,21 +56,21 @@ def test_everything_comes_back_bit_by_bit(tiny: Maker, saved: Path):
 
 
 def test_saving_twice_gives_equal_files(tiny: Maker, saved: Path, tmp_path: Path):
-    """The same weights give the same bytes, and nothing else is left in the folder."""
+    """The same weights give the same bytes, and no other file is left in the folder."""
     save_weights(load_weights(saved), tmp_path / "again.safetensors")
     assert (tmp_path / "again.safetensors").read_bytes() == saved.read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["again.safetensors", "w.safetensors"]
 
 
-def test_a_missing_file_says_how_to_make_one(tmp_path: Path):
-    """The message names the path and the command."""
+def test_the_error_of_a_missing_file_says_how_to_make_one(tmp_path: Path):
+    """The error names the path and the training command."""
     with pytest.raises(WeightsError, match=r"no weights at .*gone.safetensors; train some with: spectralzoom train"):
         load_weights(tmp_path / "gone.safetensors")
 
 
 @pytest.mark.parametrize("keep", [0, 5, 400, -100, None])
-def test_what_is_no_whole_file_is_not_readable(saved: Path, keep: int | None):
-    """A file that ends early is named, whatever is left of it, and so is torch's own kind: no pickle is opened."""
+def test_truncated_and_pickled_files_are_refused(saved: Path, keep: int | None):
+    """The error names the file, wherever it ends; a pickle of torch is not opened."""
     if keep is None:
         torch.save({"a": torch.zeros(1)}, saved)
     else:
@@ -79,8 +79,8 @@ def test_what_is_no_whole_file_is_not_readable(saved: Path, keep: int | None):
         load_weights(saved)
 
 
-def test_another_format_is_named(saved: Path):
-    """A newer or older format, with the command that made the file; tensors without any mark."""
+def test_another_format_is_refused(saved: Path):
+    """The error names a newer or older format and the command that made the file; tensors alone have no format."""
     record = {"command": "spectralzoom train mine"}
     for other in ("spectralzoom-weights/9", "spectralzoom-weights/4"):
         _rewritten(saved, {**_about(saved), "record": record, "format": other})
@@ -103,8 +103,8 @@ def test_another_format_is_named(saved: Path):
         ({"layers": 1.0}, "layers of a segmenter must be a whole number, got 1.0"),
     ],
 )
-def test_sizes_that_do_not_fit_are_named(saved: Path, changes: dict[str, Any], words: str):
-    """A configuration that cannot be built is refused by name, and one that its tensors do not fit as another's."""
+def test_sizes_that_do_not_fit_are_refused(saved: Path, changes: dict[str, Any], words: str):
+    """An impossible size is named; sizes that do not fit the tensors are called those of another version."""
     about = _about(saved)
     _rewritten(saved, {**about, "config": {**about["config"], **changes}})
     with pytest.raises(WeightsError, match=words):
@@ -124,8 +124,8 @@ def test_sizes_that_do_not_fit_are_named(saved: Path, changes: dict[str, Any], w
         ("normalisation.spread", torch.zeros_like, "spread has a value that is not above 0"),
     ],
 )
-def test_tensors_that_cannot_be_are_refused_by_name(saved: Path, name: str, change: Any, words: str):
-    """Each is wanted, in finite numbers of its own kind, and columns are not divided by 0."""
+def test_invalid_tensors_are_refused_by_name(saved: Path, name: str, change: Any, words: str):
+    """Each tensor is required, in finite numbers of its own type, and columns are not divided by 0."""
     tensors = load_file(saved)
     tensor = tensors.pop(name)
     if change is not None:
@@ -135,15 +135,15 @@ def test_tensors_that_cannot_be_are_refused_by_name(saved: Path, name: str, chan
         load_weights(saved)
 
 
-def test_a_file_without_rights_is_not_called_missing(saved: Path, monkeypatch: pytest.MonkeyPatch):
-    """The library for its format says that there is no such file."""
+def test_an_unreadable_file_is_not_called_missing(saved: Path, monkeypatch: pytest.MonkeyPatch):
+    """Without permission to read it, the library for its format reports that there is no such file."""
     monkeypatch.setattr(Path, "open", Mock(side_effect=PermissionError(13, "Permission denied", str(saved))))
     with pytest.raises(WeightsError, match="Permission denied"):
         load_weights(saved)
 
 
-def test_a_missing_entry_is_named(saved: Path):
-    """A description without its basis is damaged; so is one with too few names."""
+def test_an_incomplete_description_is_refused(saved: Path):
+    """The basis is missing, or there are too few class names."""
     about = _about(saved)
     _rewritten(saved, {key: value for key, value in about.items() if key != "basis"})
     with pytest.raises(WeightsError, match=r"w\.safetensors: 'basis'; restore a copy"):
@@ -153,8 +153,8 @@ def test_a_missing_entry_is_named(saved: Path):
         load_weights(saved)
 
 
-def test_a_write_that_fails_leaves_the_old_file(tiny: Maker, saved: Path, monkeypatch: pytest.MonkeyPatch):
-    """A disk that fills up leaves the file that was there, and no part of the new one."""
+def test_a_failed_write_keeps_the_old_file(tiny: Maker, saved: Path, monkeypatch: pytest.MonkeyPatch):
+    """A full disk leaves the file that was there, and no part of the new one."""
     before = saved.read_bytes()
 
     def fill(path: Path, data: bytes) -> int:
@@ -169,8 +169,8 @@ def test_a_write_that_fails_leaves_the_old_file(tiny: Maker, saved: Path, monkey
     assert [path.name for path in saved.parent.iterdir()] == ["w.safetensors"]
 
 
-def test_a_flipped_bit_of_a_tensor_is_named(saved: Path):
-    """Any number of any tensor, to its lowest bit."""
+def test_a_flipped_bit_of_a_tensor_is_found(saved: Path):
+    """The error names the tensor; the lowest bit of one number is enough."""
     raw = bytearray(saved.read_bytes())
     raw[-4] ^= 1
     saved.write_bytes(raw)
@@ -178,16 +178,16 @@ def test_a_flipped_bit_of_a_tensor_is_named(saved: Path):
         load_weights(saved)
 
 
-def test_a_description_that_was_changed_is_refused(saved: Path):
-    """A class renamed by one bit, which no tensor would tell."""
+def test_a_changed_description_is_refused(saved: Path):
+    """A class is renamed by one bit, which no tensor shows."""
     raw = saved.read_bytes()
     saved.write_bytes(raw.replace(b"class 1", b"class 3"))
     with pytest.raises(WeightsError, match="is damaged: its description is not what was written"):
         describe_weights(saved)
 
 
-def test_a_header_of_petabytes_is_refused_unread(saved: Path):
-    """A tensor of 3.6 PB that the file has not: refused before memory is asked for."""
+def test_a_header_of_petabytes_is_refused(saved: Path):
+    """A claimed tensor of 3.6 PB that the file lacks is refused before memory is allocated."""
     about, size = json.dumps(_about(saved)), 900 * 10**12
     header = {"__metadata__": {"about": about}, "a": {"dtype": "F32", "shape": [size], "data_offsets": [0, 4 * size]}}
     text = json.dumps(header).encode()

@@ -1,4 +1,4 @@
-"""Recordings of small simulated fields, for tests: what the simulated rig saw, kept as sweeps."""
+"""Make recordings of small simulated fields for tests: the sweeps of a simulated rig, stored as recorded sweeps."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ FULL = Sweep("scan-0", "fine", "x", swath_px=0.0, start_px=-39.5, lines=80)
 
 
 def simulated(camera: LineCamera = CAMERA) -> SimulatedSource:
-    """The simulated rig before a small field of noise, (80, 64, 3)."""
+    """Return a simulated rig in front of a small field of noise, (80, 64, 3)."""
     values = np.random.default_rng(5).random((80, 64, 3))
     return SimulatedSource(image_scene(values, camera, np.linspace(450, 850, 3)), Rig(camera), seed=3)
 
 
 @dataclass
 class Counted:
-    """Reads of a recorded sweep, line by line."""
+    """Numbers of the lines that were read from a recorded sweep."""
 
     numbers: list[int] = field(default_factory=list)
 
 
 def record(source: SimulatedSource, sweep: Sweep, counted: Counted | None = None) -> RecordedSweep:
-    """Record one sweep of the simulated rig; the numbers of the lines that are read later go to ``counted``."""
+    """Record one sweep of the simulated rig. Later reads append their line numbers to ``counted``."""
     lines = SimulatedSweep(source, sweep)
     exposure_ms = source.camera.exposure_ms if sweep.exposure_ms is None else sweep.exposure_ms
 
@@ -54,12 +54,12 @@ def record(source: SimulatedSource, sweep: Sweep, counted: Counted | None = None
 
 
 def recorded_source(source: SimulatedSource, sweeps: Sequence[RecordedSweep]) -> RecordedSource:
-    """A source over recorded sweeps of the simulated rig's field."""
+    """Return a source over recorded sweeps of the simulated rig's field."""
     return RecordedSource(sweeps, source.camera, source.wavelength_nm, source.field_shape)
 
 
 def assert_same(found: list[Line], expected: list[Line]) -> None:
-    """Lines are equal bit for bit, with number, position, time, exposure and whether they are valid."""
+    """Assert that lines are equal bit for bit: data, number, position, time, exposure and validity."""
     assert len(found) == len(expected)
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_array_equal(one.data, other.data)

@@ -1,4 +1,4 @@
-"""A recording gives its own sweeps as they are, planned ones by their nearest lines, and reads nothing else."""
+"""A recorded source returns its own sweeps unchanged and planned sweeps by their nearest lines; it reads no others."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def assert_same_references(found: References, expected: References) -> None:
 @pytest.mark.parametrize(
     "sweep", [FULL, Sweep("c", "coarse", "x", 0.0, -39.5, 20, step=4, binning=4, exposure_ms=25.0)]
 )
-def test_a_recorded_copy_of_a_sweep_gives_its_lines(sweep: Sweep) -> None:
-    """Lines and references are those of the recorded source, bit for bit."""
+def test_a_recorded_sweep_returns_its_lines_unchanged(sweep: Sweep) -> None:
+    """Lines and references equal those of the source that was recorded, bit for bit, from any first line."""
     source = simulated()
     recorded, lines = recorded_source(source, [record(source, sweep)]), list(source.lines(sweep))
     assert_same(list(recorded.lines(sweep)), lines)
@@ -34,7 +34,7 @@ def test_a_recorded_copy_of_a_sweep_gives_its_lines(sweep: Sweep) -> None:
 
 
 def test_a_coarse_pass_over_a_full_scan_reads_one_line_in_four() -> None:
-    """Each coarse line is the recorded line just before its middle; the others are not read."""
+    """Each coarse line is the recorded line just before its middle. The other lines are not read."""
     source, counted = simulated(), Counted()
     recorded = recorded_source(source, [record(source, FULL, counted)])
     coarse = Sweep("coarse-0", "coarse", "x", 0.0, -39.5, 20, step=4)
@@ -47,8 +47,8 @@ def test_a_coarse_pass_over_a_full_scan_reads_one_line_in_four() -> None:
     assert_same_references(recorded.references(coarse), source.references(coarse))
 
 
-def test_fine_lines_of_a_full_scan_are_found_by_their_place() -> None:
-    """A planned run of lines reads those and no other, and gives them as they were recorded."""
+def test_fine_lines_of_a_full_scan_are_found_by_position() -> None:
+    """A planned run of lines reads only those lines and returns them as recorded."""
     source, counted = simulated(), Counted()
     recorded = recorded_source(source, [record(source, FULL, counted)])
     found = list(recorded.lines(Sweep("fine-0", "fine", "x", 0.0, -9.5, 12)))
@@ -59,8 +59,8 @@ def test_fine_lines_of_a_full_scan_are_found_by_their_place() -> None:
     assert counted.numbers[12:] == list(range(38, 46))
 
 
-def test_a_recorded_coarse_sweep_wins_over_the_full_scan() -> None:
-    """Of two sweeps that can serve a request, the one with its very lines does."""
+def test_a_recorded_coarse_sweep_is_preferred_to_the_full_scan() -> None:
+    """If two sweeps can serve a request, the one that has exactly its lines is read."""
     source, coarse = simulated(), Sweep("recorded coarse", "coarse", "x", 0.0, -39.5, 20, step=4)
     recorded = recorded_source(source, [record(source, FULL), record(source, coarse)])
     part = Sweep("planned", "coarse", "x", 0.0, -31.5, 10, step=4)
@@ -68,8 +68,8 @@ def test_a_recorded_coarse_sweep_wins_over_the_full_scan() -> None:
     assert_same(list(recorded.lines(part)), expected)
 
 
-def test_a_backward_scan_gives_rising_times() -> None:
-    """A plan that the recording took the other way comes in the order of its times, each line at its own position."""
+def test_a_backward_recording_returns_lines_in_order_of_time() -> None:
+    """The lines of a plan in the opposite direction come in order of time, each at its own position."""
     source = simulated()
     whole = record(source, FULL)
     backward = replace(
@@ -85,7 +85,7 @@ def test_a_backward_scan_gives_rising_times() -> None:
 
 
 def test_two_sweeps_of_one_swath_serve_a_run_across_both() -> None:
-    """Where one recorded sweep ends and the next begins, lines of both serve, and times go on rising."""
+    """A run across the end of one recorded sweep takes lines of both, and the times still ascend."""
     source = simulated()
     lower, upper = replace(FULL, lines=40), replace(FULL, name="scan-1", start_px=0.5, lines=40)
     recorded = recorded_source(source, [record(source, lower), record(source, upper)])
@@ -97,8 +97,8 @@ def test_two_sweeps_of_one_swath_serve_a_run_across_both() -> None:
     assert np.all(np.diff([line.time_s for line in found]) > 0)
 
 
-def test_a_lost_line_serves_only_where_no_other_does() -> None:
-    """The valid neighbour of a lost line stands for it in a coarse pass; in a fine one the lost line is not valid."""
+def test_an_invalid_line_is_used_only_without_a_valid_neighbour() -> None:
+    """In a coarse pass a valid neighbour replaces an invalid line. In a fine pass the line stays invalid."""
     source = simulated()
     whole = record(source, FULL)
     lost = replace(whole, valid_line=np.arange(80) != 5)
@@ -109,8 +109,8 @@ def test_a_lost_line_serves_only_where_no_other_does() -> None:
     assert [line.valid for line in fine] == [True, False, True]
 
 
-def test_a_line_that_serves_twice_is_valid_once() -> None:
-    """Recorded lines 1.25 px apart serve a plan of 1 px; where two planned lines share one, it counts once."""
+def test_a_recorded_line_that_serves_two_planned_lines_is_valid_once() -> None:
+    """Recorded lines 1.25 px apart serve a plan of 1 px. If two planned lines share one, only one of them is valid."""
     source, wide = simulated(), _lines_apart(1.25)
     found = list(recorded_source(source, [wide]).lines(Sweep("fine-0", "fine", "x", 0.0, -10.0, 10)))
     places = [line.mirror_x for line in found]
@@ -118,7 +118,7 @@ def test_a_line_that_serves_twice_is_valid_once() -> None:
 
 
 def _lines_apart(distance_px: float) -> RecordedSweep:
-    """A recording of 40 lines that are ``distance_px`` apart, centred, with numbers that do not matter."""
+    """Return a recording of 40 centred lines that are ``distance_px`` apart; their data are zeros."""
     sweep = Sweep("uneven", "fine", "x", 0.0, -19.5, 40)
     scan = distance_px * (np.arange(40) - 19.5)
     position = np.concatenate([line_positions(Sweep("one", "fine", "x", 0.0, at, 1), CAMERA) for at in scan.tolist()])
@@ -146,8 +146,8 @@ def _lines_apart(distance_px: float) -> RecordedSweep:
         (Sweep("fine", "fine", "y", 0.0, -9.5, 4), "lie along y, those of the recording along x; plan sweeps along x"),
     ],
 )
-def test_a_line_that_was_never_taken_is_named(asked: Sweep, message: str) -> None:
-    """Beyond the recording's end, beside its strip, or along the other axis: refused before any line is given."""
+def test_a_missing_line_is_named_before_any_line_is_read(asked: Sweep, message: str) -> None:
+    """Lines beyond the end of the recording, on another swath or along the other axis are refused."""
     source, counted = simulated(), Counted()
     recorded = recorded_source(source, [record(source, FULL, counted)])
     with pytest.raises(NotRecordedError, match=message):
@@ -155,8 +155,8 @@ def test_a_line_that_was_never_taken_is_named(asked: Sweep, message: str) -> Non
     assert counted.numbers == []
 
 
-def test_a_plan_is_cut_to_what_was_recorded() -> None:
-    """Lines beyond either end go, those of a gap stay, and of a plan elsewhere nothing is left."""
+def test_a_plan_is_cut_to_the_recorded_lines() -> None:
+    """Lines beyond either end are removed and lines in a gap stay. A plan on another swath becomes None."""
     source = simulated()
     lower, upper = replace(FULL, lines=30), replace(FULL, name="scan-1", start_px=10.5, lines=30)
     recorded = recorded_source(source, [record(source, lower), record(source, upper)])
@@ -169,8 +169,8 @@ def test_a_plan_is_cut_to_what_was_recorded() -> None:
         next(recorded.lines(replace(beyond, start_px=-41.5, lines=21)))
 
 
-def test_a_coarse_line_beside_a_gap_takes_what_lies_within_its_own_lines() -> None:
-    """Where lines 1 to 3 were lost, line 0 serves the coarse line in whose four lines it lies."""
+def test_a_coarse_line_next_to_a_gap_uses_one_of_its_own_four_lines() -> None:
+    """With lines 1 to 3 lost, line 0 serves the first coarse line, because it is one of that line's four."""
     source = simulated()
     whole = record(source, FULL)
     lost = replace(whole, valid_line=~np.isin(np.arange(80), [1, 2, 3]))
@@ -178,8 +178,8 @@ def test_a_coarse_line_beside_a_gap_takes_what_lies_within_its_own_lines() -> No
     assert picked.line[:2].tolist() == [0, 5]
 
 
-def test_a_plan_that_differs_by_rounding_is_the_recorded_sweep() -> None:
-    """Measured positions that stray keep their lines where the plan is the recording's own but for its last digits."""
+def test_a_plan_equal_up_to_rounding_is_the_recorded_sweep() -> None:
+    """Such a plan gets the recorded lines in order, although the measured positions have noise."""
     source = simulated()
     whole = record(source, FULL)
     strayed = replace(whole, position=whole.position + np.random.default_rng(0).normal(0, 3e-4, (80, 2)))
@@ -188,8 +188,8 @@ def test_a_plan_that_differs_by_rounding_is_the_recorded_sweep() -> None:
     assert picked.line.tolist() == list(range(80))
 
 
-def test_finer_lines_than_were_recorded_are_refused() -> None:
-    """A coarse recording serves no fine request, neither by its binning nor by its distance of lines."""
+def test_lines_finer_than_recorded_are_refused() -> None:
+    """A coarse recording serves no fine request, because of its binning or of its line spacing."""
     source = simulated()
     coarse = Sweep("coarse-0", "coarse", "x", 0.0, -39.5, 20, step=4, binning=4)
     stepped = Sweep("stepped", "coarse", "x", 0.0, -39.5, 20, step=4)
@@ -199,8 +199,8 @@ def test_finer_lines_than_were_recorded_are_refused() -> None:
 
 
 @given(st.lists(st.integers(-300, 300), min_size=1, unique=True), st.floats(-40, 40))
-def test_nearest_line_is_nearest(tenths: list[int], wanted: float) -> None:
-    """No other line lies nearer, whatever the order of the lines."""
+def test_nearest_line_has_the_smallest_distance(tenths: list[int], wanted: float) -> None:
+    """The lines may have any order; the returned distance is that of the returned line."""
     scan = np.array(tenths) / 10
     near, distance = nearest_line(scan, np.array([wanted]))
     assert distance[0] == abs(scan[near[0]] - wanted)

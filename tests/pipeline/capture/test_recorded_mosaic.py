@@ -1,4 +1,4 @@
-"""What is rectified out of a recording lies where it was seen, whatever was planned."""
+"""Mosaics of recordings use the positions of the recorded lines, not those of the plan."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ COARSE = Sweep("coarse-0", "coarse", "x", 0.0, -39.5, 20, step=4)
 
 
 def _ramp() -> SimulatedSource:
-    """The rig without noise before a field whose value grows by 0.01 a row."""
+    """Return a rig without noise in front of a field whose reflectance grows by 0.01 a row."""
     values = np.broadcast_to(0.1 + 0.01 * np.arange(80)[:, None, None], (80, 64, 2))
     return SimulatedSource(image_scene(values, CAMERA, np.array([500.0, 700.0])), Rig(CAMERA), chosen={})
 
 
 def _captured(source: RecordedSource, sweep: Sweep) -> RecordedSweep:
-    """A planned sweep as it is captured from a recording."""
+    """Return a planned sweep as captured from a recording."""
     lines = list(source.lines(sweep))
     return RecordedSweep(
         sweep,
@@ -45,10 +45,10 @@ def _mosaic(lines: SweepLines) -> NDArray[np.float32]:
     return np.concatenate(list(mosaic_rows([lines], CAMERA, GRID, rows=80)))
 
 
-def test_a_coarse_pass_from_single_lines_is_not_displaced() -> None:
-    """The recorded line lies half a pixel before the planned one; rectified, a ramp has its own values to 0.1 px.
+def test_a_coarse_pass_of_single_recorded_lines_is_not_displaced() -> None:
+    """Recorded lines lie half a pixel before the planned ones. The mosaic of a ramp is still right to 0.1 px.
 
-    Rows next to the border are left out, where a line's footprint reaches beyond the field.
+    Rows next to the border are left out, because the footprint of their lines reaches beyond the field.
     """
     source = _ramp()
     recorded = recorded_source(source, [record(source, FULL)])
@@ -59,8 +59,8 @@ def test_a_coarse_pass_from_single_lines_is_not_displaced() -> None:
     np.testing.assert_allclose(found, live, atol=1e-3)
 
 
-def test_the_rectification_goes_by_positions() -> None:
-    """A sweep that tells another strip and start gives the same mosaic, bit for bit."""
+def test_mosaics_use_recorded_positions_not_the_planned_swath() -> None:
+    """A sweep with another swath and start, but the same positions, gives the same mosaic bit for bit."""
     source = _ramp()
     one = record(source, FULL)
     expected = _mosaic(one)
@@ -68,8 +68,8 @@ def test_the_rectification_goes_by_positions() -> None:
     np.testing.assert_array_equal(_mosaic(other), expected)
 
 
-def test_lines_beyond_a_gap_do_not_reach_over_it() -> None:
-    """Rows before two lost lines stay the same, whatever the lines behind the gap hold."""
+def test_lines_beyond_a_gap_do_not_change_rows_before_it() -> None:
+    """Rows before two lost lines keep their bits when the lines behind the gap are four times as bright."""
     source = _ramp()
     one = record(source, replace(FULL, start_px=FULL.start_px - 0.4))
     one = replace(one, valid_line=~np.isin(np.arange(FULL.lines), (40, 41)))

@@ -1,4 +1,4 @@
-"""Passes over a recording: plans are kept where its lines serve them, and laid on its own strips elsewhere."""
+"""Passes over a recording keep plans that its lines serve and move other plans to the recorded swaths."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ ASIDE = replace(FULL, name="mine", swath_px=7.0)
 
 
 def passes_over(*sweeps: Sweep) -> RecordedPasses:
-    """Passes over a recording of these sweeps of a small simulated field."""
+    """Return passes over a recording of these sweeps of a small simulated field."""
     source = simulated()
     return RecordedPasses(recorded_source(source, [record(source, sweep) for sweep in sweeps]))
 
 
-def test_a_planned_pass_is_cut_where_the_recording_ends() -> None:
+def test_a_planned_pass_is_cut_at_the_ends_of_the_recording() -> None:
     """A coarse pass from -44 to 44 px keeps the lines within 2 px of those recorded from -39.5 to 39.5 px."""
     (found,) = passes_over(FULL).first_pass([COARSE])
     assert (found.swath_px, found.step, found.binning) == (0.0, 4, 1)
@@ -32,7 +32,7 @@ def test_a_planned_pass_is_cut_where_the_recording_ends() -> None:
 
 
 def test_a_recorded_line_serves_the_end_of_a_plan_once() -> None:
-    """A plan half a pixel beside the recording has a line more; a single line, and lines in between, stay."""
+    """A plan shifted by half a pixel has one line more than the recording and loses it. A single line stays."""
     passes, beside = passes_over(FULL), replace(FULL, start_px=-40.0, lines=81)
     (found,) = passes.full_scan([beside])
     assert (found.lines, found.start_px) == (80, -39.0)
@@ -42,8 +42,8 @@ def test_a_recorded_line_serves_the_end_of_a_plan_once() -> None:
     assert one.lines == 1
 
 
-def test_a_pass_is_laid_on_the_recorded_swaths() -> None:
-    """Where no recorded line lies on a planned strip, lines of the same kind go along the recorded one, end to end."""
+def test_a_plan_without_recorded_lines_moves_to_the_recorded_swath() -> None:
+    """The plan's kind, line spacing and binning stay; its lines cover the recorded swath from end to end."""
     passes = passes_over(ASIDE)
     assert passes.served([COARSE]) is None
     (found,) = passes.first_pass([COARSE])
@@ -57,16 +57,16 @@ def test_a_pass_is_laid_on_the_recorded_swaths() -> None:
     assert RecordedPasses(source).first_pass([COARSE]) == [found]  # no line of the other swath is valid
 
 
-def test_lines_that_serve_twice_count_once() -> None:
-    """A coarse and a fine pass share recorded lines; all of them are 80."""
+def test_recorded_lines_that_serve_several_sweeps_count_once() -> None:
+    """A coarse pass and two fine ones share recorded lines: 80 lines altogether."""
     passes = passes_over(FULL)
     (coarse,) = passes.first_pass([COARSE])
     assert passes.lines_served([coarse]) == coarse.lines
     assert passes.lines_served([coarse, FULL, replace(FULL, name="again")]) == 80
 
 
-def test_a_line_that_is_missing_is_named() -> None:
-    """A strip that lies elsewhere and lines that are finer than the recorded ones are refused with their place."""
+def test_a_missing_line_is_named() -> None:
+    """Lines finer than the recorded ones and lines in a gap are refused with their number."""
     sparse = Sweep("scan-0", "coarse", "x", 0.0, -39.5, 20, step=4)
     with pytest.raises(NotRecordedError, match=r"line \d+ of sweep scan-0 was never captured.*no finer than recorded"):
         passes_over(sparse).first_pass([FULL])
@@ -75,16 +75,16 @@ def test_a_line_that_is_missing_is_named() -> None:
         passes_over(*gap).fine_pass([replace(FULL, name="fine", start_px=-25.5, lines=50)])
 
 
-def test_a_uniform_scan_is_of_one_kind() -> None:
-    """A recording of a coarse and a fine pass is no uniform scan, and its fine runs are no full scan."""
+def test_a_recording_of_two_kinds_of_lines_is_no_uniform_scan() -> None:
+    """A coarse and a fine pass are refused as a uniform scan. A full scan is then planned over the fine lines."""
     passes = passes_over(replace(COARSE, start_px=-39.5, lines=20), replace(FULL, name="fine-0", lines=30))
     with pytest.raises(SceneError, match=r"lines of 2 kinds .*give the --budget of a zoomed survey"):
         passes.uniform_scan()
     assert passes.full_scan([replace(FULL, name="full-0")]) == [replace(FULL, name="full-0")]
 
 
-def test_exposures_are_the_recorded_ones() -> None:
-    """A plan's own exposure gives way to that of the lines that serve it."""
+def test_a_planned_pass_takes_the_recorded_exposure() -> None:
+    """The recorded exposure replaces the exposure of the plan; the camera's own stays unchanged."""
     (found,) = passes_over(replace(FULL, exposure_ms=20.0)).first_pass([replace(COARSE, exposure_ms=50.0)])
     assert found.exposure_ms == 20.0
     assert CAMERA.exposure_ms == 100.0

@@ -1,4 +1,4 @@
-"""Sweeps out of positions come back as they were planned; what is not straight is refused; angles are positions."""
+"""Sweeps fitted to positions equal the planned ones, bent scans are refused, and mirror angles become positions."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ CAMERA = LineCamera()
     st.integers(2, 400),
     st.sampled_from([(1, 1), (4, 4), (8, 2), (1, 4)]),
 )
-def test_a_planned_sweep_comes_back(swath: int, start: int, lines: int, shape: tuple[int, int]) -> None:
-    """Positions of any sweep give that sweep again, exactly; turned round, the same, and backward."""
+def test_fit_recovers_a_planned_sweep(swath: int, start: int, lines: int, shape: tuple[int, int]) -> None:
+    """The fit returns exactly the planned sweep. Reversed positions give the same sweep, marked as backward."""
     step, binning = shape
     sweep = Sweep("s", "fine" if step == binning == 1 else "coarse", "x", swath / 2, start / 2, lines, step, binning)
     position = line_positions(sweep, CAMERA)
@@ -37,8 +37,8 @@ def test_a_planned_sweep_comes_back(swath: int, start: int, lines: int, shape: t
     assert (back.sweep, back.backward) == (sweep, True)
 
 
-def test_noise_and_spikes_do_not_move_the_sweep() -> None:
-    """With 0.7 px of noise and a tenth of the lines lost the sweep is found to a fifth of a pixel."""
+def test_noise_and_lost_lines_do_not_move_the_fitted_sweep() -> None:
+    """With 0.7 px of noise and a tenth of the lines lost, the sweep is found to a fifth of a pixel."""
     sweep, rng = Sweep("s", "fine", "x", 320.0, -400.0, 800), np.random.default_rng(2)
     position = shifted_position(line_positions(sweep, CAMERA), rng.normal(0, 0.7, (800, 2)), CAMERA)
     valid = rng.random(800) > 0.1
@@ -50,8 +50,8 @@ def test_noise_and_spikes_do_not_move_the_sweep() -> None:
     assert abs(found.distance_px - 1) < 1e-3
 
 
-def test_a_gap_does_not_move_the_line_spacing() -> None:
-    """A camera that paused for 20 px in the middle has lines 1 px apart all the same; the gap is told."""
+def test_a_gap_does_not_change_the_line_spacing() -> None:
+    """A scan that pauses for 20 px keeps its line spacing of 1 px, and the note names the gap."""
     sweep = Sweep("s", "fine", "x", 0.0, -42.0, 84)
     position = np.delete(line_positions(sweep, CAMERA), np.s_[30:50], axis=0)
     found = fit_sweep(position, CAMERA, name="s", samples=640)
@@ -68,15 +68,15 @@ def test_a_gap_does_not_move_the_line_spacing() -> None:
         (np.zeros(50), np.concatenate([np.arange(35.0), np.arange(34.0, 19, -1)]), "turns back at line 4[23]"),
     ],
 )
-def test_what_is_no_straight_scan_is_refused(along: np.ndarray, scan: np.ndarray, message: str) -> None:
-    """A bend, a mirror at rest, and a scan that goes back: each says what to do."""
+def test_positions_that_are_no_straight_scan_are_refused(along: np.ndarray, scan: np.ndarray, message: str) -> None:
+    """A bent scan, a mirror at rest and a scan that turns back are refused, each with its own message."""
     position = shifted_position(np.zeros((len(scan), 2)), np.stack([along, scan], axis=-1), CAMERA)
     with pytest.raises(SceneError, match=message):
         fit_sweep(position, CAMERA, name="s", samples=640)
 
 
-def test_too_few_lines_and_odd_samples_are_refused() -> None:
-    """One valid line is no scan, and 500 samples are no part of 640."""
+def test_too_few_lines_and_a_wrong_number_of_samples_are_refused() -> None:
+    """One valid line is no scan, and 500 samples are no binning of 640."""
     position = line_positions(Sweep("s", "fine", "x", 0.0, 0.0, 4), CAMERA)
     with pytest.raises(SceneError, match=r"has too few valid lines \(1\)"):
         fit_sweep(position, CAMERA, name="s", samples=640, valid=np.arange(4) == 2)
@@ -85,7 +85,7 @@ def test_too_few_lines_and_odd_samples_are_refused() -> None:
 
 
 def test_the_covered_field_of_a_full_scan_is_the_field() -> None:
-    """Sweeps laid out for a field cover it along the scan to 4 px, and along the line at least as far as it reaches."""
+    """Sweeps planned for a field cover it along the scan to 4 px, and along the line at least to its ends."""
     grid = SceneGrid(700, 1500, 64)
     along, sweeps, _ = cheapest_full(grid, CAMERA, CostModel(), overlap_px=0.0)
     tangents = [direction_to_scene(position_to_direction(line_positions(sweep, CAMERA))) for sweep in sweeps]
@@ -98,7 +98,7 @@ def test_the_covered_field_of_a_full_scan_is_the_field() -> None:
 
 
 def test_the_covered_field_of_one_straight_scan_is_its_size() -> None:
-    """100 lines of 640 samples through rest: (100, 640), centred where the lines are."""
+    """100 lines of 640 samples cover (100, 640) px, centred on the lines. Lines without a position are ignored."""
     sweep = Sweep("s", "fine", "x", 0.0, 10.0, 100)
     tangents = direction_to_scene(position_to_direction(line_positions(sweep, CAMERA)))
     found = covered_field([sweep], [tangents], CAMERA)
@@ -106,7 +106,7 @@ def test_the_covered_field_of_one_straight_scan_is_its_size() -> None:
     np.testing.assert_allclose(found.centre_px, (59.5, 0.0), atol=1e-6)
     turned = covered_field([replace(sweep, along="y")], [tangents], CAMERA)
     assert turned.shape == (640, 100)
-    beside = replace(sweep, swath_px=0.4)  # its lines are turned by less than can be seen
+    beside = replace(sweep, swath_px=0.4)  # the lines turn by too little to see
     tangents = direction_to_scene(position_to_direction(line_positions(beside, CAMERA)))
     found = covered_field([sweep, beside], [np.full((4, 2), np.nan), tangents], CAMERA)  # one without a position
     assert (found.shape, round(found.centre_px[1], 6)) == ((100, 640), 0.4)
@@ -114,8 +114,8 @@ def test_the_covered_field_of_one_straight_scan_is_its_size() -> None:
         covered_field([sweep], [np.full((4, 2), np.nan)], CAMERA)
 
 
-def test_swaths_without_a_common_part_are_refused() -> None:
-    """Two strips whose scans do not meet, and lines along both axes."""
+def test_swaths_without_a_common_part_of_the_scan_are_refused() -> None:
+    """Two swaths whose scans do not overlap are refused, and so are swaths along different axes."""
     sweeps = [Sweep("a", "fine", "x", 0.0, 0.0, 50), Sweep("b", "fine", "x", 640.0, 900.0, 50)]
     tangents = [direction_to_scene(position_to_direction(line_positions(sweep, CAMERA))) for sweep in sweeps]
     with pytest.raises(SceneError, match="no part of the scan in common"):
@@ -126,7 +126,7 @@ def test_swaths_without_a_common_part_are_refused() -> None:
 
 @pytest.mark.parametrize("extent_px", [100.0, 5000.0, 40000.0])
 def test_lines_of_a_scan_without_a_mirror_are_parallel(extent_px: float) -> None:
-    """Every sample lies within 0.011 px of where a parallel line has it, and the scan is as long as it was."""
+    """Every sample lies within 0.011 px of a parallel line, and the scan keeps its length."""
     flat, scan = flat_camera(CAMERA, extent_px), np.linspace(-extent_px, extent_px, 9)
     tangents = direction_to_scene(position_to_direction(flat_positions(scan, flat))) / flat.ifov_rad
     np.testing.assert_allclose(tangents, np.stack([np.zeros(9), scan], axis=-1), atol=1e-6)
@@ -136,7 +136,7 @@ def test_lines_of_a_scan_without_a_mirror_are_parallel(extent_px: float) -> None
     assert flat.slit_px == CAMERA.slit_px
 
 
-def test_angles_along_the_scan_are_known_by_hand() -> None:
+def test_angles_along_the_scan_follow_the_formula() -> None:
     """On the axis X is -tan(angle) / tan 50 deg: the beam along the rest normal is turned by the same angle."""
     positions, reached = angles_to_positions(np.array([[0, 0], [0, 10], [0, -30], [0, 50]], float))
     expected = -np.tan(np.deg2rad([0, 10, -30, 50])) / REST_TANGENT
@@ -144,7 +144,7 @@ def test_angles_along_the_scan_are_known_by_hand() -> None:
     assert reached.all()
 
 
-def test_positions_of_angles_look_there() -> None:
+def test_positions_of_angles_view_along_these_angles() -> None:
     """The scene tangents of a position are the tangents of its two angles."""
     angles = np.array([[12.0, -20.0], [-30.0, 5.0], [33.0, 12.0]])
     positions, reached = angles_to_positions(angles)
@@ -153,8 +153,8 @@ def test_positions_of_angles_look_there() -> None:
     np.testing.assert_allclose(seen, angles, atol=1e-10)
 
 
-def test_angles_beyond_the_mirror_are_told() -> None:
-    """50 deg is the rim along the scan and 35.6 deg across it; a view to the side or behind is never reached."""
+def test_angles_beyond_the_mirror_are_reported() -> None:
+    """The rim is at 50 deg along the scan and at 35.6 deg across it. Angles beyond it, to 120 deg, become NaN."""
     angles = np.array([[0, 50.01], [35.6, 0], [35.7, 0], [0, 90], [120, 0]], float)
     positions, reached = angles_to_positions(angles)
     assert reached.tolist() == [False, True, False, False, False]

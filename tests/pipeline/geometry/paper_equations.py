@@ -1,6 +1,6 @@
-"""Five models of where a line's samples look, from no rotation to exact rays, the paper's own among them.
+"""Compute where the samples of a line look by five models, from no rotation (L0) to exact rays (L4).
 
-For comparison only, never for computing; errata in brackets, docs/background/errata.md has each with its figure.
+For comparison only, never for computing. Errata are in brackets; docs/background/errata.md has the figure of each.
 Normals and directions are in the frame of :mod:`pipeline.geometry.mirror`.
 """
 
@@ -43,14 +43,14 @@ def line_rotation(direction: ArrayLike) -> Floats:
 
 
 def unlimited_position(normal: ArrayLike) -> Floats:
-    """Give the exact position of normals, beyond the rim as well, so that the paper's forms can be followed there."""
+    """Return the exact position of normals, also beyond the rim, because the paper's formulas continue there."""
     device = normal_to_device(normal)
     c2 = 2 * device[..., 2:] ** 2 - 1
     return 2 * device[..., 2:] * device[..., :2] / (c2 * REST_TANGENT)
 
 
 def straight_slope_rotation(swath_px: ArrayLike, scan_px: ArrayLike, camera: LineCamera) -> NDArray[np.float64]:
-    """Give -atan(dY/dX) of sweeps that are straight in the scene, free of the path's own steps and noise. [rad]
+    """Return the slope rotation -atan(dY/dX) of sweeps that are straight in the scene, without steps or noise. [rad]
 
     Line centres [px] broadcast; the derivative is a central difference over 2e-6 of tangent.
     """
@@ -67,7 +67,7 @@ def straight_slope_rotation(swath_px: ArrayLike, scan_px: ArrayLike, camera: Lin
 def line_points(
     model: LineModel, swath_px: float, scan_px: NDArray[np.float64], camera: LineCamera
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Give where each sample of each line looks by one of five models of a line: along and scan, (line, sample) [px].
+    """Return the places of each line's samples by one model of a line: along and scan, (line, sample) [px].
 
     L0 no rotation; L1 the paper's -atan(dY/dX); L2 the exact rotation; L3 exact rotation and local scale; L4 exact
     rays. L0 to L2 keep the scale of the undeflected line. ``scan_px`` is (line,).
@@ -91,9 +91,9 @@ def line_points(
 
 
 def _local_scale(swath_px: float, scan_px: NDArray[np.float64], camera: LineCamera) -> NDArray[np.float64]:
-    """Length of the line in the scene for one IFOV at the camera, at the line's centre, (line, 1) [-].
+    """Return the length of a line in the scene per IFOV at the camera, at the line's centre, (line, 1) [-].
 
-    The derivative of :func:`pipeline.geometry.scan.points_of_scan` at its centre: N hypot(1, xi0 / q), q = N - e.
+    It is the derivative of :func:`pipeline.geometry.scan.points_of_scan`: N hypot(1, xi0 / q), q = N - e.
     """
     xi0, e = swath_px * camera.ifov_rad, scan_px[:, None] * camera.ifov_rad
     size = np.sqrt(1 + xi0**2 + e**2)
@@ -101,10 +101,10 @@ def _local_scale(swath_px: float, scan_px: NDArray[np.float64], camera: LineCame
 
 
 def paper_numbers(yx: NDArray[np.float64], *, fine: bool, columns: int, factor: int) -> NDArray[np.float64]:
-    """One-dimensional positions of the paper: patch n at P = n(m + 1) + 1, its patches at P + 1 ... P + m.
+    """Return the paper's patch numbers: coarse patch n has P = n(m + 1) + 1, its fine patches have P + 1 ... P + m.
 
-    ``yx`` (..., 2) are middles in patches. ``columns`` counts the coarse patches of a row, m = factor^2; patches run
-    row by row inside their patch. The text says jumps of four; its formula and its example 21 -> 26 say m + 1 = 5.
+    ``yx`` (..., 2) are centres in patches. A row has ``columns`` coarse patches; m = factor^2. Fine patches are
+    numbered by rows. The paper's text says jumps of four; its formula and its example 21 -> 26 give m + 1 = 5.
     """
     cell = np.floor(yx / factor)
     number = (cell[..., 0] * columns + cell[..., 1]) * (factor**2 + 1) + 1

@@ -1,4 +1,4 @@
-"""The line camera: timing, rays, footprints, noise, saturation, binning and the noise law of the coarse pass."""
+"""The line camera: timing, rays, footprints, noise, saturation, binning and the noise of the coarse pass."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ CAMERA = LineCamera()
 def scan_pass(
     electrons: np.ndarray, camera: LineCamera, *, step: int, rng: np.random.Generator | None = None
 ) -> np.ndarray:
-    """What one pass gives of a grid-aligned scene."""
+    """Return the values of one pass over a scene that is aligned with the grid."""
     return expose(footprint(electrons, camera), camera, step=step, rng=rng)
 
 
 def test_defaults_describe_the_rig():
-    """7.4 um behind 70 mm is 105.714 urad; a 20 um slit is 2.70 px; 12 bits end at 4095."""
+    """Pixels of 7.4 um behind 70 mm see 105.714 urad; a slit of 20 um is 2.70 px; 12 bits end at 4095."""
     assert CAMERA.ifov_rad == pytest.approx(105.714e-6, rel=1e-5)
     assert CAMERA.slit_px == pytest.approx(2.70, abs=0.005)
     assert CAMERA.full_scale_dn == 4095
@@ -31,16 +31,16 @@ def test_defaults_describe_the_rig():
 
 
 @given(st.floats(0.01, 500), st.floats(0, 50), st.floats(1, 400))
-def test_frames_are_never_faster_than_the_camera(exposure: float, readout: float, rate: float):
-    """The period is exposure and readout, or that of the highest rate if longer (erratum E13)."""
+def test_frame_period_respects_the_highest_rate(exposure: float, readout: float, rate: float):
+    """The period is exposure plus readout, or the period of the highest rate if that is longer (erratum E13)."""
     camera = replace(CAMERA, exposure_ms=exposure, readout_ms=readout, max_rate_hz=rate)
     assert camera.frame_ms == max(exposure + readout, 1000 / rate)
     assert camera.scan_seconds(7) == pytest.approx(7 * camera.frame_ms / 1000)
 
 
 @pytest.mark.parametrize("binning", [1, 2, 3, 4, 7])
-def test_binned_rays_are_the_middle_of_theirs(binning: int):
-    """A binned sample looks along the mean slope of those it sums; all lie about the axis when none is dropped."""
+def test_a_binned_ray_is_the_mean_of_its_samples(binning: int):
+    """A binned sample looks along the mean slope of its samples. Unbinned rays are symmetric about the axis."""
     fine, count = CAMERA.pixel_slopes(), CAMERA.samples // binning
     expected = fine[: count * binning].reshape(count, binning).mean(axis=1)
     assert CAMERA.pixel_slopes(binning) == pytest.approx(expected, abs=1e-16)
@@ -50,7 +50,7 @@ def test_binned_rays_are_the_middle_of_theirs(binning: int):
 
 @given(st.floats(0.2, 9))
 def test_footprint_is_a_box_over_linear_interpolation(width: float):
-    """Weights sum to 1, none is below 0, they are symmetric; pixels a px wide add a little to the box's variance."""
+    """Weights sum to 1, are symmetric and not negative. Interpolation adds at most 0.25 px^2 to the box's variance."""
     kernel = footprint_kernel(width)
     place = np.arange(len(kernel)) - len(kernel) // 2
     assert kernel.sum() == pytest.approx(1, abs=1e-12)
@@ -62,7 +62,7 @@ def test_footprint_is_a_box_over_linear_interpolation(width: float):
 @pytest.mark.parametrize("read_noise", [20.0, 3.0])
 @pytest.mark.parametrize("expected", [0.0, 50.0, 3000.0])
 def test_noise_has_the_moments_of_shot_and_read_noise(read_noise: float, expected: float):
-    """Mean, variance and third moment of either branch are those of Poisson plus normal noise plus rounding."""
+    """Mean, variance and third moment are those of Poisson plus normal noise plus rounding, in both code branches."""
     camera = replace(CAMERA, read_noise_e=read_noise, electrons_per_dn=1.0, bits=16)
     dn = digitise(np.full((400, 1000), expected, np.float32), camera, np.random.default_rng(3))
     electrons = dn.astype(np.float64) - camera.dark_dn
@@ -73,14 +73,14 @@ def test_noise_has_the_moments_of_shot_and_read_noise(read_noise: float, expecte
     assert third == pytest.approx(expected, abs=5 * np.sqrt(15 * variance**3 / 4e5))
 
 
-def test_without_noise_rounding_is_to_even_and_ends_clip():
-    """Half DN goes to even, light beyond the full well stays at full scale, negative light at the dark level."""
+def test_digitising_without_noise_rounds_to_even_and_clips():
+    """Half a DN rounds to even. Light beyond the full well gives full scale, negative light the dark level."""
     electrons = np.array([2.5, 7.5, 1e9, -50.0, CAMERA.full_scale_e])
     assert digitise(electrons, CAMERA, None).tolist() == [64, 66, 4095, 64, 4095]
 
 
 def test_binning_sums_and_drops_the_remainder():
-    """Seven samples by three give two sums; sixteen full samples still fit 16 bits."""
+    """Seven samples binned by three give two sums. Sums of sixteen saturated samples fit into 16 bits."""
     dn = np.arange(7, dtype=np.uint16)[None, :, None]
     assert bin_samples(dn, 3)[0, :, 0].tolist() == [3, 12]
     assert bin_samples(np.full((1, 16, 1), 4095, np.uint16), 16).item() == 65520
@@ -89,8 +89,8 @@ def test_binning_sums_and_drops_the_remainder():
         bin_samples(dn, 8)
 
 
-def test_sums_that_16_bits_do_not_hold_are_refused():
-    """A sum never wraps: the largest that fits is kept, one more is refused with the size and what to do."""
+def test_sums_beyond_16_bits_are_refused():
+    """A sum of 65528 DN is kept. A sum of 65536 DN raises an error with the value and the remedy."""
     full = np.full((2, 8, 3), 8191, np.uint16)
     assert bin_samples(full, 8).max() == 65528
     full[1, 5, 2] = 8199
@@ -100,8 +100,8 @@ def test_sums_that_16_bits_do_not_hold_are_refused():
 
 
 @pytest.mark.parametrize("step", [1, 2, 4, 8])
-def test_a_flat_scene_looks_flat_and_its_noise_falls_by_the_root_of_the_step(step: float):
-    """The coarse pass averages ``step`` samples of one exposure: noise falls by sqrt(step), not by step."""
+def test_coarse_pass_of_an_even_scene_lowers_noise_by_the_root_of_the_step(step: float):
+    """The coarse pass averages ``step`` samples of one exposure, so noise falls by sqrt(step), not by step."""
     electrons = np.full((256, 256, 2), 5000.0)
     seen = scan_pass(electrons, CAMERA, step=step, rng=np.random.default_rng(2))
     assert seen.shape == (256 // step, 256 // step, 2)
@@ -110,8 +110,8 @@ def test_a_flat_scene_looks_flat_and_its_noise_falls_by_the_root_of_the_step(ste
     assert seen.std() == pytest.approx(spread / np.sqrt(step), rel=5 / np.sqrt(2 * seen.size))
 
 
-def test_a_look_is_the_mean_of_footprints_over_the_smear():
-    """Without noise a coarse pixel is the block mean of the fine look, to the rounding of DN."""
+def test_a_coarse_pixel_is_the_mean_of_its_fine_pixels():
+    """Without noise a coarse pixel equals the block mean of the fine pass, to the rounding of DN."""
     electrons = np.random.default_rng(0).uniform(100, 15_000, (16, 24, 3))
     camera = replace(CAMERA, bits=14, electrons_per_dn=1.0)
     fine, coarse = scan_pass(electrons, camera, step=1), scan_pass(electrons, camera, step=4)

@@ -1,4 +1,4 @@
-"""The scene grid: padding, patches, valid shares and reflection."""
+"""The scene grid: padding, patches, valid fractions, reflection and block means."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ sizes = st.integers(1, 200)
 
 
 @given(sizes, sizes, st.integers(1, 40))
-def test_padded_grid_is_the_least_whole_number_of_patches(height: int, width: int, patch: int):
-    """The padded size divides by the patch and is less than one patch larger than the scene."""
+def test_padded_grid_is_the_smallest_whole_number_of_patches(height: int, width: int, patch: int):
+    """The padded size is a multiple of the patch and less than one patch larger than the scene."""
     padded = SceneGrid(height, width, patch).padded_shape
     for size, scene in zip(padded, (height, width), strict=True):
         assert size % patch == 0
@@ -24,14 +24,14 @@ def test_padded_grid_is_the_least_whole_number_of_patches(height: int, width: in
 
 @given(sizes, sizes, st.integers(1, 40))
 def test_valid_fractions_add_up_to_the_scene(height: int, width: int, patch: int):
-    """Shares times a patch's area sum to the scene's area, and valid patches are those with a fraction."""
+    """Valid fractions times the patch area sum to the scene's area. Valid patches have a fraction above 0."""
     grid = SceneGrid(height, width, patch)
     fraction = grid.valid_fraction()
     assert fraction.sum() * patch**2 == pytest.approx(height * width)
     assert len(grid.every_patch()) == -(-height // patch) * -(-width // patch) == np.count_nonzero(fraction)
 
 
-def test_patches_are_numbered_row_by_row():
+def test_patches_are_numbered_by_rows():
     """Patch 5 of a grid 4 patches wide starts in the second row and column."""
     grid = SceneGrid(64, 64, 16)
     assert grid.patch_shape == (4, 4)
@@ -40,23 +40,23 @@ def test_patches_are_numbered_row_by_row():
 
 @pytest.mark.parametrize("field", ["height", "width", "patch"])
 def test_sizes_below_one_are_refused(field: str):
-    """The message names the size and what came."""
+    """The message names the size and its value."""
     sizes = {"height": 4, "width": 4, "patch": 2, field: 0}
     with pytest.raises(ShapeError, match=f"{field} .* at least 1, got 0"):
         SceneGrid(**sizes)
 
 
 @given(st.integers(2, 9), st.integers(0, 40))
-def test_reflection_repeats_with_its_period(size: int, more: int):
-    """Pixel i of the grown image is the one that a mirror at either edge shows, however far it grows."""
+def test_reflection_padding_repeats_periodically(size: int, more: int):
+    """Pixel i of the padded image is the one that reflection at either edge gives, for any padding."""
     grown = pad_by_reflection(np.arange(size)[:, None], (size + more, 1))[:, 0]
     place = np.arange(size + more) % (2 * size - 2)
     assert grown.tolist() == np.where(place < size, place, 2 * size - 2 - place).tolist()
 
 
 @pytest.mark.parametrize("shape", [(8, 12), (9, 13), (3, 2)])
-def test_block_means_are_those_of_what_was_seen(shape: tuple[int, int]) -> None:
-    """Mean over the pixels of a block that are no NaN, smaller blocks at the border; NaN where none was seen."""
+def test_block_means_ignore_nan(shape: tuple[int, int]) -> None:
+    """Each mean is over the finite pixels of its block, also of smaller blocks at the border; NaN without any."""
     rng = np.random.default_rng(4)
     values = rng.normal(size=(*shape, 2)).astype(np.float32)
     values[0, 0], values[: min(4, shape[0]), : min(4, shape[1]), 1] = np.nan, np.nan
@@ -70,8 +70,8 @@ def test_block_means_are_those_of_what_was_seen(shape: tuple[int, int]) -> None:
                 np.testing.assert_allclose(means[y, x, band], expected, rtol=1e-5, atol=1e-6)
 
 
-def test_means_of_a_block_do_not_depend_on_holes_in_others() -> None:
-    """However a mosaic is cut into parts, with or without holes in them, the same bits come out."""
+def test_block_means_do_not_depend_on_holes_in_other_blocks() -> None:
+    """A hole changes the bits of its own block and band alone; the means stay finite."""
     values = np.random.default_rng(5).lognormal(size=(8, 12, 3)).astype(np.float32)
     whole = block_means(values, 4)
     values[0, 0, 1], values[7, 11] = np.nan, np.inf

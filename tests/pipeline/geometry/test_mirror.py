@@ -1,4 +1,4 @@
-"""The mirror: closed forms and inverses in both precisions, the rim, grazing, rotation, light, and its mounting."""
+"""The mirror: formulas and inverses in both precisions, rim, grazing views, line rotation, throughput and mounting."""
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ E1, E3 = np.array([-1.0, 0.0, -1.0]) / np.sqrt(2), np.array([1.0, 0.0, -1.0]) / 
 
 
 def disk(count: int, seed: int = 0) -> np.ndarray:
-    """Positions spread evenly over the mirror's disk."""
+    """Return positions spread evenly over the mirror's disk."""
     rng = np.random.default_rng(seed)
     radius, angle = np.sqrt(rng.uniform(0, 1, count)), rng.uniform(0, 2 * np.pi, count)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
 
 
 def tilted(tilt_deg: float) -> np.ndarray:
-    """The normal tilted in the plane of incidence."""
+    """Return the normal tilted in the plane of incidence."""
     tilt = np.deg2rad(tilt_deg)
     return np.sin(tilt) * E1 + np.cos(tilt) * E3
 
 
 @pytest.mark.parametrize(("precision", "most_rad"), [(np.float64, 1e-12), (np.float32, 1e-6)])
-def test_position_and_direction_are_inverse_over_the_whole_disk(precision: type, most_rad: float):
-    """Position -> ray -> position errs by less than 1e-12 rad of view in float64 and 1e-6 in float32."""
+def test_position_and_direction_are_inverse_over_the_disk(precision: type, most_rad: float):
+    """Position to direction and back errs by less than 1e-12 rad of view in float64 and 1e-6 in float32."""
     position = disk(50_000).astype(precision)
     direction = position_to_direction(position)
     back = direction_to_position(direction)
@@ -58,7 +58,7 @@ def test_position_and_direction_are_inverse_over_the_whole_disk(precision: type,
 
 
 def exact_direction(position: np.ndarray) -> list[mpmath.mpf]:
-    """Mirror and reflect one ray with 50 digits, from the definition of the device's coordinates."""
+    """Return one reflected ray, computed with 50 digits from the definition of the device's coordinates."""
     half, tangent = mpmath.sqrt(mpmath.mpf(1) / 2), mpmath.tan(50 * mpmath.pi / 180)
     axes = mpmath.matrix([[-half, 0, -half], [0, 1, 0], [half, 0, -half]])
     ray = mpmath.matrix([[float(position[0]) * tangent, float(position[1]) * tangent, mpmath.mpf(1)]])
@@ -69,7 +69,7 @@ def exact_direction(position: np.ndarray) -> list[mpmath.mpf]:
 
 @pytest.mark.parametrize(("precision", "most"), [(np.float64, 1e-15), (np.float32, 6e-7)])
 def test_directions_agree_with_fifty_digits(precision: type, most: float):
-    """For 100 random poses the direction is that of 50-digit arithmetic, to rounding; and so is the line's rotation."""
+    """Directions and line rotations of 100 random positions equal those of 50-digit arithmetic, to rounding."""
     with mpmath.workdps(50):
         for position in disk(100, seed=4).astype(precision):
             exact, direction = exact_direction(position), position_to_direction(position)
@@ -78,8 +78,8 @@ def test_directions_agree_with_fifty_digits(precision: type, most: float):
             assert abs(float(psi - mpmath.mpf(float(line_rotation(direction))))) < 3 * most
 
 
-def test_single_precision_stays_and_mixed_becomes_double():
-    """float32 arrays come out as float32 of every function; one float64 among them makes float64, plain numbers not."""
+def test_single_precision_is_kept_and_mixed_precision_becomes_double():
+    """Functions return float32 for float32 arrays and Python numbers, and float64 if any array is float64."""
     f = np.float32
     position, tangent = disk(5).astype(f) / 2, np.array([0.1, 0.2], f)
     direction = position_to_direction(position)
@@ -93,7 +93,7 @@ def test_single_precision_stays_and_mixed_becomes_double():
 
 @pytest.mark.parametrize("position", [(1.0001, 0.0), (0.8, 0.8), (-1.0, 1.0), (0.0, -50.0)])
 def test_positions_beyond_the_disk_are_refused(position: tuple[float, float]):
-    """The range is a disk, not a square; the message holds the position."""
+    """The range of positions is a disk, not a square. The message contains the position."""
     with pytest.raises(PoseError, match=rf"\({position[0]:.15g}, {position[1]:.15g}\).*outside the unit disk"):
         position_to_normal(position)
     with pytest.raises(PoseError, match="outside the unit disk"):
@@ -102,13 +102,13 @@ def test_positions_beyond_the_disk_are_refused(position: tuple[float, float]):
 
 @pytest.mark.parametrize("tilt", [25.001, 44.9999999, 45.0, 60.0, 90.0, 180.0])
 def test_normals_beyond_the_rim_are_refused_before_dividing(tilt: float):
-    """Tilts at and beyond 45 deg, where X overflows, raise instead of giving a number."""
+    """Tilts from 25.001 deg raise an error, also at 45 deg and beyond, where X overflows."""
     with pytest.raises(PoseError, match="beyond the rim"):
         normal_to_position(tilted(tilt))
 
 
 def test_line_rotation_matches_finite_differences():
-    """The image of the slit in the scene plane turns by psi, to 1e-8 rad, over the disk and on its rim."""
+    """The slit's image in the scene plane turns by psi, to 1e-8 rad, over the disk and on its rim."""
     turn = np.linspace(0, 2 * np.pi, 73)
     position = np.concatenate([disk(500), np.stack([np.cos(turn), np.sin(turn)], axis=-1)])
     step = np.array([0.0, 1e-5, 0.0])
@@ -119,8 +119,8 @@ def test_line_rotation_matches_finite_differences():
     assert np.abs(np.arctan2(np.sin(off), np.cos(off))).max() < 1e-8
 
 
-def test_throughput_follows_the_tilt():
-    """x0.72 to 1.21 over the field of 10240 x 10240 px, x0.48 to 1.33 over the disk, exactly 1 at rest."""
+def test_throughput_depends_on_the_tilt():
+    """The throughput is 0.72 to 1.21 over 10240 x 10240 px, 0.48 to 1.33 over the disk, and exactly 1 at rest."""
     side = np.linspace(-5120, 5120, 201) * 105.714e-6
     normals = direction_to_normal(scene_to_direction(np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)))
     field, turn = -normals[:, 2] * np.sqrt(2), np.linspace(0, 2 * np.pi, 721)
@@ -135,36 +135,36 @@ def test_throughput_follows_the_tilt():
 
 @given(st.floats(-0.7, 0.7), st.floats(-0.7, 0.7))
 def test_scene_tangents_and_directions_are_inverse(xi: float, eta: float):
-    """Tangents survive the way to a direction and back."""
+    """Tangents converted to a direction and back are equal to 1e-15."""
     assert direction_to_scene(scene_to_direction([xi, eta])) == pytest.approx([xi, eta], abs=1e-15)
 
 
 @given(st.sampled_from(get_args(Axes)), st.floats(-5, 5), st.floats(-0.05, 0.05), st.floats(0, 0.9), st.floats(0, 7))
-def test_to_device_and_back_is_the_identity(axes: str, clocking: float, offset: float, radius: float, angle: float):
-    """Any mounting is undone to rounding, anywhere that both disks hold."""
+def test_to_model_inverts_to_device(axes: str, clocking: float, offset: float, radius: float, angle: float):
+    """Any mounting is undone to rounding, for positions inside of both disks."""
     mounting = Mounting(axes, clocking, offset, -offset)
     position = radius * np.array([np.cos(angle), np.sin(angle)])
     assert mounting.to_model(mounting.to_device(position)) == pytest.approx(position, abs=1e-15)
 
 
-def test_axes_are_assigned_as_told():
-    """X from Y and Y from -X, as in code seen in public; the default changes no bit, the sign of 0 included."""
+def test_mounting_swaps_axes_as_set():
+    """With "y,-x" X is Y and Y is -X, as in published code. The default changes no bit, not even the sign of 0."""
     many = np.array([[0.3, 0.1], [-0.2, 0.5], [-0.0, 0.0]])
     swapped = np.array([[0.1, -0.3], [0.5, 0.2], [0.0, 0.0]])
     assert Mounting(axes="y,-x").to_device(many) == pytest.approx(swapped)
     assert Mounting().to_device(many).tobytes() == Mounting().to_model(many).tobytes() == many.tobytes()
 
 
-def test_what_the_device_would_clamp_is_refused():
-    """An offset that pushes a position of the model beyond the device's rim raises with both numbers."""
+def test_positions_that_the_device_would_clamp_are_refused():
+    """An offset that moves a position beyond the device's rim raises an error with offset and position."""
     with pytest.raises(
         PoseError, match=r"as mounted \(offset 0.1; 0\).*1.05.*outside the unit disk.*less of the field"
     ):
         Mounting(offset_x=0.1).to_device([0.95, 0.0])
 
 
-def test_mountings_that_are_none_are_refused():
-    """Axes that are not both there, each once, and what is no number."""
+def test_invalid_mountings_are_refused():
+    """Axes that repeat one axis, and numbers that are not finite, are refused."""
     with pytest.raises(SettingsError, match=r"axes must be one of .*got 'x,x'"):
         Mounting(axes="x,x")
     with pytest.raises(SettingsError, match="must be finite"):

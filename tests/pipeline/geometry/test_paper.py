@@ -1,4 +1,4 @@
-"""Figures of the errata E1 to E18: what the paper prints, beside what is right."""
+"""Figures of the errata E1 to E18: the paper's value next to the right one."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ IFOV = CAMERA.ifov_rad
 
 
 def paper_position(normal: np.ndarray) -> np.ndarray:
-    """Equation (7), X = n_x / sin 25 deg [E2]: right at rest and at the rim, up to 6.40 deg (1056 px) wrong between."""
+    """Return equation (7), X = n_x / sin 25 deg [E2]. It errs by up to 6.40 deg (1056 px) between rest and rim."""
     return mirror.normal_to_device(normal)[..., :2] / np.sin(np.deg2rad(25.0))
 
 
 def slope_rotation(position: np.ndarray) -> np.ndarray:
-    """The rotation as the paper takes it from a path (line, 2), -atan(dY/dX), NaN where one is repeated [E8, E9]."""
+    """Return the paper's rotation of a path (line, 2), -atan(dY/dX); NaN at repeated positions [E8, E9]."""
     step = np.diff(position, axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         return -np.arctan(step[:, 1] / step[:, 0])
 
 
 def paper_normal(direction: np.ndarray) -> np.ndarray:
-    """Equation (4), in the paper's frame [E7]: c = sqrt((o_z + 1) / 2), a = o_x / 2c, b = o_y / 2c."""
+    """Return equation (4), in the paper's frame [E7]: c = sqrt((o_z + 1) / 2), a = o_x / 2c, b = o_y / 2c."""
     c = np.sqrt((direction[..., 2] + 1) / 2)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.stack([direction[..., 0] / (2 * c), direction[..., 1] / (2 * c), c], axis=-1)
 
 
 def stable_normal(direction: np.ndarray) -> np.ndarray:
-    """The same as (o_x, o_y, 1 + o_z) / |.|, 1 + o_z taken without cancellation [E7]."""
+    """Return the same normal as (o_x, o_y, 1 + o_z) / norm, with 1 + o_z free of cancellation [E7]."""
     o = direction.copy()
     z = o[..., 2]
     o[..., 2] = np.where(z < 0, (o[..., 0] ** 2 + o[..., 1] ** 2) / (1 - np.minimum(z, 0)), 1 + z)
@@ -51,28 +51,28 @@ def stable_normal(direction: np.ndarray) -> np.ndarray:
 
 
 def optical_deg(position: np.ndarray) -> float:
-    """How far the device deflects along X. [deg]"""
+    """Return the device's deflection along X. [deg]"""
     return float(np.rad2deg(np.arctan(position[0] * mirror.REST_TANGENT)))
 
 
 def aim(xi_px: object, eta_px: object) -> np.ndarray:
-    """Exact positions that look at scene points, beyond the rim too."""
+    """Return exact positions that look at scene points, also beyond the rim."""
     tangents = np.stack(np.broadcast_arrays(xi_px, eta_px), axis=-1) * IFOV
     return unlimited_position(mirror.direction_to_normal(mirror.scene_to_direction(tangents)))
 
 
 def viewed(position: np.ndarray) -> np.ndarray:
-    """Scene points (xi, eta) that positions look at. [px]"""
+    """Return the scene points (xi, eta) that positions look at. [px]"""
     return mirror.direction_to_scene(mirror.position_to_direction(position)) / IFOV
 
 
 def sweep_of_1450(xi_px: float) -> np.ndarray:
-    """Positions of 1450 lines over 1280 px of the scan, straight in the scene."""
+    """Return positions of 1450 lines over 1280 px of the scan, straight in the scene."""
     return aim(xi_px, np.linspace(-640, 640, 1450))
 
 
 def turn_of(position: np.ndarray) -> np.ndarray:
-    """Exact rotation of the line at positions. [rad]"""
+    """Return the exact rotation of the line at positions. [rad]"""
     return line_rotation(mirror.position_to_direction(position))
 
 
@@ -88,7 +88,7 @@ def turn_of(position: np.ndarray) -> np.ndarray:
     ],
 )
 def test_e1_e2_positions_differ_as_tabulated(tilt, x, eq7, error_deg, error_px, product_deg, product_px):
-    """Equation (7), code seen in public and equation (1) read with the tilt, against the device's coordinate."""
+    """Equation (7), published code, and equation (1) read with the tilt err against the device's coordinate."""
     normal, px = tilted(tilt), np.deg2rad(1) / IFOV
     assert [mirror.normal_to_position(normal)[0], paper_position(normal)[0]] == pytest.approx([x, eq7], abs=6e-5)
     off = optical_deg(paper_position(normal)) - 2 * tilt
@@ -97,15 +97,15 @@ def test_e1_e2_positions_differ_as_tabulated(tilt, x, eq7, error_deg, error_px, 
     device = mirror.normal_to_device(normal)
     off = (
         optical_deg(device[2] * device[:2] / mirror.REST_TANGENT) - 2 * tilt
-    )  # n_x n_z / tan 50 deg, as public code has it
+    )  # n_x n_z / tan 50 deg, as in published code
     assert off == pytest.approx(product_deg, abs=0.06)
     assert off * px == pytest.approx(product_px, abs=0.6)
-    mechanical = device[:2] / device[2] / mirror.REST_TANGENT  # equation (1), theta read as the mirror's own tilt
+    mechanical = device[:2] / device[2] / mirror.REST_TANGENT  # equation (1), with theta as the mirror's own tilt
     assert optical_deg(mechanical) == pytest.approx(tilt, abs=1e-12)
 
 
-def test_e2_asking_for_a_step_gives_another():
-    """With equation (7) 100 px become 141, 1280 px along the line 1792, and two axes bend: xi 4800 -> (5479, 163)."""
+def test_e2_equation_7_moves_too_far():
+    """Equation (7) turns 100 px into 141 and 1280 px along the line into 1792; xi 4800 reaches (5479, 163)."""
     reached = {
         asked: viewed(paper_position(mirror.direction_to_normal(mirror.scene_to_direction(np.array(asked) * IFOV))))
         for asked in ((100, 0), (0, 100), (0, 1280), (4800, 0))
@@ -117,7 +117,7 @@ def test_e2_asking_for_a_step_gives_another():
 
 
 def test_e3_the_corner_of_the_field_is_out_of_reach():
-    """10240 x 10240 px: the far corner needs radius 1.029, (4800, 5120) 0.965; 0.06 % of the field is not reachable."""
+    """In 10240 x 10240 px the corner needs radius 1.029, (4800, 5120) 0.965; 0.06 % of the field is out of reach."""
     assert np.hypot(*aim(5120, 5120)) == pytest.approx(1.029, abs=5e-4)
     assert np.hypot(*aim(4800, 5120)) == pytest.approx(0.965, abs=5e-4)
     side = np.linspace(-5120, 5120, 401)
@@ -125,16 +125,16 @@ def test_e3_the_corner_of_the_field_is_out_of_reach():
     assert np.mean(radius > 1) == pytest.approx(6e-4, abs=1e-4)
 
 
-def test_e4_the_papers_matrix_turns_the_ray_round():
-    """With the normal of equation (4), R i = -o: i and o point from the mirror, and o = (2 n n^T - I) i."""
+def test_e4_the_papers_matrix_reverses_the_ray():
+    """With the normal of equation (4) R i = -o, because i and o point away from the mirror: o = (2 n n^T - I) i."""
     o = mirror.scene_to_direction([[0.2, -0.4], [0.0, 0.0], [-0.5, 0.6]])
     n = paper_normal(o)
     turned = (np.eye(3) - 2 * n[..., :, None] * n[..., None, :]) @ [0.0, 0.0, 1.0]
     assert turned == pytest.approx(-o, abs=1e-15)
 
 
-def test_e5_the_turn_by_45_degrees_fits_one_side_only():
-    """The rest normal goes to (0, 0, 1) only with the scene on the -x side; for +x it becomes (1, 0, 0)."""
+def test_e5_the_rotation_by_45_degrees_fits_one_side_only():
+    """The rest normal becomes (0, 0, 1) only with the scene on the -x side; for +x it becomes (1, 0, 0)."""
     half = np.sqrt(0.5)
     turn = np.array([[half, 0.0, half], [0.0, 1.0, 0.0], [-half, 0.0, half]])
     assert turn @ [-half, 0, half] == pytest.approx([0, 0, 1], abs=1e-15)
@@ -143,7 +143,7 @@ def test_e5_the_turn_by_45_degrees_fits_one_side_only():
 
 @pytest.mark.parametrize(("grazing", "view_px"), [(1e-2, 1.65), (1e-3, 454.0), (1e-4, np.inf)])
 def test_e7_equation_4_loses_its_digits_at_grazing(grazing: float, view_px: float):
-    """float32: the view is 1.6 px off at 10 mrad, 454 px at 1 mrad, not finite at 0.1 mrad; the stable form holds."""
+    """The float32 view errs by 1.6 px at 10 mrad, 454 px at 1 mrad, not finite at 0.1 mrad; the stable form holds."""
     turn = np.linspace(0, 2 * np.pi, 500)
     o = np.stack([np.sin(grazing) * np.cos(turn), np.sin(grazing) * np.sin(turn), np.full(500, -np.cos(grazing))], -1)
     single, exact = o.astype(np.float32), stable_normal(o.astype(np.float32).astype(np.longdouble))
@@ -166,15 +166,15 @@ def test_e7_equation_4_loses_its_digits_at_grazing(grazing: float, view_px: floa
         ((-0.4, 0.8), 34.2, 28.6),
     ],
 )
-def test_e8_rotation_and_slope_at_seven_positions(position, psi_deg: float, seed_deg: float):
-    """What the line really turns by, and what the slope of the path says."""
+def test_e8_rotation_and_path_slope_differ_at_seven_positions(position, psi_deg: float, seed_deg: float):
+    """The exact rotation of the line and the paper's slope of the path have the tabulated values, to 0.06 deg."""
     xi, eta = viewed(np.array(position))
     assert np.rad2deg(turn_of(np.array(position))) == pytest.approx(psi_deg, abs=0.06)
     assert np.rad2deg(straight_slope_rotation(xi, eta, CAMERA)) == pytest.approx(seed_deg, abs=0.06)
 
 
-def test_e8_the_slope_is_wrong_by_up_to_twelve_and_a_half_degrees():
-    """The slope is 1/sqrt 2 of the rotation near the axis, 4.4 deg off within 25 deg and 12.5 deg off in the disk."""
+def test_e8_the_slope_errs_by_up_to_twelve_and_a_half_degrees():
+    """The slope is 1/sqrt 2 of the rotation near the axis. It errs by 4.4 deg within 25 deg, 12.5 deg in the disk."""
     side = np.linspace(-1, 1, 201)
     position = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     radius = np.linalg.norm(position, axis=-1)
@@ -213,14 +213,14 @@ def test_e8_the_slope_is_ill_conditioned():
 
 @pytest.mark.parametrize(("xi_px", "seed_deg", "psi_deg"), [(0, 90.0, 0.0), (500, 87.9, 3.0), (2365, 79.7, 13.6)])
 def test_e9_the_slope_is_vertical_on_the_rigs_own_path(xi_px: float, seed_deg: float, psi_deg: float):
-    """With the axes of code seen in public the scan runs along Y: -atan(dY/dX) is near 90 deg, lines hardly turn."""
+    """With the axes of published code the scan runs along Y: -atan(dY/dX) is near 90 deg, but lines hardly turn."""
     mounted = mirror.Mounting(axes="y,-x").to_device(aim(xi_px, np.array([-0.5, 0.5])))
     assert np.abs(np.rad2deg(slope_rotation(mounted))) == pytest.approx(seed_deg, abs=0.06)
     assert np.rad2deg(turn_of(aim(xi_px, 0.0))) == pytest.approx(psi_deg, abs=0.06)
 
 
 def test_e9_repeated_positions_have_no_slope():
-    """At four decimals 313 of 1450 positions repeat the one before: 0/0, or a silent 0 from atan2."""
+    """At four decimals 313 of 1450 positions repeat the previous one: the slope is 0/0, and atan2 returns 0."""
     path = np.round(sweep_of_1450(0.0), 4)
     step = np.diff(path, axis=0) + 0.0  # no negative zeros
     angle = slope_rotation(path)
@@ -230,7 +230,7 @@ def test_e9_repeated_positions_have_no_slope():
 
 
 def test_e11_speed_needs_the_pitch_and_the_frame_period():
-    """Equation (8) with the whole sensor is 640 times the speed; the mirror's own rates are 1/2 and 1/sqrt 2 of it."""
+    """Equation (8) with the whole sensor gives 640 times the speed. The mirror's rates are 1/2 and 1/sqrt 2 of it."""
     sensor_mm, frame_s = CAMERA.samples * CAMERA.pitch_um * 1e-3, CAMERA.frame_ms * 1e-3
     paper = sensor_mm / CAMERA.focal_length_mm * 30.0 / (CAMERA.exposure_ms * 1e-3)
     assert paper / (IFOV * 30.0 / frame_s) == pytest.approx(640)
@@ -239,17 +239,17 @@ def test_e11_speed_needs_the_pitch_and_the_frame_period():
         assert np.abs(mirror.direction_to_scene(moved) / IFOV)[axis] == pytest.approx(1, abs=1e-6)
 
 
-def test_e12_e13_rates_are_in_hertz_and_times_have_overheads():
-    """m / t_img in ms is 1000 times too small for Hz; 640 x 600 at 100 ms takes 60 s, and readout comes on top."""
+def test_e12_e13_rates_are_in_hertz_and_times_include_readout():
+    """m / t_img in ms is 1000 times too small for Hz. 640 x 600 at 100 ms takes 60 s, plus the readout."""
     imaging_ms = 600 * CAMERA.exposure_ms  # equation (10)
     assert imaging_ms == 60_000 == 1e3 * CAMERA.scan_seconds(600)
     assert (1500 / CAMERA.scan_seconds(600)) / (1500 / imaging_ms) == pytest.approx(1000)  # Hz over equation (9)
     assert 1e3 * LineCamera(exposure_ms=100, readout_ms=5).scan_seconds(600) - imaging_ms == pytest.approx(3000)
 
 
-def test_e14_vector_memory_is_half_open():
-    """Cells 1451..2900 start one sample late or end beyond what was written; half-open ranges do neither."""
-    last = {"exclusive": 0, "inclusive": 1}  # public code plays X from cells 0..n and Y from n + 1..2n of 2n written
+def test_e14_vector_memory_ranges_are_half_open():
+    """Published cells 1451..2900 start a sample late or end beyond the written ones; half-open ranges do neither."""
+    last = {"exclusive": 0, "inclusive": 1}  # published code plays X from cells 0..n and Y from n + 1..2n of 2n written
     y = {ends: range(1451, 2900 + more) for ends, more in last.items()}
     assert (len(y["exclusive"]), y["exclusive"][0], y["inclusive"][-1]) == (1449, 1451, 2900)
     assert pytest.approx(0.44, abs=0.002) == 640 / 1450
@@ -261,12 +261,12 @@ def test_e14_vector_memory_is_half_open():
 
 
 def test_e15_the_slit_spans_lines():
-    """A slit of 20 um is 2.70 px along the scan: lines 1 px apart overlap 2.7 times."""
+    """A slit of 20 um is 2.70 px along the scan, so lines 1 px apart overlap 2.7 times."""
     assert CAMERA.slit_px == pytest.approx(2.70, abs=0.005)
 
 
 def test_e17_the_full_scan_takes_hours():
-    """163 840 lines: 4.55 h at 100 ms and 27 min at 10 ms, 56.6 GB at 270 bands, 110 loads of 1500 positions."""
+    """163 840 lines: 4.55 h at 100 ms or 27 min at 10 ms, 56.6 GB at 270 bands, 110 loads of 1500 positions."""
     lines, fast = 16 * 10240, LineCamera(exposure_ms=10)
     assert lines == 163_840
     assert CAMERA.scan_seconds(lines) / 3600 == pytest.approx(4.55, abs=0.005)
@@ -276,8 +276,8 @@ def test_e17_the_full_scan_takes_hours():
     assert CAMERA.scan_seconds(lines) / CAMERA.scan_seconds(lines // 4) == 4
 
 
-def test_e18_counts_of_the_table_and_jumps_of_the_encoding():
-    """256 coarse patches and 100 to 500 fine ones are 356 to 756; patches of 4 patches are 5 numbers apart: 21, 26."""
+def test_e18_patch_counts_and_patch_numbers_follow_the_formula():
+    """256 coarse and 100 to 500 fine patches are 356 to 756. Coarse patches of 4 have numbers 5 apart: 21, 26."""
     assert [(512 // 32) ** 2 + fine for fine in (100, 200, 300, 400, 500)] == [356, 456, 556, 656, 756]
     # 4 columns of coarse patches of 2 x 2 patches; patches 4 and 5 are the first two of the second row.
     coarse = np.array([[2.0, 0.0], [2.0, 2.0]]) + 1.0
@@ -285,7 +285,7 @@ def test_e18_counts_of_the_table_and_jumps_of_the_encoding():
 
 
 def greatest_errors(field_deg: float) -> list[float]:
-    """Greatest error of each line model at the line ends, over the disk that reaches ``field_deg`` along X. [px]"""
+    """Return the greatest error of each line model at the line ends, over a disk to ``field_deg`` along X. [px]"""
     turn = np.linspace(0, 2 * np.pi, 60, endpoint=False)
     radius = np.tan(np.deg2rad(field_deg)) / mirror.REST_TANGENT * np.array([1.0, 0.8, 0.4])
     position = radius[:, None, None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
@@ -307,15 +307,15 @@ def greatest_errors(field_deg: float) -> list[float]:
         (50, (337, 243, 227, 13.3)),
     ],
 )
-def test_line_models_err_as_tabulated(field_deg: float, px: tuple[float, ...]):
-    """Rotation is not rectification: even the exact rotation with the local scale errs; rays do not."""
+def test_line_models_err_as_in_the_table(field_deg: float, px: tuple[float, ...]):
+    """Even the exact rotation with the local scale (L3) errs; only exact rays (L4) do not."""
     errors = greatest_errors(field_deg)
     assert errors[:4] == pytest.approx(px, rel=0.012)
     assert errors[4] == 0
 
 
 def test_lines_turn_and_stretch_over_the_field():
-    """10240 x 10240 px: psi is 14.5 deg on average and 37.0 at most, mean tan 0.265; lines stretch by up to 1.26."""
+    """Over 10240 x 10240 px psi is 14.5 deg on average and 37.0 at most, mean tan 0.265; the stretch reaches 1.26."""
     side = np.linspace(-5120, 5120, 257)
     direction = mirror.scene_to_direction(np.stack(np.meshgrid(side, side), axis=-1) * IFOV)
     psi, normal = np.abs(line_rotation(direction)), mirror.direction_to_normal(direction)
@@ -325,7 +325,7 @@ def test_lines_turn_and_stretch_over_the_field():
 
 
 def test_six_decimals_are_enough_to_point():
-    """1e-6 in XY moves the view by at most 0.0115 px."""
+    """A step of 1e-6 in X or Y moves the view by at most 0.0115 px."""
     rest = mirror.direction_to_position(mirror.scene_to_direction([0.0, 0.0]))
     step = [np.linalg.norm(viewed(rest + d) - viewed(rest)) for d in ((1e-6, 0.0), (0.0, 1e-6))]
     assert step == pytest.approx([1e-6 * mirror.REST_TANGENT / IFOV, 1e-6 * 0.8427 / IFOV], rel=1e-3)

@@ -1,4 +1,4 @@
-"""Scan paths: closed forms against the mirror's own chain, positions, prices, and loads of the mirror's memory."""
+"""Scan paths: formulas compared with the mirror's own chain, positions, durations and loads of the mirror's memory."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ places = st.floats(-5000, 5000)
 
 
 def sweep(**changes: object) -> Sweep:
-    """A short fine sweep off the axis."""
+    """Return a short fine sweep off the axis."""
     values = {"name": "a", "kind": "fine", "along": "x", "swath_px": 700.0, "start_px": -900.0, "lines": 5}
     return Sweep(**{**values, **changes})
 
 
 @pytest.mark.parametrize(("swath", "start"), [(0.0, -1200.0), (2500.0, -4000.0), (-4500.0, 3500.0)])
 def test_sample_points_equal_rays_reflected_by_the_mirror(swath: float, start: float):
-    """The closed form of a line's points agrees with position, normal and reflection to 1e-9 px."""
+    """The formula of a line's points agrees with position, normal and reflection to 1e-9 px."""
     path, slopes = sweep(swath_px=swath, start_px=start, lines=40), CAMERA.pixel_slopes()
     rays = np.stack([np.zeros_like(slopes), slopes, np.ones_like(slopes)], axis=-1)
     normals = position_to_normal(line_positions(path, CAMERA))
@@ -50,7 +50,7 @@ def test_sample_points_equal_rays_reflected_by_the_mirror(swath: float, start: f
 
 @given(places, places, st.floats(-0.034, 0.034))
 def test_scene_points_and_line_points_are_inverse(swath: float, scan: float, slope: float):
-    """Any point of any line finds its line and slope again."""
+    """The place of any point of a line gives back its line and slope."""
     along, across = points_of_scan(swath, CAMERA, scan, slope)
     centre, back = scan_of_points(swath, CAMERA, along, across)
     assert centre == pytest.approx(scan, abs=1e-8)
@@ -58,8 +58,8 @@ def test_scene_points_and_line_points_are_inverse(swath: float, scan: float, slo
 
 
 @pytest.mark.parametrize(("step", "binning"), [(1, 1), (4, 4), (3, 3), (4, 1)])
-def test_lines_and_samples_are_found_at_whole_numbers(step: int, binning: int):
-    """The points of a sweep have whole line and sample numbers, smeared and binned or not."""
+def test_sample_points_have_whole_line_and_sample_numbers(step: int, binning: int):
+    """The geolocation of a sweep's own points gives whole numbers, for any step and binning."""
     path = sweep(step=step, binning=binning)
     found = scene_to_sweep(path, CAMERA, *sweep_to_scene(path, CAMERA))
     count = CAMERA.samples // binning
@@ -67,8 +67,8 @@ def test_lines_and_samples_are_found_at_whole_numbers(step: int, binning: int):
     assert found[..., 1] == pytest.approx(np.broadcast_to(np.arange(float(count)), (5, count)), abs=1e-8)
 
 
-def test_lines_stand_in_the_middle_of_their_held_positions():
-    """Mid exposure is the mean of the positions held during it, one px apart."""
+def test_lines_lie_at_the_mean_of_their_held_positions():
+    """The middle of the exposure is the mean of the held positions, which are one px apart."""
     path = sweep(step=4)
     assert path.line_px() == pytest.approx(path.held_px().mean(axis=1))
     assert np.diff(path.held_px().ravel()) == pytest.approx(1.0)
@@ -76,14 +76,14 @@ def test_lines_stand_in_the_middle_of_their_held_positions():
     assert line_positions(sweep(), CAMERA) == pytest.approx(sweep_positions(sweep(), CAMERA)[:, 0])
 
 
-def test_sweeps_out_of_reach_are_refused():
-    """A line beyond the mirror's disk raises instead of being clamped to the rim."""
+def test_sweeps_beyond_the_rim_are_refused():
+    """A line beyond the mirror's disk raises an error; it is not clamped to the rim."""
     with pytest.raises(PoseError, match="beyond the rim"):
         line_positions(sweep(start_px=12_000.0), CAMERA)
 
 
-def test_price_counts_lines_setups_and_reloads():
-    """Two sweeps of 1000 coarse lines hold 8000 positions: six reloads beside lines and set-ups."""
+def test_survey_seconds_count_lines_setups_and_reloads():
+    """Two sweeps of 1000 coarse lines hold 8000 positions, which need six reloads."""
     cost, path = CostModel(), sweep(lines=1000, step=4)
     assert cost.setup_seconds(LineCamera(readout_ms=5)) == pytest.approx(0.05 + 0.2 + 2 * 0.105)
     assert cost.seconds([path, path], CAMERA) == pytest.approx(200 + 2 * 0.45 + 6 * 1.6)
@@ -91,7 +91,7 @@ def test_price_counts_lines_setups_and_reloads():
 
 
 def test_sweeps_of_other_exposures_cost_their_own_frames():
-    """Lines and settling by each sweep's exposure, reloads once for all; the camera's own where a sweep has none."""
+    """Lines and settling count by each sweep's exposure, or else by the camera's. Reloads count once for all sweeps."""
     cost, slow, fast = CostModel(), sweep(lines=100), replace(sweep(lines=400), exposure_ms=10.0)
     assert exposing(CAMERA, slow) is CAMERA
     assert exposing(CAMERA, fast) == replace(CAMERA, exposure_ms=10.0)
@@ -103,7 +103,7 @@ def test_sweeps_of_other_exposures_cost_their_own_frames():
 
 
 def held(lines: int, step: int = 1, name: str = "a") -> Sweep:
-    """A sweep of some lines."""
+    """Return a sweep of ``lines`` lines."""
     return Sweep(name, "fine" if step == 1 else "coarse", "x", 0.0, 0.0, lines, step)
 
 
@@ -112,7 +112,7 @@ sweeps = st.lists(st.builds(held, st.integers(0, 40), st.integers(1, 9)), max_si
 
 @given(sweeps, st.integers(9, 60))
 def test_loads_hold_every_line_once_in_order(given_sweeps: list[Sweep], capacity: int):
-    """Parts take the lines of all sweeps one after the other, lie end to end, and no load is too large."""
+    """The parts take the lines of all sweeps in order and without gaps. No load exceeds the capacity."""
     loads = memory_loads(given_sweeps, capacity)
     parts = [part for load in loads for part in load.parts]
     lines_held = [(part.sweep, line) for part in parts for line in range(*part.lines)]
@@ -128,13 +128,13 @@ def test_loads_hold_every_line_once_in_order(given_sweeps: list[Sweep], capacity
 
 @given(sweeps, st.integers(9, 60))
 def test_loads_are_full(given_sweeps: list[Sweep], capacity: int):
-    """Every load but the last is as full as lines allow."""
+    """No load but the last has room for the next line."""
     loads = memory_loads(given_sweeps, capacity)
     for load, after in pairwise(loads):
         assert load.pairs + given_sweeps[after.parts[0].sweep].step > capacity
 
 
-def test_a_line_that_no_load_holds_is_refused():
-    """More positions in a line than the memory has."""
+def test_a_line_larger_than_the_mirror_memory_is_refused():
+    """One line of 1501 positions does not fit into 1500 pairs."""
     with pytest.raises(SettingsError, match=r"sweep wide holds 1501 positions in each line.* 1500 pairs"):
         memory_loads([held(1, 1501, "wide")], 1500)

@@ -1,4 +1,4 @@
-"""Where fields lie and how large they are: ground by pixels' numbers, hand-worked figures and what joins them."""
+"""Position and size of fields on the ground: areas by class, and footprints against figures worked out by hand."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from pipeline.ground.map_grid import ground_grid
 from pipeline.ground.view import GroundView, RigPose, pixel_places
 from tests.pipeline.ground.test_view import view
 
-SHAPE = (600, 30)  # more rows than are taken at once
+SHAPE = (600, 30)  # more rows than one block holds
 CLASSES = np.random.default_rng(0).choice(np.array([0, 2, UNLABELLED], np.uint8), SHAPE)
 IFOV = 1e-4
 
 
-def test_before_a_rig_areas_are_sums_of_footprints() -> None:
-    """Of a field whose upper rows see the sky, of the pixels that its map shows; what is of no class counts nothing."""
+def test_areas_of_a_posed_field_are_sums_of_footprints() -> None:
+    """Only pixels below the horizon limit and with a class count; the upper rows see the sky."""
     grid = ground_grid(view(tilt_deg=2.0), SHAPE)
     points = np.stack(np.meshgrid(*pixel_places(SHAPE), indexing="ij"), axis=-1)
     near = grid.frame.view.sink(points) > grid.least_sink
@@ -38,16 +38,16 @@ def test_before_a_rig_areas_are_sums_of_footprints() -> None:
     assert areas_by_number(PosedField(grid), CLASSES, 3) == pytest.approx(wanted, rel=1e-12)
 
 
-def test_on_a_georeferenced_picture_they_are_of_the_ellipsoid() -> None:
-    """As hectares of classes are, on a grid that is turned."""
+def test_areas_of_a_georeferenced_image_are_on_the_ellipsoid() -> None:
+    """Each class's area is the sum of its pixels' areas, on a grid that is turned."""
     geobox = GeoBox(SHAPE, Affine(4.33, 2.5, 534_257, 2.5, -4.33, 5_772_301), "EPSG:32632")
     each = np.stack(list(pixel_rows_m2(geobox)))
     wanted = [each[number == CLASSES].sum() for number in range(3)]
     assert areas_by_number(PlacedPicture(geobox), CLASSES, 3) == pytest.approx(wanted, rel=1e-9)
 
 
-def test_numbers_outside_are_left_out_and_unknown_ground_is_none() -> None:
-    """Those below 0 and from the count on; nothing is summed where nobody knows how large a pixel is."""
+def test_numbers_out_of_range_are_left_out_and_an_unknown_scale_gives_none() -> None:
+    """Numbers below 0 and from the count on are ignored. Without a pixel size the result is None."""
     numbers = np.array([[-1, 0, 0], [1, 2, 7]])
     found = areas_by_number(NoPlace((2, 3), pixel_m=0.5), numbers, 2)
     assert found.tolist() == [0.5, 0.25]
@@ -55,15 +55,15 @@ def test_numbers_outside_are_left_out_and_unknown_ground_is_none() -> None:
 
 
 def looking(tilt_deg: float, *, heading_deg: float = 30.0, roll_deg: float = 0.0, height_m: float = 12.0) -> GroundView:
-    """A rig of 0.1 mrad a pixel above level ground."""
+    """Return the view of a rig with pixels of 0.1 mrad above level ground."""
     pose = RigPose(
         lon_deg=9.5, lat_deg=52.1, heading_deg=heading_deg, tilt_deg=tilt_deg, roll_deg=roll_deg, height_m=height_m
     )
     return GroundView(pose, IFOV)
 
 
-def test_straight_down_a_field_is_its_pixels_times_their_side():
-    """From 100 m, pixels of 0.1 mrad are 1 cm: 400 x 600 of them are 4 x 6 m, 1 ha an hour in 8.64 s."""
+def test_a_view_straight_down_has_the_area_of_its_pixels():
+    """From 100 m, 400 x 600 pixels of 0.1 mrad, 1 cm each, cover 4 x 6 m. In 8.64 s that is 1 ha an hour."""
     found = scale_of_view(looking(90, height_m=100), (400, 600))
     assert found.pixel_m == pytest.approx(0.01)
     assert (found.footprint.width_m, found.footprint.depth_m) == pytest.approx((6, 4))
@@ -72,16 +72,16 @@ def test_straight_down_a_field_is_its_pixels_times_their_side():
     assert found.hectares_per_hour(8.64) == pytest.approx(1)
 
 
-def test_the_range_is_that_of_the_slanted_ray():
-    """At 30 deg below the horizon the ground lies twice as far away as the rig is high."""
+def test_range_is_the_length_of_the_oblique_ray():
+    """At 30 deg below the horizon the ground is twice as far away as the rig is high."""
     near, middle, far = footprint_of(looking(30), (21, 21)).range_m
     assert near < middle < far
     assert middle == pytest.approx(24, rel=1e-4)
 
 
 @given(tilt=st.floats(15, 90), heading=st.floats(-360, 360), roll=st.floats(-20, 20))
-def test_the_footprint_is_as_large_as_its_pixels_together(tilt: float, heading: float, roll: float):
-    """Sum of the pixels' areas and area within the corners agree, whichever way the rig looks."""
+def test_footprint_area_is_the_sum_of_the_pixel_areas(tilt: float, heading: float, roll: float):
+    """The sum of pixel areas and the area within the corners agree for any tilt, heading and roll."""
     view, shape = looking(tilt, heading_deg=heading, roll_deg=roll), (60, 90)
     places = np.stack(np.meshgrid(*pixel_places(shape), indexing="ij"), axis=-1)
     found = footprint_of(view, shape)
@@ -90,15 +90,15 @@ def test_the_footprint_is_as_large_as_its_pixels_together(tilt: float, heading: 
 
 
 @given(tilt=st.floats(15, 90), turn=st.floats(-360, 360))
-def test_turning_the_rig_changes_nothing_but_where_it_looks(tilt: float, turn: float):
-    """Width, depth, area and range are of the view, not of the compass."""
+def test_heading_does_not_change_the_footprint_size(tilt: float, turn: float):
+    """Width, depth, area and range depend on the view and not on the compass direction."""
     one, other = (footprint_of(looking(tilt, heading_deg=heading), (80, 50)) for heading in (0, turn))
     assert (other.width_m, other.depth_m, other.area_m2) == pytest.approx((one.width_m, one.depth_m, one.area_m2))
     assert other.range_m == pytest.approx(one.range_m)
 
 
-def test_a_view_of_the_horizon_ends_where_the_map_does():
-    """A field that goes beyond the horizon has a finite footprint, of the part that is mapped."""
+def test_a_view_of_the_horizon_has_a_finite_footprint():
+    """The footprint covers only the part of the field that is mapped, below the horizon."""
     found = footprint_of(looking(1), (800, 400))
     assert np.isfinite(found.outline_m).all()
     assert found.range_m[2] < 100 * 12 / np.tan(np.deg2rad(1))

@@ -1,4 +1,4 @@
-"""Areas and coarser grids of scenes that have a place on the earth."""
+"""Pixel areas and coarser grids of georeferenced scenes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PLACES |= {27572: (2.5, 47.0)}  # of a datum in grads
 
 
 def box(epsg: int, step: float, turn: float = 20, shape: tuple[int, int] = (300, 400)) -> GeoBox:
-    """A turned grid at a usual place of its CRS."""
+    """Return a turned grid at a usual place of its CRS."""
     left, top = pyproj.Transformer.from_crs(4326, epsg, always_xy=True).transform(*PLACES[epsg])
     cos, sin = np.cos(np.radians(turn)), np.sin(np.radians(turn))
     return GeoBox(shape, Affine(step * cos, step * sin, left, step * sin, -step * cos, top), f"EPSG:{epsg}")
@@ -28,8 +28,8 @@ def box(epsg: int, step: float, turn: float = 20, shape: tuple[int, int] = (300,
 @pytest.mark.parametrize(
     ("epsg", "step"), [(32632, 10.0), (3857, 10.0), (3035, 10.0), (4326, 1e-4), (2263, 30.0), (3413, 10.0)]
 )
-def test_areas_are_those_of_the_ellipsoid(epsg: int, step: float) -> None:
-    """In metres, feet and degrees, of any projection: the whole grid is as large as its outline on the ellipsoid."""
+def test_areas_are_on_the_ellipsoid(epsg: int, step: float) -> None:
+    """In metres, feet and degrees, for any projection, pixel areas sum to the area of the outline on the ellipsoid."""
     geobox = box(epsg, step)
     rows, columns = geobox.shape
     fraction = np.linspace(0, 1, 2000)
@@ -45,14 +45,14 @@ def test_areas_are_those_of_the_ellipsoid(epsg: int, step: float) -> None:
     assert pixel_side_m(geobox) == pytest.approx(np.sqrt(outline / rows / columns), rel=1e-3)
 
 
-def test_a_metre_of_the_map_is_one_on_the_ground_or_not() -> None:
-    """Within 1 % in every direction: neither where a projection stretches both, nor one on the cost of the other."""
+def test_a_crs_is_in_metres_only_if_its_scale_is_one_on_the_ground() -> None:
+    """The scale must be within 1 % in every direction. Some projections stretch both axes, others one of them."""
     assert [epsg for epsg in PLACES if is_in_metres(box(epsg, 1e-4))] == [32632, 3035, 27572]
 
 
 @given(st.integers(1, 70), st.integers(1, 70), st.sampled_from([1, 2, 4, 8]), st.floats(-180, 180))
-def test_a_coarser_grid_begins_at_the_same_corner(height: int, width: int, factor: int, turn: float) -> None:
-    """Pixel (y, x) of it begins where pixel (factor y, factor x) of the fine grid does, turned or not."""
+def test_a_coarser_grid_has_the_same_origin(height: int, width: int, factor: int, turn: float) -> None:
+    """Coarse pixel (y, x) begins where fine pixel (factor y, factor x) does, also on a turned grid."""
     fine = box(32632, 0.05, turn, (height, width))
     shape = -(-height // factor), -(-width // factor)
     coarse = zoomed_out(fine, factor, shape)
@@ -66,8 +66,8 @@ def test_a_coarser_grid_begins_at_the_same_corner(height: int, width: int, facto
 
 
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(1, 9), st.integers(0, 2**32 - 1))
-def test_patches_hold_every_pixel_once(height: int, width: int, patch: int, seed: int) -> None:
-    """What lies at a pixel of the scene lies there in its patch; beyond the scene is nothing."""
+def test_patches_contain_every_pixel_once(height: int, width: int, patch: int, seed: int) -> None:
+    """A pixel of the scene lies at its place in its patch; pixels beyond the scene are False."""
     grid = SceneGrid(height, width, patch)
     image = np.random.default_rng(seed).random((height, width)) < 0.5
     patch_index = patch_pixels(grid, image)
@@ -79,7 +79,7 @@ def test_patches_hold_every_pixel_once(height: int, width: int, patch: int, seed
 
 
 def test_areas_do_not_change_across_180_degrees_of_longitude() -> None:
-    """Fiji: longitudes jump there, square metres do not."""
+    """Near Fiji longitudes jump from 180 to -180 deg, but square metres do not change."""
     areas = []
     for shift_m in (0, 20_000):
         field = GeoBox((20, 200), Affine(10, 0, 179_300 + shift_m, 0, -10, 8_140_000), "EPSG:32701")

@@ -1,4 +1,4 @@
-"""The map's grid: it covers the field, agrees with exact areas, and shows the scene's own pixels."""
+"""The map's grid covers the field, agrees with exact areas, and shows the pixels of the scene."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from tests.pipeline.ground.test_view import view
 
 
 def whole(grid: map_grid.GroundGrid) -> np.ndarray:
-    """Scene pixels of all of a map."""
+    """Return the scene pixels of a whole map."""
     return grid.scene_pixels(slice(0, grid.shape[0]), slice(0, grid.shape[1]))
 
 
 @pytest.mark.parametrize(
     "pose", [{}, {"tilt_deg": 90.0}, {"roll_deg": 20.0, "slope_deg": 8.0, "aspect_deg": 200.0}, {"lat_deg": -89.5}]
 )
-def test_every_pixel_of_the_field_is_on_the_map(pose: dict[str, float]):
-    """The centres of the scene's border pixels fall on the map, and none of the map lies far outside the field."""
+def test_map_covers_every_pixel_of_the_field(pose: dict[str, float]):
+    """The centres of the scene's corner pixels fall on the map, and the field reaches each of its edges to 3 px."""
     shape = (160, 200)
     grid = map_grid.ground_grid(view(**pose), shape)
     y, x = pixel_places(shape)
@@ -40,8 +40,8 @@ def test_every_pixel_of_the_field_is_on_the_map(pose: dict[str, float]):
 
 
 @pytest.mark.parametrize("pose", [{}, {"tilt_deg": 90.0}, {"slope_deg": 10.0, "aspect_deg": 120.0}, {"lat_deg": 85.0}])
-def test_mapped_area_is_the_sum_of_the_pixels_footprints(pose: dict[str, float]):
-    """Map pixels seen, times the ground that each stands for, are the closed form's area of the field."""
+def test_mapped_area_is_the_sum_of_pixel_footprints(pose: dict[str, float]):
+    """The map pixels of the field, times the ground area of each, equal the sum of exact areas to 0.2 %."""
     shape = (300, 260)
     grid = map_grid.ground_grid(view(**pose), shape)
     rig, areal_scale = grid.frame.view.pose, Proj(grid.frame.crs).get_factors
@@ -50,8 +50,8 @@ def test_mapped_area_is_the_sum_of_the_pixels_footprints(pose: dict[str, float])
     assert np.isfinite(whole(grid)[..., 0]).sum() * pixel_m2 == pytest.approx(exact, rel=2e-3)
 
 
-def test_a_map_pixel_shows_the_scene_pixel_that_sees_it():
-    """Forward from the scene pixel given by the geolocation grid, the ray ends in the map pixel's centre."""
+def test_a_map_pixel_shows_the_scene_pixel_that_views_it():
+    """The ray of the scene pixel in the geolocation grid ends at the centre of its map pixel, to 1e-6 m."""
     grid = map_grid.ground_grid(view(slope_deg=5.0), (80, 120))
     pixels = whole(grid)
     row, column = (int(at) for at in np.argwhere(np.isfinite(pixels[..., 0]))[1234])
@@ -62,8 +62,8 @@ def test_a_map_pixel_shows_the_scene_pixel_that_sees_it():
 
 @pytest.mark.parametrize(("step", "bound"), [(0.05, 1e-6), (1.0, 2e-5)])
 @pytest.mark.parametrize("pose", [{}, {"lat_deg": 85.0}, {"lat_deg": -79.0, "slope_deg": 12.0}])
-def test_places_between_tie_points_are_the_exact_ones(pose: dict[str, float], step: float, bound: float):
-    """Linear between exact places every 32 pixels, map pixels lie where PROJ puts them, in parts of a pixel."""
+def test_places_interpolated_between_tie_points_are_exact(pose: dict[str, float], step: float, bound: float):
+    """Places interpolated linearly between tie points every 32 pixels agree with PROJ to the given part of a pixel."""
     grid = map_grid.ground_grid(view(**({"height_m": 1000.0, "tilt_deg": 80.0} | pose)), (900, 900), resolution_m=step)
     rows, columns = (slice(size // 3, size // 3 + 75) for size in grid.shape)
     x, y = (np.arange(part.start, part.stop) + 0.5 for part in (columns, rows))
@@ -73,8 +73,8 @@ def test_places_between_tie_points_are_the_exact_ones(pose: dict[str, float], st
     assert worst < bound
 
 
-def test_resolution_is_the_median_footprint_rounded():
-    """The default lies within a ratio of 1.16 of the median footprint; one asked for is kept."""
+def test_resolution_is_the_rounded_median_footprint():
+    """The default differs from the median footprint by a ratio below 1.16. A given resolution is kept."""
     rig = view()
     median = map_grid.median_footprint_m(rig, (200, 200))
     step = map_grid.ground_grid(rig, (200, 200)).geobox.resolution.x
@@ -83,8 +83,8 @@ def test_resolution_is_the_median_footprint_rounded():
     assert map_grid.ground_grid(rig, (200, 200), resolution_m=0.0123).geobox.resolution.x == pytest.approx(0.0123)
 
 
-def test_grids_of_two_days_fraction_their_pixels():
-    """A rig moved by a metre has another map, with pixels at the same multiples of the resolution."""
+def test_grids_of_two_poses_share_their_pixel_raster():
+    """A rig moved by a metre gets another map, whose origin differs by whole pixels."""
     here, there = (map_grid.ground_grid(view(lat_deg=52.1 + shift), (90, 90)) for shift in (0.0, 1e-5))
     offset = (here.geobox.affine.f - there.geobox.affine.f) / here.geobox.resolution.x
     assert offset == pytest.approx(round(offset), abs=1e-4)
@@ -92,7 +92,7 @@ def test_grids_of_two_days_fraction_their_pixels():
 
 
 def test_far_pixels_are_left_out_and_counted():
-    """Towards the horizon a pixel covers ever more: the map ends, and all pixels are accounted for."""
+    """Towards the horizon footprints grow; the map ends where they are 8 times the median. All pixels are counted."""
     grid = map_grid.ground_grid(view(tilt_deg=0.5), (400, 300))
     counts = grid.counts()
     assert all(count > 0 for count in counts.values())
@@ -105,21 +105,21 @@ def test_far_pixels_are_left_out_and_counted():
 
 
 def test_a_resolution_too_fine_for_memory_is_refused():
-    """The message names the finest that goes, and the median footprint."""
+    """The message names the finest allowed resolution."""
     with pytest.raises(PoseError, match=r"resolution_m = 1e-05 .* 64 times the scene's .*; use 0\.\d+ or more"):
         map_grid.ground_grid(view(), (100, 100), resolution_m=1e-5)
 
 
-def test_the_nearest_pixel_is_read_and_no_other():
-    """Halves of pixels belong to them up to the border; NaN has no class."""
+def test_the_nearest_pixel_is_read():
+    """A pixel reaches half a pixel to either side of its centre. NaN places have no class."""
     classes = np.arange(12, dtype=np.uint8).reshape(3, 4)
     places = np.array([[[-0.5, -0.5], [0.49, 0.51], [2.5, 3.5], [np.nan, 1.0]]])
     assert map_grid.nearest_at(classes, places, UNLABELLED).tolist() == [[0, 1, 11, UNLABELLED]]
 
 
 @given(seed=st.integers(0, 2**16), factor=st.integers(1, 9), rows=st.integers(1, 20), columns=st.integers(1, 20))
-def test_a_patch_is_read_at_every_pixel_of_it(seed: int, factor: int, rows: int, columns: int):
-    """As if each patch were so many pixels, also where the last ones reach beyond the scene."""
+def test_a_patch_is_read_at_each_of_its_pixels(seed: int, factor: int, rows: int, columns: int):
+    """The result equals that of patches repeated into pixels, also where the last patches reach beyond the scene."""
     rng = np.random.default_rng(seed)
     patch_index = rng.random((-(-rows // factor), -(-columns // factor))).astype(np.float32)
     places = rng.uniform(-0.5, [rows - 0.5, columns - 0.5], (5, 4, 2))
@@ -131,8 +131,8 @@ def test_a_patch_is_read_at_every_pixel_of_it(seed: int, factor: int, rows: int,
     assert np.isnan(found[0, 0])
 
 
-def test_images_are_read_between_their_pixels():
-    """A ramp is read as the ramp, beyond the centres of the outer pixels as they are; NaN leaves its neighbours."""
+def test_images_are_interpolated_between_pixels():
+    """A ramp is read exactly; beyond the outer centres the outer pixels count. NaN does not change its neighbours."""
     y, x = (np.arange(size) for size in (5, 6))
     ramp = (y[:, None] * 2 + x).astype(np.float32)[..., None]
     places = np.array([[[0.75, 1.5], [4.4, 2.0], [np.nan, np.nan]]])

@@ -1,4 +1,4 @@
-"""A posed rig's rays: known places, exact inverses, footprints as derivatives, the horizon; places on the earth."""
+"""Rays of a posed rig: known places, exact inverses, footprints as derivatives, the horizon, geodetic coordinates."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)
 
 
 def view(**changes: float | None) -> GroundView:
-    """A rig 12 m above Hanover's clay looking down at 40 deg, or as changed."""
+    """Return a rig 12 m above ground near Hanover that looks down at 40 deg, with ``changes``."""
     given: dict[str, Any] = {"lon_deg": 9.5, "lat_deg": 52.1, "heading_deg": 30.0, "tilt_deg": 40.0, "height_m": 12.0}
     return GroundView(RigPose(**(given | changes)), IFOV)
 
@@ -40,22 +40,22 @@ poses = st.builds(
 places = st.tuples(st.floats(-900, 900), st.floats(-900, 900))
 
 
-def test_looking_straight_down_is_a_north_up_picture():
-    """At tilt 90 and heading 0, x is east and y is south, by height times tangent."""
+def test_a_view_straight_down_is_a_north_up_image():
+    """At tilt 90 and heading 0, x is east and y is south; distances are height times tangent."""
     points = view(heading_deg=0, tilt_deg=90, height_m=10).scene_to_ground([[0, 0], [0, 100], [100, 0]])
     step = 100 * IFOV * 10
     assert points == pytest.approx(np.array([[0, 0, 0], [step, 0, 0], [0, -step, 0]]), abs=1e-12)
 
 
 @pytest.mark.parametrize(("heading", "towards"), [(0, (0, 1)), (90, (1, 0)), (180, (0, -1)), (-90, (-1, 0))])
-def test_the_undeflected_ray_goes_where_the_rig_heads(heading: float, towards: tuple[int, int]):
-    """At 45 deg the centre of the scene lies as far ahead as the rig is high."""
+def test_the_undeflected_ray_points_along_the_heading(heading: float, towards: tuple[int, int]):
+    """At 45 deg the centre of the scene is as far ahead as the rig is high."""
     found = view(heading_deg=heading, tilt_deg=45, height_m=10).scene_to_ground([0, 0])
     assert found == pytest.approx([10 * towards[0], 10 * towards[1], 0], abs=1e-12)
 
 
-def test_rows_further_down_are_nearer_and_roll_turns_the_right_side_down():
-    """y grows towards the rig; with a positive roll a pixel to the right sinks more than one to the left."""
+def test_lower_rows_are_nearer_and_positive_roll_lowers_the_right_side():
+    """y grows towards the rig. With positive roll a pixel on the right points further down than one on the left."""
     straight, rolled = view(), view(roll_deg=10)
     near, far = straight.scene_to_ground([[300, 0], [-300, 0]])
     assert np.hypot(*near[:2]) < np.hypot(*far[:2])
@@ -65,8 +65,8 @@ def test_rows_further_down_are_nearer_and_roll_turns_the_right_side_down():
 
 
 @given(poses, places)
-def test_ground_and_scene_undo_each_other(rig: GroundView, place: tuple[float, float]):
-    """Every ray that meets the ground comes back to its pixel, and ends on the plane."""
+def test_ground_to_scene_inverts_scene_to_ground(rig: GroundView, place: tuple[float, float]):
+    """Every ray that meets the ground ends on its plane, and its point leads back to its pixel."""
     ground = rig.scene_to_ground(place)
     if rig.sink(place) < 0.05:
         return
@@ -75,8 +75,8 @@ def test_ground_and_scene_undo_each_other(rig: GroundView, place: tuple[float, f
 
 
 @given(poses, places)
-def test_areas_are_the_derivatives_of_the_ground(rig: GroundView, place: tuple[float, float]):
-    """A pixel's level area agrees with finite differences of both its sides."""
+def test_pixel_areas_are_derivatives_of_ground_points(rig: GroundView, place: tuple[float, float]):
+    """A pixel's level area agrees with finite differences along its two sides."""
     if rig.sink(place) < 0.1:
         return
     half = 0.05
@@ -86,24 +86,24 @@ def test_areas_are_the_derivatives_of_the_ground(rig: GroundView, place: tuple[f
     assert rig.area_m2(place) == pytest.approx(abs(down[0] * right[1] - down[1] * right[0]), rel=1e-5)
 
 
-def test_a_range_stands_for_the_height_above_the_plane():
-    """18 m to ground that falls by 5 deg along the view put the undeflected ray's end 18 m away, on the plane."""
+def test_a_range_determines_the_height():
+    """With a range of 18 m to ground that falls by 5 deg along the view, the undeflected ray is 18 m long."""
     rig = view(height_m=None, range_m=18.0, slope_deg=5.0, aspect_deg=30.0)
     centre = rig.scene_to_ground([0, 0])
     assert np.linalg.norm(centre - [0, 0, rig.height_m]) == pytest.approx(18.0)
     assert centre[2] == pytest.approx(-np.tan(np.deg2rad(5)) * np.hypot(*centre[:2]))
 
 
-def test_a_slope_falls_towards_its_aspect():
-    """Ground with aspect 90 is lower in the east, and the rig sees it further away there."""
+def test_ground_descends_towards_its_aspect():
+    """Ground of aspect 90 deg is lower in the east, so rays to the east reach further."""
     rig = view(tilt_deg=90, heading_deg=0, slope_deg=20, aspect_deg=90)
     east, west = rig.scene_to_ground([[0, 1000], [0, -1000]])
     assert east[2] < 0 < west[2]
     assert east[0] > -west[0]
 
 
-def test_rays_that_meet_no_ground_are_nan_and_counted():
-    """With the horizon across the middle of the scene, the upper rows have no ground and no footprint."""
+def test_rays_without_ground_are_nan_and_counted():
+    """With the horizon across the middle of the scene, the upper rows have no ground and no area."""
     rig = view(tilt_deg=0)
     y, x = pixel_places((101, 40))
     points = np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1)
@@ -114,8 +114,8 @@ def test_rays_that_meet_no_ground_are_nan_and_counted():
 
 
 @given(poses, st.floats(0.01, 1.2))
-def test_the_outline_holds_exactly_the_pixels_that_sink_enough(rig: GroundView, least: float):
-    """Its corners sink by the least or more, and its area over the field's is the fraction of such pixels."""
+def test_outline_contains_exactly_the_pixels_below_the_least_sink(rig: GroundView, least: float):
+    """Its corners sink by at least the limit, and its area is the number of such pixels to 120."""
     outline = rig.outline_px((90, 120), least)
     assert (rig.sink(outline) >= least - 1e-9).all()
     after = np.roll(outline, -1, axis=0)
@@ -124,28 +124,28 @@ def test_the_outline_holds_exactly_the_pixels_that_sink_enough(rig: GroundView, 
 
 
 @pytest.mark.parametrize("item", fields(RigPose), ids=lambda item: item.name)
-def test_values_out_of_range_or_not_finite_are_named(item: Field[float]):
-    """Each field of the pose refuses NaN, infinity and what lies beyond its limits."""
+def test_pose_values_out_of_range_are_named(item: Field[float]):
+    """Each field of the pose refuses NaN, infinity and values beyond its limits."""
     for value in (np.nan, np.inf, span_of(item)[1] * 1.01 + 1):
         with pytest.raises(PoseError, match=rf"the rig's pose: {item.name} must be a number from .* got {value!r}"):
             view(**{item.name: value})
 
 
-def test_height_or_range_but_not_both():
-    """None of them, or both, say nothing or two things."""
+def test_a_pose_needs_either_height_or_range():
+    """Neither of them is too little, both are ambiguous."""
     for said in ({"height_m": None}, {"range_m": 5.0}):
         with pytest.raises(PoseError, match="height_m or range_m, one of the two"):
             view(**said)
 
 
 def frame(lon: float = 9.5, lat: float = 52.1, epsg: int | None = None, **more: float) -> MapFrame:
-    """A map around a rig at the place, 100 m up and looking down at 45 deg."""
+    """Return a map around a rig at the place, 100 m up and looking down at 45 deg."""
     pose = RigPose(lon_deg=lon, lat_deg=lat, height_m=100.0, heading_deg=40.0, tilt_deg=45.0, **more)
     return MapFrame(GroundView(pose, 1e-4), map_crs(pose, epsg))
 
 
 def earth_centred(lon_deg: float, lat_deg: float, height_m: float) -> np.ndarray:
-    """Cartesian coordinates of the earth, the textbook's way."""
+    """Return Cartesian earth-centred coordinates by the textbook's formula."""
     lon, lat = np.deg2rad([lon_deg, lat_deg])
     normal = SEMI_MAJOR_M / np.sqrt(1 - ECCENTRICITY2 * np.sin(lat) ** 2)
     flat = (normal + height_m) * np.cos(lat)
@@ -153,8 +153,8 @@ def earth_centred(lon_deg: float, lat_deg: float, height_m: float) -> np.ndarray
 
 
 @pytest.mark.parametrize(("lon", "lat"), [(9.5, 52.1), (-70.2, -33.4), (179.9999, 10.0), (20.0, 89.0), (0.0, 0.0)])
-def test_metres_around_the_foot_are_the_textbooks(lon: float, lat: float):
-    """East, north and up of the foot, added in Cartesian coordinates, come to the same longitude, latitude, height."""
+def test_local_metres_agree_with_cartesian_coordinates(lon: float, lat: float):
+    """East, north and up of the rig's foot, added in Cartesian coordinates, give the same geodetic position."""
     east_north_up = np.array([1200.0, -800.0, 35.0])
     a, b = np.deg2rad([lon, lat])
     east = np.array([-np.sin(a), np.cos(a), 0])
@@ -172,16 +172,16 @@ def test_metres_around_the_foot_are_the_textbooks(lon: float, lat: float):
     st.floats(0, 15),
     st.floats(-180, 180),
 )
-def test_map_and_ground_undo_each_other(lon: float, lat: float, east: float, north: float, slope: float, aspect: float):
-    """Points of the plane come back from the map to a tenth of a micrometre, wherever the rig stands."""
+def test_map_and_ground_are_inverse(lon: float, lat: float, east: float, north: float, slope: float, aspect: float):
+    """Points of the plane return from the map to 1e-6 m, anywhere on the earth."""
     around = frame(lon, lat, slope_deg=slope, aspect_deg=aspect, elevation_m=700.0)
     point = np.array([east, north, 0.0])
     point[2] = -point @ around.view.normal
     assert around.map_to_ground(around.ground_to_map(point)) == pytest.approx(point, abs=1e-6)
 
 
-def test_nothing_is_taken_for_flat():
-    """A kilometre away the geodesic agrees to 0.1 mm, metres per degree at the foot do not to 5 cm."""
+def test_ground_positions_include_the_curvature_of_the_earth():
+    """A kilometre away the geodesic distance agrees to 0.1 mm; metres per degree at the foot err by over 5 cm."""
     around, point = frame(), np.array([700.0, 714.0, 0.0])
     lon, lat, height = around.ground_to_geodetic(point)
     azimuth, _, distance = Geod(ellps="WGS84").inv(9.5, 52.1, lon, lat)
@@ -207,8 +207,8 @@ def test_nothing_is_taken_for_flat():
         (15.0, -80.5, 5042),
     ],
 )
-def test_the_rigs_own_zone_is_taken(lon: float, lat: float, epsg: int):
-    """UTM by longitude and hemisphere, polar stereographic beyond 84 N and 80 S."""
+def test_default_crs_is_the_zone_of_the_rig(lon: float, lat: float, epsg: int):
+    """UTM zones follow longitude and hemisphere; beyond 84 N and 80 S the CRS is polar stereographic."""
     around = frame(lon, lat)
     assert default_epsg(around.view.pose) == epsg
     x, y = around.ground_to_map([0, 0, 0])
@@ -224,14 +224,14 @@ def test_the_rigs_own_zone_is_taken(lon: float, lat: float, epsg: int):
         (30001, "there is no EPSG:30001; give the code of a projected CRS"),
     ],
 )
-def test_a_crs_that_does_not_suit_is_refused(epsg: int, words: str):
-    """Another place's zone, degrees, feet and codes that do not exist say what to do."""
+def test_unsuitable_crs_are_refused(epsg: int, words: str):
+    """The zone of another place, degrees, feet and unknown codes each name the remedy."""
     with pytest.raises(PoseError, match=words):
         frame(epsg=epsg)
 
 
-def test_any_projected_crs_of_the_place_can_be_asked_for():
-    """ETRS89 / UTM 32N and Lambert's conformal cone for Europe, and a neighbouring zone just across its border."""
+def test_suitable_projected_crs_are_accepted():
+    """The CRS may be ETRS89 / UTM 32N, Lambert's cone for Europe, or a neighbouring zone just across its border."""
     assert frame(epsg=25832).ground_to_map([0, 0, 0]) == pytest.approx(frame().ground_to_map([0, 0, 0]), abs=1e-3)
     assert frame(epsg=3034).crs.name.endswith("LCC Europe")
     assert frame(lon=12.3, epsg=32632).crs.utm_zone == "32N"
@@ -245,7 +245,7 @@ def test_any_projected_crs_of_the_place_can_be_asked_for():
         ({"lon": 9.0, "elevation_m": 2000.0}, 0.9996**2 * (1 - 6.26e-4)),
     ],
 )
-def test_the_map_has_its_own_scale(place: dict[str, float], square_m2: float):
+def test_the_map_scale_depends_on_projection_and_elevation(place: dict[str, float], square_m2: float):
     """A square metre is 0.9992 m2 near a UTM zone's axis, 2.65 m2 in web Mercator, and less on high ground."""
     origin, east, north = frame(**place).ground_to_map(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]))
     a, b = east - origin, north - origin

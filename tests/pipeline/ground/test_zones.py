@@ -1,4 +1,4 @@
-"""Polygons on pixels: laws of masks, areas against shapely's, CRS round trips, and what zones leave of patches."""
+"""Polygons on pixels: masks, areas compared with shapely's, CRS round trips, and zones as parts of patches."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ polygons = corners.map(lambda points: shapely.MultiPoint(points).convex_hull).fi
 
 
 def posed(lon_deg: float = 7.6, lat_deg: float = 51.96, *, tilt_deg: float = 35.0) -> PosedField:
-    """A field of 60 x 80 px of 1 mrad before a rig 30 m high."""
+    """Return a field of 60 x 80 px of 1 mrad in front of a rig 30 m high."""
     pose = RigPose(lon_deg=lon_deg, lat_deg=lat_deg, heading_deg=20.0, tilt_deg=tilt_deg, height_m=30.0)
     return PosedField(ground_grid(GroundView(pose, 1e-3), SHAPE))
 
 
 @given(polygons)
-def test_an_area_and_what_is_outside_of_it_are_all_pixels_once(area: Any) -> None:
-    """Masks of a polygon and of its complement share no pixel and miss none."""
+def test_masks_of_a_polygon_and_its_complement_partition_the_pixels(area: Any) -> None:
+    """Each pixel belongs to exactly one of the two masks."""
     outside = shapely.box(-200, -200, 300, 300).difference(area)
     inner, outer = pixels_inside([area], SHAPE), pixels_inside([outside], SHAPE)
     assert (inner ^ outer).all()
 
 
 @given(polygons)
-def test_pixels_are_as_many_as_the_polygon_is_large(area: Any) -> None:
-    """To a pixel of its border's length; with every pixel touched there are no fewer, and all that centres have."""
+def test_mask_size_is_the_polygon_area(area: Any) -> None:
+    """Mask and area differ by at most the border's length plus one pixel. The touched pixels contain the mask."""
     there = area.intersection(shapely.box(0, 0, SHAPE[1], SHAPE[0]))
     inside, touched = (pixels_inside([area], SHAPE, touched=one) for one in (False, True))
     assert abs(inside.sum() - there.area) <= there.length + 1
@@ -49,32 +49,32 @@ def test_pixels_are_as_many_as_the_polygon_is_large(area: Any) -> None:
 
 @given(polygons, st.integers(0, 40), st.integers(0, 50))
 def test_a_window_shows_its_part_of_the_mask(area: Any, top: int, left: int) -> None:
-    """Pixels do not depend on where the window begins, but for centres on the border itself."""
+    """Pixels do not depend on the window's origin, except those whose centres lie on the border."""
     whole = pixels_inside([area], SHAPE)
     part = pixels_inside([area], (20, 30), origin=(top, left))
     y, x = np.nonzero(part != whole[top : top + 20, left : left + 30])
     centres = shapely.points(x + left + 0.5, y + top + 0.5)
-    assert (shapely.distance(centres, area.boundary) < 1e-6).all()  # on the border rounding decides
+    assert (shapely.distance(centres, area.boundary) < 1e-6).all()  # rounding decides on the border
 
 
-def test_holes_and_islands_are_as_drawn() -> None:
-    """A polygon with a hole, and a second one elsewhere."""
+def test_holes_and_separate_parts_are_kept() -> None:
+    """The mask has the pixels of a square without its hole, and those of a second rectangle."""
     ring = shapely.box(10, 10, 30, 30).difference(shapely.box(15, 15, 25, 25))
     found = pixels_inside([shapely.union(ring, shapely.box(50, 40, 60, 45))], SHAPE)
     assert found.sum() == 400 - 100 + 50
     assert not found[15:25, 15:25].any()
 
 
-def test_less_than_a_pixel_is_touched_and_holds_no_centre() -> None:
-    """A tiny polygon beside a pixel's centre."""
+def test_a_polygon_below_a_pixel_is_touched_but_not_inside() -> None:
+    """A tiny polygon next to a pixel's centre touches that one pixel."""
     tiny = shapely.box(10.1, 20.1, 10.2, 20.2)
     assert not pixels_inside([tiny], SHAPE).any()
     assert np.argwhere(pixels_inside([tiny], SHAPE, touched=True)).tolist() == [[20, 10]]
 
 
 @pytest.mark.parametrize("crs", [32632, 4326, 3857, 3035, 31466])
-def test_the_way_to_a_map_and_back_is_none(crs: int) -> None:
-    """A polygon in pixels, brought to the ground and to another CRS, comes back to its pixels."""
+def test_polygons_return_from_the_map_unchanged(crs: int) -> None:
+    """A polygon in pixels, projected to the ground and to another CRS, returns to its pixels."""
     place, drawn = posed(), shapely.segmentize(shapely.Polygon([(5, 5), (70, 8), (60, 50), (9, 44)]), 1)
     frame, middle = place.grid.frame, np.array([SHAPE[1], SHAPE[0]]) / 2
     on_map = shapely.transform(
@@ -87,8 +87,8 @@ def test_the_way_to_a_map_and_back_is_none(crs: int) -> None:
 
 
 @pytest.mark.parametrize("lon_deg", [179.9999, -179.9999])
-def test_a_polygon_across_the_antimeridian_is_one(lon_deg: float) -> None:
-    """Longitudes to either side of 180, whole or parted there as RFC 7946 wants it, hold the field."""
+def test_a_polygon_across_the_antimeridian_stays_whole(lon_deg: float) -> None:
+    """Longitudes on both sides of 180 deg cover the field, in one polygon or split as RFC 7946 demands."""
     place = posed(lon_deg, -17.0)
     whole = shapely.Polygon([(179.99, -17.01), (-179.99, -17.01), (-179.99, -16.99), (179.99, -16.99)])
     parts = shapely.union(shapely.box(179.99, -17.01, 180, -16.99), shapely.box(-180, -17.01, -179.99, -16.99))
@@ -98,8 +98,8 @@ def test_a_polygon_across_the_antimeridian_is_one(lon_deg: float) -> None:
     assert on_field(elsewhere, pyproj.CRS.from_epsg(4326), place).is_empty
 
 
-def test_what_lies_behind_the_rig_has_no_pixels() -> None:
-    """A polygon around the rig's foot that reaches into the field holds that part alone; one behind it holds none."""
+def test_ground_behind_the_rig_has_no_pixels() -> None:
+    """A polygon around the rig's foot has only its pixels in the field; one behind the rig has none."""
     place = posed()
     foot = np.array(place.grid.frame.ground_to_map(np.zeros((1, 3))))[0]
     around = shapely.Point(foot).buffer(float(place.scale(1e-3).footprint.range_m[1]) * 0.82)  # type: ignore[union-attr]
@@ -112,8 +112,8 @@ def test_what_lies_behind_the_rig_has_no_pixels() -> None:
 
 
 @pytest.mark.parametrize("turn", [0.0, 30.0])
-def test_a_georeferenced_picture_takes_polygons_by_its_transform(turn: float) -> None:
-    """Rows and columns are those of the GeoBox, also of one that is turned; pixel areas are those of its sides."""
+def test_a_georeferenced_image_maps_polygons_by_its_transform(turn: float) -> None:
+    """Rows and columns follow the GeoBox, also if it is turned. Pixel areas are the product of its sides."""
     place = PlacedPicture(
         GeoBox(SHAPE, Affine.translation(4e5, 5.7e6) @ Affine.rotation(turn) @ Affine.scale(0.5, -0.5), 32632)
     )
@@ -123,11 +123,11 @@ def test_a_georeferenced_picture_takes_polygons_by_its_transform(turn: float) ->
     assert found.sum() == 600
     assert place.pixel_areas_m2(slice(0, 2), slice(0, 3)) == pytest.approx(
         np.full((2, 3), 0.25), rel=2e-3
-    )  # of the ground, not of the map
+    )  # area on the ground, not on the map
 
 
 def test_pixels_of_degrees_have_their_area_on_the_ellipsoid() -> None:
-    """A hundredth of a second at 52 N is 0.309 m north and 0.191 m east."""
+    """A pixel of a hundredth of a second at 52 N is 0.309 m north and 0.191 m east."""
     step = 0.01 / 3600
     place = PlacedPicture(GeoBox(SHAPE, Affine(step, 0, 7.6, 0, -step, 52.0), 4326))
     areas = place.pixel_areas_m2(slice(10, 12), slice(5, 6))
@@ -135,8 +135,8 @@ def test_pixels_of_degrees_have_their_area_on_the_ellipsoid() -> None:
 
 
 @given(polygons, polygons)
-def test_no_patch_that_a_no_go_zone_touches_is_worth_anything(area: Any, no_go: Any) -> None:
-    """Nor one outside of the area; a patch wholly inside and untouched counts in full."""
+def test_patches_in_a_no_go_zone_count_nothing(area: Any, no_go: Any) -> None:
+    """A touched patch counts 0, any other by its pixels inside of the area."""
     grid, barred = SceneGrid(*SHAPE, 8), pixels_inside([no_go], SHAPE, touched=True)
     found = field_zones(pixels_inside([area], SHAPE), barred)
     if found is None:
@@ -150,28 +150,28 @@ def test_no_patch_that_a_no_go_zone_touches_is_worth_anything(area: Any, no_go: 
     assert not found.kept[barred].any()
 
 
-def test_zones_that_leave_nothing_out_are_none() -> None:
-    """Whoever keeps to all of a field surveys it as without zones."""
+def test_zones_that_exclude_nothing_are_none() -> None:
+    """An area that covers the whole field equals no zones. A no-go zone alone gives zones."""
     everything = np.ones(SHAPE, bool)
     assert field_zones(everything, ~everything) is None
     assert field_zones(None, None) is None
     assert field_zones(None, everything) is not None
 
 
-def test_a_plot_is_as_sure_as_its_pixels_that_are() -> None:
-    """Three pixels of 0.5, 0.7 and 0.9, one of the class unknown: the mean is of the three; of none it is None."""
+def test_plot_confidence_is_the_mean_of_known_pixels() -> None:
+    """Pixels of 0.5, 0.7 and 0.9 and an unknown one have the mean of the three. Without a known pixel it is None."""
     classes, confidence = np.array([[0, 0], [0, 1]], np.uint8), np.array([[0.5, 0.7], [0.9, np.nan]], np.float32)
-    plots = {"all": shapely.box(0, 0, 2, 2), "out_of_range": shapely.box(1, 1, 2, 2)}
-    whole, out_of_range = (
+    plots = {"all": shapely.box(0, 0, 2, 2), "unknown": shapely.box(1, 1, 2, 2)}
+    whole, unknown = (
         figures_of_plot(name, shape, NoPlace((2, 2)), classes, confidence, ("crop", "unknown"))
         for name, shape in plots.items()
     )
     assert (whole.pixels, whole.confidence) == (4, pytest.approx(0.7))
-    assert (whole.fractions["unknown"], out_of_range.fractions["unknown"], out_of_range.confidence) == (0.25, 1.0, None)
+    assert (whole.fractions["unknown"], unknown.fractions["unknown"], unknown.confidence) == (0.25, 1.0, None)
 
 
-def test_without_a_place_polygons_are_pixels() -> None:
-    """From the upper left corner, and no pixel has an area."""
+def test_polygons_without_a_georeference_are_in_pixels() -> None:
+    """Coordinates count from the upper left corner, and no pixel has an area."""
     found = on_field(shapely.box(-5, -5, 3, 2), None, NoPlace(SHAPE))
     assert np.argwhere(pixels_inside([found], SHAPE)).tolist() == [[0, 0], [0, 1], [0, 2], [1, 0], [1, 1], [1, 2]]
     assert NoPlace(SHAPE).pixel_areas_m2(slice(0, 1), slice(0, 1)) is None

@@ -1,4 +1,4 @@
-"""Covering sweeps, the lines of a patch, strips at every offset and what they show: every pixel with its taps."""
+"""Sweeps that cover a field, the lines of a patch, swaths at any offset, and the samples on the scene."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CAMERA, COST = LineCamera(), CostModel()
 
 
 def unseen(sweeps: list[Sweep], grid: SceneGrid) -> int:
-    """How many (coarse) pixel centres no sweep holds with its taps along the scan and within its samples."""
+    """Return the number of (coarse) pixel centres that no sweep sees with all their resampling taps."""
     step = sweeps[0].step
     across, scan = (grid.width, grid.height) if sweeps[0].along == "x" else (grid.height, grid.width)
     centres = [np.arange(-(-size // step)) * step + (step - 1) / 2 - (size - 1) / 2 for size in (across, scan)]
@@ -38,23 +38,23 @@ def unseen(sweeps: list[Sweep], grid: SceneGrid) -> int:
 
 @settings(max_examples=15, deadline=None)
 @given(st.integers(1, 1500), st.integers(1, 300), st.sampled_from(["x", "y"]))
-def test_every_pixel_is_seen(height: int, width: int, along: str):
-    """A full scan holds every pixel of its grid, with resampling taps, for any size."""
+def test_full_scan_sees_every_pixel(height: int, width: int, along: str):
+    """A full scan has the resampling taps of every pixel of its grid, for any size."""
     grid = SceneGrid(height, width, 16)
     assert unseen(full_sweeps(grid, CAMERA, along), grid) == 0
 
 
 @pytest.mark.parametrize(("size", "swaths"), [(1, 1), (640, 1), (641, 2), (1280, 2), (1281, 3), (1920, 3)])
-def test_swaths_are_the_fewest_that_cover(size: int, swaths: int):
-    """A line of 640 samples covers 640 px and a little more away from the axis."""
+def test_swaths_are_the_fewest_that_cover_the_field(size: int, swaths: int):
+    """A line of 640 samples covers 640 px, and slightly more away from the axis. Swaths lie symmetrically."""
     grid = SceneGrid(200, size, 16)
     sweeps = full_sweeps(grid, CAMERA, "x")
     assert len(sweeps) == swaths
     assert [sweep.swath_px for sweep in sweeps] == pytest.approx([-sweep.swath_px for sweep in sweeps[::-1]], abs=1e-6)
 
 
-def test_swaths_on_the_axis_scan_the_scene_and_its_taps_only():
-    """Without rotation a full scan takes the scene's rows and three lines for taps, standing on the rows."""
+def test_swaths_on_the_axis_scan_only_the_scene_and_its_taps():
+    """Without rotation a full scan has the scene's rows and three lines for taps, and its lines lie on the rows."""
     (sweep,) = full_sweeps(SceneGrid(480, 600, 16), CAMERA, "x")
     assert sweep.lines == 483
     assert sweep.start_px == -479 / 2 - 1
@@ -62,8 +62,8 @@ def test_swaths_on_the_axis_scan_the_scene_and_its_taps_only():
     assert coarse.lines == 123
 
 
-def test_the_known_fields_have_their_known_lines():
-    """1280 x 1024 takes 2098 lines in full and 528 coarse; 1296 x 966 is cheaper with lines along its short side."""
+def test_known_fields_need_their_known_lines():
+    """A field of 1280 x 1024 needs 2098 full or 528 coarse lines; 1296 x 966 is cheaper with lines along y."""
     along, sweeps, seconds = cheapest_full(SceneGrid(1024, 1280, 16), CAMERA, COST)
     assert (along, sum(s.lines for s in sweeps), round(seconds, 1)) == ("x", 2098, 213.9)
     assert sum(s.lines for s in uniform_sweeps(SceneGrid(1024, 1280, 16), CAMERA, "x", step=4)) == 528
@@ -71,22 +71,22 @@ def test_the_known_fields_have_their_known_lines():
     assert (along, len(sweeps)) == ("y", 2)
 
 
-def test_fields_beyond_the_mirror_are_refused():
-    """The error names the sweep, where it would have to look, and what to do."""
+def test_fields_beyond_the_mirror_range_are_refused():
+    """The error names the sweep, the mirror's range and the remedy."""
     grid = SceneGrid(23_000, 640, 32)
     with pytest.raises(PoseError, match=r"sweep full-0 .* beyond the mirror's range.*smaller scene"):
         full_sweeps(grid, CAMERA, "x")
     with pytest.raises(PoseError, match="beyond the mirror's range"):
         cheapest_full(SceneGrid(24_000, 24_000, 32), CAMERA, COST)
-    for shape in ((1024, 1280), (4000, 64)):  # neither any number of swaths of such a lens, nor any line, reaches them
+    for shape in ((1024, 1280), (4000, 64)):  # neither several swaths nor a single line of such a lens reach them
         with pytest.raises(PoseError, match="beyond the mirror's range"):
             cheapest_full(SceneGrid(*shape, 16), LineCamera(focal_length_mm=3.0), COST)
 
 
 @pytest.mark.parametrize("along", ["x", "y"])
 @pytest.mark.parametrize("binning", [1, 4])
-def test_mask_follows_the_rays(along: str, binning: int):
-    """Far off the axis the samples on the scene are those whose reflected ray meets one of its pixels."""
+def test_samples_on_the_scene_follow_the_rays(along: str, binning: int):
+    """Far off the axis the mask has exactly the samples whose reflected ray meets a pixel of the scene."""
     sweep = Sweep("s", "fine", along, swath_px=2300.3, start_px=-1100.2, lines=90, binning=binning)
     slopes = CAMERA.pixel_slopes(binning)
     rays = np.stack([np.zeros_like(slopes), slopes, np.ones_like(slopes)], axis=-1)
@@ -99,8 +99,8 @@ def test_mask_follows_the_rays(along: str, binning: int):
 
 
 @pytest.mark.parametrize("overlap_px", [0.0, 64.0, 164.0, 320.0])
-def test_swaths_overlap_by_what_is_asked(overlap_px: float):
-    """Neighbours share at least the overlap, with no strip more than it takes, and 0 changes nothing."""
+def test_neighbouring_swaths_overlap_as_requested(overlap_px: float):
+    """Neighbours overlap by at least the given width, with the fewest swaths. An overlap of 0 changes nothing."""
     grid = SceneGrid(300, 1100, 16)
     for cover in (full_sweeps, partial(uniform_sweeps, step=4)):
         sweeps = cover(grid, CAMERA, "x", overlap_px=overlap_px)
@@ -112,7 +112,7 @@ def test_swaths_overlap_by_what_is_asked(overlap_px: float):
 
 @pytest.mark.parametrize(("margin_px", "lines"), [(0.0, 0), (0.5, 1), (8.0, 2), (9.0, 3)])
 def test_margins_are_whole_lines_at_both_ends(margin_px: float, lines: int):
-    """Every sweep begins and ends at least so much further out, by no line too many, and keeps its own lines."""
+    """Every sweep gets the fewest lines that reach the margin at both ends, and keeps its own lines."""
     sweeps = uniform_sweeps(SceneGrid(300, 700, 16), CAMERA, "x", step=4)
     for sweep, grown in zip(sweeps, with_margin(sweeps, CAMERA, margin_px), strict=True):
         assert grown == replace(sweep, start_px=sweep.start_px - 4 * lines, lines=sweep.lines + 2 * lines)

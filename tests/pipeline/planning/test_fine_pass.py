@@ -1,4 +1,4 @@
-"""The second pass: laws of its time, lines that are not captured twice, and the choice of spacing and exposure."""
+"""The second pass: its duration, no line captured twice, and the choice of line spacing and exposure."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ RECORD = ScanPerformance((1, 2, 4), (5.0, 100.0), {MIOU: np.array([[0.9, 0.95], 
 
 
 def second_pass(seconds: float, *, step: int = 4, margin_px: float = 0.0) -> SecondPass:
-    """Plans after a first pass of every 4th line, or with a margin, beside it."""
+    """Return a planner after a first pass of every ``step``-th line."""
     return SecondPass(GRID, CAMERA, COST, every_nth(FULL, step), FULL, seconds, margin_px)
 
 
 def drawn(seed: int) -> np.ndarray:
-    """Gains with a few strong patches, some of them none."""
+    """Return random gains with a few strong patches; a quarter of the patches have none."""
     rng = np.random.default_rng(seed)
     gain = rng.exponential(size=int(np.prod(GRID.patch_shape))) ** 3
     return np.where(rng.random(gain.size) > 0.25, gain, 0.0)
@@ -45,7 +45,7 @@ def drawn(seed: int) -> np.ndarray:
 def test_a_plan_ends_in_time_and_captures_its_patches(
     fraction: float, seed: int, step: int, margin_px: float, exposure_ms: float | None
 ) -> None:
-    """The time is the cost model's, the gain that of the captured patches, and names sort as the lines do."""
+    """Its seconds are those of the cost model, its gain is that of the captured patches, and names are unique."""
     gain, planner = drawn(seed), second_pass(fraction * FULL_S, margin_px=margin_px)
     plan = planner.plan(gain, step=step, exposure_ms=exposure_ms)
     assert plan.seconds == COST.seconds(plan.sweeps, CAMERA) <= fraction * FULL_S
@@ -59,7 +59,7 @@ def test_a_plan_ends_in_time_and_captures_its_patches(
 @settings(max_examples=10, deadline=None)
 @given(st.floats(0.05, 1), st.integers(0, 99))
 def test_no_line_is_captured_twice(fraction: float, seed: int) -> None:
-    """New lines lie between those of the first pass, and complete its runs to every line."""
+    """New lines lie between those of the first pass and complete its runs to every line."""
     planner = second_pass(fraction * FULL_S)
     plan = planner.plan(drawn(seed))
     sweeps = [*planner.first_pass, *plan.sweeps]
@@ -75,8 +75,8 @@ def test_no_line_is_captured_twice(fraction: float, seed: int) -> None:
             assert set(wanted.tolist()) <= found
 
 
-def test_time_goes_to_several_runs_of_a_swath() -> None:
-    """Two far rows of one swath are two runs, as the lines between them take longer than a set-up."""
+def test_distant_rows_of_a_swath_become_separate_runs() -> None:
+    """Two distant rows of one swath become two runs, because the lines between them take longer than a set-up."""
     planner, gain = second_pass(0.5 * FULL_S), np.zeros(int(np.prod(GRID.patch_shape)))
     rows, count = planner.rows.row, planner.rows.first.shape[1]
     gain[np.isin(rows, [1, count - 2])] = 1.0
@@ -86,8 +86,8 @@ def test_time_goes_to_several_runs_of_a_swath() -> None:
     assert plan.lines < 0.3 * FULL[0].lines
 
 
-def test_more_seconds_gain_no_less() -> None:
-    """And the seconds of the whole field gain all of it, which the plan says."""
+def test_more_seconds_never_reduce_the_gain() -> None:
+    """The seconds of a full scan gain everything, and the plan's reason says that it captures the whole field."""
     for seed in range(4):
         gains = [second_pass(part * FULL_S).plan(drawn(seed)).expected_gain for part in (0.2, 0.4, 0.6, 1.0)]
         assert gains == sorted(gains)
@@ -97,24 +97,24 @@ def test_more_seconds_gain_no_less() -> None:
     assert "the whole field, every line, 100 ms" in whole.reason
 
 
-def test_equal_gains_fill_the_time() -> None:
-    """Where no price of a second tells patches apart, less than a row of patches is left over."""
+def test_equal_gains_use_the_available_time() -> None:
+    """With equal gains everywhere, less time is unused than two rows of patches take with set-ups and a reload."""
     plan = second_pass(0.5 * FULL_S).plan(np.ones(int(np.prod(GRID.patch_shape))))
     assert 0.5 * FULL_S - plan.seconds < 2 * (16 * 0.1 + COST.setup_seconds(CAMERA)) + COST.reload_s
 
 
-def test_a_margin_is_added_at_both_ends_of_a_run() -> None:
-    """With pointing errors, a run takes every line of its swath, so many more as the mirror may be off."""
+def test_a_pointing_margin_extends_a_run_at_both_ends() -> None:
+    """With pointing errors a run has every line of its swath, and as many more at both ends as the error reaches."""
     gain = np.zeros(GRID.patch_shape)
     gain[8, 3] = 1.0
     (plain,) = second_pass(FULL_S, step=4, margin_px=1e-9).plan(gain.ravel()).sweeps
     (wide,) = second_pass(FULL_S, step=4, margin_px=6.0).plan(gain.ravel()).sweeps
-    assert (wide.start_px, wide.lines) == (plain.start_px - 5, plain.lines + 10)  # 1e-9 is a line already
+    assert (wide.start_px, wide.lines) == (plain.start_px - 5, plain.lines + 10)  # 1e-9 already adds a line
     assert wide.step == 1
 
 
-def test_a_recording_cuts_the_sweeps() -> None:
-    """The time is that of the lines that exist."""
+def test_a_recording_limits_the_sweeps_of_a_plan() -> None:
+    """The plan's seconds are those of the recorded lines."""
     planner = replace(second_pass(FULL_S), recorded=lambda sweeps: sweeps[:1])
     plan = planner.plan(drawn(1))
     assert len(plan.sweeps) == 1
@@ -122,8 +122,8 @@ def test_a_recording_cuts_the_sweeps() -> None:
 
 
 @pytest.mark.parametrize("step", FIRST_STEPS)
-def test_spacing_and_exposure_are_those_of_most_gain(step: int) -> None:
-    """No other pair that is tried gains more in the time; a small gain plans nothing."""
+def test_spacing_and_exposure_have_the_highest_gain(step: int) -> None:
+    """No other pair gains over 2 % more than the chosen one in the time. A negligible gain plans no second pass."""
     planner = second_pass(0.3 * FULL_S, step=step)
     asked: list[tuple[int, float]] = []
 
@@ -140,7 +140,7 @@ def test_spacing_and_exposure_are_those_of_most_gain(step: int) -> None:
     dim = replace(planner, first_pass=every_nth(FULL, step, 100.0), margin_px=6.0)
     worse = replace(RECORD, steps=(1, step), scores={MIOU: np.array([[0.6, 0.95], [0.7, 0.8]])})
     asked.clear()
-    dim.best(worse, gain_of)  # lines that score less than those of the first pass are not tried
+    dim.best(worse, gain_of)  # lines with a lower score than those of the first pass are not tried
     assert asked
     assert all(worse.expected(*pair)[MIOU] >= 0.8 for pair in asked)
     nothing = planner.best(RECORD, lambda spacing, mean_ms: np.full(drawn(2).size, 0.1 * LEAST_GAIN / drawn(2).size))

@@ -1,4 +1,4 @@
-"""Looks at a part of a field: every patch has its line, and no run of lines in the same seconds is worth more."""
+"""Partial scans: every patch has its lines, and no other run of the same seconds has a higher gain."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ EXPOSURE_MS = 5.0
 
 
 def rows_of(along: Axis = "x", step: int = 2) -> PatchRows:
-    """Rows of patches in the sweeps of a scan, three strips of them."""
+    """Return rows of patches in the three sweeps of a uniform scan."""
     return PatchRows.of(uniform_sweeps(GRID, CAMERA, along, step=step, exposure_ms=EXPOSURE_MS), GRID, CAMERA)
 
 
@@ -39,7 +39,7 @@ worths = st.integers(0, 2**32 - 1).map(lambda seed: _patchy(np.random.default_rn
 
 
 def _patchy(rng: np.random.Generator) -> np.ndarray:
-    """Worth of the patches, much of it in a few places."""
+    """Return a gain for each patch, most of it in one block."""
     expected_gain = rng.random(GRID.patch_shape) * 0.1
     top, left = rng.integers(0, GRID.patch_shape[0] - 4), rng.integers(0, GRID.patch_shape[1] - 4)
     expected_gain[top : top + 4, left : left + 4] += 5 * rng.random()
@@ -53,15 +53,15 @@ def partial_scan(
     camera: LineCamera = CAMERA,
     cost: CostModel = COST,
 ) -> PartialScan | None:
-    """The runs of a scan in so many seconds, one for each sweep."""
+    """Return the runs of a partial scan in a number of seconds, at most one for each sweep."""
     times = RunTimes.of_scan(rows.sweeps, camera, cost, EXPOSURE_MS)
     return choose_runs(rows, expected_gain, times, seconds=seconds)
 
 
 @pytest.mark.parametrize("along", ["x", "y"])
 @pytest.mark.parametrize("step", [1, 2, 4])
-def test_every_patch_is_in_a_row_whose_lines_show_it(along: Axis, step: int) -> None:
-    """The lines of a row show the patches of that row, and all rows together the field."""
+def test_the_lines_of_a_row_show_its_patches(along: Axis, step: int) -> None:
+    """The rows together contain every patch of the field."""
     rows = rows_of(along, step)
     assert (rows.row[GRID.every_patch()] >= 0).all()
     for number, place in np.argwhere(rows.there)[:: 7 if step > 1 else 3]:
@@ -71,8 +71,8 @@ def test_every_patch_is_in_a_row_whose_lines_show_it(along: Axis, step: int) -> 
 
 
 @given(worths, st.floats(0.02, 1.2))
-def test_no_run_of_the_same_sweep_is_worth_more_in_its_seconds(expected_gain: np.ndarray, fraction: float) -> None:
-    """Each chosen run is worth most of all runs of its sweep that have as many lines or fewer."""
+def test_chosen_runs_have_the_highest_gain_of_their_length(expected_gain: np.ndarray, fraction: float) -> None:
+    """No run of the same sweep with at most as many lines has a higher gain."""
     scan_pass, sums = partial_scan(expected_gain, fraction * WHOLE_S), ROWS.sums(expected_gain)
     for number, first, stop in () if scan_pass is None else scan_pass.runs:
         firsts, stops, values = ROWS.first[number], ROWS.stop[number], sums[number]
@@ -83,8 +83,8 @@ def test_no_run_of_the_same_sweep_is_worth_more_in_its_seconds(expected_gain: np
 
 
 @given(worths, st.floats(0.1, 1.0), st.floats(0.1, 4.0))
-def test_no_run_of_one_swath_in_time_is_worth_more(expected_gain: np.ndarray, fraction: float, power: float) -> None:
-    """Whatever the strip: also where rows are worth the same, and no price of a second divides them."""
+def test_no_single_run_in_time_has_a_higher_gain(expected_gain: np.ndarray, fraction: float, power: float) -> None:
+    """No run of any swath gains more in the given seconds, also if rows have equal gains per second."""
     seconds = fraction * WHOLE_S
     scan_pass = partial_scan(expected_gain**power, seconds)
     found = 0.0 if scan_pass is None else scan_pass.expected_gain
@@ -97,8 +97,8 @@ def test_no_run_of_one_swath_in_time_is_worth_more(expected_gain: np.ndarray, fr
 
 @pytest.mark.parametrize("seed", range(12))
 @pytest.mark.parametrize("fraction", [0.66, 0.8, 0.95])
-def test_hardly_any_runs_of_two_swaths_are_worth_more(seed: int, fraction: float) -> None:
-    """In the same seconds, set-ups included, where one load of the mirror's memory holds all lines."""
+def test_runs_of_two_swaths_reach_98_percent_of_the_best_gain(seed: int, fraction: float) -> None:
+    """The best pair is found by trying all pairs. Set-ups count, and one load of the mirror's memory has all lines."""
     cost = CostModel(vector_pairs=100_000, capture_start_s=0.3)
     expected_gain = _patchy(np.random.default_rng(seed)) ** 4
     rows = PatchRows.of(uniform_sweeps(GRID, WIDER, "x", step=4, exposure_ms=EXPOSURE_MS), GRID, WIDER)
@@ -117,8 +117,8 @@ def test_hardly_any_runs_of_two_swaths_are_worth_more(seed: int, fraction: float
     assert 0.98 * best <= scan_pass.expected_gain <= best * (1 + 1e-9)
 
 
-def test_a_swath_that_does_not_pay_its_set_up_is_left_out() -> None:
-    """Two rows of two swaths are taken, and nothing of the third, where time is for these two."""
+def test_a_swath_whose_gain_does_not_justify_its_set_up_is_left_out() -> None:
+    """With time for two rows of two swaths, exactly these rows are captured."""
     expected_gain, count = np.full(int(np.prod(GRID.patch_shape)), 1e-6), ROWS.first.shape[1]
     for number in (0, 2):
         expected_gain[ROWS.row == number * count + 5] = 1.0
@@ -128,8 +128,8 @@ def test_a_swath_that_does_not_pay_its_set_up_is_left_out() -> None:
     assert found.runs == wanted
 
 
-def test_lines_that_two_rows_share_are_paid_once() -> None:
-    """Neighbours of two good rows cost fewer lines than a far row of more gain."""
+def test_lines_shared_by_two_rows_are_paid_once() -> None:
+    """Neighbours of two chosen rows cost fewer lines than a distant row of higher gain."""
     expected_gain, count = np.zeros(int(np.prod(GRID.patch_shape))), ROWS.first.shape[1]
     for place, gain in ((2, 1.0), (3, 0.5), (9, 0.6), (15, 1.0), (16, 0.5)):
         expected_gain[np.flatnonzero(place == ROWS.row)[0]] = gain
@@ -140,8 +140,8 @@ def test_lines_that_two_rows_share_are_paid_once() -> None:
     assert found.runs == wanted
 
 
-def test_rows_worth_the_same_are_looked_at_as_far_as_time_goes() -> None:
-    """Of a block that the seconds do not pay for as much as they do, and no lines beside it."""
+def test_rows_of_equal_gain_are_captured_until_time_ends() -> None:
+    """Part of a block that exceeds the time is captured, with no lines next to the block."""
     expected_gain = np.zeros(GRID.patch_shape)
     expected_gain[4:16, 3:6] = 1.0
     scan_pass = partial_scan(expected_gain.ravel(), 2.2)
@@ -152,18 +152,18 @@ def test_rows_worth_the_same_are_looked_at_as_far_as_time_goes() -> None:
 
 
 @pytest.mark.parametrize("along", ["x", "y"])
-def test_a_patch_that_two_swaths_show_is_of_the_nearer(along: Axis) -> None:
-    """By how far its middle lies from the middle of their lines."""
+def test_a_patch_in_two_swaths_belongs_to_the_nearer_one(along: Axis) -> None:
+    """The distance is that from the patch's centre to the middle of the lines."""
     rows, patch_index = rows_of(along), GRID.every_patch()
     middle = GRID.patch_origin(patch_index) + GRID.patch / 2 - np.array([GRID.height, GRID.width]) / 2
     across = middle[:, "yx".index(along)]
     off = np.abs(across[:, None] - np.array([sweep.swath_px for sweep in rows.sweeps]))
     own = off[np.arange(len(patch_index)), rows.row[patch_index] // rows.first.shape[1]]
-    assert (own <= off.min(axis=1) + 1).all()  # lines are turned by a pixel at most
+    assert (own <= off.min(axis=1) + 1).all()  # rotation moves lines by a pixel at most
 
 
-def test_the_least_seconds_are_those_of_a_row_that_gains() -> None:
-    """A shorter row outside of zones is no scan: its seconds would be refused again."""
+def test_least_seconds_are_those_of_the_cheapest_row_with_gain() -> None:
+    """A shorter row without gain does not count, because a scan of its seconds would be refused again."""
     gain = np.zeros(len(ROWS.row))
     assert cheapest_row_seconds(ROWS, gain, CAMERA, COST, EXPOSURE_MS) == np.inf
     for patch in (0, len(gain) // 2, len(gain) - 1):
@@ -174,8 +174,8 @@ def test_the_least_seconds_are_those_of_a_row_that_gains() -> None:
 
 
 @given(worths, st.floats(0.02, 1.2))
-def test_looks_end_in_time_and_are_worth_what_they_show(expected_gain: np.ndarray, fraction: float) -> None:
-    """Seconds are those of the cost model, at most those given; the worth is that of the rows the lines show."""
+def test_partial_scans_end_in_time_and_gain_only_shown_patches(expected_gain: np.ndarray, fraction: float) -> None:
+    """Seconds are those of the cost model, at most the given ones. The gain is at most that of the shown patches."""
     scan_pass = partial_scan(expected_gain, fraction * WHOLE_S)
     if scan_pass is None:
         assert cheapest_row_seconds(ROWS, expected_gain, CAMERA, COST, EXPOSURE_MS) > fraction * WHOLE_S
@@ -186,8 +186,8 @@ def test_looks_end_in_time_and_are_worth_what_they_show(expected_gain: np.ndarra
 
 
 @given(worths)
-def test_more_seconds_are_worth_no_less(expected_gain: np.ndarray) -> None:
-    """And all the seconds of the whole scan buy all that a scan is worth."""
+def test_more_seconds_never_reduce_the_gain(expected_gain: np.ndarray) -> None:
+    """The seconds of the whole scan reach the whole gain."""
     fractions = (0.3, 0.5, 0.7, 0.9, 1.0)
     scan_passes = [partial_scan(expected_gain, one * WHOLE_S) for one in fractions]
     found = [0.0 if scan_pass is None else scan_pass.expected_gain for scan_pass in scan_passes]
@@ -203,14 +203,14 @@ def test_more_seconds_are_worth_no_less(expected_gain: np.ndarray) -> None:
         ([(1, 0, 5), (1, 9, 12)], "names sweep 1 twice"),
     ],
 )
-def test_lines_that_a_scan_does_not_have_are_refused(runs: list[tuple[int, int, int]], told: str) -> None:
-    """With what it has."""
+def test_lines_outside_of_a_scan_are_refused(runs: list[tuple[int, int, int]], told: str) -> None:
+    """The message names the sweeps and lines that the scan has."""
     with pytest.raises(SettingsError, match=told):
         sweeps_of_runs(ROWS.sweeps, runs)
 
 
 def shown_of(top: int, left: int, rows: int, columns: int) -> np.ndarray:
-    """Patches of a block, (patch,)."""
+    """Return a mask of a block of patches, (patch,)."""
     shown = np.zeros(GRID.patch_shape, bool)
     shown[top : top + rows, left : left + columns] = True
     return shown.ravel()
@@ -220,8 +220,8 @@ blocks = st.builds(shown_of, st.integers(0, 19), st.integers(0, 25), st.integers
 
 
 @given(blocks, st.sampled_from(["x", "y"]))
-def test_every_patch_that_was_shown_still_is(shown: np.ndarray, along: Axis) -> None:
-    """Of a full scan that is cut, each swath has the lines that show part of them."""
+def test_cutting_a_full_scan_keeps_the_requested_patches(shown: np.ndarray, along: Axis) -> None:
+    """Each swath of a full scan keeps the lines that show part of them, and others are removed."""
     sweeps = full_sweeps(GRID, CAMERA, along)
     cut = sweeps_over(sweeps, GRID, CAMERA, shown)
     before, after = (patches_shown(one, GRID, CAMERA) for one in (sweeps, cut))
@@ -230,15 +230,15 @@ def test_every_patch_that_was_shown_still_is(shown: np.ndarray, along: Axis) -> 
 
 
 @given(blocks)
-def test_lines_stay_where_they_lie(shown: np.ndarray) -> None:
-    """A coarse sweep that is cut holds positions that the whole one does, and no others."""
+def test_cutting_a_coarse_sweep_keeps_its_positions(shown: np.ndarray) -> None:
+    """A coarse sweep that is cut has only positions of the whole one."""
     whole = {sweep.name: sweep for sweep in uniform_sweeps(GRID, CAMERA, "x", step=4)}
     for sweep in sweeps_over(list(whole.values()), GRID, CAMERA, shown):
         assert np.isin(sweep.held_px(), whole[sweep.name].held_px()).all()
 
 
-def test_swaths_beside_the_area_are_left_out() -> None:
-    """A corner of the field needs one strip of three."""
+def test_swaths_outside_of_the_area_are_left_out() -> None:
+    """A corner of the field needs one of three swaths, no patch needs none."""
     sweeps = full_sweeps(GRID, CAMERA, "x")
     assert len(sweeps) == 3
     assert [one.name for one in sweeps_over(sweeps, GRID, CAMERA, shown_of(0, 0, 3, 3))] == ["full-0"]
@@ -246,7 +246,7 @@ def test_swaths_beside_the_area_are_left_out() -> None:
 
 
 def test_a_patch_has_all_lines_that_resampling_reads() -> None:
-    """From the line before its first pixel to two lines after its last, where the sweep has them."""
+    """Its lines reach from the one before its first pixel to two after its last, within the sweep."""
     for sweep in full_sweeps(GRID, CAMERA, "x"):
         for patch in GRID.every_patch()[::5]:
             down, across = GRID.patch_origin(np.array([patch]))[0]

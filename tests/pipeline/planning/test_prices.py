@@ -1,4 +1,4 @@
-"""Prices: what a sweep counts for in lines, samples, bytes and seconds, savings, and the least budget."""
+"""Prices: the lines, samples, bytes and seconds of a sweep, savings, and the choice of patches."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from pipeline.planning import coverage
 CAMERA, COST = LineCamera(), CostModel()
 
 
-def test_entries_have_a_ratio_unless_full_is_nothing():
-    """Done over full, or None, and the receipt's four keys."""
+def test_saving_entries_have_a_ratio_unless_full_is_zero():
+    """The ratio is done / full or None, and the receipt has four keys."""
     assert coverage.SavingEntry(3, 12).as_dict() == {"done": 3, "full": 12, "ratio": 0.25, "full_is": "predicted"}
     assert coverage.SavingEntry(3, 0).ratio is None
 
 
-def test_samples_beside_the_scene_are_not_counted():
-    """A line of 640 samples over a scene 100 px wide counts 100; lines above and below the scene count none."""
+def test_samples_outside_of_the_scene_are_not_counted():
+    """A line of 640 samples over a scene 100 px wide counts 100. Lines above and below the scene count none."""
     path = Sweep("a", "fine", "x", 0.0, -32.5, 66)
     assert coverage.count_samples([path], CAMERA, SceneGrid(60, 100, 16)) == 60 * 100
     assert coverage.count_samples([path], CAMERA, SceneGrid(60, 640, 16)) == 60 * 640
@@ -32,14 +32,14 @@ def test_samples_beside_the_scene_are_not_counted():
 
 @given(st.integers(1, 90), st.integers(1, 45), st.sampled_from(["x", "y"]))
 def test_a_full_scan_near_the_axis_samples_every_pixel_once(scan: int, half: int, along: str):
-    """One strip through the axis takes as many samples on the scene as it has pixels."""
+    """One swath through the axis has as many samples on the scene as the scene has pixels."""
     height, width = (scan, 2 * half) if along == "x" else (2 * half, scan)
     grid = SceneGrid(height, width, 8)
     assert coverage.count_samples(coverage.full_sweeps(grid, CAMERA, along), CAMERA, grid) == height * width
 
 
-def test_the_ledger_compares_like_with_like():
-    """The full scan against itself is 1 in every entry; nothing against it is 0."""
+def test_savings_are_relative_to_the_full_scan():
+    """The full scan relative to itself is 1 in every entry, no sweep relative to it is 0."""
     grid = SceneGrid(100, 700, 16)
     full = coverage.full_sweeps(grid, CAMERA, "x")
     same = coverage.capture_savings(full, full, CAMERA, grid)
@@ -52,8 +52,8 @@ SCORES = st.lists(st.sampled_from([0.0, 1.0, 2.0, -1.0, np.nan, np.inf, -np.inf]
 
 
 @given(SCORES, st.data())
-def test_a_smaller_choice_is_the_beginning_of_a_larger_one(values: list[float], data: st.DataObject):
-    """Top K lies in top K + 1, whatever the scores, and no patch comes twice."""
+def test_a_smaller_choice_of_patches_begins_a_larger_one(values: list[float], data: st.DataObject):
+    """The best K patches begin the best K + 1 for any scores, NaN included, and no patch occurs twice."""
     large = data.draw(st.integers(0, len(values)))
     small = data.draw(st.integers(0, large))
     chosen = coverage.select_patches(np.array(values), large)
@@ -62,15 +62,15 @@ def test_a_smaller_choice_is_the_beginning_of_a_larger_one(values: list[float], 
 
 
 def test_only_valid_patches_are_chosen():
-    """Masked patches are neither chosen nor counted, however good."""
+    """Masked patches are neither chosen nor counted, however high their score."""
     valid = np.array([False, True, True, False])
     assert coverage.select_patches(np.array([9.0, 1, 2, 9]), 2, valid).tolist() == [2, 1]
     assert len(coverage.frame_patches(np.arange(64.0), 0.35, np.arange(64) < 20)) == 7
 
 
 @given(st.floats(0, 1), st.integers(0, 500))
-def test_counts_follow_fractions(fraction: float, valid: int):
-    """The count is within half a patch of the fraction and within the patches."""
+def test_patch_counts_follow_the_fraction(fraction: float, valid: int):
+    """The count is within half a patch of the fraction and at most the number of patches."""
     count = len(coverage.frame_patches(np.zeros(valid), fraction))
     assert abs(count - fraction * valid) <= 0.5 + 1e-9
     assert 0 <= count <= valid

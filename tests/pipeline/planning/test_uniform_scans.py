@@ -1,4 +1,4 @@
-"""Uniform scans: what they cost, what a record expects of them, and the choice within limits."""
+"""Uniform scans: their costs, the scores that a record expects, and the choice within limits."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ SCANS = uniform_scans(RECORD, SWEEPS, CAMERA, COST, 270)
 CHEAPEST = min(scan.seconds for scan in SCANS)
 
 
-def test_lines_of_a_scan_are_not_binned_and_cover_the_field() -> None:
-    """Every pixel across is seen by half or a quarter of the lines; with step 1 they are those of the full scan."""
+def test_lines_of_a_uniform_scan_are_unbinned_and_cover_the_field() -> None:
+    """Steps 2 and 4 see a half and a quarter of the samples; step 1 has the lines of the full scan."""
     full = full_sweeps(GRID, CAMERA, "x")
     assert [replace(one, name="", kind="fine") for one in SWEEPS[1]] == [replace(one, name="") for one in full]
     for step, sweeps in SWEEPS.items():
@@ -51,16 +51,16 @@ def test_lines_of_a_scan_are_not_binned_and_cover_the_field() -> None:
         assert seen == 256 * 320 / step
 
 
-def test_a_record_is_read_between_its_exposures_by_their_logarithm() -> None:
-    """At an exposure of the table its own figure, half-way by the logarithm the mean, for maps and classes alike."""
+def test_a_record_interpolates_scores_by_the_logarithm_of_exposure() -> None:
+    """Exposures of the table have their own scores, the logarithmic middle has the mean, for mIoU and classes alike."""
     assert RECORD.expected(2, 25.0) == pytest.approx({MIOU: 0.91, "weed": 0.65})
     assert RECORD.expected(1, 12.5) == pytest.approx({MIOU: 0.91, "weed": 0.65})
     assert RECORD.expected(1, 400.0) == RECORD.expected(1, 100.0)
 
 
 @pytest.mark.parametrize("light", [0.125, 0.2, 0.7])
-def test_in_less_light_longer_exposures_score_the_same(light: float) -> None:
-    """An exposure counts by its light; those offered range up to the camera's own light, and each is known."""
+def test_longer_exposures_in_less_light_score_the_same(light: float) -> None:
+    """An exposure counts by its light. The longest offered one is the camera's own divided by the light fraction."""
     dim = ScanPerformance.read(CONTENT, light)
     assert dim.expected(2, 25.0 / light) == pytest.approx(RECORD.expected(2, 25.0))
     assert dim.offered_ms(CAMERA) == pytest.approx((6.25 / light, 100 / light))
@@ -75,8 +75,8 @@ def test_in_less_light_longer_exposures_score_the_same(light: float) -> None:
 
 
 @given(seconds=st.floats(0.1, 60.0))
-def test_a_scan_ends_in_time_and_no_longer_exposure_would(seconds: float) -> None:
-    """The longest exposure that ends in time is offered, to a tenth of a millisecond; more seconds never give less."""
+def test_a_scan_has_the_longest_exposure_that_ends_in_time(seconds: float) -> None:
+    """The exposure is the longest to 0.1 ms, and more seconds never choose a worse scan."""
     offered = uniform_scans(RECORD, SWEEPS, CAMERA, COST, 270, seconds=seconds)
     assert all(6.2 <= scan.exposure_ms <= 100 for scan in offered)
     for step in (1, 2, 4):
@@ -88,7 +88,7 @@ def test_a_scan_ends_in_time_and_no_longer_exposure_would(seconds: float) -> Non
         with pytest.raises(BudgetError, match=r"--seconds .*the least is \S+ s") as refused:
             choose_scan(offered, seconds)
         named = float(re.findall(r"the least is (\S+) s", str(refused.value))[0])
-        assert choose_scan(offered, named).seconds <= named  # the time that the message names suffices
+        assert choose_scan(offered, named).seconds <= named  # the duration in the message suffices
         return
     chosen = choose_scan(offered, seconds)
     assert chosen.seconds <= seconds
@@ -96,21 +96,21 @@ def test_a_scan_ends_in_time_and_no_longer_exposure_would(seconds: float) -> Non
     assert choose_scan(more, 2 * seconds).expected[MIOU] >= chosen.expected[MIOU] - LOSS
 
 
-def test_the_longest_exposure_in_time_may_be_the_shortest_there_is() -> None:
-    """Rounded to the next tenth of a millisecond it would end too late."""
+def test_the_longest_exposure_in_time_may_be_the_shortest_allowed() -> None:
+    """Rounding it up to the next tenth of a millisecond would end too late."""
     seconds = priced_scan(RECORD, SWEEPS[1], CAMERA, COST, 270, 16.23).seconds
     assert longest_exposure(seconds, SWEEPS[1], CAMERA, COST, 16.23, 100.0) == 16.23
 
 
-def test_nothing_is_spent_that_does_not_pay() -> None:
-    """Where a record no longer grows with the exposure, the shortest of those as good is taken."""
+def test_the_shortest_of_equally_good_exposures_is_chosen() -> None:
+    """Beyond 25 ms the recorded score grows by 0.05 points only, so the scan uses 25 ms."""
     flat = replace(RECORD, scores={MIOU: np.array([[0.9, 0.94, 0.9405], [0.8, 0.8, 0.8], [0.7, 0.7, 0.7]])})
     chosen = choose_scan(uniform_scans(flat, SWEEPS, CAMERA, COST, 270))
     assert (chosen.step, chosen.exposure_ms) == (1, 25.0)
 
 
-def test_the_camera_bounds_exposures_and_its_rate_the_seconds() -> None:
-    """No exposure beyond the camera's own; below its shortest frame less light saves no time, and is not taken."""
+def test_camera_limits_exposures_and_frame_rate() -> None:
+    """No exposure exceeds the camera's own. One below the shortest frame saves no time and is not chosen."""
     short = replace(CAMERA, exposure_ms=50.0)
     assert max(scan.exposure_ms for scan in uniform_scans(RECORD, SWEEPS, short, COST, 270)) == 50.0
     assert uniform_scans(RECORD, SWEEPS, replace(CAMERA, exposure_ms=5.0), COST, 270) == []
@@ -121,16 +121,16 @@ def test_the_camera_bounds_exposures_and_its_rate_the_seconds() -> None:
 
 
 @pytest.mark.parametrize("goals", [{MIOU: 0.85}, {"weed": 0.55}, {MIOU: 0.9, "weed": 0.7}])
-def test_a_goal_is_reached_as_cheaply_as_it_can_be(goals: dict[str, float]) -> None:
-    """The choice reaches it, and no cheaper scan does."""
+def test_a_goal_is_reached_by_the_cheapest_scan(goals: dict[str, float]) -> None:
+    """The chosen scan reaches the goal, and no cheaper one does."""
     chosen = choose_scan(SCANS, goals=goals)
     assert all(chosen.expected[name] >= least for name, least in goals.items())
     cheaper = [scan for scan in SCANS if scan.seconds < chosen.seconds]
     assert all(any(scan.expected[name] < least for name, least in goals.items()) for scan in cheaper)
 
 
-def test_goals_out_of_reach_name_the_best_there_is() -> None:
-    """Beyond the record, or of two goals that no one scan has: the best; beyond the time: what it takes."""
+def test_unreachable_goals_name_the_best_scan() -> None:
+    """Goals beyond the record, alone or together, name the best scores. Goals beyond the time name its duration."""
     with pytest.raises(BudgetError, match=r"reaches --goal 95, where the best scan has 94\.0; ask for less"):
         choose_scan(SCANS, goals={MIOU: 0.95})
     with pytest.raises(BudgetError, match=r"--goal takes \d+\.\d+ s .*, --seconds is") as refused:
@@ -143,8 +143,8 @@ def test_goals_out_of_reach_name_the_best_there_is() -> None:
         choose_scan(torn, goals={MIOU: 0.93, "weed": 0.93})
 
 
-def test_the_reference_is_the_cheapest_scan_that_is_nearly_as_good_as_any() -> None:
-    """Half a point of mIoU below the best at most, and dearer than no other such scan."""
+def test_reference_is_the_cheapest_scan_near_the_best() -> None:
+    """The reference is at most half a point of mIoU below the best scan; every cheaper scan is further below."""
     reference = reference_scan(SCANS)
     assert reference.expected[MIOU] >= 0.94 - REFERENCE_LOSS
     assert all(one.expected[MIOU] < 0.94 - REFERENCE_LOSS for one in SCANS if one.seconds < reference.seconds)

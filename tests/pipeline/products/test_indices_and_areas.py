@@ -1,4 +1,4 @@
-"""Products of maps: spectral indices by hand, bands by wavelength, refusals, and areas with their errors."""
+"""Products of maps: spectral indices worked out by hand, bands by wavelength, refusals, and areas with errors."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FINE_NM = np.arange(400.0, 1000.0, 5.0)
     ],
 )
 def test_an_index_is_its_papers_formula_of_the_nearest_bands(name: str, nm: dict[float, float], value: float) -> None:
-    """Worked out by hand; every other band of the cube holds what would spoil it."""
+    """The values are worked out by hand. Every other band of the cube holds 0.9, which would change the result."""
     index, cube = find_index(name), np.full((1, 2, len(FINE_NM)), 0.9)
     for centre, level in nm.items():
         cube[..., centre == FINE_NM] = level
@@ -33,8 +33,8 @@ def test_an_index_is_its_papers_formula_of_the_nearest_bands(name: str, nm: dict
     np.testing.assert_allclose(index_values(index, cube[..., bands], FINE_NM[bands].tolist()), value, rtol=1e-6)
 
 
-def test_what_is_dark_missing_or_divided_by_zero_is_nan() -> None:
-    """A pixel of which the bands' mean is below 1 % of white, one without a value, and one where the formula ends."""
+def test_dark_missing_and_divided_by_zero_pixels_are_nan() -> None:
+    """Dark pixels have a mean of their bands below 1 % of white."""
     index = find_index("MCARI")  # divides by red
     cube = np.array([[[0.2, 0.1, 0.1], [0.01, 0.005, 0.01], [0.2, np.nan, 0.1], [0.2, 0.0, 0.1]]])
     found = index_values(index, cube, [700, 670, 550])
@@ -43,25 +43,25 @@ def test_what_is_dark_missing_or_divided_by_zero_is_nan() -> None:
     np.testing.assert_array_equal(scaled, index_values(find_index("NDVI"), cube[..., :2], [835, 665]))
 
 
-def test_a_cube_without_a_band_is_refused_with_what_is_wanted() -> None:
-    """Which band is missing, its range, and what the cube has."""
+def test_a_cube_without_a_required_band_is_refused() -> None:
+    """The message names the missing band's range and the cube's wavelengths."""
     with pytest.raises(WavelengthError, match=r"NDVI wants .*760 to 900 nm, .*at 460, 550, 640 nm; leave NDVI out"):
         pick_bands(find_index("NDVI"), [460, 550, 640])
-    assert pick_bands(find_index("MCARI"), [550, 667, 690, 712]) == (3, 1, 0)  # 690 is nearer to 700, and no red edge
+    assert pick_bands(find_index("MCARI"), [550, 667, 690, 712]) == (3, 1, 0)  # 690 is nearer, but no red edge
 
 
 @pytest.mark.parametrize(
     ("name", "words"),
     [("NDVY", "like it: .*NDVI"), ("kNDVI", "needs kNN, which no camera gives"), ("RFDI", "which no camera gives")],
 )
-def test_what_is_no_index_of_a_camera_is_refused(name: str, words: str) -> None:
-    """Unknown names with those like them; radar and kernels with what they need."""
+def test_indices_that_a_camera_cannot_give_are_refused(name: str, words: str) -> None:
+    """Unknown names come with similar ones, radar and kernel indices with their requirements."""
     with pytest.raises(SettingsError, match=words):
         find_index(name)
 
 
 def test_an_index_of_ratios_needs_no_reflectance() -> None:
-    """Told from the formula itself; what is white in a cube tells whether it holds reflectance."""
+    """The formula decides whether an index needs reflectance. The white level of a cube shows whether it has it."""
     assert [find_index(name).wants_reflectance for name in ("NDVI", "PRI", "SAVI", "EVI", "MCARI")] == [
         False,
         False,
@@ -75,14 +75,14 @@ def test_an_index_of_ratios_needs_no_reflectance() -> None:
     assert white_level(np.linspace(0, 0.01, 500)) < 0.01  # radiance
 
 
-# Olofsson et al. 2014, table 8: rows are mapped classes there, columns what the reference says
+# Olofsson et al. 2014, table 8: rows are mapped classes there, columns reference classes
 EXAMPLE = np.array([[66, 0, 5, 4], [0, 55, 8, 12], [1, 0, 153, 11], [2, 1, 9, 313]])
 MAPPED = np.array([200_000, 150_000, 3_200_000, 6_450_000]) / 1e7
 HECTARES_A_PIXEL = 0.09
 
 
-def test_the_stratified_estimate_is_that_of_its_paper() -> None:
-    """Deforestation: 21158 ha with a 95 % interval of 6158 ha, as printed there."""
+def test_stratified_area_estimate_equals_the_paper() -> None:
+    """Deforestation is 21158 ha with a 95 % interval of 6158 ha, as printed in the paper."""
     fractions, errors = stratified_fractions(MAPPED, EXAMPLE.T)
     hectares, intervals = fractions * 1e7 * HECTARES_A_PIXEL, 1.96 * errors * 1e7 * HECTARES_A_PIXEL
     assert hectares[0] == pytest.approx(21_158, abs=1)
@@ -90,8 +90,8 @@ def test_the_stratified_estimate_is_that_of_its_paper() -> None:
     assert hectares.sum() == pytest.approx(900_000)
 
 
-def test_a_mapped_class_with_one_judged_pixel_has_no_estimate() -> None:
-    """One pixel has no spread to tell an error by; a class that is not mapped needs none."""
+def test_a_mapped_class_with_one_reference_pixel_has_no_estimate() -> None:
+    """One pixel has no variance for an error estimate. A class that is not mapped needs none."""
     counts = np.array([[8, 1], [2, 0]])
     for estimate in stratified_fractions([0.9, 0.1], counts):
         assert np.isnan(estimate).all()

@@ -14,7 +14,7 @@ CAMERA = LineCamera()
 
 
 def aim(along_px: np.ndarray | float, scan_px: np.ndarray) -> np.ndarray:
-    """Mirror positions (line, 2) that look at points given in px along the line and the scan."""
+    """Return mirror positions (line, 2) that look at points given in px along the line and the scan."""
     tangents = np.stack(np.broadcast_arrays(along_px, scan_px), axis=-1) * CAMERA.ifov_rad
     return direction_to_position(scene_to_direction(tangents))
 
@@ -22,7 +22,7 @@ def aim(along_px: np.ndarray | float, scan_px: np.ndarray) -> np.ndarray:
 def geolocation(
     position: np.ndarray, camera: LineCamera, points_px: np.ndarray, *, along: Axis, binning: int = 1
 ) -> np.ndarray:
-    """Line and sample at which a sweep that runs forward saw points (..., 2); a knot for every line."""
+    """Return line and sample at which a forward sweep sees points (..., 2), with a knot for every line."""
     scan, across, lines = line_centres(position, camera)
     steps = np.diff(scan)
     width = float(np.median(steps)) if len(steps) else camera.ifov_rad * binning

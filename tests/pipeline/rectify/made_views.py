@@ -1,4 +1,4 @@
-"""Two views of one place, a shift apart: random waves, and crop rows."""
+"""Two views of one place, shifted: random waves, and crop rows."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ ROW_PX = 12.0
 def wave_views(
     seed: int, shape: tuple[int, int], shift: Floats, snr: float, periods: tuple[float, float]
 ) -> tuple[Floats, Floats]:
-    """Sixty random waves with periods spread evenly in log; ``snr`` is the deviation over that of the noise."""
+    """Return two views of sixty random waves with log-uniform periods; ``snr`` is their deviation over the noise's."""
     rng = np.random.default_rng(seed)
     period = np.exp(rng.uniform(*np.log(periods), 60))
     turn, phase = rng.uniform(0, 2 * np.pi, (2, 60))
@@ -29,7 +29,7 @@ def wave_views(
 
 
 def row_views(seed: int, shape: tuple[int, int], shift: Floats, snr: float, gaps: float) -> tuple[Floats, Floats]:
-    """Crop rows 12 px apart along the first axis, a fraction ``gaps`` of their length bare; shifts of up to 50 px."""
+    """Return two views of crop rows 12 px apart along axis 0, ``gaps`` of them bare; shifts of up to 50 px."""
     rng = np.random.default_rng(seed)
     stand = np.ones((int(shape[1] / ROW_PX) + 12, shape[0] + 120))
     for row in stand:

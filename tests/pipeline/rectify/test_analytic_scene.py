@@ -1,4 +1,4 @@
-"""Acceptance: a scene known in closed form, swept, calibrated, resampled and mosaicked, against its truth."""
+"""Acceptance: a scene with a closed form is swept, calibrated, resampled, mosaicked and compared with its truth."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from pipeline.simulator.simulated import SimulatedSource
 from tests.pipeline.rectify.aiming import geolocation
 from tests.pipeline.simulator.small_scenes import effects_on, made_scene
 
-CAMERA = LineCamera(bits=14, electrons_per_dn=1.0)  # finer steps than the rig's: rounding does not blur the figure
+CAMERA = LineCamera(bits=14, electrons_per_dn=1.0)  # finer steps than the rig's, so that rounding adds no error
 FULL = 15_000.0
 BESIDE = 24  # px
 
@@ -35,19 +35,19 @@ class Waves:
     height: np.ndarray
 
     def pixels(self) -> RasterScene:
-        """The scene that is looked at: wider by what lines see beside the field."""
+        """Return the scene in pixels, wider than the field by the margin that lines see next to it."""
         y, x = np.mgrid[-BESIDE : self.shape[0] + BESIDE, -BESIDE : self.shape[1] + BESIDE]
         values = self.field_of(y.ravel(), x.ravel()).reshape(*y.shape, 2)
         return made_scene(values, np.full(2, FULL), [500.0, 700.0])
 
     def field_of(self, y: np.ndarray, x: np.ndarray, damping: np.ndarray | float = 1.0) -> np.ndarray:
-        """Values (n, 2) at points, each wave damped by a factor; even waves are in band 0, odd ones in band 1."""
+        """Return values (n, 2) at points, each wave damped by a factor; even waves are in band 0, odd in band 1."""
         turns = np.multiply.outer(y, self.frequency[:, 0]) + np.multiply.outer(x, self.frequency[:, 1])
         waves = np.cos(2 * np.pi * turns + self.phase) * (self.height * damping)
         return 0.5 + np.stack([waves[:, ::2].sum(axis=1), waves[:, 1::2].sum(axis=1)], axis=1)
 
     def damping(self, along: Axis, step: int) -> NDArray[np.float64]:
-        """What pixels, slit, detector, held positions and binned samples leave of each wave, in closed form."""
+        """Return each wave's damping by pixels, slit, detector, held positions and binning, in closed form."""
         scan, line = self.frequency.T if along == "x" else self.frequency.T[::-1]
         held = np.arange(step) - (step - 1) / 2
         smear, binned = (np.cos(2 * np.pi * np.outer(f, held)).mean(axis=1) for f in (scan, line))
@@ -57,7 +57,7 @@ class Waves:
 
 
 def waves(shape: tuple[int, int], period_px: tuple[float, float], slope: float, count: int = 12) -> Waves:
-    """Waves of evenly spread periods, heights growing as period ** slope (1 is the fall of natural scenes)."""
+    """Return waves of evenly spread periods and heights of period ** slope (1 is the spectrum of natural scenes)."""
     rng = np.random.default_rng(7)
     period, angle = np.linspace(*period_px, count), rng.uniform(0, np.pi, count)
     frequency = np.stack([np.sin(angle), np.cos(angle)], axis=1) / period[:, None]
@@ -66,7 +66,7 @@ def waves(shape: tuple[int, int], period_px: tuple[float, float], slope: float, 
 
 
 def rectified(scene: Waves, swaths: list[float], along: Axis, step: int) -> tuple[np.ndarray, np.ndarray]:
-    """The mosaic of noise-free sweeps and the closed-form truth at the same grid pixels, (y, x, 2) each."""
+    """Return the mosaic of noise-free sweeps and the closed-form truth at the same grid pixels, (y, x, 2) each."""
     shape = (scene.shape[0] // step, scene.shape[1] // step)
     parts = [rectified_swath(scene, swath, along, step) for swath in swaths]
     y, x = (axis.ravel() * step + (step - 1) / 2 for axis in np.mgrid[: shape[0], : shape[1]])
@@ -75,7 +75,7 @@ def rectified(scene: Waves, swaths: list[float], along: Axis, step: int) -> tupl
 
 
 def rectified_swath(scene: Waves, swath: float, along: Axis, step: int) -> MosaicPart:
-    """One sweep on the grid of the scene: captured, calibrated, looked up, resampled."""
+    """Return one sweep on the scene's grid: captured, calibrated, geolocated and resampled."""
     source = SimulatedSource(scene.pixels(), Rig(CAMERA), chosen=effects_on("rotation", "slit", "smear"))
     length = scene.shape[0] if along == "x" else scene.shape[1]
     margin = (3 + int(abs(swath) * 330 * CAMERA.ifov_rad / step)) * step  # for the line's rotation, and for taps
@@ -98,13 +98,13 @@ def rectified_swath(scene: Waves, swath: float, along: Axis, step: int) -> Mosai
         ((120, 900), "x", [-200, 200], (4, 40), 1.0, 1),
         ((900, 120), "y", [-200, 200], (4, 40), 1.0, 1),
         ((40, 1800), "x", [-620, 0, 620], (4, 40), 1.0, 1),
-        ((120, 900), "x", [-200, 200], (6, 40), 0.0, 1),  # equally high; a 4-px wave alone is too short for four taps
+        ((120, 900), "x", [-200, 200], (6, 40), 0.0, 1),  # equal heights; a 4-px wave alone is too short for four taps
         ((240, 900), "x", [-200, 200], (16, 160), 1.0, 4),  # 4 to 40 of the coarse pass's own pixels
     ],
 )
-def test_mosaic_meets_the_analytic_scene(
+def test_mosaic_equals_the_analytic_scene(
     shape: tuple[int, int], along: Axis, swaths: list[float], periods: tuple[float, float], slope: float, step: int
 ) -> None:
-    """Waves with the fall of natural scenes, or none, come back within 0.5 % of their spread, seams included."""
+    """Waves with the spectrum of natural scenes, or of equal heights, err by less than 0.5 % of their spread."""
     got, truth = rectified(waves(shape, periods, slope), swaths, along, step)
     assert np.sqrt(((got - truth) ** 2).mean()) < 0.005 * truth.std(axis=(0, 1)).mean()

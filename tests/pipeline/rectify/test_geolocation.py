@@ -1,4 +1,4 @@
-"""Lookup: the inverse of the exact rays over the whole disk for any path; of a grid within the bound that it states."""
+"""Geolocation inverts the exact rays for any path over the whole disk; a geolocation grid keeps to its error bound."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ EVERYTHING = (slice(None), slice(None))
 
 
 def see(position: np.ndarray, sample: np.ndarray, binning: int = 1) -> np.ndarray:
-    """Scene points (n, 2), y and x in px, that samples see from positions, by reflecting the camera's rays."""
+    """Return scene points (n, 2), y and x in px, that samples see from positions, by reflecting the camera's rays."""
     slope = ((sample + 0.5) * binning - CAMERA.samples / 2) * CAMERA.ifov_rad
     ray = np.stack([np.zeros_like(slope), slope, np.ones_like(slope)], axis=-1)
     return direction_to_scene(reflect(ray, position_to_normal(position)))[:, ::-1] / CAMERA.ifov_rad
@@ -30,8 +30,8 @@ def see(position: np.ndarray, sample: np.ndarray, binning: int = 1) -> np.ndarra
 
 @given(st.floats(-5000, 5000), st.floats(-5000, 4600), st.sampled_from([1, 2, 4]), st.integers(0, 99))
 @settings(max_examples=15, deadline=None)
-def test_lookup_undoes_the_rays(swath: float, start: float, binning: int, seed: int) -> None:
-    """What a sample between lines saw is found at that line and sample to 1e-7 px, anywhere in the disk."""
+def test_geolocation_inverts_the_rays(swath: float, start: float, binning: int, seed: int) -> None:
+    """The view of a sample between lines is found at that line and sample to 1e-7 px, anywhere in the disk."""
     rng = np.random.default_rng(seed)
     lines, samples = 60, CAMERA.samples // binning
     at = np.stack([rng.uniform(0, lines - 1, 30), rng.uniform(0, samples - 1, 30)], axis=-1)
@@ -40,8 +40,8 @@ def test_lookup_undoes_the_rays(swath: float, start: float, binning: int, seed: 
     np.testing.assert_allclose(found, at, atol=1e-7)
 
 
-def test_points_off_the_sweep_are_nan() -> None:
-    """A sweep reaches half a line and half a sample beyond its outermost centres; all else, however far, is NaN."""
+def test_points_outside_of_the_sweep_are_nan() -> None:
+    """A sweep reaches half a line and half a sample beyond its outermost centres. Points further away are NaN."""
     position = aim(0.0, np.arange(10.0))
     inside = np.array([[-0.49, 0], [9.49, 0], [4, 319.9], [4, -319.9]])
     outside = np.array([[-0.6, 0], [9.6, 0], [4, 321], [4, -321], [9000, 9000], [4, 11_000], [-9000, -11_000]])
@@ -51,8 +51,8 @@ def test_points_off_the_sweep_are_nan() -> None:
 
 @given(st.floats(-5000, 5000), st.integers(0, 99))
 @settings(max_examples=15, deadline=None)
-def test_what_is_found_was_seen(swath: float, seed: int) -> None:
-    """No point of a field wider than the mirror's disk is found where its ray did not pass."""
+def test_geolocated_points_lie_on_their_rays(swath: float, seed: int) -> None:
+    """In a field wider than the mirror's disk, the ray of every found line and sample passes its point."""
     scan = np.linspace(-5000, 4500, 300)
     position = aim(swath, scan)
     points = np.random.default_rng(seed).uniform(-20_000, 20_000, (20_000, 2))
@@ -67,8 +67,8 @@ def test_what_is_found_was_seen(swath: float, seed: int) -> None:
 
 @given(st.integers(0, 999), st.floats(0, 0.4), st.sampled_from([0.0, 2600.0, -4000.0]))
 @settings(max_examples=15, deadline=None)
-def test_linear_scene_comes_back_from_any_path(seed: int, amount: float, swath: float) -> None:
-    """What lines that lie unevenly and beside their strip saw of y and x is resampled to y and x, to float32."""
+def test_a_linear_scene_is_recovered_from_any_path(seed: int, amount: float, swath: float) -> None:
+    """Lines at uneven distances and next to their swath, which see y and x, are resampled to y and x, to float32."""
     off = np.random.default_rng(seed).uniform(-amount, amount, (2, 120))
     (scan_path,) = make_scan_paths(aim(swath + off[0], np.arange(120.0) + off[1]), CAMERA, step_px=1.0)
     across, scan = scan_path.across[:, None] / CAMERA.ifov_rad, scan_path.scan[:, None] / CAMERA.ifov_rad
@@ -85,13 +85,13 @@ def test_linear_scene_comes_back_from_any_path(seed: int, amount: float, swath: 
 
 
 def scan_path_of(along_px: np.ndarray | float, scan_px: np.ndarray) -> ScanPath:
-    """The one track of lines that look at points given in px along the line and the scan."""
+    """Return the single scan path of lines that look at points given in px along the line and the scan."""
     (scan_path,) = make_scan_paths(aim(along_px, scan_px), CAMERA)
     return scan_path
 
 
 def exact(scan_path: ScanPath, along: str = "x", **grid: Any) -> np.ndarray:
-    """The grid's coordinates looked up one by one."""
+    """Return the grid's coordinates, geolocated point by point."""
     grid = GRID | grid
     y, x = (grid["origin_px"][axis] + grid["spacing_px"] * np.arange(grid["shape"][axis]) for axis in (0, 1))
     points = np.stack(np.broadcast_arrays(y[:, None], x[None, :]), axis=-1)
@@ -111,8 +111,8 @@ PATHS = {
 
 @pytest.mark.parametrize("name", PATHS)
 @pytest.mark.parametrize("tie", [16, 7])
-def test_error_is_within_the_bound(name: str, tie: int) -> None:
-    """On every kind of path the error of a pixel is within the bound, and the bound within the tolerance."""
+def test_interpolation_error_is_within_the_bound(name: str, tie: int) -> None:
+    """On every kind of path the error of a pixel is within the stated bound, and the bound within the tolerance."""
     scan_path = scan_path_of(*PATHS[name])
     table = tie_table(scan_path, CAMERA, along="x", tie=tie, **GRID)
     error = np.abs(table.coordinates(*EVERYTHING) - exact(scan_path))
@@ -120,8 +120,8 @@ def test_error_is_within_the_bound(name: str, tie: int) -> None:
     assert np.isfinite(error).mean() > 0.4
 
 
-def test_spacing_follows_the_path() -> None:
-    """Ties stay 16 px apart on even and drifting paths, and come down to every pixel where one line is out of place."""
+def test_tie_point_spacing_follows_the_path() -> None:
+    """Tie points are 16 px apart on even and drifting paths, and at every pixel if one line is out of place."""
     spacing = {name: tie_table(scan_path_of(*path), CAMERA, along="x", **GRID).spacing for name, path in PATHS.items()}
     assert spacing["even"] == spacing["drifting"] == 16
     assert spacing["one line out of place"] == spacing["jittered"] == 1
@@ -130,8 +130,8 @@ def test_spacing_follows_the_path() -> None:
 
 @given(st.floats(-4500, 4500), st.floats(-4500, 4000), st.sampled_from(["x", "y"]), st.sampled_from([1.0, 3.0]))
 @settings(max_examples=15, deadline=None)
-def test_bound_holds_over_the_field(swath: float, start: float, along: str, spacing: float) -> None:
-    """Anywhere in the field, in both orientations, the table keeps to its bound, and loses no pixel well inside."""
+def test_error_bound_holds_over_the_field(swath: float, start: float, along: str, spacing: float) -> None:
+    """The interpolation error keeps to its bound in both orientations, and no pixel well inside of a sweep is lost."""
     scan_path = scan_path_of(swath, start + LINES)
     corner = (start - 9.3, swath - 330.7) if along == "x" else (swath - 330.7, start - 9.3)
     size = (int(150 / spacing), int(660 / spacing))
@@ -143,8 +143,8 @@ def test_bound_holds_over_the_field(swath: float, start: float, along: str, spac
     assert np.isfinite(found[inside]).all()
 
 
-def test_knots_that_nothing_saw_are_left_out() -> None:
-    """Around lost lines the table is NaN where the geolocation grid is."""
+def test_lost_lines_are_nan_in_the_geolocation_grid() -> None:
+    """Around lost lines the interpolated coordinates are NaN for the same pixels as the exact ones."""
     scan_path = scan_path_of(2600.0, LINES[(LINES < 40) | (LINES > 44)])
     table = tie_table(scan_path, CAMERA, along="x", **GRID)
     assert table.spacing == 16
@@ -152,8 +152,8 @@ def test_knots_that_nothing_saw_are_left_out() -> None:
     assert differs.mean() < 1e-4
 
 
-def test_scan_path_smaller_than_a_cell_is_not_lost() -> None:
-    """A single line between two rows of ties is found, and its cells count for the bound."""
+def test_a_scan_path_smaller_than_a_cell_is_found() -> None:
+    """A single line between two rows of tie points is found, and its cells count for the bound."""
     scan_path = scan_path_of(2600.0, np.array([24.0]))
     table = tie_table(scan_path, CAMERA, along="x", **GRID)
     found = table.coordinates(*EVERYTHING)
@@ -162,8 +162,8 @@ def test_scan_path_smaller_than_a_cell_is_not_lost() -> None:
 
 
 @pytest.mark.parametrize("tie", [16, 1])
-def test_only_what_the_scan_path_can_have_seen_is_kept(tie: int) -> None:
-    """Of a large grid the table keeps the part around the track, and answers for the rest with NaN."""
+def test_only_the_part_near_the_scan_path_is_kept(tie: int) -> None:
+    """Less than a quarter of a large grid is kept, and pixels of the rest are NaN."""
     scan_path = scan_path_of(*PATHS["even"])
     grid = GRID | {"origin_px": (-400.0, 1900.0), "shape": (1000, 1500)}
     table = tie_table(scan_path, CAMERA, along="x", tie=tie, **grid)

@@ -1,4 +1,4 @@
-"""Illumination of sweeps from what overlaps show twice: drift recovered, spectra kept, what nothing ties left at 1."""
+"""Illumination of sweeps from their overlaps: drift is recovered, spectra are kept, and separate sweeps stay at 1."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PLACE = (WAVELENGTH - 700) / 300
 
 
 def ratios_of(log_light: np.ndarray, error: float, seed: int = 0) -> list[LightRatio]:
-    """Ratios of neighbours with noise of a stated size."""
+    """Return light ratios of neighbouring sweeps with noise of a stated size."""
     rng = np.random.default_rng(seed)
     return [
         LightRatio(one, one + 1, step + rng.normal(0, error, len(step)), np.full(len(step), error))
@@ -35,14 +35,14 @@ def ratios_of(log_light: np.ndarray, error: float, seed: int = 0) -> list[LightR
 
 
 def smooth_lights(count: int) -> np.ndarray:
-    """Log lights that drift by colour, of mean 0 over the sweeps."""
+    """Return log lights that drift by colour and have a mean of 0 over the sweeps."""
     draws = np.random.default_rng(1).normal(0, [0.2, 0.1, 0.05, 0.02], (count, 4))
     lights = draws @ np.polynomial.legendre.legvander(PLACE, 3).T
     return lights - lights.mean(axis=0)
 
 
 def test_smooth_drift_is_recovered():
-    """From ratios with 1 % of noise per band, the light of every sweep comes back to 0.7 %: smoothness averages it."""
+    """With 1 % of noise per band the light of every sweep errs by 0.7 % rms, because smoothness averages the noise."""
     truth = smooth_lights(5)
     found = solve_lights(ratios_of(truth, 0.01), 5, WAVELENGTH)
     np.testing.assert_allclose(np.log(found.light), truth, atol=0.02)
@@ -51,8 +51,8 @@ def test_smooth_drift_is_recovered():
     np.testing.assert_allclose(found.gain(2) * found.light[2], 1, rtol=1e-6)
 
 
-def test_bands_without_light_take_no_part():
-    """NaN ratios and bands of large error neither spread nor bend the rest."""
+def test_bands_without_light_are_ignored():
+    """NaN ratios and bands of large error change neither their neighbours nor the rest."""
     truth = smooth_lights(3)
     ratios = ratios_of(truth, 1e-4)
     broken = [
@@ -66,8 +66,8 @@ def test_bands_without_light_take_no_part():
     np.testing.assert_allclose(np.log(solve_lights(broken, 3, WAVELENGTH).light), truth, atol=0.01)
 
 
-def test_sweeps_apart_keep_a_mean_of_one():
-    """A sweep in no ratio stays at 1 and is named; groups that nothing joins have a mean log light of 0 each."""
+def test_separate_sweeps_keep_a_mean_light_of_one():
+    """A sweep without a ratio stays at 1 and is named. Separate groups have a mean log light of 0 each."""
     truth = np.array([[0.1], [-0.1], [0.0], [0.3], [-0.3]]) * np.ones((1, 31))
     ratios = [ratio for ratio in ratios_of(truth, 1e-6) if 2 not in (ratio.reference, ratio.moving)]
     found = solve_lights(ratios, 5, WAVELENGTH)
@@ -76,8 +76,8 @@ def test_sweeps_apart_keep_a_mean_of_one():
     assert (solve_lights([], 2, WAVELENGTH).light == 1).all()
 
 
-def test_ratio_is_not_moved_by_noise_or_by_what_moved():
-    """Noise of a fifth of the light and a quarter of changed rows leave the ratio to 2 %."""
+def test_light_ratio_withstands_noise_and_changes():
+    """Noise of a fifth of the light and a quarter of changed rows leave the ratio right to 2 %."""
     rng = np.random.default_rng(2)
     ground = rng.uniform(0.2, 1.0, (40, 60, 3))
     moving = ground * np.array([1.1, 0.9, 1.0]) + rng.normal(0, 0.1, ground.shape)
@@ -91,8 +91,8 @@ def test_ratio_is_not_moved_by_noise_or_by_what_moved():
     assert np.isinf(dark.error).all()
 
 
-def test_drift_between_captured_sweeps_is_taken_out():
-    """Two simulated sweeps, one lit 20 % more and redder, agree to 0.5 % in every band once gains are in."""
+def test_drift_between_captured_sweeps_is_removed():
+    """Two simulated sweeps with different light and colour agree to 0.5 % in every band after correction."""
     camera, rng = LineCamera(samples=120), np.random.default_rng(3)
     values = np.kron(rng.uniform(0.3, 1, (15, 26, 8)), np.ones((8, 8, 1)))
     scene = raster_from_values(values, camera, name="t", wavelength_nm=np.linspace(400, 1000, 8))
@@ -125,8 +125,8 @@ def test_drift_between_captured_sweeps_is_taken_out():
 
 @pytest.mark.parametrize("period", [4.0, 8.0, 12.37])
 @pytest.mark.parametrize("along", ["x", "y"])
-def test_crop_rows_are_not_taken_for_light(period: float, along: Axis):
-    """Sweeps that meet crop rows of any period half a pixel apart have a ratio of 1, with lines along or across."""
+def test_crop_rows_do_not_change_the_light_ratio(period: float, along: Axis):
+    """Sweeps whose lines meet crop rows half a pixel apart have a ratio of 1, for any period and both orientations."""
     camera = LineCamera(samples=120)
     y, _ = np.mgrid[:150, :208].astype(float)
     rows = 0.3 + 0.25 * np.cos(2 * np.pi * y / period)

@@ -1,4 +1,4 @@
-"""Mosaic: feathering laws, pixels of the scene grid from simulated sweeps, at borders too, and lines that are kept."""
+"""Mosaics: weights of overlaps, pixels from simulated sweeps, and the cache of lines."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LINES, SAMPLES, BANDS = 300, 100, 2
 
 
 def part(seed: int, points: int = 20, bands: int = 4) -> MosaicPart:
-    """A sweep of random values with some points not reached, which hold NaN."""
+    """Return a part of random values; points that it does not reach are NaN."""
     rng = np.random.default_rng(seed)
     values, weight = rng.random((points, bands), np.float32), rng.random(points).astype(np.float32)
     weight[rng.random(points) < 0.3] = 0
@@ -27,8 +27,8 @@ def part(seed: int, points: int = 20, bands: int = 4) -> MosaicPart:
     return MosaicPart(values, weight, np.where(weight > 0, rng.uniform(0, 300, points), np.nan))
 
 
-def test_one_sweep_comes_back_bit_by_bit() -> None:
-    """The mosaic of one sweep is the sweep."""
+def test_a_mosaic_of_one_sweep_equals_the_sweep() -> None:
+    """The values are equal bit for bit, and points with a weight count 1."""
     alone = part(1)
     values, coverage = mosaic([alone])
     np.testing.assert_array_equal(values, alone.values)
@@ -37,8 +37,8 @@ def test_one_sweep_comes_back_bit_by_bit() -> None:
 
 @given(st.lists(st.integers(0, 10_000), min_size=1, max_size=4))
 @settings(max_examples=20, deadline=None)
-def test_spectra_are_convex_mixtures(seeds: list[int]) -> None:
-    """Every blended value lies between the values that went in, and NaN marks exactly what no sweep reached."""
+def test_blended_spectra_lie_between_their_sources(seeds: list[int]) -> None:
+    """Every value lies between the values of the sweeps. Exactly the points that no sweep reaches are NaN."""
     parts = [part(seed) for seed in seeds]
     values, coverage = mosaic(parts)
     assert (np.isnan(values).any(axis=1) == (coverage == 0)).all()
@@ -50,8 +50,8 @@ def test_spectra_are_convex_mixtures(seeds: list[int]) -> None:
 @pytest.mark.parametrize(
     ("weight", "edge_px", "fraction"), [((1, 1), (30.0, 10.0), 0.75), ((0.8, 1), (20.0, 20.0), 0.8 / 1.8)]
 )
-def test_weights_are_those_of_resampling_and_edge(weight: tuple, edge_px: tuple, fraction: float) -> None:
-    """A point counts by its distance to the sweep's edge, and by how much of the kernel was there."""
+def test_weights_combine_resampling_and_edge_distance(weight: tuple, edge_px: tuple, fraction: float) -> None:
+    """A point counts by its distance to the sweep's edge and by the valid fraction of its kernel."""
     ones, zeros = np.ones((1, 2), np.float32), np.zeros((1, 2), np.float32)
     parts = [
         MosaicPart(values, np.array([of], np.float32), np.array([edge]))
@@ -62,8 +62,8 @@ def test_weights_are_those_of_resampling_and_edge(weight: tuple, edge_px: tuple,
     assert coverage.tolist() == [2]
 
 
-def test_a_band_without_a_value_is_the_other_sweeps() -> None:
-    """Where one sweep lacks a band (a dead element), the other counts alone in it; where both do, it stays NaN."""
+def test_a_band_missing_in_one_sweep_is_taken_from_the_other() -> None:
+    """If one sweep lacks a band (a dead pixel), the other alone counts in it. If both do, it stays NaN."""
     one, other = np.ones((1, 3), np.float32), np.full((1, 3), 3, np.float32)
     one[0, 1:], other[0, 2] = np.nan, np.nan
     full, edge = np.ones(1, np.float32), np.array([20.0])
@@ -72,8 +72,8 @@ def test_a_band_without_a_value_is_the_other_sweeps() -> None:
     assert coverage.tolist() == [2]
 
 
-def test_a_point_alone_is_summed_as_among_others() -> None:
-    """One point of one band in many sweeps, some without a value, is mixed in the order in which many points are."""
+def test_a_single_point_is_blended_as_among_many() -> None:
+    """One point of one band in 12 sweeps, some without a value, has the same bits as in a block of 40 points."""
     rng, full = np.random.default_rng(5), np.ones(40, np.float32)
     parts = [
         MosaicPart(
@@ -91,8 +91,8 @@ def test_a_point_alone_is_summed_as_among_others() -> None:
     np.testing.assert_array_equal(np.concatenate(alone), whole)
 
 
-def test_very_edge_counts_where_nothing_else_reaches() -> None:
-    """A point exactly on a sweep's edge keeps its value, and on the edges of two it is their mean."""
+def test_a_point_on_the_edge_counts_if_it_is_alone() -> None:
+    """A point exactly on a sweep's edge keeps its value. On the edges of two sweeps it has their mean."""
     values, coverage = mosaic([MosaicPart(np.full((1, 1), 7, np.float32), np.ones(1, np.float32), np.zeros(1))])
     assert values[0, 0] == 7
     assert coverage[0] == 1
@@ -100,8 +100,8 @@ def test_very_edge_counts_where_nothing_else_reaches() -> None:
     assert mosaic(parts)[0].tolist() == [[3]]
 
 
-def test_edge_distance_is_to_the_nearest_border() -> None:
-    """Distances are taken to the outer edge of the outermost pixels; NaN stays NaN."""
+def test_edge_distance_is_that_to_the_nearest_border() -> None:
+    """Distances count to the outer edge of the outermost pixels. NaN stays NaN."""
     at = np.array([[0.0, 100], [50, 0], [99, 100], [50, 639.5], [50, 300], [np.nan, np.nan]])
     np.testing.assert_allclose(edge_distance(at, 100, 640), [0.5, 0.5, 0.5, 0, 49.5, np.nan])
 
@@ -110,7 +110,7 @@ CAMERA = LineCamera()
 
 
 class Numbered:
-    """Lines whose numbers say where they lie; notes what is read, slowly if asked."""
+    """Lines of consecutive numbers that record their reads, with an optional delay."""
 
     valid_line = np.ones(LINES, np.bool_)
     references = SimpleNamespace(dark=np.zeros((SAMPLES, BANDS), np.float32))
@@ -120,7 +120,7 @@ class Numbered:
         self.delay_s, self.asked = delay_s, list[tuple[int, int]]()
 
     def read(self, start: int, stop: int) -> np.ndarray:
-        """Whole lines."""
+        """Return whole lines."""
         time.sleep(self.delay_s)
         self.asked.append((start, stop))
         return self.raw[start:stop]
@@ -128,16 +128,16 @@ class Numbered:
 
 @given(st.integers(0, LINES - 1), st.integers(1, LINES), st.integers(0, SAMPLES - 1), st.integers(1, SAMPLES))
 @settings(max_examples=20, deadline=None)
-def test_a_window_is_that_part_of_the_lines(first: int, count: int, left: int, width: int) -> None:
-    """Any range of lines and samples comes back as it is, from however many blocks."""
+def test_a_window_is_its_part_of_the_lines(first: int, count: int, left: int, width: int) -> None:
+    """Any range of lines and samples is returned unchanged, over any number of blocks."""
     lines = Numbered()
     wanted, samples = slice(first, min(first + count, LINES)), slice(left, min(left + width, SAMPLES))
     window = LineCache(0).window(lines, wanted, samples)  # type: ignore[arg-type]
     np.testing.assert_array_equal(window, lines.raw[wanted, samples])
 
 
-def test_a_block_being_read_is_not_let_go() -> None:
-    """While one thread reads a block another fills a full cache: both get their lines."""
+def test_a_block_that_is_being_read_stays_in_the_cache() -> None:
+    """While one thread reads a block, another one fills the full cache: both get their lines."""
     started, go = threading.Event(), threading.Event()
 
     class Held(Numbered):
@@ -161,8 +161,8 @@ def test_a_block_being_read_is_not_let_go() -> None:
     np.testing.assert_array_equal(got[0], lines.raw[:4, :4])
 
 
-def test_threads_wait_for_one_read() -> None:
-    """Eight threads that want the same block at once cause one read, and all get it."""
+def test_threads_share_one_read() -> None:
+    """Eight threads that request the same block at once cause one read, and all get the lines."""
     lines, cache = Numbered(delay_s=0.05), LineCache(2**20)
     got: list[np.ndarray] = []
     threads = [
@@ -178,8 +178,8 @@ def test_threads_wait_for_one_read() -> None:
     assert len(got) == 8
 
 
-def test_a_failed_read_is_tried_again() -> None:
-    """An error reaches who asked, and does not stay in the cache."""
+def test_a_failed_read_is_retried() -> None:
+    """The error reaches the caller and is not cached, so the next request reads again."""
     lines, cache = Numbered(), LineCache(2**20)
     whole, lines.raw = lines.raw, None  # type: ignore[assignment]
     try:

@@ -1,4 +1,4 @@
-"""Overlaps of sweeps: broad-band images, windows of neighbours, and a pass registered against the truth."""
+"""Overlaps of sweeps: broad-band images, windows of neighbours, and a pass registered and compared with the truth."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ GRID = SceneGrid(260, 300, 16)
 
 
 def source_of(pointing: PointingErrors | None = None, bands: int = 2, *, turned: bool = False) -> SimulatedSource:
-    """A source over random waves of 6 to 60 px, wider than the grid by 40 px."""
+    """Return a source over random waves of 6 to 60 px, wider than the grid by 40 px on each side."""
     rng = np.random.default_rng(0)
     y, x = np.mgrid[: GRID.height + 80, : GRID.width + 80].astype(float)
     values = np.full(y.shape, 1.0)
@@ -45,7 +45,7 @@ def source_of(pointing: PointingErrors | None = None, bands: int = 2, *, turned:
 
 
 def registered(pointing: PointingErrors, along: Axis, **options: Any) -> tuple[list[Sweep], Registration]:
-    """A full pass over the grid with an overlap of 84 px, registered."""
+    """Return the sweeps of a full pass over the grid with an overlap of 84 px, and their registration."""
     grid = GRID if along == "x" else replace(GRID, height=GRID.width, width=GRID.height)
     sweeps = full_sweeps(grid, CAMERA, along, overlap_px=84)
     source = source_of(pointing, turned=along == "y")
@@ -54,8 +54,8 @@ def registered(pointing: PointingErrors, along: Axis, **options: Any) -> tuple[l
 
 
 @pytest.mark.parametrize("along", ["x", "y"])
-def test_pass_is_registered_to_a_tenth(along: Axis):
-    """Sweeps that look up to 10 px beside the plan are brought together to 0.2 px."""
+def test_a_pass_is_registered_to_a_fifth_of_a_pixel(along: Axis):
+    """Sweeps with pointing errors of up to 10 px are registered to 0.2 px."""
     pointing = PointingErrors(offset_px=10, seed=2)
     sweeps, found = registered(pointing, along)
     assert len(sweeps) == 4
@@ -68,7 +68,7 @@ def test_pass_is_registered_to_a_tenth(along: Axis):
 
 
 def test_narrow_overlaps_are_reported():
-    """Overlaps below 64 px beyond the prior are named with their width, and nothing is moved."""
+    """Overlaps below 64 px beyond the prior are named with their width, and no sweep is moved."""
     sweeps, found = registered(PointingErrors(5), "x", prior_px=15)
     narrow = {(one.reference, one.moving): one for one in found.narrow}
     for one, other in pairwise(sweeps):
@@ -77,8 +77,8 @@ def test_narrow_overlaps_are_reported():
     assert all((shift.offset == 0).all() for shift in found.shifts)
 
 
-def test_coarse_pass_is_registered_in_scene_pixels():
-    """Lines 2 px apart of binned samples give corrections in px of the scene, as fine ones do."""
+def test_a_coarse_pass_is_registered_in_scene_pixels():
+    """Lines 2 px apart of binned samples give corrections in px of the scene, like fine lines."""
     pointing = PointingErrors(offset_px=6, seed=5)
     scan = uniform_sweeps(GRID, CAMERA, "x", step=2, overlap_px=84)
     sweeps, source = [replace(sweep, binning=2) for sweep in scan], source_of(pointing)
@@ -92,8 +92,8 @@ def test_coarse_pass_is_registered_in_scene_pixels():
             np.testing.assert_array_equal(window.measured.error_px, 2 * window.found.error_px[::-1])
 
 
-def test_windows_lie_where_both_sweeps_look():
-    """Every window's corners are seen by both of its sweeps, except where lines end."""
+def test_windows_lie_inside_of_both_sweeps():
+    """Both sweeps see every window, except for 2 px at its borders."""
     sweeps, source = full_sweeps(GRID, CAMERA, "x", overlap_px=84), source_of()
     broad = [BroadSweep.read(SimulatedSweep(source, sweep), CAMERA) for sweep in sweeps]
     images = place_images(broad, no_shifts([sweep.name for sweep in sweeps]), CAMERA)
@@ -107,8 +107,8 @@ def test_windows_lie_where_both_sweeps_look():
         overlap_windows(images, window_px=32)
 
 
-def test_broad_image_is_the_mean_of_the_bands():
-    """Without noise the image is the scene's mean over bands; lost and doubted lines leave NaN."""
+def test_a_broad_band_image_is_the_mean_of_the_bands():
+    """Without noise it is the scene's mean over bands. Lost and unusable lines are NaN."""
     source = replace(source_of(bands=5), chosen=effects_on("rotation"))
     sweep = full_sweeps(GRID, CAMERA, "x")[0]
     lines, kept = SimulatedSweep(source, sweep), np.arange(sweep.lines) != 7
@@ -129,7 +129,7 @@ def test_broad_image_is_the_mean_of_the_bands():
 
 @pytest.mark.parametrize("factor", [1, 2])
 def test_saturated_samples_are_left_out(factor: int):
-    """Where the converter is at its end, of one sample or of a sum, the broad image holds nothing."""
+    """Saturated samples, or sums of samples, are NaN in the broad-band image."""
     values = np.full((GRID.height, GRID.width, 1), 1.0)
     values[100:140, 120:180] = 2.0  # 60 % of the full well
     scene = raster_from_values(values, CAMERA, name="t", wavelength_nm=np.array([600.0]))
@@ -143,8 +143,8 @@ def test_saturated_samples_are_left_out(factor: int):
     assert np.isfinite(broad.image[0]).all()
 
 
-def test_bands_that_few_samples_have_take_no_part():
-    """A band without white reference in every fifth sample is left out, unless no band is better."""
+def test_bands_with_too_few_lit_samples_are_left_out():
+    """A band without white reference in every fifth sample is left out, unless all bands are like that."""
     references = SimulatedSweep(source_of(bands=4), full_sweeps(GRID, CAMERA, "x")[0]).references
     white = references.white.copy()
     white[::5, 1] = references.dark[::5, 1]
@@ -153,8 +153,8 @@ def test_bands_that_few_samples_have_take_no_part():
     assert broad_bands(replace(references, white=white)).tolist() == [0, 1, 2, 3]
 
 
-def test_turn_is_how_places_move_with_the_swath():
-    """Far off the axis the turn says where a sample looks when its strip lies a little further along."""
+def test_turn_is_the_derivative_of_places_by_the_swath():
+    """Far off the axis it predicts the view of a sample whose swath lies 1 px further along."""
     sweep = Sweep("s", "fine", "x", 1500.0, -900.0, 3)
     broad = BroadSweep.read(SimulatedSweep(source_of(), sweep), CAMERA)
     image, slope = PlacedImage(broad, CAMERA, np.zeros((3, 2))), CAMERA.pixel_slopes()[140]

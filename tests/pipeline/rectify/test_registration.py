@@ -1,4 +1,4 @@
-"""Registration of two images of one overlap, crop rows included, of all sweeps, and of a field on its earlier look."""
+"""Registration of two images of one overlap, crop rows included, of all sweeps, and of a field on an earlier visit."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ REACH = 12.0
 
 
 @pytest.mark.parametrize("periods", [(4, 40), (40, 400)])
-def test_narrow_overlaps_are_registered_to_a_tenth(periods: tuple[float, float]):
-    """Over 64 px at a signal to noise of 50 the shift is found to 0.03 px, fine texture or broad."""
+def test_narrow_overlaps_are_registered_to_three_hundredths_of_a_pixel(periods: tuple[float, float]):
+    """Over 64 px at an SNR of 50 the shift is right to 0.03 px, for fine and for broad texture."""
     for seed in range(2):
         shift = np.random.default_rng(seed).uniform(-6, 6, 2)
         found = pair_shift(*wave_views(seed, (512, 64), shift, 50, periods), prior_px=7)
         np.testing.assert_allclose(found.shift, shift, atol=0.03)
 
 
-def test_gain_and_offset_do_not_matter():
-    """A view lit differently gives the same shift."""
+def test_gain_and_offset_do_not_change_the_shift():
+    """A view with another light has the same shift to 1e-6 px."""
     one, other = wave_views(3, (128, 64), np.array([2.3, -1.6]), 50, (6, 40))
     plain, lit = pair_shift(one, other, prior_px=4), pair_shift(one, 7 + 0.2 * other, prior_px=4)
     np.testing.assert_allclose(lit.shift, plain.shift, atol=1e-6)
@@ -43,8 +43,8 @@ def test_gain_and_offset_do_not_matter():
 
 @settings(max_examples=8, deadline=None)
 @given(st.integers(-9, 9), st.integers(-9, 9), st.integers(0, 5))
-def test_whole_shifts_are_exact_and_swap_their_sign(down: int, right: int, seed: int):
-    """Cuts of one image are a whole shift apart, to rounding; the other way round it is the opposite."""
+def test_whole_shifts_are_exact_and_antisymmetric(down: int, right: int, seed: int):
+    """Parts of one image that are whole pixels apart have that shift to rounding. Swapped views have its negative."""
     image = gaussian_filter1d(np.random.default_rng(seed).normal(size=(120, 90)), 1.5, axis=0)
     one, other = image[10:-10, 10:-10], image[10 + down : 110 + down, 10 + right : 80 + right]
     forth, back = pair_shift(one, other, prior_px=9), pair_shift(other, one, prior_px=9)
@@ -52,8 +52,8 @@ def test_whole_shifts_are_exact_and_swap_their_sign(down: int, right: int, seed:
     np.testing.assert_allclose(back.shift, -forth.shift, atol=1e-6)
 
 
-def test_crop_rows_with_gaps_are_never_off_by_a_row():
-    """The bare places tell which row is which; a shift of up to two rows is found right."""
+def test_crop_rows_with_gaps_are_registered_to_the_right_row():
+    """Bare places identify the rows, so that a shift of up to two rows is found."""
     for seed in range(5):
         shift = np.random.default_rng(seed).uniform(-25, 25, 2)
         found = pair_shift(*row_views(seed, (256, 64), shift, 50, 0.2), prior_px=26)
@@ -61,8 +61,8 @@ def test_crop_rows_with_gaps_are_never_off_by_a_row():
 
 
 @pytest.mark.parametrize("turned", [False, True])
-def test_rows_without_gaps_are_undecidable(turned: bool):
-    """Purely periodic rows are not guessed, whichever way they run and whatever the noise."""
+def test_crop_rows_without_gaps_are_undecidable(turned: bool):
+    """Purely periodic rows have no shift, for either direction and any noise."""
     for seed, snr in enumerate((50, 50, 5, 1)):
         shift = np.random.default_rng(seed).uniform(-25, 25, 2)
         views = row_views(seed, (256, 64), shift, snr, 0)
@@ -71,19 +71,19 @@ def test_rows_without_gaps_are_undecidable(turned: bool):
         assert np.isnan(found.shift).all()
 
 
-def test_error_is_the_scatter_of_the_shift():
-    """Over noisy views of one overlap the stated error is the scatter found, to a third; the peak is a correlation."""
+def test_stated_error_is_the_scatter_of_the_shift():
+    """Over noisy views of one overlap both agree to a third. The peak is the correlation of the views."""
     shift, drawn = np.array([2.3, -1.4]), np.random.default_rng(9)
     clean = wave_views(3, (96, 96), shift, np.inf, (8, 60))
     found = [pair_shift(*(view + drawn.normal(0, 0.5, view.shape) for view in clean), prior_px=5) for _ in range(40)]
     scatter = np.sqrt(np.mean([(each.shift - shift) ** 2 for each in found], axis=0))
     np.testing.assert_allclose(np.mean([each.error_px for each in found], axis=0), scatter, rtol=0.35)
-    smoothed = 0.25 * 2 * (35 / 128) ** 2  # variance that smoothing leaves of both noises, over that of one view
+    smoothed = 0.25 * 2 * (35 / 128) ** 2  # variance of both noises after smoothing, relative to that of one view
     assert np.mean([each.peak**2 for each in found]) == pytest.approx(1 - smoothed, abs=0.02)
 
 
-def test_negative_of_an_image_is_no_likeness():
-    """An overlap that one sweep shows bright where the other shows it dark is not registered."""
+def test_an_image_and_its_negative_are_not_registered():
+    """An overlap that is bright in one sweep and dark in the other is undecidable."""
     for seed in range(2):
         one, other = wave_views(seed, (128, 96), np.array([1.2, -0.7]), 50, (30, 300))
         assert pair_shift(one, other, prior_px=4).status == "found"
@@ -95,13 +95,13 @@ NAMES = ("a", "b", "c", "d", "e")
 
 
 def truths(rng: np.random.Generator) -> list[SweepShift]:
-    """Offsets of up to 50 px and drifts of up to 2 px over half a sweep; the middle sweep has none."""
+    """Return offsets of up to 50 px and drifts of up to 2 px over half a sweep; the middle sweep has none."""
     drawn = [SweepShift(name, rng.uniform(-50, 50, 2), rng.uniform(-2, 2, 2) / 1500) for name in NAMES]
     return [*drawn[:2], SweepShift("c", np.zeros(2), np.zeros(2)), *drawn[3:]]
 
 
 def windows_of(truth: list[SweepShift], rng: np.random.Generator, noise: float) -> list[WindowShift]:
-    """Six windows along every overlap of neighbours, with errors of ``noise`` px."""
+    """Return six windows along every overlap of neighbours, with errors of ``noise`` px."""
     lines = [shift.of_lines(LINES) for shift in truth]
     return [
         WindowShift(
@@ -118,13 +118,13 @@ def windows_of(truth: list[SweepShift], rng: np.random.Generator, noise: float) 
 
 
 def farthest(found: tuple[SweepShift, ...], wanted: tuple[SweepShift, ...] | list[SweepShift]) -> float:
-    """Largest difference of any line's shift."""
+    """Return the largest difference of any line's shift."""
     pairs = zip(found, wanted, strict=True)
     return max(float(np.abs(a.of_lines(LINES) - b.of_lines(LINES)).max()) for a, b in pairs)
 
 
-def test_truth_is_recovered():
-    """Exact windows give back every offset and drift; noise comes through no larger than it went in."""
+def test_offsets_and_drifts_are_recovered():
+    """Exact windows give every offset and drift to 1e-3 px. Windows with noise of 0.05 px err by less than 0.3 px."""
     rng = np.random.default_rng(0)
     truth = truths(rng)
     exact = solve_sweeps(windows_of(truth, rng, 1e-9), NAMES, [LINES] * 5)
@@ -133,8 +133,8 @@ def test_truth_is_recovered():
     assert farthest(solve_sweeps(windows_of(truth, rng, 0.05), NAMES, [LINES] * 5).shifts, truth) < 0.3
 
 
-def test_one_wrong_window_hardly_moves_the_rest():
-    """A window wrong by 12 px moves no line by more than 0.1 px, and its residual shows it."""
+def test_one_wrong_window_hardly_moves_the_sweeps():
+    """A window that errs by 12 px moves no line by more than 0.1 px, and its residual shows the error."""
     rng = np.random.default_rng(1)
     windows = windows_of(truths(rng), rng, 0.05)
     right = solve_sweeps(windows, NAMES, [LINES] * 5)
@@ -146,8 +146,8 @@ def test_one_wrong_window_hardly_moves_the_rest():
         assert found.residual[number, 1] == pytest.approx(12, abs=0.5)
 
 
-def test_turn_of_the_line_is_part_of_the_model():
-    """A window that sees a line's end tells the offset of its centre, not of the place that the end sees."""
+def test_the_turn_of_the_line_is_part_of_the_model():
+    """A window at a line's end gives the offset of the line's centre, not of the end."""
     turn, shift = np.array([[1.0, 0.0], [0.034, 1.0]]), np.array([50.0, -20.0])
     windows = [
         WindowShift(0, 1, (line, line), np.stack([np.eye(2), turn]), turn @ shift, np.full(2, 0.05))
@@ -158,7 +158,7 @@ def test_turn_of_the_line_is_part_of_the_model():
 
 
 def test_sweeps_without_windows_stay_and_are_named():
-    """A sweep in no window keeps 0; a group apart from the reference keeps 0 on average; both are untied."""
+    """A sweep without a window keeps 0; a group apart from the reference has a mean of 0. Both count as untied."""
     rng = np.random.default_rng(2)
     windows = [w for w in windows_of(truths(rng), rng, 0.05) if 2 not in (w.reference, w.moving)]
     found = solve_sweeps(windows, NAMES, [LINES] * 5)
@@ -170,29 +170,29 @@ def test_sweeps_without_windows_stay_and_are_named():
     assert nothing.residual.shape == (0, 2)
 
 
-def test_one_window_gives_an_offset_and_no_drift():
-    """Where one window alone would have to tell drift from offset, the drift is small beside it."""
+def test_one_window_gives_an_offset_without_drift():
+    """One window cannot separate drift from offset, so the drift stays below 1e-3 px."""
     window = WindowShift(0, 1, (499.5, 499.5), np.stack([np.eye(2)] * 2), np.array([7.0, -3.0]), np.full(2, 0.02))
     found = solve_sweeps([window], ("a", "b"), (1000, 1000), reference=0)
     np.testing.assert_allclose(found.shifts[1].of_lines(1000), [[7.0, -3.0]] * 1000, atol=1e-3)
 
 
 def textured(seed: int, shape: tuple[int, int] = (180, 210)) -> NDArray[np.float64]:
-    """A field with structure over some pixels, larger than what is compared."""
+    """Return a field with structure over some pixels, larger than the compared part."""
     rng = np.random.default_rng(seed)
     field: NDArray[np.float64] = gaussian_filter(rng.normal(size=shape), 2.0)
     return field
 
 
 def cut(field: NDArray[np.float64], down: int = 0, across: int = 0) -> NDArray[np.float64]:
-    """The middle of it, as much higher and further left."""
+    """Return the middle of a field, moved up by ``down`` and to the left by ``across`` px."""
     return field[30 - down : 150 - down, 30 - across : 180 - across]
 
 
 @settings(max_examples=4)
 @given(seed=st.integers(0, 1000), down=st.integers(-11, 11), across=st.integers(-11, 11))
-def test_a_moved_field_is_found(seed: int, down: int, across: int) -> None:
-    """To a tenth of a pixel, and not turned."""
+def test_field_shift_finds_a_moved_field(seed: int, down: int, across: int) -> None:
+    """The shift is right to a tenth of a pixel, and there is no rotation."""
     field = textured(seed)
     found = field_shift(cut(field, down, across), cut(field), reach_px=REACH)
     np.testing.assert_allclose(found.shift, (down, across), atol=0.1)
@@ -200,8 +200,8 @@ def test_a_moved_field_is_found(seed: int, down: int, across: int) -> None:
 
 
 @pytest.mark.parametrize(("seed", "degrees"), [(0, -5.0), (1, -2.0), (2, 1.0), (0, 3.0), (1, 5.0)])
-def test_a_turned_field_is_found(seed: int, degrees: float) -> None:
-    """To a fifth of a degree, about its middle."""
+def test_field_shift_finds_a_rotated_field(seed: int, degrees: float) -> None:
+    """The rotation about the centre is right to a fifth of a degree."""
     field = textured(seed, (180, 210))
     found = field_shift(cut(rotate(field, degrees, reshape=False, order=3)), cut(field), reach_px=REACH)
     assert abs(found.turned_deg) == pytest.approx(abs(degrees), abs=0.2)
@@ -209,8 +209,8 @@ def test_a_turned_field_is_found(seed: int, degrees: float) -> None:
 
 
 @pytest.mark.parametrize("seed", [3, 4])
-def test_what_changed_in_places_moves_nothing(seed: int) -> None:
-    """A third of the field grown over by another, and noise everywhere."""
+def test_local_changes_do_not_move_the_field(seed: int) -> None:
+    """A third of the field is replaced by another one, and there is noise everywhere."""
     field, rng = textured(seed), np.random.default_rng(seed)
     now = cut(field).copy()
     now[:, :50] = cut(textured(seed + 50))[:, :50]
@@ -219,8 +219,8 @@ def test_what_changed_in_places_moves_nothing(seed: int) -> None:
     assert max(np.hypot(*found.shift) / 0.3, found.edge_px(SIZE) / 0.5) < 1
 
 
-def test_the_motion_of_most_windows_is_that_of_the_field() -> None:
-    """Four of nine windows, faint ones, stayed where they were."""
+def test_field_shift_follows_the_majority_of_windows() -> None:
+    """Four of nine windows, which are faint, did not move."""
     still = (np.indices((240, 240)) < 160).all(axis=0)
     now = gaussian_filter(np.random.default_rng(0).normal(size=still.shape), 2) * np.where(still, 0.2, 1)
     before = np.where(still, now, np.roll(now, -24, axis=1))
@@ -228,6 +228,6 @@ def test_the_motion_of_most_windows_is_that_of_the_field() -> None:
 
 
 @pytest.mark.parametrize("now", [np.full(SIZE, np.nan), np.ones(SIZE), cut(textured(8))])
-def test_where_nothing_is_shown_nothing_is_said(now: NDArray[np.float64]) -> None:
-    """No value at all, no structure, or nothing in common with the field of before."""
+def test_a_field_without_common_structure_has_no_shift(now: NDArray[np.float64]) -> None:
+    """The image is NaN, is constant, or shows another field than the earlier one."""
     assert field_shift(now, cut(textured(6)), reach_px=REACH) == FieldShift()

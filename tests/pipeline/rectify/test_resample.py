@@ -1,4 +1,4 @@
-"""Resampling: laws of the kernels, masks, and the hard cases of rectification."""
+"""Resampling: properties of the kernels, masks, and special cases of rectification."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ KERNELS: tuple[Kernel, ...] = ("catmull-rom", "bilinear", "nearest")
 
 
 def by_hand(values: np.ndarray, valid: np.ndarray, at: np.ndarray, kernel: Kernel) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted sums in float64, point by point and band by band, and the weight that was valid in each band."""
+    """Return weighted sums in float64, point by point and band by band, and the valid weight of each band."""
     usable = np.broadcast_to(valid if valid.ndim == 3 else valid[..., None], values.shape)
     out, weight_of = np.full((len(at), values.shape[2]), np.nan), np.zeros((len(at), values.shape[2]))
     for point, place in enumerate(at):
@@ -34,8 +34,8 @@ def by_hand(values: np.ndarray, valid: np.ndarray, at: np.ndarray, kernel: Kerne
 
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("by_element", [False, True])
-def test_is_the_sum_written_out(kernel: Kernel, by_element: bool) -> None:
-    """Masks by sample and by element give what the sums written out give, band by band, at the borders too."""
+def test_resampling_equals_explicit_sums(kernel: Kernel, by_element: bool) -> None:
+    """Masks by sample and by element give the explicit sums, band by band, also at the borders."""
     rng = np.random.default_rng(11)
     values, valid = rng.random((9, 8, 5), np.float32), rng.random((9, 8)) > 0.1
     if by_element:
@@ -51,8 +51,8 @@ def test_is_the_sum_written_out(kernel: Kernel, by_element: bool) -> None:
 
 @given(arrays(np.bool_, (9, 8)), st.floats(-1, 9), st.floats(-1, 8))
 @settings(max_examples=30, deadline=None)
-def test_constant_stays_constant_under_any_mask(valid: np.ndarray, line: float, sample: float) -> None:
-    """Renormalised taps keep a constant, whichever samples are missing, or fail with weight 0."""
+def test_a_constant_stays_constant_under_any_mask(valid: np.ndarray, line: float, sample: float) -> None:
+    """Renormalised taps keep the constant for any missing samples, or give NaN with weight 0."""
     values = np.full((9, 8, 2), 3.5, np.float32)
     values[~valid] = np.nan
     out, fraction = resample(values, valid, np.array([[line, sample]]))
@@ -60,8 +60,8 @@ def test_constant_stays_constant_under_any_mask(valid: np.ndarray, line: float, 
     assert fraction[0] == 0 or (fraction[0] >= 0.5 and np.allclose(out, 3.5, rtol=1e-5))
 
 
-def test_catmull_rom_keeps_parabolas() -> None:
-    """Third-order accuracy: a parabola inside the sweep is met exactly."""
+def test_catmull_rom_reproduces_parabolas() -> None:
+    """The kernel has third-order accuracy, so a parabola inside of the sweep is exact."""
     y, x = np.mgrid[:12, :12].astype(np.float32)
     values = (y * y - 2 * x * y + 3 * x)[..., None]
     at = np.random.default_rng(2).uniform(2, 9, (50, 2))
@@ -71,8 +71,8 @@ def test_catmull_rom_keeps_parabolas() -> None:
 
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("bands", [1, 80])
-def test_result_does_not_depend_on_the_blocks(kernel: Kernel, bands: int) -> None:
-    """All points at once, each alone and in any order give the same bits: whole windows, borders and masks alike."""
+def test_resampling_does_not_depend_on_the_blocks(kernel: Kernel, bands: int) -> None:
+    """All points together, single points and any order give the same bits, with masks and at borders."""
     rng = np.random.default_rng(13)
     values, valid = rng.random((14, 15, bands), np.float32), rng.random((14, 15, bands)) > 0.01
     at = rng.uniform(-1, 15, (BLOCK_PX + 300, 2))
@@ -85,8 +85,8 @@ def test_result_does_not_depend_on_the_blocks(kernel: Kernel, bands: int) -> Non
         np.testing.assert_array_equal(resample(values, valid, at[point : point + 1], kernel)[0], out[[point]])
 
 
-def test_dwell_is_the_mean_of_its_valid_lines() -> None:
-    """Lines of one dwell are averaged sample by sample over what is valid; a line alone comes back bit by bit."""
+def test_lines_of_one_dwell_are_averaged() -> None:
+    """The mean of each sample is over its valid lines. A line alone keeps its bits."""
     values, valid = np.random.default_rng(18).random((6, 3, 2), np.float32), np.ones((6, 3), bool)
     values[2, 1], valid[2, 1] = np.nan, False
     valid[4:, 0] = False
@@ -100,8 +100,8 @@ def test_dwell_is_the_mean_of_its_valid_lines() -> None:
 
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("kind", [np.float32, np.uint16])
-def test_what_stands_at_an_invalid_element_does_not_matter(kernel: Kernel, kind: type[np.generic]) -> None:
-    """Zero and any other number at invalid elements give the same; nothing is written."""
+def test_values_of_invalid_elements_do_not_matter(kernel: Kernel, kind: type[np.generic]) -> None:
+    """Zero and any other number at invalid elements give the same result, and the input stays unchanged."""
     rng = np.random.default_rng(19)
     values, valid = rng.integers(1, 60_000, (9, 9, 3)).astype(kind), rng.random((9, 9, 3)) > 0.1
     kept, at = values.copy(), rng.uniform(-0.4, 8.4, (100, 2))

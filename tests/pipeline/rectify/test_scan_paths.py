@@ -1,4 +1,4 @@
-"""Tracks: every line in one place, in order, whatever path the mirror took; and what time stamps say of lines."""
+"""Scan paths have every line at one place in ascending order, for any motion; line numbers follow from time stamps."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ STEPS = st.lists(st.sampled_from([-3.0, -1.0, 0.0, 0.1, 1.0, 1.0, 1.2, 4.0]), mi
 
 
 @given(STEPS, st.integers(0, 99))
-def test_every_usable_line_is_on_one_knot(steps: list[float], seed: int) -> None:
-    """On any path each usable line is a member of one seen knot, at the mean of its members, and knots ascend."""
+def test_every_usable_line_belongs_to_one_knot(steps: list[float], seed: int) -> None:
+    """On any path a knot lies at the mean of its lines, and knots ascend along the scan."""
     position = aim(30.0, np.concatenate([[0.0], np.cumsum(steps)]))
     usable = np.random.default_rng(seed).random(len(position)) < 0.8
     scan, across, _ = line_centres(position, CAMERA)
@@ -34,15 +34,15 @@ def test_every_usable_line_is_on_one_knot(steps: list[float], seed: int) -> None
 
 @given(STEPS)
 @settings(max_examples=30, deadline=None)
-def test_no_gap_wider_than_a_step_and_a_half_is_left(steps: list[float]) -> None:
-    """Neighbouring knots are at most 1.5 steps apart: where lines are missing knots that nothing saw stand in."""
+def test_knots_leave_no_gap_above_one_and_a_half_steps(steps: list[float]) -> None:
+    """Unseen knots fill gaps where lines are missing. The first and last knot are seen."""
     for scan_path in make_scan_paths(aim(0.0, np.concatenate([[0.0], np.cumsum(steps)])), CAMERA, step_px=1.0):
         assert np.diff(scan_path.scan).max(initial=0) <= 1.5 * CAMERA.ifov_rad * (1 + 1e-9)
         assert scan_path.seen[[0, -1]].all()
 
 
-def test_even_sweep_is_one_even_scan_path() -> None:
-    """A planned sweep gives a knot a line, straight and even, in either direction."""
+def test_an_even_sweep_gives_one_even_scan_path() -> None:
+    """A planned sweep gives one knot for each line, straight and even, in either direction."""
     position = aim(-700.0, 12.0 + 4 * np.arange(50.0))
     (scan_path,), (back,) = make_scan_paths(position, CAMERA), make_scan_paths(position[::-1], CAMERA)
     assert scan_path.straight
@@ -56,13 +56,13 @@ def test_even_sweep_is_one_even_scan_path() -> None:
 
 
 def test_lost_and_unusable_lines_keep_a_scan_path_even() -> None:
-    """Where lines 3, 4 and 7 are lost or not usable the track has unseen knots at their places, and stays even."""
+    """Lost or unusable lines get unseen knots at their places."""
     usable = np.ones(8, np.bool_)
     usable[5] = False
     (scan_path,) = make_scan_paths(aim(0.0, np.array([0.0, 1, 2, 5, 6, 7, 8, 9])), CAMERA, usable=usable)
     assert scan_path.uniform
     np.testing.assert_array_equal(scan_path.seen, [True, True, True, False, False, True, True, False, True, True])
-    np.testing.assert_array_equal(scan_path.lines, [0, 1, 2, 2, 3, 3, 4, 4, 6, 7])  # stand-ins are the nearest lines
+    np.testing.assert_array_equal(scan_path.lines, [0, 1, 2, 2, 3, 3, 4, 4, 6, 7])  # unseen: the nearest line
 
 
 def test_corrections_move_the_line_centres() -> None:
@@ -74,23 +74,23 @@ def test_corrections_move_the_line_centres() -> None:
     np.testing.assert_allclose(scan_path.scan / CAMERA.ifov_rad, 1.5 * np.arange(5), atol=1e-9)
 
 
-def test_noise_of_the_position_is_no_turn() -> None:
-    """A path of 1 px steps stays one track under 0.8 px of noise, although lines change places."""
+def test_position_noise_does_not_split_a_scan_path() -> None:
+    """A path of 1 px steps stays one scan path under 0.8 px of noise, although lines change their order."""
     rng = np.random.default_rng(4)
     scan_paths = make_scan_paths(aim(0.0, np.arange(400.0) + rng.normal(0, 0.8, 400)), CAMERA, step_px=1.0)
     assert len(scan_paths) == 1
     assert (np.diff(scan_paths[0].lines) < 0).any()
 
 
-def test_turn_beyond_the_noise_is_a_turn() -> None:
-    """Under 0.3 px of noise a path that goes back by 3.5 px turns twice."""
+def test_a_reversal_above_the_noise_splits_the_scan_path() -> None:
+    """A path that goes back by 3.5 px under 0.3 px of noise turns twice and gives three scan paths."""
     scan = np.concatenate([np.arange(60.0), 59 - 0.5 * np.arange(1, 8), 55.5 + np.arange(1, 60)])
     noise = np.random.default_rng(2).normal(0, 0.3, len(scan))
     assert len(make_scan_paths(aim(0.0, scan + noise), CAMERA, step_px=1.0)) == 3
 
 
-def test_lines_nearer_than_a_quarter_step_are_one_knot() -> None:
-    """Pairs of lines 0.2 steps apart are a knot each, pairs 0.3 apart are not."""
+def test_lines_closer_than_a_quarter_step_share_a_knot() -> None:
+    """Pairs of lines 0.2 steps apart share a knot, pairs 0.3 steps apart do not."""
     pairs = np.repeat(np.arange(10.0), 2)
     for apart, knots in ((0.2, 10), (0.3, 20)):
         (scan_path,) = make_scan_paths(aim(0.0, pairs + np.tile([0, apart], 10)), CAMERA, step_px=1.0)
@@ -100,19 +100,19 @@ def test_lines_nearer_than_a_quarter_step_are_one_knot() -> None:
 @pytest.mark.parametrize(
     ("scan", "lines"),
     [
-        (np.repeat(np.arange(6.0), 9) + 1e-6 * np.arange(54), np.arange(54)),  # stands, and creeps while it does
+        (np.repeat(np.arange(6.0), 9) + 1e-6 * np.arange(54), np.arange(54)),  # stands for 9 lines, creeping
         (np.array([0.0, 1.0, 4.0]), np.arange(3)),  # as many gaps as steps
         (np.arange(5.0), np.arange(0, 5, 2)),  # every other line not usable
     ],
 )
-def test_the_step_is_taken_from_the_path(scan: np.ndarray, lines: np.ndarray) -> None:
-    """Without a planned step it is that of a moving mirror from one line to the next: knots are 1 px apart."""
+def test_the_step_is_estimated_from_the_path(scan: np.ndarray, lines: np.ndarray) -> None:
+    """Without a planned step it is the distance that a moving mirror covers from line to line: knots are 1 px apart."""
     (scan_path,) = make_scan_paths(aim(0.0, scan), CAMERA, usable=np.isin(np.arange(len(scan)), lines))
     np.testing.assert_allclose(np.diff(scan_path.scan) / CAMERA.ifov_rad, 1, atol=1e-4)
 
 
-def test_a_pace_off_the_plan_is_still_even() -> None:
-    """An even path at a pace a thousandth off the planned one is looked up in closed form, at its own pace."""
+def test_a_speed_near_the_plan_is_still_even() -> None:
+    """An even path whose step is 0.1 % above the plan uses its own step."""
     (scan_path,) = make_scan_paths(aim(0.0, 1.001 * np.arange(50.0)), CAMERA, step_px=1.0)
     assert scan_path.uniform
     np.testing.assert_allclose(scan_path.width, 1.001 * CAMERA.ifov_rad, rtol=1e-9)
@@ -121,14 +121,14 @@ def test_a_pace_off_the_plan_is_still_even() -> None:
 
 
 def test_recorded_lines_far_apart_leave_no_gap() -> None:
-    """The plan of a recording has whole pixels: lines 1.45 px apart, with noise, are 1 px apart there."""
+    """Plans of recordings have whole pixels. Lines 1.45 px apart, with noise, still get no unseen knot between them."""
     scan = 1.45 * np.arange(60.0) + np.random.default_rng(0).normal(0, 0.04, 60)
     (scan_path,) = make_scan_paths(aim(0.0, scan), CAMERA, step_px=1.0)
     assert scan_path.seen.all()
 
 
-def test_line_out_of_reach_is_named() -> None:
-    """A usable line beyond the disk or without a position raises with its number; one that is not usable does not."""
+def test_a_line_out_of_reach_is_named() -> None:
+    """Usable lines beyond the disk or without a position raise an error with their number. Unusable ones do not."""
     position = aim(0.0, np.arange(6.0))
     position[4] = np.nan
     with pytest.raises(PoseError, match="line 4 is at mirror position"):
@@ -142,10 +142,10 @@ def test_line_out_of_reach_is_named() -> None:
 
 
 @given(st.lists(st.integers(0, 400), min_size=2, max_size=60, unique=True), st.floats(0.97, 1.03), st.integers(0, 99))
-def test_numbers_are_those_of_the_lines_that_came(lines: list[int], pace: float, seed: int) -> None:
-    """Whatever frames are lost, with a clock off by 3 % and jitter of a tenth, short gaps are counted exactly."""
+def test_line_numbers_count_lost_frames(lines: list[int], pace: float, seed: int) -> None:
+    """With a clock that errs by 3 % and jitter of a tenth, gaps of up to 8 lines are counted exactly."""
     came = np.sort(lines)
-    came = came[np.concatenate([[True], np.cumprod(np.diff(came) < 9).astype(bool)])]  # a longer gap may miscount
+    came = came[np.concatenate([[True], np.cumprod(np.diff(came) < 9).astype(bool)])]  # longer gaps may be miscounted
     time = 5.0 + 0.1 * (pace * came + np.random.default_rng(seed).uniform(-0.1, 0.1, len(came)))
     found = number_lines(time, 0.1)
     np.testing.assert_array_equal(found.number, came - came[0])
@@ -154,8 +154,8 @@ def test_numbers_are_those_of_the_lines_that_came(lines: list[int], pace: float,
 
 
 @given(st.integers(0, 99), st.integers(3, 40))
-def test_copies_and_wild_stamps_change_no_other_line(seed: int, lines: int) -> None:
-    """A frame sent again and a single wild stamp are marked; the others keep the numbers that they had."""
+def test_repeated_frames_and_wild_stamps_change_no_other_line(seed: int, lines: int) -> None:
+    """A repeated frame and one wild time stamp are marked. The other lines keep their numbers."""
     rng, time = np.random.default_rng(seed), np.arange(float(lines))
     again = rng.integers(0, lines)
     sent = np.insert(time, again + 1, time[again])
@@ -166,8 +166,8 @@ def test_copies_and_wild_stamps_change_no_other_line(seed: int, lines: int) -> N
 
 
 @pytest.mark.parametrize("ends", [[1e6], [1e300], [-1e6], [-1e300, 1e300]])
-def test_wild_stamps_at_the_ends_are_not_believed(ends: list[float]) -> None:
-    """A first or last stamp far off all others goes neither back nor loses a million lines: it costs its own line."""
+def test_wild_stamps_at_the_ends_are_unusable(ends: list[float]) -> None:
+    """A first or last stamp far off all others costs its own line only. It adds neither lost lines nor a step back."""
     found = number_lines(np.sort([*ends, *np.arange(20.0)]), 1.0)
     assert found.usable.sum() == 20
     assert (found.backward, found.lost) == (len(ends), 0)
@@ -177,20 +177,20 @@ def test_wild_stamps_at_the_ends_are_not_believed(ends: list[float]) -> None:
 @pytest.mark.parametrize(
     ("stamps", "number", "unusable"),
     [
-        ([0, 1, 2, 3, 2.5, 4], [0, 1, 2, 3, 3, 4], [4]),  # of two that contradict each other the later one goes
-        ([0, 1, 2, 1, 3], [0, 1, 2, 1, 3], [3]),  # a copy is the line that its stamp says
-        ([0, 1, 2.6, 3, 4, 5], [0, 1, 2, 3, 4, 5], []),  # late by 0.6 periods, and none was lost
+        ([0, 1, 2, 3, 2.5, 4], [0, 1, 2, 3, 3, 4], [4]),  # of two contradicting stamps the later one is unusable
+        ([0, 1, 2, 1, 3], [0, 1, 2, 1, 3], [3]),  # a copy has the number of its stamp
+        ([0, 1, 2.6, 3, 4, 5], [0, 1, 2, 3, 4, 5], []),  # late by 0.6 periods, but no line is lost
         ([0, 1, 2, 3.8, 4], [0, 1, 2, 3, 4], []),
     ],
 )
-def test_stamps_by_hand(stamps: list[float], number: list[int], unusable: list[int]) -> None:
-    """Numbers, and what is believed, frame by frame."""
+def test_line_numbers_of_stamps_worked_out_by_hand(stamps: list[float], number: list[int], unusable: list[int]) -> None:
+    """Line numbers and unusable frames, frame by frame; no line is lost."""
     found = number_lines(np.array(stamps, float), 1.0)
     assert (found.number.tolist(), np.flatnonzero(~found.usable).tolist()) == (number, unusable)
     assert found.lost == 0
 
 
 @pytest.mark.parametrize(("gap", "lost"), [(1.45, 0), (1.5, 0), (1.55, 1), (2.45, 1), (2.55, 2)])
-def test_a_gap_of_more_than_one_and_a_half_periods_loses_a_line(gap: float, lost: int) -> None:
-    """Gaps are counted to the nearest line, halves to fewer."""
+def test_a_gap_above_one_and_a_half_periods_counts_a_lost_line(gap: float, lost: int) -> None:
+    """Gaps are rounded to the nearest line, halves down."""
     assert number_lines(np.concatenate([np.arange(4.0), 3 + gap + np.arange(4)]), 1.0).lost == lost

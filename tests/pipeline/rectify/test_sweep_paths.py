@@ -1,4 +1,4 @@
-"""Passes over one swath: later lines lie between those of the first, and are read in the order of their places."""
+"""Passes over one swath: later lines lie between those of the first pass, and are read in order of place."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from pipeline.signal.components import Components
 from pipeline.source import References
 
 CAMERA = LineCamera()
-SCALE = 8  # steps of a stored score for a pixel along the scan
+SCALE = 8  # steps of a stored score per pixel along the scan
 FIRST = every_nth([Sweep("full-0", "fine", "x", 0.0, -40.0, 81)], 4, 50.0)  # lines at -40, -36 ... 40
 RUN = Sweep("fine-0", "fine", "x", 0.0, -20.0, 21)
 ONE = Components(np.zeros(1), np.eye(1), np.ones(1))
@@ -60,8 +60,8 @@ class PlaceLines:
 
 
 @pytest.mark.parametrize("step", [1, 2])
-def test_later_lines_and_those_of_the_first_pass_are_one_sweep(step: int) -> None:
-    """The run has every line of its distance once, in order, with its own place, time and score."""
+def test_later_lines_and_first_pass_lines_become_one_sweep(step: int) -> None:
+    """The run has every line of its spacing once, in order, with its own place and score and the mean exposure."""
     later = lines_between([RUN], FIRST, step=step, exposure_ms=100.0)
     lines = [PlaceLines(sweep) for sweep in (*later, *FIRST)]
     placed = interlaced_paths(sweep_paths(lines, CAMERA), CAMERA)
@@ -77,16 +77,16 @@ def test_later_lines_and_those_of_the_first_pass_are_one_sweep(step: int) -> Non
     assert run.sweep.exposure_ms == pytest.approx(1 / np.where(first, 1 / 50.0, 1 / 100.0).mean())
 
 
-def test_lines_that_repeat_those_of_the_first_pass_are_a_sweep_of_their_own() -> None:
-    """As after pointing errors, which registration then takes off each by itself."""
+def test_a_run_that_repeats_first_pass_lines_stays_a_separate_sweep() -> None:
+    """Such runs follow pointing errors, which registration then removes from each sweep separately."""
     lines = [PlaceLines(sweep) for sweep in (*FIRST, *lines_between([RUN], []))]
     placed = interlaced_paths(sweep_paths(lines, CAMERA), CAMERA)
     assert [(one.lines.sweep.kind, one.lines.sweep.step) for one in placed] == [("coarse", 4), ("fine", 1)]
     assert placed[1].lines.sweep.lines == RUN.lines
 
 
-def test_the_closest_lines_take_a_pixel() -> None:
-    """Pixels within the run are of its lines, all others of the first pass."""
+def test_a_pixel_belongs_to_the_pass_with_the_closest_lines() -> None:
+    """Pixels within the run belong to it, all others to the first pass."""
     lines = [PlaceLines(sweep) for sweep in (*FIRST, *lines_between([RUN], FIRST))]
     placed = interlaced_paths(sweep_paths(lines, CAMERA), CAMERA)
     number = capture_numbers(placed, CAMERA, PixelGrid((-38.0, -50.0), 1, (76, 100)))
@@ -96,8 +96,8 @@ def test_the_closest_lines_take_a_pixel() -> None:
     assert (number[42:] == 0).all()
 
 
-def test_corrections_come_back_by_name() -> None:
-    """A record's offset, drift and gain are those of its sweep; other sweeps have none."""
+def test_corrections_are_matched_by_sweep_name() -> None:
+    """The recorded offset, drift and gain apply to their sweep. Other sweeps have none."""
     found = {"coarse-0": {"offset_px": [1.0, -2.0], "drift_px_per_line": [0.0, 0.1], "gain": [2.0]}}
     one, other = sweep_paths([PlaceLines(FIRST[0]), PlaceLines(RUN)], CAMERA, found)
     np.testing.assert_allclose(one.shift_px[[0, -1]], [[1, -3], [1, -1]])
@@ -108,7 +108,7 @@ def test_corrections_come_back_by_name() -> None:
 
 @pytest.mark.parametrize(("source", "lost"), [("sim", 3), ("rig", 0)])
 def test_pauses_of_a_rig_are_no_lost_lines(source: str, lost: int) -> None:
-    """A rig stops while it loads positions; its lost lines are rows that are not valid."""
+    """A rig pauses while it loads positions; its lost lines are marked as invalid rows instead."""
     lines = PlaceLines(RUN, source)
     lines.time_s[10:] += 0.3
     (path,) = sweep_paths([lines], CAMERA)

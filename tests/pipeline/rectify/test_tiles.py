@@ -1,4 +1,4 @@
-"""Tiles: what comes out for a pixel does not depend on how a grid is cut, and lines are read once."""
+"""Tiles: pixels do not depend on the division of a grid into tiles, and lines are read once."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from pipeline.signal.lines import LineCache
 from pipeline.source import References
 
 CAMERA = LineCamera(samples=160)
-TURNED = Sweep("turned", "fine", "x", -4700.0, 2990.0, 200)  # lines lie at some 30 degrees to the grid's rows
+TURNED = Sweep("turned", "fine", "x", -4700.0, 2990.0, 200)  # lines lie at about 30 degrees to the grid's rows
 CORNER = (3040.0, -4760.0)
 
 
 @dataclass(frozen=True)
 class Taken:
-    """A sweep of random numbers in memory, that notes what is read of it."""
+    """A sweep of random numbers in memory that records its reads."""
 
     sweep: Sweep
     raw: NDArray[np.uint16]
@@ -36,23 +36,23 @@ class Taken:
     asked: list[tuple[int, ...]] = field(default_factory=list)
 
     def read(self, start: int, stop: int) -> NDArray[np.uint16]:
-        """Whole lines."""
+        """Return whole lines."""
         self.asked.append((start, stop))
         return self.raw[start:stop]
 
 
 @dataclass(frozen=True)
 class Cropped(Taken):
-    """The same, read by lines and samples."""
+    """The same sweep, read by lines and samples."""
 
     def read_window(self, lines: slice, samples: slice) -> NDArray[np.uint16]:
-        """A part of some lines."""
+        """Return samples of some lines."""
         self.asked.append((lines.start, lines.stop, samples.start, samples.stop))
         return self.raw[lines, samples]
 
 
 def taken(sweep: Sweep, *, bands: int = 3, seed: int = 0, kind: type[Taken] = Taken, faults: bool = False) -> Taken:
-    """A sweep of noise; with faults, of dead lines, saturated and bad elements as well."""
+    """Return a sweep of noise; with ``faults`` also with dead lines and saturated and bad elements."""
     rng = np.random.default_rng(seed)
     raw = rng.integers(100, 3000, (sweep.lines, CAMERA.samples, bands)).astype(np.uint16)
     frame = (CAMERA.samples, bands)
@@ -71,7 +71,7 @@ def taken(sweep: Sweep, *, bands: int = 3, seed: int = 0, kind: type[Taken] = Ta
 def in_tiles(
     placed: list[PlacedSweep], grid: PixelGrid, shape: tuple[int, int], cache: LineCache | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A grid's values and coverage, made in tiles of this shape."""
+    """Return a grid's values and coverage, computed in tiles of this shape."""
     values = np.zeros((*grid.shape, len(placed[0].lines.references.white_reference)), np.float32)
     coverage = np.zeros(grid.shape, np.intp)
     for tile in plan_tiles(placed, CAMERA, grid, shape):
@@ -81,7 +81,7 @@ def in_tiles(
 
 
 def partly_lit(lines: Taken) -> Taken:
-    """The same with references as real ones are: every band without light somewhere, most in a part of the slit."""
+    """Return the sweep with realistic references: each band is unlit somewhere, most in one part of the slit."""
     sample, band = np.mgrid[: CAMERA.samples, : lines.raw.shape[2]]
     white = lines.references.white.copy()
     white[(sample + 20 * band) % 60 < 15] = 0
@@ -90,7 +90,7 @@ def partly_lit(lines: Taken) -> Taken:
 
 
 def two_turned(grid: PixelGrid | None) -> list[PlacedSweep]:
-    """Two overlapping sweeps of turned lines with all kinds of faults, one by a slit lit in parts."""
+    """Return two overlapping sweeps of turned lines with all kinds of faults, one with a partly lit slit."""
     other = replace(TURNED, name="other", swath_px=-4600.0, start_px=3010.0)
     gain = np.array([1.0, 0.9, 1.1], np.float32)
     return [
@@ -102,7 +102,7 @@ def two_turned(grid: PixelGrid | None) -> list[PlacedSweep]:
 @given(st.tuples(st.integers(5, 90), st.integers(5, 140)), st.booleans(), st.booleans())
 @settings(max_examples=4, deadline=None)
 def test_any_tiling_gives_the_same_bits(shape: tuple[int, int], tied: bool, cached: bool) -> None:
-    """Turned lines, an overlap, dead lines, bad and unlit elements: every tiling gives what one tile gives."""
+    """Turned lines, an overlap, dead lines, bad and unlit elements: every tiling equals a single tile."""
     grid = PixelGrid(CORNER, 1, (90, 140))
     placed = two_turned(grid if tied else None)
     whole, coverage = in_tiles(placed, grid, grid.shape)
@@ -113,7 +113,7 @@ def test_any_tiling_gives_the_same_bits(shape: tuple[int, int], tied: bool, cach
 
 
 def test_cutting_a_tile_into_runs_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Windows as short as they can be give what one window for the whole tile gives."""
+    """The shortest possible windows give the same values as one window for the whole tile."""
     grid = PixelGrid(CORNER, 1, (40, 140))
     whole = in_tiles(two_turned(None), grid, grid.shape)
     monkeypatch.setattr("pipeline.rectify.mosaic.RUN_ELEMENTS", 0)
@@ -123,8 +123,8 @@ def test_cutting_a_tile_into_runs_changes_no_bit(monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.parametrize("kind", [Taken, Cropped])
-def test_a_block_of_lines_is_read_once_down_a_column(kind: type[Taken]) -> None:
-    """In the order of the tiles, with the cache that they are projected to need, nothing is read twice in a column."""
+def test_a_block_of_lines_is_read_once_in_a_column_of_tiles(kind: type[Taken]) -> None:
+    """In the order of the tiles, with a cache of the projected size, no block of a column is read twice."""
     grid, lines = PixelGrid((3010.0, -4770.0), 1, (160, 120)), taken(TURNED, kind=kind)
     placed = [place(lines, CAMERA)]
     for tiles in (plan_tiles(placed, CAMERA, grid, (32, 120)), plan_tiles(placed, CAMERA, grid, (32, 60))[:5]):
@@ -137,8 +137,8 @@ def test_a_block_of_lines_is_read_once_down_a_column(kind: type[Taken]) -> None:
 
 
 @pytest.mark.parametrize("kind", [Taken, Cropped])
-def test_raw_lines_are_projected_as_they_are_held(kind: type[Taken]) -> None:
-    """A tile holds no more raw lines than projected: whole ones of a sweep read so, else whole chunks of samples."""
+def test_projected_cache_size_covers_the_raw_lines(kind: type[Taken]) -> None:
+    """A tile holds at most the projected bytes: whole lines, or whole chunks of samples if the sweep reads these."""
     grid = PixelGrid((3010.0, -4770.0), 1, (160, 120))
     placed = [place(taken(TURNED, kind=kind), CAMERA)]
     tiles, whole = plan_tiles(placed, CAMERA, grid, (32, 20)), LineCache(2**30)
@@ -152,8 +152,8 @@ def test_raw_lines_are_projected_as_they_are_held(kind: type[Taken]) -> None:
 
 @given(st.integers(-100, 300), st.integers(-250, 250), st.integers(1, 60), st.integers(1, 60))
 @settings(max_examples=25, deadline=None)
-def test_reach_is_never_too_little(row: int, column: int, height: int, width: int) -> None:
-    """All knots and samples at which pixels are looked up, with a margin for taps, are among those foretold."""
+def test_reach_contains_all_knots_and_samples_of_a_tile(row: int, column: int, height: int, width: int) -> None:
+    """The predicted knots and samples contain those of every pixel, with a margin for taps."""
     grid, placed = PixelGrid(CORNER, 1, (400, 400)), place(taken(TURNED, bands=1), CAMERA)
     rows, columns = slice(row, row + height), slice(column, column + width)
     scan_path = placed.scan_paths[0][0]
@@ -169,7 +169,7 @@ def test_reach_is_never_too_little(row: int, column: int, height: int, width: in
 
 
 def test_turned_lines_are_cut_into_short_runs() -> None:
-    """A long tile of lines turned by 30 degrees is cut so that less than half as much is calibrated; upright is not."""
+    """Cutting a long tile of lines turned by 30 degrees halves the calibrated area. Upright lines stay one run."""
     for tilt, most_fraction, runs in ((np.tan(np.pi / 6), 0.5, range(4, 20)), (0.0, 1.0, range(1, 2))):
         y, x = np.mgrid[:64, :640]
         place_of = np.stack([y + tilt * x, x - tilt * y], axis=-1).reshape(64, 20, 32, 2).swapaxes(0, 1)
@@ -181,8 +181,8 @@ def test_turned_lines_are_cut_into_short_runs() -> None:
 
 
 @pytest.mark.parametrize("beside", [True, False])
-def test_where_no_line_shows_anything_all_is_empty(beside: bool) -> None:
-    """Beside the swath, and where all lines are dead, pixels are NaN with a coverage of 0, and nothing is read."""
+def test_pixels_without_any_line_are_nan(beside: bool) -> None:
+    """Next to the swath, and where all lines are dead, pixels are NaN with a coverage of 0, and no line is read."""
     lines = taken(TURNED)
     lines.valid_line[:] = beside
     grid = PixelGrid((0.0, 0.0) if beside else CORNER, 1, (70, 50))
@@ -194,7 +194,7 @@ def test_where_no_line_shows_anything_all_is_empty(beside: bool) -> None:
 
 @pytest.mark.parametrize("placed_by_it", [False, True])
 def test_a_dead_line_leaves_its_own_row_empty(placed_by_it: bool) -> None:
-    """What a dead line holds reaches no pixel, even if its place is believed; only pixels nearest to it are lost."""
+    """The values of a dead line reach no pixel, even if its position is usable. Only the nearest pixels are lost."""
     sweep = Sweep("straight", "fine", "x", 0.0, -30.0, 60)
     lines = taken(sweep)
     whole, _ = in_tiles([place(lines, CAMERA)], grid := PixelGrid((-20.0, -60.0), 1, (40, 120)), (64, 640))
@@ -208,8 +208,8 @@ def test_a_dead_line_leaves_its_own_row_empty(placed_by_it: bool) -> None:
     np.testing.assert_array_equal(seen[far], whole[far])
 
 
-def test_lines_that_are_missing_count_nothing() -> None:
-    """Beside a lost line a point is what the kernel's other lines say: the line that stands in for it has no weight."""
+def test_missing_lines_have_no_weight() -> None:
+    """A point next to a lost line is computed from the kernel's other lines; the substitute line has no weight."""
     whole, came = taken(Sweep("straight", "fine", "x", 0.0, -30.0, 60)), np.arange(60) != 30
     rows = {name: getattr(whole, name)[came] for name in ("raw", "position", "valid_line")}
     lines = replace(whole, sweep=replace(whole.sweep, lines=59), **rows)
@@ -221,8 +221,8 @@ def test_lines_that_are_missing_count_nothing() -> None:
     np.testing.assert_allclose(seen[0], expected, rtol=1e-3)
 
 
-def test_sums_of_samples_saturate_later() -> None:
-    """A sum of two samples beyond one's full scale has a value, a sum of two full ones has none."""
+def test_binned_samples_saturate_at_the_sum_of_full_scales() -> None:
+    """A sum of two samples above the full scale of one is valid; a sum of two saturated samples is not."""
     sweep = Sweep("binned", "coarse", "x", 0.0, -30.0, 40, step=2, binning=2)
     half = taken(sweep)
     raw, references = half.raw[:, ::2].copy(), half.references
@@ -234,8 +234,8 @@ def test_sums_of_samples_saturate_later() -> None:
     assert np.isnan(seen[21:]).all()
 
 
-def test_a_sweep_that_turns_is_two_sweeps() -> None:
-    """Lines taken there and back are blended as if each way were a sweep of its own, in any tiling."""
+def test_a_sweep_that_turns_back_counts_as_two_sweeps() -> None:
+    """Lines captured there and back are blended like two sweeps, for any tiling."""
     there = taken(Sweep("there", "fine", "x", 0.0, -30.0, 60))
     path = np.concatenate([there.position, there.position[::-1]])
     longer = taken(replace(there.sweep, start_px=0.0, lines=120))

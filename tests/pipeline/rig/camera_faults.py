@@ -1,4 +1,4 @@
-"""Faults of the emulated camera, wrapped around it: replies, captures, cubes and transfers that go wrong."""
+"""Faults of the emulated camera: replies, captures, cubes and transfers that go wrong."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SLOW_S, LATE_S = 1.0, 60.0
 
 
 class CameraFault(StrEnum):
-    """A fault of the camera."""
+    """Kinds of faults of the camera."""
 
     SLOW = "a reply comes late, and in time"
     LATE = "a reply comes after any deadline"
@@ -37,7 +37,7 @@ class CameraFault(StrEnum):
 
 @dataclass
 class CameraFaults:
-    """Faults still to come, each so many times, after ``passes`` occasions; the seed draws where pieces are cut."""
+    """Pending faults and their counts, which strike after ``passes`` occasions; the seed draws the cuts of replies."""
 
     left: dict[CameraFault, int] = field(default_factory=dict)
     seed: int = 0
@@ -47,7 +47,7 @@ class CameraFaults:
         self.rng = np.random.default_rng(self.seed)
 
     def strikes(self, fault: CameraFault) -> bool:
-        """Whether the fault strikes now; it is then one less to come."""
+        """Return whether the fault strikes now, and count it down."""
         if self.left.get(fault, 0) < 1:
             return False
         if self.passes > 0:
@@ -58,20 +58,20 @@ class CameraFaults:
 
 
 class FaultyCamera(CameraDevice):
-    """A camera that fails."""
+    """A camera with faults."""
 
     def __init__(self, *given: Any, faults: CameraFaults | None = None, **named: Any) -> None:
         self.faults = CameraFaults() if faults is None else faults
-        self.commands: list[str] = []  # as they came
-        self._cut: set[str] = set()  # folders whose last cube is cut off
+        self.commands: list[str] = []  # in order of arrival
+        self._cut: set[str] = set()  # folders whose last cube is truncated
         super().__init__(*given, **named)
 
     def greet(self) -> list[Chunk]:
-        """Greet, perhaps in pieces."""
+        """Greet, possibly in pieces."""
         return self._in_pieces(b"".join(data for _, data in super().greet()))
 
     def command(self, line: str) -> list[Chunk] | None:
-        """Do a command, and answer it or not."""
+        """Execute a command, and reply unless a fault prevents it."""
         with self._lock:
             self.commands.append(line)
             said = super().command(line)
@@ -89,7 +89,7 @@ class FaultyCamera(CameraDevice):
             return self._in_pieces(data)
 
     def files(self) -> dict[str, bytes]:
-        """Give the files, with cubes that are cut off."""
+        """Return the files, with truncated cubes."""
         found = super().files()
         for folder in self._cut:
             cube = f"{folder}/raw_0"
@@ -119,11 +119,11 @@ class FaultyCamera(CameraDevice):
 
 
 class FaultySceneCamera(FaultyCamera, SceneCamera):
-    """A camera that looks at a scene, and fails."""
+    """A camera in front of a scene, with faults."""
 
 
 class _HalfOf:
-    """Gives half of what is left of a producer's file, and closes the session."""
+    """Producer of half of the remaining file, which then closes the session."""
 
     def __init__(self, producer: Any, transfer: Any) -> None:
         rest = producer.file.read()
@@ -155,13 +155,13 @@ class _FaultyHandler(FileHandler):
 
 
 class FaultyServer(CameraServer):
-    """A camera's ports, whose transfers fail as the camera's faults say."""
+    """A camera's ports, whose transfers fail by the camera's faults."""
 
     handler = _FaultyHandler
 
 
 class FaultyRig(EmulatedRig):
-    """An emulated rig whose devices fail."""
+    """An emulated rig whose devices have faults."""
 
     mirror_kind, camera_kind, server_kind = FaultyMirror, FaultySceneCamera, FaultyServer
     mirror: FaultyMirror

@@ -1,4 +1,4 @@
-"""Emulated devices in this process: lines without ports, on a clock that waiting moves."""
+"""Emulated devices in this process: lines without ports, with a manual clock."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.pipeline.rig.mirror_faults import FaultyMirror, VanishedError
 
 
 class ManualClock:
-    """A clock that moves only when it is told to: sleeping takes no time and moves it."""
+    """A clock that advances only by sleeping, which takes no real time."""
 
     def __init__(self, start: float = 0.0) -> None:
         self._now = start
@@ -33,20 +33,20 @@ class ManualClock:
 
 
 class Incoming:
-    """What is on its way to a driver, an error among it perhaps; whoever waits for it moves the clock."""
+    """Data on their way to a driver, possibly with an error; reading advances the clock."""
 
     clock: Clock
 
     def __post_init__(self) -> None:
-        self.coming: list[tuple[float, int, bytes | Exception]] = []  # by the time at which it can be read
+        self.coming: list[tuple[float, int, bytes | Exception]] = []  # by the time at which they can be read
         self._order = count()
 
     def expect(self, when_s: float, data: bytes | Exception) -> None:
-        """Have something come at a time, behind all that comes then."""
+        """Schedule data for a time, after all that is scheduled for the same time."""
         heapq.heappush(self.coming, (when_s, next(self._order), data))
 
     def read(self, at_most: int, deadline: float) -> bytes:
-        """Give the next part, at the time that it comes."""
+        """Return the next part, at its time."""
         if not self.coming or self.coming[0][0] > deadline:
             self.clock.sleep(deadline - self.clock.now())
             return b""
@@ -59,7 +59,7 @@ class Incoming:
         return data[:at_most]
 
     def drain(self) -> bytes:
-        """Give what came already."""
+        """Return all data that have arrived."""
         found = b""
         while self.coming and self.coming[0][0] <= self.clock.now():
             found += self.read(1 << 20, self.clock.now())
@@ -70,7 +70,7 @@ class Incoming:
 class InProcessTransport(Incoming):
     """A :class:`~pipeline.rig.transports.Transport` to ``device``; both share the clock.
 
-    ``sent`` are the writes, for whoever checks what was sent. ``baud`` paces both directions; 0 does not.
+    ``sent`` has the writes, for tests that check them. ``baud`` paces both directions; 0 does not.
     """
 
     device: MirrorDevice
@@ -87,7 +87,7 @@ class InProcessTransport(Incoming):
             self._schedule(self.device.opened())
 
     def write(self, data: bytes, deadline: float) -> None:
-        """Hand the bytes to the device at once."""
+        """Pass the bytes to the device at once."""
         self._check_open()
         self.sent.append(data)
         if getattr(self.device, "hung", False):
@@ -100,7 +100,7 @@ class InProcessTransport(Incoming):
             raise self._gone() from error
 
     def read(self, at_most: int, deadline: float) -> bytes:
-        """Give what the device has answered by then."""
+        """Return the device's reply up to the deadline."""
         self._check_open()
         if not self.coming and getattr(self.device, "gone", False):
             raise self._gone()
@@ -151,7 +151,7 @@ class InProcessCameraLine(Incoming):
         self._say(chunks)
 
     def read(self, at_most: int, deadline: float) -> bytes:
-        """Give what the camera has answered by then."""
+        """Return the camera's reply up to the deadline."""
         if not self.coming:
             self._check_open()
         return super().read(at_most, deadline)
@@ -173,12 +173,12 @@ class InProcessCameraLine(Incoming):
 
 @dataclass
 class InProcessRig(Closing):
-    """Lines to an emulated rig. Close it: a thread serves the camera's files, through a socket of this machine."""
+    """Lines to an emulated rig. Close it, because a thread serves the camera's files through a local socket."""
 
     rig: EmulatedRig
 
     def __post_init__(self) -> None:
-        self.clock = self.rig.clock  # of the devices, and of drivers that talk to them
+        self.clock = self.rig.clock  # of the devices and of their drivers
         self.transport = InProcessTransport(self.rig.mirror, self.clock)
         self.server = self.rig.server_kind(self.rig.camera)
         self.files = FileServer(self.server.host, self.server.file_port)
@@ -188,21 +188,21 @@ class InProcessRig(Closing):
         return InProcessCameraLine(self.rig.camera, self.clock)
 
     def camera(self) -> HeadwallCamera:
-        """Give a driver that is connected to the camera."""
+        """Return a driver that is connected to the camera."""
         return HeadwallCamera(self.camera_line, self.files, clock=self.clock)
 
     def mirror(self, rig: SurveyRig, vector_pairs: int = 1500) -> MirrorController:
-        """Connect a driver to the mirror, by a line of its own."""
+        """Connect a driver to the mirror, with a line of its own."""
         self.transport = InProcessTransport(self.rig.mirror, self.clock)
         mirror = MirrorController(self.transport, rig, self.clock, vector_pairs=vector_pairs)
         mirror.connect()
         return mirror
 
     def devices(self, rig: SurveyRig, vector_pairs: int = 1500) -> RigDevices:
-        """Connect drivers to both."""
+        """Connect drivers to both devices."""
         mirror = self.mirror(rig, vector_pairs)
         return RigDevices(mirror, self.camera(), self.clock)
 
     def close(self) -> None:
-        """Let go of the port for files."""
+        """Close the port for files."""
         self.server.close()

@@ -1,4 +1,4 @@
-"""Faults of the emulated mirror controller, wrapped around it, by name; a seed draws when and how each strikes."""
+"""Named faults of the emulated mirror controller, wrapped around it; a seed draws when and how each strikes."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from pipeline.rig.pro_mode import CELL, VECTOR_MEMORY, Command, ErrorCode, Statu
 
 LATE_S = 20.0  # beyond any deadline
 SLOW_S = 0.02  # from byte to byte
-# the end of a reply with a text, one of a status, and a whole frame: what another program left behind
+# left behind by another program: the end of a text reply, the end of a status, and a whole frame
 _LEFT_BEHIND = (b"R-E-2\r\n", b"00000010\r\n", bytes.fromhex("7e 00 11 04 00 00 00 00 f2 81 7e"))
 _OTHER_TEXTS = {ID: "LENS-DRIVER-4", VERSION: "0.0.1"}
 
-Change = Callable[[bytes, int, Random], bytes]  # some bytes, and the place of the one that is changed
+Change = Callable[[bytes, int, Random], bytes]  # some bytes, and the place of the changed one
 Spoil = Callable[[MirrorDevice, list[Chunk], Random], list[Chunk]]
 
 
 class VanishedError(OSError):
-    """The device went away: no port knows it any more."""
+    """The device disappeared, so that no port has it."""
 
     def __init__(self) -> None:
         super().__init__(errno.EIO, "the device is gone")
@@ -36,7 +36,7 @@ class VanishedError(OSError):
 
 @dataclass
 class Chance:
-    """When a fault strikes: at one of the opportunities that come, early ones as likely as later twice as many."""
+    """Draws the opportunity at which a fault strikes, with equal probability per octave of opportunities."""
 
     random: Random
     at: int
@@ -45,76 +45,76 @@ class Chance:
 
     @classmethod
     def drawn(cls, name: str, seed: int, span: int, at: int | None = None) -> Chance:
-        """Draw the opportunity, from 0 to ``span``, exclusive; ``at`` says it instead."""
+        """Draw the opportunity from 0 to ``span``, exclusive, unless ``at`` is given."""
         random = Random(f"{name} {seed}")
         drawn = int(2 ** random.uniform(0, math.log2(span + 1))) - 1
         return cls(random, min(drawn, span - 1) if at is None else at)
 
     def comes(self) -> bool:
-        """Take note of an opportunity and say whether it is the one."""
+        """Count an opportunity and return whether the fault strikes at it."""
         self.seen += 1
         now = self.seen == self.at + 1
         self.struck += now
         return now
 
     def lasts(self) -> bool:
-        """Take note of an opportunity and say whether it is the one, or comes after it."""
+        """Count an opportunity and return whether the fault strikes at it or struck before."""
         return self.comes() or self.seen > self.at
 
 
 @dataclass
 class Fault:
-    """A fault that never strikes. Hooks are called in the order in which they stand here."""
+    """A fault that never strikes. Its hooks are called in this order."""
 
     chance: Chance
 
     def begin(self, device: FaultyMirror) -> None:
-        """Take a hand as the controller is switched on."""
+        """Act when the controller is switched on."""
 
     def opened(self, device: FaultyMirror) -> list[Chunk]:
-        """Give what is found in the port as it is opened."""
+        """Return the bytes in the port when it is opened."""
         return []
 
     def instead(self, device: FaultyMirror, data: bytes) -> list[Chunk] | None:
-        """Answer bytes in the controller's place; None leaves them to it."""
+        """Answer bytes instead of the controller; None leaves them to it."""
         return None
 
     def incoming(self, device: FaultyMirror, data: bytes) -> bytes:
-        """Give the bytes that reach the controller."""
+        """Return the bytes that reach the controller."""
         return data
 
     def verdict(self, device: FaultyMirror, request: Request) -> bytes | None:
-        """Give a reply to a request that then is not carried out; None lets the controller do it."""
+        """Reply to a request that is then not executed; None lets the controller execute it."""
         return None
 
     def outgoing(self, device: FaultyMirror, request: Request, chunks: list[Chunk]) -> list[Chunk]:
-        """Give the bytes that leave the controller, and when."""
+        """Return the bytes that leave the controller, with their delays."""
         return chunks
 
 
 class FaultyMirror(MirrorDevice):
-    """A controller that fails; ``gone`` and ``hung`` say that no port knows it any more, or that it takes no bytes."""
+    """A controller with faults; ``gone``: no port has it; ``hung``: it takes no bytes."""
 
     def __init__(self, clock: Any, faults: Sequence[Fault] = ()) -> None:
         self.faults: tuple[Fault, ...] = ()
-        self.requests: list[Request] = []  # that were carried out
+        self.requests: list[Request] = []  # executed ones
         self.gone = self.hung = False
         self.deaf_until_s = -math.inf
         super().__init__(clock)
         self.have(faults)
 
     def have(self, faults: Sequence[Fault]) -> None:
-        """Fail so from now on."""
+        """Replace the faults."""
         self.faults = tuple(faults)
         for fault in self.faults:
             fault.begin(self)
 
     def opened(self) -> list[Chunk]:
-        """Give what a user finds in the port when it is opened."""
+        """Return the bytes that a user finds in the port when it is opened."""
         return [chunk for fault in self.faults for chunk in fault.opened(self)]
 
     def receive(self, data: bytes) -> list[Chunk]:
-        """Take bytes and give what comes back; VanishedError where a fault took the device away."""
+        """Receive bytes and return the reply; raise VanishedError if a fault removed the device."""
         self.take_pulses()
         with self._lock:
             if self.gone:
@@ -127,7 +127,7 @@ class FaultyMirror(MirrorDevice):
             return super().receive(data) if self.clock.now() >= self.deaf_until_s else []
 
     def carry_out(self, request: Request) -> bytes:
-        """Note a request, and do what it asks for."""
+        """Record a request, and execute it."""
         self.requests.append(request)
         return super().carry_out(request)
 
@@ -145,24 +145,24 @@ class FaultyMirror(MirrorDevice):
         out += chunks
 
 
-# what may become of bytes
+# changes of bytes
 
 
 def lose(data: bytes, at: int, random: Random) -> bytes:
-    """Leave a byte out."""
+    """Drop a byte."""
     return data[:at] + data[at + 1 :]
 
 
 def flip(data: bytes, at: int, random: Random) -> bytes:
-    """Turn one bit of a byte."""
+    """Flip one bit of a byte."""
     return data[:at] + bytes((data[at] ^ 1 << random.randrange(8),)) + data[at + 1 :]
 
 
-# what may become of a reply
+# changes of a reply
 
 
 def changed(change: Change) -> Spoil:
-    """Change one byte."""
+    """Return a function that changes one byte."""
 
     def spoil(device: MirrorDevice, chunks: list[Chunk], random: Random) -> list[Chunk]:
         delay_s, data = chunks[0]
@@ -172,7 +172,7 @@ def changed(change: Change) -> Spoil:
 
 
 def split(device: MirrorDevice, chunks: list[Chunk], random: Random) -> list[Chunk]:
-    """Cut it into pieces of a few bytes, a millisecond apart."""
+    """Split it into pieces of a few bytes, a millisecond apart."""
     pieces = []
     for delay_s, data in chunks:
         while data:
@@ -183,17 +183,17 @@ def split(device: MirrorDevice, chunks: list[Chunk], random: Random) -> list[Chu
 
 
 def late(device: MirrorDevice, chunks: list[Chunk], random: Random) -> list[Chunk]:
-    """Hold it back beyond any deadline."""
+    """Delay it beyond any deadline."""
     return [Chunk(delay_s + LATE_S, data) for delay_s, data in chunks]
 
 
 def just_late(device: MirrorDevice, chunks: list[Chunk], random: Random) -> list[Chunk]:
-    """Hold it back until around its deadline of a second, so that it may meet the next request."""
+    """Delay it to about its deadline of a second, so that it may collide with the next request."""
     return [Chunk(delay_s + random.uniform(0.3, 1.5), data) for delay_s, data in chunks]
 
 
 def lost(device: MirrorDevice, chunks: list[Chunk], random: Random) -> list[Chunk]:
-    """Keep it."""
+    """Drop it."""
     return []
 
 
@@ -205,7 +205,7 @@ def slow(device: MirrorDevice, chunks: list[Chunk], random: Random) -> list[Chun
 
 @dataclass
 class SpoiltReply(Fault):
-    """One reply leaves otherwise than it should, or all from one on do; requests without a reply do not count."""
+    """One reply, or all from one on, are changed; requests without a reply do not count."""
 
     spoil: Spoil
     lasting: bool = False
@@ -218,7 +218,7 @@ class SpoiltReply(Fault):
 
 @dataclass
 class StaleBytes(Fault):
-    """What another program asked for lies in the port when it is opened, and some more follows."""
+    """The port has bytes of another program's session when it is opened, and more follow."""
 
     def opened(self, device: FaultyMirror) -> list[Chunk]:
         self.chance.struck += 1
@@ -229,7 +229,7 @@ class StaleBytes(Fault):
 
 @dataclass
 class RequestByte(Fault):
-    """One byte of all that go to the controller is changed."""
+    """One of all bytes to the controller is changed."""
 
     change: Change
 
@@ -252,13 +252,13 @@ class ProAtConnect(Fault):
 
 @dataclass
 class SilentReset(Fault):
-    """The controller restarts by itself as a request comes, says nothing and is in simple mode afterwards."""
+    """The controller restarts at a request, sends nothing and is in simple mode afterwards."""
 
     boot_s: float
-    commands: Collection[int] | None = None  # frames that can be struck; None is any request
+    commands: Collection[int] | None = None  # frames that can be struck; None: any request
 
     def verdict(self, device: FaultyMirror, request: Request) -> bytes | None:
-        """Restart instead of doing what was asked, and answer nothing."""
+        """Restart instead of executing the request, without a reply."""
         if (self.commands is not None and request.command not in self.commands) or not self.chance.comes():
             return None
         device.restart()
@@ -268,7 +268,7 @@ class SilentReset(Fault):
 
 @dataclass
 class AnswersNo(Fault):
-    """One line of simple mode gets a refusal and is not carried out."""
+    """One line of simple mode is refused and not executed."""
 
     def verdict(self, device: FaultyMirror, request: Request) -> bytes | None:
         if request.mode is not Mode.SIMPLE or not self.chance.comes():
@@ -278,10 +278,10 @@ class AnswersNo(Fault):
 
 @dataclass
 class AnswersError(Fault):
-    """One frame gets an error code and is not carried out."""
+    """One frame gets an error code and is not executed."""
 
     code: int
-    commands: Collection[int] | None = None  # that can be struck; None is any
+    commands: Collection[int] | None = None  # those that can be struck; None: any
 
     def verdict(self, device: FaultyMirror, request: Request) -> bytes | None:
         command = request.command
@@ -292,10 +292,10 @@ class AnswersError(Fault):
 
 @dataclass
 class CellLost(Fault):
-    """One cell of the vector memory keeps what it held, though its writing is acknowledged."""
+    """One cell of the vector memory keeps its old value, although its writing is acknowledged."""
 
     def verdict(self, device: FaultyMirror, request: Request) -> bytes | None:
-        """Have the cells written, put one that changed back, and acknowledge all of them."""
+        """Write the cells, restore one that changed, and acknowledge all of them."""
         if request.frame is None or request.command != Command.SET_VECTOR or len(request.frame.payload) < 5 + CELL:
             return None
         register, offset, length, _ = read_vector(request.frame.payload)
@@ -312,7 +312,7 @@ class CellLost(Fault):
 
 @dataclass
 class StatusBit(Fault):
-    """From one request on a bit of the status is on, and stays."""
+    """A bit of the status is set from one request on."""
 
     bit: Status
 
@@ -324,10 +324,10 @@ class StatusBit(Fault):
 
 @dataclass
 class OtherFirmware(Fault):
-    """The controller is another model of its maker."""
+    """The controller is another model of its manufacturer."""
 
     def verdict(self, device: FaultyMirror, request: Request) -> bytes | None:
-        """Answer whoever asks for the model, the version or the firmware as that other model would."""
+        """Answer requests for the model, the version or the firmware like the other model."""
         if request.line in _OTHER_TEXTS:
             self.chance.struck += 1
             return _OTHER_TEXTS[request.line].encode("ascii") + END
@@ -336,7 +336,7 @@ class OtherFirmware(Fault):
 
 @dataclass
 class GoneBefore(Fault):
-    """The device goes away before a request reaches it."""
+    """The device disappears before a request reaches it."""
 
     def incoming(self, device: FaultyMirror, data: bytes) -> bytes:
         if self.chance.comes():
@@ -347,7 +347,7 @@ class GoneBefore(Fault):
 
 @dataclass
 class GoneAfter(Fault):
-    """The device carries a request out and goes away before it answers."""
+    """The device executes a request and disappears before it answers."""
 
     def outgoing(self, device: FaultyMirror, request: Request, chunks: list[Chunk]) -> list[Chunk]:
         if self.chance.comes():
@@ -358,7 +358,7 @@ class GoneAfter(Fault):
 
 @dataclass
 class PortHangs(Fault):
-    """From one request on the port takes no more bytes, and writing to it blocks."""
+    """The port takes no bytes from one request on, and writing to it blocks."""
 
     def incoming(self, device: FaultyMirror, data: bytes) -> bytes:
         if self.chance.lasts():
@@ -369,10 +369,10 @@ class PortHangs(Fault):
 
 @dataclass
 class Echo(Fault):
-    """A loop of wire instead of a controller: all that is sent comes back."""
+    """A loopback wire instead of a controller: all sent bytes come back."""
 
     def instead(self, device: FaultyMirror, data: bytes) -> list[Chunk]:
-        """Send back all that came."""
+        """Return all received bytes."""
         self.chance.struck += 1
         return [Chunk(TURNAROUND_S, data)]
 
@@ -380,8 +380,8 @@ class Echo(Fault):
 _SETTING = frozenset({Command.SET_VALUES})
 _VECTORS = frozenset({Command.SET_VECTOR, Command.GET_VECTOR})
 _UPLOAD = frozenset({Command.SET_VECTOR})
-_BYTES = 1024  # within so many bytes to the controller
-HARMLESS = ("split-replies", "stale-bytes", "pro-at-connect")  # a driver copes with them
+_BYTES = 1024  # bytes to the controller within which it strikes
+HARMLESS = ("split-replies", "stale-bytes", "pro-at-connect")  # the driver copes with these
 
 
 def _reply(spoil: Spoil, *, lasting: bool = False) -> tuple[Callable[[Chance], Fault], int]:
@@ -396,7 +396,7 @@ def _bit(bit: Status) -> tuple[Callable[[Chance], Fault], int]:
     return partial(StatusBit, bit=bit), 32
 
 
-# how each fault is built, and the number of opportunities within which it strikes
+# constructor of each fault, and the number of opportunities within which it strikes
 KINDS: dict[str, tuple[Callable[[Chance], Fault], int]] = {
     "request-byte-lost": (partial(RequestByte, change=lose), _BYTES),
     "request-bit-flipped": (partial(RequestByte, change=flip), _BYTES),
@@ -430,6 +430,6 @@ KINDS: dict[str, tuple[Callable[[Chance], Fault], int]] = {
 
 
 def make_fault(name: str, seed: int = 0, at: int | None = None) -> Fault:
-    """Build a fault; the seed draws when and how it strikes, ``at`` says when instead."""
+    """Return a fault; the seed draws when and how it strikes, ``at`` overrides when."""
     build, span = KINDS[name]
     return build(Chance.drawn(name, seed, span, at))

@@ -1,4 +1,4 @@
-"""A transport that knows beforehand what is sent and what comes back, and fails on every byte that differs."""
+"""A transport with a script of sent and received bytes, which fails on every byte that differs."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ Pair = tuple[bytes, bytes | Sequence[Reply]]
 
 
 class ScriptedTransport(Incoming):
-    """Plays (sent, received) pairs. What is received may come in parts, late, or be an error; waiting takes no time.
+    """Transport that plays (sent, received) pairs. Received data may be parts, late or an error; waiting takes no time.
 
-    ``stale`` lies on the line at first.
+    ``stale`` is on the line at first.
     """
 
     port = "scripted"
@@ -41,7 +41,7 @@ class ScriptedTransport(Incoming):
             self.expect(clock.now(), stale)
 
     def write(self, data: bytes, deadline: float) -> None:
-        """Take a request: the next one, to the byte."""
+        """Accept the next request, which must be equal to the byte."""
         assert self.clock.now() < deadline
         assert self._pairs, f"nothing more was expected, {data.hex(' ')} was sent"
         expected, received = self._pairs.popleft()
@@ -53,13 +53,13 @@ class ScriptedTransport(Incoming):
                 self.expect(self.clock.now() + after, reply)
 
     def drain(self) -> bytes:
-        """Give what came already, and note it."""
+        """Return the data that have arrived, and record them."""
         found = super().drain()
         self.drained += found
         return found
 
     def close(self) -> None:
-        """Note that the port was let go of."""
+        """Record that the port was closed."""
         self.closed = True
 
     def check(self) -> None:
@@ -70,7 +70,7 @@ class ScriptedTransport(Incoming):
 
 @contextmanager
 def scripted(pairs: Sequence[Pair], *, stale: bytes = b"", drained: bytes = b"") -> Iterator[ScriptedTransport]:
-    """Play pairs and fail at the end on what was not sent or read. ``drained`` is what has to be thrown away unread."""
+    """Play pairs, and fail at the end on unsent or unread ones. ``drained`` must be dropped unread."""
     transport = ScriptedTransport(pairs, ManualClock(), stale)
     yield transport
     transport.check()

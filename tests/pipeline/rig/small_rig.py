@@ -1,4 +1,4 @@
-"""A small scene before an emulated rig in this process, and the source of lines that looks through it."""
+"""A small scene in front of an emulated rig in this process, and the rig as a source of lines."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ FINE = Sweep("fine-3", "fine", "x", 3.25, -7.5, 17)
 
 
 def small_source(**changed: Any) -> SimulatedSource:
-    """A simulated source of 40 x 48 px and 3 bands, with usual effects."""
+    """Return a simulated source of 40 x 48 px and 3 bands, with usual effects."""
     rng = np.random.default_rng(11)
     scene = raster_from_values(
         rng.uniform(20, 200, (40, 48, 3)), CAMERA, name="small", wavelength_nm=np.array([460.0, 550.0, 640.0])
@@ -44,12 +44,12 @@ def small_source(**changed: Any) -> SimulatedSource:
 
 @cache
 def simulated_lines(sweep: Sweep) -> list[Line]:
-    """The simulated source's lines of a sweep, made once."""
+    """Return the simulated source's lines of a sweep, cached."""
     return list(small_source().lines(sweep))
 
 
 def assert_simulated(found: Sequence[Line], sweep: Sweep, first: int = 0) -> None:
-    """The numbers of the simulated source's lines from ``first`` on, bit for bit and in order."""
+    """Assert the numbers of the simulated source's lines from ``first`` on, bit for bit and in order."""
     expected = simulated_lines(sweep)[first:]
     assert [line.number for line in found] == [line.number for line in expected]
     np.testing.assert_array_equal([line.data for line in found], [line.data for line in expected])
@@ -57,7 +57,7 @@ def assert_simulated(found: Sequence[Line], sweep: Sweep, first: int = 0) -> Non
 
 @dataclass
 class SmallRig:
-    """An emulated rig and what is needed to look through it."""
+    """An emulated rig and the settings of its sources."""
 
     line: InProcessRig
     settings: SurveyRig
@@ -67,21 +67,21 @@ class SmallRig:
 
     @property
     def emulated(self) -> FaultyRig:
-        """Both emulated devices."""
+        """Return both emulated devices."""
         return cast("FaultyRig", self.line.rig)
 
     @property
     def captures(self) -> list[str]:
-        """Capture commands that the camera took, references left out."""
+        """Return the capture commands that the camera received, without references."""
         return [said for said in self.emulated.camera.commands if "capture(" in said and "references" not in said]
 
     def devices(self) -> RigDevices:
-        """Connect to both."""
+        """Connect to both devices."""
         self.opened += 1
         return self.line.devices(self.settings, self.vector_pairs)
 
     def source(self, kept: Kept | None = None) -> RigSource:
-        """A source that looks through the rig; another call is another process."""
+        """Return a source that captures with the rig; each call acts as another process."""
         return RigSource(
             self.emulated.camera.view.source.camera,
             self.wavelength_nm,
@@ -104,9 +104,9 @@ def small_rig(
     mounting: Mounting = STRAIGHT,
     **settings: Any,
 ) -> Iterator[SmallRig]:
-    """An emulated rig before a source's scene, until the context ends; its mirror is mounted as ``mounting`` says.
+    """Yield an emulated rig in front of a source's scene, with its mirror mounted as ``mounting``.
 
-    Settings and cable have one pulse a held position, and requests to the mirror a CRC, unless ``settings`` differ.
+    Settings and cable have one pulse per held position, and requests to the mirror a CRC, unless ``settings`` differ.
     """
     told = {"pulses": "position", "with_crc": True, **settings}
     viewed = small_source() if source is None else source

@@ -1,4 +1,4 @@
-"""Serial ports, and every way in which one is not there."""
+"""Serial ports, and all errors of missing ports."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo terminal
 
 @pytest.fixture
 def ends() -> Iterator[tuple[FileIO, str]]:
-    """The device's end of a pseudo terminal, and the name of the driver's."""
+    """Yield the device's end of a pseudo terminal, and the name of the driver's end."""
     device, driver = os.openpty()
     tty.setraw(driver)
     with FileIO(device, "r+") as end:
@@ -29,13 +29,13 @@ def ends() -> Iterator[tuple[FileIO, str]]:
 
 
 def soon(seconds: float = 5.0) -> float:
-    """A deadline that a working line never meets."""
+    """Return a deadline that a working line never reaches."""
     return SYSTEM_CLOCK.now() + seconds
 
 
 @pytest.mark.parametrize("baud", [115200, 256000])
 def test_bytes_pass_both_ways(ends: tuple[FileIO, str], baud: int):
-    """All 256 values, at speeds that the system has a name for and that it has none for."""
+    """All 256 byte values pass, at a standard baud rate and at another one."""
     device, name = ends
     line = SerialTransport(name, baud)
     line.write(bytes(range(256)), soon())
@@ -49,7 +49,7 @@ def test_bytes_pass_both_ways(ends: tuple[FileIO, str], baud: int):
 
 
 def test_reading_ends_at_the_deadline_and_draining_at_once(ends: tuple[FileIO, str]):
-    """Nothing comes: nothing is given, and a deadline that has passed is not waited for; what is there is, once."""
+    """Without data nothing is returned. A deadline in the past is not waited for. Data are drained once."""
     line = SerialTransport(ends[1], 115200)
     assert line.read(10, SYSTEM_CLOCK.now() + 0.03) == b""
     assert line.read(10, SYSTEM_CLOCK.now() - 1) == b""
@@ -63,7 +63,7 @@ def test_reading_ends_at_the_deadline_and_draining_at_once(ends: tuple[FileIO, s
 
 
 def test_a_port_in_use_is_refused(ends: tuple[FileIO, str]):
-    """Two programs would mix their motions; when the first lets go, the second gets it."""
+    """Two programs would mix their motions. After the first one closes the port, the second can open it."""
     first = SerialTransport(ends[1], 115200)
     with pytest.raises(DeviceGone, match=r"cannot be opened .*no other program at it"):
         SerialTransport(ends[1], 115200)
@@ -71,8 +71,8 @@ def test_a_port_in_use_is_refused(ends: tuple[FileIO, str]):
     SerialTransport(ends[1], 115200).close()
 
 
-def test_a_device_that_goes_away_is_said(ends: tuple[FileIO, str]):
-    """The cable was pulled: reading, writing and draining say so."""
+def test_a_disconnected_device_is_reported(ends: tuple[FileIO, str]):
+    """After the cable is pulled, reading, writing and draining raise an error with a remedy."""
     line = SerialTransport(ends[1], 115200)
     ends[0].close()
     for call in (lambda: line.read(1, soon()), lambda: line.write(b"x", soon()), line.drain):
@@ -81,8 +81,8 @@ def test_a_device_that_goes_away_is_said(ends: tuple[FileIO, str]):
     line.close()
 
 
-def test_a_full_line_does_not_hold_up(ends: tuple[FileIO, str]):
-    """A device that takes no bytes costs the write's own time; addresses and speeds that mean nothing are settings."""
+def test_a_blocked_write_ends_at_its_time_limit(ends: tuple[FileIO, str]):
+    """A device that takes no bytes costs 0.25 s. Invalid addresses and baud rates are errors of the settings."""
     line = SerialTransport(ends[1], 115200)
     with pytest.raises(DeadlinePassed, match=r"did not take 1000000 bytes within 0.25 s"):
         line.write(bytes(1_000_000), soon())
@@ -93,11 +93,11 @@ def test_a_full_line_does_not_hold_up(ends: tuple[FileIO, str]):
         SerialTransport(ends[1], -5)
 
 
-def test_no_port_says_which_there_are(monkeypatch: pytest.MonkeyPatch):
-    """The ports of this machine stand in the message."""
+def test_a_missing_port_lists_the_existing_ones(monkeypatch: pytest.MonkeyPatch):
+    """The message has the ports of this machine."""
 
     class Port:
-        """What pyserial lists."""
+        """An entry of pyserial's list of ports."""
 
         device = "/dev/ttyUSB3"
 
@@ -106,8 +106,8 @@ def test_no_port_says_which_there_are(monkeypatch: pytest.MonkeyPatch):
         SerialTransport("/dev/no-such-port", 115200)
 
 
-def test_a_socket_is_a_port_too():
-    """The same driver reaches a device over the network, or an emulator."""
+def test_a_socket_serves_as_a_port():
+    """The same driver reaches a device or an emulator over the network."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
 

@@ -1,4 +1,4 @@
-"""What is asked of a rig before a survey: rows that say what came and what to mend, and nothing moves."""
+"""The check of a rig before a survey: its rows have results and remedies, and nothing moves unless requested."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SETS = {Command.SET_VALUES, Command.SET_VECTOR}
 
 @contextmanager
 def rig(*faults: str, camera: CameraFaults | None = None) -> Iterator[InProcessRig]:
-    """An emulated rig whose mirror's faults strike at the first occasion."""
+    """Yield an emulated rig whose mirror's faults strike at the first opportunity."""
     struck = [make_fault(name, at=0) for name in faults]
     whole = FaultyRig(small_source(), ManualClock(), mirror_faults=struck, camera_faults=camera)
     with InProcessRig(whole) as line:
@@ -43,17 +43,17 @@ def mirror_rows(line: InProcessRig, *, move: bool = False, **settings: Any) -> l
 
 
 def told(rows: list[CheckRow], verdict: str) -> list[str]:
-    """What was asked where a verdict fell."""
+    """Return the names of the checks with this verdict."""
     return [row.asked for row in rows if row.verdict == verdict]
 
 
 def set_anything(line: InProcessRig) -> bool:
-    """Whether the mirror was told anything but its mode."""
+    """Return whether any register or vector of the mirror was set."""
     return any(request.command in SETS for request in line.rig.mirror.requests)
 
 
-def test_mirror_in_order() -> None:
-    """Everything that was asked, in order; nothing was set, and the port is let go of."""
+def test_a_working_mirror_passes_the_check() -> None:
+    """The rows are in order, nothing was set, and the port is closed."""
     with rig() as line:
         rows = mirror_rows(line)
         assert [row.asked for row in rows] == ["connect", "status"]
@@ -66,8 +66,8 @@ def test_mirror_in_order() -> None:
             line.transport.drain()
 
 
-def test_square_is_gone_round_and_read_back() -> None:
-    """Four corners within 0.05 and the middle, each found where it was sent."""
+def test_the_mirror_moves_in_a_square_and_is_read_back() -> None:
+    """Four corners within 0.05 of the centre, and the centre, are each reached."""
     assert np.hypot(*np.transpose(SQUARE)).max() < 0.05
     with rig() as line:
         rows = mirror_rows(line, move=True)
@@ -85,15 +85,15 @@ def test_square_is_gone_round_and_read_back() -> None:
         ("wrong-firmware", "connect", "rig.expected_id"),
         ("mirror-warm", "status", "motions are refused"),
         ("disconnected", "status", "motions are refused"),
-        ("never-stable", "status", "not stable"),  # as a survey would wait
+        ("never-stable", "status", "not stable"),  # a survey would wait
         ("trimmed", "status", "trimmed"),
         ("echo", "connect", ""),
         ("mute", "connect", "is the controller on"),
         ("gone-before", "connect", "cable"),
     ],
 )
-def test_faults_fail_and_nothing_moves(fault: str, asked: str, mend: str) -> None:
-    """One row that failed, with what to mend; a square that was asked for is not begun."""
+def test_mirror_faults_fail_the_check_and_nothing_moves(fault: str, asked: str, mend: str) -> None:
+    """One row fails and names a remedy, and a requested square is not begun."""
     with rig(fault) as line:
         rows = mirror_rows(line, move=True)
         assert told(rows, "fail") == [asked]
@@ -104,23 +104,23 @@ def test_faults_fail_and_nothing_moves(fault: str, asked: str, mend: str) -> Non
             assert "move" in told(rows, "warn")
 
 
-def test_another_name_is_no_failure_where_the_settings_name_it() -> None:
-    """The id of a controller that documents do not know."""
+def test_another_device_id_passes_if_it_is_configured() -> None:
+    """The configured id may be undocumented. An error without a remedy gives a row without one."""
     with rig("wrong-firmware") as line:
         assert works(mirror_rows(line, expected_id="LENS"), "mirror")
     assert failed("mirror", "connect", RigError("no")) == CheckRow("mirror", "connect", "no", "fail", "")
 
 
-def test_position_that_is_no_number_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A mirror that measures nothing is not where it was sent."""
+def test_a_position_that_is_not_finite_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A mirror whose log has only NaN has not reached its target."""
     log = MotionLog(np.full((8, 2), np.nan, np.float32), 1000.0, 0.0, 0.0)
     monkeypatch.setattr(MirrorController, "read_log", lambda *_: log)
     with rig() as line:
         assert "go to 0.03; 0.03" in told(mirror_rows(line, move=True), "fail")
 
 
-def test_camera_in_order() -> None:
-    """Whether it captures, what is there, and its files' server; a capture that runs is told and left alone."""
+def test_a_working_camera_passes_the_check() -> None:
+    """Rows report its state, its files and their server. A running capture is a warning and is left alone."""
     with rig() as line:
         rows = check_camera(line.camera)
         asked = [row.asked.partition(",")[0] for row in rows]
@@ -131,8 +131,8 @@ def test_camera_in_order() -> None:
         assert line.rig.camera.is_capturing()
 
 
-def test_camera_out_of_order() -> None:
-    """No control, no files, another password: a row each, and the other is asked all the same."""
+def test_camera_faults_fail_the_check() -> None:
+    """A missing control port or file server fails its row. A wrong password is refused."""
     with rig(camera=CameraFaults({CameraFault.HANGS_UP: 9})) as line:
         assert told(check_camera(line.camera), "fail") == ["connect"]
     with rig() as line:
@@ -146,7 +146,7 @@ def test_camera_out_of_order() -> None:
 
 @dataclass
 class Mock:
-    """A mirror of another make, which is where it was sent at once."""
+    """A mirror of another manufacturer, which reaches its targets at once."""
 
     clock: Clock
     place: tuple[float, float] = (0.0, 0.0)
@@ -166,8 +166,8 @@ class Mock:
         self.closed = True
 
 
-def test_a_mirror_of_another_make_goes_round_the_square() -> None:
-    """It is asked nothing that only the shipped one knows, and let go of."""
+def test_a_mirror_of_another_make_passes_the_square() -> None:
+    """The check uses only what every mirror driver has, and closes the driver."""
     mirror: Any = Mock(ManualClock())
     rows = check_mirror(lambda: mirror, mirror.clock, move=True)
     assert rows[0].came == "Mock is there"

@@ -1,4 +1,4 @@
-"""Spectra that tests make: smooth fields of some materials, a camera's noise, and their lines as a source has them."""
+"""Spectra for tests: smooth fields of some materials, a camera's noise, and their lines as from a source."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pipeline.signal.subspace import SignalStatistics
 from pipeline.source import References
 
 CAMERA = LineCamera(samples=64)
-DARK, GAIN = 64, 1e-3  # DN, and the scene value of one
+DARK, GAIN = 64, 1e-3  # DN, and the scene value of one DN
 
 Values = NDArray[np.float32]
 Floats = NDArray[np.float64]
@@ -25,7 +25,7 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Field:
-    """Spectra without noise (line, sample, band), the noise's deviation (band,), and both together."""
+    """Spectra without noise (line, sample, band), the standard deviation of the noise (band,), and their sum."""
 
     clean: Floats
     noise: Floats
@@ -35,7 +35,7 @@ class Field:
 def field_of(
     seed: int, shape: tuple[int, int] = (96, 96), bands: int = 40, materials: int = 3, signal: float = 30.0
 ) -> Field:
-    """Materials that vary over some px, each by ``signal`` deviations of a band's noise, around a value of 1."""
+    """Return materials that vary over some px, each by ``signal`` sigma of a band's noise, around a value of 1."""
     rng, noise = np.random.default_rng(seed), np.linspace(4, 10, bands) * GAIN
     clean = np.ones((*shape, bands))
     for _ in range(materials):
@@ -45,14 +45,14 @@ def field_of(
 
 
 def with_noise(clean: Floats, noise: Floats, seed: int) -> Values:
-    """What a camera makes of spectra."""
+    """Return spectra with a camera's noise."""
     return (clean + noise * np.random.default_rng([seed, 1]).normal(size=clean.shape)).astype(np.float32)
 
 
 def statistics_of(
     values: Values, valid: Bools | None = None, *, lines: int = 64, expected: int | None = None
 ) -> SignalStatistics:
-    """Statistics of a field that comes some lines at a time."""
+    """Return statistics of a field that is added some lines at a time."""
     known = np.ones(values.shape[:2], np.bool_) if valid is None else valid
     found = SignalStatistics(values.shape[2], expected or values.shape[0] * values.shape[1])
     for first in range(0, len(values), lines):
@@ -61,31 +61,31 @@ def statistics_of(
 
 
 def scored(values: Values, components: Components, valid: Bools | None = None) -> ScoredLines:
-    """Scores of spectra that may all be used, or of those that are ``valid``."""
+    """Return scores of all spectra, or of those that are ``valid``."""
     return score_lines(values, np.ones(values.shape[:2], np.bool_) if valid is None else valid, components)
 
 
 def marked(
     values: Values, found: SignalStatistics, components: Components, valid: Bools | None = None, alarms: float = 1.0
 ) -> Bools:
-    """Which (line, sample) spectra are rare, by the law that the statistics' own spectra tell."""
+    """Return a mask of rare spectra (line, sample), by the residual law of the statistics' own spectra."""
     law, seen = ResidualLaw.learned(found.spectra, components), scored(values, components, valid)
     return find_rare(seen.residual / law.expected(seen.scores), law, alarms)
 
 
 def restored(seen: ScoredLines, components: Components, step: float = 1.0) -> Values:
-    """Scene values of scores rounded in steps."""
+    """Return scene values of scores rounded in steps."""
     return components.restore(np.rint(seen.scores / np.float32(step)) * np.float32(step))
 
 
 def raw_of(values: Values) -> NDArray[np.uint16]:
-    """Scene values as 12-bit numbers of the camera."""
+    """Return scene values as 12-bit numbers of the camera."""
     return np.clip(np.rint(values / GAIN) + DARK, 0, CAMERA.full_scale_dn).astype(np.uint16)
 
 
 @dataclass(frozen=True, eq=False)
 class MadeLines:
-    """A sweep whose raw lines are in memory."""
+    """A sweep with its raw lines in memory."""
 
     raw: NDArray[np.uint16]
     valid_line: Bools
@@ -93,26 +93,26 @@ class MadeLines:
 
     @classmethod
     def of(cls, raw: NDArray[np.uint16], bad: Bools | None = None, *, by_mirror: bool = False) -> MadeLines:
-        """Lines of a detector whose elements are all alike."""
+        """Return lines of a detector with equal elements."""
         lines, *frame = raw.shape
         dark, white = np.full(frame, DARK, np.float32), np.ones(frame[1], np.float32)
         return cls(raw, np.ones(lines, np.bool_), References(dark, dark + 1 / GAIN, white, bad, by_mirror=by_mirror))
 
     @property
     def sweep(self) -> Sweep:
-        """Where the lines lie."""
+        """Return the sweep of the lines."""
         return Sweep("fine-0", "fine", "x", 0.0, 0.0, len(self.raw))
 
     @property
     def position(self) -> Floats:
-        """The mirror moves a little with every line."""
+        """Return mirror positions that differ slightly from line to line."""
         return np.stack([np.zeros(len(self.raw)), np.linspace(-0.1, 0.1, len(self.raw))], axis=-1)
 
     @property
     def time_s(self) -> Floats:
-        """Ten lines a second."""
+        """Return times at ten lines a second."""
         return 0.1 * np.arange(len(self.raw))
 
     def read(self, start: int, stop: int) -> NDArray[np.uint16]:
-        """Raw numbers of some lines."""
+        """Return raw numbers of some lines."""
         return self.raw[start:stop]

@@ -1,4 +1,4 @@
-"""Calibration: raw numbers to scene values, bad and saturated elements, flat and mirror; how bad ones are found."""
+"""Calibration: raw numbers to scene values, bad and saturated elements, flat field, mirror, and bad element search."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from pipeline.source import References
 
 
 def reflectance(raw: NDArray[np.uint16], references: References, position: object = None) -> NDArray[np.float32]:
-    """Scene values without saturation."""
+    """Return scene values without saturation."""
     return calibrate(raw, references, saturated_dn=np.inf, position=position)[0]
 
 
 def frames(samples: int = 4, bands: int = 3) -> References:
-    """References with a dark of 60 DN, a white of 1060 DN and a white reference of value 2."""
+    """Return references with a dark of 60 DN, a white of 1060 DN and a white reference of value 2."""
     return References(
         dark=np.full((samples, bands), 60, np.float32),
         white=np.full((samples, bands), 1060, np.float32),
@@ -31,16 +31,16 @@ def frames(samples: int = 4, bands: int = 3) -> References:
     )
 
 
-def test_hand_worked_values() -> None:
-    """Dark is 0, white is the white reference, between them it is linear; below dark is negative."""
+def test_calibrated_values_are_those_worked_out_by_hand() -> None:
+    """Dark gives 0, white the white reference, and values between are linear; below dark they are negative."""
     raw = np.tile(np.array([60, 1060, 310, 10], np.uint16)[None, :, None], (2, 1, 3))
     values = reflectance(raw, frames())
     assert values.dtype == np.float32
     np.testing.assert_allclose(values[1, :, 0], [0, 2, 0.5, -0.1], atol=1e-6)
 
 
-def test_sums_of_samples_and_parts_of_numbers_are_calibrated_as_they_are() -> None:
-    """Numbers beyond 16 bits do not wrap, and no part is cut off."""
+def test_sums_and_fractions_of_numbers_are_calibrated() -> None:
+    """Numbers beyond 16 bits do not wrap, and fractions are kept."""
     for raw in (np.full((2, 6, 3), 100_000, np.uint32), np.full((2, 6, 3), 10.25, np.float32)):
         values, _ = calibrate(raw, frames(6), saturated_dn=np.inf)
         small, _ = calibrate(np.full(raw.shape, 10, np.uint16), frames(6), saturated_dn=np.inf)
@@ -65,8 +65,8 @@ def test_sums_of_samples_and_parts_of_numbers_are_calibrated_as_they_are() -> No
     ],
     ids=["sample", "band", "unlit", "both", "filled from saturated", "band without light"],
 )
-def test_an_element_spoils_only_itself(unlit: list, bad: list, hot: list, out: list) -> None:
-    """Saturated, uncalibrated and wrongly filled elements are invalid; a sample is where all bands with light are."""
+def test_an_invalid_element_invalidates_only_itself(unlit: list, bad: list, hot: list, out: list) -> None:
+    """Saturated, unlit and wrongly filled elements are invalid; a sample is invalid if all its lit bands are."""
     references, raw = replace(frames(), bad=np.zeros((4, 3), np.bool_)), np.full((2, 4, 3), 500, np.uint16)
     for place in unlit:
         references.white[place] = 60
@@ -79,8 +79,8 @@ def test_an_element_spoils_only_itself(unlit: list, bad: list, hot: list, out: l
     assert np.argwhere(np.isnan(values[0])).tolist() == [list(place) for place in sorted(unlit)]
 
 
-def test_bad_elements_are_filled_along_the_line() -> None:
-    """A bad element takes the value between its good neighbours of the band, or of the only side that has one."""
+def test_bad_elements_are_interpolated_along_the_line() -> None:
+    """A bad element gets the value between its good neighbours in the band, or that of the only one."""
     raw = np.full((1, 6, 3), 60, np.uint16)
     raw[0, :, 1] = [4095, 160, 4095, 4095, 460, 560]
     bad = np.zeros((6, 3), np.bool_)
@@ -91,8 +91,8 @@ def test_bad_elements_are_filled_along_the_line() -> None:
     assert valid.all()
 
 
-def test_a_sample_that_is_out_fills_nothing() -> None:
-    """A bad element is filled past a sample with more than half of its bands bad, whose other bands are out as well."""
+def test_an_invalid_sample_fills_no_bad_element() -> None:
+    """A sample with more than half of its bands bad is skipped when a neighbour's bad element is filled."""
     raw = np.broadcast_to(np.array([60, 160, 4000, 360], np.uint16)[None, :, None], (1, 4, 3))
     bad = np.zeros((4, 3), np.bool_)
     bad[2, :2] = bad[1, 2] = True
@@ -101,8 +101,8 @@ def test_a_sample_that_is_out_fills_nothing() -> None:
     assert np.argwhere(~valid).tolist() == [[0, 2]]
 
 
-def test_bad_elements_are_filled_from_near() -> None:
-    """A neighbour more than 8 samples away counts nothing: the other is taken alone, and without one nothing is."""
+def test_bad_elements_are_filled_from_at_most_8_samples_away() -> None:
+    """A farther neighbour does not count: the nearer one is used alone, and without one the element stays NaN."""
     raw = np.full((1, 30, 3), 60, np.uint16)
     raw[0, :, 1] = 60 + 10 * np.arange(30)
     bad = np.zeros((30, 3), np.bool_)
@@ -115,8 +115,8 @@ def test_bad_elements_are_filled_from_near() -> None:
 
 
 @given(arrays(np.bool_, (5, 4)), st.integers(0, 9))
-def test_bad_elements_change_nothing_else(bad: NDArray[np.bool_], seed: int) -> None:
-    """Good elements keep their values; a sample is out when more than half of its bands are bad."""
+def test_bad_elements_change_no_good_element(bad: NDArray[np.bool_], seed: int) -> None:
+    """Good elements keep their values. A sample is invalid if more than half of its bands are bad."""
     raw = np.random.default_rng(seed).integers(0, 900, (3, 5, 4), dtype=np.uint16)
     values, valid = calibrate(raw, replace(frames(5, 4), bad=bad), saturated_dn=4095)
     np.testing.assert_array_equal(values[:, ~bad], reflectance(raw, frames(5, 4))[:, ~bad])
@@ -127,8 +127,8 @@ def test_bad_elements_change_nothing_else(bad: NDArray[np.bool_], seed: int) -> 
     assert np.isfinite(values[:, ~gone][..., lit]).all() or valid.ndim == 3
 
 
-def test_flat_and_mirror_divide() -> None:
-    """The flat divides its column, the throughput its line: twice the light through a mirror is the same scene."""
+def test_flat_field_and_mirror_throughput_divide_the_values() -> None:
+    """The flat field divides its sample and the throughput its line, so that the scene is the same at any position."""
     raw, flat = np.full((2, 4, 3), 560, np.uint16), np.ones((4, 3), np.float32)
     flat[2] = 0.5
     position = np.array([[0.0, 0.0], [0.3, -0.2]])
@@ -138,8 +138,8 @@ def test_flat_and_mirror_divide() -> None:
     np.testing.assert_allclose(values[1] * mirror_throughput(position[1]), values[0], rtol=1e-6)
 
 
-def test_lines_without_a_position_are_out() -> None:
-    """Where the light depends on the mirror a line whose position is unknown is NaN and invalid; none is an error."""
+def test_lines_without_a_position_are_invalid() -> None:
+    """With references by the mirror, a line without a position is NaN. Calibration without positions is an error."""
     raw, references = np.full((2, 4, 3), 560, np.uint16), replace(frames(), by_mirror=True)
     values, valid = calibrate(raw, references, saturated_dn=4095, position=[[0.0, 0.0], [np.nan, 0.0]])
     assert np.isnan(values[1]).all()
@@ -148,8 +148,8 @@ def test_lines_without_a_position_are_out() -> None:
         calibrate(raw, references, saturated_dn=4095)
 
 
-def test_blocks_do_not_show() -> None:
-    """Lines calibrated together are those calibrated one by one."""
+def test_calibration_does_not_depend_on_blocks() -> None:
+    """Lines calibrated together have the same bits as lines calibrated one by one."""
     rng = np.random.default_rng(1)
     references = replace(frames(700, 200), bad=rng.random((700, 200)) < 0.01)
     raw = rng.integers(0, 4096, (5, 700, 200), dtype=np.uint16)
@@ -161,7 +161,7 @@ def test_blocks_do_not_show() -> None:
 
 
 def test_references_of_another_binning_are_refused() -> None:
-    """The message names both sizes and says what to do."""
+    """The message has both sizes and a remedy."""
     with pytest.raises(ShapeError, match=r"8 samples and 3 bands, the dark frame \(4, 3\); take references"):
         calibrate(np.zeros((1, 8, 3), np.uint16), frames(), saturated_dn=4095)
     bad = References(frames().dark, frames().white, np.ones(5, np.float32))
@@ -175,7 +175,7 @@ Frame = NDArray[np.float64]
 
 
 def simulated(samples: int = 640, bands: int = 20, seed: int = 0) -> tuple[Frame, Frame]:
-    """Dark and white frames with noise, vignetting, a spectrum, 1 % of uneven response and a column of dust."""
+    """Return dark and white frames with noise, vignetting, a spectrum, 1 % of uneven response and a column of dust."""
     rng = np.random.default_rng(seed)
     dark = np.rint(64 + rng.normal(0, 0.7, (samples, bands)))
     along = np.cos(np.linspace(-0.6, 0.6, samples))[:, None] ** 4
@@ -185,8 +185,8 @@ def simulated(samples: int = 640, bands: int = 20, seed: int = 0) -> tuple[Frame
     return dark, dark + light + rng.normal(0, 1, light.shape)
 
 
-def test_faults_are_found_and_nothing_else() -> None:
-    """Hot, dead, odd and missing elements are bad, side by side too; dust, vignetting and noise are not."""
+def test_only_faulty_elements_are_found() -> None:
+    """Hot, dead, deviating and missing elements are bad, also side by side; dust, vignetting and noise are not."""
     dark, white = simulated()
     dark[100, 3] += 50
     white[200, 5] = dark[200, 5]
@@ -198,15 +198,15 @@ def test_faults_are_found_and_nothing_else() -> None:
     assert found == [[100, 3], [200, 5], [300, 8], [301, 8], [400, 9], [500, 1], [639, 6]]
 
 
-def test_bands_without_light_are_not_judged() -> None:
-    """Where nothing responds no element is called dead, even where white lies below dark."""
+def test_bands_without_light_have_no_dead_elements() -> None:
+    """Elements of a band without any response are not called dead, even if white is below dark."""
     dark, white = simulated()
     white[:, :4] = dark[:, :4] - 8
     assert not find_bad_elements(dark, white)[:, :4].any()
 
 
 def test_a_white_frame_at_full_scale_is_noted() -> None:
-    """With its part of the elements; one below or, of a camera that scales its frames, beyond it is not."""
+    """The note has the fraction of elements. Values below full scale, or beyond it in scaled frames, are not noted."""
     white = np.full((10, 10), 4095.0)
     white[:, :5] = 4094.4
     (note,) = full_scale_notes(white, 4095)
@@ -214,8 +214,8 @@ def test_a_white_frame_at_full_scale_is_noted() -> None:
     assert full_scale_notes(white, 4000) == []
 
 
-def test_more_than_a_detector_can_have_is_refused() -> None:
-    """Frames that would put out too many elements are named as the fault."""
+def test_too_many_bad_elements_are_refused() -> None:
+    """Frames with more than 5 % of bad elements are refused."""
     dark, white = simulated()
     white[4::9] = dark[4::9]
     with pytest.raises(RigError, match=r"1[01]\.\d % of the elements look bad, at most 5 % can be"):

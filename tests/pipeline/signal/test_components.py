@@ -1,4 +1,4 @@
-"""The law that gives spectra of scores: what is linear stays linear, and bands without a value take no part."""
+"""Components give spectra from scores: linear operations stay linear, and bands without a value are ignored."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 def law_of(seed: int, bands: int = 12, count: int = 4, dead: tuple[int, ...] = ()) -> Components:
-    """Any law of some bands, of which ``dead`` ones have no value."""
+    """Return random components of some bands; ``dead`` bands have no value."""
     rng = np.random.default_rng(seed)
     mean, noise, axes = rng.uniform(0.1, 2, bands), rng.uniform(0.01, 0.1, bands), np.zeros((count, bands))
     lit = np.setdiff1d(np.arange(bands), dead)
@@ -23,13 +23,13 @@ def law_of(seed: int, bands: int = 12, count: int = 4, dead: tuple[int, ...] = (
 
 
 def spectra_of(seed: int, bands: int = 12) -> np.ndarray:
-    """A few spectra."""
+    """Return a few spectra."""
     return np.random.default_rng([seed, 7]).uniform(0, 3, (2, 3, bands)).astype(np.float32)
 
 
 @given(seed=SEEDS, dead=st.sampled_from([(), (0,), (3, 7)]))
-def test_restoring_a_projection_is_a_projection(seed: int, dead: tuple[int, ...]) -> None:
-    """A spectrum that came of scores gives the same scores, and so the same spectrum, again."""
+def test_restoring_scores_is_a_projection(seed: int, dead: tuple[int, ...]) -> None:
+    """A spectrum restored from scores has the same scores again, and so the same spectrum."""
     law = law_of(seed, dead=dead)
     axes = law.axes.T.astype(np.float32)
     once = law.restore(law.white(spectra_of(seed)) @ axes)
@@ -38,8 +38,8 @@ def test_restoring_a_projection_is_a_projection(seed: int, dead: tuple[int, ...]
 
 
 @given(seed=SEEDS)
-def test_what_projection_leaves_is_orthogonal_to_the_axes(seed: int) -> None:
-    """Scores of a spectrum less its restored one are 0."""
+def test_the_residual_is_orthogonal_to_the_axes(seed: int) -> None:
+    """A spectrum minus its restored one has scores of 0."""
     law, spectra = law_of(seed), spectra_of(seed)
     axes = law.axes.T.astype(np.float32)
     left = spectra - law.restore(law.white(spectra) @ axes)
@@ -48,7 +48,7 @@ def test_what_projection_leaves_is_orthogonal_to_the_axes(seed: int) -> None:
 
 @given(seed=SEEDS, dead=st.sampled_from([(), (2, 11)]))
 def test_a_matrix_acts_on_scores_as_on_spectra(seed: int, dead: tuple[int, ...]) -> None:
-    """Weights and offset of `onto` give of scores what the matrix gives of restored spectra, dead bands being 0."""
+    """Weights and offset of `onto` give from scores the matrix product of restored spectra, with 0 in dead bands."""
     law, rng = law_of(seed, dead=dead), np.random.default_rng(seed)
     scores, matrix = rng.normal(0, 20, (2, 3, 4)).astype(np.float32), rng.normal(size=(12, 5))
     weights, offset = law.onto(matrix)
@@ -59,7 +59,7 @@ def test_a_matrix_acts_on_scores_as_on_spectra(seed: int, dead: tuple[int, ...])
 
 @given(seed=SEEDS, dead=st.sampled_from([(), (5,)]))
 def test_a_gain_acts_on_scores_as_on_spectra(seed: int, dead: tuple[int, ...]) -> None:
-    """Scores of spectra times a gain a band are a matrix times their scores, and a shift."""
+    """Scores of spectra times a gain per band are a matrix times their scores, plus a shift."""
     law, rng = law_of(seed, dead=dead), np.random.default_rng(seed)
     scores, gain = rng.normal(0, 20, (2, 3, 4)).astype(np.float32), rng.uniform(0.5, 2, 12)
     matrix, shift = law.scaled(gain)
@@ -76,7 +76,7 @@ def test_a_gain_of_one_changes_nothing() -> None:
 
 @given(seed=SEEDS, bands=st.lists(st.integers(0, 11), min_size=1, max_size=12))
 def test_some_bands_are_restored_as_with_all(seed: int, bands: list[int]) -> None:
-    """The law of some bands, in any order, gives those bands of what the whole law gives."""
+    """Components of some bands, in any order, restore the same values as all components do in those bands."""
     law = law_of(seed, dead=(4,))
     scores = np.random.default_rng(seed).normal(0, 20, (3, 4)).astype(np.float32)
     some = law.of_bands(bands)
@@ -85,8 +85,8 @@ def test_some_bands_are_restored_as_with_all(seed: int, bands: list[int]) -> Non
 
 
 @given(seed=SEEDS)
-def test_no_score_exceeds_the_largest(seed: int) -> None:
-    """Of spectra within some distance of the mean every score is at most what `largest` says."""
+def test_no_score_exceeds_the_stated_largest(seed: int) -> None:
+    """`largest` bounds the scores of all spectra within a distance of the mean."""
     law, rng = law_of(seed, dead=(1,)), np.random.default_rng(seed)
     reach = rng.uniform(0, 3, 12)
     spectra = (np.nan_to_num(law.mean) + reach * rng.choice([-1, 1], (50, 12))).astype(np.float32)
@@ -94,8 +94,8 @@ def test_no_score_exceeds_the_largest(seed: int) -> None:
 
 
 @pytest.mark.parametrize("value", [np.nan, 0.0, 5.0])
-def test_a_band_without_a_value_says_nothing(value: float) -> None:
-    """Whatever stands in it, it is 0 in whitened spectra, and it comes back as NaN alone."""
+def test_a_band_without_a_value_is_ignored(value: float) -> None:
+    """Any value in it becomes 0 in whitened spectra, and only this band is restored as NaN."""
     law, spectra = law_of(1, dead=(6,)), spectra_of(1)
     spectra[..., 6] = value
     white = law.white(spectra)
@@ -105,15 +105,15 @@ def test_a_band_without_a_value_says_nothing(value: float) -> None:
     assert missing.sum() == 6
 
 
-def test_scores_that_are_not_known_restore_nothing() -> None:
+def test_a_nan_score_restores_nan() -> None:
     """A NaN score makes its own spectrum NaN and no other."""
     scores = np.zeros((2, 4), np.float32)
     scores[0, 2] = np.nan
     assert np.isnan(law_of(2).restore(scores)).all(axis=1).tolist() == [True, False]
 
 
-def test_the_law_of_nothing_has_no_component() -> None:
-    """Lines without a value anywhere have 0 scores and restore as NaN."""
+def test_components_without_data_are_empty() -> None:
+    """Lines without any value have 0 scores and are restored as NaN."""
     law = Components.empty(5)
     assert (len(law), law.bands, law.largest(np.ones(5))) == (0, 5, 0.0)
     assert np.isnan(law.restore(np.zeros((2, 3, 0), np.float32))).all()

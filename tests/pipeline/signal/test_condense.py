@@ -1,4 +1,4 @@
-"""Condensing: scores by least squares over the bands that were seen, and the spectra that components do not hold."""
+"""Scores by least squares over the valid bands, and rare spectra that the components do not represent."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SHAPES = {"a pixel": (1, 1), "2 x 2 px": (2, 2), "a line of 8": (1, 8)}
 
 @pytest.fixture(scope="module")
 def condensed() -> tuple[Field, SignalStatistics, Components]:
-    """A field of 3 materials in 60 bands, its statistics and its components."""
+    """Return a field of 3 materials in 60 bands, its statistics and its components."""
     made = field_of(11, bands=60)
     found = statistics_of(made.values)
     return made, found, find_components(found)
@@ -37,8 +37,8 @@ def condensed() -> tuple[Field, SignalStatistics, Components]:
 
 @settings(max_examples=10)
 @given(seed=SEEDS)
-def test_scores_with_missing_bands_are_those_of_least_squares(seed: int) -> None:
-    """Whichever bands are missing, up to half of them, numpy's least squares over the others gives the same scores."""
+def test_scores_with_missing_bands_equal_least_squares(seed: int) -> None:
+    """With up to half of the bands missing, numpy's least squares over the others gives the same scores."""
     rng = np.random.default_rng(seed)
     axes = np.linalg.qr(rng.normal(size=(24, 4)))[0].T
     law = Components(rng.uniform(0, 2, 24), axes, rng.uniform(0.1, 1, 24))
@@ -56,7 +56,7 @@ def test_scores_with_missing_bands_are_those_of_least_squares(seed: int) -> None
 @settings(max_examples=10)
 @given(seed=SEEDS)
 def test_a_spectrum_is_scored_without_its_neighbours(condensed: tuple, seed: int) -> None:
-    """Scores, quality and residual of some spectra, missing bands and all, are those that all together give."""
+    """Scores, quality and residual of some spectra, with missing bands, equal those of the whole field."""
     made, _, law = condensed
     rng = np.random.default_rng(seed)
     valid = rng.random((*made.values.shape[:2], 60)) > 0.3
@@ -68,8 +68,8 @@ def test_a_spectrum_is_scored_without_its_neighbours(condensed: tuple, seed: int
     np.testing.assert_allclose(alone.residual, whole.residual[part], rtol=1e-3)
 
 
-def test_quality_says_how_much_was_seen(condensed: tuple) -> None:
-    """All bands 0, some restored from the others 1, less than half 2 with scores of 0 and no residual."""
+def test_quality_depends_on_the_missing_bands(condensed: tuple) -> None:
+    """Quality is 0 with all bands, 1 with at least half, else 2 with scores of 0 and no residual."""
     made, _, law = condensed
     valid = np.ones((1, 5, 60), np.bool_)
     for sample, missing in enumerate((0, 1, 30, 31, 60)):
@@ -80,8 +80,8 @@ def test_quality_says_how_much_was_seen(condensed: tuple) -> None:
     assert np.isnan(seen.residual[0]).tolist() == [False, False, False, True, True]
 
 
-def test_spectra_that_are_not_valid_are_unusable(condensed: tuple) -> None:
-    """With one validity a spectrum, and nothing missing, the others keep their scores."""
+def test_invalid_spectra_are_unusable(condensed: tuple) -> None:
+    """With a validity per spectrum and no missing band, the others keep their scores."""
     made, _, law = condensed
     valid = np.ones((4, 4), np.bool_)
     valid[2, 1] = False
@@ -90,8 +90,8 @@ def test_spectra_that_are_not_valid_are_unusable(condensed: tuple) -> None:
     np.testing.assert_array_equal(seen.scores[valid], plain.scores[valid])
 
 
-def test_nan_counts_as_missing(condensed: tuple) -> None:
-    """A NaN that validity does not know of is a missing band: it is restored, and the spectrum says so."""
+def test_nan_counts_as_a_missing_band(condensed: tuple) -> None:
+    """NaN in a valid spectrum is restored from the other bands, and its quality is partial."""
     made, _, law = condensed
     values = made.values[:2, :2].copy()
     values[1, 1, 20:25] = np.nan
@@ -102,7 +102,7 @@ def test_nan_counts_as_missing(condensed: tuple) -> None:
 
 
 def test_saturated_bands_are_restored_from_the_others(condensed: tuple) -> None:
-    """A third of the bands saturated in a patch: their values come back as near as those that were seen, twice."""
+    """With a third of the bands saturated in an area, their median error is below twice that of the other bands."""
     made, found, law = condensed
     values, valid = made.values.copy(), np.ones(made.values.shape, np.bool_)
     values[30:40, 30:50, ::3], valid[30:40, 30:50, ::3] = 9.0, False
@@ -113,8 +113,8 @@ def test_saturated_bands_are_restored_from_the_others(condensed: tuple) -> None:
     assert not marked(values, found, law, valid).any()
 
 
-def test_many_components_and_few_bands_left_mark_nothing() -> None:
-    """Half of the bands saturated and half as many components: few degrees of freedom make nothing rare."""
+def test_many_components_and_few_valid_bands_mark_nothing() -> None:
+    """Half of the bands are saturated and there are half as many components: few degrees of freedom cause no alarm."""
     made = field_of(6, bands=30, materials=9)
     found = statistics_of(made.values)
     law, valid = find_components(found), np.ones(made.values.shape, np.bool_)
@@ -123,14 +123,14 @@ def test_many_components_and_few_bands_left_mark_nothing() -> None:
 
 
 def test_lines_without_light_are_unusable() -> None:
-    """No band has a value: no scores, all of them unusable."""
+    """Without a value in any band there are no scores."""
     seen = score_lines(np.full((2, 3, 12), np.nan, np.float32), np.zeros((2, 3), np.bool_), Components.empty(12))
     assert seen.scores.shape == (2, 3, 0)
     assert (seen.quality == UNUSABLE).all()
 
 
-def test_one_of_two_bands_is_enough() -> None:
-    """Half of two bands is one: the one that was seen comes back, and the other as both go together in the field."""
+def test_one_of_two_bands_suffices() -> None:
+    """The valid band is restored, and the other one by their correlation in the field."""
     made = field_of(1, bands=2, materials=1)
     law, valid = find_components(statistics_of(made.values)), np.ones((1, 2, 2), np.bool_)
     valid[0, 1, 0] = False
@@ -144,7 +144,7 @@ def test_one_of_two_bands_is_enough() -> None:
 
 @pytest.mark.parametrize("missing", [3, 6, 12, 24])
 def test_a_run_of_missing_bands_is_restored_within_noise(missing: int) -> None:
-    """Neighbours that saturate together leave smooth directions open: the field's scores say what is likely there."""
+    """Neighbouring saturated bands leave smooth directions open; the field's scores show the likely ones."""
     made = field_of(3, bands=60)
     found = statistics_of(made.values)
     law = components_of_field(found, np.linspace(400, 1000, 60), false_alarm=0.01, least=4)
@@ -156,8 +156,8 @@ def test_a_run_of_missing_bands_is_restored_within_noise(missing: int) -> None:
     assert np.abs(off).max() < 6
 
 
-def test_the_law_follows_shot_noise() -> None:
-    """Noise that grows with the signal is expected by the scores: bright spectra are no more often rare than dark."""
+def test_the_residual_law_follows_shot_noise() -> None:
+    """Noise that grows with the signal is predicted by the scores, so bright spectra are not rarer than dark ones."""
     made = field_of(5, bands=60, materials=1, signal=40)
     level = 1 + np.clip((made.clean - 1) / np.ptp(made.clean), -0.45, 0.45).mean(axis=2, keepdims=True)
     values = (made.clean + (made.values - made.clean) * level).astype(np.float32)
@@ -169,8 +169,8 @@ def test_the_law_follows_shot_noise() -> None:
     assert ratio[bright].mean() == pytest.approx(ratio[~bright].mean(), rel=0.02)
 
 
-def test_few_spectra_teach_no_law() -> None:
-    """Fewer than 8 a component: the noise's own variance is expected of all."""
+def test_few_spectra_give_the_default_residual_law() -> None:
+    """With fewer than 8 spectra per component the noise's own variance is expected of all."""
     made = field_of(2)
     components = find_components(statistics_of(made.values))
     law = ResidualLaw.learned(made.values[:2, :10].reshape(-1, 40), components)
@@ -180,10 +180,10 @@ def test_few_spectra_teach_no_law() -> None:
 
 @pytest.mark.parametrize("alarms", [1.0, 10.0])
 @pytest.mark.parametrize("shape", [(64, 64), (8, 500), (1, 300), (2, 9)])
-def test_noise_alone_marks_no_more_than_stated(shape: tuple[int, int], alarms: float) -> None:
-    """Marks of 60 images of noise, edges and all, are no more than a mean of ``alarms`` each gives.
+def test_noise_alone_marks_at_most_the_stated_number(shape: tuple[int, int], alarms: float) -> None:
+    """Marks in 60 images of noise, edges included, stay within a Poisson quantile for a mean of ``alarms`` each.
 
-    Windows mark up to 8 at once, so that single chances are 8 times fewer.
+    Windows mark up to 8 spectra at once, so that there are 8 times fewer independent events.
     """
     law, total = ResidualLaw(1.0, np.zeros(0), 50.0), 0
     for seed in range(60):
@@ -192,8 +192,8 @@ def test_noise_alone_marks_no_more_than_stated(shape: tuple[int, int], alarms: f
     assert total <= 8 * poisson.ppf(0.999, 60 * alarms / 8)
 
 
-def test_noise_of_a_field_marks_no_more_than_stated() -> None:
-    """The same of fields of materials, whose noise, components and law are all learned of them: 8 fields, 10 each."""
+def test_noise_of_a_field_marks_at_most_the_stated_number() -> None:
+    """Noise, components and residual law are learned from each of 8 fields of materials, with 10 alarms each."""
     total = 0
     for seed in range(8):
         made = field_of(seed, (64, 64), 24)
@@ -205,9 +205,9 @@ def test_noise_of_a_field_marks_no_more_than_stated() -> None:
 @pytest.mark.parametrize("sigma", [1.0, 2.0, 5.0, 20.0])
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
 def test_planted_spectra_are_marked(condensed: tuple, shape: tuple[int, int], sigma: float) -> None:
-    """A signature over all bands, of 1 to 20 deviations a band: 30 places of it, in 60 bands.
+    """A random signature of 1 to 20 sigma per band is planted at 30 places of a field of 60 bands.
 
-    At 1 deviation more than half of the single pixels are, and nine in ten of the others.
+    At 1 sigma more than half of the single pixels are marked, and nine in ten of the others.
     """
     made, found, law = condensed
     rng = np.random.default_rng(8)
@@ -221,8 +221,8 @@ def test_planted_spectra_are_marked(condensed: tuple, shape: tuple[int, int], si
     assert kept >= (0.9 if sigma == 1 and shape != (1, 1) else 0.55 if sigma == 1 else 1.0)
 
 
-def test_neighbours_are_found_together_that_none_shows_alone(condensed: tuple) -> None:
-    """.7 deviations a band: a pixel of it is nearly never rare, most of the blocks and lines of 8 are."""
+def test_neighbours_are_found_together_below_the_threshold_of_one(condensed: tuple) -> None:
+    """At 0.7 sigma per band few single pixels are rare, but most blocks and lines of 8 are."""
     made, found, law = condensed
     rng, kept = np.random.default_rng(9), {}
     for name, shape in SHAPES.items():
@@ -238,7 +238,7 @@ def test_neighbours_are_found_together_that_none_shows_alone(condensed: tuple) -
 
 
 def test_one_bright_spectrum_marks_only_itself(condensed: tuple) -> None:
-    """A spectrum far off all components is rare; those beside it are noise, and stay so."""
+    """A spectrum far from all components is rare; its neighbours are noise and are not marked."""
     made, found, law = condensed
     values = made.values.copy()
     values[50, 40, ::2] += 1.0
@@ -246,7 +246,7 @@ def test_one_bright_spectrum_marks_only_itself(condensed: tuple) -> None:
 
 
 def test_windows_mark_all_of_their_own_spectra() -> None:
-    """2 x 2 spectra, and lines of 8 either way, as far as the corners of the image, are marked and nothing else is."""
+    """Blocks of 2 x 2 and lines of 8 in both directions are marked up to the image's corners, and nothing else is."""
     law = ResidualLaw(1.0, np.zeros(0), 200.0)
     places = (np.s_[0:2, 0:2], np.s_[18:20, 28:30], np.s_[0, :8], np.s_[19, 22:], np.s_[12:, 29], np.s_[5, 9:17])
     for place in places:
@@ -257,7 +257,7 @@ def test_windows_mark_all_of_their_own_spectra() -> None:
         np.testing.assert_array_equal(find_rare(ratio, law, 1e-3), wanted)
 
 
-def test_what_is_unusable_is_never_rare() -> None:
+def test_unusable_spectra_are_never_rare() -> None:
     """NaN is not rare and does not hide its neighbours."""
     ratio = np.ones((20, 30), np.float32)
     ratio[5, 5], ratio[5, 6] = np.nan, 9
@@ -265,8 +265,8 @@ def test_what_is_unusable_is_never_rare() -> None:
 
 
 @pytest.mark.parametrize("sigma", [2.0, 20.0, 1e5])
-def test_rare_spectra_lie_within_a_quarter_deviation(condensed: tuple, sigma: float) -> None:
-    """Rounded scores and residual steps together give the raw spectrum back, however far from all others it lies."""
+def test_rare_spectra_are_stored_within_a_residual_step(condensed: tuple, sigma: float) -> None:
+    """Rounded scores plus residual steps restore a spectrum to half a step, at any distance from the others."""
     made, _, law = condensed
     values = made.values[7, :20] + (sigma * np.random.default_rng(1).normal(size=(20, 60)) * made.noise).astype("f4")
     seen = scored(values[None], law)
@@ -277,7 +277,7 @@ def test_rare_spectra_lie_within_a_quarter_deviation(condensed: tuple, sigma: fl
 
 
 def test_missing_bands_have_no_residual(condensed: tuple) -> None:
-    """What was not seen adds nothing to what scores restore."""
+    """Missing bands add nothing to the values restored from scores."""
     made, _, law = condensed
     values, valid = made.values[:1, :4].reshape(4, 60) + 1, np.ones((4, 60), np.bool_)
     valid[1, 5:9] = False
@@ -289,7 +289,7 @@ def test_missing_bands_have_no_residual(condensed: tuple) -> None:
 @given(seed=SEEDS, step=st.sampled_from([1.5, 3.0, 6.0]), shape=st.tuples(*[st.integers(0, 13)] * 2, st.integers(0, 3)))
 @settings(max_examples=20)
 def test_coarse_steps_keep_the_means_of_blocks(seed: int, step: float, shape: tuple[int, int, int]) -> None:
-    """No score is off by more than a step, and the mean of a whole block of 4 x 4 by more than 1/32 of one."""
+    """No score errs by more than a step, and the mean of a whole 4 x 4 block by more than 1/32 of one."""
     scores = np.random.default_rng(seed).normal(0, 4, shape).astype(np.float32)
     off = whole_steps(scores, step) - scores / np.float32(step)
     assert np.abs(off).max(initial=0) <= 1
@@ -300,8 +300,8 @@ def test_coarse_steps_keep_the_means_of_blocks(seed: int, step: float, shape: tu
     assert np.abs(rest).max(initial=0) <= 0.5 + 1e-5
 
 
-def test_a_signal_weaker_than_a_coarse_step_stays_in_the_means() -> None:
-    """Half of a field lies a quarter of a deviation higher: rounded one by one most of that is lost, here none is."""
+def test_a_signal_below_a_coarse_step_stays_in_the_means() -> None:
+    """Half of a field is 0.25 sigma higher: rounding each score alone loses most of this difference, steps keep it."""
     rng = np.random.default_rng(5)
     scores = rng.normal(0, 0.5, (64, 64, 1)).astype(np.float32)
     scores[:, 32:] += 0.25
@@ -312,8 +312,8 @@ def test_a_signal_weaker_than_a_coarse_step_stays_in_the_means() -> None:
     assert alone[1] - alone[0] < 0.05
 
 
-def test_blocks_with_a_score_that_is_not_finite_are_rounded_one_by_one() -> None:
-    """A spectrum that nobody saw says nothing of its neighbours; other blocks and components keep their means."""
+def test_blocks_with_a_non_finite_score_are_rounded_one_by_one() -> None:
+    """Only the component of the non-finite score is affected; others keep their block means."""
     scores = np.random.default_rng(2).normal(0, 4, (32, 32, 2)).astype(np.float32)
     scores[1::4, 2::4, 0] = np.nan
     scores[2, 2, 0] = np.inf
@@ -324,6 +324,6 @@ def test_blocks_with_a_score_that_is_not_finite_are_rounded_one_by_one() -> None
 
 @pytest.mark.parametrize("step", [0.5, 1.0])
 def test_fine_steps_are_rounded_one_by_one(step: float) -> None:
-    """Noise is larger than they are, and keeps the means."""
+    """The noise is larger than the steps, so it keeps the means."""
     scores = np.random.default_rng(2).normal(0, 4, (8, 8, 2)).astype(np.float32)
     np.testing.assert_array_equal(whole_steps(scores, step), np.rint(scores / np.float32(step)))

@@ -1,4 +1,4 @@
-"""The signal subspace: the components that are there are found, noise gives none, and hard fields do what is said."""
+"""The signal subspace: existing components are found, noise gives none, and special fields are handled as stated."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ FALSE_ALARM, TRIALS = 0.1, 60
 
 @settings(max_examples=12)
 @given(cuts=st.lists(st.integers(1, 8), min_size=1, max_size=6), expected=st.sampled_from([0, 300_000, 800_000]))
-def test_statistics_do_not_depend_on_how_many_lines_come_at_a_time(cuts: list[int], expected: int) -> None:
-    """Blocks of any multiples of 4 lines give the same moments and the same chosen spectra as all lines at once."""
+def test_statistics_do_not_depend_on_blocks_of_lines(cuts: list[int], expected: int) -> None:
+    """Blocks of any multiples of 4 lines give the same moments and chosen spectra as all lines at once."""
     values = field_of(3, (64, 40), 9).values
     whole = statistics_of(values, expected=expected)
     parts = SignalStatistics(9, expected or 64 * 40)
@@ -45,8 +45,8 @@ def test_statistics_do_not_depend_on_how_many_lines_come_at_a_time(cuts: list[in
     np.testing.assert_allclose(other.axes.T @ other.axes, one.axes.T @ one.axes, atol=1e-4)
 
 
-def test_merged_statistics_are_those_of_all_lines() -> None:
-    """Two passes of different brightness have together the mean, moments and largest values of one after the other."""
+def test_merged_statistics_equal_those_of_all_lines() -> None:
+    """Two passes of different brightness, merged, have the moments and chosen spectra of all lines together."""
     values = field_of(3, (64, 40), 9).values
     values[32:] += 0.5
     passes = [statistics_of(values[:32]), statistics_of(values[32:])]
@@ -66,8 +66,8 @@ def test_merged_statistics_are_those_of_all_lines() -> None:
 
 
 @pytest.mark.parametrize("bands", [2, 12])
-def test_statistics_come_back_of_arrays(bands: int) -> None:
-    """Every sum, count and spectrum is as it was, and more lines may be added."""
+def test_statistics_are_restored_from_arrays(bands: int) -> None:
+    """Every sum, count and spectrum is equal, and more lines may be added."""
     values = field_of(1, (32, 32), bands).values
     found = statistics_of(values)
     back = SignalStatistics.of_arrays({name: array.copy() for name, array in found.arrays().items()})
@@ -79,15 +79,15 @@ def test_statistics_come_back_of_arrays(bands: int) -> None:
     np.testing.assert_array_equal(find_components(back).axes, find_components(found).axes)
 
 
-def test_statistics_of_nothing_come_back_of_arrays() -> None:
-    """Before the first line there is no component, then as well as now."""
+def test_empty_statistics_are_restored_from_arrays() -> None:
+    """Before the first line there is no component."""
     assert len(find_components(SignalStatistics.of_arrays(SignalStatistics(5, 100).arrays()))) == 0
 
 
 @pytest.mark.parametrize("bands", [24, 60])
 @pytest.mark.parametrize("materials", [1, 2, 4])
-def test_the_known_rank_is_found(bands: int, materials: int) -> None:
-    """A field of so many materials has so many components, and they hold it."""
+def test_the_number_of_materials_is_the_number_of_components(bands: int, materials: int) -> None:
+    """The components represent the field without noise to half a sigma."""
     made = field_of(materials, bands=bands, materials=materials)
     found = find_components(statistics_of(made.values), least=1)
     assert len(found) == materials
@@ -96,8 +96,8 @@ def test_the_known_rank_is_found(bands: int, materials: int) -> None:
 
 
 @pytest.mark.parametrize("signal", [300.0, 3000.0, 20_000.0])
-def test_a_bright_field_has_no_more_components(signal: float) -> None:
-    """However far the signal stands above the noise, rounding of sums makes no component and no rare spectrum."""
+def test_a_bright_field_has_no_additional_components(signal: float) -> None:
+    """At any ratio of signal to noise, rounding of sums creates no component and no rare spectrum."""
     made = field_of(2, signal=signal)
     found = statistics_of(made.values)
     components = find_components(found, least=1)
@@ -106,8 +106,8 @@ def test_a_bright_field_has_no_more_components(signal: float) -> None:
     assert not marked(made.values, found, find_components(found)).any()
 
 
-def test_a_weak_component_that_neighbours_share_is_found() -> None:
-    """3 % of one pixel's noise variance, spread over some px, no single spectrum shows: the means of 4 x 4 do."""
+def test_a_weak_component_shared_by_neighbours_is_found() -> None:
+    """A component with 3 % of a pixel's noise variance, varying over some px, shows only in means of 4 x 4 spectra."""
     made, rng = field_of(5, (192, 192)), np.random.default_rng(6)
     direction = rng.normal(size=40)
     direction /= np.linalg.norm(direction)
@@ -120,8 +120,8 @@ def test_a_weak_component_that_neighbours_share_is_found() -> None:
 
 
 @pytest.mark.parametrize("bands", [12, 32])
-def test_noise_alone_gives_no_more_components_than_stated(bands: int) -> None:
-    """Of 120 fields of noise at most so many have a component that a rate of 10 % exceeds once in a thousand times."""
+def test_noise_alone_gives_components_at_most_at_the_stated_rate(bands: int) -> None:
+    """The count in 60 fields of noise is at most the 99.9 % quantile for a false-alarm rate of 10 %."""
     noise, alarms = np.linspace(1, 3, bands), 0
     for seed in range(TRIALS):
         values = with_noise(np.full((48, 48, bands), 100.0), noise, seed)
@@ -134,27 +134,27 @@ def test_noise_alone_gives_no_more_components_than_stated(bands: int) -> None:
     [(8, 50, 0, 0.03), (8, 50, 1, 0.03), (8, 50, 5, 0.03), (2, 1, 1, 0.05), (2, 2, 1, 0.05), (2, 8, 1, 0.05)],
 )
 def test_noise_is_estimated_in_every_band(seed: int, bands: int, materials: int, within: float) -> None:
-    """To 3 % whatever the materials; to 5 % by what neighbours differ by, where few bands do not predict each other."""
+    """The error is below 3 % with any materials, and 5 % with few bands, which need differences of neighbours."""
     made = field_of(seed, (128, 128), bands, materials)
     np.testing.assert_allclose(find_components(statistics_of(made.values)).noise, made.noise, rtol=within)
 
 
 def test_noise_is_estimated_in_bands_of_different_units() -> None:
-    """One band counts in millionths of the others' unit."""
+    """One band's unit is a ten-millionth of the others'."""
     made, scale = field_of(8, (128, 128), 20, 3), np.where(np.arange(20) == 4, 1e7, 1.0)
     noise = find_components(statistics_of((made.values * scale).astype(np.float32))).noise
     np.testing.assert_allclose(noise / scale, made.noise, rtol=0.05)
 
 
-def test_pixels_without_data_say_nothing_of_the_noise_of_few_bands() -> None:
-    """More than half of the field is missing, and the noise of four bands is that of the rest."""
+def test_pixels_without_data_do_not_change_the_noise_of_few_bands() -> None:
+    """With more than half of the field missing, the noise of four bands is that of the rest, to 8 %."""
     made, valid = field_of(0, (128, 128), 4, 1), np.broadcast_to(np.arange(128) >= 72, (128, 128))
     np.testing.assert_allclose(find_components(statistics_of(made.values, valid)).noise, made.noise, rtol=0.08)
 
 
 @pytest.mark.parametrize("bands", [1, 2, 8])
-def test_all_of_few_bands_are_kept(bands: int) -> None:
-    """Up to 8 bands have as many components: rounding to a step is all that is lost, and no spectrum is rare."""
+def test_up_to_8_bands_keep_all_components(bands: int) -> None:
+    """Only the rounding to a step is lost, and no spectrum is rare."""
     made = field_of(4, bands=bands, materials=min(bands, 2))
     found = statistics_of(made.values)
     components = find_components(found)
@@ -164,8 +164,8 @@ def test_all_of_few_bands_are_kept(bands: int) -> None:
     assert not marked(made.values, found, components).any()
 
 
-def test_few_bands_are_kept_in_steps_of_the_camera() -> None:
-    """Whole multiples of such a step come back exactly; a missing band is what the others let expect."""
+def test_few_bands_are_stored_in_steps_of_the_camera() -> None:
+    """Whole multiples of such a step are exact. A missing band is predicted from the others."""
     made = field_of(4, bands=3, materials=2)
     values = np.rint(made.values / 0.01).astype(np.float32) * np.float32(0.01)
     components = bands_alone(statistics_of(values), np.full(3, 0.01))
@@ -177,7 +177,7 @@ def test_few_bands_are_kept_in_steps_of_the_camera() -> None:
 
 
 def test_small_fields_keep_a_weak_difference_of_a_small_part() -> None:
-    """A hundredth of the spectra lies a third of a deviation apart: no test finds it; of a small field it stays."""
+    """A hundredth of the spectra differs by a third of a sigma. No test detects it, but a small field keeps it."""
     rng, bands = np.random.default_rng(3), 120
     wavelength = np.linspace(400, 1000, bands)
     smooth = np.exp(-0.5 * ((wavelength - 700) / 40) ** 2)
@@ -197,8 +197,8 @@ def test_small_fields_keep_a_weak_difference_of_a_small_part() -> None:
     np.testing.assert_allclose(all_smooth.axes @ all_smooth.axes.T, np.eye(len(all_smooth)), atol=1e-9)
 
 
-def test_large_fields_keep_what_is_proved() -> None:
-    """Half a million spectra are enough for the test alone."""
+def test_large_fields_keep_only_significant_components() -> None:
+    """From half a million spectra on, the statistical test alone selects the components."""
     found, wavelength = statistics_of(field_of(2, bands=60).values), np.linspace(400, 900, 60)
     proved, counts = len(find_components(found, least=4)), []
     for found.expected in (SMALL_FIELD - 1, SMALL_FIELD):
@@ -207,15 +207,15 @@ def test_large_fields_keep_what_is_proved() -> None:
 
 
 @pytest.mark.parametrize("wavelength", [np.full(60, 550.0), np.linspace(400, 900, 60)[::-1]])
-def test_smooth_directions_need_wavelengths_that_differ(wavelength: np.ndarray) -> None:
-    """Bands of one wavelength add none; descending ones are as good as ascending."""
+def test_smooth_directions_need_different_wavelengths(wavelength: np.ndarray) -> None:
+    """Bands of one wavelength add no direction; descending wavelengths work like ascending ones."""
     found = statistics_of(field_of(2, bands=60).values)
     components = components_of_field(found, wavelength, false_alarm=0.01, least=4)
     assert (len(components) > len(find_components(found, least=4))) == (np.ptp(wavelength) > 0)
 
 
-def test_all_dark_has_no_component() -> None:
-    """Lines of which nothing may be used have no mean, no noise and no component."""
+def test_lines_without_valid_spectra_have_no_component() -> None:
+    """The mean is NaN in every band."""
     found = statistics_of(np.full((8, 8, 12), np.nan, np.float32), np.zeros((8, 8), np.bool_))
     components = find_components(found)
     assert len(components) == 0
@@ -223,8 +223,8 @@ def test_all_dark_has_no_component() -> None:
 
 
 @pytest.mark.parametrize("value", [0.0, 3.0])
-def test_values_that_never_change_have_nothing_to_say(value: float) -> None:
-    """Without noise and signal the least number of components is kept, they give the value back, and none is rare."""
+def test_constant_values_have_the_least_number_of_components(value: float) -> None:
+    """Without noise and signal these components restore the value exactly, and no spectrum is rare."""
     values = np.full((48, 48, 12), value, np.float32)
     found = statistics_of(values)
     components = find_components(found, least=2)
@@ -234,7 +234,7 @@ def test_values_that_never_change_have_nothing_to_say(value: float) -> None:
 
 
 def test_one_material_has_the_least_number_of_components() -> None:
-    """A spectrum and its noise: no component rises above it, and what is asked for at least is kept."""
+    """No component rises above the noise of a single spectrum, so the requested minimum is kept."""
     made = field_of(1, (128, 128), materials=0)
     found = statistics_of(made.values)
     assert len(find_components(found, least=0)) == 0
@@ -243,8 +243,8 @@ def test_one_material_has_the_least_number_of_components() -> None:
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 5), (3, 7), (8, 8)])
-def test_fewer_spectra_than_bands_come_back(shape: tuple[int, int]) -> None:
-    """There are fewer components than spectra, or the least number, and what they do not hold is noise."""
+def test_fewer_spectra_than_bands_are_restored(shape: tuple[int, int]) -> None:
+    """There are fewer components than spectra, or the minimum, and the residual is below the noise."""
     made = field_of(7, (16, 16), 80)
     values = made.values[: shape[0], : shape[1]]
     found = statistics_of(values)
@@ -256,7 +256,7 @@ def test_fewer_spectra_than_bands_come_back(shape: tuple[int, int]) -> None:
 
 
 def test_nan_and_infinite_values_are_left_out() -> None:
-    """Spectra that miss bands make no direction of it: the rank stays, and the noise."""
+    """Spectra with missing bands change neither the number of components nor the noise."""
     made = field_of(2, (128, 128))
     values = made.values.copy()
     values[3, 5] = np.nan
@@ -267,8 +267,8 @@ def test_nan_and_infinite_values_are_left_out() -> None:
     np.testing.assert_allclose(components.noise, made.noise, rtol=0.03)
 
 
-def test_a_detector_with_a_dead_element_in_every_column_has_components() -> None:
-    """Where no spectrum is whole those with most of their bands tell the materials, and the noise to a tenth."""
+def test_a_dead_element_in_every_column_leaves_the_components() -> None:
+    """If no spectrum is whole, those with most of their bands determine the components to one sigma."""
     made = field_of(2, (128, 128), signal=10)
     values = made.values.copy()
     values[:, np.arange(128), np.arange(128) * 7 % 40] = np.nan
@@ -278,8 +278,8 @@ def test_a_detector_with_a_dead_element_in_every_column_has_components() -> None
     assert np.abs(left / made.noise).max() < 1
 
 
-def test_dead_columns_and_bands_take_no_part() -> None:
-    """A band without light is NaN in mean and noise and 0 in axes; the others are as without it."""
+def test_dead_columns_and_bands_are_left_out() -> None:
+    """A band without light is NaN in mean and noise and 0 in axes. The other bands are as without it."""
     made = field_of(2)
     values = np.insert(made.values, 11, np.nan, axis=2)
     valid = np.ones(made.values.shape[:2], np.bool_)
@@ -292,8 +292,8 @@ def test_dead_columns_and_bands_take_no_part() -> None:
     np.testing.assert_allclose(np.abs(np.delete(components.axes, 11, axis=1)), np.abs(alone.axes), atol=1e-9)
 
 
-def test_a_band_that_lights_up_late_counts_from_then() -> None:
-    """A band of which the first lines have nothing has the mean of the others' lines."""
+def test_a_band_that_starts_late_counts_from_its_first_line() -> None:
+    """A band without values in the first lines has the mean of the other lines."""
     made = field_of(2)
     values = made.values.copy()
     values[:64, :, 5] = np.nan
@@ -303,8 +303,8 @@ def test_a_band_that_lights_up_late_counts_from_then() -> None:
 
 
 @pytest.mark.parametrize("what", ["drift", "cloud"])
-def test_what_the_bands_of_a_line_share_is_one_more_component(what: str) -> None:
-    """A dark frame's drift by 3 deviations, or light that falls to a third within some lines; nothing of it is rare."""
+def test_an_effect_shared_by_the_bands_of_a_line_is_one_component(what: str) -> None:
+    """The effect is a dark frame's drift of 3 sigma, or light that falls to a third; neither makes a spectrum rare."""
     made = field_of(9)
     drift = 3 * np.linspace(0, 1, 96)[:, None, None] * np.random.default_rng(1).normal(size=40) * made.noise
     light = gaussian_filter(np.where(np.arange(96) < 50, 1.0, 0.35), 1.0)[:, None, None]
@@ -318,8 +318,8 @@ def test_what_the_bands_of_a_line_share_is_one_more_component(what: str) -> None
     assert np.abs(left[there].mean(axis=(0, 1))).max() < 0.15
 
 
-def test_full_scale_integers_keep_the_rank() -> None:
-    """Values from 0 to 65 535 with a noise of some counts, as a raster has them."""
+def test_full_scale_integers_keep_the_number_of_components() -> None:
+    """A raster has values from 0 to more than 30 000, with noise of some counts."""
     made = field_of(4, materials=2, signal=1000)
     values = np.rint(made.values * 4000 - (made.values * 4000).min()).astype(np.float32)
     components = find_components(statistics_of(values), least=1)
@@ -328,8 +328,8 @@ def test_full_scale_integers_keep_the_rank() -> None:
     np.testing.assert_allclose(components.noise, made.noise * 4000, rtol=0.03)
 
 
-def test_a_direction_that_rare_spectra_share_becomes_a_component() -> None:
-    """Residuals of 200 rare spectra along one direction add that one, after the others, orthonormal to them."""
+def test_a_direction_shared_by_rare_spectra_becomes_a_component() -> None:
+    """Residuals of 200 rare spectra along one direction add it as the last axis, orthonormal to the others."""
     made = field_of(3)
     components = find_components(statistics_of(made.values), least=1)
     rng = np.random.default_rng(2)
@@ -344,8 +344,8 @@ def test_a_direction_that_rare_spectra_share_becomes_a_component() -> None:
     assert abs(more.axes[3] @ shared) > 0.99
 
 
-def test_residuals_of_noise_share_nothing() -> None:
-    """Rare spectra each of its own kind add no component."""
+def test_residuals_of_noise_add_no_component() -> None:
+    """The residuals of these rare spectra have no common direction."""
     made = field_of(3)
     components = find_components(statistics_of(made.values), least=1)
     residuals = np.random.default_rng(4).normal(0, 3, (400, 40)).astype(np.float32)

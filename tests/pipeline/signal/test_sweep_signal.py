@@ -1,4 +1,4 @@
-"""A sweep, block by block: what lines tell as they arrive, what is stored of them, and which stored lines differ."""
+"""A sweep, block by block: statistics of arriving lines, stored scores, and stored lines that differ."""
 
 from __future__ import annotations
 
@@ -39,20 +39,20 @@ class Stored:
 
     @property
     def usable(self) -> NDArray[np.bool_]:
-        """Spectra that may be used."""
+        """Return a mask of the usable spectra."""
         return self.quality != UNUSABLE
 
     def write(self, first: int, scores: NDArray[np.float32], quality: NDArray[np.uint8]) -> None:
-        """Take some lines."""
+        """Store some lines."""
         part = slice(first, first + len(scores))
         self.scores[part], self.quality[part] = whole_steps(scores, self.step), quality
 
     def read(self, start: int, stop: int) -> NDArray[np.int32]:
-        """Scores of some lines in steps."""
+        """Return scores of some lines in steps."""
         return self.scores[start:stop]
 
     def restored(self, done: CondensedSweep) -> NDArray[np.float32]:
-        """Scene values of all lines."""
+        """Return scene values of all lines."""
         values = self.components.restore(self.scores.astype(np.float32) * np.float32(self.step))
         line, sample = done.rare.T
         values[line, sample] += done.residuals * RESIDUAL_STEP * np.nan_to_num(self.components.noise)
@@ -60,7 +60,7 @@ class Stored:
 
 
 def statistics_of_lines(lines: MadeLines) -> SignalStatistics:
-    """What the lines tell while they arrive."""
+    """Return the statistics of lines as they arrive."""
     found = SignalStatistics(lines.raw.shape[2], lines.raw.shape[0] * lines.raw.shape[1])
     taker = LineStatistics(found, lines.sweep, lines.references, CAMERA)
     facts = zip(lines.raw, lines.position, lines.valid_line, strict=True)
@@ -82,17 +82,17 @@ def condense(lines: MadeLines, step: float = 1.0, alarms: float = 0.01) -> tuple
 
 
 def made_lines(seed: int = 3, **how: float) -> MadeLines:
-    """Lines of 3 materials, the third block of which is no whole one."""
+    """Return lines of 3 materials; the third block is not full."""
     return MadeLines.of(raw_of(field_of(seed, SHAPE, BANDS, **how).values))
 
 
 def values_of(lines: MadeLines) -> NDArray[np.float32]:
-    """Scene values of raw lines."""
+    """Return scene values of raw lines."""
     return calibrate(lines.raw, lines.references, saturated_dn=1e9, position=lines.position)[0]
 
 
-def test_statistics_of_lines_are_those_of_their_values() -> None:
-    """64 lines at a time and what is left, calibrated, count as all values at once do."""
+def test_statistics_of_arriving_lines_equal_those_of_their_values() -> None:
+    """Blocks of 64 lines and the remainder, calibrated, count the same as all values at once."""
     lines = made_lines()
     values = values_of(lines)
     found, whole = statistics_of_lines(lines), SignalStatistics(BANDS, values[..., 0].size)
@@ -101,8 +101,8 @@ def test_statistics_of_lines_are_those_of_their_values() -> None:
     np.testing.assert_allclose(find_components(found).noise, find_components(whole).noise, rtol=0.01)
 
 
-def test_lines_that_are_not_valid_stay_out_of_the_statistics() -> None:
-    """Whatever stands in such a line, statistics are those without it."""
+def test_invalid_lines_are_left_out_of_the_statistics() -> None:
+    """Any values in such lines are ignored."""
     lines = made_lines()
     lines.valid_line[[5, 140]] = False
     lines.raw[5] = 3000
@@ -110,8 +110,8 @@ def test_lines_that_are_not_valid_stay_out_of_the_statistics() -> None:
 
 
 @pytest.mark.parametrize("hot", [False, True])
-def test_a_lost_line_is_unusable_and_a_line_without_position_keeps_its_light(hot: bool) -> None:
-    """Zeros of a line that is not valid are out; light from an unknown place comes back, in either form of validity."""
+def test_invalid_lines_are_unusable_only_without_light(hot: bool) -> None:
+    """An invalid line of zeros is unusable; one with light is restored, for both forms of validity."""
     lines = made_lines()
     lines.valid_line[[5, 140]] = False
     lines.raw[5] = 0
@@ -126,7 +126,7 @@ def test_a_lost_line_is_unusable_and_a_line_without_position_keeps_its_light(hot
 
 @pytest.mark.parametrize("step", [0.5, 1.0, 3.0])
 def test_scores_are_stored_in_steps(step: float) -> None:
-    """What comes back lies as near to the raw values as the noise, and rounding by a step, allow; nothing is rare."""
+    """Restored values differ from raw ones by the noise and the rounding to a step, and none is rare."""
     lines = made_lines()
     stored, done = condense(lines, step)
     off, count = (stored.restored(done) - values_of(lines)) / stored.components.noise, len(stored.components)
@@ -135,8 +135,8 @@ def test_scores_are_stored_in_steps(step: float) -> None:
     assert differing_lines(lines, stored, CAMERA) == []
 
 
-def test_lines_that_changed_or_were_lost_are_found() -> None:
-    """A raw line that is another one now, one score a step off, one spectrum lost: their lines and no others."""
+def test_changed_and_lost_lines_are_found() -> None:
+    """Exactly three lines differ: with other raw values, with a score a step off, and with a lost spectrum."""
     lines = made_lines()
     stored, _ = condense(lines)
     stored.quality[149, 0] = UNUSABLE
@@ -146,7 +146,7 @@ def test_lines_that_changed_or_were_lost_are_found() -> None:
 
 
 def test_saturated_spectra_are_restored_or_unusable() -> None:
-    """Some bands at full scale: quality 1, values from the others. All bands: quality 2. Neither spoils the field."""
+    """With some bands at full scale quality is 1, with all of them 2. Neither changes components or noise."""
     lines = made_lines()
     before, values = find_components(statistics_of_lines(lines)), values_of(lines)
     lines.raw[20, 10:14, ::3] = CAMERA.full_scale_dn
@@ -162,8 +162,8 @@ def test_saturated_spectra_are_restored_or_unusable() -> None:
     assert done.saturated == 5
 
 
-def test_saturated_spectra_are_counted_where_all_lines_have_them() -> None:
-    """A band that is bright everywhere; a lost line and the spectra of a dead column do not count."""
+def test_saturated_spectra_are_counted_in_all_lines() -> None:
+    """One band saturates everywhere; an invalid line and the spectra of a dead column do not count."""
     bad = np.zeros((40, BANDS), np.bool_)
     bad[8] = True
     lines = replace(made_lines(), references=MadeLines.of(made_lines().raw, bad).references)
@@ -173,8 +173,8 @@ def test_saturated_spectra_are_counted_where_all_lines_have_them() -> None:
     assert done.saturated == 149 * 39
 
 
-def test_dead_columns_and_elements() -> None:
-    """A column of bad elements is unusable, one bad element is filled from its neighbours, and no line differs."""
+def test_dead_columns_are_unusable_and_dead_elements_are_filled() -> None:
+    """The single bad element is filled from its neighbours, and no stored line differs."""
     bad = np.zeros((40, BANDS), np.bool_)
     bad[8], bad[25, 4] = True, True
     lines = replace(made_lines(), references=MadeLines.of(made_lines().raw, bad).references)
@@ -187,8 +187,8 @@ def test_dead_columns_and_elements() -> None:
     assert differing_lines(lines, stored, CAMERA) == []
 
 
-def test_a_dark_frame_that_drifts_apart_in_every_element_makes_raw_lines_stay() -> None:
-    """Elements that drift each by its own are no low rank and no noise: more spectra than exceptions are, are rare."""
+def test_a_dark_frame_that_drifts_per_element_makes_many_spectra_rare() -> None:
+    """Such drift is neither of low rank nor noise: over 5 % are rare, too many for exceptions, so raw lines stay."""
     made = field_of(3, SHAPE, BANDS)
     own = np.random.default_rng(2).normal(size=(40, BANDS)) * made.noise
     drift = 6 * np.linspace(0, 1, 150)[:, None, None] * own
@@ -200,7 +200,7 @@ def test_a_dark_frame_that_drifts_apart_in_every_element_makes_raw_lines_stay() 
 
 
 def test_progress_ends_at_one() -> None:
-    """Every block is told, the last one as all of it."""
+    """Every block reports the completed fraction."""
     lines, told = made_lines(), []
     found = statistics_of_lines(lines)
     components = find_components(found)

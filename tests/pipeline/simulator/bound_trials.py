@@ -1,4 +1,4 @@
-"""What leaving out an effect, or a variant of it, changes beside all others, held against what the decision counts."""
+"""Trials that compare the change from leaving out or approximating an effect with the bound of the decision."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from pipeline.simulator.render import EFFECTS, READOUT, expected_light
 from pipeline.simulator.selection.options import SAFETY, Menu, list_options
 from tests.pipeline.simulator.random_cases import Case
 
-ROUNDING = 4e-6  # of the brightest light of some lines: float32 sums
-KERNELS = 4e-3  # of the light's range, by which two sets of kernels that are fitted to the same blurs may differ
-REACH_PX = 16  # along a line, within which arithmetic may put light elsewhere
-DRAWN = frozenset({"jitter", "turbulence"})  # one survey of 1000 may go beyond their bounds
+ROUNDING = 4e-6  # times the brightest light of the lines: float32 sums
+KERNELS = 4e-3  # times the light's range: difference of two sets of kernels that are fitted to the same blurs
+REACH_PX = 16  # along a line: numerical errors displace light at most this far
+DRAWN = frozenset({"jitter", "turbulence"})  # one survey of 1000 may exceed their bounds
 IN_THE_LIGHT: tuple[Effect, ...] = tuple(effect for effect in EFFECTS if effect not in READOUT)
 
 
 @dataclass(frozen=True)
 class Trial:
-    """``bound`` is the composed one, with gains of other effects and without `SAFETY`; all in sigma as stored.
+    """Result for an effect or variant; ``bound`` has gains of other effects but not `SAFETY`. All in sigma as stored.
 
-    ``unexplained`` is the most that is left of the change at any number without what arithmetic may misplace there.
+    ``unexplained`` is the greatest change at any number, minus the light that numerical errors may displace there.
     """
 
     effect: str
@@ -40,27 +40,27 @@ class Trial:
 
     @property
     def is_broken(self) -> bool:
-        """Whether the change exceeds what the decision counts."""
+        """Return whether the change exceeds the bound that the decision counts."""
         return not self.unexplained <= self.bound * SAFETY
 
     @property
     def looseness(self) -> float:
-        """Bound over measured change; NaN where rounding hides the change."""
+        """Return bound over measured change; NaN where rounding hides the change."""
         return self.bound / self.measured if self.measured > 10 * self.rounding else np.nan
 
 
 @dataclass(frozen=True)
 class _Stored:
-    """A case as it is stored in sums of so many samples: what is decided of it, and its noise."""
+    """A case that is stored in sums of ``binning`` samples: its options and its noise."""
 
     binning: int
     menus: tuple[Menu, ...]
     noise: list[Radiance]  # of each block with everything on, of the sums (line, number, band) [e-]
-    contrast: list[Radiance]  # of the light about each sample, summed (1, number, band) [e-]
+    contrast: list[Radiance]  # range of light around each sample, summed (1, number, band) [e-]
     rounding: float
 
     def change(self, light: list[Radiance], full: list[Radiance], fraction: float) -> tuple[float, float]:
-        """Return the greatest change of a stored number in its own sigmas, and what arithmetic does not explain."""
+        """Return the greatest change of a stored number in its own sigmas, and the greatest beyond numerical errors."""
         most, left = 0.0, 0.0
         for one, other, noise, contrast in zip(light, full, self.noise, self.contrast, strict=True):
             change = np.abs(_summed(one - other, self.binning))
@@ -71,10 +71,10 @@ class _Stored:
 
 
 def trials(case: Case, binnings: Sequence[int] = (1,), only: str = "") -> Iterator[Trial]:
-    """Leave out every effect that the rig has, and take each variant, beside all others exact.
+    """Yield trials without each effect of the rig and with each of its variants, with all other effects exact.
 
     Changes are over the noise of every stored number of all sweeps, with everything on; draws are paired. The same
-    light is stored in each of the ``binnings``. ``only`` names the one effect that is tried, where it is not every one.
+    light is stored in each of the ``binnings``. ``only`` limits the trials to one effect.
     """
     probes = [case.stored_in_sums_of(binning).probe() for binning in binnings]
     menus = [list_options(probe, case.rig, IN_THE_LIGHT) for probe in probes]
@@ -103,7 +103,7 @@ def _stored(full: list[Radiance], case: Case, binning: int, menus: tuple[Menu, .
 
 
 def _range_about(light: Radiance) -> Radiance:
-    """Return the range of light within `REACH_PX` of each sample, of all lines, (1, sample, band) [e-]."""
+    """Return the range of light within `REACH_PX` of each sample, over all lines, (1, sample, band) [e-]."""
     most, least = light.max(axis=0), light.min(axis=0)
     size = 2 * REACH_PX + 1
     high = scipy.ndimage.maximum_filter1d(most, size, axis=0, mode="nearest")
@@ -111,7 +111,7 @@ def _range_about(light: Radiance) -> Radiance:
 
 
 def _summed(values: Radiance, binning: int) -> Radiance:
-    """Sums of neighbouring samples, a remainder dropped."""
+    """Return sums of neighbouring samples; a remainder is dropped."""
     count = values.shape[1] // binning
     sums: Radiance = values[:, : count * binning].reshape(len(values), count, binning, -1).sum(axis=2)
     return sums
@@ -123,10 +123,10 @@ def _error(menus: tuple[Menu, ...], name: str, variant: str) -> float:
 
 
 def misplaced_fraction(exact: Mapping[Effect, str], chosen: Mapping[Effect, str]) -> float:
-    """The fraction of the light's range by which arithmetic may make two ways to render it differ.
+    """Return the fraction of the light's range by which numerical errors may make two renderings differ.
 
-    Tables of weights misplace up to `TABULATED` along either axis, in either image. Kernels that stand for those of all
-    bands differ, too, where blurs or held positions do.
+    Tables of weights displace up to `TABULATED` along either axis, in either image. Kernels fitted to all bands differ
+    as well, if blurs or held positions do.
     """
     return 2 * TABULATED + (0.0 if _folded(exact) == _folded(chosen) else KERNELS)
 

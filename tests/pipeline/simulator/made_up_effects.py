@@ -1,4 +1,4 @@
-"""Effects with bounds and costs as a test says, and a probe of an even scene to ask them with."""
+"""Made-up effects with given bounds and costs, and probes to evaluate them with."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RIG = Rig()
 
 @dataclass(frozen=True)
 class MadeUp:
-    """``ways``: (variant, bound, cost) from exact to cheap, bounds per unit of the scene's level."""
+    """An effect; ``ways`` are (variant, bound, cost) from exact to cheap, with bounds per unit of the scene's level."""
 
     name: str
     left_out: float
@@ -40,7 +40,7 @@ class MadeUp:
 
 @dataclass(frozen=True)
 class Brightening(MadeUp):
-    """Light times 1 + ``fraction``; ``left_out`` is what its bound says, right or not."""
+    """A gain of 1 + ``fraction``; ``left_out`` is its stated bound, right or wrong."""
 
     fraction: float = 0.0
 
@@ -56,12 +56,12 @@ class Shift(MadeUp):
     """A shift along the line by ``left_out`` px."""
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
-        """Slope times way."""
+        """Return slope times displacement."""
         return Bound(probe.moved(self.left_out if variant == OFF else 0.0, 0.0), f"{self.left_out:g} px aside")
 
 
 def even_probe(**values: object) -> Probe:
-    """A probe of one band and level 1 without detail."""
+    """Return a probe of one band and level 1 without detail, with ``values`` changed."""
     zeros, ones = np.zeros(1), np.ones(1)
     probe = Probe(
         unit="sigma",
@@ -85,7 +85,7 @@ def even_probe(**values: object) -> Probe:
 def steep_probe(
     slope: tuple[float, float] = (0.0, 1.0), sweeps: tuple[Sweep, ...] = (SWEEP,), span: float = 1e9, **values: object
 ) -> Probe:
-    """A scene of one band, known by its slope along the line and along the scan; ``curvature`` is one pair, too."""
+    """Return a probe of one band with a slope and ``curvature``, each as (along the line, along the scan)."""
     both = np.array(values.pop("curvature", (0.0, 0.0)))[:, None]
     lines = sum(sweep.lines for sweep in sweeps)
     known = {"sweeps": sweeps, "slope": np.array(slope)[:, None], "curvature": both, "span": np.full(1, span)}

@@ -1,4 +1,4 @@
-"""Rigs outdoors, the light of a white reference as bright as the farm's, and lines of a sweep."""
+"""Outdoor rigs, a white reference about as bright as the farm's, and lines of a sweep."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ SHAPE = (400, 640)
 
 
 def rig_with(air: Air | None = None, exposure_ms: float = 100.0, **sky: Any) -> Rig:
-    """A rig under some sky, in some air."""
+    """Return a rig with this sky and air."""
     return Rig(camera=LineCamera(exposure_ms=exposure_ms), air=air or Air(), sky=Sky(**sky))
 
 
 def white_e(exposure_ms: float = 100.0) -> Floats:
-    """Electrons of the white reference in an exposure, (band,): near the farm's."""
+    """Return the electrons of the white reference in an exposure, (band,), close to those of the farm."""
     knots = [400, 450, 550, 600, 700, 760, 800, 900, 940, 1000]
     light = np.interp(WAVELENGTH, knots, [0.25, 0.58, 0.95, 1.0, 0.83, 0.6, 0.6, 0.3, 0.1, 0.1])
     return 0.94 * CAMERA.full_scale_e * exposure_ms / 100 * light
 
 
 def block_of(rig: Rig, lines: range = range(60), *, sweep: Sweep = SWEEP, **more: Any) -> SweepBlock:
-    """Lines of a sweep."""
+    """Return lines of a sweep as a block."""
     more.setdefault("white_e", white_e(rig.camera.exposure_ms))
     return SweepBlock(rig, sweep, lines, WAVELENGTH, SHAPE, **more)

@@ -1,9 +1,9 @@
-"""An independent reference of everything on: the pupil's own integral, dense in frequency, in place of few kernels.
+"""An independent reference with all effects on: the pupil's own integral, dense in frequency, instead of few kernels.
 
-What a sample sees of tiles of random light on an even ground is summed over all waves that the pupil passes: linear
-pixels, slit, pixel, held positions, blurs, and the autocorrelation of the elliptic pupil by quadrature. No kernel is
-fitted, no weight is tabulated, no tail is cut; only the geometry of rays is that of the renderer. A tile is repeated
-`PERIOD_PX` farther on, where next to nothing of the pattern is left.
+The light of a sample of random tiles on even ground is summed over all waves that the pupil passes. The sum contains
+linear pixels, slit, pixel, held positions, blurs, and the autocorrelation of the elliptic pupil by quadrature. No
+kernel is fitted, no weight is tabulated, no tail is cut; only the geometry of rays is the renderer's. A tile repeats
+after `PERIOD_PX`, where almost nothing of the pattern is left.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from tests.pipeline.simulator.small_scenes import made_scene
 
 Floats = NDArray[np.float64]
 PERIOD_PX = 768
-TILE_PX = 120  # of a tile, within a scene that is even about it
+TILE_PX = 120  # of a tile; the scene around it is even
 EDGE_PX = 8
 SAMPLES = 3  # of a tile that are compared
 KINDS = ("noise", "edges", "points", "field")
@@ -43,7 +43,7 @@ ALL: dict[Effect, str] = {
 
 @dataclass(frozen=True)
 class Tile:
-    """A scene of one band, the lines that are taken of it, and the samples of them that are compared."""
+    """A scene of one band, the line that is taken of it, and the compared samples."""
 
     kind: str
     scene: RasterScene
@@ -53,7 +53,7 @@ class Tile:
 
 
 def random_tile(number: int, focus_m: float | None = None) -> Tile:
-    """Give the tile of a number, always the same; kinds take turns. ``focus_m``: of a scene 40 m away; None: sharp."""
+    """Return the tile of a number, always the same; kinds alternate. ``focus_m``: for a scene at 40 m; None: sharp."""
     rng = np.random.default_rng([17, number])
     kind, size = KINDS[number % len(KINDS)], TILE_PX + 2 * EDGE_PX
     values = np.full((size, size), rng.choice([0.0, 0.1, 0.5]))
@@ -84,7 +84,7 @@ def _drawn(rng: np.random.Generator, kind: str, ground: float) -> Floats:
 
 
 def distances(tile: Tile) -> Floats:
-    """Give by how many sigmas of its noise each sample of a tile, with everything on, is off the reference, (n,)."""
+    """Return by how many sigmas each sample of a tile, with everything on, differs from the reference, (n,)."""
     block = sweep_block(tile.scene, tile.rig, tile.sweep, range(1))
     light = expected_light(tile.scene, block, ALL)[0, tile.samples, 0].astype(np.float64)
     slopes = block.slopes[tile.samples]
@@ -95,12 +95,12 @@ def distances(tile: Tile) -> Floats:
 
 
 def _seen(tile: Tile, views: RayViews, normal: Floats) -> Floats:
-    """Light of the samples that look so, (n,), by the sum over all waves that the pupil passes. [e-]"""
+    """Return the light of the samples with these views, (n,), as a sum over all waves that the pupil passes. [e-]"""
     scene, rig = tile.scene, tile.rig
     values = scene.planes[..., 0].astype(np.float64) * float(scene.electrons[0, 0])
     ground = values[0, 0]
     waves = scene.wavelength_nm[0] * 1e-9 / (rig.optics.aperture_mm * 1e-3) / rig.camera.ifov_rad
-    most = int(np.ceil(1.02 / waves * PERIOD_PX))  # no wave is finer than the pupil passes, along the line
+    most = int(np.ceil(1.02 / waves * PERIOD_PX))  # the pupil passes no finer wave along the line
     column, row = np.arange(most + 1), np.arange(-most, most + 1)
     passed = np.fft.fft2(values - ground, (PERIOD_PX, PERIOD_PX))[np.ix_(row % PERIOD_PX, column % PERIOD_PX)]
     x, y = column / PERIOD_PX, row[:, None] / PERIOD_PX
@@ -119,7 +119,7 @@ def _seen(tile: Tile, views: RayViews, normal: Floats) -> Floats:
 
 
 def _transfer(run: Floats, turn: Floats, rig: Rig, nm: Floats, normal: Floats, waves: float) -> NDArray[np.complex128]:
-    """What pixel, slit, lens, disc and pupil pass of waves along the line and across it, in px of the camera."""
+    """Return the transfer of pixel, slit, lens, disc and pupil for waves along and across the line, in camera px."""
     n_x, n_y, n_z = normal
     steep = (n_y * run + n_x * turn) / n_z
     contrast = np.interp(waves * np.sqrt(run**2 + turn**2 + steep**2), *autocorrelation(), right=0.0)
@@ -135,10 +135,10 @@ def _transfer(run: Floats, turn: Floats, rig: Rig, nm: Floats, normal: Floats, w
 
 @cache
 def autocorrelation() -> tuple[Floats, Floats]:
-    """Give shares u of a pupil's width and what of a round one overlaps with itself, moved by u: by quadrature."""
+    """Return shifts u over a pupil's width, and a round pupil's overlap with its copy shifted by u, by quadrature."""
     u = np.linspace(0, 1, 4001)
     node, weight = np.polynomial.legendre.leggauss(400)
-    turn = (node + 1) * np.pi / 4  # chords at heights that lie densely where they end
+    turn = (node + 1) * np.pi / 4  # heights of chords, dense near their ends
     high = np.sqrt(1 - u**2)[:, None] / 2
     chord = np.sqrt(np.maximum(0.25 - (high * np.sin(turn)) ** 2, 0)) * 2 - u[:, None]
     area = (np.maximum(chord, 0) * high * np.cos(turn) * weight).sum(axis=1) * np.pi / 4 * 2

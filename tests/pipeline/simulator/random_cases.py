@@ -1,8 +1,8 @@
-"""Random scenes and rigs: what leaving out an effect changes is held against its bound.
+"""Random scenes and rigs: the change from leaving out an effect is checked against its bound.
 
-Scenes are strips of pixels, long along the scan so that sweeps may lie far from the middle: edges, textures, points,
-gradients and mixtures, of one band to many, bright and dark. Rigs have random numbers within sensible ranges, and
-about half of what a rig may have.
+Scenes are long along the scan, so that sweeps may lie far from the middle. They have edges, textures, points,
+gradients and mixtures, one band to many, bright and dark. Rigs have random numbers within sensible ranges, and
+about half of the optional parts.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _COMPONENTS = 3
 
 @dataclass(frozen=True)
 class Case:
-    """A scene, a rig and the sweeps that it takes of it, the last of them at the survey's end."""
+    """A scene, a rig and its sweeps over the scene, the last of them at the survey's end."""
 
     scene: RasterScene
     rig: Rig
@@ -44,16 +44,16 @@ class Case:
     measured: range | None = None  # lines of every sweep that are measured; None is all
 
     def stored_in_sums_of(self, binning: int) -> Case:
-        """The same, with so many neighbouring samples summed to one number."""
+        """Return the case with ``binning`` neighbouring samples summed to one number."""
         return replace(self, sweeps=tuple(replace(sweep, binning=binning) for sweep in self.sweeps))
 
     def probe(self) -> Probe:
-        """What the decision sees of it."""
+        """Return the probe of the scene, on which the decision is based."""
         probe = probe_scene(self.scene, self.rig, self.sweeps)
         return probe if self.seconds is None else replace(probe, seconds=max(self.seconds, probe.seconds))
 
     def blocks(self, probe: Probe) -> list[SweepBlock]:
-        """Those lines of every sweep that are measured: the first as the survey starts, the others as it ends."""
+        """Return the measured lines of every sweep: the first sweep starts the survey, the others end it."""
         scene, rig = self.scene, self.rig
         white = scene.white_reference_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
         ends = [0.0, *(probe.seconds - rig.camera.scan_seconds(sweep.lines) for sweep in self.sweeps[1:])]
@@ -74,7 +74,7 @@ class Case:
 
 
 def random_case(number: int) -> Case:
-    """Give the case of a number, always the same."""
+    """Return the case of a number, always the same."""
     rng = np.random.default_rng([6, number])
     rig, upright = random_rig(rng), bool(rng.random() < 0.3)
     scene = _scene(rng, rig.camera, upright=upright, long_px=LONG_PX)
@@ -113,7 +113,7 @@ def _scene(rng: np.random.Generator, camera: LineCamera, *, upright: bool, long_
 
 
 def _plane(rng: np.random.Generator, shape: tuple[int, int]) -> Floats:
-    """One component, 0 to 1: bars at any angle, noise of any coarseness, points, a ramp, or a sum of two of these."""
+    """Return one component, 0 to 1: bars at any angle, noise of any coarseness, points, a ramp, or bars plus noise."""
     y, x = np.mgrid[: shape[0], : shape[1]]
     turn = rng.uniform(0, np.pi)
     way = y * np.sin(turn) + x * np.cos(turn)
@@ -130,7 +130,7 @@ def _plane(rng: np.random.Generator, shape: tuple[int, int]) -> Floats:
 
 
 def _spectrum(rng: np.random.Generator, nm: Floats) -> Floats:
-    """A smooth slope and a bump, perhaps a narrow line."""
+    """Return a smooth slope and a bump, perhaps with a narrow absorption line."""
     bump = np.exp(-(((nm - rng.uniform(400, 1000)) / rng.uniform(30, 300)) ** 2))
     line = rng.choice([0.0, 0.6]) * np.exp(-(((nm - rng.uniform(400, 1000)) / rng.uniform(4, 20)) ** 2))
     spectrum: Floats = (0.2 + rng.uniform(0, 1) * (nm - 400) / 600 + bump) * (1 - line)
@@ -138,7 +138,7 @@ def _spectrum(rng: np.random.Generator, nm: Floats) -> Floats:
 
 
 def random_rig(rng: np.random.Generator) -> Rig:
-    """Give a rig of random numbers within sensible ranges; it has about half of what a rig may have."""
+    """Return a rig of random numbers within sensible ranges, with about half of the optional parts."""
     camera = LineCamera(
         samples=int(rng.choice(SAMPLES)),
         exposure_ms=float(np.exp(rng.uniform(np.log(3), np.log(100)))),
@@ -152,7 +152,7 @@ def random_rig(rng: np.random.Generator) -> Rig:
 
 
 def _some(rng: np.random.Generator, least: float, most: float, none: float = 0.0) -> float:
-    """A number within a range by its logarithm; ``none`` in half of the cases."""
+    """Return a number from a range, uniform in its logarithm, or ``none`` in half of the cases."""
     value = float(np.exp(rng.uniform(np.log(least), np.log(most))))
     return value if rng.random() < 0.5 else none
 
@@ -173,7 +173,7 @@ def _optics(rng: np.random.Generator, distance_m: float | None) -> Optics:
 
 
 def _coating(rng: np.random.Generator) -> Coating:
-    """A metal, or in half of the cases none."""
+    """Return a metal, or ``ideal`` in half of the cases."""
     metals: tuple[Coating, ...] = ("aluminium", "gold", "silver")
     metal = metals[int(rng.uniform(0, 3))]
     return metal if rng.random() < 0.5 else "ideal"

@@ -1,4 +1,4 @@
-"""Scenes and probes that tests of the simulator are made with: arrays in, the rest as small as it may be."""
+"""Minimal scenes from arrays, choices of effects and pointing errors for tests of the simulator."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRas
 
 
 def made_scene(planes: ArrayLike, electrons: ArrayLike, wavelength_nm: ArrayLike, **more: Any) -> RasterScene:
-    """A scene of planes (y, x, component) and electrons (component, band), its panel as bright as the greatest."""
+    """Return a scene of planes (y, x, component) and electrons (component, band); white is their maximum."""
     light = np.asarray(electrons, np.float32)
     white = light if light.ndim == 1 else light.max(axis=0)
     nm = np.asarray(wavelength_nm, np.float64)
@@ -29,29 +29,29 @@ def made_scene(planes: ArrayLike, electrons: ArrayLike, wavelength_nm: ArrayLike
 
 
 def image_scene(values: ArrayLike, camera: LineCamera, wavelength_nm: ArrayLike) -> RasterScene:
-    """A scene of an image's values (y, x, band)."""
+    """Return a scene of an image's values (y, x, band)."""
     return raster_from_values(np.asarray(values), camera, name="image", wavelength_nm=np.asarray(wavelength_nm, float))
 
 
 def seen_at(scene: RasterScene, y: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Components at points, (..., component): linear between pixels, the edge repeated outside."""
+    """Return components at points, (..., component): linear between pixels, with the edge repeated outside."""
     found = [map_coordinates(plane, [y, x], order=1, mode="nearest") for plane in np.moveaxis(scene.planes, -1, 0)]
     return np.stack(found, axis=-1)
 
 
 def effects_on(*names: str) -> Choice:
-    """Give effects by their names, in the order of the chain: exact ones, but for shot noise, which is cheap."""
+    """Return effects by their names, in the order of the chain: exact variants, except for cheap shot noise."""
     assert set(names) <= set(BY_NAME)
     return Choice(tuple((one, GAUSSIAN if one is SHOT else one.variants[0]) for one in EFFECTS if one.name in names))
 
 
 @dataclass(frozen=True)
 class CommonOffset(PointingErrors):
-    """A mirror that looks beside every reported place by the same (along, scan) px."""
+    """Pointing errors with the same offset (along, scan) in px for every sweep."""
 
     offset_px: float = 0.0
     way_px: tuple[float, float] = (0.0, 0.0)
 
     def offset(self, sweep_name: str) -> NDArray[np.float64]:
-        """Give the same error for every sweep."""
+        """Return the same error for every sweep."""
         return np.array(self.way_px)

@@ -1,7 +1,7 @@
-"""Random scenes of which a few looks see little: what leaving out an effect changes is held against its bound.
+"""Random scenes whose light few samples show: the change from leaving out an effect is checked against its bound.
 
-Cubes each of whose bands has a plane of its own, detail in few of them; lone sweeps beside bright fields, edges and
-pixels; single pixels; one bright line of many. Rigs are those of the random cases.
+Scenes are cubes with a plane for each band and detail in few of them, few pixels, or one bright line of many. Some
+sweeps lie alone beside bright fields, edges and pixels. Rigs are those of the random cases.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ KINDS = (*IN_BANDS, "beside fields", "beside points", "bright line", "pixel")
 
 
 def sparse_case(number: int) -> Case:
-    """Give the case of a number, always the same; kinds take turns."""
+    """Return the case of a number, always the same; the kinds alternate."""
     rng = np.random.default_rng([11, number])
     kind, rig = KINDS[number % len(KINDS)], random_rig(rng)
     samples = rig.camera.samples
@@ -43,7 +43,7 @@ def sparse_case(number: int) -> Case:
 
 
 def _scene(rng: np.random.Generator, values: Floats, rig: Rig) -> RasterScene:
-    """A scene of values (y, x, band), each band a plane of its own."""
+    """Return a scene of values (y, x, band), with a plane for each band."""
     bands = values.shape[2]
     brightest = float(np.exp(rng.uniform(np.log(500), np.log(20_000)))) * DEFAULT_EXPOSURE_MS / rig.camera.exposure_ms
     light = np.full(bands, brightest / max(values.max(), 1e-9), np.float32)
@@ -75,7 +75,7 @@ def _cube(rng: np.random.Generator, kind: str) -> Floats:
 
 
 def _beside(rng: np.random.Generator, kind: str, sweep: Sweep) -> Floats:
-    """Even light where a sweep looks; beyond some px beside it fields, or pixels, in every band or in one."""
+    """Return even light under a sweep, with fields or pixels some px beside it, in every band or in one."""
     bands = int(rng.choice([1, 3, 12]))
     values = np.full((*SHAPE, bands), rng.choice([0.0, 0.1, 0.5]))
     edge = int(np.floor(sweep.start_px + (SHAPE[0] - 1) / 2 - float(np.exp(rng.uniform(np.log(1.5), np.log(40))))))
@@ -89,7 +89,7 @@ def _beside(rng: np.random.Generator, kind: str, sweep: Sweep) -> Floats:
 
 
 def _line(rng: np.random.Generator, kind: str, sweep: Sweep) -> Floats:
-    """Dark land with one bright stripe across it, in which something dark lies."""
+    """Return dark land with one bright stripe across it, which has a dark gap."""
     bands = int(rng.choice([1, 3, 12]))
     values = np.full((*SHAPE, bands), rng.uniform(0, 0.2))
     row, high = int(rng.integers(20, 120)), int(rng.integers(3, 12))
@@ -100,6 +100,6 @@ def _line(rng: np.random.Generator, kind: str, sweep: Sweep) -> Floats:
 
 
 def _pixel(rng: np.random.Generator, kind: str, sweep: Sweep) -> Floats:
-    """A scene of one pixel, or of few."""
+    """Return a scene of 1 x 1 to 3 x 3 pixels."""
     bands = int(rng.choice([1, 3, 12]))
     return rng.uniform(0.0, 1, (int(rng.integers(1, 4)), int(rng.integers(1, 4)), bands))

@@ -1,4 +1,4 @@
-"""Light of lines with many bands, and its summary: what the bounds of the spectrometer's effects are held against."""
+"""Lines with many bands and their probe, to check the bounds of the spectrometer's effects."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ READ_E = LineCamera().read_noise_e
 
 
 def rig_with(samples: int = SAMPLES, **optics: float) -> Rig:
-    """A rig of few samples whose optics differ from the usual in these numbers."""
+    """Return a rig of few samples with these settings of the optics."""
     return Rig(camera=replace(LineCamera(), samples=samples), optics=replace(Optics(), **optics))
 
 
 def random_light(seed: int, bands: int = 90, samples: int = SAMPLES, lines: int = 6) -> tuple[Floats, Radiance]:
-    """Wavelengths [nm] at uneven distances, and patches of a few spectra with edges and absorption lines [e-]."""
+    """Return uneven wavelengths [nm], and patches of a few spectra with edges and absorption lines [e-]."""
     rng = np.random.default_rng(seed)
     wavelength = 400 + np.cumsum(rng.uniform(1.5, 3.0, bands))
     place, spectra = wavelength[None, :], np.full((4, bands), 300.0)
@@ -44,12 +44,12 @@ def random_light(seed: int, bands: int = 90, samples: int = SAMPLES, lines: int 
 def block_of(
     rig: Rig, wavelength_nm: Floats, lines: range = range(6), fwhm_nm: Floats | None = None, **more: Any
 ) -> SweepBlock:
-    """Some lines of the usual sweep."""
+    """Return some lines of the usual sweep as a block."""
     return SweepBlock(rig, SWEEP, lines, wavelength_nm, (640, 640), fwhm_nm=fwhm_nm, **more)
 
 
 def units(light: Radiance, unit: Unit) -> Floats:
-    """The unit at every sample [e-]: shot and read noise, or one DN."""
+    """Return the unit at every sample [e-]: shot and read noise, or one DN."""
     electrons = np.asarray(light, np.float64)
     return np.sqrt(electrons + READ_E**2) if unit == "sigma" else np.full(light.shape, LineCamera().electrons_per_dn)
 
@@ -57,7 +57,7 @@ def units(light: Radiance, unit: Unit) -> Floats:
 def probe_of(
     light: Radiance, wavelength_nm: Floats, unit: Unit = "sigma", fwhm_nm: Floats | None = None, sweep: Sweep = SWEEP
 ) -> Probe:
-    """Summary of all samples of some lines."""
+    """Return the probe of all samples of some lines."""
     signal, one = np.asarray(light, np.float64), units(light, unit)
     most, none = tuple(range(light.ndim - 1)), np.zeros((2, len(wavelength_nm)))
     return Probe(
@@ -79,6 +79,6 @@ def probe_of(
 
 
 def worst(changed: Radiance, light: Radiance, unit: Unit, like: Radiance | None = None) -> float:
-    """Greatest difference over the unit, which is taken from ``like`` or from ``light``."""
+    """Return the greatest difference over the unit, which is taken from ``like`` or from ``light``."""
     way = np.abs(np.asarray(changed, np.float64) - light)
     return float((way / units(light if like is None else like, unit)).max())

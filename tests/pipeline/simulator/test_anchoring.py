@@ -1,4 +1,4 @@
-"""Anchoring: a fine sweep is found on the coarse mosaic, wherever it lies and however short it is, or left alone."""
+"""Anchoring: a fine sweep of any place and length is found on the coarse mosaic, or left unchanged."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ GRID = SceneGrid(240, 300, 16)
 
 
 def textured(seed: int = 0) -> RasterScene:
-    """A scene of the grid's size with texture of 4 px and more."""
+    """Return a scene of the grid's size with texture of 4 px and more."""
     values = gaussian_filter(np.random.default_rng(seed).normal(size=(GRID.height, GRID.width)), 4.0)
     cube = np.repeat((1 + 0.3 * values / values.std())[..., None], 2, axis=2)
     return image_scene(cube, CAMERA, [600.0, 700.0])
 
 
 def brightness(scene: RasterScene) -> np.ndarray:
-    """What a coarse pass sees, without its blur."""
+    """Return the image of a coarse pass, without its blur."""
     return np.asarray(seen_at(scene, *np.mgrid[: GRID.height, : GRID.width]).mean(axis=-1))
 
 
 def anchored(sweep: Sweep, offset: tuple[float, float], *, prior_px: float = 16) -> Anchor:
-    """A sweep seen by a mirror that looks beside the plan, on the mosaic of one that does not."""
+    """Return the anchor of a sweep whose mirror has an offset, on the mosaic of one without."""
     seen = textured()
     source = SimulatedSource(
         seen, Rig(CAMERA), 0, effects_on("rotation", "read-noise"), pointing=CommonOffset(way_px=offset)
@@ -45,13 +45,13 @@ def anchored(sweep: Sweep, offset: tuple[float, float], *, prior_px: float = 16)
 
 
 def sweep_of(along: Axis = "x", *, swath: float = -20.0, start: float = -70.0, lines: int = 140) -> Sweep:
-    """A fine sweep in the middle of the field."""
+    """Return a fine sweep in the middle of the field."""
     return Sweep("fine", "fine", along, swath, start, lines)
 
 
 @pytest.mark.parametrize("along", ["x", "y"])
 def test_sweep_is_found_on_the_mosaic(along: Axis) -> None:
-    """Where the mirror looked is found to 0.1 px, by sign and axis, for either orientation."""
+    """The mirror's offset is found to 0.1 px, with sign and axis, for either orientation."""
     found = anchored(sweep_of(along), (9.3, -6.6))
     assert found.found.status == "found"
     np.testing.assert_allclose(found.shift.offset, [9.3, -6.6], atol=0.1)
@@ -60,29 +60,29 @@ def test_sweep_is_found_on_the_mosaic(along: Axis) -> None:
 
 @pytest.mark.parametrize("start", [-119.0, 80.0])
 def test_short_sweep_at_the_end_of_the_field_is_found(start: float) -> None:
-    """Where the middle of what may have been seen is no place of the sweep, the sweep is put right all the same."""
+    """The offset is found although the middle of the area that the sweep may have seen lies outside of the sweep."""
     found = anchored(sweep_of(start=start, lines=40), (-8.0, 2.5), prior_px=40)
     assert found.found.status == "found"
     np.testing.assert_allclose(found.shift.offset, [-8.0, 2.5], atol=0.15)
 
 
-def test_sweep_is_compared_with_all_that_it_may_have_seen() -> None:
-    """Twenty lines that looked as many pixels further on share nothing with where they were to look, and are found."""
+def test_sweep_without_overlap_with_its_planned_place_is_found() -> None:
+    """A sweep of 24 lines with an offset of 24 px, forward or backward, is found within the prior of 30 px."""
     found = anchored(sweep_of(start=-10.0, lines=24), (-3.0, 24.0), prior_px=30)
     np.testing.assert_allclose(found.shift.offset, [-3.0, 24.0], atol=0.2)
     back = anchored(sweep_of(start=-10.0, lines=24), (3.0, -24.0), prior_px=30)
     np.testing.assert_allclose(back.shift.offset, [3.0, -24.0], atol=0.2)
 
 
-def test_sweep_beyond_the_prior_stays_where_it_was() -> None:
-    """A sweep further off than can be is not put elsewhere."""
+def test_sweep_with_an_offset_beyond_the_prior_is_not_moved() -> None:
+    """An offset of 14 px is undecidable with a prior of 6 px."""
     found = anchored(sweep_of(), (14.0, 0.0), prior_px=6)
     assert found.found.status == "undecidable"
     assert (found.shift.offset == 0).all()
 
 
-def test_sweep_that_shows_nothing_of_the_mosaic_is_empty() -> None:
-    """Without a usable line, beside the field, or on a mosaic that holds nothing, there is nothing to compare."""
+def test_sweep_without_common_pixels_with_the_mosaic_is_empty() -> None:
+    """Without a usable line, beside the field, or on a mosaic of NaN, there is nothing to compare."""
     source = SimulatedSource(textured(), Rig(CAMERA), 0, effects_on("rotation"))
     broad = BroadSweep.read(SimulatedSweep(source, sweep_of()), CAMERA)
     blind, mosaic = replace(broad, usable=np.zeros(140, bool)), brightness(textured())

@@ -1,4 +1,4 @@
-"""Laws of light over hard scenes, and how the renderer puts aims, displacements, blurs, gains and changes together."""
+"""Laws of light over hard scenes, and the renderer's combination of aims, displacements, blurs, gains and changes."""
 
 from __future__ import annotations
 
@@ -49,13 +49,13 @@ CHOICES = st.fixed_dictionaries(
 
 
 def scene_of(picture: str, dark: float = 0.0) -> RasterScene:
-    """The picture in all bands: 1 on ``dark``."""
+    """Return the picture in all bands: 1 on ``dark``."""
     values = np.where(PICTURES[picture], 1.0, dark)
     return image_scene(np.repeat(values[..., None], len(NM), axis=2), RIG.camera, NM)
 
 
 def seen(scene: RasterScene, sweep: Sweep, chosen: dict[Any, str], rig: Rig = RIG) -> NDArray[np.float64]:
-    """Light of all lines over that of the scene's brightest pixel."""
+    """Return the light of all lines over that of the scene's brightest pixel."""
     block = SweepBlock(rig, sweep, range(sweep.lines), NM, scene.shape)
     light = expected_light(scene, block, {effect: variant for effect, variant in chosen.items() if variant != OFF})
     return light / scene.electrons.astype(np.float64)
@@ -72,11 +72,11 @@ def seen(scene: RasterScene, sweep: Sweep, chosen: dict[Any, str], rig: Rig = RI
     step=st.sampled_from((1, 4)),
     turned=st.booleans(),
 )
-def test_light_is_within_that_of_the_scene(
+def test_light_stays_within_the_range_of_the_scene(
     picture: str, dark: float, chosen: dict[Any, str], swath: float, start: float, along: Any, step: int, turned: bool
 ) -> None:
-    """At any place and turn of the lines and through any variants light lies between the scene's least and most."""
-    far = 60.0 if turned else 0.0  # the scene's edge is repeated, its lines lie turned
+    """At any place and rotation of the lines, with any variants, light lies between the scene's minimum and maximum."""
+    far = 60.0 if turned else 0.0  # on the scene's repeated edge, where lines are rotated
     rows = 24 // step
     sweep = Sweep("s", "fine" if step == 1 else "coarse", along, swath + far, start + far, rows, step)
     light = seen(scene_of(picture, dark), sweep, chosen)
@@ -92,10 +92,10 @@ def test_light_is_within_that_of_the_scene(
     start=st.floats(-20.0, -18.0),
     along=st.sampled_from("xy"),
 )
-def test_light_of_a_sweep_is_kept(picture: str, chosen: dict[Any, str], swath: float, start: float, along: Any) -> None:
-    """Where lines lie straight, samples 1 px apart sum to the light of a spot on black, wherever among them it lies.
+def test_sweep_conserves_light(picture: str, chosen: dict[Any, str], swath: float, start: float, along: Any) -> None:
+    """Samples 1 px apart on straight lines sum to the light of a spot on black, at any place among them.
 
-    Of the tails of diffraction a part falls beside what is swept: they have a law of their own.
+    Diffraction is off: a part of its tails falls outside of the sweep, and another test covers them.
     """
     straight = chosen | {ROTATION: OFF, DIFFRACTION: OFF}
     light = seen(scene_of(picture), Sweep("s", "fine", along, swath, start, 40), straight)
@@ -104,7 +104,7 @@ def test_light_of_a_sweep_is_kept(picture: str, chosen: dict[Any, str], swath: f
 
 @pytest.mark.parametrize("level", [2, 4, 16, 64])
 def test_thinned_scenes_keep_their_light(level: int) -> None:
-    """What the far tails look at: a spot anywhere between the pixels that are left has as much light as before."""
+    """A spot anywhere between the remaining pixels, which the far tails use, keeps its light."""
     rng, planes = np.random.default_rng(level), np.zeros((700, 600, 3), np.float32)
     planes[rng.integers(250, 400, 3), rng.integers(250, 350, 3), range(3)] = 1.0
     found = SceneRaster.of(planes).thinned(level)
@@ -113,8 +113,8 @@ def test_thinned_scenes_keep_their_light(level: int) -> None:
 
 
 @pytest.mark.parametrize("pattern", ["rows", "columns", "noise"])
-def test_beyond_the_scene_its_edge_goes_on(pattern: str) -> None:
-    """A scene has the same light as one whose edge is repeated for 320 px more, also through the far tails."""
+def test_edge_of_the_scene_is_repeated_outside(pattern: str) -> None:
+    """A scene has the same light as one padded with 320 px of its edge, also through the far tails."""
     y, x = np.mgrid[:41, :52]
     noise = np.random.default_rng(3).random((41, 52))
     plane = {"rows": y % 2, "columns": x // 3 % 2, "noise": noise}[pattern]
@@ -126,10 +126,10 @@ def test_beyond_the_scene_its_edge_goes_on(pattern: str) -> None:
     np.testing.assert_allclose(light / light.max(), same / same.max(), atol=3e-5)
 
 
-def test_tails_of_diffraction_reach_as_far_as_the_pupil_says() -> None:
-    """Beside an edge, 10 to 50 px in the dark, lies 2 / pi^3 lambda / (D x) of the bright side.
+def test_tails_of_diffraction_match_the_pupil() -> None:
+    """In the dark, 10 to 50 px from an edge, light is 2 / pi^3 lambda / (D x) of the bright side.
 
-    Few wide Gaussians stand for the tail: within a quarter of it, 0.0002 of the bright side at most.
+    Few wide Gaussians model the tail to within a quarter of it, 0.0002 of the bright side at most.
     """
     rig = Rig(camera=LineCamera(samples=16))
     values = np.repeat((np.arange(801) > 400)[None, :, None] * np.ones((400, 1, 4)), 1, axis=2)
@@ -146,7 +146,7 @@ PLAIN = {ROTATION: "rays", SMEAR: "positions", SLIT: "3x1"}
 
 
 def grainy(bands: int = 5, seed: int = 0) -> RasterScene:
-    """A raster of 3 components, different at every pixel, mixed to ``bands``."""
+    """Return a raster of 3 components, different at every pixel, mixed to ``bands``."""
     rng = np.random.default_rng(seed)
     planes, wavelength = rng.uniform(0, 1, (90, 110, 3)).astype(np.float32), np.linspace(400, 1000, bands)
     electrons = rng.uniform(1e3, 9e3, (3, bands)).astype(np.float32)
@@ -154,15 +154,15 @@ def grainy(bands: int = 5, seed: int = 0) -> RasterScene:
 
 
 def block_of(scene: RasterScene, sweep: Sweep, lines: range, **more: object) -> SweepBlock:
-    """Lines of a sweep by a rig as it is."""
+    """Return lines of a sweep by the default rig as a block."""
     return SweepBlock(Rig(), sweep, lines, scene.wavelength_nm, scene.shape, **more)
 
 
 NEAR = replace(FINE, swath_px=20.0, start_px=-40.0)
 
 
-def test_nothing_chosen_is_a_straight_line_of_points() -> None:
-    """Without effects a sample at a pixel's centre sees the pixel's value."""
+def test_line_without_effects_shows_pixel_values() -> None:
+    """Without effects a sample at a pixel's centre shows the pixel's value."""
     scene = grainy()
     sweep = Sweep("s", "fine", "x", swath_px=0.0, start_px=-20.5, lines=30)  # places are pixel centres
     light = expected_light(scene, block_of(scene, sweep, range(30)), {})[:, 300:340]
@@ -170,8 +170,8 @@ def test_nothing_chosen_is_a_straight_line_of_points() -> None:
     np.testing.assert_allclose(light, wanted, rtol=1e-5)
 
 
-def test_diagonal_scene_is_that_of_its_matrix() -> None:
-    """A scene with a plane of its own in each band gives what its diagonal matrix of electrons gives."""
+def test_scene_with_a_plane_per_band_equals_its_diagonal_matrix() -> None:
+    """The same planes with a full but diagonal matrix of electrons give the same light."""
     diagonal = image_scene(np.random.default_rng(1).uniform(0, 1, (60, 50, 4)), CAMERA, np.linspace(400, 1000, 4))
     light = SceneRadiance(np.diag(diagonal.electrons), diagonal.white_reference_electrons)
     full, chosen = replace(diagonal, light=Once.of(light)), {**PLAIN, Widening(): "only"}
@@ -187,13 +187,13 @@ class Widening:
     variants = ("only",)
 
     def moments(self, rig: Rig, wavelength_nm: np.ndarray, variant: str, normal: np.ndarray | None = None) -> Moments:
-        """The second band has twice the first's."""
+        """Return moments that grow linearly with the band, from 0."""
         grown = np.arange(len(wavelength_nm)) / len(wavelength_nm)
         return Moments(np.stack([0.3 * grown, -0.2 * grown]), np.stack([0.2 * grown, 0.5 * grown]))
 
 
 def test_blurs_widen_and_shift_each_band_by_its_moments() -> None:
-    """On a wave every band keeps the contrast of its Gaussian, and is seen from the shifted place."""
+    """On a wave every band has the contrast of its Gaussian and is seen from the shifted place."""
     x = np.arange(160)
     wave = 1 + 0.5 * np.sin(2 * np.pi * x / 20)
     scene = image_scene(np.broadcast_to(wave[None, :, None], (40, 160, 6)), CAMERA, np.linspace(400, 1000, 6))
@@ -208,7 +208,7 @@ def test_blurs_widen_and_shift_each_band_by_its_moments() -> None:
 
 @dataclass(frozen=True)
 class Nudge:
-    """Looks or meets the scene beside its place, and changes light."""
+    """An effect that aims or displaces by (3, -2) px, or applies a gain or a change of light."""
 
     name = "nudge"
     variants = ("only",)
@@ -227,7 +227,7 @@ class Nudge:
 
 
 def test_aims_and_displacements_move_the_view() -> None:
-    """Near rest an aim and a displacement by whole px show the neighbouring lines' samples."""
+    """Close to rest an aim and a displacement by whole px show the samples of neighbouring lines."""
     scene, sweep = grainy(), replace(NEAR, swath_px=0.0, start_px=-20.0)
     plain = expected_light(scene, block_of(scene, sweep, range(16)), {SLIT: "3x1"})[:, 310:330]
     for do in ("aim", "displaced"):
@@ -235,8 +235,8 @@ def test_aims_and_displacements_move_the_view() -> None:
         np.testing.assert_allclose(moved[:, 307:327], plain[:14], rtol=1e-3)
 
 
-def test_gains_and_changes_run_in_the_order_given() -> None:
-    """Adding light before a gain is not adding it after."""
+def test_gains_and_changes_are_applied_in_order() -> None:
+    """Light that is added before a gain differs from light that is added after it."""
     scene = grainy()
     block = block_of(scene, NEAR, range(3))
     plain, gain = expected_light(scene, block, {}), np.arange(1, 6, dtype=np.float32)
@@ -247,7 +247,7 @@ def test_gains_and_changes_run_in_the_order_given() -> None:
 
 
 def test_flat_scene_gives_flat_lines() -> None:
-    """At any pose a flat scene gives each sample the same electrons but for the mirror, by exposure."""
+    """Far from rest all samples have the same electrons, in proportion to exposure; the mirror's throughput is off."""
     scene = image_scene(np.full((30, 30, 2), 4.0), CAMERA, [400.0, 900.0])
     far = Sweep("far", "coarse", "y", swath_px=2000.0, start_px=-3000.0, lines=5, step=4, binning=4)
     expected = np.broadcast_to(4 * scene.electrons, (5, 640, 2))
@@ -257,8 +257,8 @@ def test_flat_scene_gives_flat_lines() -> None:
 
 
 @pytest.mark.parametrize("step", [1, 4])
-def test_undeflected_sweep_is_the_operator_on_the_grid(step: int) -> None:
-    """Around the undeflected direction lines equal the closed-form operator that training uses, slit and smear."""
+def test_undeflected_sweep_equals_the_operator_of_training(step: int) -> None:
+    """Around the undeflected direction lines match the closed-form operator that training uses, with slit and smear."""
     rng, (y, x), values = np.random.default_rng(0), np.mgrid[:40, :640], np.ones((40, 640, 1))
     for _ in range(12):  # waves of 6 to 60 px
         fy, fx = rng.normal(size=2) / rng.uniform(6, 60)

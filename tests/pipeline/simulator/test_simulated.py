@@ -1,4 +1,4 @@
-"""The simulated source: lines, noise, saturation, frames that calibrate, when sweeps start, and the rig's numbers."""
+"""The simulated source: lines, noise, saturation, calibration frames, start times of sweeps, and finite settings."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ QUIET = ("rotation", "slit", "smear")
 
 
 def source_of(values: np.ndarray, camera: LineCamera = CAMERA, **options: object) -> SimulatedSource:
-    """A source that looks at given values (y, x, band)."""
+    """Return a source over given values (y, x, band)."""
     scene = image_scene(values, CAMERA, np.linspace(400, 900, values.shape[2]))
     return SimulatedSource(scene, Rig(camera), **options)
 
 
 def raw_of(source: Source, sweep: Sweep = SWEEP, first: int = 0) -> np.ndarray:
-    """All lines of a sweep, (line, sample, band)."""
+    """Return all lines of a sweep, (line, sample, band)."""
     return np.stack([line.data for line in source.lines(sweep, first)])
 
 
-def test_lines_do_not_depend_on_where_one_starts() -> None:
-    """Resuming at any line gives the lines that an uninterrupted run gives, with numbers and positions."""
+def test_lines_do_not_depend_on_the_first_line_read() -> None:
+    """Resuming at any line gives the data, numbers and positions of an uninterrupted run."""
     source = source_of(np.random.default_rng(1).random((40, 100, 3)), seed=5)
     whole = list(source.lines(SWEEP))
     for first in (1, 16, 23, 39):
@@ -52,8 +52,8 @@ def test_lines_do_not_depend_on_where_one_starts() -> None:
 
 
 @pytest.mark.parametrize("exposure_ms", [3.0, 250.0])
-def test_a_sweep_of_its_own_exposure_is_as_by_a_camera_that_has_it(exposure_ms: float) -> None:
-    """Numbers, times, exposures and references, of light that drifts while the survey goes on."""
+def test_sweep_with_its_own_exposure_equals_a_camera_with_it(exposure_ms: float) -> None:
+    """Data, times, exposures and references agree, with mirror lag, shot noise and dark current on."""
     values = np.random.default_rng(2).random((40, 100, 3))
     other = replace(CAMERA, exposure_ms=exposure_ms)
     chosen = effects_on(*QUIET, "lag", "shot", "dark-current")
@@ -69,8 +69,8 @@ def test_a_sweep_of_its_own_exposure_is_as_by_a_camera_that_has_it(exposure_ms: 
     np.testing.assert_array_equal(SimulatedSweep(source, own).time_s, SimulatedSweep(told, SWEEP).time_s)
 
 
-def test_line_says_when_and_where() -> None:
-    """Times are of mid exposure, a frame apart, and positions those of the scan, as float32 on the wire."""
+def test_line_has_its_time_and_position() -> None:
+    """Times are mid-exposure, one frame apart; positions are those of the scan, as float32."""
     lines = list(source_of(np.ones((40, 40, 1))).lines(SWEEP))
     np.testing.assert_allclose([line.time_s for line in lines], 0.05 + 0.1 * np.arange(40))
     positions = [(line.mirror_x, line.mirror_y) for line in lines]
@@ -79,7 +79,7 @@ def test_line_says_when_and_where() -> None:
 
 
 def test_binned_lines_are_sums_and_saturate_without_wrapping() -> None:
-    """Twice the light that fills the well gives sums at full scale, and dark stays dark beside it."""
+    """Twice the light that fills the well gives sums at full scale, and dark samples beside it stay dark."""
     values = np.zeros((40, 640, 2))
     values[:, :320] = 1.0
     source = source_of(values, replace(CAMERA, exposure_ms=400.0), chosen=effects_on(*QUIET))
@@ -92,8 +92,8 @@ def test_binned_lines_are_sums_and_saturate_without_wrapping() -> None:
 
 @pytest.mark.parametrize("binning", [1, 4])
 @pytest.mark.parametrize("exposure_ms", [50.0, 140.0, 400.0])
-def test_references_give_back_scene_values(binning: int, exposure_ms: float) -> None:
-    """Calibrated lines are scene values at any exposure and binning; what saturates is marked, not wrong."""
+def test_calibration_recovers_scene_values(binning: int, exposure_ms: float) -> None:
+    """Calibrated lines are scene values at any exposure and binning; saturated samples are marked, not wrong."""
     values = np.random.default_rng(2).uniform(0.2, 1.0, (1, 1, 6)) * np.ones((40, 40, 1))
     source = source_of(values, replace(CAMERA, exposure_ms=exposure_ms), chosen=effects_on(*QUIET))
     sweep = replace(SWEEP, lines=10, step=binning, binning=binning)
@@ -106,7 +106,7 @@ def test_references_give_back_scene_values(binning: int, exposure_ms: float) -> 
 
 
 def test_impossible_settings_are_refused() -> None:
-    """Unknown variants, and sums that overflow uint16 are named."""
+    """The errors name the unknown variant, and the most samples whose sum fits uint16."""
     with pytest.raises(SettingsError, match=r"shot has no variant 'rough'"):
         source_of(np.ones((8, 8, 1)), chosen={SHOT: "rough"})
     with pytest.raises(ShapeError, match="bin at most 16"):
@@ -117,12 +117,12 @@ COST = CostModel()
 
 
 def sweeps_of(*sizes: int, step: int = 1) -> list[Sweep]:
-    """Sweeps of so many lines each."""
+    """Return sweeps with these numbers of lines."""
     return [Sweep(f"sweep {k}", "fine", "x", 0.0, -10.0, lines, step) for k, lines in enumerate(sizes)]
 
 
-def test_sweeps_follow_one_another() -> None:
-    """Worked by hand: set-ups of .45 s, one load of 1.6 s for 1500 positions, 100 ms a line."""
+def test_start_times_of_sweeps_match_hand_calculation() -> None:
+    """Set-ups take .45 s, one load of up to 1500 positions 1.6 s, and a line 100 ms."""
     assert sweep_starts(sweeps_of(10, 20, 5), CAMERA, COST) == pytest.approx(
         {"sweep 0": 2.05, "sweep 1": 3.5, "sweep 2": 5.95}
     )
@@ -131,24 +131,24 @@ def test_sweeps_follow_one_another() -> None:
 
 
 @given(st.lists(st.integers(0, 2000), max_size=12), st.integers(1, 4))
-def test_sweeps_end_before_the_next_and_within_the_price(sizes: list[int], step: int) -> None:
-    """No sweep starts before the one before has ended, and the last ends within the plan's seconds."""
+def test_sweep_ends_before_the_next_starts(sizes: list[int], step: int) -> None:
+    """No sweep starts before the previous one has ended, and the last ends within the plan's seconds."""
     sweeps = sweeps_of(*sizes, step=step)
     starts = [*sweep_starts(sweeps, CAMERA, COST).values(), COST.seconds(sweeps, CAMERA) + 1e-9]
     for sweep, start, following in zip(sweeps, starts, starts[1:], strict=False):
         assert start + CAMERA.scan_seconds(sweep.lines) <= following
 
 
-def test_blocks_tell_the_time_of_mid_exposure() -> None:
-    """Since the survey's start: line 3 of a sweep that starts after 60 s is exposed from 60.3 to 60.4 s."""
+def test_block_times_are_mid_exposure() -> None:
+    """Times count from the survey's start: line 3 of a sweep that starts after 60 s is exposed from 60.3 to 60.4 s."""
     source = SimulatedSource(image_scene(np.ones((8, 8, 1)), CAMERA, [500.0]), Rig(CAMERA), clock={"a": 60.0})
     sweep = Sweep("a", "fine", "x", 0.0, 0.0, 9)
     block = sweep_block(source.scene, source.rig, sweep, range(3, 5), started_s=source.started_s(sweep))
     assert block.time_s == pytest.approx([60.35, 60.45])
 
 
-def test_light_goes_with_the_clock() -> None:
-    """A sweep that starts an hour after sunrise's light is brighter; references are of the survey's start."""
+def test_light_follows_the_clock() -> None:
+    """A sweep that starts an hour later in the morning is brighter; references are those of the survey's start."""
     scene = image_scene(np.full((8, 8, 3), 0.1), CAMERA, [500.0, 600.0, 700.0])
     rig = Rig(CAMERA, sky=Sky(started=datetime(2025, 6, 21, 5, tzinfo=UTC)))
     chosen, sweep = effects_on("rotation", "drift"), Sweep("a", "fine", "x", 0.0, 0.0, 2)
@@ -161,7 +161,7 @@ def test_light_goes_with_the_clock() -> None:
     assert [line.time_s for line in later.lines(sweep)] == [line.time_s for line in now.lines(sweep)]
 
 
-# fine steps: rounding is no part of the figures
+# fine steps: rounding does not matter
 WHITE_REFERENCE_CAMERA = LineCamera(samples=64, bits=16, electrons_per_dn=1.0)
 RIG = Rig(WHITE_REFERENCE_CAMERA, detector=Detector(prnu_std=0.05, striping_std=0.02, temperature_deg_c=45.0))
 WHITE_REFERENCE_SWEEP = Sweep("s", "fine", "x", swath_px=900.0, start_px=-1500.0, lines=6)
@@ -169,25 +169,25 @@ BANDS = 12
 
 
 def even_scene(fwhm_nm: float = 2.0) -> RasterScene:
-    """An even scene under light with a deep absorption, 40 % of the white reference; values are reflectances."""
+    """Return an even scene under light with a deep absorption, 40 % of the white reference; values are reflectances."""
     nm = np.linspace(740, 784, BANDS)
     white_reference_electrons = (30_000 * (1 - 0.6 * np.exp(-(((nm - 762) / 5) ** 2)))).astype(np.float32)
     return made_scene(np.full((20, 20, 1), 0.4), white_reference_electrons[None], nm, fwhm_nm=np.full(BANDS, fwhm_nm))
 
 
 def white_reference_source_of(*names: str, rig: Rig = RIG) -> SimulatedSource:
-    """A source over the even scene with some effects."""
+    """Return a source over the even scene with some effects."""
     return SimulatedSource(even_scene(), rig, chosen=effects_on("rotation", *names))
 
 
-SEEN = ("dark-current", "prnu", "striping", "response", "smile", "vignetting")  # in the frames
+SEEN = ("dark-current", "prnu", "striping", "response", "smile", "vignetting")  # effects that the frames show
 
 
 @pytest.mark.parametrize("names", [*((one,) for one in SEEN), ("response", "smile"), (*SEEN, "smear", "slit")])
-def test_calibration_takes_out_what_it_sees(names: tuple[str, ...]) -> None:
-    """An even scene comes back as its reflectance to a rounding, far from rest, whatever spectrograph and detector do.
+def test_calibration_removes_effects_that_the_frames_show(names: tuple[str, ...]) -> None:
+    """Far from rest an even scene comes back as its reflectance to 2e-4, whatever spectrograph and detector do.
 
-    The names, then the raw numbers with none of them, are not the same: there was something to take out.
+    The raw numbers differ from those without the effects: there was something to remove.
     """
     source, sweep = white_reference_source_of(*names), WHITE_REFERENCE_SWEEP
     raw, position = source.render(sweep, range(sweep.lines)), line_positions(sweep, WHITE_REFERENCE_CAMERA)
@@ -198,7 +198,7 @@ def test_calibration_takes_out_what_it_sees(names: tuple[str, ...]) -> None:
 
 
 def test_binned_frames_are_sums() -> None:
-    """Frames of n samples are the sums of theirs, and what is left over of the line is dropped."""
+    """Frames of n samples are sums of the unbinned frames; the remainder of the line is dropped."""
     source = white_reference_source_of("prnu", "smile", "dark-current")
     one, three = source.references(WHITE_REFERENCE_SWEEP), source.references(replace(WHITE_REFERENCE_SWEEP, binning=3))
     for name in ("dark", "white"):
@@ -207,7 +207,7 @@ def test_binned_frames_are_sums() -> None:
 
 
 def test_frames_show_dark_current_and_gains() -> None:
-    """The dark frame has the mean dark current, the white frame both gains of every element, in 32nds of a number."""
+    """The dark frame has the mean dark current, the white frame both gains of every element, in 32nds of a DN."""
     found = white_reference_source_of("dark-current", "prnu", "striping").references(WHITE_REFERENCE_SWEEP)
     np.testing.assert_allclose(found.dark, 64 + dark_electrons(RIG), rtol=0, atol=1 / 64)
     np.testing.assert_array_equal(found.white * 32 % 1, 0)
@@ -215,8 +215,8 @@ def test_frames_show_dark_current_and_gains() -> None:
     np.testing.assert_allclose(found.white - found.dark, gains * even_scene().white_reference_electrons, rtol=1e-4)
 
 
-def test_defects_are_told_as_bad() -> None:
-    """Dead elements show no panel, hot ones are bright in the dark; a sum with one of either is bad."""
+def test_defective_elements_are_marked_bad() -> None:
+    """Dead elements have white equal to dark, hot ones are bright in the dark; a sum with one of either is bad."""
     rig = replace(RIG, detector=Detector(dead_fraction=0.02, hot_fraction=0.02, hot_e_per_s=2e4))
     found = white_reference_source_of("defects", rig=rig).references(WHITE_REFERENCE_SWEEP)
     dead, hot = dead_elements(rig, BANDS), hot_electrons(rig, BANDS) > 0
@@ -231,8 +231,8 @@ def test_defects_are_told_as_bad() -> None:
     assert white_reference_source_of(rig=rig).references(WHITE_REFERENCE_SWEEP).bad is None
 
 
-def test_white_reference_is_stated_in_the_rigs_bands() -> None:
-    """Where the white reference's values have detail in the spectrum, the response rounds it as it does the light."""
+def test_band_response_smooths_the_white_reference() -> None:
+    """The response smooths spectral detail of the white reference's values as it does that of the light."""
     scene = even_scene()
     detailed = 1 - 0.5 * np.exp(-(((scene.wavelength_nm - 762) / 4) ** 2))
     scene = replace(scene, white_reference=detailed.astype(np.float32))
@@ -256,13 +256,13 @@ NUMBERS = [
 
 
 def with_number(part: str, name: str, value: Any) -> Rig:
-    """A rig as its defaults are but for one number."""
+    """Return the default rig with one number changed."""
     return replace(RIG_MODEL_RIG, **{part: replace(getattr(RIG_MODEL_RIG, part), **{name: value})})
 
 
 @pytest.mark.parametrize(("part", "item"), NUMBERS, ids=lambda one: getattr(one, "name", one))
-def test_numbers_that_are_not_finite_are_refused_by_name(part: str, item: Any):
-    """Infinity only where it is the default; no number never."""
+def test_non_finite_settings_are_refused_by_name(part: str, item: Any):
+    """Infinity is allowed only where it is the default; NaN is never allowed."""
     for value in (math.nan, -math.inf, math.inf):
         if value == item.default:
             assert with_number(part, item.name, value) == RIG_MODEL_RIG

@@ -1,4 +1,4 @@
-"""Stores appear whole or not at all, stay as they are, and verification finds every change."""
+"""Stores appear whole or not at all, never change, and verification finds every change."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _publish(archive: Archive, key: str = "abc", text: str = "content") -> Path:
 
 
 def test_a_store_is_found_with_its_manifest(tmp_path: Path) -> None:
-    """Before, nothing; afterwards the files, their hashes and the facts."""
+    """Before publication `find` returns None; afterwards the manifest has files, hashes and parameters."""
     archive = Archive.open(tmp_path / "archive")
     assert archive.find("mosaic", "abc") is None
     path, ref = _publish(archive), archive.find("mosaic", "abc")
@@ -50,7 +50,7 @@ def test_a_store_is_found_with_its_manifest(tmp_path: Path) -> None:
 
 
 def test_a_failed_stage_leaves_nothing(tmp_path: Path, archive: Archive) -> None:
-    """The error passes, the staged folder goes, the key stays free."""
+    """The exception propagates, the staged folder is removed, and the key stays free."""
 
     def fail(path: Path) -> None:
         (path / "a").write_text("half")
@@ -62,8 +62,8 @@ def test_a_failed_stage_leaves_nothing(tmp_path: Path, archive: Archive) -> None
     assert list((tmp_path / "stages" / "mosaic").iterdir()) == []
 
 
-def test_a_dead_runs_rest_is_reclaimed(tmp_path: Path, archive: Archive) -> None:
-    """A .part folder of a dead process is not seen, and is gone after the next publication or reclaim."""
+def test_leftovers_of_dead_processes_are_reclaimed(tmp_path: Path, archive: Archive) -> None:
+    """A .part folder of a dead process is ignored; the next publication of its key or `reclaim` removes it."""
     for key in ("abc", "def"):
         (tmp_path / "stages" / "mosaic" / f"{key}.part").mkdir(parents=True)
         (tmp_path / "stages" / "mosaic" / f"{key}.part" / "old").write_text("x")
@@ -73,8 +73,8 @@ def test_a_dead_runs_rest_is_reclaimed(tmp_path: Path, archive: Archive) -> None
     assert [ref.key for ref in archive.refs()] == ["abc"]
 
 
-def test_lines_of_a_cleared_capture_that_is_taken_again_are_no_leftover(archive: Archive) -> None:
-    """Those of a published one are."""
+def test_spooled_lines_of_a_cleared_capture_are_kept(archive: Archive) -> None:
+    """Reclaim removes the spooled lines of a published capture only."""
     _publish(archive)
     (archive.spool_folder("abc") / "lines").write_text("x")
     archive.clear(archive.refs()[0])
@@ -91,16 +91,16 @@ def test_lines_of_a_cleared_capture_that_is_taken_again_are_no_leftover(archive:
         (lambda text: text[:40], r"no valid manifest\.json"),
     ],
 )
-def test_every_byte_of_a_manifest_counts(archive: Archive, change: Callable[[str], str], words: str) -> None:
-    """Also one that means nothing to JSON; of a torn one it is said that it is not valid."""
+def test_any_changed_byte_of_a_manifest_is_detected(archive: Archive, change: Callable[[str], str], words: str) -> None:
+    """White space counts as well; a truncated manifest is reported as not valid."""
     path = _publish(archive) / "manifest.json"
     path.write_text(change(path.read_text()))
     with pytest.raises(IncompleteStoreError, match=words):
         archive.find("mosaic", "abc")
 
 
-def test_a_store_is_on_disk_before_and_after_it_has_its_name(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Files, manifest and folders first, then the name, then the folder that holds the name."""
+def test_a_store_is_synced_before_and_after_its_rename(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files, manifest and folders are synced first, then the store is renamed, then its parent folder is synced."""
     told, rename = list[str](), Path.rename
 
     def renamed(self: Path, to: Path) -> Path:
@@ -112,10 +112,10 @@ def test_a_store_is_on_disk_before_and_after_it_has_its_name(archive: Archive, m
         monkeypatch.setattr(module, "sync_path", lambda path: told.append(path.name))
     _publish(archive)
     assert told[:3] == ["b.bin", "a.txt", "manifest.json"]
-    assert told[3:] == ["inner", "abc.part", "stages", "rename abc.part", "mosaic"]  # and so the stage's own name
+    assert told[3:] == ["inner", "abc.part", "stages", "rename abc.part", "mosaic"]  # the stage's name is synced too
 
 
-def test_two_same_runs_make_one_store(tmp_path: Path, archive: Archive) -> None:
+def test_concurrent_requests_build_a_store_once(tmp_path: Path, archive: Archive) -> None:
     """Eight threads ask for one key; one builds, seven find it."""
     build = Mock(side_effect=lambda path: (path / "a").write_text("x" * 1000))
 
@@ -129,16 +129,16 @@ def test_two_same_runs_make_one_store(tmp_path: Path, archive: Archive) -> None:
     assert archive.find("mosaic", stage_key("mosaic", 1, {"a": 1}, [])) is not None
 
 
-def test_who_ignores_done_harms_nothing(archive: Archive) -> None:
-    """Publishing a key again leaves the first store as it was."""
+def test_publishing_a_key_again_keeps_the_first_store(archive: Archive) -> None:
+    """The second store of one key is discarded."""
     path = _publish(archive, text="first")
     _publish(archive, text="second")
     assert (path / "inner" / "a.txt").read_text() == "first"
     check_files(archive.refs()[0].path, hashes=True)
 
 
-def test_what_cannot_be_an_archive(tmp_path: Path) -> None:
-    """A file, a path below a file, a missing one and a folder of other things are told apart."""
+def test_open_refuses_paths_that_are_no_archive(tmp_path: Path) -> None:
+    """A file, a path below a file, a missing folder and a folder of other files have different messages."""
     (tmp_path / "file").write_text("x")
     (tmp_path / "folder").mkdir()
     for name, create, words in (
@@ -155,8 +155,8 @@ def test_what_cannot_be_an_archive(tmp_path: Path) -> None:
     ("number", "words"),
     [(errno.EACCES, "permission is denied"), (errno.EROFS, "read-only"), (errno.ENOSPC, "the disk is full: free some")],
 )
-def test_refusing_disks_are_told_of(tmp_path: Path, number: int, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Opening writes a probe, so that a survey does not begin what it cannot keep."""
+def test_unwritable_disk_is_refused(tmp_path: Path, number: int, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Opening writes a probe file, so that no survey begins on a disk that cannot store it."""
 
     def refuse(path: Path, content: bytes) -> int:
         raise OSError(number, os.strerror(number), str(path))
@@ -170,7 +170,7 @@ def test_refusing_disks_are_told_of(tmp_path: Path, number: int, words: str, mon
 
 @pytest.mark.parametrize("where", ["fsync", "rename", "body"])
 def test_full_disks_harm_nothing(tmp_path: Path, archive: Archive, where: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Refused while writing, syncing or renaming: one message, no new store, the old one whole."""
+    """The disk fails while writing, syncing or renaming: one error, no new store, the old one whole."""
     _publish(archive, key="old")
     refuse = Mock(side_effect=OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
 
@@ -189,8 +189,8 @@ def test_full_disks_harm_nothing(tmp_path: Path, archive: Archive, where: str, m
     check_files(archive.refs()[0].path, hashes=True)
 
 
-def test_errors_from_elsewhere_are_not_blamed_on_the_archive(tmp_path: Path) -> None:
-    """A missing scene file inside a stage stays what it is."""
+def test_errors_outside_of_the_archive_keep_their_type(tmp_path: Path) -> None:
+    """A missing or unreadable scene file inside a stage does not become an ArchiveError."""
     archive = Archive.open(tmp_path / "archive")
     with pytest.raises(FileNotFoundError), archive.publish("mosaic", "abc"):
         (tmp_path / "scene.png").read_bytes()
@@ -199,14 +199,14 @@ def test_errors_from_elsewhere_are_not_blamed_on_the_archive(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("name", ["", "../up", "a/b", "a.part", ".hidden", "a b"])
-def test_names_that_are_no_names(tmp_path: Path, name: str) -> None:
+def test_invalid_key_names_are_refused(tmp_path: Path, name: str) -> None:
     """Stages and keys are single, plain folder names."""
     with pytest.raises(ArchiveError, match="cannot be a name"):
         Archive.open(tmp_path).find("mosaic", name)
 
 
-def test_a_run_appears_as_a_whole(archive: Archive) -> None:
-    """Nothing under runs before publication; afterwards every file, verified."""
+def test_a_run_appears_with_all_its_files(archive: Archive) -> None:
+    """No run is listed before publication; afterwards every file is there and verified."""
     with archive.new_run("field 7 / north") as run:
         run.write_file("receipt.json", json.dumps({"survey": "north"}))
         run.write_file("quicklook.png", b"\x89PNG")
@@ -218,8 +218,8 @@ def test_a_run_appears_as_a_whole(archive: Archive) -> None:
     assert [(finding.uri, finding.problem) for finding in verify_archive(archive)] == [(f"runs/{run.id}", None)]
 
 
-def test_a_broken_run_leaves_nothing_and_a_live_one_is_not_reclaimed(tmp_path: Path, archive: Archive) -> None:
-    """reclaim keeps its hands off what a living process writes."""
+def test_a_failed_run_leaves_nothing_and_a_live_one_is_kept(tmp_path: Path, archive: Archive) -> None:
+    """`reclaim` keeps the folder that a living process writes."""
 
     def break_off() -> None:
         with archive.new_run("a") as run:
@@ -232,8 +232,8 @@ def test_a_broken_run_leaves_nothing_and_a_live_one_is_not_reclaimed(tmp_path: P
     assert list((tmp_path / "runs").iterdir()) == []
 
 
-def test_a_lock_let_go_twice_leaves_the_next_holder_alone(tmp_path: Path) -> None:
-    """Letting go again closes no file of another."""
+def test_releasing_a_lock_twice_keeps_the_next_holders_lock(tmp_path: Path) -> None:
+    """The second release closes no file of the next holder."""
     path = tmp_path / "a.lock"
     first = take_lock(path)
     assert first is not None
@@ -247,7 +247,7 @@ def test_a_lock_let_go_twice_leaves_the_next_holder_alone(tmp_path: Path) -> Non
 
 
 def test_a_run_begins_in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a killed run of the same second and name left is not published with the next."""
+    """Files that a killed run of the same second and name left are not published with the next run."""
     monkeypatch.setattr(
         "storage.archive.archive.datetime", Mock(now=Mock(return_value=datetime(2026, 5, 1, tzinfo=UTC)))
     )
@@ -262,8 +262,8 @@ def test_a_run_begins_in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.Mon
     assert not (archive.runs()[0] / "torn.bin").exists()
 
 
-def test_runs_of_one_second_are_listed_as_they_were_written(tmp_path: Path, archive: Archive) -> None:
-    """Names in the order of the alphabet would put a later run before an earlier one."""
+def test_runs_of_one_second_are_listed_in_publication_order(tmp_path: Path, archive: Archive) -> None:
+    """Alphabetical order would put a later run before an earlier one."""
     names = []
     for name in ("zebra", "apple", "mango"):
         with archive.new_run(name) as draft:
@@ -277,7 +277,7 @@ def test_runs_of_one_second_are_listed_as_they_were_written(tmp_path: Path, arch
 
 @pytest.fixture
 def table(tmp_path: Path) -> Path:
-    """A table in a store."""
+    """Return the path of a JSON table in a store."""
 
     def build(path: Path) -> None:
         (path / "plan.json").write_text('{"patch_index": [1, 2], "fraction": 0.25}')
@@ -288,16 +288,16 @@ def table(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     "content", ['{"patch_index": [1, 3], "fraction": 0.25}', '{"patch_index": [1, 2], "fraction": 0.25', ""]
 )
-def test_a_changed_table_is_not_read(table: Path, content: str) -> None:
-    """It comes back as it was written; then one other digit is as bad as what is no JSON."""
+def test_read_table_refuses_a_changed_table(table: Path, content: str) -> None:
+    """An unchanged table is read; one changed digit is refused as invalid JSON is."""
     assert read_table(table) == {"patch_index": [1, 2], "fraction": 0.25}
     table.write_text(content)
     with pytest.raises(IncompleteStoreError, match=r"plan\.json has .*verify --repair"):
         read_table(table)
 
 
-def test_a_missing_or_foreign_table_is_not_read(table: Path) -> None:
-    """Neither what is gone, nor what somebody put there."""
+def test_read_table_refuses_missing_and_unlisted_files(table: Path) -> None:
+    """A deleted file is refused, and so is a file that the manifest does not list."""
     (table.parent / "other.json").write_text("{}")
     with pytest.raises(IncompleteStoreError, match=r"other\.json is in no manifest"):
         read_table(table.parent / "other.json")
@@ -315,16 +315,16 @@ PLAIN = st.recursive(
 
 @given(st.dictionaries(st.text(max_size=4), PLAIN, max_size=5))
 @settings(max_examples=25, deadline=None)
-def test_order_of_parameters_does_not_count(params: dict[str, object]) -> None:
-    """The same table in another order has the same key."""
+def test_stage_key_ignores_the_order_of_parameters(params: dict[str, object]) -> None:
+    """The same parameters in reverse order have the same key."""
     turned = dict(reversed(params.items()))
     assert stage_key("mosaic", 1, params, ["a"]) == stage_key("mosaic", 1, turned, ["a"])
 
 
 @given(st.floats(1e-6, 1e6))
 @settings(max_examples=25, deadline=None)
-def test_rounding_noise_does_not_count(value: float) -> None:
-    """A float and the float that its 12 digits give are one parameter; a change in the ninth digit is another."""
+def test_stage_key_ignores_rounding_noise(value: float) -> None:
+    """Floats equal to 12 digits are one parameter; a change in the ninth digit is another."""
     key = stage_key("plan", 1, {"a": value}, [])
     assert key == stage_key("plan", 1, {"a": float(f"{value:.12g}")}, [])
     assert key != stage_key("plan", 1, {"a": value * (1 + 1e-8)}, [])
@@ -344,8 +344,8 @@ def test_every_part_counts() -> None:
     assert all(len(key) == 20 and set(key) <= set("0123456789abcdef") for key in keys)
 
 
-def test_kinds_of_the_same_meaning_agree() -> None:
-    """2 and 2.0, lists and tuples, numpy numbers and plain ones, paths and dataclasses."""
+def test_canonical_json_agrees_for_equivalent_types() -> None:
+    """2 and 2.0, lists and tuples, numpy and Python numbers, paths and dataclasses have the same text."""
     sweep = Sweep("a", "fine", "x", 0.0, -3.5, 10)
     assert canonical_json({"a": (1, 2.0, -0.0)}) == canonical_json({"a": [np.int64(1), np.float64(2), 0]})
     assert canonical_json(sweep) == canonical_json(dataclasses.asdict(sweep))
@@ -354,7 +354,7 @@ def test_kinds_of_the_same_meaning_agree() -> None:
     assert canonical_json(np.ones(3)) != canonical_json(np.ones(3, np.float32))
 
 
-def test_what_has_no_lasting_text_is_refused() -> None:
+def test_stage_key_refuses_values_without_a_stable_text() -> None:
     """A function or a bare object cannot be part of a key."""
     for value in (test_every_part_counts, object(), np.array([None])):
         with pytest.raises(ArchiveError, match="cannot be part of a key"):

@@ -1,4 +1,4 @@
-"""What rests on what, what changed, and what a person means by a product; damaged files are told, never raised."""
+"""Lineage of stores: inputs, dependents, changes, and products by name. Damaged files are reported, never raised."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from storage.remote.opening import verify_archive
 from tests.storage.small_archive import flip, rewrite, small_survey
 
 
-def test_inputs_and_dependents_are_followed_all_the_way(tmp_path: Path, archive: Archive) -> None:
-    """A map rests on its mosaic and, through it and directly, on the raw lines."""
+def test_lineage_includes_indirect_inputs(tmp_path: Path, archive: Archive) -> None:
+    """A map depends on its mosaic and, through it and directly, on the raw lines."""
     small, catalogue = small_survey(archive), lineage.Catalogue.read(tmp_path)
     assert catalogue.ancestors([small.map.uri]) == {small.mosaic.uri, small.raw.uri}
     assert catalogue.inputs_first(catalogue.stores) == [small.raw.uri, small.mosaic.uri, small.map.uri]
@@ -38,8 +38,8 @@ def test_inputs_and_dependents_are_followed_all_the_way(tmp_path: Path, archive:
         '{"files": {}, "format": 2}',
     ],
 )
-def test_any_manifest_can_be_read_or_is_told_damaged(tmp_path: Path, archive: Archive, content: str) -> None:
-    """Nothing a manifest says ends in a traceback, or in reading a file elsewhere."""
+def test_an_invalid_manifest_is_reported_as_damaged(tmp_path: Path, archive: Archive, content: str) -> None:
+    """No content of a manifest causes another error, or makes verify read a file elsewhere."""
     small = small_survey(archive)
     (small.mosaic.path / "manifest.json").write_text(content)
     catalogue = lineage.Catalogue.read(tmp_path)
@@ -51,8 +51,8 @@ def test_any_manifest_can_be_read_or_is_told_damaged(tmp_path: Path, archive: Ar
 
 
 @pytest.mark.parametrize("inputs", [7, "abc", [3, None], {"a": 5}, ["nowhere", "stages/rectify/nowhere"]])
-def test_odd_inputs_are_borne(tmp_path: Path, archive: Archive, inputs: object) -> None:
-    """Whatever a manifest says of its inputs, nothing ends in a traceback."""
+def test_malformed_inputs_of_a_manifest_are_tolerated(tmp_path: Path, archive: Archive, inputs: object) -> None:
+    """Inputs, parameters and dates of a wrong type raise no exception."""
     small = small_survey(archive)
     odd = {"inputs": inputs, "params": 3, "created": None, "libraries": []}
     rewrite(small.map.path / "manifest.json", **odd)
@@ -61,8 +61,8 @@ def test_odd_inputs_are_borne(tmp_path: Path, archive: Archive, inputs: object) 
     assert all(isinstance(one.uri, str) for one in verify_archive(archive))
 
 
-def test_what_changed_is_followed_to_where_it_began(tmp_path: Path, archive: Archive) -> None:
-    """The map has another mosaic, which has another kernel; the version before is that of the same scene and part."""
+def test_changes_are_traced_to_their_origin(tmp_path: Path, archive: Archive) -> None:
+    """The map has another mosaic, which has another kernel; the previous version is that of the same scene and part."""
     first, _, second = (small_survey(archive, kernel=kernel) for kernel in ("bilinear", "nearest", "catmull-rom"))
     catalogue = lineage.Catalogue.read(tmp_path)
     before = lineage.version_before(catalogue, second.map.uri)
@@ -75,8 +75,8 @@ def test_what_changed_is_followed_to_where_it_began(tmp_path: Path, archive: Arc
     assert lineage.version_before(catalogue, first.map.uri) is None
 
 
-def test_versions_and_libraries_count_as_changes(tmp_path: Path, archive: Archive) -> None:
-    """A stage that got a new version, and parameters that came and went."""
+def test_changes_list_versions_and_parameters(tmp_path: Path, archive: Archive) -> None:
+    """Listed are a stage's new version, and parameters that changed, appeared or disappeared."""
     for key, version, params in (("one", 1, {"a": {"b": 1}, "c": 2}), ("two", 2, {"a": {"b": 3}, "d": [1, 2]})):
         with archive.publish("segment", key, version=version, params=params):
             pass
@@ -91,8 +91,8 @@ def test_versions_and_libraries_count_as_changes(tmp_path: Path, archive: Archiv
     ]
 
 
-def test_raw_lines_of_which_nobody_says_their_origin_are_the_only_copy(tmp_path: Path, archive: Archive) -> None:
-    """The simulator's say so, by a run or by their own parameters; one run of a rig is enough against all others."""
+def test_raw_lines_of_unknown_origin_are_the_only_copy(tmp_path: Path, archive: Archive) -> None:
+    """Simulated lines are marked by a run or by their own parameters; one run of a rig outweighs all others."""
     for key, params in (("bare", {}), ("light", {"effects": []}), ("rig", {"effects": [], "source": "rig"})):
         with archive.publish("capture", key, params=params):
             pass
@@ -112,7 +112,7 @@ def test_raw_lines_of_which_nobody_says_their_origin_are_the_only_copy(tmp_path:
 
 
 def test_nested_parameters_have_dotted_names() -> None:
-    """Lists of tables by number, lists of numbers as one value."""
+    """Items of a list of tables are numbered; a list of numbers is one value."""
     assert lineage.flatten({"a": {"b": 1}, "s": [{"x": 1}, {"x": 2}], "l": [1, 2], "e": {}}) == {
         "a.b": 1,
         "s[0].x": 1,
@@ -122,8 +122,8 @@ def test_nested_parameters_have_dotted_names() -> None:
     }
 
 
-def test_products_go_by_many_names(tmp_path: Path, archive: Archive) -> None:
-    """Address, address of a file in it, stage and key, beginning of a key, run, and name in the newest run."""
+def test_products_are_found_by_address_key_run_and_name(tmp_path: Path, archive: Archive) -> None:
+    """Accepted are addresses of stores and files, stage and key, a key's start, a run, and a name in the newest run."""
     small, catalogue = small_survey(archive), lineage.Catalogue.read(tmp_path)
     key = small.map.key
     for text in (small.map.uri, f"{small.map.uri}/class_map.zarr/", f"segment/{key}", key, key[:8], "class_map"):
@@ -134,8 +134,8 @@ def test_products_go_by_many_names(tmp_path: Path, archive: Archive) -> None:
         assert found.folder == small.run
 
 
-def test_a_stage_narrows_the_beginning_of_a_key(tmp_path: Path, archive: Archive) -> None:
-    """With and without the word stages; what is still two keys is refused with both."""
+def test_a_stage_name_resolves_an_ambiguous_key(tmp_path: Path, archive: Archive) -> None:
+    """The prefix `stages/` is optional; a beginning that still fits several keys is refused with a list of them."""
     for stage, key in (("rectify", "abcd1"), ("segment", "abcd1"), ("segment", "abcd2"), ("segment", "abce3")):
         with archive.publish(stage, key):
             pass
@@ -149,8 +149,8 @@ def test_a_stage_narrows_the_beginning_of_a_key(tmp_path: Path, archive: Archive
         lineage.find_product(catalogue, "abcd")
 
 
-def test_a_products_name_is_of_the_newest_run_that_can_be_read(tmp_path: Path, archive: Archive) -> None:
-    """A damaged one after it does not hide it."""
+def test_a_product_name_means_the_newest_readable_run(tmp_path: Path, archive: Archive) -> None:
+    """A newer run whose receipt is damaged is skipped."""
     made = [small_survey(archive, seed=seed) for seed in range(3)]
     catalogue = lineage.Catalogue.read(tmp_path)
     assert lineage.find_product(catalogue, "class_map") == made[2].map.uri
@@ -160,8 +160,8 @@ def test_a_products_name_is_of_the_newest_run_that_can_be_read(tmp_path: Path, a
     assert lineage.find_product(lineage.Catalogue.read(tmp_path), "class_map") == made[1].map.uri
 
 
-def test_a_version_before_is_of_the_same_scene_and_can_be_read(tmp_path: Path, archive: Archive) -> None:
-    """The newest of those; a store that says no scene may be of any."""
+def test_the_previous_version_is_readable_and_of_the_same_scene(tmp_path: Path, archive: Archive) -> None:
+    """The newest such store is taken; a store without a scene fits any scene."""
     for key, params in (
         ("old1", {}),
         ("old2", {"scene": "a"}),
@@ -192,8 +192,8 @@ def test_a_version_before_is_of_the_same_scene_and_can_be_read(tmp_path: Path, a
         ("mosaic", "the mosaic of runs/.* lacks its store stages/.*; run verify --repair"),
     ],
 )
-def test_what_is_no_product_is_refused(tmp_path: Path, text: str, words: str) -> None:
-    """With the nearest that there is; a product whose store has gone is told from a wrong name."""
+def test_find_product_refuses_unknown_names(tmp_path: Path, text: str, words: str) -> None:
+    """The error suggests the nearest name; a product whose store is missing has its own message."""
     small_survey(Archive.open(tmp_path))
     shutil.rmtree(tmp_path / str(in_text(lineage.Catalogue.read(tmp_path).runs[-1].products["mosaic"])))
     with pytest.raises(ArchiveError, match=words):
@@ -201,8 +201,8 @@ def test_what_is_no_product_is_refused(tmp_path: Path, text: str, words: str) ->
 
 
 @pytest.mark.parametrize("well", [False, True])
-def test_a_damaged_receipt_names_what_its_manifest_recorded(tmp_path: Path, archive: Archive, well: bool) -> None:
-    """The receipt's own words do not count any more, even where one digit of it is another and it reads well."""
+def test_a_run_with_a_damaged_receipt_uses_its_manifest(tmp_path: Path, archive: Archive, well: bool) -> None:
+    """The content of the receipt is ignored, even where one digit changed and it is valid JSON."""
     small = small_survey(archive)
     receipt = small.run / "receipt.json"
     if well:
@@ -215,8 +215,8 @@ def test_a_damaged_receipt_names_what_its_manifest_recorded(tmp_path: Path, arch
     assert run.names == {small.raw.uri, small.mosaic.uri, small.map.uri}
 
 
-def test_settings_are_those_of_the_receipt_or_else_of_the_manifest(tmp_path: Path, archive: Archive) -> None:
-    """The manifest's numbers are rounded; they are there even where the receipt is damaged."""
+def test_settings_come_from_the_manifest_if_the_receipt_is_damaged(tmp_path: Path, archive: Archive) -> None:
+    """The receipt comes first, because the manifest's numbers are rounded."""
     with archive.new_run("farm") as draft:
         draft.write_file("receipt.json", json.dumps({"settings": {"seed": 1}}))
         draft.publish(settings={"seed": 2})
@@ -225,8 +225,8 @@ def test_settings_are_those_of_the_receipt_or_else_of_the_manifest(tmp_path: Pat
     assert lineage.Catalogue.read(tmp_path).runs[0].settings == {"seed": 2}
 
 
-def test_a_run_that_is_no_table_is_borne(tmp_path: Path, archive: Archive) -> None:
-    """Receipts of any shape are read."""
+def test_receipts_of_any_shape_are_read(tmp_path: Path, archive: Archive) -> None:
+    """A receipt that is a list, a text, or a table of wrong types names no store, product or setting."""
     for receipt in ("[1, 2]", '{"stages": [3, {"key": 4}], "products": 5, "settings": null}', '"text"'):
         with archive.new_run("odd") as draft:
             draft.write_file("receipt.json", receipt)

@@ -1,4 +1,4 @@
-"""Adding to a published run: whatever happens, the run lies there whole, with what is added or without it."""
+"""A published run stays whole while it is extended: after any failure it has the addition or lacks it."""
 
 from __future__ import annotations
 
@@ -52,13 +52,13 @@ print(calls)
 
 
 def run_id(archive: Archive) -> str:
-    """The name of the one run of an archive."""
+    """Return the name of the archive's only run."""
     (folder,) = archive.runs()
     return folder.name
 
 
 def extend(archive: Archive, name: str, figure: float = 0.75) -> Path:
-    """Judge the small survey's map, and publish the run again with what came of it."""
+    """Evaluate the small survey's map, and publish the run again with the accuracy."""
 
     def build(path: Path) -> None:
         (path / "accuracy.json").write_text(json.dumps({"miou": figure}))
@@ -73,7 +73,7 @@ def extend(archive: Archive, name: str, figure: float = 0.75) -> Path:
 
 
 def figure_of(archive: Archive) -> float | None:
-    """The accuracy in the receipt of the one run, None where there is none yet."""
+    """Return the accuracy in the receipt of the only run, None where there is none yet."""
     found = read_run(archive.root / "runs" / run_id(archive))
     assert found.problem is None
     return found.receipt.get("accuracy", {}).get("miou")
@@ -81,14 +81,14 @@ def figure_of(archive: Archive) -> float | None:
 
 @pytest.fixture
 def archive(tmp_path: Path) -> Archive:
-    """An archive with one run."""
+    """Return an archive with one run."""
     opened = Archive.open(tmp_path / "archive")
     small_survey(opened)
     return opened
 
 
-def test_a_run_keeps_its_name_and_date(archive: Archive) -> None:
-    """One folder, one run, of the time at which it was published, that rests on what was added too; it verifies."""
+def test_an_extended_run_keeps_its_name_and_date(archive: Archive) -> None:
+    """There is still one run folder; the run depends on the added store as well, and verification passes."""
     name = run_id(archive)
     created = read_manifest(archive.root / "runs" / name)["created"]
     folder = extend(archive, name)
@@ -99,8 +99,8 @@ def test_a_run_keeps_its_name_and_date(archive: Archive) -> None:
     assert problems(archive) == []
 
 
-def test_what_is_not_published_changes_nothing(archive: Archive) -> None:
-    """A block that fails, and one that ends without a word, leave the run as it was, and nothing beside it."""
+def test_an_unpublished_extension_changes_nothing(archive: Archive) -> None:
+    """A block that raises, or ends without publishing, leaves the run as it was and no other folder."""
     name, before = run_id(archive), (archive.runs()[0] / "manifest.json").read_bytes()
     for error in (None, KeyboardInterrupt(), ArchiveError("the disk is full")):
         with suppress(KeyboardInterrupt, ArchiveError), archive.extend_run(name) as draft:
@@ -112,8 +112,8 @@ def test_what_is_not_published_changes_nothing(archive: Archive) -> None:
         assert problems(archive) == []
 
 
-def test_one_at_a_time(archive: Archive) -> None:
-    """A second process is told that it is being done, and a run that is not there is named."""
+def test_a_run_is_extended_by_one_process_at_a_time(archive: Archive) -> None:
+    """Without waiting a second process gets None, and gc leaves the draft alone; a missing run's error names it."""
     name = run_id(archive)
     with archive.extend_run(name):
         assert archive.extend_run(name, wait=False) is None
@@ -124,8 +124,8 @@ def test_one_at_a_time(archive: Archive) -> None:
         archive.extend_run("20261120T101701-gone")
 
 
-def test_the_next_process_keeps_its_draft(archive: Archive) -> None:
-    """It may begin as soon as a run is published, before the process that published it leaves its block."""
+def test_leaving_a_published_draft_keeps_the_next_draft(archive: Archive) -> None:
+    """Another process may begin its draft between a publication and the end of that process's block."""
     for draft in (archive.extend_run(run_id(archive)), archive.new_run("new")):
         with draft:
             draft.write_file("receipt.json", "{}")
@@ -134,8 +134,8 @@ def test_the_next_process_keeps_its_draft(archive: Archive) -> None:
         assert list(draft.folder.iterdir()) == []
 
 
-def test_killed_at_every_call_of_the_system(archive: Archive, tmp_path: Path) -> None:
-    """The run is there, whole, without what is added or with it; the next time it is added."""
+def test_a_run_stays_whole_when_killed_at_any_system_call(archive: Archive, tmp_path: Path) -> None:
+    """The run verifies, with the addition or without it; the next extension succeeds and leaves no draft."""
     command = [sys.executable, "-c", KILL_EVERYWHERE, str(archive.root), str(tmp_path)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     calls = int(subprocess.run(command, cwd=ROOT, env=environment, check=True, capture_output=True).stdout)
@@ -153,8 +153,8 @@ def test_killed_at_every_call_of_the_system(archive: Archive, tmp_path: Path) ->
     assert seen == {None, 0.75}
 
 
-def test_where_folders_cannot_be_exchanged_files_are(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The run is whole with what is added; killed before its manifest is there it is damaged, and named."""
+def test_interrupted_replacement_of_files_is_reported(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without folder exchange, a run killed before its manifest is replaced is damaged: verify names it, gc works."""
     monkeypatch.setattr(run_folders, "try_exchange", lambda one, other: False)
     name, replace = run_id(archive), Path.replace
 
@@ -176,7 +176,7 @@ def test_where_folders_cannot_be_exchanged_files_are(archive: Archive, monkeypat
 
 
 def test_an_extension_reaches_other_machines(machine: Machine) -> None:
-    """One that has the run already brings what was added; nothing of before is left, and all verifies."""
+    """A machine that already has the run fetches the addition; no old file is left, and all verifies."""
     archive = machine(FIRST)
     small_survey(archive)
     other = machine(SECOND, create=False)
@@ -188,8 +188,8 @@ def test_an_extension_reaches_other_machines(machine: Machine) -> None:
     assert clear_up(other, keep_days=0).removals == ()
 
 
-def test_killed_before_the_files_of_before_go(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Other machines have what was added, and gc clears those files away."""
+def test_gc_removes_old_files_of_an_interrupted_extension(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The machine was killed before it removed them; other machines read the extended run."""
     archive = machine(FIRST)
     small_survey(archive)
     machine(SECOND, create=False)
@@ -204,8 +204,8 @@ def test_killed_before_the_files_of_before_go(machine: Machine, monkeypatch: pyt
     assert (figure_of(machine(SECOND, create=False)), problems(machine(FIRST))) == (0.75, [])
 
 
-def test_a_damaged_manifest_in_the_bucket_does_not_reach_the_copy(machine: Machine) -> None:
-    """Where a run was extended its manifest is asked for again: what has rotted is not taken."""
+def test_a_damaged_manifest_in_the_bucket_is_not_fetched(machine: Machine) -> None:
+    """The manifest of an extended run is fetched again; a damaged one is reported and does not replace the copy."""
     archive = machine(FIRST)
     small_survey(archive)
     extend(archive, run_id(archive))
@@ -218,8 +218,8 @@ def test_a_damaged_manifest_in_the_bucket_does_not_reach_the_copy(machine: Machi
     assert any("its seal does not fit" in one for one in problems(again))
 
 
-def test_folders_exchange_their_names(tmp_path: Path) -> None:
-    """Each has what the other had; a name that leads nowhere is the system's own error."""
+def test_try_exchange_swaps_two_folders(tmp_path: Path) -> None:
+    """Each folder gets the other's content; a missing folder raises FileNotFoundError."""
     for name in "ab":
         (tmp_path / name).mkdir()
         (tmp_path / name / "who").write_text(name)

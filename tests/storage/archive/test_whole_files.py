@@ -1,4 +1,4 @@
-"""Files that people take away appear whole or not at all; settings in TOML are read or refused in one sentence."""
+"""Exported files appear whole or not at all; settings in TOML are read or refused with a clear error."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _files(folder: Path) -> dict[str, str]:
 
 
 def test_files_appear_together_and_replace_the_old(tmp_path: Path) -> None:
-    """In a folder that need not be there; what else lies in it stays."""
+    """A missing folder is created, and other files in it stay."""
     folder = tmp_path / "a" / "b"
     for text in ("old", "new"):
         with written_aside(folder, ["x", "y"]) as aside:
@@ -39,8 +39,8 @@ def test_files_appear_together_and_replace_the_old(tmp_path: Path) -> None:
         (OSError(errno.ENOSPC, "No space left"), pytest.raises(ArchiveError, match="the disk is full")),
     ],
 )
-def test_a_block_that_fails_leaves_the_old(tmp_path: Path, error: BaseException, told: Any) -> None:
-    """Whatever it had written; a full disk is told, with what to do."""
+def test_a_failed_write_keeps_the_old_files(tmp_path: Path, error: BaseException, told: Any) -> None:
+    """Half-written files are removed; a full disk raises an error that says so."""
     write_whole(tmp_path / "x", "old")
     with told, written_aside(tmp_path, ["x"]) as aside:
         (aside / "x").write_text("half")
@@ -50,7 +50,7 @@ def test_a_block_that_fails_leaves_the_old(tmp_path: Path, error: BaseException,
 
 
 def test_old_and_new_files_are_never_mixed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Killed at any rename, there are no files of the second name beside a first of another time."""
+    """A process killed between the renames leaves no old second file beside a new first one."""
     for name in ("x", "y"):
         (tmp_path / name).write_text("old")
     true, seen = Path.replace, []
@@ -67,8 +67,8 @@ def test_old_and_new_files_are_never_mixed(tmp_path: Path, monkeypatch: pytest.M
     assert _files(tmp_path) == {"x": "new", "y": "new"}
 
 
-def test_every_file_is_synced_before_it_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And the folder after the last."""
+def test_files_are_synced_before_they_are_renamed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The folder is synced after the last rename."""
     events: list[str] = []
     monkeypatch.setattr(whole_files, "sync_path", lambda path: events.append(f"sync {Path(path).name}"))
     true = Path.replace
@@ -84,8 +84,8 @@ def test_every_file_is_synced_before_it_has_its_name(tmp_path: Path, monkeypatch
     assert events == ["sync x", "sync y", "name x", "name y", "sync out"]
 
 
-def test_a_file_where_the_folder_should_be_is_refused(tmp_path: Path) -> None:
-    """Also where it lies above, and with a relative path; the file is left as it is."""
+def test_write_refuses_a_file_in_place_of_the_folder(tmp_path: Path) -> None:
+    """A file above the folder and a relative path are refused too; the file stays as it is."""
     (tmp_path / "mine").write_text("mine")
     here = Path(os.path.relpath(tmp_path / "mine"))
     for folder in (tmp_path / "mine", tmp_path / "mine" / "below", here):
@@ -94,16 +94,16 @@ def test_a_file_where_the_folder_should_be_is_refused(tmp_path: Path) -> None:
     assert (tmp_path / "mine").read_text() == "mine"
 
 
-def test_leftovers_of_killed_writers_go_and_nothing_else(tmp_path: Path) -> None:
-    """Other people's folders stay, even those that end alike."""
+def test_remove_leftovers_deletes_only_folders_of_killed_writers(tmp_path: Path) -> None:
+    """Other folders stay, even those whose names begin or end like a leftover's."""
     for name in (".export-abc.part", "mine.part", ".export-mine"):
         (tmp_path / name).mkdir()
     remove_leftovers(tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == [".export-mine", "mine.part"]
 
 
-def test_a_byte_order_mark_is_read_over(tmp_path: Path) -> None:
-    """Some editors write one."""
+def test_toml_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
+    """Some editors write a byte order mark at the start of a file."""
     (tmp_path / "survey.toml").write_bytes(b"\xef\xbb\xbfseed = 1\r\n")
     assert read_toml(tmp_path / "survey.toml") == {"seed": 1}
 
@@ -119,8 +119,8 @@ def test_a_byte_order_mark_is_read_over(tmp_path: Path) -> None:
         (None, "no plain file"),
     ],
 )
-def test_what_cannot_be_read_is_said_in_a_sentence(tmp_path: Path, content: bytes | None, why: str) -> None:
-    """Endless digits, nesting without end, a pipe that nobody writes to: none hangs, none is another error."""
+def test_unreadable_toml_raises_a_clear_error(tmp_path: Path, content: bytes | None, why: str) -> None:
+    """Huge integers, deep nesting and a pipe without a writer raise these errors; none of them hangs."""
     path = tmp_path / "scene.toml"
     if content is None:
         os.mkfifo(path)

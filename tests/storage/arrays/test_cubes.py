@@ -1,4 +1,4 @@
-"""What is stored comes back, opens with plain xarray, and a flipped bit is never a number."""
+"""Raw cubes, mosaics and attention maps are read as written, also by plain xarray; a damaged block raises an error."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_raw_cube_opens_with_plain_xarray(tmp_path: Path) -> None:
 
 
 def test_raw_cube_refuses_to_end_early(tmp_path: Path) -> None:
-    """Lines that are missing are counted."""
+    """The error counts the written lines: 2 of 3."""
     header = _header(3, 4, 2)
     cube = RawCubeWriter(tmp_path / "raw.zarr", header)
     cube.write(_lines(header)[:2])
@@ -81,7 +81,7 @@ def test_raw_cube_refuses_to_end_early(tmp_path: Path) -> None:
 
 
 def _calibrated(tmp_path: Path) -> tuple[Path, SweepHeader, list[Line]]:
-    """A stored sweep of 130 lines whose references have all that references can have."""
+    """Return a stored sweep of 130 lines whose references have all optional parts."""
     header, rng = _header(130, 9, 4), np.random.default_rng(4)
     flat, bad = rng.uniform(0.9, 1.1, (9, 4)).astype(np.float32), np.zeros((9, 4), np.bool_)
     bad[3, 1] = True
@@ -92,8 +92,8 @@ def _calibrated(tmp_path: Path) -> tuple[Path, SweepHeader, list[Line]]:
     return tmp_path / "raw.zarr", header, lines
 
 
-def test_bad_flat_and_mirror_come_back(tmp_path: Path) -> None:
-    """They are stored where there are any; without them nothing is, as in cubes of before."""
+def test_optional_references_are_read_as_written(tmp_path: Path) -> None:
+    """Dead pixels, flat field and mirror flag are stored where there are any; other cubes have no such arrays."""
     path, header, _ = _calibrated(tmp_path)
     found = open_raw_cube(path).references
     np.testing.assert_array_equal(found.bad, header.references.bad)
@@ -107,8 +107,8 @@ def test_bad_flat_and_mirror_come_back(tmp_path: Path) -> None:
     assert (found.bad, found.flat, found.by_mirror) == (None, None, False)
 
 
-def test_lines_are_read_as_they_are_asked_for(tmp_path: Path) -> None:
-    """Opening reads no line: a damaged block is an error only where it is asked for, and is named."""
+def test_a_damaged_block_fails_only_when_it_is_read(tmp_path: Path) -> None:
+    """Opening reads no line; the error names the damaged array."""
     path, _, lines = _calibrated(tmp_path)
     shard = path / "dn" / "c" / "1" / "0" / "0"
     shard.write_bytes(shard.read_bytes()[:-40])
@@ -118,8 +118,8 @@ def test_lines_are_read_as_they_are_asked_for(tmp_path: Path) -> None:
         cube.read(100, 101)
 
 
-def test_raw_lines_are_packed_64_at_a_time(tmp_path: Path) -> None:
-    """A chunk is 64 lines of up to 640 samples with all bands, with blosc and crc32c: they are read as a whole."""
+def test_raw_lines_are_stored_in_chunks_of_64(tmp_path: Path) -> None:
+    """A chunk is 64 lines of up to 640 samples with all bands, with blosc and crc32c: it is read as a whole."""
     header = _header(130, 100, 6)
     with RawCubeWriter(tmp_path / "raw.zarr", header) as cube:
         cube.write(_lines(header))
@@ -131,8 +131,8 @@ def test_raw_lines_are_packed_64_at_a_time(tmp_path: Path) -> None:
     assert len([path for path in (tmp_path / "raw.zarr" / "dn" / "c").rglob("*") if path.is_file()]) == 3
 
 
-def test_an_image_without_bands_has_a_chunk_a_file(tmp_path: Path) -> None:
-    """Calls for chunks of a few kilobytes would cost more than unpacking them."""
+def test_images_without_bands_have_one_chunk_per_file(tmp_path: Path) -> None:
+    """Separate reads of chunks of a few kilobytes would take longer than their decompression."""
     coverage = plain_writer(tmp_path / "m.zarr", (130, 700), np.array([500.0, 700.0])).group["coverage"]
     assert isinstance(coverage, zarr.Array)
     assert coverage.chunks == coverage.shards == (64, 640)
@@ -149,7 +149,7 @@ def _values(bands: int) -> NDArray[np.float32]:
 
 @pytest.mark.parametrize("bands", [1, 40])
 def test_mosaic_round_trip(tmp_path: Path, bands: int) -> None:
-    """Values come back but for rounding, missing ones as NaN; plain xarray masks and scales the same scores."""
+    """Values are read as rounded, missing ones as NaN; plain xarray masks and scales the same scores."""
     stored = write_values(tmp_path / "m.zarr", _values(bands), NM[:bands], GRID)
     found = open_mosaic(tmp_path / "m.zarr")
     np.testing.assert_array_equal(found.values(), stored)
@@ -160,8 +160,8 @@ def test_mosaic_round_trip(tmp_path: Path, bands: int) -> None:
         np.testing.assert_allclose(data["scores"].values.transpose(1, 2, 0), found.scores())
 
 
-def test_mosaic_says_where_its_pixels_lie(tmp_path: Path) -> None:
-    """The spatial transform maps the centre pixel's corner to the undeflected direction, for coarse grids alike."""
+def test_mosaic_has_the_spatial_transform_of_its_grid(tmp_path: Path) -> None:
+    """The transform maps the centre pixel's corner to the undeflected direction, for coarse grids too."""
     coarse = AngularGrid(1.057e-4, (100, 70), factor=4)
     for grid, shape in ((GRID, (100, 70)), (coarse, (25, 18))):
         a, _, c, _, e, f = grid.attributes(shape)["spatial:transform"]
@@ -174,7 +174,7 @@ def test_mosaic_says_where_its_pixels_lie(tmp_path: Path) -> None:
 
 
 def test_attention_round_trip(tmp_path: Path) -> None:
-    """Scores keep NaN and infinity; ranks keep -1 for what was not chosen."""
+    """Scores keep NaN and infinity; ranks keep -1 for patches that were not chosen."""
     score = np.array([[1.0, np.nan], [np.inf, -np.inf]])
     attention = Attention(score, np.array([[1, -1], [0, -1]], np.int32), "entropy")
     write_attention(tmp_path / "a.zarr", attention)
@@ -186,8 +186,8 @@ def test_attention_round_trip(tmp_path: Path) -> None:
         np.testing.assert_array_equal(data["score"].values, score)
 
 
-def test_what_is_no_store(tmp_path: Path) -> None:
-    """A missing folder and one without the arrays are incomplete stores."""
+def test_open_refuses_missing_and_other_stores(tmp_path: Path) -> None:
+    """A missing folder and a store without the expected arrays are incomplete."""
     with pytest.raises(IncompleteStoreError, match="cannot be read"):
         open_mosaic(tmp_path / "none.zarr")
     write_attention(tmp_path / "a.zarr", Attention(np.zeros((1, 1)), np.zeros((1, 1), np.int32), "x"))

@@ -1,4 +1,4 @@
-"""Camera files in a folder: bytes stay as they came, whatever a file is called and whatever the disk does."""
+"""Fetched camera files keep their bytes, whatever their names are and whatever disk errors occur."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from storage.arrays.spool import SUMS, FetchedFiles
 from tests.storage.small_archive import flip
 
 
-def test_what_was_appended_is_read_back(tmp_path: Path):
-    """Sizes and parts of several files; another look at the folder has the same."""
+def test_appended_bytes_are_read_back(tmp_path: Path):
+    """Sizes and parts of several files are right; a second object on the same folder reads the same."""
     kept = FetchedFiles(tmp_path / "camera")
     assert kept.size("/captured/a_000000/raw_0") == 0
     assert kept.read("/captured/a_000000/raw_0", 0, 10) == b""
@@ -31,16 +31,16 @@ def test_what_was_appended_is_read_back(tmp_path: Path):
         assert scan_pass.read("notes", 0, 2) == b"1\n"
 
 
-def test_empty_file_is_there(tmp_path: Path):
-    """A file without a byte is not one that was never fetched."""
+def test_an_empty_file_is_stored(tmp_path: Path):
+    """An empty file differs from a file that was never fetched."""
     kept = FetchedFiles(tmp_path)
     kept.append("/a/empty", b"")
     assert [path.name for path in tmp_path.iterdir()] == ["a%2Fempty"]
 
 
 @pytest.mark.parametrize("name", ["/captured/../../etc/passwd", "..", "/a b/ü", "a%2Fb", "\\..\\x"])
-def test_no_name_leads_out_of_the_folder(tmp_path: Path, name: str):
-    """Whatever the camera calls its files, they lie in the folder, each in its own."""
+def test_no_file_name_leads_out_of_the_folder(tmp_path: Path, name: str):
+    """Each camera file is stored inside the folder under its own name, whatever the camera calls it."""
     kept = FetchedFiles(tmp_path / "camera")
     kept.append(name, b"x")
     kept.append("/a/b", b"yy")
@@ -49,16 +49,16 @@ def test_no_name_leads_out_of_the_folder(tmp_path: Path, name: str):
     assert [path.name for path in tmp_path.iterdir()] == ["camera"]
 
 
-def test_name_that_is_none_is_refused(tmp_path: Path):
-    """Nothing, or more than a file system takes."""
+def test_invalid_file_names_are_refused(tmp_path: Path):
+    """An empty name is refused, and so is a name longer than file systems allow."""
     for name in ("/", "x" * 300):
         with pytest.raises(NotKept, match="use a shorter prefix"):
             FetchedFiles(tmp_path).append(name, b"x")
 
 
 @pytest.mark.parametrize("name", ["/a/raw_0", "notes"])
-def test_full_disk_keeps_what_there_was(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch):
-    """A write that the disk takes a part of is taken back, and told with what to do."""
+def test_a_full_disk_keeps_earlier_bytes(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch):
+    """A partial write is undone, and the error says what was kept."""
     kept = FetchedFiles(tmp_path)
     kept.append(name, b"whole")
     write = os.write
@@ -75,8 +75,8 @@ def test_full_disk_keeps_what_there_was(tmp_path: Path, name: str, monkeypatch: 
 
 
 @pytest.mark.parametrize("rotten", ["bytes", "sums"])
-def test_flipped_bit_is_cut_off_and_nothing_before_it(tmp_path: Path, rotten: str):
-    """Only bytes before the part with the flipped bit are held; the camera gives the rest again."""
+def test_a_flipped_bit_cuts_the_file_off_before_its_part(tmp_path: Path, rotten: str):
+    """Only parts before the flipped bit are kept; the camera sends the rest again."""
     chance, name = random.Random(7), "/captured/a/raw_0"
     parts = [chance.randbytes(chance.randint(1, 40)) for _ in range(12)]
     truth, ends = b"".join(parts), [0, *itertools.accumulate(len(part) for part in parts)]
@@ -95,7 +95,7 @@ def test_flipped_bit_is_cut_off_and_nothing_before_it(tmp_path: Path, rotten: st
         assert FetchedFiles(folder).read(name, 0, 1000) == truth
 
 
-def test_file_without_sums_is_fetched_again(tmp_path: Path):
-    """As of an earlier version, or of a disk that did not keep them: nothing vouches for a byte of it."""
+def test_a_file_without_checksums_is_fetched_again(tmp_path: Path):
+    """Without checksums no byte of the file can be trusted, so its size counts as 0."""
     (tmp_path / "a%2Fraw_0").write_bytes(b"whatever")
     assert FetchedFiles(tmp_path).size("/a/raw_0") == 0

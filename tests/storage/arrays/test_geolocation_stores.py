@@ -1,4 +1,4 @@
-"""Stored lookups: what is written comes back bit by bit, and names of paths change with what the tracks depend on."""
+"""Stored geolocation tables are read bit by bit; digests follow the values that scan paths depend on."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ CAMERA = LineCamera()
 
 
 def tabulated(scan_px: np.ndarray) -> list[tuple[ScanPath, TieTable]]:
-    """Tracks and tables of a sweep whose lines look at these places."""
+    """Return the scan paths of lines at these positions, each with its table."""
     tangents = np.stack([np.full_like(scan_px, 100.0), scan_px], axis=-1) * CAMERA.ifov_rad
     scan_paths = make_scan_paths(direction_to_position(scene_to_direction(tangents)), CAMERA)
     grid = {"origin_px": (-5.0, -250.0), "spacing_px": 1.0, "shape": (60, 700)}
     return [(scan_path, tie_table(scan_path, CAMERA, along="x", **grid)) for scan_path in scan_paths]  # type: ignore[arg-type]
 
 
-def test_tables_come_back(tmp_path: Path) -> None:
-    """Tracks that turn, dwell and have gaps, and their tables, are read as they were written."""
+def test_geolocation_tables_round_trip(tmp_path: Path) -> None:
+    """Scan paths that turn, dwell and have gaps, and their tables, are read as they were written."""
     there = np.concatenate([np.arange(20.0), np.arange(25.0, 50), [49.0, 49.0], np.arange(48.0, 0, -1)])
     tables = {"coarse 0": tabulated(np.arange(50.0)), "fine/1": tabulated(there), "dark": []}
     write_geolocation(tmp_path / "geolocation.zarr", tables, {"ifov_rad": CAMERA.ifov_rad})
@@ -49,8 +49,8 @@ def test_tables_come_back(tmp_path: Path) -> None:
     assert 0 < root["sweep_0/scan_path_0"].attrs["bound_px"] <= 2e-3
 
 
-def test_damage_is_named(tmp_path: Path) -> None:
-    """A store that is not there, lacks a track, or has changed bytes is refused with its place."""
+def test_a_damaged_geolocation_store_is_refused(tmp_path: Path) -> None:
+    """A missing store, a missing scan path and changed bytes each raise an error that names the place."""
     path = tmp_path / "geolocation.zarr"
     with pytest.raises(IncompleteStoreError, match=r"geolocation\.zarr cannot be read"):
         open_geolocation(path)
@@ -65,8 +65,8 @@ def test_damage_is_named(tmp_path: Path) -> None:
 
 
 @given(st.integers(0, 4), st.floats(1e-12, 1e-3))
-def test_digest_follows_what_counts(line: int, change: float) -> None:
-    """A usable line's position or correction changes the name, and so does which lines are usable."""
+def test_path_digest_depends_on_usable_lines(line: int, change: float) -> None:
+    """The digest changes with a usable line's position or correction, and with the set of usable lines."""
     position, shift, usable = np.linspace(0.1, 0.5, 10).reshape(5, 2), np.zeros((5, 2)), np.ones(5, np.bool_)
     moved, off = position.copy(), usable.copy()
     moved[line, 1] += change
@@ -82,8 +82,8 @@ def test_digest_follows_what_counts(line: int, change: float) -> None:
     assert path_digest(moved, off, shift) == path_digest(position, off, shift)
 
 
-def test_digest_leaves_out_what_does_not() -> None:
-    """No flags, all flags; no correction, a correction of 0; NaN at a line that is not usable: one name."""
+def test_path_digest_ignores_defaults_and_unusable_lines() -> None:
+    """Default flags, a correction of 0, memory order and NaN at an unusable line do not change the digest."""
     position = np.linspace(0.1, 0.5, 10).reshape(5, 2)
     plain = path_digest(position)
     assert len(plain) == 20

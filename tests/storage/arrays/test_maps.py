@@ -1,4 +1,4 @@
-"""Stored maps: what was written comes back, in blocks or at once, areas in hectares too; wrong blocks are refused."""
+"""Stored maps are read as written, in blocks or at once, with areas in hectares; wrong blocks are refused."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ LEGEND = class_maps.ClassNames(("sugar beet", "bare soil"), np.array([[10, 200, 
 
 
 def begin(path: Path, shape: tuple[int, int] = (100, 90), *, goes_on: bool = False) -> GroundMapWriter:
-    """A writer of a map of the shape."""
+    """Return a writer of a map of the shape."""
     geobox = GeoBox.from_bbox((0, 0, shape[1] * 0.5, shape[0] * 0.5), crs="EPSG:32632", shape=shape, tight=True)
     return GroundMapWriter(path, geobox, LEGEND, about={"rig_pose": {"tilt_deg": 40}}, goes_on=goes_on)
 
 
 def block(shape: tuple[int, int], *, goes_on: bool = False) -> dict[str, np.ndarray]:
-    """Images with unseen pixels: classes, confidence, picture, age, and of a later look what changed."""
+    """Return images with some pixels unclassified: classes, confidence, picture, age; for a later visit changes too."""
     rng = np.random.default_rng(0)
     classes, old = rng.choice(np.array([0, 1, UNLABELLED], np.uint8), (2, *shape))
     confidence, age, changed = (
@@ -43,8 +43,8 @@ def block(shape: tuple[int, int], *, goes_on: bool = False) -> dict[str, np.ndar
 
 
 @pytest.mark.parametrize("goes_on", [False, True])
-def test_a_map_written_in_blocks_comes_back(tmp_path: Path, goes_on: bool) -> None:
-    """All arrays, the legend and the grid are as written, through this project's reader; at first nothing changed."""
+def test_a_map_written_in_blocks_round_trips(tmp_path: Path, goes_on: bool) -> None:
+    """Arrays, class names, colours and shape are read as written; a first visit's map has no changes."""
     writer = begin(tmp_path / "a.zarr", (150, 700), goes_on=goes_on)
     whole = block((150, 700), goes_on=goes_on)
     for rows in (slice(0, 64), slice(64, 150)):
@@ -62,15 +62,15 @@ def test_a_map_written_in_blocks_comes_back(tmp_path: Path, goes_on: bool) -> No
 
 @pytest.mark.parametrize(("areas_m2", "fractions"), [((7500.0, 2500.0), (0.75, 0.25)), ((0.0, 0.0), (0.0, 0.0))])
 def test_areas_are_kept_in_hectares(tmp_path: Path, areas_m2: tuple[float, ...], fractions: tuple[float, ...]) -> None:
-    """Each class has its square metres, hectares and share; a map of no class has fractions of nothing."""
+    """Each class has square metres, hectares and a fraction; in a map without classes all fractions are 0."""
     begin(tmp_path / "a.zarr").finish(np.array(areas_m2))
     found = load_ground_map(tmp_path / "a.zarr").areas
     for name, m2, fraction in zip(LEGEND.names, areas_m2, fractions, strict=True):
         assert found[name] == {"m2": m2, "ha": m2 / 10_000, "fraction": fraction}
 
 
-def test_plain_xarray_opens_it_with_flags_and_areas(tmp_path: Path) -> None:
-    """Flags, hectares, pose and grid mapping are there without this project's code; unseen pixels have no class."""
+def test_xarray_reads_flags_areas_and_grid_of_a_map(tmp_path: Path) -> None:
+    """Flags, areas, pose, units and grid mapping need no project code; unwritten pixels are nodata or NaN."""
     writer, images = begin(tmp_path / "a.zarr", goes_on=True), block((64, 90), goes_on=True)
     writer.write_block(slice(0, 64), slice(0, 90), images)
     writer.finish(np.ones(2))
@@ -92,7 +92,7 @@ def test_plain_xarray_opens_it_with_flags_and_areas(tmp_path: Path) -> None:
 
 
 def test_a_class_without_a_name_is_refused(tmp_path: Path) -> None:
-    """The first wrong class is named."""
+    """The error names the class and the number of class names."""
     writer, images = begin(tmp_path / "a.zarr", goes_on=True), block((64, 90), goes_on=True)
     place = slice(0, 64), slice(0, 90)
     for name in ("classes", "changed_from"):
@@ -101,32 +101,32 @@ def test_a_class_without_a_name_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("goes_on", [False, True])
-def test_a_block_has_the_images_of_its_map(tmp_path: Path, goes_on: bool) -> None:
-    """A first look has no changes to store, and a later one leaves none out; the message names what is wanted."""
+def test_a_block_must_have_the_images_of_its_map(tmp_path: Path, goes_on: bool) -> None:
+    """A first visit's map refuses changes, a later one requires them; the error lists the expected images."""
     writer = begin(tmp_path / "a.zarr", goes_on=goes_on)
     with pytest.raises(ShapeError, match="give classes, confidence, picture, age" + (", changed" if goes_on else "")):
         writer.write_block(slice(0, 64), slice(0, 90), block((64, 90), goes_on=not goes_on))
 
 
-def test_the_usual_block_is_whole_shards() -> None:
-    """The size in which the stage writes splits none."""
+def test_the_default_block_is_a_whole_number_of_shards() -> None:
+    """The stage that writes maps in these blocks therefore splits no shard."""
     assert BLOCK[0] % SHARD_ROWS == BLOCK[1] % SHARD_COLUMNS == 0
 
 
-def test_an_angular_map_is_no_ground_map(tmp_path: Path) -> None:
-    """A store without a grid mapping is refused by name."""
+def test_load_ground_map_refuses_an_angular_map(tmp_path: Path) -> None:
+    """The error says that the store has no grid mapping."""
     create_group(tmp_path / "a.zarr", "class map", {})
     with pytest.raises(IncompleteStoreError, match="no grid mapping; it is no map of the ground"):
         load_ground_map(tmp_path / "a.zarr")
 
 
 def box(epsg: int = 32632, resolution: float = 0.03) -> GeoBox:
-    """A map of 20 x 30 px or so at an awkward place."""
+    """Return a map grid of about 20 x 30 px with uneven bounds."""
     return GeoBox.from_bbox((534257.67, 5772300.8, 534258.6, 5772301.43), crs=f"EPSG:{epsg}", resolution=resolution)
 
 
 def write(path: Path, geobox: GeoBox) -> Path:
-    """A store with one image on the map."""
+    """Write a store with one image on the map grid, and return its path."""
     group = create_group(path, "a map", map_attributes(geobox), map_coordinates(geobox))
     image = np.arange(np.prod(geobox.shape), dtype=np.float32).reshape(geobox.shape)
     write_image(group, "height", ("y", "x"), image, {"units": "m", **ON_THE_MAP})
@@ -134,8 +134,8 @@ def write(path: Path, geobox: GeoBox) -> Path:
 
 
 @pytest.mark.parametrize(("epsg", "resolution", "turn"), [(32632, 0.03, 0), (5041, 1 / 3, 30)])
-def test_plain_xarray_sees_the_same_geobox(tmp_path: Path, epsg: int, resolution: float, turn: float) -> None:
-    """Opened without this project's code, dataset and image have the grid that was written, to the last bit."""
+def test_xarray_reads_the_same_geobox(tmp_path: Path, epsg: int, resolution: float, turn: float) -> None:
+    """Dataset and image have the grid that was written, to the last bit, without this project's code."""
     geobox = box(epsg, resolution).rotate(turn) if turn else box(epsg, resolution)
     path = write(tmp_path / "a.zarr", geobox)
     with xr.open_zarr(path, consolidated=False) as content:
@@ -144,7 +144,7 @@ def test_plain_xarray_sees_the_same_geobox(tmp_path: Path, epsg: int, resolution
     assert load_geobox(path) == geobox
 
 
-def test_coordinates_and_grid_mapping_are_cfs(tmp_path: Path) -> None:
+def test_coordinates_and_grid_mapping_follow_cf(tmp_path: Path) -> None:
     """x and y are pixel centres with standard names; the grid mapping holds WKT, GeoTransform and its CF name."""
     geobox = box()
     with xr.open_zarr(write(tmp_path / "a.zarr", geobox), consolidated=False) as content:
@@ -162,8 +162,8 @@ def test_coordinates_and_grid_mapping_are_cfs(tmp_path: Path) -> None:
         assert "spatial_ref" in found.coords
 
 
-def test_degrees_have_their_own_words(tmp_path: Path) -> None:
-    """Of a geographic CRS the axes are longitude and latitude, and the grid is read as it was written."""
+def test_a_geographic_crs_has_longitude_and_latitude(tmp_path: Path) -> None:
+    """The axes have the standard names and units of CF, and the grid is read as it was written."""
     geobox = GeoBox((20, 30), Affine(1e-5, 0, 7.5, 0, -1e-5, 52), "EPSG:4326")
     with xr.open_zarr(write(tmp_path / "a.zarr", geobox), consolidated=False) as content:
         assert content.x.attrs["standard_name"] == "longitude"
@@ -171,8 +171,8 @@ def test_degrees_have_their_own_words(tmp_path: Path) -> None:
         assert content.odc.geobox == load_geobox(tmp_path / "a.zarr") == geobox
 
 
-def test_geozarr_attributes_say_the_same_as_the_grid() -> None:
-    """proj: has code and WKT2, spatial: the transform and box of the grid, and both conventions are registered."""
+def test_geozarr_attributes_match_the_grid() -> None:
+    """`proj:` has code and WKT2, `spatial:` has transform and bounding box, and both conventions are registered."""
     geobox = box()
     found = map_attributes(geobox)
     assert found["proj:code"] == "EPSG:32632"
@@ -190,7 +190,7 @@ UUIDS = ("f17cb550-5864-4468-aeb7-f3180cfb622f", "689b58e2-cf7b-45e0-9fff-9cfc08
 
 
 def test_an_angular_store_has_no_geobox(tmp_path: Path) -> None:
-    """Without a place on the earth a store has no CRS and no grid mapping."""
+    """A store without a position on the earth has no CRS and no grid mapping."""
     grid = AngularGrid(1e-4, (20, 30))
     group = create_group(tmp_path / "a.zarr", "a mosaic", grid.attributes((20, 30)))
     write_image(group, "values", ("y", "x"), np.zeros((20, 30), np.float32), grid.attributes((20, 30)))
@@ -198,8 +198,8 @@ def test_an_angular_store_has_no_geobox(tmp_path: Path) -> None:
     assert not {"proj:code", "proj:wkt2"} & set(group.attrs)
 
 
-def test_damage_is_named(tmp_path: Path) -> None:
-    """A store that is not there, and one whose grid mapping says nothing."""
+def test_load_geobox_refuses_a_damaged_store(tmp_path: Path) -> None:
+    """A missing store and an empty grid mapping each raise an error."""
     with pytest.raises(IncompleteStoreError, match="cannot be read"):
         load_geobox(tmp_path / "none.zarr")
     path = write(tmp_path / "a.zarr", box())
@@ -210,8 +210,8 @@ def test_damage_is_named(tmp_path: Path) -> None:
         load_geobox(path)
 
 
-def test_a_grid_without_a_crs_is_no_map() -> None:
-    """What has no CRS is refused."""
+def test_map_attributes_require_a_crs() -> None:
+    """A grid without a CRS raises PoseError."""
     with pytest.raises(PoseError, match="a map needs a CRS"):
         map_attributes(GeoBox(box().shape, box().affine, None))
 
@@ -232,13 +232,13 @@ def _drawn() -> tuple[np.ndarray, np.ndarray]:
     return classes, np.where(classes == 255, np.nan, rng.random(SHAPE)).astype(np.float32)
 
 
-def test_tiles_in_any_order_are_the_map_at_once(tmp_path: Path) -> None:
-    """Not a byte tells whether a map was written at once or in whole shards."""
+def test_class_map_tiles_equal_the_map_written_at_once(tmp_path: Path) -> None:
+    """Tiles of whole shards, in any order, give the same files byte by byte."""
     (classes, confidence), grid = _drawn(), AngularGrid(1e-4, SHAPE)
     write_class_map(tmp_path / "one.zarr", class_maps.ClassMap(classes, confidence, LEGEND.names, LEGEND.colours, grid))
     class_maps.create_class_map(tmp_path / "tiles.zarr", SHAPE, LEGEND, grid=grid)
     begun = class_maps.load_class_map(tmp_path / "tiles.zarr")
-    assert (begun.classes == 255).all()  # what is not written yet
+    assert (begun.classes == 255).all()  # unwritten tiles
     assert np.isnan(begun.confidence).all()
     for rows, columns in [((64, 150), (640, 700)), ((0, 64), (0, 700)), ((64, 150), (0, 640))]:
         part = np.s_[slice(*rows), slice(*columns)]
@@ -246,8 +246,8 @@ def test_tiles_in_any_order_are_the_map_at_once(tmp_path: Path) -> None:
     assert _contents(tmp_path / "one.zarr") == _contents(tmp_path / "tiles.zarr")
 
 
-def test_what_a_tile_lacks_is_told(tmp_path: Path) -> None:
-    """A class without a name, and a map that is not there."""
+def test_write_class_tile_refuses_wrong_input(tmp_path: Path) -> None:
+    """A class without a name and a map that does not exist are refused."""
     class_maps.create_class_map(tmp_path / "c.zarr", (20, 30), LEGEND)
     ones = np.ones((20, 30), np.uint8)
     with pytest.raises(ShapeError, match="class 2 is in the map, but only 2 classes have names"):
@@ -256,8 +256,8 @@ def test_what_a_tile_lacks_is_told(tmp_path: Path) -> None:
         class_maps.write_class_tile(tmp_path / "none.zarr", (0, 0), ones, ones.astype(np.float32))
 
 
-def test_classes_are_taken_from_pixels_and_from_no_other(tmp_path: Path) -> None:
-    """In whichever shards they lie; a map of which none is taken keeps its bytes."""
+def test_blank_pixels_clears_only_the_chosen_pixels(tmp_path: Path) -> None:
+    """The pixels may lie in any shard; if none is chosen, the files keep their bytes."""
     classes, confidence = _drawn()
     write_class_map(tmp_path / "m.zarr", class_maps.ClassMap(classes, confidence, LEGEND.names, LEGEND.colours))
     before, where = _contents(tmp_path / "m.zarr"), np.zeros(SHAPE, np.bool_)
@@ -273,7 +273,7 @@ def test_classes_are_taken_from_pixels_and_from_no_other(tmp_path: Path) -> None
 
 
 def test_class_map_round_trip(tmp_path: Path) -> None:
-    """Classes, names and colours come back; xarray reads the CF flags and keeps whole numbers, 255 for no class."""
+    """Classes, names and colours are read as written; xarray reads CF flags and whole numbers, 255 for no class."""
     classes = np.random.default_rng(0).integers(0, 3, (50, 70), dtype=np.uint8)
     classes[0, :9] = 255
     confidence = np.where(classes == 255, np.nan, 0.75).astype(np.float32)

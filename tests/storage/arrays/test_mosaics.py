@@ -1,4 +1,4 @@
-"""The stored mosaic: tiles of whole shards, scores and their spectra, coarser pixels, patches, refusals."""
+"""Stored mosaics: tiles, spectra in row blocks, captures and downsampled brightness."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ NM = np.linspace(400, 1000, 17)
 
 
 def writer(path: Path) -> MosaicWriter:
-    """An empty mosaic of two bands, two shards down and three across."""
+    """Return an empty mosaic of two bands, two shards down and three across."""
     return plain_writer(path, SHAPE, np.array([500.0, 600.0]))
 
 
 def test_tiles_and_rows_store_the_same(tmp_path: Path) -> None:
-    """Written in tiles, last ones first, or in rows, a mosaic reads back the same; shards that never came are NaN."""
+    """Tiles in reverse order read the same as rows; tiles that were never written are NaN."""
     rng = np.random.default_rng(3)
     values, coverage = rng.normal(size=(*SHAPE, 2)).astype(np.float32), rng.integers(0, 3, SHAPE)
     rows, tiles = writer(tmp_path / "rows.zarr"), writer(tmp_path / "tiles.zarr")
@@ -40,8 +40,8 @@ def test_tiles_and_rows_store_the_same(tmp_path: Path) -> None:
     assert np.isnan(other.values()[coverage == 0]).all()
 
 
-def test_each_pixel_keeps_its_capture_of_hundreds_of_sweeps(tmp_path: Path) -> None:
-    """Sweeps of the same exposure and spacing are one kind; there may be more kinds than a byte holds."""
+def test_pixels_keep_their_capture_among_hundreds_of_sweeps(tmp_path: Path) -> None:
+    """Sweeps of equal exposure and line spacing are one kind; 300 kinds, more than a byte holds, are kept."""
     first, later = (0.1, 4.0), (0.5, 1.0)
     number = np.tile(np.arange(SHAPE[1]) % 300, (SHAPE[0], 1))
     writer(tmp_path / "mosaic.zarr").write_captures([first] * 16 + [later] * 284, number)
@@ -54,7 +54,7 @@ def test_each_pixel_keeps_its_capture_of_hundreds_of_sweeps(tmp_path: Path) -> N
 
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory: pytest.TempPathFactory) -> Stored:
-    """A stored mosaic of 150 x 90 px, a part of it not seen, and its values."""
+    """Return the path and values of a stored mosaic of 150 x 90 px, a part of it not captured."""
     path = tmp_path_factory.mktemp("mosaic") / "mosaic.zarr"
     values = np.random.default_rng(0).random((150, 90, len(NM)), np.float32)
     values[:19, :29] = np.nan
@@ -65,8 +65,8 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Stored:
     ("rows", "columns", "heights"),
     [(*np.s_[:, :], [64, 64, 22]), (*np.s_[10:130, 5:60], [54, 64, 2]), (*np.s_[70:71, :1], [1])],
 )
-def test_strips_make_the_window(stored: Stored, rows: slice, columns: slice, heights: list[int]) -> None:
-    """They end where shards do, and together are what is stored there."""
+def test_row_blocks_cover_the_window(stored: Stored, rows: slice, columns: slice, heights: list[int]) -> None:
+    """Blocks end at shard boundaries; together they equal the stored values of the window."""
     mosaic = open_mosaic(stored[0])
     strips = [mosaic.spectra(strip) for strip in mosaic.row_blocks(rows, columns)]
     assert [len(strip) for strip in strips] == heights
@@ -75,7 +75,7 @@ def test_strips_make_the_window(stored: Stored, rows: slice, columns: slice, hei
 
 @pytest.mark.parametrize("factor", [1, 2, 4])
 def test_brightness_is_the_mean_over_bands(stored: Stored, factor: int) -> None:
-    """Of the pixels that were seen, also at the edges; NaN where these are fewer than half."""
+    """The mean is over captured pixels, also at the edges; it is NaN where these are fewer than half."""
     found, (height, width) = open_mosaic(stored[0]).brightness(factor), stored[1].shape[:2]
     expected = np.full((-(-height // factor), -(-width // factor)), np.nan)
     for y, x in np.ndindex(expected.shape):
@@ -85,8 +85,8 @@ def test_brightness_is_the_mean_over_bands(stored: Stored, factor: int) -> None:
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
-def test_a_store_is_opened_once_and_again_where_another_takes_its_place(tmp_path: Path) -> None:
-    """As when `verify --repair` makes it anew."""
+def test_an_opened_mosaic_is_cached_until_it_is_replaced(tmp_path: Path) -> None:
+    """`verify --repair` replaces a store by a new one at the same path."""
     path = tmp_path / "mosaic.zarr"
     writer(path)
     first = open_mosaic(path)

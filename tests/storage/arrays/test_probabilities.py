@@ -1,4 +1,4 @@
-"""What is believed of a field, stored in bytes and read back, by this project and by xarray."""
+"""Class probabilities of a field: packed in bytes, and read back by this project and by xarray."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SHAPE = (70, 50)
 
 
 def drawn(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Probabilities of three classes and ages, some of them unknown, and light, some of it none."""
+    """Return log probabilities of three classes, ages and light: some are unknown, and some light is 0."""
     rng = np.random.default_rng(seed)
     logits = rng.normal(0, 2, (*SHAPE, 3))
     values = (logits - np.log(np.exp(logits).sum(axis=-1, keepdims=True))).astype(np.float32)
@@ -30,7 +30,7 @@ def drawn(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def stored(path: Path, seed: int = 0) -> Path:
-    """A class probabilities of two tiles."""
+    """Store class probabilities of two tiles, and return their path."""
     values, ages, light = drawn(seed)
     class_maps.create_probabilities(path, SHAPE, LEGEND)
     for top, bottom in ((0, 64), (64, 70)):
@@ -40,8 +40,8 @@ def stored(path: Path, seed: int = 0) -> Path:
     return path
 
 
-def test_visits_of_every_hour_do_not_stop_the_clock(tmp_path: Path) -> None:
-    """Three days of them make a pixel three days older, and its light fades by the hour."""
+def test_hourly_visits_add_up_in_age_and_light(tmp_path: Path) -> None:
+    """After 72 hourly visits a pixel is three days older, and its light has faded by 0.998 per visit."""
     values, age, light = drawn(0)
     age, light = np.zeros_like(age), np.ones_like(light)
     class_maps.create_probabilities(tmp_path / "visits.zarr", SHAPE, LEGEND)
@@ -56,8 +56,8 @@ def test_visits_of_every_hour_do_not_stop_the_clock(tmp_path: Path) -> None:
 
 
 @given(seed=st.integers(0, 2**16))
-def test_what_is_read_was_written_within_half_a_step(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
-    """The likeliest class stays where no other is within a step; ages and light stay as they are, NaN where unknown."""
+def test_probabilities_round_trip_within_their_step(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
+    """The likeliest class stays where it leads by a step; values stay within 1.5 steps; ages and light are kept."""
     path = stored(tmp_path_factory.mktemp("class_probabilities") / "class_probabilities.zarr", seed)
     values, ages, light = drawn(seed)
     found, days, shown = class_maps.ProbabilityStore(path).read()
@@ -75,13 +75,13 @@ def test_what_is_read_was_written_within_half_a_step(tmp_path_factory: pytest.Te
     np.testing.assert_allclose(found[known][~told], class_maps.UNLIKELY, atol=class_maps.STEP)
 
 
-def test_the_faintest_probabilities_is_the_faintest_that_is_stored() -> None:
-    """Models and stores import nothing of each other, and mean the same least probability."""
+def test_models_and_stores_have_the_same_faintest_value() -> None:
+    """The two packages do not import each other, so each defines the constant."""
     assert class_maps.FAINTEST == FAINTEST_BELIEVED
 
 
-def test_a_part_is_read_alone(tmp_path: Path) -> None:
-    """Some rows and columns are those of the whole."""
+def test_a_window_equals_that_part_of_the_whole(tmp_path: Path) -> None:
+    """Some rows and columns are read alone; shape and class names are those of the whole store."""
     store = class_maps.ProbabilityStore(stored(tmp_path / "class_probabilities.zarr"))
     whole, part = store.read(), store.read(slice(10, 66), slice(7, 9))
     for one, other in zip(whole, part, strict=True):
@@ -90,8 +90,8 @@ def test_a_part_is_read_alone(tmp_path: Path) -> None:
     assert store.legend.names == LEGEND.names
 
 
-def test_xarray_unpacks_it(tmp_path: Path) -> None:
-    """Probabilities and days come as numbers by CF's packing, with a missing value where nothing is known."""
+def test_xarray_unpacks_probabilities(tmp_path: Path) -> None:
+    """Probabilities and days are packed by CF's rules; unknown pixels are NaN."""
     path = stored(tmp_path / "class_probabilities.zarr")
     opened = xr.open_zarr(path, consolidated=False)
     values, ages, light = drawn(0)
@@ -104,8 +104,8 @@ def test_xarray_unpacks_it(tmp_path: Path) -> None:
     np.testing.assert_allclose(opened.age.values[3:].astype(float), ages[3:], rtol=1e-6)
 
 
-def test_changes_are_there_once_written(tmp_path: Path) -> None:
-    """A first visit has none."""
+def test_changes_are_none_until_they_are_written(tmp_path: Path) -> None:
+    """A first visit has no changes; a later one has them after `write_changes`."""
     assert class_maps.ProbabilityStore(stored(tmp_path / "first.zarr")).changes() is None
     path, old = gone_on(tmp_path / "later.zarr")
     assert class_maps.ProbabilityStore(path).changes() is None
@@ -116,7 +116,7 @@ def test_changes_are_there_once_written(tmp_path: Path) -> None:
 
 
 def gone_on(path: Path) -> tuple[Path, np.ndarray]:
-    """A class probabilities that goes on from an earlier one, and what some of its pixels were."""
+    """Store probabilities that continue an earlier visit; return their path and the pixels' old classes."""
     old = np.random.default_rng(1).choice(np.array([0, 2, 255], np.uint8), SHAPE)
     class_maps.create_probabilities(path, SHAPE, LEGEND, goes_on=True)
     for top, bottom in ((0, 64), (64, 70)):
@@ -124,8 +124,8 @@ def gone_on(path: Path) -> tuple[Path, np.ndarray]:
     return path, old
 
 
-def test_what_pixels_were_is_kept_with_its_names(tmp_path: Path) -> None:
-    """Written in tiles; plain xarray reads whole numbers and CF flags, 255 where nothing changed."""
+def test_old_classes_are_stored_with_their_names(tmp_path: Path) -> None:
+    """Tiles of old classes are read by plain xarray as whole numbers with CF flags, 255 where nothing changed."""
     path, old = gone_on(tmp_path / "class_probabilities.zarr")
     np.testing.assert_array_equal(class_maps.ProbabilityStore(path).old_class(), old)
     with xr.open_zarr(path, consolidated=False) as opened:
@@ -136,8 +136,8 @@ def test_what_pixels_were_is_kept_with_its_names(tmp_path: Path) -> None:
         assert found.attrs["nodata"] == 255
 
 
-def test_a_first_probabilities_has_nothing_that_pixels_were(tmp_path: Path) -> None:
-    """Nor has one that goes on from none after all; tiles of either are refused."""
+def test_a_first_visit_has_no_old_classes(tmp_path: Path) -> None:
+    """A later visit has none after `drop_changes`; both refuse tiles of old classes."""
     first, (dropped, old) = stored(tmp_path / "first.zarr"), gone_on(tmp_path / "dropped.zarr")
     class_maps.drop_changes(dropped)
     for path in (first, dropped):
@@ -147,8 +147,8 @@ def test_a_first_probabilities_has_nothing_that_pixels_were(tmp_path: Path) -> N
     assert not list(dropped.rglob("*changed_from*"))
 
 
-def test_a_store_that_is_not_there_is_refused(tmp_path: Path) -> None:
-    """By its place."""
+def test_missing_and_outdated_probabilities_are_refused(tmp_path: Path) -> None:
+    """A store whose light is packed in bytes has to be computed again by `reprocess`."""
     with pytest.raises(IncompleteStoreError, match="cannot be read"):
         class_maps.ProbabilityStore(tmp_path / "none.zarr")
     write_image(
@@ -158,8 +158,8 @@ def test_a_store_that_is_not_there_is_refused(tmp_path: Path) -> None:
         class_maps.ProbabilityStore(tmp_path / "old.zarr")
 
 
-def test_certainty_is_not_mistaken_for_nothing(tmp_path: Path) -> None:
-    """A probability of 1 is stored below the byte that stands for nothing known."""
+def test_a_probability_of_1_is_not_read_as_unknown(tmp_path: Path) -> None:
+    """A probability of 1 is stored below 255, the byte for unknown."""
     path = tmp_path / "class_probabilities.zarr"
     class_maps.create_probabilities(path, (4, 4), LEGEND)
     sure = np.full((4, 4, 3), -50.0, np.float32)

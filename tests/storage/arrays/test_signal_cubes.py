@@ -1,4 +1,4 @@
-"""A condensed sweep comes back as it was stored, any reader restores its spectra, a flipped bit is never a number."""
+"""Condensed sweeps are read as stored, zarr and xarray restore their spectra, and flipped bits raise errors."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SHAPE, BANDS, RARE = (130, 70), 24, [(2, 3), (64, 69), (129, 0)]
 
 
 def lines_of(bands: int = BANDS, signal: float = 30.0) -> MadeLines:
-    """Lines of 3 materials with some rare spectra."""
+    """Return lines of three materials with three rare spectra."""
     raw = raw_of(field_of(4, SHAPE, bands, materials=min(3, bands), signal=signal).values)
     rng = np.random.default_rng(3)
     for line, sample in RARE:  # each of its own kind
@@ -60,14 +60,14 @@ def store(
 
 
 def common(cube: signal_cubes.SignalCube) -> NDArray[np.bool_]:
-    """Spectra that are not rare, (line, sample)."""
+    """Return a mask of the spectra that are not rare, (line, sample)."""
     found = np.ones(cube.shape[:2], np.bool_)
     found[cube.rare] = False
     return found
 
 
-def test_what_is_stored_comes_back(tmp_path: Path) -> None:
-    """The sweep, line facts, references, wavelengths, components, rare spectra and the step are as they were."""
+def test_condensed_sweep_round_trip(tmp_path: Path) -> None:
+    """Sweep, line positions and times, references, step and places of rare spectra are as written."""
     lines = lines_of()
     cube, done = store(tmp_path / "fine-0.zarr", lines, step=0.5)
     assert (cube.sweep, cube.source, cube.started, cube.step) == (lines.sweep, "sim", "2026-05-01T10:00:00", 0.5)
@@ -84,7 +84,7 @@ def test_what_is_stored_comes_back(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("step", [0.5, 1.0])
 def test_plain_zarr_restores_the_spectra(tmp_path: Path, step: float) -> None:
-    """Three lines of numpy give what `spectra` gives, to the last bit, but for the rare ones."""
+    """Three lines of numpy equal `spectra` to the last bit, except for the rare spectra."""
     cube, _ = store(tmp_path / "fine-0.zarr", lines_of(), step=step)
     group = zarr.open_group(tmp_path / "fine-0.zarr", mode="r")
     scores, axes, mean = (np.asarray(group[name][...], np.float32) for name in ("scores", "axes", "mean"))
@@ -95,7 +95,7 @@ def test_plain_zarr_restores_the_spectra(tmp_path: Path, step: float) -> None:
 
 
 def test_xarray_restores_the_spectra(tmp_path: Path) -> None:
-    """Opened with names and coordinates, scores in deviations of the noise; one line more adds the rare spectra."""
+    """Scores are in standard deviations of the noise; one more line of code adds the rare residuals."""
     cube, _ = store(tmp_path / "fine-0.zarr", lines_of(), step=0.5)
     with xr.open_zarr(tmp_path / "fine-0.zarr", consolidated=False) as data:
         assert data["scores"].dims == ("component", "line", "sample")
@@ -107,8 +107,8 @@ def test_xarray_restores_the_spectra(tmp_path: Path) -> None:
     np.testing.assert_allclose(spectra, cube.spectra(0, 130), atol=1e-5)
 
 
-def test_rare_spectra_come_back(tmp_path: Path) -> None:
-    """Wherever the lines are read from, rare ones lie within a quarter of the noise of the raw ones."""
+def test_rare_spectra_are_restored(tmp_path: Path) -> None:
+    """From any block of lines, they lie within a quarter of the noise of the raw spectra."""
     lines = lines_of()
     cube, _ = store(tmp_path / "fine-0.zarr", lines)
     values, _ = calibrate(lines.raw, lines.references, saturated_dn=4095)
@@ -118,8 +118,8 @@ def test_rare_spectra_come_back(tmp_path: Path) -> None:
             assert np.abs(off / cube.components.noise).max() <= RESIDUAL_STEP / 2 + 1e-3
 
 
-def test_windows_are_parts_of_the_whole(tmp_path: Path) -> None:
-    """Scores of some lines and samples are those of all, cut."""
+def test_read_window_equals_that_part_of_the_whole(tmp_path: Path) -> None:
+    """Scores of some lines and samples equal that part of all scores."""
     cube, _ = store(tmp_path / "fine-0.zarr", lines_of())
     whole = cube.read()
     assert whole.dtype == np.int16
@@ -127,8 +127,8 @@ def test_windows_are_parts_of_the_whole(tmp_path: Path) -> None:
     np.testing.assert_array_equal(cube.read(127), whole[127:])
 
 
-def test_no_line_of_the_store_differs(tmp_path: Path) -> None:
-    """Raw lines and what is read from the disk agree, and one score altered there is found."""
+def test_differing_lines_finds_an_altered_score(tmp_path: Path) -> None:
+    """The stored lines agree with the raw lines until a score of line 99 is altered."""
     lines = lines_of()
     cube, _ = store(tmp_path / "fine-0.zarr", lines)
     assert differing_lines(lines, cube, CAMERA) == []
@@ -144,8 +144,8 @@ READS: dict[str, Callable[[signal_cubes.SignalCube], object]] = {
 
 
 @pytest.mark.parametrize("name", READS)
-def test_a_flipped_bit_is_named(tmp_path: Path, name: str) -> None:
-    """A bit that rots in an array is an error that names it, never another number."""
+def test_a_flipped_bit_raises_an_error(tmp_path: Path, name: str) -> None:
+    """The error names the damaged array; no wrong number is returned."""
     lines = lines_of()
     lines.raw[9, 9] = 4095
     store(tmp_path / "fine-0.zarr", lines)
@@ -156,7 +156,7 @@ def test_a_flipped_bit_is_named(tmp_path: Path, name: str) -> None:
 
 
 def test_a_store_that_was_not_closed_is_incomplete(tmp_path: Path) -> None:
-    """Without line facts there is no sweep."""
+    """Before it is closed a store lacks the line facts, without which a sweep cannot be opened."""
     lines = lines_of()
     header = SweepHeader(lines.sweep, lines.references, np.linspace(400, 1000, BANDS))
     signal_cubes.SignalCubeWriter(tmp_path / "a.zarr", header, Components.empty(BANDS), step=1.0, largest=1.0)
@@ -165,8 +165,8 @@ def test_a_store_that_was_not_closed_is_incomplete(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("by_mirror", [False, True])
-def test_restored_lines_are_raw_numbers(tmp_path: Path, by_mirror: bool) -> None:
-    """They lie within the noise of the raw ones, nearer to what they would be without noise; rare ones within 2 DN."""
+def test_restored_lines_are_close_to_raw_lines(tmp_path: Path, by_mirror: bool) -> None:
+    """Errors stay below 6 standard deviations, and 3.5 DN in rare spectra; the noise falls by half or more."""
     made, lines = field_of(4, SHAPE, BANDS), MadeLines.of(lines_of().raw, by_mirror=by_mirror)
     light = mirror_throughput(lines.position)[:, None, None] if by_mirror else 1.0
     raw = np.rint((lines.raw.astype(float) - DARK) * light + DARK).astype(np.uint16)
@@ -188,7 +188,7 @@ def test_restored_lines_are_raw_numbers(tmp_path: Path, by_mirror: bool) -> None
 
 
 def test_restored_lines_count_unusable_spectra_as_saturated(tmp_path: Path) -> None:
-    """A spectrum saturated in all bands is the largest number in all of them, and calibrates as unusable again."""
+    """A spectrum saturated in all bands is restored as 65535 in each, and calibrates as unusable again."""
     lines = lines_of()
     lines.raw[7, 9] = 4095
     store(tmp_path / "fine-0.zarr", lines)
@@ -199,7 +199,7 @@ def test_restored_lines_count_unusable_spectra_as_saturated(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("bands", [1, 2, 8])
-def test_few_bands_take_no_more_bytes_than_raw_numbers(tmp_path: Path, bands: int) -> None:
+def test_few_bands_take_fewer_bytes_than_raw_numbers(tmp_path: Path, bands: int) -> None:
     """All components of 1 to 8 bands are kept, and stored scores are smaller than the numbers as uint16."""
     cube, _ = store(tmp_path / "fine-0.zarr", lines_of(bands))
     assert cube.shape[2] == bands
@@ -208,7 +208,7 @@ def test_few_bands_take_no_more_bytes_than_raw_numbers(tmp_path: Path, bands: in
 
 
 def test_lines_without_light_are_stored(tmp_path: Path) -> None:
-    """No component and no usable spectrum: every spectrum is NaN, and restored lines are saturated."""
+    """There is no component and no usable spectrum: spectra are NaN, and restored lines are saturated."""
     lines = lines_of()
     lines = replace(lines, references=replace(lines.references, white=lines.references.dark))
     cube, _ = store(tmp_path / "fine-0.zarr", lines)
@@ -221,7 +221,7 @@ def test_lines_without_light_are_stored(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("largest", "kind"), [(LARGEST_SHORT, "int16"), (LARGEST_SHORT + 1, "int32")])
 def test_scores_beyond_16_bits_are_stored_in_32(tmp_path: Path, largest: float, kind: str) -> None:
-    """What the largest score may be says the type, and either gives back what was written."""
+    """The largest possible score selects the type; both types store the rounded scores exactly."""
     lines = lines_of()
     header = SweepHeader(lines.sweep, lines.references, np.linspace(400, 1000, BANDS))
     axes = np.eye(2, BANDS)
@@ -241,8 +241,8 @@ def test_scores_beyond_16_bits_are_stored_in_32(tmp_path: Path, largest: float, 
     np.testing.assert_array_equal(off[2:], steps[0, 2:] * RESIDUAL_STEP)
 
 
-def test_a_score_beyond_its_type_is_cut_off_and_does_not_wrap(tmp_path: Path) -> None:
-    """A score that the bound did not foresee is the largest of its sign, which a comparison with raw lines tells."""
+def test_a_score_beyond_its_type_is_clipped(tmp_path: Path) -> None:
+    """A score above the expected bound keeps its sign; it does not wrap around."""
     lines = lines_of()
     header = SweepHeader(lines.sweep, lines.references, np.linspace(400, 1000, BANDS))
     components = Components(np.zeros(BANDS), np.eye(1, BANDS), np.ones(BANDS))

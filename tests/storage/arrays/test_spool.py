@@ -1,4 +1,4 @@
-"""Lines come back as written; a torn tail is cut off, a damaged line is lost alone."""
+"""Spooled lines are read as written; a truncated tail is cut off, and a damaged line harms no other."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ def _wrong(spool: Spool) -> list[int]:
     return [a.number for a, b in pairs if (a.data != b.data).any() or replace(a, data=b.data) != b]
 
 
-def test_lines_come_back_in_blocks(tmp_path: Path) -> None:
-    """150 lines are blocks of 64, 64 and 22, each line with all its facts."""
+def test_spooled_lines_are_read_in_blocks_of_64(tmp_path: Path) -> None:
+    """150 lines give blocks of 64, 64 and 22, each line with all its facts."""
     for count in (10, 12, 150):  # interrupted, and continued
         _fill(tmp_path, count)
     with _open(tmp_path) as spool:
@@ -54,8 +54,8 @@ def test_lines_come_back_in_blocks(tmp_path: Path) -> None:
         assert _wrong(spool) == []
 
 
-def test_every_64th_line_waits_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The file is synced at lines 64 and 128: a power cut loses fewer than 64 lines."""
+def test_spool_syncs_after_every_64_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The file is synced at lines 64 and 128 of 130: a power cut loses fewer than 64 lines."""
     synced_at: list[int] = []
     with _open(tmp_path) as spool:
         real = os.fdatasync
@@ -66,8 +66,8 @@ def test_every_64th_line_waits_for_the_disk(tmp_path: Path, monkeypatch: pytest.
 
 
 @pytest.mark.parametrize("cut", [1, 30, RECORD - 1, RECORD, RECORD + 1, 3 * RECORD])
-def test_a_torn_tail_is_cut_off(tmp_path: Path, cut: int) -> None:
-    """Whatever part of the last lines is lost, the whole lines before it are kept and the capture continues."""
+def test_a_truncated_tail_is_cut_off(tmp_path: Path, cut: int) -> None:
+    """Whole lines before the cut are kept, and the capture continues after them."""
     _fill(tmp_path, 8)
     before = (tmp_path / "lines.lines").read_bytes()
     os.truncate(tmp_path / "lines.lines", len(before) - cut)
@@ -81,10 +81,10 @@ def test_a_torn_tail_is_cut_off(tmp_path: Path, cut: int) -> None:
 @pytest.mark.parametrize(
     ("damaged", "lost", "count"), [([0], [0], 128), ([3, 63], [3, 63], 128), ([64], [], 64), ([5, 127], [5], 127)]
 )
-def test_a_damaged_line_is_lost_alone(
+def test_a_damaged_line_harms_no_other_line(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, damaged: list[int], lost: list[int], count: int
 ) -> None:
-    """Before the last sync it is named and not valid, all others stay; behind it the capture continues there."""
+    """Before the last sync the line is reported and invalid; after it the capture continues from that line."""
     _fill(tmp_path, 128)  # the second sync may not have ended
     for number in damaged:
         flip(tmp_path / "lines.lines", (number - 128) * RECORD + 7 * number % RECORD)
@@ -96,30 +96,30 @@ def test_a_damaged_line_is_lost_alone(
     assert all(str(number) in caplog.text for number in lost)
 
 
-def test_a_damaged_header_costs_no_line(tmp_path: Path) -> None:
-    """Records continue the header's checksum: lines of this capture are known without it, others are not taken."""
+def test_a_damaged_header_loses_no_line(tmp_path: Path) -> None:
+    """Records continue the header's checksum, which identifies this capture's lines; a broken header alone has none."""
     _fill(tmp_path, 6)
     before = (tmp_path / "lines.lines").read_bytes()
     flip(tmp_path / "lines.lines", 30)
     with _open(tmp_path) as spool:
         assert spool.count == 6
     assert (tmp_path / "lines.lines").read_bytes() == before
-    for left in (b"", b'{"samp', bytes(100)):  # by a crash while it was begun
+    for left in (b"", b'{"samp', bytes(100)):  # by a crash at the start of a capture
         (tmp_path / "lines.lines").write_bytes(left)
         with _open(tmp_path) as spool:
             assert spool.count == 0
 
 
 def test_lines_of_another_capture_are_not_continued(tmp_path: Path) -> None:
-    """Another header begins anew."""
+    """With another header or band count the spool begins at line 0."""
     _fill(tmp_path, 70)
     for bands, header in ((4, {**HEADER, "seed": 4}), (5, HEADER)):
         with Spool.open(tmp_path, 6, bands, header=header) as spool:
             assert spool.count == 0
 
 
-def test_lines_come_in_order_and_of_one_size(tmp_path: Path) -> None:
-    """A line with another number or shape is refused, and so is a file where the folder should be."""
+def test_spool_refuses_a_wrong_line_number_or_shape(tmp_path: Path) -> None:
+    """A file in place of the folder is refused as well."""
     (tmp_path / "file").write_text("x")
     with pytest.raises(RigError, match="cannot write line 0"):
         _open(tmp_path / "file")
@@ -130,8 +130,8 @@ def test_lines_come_in_order_and_of_one_size(tmp_path: Path) -> None:
             spool.append(_line(0, samples=5))
 
 
-def test_a_full_disk_keeps_the_lines_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The disk takes half a line and refuses: the message counts what is kept, and the capture can go on at once."""
+def test_a_full_disk_keeps_earlier_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The disk takes part of a line: the error counts the kept lines, and the capture can continue at once."""
     _fill(tmp_path, 5)
     real = os.write
 

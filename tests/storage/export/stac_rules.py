@@ -1,8 +1,8 @@
-"""What the documentation of STAC's extensions asks of the fields that are written here, in schemas made by hand.
+"""Checks of exported STAC items: handwritten schemas of the extension fields, and STAC's own core schemas.
 
-The extensions' own schemas lie on a server and come with no package. These hold what their documentation says of the
-fields that an export writes: names, types, ranges, which belong together. They do not hold: fields that are not
-written here, collections' summaries, and whatever the official schemas say beyond their documentation.
+The extensions' official schemas lie on a server and come with no package. The schemas here follow the extensions'
+documentation for each exported field: name, type, range, and fields that need each other. They leave out
+fields that are not exported, collections' summaries, and rules that only the official schemas have.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ PLACES = {  # where the fields of each extension may stand in an item
 
 
 def extension_problems(item: Mapping[str, Any]) -> list[str]:
-    """What is wrong with the fields of extensions in one item; empty where nothing."""
+    """Return the problems of the extension fields in one item; empty if there are none."""
     return list(_problems(item))
 
 
@@ -71,7 +71,7 @@ def _tables(item: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, An
 
 
 def _together(table: Mapping[str, Any]) -> Iterator[str]:
-    """Fields that need each other."""
+    """Yield problems of fields that need each other."""
     if "proj:bbox" in table and table.get("proj:code") is None and table.get("proj:wkt2") is None:
         yield "proj:bbox without a CRS"
     box, transform, shape = (table.get(f"proj:{name}") for name in ("bbox", "transform", "shape"))
@@ -83,7 +83,7 @@ def _together(table: Mapping[str, Any]) -> Iterator[str]:
 
 
 def core_problems(path: Path) -> list[str]:
-    """Return what STAC's own schemas, which pystac brings, say of an item or a collection."""
+    """Return the problems of an item or a collection by STAC's core schemas, which pystac brings."""
     content, schemas = json.loads(path.read_text(encoding="utf-8")), get_local_schema_cache()
     known = Registry().with_resources([(name, Resource.from_contents(schema)) for name, schema in schemas.items()])
     kind = "collection" if content.get("type") == "Collection" else "item"
@@ -93,7 +93,7 @@ def core_problems(path: Path) -> list[str]:
 
 
 def is_cog(path: Path) -> bool:
-    """Tell whether GDAL finds the layout of a cloud-optimised file, with overviews down to one tile of 512 px."""
+    """Return whether GDAL finds the layout of a cloud-optimised file, with overviews down to one tile of 512 px."""
     with rasterio.open(path) as file:
         levels = [1, *file.overviews(1)]
         tiled = file.profile.get("tiled") or max(file.shape) <= 512

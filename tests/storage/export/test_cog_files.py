@@ -1,4 +1,4 @@
-"""Cloud-optimised GeoTIFFs: what rasterio reads of them, their layout, and that only whole files get a name."""
+"""Cloud-optimised GeoTIFFs: rasterio reads them as written, with their layout; only whole files get a name."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ FEW = (90, 70)
 
 
 def on_map(shape: tuple[int, int], crs: str = "EPSG:32632") -> GeoBox:
-    """A grid of 0.5 m somewhere in Germany."""
+    """Return a grid of 0.5 m somewhere in Germany."""
     height, width = (size / 2 for size in shape)
     return GeoBox.from_bbox((500000, 5770000, 500000 + width, 5770000 + height), crs=crs, resolution=0.5)
 
 
 def classes_of(shape: tuple[int, int]) -> NDArray[np.uint8]:
-    """Blocks of three classes, some pixels of none."""
+    """Return blocks of three classes, with 10 % of the pixels unlabelled."""
     rng = np.random.default_rng(4)
     small = rng.integers(0, 3, (-(-shape[0] // 20), -(-shape[1] // 20)), dtype=np.uint8)
     found = np.kron(small, np.ones((20, 20), np.uint8))[: shape[0], : shape[1]]
@@ -46,25 +46,25 @@ def classes_of(shape: tuple[int, int]) -> NDArray[np.uint8]:
 
 
 def rows_of(values: NDArray[Any]) -> Iterator[tuple[int, NDArray[Any]]]:
-    """The image in blocks of 64 rows."""
+    """Yield the image in blocks of 64 rows."""
     for first in range(0, len(values), 64):
         yield first, values[first : first + 64]
 
 
 def class_image(geobox: GeoBox) -> CogImage:
-    """Return a file of classes."""
+    """Return the description of a file of classes."""
     return CogImage(geobox, "uint8", ("class",), UNLABELLED, LEGEND, {"run": "r1"})
 
 
-def test_ctrl_c_while_gdal_is_imported_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The next import of the package succeeds without the modules that the first had loaded."""
+def test_ctrl_c_during_the_import_of_gdal_is_raised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A second import succeeds without the modules that the first had loaded; this must not hide the interrupt."""
     monkeypatch.setattr(importlib, "import_module", Mock(side_effect=[KeyboardInterrupt, ModuleType("rasterio")]))
     with pytest.raises(KeyboardInterrupt):
         write_cog(tmp_path / "a.tif", class_image(on_map(FEW, "EPSG:32632")), [])
 
 
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:25832", "EPSG:3035", "EPSG:32733"])
-def test_rasterio_reads_what_was_written(tmp_path: Path, crs: str) -> None:
+def test_rasterio_reads_values_and_tags_as_written(tmp_path: Path, crs: str) -> None:
     """Values, CRS, transform, nodata, band names and tags of a map are those given."""
     values, box = classes_of(FEW), on_map(FEW, crs)
     write_cog(tmp_path / "a.tif", class_image(box), rows_of(values))
@@ -78,7 +78,7 @@ def test_rasterio_reads_what_was_written(tmp_path: Path, crs: str) -> None:
 
 @pytest.mark.parametrize("dtype", ["uint8", "float32", "float64"])
 def test_a_large_image_is_cloud_optimised(tmp_path: Path, dtype: str) -> None:
-    """Tiles, halving overviews down to one tile, directories first: every check passes, also with three bands."""
+    """GDAL finds the COG layout with three bands: tiles of 512 px, and halving overviews down to one tile."""
     values = np.random.default_rng(1).integers(0, 200, (1100, 600, 3)).astype(dtype)
     image = CogImage(angular_geobox(GRID, (1100, 600)), dtype, ("r", "g", "b"), 0)
     write_cog(tmp_path / "a.tif", image, rows_of(values))
@@ -89,8 +89,8 @@ def test_a_large_image_is_cloud_optimised(tmp_path: Path, dtype: str) -> None:
         assert file.block_shapes[0] == (512, 512)
 
 
-def test_overviews_of_classes_are_no_mean_of_colours(tmp_path: Path) -> None:
-    """The commonest class: three white pixels and a black one are white, though grey is nearer to their mean."""
+def test_overviews_of_classes_show_the_commonest_class(tmp_path: Path) -> None:
+    """Three white pixels and a black one give white, though grey is nearer to the mean of their colours."""
     greys = ClassNames(("black", "grey", "white"), np.repeat(np.array([[0], [180], [255]], "u1"), 3, axis=1))
     values = np.tile(np.array([[0, 2], [2, 2]], np.uint8), (300, 280))
     image = replace(class_image(on_map(values.shape)), legend=greys)
@@ -99,7 +99,7 @@ def test_overviews_of_classes_are_no_mean_of_colours(tmp_path: Path) -> None:
         assert set(np.unique(file.read(1))) == {2}
 
 
-def test_confidence_of_overviews_leaves_out_what_is_not_known(tmp_path: Path) -> None:
+def test_overviews_of_confidence_ignore_nan(tmp_path: Path) -> None:
     """The mean of two known pixels and two NaN is the mean of the known."""
     values = np.full((1300, 1100), 0.25, np.float32)
     values[1::2] = np.nan
@@ -110,7 +110,7 @@ def test_confidence_of_overviews_leaves_out_what_is_not_known(tmp_path: Path) ->
 
 
 def test_classes_have_colours_and_names(tmp_path: Path) -> None:
-    """Colour table, tags, and GDAL's own category names, which a VRT made by GDAL repeats."""
+    """The file has a colour table, tags, and GDAL's own category names, which a VRT made by GDAL repeats."""
     write_cog(tmp_path / "a.tif", class_image(on_map(FEW)), rows_of(classes_of(FEW)))
     with rasterio.open(tmp_path / "a.tif") as file:
         table, tags = file.colormap(1), file.tags(1)
@@ -123,8 +123,8 @@ def test_classes_have_colours_and_names(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kept", [0.0, 0.3, 0.9])
-def test_a_file_that_the_disk_cut_gets_no_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept: float) -> None:
-    """What does not read back as it was given is an error, whatever GDAL said while it wrote."""
+def test_a_truncated_file_gets_no_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept: float) -> None:
+    """A file that does not read back as written is an error, even if GDAL reported none."""
     module = importlib.import_module("rasterio.shutil")
     whole = module.copy
 

@@ -1,4 +1,4 @@
-"""ENVI files bit for bit through this project, Spectral Python (SPy) and rasterio; never a pair that is none."""
+"""ENVI files are equal bit by bit in this project, Spectral Python (SPy) and rasterio; broken pairs are refused."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from storage.readers.envi_files import EnviCube, open_envi_cube
 pytest.importorskip("spectral", reason="SPy is the oracle: pip install spectral")
 envi = pytest.importorskip("spectral.io.envi", reason="SPy is the oracle: pip install spectral")
 
-# SPy says so of keys as ENVI has them
+# SPy warns of ENVI's own keys
 pytestmark = pytest.mark.filterwarnings("ignore:Parameters with non-lowercase names")
 ORDERS = {"little": "<", "big": ">"}
 CODES = sorted(DATA_TYPES)
@@ -33,7 +33,7 @@ NAMES = ["blue 1", "blue 2", "green", "edge", "last"]
 
 
 def numbers(code: int, seed: int = 0) -> NDArray[Any]:
-    """Random numbers over the whole range of an ENVI type, (line, sample, band); of those that float some are not."""
+    """Return random numbers over an ENVI type's whole range, (line, sample, band); floats include NaN and infinity."""
     kind, rng = np.dtype(DATA_TYPES[code]), np.random.default_rng(100 * code + seed)
     if kind.kind in "ui":
         return np.frombuffer(rng.bytes(int(np.prod(SHAPE)) * kind.itemsize), kind).reshape(SHAPE).copy()
@@ -43,19 +43,19 @@ def numbers(code: int, seed: int = 0) -> NDArray[Any]:
 
 
 def written_by_spy(folder: Path, code: int, interleave: str, order: str, **about: Any) -> tuple[Path, NDArray[Any]]:
-    """A header by SPy with a random cube beside it, and the cube."""
+    """Return a header that SPy wrote beside a random cube, and the cube."""
     values, header = numbers(code), folder / "a.hdr"
     envi.save_image(str(header), values, interleave=interleave, byteorder=order, ext=".img", metadata=about, force=True)
     return header, values
 
 
 def as_spy_reads(header: Path) -> NDArray[Any]:
-    """The numbers, (line, sample, band), without any factor that the header states."""
+    """Return the numbers, (line, sample, band), without any factor that the header states."""
     return np.asarray(envi.open(str(header)).open_memmap(interleave="bip"))
 
 
 def assert_same(found: EnviCube, values: NDArray[Any], code: int, order: str) -> None:
-    """Equal bit by bit, of the type and byte order asked for, and whole."""
+    """Check that values are equal bit by bit, of the type and byte order asked for, and without lost lines."""
     assert found.header.dtype == np.dtype(ORDERS[order] + DATA_TYPES[code])
     assert np.ascontiguousarray(found.values, values.dtype).tobytes() == values.tobytes()
     assert found.lost_lines == 0
@@ -64,8 +64,8 @@ def assert_same(found: EnviCube, values: NDArray[Any], code: int, order: str) ->
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("interleave", INTERLEAVES)
 @pytest.mark.parametrize("code", CODES)
-def test_what_spy_writes_is_read(tmp_path: Path, code: int, interleave: str, order: str) -> None:
-    """Every type, interleave and byte order: the numbers that SPy was given, with and without a header offset."""
+def test_envi_files_of_spy_are_read(tmp_path: Path, code: int, interleave: str, order: str) -> None:
+    """Every type, interleave and byte order is read exactly, with and without a header offset."""
     header, values = written_by_spy(tmp_path, code, interleave, order)
     assert_same(open_envi_cube(header), values, code, order)
     shifted(header, 37)
@@ -74,7 +74,7 @@ def test_what_spy_writes_is_read(tmp_path: Path, code: int, interleave: str, ord
 
 
 def shifted(header: Path, offset: int) -> None:
-    """Put bytes before the numbers, and say so in the header."""
+    """Put bytes before the numbers, and state the offset in the header."""
     data = header.with_suffix(".img")
     data.write_bytes(random.Random(1).randbytes(offset) + data.read_bytes())
     header.write_text(header.read_text().replace("header offset = 0", f"header offset = {offset}"))
@@ -82,8 +82,8 @@ def shifted(header: Path, offset: int) -> None:
 
 
 @pytest.mark.parametrize("code", CODES)
-def test_what_is_written_is_read(tmp_path: Path, code: int) -> None:
-    """Every type: SPy and this project read the numbers and bands again."""
+def test_spy_reads_written_envi_files(tmp_path: Path, code: int) -> None:
+    """For every type, SPy and this project read the same numbers, bands and description."""
     values, file = numbers(code), EnviFile(SHAPE, DATA_TYPES[code], np.array(NM), np.array(WIDTHS), "two {x}")
     data = write_envi(tmp_path / "a.hdr", file, in_blocks(values))
     assert data == tmp_path / "a.img"
@@ -97,13 +97,13 @@ def test_what_is_written_is_read(tmp_path: Path, code: int) -> None:
 
 
 def in_blocks(values: NDArray[Any]) -> Iterator[tuple[int, NDArray[Any]]]:
-    """Four lines, then the rest."""
+    """Yield four lines, then the rest."""
     yield 0, values[:4]
     yield 4, values[4:]
 
 
-def test_what_headers_say_of_bands(tmp_path: Path) -> None:
-    """Wavelengths, widths, names and the no-data value are the same to both."""
+def test_spy_and_this_project_agree_on_band_metadata(tmp_path: Path) -> None:
+    """Both read the same wavelengths, widths and no-data value from a header of SPy."""
     about = {"wavelength": NM, "fwhm": WIDTHS, "wavelength units": "nm", "band names": NAMES, "data ignore value": -7.5}
     header, _ = written_by_spy(tmp_path, 4, "bil", "little", **about)
     ours, theirs = open_envi_cube(header).header, envi.open(str(header))
@@ -114,8 +114,8 @@ def test_what_headers_say_of_bands(tmp_path: Path) -> None:
 
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 @pytest.mark.parametrize("dtype", ["u2", "f4"])
-def test_rasterio_reads_the_same(tmp_path: Path, dtype: str) -> None:
-    """GDAL's reader agrees on values, bands and wavelengths."""
+def test_rasterio_reads_written_envi_files(tmp_path: Path, dtype: str) -> None:
+    """GDAL's reader agrees on values, number of bands and wavelengths."""
     code = next(code for code, name in DATA_TYPES.items() if name == dtype)
     values, file = numbers(code), EnviFile(SHAPE, dtype, np.array(NM), np.array(WIDTHS))
     with rasterio.open(write_envi(tmp_path / "a.hdr", file, in_blocks(values))) as found:
@@ -125,7 +125,7 @@ def test_rasterio_reads_the_same(tmp_path: Path, dtype: str) -> None:
 
 
 def test_a_large_cube_is_written_in_little_memory(tmp_path: Path) -> None:
-    """Memory follows the block, not the file: 500 lines of 160 kB stay within three blocks of 64."""
+    """Memory follows the block, not the file: 500 lines of 160 kB need less than three blocks of 64."""
     shape = (500, 400, 200)
     block = np.ones((64, *shape[1:]), np.uint16)
     blocks = ((first, block[: min(64, shape[0] - first)]) for first in range(0, shape[0], 64))
@@ -136,8 +136,8 @@ def test_a_large_cube_is_written_in_little_memory(tmp_path: Path) -> None:
     assert peak < 3 * block.nbytes
 
 
-def test_a_header_never_stands_beside_other_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Killed between the two renames, the pair has no header and says so; it does not read wrongly."""
+def test_an_interrupted_write_leaves_no_old_header(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process killed between the two renames leaves data without a header, which is refused, never misread."""
     write_envi(tmp_path / "a.hdr", EnviFile(SHAPE, "u2"), in_blocks(numbers(12)))
     real = Path.replace
 

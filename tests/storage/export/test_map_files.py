@@ -1,4 +1,4 @@
-"""Task data, read again by a library that did not write them and held against ISO's schema."""
+"""ISOXML task data: another library reads it, and it is checked against ISO's schema."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ WORDS = TaskText("spot spraying of the northern field", "north", "weed 2.5 l/ha"
 
 
 def schema_problems(found: Any, of: str = "") -> Iterator[str]:
-    """Where a parsed file breaks what the schema says of it: required, ranges, lengths, patterns."""
+    """Yield violations of the schema in a parsed file: required values, ranges, lengths, patterns."""
     for one in fields(found):
         value, rule, name = getattr(found, one.name), one.metadata, f"{of}{type(found).__name__}.{one.name}"
         if isinstance(value, list):
@@ -46,7 +46,7 @@ def schema_problems(found: Any, of: str = "") -> Iterator[str]:
 
 @pytest.mark.parametrize("unit", list(UNITS))
 def test_another_library_reads_the_same_doses(tmp_path: Path, unit: str) -> None:
-    """Rows from the south, columns from the west, in the dictionary's own steps and unit; 0 where there is no field."""
+    """Rows start in the south, columns in the west; step and unit are the data dictionary's; NaN becomes 0."""
     write_task_data(tmp_path, replace(GRID, unit=UNITS[unit]), WORDS)
     task_data, numbers = isoxml_from_path(tmp_path / "TASKDATA")
     assert list(schema_problems(task_data)) == []
@@ -65,8 +65,8 @@ def test_another_library_reads_the_same_doses(tmp_path: Path, unit: str) -> None
     assert shown.unit_designator == unit
 
 
-def test_the_grid_lies_where_it_was_said(tmp_path: Path) -> None:
-    """South-west corner and sides of a cell in degrees; the task is planned, and nothing is sprayed off the grid."""
+def test_task_grid_has_its_position_and_treatment_zones(tmp_path: Path) -> None:
+    """South-west corner and cell sides are in degrees; the dose is 0 outside of the grid and without a position."""
     xml, numbers = write_task_data(tmp_path, GRID, WORDS)
     task_data, _ = isoxml_from_path(xml)
     task = task_data.tasks[0]
@@ -83,7 +83,7 @@ def test_the_grid_lies_where_it_was_said(tmp_path: Path) -> None:
 
 
 def test_a_dose_beyond_the_format_is_refused(tmp_path: Path) -> None:
-    """With what it can hold, before anything is written."""
+    """The error states the largest dose of the format; nothing is written."""
     with pytest.raises(SettingsError, match="doses up to 214748 l/ha, got 300000"):
         write_task_data(tmp_path, replace(GRID, doses=np.array([[3e5]])), WORDS)
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""STAC: items and a collection that pystac reads and its schemas accept, without a network."""
+"""STAC items and collections are written relative to their folder, without network access."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ABOUT = "field-a"
 
 
 def item(name: str, *, day: int = 1, placed: bool = True) -> Item:
-    """An item with an image and a store."""
+    """Return an item with an image and a store."""
     image: dict[str, Any] = {"href": "class_map.tif", "type": COG, "roles": ["data"]}
     image["bands"] = [{"name": "class", "data_type": "uint8", "nodata": 255}]
     store: dict[str, Any] = {"href": "../../a/mosaic.zarr", "type": ZARR, "roles": ["data"]}
@@ -36,12 +36,12 @@ def item(name: str, *, day: int = 1, placed: bool = True) -> Item:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """A JSON file."""
+    """Return the content of a JSON file."""
     found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     return found
 
 
-def test_without_a_place_there_is_no_geometry(tmp_path: Path) -> None:
+def test_an_item_without_a_position_has_no_geometry(tmp_path: Path) -> None:
     """Geometry is null, there is no bbox and no CRS; the collection's extent is the whole earth."""
     path, collection = write_stac(tmp_path, ABOUT, "Surveys", item("r1", placed=False))
     content = read(path)
@@ -52,9 +52,9 @@ def test_without_a_place_there_is_no_geometry(tmp_path: Path) -> None:
     assert read(collection)["extent"]["spatial"]["bbox"] == [[-180, -90, 180, 90]]
 
 
-@pytest.mark.parametrize("name", ["maps", "maps of #1? 50%20"])  # characters that mean something in an address
-def test_items_of_one_folder_are_one_collection(tmp_path: Path, name: str) -> None:
-    """Items come in order of time, those of before stay as they are, and the extents hold them all."""
+@pytest.mark.parametrize("name", ["maps", "maps of #1? 50%20"])  # characters with a meaning in addresses
+def test_items_of_a_folder_form_one_collection(tmp_path: Path, name: str) -> None:
+    """Items are in order of time, earlier item files stay unchanged, and the extents cover all items."""
     folder = tmp_path / name
     first, _ = write_stac(folder, ABOUT, "Surveys", item("r2", day=2))
     before = first.read_bytes()
@@ -71,7 +71,7 @@ def test_items_of_one_folder_are_one_collection(tmp_path: Path, name: str) -> No
 
 
 def test_links_are_relative(tmp_path: Path) -> None:
-    """The folder can be moved: no link and no asset holds a path of this machine, none says where it lies itself."""
+    """The folder can be moved: links and assets hold no path of this machine, and no link has the relation self."""
     paths = write_stac(tmp_path, ABOUT, "Surveys", item("r1"))
     texts = [path.read_bytes() for path in paths]
     assert [path.read_bytes() for path in write_stac(tmp_path, ABOUT, "Surveys", item("r1"))] == texts  # no clock
@@ -83,8 +83,8 @@ def test_links_are_relative(tmp_path: Path) -> None:
         assert str(tmp_path) not in path.read_text()
 
 
-def test_the_grid_is_said_as_the_projection_extension_wants_it() -> None:
-    """Code, shape, and the transform in rasterio's order; WKT where there is no code; null where there is no CRS."""
+def test_projection_fields_follow_the_extension() -> None:
+    """The fields are code, shape, and the transform in rasterio's order; a CRS without a code has WKT."""
     assert projection(BOX) == {
         "proj:code": "EPSG:32632",
         "proj:shape": [80, 100],
@@ -96,13 +96,13 @@ def test_the_grid_is_said_as_the_projection_extension_wants_it() -> None:
     assert projection(own)["proj:wkt2"].startswith("PROJCRS")
 
 
-def test_an_id_is_a_name_of_a_file() -> None:
-    """Letters, digits, - and _ alone."""
+def test_clean_id_is_a_valid_file_name() -> None:
+    """An id keeps only letters, digits, - and _; a text without any of them becomes the default."""
     assert (clean_id("Feld 3/Süd", "x"), clean_id("???", "class-1")) == ("Feld-3-S-d", "class-1")
 
 
 def test_a_folder_of_another_archive_is_refused(tmp_path: Path) -> None:
-    """Its collection stays, and nothing is written."""
+    """The folder's collection stays, and nothing is written."""
     write_stac(tmp_path, ABOUT, "Surveys", item("r1"))
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(ArchiveError, match="collection 'field-a' of another archive, expected 'field-b'"):
@@ -111,8 +111,8 @@ def test_a_folder_of_another_archive_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"type": "Feature"}', '{"type": "Feature", "id": "r1"}'])
-def test_a_damaged_item_of_before_is_named(tmp_path: Path, text: str) -> None:
-    """The message says which file to remove."""
+def test_a_damaged_earlier_item_is_reported(tmp_path: Path, text: str) -> None:
+    """The error names the file to remove."""
     (tmp_path / "r1").mkdir()
     (tmp_path / "r1" / "r1.json").write_text(text)
     with pytest.raises(ArchiveError, match=r"r1\.json .*remove"):
@@ -120,7 +120,7 @@ def test_a_damaged_item_of_before_is_named(tmp_path: Path, text: str) -> None:
 
 
 def test_the_footprint_is_the_grid_in_degrees() -> None:
-    """An anticlockwise ring of the area of the grid."""
+    """The footprint is an anticlockwise ring of the grid's area, within 1 %."""
     ring = np.array(footprint(BOX)["coordinates"][0])
     assert (ring[0] == ring[-1]).all()
     area = np.sum(ring[:-1, 0] * ring[1:, 1] - ring[1:, 0] * ring[:-1, 1]) / 2
@@ -132,7 +132,7 @@ def test_the_footprint_is_the_grid_in_degrees() -> None:
 
 @pytest.mark.parametrize(("crs", "south", "north"), [("EPSG:3413", 88.7, 90), ("EPSG:3031", -90, -88.7)])
 def test_a_map_around_a_pole_has_all_longitudes(crs: str, south: float, north: float) -> None:
-    """From its farthest corner to the pole."""
+    """The bounds reach from the map's farthest corner to the pole."""
     place = footprint(GeoBox.from_bbox((-1e5, -1e5, 1e5, 1e5), crs=crs, shape=(20, 20)))
     assert shapely.geometry.shape(place).bounds == pytest.approx((-180, south, 180, north), abs=0.05)
 
@@ -141,10 +141,10 @@ def test_a_map_around_a_pole_has_all_longitudes(crs: str, south: float, north: f
     ("crs", "bounds"),
     [("EPSG:32701", (179_000, 8_140_000, 181_000, 8_142_000)), ("EPSG:4326", (179.99, -17, 180.01, -16.98))],
 )
-def test_an_outline_across_180_degrees_is_cut_there(tmp_path: Path, crs: str, bounds: tuple[float, ...]) -> None:
-    """Two polygons of a map of 2 km, and a box whose west is more than its east, as RFC 7946 has it.
+def test_a_footprint_across_180_degrees_is_split(tmp_path: Path, crs: str, bounds: tuple[float, ...]) -> None:
+    """A map of 2 km has two polygons, and a bbox whose west exceeds its east, as in RFC 7946.
 
-    The collection of it and a field east of it is as narrow.
+    The collection of it and a field east of it has such a narrow extent too.
     """
     place = footprint(GeoBox.from_bbox(bounds, crs=crs, shape=(200, 200)))
     shape = shapely.geometry.shape(place)

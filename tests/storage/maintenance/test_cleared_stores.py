@@ -1,4 +1,4 @@
-"""Stores whose files are cleared away: their manifests stay, and whoever asks for them has them made again."""
+"""Cleared stores: their files are removed and their manifests stay; the next request makes the files again."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from tests.storage.small_archive import problems, small_survey
 
 
 def cleared(archive: Archive) -> list[str]:
-    """Addresses of the mosaics of which the files go."""
+    """Clear the mosaics whose files are there, and return their addresses."""
     there = [ref for ref in archive.refs("rectify") if archive.is_there(ref.uri)]
     return [ref.uri for ref in there if archive.clear(ref, wait=False)]
 
 
 def content(ref: StageRef) -> str:
-    """Hash of the one file of a small store."""
+    """Return the hash of the one file of a small store."""
     return hashlib.sha256((ref.path / "data.bin").read_bytes()).hexdigest()
 
 
-def test_the_files_go_and_the_manifest_stays(archive: Archive) -> None:
-    """What it was made of, what it took and how large it was is told yet; the archive is whole."""
+def test_clear_removes_files_and_keeps_the_manifest(archive: Archive) -> None:
+    """Key, parameters, inputs, date and size are still known, and verify finds no problem."""
     small = small_survey(archive)
     before, size = archive.manifest(small.mosaic), archive.stored_bytes(small.mosaic)
     assert cleared(archive) == [small.mosaic.uri]
@@ -40,13 +40,13 @@ def test_the_files_go_and_the_manifest_stays(archive: Archive) -> None:
     assert archive.stored_bytes(small.mosaic) == size > read_store(small.mosaic).size == 0
     assert problems(archive) == []
     assert cleared(archive) == []
-    assert archive.clear(small.mosaic)  # once more
+    assert archive.clear(small.mosaic)  # a second time
     assert archive.stored_bytes(small.mosaic) == size
     assert archive.find("capture", small.raw.key) is not None
 
 
-def test_what_is_asked_for_is_made_again(archive: Archive) -> None:
-    """The same bytes under the same address; the run that names it finds nothing wrong, and it can go again."""
+def test_a_cleared_store_is_made_again_on_request(archive: Archive) -> None:
+    """The store has the same bytes at the same address; verify finds no problem, and it can be cleared again."""
     small = small_survey(archive)
     before = content(small.mosaic)
     cleared(archive)
@@ -60,16 +60,16 @@ def test_what_is_asked_for_is_made_again(archive: Archive) -> None:
     assert problems(archive) == []
 
 
-def test_a_reader_of_what_was_cleared_is_told_what_to_do(archive: Archive) -> None:
-    """No file is looked for that is not there."""
+def test_locating_a_cleared_store_explains_what_to_do(archive: Archive) -> None:
+    """The error says to run the survey again."""
     small = small_survey(archive)
     cleared(archive)
     with pytest.raises(IncompleteStoreError, match=r"cleared away\. Run its survey again, for raw lines with --keep"):
         archive.locate(f"{small.mosaic.uri}/mosaic.zarr")
 
 
-def test_a_store_that_is_cleared_while_checked_is_whole(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By a survey beside it: neither its reader nor verify takes it for damaged."""
+def test_a_store_cleared_during_a_check_is_not_damaged(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another survey may clear it while a reader or verify checks its files."""
     small, problem = small_survey(archive), manifests.file_problem
 
     def clear_first(path: Path, *given: Any, **options: Any) -> str | None:
@@ -83,8 +83,8 @@ def test_a_store_that_is_cleared_while_checked_is_whole(archive: Archive, monkey
 
 
 @pytest.mark.parametrize("exchanges", [True, False])
-def test_broken_off_it_leaves_a_store_whole(archive: Archive, monkeypatch: pytest.MonkeyPatch, exchanges: bool) -> None:
-    """Whichever rename fails, the files are there yet, or can be had again."""
+def test_interrupted_clear_keeps_the_store(archive: Archive, monkeypatch: pytest.MonkeyPatch, exchanges: bool) -> None:
+    """If a sync fails, with or without folder exchange, the files are still there and can be cleared later."""
     small = small_survey(archive)
     before = content(small.mosaic)
     if not exchanges:

@@ -1,4 +1,4 @@
-"""Clearing up takes what nobody needs and nothing else, and leaves a whole archive wherever it is broken off."""
+"""Garbage collection removes only unneeded files, and leaves a whole archive when it is interrupted."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from storage.maintenance.garbage import IN_USE, Removal, clear_up, plan_clearanc
 from tests.storage.small_archive import flip, grow_old, problems, small_survey
 
 
-def test_what_no_run_names_goes_and_the_rest_stays(archive: Archive) -> None:
-    """A store that a named one was made of stays, though no receipt names it."""
+def test_gc_removes_only_stores_that_no_run_needs(archive: Archive) -> None:
+    """Inputs of a named store stay, though no receipt names them; a dry run lists the same removals."""
     kept, gone = small_survey(archive), small_survey(archive, seed=1, named=False)
     planned = clear_up(archive, keep_days=0, dry_run=True)
     assert [removal.uri for removal in planned.removals] == [gone.map.uri, gone.mosaic.uri, gone.raw.uri]
@@ -26,15 +26,15 @@ def test_what_no_run_names_goes_and_the_rest_stays(archive: Archive) -> None:
     assert clear_up(archive, keep_days=0).removals == ()
 
 
-def test_a_shared_input_stays(archive: Archive) -> None:
-    """Of a map with another kernel that no run names, the raw lines are those of a map that one names."""
+def test_gc_keeps_a_shared_input(archive: Archive) -> None:
+    """An unnamed map with another kernel has the same raw lines as a named map."""
     kept, gone = small_survey(archive), small_survey(archive, kernel="nearest", named=False)
     assert gone.raw == kept.raw
     assert [one.uri for one in clear_up(archive, keep_days=0).removals] == [gone.map.uri, gone.mosaic.uri]
 
 
-def test_young_stores_stay_with_what_they_rest_on(archive: Archive) -> None:
-    """A survey under way has made a map of old raw lines: neither goes."""
+def test_gc_keeps_young_stores_and_their_inputs(archive: Archive) -> None:
+    """A survey in progress has made a map from old raw lines: both stay."""
     small, other = small_survey(archive, named=False), small_survey(archive, seed=5, named=False)
     for ref in (small.raw, small.mosaic, other.raw, other.mosaic, other.map):
         grow_old(ref, days=3)
@@ -48,8 +48,8 @@ def test_young_stores_stay_with_what_they_rest_on(archive: Archive) -> None:
     assert len(plan_clearance(archive, keep_days=4).removals) == 0
 
 
-def test_raw_lines_of_a_rig_go_only_when_asked(archive: Archive) -> None:
-    """A survey that broke off after its capture has lines that no run names and that cannot be had again."""
+def test_gc_removes_raw_lines_of_a_rig_only_on_request(archive: Archive) -> None:
+    """A survey that broke off after its capture has lines that no run names and that cannot be captured again."""
     small = small_survey(archive, named=False, simulated=False)
     assert small.raw.uri in clear_up(archive, keep_days=0).kept
     assert [ref.uri for ref in archive.refs()] == [small.raw.uri]
@@ -57,8 +57,8 @@ def test_raw_lines_of_a_rig_go_only_when_asked(archive: Archive) -> None:
     assert archive.refs() == []
 
 
-def test_spools_of_published_captures_and_dead_parts_go(tmp_path: Path, archive: Archive) -> None:
-    """The spool of a capture that is not published is what its lines will be continued from."""
+def test_gc_removes_spools_of_published_captures_and_dead_drafts(tmp_path: Path, archive: Archive) -> None:
+    """The spool of an unpublished capture stays, because the capture continues from it."""
     small = small_survey(archive)
     for key in (small.raw.key, "underway"):
         (archive.spool_folder(key) / "lines.lines").write_bytes(b"x" * 100)
@@ -78,8 +78,8 @@ def test_spools_of_published_captures_and_dead_parts_go(tmp_path: Path, archive:
     assert [path.name for path in (tmp_path / ".locks").iterdir()] == ["use.lock"]
 
 
-def test_a_stray_file_among_the_runs_holds_nothing_up(tmp_path: Path, archive: Archive) -> None:
-    """It names nothing; a folder there might have."""
+def test_a_stray_file_among_the_runs_does_not_stop_gc(tmp_path: Path, archive: Archive) -> None:
+    """A file names no store; only a folder there could."""
     small_survey(archive, named=False)
     (tmp_path / "runs").mkdir()
     (tmp_path / "runs" / "notes.txt").write_text("mine")
@@ -87,8 +87,8 @@ def test_a_stray_file_among_the_runs_holds_nothing_up(tmp_path: Path, archive: A
     assert (tmp_path / "runs" / "notes.txt").exists()
 
 
-def test_a_spool_stays_while_its_capture_may_be_in_need_of_it(archive: Archive) -> None:
-    """Held by whoever publishes its lines, or where what was published of them is damaged."""
+def test_gc_keeps_a_spool_that_its_capture_may_need(archive: Archive) -> None:
+    """The capture is being published, or its published manifest is damaged."""
     small = small_survey(archive)
     (archive.spool_folder(small.raw.key) / "lines.lines").write_bytes(b"x")
     with archive.publish("capture", small.raw.key):
@@ -100,8 +100,8 @@ def test_a_spool_stays_while_its_capture_may_be_in_need_of_it(archive: Archive) 
     assert [removal.what for removal in clear_up(archive).removals] == ["leftover"]
 
 
-def test_what_cannot_be_removed_is_not_gone(tmp_path: Path, archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The disk refuses: the next gc tries again."""
+def test_gc_does_not_report_a_failed_removal(tmp_path: Path, archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The disk refuses the removal; the next gc tries again."""
     (tmp_path / "stages/segment/aaaa.part").mkdir(parents=True)
     with monkeypatch.context() as broken:
         broken.setattr("storage.archive.archive.remove_tree", lambda path: None)
@@ -109,8 +109,8 @@ def test_what_cannot_be_removed_is_not_gone(tmp_path: Path, archive: Archive, mo
     assert [removal.uri for removal in clear_up(archive).removals] == ["stages/segment/aaaa.part"]
 
 
-def test_nothing_goes_while_somebody_uses_the_archive(tmp_path: Path, archive: Archive) -> None:
-    """Two surveys may use an archive at a time; clearing up waits for its turn, and says so."""
+def test_gc_removes_nothing_while_the_archive_is_in_use(tmp_path: Path, archive: Archive) -> None:
+    """Two surveys may use an archive at a time; gc reports that it is in use."""
     small = small_survey(archive, named=False)
     with archive.in_use(), Archive.open(tmp_path).in_use():
         done = clear_up(archive, keep_days=0)
@@ -121,8 +121,8 @@ def test_nothing_goes_while_somebody_uses_the_archive(tmp_path: Path, archive: A
     assert archive.find("capture", small.raw.key) is None
 
 
-def test_a_store_that_is_held_stays(archive: Archive) -> None:
-    """Whoever holds a key's lock works on it."""
+def test_gc_keeps_a_locked_store(archive: Archive) -> None:
+    """The process that holds a key's lock works on its store."""
     small = small_survey(archive, named=False)
     with archive.publish(small.map.stage, small.map.key) as staged:
         assert staged.done
@@ -131,8 +131,8 @@ def test_a_store_that_is_held_stays(archive: Archive) -> None:
 
 
 @pytest.mark.parametrize("victim", ["receipt.json", "manifest.json"])
-def test_no_store_goes_where_a_run_cannot_tell_what_it_names(archive: Archive, victim: str) -> None:
-    """A damaged receipt is made up for by the run's manifest; with that damaged or gone all stores stay."""
+def test_gc_keeps_all_stores_if_a_run_cannot_be_read(archive: Archive, victim: str) -> None:
+    """The run's manifest replaces a damaged receipt; if the manifest is damaged or missing, all stores stay."""
     small, other = small_survey(archive), small_survey(archive, seed=1, named=False)
     flip(small.run / victim)
     found = clear_up(archive, keep_days=0)
@@ -147,8 +147,8 @@ def test_no_store_goes_where_a_run_cannot_tell_what_it_names(archive: Archive, v
     assert archive.find("segment", other.map.key) == other.map
 
 
-def test_no_store_goes_where_a_store_cannot_tell_what_it_rests_on(archive: Archive) -> None:
-    """The map is young, and its manifest is damaged: the mosaic might be its input."""
+def test_gc_keeps_all_stores_if_inputs_are_unknown(archive: Archive) -> None:
+    """The map is young and its manifest is damaged: the old mosaic might be its input."""
     small = small_survey(archive, named=False)
     for ref in (small.raw, small.mosaic):
         grow_old(ref, days=3)
@@ -159,8 +159,8 @@ def test_no_store_goes_where_a_store_cannot_tell_what_it_rests_on(archive: Archi
 
 
 @pytest.mark.parametrize("at", range(4))
-def test_broken_off_it_leaves_a_whole_archive(archive: Archive, at: int) -> None:
-    """Stores go before those that they were made of; the next time does the rest."""
+def test_an_interrupted_gc_leaves_a_whole_archive(archive: Archive, at: int) -> None:
+    """Stores are removed before their inputs; the next gc removes the rest."""
     small_survey(archive)
     small_survey(archive, seed=1, named=False)
     (archive.spool_folder(archive.refs("capture")[0].key) / "lines.lines").write_bytes(b"x")
@@ -179,15 +179,15 @@ def test_broken_off_it_leaves_a_whole_archive(archive: Archive, at: int) -> None
 
 
 def test_a_negative_age_is_refused(tmp_path: Path) -> None:
-    """So is what is no number."""
+    """NaN is refused as well."""
     for days in (-1.0, float("nan")):
         with pytest.raises(SettingsError, match="expected a number of days"):
             clear_up(Archive.open(tmp_path), keep_days=days)
 
 
 @pytest.mark.parametrize("place", ["", "s3://bucket/prefix"], ids=["folder", "bucket"])
-def test_an_ingested_cube_that_a_run_surveyed_stays(archive: Archive, place: str) -> None:
-    """Its survey names it as its scene and cannot be repeated without it."""
+def test_gc_keeps_an_ingested_cube_that_a_run_surveyed(archive: Archive, place: str) -> None:
+    """The survey names it as its scene and cannot be repeated without it."""
     small = small_survey(archive)
     with archive.publish("ingest", "cube") as staged:
         (staged.path / "data.bin").write_bytes(b"light")

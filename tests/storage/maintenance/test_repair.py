@@ -1,4 +1,4 @@
-"""A repair makes anew what is broken, and leaves alone what it cannot make."""
+"""Repair makes broken stores and runs again, and leaves alone those that it cannot make."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ def _moments(archive: Archive) -> dict[str, int]:
     return {ref.uri: (ref.path / "manifest.json").stat().st_mtime_ns for ref in archive.refs()}
 
 
-def test_only_what_is_broken_is_made_again(archive: Archive) -> None:
-    """Neither what it was made of, nor what was made of it, nor anything of the other survey."""
+def test_repair_makes_only_broken_stores_again(archive: Archive) -> None:
+    """The inputs and dependents of a broken store stay, and so does the other survey."""
     small, _ = _two(archive)
     before = _moments(archive)
     flip(small.mosaic.path / "data.bin")
@@ -56,12 +56,12 @@ def test_only_what_is_broken_is_made_again(archive: Archive) -> None:
     assert done.remade == [small.mosaic.uri]
     after = _moments(archive)
     assert {uri for uri in after if after[uri] != before[uri]} == set(done.remade)
-    assert len(archive.runs()) == 2  # the repetition is gone
+    assert len(archive.runs()) == 2  # the repeated run is removed
     assert _bad(archive) == []
 
 
 def test_two_damaged_runs_of_one_command_keep_their_names(archive: Archive) -> None:
-    """A survey that was repeated has two runs with the same settings: each comes back under its own name."""
+    """A repeated survey has two runs with the same settings; each is repaired under its own name and date."""
     for _ in range(2):
         with archive.new_run("farm") as draft:
             draft.write_file("receipt.json", json.dumps({"settings": settings(kernel="bilinear")}))
@@ -77,8 +77,8 @@ def test_two_damaged_runs_of_one_command_keep_their_names(archive: Archive) -> N
     assert _bad(archive) == []
 
 
-def test_a_repetition_of_another_scene_replaces_no_run(archive: Archive) -> None:
-    """The file of its scene was written over: nothing that it was made of is made again."""
+def test_a_changed_scene_file_does_not_replace_a_run(archive: Archive) -> None:
+    """The scene's file was overwritten, so the repeated survey made other stores; the run stays and is reported."""
     with archive.new_run("farm") as draft:
         draft.write_file("receipt.json", json.dumps({"settings": settings()}))
         draft.write_file("quicklook.png", b"picture")
@@ -91,7 +91,7 @@ def test_a_repetition_of_another_scene_replaces_no_run(archive: Archive) -> None
 
 @pytest.mark.parametrize("how", ["flip", "manifest", "lost", "gone"])
 def test_broken_raw_lines_of_the_simulator_are_made_again(archive: Archive, how: str) -> None:
-    """Whatever is wrong with them: both surveys that name them run again."""
+    """A flipped bit, a damaged or lost manifest or a lost store: both surveys that name the lines run again."""
     small, _ = _two(archive)
     if how == "flip":
         flip(small.raw.path / "data.bin")
@@ -109,8 +109,8 @@ def test_broken_raw_lines_of_the_simulator_are_made_again(archive: Archive, how:
     assert _bad(archive) == []
 
 
-def test_raw_lines_of_a_rig_stay_with_all_that_was_made_of_them(archive: Archive) -> None:
-    """They cannot be had again; a broken map beside them is made again of them."""
+def test_damaged_raw_lines_of_a_rig_stay(archive: Archive) -> None:
+    """Raw lines cannot be captured again, and their dependents stay; a broken map of them is made again."""
     small, before = small_survey(archive, simulated=False), _moments(archive)
     flip(small.raw.path / "data.bin")
     done = _repair(archive, lambda settings: pytest.fail("nothing to run"))
@@ -126,7 +126,7 @@ def test_raw_lines_of_a_rig_stay_with_all_that_was_made_of_them(archive: Archive
 
 @pytest.mark.parametrize("how", ["flip", "short", "manifest", "gone", "old"])
 def test_condensed_lines_whose_raw_lines_were_cleared_stay(archive: Archive, how: str) -> None:
-    """They are the only copy. A map is made of them as long as a survey finds them: it never captures another day."""
+    """They are the only copy. A broken map is made from them only if a survey finds them; nothing is captured again."""
     light, asked = {"scene": "farm", "source": "rig"}, settings(source="rig")
     raw = make_store(archive, "capture", light, [])
     signal = make_store(archive, "condense", {}, [raw])
@@ -156,8 +156,8 @@ def test_condensed_lines_whose_raw_lines_were_cleared_stay(archive: Archive, how
         assert before == {path: path.read_bytes() for path in (archive.root / "stages").rglob("*.*")}
 
 
-def test_an_ingested_cube_stays_whatever_its_runs_can_capture(archive: Archive) -> None:
-    """Surveys read it and cannot make it, of simulated rigs too."""
+def test_repair_keeps_a_damaged_ingested_cube(archive: Archive) -> None:
+    """Surveys read it and cannot make it, even those of simulated rigs."""
     cube = make_store(archive, "ingest", {}, [])
     asked = settings(scene=str(cube.path))
     archive.new_run("farm").publish(settings=asked, rests_on=archive.manifest_hashes([cube]))
@@ -169,8 +169,8 @@ def test_an_ingested_cube_stays_whatever_its_runs_can_capture(archive: Archive) 
 
 
 @pytest.mark.parametrize("error", [SceneError("no scene farm.png; give the file"), KeyboardInterrupt()])
-def test_what_could_not_be_made_again_is_named_by_the_next_verify(archive: Archive, error: BaseException) -> None:
-    """The scene has gone, or the repair was broken off: once that is mended the same command makes it."""
+def test_verify_names_a_store_that_repair_could_not_make(archive: Archive, error: BaseException) -> None:
+    """The scene is missing, or repair was interrupted; the same command succeeds once the cause is removed."""
     small = small_survey(archive)
     flip(small.mosaic.path / "data.bin")
     fail = Mock(side_effect=error)
@@ -184,8 +184,8 @@ def test_what_could_not_be_made_again_is_named_by_the_next_verify(archive: Archi
     assert _bad(archive) == []
 
 
-def test_one_survey_is_run_again_once(archive: Archive) -> None:
-    """However many runs asked for the same, whatever they noted and wherever the archive lay."""
+def test_equal_surveys_are_run_again_once(archive: Archive) -> None:
+    """Runs with the same settings count as one survey, whatever their notes and output folders are."""
     small = small_survey(archive)
     for more in ({"notes": ["dull"]}, {"out": "elsewhere"}):
         asked = {"seed": 0, "kernel": "bilinear", "source": "sim", "scene": "farm", "budget": 0.5, **more}
@@ -196,8 +196,8 @@ def test_one_survey_is_run_again_once(archive: Archive) -> None:
     assert [call.args[0]["kernel"] for call in again.call_args_list] == ["bilinear"]
 
 
-def test_a_run_that_lost_its_manifest_is_left_to_people(archive: Archive) -> None:
-    """Nothing vouches for what its receipt says."""
+def test_a_run_without_a_manifest_is_not_repaired(archive: Archive) -> None:
+    """Without the manifest's checksums its receipt cannot be trusted; the error says to run the survey by hand."""
     small = small_survey(archive)
     (small.run / "manifest.json").unlink()
     done = _repair(archive, lambda settings: pytest.fail("nothing to run"))
@@ -206,8 +206,8 @@ def test_a_run_that_lost_its_manifest_is_left_to_people(archive: Archive) -> Non
     assert small.run.exists()
 
 
-def test_stores_of_runs_that_cannot_tell_their_settings_stay(archive: Archive) -> None:
-    """Nobody knows how to ask for them."""
+def test_stores_of_runs_without_settings_stay(archive: Archive) -> None:
+    """Repair cannot run their survey again without its settings."""
     small = small_survey(archive, named=False)
     archive.new_run("farm").publish(rests_on=archive.manifest_hashes([small.map]))
     flip(small.mosaic.path / "data.bin")
@@ -216,8 +216,8 @@ def test_stores_of_runs_that_cannot_tell_their_settings_stay(archive: Archive) -
     assert _bad(archive) == [small.mosaic.uri]
 
 
-def test_what_no_run_names_is_dropped(archive: Archive) -> None:
-    """Nobody asks for it: it is made again by whoever does."""
+def test_repair_drops_broken_stores_that_no_run_names(archive: Archive) -> None:
+    """No run needs the store; the next survey that requests it makes it again."""
     small = small_survey(archive, named=False)
     flip(small.mosaic.path / "data.bin")
     done = _repair(archive, lambda settings: pytest.fail("nothing to run"))
@@ -225,8 +225,8 @@ def test_what_no_run_names_is_dropped(archive: Archive) -> None:
     assert done.dropped == [small.mosaic.uri]
 
 
-def test_what_was_never_of_the_archive_is_not_thrown_away(tmp_path: Path, archive: Archive) -> None:
-    """A folder in the place of a stage that is none, whoever laid it there."""
+def test_repair_keeps_folders_of_unknown_stages(tmp_path: Path, archive: Archive) -> None:
+    """A folder that people put among the stages stays, and is reported."""
     notes = tmp_path / "stages" / "mine" / "notes.txt"
     small_survey(archive)
     notes.parent.mkdir()
@@ -250,7 +250,7 @@ def test_what_was_never_of_the_archive_is_not_thrown_away(tmp_path: Path, archiv
         ("mosaic", {"weights_of": lambda run: "w1"}, ""),
     ],
 )
-def test_what_would_not_be_made_again_stays(archive: Archive, store: str, newer: dict[str, Any], why: str) -> None:
+def test_repair_keeps_stores_of_outdated_keys(archive: Archive, store: str, newer: dict[str, Any], why: str) -> None:
     """Other versions, also of inputs, and other weights make stores of other keys."""
     ref = getattr(small_survey(archive), store)
     flip(ref.path / "data.bin")
@@ -260,7 +260,7 @@ def test_what_would_not_be_made_again_stays(archive: Archive, store: str, newer:
 
 
 def test_a_damaged_run_is_run_again(archive: Archive) -> None:
-    """By the settings of its receipt where only a picture is damaged; not by those of a damaged receipt."""
+    """The settings come from its receipt if only a picture is damaged; a damaged receipt is not used."""
     with archive.new_run("farm") as draft:
         draft.write_file("receipt.json", json.dumps({"settings": {"seed": 0, "kernel": "bilinear", "source": "sim"}}))
         draft.write_file("quicklook.png", b"picture")
@@ -269,7 +269,7 @@ def test_a_damaged_run_is_run_again(archive: Archive) -> None:
     done = _repair(archive)
     assert done.complete
     assert done.remade == [f"runs/{run.name}"]
-    assert archive.runs() == [run]  # under its name, by which later visits know their prior map
+    assert archive.runs() == [run]  # later visits find their prior map by this name
     assert json.loads((run / "manifest.json").read_text())["run"] == run.name
     assert _bad(archive) == []
     flip(run / "receipt.json")
@@ -279,8 +279,8 @@ def test_a_damaged_run_is_run_again(archive: Archive) -> None:
     assert run.exists()
 
 
-def test_it_waits_for_nobody(archive: Archive) -> None:
-    """While a survey uses the archive, nothing of it is set aside."""
+def test_repair_refuses_an_archive_in_use(archive: Archive) -> None:
+    """Repair does not wait: while a survey uses the archive, no store is moved."""
     small_survey(archive)
     with archive.in_use(), pytest.raises(ArchiveError, match="is in use; run verify --repair again"):
         _repair(archive)

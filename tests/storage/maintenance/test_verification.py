@@ -1,4 +1,4 @@
-"""Verification finds every bit that has changed and names the store and file that holds it."""
+"""Verification finds every changed bit and names the store and file that hold it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FLIPS = 30
 
 
 def _with_cube(archive: Archive) -> StageRef:
-    """A store with a cube of (130, 700, 3): shards of 64 rows and 640 columns, chunks of 32 x 32."""
+    """Make a store with a cube of (130, 700, 3): shards of 64 rows and 640 columns, chunks of 32 x 32."""
     values = np.random.default_rng(2).integers(0, 4096, (130, 700, 3), dtype=np.uint16)
 
     def build(path: Path) -> None:
@@ -39,8 +39,8 @@ def _found(archive: Archive) -> dict[str, list[str]]:
     return found
 
 
-def test_bits_that_flip_anywhere_are_found_and_named(tmp_path: Path, archive: Archive) -> None:
-    """Places are drawn from all bytes and from all files, manifests and receipts among them."""
+def test_verify_finds_flipped_bits_in_any_file(tmp_path: Path, archive: Archive) -> None:
+    """30 places are drawn from all bytes and all files, manifests and receipts among them."""
     small_survey(archive)
     _with_cube(archive)
     files = [path for path in sorted(tmp_path.rglob("*")) if path.is_file() and path.suffix != ".lock"]
@@ -58,8 +58,8 @@ def test_bits_that_flip_anywhere_are_found_and_named(tmp_path: Path, archive: Ar
 
 
 @pytest.mark.parametrize("at", [0, 1000, -10])
-def test_no_flipped_bit_of_a_shard_is_read_silently(archive: Archive, at: int) -> None:
-    """Chunks and the shard's index have checksums: reading raises, or gives what was written."""
+def test_a_flipped_bit_in_a_shard_raises_an_error(archive: Archive, at: int) -> None:
+    """Chunks and the shard's index have checksums; other shards are still read as written."""
     ref = _with_cube(archive)
     before = read_array(open_group(ref.path / "mosaic.zarr"), "values")
     flip(ref.path / "mosaic.zarr/values/c/0/0/0", at=at)
@@ -70,7 +70,7 @@ def test_no_flipped_bit_of_a_shard_is_read_silently(archive: Archive, at: int) -
 
 
 def test_missing_short_and_extra_files_each_have_a_finding(archive: Archive) -> None:
-    """Each by its name."""
+    """Each finding names its file."""
     ref = _with_cube(archive)
     values = ref.path / "mosaic.zarr/values"
     (values / "c/0/0/0").unlink()
@@ -82,8 +82,8 @@ def test_missing_short_and_extra_files_each_have_a_finding(archive: Archive) -> 
     assert "values/notes.txt is not in the manifest" in extra
 
 
-def test_a_lost_manifest_and_a_lost_store_are_told(tmp_path: Path, archive: Archive) -> None:
-    """By the folder that is left, by the run that names it, and by what was made of it."""
+def test_verify_reports_lost_manifests_and_lost_stores(tmp_path: Path, archive: Archive) -> None:
+    """A lost store is known by the run that names it, a lost manifest by its folder; stray files are reported."""
     small = small_survey(archive)
     (small.mosaic.path / "manifest.json").unlink()
     with pytest.raises(IncompleteStoreError, match="it is missing"):
@@ -97,8 +97,8 @@ def test_a_lost_manifest_and_a_lost_store_are_told(tmp_path: Path, archive: Arch
     assert found == {}
 
 
-def test_what_is_gone_is_told_once(archive: Archive) -> None:
-    """However many runs name it; and by what was made of it where no run does."""
+def test_verify_reports_a_missing_store_once(archive: Archive) -> None:
+    """Two runs that name the store give one finding; without a run, its dependent store reveals it."""
     small, other = small_survey(archive), small_survey(archive, seed=1, named=False)
     small_survey(archive)
     for ref in (small.mosaic, other.mosaic):
@@ -108,8 +108,8 @@ def test_what_is_gone_is_told_once(archive: Archive) -> None:
     assert f"is not there, but {other.map.uri} was made of it" in str(gone[1].problem)
 
 
-def test_what_is_cleared_away_meanwhile_is_no_damage(archive: Archive) -> None:
-    """gc may run beside it; what a run names must be there."""
+def test_a_store_removed_during_verify_is_not_damage(archive: Archive) -> None:
+    """gc may run at the same time; a store that a run names must be there."""
     named, other = small_survey(archive), small_survey(archive, seed=1, named=False)
 
     def clear(ref: StageRef) -> list[str]:

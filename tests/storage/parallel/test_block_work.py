@@ -1,4 +1,4 @@
-"""Blocks on threads and processes: order, results, bounds, what cannot be sent, workers that die."""
+"""Blocks on threads, processes and dask: order, results, memory bounds, errors, and workers that die."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ from storage.parallel.pool import THREADS_OF, WorkerPool, run_blocks
 
 ROOT = Path(__file__).parents[3]
 PROCESSES = WorkerPool("processes", 2)
-# dask leaves its half of a handshake with a worker that dies
+# dask does not close its handshake with a worker that dies
 pytestmark = pytest.mark.filterwarnings("ignore:unclosed <ssl.SSLSocket:ResourceWarning")
 
 
 def square(number: int) -> int:
-    """What is sent to other processes stands in a module."""
+    """Return the square; functions for other processes must be at module level."""
     return number * number
 
 
 def square_unless(refused: int, number: int) -> int:
-    """Fail for one number."""
+    """Return the square; raise ShapeError for one number."""
     if number == refused:
         raise ShapeError(f"no {number}")
     return number * number
 
 
 def die_once(folder: Path, number: int) -> int:
-    """Be killed in the middle of block 3, the first time."""
+    """Kill the process in block 3, the first time only."""
     if number == 3 and not (folder / "died").exists():
         (folder / "died").touch()
         os.kill(os.getpid(), signal.SIGKILL)
@@ -48,20 +48,20 @@ def die_once(folder: Path, number: int) -> int:
 
 
 def die(number: int) -> int:
-    """Be killed in every block 1."""
+    """Kill the process in block 1."""
     if number == 1:
         os.kill(os.getpid(), signal.SIGKILL)
     return number
 
 
 def threads_here(number: int) -> tuple[int, str | None]:
-    """Whose process this is, and how many threads arithmetic may take."""
+    """Return the process and the number of threads that arithmetic may take."""
     return os.getpid(), os.environ.get("OMP_NUM_THREADS")
 
 
 @pytest.fixture(scope="module")
 def processes() -> Iterator[WorkerPool]:
-    """Two worker processes for all tests here."""
+    """Yield two worker processes for all tests of this module."""
     with PROCESSES.open() as pool:
         yield pool
 
@@ -69,7 +69,7 @@ def processes() -> Iterator[WorkerPool]:
 @pytest.mark.parametrize("workers", [1, 3])
 @pytest.mark.parametrize("count", [0, 1, 7])
 def test_threads_give_results_in_order(workers: int, count: int) -> None:
-    """However many threads, each item is made once, results stand in the items' order, and progress ends at 1."""
+    """With any number of threads results are in the items' order, and progress ends at 1."""
     fractions: list[float] = []
     found = run_blocks(lambda item: item * 10, range(count), WorkerPool(workers=workers), report=fractions.append)
     assert found == [10 * item for item in range(count)]
@@ -77,22 +77,22 @@ def test_threads_give_results_in_order(workers: int, count: int) -> None:
 
 
 def test_processes_give_results_in_order(processes: WorkerPool) -> None:
-    """Other processes give what threads give, and what all blocks share may be large."""
+    """Processes give the same results as threads, and the shared part may be large (12 MiB)."""
     assert run_blocks(square, range(20), processes) == [square(item) for item in range(20)]
     assert run_blocks(bytes(12 * 2**20).__getitem__, [1, 2], processes) == [0, 0]
 
 
-def test_workers_are_kept_and_have_one_thread(processes: WorkerPool) -> None:
-    """While a worker pool is open the same processes work for every call, none of them this one, one thread each."""
+def test_an_open_pool_keeps_its_processes(processes: WorkerPool) -> None:
+    """Several calls use the same processes, none of them this one, and each has one arithmetic thread."""
     seen = {one for _ in range(4) for one in run_blocks(threads_here, range(8), processes)}
-    assert len({process for process, _ in seen}) <= processes.count  # one may do all blocks of a call
+    assert len({process for process, _ in seen}) <= processes.count  # one process may do all blocks of a call
     assert {threads for _, threads in seen} == {"1"}
     assert os.getpid() not in {process for process, _ in seen}
 
 
 @pytest.mark.parametrize("workers", [2, 5])
-def test_few_blocks_are_begun_ahead_of_the_oldest(workers: int) -> None:
-    """A slow block holds up those far behind it: what is in memory at a time does not grow with the blocks."""
+def test_a_slow_block_limits_the_blocks_started_after_it(workers: int) -> None:
+    """Blocks in memory are limited by the number of workers, not by the number of blocks."""
     begun: list[int] = []
     go_on = threading.Event()
 
@@ -107,22 +107,22 @@ def test_few_blocks_are_begun_ahead_of_the_oldest(workers: int) -> None:
 
 
 @pytest.mark.parametrize("pool", [WorkerPool(workers=1), WorkerPool(workers=2), None], ids=["here", "two", "processes"])
-def test_an_error_of_a_block_is_raised_here(processes: WorkerPool, pool: WorkerPool | None) -> None:
-    """What a block raises ends the work with its type and message, and the workers serve the next call."""
+def test_an_error_of_a_block_is_raised_in_the_caller(processes: WorkerPool, pool: WorkerPool | None) -> None:
+    """The error keeps its type and message, and the workers serve the next call."""
     pool = processes if pool is None else pool
     with pytest.raises(ShapeError, match="no 3"):
         run_blocks(partial(square_unless, 3), range(9), pool)
     assert run_blocks(square, range(3), pool) == [0, 1, 4]
 
 
-def test_a_killed_worker_costs_only_time(tmp_path: Path, processes: WorkerPool) -> None:
-    """kill -9 of a worker in the middle of a block: the block is made again, by another."""
+def test_a_block_of_a_killed_worker_is_repeated(tmp_path: Path, processes: WorkerPool) -> None:
+    """Another worker repeats the block after kill -9."""
     assert run_blocks(partial(die_once, tmp_path), range(8), processes) == list(range(8))
     assert (tmp_path / "died").exists()
 
 
-def test_a_block_that_kills_its_workers_is_one_error() -> None:
-    """Where every try kills the worker, the error says so and what to do; an open worker pool gets other workers."""
+def test_a_block_that_always_kills_its_worker_raises_an_error() -> None:
+    """The error says what to do, and the open pool gets new workers."""
     with WorkerPool("processes", 1).open() as pool:
         (before, _), *_ = run_blocks(threads_here, [0], pool)
         with pytest.raises(
@@ -135,20 +135,20 @@ def test_a_block_that_kills_its_workers_is_one_error() -> None:
 
 @pytest.mark.parametrize("scheduler", ["thread", "tcp://", "tcp://host", "http://host:80", "tcp://host:port"])
 def test_an_unknown_scheduler_is_refused(scheduler: str) -> None:
-    """A word that is none, or an address without a port, is refused with what is expected."""
+    """The value is an unknown word, or an address without a port; the error says what is expected."""
     with pytest.raises(SettingsError, match="threads, processes, or the address of a dask scheduler such as tcp://"):
         WorkerPool(scheduler)
 
 
-def test_workers_are_counted() -> None:
-    """None is a worker for each core; fewer than one is refused."""
+def test_pool_has_a_worker_for_each_core_by_default() -> None:
+    """Fewer than one worker is refused."""
     assert WorkerPool().count == len(os.sched_getaffinity(0))
     with pytest.raises(SettingsError, match="at least 1, got 0"):
         WorkerPool(workers=0)
 
 
-def test_nobody_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No scheduler at the address: one error that says where, what was expected and what to do."""
+def test_a_missing_scheduler_raises_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The error names the address, what was expected and what to do."""
     monkeypatch.setattr(pool_module, "ANSWER_S", 0.3)
     with pytest.raises(SettingsError, match=r"tcp://127.0.0.1:9: expected a dask scheduler .*start `dask scheduler`"):
         run_blocks(square, [1], WorkerPool("tcp://127.0.0.1:9"))
@@ -156,15 +156,15 @@ def test_nobody_answers(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def elsewhere() -> Iterator[WorkerPool]:
-    """A scheduler with one worker, found by its address."""
+    """Yield the pool of a dask scheduler with one worker, found by its address."""
     with LocalCluster(n_workers=1, threads_per_worker=2, dashboard_address="127.0.0.1:0") as cluster:
         pool = WorkerPool(cluster.scheduler_address)
         with pool.open():
             yield pool
 
 
-def test_workers_of_a_scheduler_elsewhere_give_the_same(elsewhere: WorkerPool, tmp_path: Path) -> None:
-    """By the address of a scheduler its workers make the blocks, once they have shown that they see the store."""
+def test_workers_of_a_dask_scheduler_give_the_same_results(elsewhere: WorkerPool, tmp_path: Path) -> None:
+    """The workers make the blocks after they have shown that they see the input store."""
     store = StageRef("rectify", "key", tmp_path)
     assert run_blocks(square, range(6), elsewhere, inputs=[store]) == [square(item) for item in range(6)]
 
@@ -180,7 +180,7 @@ def test_workers_of_a_scheduler_elsewhere_give_the_same(elsewhere: WorkerPool, t
 def test_workers_that_differ_are_refused(
     elsewhere: WorkerPool, monkeypatch: pytest.MonkeyPatch, here: dict[str, str], words: str
 ) -> None:
-    """Other code, another numpy or other files would give other bytes: the first that differs is named."""
+    """Other code, another numpy or other files would give other bytes; the error names the first difference."""
     run, true = pool_module.dask_distributed.Client.run, pool_module.about_here([])
     monkeypatch.setattr(pool_module.dask_distributed.Client, "run", lambda self, ask, inputs: run(self, _true, true))
     monkeypatch.setattr(pool_module, "about_here", lambda inputs: {**true, **here})
@@ -196,7 +196,7 @@ STALE_S = 0.6
 
 
 def fail_or_write(folder: Path, number: int) -> None:
-    """Fail in block 0 while block 1 is still to write."""
+    """Fail in block 0 while block 1 has still to write."""
     if number == 0:
         while not (folder / "begun").exists():
             time.sleep(0.01)
@@ -207,8 +207,8 @@ def fail_or_write(folder: Path, number: int) -> None:
 
 
 @pytest.mark.parametrize("scheduler", ["threads", "processes"])
-def test_nobody_writes_after_an_error(tmp_path: Path, processes: WorkerPool, scheduler: str) -> None:
-    """Once an error is raised whoever asked may take the folder away: no block comes back to it, none is begun."""
+def test_no_block_writes_after_an_error_is_raised(tmp_path: Path, processes: WorkerPool, scheduler: str) -> None:
+    """The caller may then delete the folder: running blocks have ended, and no new one starts."""
     pool = processes if scheduler == "processes" else WorkerPool(workers=2)
     with pytest.raises(ShapeError, match="no 0"):
         run_blocks(partial(fail_or_write, tmp_path), range(6), pool)
@@ -258,13 +258,13 @@ if __name__ == "__main__":
 
 
 def nap(number: int) -> int:
-    """A short block."""
+    """Sleep for a short block."""
     time.sleep(0.05)
     return number
 
 
-def test_a_scheduler_that_goes_away_is_one_error(tmp_path: Path) -> None:
-    """In the middle of the work: one message, no traceback of dask's; a scheduler that comes back serves the pool."""
+def test_a_lost_scheduler_raises_one_error(tmp_path: Path) -> None:
+    """There is one message and no traceback of dask; a restarted scheduler serves the pool again."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
     with run_script(tmp_path, GONE, address) as started:
@@ -291,7 +291,7 @@ if __name__ == "__main__":
 
 
 def run_script(folder: Path, text: str, *words: str) -> subprocess.Popen[str]:
-    """A program in a process, and a session, of its own."""
+    """Start a program in a process and a session of its own."""
     (script := folder / "script.py").write_text(text)
     command, environment = [sys.executable, str(script), *words], {**os.environ, "PYTHONPATH": str(ROOT)}
     said = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
@@ -305,7 +305,7 @@ def touch_slowly(folder: Path, number: int) -> None:
 
 
 def is_running(process: int) -> bool:
-    """Whether a process is there and no zombie that nobody has asked for."""
+    """Return whether a process exists and is no zombie."""
     try:
         return ") Z " not in Path(f"/proc/{process}/stat").read_text()
     except OSError:
@@ -314,7 +314,7 @@ def is_running(process: int) -> bool:
 
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGKILL])
 def test_no_worker_outlives_its_pool(tmp_path: Path, sent: signal.Signals) -> None:
-    """Ctrl-C ends the workers without a word of theirs; after kill -9 of the process that started them they end too."""
+    """Ctrl-C ends the workers without output; after kill -9 of their parent process they end too."""
     begun = tmp_path / "begun"
     begun.mkdir()
     with run_script(tmp_path, INTERRUPTED, str(begun)) as started:

@@ -1,4 +1,4 @@
-"""ENVI cubes of every interleave, type and byte order are the same view; damaged ones say what is left."""
+"""ENVI cubes and headers: interleaves, truncated files, braces, comments, wavelengths and refused claims."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ AXES = {"bil": (0, 2, 1), "bip": (0, 1, 2), "bsq": (2, 0, 1)}
 
 
 def write_envi(path: Path, values: NDArray[Any], interleave: str = "bil", *, offset: int = 0) -> Path:
-    """Write (line, sample, band) values and their header beside them; give the data file's path."""
+    """Write (line, sample, band) values and their header beside them; return the data file's path."""
     lines, samples, bands = values.shape
     code = CODES[values.dtype.str[1:]]
     path.with_suffix(".hdr").write_text(
@@ -32,8 +32,8 @@ def write_envi(path: Path, values: NDArray[Any], interleave: str = "bil", *, off
 
 
 @pytest.mark.parametrize("interleave", sorted(AXES))
-def test_cut_off_at_every_byte(tmp_path: Path, interleave: str) -> None:
-    """Wherever a cube ends, in its offset, in a line or at one: lines that are whole in all bands are kept."""
+def test_truncated_cubes_keep_their_whole_lines(tmp_path: Path, interleave: str) -> None:
+    """Cut at any byte, in the offset or in a line: lines that are whole in all bands are kept, others are 0."""
     values = np.random.default_rng(0).integers(0, 4096, (5, 3, 2), dtype=np.uint16)
     path = write_envi(tmp_path / "a.img", values, interleave, offset=10)
     whole = path.read_bytes()
@@ -54,8 +54,8 @@ def test_cut_off_at_every_byte(tmp_path: Path, interleave: str) -> None:
 
 
 @pytest.mark.parametrize("interleave", sorted(AXES))
-def test_lines_not_said(tmp_path: Path, interleave: str) -> None:
-    """Without lines in the header the file's size says how many there are."""
+def test_lines_are_counted_from_the_file_size(tmp_path: Path, interleave: str) -> None:
+    """The header does not state the number of lines."""
     values = np.arange(60, dtype="f4").reshape(5, 4, 3)
     path = write_envi(tmp_path / "a.bin", values, interleave)
     header = path.with_suffix(".hdr")
@@ -65,8 +65,8 @@ def test_lines_not_said(tmp_path: Path, interleave: str) -> None:
     assert "the file holds 5" in cube.notes[0]
 
 
-def test_names_of_the_pair(tmp_path: Path) -> None:
-    """Header and data find each other by either name."""
+def test_header_and_data_file_find_each_other(tmp_path: Path) -> None:
+    """Either file may be given, and the header's name may contain the ending of the data file."""
     path = write_envi(tmp_path / "scene.bip", np.ones((2, 2, 2), "u1"), "bip")
     (tmp_path / "scene.hdr").rename(tmp_path / "scene.bip.hdr")
     assert open_envi_cube(path).path == path
@@ -85,8 +85,8 @@ REFUSED = {
 }
 
 
-def test_braces() -> None:
-    """Values in braces run over lines, nest and hold equal signs; escaped braces and those in mid line do not count."""
+def test_values_in_braces_are_parsed() -> None:
+    """Values may span lines, nest and hold equal signs; escaped braces and braces within a line do not count."""
     text = PLAIN + (
         'description = {\n first {nested}\n samples = 9\n}\nhistory = a -> b{c\nproj = {PROJCS["x"], {1, 2}}\n'
         "odd = {with \\{ escaped}\nband names = {red, near infrared}\n"
@@ -99,8 +99,8 @@ def test_braces() -> None:
     assert header.fields["odd"] == "with \\{ escaped"
 
 
-def test_one_brace_too_many() -> None:
-    """A brace opened in vain does not swallow the fields after it; one that nothing closes is refused."""
+def test_unbalanced_braces_do_not_hide_fields() -> None:
+    """An extra opening brace does not swallow later fields; a brace that is never closed is refused."""
     header = parse_envi_header(PLAIN.replace("samples", "description = {a {b}\nsamples"))
     assert header.samples == 4
     assert "opens more braces than it closes" in header.notes[0]
@@ -108,8 +108,8 @@ def test_one_brace_too_many() -> None:
         parse_envi_header(PLAIN + "wavelength = {400,\n500")
 
 
-def test_comment_lines() -> None:
-    """Lines that begin with a semicolon are no fields, but the settings in them are kept; also within braces."""
+def test_comment_lines_hold_settings() -> None:
+    """Lines that begin with a semicolon are no fields, but settings in them are kept, also within braces."""
     text = (
         PLAIN + "; free words\n;Exposure (ms) = 100.25\n ;POST AOI width : 1600\nwavelength = {\n400\n;x = 1\n,402\n}\n"
     )
@@ -132,8 +132,8 @@ def test_comment_lines() -> None:
         ("nm", "400, x", None),
     ],
 )
-def test_wavelengths(unit: str, listed: str, found: list[float] | None) -> None:
-    """Wavelengths come out in nm; what has no unit is read by its size, what cannot be read is left out with a note."""
+def test_wavelengths_are_converted_to_nm(unit: str, listed: str, found: list[float] | None) -> None:
+    """Without a unit they are read by their size; wavelengths that cannot be read are left out with a note."""
     header = parse_envi_header(PLAIN + f"wavelength units = {unit}\nwavelength = {{{listed}}}\n")
     if found is None:
         assert header.wavelength_nm is None
@@ -155,14 +155,14 @@ def test_wavelengths(unit: str, listed: str, found: list[float] | None) -> None:
         ("bil", "xyz", "interleave = 'xyz'"),
     ],
 )
-def test_refusals(old: str, new: str, words: str) -> None:
-    """What cannot be used is refused, and the message says what was expected."""
+def test_invalid_headers_are_refused(old: str, new: str, words: str) -> None:
+    """The error says what was expected."""
     with pytest.raises(SceneError, match=words):
         parse_envi_header(PLAIN.replace(old, new), "a.hdr")
 
 
-def test_what_is_no_text(tmp_path: Path) -> None:
-    """Missing, empty and binary files are refused; Latin letters of old programs are read."""
+def test_missing_empty_and_binary_headers_are_refused(tmp_path: Path) -> None:
+    """Latin letters in headers of old programs are read."""
     path = tmp_path / "a.hdr"
     with pytest.raises(SceneError, match=r"a\.hdr cannot be read"):
         load_envi_header(path)
@@ -177,7 +177,7 @@ def test_what_is_no_text(tmp_path: Path) -> None:
 
 
 def test_headers_of_real_instruments(real_data: Path) -> None:
-    """All 42 headers are read or refused with the reason; none is misread silently."""
+    """All 42 headers are read or refused for the expected reason; the wavelength ranges of six are checked."""
     refused, read = {}, {}
     for path in sorted((real_data / "envi_headers").glob("*.hdr")):
         try:
@@ -213,7 +213,7 @@ def test_headers_of_real_instruments(real_data: Path) -> None:
     ],
 )
 def test_huge_claims_are_refused_from_the_size_of_the_file(tmp_path: Path, text: str) -> None:
-    """What a header claims beyond its data file is refused before anything of that size is asked for."""
+    """A header that claims more than its data file holds is refused before memory is allocated."""
     (tmp_path / "a.hdr").write_text(text)
     (tmp_path / "a.bin").write_bytes(bytes(48))
     tracemalloc.start()
@@ -223,8 +223,8 @@ def test_huge_claims_are_refused_from_the_size_of_the_file(tmp_path: Path, text:
     tracemalloc.stop()
 
 
-def test_lines_beyond_the_file_are_not_made_up(tmp_path: Path) -> None:
-    """Some missing lines are flagged; lines beyond all measure are told of, and not made."""
+def test_lines_beyond_the_file_are_flagged_or_left_out(tmp_path: Path) -> None:
+    """A few missing lines are flagged; of 10^12 claimed lines the missing ones are left out with a note."""
     (tmp_path / "a.bin").write_bytes(bytes(48))
     (tmp_path / "a.hdr").write_text(PLAIN.replace("lines = 3", "lines = 5"))
     source = open_cube(tmp_path / "a.hdr")
@@ -247,16 +247,16 @@ def test_lines_beyond_the_file_are_not_made_up(tmp_path: Path) -> None:
     ],
     ids=["spaces", "comment", "brace in a key", "unbalanced values", "braces", "nested"],
 )
-def test_texts_that_would_keep_a_reader_busy(made: str) -> None:
-    """Text made to be searched again and again is read once or refused; a quadratic search would take hours."""
+def test_hostile_headers_do_not_stall_the_parser(made: str) -> None:
+    """Text that invites repeated searches is read once or refused; a quadratic search would take hours."""
     try:
         parse_envi_header(PLAIN + made)
     except SceneError as error:
         assert "more braces than it closes" in str(error)  # noqa: PT017 - either end is well
 
 
-def test_gains_and_offsets_of_bands(tmp_path: Path) -> None:
-    """The header's lists, one number a band; a list of another length is refused."""
+def test_gains_and_offsets_of_bands_are_applied(tmp_path: Path) -> None:
+    """The header lists one number per band; a list of another length is refused."""
     path = write_envi(tmp_path / "a.img", np.arange(6, dtype=np.uint16).reshape(1, 3, 2))
     header = path.with_suffix(".hdr")
     text = header.read_text()

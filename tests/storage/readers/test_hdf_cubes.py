@@ -1,4 +1,4 @@
-"""NetCDF and HDF5 cubes: EMIT, PRISMA and NEON in their published layouts, CF files as xarray writes them, bad ones."""
+"""NetCDF and HDF5 cubes: published layouts of EMIT, PRISMA and NEON, CF files of xarray, and damaged files."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def emit_file(path: Path) -> NDArray[np.float32]:
     return values
 
 
-def test_emit_reflectance(tmp_path: Path) -> None:
-    """Values, wavelengths, widths and bad bands as EMIT says them; a note says that there is no map grid."""
+def test_emit_reflectance_is_read(tmp_path: Path) -> None:
+    """Values, wavelengths, widths and bad bands are EMIT's; a note says that there is no map grid."""
     values, source = emit_file(tmp_path / "emit.nc"), open_cube(tmp_path / "emit.nc")
     assert (source.shape, source.nodata, source.bad_bands) == ((7, 6, 5), -9999.0, (2,))
     scene = load_scene_file(tmp_path / "emit.nc")
@@ -81,8 +81,8 @@ def neon_file(path: Path, **about: Any) -> None:
         below.create_dataset("Coordinate_System/EPSG Code", data="32632")
 
 
-def test_neon_reflectance(tmp_path: Path) -> None:
-    """Divided by its scale, without the number for no data, on the grid of its map info."""
+def test_neon_reflectance_is_read(tmp_path: Path) -> None:
+    """Values are divided by their scale, no-data is NaN, and the grid comes from the map info."""
     neon_file(tmp_path / "NEON_SERC.h5")
     scene, expected = load_scene_file(tmp_path / "NEON_SERC.h5"), CUBE / 10000
     expected[1, 1] = np.nan
@@ -121,8 +121,8 @@ def prisma_file(path: Path, level: str = "D", **about: Any) -> dict[str, NDArray
     return {part: cube.astype(np.uint16) for part, cube in cubes.items()}
 
 
-def test_prisma_reflectance(tmp_path: Path) -> None:
-    """One cube of both spectrometers by ascending wavelength, scaled; corners are centres of pixels of 30 m."""
+def test_prisma_reflectance_is_read(tmp_path: Path) -> None:
+    """Both spectrometers form one scaled cube by ascending wavelength; corners are centres of pixels of 30 m."""
     cubes = prisma_file(tmp_path / "PRS_L2D.he5")
     scene = load_scene_file(tmp_path / "PRS_L2D.he5")
     np.testing.assert_allclose(scene.wavelength_nm, [450.1, 660.3, 943.4, 977.4, 2490.0], rtol=1e-6)
@@ -140,8 +140,8 @@ def test_prisma_reflectance(tmp_path: Path) -> None:
     ("dims", "unit", "scale"),
     [(("y", "x", "wl"), "nm", 1.0), (("wl", "y", "x"), "micrometer", 1e-3), (("y", "wl", "x"), "m", 1e-9)],
 )
-def test_cf_files(tmp_path: Path, dims: tuple[str, ...], unit: str, scale: float) -> None:
-    """Any order of axes and unit of wavelengths give one scene: packed values, place and units."""
+def test_cf_files_are_read(tmp_path: Path, dims: tuple[str, ...], unit: str, scale: float) -> None:
+    """Any order of axes and unit of wavelengths gives the same scene: unpacked values, grid and units."""
     path = tmp_path / "cube.nc"
     packing = {"dtype": "i2", "scale_factor": 0.25, "add_offset": 3.0, "_FillValue": -1}
     values = CUBE.transpose([("y", "x", "wl").index(dim) for dim in dims]) * 0.25 + 3
@@ -159,8 +159,8 @@ def test_cf_files(tmp_path: Path, dims: tuple[str, ...], unit: str, scale: float
     assert "values are in W m-2 sr-1 um-1" in scene.provenance
 
 
-def test_plain_hdf5_without_names(tmp_path: Path) -> None:
-    """The axis that has as many numbers as there are wavelengths is the band; a note says which."""
+def test_hdf5_without_dimension_names_is_read(tmp_path: Path) -> None:
+    """The axis whose length is the number of wavelengths is the band; a note says which."""
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["cube"], file["wavelength"] = np.moveaxis(CUBE, -1, 0), NM
     scene = load_scene_file(tmp_path / "a.h5")
@@ -168,8 +168,8 @@ def test_plain_hdf5_without_names(tmp_path: Path) -> None:
     assert "dims have no names, read as y, x and band: axis 0 (from 0) is band" in scene.provenance
 
 
-def test_a_step_of_time_and_a_variable_are_named(tmp_path: Path) -> None:
-    """By the address, with groups or without."""
+def test_an_address_selects_variable_and_time_step(tmp_path: Path) -> None:
+    """The name of the variable may be given with its groups or without."""
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["field/one"], file["field/two"], file["wavelength"] = CUBE, CUBE + 1, NM
         file["series/days"] = np.stack([CUBE, CUBE + 7])
@@ -178,7 +178,7 @@ def test_a_step_of_time_and_a_variable_are_named(tmp_path: Path) -> None:
 
 
 def test_chunks_are_read_once(tmp_path: Path) -> None:
-    """Lines asked for in order are the same as all at once, and no chunk is asked for twice."""
+    """Lines read in order equal those read at once; each way reads every chunk once."""
     read = Mock(side_effect=lambda start, stop: CUBE[start:stop])
     lines = read_by_chunks(read, 7, 3)
     np.testing.assert_array_equal(np.concatenate([lines(at, min(at + 2, 7)) for at in range(0, 7, 2)]), CUBE)
@@ -187,7 +187,7 @@ def test_chunks_are_read_once(tmp_path: Path) -> None:
 
 
 def hold(path: Path, name: str, value: Any) -> None:
-    """An HDF5 file of one entry."""
+    """Write an HDF5 file of one entry."""
     with h5py.File(path, "w") as file:
         file[name] = value
 
@@ -217,15 +217,15 @@ NO_CUBE_AXES = xr.Dataset({"rain": (("level", "lat", "lon"), CUBE.astype(float))
         (partial(hold, name=LEVEL_1, value=np.ones((7, 4, 6), "u2")), "is no PRISMA product of level 2B, 2C or 2D"),
     ],
 )
-def test_bad_files_end_in_one_message(write: Any, words: str, tmp_path: Path) -> None:
-    """Damaged, empty and mistaken files."""
+def test_unusable_hdf_files_raise_one_error(write: Any, words: str, tmp_path: Path) -> None:
+    """The files are damaged, inconsistent, without a cube, or of another product."""
     write(tmp_path / "bad.h5")
     with pytest.raises((SceneError, WavelengthError), match=words):
         load_scene_file(tmp_path / "bad.h5")
 
 
-def test_rows_from_the_bottom_up_lie_where_gdal_has_them(tmp_path: Path) -> None:
-    """GDAL writes the south first, under the GeoTransform of the image upright."""
+def test_rows_from_south_to_north_have_gdals_position(tmp_path: Path) -> None:
+    """GDAL writes the southern row first, under the GeoTransform of the upright image."""
     values = np.arange(12, dtype=np.float32).reshape(3, 4)
     upright = rasterio.transform.from_origin(500_000, 5_000_030, 10, 10)
     size = {"height": 3, "width": 4, "count": 1, "dtype": "float32"}
@@ -251,8 +251,8 @@ def test_rows_from_the_bottom_up_lie_where_gdal_has_them(tmp_path: Path) -> None
     ],
     ids=["unsigned", "least and most", "range", "two fills"],
 )
-def test_numbers_mean_what_xarray_reads(tmp_path: Path, stored: Any, about: dict[str, Any], read: list[float]) -> None:
-    """Unsigned numbers, ranges and several numbers for no value, by the conventions of NetCDF."""
+def test_netcdf_packing_is_decoded(tmp_path: Path, stored: Any, about: dict[str, Any], read: list[float]) -> None:
+    """Unsigned numbers, valid ranges and several fill values are decoded."""
     with h5py.File(tmp_path / "a.nc", "w") as file:
         file["values"] = stored.reshape(1, 4, 1)
         file["values"].attrs.update({"scale_factor": 0.01, **about})
@@ -268,8 +268,8 @@ def test_numbers_mean_what_xarray_reads(tmp_path: Path, stored: Any, about: dict
         (np.float32, {"_FillValue": np.float32("nan"), "missing_value": -3.0}, np.float32, [0, 101, np.nan, -9]),
     ],
 )
-def test_numbers_out_of_range_are_no_value(tmp_path: Path, stored: Any, about: Any, kind: Any, read: Any) -> None:
-    """Without a scale whole numbers stay whole if one of them is the fill value."""
+def test_values_out_of_valid_range_are_nodata(tmp_path: Path, stored: Any, about: Any, kind: Any, read: Any) -> None:
+    """Unscaled whole numbers stay whole if there is a fill value; else they become floats with NaN."""
     with h5py.File(tmp_path / "a.nc", "w") as file:
         file["values"] = stored([0, 101, -3, -9]).reshape(1, 4, 1)
         file["values"].attrs.update(about)

@@ -1,4 +1,4 @@
-"""Parts of a Headwall folder are one cube in order; gaps, cut files and references are found."""
+"""Headwall folders: parts form one cube in order; gaps, truncated files and references are found."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NM = "wavelength units = nm\nwavelength = {\n400.0\n,500.0\n,600.0\n}\n"
 
 
 def write_part(folder: Path, name: str, values: NDArray[Any], *, lines: int | None = None, more: str = NM) -> None:
-    """Write (line, sample, band) values as the camera does: BIL without an ending, the header beside it."""
+    """Write (line, sample, band) values as the camera does: BIL without a file ending, the header beside it."""
     folder.mkdir(exist_ok=True)
     promised = len(values) if lines is None else lines
     (folder / f"{name}.hdr").write_text(
@@ -31,12 +31,12 @@ def write_part(folder: Path, name: str, values: NDArray[Any], *, lines: int | No
 
 @pytest.fixture
 def lines() -> NDArray[np.uint16]:
-    """Numbers of 30 lines, (30, 4, 3) uint16."""
+    """Return the numbers of 30 lines, (30, 4, 3) uint16."""
     return np.arange(360, dtype=np.uint16).reshape(30, 4, 3)
 
 
-def test_parts_in_order_of_their_frames(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
-    """Parts follow each other by number, not by letters; times come from the index of each, in both layouts."""
+def test_parts_are_joined_in_order_of_their_frames(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
+    """Parts are ordered by number, not by alphabet; times come from each part's frame index, in both layouts."""
     for first, last, between in ((0, 8, "\t"), (8, 20, " "), (20, 30, "\t")):
         write_part(tmp_path, f"raw_{first}", lines[first:last])
         rows = [f"{frame}{between}{1000 + 10 * frame}" for frame in range(first, last)]
@@ -52,15 +52,15 @@ def test_parts_in_order_of_their_frames(tmp_path: Path, lines: NDArray[np.uint16
     assert len(source.files) == 9
 
 
-def test_stamps_that_never_change_are_no_times(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
-    """A camera without a clock repeats one stamp."""
+def test_constant_timestamps_are_ignored(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
+    """A camera without a clock repeats one timestamp."""
     write_part(tmp_path, "raw_0", lines)
     (tmp_path / "frameIndex_0.txt").write_text("\n".join(["Frame#\tTimestamp", *(f"{n}\t7" for n in range(30))]))
     assert open_cube(tmp_path).lines.time_s is None
 
 
-def test_lines_in_no_file_are_flagged(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
-    """A part that is cut off, or not there, leaves lines between; the last one's lost lines stand at the end."""
+def test_missing_lines_are_flagged(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
+    """A truncated or missing part leaves a gap; the last part's lost lines are at the end."""
     write_part(tmp_path, "raw_0", lines[:6], lines=10)
     write_part(tmp_path, "raw_10", lines[10:20], lines=12)
     source, missing = open_cube(tmp_path), [6, 7, 8, 9, 20, 21]
@@ -72,17 +72,17 @@ def test_lines_in_no_file_are_flagged(tmp_path: Path, lines: NDArray[np.uint16])
 
 
 def test_an_empty_part_is_left_out(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
-    """A part that was opened when the capture died holds nothing; the rest is read."""
+    """A part that was begun when the capture died is empty; the others are read."""
     write_part(tmp_path, "raw_0", lines[:6])
     write_part(tmp_path, "raw_6", lines[:0], lines=10)
-    for name in ("raw_6", "raw_6.bin"):  # whatever its data file is called
+    for name in ("raw_6", "raw_6.bin"):  # with either name of the data file
         source = open_cube(tmp_path)
         assert (source.shape[0], source.notes) == (6, (f"{name} is empty and left out",))
         (tmp_path / "raw_6").rename(tmp_path / "raw_6.bin") if name == "raw_6" else None
 
 
-def test_references_found_by_name(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
-    """Dark and white frames are averaged over their lines, whatever the capitals; flags win over them."""
+def test_references_are_found_by_name(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
+    """Dark and white frames are averaged over their lines, in any letter case; the argument `dark` has priority."""
     write_part(tmp_path, "raw_0", lines)
     write_part(tmp_path, "darkReference", np.stack([lines[0], lines[2]]), more="")
     write_part(tmp_path, "WhiteReference_01", lines[5:6], more="")
@@ -94,7 +94,7 @@ def test_references_found_by_name(tmp_path: Path, lines: NDArray[np.uint16]) -> 
     np.testing.assert_array_equal(open_cube(tmp_path, dark=tmp_path / "d.npy").dark, lines[9])
 
 
-def test_references_of_another_size_or_several(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
+def test_unsuitable_references_are_refused(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
     """A frame that does not fit the cube is refused, and so are two of a kind."""
     write_part(tmp_path, "raw_0", lines)
     write_part(tmp_path, "darkReference", lines[:1, :2], more="")
@@ -106,8 +106,8 @@ def test_references_of_another_size_or_several(tmp_path: Path, lines: NDArray[np
     assert open_cube(tmp_path, dark=tmp_path / "darkReference_2.hdr").dark is not None
 
 
-def test_parts_that_do_not_fit(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
-    """Parts of another size, or far behind the rest, are no part of one cube."""
+def test_parts_that_do_not_fit_are_refused(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
+    """A part of another frame size is refused, and so is one with a frame number far beyond the others."""
     write_part(tmp_path / "size", "raw_0", lines)
     write_part(tmp_path / "size", "raw_30", lines[:, :3])
     write_part(tmp_path / "far", "raw_0", lines)
@@ -117,8 +117,8 @@ def test_parts_that_do_not_fit(tmp_path: Path, lines: NDArray[np.uint16]) -> Non
             open_cube(tmp_path / name)
 
 
-def test_folders_that_are_none(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
-    """A folder without parts, and parts that are all empty, each say so."""
+def test_folders_without_lines_are_refused(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
+    """A folder without parts and one with only empty parts have different messages."""
     with pytest.raises(
         SceneError, match="is a folder, expected a file, a Zarr store, or a folder with raw_<frame> files"
     ):
@@ -128,8 +128,8 @@ def test_folders_that_are_none(tmp_path: Path, lines: NDArray[np.uint16]) -> Non
         open_cube(tmp_path)
 
 
-def test_what_is_no_file_is_no_part(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
-    """Folders and pipes with the names of parts and indices are passed over; none of them is waited for."""
+def test_folders_and_pipes_are_ignored_as_parts(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
+    """A folder named like a part and a pipe named like an index are ignored; a pipe as header is refused."""
     write_part(tmp_path, "raw_0", lines[:5])
     (tmp_path / "raw_5").mkdir()
     os.mkfifo(tmp_path / "frameIndex_0.txt")
@@ -147,8 +147,8 @@ def _index(folder: Path, text: str) -> Path:
 
 
 @pytest.mark.parametrize("text", ["", "Frame#\tTimestamp\n", "\0\0\0"])
-def test_no_frame_at_all(tmp_path: Path, text: str) -> None:
-    """A file that lists no frame is refused; so is one that is not there."""
+def test_an_empty_frame_index_is_refused(tmp_path: Path, text: str) -> None:
+    """A missing index is refused as well."""
     with pytest.raises(SceneError, match=r"lists no frame, expected lines of number and microseconds"):
         load_frame_index(_index(tmp_path, text))
     with pytest.raises(SceneError, match="cannot be read"):
@@ -159,7 +159,7 @@ def test_no_frame_at_all(tmp_path: Path, text: str) -> None:
     ("frames", "first", "lost", "found", "notes"),
     [
         (
-            # by number: a line's frame is the part's first and so on; where the index has a gap nothing is known
+            # by number: lines count from the part's first frame; a gap of the index has no time
             {2000: 10, 2001: 20, 2003: 40, 2009: 99},
             (2000, 5),
             0,
@@ -167,17 +167,17 @@ def test_no_frame_at_all(tmp_path: Path, text: str) -> None:
             ("the frame index has the time of 3 of 5 lines", "the frame index lists 1 frames beyond the lines"),
         ),
         (
-            # as many frames as lines are the lines, whatever their numbers
+            # as many frames as lines: they are the lines, whatever their numbers
             {0: 10, 1: 20, 3: 40},
             (0, 3),
             0,
             [0, 1, 3],
             ("1 frames between the first and the last were dropped by the camera",),
         ),
-        # the index of a later part that counts from 0 counts from the part's own start
+        # the index of a later part may count from the part's own start
         ({0: 10, 1: 20}, (2000, 3), 0, [2000, 2001, -1], ("the frame index has the time of 2 of 3 lines",)),
         ({0: 10, 1: 20, 2: 30}, (2000, 3), 0, [2000, 2001, 2002], ()),
-        # a file that lost its last line still has its lines in order, where frames had been dropped before
+        # a file that lost its last line still has its lines in order, also with dropped frames
         (
             {0: 10, 1: 20, 3: 40, 4: 50},
             (0, 3),
@@ -187,10 +187,10 @@ def test_no_frame_at_all(tmp_path: Path, text: str) -> None:
         ),
     ],
 )
-def test_times_of_lines(
+def test_lines_have_the_times_of_their_frames(
     tmp_path: Path, frames: dict[int, int], first: tuple[int, int], lost: int, found: list[int], notes: tuple[str, ...]
 ) -> None:
-    """Whatever the camera dropped and the file lost, each line has the time of its own frame, or none."""
+    """With dropped frames and lost lines, each line has the time of its own frame, or none."""
     index = load_frame_index(_index(tmp_path, "f t\n" + "".join(f"{frame} {at}\n" for frame, at in frames.items())))
     times = times_of_lines(index, *first, lost=lost)
     own = first[0] if 0 in frames else 0

@@ -1,4 +1,4 @@
-"""Files that claim more than they hold, or would run or fetch something: one clear error, and little memory."""
+"""Files that claim more than they hold, or would run code or fetch files: one clear error, and little memory."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def read_all(path: Path) -> Any:
 
 @contextmanager
 def little_memory(most: int = FEW) -> Iterator[None]:
-    """Fails where more is asked for within."""
+    """Fail if the block allocates more memory."""
     tracemalloc.start()
     try:
         yield
@@ -44,15 +44,15 @@ def little_memory(most: int = FEW) -> Iterator[None]:
 
 
 def npy_header(shape: tuple[int, ...], kind: str = "<u2") -> bytes:
-    """A .npy header, without any number after it."""
+    """Return a .npy header, without any number after it."""
     stream = io.BytesIO()
     np.lib.format.write_array_header_1_0(stream, {"descr": kind, "fortran_order": False, "shape": shape})
     return stream.getvalue()
 
 
 @pytest.mark.parametrize("packed", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, None])
-def test_arrays_that_claim_too_much(tmp_path: Path, packed: int | None) -> None:
-    """A shape beyond the file's or the member's bytes is refused before it is allocated."""
+def test_arrays_with_huge_claims_are_refused(tmp_path: Path, packed: int | None) -> None:
+    """A shape beyond the bytes of the file or of its member is refused before it is allocated."""
     claim = npy_header((100_000, 1000, 1000)) + bytes(100)
     path, words = tmp_path / ("a.npy" if packed is None else "a.npz"), "claims 200000000000 bytes of numbers"
     if packed is None:
@@ -65,8 +65,8 @@ def test_arrays_that_claim_too_much(tmp_path: Path, packed: int | None) -> None:
         read_all(path)
 
 
-def test_only_the_array_wanted_is_read(tmp_path: Path) -> None:
-    """What lies beside the cube in a pack is not unpacked: not numbers, not objects."""
+def test_only_the_cube_of_a_file_is_read(tmp_path: Path) -> None:
+    """Other arrays and objects in a .npz or .mat file are not unpacked."""
     cube = np.ones((3, 4, 5), np.uint8)
     np.savez_compressed(tmp_path / "a.npz", cube=cube, large=np.zeros((6000, 6000), np.uint8), what={"a": 1})
     scipy.io.savemat(tmp_path / "a.mat", {"cube": cube, "large": np.zeros((6000, 6000), np.uint8)}, do_compression=True)
@@ -76,7 +76,7 @@ def test_only_the_array_wanted_is_read(tmp_path: Path) -> None:
 
 
 class Trap:
-    """Unpickled, it would leave a file."""
+    """Leave a file if unpickled."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -85,8 +85,8 @@ class Trap:
         return Path.touch, (self.path,)
 
 
-def test_pickles_in_arrays_and_packs(tmp_path: Path) -> None:
-    """What only unpickling could read is never read, whatever file it stands in."""
+def test_pickles_are_never_loaded(tmp_path: Path) -> None:
+    """Content that only unpickling could read is refused in .npy, .npz and .mat files."""
     trap = pickle.dumps(Trap(tmp_path / "trapped"))
     (tmp_path / "bare.npy").write_bytes(trap)
     (tmp_path / "object.npy").write_bytes(npy_header((2, 2, 2), "|O") + trap)
@@ -94,15 +94,15 @@ def test_pickles_in_arrays_and_packs(tmp_path: Path) -> None:
         pack.writestr("cube.npy", npy_header((2, 2, 2), "|O") + trap)
         pack.writestr("cube.pkl", trap)
     (tmp_path / "bare.mat").write_bytes(trap)
-    scipy.io.savemat(tmp_path / "cell.mat", {"cube": np.array([{"a": 1}], object)})  # objects are passed over
+    scipy.io.savemat(tmp_path / "cell.mat", {"cube": np.array([{"a": 1}], object)})  # objects are skipped
     for name in ("bare.npy", "object.npy", "a.npz", "a.npz:cube", "bare.mat", "cell.mat"):
         with pytest.raises(SceneError, match=r"Python objects|cannot be read|has no (single )?array"):
             open_cube(tmp_path / name)
     assert not (tmp_path / "trapped").exists()
 
 
-def test_mat_arrays_that_claim_too_much(tmp_path: Path) -> None:
-    """Axes beyond what the file can hold are refused, in both versions; so are arrays never written."""
+def test_mat_arrays_with_huge_claims_are_refused(tmp_path: Path) -> None:
+    """Axes beyond the file's size are refused in both versions; the array of version 7.3 was never written."""
     scipy.io.savemat(tmp_path / "a.mat", {"cube": np.ones((3, 4, 5), np.uint8)})
     whole, sizes = (tmp_path / "a.mat").read_bytes(), struct.pack("<iii", 3, 4, 5)
     assert sizes in whole
@@ -114,8 +114,8 @@ def test_mat_arrays_that_claim_too_much(tmp_path: Path) -> None:
             read_all(tmp_path / name)
 
 
-def test_text_and_cells_of_matlab_are_no_arrays(tmp_path: Path) -> None:
-    """Text, which MATLAB 7.3 keeps as numbers, is not taken for an image beside the labels."""
+def test_matlab_text_and_cells_are_ignored(tmp_path: Path) -> None:
+    """MATLAB 7.3 stores text as numbers; it is not taken for an image beside the labels."""
     labels = np.arange(12, dtype=np.uint8).reshape(3, 4)
     with h5py.File(tmp_path / "a.mat", "w", userblock_size=512) as file:
         file["labels"] = labels.T
@@ -126,7 +126,7 @@ def test_text_and_cells_of_matlab_are_no_arrays(tmp_path: Path) -> None:
 
 
 def png(width: int, height: int, packed: bytes) -> bytes:
-    """A grey PNG of any claimed size."""
+    """Return a grey PNG of any claimed size."""
     chunks = [(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)), (b"IDAT", packed), (b"IEND", b"")]
     parts = [
         struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body)) for kind, body in chunks
@@ -135,7 +135,7 @@ def png(width: int, height: int, packed: bytes) -> bytes:
 
 
 @pytest.mark.parametrize("side", [12_000, 25_000, 2**31 - 1])
-def test_images_that_claim_too_much(tmp_path: Path, side: int) -> None:
+def test_images_with_huge_claims_are_refused(tmp_path: Path, side: int) -> None:
     """A PNG and a bitmap of a few bytes do not get the memory of the size that they claim."""
     (tmp_path / "a.png").write_bytes(png(side, side, zlib.compress(bytes(2000))))
     Image.new("L", (2, 2)).save(tmp_path / "a.bmp")
@@ -148,8 +148,8 @@ def test_images_that_claim_too_much(tmp_path: Path, side: int) -> None:
 
 
 @pytest.mark.parametrize(("side", "tile"), [(2_000_000_000, 2_000_000_000), (60_000, 60_000), (1_000_000, 512)])
-def test_tiffs_that_claim_too_much(tmp_path: Path, side: int, tile: int) -> None:
-    """A TIFF of a few bytes with the size of a country is refused."""
+def test_tiffs_with_huge_claims_are_refused(tmp_path: Path, side: int, tile: int) -> None:
+    """A TIFF of a few bytes claims sides of up to 2 000 000 000 px."""
     told = {(256, 257): (4, side), (258,): (3, 8), (259, 262, 277): (3, 1), (322, 323): (4, tile), (324, 325): (4, 0)}
     entries = [(tag, *one) for tags, one in told.items() for tag in tags]
     body = b"".join(struct.pack("<HHII", tag, kind, 1, value) for tag, kind, value in entries)
@@ -160,8 +160,8 @@ def test_tiffs_that_claim_too_much(tmp_path: Path, side: int, tile: int) -> None
 
 @pytest.mark.parametrize("compression", [None, "zlib"])
 @pytest.mark.parametrize("fraction", [0.02, 0.9])
-def test_tiffs_that_are_cut_off(tmp_path: Path, compression: str | None, fraction: float) -> None:
-    """A TIFF that ends too early is refused when its missing rows are asked for, not filled."""
+def test_truncated_tiffs_are_refused(tmp_path: Path, compression: str | None, fraction: float) -> None:
+    """The error comes when missing rows are read; they are not filled."""
     values = np.random.default_rng(0).integers(1, 255, (200, 100), dtype=np.uint8)
     tifffile.imwrite(tmp_path / "a.tif", values, compression=compression, rowsperstrip=16)
     whole = (tmp_path / "a.tif").read_bytes()
@@ -170,8 +170,8 @@ def test_tiffs_that_are_cut_off(tmp_path: Path, compression: str | None, fractio
         open_cube(tmp_path / "a.tif").read(0, 200)
 
 
-def test_images_of_one_size_in_a_tiff_are_bands(tmp_path: Path) -> None:
-    """Pages are bands, in order, by rows and as a whole; pages of several sizes are not, and a note says so."""
+def test_tiff_pages_of_one_size_are_bands(tmp_path: Path) -> None:
+    """The pages are read by rows and as a whole; of pages of several sizes only the first is read, with a note."""
     values = np.random.default_rng(0).integers(0, 4096, (7, 9, 5), dtype=np.uint16)
     with tifffile.TiffWriter(tmp_path / "a.tif") as file:
         for band in range(5):
@@ -195,8 +195,8 @@ VRT = """<VRTDataset rasterXSize="4" rasterYSize="3"><VRTRasterBand dataType="By
 </VRTDataset>"""
 
 
-def test_lists_of_other_files_are_no_tiff(tmp_path: Path) -> None:
-    """Other formats of GDAL's may name any file or server: with the ending of a TIFF they are not opened."""
+def test_a_vrt_named_as_tiff_is_refused(tmp_path: Path) -> None:
+    """Other formats of GDAL may refer to any file or server, so they are not opened under this ending."""
     tifffile.imwrite(tmp_path / "secret.tif", np.full((3, 4), 7, np.uint8))
     (tmp_path / "a.tif").write_text(VRT)
     with pytest.raises(SceneError, match=r"a\.tif cannot be read as TIFF"):

@@ -1,4 +1,4 @@
-"""Labels with a place of their own lie where they say, on the pixels of the scene."""
+"""Georeferenced labels are resampled to the pixels of the scene."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from pipeline.errors import SceneError
 from storage.readers.scene_files import load_scene_file, open_scene_file
 
 WEST, NORTH, SIDE = 600_000.0, 5_700_000.0, 60
-CLASSES = np.zeros((SIDE, SIDE), np.uint8)  # three stripes and a corner, nothing of them symmetric
+CLASSES = np.zeros((SIDE, SIDE), np.uint8)  # three stripes and a corner, without any symmetry
 CLASSES[:, 20:], CLASSES[:, 45:], CLASSES[:10, :15] = 1, 2, 3
 NORTH_UP = Affine(1, 0, WEST, 0, -1, NORTH)
 
@@ -26,7 +26,7 @@ NORTH_UP = Affine(1, 0, WEST, 0, -1, NORTH)
 def write(
     path: Path, values: NDArray[Any], transform: Affine = NORTH_UP, crs: str | None = "EPSG:32632", **about: Any
 ) -> Path:
-    """A GeoTIFF of (y, x) or (y, x, band) values."""
+    """Write a GeoTIFF of (y, x) or (y, x, band) values, and return its path."""
     planes = np.moveaxis(np.atleast_3d(values), -1, 0)
     count, height, width = planes.shape
     kind = {"driver": "GTiff", "count": count, "height": height, "width": width, "dtype": values.dtype}
@@ -37,20 +37,20 @@ def write(
 
 
 def image(folder: Path, transform: Affine = NORTH_UP, classes: NDArray[np.uint8] = CLASSES) -> Path:
-    """An image whose only band is ten times the class of its ground, with its wavelength beside it."""
+    """Write an image whose only band is ten times the class plus 5, with its wavelength in scene.toml."""
     (folder / "scene.toml").write_text("wavelengths_nm = [800]\n")
     return write(folder / "field.tif", classes * np.uint8(10) + np.uint8(5), transform)
 
 
 def agree(scene: Any) -> float:
-    """Fraction of the labelled pixels whose label is the class that the image shows there."""
+    """Return the fraction of the labelled pixels whose label is the class that the image shows there."""
     there = scene.labels != 255
     named = np.array([int(name.removeprefix("class_")) for name in scene.class_names])
     return float((named[scene.labels[there]] == (scene.values[..., 0][there] - 5) / 10).mean())
 
 
-def test_labels_seven_metres_beside_the_image(tmp_path: Path) -> None:
-    """Labels that begin 7 m to the east lie on their own ground; what they do not reach is unlabelled."""
+def test_labels_shifted_by_seven_metres_are_aligned(tmp_path: Path) -> None:
+    """Labels that begin 7 m to the east stay on their ground; pixels that they do not reach are unlabelled."""
     path = image(tmp_path)
     write(tmp_path / "field_labels.tif", CLASSES[:, 7:], NORTH_UP * Affine.translation(7, 0))
     write(tmp_path / "pixel_by_pixel.tif", np.pad(CLASSES[:, 7:], ((0, 0), (0, 7)), mode="edge"), NORTH_UP)
@@ -59,11 +59,11 @@ def test_labels_seven_metres_beside_the_image(tmp_path: Path) -> None:
     assert (scene.labels[:, :7] == 255).all()
     assert (scene.labels[:, 7:] != 255).all()
     assert any("have another grid than the scene" in note for note in scene.provenance)
-    assert agree(load_scene_file(path, labels=tmp_path / "pixel_by_pixel.tif")) < 0.8  # so they were laid before
+    assert agree(load_scene_file(path, labels=tmp_path / "pixel_by_pixel.tif")) < 0.8  # without their georeference
 
 
-def test_labels_in_another_crs(tmp_path: Path) -> None:
-    """Labels in degrees lie on their ground to a pixel at borders of classes."""
+def test_labels_in_another_crs_are_aligned(tmp_path: Path) -> None:
+    """Labels in degrees agree with the image in more than 98 % of the pixels; borders of classes may differ."""
     path, to_metres = image(tmp_path), Transformer.from_crs(4326, 32632, always_xy=True)
     to_degrees = Transformer.from_crs(32632, 4326, always_xy=True)
     west, south, east, north = to_degrees.transform_bounds(WEST - 5, NORTH - SIDE - 5, WEST + SIDE + 5, NORTH + 5)
@@ -79,8 +79,8 @@ def test_labels_in_another_crs(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("turned", ["labels", "image"])
-def test_north_up_beside_south_up(tmp_path: Path, turned: str) -> None:
-    """Rows from the south up and rows from the north down are the same ground."""
+def test_labels_align_with_rows_in_opposite_order(tmp_path: Path, turned: str) -> None:
+    """Rows from the south up and rows from the north down show the same ground."""
     south_up = Affine(1, 0, WEST, 0, 1, NORTH - SIDE)
     flipped = np.ascontiguousarray(CLASSES[::-1])
     path = image(tmp_path, south_up, flipped) if turned == "image" else image(tmp_path)
@@ -91,8 +91,8 @@ def test_north_up_beside_south_up(tmp_path: Path, turned: str) -> None:
     assert (scene.labels != 255).all()
 
 
-def test_labels_of_one_grid_are_as_they_were(tmp_path: Path) -> None:
-    """Labels on the image's own pixels are taken without a word, rounding of their place included."""
+def test_labels_on_the_same_grid_are_unchanged(tmp_path: Path) -> None:
+    """An offset of 0.01 px counts as rounding and gives no note."""
     path = image(tmp_path)
     write(tmp_path / "field_labels.tif", CLASSES, NORTH_UP * Affine.translation(0.01, -0.01))
     scene = load_scene_file(path)
@@ -101,8 +101,8 @@ def test_labels_of_one_grid_are_as_they_were(tmp_path: Path) -> None:
     assert not scene.regridded
 
 
-def test_labels_of_another_place(tmp_path: Path) -> None:
-    """Labels that lie beside the image are one error where they are needed, and one note where they are not."""
+def test_labels_outside_of_the_image_are_refused(tmp_path: Path) -> None:
+    """The position is an error if labels are needed, and a note if they are not."""
     path = image(tmp_path)
     write(tmp_path / "field_labels.tif", CLASSES, NORTH_UP * Affine.translation(500, 0))
     with pytest.raises(SceneError, match=r"do not lie on the scene: x 600500 to 600560, y .* the scene x 600000"):
@@ -112,8 +112,8 @@ def test_labels_of_another_place(tmp_path: Path) -> None:
     assert any("left out" in note and "do not lie on the scene" in note for note in scene.provenance)
 
 
-def test_a_training_mask_on_another_grid(tmp_path: Path) -> None:
-    """A mask of where to train is brought to the scene's pixels as well."""
+def test_a_training_mask_on_another_grid_is_aligned(tmp_path: Path) -> None:
+    """The mask of training pixels is resampled to the scene's pixels as well."""
     path, south_up = image(tmp_path), Affine(1, 0, WEST, 0, 1, NORTH - SIDE)
     labels = write(tmp_path / "truth.tif", np.ascontiguousarray(CLASSES[::-1]), south_up)
     mask = write(tmp_path / "mask.tif", np.where(CLASSES == 1, 1, 0).astype(np.uint8)[::-1].copy(), south_up)
@@ -124,8 +124,8 @@ def test_a_training_mask_on_another_grid(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("turned", [False, True])
-def test_no_data_of_a_label_file_is_no_class(tmp_path: Path, turned: bool) -> None:
-    """The file's no-data value is unlabelled, on its own grid and on another; a note counts its pixels."""
+def test_nodata_of_a_label_file_is_unlabelled(tmp_path: Path, turned: bool) -> None:
+    """The value is found on the scene's grid and on another; a note counts its pixels."""
     path, codes = image(tmp_path), np.where(CLASSES == 3, np.uint8(255), CLASSES)
     grid = (codes[::-1].copy(), Affine(1, 0, WEST, 0, 1, NORTH - SIDE)) if turned else (codes, NORTH_UP)
     write(tmp_path / "field_labels.tif", *grid, nodata=255)
@@ -136,8 +136,8 @@ def test_no_data_of_a_label_file_is_no_class(tmp_path: Path, turned: bool) -> No
     assert [one.value for one in draft_scene(path).classes] == [0, 1, 2]
 
 
-def test_a_stated_class_is_no_missing_label(tmp_path: Path) -> None:
-    """A class that scene.toml states counts, also where programs wrote its value as no data."""
+def test_a_stated_class_overrides_nodata(tmp_path: Path) -> None:
+    """A class in scene.toml counts, even if the file marks its value as no data."""
     path = image(tmp_path)
     write(tmp_path / "field_labels.tif", CLASSES, NORTH_UP, nodata=0)
     assert load_scene_file(path).class_names == ("class_1", "class_2", "class_3")

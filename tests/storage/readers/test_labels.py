@@ -1,4 +1,4 @@
-"""Labels come out as class indices whatever they are stored as; what is no class is named and counted."""
+"""Labels of every file type become class indices; values that are no class are reported and counted."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ COLOURS = {"soil": (0, 0, 0), "crop": (0, 255, 0), "weed": (255, 0, 0)}
 
 
 def test_colours_become_indices(tmp_path: Path) -> None:
-    """Exact colours give the class's place in the table."""
+    """An exact colour gives the position of its class in the table."""
     index = np.random.default_rng(0).integers(0, 3, (5, 6))
     Image.fromarray(np.array(list(COLOURS.values()), np.uint8)[index]).save(tmp_path / "a.png")
     found = load_labels(tmp_path / "a.png", (5, 6), classes=COLOURS)
@@ -29,7 +29,7 @@ def test_colours_become_indices(tmp_path: Path) -> None:
 
 
 def test_an_unknown_colour_is_counted(tmp_path: Path) -> None:
-    """A colour that is no class is named with its pixels, unless it means unlabelled."""
+    """The error names the colour and its number of pixels, unless it means unlabelled."""
     image = np.zeros((4, 4, 3), np.uint8)
     image[0, :3] = 9
     Image.fromarray(image).save(tmp_path / "a.png")
@@ -53,7 +53,7 @@ def test_numbers_become_indices(tmp_path: Path, ending: str) -> None:
     assert found.index.tolist() == [[255, 0, 1], [1, 1, 0]]
 
 
-def test_a_palette_is_read_either_way(tmp_path: Path) -> None:
+def test_a_palette_gives_indices_or_colours(tmp_path: Path) -> None:
     """An indexed PNG gives its indices for numbered classes and its colours for coloured ones."""
     image = Image.new("P", (2, 2))
     image.putpalette([0, 0, 0, 0, 255, 0, 255, 0, 0])
@@ -64,10 +64,10 @@ def test_a_palette_is_read_either_way(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("classes", "unlabelled_px"), [({}, 2), (COLOURS, 1)])
-def test_transparent_pixels_are_no_class_unless_one_has_them(
+def test_transparent_pixels_are_unlabelled_unless_stated(
     tmp_path: Path, classes: dict[str, tuple[int, int, int]], unlabelled_px: int
 ) -> None:
-    """A note has their number; a colour of [classes] counts."""
+    """A note counts them; a transparent pixel with a colour of [classes] has that class."""
     colours = [[(0, 0, 0, 0), (0, 255, 0, 255)], [(9, 9, 9, 0), (255, 0, 0, 255)]]
     Image.fromarray(np.array(colours, np.uint8)).save(tmp_path / "a.png")
     found = load_labels(tmp_path / "a.png", (2, 2), classes=classes)
@@ -76,7 +76,7 @@ def test_transparent_pixels_are_no_class_unless_one_has_them(
 
 
 def test_classes_are_found_where_none_are_stated(tmp_path: Path) -> None:
-    """Values become classes named after their number, NaN stays unlabelled."""
+    """Each value becomes a class named after its number; NaN stays unlabelled."""
     np.save(tmp_path / "a.npy", np.array([[1.0, 5.0], [np.nan, 5.0]]))
     found = load_labels(tmp_path / "a.npy", (2, 2), classes={})
     assert found.names == ("class_1", "class_5")
@@ -88,8 +88,8 @@ MANY = "alfalfa", "corn", "corn_notill", "grass_pasture", "oats", "soybean", "wo
 
 
 @pytest.mark.parametrize("names", [range(24), MANY], ids=["numbers", "words"])
-def test_classes_have_colours_that_differ(names: Iterable[object]) -> None:
-    """By 15 in CIELAB and more, words and numbers alike."""
+def test_class_colours_are_distinguishable(names: Iterable[object]) -> None:
+    """Colours differ by at least 15 in CIELAB, for class names of words and numbers alike."""
     colours = class_colours({str(name): number for number, name in enumerate(names)})
     lab = skimage.color.rgb2lab(colours[:, None])[:, 0]
     apart = np.linalg.norm(lab[:, None] - lab[None], axis=-1)
@@ -97,8 +97,8 @@ def test_classes_have_colours_that_differ(names: Iterable[object]) -> None:
 
 
 @pytest.mark.parametrize("classes", [{}, {"grass": 1, "soil": 5}, {"lost": -1, "grass": 1, "soil": 5}])
-def test_negative_values_are_no_class_unless_one_has_them(tmp_path: Path, classes: dict[str, int]) -> None:
-    """NaN and what lies beside the labels never is."""
+def test_negative_values_are_unlabelled_unless_stated(tmp_path: Path, classes: dict[str, int]) -> None:
+    """NaN is always unlabelled."""
     np.save(tmp_path / "a.npy", np.array([[-1.0, 5.0], [np.nan, 1.0]]))
     found = load_labels(tmp_path / "a.npy", (2, 2), classes=classes)
     assert (found.index == 255).tolist() == [["lost" not in classes, False], [True, False]]
@@ -113,14 +113,14 @@ def test_negative_values_are_no_class_unless_one_has_them(tmp_path: Path, classe
     ],
 )
 def test_classes_that_labels_cannot_have_are_refused(tmp_path: Path, pixel: Any, unlabelled: Any, words: str) -> None:
-    """Numbers of classes for labels in colours, and one number for a class and for no class."""
+    """Labels in colours cannot have numbered classes, and a class cannot have the unlabelled number."""
     Image.fromarray(np.full((2, 2, np.size(pixel)), pixel, np.uint8).squeeze()).save(tmp_path / "a.png")
     with pytest.raises(SceneError, match=words):
         load_labels(tmp_path / "a.png", (2, 2), classes={"soil": 1}, unlabelled=unlabelled)
 
 
-def test_names_that_all_know_have_their_colour() -> None:
-    """By a word of the name, once each; others have those that stay apart, and what is stated wins."""
+def test_common_class_names_have_usual_colours() -> None:
+    """A word of the name gives each colour once; other classes get distinct colours, and stated colours win."""
     names = {"Deep water": 1, "winter_wheat": 2, "spring_wheat": 3, "class_4": 4, "Bare soil": 5, "watery": 6}
     water, winter, spring, other, soil, watery = class_colours(names).tolist()
     assert max(water) == water[2]

@@ -1,4 +1,4 @@
-"""Pointing tables of every kind give positions; each fault of a table has one message that names it."""
+"""Pointing tables of every kind give mirror positions; each fault of a table has its own message."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def _table(folder: Path, text: str, name: str = "table.csv") -> Path:
     return path
 
 
-def test_mirror_positions_are_read_as_they_stand(tmp_path: Path) -> None:
-    """Positions and times are the file's, whatever delimiter, capitals, byte order mark, blank or swapped rows."""
+def test_mirror_positions_are_read_from_any_layout(tmp_path: Path) -> None:
+    """Delimiter, capitals, byte order mark, blank rows and order of rows do not matter."""
     rows = MIRROR.splitlines()
     swapped = "\ufeff" + "\n".join([rows[0].upper(), rows[3], "", rows[1], rows[2]]).replace(",", ";")
     for text in (MIRROR, swapped, MIRROR.replace(",", "\t")):
@@ -32,15 +32,15 @@ def test_mirror_positions_are_read_as_they_stand(tmp_path: Path) -> None:
         assert (found.valid.all(), found.exposure_ms, found.part) == (True, None, None)
 
 
-def test_numbers_come_back_bit_for_bit(tmp_path: Path) -> None:
+def test_positions_are_read_bit_by_bit(tmp_path: Path) -> None:
     """A float64 written by repr is read as the same float64."""
     values = np.random.default_rng(1).uniform(-0.5, 0.5, (200, 2))
     text = "mirror_x,mirror_y\n" + "".join(f"{x!r},{y!r}\n" for x, y in values.tolist())
     np.testing.assert_array_equal(load_pointing_table(_table(tmp_path, text)).of_cube("c", 200).position, values)
 
 
-def test_angles_become_positions(tmp_path: Path) -> None:
-    """Two angles look where they say; one angle is that along the scan."""
+def test_angles_are_converted_to_positions(tmp_path: Path) -> None:
+    """Two angles give that viewing direction; a single angle is along the scan."""
     two = load_pointing_table(_table(tmp_path, "angle_x_deg,angle_y_deg\n5,-10\n5,10\n")).of_cube("c", 2)
     seen = np.rad2deg(np.arctan(direction_to_scene(position_to_direction(two.position))))
     np.testing.assert_allclose(seen, [[5, -10], [5, 10]], atol=1e-10)
@@ -50,8 +50,8 @@ def test_angles_become_positions(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("line", [",,,0,", "99,-99,0,0,-1"])
-def test_lines_that_are_not_valid_need_no_numbers(tmp_path: Path, line: str) -> None:
-    """Their positions are made up between their neighbours, their times stay unknown."""
+def test_invalid_lines_need_no_numbers(tmp_path: Path, line: str) -> None:
+    """Positions and exposures of invalid lines are interpolated from their neighbours; their times are NaN."""
     text = f"mirror_x,mirror_y,time,valid,exposure_ms\n0.1,0,0.1,1,5\n{line}\n0.3,0.2,0.3,true,7\n"
     found = load_pointing_table(_table(tmp_path, text)).of_cube("c", 3)
     np.testing.assert_allclose(found.position, [[0.1, 0], [0.2, 0.1], [0.3, 0.2]])
@@ -60,8 +60,8 @@ def test_lines_that_are_not_valid_need_no_numbers(tmp_path: Path, line: str) -> 
     np.testing.assert_array_equal(found.exposure_ms, [5, 6, 7])
 
 
-def test_one_table_for_several_cubes_and_for_parts_of_one(tmp_path: Path) -> None:
-    """Rows belong to the cube that they name; of a lone cube of another name they tell the sweeps."""
+def test_a_table_describes_several_cubes_or_sweeps(tmp_path: Path) -> None:
+    """Rows belong to the cube that they name; for a single cube of another name they name its sweeps."""
     text = "sweep,position_px,time\na,0,0\na,1,1\nb,5,0\nb,4,1\nb,3,2\n"
     table = load_pointing_table(_table(tmp_path, text))
     assert table.of_cube("a", 2).position[:, 0].tolist() == [0, 1]
@@ -108,14 +108,14 @@ def test_one_table_for_several_cubes_and_for_parts_of_one(tmp_path: Path) -> Non
         ("angle_deg,line\n0,0\n1,2\n2,2\n", "row 3: line = 2, expected each of 0 to 2 once"),
     ],
 )
-def test_a_table_that_cannot_be_used_says_why(tmp_path: Path, text: str, message: str) -> None:
-    """Columns, cells, numbers of rows, range, order and unknown values: the first wrong row is named."""
+def test_unusable_tables_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    """Columns, cells, numbers of rows, range, order and unknown values are checked; the first wrong row is named."""
     with pytest.raises(SceneError, match=re.escape(message)):
         load_pointing_table(_table(tmp_path, text)).of_cube("cube", 3)
 
 
 def test_pointing_is_found_by_the_cubes_name(tmp_path: Path) -> None:
-    """Only ``NAME.pointing`` with one of the endings is taken; a table of something else is left alone."""
+    """Only ``NAME.pointing`` with one of the endings is used; other tables are ignored."""
     _table(tmp_path, "soil,wet\n1,2\n", "cube.csv")
     assert find_pointing(tmp_path, "cube") is None
     path = _table(tmp_path, MIRROR, "cube.pointing.csv")

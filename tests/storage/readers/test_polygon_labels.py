@@ -1,4 +1,4 @@
-"""Labels that are polygons: on a map and in pixels, in every format, found by name; one message for each mistake."""
+"""Polygon labels: on a map and in pixels, in every format, found by name; one error for each mistake."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ TRUTH[:, :4], TRUTH[:5, 6:] = 1, 0
 
 
 def scene(folder: Path, name: str = "field.tif", place: Affine | None = PLACE) -> Path:
-    """Write a scene of two bands, on a map or nowhere."""
+    """Write a scene of two bands, with or without a georeference."""
     path = folder / name
     path.parent.mkdir(exist_ok=True)
     known: dict[str, Any] = {} if place is None else {"crs": "EPSG:32632", "transform": place}
@@ -50,8 +50,8 @@ def written(path: Path, shapes: Any = (WEST, EAST), crs: Any = 32632, layer: str
 
 
 @pytest.mark.parametrize(("name", "crs"), [("a.gpkg", 32632), ("a.geojson", 4326), ("a.shp", 3857)])
-def test_polygons_on_a_map(name: str, crs: int, tmp_path: Path) -> None:
-    """In whatever format and CRS, the pixels whose centres they hold have their class, and no other."""
+def test_polygons_on_a_map_become_labels(name: str, crs: int, tmp_path: Path) -> None:
+    """In any format and CRS, exactly the pixels whose centres lie in a polygon have its class."""
     table = geopandas.GeoSeries([WEST, EAST], crs=32632).to_crs(crs)
     found = load_scene_file(scene(tmp_path), labels=written(tmp_path / "x" / name, table, crs))
     assert found.class_names == ("maize", "wheat")
@@ -60,8 +60,8 @@ def test_polygons_on_a_map(name: str, crs: int, tmp_path: Path) -> None:
     assert "2 polygons by their attribute crop" in found.provenance
 
 
-def test_the_same_as_rasterio(tmp_path: Path) -> None:
-    """A turned grid and slanted polygons give what rasterio's own features give."""
+def test_polygon_labels_equal_rasterios(tmp_path: Path) -> None:
+    """A rotated grid and slanted polygons give the same as rasterio's own features."""
     place = PLACE * Affine.rotation(20)
     shapes = [shapely.Point(400_010, 5_699_995).buffer(6), shapely.Point(400_016, 5_699_990).buffer(5)]
     found = load_scene_file(scene(tmp_path, place=place), labels=written(tmp_path / "a.gpkg", shapes, code=[4, 7]))
@@ -73,8 +73,8 @@ def test_the_same_as_rasterio(tmp_path: Path) -> None:
     assert found.class_values == (4, 7)
 
 
-def test_polygons_in_pixels(tmp_path: Path) -> None:
-    """A scene without a place takes polygons without a CRS in its pixels."""
+def test_polygons_without_a_crs_are_in_pixels(tmp_path: Path) -> None:
+    """A scene without a georeference takes them in its pixels, with a note."""
     shapes = [
         {"type": "Feature", "properties": {"label": name}, "geometry": shapely.geometry.mapping(shape)}
         for name, shape in zip(("wheat", "maize"), PIXELS, strict=True)
@@ -85,8 +85,8 @@ def test_polygons_in_pixels(tmp_path: Path) -> None:
     assert "polygons are taken in pixels of the scene, x to the right and y down" in found.provenance
 
 
-def test_a_layer_is_named(tmp_path: Path) -> None:
-    """``FILE.gpkg:LAYER`` takes one of several, as a flag and in scene.toml; without it the message names them."""
+def test_a_layer_is_selected_by_name(tmp_path: Path) -> None:
+    """``FILE.gpkg:LAYER`` selects one of several layers, as an argument and in scene.toml."""
     path = written(tmp_path / "farm.gpkg", layer="crops")
     written(path, layer="soil", soil=["clay", "sand"])
     image = scene(tmp_path)
@@ -95,8 +95,8 @@ def test_a_layer_is_named(tmp_path: Path) -> None:
     assert load_scene_file(image).class_names == ("clay", "sand")
 
 
-def test_classes_of_scene_toml(tmp_path: Path) -> None:
-    """Names and numbers of [classes] hold for polygons, unlabelled ones count for nothing."""
+def test_polygons_use_the_classes_of_scene_toml(tmp_path: Path) -> None:
+    """Names and numbers of [classes] apply; unlabelled polygons do not count, and unknown values are refused."""
     image = scene(tmp_path)
     (tmp_path / "scene.toml").write_text("unlabelled = 9\n[classes]\nmaize = 3\nwheat = 1\nbarley = 2\n")
     found = load_scene_file(image, labels=written(tmp_path / "names.gpkg"))
@@ -108,8 +108,8 @@ def test_classes_of_scene_toml(tmp_path: Path) -> None:
         load_scene_file(image, labels=written(tmp_path / "odd.gpkg", crop=["wheat", "oats"]))
 
 
-def test_overlaps_and_gaps(tmp_path: Path) -> None:
-    """The later polygon counts, and a note says how many pixels; a polygon without a value is left out."""
+def test_overlapping_polygons_take_the_later_class(tmp_path: Path) -> None:
+    """A note counts their pixels; a polygon without a value is left out."""
     shapes = [WEST, WEST.buffer(-2, join_style="mitre"), EAST]
     path = written(tmp_path / "a.gpkg", shapes, crop=["wheat", "maize", None])
     found, expected = load_scene_file(scene(tmp_path), labels=path), np.where(TRUTH == 1, 1, NONE)
@@ -121,7 +121,7 @@ def test_overlaps_and_gaps(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["field.gpkg", "field_labels.geojson", "labels/field.shp"])
 def test_labels_are_found_by_their_names(name: str, tmp_path: Path) -> None:
-    """Beside the scene under its name, with a word, or in a folder of labels; a picture comes first."""
+    """The files have the scene's name, alone or with a word, or are in a folder `labels`; an image has priority."""
     image = scene(tmp_path)
     written(tmp_path / name)
     found = load_scene_file(image)
@@ -132,8 +132,8 @@ def test_labels_are_found_by_their_names(name: str, tmp_path: Path) -> None:
     assert load_scene_file(image).class_names == ("class_1",)
 
 
-def test_a_folder_of_scenes(tmp_path: Path) -> None:
-    """Each scene has its own polygons; classes are those of all files by name, and init finds them with shares."""
+def test_scenes_of_a_folder_share_their_classes(tmp_path: Path) -> None:
+    """Each scene has its own polygons; classes are those of all files by name, and `init` finds their fractions."""
     for name, crops in (("a", ["wheat", "maize"]), ("b", ["maize", "oats"])):
         scene(tmp_path, f"{name}.tif")
         written(tmp_path / f"{name}.gpkg", crop=crops)
@@ -154,8 +154,8 @@ def test_a_folder_of_scenes(tmp_path: Path) -> None:
         _ = load_data_set(tmp_path).classes
 
 
-def test_init_again_keeps_the_attribute_that_it_asked_for(tmp_path: Path) -> None:
-    """The folder whose polygons have an attribute of their own: write it down, run the command again, train."""
+def test_init_uses_the_class_attribute_of_scene_toml(tmp_path: Path) -> None:
+    """`init` asks for an unusual attribute; with that in scene.toml it finds the classes and suggests training."""
     written(scene(tmp_path).with_suffix(".gpkg"), culture=["wheat", "maize"])
     asked = run_init(str(tmp_path), QUIET)
     assert "class_attribute" in asked["unseen"][0]
@@ -179,8 +179,8 @@ def test_init_again_keeps_the_attribute_that_it_asked_for(tmp_path: Path) -> Non
         ([WEST.centroid.buffer(0.1)] * 2, 32632, {}, PLACE, "no pixel's centre lies in a polygon that has a class"),
     ],
 )
-def test_mistakes_are_one_message(shapes: Any, crs: Any, columns: Any, place: Any, words: str, tmp_path: Path) -> None:
-    """Each says what is wrong with which file, and what to do."""
+def test_bad_polygons_are_refused(shapes: Any, crs: Any, columns: Any, place: Any, words: str, tmp_path: Path) -> None:
+    """The error says what is wrong with which file, and what to do."""
     path = written(tmp_path / "labels.shp", shapes, crs, **columns)
     with pytest.raises(SceneError, match=words):
         load_scene_file(scene(tmp_path, place=place), labels=path)

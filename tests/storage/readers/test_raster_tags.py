@@ -1,4 +1,4 @@
-"""What GeoTIFF, ENVI and Zarr files say beside their numbers, as scenes and ingested cubes keep it."""
+"""Metadata of GeoTIFF, PNG and Zarr files, as scenes and ingested cubes keep it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ NM = [450.0, 550.0, 660.5, 800.0]
 
 
 def write(path: Path, values: Any = VALUES, **profile: Any) -> rasterio.io.DatasetWriter:
-    """A GeoTIFF of (band, y, x) values, open for more to be said."""
+    """Return an open GeoTIFF of (band, y, x) values, to which metadata can be added."""
     count, height, width = values.shape
     known = {"driver": "GTiff", "count": count, "height": height, "width": width, "dtype": values.dtype.name}
     file = rasterio.open(path, "w", photometric="MINISBLACK", **known, **profile)
@@ -55,8 +55,8 @@ def say_in_names(file: Any) -> None:
 
 
 @pytest.mark.parametrize("say", [say_in_bands, say_in_imagery, say_in_a_list, say_in_names])
-def test_wavelengths_stand_in_tags_of_many_kinds(tmp_path: Path, say: Any) -> None:
-    """Of bands, of GDAL's domain IMAGERY, of the file as a list, or in the bands' names; widths where they are said."""
+def test_wavelengths_are_read_from_several_kinds_of_tags(tmp_path: Path, say: Any) -> None:
+    """Tags of bands, GDAL's domain IMAGERY, a list of the file and band names are read; two kinds have widths."""
     with write(tmp_path / "a.tif") as file:
         say(file)
     scene = load_scene_file(tmp_path / "a.tif")
@@ -65,8 +65,8 @@ def test_wavelengths_stand_in_tags_of_many_kinds(tmp_path: Path, say: Any) -> No
         assert scene.fwhm_nm.tolist() == pytest.approx([6.0] * 4)
 
 
-def test_a_geotiff_keeps_its_place(tmp_path: Path) -> None:
-    """CRS and transform as written; one without the other, and ground control points, are no place, as a note says."""
+def test_a_geotiff_keeps_its_georeference(tmp_path: Path) -> None:
+    """CRS and transform are as written; one alone, or ground control points, give no georeference but a note."""
     write(tmp_path / "a.tif", crs="EPSG:25832", transform=PLACE).close()
     scene = load_scene_file(tmp_path / "a.tif", wavelengths=NM)
     assert (scene.geobox.affine, scene.geobox.crs.epsg, tuple(scene.geobox.shape)) == (PLACE, 25832, (6, 7))
@@ -81,8 +81,8 @@ def test_a_geotiff_keeps_its_place(tmp_path: Path) -> None:
         assert any(words in note for note in scene.provenance)
 
 
-def test_bands_that_a_file_calls_bad_are_left_out(tmp_path: Path) -> None:
-    """Without a word of the user's; a note says which, and --bands takes them all the same."""
+def test_bands_marked_as_bad_are_left_out(tmp_path: Path) -> None:
+    """A note names them, and `--bands` can still select them."""
     with write(tmp_path / "a.tif") as file:
         say_in_a_list(file)
         file.update_tags(bbl="{1, 0, 1, 1}")
@@ -95,8 +95,8 @@ def test_bands_that_a_file_calls_bad_are_left_out(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["mask", "RGBA", "P", "RGB"])
-def test_masked_and_transparent_pixels_have_no_value(tmp_path: Path, kind: str) -> None:
-    """A mask; alpha, an index and a colour of a PNG. Another gap is another scene, whatever the pixels under it."""
+def test_masked_and_transparent_pixels_are_nan(tmp_path: Path, kind: str) -> None:
+    """The kinds are a mask, alpha, a palette index and a PNG colour. A gap changes the hash of the scene."""
     there = np.ones((6, 7), np.bool_)
     there[2:4, :3] = False
     hashes = set()
@@ -122,8 +122,8 @@ def test_masked_and_transparent_pixels_have_no_value(tmp_path: Path, kind: str) 
     assert len(hashes) == 2
 
 
-def test_a_zarr_store_says_its_place_in_any_of_three_ways(tmp_path: Path) -> None:
-    """By a grid mapping, by coordinates and a CRS, by GeoZarr's attributes; not by halves."""
+def test_a_zarr_store_is_georeferenced_in_three_ways(tmp_path: Path) -> None:
+    """A grid mapping, coordinates with a CRS, and GeoZarr's attributes are read; coordinates alone do not suffice."""
     values = ("y", "x", "band"), np.moveaxis(VALUES, 0, -1)
     centres = {"y": 5_700_000 - 0.25 - 0.5 * np.arange(6), "x": 400_000.25 + 0.5 * np.arange(7)}
     waves = {"wavelength": ("band", np.array(NM), {"units": "nm"})}
@@ -146,8 +146,8 @@ def test_a_zarr_store_says_its_place_in_any_of_three_ways(tmp_path: Path) -> Non
             np.testing.assert_allclose(geobox.affine[:6], PLACE[:6])
 
 
-def test_an_ingested_cube_keeps_place_gaps_and_bad_bands(tmp_path: Path) -> None:
-    """What a file says is what a scene of the archive's cube says."""
+def test_an_ingested_cube_keeps_its_metadata(tmp_path: Path) -> None:
+    """Georeference, gaps and bad bands of the stored cube are those of the file."""
     with (
         rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True),
         write(tmp_path / "a.tif", crs="EPSG:25832", transform=PLACE) as file,
@@ -164,8 +164,8 @@ def test_an_ingested_cube_keeps_place_gaps_and_bad_bands(tmp_path: Path) -> None
 
 
 @given(st.lists(st.booleans(), min_size=1, max_size=40))
-def test_bands_in_words_are_those_that_are_meant(good: list[bool]) -> None:
-    """A list of bad bands gives the bands of its zeros, and bands in words are read as what they were."""
+def test_bad_bands_round_trip_as_text(good: list[bool]) -> None:
+    """The zeros of a list are the bad bands, and their text is read as the same bands."""
     bad = bad_bands("{" + ", ".join(str(int(one)) for one in good) + "}", len(good))
     assert list(bad) == [band for band, one in enumerate(good) if not one]
     assert bad_bands("1, 1", len(good)) == () or len(good) == 2

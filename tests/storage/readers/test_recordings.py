@@ -1,4 +1,4 @@
-"""Recordings out of archives and files: what is read, found beside the cubes, assumed, and refused."""
+"""Recordings from archives and files: what is read, found beside the cubes, assumed and refused."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ COARSE = Sweep("coarse-0", "coarse", "x", 0.0, -39.5, 20, step=4, binning=4)
 
 
 def write_raw(folder: Path, source: SimulatedSource, sweep: Sweep) -> RawCube:
-    """A sweep of the simulated rig as a raw cube; its fifth line is lost."""
+    """Write a sweep of the simulated rig as a raw cube whose fifth line is lost."""
     header = SweepHeader(sweep, source.references(sweep), source.wavelength_nm, np.full(3, 5.0), "sim")
     with RawCubeWriter(folder / f"{sweep.name}.zarr", header) as cube:
         cube.write([replace(line, valid=line.number != 4) for line in source.lines(sweep)])
@@ -47,7 +47,7 @@ def write_raw(folder: Path, source: SimulatedSource, sweep: Sweep) -> RawCube:
 
 
 def assert_is_recording_of(found: Any, cube: RawCube) -> None:
-    """A recorded sweep has a raw cube's numbers, positions, times, exposures, flags and references, bit for bit."""
+    """Check a recorded sweep's numbers, positions, times, exposures, flags and references against a raw cube."""
     assert replace(found.sweep, name=cube.sweep.name) == cube.sweep
     np.testing.assert_array_equal(found.read(0, cube.shape[0]), cube.read())
     for name in ("position", "time_s", "exposure_ms", "valid_line"):
@@ -56,8 +56,8 @@ def assert_is_recording_of(found: Any, cube: RawCube) -> None:
         np.testing.assert_array_equal(getattr(found.references, name), value, err_msg=name)
 
 
-def test_a_raw_cube_as_files_reads_back_bit_for_bit(tmp_path: Path) -> None:
-    """Numbers, pointing and references of two sweeps come back from ENVI and CSV."""
+def test_raw_cubes_written_as_files_round_trip(tmp_path: Path) -> None:
+    """Numbers, pointing and references of two sweeps are read bit by bit from ENVI and CSV."""
     source = simulated()
     cubes = [write_raw(tmp_path / "raw", source, sweep) for sweep in (COARSE, FULL)]
     for cube in cubes:
@@ -71,8 +71,8 @@ def test_a_raw_cube_as_files_reads_back_bit_for_bit(tmp_path: Path) -> None:
     assert recording.camera == CAMERA
 
 
-def test_raw_cubes_of_a_folder_a_store_and_an_archive(tmp_path: Path, archive: Archive) -> None:
-    """Raw cubes are found in a capture's folder, singly, and by the newest or a named run; lines read singly too."""
+def test_recordings_open_from_folders_runs_and_archives(tmp_path: Path, archive: Archive) -> None:
+    """A capture's folder, a single cube, a run, and an archive's newest run give raw cubes, also single lines."""
     source = simulated()
     runs, cubes = [], []
     for number, sweep in enumerate((FULL, COARSE)):
@@ -92,7 +92,7 @@ def test_raw_cubes_of_a_folder_a_store_and_an_archive(tmp_path: Path, archive: A
         numbers = np.array([0, 3, 17])
         np.testing.assert_array_equal(recording.sweeps[0].read_lines(numbers), cube.read()[numbers])
     longer = replace(CAMERA, exposure_ms=2 * CAMERA.exposure_ms)
-    assert open_recording(store, longer).camera.exposure_ms == full.exposure_ms[0]  # plans are priced as recorded
+    assert open_recording(store, longer).camera.exposure_ms == full.exposure_ms[0]  # plans use the recorded exposure
     with pytest.raises(SettingsError, match=r"--dark is for files, and .* holds raw cubes"):
         open_recording(store, CAMERA, RecordedWith(dark=store))
     with pytest.raises(ArchiveError, match=f"has no run 'x'; its latest are {runs[0].name}, {runs[1].name}"):
@@ -103,8 +103,8 @@ def test_raw_cubes_of_a_folder_a_store_and_an_archive(tmp_path: Path, archive: A
 
 
 @pytest.mark.parametrize("copied", [False, True])
-def test_a_lost_part_of_a_raw_cube_is_named(tmp_path: Path, archive: Archive, copied: bool) -> None:
-    """In a store and in a folder without a manifest: zarr would read zeros in its place."""
+def test_a_lost_chunk_of_a_raw_cube_is_reported(tmp_path: Path, archive: Archive, copied: bool) -> None:
+    """In a store and in a folder without a manifest, zarr would read zeros in its place."""
     build = partial(write_raw, source=simulated(), sweep=FULL)
     folder = archive.produce("capture", build, version=1, params={})[0].path
     if copied:
@@ -119,13 +119,13 @@ def test_a_lost_part_of_a_raw_cube_is_named(tmp_path: Path, archive: Archive, co
 
 @pytest.fixture
 def files(tmp_path: Path) -> Path:
-    """A folder with one cube of 80 lines as ENVI, with pointing and frames."""
+    """Return a folder with one cube of 80 lines as ENVI, with pointing and reference frames."""
     write_recorded_files(write_raw(tmp_path / "raw", simulated(), FULL), tmp_path / "files")
     return tmp_path / "files"
 
 
-def test_frames_that_are_not_there_are_assumed_and_said(files: Path) -> None:
-    """Without dark and white frames a dark level of 0 and full scale are taken, and notes say so."""
+def test_missing_reference_frames_are_assumed(files: Path) -> None:
+    """The dark level is 0 and white is full scale; notes say so."""
     for kind in ("dark", "white", "bad"):
         (files / f"scan-0.{kind}.hdr").unlink()
     recording = open_recording(files, CAMERA)
@@ -138,7 +138,7 @@ def test_frames_that_are_not_there_are_assumed_and_said(files: Path) -> None:
 
 
 def test_a_cube_without_pointing_is_an_even_straight_scan(files: Path) -> None:
-    """Lines lie one pixel apart through the centre, parallel, and the notes say what was assumed."""
+    """Lines are parallel, one pixel apart and centred; notes state what was assumed."""
     (files / "scan-0.pointing.csv").unlink()
     recording = open_recording(files, CAMERA)
     sweep = recording.sweeps[0]
@@ -154,10 +154,10 @@ def test_a_cube_without_pointing_is_an_even_straight_scan(files: Path) -> None:
     ("column", "values", "distance"),
     [("position_px", np.arange(80) * 2.0 + 7, 2.0), ("position_m", np.arange(80) * -0.05, 1.0)],
 )
-def test_a_scan_without_a_mirror_by_its_positions(
+def test_a_scan_without_a_mirror_uses_its_positions(
     files: Path, tmp_path: Path, column: str, values: NDArray[np.float64], distance: float
 ) -> None:
-    """Stage, conveyor or drone: places in px as they are, in metres by the lines' distance."""
+    """For a stage, conveyor or drone, pixels are used as given, and metres are divided by the lines' distance."""
     table = tmp_path / "stage.csv"
     table.write_text(column + "\n" + "".join(f"{value!r}\n" for value in values.tolist()))
     recording = open_recording(files, CAMERA, RecordedWith(pointing=table))
@@ -171,7 +171,7 @@ def test_a_scan_without_a_mirror_by_its_positions(
 
 
 def test_a_table_cuts_one_cube_into_sweeps(files: Path, tmp_path: Path) -> None:
-    """Forward and backward ways of one cube become two sweeps; lines of neither are left out."""
+    """Forward and backward motion become two sweeps; lines of neither are left out."""
     cube, rows = open_raw_cube(tmp_path / "raw" / "scan-0.zarr"), ["mirror_x,mirror_y,sweep"]
     for number in range(80):
         x, y = cube.position[number if number < 42 else 80 - number].tolist()
@@ -184,7 +184,7 @@ def test_a_table_cuts_one_cube_into_sweeps(files: Path, tmp_path: Path) -> None:
 
 
 def write_envi_cube(stem: Path, values: NDArray[Any], ending: str = "", **fields: object) -> None:
-    """An ENVI cube in BIL with a header of given fields."""
+    """Write an ENVI cube in BIL whose header has the given fields."""
     lines, samples, bands = values.shape
     code = {"u2": 12, "u1": 1, "i2": 2, "f4": 4}[values.dtype.str[1:]]
     said: dict[str, object] = {
@@ -214,10 +214,10 @@ NO_WAVELENGTHS = "has 3 bands and nothing says their wavelengths; give --wavelen
         (VALUES.astype("<i2") - np.int16(2000), {}, SceneError, "expected a camera's own numbers from 0"),
     ],
 )
-def test_a_cube_that_cannot_be_used_says_why(
+def test_unusable_cubes_are_refused(
     tmp_path: Path, values: NDArray[Any], fields: dict[str, Any], error: type[PipelineError], message: str
 ) -> None:
-    """Interleave, wavelengths and types: each fault has its own message."""
+    """Each fault of interleave, wavelengths and number type has its own message."""
     write_envi_cube(tmp_path / "cube", values, **fields)
     with pytest.raises(error) as caught:
         open_recording(tmp_path / "cube.hdr").sweeps[0].read_lines(np.arange(6))
@@ -225,7 +225,7 @@ def test_a_cube_that_cannot_be_used_says_why(
 
 
 def test_several_cubes_need_pointing_and_the_same_bands(tmp_path: Path) -> None:
-    """How cubes without pointing lie beside each other is not known, and cubes of other bands are not one recording."""
+    """Without pointing the cubes' relative position is unknown; cubes of other bands are not one recording."""
     write_envi_cube(tmp_path / "a", VALUES)
     write_envi_cube(tmp_path / "b", VALUES)
     with pytest.raises(SceneError, match=r"a\.hdr has no pointing, and how 2 cubes lie beside each other is not known"):
@@ -244,15 +244,15 @@ def test_several_cubes_need_pointing_and_the_same_bands(tmp_path: Path) -> None:
         open_recording(tmp_path, given=RecordedWith(pointing=tmp_path / "tables"))
 
 
-def test_a_file_without_a_header_is_not_told_to_get_one(tmp_path: Path) -> None:
-    """An array in .npy takes wavelengths by the flag alone."""
+def test_missing_wavelengths_of_npy_suggest_the_option(tmp_path: Path) -> None:
+    """An array in .npy has no header that could hold them."""
     np.save(tmp_path / "a.npy", VALUES)
     with pytest.raises(WavelengthError, match=r"give --wavelengths in nm$"):
         open_recording(tmp_path / "a.npy")
 
 
 def test_cubes_of_two_formats_are_refused(tmp_path: Path) -> None:
-    """Neither is left out without a word."""
+    """Neither format is left out without an error."""
     write_envi_cube(tmp_path / "a", VALUES)
     zarr.create_array(tmp_path / "b.zarr", data=VALUES)
     with pytest.raises(SceneError, match=r"holds ENVI cubes and the Zarr store b\.zarr; name one, or move"):
@@ -260,8 +260,8 @@ def test_cubes_of_two_formats_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("version", [2, 3])
-def test_a_zarr_cube_of_anyones_is_a_recording(tmp_path: Path, version: Any) -> None:
-    """An array with wavelengths beside it is read line by line, of either version of the format."""
+def test_a_zarr_cube_of_other_programs_is_a_recording(tmp_path: Path, version: Any) -> None:
+    """An array with wavelengths is read line by line, in both format versions; missing chunks are noted."""
     group = zarr.create_group(tmp_path / "cube.zarr", zarr_format=version)
     group.create_array("counts", shape=VALUES.shape, dtype="uint16")[...] = VALUES
     group.create_array("wavelength", shape=(3,), dtype="float64", attributes={"units": "nm"})[...] = [500, 600, 700]
@@ -273,7 +273,7 @@ def test_a_zarr_cube_of_anyones_is_a_recording(tmp_path: Path, version: Any) -> 
 
 
 def test_a_headwall_folder_is_a_recording(tmp_path: Path) -> None:
-    """Parts follow each other; stamps, exposures and references of the folder are taken."""
+    """Parts are joined; timestamps, exposures and references of the folder are used."""
     for first, last in ((0, 4), (4, 6)):
         write_envi_cube(tmp_path / f"raw_{first}", VALUES[first:last])
         text = (tmp_path / f"raw_{first}.hdr").read_text().replace("ENVI\n", "ENVI\n;Exposure (ms) = 4.0\n")
@@ -299,8 +299,8 @@ def test_a_headwall_folder_is_a_recording(tmp_path: Path) -> None:
         open_recording(tmp_path)
 
 
-def test_the_key_of_a_recording_is_its_content(files: Path, tmp_path: Path) -> None:
-    """It is the same under another address, and another for other numbers, bits, pointing or frames."""
+def test_the_key_of_a_recording_depends_on_its_content(files: Path, tmp_path: Path) -> None:
+    """The key is the same at another address; other numbers, bits, pointing or frames change it."""
     key, moved = open_recording(files, CAMERA).key(), files.rename(tmp_path / "moved")
     assert open_recording(moved, CAMERA).key() == open_recording(moved / "scan-0.hdr", CAMERA).key() == key
     np.save(tmp_path / "dark.npy", np.full((64, 3), 7.0))
@@ -316,8 +316,8 @@ def test_the_key_of_a_recording_is_its_content(files: Path, tmp_path: Path) -> N
     assert stored[0] == stored[1]
 
 
-def test_the_white_frame_says_how_many_bits_a_camera_has(tmp_path: Path) -> None:
-    """Over dark ground no line does."""
+def test_the_white_frame_gives_the_bit_depth(tmp_path: Path) -> None:
+    """Lines over dark ground reach 2000 only; the white frame's 12000 needs 14 bits."""
     write_envi(tmp_path / "a.raw", np.full((40, 8, 2), 2000, np.uint16))
     np.save(tmp_path / "a.white.npy", np.full((8, 2), 12_000, np.float32))
     recording = open_recording(tmp_path / "a.hdr", None, RecordedWith(wavelengths=(500.0, 600.0)))
@@ -326,7 +326,7 @@ def test_the_white_frame_says_how_many_bits_a_camera_has(tmp_path: Path) -> None
 
 
 def test_cubes_of_bytes_are_of_8_bits(tmp_path: Path) -> None:
-    """Their full scale is 255, and a dark level of 12 bits keeps its fraction; beside a cube of 16 bits it stays."""
+    """Full scale is 255, and a dark level of 12 bits is scaled to 8; with a 16-bit cube beside it, 12 bits stay."""
     write_envi_cube(tmp_path / "a", np.full((6, 16, 3), 200, "u1"))
     recording = open_recording(tmp_path / "a.hdr", LineCamera(dark_dn=819.0))
     assert (recording.camera.bits, recording.camera.dark_dn) == (8, 51.0)
@@ -340,7 +340,7 @@ def test_cubes_of_bytes_are_of_8_bits(tmp_path: Path) -> None:
 
 
 def test_bands_marked_as_bad_are_left_out(tmp_path: Path) -> None:
-    """Their elements are bad, a note names them, and their numbers need no bits; a file that marks all marks none."""
+    """Bad bands do not raise the bit depth, and a note names them. A file that marks all bands marks none."""
     values = VALUES.copy()
     values[..., 1] = 60_000
     write_envi_cube(tmp_path / "a", values, bbl="{1, 0, 1}")
@@ -354,8 +354,8 @@ def test_bands_marked_as_bad_are_left_out(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("kind", "void"), [("<u2", 0), ("<u2", 65535), ("<i2", -9999)])
-def test_numbers_of_no_data_are_not_valid(tmp_path: Path, kind: str, void: int) -> None:
-    """They read as saturated ones, need no bits, and a line of them alone is not valid."""
+def test_nodata_values_are_invalid(tmp_path: Path, kind: str, void: int) -> None:
+    """No-data is read as saturated and does not raise the bit depth; a line of it alone is invalid."""
     values = VALUES.astype(kind)
     values[2] = values[4, 3] = void
     write_envi_cube(tmp_path / "a", values, data_ignore_value=void)
@@ -367,8 +367,8 @@ def test_numbers_of_no_data_are_not_valid(tmp_path: Path, kind: str, void: int) 
     assert f"a: the number {void} is no data, as the file says" in recording.notes
 
 
-def test_lines_without_a_time_go_on_in_the_period_of_the_others() -> None:
-    """Before the first and after the last too: lines at one time would count as repeated."""
+def test_missing_line_times_follow_the_period() -> None:
+    """Times before the first and after the last follow it too: lines at one time would count as repeated."""
     source: Any = SimpleNamespace(shape=(6,))
     times = _middle_s(source, np.array([np.nan, 1.0, np.nan, 3.0, np.nan, np.nan]), CAMERA, [])
     assert times.tolist() == [0, 1, 2, 3, 4, 5]

@@ -1,4 +1,4 @@
-"""JPEG 2000, and TIFF files that say scale and offset; GDAL reads the same."""
+"""JPEG 2000 images, and scale factors of TIFF, ENVI and scene.toml."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ RNG = np.random.default_rng(9)
 REVERSIBLE = {"QUALITY": "100", "REVERSIBLE": "YES"}
 
 
-def test_jpeg_2000(tmp_path: Path) -> None:
-    """Numbers and place as rasterio gives them, whole and by lines; wavelengths have to be stated."""
+def test_jpeg_2000_is_read(tmp_path: Path) -> None:
+    """Numbers are read as written, whole and by lines; wavelengths have to be stated."""
     values, path = RNG.integers(1, 60_000, (3, 70, 50)).astype(np.uint16), tmp_path / "a.jp2"
     place = {"crs": "EPSG:32632", "transform": Affine(10, 0, 600_000, 0, -10, 5_700_000)}
     with rasterio.open(path, "w", "JP2OpenJPEG", 50, 70, 3, dtype="uint16", **place, **REVERSIBLE) as file:
@@ -45,8 +45,8 @@ def write_tiff(path: Path, scales: tuple[float, ...] | None = None, offsets: tup
     return path
 
 
-def test_scale_and_offset_of_tiff(tmp_path: Path) -> None:
-    """Applied band by band, to a scene and by lines alike; no-data is found before; another scale, another hash."""
+def test_scale_and_offset_of_tiff_are_applied(tmp_path: Path) -> None:
+    """Both apply by band, to a scene and to lines; no-data is found before scaling. Another scale changes the hash."""
     scaled = write_tiff(tmp_path / "scaled.tif", (0.001, 0.002), (0.5, 0.0))
     scene = load_scene_file(scaled, wavelengths=[500, 600])
     raw = np.moveaxis(np.arange(24).reshape(2, 3, 4) * 100, 0, -1)
@@ -73,8 +73,8 @@ def test_unscaled_files_keep_their_hash(tmp_path: Path) -> None:
     assert scene.light_hash == hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 
-def test_scale_of_scene_toml(tmp_path: Path) -> None:
-    """Values are the file's times scale plus offset, kept or read by rows; no data is found before it."""
+def test_scale_of_scene_toml_is_applied(tmp_path: Path) -> None:
+    """Values are numbers times scale plus offset, loaded or read by rows; no-data is found before scaling."""
     path = write_tiff(tmp_path / "plain.tif")
     before = load_scene_file(path, wavelengths=[500, 600])
     (tmp_path / "scene.toml").write_text("scale = 0.0001\noffset = -0.1\nnodata = 300\n")
@@ -89,16 +89,16 @@ def test_scale_of_scene_toml(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "toml", ["scale = 0", "scale = -1.0", "scale = inf", 'scale = "0.0001"', "offset = nan", "offset = true"]
 )
-def test_scales_that_cannot_be(tmp_path: Path, toml: str) -> None:
-    """A scale is a number above 0, an offset any number; the message says so."""
+def test_invalid_scales_are_refused(tmp_path: Path, toml: str) -> None:
+    """A scale is a number above 0, an offset any number; the error says so."""
     path = write_tiff(tmp_path / "plain.tif")
     (tmp_path / "scene.toml").write_text(toml)
     with pytest.raises(SceneError, match=r"(scale|offset): Input should be (a|greater)"):
         load_scene_file(path, wavelengths=[500, 600])
 
 
-def test_reflectance_scale_factor_of_envi(tmp_path: Path) -> None:
-    """Numbers are divided by it, but for labels and where dark and white frames say what is white."""
+def test_envi_reflectance_scale_factor_is_applied(tmp_path: Path) -> None:
+    """Numbers are divided by it, except for labels and for cubes with dark and white frames."""
     numbers = np.arange(24, dtype=np.uint16).reshape(3, 4, 2) * 400
     head = "ENVI\nsamples = 4\nlines = 3\nbands = 2\ndata type = 12\ninterleave = bip\nbyte order = 0\n"
     (tmp_path / "a.hdr").write_text(f"{head}reflectance scale factor = 10000\ndata ignore value = 0\n")

@@ -1,4 +1,4 @@
-"""Scene files of every kind give the same arrays back, and what cannot be used says why."""
+"""Scene files of every kind give the same arrays, and unusable files are refused with the reason."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NM = [450.0, 550.0, 650.0, 800.0, 900.0]
 
 
 def _save(path: Path, values: NDArray[Any]) -> Path:
-    """Write a cube in the way that the file's ending says."""
+    """Write a cube in the format of the file's ending."""
     if path.suffix == ".npy":
         np.save(path, values)
     elif path.suffix == ".npz":
@@ -45,7 +45,7 @@ def test_every_kind_of_cube_file_gives_the_same_values(tmp_path: Path, cube: NDA
     np.testing.assert_array_equal(scene.wavelength_nm, NM)
 
 
-def test_doubles_that_matlab_keeps_as_bytes_are_read(tmp_path: Path) -> None:
+def test_matlab_doubles_stored_as_bytes_are_read(tmp_path: Path) -> None:
     """MATLAB stores whole doubles in fewer bytes; complex numbers are refused."""
     values = np.arange(60, dtype=np.uint8).reshape(4, 5, 3)
     path = _save(tmp_path / "a.mat", values)
@@ -57,8 +57,8 @@ def test_doubles_that_matlab_keeps_as_bytes_are_read(tmp_path: Path) -> None:
         load_scene_file(_save(tmp_path / "b.mat", values * 1j), wavelengths=NM[:3])
 
 
-def test_bands_and_wavelengths_follow_the_flags(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
-    """Wavelengths are stated for the chosen bands or for all; order is kept."""
+def test_bands_and_wavelengths_follow_the_arguments(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
+    """Wavelengths are given for the chosen bands or for all; the order is kept."""
     path = _save(tmp_path / "a.npy", cube)
     for stated in ([800.0, 450.0], NM):
         scene = load_scene_file(path, bands=[3, 0], wavelengths=stated)
@@ -71,7 +71,7 @@ def test_bands_and_wavelengths_follow_the_flags(tmp_path: Path, cube: NDArray[np
     [("L", 1, [550]), ("LA", 1, [550]), ("RGB", 3, [640, 550, 460]), ("RGBA", 3, [640, 550, 460])],
 )
 def test_images_have_assumed_wavelengths(tmp_path: Path, mode: str, bands: int, nm: list[float]) -> None:
-    """Grey and colour images get usual wavelengths, said to be assumed; alpha is dropped, and said to be."""
+    """Grey and colour images get usual wavelengths, and alpha is dropped; notes say both."""
     Image.new(mode, (6, 4), 77).save(tmp_path / "a.png")
     scene = load_scene_file(tmp_path / "a.png")
     assert scene.values.shape == (4, 6, bands)
@@ -80,8 +80,8 @@ def test_images_have_assumed_wavelengths(tmp_path: Path, mode: str, bands: int, 
     assert (ALPHA_NOTE in scene.provenance) == mode.endswith("A")
 
 
-def test_geotiff_says_its_colours(tmp_path: Path) -> None:
-    """A band after red, green and blue that is no mask is assumed near infrared, also where it is called alpha."""
+def test_a_fourth_geotiff_band_is_near_infrared(tmp_path: Path) -> None:
+    """A band that the file calls alpha counts too, unless its values are those of a mask."""
     values = np.random.default_rng(0).integers(0, 255, (4, 5, 4), dtype=np.uint8)
     tifffile.imwrite(tmp_path / "n.tif", values, photometric="rgb", extrasamples=["unspecified"])
     tifffile.imwrite(tmp_path / "a.tif", values, photometric="rgb", extrasamples=["unassalpha"])
@@ -108,21 +108,21 @@ def test_geotiff_says_its_colours(tmp_path: Path) -> None:
     ],
 )
 def test_wrong_wavelengths(tmp_path: Path, cube: NDArray[np.uint16], stated: list[float] | None, words: str) -> None:
-    """Micrometres, a wrong number, a wrong range and none at all each have their own words."""
+    """Micrometres, a wrong count, a wrong range and no wavelengths each have their own message."""
     with pytest.raises(WavelengthError, match=words):
         load_scene_file(_save(tmp_path / "a.npy", cube), wavelengths=stated)
 
 
-def test_a_void_value_that_the_numbers_cannot_hold_voids_nothing(tmp_path: Path) -> None:
-    """-9999 stated for 16-bit numbers is not 55537, which it would wrap to; 7 voids the sevens."""
+def test_a_nodata_value_beyond_the_number_type_is_ignored(tmp_path: Path) -> None:
+    """-9999 stated for 16-bit numbers is not 55537, to which it would wrap; 7 marks the sevens."""
     values = np.array([[1, 55537], [7, 7]], np.uint16)
     for stated, missing in (("-9999", 0), ("7", 2)):
         tifffile.imwrite(tmp_path / "a.tif", values, extratags=[(42113, "s", 0, stated, True)])
         assert np.isnan(load_scene_file(tmp_path / "a.tif", wavelengths=[500.0]).values).sum() == missing
 
 
-def test_hash_follows_content_and_choices(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
-    """Same bytes and choices, same hash wherever the file lies and whatever its labels; other bands, another."""
+def test_scene_hash_depends_on_content_and_bands(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
+    """The hash does not depend on the file's location and labels."""
     one, two = _save(tmp_path / "a.npy", cube), _save(tmp_path / "b.npy", cube)
     np.save(tmp_path / "labels.npy", np.ones((7, 9), int))
     plain = load_scene_file(one, wavelengths=NM)
@@ -136,8 +136,8 @@ ENVI_NM = "wavelength units = um\nwavelength = {0.45, 0.55, 0.65, 0.8, 0.9}\nfwh
 
 
 @pytest.mark.parametrize("name", ["a.hdr", "a.img"])
-def test_envi_scenes(tmp_path: Path, cube: NDArray[np.uint16], name: str) -> None:
-    """A cube is named by its header or its data; wavelengths in micrometres become nm."""
+def test_envi_scenes_are_read(tmp_path: Path, cube: NDArray[np.uint16], name: str) -> None:
+    """The header or the data file may be given; wavelengths in micrometres become nm."""
     (tmp_path / "a.hdr").write_text(ENVI + ENVI_NM)
     (tmp_path / "a.img").write_bytes(cube.tobytes())
     scene = load_scene_file(tmp_path / name)
@@ -147,8 +147,8 @@ def test_envi_scenes(tmp_path: Path, cube: NDArray[np.uint16], name: str) -> Non
     assert load_scene_file(tmp_path / name, bands=[1], wavelengths=[560]).wavelength_nm.tolist() == [560]
 
 
-def test_envi_scenes_that_are_cut_off(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
-    """Lines that the file lacks are missing, and told of."""
+def test_truncated_envi_scenes_have_nan_lines(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
+    """The lines that the file lacks are NaN, and a note counts the whole lines."""
     (tmp_path / "a.hdr").write_text(ENVI)
     (tmp_path / "a.img").write_bytes(cube.tobytes()[:-100])
     scene = load_scene_file(tmp_path / "a.hdr", wavelengths=NM)
@@ -157,8 +157,8 @@ def test_envi_scenes_that_are_cut_off(tmp_path: Path, cube: NDArray[np.uint16]) 
     assert "a.img is cut off: 5 of 7 lines are whole" in scene.provenance
 
 
-def test_headwall_scenes_are_taken_over_the_white_white_reference(tmp_path: Path) -> None:
-    """With dark and white frames beside its parts a folder is a scene of reflectance, without them of raw numbers."""
+def test_headwall_scenes_are_divided_by_the_white_reference(tmp_path: Path) -> None:
+    """With dark and white frames beside its parts a folder gives reflectance, without them raw numbers."""
     shown = np.random.default_rng(5).uniform(0.1, 0.9, (6, 40, 5))
     raw, head = np.rint(100 + shown * 1000).astype(np.uint16), ENVI.replace("9", "40").replace("bip", "bil")
     frames = {"raw_0": raw[:4], "raw_4": raw[4:], "darkReference": np.full((2, 40, 5), 100, np.uint16)}
@@ -176,8 +176,8 @@ def test_headwall_scenes_are_taken_over_the_white_white_reference(tmp_path: Path
     assert plain.light_hash != before
 
 
-def test_links_in_a_mat_file_lead_nowhere(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
-    """A MATLAB 7.3 file cannot bring arrays of other files with it: by link, external storage or virtual data set."""
+def test_links_in_a_mat_file_are_ignored(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
+    """A MATLAB 7.3 file cannot include other files by link, external storage or virtual data set."""
     secret = _save(tmp_path / "secret73.mat", cube)
     (tmp_path / "raw.bin").write_bytes(cube.tobytes())
     layout = h5py.VirtualLayout(cube.shape, cube.dtype)
@@ -192,8 +192,8 @@ def test_links_in_a_mat_file_lead_nowhere(tmp_path: Path, cube: NDArray[np.uint1
 
 
 @pytest.mark.parametrize("value", ["1e+30", "-3.4028235e+38", "2e+09"])
-def test_a_fill_value_that_nobody_stated_is_refused_with_its_place(tmp_path: Path, value: str) -> None:
-    """The first of them in the file's own bands; what the message says to write makes them missing, and no other."""
+def test_an_unstated_fill_value_is_refused_with_its_position(tmp_path: Path, value: str) -> None:
+    """The error names the band of the file; the setting that it suggests makes exactly these values missing."""
     values = np.random.default_rng(0).uniform(0.1, 0.5, (6, 7, 4)).astype(np.float32)
     holes = values.copy()
     values[2, 3:5, 1], values[4, 0, 3] = np.float32(value), np.float32(value)
@@ -211,8 +211,8 @@ def test_a_fill_value_that_nobody_stated_is_refused_with_its_place(tmp_path: Pat
     load_scene_file(path, bands=[0, 2], wavelengths=[500, 600])
 
 
-def test_another_no_data_value_is_another_scene(tmp_path: Path) -> None:
-    """What counts as light changes with it, so that nothing stored of one is taken for the other."""
+def test_another_nodata_value_gives_another_hash(tmp_path: Path) -> None:
+    """Stores of one scene are therefore never used for the other; 5 and 5.0 are equal."""
     path = _save(tmp_path / "a.npy", np.arange(12.0).reshape(2, 3, 2))
     found = [load_scene_file(path, wavelengths=[500, 600]).light_hash]
     for number in ("0", "5", "5.0"):
@@ -228,8 +228,8 @@ def _scene(folder: Path, cube: NDArray[np.uint16], toml: str) -> Path:
     return folder / "a.npy"
 
 
-def test_bands_and_wavelengths_of_the_file(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
-    """Bands are counted from 0; --bands picks from the wavelengths stated, and a band without one is refused."""
+def test_bands_and_wavelengths_of_scene_toml(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
+    """Bands are counted from 0; --bands selects from the stated wavelengths, and a band without one is refused."""
     path = _scene(tmp_path, cube, "bands = [4, 1]\nwavelengths_nm = [800.0, 500.0]")
     scene = load_scene_file(path)
     np.testing.assert_array_equal(scene.values, cube[..., [4, 1]])
@@ -240,8 +240,8 @@ def test_bands_and_wavelengths_of_the_file(tmp_path: Path, cube: NDArray[np.uint
     assert load_scene_file(path, bands=[2], wavelengths=[700]).wavelength_nm.tolist() == [700]
 
 
-def test_wavelengths_file_less_dropped_rows(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
-    """Rows are counted from 1, headings passed over, widths kept, order kept."""
+def test_wavelengths_file_skips_dropped_rows(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
+    """Rows are counted from 1, headings are skipped, and widths and order are kept."""
     (tmp_path / "w.txt").write_text("instrument\n----\n900 10\n500, 9, x\n1 1\n400 8\n600 7\n700 6\n")
     scene = load_scene_file(_scene(tmp_path, cube, 'wavelengths_file = "w.txt"\ndropped_bands = [3]'))
     assert scene.wavelength_nm.tolist() == [900, 500, 400, 600, 700]
@@ -267,7 +267,7 @@ def test_wavelengths_file_less_dropped_rows(tmp_path: Path, cube: NDArray[np.uin
         ('wavelengths_file = "none.txt"', r"none\.txt cannot be read"),
     ],
 )
-def test_mistakes_are_named(tmp_path: Path, cube: NDArray[np.uint16], toml: str, words: str) -> None:
+def test_mistakes_in_scene_toml_are_named(tmp_path: Path, cube: NDArray[np.uint16], toml: str, words: str) -> None:
     """Unknown keys and wrong values are refused with the key's name."""
     with pytest.raises(SceneError, match=words):
         load_scene_file(_scene(tmp_path, cube, toml))

@@ -1,4 +1,4 @@
-"""Zarr stores as scenes: this project's own, anyone's with known dims; what is not plain numbers is refused."""
+"""Zarr stores as scenes: known dims are read; raw cubes, pickles, outside links and huge claims are refused."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _dataset(cube: NDArray[Any], dims: tuple[str, ...], **about: Any) -> xr.Data
 
 @pytest.mark.parametrize("dims", [("y", "x", "band"), ("band", "y", "x")])
 @pytest.mark.parametrize("version", [2, 3])
-def test_xarray_datasets(tmp_path: Path, cube: NDArray[np.uint16], dims: tuple[str, ...], version: int) -> None:
+def test_xarray_dataset_is_read(tmp_path: Path, cube: NDArray[np.uint16], dims: tuple[str, ...], version: int) -> None:
     """Either order of dims and either version of the format give the same scene, with the coordinate's wavelengths."""
     path = tmp_path / "a.zarr"
     _dataset(cube, dims, units="nm").to_zarr(path, zarr_format=version, consolidated=False)
@@ -43,8 +43,8 @@ def test_xarray_datasets(tmp_path: Path, cube: NDArray[np.uint16], dims: tuple[s
     assert "wavelengths from the array wavelength, in nm" in scene.provenance
 
 
-def test_plain_arrays(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
-    """An array by itself, in both versions, is y, x, band; two axes are one band."""
+def test_zarr_arrays_without_dims_are_read(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
+    """A single array is y, x, band in both format versions; two axes are one band. Missing chunks are noted."""
     for version in (2, 3):
         path = tmp_path / f"{version}.zarr"
         zarr.create_array(path, data=cube, zarr_format=version)
@@ -62,8 +62,8 @@ def test_plain_arrays(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
 
 @pytest.mark.parametrize("version", [2, 3])
 @pytest.mark.parametrize("packing", [{"dtype": "f4"}, {"dtype": "i2", "scale_factor": 0.5, "add_offset": 1.0}])
-def test_xarrays_void_numbers(tmp_path: Path, cube: NDArray[np.uint16], version: int, packing: dict[str, Any]) -> None:
-    """Packed numbers are what they mean, and the one that stands for none is found, in both versions."""
+def test_packing_is_decoded(tmp_path: Path, cube: NDArray[np.uint16], version: int, packing: dict[str, Any]) -> None:
+    """Scale, offset and fill value are applied in both format versions."""
     data = _dataset(np.where(cube > 4000, np.nan, cube * 0.5 + 1), ("y", "x", "band"), units="nm")
     encoding: Any = {"reflectance": {**packing, "_FillValue": -9999}}
     data.to_zarr(tmp_path / "a.zarr", encoding=encoding, zarr_format=version, consolidated=False)
@@ -71,8 +71,8 @@ def test_xarrays_void_numbers(tmp_path: Path, cube: NDArray[np.uint16], version:
     np.testing.assert_allclose(scene.values, np.where(cube > 4000, np.nan, cube * 0.5 + 1), rtol=1e-6)
 
 
-def test_own_raw_cube(tmp_path: Path) -> None:
-    """A raw cube of this project is no scene but a recording."""
+def test_a_raw_cube_is_refused_as_a_scene(tmp_path: Path) -> None:
+    """A raw cube of this project is a recording; the error says to survey it with `--sweeps`."""
     sweep, frame = Sweep("fine-0", "fine", "y", 0.0, 0.0, 6), np.ones((40, 5), np.float32)
     with RawCubeWriter(tmp_path / "s0.zarr", SweepHeader(sweep, References(frame, frame, frame[0]), NM)) as cube:
         cube.write([Line(i, np.ones((40, 5), np.uint16), 0.0, 0.0, 0.1 * i, 10.0, True) for i in range(6)])
@@ -99,8 +99,8 @@ def test_pickle_is_never_loaded(tmp_path: Path, cube: NDArray[np.uint16], filter
     assert not (tmp_path / "trapped").exists()
 
 
-def test_codecs_within_shards_are_looked_at(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
-    """A codec inside a shard's own list is refused like any other."""
+def test_codecs_within_shards_are_checked(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
+    """A codec in a shard's own list is refused like any other."""
     path = tmp_path / "a.zarr"
     zarr.create_array(path, data=cube, chunks=(7, 9, 5), shards=(7, 9, 5))
 
@@ -112,8 +112,8 @@ def test_codecs_within_shards_are_looked_at(tmp_path: Path, cube: NDArray[np.uin
         load_scene_file(path, wavelengths=NM.tolist())
 
 
-def test_damaged_stores(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
-    """Torn metadata and flipped chunks are one message."""
+def test_damaged_zarr_stores_are_refused(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
+    """A truncated chunk and broken metadata raise the same error."""
     path = tmp_path / "a.zarr"
     zarr.create_array(path, data=cube)
     chunk = next(file for file in path.rglob("*") if file.is_file() and file.name != "zarr.json")
@@ -125,8 +125,8 @@ def test_damaged_stores(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
         load_scene_file(path, wavelengths=NM.tolist())
 
 
-def test_links_out_of_a_store(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
-    """Chunks, arrays and metadata that are links to elsewhere, or pipes, are refused before one is read."""
+def test_links_out_of_a_store_are_refused(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
+    """Links to other places and pipes are refused before one is read; a link to the store itself is allowed."""
     (tmp_path / "secret").mkdir()
     (tmp_path / "secret" / "key").write_bytes(b"secret")
     path = tmp_path / "a.zarr"
@@ -153,7 +153,7 @@ def test_links_out_of_a_store(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
 
 
 def test_names_in_consolidated_metadata_are_not_followed(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
-    """Arrays are those that lie in the store, whatever its consolidated metadata list, and names are no paths."""
+    """Only arrays inside of the store are read, whatever its consolidated metadata list; names are no paths."""
     path, other = tmp_path / "a.zarr", tmp_path / "other.zarr"
     for version in (2, 3):
         zarr.open_group(other, mode="w", zarr_format=version).create_array("cube", data=cube + 1)
@@ -171,8 +171,8 @@ def test_names_in_consolidated_metadata_are_not_followed(tmp_path: Path, cube: N
             open_cube(f"{path}:{name}")
 
 
-def test_coordinates_that_claim_too_much(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
-    """Small arrays beside the cube are judged like the cube."""
+def test_coordinates_with_huge_claims_are_refused(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
+    """Small arrays beside the cube are checked like the cube."""
     _dataset(cube, ("y", "x", "band"), units="nm").to_zarr(tmp_path / "a.zarr", consolidated=False)
 
     def change(content: dict[str, Any]) -> None:
@@ -183,8 +183,8 @@ def test_coordinates_that_claim_too_much(tmp_path: Path, cube: NDArray[np.uint16
         open_cube(tmp_path / "a.zarr")
 
 
-def test_blocks_beyond_the_memory(tmp_path: Path, cube: NDArray[np.uint16], monkeypatch: pytest.MonkeyPatch) -> None:
-    """What reading some lines takes is held against the machine's memory, and chunks are read whole."""
+def test_chunks_must_fit_into_memory(tmp_path: Path, cube: NDArray[np.uint16], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Chunks are read whole, so the memory for a few lines is compared with the machine's."""
     zarr.create_array(tmp_path / "a.zarr", data=cube, chunks=cube.shape)
     monkeypatch.setattr("storage.readers.cube_sources.machine_bytes", lambda: cube.nbytes - 1)
     with pytest.raises(SceneError, match="reading it takes about"):

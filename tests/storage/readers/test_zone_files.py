@@ -1,4 +1,4 @@
-"""Files of polygons: formats, layers, names and CRS as written, mended borders, and one message for each mistake."""
+"""Polygon files: formats, layers, names, CRS and repaired borders; one error for each mistake."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ BOWTIE = shapely.Polygon([(0, 0), (10, 10), (10, 0), (0, 10)])
 
 
 def written(path: Path, shapes: list[Any], crs: Any = 32632, layer: str | None = None, **columns: list[Any]) -> str:
-    """Write geometries with attributes; gives the path."""
+    """Write geometries with attributes, and return the path."""
     table = geopandas.GeoDataFrame(columns, geometry=shapes, crs=crs)
     table.to_file(path, engine="pyogrio", **({} if layer is None else {"layer": layer}))
     return str(path)
@@ -28,15 +28,15 @@ def written(path: Path, shapes: list[Any], crs: Any = 32632, layer: str | None =
 
 @pytest.mark.parametrize("name", ["z.geojson", "z.gpkg", "z.shp"])
 def test_every_format_gives_its_polygons_by_name(name: str, tmp_path: Path) -> None:
-    """With the CRS that the file names."""
+    """The CRS is the one that the file names."""
     found = read_zones(written(tmp_path / name, [SQUARE, OTHER], name=["west", "east"]))
     assert found.crs.to_epsg() == 32632
     assert {key: shape.area for key, shape in found.shapes.items()} == {"west": 100, "east": 50}
     assert found.notes == ()
 
 
-def test_a_layer_is_named_after_a_colon(tmp_path: Path) -> None:
-    """Where there are several it has to be, and the message names them."""
+def test_a_layer_is_selected_after_a_colon(tmp_path: Path) -> None:
+    """If a file has several layers, one has to be named; the error lists them."""
     path = tmp_path / "farm.gpkg"
     written(path, [SQUARE], layer="area")
     written(path, [OTHER], layer="trial")
@@ -47,16 +47,16 @@ def test_a_layer_is_named_after_a_colon(tmp_path: Path) -> None:
         read_zones(f"{path}:plots")
 
 
-def test_borders_that_cross_are_mended_with_a_note(tmp_path: Path) -> None:
-    """A bowtie is two triangles."""
+def test_crossing_borders_are_repaired_with_a_note(tmp_path: Path) -> None:
+    """A bowtie becomes two triangles."""
     found = read_zones(written(tmp_path / "z.gpkg", [BOWTIE, OTHER]))
     assert found.shapes["1"].is_valid
     assert found.shapes["1"].area == pytest.approx(50)
     assert "the borders of 1 of 2 polygons" in found.notes[0]
 
 
-def test_plots_are_named_by_the_attribute_asked_for(tmp_path: Path) -> None:
-    """By default by the first usual one; polygons of one name are one plot, and one without a name has its number."""
+def test_plots_are_named_by_an_attribute(tmp_path: Path) -> None:
+    """The default is the first usual one; equal names are one plot, and a polygon without a name gets its number."""
     path = written(
         tmp_path / "z.gpkg", [SQUARE, OTHER, BOWTIE.convex_hull], plot_id=[7.0, 7.0, None], kind=["a", "b", "c"]
     )
@@ -66,8 +66,8 @@ def test_plots_are_named_by_the_attribute_asked_for(tmp_path: Path) -> None:
         read_zones(path, named_by="variety")
 
 
-def test_geojson_without_a_crs_and_a_shapefile_without_prj_name_none(tmp_path: Path) -> None:
-    """What is meant is the survey's to say."""
+def test_files_without_a_crs_have_none(tmp_path: Path) -> None:
+    """For GeoJSON without a CRS and a shapefile without .prj, the survey decides which CRS is meant."""
     bare = {"type": "Feature", "properties": {}, "geometry": SQUARE.__geo_interface__}
     (tmp_path / "z.geojson").write_text("\ufeff" + json.dumps(bare), encoding="utf-8")
     assert read_zones(str(tmp_path / "z.geojson")).crs is None
@@ -88,16 +88,16 @@ def test_geojson_without_a_crs_and_a_shapefile_without_prj_name_none(tmp_path: P
         ("z.shp", "\x00\x00", "cannot read"),
     ],
 )
-def test_what_holds_no_polygons_is_one_message(name: str, content: str | None, words: str, tmp_path: Path) -> None:
-    """Endings, missing, empty and foreign files."""
+def test_files_without_polygons_are_refused(name: str, content: str | None, words: str, tmp_path: Path) -> None:
+    """Wrong endings, and missing, empty and foreign files, each raise one error."""
     if content is not None:
         (tmp_path / name).write_text(content)
     with pytest.raises(ZoneError, match=words):
         read_zones(str(tmp_path / name))
 
 
-def test_a_ring_that_does_not_close_is_one_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As one with a corner of NaN, which is not equal to itself."""
+def test_a_ring_that_does_not_close_raises_one_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A corner of NaN is not equal to itself."""
     ring = struct.pack("<BIII8d", 1, 3, 1, 4, *(math.nan, 1), *(5, 5), *(9, 1), *(math.nan, 1))
     path = written(tmp_path / "z.geojson", [SQUARE])
     monkeypatch.setattr("pyogrio.raw.read", lambda path, layer: ({"crs": None, "fields": []}, None, [ring], []))

@@ -1,4 +1,4 @@
-"""An archive on S3: whoever publishes first wins, a half upload is nothing, and every byte that is used was checked."""
+"""An archive on S3: the first publisher wins, a partial upload does not count, and all used bytes are checked."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ from tests.storage.small_archive import problems, small_survey
 from tests.storage.small_bucket import FIRST, SECOND, Machine, make, object_of, rot
 
 
-def test_a_store_is_found_and_fetched_elsewhere(machine: Machine) -> None:
-    """A second machine makes nothing, has no file of the store before it asks for its path, and then the same bytes."""
+def test_a_store_is_found_and_fetched_by_another_machine(machine: Machine) -> None:
+    """The second machine makes nothing, and has the same bytes; it fetches files only when it asks for their path."""
     ref, built = make(machine(FIRST))
     other = machine(SECOND)
     found, rebuilt = make(other, b"never written")
@@ -45,8 +45,8 @@ def test_a_store_is_found_and_fetched_elsewhere(machine: Machine) -> None:
     check_files(found.path, hashes=True)
 
 
-def test_a_second_writer_takes_what_stands(bucket: str, machine: Machine) -> None:
-    """Of two machines that make one key at a time one publishes; both end with its store, whatever they had made."""
+def test_a_second_writer_takes_the_published_store(bucket: str, machine: Machine) -> None:
+    """If two machines make one key at the same time, one publishes; both end with its store."""
     archives, together = [machine(FIRST), machine(SECOND)], threading.Barrier(2)
 
     def publish(number: int) -> StageRef:
@@ -67,14 +67,14 @@ def test_a_second_writer_takes_what_stands(bucket: str, machine: Machine) -> Non
 
 
 def test_a_store_without_conditional_puts_is_refused(bucket: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where a put that must not overwrite does, two surveys would destroy each other's: no archive is begun."""
+    """If conditional puts overwrite, two surveys could destroy each other's stores: no archive is created."""
     monkeypatch.setattr(Objects, "create", lambda self, name, content: True)
     with pytest.raises(ArchiveError, match="ignores conditional puts"):
         open_archive(bucket)
 
 
-def test_a_publisher_killed_before_the_manifest_leaves_nothing(bucket: str, machine: Machine, tmp_path: Path) -> None:
-    """Killed between files and manifest: others find nothing; the rerun uploads the manifest, and no file again."""
+def test_a_publisher_killed_before_the_manifest_can_resume(bucket: str, machine: Machine, tmp_path: Path) -> None:
+    """Other machines find no store; the rerun uploads the manifest, and no file again."""
     script = (
         "import os, signal, sys\n"
         "from pathlib import Path\n"
@@ -89,7 +89,7 @@ def test_a_publisher_killed_before_the_manifest_leaves_nothing(bucket: str, mach
         "archive.produce('rectify', build, version=1, params={})\n"
     )
     other = machine(SECOND)
-    mine = machine(FIRST)  # and so for the process: its environment is this one's
+    mine = machine(FIRST)  # the process inherits this environment
     ended = subprocess.run([sys.executable, "-c", script, bucket], cwd=Path(__file__).parents[3], check=False)
     assert ended.returncode == -9
     assert len(other.objects.listing("stages")) == 2
@@ -103,8 +103,8 @@ def test_a_publisher_killed_before_the_manifest_leaves_nothing(bucket: str, mach
     assert other.find("rectify", key) == ref
 
 
-def test_a_flipped_bit_is_found_and_never_used(machine: Machine) -> None:
-    """verify names the file; whoever fetches it is refused, and has nothing of it."""
+def test_a_flipped_bit_is_found_and_its_file_refused(machine: Machine) -> None:
+    """Verify names the file; a machine that fetches it gets an error and no file."""
     archive = machine(FIRST)
     ref, _ = make(archive)
     rot(archive, object_of(archive, ref, "a.bin"))
@@ -118,7 +118,7 @@ def test_a_flipped_bit_is_found_and_never_used(machine: Machine) -> None:
 
 
 def test_a_flipped_bit_in_a_manifest_is_found(machine: Machine) -> None:
-    """The manifest vouches for itself, in the bucket too."""
+    """A manifest holds its own checksum, in the bucket too."""
     archive = machine(FIRST)
     ref, _ = make(archive)
     rot(archive, f"{ref.uri}/manifest.json", 200)
@@ -128,7 +128,7 @@ def test_a_flipped_bit_in_a_manifest_is_found(machine: Machine) -> None:
 
 
 def test_missing_and_foreign_objects_are_found(machine: Machine) -> None:
-    """A file that is gone, one that nobody listed, and a store that a run names and that is gone."""
+    """Verify finds a missing file, an unlisted file, and a missing store that a run names."""
     archive = machine(FIRST)
     small = small_survey(archive)
     ref, _ = make(archive)
@@ -142,15 +142,15 @@ def test_missing_and_foreign_objects_are_found(machine: Machine) -> None:
     }
 
 
-def test_runs_of_one_second_have_names_of_their_own(machine: Machine) -> None:
-    """Two machines that begin a run in the same second do not get the same name."""
+def test_runs_of_one_second_have_different_names(machine: Machine) -> None:
+    """Two machines begin a run in the same second."""
     drafts = [machine(name)._begin_run("20261120T101010-farm") for name in (FIRST, SECOND)]
     assert len({draft.id for draft in drafts if draft is not None}) == 2
 
 
 @pytest.mark.parametrize("method", ["write", "create"])
-def test_a_run_that_was_not_sent_is_sent_later(machine: Machine, monkeypatch: pytest.MonkeyPatch, method: str) -> None:
-    """Killed with its files on the way, or before its manifest: whoever opens the archive there uploads it."""
+def test_an_interrupted_run_is_uploaded_later(machine: Machine, monkeypatch: pytest.MonkeyPatch, method: str) -> None:
+    """The machine was killed before its files or its manifest were sent; opening the archive there uploads them."""
     archive = machine(FIRST)
     small_survey(archive, named=False)
     with monkeypatch.context() as patch:
@@ -164,10 +164,10 @@ def test_a_run_that_was_not_sent_is_sent_later(machine: Machine, monkeypatch: py
     assert problems(opened) == []
 
 
-def test_a_run_whose_stores_are_gone_is_in_the_way_of_no_command(
+def test_an_unsent_run_with_missing_stores_stops_no_command(
     machine: Machine, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Killed before its run was sent, then another machine removes a store of it: the same survey mends that."""
+    """Another machine removed a store of the unsent run; the same survey, run again, repairs it."""
     small_survey(machine(FIRST), named=False)
     archive = machine(SECOND)
     with monkeypatch.context() as patch:
@@ -185,8 +185,8 @@ def test_a_run_whose_stores_are_gone_is_in_the_way_of_no_command(
     assert problems(machine(FIRST)) == []
 
 
-def test_gc_takes_what_no_run_names_and_broken_off_uploads(machine: Machine) -> None:
-    """Manifest first; what a receipt names stays, on every machine; a broken-off upload goes with its files."""
+def test_gc_removes_unnamed_stores_and_interrupted_uploads(machine: Machine) -> None:
+    """Stores named by a receipt stay, on every machine; with `keep_days=1` nothing is removed."""
     archive = machine(FIRST)
     kept, gone = small_survey(archive), small_survey(archive, seed=1, named=False)
     archive.objects.write("stages/rectify/half/0123456789abcdef/a.bin", b"half")
@@ -201,8 +201,8 @@ def test_gc_takes_what_no_run_names_and_broken_off_uploads(machine: Machine) -> 
     assert problems(opened) == []
 
 
-def test_a_cached_store_that_was_cleared_away_is_sent_again(machine: Machine) -> None:
-    """What another machine removed is uploaded again before a run names it."""
+def test_a_cached_store_removed_elsewhere_is_uploaded_again(machine: Machine) -> None:
+    """Another machine removed it; it is uploaded before a run names it."""
     archive, other = machine(FIRST), machine(SECOND, create=False)
     small = small_survey(archive, named=False)
     other.discard(small.raw)
@@ -210,8 +210,8 @@ def test_a_cached_store_that_was_cleared_away_is_sent_again(machine: Machine) ->
     assert problems(archive) == []
 
 
-def test_a_lost_working_copy_costs_nothing_but_time(machine: Machine) -> None:
-    """All of it may be deleted; files that lack are fetched again."""
+def test_a_lost_working_copy_is_fetched_again(machine: Machine) -> None:
+    """One file or the whole copy may be deleted; the store is not made again."""
     archive = machine(FIRST)
     ref, _ = make(archive)
     (ref.path / "deep" / "a.bin").unlink()
@@ -224,7 +224,7 @@ def test_a_lost_working_copy_costs_nothing_but_time(machine: Machine) -> None:
 
 
 def test_a_published_store_opens_with_plain_zarr(bucket: str, machine: Machine) -> None:
-    """Without SpectralZoom: the manifest's hash tells the folder, zarr and obstore do the rest."""
+    """Without SpectralZoom, the manifest's hash gives the folder; zarr and obstore read it."""
     import hashlib
 
     import zarr
@@ -245,8 +245,8 @@ def test_a_published_store_opens_with_plain_zarr(bucket: str, machine: Machine) 
 
 
 @pytest.mark.parametrize("text", ["s3://", "s3:///bucket", "s3://ok/../x", "s3://bucket/a//b", "s3://bucket/a b"])
-def test_addresses_that_are_none_are_refused(text: str) -> None:
-    """A prefix is of plain letters and cannot climb."""
+def test_invalid_addresses_are_refused(text: str) -> None:
+    """A prefix has plain letters only and cannot lead upwards."""
     assert is_remote(text)
     with pytest.raises(SettingsError, match=r"expected s3://bucket/prefix"):
         parse_place(text)
@@ -256,15 +256,15 @@ def test_addresses_that_are_none_are_refused(text: str) -> None:
     ("endpoint", "words"),
     {"nonsense": "is no address", "http://10.0.0.1:90": "plain http", "ftp://x": "no address", "http://": "no"}.items(),
 )
-def test_endpoints_that_cannot_be_used_are_refused(endpoint: str, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Plain http goes to this machine alone, unless it is allowed."""
+def test_unusable_endpoints_are_refused(endpoint: str, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Plain http is allowed for this machine only, unless a setting permits it."""
     monkeypatch.setenv("AWS_ENDPOINT_URL", endpoint)
     with pytest.raises(SettingsError, match=words):
         parse_place("s3://bucket/x")
 
 
 def test_a_missing_bucket_or_archive_is_one_clear_error(bucket: str) -> None:
-    """The message says what is missing and what to do."""
+    """The error says what is missing and what to do."""
     with pytest.raises(ArchiveError, match=r"s3://no-such-bucket/x at http://.*: there is no such bucket: create it"):
         open_archive("s3://no-such-bucket/x")
     with pytest.raises(ArchiveError, match="is not there; check the name"):
@@ -273,8 +273,8 @@ def test_a_missing_bucket_or_archive_is_one_clear_error(bucket: str) -> None:
 
 
 @pytest.mark.parametrize("text", ["gs://bucket/x", "http://host/x", "S3://bucket/x"])
-def test_addresses_of_other_kinds_are_no_folders(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They are refused, and no folder is made that is called so."""
+def test_other_kinds_of_addresses_are_refused(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Such addresses are not taken for folders, and no folder of that name is created."""
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SettingsError, match=r"expected a folder, or s3://bucket/prefix"):
         open_archive(text)
@@ -294,8 +294,8 @@ def test_addresses_of_other_kinds_are_no_folders(text: str, tmp_path: Path, monk
         ("The AWS Access Key Id does not exist: InvalidAccessKeyId", "check the credentials"),
     ],
 )
-def test_what_a_store_answers_is_told_in_words(bucket: str, answer: str, words: str) -> None:
-    """What may pass by itself is told from what somebody has to change."""
+def test_errors_of_a_bucket_are_explained(bucket: str, answer: str, words: str) -> None:
+    """The message separates failures that pass by themselves from those that a person has to fix."""
     from obstore.exceptions import GenericError
 
     with pytest.raises(UnreachableError, match=re.escape(words)), object_stores.answers_of(parse_place(bucket)):
@@ -303,7 +303,7 @@ def test_what_a_store_answers_is_told_in_words(bucket: str, answer: str, words: 
 
 
 def test_copies_between_bucket_and_folder_are_no_archives(bucket: str, machine: Machine, tmp_path: Path) -> None:
-    """Stores lie otherwise there: nothing is verified, repaired or continued in such a copy."""
+    """Bucket and folder have other layouts: a copy is neither verified nor repaired nor continued."""
     ref, _ = make(machine(FIRST))
     objects = Objects(parse_place(bucket))
     for path in objects.listing():
@@ -319,8 +319,8 @@ def test_copies_between_bucket_and_folder_are_no_archives(bucket: str, machine: 
 
 
 @pytest.mark.parametrize("create", [True, False])
-def test_what_has_another_mark_is_no_archive(bucket: str, machine: Machine, create: bool) -> None:
-    """Such as a network's page for guests, which answers everything, or an archive of a later version."""
+def test_an_archive_with_another_marker_is_refused(bucket: str, machine: Machine, create: bool) -> None:
+    """The file may be a network's login page, which answers every request, or of a later version."""
     machine(FIRST).objects.write("archive.json", b"<html>welcome</html>")
     with pytest.raises(ArchiveError, match=r"archive\.json is not as expected"):
         open_archive(bucket, create=create)

@@ -1,4 +1,4 @@
-"""Several machines at one archive in a bucket: none harms what another clears, repairs or uploads, and all read it."""
+"""Several machines share an archive in a bucket: none harms a store that another clears, repairs or uploads."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ from tests.storage.small_bucket import FIRST, SECOND, Machine, make
 THIRD = "third"
 
 
-def test_gc_gives_a_store_back_that_a_run_named_meanwhile(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Another machine publishes a run between gc's look at the runs and its removal of a store: the store stays."""
+def test_gc_restores_a_store_that_a_new_run_names(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another machine publishes a run between gc's listing of the runs and its removal of a store."""
     archive = machine(FIRST)
     small_survey(archive, named=False)
     opened, remove, done = machine(SECOND, create=False), Objects.remove, list[bool]()
@@ -49,8 +49,8 @@ def test_gc_gives_a_store_back_that_a_run_named_meanwhile(machine: Machine, monk
     assert problems(archive) == []
 
 
-def test_files_that_another_machine_cleared_are_not_there(machine: Machine) -> None:
-    """A working copy has an older manifest of them."""
+def test_files_cleared_by_another_machine_are_missing(machine: Machine) -> None:
+    """The working copy has an older manifest of them."""
     archive = machine(FIRST)
     small, _ = small_survey(archive), machine(SECOND, create=False)
     archive.clear(small.raw)
@@ -58,8 +58,8 @@ def test_files_that_another_machine_cleared_are_not_there(machine: Machine) -> N
     assert (other.is_there(small.raw.uri), other.is_there(small.map.uri)) == (False, True)
 
 
-def test_gc_leaves_what_another_machine_puts_back(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A run that names a store is published after gc's last look at the runs: the publisher's store stays."""
+def test_discard_keeps_a_store_that_a_new_run_names(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run that names the store is published after gc's last listing of the runs."""
     archive = machine(FIRST)
     ref = small_survey(archive, named=False).map
     opened, discard, done = machine(SECOND, create=False), Archive.discard, list[bool]()
@@ -75,8 +75,8 @@ def test_gc_leaves_what_another_machine_puts_back(machine: Machine, monkeypatch:
     assert problems(archive) == []
 
 
-def test_gc_counts_runs_that_others_published_since_it_was_opened(machine: Machine) -> None:
-    """Between opening and clearing up another machine names old stores: they stay."""
+def test_gc_sees_runs_published_after_the_archive_was_opened(machine: Machine) -> None:
+    """Between opening and gc another machine names old stores: they stay."""
     archive = machine(FIRST)
     small_survey(archive, named=False)
     opened = machine(SECOND, create=False)
@@ -93,7 +93,7 @@ def extend(archive: Archive, name: str, content: str) -> None:
 
 
 def test_a_survey_sees_runs_of_other_machines(machine: Machine) -> None:
-    """Those that were there when it opened the archive, and after a refresh those that came since."""
+    """Runs from before the opening are listed at once, later ones after a refresh."""
     archive = machine(FIRST)
     runs, opened = [small_survey(archive).run.name], machine(SECOND)
     assert [folder.name for folder in opened.runs()] == runs
@@ -102,8 +102,8 @@ def test_a_survey_sees_runs_of_other_machines(machine: Machine) -> None:
     assert {run.uri for run in Catalogue.read(opened.root).runs} == {f"runs/{name}" for name in runs}
 
 
-def test_a_run_that_was_removed_elsewhere_goes(machine: Machine) -> None:
-    """It is neither uploaded again nor in the way of the next command."""
+def test_a_run_removed_by_another_machine_is_removed_here(machine: Machine) -> None:
+    """The run is not uploaded again, and does not stop the next command."""
     archive = machine(FIRST)
     folder = small_survey(archive).run
     extend(archive, folder.name, "of more files than the receipt")
@@ -114,8 +114,8 @@ def test_a_run_that_was_removed_elsewhere_goes(machine: Machine) -> None:
     assert problems(archive) == []
 
 
-def test_a_store_that_was_removed_elsewhere_goes(machine: Machine) -> None:
-    """From the list of stores on a machine that had its manifest alone."""
+def test_a_store_removed_by_another_machine_is_not_listed(machine: Machine) -> None:
+    """This machine had only the store's manifest."""
     archive = machine(FIRST)
     ref = small_survey(archive, named=False).map
     assert ref.uri in {one.uri for one in machine(SECOND, create=False).refs()}
@@ -124,7 +124,7 @@ def test_a_store_that_was_removed_elsewhere_goes(machine: Machine) -> None:
 
 
 def test_two_machines_that_extend_one_run_leave_it_whole(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The second finds that the manifest is not the one that it extended, and takes the first's."""
+    """The second finds that the manifest has changed, and takes the first's extension."""
     archives = machine(FIRST), machine(SECOND)
     name = small_survey(archives[0]).run.name
     archives[1].refresh()
@@ -143,8 +143,8 @@ def test_two_machines_that_extend_one_run_leave_it_whole(machine: Machine, monke
         assert archive.locate(f"runs/{name}/note.txt").read_text() == "first"
 
 
-def test_what_was_cleared_away_elsewhere_is_made_again(machine: Machine) -> None:
-    """A manifest here, of whose files none was fetched, does not stand for a store that is gone."""
+def test_a_store_removed_by_another_machine_is_made_again(machine: Machine) -> None:
+    """A cached manifest without fetched files does not stand for a removed store."""
     archive = machine(FIRST)
     ref, _ = make(archive)
     assert machine(SECOND).find("rectify", ref.key) is not None
@@ -155,8 +155,8 @@ def test_what_was_cleared_away_elsewhere_is_made_again(machine: Machine) -> None
     assert problems(archive) == []
 
 
-def test_what_was_made_again_elsewhere_is_fetched_as_it_is_now(machine: Machine) -> None:
-    """Cleared away and made with other bytes: a run under way is told to run again, and then has the new ones."""
+def test_a_store_remade_by_another_machine_is_fetched_anew(machine: Machine) -> None:
+    """The store has other bytes now: a run in progress stops with the advice to run again, which fetches them."""
     archive = machine(FIRST)
     ref, _ = make(archive)
     other = machine(SECOND)
@@ -172,7 +172,7 @@ def test_what_was_made_again_elsewhere_is_fetched_as_it_is_now(machine: Machine)
     assert other.manifest_hash(found) == archive.manifest_hash(ref)
 
 
-def test_ages_are_counted_by_the_clock_of_the_bucket(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gc_counts_ages_by_the_clock_of_the_bucket(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     """A machine whose clock is days ahead removes no fresh store."""
     small_survey(machine(FIRST), named=False)
     opened = machine(SECOND, create=False)
@@ -180,8 +180,8 @@ def test_ages_are_counted_by_the_clock_of_the_bucket(machine: Machine, monkeypat
     assert clear_up(opened, keep_days=1).removals == ()
 
 
-def test_a_store_that_is_cleared_under_verify_is_no_damage(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
-    """gc on another machine takes a store whose manifest was read, and its files not yet."""
+def test_a_store_removed_during_verify_is_not_damage(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+    """gc on another machine removes the store after its manifest was read and before its files are."""
     archive = machine(FIRST)
     ref, _ = make(archive)
     save = Objects.save
@@ -195,7 +195,7 @@ def test_a_store_that_is_cleared_under_verify_is_no_damage(machine: Machine, mon
 
 
 def test_a_full_disk_under_the_working_copy_is_one_error(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
-    """While a file is fetched, and while what is known is noted; what was there stays, and the next try goes on."""
+    """Fetching a file and writing a manifest can fail; stored files stay, and the next attempt continues."""
     ref, _ = make(machine(FIRST))
     other, full = machine(SECOND), Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
     with monkeypatch.context() as patch:
@@ -211,8 +211,8 @@ def test_a_full_disk_under_the_working_copy_is_one_error(machine: Machine, monke
     assert (found.path / "deep" / "a.bin").read_bytes() == b"light"
 
 
-def test_what_a_killed_fetch_left_goes_with_a_later_one(machine: Machine) -> None:
-    """Halves of files are no use to anybody after a day."""
+def test_leftovers_of_killed_fetches_are_removed_after_a_day(machine: Machine) -> None:
+    """A younger folder stays, because its fetch may be in progress."""
     other = machine(SECOND)
     dead, living = (other.root / f".fetch-{name}" for name in ("dead", "living"))
     for folder in (dead, living):
@@ -223,8 +223,8 @@ def test_what_a_killed_fetch_left_goes_with_a_later_one(machine: Machine) -> Non
     assert (dead.exists(), living.exists()) == (False, True)
 
 
-def test_what_is_brought_while_it_is_made_here_is_kept(machine: Machine) -> None:
-    """Another process of this machine has fetched the store that another machine published: it is not taken away."""
+def test_a_store_fetched_while_it_is_made_here_is_kept(machine: Machine) -> None:
+    """Another process of this machine fetched the store that another machine published; its files stay in place."""
     mine, read = machine(FIRST), list[int]()
 
     def build(path: Path) -> None:
@@ -239,8 +239,8 @@ def test_what_is_brought_while_it_is_made_here_is_kept(machine: Machine) -> None
     assert read == [(ref.path / "a.bin").stat().st_ino]
 
 
-def test_what_one_machine_cleared_another_makes_again(machine: Machine) -> None:
-    """Files go from the bucket, the manifest stays; another machine makes them with the same bytes."""
+def test_a_store_cleared_by_one_machine_is_remade_by_another(machine: Machine) -> None:
+    """Clearing removes the files from the bucket and keeps the manifest; the files are made with the same bytes."""
     first = machine(FIRST)
     small = small_survey(first)
     before = (small.mosaic.path / "data.bin").read_bytes()
@@ -257,7 +257,7 @@ def test_what_one_machine_cleared_another_makes_again(machine: Machine) -> None:
 
 
 def test_a_run_of_a_bucket_is_a_recording(bucket: str, machine: Machine) -> None:
-    """The newest run, the run named and a store give the cubes that the first machine wrote; others are refused."""
+    """The newest run, a named run and a store give the cubes that the first machine wrote; others are refused."""
     archive, source = machine(FIRST), simulated()
     ref, _ = archive.produce("capture", partial(write_raw, source=source, sweep=FULL), version=1, params={})
     with archive.new_run("field") as draft:

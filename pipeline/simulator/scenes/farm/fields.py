@@ -91,7 +91,7 @@ def _content(
         return _meadow(rows, field, here, land.days, work.plan.day)
     soil = moist_soil(work.plan, here, field.wetter)
     if land.phase == "soil" or (crop is None and land.phase == "crop"):
-        return _bare_field(rows, field, here, soil)
+        return _bare_field(rows, field, soil)
     if crop is None or land.phase == "stubble":
         return _stubble_field(rows, field, here, soil, land.days)
     return _standing_crop(work, field, crop, (rows, here, soil), (row_gaps(salt, field, rows, here), down))
@@ -166,7 +166,7 @@ def _meadow(rows: Rows, field: FieldPlan, here: Ground, days: float, day: int) -
     return Content(blend(grass(here, dryness), grass(here, dryness + 0.16), bands), {"grass": np.ones_like(bands)})
 
 
-def _bare_field(rows: Rows, field: FieldPlan, here: Ground, soil: Mixture) -> Content:
+def _bare_field(rows: Rows, field: FieldPlan, soil: Mixture) -> Content:
     furrow = stripes(rows.place, field.row_period_px if field.crop is None else 10.5, 3.0)
     content = Content(blend(soil, {"shade": np.ones_like(furrow)}, 0.15 * furrow), {"soil": np.ones_like(furrow)})
     return _with_wheel_marks(content, field, rows, soil) if field.crop is None else content

@@ -1,4 +1,4 @@
-"""Bytes of a capture's files come out as the lines that went in, and references as exact means, whatever is missing."""
+"""Files of a capture become the lines that were written, with missing lines counted; references are exact means."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ HEADER = (
 
 
 def numbers(lines: int, first: int = 0) -> NDArray[np.uint16]:
-    """Lines (line, sample, band) of which each number is another."""
+    """Return lines (line, sample, band) of distinct numbers."""
     return (np.arange(lines * 15) + first * 15).reshape(lines, 5, 3).astype(np.uint16)
 
 
 def bil(values: NDArray[np.uint16]) -> bytes:
-    """Their bytes, band after band within each line."""
+    """Return their bytes, interleaved by line (BIL)."""
     return values.transpose(0, 2, 1).astype("<u2").tobytes()
 
 
 def folder(**files: bytes) -> tuple[list[str], Callable[[str], bytes]]:
-    """Names and a reader of files, whose names have _ for dots and a folder before them."""
+    """Return names and a reader of files; "__" in a name becomes a dot, and a folder is prefixed."""
     content = {f"/c/{name.replace('__', '.')}": data for name, data in files.items()}
     return list(content), content.__getitem__
 
 
 def header(lines: int) -> bytes:
-    """A header as the camera writes it, in bytes."""
+    """Return a header as the camera writes it, in bytes."""
     return HEADER.format(lines=lines).encode()
 
 
-def test_header_by_hand() -> None:
-    """Sizes, byte order and offset are read; band after band stands within a line."""
+def test_header_of_a_cube_is_parsed() -> None:
+    """Sizes, byte order and offset are read, and bands are interleaved by line."""
     found = parse_cube_header(HEADER.format(lines=1).replace("\n", "\r\n"), "raw_0.hdr")
     assert (found.samples, found.lines, found.bands, found.offset, found.line_bytes) == (5, 1, 3, 0, 30)
     values = cube_lines(found, bytes(range(30))).values
@@ -54,8 +54,8 @@ def test_header_by_hand() -> None:
     assert values[0, 0, 1] == 0x0B0A
 
 
-def test_big_endian_with_an_offset() -> None:
-    """Byte order and header offset are followed."""
+def test_big_endian_cubes_with_an_offset_are_read() -> None:
+    """The reader applies the header's byte order and offset."""
     text = HEADER.format(lines=2).replace("byte order = 0", "byte order = 1").replace("offset = 0", "offset = 7")
     data = b"7 bytes" + numbers(2).transpose(0, 2, 1).astype(">u2").tobytes()
     np.testing.assert_array_equal(cube_lines(parse_cube_header(text, "h"), data).values, numbers(2))
@@ -71,14 +71,14 @@ def test_big_endian_with_an_offset() -> None:
         ("\n}\n", "\n", "never closed; .* fetch it again"),
     ],
 )
-def test_headers_that_cameras_do_not_write(old: str, new: str, words: str) -> None:
-    """Anything else than 16-bit lines is refused with what stands there."""
+def test_headers_of_other_formats_are_refused(old: str, new: str, words: str) -> None:
+    """Any format other than 16-bit BIL is refused with the offending text."""
     with pytest.raises(RigError, match=words):
         parse_cube_header(HEADER.format(lines=1).replace(old, new), "raw_0.hdr")
 
 
-def test_times_by_the_index() -> None:
-    """Frames and stamps of the index, of which one is listed twice and one is missing."""
+def test_times_come_from_the_frame_index() -> None:
+    """A frame that is listed twice counts once, and a missing one has the time -1."""
     names, read = folder(
         raw_4=bil(numbers(4)),
         raw_4__hdr=header(4),
@@ -93,8 +93,8 @@ def test_times_by_the_index() -> None:
     assert "frameIndex_4.txt: 1 frames are listed twice, the first counts" in found.notes
 
 
-def test_lines_that_are_cut_off() -> None:
-    """A cube that ends within a line: the whole ones, the number of the others, and a note."""
+def test_a_truncated_cube_gives_its_whole_lines() -> None:
+    """A cube that ends within a line returns the whole lines, the number of lost ones, and a note."""
     names, read = folder(raw_0=bil(numbers(4))[:-40], raw_0__hdr=header(4))
     found = read_capture(names, read)
     np.testing.assert_array_equal(found.values, numbers(2))
@@ -112,14 +112,14 @@ def test_lines_that_are_cut_off() -> None:
         ({"raw_0": bil(numbers(2)), "raw_0__hdr": header(1)}, "60 bytes, its header says 30"),
     ],
 )
-def test_captures_that_are_none(files: dict[str, bytes], words: str) -> None:
-    """What cannot be read is refused with what is wrong."""
+def test_incomplete_captures_are_refused(files: dict[str, bytes], words: str) -> None:
+    """The message names the missing or contradicting file."""
     with pytest.raises(RigError, match=words):
         read_capture(*folder(**files))
 
 
-def test_references_of_a_folder() -> None:
-    """Dark and white cubes are found by how their names begin; two of a kind are refused."""
+def test_references_are_found_in_a_folder() -> None:
+    """Dark and white cubes are recognised by the beginning of their names. Two of a kind are refused."""
     names, read = folder(darkReference=bil(numbers(2)), darkReference__hdr=header(2))
     assert list(read_references(names, read)) == ["dark"]
     np.testing.assert_array_equal(read_references(names, read)["dark"].values, numbers(2))
@@ -129,20 +129,20 @@ def test_references_of_a_folder() -> None:
 
 
 def frames(level: float, count: int = 40, shape: tuple[int, int] = (40, 10)) -> np.ndarray:
-    """Noisy frames (frame, sample, band) around a level."""
+    """Return noisy frames (frame, sample, band) around a level."""
     rng = np.random.default_rng(3)
     return np.clip(np.rint(rng.normal(level, 4, (count, *shape))), 0, 4095).astype(np.uint16)
 
 
-def test_the_mean_is_exact() -> None:
-    """It is that of float64 over all frames, in any order."""
+def test_mean_frame_is_exact() -> None:
+    """The mean equals that of float64 over all frames, in any order of frames."""
     taken = frames(200, 200)
     np.testing.assert_array_equal(mean_frame(taken).mean, taken.mean(axis=0).astype(np.float32))
     np.testing.assert_array_equal(mean_frame(taken[::-1]).mean, mean_frame(taken).mean)
 
 
-def test_stuck_and_dead_elements_are_told() -> None:
-    """One that never changes and one that hardly responds are bad."""
+def test_stuck_and_dead_pixels_are_found() -> None:
+    """An element that never changes and one that hardly responds are marked as bad."""
     dark, white = frames(64), frames(3000)
     dark[:, 3, 4] = 70
     white[:, 20, 5] = 66
@@ -152,8 +152,8 @@ def test_stuck_and_dead_elements_are_told() -> None:
     assert references.white_reference.tolist() == [0.5] * 10
 
 
-def test_references_that_do_not_fit() -> None:
-    """Swapped frames and two sizes are refused; one frame shows no stuck elements."""
+def test_references_that_do_not_fit_are_refused() -> None:
+    """Swapped frames and two sizes are refused. A single frame shows no stuck elements."""
     dark, white = mean_frame(frames(64)), mean_frame(frames(3000))
     with pytest.raises(RigError, match="are they swapped, or was the lamp off"):
         as_references(white, dark)
@@ -165,7 +165,7 @@ def test_references_that_do_not_fit() -> None:
     assert not one.stuck.any()
 
 
-def test_few_frames_show_no_stuck_element() -> None:
+def test_stuck_elements_need_eight_frames() -> None:
     """An element may have the same number in seven frames by chance, but not in eight."""
     dark = frames(64, 8)
     dark[:, 3, 4] = 70

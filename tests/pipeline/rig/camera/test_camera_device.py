@@ -1,4 +1,4 @@
-"""The emulated camera speaks the documented bytes, and its frames pass with time."""
+"""The emulated camera speaks the documented bytes, and its frames advance with the clock."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ TOO_LONG = b'configure({"exposure": 6, "framePeriod": 5})'
         (b"", b"\r", None),
     ],
 )
-def test_bytes_of_every_command(sent: bytes, end: bytes, reply: bytes | None) -> None:
-    """Each command gives its bytes after its own echo, in one piece or byte by byte."""
+def test_every_command_gets_its_documented_bytes(sent: bytes, end: bytes, reply: bytes | None) -> None:
+    """The reply follows an echo of the command, whether it is sent in one piece or byte by byte."""
     for size in (1, len(sent + end)):
         talk, came = CameraConnection(CameraDevice(LinesOf(), ManualClock())), b""
         for at in range(0, len(sent + end), size):
@@ -45,8 +45,8 @@ def test_bytes_of_every_command(sent: bytes, end: bytes, reply: bytes | None) ->
         assert talk.feed(b"exit\r") == ([], False)
 
 
-def test_frames_pass_with_time() -> None:
-    """A capture runs for its frames' time; what is over by then is in the files."""
+def test_frames_advance_with_the_clock() -> None:
+    """A capture lasts as long as its frames. Frames that are over by then are in the files."""
     clock = ManualClock()
     device = CameraDevice(LinesOf(), clock)
     line = lambda: InProcessCameraLine(device, clock, "emulated:8100")  # noqa: E731

@@ -1,7 +1,7 @@
-"""Every fault of the emulated camera, and some of the mirror's, with many seeds, against whole sweeps through a rig.
+"""Test whole sweeps through a rig under every fault of the emulated camera and some of the mirror, with many seeds.
 
-Each session takes a small sweep through drivers of both devices on a clock that waiting moves. What was given is right,
-no acknowledged line is captured twice, and a later process with the same files ends the sweep.
+Each session captures a small sweep with drivers of both devices and a manual clock. Returned lines are right, no
+acknowledged line is captured twice, and a later process with the same files completes the sweep.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from tests.pipeline.rig.small_rig import SmallRig, assert_simulated, small_rig
 
 SEEDS = range(8)
 SWEEP = Sweep("fine-5", "fine", "x", 1.5, -4.5, 7)
-PAIRS = 5  # of the vector memory, with its lead-in: four lines a capture
-COMMANDS, TRANSFERS = 12, 8  # occasions of an undisturbed sweep, a few less
+PAIRS = 5  # of the vector memory, with its lead-in: four lines per capture
+COMMANDS, TRANSFERS = 12, 8  # occasions of an undisturbed sweep, slightly fewer than there are
 PATIENCE = ControlPatience()
-# a request that is asked again: each time a connection, its prompt, the reply
+# duration of a request with all retries: each opens a connection, reads its prompt and waits for the reply
 MOST_ASKED_S = (PATIENCE.retries + 1) * 2 * PATIENCE.deadline_s + PATIENCE.retries * PATIENCE.pause_s
-MOST_CAPTURED_S = 4 * MOST_ASKED_S  # what is there before, the capture, and what it did where its reply is lost
-MOST_TAKEN_S = 300.0  # a sweep, whatever is asked again
+MOST_CAPTURED_S = 4 * MOST_ASKED_S  # four requests: the check before, the capture, and its effect if the reply is lost
+MOST_TAKEN_S = 300.0  # a sweep with all retries
 HARMLESS = (CameraFault.SLOW, CameraFault.SPLIT)
 OF_FILES = (CameraFault.BREAKS_OFF, CameraFault.REFUSES_FILES)
 OF_MIRROR = (
@@ -47,7 +47,7 @@ PLACES = re.compile(r"emulat|127\.0\.0\.1|/captured/|camera")
 
 @pytest.fixture(scope="module")
 def undisturbed() -> list[Line]:
-    """The sweep's lines as an undisturbed rig gives them, which are the simulated source's."""
+    """Return the sweep's lines from an undisturbed rig, which equal those of the simulated source."""
     with small_rig(vector_pairs=PAIRS) as rig:
         lines = list(rig.source().lines(SWEEP))
     assert_simulated(lines, SWEEP)
@@ -56,7 +56,7 @@ def undisturbed() -> list[Line]:
 
 @dataclass
 class Polls:
-    """Sweeps through one emulated rig, each with its fault; what was sent and waited for is noted."""
+    """Sweeps through one emulated rig, each with its fault, with a record of requests, durations and errors."""
 
     rig: SmallRig
     asked_s: list[float] = field(default_factory=list)
@@ -78,7 +78,7 @@ class Polls:
         self.rig.devices = devices  # type: ignore[method-assign]
 
     def timed(self, call: Callable[..., Any], noted: list[float]) -> Callable[..., Any]:
-        """The same call, with the time that it took noted."""
+        """Return the call with a record of its duration."""
 
         def timing(*given: Any, **named: Any) -> Any:
             began = self.rig.line.clock.now()
@@ -90,20 +90,20 @@ class Polls:
         return timing
 
     def strike(self, camera: CameraFaults, mirror: tuple[Fault, ...] = ()) -> None:
-        """Have faults from now on."""
+        """Set the faults from now on."""
         self.rig.emulated.camera.faults, self.rig.emulated.mirror.faults = camera, mirror
 
     def mend(self) -> None:
-        """Take all faults away, and the mirror off and on again."""
+        """Remove all faults and restart the mirror."""
         self.strike(CameraFaults())
-        self.rig.emulated.camera.files()  # looks at what is over: a mirror that restarts forgets where it was
+        self.rig.emulated.camera.files()  # computes finished frames, because a restarted mirror forgets its positions
         mirror = self.rig.emulated.mirror
         mirror.gone = mirror.hung = False
         mirror.state.flags = Status(0)
         mirror.restart()
 
     def go_on(self, kept: KeptInMemory, lines: list[Line]) -> None:
-        """Take what is still missing as another process would; the error that ends it is noted."""
+        """Capture the missing lines as another process would, and record the error that ends it."""
         try:
             for line in self.rig.source(kept).lines(SWEEP, first=len(lines)):
                 lines.append(line)
@@ -113,13 +113,13 @@ class Polls:
 
 @pytest.fixture(scope="module")
 def scan_passes() -> Iterator[Polls]:
-    """One rig for all sessions of this file."""
+    """Yield one rig for all sessions of this file."""
     with small_rig(vector_pairs=PAIRS) as rig:
         yield Polls(rig)
 
 
 def assert_right(lines: list[Line], undisturbed: list[Line]) -> None:
-    """Lines from the first on, each as an undisturbed rig gives it."""
+    """Assert that lines from the first one on equal those of an undisturbed rig."""
     for number, (line, expected) in enumerate(zip(lines, undisturbed, strict=False)):
         assert line.number == number
         np.testing.assert_array_equal(line.data, expected.data)
@@ -127,12 +127,12 @@ def assert_right(lines: list[Line], undisturbed: list[Line]) -> None:
 
 
 def session(scan_passes: Polls, undisturbed: list[Line], camera: CameraFaults, mirror: tuple[Fault, ...] = ()) -> None:
-    """A sweep with a fault, then the rest of it without: every line once, and right."""
+    """Capture a sweep with a fault and its rest without: every line is captured once and right."""
     kept, lines = KeptInMemory(), list[Line]()
     for noted in (scan_passes.asked_s, scan_passes.captured_s, scan_passes.errors):
         noted.clear()
     began_s, captures = scan_passes.rig.line.clock.now(), scan_passes.rig.emulated.camera.captures
-    captures.clear()  # of the session before
+    captures.clear()  # of the previous session
     scan_passes.strike(camera, mirror)
     scan_passes.go_on(kept, lines)
     assert scan_passes.rig.line.clock.now() - began_s <= MOST_TAKEN_S
@@ -146,7 +146,7 @@ def session(scan_passes: Polls, undisturbed: list[Line], camera: CameraFaults, m
         assert "\n" not in words
         assert "Traceback" not in words
         assert 20 < len(words) < 900, words
-    motions = [data for data in scan_passes.sent if moves(data)]  # there and along the path, in turn
+    motions = [data for data in scan_passes.sent if moves(data)]  # alternating: to the start, along the path
     assert all(one != other for one, other in pairwise(motions)), "a motion was sent twice"
     broke = len(scan_passes.errors)
     scan_passes.mend()
@@ -163,7 +163,7 @@ def session(scan_passes: Polls, undisturbed: list[Line], camera: CameraFaults, m
 
 @pytest.mark.parametrize("fault", CameraFault, ids=lambda fault: fault.name)
 def test_no_camera_fault_loses_lines_or_hangs(fault: CameraFault, scan_passes: Polls, undisturbed: list[Line]) -> None:
-    """Eight sweeps with each: struck once at some occasion, or so often that asking again does not help."""
+    """Eight sweeps per fault: it strikes once at a random occasion, or so often that retries do not help."""
     ended, struck = 0, 0
     for seed in SEEDS:
         rng = np.random.default_rng(seed)
@@ -184,11 +184,11 @@ def test_no_camera_fault_loses_lines_or_hangs(fault: CameraFault, scan_passes: P
 
 
 @pytest.mark.parametrize("name", OF_MIRROR)
-def test_no_fault_of_the_mirror_spoils_a_sweep(name: str, scan_passes: Polls, undisturbed: list[Line]) -> None:
-    """Eight sweeps with each: lines are right or not given, and the sweep is ended once the mirror is mended."""
+def test_no_mirror_fault_spoils_a_sweep(name: str, scan_passes: Polls, undisturbed: list[Line]) -> None:
+    """Eight sweeps per fault: returned lines are right, and the sweep is completed after the mirror's repair."""
     ended = 0
     for seed in SEEDS:
-        at = 4 * seed + 2 if name == "no-reply" else None  # most requests are reads, which are asked again
+        at = 4 * seed + 2 if name == "no-reply" else None  # most requests are reads, which are retried
         session(scan_passes, undisturbed, CameraFaults(), (make_fault(name, seed, at),))
         ended += bool(scan_passes.errors)
     assert ended > 0 or name in ("split-replies", "reply-bit-flipped")

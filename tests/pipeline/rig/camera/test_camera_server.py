@@ -1,4 +1,4 @@
-"""The emulated camera on the network and its driver: what was seen comes back bit for bit, and faults are told."""
+"""The emulated camera on the network and its driver: lines arrive bit for bit, and faults are reported."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.pipeline.rig.in_process import ManualClock
 
 
 def remote_files(device: CameraDevice, folder: str) -> list[RemoteFile]:
-    """A device's files in a folder, as a listing has them."""
+    """Return a device's files in a folder, as a listing has them."""
     files = sorted(device.files().items())
     return [RemoteFile(name, len(data), False) for name, data in files if name.startswith(folder + "/")]
 
@@ -32,7 +32,7 @@ def remote_files(device: CameraDevice, folder: str) -> list[RemoteFile]:
 def camera(
     faults: dict[CameraFault, int] | None = None, **server: object
 ) -> Iterator[tuple[HeadwallCamera, CameraDevice, LinesOf]]:
-    """A served camera, its driver by the same clock, and what it sees."""
+    """Yield the driver of a served camera, the camera with the same clock, and the lines that it sees."""
     clock, lines = ManualClock(100.0), LinesOf()
     device = FaultyCamera(lines, clock, faults=CameraFaults(dict(faults or {})))
     with FaultyServer(device) as served:
@@ -42,15 +42,15 @@ def camera(
         driver.close()
 
 
-def test_whoever_never_ends_a_command_is_hung_up_on() -> None:
-    """Up to the longest command is waited for its end, and no byte more is kept."""
+def test_an_endless_command_closes_the_connection() -> None:
+    """The camera keeps at most the bytes of the longest command and closes the connection at the next byte."""
     talk = CameraConnection(CameraDevice(LinesOf(), ManualClock()))
     assert talk.feed(b"x" * MOST_LINE) == ([], True)
     assert talk.feed(b"x") == ([], False)
 
 
-def test_whole_loop() -> None:
-    """Configure, capture, poll, fetch, lines and references: what the camera saw, with its own frames' times."""
+def test_capture_and_fetch_return_the_cameras_lines() -> None:
+    """Configure, capture, poll and fetch give the camera's lines, its frame times and the mean of its references."""
     dark = np.random.default_rng(1).integers(60, 70, (20, 6, 4)).astype(np.uint16)
     with camera() as (driver, device, lines):
         driver.configure(8.0, 10.0)
@@ -70,8 +70,8 @@ def test_whole_loop() -> None:
         np.testing.assert_array_equal(means["dark"].mean, dark.mean(axis=0).astype(np.float32))
 
 
-def test_transfer_that_breaks_off_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Broken off again and again it is taken up where it ended: no byte lost, none twice."""
+def test_an_interrupted_transfer_resumes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Several interruptions lose no byte and repeat none."""
     monkeypatch.setattr(camera_files, "OVERLAP", 16)
     faults = {CameraFault.BREAKS_OFF: 4, CameraFault.REFUSES_FILES: 2}
     with camera(faults, tries=3) as (driver, device, lines):
@@ -83,8 +83,8 @@ def test_transfer_that_breaks_off_goes_on(monkeypatch: pytest.MonkeyPatch) -> No
         assert not any(device.faults.left.values())
 
 
-def test_another_file_of_the_same_name() -> None:
-    """What is held of another file is never mixed with this one's bytes."""
+def test_a_different_file_of_the_same_name_is_refused() -> None:
+    """Bytes of another file are kept as they are and never mixed with new ones. A file that has grown is refused."""
     with camera() as (driver, device, _):
         driver.capture(10)
         wait_for(driver, 5.0)
@@ -106,7 +106,7 @@ def test_another_file_of_the_same_name() -> None:
     ],
 )
 def test_transfer_of_other_length(more: int, kind: type[RigError], words: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A file that is longer, or shorter, than the server said is not taken for whole."""
+    """A file that is longer or shorter than the server's size is not accepted as complete."""
     with camera(tries=2) as (driver, device, _):
         driver.capture(10)
         wait_for(driver, 5.0)
@@ -118,8 +118,8 @@ def test_transfer_of_other_length(more: int, kind: type[RigError], words: str, m
         assert type(caught.value) is kind
 
 
-def test_a_server_that_falls_silent() -> None:
-    """It costs the timeout; what is no FTP is named as such."""
+def test_a_silent_server_is_reported() -> None:
+    """A silent server costs the timeout. A port that speaks no FTP is named as such."""
     with socket.create_server(("127.0.0.1", 0)) as silent:
         server = FileServer("127.0.0.1", silent.getsockname()[1], stall_s=0.1, tries=1)
         with pytest.raises(DeviceGone, match=r"fell silent .*timed out"):
@@ -130,8 +130,8 @@ def test_a_server_that_falls_silent() -> None:
             log_in(server)
 
 
-def test_files_that_are_refused() -> None:
-    """A wrong password, a missing file and nobody there are told apart, each once."""
+def test_refused_files_are_reported() -> None:
+    """A wrong password, a missing file and an absent server have different messages."""
     with camera() as (driver, device, _):
         driver.capture(2)
         wait_for(driver, 5.0)
@@ -147,8 +147,8 @@ def test_files_that_are_refused() -> None:
         fetch_files(away, [index], KeptInMemory())
 
 
-def test_fetch_while_it_captures() -> None:
-    """Files that may still grow are not fetched; nobody there, and a port that cannot be, are told before anything."""
+def test_files_of_a_running_capture_are_not_fetched() -> None:
+    """The error says that the capture still runs. An address without a camera is reported on connecting."""
     with camera() as (driver, _, _):
         folder = driver.capture(1000).folder
         with pytest.raises(RigError, match="a capture still runs"):
@@ -159,8 +159,8 @@ def test_fetch_while_it_captures() -> None:
         SocketTransport("127.0.0.1", 1)
 
 
-def test_server_closes_cleanly() -> None:
-    """Threads end."""
+def test_camera_server_closes_its_threads() -> None:
+    """The number of threads is the same after the server's end, even with a client that connected."""
     before = threading.active_count()
     with CameraServer(CameraDevice(LinesOf(), ManualClock())) as served:
         line = SocketTransport(served.host, served.port)

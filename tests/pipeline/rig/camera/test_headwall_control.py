@@ -1,4 +1,4 @@
-"""The control client sends the documented bytes once or again as it may, and says what it found."""
+"""The control client sends the documented bytes, retries what is safe to retry, and reports what it finds."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ IS_CAPTURING = b"isCapturing\r"
 
 
 def said(command: bytes, response: bytes) -> bytes:
-    """A reply as the camera writes it."""
+    """Return a reply as the camera writes it."""
     return command + b'\n{"success": true, "response": ' + response + b', "errorMessage": ""}\r\nhpi> '
 
 
 def refused(command: bytes, why: bytes) -> bytes:
-    """A refusal."""
+    """Return a refusal as the camera writes it."""
     return command + b'\n{"success": false, "response": null, "errorMessage": "' + why + b'"}\r\nhpi> '
 
 
 @contextmanager
 def talk(*connections: Sequence[Pair], retries: int = 2, hello: bytes = HELLO) -> Iterator[HeadwallCamera]:
-    """A client whose connections follow these scripts, all of which must be used up."""
+    """Yield a client whose connections follow these scripts; all of them must be used up."""
     clock = ManualClock()
     scripts = [ScriptedTransport(pairs, clock, hello) for pairs in connections]
     waiting = iter(scripts)
@@ -42,8 +42,8 @@ def talk(*connections: Sequence[Pair], retries: int = 2, hello: bytes = HELLO) -
 
 
 @pytest.mark.parametrize("echo", [True, False])
-def test_every_command(echo: bool) -> None:
-    """Each command and its reply, with the command repeated or not."""
+def test_every_command_is_sent_and_its_reply_read(echo: bool) -> None:
+    """Replies are read with or without an echo of the command."""
 
     def answer(command: bytes, response: bytes) -> Pair:
         return command, said(command if echo else b"", response)
@@ -71,7 +71,7 @@ def test_every_command(echo: bool) -> None:
         control.close()
 
 
-def test_greeting_in_pieces() -> None:
+def test_replies_in_pieces_are_assembled() -> None:
     """Greeting, prompt and reply may be cut anywhere, also within the prompt."""
     whole = said(IS_CAPTURING, b"false")
     pieces: list[Reply] = [whole[at : at + 1] for at in range(len(whole))]
@@ -79,8 +79,8 @@ def test_greeting_in_pieces() -> None:
         assert not control.is_capturing()
 
 
-def test_late_reply_is_never_the_next_ones() -> None:
-    """After a reply that did not come in time the connection is a new one."""
+def test_a_late_reply_is_not_taken_for_the_next_one() -> None:
+    """A reply after the deadline leads to a new connection, 5.5 s after the request."""
     with talk([(b"isCapturing\r", b"")], [(b"isCapturing\r", said(IS_CAPTURING, b"true"))]) as control:
         assert control.is_capturing()
         assert control.clock.now() == pytest.approx(5.5)
@@ -97,15 +97,15 @@ def test_late_reply_is_never_the_next_ones() -> None:
         (None, b"SSH-2.0\r\n", "no reply 'hpi> ' to the greeting .*; is it the camera's control port"),
     ],
 )
-def test_what_is_no_reply_in_the_end(reply: bytes | None, hello: bytes, words: str) -> None:
-    """It is told as it came, or the deadline with what came; somebody who sends no prompt is not the camera."""
+def test_invalid_replies_are_reported(reply: bytes | None, hello: bytes, words: str) -> None:
+    """The message quotes the reply, or names the deadline and what came. A peer without a prompt is no camera."""
     pairs: list[Pair] = [] if reply is None else [(IS_CAPTURING, reply)]
     with talk(pairs, retries=0, hello=hello) as control, pytest.raises(RigError, match=words):
         control.is_capturing()
 
 
-def test_refusals() -> None:
-    """A capture that is refused did not begin: told once, nothing frozen or sent again; to stop none is no failure."""
+def test_a_refused_capture_did_not_begin() -> None:
+    """The refusal is reported once, and the capture is not retried. Stopping without a capture is no failure."""
     stop = (b"stopCapture\r", refused(b"stopCapture\r", b"oh"))
     with talk([(CAPTURE, refused(CAPTURE, b"disk full")), stop]) as control:
         with pytest.raises(DeviceRefused, match="refused capture: 'disk full'; see its manual"):
@@ -114,8 +114,8 @@ def test_refusals() -> None:
         control.stop()
 
 
-def test_capture_without_a_reply() -> None:
-    """It is sent once; captures and settings are refused then, and stopping still works."""
+def test_a_capture_without_a_reply_is_sent_once() -> None:
+    """Further captures and settings are refused afterwards, but stopping still works."""
     with talk([(CAPTURE, b"")], [(b"stopCapture\r", said(b"stopCapture\r", b"true"))]) as control:
         with pytest.raises(StateUnknown, match=r"capture \(prefix 'f1'\) was sent and its reply is lost: no reply"):
             control.capture(500, prefix="f1")
@@ -125,8 +125,8 @@ def test_capture_without_a_reply() -> None:
         control.stop()
 
 
-def test_capture_that_is_interrupted() -> None:
-    """Ctrl-C while the reply is awaited leaves captures frozen, since one may run."""
+def test_an_interrupted_capture_blocks_further_captures() -> None:
+    """Ctrl-C before the reply leaves the state unknown, because a capture may run."""
     with talk([(CAPTURE, b"")]) as control:
         sleep = control.clock.sleep
 
@@ -143,7 +143,7 @@ def test_capture_that_is_interrupted() -> None:
 
 
 def test_stale_bytes_are_dropped(caplog: pytest.LogCaptureFixture) -> None:
-    """What lies on the line before a command is thrown away, not taken for its reply."""
+    """Bytes that arrive before a command are dropped and not taken for its reply."""
     torn = said(IS_CAPTURING, b"false") + said(IS_CAPTURING, b"true")[:20]
     with talk([(IS_CAPTURING, torn), (IS_CAPTURING, said(IS_CAPTURING, b"false"))]) as control:
         assert not control.is_capturing()
@@ -161,8 +161,8 @@ def test_stale_bytes_are_dropped(caplog: pytest.LogCaptureFixture) -> None:
         (100_000, 100_000, "frame period 100000 ms"),
     ],
 )
-def test_times_that_cannot_be_meant(exposure: float, period: float, words: str) -> None:
-    """Seconds for milliseconds and exposures that do not fit are refused."""
+def test_implausible_exposure_times_are_refused(exposure: float, period: float, words: str) -> None:
+    """Seconds instead of milliseconds, and exposures above the frame period, are refused."""
     with pytest.raises(SettingsError, match=words):
         check_times(exposure, period, 350.0)
 
@@ -177,14 +177,14 @@ def test_times_that_cannot_be_meant(exposure: float, period: float, words: str) 
         b'\xff\xfd\x18\r\n{"success": true, "response": 1}\0\r\nhpi> ',
     ],
 )
-def test_forms_of_a_reply(data: bytes) -> None:
-    """With and without its command, on one line or several, with a telnet server's bytes."""
+def test_every_form_of_a_reply_is_parsed(data: bytes) -> None:
+    """Replies come with or without the command, on one line or several, and with bytes of a telnet server."""
     (reply,) = ReplyReader().feed(data)
     assert response_of(reply, "it", "here") == 1
 
 
-def test_other_text_before_a_prompt() -> None:
-    """A greeting, torn JSON, a prompt within a text, and two replies in pieces of any size."""
+def test_other_text_before_a_prompt_is_separated() -> None:
+    """The reader splits off a greeting, torn JSON and a prompt within a text, and two replies in pieces of any size."""
     assert ReplyReader().feed(b'Welcome\r\nhpi> {"success": tr\r\nhpi> ') == ["Welcome", '{"success": tr']
     (one,) = ReplyReader().feed(b'{"success": false, "errorMessage": "type after hpi> only"}\r\nhpi> ')
     assert one == '{"success": false, "errorMessage": "type after hpi> only"}'
@@ -196,8 +196,8 @@ def test_other_text_before_a_prompt() -> None:
         assert reader.held == b""
 
 
-def test_no_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Bytes without a prompt are refused before they fill the memory."""
+def test_bytes_without_a_prompt_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The reader raises an error before such bytes fill the memory."""
     monkeypatch.setattr(headwall_camera, "LONGEST_REPLY", 100)
     with pytest.raises(RigError, match=r"bytes came without a prompt .* is this the camera's control port"):
         ReplyReader().feed(b"x" * 101)

@@ -1,4 +1,4 @@
-"""What is taken down of captures: the latest one that has a line counts, and nothing is told twice."""
+"""The journal of captures: the latest capture with a line counts, also for another process, and damage is reported."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ OTHER = replace(ONE, folder="/captured/b", first=3, stop=9)
 
 
 def folders(journal: CaptureJournal) -> list[str]:
-    """Which capture has each line of the sweep; empty where none has."""
+    """Return the capture of each line of the sweep, or an empty text."""
     held = [journal.holding(FINE, line) for line in range(10)]
     return [taken.folder[-1:] if taken else "" for taken in held]
 
 
 def test_latest_capture_of_a_line_counts() -> None:
-    """Of two that have a line the later one is read, and the earlier one once that is spent; so by another process."""
+    """If the later capture of a line is spent, the earlier one counts. Another process reads the same."""
     kept = KeptInMemory()
     journal = CaptureJournal(kept)
     journal.record_capture(ONE)
@@ -35,8 +35,8 @@ def test_latest_capture_of_a_line_counts() -> None:
     assert journal.holding(COARSE, 0) is None
 
 
-def test_folder_whose_name_comes_again_is_the_latest() -> None:
-    """A camera that was emptied counts its folders anew: the new capture counts, is not spent, and is tied anew."""
+def test_a_reused_folder_name_counts_as_the_latest_capture() -> None:
+    """An emptied camera numbers its folders anew: the new capture counts, is not spent, and gets its own positions."""
     kept = KeptInMemory()
     journal, again = CaptureJournal(kept), replace(ONE, run_s=(7.0, 7.1))
     journal.record_capture(ONE)
@@ -53,12 +53,12 @@ def test_folder_whose_name_comes_again_is_the_latest() -> None:
 
 
 def tied(residual_px: float) -> LinePositions:
-    """How lines were tied, with a residual that tells one from another."""
+    """Return line positions with a residual that identifies them."""
     return LinePositions(np.zeros((0, 2)), np.zeros(0, np.bool_), "log", residual_px)
 
 
-def test_a_log_comes_back() -> None:
-    """Positions that the mirror measured, bit for bit, by another process."""
+def test_the_mirror_log_is_restored_from_the_journal() -> None:
+    """Another process reads the measured positions bit for bit."""
     kept, position = KeptInMemory(), np.array([(0.1, -0.2), (0.3, 0.4)], np.float32)
     journal = CaptureJournal(kept)
     journal.record_capture(ONE)
@@ -68,15 +68,15 @@ def test_a_log_comes_back() -> None:
     assert (found.log.rate_hz, found.log.started_s, found.log.start_error_s) == (1000.0, 0.06, 0.04)
 
 
-def test_flipped_bit_of_the_journal_changes_no_capture():
-    """Whichever it is: each capture is held as it was or not at all, one is lost at most, and the journal says so."""
+def test_a_flipped_bit_of_the_journal_changes_no_capture():
+    """A capture stays unchanged or is lost; at most one is lost, and the journal reports the damage."""
     found = flip_journal(150, seed=3)
     assert found.wrong == []
-    assert found.told >= found.flips - 1  # the end of the last line is no part of it
+    assert found.told >= found.flips - 1  # the newline at the end is no part of a record
 
 
-def test_a_torn_journal_is_read():
-    """Behind a torn record the next is whole; line 0 keeps its stamp."""
+def test_records_after_a_torn_one_are_read():
+    """The record after a torn one is whole, and line 0 keeps its time stamp until it is captured again."""
     kept = KeptInMemory()
     CaptureJournal(kept).record_capture(ONE)
     kept.append(JOURNAL, b'{"what": "spent", "fol')

@@ -1,4 +1,4 @@
-"""What captures are called, and their frames as lines: none that was dropped, or is contradicted, counts."""
+"""Names of captures, and lines of their frames: dropped frames and contradicted captures do not count."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from pipeline.rig.mirror_controller import MotionLog
 from tests.pipeline.rig.small_rig import CAMERA, COARSE, FINE
 
 
-def test_prefix_of_a_sweep_is_readable() -> None:
-    """Short numbers stand there as they are."""
+def test_the_prefix_of_a_sweep_is_readable() -> None:
+    """Short numbers appear unchanged, with p for the decimal point."""
     sweep = Sweep("coarse-0", "coarse", "y", -31.5, 0.5, 96, 16, 16)
     assert capture_paths.capture_prefix(sweep) == "coarse-0_cy-31p5_0p5_96x16x16_0"
 
 
-def test_every_sweep_comes_back() -> None:
-    """To the last bit of its numbers, from any line on, and always as a name that cameras take."""
+def test_a_sweep_is_recovered_from_its_prefix() -> None:
+    """The numbers are equal to the last bit, from any first line, and the name is valid for cameras."""
     rng = np.random.default_rng(0)
     for number in range(300):
         odd = rng.normal(size=2) * 10.0 ** rng.integers(-9, 9, 2)
@@ -41,13 +41,13 @@ def test_every_sweep_comes_back() -> None:
     ["", "field", capture_paths.REFERENCES, "a_cx0_0_0x1x1_0", "a_cx0_0_5x1x1_5", "a_cz0_0_5x1x1_0", "a_cx0_0_5x1_0"],
 )
 def test_other_prefixes_announce_nothing(prefix: str) -> None:
-    """Names that others gave, and sweeps that cannot be."""
+    """Prefixes that others chose, and those of impossible sweeps, give no sweep."""
     assert capture_paths.announced(prefix) is None
 
 
 @pytest.mark.parametrize("name", ["a b", "é", "x" * 120])
-def test_names_that_no_folder_has_are_refused(name: str) -> None:
-    """Before anything is sent."""
+def test_names_invalid_for_a_folder_are_refused(name: str) -> None:
+    """The error is raised before anything is sent."""
     with pytest.raises(SettingsError, match="letters, digits"):
         capture_paths.capture_prefix(Sweep(name, "fine", "x", 0.0, 0.0, 5))
 
@@ -57,7 +57,7 @@ TAKEN = capture_paths.CaptureRecord(FINE, 3, 9, "/captured/x", True, (0.0, 0.1),
 
 
 def frames(numbers: list[int], lost: int = 0, first: int = 0) -> CapturedLines:
-    """A capture with these frames, numbers as the index has them, and lines missing at its end."""
+    """Return a capture with these frame numbers of the index and with ``lost`` lines missing at its end."""
     told = np.array(numbers, np.int64)
     times = LineTimes(told, np.where(told >= 0, 10**15 + told * 100_000, -1))
     return CapturedLines(np.zeros((len(told), 48, 3), np.uint16), first, times, lost=lost)
@@ -72,16 +72,16 @@ def frames(numbers: list[int], lost: int = 0, first: int = 0) -> CapturedLines:
     ],
     ids=["frame 2 dropped", "counted from 70", "two lost at the end"],
 )
-def test_rows_belong_to_the_lines_that_they_were_taken_for(seen: CapturedLines, row: list[int]):
-    """By their numbers from the capture's first frame; what a cube promises and does not hold is left out."""
+def test_rows_are_assigned_to_lines_by_frame_number(seen: CapturedLines, row: list[int]):
+    """Numbers count from the capture's first frame. Lines that the cube lacks are left out."""
     located, there = capture_paths.locate_lines(seen, PATH, TAKEN, CAMERA), np.array(row) >= 0
     assert located.row.tolist() == row
     assert [located.is_valid(line) for line in range(len(row))] == there.tolist()
     np.testing.assert_array_equal(located.positions.position, PATH.middle[: len(row)][there].astype(np.float64))
 
 
-def test_whole_capture_without_an_index_is_in_order():
-    """As many rows as lines leave no doubt; fewer do."""
+def test_a_complete_capture_without_an_index_is_in_order():
+    """As many rows as lines are unambiguous; fewer rows are refused."""
     unnumbered = frames([-1] * 6)
     assert capture_paths.locate_lines(unnumbered, PATH, TAKEN, CAMERA).row.tolist() == list(range(6))
     with pytest.raises(capture_paths.UnusableCaptureError, match="fetch frameIndex"):
@@ -91,8 +91,8 @@ def test_whole_capture_without_an_index_is_in_order():
 
 
 @pytest.mark.parametrize(("sweep", "last"), [(FINE, 6), (COARSE, 8)], ids=lambda value: getattr(value, "kind", ""))
-def test_mirror_that_stepped_otherwise_is_not_believed(sweep: Sweep, last: int):
-    """One edge too few or too many, in a coarse line's four cells too: which lines are off is not known."""
+def test_captures_with_a_wrong_number_of_steps_are_refused(sweep: Sweep, last: int):
+    """With one edge too few or too many the wrong lines are unknown, also within the four cells of a coarse line."""
     path = capture_paths.next_path(sweep, 2, CAMERA, vector_pairs=12, triggered=True)
     count = last // sweep.step
     taken = capture_paths.CaptureRecord(
@@ -106,8 +106,8 @@ def test_mirror_that_stepped_otherwise_is_not_believed(sweep: Sweep, last: int):
             capture_paths.locate_lines(seen, path, replace(taken, index_at_end=index), CAMERA)
 
 
-def test_a_log_gives_the_positions():
-    """The log gives the positions, not the times of the commands; lines behind its end are left to another capture."""
+def test_a_mirror_log_gives_the_positions():
+    """Positions come from the log, not from command times. Lines after its end are left to another capture."""
     path = capture_paths.next_path(FINE, 3, CAMERA, vector_pairs=6, triggered=False)
     log = MotionLog(np.zeros((1000, 2), np.float32), 1000.0, started_s=0.06, start_error_s=0.04)
     taken = capture_paths.CaptureRecord(FINE, 3, 9, "/captured/x", False, (5.0, 5.1), (0.1, 0.2), log=log)
@@ -120,9 +120,9 @@ def test_a_log_gives_the_positions():
 
 @pytest.mark.parametrize("last", [11, 5, 0])
 def test_a_log_of_few_samples_does_not_bend_the_path(last: int):
-    """Lines stand where the path held them, as far beside as the log says; a mirror that stood still is believed."""
+    """Lines lie at the held positions plus the log's offset. After the mirror stops, they stay at its last position."""
     path = capture_paths.next_path(FINE, 3, CAMERA, vector_pairs=12, triggered=False)
-    cell = ((np.arange(20) / 14 - 0.2) * path.rate_hz).clip(0, last).astype(int)  # it stands still from there on
+    cell = ((np.arange(20) / 14 - 0.2) * path.rate_hz).clip(0, last).astype(int)  # stands still from cell last on
     log = MotionLog((path.cells[cell] + 1e-4).astype(np.float32), 14.0, started_s=0.05, start_error_s=0.0)
     taken = capture_paths.CaptureRecord(FINE, 3, 15, "/captured/x", False, (0.24, 0.26), (0.25, 0.25), log=log)
     tied = capture_paths.locate_lines(frames(list(range(12))), path, taken, CAMERA).positions
@@ -130,8 +130,8 @@ def test_a_log_of_few_samples_does_not_bend_the_path(last: int):
     np.testing.assert_allclose(tied.position[some], path.middle[some.clip(0, last)] + 1e-4, atol=1e-6)
 
 
-def test_paths_take_whole_lines():
-    """A line's held positions are never parted, and the lead-in cell has its room."""
+def test_paths_contain_whole_lines():
+    """The held positions of a line stay together, and the lead-in cell takes one pair."""
     path = capture_paths.next_path(COARSE, 2, CAMERA, vector_pairs=12, triggered=True)
     assert (path.first, path.stop, path.cells.shape) == (2, 4, (9, 2))
     assert path.cells[0].tolist() == path.cells[1].tolist()

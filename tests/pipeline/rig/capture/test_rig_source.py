@@ -1,4 +1,4 @@
-"""The rig as a source: lines through emulated devices are those of the simulated source, bit for bit."""
+"""The rig as a source: lines from emulated devices equal those of the simulated source, bit for bit."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tests.pipeline.rig.small_rig import (
 
 
 def assert_same(found: list[Line], sweep: Sweep, first: int = 0) -> None:
-    """The simulated source's lines: numbers bit for bit, positions at the wire's precision, times to a microsecond."""
+    """Assert lines of the simulated source: equal bits, positions in the wire's precision, times to a microsecond."""
     assert_simulated(found, sweep, first)
     wired = wire_positions(line_positions(sweep, CAMERA)[first:])
     np.testing.assert_array_equal([(line.mirror_x, line.mirror_y) for line in found], wired.astype(np.float64))
@@ -38,12 +38,12 @@ def assert_same(found: list[Line], sweep: Sweep, first: int = 0) -> None:
     assert all(line.valid and line.exposure_ms == CAMERA.exposure_ms for line in found)
 
 
-def test_sweeps_have_exposures_of_their_own():
-    """The camera is told each, lines and references are those of that exposure, and the journal knows them again."""
+def test_each_sweep_is_captured_with_its_own_exposure():
+    """Lines and references have the sweep's exposure, and another process finds the references in the journal."""
     own, kept = replace(COARSE, exposure_ms=25.0), KeptInMemory()
     with small_rig() as rig:
         source = rig.source(kept)
-        with source.session():  # as one visit: the camera is told anew between sweeps
+        with source.session():  # one visit: the camera is configured anew between sweeps
             given = {sweep: list(source.lines(sweep)) for sweep in (own, FINE)}
         for sweep, found in given.items():
             expected = list(small_source().lines(sweep))
@@ -55,15 +55,15 @@ def test_sweeps_have_exposures_of_their_own():
             np.testing.assert_allclose(dark, wanted.dark, atol=0.6)
             np.testing.assert_allclose(white, wanted.white, atol=0.6)
         assert len(rig.captures) == 2
-        again = rig.source(kept)  # as another process
+        again = rig.source(kept)  # another process
         np.testing.assert_array_equal(again.references(own).white, source.references(own).white)
         assert len(rig.captures) == 2
 
 
 @pytest.mark.parametrize("sweep", [COARSE, FINE], ids=lambda sweep: sweep.kind)
 @pytest.mark.parametrize("first", [0, 9])
-def test_lines_are_those_of_the_simulated_source(sweep: Sweep, first: int):
-    """Coarse lines that hold four positions each and are summed by four, and fine ones; from the middle too."""
+def test_rig_lines_equal_those_of_the_simulated_source(sweep: Sweep, first: int):
+    """Coarse lines, with four held positions and binned by four, and lines from number 9 on are equal as well."""
     with small_rig() as rig:
         source = rig.source()
         found = list(source.lines(sweep, first))
@@ -80,8 +80,8 @@ MOUNTED = {
 
 
 @pytest.mark.parametrize("mounting", MOUNTED.values(), ids=MOUNTED)
-def test_lines_of_a_mirror_mounted_otherwise_are_the_same_once_it_is_told(mounting: Mounting):
-    """By pulses bit for bit, and where the mirror's log measured them; other lines come where nobody says so."""
+def test_a_configured_mounting_gives_the_same_lines(mounting: Mounting):
+    """Lines by pulses are equal bit for bit, those by the mirror's log to 3 px. Without the setting they differ."""
     told = {f"mirror_{name}": value for name, value in asdict(mounting).items()}
     with small_rig(mounting=mounting, **told) as rig:
         source = rig.source()
@@ -101,10 +101,10 @@ def test_lines_of_a_mirror_mounted_otherwise_are_the_same_once_it_is_told(mounti
 
 
 @pytest.mark.parametrize(("sweep", "captures"), [(COARSE, 3), (FINE, 2)], ids=lambda value: getattr(value, "kind", ""))
-def test_loads_of_the_vector_memory_change_no_line(sweep: Sweep, captures: int):
-    """A sweep in several loads gives the same numbers: noise is keyed by the sweep's name and the line's number.
+def test_several_loads_of_the_vector_memory_change_no_line(sweep: Sweep, captures: int):
+    """A sweep in several loads has the same numbers, because noise depends on sweep name and line number.
 
-    Its time is the camera's own, so a load in the midst of a sweep shows in it.
+    Times are the camera's own, so each load within a sweep delays the lines after it.
     """
     with small_rig(vector_pairs=17) as rig:
         found = list(rig.source().lines(sweep))
@@ -118,7 +118,7 @@ def test_loads_of_the_vector_memory_change_no_line(sweep: Sweep, captures: int):
 
 @pytest.mark.parametrize("white_at_rest", [True, False])
 def test_references_are_the_mean_of_the_cameras_frames(white_at_rest: bool):
-    """Those of the simulated source to the frames' rounding, of one capture; the mirror moves only if it shall rest."""
+    """References equal the simulated source's to the rounding of frames. The mirror moves only for a white at rest."""
     with small_rig(white_reference=2.0, white_at_rest=white_at_rest) as rig:
         source = rig.source()
         for sweep in (COARSE, FINE):
@@ -133,7 +133,7 @@ def test_references_are_the_mean_of_the_cameras_frames(white_at_rest: bool):
 
 
 def test_references_are_fetched_once(monkeypatch: pytest.MonkeyPatch):
-    """By all sweeps, and by whoever shares the files; one that keeps its files elsewhere fetches its own."""
+    """All sweeps, and sources that share the files, use one fetch. A source with other files fetches its own."""
     log_in = create_autospec(FTP.login, side_effect=FTP.login)
     monkeypatch.setattr(FTP, "login", log_in)
     with small_rig() as rig:
@@ -156,8 +156,8 @@ def test_references_are_fetched_once(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.parametrize("pulses", ["none", "frame"])
-def test_without_pulses_lines_lie_where_the_log_measured(pulses: str):
-    """A path that runs by its own clock: lines are located by the log; a pulse a frame steps fine sweeps only."""
+def test_lines_without_pulses_lie_at_the_logged_positions(pulses: str):
+    """The log locates lines of a path on its own clock. One pulse per frame steps fine sweeps only."""
     with small_rig(pulses=pulses, log_samples=16000) as rig:
         source = rig.source()
         found = list(source.lines(COARSE))
@@ -168,14 +168,14 @@ def test_without_pulses_lines_lie_where_the_log_measured(pulses: str):
     assert [line.number for line in found] == list(range(COARSE.lines))
     assert all(line.valid for line in found)
     off = np.array([(line.mirror_x, line.mirror_y) for line in found]) - line_positions(COARSE, CAMERA)
-    assert np.hypot(*off.T).max() * 11275 < 3  # about as many px as a unit of the disk has
+    assert np.hypot(*off.T).max() * 11275 < 3  # a unit of the disk is about 11275 px
     assert (told["method"], told["sweep"], told["first"], told["stop"]) == ("log", "coarse-0", 0, 10)
     assert 0 <= told["residual_px"] < 3
     assert any("software timing" in note for note in told["notes"])
 
 
-def test_devices_are_let_go_of_whatever_ends_a_look():
-    """A consumer that stops early, or an error, leaves no device held; a session holds them over several calls."""
+def test_devices_are_released_after_every_call():
+    """A consumer that stops early, or an error, leaves no device open. A session keeps them over several calls."""
     with small_rig() as rig:
         source = rig.source()
         lines = source.lines(FINE)
@@ -192,7 +192,7 @@ def test_devices_are_let_go_of_whatever_ends_a_look():
 
 
 def test_lines_of_another_size_are_refused():
-    """A camera that gives other lines than the settings say ends the sweep, with what to set."""
+    """If the camera's lines differ from the settings, the sweep ends with both sizes in the message."""
     with small_rig() as rig:
         rig.wavelength_nm = np.array([500.0, 600.0])
         with pytest.raises(RigError, match=r"holds lines of \(48, 3\) \(sample, band\), the settings say \(48, 2\)"):

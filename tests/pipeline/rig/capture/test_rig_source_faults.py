@@ -1,4 +1,4 @@
-"""Captures that break, by fault or kill: nothing acknowledged is lost or taken twice, and what is left is used."""
+"""Interrupted captures: no acknowledged line is lost or captured twice, and existing captures are used."""
 
 from __future__ import annotations
 
@@ -22,30 +22,30 @@ from tests.pipeline.rig.small_rig import COARSE, FINE, SmallRig, assert_simulate
 
 
 def assert_same(found: list[Line], first: int = 0) -> None:
-    """The simulated source's numbers, all valid."""
+    """Assert the simulated source's numbers, all valid."""
     assert_simulated(found, FINE, first)
     assert all(line.valid for line in found)
 
 
 class KilledError(BaseException):
-    """The process ends here."""
+    """The process is killed here."""
 
 
 @dataclass
 class KeptUntil(KeptInMemory):
-    """Files that do something as soon as bytes with a mark come, or of a file called so; once for each mark."""
+    """Files that call a function once at the first bytes with a mark, or at the first file of such a name."""
 
     acts: dict[bytes, Callable[[], None]] = field(default_factory=dict)
 
     def append(self, name: str, data: bytes) -> None:
-        """Act, then keep."""
+        """Call the function of each mark, then keep the data."""
         for mark in [mark for mark in self.acts if mark in data or name.encode().endswith(mark)]:
             self.acts.pop(mark)()
         super().append(name, data)
 
 
-def test_cubes_that_are_always_cut_end_the_sweep():
-    """Two captures in a row without a new line are enough; the message says what is kept."""
+def test_cubes_that_are_always_truncated_end_the_sweep():
+    """Two captures in a row without a new line end it; the message says how many lines are kept."""
     with small_rig(faults={CameraFault.CUT_CUBE: 99}, vector_pairs=2) as rig:
         source = rig.source()
         with pytest.raises(RigError, match=r"2 captures in a row gave no line 0; .*The 0 lines before it are kept"):
@@ -56,15 +56,15 @@ def test_cubes_that_are_always_cut_end_the_sweep():
 @pytest.mark.parametrize(
     ("cut", "pairs", "begun"), [(1, 1500, ["0", "15"]), (3, 6, ["0", "3", "6", "9", "14"])], ids=["once", "often"]
 )
-def test_cut_cubes_are_taken_again_from_their_first_missing_line(cut: int, pairs: int, begun: list[str]):
-    """Whole lines of a cube that was cut off count, so none is in vain; the others come with the same numbers."""
+def test_truncated_cubes_are_captured_again_from_the_first_missing_line(cut: int, pairs: int, begun: list[str]):
+    """Whole lines of a truncated cube count. The others are captured again with the same numbers."""
     with small_rig(faults={CameraFault.CUT_CUBE: cut}, vector_pairs=pairs) as rig:
         assert_same(list(rig.source().lines(FINE)))
         assert [said.split("_")[-1].split('"')[0] for said in rig.captures] == begun
 
 
-def test_broken_transfer_goes_on_in_the_next_process():
-    """The camera goes away in the midst of a file: what has come is kept, and nothing is captured again."""
+def test_an_interrupted_transfer_resumes_in_the_next_process():
+    """The camera disconnects within a file: the received bytes are kept, and nothing is captured again."""
     with small_rig() as rig:
         faults = rig.emulated.camera.faults
         kept = KeptUntil(
@@ -86,8 +86,8 @@ kill = Mock(side_effect=KilledError)
 
 
 @pytest.mark.parametrize("mark", [b'"what": "end"', b"frameIndex_0.txt", b"origin"])
-def test_killed_process_is_gone_on_with(mark: bytes):
-    """Killed before a capture's end is taken down, a file has come, or a line is given: the capture is used."""
+def test_a_capture_is_used_after_the_process_is_killed(mark: bytes):
+    """The process is killed before the capture's end is recorded, a file has arrived, or a line is returned."""
     with small_rig() as rig:
         kept = KeptUntil(acts={mark: kill})
         with pytest.raises(KilledError):
@@ -96,8 +96,8 @@ def test_killed_process_is_gone_on_with(mark: bytes):
         assert len(rig.captures) == 1
 
 
-def test_lost_edge_is_seen_and_the_lines_taken_again():
-    """The mirror's index tells that it stepped once less: none of these lines is believed."""
+def test_a_lost_edge_is_detected_and_its_lines_captured_again():
+    """The mirror's index shows one step too few, so none of these lines is used."""
     with small_rig() as rig:
         whole, left = rig.emulated.mirror.pulses, [1]
 
@@ -114,8 +114,8 @@ def test_lost_edge_is_seen_and_the_lines_taken_again():
 
 
 @pytest.mark.parametrize("lost", [False, True], ids=["there", "taken away"])
-def test_lines_given_are_not_given_again(lost: bool):
-    """A process that goes on from line 5 captures nothing, unless the folder was taken away in between."""
+def test_lines_from_a_later_start_are_not_captured_again(lost: bool):
+    """A process that resumes at line 5 captures nothing, unless the folder was removed in between."""
     with small_rig() as rig:
         kept = KeptInMemory()
         lines = rig.source(kept).lines(FINE)
@@ -129,7 +129,7 @@ def test_lines_given_are_not_given_again(lost: bool):
 
 @dataclass
 class SlowEye:
-    """Has the camera look at frames only once a clock stands later than that."""
+    """Makes the camera render frames only after the clock passes ``after_s``."""
 
     rig: SmallRig
     after_s: float
@@ -146,8 +146,8 @@ class SlowEye:
         camera.command = later  # type: ignore[method-assign, assignment]
 
 
-def test_camera_that_writes_for_long_is_waited_for():
-    """Frames that come late are not taken again; two minutes after it was told to stop it is told."""
+def test_a_camera_that_writes_slowly_is_waited_for():
+    """Late frames are not captured again. Two minutes after its stop a capture that still runs is an error."""
     with small_rig() as rig:
         SlowEye(rig, rig.line.clock.now() + 60)
         assert_same(list(rig.source().lines(FINE)))
@@ -161,8 +161,8 @@ def test_camera_that_writes_for_long_is_waited_for():
         assert len(rig.captures) == 1
 
 
-def test_wrong_password_costs_no_capture():
-    """Files that are not given to this user stay where they are: with another password the capture is used."""
+def test_a_wrong_password_costs_no_capture():
+    """The refused files stay on the camera, and with the right password the capture is used."""
     with small_rig() as rig:
         kept = KeptInMemory()
         with pytest.MonkeyPatch.context() as patch:
@@ -173,8 +173,8 @@ def test_wrong_password_costs_no_capture():
         assert len(rig.captures) == 1
 
 
-def test_full_camera_ends_the_sweep_at_once():
-    """A capture that is refused is not asked for again; the mirror does not go on waiting for edges."""
+def test_a_full_camera_ends_the_sweep_at_once():
+    """A refused capture is not retried, and the mirror does not keep waiting for edges."""
     with small_rig(faults={CameraFault.FULL: 1}) as rig:
         with pytest.raises(DeviceRefused, match="disk full"):
             list(rig.source().lines(FINE))
@@ -182,10 +182,10 @@ def test_full_camera_ends_the_sweep_at_once():
         assert not any(playback.running for playback in rig.emulated.mirror.state.playbacks)
 
 
-def test_nothing_is_sent_to_a_rig_of_unknown_state():
-    """A capture whose reply is lost freezes the rig for this process, whoever holds the source; another may go on."""
+def test_a_rig_of_unknown_state_gets_no_command():
+    """A capture without a reply blocks the rig for every source of this process."""
     with small_rig(faults={CameraFault.SILENT: 1}) as rig:
-        rig.emulated.camera.faults.passes = 1  # configure comes before the capture
+        rig.emulated.camera.faults.passes = 1  # configure precedes the capture
         source, kept = rig.source(), KeptInMemory()
         with pytest.raises(StateUnknown, match="not sent again"):
             list(source.keeping(kept).lines(FINE))
@@ -196,15 +196,15 @@ def test_nothing_is_sent_to_a_rig_of_unknown_state():
 
 
 def killed_amid(rig: SmallRig, kept: KeptInMemory, patch: pytest.MonkeyPatch | None = None) -> None:
-    """Begin to capture the sweep, and die while it is waited for; with ``patch`` before the camera can be stopped."""
+    """Start to capture the sweep and get killed while waiting; with ``patch`` before the camera is stopped."""
     if patch is not None:
         patch.setattr(HeadwallCamera, "stop", lambda _: kill())
     with pytest.raises(KilledError):
         list(rig.source(kept).saying(lambda words: kill() if words.startswith("capturing") else None).lines(FINE))
 
 
-def test_capture_that_still_runs_is_waited_for():
-    """Killed while the camera captures: the next process waits for its end and has all of it, counted and tied."""
+def test_a_capture_that_still_runs_is_waited_for():
+    """If a process is killed during a capture, the next one waits for its end and gets all lines by trigger."""
     with small_rig() as rig:
         kept = KeptInMemory()
         SlowEye(rig, rig.line.clock.now() + 60)
@@ -218,8 +218,8 @@ def test_capture_that_still_runs_is_waited_for():
         assert (told["method"], told["residual_px"]) == ("trigger", 0.0)
 
 
-def test_error_while_it_captures_stops_both():
-    """Whoever is interrupted leaves neither a camera that captures nor a mirror that waits for edges."""
+def test_an_error_during_a_capture_stops_both_devices():
+    """After an interruption the camera captures nothing, and the mirror does not wait for edges."""
     with small_rig() as rig:
         killed_amid(rig, KeptInMemory())
         assert not rig.emulated.camera.is_capturing()
@@ -227,8 +227,8 @@ def test_error_while_it_captures_stops_both():
         assert not any(playback.running for playback in rig.emulated.mirror.state.playbacks)
 
 
-def test_capture_by_its_own_clock_is_not_counted():
-    """Killed before its log is read: lines are tied by the commands' times, and no index is taken for a count."""
+def test_a_capture_without_a_log_is_located_by_command_times():
+    """A process on a free-running path is killed before it reads the log; the index does not serve as a count."""
     with small_rig(pulses="none", log_samples=16000) as rig:
         kept = KeptUntil(acts={b'"what": "end"': kill})
         with pytest.raises(KilledError):
@@ -239,8 +239,8 @@ def test_capture_by_its_own_clock_is_not_counted():
 
 
 @pytest.mark.parametrize("held", ["of a later folder", "as it is", "of another file"])
-def test_camera_that_was_emptied_in_between_is_gone_on_with(held: str):
-    """Its disk was cleared, or it is another: frames and lines that it has no more are taken again."""
+def test_a_camera_that_was_emptied_captures_again(held: str):
+    """The disk was cleared or the camera replaced: references and lines that are missing are captured again."""
     earlier = 0 if held == "of a later folder" else 3
     kept = KeptInMemory()
     with small_rig() as rig:
@@ -263,8 +263,8 @@ def test_camera_that_was_emptied_in_between_is_gone_on_with(held: str):
 
 
 @pytest.mark.parametrize("scan_pass", ["lines", "references"])
-def test_mirror_that_never_rests_is_not_captured_with(scan_pass: str):
-    """Neither a path nor a look at rest is begun while the mirror is not there yet."""
+def test_an_unstable_mirror_is_not_used_for_captures(scan_pass: str):
+    """Neither a path nor references begin before the mirror is at rest."""
     with small_rig(mirror_faults=[make_fault("never-stable", at=0)]) as rig:
         source = rig.source()
         with pytest.raises(RigError, match="is not at rest after"):
@@ -272,8 +272,8 @@ def test_mirror_that_never_rests_is_not_captured_with(scan_pass: str):
         assert not any(said.startswith("capture(") for said in rig.emulated.camera.commands)
 
 
-def test_end_that_the_journal_has_lost_is_not_read_from_another_path():
-    """The mirror has played another path since: what it stands at now is not taken for the end of the first."""
+def test_a_lost_end_record_is_not_taken_from_another_path():
+    """The mirror has played another path since, so its index does not end the first one: lines are captured again."""
     with small_rig() as rig:
         kept = KeptInMemory()
         list(rig.source(kept).lines(FINE))

@@ -1,4 +1,4 @@
-"""A whole emulated rig: planned sweeps give the simulated source's lines, and everything else what the mirror does."""
+"""A whole emulated rig: planned sweeps give the simulated source's lines, other paths what the mirror points at."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Pair:
         camera.configure(CAMERA.exposure_ms, CAMERA.frame_ms)
 
     def play(self, sweep: Sweep, first: int = 0, *, edges: bool = True, told: Sweep | None = None) -> str:
-        """Play a sweep from a line on during a capture, announced as ``told``; give the folder of what was seen."""
+        """Play a sweep from a line on during a capture announced as ``told``, and return the folder of its files."""
         held = sweep_positions(sweep, CAMERA)[first:].reshape(-1, 2)
         cells = np.concatenate([held[:1], held]) if edges else held
         self.mirror.goto(*held[0])
@@ -50,41 +50,41 @@ class Pair:
         return folder
 
     def lines(self, folder: str) -> np.ndarray[Any, Any]:
-        """Lines of a capture, (line, sample, band)."""
+        """Return lines of a capture, (line, sample, band)."""
         return self.camera.fetch(folder, KeptInMemory()).values
 
 
 @contextmanager
 def connected(source: SimulatedSource | None = None, **rig: Any) -> Iterator[tuple[Pair, EmulatedRig]]:
-    """Drivers of an emulated rig in this process."""
+    """Yield drivers of an emulated rig in this process."""
     whole = EmulatedRig(small_source() if source is None else source, ManualClock(), **rig)
     with InProcessRig(whole) as line:
         yield Pair(line.mirror(SurveyRig(with_crc=True)), line.camera(), line.clock), whole
 
 
 def planned(sweep: Sweep, lines: range, source: SimulatedSource | None = None) -> np.ndarray[Any, Any]:
-    """What the simulated source gives of some lines, not binned."""
+    """Return the simulated source's values of some lines, not binned."""
     return (small_source() if source is None else source).render(replace(sweep, binning=1), lines)
 
 
 @pytest.mark.parametrize("sweep", [FINE, COARSE], ids=lambda sweep: str(sweep.name))
-def test_path_on_its_own_clock_gives_them_too(sweep: Sweep) -> None:
-    """Where it begins within half a held position of the first exposure."""
+def test_a_path_on_its_own_clock_gives_the_planned_lines(sweep: Sweep) -> None:
+    """The path starts within half a held position of the first exposure."""
     with connected(wired="none") as (pair, _):
         folder = pair.play(sweep, edges=False)
         np.testing.assert_array_equal(pair.lines(folder), planned(sweep, range(sweep.lines)))
 
 
 @pytest.mark.parametrize(("wired", "cells"), [("position", 40), ("frame", 10), ("none", 0)])
-def test_pulses_are_as_the_cable_has_them(wired: Any, cells: int) -> None:
-    """One for each held position of 10 lines of 4, one for each frame, or none."""
+def test_pulses_follow_the_wiring(wired: Any, cells: int) -> None:
+    """The mirror receives one pulse for each held position of 10 lines of 4, one for each frame, or none."""
     with connected(wired=wired) as (pair, _):
         pair.play(COARSE)
         assert pair.mirror.index() == cells
 
 
-def test_lines_are_those_where_the_mirror_is() -> None:
-    """Two lines on or half a px beside what was announced: what the sweep there gives, but for the rounding of DN."""
+def test_lines_show_the_mirrors_actual_position() -> None:
+    """Lines 2 px or 0.5 px away from the announced sweep equal a sweep there, to the rounding of DN."""
     with connected() as (pair, _):
         folder = pair.play(replace(FINE, start_px=FINE.start_px + 2, lines=FINE.lines - 2), told=FINE)
         np.testing.assert_array_equal(pair.lines(folder), planned(FINE, range(2, FINE.lines)))
@@ -95,8 +95,8 @@ def test_lines_are_those_where_the_mirror_is() -> None:
     assert np.abs(found - planned(FINE, range(FINE.lines), source)).max() > 1
 
 
-def test_a_capture_that_announces_nothing_is_seen_at_its_place() -> None:
-    """Every frame is the line where the mirror is."""
+def test_a_capture_without_an_announcement_shows_the_mirrors_position() -> None:
+    """Every frame is the line at rest."""
     with connected() as (pair, _):
         pair.mirror.goto(0.0, 0.0)
         folder = pair.camera.capture(2).folder
@@ -105,8 +105,8 @@ def test_a_capture_that_announces_nothing_is_seen_at_its_place() -> None:
         np.testing.assert_array_equal(pair.lines(folder), np.concatenate([at_rest, at_rest]))
 
 
-def test_frames_that_wait_to_be_looked_at_keep_the_camera_busy() -> None:
-    """Behind ports a thread looks; until it has, the capture is not over and its files are not whole."""
+def test_frames_that_wait_for_rendering_keep_the_camera_busy() -> None:
+    """Behind ports a thread renders frames. Until it ends, the capture runs and has no whole files."""
     with connected() as (pair, rig):
         rig.camera.aside = True
         folder = pair.camera.capture(20, prefix=capture_prefix(FINE)).folder
@@ -118,8 +118,8 @@ def test_frames_that_wait_to_be_looked_at_keep_the_camera_busy() -> None:
         assert len(pair.lines(folder)) == 20
 
 
-def test_clock_of_the_source_says_when_a_sweep_began() -> None:
-    """What drifts is as in the survey where the source knows the sweep's start, whenever it is played."""
+def test_the_source_clock_determines_the_start_of_a_sweep() -> None:
+    """Drift is that of the survey if the source knows the sweep's start, at whatever time it is played."""
     source = small_source(clock={FINE.name: 12.0})
     with connected(source) as (pair, rig):
         pair.clock.sleep(100.0)
@@ -128,8 +128,8 @@ def test_clock_of_the_source_says_when_a_sweep_began() -> None:
         assert rig.camera.view.source.started_s(FINE) == 12.0
 
 
-def test_state_in_words() -> None:
-    """What both devices do now."""
+def test_state_describes_both_devices() -> None:
+    """The text has the mirror's position and the camera's activity."""
     with connected() as (pair, rig):
         pair.mirror.goto(0.25, 0.0)
         pair.mirror.settle(2.0)

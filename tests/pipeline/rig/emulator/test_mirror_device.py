@@ -1,4 +1,4 @@
-"""The emulated mirror controller, byte for byte; the bytes were worked out by hand and by a CRC of their own."""
+"""The emulated mirror controller, byte for byte. The bytes were worked out by hand, with an independent CRC."""
 
 from __future__ import annotations
 
@@ -47,33 +47,33 @@ PRO = {
 
 
 def answer(device: MirrorDevice, data: bytes) -> bytes:
-    """All that comes back to some bytes."""
+    """Return all bytes that answer some bytes."""
     return b"".join(chunk for _, chunk in device.receive(data))
 
 
 def pro_device(line: bytes = GO_PRO_CRC) -> MirrorDevice:
-    """A controller in pro mode."""
+    """Return a controller in pro mode."""
     device = MirrorDevice(ManualClock())
     assert answer(device, line) == b"OK\r\n"
     return device
 
 
 @pytest.mark.parametrize("name", SIMPLE)
-def test_every_line_of_simple_mode_has_its_answer(name: str) -> None:
-    """Each request of simple mode is answered by exactly these bytes."""
+def test_every_line_of_simple_mode_has_its_reply(name: str) -> None:
+    """The reply to each request of simple mode has exactly these bytes."""
     sent, expected = SIMPLE[name]
     assert answer(MirrorDevice(ManualClock()), sent) == expected
 
 
 @pytest.mark.parametrize("name", PRO)
-def test_every_frame_of_pro_mode_has_its_answer(name: str) -> None:
-    """Each request of pro mode is answered by exactly these bytes."""
+def test_every_frame_of_pro_mode_has_its_reply(name: str) -> None:
+    """The reply to each request of pro mode has exactly these bytes."""
     sent, expected = map(bytes.fromhex, PRO[name])
     assert answer(pro_device(), sent).hex(" ") == expected.hex(" ")
 
 
-def test_what_is_set_can_be_read() -> None:
-    """Cells that a frame sets come back in those that read them, from registers and from the vector memory."""
+def test_cells_that_are_set_can_be_read() -> None:
+    """Frames read the cells that other frames set, in registers and in the vector memory."""
     device = pro_device()
     pairs = (
         ("7e 00 12 0e 00 02 50 02 51 02 3e 80 00 00 bf 00 00 00 a3 f3 7e", "7e 00 12 00 0c a0 7e"),
@@ -85,8 +85,8 @@ def test_what_is_set_can_be_read() -> None:
         assert answer(device, bytes.fromhex(sent)).hex(" ") == expected
 
 
-def test_each_mode_knows_its_own_requests_alone() -> None:
-    """A line has no answer in pro mode, but is answered again after mode 0, in the same write; CRCs pass by mode."""
+def test_each_mode_answers_only_its_own_requests() -> None:
+    """Pro mode answers no line, but simple mode does after a change in the same write. CRCs depend on the mode."""
     device = pro_device()
     assert answer(device, b"START\r\n") == b""
     request, reply = map(bytes.fromhex, PRO["status"])
@@ -99,8 +99,8 @@ def test_each_mode_knows_its_own_requests_alone() -> None:
     assert answer(pro_device(), without) == bytes.fromhex("7e 00 82 04 00 00 00 04 ee 21 7e")
 
 
-def test_a_reset_forgets_everything() -> None:
-    """After a reset the controller is in simple mode, at rest in the middle, memory empty."""
+def test_a_reset_clears_everything() -> None:
+    """After a reset the controller is in simple mode, at rest in the centre, with an empty memory."""
     device = pro_device()
     answer(device, bytes.fromhex(PRO["set two"][0] + PRO["set vector"][0]))
     assert np.any(device.state.memory)

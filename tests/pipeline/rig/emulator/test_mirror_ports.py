@@ -1,4 +1,4 @@
-"""Ways to the emulated controller: a line in this process, and a pty that is used as a real port is."""
+"""Connections to the emulated controller: a line in this process, and a pty that acts as a real port."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ REPLIED = bytes.fromhex("7e 00 11 04 00 00 00 00 f2 81 7e")
 
 @contextmanager
 def opened(*faults: str, baud: int = 0) -> Iterator[tuple[EmulatedPort, serial.Serial]]:
-    """An emulated port with faults that strike at once, and a user of it."""
+    """Yield an emulated port with faults that strike at once, and a client of it."""
     device = FaultyMirror(SYSTEM_CLOCK, [make_fault(name, at=0) for name in faults])
     with (
         EmulatedPort(device, baud=baud) as port,
@@ -36,12 +36,12 @@ def opened(*faults: str, baud: int = 0) -> Iterator[tuple[EmulatedPort, serial.S
 
 
 def descriptors() -> int:
-    """Open files of this process."""
+    """Return the number of open files of this process."""
     return len(list(Path("/proc/self/fd").iterdir()))
 
 
-def test_both_modes_speak_through_the_pty() -> None:
-    """No byte is changed on the way, neither line ends nor 03 or 1A."""
+def test_both_modes_work_through_the_pty() -> None:
+    """The pty changes no byte, neither line ends nor 03 or 1A."""
     with opened() as (_, user):
         user.write(b"START\r\n")
         assert user.read_until(b"\n") == b"OK\r\n"
@@ -51,8 +51,8 @@ def test_both_modes_speak_through_the_pty() -> None:
         assert user.read_until(REPLIED).endswith(REPLIED)
 
 
-def test_nothing_is_left_behind() -> None:
-    """After closing, twice even, there are as many threads and open files as before."""
+def test_a_closed_port_leaves_no_threads_or_files() -> None:
+    """After closing, even twice, the numbers of threads and open files are the initial ones."""
     before = (threading.active_count(), descriptors())
     for _ in range(3):
         port = EmulatedPort(MirrorDevice(SYSTEM_CLOCK))
@@ -61,8 +61,8 @@ def test_nothing_is_left_behind() -> None:
     assert (threading.active_count(), descriptors()) == before
 
 
-def test_bytes_keep_to_the_speed() -> None:
-    """At 2400 baud 7 bytes there and 4 back take at least 11 times 10 bits."""
+def test_bytes_take_the_time_of_the_baud_rate() -> None:
+    """At 2400 baud 7 bytes sent and 4 received take at least 11 times 10 bits."""
     with opened(baud=2400) as (_, user):
         began = SYSTEM_CLOCK.now()
         user.write(b"START\r\n")
@@ -70,8 +70,8 @@ def test_bytes_keep_to_the_speed() -> None:
         assert SYSTEM_CLOCK.now() - began >= 110 / 2400
 
 
-def test_the_driver_drives_it() -> None:
-    """The driver connects, moves, loads and lets go, through a real pty; a device that goes is told as such."""
+def test_the_driver_works_through_a_pty() -> None:
+    """The driver connects, moves, loads and disconnects. A device that disappears is reported as such."""
     device = MirrorDevice(SYSTEM_CLOCK)
     with EmulatedPort(device) as port, open_mirror(SurveyRig(port=port.path)) as mirror:
         assert mirror.identity.device == "MR-E-2"
@@ -84,8 +84,8 @@ def test_the_driver_drives_it() -> None:
         open_mirror(SurveyRig(port=port.path)).goto(0.0, 0.0)
 
 
-def test_without_ptys_there_is_one_clear_message(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where the system has no pty left, the error says so."""
+def test_a_missing_pty_has_a_clear_message(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The message quotes the error of a system without free ptys."""
     monkeypatch.setattr(os, "openpty", Mock(side_effect=OSError("out of pty devices")))
     with pytest.raises(RigError, match="no pty for the emulated port: out of pty devices"):
         EmulatedPort(MirrorDevice(SYSTEM_CLOCK))

@@ -22,12 +22,12 @@ def ask(device: MirrorDevice, frame: pro.Frame) -> pro.Frame:
 
 
 def do(device: MirrorDevice, frame: pro.Frame) -> None:
-    """Send a frame that is acknowledged."""
+    """Send a frame and assert that it is acknowledged."""
     assert ask(device, frame) == pro.Frame(frame.command)
 
 
 def running(clock: ManualClock, trigger: pro.Trigger = pro.Trigger.OFF) -> MirrorDevice:
-    """Return a controller that begins to play PATH."""
+    """Return a controller that starts to play PATH."""
     device = MirrorDevice(clock)
     device.receive(b"GOPROCRC\r\n")
     do(device, pro.set_vector(pro.VECTOR_MEMORY, 0, PATH.T.astype(">f4").tobytes()))
@@ -52,12 +52,12 @@ def index(device: MirrorDevice) -> int:
 
 
 def expected(times_s: NDArray[np.float64], began_s: float) -> NDArray[np.float64]:
-    """Return where the path is at times from its start on."""
+    """Return the positions of the path at times after its start."""
     return PATH[np.minimum(np.floor((times_s - began_s) * RATE_HZ + 1e-9).astype(int), 3)]
 
 
 def test_a_run_moves_the_mirror_along_the_path() -> None:
-    """Each cell is held for a period, the last one for good; then the run is over, and halting changes nothing."""
+    """Each position is held for a period, the last one permanently. A halt after the run changes nothing."""
     clock = ManualClock(7.0)
     device = running(clock)
     clock.sleep(3 / RATE_HZ + 0.001)
@@ -72,7 +72,7 @@ def test_a_run_moves_the_mirror_along_the_path() -> None:
 
 
 def test_pulses_step_through_the_path() -> None:
-    """The run command plays the first cell, each pulse the next; pulses beyond the last end the run."""
+    """The run command plays the first position and each pulse the next one. A pulse after the last ends the run."""
     clock = ManualClock()
     device = running(clock, pro.Trigger.RISING_EDGE)
     for pulses, place, runs in ((0, 0, True), (1, 1, True), (2, 3, True), (1, 3, False)):
@@ -83,8 +83,8 @@ def test_pulses_step_through_the_path() -> None:
         assert (index(device), device.state.playbacks[0].running) == (place, runs)
 
 
-def test_status_while_it_moves() -> None:
-    """NOT_STABLE for a short time after each move."""
+def test_status_is_not_stable_during_a_move() -> None:
+    """NOT_STABLE is set after a move and cleared within a second."""
     clock = ManualClock()
     device = MirrorDevice(clock)
     device.receive(b"GOPROCRC\r\n")
@@ -96,8 +96,8 @@ def test_status_while_it_moves() -> None:
     np.testing.assert_allclose(device.positions(clock.now()), (0.5, 0.0), atol=1e-7)
 
 
-def test_the_log_holds_the_positions() -> None:
-    """Rows at the set rate from the run command on; it keeps them when it is stopped."""
+def test_the_log_contains_the_positions() -> None:
+    """The log has rows at the set rate from the run command on, and keeps them after it is stopped."""
     clock = ManualClock(3.0)
     device = running(clock)
     chosen: dict[int, pro.Value] = {pro.log_slot(0): pro.FEEDBACK_X, pro.log_slot(1): pro.FEEDBACK_Y}

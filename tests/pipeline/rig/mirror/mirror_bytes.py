@@ -11,7 +11,7 @@ from tests.pipeline.rig.scripted import Pair, ScriptedTransport
 
 
 def pair(sent: str, received: str) -> Pair:
-    """A pair from hexadecimal."""
+    """Return a pair of bytes from hexadecimal."""
     return bytes.fromhex(sent), bytes.fromhex(received)
 
 
@@ -30,7 +30,7 @@ WARM = pair("7E 00 02 02 00 00 A0 78 7E", "7E 00 02 04 00 00 00 04 F1 E1 7E")
 UNREST = pair("7E 00 02 02 00 00 A0 78 7E", "7E 00 02 04 00 00 00 10 F1 EE 7E")
 TRIMMED = pair("7E 00 02 02 00 00 A0 78 7E", "7E 00 02 04 00 00 00 80 F1 82 7E")
 CONNECT: list[Pair] = [GREET, *WHO, ENTER, WELL]
-DONE = "7E 00 12 00 0C A0 7E"  # several registers were set
+DONE = "7E 00 12 00 0C A0 7E"  # acknowledgement of several registers
 GOTO = (  # positions 0.5 and -0.25, control C0 and C1, inputs 50 and 51, both units stopped
     "7E 00 12 32 00 08 50 02 51 02 40 02 40 00 40 07 40 05 68 01 69 01 3F 00 00 00 BE 80 00 00 00 00 00 C0"
     " 00 00 00 50 00 00 00 C1 00 00 00 51 00 00 00 00 00 00 00 00 BA 0A 7E"
@@ -45,7 +45,7 @@ READ_BACK = pair(
     "7E 00 15 18 3F 00 00 00 00 00 00 00 3F 80 00 00 BE 80 00 00 00 00 00 00 00 00 00 00 81 75 7E",
 )
 HALT = pair("7E 00 12 0E 00 02 68 01 69 01 00 00 00 00 00 00 00 00 BE 49 7E", DONE)
-# All of 3 positions at 10 Hz, by rising edges: X from cell 0 up to cell 3, Y from 3 up to 6.
+# Three positions at 10 Hz, by rising edges: X in cells 0 to 3, Y in cells 3 to 6, ends excluded.
 SET_X = pair(
     "7E 00 12 26 00 06 68 00 68 02 68 03 68 04 68 07 68 08"
     " 00 00 00 02 00 00 00 00 00 00 00 03 41 20 00 00 00 00 00 01 00 00 00 02 0F 02 7E",
@@ -78,7 +78,7 @@ START_LOG = pair("7E 00 12 08 00 01 24 10 00 00 00 01 D1 B8 7E", DONE)
 
 
 def connected(transport: ScriptedTransport, vector_pairs: int = 1500, **settings: Any) -> MirrorController:
-    """A controller that has been connected; the script begins with CONNECT, and CRCs in it have to fit."""
+    """Return a connected controller; the script begins with CONNECT, and its CRCs have to fit."""
     told = {"with_crc": True, "strict_crc": True, **settings}
     mirror = MirrorController(transport, SurveyRig(**told), transport.clock, vector_pairs=vector_pairs)
     mirror.connect()

@@ -1,4 +1,4 @@
-"""Every fault of the emulated controller, with many seeds, against the driver: whole sessions on their own clock."""
+"""Test whole sessions of the driver under every fault of the emulated controller, with many seeds."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.pipeline.rig.mirror_faults import HARMLESS, KINDS, FaultyMirror, make
 SEEDS = range(8)
 SETTINGS = SurveyRig(expected_id="MR-E", read_back="all")
 PATH = np.stack([np.linspace(-0.5, 0.5, 47), np.linspace(0.3, 0.1, 47)], axis=-1)
-MOST_QUIET = 6  # times the time of silence that is waited for before a request
+MOST_QUIET = 6  # longest wait for silence before a request, in units of quiet_s
 EPSILON_S = 1e-6
 STATIC = (X.static_xy, Y.static_xy)
 RUNS = (X.vector(VectorRegister.RUN), Y.vector(VectorRegister.RUN))
@@ -27,7 +27,7 @@ ALWAYS_FATAL = ("mute", "gone-before", "gone-after", "hangs", "echo", "wrong-fir
 
 
 def moves(data: bytes) -> bool:
-    """Whether a write of the driver moves the mirror."""
+    """Return whether a write of the driver moves the mirror."""
     if data[:2] in (b"X=", b"Y=", b"XY") or data.startswith(b"RESET"):
         return True
     for found in FrameReader().feed(data):
@@ -40,14 +40,14 @@ def moves(data: bytes) -> bool:
 
 @dataclass
 class Session:
-    """A driver, a controller with one fault, and what was seen of them."""
+    """A driver, a controller with one fault, and a record of their session."""
 
     name: str
     seed: int
-    at: int | None = None  # opportunity at which the fault strikes; None leaves it to the seed
+    at: int | None = None  # opportunity at which the fault strikes; None: by the seed
     baud: int = 0
-    quiet_s: list[float] = field(default_factory=list)  # of each transaction, until its first byte was sent
-    waits_s: list[float] = field(default_factory=list)  # and from then on
+    quiet_s: list[float] = field(default_factory=list)  # of each transaction, until its first byte is sent
+    waits_s: list[float] = field(default_factory=list)  # and after that
     errors: list[RigError] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -60,7 +60,7 @@ class Session:
         self.times()
 
     def times(self) -> None:
-        """Take the time of each transaction: in all, and from its first byte on."""
+        """Record the duration of each transaction: the wait before its first byte, and the rest."""
         exchange, write = self.driver.wire.exchange, self.transport.write
         first: list[float] = []
 
@@ -81,7 +81,7 @@ class Session:
         self.driver.wire.exchange = timed  # type: ignore[method-assign, assignment]
 
     def does(self, act: Callable[[], object], motions: int) -> bool:
-        """Do one thing; say whether it went well. It sends no more motions than it has."""
+        """Perform one action with at most ``motions`` motions, and return whether the session has no error."""
         sent = len(self.transport.sent)
         try:
             act()
@@ -91,25 +91,25 @@ class Session:
         return not self.errors
 
     def goes(self, x: float, y: float) -> None:
-        """Go somewhere, and be sent there where it was acknowledged."""
+        """Go to a place, and assert the device's target if it is acknowledged."""
         self.driver.goto(x, y)
         went = [axis.place[-1] for axis in self.device.state.axes]
         assert went == [float(np.float32(x)), float(np.float32(y))]
 
     def loads(self) -> None:
-        """Load a path; what was acknowledged is there."""
+        """Load a path, and assert the device's memory if it is acknowledged."""
         self.driver.load_path(PATH)
         held = self.device.state.memory[: PATH.size]
         np.testing.assert_array_equal(held, PATH.T.ravel().astype(np.float32))
 
     def plays(self) -> None:
-        """Play the path; where it was acknowledged, the mirror ends where the path does."""
+        """Play the path, and assert the final position if it is acknowledged."""
         self.driver.run(100.0)
         self.clock.sleep(1.0)
         np.testing.assert_allclose(self.device.positions(self.clock.now()), PATH[-1], atol=1e-5)
 
     def run(self) -> None:
-        """Do what a survey does, until something fails, and let go."""
+        """Perform the steps of a survey until one fails, then disconnect."""
         steps: list[tuple[Callable[[], object], int]] = [
             (self.driver.connect, 0),
             (self.driver.status, 0),
@@ -128,7 +128,7 @@ class Session:
         self.ends()
 
     def ends(self) -> None:
-        """An unknown state stays frozen, and the port is let go in any state."""
+        """Assert that an unknown state stays blocked, and that the port closes in any state."""
         if self.errors and isinstance(self.errors[0], StateUnknown):
             sent = len(self.transport.sent)
             with pytest.raises(StateUnknown, match="then run again, which connects anew"):
@@ -138,8 +138,8 @@ class Session:
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_no_fault_hangs_moves_twice_or_loses_what_was_acknowledged(name: str) -> None:
-    """Eight sessions with each fault: each ends well, or with one error that says where and what to do."""
+def test_no_fault_hangs_moves_twice_or_loses_acknowledged_data(name: str) -> None:
+    """Each of eight sessions per fault succeeds or ends with one error that names the place and the remedy."""
     struck = 0
     for seed in SEEDS:
         session = Session(name, seed)
@@ -161,8 +161,8 @@ def test_no_fault_hangs_moves_twice_or_loses_what_was_acknowledged(name: str) ->
 
 
 @pytest.mark.parametrize("name", ["no-reply", "silent-reset", "gone-after"])
-def test_no_reply_of_a_session_can_be_spared(name: str) -> None:
-    """The fault strikes each request in turn, motions among them: nothing moves twice or is lost unseen."""
+def test_no_lost_reply_moves_twice_or_goes_unnoticed(name: str) -> None:
+    """The fault strikes each request of a session in turn, motions included."""
     kinds = set()
     for at in range(200):
         session = Session(name, seed=at, at=at, baud=115200)

@@ -1,4 +1,4 @@
-"""The mirror controller, byte by byte: connecting, going, loading, playing, logging, parking, freezing."""
+"""The mirror controller, byte by byte: connecting, moving, loading, playing, logging, closing and blocking."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def play(mirror: MirrorController) -> None:
     mirror.run(10.0, Trigger.RISING_EDGE)
 
 
-# what follows connecting, the call, settings, and what the call gives
+# exchanges after connecting, the call, settings, and the call's result
 DONE_AS_ASKED: dict[str, tuple[list[Pair], Call, dict[str, Any], object]] = {
     "who is there": ([], lambda mirror: mirror.identity, {}, Identity("MR-E-2", "1.2.4065", "ABCD0123")),
     "going, in one frame": ([w.WELL, THERE], lambda mirror: mirror.goto(0.5, -0.25), {}, None),
@@ -56,8 +56,8 @@ DONE_AS_ASKED: dict[str, tuple[list[Pair], Call, dict[str, Any], object]] = {
 
 
 @pytest.mark.parametrize("name", DONE_AS_ASKED)
-def test_each_call_is_these_bytes(name: str):
-    """No other byte is sent, and each acknowledged; closing lets go of the port."""
+def test_each_call_sends_exactly_these_bytes(name: str):
+    """Every frame is acknowledged, and only closing releases the port."""
     script, call, settings, given = DONE_AS_ASKED[name]
     with scripted([*w.CONNECT, *script]) as transport:
         assert call(connected(transport, **settings)) == given
@@ -92,15 +92,15 @@ REFUSED: dict[str, tuple[list[Pair], Call, dict[str, Any], type[Exception], str]
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_cannot_be_is_refused_or_said(name: str):
-    """What cannot be meant sends no byte, a status that forbids motion none that moves; the rest is said in words."""
+def test_invalid_calls_and_device_errors_are_refused(name: str):
+    """Invalid calls send no byte. A status that forbids motion prevents it. Device errors are reported in words."""
     script, call, settings, error, words = REFUSED[name]
     with scripted([*w.CONNECT, *script]) as transport, pytest.raises(error, match=words):
         call(connected(transport, **settings))
 
 
-def test_a_path_that_was_not_kept_is_not_played():
-    """A cell that came back otherwise is named; so with an upload that failed, and the memory holds some of both."""
+def test_a_path_that_was_not_stored_is_not_played():
+    """Cells that differ after reading back are named. After a failed upload no path counts as loaded."""
     with scripted([*w.CONNECT, w.HALT, w.LOAD, WRONG]) as transport:
         mirror = connected(transport)
         with pytest.raises(RigError, match=r"cells 0 to 6 of the vector memory on scripted hold other values"):
@@ -116,8 +116,8 @@ def test_a_path_that_was_not_kept_is_not_played():
             mirror.run(10.0)
 
 
-def test_an_unacknowledged_motion_freezes():
-    """The motion goes once, later ones send no byte, closing neither; looking and halting still work."""
+def test_an_unacknowledged_motion_blocks_further_motions():
+    """The motion is sent once and later ones send no byte. Status, halting and closing still work."""
     late = Late(1.02, bytes.fromhex(w.DONE))
     script = [*w.CONNECT, w.HALT, w.LOAD, w.WELL, (bytes.fromhex(w.GOTO), [late]), w.WELL, w.HALT]
     with scripted(script) as transport:
@@ -136,7 +136,7 @@ def test_an_unacknowledged_motion_freezes():
 
 
 def give(monkeypatch: pytest.MonkeyPatch, transport: ScriptedTransport) -> None:
-    """Let the port that the settings name be the transport."""
+    """Replace the port of the settings by the transport."""
 
     def opened(port: str, baud: int, clock: object) -> ScriptedTransport:
         assert (port, baud, clock) == ("/dev/mirror", 256000, transport.clock)
@@ -148,8 +148,8 @@ def give(monkeypatch: pytest.MonkeyPatch, transport: ScriptedTransport) -> None:
 SETTINGS = SurveyRig(port="/dev/mirror", baud=256000, with_crc=True, strict_crc=True)
 
 
-def test_opening_connects_or_lets_go_of_the_port(monkeypatch: pytest.MonkeyPatch):
-    """Port and speed are those of the settings; without the controller it is let go of."""
+def test_opening_connects_or_releases_the_port(monkeypatch: pytest.MonkeyPatch):
+    """Port and baud rate are those of the settings. Without a controller the port is closed."""
     silent = (b"START\r\n", b"")
     with scripted(w.CONNECT) as transport:
         give(monkeypatch, transport)
@@ -169,8 +169,8 @@ Y3 = pair("7E 00 15 05 24 01 00 00 0C 35 6A 7E", "7E 00 15 0C BE 80 00 00 00 00 
 OUT_OF_RANGE = "7E 00 95 04 00 00 01 07 AC 97 7E"
 
 
-def test_a_log_is_started_stopped_and_fetched():
-    """Both feedbacks, the rate, the run bit, and as many samples as the time since the start has."""
+def test_a_log_is_started_stopped_and_read():
+    """The log has both feedbacks and as many samples as fit into the time since its start."""
     start = [w.STOP_LOG, w.SET_LOG, (w.START_LOG[0], [Late(0.002, bytes(w.START_LOG[1]))])]
     with scripted([*w.CONNECT, *start, w.STOP_LOG, X3, Y3]) as transport:
         mirror = connected(transport, log_rate_hz=1000.0)
@@ -182,8 +182,8 @@ def test_a_log_is_started_stopped_and_fetched():
     assert (log.started_s, log.start_error_s) == (pytest.approx(0.002), pytest.approx(0.002))
 
 
-def test_a_log_ends_where_the_device_says(caplog: pytest.LogCaptureFixture):
-    """An index outside the log ends it; both channels are as long as the shorter."""
+def test_a_log_ends_at_the_index_that_the_device_refuses(caplog: pytest.LogCaptureFixture):
+    """An index outside of the log ends it, and both channels get the shorter length."""
     zeros = "7E 00 15 28" + " 00" * 40 + " 39 6E 7E"
     script = [
         pair("7E 00 15 05 24 00 00 00 28 34 8D 7E", zeros),
@@ -199,8 +199,8 @@ def test_a_log_ends_where_the_device_says(caplog: pytest.LogCaptureFixture):
     assert "ends at 10 of 12 samples" in caplog.text
 
 
-def test_no_log_is_read_that_was_not_started():
-    """A log is read once, never more of it than the setting says; only an index outside of it is its end."""
+def test_a_log_that_was_not_started_is_not_read():
+    """A log is read once and up to the configured samples. Only an index outside of it ends it, not other refusals."""
     refused = pair("7E 00 15 05 24 00 00 00 0C 34 96 7E", "7E 00 95 04 00 00 01 01 2C 95 7E")
     logs = [*START, w.STOP_LOG, X3, Y3, *START, w.STOP_LOG, refused]
     with scripted([*w.CONNECT, *logs]) as transport:

@@ -1,4 +1,4 @@
-"""Requests in both modes as (sent, received) bytes, what is accepted as an answer, and connecting in either mode."""
+"""Requests in both modes as (sent, received) bytes, the accepted replies, and connecting in either mode."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ WRONG_CRC = bytes.fromhex("7E 00 11 04 00 00 01 2C F2 CD 7E")
 
 
 def wire(transport: ScriptedTransport) -> Wire:
-    """A wire that waits a second, asks twice again, and takes 0.1 s for silence."""
+    """Return a wire with a deadline of a second, two retries and 0.1 s of silence."""
     return Wire(transport, transport.clock, Patience(1.0, 2, 0.1))
 
 
 def pro(transport: ScriptedTransport, **settings: bool) -> ProLink:
-    """Pro mode over the transport; CRCs in the script have to fit."""
+    """Return pro mode over the transport; CRCs in the script have to fit."""
     return ProLink(wire(transport), **{"with_crc": True, "strict_crc": True, **settings})
 
 
-def test_every_kind_of_request_in_pro_mode():
-    """Each request is these bytes, whether it asks, sets or moves, and each reply means this."""
+def test_pro_mode_sends_every_kind_of_request():
+    """A read, a write and a motion have these bytes, and the reply gives this value."""
     with scripted([(ASK, REPLY), (SET, DONE), (SET, DONE)]) as transport:
         link = pro(transport)
         assert link.ask(get_value(0x680A), "it", cell_int) == 300
@@ -46,14 +46,14 @@ def test_every_kind_of_request_in_pro_mode():
         ("7E 00 91 04 00 00 01 01 2D 11 7E", r"no register \(code 0101"),
     ],
 )
-def test_error_replies(received: str, words: str):
-    """The device's error code is said in words, with port and request, and is not asked again."""
+def test_error_replies_are_reported_in_words(received: str, words: str):
+    """The message has the error code in words, the port and the request. The request is not retried."""
     refused = pytest.raises(DeviceRefused, match=f"on scripted refused the place: {words}")
     with scripted([(ASK, bytes.fromhex(received))]) as transport, refused:
         pro(transport).ask(get_value(0x680A), "the place", cell_int)
 
 
-def test_a_refused_motion_freezes_nothing():
+def test_a_refused_motion_blocks_nothing():
     """A motion that the device refused did not happen."""
     with scripted([(SET, bytes.fromhex("7E 00 90 04 00 00 01 03 AD 01 7E"))]) as transport:
         link = pro(transport)
@@ -62,8 +62,8 @@ def test_a_refused_motion_freezes_nothing():
         assert not link.wire.unknown
 
 
-def test_a_wrong_crc_is_what_the_settings_say(caplog: pytest.LogCaptureFixture):
-    """Until hardware confirms the CRC, one that does not fit is logged and taken; strictly refused; or none is sent."""
+def test_a_wrong_crc_is_handled_as_set(caplog: pytest.LogCaptureFixture):
+    """Until hardware confirms the CRC, a wrong one is logged and accepted, or refused if strict; or none is sent."""
     with scripted([(ASK, WRONG_CRC)]) as transport:
         assert pro(transport, strict_crc=False).ask(get_value(0x680A), "the place", cell_int) == 300
     assert "CRC of an answer to the place does not fit; accepted" in caplog.text
@@ -77,16 +77,16 @@ def test_a_wrong_crc_is_what_the_settings_say(caplog: pytest.LogCaptureFixture):
 
 
 @pytest.mark.parametrize("noise", [b"junk\x7e", b"\x7e\x00\x11\x7e", OTHER, bytes.fromhex("7E 00 11 00 0C 50 7E")])
-def test_what_is_no_answer_is_passed_over(noise: bytes):
-    """Rubbish, halves of frames, answers to other commands, of another size are not taken; in pieces too."""
+def test_data_other_than_the_reply_are_skipped(noise: bytes):
+    """Noise, partial frames, and replies to other commands or of another size are skipped, also in pieces."""
     pieces: list[Reply] = [bytes((byte,)) for byte in noise + REPLY]
     with scripted([(ASK, [noise + REPLY]), (ASK, pieces)]) as transport:
         for _ in range(2):
             assert pro(transport).ask(get_value(0x680A), "the place", cell_int) == 300
 
 
-def test_lines_of_simple_mode():
-    """Greeting and text with their replies, in pieces too."""
+def test_simple_mode_reads_replies_to_lines():
+    """A greeting and a text have their replies, also in pieces."""
     pairs: list[Pair] = [(b"START\r\n", b"\r\nOK\r\n"), (b"GETID\r\n", [b"MR-", b"E-2\r", b"\n"])]
     with scripted(pairs) as transport:
         line = wire(transport)
@@ -103,14 +103,14 @@ def test_lines_of_simple_mode():
         *((line, RigError, "is this the mirror controller") for line in (b"", b"OKOK", b"$GPGGA,1", b"\xff\xfe")),
     ],
 )
-def test_replies_that_say_whether_it_was_done(line: bytes, error: type[RigError] | None, words: str):
-    """OK in any case is done; refusals are said, and what the protocol does not have is another device."""
+def test_replies_of_simple_mode_mean_done_or_refused(line: bytes, error: type[RigError] | None, words: str):
+    """OK in any case is done, NO and ERROR are refusals. Other text comes from another device."""
     with nullcontext() if error is None else pytest.raises(error, match=words):
         read_done(line, "X=2", "/dev/m")
 
 
-def test_texts_are_text():
-    """An id is printable; NO says that there is none."""
+def test_text_replies_are_printable():
+    """A reply of NO gives an empty text, and unprintable bytes are refused."""
     assert read_text(b"MR-E-2 ", "GETID", "p") == "MR-E-2"
     assert read_text(b"NO", "GETID", "p") == ""
     with pytest.raises(RigError, match="port's speed"):
@@ -118,7 +118,7 @@ def test_texts_are_text():
 
 
 SILENT = (b"START\r\n", b"")
-DAMAGED = bytes.fromhex("7E 00 D4 04 00 00 00 01 22 14 7E")  # what the greeting gets in pro mode
+DAMAGED = bytes.fromhex("7E 00 D4 04 00 00 00 01 22 14 7E")  # reply to the greeting in pro mode
 REST: list[Pair] = [*WHO, ENTER, WELL]
 FOUND: dict[str, list[Pair]] = {
     "in pro mode": [SILENT, SILENT, SILENT, LEAVE, GREET, *REST],
@@ -131,14 +131,14 @@ FOUND: dict[str, list[Pair]] = {
 
 
 @pytest.mark.parametrize("name", FOUND)
-def test_a_controller_is_found(name: str):
-    """In whichever mode an earlier session left it; a greeting moves nothing and is repeated."""
+def test_a_controller_is_found_in_any_mode(name: str):
+    """An earlier session may have left it in either mode. The greeting moves nothing, so it is repeated."""
     with scripted(FOUND[name]) as transport:
         assert connected(transport).identity.device == "MR-E-2"
 
 
-def test_stale_bytes_and_unknown_questions_at_connect():
-    """Whatever lies on the line from before is dropped; a version that is not told stays empty."""
+def test_stale_bytes_are_dropped_at_connect():
+    """A version or serial number that the controller does not give is empty."""
     stale = b"NO\r\n" + bytes.fromhex("7E 00 11 04 00 00")
     who = [WHO[0], (b"GETVERSION\r\n", b"NO\r\n"), (b"GETSN\r\n", b"NO\r\n")]
     with scripted([GREET, *who, ENTER, WELL], stale=stale, drained=stale) as transport:
@@ -146,8 +146,8 @@ def test_stale_bytes_and_unknown_questions_at_connect():
     assert (identity.device, identity.version, identity.serial) == ("MR-E-2", "", "")
 
 
-def test_nobody_there_is_said_within_the_deadlines():
-    """No answer in either mode: three transactions' time, and what to look at."""
+def test_a_silent_port_is_reported_within_the_deadlines():
+    """Without a reply in either mode the error comes within three transactions and names a remedy."""
     with scripted([*[SILENT] * 3, (LEAVE[0], b""), *[SILENT] * 3]) as transport:
         with pytest.raises(DeadlinePassed, match=r"no answer to START from scripted .*is the controller on"):
             connected(transport)
@@ -164,22 +164,22 @@ FIRMWARES: dict[str, tuple[bool, list[Pair]]] = {
 
 
 @pytest.mark.parametrize("name", FIRMWARES)
-def test_a_firmware_that_wants_frames_the_other_way_says_which_setting(name: str):
-    """The message names the setting with which this firmware may answer."""
+def test_unsuitable_firmware_names_the_crc_setting(name: str):
+    """The message names the setting with which this firmware may reply."""
     with_crc, script = FIRMWARES[name]
     words = rf"wants them with(out)? one, set with_crc = {str(not with_crc).lower()} in \[rig\]"
     with scripted([GREET, *WHO, *script]) as transport, pytest.raises(RigError, match=words):
         connected(transport, with_crc=with_crc, strict_crc=False)
 
 
-def test_frames_without_a_crc_connect_by_these_bytes():
-    """00 00 stands in the CRC's place; a controller that an earlier session left is left by a frame with a CRC."""
+def test_frames_without_a_crc_have_zeros():
+    """00 00 replaces the CRC. A controller left in pro mode gets a frame with a CRC to leave it."""
     with scripted([*[SILENT] * 3, LEAVE, GREET, *WHO, PLAIN, PLAIN_WELL]) as transport:
         connected(transport, with_crc=False)
 
 
 def test_another_device_is_refused():
-    """What talks without being asked, or answers otherwise, is not the mirror."""
+    """Its text does not fit the greeting, or its id is another than expected."""
     with scripted([(b"START\r\n", b"login: \r\n")] * 3) as transport, pytest.raises(RigError, match="got 'login:'"):
         connected(transport)
     with scripted([GREET, *WHO]) as transport, pytest.raises(RigError, match=r"whose id holds 'MR-E-9' .* got MR-E-2,"):

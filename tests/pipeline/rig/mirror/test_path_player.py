@@ -1,4 +1,4 @@
-"""Positions at the precision of the wire, uploads and what is read back, and what plays as registers."""
+"""Positions in the precision of the wire, uploads and their read-back."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.pipeline.rig.in_process import ManualClock
 
 @given(st.floats(0, 1), st.floats(-7, 7))
 def test_no_position_is_rounded_beyond_the_rim(radius: float, angle: float):
-    """Positions stay in the disk, near where they were, and are not rounded twice."""
+    """Positions stay in the disk, move by at most 2e-7, and are not rounded twice."""
     given_ = np.array([[radius * np.cos(angle), radius * np.sin(angle)]])
     rounded = wire_positions(given_)
     assert rounded.dtype == np.float32
@@ -27,22 +27,22 @@ def test_no_position_is_rounded_beyond_the_rim(radius: float, angle: float):
     np.testing.assert_array_equal(wire_positions(rounded), rounded)
 
 
-def test_a_rim_of_float32_is_taken():
-    """A float32 position that rounding put beyond the rim comes back to it."""
+def test_a_float32_position_on_the_rim_is_accepted():
+    """A float32 position that rounding put beyond the rim is moved back to it."""
     beyond = np.array([[0.6, 0.8]], np.float32) * np.float32(1 + 3e-7)
     assert np.hypot(*wire_positions(beyond)[0].astype(np.float64)) <= 1
 
 
 @pytest.mark.parametrize(("x", "y"), [(1.0001, 0), (0.8, 0.8), (float("nan"), 0), (0, float("inf"))])
-def test_targets_outside_the_disk_are_refused(x: float, y: float):
-    """Beyond the rim, and what is no number."""
+def test_targets_outside_of_the_disk_are_refused(x: float, y: float):
+    """Positions beyond the rim or that are not finite raise an error with their index."""
     with pytest.raises(PoseError, match=r"index 1\)"):
         wire_positions([(0, 0), (x, y)])
 
 
 @pytest.mark.parametrize("shape", [(0, 2), (2,), (3, 3), (2, 2, 2)])
-def test_a_path_is_a_list_of_pairs(shape: tuple[int, ...]):
-    """Anything but (position, 2) is refused, and an empty path."""
+def test_a_path_has_two_columns(shape: tuple[int, ...]):
+    """Any shape but (position, 2), and an empty path, are refused."""
     with pytest.raises(ShapeError, match=r"\(position, 2\), at least one, got shape"):
         wire_positions(np.zeros(shape))
 
@@ -51,7 +51,7 @@ BAUD = 115200
 
 
 class Memory:
-    """A vector memory behind a transport: keeps what is written, but for ``wrong`` cells, and takes the wire's time."""
+    """A vector memory behind a transport, with ``wrong`` cells that it does not keep, and the delays of the wire."""
 
     port = "memory"
 
@@ -64,7 +64,7 @@ class Memory:
         self.passed = 0  # bytes, in both directions
 
     def write(self, data: bytes, deadline: float) -> None:
-        """Take a frame and prepare the reply."""
+        """Accept a frame and prepare the reply."""
         self.clock.sleep(len(data) * 10 / BAUD)
         self.passed += len(data)
         (frame,) = self._reader.feed(data)
@@ -83,27 +83,27 @@ class Memory:
             self._reply = encode(Frame(frame.command, bytes(self.cells[offset : offset + size])))
 
     def read(self, at_most: int, deadline: float) -> bytes:
-        """Give the reply, or wait in vain."""
+        """Return the reply, or wait until the deadline."""
         reply, self._reply = self._reply, b""
         self.passed += len(reply)
         self.clock.sleep(len(reply) * 10 / BAUD if reply else deadline - self.clock.now())
         return reply
 
     def drain(self) -> bytes:
-        """Nothing is ever left."""
+        """Return nothing."""
         return b""
 
     def close(self) -> None:
-        """Nothing to let go of."""
+        """Do nothing."""
 
 
 def link(memory: Memory) -> ProLink:
-    """Pro mode over the memory."""
+    """Return pro mode over the memory."""
     return ProLink(Wire(memory, memory.clock, Patience()))
 
 
 def path(count: int) -> bytes:
-    """Cells of positions on a spiral."""
+    """Return cells of positions on a spiral."""
     turn = np.linspace(0, 40, count)
     positions = wire_positions(np.stack([np.cos(turn), np.sin(turn)], axis=-1) * (turn / 40)[:, None])
     return positions.T.astype(">f4").tobytes()
@@ -111,8 +111,8 @@ def path(count: int) -> bytes:
 
 @given(st.integers(1, 120), st.sampled_from(["none", "sampled", "all"]))
 @settings(max_examples=30, deadline=None)
-def test_what_was_sent_is_what_is_held(count: int, read_back: ReadBack):
-    """Any path arrives whole, ten cells to a frame."""
+def test_an_uploaded_path_is_stored(count: int, read_back: ReadBack):
+    """Paths of any length arrive complete, ten cells per frame."""
     memory, cells = Memory(), path(count)
     upload(link(memory), cells, read_back)
     assert memory.cells[: len(cells)] == cells
@@ -125,16 +125,16 @@ def test_what_was_sent_is_what_is_held(count: int, read_back: ReadBack):
     ("cell", "read_back"),
     [(9, "all"), (57, "all"), (100, "all"), (0, "sampled"), (98, "sampled"), (101, "sampled"), (199, "sampled")],
 )
-def test_a_wrong_cell_is_found(cell: int, read_back: ReadBack):
-    """Reading all back finds any cell; a sample finds the ends of both channels, where ranges are most often wrong."""
+def test_a_wrong_cell_is_found_by_reading_back(cell: int, read_back: ReadBack):
+    """Reading all cells finds any error. A sample finds the ends of both channels, where ranges fail most often."""
     first = cell // 10 * 10
     with pytest.raises(RigError, match=rf"cells {first} to {first + 10} of .* on memory hold other values"):
         upload(link(Memory(wrong=(cell,))), path(100), read_back)
 
 
 @given(st.integers(1, 400))
-def test_samples_are_few_and_within(frames: int):
-    """First and last frame are always read, and not many more than a tenth."""
+def test_sampled_frames_are_few(frames: int):
+    """First and last frame are always read, and at most five frames more than a tenth."""
     checked = frames_to_check(frames, "sampled")
     assert {0, frames - 1} <= set(checked) <= set(range(frames))
     assert len(checked) <= frames / 10 + 5
@@ -143,7 +143,7 @@ def test_samples_are_few_and_within(frames: int):
 
 
 def test_a_lost_frame_ends_the_upload():
-    """A write is not sent again; the message names the cells."""
+    """A write is not retried, and the message names its cells."""
     memory = Memory(deaf_after=3)
     with pytest.raises(DeadlinePassed, match="no answer to writing cells 30 to 40 from memory"):
         upload(link(memory), path(100), "all")
@@ -152,9 +152,9 @@ def test_a_lost_frame_ends_the_upload():
 
 @pytest.mark.parametrize(("read_back", "fraction"), [("none", 0.0), ("sampled", 0.11), ("all", 1.0)])
 def test_an_upload_takes_the_wire_time(read_back: ReadBack, fraction: float):
-    """1500 positions are 300 frames of 52 bytes and acknowledgements of 7, and reading back costs as much again.
+    """1500 positions are 300 frames of 52 bytes and acknowledgements of 7; reading back takes the same again.
 
-    Bytes that need an escape come on top, below 1 %; nothing else does: the clock passed by what the wire took.
+    Escaped bytes add less than 1 %. The clock advances by exactly the time of all bytes.
     """
     memory = Memory()
     upload(link(memory), path(1500), read_back)

@@ -1,4 +1,4 @@
-"""Pro mode: the documented bytes of frames and payloads, laws over any stream, and the published registers."""
+"""Pro mode: the documented bytes of frames and payloads, any stream of bytes, and the published registers."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ nasty = st.one_of(
 frames = st.builds(pro.Frame, st.integers(0, 255), nasty, st.integers(0, 255))
 
 
-def test_the_documented_frame():
-    """The one reply whose CRC is documented, 00 11 04 00 00 00 00, is written and read so; without a CRC zeros."""
+def test_the_documented_frame_is_written_and_read():
+    """The only reply with a documented CRC is 00 11 04 00 00 00 00. Frames without a CRC have zeros."""
     data = bytes.fromhex("7E 00 11 04 00 00 00 00 F2 81 7E")
     assert pro.encode(pro.Frame(pro.Command.GET_VALUE, bytes(4))) == data
     assert pro.encode(pro.Frame(pro.Command.GET_VALUE, bytes(4)), with_crc=False) == data[:-3] + b"\x00\x00\x7e"
@@ -37,8 +37,8 @@ def test_both_marks_are_escaped():
 
 
 @given(frames)
-def test_reading_undoes_writing(frame: pro.Frame):
-    """Any frame comes back, with a CRC that fits, and boundaries stand nowhere but at its ends."""
+def test_reading_inverts_writing(frame: pro.Frame):
+    """Any frame is read back with a good CRC, and boundary bytes occur only at its ends."""
     data = pro.encode(frame)
     assert 0x7E not in data[1:-1]
     found = pro.FrameReader().feed(data)
@@ -47,8 +47,8 @@ def test_reading_undoes_writing(frame: pro.Frame):
 
 
 @given(st.binary(max_size=400), st.lists(st.integers(0, 1000), max_size=20))
-def test_no_stream_stops_a_reader(stream: bytes, cuts: list[int]):
-    """Any bytes, however cut, give the same findings, and the next frame is found after a boundary."""
+def test_a_reader_survives_any_stream(stream: bytes, cuts: list[int]):
+    """Any bytes, cut anywhere, give the same results, and the reader finds the next frame after a boundary."""
     places = sorted({0, len(stream), *(place % (len(stream) + 1) for place in cuts)})
     whole, cut = pro.FrameReader(), pro.FrameReader()
     found = whole.feed(stream)
@@ -60,8 +60,8 @@ def test_no_stream_stops_a_reader(stream: bytes, cuts: list[int]):
 
 
 @given(frames, st.integers(0, 2000))
-def test_a_flipped_bit_is_never_a_good_frame(frame: pro.Frame, place: int):
-    """One wrong bit inside a frame leaves no frame whose CRC fits, but for one cut in two by a false boundary."""
+def test_a_flipped_bit_breaks_the_crc(frame: pro.Frame, place: int):
+    """One wrong bit inside of a frame leaves no frame with a good CRC, unless it becomes a boundary byte."""
     data = bytearray(pro.encode(frame))
     at, bit = 1 + place // 8 % (len(data) - 2), place % 8
     data[at] ^= 1 << bit
@@ -82,20 +82,20 @@ def test_a_flipped_bit_is_never_a_good_frame(frame: pro.Frame, place: int):
         "7E" + " 00" * 111 + " 7E",
     ],
 )
-def test_what_is_no_frame_is_given_back(data: str):
-    """Too short, another size than stated, an escape of nothing, or too long."""
+def test_damaged_frames_are_returned_as_such(data: str):
+    """Damaged frames are too short or too long, contradict their size, or have an invalid escape."""
     (found,) = pro.FrameReader().feed(bytes.fromhex(data))
     assert found == pro.Damaged(bytes.fromhex(data).strip(b"\x7e"))
 
 
 def test_error_codes_have_words():
-    """Known codes are said by name and number; others by number."""
+    """Known codes have a name and a number, others a number only."""
     assert pro.format_error(pro.ErrorCode.OUT_OF_RANGE) == "out of range (code 0103)"
     assert pro.format_error(0x7777) == "unknown error (code 7777)"
 
 
-def test_a_wrong_crc_is_a_frame_all_the_same():
-    """A reader says that the CRC does not fit; what to make of it is the driver's."""
+def test_a_wrong_crc_is_reported_with_its_frame():
+    """The reader returns the frame and marks its CRC as wrong; the driver decides whether to accept it."""
     (found,) = pro.FrameReader().feed(bytes.fromhex("7E 00 11 04 00 00 00 00 F2 82 7E"))
     assert isinstance(found, pro.Frame)
     assert not found.crc_good
@@ -133,8 +133,8 @@ REPLIES = [
 
 
 @pytest.mark.parametrize(("frame", "data"), [*REQUESTS, *REPLIES])
-def test_forms_are_these_bytes(frame: pro.Frame, data: str):
-    """Every request and reply is these bytes, and these bytes are it."""
+def test_requests_and_replies_have_these_bytes(frame: pro.Frame, data: str):
+    """Every request and reply is encoded to these bytes and decoded from them."""
     assert pro.encode(frame) == bytes.fromhex(data)
     assert pro.FrameReader().feed(bytes.fromhex(data)) == [frame]
 
@@ -148,14 +148,14 @@ def test_forms_are_these_bytes(frame: pro.Frame, data: str):
         (lambda: pro.cell_int(b"123"), "expected 4 bytes, got 3"),
     ],
 )
-def test_payloads_that_do_not_fit_are_refused(make, match):
-    """Numbers and lengths that no payload has are refused, with what was expected."""
+def test_payloads_of_a_wrong_size_are_refused(make, match):
+    """The message has the expected and the given size."""
     with pytest.raises(ShapeError, match=match):
         make()
 
 
 def test_registers_have_the_published_ids():
-    """Ids are system times 256 plus number."""
+    """An id is the system times 256 plus the number."""
     assert (pro.X.static_xy, pro.Y.static_xy) == (0x5002, 0x5102)
     assert [pro.X.vector(register) & 0xFF for register in pro.VectorRegister] == [0, 1, 2, 3, 4, 7, 8, 10]
     assert pro.X.vector(pro.VectorRegister.RUN) == 0x6801
@@ -165,8 +165,8 @@ def test_registers_have_the_published_ids():
     assert (pro.VECTOR_MEMORY, pro.FEEDBACK_X, pro.FEEDBACK_Y, pro.log_slot(5)) == (0x2600, 0x2302, 0x2303, 0x2405)
 
 
-def test_status_in_words():
-    """Known bits have names, others the number; only what holds now, and moves no mirror, stops motion."""
+def test_status_bits_have_words():
+    """Known bits have names, others appear in the number. Only bits 0 to 3 forbid motion."""
     assert pro.Status(0).sentence == "status 00000000: no known bit"
     assert pro.Status(0x80000090).sentence == "status 80000090: not stable, trimmed"
     assert [bit for bit in range(32) if pro.Status(1 << bit).stops_motion] == [0, 1, 2, 3]

@@ -1,4 +1,4 @@
-"""Transactions: deadlines, retries, motions that are sent once, late and stale bytes, and what is counted."""
+"""Transactions: deadlines, retries, motions that are sent once, and late and stale bytes."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from tests.pipeline.rig.scripted import Late, Pair, ScriptedTransport, scripted
 
 
 def one_line(data: bytes) -> bytes | None:
-    """Take a whole part that ends a line as the answer."""
+    """Return data that end a line as the reply."""
     if data == b"bad\n":
         raise RigError("expected an answer, got bad")
     return data if data.endswith(b"\n") else None
 
 
 def ask(wire: Wire, data: bytes = b"q\n", kind: Kind = "read") -> bytes:
-    """One transaction."""
+    """Perform one transaction."""
     return wire.exchange(data, f"asking {data.decode().strip()}", kind, lambda: one_line)
 
 
 def make(transport: ScriptedTransport, **patience: float) -> Wire:
-    """A wire over the transport, a second and two retries by default."""
+    """Return a wire over the transport, with a deadline of a second and two retries by default."""
     given = {"deadline_s": 1.0, "retries": 2, "quiet_s": 0.1} | patience
     return Wire(transport, transport.clock, Patience(given["deadline_s"], int(given["retries"]), given["quiet_s"]))
 
 
 ANSWERED, LOST, BAD = (b"q\n", b"a\n"), (b"q\n", b""), (b"q\n", b"bad\n")
 SLOW = [*(Late(0.1 * number, b"a") for number in range(1, 9)), Late(0.9, b"\n")]
-READS: dict[str, tuple[list[Pair], bytes | str]] = {  # the script, and the answer or the words of the error
+READS: dict[str, tuple[list[Pair], bytes | str]] = {  # the script, and the reply or the words of the error
     "answered": ([ANSWERED], b"a\n"),
     "one answer lost": ([LOST, ANSWERED], b"a\n"),
     "two answers lost": ([LOST, LOST, ANSWERED], b"a\n"),
@@ -49,8 +49,8 @@ READS: dict[str, tuple[list[Pair], bytes | str]] = {  # the script, and the answ
 
 
 @pytest.mark.parametrize("name", READS)
-def test_reads_are_asked_again_within_one_deadline(name: str):
-    """Up to two lost answers, or ones that are none, cost time within it; one that goes on is not cut off."""
+def test_reads_are_retried_within_one_deadline(name: str):
+    """Up to two lost or invalid replies are retried within it, and a slow reply is not cut off."""
     script, given = READS[name]
     with scripted(script) as transport:
         if isinstance(given, bytes):
@@ -61,8 +61,8 @@ def test_reads_are_asked_again_within_one_deadline(name: str):
         assert transport.clock.now() <= 1.0 + 1e-9
 
 
-def test_waiting_for_silence_between_retries_stays_within_the_deadline():
-    """Bytes that trickle on after a retry was due do not stretch the transaction."""
+def test_silence_between_retries_stays_within_the_deadline():
+    """Bytes that arrive slowly after a retry is due do not extend the transaction."""
     parts = [Late(0.4 + 0.09 * number, b"x") for number in range(20)]
     transport = ScriptedTransport([(b"q\n", parts), LOST], ManualClock())
     with pytest.raises(DeadlinePassed):
@@ -71,7 +71,7 @@ def test_waiting_for_silence_between_retries_stays_within_the_deadline():
 
 
 def test_writes_are_sent_once():
-    """A write without an answer is not sent again, and freezes nothing."""
+    """A write without a reply is not retried and blocks nothing."""
     with scripted([(b"w\n", b"")]) as transport:
         wire = make(transport)
         with pytest.raises(DeadlinePassed):
@@ -80,8 +80,8 @@ def test_writes_are_sent_once():
 
 
 @pytest.mark.parametrize("received", [b"", b"half", b"bad\n", [Late(1.5, b"ok\n")], [DeviceGone("it went away")]])
-def test_a_motion_without_acknowledgement_is_sent_once_and_freezes(received):
-    """Whatever became of the acknowledgement, the motion may have happened: it and all others are refused from then."""
+def test_an_unacknowledged_motion_is_sent_once_and_blocks(received):
+    """If its acknowledgement is lost, damaged or late, the motion may have happened: all further ones are refused."""
     transport = ScriptedTransport([(b"m\n", received)], ManualClock())
     wire = make(transport)
     with pytest.raises(StateUnknown, match="asking m was sent to scripted and may have happened or not"):
@@ -92,8 +92,8 @@ def test_a_motion_without_acknowledgement_is_sent_once_and_freezes(received):
     assert transport.sent == 1
 
 
-def test_a_late_acknowledgement_never_answers_the_next_read(caplog: pytest.LogCaptureFixture):
-    """It is thrown away, and motions stay refused, with what a person can do."""
+def test_a_late_acknowledgement_does_not_answer_the_next_read(caplog: pytest.LogCaptureFixture):
+    """The late acknowledgement is dropped, and motions stay refused with a remedy in the message."""
     pairs: list[Pair] = [(b"m\n", [Late(1.05, b"late\n")]), (b"q\n", b"a\n")]
     with scripted(pairs) as transport, caplog.at_level(logging.INFO):
         wire = make(transport)
@@ -105,8 +105,8 @@ def test_a_late_acknowledgement_never_answers_the_next_read(caplog: pytest.LogCa
     assert "dropped 5 stale bytes" in caplog.text
 
 
-def test_an_interrupted_motion_freezes():
-    """Whoever stops the program while a motion waits for its acknowledgement does not know either."""
+def test_an_interrupted_motion_blocks_further_motions():
+    """After Ctrl-C before the acknowledgement it is unknown whether the motion happened."""
     transport = ScriptedTransport([(b"m\n", b"x")], ManualClock())
     wire, stop = make(transport), Mock(side_effect=KeyboardInterrupt)
     with pytest.raises(KeyboardInterrupt):
@@ -115,8 +115,8 @@ def test_an_interrupted_motion_freezes():
         ask(wire, b"n\n", "motion")
 
 
-def test_a_late_answer_never_answers_the_next_request():
-    """An answer that comes after its deadline is waited for, once, and dropped before the next request goes."""
+def test_a_late_reply_does_not_answer_the_next_request():
+    """The next request waits once for a late reply and drops it before it is sent."""
     pairs: list[Pair] = [(b"q\n", [Late(1.05, b"old\n")]), (b"r\n", b"new\n"), (b"s\n", b"b\n")]
     with scripted(pairs) as transport:
         wire = make(transport, retries=0)
@@ -129,8 +129,8 @@ def test_a_late_answer_never_answers_the_next_request():
         assert transport.clock.now() == until
 
 
-def test_a_late_answer_of_a_retried_read_never_answers_the_next_request():
-    """Both answers of a read that was asked twice are taken off the line."""
+def test_a_late_reply_of_a_retried_read_does_not_answer_the_next_request():
+    """Both replies to a read that was sent twice are removed from the line."""
     pairs: list[Pair] = [(b"q\n", [Late(0.5, b"old\n")]), (b"q\n", b"a\n"), (b"r\n", b"new\n")]
     with scripted(pairs, drained=b"") as transport:
         wire = make(transport, quiet_s=0.3)
@@ -138,18 +138,18 @@ def test_a_late_answer_of_a_retried_read_never_answers_the_next_request():
         assert ask(wire, b"r\n") == b"new\n"
 
 
-def test_stale_bytes_are_drained_and_logged(caplog: pytest.LogCaptureFixture):
-    """What an earlier session left on the line is no answer."""
+def test_stale_bytes_are_dropped_and_logged(caplog: pytest.LogCaptureFixture):
+    """Bytes that an earlier session left on the line are no reply."""
     with scripted([(b"q\n", b"a\n")], stale=b"old\n", drained=b"old\n") as transport, caplog.at_level(logging.INFO):
         assert ask(make(transport)) == b"a\n"
     assert "scripted: dropped 4 stale bytes before asking q: 6f 6c 64 0a" in caplog.text
 
 
-def test_a_device_that_never_stops_talking_holds_nothing_up():
-    """Silence is waited for only so long."""
+def test_a_device_that_sends_endlessly_does_not_block():
+    """The wait for silence is limited: two requests end within 3 s."""
 
     class Babbling(ScriptedTransport):
-        """Says something every 10 ms."""
+        """Transport that receives a byte every 10 ms."""
 
         def read(self, at_most: int, deadline: float) -> bytes:
             if self.clock.now() >= deadline:
@@ -166,11 +166,11 @@ def test_a_device_that_never_stops_talking_holds_nothing_up():
     assert transport.clock.now() < 3
 
 
-def test_a_motion_that_was_not_sent_freezes_nothing():
-    """Where there is nobody, the port cannot even be drained."""
+def test_a_motion_that_was_not_sent_blocks_nothing():
+    """Without a device the port cannot even be drained, so nothing is sent."""
 
     class Gone(ScriptedTransport):
-        """Cannot be drained."""
+        """Transport that cannot be drained."""
 
         def drain(self) -> bytes:
             raise DeviceGone("it went away")
@@ -181,11 +181,11 @@ def test_a_motion_that_was_not_sent_freezes_nothing():
     assert not wire.unknown
 
 
-def test_transactions_do_not_mix():
-    """Several threads ask at once, and each gets its own answer."""
+def test_transactions_of_threads_do_not_mix():
+    """Four threads send requests at once, and each gets its own reply."""
 
     class Echo(ScriptedTransport):
-        """Answers with what was asked, in two parts."""
+        """Transport that returns the request in two parts."""
 
         def write(self, data: bytes, deadline: float) -> None:
             assert not self.coming

@@ -1,4 +1,4 @@
-"""Air and depth: turbulence by three laws, rays of a pinhole behind the pivot, one wave of wind, and their bounds."""
+"""Air and depth: turbulence by three laws, rays of a pinhole behind the pivot, sway by wind, and their bounds."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ LONG = Sweep("long", "fine", "x", 0.0, -1500.0, 3000)
 
 
 def rig_at(distance_m: float | None, **air: float) -> Rig:
-    """A rig that looks through so much air."""
+    """Return a rig at this distance from the scene."""
     return Rig(air=Air(distance_m, **air))
 
 
 def drawn(lines: range, seed: int = 0, rig: Rig | None = None) -> np.ndarray:
-    """Jitter of lines of the long sweep, (line, 2) [px]."""
+    """Return the jitter of lines of the long sweep, (line, 2) [px]."""
     block = SweepBlock(rig or rig_at(300.0), LONG, lines, np.array([700.0]), (10, 10), seed=seed)
     jitter = TURBULENCE.aim(block, "jitter")
     assert jitter.shape == (len(lines), 1, 2)
@@ -34,15 +34,15 @@ def drawn(lines: range, seed: int = 0, rig: Rig | None = None) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("distance", "px"), [(30.0, 0.0365), (300.0, 0.1154)])
-def test_size_by_hand(distance: float, px: float):
-    """sqrt(1.09 1e-13 d 4.551) / 105.7 urad, where 10.6 mm to the power -1/3 are 4.551: 3.86 urad at 30 m."""
+def test_turbulence_matches_hand_calculation(distance: float, px: float):
+    """The jitter is sqrt(1.09 1e-13 d 4.551) / 105.7 urad, with (10.6 mm)^(-1/3) = 4.551: 3.86 urad at 30 m."""
     assert turbulence_px(rig_at(distance)) == pytest.approx(px, abs=1e-4)
 
 
-def test_size_by_the_structure_function():
-    """Its square is the phase's structure function at D over (k D)^2, summed along the way by the spectrum itself.
+def test_turbulence_matches_the_structure_function():
+    """The variance is the phase's structure function at D over (k D)^2, integrated over path and spectrum.
 
-    8 pi^2 k^2 dz Phi (1 - J0(kappa D z / d)) kappa dkappa, Phi = 0.033 Cn2 kappa^(-11/3): spherical waves from z = 0.
+    `8 pi^2 k^2 dz Phi (1 - J0(kappa D z / d)) kappa dkappa`, `Phi = 0.033 Cn2 kappa^(-11/3)`: waves from z = 0.
     """
     kappa = np.geomspace(1e-4, 1e7, 40_000)  # 1/m
     place = (np.arange(64) + 0.5) / 64
@@ -53,8 +53,8 @@ def test_size_by_the_structure_function():
     assert (turbulence_px(rig) * rig.camera.ifov_rad) ** 2 == pytest.approx(variance, rel=5e-3)
 
 
-def test_statistics():
-    """Zero mean, the stated deviation in both directions, and no link between them or between lines."""
+def test_turbulence_jitter_is_unbiased_and_uncorrelated():
+    """The jitter has the stated deviation in both directions, without correlation between them or between lines."""
     jitter = drawn(range(3000)) / turbulence_px(rig_at(300.0))
     assert jitter.mean(axis=0) == pytest.approx([0, 0], abs=0.06)
     assert jitter.std(axis=0) == pytest.approx([1, 1], abs=0.05)
@@ -62,8 +62,8 @@ def test_statistics():
     assert np.abs(np.corrcoef(both.T) - np.eye(4)).max() < 0.06
 
 
-def test_risk_of_the_bound():
-    """Of 20,000 surveys of 50 lines, about 20 have a line beyond the way that the bound allows."""
+def test_one_survey_in_1000_exceeds_the_bound_of_turbulence():
+    """Among 20,000 surveys of 50 lines, about 20 have a line beyond the displacement that the bound allows."""
     rng = np.random.default_rng(3)
     ways = np.hypot(*rng.standard_normal((2, 20_000, 50))).max(axis=1)
     ramp = steep_probe((0.0, 1.0), span=np.inf, lines=50)
@@ -76,14 +76,14 @@ STEP = Air(distance_m=30.0, relief="step", nearest_m=3.0)
 
 
 def shown(air: Air, sweep: Sweep = SWEEP, effect: Any = PARALLAX, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Displacement of all points of a sweep."""
+    """Return the displacement of all points of a sweep."""
     rig = Rig(air=air)
     block = SweepBlock(rig, sweep, range(201), np.ones(1), (201, 640), seed=seed)
     return effect.displaced(block, *sweep_to_scene(sweep, rig.camera), "exact")
 
 
 def test_line_ends_move_by_half_a_line_times_the_lever():
-    """At a line's ends parts at 3 and 30 m lie 320 L (1/3 - 1/30) px apart, 9.6 px for 0.1 m; centres stay."""
+    """Parts at 3 and 30 m lie `320 L (1/3 - 1/30)` px apart at a line's ends, 9.6 px for 0.1 m; centres stay."""
     along, scan = shown(STEP)
     near = along[150]
     assert np.abs(near[[0, -1]]) == pytest.approx(9.6 * 319.5 / 320, rel=2e-3)
@@ -93,8 +93,8 @@ def test_line_ends_move_by_half_a_line_times_the_lever():
 
 
 @pytest.mark.parametrize("swath_px", [0.0, 1500.0, -3000.0])
-def test_rays_of_a_pinhole_behind_the_pivot(swath_px: float):
-    """Points seen from the lever behind the pivot, on a plane across the chief ray's distance, are met exactly."""
+def test_parallax_matches_a_pinhole_behind_the_pivot(swath_px: float):
+    """Points on a plane across the chief ray's distance, seen from the lever behind the pivot, are met exactly."""
     sweep = replace(SWEEP, swath_px=swath_px, start_px=900.0)
     air = Air(distance_m=math.inf, relief="step", nearest_m=4.0, farthest_m=4.0, lever_m=0.1)
     camera = Rig().camera
@@ -108,8 +108,8 @@ def test_rays_of_a_pinhole_behind_the_pivot(swath_px: float):
     np.testing.assert_allclose(found * camera.ifov_rad, point[..., 1:] / point[..., :1], atol=1e-12)
 
 
-def test_reliefs():
-    """A step is far above the middle row and near from there on; along a plane 1/d runs evenly; flat is d0."""
+def test_relief_sets_the_distance_of_each_row():
+    """A step is far above the middle row and near from it down; on a plane 1/d is linear; flat has one distance."""
     row = np.array([-2.0, -1.0, -0.5, 0.0, 1.0, 3.0])
     np.testing.assert_allclose(closeness(STEP, row), [1 / 30, 1 / 30, 1 / 30, 1 / 3, 1 / 3, 1 / 3])
     plane = closeness(replace(STEP, relief="plane", farthest_m=math.inf), row)
@@ -121,12 +121,12 @@ BREEZE = Air(distance_m=30.0, wind_amplitude_m=0.02, wind_hz=1.0)
 
 
 def wind_shown(sweep: Sweep = SWEEP, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Displacement of all points by the breeze."""
+    """Return the displacement of all points by the breeze."""
     return shown(BREEZE, sweep, WIND, seed)
 
 
-def test_sizes():
-    """2 cm at 30 m are 6.3 px; at 1 Hz and 100 ms a line a tenth of a sway, up to 3.9 px from line to line."""
+def test_wind_sway_matches_hand_calculation():
+    """2 cm at 30 m are 6.3 px. At 1 Hz a line of 100 ms is a tenth of a period, up to 3.9 px per line."""
     assert sway_px(Rig(air=BREEZE)) == pytest.approx(6.3, abs=0.01)
     along, scan = wind_shown()
     assert np.hypot(along, scan).max() == pytest.approx(6.306, rel=0.01)
@@ -135,8 +135,8 @@ def test_sizes():
 
 
 @pytest.mark.parametrize("along", ["x", "y"])
-def test_the_crop_sways_along_the_wind(along: str):
-    """The motion lies along the heading that is drawn for the survey, on the scene's own axes."""
+def test_crop_sways_along_the_wind(along: str):
+    """The motion follows the heading that is drawn for the survey, on the scene's own axes."""
     heading = survey_stream(0, WIND.name).uniform(0, 2 * math.pi, 2)[1]
     first, second = wind_shown(replace(SWEEP, along=along))
     right, down = (first, second) if along == "x" else (second, first)
@@ -144,7 +144,7 @@ def test_the_crop_sways_along_the_wind(along: str):
     assert np.abs(right).max() == pytest.approx(6.306 * abs(math.cos(heading)), rel=0.02)
 
 
-def test_one_wave_for_all_sweeps():
+def test_all_sweeps_see_the_same_sway():
     """Sweeps of other names and either axis see the same crop at the same place and time; another seed does not."""
     point = np.array([[40.0]]), np.array([[-25.0]])
     line = replace(SWEEP, lines=1)

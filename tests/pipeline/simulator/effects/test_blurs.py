@@ -1,4 +1,4 @@
-"""Blurs: moments by hand, contrast through the renderer, bounds against real convolution, what folding leaves out."""
+"""Blurs: moments by hand, contrast through the renderer, and bounds against real convolution."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from tests.pipeline.simulator.made_up_effects import steep_probe
 from tests.pipeline.simulator.small_scenes import made_scene
 
 
-def test_a_ridge_changes_by_as_much_as_is_bounded():
-    """At the top of a ridge a blur takes its slope times the mean way of the light: no bound of slopes may be less."""
+def test_blur_bounds_are_reached_on_a_ridge():
+    """At the top of a ridge a blur takes slope times mean displacement of the light: no bound may be smaller."""
     ridge, x = steep_probe((3.0, 0.0), curvature=(1e9, 0.0)), np.linspace(-1, 1, 200_001)
     gauss, half_disc = np.exp(-((8 * x) ** 2) / 2), np.sqrt(1 - x**2)
     by_lens = 3.0 * 0.4 * np.average(np.abs(8 * x), weights=gauss)
@@ -38,26 +38,26 @@ NM = np.array([700.0])
 
 
 def rig_at(distance_m: float | None, focus_m: float = math.inf, **air: float) -> Rig:
-    """A rig that looks at a distance and is focused at another."""
+    """Return a rig with the scene at one distance and the focus at another."""
     return Rig(optics=Optics(focus_m=focus_m), air=Air(distance_m, **air))
 
 
-def test_disc_at_30_m():
+def test_defocus_at_30_m_matches_hand_calculation():
     """Focused at infinity, 10.6 mm of pupil make 3.3 px along the scan, and 15 mm make 4.7 px along the line."""
     assert defocus_px(rig_at(30.0), 30.0) == pytest.approx([4.73, 3.34], abs=0.005)
     variance = DEFOCUS.moments(rig_at(30.0), NM, "disc").spread[:, 0]
     assert variance == pytest.approx(np.array([4.73, 3.344]) ** 2 / 16, rel=1e-3)
 
 
-def test_a_scene_far_out_of_focus_is_refused():
-    """A disc of thousands of pixels would take terabytes."""
+def test_scene_far_out_of_focus_is_refused():
+    """A disc of thousands of pixels would take terabytes; at most 256 px are allowed."""
     with pytest.raises(
         SettingsError, match=r"0.001 m, with the focus at inf m, is blurred over 1\d{5} px; at most 256"
     ):
         defocus_px(rig_at(1e-3), 1e-3)
 
 
-def test_disc_at_grazing_incidence():
+def test_defocus_disc_narrows_at_grazing_incidence():
     """At 70 deg of incidence the disc is 0.34 as wide along the scan as along the line."""
     normal = np.array([np.sin(np.deg2rad(70)), 0, -np.cos(np.deg2rad(70))])
     assert DEFOCUS.moments(rig_at(30.0), NM, "disc", normal).disc == pytest.approx(
@@ -66,29 +66,29 @@ def test_disc_at_grazing_incidence():
 
 
 @pytest.mark.parametrize(("distance", "focus"), [(None, 30.0), (30.0, 30.0), (math.inf, math.inf)])
-def test_in_focus_or_without_distance(distance: float | None, focus: float):
-    """No blur and a bound of 0, no NaN from infinity less infinity."""
+def test_scene_in_focus_or_without_distance_has_no_defocus(distance: float | None, focus: float):
+    """Blur and bound are 0; infinity minus infinity gives no NaN."""
     rig = rig_at(distance, focus)
     assert not DEFOCUS.moments(rig, NM, "disc").spread.any()
     assert DEFOCUS.bound(steep_probe((1.0, 1.0)), rig).value == 0
 
 
 def keystone_rig_of(keystone_px: float) -> Rig:
-    """A rig with so much keystone."""
+    """Return a rig with this keystone."""
     return Rig(optics=Optics(keystone_px=keystone_px))
 
 
 @given(st.floats(0, 3), st.floats(400, 1000))
-def test_line_over_the_wavelengths(keystone: float, nm: float):
-    """From -k/2 at 400 nm through 0 at 700 to k/2 at 1000; a band's shift does not depend on other bands."""
+def test_keystone_shift_is_linear_over_wavelength(keystone: float, nm: float):
+    """The shift is -k/2 at 400 nm, 0 at 700 and k/2 at 1000; a band's shift does not depend on other bands."""
     shift = keystone_shift(keystone_rig_of(keystone), np.array([400.0, 700.0, 1000.0, nm]))
     assert shift[:3] == pytest.approx([-keystone / 2, 0, keystone / 2])
     assert shift[3] == pytest.approx(keystone * (nm - 700) / 600, abs=1e-12)
     assert keystone_shift(keystone_rig_of(keystone), np.array([nm])) == pytest.approx(shift[3])
 
 
-def test_beyond_the_spectrograph_the_shift_stays():
-    """Bands that the spectrograph has not, of a scene from elsewhere, are shifted as its first or last."""
+def test_keystone_shift_is_constant_beyond_the_spectrograph():
+    """Bands of other sensors, outside of 400 to 1000 nm, are shifted like the first or last band."""
     assert keystone_shift(keystone_rig_of(0.4), np.array([300.0, 2500.0])) == pytest.approx([-0.2, 0.2])
 
 
@@ -98,10 +98,10 @@ WAVES_SWEEP = Sweep("fine", "fine", "x", swath_px=0.0, start_px=-20.0, lines=40)
 
 
 @pytest.mark.parametrize("blur", [DIFFRACTION, DEFOCUS, ABERRATION], ids=lambda blur: blur.name)
-def test_contrast_is_that_of_the_blur(blur: Any):
-    """A wave of 16 px along the scan keeps exp(-2 pi^2 s^2 / 16^2) of what the footprint left of it, or the pupil's.
+def test_rendered_contrast_matches_that_of_the_blur(blur: Any):
+    """A wave of 16 px along the scan keeps the contrast of the blur's Gaussian, disc or pupil.
 
-    Or the disc's.
+    The Gaussian keeps exp(-2 pi^2 s^2 / 16^2) of the contrast that the footprint leaves.
     """
     wave = 1 + np.cos(2 * np.pi * (np.arange(120) - 59.5) / 16)
     electrons = np.full((1, 3), 1000.0, np.float32)

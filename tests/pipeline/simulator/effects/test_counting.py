@@ -1,4 +1,4 @@
-"""Which effects of the readout a scene calls for, that their bounds hold, and silicon's dark current."""
+"""Effects of the readout: the scenes that need them, their bounds, and silicon's dark current."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from pipeline.simulator.readout import read_out
 from pipeline.simulator.rig_model import Detector, Rig
 from tests.pipeline.simulator.spectral_light import block_of, probe_of
 
-TOLERANCE = 0.1 / 1.2  # of 0.1 sigma with the decision's factor of safety
+TOLERANCE = 0.1 / 1.2  # 0.1 sigma with the decision's factor of safety
 NM = np.array([500.0, 700.0, 900.0])
 RIG = Rig()
 
 
 def probe(darkest_e: float, brightest_e: float, unit: Unit = "sigma") -> Probe:
-    """Summary of light from the darkest to the brightest, in every band."""
+    """Return the probe of light from the darkest to the brightest, in every band."""
     return probe_of(np.linspace(darkest_e, brightest_e, 60).reshape(2, 10, 3).astype(np.float32), NM, unit)
 
 
 def apart(wide: float, narrow: float) -> float:
-    """Twice the total variation of two centred normal distributions, by integration."""
+    """Return twice the total variation of two centred normal distributions, by integration."""
     x = np.linspace(-8 * wide, 8 * wide, 100_001)
     return float(np.trapezoid(np.abs(stats.norm.pdf(x, scale=wide) - stats.norm.pdf(x, scale=narrow)), x))
 
 
-def test_a_bright_scene_needs_shot_noise_and_no_read_noise() -> None:
-    """At 10,000 e- 20 e- of read noise make 100 e- into 102 e-."""
+def test_bright_scene_needs_shot_noise_but_no_read_noise() -> None:
+    """At 10,000 e- a read noise of 20 e- turns a noise of 100 e- into 102 e-."""
     bright = probe(10_000, 10_000)
     assert counting.SHOT.bound(bright, RIG).value > TOLERANCE
     bound = counting.READ_NOISE.bound(bright, RIG)
@@ -43,8 +43,8 @@ def test_a_bright_scene_needs_shot_noise_and_no_read_noise() -> None:
     assert bound.why == "20 e- beside at least 100 e- of shot noise make 102 e-"
 
 
-def test_a_dim_scene_at_1_s_needs_dark_current() -> None:
-    """200 e- beside 24 e- of noise; a cooled sensor at 100 ms does without."""
+def test_dim_scene_at_1_s_needs_dark_current() -> None:
+    """The current of 200 e- exceeds the noise of 24 e-; a cooled sensor at 100 ms does not need it."""
     slow = replace(RIG, camera=LineCamera(exposure_ms=1000.0))
     bound = counting.DARK_CURRENT.bound(probe(200, 400), slow)
     assert bound.value > 8
@@ -57,7 +57,7 @@ def test_a_dim_scene_at_1_s_needs_dark_current() -> None:
 @pytest.mark.parametrize("unit", ["sigma", "dn"])
 @pytest.mark.parametrize(("darkest", "brightest"), [(50.0, 300.0), (1000.0, 1200.0), (10.0, 15_000.0)])
 def test_noise_bounds_are_the_total_variation(unit: Unit, darkest: float, brightest: float) -> None:
-    """At no sample do distributions with and without differ by more; at the worst one they differ by as much."""
+    """Distributions with and without a noise differ by the bound at the worst sample, and by at most it elsewhere."""
     rig = Rig(detector=Detector(dark_e_per_s=0.0))
     levels, seen = np.linspace(darkest, brightest, 7), probe(darkest, brightest, unit)
     for effect, without in ((counting.SHOT, np.full(7, 20.0)), (counting.READ_NOISE, np.sqrt(levels))):
@@ -67,8 +67,8 @@ def test_noise_bounds_are_the_total_variation(unit: Unit, darkest: float, bright
         assert effect.bound(seen, rig).value == pytest.approx(found, rel=2e-3)
 
 
-def test_the_bound_of_the_cheap_draw_is_stated_for_a_patch() -> None:
-    """A number errs by sqrt(divergence) of a sigma at most; a patch of 1e6 by the variation that is said."""
+def test_bound_of_the_cheap_draw_is_stated_for_a_patch() -> None:
+    """A number errs by at most sqrt(divergence) of a sigma, and a patch of 1e6 numbers by the stated variation."""
     bound = counting.SHOT.bound(probe(100, 10_000), RIG, "gaussian")
     assert bound.value <= 2 * counting.MOST_VARIATION / np.sqrt(counting.CHIP_SAMPLES)
     assert bound.value >= np.sqrt(counting.divergence(np.geomspace(1, 1e5, 500), 20.0)).max()
@@ -77,8 +77,8 @@ def test_the_bound_of_the_cheap_draw_is_stated_for_a_patch() -> None:
     assert counting.SHOT.bound(probe(100, 10_000), RIG, "exact").value == 0
 
 
-def test_defects_of_bands_that_are_not_used_do_not_matter() -> None:
-    """A sensor without defects, or whose masks are empty, has a bound of 0."""
+def test_sensor_without_defects_has_a_bound_of_0() -> None:
+    """A sensor with empty masks has a bound of 0 too, and a noiseless one has no hot elements."""
     assert counting.DEFECTS.bound(probe(100, 1000), RIG).value == 0
     few = Rig(detector=Detector(dead_fraction=1e-9, hot_fraction=1e-9))
     assert not counting.dead_elements(few, 3).any()
@@ -87,8 +87,8 @@ def test_defects_of_bands_that_are_not_used_do_not_matter() -> None:
     assert not counting.hot_electrons(Rig(detector=Detector(hot_fraction=0.1, noiseless=True)), 3).any()
 
 
-def test_more_defects_keep_those_there_were() -> None:
-    """A larger fraction adds elements; a sensor of another number has others; dead and hot are drawn apart."""
+def test_larger_defect_fraction_keeps_the_defects_of_a_smaller_one() -> None:
+    """A larger fraction adds elements; another unit has others; dead and hot elements are drawn separately."""
     few, many, other = (
         Rig(detector=Detector(dead_fraction=fraction, hot_fraction=fraction, unit=unit))
         for fraction, unit in ((0.01, 0), (0.05, 0), (0.05, 1))
@@ -99,8 +99,8 @@ def test_more_defects_keep_those_there_were() -> None:
 
 
 @pytest.mark.parametrize("unit", ["sigma", "dn"])
-def test_a_bright_roof_saturates(unit: Unit) -> None:
-    """Six deviations below full scale the bound is 0; above it is what is clipped."""
+def test_bright_roof_saturates(unit: Unit) -> None:
+    """Six standard deviations below full scale the bound is 0; above it the bound is the clipped light."""
     well = LineCamera().full_scale_e
     assert counting.SATURATION.bound(probe(100, well - 6.2 * np.sqrt(well + 400) - 20, unit), RIG).value == 0
     bound, lost = counting.SATURATION.bound(probe(100, 30_000, unit), RIG), 30_000 + 20 - well
@@ -117,7 +117,7 @@ def test_a_bright_roof_saturates(unit: Unit) -> None:
 
 
 def test_quantisation_is_half_a_dn() -> None:
-    """In units of the smallest noise, or one DN; and rounding changes no number by more."""
+    """The bound is in units of the smallest noise, or of one DN; rounding changes no number by more than half a DN."""
     assert counting.QUANTISATION.bound(probe(100, 1000, "dn"), RIG).value == 0.5
     assert counting.QUANTISATION.bound(probe(0, 1000), RIG).value == pytest.approx(0.5 / 4)
     light: NDArray[np.float32] = np.random.default_rng(0).uniform(0, 9000, (6, 640, 3)).astype(np.float32)
@@ -128,13 +128,13 @@ def test_quantisation_is_half_a_dn() -> None:
 @pytest.mark.parametrize(
     ("deg_c", "factor"), [(25.0, 1.0), (0.0, 0.1056), (-40.0, 1.12e-3), (-80.0, 1.97e-6), (50.0, 6.80)]
 )
-def test_warmth_by_hand(deg_c: float, factor: float) -> None:
+def test_dark_current_factor_matches_hand_calculation(deg_c: float, factor: float) -> None:
     """Worked with a pocket calculator: at -80 deg C (193.15 / 298.15)^1.5 exp(21.629 - 34.114) = 1.97e-6."""
     assert counting.warmth(deg_c) == pytest.approx(factor, rel=3e-3)
 
 
 @pytest.mark.parametrize("deg_c", [-80.5, 51.0])
-def test_beyond_the_laws_range_is_refused(deg_c: float) -> None:
-    """Below, other leaks lead; above, what diffuses from the bulk."""
+def test_temperature_beyond_the_range_of_the_law_is_refused(deg_c: float) -> None:
+    """Other leakage dominates below the range, and diffusion from the bulk above it."""
     with pytest.raises(SettingsError, match=r"detector\.temperature_deg_c must be a number from -80 to 50 deg C"):
         Rig(detector=Detector(temperature_deg_c=deg_c))

@@ -1,4 +1,4 @@
-"""Diffraction: widths, contrast, the kernels that stand for it, and the reference that sums all waves of a pupil."""
+"""Diffraction: widths, contrast, the kernels that model it, and the reference that sums all waves of a pupil."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ NM = np.array([400.0, 700.0, 1000.0])
 RADIAN_PX = NM * 1e-9 / 15e-3 / RIG.camera.ifov_rad  # lambda / D
 
 
-def test_widths_at_rest():
-    """0.37 px at 400 nm and 0.92 px at 1000 nm along the scan, where 10.6 mm are seen; 0.71 of it along the line."""
+def test_airy_widths_at_rest_match_hand_calculation():
+    """With 10.6 mm along the scan, widths are 0.37 px at 400 nm and 0.92 px at 1000; along the line 0.71 of it."""
     waves = DIFFRACTION.moments(RIG, NM, "airy").waves
     along, scan = 1.029 * waves  # full widths at half maximum of the pattern, of the wavelength over the pupil's widths
     assert scan[[0, 2]] == pytest.approx([0.37, 0.92], abs=0.005)
@@ -44,10 +44,10 @@ def test_contrast_of_the_pupil_is_the_transform_of_its_pattern(u: float):
 
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("cycles", [0.02, 0.1, 0.15, 0.2, 0.35])
-def test_rendered_waves_are_those_of_the_pupil(axis: int, cycles: float):
-    """Of a scene's wave every sample shows what the pupil, slit, pixel and linear interpolation leave: to 0.0015.
+def test_rendered_waves_have_the_contrast_of_the_pupil(axis: int, cycles: float):
+    """Every sample shows the wave that pupil, slit, pixel and linear interpolation leave, to 0.0015.
 
-    Interpolation adds fainter waves of whole cycles per px more and less; each meets the pupil as well.
+    Interpolation adds fainter waves of whole cycles per px more and less; each passes the pupil as well.
     """
     where = np.arange(900) - 449.5
     wave = 1 + np.cos(2 * np.pi * cycles * where)
@@ -63,15 +63,15 @@ def test_rendered_waves_are_those_of_the_pupil(axis: int, cycles: float):
     for more in range(-4, 5):
         f = cycles + more
         left = np.sinc(f) ** 2 * np.sinc(f * box) * pupil_contrast(np.abs(f) * RADIAN_PX * width)
-        # pixels lie half a px beside the middle: there the wave has its crest
+        # pixels lie half a px off the middle, where the wave has its crest
         wanted += left * np.cos(2 * np.pi * (cycles * place + more * (place + 0.5)))
     np.testing.assert_allclose(profile, wanted, atol=1.5e-3)
 
 
 @pytest.mark.parametrize("aperture_mm", [12.0, 15.0, 25.0])
 @pytest.mark.parametrize("keystone_px", [0.0, 0.15])
-def test_few_kernels_pass_what_the_pupil_passes(aperture_mm: float, keystone_px: float):
-    """Of 60 bands none errs by more than 0.002 of any wave, 0.0017 from 0.1 to 0.2 cycles per px, 0.0008 below 0.03."""
+def test_few_kernels_have_the_contrast_of_the_pupil(aperture_mm: float, keystone_px: float):
+    """In 60 bands no wave errs by more than 0.002, 0.0017 from 0.1 to 0.2 cycles per px, and 0.0008 below 0.03."""
     rig, nm = Rig(optics=Optics(aperture_mm=aperture_mm, keystone_px=keystone_px)), np.linspace(400, 1000, 60)
     blurs = Moments.together(
         [blur.moments(rig, nm, blur.variants[0]) for blur in (DIFFRACTION, ABERRATION, KEYSTONE)], len(nm)
@@ -98,7 +98,7 @@ def test_few_kernels_pass_what_the_pupil_passes(aperture_mm: float, keystone_px:
 
 
 def _left(along: np.ndarray, scan: np.ndarray, shift: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """What Gaussians leave of waves, (wave, kernel)."""
+    """Return the contrast that Gaussians leave of waves, (wave, kernel)."""
     turned = np.outer(along, shift[0]) + np.outer(scan, shift[1])
     return np.exp(
         -2j * np.pi * turned - 2 * np.pi**2 * (np.outer(along**2, variance[0]) + np.outer(scan**2, variance[1]))
@@ -119,16 +119,16 @@ def few(tile: Tile) -> Tile:
     return replace(tile, samples=tile.samples[:1])
 
 
-def test_quadrature_over_chords_is_the_closed_form() -> None:
-    """What a round pupil passes of a wave, integrated, is Goodman's formula."""
+def test_quadrature_over_chords_matches_the_closed_form() -> None:
+    """The integrated contrast of a round pupil is Goodman's formula."""
     u, passed = autocorrelation()
     np.testing.assert_allclose(passed, pupil_contrast(u), atol=1e-6)
 
 
 @pytest.mark.parametrize(("number", "focus_m"), [(23, None), (32, math.inf)], ids=["sharp", "out of focus"])
-def test_kernels_show_what_the_pupil_does(number: int, focus_m: float | None) -> None:
-    """Of noise, edges, points and beside wide bright fields light is within 0.1 sigma of the integral.
+def test_rendered_light_matches_the_integral_over_the_pupil(number: int, focus_m: float | None) -> None:
+    """Light beside a wide bright field is within 0.1 sigma of the integral.
 
-    Out of focus as well, 40 m away when focused at infinity.
+    So is noise that is out of focus, 40 m away with the focus at infinity.
     """
     assert distances(few(random_tile(number, focus_m))).max() < 0.1

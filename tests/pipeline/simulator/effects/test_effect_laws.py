@@ -1,4 +1,4 @@
-"""Laws of every effect: absent is nothing, bounds hold, blocks do not matter, the seed decides, all are named."""
+"""Laws of every effect: absent ones change nothing, bounds hold, block size does not matter, seeds decide draws."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from tests.pipeline.simulator.made_up_effects import even_probe
 from tests.pipeline.simulator.random_cases import random_case
 from tests.pipeline.simulator.small_scenes import made_scene
 
-RIG = Rig(  # that has every effect
+RIG = Rig(  # with every effect
     LineCamera(samples=48, exposure_ms=20.0),
     Optics(aberration_px=0.3, keystone_px=0.4, smile_nm=0.8, stray_fraction=0.02, stray_halo_px=8.0),
     MirrorMotion(positions_per_line=1.5, repeatability_urad=40.0, hysteresis_px=3.0, drift_px_per_min=50.0),
@@ -40,7 +40,7 @@ RIG = Rig(  # that has every effect
     Air(40.0, "step", 30.0, 60.0, visibility_km=2.0, turbulence_cn2=1e-12, wind_amplitude_m=0.02),
     Sky(datetime(2026, 6, 21, 5, 34, tzinfo=UTC), cloud_fraction=0.4, cloud_size_px=40.0, hot_spot=0.1),
 )
-WITHOUT: dict[str, dict[str, Any]] = {  # what a rig is like that lacks an effect
+WITHOUT: dict[str, dict[str, Any]] = {  # settings of a rig that lacks an effect
     "staircase": {"mirror": {"positions_per_line": 1.0}},
     "jitter": {"mirror": {"repeatability_urad": 0.0}},
     "hysteresis": {"mirror": {"hysteresis_px": 0.0}},
@@ -67,10 +67,10 @@ WITHOUT: dict[str, dict[str, Any]] = {  # what a rig is like that lacks an effec
     "shot": {"detector": {"noiseless": True}},
     "read-noise": {"camera": {"read_noise_e": 0.0}},
 }
-OF_THE_SEED = {"jitter", "turbulence", "wind", "cloud", "shot", "read-noise"}  # all else belongs to the rig
+OF_THE_SEED = {"jitter", "turbulence", "wind", "cloud", "shot", "read-noise"}  # all others belong to the rig
 FINE = Sweep("fine", "fine", "x", 3.0, -12.0, 15)
 COARSE = Sweep("coarse", "coarse", "y", -6.0, -9.0, 5, 4, 4)
-CASES = (1, 5, 6, 8, 10, 11)  # the fewest of the first twelve that find each of the 174 low bounds that those find
+CASES = (1, 5, 6, 8, 10, 11)  # the fewest of the first twelve cases that find all 174 low bounds which those find
 each_effect = pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect.name)
 each_variant = pytest.mark.parametrize(
     ("effect", "variant"),
@@ -81,7 +81,7 @@ each_variant = pytest.mark.parametrize(
 
 @cache
 def scene(flat: bool = False) -> RasterScene:
-    """Three components of 6 bands of 2 nm, a grain that differs at every pixel, or none; one bright pixel."""
+    """Return 3 components of 6 bands of 2 nm: grain that differs at every pixel, with a bright pixel, or ``flat``."""
     rng = np.random.default_rng(0)
     planes = np.full((60, 70, 3), 0.5) if flat else rng.uniform(0, 1, (60, 70, 3))
     planes[31, 36] *= 1 if flat else 8
@@ -91,19 +91,19 @@ def scene(flat: bool = False) -> RasterScene:
 
 @cache
 def probe(flat: bool = False) -> Probe:
-    """What the decision sees of it."""
+    """Return the probe of the scene, on which the decision is based."""
     return replace(probe_scene(scene(flat), RIG, (FINE,)), seconds=600.0)
 
 
 def rig_without(name: str) -> Rig:
-    """The rig less one effect."""
+    """Return the rig without one effect."""
     return replace(RIG, **{part: replace(getattr(RIG, part), **values) for part, values in WITHOUT[name].items()})
 
 
 def taken(
     chosen: dict[Effect, str], rig: Rig = RIG, lines: range | None = None, *, sweep: Sweep = FINE, seed: int = 0
 ) -> tuple[NDArray[np.float32], NDArray[np.uint16]]:
-    """Light and raw numbers of some lines through turned slits and what is chosen."""
+    """Return light and raw numbers of some lines, with rotated slits and the chosen effects."""
     with_rays = {ROTATION: "rays", SLIT: "1x1"} | chosen
     ordered = {one: with_rays[one] for one in EFFECTS if one in with_rays}
     block = sweep_block(scene(), rig, sweep, lines or range(sweep.lines), seed=seed, started_s=500.0)
@@ -112,8 +112,8 @@ def taken(
 
 
 @pytest.mark.parametrize("name", WITHOUT)
-def test_what_a_rig_lacks_is_nothing(name: str):
-    """Its bound is 0 and the numbers are those without it; where the rig has it they are not."""
+def test_effect_that_the_rig_lacks_changes_nothing(name: str):
+    """The effect's bound is 0 and the numbers are those without it; on a rig that has the effect they differ."""
     effect, lacking = BY_NAME[name], rig_without(name)
     assert effect.bound(probe(), lacking).value == 0
     for variant in effect.variants:
@@ -124,8 +124,8 @@ def test_what_a_rig_lacks_is_nothing(name: str):
 
 @each_variant
 @pytest.mark.parametrize("sweep", [FINE, COARSE], ids=["fine", "coarse"])
-def test_blocks_do_not_matter(effect: Effect, variant: str, sweep: Sweep):
-    """Lines one by one and by threes have the bits of all at once."""
+def test_lines_do_not_depend_on_the_block_size(effect: Effect, variant: str, sweep: Sweep):
+    """Blocks of one and of three lines have the bits of the whole sweep."""
     whole = taken({effect: variant}, sweep=sweep)
     for size in (1, 3):
         blocks = [range(first, first + size) for first in range(0, sweep.lines - size + 1, 2 * size)]
@@ -135,8 +135,8 @@ def test_blocks_do_not_matter(effect: Effect, variant: str, sweep: Sweep):
 
 
 @each_variant
-def test_the_seed_decides_what_is_drawn_and_nothing_else(effect: Effect, variant: str):
-    """The same seed gives the same numbers; another changes those of the draws of a survey alone."""
+def test_seed_changes_only_the_draws_of_a_survey(effect: Effect, variant: str):
+    """The same seed gives the same numbers; another seed leaves all effects of the rig itself unchanged."""
     one, same, other = (taken({effect: variant}, seed=seed)[1] for seed in (1, 1, 2))
     np.testing.assert_array_equal(one, same)
     assert (one != other).any() == (effect.name in OF_THE_SEED)
@@ -144,7 +144,7 @@ def test_the_seed_decides_what_is_drawn_and_nothing_else(effect: Effect, variant
 
 @each_effect
 def test_effects_are_complete(effect: Effect):
-    """Variants with a cost each, finite bounds with reasons, the exact one's 0, and fit for a key."""
+    """Each variant has a cost, bounds are finite with reasons, the exact one's is 0, and effects are hashable."""
     assert effect.variants
     assert OFF not in effect.variants
     assert set(effect.cost_ns) == set(effect.variants)
@@ -161,7 +161,7 @@ def test_effects_are_complete(effect: Effect):
 
 @pytest.mark.parametrize("effect", [*AIMS, *RAYS, *FOOTPRINT], ids=lambda effect: effect.name)
 def test_flat_scenes_show_no_shift_and_no_blur(effect: Effect):
-    """Bound 0 without slope, curvature and span; none where no line is taken but for the air's and the footprint's."""
+    """The bound is 0 without slope, curvature and span; without lines it is 0 for mirror, rotation, parallax, smear."""
     for variant in (OFF, *effect.variants):
         assert effect.bound(probe(flat=True), RIG, variant).value == pytest.approx(0, abs=1e-3)
     none = even_probe(sweeps=(), lines=0, slope=np.ones((2, 1)), curvature=np.ones((2, 1)))
@@ -170,11 +170,11 @@ def test_flat_scenes_show_no_shift_and_no_blur(effect: Effect):
 
 
 @pytest.mark.parametrize("number", CASES)
-def test_no_change_exceeds_what_the_decision_counts(number: int):
-    """Each effect left out, and each variant taken, beside all others exact, as samples and in sums of 2 to 8.
+def test_no_change_exceeds_its_bound(number: int):
+    """Each effect is left out and each variant taken, with all others exact, as samples and in sums of 2 to 8.
 
-    The last, in sums of 4, has a mirror that swings within its exposures: that is left out with the smear. On 200 cases
-    in `python tests/benchmarks effects`.
+    The last case, in sums of 4, has a mirror that swings within its exposures: that is left out with the smear.
+    `python tests/benchmarks effects` checks 200 cases.
     """
     broken = [trial for trial in trials(random_case(number), (1, 2 + (number + 5) % 7)) if trial.is_broken]
     assert broken == []
@@ -182,7 +182,7 @@ def test_no_change_exceeds_what_the_decision_counts(number: int):
 
 @each_variant
 def test_no_variant_makes_light_negative(effect: Effect, variant: str):
-    """A bright pixel through every variant of every effect, beside all exact blurs, gives finite light from 0 on."""
+    """One bright pixel through every variant of every effect, with all exact blurs, gives finite light of 0 or more."""
     blurs: dict[Effect, str] = {blur: blur.variants[0] for blur in FOOTPRINT if hasattr(blur, "moments")}
     light = taken(blurs | {effect: variant})[0]
     assert np.isfinite(light).all()
@@ -191,8 +191,8 @@ def test_no_variant_makes_light_negative(effect: Effect, variant: str):
 
 @each_effect
 @pytest.mark.parametrize("step", [1, 4])
-def test_extreme_rigs_give_numbers(effect: Effect, step: int):
-    """At either end of what mirror and air may be, light and bounds are finite, for a block of no line as well."""
+def test_extreme_rigs_give_finite_light(effect: Effect, step: int):
+    """At the limits of mirror and air settings light is finite, also in a block without lines; no bound is negative."""
     slow = MirrorMotion(0.1, 0.01, 0.0, 0.01, 1e3, 1e2, 1e2)
     stiff = MirrorMotion(1e5, 10.0, 1e4, 1e4, 0.0, 0.0, 0.0)
     far = Air(distance_m=np.inf, relief="plane", nearest_m=1e-3, wind_amplitude_m=100.0, wind_hz=50.0)
@@ -206,8 +206,8 @@ def test_extreme_rigs_give_numbers(effect: Effect, step: int):
             assert effect.bound(replace(probe(), sweeps=(sweep,)), rig, variant).value >= 0
 
 
-def test_the_manifest_names_every_effect():
-    """In the order of the chain; at tolerance 0 all that the rig has are on and exact, and one it lacks is absent."""
+def test_manifest_lists_every_effect():
+    """The order is the chain's; at tolerance 0 all effects of the rig are on and exact, and any others absent."""
     rows = list_effects(decide(probe(), RIG, EFFECTS, 0.0))
     assert [row["name"] for row in rows] == [effect.name for effect in EFFECTS]
     others = [row for row in rows if row["variant"] != BY_NAME[row["name"]].variants[0]]
@@ -217,7 +217,7 @@ def test_the_manifest_names_every_effect():
 
 
 def test_every_effect_of_every_module_is_registered_once():
-    """A module that is forgotten would never be computed."""
+    """The effects of a forgotten module would never be computed."""
     modules = [
         importlib.import_module(f"{package.__name__}.{one.name}") for one in pkgutil.iter_modules(package.__path__)
     ]

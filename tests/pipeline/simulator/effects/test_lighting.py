@@ -1,4 +1,4 @@
-"""Light of sun and sky: reflectance by angle, clouds and the day's course, by hand, and their bounds."""
+"""Light of sun and sky: reflectance by angle and cloud shadows, by hand, over time and for crossing sweeps."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pipeline.simulator.rig_model import Rig
 from tests.pipeline.simulator.outdoors import SWEEP, block_of, rig_with
 
 
-def test_slope_along_a_line_by_hand() -> None:
+def test_reflectance_slope_along_a_line_matches_hand_calculation() -> None:
     """640 px are 3.9 deg, so that 0.1/rad is a slope of 0.68 % from end to end."""
     gain = BRDF.gain(block_of(rig_with(brdf_per_rad=0.1), range(30, 31)), "angles")[0, :, 0]
     assert gain[-1] - gain[0] == pytest.approx(0.1 * np.deg2rad(3.87), rel=2e-3)
@@ -23,7 +23,7 @@ def test_slope_along_a_line_by_hand() -> None:
 
 
 def test_hot_spot_is_a_cusp() -> None:
-    """Its peak is its height; 2 deg away it is down to 1/e; its slope breaks at the peak."""
+    """The peak has the stated height, falls to 1/e at 2 deg, and breaks the slope."""
     rig = rig_with(brdf_per_rad=0.0, hot_spot=0.05)
     extra = BRDF.gain(block_of(rig, range(30, 31)), "angles")[0, :, 0].astype(np.float64) - 1
     assert extra.max() == pytest.approx(0.05, rel=2e-3)
@@ -35,7 +35,7 @@ def test_hot_spot_is_a_cusp() -> None:
 
 
 def test_reflectance_is_never_negative() -> None:
-    """The steepest slope ends at 0."""
+    """The gain of the steepest slope ends at 0."""
     rig = rig_with(brdf_per_rad=5.0)
     gain = BRDF.gain(block_of(rig, sweep=replace(SWEEP, swath_px=-3000.0)), "angles")
     assert gain.min() == 0
@@ -45,14 +45,14 @@ SIZE = 300.0
 RIG = rig_with(cloud_fraction=0.6, cloud_size_px=SIZE)
 
 
-def test_a_shadow_by_hand() -> None:
-    """Full in the middle, none between two, a half in the middle of an edge."""
+def test_cloud_shadow_matches_hand_calculation() -> None:
+    """The shadow is full in the middle, absent between two shadows, and a half in the middle of an edge."""
     np.testing.assert_allclose(shadow(np.array([0, 150, 300, 450, 600.0]), SIZE), [1, 0.5, 0, 0.5, 1], atol=1e-12)
 
 
 @given(way=st.floats(-1e6, 1e6), size=st.floats(1, 1e5))
-def test_shadows_are_soft_and_come_again(way: float, size: float) -> None:
-    """Between 0 and 1, even about the middle, with a period of two sizes and a slope of at most 1.5 over the edge."""
+def test_cloud_shadows_are_smooth_and_periodic(way: float, size: float) -> None:
+    """Shadows lie between 0 and 1 and are even; their period is two sizes, their slope at most 1.5 over the edge."""
     step = 1e-3 * size
     here, there = shadow(np.array([way, way + step]), size)
     assert 0 <= here <= 1
@@ -61,8 +61,8 @@ def test_shadows_are_soft_and_come_again(way: float, size: float) -> None:
     assert shadow(np.array([way + 2 * size]), size)[0] == pytest.approx(here, abs=1e-6)
 
 
-def test_shadow_moves_at_its_speed() -> None:
-    """Where a shadow is, it has come by its speed: a later line sees what another place saw before."""
+def test_cloud_shadow_moves_at_its_speed() -> None:
+    """The light changes with time and repeats after one period; without speed it is constant."""
     still, quick = (rig_with(cloud_fraction=0.6, cloud_size_px=SIZE, cloud_px_per_s=speed) for speed in (0.0, 50.0))
     now, later = (CLOUD.gain(block_of(quick, range(1), started_s=start), "shadow") for start in (0.0, 12.0))
     np.testing.assert_allclose(now, later, atol=1e-5)  # 12 s at 50 px/s are one period
@@ -76,8 +76,8 @@ def test_shadow_moves_at_its_speed() -> None:
     [(BRDF, rig_with(brdf_per_rad=0.4, hot_spot=0.1), 100.0, 1e-5), (CLOUD, RIG, 0.0, 1e-6)],
     ids=["reflectance", "shadow"],
 )
-def test_crossing_sweeps_see_the_same(effect: Any, rig: Rig, place_px: float, apart: float) -> None:
-    """Light belongs to the scene: two sweeps of any name that cross see the same where and when they do."""
+def test_crossing_sweeps_have_the_same_gain(effect: Any, rig: Rig, place_px: float, apart: float) -> None:
+    """Light belongs to the scene: two sweeps of any name have the same gain at the same place and time."""
     along_x = replace(SWEEP, name="a", swath_px=0.0, start_px=place_px)
     along_y = replace(SWEEP, name="b", along="y", swath_px=place_px, start_px=0.0)
     blocks = (block_of(rig, range(1), sweep=sweep) for sweep in (along_x, along_y))

@@ -1,4 +1,4 @@
-"""A line's footprint: boxes of slit and pixel, held positions, rotation, and what leaving them out changes."""
+"""A line's footprint: boxes of slit and pixel, held positions, rotation, and the changes without them."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SWEEP = Sweep("s", "fine", "x", swath_px=0.0, start_px=-14.5, lines=30)
 
 @pytest.mark.parametrize("variant", SLIT.variants)
 def test_point_is_spread_by_the_closed_form_of_the_box(variant: str) -> None:
-    """Of a bright pixel, lines at pixel centres show the box over linear interpolation, in closed form."""
+    """Lines at pixel centres show a bright pixel as the box over linear interpolation."""
     values = np.zeros((40, 64, 1))
     values[20, 30] = 1.0
     scene = image_scene(values, RIG.camera, [550.0])
@@ -39,8 +39,8 @@ def test_point_is_spread_by_the_closed_form_of_the_box(variant: str) -> None:
     np.testing.assert_allclose(got, wanted, atol=3e-5)
 
 
-def test_no_smear_where_every_line_has_one_position() -> None:
-    """Fine lines stand still: the bound is 0 and the position that of mid exposure."""
+def test_lines_with_one_position_have_no_smear() -> None:
+    """Fine lines stand still: the bound is 0 and the position is that of mid-exposure."""
     sweep = Sweep("s", "fine", "x", swath_px=0.0, start_px=0.0, lines=4)
     scene = image_scene(np.random.default_rng(0).uniform(0, 1, (30, 60, 1)), RIG.camera, [550.0])
     assert SMEAR.bound(probe_scene(scene, RIG, [sweep]), RIG).value == 0
@@ -48,15 +48,15 @@ def test_no_smear_where_every_line_has_one_position() -> None:
     np.testing.assert_array_equal(smeared_positions(block, "positions"), block.middle[:, None])
 
 
-def test_folded_smear_counts_what_sways_within_an_exposure() -> None:
-    """Wind that pulls held positions apart: a random rig on which the bound without it is broken five times over."""
+def test_folded_smear_counts_motion_within_an_exposure() -> None:
+    """Wind pulls held positions apart: on this random rig the bound without that is exceeded by a factor of five."""
     (trial,) = (one for one in trials(random_case(194), only="smear") if one.variant == "folded")
     assert trial.measured > 0.03
     assert not trial.is_broken
 
 
-def test_ends_of_a_line_are_turned_by_the_line_rotation() -> None:
-    """The ends of a line of 640 samples lie 320 px times the sine of its rotation off the plan, and stretched."""
+def test_bound_of_rotation_covers_the_ends_of_a_line() -> None:
+    """The ends of a line of 640 samples lie 320 px times the sine of its rotation off the plan, and are stretched."""
     camera = LineCamera()
     sweep = Sweep("s", "fine", "x", swath_px=1500.0, start_px=800.0, lines=1)
     scene = image_scene(np.ones((4, 4, 1)), camera, [550.0])

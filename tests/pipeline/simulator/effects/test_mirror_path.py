@@ -1,4 +1,4 @@
-"""How the mirror follows: the matrix exponential at any damping, the staircase of the path, and their bounds."""
+"""Motion of the mirror: the matrix exponential at any damping, the staircase of the path, and their bounds."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ SWEEP = Sweep("swath", "fine", "x", 0.0, -100.0, 200)
 
 
 def rig(exposure_ms: float = 3.0, **mirror: float) -> Rig:
-    """A rig with the default mirror, or one changed in some numbers."""
+    """Return a rig with the default mirror, or one with some settings changed."""
     return Rig(camera=LineCamera(exposure_ms=exposure_ms), mirror=replace(MirrorMotion(), **mirror))
 
 
 @pytest.mark.parametrize("damping", [0.01, 0.7, 1 - 1e-9, 1.0, 1 + 1e-12, 1 + 1e-6, 1.5, 10.0])
 @pytest.mark.parametrize("time", [0.0, 1e-12, 1e-4, 0.02, 0.3, 1.0, 30.0, 1e6])
-def test_responses_agree_with_fifty_digits(damping: float, time: float):
-    """Impulse and step response below, at or above damping 1, early or late."""
+def test_responses_match_arithmetic_of_50_digits(damping: float, time: float):
+    """Impulse and step response agree below, at and above damping 1, early and late."""
     with mpmath.workdps(50):
         z, t = mpmath.mpf(damping), mpmath.mpf(time)
         root = mpmath.sqrt(z * z - 1)
@@ -43,8 +43,8 @@ def test_responses_agree_with_fifty_digits(damping: float, time: float):
 @pytest.mark.parametrize(
     ("exposure_ms", "step", "positions"), [(3.0, 1, 1.0), (5.0, 4, 1.0), (4.0, 2, 1.5), (1.0, 3, 1)]
 )
-def test_transient_is_that_of_the_whole_motion(damping: float, exposure_ms: float, step: int, positions: float):
-    """Integrating the mirror step by step from rest, less the same after a long run-in, gives the transient."""
+def test_transient_matches_the_integrated_motion(damping: float, exposure_ms: float, step: int, positions: float):
+    """The motion from rest, minus that after a long run-in, is integrated step by step."""
     of_mirror = rig(exposure_ms, damping=damping, positions_per_line=positions, settled_s=50.0)
     sweep = replace(SWEEP, lines=20, step=step)
     found = transient(of_mirror, sweep, np.arange(20))
@@ -53,11 +53,11 @@ def test_transient_is_that_of_the_whole_motion(damping: float, exposure_ms: floa
 
 
 def driven(of_mirror: Rig, sweep: Sweep, run_in: int) -> np.ndarray:
-    """Means over held px of path of a mirror fed step by step, its motion starting so many lines earlier."""
+    """Return means over held px of the path of a mirror driven step by step, with a run-in of so many lines."""
     camera, mirror = of_mirror.camera, of_mirror.mirror
     pace, count = 2e-3 * np.pi * mirror.natural_hz, round(mirror.positions_per_line * sweep.step)
     moves = np.array([[0.0, 1.0], [-1.0, -2 * mirror.damping]])
-    tick = camera.exposure_ms / (sweep.step * count) * pace  # divides held px and positions alike
+    tick = camera.exposure_ms / (sweep.step * count) * pace  # divides both held px and positions
     advance = expm(moves * tick)
     mean = np.linalg.solve(moves, advance - np.eye(2)) / tick
     rest = expm(moves * pace * (camera.frame_ms - camera.exposure_ms))
@@ -73,8 +73,8 @@ def driven(of_mirror: Rig, sweep: Sweep, run_in: int) -> np.ndarray:
     return np.array(means[run_in:])
 
 
-def test_settling_takes_the_way_back_away():
-    """Without time to settle the sweep begins where the mirror comes from; the default leaves nothing of it."""
+def test_settling_removes_the_initial_transient():
+    """Without settling a sweep begins over 10 px off, where the mirror comes from; the default leaves under 1e-4 px."""
     slow = rig(100.0, settled_s=0.0)
     assert transient(slow, SWEEP, np.arange(1))[0, 0] > 10
     assert abs(transient(rig(100.0), SWEEP, np.arange(1))[0, 0]) < 1e-4
@@ -83,7 +83,7 @@ def test_settling_takes_the_way_back_away():
 @settings(max_examples=20, deadline=None)
 @given(st.floats(0.01, 10.0), st.floats(0.5, 1000.0), st.floats(0.1, 500.0), st.floats(0.0, 1.0), st.integers(1, 5))
 def test_any_mirror_is_finite_and_within_its_bound(damping: float, ms: float, hz: float, settled: float, step: int):
-    """Stiff or slack, no NaN; and the change of a wave stays below the bound."""
+    """Stiff and slow mirrors give no NaN, and the change of a wave stays below the bound."""
     of_mirror, sweep = rig(ms, damping=damping, natural_hz=hz, settled_s=settled), replace(SWEEP, lines=30, step=step)
     numbers, places = np.arange(30), np.linspace(0, 2 * np.pi, 25)[:, None]
     shift, held = transient(of_mirror, sweep, numbers), np.arange(step)
@@ -94,8 +94,8 @@ def test_any_mirror_is_finite_and_within_its_bound(damping: float, ms: float, hz
 
 @settings(max_examples=30, deadline=None)
 @given(st.floats(0.05, 40.0), st.integers(1, 5), st.integers(1, 4))
-def test_parts_are_means_of_the_held_positions(positions: float, step: int, parts: int):
-    """Each part has the mean of what the mirror holds in it, taken here at many moments."""
+def test_staircase_parts_are_means_of_held_positions(positions: float, step: int, parts: int):
+    """Each part is compared with the mean of the held position over 4000 moments."""
     found, moment = beside_plan(positions, step, np.arange(7), parts), (np.arange(4000) + 0.5) / 4000
     for line in (0, 6):
         time = line * step + (np.arange(step * parts)[:, None] + moment) / parts

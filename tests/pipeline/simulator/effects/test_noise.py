@@ -1,4 +1,4 @@
-"""Draws are normal, counts are Poisson, cheap counts are so where their bound holds, and pairs stay pairs."""
+"""Draws of noise: deviates are normal, counts are Poisson, and cheap counts are so within their bounds."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ Radiance = NDArray[np.float32]
 
 
 def deviates(count: int = DRAWS, seed: int = 0) -> Radiance:
-    """Standard normal numbers of one seed."""
+    """Return standard normal numbers of one seed."""
     return counting.normal_deviates(np.random.Generator(np.random.Philox(seed)), count)
 
 
 def even(level: float, count: int = DRAWS) -> Radiance:
-    """Light that is the same everywhere."""
+    """Return light that is the same everywhere."""
     return np.full(count, level, np.float32)
 
 
 def read(light: Radiance, deviate: Radiance, added: Radiance | None = None) -> NDArray[np.float64]:
-    """Numbers of light with its own noise and 20 e- of the amplifier, of 1 e- each, from `DARK_DN` on."""
+    """Return numbers of light with shot noise and 20 e- of read noise, at 1 e- each, from `DARK_DN` upwards."""
     raw = np.empty(len(light), np.uint16)
     more = np.zeros(1, np.float32) if added is None else added
     assert read_merged(light, more, deviate, 20.0, 1.0, DARK_DN, 65_535, raw)
@@ -37,13 +37,13 @@ def read(light: Radiance, deviate: Radiance, added: Radiance | None = None) -> N
 
 
 def fit(counts: Radiance, edges: NDArray[np.float64], chances: NDArray[np.float64]) -> float:
-    """The p-value of a chi-square test of numbers in classes up to and with each edge."""
+    """Return the p-value of a chi-square test of numbers in classes up to and including each edge."""
     seen = np.bincount(np.searchsorted(edges, counts), minlength=len(edges) + 1)
     return float(stats.chisquare(seen, chances / chances.sum() * len(counts)).pvalue)
 
 
 def poisson_fit(counts: Radiance, level: float) -> float:
-    """The p-value of counts against Poisson, in at most 200 classes, the tails of 1e-4 among them."""
+    """Return the p-value of counts against Poisson, in about 200 classes with tails of 1e-4."""
     edges = np.unique(
         stats.poisson.ppf(np.concatenate([[1e-4, 1e-3], np.linspace(0.005, 0.995, 199), [0.9999]]), level)
     )
@@ -51,7 +51,7 @@ def poisson_fit(counts: Radiance, level: float) -> float:
 
 
 def test_deviates_are_normal() -> None:
-    """A million deviates in a thousand classes; mean, variance, skew and kurtosis."""
+    """A million deviates pass a chi-square test in 1000 classes; their first four moments are within 4 sigma."""
     drawn, edges = deviates(1_000_000), stats.norm.ppf(np.arange(1, 1000) / 1000)
     assert fit(drawn, edges, np.full(1000, 1e-3)) > 1e-3
     z = drawn.astype(np.float64)
@@ -59,8 +59,8 @@ def test_deviates_are_normal() -> None:
         assert abs((z**moment).mean() - truth) < 4 * sd / 1000
 
 
-def test_deviates_do_not_go_together() -> None:
-    """Neither neighbours nor the two of a pair, nor their squares, are correlated."""
+def test_deviates_are_uncorrelated() -> None:
+    """Neighbours, the two deviates of a pair, and their squares are not correlated."""
     drawn = deviates(2 * counting.PIECE)
     for lag in (1, 2, counting.PIECE // 2, counting.PIECE):
         one, other = drawn[:-lag], drawn[lag:]
@@ -70,7 +70,7 @@ def test_deviates_do_not_go_together() -> None:
 
 @pytest.mark.parametrize("level", LEVELS)
 def test_exact_counts_are_poisson(level: float) -> None:
-    """Chi-square at 1e-3; mean and variance over the level within 3 sigma of 1."""
+    """Counts pass a chi-square test at 1e-3; mean and variance over the level are within 3 sigma, or 1 %, of 1."""
     level = float(np.float32(level))
     counts = counting.photon_counts(even(level), deviates(seed=int(level)))
     assert poisson_fit(counts, level) > 1e-3
@@ -81,7 +81,7 @@ def test_exact_counts_are_poisson(level: float) -> None:
 @settings(max_examples=30, deadline=None)
 @given(level=st.floats(2**-7, 2.0**17, width=32), z=st.floats(-6.5, 6.5, width=32))
 def test_exact_counts_are_the_quantile(level: float, z: float) -> None:
-    """The count is the least k with F(k) >= Phi(z)."""
+    """The count is the smallest k with F(k) >= Phi(z)."""
     (count,) = counting.photon_counts(even(level, 1), even(z, 1))
     below, upto = stats.poisson.cdf([count - 1, count], level), stats.norm.cdf(z)
     above, least = stats.poisson.sf([count - 1, count], level), stats.norm.sf(z)
@@ -90,16 +90,16 @@ def test_exact_counts_are_the_quantile(level: float, z: float) -> None:
     assert below[1] >= upto * (1 - slack) or above[1] <= least * (1 + slack)
 
 
-def test_counts_of_hardly_any_and_very_much_light() -> None:
-    """0, negative and tiny light give 0; 1e9 and more give finite numbers near what is expected."""
+def test_counts_of_extreme_light_are_finite() -> None:
+    """Light of 0, below 0 or tiny gives 0; 1e9 e- and more give finite numbers near the expected ones."""
     light = np.array([0, -3, 1e-30, 1e9, 1e20], np.float32)
     counts = counting.photon_counts(light, np.array([5, 5, 5, 1, 1], np.float32))
     np.testing.assert_allclose(counts, [0, 0, 0, 1e9 + 1e4**1.125, 1e20], rtol=1e-6)
     assert not counting.photon_counts(light[:3], even(6.7, 3)).any()
 
 
-def test_more_light_gives_no_fewer_counts() -> None:
-    """One deviate, rising light: counts never fall, through small and large means."""
+def test_counts_never_fall_with_more_light() -> None:
+    """With one deviate this holds through small and large means."""
     light = np.geomspace(0.1, 1e5, 20_001).astype(np.float32)
     for z in (-4.0, -1.0, 0.0, 0.7, 5.0):
         assert (np.diff(counting.photon_counts(light, even(z, len(light)))) >= 0).all()
@@ -107,7 +107,7 @@ def test_more_light_gives_no_fewer_counts() -> None:
 
 @pytest.mark.parametrize("level", [700.0, 1000.0, 3000.0, 10_000.0, 60_000.0])
 def test_rounded_counts_are_poisson_where_the_bound_holds(level: float) -> None:
-    """From the least expected electrons on, 2e5 draws pass the test of the exact ones, and hardly one differs."""
+    """From the least expected electrons upwards, 2e5 draws pass the test of exact counts and differ by at most 1."""
     assert level >= counting.least_expected(0.0)
     z = deviates(seed=int(level))
     counts, exact = counting.rounded_counts(even(level), z), counting.photon_counts(even(level), z)
@@ -118,7 +118,7 @@ def test_rounded_counts_are_poisson_where_the_bound_holds(level: float) -> None:
 
 @pytest.mark.parametrize("level", [0.0, 20.0, 150.0, 400.0, 3000.0, 60_000.0])
 def test_merged_noise_has_the_cumulants_of_both(level: float) -> None:
-    """Mean, variance and third cumulant of Poisson plus normal, 20 e-, and of rounding; within 4 sigma."""
+    """Mean, variance and third cumulant are those of Poisson, normal (20 e-) and rounding, within 4 sigma."""
     drawn = read(even(level, 1_000_000), deviates(1_000_000)).astype(np.float64) - level - DARK_DN
     variance = level + 400 + 1 / 12
     assert abs(drawn.mean()) < 4 * np.sqrt(variance / 1e6)
@@ -126,10 +126,10 @@ def test_merged_noise_has_the_cumulants_of_both(level: float) -> None:
     assert abs((drawn**3).mean() - level) < 4 * np.sqrt(15 * variance**3 / 1e6)
 
 
-def test_loops_are_their_formulae() -> None:
+def test_compiled_loops_match_their_formulae() -> None:
     """Deviates are those of Box and Muller's logarithm, sine and cosine to 2e-5, and numbers those of the series.
 
-    Where they stand beside a half, float32 tells: less than one number in a hundred is 1 off.
+    Close to a half float32 decides: less than one number in a hundred is 1 off.
     """
     count = 3 * counting.PIECE + 8
     words = np.random.SFC64(4).random_raw(count // 2).view(np.uint32)
@@ -152,8 +152,8 @@ def test_loops_are_their_formulae() -> None:
 
 
 @pytest.mark.parametrize("value", [np.inf, np.nan, -np.inf])
-def test_loop_tells_what_is_not_finite(value: float) -> None:
-    """Whatever stands in the last place; endless darkness is dark."""
+def test_loop_reports_non_finite_light(value: float) -> None:
+    """NaN and infinity are found in the last place; minus infinity is dark."""
     light, raw = even(100.0, 1030), np.empty(1030, np.uint16)
     light[-1] = value
     told = read_merged(light, np.zeros(1, np.float32), deviates(1030), 20.0, 1.0, DARK_DN, 65_535, raw)
@@ -161,7 +161,7 @@ def test_loop_tells_what_is_not_finite(value: float) -> None:
 
 
 def merged_chances(level: float, read: float, edges: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How likely the cheap draw lies below each edge, by solving its square for the deviate."""
+    """Return the probability that the cheap draw lies below each edge, by solving its square for the deviate."""
     variance = level + read**2
     bend, slope = level / (6 * variance), np.sqrt(variance)
     if bend == 0:
@@ -179,8 +179,8 @@ def merged_chances(level: float, read: float, edges: NDArray[np.float64]) -> NDA
         if level >= counting.least_expected(read)
     ],
 )
-def test_divergence_bounds_the_distributions(level: float, read: float) -> None:
-    """Chi-square divergence of the cheap draw's DN from the exact one's is no more than stated, nor much less."""
+def test_divergence_of_the_cheap_draw_is_within_its_bound(level: float, read: float) -> None:
+    """The chi-square divergence of its DN from the exact draw's is at most 1.2 times the stated divergence."""
     reach = 12 * np.sqrt(level + read**2)
     edges = np.arange((level - reach) // 5, (level + reach) // 5) * 5.0 + 2.5
     counts = np.arange(max(int(level - 12 * np.sqrt(level)), 0), int(level + 12 * np.sqrt(level) + 30))
@@ -192,7 +192,7 @@ def test_divergence_bounds_the_distributions(level: float, read: float) -> None:
 
 
 def test_least_expected_keeps_a_patch_within_its_variation() -> None:
-    """At the default read noise cheap draws serve any light; without, from some 700 e- on; the bound is kept."""
+    """Cheap draws suit any light at the default read noise, and light from about 700 e- without read noise."""
     assert counting.least_expected(20.0) == 0
     assert 600 < counting.least_expected(0.0) < 3000
     for read in (0.0, 1.0, 5.0, 20.0):

@@ -1,4 +1,4 @@
-"""Where the mirror looks: tilt's way into the scene, fields and draws, ends of lines, bounds, and all on a ramp."""
+"""Pointing of the mirror: tilt to scene, fields and draws, ends of lines, bounds, and all effects on a ramp."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ RIG = Rig(mirror=replace(MirrorMotion(), repeatability_urad=40.0))
 
 @pytest.mark.parametrize("position", [(0.0, 0.0), (0.3, 0.4), (-0.7, 0.5), (0.1, -0.9)])
 def test_gains_are_the_derivatives_of_the_reflection(position: tuple[float, float]):
-    """Small turns of the normal about two axes of its own move the view by the gains, anywhere on the disk."""
+    """Small rotations of the normal around two axes move the view by the gains, anywhere on the disk."""
     normal = position_to_normal(position)
     within = np.cross([0.0, 1.0, 0.0], normal)
     within /= np.linalg.norm(within)
@@ -48,7 +48,7 @@ def test_gains_are_the_derivatives_of_the_reflection(position: tuple[float, floa
         np.testing.assert_allclose(tilt_to_scene(normal)[:, column], (seen[0] - seen[1]) / 2e-6, atol=1e-6)
 
 
-def test_spread_of_the_draws():
+def test_jitter_has_the_stated_spread():
     """Lines scatter by .76 px rms along the scan and .54 px along the line, without bias or correlation."""
     shift = JITTER.aim(SweepBlock(RIG, SWEEP, range(1001), np.ones(1), (64, 64)), "exact")[:, 0]
     assert np.std(shift, axis=0) == pytest.approx((0.535, 0.757), rel=0.1)
@@ -61,23 +61,23 @@ HYSTERESIS_RIG = Rig(mirror=replace(MirrorMotion(), hysteresis_px=50.0, drift_px
 
 
 class Returning(Sweep):
-    """A sweep that is scanned the other way."""
+    """A sweep that is scanned in the opposite direction."""
 
     def held_px(self) -> np.ndarray:
-        """From the last position to the first."""
+        """Return positions from the last to the first."""
         return super().held_px()[::-1, ::-1]
 
 
 def block(
     lines: range = range(1401), *, sweep: Sweep = HYSTERESIS_SWEEP, rig: Rig = HYSTERESIS_RIG, started_s: float = 0.0
 ) -> SweepBlock:
-    """Some lines of a sweep."""
+    """Return some lines of a sweep as a block."""
     return SweepBlock(rig, sweep, lines, np.ones(1), (64, 64), started_s=started_s)
 
 
 @pytest.mark.parametrize("unit", range(8))
-def test_field_stays_within_one_and_is_smooth(unit: int):
-    """Over the disk the field is at most 1 in either axis and changes by at most 4 per unit of position."""
+def test_pointing_field_is_bounded_and_smooth(unit: int):
+    """Over the disk the field is at most 1 on either axis and changes by at most 4 per unit of position."""
     grid = np.stack(np.meshgrid(np.linspace(-1, 1, 101), np.linspace(-1, 1, 101)), axis=-1)
     inside = np.hypot(*np.moveaxis(grid, -1, 0)) <= 1
     field = np.where(inside[..., None], pointing_field(unit, grid), np.nan)
@@ -86,7 +86,7 @@ def test_field_stays_within_one_and_is_smooth(unit: int):
     assert np.nanstd(field) > 0.05
 
 
-def test_units_differ_and_a_unit_keeps_its_field():
+def test_hysteresis_depends_on_the_unit_of_the_rig():
     """The field follows from the copy of the rig alone, not from the sweep's name."""
     whole = HYSTERESIS.aim(block(), "exact")
     named = replace(block(), sweep=replace(HYSTERESIS_SWEEP, name="b"))
@@ -95,8 +95,8 @@ def test_units_differ_and_a_unit_keeps_its_field():
     assert not np.isclose(HYSTERESIS.aim(block(rig=other), "exact"), whole).all()
 
 
-def test_sign_is_that_of_the_scan():
-    """A scan that comes back meets the same field with the other sign; one position counts as forward."""
+def test_hysteresis_changes_sign_with_the_scan_direction():
+    """A scan in the opposite direction has the same field with the other sign; a single position counts as forward."""
     forth = HYSTERESIS.aim(block(), "exact")
     back = HYSTERESIS.aim(block(sweep=Returning(**vars(HYSTERESIS_SWEEP))), "exact")
     np.testing.assert_array_equal(back, -forth)
@@ -105,8 +105,8 @@ def test_sign_is_that_of_the_scan():
     assert np.abs(forth).max() <= 50
 
 
-def test_drift_walks_evenly_in_one_direction():
-    """2 px a minute are 2 px after a minute, whatever the direction."""
+def test_thermal_drift_is_linear_in_one_direction():
+    """2 px a minute are 2 px after a minute and 120 px after an hour, in any direction."""
     drift = THERMAL_DRIFT.aim(block(range(601)), "exact")[:, 0]
     assert np.hypot(*(drift[600] - drift[0])) == pytest.approx(2.0, rel=1e-9)
     np.testing.assert_allclose(np.diff(drift, axis=0), np.broadcast_to(drift[1] - drift[0], (600, 2)), atol=1e-12)
@@ -117,16 +117,16 @@ def test_drift_walks_evenly_in_one_direction():
 CAMERA = LineCamera()
 
 
-def test_centres_move_as_they_are_told_and_ends_turn():
-    """The centre's derivatives are the identity; an end of 320 px has .034 px across for every px along."""
+def test_centres_move_by_the_shift_and_ends_rotate():
+    """The centre's derivatives are the identity; an end at 320 px moves .034 px across for every px along."""
     gains = end_gains(Sweep("a", "fine", "x", 0.0, 0.0, 1), CAMERA)[0]
     np.testing.assert_allclose(gains[1], np.eye(2), atol=1e-9)
     np.testing.assert_allclose(np.abs(gains[[0, 2], 1, 0]), 0.0338, atol=2e-4)
 
 
 @pytest.mark.parametrize("swath_px", [0.0, 2000.0, -4000.0])
-def test_no_point_of_a_line_moves_farther(swath_px: float):
-    """Shifts of 5 px in any direction move no point of any line by more than the bound, and some nearly so."""
+def test_no_point_of_a_line_moves_beyond_the_bound(swath_px: float):
+    """Shifts of 5 px in four directions move no point beyond the bound, which is at most 1.1 of the greatest motion."""
     sweep = Sweep("a", "fine", "x", swath_px, -1500.0, 301, step=10)
     plan = np.stack(points_of_scan(swath_px, CAMERA, sweep.line_px()[:, None], CAMERA.pixel_slopes()))
     bound, most = np.array(at_line_ends([sweep], CAMERA, 3.0, 4.0)), np.zeros(2)
@@ -141,15 +141,15 @@ POINTING_ERRORS_SWEEP = Sweep("s", "fine", "x", swath_px=0.0, start_px=-19.5, li
 
 
 def source_of(pointing: PointingErrors | None) -> SimulatedSource:
-    """A source without noise over a smooth scene."""
+    """Return a source without noise over a smooth scene."""
     y, x = np.mgrid[:120, :760]
     values = (1 + 0.3 * np.cos(y / 7) * np.cos(x / 11))[..., None]
     scene = image_scene(values, CAMERA, [500.0])
     return SimulatedSource(scene, Rig(CAMERA), chosen=effects_on("rotation", "slit"), pointing=pointing)
 
 
-def test_mirror_looks_beside_and_reports_the_plan():
-    """An offset shows the scene moved by as much, while the lines and the sweep report planned positions."""
+def test_pointing_offset_moves_the_view_but_not_reported_positions():
+    """The scene appears moved by the offset, while the lines and the sweep report planned positions."""
     errors = PointingErrors(offset_px=20.0, seed=1)
     along, scan = errors.offset("s")
     start_px = float(POINTING_ERRORS_SWEEP.start_px + scan)
@@ -175,7 +175,7 @@ MOVERS = [STAIRCASE, LAG, JITTER, HYSTERESIS, THERMAL_DRIFT, PARALLAX, WIND]
 
 
 def ramp() -> RasterScene:
-    """A scene that rises evenly along x and along y, in two bands of which the second is half as bright."""
+    """Return a scene that rises evenly along x and y, in two bands of which the second is half as bright."""
     y, x = np.mgrid[:161, :161]
     plane = (2000 + SLOPE[0] * (x - 80) + SLOPE[1] * (y - 80)).astype(np.float32)[..., None]
     electrons = np.array([[1.0, 0.5]], np.float32) * np.float32(DEFAULT_EXPOSURE_MS / MIRROR_EFFECTS_CAMERA.exposure_ms)
@@ -183,7 +183,7 @@ def ramp() -> RasterScene:
 
 
 def scan_pass(chosen: dict[Any, str], sweep: Sweep = SWATH, lines: range = range(40), **more: Any) -> np.ndarray:
-    """Light of some lines of the ramp."""
+    """Return the light of some lines of the ramp."""
     scene = ramp()
     block = SweepBlock(MIRROR_EFFECTS_RIG, sweep, lines, scene.wavelength_nm, scene.shape, **more)
     return expected_light(scene, block, {**chosen, **PLAIN})
@@ -191,8 +191,8 @@ def scan_pass(chosen: dict[Any, str], sweep: Sweep = SWATH, lines: range = range
 
 @pytest.mark.parametrize("sweep", [SWATH, ACROSS], ids=["x", "y"])
 @pytest.mark.parametrize("effect", MOVERS, ids=lambda effect: effect.name)
-def test_light_changes_by_slope_times_way(effect: Any, sweep: Sweep):
-    """On a ramp the light changes by the slope times the stated shift or displacement, in either orientation."""
+def test_light_on_a_ramp_changes_by_slope_times_displacement(effect: Any, sweep: Sweep):
+    """The displacement is the stated shift of each effect, in either orientation."""
     found = scan_pass({effect: "exact"}, sweep) - scan_pass({}, sweep)
     block = SweepBlock(MIRROR_EFFECTS_RIG, sweep, range(40), np.array([500.0, 600.0]), (161, 161))
     if hasattr(effect, "aim"):
@@ -203,13 +203,13 @@ def test_light_changes_by_slope_times_way(effect: Any, sweep: Sweep):
     stated = np.broadcast_to(SLOPE[0] * x + SLOPE[1] * y, found.shape[:2])
     away = (
         np.abs(sweep_to_scene(sweep, MIRROR_EFFECTS_CAMERA)[sweep.along == "x"]) > 2
-    )  # a step of depth splits footprints on it
+    )  # a depth step splits footprints on it
     np.testing.assert_allclose(found[..., 0][away], stated[away], rtol=5e-3, atol=0.05)
     np.testing.assert_allclose(found[..., 1], found[..., 0] / 2, atol=2e-3)
     assert np.abs(found).max() > 0.1
 
 
-def test_offsets_of_a_sweep_are_of_its_seed() -> None:
-    """Two surveys have two offsets of the sweep of one name."""
+def test_offset_of_a_sweep_depends_on_the_seed() -> None:
+    """Two surveys have different offsets for sweeps of the same name."""
     one, other = (PointingErrors(6.0, seed).offset("full-0") for seed in (1, 2))
     assert (one != other).all()

@@ -31,8 +31,8 @@ NM = np.linspace(400.0, 1000.0, 25)
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_spectra_behind_gains_are_no_steeper_than_said(seed: int):
-    """Random spectra, two random gains and added light; the greatest gains are taken off."""
+def test_spectra_after_gains_keep_the_stated_slope(seed: int):
+    """Random spectra get two random gains and added light; the greatest gains are divided out."""
     rng = np.random.default_rng(seed)
     spectra, first, second = rng.uniform(50, 100, (4, 25)), rng.uniform(0.5, 1.5, (3, 25)), rng.uniform(0.1, 1, (3, 25))
     added = rng.uniform(0, 20, (3, 25))
@@ -49,37 +49,37 @@ def test_spectra_behind_gains_are_no_steeper_than_said(seed: int):
         assert (steepest_difference(light, NM) / 5 <= greatest * after.spectral_slope + 1e-9).all()
 
 
-def test_even_gains_leave_spectra_as_they_are():
-    """Their factors are for the growth of errors."""
+def test_even_gains_do_not_change_the_spectral_slope():
+    """Their factors count in the growth of errors instead."""
     probe = even_probe(spectral_slope=np.full(1, 0.3))
     after = light_after(probe, RIG, [GainRange.between(1.0, 2.0, 1)])
     assert after.spectral_slope == probe.spectral_slope
 
 
 def test_errors_grow_with_the_light_over_its_noise():
-    """At the darkest sample: 100 e- and 400 e- of read noise doubled, an error of 1 unit is 2 sqrt(502 / 602)."""
+    """Doubling the darkest 100 e-, with 402 e-^2 of fixed noise, turns an error of 1 unit into 2 sqrt(502 / 602)."""
     probe, fixed = even_probe(), fixed_variance(RIG)
     expected = 2 * np.sqrt((100 + fixed) / (200 + fixed))
     assert error_growth(probe, RIG, None, 2.0) == pytest.approx(expected)
     assert error_growth(replace(probe, unit="dn"), RIG, None, 2.0) == 2.0
 
 
-def test_what_a_shadow_takes_counts_by_the_noise_within_it():
-    """Half of 10,000 e- is 5,000 e- over the noise of 5,000 e-."""
+def test_shadow_counts_by_the_noise_within_it():
+    """Half of 10,000 e- counts as 5,000 e- over the noise of 5,000 e-."""
     probe, rig = even_probe(darkest_e=1e4), Rig()
     growth = error_growth(probe, rig, GainRange.between(0.5, 1, 1), 1.0)
     lost = 1e4 / np.sqrt(1e4 + fixed_variance(rig)) / 2 * growth
     assert lost == pytest.approx(5e3 / np.sqrt(5e3 + fixed_variance(rig)))
 
 
-def test_steeper_neighbour_counts():
-    """Steps of 2 over 1 nm and 9 over 3 nm: slopes 2 and 3, the middle band takes the greater."""
+def test_spectral_slope_is_that_of_the_steeper_neighbour():
+    """Steps of 2 over 1 nm and of 9 over 3 nm have slopes of 2 and 3; the middle band takes the greater."""
     found = steepest_difference(np.array([[0.0, 2.0, 11.0]]), np.array([400.0, 401.0, 404.0]))
     np.testing.assert_allclose(found, [[2, 3, 3]])
 
 
 def test_bands_of_two_detectors_are_not_neighbours():
-    """Where wavelengths fall back or repeat, a run ends: finite numbers, and none across."""
+    """A run ends if wavelengths fall or repeat: numbers are finite, and no difference crosses the seam."""
     nm = np.array([400.0, 402.0, 404.0, 403.0, 405.0, 405.0])
     spectrum = np.array([1.0, 3.0, 1.0, 50.0, 52.0, 9e9])
     assert rising_runs(nm) == [slice(0, 3), slice(3, 5), slice(5, 6)]
@@ -87,7 +87,7 @@ def test_bands_of_two_detectors_are_not_neighbours():
     np.testing.assert_allclose(steepest_difference(spectrum, nm), [1, 1, 1, 1, 1, 0])
 
 
-def test_one_band_has_no_neighbours():
+def test_one_band_has_no_spectral_slope():
     """One band, or two, have no second difference; one has no first."""
     one, two = np.array([500.0]), np.array([500.0, 501.0])
     assert not steepest_difference(np.ones((3, 1), np.float32), one).any()
@@ -99,8 +99,8 @@ COLOURED_RIG = Rig(optics=Optics(keystone_px=0.6))
 
 
 @pytest.mark.parametrize("px", [3.0, 8.0, 30.0])
-def test_waves_are_no_more_coloured_than_said(px: float):
-    """A grey wave through a pupil and shifts that differ from band to band, in closed form."""
+def test_coloured_edges_keep_the_stated_slope(px: float):
+    """A grey wave passes a pupil and shifts that differ from band to band, in closed form."""
     k, x, bands = 2 * np.pi / px, np.linspace(0, px, 200), np.ones(len(NM))
     grey = even_probe(unit="dn", wavelength_nm=NM, level=bands, span=2 * bands, slope=k * np.ones((2, 25)))
     grey = replace(grey, spectral_slope=0 * bands, curvature=k**2 * np.ones((2, 25)))
@@ -115,21 +115,21 @@ STORED_LIGHT_RIG = Rig()
 
 
 @given(binning=st.integers(1, 16), samples=st.integers(16, 70), seed=st.integers(0, 99))
-def test_means_are_those_of_the_sums_that_are_stored(binning: int, samples: int, seed: int) -> None:
-    """Of the same samples as the raw numbers sum, a remainder dropped."""
+def test_stored_mean_matches_the_stored_sum(binning: int, samples: int, seed: int) -> None:
+    """Mean and raw sum use the same samples, with a remainder dropped."""
     dn = np.random.default_rng(seed).integers(0, 4095, (2, samples, 3)).astype(np.uint16)
     np.testing.assert_allclose(stored_mean(dn.astype(np.float64), binning) * binning, bin_samples(dn, binning))
 
 
 @given(binning=st.integers(1, 16), signal=st.floats(0, 1e6), noiseless=st.booleans())
-def test_noise_of_a_sum_is_that_of_its_samples_together(binning: int, signal: float, noiseless: bool) -> None:
-    """Variances add up: the sum has root n times the noise of a sample, so its mean has a root n-th of it."""
+def test_noise_of_a_sum_adds_the_variances_of_its_samples(binning: int, signal: float, noiseless: bool) -> None:
+    """The sum has root n times the noise of a sample, so its mean has a root n-th of it."""
     rig, light = Rig(detector=Detector(noiseless=noiseless)), np.full(1, signal, np.float32)
     of_sum = binning * noise_electrons(light, rig, binning)
     np.testing.assert_allclose(of_sum, np.sqrt(binning) * noise_electrons(light, rig), rtol=1e-6)
 
 
-def test_a_dn_of_a_sum_is_shared_by_its_samples() -> None:
-    """Where the mean of 4 samples changes by a quarter of a DN, the stored number does by one."""
+def test_dn_of_a_sum_is_divided_by_its_samples() -> None:
+    """If the mean of 4 samples changes by a quarter of a DN, the stored number changes by one."""
     unit = unit_at(np.ones(1, np.float32), STORED_LIGHT_RIG, "dn", 4)
     np.testing.assert_allclose(unit, STORED_LIGHT_RIG.camera.electrons_per_dn / 4)

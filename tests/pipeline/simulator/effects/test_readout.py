@@ -1,4 +1,4 @@
-"""From expected electrons to DN: noise by level, well and amplifier, ends of the range, draws that stay put."""
+"""From expected electrons to DN: noise by level, well and amplifier, limits of the range, and reproducible draws."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from pipeline.simulator.rig_model import Detector, Rig
 
 SWEEP = Sweep("fine", "fine", "x", swath_px=0.0, start_px=-32.0, lines=64)
 BANDS = 20
-# Read noise of 0 and wells without end where a test says nothing else; 1 e- is 1 DN, so that DN are counts.
+# Read noise is 0 and wells have no limit unless a test sets them; 1 e- is 1 DN, so that DN are counts.
 COUNTING = LineCamera(electrons_per_dn=1.0, bits=16, dark_dn=0.0, read_noise_e=0.0)
 EVERYTHING: dict[Any, str] = {
     DARK_CURRENT: "exact",
@@ -43,17 +43,17 @@ ALL_EXACT = EVERYTHING | {SHOT: "exact"}
 
 
 def block_of(rig: Rig, lines: range = range(16), seed: int = 0, bands: int = BANDS) -> SweepBlock:
-    """Some lines of the sweep."""
+    """Return some lines of the sweep as a block."""
     return SweepBlock(rig, SWEEP, lines, np.linspace(400, 1000, bands), (640, 640), seed=seed)
 
 
 def even(level: float, lines: int = 16, bands: int = BANDS) -> NDArray[np.float32]:
-    """Light that is the same everywhere."""
+    """Return light that is the same everywhere."""
     return np.full((lines, 640, bands), level, np.float32)
 
 
-def test_read_noise_alone() -> None:
-    """Without shot noise it is normal about the light, below zero light too."""
+def test_read_noise_alone_is_normal() -> None:
+    """Without shot noise numbers are normal around the light, also below zero light."""
     camera = LineCamera(electrons_per_dn=1.0, dark_dn=500.0)
     raw = read_out(even(0), block_of(Rig(camera=camera)), {READ_NOISE: "exact"}).astype(np.float64) - 500
     assert (
@@ -64,21 +64,21 @@ def test_read_noise_alone() -> None:
 
 
 def test_without_effects_light_is_rounded() -> None:
-    """Half to even, from the dark level on; negative light counts as 0."""
+    """Rounding is half to even, from the dark level upwards; negative light counts as 0."""
     light = even(0, 1)
     light[0, :6, 0] = [-50, 0, 2.5, 7.5, 12.5, 100]
     assert read_out(light, block_of(Rig(), range(1)), {})[0, :6, 0].tolist() == [64, 64, 64, 66, 66, 84]
 
 
 @pytest.mark.parametrize("chosen", [{}, {SHOT: "exact"}, EVERYTHING], ids=["none", "shot", "everything"])
-def test_all_saturated(chosen: dict[Any, str]) -> None:
-    """Light of 1e9 e- and of 1e20 gives full scale everywhere, whether saturation is chosen or not."""
+def test_extreme_light_gives_full_scale(chosen: dict[Any, str]) -> None:
+    """Light of 1e9 e- and of 1e20 e- saturates everywhere, with saturation chosen or not."""
     for level in (1e9, 1e20):
         assert (read_out(even(level, 2), block_of(Rig(), range(2)), chosen) == 4095).all()
 
 
-def test_a_well_overflows_before_the_amplifier() -> None:
-    """Full wells still carry read noise, but no shot noise; with saturation off they never fill."""
+def test_full_wells_have_read_noise_but_no_shot_noise() -> None:
+    """Wells of 10,000 e- are full before the amplifier's noise; with saturation off they never fill."""
     rig = Rig(detector=Detector(full_well_e=10_000))
     chosen = {SHOT: "gaussian", READ_NOISE: "exact", SATURATION: "exact"}
     full = (read_out(even(15_000), block_of(rig), chosen).astype(np.float64) - 64) * 5
@@ -89,7 +89,7 @@ def test_a_well_overflows_before_the_amplifier() -> None:
 
 
 def test_dark_current_follows_the_temperature_and_has_shot_noise() -> None:
-    """200 e-/s at 25 deg C: 1360 e- in 1 s at 50 deg C, of variance 1360."""
+    """200 e-/s at 25 deg C become 1360 e- in 1 s at 50 deg C, with a variance of 1360."""
     detector = Detector(temperature_deg_c=50.0)
     rig = Rig(camera=replace(COUNTING, exposure_ms=1000.0), detector=detector)
     counts = read_out(even(0), block_of(rig), {DARK_CURRENT: "exact", SHOT: "exact"}).astype(np.float64)
@@ -97,8 +97,8 @@ def test_dark_current_follows_the_temperature_and_has_shot_noise() -> None:
     assert counts.var() == pytest.approx(1360, rel=0.01)
 
 
-def test_dead_and_hot_elements() -> None:
-    """Dead ones show dark current alone, hot ones 5,000 e- more in 100 ms, the others are as they were."""
+def test_dead_and_hot_elements_have_their_levels() -> None:
+    """Dead ones show dark current alone, hot ones 5,000 e- more in 100 ms; the others are unchanged."""
     rig = Rig(detector=Detector(dead_fraction=0.01, hot_fraction=0.01))
     raw = read_out(even(5000, 1), block_of(rig, range(1)), {DARK_CURRENT: "exact", DEFECTS: "exact"})[0]
     dead, hot = dead_elements(rig, BANDS), hot_electrons(rig, BANDS) > 0
@@ -108,8 +108,8 @@ def test_dead_and_hot_elements() -> None:
 
 
 @pytest.mark.parametrize(("dark_dn", "exposure_ms"), [(64.0, 500.0), (0.0, 500.0), (2.0, 20.0)])
-def test_the_mean_dark_frame_is_that_of_many_lines(dark_dn: float, exposure_ms: float) -> None:
-    """What a cap on the lens would show: dark level, dark current, hot elements up to full scale, nothing below 0."""
+def test_mean_dark_frame_matches_that_of_many_lines(dark_dn: float, exposure_ms: float) -> None:
+    """A capped lens shows dark level, dark current and hot elements up to full scale, and nothing below 0."""
     rig = Rig(
         camera=LineCamera(exposure_ms=exposure_ms, dark_dn=dark_dn),
         detector=Detector(hot_fraction=0.01, dead_fraction=0.01),
@@ -123,8 +123,8 @@ def test_the_mean_dark_frame_is_that_of_many_lines(dark_dn: float, exposure_ms: 
     assert abs((mean - expected)[fine].mean()) < 0.05
 
 
-def test_an_ideal_sensor_is_silent() -> None:
-    """Neither shot noise, read noise nor dark current, even when asked for; its pattern and its bits stay."""
+def test_noiseless_sensor_has_no_noise() -> None:
+    """Shot noise, read noise and dark current are absent even if chosen: numbers are those without effects."""
     rig = Rig(detector=Detector(noiseless=True))
     light = np.random.default_rng(0).uniform(-100, 25_000, (4, 640, BANDS)).astype(np.float32)
     np.testing.assert_array_equal(
@@ -156,8 +156,8 @@ def test_other_effects_do_not_change_the_draws() -> None:
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_light_that_is_not_finite_is_refused(value: float) -> None:
-    """The first such number is named by sweep, line, sample and band."""
+def test_non_finite_light_is_refused(value: float) -> None:
+    """The message names sweep, line, sample and band of the first such value."""
     light = even(100, 4)
     light[2, 40, 3] = value
     with pytest.raises(SceneError, match=rf"sweep fine: line 12, sample 40, band 3 expects {value} electrons"):

@@ -1,4 +1,4 @@
-"""Light on the detector: widths of bands, smile, stray light and fixed patterns, by hand and by plain convolutions."""
+"""Light on the detector: band widths, smile, stray light and fixed patterns, by hand and by plain convolutions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ VARIANCE_OF_6 = 36 / (8 * np.log(2))
 
 @pytest.mark.parametrize("fwhm_nm", [0.0, 2.0, 5.9])
 def test_kernel_has_the_missing_variance_on_uneven_bands(fwhm_nm):
-    """No weight below 0, sum 1, mean 0 and the variance to 1e-6, however few bands a width spans."""
+    """Weights are not below 0, sum to 1, have mean 0, and the variance to 1e-5, however few bands a width spans."""
     nm = 400 + np.cumsum(np.random.default_rng(0).uniform(1, 3, 60))
     rows = spectrometer.widen_bands(np.eye(60), nm, np.full(60, fwhm_nm), 6.0).T  # (band made, band taken)
     way = nm - nm[:, None]
@@ -27,7 +27,7 @@ def test_kernel_has_the_missing_variance_on_uneven_bands(fwhm_nm):
 
 
 def test_narrow_line_becomes_a_gaussian_of_6_nm():
-    """A line of 2 nm on bands 0.5 nm apart gets 6 nm at half its height and keeps its area."""
+    """A line of 2 nm on bands 0.5 nm apart gets a FWHM of 6 nm and keeps its area."""
     nm = np.arange(450, 550.5, 0.5)
     line = np.exp(-4 * np.log(2) * ((nm - 500) / 2) ** 2)
     made = spectrometer.widen_bands(line, nm, np.full(len(nm), 2.0), 6.0)
@@ -35,7 +35,7 @@ def test_narrow_line_becomes_a_gaussian_of_6_nm():
     np.testing.assert_allclose(made.sum(), line.sum(), rtol=1e-6)
 
 
-def test_straight_spectra_and_both_ends_stay():
+def test_straight_spectra_and_end_bands_are_kept():
     """A straight spectrum is kept up to its ends; the first and last band of any spectrum keep their light."""
     wavelength, light = random_light(1)
     narrow, straight = np.full(90, 1.0), 3 * wavelength
@@ -44,8 +44,8 @@ def test_straight_spectra_and_both_ends_stay():
     np.testing.assert_allclose(made[..., [0, -1]], light[..., [0, -1]], rtol=1e-6)
 
 
-def test_nothing_where_bands_are_wide_or_not_known():
-    """Light itself comes back, and the bound of 0 says which of the two it is."""
+def test_response_is_off_for_wide_or_unknown_bands():
+    """The light itself is returned, and the reason of the bound of 0 states which of the two it is."""
     wavelength, light = random_light(2)
     for fwhm, word in ((np.full(90, 6), "6 nm wide already"), (None, "not known"), (np.full(90, np.nan), "not known")):
         assert spectrometer.RESPONSE.change(light, block_of(rig_with(), wavelength, fwhm_nm=fwhm), "exact") is light
@@ -55,8 +55,8 @@ def test_nothing_where_bands_are_wide_or_not_known():
 
 
 @pytest.mark.parametrize("bands", [1, 2])
-def test_one_or_two_bands_stay(bands):
-    """Without a band on either side nothing can be averaged."""
+def test_response_keeps_one_or_two_bands(bands):
+    """A band without neighbours on both sides cannot be averaged."""
     nm, light = np.linspace(500, 510, bands), np.full((2, 3, bands), 7, np.float32)
     light[..., -1] = 9
     made = spectrometer.widen_bands(light, nm, np.zeros(bands), 6.0)
@@ -65,7 +65,7 @@ def test_one_or_two_bands_stay(bands):
 
 
 def test_steep_step_is_bounded_by_its_slope():
-    """A step between two bands has I'' v / 2 far above I' sqrt(v): the smaller of the two counts, and holds."""
+    """At a step between two bands I'' v / 2 is far above I' sqrt(v): the smaller of the two counts, and holds."""
     wavelength = np.linspace(400, 500, 101)
     light = np.where(wavelength < 450, 100, 5000).astype(np.float32) * np.ones((1, 2, 1), np.float32)
     fwhm = np.zeros(101)
@@ -79,21 +79,21 @@ def test_steep_step_is_bounded_by_its_slope():
 
 
 def bent(light, wavelength, smile_nm, **more):
-    """Light after smile."""
+    """Return light after smile."""
     block = block_of(rig_with(light.shape[1], smile_nm=smile_nm), wavelength, **more)
     return spectrometer.SMILE.change(light.copy(), block, "cubic")
 
 
-def test_shift_is_0_at_the_centre_and_smile_at_both_ends():
-    """641 samples: 0 in the middle, a quarter half way, all at the ends; one sample is all centre."""
+def test_wavelength_shift_is_parabolic_along_the_line():
+    """With 641 samples the shift is 0 in the middle, a quarter halfway, all at the ends; one sample has no shift."""
     shift = spectrometer.wavelength_shift(641, 0.3)
     np.testing.assert_allclose(shift[[0, 160, 320, 480, 640]], [0.3, 0.075, 0, 0.075, 0.3])
     assert spectrometer.wavelength_shift(1, 0.3) == [0]
 
 
 @pytest.mark.parametrize(("smile_nm", "sign"), [(0.5, 1), (-0.5, -1)])
-def test_sign_is_that_of_the_wavelengths_seen(smile_nm, sign):
-    """On a spectrum of 10 e-/nm a smile of 0.5 nm adds 5 e- at the ends, a frown takes as much."""
+def test_smile_has_the_sign_of_the_wavelength_shift(smile_nm, sign):
+    """On a spectrum of 10 e-/nm a smile of 0.5 nm adds 5 e- at the ends, and a frown takes as much."""
     wavelength = np.linspace(400, 500, 51)
     light = np.tile((10 * (wavelength - 300)).astype(np.float32), (2, SAMPLES, 1))
     change = bent(light, wavelength, smile_nm, lines=range(2)) - light
@@ -102,7 +102,7 @@ def test_sign_is_that_of_the_wavelengths_seen(smile_nm, sign):
 
 
 def test_cubic_is_exact_on_parabolas_between_inner_bands():
-    """A parabola on uneven bands comes back to rounding."""
+    """A parabola on uneven bands is reproduced to rounding."""
     wavelength = 500 + np.cumsum(np.random.default_rng(0).uniform(1, 3, 20))
     light = np.tile((50 * (wavelength - 510) ** 2).astype(np.float32), (1, 3, 1))
     wanted = 50 * (wavelength + 0.8 - 510) ** 2
@@ -111,8 +111,8 @@ def test_cubic_is_exact_on_parabolas_between_inner_bands():
 
 
 @pytest.mark.parametrize("smile_nm", [0.4, -0.4, 7.0, 100.0])
-def test_nothing_is_invented_beyond_the_bands(smile_nm):
-    """Bands that would see beyond the first or last take that one's light, however far the shift."""
+def test_smile_does_not_extrapolate_beyond_the_bands(smile_nm):
+    """Bands that would lie beyond the first or last one take its light, for any shift."""
     wavelength, light = random_light(3, bands=30)
     made = bent(light, wavelength, smile_nm)
     end = -1 if smile_nm > 0 else 0
@@ -121,8 +121,8 @@ def test_nothing_is_invented_beyond_the_bands(smile_nm):
         np.testing.assert_allclose(made[:, 0], np.broadcast_to(light[:, 0, -1:], made[:, 0].shape), rtol=1e-6)
 
 
-def test_smile_detectors_do_not_mix():
-    """Two runs of rising wavelengths are bent apart, each as if alone; a run of one band stays."""
+def test_smile_does_not_mix_detectors():
+    """Two runs of rising wavelengths are shifted apart, each as if alone; a run of one band is unchanged."""
     first, light = random_light(1, bands=30)
     second, other = random_light(2, bands=20)
     wavelength = np.concatenate([first, second, [405.0]])
@@ -132,8 +132,8 @@ def test_smile_detectors_do_not_mix():
     np.testing.assert_array_equal(both[..., 50], other[..., 0])
 
 
-def test_off_where_there_is_nothing_to_bend():
-    """One band, a straight slit, or a flat spectrum: bound 0 with a reason, and light stays as it is."""
+def test_smile_without_any_effect_has_a_bound_of_0():
+    """One band, a straight slit and a flat spectrum have a bound of 0; a single band is unchanged and is the reason."""
     one, light = np.array([550.0]), np.full((6, SAMPLES, 1), 900, np.float32)
     bound = spectrometer.SMILE.bound(probe_of(light, one), rig_with())
     assert bound.value == 0
@@ -146,7 +146,7 @@ def test_off_where_there_is_nothing_to_bend():
 
 
 def scattered(light, variant="halo", **optics):
-    """Light after scattering; the optics' numbers start with stray_."""
+    """Return light after scattering; names in ``optics`` are without their prefix stray_."""
     rig = rig_with(light.shape[1], **{f"stray_{name}": value for name, value in optics.items()})
     wavelength = np.linspace(400, 1000, light.shape[2])
     return spectrometer.STRAY_LIGHT.change(light.copy(), block_of(rig, wavelength, range(len(light))), variant)
@@ -154,8 +154,8 @@ def scattered(light, variant="halo", **optics):
 
 @pytest.mark.parametrize("variant", spectrometer.STRAY_LIGHT.variants)
 @pytest.mark.parametrize("halo_px", [3.0, 64.0, 1e4])
-def test_all_light_is_kept_in_each_line(variant, halo_px):
-    """What leaves a sample lands on the same line's detector, also at its edges, and no light falls below 0."""
+def test_stray_light_conserves_the_light_of_each_line(variant, halo_px):
+    """Light that leaves a sample lands on the same line's detector, also at its edges, and no light is negative."""
     light = random_light(0)[1]
     light[:, :3] = 0
     light[:, :, -1] *= 20
@@ -165,7 +165,7 @@ def test_all_light_is_kept_in_each_line(variant, halo_px):
 
 
 def test_halo_is_a_gaussian_reflected_at_the_edges():
-    """The product with few cosines is the plain convolution, sample by sample and band by band, to 1e-5."""
+    """The product with few cosines matches the plain convolution, sample by sample and band by band, to 2e-5."""
     light = random_light(1)[1]
     made = scattered(light, fraction=0.2, even=0.25, halo_px=6.0)
     for line, before in zip(made, light.astype(np.float64), strict=True):
@@ -173,8 +173,8 @@ def test_halo_is_a_gaussian_reflected_at_the_edges():
         np.testing.assert_allclose(line, 0.8 * before + 0.2 * (0.25 * before.mean() + 0.75 * halo), rtol=2e-5)
 
 
-def test_even_fraction_by_hand():
-    """One line of one sample and bands 0 and 100, a tenth scattered evenly: 5 and 95."""
+def test_even_stray_light_matches_hand_calculation():
+    """One line of one sample with bands of 0 and 100, a tenth scattered evenly, becomes 5 and 95."""
     light = np.array([[[0, 100]]], np.float32)
     np.testing.assert_allclose(scattered(light, fraction=0.1, even=1.0), [[[5, 95]]], rtol=1e-6)
     alone = np.array([[[70]]], np.float32)
@@ -184,8 +184,8 @@ def test_even_fraction_by_hand():
 RIG = Rig()
 
 
-def test_gains_have_the_spread_that_is_stated() -> None:
-    """1 % an element, 0.2 % a column; of mean 1; nothing shared between the two."""
+def test_fixed_pattern_gains_have_the_stated_spread() -> None:
+    """The spread is 1 % an element and 0.2 % a column, the mean is 1, and the two are not correlated."""
     elements, columns = spectrometer.PRNU.gains(RIG, 270), spectrometer.STRIPING.gains(RIG, 1)
     assert elements.shape == (640, 270)
     assert elements.mean() == pytest.approx(1, abs=1e-4)
@@ -194,16 +194,16 @@ def test_gains_have_the_spread_that_is_stated() -> None:
     assert abs(np.corrcoef(elements.mean(axis=1), columns[:, 0])[0, 1]) < 0.15
 
 
-def test_gains_belong_to_the_unit() -> None:
-    """Another sensor has others; more bands have the same."""
+def test_fixed_pattern_gains_belong_to_the_unit() -> None:
+    """Another sensor has other gains; more bands keep the gains of the first ones."""
     assert not np.array_equal(
         spectrometer.PRNU.gains(RIG, 5), spectrometer.PRNU.gains(Rig(detector=Detector(unit=1)), 5)
     )
     np.testing.assert_array_equal(spectrometer.PRNU.gains(RIG, 9)[:, :5], spectrometer.PRNU.gains(RIG, 5))
 
 
-def test_gains_never_fall_below_0() -> None:
-    """A spread of 50 % leaves elements without response, none with less."""
+def test_fixed_pattern_gains_never_fall_below_0() -> None:
+    """A spread of 50 % leaves elements without response, but none with a negative one."""
     gains = spectrometer.PRNU.gains(Rig(detector=Detector(prnu_std=0.5)), 50)
     assert gains.min() == 0
     assert gains.max() > 2

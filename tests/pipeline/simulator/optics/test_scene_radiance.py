@@ -1,4 +1,4 @@
-"""Light of a scene at samples: the same bits whoever else is looked for, within the scene's memory, mixed rightly."""
+"""Light of a scene at samples: the same bits for any other samples, reads within the scene's memory, correct mixing."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ KINDS = {"one": 1, "few": 3, "materials": 27, "own plane": 2, "own planes": 40}
 
 
 def scene_of(kind: str, bands: int = 40) -> RasterScene:
-    """Pixels that know nothing of their neighbours, mixed to bands or with a plane for each."""
+    """Return independent random pixels, mixed to bands or with a plane for each band."""
     rng, components = np.random.default_rng(5), KINDS[kind]
     planes = rng.uniform(0, 1, (*SHAPE, components))
-    if kind == "materials":  # a pixel has few of many
+    if kind == "materials":  # a pixel has few of many materials
         planes *= rng.random((6, 7, components)).repeat(4, axis=0).repeat(6, axis=1)[: SHAPE[0], : SHAPE[1]] < 0.15
     if kind.startswith("own"):
         return made_scene(planes, rng.uniform(1e3, 9e3, components), np.linspace(400, 1000, components))
@@ -36,14 +36,14 @@ def scene_of(kind: str, bands: int = 40) -> RasterScene:
 
 
 def footprint_of(scene: RasterScene) -> Footprint:
-    """Slit and pixel in three boxes, with diffraction whose tails look at thinned pixels."""
+    """Return slit and pixel in three boxes, with diffraction whose tails read thinned pixels."""
     waves = np.linspace(0.4, 1.0, len(scene.wavelength_nm)) * np.ones((2, 1))
     shift = np.linspace(-0.2, 0.2, waves.shape[1]) * np.ones((2, 1))
     return fold((2.7, 1.0), (3, 1), 1, Moments(shift, np.full(waves.shape, 0.04), waves))
 
 
 def views_of(count: int, far: float = 6.0) -> RayViews:
-    """Samples all over the scene and around it, whose footprints lie turned."""
+    """Return samples all over the scene and around it, with rotated footprints."""
     rng = np.random.default_rng(8)
     along, scan = rng.uniform(-far, max(SHAPE) + far, (2, count))
     turn = rng.uniform(-0.1, 0.1, count)
@@ -51,7 +51,7 @@ def views_of(count: int, far: float = 6.0) -> RayViews:
 
 
 def scan_pass(scene: RasterScene, views: RayViews, *, along_y: bool = False) -> np.ndarray:
-    """Light (n, band) of one exposure."""
+    """Return the light (n, band) of one exposure."""
     return SceneSampler(footprint_of(scene), views_of(COUNT)).scan_pass(
         scene, [views], along_y=along_y, exposure_ratio=1.0
     )
@@ -59,7 +59,7 @@ def scan_pass(scene: RasterScene, views: RayViews, *, along_y: bool = False) -> 
 
 @pytest.mark.parametrize(("kind", "along_y"), [(kind, bool(number % 2)) for number, kind in enumerate(KINDS)])
 def test_light_of_a_sample_does_not_depend_on_the_others(kind: str, along_y: bool) -> None:
-    """However samples are ordered and divided among calls and threads, each has the same bits."""
+    """Each sample has the same bits in any order and any division among calls and threads."""
     scene, views = scene_of(kind), views_of(COUNT)
     whole, order = scan_pass(scene, views, along_y=along_y), np.random.default_rng(1).permutation(COUNT)
     np.testing.assert_array_equal(scan_pass(scene, views[order], along_y=along_y), whole[order])
@@ -70,16 +70,16 @@ def test_light_of_a_sample_does_not_depend_on_the_others(kind: str, along_y: boo
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_lines_along_y_see_the_turned_scene(kind: str) -> None:
-    """A line along y over a scene is one along x over its transpose."""
+def test_lines_along_y_see_the_transposed_scene(kind: str) -> None:
+    """A line along y over a scene equals one along x over its transpose."""
     scene, views = scene_of(kind), views_of(COUNT)
     turned = made_scene(scene.planes.swapaxes(0, 1), scene.electrons, scene.wavelength_nm)
     np.testing.assert_allclose(scan_pass(scene, views, along_y=True), scan_pass(turned, views), rtol=2e-6)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_last_pixels_are_seen_as_any(kind: str) -> None:
-    """What lies behind a scene's last pixel in memory adds nothing: a wider scene has the same bits there."""
+def test_memory_behind_the_last_pixel_adds_nothing(kind: str) -> None:
+    """A scene that is padded with its edge has the same bits at the last pixels."""
     scene = scene_of(kind)
     wide = np.pad(scene.planes, ((0, 9), (0, 9), (0, 0)), mode="edge")
     corner = views_of(COUNT, 0.0)
@@ -94,7 +94,7 @@ def test_the_last_pixels_are_seen_as_any(kind: str) -> None:
 
 
 def far_and_near() -> np.ndarray:
-    """Light of samples in small scenes, far beside them and nowhere: a block of 64, and a part of one."""
+    """Return the light of samples in small scenes, far beside them and at NaN: a block of 64 and a partial one."""
     views = views_of(66, 60.0)
     views = replace(views, scan=np.where(np.arange(66) % 5, views.scan, np.nan))
     found = [scan_pass(scene_of(kind, 9), views, along_y=bool(number % 2)) for number, kind in enumerate(CHECKED_KINDS)]
@@ -110,8 +110,8 @@ numpy.save(sys.argv[1], far_and_near())
 """
 
 
-def test_no_index_leaves_its_array(tmp_path: Path) -> None:
-    """As Python, where every index is checked, loops end well, and give what they give compiled."""
+def test_loops_stay_within_their_arrays(tmp_path: Path) -> None:
+    """Without compilation Python checks every index: the loops end, and give the compiled results."""
     command = [sys.executable, "-c", CHECKED, str(tmp_path / "light.npy")]
     python = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_DISABLE_JIT": "1"}
     subprocess.run(command, env=python, cwd=ROOT, check=True)
@@ -120,19 +120,19 @@ def test_no_index_leaves_its_array(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("place", [-1e300, 1e300, np.inf, -np.inf])
 @pytest.mark.parametrize("kind", ["few", "materials", "own planes"])
-def test_places_far_out_read_the_scene_s_edge(kind: str, place: float) -> None:
-    """However far beside the scene a sample looks, no other memory is read."""
+def test_places_far_outside_read_the_edge_of_the_scene(kind: str, place: float) -> None:
+    """A sample at any distance from the scene reads no other memory."""
     scene, views = scene_of(kind), views_of(4)
     far = scan_pass(scene, replace(views, along=np.full(4, place), scan=np.full(4, 3.0)))
     near = scan_pass(scene, replace(views, along=np.full(4, np.copysign(1e6, place)), scan=np.full(4, 3.0)))
-    seen = np.isfinite(far)  # how far a place that is not finite lies beside its pixel is no number
+    seen = np.isfinite(far)  # an infinite place has no finite offset from its pixel
     assert seen.all() or np.isinf(place)
     np.testing.assert_allclose(far[seen], near[seen], rtol=1e-6)
 
 
 @pytest.mark.parametrize(("nodes", "bands"), [(1, 2), (1, 270), (3, 17), (5, 70), (5, 270), (9, 33)])
-def test_rows_are_mixed_alike_wherever_they_stand(nodes: int, bands: int) -> None:
-    """The same components give the same bits in any row, and those are the product of the matrices."""
+def test_mixing_does_not_depend_on_the_row(nodes: int, bands: int) -> None:
+    """The same components give the same bits in any row, and match the product of the matrices."""
     rng, kernels, components = np.random.default_rng(bands), nodes + 2, 6
     place = np.linspace(0, nodes - 1, bands)
     between = np.stack([np.interp(place, np.arange(nodes), one) for one in np.eye(nodes)])

@@ -33,16 +33,16 @@ MIDDLE = Sweep("middle", "fine", "y", swath_px=0.0, start_px=-1279.0, lines=2560
 
 
 def grain(bands: int = 3) -> RasterScene:
-    """Pixels that know nothing of their neighbours: the roughest scene that there is, as large as it has to be."""
+    """Return a scene of independent pixels, the roughest possible, as large as needed."""
     rng = np.random.default_rng(0)
     values = rng.uniform(0.05, 1, (120, 160, bands))
     return image_scene(values, CAMERA, np.linspace(400, 1000, bands))
 
 
 def error(sweep: Sweep, line: int, variant: str, blurs: dict[Any, str]) -> float:
-    """Greatest difference from the rays, over the light's standard deviation."""
+    """Return the greatest difference from the rays, over the light's standard deviation."""
     scene = grain()
-    # The scene lies where the line does: a block's shape is where the scene's first pixel lies.
+    # The scene moves to the line: the shape of a block sets the place of the scene's first pixel.
     block = SweepBlock(RIG, sweep, range(line, line + 1), scene.wavelength_nm, scene.shape)
     moved = Moved.to(block, scene)
     light = expected_light(scene, block, {moved: "only", ROTATION: "rays", SLIT: variant, **blurs})[:, ::10]
@@ -52,7 +52,7 @@ def error(sweep: Sweep, line: int, variant: str, blurs: dict[Any, str]) -> float
 
 @dataclass(frozen=True)
 class Moved:
-    """Moves all that a block sees by whole px onto a small scene, folded back at its edges."""
+    """A displacement of all points of a block by whole px, onto a small scene."""
 
     along: float
     scan: float
@@ -61,11 +61,11 @@ class Moved:
 
     @staticmethod
     def to(block: SweepBlock, scene: RasterScene) -> Moved:
-        """So that the middle of a block's line falls on the middle of the scene."""
+        """Return the displacement from the middle of a block's line to the middle of the scene."""
         return Moved(-float(block.sweep.swath_px), -float(np.rint(block.scan_px.mean())))
 
     def displaced(self, block: SweepBlock, along_px: Any, scan_px: Any, variant: str) -> tuple[Any, Any]:
-        """Give what to add."""
+        """Return the px to add."""
         return np.full_like(along_px, self.along), np.full_like(scan_px, self.scan)
 
 
@@ -78,12 +78,12 @@ class Moved:
         (CORNER, 2, "3x1", 3e-3, 1e-2),
     ],
 )
-def test_closed_form_is_that_of_many_rays(sweep: Sweep, line: int, variant: str, sharp: float, blurred: float) -> None:
-    """In the middle of a survey and at its corner, where lines are turned by 9 deg, with blurs and without.
+def test_closed_form_matches_many_rays(sweep: Sweep, line: int, variant: str, sharp: float, blurred: float) -> None:
+    """The middle of a survey and its corner, with lines rotated by 9 deg, are compared with and without blurs.
 
-    Tables misplace 1e-4 of the light, and grain ranges over 6 of its deviations: .0003 for either axis.
+    Tables displace 1e-4 of the light, and grain ranges over 6 of its standard deviations: .0003 for either axis.
     With blurs, boxes at the corner are moved for the covariance of the Gaussian as well as their own. That leaves its
-    fourth moments wrong: .008 of the deviation.
+    fourth moments wrong, by .008 of the standard deviation.
     """
     assert error(sweep, line, variant, {}) < sharp
     assert error(sweep, line, variant, BLURS) < blurred
@@ -93,7 +93,7 @@ DISTANCE = np.linspace(-5, 5, 401)
 
 
 @pytest.mark.parametrize("width", [0.3, 1.0, 2.7, 4.4])
-def test_box_is_the_mean_of_the_kernel(width: float) -> None:
+def test_box_weight_is_the_mean_of_the_kernel(width: float) -> None:
     """The closed form is the mean of linear interpolation's kernel over a thousand points of the box."""
     inside = (np.arange(1000) + 0.5) / 1000 - 0.5
     wanted = np.interp(DISTANCE[:, None] + inside * width, [-1, 0, 1], [0, 1, 0]).mean(axis=1)
@@ -101,8 +101,8 @@ def test_box_is_the_mean_of_the_kernel(width: float) -> None:
 
 
 @pytest.mark.parametrize("held", [1, 4])
-def test_gaussian_is_that_of_many_steps(held: int) -> None:
-    """Kernels with Gaussians are means of the sharp one over thousands of even steps."""
+def test_blurred_weight_is_the_mean_over_a_gaussian(held: int) -> None:
+    """Kernels with Gaussians are means of the sharp kernel over thousands of even steps."""
     step = np.arange(-8, 8, 0.002)
     fraction, variance = np.exp(-(step**2) / 2), np.array([0.0, 0.08, 0.5])
     distance, weight = blurred_weight(2.7, variance, held)
@@ -114,8 +114,8 @@ def test_gaussian_is_that_of_many_steps(held: int) -> None:
 
 @settings(max_examples=15, deadline=None)
 @given(width=st.sampled_from([0.0, 0.9, 2.7]), blur=st.floats(0, 1), scale=st.floats(0.99, 1.04), off=st.floats(-1, 1))
-def test_table_is_the_kernel_at_any_place_and_scale(width: float, blur: float, scale: float, off: float) -> None:
-    """Weights out of the table sum to 1 and are those of the kernel, by place and by scale right to a thousandth."""
+def test_table_matches_the_kernel_at_any_place_and_scale(width: float, blur: float, scale: float, off: float) -> None:
+    """Weights from the table sum to 1 and match those of the kernel to 0.002."""
     variance = np.array([0.0, blur**2])
     table = TapTable.of(width, variance, 1, (0.99, 1.04), 0.5)
     weight, places = np.empty((2, table.taps, 1), np.float32), np.full((2, 1, 1), off, np.float32)
@@ -128,11 +128,11 @@ def test_table_is_the_kernel_at_any_place_and_scale(width: float, blur: float, s
     np.testing.assert_allclose(weight, wanted, atol=2e-3)
 
 
-PER_PX = 24  # steps of the sums that are written out
+PER_PX = 24  # steps of the explicit sums
 
 
 def fine_light(scene: RasterScene, block: SweepBlock, moved: Any, blurs: dict[Any, str]) -> np.ndarray:
-    """Electrons (line, every tenth sample, band) of a diagonal scene; ``moved`` displaces points."""
+    """Return electrons (line, every tenth sample, band) of a diagonal scene; ``moved`` displaces points."""
     rig, bands = block.rig, len(block.wavelength_nm)
     ifov, size = rig.camera.ifov_rad, scene.shape if block.sweep.along == "y" else scene.shape[::-1]
     normals, centres = position_to_normal(block.middle)[:, None], block.slopes[::10, None]
@@ -155,7 +155,7 @@ def fine_light(scene: RasterScene, block: SweepBlock, moved: Any, blurs: dict[An
 
 
 def _moments(block: SweepBlock, blurs: dict[Any, str]) -> tuple[np.ndarray, np.ndarray]:
-    """Shift and variance, (band, 2) each."""
+    """Return shift and variance, (band, 2) each."""
     nm, normal = block.wavelength_nm, middle_normal(block.sweep, block.rig.camera)
     found = [blur.moments(block.rig, nm, variant, normal) for blur, variant in blurs.items()]
     none = np.zeros((2, len(nm)))
@@ -163,7 +163,7 @@ def _moments(block: SweepBlock, blurs: dict[Any, str]) -> tuple[np.ndarray, np.n
 
 
 def _axis(width: float, variance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Even steps over a box; with a Gaussian steps over both, as heavy as both together are there."""
+    """Return even steps over a box and their weights; with a Gaussian, over the convolution of both."""
     if variance == 0:
         count = int(np.ceil(PER_PX * width))
         return ((np.arange(count) + 0.5) / count - 0.5) * width, np.full(count, 1 / count)

@@ -1,4 +1,4 @@
-"""The farm's land: parcels, lines, discs and rows by their laws, and scenes that are worth a second pass."""
+"""The farm's land: parcels fill it once, coverage is area, and crop rows have their period and heading."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.farm.land import Parcel, clip_polygon, divide_land, parcel_pixels, polygon_area, stream
 
 
-def test_parcels_fraction_the_land() -> None:
+def test_parcels_cover_the_land_once() -> None:
     """The parcels' coverages sum to 1 in every pixel, and their areas to the land's."""
     parcels, _ = divide_land(stream(4, "land"), (700, 640), 20_000)
     assert sum(polygon_area(parcel.corners) for parcel in parcels) == pytest.approx(700 * 640)
@@ -22,8 +22,8 @@ def test_parcels_fraction_the_land() -> None:
     np.testing.assert_allclose(cover, 1, atol=1e-5)
 
 
-def test_coverage_is_area() -> None:
-    """Coverage summed over the pixels is the polygon's area, whatever its angle."""
+def test_coverage_sums_to_the_area_of_the_polygon() -> None:
+    """Coverage summed over the pixels is the polygon's area to 0.2 %, at any angle."""
     square, cuts = np.array([[-40.0, -40], [-40, 40], [40, 40], [40, -40]]), []
     for angle in (0.3, 1.7, 2.9, 4.4):
         cuts.append((float(np.cos(angle)), float(np.sin(angle)), -20.0))
@@ -36,7 +36,7 @@ WINDOW = 128
 
 
 def middle(field: FieldPlan, image: NDArray[np.float32]) -> NDArray[np.float32] | None:
-    """The square window that lies deepest in a field; None where the field is too narrow."""
+    """Return the square window deepest inside a field, or None if the field is too narrow."""
     index, _, centres = parcel_pixels(field.parcel, image.shape)
     depth = np.min(np.array(image.shape) / 2 - np.abs(centres), axis=1)
     for ny, nx, offset in field.parcel.cuts:
@@ -49,7 +49,7 @@ def middle(field: FieldPlan, image: NDArray[np.float32]) -> NDArray[np.float32] 
 
 
 def wave(image: NDArray[np.float32], near_period: float) -> tuple[float, float]:
-    """Period and heading of the strongest wave within a quarter of a period, by a padded, windowed transform."""
+    """Return period and heading of the strongest wave within 25 % of a frequency, by a padded, windowed transform."""
     taper = np.hanning(WINDOW)
     power = np.abs(np.fft.rfft2((image - image.mean()) * taper[:, None] * taper, (8 * WINDOW, 8 * WINDOW)))
     fy, fx = np.fft.fftfreq(8 * WINDOW)[:, None], np.fft.rfftfreq(8 * WINDOW)
@@ -60,7 +60,7 @@ def wave(image: NDArray[np.float32], near_period: float) -> tuple[float, float]:
     return float(1 / frequency[row, column]), float(angle % 180)
 
 
-def test_period_and_heading_are_in_the_picture() -> None:
+def test_crop_rows_have_their_period_and_heading() -> None:
     """In every field with a crop, the Fourier transform finds the period to 2 % and the heading to 1.2 degrees."""
     plan, scene, seen = farm_plan(1), farm_scene(1, bands=4), 0
     picture = scene.planes @ np.ascontiguousarray(scene.spectra()[:, 3])  # in June, in the near infrared
@@ -70,6 +70,6 @@ def test_period_and_heading_are_in_the_picture() -> None:
             continue
         period, heading = wave(window, field.row_period_px)
         assert period == pytest.approx(field.row_period_px, rel=0.02)
-        assert abs((heading - field.row_angle_deg + 90) % 180 - 90) < 1.2  # between two lines
+        assert abs((heading - field.row_angle_deg + 90) % 180 - 90) < 1.2  # angle between undirected lines
         seen += 1
     assert seen >= 6

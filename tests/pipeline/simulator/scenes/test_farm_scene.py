@@ -1,4 +1,4 @@
-"""The farm through the year: one land for all days of a seed, mixtures that are shares, and what the days change."""
+"""The farm through the year: one land for all days of a seed, mixtures as fractions, and changes between days."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SIZE, LONG, WIDE = (420, 520), (400, 1000), (720, 1000)
 
 
 def labels_of(scene: RasterScene) -> NDArray[np.uint8]:
-    """The labels, which every farm has."""
+    """Return the labels, which every farm has."""
     assert scene.labels is not None
     return scene.labels
 
@@ -35,8 +35,8 @@ def labels_of(scene: RasterScene) -> NDArray[np.uint8]:
         (7, {"day": 250, "hour": 16.0}, "c639cef3070fccce", -0.158003, -995.926),
     ],
 )
-def test_the_law_gives_the_same_farms(seed: int, when: dict[str, Any], labels: str, mixed: float, lit: float) -> None:
-    """Land, days, hours and spectra of law farm@2 are what they were: labels by their hash, the rest by sums."""
+def test_law_gives_the_same_farms(seed: int, when: dict[str, Any], labels: str, mixed: float, lit: float) -> None:
+    """Land, days, hours and spectra of law farm@2 match stored values: labels by their hash, the rest by sums."""
     scene = farm_scene(seed, (160, 200), bands=5, **when)
     assert hashlib.sha256(labels_of(scene).tobytes()).hexdigest().startswith(labels)
     sums = [
@@ -57,8 +57,8 @@ def test_abundances_are_fractions(seed: int, height: int, width: int, day: int) 
     assert labels_of(scene).max() < len(CLASSES)
 
 
-def test_key_tells_the_law_and_the_day() -> None:
-    """The key names law, seed, day, shape, hour, bands and what the camera changes."""
+def test_key_contains_law_and_day() -> None:
+    """The key names law, seed, day and shape, and changes with day, hour and camera."""
     key = farm_scene(42, (20, 30), bands=7, day=99).key
     assert key.startswith(f"{FARM_LAW}/seed=42/day=99/shape=20x30")
     others = [
@@ -69,8 +69,8 @@ def test_key_tells_the_law_and_the_day() -> None:
     assert len({key, *(scene.key for scene in others)}) == 4
 
 
-def test_another_day_is_the_same_land() -> None:
-    """Fields, rows, borders and trees stay where they are; roads, ponds and crowns are labelled alike."""
+def test_land_is_the_same_on_another_day() -> None:
+    """Fields, rows and borders stay in place; trees and ponds of April and June overlap by more than 75 %."""
     june, april = farm_plan(4, SIZE, day=172), farm_plan(4, SIZE, day=110)
     for one, other in zip(june.fields, april.fields, strict=True):
         np.testing.assert_array_equal(one.parcel.corners, other.parcel.corners)
@@ -82,8 +82,8 @@ def test_another_day_is_the_same_land() -> None:
         assert (masks[0] & masks[1]).sum() > 0.75 * (masks[0] | masks[1]).sum()
 
 
-def test_planes_are_the_plans_materials() -> None:
-    """A day's scene mixes only what the day can show, in the order of the whole list."""
+def test_planes_are_the_materials_of_the_day() -> None:
+    """A day's scene mixes only materials of that day, in the order of the whole list."""
     plan = farm_plan(0, day=225)
     assert len(plan.materials) < len(MATERIALS)
     assert list(plan.materials) == sorted(plan.materials, key=MATERIALS.index)
@@ -105,6 +105,6 @@ def test_planes_are_the_plans_materials() -> None:
     ],
 )
 def test_impossible_farms_are_refused(what: dict[str, Any], error: type[Exception], words: str) -> None:
-    """A day of no year, a farm without sun, a negative seed, an empty shape or one band, each with what came."""
+    """A day outside of the year, a farm without sun, a negative seed, an empty shape and a single band are errors."""
     with pytest.raises(error, match=words):
         farm_scene(**{"seed": 0, "shape": (8, 8), **what})

@@ -1,4 +1,4 @@
-"""The farm's year, its sun and its spectra: calendars, cover, shadows, and what remote sensing knows of materials."""
+"""The farm's year, its sun and its spectra: calendars, growth stages, shadows, bands and the white reference."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from pipeline.simulator.scenes.farm.spectra import FWHM_NM, MATERIALS, band_resp
 
 
 @given(st.sampled_from(sorted(CROPS)), st.floats(-50, 350))
-def test_stages_fraction_the_stand(use: str, age: float) -> None:
-    """Shares of stages are non-negative, sum to 1, and at most two neighbours mix."""
+def test_fractions_of_growth_stages_sum_to_1(use: str, age: float) -> None:
+    """The fractions are not negative, and at most two neighbouring stages mix."""
     fractions = stage_fractions(CROPS[use], np.array([age]))
     assert 1 <= len(fractions) <= 2
     assert sum(float(fraction[0]) for fraction in fractions.values()) == pytest.approx(1, abs=1e-6)
@@ -40,16 +40,16 @@ def test_stages_fraction_the_stand(use: str, age: float) -> None:
         ("late_maize", 172, "crop", 20),
     ],
 )
-def test_calendars(use: str, day: int, phase: str, days: float) -> None:
-    """Each field is what the calendar says, through the turn of the year."""
+def test_fields_follow_their_calendar(use: str, day: int, phase: str, days: float) -> None:
+    """Phase and days of each use match the calendar, also across the turn of the year."""
     assert land_on(use, day, 0.0) == (phase, days)
 
 
 SHAPE = (161, 161)
 
 
-def test_the_sun_agrees_with_the_surveys() -> None:
-    """Place by the survey's algorithm for the same true solar time differs by less than 0.7 degrees."""
+def test_sun_position_agrees_with_the_solar_position_algorithm() -> None:
+    """At the same true solar time, elevation and azimuth differ from pvlib's by less than 0.7 degrees."""
     from pvlib.spa import solar_position
 
     at_ground = {"elev": 0.0, "pressure": 1013.25, "temp": 12.0, "delta_t": 69.0, "atmos_refract": 0.5667}
@@ -67,8 +67,8 @@ def test_the_sun_agrees_with_the_surveys() -> None:
 
 
 @pytest.mark.parametrize("azimuth", [90.0, 135.0, 180.0, 240.0])
-def test_shadows_point_away_and_lengthen(azimuth: float) -> None:
-    """The shadow's centre lies opposite the sun, further off and longer the lower the sun."""
+def test_shadows_point_away_from_the_sun_and_lengthen(azimuth: float) -> None:
+    """The shadow's centre lies opposite the sun; the lower the sun, the farther it is and the longer the shadow."""
     lengths = []
     for elevation in (60.0, 35.0, 20.0):
         shadow = crown_shadows(np.zeros((1, 2)), np.array([8.0]), Sun(azimuth, elevation), SHAPE)
@@ -82,15 +82,9 @@ def test_shadows_point_away_and_lengthen(azimuth: float) -> None:
     assert lengths == sorted(lengths)
 
 
-def at(name: str, nm: float) -> float:
-    """Reflectance of a material in the band nearest a wavelength."""
-    library = spectral_library(270)
-    return float(library.reflectance[MATERIALS.index(name), np.abs(library.wavelength_nm - nm).argmin()])
-
-
 @pytest.mark.parametrize("bands", [2, 4, 15, 200, 270, 939])
-def test_any_number_of_bands(bands: int) -> None:
-    """Band counts from 2 to 939 span 400 to 1000 nm, with the brightest band of a white at 1."""
+def test_spectral_library_has_any_number_of_bands(bands: int) -> None:
+    """Libraries of 2 to 939 bands span 400 to 1000 nm, with positive light that has a maximum of 1."""
     library = spectral_library(bands)
     assert library.wavelength_nm[[0, -1]].tolist() == [400.0, 1000.0]
     assert library.reflectance.shape == (len(MATERIALS), bands)
@@ -98,7 +92,7 @@ def test_any_number_of_bands(bands: int) -> None:
     assert library.light.min() > 0
 
 
-def test_band_response_keeps_a_line_in_place() -> None:
+def test_band_response_is_centred_with_the_stated_width() -> None:
     """Bands weigh a straight line to its value at their centre and have the stated width at half maximum."""
     centre, grid = np.array([500.0, 700.0]), np.arange(400.0, 1031.0)
     weight = band_response(centre, np.full(2, FWHM_NM))
@@ -106,8 +100,8 @@ def test_band_response_keeps_a_line_in_place() -> None:
     np.testing.assert_allclose(weight[0, 103] / weight[0, 100], 0.5, rtol=1e-9)
 
 
-def test_white_white_reference_never_saturates() -> None:
-    """The panel stays six standard deviations of shot and read noise below the full well, and so in DN."""
+def test_white_reference_never_saturates() -> None:
+    """Six standard deviations of shot and read noise fit below the full well, and DN stay below full scale."""
     camera = LineCamera()
     white_reference = spectral_library(270).white_reference_electrons(camera)
     assert (white_reference + 6 * np.sqrt(white_reference + camera.read_noise_e**2)).max() < camera.full_scale_e

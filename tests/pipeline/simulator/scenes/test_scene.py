@@ -1,4 +1,4 @@
-"""Scenes of files, and daylight: what values become, where the sun stands, and the light from noon to the night."""
+"""Scenes from files, and daylight: scene values, the sun's position, and light from noon to night."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ BANDS = np.array([400.0, 550.0, 760.0, 1000.0])
 EQUINOX = Sky(started=datetime(2026, 3, 20, 0, 0, tzinfo=UTC), latitude_deg=29.5, longitude_deg=0.0)
 
 
-def test_the_sun_stands_at_the_latitudes_complement_at_an_equinox() -> None:
-    """At noon of an equinox the sun is 90 deg less the latitude high, at midnight as far below."""
+def test_sun_at_an_equinox_is_90_deg_minus_latitude_high() -> None:
+    """At 29.5 deg north the sun is 60.5 deg high at noon, and as far below the horizon at midnight."""
     high = sun_elevation_deg(EQUINOX, np.arange(0, 86400, 300.0))
     assert high.max() == pytest.approx(60.5, abs=0.1)
     assert high.min() == pytest.approx(-60.5, abs=0.3)
@@ -37,7 +37,7 @@ def test_the_sun_stands_at_the_latitudes_complement_at_an_equinox() -> None:
 @pytest.mark.parametrize(
     ("day", "elevation", "percent"), [((4, 16), 20.0, 1.04), ((4, 29), 30.0, 0.66), ((5, 23), 45.0, 0.38)]
 )
-def test_rates_worked_by_hand(day: tuple[int, int], elevation: float, percent: float) -> None:
+def test_rate_of_morning_light_matches_hand_calculation(day: tuple[int, int], elevation: float, percent: float) -> None:
     """Due east at 29.5 deg north the sun rises by 13.05 deg an hour: cot(h) dh/dt is 1.04, 0.66, 0.38 % in 60 s."""
     sky = replace(EQUINOX, started=datetime(2026, *day, tzinfo=UTC))
     seconds = np.arange(4 * 3600.0, 12 * 3600.0, 60.0)
@@ -47,8 +47,8 @@ def test_rates_worked_by_hand(day: tuple[int, int], elevation: float, percent: f
     assert 100 * (after / before - 1) == pytest.approx(percent, abs=0.02)
 
 
-def test_a_low_sun_is_redder() -> None:
-    """At 5 deg green has lost more than the near infrared; at 20 deg green has fallen by more than the sine."""
+def test_low_sun_is_redder() -> None:
+    """At 5 deg green has lost more than the near infrared; at 20 deg it has lost more than the sine of elevation."""
     sky = replace(EQUINOX, started=datetime(2026, 3, 20, 15, 0, tzinfo=UTC))
     seconds = np.arange(0, 4 * 3600, 60.0)
     height, light = sun_elevation_deg(sky, seconds), relative_daylight(sky, BANDS, seconds)
@@ -60,7 +60,7 @@ def test_a_low_sun_is_redder() -> None:
 
 @pytest.mark.parametrize("hour", [0, 5, 12, 17])
 def test_night_is_dark_and_finite(hour: int) -> None:
-    """Through a day from any hour the light is finite and 0 exactly with the sun down, the start's sun down or not."""
+    """Over a day from any start hour, light is finite, positive with the sun up and exactly 0 with the sun down."""
     sky = replace(EQUINOX, started=datetime(2026, 3, 20, hour, tzinfo=UTC))
     seconds = np.arange(0, 86400, 300.0)
     light, height = relative_daylight(sky, BANDS, seconds), sun_elevation_deg(sky, seconds)
@@ -69,16 +69,16 @@ def test_night_is_dark_and_finite(hour: int) -> None:
     assert (light[height > 0.1] > 0).all()
 
 
-def test_sunset_is_even() -> None:
-    """The light goes to 0 at the horizon without a step: by less than 0.2 % of that at 1 deg in a second."""
+def test_light_falls_to_0_at_sunset_without_a_step() -> None:
+    """In a second light changes by less than 1 % of that at the start, with the sun 3 deg high."""
     sky = replace(EQUINOX, started=datetime(2026, 3, 20, 17, 55, tzinfo=UTC))
     light = relative_daylight(sky, BANDS, np.arange(0, 1200.0))
     assert light[-1].max() == 0
     assert np.abs(np.diff(light, axis=0)).max() < 0.01
 
 
-def test_knots_are_fine_enough() -> None:
-    """Between its knots the light is right to 2e-6 of the start's, up to sunset, and a new year makes no jump."""
+def test_daylight_between_knots_is_accurate() -> None:
+    """Between its knots light is right to 2e-6 of the start's, until sunset, and the turn of the year makes no jump."""
     sky = Sky(started=datetime(2026, 12, 31, 22, 0, tzinfo=UTC), latitude_deg=0.0, longitude_deg=-150.0)
     seconds = np.arange(0, 7 * 3600, 10.0)
     on, half = (relative_daylight(sky, BANDS, seconds + shift) for shift in (0.0, 5.0))
@@ -89,7 +89,7 @@ def test_knots_are_fine_enough() -> None:
 
 
 def test_knots_within_a_survey() -> None:
-    """The survey's ends and the full ten seconds of the day between them."""
+    """The knots are the survey's ends and the full ten seconds of the day between them."""
     sky = replace(EQUINOX, started=datetime(2026, 3, 20, 9, 0, 7, tzinfo=UTC))
     np.testing.assert_allclose(knots_within(sky, 20.0), [0, 3, 13, 20])
 
@@ -99,19 +99,19 @@ WAVELENGTH = np.array([660.0, 800.0])
 
 
 def picture(seed: int = 0, shape: tuple[int, ...] = (20, 30, 2)) -> np.ndarray:
-    """Random values in 0..255."""
+    """Return random values in 0..255."""
     return (np.random.default_rng(seed).random(shape) * 255).astype(np.uint8)
 
 
-def test_bright_end_fills_the_stated_fraction_of_the_well() -> None:
-    """The 99.9th percentile gives 60 % of the full well, whatever the unit of the file."""
+def test_bright_end_fills_60_percent_of_the_well() -> None:
+    """The 99.9th percentile of the values gives 60 % of the full well."""
     scene = raster_from_values(picture(), CAMERA, name="p", wavelength_nm=WAVELENGTH)
     bright = np.percentile(picture(), 99.9)
     np.testing.assert_allclose(bright * scene.electrons, 0.6 * CAMERA.full_scale_e, rtol=1e-6)
     np.testing.assert_allclose(scene.white_reference * scene.electrons, scene.white_reference_electrons, rtol=1e-6)
 
 
-def test_values_are_those_of_the_file() -> None:
+def test_scene_returns_the_values_it_was_made_of() -> None:
     """A scene made of values returns them; a scene of components returns their mixture."""
     scene = raster_from_values(picture(), CAMERA, name="p", wavelength_nm=WAVELENGTH)
     np.testing.assert_allclose(scene.values(), picture(), rtol=1e-6)
@@ -124,7 +124,7 @@ def test_values_are_those_of_the_file() -> None:
 
 
 def test_gaps_are_filled_and_counted() -> None:
-    """Pixels without a value get the band's median; a band without any gets 0."""
+    """Pixels without a value get the band's median; a band without any value gets 0."""
     values = picture().astype(np.float32)
     values[3, 4, 0], values[5, 6, 0], values[5, 6, 1] = np.nan, np.inf, -np.inf
     scene = raster_from_values(values, CAMERA, name="gaps", wavelength_nm=WAVELENGTH)
@@ -136,14 +136,14 @@ def test_gaps_are_filled_and_counted() -> None:
 
 
 def test_black_scene_keeps_scale_one() -> None:
-    """Without positive light the scale is 1 and everything stays finite."""
+    """Without positive light the scale is 1 and all values stay finite."""
     scene = raster_from_values(np.zeros((5, 5, 2)), CAMERA, name="black", wavelength_nm=WAVELENGTH)
     np.testing.assert_allclose(scene.electrons, 0.6 * CAMERA.full_scale_e, rtol=1e-6)
     assert (scene.values() == 0).all()
 
 
 def test_key_follows_the_content() -> None:
-    """Equal values have equal keys, one changed pixel another."""
+    """Equal values have equal keys under any name; one changed pixel gives another key."""
     changed = picture()
     changed[0, 0, 0] ^= 1
     keys = [raster_from_values(v, CAMERA, name="p", wavelength_nm=WAVELENGTH).key for v in (picture(), changed)]
@@ -152,7 +152,7 @@ def test_key_follows_the_content() -> None:
 
 
 def test_bright_end_of_a_large_scene_is_sampled() -> None:
-    """Above 2^24 values the percentile is read on a part of the pixels and hardly moves."""
+    """Above 2^24 values the percentile is read from a part of the pixels, and stays right to 0.1 %."""
     row = np.linspace(0, 1, 6_000, dtype=np.float32)
     values = np.broadcast_to(row[:, None, None], (6_000, 3_000, 2))
     scene = raster_from_values(values, CAMERA, name="large", wavelength_nm=WAVELENGTH, key="k")
@@ -160,7 +160,7 @@ def test_bright_end_of_a_large_scene_is_sampled() -> None:
 
 
 def test_unusable_scenes_are_refused() -> None:
-    """Missing axes, nothing finite, and labels of another size are named."""
+    """The errors name missing axes, values without a finite one, and labels or wavelengths of another size."""
     with pytest.raises(SceneError, match=r"\(y, x, band\)"):
         raster_from_values(picture(shape=(4, 5)), CAMERA, name="flat", wavelength_nm=WAVELENGTH)
     with pytest.raises(SceneError, match="no finite value"):
@@ -172,8 +172,8 @@ def test_unusable_scenes_are_refused() -> None:
         raster_from_values(picture(), CAMERA, name="p", wavelength_nm=np.arange(3.0))
 
 
-def test_a_raster_is_drawn_when_it_is_looked_at() -> None:
-    """Name, size and bands are known before; what is drawn must be what was announced."""
+def test_raster_is_drawn_on_first_use() -> None:
+    """Size and labels are stated before; the drawn planes and labels must match them."""
     draw = Mock(return_value=(np.ones((4, 5, 2), np.float32), np.zeros((4, 5), np.uint8)))
     light = Once.of(SceneRadiance(np.ones(2, np.float32), np.ones(2, np.float32)))
     scene = RasterScene(
@@ -192,21 +192,21 @@ def test_a_raster_is_drawn_when_it_is_looked_at() -> None:
 
 @pytest.mark.parametrize("value", [1e30, -1e20, 2e9, 1e300])
 def test_values_that_no_sensor_gives_are_refused(value: float) -> None:
-    """All light is measured by the brightest: one message with the first place, the value and what to do."""
+    """All light is scaled by the brightest value: one message names the first place, the value and the remedy."""
     values = np.ones((4, 5, 2))
     values[1, 3, 0], values[2, 0, 1], values[0, 0, 0], values[0, 1, 0] = value, value, np.nan, np.inf
     with pytest.raises(SceneError, match=r"scene p has 2 values, the first \S+ at y 1, x 3, band 0, .*; put NaN"):
         raster_from_values(values, CAMERA, name="p", wavelength_nm=WAVELENGTH)
 
 
-def test_light_too_small_for_numbers_is_refused() -> None:
-    """Electrons per unit would be infinite."""
+def test_values_too_small_for_float32_are_refused() -> None:
+    """Values of 1e-38 would give infinite electrons per unit."""
     with pytest.raises(SceneError, match="brightest values of scene p are 1e-38, too small for float32"):
         raster_from_values(np.full((4, 5, 2), 1e-38), CAMERA, name="p", wavelength_nm=WAVELENGTH)
 
 
 def test_pixels_without_most_bands_are_missing_and_unlabelled() -> None:
-    """Half of the bands is enough to be known by; a scene with every value misses nothing."""
+    """A pixel with half of its bands is kept; a scene with every value has no missing pixels."""
     values, labels = np.ones((4, 5, 2)), np.zeros((4, 5), np.uint8)
     values[0, 0], values[1, 1, 0], values[2, 2] = np.nan, np.nan, np.inf
     scene = raster_from_values(values, CAMERA, name="p", wavelength_nm=WAVELENGTH, labels=labels)
@@ -219,8 +219,8 @@ def test_pixels_without_most_bands_are_missing_and_unlabelled() -> None:
     assert raster_from_values(np.ones((4, 5, 2)), CAMERA, name="p", wavelength_nm=WAVELENGTH).missing is None
 
 
-def test_a_large_array_lies_in_a_file(monkeypatch: pytest.MonkeyPatch):
-    """It is zero at first, and keeps what is written."""
+def test_large_array_is_stored_in_a_file(monkeypatch: pytest.MonkeyPatch):
+    """The array is zero at first, and keeps written values."""
     assert scratch((4, 5)).base is None
     monkeypatch.setattr(scratch_module, "MOST_BYTES", 64)
     held = scratch((4, 5))
@@ -231,7 +231,7 @@ def test_a_large_array_lies_in_a_file(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_full_disk_is_an_error(monkeypatch: pytest.MonkeyPatch):
-    """Space is taken before anything is written: a file with holes would end the process later, with a signal."""
+    """Space is allocated before anything is written: a sparse file would end the process later, with a signal."""
     full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     monkeypatch.setattr(scratch_module, "MOST_BYTES", 64)
     monkeypatch.setattr(os, "posix_fallocate", Mock(side_effect=full))
@@ -239,8 +239,8 @@ def test_a_full_disk_is_an_error(monkeypatch: pytest.MonkeyPatch):
         scratch((4, 5))
 
 
-def test_a_farm_does_not_depend_on_the_rows_drawn_at_once(monkeypatch: pytest.MonkeyPatch):
-    """Noise, weeds, ponds, shadows and trees lie across strips as they lie in one; each fills its own pixels."""
+def test_farm_does_not_depend_on_the_rows_drawn_at_once(monkeypatch: pytest.MonkeyPatch):
+    """Noise, weeds, ponds, shadows and trees cross the borders of row blocks; each block fills its own pixels."""
     whole, parted = farm_scene(3, (300, 400)), farm_scene(3, (300, 400))
     for rows, scene in ((300, whole), (7, parted)):
         for module in (land, farm_plan, farm_scene_module):
@@ -251,8 +251,8 @@ def test_a_farm_does_not_depend_on_the_rows_drawn_at_once(monkeypatch: pytest.Mo
     assert {"water", "tree", "weed"} <= {whole.class_names[number] for number in np.unique(whole.labels)}
 
 
-def test_a_farm_is_the_same_from_files(monkeypatch: pytest.MonkeyPatch):
-    """Planes, labels and blurred planes are the same bytes."""
+def test_farm_stored_in_files_equals_one_in_memory(monkeypatch: pytest.MonkeyPatch):
+    """Planes, labels and thinned planes have the same values."""
     here, there = farm_scene(3, (300, 200)), farm_scene(3, (300, 200))
     want = here.planes, here.labels, here.raster.thinned(2)
     monkeypatch.setattr(scratch_module, "MOST_BYTES", 1000)

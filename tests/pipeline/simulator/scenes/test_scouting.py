@@ -1,4 +1,4 @@
-"""The scouted field: one crop with patches of interest, the same land on all days, in the farm's classes."""
+"""The scouted field: one crop with patches of interest, the same land on all days, with the farm's classes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SEEDS = (0, 1, 2, 3, 33)
 
 
 def test_equal_arguments_give_equal_fields() -> None:
-    """One seed, day and share give one scene, bit for bit; names and law are one scene."""
+    """One seed and day give one scene, bit for bit, by name and by law."""
     first, second = (scouting_scene(7, SIZE, 5, day=165) for _ in range(2))
     named = built_in_scene("scouting", 7, SIZE, 5, day=165)
     assert first.key == second.key == named.key
@@ -25,8 +25,8 @@ def test_equal_arguments_give_equal_fields() -> None:
         np.testing.assert_array_equal(first.labels, other.labels)
 
 
-def test_another_day_is_the_same_land() -> None:
-    """Rows, wheel marks and patches stay; bare ground of June is bare in May."""
+def test_land_is_the_same_on_another_day() -> None:
+    """Wheel marks and patches stay in place, and ground that is bare in June is bare in May and July."""
     plans = [scouting_plan(5, SIZE, day=day, hour=11.0) for day in (140, 172)]
     assert plans[0].fields[0].tramlines == plans[1].fields[0].tramlines
     patches = [patches_of(plan) for plan in plans]
@@ -39,9 +39,9 @@ def test_another_day_is_the_same_land() -> None:
 
 @pytest.mark.parametrize("seed", SEEDS[::2])
 @pytest.mark.parametrize("interest", [None, 1 / 4])
-def test_patches_take_their_share(seed: int, interest: float | None) -> None:
-    """What differs from a field without patches covers the share that is asked for, 2 to 10 % by default."""
-    day = 185  # every kind shows
+def test_patches_cover_the_requested_fraction(seed: int, interest: float | None) -> None:
+    """The pixels that differ from a field without patches cover the requested fraction, 2 to 10 % by default."""
+    day = 185  # every kind is visible
     scene, plain = (scouting_scene(seed, SIZE, 2, day=day, interest=share) for share in (interest, 0.0))
     changed = float((np.abs(scene.planes - plain.planes).sum(axis=2) > 0.2).mean())
     cover = sum(
@@ -55,8 +55,8 @@ def test_patches_take_their_share(seed: int, interest: float | None) -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS[::2])
-def test_patches_lie_together(seed: int) -> None:
-    """A sixteenth of the field lies in few patches, nine tenths of it within a window of a third of the field."""
+def test_patches_are_clustered(seed: int) -> None:
+    """Patches on 1/16 of the field are at most 15; their 5 to 95 % range of rows and columns is below a third."""
     patches = patches_of(scouting_plan(seed, (512, 640), day=172, hour=11.0), 1 / 16)
     interest = sum(patches.values()) > 0.5
     assert ndimage.label(interest)[1] <= 15
@@ -64,8 +64,8 @@ def test_patches_lie_together(seed: int) -> None:
     assert np.ptp(y) * np.ptp(x) < 512 * 640 / 3
 
 
-def test_classes_are_the_farms() -> None:
-    """Names, colours and order; the crop of the seed fills the field, and there are weeds, bare ground and marks."""
+def test_classes_are_those_of_the_farm() -> None:
+    """Names, colours and order agree; the seed's crop fills the field, with weeds, bare ground and wheel marks."""
     uses = set()
     for seed in SEEDS:
         scene = scouting_scene(seed, SIZE, 2)
@@ -80,8 +80,8 @@ def test_classes_are_the_farms() -> None:
     assert uses == set(SCOUTED)
 
 
-def test_key_tells_the_share_and_the_light() -> None:
-    """Each where it is not the default, behind the law, the seed and the day."""
+def test_key_contains_interest_and_light() -> None:
+    """Each is written only if it is not the default, after law, seed and day."""
     scene = scouting_scene(3, (20, 30), 7)
     assert scene.key == "scouting@1/seed=3/day=172/shape=20x30/hour=11/bands=7/full_well=20155"
     assert scouting_scene(3, (20, 30), 7, interest=0.25).key == scene.key.replace("/bands", "/interest=0.25/bands")
@@ -89,14 +89,14 @@ def test_key_tells_the_share_and_the_light() -> None:
 
 
 @pytest.mark.parametrize("interest", [-0.1, 1.5, float("nan")])
-def test_impossible_shares_are_refused(interest: float) -> None:
-    """With the share that came."""
+def test_interest_outside_0_to_1_is_refused(interest: float) -> None:
+    """The message names the fraction, NaN included."""
     with pytest.raises(SceneError, match=f"from 0 to 1, got {interest:g}"):
         scouting_scene(0, (8, 8), interest=interest)
 
 
 def test_less_light_scales_scene_and_white_reference_alike() -> None:
-    """Electrons of both fall by the fraction, scene values do not; light of light is their product."""
+    """Electrons of both fall by the fraction and scene values stay; repeated fractions multiply."""
     scene = scouting_scene(2, (24, 32), 9)
     dim = scene.in_light(0.5).in_light(0.25)
     np.testing.assert_array_equal(dim.electrons, scene.electrons * np.float32(0.125))

@@ -1,4 +1,4 @@
-"""The decision which effects to compute: laws, cases worked by hand, the words of what is asked, and the manifest."""
+"""The choice of effects to compute: laws, cases worked by hand, selection by name, and the manifest."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _COSTS = st.sampled_from((0.0, 0.3, 1.0, 7.7, 24.7)) | st.floats(0, 30)
 
 @st.composite
 def made_up(draw: st.DrawFn, most: int = 6) -> list[MadeUp]:
-    """Some effects, quantisation perhaps among them, with up to three variants each."""
+    """Draw some effects, perhaps with quantisation, each with up to three variants."""
     names, effects = draw(st.lists(st.sampled_from([*"abcdefgh", "quantisation"]), unique=True, max_size=most)), []
     for name in names:
         cheap = [(f"v{i}", draw(_BOUNDS), draw(_COSTS)) for i in range(draw(st.integers(0, 2)))]
@@ -37,13 +37,13 @@ def made_up(draw: st.DrawFn, most: int = 6) -> list[MadeUp]:
 
 
 def variants(decision: Decision) -> dict[str, str]:
-    """Option of every effect by name."""
+    """Return the chosen option of every effect by name."""
     return {one.name: one.option.variant for one in decision.taken}
 
 
 @given(made_up(), TOLERANCES)
 def test_errors_never_exceed_the_tolerance(effects: list[MadeUp], tolerance: float):
-    """The bounds of what is left out, with safety, sum up to the tolerance at most."""
+    """The bounds of effects that are left out, with safety, sum to at most the tolerance."""
     decision = decide(PROBE, RIG, effects, tolerance)
     assert decision.error <= tolerance
     assert decision.error == math.fsum(one.option.error for one in decision.taken)
@@ -51,15 +51,15 @@ def test_errors_never_exceed_the_tolerance(effects: list[MadeUp], tolerance: flo
 
 @given(made_up(), TOLERANCES, TOLERANCES)
 def test_larger_tolerance_never_costs_more(effects: list[MadeUp], one: float, other: float):
-    """Whatever may be left out under a tolerance may be left out under a larger one."""
+    """The cost at a larger tolerance is at most that at a smaller one, which is at most the exact cost."""
     strict, loose = (decide(PROBE, RIG, effects, tolerance) for tolerance in sorted((one, other)))
     assert loose.cost_ns <= strict.cost_ns * (1 + 1e-12)
     assert strict.cost_ns <= strict.exact_cost_ns * (1 + 1e-12)
 
 
 @given(made_up(), TOLERANCES, st.randoms(use_true_random=False))
-def test_order_of_effects_changes_nothing(effects: list[MadeUp], tolerance: float, random):
-    """Only the names tell effects apart; the decision keeps the order of the chain."""
+def test_decision_does_not_depend_on_the_order_of_effects(effects: list[MadeUp], tolerance: float, random):
+    """Effects are distinguished by their names only; the decision keeps the order of the chain."""
     mixed = random.sample(effects, len(effects))
     first, second = (decide(PROBE, RIG, order, tolerance) for order in (effects, mixed))
     assert variants(first) == variants(second)
@@ -67,8 +67,8 @@ def test_order_of_effects_changes_nothing(effects: list[MadeUp], tolerance: floa
 
 
 @given(made_up())
-def test_tolerance_of_zero_computes_all_that_the_rig_has(effects: list[MadeUp]):
-    """Exact and on, but for what is absent."""
+def test_tolerance_of_zero_makes_every_effect_of_the_rig_exact(effects: list[MadeUp]):
+    """Only effects that the rig lacks are off."""
     decision = decide(PROBE, RIG, effects, 0.0)
     for one in decision.taken:
         has = one.menu.effect.left_out > 0 or one.name == "quantisation"
@@ -78,15 +78,15 @@ def test_tolerance_of_zero_computes_all_that_the_rig_has(effects: list[MadeUp]):
 
 
 @given(made_up())
-def test_infinite_tolerance_leaves_only_what_is_stored(effects: list[MadeUp]):
-    """All that may be off is off."""
+def test_infinite_tolerance_leaves_only_quantisation_on(effects: list[MadeUp]):
+    """Every effect that may be off is off."""
     on = [one.name for one in decide(PROBE, RIG, effects, math.inf).taken if one.is_on]
     assert on == [effect.name for effect in effects if effect.name == "quantisation"]
 
 
 @given(made_up(), TOLERANCES, st.data())
-def test_asking_by_name_switches_on_those_and_no_others(effects: list[MadeUp], tolerance: float, data):
-    """Named ones are on in a variant within the tolerance, where the rig has them; the others are off."""
+def test_selection_by_name_switches_on_only_named_effects(effects: list[MadeUp], tolerance: float, data):
+    """Named effects of the rig are on, in a variant within the tolerance; the others are off, except quantisation."""
     known = [effect.name for effect in effects]
     named = data.draw(st.lists(st.sampled_from(known), min_size=1, unique=True)) if known else ["all"]
     decision = decide(PROBE, RIG, effects, tolerance, ", ".join(named))
@@ -97,8 +97,8 @@ def test_asking_by_name_switches_on_those_and_no_others(effects: list[MadeUp], t
 
 
 @given(made_up(5), st.floats(1e-3, 5))
-def test_at_least_half_of_what_can_be_saved_is_saved(effects: list[MadeUp], tolerance: float):
-    """The rule's worst case against an enumeration of all options."""
+def test_decision_saves_at_least_half_of_the_possible_cost(effects: list[MadeUp], tolerance: float):
+    """The rule's worst case is compared with an enumeration of all options."""
     decision, menus = decide(PROBE, RIG, effects, tolerance), list_options(PROBE, RIG, effects)
     ways = [menu.variants if menu.name == "quantisation" else (*menu.variants, menu.off) for menu in menus]
     fitting = (way for way in itertools.product(*ways) if math.fsum(one.error for one in way) <= tolerance)
@@ -134,15 +134,15 @@ POISSON = [MadeUp("shot", 2.0, (("poisson", 0.0, 24.7), ("gauss", 0.01, 7.7), ("
         pytest.param(POISSON, 0.1, "auto", "gauss", id="a variant where leaving out is too much, no cheaper one"),
     ],
 )
-def test_worked_by_hand(effects: list[MadeUp], tolerance: float, asked: str, wanted: str):
-    """What each effect is treated as, in the order of the chain."""
+def test_decision_matches_hand_calculation(effects: list[MadeUp], tolerance: float, asked: str, wanted: str):
+    """The wanted variants are in the order of the chain; with ``auto`` the error is within the tolerance."""
     decision = decide(PROBE, RIG, effects, tolerance, asked)
     assert " ".join(variants(decision).values()) == wanted
     assert decision.error <= tolerance or asked != "auto"
 
 
 def test_gains_multiply_the_errors_of_others_but_not_their_own():
-    """Light that is brightened by a quarter carries errors a quarter higher, to the readout too; DN follow no light."""
+    """Light that is 25 % brighter carries errors 25 % larger, also to the readout; DN do not depend on the light."""
     effects = [
         MadeUp("read", 0.1),
         Brightening("vignetting", 0.25, fraction=0.25),
@@ -152,8 +152,8 @@ def test_gains_multiply_the_errors_of_others_but_not_their_own():
     assert errors == pytest.approx([0.1 * 1.875 * SAFETY, 0.25 * 1.5 * SAFETY, 0.5 * 1.25 * SAFETY])
 
 
-def test_of_several_binnings_the_worst_counts():
-    """Each option has the greater error of two probes, and what one of them does not see, the other may."""
+def test_worst_of_several_binnings_counts():
+    """Each option has the greater error of two probes; an effect that one probe does not show may show in the other."""
     fine, coarse = even_probe(), replace(even_probe(level=np.full(1, 2.0), slope=np.zeros((2, 1))), binning=4)
     steep = replace(fine, slope=np.ones((2, 1)))
     effects = [MadeUp("read", 0.1, (("exact", 0.0, 5.0), ("cheap", 0.01, 1.0))), Shift("shift", 0.1)]
@@ -166,8 +166,8 @@ def test_of_several_binnings_the_worst_counts():
     assert decide([fine, coarse], RIG, effects, 0.15).taken[0].option.variant == "cheap"
 
 
-def test_a_gain_that_only_darkens_does_not_multiply_errors():
-    """A shadow states its own range; what it takes, left out, counts by the smaller noise of the shadow."""
+def test_gain_that_only_darkens_does_not_multiply_errors():
+    """A shadow states its own range; leaving it out counts by the smaller noise within the shadow."""
     rig, slope = Rig(sky=Sky(cloud_fraction=0.5)), even_probe(slope=np.ones((2, 1)), brightest_e=1e4, darkest_e=1e4)
     shift, cloud = (menu.off.error for menu in list_options(slope, rig, [Shift("shift", 0.1), CLOUD]))
     assert shift == pytest.approx(0.1 * SAFETY)
@@ -175,15 +175,15 @@ def test_a_gain_that_only_darkens_does_not_multiply_errors():
 
 
 @pytest.mark.parametrize("name", ["rotation", "slit", "smear"])
-def test_later_gains_multiply_errors_of_what_the_renderer_does(name: str):
-    """Lines that are not turned, seen in 1.5 times the light, err by 1.5 times; so does a readout of that light."""
+def test_later_gains_multiply_errors_of_the_renderer(name: str):
+    """In 1.5 times the light, lines without rotation err by 1.5 times, and so does a readout of that light."""
     effects = [MadeUp(name, 0.1), MadeUp("read", 0.1), Brightening("drift", 0.5, fraction=0.5)]
     errors = [menu.off.error for menu in list_options(replace(PROBE, unit="dn"), RIG, effects)]
     assert errors[:2] == pytest.approx([0.15 * SAFETY, 0.15 * SAFETY])
 
 
-def test_the_readout_is_bounded_in_the_light_that_it_gets():
-    """Under a cloud that takes all light read noise is all noise, and its bound that of darkness."""
+def test_readout_is_bounded_by_the_light_that_it_receives():
+    """Under a cloud that takes all light, read noise is all noise, and its bound is that of darkness."""
     probe, rig = even_probe(brightest_e=1e4, darkest_e=1e4), Rig(sky=Sky(cloud_fraction=1.0))
     found = {menu.name: menu.off.error for menu in list_options(probe, rig, [READ_NOISE, CLOUD])}
     dark = READ_NOISE.bound(replace(probe, darkest_e=0.0), rig).value
@@ -191,8 +191,8 @@ def test_the_readout_is_bounded_in_the_light_that_it_gets():
     assert dark > 10 * READ_NOISE.bound(probe, rig).value
 
 
-def test_even_scene_shows_no_geometry_but_the_rig_has_it():
-    """An effect without a trace in the scene is off from the smallest tolerance on, and on at 0."""
+def test_shift_on_an_even_scene_is_unseen():
+    """An effect without a trace in the scene is off from the smallest tolerance upwards, and on at 0."""
 
     assert decide(PROBE, RIG, [Shift("shift", 1.0)], 1e-300).taken[0].reason == "unseen"
     assert decide(PROBE, RIG, [Shift("shift", 1.0)], 0.0).taken[0].reason == "exact"
@@ -208,21 +208,21 @@ def test_even_scene_shows_no_geometry_but_the_rig_has_it():
         (" , ", "no effect is named in ' , '; write auto, all, none, or names"),
     ],
 )
-def test_unknown_names_are_refused_with_the_nearest(asked: str, words: str):
-    """One error that says what was meant."""
+def test_unknown_names_are_refused_with_a_suggestion(asked: str, words: str):
+    """One error states the nearest known name, or the correct use of ``auto``, ``all`` and ``none``."""
     with pytest.raises(SettingsError, match=words):
         named_effects(asked, ["shot", "jitter", "vignetting"])
 
 
 @pytest.mark.parametrize("tolerance", [-0.1, math.nan])
-def test_tolerances_below_zero_are_refused(tolerance: float):
-    """As are those that are no number."""
+def test_negative_and_nan_tolerances_are_refused(tolerance: float):
+    """A tolerance is a number of 0 or more."""
     with pytest.raises(SettingsError, match="tolerance must be 0 or more, got"):
         decide(PROBE, RIG, [], tolerance)
 
 
-def test_bounds_that_are_no_numbers_are_refused_by_name():
-    """Rather than decided on."""
+def test_nan_bounds_are_refused_by_name():
+    """The error names the effect, the variant and the bound's reason."""
     with pytest.raises(SettingsError, match=r"effect smear, off: its bound is nan.*smear as off"):
         decide(PROBE, RIG, [MadeUp("smear", math.nan)], 0.1)
 
@@ -240,15 +240,15 @@ EFFECTS = [
 
 
 def test_rows_have_the_fields_of_a_receipt_and_plain_values():
-    """Receipts take them as they are."""
+    """Rows survive JSON without NaN, as receipts need, and keep the order of the effects."""
     rows = list_effects(decide(PROBE, RIG, EFFECTS, math.inf))
     assert all(set(row) == FIELDS for row in rows)
     assert json.loads(json.dumps(rows, allow_nan=False)) == rows
     assert [row["name"] for row in rows] == [effect.name for effect in EFFECTS]
 
 
-def test_totals_add_up():
-    """Bounds to the whole bound, seconds to what was saved against everything on."""
+def test_totals_are_sums_of_the_rows():
+    """Bounds sum to the whole bound, and seconds to those saved relative to everything on."""
     decision = decide(PROBE, RIG, EFFECTS, 0.1)
     rows, totals = list_effects(decision), sum_up(decision)
     assert math.fsum(row["bound"] for row in rows) == pytest.approx(totals["bound"])
@@ -258,23 +258,23 @@ def test_totals_add_up():
     assert (totals["on"], totals["off"], totals["within"]) == (3, 4, True)
 
 
-def test_asked_effects_may_leave_the_tolerance():
-    """The totals say so."""
+def test_selected_effects_may_exceed_the_tolerance():
+    """The totals state that ``none`` is not within the tolerance."""
     totals = sum_up(decide(PROBE, RIG, EFFECTS, 0.1, "none"))
     assert not totals["within"]
     assert totals["bound"] == pytest.approx(1.2 * (0.05 + 2.0 + 0.06 + 0.02))
 
 
-def test_every_case_of_the_rule_has_its_reason():
-    """Absent, unseen, small, needed, without room in the tolerance, and always there."""
+def test_every_outcome_of_the_rule_has_its_reason():
+    """The reasons are absent, unseen, small, needed, without room in the tolerance (``spent``), and always on."""
     rows = list_effects(decide(PROBE, RIG, EFFECTS, 0.1))
     assert [row["reason"] for row in rows] == ["absent", "unseen", "small", "needed", "spent", "small", "always"]
     assert rows[3]["magnitude"] == "shot as off"
     assert rows[3]["left_out"] == pytest.approx(2.4)
 
 
-def test_bounds_without_limit_become_null():
-    """JSON knows no infinity."""
+def test_infinite_bounds_become_null():
+    """JSON has no infinity."""
     decision = decide(PROBE, RIG, [MadeUp("slit", math.inf)], math.inf, "none")
     assert list_effects(decision)[0]["bound"] is None
     assert (sum_up(decision)["bound"], sum_up(decision)["tolerance"]) == (None, None)

@@ -1,4 +1,4 @@
-"""The probe of a scene: what it finds is there, nothing in the image exceeds it, and odd scenes are told."""
+"""The probe of a scene: its maxima are reached, the image does not exceed them, and unusual scenes are finite."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ BLURS: dict[Any, str] = {DIFFRACTION: "airy", ABERRATION: "gaussian", KEYSTONE: 
 
 
 def scene_of(values: np.ndarray) -> RasterScene:
-    """A scene of given values (y, x, band)."""
+    """Return a scene of given values (y, x, band)."""
     return image_scene(values, RIG.camera, np.linspace(400, 900, values.shape[2]))
 
 
 def mixed(seed: int, shape: tuple[int, int] = (80, 110), bands: int = 6) -> RasterScene:
-    """Grain, waves, an edge and a point of 3 components, in strengths of their own."""
+    """Return grain, waves, an edge and a point of 3 components, each with a strength of its own."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float64)
     grain = rng.uniform(0, 1, (*shape, 3)) * rng.uniform(0, 0.6)
@@ -47,13 +47,13 @@ def mixed(seed: int, shape: tuple[int, int] = (80, 110), bands: int = 6) -> Rast
 
 
 def seen(scene: RasterScene, sweep: Sweep, variant: str = "3x1", blurs: dict[Any, str] | None = None) -> np.ndarray:
-    """All lines of a sweep through the footprint."""
+    """Return all lines of a sweep through the footprint."""
     block = SweepBlock(RIG, sweep, range(sweep.lines), scene.wavelength_nm, scene.shape)
     return expected_light(scene, block, {ROTATION: "rays", SLIT: variant, **(blurs or {})})
 
 
 def test_flat_scene_has_no_slope() -> None:
-    """A flat scene has level but neither slope, curvature nor span."""
+    """A flat scene has a level but neither slope, curvature nor span."""
     probe = probe_scene(scene_of(np.full((50, 60, 1), 3.0)), RIG, [SWEEP])
     assert probe.slope.max() == probe.curvature.max() == probe.span.max() == 0
     assert probe.level[0] == pytest.approx(probe.brightest_e / noise_electrons(np.float32([probe.brightest_e]), RIG)[0])
@@ -63,7 +63,7 @@ def test_flat_scene_has_no_slope() -> None:
 
 @pytest.mark.parametrize("along", ["x", "y"])
 def test_wave_has_its_slope_and_curvature(along: str) -> None:
-    """A long wave across the lines has slope and curvature of its amplitude and frequency, and none along them."""
+    """A long wave across the lines has slope and curvature of its amplitude and frequency, and no slope along them."""
     y, x = np.mgrid[:121, :121]  # level at the edges, which are repeated
     phase = 2 * np.pi * (y if along == "x" else x) / 24
     scene = scene_of((1 + 0.5 * np.cos(phase))[..., None])
@@ -78,8 +78,8 @@ def test_wave_has_its_slope_and_curvature(along: str) -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 11])
-def test_nothing_in_the_image_exceeds_the_probe(seed: int) -> None:
-    """Levels, spans, differences of neighbours and of variants of the slit stay below 1.05 of the probe's."""
+def test_image_does_not_exceed_the_probe(seed: int) -> None:
+    """Levels, spans and differences of neighbours stay within 1.05 of the probe's; slit variants keep their bounds."""
     scene, sweep = mixed(seed), replace(SWEEP, swath_px=40.0 * (seed % 3), start_px=-30.0 + seed)
     probe, light = probe_scene(scene, RIG, [sweep]), seen(scene, sweep)
     noise = noise_electrons(light, RIG)
@@ -99,8 +99,8 @@ def test_nothing_in_the_image_exceeds_the_probe(seed: int) -> None:
 
 
 @pytest.mark.parametrize(("swath", "seed"), [(300.0, 0), (900.0, 1)])
-def test_turned_lines_do_not_exceed_what_the_probe_measured(seed: int, swath: float) -> None:
-    """At strips far from the middle, where lines are turned by 3 and 8 deg, each keeps its bound beside all blurs."""
+def test_rotated_lines_do_not_exceed_the_probe(seed: int, swath: float) -> None:
+    """Far from the middle, with lines rotated by 3 and 8 deg, each slit variant keeps its bound with all blurs on."""
     scene, sweep = mixed(seed, (80, 2000)), replace(SWEEP, swath_px=swath)
     probe, light = probe_scene(scene, RIG, [sweep]), seen(scene, sweep, "9x3", BLURS)
     noise = noise_electrons(light, RIG)
@@ -111,7 +111,7 @@ def test_turned_lines_do_not_exceed_what_the_probe_measured(seed: int, swath: fl
 
 
 def test_bands_at_the_same_wavelength_have_finite_derivatives() -> None:
-    """Detectors that overlap repeat wavelengths and step back; across such a seam there is no derivative."""
+    """Overlapping detectors repeat wavelengths and step back; no derivative is taken across such a seam."""
     scene = replace(mixed(2, bands=4), wavelength_nm=np.array([500.0, 510.0, 510.0, 505.0]))
     probe = probe_scene(scene, RIG, [SWEEP])
     assert np.isfinite(probe.spectral_slope).all()
@@ -130,8 +130,8 @@ def test_probe_finds_a_single_bright_pixel_in_a_large_scene() -> None:
 
 
 @pytest.mark.parametrize(("binning", "along"), [(2, "y"), (4, "x"), (7, "y")])
-def test_no_stored_sum_exceeds_its_probe(binning: int, along: str) -> None:
-    """Sums' levels, and what a sample on either side changes of them, are within 1.05 of the probe for the binning."""
+def test_stored_sums_do_not_exceed_their_probe(binning: int, along: str) -> None:
+    """Levels of sums, and their differences from line to line, are within 1.05 of the probe for the binning."""
     scene = mixed(binning, (96, 110))
     sweep = replace(SWEEP, along=along, binning=binning, start_px=-20.0, lines=41)
     probe, light = probe_scene(scene, RIG, [sweep]), seen(scene, sweep)
@@ -144,8 +144,8 @@ def test_no_stored_sum_exceeds_its_probe(binning: int, along: str) -> None:
     assert probe.binning == binning
 
 
-def test_a_bright_sum_counts_by_the_root_of_its_samples() -> None:
-    """Of an even scene the level in sigmas of a sum of 4 is twice that of a sample, in DN 4 times."""
+def test_level_of_a_sum_grows_with_the_root_of_its_samples() -> None:
+    """For an even scene the level of a sum of 4 is that of a sample times 2 in sigmas, and times 4 in DN."""
     scene, four = scene_of(np.full((50, 60, 1), 3.0)), replace(SWEEP, binning=4)
     for unit, growth in (("sigma", 2.0), ("dn", 4.0)):
         probes = [probe_scene(scene, RIG, [sweep], unit) for sweep in (SWEEP, four)]
@@ -153,8 +153,8 @@ def test_a_bright_sum_counts_by_the_root_of_its_samples() -> None:
         assert probes[1].unit_least_dn == pytest.approx(probes[0].unit_least_dn / growth, rel=1e-4)
 
 
-def test_a_survey_has_a_probe_for_each_exposure() -> None:
-    """That of a rig which takes all lines so, but for the time and the lines of all."""
+def test_survey_has_a_probe_for_each_exposure() -> None:
+    """Each probe is that of a rig which takes all lines with this exposure, except for the survey's time and lines."""
     scene, coarse = mixed(4), replace(SWEEP, name="c", kind="coarse", lines=15, step=4, binning=4, exposure_ms=25.0)
     fast = replace(SWEEP, name="f", exposure_ms=5.0)
     probes = probe_survey(scene, RIG, [coarse, SWEEP, fast])
@@ -171,15 +171,15 @@ def test_a_survey_has_a_probe_for_each_exposure() -> None:
     assert "in 100 ms" in whole["dark-current"].off.why
 
 
-def test_a_survey_lasts_as_long_as_its_mirror_and_camera_take() -> None:
-    """Drifts are bounded over the whole survey, slow set-ups included."""
+def test_survey_time_includes_slow_setups() -> None:
+    """Drifts are bounded over the whole survey, including slews of 10 s and reloads of 60 s."""
     slow, sweeps = CostModel(slew_s=10, reload_s=60), [replace(SWEEP, name=name) for name in "ab"]
     (probe,) = probe_survey(mixed(4), RIG, sweeps, "sigma", slow)
     assert probe.seconds == slow.seconds(sweeps, RIG.camera) > CostModel().seconds(sweeps, RIG.camera) + 60
 
 
 def test_probe_of_a_noiseless_rig_is_finite() -> None:
-    """Its unit is that of quantisation, wherever there is no light either, and every effect has a bound."""
+    """The unit is the noise of quantisation, also where there is no light, and every effect has a finite bound."""
     values = np.zeros((60, 60, 3))
     values[30:] = 1.0
     noiseless = replace(RIG, detector=Detector(noiseless=True))
@@ -190,14 +190,14 @@ def test_probe_of_a_noiseless_rig_is_finite() -> None:
     assert all(np.isfinite(menu.off.error) for menu in list_options(probe, noiseless, EFFECTS))
 
 
-def test_no_lines_are_refused() -> None:
-    """Without a line there is nothing to look at."""
+def test_survey_without_lines_is_refused() -> None:
+    """A probe needs at least one line."""
     with pytest.raises(SettingsError, match="no sweep has a line"):
         probe_scene(mixed(0), RIG, [replace(SWEEP, lines=0)])
 
 
-def test_sweep_beside_the_scene_is_flat() -> None:
-    """Lines that miss the scene see its repeated edge; the probe is finite."""
+def test_sweep_outside_of_the_scene_has_a_finite_probe() -> None:
+    """Lines that miss the scene see its repeated edge."""
     probe: Probe = probe_scene(mixed(1), RIG, [replace(SWEEP, swath_px=900.0, start_px=800.0)])
     assert np.isfinite(probe.slope).all()
     assert np.isfinite(probe.level).all()

@@ -1,4 +1,4 @@
-"""Which effects a scene and a rig call for, at a tenth of the noise: one test for every case of the design's table."""
+"""Effects that a scene and a rig need at a tenth of the noise: one test for every case of the design's table."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ DIM, BRIGHT, ROOF = 50.0, 10_000.0, 40_000.0
 
 @dataclass(frozen=True)
 class Case:
-    """A scene of so many electrons at the exposure, perhaps with a gentle texture or a roof, and a rig."""
+    """A scene of given electrons at the exposure, with an optional gentle texture or roof, and a rig."""
 
     electrons: float = 2_000.0
     texture: float = 0.0  # amplitude of waves of 40 px, over the electrons
@@ -43,7 +43,7 @@ class Case:
 
 @cache
 def scene_of(case: Case) -> RasterScene:
-    """Pixels of one component that all bands show alike."""
+    """Return a scene of one component that is the same in all bands."""
     y, x = np.mgrid[:1000, :680]
     plane = case.electrons * (1 + case.texture * np.sin(2 * np.pi * (x + y) / 40))
     if case.roof_e:
@@ -56,32 +56,32 @@ def scene_of(case: Case) -> RasterScene:
 
 @pytest.fixture(autouse=True)
 def a_sparse_pass(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Waves, a roof and flat fields repeat themselves: an eighth of the usual samples sees all that they have."""
+    """Probe an eighth of the usual samples, enough for waves, a roof and flat fields, which repeat themselves."""
     monkeypatch.setattr(survey_probe, "MOST_SAMPLES", 1500)
     monkeypatch.setattr(survey_probe, "FINEST_SAMPLES", 200)
 
 
 @cache
 def probed(case: Case) -> Probe:
-    """What the probe sees of a case."""
+    """Return the probe of a case."""
     probe = survey_probe.probe_scene(scene_of(case), case.rig, SWEEPS)
     return probe if case.seconds is None else replace(probe, seconds=case.seconds)
 
 
 @cache
 def decided(case: Case) -> Decision:
-    """What the rule makes of a case."""
+    """Return the decision for a case."""
     return decide(probed(case), case.rig, EFFECTS, TOLERANCE)
 
 
 def rig_of(*, exposure_ms: float = 100.0, **parts: object) -> Rig:
-    """A rig with some parts other than the defaults."""
+    """Return a rig with some parts other than the defaults."""
     return Rig(camera=replace(CAMERA, exposure_ms=exposure_ms), **parts)
 
 
 FLAT = Case()
 NOISELESS = Case(rig=rig_of(detector=Detector(noiseless=True)))
-BRIGHT_FLAT = Case(BRIGHT, rig=rig_of(mirror=MirrorMotion(coating="ideal")))  # which else takes the tolerance
+BRIGHT_FLAT = Case(BRIGHT, rig=rig_of(mirror=MirrorMotion(coating="ideal")))  # others use up the tolerance
 DIM_1_S = Case(DIM, rig=rig_of(exposure_ms=1000.0))
 FAST = Case(texture=0.01, rig=rig_of(exposure_ms=3.0))
 SLOW = Case(texture=0.01)
@@ -90,7 +90,7 @@ HAZY_300_M = Case(DIM, 0.08, rig=rig_of(air=Air(distance_m=300.0, visibility_km=
 FOUR_HOURS = Case(rig=rig_of(sky=Sky(started=LOW_SUN)), seconds=4 * 3600.0)
 ONE_SWEEP_AT_NOON = Case(rig=rig_of(sky=Sky(started=NOON)), seconds=6.0)
 BRIGHT_ROOF = Case(roof_e=ROOF)
-DEPTH_STEP = Case(  # focused where it looks: at infinity, all of it were a blur of 33 px
+DEPTH_STEP = Case(  # focused on the scene: with the focus at infinity the blur would be 33 px
     texture=0.2, rig=rig_of(air=Air(distance_m=3.0, nearest_m=2.0, relief="step"), optics=Optics(focus_m=3.0))
 )
 TABLE = [
@@ -115,8 +115,8 @@ TABLE = [
 
 
 @pytest.mark.parametrize(("case", "on", "off"), TABLE)
-def test_scene_and_rig_switch_effects(case: Case, on: str, off: str):
-    """As the design's table says, of a rig that is as its defaults but for what the row names."""
+def test_effects_switch_as_in_the_design_table(case: Case, on: str, off: str):
+    """Rigs have default settings except for those that the row names; the error stays within the tolerance."""
     states = {one.name: one.is_on for one in decided(case).taken}
     assert [name for name in on.split(",") if name and not states[name]] == []
     assert [name for name in off.split(",") if name and states[name]] == []
@@ -124,8 +124,8 @@ def test_scene_and_rig_switch_effects(case: Case, on: str, off: str):
 
 
 @pytest.mark.parametrize("case", [pytest.param(row.values[0], id=row.id) for row in TABLE])
-def test_what_is_left_out_keeps_its_bounds(case: Case):
-    """Some lines of both sweeps rendered with everything on and with the choice."""
+def test_light_of_the_decision_keeps_its_bound(case: Case):
+    """Some lines of both sweeps, with everything on and with the choice, differ by at most the decision's error."""
     scene, rig, decision = scene_of(case), case.rig, decided(case)
     white = scene.white_reference_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
     ends = (0.0, 0.0 if case.seconds is None else case.seconds - rig.camera.scan_seconds(SWEEPS[1].lines))
@@ -142,7 +142,7 @@ def test_what_is_left_out_keeps_its_bounds(case: Case):
 
 @pytest.mark.parametrize(("case", "reached"), [(BRIGHT_ROOF, True), (FLAT, False)])
 def test_manifest_says_whether_saturation_is_reached(case: Case, reached: bool):
-    """It is on in any case."""
+    """The reason states whether the light exceeds the limit of the well."""
     menu = next(one.menu for one in decided(case).taken if one.name == "saturation")
     assert (menu.off.error > 0) == reached
     assert ("above the limit" if reached else "stay below") in menu.off.why

@@ -1,4 +1,4 @@
-"""Light that a few looks do not show: bounds hold for bands of their own, beside lone sweeps and for every line."""
+"""Light that few samples show: bounds hold for single bands, beside single sweeps and for every line."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ SHARP = Rig(camera=CAMERA, optics=Optics(stray_fraction=0.0, keystone_px=0.0, sm
 
 
 def off(case: Case, effect: str) -> list[tuple[float, float, bool]]:
-    """Bound and change of an effect that is left out or made cheaper, and whether the bound is broken."""
+    """Return bound, change, and whether the bound is broken, for an effect that is left out or approximated."""
     return [(one.bound, one.measured, one.is_broken) for one in trials(case, (1,), effect)]
 
 
-def test_a_pixel_in_one_band_of_thirty_counts() -> None:
-    """Of 642 x 402 x 30 even pixels with one bright one, in band 5, diffraction changes sigmas, and is said to."""
+def test_bright_pixel_in_one_band_of_thirty_is_bounded() -> None:
+    """One bright pixel in band 5 of 642 x 402 x 30 even ones: diffraction changes over 4 sigma, within its bound."""
     values = np.full((642, 402, 30), 1.0)
     values[321, 200, 5] = 3.0
     rig = replace(SHARP, camera=LineCamera(samples=380))
@@ -38,8 +38,8 @@ def test_a_pixel_in_one_band_of_thirty_counts() -> None:
     assert not any(broken for _, _, broken in found)
 
 
-def test_bright_pixels_beside_a_lone_sweep_count() -> None:
-    """Of one line over even dark land, bright pixels 6 px beside it, diffraction brings light that is seen."""
+def test_bright_pixels_beside_a_single_sweep_are_bounded() -> None:
+    """One line over dark land has bright pixels 6 px beside it: diffraction adds over 0.5 sigma, within its bound."""
     values = np.full((120, 200, 3), 1.0)
     values[50, 60:140] = 40.0
     scene = image_scene(values, CAMERA, np.linspace(400, 1000, 3))
@@ -48,8 +48,8 @@ def test_bright_pixels_beside_a_lone_sweep_count() -> None:
     assert not any(broken for _, _, broken in found)
 
 
-def test_stray_light_of_few_bright_lines_counts() -> None:
-    """Twenty bright lines among 600 dark ones scatter into a dark patch within them: no look at a few lines sees it."""
+def test_stray_light_of_few_bright_lines_is_bounded() -> None:
+    """Twenty bright lines among 600 dark ones scatter into a dark patch within them, which few sampled lines miss."""
     values = np.full((700, 160, 3), 0.05)
     values[150:170] = 1.0
     values[156:165, 70:74] = 0.0
@@ -64,15 +64,15 @@ def test_stray_light_of_few_bright_lines_counts() -> None:
 @pytest.mark.parametrize(
     ("number", "effect", "lines"),
     [
-        *((number, "", None) for number in (17, 25, 27, 31, 54)),  # lone sweeps beside fields and pixels, one stripe
+        *((number, "", None) for number in (17, 25, 27, 31, 54)),  # single sweeps beside fields and pixels, one stripe
         (134, "path-radiance", range(156, 158)),  # a dark band among bright ones, under a bright sky
-        (164, "response", None),  # a field in one band of twelve, beside a lone sweep
+        (164, "response", None),  # a field in one band of twelve, beside a single sweep
     ],
 )
-def test_bounds_hold_where_little_is_seen(number: int, effect: str, lines: range | None) -> None:
-    """No bound of any effect is broken; each band counts by its own least light, and its neighbours' from beside it.
+def test_bounds_hold_for_sparse_light(number: int, effect: str, lines: range | None) -> None:
+    """No bound is broken: a band counts by its own least light, and by its neighbour bands' light beside the sweep.
 
-    The sizes of the changes are the effects'; the others are on.
+    Each change is that of one effect, with all others on.
     """
     found = list(trials(replace(sparse_case(number), measured=lines), (1, 2 + number % 7), effect))
     assert found
@@ -80,8 +80,8 @@ def test_bounds_hold_where_little_is_seen(number: int, effect: str, lines: range
 
 
 @pytest.mark.parametrize("bands", [3, 12])
-def test_places_lie_within_the_scene(bands: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The brightest pixel is the last one, of a scene whose tiles end beyond it; its edge is repeated there.
+def test_extrema_lie_within_the_scene(bands: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The brightest pixel is the last one; tiles end beyond it, where the scene's edge is repeated.
 
     Strips of one tile, as those of a large scene, give the same places.
     """
@@ -96,8 +96,8 @@ def test_places_lie_within_the_scene(bands: int, monkeypatch: pytest.MonkeyPatch
     np.testing.assert_array_equal(find_extrema(scene, CAMERA, [Sweep("s", "fine", "x", 0.0, -22.0, 45)], 200), places)
 
 
-def test_a_lone_sweep_is_bounded_by_all_of_the_scene() -> None:
-    """Three lines of a scene have the levels and slopes of sweeps that see all of it."""
+def test_short_sweep_is_bounded_by_the_whole_scene() -> None:
+    """Three lines have level, span, slope and curvature of sweeps over the whole scene, to 15 %."""
     scene = image_scene(np.random.default_rng(1).uniform(0, 1, (60, 80, 2)), CAMERA, [500.0, 600.0])
     whole = probe_scene(scene, SHARP, [Sweep("s", "fine", "x", 0.0, -32.0, 64)])
     lone = probe_scene(scene, SHARP, [Sweep("s", "fine", "x", 0.0, -2.0, 3)])
