@@ -103,5 +103,6 @@ def map_loss(logits: Tensor, losses: Tensor, labels: Tensor, weight: Tensor, *, 
     probability = logits.float().softmax(dim=1) * labelled[:, None]
     truth = F.one_hot(labels.where(labelled, 0), logits.shape[1]).permute(0, 3, 1, 2) * labelled[:, None]
     both = (probability * truth).sum(dim=(0, 2, 3))
-    size, present = probability.sum(dim=(0, 2, 3)) + truth.sum(dim=(0, 2, 3)), truth.sum(dim=(0, 2, 3)) > 0
+    size = probability.sum(dim=(0, 2, 3)) + truth.sum(dim=(0, 2, 3))
+    present = truth.sum(dim=(0, 2, 3)) > 0
     return loss + 0.5 * (1 - 2 * both[present] / (size[present] + 1)).mean()

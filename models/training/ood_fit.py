@@ -68,7 +68,8 @@ def _noise_of_columns(noise: ColumnNoise, centres: Exact, normalisation: Normali
     """Return shot noise (component, column, column) and read noise of normalised columns at the reference exposure."""
     whitening = normalisation.whitening.astype(np.float64)
     values = centres @ np.linalg.inv(whitening) * normalisation.spread + normalisation.centre
-    mixing, sizes = whitening / normalisation.spread[:, None], np.sqrt(np.maximum(values, 0) * noise.shot)
+    mixing = whitening / normalisation.spread[:, None]
+    sizes = np.sqrt(np.maximum(values, 0) * noise.shot)
     shot = np.stack([mixing.T @ (noise.correlation() * np.outer(one, one)) @ mixing for one in sizes])
     return shot, mixing.T @ noise.read @ mixing
 

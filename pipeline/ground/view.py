@@ -138,7 +138,8 @@ class GroundView:
         """
         tangents = _pairs(points_px) * self.ifov_rad
         view, right, down = self.axes
-        rays, w = view + tangents[..., 1:] * right + tangents[..., :1] * down, self.sink(points_px)
+        rays = view + tangents[..., 1:] * right + tangents[..., :1] * down
+        w = self.sink(points_px)
         points: Floats = rays * (self.height_m / np.where(w > LEAST_SINK, w, np.nan))[..., None]
         points[..., 2] += self.height_m
         return points

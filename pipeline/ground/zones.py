@@ -150,9 +150,11 @@ def figures_of_plot(
     size = rows.stop - rows.start, columns.stop - columns.start
     inside = pixels_inside([shape], size, origin=(rows.start, columns.start))
     drawn = classes[rows, columns]
-    mapped, ground = inside & (drawn != UNLABELLED), place.pixel_areas_m2(rows, columns)
+    mapped = inside & (drawn != UNLABELLED)
+    ground = place.pixel_areas_m2(rows, columns)
     weight = np.where(mapped, 1.0 if ground is None else np.nan_to_num(ground), 0.0)
-    by_class, total = np.bincount(drawn[mapped], weight[mapped], len(names)), float(weight.sum())
+    by_class = np.bincount(drawn[mapped], weight[mapped], len(names))
+    total = float(weight.sum())
     sure = confidence[rows, columns][mapped]
     sure = sure[np.isfinite(sure)]  # unknown pixels have no confidence
     return PlotFigures(

@@ -82,7 +82,8 @@ def mosaic_rows(sweeps: Sequence[SweepLines], camera: LineCamera, grid: SceneGri
 
     Yields (row, x, band) float32 with NaN where no line reached.
     """
-    pixels, placed = PixelGrid.of_scene(grid), [place(lines, camera) for lines in sweeps]
+    pixels = PixelGrid.of_scene(grid)
+    placed = [place(lines, camera) for lines in sweeps]
     columns = slice(0, pixels.shape[1])
     reach = column_reach(placed, camera, pixels, columns)
     for part in cuts(pixels.shape[0], rows):

@@ -81,7 +81,8 @@ class Signal:
         Lines are read 64 at a time. ``usable`` (line,) are those with a trusted position.
         """
         lines, chosen = self.lines, broad_bands(self.lines.references, bands)
-        references, saturated = of_bands(lines.references, chosen.tolist()), full_scale_dn * lines.sweep.binning
+        references = of_bands(lines.references, chosen.tolist())
+        saturated = full_scale_dn * lines.sweep.binning
         image = np.full((len(usable), self.samples), np.nan, np.float32)
         for part in cuts(len(usable), BLOCK_LINES):
             raw = np.ascontiguousarray(lines.read(part.start, part.stop)[..., chosen])

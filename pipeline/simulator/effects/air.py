@@ -282,7 +282,8 @@ def transmission(metres: Floats, rig: Rig, wavelength_nm: Floats) -> Floats:
 
     The bands are Gaussians of ``optics.fwhm_nm``, cut at 2 standard deviations.
     """
-    sigma, weight = rig.optics.fwhm_nm / np.sqrt(8 * np.log(2)), np.exp(-(_QUADRATURE**2) / 2)
+    sigma = rig.optics.fwhm_nm / np.sqrt(8 * np.log(2))
+    weight = np.exp(-(_QUADRATURE**2) / 2)
     fine = wavelength_nm[:, None] + sigma * _QUADRATURE  # (band, node)
     mass = metres[:, None, None] / AIR_MASS_M
     water_cm = metres[:, None, None] * rig.air.vapour_g_per_m3 * 1e-4  # as liquid: 1 g/m^2 is 1e-4 cm

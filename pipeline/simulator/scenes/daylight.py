@@ -67,7 +67,8 @@ def _irradiance(latitude: float, longitude: float, moments: Floats, wavelength_n
     knot = moments / KNOT_S
     low = np.floor(knot)
     hours, row = np.divmod(low.astype(np.int64), _KNOTS_AN_HOUR)
-    fraction, light = (knot - low)[:, None], np.empty((len(moments), len(wavelength_nm)))
+    fraction = (knot - low)[:, None]
+    light = np.empty((len(moments), len(wavelength_nm)))
     for hour in np.unique(hours):
         here, table = hours == hour, _table(latitude, longitude, int(hour))
         before, after = table[row[here]], table[row[here] + 1]

@@ -71,7 +71,8 @@ def probe_survey(
     for sweep in taken:
         alike.setdefault((sweep.binning, exposing(rig.camera, sweep).exposure_ms), []).append(sweep)
     probes = [probe_scene(scene, rig, some, unit) for _, some in sorted(alike.items())]
-    lines, seconds = sum(one.lines for one in probes), cost.seconds(list(taken), rig.camera)
+    lines = sum(one.lines for one in probes)
+    seconds = cost.seconds(list(taken), rig.camera)
     return tuple(replace(one, lines=lines, seconds=seconds) for one in probes)
 
 
@@ -319,7 +320,8 @@ def _slit_errors(
 def _roughest(scene: RasterScene, rig: Rig, views: SampleViews, unit: Unit) -> NDArray[np.intp]:
     """Return the stored numbers that the slit, or one upright box in its place, changes most."""
     close = light_seen(scene, rig.camera, views, _footprint(SLIT.variants[0], rig, _CLOSE, None, scene), _PHASES)
-    scale, most = unit_at(_stored(close, views), rig, unit, views.binning), max(FINEST_SAMPLES // views.binning, 50)
+    scale = unit_at(_stored(close, views), rig, unit, views.binning)
+    most = max(FINEST_SAMPLES // views.binning, 50)
     others = [_footprint(variant, rig, (1, 1), None, scene) for variant in (OFF, UPRIGHT)]
     changes = [_changes(scene, rig, views, other, close, scale) for other in others]
     return np.unique([np.argsort(-change, kind="stable")[:most] for change in changes])

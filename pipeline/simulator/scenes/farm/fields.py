@@ -86,7 +86,8 @@ def _content(
 ) -> Content:
     here, down = ground
     land, crop = field.land_on(work.plan.day), field.crop
-    salt, rows = int(rng.integers(2**31)), rows_of(rng, field, centres)
+    salt = int(rng.integers(2**31))
+    rows = rows_of(rng, field, centres)
     if land.phase == "grass":
         return _meadow(rows, field, here, land.days, work.plan.day)
     soil = moist_soil(work.plan, here, field.wetter)
@@ -201,7 +202,8 @@ def rows_of(rng: np.random.Generator, field: FieldPlan, centres: Points) -> Rows
     angle = np.deg2rad(field.row_angle_deg)
     normal, ahead = np.array([np.cos(angle), -np.sin(angle)]), np.array([np.sin(angle), np.cos(angle)])
     across, along = centres @ normal + field.row_phase_px, centres @ ahead
-    ends, end_normal = np.full(len(centres), 1e4), np.tile(normal, (len(centres), 1))
+    ends = np.full(len(centres), 1e4)
+    end_normal = np.tile(normal, (len(centres), 1))
     for ny, nx, offset in field.parcel.cuts:
         if abs(ahead @ (ny, nx)) > 0.7:
             distance = centres @ np.array([ny, nx]) - offset
@@ -290,7 +292,8 @@ def field_weeds(rng: np.random.Generator, field: FieldPlan, day: int) -> dict[st
     corners = field.parcel.corners
     area = polygon_area(corners)
     count, single = rng.poisson(field.weeds * area / 1000), rng.poisson(VOLUNTEERS * area)
-    places, radius = _clustered(rng, field, count), rng.uniform(0.9, 2.4, count)
+    places = _clustered(rng, field, count)
+    radius = rng.uniform(0.9, 2.4, count)
     kinds = rng.choice(list(SPECIES), count, p=[fraction for fraction, _, _ in SPECIES.values()])
     first, last = (np.array([SPECIES[kind][end] for kind in kinds]).reshape(-1) for end in (1, 2))
     emergence = rng.uniform(size=count) * (last - first) + first
@@ -317,7 +320,8 @@ def _clustered(rng: np.random.Generator, field: FieldPlan, count: int) -> Points
     angle = np.deg2rad(field.row_angle_deg)
     ahead, aside = np.array([np.sin(angle), np.cos(angle)]), np.array([np.cos(angle), -np.sin(angle)])
     thrown = rng.normal(0, ALONG_PX, (count, 1)) * ahead + rng.normal(0, ASIDE_PX, (count, 1)) * aside
-    near, inside = parents[rng.integers(len(parents), size=count)] + thrown, np.ones(count, bool)
+    near = parents[rng.integers(len(parents), size=count)] + thrown
+    inside = np.ones(count, bool)
     for ny, nx, offset in field.parcel.cuts:
         inside &= near @ np.array([ny, nx]) > offset
     return np.where((inside & (rng.uniform(size=count) < CLUSTERED))[:, None], near, places)
