@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,10 +35,11 @@ from storage.export.map_files import (
 
 CELL_M = 3.0  # default of a prescription, if pixels are smaller
 MOST_CELLS = 4_000_000
-WITHIN = (0.01, 0.5, 0.99)  # places in a pixel, down and across, whose cells get its dose
+WITHIN = (0.001, 0.5, 0.999)  # places in a pixel or a cell, down and across, at which the two overlap
 PIXELS_AT_ONCE = 1_000_000
 WGS84 = "EPSG:4326"
 IN_DEGREES = {"proj:code": WGS84}
+Places = tuple[NDArray[np.integer], ...]  # row and column
 Add = Callable[..., None]  # adds a file to the catalogue: key, path, title, media type, roles, STAC fields
 
 
@@ -180,13 +181,21 @@ def dose_cells(raster: ClassRaster, doses: Mapping[str, float], cells: GeoBox) -
 
 def _raise_doses(found: NDArray[np.uint8], level: NDArray[np.uint8], geobox: GeoBox, cells: GeoBox) -> None:
     """Raise the level of each cell to that of every pixel in it, in place: GDAL misses pixels of rotated maps."""
-    between = pyproj.Transformer.from_crs(str(geobox.crs), str(cells.crs), always_xy=True)
-    to_map: Any = geobox.affine
-    to_cells: Any = ~cells.affine
-    rows, columns = np.nonzero(level > 1)
-    for some in cuts(len(rows), PIXELS_AT_ONCE):
+    for pixel, cell in _overlaps(np.nonzero(level > 1), geobox, cells):
+        np.maximum.at(found, cell, level[pixel])
+    for cell, pixel in _overlaps(tuple(np.indices(found.shape).reshape(2, -1)), cells, geobox):
+        np.maximum.at(found, cell, level[pixel])
+
+
+def _overlaps(places: Places, grid: GeoBox, other: GeoBox) -> Iterator[tuple[Places, Places]]:
+    """Yield pixels (row, column) of a grid, and the pixels of another one that nine points within each meet."""
+    between = pyproj.Transformer.from_crs(str(grid.crs), str(other.crs), always_xy=True)
+    to_ground: Any = grid.affine
+    to_other: Any = ~other.affine
+    for some in cuts(len(places[0]), PIXELS_AT_ONCE):
+        rows, columns = (one[some] for one in places)
         for down, across in itertools.product(WITHIN, WITHIN):
-            place: Any = between.transform(*(to_map * (columns[some] + across, rows[some] + down)))
-            column, row = (np.floor(one).astype(np.int64) for one in to_cells * place)
-            inside = (row >= 0) & (row < found.shape[0]) & (column >= 0) & (column < found.shape[1])
-            np.maximum.at(found, (row[inside], column[inside]), level[rows[some], columns[some]][inside])
+            point: Any = between.transform(*(to_ground * (columns + across, rows + down)))
+            column, row = (np.floor(one).astype(np.int64) for one in to_other * point)
+            inside = (row >= 0) & (row < other.shape[0]) & (column >= 0) & (column < other.shape[1])
+            yield (rows[inside], columns[inside]), (row[inside], column[inside])

@@ -9,7 +9,7 @@ from __future__ import annotations
 import platform
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -140,7 +140,9 @@ def publish_draft(survey: OpenSurvey, draft: RunDraft, plan: FinePlan, receipt: 
 
 def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str) -> Receipt:
     """Return the receipt of a run, without counted bytes."""
-    run, products = survey.run, survey.products
+    products = survey.products
+    read = len(open_mosaic(products.mosaic.path / "mosaic.zarr").components)  # where a plan assumes `SMOOTH` of them
+    run = replace(survey.run, costs=replace(survey.run.costs, bands=read))
     accuracy = load_accuracy(products["evaluate"]) if "evaluate" in products else None
     effects = load_manifest(products["choose_effects"]) if run.source.simulates else {}
     stores = {key: place for name, ref in products.items() for key, place in STAGES[name].addresses(ref).items()}

@@ -118,8 +118,7 @@ def tie_table(
 
     step_px = spacing_px * camera.ifov_rad / scan_path.width
     while tie > 1:
-        tie_points = np.empty((0, 0, 2))
-        bound = _knot_bound(scan_path, tie * step_px)
+        tie_points, bound = np.empty((0, 0, 2)), _knot_bound(scan_path, tie * step_px)
         if bound <= tolerance_px and min(kept) > 0:
             rows, columns = ((size - 1) // tie + 2 for size in kept)
             tie_points = exact(0, tie, (rows, columns))

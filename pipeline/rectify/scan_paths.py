@@ -180,8 +180,7 @@ def _with_stand_ins(
     empty = np.flatnonzero(~seen)
     before = np.searchsorted(at, empty) - 1
     nearest = np.where(empty - at[before] <= at[np.minimum(before + 1, len(at) - 1)] - empty, before, before + 1)
-    members = np.empty(sizes.sum(), np.intp)
-    real = np.repeat(seen, sizes)
+    members, real = np.empty(sizes.sum(), np.intp), np.repeat(seen, sizes)
     members[real] = lines
     members[~real] = lines[(np.cumsum(counts) - counts)[nearest]]
     return members, np.cumsum(sizes) - sizes

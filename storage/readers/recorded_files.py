@@ -363,7 +363,7 @@ def load_pointing_table(path: Path) -> PointingTable:
     if unknown or len(set(header)) < len(header):
         twice = next((name for name in header if header.count(name) > 1), None)
         what = f"the column {unknown[0]!r}, which is not known" if unknown else f"the column {twice!r} twice"
-        raise SceneError(f"{path} has {what}; accepted are {', '.join(ACCEPTED)}")
+        raise SceneError(f"{path} has {what}; leave it out; accepted are {', '.join(ACCEPTED)}")
     kinds = [kind for kind, names in KINDS.items() if set(names) & set(header)]
     missing = [name for kind in kinds for name in KINDS[kind] if name not in header]
     if len(kinds) != 1 or missing:
@@ -388,7 +388,7 @@ def _numbers(path: Path, name: str, cells: Sequence[str]) -> Floats:
         except ValueError:
             raise SceneError(
                 f"{path}, row {number + FIRST_ROW}: {name} = {cell[:40]!r} is no number; write numbers with a decimal"
-                " point"
+                " point, and 1 or 0 for valid"
             ) from None
     return values
 
@@ -408,7 +408,7 @@ def _csv_cells(path: Path) -> tuple[list[str], list[list[str]]]:
     for number, row in enumerate(rows[1:], 2):
         if any(row) and len(row) != len(names):
             raise SceneError(
-                f"{path}, row {number} has {len(row)} cells, its header {len(names)}; give each row one cell a column"
+                f"{path}, row {number} has {len(row)} cells, the header in row 1 has {len(names)}; give each as many"
             )
     return names, [row for row in rows[1:] if any(row)]
 

@@ -28,7 +28,7 @@ from storage.archive.manifests import read_table, write_table
 from storage.arrays.mosaics import Attention, chosen_patches, open_mosaic, write_attention
 
 READING = "attention.zarr"  # beside a class map whose drawing chose the patches
-ATTENTION = Product("score", version=17, files=("attention.zarr", "plan.json"), by_weights=True)
+ATTENTION = Product("score", version=18, files=("attention.zarr", "plan.json"), by_weights=True)
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,9 @@ def score(
         if second_pass is not None:
             return scores, second_pass.plan(scores)
         assert budget is not None
-        chosen = budget.choose(scores)
+        components = len(open_mosaic(mosaic.path / "mosaic.zarr").components)
+        paid = replace(budget, costs=replace(budget.costs, bands=components))
+        chosen = paid.choose(scores)
         reason = f"{scanned.reason}; the full network reads {len(chosen)} of {len(budget.patch_index)} patches"
         gain = float(np.where(np.isfinite(scores), scores, 0.0)[chosen].sum())
         return scores, replace(scanned, patch_index=np.sort(chosen), reason=reason, expected_gain=gain)

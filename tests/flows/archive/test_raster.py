@@ -19,9 +19,11 @@ from flows.archive.export_command import run_export
 from flows.archive.export_layers import ProductFlags, choose_products
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
+from flows.tasks.patch_budget import ReadingCosts
 from flows.terminal.figures import format_area, format_count
+from models.weights.files import describe_weights
 from pipeline.errors import SceneError, SettingsError
-from pipeline.geometry.grid import block_means
+from pipeline.geometry.grid import SceneGrid, block_means
 from storage.archive.archive import Archive
 from storage.arrays.mosaics import open_mosaic
 from storage.remote.opening import verify_archive
@@ -113,6 +115,21 @@ def test_a_receipt_of_a_raster_has_no_camera_figures(surveyed: Raster, scene_fil
     assert receipt["field"]["camera_s"] is receipt["field"]["lines"] is receipt["field"]["view_deg"] is None
     assert [row["name"] for row in receipt["stages"]] == [*("condense_raster", "score", "segment", "evaluate")]
     assert [found.problem for found in verify_archive(Archive.open(tmp_path / "archive"))] == [None] * 5
+
+
+def test_multiply_adds_count_all_components(surveyed: Raster, tmp_path: Path, make_weights: WeightsMaker) -> None:
+    """A raster of 40 bands of noise has more components than a plan assumes; a limit of multiply-adds holds."""
+    own = make_weights(tuple(map(float, range(400, 1000, 15))))
+    np.save(tmp_path / "noise.npy", np.random.default_rng(0).normal(100, 9, (64, 64, 40)))
+    flags = {"wavelengths": ",".join(map(str, range(400, 1000, 15))), "weights": str(own), "macs": "90%"}
+    receipt = surveyed(tmp_path / "noise.npy", **flags).receipt
+    components = len(open_mosaic(tmp_path / "archive" / receipt["products"]["mosaic"]).components)
+    assert components > 24
+    costs = ReadingCosts(describe_weights(own).config, SceneGrid(64, 64, 8), components)
+    found, none = receipt["savings"]["multiply_adds"], np.zeros(0, np.intp)
+    assert found["overview"] == 2 * costs.of_map(none).overview  # the choice of patches reads it too
+    assert found["full"] == costs.of_map(costs.grid.every_patch()).total
+    assert 0.8 < found["ratio"] <= 0.9
 
 
 @pytest.mark.parametrize("pixel_m", [None, 10.0])

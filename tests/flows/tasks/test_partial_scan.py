@@ -296,12 +296,8 @@ def test_the_reader_counts_for_the_choice_of_lines_and_for_the_map() -> None:
     run: Any = SimpleNamespace(costs=SimpleNamespace(of_map=lambda index: read), least_gain=None, chooses=False)
     run.prior, run.reader, run.grid = "there", reader, SceneGrid(95, 63, 4)
     map_px, choice_px = 95 * 63, 48 * 32
-    for extent, aside, pixels in (
-        (None, None, map_px),
-        ("chosen", None, map_px + choice_px),
-        ("chosen", TURNED, choice_px),
-        (None, TURNED, 0),
-    ):
+    cases = (None, None, map_px), ("chosen", None, map_px + choice_px), ("chosen", TURNED, choice_px), (None, TURNED, 0)
+    for extent, aside, pixels in cases:
         run.extent = extent
         done = SurveyRun.work_done(run, np.arange(3), {"put_aside": aside}).detail
         assert done == 7 + reader.sizes.multiply_adds(pixels)

@@ -254,18 +254,6 @@ def test_spacings_that_do_not_fit_are_no_candidates(tmp_path: Path) -> None:
         open_run(load_settings(None, farm | {"camera.samples": "64"}), planning=True)
 
 
-def test_candidates_of_a_farm_share_one_reference(tmp_path: Path) -> None:
-    """The reference is the same for every request, and the expected mIoU rises with the seconds."""
-    farm = {"scene": "farm", "size": "160x128", "out": str(tmp_path)}
-    asked = ({}, {"budget": "0.8"}, {"scan_step": "4"})
-    told = [plan_content(load_settings(None, farm | more))["scans"] for more in asked]
-    assert [one["reference"] for one in told] == [told[0]["reference"]] * len(asked)
-    assert told[0]["taken"] == told[0]["reference"]
-    scores = [one["expected_miou"] for one in told[0]["candidates"]]
-    assert len(scores) > 4
-    assert scores == sorted(scores)  # in order of ascending seconds
-
-
 def test_a_faster_coarse_pass_gives_its_seconds_to_the_fine_pass(survey_png: Any, tmp_path: Path) -> None:
     """The budget is the same; the cubes hold the exposure of each pass."""
     usual = survey_png(tmp_path / "usual", budget="0.6").receipt

@@ -50,14 +50,15 @@ def test_noise_and_lost_lines_do_not_move_the_fitted_sweep() -> None:
     assert abs(found.distance_px - 1) < 1e-3
 
 
-def test_a_gap_does_not_change_the_line_spacing() -> None:
-    """A scan that pauses for 20 px keeps its line spacing of 1 px, and the note names the gap."""
+@pytest.mark.parametrize(("first", "stop"), [(30, 50), (4, 24), (70, 71), (41, 44)])
+def test_a_gap_does_not_change_the_line_spacing(first: int, stop: int) -> None:
+    """A scan that pauses anywhere, for 1 to 20 px, keeps its line spacing of 1 px, and the note names the gap."""
     sweep = Sweep("s", "fine", "x", 0.0, -42.0, 84)
-    position = np.delete(line_positions(sweep, CAMERA), np.s_[30:50], axis=0)
+    position = np.delete(line_positions(sweep, CAMERA), np.s_[first:stop], axis=0)
     found = fit_sweep(position, CAMERA, name="s", samples=640)
-    assert (found.sweep.step, found.sweep.lines) == (1, 64)
+    assert (found.sweep.step, found.sweep.lines) == (1, 84 - stop + first)
     assert found.distance_px == pytest.approx(1, abs=1e-6)
-    assert found.note == "lines 29 and 30 lie 21 px apart"
+    assert found.note == f"lines {first - 1} and {first} lie {stop - first + 1} px apart"
 
 
 @pytest.mark.parametrize(

@@ -86,8 +86,7 @@ def _content(
 ) -> Content:
     here, down = ground
     land, crop = field.land_on(work.plan.day), field.crop
-    salt = int(rng.integers(2**31))
-    rows = rows_of(rng, field, centres)
+    salt, rows = int(rng.integers(2**31)), rows_of(rng, field, centres)
     if land.phase == "grass":
         return _meadow(rows, field, here, land.days, work.plan.day)
     soil = moist_soil(work.plan, here, field.wetter)
@@ -202,8 +201,7 @@ def rows_of(rng: np.random.Generator, field: FieldPlan, centres: Points) -> Rows
     angle = np.deg2rad(field.row_angle_deg)
     normal, ahead = np.array([np.cos(angle), -np.sin(angle)]), np.array([np.sin(angle), np.cos(angle)])
     across, along = centres @ normal + field.row_phase_px, centres @ ahead
-    ends = np.full(len(centres), 1e4)
-    end_normal = np.tile(normal, (len(centres), 1))
+    ends, end_normal = np.full(len(centres), 1e4), np.tile(normal, (len(centres), 1))
     for ny, nx, offset in field.parcel.cuts:
         if abs(ahead @ (ny, nx)) > 0.7:
             distance = centres @ np.array([ny, nx]) - offset
@@ -292,8 +290,7 @@ def field_weeds(rng: np.random.Generator, field: FieldPlan, day: int) -> dict[st
     corners = field.parcel.corners
     area = polygon_area(corners)
     count, single = rng.poisson(field.weeds * area / 1000), rng.poisson(VOLUNTEERS * area)
-    places = _clustered(rng, field, count)
-    radius = rng.uniform(0.9, 2.4, count)
+    places, radius = _clustered(rng, field, count), rng.uniform(0.9, 2.4, count)
     kinds = rng.choice(list(SPECIES), count, p=[fraction for fraction, _, _ in SPECIES.values()])
     first, last = (np.array([SPECIES[kind][end] for kind in kinds]).reshape(-1) for end in (1, 2))
     emergence = rng.uniform(size=count) * (last - first) + first

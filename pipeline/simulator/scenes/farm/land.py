@@ -156,8 +156,7 @@ def parcel_pixels(parcel: Parcel, shape: tuple[int, int]) -> tuple[NDArray[np.in
 def band_pixels(border: Border, reach: float, shape: tuple[int, int]) -> Band:
     """Return the pixels within ``reach`` of a line, and a little more at its ends, row by row or column by column."""
     step = (border.end - border.start) / max(border.length, 1e-9)
-    major = int(abs(step[1]) >= abs(step[0]))
-    middle = (np.array(shape) - 1) / 2
+    major, middle = int(abs(step[1]) >= abs(step[0])), (np.array(shape) - 1) / 2
     ends = np.sort([border.start[major], border.end[major]]) + middle[major]
     count = np.clip([np.floor(ends[0]), np.ceil(ends[1]) + 1], 0, shape[major])
     m, slope = np.arange(*count.astype(int)), step[1 - major] / step[major]
