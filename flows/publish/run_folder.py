@@ -141,7 +141,7 @@ def publish_draft(survey: OpenSurvey, draft: RunDraft, plan: FinePlan, receipt: 
 def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str) -> Receipt:
     """Return the receipt of a run, without counted bytes."""
     products = survey.products
-    read = len(open_mosaic(products.mosaic.path / "mosaic.zarr").components)  # where a plan assumes `SMOOTH` of them
+    read = len(open_mosaic(products.mosaic.path / "mosaic.zarr").components)  # a plan assumes `SMOOTH` of them
     run = replace(survey.run, costs=replace(survey.run.costs, bands=read))
     accuracy = load_accuracy(products["evaluate"]) if "evaluate" in products else None
     effects = load_manifest(products["choose_effects"]) if run.source.simulates else {}

@@ -397,7 +397,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
         prior = None if found is None else found[0]
         planned = _plan_capture(settings, scene, zones, path, described, prior, passes, planning=planning)
     settings, plan = planned.settings, planned.plan
-    read = min(len(scene.wavelength_nm), SMOOTH)  # components of most mosaics; a few have more
+    read = min(len(scene.wavelength_nm), SMOOTH)  # components that a plan assumes; most mosaics have 11 to 33
     costs = ReadingCosts(described.config, grid, read)
     shown = None if zones.fractions is None else zones.fractions > 0
     budget = None if settings.macs is None else PatchBudget.asked(costs, shown, settings.policy, settings.macs)

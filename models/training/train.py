@@ -153,8 +153,8 @@ class Trainer:
     def keep(self, path: Path, identity: str) -> None:
         """Write a checkpoint."""
         now, worked = time.monotonic(), time.process_time()
-        self.course.seconds = self.course.seconds + now - self._started
-        self.course.processor_seconds = self.course.processor_seconds + worked - self._worked
+        self.course.seconds += now - self._started
+        self.course.processor_seconds += worked - self._worked
         self._started, self._worked = now, worked
         tensors = {f"model.{name}": tensor for name, tensor in self.model.state_dict().items()}
         tensors |= {f"averaged.{name}": tensor for name, tensor in self.averaged.state_dict().items()}

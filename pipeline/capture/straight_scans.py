@@ -52,7 +52,7 @@ EDGE_PX = 0.05  # of their pixel that the outermost lines and samples of a field
 MOST_BEND = 1 / 16  # largest distance of line centres from their swath, as a fraction of a line's length
 MOST_BACK = 8.0  # line spacings that a scan may go back before it counts as turned
 UNEVEN, MOST_EVEN = 0.1, 0.9  # of the line spacing, and fraction of the lines of a scan with gaps that keep to it
-GAP = 1.5  # line spacings between two lines beyond which a gap lies between them
+GAP = 1.5  # least distance of two consecutive lines with a gap between them, in line spacings
 STANDING_PX = 1e-3  # a scan that moves less from line to line stands still
 STATED_DIGITS = 6  # of derived coordinates [px], so that a planned sweep comes back as it was
 FLAT_PX = 0.01  # largest stretch or shift at the ends of a line without a mirror
@@ -142,8 +142,8 @@ def _check_path(name: str, lines: NDArray[np.intp], across: Floats, scan: Floats
 def line_spacing(scan: Floats, lines: NDArray[np.intp]) -> tuple[float, str]:
     """Return the signed distance of consecutive lines [px], and a note on a gap.
 
-    It is the median over pairs half the scan apart, which averages noise. A gap moves that: the median of consecutive
-    lines is taken if nearly all of them keep to it, and some lie farther apart.
+    It is the median over pairs half the scan apart, which averages noise. A gap would change it. If some lines lie
+    farther apart and nearly all others are evenly spaced, it is the median of consecutive lines.
     """
     half, steps = len(lines) // 2, np.diff(scan) / np.diff(lines)
     distance = float(np.median((scan[half:] - scan[:-half]) / (lines[half:] - lines[:-half])))
