@@ -1,5 +1,6 @@
 -- The empty database of Prefect 3.8.8
 -- python tests/flows/schedule/test_local_server.py writes this file.
+-- SHA-256 of the statements: 6f702379b6859a08da256a5884e35f8ab879252162b4724f18b225acf87ecd30
 BEGIN TRANSACTION;
 CREATE TABLE agent (
 	id CHAR(36) DEFAULT (

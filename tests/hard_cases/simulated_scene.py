@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
@@ -22,7 +19,7 @@ from pipeline.simulator.selection import survey_probe
 from pipeline.simulator.selection.choice import Decision, decide
 from pipeline.simulator.selection.options import acts_on_light
 from pipeline.simulator.simulated import sweep_block
-from tests.pipeline.simulator.small_scenes import made_scene
+from tests.pipeline.simulator.small_scenes import looking_at_less, made_scene
 
 ROUNDING = 4e-6  # times the light over its noise: float32 sums in another order
 CAMERA = LineCamera(samples=64)
@@ -48,15 +45,6 @@ def scene_of(values: NDArray[np.floating], electrons: float = 5000.0) -> RasterS
 def block_of(scene: RasterScene, rig: Rig, lines: range = range(0, 30, 5), sweep: Sweep = SWEEP) -> SweepBlock:
     """Return some lines of a sweep as a block."""
     return sweep_block(scene, rig, sweep, lines)
-
-
-@contextmanager
-def looking_at_less() -> Iterator[None]:
-    """Limit the samples of probes, within the context, to about those of a small sweep."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(survey_probe, "MOST_SAMPLES", 3000)  # a sweep has about 2000: some are sampled twice
-        patch.setattr(survey_probe, "FINEST_SAMPLES", 300)
-        yield
 
 
 def probed(scene: RasterScene, rig: Rig, sweep: Sweep = SWEEP) -> Probe:

@@ -108,22 +108,22 @@ def seen_from(distance_m: float, focus_m: float) -> tuple[NDArray[np.float32], D
     return expected_light(TEXTURE, block_of(TEXTURE, rig), decision.exact), decision
 
 
-@pytest.mark.parametrize("focus_m", [30.0, math.inf])
+@pytest.mark.parametrize("focus_m", [60.0, math.inf])
 def test_very_large_distance_equals_infinity(focus_m: float) -> None:
-    """Light and error at 1e300 m match those at infinity; path radiance is on, and defocus with the focus at 30 m."""
+    """Light and error at 1e300 m match those at infinity; path radiance is on, and defocus with the focus at 60 m."""
     (light, decision), (limit, endless) = seen_from(1e300, focus_m), seen_from(math.inf, focus_m)
     assert np.isfinite(limit).all()
     np.testing.assert_allclose(light, limit, rtol=1e-5)
     assert decision.error == pytest.approx(endless.error, rel=0.01)
     assert PATH_RADIANCE in endless.chosen
-    assert (DEFOCUS in endless.chosen) == (focus_m == 30.0)
+    assert (DEFOCUS in endless.chosen) == (focus_m == 60.0)
 
 
-@pytest.mark.parametrize("relief", ["flat", "step"])
-def test_scene_that_reaches_to_the_horizon_keeps_every_bound(relief: str) -> None:
+@pytest.mark.parametrize(("relief", "focus_m"), [("flat", 60.0), ("step", 30.0)])
+def test_scene_that_reaches_to_the_horizon_keeps_every_bound(relief: str, focus_m: float) -> None:
     """The farthest part lies at infinity: after a step, parallax there is the lever over the scene's 30 m."""
     air = Air(distance_m=30.0, nearest_m=20.0, farthest_m=math.inf, relief=relief)  # type: ignore[arg-type]
-    rig = replace(RIG, air=air)
+    rig = replace(RIG, air=air, optics=Optics(focus_m=focus_m))
     found = left_out(TEXTURE, rig)
     for change, counted in found.values():
         assert change <= counted < math.inf

@@ -21,8 +21,8 @@ from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
 from pipeline.simulator.selection.choice import decide
 from pipeline.simulator.selection.survey_probe import probe_survey
 from pipeline.simulator.simulated import sweep_block
-from tests.hard_cases.simulated_scene import looking_at_less
 from tests.pipeline.simulator.bound_trials import ROUNDING, misplaced_fraction
+from tests.pipeline.simulator.small_scenes import looking_at_less
 
 SHAPE = (40, 64)
 PATTERNS = ("black", "even", "rows", "columns", "checkers", "pixel", "disc", "noise", "decades")
@@ -45,7 +45,7 @@ class Asked:
 
     def rig(self) -> Rig:
         """Return a narrow rig, for speed."""
-        camera = LineCamera(samples=64, exposure_ms=self.exposure_ms, read_noise_e=self.read_noise_e)
+        camera = LineCamera(samples=32, exposure_ms=self.exposure_ms, read_noise_e=self.read_noise_e)
         return Rig(camera, detector=Detector(noiseless=self.noiseless), air=Air(distance_m=self.distance_m))
 
     def scene(self) -> RasterScene:
@@ -101,7 +101,7 @@ def test_decision_for_permitted_settings_keeps_its_bounds(asked: Asked) -> None:
     misplaced_e = max(one.brightest_e for one in probes) - min(one.darkest_e for one in probes)
     misplaced_e *= misplaced_fraction(decision.exact, decision.chosen)
     for sweep in sweeps:
-        block = sweep_block(scene, rig, sweep, range(0, sweep.lines, 3))
+        block = sweep_block(scene, rig, sweep, range(0, sweep.lines, 7))
         light, full = (expected_light(scene, block, one) for one in (decision.chosen, decision.exact))
         change = np.abs(stored_mean(light, sweep.binning) - stored_mean(full, sweep.binning))
         unit = unit_at(np.asarray(stored_mean(full, sweep.binning), np.float32), rig, asked.unit, sweep.binning)

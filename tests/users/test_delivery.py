@@ -32,7 +32,8 @@ USED = """
 import json, sys
 import spectralzoom
 run = spectralzoom.survey(scene="field.png", weights="mine.safetensors", out=sys.argv[1])
-print(json.dumps([spectralzoom.__version__, spectralzoom.__file__, str(run.report)]))
+plan = spectralzoom.plan(scene="farm", size="32x32", out=sys.argv[1])
+print(json.dumps([spectralzoom.__version__, spectralzoom.__file__, str(run.report), len(plan["stages"])]))
 """
 
 
@@ -117,14 +118,14 @@ def test_the_wheel_needs_no_home(installed: Path, ground: Path, scene_files: Pat
     nobody = AS_NOBODY if may_be_nobody(installed / "python") else ()
     bare = {"TMPDIR": str(temporary), "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
     version = run([*nobody, installed / "spectralzoom", "--version"], place, bare)
-    told, file, report = json.loads(run([*nobody, installed / "python", "-c", USED, archive], place, bare))
-    farm = ["--scene", "farm", "--size", "32x32", "--out", archive, "--json"]
-    plan = json.loads(run([*nobody, installed / "spectralzoom", "plan", *farm], place, bare))
+    told, file, report, planned = json.loads(run([*nobody, installed / "python", "-c", USED, archive], place, bare))
+    listed = json.loads(run([*nobody, installed / "spectralzoom", "ls", archive, "--json"], place, bare))
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert version.strip() == told == project["version"]
     assert Path(file).is_relative_to(installed.parent)
     assert Path(report).read_text(encoding="utf-8").lower().startswith("<!doctype html>")
-    assert len(plan["stages"]) > 7
+    assert planned > 7
+    assert [row["id"] for row in listed["runs"]] == [Path(report).parent.name]
     assert not list(temporary.glob("spectralzoom-*"))  # caches of libraries end with the process
 
 

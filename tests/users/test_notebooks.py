@@ -44,7 +44,8 @@ def test_every_cell_runs(
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     with without_effects():
         for number, cell in enumerate(cells(name, "code")):
-            exec(compile("".join(cell["source"]), f"{name}.ipynb, cell {number}", "exec", dont_inherit=True), names)
+            text = re.sub(r'("size": "|"samples": )\d+', r"\g<1>64", "".join(cell["source"]))
+            exec(compile(text, f"{name}.ipynb, cell {number}", "exec", dont_inherit=True), names)
             shown = [output for output in cell["outputs"] if output.get("name") == "stdout"]
             assert bool(capsys.readouterr().out) == bool(shown), f"cell {number} prints other than what is shown of it"
     drawn = [axes for number in plt.get_fignums() for axes in plt.figure(number).axes]

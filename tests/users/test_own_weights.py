@@ -67,10 +67,11 @@ def survey(command_line: Any, made: Path, scene: object, out: Path, *words: str)
     return " ".join((ended.out + ended.err).split()), json.loads((folder / "receipt.json").read_text())
 
 
-def test_a_score_on_a_training_scene_is_marked(made: Path, tmp_path: Path, command_line: Any) -> None:
+def test_a_training_scene_and_lacking_bands_are_marked(made: Path, tmp_path: Path, command_line: Any) -> None:
     """Terminal, report, receipt and `ls` mark the score of a training scene, and not that of a validation scene.
 
-    The scene is recognized by its content: it has another file name and fewer bands here.
+    The scene is recognized by its content: it has another file name and fewer bands here. A note counts only spectral
+    features that training reached; a survey of fewer bands brings it, and one of all bands does not.
     """
     scene = tmp_path / "other name.tif"
     shutil.copy(made / "field" / "images" / "t1.tif", scene)
@@ -78,11 +79,13 @@ def test_a_score_on_a_training_scene_is_marked(made: Path, tmp_path: Path, comma
     said, receipt = survey(command_line, made, scene, tmp_path / "a", *labels, "--bands", "0-8")
     sentence = "of 100 against the labels on a training scene (not valid for other fields) ("
     assert sentence in said
+    assert "the bands cover 5 of the weights' 12 spectral features" in said
     assert receipt["training_scene"] == "all"
     assert sentence in (open_archive(tmp_path / "a").latest.folder / "report.html").read_text()
     assert "* on a scene that the weights were trained on" in command_line("ls", tmp_path / "a").out
     said, receipt = survey(command_line, made, made / "field" / "images" / "t0.tif", tmp_path / "b")
     assert "of 100 against the labels (" in said
+    assert "spectral features" not in said
     assert "training_scene" not in receipt
     assert "*" not in command_line("ls", tmp_path / "b").out
 
@@ -93,14 +96,6 @@ def test_the_detector_of_13_band_weights_loads(made: Path) -> None:
     assert np.linalg.eigvalsh(familiar.covariance).min() < 1e-5 * np.linalg.eigvalsh(familiar.covariance).max()
     for light in familiar.limits.light:
         assert np.isfinite(familiar.lit(float(light)).distance(familiar.centres)).all()
-
-
-def test_bands_of_the_training_bring_no_note(made: Path, tmp_path: Path, command_line: Any) -> None:
-    """The note counts only spectral features that training reached; a survey of fewer bands brings it."""
-    said, _ = survey(command_line, made, made / "field" / "images" / "t0.tif", tmp_path / "a")
-    assert "spectral features" not in said
-    said, _ = survey(command_line, made, made / "field" / "images" / "t0.tif", tmp_path / "a", "--bands", "0-8")
-    assert "the bands cover 5 of the weights' 12 spectral features" in said
 
 
 def test_products_of_a_run_are_written_as_netcdf_and_zarr(made: Path, tmp_path: Path, command_line: Any) -> None:

@@ -25,9 +25,9 @@ BAD = '<script>alert("1")</script>&'
 def archive(tmp_path_factory: pytest.TempPathFactory, survey_png: Any) -> Path:
     """Return an archive of one field with two surveys, by time or another name of the visit, and of another field."""
     root = tmp_path_factory.mktemp("history") / "archive"
-    survey_png(root, name="north", visit=f"b {BAD}")
-    survey_png(root, name="north", visit="2026-06-01T10:00:00Z")
-    survey_png(root, name="south")
+    for visit in (f"b {BAD}", "2026-06-01T10:00:00Z"):
+        survey_png(root, name="north", visit=visit, budget=None, scan_step="2")
+    survey_png(root, name="south", budget=None, scan_step="2", labels=None)
     return root
 
 

@@ -25,6 +25,7 @@ from tests.storage.small_archive import flip
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 
+ONE_SCAN = {"budget": None, "scan_step": "2"}
 Refuse = Callable[[Path, Path, pytest.MonkeyPatch], None]
 
 
@@ -56,8 +57,8 @@ def words_of(folder: Path) -> dict[str, str]:
 
 @pytest.fixture
 def survey(survey_png: Any, scene: Path, out: Path) -> Survey:
-    """Return a function that surveys the scene of the folder into the archive of the test."""
-    return lambda **flags: survey_png(out, **{**words_of(scene), **flags})
+    """Return a function that surveys the scene of the folder, by one scan, into the archive of the test."""
+    return lambda **flags: survey_png(out, **{**words_of(scene), **ONE_SCAN, **flags})
 
 
 @pytest.fixture
@@ -149,7 +150,7 @@ def test_evaluate_adds_accuracy_and_controls(unjudged: Path, survey: Survey, com
     assert set(receipt["accuracy"]["controls"]) == {"gain", "entropy", "sobel", "random"}
     assert Archive.open(unjudged).runs() == [run]
     assert problems(unjudged) == []
-    asked = survey(controls=True).receipt
+    asked = survey(controls=True, budget="0.8", scan_step=None).receipt
     assert comparable(receipt) == comparable(asked)
 
 

@@ -107,13 +107,13 @@ def test_a_field_beyond_memory_is_planned(settings: Settings, tmp_path: Path, mo
     monkeypatch.setattr("pipeline.simulator.scenes.farm.farm_scene._draw", refuse)
     monkeypatch.setattr("pipeline.simulator.scenes.farm.farm_scene.spectral_library", refuse)
     monkeypatch.setattr(
-        "storage.readers.cube_sources.os.sysconf", lambda name: {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 2**20}[name]
+        "storage.readers.cube_sources.os.sysconf", lambda name: {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 2**18}[name]
     )
-    asked = replace(settings, scene="farm", size=(10240, 10240), labels=None, weights=None, out=str(tmp_path / "a"))
+    asked = replace(settings, scene="farm", size=(4096, 4096), labels=None, weights=None, out=str(tmp_path / "a"))
     found = plan_content(asked)
     ahead = [row["stage"] for row in found["stages"] if row["state"] == "to run"]
     assert ahead == ["choose_effects", "capture_coarse", "condense_coarse"]
-    with pytest.raises(SettingsError, match="this machine has 4; take a smaller one") as refused:
+    with pytest.raises(SettingsError, match="this machine has 1; take a smaller one") as refused:
         open_run(asked)
     assert found["refused"] == str(refused.value)
     shown = io.StringIO()

@@ -114,11 +114,11 @@ def test_bad_input_is_refused_with_one_message(
 
 
 WORKS = {
-    "one band": ("--scene one.npy --wavelengths 550 --budget 1", "wavelengths stated: 550 nm"),
-    "wavelengths out of order": ("--scene cube.npy --wavelengths 640,460,500,550,620,600 --budget 1", "640, 460"),
+    "one band": ("--scene one.npy --wavelengths 550 --scan-step 1", "wavelengths stated: 550 nm"),
+    "wavelengths out of order": ("--scene cube.npy --wavelengths 640,460,500,550,620,600 --scan-step 1", "640, 460"),
     "scene smaller than a patch": ("--scene tiny.png --budget 1", RAN),
-    "NaN pixels": (f"--scene gaps.npy --wavelengths {NM} --budget 1", "given their band's median: 1 "),
-    "all black": ("--scene black.png --budget 1", RAN),
+    "NaN pixels": (f"--scene gaps.npy --wavelengths {NM} --scan-step 1", "given their band's median: 1 "),
+    "all black": ("--scene black.png --scan-step 1", RAN),
 }
 
 

@@ -103,7 +103,7 @@ def test_raw_of_a_killed_survey_is_cleared(survey_png: Survey, tmp_path: Path, m
     """With `keep = signal` they are cleared at once, at any age."""
     with monkeypatch.context() as patch:
         patch.setattr("flows.survey.clear_raw", lambda plan, run: run)
-        survey_png(tmp_path / "archive", accuracy=False)
+        survey_png(tmp_path / "archive", budget=None, scan_step="2", accuracy=False)
     archive = Archive.open(tmp_path / "archive")
     there = raw_uris(archive)
     assert there

@@ -50,7 +50,7 @@ made = getattr(flows.survey, flow).to_deployment(name, entrypoint_type=Entrypoin
 serve(made, print_starting_message=False)
 """
 
-pytestmark = pytest.mark.usefixtures("no_effects", "scheduling")
+pytestmark = pytest.mark.usefixtures("no_effects")
 
 
 @pytest.fixture(scope="module")
@@ -61,8 +61,8 @@ def scheduling(prefect_home: Path) -> Iterator[str]:
 
 
 @pytest.fixture
-def north(field_file: Callable[..., Path]) -> Any:
-    """Return the field north, due at six in Berlin."""
+def north(field_file: Callable[..., Path], scheduling: str) -> Any:
+    """Return the field north, due at six in Berlin, on the server that schedules."""
     return load_fields([field_file("north", source="raster", budget=None)])[0]
 
 
@@ -156,6 +156,7 @@ def test_a_shared_server_keeps_the_fields_of_others(north: Any) -> None:
     assert reprocessing("/data/a b", shared=True).name == "data-a-b"
 
 
+@pytest.mark.usefixtures("scheduling")
 def test_two_fields_due_at_once_use_the_rig_in_turn(tmp_path: Path) -> None:
     """Prefect's limit makes the second wait; the rig's own lock would refuse it."""
     from prefect import flow

@@ -160,9 +160,9 @@ def test_emulated_scene_is_found_from_every_folder(tmp_path: Path, monkeypatch: 
     assert load_settings(tmp_path / "there" / "x.toml").scene == str(tmp_path / "x.png")
 
 
-def test_emulation_ends_at_ctrl_c() -> None:
+def test_emulation_ends_at_ctrl_c(scene_files: Path) -> None:
     """The exit code is 0, and the port is gone."""
-    words = ["rig", "emulate", "--size", "48x48", "--bands", "40", "--effects", "all"]
+    words = ["rig", "emulate", "--scene", str(scene_files / "scene.png"), "--effects", "shot"]
     with subprocess.Popen(
         [sys.executable, "-m", "flows.cli.main", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:

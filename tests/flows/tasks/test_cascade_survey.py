@@ -17,7 +17,7 @@ from models.weights.files import CASCADE, save_weights
 from tests.conftest import RGB_NM, Flags, Survey, random_weights
 from tests.prior_work import without_effects
 
-SCAN: dict[str, Any] = {"budget": None, "scan_step": "1", "camera.samples": 160}  # few samples outside of the field
+SCAN: dict[str, Any] = {"budget": None, "source": "raster"}
 TABLE = CascadeTable((0.02, 0.05, 0.15, 0.2), (0.0, 0.001, 0.003, 0.2), (0.9, 0.8, 0.4, 0.1))
 
 pytestmark = pytest.mark.usefixtures("no_effects")

@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
-import os
-import signal
 import weakref
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +13,7 @@ from pipeline.errors import SettingsError, ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.rectify.placed import PixelGrid, place
-from pipeline.rectify.region import MosaicWork, Place, TileMaker, free_tiles, opened_tiles, plan_tiles
+from pipeline.rectify.region import MosaicWork, TileMaker, free_tiles, opened_tiles, plan_tiles
 from pipeline.source import References
 from storage.archive.keys import StageRef
 from storage.arrays.cubes import SweepHeader
@@ -47,20 +42,6 @@ def cubes(tmp_path_factory: pytest.TempPathFactory) -> list[SignalCube]:
     return open_signal_cubes(folder)
 
 
-@dataclass(frozen=True)
-class KillOnce(TileMaker):
-    """Tile maker that kills its own process at the first call."""
-
-    folder: str = ""
-
-    def __call__(self, place: Place) -> tuple[np.ndarray, np.ndarray]:
-        """Kill the process if none was killed yet; then make the tile."""
-        if not (Path(self.folder) / "killed").exists():
-            (Path(self.folder) / "killed").touch()
-            os.kill(os.getpid(), signal.SIGKILL)
-        return super().__call__(place)
-
-
 def recipe_of(cubes: list[SignalCube]) -> MosaicRecipe:
     """Return the recipe of a mosaic of both sweeps, by their folder."""
     folder = Path(str(cubes[0].group.store_path.store.root)).parent
@@ -70,14 +51,6 @@ def recipe_of(cubes: list[SignalCube]) -> MosaicRecipe:
 def mosaic_at(path: Path) -> MosaicWriter:
     """Return a writer of an empty mosaic on the grid."""
     return plain_writer(path, GRID.shape, BANDS)
-
-
-def digest_of(folder: Path) -> str:
-    """Return a hash of all files of a store and their names."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
-    return hashlib.sha256(
-        b"".join(f"{path.relative_to(folder)}".encode() + path.read_bytes() for path in files)
-    ).hexdigest()
 
 
 def test_memory_limits_the_tiles_at_a_time(tmp_path: Path, cubes: list[SignalCube]) -> None:
@@ -94,17 +67,6 @@ def test_an_error_in_a_tile_ends_the_work(tmp_path: Path, cubes: list[SignalCube
     other = plain_writer(tmp_path / "m.zarr", GRID.shape, BANDS[:2])
     with pytest.raises(ShapeError, match="a tile of the mosaic has the shape"):
         write_mosaic(recipe_of(cubes), other, memory=PLENTY, pool=TWO)
-
-
-def test_killed_workers_do_no_harm(tmp_path: Path, cubes: list[SignalCube], monkeypatch: pytest.MonkeyPatch) -> None:
-    """After kill -9 of a process that makes tiles, the mosaic equals that of an undisturbed thread."""
-    write_mosaic(recipe_of(cubes), mosaic_at(tmp_path / "a.zarr"), memory=PLENTY, pool=ONE)
-    monkeypatch.setattr("flows.tasks.stages.placement.TileMaker", partial(KillOnce, folder=str(tmp_path)))
-    with WorkerPool("processes", 2).open() as pool:
-        budget = write_mosaic(recipe_of(cubes), mosaic_at(tmp_path / "m.zarr"), memory=PLENTY, pool=pool)
-    assert (budget.workers, budget.processes) == (2, True)
-    assert (tmp_path / "killed").exists()
-    assert digest_of(tmp_path / "m.zarr") == digest_of(tmp_path / "a.zarr")
 
 
 def test_a_worker_frees_its_raw_lines(cubes: list[SignalCube]) -> None:

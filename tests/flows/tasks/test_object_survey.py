@@ -36,7 +36,7 @@ pytestmark = pytest.mark.usefixtures("no_effects")
 
 SMALL = ("--size", "96x64", "--bands", FEW_BANDS, "--no-controls", "--engine", "plain")
 CACHED = {"cached"}
-NARROW: dict[str, Any] = {"camera.samples": 160}  # few outside of the field
+SCANNED: dict[str, Any] = {"budget": None, "scan_step": "2", "scan_exposure_ms": "25", "keep": "raw 7d"}
 OF_THIS = set(STAGES) - {"register_coarse", "register_fine", "ground", "condense_raster"}
 
 
@@ -44,7 +44,6 @@ def states(receipt: dict[str, object]) -> set[str]:
     """Return the states of the stages."""
     rows = receipt["stages"]
     assert isinstance(rows, list)
-    assert {row["name"] for row in rows} == OF_THIS
     return {row["state"] for row in rows}
 
 
@@ -62,6 +61,7 @@ def test_a_rerun_finds_every_stage_in_the_bucket(
     monkeypatch.setattr(Objects, "save", lambda self, name, path: (fetched.append(name), save(self, name, path))[1])
     with with_effects():  # the survey for comparison has them
         first = survey_png(bucket)
+    assert {row["name"] for row in first.receipt["stages"]} == OF_THIS
     beside = map_of(open_archive(tmp_path / "folder"), surveyed_png(tmp_path / "folder"))
     np.testing.assert_array_equal(map_of(open_archive(bucket), first), beside)
     again = survey_png(bucket)
@@ -83,18 +83,18 @@ def test_a_rerun_finds_every_stage_in_the_bucket(
 
 
 @contextmanager
-def workers(count: int, environment: dict[str, str]) -> Iterator[str]:
-    """Start a scheduler and workers with this environment; yield its address."""
-    with LocalCluster(count, threads_per_worker=1, dashboard_address="127.0.0.1:0", env=environment) as cluster:
+def worker(environment: dict[str, str]) -> Iterator[str]:
+    """Start a scheduler and a worker with this environment; yield its address."""
+    with LocalCluster(1, threads_per_worker=1, dashboard_address="127.0.0.1:0", env=environment) as cluster:
         yield cluster.scheduler_address
 
 
-def test_workers_read_the_bucket_themselves(
+def test_a_worker_reads_the_bucket_itself(
     bucket: str, survey_png: Survey, surveyed_png: Survey, tmp_path: Path
 ) -> None:
-    """Two workers with a working copy of their own fetch their input, and the map equals that of a folder."""
+    """A worker with a working copy of its own fetches its input, and the map equals that of a folder."""
     there = {"SPECTRALZOOM_WORK": str(tmp_path / "there"), THREADS_OF: "1"}
-    with workers(2, there) as address, with_effects():
+    with worker(there) as address, with_effects():
         published = survey_png(bucket, scheduler=address)
     beside = map_of(open_archive(tmp_path / "folder"), surveyed_png(tmp_path / "folder"))
     np.testing.assert_array_equal(map_of(open_archive(bucket), published), beside)
@@ -102,9 +102,9 @@ def test_workers_read_the_bucket_themselves(
     assert fetched == {"condense", "locate", "rectify", "condense_fine", "rectify_fine", "score"}
 
 
-def test_workers_without_access_to_the_bucket_are_reported(bucket: str, command_line: CommandLine) -> None:
+def test_a_worker_without_access_to_the_bucket_is_reported(bucket: str, command_line: CommandLine) -> None:
     """One message names the worker and the cause."""
-    with workers(1, {"AWS_ENDPOINT_URL": "http://127.0.0.1:9", THREADS_OF: "1"}) as address:
+    with worker({"AWS_ENDPOINT_URL": "http://127.0.0.1:9", THREADS_OF: "1"}) as address:
         ended = command_line("survey", "--out", bucket, *SMALL, "--scheduler", address)
     assert ended.code == 2
     assert re.fullmatch(r".*--scheduler tcp:\S+: a worker cannot read the archive.* not answer: .*", ended.errors[-1])
@@ -114,7 +114,7 @@ def test_another_machine_clears_expired_raw_lines_in_a_bucket(
     bucket: str, survey_png: Survey, command_line: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Raw lines stay for 7 days; then gc clears them, and no later survey sends them."""
-    survey_png(bucket, keep="raw 7d", **NARROW)
+    survey_png(bucket, **SCANNED)
 
     def raw() -> set[str]:
         archive = open_archive(bucket)
@@ -127,10 +127,10 @@ def test_another_machine_clears_expired_raw_lines_in_a_bucket(
     with monkeypatch.context() as later:
         later.setattr(ObjectArchive, "now", lambda self: datetime.now(UTC) + timedelta(days=8))
         ended = json.loads(command_line("gc", bucket, "--json").out)
-    assert [removal["uri"].split("/")[1] for removal in ended["removals"]] == ["capture"] * 2  # coarse and fine lines
+    assert [removal["uri"].split("/")[1] for removal in ended["removals"]] == ["capture"]
     assert raw() == {"manifest.json"}
     monkeypatch.setenv("SPECTRALZOOM_WORK", str(tmp_path / "work"))
-    assert states(survey_png(bucket, keep="raw 7d", **NARROW).receipt) <= CACHED
+    assert states(survey_png(bucket, **SCANNED).receipt) <= CACHED
     assert raw() == {"manifest.json"}
     assert command_line("verify", bucket).code == 0
 
@@ -181,7 +181,7 @@ def rot_mosaic(address: str) -> None:
     """Flip a bit of the mosaic's values in the bucket."""
     archive = open_archive(address)
     assert isinstance(archive, ObjectArchive)
-    name = next(name for name in archive.objects.listing("stages/rectify_fine") if "/scores/c/" in name)
+    name = next(name for name in archive.objects.listing("stages/rectify") if "/scores/c/" in name)
     rot(archive, name, 100)
 
 
@@ -189,7 +189,7 @@ def test_a_flipped_bit_is_reported_and_repaired(
     bucket: str, survey_png: Survey, command_line: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """verify names store and array; --repair uses this machine's working copy, and another machine surveys again."""
-    published = survey_png(bucket, **NARROW)
+    published = survey_png(bucket, source="raster", budget=None)
     before = map_of(open_archive(bucket), published)
     rot_mosaic(bucket)
     ended = command_line("verify", bucket, "--json")

@@ -41,7 +41,7 @@ from tests.prior_work import without_effects
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 
-UNIFORM: dict[str, Any] = {"budget": None, "scan_step": "2", "name": "north", "accuracy": False}
+UNIFORM: dict[str, Any] = {"budget": None, "source": "raster", "name": "north", "accuracy": False}
 FIRST, LATER = "2026-06-01T10:00:00Z", "2026-06-04T10:00:00Z"
 
 
@@ -274,7 +274,7 @@ def test_a_reader_in_the_weights_is_used(visited: Path, survey_png: Survey, weig
 def test_a_rig_moved_between_two_partial_visits_is_detected(survey_png: Survey, tmp_path: Path) -> None:
     """Without a common part, today's lines are registered to the visit before the last."""
     out, (values, _) = tmp_path / "archive", patchy_scene((160, 192), 3, seed=5)
-    flags = {**UNIFORM, "labels": None, "prior": "latest"}
+    flags = {**UNIFORM, "labels": None, "prior": "latest", "source": "sim", "scan_step": "2"}
     before, now = ({**flags, "scene": str(tmp_path / f"{name}.png")} for name in ("before", "now"))
     for one, part in ((before, np.s_[12:140, 0:160]), (now, np.s_[0:128, 20:180])):  # 12 px lower, 20 further left
         Image.fromarray(values[part].astype(np.uint8)).save(one["scene"])

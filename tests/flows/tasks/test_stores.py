@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
+import os
+import signal
 from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,12 +27,15 @@ from flows.tasks.open_survey import OpenSurvey
 from flows.tasks.stage import Product, Stage, Wanted
 from flows.tasks.stages.condense import SignalChoice, components_of
 from pipeline.errors import ArchiveError
+from pipeline.rectify.region import Place, TileMaker
 from pipeline.signal.subspace import SignalStatistics
 from pipeline.source import References
 from storage.archive.archive import Archive
 from storage.archive.records import read_run
 from storage.arrays.cubes import open_raw_cube
 from tests.conftest import QUIET, Survey
+from tests.faults.small_survey import stored
+from tests.flows.conftest import problems
 
 
 def test_a_store_whose_input_was_cleared_meanwhile_is_not_published(tmp_path: Path) -> None:
@@ -112,20 +118,31 @@ def test_raw_lines_are_stored_once_and_as_uint16(tmp_path: Path) -> None:
     assert signal < lines
 
 
-def test_processes_make_the_same_archive(tmp_path: Path, survey_png: Survey, surveyed_png: Survey) -> None:
-    """A survey with two processes writes the same keys and bytes as one with threads, and xarray opens the map."""
+@dataclass(frozen=True)
+class KillOnce(TileMaker):
+    """Tile maker that kills its own process at the first call."""
+
+    folder: str = ""
+
+    def __call__(self, place: Place) -> tuple[np.ndarray, np.ndarray]:
+        """Kill the process if none was killed yet; then make the tile."""
+        if not (Path(self.folder) / "killed").exists():
+            (Path(self.folder) / "killed").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().__call__(place)
+
+
+def test_a_killed_process_makes_the_same_archive(
+    tmp_path: Path, survey_png: Survey, surveyed_png: Survey, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Keys and bytes are those of a survey with threads, after kill -9 of the worker; xarray opens the map."""
     roots = tmp_path / "threads", tmp_path / "processes"
     surveyed_png(roots[0])
-    survey_png(roots[1], scheduler="processes", workers=2)
-    kept = [
-        {
-            path.relative_to(root): hashlib.sha256(path.read_bytes()).hexdigest()
-            for path in (root / "stages").rglob("*")
-            if path.is_file() and path.name != "manifest.json"  # has times
-        }
-        for root in roots
-    ]
-    assert kept[0] == kept[1]
+    monkeypatch.setattr("flows.tasks.stages.placement.TileMaker", partial(KillOnce, folder=str(tmp_path)))
+    survey_png(roots[1], scheduler="processes", workers=1)
+    assert (tmp_path / "killed").exists()
+    assert stored(roots[0]) == stored(roots[1])
+    assert problems(roots[1]) == []
     (drawn,) = roots[1].glob("stages/segment/*/class_map.zarr")
     with xr.open_zarr(drawn, consolidated=False) as found:
         assert found["classes"].values.shape == (96, 128)

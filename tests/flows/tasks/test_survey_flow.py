@@ -29,7 +29,7 @@ from tests.flows.conftest import act_instead, newest_run
 from tests.prior_work import with_effects
 
 pytestmark = pytest.mark.usefixtures("no_effects")
-NARROW: dict[str, Any] = {"camera.samples": 160}  # few outside of the field
+RASTER: dict[str, Any] = {"source": "raster", "budget": None}
 
 
 class UnmadeRef(StageRef):
@@ -241,7 +241,7 @@ def test_a_survey_has_a_server_of_its_own(survey_png: Any, tmp_path: Path, monke
     """The server's files are in the archive, and the environment is unchanged afterwards."""
     monkeypatch.delenv("PREFECT_API_URL", raising=False)
     before, opened = prefect_variables(), opened_surveys()
-    survey_png(tmp_path, engine="prefect", **NARROW)
+    survey_png(tmp_path, engine="prefect", **RASTER)
     assert opened_surveys() <= opened  # no run stays in memory
     assert (tmp_path / ".prefect" / "prefect.db").exists()
     assert prefect_variables() == before
@@ -253,7 +253,7 @@ def test_without_a_server_the_survey_runs_plain(
     """The server cannot start, and every stage runs without it."""
     refuse = Mock(side_effect=ServerUnavailable("the Prefect server did not start (no port)"))
     monkeypatch.setattr(survey_command, "_prefect_server", refuse)
-    found = survey_png(tmp_path, engine="prefect", **NARROW).receipt
+    found = survey_png(tmp_path, engine="prefect", **RASTER).receipt
     assert {stage["state"] for stage in found["stages"]} == {"ran"}
 
 
@@ -267,16 +267,16 @@ def test_a_named_server_that_does_not_answer_is_reported(monkeypatch: pytest.Mon
 
 def test_sigterm_in_a_stage(field_file: Any, server: str, monkeypatch: pytest.MonkeyPatch, command_line: Any) -> None:
     """SIGTERM gives exit code 143 and one sentence, despite Prefect's own handling; the same command resumes."""
-    real, file = STAGES["rectify"], field_file()
+    real, file = STAGES["segment"], field_file(**RASTER)
 
     def terminated(*given: Any) -> None:
         os.kill(os.getpid(), signal.SIGTERM)
         pytest.fail("SIGTERM was not heard")
 
-    act_instead(monkeypatch, "rectify", terminated)
+    act_instead(monkeypatch, "segment", terminated)
     ended = command_line("survey", file)
     assert (ended.code, ended.out, ended.errors) == (143, "", [])
     assert ended.err.splitlines()[-1] == "terminated; run the same command to resume"
-    monkeypatch.setitem(STAGES, "rectify", real)
+    monkeypatch.setitem(STAGES, "segment", real)
     assert command_line("survey", file).code == 0
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL

@@ -28,8 +28,8 @@ from tests.conftest import CLASSES, RGB_NM, Survey
 
 SEEN = TrainedOn(3, (460.0, 640.0), (3.0, 100.0), 2, CLASSES, (96, 300), (24.0, 60.0), 0.12)
 Maker = Callable[[float], Path]
-# one scan, and fewer samples outside of the field
-NARROW: dict[str, Any] = {"effects": "none", "camera.samples": 160, "budget": None, "scan_step": 1}
+RASTER: dict[str, Any] = {"source": "raster", "budget": None, "unknown": "0.1%"}  # by default a raster has no unknown
+OFF: dict[str, Any] = {**RASTER, "unknown": "off"}
 
 
 def add_judgement(weights: Path, path: Path, limit: float, tables: dict[str, Any]) -> Path:
@@ -64,8 +64,8 @@ def both(
 ) -> tuple[Path, Path, dict[str, Any]]:
     """Return archives of the same survey with and without the class unknown, and the receipt of the first."""
     path, out, plain = judging(0.5), tmp_path_factory.mktemp("with"), tmp_path_factory.mktemp("without")
-    receipt = survey_png(out, weights=str(path), **NARROW).receipt
-    survey_png(plain, weights=str(path), unknown="off", **NARROW)
+    receipt = survey_png(out, weights=str(path), **RASTER).receipt
+    survey_png(plain, weights=str(path), **OFF)
     return out, plain, dict(receipt)
 
 
@@ -98,7 +98,7 @@ def test_maps_without_a_detector_keep_every_byte(
     both: tuple[Path, Path, dict[str, Any]], survey_png: Survey, weights: Path, tmp_path: Path
 ) -> None:
     """Keys and bytes are equal with the detector switched off and with weights that have none."""
-    survey_png(tmp_path, weights=str(weights), **NARROW)
+    survey_png(tmp_path, weights=str(weights), **OFF)
     assert _files(tmp_path, "segment") == _files(both[1], "segment")
     assert not set(_files(both[0], "segment")) & set(_files(both[1], "segment"))
 
@@ -116,7 +116,7 @@ def test_a_prior_map_gives_unknown_pixels_no_class(
     """A pixel unknown today is so whatever the prior map has; it has no probabilities, and its age is 0."""
     shutil.copytree(both[1], tmp_path, dirs_exist_ok=True)
     before = set(tmp_path.glob("stages/segment/*"))
-    flags = {"visit": "later", "seed": "1", "prior": "latest", **NARROW}
+    flags = {"visit": "later", "seed": "1", "prior": "latest", **RASTER}
     receipt = survey_png(tmp_path, weights=str(judging(0.5)), **flags).receipt
     assert receipt["prior_map"]["put_aside"] is None
     (store,) = set(tmp_path.glob("stages/segment/*")) - before
@@ -129,7 +129,7 @@ def test_a_prior_map_gives_unknown_pixels_no_class(
 
 def test_an_entirely_unknown_map_names_the_remedy(survey_png: Survey, judging: Maker, tmp_path: Path) -> None:
     """Receipt and report advise training or --unknown off; the mIoU is 0."""
-    published = survey_png(tmp_path, weights=str(judging(1e-6)), **NARROW)
+    published = survey_png(tmp_path, weights=str(judging(1e-6)), **RASTER)
     receipt: Any = published.receipt
     assert receipt["unknown"]["fraction"] == 1
     assert receipt["accuracy"]["miou"] == 0
@@ -148,7 +148,7 @@ def test_pixels_without_a_value_are_nodata_and_not_unknown(
     values[:8, :8] = np.nan
     np.save(tmp_path / "holes.npy", values)
     flags = {"scene": str(tmp_path / "holes.npy"), "labels": None, "wavelengths": ",".join(map(str, RGB_NM))}
-    survey_png(tmp_path / "out", weights=str(judging(1e-6)), **NARROW, **flags)
+    survey_png(tmp_path / "out", weights=str(judging(1e-6)), **RASTER, **flags)
     classes = _stored(tmp_path / "out", "class_map")["classes"].values
     assert (classes[:8, :8] == UNLABELLED).all()
     assert (classes[8:, 8:] == 3).all()

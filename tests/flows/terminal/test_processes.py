@@ -15,7 +15,10 @@ import pytest
 
 from flows.terminal.processes import format_refusal, place_caches, place_pages
 from pipeline.errors import SettingsError
+from tests.flows.conftest import CommandLine, Ended
+from tests.users.test_first_steps import small_files
 
+SURVEY = ("survey", "--size=64x64", "--bands=20,120,220", "--effects=none", "--engine=plain")
 NOWHERE = "/proc/nonexistent"  # not even root can write here
 
 
@@ -97,19 +100,18 @@ def test_refused_resources_get_a_message(error: Exception, words: str | None) ->
     assert found is None if words is None else words in str(found)
 
 
-@pytest.mark.parametrize(
-    ("limit", "words"),
-    [("ulimit -v 999999", "error: memory ran out: "), ("ulimit -f 100", "may not grow so large here: raise ulimit -f")],
-)
-def test_survey_within_narrow_limits_fails_with_one_message(tmp_path: Path, limit: str, words: str) -> None:
-    """Limits are 1 GB of address space or files of 100 kB: exit code 1, and no report of a defect."""
-    survey = (
-        f"{sys.executable} -m flows.cli.main survey --scene farm --size 64x64 --effects all --engine plain "
-        f"--out {tmp_path / 'a'}"
-    )
-    command = ["sh", "-c", f"{limit}; exec {survey}"]
+def test_survey_within_narrow_memory_fails_with_one_message(tmp_path: Path) -> None:
+    """The limit is 0.4 GB of address space: exit code 1, and no report of a defect."""
+    survey = f"{sys.executable} -m flows.cli.main {' '.join(SURVEY)} --out {tmp_path / 'a'}"
+    command = ["sh", "-c", f"ulimit -v 400000; exec {survey}"]
     ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    errors = [line for line in ended.stderr.splitlines() if line.startswith("error: ")]
-    assert (ended.returncode, len(errors)) == (1, 1), ended.stderr
-    assert words in errors[0]
+    Ended(ended.returncode, ended.stdout, ended.stderr).refused(1, "^memory ran out: ")
     assert "defect" not in ended.stderr
+
+
+def test_survey_with_small_files_fails_with_one_message(tmp_path: Path, command_line: CommandLine) -> None:
+    """The limit is 50 kB a file: exit code 1, and no report of a defect."""
+    with small_files(50_000):
+        ended = command_line(*SURVEY, "--out", tmp_path / "a")
+    ended.refused(1, "may not grow so large here: raise ulimit -f")
+    assert "defect" not in ended.err

@@ -80,7 +80,7 @@ def test_trade_offs_of_a_labelled_scene_are_measured(
     assert (parts["stage"], parts["default"]) == ("segment", 1.0)
     assert scans["stage"] == "survey"
     assert all(0 <= point["error"] <= 1 and point["cost"] > 0 for one in (parts, scans) for point in one["points"])
-    asked = {"scene": scene, "weights": str(weights), "out": str(tmp_path / "a")}
+    asked = {"scene": scene, "weights": str(weights), "out": str(tmp_path / "a"), "engine": "plain"}
     surveyed = run_survey(load_settings(None, asked), QUIET)
     errors = {point["setting"]: point["error"] for point in parts["points"]}
     assert errors[1.0] == pytest.approx(1 - surveyed.receipt["accuracy"]["miou"], abs=1e-3)

@@ -15,7 +15,7 @@ from flows.tradeoff.store import STORE, WAYS, ScanLines, block_means_of, scan_fa
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 
-SMALL = (96, 160)
+SMALL = (96, 128)
 BLOCK, MIOU = "mean of 64² [σ]", "mIoU [%]"  # noqa: RUF001
 STEPS = tuple(f"condensed, step {step:g}" for step in store.STEPS[::3])
 ROUNDED = tuple(f"pcodec, rounded {step:g}" for step in store.ROUNDED[::2])
@@ -26,7 +26,7 @@ PACKED = ("PCA, JPEG 2000, 2 B", "condensed, JPEG 2000, 2 B")
 @pytest.fixture(scope="module")
 def farm() -> ScanLines:
     """Return the lines of a small farm."""
-    return scan_farm(3, SMALL, LineCamera(samples=192))
+    return scan_farm(3, SMALL, LineCamera(samples=144))
 
 
 @pytest.fixture(scope="module")

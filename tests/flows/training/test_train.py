@@ -47,6 +47,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_field(tmp_path_factory.mktemp("frames") / "field", (16, 16), ("001", "002", "003", "004"))
 
 
+@pytest.fixture(scope="module")
+def first(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """Return weights that were trained with one scene for validation, and their record; do not change them."""
+    path = tmp_path_factory.mktemp("first") / "w.safetensors"
+    return path, train_weights(_request(folder, path, validation=1))
+
+
 @pytest.fixture
 def out(tmp_path: Path) -> Path:
     """Return the path for the weights of a test."""
@@ -59,8 +66,9 @@ def _request(folder: Path, out: Path, **choices: Any) -> TrainRequest:
 
 
 def test_the_record_lists_the_training_scenes(folder: Path, out: Path, tmp_path: Path):
-    """Scenes kept for validation or held out are not among them."""
+    """Scenes kept for validation or held out are not among them; full exposures give no scan performance."""
     record = train_weights(_request(folder, out, validation=1, hold_out=("003",)))
+    assert "scans" not in record
     split = record["split"]
     assert (len(split["train"]), len(split["validation"])) == (2, 1)
     assert not set(split["train"]) & {*split["validation"], "003"}
@@ -236,7 +244,7 @@ def test_surveys_warn_of_unlike_scenes(factor: float, bands: list[int], note: st
 
 
 def test_weights_for_short_exposures_have_scan_performance(folder: Path, out: Path):
-    """It holds mIoU and expected scores by step and exposure; other trainings have none."""
+    """It holds mIoU and expected scores by step and exposure."""
     settings = replace(SETTINGS, darkest_ms=6.0)
     record = train_weights(_request(folder, out, validation=2, settings=settings))
     scans = describe_weights(out).record["scans"]
@@ -248,16 +256,14 @@ def test_weights_for_short_exposures_have_scan_performance(folder: Path, out: Pa
     scores = describe_weights(out).ood_detector.map_scores
     assert (scores.steps, scores.exposures_ms, scores.scenes) == ((1, 2, 4, 8), (6.0, 12.0, 25.0, 50.0, 100.0), 2)
     assert np.abs(scores.bias).max() > 0.01
-    assert "scans" not in train_weights(_request(folder, out, validation=2))
-    assert "scans" not in train_weights(_request(folder, out, validation=0, settings=settings))
 
 
 @pytest.mark.parametrize(("darkest_ms", "said"), [(3.0, True), (100.0, False)])
 def test_missing_scan_performance_is_reported_after_training(folder: Path, out: Path, darkest_ms: float, said: bool):
-    """Short exposures without validation scenes are reported at the end of training, not first by a survey."""
+    """Weights have none without validation scenes; after short exposures training reports that, before any survey."""
     shown, settings = io.StringIO(), replace(SETTINGS, darkest_ms=darkest_ms)
     request = _request(folder, out, validation=0, settings=settings)
-    run_train(request, Console(file=shown, width=100))
+    assert "scans" not in run_train(request, Console(file=shown, width=100))
     assert ("the file has no scan performance" in shown.getvalue()) == said
 
 
@@ -290,21 +296,19 @@ def test_training_resumes_from_a_file(folder: Path, out: Path, tmp_path: Path, m
 
 @pytest.mark.parametrize(("better", "kept"), [(0, "network"), (3, "mean with --start")])
 def test_continued_training_keeps_the_best_by_validation(
-    folder: Path, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, better: int, kept: str
+    folder: Path, out: Path, first: tuple[Path, Any], monkeypatch: pytest.MonkeyPatch, better: int, kept: str
 ) -> None:
     """The candidates are the trained network and the mean of its weights and the old ones."""
-    train_weights(_request(folder, out, validation=1))
     scores = iter(np.eye(4)[better])
     monkeypatch.setattr(figures, "_miou", lambda *judged: float(next(scores)))
-    record = train_weights(_request(folder, tmp_path / "b.safetensors", validation=1, start=out))
+    record = train_weights(_request(folder, out, validation=1, start=first[0]))
     assert record["readings"]["kept"] == kept
 
 
-def test_continued_training_may_have_more_scenes(folder: Path, out: Path, tmp_path: Path) -> None:
+def test_continued_training_may_have_more_scenes(folder: Path, out: Path, first: tuple[Path, Any]) -> None:
     """Its record names the scenes of both trainings."""
-    first = train_weights(_request(folder, out, validation=1))["split"]
-    second = train_weights(_request(folder, tmp_path / "b.safetensors", validation=0, start=out))["split"]
-    assert second["train"].items() > first["train"].items()
+    second = train_weights(_request(folder, out, validation=0, start=first[0]))["split"]
+    assert second["train"].items() > first[1]["split"]["train"].items()
 
 
 def test_continued_training_has_a_lower_learning_rate(out: Path) -> None:
@@ -324,11 +328,12 @@ def test_continued_training_has_a_lower_learning_rate(out: Path) -> None:
         ({"width": 8}, "sizes of the network"),
     ],
 )
-def test_continued_training_refuses_changed_input(folder: Path, out: Path, changed: dict[str, Any], what: str) -> None:
+def test_continued_training_refuses_changed_input(
+    folder: Path, out: Path, first: tuple[Path, Any], changed: dict[str, Any], what: str
+) -> None:
     """One message names the difference: missing training scenes, other bands or other network sizes."""
-    train_weights(_request(folder, out, validation=1))
     with pytest.raises(SettingsError, match=f"its training had other {what}; give its data set and options"):
-        train_weights(_request(folder, out.with_name("b.safetensors"), **{"validation": 1, "start": out, **changed}))
+        train_weights(_request(folder, out, **{"validation": 1, "start": first[0], **changed}))
 
 
 def test_continued_training_refuses_other_scenes_of_the_same_names(folder: Path, out: Path, tmp_path: Path) -> None:

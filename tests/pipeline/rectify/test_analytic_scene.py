@@ -95,10 +95,10 @@ def rectified_swath(scene: Waves, swath: float, along: Axis, step: int) -> Mosai
 @pytest.mark.parametrize(
     ("shape", "along", "swaths", "periods", "slope", "step"),
     [
-        ((120, 900), "x", [-200, 200], (4, 40), 1.0, 1),
-        ((900, 120), "y", [-200, 200], (4, 40), 1.0, 1),
+        ((60, 900), "x", [-200, 200], (4, 40), 1.0, 1),
+        ((900, 60), "y", [-200, 200], (4, 40), 1.0, 1),
         ((40, 1800), "x", [-620, 0, 620], (4, 40), 1.0, 1),
-        ((120, 900), "x", [-200, 200], (6, 40), 0.0, 1),  # equal heights; a 4-px wave alone is too short for four taps
+        ((60, 900), "x", [-200, 200], (6, 40), 0.0, 1),  # equal heights; a 4-px wave alone is too short for four taps
         ((240, 900), "x", [-200, 200], (16, 160), 1.0, 4),  # 4 to 40 of the coarse pass's own pixels
     ],
 )

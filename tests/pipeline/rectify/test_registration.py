@@ -199,7 +199,7 @@ def test_field_shift_finds_a_moved_field(seed: int, down: int, across: int) -> N
     assert found.edge_px(SIZE) < 0.3
 
 
-@pytest.mark.parametrize(("seed", "degrees"), [(0, -5.0), (1, -2.0), (2, 1.0), (0, 3.0), (1, 5.0)])
+@pytest.mark.parametrize(("seed", "degrees"), [(0, -5.0), (2, 1.0), (1, 5.0)])
 def test_field_shift_finds_a_rotated_field(seed: int, degrees: float) -> None:
     """The rotation about the centre is right to a fifth of a degree."""
     field = textured(seed, (180, 210))

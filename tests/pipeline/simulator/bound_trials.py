@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pytest
 import scipy
 
 from pipeline.simulator.effects.effect import OFF, Effect, Radiance
@@ -15,12 +16,15 @@ from pipeline.simulator.optics.scene_radiance import TABULATED
 from pipeline.simulator.render import EFFECTS, READOUT, expected_light
 from pipeline.simulator.selection.options import SAFETY, Menu, list_options
 from tests.pipeline.simulator.random_cases import Case
+from tests.pipeline.simulator.small_scenes import leave_slit_unmeasured
 
 ROUNDING = 4e-6  # times the brightest light of the lines: float32 sums
 KERNELS = 4e-3  # times the light's range: difference of two sets of kernels that are fitted to the same blurs
 REACH_PX = 16  # along a line: numerical errors displace light at most this far
 DRAWN = frozenset({"jitter", "turbulence"})  # one survey of 1000 may exceed their bounds
 IN_THE_LIGHT: tuple[Effect, ...] = tuple(effect for effect in EFFECTS if effect not in READOUT)
+BY_FOOTPRINT = frozenset({"slit", "rotation"})  # bounded by the changes between variants of the slit
+OTHERS = frozenset(effect.name for effect in IN_THE_LIGHT) - BY_FOOTPRINT
 
 
 @dataclass(frozen=True)
@@ -70,20 +74,23 @@ class _Stored:
         return most, left
 
 
-def trials(case: Case, binnings: Sequence[int] = (1,), only: str = "") -> Iterator[Trial]:
+def trials(case: Case, binnings: Sequence[int] = (1,), only: Collection[str] = ()) -> Iterator[Trial]:
     """Yield trials without each effect of the rig and with each of its variants, with all other effects exact.
 
     Changes are over the noise of every stored number of all sweeps, with everything on; draws are paired. The same
-    light is stored in each of the ``binnings``. ``only`` limits the trials to one effect.
+    light is stored in each of the ``binnings``. ``only`` limits the trials to some effects.
     """
-    probes = [case.stored_in_sums_of(binning).probe() for binning in binnings]
+    with pytest.MonkeyPatch.context() as patch:
+        if only and BY_FOOTPRINT.isdisjoint(only):
+            leave_slit_unmeasured(patch)
+        probes = [case.stored_in_sums_of(binning).probe() for binning in binnings]
     menus = [list_options(probe, case.rig, IN_THE_LIGHT) for probe in probes]
     present = [menu for menu in menus[0] if menu.present]
     exact: dict[Effect, str] = {menu.effect: menu.exact.variant for menu in present}
     blocks = case.blocks(probes[0])
     full = [expected_light(case.scene, block, exact) for block in blocks]
     stored = [_stored(full, case, binning, found) for binning, found in zip(binnings, menus, strict=True)]
-    for menu in (one for one in present if only in ("", one.name)):
+    for menu in (one for one in present if not only or one.name in only):
         for variant in (OFF, *(option.variant for option in menu.variants[1:])):
             chosen = {effect: variant if effect is menu.effect else way for effect, way in exact.items()}
             shown = {one: way for one, way in chosen.items() if way != OFF}

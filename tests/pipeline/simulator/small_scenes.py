@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import map_coordinates
 
@@ -15,6 +18,7 @@ from pipeline.simulator.effects.counting import GAUSSIAN, SHOT
 from pipeline.simulator.effects.pointing import PointingErrors
 from pipeline.simulator.render import BY_NAME, EFFECTS, Choice
 from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster, raster_from_values
+from pipeline.simulator.selection import survey_probe
 
 
 def made_scene(planes: ArrayLike, electrons: ArrayLike, wavelength_nm: ArrayLike, **more: Any) -> RasterScene:
@@ -31,6 +35,20 @@ def made_scene(planes: ArrayLike, electrons: ArrayLike, wavelength_nm: ArrayLike
 def image_scene(values: ArrayLike, camera: LineCamera, wavelength_nm: ArrayLike) -> RasterScene:
     """Return a scene of an image's values (y, x, band)."""
     return raster_from_values(np.asarray(values), camera, name="image", wavelength_nm=np.asarray(wavelength_nm, float))
+
+
+@contextmanager
+def looking_at_less() -> Iterator[None]:
+    """Limit the samples of probes, within the context, to about half of those of a small sweep."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(survey_probe, "MOST_SAMPLES", 1000)
+        patch.setattr(survey_probe, "FINEST_SAMPLES", 100)
+        yield
+
+
+def leave_slit_unmeasured(patch: pytest.MonkeyPatch) -> None:
+    """Skip the comparison of the slit's variants: most of a probe's work, which only slit and rotation need."""
+    patch.setattr(survey_probe, "_slit_errors", lambda *_: {})
 
 
 def seen_at(scene: RasterScene, y: np.ndarray, x: np.ndarray) -> np.ndarray:

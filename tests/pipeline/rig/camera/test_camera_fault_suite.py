@@ -27,7 +27,7 @@ from tests.pipeline.rig.mirror.test_fault_suite import moves
 from tests.pipeline.rig.mirror_faults import Fault, make_fault
 from tests.pipeline.rig.small_rig import SmallRig, assert_simulated, small_rig
 
-SEEDS = range(8)
+SEEDS = range(6)
 SWEEP = Sweep("fine-5", "fine", "x", 1.5, -4.5, 7)
 PAIRS = 5  # of the vector memory, with its lead-in: four lines per capture
 COMMANDS, TRANSFERS = 12, 8  # occasions of an undisturbed sweep, slightly fewer than there are
@@ -163,7 +163,7 @@ def session(scan_passes: Polls, undisturbed: list[Line], camera: CameraFaults, m
 
 @pytest.mark.parametrize("fault", CameraFault, ids=lambda fault: fault.name)
 def test_no_camera_fault_loses_lines_or_hangs(fault: CameraFault, scan_passes: Polls, undisturbed: list[Line]) -> None:
-    """Eight sweeps per fault: it strikes once at a random occasion, or so often that retries do not help."""
+    """Six sweeps per fault: it strikes once at a random occasion, or so often that retries do not help."""
     ended, struck = 0, 0
     for seed in SEEDS:
         rng = np.random.default_rng(seed)
@@ -185,7 +185,7 @@ def test_no_camera_fault_loses_lines_or_hangs(fault: CameraFault, scan_passes: P
 
 @pytest.mark.parametrize("name", OF_MIRROR)
 def test_no_mirror_fault_spoils_a_sweep(name: str, scan_passes: Polls, undisturbed: list[Line]) -> None:
-    """Eight sweeps per fault: returned lines are right, and the sweep is completed after the mirror's repair."""
+    """Six sweeps per fault: returned lines are right, and the sweep is completed after the mirror's repair."""
     ended = 0
     for seed in SEEDS:
         at = 4 * seed + 2 if name == "no-reply" else None  # most requests are reads, which are retried

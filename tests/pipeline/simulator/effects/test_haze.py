@@ -22,9 +22,9 @@ from pipeline.simulator.effects.air import (
     transmission,
 )
 from pipeline.simulator.rig_model import Air, Optics, Rig, Sky
-from pipeline.simulator.selection import survey_probe
+from pipeline.simulator.selection.survey_probe import probe_scene
 from tests.pipeline.simulator.outdoors import BANDS, WAVELENGTH, block_of, rig_with, white_e
-from tests.pipeline.simulator.small_scenes import image_scene
+from tests.pipeline.simulator.small_scenes import image_scene, leave_slit_unmeasured
 
 CLEAR_30_M, HAZY_300_M = Air(30.0, visibility_km=23.0), Air(300.0, visibility_km=5.0)
 SLOPING = Air(30.0, relief="plane", nearest_m=10.0, farthest_m=100.0)
@@ -73,12 +73,12 @@ def test_no_path_radiance_without_a_white_reference() -> None:
 @pytest.mark.parametrize("black", [slice(1, 2), slice(None)], ids=["one band", "all bands"])
 def test_bands_without_light_have_a_finite_bound(air: Air, black: slice, monkeypatch: pytest.MonkeyPatch) -> None:
     """Path radiance is the only light of such bands; no value overflows, with any effect of the view."""
+    leave_slit_unmeasured(monkeypatch)
     values = np.random.default_rng(0).uniform(0, 1, (24, 32, 3))
     values[..., black] = 0
-    monkeypatch.setattr(survey_probe, "MOST_SAMPLES", 1500)  # more than such a small field has
     scene = image_scene(values, LineCamera(samples=32), [640.0, 550.0, 460.0])
     rig = Rig(LineCamera(samples=32), air=air, sky=Sky(brdf_per_rad=0.3, hot_spot=0.2))
-    probe = survey_probe.probe_scene(scene, rig, full_sweeps(SceneGrid(24, 32, 8), rig.camera, "x"))
+    probe = probe_scene(scene, rig, full_sweeps(SceneGrid(24, 32, 8), rig.camera, "x"))
     assert 0 < PATH_RADIANCE.bound(probe, rig).value < np.inf
 
 

@@ -50,7 +50,7 @@ def test_lines_with_one_position_have_no_smear() -> None:
 
 def test_folded_smear_counts_motion_within_an_exposure() -> None:
     """Wind pulls held positions apart: on this random rig the bound without that is exceeded by a factor of five."""
-    (trial,) = (one for one in trials(random_case(194), only="smear") if one.variant == "folded")
+    (trial,) = (one for one in trials(random_case(194), only=["smear"]) if one.variant == "folded")
     assert trial.measured > 0.03
     assert not trial.is_broken
 

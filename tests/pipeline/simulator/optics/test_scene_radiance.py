@@ -97,7 +97,7 @@ def far_and_near() -> np.ndarray:
     """Return the light of samples in small scenes, far beside them and at NaN: a block of 64 and a partial one."""
     views = views_of(66, 60.0)
     views = replace(views, scan=np.where(np.arange(66) % 5, views.scan, np.nan))
-    found = [scan_pass(scene_of(kind, 9), views, along_y=bool(number % 2)) for number, kind in enumerate(CHECKED_KINDS)]
+    found = [scan_pass(scene_of(kind, 3), views, along_y=bool(number % 2)) for number, kind in enumerate(CHECKED_KINDS)]
     return np.concatenate([light.ravel() for light in found])
 
 

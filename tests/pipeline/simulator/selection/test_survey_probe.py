@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -20,7 +21,7 @@ from pipeline.simulator.rig_model import Detector, Rig
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.selection.options import SAFETY, list_options
 from pipeline.simulator.selection.survey_probe import probe_scene, probe_survey
-from tests.pipeline.simulator.small_scenes import image_scene, made_scene
+from tests.pipeline.simulator.small_scenes import image_scene, leave_slit_unmeasured, made_scene
 
 RIG = Rig(camera=LineCamera(samples=96))
 SWEEP = Sweep("s", "fine", "x", swath_px=0.0, start_px=-30.0, lines=61)
@@ -61,13 +62,20 @@ def test_flat_scene_has_no_slope() -> None:
     assert set(probe.slit_errors.values()) == {0.0}
 
 
+def quick(probe: Callable[..., Any], *given: object) -> Any:
+    """Return what a probe finds without comparing the slit's variants, which is most of its work."""
+    with pytest.MonkeyPatch.context() as patch:
+        leave_slit_unmeasured(patch)
+        return probe(*given)
+
+
 @pytest.mark.parametrize("along", ["x", "y"])
 def test_wave_has_its_slope_and_curvature(along: str) -> None:
     """A long wave across the lines has slope and curvature of its amplitude and frequency, and no slope along them."""
     y, x = np.mgrid[:121, :121]  # level at the edges, which are repeated
     phase = 2 * np.pi * (y if along == "x" else x) / 24
     scene = scene_of((1 + 0.5 * np.cos(phase))[..., None])
-    probe = probe_scene(scene, RIG, [replace(SWEEP, along=along)], "dn")
+    probe = quick(probe_scene, scene, RIG, [replace(SWEEP, along=along)], "dn")
     passed = np.sinc(RIG.camera.slit_px / 24)
     high = 0.5 * scene.electrons[0] * passed / RIG.camera.electrons_per_dn
     assert probe.slope[1, 0] == pytest.approx(high * 2 * np.pi / 24, rel=0.03)
@@ -77,7 +85,7 @@ def test_wave_has_its_slope_and_curvature(along: str) -> None:
     assert probe.unit_least_dn == 1.0
 
 
-@pytest.mark.parametrize("seed", [0, 1, 11])
+@pytest.mark.parametrize("seed", [0, 11])
 def test_image_does_not_exceed_the_probe(seed: int) -> None:
     """Levels, spans and differences of neighbours stay within 1.05 of the probe's; slit variants keep their bounds."""
     scene, sweep = mixed(seed), replace(SWEEP, swath_px=40.0 * (seed % 3), start_px=-30.0 + seed)
@@ -113,7 +121,7 @@ def test_rotated_lines_do_not_exceed_the_probe(seed: int, swath: float) -> None:
 def test_bands_at_the_same_wavelength_have_finite_derivatives() -> None:
     """Overlapping detectors repeat wavelengths and step back; no derivative is taken across such a seam."""
     scene = replace(mixed(2, bands=4), wavelength_nm=np.array([500.0, 510.0, 510.0, 505.0]))
-    probe = probe_scene(scene, RIG, [SWEEP])
+    probe = quick(probe_scene, scene, RIG, [SWEEP])
     assert np.isfinite(probe.spectral_slope).all()
     assert probe.spectral_slope[1] > 0
 
@@ -124,7 +132,7 @@ def test_probe_finds_a_single_bright_pixel_in_a_large_scene() -> None:
     values[431, 222] = 5.0
     scene = scene_of(values)
     sweeps = [replace(SWEEP, name=f"{n}", swath_px=n, start_px=-300, lines=600) for n in (-252.0, -160.0, -64.0, 90.0)]
-    probe = probe_scene(scene, RIG, sweeps)
+    probe = quick(probe_scene, scene, RIG, sweeps)
     assert probe.brightest_e > 1.5 * scene.electrons[0]
     assert probe.slope.min() > 10
 
@@ -134,7 +142,7 @@ def test_stored_sums_do_not_exceed_their_probe(binning: int, along: str) -> None
     """Levels of sums, and their differences from line to line, are within 1.05 of the probe for the binning."""
     scene = mixed(binning, (96, 110))
     sweep = replace(SWEEP, along=along, binning=binning, start_px=-20.0, lines=41)
-    probe, light = probe_scene(scene, RIG, [sweep]), seen(scene, sweep)
+    probe, light = quick(probe_scene, scene, RIG, [sweep]), seen(scene, sweep)
     noise = noise_electrons(stored_mean(light, binning), RIG, binning)
     level = (stored_mean(light, binning) / noise).max(axis=(0, 1))
     assert (level <= 1.03 * probe.level).all()
@@ -148,7 +156,7 @@ def test_level_of_a_sum_grows_with_the_root_of_its_samples() -> None:
     """For an even scene the level of a sum of 4 is that of a sample times 2 in sigmas, and times 4 in DN."""
     scene, four = scene_of(np.full((50, 60, 1), 3.0)), replace(SWEEP, binning=4)
     for unit, growth in (("sigma", 2.0), ("dn", 4.0)):
-        probes = [probe_scene(scene, RIG, [sweep], unit) for sweep in (SWEEP, four)]
+        probes = [quick(probe_scene, scene, RIG, [sweep], unit) for sweep in (SWEEP, four)]
         assert probes[1].level[0] == pytest.approx(growth * probes[0].level[0], rel=1e-4)
         assert probes[1].unit_least_dn == pytest.approx(probes[0].unit_least_dn / growth, rel=1e-4)
 
@@ -157,11 +165,11 @@ def test_survey_has_a_probe_for_each_exposure() -> None:
     """Each probe is that of a rig which takes all lines with this exposure, except for the survey's time and lines."""
     scene, coarse = mixed(4), replace(SWEEP, name="c", kind="coarse", lines=15, step=4, binning=4, exposure_ms=25.0)
     fast = replace(SWEEP, name="f", exposure_ms=5.0)
-    probes = probe_survey(scene, RIG, [coarse, SWEEP, fast])
+    probes = quick(probe_survey, scene, RIG, [coarse, SWEEP, fast])
     assert [(one.binning, one.sweeps) for one in probes] == [(1, (fast,)), (1, (SWEEP,)), (4, (coarse,))]
     for exposure_ms, sweep, found in ((5.0, fast, probes[0]), (25.0, coarse, probes[2])):
         told = replace(RIG, camera=replace(RIG.camera, exposure_ms=exposure_ms))
-        alone = probe_scene(scene, told, [replace(sweep, exposure_ms=None)])
+        alone = quick(probe_scene, scene, told, [replace(sweep, exposure_ms=None)])
         for name in ("level", "span", "slope", "curvature", "white_e"):
             np.testing.assert_array_equal(getattr(found, name), getattr(alone, name))
         assert (found.brightest_e, found.darkest_e) == (alone.brightest_e, alone.darkest_e)
@@ -174,7 +182,7 @@ def test_survey_has_a_probe_for_each_exposure() -> None:
 def test_survey_time_includes_slow_setups() -> None:
     """Drifts are bounded over the whole survey, including slews of 10 s and reloads of 60 s."""
     slow, sweeps = CostModel(slew_s=10, reload_s=60), [replace(SWEEP, name=name) for name in "ab"]
-    (probe,) = probe_survey(mixed(4), RIG, sweeps, "sigma", slow)
+    (probe,) = quick(probe_survey, mixed(4), RIG, sweeps, "sigma", slow)
     assert probe.seconds == slow.seconds(sweeps, RIG.camera) > CostModel().seconds(sweeps, RIG.camera) + 60
 
 
@@ -198,6 +206,6 @@ def test_survey_without_lines_is_refused() -> None:
 
 def test_sweep_outside_of_the_scene_has_a_finite_probe() -> None:
     """Lines that miss the scene see its repeated edge."""
-    probe: Probe = probe_scene(mixed(1), RIG, [replace(SWEEP, swath_px=900.0, start_px=800.0)])
+    probe: Probe = quick(probe_scene, mixed(1), RIG, [replace(SWEEP, swath_px=900.0, start_px=800.0)])
     assert np.isfinite(probe.slope).all()
     assert np.isfinite(probe.level).all()

@@ -17,9 +17,10 @@ from pipeline.simulator.effects.probe import Probe, noise_electrons
 from pipeline.simulator.render import EFFECTS, expected_light
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, SceneRadiance, SceneRaster
-from pipeline.simulator.selection import survey_probe
 from pipeline.simulator.selection.choice import Decision, decide
+from pipeline.simulator.selection.survey_probe import probe_scene
 from tests.pipeline.simulator.bound_trials import ROUNDING, misplaced_fraction
+from tests.pipeline.simulator.small_scenes import looking_at_less
 
 TOLERANCE = 0.1
 CAMERA = LineCamera()
@@ -54,17 +55,11 @@ def scene_of(case: Case) -> RasterScene:
     return RasterScene("case", "case", raster, Once.of(light), np.ones(3, np.float32), WAVELENGTHS)
 
 
-@pytest.fixture(autouse=True)
-def a_sparse_pass(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Probe an eighth of the usual samples, enough for waves, a roof and flat fields, which repeat themselves."""
-    monkeypatch.setattr(survey_probe, "MOST_SAMPLES", 1500)
-    monkeypatch.setattr(survey_probe, "FINEST_SAMPLES", 200)
-
-
 @cache
 def probed(case: Case) -> Probe:
-    """Return the probe of a case."""
-    probe = survey_probe.probe_scene(scene_of(case), case.rig, SWEEPS)
+    """Return the probe of a case, from few samples: waves, a roof and flat fields repeat themselves."""
+    with looking_at_less():
+        probe = probe_scene(scene_of(case), case.rig, SWEEPS)
     return probe if case.seconds is None else replace(probe, seconds=case.seconds)
 
 
