@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import signal
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import line_positions
+from pipeline.rectify.region import Place, TileMaker
 from pipeline.signal.components import Components
 from storage.arrays.cubes import SweepHeader
 from storage.arrays.georeference import AngularGrid
@@ -57,3 +61,17 @@ def write_plain_sweep(path: Path, header: SweepHeader, values: NDArray[np.floati
     facts = LineRows(np.arange(count) * 0.1, *x_y.T, np.full(count, 100.0), np.ones(count, np.bool_))
     none = np.zeros((0, values.shape[2]), np.int16)
     writer.close(facts, np.zeros((0, 2), np.intp), none)
+
+
+@dataclass(frozen=True)
+class KillOnce(TileMaker):
+    """Tile maker that kills its own process at the first call."""
+
+    folder: str = ""
+
+    def __call__(self, place: Place) -> tuple[np.ndarray, np.ndarray]:
+        """Kill the process if none was killed yet; then make the tile."""
+        if not (Path(self.folder) / "killed").exists():
+            (Path(self.folder) / "killed").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().__call__(place)

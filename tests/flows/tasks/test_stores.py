@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,7 +24,6 @@ from flows.tasks.open_survey import OpenSurvey
 from flows.tasks.stage import Product, Stage, Wanted
 from flows.tasks.stages.condense import SignalChoice, components_of
 from pipeline.errors import ArchiveError
-from pipeline.rectify.region import Place, TileMaker
 from pipeline.signal.subspace import SignalStatistics
 from pipeline.source import References
 from storage.archive.archive import Archive
@@ -36,6 +32,7 @@ from storage.arrays.cubes import open_raw_cube
 from tests.conftest import QUIET, Survey
 from tests.faults.small_survey import stored
 from tests.flows.conftest import problems
+from tests.storage.plain_mosaic import KillOnce
 
 
 def test_a_store_whose_input_was_cleared_meanwhile_is_not_published(tmp_path: Path) -> None:
@@ -116,20 +113,6 @@ def test_raw_lines_are_stored_once_and_as_uint16(tmp_path: Path) -> None:
         for kind, name in (("capture", "dn"), ("condense_fine", "scores"))
     )
     assert signal < lines
-
-
-@dataclass(frozen=True)
-class KillOnce(TileMaker):
-    """Tile maker that kills its own process at the first call."""
-
-    folder: str = ""
-
-    def __call__(self, place: Place) -> tuple[np.ndarray, np.ndarray]:
-        """Kill the process if none was killed yet; then make the tile."""
-        if not (Path(self.folder) / "killed").exists():
-            (Path(self.folder) / "killed").touch()
-            os.kill(os.getpid(), signal.SIGKILL)
-        return super().__call__(place)
 
 
 def test_a_killed_process_makes_the_same_archive(
