@@ -91,7 +91,7 @@ def test_a_later_visit_uses_the_one_before_as_prior_map(twice: tuple[Path, Any, 
     memory = later.receipt["prior_map"]
     assert (memory["run"], memory["days"], memory["put_aside"]) == (first.folder.name, 3.0, None)
     assert later.receipt["settings"]["prior"] == first.folder.name
-    assert memory["agreement"] > 0.9  # it is the same picture with other noise
+    assert memory["agreement"] > 0.9  # it is the same picture
     page = (later.folder / "report.html").read_text(encoding="utf-8")
     assert first.folder.name in page
     assert re.search("3.0 days earlier; .*agreement [0-9.]+ %", page)
