@@ -28,7 +28,7 @@ SYNC = 60  # sync calls before the survey is stopped
 CODES = {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: TERMINATED}
 BEGUN = ("flows.tasks.stages.accuracy:load_class_map", 1)
 PLACES = {  # function, its call before which a survey with a map is stopped, and the signal
-    "in the controls": ("flows.tasks.stages.accuracy:run_controls", 1, signal.SIGKILL),
+    "in the controls": ("flows.tasks.stages.accuracy:run_controls", 1, signal.SIGTERM),
     "stored and not added": ("flows.publish.publishing:extend_with_accuracy", 1, signal.SIGKILL),
     "after the run has changed": ("storage.archive.run_folders:remove_tree", 2, signal.SIGKILL),
 }

@@ -17,7 +17,7 @@ from models.weights.files import CASCADE, save_weights
 from tests.conftest import RGB_NM, Flags, Survey, random_weights
 from tests.prior_work import without_effects
 
-SCAN: dict[str, Any] = {"budget": None, "source": "raster"}
+RASTER: dict[str, Any] = {"budget": None, "source": "raster"}
 TABLE = CascadeTable((0.02, 0.05, 0.15, 0.2), (0.0, 0.001, 0.003, 0.2), (0.9, 0.8, 0.4, 0.1))
 
 pytestmark = pytest.mark.usefixtures("no_effects")
@@ -36,7 +36,7 @@ def cascade(judged: Path, survey_png: Survey, tmp_path_factory: pytest.TempPathF
     """Return archive and receipt of a survey with these weights and no flag; do not change it."""
     out = tmp_path_factory.mktemp("cascade")
     with without_effects():
-        return out, survey_png(out, **SCAN, weights=str(judged)).receipt
+        return out, survey_png(out, **RASTER, weights=str(judged)).receipt
 
 
 def _open(out: Path, receipt: Any, name: str) -> xr.Dataset:
@@ -63,7 +63,7 @@ def test_read_patches_equal_a_full_reading(cascade: tuple[Path, Any], survey_png
     """The other patches come from the overview, and some differ."""
     out, receipt = cascade
     weights = str(receipt["settings"]["weights"])
-    everything = survey_png(tmp_path, **SCAN, weights=weights, expected_loss="0").receipt
+    everything = survey_png(tmp_path, **RASTER, weights=weights, expected_loss="0").receipt
     assert "kept" not in everything
     ours, whole = _classes(out, receipt), _classes(tmp_path, everything)
     patches = _open(out, receipt, "attention")["rank"].values >= 0

@@ -1,4 +1,4 @@
-"""Mosaics from disk to disk: the same bytes for any number of workers, and bounded memory."""
+"""Mosaics from disk to disk: bounded memory, errors of workers, and lines that they free."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ from tests.prior_work import without_effects
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 
-UNIFORM: dict[str, Any] = {"budget": None, "source": "raster", "name": "north", "accuracy": False}
+RASTER: dict[str, Any] = {"budget": None, "source": "raster", "name": "north", "accuracy": False}
 FIRST, LATER = "2026-06-01T10:00:00Z", "2026-06-04T10:00:00Z"
 
 
@@ -50,8 +50,8 @@ def twice(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) -> tuple
     """Return an archive with two visits to one field, three days apart, and both runs; do not change it."""
     out = tmp_path_factory.mktemp("twice") / "archive"
     with without_effects():
-        first = survey_png(out, **UNIFORM, visit=FIRST, prior="latest")
-        return out, first, survey_png(out, **UNIFORM, visit=LATER, prior="latest")
+        first = survey_png(out, **RASTER, visit=FIRST, prior="latest")
+        return out, first, survey_png(out, **RASTER, visit=LATER, prior="latest")
 
 
 @pytest.fixture
@@ -68,7 +68,7 @@ def class_map(out: Path, published: Any) -> np.ndarray:
 def words_of(out: Path, survey_png: Survey, **flags: Any) -> tuple[str, Any]:
     """Return the terminal output of a survey, joined into one line, and the run."""
     text = io.StringIO()
-    published = survey_png(out, console=Console(file=text, width=400), **{**UNIFORM, **flags})
+    published = survey_png(out, console=Console(file=text, width=400), **{**RASTER, **flags})
     return " ".join(text.getvalue().split()), published
 
 
@@ -107,9 +107,9 @@ def test_a_later_visit_uses_the_one_before_as_prior_map(twice: tuple[Path, Any, 
 
 def test_a_survey_uses_no_prior_map_by_default(visited: Path, survey_png: Survey) -> None:
     """Its map is that of a first visit, so the stage is cached."""
-    published = survey_png(visited, **UNIFORM, visit=LATER)
+    published = survey_png(visited, **RASTER, visit=LATER)
     assert "prior_map" not in published.receipt
-    fresh = survey_png(visited, **UNIFORM, visit=FIRST)
+    fresh = survey_png(visited, **RASTER, visit=FIRST)
     (row,) = (stage for stage in fresh.receipt["stages"] if stage["name"] == "segment")
     assert row["state"] == "cached"
 
@@ -150,7 +150,7 @@ def found_prior(out: Path, visit: str, prior: str) -> tuple[str, float] | None:
 
 def test_a_changed_file_of_the_same_path_is_another_visit(survey_png: Survey, tmp_path: Path) -> None:
     """All settings are equal; a file that is surveyed again is not the prior map of itself."""
-    flags: dict[str, Any] = {**UNIFORM, "scene": str(tmp_path / "week.png"), "labels": None, "prior": "latest"}
+    flags: dict[str, Any] = {**RASTER, "scene": str(tmp_path / "week.png"), "labels": None, "prior": "latest"}
     for seed, earlier in ((1, False), (2, True), (2, True)):
         Image.fromarray(patchy_scene((96, 128), 3, seed=seed)[0].astype(np.uint8)).save(tmp_path / "week.png")
         _, published = words_of(tmp_path / "archive", survey_png, **flags)
@@ -187,7 +187,7 @@ def test_a_map_of_another_place_is_no_prior_map(
         with rasterio.open(tmp_path / f"{name}.tif", "w", **kind, **place) as file:
             file.write(values)
     flags = {"labels": None, "name": "tile", "prior": "latest"}
-    survey_png(visited, **{**UNIFORM, **flags}, scene=str(tmp_path / "here.tif"), visit=FIRST)
+    survey_png(visited, **{**RASTER, **flags}, scene=str(tmp_path / "here.tif"), visit=FIRST)
     words, run = words_of(visited, survey_png, **flags, scene=str(tmp_path / "there.tif"), visit=LATER)
     assert ("prior_map" in run.receipt) == (why is None)
     assert why is None or why in words
@@ -198,7 +198,7 @@ def test_a_prior_map_of_another_field_is_put_aside(visited: Path, survey_png: Su
     Image.fromarray(patchy_scene((96, 128), 3, seed=77)[0].astype(np.uint8)).save(tmp_path / "other.png")
     flags = {"scene": str(tmp_path / "other.png"), "labels": None, "visit": "2026-06-07T10:00:00Z"}
     words, wrong = words_of(visited, survey_png, **flags, prior="latest")
-    alone = survey_png(tmp_path / "alone", **{**UNIFORM, **flags})
+    alone = survey_png(tmp_path / "alone", **{**RASTER, **flags})
     assert wrong.receipt["prior_map"]["put_aside"] == "another field"
     assert {wrong.receipt["prior_map"][name] for name in ("differing_px", "changed_px")} == {None}
     assert "differing" not in words
@@ -231,7 +231,7 @@ def test_prior_map_classes_are_matched_by_name(visited: Path, survey_png: Survey
     """Weights with another order and one more class use the prior map; weights without a common class do not."""
     other = make_weights(names=("class_2", "class_0", "class_1", "more"))
     flags = {"weights": str(other), "labels": None, "visit": "2026-06-07T10:00:00Z", "prior": "latest"}
-    published = survey_png(visited, **{**UNIFORM, **flags})
+    published = survey_png(visited, **{**RASTER, **flags})
     assert published.receipt["prior_map"]["days"] == 3.0
     strangers = make_weights(names=("a", "b", "c"))
     words, published = words_of(
@@ -260,7 +260,7 @@ def test_a_reader_in_the_weights_is_used(visited: Path, survey_png: Survey, weig
     reader = TemporalReader(TemporalSizes(config.classes, config.columns, 8, 4))
     torch.nn.init.normal_(reader.leave.weight, std=0.2)
     add_reader(own, own, reader, {})
-    flags = {**UNIFORM, "visit": "2026-06-07T10:00:00Z", "prior": "latest", "weights": str(own)}
+    flags = {**RASTER, "visit": "2026-06-07T10:00:00Z", "prior": "latest", "weights": str(own)}
     published = survey_png(visited, **flags)
     assert len(published.receipt["prior_map"]["reader"]) == 20
     first = survey_png(tmp_path / "alone", **{**flags, "prior": "none"})
@@ -274,7 +274,7 @@ def test_a_reader_in_the_weights_is_used(visited: Path, survey_png: Survey, weig
 def test_a_rig_moved_between_two_partial_visits_is_detected(survey_png: Survey, tmp_path: Path) -> None:
     """Without a common part, today's lines are registered to the visit before the last."""
     out, (values, _) = tmp_path / "archive", patchy_scene((160, 192), 3, seed=5)
-    flags = {**UNIFORM, "labels": None, "prior": "latest", "source": "sim", "scan_step": "2"}
+    flags = {**RASTER, "labels": None, "prior": "latest", "source": "sim", "scan_step": "2"}
     before, now = ({**flags, "scene": str(tmp_path / f"{name}.png")} for name in ("before", "now"))
     for one, part in ((before, np.s_[12:140, 0:160]), (now, np.s_[0:128, 20:180])):  # 12 px lower, 20 further left
         Image.fromarray(values[part].astype(np.uint8)).save(one["scene"])
@@ -296,7 +296,7 @@ def test_a_rig_turned_by_four_degrees_is_detected(survey_png: Survey, tmp_path: 
     images = {"before": soft[there], "now": rotate(soft, 4.0, reshape=False, order=1, mode="nearest")[there]}
     for name, image in images.items():
         Image.fromarray(np.clip(image, 0, 255).astype(np.uint8)).save(tmp_path / f"{name}.png")
-    flags = {**UNIFORM, "labels": None}
+    flags = {**RASTER, "labels": None}
     survey_png(tmp_path / "a", **flags, scene=str(tmp_path / "before.png"), visit=FIRST)
     now = {"labels": None, "scene": str(tmp_path / "now.png"), "visit": LATER, "prior": "latest"}
     words, later = words_of(tmp_path / "a", survey_png, **now)
@@ -324,7 +324,7 @@ def test_two_simultaneous_visits_are_both_published(visited: Path, twice: Any, s
     """Neither waits for the other; the prior map of each is a finished run."""
     at = ["2026-06-09T10:00:00Z", "2026-06-09T11:00:00Z"]
     with ThreadPoolExecutor(2) as pool:
-        both = list(pool.map(lambda visit: survey_png(visited, **UNIFORM, visit=visit, prior="latest"), at))
+        both = list(pool.map(lambda visit: survey_png(visited, **RASTER, visit=visit, prior="latest"), at))
     assert both[0].folder != both[1].folder
     assert both[0].receipt["prior_map"]["run"] == twice[2].folder.name
     assert both[1].receipt["prior_map"]["run"] in {twice[2].folder.name, both[0].folder.name}

@@ -115,14 +115,14 @@ def test_raw_lines_are_stored_once_and_as_uint16(tmp_path: Path) -> None:
     assert signal < lines
 
 
-def test_a_killed_process_makes_the_same_archive(
+def test_processes_make_the_same_archive(
     tmp_path: Path, survey_png: Survey, surveyed_png: Survey, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Keys and bytes are those of a survey with threads, after kill -9 of the worker; xarray opens the map."""
+    """Two processes, one killed by kill -9, write the keys and bytes of a survey with threads; xarray opens the map."""
     roots = tmp_path / "threads", tmp_path / "processes"
     surveyed_png(roots[0])
     monkeypatch.setattr("flows.tasks.stages.placement.TileMaker", partial(KillOnce, folder=str(tmp_path)))
-    survey_png(roots[1], scheduler="processes", workers=1)
+    survey_png(roots[1], scheduler="processes", workers=2)
     assert (tmp_path / "killed").exists()
     assert stored(roots[0]) == stored(roots[1])
     assert problems(roots[1]) == []
