@@ -17,21 +17,24 @@ export DO_NOT_TRACK = 1
 
 setup: $(BIN)/.ok
 
-# A small survey checks the installation, and compiles what surveys import: larger ones then begin at once.
 # The pip that comes with Python 3.11 takes twice as long to resolve pinned versions as a new one.
 # Debian without python3-venv has no ensurepip: create a bare environment, then install pip with the system's pip.
-$(BIN)/.ok: pyproject.toml constraints.txt
+$(BIN)/.pip:
 	$(PY) -m venv $(VENV) 2>/dev/null || { $(PY) -m venv --without-pip $(VENV) \
 		&& $(PY) -m pip --python $(BIN)/python install -q pip; }
 	$(PIP) -U pip
-	$(PIP) -e .
-	small=$$(mktemp -d); PYTHONDONTWRITEBYTECODE= $(BIN)/spectralzoom survey --scene farm --size 64x64 --seconds 2 \
-		--out $$small/archive > $$small/log 2>&1 || { cat $$small/log; exit 1; }; rm -rf $$small
 	touch $@
 
-# Additional packages for tests, lint, pages and benchmarks.
-$(BIN)/.ok-dev: $(BIN)/.ok
+# Packages of a survey and those of tests, lint, pages and benchmarks, by one command: two take half as long again.
+$(BIN)/.ok-dev: pyproject.toml constraints.txt | $(BIN)/.pip
 	$(PIP) -e '.[dev,s3,bench]'
+	touch $@
+
+# A small survey checks the installation, and compiles what surveys import: larger ones then begin at once.
+$(BIN)/.ok: pyproject.toml constraints.txt | $(BIN)/.pip $(if $(filter-out setup survey,$(MAKECMDGOALS)),$(BIN)/.ok-dev)
+	[ $(BIN)/.ok-dev -nt pyproject.toml ] && [ $(BIN)/.ok-dev -nt constraints.txt ] || $(PIP) -e .
+	small=$$(mktemp -d); PYTHONDONTWRITEBYTECODE= $(BIN)/spectralzoom survey --scene farm --size 64x64 --seconds 2 \
+		--out $$small/archive > $$small/log 2>&1 || { cat $$small/log; exit 1; }; rm -rf $$small
 	touch $@
 
 # Surveys the built-in farm, and again a week later with the first map as prior map; or by other settings and flags.
@@ -44,7 +47,7 @@ survey-rig: $(BIN)/.ok-dev
 
 # Property tests draw the same cases each time; PYTEST_ARGS="-n 3 --hypothesis-profile=anew" draws new ones.
 # Tests start hundreds of processes, so they write bytecode even if the environment disables it.
-test: $(BIN)/.ok-dev
+test: $(BIN)/.ok-dev $(BIN)/.ok
 	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q $(PYTEST_ARGS)
 
 lint: $(BIN)/.ok-dev
