@@ -33,7 +33,9 @@ FIRST_NM, LAST_NM = 400.0, 1000.0
 FWHM_NM = 6.0  # assumed
 WHITE_REFERENCE_REFLECTANCE = 0.99
 FILL = 0.95  # of the full well, by a perfect white in the brightest band
-TWIN_CENTRE_NM, TWIN_HALF_WIDTH_NM, TWIN_CONTRAST = 715.0, 25.0, 0.10
+TWIN_CENTRE_NM = 715.0
+TWIN_HALF_WIDTH_NM = 25.0
+TWIN_CONTRAST = 0.10
 RIPE_CONTRAST = 0.4  # of the twins' contrast, in ripe wheat (law of this project)
 MOISTURE_EXPONENT = 5.0  # law of this project; 80 % of the darkening is done at 0.32 by volume
 
@@ -135,13 +137,12 @@ def spectral_library(bands: int, materials: tuple[str, ...] = MATERIALS) -> Spec
     Raises WavelengthError: fewer than 2 bands.
     """
     wavelength, fwhm = band_centres(bands)
-    known = _known_spectra()
     # Photons under a clear sky on 21 June at sea level; a silicon sensor behind a grating (assumed).
     nm, sky = clear_sky(_SUN_ZENITH_DEG, 1 / np.cos(np.deg2rad(_SUN_ZENITH_DEG)), 172)
     efficiency = np.interp(GRID_NM, np.arange(400.0, 1101.0, 100.0), [0.34, 0.66, 0.72, 0.62, 0.47, 0.26, 0.09, 0.01])
     response = band_response(wavelength, fwhm) * (np.interp(GRID_NM, nm, sky[:, 0]) * GRID_NM * efficiency)
     light = response.sum(axis=1)
-    reflectance = np.stack([known[name] for name in materials]) @ response.T / light
+    reflectance = np.stack([_known_spectra()[name] for name in materials]) @ response.T / light
     parts = (wavelength, fwhm, reflectance, light / light.max())
     for part in parts:
         part.setflags(write=False)
@@ -163,10 +164,10 @@ def _known_spectra() -> dict[str, Spectrum]:
     """Return the reflectance of each of ``MATERIALS`` on the 1 nm grid from 400 to 1030 nm, by models or laws."""
 
     def stand(one: Canopy) -> Spectrum:
-        leaf, blades = (one.n, one.cab, one.car, one.cbrown, one.cw, one.cm), (one.lai, one.lidfa)
+        leaf = (one.n, one.cab, one.car, one.cbrown, one.cw, one.cm)
         light = (_SUN_ZENITH_DEG, 0.0, 0.0)  # seen straight from above
         seen = prosail.run_prosail(
-            *leaf, *blades, 0.05, *light, ant=one.ant, prospect_version="D", rsoil=1.0, psoil=one.dry_soil
+            *leaf, one.lai, one.lidfa, 0.05, *light, ant=one.ant, prospect_version="D", rsoil=1.0, psoil=one.dry_soil
         )
         return np.asarray(seen[: len(GRID_NM)], dtype=np.float64)
 
