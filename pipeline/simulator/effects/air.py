@@ -213,7 +213,6 @@ def format_reach(ends: tuple[float, float]) -> str:
 TURBULENCE, WIND, PARALLAX = Turbulence(), Wind(), Parallax()
 
 
-RANGE = "range"
 # Rows: wavelength [nm], coefficient of [4]; straight between, 0 outside. About 5 nm fine at oxygen A, 10 nm elsewhere.
 WATER = np.array([
     (570.0, 0.0), (593.0, 0.075), (610.0, 0.0), (667.6, 0.0), (690.0, 0.016), (710.0, 0.0125), (718.0, 1.8),
@@ -242,7 +241,7 @@ class Absorption(Gain):
     """
 
     name = "absorption"
-    cost_ns = MappingProxyType({RANGE: 2.7})  # of a scene with relief
+    cost_ns = MappingProxyType({"range": 2.7})  # of a scene with relief
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by level times the fraction that gases take."""
@@ -305,7 +304,7 @@ class PathRadiance(LightChange):
     """
 
     name = "path-radiance"
-    cost_ns = MappingProxyType({RANGE: 3.1})  # of a scene with relief
+    cost_ns = MappingProxyType({"range": 3.1})  # of a scene with relief
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by the fraction that is lost times the greatest difference of signal and H."""
@@ -360,8 +359,7 @@ def extinction_per_m(air: Air, wavelength_nm: Floats) -> Floats:
     by Angstrom's exponent: 1.14 [4], below 7.4 km Kruse's 0.585 V^(1/3) [5]. Above 336 km no aerosol is left. Valid
     from 400 to 1000 nm beside the lines of gases, and down to some 0.5 km of visibility.
     """
-    molecules = rayleigh_per_m(np.array([VISIBLE_NM]))[0]
-    aerosol = max(KOSCHMIEDER / air.visibility_km * 1e-3 - molecules, 0.0)
+    aerosol = max(KOSCHMIEDER / air.visibility_km * 1e-3 - rayleigh_per_m(np.array([VISIBLE_NM]))[0], 0.0)
     exponent = min(ANGSTROM, KRUSE * air.visibility_km ** (1 / 3))
     return np.asarray(aerosol * (wavelength_nm / VISIBLE_NM) ** -exponent + rayleigh_per_m(wavelength_nm))
 

@@ -17,7 +17,6 @@ from pipeline.simulator.optics.kernel_fit import Floats, Moments
 from pipeline.simulator.optics.rays import extreme_normals, pupil_contrast, spread_of_rays, spread_of_waves
 from pipeline.simulator.rig_model import Rig
 
-AIRY = "airy"
 MOST_BLUR_PX = 256  # diameter of a disc that is simulated
 FIRST_NM, LAST_NM = 400.0, 1000.0  # of the spectrograph
 _ALONE: Floats = np.ones(1)
@@ -62,7 +61,7 @@ class Diffraction(Blur):
 
     name = "diffraction"
     # Each kernel costs: of the pattern's core, of its tails, of the bands' own widths.
-    cost_ns = MappingProxyType({AIRY: 6.5})
+    cost_ns = MappingProxyType({"airy": 6.5})
 
     def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
         none = np.zeros((2, len(wavelength_nm)))

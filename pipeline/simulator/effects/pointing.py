@@ -45,11 +45,8 @@ def end_gains(sweep: Sweep, camera: LineCamera) -> Floats:
 
 def at_line_ends(sweeps: Iterable[Sweep], camera: LineCamera, along: float, scan: float) -> tuple[float, float]:
     """Bound how far any point of any line moves, for centres that move by up to so much. [px]"""
-    most = np.eye(2)
-    for sweep in sweeps:
-        if sweep.lines:
-            most = np.maximum(most, np.abs(end_gains(sweep, camera)).max(axis=(0, 1)))
-    moved = most @ [along, scan]
+    gains = [np.abs(end_gains(sweep, camera)).max(axis=(0, 1)) for sweep in sweeps if sweep.lines]
+    moved = np.max([np.eye(2), *gains], axis=0) @ [along, scan]
     return float(moved[0]), float(moved[1])
 
 
@@ -213,7 +210,6 @@ class PointingErrors(Aim):
 JITTER, HYSTERESIS, THERMAL_DRIFT = Jitter(), Hysteresis(), ThermalDrift()
 
 
-EXACT = "exact"
 MOST_PARTS = 8  # of an exposure; a jump of h px within a part goes unseen as a blur of at most h^2/32 px^2
 _RAMP = 64  # steps of a line that are as good as a ramp
 
@@ -228,7 +224,7 @@ class Staircase(Aim):
     """
 
     name = "staircase"
-    cost_ns = MappingProxyType({EXACT: 27.0})  # five positions a line instead of one
+    cost_ns = MappingProxyType({"exact": 27.0})  # five positions a line instead of one
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
         positions = block.rig.mirror.positions_per_line
@@ -285,7 +281,7 @@ class Lag(Aim):
     """
 
     name = "lag"
-    cost_ns = MappingProxyType({EXACT: 0.15})
+    cost_ns = MappingProxyType({"exact": 0.15})
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
         scan = transient(block.rig, block.sweep, block.numbers)

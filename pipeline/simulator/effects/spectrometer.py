@@ -173,16 +173,14 @@ def _tap_weights(wavelength_nm: tuple[float, ...], smile_nm: float, samples: int
     shift = wavelength_shift(samples, smile_nm)
     runs = [run for run in rising_runs(wavelength) if run.stop - run.start > 1]
     taps = [(run, off, weight) for run in runs for off, weight in _run_taps(wavelength[run], shift)]
-    first = min((int(off.min()) for _, off, _ in taps), default=0)
-    last = max((int(off.max()) for _, off, _ in taps), default=0)
-    first, last = min(first, 0), max(last, 0)
+    first = min([0, *(int(off.min()) for _, off, _ in taps)])
+    last = max([0, *(int(off.max()) for _, off, _ in taps)])
     weights = np.zeros((last - first + 1, samples, len(wavelength)))
     weights[-first] = 1
-    sample = np.arange(samples)[:, None]
     for run in runs:
         weights[-first, :, run] = 0
     for run, off, weight in taps:
-        weights[off - first, sample, np.arange(run.start, run.stop)] += weight
+        weights[off - first, np.arange(samples)[:, None], np.arange(run.start, run.stop)] += weight
     used = np.flatnonzero(weights.any(axis=(1, 2)))
     low, high = min(used[0], -first), max(used[-1], -first)
     return first + int(low), weights[low : high + 1].astype(np.float32)

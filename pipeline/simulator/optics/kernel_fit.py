@@ -131,8 +131,7 @@ def _fit(packed: bytes, bands: int, box: tuple[float, float], held: int, disc: A
         fitted = _some(order, count)
         fractions = _fractions(passed, _wanted(moments[:, fitted], own))
         between = np.stack([np.interp(place, place[fitted], one) for one in np.eye(len(fitted))])
-        off = np.abs(passed @ (fractions @ between[:, judged]) - wanted)
-        if off.max() <= enough or count >= bands:
+        if np.abs(passed @ (fractions @ between[:, judged]) - wanted).max() <= enough or count >= bands:
             break
     return chosen, fractions, between
 
@@ -170,7 +169,9 @@ def _candidates(moments: Floats, place: Floats) -> Iterator[Kernels]:
             for size, level in ladder:
                 few = count if size <= _SHIFTED_PX[0] else min(count, 2 if size <= _SHIFTED_PX[1] else 1)
                 nodes = _nodes(moments[:4], place, few)
-                wide = (size**2 * stretch)[:, None] - _LESS * _steps(nodes[:2]) ** 2
+                # Light between two nodes is wider than either: each is the narrower, the farther they are apart.
+                step = np.abs(np.diff(nodes[:2], axis=1)).max(axis=1, keepdims=True, initial=0.0)
+                wide = (size**2 * stretch)[:, None] - _LESS * step**2
                 variance = np.maximum(nodes[2:] + np.where(level == 1, wide, (size**2 * stretch)[:, None]), 0.0)
                 found.append((nodes[:2], variance, np.full(nodes.shape[1], level, np.intp)))
             shift, variance, level_of = (np.concatenate(parts, axis=-1) for parts in zip(*found, strict=True))
@@ -191,13 +192,6 @@ def _ladder(widest: Floats, core: float, ratio: float) -> list[tuple[float, int]
         sizes.append((level * _size_at(level), level))
         level *= 2
     return sizes
-
-
-def _steps(shift: Floats) -> Floats:
-    """Return the distance of neighbouring nodes, (2, 1): light between two of them is wider than either."""
-    if shift.shape[1] == 1:
-        return np.zeros((2, 1))
-    return np.asarray(np.abs(np.diff(shift, axis=1)).max(axis=1, keepdims=True))
 
 
 def _size_at(level: int) -> float:

@@ -69,10 +69,10 @@ class SceneSampler:
         self._extremes = extremes
 
     @cached_property
-    def gatherers(self) -> list[tuple[int, NDArray[np.intp], Gatherer]]:
-        """Return what sums pixels of which level through which kernels."""
+    def tables(self) -> list[tuple[int, NDArray[np.intp], KernelTables]]:
+        """Return through which kernels pixels of which level are summed, and the tables of these."""
         whole = self.footprint
-        return [(level, some, Gatherer(whole.part(level, some), self._extremes)) for level, some in whole.windows()]
+        return [(level, some, KernelTables(whole.part(level, some), self._extremes)) for level, some in whole.windows()]
 
     def scan_pass(
         self, scene: RasterScene, steps: Sequence[RayViews], *, along_y: bool, exposure_ratio: float
@@ -85,8 +85,8 @@ class SceneSampler:
         levels = np.unique(self.footprint.level).tolist()
         planes = {level: np.ascontiguousarray(scene.raster.thinned(level), np.float32) for level in levels}
         sums = np.ones(self.footprint.kernels)
-        for _, some, gatherer in self.gatherers:
-            sums[some] = gatherer.parts
+        for _, some, tables in self.tables:
+            sums[some] = tables.parts
         fractions = (self.footprint.fractions / np.reshape(len(steps) * sums, (-1, 1))).T.astype(np.float32)
         count = len(steps[0].along)
         kernels = self.footprint.kernels
@@ -118,50 +118,43 @@ class SceneSampler:
         *,
         along_y: bool,
     ) -> None:
+        """Add the components that samples see through every kernel to ``out`` (number, n, component).
+
+        They are sums over the parts, times ``gains`` (kernel, component). ``planes`` (y, x, component), by level, are
+        C-contiguous. ``numbers`` (kernel,) say where in ``out`` kernels belong.
+        """
         for views in steps:
-            for level, some, gatherer in self.gatherers:
-                seen = views.thinned(level, THINNED_MARGIN)
-                gatherer.gather(planes[level], seen, out, numbers[some], gains[some], along_y=along_y)
+            for level, some, tables in self.tables:
+                rows, columns, components = planes[level].shape
+                compiled_loops.gather_windows(
+                    planes[level].reshape(-1),
+                    compiled_loops.PixelTable(columns, rows, components, along_y),
+                    views.thinned(level, THINNED_MARGIN).table(),
+                    *(tables.kernels, tables.along, tables.scan, numbers[some], gains[some], out),
+                )
 
 
-class Gatherer:
-    """Gathers a scene's components through a footprint at views whose shape is within a range."""
+class KernelTables:
+    """A footprint's kernels and tables of their weights, for views whose shape is within a range."""
 
     def __init__(self, footprint: Footprint, views: RayViews) -> None:
-        """Take ``views`` that include the extremes of all that will be gathered."""
-        slit, pixel = footprint.box
-        across, along = footprint.parts
-        variance = footprint.variance + disc_points(footprint.disc)[1][:, None]
-        scale, off = place_parts(footprint, views)
+        """Take ``views`` that include the extremes of all that will be sampled."""
+        self.kernels = kernels_of(footprint)
+        self.parts = int(self.kernels.place.shape[1])  # boxes that each kernel is summed over
+        table = views.table()
+        beside = np.zeros((2, len(views.along)), np.float32)  # all look at the middle of a pixel
+        scale = np.empty((footprint.kernels, 2, len(views.along)))
+        off = np.empty((footprint.kernels, 2, self.parts, len(views.along)), np.float32)
+        for kernel in range(footprint.kernels):
+            compiled_loops.place_parts(table, beside, kernel, self.kernels, scale[kernel], off[kernel])
         reach = np.abs(off).max(axis=(0, 2, 3), initial=0.0) + 0.02
         ranges = [(float(one.min()), float(one.max())) for one in scale.swapaxes(0, 1)]
         tail = TAIL / float(footprint.fractions.max(initial=0.0) or 1.0)
-        self._kernels = kernels_of(footprint)
-        self.parts = int(self._kernels.place.shape[1])  # boxes that each kernel is summed over
-        self._along = TapTable.of(pixel / along, variance[0], 1, ranges[0], float(reach[0]), tail)
-        self._scan = TapTable.of(slit / across, variance[1], footprint.held, ranges[1], float(reach[1]), tail)
-
-    def gather(
-        self,
-        planes: Radiance,
-        views: RayViews,
-        out: Radiance,
-        numbers: NDArray[np.intp],
-        gains: Radiance,
-        *,
-        along_y: bool,
-    ) -> None:
-        """Add the components that some samples see through every kernel to ``out`` (number, n, component).
-
-        They are sums over the parts, times ``gains`` (kernel, component). ``planes`` (y, x, component) are float32 and
-        C-contiguous, ``views`` in their px. ``numbers`` (kernel,) say where in ``out`` kernels belong. A sample's light
-        does not depend on the others.
-        """
-        rows, columns, components = planes.shape
-        raster = compiled_loops.PixelTable(columns, rows, components, along_y)
-        compiled_loops.gather_windows(
-            planes.reshape(-1), raster, views.table(), self._kernels, self._along, self._scan, numbers, gains, out
-        )
+        slit, pixel = footprint.box
+        across, along = footprint.parts
+        variance = footprint.variance + disc_points(footprint.disc)[1][:, None]
+        self.along = TapTable.of(pixel / along, variance[0], 1, ranges[0], float(reach[0]), tail)
+        self.scan = TapTable.of(slit / across, variance[1], footprint.held, ranges[1], float(reach[1]), tail)
 
 
 def kernels_of(footprint: Footprint) -> compiled_loops.PartedKernels:
@@ -177,19 +170,3 @@ def kernels_of(footprint: Footprint) -> compiled_loops.PartedKernels:
     boxes = np.stack([np.repeat(turn, along), np.tile(run, across)])  # across and along, in px of the camera
     parts = (boxes[:, :, None] + points[::-1, None]).reshape(2, -1).astype(np.float32)  # boxes at a disc's points
     return compiled_loops.PartedKernels(np.array(footprint.shift, np.float32, order="C"), variance, between, parts)
-
-
-def place_parts(footprint: Footprint, views: RayViews) -> tuple[Floats, Radiance]:
-    """Return the places of the parts of kernels for samples in the middle of a pixel, along and scan.
-
-    Returns scales of one part (kernel, 2, n), and how far beside the pixel parts lie, (kernel, 2, part, n) [px].
-    """
-    kernels = kernels_of(footprint)
-    count = len(views.along)
-    scale = np.empty((footprint.kernels, 2, count))
-    off = np.empty((footprint.kernels, 2, kernels.place.shape[1], count), np.float32)
-    table = views.table()
-    beside = np.zeros((2, count), np.float32)
-    for kernel in range(footprint.kernels):
-        compiled_loops.place_parts(table, beside, kernel, kernels, scale[kernel], off[kernel])
-    return scale, off

@@ -47,7 +47,7 @@ def find_extrema(scene: RasterScene, camera: LineCamera, sweeps: Sequence[Sweep]
         bands = telling_bands(scene, spectra, optics, tile, ranking)
         kinds = np.searchsorted([one.stop for one in band_groups(len(spectra))], bands, side="right").tolist()
     else:
-        bands = chosen_bands(spectra)
+        bands = np.arange(len(spectra)) if own_planes else chosen_bands(spectra)
         kinds = list(range(len(bands)))
     some = spectra[bands] if own_planes else np.ascontiguousarray(spectra[:, bands])
     high = min(_TILES_HIGH, max(1, _STRIP_PX // (tile * scene.shape[1]))) * tile
@@ -60,8 +60,6 @@ def find_extrema(scene: RasterScene, camera: LineCamera, sweeps: Sequence[Sweep]
 
 def chosen_bands(spectra: Radiance) -> NDArray[np.intp]:
     """Return the brightest band and those least like the ones chosen, at most ``CHOSEN_BANDS``."""
-    if spectra.ndim == 1:
-        return np.arange(len(spectra))
     chosen = [int(spectra.max(axis=0).argmax())]
     for _ in range(min(CHOSEN_BANDS, spectra.shape[1]) - 1):
         gap = np.min([np.abs(spectra - spectra[:, [one]]).max(axis=0) for one in chosen], axis=0)

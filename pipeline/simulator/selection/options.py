@@ -107,8 +107,9 @@ def _options_of(probe: Probe, rig: Rig, effects: Sequence[Effect]) -> list[Menu]
             arriving = light_read(probe, rig, [one for one in ranges if one is not None])
         growth = 1.0
         if acts_on_light(effect):
-            beside = ranges[:place] + ranges[place + 1 :]
-            greatest = [np.maximum(one.greatest, 1.0) for one in beside if one is not None]
+            greatest = [
+                np.maximum(one.greatest, 1.0) for one in ranges[:place] + ranges[place + 1 :] if one is not None
+            ]
             others = float(np.prod(greatest, axis=0).max(initial=1.0)) if greatest else 1.0
             growth = error_growth(probe, rig, ranges[place], others)
         menus.append(_menu(effect, arriving, rig, present[place], growth))

@@ -245,8 +245,7 @@ class FarmPlan:
         there = {"soil_dry", "soil_wet", "gravel", "water", "straw", "straw_grey", "grass_green", "grass_dry", "shade"}
         there |= {"weed_leafy", "weed_red", "volunteer", "blossom"}
         there |= {name for name, fraction in foliage(self.day).items() if fraction > 0}
-        for one in self.fields:
-            there |= one.materials_on(self.day)
+        there = there.union(*(one.materials_on(self.day) for one in self.fields))
         return tuple(name for name in MATERIALS if name in there)
 
 

@@ -92,7 +92,7 @@ def _content(
     if land.phase == "grass":
         return _meadow(rows, field, here, land.days, work.plan.day)
     soil = moist_soil(work.plan, here, field.wetter)
-    if land.phase == "soil" or (crop is None and land.phase == "crop"):
+    if land.phase == "soil":
         return _bare_field(rows, field, soil)
     if crop is None or land.phase == "stubble":
         return _stubble_field(rows, field, here, soil, land.days)
