@@ -57,7 +57,7 @@ def dark_frame(block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> Radianc
     """
     readout = Readout(block, Choice.of(chosen))
     camera = block.rig.camera
-    dark = np.zeros((camera.samples, len(block.wavelength_nm)), np.float32) + readout.added
+    dark: Radiance = np.zeros((camera.samples, len(block.wavelength_nm)), np.float32) + readout.added
     dark = dark / np.float32(camera.electrons_per_dn) + np.float32(camera.dark_dn)
     if readout.read_noise_e:
         sd = np.sqrt(readout.read_noise_e**2 + readout.added) / camera.electrons_per_dn

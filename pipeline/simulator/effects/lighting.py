@@ -41,8 +41,7 @@ class Drift(Gain):
         if rig.sky.started is None:
             return Bound(0.0, "the survey has no time of day")
         seconds = probe.seconds + rig.camera.frame_ms * 1e-3  # to the end of the last line
-        light = relative_daylight(rig.sky, probe.wavelength_nm, knots_within(rig.sky, seconds))
-        worst = np.abs(light - 1).max(axis=0)
+        worst = np.abs(relative_daylight(rig.sky, probe.wavelength_nm, knots_within(rig.sky, seconds)) - 1).max(axis=0)
         low, high = sun_elevation_deg(rig.sky, np.array([0.0, seconds]))
         duration = f"{seconds / 3600:.1f} h" if seconds >= 3600 else f"{seconds:.0f} s"
         course = f"with the sun from {low:.1f} to {high:.1f} deg in {duration}"

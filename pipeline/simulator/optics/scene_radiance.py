@@ -84,12 +84,12 @@ class SceneSampler:
         spectra = scene.electrons * np.float32(exposure_ratio)
         levels = np.unique(self.footprint.level).tolist()
         planes = {level: np.ascontiguousarray(scene.raster.thinned(level), np.float32) for level in levels}
-        sums = np.ones(self.footprint.kernels)
+        kernels = self.footprint.kernels
+        sums = np.ones(kernels)
         for _, some, tables in self.tables:
             sums[some] = tables.parts
         fractions = (self.footprint.fractions / np.reshape(len(steps) * sums, (-1, 1))).T.astype(np.float32)
         count = len(steps[0].along)
-        kernels = self.footprint.kernels
         light = np.empty((count, spectra.shape[-1]), np.float32)
         if spectra.ndim == 1:
             gains = ((fractions.T @ self.footprint.between) * spectra).astype(np.float32)
@@ -124,13 +124,13 @@ class SceneSampler:
         C-contiguous. ``numbers`` (kernel,) say where in ``out`` kernels belong.
         """
         for views in steps:
-            for level, some, tables in self.tables:
-                rows, columns, components = planes[level].shape
+            for level, some, one in self.tables:
+                pixels = planes[level]
+                rows, columns, components = pixels.shape
+                raster = compiled_loops.PixelTable(columns, rows, components, along_y)
+                seen = views.thinned(level, THINNED_MARGIN).table()
                 compiled_loops.gather_windows(
-                    planes[level].reshape(-1),
-                    compiled_loops.PixelTable(columns, rows, components, along_y),
-                    views.thinned(level, THINNED_MARGIN).table(),
-                    *(tables.kernels, tables.along, tables.scan, numbers[some], gains[some], out),
+                    pixels.reshape(-1), raster, seen, one.kernels, one.along, one.scan, numbers[some], gains[some], out
                 )
 
 
@@ -143,8 +143,8 @@ class KernelTables:
         self.parts = int(self.kernels.place.shape[1])  # boxes that each kernel is summed over
         table = views.table()
         beside = np.zeros((2, len(views.along)), np.float32)  # all look at the middle of a pixel
-        scale = np.empty((footprint.kernels, 2, len(views.along)))
-        off = np.empty((footprint.kernels, 2, self.parts, len(views.along)), np.float32)
+        scale = np.empty((footprint.kernels, 2, len(views.along)))  # of one part
+        off = np.empty((footprint.kernels, 2, self.parts, len(views.along)), np.float32)  # of parts from it [px]
         for kernel in range(footprint.kernels):
             compiled_loops.place_parts(table, beside, kernel, self.kernels, scale[kernel], off[kernel])
         reach = np.abs(off).max(axis=(0, 2, 3), initial=0.0) + 0.02
