@@ -87,7 +87,7 @@ def _band_groups(
 ) -> tuple[tuple[slice, slice, Radiance], ...]:
     """Cut the kernel into products of few bands each: most of its weights are 0.
 
-    Of each: the bands made, the bands that they are made of, and their weights (taken, made).
+    A product is the bands made, the bands that they are made of, and their weights (taken, made).
     """
     kernel = np.zeros((len(wavelength_nm), len(wavelength_nm)))
     for run in rising_runs(np.array(wavelength_nm)):

@@ -90,10 +90,15 @@ def _content(
     salt = int(rng.integers(2**31))
     rows = rows_of(rng, field, centres)
     if land.phase == "grass":
-        return _meadow(rows, field, here, land.days, work.plan.day)
+        winter = 0.5 + 0.5 * np.cos(2 * np.pi * (work.plan.day - 25) / YEAR_DAYS)
+        dryness = float(0.18 + 0.34 * np.exp(-land.days / 12) + 0.24 * winter)
+        bands = stripes(rows.across, field.row_period_px, field.row_period_px / 2)
+        return Content(blend(grass(here, dryness), grass(here, dryness + 0.16), bands), {"grass": np.ones_like(bands)})
     soil = moist_soil(work.plan, here, field.wetter)
     if land.phase == "soil":
-        return _bare_field(rows, field, soil)
+        furrow = stripes(rows.place, field.row_period_px if crop is None else 10.5, 3.0)
+        content = Content(blend(soil, {"shade": np.ones_like(furrow)}, 0.15 * furrow), {"soil": np.ones_like(furrow)})
+        return _with_wheel_marks(content, field, rows, soil) if crop is None else content
     if crop is None or land.phase == "stubble":
         return _stubble_field(rows, field, here, soil, land.days)
     return _standing_crop(work, field, crop, rows, here, soil, row_gaps(salt, field, rows, here), down)
@@ -168,19 +173,6 @@ def _stubble_field(rows: Rows, field: FieldPlan, here: Ground, soil: Mixture, da
     return _with_wheel_marks(Content(mixture, {"stubble": straw + green, "soil": 1 - straw - green}), field, rows, soil)
 
 
-def _meadow(rows: Rows, field: FieldPlan, here: Ground, days: float, day: int) -> Content:
-    winter = 0.5 + 0.5 * np.cos(2 * np.pi * (day - 25) / YEAR_DAYS)
-    dryness = float(0.18 + 0.34 * np.exp(-days / 12) + 0.24 * winter)
-    bands = stripes(rows.across, field.row_period_px, field.row_period_px / 2)
-    return Content(blend(grass(here, dryness), grass(here, dryness + 0.16), bands), {"grass": np.ones_like(bands)})
-
-
-def _bare_field(rows: Rows, field: FieldPlan, soil: Mixture) -> Content:
-    furrow = stripes(rows.place, field.row_period_px if field.crop is None else 10.5, 3.0)
-    content = Content(blend(soil, {"shade": np.ones_like(furrow)}, 0.15 * furrow), {"soil": np.ones_like(furrow)})
-    return _with_wheel_marks(content, field, rows, soil) if field.crop is None else content
-
-
 def _lodged(noise: Field, field: FieldPlan, day: int) -> Field:
     fraction = field.lodging * lodged_fraction(day)
     if fraction <= 0 or field.crop is None or field.land_on(day).phase != "crop" or field.land_on(day).days < 150:
@@ -213,7 +205,8 @@ def rows_of(rng: np.random.Generator, field: FieldPlan, centres: Points) -> Rows
         if abs(ahead @ (ny, nx)) > 0.7:
             distance = centres @ np.array([ny, nx]) - offset
             nearer = distance < ends
-            ends[nearer], end_normal[nearer] = distance[nearer], (ny, nx)
+            ends[nearer] = distance[nearer]
+            end_normal[nearer] = (ny, nx)
     aside = rng.normal(0, PASS_SD * field.row_period_px, 512)
     passes = np.floor(across / (PASS_ROWS * field.row_period_px) - 0.5 / PASS_ROWS).astype(int)
     turned = ends < field.headland_px
