@@ -16,15 +16,17 @@ from numba import types
 from numpy.typing import NDArray
 
 from pipeline.compiled import DOUBLES, FLOATS, OFFSETS, compiled, record_of, rows_of
-from pipeline.simulator.optics.kernel_fit import TapTable
+from pipeline.simulator.optics.kernel_fit import Floats, TapTable
 
 Radiance = NDArray[np.float32]
 _AT_ONCE = 1024  # numbers that stay in the processor's first cache
-_WORDS, _LIGHT, _RAW = rows_of(types.uint32, 1), rows_of(FLOATS, 1), rows_of(types.uint16, 1)
+_LIGHT1, _LIGHT2, _LIGHT3 = rows_of(FLOATS, 1), rows_of(FLOATS, 2), rows_of(FLOATS, 3)
+_WORDS = rows_of(types.uint32, 1)
+_RAW = rows_of(types.uint16, 1)
 _ENDLESS = 0x7F800000  # bits of an infinite float32; of what is no number they are more
 
 
-@compiled(_WORDS, OFFSETS, _LIGHT)
+@compiled(_WORDS, OFFSETS, _LIGHT1)
 def draw_pairs(words: NDArray[np.uint32], piece: int, drawn: Radiance) -> None:
     """Write standard normal deviates, a piece after the other: of each, words for radii, then as many for turns.
 
@@ -37,7 +39,8 @@ def draw_pairs(words: NDArray[np.uint32], piece: int, drawn: Radiance) -> None:
     for first in range(0, len(drawn), piece):
         half = min(piece, len(drawn) - first) // 2
         for start in range(0, half, _AT_ONCE):
-            some, at = min(_AT_ONCE, half - start), np.uint64(first + start)
+            some = min(_AT_ONCE, half - start)
+            at = np.uint64(first + start)
             for n in range(some):
                 radius[n] = np.float32(words[at + np.uint64(n)]) * np.float32(2**-32) + np.float32(2**-33)  # never 0
             for n in range(some):
@@ -74,7 +77,7 @@ def draw_pairs(words: NDArray[np.uint32], piece: int, drawn: Radiance) -> None:
                 drawn[at + np.uint64(half + n)] = aside * radius[n]
 
 
-@compiled(_LIGHT, _LIGHT, _LIGHT, DOUBLES, DOUBLES, DOUBLES, DOUBLES, _RAW)
+@compiled(_LIGHT1, _LIGHT1, _LIGHT1, DOUBLES, DOUBLES, DOUBLES, DOUBLES, _RAW)
 def read_merged(
     light: Radiance,
     added: Radiance,
@@ -91,17 +94,17 @@ def read_merged(
     second order). `divergence` in `effects.counting` bounds the rest. ``light`` below 0 counts as 0; ``added`` comes to
     it, one number or as many as light. All [e-]. Numbers are rounded half to even, within 0 and full scale.
     """
-    read, per_dn, dark, most = (
-        np.float32(read_noise_e * read_noise_e),
-        np.float32(electrons_per_dn),
-        np.float32(dark_dn),
-        np.float32(full_scale_dn),
-    )
+    read = np.float32(read_noise_e * read_noise_e)
+    per_dn = np.float32(electrons_per_dn)
+    dark = np.float32(dark_dn)
+    most = np.float32(full_scale_dn)
     expected = np.empty(_AT_ONCE, np.float32)
     bits = expected.view(np.int32)
-    every, worst = np.uint64(1 if len(added) > 1 else 0), np.int32(0)
+    every = np.uint64(1 if len(added) > 1 else 0)
+    worst = np.int32(0)
     for first in range(0, len(light), _AT_ONCE):
-        some, start = min(_AT_ONCE, len(light) - first), np.uint64(first)
+        some = min(_AT_ONCE, len(light) - first)
+        start = np.uint64(first)
         if every:
             for n in range(some):
                 one = light[start + np.uint64(n)]
@@ -113,7 +116,8 @@ def read_merged(
         for n in range(some):
             worst = max(worst, bits[n] & np.int32(0x7FFFFFFF))
         for n in range(some):
-            mean, z = expected[n], deviate[start + np.uint64(n)]
+            mean = expected[n]
+            z = deviate[start + np.uint64(n)]
             variance = mean + read
             skew = mean / variance * np.float32(1 / 6)
             electrons = (np.sqrt(variance) + skew * z) * z - skew + mean
@@ -126,10 +130,9 @@ def read_merged(
 
 
 SAMPLES_AT_ONCE = 32  # whose weights stay in the processor's cache while lines pass
-_LINES = rows_of(FLOATS, 3)
 
 
-@compiled(rows_of(FLOATS, 3, read_only=True), rows_of(FLOATS, 3, read_only=True), OFFSETS, _LINES)
+@compiled(rows_of(FLOATS, 3, read_only=True), rows_of(FLOATS, 3, read_only=True), OFFSETS, _LIGHT3)
 def mix_neighbours(light: Radiance, weights: Radiance, first: int, made: Radiance) -> None:
     """Write light (line, sample, band) times weights (tap, sample, band) of bands ``first``, ``first`` + 1, ... beside.
 
@@ -153,12 +156,11 @@ def mix_neighbours(light: Radiance, weights: Radiance, first: int, made: Radianc
                         made[line, sample, here] += seen * weights[tap, sample, here]
 
 
-Rows = NDArray[np.int64]
+Places = NDArray[np.int64]
 TERMS = 4  # of a sum between two looks at its total, and samples that share what is read for them
 LANES = 16  # floats: rows of a mixing matrix are some times as long, and begin where a line of the cache does
 _FLOATS_AT_ONCE = 2048  # floats of every kernel that stay in the processor's cache
 _ROWS = rows_of(OFFSETS, 1)
-_LIGHT1, _LIGHT2, _LIGHT3 = rows_of(FLOATS, 1), rows_of(FLOATS, 2), rows_of(FLOATS, 3)
 
 
 @compiled(_LIGHT2, _LIGHT2, _LIGHT2)
@@ -166,7 +168,8 @@ def sum_nodes(parts: Radiance, fractions: Radiance, nodes: Radiance) -> None:
     """Write sums (node, value) over kernels of values (kernel, value), times shares (node, kernel)."""
     kernels, count = parts.shape
     for first in range(0, count, _FLOATS_AT_ONCE):
-        start, some = np.uint64(first), min(_FLOATS_AT_ONCE, count - first)
+        start = np.uint64(first)
+        some = min(_FLOATS_AT_ONCE, count - first)
         for node in range(len(nodes)):
             for number in range(some):
                 nodes[node, start + np.uint64(number)] = np.float32(0)
@@ -184,12 +187,14 @@ def sum_nodes(parts: Radiance, fractions: Radiance, nodes: Radiance) -> None:
 
 
 @compiled(_LIGHT3, OFFSETS, OFFSETS, OFFSETS, _LIGHT2, _ROWS)
-def _take_terms(nodes: Radiance, start: int, lower: int, upper: int, taken: Radiance, rows: Rows) -> int:
+def _take_terms(nodes: Radiance, start: int, lower: int, upper: int, taken: Radiance, rows: Places) -> int:
     """Write what four samples have of components that any of them has, (sample, term), and their rows of the mixing.
 
     Gives how many that are; the last sample stands for those beyond it, nothing for terms beyond the last.
     """
-    last, components, count = nodes.shape[1] - 1, nodes.shape[2], 0
+    last = nodes.shape[1] - 1
+    components = nodes.shape[2]
+    count = 0
     n0, n1, n2, n3 = start, min(start + 1, last), min(start + 2, last), min(start + 3, last)
     for node in range(lower, upper):
         for one in range(components):
@@ -206,7 +211,7 @@ def _take_terms(nodes: Radiance, start: int, lower: int, upper: int, taken: Radi
 
 @compiled(_LIGHT2, _ROWS, OFFSETS, _LIGHT2, _LIGHT1, _LIGHT1, _LIGHT1, _LIGHT1)
 def _mix_four(
-    taken: Radiance, rows: Rows, count: int, mixing: Radiance, a: Radiance, b: Radiance, c: Radiance, d: Radiance
+    taken: Radiance, rows: Places, count: int, mixing: Radiance, a: Radiance, b: Radiance, c: Radiance, d: Radiance
 ) -> None:
     """Write totals (band,) of four samples: their terms (sample, term) times rows of the mixing."""
     wide = mixing.shape[1]
@@ -235,8 +240,10 @@ def mix_bands(
     Nodes from ``lower`` to before ``upper`` are taken; ``mixing`` (node * component, band) is as `mixing_rows` has it.
     A sample has few of many components. Terms are added one by one, and those of 0 may be left out.
     """
-    count, wide = nodes.shape[1], mixing.shape[1]
-    taken, rows = np.empty((TERMS, len(mixing)), np.float32), np.empty(len(mixing), np.int64)
+    count = nodes.shape[1]
+    wide = mixing.shape[1]
+    taken = np.empty((TERMS, len(mixing)), np.float32)
+    rows = np.empty(len(mixing), np.int64)
     a, b = np.empty(wide, np.float32), np.empty(wide, np.float32)
     c, d = np.empty(wide, np.float32), np.empty(wide, np.float32)
     for start in range(0, count, TERMS):
@@ -259,8 +266,6 @@ def mixing_rows(mixing: Radiance) -> Radiance:
     return found
 
 
-Floats = NDArray[np.float64]
-Places = NDArray[np.int64]
 AT_ONCE = 64  # samples whose weights are worked out together: they stay in the processor's first cache
 TAPS_AT_ONCE = 8  # terms of a sum between two looks at its total
 FEW = 4  # components that are summed one by one
@@ -284,15 +289,16 @@ class PixelTable(NamedTuple):
     along_outer: bool
 
 
-_PIXELS, _VIEWS = rows_of(FLOATS, 1, read_only=True), rows_of(DOUBLES, 2)
+_PIXELS = rows_of(FLOATS, 1, read_only=True)
 _FLOATS2 = rows_of(DOUBLES, 2)
 _TABLE = record_of(TapTable, _LIGHT2, OFFSETS, DOUBLES, DOUBLES, OFFSETS, OFFSETS, OFFSETS, DOUBLES)
 _KERNELS = record_of(PartedKernels, _LIGHT2, _FLOATS2, DOUBLES, _LIGHT2)
 _RASTER = record_of(PixelTable, OFFSETS, OFFSETS, OFFSETS, types.boolean)
-_NUMBERS, _PLACES = rows_of(types.intp, 1), rows_of(OFFSETS, 2)
+_NUMBERS = rows_of(types.intp, 1)
+_PLACES = rows_of(OFFSETS, 2)
 
 
-@compiled(_VIEWS, _LIGHT2, OFFSETS, _KERNELS, _FLOATS2, _LIGHT3)
+@compiled(_FLOATS2, _LIGHT2, OFFSETS, _KERNELS, _FLOATS2, _LIGHT3)
 def place_parts(
     views: Floats, beside: Radiance, kernel: int, kernels: PartedKernels, scale: Floats, off: Radiance
 ) -> None:
@@ -304,7 +310,8 @@ def place_parts(
     """
     run, turn = kernels.variance[0, kernel], kernels.variance[1, kernel]
     runs, turns = kernels.shift[0, kernel], kernels.shift[1, kernel]
-    between, place = kernels.between, kernels.place
+    between = kernels.between
+    place = kernels.place
     parts = place.shape[1]
     for n in range(scale.shape[1]):
         a, b, c, d = views[2, n], views[3, n], views[4, n], views[5, n]
@@ -329,8 +336,11 @@ def read_weights(
 
     ``scale`` is (axis, n), ``off`` (axis, part, n): by axis and part.
     """
-    taps, last_scale, last_row = table.weight.shape[1], table.scales - 1, np.float32(table.rows - 2)
-    ahead, per_px = np.float32(table.left - table.first), np.float32(table.per_px)
+    taps = table.weight.shape[1]
+    last_scale = table.scales - 1
+    last_row = np.float32(table.rows - 2)
+    ahead = np.float32(table.left - table.first)
+    per_px = np.float32(table.per_px)
     for n in range(weight.shape[1]):
         number = np.rint((scale[axis, n] - table.least_scale) * table.per_scale)
         number = number if number > 0 else 0.0  # not a number is not either
@@ -349,7 +359,8 @@ def read_weights(
 @compiled(_LIGHT2, _LIGHT2, types.boolean, _LIGHT2)
 def join_weights(outer: Radiance, inner: Radiance, more: bool, joint: Radiance) -> None:
     """Write the products (outer * inner, n) of weights (outer, n) and (inner, n), or add them where there are more."""
-    count, wide = joint.shape[1], len(inner)
+    count = joint.shape[1]
+    wide = len(inner)
     for row in range(len(outer)):
         for column in range(wide):
             tap = row * wide + column
@@ -361,7 +372,7 @@ def join_weights(outer: Radiance, inner: Radiance, more: bool, joint: Radiance) 
                     joint[tap, n] = outer[row, n] * inner[column, n]
 
 
-@compiled(_VIEWS, OFFSETS, _FLOATS2, _FLOATS2, _LIGHT2)
+@compiled(_FLOATS2, OFFSETS, _FLOATS2, _FLOATS2, _LIGHT2)
 def _take_views(views: Floats, first: int, some: Floats, nearest: Floats, beside: Radiance) -> None:
     """Write some views (6, n) from the first one on, the last again where there are fewer, and their pixels."""
     last = views.shape[1] - 1
@@ -390,7 +401,8 @@ def _within(nearest: Floats, axis: int, left: int, size: int, step: int, places:
 @compiled(_PLACES, _PLACES, _PLACES)
 def _join_places(rows: Places, columns: Places, places: Places) -> None:
     """Write the places (n, outer * inner) of a window's pixels; the last one again where there is room for more."""
-    count, high, wide = rows.shape[0], rows.shape[1], columns.shape[1]
+    count, high = rows.shape
+    wide = columns.shape[1]
     for n in range(count):
         for row in range(high):
             for column in range(wide):
@@ -399,7 +411,7 @@ def _join_places(rows: Places, columns: Places, places: Places) -> None:
             places[n, tap] = rows[n, high - 1] + columns[n, wide - 1]
 
 
-@compiled(_PIXELS, _PLACES, _LIGHT2, OFFSETS, OFFSETS, rows_of(FLOATS, 1), OFFSETS)
+@compiled(_PIXELS, _PLACES, _LIGHT2, OFFSETS, OFFSETS, _LIGHT1, OFFSETS)
 def _sum_taps(
     planes: Radiance, places: Places, weight: Radiance, taps: int, n: int, total: Radiance, components: int
 ) -> None:
@@ -438,7 +450,7 @@ def _sum_taps(
             )
 
 
-@compiled(_PIXELS, _RASTER, _VIEWS, _KERNELS, _TABLE, _TABLE, _NUMBERS, _LIGHT2, _LIGHT3)
+@compiled(_PIXELS, _RASTER, _FLOATS2, _KERNELS, _TABLE, _TABLE, _NUMBERS, _LIGHT2, _LIGHT3)
 def gather_windows(
     planes: Radiance,
     raster: PixelTable,
@@ -453,13 +465,19 @@ def gather_windows(
     """Add what samples see through kernels, times gains (kernel, component), to ``out`` (number, n, component)."""
     outer, inner = (along, scan) if raster.along_outer else (scan, along)
     by_outer, by_inner = (0, 1) if raster.along_outer else (1, 0)
-    high, wide, components = outer.weight.shape[1], inner.weight.shape[1], raster.components
+    high, wide = outer.weight.shape[1], inner.weight.shape[1]
+    components = raster.components
     taps = high * wide
-    parts, padded = kernels.place.shape[1], -(-taps // TAPS_AT_ONCE) * TAPS_AT_ONCE
-    some, nearest, scale = np.empty((6, AT_ONCE)), np.empty((2, AT_ONCE)), np.empty((2, AT_ONCE))
-    beside, off = np.empty((2, AT_ONCE), np.float32), np.empty((2, parts, AT_ONCE), np.float32)
+    parts = kernels.place.shape[1]
+    padded = -(-taps // TAPS_AT_ONCE) * TAPS_AT_ONCE
+    some = np.empty((6, AT_ONCE))
+    nearest = np.empty((2, AT_ONCE))
+    beside = np.empty((2, AT_ONCE), np.float32)
+    scale = np.empty((2, AT_ONCE))
+    off = np.empty((2, parts, AT_ONCE), np.float32)
     turn, run = np.empty((high, AT_ONCE), np.float32), np.empty((wide, AT_ONCE), np.float32)
-    joint, places = np.zeros((padded, AT_ONCE), np.float32), np.empty((AT_ONCE, padded), np.int64)
+    joint = np.zeros((padded, AT_ONCE), np.float32)
+    places = np.empty((AT_ONCE, padded), np.int64)
     rows, columns = np.empty((AT_ONCE, high), np.int64), np.empty((AT_ONCE, wide), np.int64)
     total = np.empty(-(-components // LANES) * LANES, np.float32)
     for first in range(0, views.shape[1], AT_ONCE):

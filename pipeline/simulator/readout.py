@@ -55,11 +55,10 @@ def dark_frame(block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> Radianc
 
     Numbers below 0 become 0, so that the mean is above a dark level that noise reaches down from.
     """
-    readout, camera = Readout(block, Choice.of(chosen)), block.rig.camera
-    dark = np.zeros((camera.samples, len(block.wavelength_nm)), np.float32)
-    dark += readout.added
-    dark /= np.float32(camera.electrons_per_dn)
-    dark += np.float32(camera.dark_dn)
+    readout = Readout(block, Choice.of(chosen))
+    camera = block.rig.camera
+    dark: Radiance = np.zeros((camera.samples, len(block.wavelength_nm)), np.float32) + readout.added
+    dark = dark / np.float32(camera.electrons_per_dn) + np.float32(camera.dark_dn)
     if readout.read_noise_e:
         sd = np.sqrt(readout.read_noise_e**2 + readout.added) / camera.electrons_per_dn
         bell = np.exp(-((dark / sd) ** 2) / 2) / math.sqrt(math.tau)
@@ -81,7 +80,8 @@ class Readout:
             return self.converted(self.electrons(light, number))
         seen = np.ascontiguousarray(light if self.dead is None else np.where(self.dead, 0, light), np.float32)
         deviate = self._deviates(SHOT.name, number)
-        camera, raw = self.block.rig.camera, np.empty(light.shape, np.uint16)
+        camera = self.block.rig.camera
+        raw = np.empty(light.shape, np.uint16)
         finite = compiled_loops.read_merged(
             *(seen.reshape(-1), np.ravel(np.asarray(self.added, np.float32)), deviate.reshape(-1), self.read_noise_e),
             *(camera.electrons_per_dn, camera.dark_dn, camera.full_scale_dn, raw.reshape(-1)),
@@ -97,8 +97,9 @@ class Readout:
 
     def electrons(self, light: Radiance, number: int) -> Radiance:
         """Return what leaves the amplifier for one line's light, (sample, band); each noise of its own draw. [e-]"""
-        expected, shot = self._expected(light, number), self._variant(SHOT.name)
+        expected = self._expected(light, number)
         electrons = expected
+        shot = self._variant(SHOT.name)
         if shot != OFF:
             deviate = self._deviates(SHOT.name, number)
             electrons = (photon_counts if shot == EXACT else rounded_counts)(expected, deviate)
@@ -142,7 +143,8 @@ class Readout:
     @cached_property
     def full_well_e(self) -> float | None:
         """Return the electrons that an element holds; None where the converter ends first, or saturation is off."""
-        well_e, camera = self.block.rig.detector.full_well_e, self.block.rig.camera
+        well_e = self.block.rig.detector.full_well_e
+        camera = self.block.rig.camera
         end_e = (camera.full_scale_dn + 1 - camera.dark_dn) * camera.electrons_per_dn + 8 * self.read_noise_e
         return well_e if self._variant(SATURATION.name) != OFF and well_e < end_e else None
 

@@ -78,7 +78,8 @@ def expected_light(scene: RasterScene, block: SweepBlock, chosen: Mapping[Any, s
     """
     choice = Choice.of(chosen)
     steps = [views.flat() for views in _views(block, choice, scene.shape)]
-    moments, names = tuple(choice.doing("moments")), tuple(map(choice.variant, ("slit", "smear", "rotation")))
+    moments = tuple(choice.doing("moments"))
+    names = tuple(map(choice.variant, ("slit", "smear", "rotation")))
     light = _sampler(block.rig, block.sweep, block.wavelength_nm.tobytes(), moments, names).scan_pass(
         scene,
         steps,
@@ -117,11 +118,10 @@ def _views(block: SweepBlock, choice: Choice, shape: tuple[int, int]) -> Iterato
         position = shifted_position(position, shift, block.rig.camera)
     ifov = block.rig.camera.ifov_rad
     size = shape if block.sweep.along == "y" else shape[::-1]
-    displacements = list(choice.doing("displaced"))
     for step in range(position.shape[1]):
         views = _tangents(position[:, step, None], block.slopes, exact=choice.variant("rotation") != OFF)
         along, scan = views.along / ifov, views.scan / ifov
-        for displacement, variant in displacements:
+        for displacement, variant in choice.doing("displaced"):
             beside = displacement.displaced(block, along, scan, variant)
             along, scan = along + beside[0], scan + beside[1]
         yield replace(views, along=along + (size[0] - 1) / 2, scan=scan + (size[1] - 1) / 2)
@@ -140,7 +140,8 @@ def _tangents(position: Floats, slopes: Floats, *, exact: bool) -> RayViews:
 def _sampler(
     rig: Rig, sweep: Sweep, wavelengths: bytes, blurs: tuple[tuple[Any, str], ...], names: tuple[str, ...]
 ) -> SceneSampler:
-    wavelength, normal = np.frombuffer(wavelengths), middle_normal(sweep, rig.camera)
+    wavelength = np.frombuffer(wavelengths)
+    normal = middle_normal(sweep, rig.camera)
     moments = [blur.moments(rig, wavelength, variant, normal) for blur, variant in blurs]
     slit, smear, rotation = names
     whole = line_positions(replace(sweep, lines=max(sweep.lines, 1)), rig.camera)

@@ -159,8 +159,7 @@ class Rig:
     def distances_m(self) -> tuple[float, float] | None:
         """Return nearest and farthest part of the scene [m]; None for a scene without a distance."""
         air = self.air
-        distance_m = air.distance_m
-        return None if distance_m is None else (air.nearest_m or distance_m, air.farthest_m or distance_m)
+        return None if air.distance_m is None else (air.nearest_m or air.distance_m, air.farthest_m or air.distance_m)
 
     def moment(self, seconds: float) -> datetime | None:
         """Return time of day so many seconds after the survey's start; None where it has none."""

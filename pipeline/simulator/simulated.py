@@ -159,7 +159,8 @@ def sweep_starts(
     taken: dict[LineCamera, tuple[int, int]] = {}
     loads = 0
     for place, sweep in enumerate(sweeps):
-        loads, exposed = loads_before.get(place, loads), exposing(camera, sweep)
+        loads = loads_before.get(place, loads)
+        exposed = exposing(camera, sweep)
         lines, count = taken.get(exposed, (0, 0))
         taken[exposed] = lines, count + 1
         starts[sweep.name] = after_s + (cost.line_seconds(taken) + loads * cost.reload_s)
@@ -253,6 +254,6 @@ def take_references(scene: RasterScene, rig: Rig, choice: Choice, sweep: Sweep) 
 
 def _binned(frame: Frame, binning: int) -> Frame:
     """Return a frame with summed samples, rounded as a mean of `REFERENCE_FRAMES` frames of whole numbers is."""
-    count, frames = len(frame) // binning, frame.astype(np.float64) * REFERENCE_FRAMES
-    frame = (np.floor(frames + 0.5) / REFERENCE_FRAMES).astype(np.float32)
+    count = len(frame) // binning
+    frame = (np.floor(frame.astype(np.float64) * REFERENCE_FRAMES + 0.5) / REFERENCE_FRAMES).astype(np.float32)
     return np.asarray(frame[: count * binning].reshape(count, binning, -1).sum(axis=1))

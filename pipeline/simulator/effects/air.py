@@ -62,11 +62,10 @@ class Turbulence(Aim):
         if not sigma:
             return Bound(0.0, "no distance or no turbulence")
         farthest = sigma * math.sqrt(2 * math.log(max(probe.lines, 1) / RISK))
-        steep = np.hypot(*probe.slope)
         return Bound(
             probe.moved(farthest, farthest),
             f"{sigma:.2g} px (sd) per line, at most {farthest:.2g} px in {probe.lines} lines,"
-            f" on edges of at most {steep.max(initial=0.0):.3g} {UNITS[probe.unit]}/px",
+            f" on edges of at most {np.hypot(*probe.slope).max(initial=0.0):.3g} {UNITS[probe.unit]}/px",
         )
 
 
@@ -102,7 +101,8 @@ class Wind(Displacement):
 
         A plane wave A sin(2 pi (f t - way / gust) + phase), its way and its motion along the wind's heading.
         """
-        sway, air = sway_px(block.rig), block.rig.air
+        sway = sway_px(block.rig)
+        air = block.rig.air
         if sway == 0 or air.distance_m is None:
             return np.zeros_like(along_px), np.zeros_like(scan_px)
         phase, heading = survey_stream(block.seed, self.name).uniform(0, 2 * math.pi, 2)
@@ -141,16 +141,18 @@ class Parallax(Displacement):
     cost_ns = MappingProxyType({"exact": 0.2})
 
     def displaced(self, block: SweepBlock, along_px: Floats, scan_px: Floats, variant: str) -> tuple[Floats, Floats]:
-        air, sweep = block.rig.air, block.sweep
+        air = block.rig.air
+        sweep = block.sweep
         if air.distance_m is None:
             return np.zeros_like(along_px), np.zeros_like(scan_px)
-        row, size = (scan_px, block.shape[0]) if sweep.along == "x" else (along_px, block.shape[0])
-        fraction = air.lever_m * (closeness(air, row / max((size - 1) / 2, 0.5)) - 1 / air.distance_m)
+        row = scan_px if sweep.along == "x" else along_px
+        fraction = air.lever_m * (closeness(air, row / max((block.shape[0] - 1) / 2, 0.5)) - 1 / air.distance_m)
         return fraction * (along_px - sweep.swath_px), fraction * (scan_px - block.scan_px[:, None])
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by the slope times the greatest displacement: at a line's ends, at the nearest or farthest surface."""
-        air, fraction = rig.air, 0.0  # greatest displacement a px of distance from the line's centre
+        air = rig.air
+        fraction = 0.0  # greatest displacement a px of distance from the line's centre
         if air.distance_m is not None:
             fraction = air.lever_m * float(np.abs(closeness(air, np.array([-1.0, 1.0])) - 1 / air.distance_m).max())
         if fraction == 0 or not probe.sweeps:
@@ -211,7 +213,6 @@ def format_reach(ends: tuple[float, float]) -> str:
 TURBULENCE, WIND, PARALLAX = Turbulence(), Wind(), Parallax()
 
 
-RANGE = "range"
 # Rows: wavelength [nm], coefficient of [4]; straight between, 0 outside. About 5 nm fine at oxygen A, 10 nm elsewhere.
 WATER = np.array([
     (570.0, 0.0), (593.0, 0.075), (610.0, 0.0), (667.6, 0.0), (690.0, 0.016), (710.0, 0.0125), (718.0, 1.8),
@@ -240,7 +241,7 @@ class Absorption(Gain):
     """
 
     name = "absorption"
-    cost_ns = MappingProxyType({RANGE: 2.7})  # of a scene with relief
+    cost_ns = MappingProxyType({"range": 2.7})  # of a scene with relief
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by level times the fraction that gases take."""
@@ -253,10 +254,10 @@ class Absorption(Gain):
         return Bound(probe.scaled(fraction), f"oxygen and water vapour take at most {most} over {format_reach(reach)}")
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
-        reach, nm = reach_m(rig), np.asarray(probe.wavelength_nm, np.float64)
+        reach = reach_m(rig)
         if reach is None:
-            return GainRange.between(1.0, 1.0, len(nm))
-        passed = transmission(np.array(reach), rig, nm)
+            return GainRange.between(1.0, 1.0, len(probe.wavelength_nm))
+        passed = transmission(np.array(reach), rig, probe.wavelength_nm)
         return GainRange.of(passed, uneven=float(passed.max(initial=0.0) - passed.min(initial=1.0)))
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
@@ -264,12 +265,12 @@ class Absorption(Gain):
 
         Every sample's is read off a table over the logarithm of the distance, by straight lines.
         """
-        rig, reach = block.rig, reach_m(block.rig)
+        reach = reach_m(block.rig)
         if reach is None:
             return np.ones((1, 1, 1), np.float32)
         if reach[0] == reach[1]:
-            return transmission(np.array(reach[:1]), rig, block.wavelength_nm)[:, None].astype(np.float32)
-        table = transmission(np.geomspace(*reach, _KNOTS), rig, block.wavelength_nm).astype(np.float32)
+            return transmission(np.array(reach[:1]), block.rig, block.wavelength_nm)[:, None].astype(np.float32)
+        table = transmission(np.geomspace(*reach, _KNOTS), block.rig, block.wavelength_nm).astype(np.float32)
         place = np.log(sample_distances(block) / reach[0]) / np.log(reach[1] / reach[0]) * (_KNOTS - 1)
         low = np.clip(place.astype(np.int64), 0, _KNOTS - 2)
         gain: Radiance = table[low]
@@ -285,10 +286,10 @@ def transmission(metres: Floats, rig: Rig, wavelength_nm: Floats) -> Floats:
     sigma = rig.optics.fwhm_nm / np.sqrt(8 * np.log(2))
     weight = np.exp(-(_QUADRATURE**2) / 2)
     fine = wavelength_nm[:, None] + sigma * _QUADRATURE  # (band, node)
-    mass = metres[:, None, None] / AIR_MASS_M
     water_cm = metres[:, None, None] * rig.air.vapour_g_per_m3 * 1e-4  # as liquid: 1 g/m^2 is 1e-4 cm
     water, oxygen = (np.interp(fine, table[:, 0], table[:, 1], left=0.0, right=0.0) for table in (WATER, OXYGEN))
-    x, y = water * water_cm, oxygen * mass
+    x = water * water_cm
+    y = oxygen * (metres[:, None, None] / AIR_MASS_M)
     passed = np.exp(-0.2385 * x / (1 + 20.07 * x) ** 0.45)  # [4] Eq. 2-8
     passed *= np.exp(-1.41 * y / (1 + 118.3 * y) ** 0.45)  # [4] Eq. 2-11
     return np.asarray((passed * (weight / weight.sum())).sum(axis=-1))
@@ -303,7 +304,7 @@ class PathRadiance(LightChange):
     """
 
     name = "path-radiance"
-    cost_ns = MappingProxyType({RANGE: 3.1})  # of a scene with relief
+    cost_ns = MappingProxyType({"range": 3.1})  # of a scene with relief
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by the fraction that is lost times the greatest difference of signal and H."""
@@ -315,9 +316,8 @@ class PathRadiance(LightChange):
         if probe.white_e is not None:
             horizon = rig.air.airlight_fraction * probe.white_e * np.maximum(DRIFT.gain_range(probe, rig).greatest, 1.0)
             contrast = np.maximum(probe.level, horizon / (probe.unit_least_dn * rig.camera.electrons_per_dn))
-        worst = float((contrast * lost).max(initial=0.0))
-        most = f"at most {lost.max(initial=0.0):.2%} of the light"
-        return Bound(worst, f"air takes {most} and adds its own, over {format_reach(reach)}")
+        why = f"air takes at most {lost.max(initial=0.0):.2%} of the light and adds its own, over {format_reach(reach)}"
+        return Bound(float((contrast * lost).max(initial=0.0)), why)
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
         """Return what passes between the nearest and the farthest sample, and the greatest light that air adds. [e-]
@@ -325,10 +325,10 @@ class PathRadiance(LightChange):
         Added light is the airlight's fraction of the white reference's, where that is known, times what the daylight
         grows by.
         """
-        reach, nm = reach_m(rig), np.asarray(probe.wavelength_nm, np.float64)
+        reach = reach_m(rig)
         if reach is None:
-            return GainRange.between(1.0, 1.0, len(nm))
-        passed = np.exp(-np.array(reach)[:, None] * extinction_per_m(rig.air, nm))
+            return GainRange.between(1.0, 1.0, len(probe.wavelength_nm))
+        passed = np.exp(-np.array(reach)[:, None] * extinction_per_m(rig.air, probe.wavelength_nm))
         alone = GainRange.of(passed, uneven=float(passed.max(initial=0.0) - passed.min(initial=1.0)))
         if probe.white_e is None:
             return alone
@@ -343,7 +343,8 @@ class PathRadiance(LightChange):
         lost = -np.expm1(-(extinction_per_m(block.rig.air, block.wavelength_nm) * metres).astype(np.float32))
         light *= 1 - lost
         if block.white_e is not None:
-            sky, still = block.rig.sky, block.rig.air.airlight_fraction * np.asarray(block.white_e, np.float64)
+            sky = block.rig.sky
+            still = block.rig.air.airlight_fraction * np.asarray(block.white_e, np.float64)
             if sky.started is not None:
                 still = still * relative_daylight(sky, block.wavelength_nm, block.time_s)
             horizon = np.atleast_2d(still)[:, None].astype(np.float32)  # of endless air, (line or 1, 1, band)
@@ -358,8 +359,7 @@ def extinction_per_m(air: Air, wavelength_nm: Floats) -> Floats:
     by Angstrom's exponent: 1.14 [4], below 7.4 km Kruse's 0.585 V^(1/3) [5]. Above 336 km no aerosol is left. Valid
     from 400 to 1000 nm beside the lines of gases, and down to some 0.5 km of visibility.
     """
-    molecules = rayleigh_per_m(np.array([VISIBLE_NM]))[0]
-    aerosol = max(KOSCHMIEDER / air.visibility_km * 1e-3 - molecules, 0.0)
+    aerosol = max(KOSCHMIEDER / air.visibility_km * 1e-3 - rayleigh_per_m(np.array([VISIBLE_NM]))[0], 0.0)
     exponent = min(ANGSTROM, KRUSE * air.visibility_km ** (1 / 3))
     return np.asarray(aerosol * (wavelength_nm / VISIBLE_NM) ** -exponent + rayleigh_per_m(wavelength_nm))
 

@@ -17,7 +17,6 @@ from pipeline.simulator.optics.kernel_fit import Floats, Moments
 from pipeline.simulator.optics.rays import extreme_normals, pupil_contrast, spread_of_rays, spread_of_waves
 from pipeline.simulator.rig_model import Rig
 
-AIRY = "airy"
 MOST_BLUR_PX = 256  # diameter of a disc that is simulated
 FIRST_NM, LAST_NM = 400.0, 1000.0  # of the spectrograph
 _ALONE: Floats = np.ones(1)
@@ -39,11 +38,11 @@ def blurred_bound(
         return Bound(value, f"{cause}: none")
     band = int(np.argmax(change))
     nearest = np.sqrt(variance[int(np.argmax(fraction)), :, band])
-    nm, detail = probe.wavelength_nm[band], probe.curvature[:, band].max()
     return Bound(
         value,
-        f"{cause}: {nearest[0]:.2g} px (sd) along the line, {nearest[1]:.2g} px along the scan at {nm:.0f} nm,"
-        f" on detail of at most {detail:.3g} {UNITS[probe.unit]}/px^2",
+        f"{cause}: {nearest[0]:.2g} px (sd) along the line, {nearest[1]:.2g} px along the scan"
+        f" at {probe.wavelength_nm[band]:.0f} nm, on detail of at most {probe.curvature[:, band].max():.3g}"
+        f" {UNITS[probe.unit]}/px^2",
     )
 
 
@@ -62,7 +61,7 @@ class Diffraction(Blur):
 
     name = "diffraction"
     # Each kernel costs: of the pattern's core, of its tails, of the bands' own widths.
-    cost_ns = MappingProxyType({AIRY: 6.5})
+    cost_ns = MappingProxyType({"airy": 6.5})
 
     def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
         none = np.zeros((2, len(wavelength_nm)))
@@ -86,8 +85,10 @@ def airy_gaussians() -> tuple[Floats, Floats]:
     The least squares fit to the pupil's transfer is within 0.004 of it up to 0.6 of its cut-off. For bounds, not for
     light.
     """
-    size, u = np.geomspace(0.1, 160.0, 24), np.concatenate([np.geomspace(1e-3, 0.02, 30), np.linspace(0.03, 1.5, 150)])
-    weight, passed = 1 / (1 + (u / 0.5) ** 4), np.exp(-2 * (np.pi * np.outer(u, size)) ** 2)
+    size = np.geomspace(0.1, 160.0, 24)
+    u = np.concatenate([np.geomspace(1e-3, 0.02, 30), np.linspace(0.03, 1.5, 150)])
+    weight = 1 / (1 + (u / 0.5) ** 4)
+    passed = np.exp(-2 * (np.pi * np.outer(u, size)) ** 2)
     system = np.concatenate([passed * weight[:, None], np.full((1, len(size)), 1e3)])
     fraction = scipy.optimize.nnls(system, np.append(pupil_contrast(u) * weight, 1e3))[0]
     held = fraction > 0

@@ -134,7 +134,8 @@ def _series_quantile(mean: Floats, z: Floats) -> Floats:
     [1] Giles, "Algorithm 955: approximation of the inverse Poisson cumulative distribution function", ACM Trans. Math.
     Softw. 42, 2016. doi:10.1145/2699466
     """
-    root, square = np.sqrt(mean), z * z
+    root = np.sqrt(mean)
+    square = z * z
     x = mean + root * z
     x += 1 / 3 + square / 6
     x -= z * (1 / 36 + square / 72) / root
@@ -217,8 +218,7 @@ def dark_electrons(rig: Rig) -> float:
     """Return the expected dark electrons of one exposure in a sound element; 0 in an ideal sensor. [e-]"""
     if rig.detector.noiseless:
         return 0.0
-    seconds = rig.camera.exposure_ms * 1e-3
-    return rig.detector.dark_e_per_s * seconds * warmth(rig.detector.temperature_deg_c)
+    return rig.detector.dark_e_per_s * (rig.camera.exposure_ms * 1e-3) * warmth(rig.detector.temperature_deg_c)
 
 
 @dataclass(frozen=True)
@@ -248,8 +248,7 @@ def dead_elements(rig: Rig, bands: int) -> Mask:
 
 def hot_electrons(rig: Rig, bands: int) -> Radiance:
     """Return the electrons that hot elements add in one exposure, (sample, band) of the whole camera [e-]."""
-    detector = rig.detector
-    mask = _mask(detector.unit, "hot", rig.camera.samples, bands, fraction=detector.hot_fraction)
+    mask = _mask(rig.detector.unit, "hot", rig.camera.samples, bands, fraction=rig.detector.hot_fraction)
     return mask * np.float32(most_hot_electrons(rig))
 
 
@@ -315,12 +314,12 @@ class Shot(Effect):
             worst = max(chip_variation(0.0), chip_variation(read))
             # for one sample: 2 TV <= sqrt(divergence), which sums with samples.
             apart = 2 * worst / np.sqrt(CHIP_SAMPLES) * np.sqrt(probe.binning)
-            why = (
+            return Bound(
+                in_unit(apart, total, probe, rig),
                 f"{CHIP_SAMPLES:.0e} numbers have a total variation of at most {worst:.2g} from exact ones"
                 f" (limit {MOST_VARIATION:.2g}); exact below {least_expected(read):.3g} e-, without read noise"
-                f" {least_expected(0.0):.3g} e-"
+                f" {least_expected(0.0):.3g} e-",
             )
-            return Bound(in_unit(apart, total, probe, rig), why)
         why = f"{total:.3g} e- of noise at {brightest:.3g} e-, {read:.3g} e- without"
         return Bound(in_unit(separable(total, read), total, probe, rig), why)
 

@@ -41,18 +41,17 @@ class Drift(Gain):
         if rig.sky.started is None:
             return Bound(0.0, "the survey has no time of day")
         seconds = probe.seconds + rig.camera.frame_ms * 1e-3  # to the end of the last line
-        light = relative_daylight(rig.sky, probe.wavelength_nm, knots_within(rig.sky, seconds))
-        worst = np.abs(light - 1).max(axis=0)
+        worst = np.abs(relative_daylight(rig.sky, probe.wavelength_nm, knots_within(rig.sky, seconds)) - 1).max(axis=0)
         low, high = sun_elevation_deg(rig.sky, np.array([0.0, seconds]))
         duration = f"{seconds / 3600:.1f} h" if seconds >= 3600 else f"{seconds:.0f} s"
         course = f"with the sun from {low:.1f} to {high:.1f} deg in {duration}"
         return Bound(probe.scaled(worst), f"light changes by at most {100 * worst.max(initial=0.0):.3g} % {course}")
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
-        nm = np.asarray(probe.wavelength_nm, np.float64)
         if rig.sky.started is None:
-            return GainRange.between(1.0, 1.0, len(nm))
-        light = relative_daylight(rig.sky, nm, knots_within(rig.sky, probe.seconds + rig.camera.frame_ms * 1e-3))
+            return GainRange.between(1.0, 1.0, len(probe.wavelength_nm))
+        knots = knots_within(rig.sky, probe.seconds + rig.camera.frame_ms * 1e-3)
+        light = relative_daylight(rig.sky, probe.wavelength_nm, knots)
         return GainRange.of(light, uneven=float(np.ptp(light, axis=1).max(initial=0.0)))
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
@@ -78,10 +77,11 @@ class Cloud(Gain):
         sky = rig.sky
         if sky.cloud_fraction == 0:
             return Bound(0.0, "the sky is clear")
-        why = (
-            f"a shadow takes {sky.cloud_fraction:.0%} of the light and moves {sky.cloud_px_per_s:g} px/s over the scene"
+        return Bound(
+            probe.scaled(sky.cloud_fraction),
+            f"a shadow takes {sky.cloud_fraction:.0%} of the light and moves {sky.cloud_px_per_s:g} px/s"
+            " over the scene",
         )
-        return Bound(probe.scaled(sky.cloud_fraction), why)
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
         fraction = rig.sky.cloud_fraction
@@ -89,12 +89,14 @@ class Cloud(Gain):
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
         """Return 1 less the cloud's shadow at each sample's place and time, (line, sample, 1)."""
-        sky, sweep = block.rig.sky, block.sweep
+        sky = block.rig.sky
+        sweep = block.sweep
         along, scan = points_of_scan(sweep.swath_px, block.rig.camera, block.scan_px[:, None], block.slopes)
         x, y = (along, scan) if sweep.along == "x" else (scan, along)
         turn, place = survey_stream(block.seed, self.name).random(2)
-        heading, place = 2 * math.pi * float(turn), 2 * sky.cloud_size_px * float(place)
-        way = x * math.cos(heading) + y * math.sin(heading) - sky.cloud_px_per_s * block.time_s[:, None] + place
+        heading = 2 * math.pi * float(turn)
+        start = 2 * sky.cloud_size_px * float(place)
+        way = x * math.cos(heading) + y * math.sin(heading) - sky.cloud_px_per_s * block.time_s[:, None] + start
         return (1 - sky.cloud_fraction * shadow(way, sky.cloud_size_px))[..., None].astype(np.float32)
 
 
@@ -221,15 +223,14 @@ class Vignetting(Gain):
         return GainRange.between(least, greatest, len(probe.wavelength_nm))
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
-        sweep, camera = block.sweep, block.rig.camera
-        fraction = np.sqrt(1 - ahead(sweep.swath_px, sweep.held_px()[block.numbers], camera)).mean(axis=1)
+        sweep = block.sweep
+        fraction = np.sqrt(1 - ahead(sweep.swath_px, sweep.held_px()[block.numbers], block.rig.camera)).mean(axis=1)
         return np.asarray(fraction.astype(np.float32)[:, None, None])
 
 
 def sweep_ends(probe: Probe, camera: LineCamera) -> Floats:
     """Return o_z at the first and the last position of every sweep, (2 sweep,); it never turns round in between."""
-    ends = [sweep.held_px().ravel()[[0, -1]] for sweep in probe.sweeps]
-    found = [ahead(sweep.swath_px, px, camera) for sweep, px in zip(probe.sweeps, ends, strict=True)]
+    found = [ahead(sweep.swath_px, sweep.held_px().ravel()[[0, -1]], camera) for sweep in probe.sweeps]
     return np.concatenate(found) if found else np.zeros(0)
 
 
@@ -259,22 +260,21 @@ class Polarisation(Gain):
         most = np.abs(_factors_between(incidence, rig, probe.wavelength_nm) - 1).max(axis=0)
         least_deg, most_deg = np.degrees(incidence.min()), np.degrees(incidence.max())
         where = f" at {probe.wavelength_nm[int(most.argmax())]:.0f} nm" if most.size else ""
-        why = (
+        return Bound(
+            probe.scaled(most),
             f"{rig.mirror.coating} changes {100 * most.max(initial=0.0):.2g} % of the light{where}, at incidences from"
-            f" {least_deg:.1f} to {most_deg:.1f} deg"
+            f" {least_deg:.1f} to {most_deg:.1f} deg",
         )
-        return Bound(probe.scaled(most), why)
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
-        incidence, nm = _incidence(sweep_ends(probe, rig.camera)), np.asarray(probe.wavelength_nm, np.float64)
+        incidence = _incidence(sweep_ends(probe, rig.camera))
         if not incidence.size:
-            return GainRange.between(1.0, 1.0, len(nm))
-        return GainRange.of(_factors_between(incidence, rig, nm), uneven=0.0)
+            return GainRange.between(1.0, 1.0, len(probe.wavelength_nm))
+        return GainRange.of(_factors_between(incidence, rig, probe.wavelength_nm), uneven=0.0)
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
-        probes = ahead(block.sweep.swath_px, block.scan_px, block.rig.camera)
-        factor: Radiance = _factors(_incidence(probes), block.rig, block.wavelength_nm).astype(np.float32)
-        return factor[:, None, :]
+        incidence = _incidence(ahead(block.sweep.swath_px, block.scan_px, block.rig.camera))
+        return _factors(incidence, block.rig, block.wavelength_nm)[:, None].astype(np.float32)
 
 
 def _incidence(view_directions: Floats) -> Floats:
@@ -307,7 +307,8 @@ def reflectance(coating: Coating, wavelength_nm: Floats, incidence_rad: Floats) 
 
 def fresnel(index: NDArray[np.complex128], incidence_rad: Floats) -> tuple[Floats, Floats]:
     """Return what a surface in air reflects of light polarised across (s) and within (p) the plane of incidence [1]."""
-    cosine, square = np.cos(incidence_rad), index**2
+    cosine = np.cos(incidence_rad)
+    square = index**2
     beyond = np.sqrt(square - np.sin(incidence_rad) ** 2)  # index times the cosine behind the surface
     across = np.abs((cosine - beyond) / (cosine + beyond)) ** 2
     within = np.abs((square * cosine - beyond) / (square * cosine + beyond)) ** 2

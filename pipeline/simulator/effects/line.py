@@ -31,10 +31,10 @@ def beside_plan_px(probe: Probe, rig: Rig) -> tuple[float, float]:
 
     Along the line and the scan. Lines lie turned by where the mirror looks: the farther from the middle, the more.
     """
-    mirror, lines = rig.mirror, max(probe.lines, 1)
+    mirror = rig.mirror
     drift = mirror.drift_px_per_min / 60 * (probe.seconds + rig.camera.frame_ms * 1e-3)
     jitter = _RAY_PER_TILT * mirror.repeatability_urad * 1e-6 / rig.camera.ifov_rad
-    drawn = (jitter + turbulence_px(rig)) * math.sqrt(2 * math.log(lines / 1e-3))
+    drawn = (jitter + turbulence_px(rig)) * math.sqrt(2 * math.log(max(probe.lines, 1) / 1e-3))
     way = drift + mirror.hysteresis_px + drawn
     return way, way + greatest_lag_px(rig, probe.sweeps)
 
@@ -91,7 +91,8 @@ class SlitBox(Effect):
         The error of a variant depends on the light within the footprint, which no derivative of the image gives.
         Rounding in tables adds a little, and so do lines that turn more where the mirror looks beside its plan.
         """
-        width, bands = rig.camera.slit_px, len(probe.wavelength_nm)
+        width = rig.camera.slit_px
+        bands = len(probe.wavelength_nm)
         instead = "its middle ray" if variant == OFF else f"{variant.replace('x', ' x ')} boxes that are not turned"
         why = f"{instead} in place of a footprint {width:.2g} px wide and 1 px long"
         box = np.array([[1.0], [width**2]]) / 12

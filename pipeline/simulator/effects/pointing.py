@@ -45,11 +45,8 @@ def end_gains(sweep: Sweep, camera: LineCamera) -> Floats:
 
 def at_line_ends(sweeps: Iterable[Sweep], camera: LineCamera, along: float, scan: float) -> tuple[float, float]:
     """Bound how far any point of any line moves, for centres that move by up to so much. [px]"""
-    most = np.eye(2)
-    for sweep in sweeps:
-        if sweep.lines:
-            most = np.maximum(most, np.abs(end_gains(sweep, camera)).max(axis=(0, 1)))
-    moved = most @ [along, scan]
+    gains = [np.abs(end_gains(sweep, camera)).max(axis=(0, 1)) for sweep in sweeps if sweep.lines]
+    moved = np.max([np.eye(2), *gains], axis=0) @ [along, scan]
     return float(moved[0]), float(moved[1])
 
 
@@ -76,7 +73,8 @@ class Jitter(Aim):
         exceeds m with probability exp(-m^2 / 2), so any of n lines' does with at most n exp(-m^2 / 2). The limit m is
         sqrt(2 ln(n / 1e-3)), 5.4 for 2560 lines.
         """
-        sigma, lines = _sigma_px(rig), probe.lines
+        sigma = _sigma_px(rig)
+        lines = probe.lines
         if sigma == 0 or lines == 0:
             return Bound(0.0, "the mirror comes back to the same tilt")
         worst = np.zeros(2)
@@ -106,8 +104,7 @@ def tilt_to_scene(normals: Floats) -> Floats:
     view[..., 2] += 1
     turned = -2 * (tilts[..., 2:] * normals[..., None, :] + normals[..., None, 2:] * tilts)
     ahead = view[..., None, :1]
-    tangents = (turned[..., 1:] - turned[..., :1] * view[..., None, 1:] / ahead) / ahead
-    return np.swapaxes(tangents, -1, -2)
+    return np.swapaxes((turned[..., 1:] - turned[..., :1] * view[..., None, 1:] / ahead) / ahead, -1, -2)
 
 
 def _sigma_px(rig: Rig) -> float:
@@ -213,7 +210,6 @@ class PointingErrors(Aim):
 JITTER, HYSTERESIS, THERMAL_DRIFT = Jitter(), Hysteresis(), ThermalDrift()
 
 
-EXACT = "exact"
 MOST_PARTS = 8  # of an exposure; a jump of h px within a part goes unseen as a blur of at most h^2/32 px^2
 _RAMP = 64  # steps of a line that are as good as a ramp
 
@@ -228,10 +224,11 @@ class Staircase(Aim):
     """
 
     name = "staircase"
-    cost_ns = MappingProxyType({EXACT: 27.0})  # five positions a line instead of one
+    cost_ns = MappingProxyType({"exact": 27.0})  # five positions a line instead of one
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
-        positions, held = block.rig.mirror.positions_per_line, block.sweep.positions
+        positions = block.rig.mirror.positions_per_line
+        held = block.sweep.positions
         scan = beside_plan(positions, held, block.numbers, _parts(positions, held))
         return np.stack([np.zeros_like(scan), scan], axis=-1)
 
@@ -258,9 +255,8 @@ def beside_plan(positions: float, step: int, numbers: NDArray[np.int64], parts: 
     edges = np.arange(step * parts + 1) / parts
     place = positions * (numbers[:, None] * float(step) + edges)
     whole = np.floor(place)
-    part = place - whole
     # Integral of frac: one half for each whole, and half the square of the rest.
-    area = np.diff(whole, axis=1) / 2 + np.diff(part**2, axis=1) / 2
+    area = np.diff(whole, axis=1) / 2 + np.diff((place - whole) ** 2, axis=1) / 2
     lag = area * parts / positions
     middle = np.tile((np.arange(parts) + 0.5) / parts - 0.5, step)
     return middle + (0.5 - lag) / positions
@@ -285,7 +281,7 @@ class Lag(Aim):
     """
 
     name = "lag"
-    cost_ns = MappingProxyType({EXACT: 0.15})
+    cost_ns = MappingProxyType({"exact": 0.15})
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
         scan = transient(block.rig, block.sweep, block.numbers)
@@ -293,10 +289,9 @@ class Lag(Aim):
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         worst = greatest_lag_px(rig, probe.sweeps)
-        moved = at_line_ends(probe.sweeps, rig.camera, 0.0, worst)
         pace = f"{rig.camera.frame_ms:g} ms a line, {rig.mirror.natural_hz:g} Hz"
-        why = f"while the mirror gets up to speed ({pace})"
-        return Bound(probe.moved(*moved), f"lines lie up to {worst:.2g} px off {why}")
+        why = f"lines lie up to {worst:.2g} px off while the mirror gets up to speed ({pace})"
+        return Bound(probe.moved(*at_line_ends(probe.sweeps, rig.camera, 0.0, worst)), why)
 
 
 def greatest_lag_px(rig: Rig, sweeps: Iterable[Sweep]) -> float:
@@ -309,9 +304,9 @@ def greatest_lag_px(rig: Rig, sweeps: Iterable[Sweep]) -> float:
 
 def transient(rig: Rig, sweep: Sweep, numbers: NDArray[np.int64]) -> Floats:
     """Return the mean shift along the scan over each held position of some lines, (line, step). [px]"""
-    camera, mirror = rig.camera, rig.mirror
+    mirror = rig.mirror
     pace = 2 * math.pi * mirror.natural_hz * 1e-3  # [1/ms]
-    period, held = pace * camera.frame_ms, pace * camera.exposure_ms / sweep.positions
+    period, held = pace * rig.camera.frame_ms, pace * rig.camera.exposure_ms / sweep.positions
     start = _at_start(mirror, sweep, period, held)
     impulse, rise = responses(numbers[:, None] * period + np.arange(sweep.positions) * held, mirror.damping)
     place: Floats = start[0] * (1 - rise) + start[1] * impulse
@@ -329,13 +324,15 @@ def responses(time: Floats, damping: float) -> tuple[Floats, Floats]:
     """
     with np.errstate(under="ignore"):
         if damping <= 1:
-            turn, decay = math.sqrt((1 - damping) * (1 + damping)) * time, np.exp(-damping * time)
+            turn = math.sqrt((1 - damping) * (1 + damping)) * time
+            decay = np.exp(-damping * time)
             impulse = decay * time * np.sinc(turn / np.pi)
             rest = decay * np.cos(turn) + damping * impulse
         else:
             root = math.sqrt((damping - 1) * (damping + 1))
             slow = 1 / (damping + root)  # zeta - sqrt(zeta^2 - 1) without its cancellation
-            apart, decay = 2 * root * time, np.exp(-slow * time)
+            apart = 2 * root * time
+            decay = np.exp(-slow * time)
             impulse = decay * time * np.where(apart > 0, -np.expm1(-apart) / np.where(apart > 0, apart, 1.0), 1.0)
             rest = decay + slow * impulse
     return impulse, 1 - rest
@@ -354,10 +351,8 @@ def _at_start(mirror: MirrorMotion, sweep: Sweep, period: float, held: float) ->
     g, h = (one.item() for one in responses(np.array([every]), damping))
     size = h * h + 2 * damping * h * g + g * g
     steady = np.array([(h + 2 * damping * g) * place + g * rate, -g * place + h * rate]) / size
-    flown = float(sweep.lines * sweep.step)
-    settled = np.array([2 * math.pi * mirror.natural_hz * mirror.settled_s])
-    g, h = (one.item() for one in responses(settled, damping))
-    return steady + flown * np.array([1 - h, -g])
+    g, h = (one.item() for one in responses(np.array([2 * math.pi * mirror.natural_hz * mirror.settled_s]), damping))
+    return steady + float(sweep.lines * sweep.step) * np.array([1 - h, -g])  # the way flown back
 
 
 def _steps(mirror: MirrorMotion, sweep: Sweep, period: float, held: float) -> tuple[Floats, float, float]:
@@ -369,8 +364,7 @@ def _steps(mirror: MirrorMotion, sweep: Sweep, period: float, held: float) -> tu
     if wanted < 1:
         return np.array([period / wanted]), sweep.step / wanted, period / wanted
     count = min(max(round(wanted), 1), _RAMP)
-    exposed = held * sweep.positions
-    return period - np.arange(count) * exposed / count, sweep.step / count, period
+    return period - np.arange(count) * (held * sweep.positions) / count, sweep.step / count, period
 
 
 STAIRCASE, LAG = Staircase(), Lag()

@@ -117,8 +117,7 @@ def unit_at(signal: NDArray[np.floating], rig: Rig, unit: Unit, binning: int = 1
 
 def fixed_variance(rig: Rig) -> float:
     """Return the variance of read noise and quantisation, which light does not change. [e-^2]"""
-    camera = rig.camera
-    return camera.read_noise_e**2 + camera.electrons_per_dn**2 / 12
+    return rig.camera.read_noise_e**2 + rig.camera.electrons_per_dn**2 / 12
 
 
 @dataclass(frozen=True)
@@ -173,7 +172,8 @@ def steepest_difference(spectra: NDArray[Real], wavelength_nm: Floats) -> NDArra
     """Return |I'| of spectra (..., band) towards the steeper neighbour of each band; 0 for a run of one band. [1/nm]"""
     gaps = np.diff(wavelength_nm)
     rate = np.divide(1, gaps, out=np.zeros_like(gaps), where=gaps > 0).astype(spectra.dtype)
-    steep, out = np.abs(np.diff(spectra, axis=-1)) * rate, np.zeros_like(spectra)
+    steep = np.abs(np.diff(spectra, axis=-1)) * rate
+    out = np.zeros_like(spectra)
     out[..., :-1] = steep
     np.maximum(out[..., 1:], steep, out=out[..., 1:])
     return out

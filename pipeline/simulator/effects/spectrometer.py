@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 from types import MappingProxyType
-from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -22,14 +21,6 @@ FWHM2_PER_VARIANCE = 8 * math.log(2)
 BANDS_AT_ONCE = 32  # bands that one product makes
 LEAST_WEIGHT = 1e-8
 REACH_SD = 6.0  # the kernel's weight beyond it is below 1e-8
-
-
-class BandGroup(NamedTuple):
-    """Bands ``made`` are the bands ``taken`` times ``weights`` (taken, made)."""
-
-    made: slice
-    taken: slice
-    weights: Radiance
 
 
 @dataclass(frozen=True)
@@ -56,9 +47,9 @@ class Response(LightChange):
             return Bound(0.0, f"the scene's bands are {rig.optics.fwhm_nm:g} nm wide already, or wider")
         near = np.abs(wavelength[:, None] - wavelength) <= REACH_SD * np.sqrt(variance)[:, None]
         steep = np.where(near, probe.spectral_slope, 0).max(axis=1) * np.sqrt(variance)
-        sd, known = float(np.sqrt(variance.max())), probe.fwhm_nm
+        known = probe.fwhm_nm
         why = f"bands widen from {0.0 if known is None else np.nanmin(known):.3g} to {rig.optics.fwhm_nm:.3g} nm"
-        return Bound(float(steep.max()), f"{why}: {sd:.2g} nm sd more")
+        return Bound(float(steep.max()), f"{why}: {np.sqrt(variance.max()):.2g} nm sd more")
 
     def change(self, light: Radiance, block: SweepBlock, variant: str) -> Radiance:
         return widen_bands(light, block.wavelength_nm, block.fwhm_nm, block.rig.optics.fwhm_nm)
@@ -91,8 +82,13 @@ def missing_variance(wanted_nm: float, fwhm_nm: Floats | None, bands: int) -> Fl
 
 
 @lru_cache(maxsize=8)
-def _band_groups(wavelength_nm: tuple[float, ...], variance: tuple[float, ...]) -> tuple[BandGroup, ...]:
-    """Cut the kernel into products of few bands each: most of its weights are 0."""
+def _band_groups(
+    wavelength_nm: tuple[float, ...], variance: tuple[float, ...]
+) -> tuple[tuple[slice, slice, Radiance], ...]:
+    """Cut the kernel into products of few bands each: most of its weights are 0.
+
+    A product is the bands made, the bands that they are made of, and their weights (taken, made).
+    """
     kernel = np.zeros((len(wavelength_nm), len(wavelength_nm)))
     for run in rising_runs(np.array(wavelength_nm)):
         kernel[run, run] = _heat_kernel(np.array(wavelength_nm[run]), np.array(variance[run]))
@@ -101,7 +97,7 @@ def _band_groups(wavelength_nm: tuple[float, ...], variance: tuple[float, ...]) 
         made = slice(start, min(start + BANDS_AT_ONCE, len(kernel)))
         used = np.flatnonzero((np.abs(kernel[made]) > LEAST_WEIGHT).any(axis=0))
         taken = slice(int(used[0]), int(used[-1]) + 1)
-        groups.append(BandGroup(made, taken, np.ascontiguousarray(kernel[made, taken].T, dtype=np.float32)))
+        groups.append((made, taken, np.ascontiguousarray(kernel[made, taken].T, dtype=np.float32)))
     return tuple(groups)
 
 
@@ -155,8 +151,8 @@ class Smile(LightChange):
 
     def change(self, light: Radiance, block: SweepBlock, variant: str) -> Radiance:
         """Return light (line, sample, band) [e-] at the wavelengths that each sample sees."""
-        camera, smile = block.rig.camera, block.rig.optics.smile_nm
-        first, weights = _tap_weights(tuple(map(float, block.wavelength_nm)), float(smile), camera.samples)
+        wavelength = tuple(map(float, block.wavelength_nm))
+        first, weights = _tap_weights(wavelength, float(block.rig.optics.smile_nm), block.rig.camera.samples)
         out = np.empty(light.shape, np.float32)
         compiled_loops.mix_neighbours(np.ascontiguousarray(light, np.float32), weights, first, out)
         return out
@@ -173,19 +169,18 @@ def wavelength_shift(samples: int, smile_nm: float) -> Floats:
 @lru_cache(maxsize=4)
 def _tap_weights(wavelength_nm: tuple[float, ...], smile_nm: float, samples: int) -> tuple[int, NDArray[np.float32]]:
     """Return the offset of the first tap and the weights of all, (tap, sample, band)."""
-    wavelength, shift = np.array(wavelength_nm), wavelength_shift(samples, smile_nm)
+    wavelength = np.array(wavelength_nm)
+    shift = wavelength_shift(samples, smile_nm)
     runs = [run for run in rising_runs(wavelength) if run.stop - run.start > 1]
     taps = [(run, off, weight) for run in runs for off, weight in _run_taps(wavelength[run], shift)]
-    first = min((int(off.min()) for _, off, _ in taps), default=0)
-    last = max((int(off.max()) for _, off, _ in taps), default=0)
-    first, last = min(first, 0), max(last, 0)
+    first = min([0, *(int(off.min()) for _, off, _ in taps)])
+    last = max([0, *(int(off.max()) for _, off, _ in taps)])
     weights = np.zeros((last - first + 1, samples, len(wavelength)))
     weights[-first] = 1
-    sample = np.arange(samples)[:, None]
     for run in runs:
         weights[-first, :, run] = 0
     for run, off, weight in taps:
-        weights[off - first, sample, np.arange(run.start, run.stop)] += weight
+        weights[off - first, np.arange(samples)[:, None], np.arange(run.start, run.stop)] += weight
     used = np.flatnonzero(weights.any(axis=(1, 2)))
     low, high = min(used[0], -first), max(used[-1], -first)
     return first + int(low), weights[low : high + 1].astype(np.float32)
@@ -276,9 +271,10 @@ class StrayLight(LightChange):
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound it by f (S - H): what is scattered to a sample is between the least and the greatest light."""
-        fraction, range_e = rig.optics.stray_fraction, max(probe.brightest_e - probe.darkest_e, 0.0)
+        fraction = rig.optics.stray_fraction
         if fraction == 0:
             return Bound(0.0, "no light is scattered")
+        range_e = max(probe.brightest_e - probe.darkest_e, 0.0)
         why = f"{fraction:.2g} times a line's light, signals up to {range_e:.3g} e- from others"
         return Bound(probe.added(fraction * range_e, rig.camera.electrons_per_dn), why)
 

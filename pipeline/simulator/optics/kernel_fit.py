@@ -60,7 +60,8 @@ def _rings(diameter: float) -> tuple[float, ...]:
     wanted = math.ceil(diameter / _PX_A_RING)
     rings = min(wanted, _MOST_RINGS)
     ends = np.array([3 * ring * (ring + 1) + 1 for ring in range(rings + 1)], np.float64)
-    middle, left = (ends[:-1] + ends[1:]) / 2 / ends[-1], 0.5 / ends[-1]
+    middle = (ends[:-1] + ends[1:]) / 2 / ends[-1]
+    left = 0.5 / ends[-1]
     if wanted > rings:
         left = max(left, 2 * (_SMOOTH / (rings + 0.5)) ** 2)
     return tuple(np.sqrt(np.maximum(middle - left, 0.0)).tolist())
@@ -100,9 +101,6 @@ class Kernels:
     variance: Floats
     level: NDArray[np.intp]
 
-    def some(self, which: list[int]) -> Kernels:
-        return Kernels(self.shift[:, which], self.variance[:, which], self.level[which])
-
 
 @lru_cache(maxsize=64)
 def _fit(packed: bytes, bands: int, box: tuple[float, float], held: int, disc: Axes) -> tuple[Kernels, Floats, Floats]:
@@ -118,21 +116,22 @@ def _fit(packed: bytes, bands: int, box: tuple[float, float], held: int, disc: A
     own *= disc_contrast(_ALONG, _SCAN, disc)
     own *= _STRICT
     judged = _some(order, _JUDGED)
-    wanted, tried = _wanted(moments[:, judged], own), []
+    wanted = _wanted(moments[:, judged], own)
+    tried: list[tuple[Kernels, float]] = []
     for kernels in _candidates(moments, place):
         tried.append((kernels, _error(_passed(kernels, own), wanted)))
         if tried[-1][1] <= NEGLIGIBLE:
             break
     enough = max(_ENOUGH * min(error for _, error in tried), NEGLIGIBLE)
     chosen = next(kernels for kernels, error in tried if error <= enough)
-    chosen = chosen.some(_needed(_passed(chosen, own), wanted, enough))
+    kept = _needed(_passed(chosen, own), wanted, enough)
+    chosen = Kernels(chosen.shift[:, kept], chosen.variance[:, kept], chosen.level[kept])
     passed = _passed(chosen, own)
     for count in _BASIS:
         fitted = _some(order, count)
         fractions = _fractions(passed, _wanted(moments[:, fitted], own))
         between = np.stack([np.interp(place, place[fitted], one) for one in np.eye(len(fitted))])
-        off = np.abs(passed @ (fractions @ between[:, judged]) - wanted)
-        if off.max() <= enough or count >= bands:
+        if np.abs(passed @ (fractions @ between[:, judged]) - wanted).max() <= enough or count >= bands:
             break
     return chosen, fractions, between
 
@@ -160,8 +159,7 @@ def _some(order: NDArray[np.intp], most: int) -> NDArray[np.intp]:
 def _candidates(moments: Floats, place: Floats) -> Iterator[Kernels]:
     waves = moments[4:]
     widest = waves[:, waves[0].argmax()]
-    core = _CORE * float(waves.min())
-    ladders = [_ladder(widest, core, ratio) for ratio in _RATIOS] if waves.any() else [[(0.0, 1)]]
+    ladders = [_ladder(widest, _CORE * float(waves.min()), ratio) for ratio in _RATIOS] if waves.any() else [[(0.0, 1)]]
     stretch = widest**2 / widest.min() ** 2 if waves.any() else np.ones(2)
     for count in _NODES:
         if waves.any() and count > _MOST_NODES:
@@ -171,7 +169,9 @@ def _candidates(moments: Floats, place: Floats) -> Iterator[Kernels]:
             for size, level in ladder:
                 few = count if size <= _SHIFTED_PX[0] else min(count, 2 if size <= _SHIFTED_PX[1] else 1)
                 nodes = _nodes(moments[:4], place, few)
-                wide = (size**2 * stretch)[:, None] - _LESS * _steps(nodes[:2]) ** 2
+                # Light between two nodes is wider than either: each is the narrower, the farther they are apart.
+                step = np.abs(np.diff(nodes[:2], axis=1)).max(axis=1, keepdims=True, initial=0.0)
+                wide = (size**2 * stretch)[:, None] - _LESS * step**2
                 variance = np.maximum(nodes[2:] + np.where(level == 1, wide, (size**2 * stretch)[:, None]), 0.0)
                 found.append((nodes[:2], variance, np.full(nodes.shape[1], level, np.intp)))
             shift, variance, level_of = (np.concatenate(parts, axis=-1) for parts in zip(*found, strict=True))
@@ -192,13 +192,6 @@ def _ladder(widest: Floats, core: float, ratio: float) -> list[tuple[float, int]
         sizes.append((level * _size_at(level), level))
         level *= 2
     return sizes
-
-
-def _steps(shift: Floats) -> Floats:
-    """Return the distance of neighbouring nodes, (2, 1): light between two of them is wider than either."""
-    if shift.shape[1] == 1:
-        return np.zeros((2, 1))
-    return np.asarray(np.abs(np.diff(shift, axis=1)).max(axis=1, keepdims=True))
 
 
 def _size_at(level: int) -> float:
@@ -249,9 +242,8 @@ def _fractions(passed: Transfer, wanted: Transfer) -> Floats:
 
     They are a least squares fit of what kernels and bands pass of waves.
     """
-    count, bands = passed.shape[1], wanted.shape[1]
-    system = np.concatenate([passed.real, passed.imag, np.full((1, count), _SUM)])
-    right = np.concatenate([wanted.real, wanted.imag, np.full((1, bands), _SUM)])
+    system = np.concatenate([passed.real, passed.imag, np.full((1, passed.shape[1]), _SUM)])
+    right = np.concatenate([wanted.real, wanted.imag, np.full((1, wanted.shape[1]), _SUM)])
     basis, triangle = np.linalg.qr(system)
     fractions: Floats = np.stack([scipy.optimize.nnls(triangle, one)[0] for one in (basis.T @ right).T], axis=1)
     fractions /= fractions.sum(axis=0)
@@ -311,11 +303,6 @@ class Footprint:
     def kernels(self) -> int:
         return int(self.shift.shape[1])
 
-    @property
-    def mixing(self) -> Floats:
-        """Return the weight of each kernel in each band, (kernel, band); of sum 1 in each."""
-        return self.fractions @ self.between
-
     def windows(self) -> list[tuple[int, NDArray[np.intp]]]:
         """Return the levels, and numbers of kernels that look at pixels of that level through one window."""
         found = []
@@ -339,7 +326,8 @@ class Footprint:
             return replace(some, shift=shift, variance=variance)
         variance = variance - THINNED * (level**2 - 1)
         variance[1] += (self.held**2 - 1) / 12
-        variance, box = np.maximum(variance, 0.0) / level**2, (self.box[0] / level, self.box[1] / level)
+        variance = np.maximum(variance, 0.0) / level**2
+        box = (self.box[0] / level, self.box[1] / level)
         disc = (self.disc[0] / level, self.disc[1] / level)
         return replace(some, box=box, parts=(1, 1), held=1, shift=shift / level, variance=variance, disc=disc)
 
@@ -361,10 +349,9 @@ def fold(box: tuple[float, float], parts: tuple[int, int], held: int, blurs: Mom
 PER_PX = 128  # rows of a table; between them weights are linear, right to 8e-6 of a kernel's curvature
 SCALE_STEP = 1 / 4096  # from one tabulated scale to the next; the nearest is taken
 _WORKED_OUT = 16  # every so many of them are worked out, those between are linear: right to 2e-6
-TAIL = (
-    5e-6  # fraction of a kernel's weight that may lie beyond its taps; what is left is scaled to sum 1. No tap beyond
-)
-# has more than that either: weights jump by so much where a tap comes in.
+# Fraction of a kernel's weight that may lie beyond its taps; what is left is scaled to sum 1. No tap beyond has more
+# than that either: weights jump by so much where a tap comes in.
+TAIL = 5e-6
 BETWEEN_ROWS = 1 / (4 * PER_PX**2)  # variance that a kernel gains between two rows at most: half of either [px^2]
 _SDS = 6.5  # of a Gaussian: nothing beyond
 
@@ -408,11 +395,6 @@ class TapTable(NamedTuple):
     rows: int  # of one scale
     per_px: int = PER_PX
     per_scale: float = 1 / SCALE_STEP
-
-    @property
-    def taps(self) -> int:
-        """Return the number of pixels along the axis that a position reads."""
-        return int(self.weight.shape[1])
 
     @staticmethod
     def of(

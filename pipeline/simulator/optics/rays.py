@@ -112,8 +112,7 @@ def extreme_normals(sweeps: Iterable[Sweep], camera: LineCamera) -> Floats:
     Both spreads are monotonic along a sweep, so the ends hold the extremes. In scene tangents n_x / n_z = 1 / (eta -
     sqrt(1 + xi^2 + eta^2)).
     """
-    taken = [sweep for sweep in sweeps if sweep.lines > 0]
-    ends = [(sweep.swath_px, scan) for sweep in taken for scan in sweep.held_px().ravel()[[0, -1]]]
+    ends = [(sweep.swath_px, scan) for sweep in sweeps if sweep.lines > 0 for scan in sweep.held_px().ravel()[[0, -1]]]
     tangents = np.array(ends, np.float64).reshape(-1, 2) * camera.ifov_rad
     return np.concatenate([REST_NORMAL[None], direction_to_normal(scene_to_direction(tangents))])
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,25 +25,19 @@ LEAST_BANDS = 16  # that are mixed by themselves: fewer cost as much
 TABULATED = 2e-5  # fraction of the light, by size, that a table of either axis misplaces at most, but for what follows
 
 
-class _BandProduct(NamedTuple):
-    """Bands that follow each other, the nodes that they lie between, and how these are mixed to them."""
-
-    bands: slice
-    nodes: slice
-    rows: Radiance  # as `compiled_loops.mixing_rows` has them
-
-
 @dataclass(frozen=True)
 class _Mixing:
     """From components through every kernel to bands: kernels are summed to nodes, of which each band is between two."""
 
     fractions: Radiance  # (node, kernel)
-    products: tuple[_BandProduct, ...]
+    # bands that follow each other, the nodes that they lie between, and rows as `compiled_loops.mixing_rows` has them
+    products: tuple[tuple[slice, slice, Radiance], ...]
 
     @staticmethod
     def of(fractions: Radiance, between: Floats, spectra: Radiance) -> _Mixing:
         """Return the mixing of spectra (component, band): bands between the same nodes are made at once."""
-        bands, cuts = spectra.shape[1], [0]
+        bands = spectra.shape[1]
+        cuts = [0]
         for cut in (np.flatnonzero(np.diff((between > 0).argmax(axis=0))) + 1).tolist():
             if min(cut - cuts[-1], bands - cut) >= LEAST_BANDS:
                 cuts.append(cut)
@@ -53,7 +46,7 @@ class _Mixing:
             found = np.flatnonzero(between[:, some].any(axis=1))
             nodes = slice(int(found[0]), int(found[-1]) + 1)
             mixing = (between[nodes, None, some] * spectra[:, some]).reshape(-1, some.stop - some.start)
-            products.append(_BandProduct(some, nodes, compiled_loops.mixing_rows(mixing.astype(np.float32))))
+            products.append((some, nodes, compiled_loops.mixing_rows(mixing.astype(np.float32))))
         return _Mixing(np.ascontiguousarray(fractions), tuple(products))
 
     def write(self, parts: Radiance, light: Radiance) -> None:
@@ -76,10 +69,10 @@ class SceneSampler:
         self._extremes = extremes
 
     @cached_property
-    def gatherers(self) -> list[tuple[int, NDArray[np.intp], Gatherer]]:
-        """Return what sums pixels of which level through which kernels."""
-        windows, whole = self.footprint.windows(), self.footprint
-        return [(level, some, Gatherer(whole.part(level, some), self._extremes)) for level, some in windows]
+    def tables(self) -> list[tuple[int, NDArray[np.intp], KernelTables]]:
+        """Return through which kernels pixels of which level are summed, and the tables of these."""
+        whole = self.footprint
+        return [(level, some, KernelTables(whole.part(level, some), self._extremes)) for level, some in whole.windows()]
 
     def scan_pass(
         self, scene: RasterScene, steps: Sequence[RayViews], *, along_y: bool, exposure_ratio: float
@@ -90,111 +83,90 @@ class SceneSampler:
         """
         spectra = scene.electrons * np.float32(exposure_ratio)
         levels = np.unique(self.footprint.level).tolist()
-        rasters = {level: np.ascontiguousarray(scene.raster.thinned(level), np.float32) for level in levels}
-        pixels = {level: ScenePixels(raster, along_y) for level, raster in rasters.items()}
-        sums = np.ones(self.footprint.kernels)
-        for _, some, gatherer in self.gatherers:
-            sums[some] = gatherer.parts
+        planes = {level: np.ascontiguousarray(scene.raster.thinned(level), np.float32) for level in levels}
+        kernels = self.footprint.kernels
+        sums = np.ones(kernels)
+        for _, some, tables in self.tables:
+            sums[some] = tables.parts
         fractions = (self.footprint.fractions / np.reshape(len(steps) * sums, (-1, 1))).T.astype(np.float32)
-        count, components, kernels = len(steps[0].along), spectra.shape[0], self.footprint.kernels
+        count = len(steps[0].along)
         light = np.empty((count, spectra.shape[-1]), np.float32)
         if spectra.ndim == 1:
             gains = ((fractions.T @ self.footprint.between) * spectra).astype(np.float32)
             light[:] = 0
-            self._gather(pixels, steps, light[None], np.zeros(kernels, np.intp), gains)
+            self._gather(planes, steps, light[None], np.zeros(kernels, np.intp), gains, along_y=along_y)
             return light
+        components = spectra.shape[0]
         gains = np.ones((kernels, components), np.float32)
         mixing = _Mixing.of(fractions, self.footprint.between, spectra)
         at_once = max(MOST_PARTS // (kernels * components), 1)
         for first in range(0, count, at_once):
             chunk = slice(first, min(first + at_once, count))
             parts = np.zeros((kernels, chunk.stop - first, components), np.float32)
-            self._gather(pixels, [views[chunk] for views in steps], parts, np.arange(kernels), gains)
+            some_steps = [views[chunk] for views in steps]
+            self._gather(planes, some_steps, parts, np.arange(kernels), gains, along_y=along_y)
             mixing.write(parts, light[chunk])
         return light
 
     def _gather(
         self,
-        pixels: dict[int, ScenePixels],
+        planes: dict[int, Radiance],
         steps: Sequence[RayViews],
         out: Radiance,
         numbers: NDArray[np.intp],
         gains: Radiance,
+        *,
+        along_y: bool,
     ) -> None:
+        """Add the components that samples see through every kernel to ``out`` (number, n, component).
+
+        They are sums over the parts, times ``gains`` (kernel, component). ``planes`` (y, x, component), by level, are
+        C-contiguous. ``numbers`` (kernel,) say where in ``out`` kernels belong.
+        """
         for views in steps:
-            for level, some, gatherer in self.gatherers:
-                gatherer.gather(pixels[level], views.thinned(level, THINNED_MARGIN), out, numbers[some], gains[some])
+            for level, some, one in self.tables:
+                pixels = planes[level]
+                rows, columns, components = pixels.shape
+                raster = compiled_loops.PixelTable(columns, rows, components, along_y)
+                seen = views.thinned(level, THINNED_MARGIN).table()
+                compiled_loops.gather_windows(
+                    pixels.reshape(-1), raster, seen, one.kernels, one.along, one.scan, numbers[some], gains[some], out
+                )
 
 
-@dataclass(frozen=True)
-class ScenePixels:
-    """A scene's planes (y, x, component), C-contiguous float32, and whether lines lie along y."""
-
-    planes: Radiance
-    along_y: bool
-
-
-class Gatherer:
-    """Gathers a scene's components through a footprint at views whose shape is within a range."""
+class KernelTables:
+    """A footprint's kernels and tables of their weights, for views whose shape is within a range."""
 
     def __init__(self, footprint: Footprint, views: RayViews) -> None:
-        """Take ``views`` that include the extremes of all that will be gathered."""
-        self.footprint = footprint
-        width, (across, along) = footprint.box, footprint.parts
-        variance = footprint.variance + disc_points(footprint.disc)[1][:, None]
-        scale, off = place_parts(footprint, views)
+        """Take ``views`` that include the extremes of all that will be sampled."""
+        self.kernels = kernels_of(footprint)
+        self.parts = int(self.kernels.place.shape[1])  # boxes that each kernel is summed over
+        table = views.table()
+        beside = np.zeros((2, len(views.along)), np.float32)  # all look at the middle of a pixel
+        scale = np.empty((footprint.kernels, 2, len(views.along)))  # of one part
+        off = np.empty((footprint.kernels, 2, self.parts, len(views.along)), np.float32)  # of parts from it [px]
+        for kernel in range(footprint.kernels):
+            compiled_loops.place_parts(table, beside, kernel, self.kernels, scale[kernel], off[kernel])
         reach = np.abs(off).max(axis=(0, 2, 3), initial=0.0) + 0.02
         ranges = [(float(one.min()), float(one.max())) for one in scale.swapaxes(0, 1)]
         tail = TAIL / float(footprint.fractions.max(initial=0.0) or 1.0)
-        self._kernels = kernels_of(footprint)
-        self._along = TapTable.of(width[1] / along, variance[0], 1, ranges[0], float(reach[0]), tail)
-        self._scan = TapTable.of(width[0] / across, variance[1], footprint.held, ranges[1], float(reach[1]), tail)
-
-    @property
-    def parts(self) -> int:
-        """Return the number of boxes that each kernel is summed over."""
-        return int(self._kernels.place.shape[1])
-
-    def gather(
-        self, pixels: ScenePixels, views: RayViews, out: Radiance, numbers: NDArray[np.intp], gains: Radiance
-    ) -> None:
-        """Add the components that some samples see through every kernel to ``out`` (number, n, component).
-
-        They are sums over the parts, times ``gains`` (kernel, component). ``views`` are in px of the pixels,
-        ``numbers`` (kernel,) where in ``out`` kernels belong. A sample's light does not depend on the others.
-        """
-        (rows, columns, components), along_y = pixels.planes.shape, pixels.along_y
-        raster = compiled_loops.PixelTable(columns, rows, components, along_y)
-        table = views.table()
-        compiled_loops.gather_windows(
-            pixels.planes.reshape(-1), raster, table, self._kernels, self._along, self._scan, numbers, gains, out
-        )
+        slit, pixel = footprint.box
+        across, along = footprint.parts
+        variance = footprint.variance + disc_points(footprint.disc)[1][:, None]
+        self.along = TapTable.of(pixel / along, variance[0], 1, ranges[0], float(reach[0]), tail)
+        self.scan = TapTable.of(slit / across, variance[1], footprint.held, ranges[1], float(reach[1]), tail)
 
 
 def kernels_of(footprint: Footprint) -> compiled_loops.PartedKernels:
     """Return a footprint's kernels and the parts of its box as the compiled loops take them."""
-    (across, along), (slit, pixel) = footprint.parts, footprint.box
+    across, along = footprint.parts
+    slit, pixel = footprint.box
     variance = footprint.variance + np.array([[pixel / along], [slit / across]]) ** 2 / 12
     points, about = disc_points(footprint.disc)
     variance = np.array(variance + about[:, None], order="C")
     between = slit**2 / 12 * (1 - 1 / across**2) + float((points[1] ** 2).mean())
-    shift = np.array(footprint.shift, np.float32, order="C")
     turn = ((np.arange(across) + 0.5) / across - 0.5) * slit
     run = ((np.arange(along) + 0.5) / along - 0.5) * pixel
     boxes = np.stack([np.repeat(turn, along), np.tile(run, across)])  # across and along, in px of the camera
     parts = (boxes[:, :, None] + points[::-1, None]).reshape(2, -1).astype(np.float32)  # boxes at a disc's points
-    return compiled_loops.PartedKernels(shift, variance, between, parts)
-
-
-def place_parts(footprint: Footprint, views: RayViews) -> tuple[Floats, Radiance]:
-    """Return the places of the parts of kernels for samples in the middle of a pixel, along and scan.
-
-    Returns scales of one part (kernel, 2, n), and how far beside the pixel parts lie, (kernel, 2, part, n) [px].
-    """
-    kernels, count = kernels_of(footprint), len(views.along)
-    scale = np.empty((footprint.kernels, 2, count))
-    off = np.empty((footprint.kernels, 2, kernels.place.shape[1], count), np.float32)
-    table, beside = views.table(), np.zeros((2, count), np.float32)
-    for kernel in range(footprint.kernels):
-        compiled_loops.place_parts(table, beside, kernel, kernels, scale[kernel], off[kernel])
-    return scale, off
+    return compiled_loops.PartedKernels(np.array(footprint.shift, np.float32, order="C"), variance, between, parts)

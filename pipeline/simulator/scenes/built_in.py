@@ -49,13 +49,15 @@ SCOUTING_LAW = "scouting@1"
 SCOUTING_NAMES = ("scouting", SCOUTING_LAW)
 SCOUTED = ("maize", "sugar_beet", "wheat_a")
 USUAL_INTEREST = (0.02, 0.10)  # share of the scene in patches, least and greatest
-RAGGED, RAGGED_PX = 0.08, 45.0  # noise that patches follow: over the side of the scene, and how wide its bumps are
+RAGGED = 0.08  # noise that patches follow, over the side of the scene
+RAGGED_PX = 45.0  # how wide the bumps of that noise are
 KIND_PX = 60.0
 EDGE = 120.0  # by which a patch ends within about 3 px
 KINDS = {"weeds": 0.5, "bare": 0.0, "poor": 0.0, "lodged": 0.3}  # what a kind has ahead of the others
 EARLY = -11.0  # days by which row crops are behind the farm's: they close by the middle of June
 DENSE = 350.0  # weeds of a patch per 1000 px
-EVEN, POOR = 0.4, 4.2  # vigour's sd over the farm's, and by how much it is less in poor growth
+EVEN = 0.4  # vigour's sd over the farm's
+POOR = 4.2  # by how much vigour is less in poor growth
 LODGED = 0.5  # of a field in the end, at the middle of a patch's edge
 BUILT_IN_NAMES = (*FARM_NAMES, *SCOUTING_NAMES)
 LAWS = dict.fromkeys(FARM_NAMES, FARM_LAW) | dict.fromkeys(SCOUTING_NAMES, SCOUTING_LAW)  # by the names of scenes
@@ -118,7 +120,8 @@ def scouting_plan(seed: int, shape: tuple[int, int] = FARM_SHAPE, *, day: int, h
 
 def patches_of(plan: FarmPlan, interest: float | None = None) -> dict[str, Field]:
     """Cover of the scene by each kind of patch, (y, x) each, 0 to 1; the same on all days."""
-    shape, rng = plan.shape, stream(plan.seed, "patches")
+    shape = plan.shape
+    rng = stream(plan.seed, "patches")
     drawn = rng.uniform(*USUAL_INTEREST)
     side = float(np.sqrt(shape[0] * shape[1]))
     y, x = np.ogrid[: shape[0], : shape[1]]
@@ -154,10 +157,12 @@ def _weeds_within(plan: FarmPlan, cover: Field) -> dict[str, Points]:
     """Return weeds that grow densely under a cover: y, x and radius (n, 3) by spectrum."""
     if not cover.any():
         return {}
-    middle, there = (np.array(cover.shape) - 1) / 2, np.argwhere(cover)
+    middle = (np.array(cover.shape) - 1) / 2
+    there = np.argwhere(cover)
     (top, left), (bottom, right) = there.min(axis=0) - middle - 1, there.max(axis=0) - middle + 1
     box = Parcel(np.array([[top, left], [top, right], [bottom, right], [bottom, left]]))
-    rng, kept = stream(plan.seed, "weeds of patches"), {}
+    rng = stream(plan.seed, "weeds of patches")
+    kept: dict[str, Points] = {}
     for name, plants in field_weeds(rng, replace(plan.fields[0], parcel=box, weeds=DENSE), plan.day).items():
         y, x = np.clip(np.rint(plants[:, :2] + middle), 0, np.array(cover.shape) - 1).astype(int).T
         kept[name] = plants[rng.uniform(size=len(plants)) < cover[y, x]]

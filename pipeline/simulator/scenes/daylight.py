@@ -43,10 +43,10 @@ def relative_daylight(sky: Sky, wavelength_nm: Floats, seconds: Floats) -> Float
 
     Raises SettingsError: the sky has no time of day.
     """
-    start, place = _started(sky), (sky.latitude_deg, sky.longitude_deg)
-    first = _irradiance(*place, np.array([start]), wavelength_nm)
+    start = _started(sky)
+    first = _irradiance(sky, np.array([start]), wavelength_nm)
     faintest = _at_bands(_light_of(np.array([FAINTEST_DEG]), np.array([start])), wavelength_nm)
-    return _irradiance(*place, start + np.asarray(seconds), wavelength_nm) / np.maximum(first, faintest)
+    return _irradiance(sky, start + np.asarray(seconds), wavelength_nm) / np.maximum(first, faintest)
 
 
 def knots_within(sky: Sky, seconds: float) -> Floats:
@@ -62,7 +62,7 @@ def _started(sky: Sky) -> float:
     return sky.started.timestamp()
 
 
-def _irradiance(latitude: float, longitude: float, moments: Floats, wavelength_nm: Floats) -> Floats:
+def _irradiance(sky: Sky, moments: Floats, wavelength_nm: Floats) -> Floats:
     """Return light at moments [s since 1970], (time, band) [W/m^2/nm], linear between knots."""
     knot = moments / KNOT_S
     low = np.floor(knot)
@@ -70,7 +70,8 @@ def _irradiance(latitude: float, longitude: float, moments: Floats, wavelength_n
     fraction = (knot - low)[:, None]
     light = np.empty((len(moments), len(wavelength_nm)))
     for hour in np.unique(hours):
-        here, table = hours == hour, _table(latitude, longitude, int(hour))
+        here = hours == hour
+        table = _table(sky.latitude_deg, sky.longitude_deg, int(hour))
         before, after = table[row[here]], table[row[here] + 1]
         light[here] = _at_bands(before + fraction[here] * (after - before), wavelength_nm)
     return light

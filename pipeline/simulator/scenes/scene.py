@@ -151,7 +151,9 @@ class RasterScene:
         self._check_bands("white_reference", self.white_reference)
 
     def _checked_light(self) -> SceneRadiance:
-        light, bands, components = self.light(), len(self.wavelength_nm), self.raster.shape[2]
+        light = self.light()
+        bands = len(self.wavelength_nm)
+        components = self.raster.shape[2]
         wanted = {(components, bands)} | ({(bands,)} if bands == components else set())
         if light.electrons.shape not in wanted:
             raise ShapeError(
@@ -263,7 +265,8 @@ def raster_from_values(
             " no data, or give the values in a larger unit"
         )
     planes = np.ascontiguousarray(values, dtype=np.float32)
-    bright, missing = _bright_value(planes, name), _missing_pixels(planes)
+    bright = _bright_value(planes, name)
+    missing = _missing_pixels(planes)
     if missing is not None and labels is not None:
         labels = np.where(missing, np.uint8(UNLABELLED), labels)
     planes, filled = _fill_by_median(planes)

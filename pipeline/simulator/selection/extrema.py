@@ -41,12 +41,13 @@ def find_extrema(scene: RasterScene, camera: LineCamera, sweeps: Sequence[Sweep]
     spectra = scene.electrons * np.float32(camera.exposure_ms / DEFAULT_EXPOSURE_MS)
     optics = PixelOptics.of(camera, sweeps[0].binning, tuple(sorted({sweep.along == "y" for sweep in sweeps})))
     tile = max(8, math.ceil(math.sqrt(scene.shape[0] * scene.shape[1] / _TILES)))
-    ranking, own_planes = Ranking(), spectra.ndim == 1
+    ranking = Ranking()
+    own_planes = spectra.ndim == 1
     if own_planes and len(spectra) > CHOSEN_BANDS:
         bands = telling_bands(scene, spectra, optics, tile, ranking)
         kinds = np.searchsorted([one.stop for one in band_groups(len(spectra))], bands, side="right").tolist()
     else:
-        bands = chosen_bands(spectra)
+        bands = np.arange(len(spectra)) if own_planes else chosen_bands(spectra)
         kinds = list(range(len(bands)))
     some = spectra[bands] if own_planes else np.ascontiguousarray(spectra[:, bands])
     high = min(_TILES_HIGH, max(1, _STRIP_PX // (tile * scene.shape[1]))) * tile
@@ -59,8 +60,6 @@ def find_extrema(scene: RasterScene, camera: LineCamera, sweeps: Sequence[Sweep]
 
 def chosen_bands(spectra: Radiance) -> NDArray[np.intp]:
     """Return the brightest band and those least like the ones chosen, at most ``CHOSEN_BANDS``."""
-    if spectra.ndim == 1:
-        return np.arange(len(spectra))
     chosen = [int(spectra.max(axis=0).argmax())]
     for _ in range(min(CHOSEN_BANDS, spectra.shape[1]) - 1):
         gap = np.min([np.abs(spectra - spectra[:, [one]]).max(axis=0) for one in chosen], axis=0)
@@ -76,8 +75,9 @@ def telling_bands(
     They are the steepest from pixel to pixel, and from one mean of some pixels to the next. Places where light differs
     most from band to band are offered as they are found.
     """
-    groups, nm = band_groups(len(spectra)), np.asarray(scene.wavelength_nm, np.float64)
-    starts, worst = [one.start for one in groups], np.full((6, len(spectra)), -np.inf)
+    groups = band_groups(len(spectra))
+    starts = [one.start for one in groups]
+    worst = np.full((6, len(spectra)), -np.inf)
     for first, planes in _row_blocks(scene, tile, 1):
         light = planes * spectra
         inner = light[1:-1, 1:-1]
@@ -90,7 +90,7 @@ def telling_bands(
         steps += [np.abs(means[:, 1:] - means[:, :-1]) / optics.noise(means[:, 1:])]
         for number, values in enumerate((inner, -inner, *steps)):
             worst[number] = np.maximum(worst[number], values.max(axis=(0, 1), initial=-np.inf))
-        in_groups = np.maximum.reduceat(steepest_difference(inner, nm) / noise, starts, axis=2)
+        in_groups = np.maximum.reduceat(steepest_difference(inner, scene.wavelength_nm) / noise, starts, axis=2)
         ranking.offer(_SPECTRAL, in_groups, first, tile, range(len(groups)))
     return np.unique([one.start + values[one].argmax() for one in groups for values in worst])
 
@@ -102,21 +102,15 @@ def _row_blocks(scene: RasterScene, high: int, halo: int) -> Iterator[tuple[int,
     for first in range(0, rows, high):
         down = np.arange(first - halo, min(first + high, rows) + halo).clip(0, rows - 1)
         planes = scene.planes[down[:, None], across]
-        _check_finite(scene, planes, first - halo)
+        with np.errstate(invalid="ignore", over="ignore"):  # infinity less infinity: found below
+            total = planes.sum(dtype=np.float64)
+        if not np.isfinite(total):
+            row, column, component = np.argwhere(~np.isfinite(planes))[0].tolist()
+            raise SceneError(
+                f"scene {scene.name} is not finite at row {down[row]}, column {across[column]}, component {component};"
+                " fill such pixels before it is simulated"
+            )
         yield first, planes
-
-
-def _check_finite(scene: RasterScene, planes: Radiance, first: int) -> None:
-    with np.errstate(invalid="ignore", over="ignore"):  # infinity less infinity: found below
-        if np.isfinite(planes.sum(dtype=np.float64)):
-            return
-    row, column, component = np.argwhere(~np.isfinite(planes))[0].tolist()
-    row = min(max(first + row, 0), scene.shape[0] - 1)
-    column = min(max(column - (planes.shape[1] - scene.shape[1]) // 2, 0), scene.shape[1] - 1)
-    raise SceneError(
-        f"scene {scene.name} is not finite at row {row}, column {column}, component {component};"
-        " fill such pixels before it is simulated"
-    )
 
 
 class Ranking:

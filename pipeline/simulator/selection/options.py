@@ -97,7 +97,8 @@ def _options_of(probe: Probe, rig: Rig, effects: Sequence[Effect]) -> list[Menu]
         for effect, there in zip(effects, present, strict=True)
     ]
     blurs = [effect for effect, there in zip(effects, present, strict=True) if there and hasattr(effect, "moments")]
-    blurred, menus = math.fsum(blur.bound(probe, rig).value for blur in blurs), []
+    blurred = math.fsum(blur.bound(probe, rig).value for blur in blurs)
+    menus: list[Menu] = []
     for place, effect in enumerate(effects):
         arriving = probe
         if hasattr(effect, "change") or hasattr(effect, "gain"):
@@ -106,8 +107,9 @@ def _options_of(probe: Probe, rig: Rig, effects: Sequence[Effect]) -> list[Menu]
             arriving = light_read(probe, rig, [one for one in ranges if one is not None])
         growth = 1.0
         if acts_on_light(effect):
-            beside = ranges[:place] + ranges[place + 1 :]
-            greatest = [np.maximum(one.greatest, 1.0) for one in beside if one is not None]
+            greatest = [
+                np.maximum(one.greatest, 1.0) for one in ranges[:place] + ranges[place + 1 :] if one is not None
+            ]
             others = float(np.prod(greatest, axis=0).max(initial=1.0)) if greatest else 1.0
             growth = error_growth(probe, rig, ranges[place], others)
         menus.append(_menu(effect, arriving, rig, present[place], growth))
@@ -132,8 +134,8 @@ def _menu(effect: Effect, probe: Probe, rig: Rig, present: bool, gain: float) ->
 
 
 def _is_present(effect: Effect, probe: Probe, rig: Rig) -> bool:
-    ones, both = np.ones(len(probe.wavelength_nm)), np.ones((2, len(probe.wavelength_nm)))
-    bright = max(probe.brightest_e, rig.camera.full_scale_e)
+    ones = np.ones(len(probe.wavelength_nm))
+    both = np.ones((2, len(probe.wavelength_nm)))
     loud = replace(
         probe,
         level=ones,
@@ -141,11 +143,10 @@ def _is_present(effect: Effect, probe: Probe, rig: Rig) -> bool:
         slope=both,
         curvature=both,
         spectral_slope=ones,
-        brightest_e=bright,
+        brightest_e=max(probe.brightest_e, rig.camera.full_scale_e),
         slit_errors={},
     )
-    greatest = max(effect.bound(loud, rig, OFF).value, effect.bound(probe, rig, OFF).value)
-    return effect.name in ALWAYS_ON or greatest > 0
+    return effect.name in ALWAYS_ON or max(effect.bound(one, rig, OFF).value for one in (loud, probe)) > 0
 
 
 def error_growth(probe: Probe, rig: Rig, own: GainRange | None, others: float) -> float:
@@ -170,32 +171,32 @@ def unit_ratio(probe: Probe, rig: Rig, gain: float) -> float:
     return max(math.sqrt((light + fixed) / (gain * light + fixed)) for light in ends)
 
 
-def light_after(probe: Probe, rig: Rig, gains: Iterable[GainRange], blurred: float = 0.0) -> Probe:
+def light_after(probe: Probe, rig: Rig, gains: Sequence[GainRange], blurred: float = 0.0) -> Probe:
     """Return the probe of light after some gains, their greatest factors taken off: those are for `error_growth`.
 
     Light that the factor does not reduce counts by the unit of the darkest. ``blurred`` is the most that blurs changed
     in any band before. Differences over wavelength grow by what two bands may be changed apart. Blurs do so, and added
     light, and factors that are not the same in all bands.
     """
-    bands = len(probe.wavelength_nm)
-    least, kept, added, uneven = np.ones(bands), 1.0, np.zeros(bands), 0.0
+    least = np.ones(len(probe.wavelength_nm))
+    kept = 1.0
     for one in gains:
         least = least * np.minimum(one.least, 1.0)
         if np.ptp(one.least) > 0 or np.ptp(one.greatest) > 0:
             kept *= float((one.least / np.maximum(one.greatest, 1.0)).min())
-        uneven += one.uneven
-        added = added + one.added_e
+    added = sum((one.added_e for one in gains), np.zeros(len(probe.wavelength_nm)))
     ratio = unit_ratio(probe, rig, float(least.min(initial=1.0)))
     unit_e = probe.unit_least_dn * rig.camera.electrons_per_dn / ratio
     apart = float((2 * blurred + ratio * (1 - kept) * probe.level + added / unit_e).max(initial=0.0))
-    gaps, follows = rising_gaps(probe.wavelength_nm), probe.unit == "sigma" and not rig.detector.noiseless
+    gaps = rising_gaps(probe.wavelength_nm)
+    follows = probe.unit == "sigma" and not rig.detector.noiseless
     own_e = np.sqrt((np.maximum(added, 0.0) + fixed_variance(rig)) / probe.binning) if follows else unit_e
     return replace(
         probe,
         level=probe.level + added / own_e,
         spectral_slope=probe.spectral_slope + (apart / gaps.min() if gaps.size else 0.0),
         brightest_e=probe.brightest_e + float(added.max(initial=0.0)),
-        darkest_e=probe.darkest_e * max(1 - uneven, 0.0),
+        darkest_e=probe.darkest_e * max(1 - sum(one.uneven for one in gains), 0.0),
         unit_least_dn=probe.unit_least_dn / ratio,
     )
 

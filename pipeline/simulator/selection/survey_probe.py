@@ -6,7 +6,7 @@ The whole scene is probed, whatever part of it the sweeps see: blurs and shifts 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -33,7 +33,8 @@ MOST_SAMPLES = 6_000
 FINEST_SAMPLES = 1000  # at which variants of the slit are compared with the finest
 _LEAST_PLACES = 24  # where samples are summed, however many samples that takes
 _BESIDE = 2  # samples to either side of a place; of sums, one
-_PROBE, _CLOSE = (2, 1), (3, 1)  # boxes of the probe, and boxes that find where variants differ
+_PROBE = (2, 1)  # boxes of the probe
+_CLOSE = (3, 1)  # boxes that find where variants differ
 _ROUNDING = 2e-6  # of the level: less is rounding of float32
 _NEAR, _FAR = 0.25, 0.5  # px by which the footprint is shifted
 _STILL: Way = (0.0, 0.0)
@@ -42,15 +43,14 @@ _OPTICS = (DIFFRACTION, DEFOCUS, ABERRATION, KEYSTONE)
 _BY_BAND = ("level", "span", "slope", "curvature", "spectral_slope")  # of a probe
 
 
-def _shifts() -> list[tuple[Way, Way]]:
-    found = [(_STILL, _STILL)]
-    for axis in (0, 1):
-        both = [(way, 0.0) if axis == 0 else (0.0, way) for way in (-_FAR, -_NEAR, _NEAR, _FAR)]
-        found += [(way, _STILL) for way in both] + [(_STILL, way) for way in (both[0], both[3])]
-    return found
-
-
-SHIFTS = tuple(_shifts())  # of rays and of points; derivatives are differences between them
+_WAYS = (-_FAR, -_NEAR, _NEAR, _FAR)
+SHIFTS = (  # of rays and of points; derivatives are differences between them
+    (_STILL, _STILL),
+    *(((way, 0.0), _STILL) for way in _WAYS),
+    *((_STILL, (way, 0.0)) for way in (-_FAR, _FAR)),
+    *(((0.0, way), _STILL) for way in _WAYS),
+    *((_STILL, (0.0, way)) for way in (-_FAR, _FAR)),
+)
 
 
 def probe_survey(
@@ -85,7 +85,9 @@ def probe_scene(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Uni
     """
     taken = _taken(sweeps)
     rig = rig.taking(taken[0])
-    binning, camera, bands = taken[0].binning, rig.camera, len(scene.wavelength_nm)
+    binning = taken[0].binning
+    camera = rig.camera
+    bands = len(scene.wavelength_nm)
     room = max(min(MOST_VALUES // bands, MOST_SAMPLES), 64)
     most = room // (len(_patch_steps(binning)) * binning * len({sweep.along for sweep in taken}))
     places = find_extrema(scene, camera, taken, max(most, 1 if binning == 1 else _LEAST_PLACES))
@@ -118,17 +120,9 @@ class SampleViews:
     binning: int = 1
 
     def chosen(self, which: NDArray[np.intp]) -> SampleViews:
-        some: dict[str, Any] = {name: getattr(self, name)[which] for name in _OF_A_VIEW}
-        return replace(self, **some)
-
-
-_OF_A_VIEW = tuple(one.name for one in fields(SampleViews) if one.name != "binning")
-
-
-def joined(parts: list[SampleViews]) -> SampleViews:
-    """Return views of one binning, one part after the other."""
-    every: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in parts]) for name in _OF_A_VIEW}
-    return replace(parts[0], **every)
+        return SampleViews(
+            self.swath_px[which], self.scan_px[which], self.slope[which], self.along_y[which], self.binning
+        )
 
 
 def views_of_places(places: Floats, scene: RasterScene, camera: LineCamera, sweeps: tuple[Sweep, ...]) -> SampleViews:
@@ -137,7 +131,8 @@ def views_of_places(places: Floats, scene: RasterScene, camera: LineCamera, swee
     A place that no sweep sees is looked at as if the lines and samples of the least oblique continued. All sweeps sum
     as many samples to a number.
     """
-    centred, found = places - (np.array(scene.shape) - 1) / 2, []
+    centred = places - (np.array(scene.shape) - 1) / 2
+    found: list[SampleViews] = []
     for along_y in (False, True):
         numbers = [number for number, sweep in enumerate(sweeps) if (sweep.along == "y") == along_y]
         oblique = sorted(numbers, key=lambda number: -abs(sweeps[number].swath_px))
@@ -148,7 +143,13 @@ def views_of_places(places: Floats, scene: RasterScene, camera: LineCamera, swee
             line, sample = scene_to_sweep(_held(sweeps[number]), camera, along[which], scan[which]).T
             reached = np.isfinite(line) & np.isfinite(sample)
             found.append(_patches(sweeps[number], camera, line[reached], sample[reached]))
-    return joined(found)
+    return SampleViews(
+        np.concatenate([one.swath_px for one in found]),
+        np.concatenate([one.scan_px for one in found]),
+        np.concatenate([one.slope for one in found]),
+        np.concatenate([one.along_y for one in found]),
+        found[0].binning,
+    )
 
 
 def _first_seeing(
@@ -157,7 +158,8 @@ def _first_seeing(
     """Return the number of the first sweep that sees each place, or nearly; -1 where none does."""
     found = np.full(len(along), -1)
     for number in order:
-        left, held = np.flatnonzero(found < 0), _held(sweeps[number])
+        left = np.flatnonzero(found < 0)
+        held = _held(sweeps[number])
         line, sample = scene_to_sweep(held, camera, along[left], scan[left]).T
         with np.errstate(invalid="ignore"):  # places that no ray reaches
             inside = (line > -2) & (line < held.lines + 1) & (sample > -3) & (sample < camera.samples + 2)
@@ -176,7 +178,8 @@ def _patch_steps(binning: int) -> Floats:
 
 
 def _patches(sweep: Sweep, camera: LineCamera, line: Floats, sample: Floats) -> SampleViews:
-    patch, binning = _patch_steps(sweep.binning), sweep.binning
+    binning = sweep.binning
+    patch = _patch_steps(binning)
     middle = sample if binning == 1 else (sample + 0.5) / binning - 0.5
     sums = np.rint(middle[:, None] + patch[:, 0]).ravel()
     numbers = (sums[:, None] * binning + np.arange(binning)).ravel()
@@ -202,7 +205,8 @@ def light_seen(
 
     Rays are turned and points moved (along, scan) by shifts [px].
     """
-    exposure_ratio, ifov = camera.exposure_ms / DEFAULT_EXPOSURE_MS, camera.ifov_rad
+    exposure_ratio = camera.exposure_ms / DEFAULT_EXPOSURE_MS
+    ifov = camera.ifov_rad
     light = np.empty((len(shifts), len(views.slope), len(scene.wavelength_nm)), np.float32)
     for along_y in (False, True):
         which = np.flatnonzero(views.along_y == along_y)
@@ -228,7 +232,8 @@ def _rays_of(views: SampleViews, camera: LineCamera, turned: Way) -> RayViews:
 
 def sum_up_light(seen: Radiance, scene: RasterScene, rig: Rig, sweeps: tuple[Sweep, ...], unit: Unit) -> Probe:
     """Return the maxima of light (shift, view, band) [e-]."""
-    camera, binning, nm = rig.camera, sweeps[0].binning, np.asarray(scene.wavelength_nm, np.float64)
+    camera = rig.camera
+    binning = sweeps[0].binning
     least, most = seen.min(axis=0), seen.max(axis=0)
     darkest, brightest = stored_mean(least, binning), stored_mean(most, binning)
     scale = unit_at(np.asarray(darkest, np.float32), rig, unit, binning)  # of each stored number [e-]
@@ -239,9 +244,6 @@ def sum_up_light(seen: Radiance, scene: RasterScene, rig: Rig, sweeps: tuple[Swe
     span = np.maximum(most - low, high - least)
     span[span <= _ROUNDING * np.maximum(np.abs(low), np.abs(high))] = 0  # may be rounding
     slope, curvature = _derivatives(seen, scale, binning)
-    spectral = np.zeros(len(nm))
-    if len(nm) > 1:
-        spectral = _greatest(stored_mean(steepest_difference(seen[0], nm), binning) / scale)
     return Probe(
         unit=unit,
         sweeps=sweeps,
@@ -251,7 +253,7 @@ def sum_up_light(seen: Radiance, scene: RasterScene, rig: Rig, sweeps: tuple[Swe
         span=_greatest(stored_mean(span, binning) / scale),
         slope=slope,
         curvature=curvature,
-        spectral_slope=spectral,
+        spectral_slope=_greatest(stored_mean(steepest_difference(seen[0], scene.wavelength_nm), binning) / scale),
         brightest_e=float(most.max()),
         darkest_e=float(least.min()),
         unit_least_dn=float(scale.min()) / camera.electrons_per_dn,
@@ -267,7 +269,8 @@ def _derivatives(seen: Radiance, scale: Radiance, binning: int) -> tuple[Floats,
 
     A stored number has the mean size over its samples: they may be moved one way or the other.
     """
-    level, high = seen[0], np.abs(seen[0]).max(axis=0)
+    level = seen[0]
+    high = np.abs(level).max(axis=0)
 
     def size(difference: Radiance) -> Floats:
         shown = np.where(np.abs(difference) > _ROUNDING * high, np.abs(difference), np.float32(0))
@@ -291,12 +294,11 @@ def _greatest(values: NDArray[np.floating]) -> Floats:
 def worst_of_groups(probe: Probe) -> Probe:
     """Return the probe with the worst of each group of neighbouring bands in all of them."""
     groups = band_groups(len(probe.wavelength_nm))
-
-    def worst(values: Floats) -> Floats:
-        parts = [values[..., one] for one in groups]
-        return np.concatenate([np.broadcast_to(one.max(axis=-1, keepdims=True), one.shape) for one in parts], axis=-1)
-
-    values: dict[str, Any] = {name: worst(getattr(probe, name)) for name in _BY_BAND}
+    starts = [one.start for one in groups]
+    sizes = [one.stop - one.start for one in groups]
+    values: dict[str, Any] = {
+        name: np.repeat(np.maximum.reduceat(getattr(probe, name), starts, axis=-1), sizes, axis=-1) for name in _BY_BAND
+    }
     return replace(probe, **values)
 
 
@@ -313,8 +315,7 @@ def _slit_errors(
     boxes = {one: _footprint(one, rig, BOXES.get(one, (1, 1)), moments, scene) for one in (*SLIT.variants, OFF)}
     finest = light_seen(scene, rig.camera, views, boxes.pop(SLIT.variants[0]), _PHASES)
     scale = unit_at(_stored(finest, views), rig, unit, views.binning)
-    changes = {one: _changes(scene, rig, views, box, finest, scale) for one, box in boxes.items()}
-    return {one: float(change.max(initial=0.0)) for one, change in changes.items()}
+    return {one: float(_changes(scene, rig, views, box, finest, scale).max(initial=0.0)) for one, box in boxes.items()}
 
 
 def _roughest(scene: RasterScene, rig: Rig, views: SampleViews, unit: Unit) -> NDArray[np.intp]:

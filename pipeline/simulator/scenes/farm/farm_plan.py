@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
@@ -47,7 +47,8 @@ _COLOURS = {
     "water": (40, 110, 220),
     "tree": (15, 75, 45),
 }
-CLASSES, CLASS_COLOURS = tuple(_COLOURS), np.array(list(_COLOURS.values()), np.uint8)
+CLASSES = tuple(_COLOURS)
+CLASS_COLOURS = np.array(list(_COLOURS.values()), np.uint8)
 
 Mixture = dict[str, Field]
 PARCEL_AREA_PX = 95_000.0
@@ -84,8 +85,7 @@ class Ground:
 
     def at(self, index: NDArray[np.intp]) -> Ground:
         """Return the fields at flat pixel numbers, (n,) each."""
-        parts = (self.moisture, self.vigour, self.tuft, self.grain, self.light)
-        return Ground(*(part.ravel()[index] for part in parts))
+        return Ground(*(getattr(self, one.name).ravel()[index] for one in fields(self)))
 
 
 class Canvas:
@@ -200,7 +200,8 @@ class FieldPlan:
 
     def materials_on(self, day: int) -> set[str]:
         """Return spectra of the crop that may stand on the field on a day."""
-        crop, land = self.crop, self.land_on(day)
+        crop = self.crop
+        land = self.land_on(day)
         if crop is None or land.phase != "crop":
             return set()
         names = set(stage_fractions(crop, np.linspace(land.days - UNEVEN_DAYS, land.days + UNEVEN_DAYS, 37)))
@@ -244,8 +245,7 @@ class FarmPlan:
         there = {"soil_dry", "soil_wet", "gravel", "water", "straw", "straw_grey", "grass_green", "grass_dry", "shade"}
         there |= {"weed_leafy", "weed_red", "volunteer", "blossom"}
         there |= {name for name, fraction in foliage(self.day).items() if fraction > 0}
-        for one in self.fields:
-            there |= one.materials_on(self.day)
+        there = there.union(*(one.materials_on(self.day) for one in self.fields))
         return tuple(name for name in MATERIALS if name in there)
 
 

@@ -24,6 +24,7 @@ crop that hardly covers the soil is soil. Edges are mixed by the fraction of the
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -143,21 +144,20 @@ def paint_borders(work: Painting) -> None:
         for number, (border, its_kind) in enumerate(work.plan.borders):
             if its_kind == kind:
                 rng = stream(work.plan.seed, f"border {number}")
-                canvas, plan = work.canvas, work.plan
+                canvas = work.canvas
                 band = band_pixels(border, 12.0, canvas.shape)
                 phases = rng.uniform(0, 2 * np.pi, 2)
                 bend = np.sin(band.along / 37 + phases[0]) + np.sin(band.along / 61 + phases[1])
-                band = Band(
-                    band.index,
-                    band.across + np.float32((0.8 if kind == "road" else 1.6) / 2) * bend.astype(np.float32),
-                    band.along,
-                )
+                way = np.float32((0.8 if kind == "road" else 1.6) / 2)
+                band = replace(band, across=band.across + way * bend.astype(np.float32))
                 here = work.ground.at(band.index)
                 half, bank = rng.uniform(*WIDTHS[kind]), rng.uniform(*BANKS[kind])
-                dryness, swath, inner = rng.uniform(0.25, 0.55), rng.uniform() < 0.5, rng.uniform(0.8, 1.2)
+                dryness = rng.uniform(0.25, 0.55)
+                swath = rng.uniform() < 0.5
+                inner = rng.uniform(0.8, 1.2)
                 _cover(canvas, band, half + bank, grass(here, dryness), "grass")
                 if kind == "ditch":
-                    full = half * (0.75 + 1.4 * plan.moisture)
+                    full = half * (0.75 + 1.4 * work.plan.moisture)
                     _cover(canvas, band, full, {"water": np.ones_like(band.across)}, "water")
                 if kind == "road":
                     stone = np.clip(0.75 + 0.08 * here.tuft + 0.05 * here.grain, 0, 1)  # trodden into dry soil
@@ -175,8 +175,9 @@ def _cover(canvas: Canvas, band: Band, half: float, mixture: Mixture, label: str
 
 def dig_ponds(work: Painting) -> None:
     """Paint ponds with grass round them, in meadows where there are any: one, and one more for every 650 000 px."""
-    canvas, plan = work.canvas, work.plan
-    rng, shape = stream(plan.seed, "ponds"), plan.shape
+    plan = work.plan
+    shape = plan.shape
+    rng = stream(plan.seed, "ponds")
     shore = smooth_noise(rng, shape, 14).ravel()
     meadows = [one.parcel for one in plan.fields if one.use == "grass"] or [one.parcel for one in plan.fields]
     ponds = []
@@ -186,17 +187,18 @@ def dig_ponds(work: Painting) -> None:
         radius = rng.uniform(14, 24)
         for index, _, _ in disc_pixels(centre[None], np.array([34.0]), shape):
             inside = radius + 1.8 * shore[index] - np.hypot(*(scene_points(index, shape) - centre).T)
-            canvas.over(index, edge(inside + 4), grass(work.ground.at(index), 0.15), "grass")
+            work.canvas.over(index, edge(inside + 4), grass(work.ground.at(index), 0.15), "grass")
             ponds.append((index, edge(inside)))
     for index, cover in ponds:  # after every bank: two ponds may meet
-        canvas.over(index, cover, {"water": np.ones_like(cover)}, "water")
+        work.canvas.over(index, cover, {"water": np.ones_like(cover)}, "water")
 
 
 def crowns_of(work: Painting) -> Points:
     """Return the crowns of hedges and of trees beside the lines: y, x and radius, (n, 3)."""
     plan = work.plan
-    rng, trees = stream(plan.seed, "trees"), [np.zeros((0, 3))]
-    for border in [border for border, _ in plan.borders]:
+    rng = stream(plan.seed, "trees")
+    trees = [np.zeros((0, 3))]
+    for border, _ in plan.borders:
         count = rng.poisson(border.length / 320)
         step = (border.end - border.start) / max(border.length, 1e-9)
         aside = rng.choice([-1.0, 1.0], (count, 1)) * rng.uniform(7, 14, (count, 1)) * np.array([-step[1], step[0]])
@@ -216,7 +218,7 @@ def crowns_of(work: Painting) -> Points:
 
 def plant_trees(work: Painting) -> None:
     """Paint shadows away from the sun, then crowns that are darker on that side, in the leaves of the day."""
-    canvas, plan = work.canvas, work.plan
+    plan = work.plan
     crowns = crowns_of(work)
     centres, radius = crowns[:, :2], crowns[:, 2]
     leaves = {name: fraction for name, fraction in foliage(plan.day).items() if fraction > 0}
@@ -225,14 +227,14 @@ def plant_trees(work: Painting) -> None:
     for rows in cuts(plan.shape[0], ROWS_AT_ONCE):
         dark = np.flatnonzero(shadow[rows]) + rows.start * plan.shape[1]
         depth = np.asarray(SHADOW * opaque * shadow.ravel()[dark], np.float32)
-        canvas.over(dark, depth, {"shade": np.ones_like(depth)}, None)
+        work.canvas.over(dark, depth, {"shade": np.ones_like(depth)}, None)
     for index, cover, disc in disc_pixels(centres, radius, plan.shape):
         away = ((scene_points(index, plan.shape) - centres[disc]) / radius[disc, None]) @ plan.sun.cast
         away /= np.hypot(*plan.sun.cast)
         here = work.ground.at(index)
         shade = np.asarray(np.clip(0.18 + 0.18 * away + 0.08 * here.tuft + 0.05 * here.grain, 0, 0.6), np.float32)
         mixture = {name: fraction * (1 - shade) for name, fraction in leaves.items()}
-        canvas.over(index, np.asarray(opaque * cover, np.float32), mixture | {"shade": shade}, "tree")
+        work.canvas.over(index, np.asarray(opaque * cover, np.float32), mixture | {"shade": shade}, "tree")
 
 
 def crown_shadows(
@@ -243,7 +245,8 @@ def crown_shadows(
     A crown is ``radius`` wide and 0.9 ``radius`` high each way about a point 1.2 ``radius`` above the ground. Its
     shadow is an ellipse; the darker one counts where shadows meet.
     """
-    covered, length = scratch(shape), float(np.hypot(*sun.cast))
+    covered = scratch(shape)
+    length = float(np.hypot(*sun.cast))
     along = sun.cast / length
     middles = centres + 1.2 * radius[:, None] * sun.cast + (np.array(shape) - 1) / 2
     for (y0, x0), width in zip(middles, radius, strict=True):

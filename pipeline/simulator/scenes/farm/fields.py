@@ -53,7 +53,8 @@ SPECIES: dict[str, tuple[float, float, float]] = {  # share, and first and last 
     "mustard": (0.15, 92.0, 150.0),
 }
 FLOWERING = (36.0, 85.0)  # days since mustard came up
-CLUSTERED, CLUSTER = 0.65, 22  # fraction of plants in clusters, and plants in one
+CLUSTERED = 0.65  # fraction of plants in clusters
+CLUSTER = 22  # plants in one
 ALONG_PX, ASIDE_PX = 16.0, 6.0  # spread of a cluster along the rows and across, sd
 VOLUNTEERS = 1 / 6000  # single plants of another crop per px
 SEEN_PX = 0.35  # least radius of a plant that is drawn
@@ -77,33 +78,39 @@ def paint_fields(work: Painting, lodging: Field | None = None) -> None:
         if not index.size:
             continue
         down = np.zeros(index.size, np.float32) if lodging is None else _lodged(lodging.ravel()[index], field, plan.day)
-        content = _content(work, stream(plan.seed, f"paint {number}"), field, centres, (work.ground.at(index), down))
+        content = _content(work, stream(plan.seed, f"paint {number}"), field, centres, work.ground.at(index), down)
         work.canvas.add(index, cover, *content)
 
 
 def _content(
-    work: Painting, rng: np.random.Generator, field: FieldPlan, centres: Points, ground: tuple[Ground, Field]
+    work: Painting, rng: np.random.Generator, field: FieldPlan, centres: Points, here: Ground, down: Field
 ) -> Content:
-    here, down = ground
-    land, crop = field.land_on(work.plan.day), field.crop
-    salt, rows = int(rng.integers(2**31)), rows_of(rng, field, centres)
+    land = field.land_on(work.plan.day)
+    crop = field.crop
+    salt = int(rng.integers(2**31))
+    rows = rows_of(rng, field, centres)
     if land.phase == "grass":
-        return _meadow(rows, field, here, land.days, work.plan.day)
+        winter = 0.5 + 0.5 * np.cos(2 * np.pi * (work.plan.day - 25) / YEAR_DAYS)
+        dryness = float(0.18 + 0.34 * np.exp(-land.days / 12) + 0.24 * winter)
+        bands = stripes(rows.across, field.row_period_px, field.row_period_px / 2)
+        return Content(blend(grass(here, dryness), grass(here, dryness + 0.16), bands), {"grass": np.ones_like(bands)})
     soil = moist_soil(work.plan, here, field.wetter)
-    if land.phase == "soil" or (crop is None and land.phase == "crop"):
-        return _bare_field(rows, field, soil)
+    if land.phase == "soil":
+        furrow = stripes(rows.place, field.row_period_px if crop is None else 10.5, 3.0)
+        content = Content(blend(soil, {"shade": np.ones_like(furrow)}, 0.15 * furrow), {"soil": np.ones_like(furrow)})
+        return _with_wheel_marks(content, field, rows, soil) if crop is None else content
     if crop is None or land.phase == "stubble":
         return _stubble_field(rows, field, here, soil, land.days)
-    return _standing_crop(work, field, crop, (rows, here, soil), (row_gaps(salt, field, rows, here), down))
+    return _standing_crop(work, field, crop, rows, here, soil, row_gaps(salt, field, rows, here), down)
 
 
 def _standing_crop(
-    work: Painting, field: FieldPlan, crop: Crop, place: tuple[Rows, Ground, Mixture], harm: tuple[Field, Field]
+    work: Painting, field: FieldPlan, crop: Crop, rows: Rows, here: Ground, soil: Mixture, gaps: Field, down: Field
 ) -> Content:
-    (rows, here, soil), (gaps, down) = place, harm
     age = field.land_on(work.plan.day).days
     local = age + np.clip(4 * here.vigour + 1.5 * here.tuft, -UNEVEN_DAYS, UNEVEN_DAYS)
-    period, closed = field.row_period_px, canopy_cover(crop, local)
+    period = field.row_period_px
+    closed = canopy_cover(crop, local)
     width = np.minimum(closed * period / ON_ROW, CLOSED * period)
     between = np.clip((closed * period - width * ON_ROW) / (period - width), 0, ON_ROW)
     row = stripes_of(rows.place, period, width)
@@ -139,9 +146,16 @@ def _stand(field: FieldPlan, crop: Crop, here: Ground, local: Points, down: Fiel
 
 
 def _with_wheel_marks(content: Content, field: FieldPlan, rows: Rows, soil: Mixture) -> Content:
-    if field.tramlines is None:
+    """Return the field with its tramlines, which also turn on the headland."""
+    trams = field.tramlines
+    if trams is None:
         return content
-    marks = wheel_marks(field, rows)
+    shift = rows.across + trams.shift
+    pair = stripes(shift, trams.spacing, trams.width) + stripes(shift + trams.gauge, trams.spacing, trams.width)
+    middle = field.headland_px / 2
+    turn = edge(trams.width / 2 - np.abs(np.abs(rows.ends - middle) - trams.gauge / 2))
+    inside = edge(rows.ends - middle - trams.gauge / 2)
+    marks: Field = np.asarray(np.clip(np.maximum(pair * inside, turn), 0, 1), np.float32)
     mixture = blend(content.mixture, blend(soil, {"gravel": np.ones_like(marks)}, np.full_like(marks, 0.22)), marks)
     return Content(mixture, blend(content.fractions, {"track": np.ones_like(marks)}, marks))
 
@@ -159,19 +173,6 @@ def _stubble_field(rows: Rows, field: FieldPlan, here: Ground, soil: Mixture, da
     return _with_wheel_marks(Content(mixture, {"stubble": straw + green, "soil": 1 - straw - green}), field, rows, soil)
 
 
-def _meadow(rows: Rows, field: FieldPlan, here: Ground, days: float, day: int) -> Content:
-    winter = 0.5 + 0.5 * np.cos(2 * np.pi * (day - 25) / YEAR_DAYS)
-    dryness = float(0.18 + 0.34 * np.exp(-days / 12) + 0.24 * winter)
-    bands = stripes(rows.across, field.row_period_px, field.row_period_px / 2)
-    return Content(blend(grass(here, dryness), grass(here, dryness + 0.16), bands), {"grass": np.ones_like(bands)})
-
-
-def _bare_field(rows: Rows, field: FieldPlan, soil: Mixture) -> Content:
-    furrow = stripes(rows.place, field.row_period_px if field.crop is None else 10.5, 3.0)
-    content = Content(blend(soil, {"shade": np.ones_like(furrow)}, 0.15 * furrow), {"soil": np.ones_like(furrow)})
-    return _with_wheel_marks(content, field, rows, soil) if field.crop is None else content
-
-
 def _lodged(noise: Field, field: FieldPlan, day: int) -> Field:
     fraction = field.lodging * lodged_fraction(day)
     if fraction <= 0 or field.crop is None or field.land_on(day).phase != "crop" or field.land_on(day).days < 150:
@@ -183,13 +184,11 @@ def _lodged(noise: Field, field: FieldPlan, day: int) -> Field:
 class Rows:
     """Pixels against the rows, (n,) each; on headlands rows run along the field's end.
 
-    ``across`` and ``along`` are distances in the field's own frame. ``place`` is the distance across the rows where the
-    pixel is, ``onward`` along them, ``ends`` to the nearest end of the field [px]. ``normal`` (n, 2) points across the
-    rows.
+    ``across`` is the distance in the field's own frame. ``place`` is the distance across the rows where the pixel is,
+    ``onward`` along them, ``ends`` to the nearest end of the field [px]. ``normal`` (n, 2) points across the rows.
     """
 
     across: Floats
-    along: Floats
     ends: Floats
     place: Floats
     onward: Floats
@@ -206,13 +205,14 @@ def rows_of(rng: np.random.Generator, field: FieldPlan, centres: Points) -> Rows
         if abs(ahead @ (ny, nx)) > 0.7:
             distance = centres @ np.array([ny, nx]) - offset
             nearer = distance < ends
-            ends[nearer], end_normal[nearer] = distance[nearer], (ny, nx)
+            ends[nearer] = distance[nearer]
+            end_normal[nearer] = (ny, nx)
     aside = rng.normal(0, PASS_SD * field.row_period_px, 512)
     passes = np.floor(across / (PASS_ROWS * field.row_period_px) - 0.5 / PASS_ROWS).astype(int)
     turned = ends < field.headland_px
     place = np.where(turned, ends, across + aside[passes % 512])
     normals = np.where(turned[:, None], end_normal, normal)
-    return Rows(across, along, ends, place, np.where(turned, across, along), normals)
+    return Rows(across, ends, place, np.where(turned, across, along), normals)
 
 
 def row_gaps(salt: int, field: FieldPlan, rows: Rows, here: Ground) -> Field:
@@ -241,18 +241,6 @@ def stripes_of(place: Floats, period: float, width: Floats) -> Field:
     whole, rest = np.divmod(start, period)
     last, left = np.divmod(start + 1, period)
     return np.asarray((last - whole) * width + np.minimum(left, width) - np.minimum(rest, width), np.float32)
-
-
-def wheel_marks(field: FieldPlan, rows: Rows) -> Field:
-    """Return the fraction of each pixel under tramlines, which also turn on the headland; 0 without tramlines."""
-    trams = field.tramlines
-    if trams is None:
-        return np.zeros(len(rows.across), np.float32)
-    shift = rows.across + trams.shift
-    pair = stripes(shift, trams.spacing, trams.width) + stripes(shift + trams.gauge, trams.spacing, trams.width)
-    middle = field.headland_px / 2
-    turn = edge(trams.width / 2 - np.abs(np.abs(rows.ends - middle) - trams.gauge / 2))
-    return np.asarray(np.clip(np.maximum(pair * edge(rows.ends - middle - trams.gauge / 2), turn), 0, 1), np.float32)
 
 
 def _scatter(first: NDArray[np.int64], second: NDArray[np.int64], salt: int) -> Floats:
@@ -290,7 +278,8 @@ def field_weeds(rng: np.random.Generator, field: FieldPlan, day: int) -> dict[st
     corners = field.parcel.corners
     area = polygon_area(corners)
     count, single = rng.poisson(field.weeds * area / 1000), rng.poisson(VOLUNTEERS * area)
-    places, radius = _clustered(rng, field, count), rng.uniform(0.9, 2.4, count)
+    places = _clustered(rng, field, count)
+    radius = rng.uniform(0.9, 2.4, count)
     kinds = rng.choice(list(SPECIES), count, p=[fraction for fraction, _, _ in SPECIES.values()])
     first, last = (np.array([SPECIES[kind][end] for kind in kinds]).reshape(-1) for end in (1, 2))
     emergence = rng.uniform(size=count) * (last - first) + first
@@ -299,13 +288,15 @@ def field_weeds(rng: np.random.Generator, field: FieldPlan, day: int) -> dict[st
     radius = np.append(radius, rng.uniform(1.0, 2.0, single))
     emergence = np.append(emergence, rng.uniform(110, 190, single))
     turned = np.full(count + single, days_since_turned(field.use, day, field.late_days))
-    age, land = (day - emergence) % YEAR_DAYS, field.land_on(day)
+    age = (day - emergence) % YEAR_DAYS
+    land = field.land_on(day)
     cut = np.where((age > land.days) & (land.phase in ("grass", "stubble")), 0.5, 1.0)  # saw mowing or harvest
     alive = (age < turned) & (age < 170)  # tillage kills a weed, and so does its age; it grows to 63 % in 22 days
     size = radius * np.where(alive, 1 - np.exp(-age / 22), 0.0) * cut
     flowers = (kinds == "mustard") & (age >= FLOWERING[0]) & (age < FLOWERING[1])
     spectra = np.where(flowers, "blossom", np.where(kinds == "mustard", "weed_leafy", kinds))
-    seen, plants = size > SEEN_PX, np.column_stack([places, size])
+    seen = size > SEEN_PX
+    plants = np.column_stack([places, size])
     return {str(name): plants[seen & (spectra == name)] for name in np.unique(spectra[seen])}
 
 

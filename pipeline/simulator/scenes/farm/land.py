@@ -69,9 +69,10 @@ def stream(seed: int, name: str) -> np.random.Generator:
 
 def divide_land(rng: np.random.Generator, size: tuple[float, float], area: float) -> tuple[list[Parcel], list[Border]]:
     """Split a rectangle about the origin until every parcel has about ``area`` px; also the lines that split it."""
-    corners = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]]) * np.array(size) / 2
+    waiting = [Parcel(np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]]) * np.array(size) / 2)]
     turn = rng.uniform(-0.6, 0.6)
-    waiting, parcels, borders = [Parcel(corners)], [], []
+    parcels: list[Parcel] = []
+    borders: list[Border] = []
     while waiting:
         parcel = waiting.pop()
         if polygon_area(parcel.corners) < area * rng.uniform(1.15, 1.9):
@@ -96,7 +97,8 @@ def _span(corners: Points, angle: float) -> tuple[float, float]:
 
 def clip_polygon(corners: Points, cut: tuple[float, float, float]) -> Points:
     """Return part of a convex polygon where ny y + nx x >= offset, (m, 2); m may be 0."""
-    height, kept = corners @ np.array(cut[:2]) - cut[2], []
+    height = corners @ np.array(cut[:2]) - cut[2]
+    kept: list[Points] = []
     for here, there, a, b in zip(corners, np.roll(corners, -1, axis=0), height, np.roll(height, -1), strict=True):
         if a >= 0:
             kept.append(here)
@@ -126,7 +128,8 @@ def allot(rng: np.random.Generator, sizes: list[float], fractions: dict[str, flo
     wanted = {kind: fraction * float(np.exp(0.25 * rng.standard_normal())) for kind, fraction in fractions.items()}
     scale = sum(sizes) / sum(wanted.values())
     lack = {kind: fraction * scale for kind, fraction in wanted.items()}
-    kinds, missing = [""] * len(sizes), set(fractions)
+    kinds = [""] * len(sizes)
+    missing = set(fractions)
     order = sorted(range(len(sizes)), key=lambda piece: -sizes[piece])
     for rank, piece in enumerate(order):
         forced = missing and len(order) - rank <= len(missing)
@@ -156,10 +159,12 @@ def parcel_pixels(parcel: Parcel, shape: tuple[int, int]) -> tuple[NDArray[np.in
 def band_pixels(border: Border, reach: float, shape: tuple[int, int]) -> Band:
     """Return the pixels within ``reach`` of a line, and a little more at its ends, row by row or column by column."""
     step = (border.end - border.start) / max(border.length, 1e-9)
-    major, middle = int(abs(step[1]) >= abs(step[0])), (np.array(shape) - 1) / 2
+    major = int(abs(step[1]) >= abs(step[0]))
+    middle = (np.array(shape) - 1) / 2
     ends = np.sort([border.start[major], border.end[major]]) + middle[major]
     count = np.clip([np.floor(ends[0]), np.ceil(ends[1]) + 1], 0, shape[major])
-    m, slope = np.arange(*count.astype(int)), step[1 - major] / step[major]
+    m = np.arange(*count.astype(int))
+    slope = step[1 - major] / step[major]
     centre = border.start[1 - major] + (m - middle[major] - border.start[major]) * slope + middle[1 - major]
     width = int(np.ceil(reach / abs(step[major]))) + 1
     k = np.rint(centre)[:, None].astype(int) + np.arange(-width, width + 1)
@@ -191,8 +196,10 @@ def disc_pixels(
     places = centres + (np.array(shape) - 1) / 2
     for rows in cuts(shape[0], ROWS_AT_ONCE):
         near = np.flatnonzero((places[:, 0] + radius > rows.start - 1) & (places[:, 0] - radius < rows.stop))
-        place, reach = places[near, :, None, None], int(np.ceil(radius[near].max(initial=0.0) + 1))
-        offset, base = np.arange(-reach, reach + 1), np.rint(place).astype(int)
+        reach = int(np.ceil(radius[near].max(initial=0.0) + 1))
+        offset = np.arange(-reach, reach + 1)
+        place = places[near, :, None, None]
+        base = np.rint(place).astype(int)
         y = base[:, 0] + offset[:, None] + np.zeros_like(offset)
         x = base[:, 1] + offset + np.zeros_like(offset)[:, None]
         cover = edge(radius[near, None, None] - np.hypot(y - place[:, 0], x - place[:, 1]))
@@ -269,7 +276,9 @@ class Land(NamedTuple):
 
 _MAIZE = ((12.0, "maize_young"), (55.0, "maize_full"), (98.0, "maize_full"), (128.0, "maize_ripe"))
 _BEET = ((10.0, "beet_young"), (55.0, "beet_full"), (140.0, "beet_full"), (190.0, "beet_old"))
-_TALL, _LOW, _EARS = ((0, 0.2), (30, 4.0), (75, 20.0)), ((0, 0.1), (60, 4.0)), ((0, 0.3), (150, 1.0), (225, 7.0))
+_TALL = ((0, 0.2), (30, 4.0), (75, 20.0))
+_LOW = ((0, 0.1), (60, 4.0))
+_EARS = ((0, 0.3), (150, 1.0), (225, 7.0))
 
 
 def _wheat(variety: str) -> Crop:
@@ -298,7 +307,8 @@ class Sun:
     @property
     def cast(self) -> Points:
         """Return where the tip of a post 1 px high throws its shadow, (y, x) from its foot [px]: away from the sun."""
-        azimuth, length = np.deg2rad(self.azimuth_deg), 1 / np.tan(np.deg2rad(self.elevation_deg))
+        azimuth = np.deg2rad(self.azimuth_deg)
+        length = 1 / np.tan(np.deg2rad(self.elevation_deg))
         return np.array([np.cos(azimuth) * length, -np.sin(azimuth) * length])
 
 
@@ -316,7 +326,8 @@ def sun_over_farm(day: int, hour: float) -> Sun:
     year = 2 * np.pi * (day - 1) / 365
     declination = 0.006918 - 0.399912 * np.cos(year) + 0.070257 * np.sin(year) - 0.006758 * np.cos(2 * year)
     declination = declination + 0.000907 * np.sin(2 * year) - 0.002697 * np.cos(3 * year) + 0.00148 * np.sin(3 * year)
-    latitude, turned = np.deg2rad(LATITUDE_DEG), np.deg2rad(15 * (hour - 12))
+    latitude = np.deg2rad(LATITUDE_DEG)
+    turned = np.deg2rad(15 * (hour - 12))
     up = np.sin(latitude) * np.sin(declination) + np.cos(latitude) * np.cos(declination) * np.cos(turned)
     north = np.cos(latitude) * np.sin(declination) - np.sin(latitude) * np.cos(declination) * np.cos(turned)
     east = -np.cos(declination) * np.sin(turned)
@@ -355,7 +366,8 @@ def land_on(use: str, day: float, late: float) -> Land:
 def canopy_cover(crop: Crop, age: ArrayLike) -> NDArray[np.float64]:
     """Return the fraction of the ground under plants, brown ones included, by days since emergence; 0 before."""
     first, growth, last = crop.cover
-    days, half_way = np.asarray(age, np.float64), np.log(last / (2 * first)) / growth
+    days = np.asarray(age, np.float64)
+    half_way = np.log(last / (2 * first)) / growth
     early = first * np.exp(growth * np.minimum(days, half_way))
     late = last - 0.25 * last**2 / first * np.exp(-growth * np.maximum(days, 0))
     return np.where(days < 0, 0.0, np.where(days < half_way, early, late))

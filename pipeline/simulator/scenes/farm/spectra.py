@@ -33,12 +33,15 @@ FIRST_NM, LAST_NM = 400.0, 1000.0
 FWHM_NM = 6.0  # assumed
 WHITE_REFERENCE_REFLECTANCE = 0.99
 FILL = 0.95  # of the full well, by a perfect white in the brightest band
-TWIN_CENTRE_NM, TWIN_HALF_WIDTH_NM, TWIN_CONTRAST = 715.0, 25.0, 0.10
+TWIN_CENTRE_NM = 715.0
+TWIN_HALF_WIDTH_NM = 25.0
+TWIN_CONTRAST = 0.10
 RIPE_CONTRAST = 0.4  # of the twins' contrast, in ripe wheat (law of this project)
 MOISTURE_EXPONENT = 5.0  # law of this project; 80 % of the darkening is done at 0.32 by volume
 
 GRID_NM: Spectrum = np.arange(400.0, 1031.0)  # room for the upper half of the last band
 _SUN_ZENITH_DEG = 30.0
+DRY_BELOW = 0.7  # fraction of dry soil below plants
 
 
 @dataclass(frozen=True)
@@ -47,8 +50,7 @@ class Canopy:
 
     Living plants here have structure n 1.3-2.1 and brown pigment 0-1. They have chlorophyll ``cab`` 8-62, carotenoids
     ``car`` 4-14 and anthocyanins ``ant`` 0-6 ug/cm2. Water ``cw`` is 0.004-0.030 cm, dry matter ``cm`` 0.003-0.012
-    g/cm2. The leaf area index is 1-6, the mean leaf angle ``lidfa`` 16-72 degrees from the horizontal. ``dry_soil`` is
-    the fraction of dry soil below.
+    g/cm2. The leaf area index is 1-6, the mean leaf angle ``lidfa`` 16-72 degrees from the horizontal.
     """
 
     n: float
@@ -60,9 +62,9 @@ class Canopy:
     cm: float
     lai: float
     lidfa: float
-    dry_soil: float = 0.7
 
 
+# Crops, and leaves of trees in autumn, at the stages of their life. Ripe wheat has next to no chlorophyll or water.
 STAGES: dict[str, Canopy] = {
     "maize_young": Canopy(1.40, 36, 8, 0.5, 0.00, 0.014, 0.0040, 1.3, 45),
     "maize_full": Canopy(1.45, 55, 11, 0.5, 0.00, 0.013, 0.0050, 4.5, 52),
@@ -78,7 +80,7 @@ STAGES: dict[str, Canopy] = {
     "wheat_a_lodged_ripe": Canopy(2.10, 0.5, 2.5, 0.0, 0.50, 0.002, 0.0070, 3.6, 16),
     "tree_autumn": Canopy(2.00, 14, 9, 4.0, 0.45, 0.007, 0.0110, 4.0, 40),
 }
-"""Crops, and leaves of trees in autumn, at the stages of their life. Ripe wheat has next to no chlorophyll or water."""
+# Stands that look alike all year.
 OTHERS: dict[str, Canopy] = {
     "weed_leafy": Canopy(1.40, 28, 8, 3.0, 0.00, 0.018, 0.0030, 3.0, 35),
     "weed_red": Canopy(1.50, 24, 9, 6.0, 0.05, 0.014, 0.0040, 2.0, 42),
@@ -87,7 +89,6 @@ OTHERS: dict[str, Canopy] = {
     "grass_dry": Canopy(1.90, 12, 6, 0.0, 0.80, 0.005, 0.0070, 2.5, 60),
     "tree": Canopy(2.10, 62, 14, 1.5, 0.15, 0.009, 0.0120, 6.0, 40),
 }
-"""Stands that look alike all year."""
 _TWINS = {name.replace("wheat_a", "wheat_b"): name for name in STAGES if name.startswith("wheat_a")}
 _LASTING = ("soil_dry", "soil_wet", "gravel", "water", "straw", *OTHERS, "blossom", "shade")
 MATERIALS: tuple[str, ...] = (*_LASTING, *STAGES, *_TWINS, "straw_grey", "twigs")
@@ -101,8 +102,6 @@ class SpectralLibrary:
     of a perfect white, at most 1 over the bands.
     """
 
-    wavelength_nm: Spectrum
-    fwhm_nm: Spectrum
     reflectance: NDArray[np.float64]
     light: Spectrum
 
@@ -135,14 +134,13 @@ def spectral_library(bands: int, materials: tuple[str, ...] = MATERIALS) -> Spec
     Raises WavelengthError: fewer than 2 bands.
     """
     wavelength, fwhm = band_centres(bands)
-    known = _known_spectra()
     # Photons under a clear sky on 21 June at sea level; a silicon sensor behind a grating (assumed).
     nm, sky = clear_sky(_SUN_ZENITH_DEG, 1 / np.cos(np.deg2rad(_SUN_ZENITH_DEG)), 172)
     efficiency = np.interp(GRID_NM, np.arange(400.0, 1101.0, 100.0), [0.34, 0.66, 0.72, 0.62, 0.47, 0.26, 0.09, 0.01])
     response = band_response(wavelength, fwhm) * (np.interp(GRID_NM, nm, sky[:, 0]) * GRID_NM * efficiency)
     light = response.sum(axis=1)
-    reflectance = np.stack([known[name] for name in materials]) @ response.T / light
-    parts = (wavelength, fwhm, reflectance, light / light.max())
+    reflectance = np.stack([_known_spectra()[name] for name in materials]) @ response.T / light
+    parts = (reflectance, light / light.max())
     for part in parts:
         part.setflags(write=False)
     return SpectralLibrary(*parts)
@@ -163,10 +161,10 @@ def _known_spectra() -> dict[str, Spectrum]:
     """Return the reflectance of each of ``MATERIALS`` on the 1 nm grid from 400 to 1030 nm, by models or laws."""
 
     def stand(one: Canopy) -> Spectrum:
-        leaf, blades = (one.n, one.cab, one.car, one.cbrown, one.cw, one.cm), (one.lai, one.lidfa)
+        leaf = (one.n, one.cab, one.car, one.cbrown, one.cw, one.cm)
         light = (_SUN_ZENITH_DEG, 0.0, 0.0)  # seen straight from above
         seen = prosail.run_prosail(
-            *leaf, *blades, 0.05, *light, ant=one.ant, prospect_version="D", rsoil=1.0, psoil=one.dry_soil
+            *leaf, one.lai, one.lidfa, 0.05, *light, ant=one.ant, prospect_version="D", rsoil=1.0, psoil=DRY_BELOW
         )
         return np.asarray(seen[: len(GRID_NM)], dtype=np.float64)
 

@@ -90,8 +90,8 @@ def test_few_kernels_have_the_contrast_of_the_pupil(aperture_mm: float, keystone
             seen = seen * (np.cos(np.pi * step * along) * np.cos(np.pi * step * scan)) ** 8
         left = _left(level * along, level * scan, part.shift, part.variance)
         kernels[:, which] = (own * seen)[:, None] * left
-    error = np.abs(kernels @ found.mixing - wanted)
-    assert found.mixing.min() >= 0
+    error = np.abs(kernels @ (found.fractions @ found.between) - wanted)
+    assert (found.fractions @ found.between).min() >= 0
     assert error.max() < 2e-3
     assert error[:60].max() < 1.7e-3
     assert error[60:90].max() < 8e-4

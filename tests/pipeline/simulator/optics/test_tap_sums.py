@@ -118,10 +118,10 @@ def test_table_matches_the_kernel_at_any_place_and_scale(width: float, blur: flo
     """Weights from the table sum to 1 and match those of the kernel to 0.002."""
     variance = np.array([0.0, blur**2])
     table = TapTable.of(width, variance, 1, (0.99, 1.04), 0.5)
-    weight, places = np.empty((2, table.taps, 1), np.float32), np.full((2, 1, 1), off, np.float32)
+    weight, places = np.empty((2, table.weight.shape[1], 1), np.float32), np.full((2, 1, 1), off, np.float32)
     for kernel in range(2):
         read_weights(table, kernel, np.full((2, 1), scale), places, 0, 0, weight[kernel])
-    weight, apart = weight[..., 0].T, table.left + off - np.arange(table.taps)
+    weight, apart = weight[..., 0].T, table.left + off - np.arange(table.weight.shape[1])
     distance, kernels = blurred_weight(width * scale, variance * scale**2)
     wanted = np.stack([np.interp(apart, distance, kernel, 0.0, 0.0) for kernel in kernels], axis=1)
     np.testing.assert_allclose(weight.sum(axis=0), 1, atol=1e-6)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pipeline.geometry.camera import LineCamera, digitise
 from pipeline.simulator.scenes.farm.farm_scene import crown_shadows
 from pipeline.simulator.scenes.farm.land import CROPS, LATITUDE_DEG, Sun, land_on, stage_fractions, sun_over_farm
-from pipeline.simulator.scenes.farm.spectra import FWHM_NM, MATERIALS, band_response, spectral_library
+from pipeline.simulator.scenes.farm.spectra import FWHM_NM, MATERIALS, band_centres, band_response, spectral_library
 
 
 @given(st.sampled_from(sorted(CROPS)), st.floats(-50, 350))
@@ -86,7 +86,7 @@ def test_shadows_point_away_from_the_sun_and_lengthen(azimuth: float) -> None:
 def test_spectral_library_has_any_number_of_bands(bands: int) -> None:
     """Libraries of 2 to 939 bands span 400 to 1000 nm, with positive light that has a maximum of 1."""
     library = spectral_library(bands)
-    assert library.wavelength_nm[[0, -1]].tolist() == [400.0, 1000.0]
+    assert band_centres(bands)[0][[0, -1]].tolist() == [400.0, 1000.0]
     assert library.reflectance.shape == (len(MATERIALS), bands)
     assert library.light.max() == 1
     assert library.light.min() > 0
