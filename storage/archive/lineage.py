@@ -68,7 +68,8 @@ class Catalogue:
     def ancestors(self, uris: Iterable[str]) -> set[str]:
         """Return all inputs of these stores, direct and indirect, without themselves; missing ones as bare keys."""
         begun = set(uris)
-        found, waiting = set(begun), list(begun)
+        found = set(begun)
+        waiting = list(begun)
         while waiting:
             new = set(self.inputs_of(waiting.pop())) - found
             found |= new
@@ -218,7 +219,8 @@ def version_before(catalogue: Catalogue, uri: str) -> Store | None:
 def changes_between(catalogue: Catalogue, old: Store, new: Store) -> list[Change]:
     """Return the differences of two stores and, for inputs that differ, those within them, down to their origin."""
     found: list[Change] = []
-    seen, waiting = set[tuple[str, str]](), [(old, new)]
+    seen: set[tuple[str, str]] = set()
+    waiting = [(old, new)]
     while waiting:
         before, after = waiting.pop(0)
         if (before.ref.uri, after.ref.uri) in seen:

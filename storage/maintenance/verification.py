@@ -44,7 +44,8 @@ def verify_everything(
     catalogue = Catalogue.read(root)
     places = [(uri, store.ref.path, store.size) for uri, store in catalogue.stores.items()]
     places += [(run.uri, run.folder, listed_bytes(run.facts) if run.facts else 0) for run in catalogue.runs]
-    total, done = sum(size for *_, size in places) or 1, 0
+    total = sum(size for *_, size in places) or 1
+    done = 0
     found: list[Finding] = []
     for uri, path, size in places:
         if progress is not None:
@@ -78,7 +79,8 @@ def _problems(folder: Path) -> Iterator[str]:
 
 def _missing(catalogue: Catalogue) -> Iterator[Finding]:
     """Yield the stores that a run or another store names and that are missing."""
-    there, told = set(catalogue.stores), set[str]()
+    there = set(catalogue.stores)
+    told: set[str] = set()
     for run in catalogue.runs:
         for uri in sorted(run.names - there - told):
             told.add(uri)
@@ -88,9 +90,6 @@ def _missing(catalogue: Catalogue) -> Iterator[Finding]:
             if given not in there | told:
                 told.add(given)
                 yield Finding(given, f"is not there, but {uri} was made of it", "missing")
-
-
-Rerun = Callable[[dict[str, Any]], str]  # settings of a survey -> address of the run; PipelineError where it cannot
 
 
 @dataclass(frozen=True)
@@ -156,7 +155,7 @@ def plan_repair(
 def repair(
     archive: Archive,
     findings: Iterable[Finding],
-    rerun: Rerun,
+    rerun: Callable[[dict[str, Any]], str],  # settings of a survey -> address of the run; PipelineError where it cannot
     *,
     versions: Mapping[str, int | str],
     can_capture: Callable[[Run], bool],
@@ -239,7 +238,8 @@ def _hopeless(
         return f"there is no stage {stage}: take it out of the archive"
     made_of = [one for key in (uri, *sorted(catalogue.ancestors([uri]))) if (one := catalogue.stores.get(key))]
     for one in made_of:
-        name, now = one.ref.stage, str(versions.get(one.ref.stage, one.version))
+        name = one.ref.stage
+        now = str(versions.get(name, one.version))
         if one.version not in ("", now):
             return f"made by version {one.version} of the stage {name}, which is now {now}: reprocess builds it again"
     runs = catalogue.named_by(uri)
