@@ -39,7 +39,6 @@ from storage.archive.manifests import (
     CLEARED,
     as_table,
     check_files,
-    cleared_facts,
     is_cleared,
     listed_bytes,
     manifest_sha256,
@@ -238,10 +237,12 @@ class Archive:
         part = final.with_name(ref.key + PART_SUFFIX)
         with refusals(self.root, "clear up the archive"), self._locked(f"{ref.stage}-{ref.key}", wait=wait) as held:
             if held and not is_cleared(before := read_manifest(final)):
+                kept = {name: value for name, value in before.items() if name not in ("files", "format", "seal")}
+                at = datetime.now(UTC).isoformat(timespec="milliseconds")
                 try:
                     remove_tree(part)
                     part.mkdir()
-                    write_manifest(part, cleared_facts(before))
+                    write_manifest(part, kept | {CLEARED: {"at": at, "bytes_before": listed_bytes(before)}})
                     take_its_place(part, final)
                 finally:
                     remove_tree(part)

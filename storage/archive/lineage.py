@@ -243,16 +243,12 @@ def changes_between(catalogue: Catalogue, old: Store, new: Store) -> list[Change
 def flatten(value: object, name: str = "") -> dict[str, Any]:
     """Return nested tables and lists of tables as dotted names: ``camera.samples``, ``sweeps[2].start_px``."""
     if isinstance(value, Mapping) and value:
-        return {
-            inner: one
-            for key, part in value.items()
-            for inner, one in flatten(part, f"{name}.{key}" if name else str(key)).items()
-        }
-    if isinstance(value, list) and any(isinstance(part, Mapping | list) for part in value):
-        return {
-            inner: one for number, part in enumerate(value) for inner, one in flatten(part, f"{name}[{number}]").items()
-        }
-    return {name: value}
+        parts = {f"{name}.{key}" if name else str(key): part for key, part in value.items()}
+    elif isinstance(value, list) and any(isinstance(part, Mapping | list) for part in value):
+        parts = {f"{name}[{number}]": part for number, part in enumerate(value)}
+    else:
+        return {name: value}
+    return {inner: one for at, part in parts.items() for inner, one in flatten(part, at).items()}
 
 
 def _differing(where: str, kind: Kind, old: Mapping[str, Any], new: Mapping[str, Any]) -> list[Change]:

@@ -167,25 +167,18 @@ def read_run(folder: Path) -> Run:
     facts, broken = try_manifest(folder)
     problem = broken and f"{MANIFEST_NAME} is damaged: {broken}"
     receipt: dict[str, Any] = {}
-    if broken is None:
-        receipt, problem = _receipt(folder, facts)
+    if broken is None and RECEIPT in facts["files"]:
+        path = folder / RECEIPT
+        try:
+            if file_hash(path) == facts["files"][RECEIPT]["sha256"]:
+                receipt = as_table(json.loads(path.read_bytes()))
+            else:
+                problem = f"{RECEIPT} has changed since it was published (its SHA-256 differs)"
+        except (OSError, ValueError, RecursionError) as error:
+            problem = f"{RECEIPT} cannot be read: {error.strerror if isinstance(error, OSError) else error}"
         if problem is not None and try_manifest(folder)[0] not in ({}, facts):  # something was added to it meanwhile
             return read_run(folder)
     return Run(folder, facts, receipt, problem)
-
-
-def _receipt(folder: Path, facts: Mapping[str, Any]) -> tuple[dict[str, Any], str | None]:
-    """Return the receipt if it is as published, else an empty table and the problem."""
-    entry = facts["files"].get(RECEIPT)
-    if entry is None:
-        return {}, None
-    path = folder / RECEIPT
-    try:
-        if file_hash(path) != entry["sha256"]:
-            return {}, f"{RECEIPT} has changed since it was published (its SHA-256 differs)"
-        return as_table(json.loads(path.read_bytes())), None
-    except (OSError, ValueError, RecursionError) as error:
-        return {}, f"{RECEIPT} cannot be read: {error.strerror if isinstance(error, OSError) else error}"
 
 
 def _text(value: object) -> str:

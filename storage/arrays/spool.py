@@ -118,14 +118,14 @@ class Spool:
             with _refusals(self.path, self.count):
                 os.fdatasync(self._file.fileno())
 
-    def blocks(self, size: int = SYNC_LINES) -> Iterator[list[Line]]:
-        """Yield the lines in blocks of ``size``; the last may be shorter. A damaged line is not valid."""
+    def blocks(self) -> Iterator[list[Line]]:
+        """Yield the lines in blocks of 64; the last may be shorter. A damaged line is not valid."""
         nothing = np.zeros((self.samples, self.bands), np.uint16)
         unknown = (float("nan"),) * 4
         with self.path.open("rb") as file:
             file.seek(len(self._head))
-            for first in range(0, self.count, size):
-                read = [self._line(one, file.read(self._size)) for one in range(first, min(first + size, self.count))]
+            for first in range(0, self.count, SYNC_LINES):
+                read = [self._line(n, file.read(self._size)) for n in range(first, min(first + SYNC_LINES, self.count))]
                 yield [line or Line(n, nothing, *unknown, valid=False) for n, line in enumerate(read, first)]
 
     def close(self) -> None:
@@ -278,7 +278,7 @@ def _sums_of(path: Path) -> Path:
 def _agreeing(path: Path) -> tuple[int, int, int]:
     """Return up to which byte a file agrees with its sums, the CRC-32 of these bytes, and the number of such sums."""
     reached, crc32, count = 0, 0, 0
-    try:
+    with suppress(FileNotFoundError):
         sums = _sums_of(path).read_bytes()
         with path.open("rb") as file:
             for to, expected in _SUM.iter_unpack(sums[: len(sums) // _SUM.size * _SUM.size]):
@@ -288,8 +288,6 @@ def _agreeing(path: Path) -> tuple[int, int, int]:
                 if (at, found) != (to, expected):
                     break
                 reached, crc32, count = at, found, count + 1
-    except FileNotFoundError:
-        pass
     return reached, crc32, count
 
 

@@ -59,8 +59,9 @@ def mib(size: int) -> str:
 
 def memory_refusal(least: int, memory: int, why: str) -> SettingsError:
     """Return the error for work that needs more than the setting ``memory`` [bytes], with the least that it needs."""
-    over = f"projected memory {mib(least)} exceeds --memory {mib(memory)}"
-    return SettingsError(f"{over}: {why}; give at least --memory {mib(least)}")
+    return SettingsError(
+        f"projected memory {mib(least)} exceeds --memory {mib(memory)}: {why}; give at least --memory {mib(least)}"
+    )
 
 
 @dataclass(frozen=True)

@@ -202,20 +202,16 @@ def open_headwall_cube(folder: Path) -> CubeSource:
     if not indices:
         return source
     times = LineTimes.unknown(source.shape[0])
-    more: list[str] = []
     for start, (number, cube) in zip(starts, opened.items(), strict=True):
         if number not in indices:
-            more.append(f"there is no frame index for {cube.path.name}")
+            notes.append(f"there is no frame index for {cube.path.name}")
             continue
         index = load_frame_index(indices[number])
         own = times_of_lines(index, number, len(cube.values), cube.lost_lines)
         times.put(start, own)
-        more.extend((*index.notes, *(f"{indices[number].name}: {note}" for note in own.notes)))
+        notes.extend((*index.notes, *(f"{indices[number].name}: {note}" for note in own.notes)))
     return replace(
-        source,
-        files=(*source.files, *indices.values()),
-        lines=_timed(source.lines, times),
-        notes=(*source.notes, *more),
+        source, files=(*source.files, *indices.values()), lines=_timed(source.lines, times), notes=tuple(notes)
     )
 
 

@@ -123,8 +123,7 @@ def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> Cub
                 void[first:last, :, None], np.float32(np.nan), np.float32(read(first, last))
             ),
         )
-    plain = not scaled or ((scale == 1).all() and (offset == 0).all())
-    return source if plain else rescaled(source, scale, offset)
+    return source if not scaled or ((scale == 1).all() and (offset == 0).all()) else rescaled(source, scale, offset)
 
 
 def _coloured(source: CubeSource, file: Any) -> CubeSource:

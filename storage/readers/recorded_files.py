@@ -398,8 +398,7 @@ def _csv_cells(path: Path) -> tuple[list[str], list[list[str]]]:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise SceneError(f"{path} cannot be read as a pointing table: {error}; name a text file (CSV)") from error
-    header = lines[0] if lines else ""
-    delimiter = max((",", ";", "\t"), key=header.count)
+    delimiter = max((",", ";", "\t"), key=(lines[0] if lines else "").count)
     rows = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=delimiter)]
     if not rows:
         raise SceneError(f"{path} is empty; give a header and a row for each line")
