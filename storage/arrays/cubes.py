@@ -137,7 +137,7 @@ def write_references(group: zarr.Group, references: References) -> None:
 
 
 def write_line_facts(group: zarr.Group, facts: Iterable[ArrayLike], started: str | None) -> None:
-    """Store time, mirror position X and Y, exposure and validity of every line."""
+    """Store the columns ``facts``: time, mirror position X and Y, exposure and validity of every line."""
     times, x, y, exposures, valid = (np.array(column) for column in facts)
     since = {"units": "s"} if started is None else {"units": f"seconds since {started}", "standard_name": "time"}
     position = {"long_name": "mirror position at mid exposure", "units": "1", "valid_range": [-1.0, 1.0]}
