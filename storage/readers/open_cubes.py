@@ -180,7 +180,8 @@ def load_frame(address: str | Path) -> tuple[NDArray[np.float32], tuple[Path, ..
     values = values.astype(np.uint8) if values.dtype.kind == "b" else values  # of a bad frame
     if values.dtype.kind not in "uif":
         raise SceneError(f"{path} holds {values.dtype}, expected the real numbers of a reference frame")
-    return np.asarray((values[None] if values.ndim == 2 else values).mean(axis=0, dtype=np.float64), np.float32), files
+    frame = values[None] if values.ndim == 2 else values
+    return np.asarray(frame.mean(axis=0, dtype=np.float64), np.float32), files
 
 
 def with_wavelengths(source: CubeSource, address: str | Path, stated: Sequence[float] | None) -> CubeSource:
