@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -39,7 +39,6 @@ from storage.archive.manifests import (
     CLEARED,
     as_table,
     check_files,
-    cleared_facts,
     is_cleared,
     listed_bytes,
     manifest_sha256,
@@ -80,7 +79,8 @@ class Archive:
     in_bucket = False  # whether `root` is a working copy alone
 
     def __init__(self, root: Path, *, writes: bool = True) -> None:
-        self.root, self.writes = root, writes
+        self.root = root
+        self.writes = writes
         self._spooled = 0
 
     @classmethod
@@ -157,9 +157,10 @@ class Archive:
         """
         ref = self.ref(stage, key)
         final = self.root / ref.uri
+        part = final.with_name(key + PART_SUFFIX)
         facts = {"stage": stage, "key": key, "version": version, "params": plain(params or {}), "inputs": plain(inputs)}
         with refusals(self.root, "write to the archive"), self._locked(f"{stage}-{key}"):
-            done, part = self.find(stage, key) is not None, final.with_name(key + PART_SUFFIX)
+            done = self.find(stage, key) is not None
             remove_tree(part)
             part.mkdir(parents=True)
             try:
@@ -236,10 +237,12 @@ class Archive:
         part = final.with_name(ref.key + PART_SUFFIX)
         with refusals(self.root, "clear up the archive"), self._locked(f"{ref.stage}-{ref.key}", wait=wait) as held:
             if held and not is_cleared(before := read_manifest(final)):
+                kept = {name: value for name, value in before.items() if name not in ("files", "format", "seal")}
+                at = datetime.now(UTC).isoformat(timespec="milliseconds")
                 try:
                     remove_tree(part)
                     part.mkdir()
-                    write_manifest(part, cleared_facts(before))
+                    write_manifest(part, kept | {CLEARED: {"at": at, "bytes_before": listed_bytes(before)}})
                     take_its_place(part, final)
                 finally:
                     remove_tree(part)
@@ -251,13 +254,10 @@ class Archive:
 
         ``alone`` asks for exclusive use, and yields False at once where another process uses the archive.
         """
-        with refusals(self.root, "write to the archive"):
-            release = take_lock(self._lock_path("use"), wait=not alone, shared=not alone)
-        try:
-            yield release is not None
-        finally:
-            if release is not None:
-                release()
+        with ExitStack() as held:
+            with refusals(self.root, "write to the archive"):
+                is_held = held.enter_context(self._locked("use", wait=not alone, shared=not alone))
+            yield is_held
 
     # --- verification and clearing up ---------------------------------------------------------------------------------
 
@@ -282,7 +282,7 @@ class Archive:
         parts = [*self.root.glob(f"stages/*/*{PART_SUFFIX}"), *self.root.glob(f"runs/*{PART_SUFFIX}")]
         found: dict[str, int] = {}
         for path in sorted((*parts, *spools)):
-            lock = self._lock_of(path)
+            lock = self._lock_path(self._lock_of(path))
             release = take_lock(lock, wait=False) if lock.exists() else lambda: None
             if release is not None:
                 release()
@@ -292,15 +292,14 @@ class Archive:
     def drop_leftover(self, uri: str) -> bool:
         """Remove one of `leftovers`; False where a process holds it, or the disk refuses."""
         path = self.root / uri
-        release = take_lock(self._lock_of(path), wait=False)
-        if release is not None:
-            remove_tree(path)
-            release()
+        with self._locked(self._lock_of(path), wait=False) as held:
+            if held:
+                remove_tree(path)
         return not path.exists()
 
-    def _lock_of(self, path: Path) -> Path:
+    def _lock_of(self, path: Path) -> str:
         kind = "capture" if path.parent.name == "spool" else path.parent.name
-        return self._lock_path(f"{kind}-{path.name.removesuffix(PART_SUFFIX)}")
+        return f"{kind}-{path.name.removesuffix(PART_SUFFIX)}"
 
     def now(self) -> datetime:
         """Return the time from which the age of stores is counted."""
@@ -332,7 +331,8 @@ class Archive:
 
         Later visits know their prior map by this name.
         """
-        before, name = self.root / uri, Path(to).name
+        before = self.root / uri
+        name = Path(to).name
         manifest = read_manifest(before)
         own = {"run", "rests_on", "files", "format", "seal"}
         with self._named_draft(name) as draft:
@@ -361,11 +361,12 @@ class Archive:
     def new_run(self, name: str) -> RunDraft:
         """Create the folder of one run, which `RunDraft.publish` puts below ``runs``."""
         stem = f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{run_stem(name)}"
-        run_id, number = stem, 1
+        number = 1
         with refusals(self.root, "write to the archive"):
-            while (draft := self._begin_run(run_id)) is None:  # another run of the same second takes the next number
+            draft = self._begin_run(stem)
+            while draft is None:  # another run of the same second takes the next number
                 number += 1
-                run_id = f"{stem}-{number}"
+                draft = self._begin_run(f"{stem}-{number}")
         return draft
 
     def _begin_run(self, run_id: str) -> RunDraft | None:
@@ -409,7 +410,8 @@ class Archive:
 
     def run_folder(self, name: str) -> Path:
         """Return the folder of a published run by name, address or ``latest``. Raises NoRunError."""
-        folders, called = self.runs(), name.rstrip("/").removeprefix("runs/")
+        folders = self.runs()
+        called = name.rstrip("/").removeprefix("runs/")
         folder = next((one for one in reversed(folders) if called in (one.name, LATEST)), None)
         if folder is None:
             known = ", ".join(one.name for one in folders[-5:])
@@ -444,9 +446,9 @@ class Archive:
         return self.root / ".locks" / f"{name}.lock"
 
     @contextmanager
-    def _locked(self, name: str, *, wait: bool = True) -> Iterator[bool]:
+    def _locked(self, name: str, *, wait: bool = True, shared: bool = False) -> Iterator[bool]:
         """Hold a lock while the block runs; yield False where another process holds it and ``wait`` is false."""
-        release = take_lock(self._lock_path(name), wait=wait)
+        release = take_lock(self._lock_path(name), wait=wait, shared=shared)
         try:
             yield release is not None
         finally:

@@ -68,7 +68,8 @@ class Catalogue:
     def ancestors(self, uris: Iterable[str]) -> set[str]:
         """Return all inputs of these stores, direct and indirect, without themselves; missing ones as bare keys."""
         begun = set(uris)
-        found, waiting = set(begun), list(begun)
+        found = set(begun)
+        waiting = list(begun)
         while waiting:
             new = set(self.inputs_of(waiting.pop())) - found
             found |= new
@@ -218,7 +219,8 @@ def version_before(catalogue: Catalogue, uri: str) -> Store | None:
 def changes_between(catalogue: Catalogue, old: Store, new: Store) -> list[Change]:
     """Return the differences of two stores and, for inputs that differ, those within them, down to their origin."""
     found: list[Change] = []
-    seen, waiting = set[tuple[str, str]](), [(old, new)]
+    seen: set[tuple[str, str]] = set()
+    waiting = [(old, new)]
     while waiting:
         before, after = waiting.pop(0)
         if (before.ref.uri, after.ref.uri) in seen:
@@ -241,16 +243,12 @@ def changes_between(catalogue: Catalogue, old: Store, new: Store) -> list[Change
 def flatten(value: object, name: str = "") -> dict[str, Any]:
     """Return nested tables and lists of tables as dotted names: ``camera.samples``, ``sweeps[2].start_px``."""
     if isinstance(value, Mapping) and value:
-        return {
-            inner: one
-            for key, part in value.items()
-            for inner, one in flatten(part, f"{name}.{key}" if name else str(key)).items()
-        }
-    if isinstance(value, list) and any(isinstance(part, Mapping | list) for part in value):
-        return {
-            inner: one for number, part in enumerate(value) for inner, one in flatten(part, f"{name}[{number}]").items()
-        }
-    return {name: value}
+        parts = {f"{name}.{key}" if name else str(key): part for key, part in value.items()}
+    elif isinstance(value, list) and any(isinstance(part, Mapping | list) for part in value):
+        parts = {f"{name}[{number}]": part for number, part in enumerate(value)}
+    else:
+        return {name: value}
+    return {inner: one for at, part in parts.items() for inner, one in flatten(part, at).items()}
 
 
 def _differing(where: str, kind: Kind, old: Mapping[str, Any], new: Mapping[str, Any]) -> list[Change]:

@@ -104,13 +104,6 @@ def listed_bytes(manifest: Mapping[str, Any]) -> int:
     return sum(entry["size"] for entry in manifest["files"].values())
 
 
-def cleared_facts(before: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the facts for the manifest of a store whose files are cleared away: those of ``before``, and the size."""
-    kept = {name: value for name, value in before.items() if name not in ("files", "format", "seal")}
-    at = datetime.now(UTC).isoformat(timespec="milliseconds")
-    return kept | {CLEARED: {"at": at, "bytes_before": listed_bytes(before)}}
-
-
 def is_cleared(manifest: Mapping[str, Any]) -> bool:
     """Return whether a store's files were cleared away."""
     return CLEARED in manifest

@@ -20,7 +20,8 @@ from storage.archive.manifests import as_table, is_cleared, listed_bytes, try_ma
 from storage.archive.staging import MANIFEST_NAME, file_hash
 
 RECEIPT = "receipt.json"
-YEARS, _DAY = range(1900, 2201), re.compile(r"^\d{4}-\d\d-\d\d(?!\d)")
+YEARS = range(1900, 2201)
+_DAY = re.compile(r"^\d{4}-\d\d-\d\d(?!\d)")
 State = Literal["ran", "cached", "skipped", "failed"]  # of a stage of a run
 LINE_PRODUCTS = {"raw_coarse": "signal_coarse", "raw_fine": "signal_fine"}  # of a run: raw lines, and condensed ones
 RESTS_ON = "rests_on"  # in a run's manifest: address of a store or of an input of it -> SHA-256 of its manifest.json
@@ -115,20 +116,18 @@ class Run:
     def names(self) -> frozenset[str]:
         """Return the addresses of its stores and of all their inputs; empty where its manifest is damaged."""
         named = {uri for uri in as_table(self.facts.get(RESTS_ON)) if in_text(uri) == uri}
-        return frozenset(named | self._ingested() if named else named)
-
-    def _ingested(self) -> set[str]:
-        """Return the addresses of ingested cubes of this archive that the survey read."""
-        root, found = self.folder.resolve().parents[1], set[str]()
-        for name in ("scene", "sweeps"):
+        if not named:
+            return frozenset()
+        root = self.folder.resolve().parents[1]
+        for name in ("scene", "sweeps"):  # the survey may have read ingested cubes of this archive
             path = Path(_text(self.settings.get(name))).resolve()
             parts = path.relative_to(root).parts if path.is_relative_to(root) else ()
             if parts[:2] == ("stages", "ingest") and len(parts) > 2:
-                found.add("/".join(parts[:3]))
+                named.add("/".join(parts[:3]))
             _, there, key = _text(self.settings.get(name)).rpartition("/stages/ingest/")
             if there and in_text(uri := f"stages/ingest/{key.split('/')[0]}") == uri:  # of a bucket or a moved archive
-                found.add(uri)
-        return found
+                named.add(uri)
+        return frozenset(named)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -168,25 +167,18 @@ def read_run(folder: Path) -> Run:
     facts, broken = try_manifest(folder)
     problem = broken and f"{MANIFEST_NAME} is damaged: {broken}"
     receipt: dict[str, Any] = {}
-    if broken is None:
-        receipt, problem = _receipt(folder, facts)
+    if broken is None and RECEIPT in facts["files"]:
+        path = folder / RECEIPT
+        try:
+            if file_hash(path) == facts["files"][RECEIPT]["sha256"]:
+                receipt = as_table(json.loads(path.read_bytes()))
+            else:
+                problem = f"{RECEIPT} has changed since it was published (its SHA-256 differs)"
+        except (OSError, ValueError, RecursionError) as error:
+            problem = f"{RECEIPT} cannot be read: {error.strerror if isinstance(error, OSError) else error}"
         if problem is not None and try_manifest(folder)[0] not in ({}, facts):  # something was added to it meanwhile
             return read_run(folder)
     return Run(folder, facts, receipt, problem)
-
-
-def _receipt(folder: Path, facts: Mapping[str, Any]) -> tuple[dict[str, Any], str | None]:
-    """Return the receipt if it is as published, else an empty table and the problem."""
-    entry = facts["files"].get(RECEIPT)
-    if entry is None:
-        return {}, None
-    path = folder / RECEIPT
-    try:
-        if file_hash(path) != entry["sha256"]:
-            return {}, f"{RECEIPT} has changed since it was published (its SHA-256 differs)"
-        return as_table(json.loads(path.read_bytes())), None
-    except (OSError, ValueError, RecursionError) as error:
-        return {}, f"{RECEIPT} cannot be read: {error.strerror if isinstance(error, OSError) else error}"
 
 
 def _text(value: object) -> str:

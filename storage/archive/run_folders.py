@@ -11,7 +11,6 @@ import errno
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from storage.archive.keys import plain
@@ -38,9 +37,7 @@ class RunDraft:
     A draft that ``extends`` a published run replaces it only when `publish` is called.
     """
 
-    def __init__(
-        self, run_id: str, folder: Path, root: Path, release: Callable[[], None], *, extends: bool = False
-    ) -> None:
+    def __init__(self, run_id: str, folder: Path, root: Path, release: Callable[[], None], *, extends: bool) -> None:
         self.id = run_id
         self.folder = folder
         self.extends = extends
@@ -57,9 +54,7 @@ class RunDraft:
     def __enter__(self) -> RunDraft:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, *_: object) -> None:
         try:
             if isinstance(error, OSError):  # of a file that the block wrote by itself
                 with refusals(self._root, "write to the archive"):
@@ -86,10 +81,8 @@ class RunDraft:
         final = self.published
         with refusals(self._root, "write to the archive"):
             self._write_manifest(rests_on, facts)
-            if self.extends:
-                take_its_place(self.folder, final)
-            else:
-                rename_into_place(self.folder, final)
+            put_in_place = take_its_place if self.extends else rename_into_place
+            put_in_place(self.folder, final)
         self._done = True
         if self.send is not None:
             self.send(f"runs/{self.id}")

@@ -36,7 +36,9 @@ from storage.arrays.layout import (
 
 CONFIDENCE = {"long_name": "probability of the class given", "units": "1", "valid_range": [0.0, 1.0]}
 CONFIDENCE_STEP = 1 / 256
-STEP, FAINTEST, NOTHING = 0.05, -12.7, 255  # nats; 254 is certainty, 255 unknown
+STEP = 0.05  # nats
+FAINTEST = -12.7  # nats
+NOTHING = 255  # unknown; 254 is certainty
 LEAST, UNLIKELY = -7.0, -11.0  # nats: lower values are stored as their mean, in a tenth of the bytes
 # values of the images in unknown pixels
 NOT_BELIEVED = {"log_probability": NOTHING, "age": np.nan, "light": 0}
@@ -64,7 +66,8 @@ class ClassNames:
     colours: NDArray[np.uint8]  # (class, 3)
 
 
-UNKNOWN, UNKNOWN_COLOUR = "unknown", (200, 0, 200)
+UNKNOWN = "unknown"
+UNKNOWN_COLOUR = (200, 0, 200)
 
 
 def unknown_name(names: Sequence[str]) -> str:
@@ -138,7 +141,8 @@ def legend_of(group: zarr.Group) -> ClassNames:
 def load_class_map(path: Path) -> ClassMap:
     """Read a class map. Raises IncompleteStoreError where it is missing or damaged."""
     group = open_group(path)
-    classes, confidence, legend = read_array(group, "classes"), read_array(group, "confidence"), legend_of(group)
+    classes, confidence = (read_array(group, name) for name in ("classes", "confidence"))
+    legend = legend_of(group)
     return ClassMap(classes, confidence, legend.names, legend.colours, grid_of(dict(group.attrs)))
 
 
@@ -166,10 +170,11 @@ def create_probabilities(
         **place,
     }
     _create_flat(group, "log_probability", ("y", "x", "class"), (*shape, len(legend.names)), "|u1", about)
-    about = {"long_name": "time since the pixel was looked at", "units": "days", **place}
-    _create_flat(group, "age", ("y", "x"), shape, "<f4", about)
-    about = {"long_name": "reference exposures that it rests on", "units": "1", **place}
-    _create_flat(group, "light", ("y", "x"), shape, "<f4", about)
+    for name, title, units in (
+        ("age", "time since the pixel was looked at", "days"),
+        ("light", "reference exposures that it rests on", "1"),
+    ):
+        _create_flat(group, name, ("y", "x"), shape, "<f4", {"long_name": title, "units": units, **place})
     if goes_on:
         _create_flat(group, OLD_CLASS, ("y", "x"), shape, "|u1", {**old_class_flags(legend), **place})
 
@@ -199,9 +204,9 @@ def write_probabilities_tile(
 
     Raises IncompleteStoreError: there is no store.
     """
-    group, place = open_group(path, "r+"), tile_place(origin, age_days.shape)
+    group = open_group(path, "r+")
     for name, values in (("log_probability", packed), ("age", age_days), ("light", light)):
-        array_of(group, name)[place] = values
+        array_of(group, name)[tile_place(origin, age_days.shape)] = values
 
 
 def write_changes_tile(path: Path, origin: tuple[int, int], old_class: NDArray[np.uint8]) -> None:
@@ -214,9 +219,8 @@ def write_changes_tile(path: Path, origin: tuple[int, int], old_class: NDArray[n
 
 def drop_changes(path: Path) -> None:
     """Remove the previous classes from stored class probabilities."""
-    group = open_group(path, "r+")
     with damage_named(str(path)):
-        del group[OLD_CLASS]
+        del open_group(path, "r+")[OLD_CLASS]
 
 
 def write_changes(path: Path, changed: Floats, patch_px: int) -> None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.scan import Sweep
@@ -54,10 +53,14 @@ class SweepHeader:
     @property
     def attributes(self) -> dict[str, Any]:
         """Facts that a store of the sweep has as attributes."""
-        facts: dict[str, Any] = {"sweep": asdict(self.sweep), "source": self.source}
-        facts |= {} if self.started is None else {"started": self.started}
-        facts |= {"by_mirror": True} if self.references.by_mirror else {}
-        return facts | ({} if self.simulation is None else {"simulation": dict(self.simulation)})
+        facts = {
+            "sweep": asdict(self.sweep),
+            "source": self.source,
+            "started": self.started,
+            "by_mirror": True if self.references.by_mirror else None,
+            "simulation": None if self.simulation is None else dict(self.simulation),
+        }
+        return {name: fact for name, fact in facts.items() if fact is not None}
 
 
 class RawCubeWriter:
@@ -87,9 +90,7 @@ class RawCubeWriter:
     def __enter__(self) -> RawCubeWriter:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None:
             self.close()
 
@@ -109,11 +110,12 @@ class RawCubeWriter:
                 f"capture the rest before closing the cube"
             )
         self._flush()
-        write_line_facts(self._group, self._facts, self._header.started)
+        write_line_facts(self._group, zip(*self._facts, strict=True), self._header.started)
 
     def _flush(self) -> None:
         if self._waiting:
-            first, block = self._waiting[0].number, np.stack([line.data for line in self._waiting])
+            first = self._waiting[0].number
+            block = np.stack([line.data for line in self._waiting])
             self._dn[first : first + len(block)] = block
             self._passed_on(self._waiting, block)
             self._waiting.clear()
@@ -134,19 +136,20 @@ def write_references(group: zarr.Group, references: References) -> None:
             write_small(group, name, dims, np.asarray(values, kind), {"long_name": title, **about})
 
 
-def write_line_facts(
-    group: zarr.Group, facts: Sequence[tuple[float, float, float, float, bool]], started: str | None
-) -> None:
-    """Store time, mirror position X and Y, exposure and validity of every line."""
-    times, x, y, exposures, valid = (np.array(column) for column in zip(*facts, strict=True))
+def write_line_facts(group: zarr.Group, facts: Iterable[ArrayLike], started: str | None) -> None:
+    """Store the columns ``facts``: time, mirror position X and Y, exposure and validity of every line."""
+    times, x, y, exposures, valid = (np.array(column) for column in facts)
     since = {"units": "s"} if started is None else {"units": f"seconds since {started}", "standard_name": "time"}
-    about_time = {"long_name": "mid exposure, since the start of the sweep", **since}
     position = {"long_name": "mirror position at mid exposure", "units": "1", "valid_range": [-1.0, 1.0]}
-    write_small(group, "time", ("line",), times.astype(np.float64), about_time)
-    write_small(group, "mirror_x", ("line",), x.astype(np.float64), position)
-    write_small(group, "mirror_y", ("line",), y.astype(np.float64), position)
-    write_small(group, "exposure_ms", ("line",), exposures.astype(np.float64), {"units": "ms"})
-    write_small(group, "valid_line", ("line",), valid.astype(np.bool_), {"long_name": "line can be used"})
+    columns: dict[str, tuple[NDArray[Any], type[np.generic], dict[str, Any]]] = {
+        "time": (times, np.float64, {"long_name": "mid exposure, since the start of the sweep", **since}),
+        "mirror_x": (x, np.float64, position),
+        "mirror_y": (y, np.float64, position),
+        "exposure_ms": (exposures, np.float64, {"units": "ms"}),
+        "valid_line": (valid, np.bool_, {"long_name": "line can be used"}),
+    }
+    for name, (values, kind, about) in columns.items():
+        write_small(group, name, ("line",), values.astype(kind), about)
 
 
 @dataclass(frozen=True)

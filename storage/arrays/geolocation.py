@@ -17,8 +17,6 @@ from storage.arrays.layout import create_group, damage_named, open_group, read_a
 
 Tables = Mapping[str, Sequence[tuple[ScanPath, TieTable]]]
 
-_TANGENT = "tangent of the undeflected direction's plane"
-
 
 def path_digest(
     position: NDArray[np.floating], usable: NDArray[np.bool_] | None = None, shift: NDArray[np.floating] | None = None
@@ -72,23 +70,26 @@ def _write_scan_path(sweep: zarr.Group, name: str, scan_path: ScanPath, table: T
             "samples": table.samples,
         },
     )
-    about = {"long_name": "line centre on the scan axis", "units": "1", "comment": _TANGENT}
-    write_small(group, "scan", ("knot",), scan_path.scan, about)
-    about = {"long_name": "line centre along the line", "units": "1", "comment": _TANGENT}
-    write_small(group, "across", ("knot",), scan_path.across, about)
-    write_small(group, "lines", ("member",), scan_path.lines.astype(np.int64), {"long_name": "line of each member"})
-    write_small(
-        group, "starts", ("knot",), scan_path.starts.astype(np.int64), {"long_name": "first member of each knot"}
-    )
-    write_small(group, "seen", ("knot",), scan_path.seen, {"long_name": "whether any line saw the knot"})
+    tangent = {"units": "1", "comment": "tangent of the undeflected direction's plane"}
+    columns: dict[str, tuple[str, NDArray[Any], dict[str, str]]] = {
+        "scan": ("knot", scan_path.scan, {"long_name": "line centre on the scan axis", **tangent}),
+        "across": ("knot", scan_path.across, {"long_name": "line centre along the line", **tangent}),
+        "lines": ("member", scan_path.lines.astype(np.int64), {"long_name": "line of each member"}),
+        "starts": ("knot", scan_path.starts.astype(np.int64), {"long_name": "first member of each knot"}),
+        "seen": ("knot", scan_path.seen, {"long_name": "whether any line saw the knot"}),
+    }
+    for array, (dim, values, words) in columns.items():
+        write_small(group, array, (dim,), values, words)
     about = {"long_name": "knot coordinate and sample of every spacing-th pixel", "units": "1"}
     write_image(group, "tie_points", ("tie_y", "tie_x", "coordinate"), table.tie_points, about)
 
 
 def _read_scan_path(group: zarr.Group) -> tuple[ScanPath, TieTable]:
     about: dict[str, Any] = dict(group.attrs)
-    width, bound = float(about["width"]), float(about["bound_px"])
-    spacing, samples = int(about["spacing"]), int(about["samples"])
+    width = float(about["width"])
+    bound = float(about["bound_px"])
+    spacing = int(about["spacing"])
+    samples = int(about["samples"])
     shape, corner, kept = ((int(about[name][0]), int(about[name][1])) for name in ("shape", "corner", "kept"))
     seen = read_array(group, "seen")
     lines, starts = (read_array(group, name).astype(np.intp) for name in ("lines", "starts"))

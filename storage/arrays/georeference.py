@@ -69,10 +69,10 @@ class AngularGrid:
 
     def coordinates(self, shape: tuple[int, int]) -> dict[str, SmallArray]:
         """Return the coordinates y and x [rad] of the pixel centres of an image of (y, x) ``shape``."""
-        step, found = self.ifov_rad * self.factor, {}
+        found: dict[str, SmallArray] = {}
         for name, size, whole in zip("yx", shape, self.scene_shape, strict=True):
             about = {"long_name": f"tangent of the angle from the undeflected direction along {name}", "units": "rad"}
-            centres = -whole / 2 * self.ifov_rad + step * (np.arange(size) + 0.5)
+            centres = -whole / 2 * self.ifov_rad + self.ifov_rad * self.factor * (np.arange(size) + 0.5)
             found[name] = SmallArray((name,), centres, {**about, "axis": name.upper()})
         return found
 
@@ -129,11 +129,12 @@ def map_attributes(geobox: GeoBox) -> dict[str, Any]:
 
 def map_coordinates(geobox: GeoBox) -> dict[str, SmallArray]:
     """Return ``x``, ``y`` and the grid mapping ``spatial_ref`` of a map by CF's rules."""
-    crs, found = _crs_of(geobox), {}
+    found: dict[str, SmallArray] = {}
     a, _, c, _, e, f = (float(number) for number in geobox.affine[:6])
     for name, size, step, first in (("x", geobox.shape[1], a, c), ("y", geobox.shape[0], e, f)):
         if geobox.axis_aligned:
-            about, centres = _axis(crs, name), np.arange(size) * step + (first + step / 2)
+            about = _axis(_crs_of(geobox), name)
+            centres = np.arange(size) * step + (first + step / 2)
         else:
             about = {"long_name": f"pixels along {name}; the grid is turned, see GeoTransform", "units": "pixel"}
             centres = np.arange(size) + 0.5
@@ -201,10 +202,12 @@ def find_geobox(
     said = next((about[name] for about, names in places for name in names if about.get(name)), None)
     if said is None:
         return None
-    crs, numbers = odc_crs.CRS(said), str(mapping.get("GeoTransform", "")).split()
+    crs = odc_crs.CRS(said)
+    numbers = str(mapping.get("GeoTransform", "")).split()
     if len(numbers) == 6:
         upright = Affine.from_gdal(*map(float, numbers))
-        flipped, axes = upright * Affine(1, 0, 0, 0, -1, shape[0]), _transform_of_axes(arrays, dims)
+        flipped = upright * Affine(1, 0, 0, 0, -1, shape[0])
+        axes = _transform_of_axes(arrays, dims)
         # GDAL stores netCDF from the bottom up, with the GeoTransform of the image upright.
         bottom_up = axes is not None and axes.almost_equals(flipped, _EVEN * abs(upright.e))
         return odc_geobox.GeoBox(shape, flipped if bottom_up else upright, crs)

@@ -102,7 +102,7 @@ class GroundMapWriter:
         names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
         facts = {**place, **names, **about}
         self._group = create_group(path, "class map on the ground", facts, map_coordinates(geobox))
-        self._shape, self._legend = tuple(geobox.shape), legend
+        self._legend = legend
         images: dict[str, tuple[str, Mapping[str, Any]]] = {
             "classes": ("|u1", class_flags(legend.names, legend.colours)),
             "confidence": ("<f4", CONFIDENCE),
@@ -114,7 +114,7 @@ class GroundMapWriter:
         self._images: dict[str, zarr.Array[Any]] = {}
         for name, (kind, words) in images.items():
             rest = {"rgb": 3} if name == PICTURE else {}
-            spec = image_spec(("y", "x", *rest), (*self._shape, *rest.values()), kind)
+            spec = image_spec(("y", "x", *rest), (*geobox.shape, *rest.values()), kind)
             self._images[name] = create_array(self._group, name, spec, {**words, **place, **ON_THE_MAP})
 
     def write_block(self, rows: slice, columns: slice, images: Mapping[str, NDArray[np.generic]]) -> None:

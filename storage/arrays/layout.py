@@ -118,7 +118,7 @@ def create_array(
     ``packing`` is blosc's codec and its level. Most pixels of a ``flat`` image, such as a map, equal their neighbours.
     Its bytes are packed channel after channel, and its files lie in one folder.
     """
-    kind, (codec, level) = np.dtype(spec.dtype), packing
+    kind = np.dtype(spec.dtype)
     shuffle = zarr_codecs.BloscShuffle.shuffle if flat else zarr_codecs.BloscShuffle.bitshuffle
     fill: Any = np.nan if kind.kind == "f" else attributes.get("_FillValue", attributes.get("nodata", 0))
     return group.create_array(
@@ -132,7 +132,7 @@ def create_array(
         attributes=dict(attributes),
         filters=(zarr_codecs.TransposeCodec(order=(2, 0, 1)),) if flat and len(spec.shape) == 3 else None,
         compressors=(
-            zarr_codecs.BloscCodec(cname=codec, clevel=level, shuffle=shuffle, typesize=kind.itemsize),
+            zarr_codecs.BloscCodec(cname=packing[0], clevel=packing[1], shuffle=shuffle, typesize=kind.itemsize),
             zarr_codecs.Crc32cCodec(),
         ),
         chunk_key_encoding={"name": "default", "separator": "." if flat else "/"},
@@ -199,11 +199,14 @@ def steps_within(scores: NDArray[np.floating], step: float, kind: np.dtype[Any])
 
 def write_components(group: zarr.Group, components: Components) -> None:
     """Store the components that restore spectra."""
-    about, rows = {"coordinates": "wavelength", "units": "1"}, components.axes * np.nan_to_num(components.noise)
-    write_small(group, "axes", ("component", "band"), rows, {"long_name": "scene value of a score of 1", **about})
-    write_small(group, "mean", ("band",), components.mean, {"long_name": "mean scene value", **about})
-    noise = {"long_name": "standard deviation of one spectrum's noise", **about}
-    write_small(group, "noise", ("band",), components.noise, noise)
+    rows = components.axes * np.nan_to_num(components.noise)
+    arrays: dict[str, tuple[tuple[str, ...], NDArray[Any], str]] = {
+        "axes": (("component", "band"), rows, "scene value of a score of 1"),
+        "mean": (("band",), components.mean, "mean scene value"),
+        "noise": (("band",), components.noise, "standard deviation of one spectrum's noise"),
+    }
+    for name, (dims, values, title) in arrays.items():
+        write_small(group, name, dims, values, {"long_name": title, "coordinates": "wavelength", "units": "1"})
     if components.spread is not None:
         spread = {"long_name": "mean square of the scores of the field", "units": "1"}
         write_small(group, "spread", ("component",), components.spread, spread)
@@ -219,15 +222,15 @@ def read_components(group: zarr.Group) -> Components:
 
 def step_of(group: zarr.Group, said: str = "scale_factor") -> float:
     """Return the step of a store's scores, or another numeric attribute (IncompleteStoreError: damaged)."""
-    scores = array_of(group, "scores")
     with damage_named(str(group.store_path)):
-        return float(scores.attrs[said])  # type: ignore[arg-type]
+        return float(array_of(group, "scores").attrs[said])  # type: ignore[arg-type]
 
 
 def score_layout(group: zarr.Group) -> tuple[tuple[int, int], tuple[int, int]]:
     """Return the rows and columns of scores, and of a shard of them (IncompleteStoreError: damaged)."""
     scores = array_of(group, "scores")
-    (_, rows, columns), (_, deep, wide) = scores.shape, scores.shards or scores.chunks
+    _, rows, columns = scores.shape
+    _, deep, wide = scores.shards or scores.chunks
     return (rows, columns), (deep, wide)
 
 
@@ -282,9 +285,8 @@ def read_array(group: zarr.Group, name: str, selection: Any = ...) -> NDArray[An
 
     Raises IncompleteStoreError: there is no such array, or a checksum says that its bytes have changed.
     """
-    array = array_of(group, name)
     with damage_named(f"{group.store_path}/{name}"):
-        return np.asarray(array[selection])
+        return np.asarray(array_of(group, name)[selection])
 
 
 def read_bands(group: zarr.Group) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:

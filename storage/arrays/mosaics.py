@@ -39,7 +39,8 @@ from storage.arrays.layout import (
 )
 
 CAPTURES = "capture"  # array of a mosaic whose pixels were captured in several ways
-RGB_NM, FAR_NM = (640.0, 550.0, 460.0), 60.0  # shown as red, green and blue; the farthest band that is
+RGB_NM = (640.0, 550.0, 460.0)  # shown as red, green and blue
+FAR_NM = 60.0  # the farthest band that is
 MID_GREY = 0.42  # of the median of a picture
 HALF = 0.5  # least fraction of its finer pixels with which a pixel has a value
 
@@ -242,14 +243,15 @@ def write_attention(path: Path, attention: Attention) -> None:
     """Store scores and ranks."""
     group = create_group(path, "attention", {"policy": attention.policy})
     write_counts(group, patch_y=attention.score.shape[0], patch_x=attention.score.shape[1])
-    dims = ("patch_y", "patch_x")
-    about = {"long_name": f"worth of a fine look, policy {attention.policy}", "units": "1"}
-    write_image(group, "score", dims, np.asarray(attention.score, np.float64), about)
-    about = {"long_name": "order in which the patch was chosen, from 0; -1 where it was not", "units": "1"}
-    write_image(group, "rank", dims, np.asarray(attention.rank, np.int32), about)
-    if attention.changed is not None:
-        about = {"long_name": "fraction of pixels whose class the full network changed", "units": "1"}
-        write_image(group, "changed", dims, np.asarray(attention.changed, np.float32), about)
+    images: dict[str, tuple[Any, type[np.generic], str]] = {
+        "score": (attention.score, np.float64, f"worth of a fine look, policy {attention.policy}"),
+        "rank": (attention.rank, np.int32, "order in which the patch was chosen, from 0; -1 where it was not"),
+        "changed": (attention.changed, np.float32, "fraction of pixels whose class the full network changed"),
+    }
+    for name, (values, kind, title) in images.items():
+        if values is not None:
+            about = {"long_name": title, "units": "1"}
+            write_image(group, name, ("patch_y", "patch_x"), np.asarray(values, kind), about)
 
 
 def load_attention(path: Path) -> Attention:
@@ -280,7 +282,8 @@ def choose_bands(wavelength_nm: NDArray[np.floating]) -> tuple[tuple[int, int, i
         return (0, 0, 0), f"grey, {waves[0]:.0f} nm"
     kind = "true colour"
     if len({red, green, blue}) < 3 or off > FAR_NM:
-        kind, order = "false colour", np.argsort(waves, kind="stable")
+        kind = "false colour"
+        order = np.argsort(waves, kind="stable")
         red, green, blue = (int(order[place]) for place in (-1, (len(order) - 1) // 2, 0))
     return (red, green, blue), f"{kind}, {waves[red]:.0f} / {waves[green]:.0f} / {waves[blue]:.0f} nm"
 

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,8 +62,7 @@ MOST_DN = np.iinfo(np.uint16).max
 SIGNAL_ARRAYS = ("scores", "quality", "axes", "mean", "noise", "rare_line", "rare_sample", "rare_residual")
 
 
-@dataclass(frozen=True)
-class LineRows:
+class LineRows(NamedTuple):
     """Facts of every line, (line,) each."""
 
     time_s: NDArray[np.float64]
@@ -71,11 +70,6 @@ class LineRows:
     mirror_y: NDArray[np.float64]
     exposure_ms: NDArray[np.float64]
     valid: NDArray[np.bool_]
-
-    def rows(self) -> list[tuple[float, float, float, float, bool]]:
-        """Return the facts of each line as a tuple."""
-        columns = (self.time_s, self.mirror_x, self.mirror_y, self.exposure_ms, self.valid)
-        return list(zip(*(column.tolist() for column in columns), strict=True))
 
 
 class SignalCubeWriter:
@@ -93,7 +87,8 @@ class SignalCubeWriter:
     ) -> None:
         """Create a sweep; ``largest`` is the greatest absolute score, ``frames_of`` a sweep with the same frames."""
         lines, samples, _ = header.shape
-        self._header, self._step = header, step
+        self._header = header
+        self._step = step
         shared = {} if frames_of is None else {FRAMES_OF: frames_of}
         self.group = create_group(path, f"condensed sweep {header.sweep.name}", header.attributes | shared)
         write_bands(self.group, header.wavelength_nm, header.fwhm_nm)
@@ -112,7 +107,8 @@ class SignalCubeWriter:
 
     def write(self, first: int, scores: NDArray[np.floating], quality: NDArray[np.uint8]) -> None:
         """Store (line, sample, component) scores from a line on, a multiple of 64."""
-        steps, stop = steps_within(scores, self._step, self._scores.dtype), first + len(scores)
+        steps = steps_within(scores, self._step, self._scores.dtype)
+        stop = first + len(scores)
         if steps.shape[2]:
             self._scores[:, first:stop] = np.ascontiguousarray(steps.transpose(2, 0, 1)).astype(self._scores.dtype)
         self._seen[first:stop] = quality
@@ -120,7 +116,7 @@ class SignalCubeWriter:
     def close(self, facts: LineRows, rare: NDArray[np.intp], residuals: NDArray[np.int32]) -> None:
         """Store quality, facts of lines, and (rare, 2) lines and samples with (rare, band) residual steps."""
         self._quality[...] = self._seen
-        write_line_facts(self.group, facts.rows(), self._header.started)
+        write_line_facts(self.group, facts, self._header.started)
         for name, column in (("rare_line", 0), ("rare_sample", 1)):
             write_small(self.group, name, ("rare",), rare[:, column].astype(np.int32), {"units": "1"})
         about = {"long_name": "residual of a rare spectrum", "units": "1", "scale_factor": RESIDUAL_STEP}

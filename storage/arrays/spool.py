@@ -30,7 +30,6 @@ import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any, BinaryIO
 from urllib.parse import quote
 
@@ -56,7 +55,8 @@ class Spool:
         self.path = path
         self.samples, self.bands = shape
         self.count = 0  # lines in the file: the number of the next one
-        self._head, self._seed = head, zlib.crc32(head)
+        self._head = head
+        self._seed = zlib.crc32(head)
         self._size = _FACTS.size + _CRC.size + 2 * shape[0] * shape[1]  # of a record
         self._file: BinaryIO | None = None
 
@@ -80,9 +80,7 @@ class Spool:
     def __enter__(self) -> Spool:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         try:
             self.close()
         except RigError:
@@ -120,13 +118,14 @@ class Spool:
             with _refusals(self.path, self.count):
                 os.fdatasync(self._file.fileno())
 
-    def blocks(self, size: int = SYNC_LINES) -> Iterator[list[Line]]:
-        """Yield the lines in blocks of ``size``; the last may be shorter. A damaged line is not valid."""
-        nothing, unknown = np.zeros((self.samples, self.bands), np.uint16), (float("nan"),) * 4
+    def blocks(self) -> Iterator[list[Line]]:
+        """Yield the lines in blocks of 64; the last may be shorter. A damaged line is not valid."""
+        nothing = np.zeros((self.samples, self.bands), np.uint16)
+        unknown = (float("nan"),) * 4
         with self.path.open("rb") as file:
             file.seek(len(self._head))
-            for first in range(0, self.count, size):
-                read = [self._line(one, file.read(self._size)) for one in range(first, min(first + size, self.count))]
+            for first in range(0, self.count, SYNC_LINES):
+                read = [self._line(n, file.read(self._size)) for n in range(first, min(first + SYNC_LINES, self.count))]
                 yield [line or Line(n, nothing, *unknown, valid=False) for n, line in enumerate(read, first)]
 
     def close(self) -> None:
@@ -215,7 +214,14 @@ class FetchedFiles:
         """
         path = self._path(name)
         with _unread(path):
-            self._compare(name, path)
+            if name not in self._crc32 and not _is_note(name):  # bytes that no sum covers are cut off, once for a file
+                reached, crc32, count = _agreeing(path)
+                if path.exists() and path.stat().st_size > reached:
+                    LOG.warning("%s: cut off at byte %d: the rest is damaged or was not synced", path, reached)
+                    os.truncate(path, reached)
+                if _sums_of(path).exists():
+                    os.truncate(_sums_of(path), count * _SUM.size)
+                self._crc32[name] = crc32
             return path.stat().st_size if path.exists() else 0
 
     def read(self, name: str, start: int, stop: int) -> bytes:
@@ -229,7 +235,8 @@ class FetchedFiles:
 
     def append(self, name: str, data: bytes) -> None:
         """Add bytes at the end. Raises NotKept: the disk refuses; a part that was written is removed again."""
-        path, before = self._path(name), self.size(name)
+        path = self._path(name)
+        before = self.size(name)
         try:
             if not before:
                 self.folder.mkdir(parents=True, exist_ok=True)
@@ -253,18 +260,6 @@ class FetchedFiles:
                 "before it are kept, and the camera still has the file"
             ) from error
 
-    def _compare(self, name: str, path: Path) -> None:
-        """Cut off the bytes that no sum covers, once for each file; notes have checksums of their own."""
-        if name in self._crc32 or _is_note(name):
-            return
-        reached, crc32, count = _agreeing(path)
-        if path.exists() and path.stat().st_size > reached:
-            LOG.warning("%s: cut off at byte %d: the rest is damaged or was not synced", path, reached)
-            os.truncate(path, reached)
-        if _sums_of(path).exists():
-            os.truncate(_sums_of(path), count * _SUM.size)
-        self._crc32[name] = crc32
-
     def _path(self, name: str) -> Path:
         named = quote(name.strip("/"), safe="")
         if not named or len(named) > _LONGEST:
@@ -283,7 +278,7 @@ def _sums_of(path: Path) -> Path:
 def _agreeing(path: Path) -> tuple[int, int, int]:
     """Return up to which byte a file agrees with its sums, the CRC-32 of these bytes, and the number of such sums."""
     reached, crc32, count = 0, 0, 0
-    try:
+    with suppress(FileNotFoundError):
         sums = _sums_of(path).read_bytes()
         with path.open("rb") as file:
             for to, expected in _SUM.iter_unpack(sums[: len(sums) // _SUM.size * _SUM.size]):
@@ -293,8 +288,6 @@ def _agreeing(path: Path) -> tuple[int, int, int]:
                 if (at, found) != (to, expected):
                     break
                 reached, crc32, count = at, found, count + 1
-    except FileNotFoundError:
-        pass
     return reached, crc32, count
 
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
 from pipeline.errors import ArchiveError
+from pipeline.geometry.grid import cuts
 from pipeline.rig.camera.camera_texts import DATA_TYPES
 from storage.archive.whole_files import make_folder, write_whole, written_aside
 from storage.arrays.class_maps import ClassNames
@@ -99,7 +100,8 @@ def _write_cog(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> No
 
 def _write_plain(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> None:
     """Write an uncompressed TIFF in strips, block by block; GDAL makes the cloud-optimised file from it."""
-    (y, x), crs = image.geobox.shape, image.geobox.crs
+    y, x = image.geobox.shape
+    crs = image.geobox.crs
     profile = {
         "driver": "GTiff",
         "height": y,
@@ -117,10 +119,12 @@ def _write_plain(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> 
         _tag_wavelengths(file, image)
         if image.legend is not None:
             names = image.legend.names
-            flags = {f"CLASS_{number}": name for number, name in enumerate(names)}
-            flags["flag_values"] = ", ".join(str(number) for number in range(len(names)))
-            flags["flag_meanings"] = " ".join("_".join(name.split()) for name in names)
-            file.update_tags(1, **flags)
+            file.update_tags(
+                1,
+                **{f"CLASS_{number}": name for number, name in enumerate(names)},
+                flag_values=", ".join(str(number) for number in range(len(names))),
+                flag_meanings=" ".join("_".join(name.split()) for name in names),
+            )
             colours = enumerate(image.legend.colours.tolist())
             file.write_colormap(1, {number: (*colour, 255) for number, colour in colours})
         for first, values in blocks:
@@ -137,7 +141,8 @@ def _tag_wavelengths(file: Any, image: CogImage) -> None:
         own = {"CENTRAL_WAVELENGTH_UM": f"{centre / 1000:.9g}"}
         usual = {"wavelength": f"{centre:.9g}", "wavelength_units": "Nanometers"}
         if width is not None:
-            own["FWHM_UM"], usual["fwhm"] = f"{width / 1000:.9g}", f"{width:.9g}"
+            own["FWHM_UM"] = f"{width / 1000:.9g}"
+            usual["fwhm"] = f"{width:.9g}"
         file.update_tags(band, ns="IMAGERY", **own)
         file.update_tags(band, **usual)
 
@@ -160,7 +165,8 @@ def write_envi(header: Path, file: EnviFile, blocks: Blocks) -> Path:
 
     Both files replace earlier ones together. Blocks of lines come in order. Raises ArchiveError: the disk refuses.
     """
-    data, kind = header.with_suffix(file.ending), np.dtype(file.dtype).newbyteorder("<")
+    data = header.with_suffix(file.ending)
+    kind = np.dtype(file.dtype).newbyteorder("<")
     text = "".join(["ENVI\n", *(f"{key} = {value}\n" for key, value in _header_fields(file, kind))])
     with written_aside(header.parent, [data.name, header.name]) as aside:
         with (aside / data.name).open("wb") as stream:
@@ -207,16 +213,12 @@ def write_recorded_files(cube: RawCube, folder: Path) -> Path:
     """
     make_folder(folder)
     name = cube.sweep.name
-
-    def blocks() -> Iterator[tuple[int, NDArray[Any]]]:
-        for first in range(0, cube.shape[0], SHARD_ROWS):
-            yield first, cube.read(first, min(first + SHARD_ROWS, cube.shape[0]))
-
-    header, bands = folder / f"{name}.hdr", EnviFile(cube.shape, "u2", cube.wavelength_nm, cube.fwhm_nm)
-    axis, what = {"line axis": cube.sweep.along}, "restored" if isinstance(cube, RestoredCube) else "raw"
-    write_envi(
-        header, replace(bands, description=f"{what} numbers of sweep {name}", ending=".bil", more=axis), blocks()
-    )
+    header = folder / f"{name}.hdr"
+    bands = EnviFile(cube.shape, "u2", cube.wavelength_nm, cube.fwhm_nm)
+    axis = {"line axis": cube.sweep.along}
+    what = "restored" if isinstance(cube, RestoredCube) else "raw"
+    blocks = ((rows.start, cube.read(rows.start, rows.stop)) for rows in cuts(cube.shape[0], SHARD_ROWS))
+    write_envi(header, replace(bands, description=f"{what} numbers of sweep {name}", ending=".bil", more=axis), blocks)
     known = cube.references
     white_reference = ", ".join(repr(value) for value in known.white_reference.astype(np.float64).tolist())
     of_white = {"white_reference": f"{{{white_reference}}}", **({"mirror at rest": "1"} if known.by_mirror else {})}

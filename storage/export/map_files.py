@@ -108,7 +108,8 @@ def write_task_data(folder: Path, grid: TaskGrid, text: TaskText) -> tuple[Path,
     if steps.max(initial=0) > MOST_NUMBER:
         most = MOST_NUMBER / grid.unit.per_unit
         raise SettingsError(f"task data hold doses up to {most:.0f} {grid.unit.name}, got {np.nanmax(grid.doses):g}")
-    numbers, place = steps.astype("<i4").tobytes(), folder / FOLDER
+    numbers = steps.astype("<i4").tobytes()
+    place = folder / FOLDER
     with written_aside(place, [NUMBERS, XML]) as aside:
         (aside / NUMBERS).write_bytes(numbers)
         tree = ElementTree.ElementTree(_task_file(grid, text, len(numbers)))

@@ -41,7 +41,8 @@ def footprint(geobox: GeoBox) -> dict[str, Any]:
 
     A map across 180 degrees of longitude is cut there, as RFC 7946 asks for; one around a pole has all longitudes.
     """
-    place, (height, width) = map_attributes(geobox), geobox.shape
+    place = map_attributes(geobox)
+    height, width = geobox.shape
     transformer = pyproj.Transformer.from_crs(place["proj:wkt2"], "EPSG:4326", always_xy=True)
     a, b, c, d, e, f = place["spatial:transform"]
     outline = shapely.segmentize(shapely.box(0, 0, width, height), max(height, width) / EDGE_POINTS)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from datetime import datetime
 from typing import Literal
 
 from pipeline.errors import SettingsError
@@ -72,8 +71,7 @@ def clear_up(
                     progress(removal, number / len(plan.removals))
                 if removal.what == "store":
                     path = archive.root / removal.uri
-                    ref = StageRef(path.parent.name, path.name, path)
-                    removed = archive.discard(ref, wait=False, unnamed=True)
+                    removed = archive.discard(StageRef(path.parent.name, path.name, path), wait=False, unnamed=True)
                 else:
                     removed = archive.drop_leftover(removal.uri)
                 if removed:  # else another process holds it
@@ -94,7 +92,19 @@ def plan_clearance(archive: Archive, *, keep_days: float = 1.0, raw_too: bool = 
         raise SettingsError(f"--keep-days {keep_days}: expected a number of days, 0 or more")
     catalogue = Catalogue.read(archive.root)
     named = set[str]().union(*(run.names for run in catalogue.runs))
-    spared = _spared(catalogue, named, keep_days, raw_too, archive.now())
+    spared: dict[str, str] = {}
+    now_s = archive.now().timestamp()
+    for uri, store in catalogue.stores.items():
+        if uri in named:
+            continue
+        try:
+            published_s = (store.ref.path / MANIFEST_NAME).stat().st_mtime  # or copied here
+        except FileNotFoundError:
+            continue  # another process has removed it
+        if now_s - published_s < keep_days * DAY_S:
+            spared[uri] = f"younger than {keep_days:g} days"
+        elif not raw_too and catalogue.is_only_copy(uri):
+            spared[uri] = "raw lines that cannot be had again; --raw-too removes them"
     below = catalogue.ancestors(spared) & set(catalogue.stores) - named
     kept = dict.fromkeys(below, "an input of a store that stays") | spared
     obstacle = _obstacle(archive, catalogue, kept)
@@ -106,23 +116,6 @@ def plan_clearance(archive: Archive, *, keep_days: float = 1.0, raw_too: bool = 
         Removal(uri, "leftover", size, "its process has ended") for uri, size in archive.leftovers(keep_days).items()
     ]
     return Clearance((*removals, *left), kept, obstacle)
-
-
-def _spared(catalogue: Catalogue, named: set[str], keep_days: float, raw_too: bool, now: datetime) -> dict[str, str]:
-    """Return the stores that no run names and that stay, with the reason."""
-    kept: dict[str, str] = {}
-    for uri, store in catalogue.stores.items():
-        if uri in named:
-            continue
-        try:
-            published = (store.ref.path / MANIFEST_NAME).stat().st_mtime  # or copied here
-        except FileNotFoundError:
-            continue  # another process has removed it
-        if now.timestamp() - published < keep_days * DAY_S:
-            kept[uri] = f"younger than {keep_days:g} days"
-        elif not raw_too and catalogue.is_only_copy(uri):
-            kept[uri] = "raw lines that cannot be had again; --raw-too removes them"
-    return kept
 
 
 def _obstacle(archive: Archive, catalogue: Catalogue, kept: Iterable[str]) -> str | None:

@@ -44,7 +44,8 @@ def verify_everything(
     catalogue = Catalogue.read(root)
     places = [(uri, store.ref.path, store.size) for uri, store in catalogue.stores.items()]
     places += [(run.uri, run.folder, listed_bytes(run.facts) if run.facts else 0) for run in catalogue.runs]
-    total, done = sum(size for *_, size in places) or 1, 0
+    total = sum(size for *_, size in places) or 1
+    done = 0
     found: list[Finding] = []
     for uri, path, size in places:
         if progress is not None:
@@ -53,16 +54,25 @@ def verify_everything(
         problems = list((problems_of or _problems)(path))
         if not path.exists() and not catalogue.named_by(uri):
             continue  # gc or a repair has cleared it away since
-        found += [Finding(uri, problem, "broken") for problem in problems]
-        if not problems:
-            found.append(Finding(uri, None))
+        found += [Finding(uri, problem, "broken") for problem in problems] or [Finding(uri, None)]
     for path in without_manifest(root):
         uri = path.relative_to(root).as_posix()
         if path.is_dir():
             found.append(Finding(uri, f"{MANIFEST_NAME} is missing", "broken"))
         else:
             found.append(Finding(uri, "expected a folder with a manifest; take it out of the archive", "stray"))
-    return [*found, *_missing(catalogue)]
+    there = set(catalogue.stores)
+    told: set[str] = set()
+    for run in catalogue.runs:
+        for uri in sorted(run.names - there - told):
+            told.add(uri)
+            found.append(Finding(uri, f"is not there, but {run.uri} names it", "missing"))
+    for uri in catalogue.stores:
+        for given in catalogue.inputs_of(uri):
+            if given not in there | told:
+                told.add(given)
+                found.append(Finding(given, f"is not there, but {uri} was made of it", "missing"))
+    return found
 
 
 def _problems(folder: Path) -> Iterator[str]:
@@ -74,23 +84,6 @@ def _problems(folder: Path) -> Iterator[str]:
     found = [f"{name} {problem}" for name, problem in broken_files(folder, manifest, hashes=True)]
     changed = found and try_manifest(folder)[0] != manifest  # cleared meanwhile, or made anew
     yield from _problems(folder) if changed else found
-
-
-def _missing(catalogue: Catalogue) -> Iterator[Finding]:
-    """Yield the stores that a run or another store names and that are missing."""
-    there, told = set(catalogue.stores), set[str]()
-    for run in catalogue.runs:
-        for uri in sorted(run.names - there - told):
-            told.add(uri)
-            yield Finding(uri, f"is not there, but {run.uri} names it", "missing")
-    for uri in catalogue.stores:
-        for given in catalogue.inputs_of(uri):
-            if given not in there | told:
-                told.add(given)
-                yield Finding(given, f"is not there, but {uri} was made of it", "missing")
-
-
-Rerun = Callable[[dict[str, Any]], str]  # settings of a survey -> address of the run; PipelineError where it cannot
 
 
 @dataclass(frozen=True)
@@ -156,7 +149,7 @@ def plan_repair(
 def repair(
     archive: Archive,
     findings: Iterable[Finding],
-    rerun: Rerun,
+    rerun: Callable[[dict[str, Any]], str],  # settings of a survey -> address of the run; PipelineError where it cannot
     *,
     versions: Mapping[str, int | str],
     can_capture: Callable[[Run], bool],
@@ -210,8 +203,9 @@ def repair(
                 repeated[text] = uri
             done.remade.append(uri)
         else:
-            words = f"its {RECEIPT} cannot be read, or its lines are lost: run that survey again by hand"
-            done.failed.setdefault(uri, words)
+            done.failed.setdefault(
+                uri, f"its {RECEIPT} cannot be read, or its lines are lost: run that survey again by hand"
+            )
     for uri in set(repeated.values()) - there:
         archive.drop_run(uri)
     return done
@@ -239,7 +233,8 @@ def _hopeless(
         return f"there is no stage {stage}: take it out of the archive"
     made_of = [one for key in (uri, *sorted(catalogue.ancestors([uri]))) if (one := catalogue.stores.get(key))]
     for one in made_of:
-        name, now = one.ref.stage, str(versions.get(one.ref.stage, one.version))
+        name = one.ref.stage
+        now = str(versions.get(name, one.version))
         if one.version not in ("", now):
             return f"made by version {one.version} of the stage {name}, which is now {now}: reprocess builds it again"
     runs = catalogue.named_by(uri)

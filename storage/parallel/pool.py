@@ -45,7 +45,6 @@ _ENVIRONMENT = {
     "MALLOC_TOP_PAD_": f"{2**26}",
 }
 _ADDRESS = re.compile(r"(tcp|tls)://[^\s/:]+:\d+|(tcp|tls)://\[[0-9a-fA-F:]+\]:\d+")
-
 RESERVED_BYTES = 512 * 2**20  # a process before its first block: interpreter, torch, zarr
 
 Item = TypeVar("Item")
@@ -60,8 +59,9 @@ def mib(size: int) -> str:
 
 def memory_refusal(least: int, memory: int, why: str) -> SettingsError:
     """Return the error for work that needs more than the setting ``memory`` [bytes], with the least that it needs."""
-    over = f"projected memory {mib(least)} exceeds --memory {mib(memory)}"
-    return SettingsError(f"{over}: {why}; give at least --memory {mib(least)}")
+    return SettingsError(
+        f"projected memory {mib(least)} exceeds --memory {mib(memory)}: {why}; give at least --memory {mib(least)}"
+    )
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,6 @@ class WorkerPool:
 
 THREADS = WorkerPool()
 
-
 _guard = threading.RLock()
 _users: Counter[WorkerPool] = Counter()  # blocks that keep a pool open
 _teams: dict[WorkerPool, Cluster] = {}  # the workers of open pools, once they are started
@@ -168,11 +167,7 @@ def run_blocks(
     elif items:
         with pool.open():
             _send_away(
-                pool,
-                make,
-                items,
-                inputs,
-                lambda number, result: ended(number, result if take is None else take(items[number], result)),
+                pool, make, items, inputs, lambda at, made: ended(at, made if take is None else take(items[at], made))
             )
     return [results[number] for number in range(len(items))]
 
@@ -246,12 +241,10 @@ class Cluster:
     def __init__(self, pool: WorkerPool) -> None:
         """Connect to the scheduler, or start processes (SettingsError: none answers, or none start)."""
         self.name = f"--scheduler {pool.scheduler}"
-        self._own: Any = None
         for name in ("distributed", "distributed.client"):  # an error reports lost connections once
             logging.getLogger(name).setLevel(logging.CRITICAL)
         try:
-            if not pool.elsewhere:
-                self._own = start(pool.count)
+            self._own: Any = None if pool.elsewhere else start(pool.count)
             place = pool.scheduler if pool.elsewhere else self._own
             self.client: Any = dask_distributed.Client(place, timeout=ANSWER_S, set_as_default=False)
         except (OSError, TimeoutError, ValueError, RuntimeError) as error:
@@ -293,7 +286,8 @@ class Cluster:
         Workers without the working copy of a bucket fetch the stores. Raises SettingsError: a worker differs, or cannot
         read the bucket; WorkerError: there is none, or one was lost meanwhile.
         """
-        expected, count = {**about_here(inputs), THREADS_OF: "1"}, self.count()
+        expected = {**about_here(inputs), THREADS_OF: "1"}
+        count = self.count()
         try:
             theirs = self.client.run(_about_there, pickle.dumps(inputs))
         except PipelineError as error:
@@ -351,7 +345,8 @@ async def _about_there(inputs: bytes) -> dict[str, str]:
 @cache
 def versions_here() -> dict[str, str]:
     """Return the versions of code and libraries in this process, as they were at the first call."""
-    root, found = Path(__file__).parents[2], hashlib.sha256()
+    root = Path(__file__).parents[2]
+    found = hashlib.sha256()
     for path in sorted(path for room in ROOMS for path in (root / room).rglob("*.py")):
         found.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
     facts = {"python": platform.python_version(), "spectralzoom": f"of code {found.hexdigest()[:12]}"}

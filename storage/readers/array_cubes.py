@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Container, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,6 +24,7 @@ from storage.readers.cube_sources import (
     MOST_RATIO,
     Bands,
     CubeSource,
+    Guard,
     check_claim,
     check_memory,
     read_by_chunks,
@@ -122,13 +122,7 @@ def find_cube(arrays: Arrays, variable: str | None, path: Path, *, labels: bool 
     return ArrayCube(name, arrays[name], order, moment, (*notes, *more))
 
 
-def cube_source(
-    path: Path,
-    cube: ArrayCube,
-    arrays: Arrays,
-    attributes: Mapping[str, Any],
-    guard: Callable[[], AbstractContextManager[None]],
-) -> CubeSource:
+def cube_source(path: Path, cube: ArrayCube, arrays: Arrays, attributes: Mapping[str, Any], guard: Guard) -> CubeSource:
     """Return the cube with its lines, bands and place; ``guard`` turns errors of reading into SceneError.
 
     Lines of an array with scale or offset are float32, NaN where there is no value. So are whole numbers with a valid
@@ -143,7 +137,8 @@ def cube_source(
     unsigned = array.dtype.kind == "i" and str(array.attrs.get("_Unsigned", "")).lower() == "true"
     stored = np.dtype(f"u{array.dtype.itemsize}") if unsigned else array.dtype.newbyteorder("=")
     missing = _missing(array.attrs, stored)
-    fill, (low, high) = missing[0] if missing else None, _valid_range(array.attrs, stored)
+    fill = missing[0] if missing else None
+    low, high = _valid_range(array.attrs, stored)
     checked = len(missing) > 1 or (low, high) != (-np.inf, np.inf)
     plain = scale in (None, 1.0) and offset in (None, 0.0)
     plain = plain and (stored.kind == "f" or fill is not None or not checked)  # whole numbers have no NaN
@@ -199,7 +194,8 @@ def _bands_of(cube: ArrayCube, arrays: Arrays, count: int) -> Bands:
         found = axis
     if found is None:
         return Bands()
-    centres, unit = np.asarray(arrays[found][...], np.float64).ravel(), _unit(arrays[found].attrs)
+    centres = np.asarray(arrays[found][...], np.float64).ravel()
+    unit = _unit(arrays[found].attrs)
     known = {**dict.fromkeys(NANOMETRES, 1.0), **dict.fromkeys(MICROMETRES, 1000.0), **dict.fromkeys(METRES, 1e9)}
     scale = (1000.0 if centres.max() <= 20 else 1.0) if unit in UNSAID else known.get(unit)  # [nm]
     if scale is None or not (np.isfinite(centres) & (centres > 0)).all():
@@ -281,7 +277,8 @@ def _axes(
 ) -> tuple[tuple[int, ...], tuple[str, ...]]:
     """Return the axes of rows, columns and (if there are some) bands; and notes."""
     array = arrays[name]
-    named, own = array.dims, [axis for axis in range(array.ndim) if moment is None or axis != moment[0]]
+    named = array.dims
+    own = [axis for axis in range(array.ndim) if moment is None or axis != moment[0]]
     if len(own) not in (2, 3):
         raise SceneError(
             f"{path} holds shape {array.shape}; expected (y, x, band), or (y, x) for one band; store one time or level"

@@ -15,7 +15,7 @@ import mmap
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from pipeline.errors import SceneError
 from pipeline.lazy import GeoBox, h5py, odc_geobox
 from storage.readers.array_cubes import ArrayCube, Arrays, FileArray, place_or_note
-from storage.readers.cube_sources import BLOCK_LINES, DEFLATE_RATIO, Bands, CubeSource, read_by_chunks, unpacked
+from storage.readers.cube_sources import BLOCK_LINES, DEFLATE_RATIO, Bands, CubeSource, Guard, read_by_chunks, unpacked
 
 ARRAY_ENDINGS = (".npy", ".npz", ".mat")
 HDF_ENDINGS = (".nc", ".nc4", ".h5", ".hdf5", ".he5")
@@ -63,8 +63,7 @@ def list_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
     arrays, attributes = _hdf_arrays(path)
     if ending == ".mat":
         numbers = {name: one for name, one in arrays.items() if "/" not in name and one.dtype.kind in "buif"}
-        is_text = {name for name, one in numbers.items() if one.attrs.get("MATLAB_class") == "char"}
-        return {name: _transposed(one) for name, one in numbers.items() if name not in is_text}, {}
+        return {name: _transposed(one) for name, one in numbers.items() if one.attrs.get("MATLAB_class") != "char"}, {}
     return arrays, attributes
 
 
@@ -118,7 +117,8 @@ def _mat_arrays(path: Path) -> dict[str, FileArray]:
     with warnings.catch_warnings(), _mapped(path) as content:
         warnings.simplefilter("ignore")  # of repeated names
         listed = scipy_io.whosmat(content)
-    size, ratio = path.stat().st_size, 8 * DEFLATE_RATIO  # a double may be one byte
+    size = path.stat().st_size
+    ratio = 8 * DEFLATE_RATIO  # a double may be one byte
     return {
         name: _whole(f"{path}:{name}", shape, np.dtype(_MATLAB[kind]), partial(load, name, kind), size, ratio)
         for name, shape, kind in listed
@@ -159,7 +159,8 @@ def _hdf_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
         """Add an array of numbers, or a single text such as NEON's map info."""
         if not isinstance(item, h5py.Dataset) or item.external or item.is_virtual or item.shape is None:
             return
-        about, is_text = _plain(item.attrs), item.dtype.kind in "SO" and not item.ndim
+        about = _plain(item.attrs)
+        is_text = item.dtype.kind in "SO" and not item.ndim
         if (item.dtype.kind in "buif" or is_text) and not str(about.get("NAME", "")).startswith(_ONLY_A_DIMENSION):
             attributes = {**about, **_as_cf(about, item)}
             chunks = item.chunks or (1,) * item.ndim
@@ -250,11 +251,7 @@ def _place_of_neon(info: str, code: str, shape: tuple[int, int]) -> GeoBox:
 
 
 def prisma_cube(
-    path: Path,
-    arrays: Arrays,
-    about: Mapping[str, Any],
-    variable: str | None,
-    guard: Callable[[], AbstractContextManager[None]],
+    path: Path, arrays: Arrays, about: Mapping[str, Any], variable: str | None, guard: Guard
 ) -> CubeSource | None:
     """Return both cubes (y, band, x) of a PRISMA product as one, its used bands by ascending wavelength.
 
@@ -294,9 +291,11 @@ def prisma_cube(
         found[np.logical_and.reduce([(block == 0).all(axis=2) for block in raw])] = np.nan
         return found
 
-    geobox, notes = None, tuple[str, ...](["it has no map grid"])
-    if level == "D":
-        geobox, notes = place_or_note(lambda: _place_of_prisma(about, (lines, samples)))
+    geobox, notes = (
+        place_or_note(lambda: _place_of_prisma(about, (lines, samples)))
+        if level == "D"
+        else (None, ("it has no map grid",))
+    )
     unused = len(centres) - len(order)
     return CubeSource(
         name=path.name,

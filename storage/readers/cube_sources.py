@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -75,6 +75,7 @@ BLOCK_LINES = 64
 MOST_MISSING = 1 << 14  # lines that a cube may claim beyond those in its file
 
 ReadLines = Callable[[int, int], NDArray[Any]]
+Guard = Callable[[], AbstractContextManager[None]]  # turns errors of reading into SceneError
 
 
 @dataclass(frozen=True)
@@ -182,7 +183,8 @@ def read_by_chunks(read: ReadLines, lines: int, chunk_lines: int) -> ReadLines:
 
 def scene_lines(source: CubeSource, start: int, stop: int) -> NDArray[Any]:
     """Return lines (line, sample, band) as scene values: over the white reference if both frames are known."""
-    raw, valid = source.read(start, stop), source.valid[start:stop]
+    raw = source.read(start, stop)
+    valid = source.valid[start:stop]
     if source.dark is None or source.white is None:
         if valid.all():
             return raw

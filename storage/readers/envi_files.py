@@ -65,9 +65,10 @@ def open_envi_cube(path: str | Path) -> EnviCube:
     header = load_envi_header(header_path)
     if "spectral library" in header.kind.lower():
         raise SceneError(f"{header_path} describes a spectral library, expected a cube (line, sample, band)")
-    size, item = data_path.stat().st_size - header.offset, header.dtype.itemsize
-    samples, bands, line_bytes = header.samples, header.bands, header.line_bytes
-    whole = size // line_bytes
+    size = data_path.stat().st_size - header.offset
+    item = header.dtype.itemsize
+    samples, bands = header.samples, header.bands
+    whole = size // header.line_bytes
     promised = whole if header.lines is None else header.lines
     if header.interleave == "bsq":  # only lines of the last band are missing
         whole = max(size - (bands - 1) * promised * samples * item, 0) // (samples * item)
@@ -82,8 +83,8 @@ def open_envi_cube(path: str | Path) -> EnviCube:
         notes.append(f"the header does not say how many lines there are; the file holds {held}")
     if held < promised:
         notes.append(f"{data_path.name} is cut off: {held} of {promised} lines are whole")
-    elif size > promised * line_bytes:
-        notes.append(f"{data_path.name} holds {size - promised * line_bytes} bytes more than its header says")
+    elif size > promised * header.line_bytes:
+        notes.append(f"{data_path.name} holds {size - promised * header.line_bytes} bytes more than its header says")
     strides = {
         "bil": (bands * samples * item, item, samples * item),
         "bip": (samples * bands * item, bands * item, item),
@@ -141,12 +142,13 @@ def open_envi_source(path: Path, *, scaled: bool = True) -> CubeSource:
     source = replace(source, geobox=geobox, notes=(*source.notes, *where))
     if not scaled:
         return source
-    fields, bands = cube.header.fields, source.shape[2]
+    fields = cube.header.fields
+    bands = source.shape[2]
     factor = finite_number(fields.get("reflectance scale factor", "")) or 0.0
     gain, offset = _numbers(fields, "data gain values", bands, 1.0), _numbers(fields, "data offset values", bands, 0.0)
     if factor > 0:
         gain, offset = np.full(bands, 1 / factor), np.zeros(bands)
-    return source if (gain == 1).all() and not offset.any() else rescaled(source, gain, offset, source.nodata)
+    return source if (gain == 1).all() and not offset.any() else rescaled(source, gain, offset)
 
 
 def _numbers(fields: Mapping[str, str], name: str, count: int, default: float) -> NDArray[np.float64]:
@@ -166,7 +168,6 @@ def open_headwall_cube(folder: Path) -> CubeSource:
     """
     files = ((_PART.fullmatch(entry.name), entry) for entry in folder.iterdir() if entry.suffix.lower() == ".hdr")
     headers = dict(sorted((int(match[1]), entry) for match, entry in files if match is not None and entry.is_file()))
-    notes, opened = list[str](), dict[int, EnviCube]()
     for entry in sorted(folder.iterdir()):
         match = _PART.fullmatch(entry.name)
         if headers and match is not None and entry.is_file() and int(match[1]) not in headers:
@@ -176,6 +177,8 @@ def open_headwall_cube(folder: Path) -> CubeSource:
             f"{folder} is a folder, expected a file, a Zarr store, or a folder with raw_<frame> files of a Headwall "
             f"camera; name one of the files in it, or {ONE_FILE}"
         )
+    notes: list[str] = []
+    opened: dict[int, EnviCube] = {}
     for number, header in headers.items():
         data = find_envi_pair(header)[1]
         if data.stat().st_size == 0:
@@ -198,20 +201,17 @@ def open_headwall_cube(folder: Path) -> CubeSource:
     indices = {int(match[1]): file for match, file in listed if match is not None and int(match[1]) in opened}
     if not indices:
         return source
-    times, more = LineTimes.unknown(source.shape[0]), list[str]()
+    times = LineTimes.unknown(source.shape[0])
     for start, (number, cube) in zip(starts, opened.items(), strict=True):
         if number not in indices:
-            more.append(f"there is no frame index for {cube.path.name}")
+            notes.append(f"there is no frame index for {cube.path.name}")
             continue
         index = load_frame_index(indices[number])
         own = times_of_lines(index, number, len(cube.values), cube.lost_lines)
         times.put(start, own)
-        more.extend((*index.notes, *(f"{indices[number].name}: {note}" for note in own.notes)))
+        notes.extend((*index.notes, *(f"{indices[number].name}: {note}" for note in own.notes)))
     return replace(
-        source,
-        files=(*source.files, *indices.values()),
-        lines=_timed(source.lines, times),
-        notes=(*source.notes, *more),
+        source, files=(*source.files, *indices.values()), lines=_timed(source.lines, times), notes=tuple(notes)
     )
 
 
@@ -222,9 +222,11 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
     lost = cube.lost_lines if cube.lost_lines <= MOST_MISSING else 0
     if lost < cube.lost_lines:
         notes.append(f"the {cube.lost_lines} lines that {cube.path.name} lacks are not filled up")
-    first, (_, samples, count) = cubes[0].header, cubes[0].values.shape
-    height, native = last + len(cube.values) + lost, cubes[0].values.dtype.newbyteorder("=")
-    valid, exposure = np.zeros(height, np.bool_), None
+    _, samples, count = cubes[0].values.shape
+    height = last + len(cube.values) + lost
+    native = cubes[0].values.dtype.newbyteorder("=")
+    valid = np.zeros(height, np.bool_)
+    exposure: NDArray[np.float64] | None = None
     for start, part in parts.items():
         valid[start : start + len(part.values)] = True
         known = finite_number(part.header.settings.get(_EXPOSURE, ""))
@@ -254,8 +256,8 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
         files=tuple(file for one in cubes for file in (one.header_path, one.path)),
         lines=LineFacts(valid, exposure_ms=exposure),
         bands=bands,
-        nodata=first.nodata,
-        bad_bands=bad_bands(first.fields.get("bbl"), count),
+        nodata=cubes[0].header.nodata,
+        bad_bands=bad_bands(cubes[0].header.fields.get("bbl"), count),
         headers={one.header_path.name: one.header_path.read_bytes().decode("utf-8", errors="replace") for one in cubes},
         notes=tuple(notes),
     )
@@ -263,7 +265,8 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
 
 def _timed(lines: LineFacts, times: LineTimes) -> LineFacts:
     """Add the times of frame indices."""
-    lines, known = replace(lines, frame=times.frame), times.stamp_us >= 0
+    lines = replace(lines, frame=times.frame)
+    known = times.stamp_us >= 0
     if not known.any() or not np.ptp(times.stamp_us[known]):  # a camera without a clock repeats its stamp
         return lines
     return replace(lines, time_s=np.where(known, (times.stamp_us - times.stamp_us[known][0]) * 1e-6, np.nan))

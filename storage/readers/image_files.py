@@ -45,7 +45,9 @@ _STRICT = {"GDAL_ERROR_ON_LIBJPEG_WARNING": True, "GDAL_PNG_WHOLE_IMAGE_OPTIM": 
 _CALLED = {"GTiff": "TIFF", "JP2OpenJPEG": "JPEG 2000"}  # in messages
 ALPHA_NOTE = "its alpha channel says where there are pixels, and is no band"
 NO_MASK_NOTE = "its channel called alpha has the values of a band, not of a mask, and is taken as a band"
-RGB_NM, NEAR_INFRARED_NM, GREY_NM = (640.0, 550.0, 460.0), 800.0, 550.0
+RGB_NM = (640.0, 550.0, 460.0)
+NEAR_INFRARED_NM = 800.0
+GREY_NM = 550.0
 _COLOURS_NM: Mapping[tuple[str, ...], tuple[float, ...]] = {
     ("gray",): (GREY_NM,),
     ("palette",): (GREY_NM,),
@@ -53,7 +55,8 @@ _COLOURS_NM: Mapping[tuple[str, ...], tuple[float, ...]] = {
     ("red", "green", "blue", "undefined"): (*RGB_NM, NEAR_INFRARED_NM),
     ("red", "green", "blue", "nir"): (*RGB_NM, NEAR_INFRARED_NM),
 }
-SAMPLED_PX, MOST_BETWEEN = 256, 0.1  # side of the part that is read of a mask, and its partly transparent fraction
+SAMPLED_PX = 256  # side of the part that is read of a mask
+MOST_BETWEEN = 0.1  # partly transparent fraction of a mask
 
 
 def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> CubeSource:
@@ -67,12 +70,14 @@ def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> Cub
     driver = _DRIVERS[path.suffix.lower()]
     with _opened(path) as file:
         pages, notes = _pages(path, file)
-        block, item = max(file.block_shapes), max(np.dtype(one).itemsize for one in file.dtypes)
+        block = max(file.block_shapes)
+        item = max(np.dtype(one).itemsize for one in file.dtypes)
         claimed = (file.height, file.width, file.count * len(pages))
         _check_size(path, driver, claimed, item, math.prod(block) * file.count)
         kinds = [kind.name for kind in file.colorinterp]
         if driver in _CALLED and "alpha" in kinds and not _is_mask(file, kinds.index("alpha")):
-            kinds, notes = ["undefined" if kind == "alpha" else kind for kind in kinds], [*notes, NO_MASK_NOTE]
+            kinds = ["undefined" if kind == "alpha" else kind for kind in kinds]
+            notes = [*notes, NO_MASK_NOTE]
         alpha = kinds.index("alpha") if "alpha" in kinds else None
         keep = [band for band in range(file.count) if band != alpha]
         kind = np.result_type(*(np.dtype(file.dtypes[band]) for band in keep or [0]))
@@ -108,7 +113,8 @@ def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> Cub
         )
         if driver not in _CALLED and kinds == ["palette"] and not palette:
             source = _coloured(source, file)
-    read, void = source.read, source.void
+    read = source.read
+    void = source.void
     if scaled and void is not None and not void.all():
         source = replace(
             source,
@@ -117,8 +123,7 @@ def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> Cub
                 void[first:last, :, None], np.float32(np.nan), np.float32(read(first, last))
             ),
         )
-    plain = not scaled or ((scale == 1).all() and (offset == 0).all())
-    return source if plain else rescaled(source, scale, offset, source.nodata)
+    return source if not scaled or ((scale == 1).all() and (offset == 0).all()) else rescaled(source, scale, offset)
 
 
 def _coloured(source: CubeSource, file: Any) -> CubeSource:
@@ -138,16 +143,14 @@ def _coloured(source: CubeSource, file: Any) -> CubeSource:
     )
 
 
-def rescaled(
-    source: CubeSource, scale: NDArray[np.float64], offset: NDArray[np.float64], nodata: float | None
-) -> CubeSource:
-    """Return the cube with ``number * scale + offset`` as values, (band,) each, NaN for ``nodata``."""
+def rescaled(source: CubeSource, scale: NDArray[np.float64], offset: NDArray[np.float64]) -> CubeSource:
+    """Return the cube with ``number * scale + offset`` as values, (band,) each, NaN for its no-data value."""
     pairs = sorted(set(zip(scale.tolist(), offset.tolist(), strict=True)))
     others = "" if len(pairs) == 1 else " (others by band)"
     return replace(
         source,
         dtype=np.dtype(np.float32),
-        read=lambda first, last: unpacked(source.read(first, last), scale, offset, nodata),
+        read=lambda first, last: unpacked(source.read(first, last), scale, offset, source.nodata),
         nodata=None,
         scaling=f"scale {scale.tolist()} offset {offset.tolist()}",
         notes=(
@@ -160,7 +163,8 @@ def rescaled(
 @contextmanager
 def _opened(path: Path, image: str = "") -> Iterator[Any]:
     """Open the first or another image of a file (SceneError: it is damaged, or of another kind)."""
-    rasterio, driver = importlib.import_module("rasterio"), _DRIVERS[path.suffix.lower()]
+    rasterio = importlib.import_module("rasterio")
+    driver = _DRIVERS[path.suffix.lower()]
     with warnings.catch_warnings(), rasterio.Env(**_STRICT):
         warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
         with (
@@ -203,7 +207,8 @@ def _is_mask(file: Any, channel: int) -> bool:
 
 def _void(file: Any, alpha: int | None) -> NDArray[np.bool_] | None:
     """Return (y, x) pixels that are transparent or masked; None without a mask."""
-    kinds, flags = importlib.import_module("rasterio").enums.MaskFlags, file.mask_flag_enums[0]
+    kinds = importlib.import_module("rasterio").enums.MaskFlags
+    flags = file.mask_flag_enums[0]
     if alpha is None and (kinds.per_dataset not in flags or kinds.alpha in flags):
         return None
     parts = []
@@ -266,7 +271,8 @@ def _of_colours(colours_nm: Sequence[float]) -> Bands:
 def _bands_of(file: Any, keep: Sequence[int], kinds: Sequence[str], path: Path) -> tuple[Bands, tuple[str, ...]]:
     """Return wavelengths and widths by the tags of an open file, else its band names, else its colours; and notes."""
     notes: list[str] = []
-    of_file, of_bands = _file_tags(file), [_band_tags(file, band) for band in keep]
+    of_file = _file_tags(file)
+    of_bands = [_band_tags(file, band) for band in keep]
     fields = {"wavelength units": next(iter(of_bands), {}).get(_UNIT) or of_file.get(_UNIT, "")}
     for key in ("wavelength", "fwhm"):
         values = [tags.get(key, "") for tags in of_bands]
@@ -301,7 +307,8 @@ def _file_tags(file: Any) -> dict[str, str]:
 
 def _band_tags(file: Any, band: int) -> dict[str, str]:
     """Return the tags of one band, counted from 0; GDAL's own take precedence."""
-    tags, imagery = _lower(file.tags(band + 1)), file.tags(band + 1, ns="IMAGERY")
+    tags = _lower(file.tags(band + 1))
+    imagery = file.tags(band + 1, ns="IMAGERY")
     if "CENTRAL_WAVELENGTH_UM" in imagery:
         tags |= {"wavelength": imagery["CENTRAL_WAVELENGTH_UM"], _UNIT: "um"}
         tags |= {"fwhm": imagery["FWHM_UM"]} if "FWHM_UM" in imagery else {}

@@ -20,9 +20,11 @@ from storage.readers.open_cubes import CUBE_ENDINGS
 from storage.readers.polygons import POLYGON_ENDINGS, is_polygon_file, load_polygon_labels, polygon_classes, split_layer
 from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, is_image_folder
 
-_OF_LAND = ("lulc", "landcover", "land_cover")
-_OF_TRUTH = ("gt", "groundtruth", "truth", "seg")
-LABEL_WORDS = ("mask", "masks", "label", "labels", "annotation", "annotations", *_OF_TRUTH, *_OF_LAND)
+LABEL_WORDS = (
+    *("mask", "masks", "label", "labels", "annotation", "annotations"),
+    *("gt", "groundtruth", "truth", "seg"),
+    *("lulc", "landcover", "land_cover"),
+)
 LABEL_FOLDERS = {*LABEL_WORDS, "ground_truth", "segmentation", "segmentations", "targets", "labelimages"}
 IMAGE_WORDS = ("image", "img", "rgb", "picture", "photo", "scene", "ortho", "cube")
 SHOWN = 5  # names in a message
@@ -95,10 +97,11 @@ def match_folder(folder: Path) -> MatchedFiles:
     """
     own = scene_entries(folder)
     beside = [entry for entry in own if is_label_name(entry)]
+    if len(beside) == len(own):  # a folder of labels is read as images
+        beside = []
     images = [entry for entry in own if entry not in beside]
-    if not images:  # a folder of labels is read as images
-        images, beside = own, []
-    pictures, polygons = [*beside, *_in_label_folders(folder)], _polygons_near(folder)
+    pictures = [*beside, *_in_label_folders(folder)]
+    polygons = _polygons_near(folder)
     matched = {image: _label_of(image, pictures) or _label_of(image, polygons) for image in images}
     labels = {image: found for image, found in matched.items() if found is not None}
     if len(images) == len(pictures) == 1:  # a single pair may have any names

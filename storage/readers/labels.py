@@ -115,20 +115,20 @@ def load_labels(
     """
     by_colour = any(isinstance(value, tuple) for value in (*classes.values(), unlabelled))
     read = load_codes(address, geobox, by_number=bool(classes) and not by_colour, classes=classes.values())
-    codes, is_colour = read.values, read.of_colours
+    codes = read.values
     if codes.shape != shape:
         raise SceneError(
             f"labels {address} are {codes.shape[0]} x {codes.shape[1]} px, the scene is {shape[0]} x {shape[1]} px "
             f"(y x x); give labels on the scene's own pixels"
         )
-    if by_colour and not is_colour and codes.max(initial=0) < 256:
+    if by_colour and not read.of_colours and codes.max(initial=0) < 256:
         codes = np.where(codes < 0, codes, codes * 0x010101)  # a grey value g is the colour (g, g, g)
     none = None if unlabelled is None else _code(unlabelled)
-    stated = dict(classes) or found_codes(codes, none, is_colour or by_colour, str(address))
+    stated = dict(classes) or found_codes(codes, none, read.of_colours or by_colour, str(address))
     negative = (codes < 0) & (codes != NO_VALUE) & ~np.isin(codes, [none or 0, *map(_code, stated.values())])
     note = (f"{negative.sum()} px of labels {address} have negative values: unlabelled",) if negative.any() else ()
     return Labels(
-        index=_index(np.where(negative, NO_VALUE, codes), stated, none, str(address), of_colours=is_colour),
+        index=_index(np.where(negative, NO_VALUE, codes), stated, none, str(address), of_colours=read.of_colours),
         names=tuple(stated),
         values=tuple(stated.values()),
         colours=class_colours(stated, colours),
@@ -165,7 +165,7 @@ def load_codes(
     """
     source = open_labels(address, by_number=by_number)
     codes, of_colours = _whole_numbers(source.read(0, source.shape[0]), address, by_number=by_number)
-    notes, regridded, own = list[str](), False, source.geobox
+    notes: list[str] = []
     if source.nodata is not None and source.nodata.is_integer():
         void = codes == int(source.nodata) * (0x010101 if of_colours else 1)
         if void.any() and codes[void][0] not in map(_code, classes):
@@ -175,10 +175,13 @@ def load_codes(
         clear = source.void & ~np.isin(codes, [*map(_code, classes)])
         codes[clear] = NO_VALUE
         notes += [f"{clear.sum()} px of the label file are transparent or masked: unlabelled"] if clear.any() else []
+    own = source.geobox
+    regridded = False
     if geobox is not None and own is not None:
         shift = shift_px(geobox, own) if own.crs == geobox.crs and own.shape == geobox.shape else None
         if shift is None or max(map(abs, shift)) > OFF_GRID_PX:
-            codes, regridded = _on_grid(codes, own, geobox, address), True
+            codes = _on_grid(codes, own, geobox, address)
+            regridded = True
             notes.append(f"labels {address} have another grid than the scene: they are resampled by nearest neighbour")
     return LabelCodes(codes, of_colours, tuple(notes), regridded)
 
@@ -256,14 +259,13 @@ def _index(
     unknown = [int(value) for value in values if int(value) not in table and value not in (none, NO_VALUE)]
     if unknown:
         count = int((codes == unknown[0]).sum())
-        cure = "add it to [classes] or state it as unlabelled in scene.toml"
         if of_colours and not any(isinstance(value, tuple) for value in classes.values()):
             raise SceneError(
                 f"labels {where} have colours, such as {list(colour_of(unknown[0]))}, and the classes are numbers; "
                 "write the colour of each class into [classes], or give labels of numbers"
             )
         others = f" (and {len(unknown) - 1} more such values)" if len(unknown) > 1 else ""
-        cure = MIXED if len(unknown) > _MANY_UNKNOWN else cure
+        cure = MIXED if len(unknown) > _MANY_UNKNOWN else "add it to [classes] or state it as unlabelled in scene.toml"
         raise SceneError(
             f"labels {where} have {count} px of {_shown(unknown[0], classes)}, which is no class{others}; {cure}"
         )

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -123,11 +123,7 @@ def _open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSourc
     such array or several; or the axes are not y, x and band.
     """
     ending = path.suffix.lower()
-    kind = "Zarr" if path.is_dir() else "NetCDF or HDF5" if ending in HDF_ENDINGS else ending
-
-    def guard() -> AbstractContextManager[None]:
-        return reading(path, kind)
-
+    guard = partial(reading, path, "Zarr" if path.is_dir() else "NetCDF or HDF5" if ending in HDF_ENDINGS else ending)
     with guard():
         arrays, about = zarr_arrays(path) if path.is_dir() else list_arrays(path)
         if (prisma := prisma_cube(path, arrays, about, variable, guard)) is not None:
@@ -144,8 +140,7 @@ def _open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSourc
             source, bad_bands=marked_bands(near, source.shape[2]), geobox=geobox, notes=(*notes, *plain, *where)
         )
         if path.is_dir():
-            files = tuple(sorted(file for file in path.rglob("*") if file.is_file()))
-            source = replace(source, root=path, files=files)
+            source = replace(source, root=path, files=tuple(sorted(file for file in path.rglob("*") if file.is_file())))
         return with_ingested(source, arrays, about) if about.get("kind") == INGESTED else source
 
 
@@ -177,7 +172,8 @@ def load_frame(address: str | Path) -> tuple[NDArray[np.float32], tuple[Path, ..
         with reading(path, ".npy"):
             values = load_npy(path)
     elif kind == "envi":
-        files, values = find_envi_pair(path), open_envi_cube(path).values
+        files = find_envi_pair(path)
+        values = open_envi_cube(path).values
     else:
         source = open_cube(address)
         values = source.read(0, source.shape[0])
@@ -193,7 +189,8 @@ def with_wavelengths(source: CubeSource, address: str | Path, stated: Sequence[f
 
     Raises WavelengthError: they do not fit.
     """
-    path, count = split_variable(address)[0], source.shape[2]
+    path, _ = split_variable(address)
+    count = source.shape[2]
     settings = SceneSettings() if stated is not None else find_scene_settings(path)
     if settings.bands is not None and settings.wavelengths_nm is not None and len(settings.wavelengths_nm) != count:
         settings = SceneSettings()  # of some bands only

@@ -182,7 +182,8 @@ def load_polygon_labels(
             f"labels {address}: no pixel's centre lies in a polygon that has a class; give polygons larger than a"
             f" pixel, with a value of {attribute}"
         )
-    shared, lacking = int(np.count_nonzero(index != _burn(burnt[::-1], shape))), names.count("")
+    shared = int(np.count_nonzero(index != _burn(burnt[::-1], shape)))
+    lacking = names.count("")
     notes = (
         f"{len(burnt)} polygons by their attribute {attribute}",
         *layer.notes,
@@ -240,9 +241,9 @@ def _index_of(word: str, classes: dict[str, ClassValue], unlabelled: ClassValue 
     """Return the class index of a polygon's name or number; 255 for unlabelled, None for no class."""
     if word and word == str(unlabelled):
         return UNLABELLED
-    names, values = list(classes), list(classes.values())
-    if word in names:
-        return names.index(word)
+    if word in classes:
+        return list(classes).index(word)
+    values = list(classes.values())
     return values.index(int(word)) if word.isdecimal() and int(word) in values else None
 
 
@@ -277,10 +278,10 @@ def _moved(layer: PolygonLayer, place: FieldPlace, address: str | Path) -> list[
         west, south = given[:, :2].min(axis=0)
         east, north = given[:, 2:].max(axis=0)
         there = f"in {crs.name}" if crs is not None else "in pixels"
-        size = f"{place.shape[0]} x {place.shape[1]} px (y x x)"
         raise SceneError(
             f"labels {address} do not lie on the scene: all polygons are within x {west:g} to {east:g}, y {south:g} to"
-            f" {north:g} {there}, off its {size}; are they of this scene, and is their CRS right?"
+            f" {north:g} {there}, off its {place.shape[0]} x {place.shape[1]} px (y x x); are they of this scene, and"
+            " is their CRS right?"
         )
     return moved
 

@@ -171,7 +171,8 @@ def find_references(
     ``white_reference`` is the default value of the white reference, one or (band,). Raises SceneError: a frame has
     other samples or bands than the cube, or white is not brighter than dark.
     """
-    name, frame = stem.name, source.shape[1:]
+    name = stem.name
+    frame = source.shape[1:]
     white_dn = camera.full_scale_dn * max(camera.samples // frame[0], 1)
     files = reference_files(stem, stated)
     found: dict[str, NDArray[np.float32]] = {}
@@ -209,16 +210,15 @@ def find_references(
         raise SceneError(
             f"the white reference has {white_reference.shape} values, the cube {bands} bands; give one or one a band"
         )
-    by_mirror, file = False, files["white"]
-    if file is not None and reader_of(file) == "envi":
-        fields = load_envi_header(find_envi_pair(file)[0]).fields
-        listed = listed_numbers(fields, "white_reference", bands, [])
-        white_reference = white_reference if listed is None else listed.astype(np.float32)
-        by_mirror = fields.get("mirror at rest", "0").strip() == "1"
-    marked, out = _marked(source), source.nodata
+    file = files["white"]
+    fields = load_envi_header(find_envi_pair(file)[0]).fields if file is not None and reader_of(file) == "envi" else {}
+    listed = listed_numbers(fields, "white_reference", bands, [])
+    white_reference = white_reference if listed is None else listed.astype(np.float32)
+    by_mirror = fields.get("mirror at rest", "0").strip() == "1"
+    marked = _marked(source)
     left_out = f"bands {bands_text(np.flatnonzero(marked).tolist())} are left out: the file marks them as bad"
     notes += [f"{name}: {left_out}"] if marked.any() else []
-    notes += [] if out is None else [f"{name}: the number {out:g} is no data, as the file says"]
+    notes += [] if source.nodata is None else [f"{name}: the number {source.nodata:g} is no data, as the file says"]
     bad = np.broadcast_to(marked | np.asarray(bad if bad is not None else False, np.bool_), frame).copy()
     white_reference = np.broadcast_to(white_reference, bands).copy()
     return References(dark, white, white_reference, bad if bad.any() else None, found.get("flat"), by_mirror)
@@ -268,7 +268,8 @@ class PointingTable:
         device's positions to the model's. Raises SceneError: the cube has another number of rows or no valid one; a
         value is no number, out of range or beyond the mirror; or times do not rise.
         """
-        rows, sweeps = np.arange(len(self.columns[KINDS[self.kind][0]])), tuple(dict.fromkeys(self.sweep or ()))
+        rows = np.arange(len(self.columns[KINDS[self.kind][0]]))
+        sweeps = tuple(dict.fromkeys(self.sweep or ()))
         cut = self.sweep is not None and alone and name not in sweeps
         if self.sweep is not None and not cut:
             rows = np.array([row for row in rows if self.sweep[row] == name], np.intp)
@@ -285,37 +286,37 @@ class PointingTable:
         if "line" in self.columns:
             rows = rows[np.argsort(self.columns["line"][rows], kind="stable")]
             wrong = self.columns["line"][rows] != np.arange(lines)
-            self._refuse(rows, wrong, "line", f"expected each of 0 to {lines - 1} once")
+            self._refuse(rows, wrong, ["line"], f"expected each of 0 to {lines - 1} once")
         valid = np.ones(lines, np.bool_)
         if "valid" in self.columns:
             flags = self.columns["valid"][rows]
-            self._refuse(rows, ~np.isin(flags, (0, 1)), "valid", "expected 0 or 1")
+            self._refuse(rows, ~np.isin(flags, (0, 1)), ["valid"], "expected 0 or 1")
             valid = flags == 1
         if not valid.any():
             raise SceneError(f"{self.path} calls no line of {name} valid; set valid = 1 for lines that can be used")
         for column in {*KINDS[self.kind], "time", "exposure_ms"} & set(self.columns):
             unknown = valid & ~np.isfinite(self.columns[column][rows])
-            self._refuse(rows, unknown, column, "expected a number; set valid = 0 where it is not known")
+            self._refuse(rows, unknown, [column], "expected a number; set valid = 0 where it is not known")
         time_s = exposure_ms = None
         if "time" in self.columns:  # may be NaN for invalid lines
             time_s = self.columns["time"][rows]
-            known, stuck = np.flatnonzero(valid), np.zeros(lines, np.bool_)
+            known = np.flatnonzero(valid)
+            stuck = np.zeros(lines, np.bool_)
             part_of = np.array([self.sweep[row] if self.sweep else "" for row in rows[known]])
             stuck[known[1:]] = (np.diff(time_s[known]) <= 0) & (part_of[1:] == part_of[:-1])
-            self._refuse(rows, stuck, "time", "expected a time after that of the line before [s]")
+            self._refuse(rows, stuck, ["time"], "expected a time after that of the line before [s]")
             before = np.maximum.accumulate(np.where(valid, time_s, -np.inf))
             after = np.minimum.accumulate(np.where(valid, time_s, np.inf)[::-1])[::-1]
             time_s = np.where(valid | ((before < time_s) & (time_s < after)), time_s, np.nan)
         if "exposure_ms" in self.columns:
             exposure_ms = _filled(self.columns["exposure_ms"][rows], valid)
-            self._refuse(rows, exposure_ms <= 0, "exposure_ms", "expected a time above 0 ms")
+            self._refuse(rows, exposure_ms <= 0, ["exposure_ms"], "expected a time above 0 ms")
         part = tuple(self.sweep[row] for row in rows) if self.sweep is not None and cut else None
         return LinePointing(self.kind, self._positions(rows, valid, mounting), valid, time_s, exposure_ms, part)
 
     def _positions(self, rows: NDArray[np.intp], valid: NDArray[np.bool_], mounting: Mounting) -> Floats:
         """Return (line, 2) positions of the model, or (line, 1) places, interpolated for invalid lines."""
-        values = np.stack([self.columns[name][rows] for name in KINDS[self.kind]], axis=-1)
-        values = np.stack([_filled(column, valid) for column in values.T], axis=-1)
+        values = np.stack([_filled(self.columns[name][rows], valid) for name in KINDS[self.kind]], axis=-1)
         if self.kind in WITHOUT_MIRROR:
             return values
         if self.kind == "mirror":
@@ -330,15 +331,12 @@ class PointingTable:
         self._refuse(rows, beyond, KINDS[self.kind], reach)
         return position
 
-    def _refuse(
-        self, rows: NDArray[np.intp], wrong: NDArray[np.bool_], columns: str | Sequence[str], expected: str
-    ) -> None:
+    def _refuse(self, rows: NDArray[np.intp], wrong: NDArray[np.bool_], columns: Sequence[str], expected: str) -> None:
         """Raise SceneError for the first wrong row, with its number in the file."""
         if not wrong.any():
             return
-        names = (columns,) if isinstance(columns, str) else tuple(columns)
         first = rows[np.argmax(wrong)]
-        came = ", ".join(f"{name} = {self.columns[name][first]:.10g}" for name in names)
+        came = ", ".join(f"{name} = {self.columns[name][first]:.10g}" for name in columns)
         count = int(np.count_nonzero(wrong))
         more = "" if count == 1 else f" (the first of {count} such rows)"
         raise SceneError(f"{self.path}, row {first + FIRST_ROW}: {came}{more}, {expected}; correct the table")
@@ -346,7 +344,8 @@ class PointingTable:
 
 def _filled(values: Floats, valid: NDArray[np.bool_]) -> Floats:
     """Return the values; those of invalid lines that are unknown, or far beyond those of valid lines, interpolated."""
-    low, high, at = values[valid].min(), values[valid].max(), np.arange(len(values))
+    low, high = values[valid].min(), values[valid].max()
+    at = np.arange(len(values))
     beyond = (high - low) / valid.sum() * (1 + (~valid).sum())  # lines before the first valid one lie so far off
     known = valid | ((values >= low - beyond) & (values <= high + beyond))
     return values if known.all() else np.interp(at, at[known], values[known])
@@ -399,8 +398,7 @@ def _csv_cells(path: Path) -> tuple[list[str], list[list[str]]]:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise SceneError(f"{path} cannot be read as a pointing table: {error}; name a text file (CSV)") from error
-    header = lines[0] if lines else ""
-    delimiter = max((",", ";", "\t"), key=header.count)
+    delimiter = max((",", ";", "\t"), key=(lines[0] if lines else "").count)
     rows = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=delimiter)]
     if not rows:
         raise SceneError(f"{path} is empty; give a header and a row for each line")

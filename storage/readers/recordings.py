@@ -91,7 +91,7 @@ class Recording:
 
     def key(self) -> dict[str, Any]:
         """Return the parameters of captures from it: lines, references, bands, bits and light, without names."""
-        arrays = list[NDArray[Any]]()
+        arrays: list[NDArray[Any]] = []
         for one in self.sweeps:
             known = one.references
             frames = (known.dark, known.white, known.white_reference, known.bad, known.flat)
@@ -109,8 +109,8 @@ class Recording:
     def source(self, field_shape: tuple[int, int] | None = None) -> RecordedSource:
         """Return a source of lines for a field of (y, x) px, by default the one that the sweeps cover (SceneError)."""
         if field_shape is None:
-            sweeps, tangents = [one.sweep for one in self.sweeps], [one.tangents for one in self.sweeps]
-            field_shape = covered_field(sweeps, tangents, self.camera).shape
+            sweeps = [one.sweep for one in self.sweeps]
+            field_shape = covered_field(sweeps, [one.tangents for one in self.sweeps], self.camera).shape
         return RecordedSource(self.sweeps, self.camera, self.wavelength_nm, field_shape, notes=self.notes)
 
 
@@ -140,7 +140,8 @@ def open_recording(
     wavelengths; SettingsError: a flag is given for an archive; ArchiveError, IncompleteStoreError: the archive cannot
     be read, or has neither raw lines nor a signal; PoseError: a position of a raw cube is beyond the mirror.
     """
-    camera, given = camera or LineCamera(), given or RecordedWith()
+    camera = camera or LineCamera()
+    given = given or RecordedWith()
     stores = find_raw_cubes(address)
     if stores is None:
         return _open_files(Path(_fetched(address)), camera, given)
@@ -224,7 +225,8 @@ def _point(cube: RecordedFile, given: RecordedWith, notes: list[str], *, alone: 
     """Return the pointing of a cube by the file given, else by one with the cube's name, else None."""
     file = given.pointing
     if file is not None and file.is_dir():
-        folder, names = file, [f"{cube.name}{middle}{end}" for middle in ("", ".pointing") for end in ENDINGS]
+        folder = file
+        names = [f"{cube.name}{middle}{end}" for middle in ("", ".pointing") for end in ENDINGS]
         file = next((folder / name for name in names if (folder / name).is_file()), None)
         if file is None:
             raise SceneError(f"{folder} has no pointing for {cube.name}; add {names[0]}, or name one table for all")
@@ -263,7 +265,8 @@ def _timed(
     camera: LineCamera, cubes: Sequence[RecordedFile], pointing: Sequence[LinePointing | None], notes: list[str]
 ) -> LineCamera:
     """Return the camera with the exposure and period of the recording, if known."""
-    exposures, periods = [], []
+    exposures: list[float] = []
+    periods: list[float] = []
     for cube, one in zip(cubes, pointing, strict=True):
         known = cube.source.lines.exposure_ms if one is None or one.exposure_ms is None else one.exposure_ms
         if known is not None and np.isfinite(known).any():
@@ -289,7 +292,8 @@ def _sweeps_of(
 ) -> list[RecordedSweep]:
     """Return the sweep of one cube, or the sweeps that its pointing table cuts it into."""
     source = cube.source
-    valid, time_s = source.valid & pointing.valid, _middle_s(source, pointing.time_s, camera, notes)
+    valid = source.valid & pointing.valid
+    time_s = _middle_s(source, pointing.time_s, camera, notes)
     known_ms = source.lines.exposure_ms if pointing.exposure_ms is None else pointing.exposure_ms
     if known_ms is None:
         notes.append(f"{cube.name}: nothing says the exposure: {camera.exposure_ms:g} ms is assumed")
@@ -347,7 +351,8 @@ def _middle_s(source: CubeSource, stated_s: Floats | None, camera: LineCamera, n
         notes.append(f"nothing says when lines were taken: one every {camera.frame_ms:g} ms is assumed")
         return np.asarray(camera.mid_exposure_s(at.astype(np.float64)))
     known = np.flatnonzero(np.isfinite(stated_s))
-    filled, first, last = np.interp(at, known, stated_s[known]), known[0], known[-1]
+    filled = np.interp(at, known, stated_s[known])
+    first, last = known[0], known[-1]
     period_s = np.median(np.diff(stated_s[known]) / np.diff(known)) if len(known) > 1 else camera.frame_ms * 1e-3
     filled[:first] += (at[:first] - first) * period_s  # beyond the known ones a line a period
     filled[last:] += (at[last:] - last) * period_s

@@ -83,7 +83,8 @@ def open_scene_file(
     labels do not fit; WavelengthError: wavelengths are missing, or their number, unit or range is wrong.
     """
     file, variable = split_variable(address)
-    source, settings = open_cube(address), find_scene_settings(file)
+    source = open_cube(address)
+    settings = find_scene_settings(file)
     height, width, count = source.shape
     chosen, bad_note = _chosen_bands(bands, settings, count, file, source.bad_bands)
     light = settle_wavelengths(file, chosen, count, stated=wavelengths, settings=settings, known=source.bands)
@@ -266,16 +267,16 @@ class FileValues:
 
     def notes(self, settings: Path | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Return notes on scaling, by the scene.toml ``settings``, and notes on the mask."""
-        how, void = list[str](), self.source.void
+        how: list[str] = []
         if self.source.dark is not None and self.source.white is not None:
             how.append("values are over the white reference")
         if self.scaling:
             how.append(f"values are the file's times {self.scale:g} plus {self.offset:g}, as {settings} says")
-        if void is None:
+        if self.source.void is None:
             return tuple(how), ()
         if self.void is None:
             return tuple(how), ("every pixel is transparent or masked: the mask is left out",)
-        return tuple(how), (f"{int(void.sum())} transparent or masked pixels have no value, and no class in a map",)
+        return tuple(how), (f"{self.void.sum()} transparent or masked pixels have no value, and no class in a map",)
 
     def converted(self, first: int, stop: int) -> tuple[NDArray[Any], NDArray[np.float32], NDArray[np.bool_] | None]:
         """Return rows (y, x, band) as the file's numbers and as float32 with NaN, and which of them are no data."""
@@ -312,8 +313,9 @@ def _find_gaps(
     value is finite.
     """
     height, width, _ = values.source.shape
-    chosen, nodata, notes = values.bands, values.nodata, list[str]()
-    missing, seen = np.zeros((height, width), np.bool_), np.zeros(len(chosen), np.bool_)
+    chosen = values.bands
+    missing = np.zeros((height, width), np.bool_)
+    seen = np.zeros(len(chosen), np.bool_)
     filled_px = void = infinite = absent = 0
     for rows in cuts(height, BLOCK_LINES):
         picked, block, empty = values.converted(rows.start, rows.stop)
@@ -337,12 +339,13 @@ def _find_gaps(
         seen |= known.any(axis=(0, 1))
         if kept is not None:
             kept[rows] = values.scaled(block)
+    notes: list[str] = []
     if void and not values.assumed:
-        notes.append(f"{void} samples have the file's no-data value {nodata:g}")
+        notes.append(f"{void} samples have the file's no-data value {values.nodata:g}")
     elif void:
         notes.append(
-            f"{void} samples are {nodata:g}, which is taken for no data; if it is a value, state another number as"
-            f" nodata in a {SETTINGS_NAME}"
+            f"{void} samples are {values.nodata:g}, which is taken for no data; if it is a value, state another number"
+            f" as nodata in a {SETTINGS_NAME}"
         )
     if infinite:
         notes.append(f"{infinite} infinite samples count as missing")
@@ -382,10 +385,10 @@ class RasterPixels:
 
     def rows_at_once(self, memory: int) -> int:
         """Return the rows to read at a time: whole rows of patches (SettingsError: one does not fit the memory)."""
-        grid = self.grid
-        deep, row = grid.patch, COPIES * grid.width * self.bands * 4
-        least = RESERVED_BYTES + deep * row
+        deep = self.grid.patch
+        block = deep * COPIES * self.grid.width * self.bands * 4
+        least = RESERVED_BYTES + block
         if least > memory:
-            why = f"{deep} rows of a raster of {grid.width} px and {self.bands} bands are read at a time"
+            why = f"{deep} rows of a raster of {self.grid.width} px and {self.bands} bands are read at a time"
             raise memory_refusal(least, memory, why)
-        return deep * max(1, (memory - RESERVED_BYTES) // FRACTION // (deep * row))
+        return deep * max(1, (memory - RESERVED_BYTES) // FRACTION // block)

@@ -98,7 +98,8 @@ def load_scene_settings(path: Path) -> SceneSettings:
         return SceneSettings.model_validate({**content, "path": path})
     except ValidationError as error:
         first = error.errors()[0]
-    key, why = ".".join(map(str, first["loc"][:2])), first["msg"].removeprefix("Value error, ")
+    key = ".".join(map(str, first["loc"][:2]))
+    why = first["msg"].removeprefix("Value error, ")
     raise SceneError(f"{path}: {key}: {why}, got {first['input']!r}; correct it" if key else f"{path} {why}")
 
 
@@ -114,8 +115,7 @@ def check_wavelengths(wavelengths: Sequence[float] | NDArray[np.float64], where:
     values = np.asarray(wavelengths, np.float64)
     if not np.isfinite(values).all():
         raise WavelengthError(f"{where}: wavelengths must be numbers [nm], got {_listed(values)}")
-    low, high = MICROMETRES
-    if values.size and ((values >= low) & (values <= high)).all():
+    if values.size and ((values >= MICROMETRES[0]) & (values <= MICROMETRES[1])).all():
         raise WavelengthError(
             f"{where}: wavelengths {_listed(values)} look like micrometres; write them in nm: {_listed(values * 1000)}"
         )

@@ -36,11 +36,12 @@ from storage.readers.cube_sources import BLOCK_LINES, CubeSource, LineFacts
 
 INGESTED = "ingested cube"  # of this project
 METADATA = ("zarr.json", ".zarray", ".zgroup")
-_CHECKSUMS = {"crc32", "crc32c", "adler32", "fletcher32", "jenkins_lookup3"}
-_PACKERS = {"blosc", "zstd", "gzip", "zlib", "bz2", "lzma", "lz4", "pcodec", "zfpy", "packbits"}
-_ORDERS = {"bytes", "transpose", "sharding_indexed", "shuffle"}
-_NUMBERS = {"delta", "fixedscaleoffset", "quantize", "bitround", "astype", "cast_value", "scale_offset"}
-CODECS = _CHECKSUMS | _PACKERS | _ORDERS | _NUMBERS
+CODECS = {
+    *("crc32", "crc32c", "adler32", "fletcher32", "jenkins_lookup3"),  # checksums
+    *("blosc", "zstd", "gzip", "zlib", "bz2", "lzma", "lz4", "pcodec", "zfpy", "packbits"),  # packers
+    *("bytes", "transpose", "sharding_indexed", "shuffle"),  # orders
+    *("delta", "fixedscaleoffset", "quantize", "bitround", "astype", "cast_value", "scale_offset"),  # of numbers
+}
 LONGEST_HEADER = 1 << 16  # characters of a header's text that are kept
 
 Report = Callable[[float], None]
@@ -87,22 +88,22 @@ def lost_chunks(array: zarr.Array[Any]) -> tuple[int, int]:
 
 def _file_array(path: Path, array: zarr.Array[Any]) -> FileArray:
     """Return an array of a store, with its no-data value as CF, xarray or Zarr has it."""
-    attributes = dict(array.attrs)
-    named, fill, kind = getattr(array.metadata, "dimension_names", None), attributes.get("_FillValue"), array.dtype.kind
+    about = dict(array.attrs)
+    fill = about.get("_FillValue")
+    kind = array.dtype.kind
     if isinstance(fill, str) and kind == "f":  # of Zarr v3
-        attributes["_FillValue"] = float(struct.unpack("<d", base64.standard_b64decode(fill))[0])
-    elif fill is None and "_ARRAY_DIMENSIONS" in attributes and kind in "buif" and array.fill_value is not None:
-        attributes["_FillValue"] = float(array.fill_value)  # xarray's of v2
+        about["_FillValue"] = float(struct.unpack("<d", base64.standard_b64decode(fill))[0])
+    elif fill is None and "_ARRAY_DIMENSIONS" in about and kind in "buif" and array.fill_value is not None:
+        about["_FillValue"] = float(array.fill_value)  # xarray's of v2
+    named = getattr(array.metadata, "dimension_names", None)
     if named is not None:
-        attributes["_ARRAY_DIMENSIONS"] = list(named)
-    stored = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
+        about["_ARRAY_DIMENSIONS"] = list(named)
+    held = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
     lost, count = lost_chunks(array)
     note = f"{lost} of {count} chunks have no file, and are read as {array.fill_value}" if lost else ""
-
-    def get(part: Any) -> NDArray[Any]:
-        return np.asarray(array[part])
-
-    return FileArray(str(path), array.shape, array.dtype, attributes, get, array.chunks, stored, lost=note)
+    return FileArray(
+        str(path), array.shape, array.dtype, about, lambda part: np.asarray(array[part]), array.chunks, held, lost=note
+    )
 
 
 def with_ingested(source: CubeSource, arrays: Arrays, attributes: Mapping[str, Any]) -> CubeSource:
@@ -182,7 +183,8 @@ def write_ingested_cube(
     array = create_array(group, "values", image_spec(("line", "sample", "band"), source.shape, kind.str), about)
     for start in range(0, source.shape[0], BLOCK_LINES):
         stop = min(start + BLOCK_LINES, source.shape[0])
-        lines, valid = source.read(start, stop), source.valid[start:stop]
+        lines = source.read(start, stop)
+        valid = source.valid[start:stop]
         with np.errstate(over="ignore"):  # values beyond float32 become infinite: missing
             block = lines.astype(kind)
         if not valid.all():

@@ -122,10 +122,11 @@ class ObjectArchive(Archive):
         archive was opened. Publishing a run looks for its stores after that, and puts back what it lacks; that stays.
         """
         manifest = f"{ref.uri}/{MANIFEST_NAME}"
-        standing, there = self.objects.read(manifest), self.objects.listing(ref.uri)
+        standing = self.objects.read(manifest)
+        there = self.objects.listing(ref.uri)
         self.objects.remove([manifest])
         if unnamed:
-            self._mirror_runs()
+            self.refresh()
             if any(ref.uri in read_run(folder).names for folder in self._later_runs):
                 if standing is not None:
                     self.objects.create(manifest, standing)
@@ -181,8 +182,13 @@ class ObjectArchive(Archive):
         return draft
 
     def refresh(self) -> None:
-        """Fetch the manifests and receipts of runs that other machines have published or extended."""
-        self._mirror_runs()
+        """Fetch manifests and receipts of new and extended runs; drop those that other machines removed."""
+        here = [f"runs/{folder.name}" for folder in self.runs()]  # before the bucket's: others here may add some
+        found = _manifests(self.objects.listing("runs"))
+        self._drop_removed(here, found)
+        changed = [uri for uri, one in found.items() if not self._is_dated(uri, one)]
+        some_at_a_time(self._bring, changed)
+        self._later_runs |= {self.root / uri for uri in changed}
 
     def send_runs(self) -> None:
         """Upload runs and extensions of runs that a killed command has left in the working copy.
@@ -219,17 +225,8 @@ class ObjectArchive(Archive):
         with refusals(self.root, "write to the working copy"):
             some_at_a_time(self._bring, [uri for uri in found if not (self.root / uri / MANIFEST_NAME).is_file()])
             self._drop_removed(here, set(found))
-            self._mirror_runs()
+            self.refresh()
         self._later_runs.clear()
-
-    def _mirror_runs(self) -> None:
-        """Fetch manifests and receipts of new and extended runs; drop those that other machines removed."""
-        here = [f"runs/{folder.name}" for folder in self.runs()]  # before the bucket's: others here may add some
-        found = _manifests(self.objects.listing("runs"))
-        self._drop_removed(here, found)
-        changed = [uri for uri, one in found.items() if not self._is_dated(uri, one)]
-        some_at_a_time(self._bring, changed)
-        self._later_runs |= {self.root / uri for uri in changed}
 
     def _drop_removed(self, here: Iterable[str], there: Container[str]) -> None:
         """Drop what is not in the bucket and known here by manifest and receipt alone; files may not have been sent."""
@@ -300,7 +297,8 @@ class ObjectArchive(Archive):
             some_at_a_time(lambda uri: _lay_out(self.objects, root, uri), _manifests(there))
 
             def problems(folder: Path) -> Iterator[str]:
-                uri, text = folder.relative_to(root).as_posix(), (folder / MANIFEST_NAME).read_bytes()
+                uri = folder.relative_to(root).as_posix()
+                text = (folder / MANIFEST_NAME).read_bytes()
                 found = list(_problems(self.objects, there, folder, _files_at(uri, text)))
                 if found and self.objects.read(f"{uri}/{MANIFEST_NAME}") == text:  # else it has gone, or was made anew
                     yield from found
@@ -384,8 +382,8 @@ class ObjectArchive(Archive):
     def _fetch_files(self, uri: str, only: Iterable[str] | None = None) -> None:
         """Fetch the missing files (``only`` these names), each checked by its hash."""
         folder = self.root / uri
-        manifest, place = read_manifest(folder), _files_at(uri, (folder / MANIFEST_NAME).read_bytes())
-
+        manifest = read_manifest(folder)
+        place = _files_at(uri, (folder / MANIFEST_NAME).read_bytes())
         with self._locked(f"fetch-{uri.replace('/', '-')}"), self._aside() as aside:
 
             def fetch(name: str) -> None:
@@ -408,28 +406,29 @@ class ObjectArchive(Archive):
 
     def _upload(self, uri: str, *, first: bool) -> None:
         """Upload a folder's files, then its manifest; ``first`` by a conditional put, else in place of the old one."""
-        folder, objects = self.root / uri, self.objects
+        folder = self.root / uri
         text = (folder / MANIFEST_NAME).read_bytes()
         files = read_manifest(folder)["files"]
         check_files(folder, hashes=True)
-        place, there = _files_at(uri, text), objects.listing(uri)
+        place = _files_at(uri, text)
+        there = self.objects.listing(uri)
         sizes = {path: one.size for path, one in there.items()}
         waiting = [name for name, one in files.items() if sizes.get(f"{place}/{name}") != one["size"]]
-        some_at_a_time(lambda name: objects.write(f"{place}/{name}", folder / name), waiting)
+        some_at_a_time(lambda name: self.objects.write(f"{place}/{name}", folder / name), waiting)
         if not first:
-            standing = objects.read(f"{uri}/{MANIFEST_NAME}") or b""
+            standing = self.objects.read(f"{uri}/{MANIFEST_NAME}") or b""
             known = {hashlib.sha256(text).hexdigest(), *manifests_before(read_manifest(folder))}
             if uri.startswith("runs/") and standing and hashlib.sha256(standing).hexdigest() not in known:
                 self._find(uri)  # another machine has extended it meanwhile
                 return
-            objects.write(f"{uri}/{MANIFEST_NAME}", text)
+            self.objects.write(f"{uri}/{MANIFEST_NAME}", text)
             if (before := _files_at(uri, standing)) != place:
-                objects.remove([path for path in there if path.startswith(f"{before}/")])
-        elif not objects.create(f"{uri}/{MANIFEST_NAME}", text):
+                self.objects.remove([path for path in there if path.startswith(f"{before}/")])
+        elif not self.objects.create(f"{uri}/{MANIFEST_NAME}", text):
             self._find(uri)  # another writer was first, or the answer to this put was lost
             return
         self._standing[uri] = text
-        if uri.startswith("runs/") and (dated := objects.read_dated(f"{uri}/{MANIFEST_NAME}")) is not None:
+        if uri.startswith("runs/") and (dated := self.objects.read_dated(f"{uri}/{MANIFEST_NAME}")) is not None:
             self._lay(uri, *dated)  # with the date of the object
 
     def _ensure(self, uris: Iterable[str]) -> None:

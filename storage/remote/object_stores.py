@@ -23,7 +23,7 @@ from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from storage.archive.staging import sync_path
 
 if TYPE_CHECKING:
-    from obstore.store import ClientConfig, RetryConfig, S3Config, S3Store
+    from obstore.store import S3Store
 
 AT_ONCE = 8  # transfers in parallel
 PART_BYTES = 8 << 20  # of the parts of a large object
@@ -135,12 +135,13 @@ def connect(place: ObjectPlace) -> S3Store:
             f"{place.url}: archives on S3 need obstore ({error}); pip install 'spectralzoom[s3]'"
         ) from error
     http = place.endpoint is not None and place.endpoint.startswith("http://")
-    client: ClientConfig = {"allow_http": http, "connect_timeout": "5s", "read_timeout": "30s", "timeout": "15min"}
-    retry: RetryConfig = {"max_retries": RETRIES, "retry_timeout": timedelta(minutes=2)}
-    config: S3Config = {} if place.endpoint is None else {"endpoint": place.endpoint}
     try:
         return S3Store(
-            place.bucket, prefix=place.prefix or None, config=config, client_options=client, retry_config=retry
+            place.bucket,
+            prefix=place.prefix or None,
+            config={} if place.endpoint is None else {"endpoint": place.endpoint},
+            client_options={"allow_http": http, "connect_timeout": "5s", "read_timeout": "30s", "timeout": "15min"},
+            retry_config={"max_retries": RETRIES, "retry_timeout": timedelta(minutes=2)},
         )
     except BaseError as error:
         raise ArchiveError(f"{place.url} cannot be used: {_first_line(error)}") from error
@@ -156,8 +157,7 @@ def answers_of(place: ObjectPlace) -> Iterator[None]:
     except (BaseError, FileNotFoundError, PermissionError) as error:
         if isinstance(error, FileNotFoundError) and "NoSuchBucket" not in str(error):
             raise
-        text = str(error)
-        known = (words for signs, words in _MEANINGS if any(sign in text for sign in signs))
+        known = (words for signs, words in _MEANINGS if any(sign in str(error) for sign in signs))
         at = "" if place.endpoint is None else f" at {place.endpoint}"
         raise UnreachableError(f"{place.url}{at}: {next(known, _first_line(error))}") from error
 
@@ -181,8 +181,10 @@ class Objects:
     """
 
     def __init__(self, place: ObjectPlace) -> None:
-        self.place, self.store = place, connect(place)
-        self._moved, self._counting = 0, Lock()
+        self.place = place
+        self.store = connect(place)
+        self._moved = 0
+        self._counting = Lock()
 
     def take_moved(self) -> int:
         """Return the bytes of objects written and read since the last call.
