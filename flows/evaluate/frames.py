@@ -7,7 +7,7 @@ by another file.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
@@ -16,7 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.tasks.scene import check_labels, judged_labels, seen_in_training
-from flows.training.data import TrainingData, alike_notes, farm_test_data, only_class, open_training_data, scene_notes
+from flows.training.data import (
+    Report,
+    TrainingData,
+    alike_notes,
+    farm_test_data,
+    only_class,
+    open_training_data,
+    scene_notes,
+)
 from flows.training.observed_scenes import observe_scene
 from models.evaluation.metrics import DRAWS
 from models.network.machine import PROCESSOR
@@ -158,7 +166,7 @@ def open_frames(
     if unknown:
         raise SettingsError(f"{dataset} has no frame {', '.join(unknown)}; it has {', '.join(data.train)}")
     names = tuple(name for name in data.train if not frames or name in frames)
-    return TrainingData(data.law, names, (), (), data.camera, data.files, data.notes)
+    return replace(data, train=names, validation=(), held_out=())
 
 
 def observe_frame(scene: RasterScene, name: str, weights: Weights, camera: LineCamera, seed: int) -> ObservedFrame:
@@ -175,9 +183,6 @@ def observe_frame(scene: RasterScene, name: str, weights: Weights, camera: LineC
     return ObservedFrame(name, seen, fine, labels, len(scene.wavelength_nm))
 
 
-Show = Callable[[str, float, str], None]
-
-
 @dataclass(frozen=True)
 class Jobs:
     """Frames with the indices of their weights, and frames that all weights were trained on."""
@@ -191,14 +196,19 @@ class Jobs:
         return [name for name, fit in self.frames.items() if number in fit]
 
 
-def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[Candidate], show: Show) -> Jobs:
+def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[Candidate], show: Report) -> Jobs:
     """Assign to each frame the weights that were not trained on it.
 
     Raises SceneError: no frame or labelled pixel is left, a named frame has no weights left, or a frame has no labels;
     SettingsError: weights were trained on different pixels of a frame.
     """
-    frames, left_out, labelled = dict[str, tuple[int, ...]](), list[str](), False
-    alike, empty, regridded, validated = dict[str, str](), list[str](), list[str](), list[str]()
+    frames: dict[str, tuple[int, ...]] = {}
+    left_out: list[str] = []
+    alike: dict[str, str] = {}
+    empty: list[str] = []
+    regridded: list[str] = []
+    validated: list[str] = []
+    labelled = False
     in_turn = len({tuple(one.split.get("held_out", ())) for one in weights}) > 1
     for number, name in enumerate(data.train):
         show("looking for frames", number / len(data.train), name)

@@ -98,7 +98,8 @@ def choose_tradeoffs(stage: str | None, scene: str | None, weights: Path | None)
 def print_tradeoff(result: Result, console: Console) -> None:
     """Print the settings from the most to the least exact, with the Pareto front marked."""
     points = sorted(result.points, key=lambda point: point.error)
-    priced, rows = [] if result.cost == Tradeoff.cost else [result.cost], []
+    priced = [] if result.cost == Tradeoff.cost else [result.cost]
+    rows = []
     for point in points:
         further = [*point.beside.values(), *([point.cost] if priced else [])]
         figures = ["-" if math.isnan(one) else f"{one:.2g}" if abs(one) < 10 else f"{one:.1f}" for one in further]

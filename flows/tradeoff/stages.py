@@ -50,7 +50,9 @@ from storage.archive.archive import Archive
 
 # rectify: kernels on plane waves, whose values are known at every point
 
-SIDE, BANDS, POINTS = 256, 64, 40_000
+SIDE = 256  # of the grid of samples
+BANDS = 64
+POINTS = 40_000
 PERIODS_PX = (4.0, 40.0)
 CONTRAST = 0.2  # standard deviation of the scene over its mean, which fills half of the converter's range
 WAVES = 24
@@ -157,7 +159,8 @@ def _dark(block: SweepBlock, chosen: Mapping[Effect, str]) -> Values:
 
 def decide_for_lines(seed: int) -> FarmLines:
     """Plan the full scan of a farm, decide on effects for every tolerance, and take lines of the first sweep."""
-    scene, rig = farm_scene(seed, LAND_SHAPE), Rig()
+    scene = farm_scene(seed, LAND_SHAPE)
+    rig = Rig()
     sweeps = full_sweeps(SceneGrid(*LAND_SHAPE, PATCH), rig.camera, "x")
     probe = probe_scene(scene, rig, sweeps)
     starts = (0, (sweeps[0].lines - LINES) // 2, sweeps[0].lines - LINES)
@@ -255,7 +258,8 @@ def open_field(seed: int, scene: str | None, weights: Path | None, source: str) 
 def plan_every_way(seed: int, scene: str | None = None, weights: Path | None = None) -> PlannedField:
     """Scan a farm or another scene by every uniform scan, and read parts of one of them."""
     run = open_field(seed, scene, weights, "sim")
-    camera, cost = run.camera, run.settings.cost
+    camera = run.camera
+    cost = run.settings.cost
     grid = SceneGrid(*run.scene.shape, run.described.config.patch)
     along, _, _ = cheapest_full(grid, camera, cost)
     passes: dict[Setting, PlannedPass] = {}
@@ -292,7 +296,9 @@ FRACTIONS = (1.0, 0.35, 0.2, 0.15, 0.1, 0.05, 0.0)
 def plan_every_fraction(seed: int, scene: str | None = None, weights: Path | None = None) -> PlannedField:
     """Scan a farm by every line, or take a raster as it is; choose every fraction of its patches by expected gain."""
     run = open_field(seed, scene, weights, "sim" if scene is None else RASTER)
-    grid, raster, wavelength_nm = run.grid, run.raster, run.scene.wavelength_nm
+    grid = run.grid
+    raster = run.raster
+    wavelength_nm = run.scene.wavelength_nm
     keep_freed_memory()  # as surveys do
     if raster is not None:
         parts = cuts(grid.height, raster.rows_at_once(run.settings.memory))

@@ -121,8 +121,12 @@ def _imaged(
 
     With ``trained`` scenes, these are for validation: those without a label, or of a trained image, are left out.
     """
-    found, empty, regridded, alike = Imaged(), list[str](), list[str](), dict[str, str]()
-    unfit, negative = list[str](), list[str]()
+    found = Imaged()
+    alike: dict[str, str] = {}
+    empty: list[str] = []
+    unfit: list[str] = []
+    regridded: list[str] = []
+    negative: list[str] = []
     stream = 0x0B5 if trained is None else 0x0B6  # validation has noise of its own
     for number, name in enumerate(names):
         report(what, number / len(names), name)

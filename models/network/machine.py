@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Literal, get_args
 
 from pipeline.errors import SettingsError
@@ -55,17 +55,13 @@ def one_thread() -> Iterator[None]:
 
 def keep_freed_memory() -> None:
     """Let the C library keep freed memory: page faults of large arrays would take longer than the arithmetic."""
-    try:
+    with suppress(OSError, AttributeError):  # another C library is slower
         libc = ctypes.CDLL("libc.so.6")
         for option, value in KEPT:
             libc.mallopt(option, value)
-    except (OSError, AttributeError):
-        return  # another C library is slower
 
 
 def give_back_freed_memory() -> None:
     """Return kept memory to the system at the end of a stage: the next one needs blocks of other sizes."""
-    try:
+    with suppress(OSError, AttributeError):  # another C library
         ctypes.CDLL("libc.so.6").malloc_trim(0)
-    except (OSError, AttributeError):
-        return  # another C library

@@ -48,7 +48,8 @@ class SpectralBasis:
         Raises WavelengthError for a wavelength that is not finite, or outside 200-3000 nm (micrometres?).
         """
         wavelength = checked_wavelengths(wavelength_nm, len(wavelength_nm))
-        centres, span_nm = np.linspace(self.low_nm, self.high_nm, self.columns), self.high_nm - self.low_nm
+        centres = np.linspace(self.low_nm, self.high_nm, self.columns)
+        span_nm = self.high_nm - self.low_nm
         apart_nm = span_nm / (self.columns - 1) if self.columns > 1 else max(span_nm, LONGEST_NM)  # one covers all
         distance = (wavelength[:, None] - centres[None, :]) / apart_nm
         bump = np.where(np.abs(distance) <= REACH, np.exp(-0.5 * (distance / 0.5) ** 2), 0.0)
@@ -155,7 +156,8 @@ class Normalisation:
         there = reached & np.isfinite(normal)
         if there.all():
             return np.asarray(normal @ self.whitening, np.float32)
-        known, alike = np.where(there, normal, np.float32(0)), (there == reached).all(axis=-1)
+        known = np.where(there, normal, np.float32(0))
+        alike = (there == reached).all(axis=-1)
         self._complete(known, alike, reached)
         partly = ~alike & there.any(axis=-1)  # a pixel without a column keeps the medians
         for pattern in np.unique(there[partly], axis=0):
@@ -167,7 +169,8 @@ class Normalisation:
         if reached.all() or not reached.any() or not pixels.any():
             return
         rows = known[pixels]
-        rest, whitening = ~reached, self.whitening.astype(np.float64)
+        rest = ~reached
+        whitening = self.whitening.astype(np.float64)
         inverse = whitening @ whitening  # of the covariance of a normal law
         weights = -np.linalg.solve(inverse[np.ix_(rest, rest)], inverse[np.ix_(rest, reached)]).T
         rows[:, rest] = rows[:, reached] @ np.asarray(weights, np.float32)  # conditional mean

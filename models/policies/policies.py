@@ -81,8 +81,10 @@ def class_errors(seen: CoarsePrediction) -> NDArray[np.float64]:
     A pixel with class probabilities p has the expected errors p (1 - p). Both are means over the pixels of a patch.
     Pixels outside of the scene count as 0. The expected pixels of a class are those with data.
     """
-    grid, shown = seen.grid, seen.probability.copy()
-    shown[grid.height :], shown[:, grid.width :] = 0, 0
+    grid = seen.grid
+    shown = seen.probability.copy()
+    shown[grid.height :] = 0
+    shown[:, grid.width :] = 0
     known = shown if seen.filled is None else np.where(seen.filled[..., None], np.float32(0), shown)
     images = (shown * (1 - shown), known)
     return np.stack([patches_of(one, grid.patch).mean(axis=(1, 2), dtype=np.float64) for one in images], axis=1)

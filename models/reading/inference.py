@@ -105,8 +105,9 @@ def read_coarse_pass(
     ``components``. ``origin`` is the row and column of the grid's first patch in a larger field. A value beyond
     `Normalisation.most_value` counts as NaN.
     """
-    shape, filled = (grid.height, grid.width), 0
-    columns, known = np.empty((*shape, weights.config.columns), np.float32), np.zeros(shape, np.bool_)
+    columns = np.empty((grid.height, grid.width, weights.config.columns), np.float32)
+    known = np.zeros((grid.height, grid.width), np.bool_)
+    filled = 0
     for strip in strips:
         last = filled + len(strip)
         if components is None:

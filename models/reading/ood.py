@@ -122,11 +122,10 @@ class LitDetector:
     def _squares(self, known: Floats) -> Floats:
         near = (known @ self.centres.T - 0.5 * (self.centres**2).sum(axis=1)).argmax(axis=1)
         order = np.argsort(near.astype(np.uint16), kind="stable")  # radix sort: a tenth of the time
-        ends, in_order = np.searchsorted(near[order], np.arange(len(self.centres) + 1)), known[order]
-        squares = np.empty(len(known), np.float32)
-        for number, (start, stop) in enumerate(pairwise(ends)):
-            apart = (in_order[start:stop] - self.centres[number]) @ self.whitening[number]
-            squares[start:stop] = np.einsum("ij,ij->i", apart, apart)
+        ends = np.searchsorted(near[order], np.arange(len(self.centres) + 1))
         found = np.empty(len(known), np.float32)
-        found[order] = squares
+        for number, (start, stop) in enumerate(pairwise(ends)):
+            own = order[start:stop]
+            apart = (known[own] - self.centres[number]) @ self.whitening[number]
+            found[own] = np.einsum("ij,ij->i", apart, apart)
         return found

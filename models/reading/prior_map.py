@@ -99,7 +99,8 @@ def pooled(columns: Floats) -> Floats:
     whole = np.pad(columns, [(0, y), (0, x), (0, 0)], mode="edge") if y or x else columns
     parts = np.stack([whole[i::CELL_PX, j::CELL_PX] for i in range(CELL_PX) for j in range(CELL_PX)])
     known = np.isfinite(parts)
-    sums, count = np.where(known, parts, np.float32(0)).sum(axis=0), known.sum(axis=0, dtype=np.float32)
+    sums = np.where(known, parts, np.float32(0)).sum(axis=0)
+    count = known.sum(axis=0, dtype=np.float32)
     return np.where(count > 0, sums / np.maximum(count, 1), np.float32(np.nan))
 
 
@@ -117,7 +118,8 @@ def fuse(prior_map: PriorMap, observation: CurrentVisit, reader: TemporalReader 
     """
     today = observation.log_probability
     y = len(today)
-    kept, ages, light = np.empty_like(today), *np.empty((2, *observation.seen.shape), np.float32)
+    kept = np.empty_like(today)
+    ages, light = np.empty((2, *observation.seen.shape), np.float32)
     high = max(ROWS // CELL_PX, 1) * CELL_PX
     for top in range(0, y, high):  # limits the memory of intermediate arrays
         first, last, stop = max(top - HALO, 0), min(top + high + HALO, y), min(top + high, y)
@@ -149,7 +151,8 @@ def _fused(
     known, shown = _finite(before), _finite(today)
     seen = observation.seen[rows] & shown
     age = prior_map.probabilities.age_days[rows] + np.float32(prior_map.days)
-    days, flat = np.nan_to_num(age, nan=0.0), np.float32(-math.log(before.shape[-1]))
+    days = np.nan_to_num(age, nan=0.0)
+    flat = np.float32(-math.log(before.shape[-1]))
     old, new = (_normalised(np.where(where[..., None], one, flat)) for where, one in ((known, before), (seen, today)))
     left = np.float32(math.exp(-prior_map.days / LIGHT_FADES_DAYS))
     rests_on = np.where(known, prior_map.probabilities.light[rows] * left, 0).astype(np.float32)
@@ -224,19 +227,17 @@ def _read(
     rows: slice,
 ) -> Floats:
     """Return the reader's log-probabilities of some rows; the first row begins a coarse pixel."""
-    s, (y, x) = CELL_PX, images[2].shape
-    down, across = -(-y // s), -(-x // s)
-    cells = slice(rows.start // s, rows.start // s + down)
+    y, x = images[2].shape
+    down, across = -(-y // CELL_PX), -(-x // CELL_PX)
+    cells = slice(rows.start // CELL_PX, rows.start // CELL_PX + down)
     now = observation.coarse[cells, :across]
     past = now if prior_map.coarse is None else prior_map.coarse[cells, :across]
-    both = _finite(past) & _finite(now)
-    if prior_map.coarse is None:
-        both[...] = False
+    both = _finite(past) & _finite(now) & (prior_map.coarse is not None)
     season = torch.tensor([season_of(prior_map.day_of_year)], dtype=torch.float32)
     taken = torch.tensor([observation.light]), torch.tensor([float(observation.step)]), season
 
     def fine(values: NDArray[np.generic]) -> Tensor:
-        fill = [(0, s * down - y), (0, s * across - x), *[(0, 0)] * (values.ndim - 2)]
+        fill = [(0, CELL_PX * down - y), (0, CELL_PX * across - x), *[(0, 0)] * (values.ndim - 2)]
         return _image(np.pad(values, fill, mode="edge"))
 
     with torch.inference_mode():
@@ -327,8 +328,8 @@ def compare(
 
 def changed_from(prior_map: PriorMap, after: ClassProbabilities) -> NDArray[np.uint8]:
     """Return the earlier class of captured pixels (y, x) whose prior map and map are confident of two; else 255."""
-    before, now = prior_map.probabilities.log_probability, after.log_probability
-    (old, old_sure), (new, new_sure) = map(likeliest, (before, now))
+    old, old_sure = likeliest(prior_map.probabilities.log_probability)
+    new, new_sure = likeliest(after.log_probability)
     sure = np.minimum(old_sure, new_sure) > math.log(CERTAIN)  # NaN is not
     return np.where(sure & (old != new) & (after.age_days == 0), old, UNLABELLED).astype(np.uint8)
 

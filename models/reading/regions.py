@@ -85,7 +85,8 @@ class Region:
 
         The full network reads none of the halo: a patch depends on the overview and its own pixels alone.
         """
-        (top, left), kept = self.origin, self.kept_patches
+        top, left = self.origin
+        kept = self.kept_patches
         row, column = np.divmod(np.asarray(patch_index, np.int64), self.field.patch_shape[1])
         inside = (row >= kept.top) & (row < kept.bottom) & (column >= kept.left) & (column < kept.right)
         return np.where(inside, (row - top) * self.grid.patch_shape[1] + column - left, -1)
@@ -103,7 +104,8 @@ class Region:
 
     def crop_patches(self, values: NDArray[Scalar]) -> NDArray[Scalar]:
         """Crop values of all patches that are read, (patch, ...), to the kept ones, (y, x, ...)."""
-        (top, left), kept = self.origin, self.kept_patches
+        top, left = self.origin
+        kept = self.kept_patches
         image = values.reshape(*self.grid.patch_shape, *values.shape[1:])
         return image[kept.top - top : kept.bottom - top, kept.left - left : kept.right - left]
 
@@ -154,14 +156,14 @@ def region_bytes(config: SegmenterConfig, region: Region, patch_index: int, band
     It counts the image and its features, those of some patches, all class probabilities, and rows of values from the
     stores.
     """
-    p, (y, x) = config.patch, region.grid.padded_shape
+    y, x = region.grid.padded_shape
     inputs = config.columns + PLANES
     overview, full = (
         FEATURE_COPIES * sum(channels / 4**level for level, channels in enumerate(level_widths(width, size, deep)))
-        for width, size, deep in ((config.overview_width, TOKEN_PX, config.deep), (config.width, p, False))
+        for width, size, deep in ((config.overview_width, TOKEN_PX, config.deep), (config.width, config.patch, False))
     )
     drawn = MAP_COPIES * config.classes
-    chunk = min(PATCHES_AT_ONCE, patch_index) * p**2 * (full + inputs + config.overview_width)
+    chunk = min(PATCHES_AT_ONCE, patch_index) * config.patch**2 * (full + inputs + config.overview_width)
     strip = STRIP_COPIES * bands * min(STRIP_ROWS, y) * x
     most: int = 4 * round(y * x * (IMAGE_COPIES * inputs + overview + drawn) + chunk + strip)
     return most
