@@ -71,13 +71,8 @@ class TemporalReader(nn.Module):
         taken = torch.cat([torch.stack([light.log(), step.log2()], dim=1), season], dim=1)[:, :, None, None]
         scaled = [(part / 4).clamp(-FAINT / 4, 0) for part in (prior_map, today)]
         known = rests_on.clamp(min=LEAST_LIGHT).log() / 2
-        features = F.gelu(
-            self.enter(
-                torch.cat(
-                    [*scaled, seen, torch.log1p(age) / 2, known, taken.expand(-1, -1, *seen.shape[-2:]), below], dim=1
-                )
-            )
-        )
+        inputs = [*scaled, seen, torch.log1p(age) / 2, known, taken.expand(-1, -1, *prior_map.shape[-2:]), below]
+        features = F.gelu(self.enter(torch.cat(inputs, dim=1)))
         wider = self.middle(F.avg_pool2d(features, CELL_PX))
         features = F.gelu(features + F.interpolate(wider, scale_factor=float(CELL_PX), mode="nearest"))
         added, gates = self.leave(features).split([self.sizes.classes, GATES], dim=1)

@@ -29,8 +29,10 @@ from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 
 NOISY = 0.25  # fraction of crops with added noise
 BRIGHTNESS = 0.04  # standard deviation of the factor of a crop's light
-ZOOMED, ZOOMS = 0.7, (-0.6, 0.5)  # fraction of crops that are zoomed, if any; octaves of their pixels
-HALO, STRIP_ROWS = 8, 64  # rows around a strip that its footprint reaches; most rows of a strip
+ZOOMED = 0.7  # fraction of crops that are zoomed, if any
+ZOOMS = (-0.6, 0.5)  # octaves of their pixels
+HALO = 8  # rows around a strip that its footprint reaches
+STRIP_ROWS = 64  # most rows of a strip
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,8 @@ def observe(
     labels = np.full(grid.padded_shape, UNLABELLED, np.uint8)
     labels[: grid.height, : grid.width] = scene.labels
     rows, width = grid.padded_shape
-    strip, columns = math.gcd(rows, STRIP_ROWS), np.empty((rows, width, basis.columns), np.float32)
+    strip = math.gcd(rows, STRIP_ROWS)
+    columns = np.empty((rows, width, basis.columns), np.float32)
     exposure = camera.exposure_ms / DEFAULT_EXPOSURE_MS
     scale = (scene.white_reference / (scene.white_reference_electrons * exposure)).astype(np.float32)
     for top, stream in zip(range(0, rows, strip), rng.spawn(rows // strip), strict=True):
@@ -133,8 +136,13 @@ class CropSampler:
         With ``zoomed`` most crops are enlarged or reduced. The scenes stay on the ``device``, where crops are made.
         """
         self.smallest: int = min(min(example.labels.shape) for example in examples)
-        self.examples, self.patch, self.crop, self.noise, self.zoomed = examples, patch, crop, noise, zoomed
-        self.augmentation, self.device = augmentation, device
+        self.examples = examples
+        self.patch = patch
+        self.crop = crop
+        self.noise = noise
+        self.zoomed = zoomed
+        self.augmentation = augmentation
+        self.device = device
         self.columns = [torch.from_numpy(example.columns).to(device) for example in examples]
         areas = np.array([np.count_nonzero(example.labels != UNLABELLED) for example in examples], np.float64)
         if not areas.any():

@@ -48,7 +48,8 @@ def fit_ood(
             "no scene was kept for validation, which the false-alarm rate needs; train with --validation 1 or more"
         )
     rng = np.random.default_rng([seed, 0xFA3])
-    augmentation, gathered = CaptureAugmentation(normalisation, darkest_ms=darkest_ms), []
+    augmentation = CaptureAugmentation(normalisation, darkest_ms=darkest_ms)
+    gathered = []
     for number, example in enumerate(train):
         gathered += _drawn_spectra(example, normalisation, rng, SPECTRA // len(train) + 1)
         report(0.3 * (number + 1) / len(train))
@@ -97,7 +98,8 @@ def components(pixels: Spectra, classes: Classes, seed: int) -> tuple[Exact, Exa
     """
     if len(pixels) < LEAST_SPECTRA:
         raise SceneError(f"{len(pixels)} labelled pixels are too few to fit a detector; it takes {LEAST_SPECTRA}")
-    exact, columns = pixels.astype(np.float64), pixels.shape[1]
+    exact = pixels.astype(np.float64)
+    columns = pixels.shape[1]
     middles = []
     for number in np.unique(classes):
         own = exact[classes == number]

@@ -208,7 +208,8 @@ def add_ood(weights: Path, ood_detector: OodDetector, trained_on: TrainedOn, rec
 
     Raises WeightsError: the file cannot be read or written.
     """
-    limits, arrays = ood_detector.limits, {name: getattr(ood_detector, name) for name in OF_COMPONENTS}
+    limits = ood_detector.limits
+    arrays = {name: getattr(ood_detector, name) for name in OF_COMPONENTS}
     arrays |= {name: getattr(limits, name) for name in OF_LIMITS}
     tensors = {name: torch.from_numpy(np.ascontiguousarray(one, np.float32)) for name, one in arrays.items()}
     about = {"bands": ood_detector.bands, "steps": list(limits.steps), "trained_on": trained_on.as_dict()}
@@ -286,8 +287,8 @@ def load_weights(path: Path) -> Weights:
         normalisation = Normalisation(*(tensors.pop(f"normalisation.{name}").numpy() for name in NORMALISATION))
         colours = tensors.pop(COLOURS).numpy()
         network.load_state_dict(tensors, assign=True)
-        own, of_columns = normalisation, (config.columns,)
-        shapes = [one.shape for one in (own.centre, own.spread, own.whitening, colours)]
+        of_columns = (config.columns,)
+        shapes = [*(getattr(normalisation, name).shape for name in NORMALISATION), colours.shape]
         if shapes != [of_columns, of_columns, of_columns * 2, (config.classes, 3)]:
             raise ValueError(f"normalisation and colours {shapes} do not fit {config.columns} columns")
         if not (normalisation.spread > 0).all():
@@ -305,8 +306,10 @@ def describe_weights(path: Path) -> Description:
         raise WeightsError(f"{what}; train some with: spectralzoom train DATASET -o FILE.safetensors")
     about = read_about(path, FORMAT)
     with refusing(path):
-        config, basis = SegmenterConfig(**about["config"]), SpectralBasis(**about["basis"])
-        names, record = tuple(map(str, about["class_names"])), dict(about["record"])
+        config = SegmenterConfig(**about["config"])
+        basis = SpectralBasis(**about["basis"])
+        names = tuple(map(str, about["class_names"]))
+        record = dict(about["record"])
         check_basis(basis, config.columns)
         keys = about["keys"]
         ood_detector = OodPart.read(keys[OOD], about[OOD]) if OOD in about else None
