@@ -73,7 +73,7 @@ def evaluate_weights(request: EvaluateRequest, show: Report = lambda what, done,
             {
                 "file": one.path.name,
                 "key": one.key,
-                "frames": len(covers := jobs.covered(number)),
+                "frames": len(covers := [name for name, judges in jobs.frames.items() if number in judges]),
                 "covers": covers,
                 "left_out": sorted({*jobs.frames, *jobs.left_out} - set(covers)),
             }

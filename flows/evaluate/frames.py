@@ -191,10 +191,6 @@ class Jobs:
     left_out: list[str] = field(default_factory=list)
     notes: tuple[str, ...] = ()  # on frames with a single class, without any value, or with labels of another grid
 
-    def covered(self, number: int) -> list[str]:
-        """Return the frames that these weights judge."""
-        return [name for name, fit in self.frames.items() if number in fit]
-
 
 def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[Candidate], show: Report) -> Jobs:
     """Assign to each frame the weights that were not trained on it.

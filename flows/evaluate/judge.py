@@ -151,18 +151,25 @@ def summarise(runs: Runs, class_names: Sequence[str], request: EvaluateRequest) 
     support = whole.counts.sum(axis=3).max(axis=0).sum(axis=0)  # labelled pixels of each class, each frame once
     table = []
     for (policy, fraction), row in rows.items():
-        figures: Record = {"policy": policy, "fraction": fraction, "uses_labels": policy == ORACLE}
-        figures |= _accuracy(row, class_names)
-        figures["gap_closed"] = None if policy in ENDS else gap_closed(figures["miou"], *ends)
+        accuracy = _accuracy(row, class_names)
         bought, best = (sum(part[name] for part in row.parts) for name in ("gain", "best_gain"))
-        figures["captured_gain"] = bought / best if best > 0 else None
-        figures["against_all"] = difference(row, whole, request)
-        figures["against_random"] = difference(row, rows.get(("random", fraction)), request)
         cost = {}  # means of a frame, and their ratio to those of all patches
         for name in ("patches", "multiply_adds"):
             done, full = (float(np.mean([one[name] for one in some.parts])) for some in (row, whole))
             cost[name] = {"done": done, "ratio": done / full if full else None}
-        table.append(figures | {"cost": cost})
+        table.append(
+            {
+                "policy": policy,
+                "fraction": fraction,
+                "uses_labels": policy == ORACLE,
+                **accuracy,
+                "gap_closed": None if policy in ENDS else gap_closed(accuracy["miou"], *ends),
+                "captured_gain": bought / best if best > 0 else None,
+                "against_all": difference(row, whole, request),
+                "against_random": difference(row, rows.get(("random", fraction)), request),
+                "cost": cost,
+            }
+        )
     return {"rows": table, "support": dict(zip(class_names, support.tolist(), strict=True))}
 
 

@@ -165,14 +165,12 @@ def _draw_tradeoff(axes: Axes, result: Result) -> None:
         place: Any = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
         axes.annotate(result.level[0], (1, result.level[1]), (-2, 3), **place, ha="right", color=_LEVEL, size=9)
     exact = any(point.error == 0 for point in result.points)  # 0 has no logarithm
-    axes.set(xscale="log", yscale="linear" if exact else "log")
+    axes.set(xscale="log", yscale="linear" if exact else "log", facecolor=PAPER, axisbelow=True)
     if exact:
         smallest = min((point.error for point in result.points if point.error > 0), default=1.0)
         axes.set_yscale("symlog", linthresh=smallest)
     axes.set_title(f"{result.stage}: {result.knob}", loc="left", weight="bold", color=INK, size=13)
     axes.set_xlabel(result.cost, color=INK)
     axes.set_ylabel(result.error, color=INK)
-    axes.set_facecolor(PAPER)
     axes.grid(visible=True, which="major", color=GRID, linewidth=0.8)
-    axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)

@@ -258,15 +258,13 @@ def open_field(seed: int, scene: str | None, weights: Path | None, source: str) 
 def plan_every_way(seed: int, scene: str | None = None, weights: Path | None = None) -> PlannedField:
     """Scan a farm or another scene by every uniform scan, and read parts of one of them."""
     run = open_field(seed, scene, weights, "sim")
-    camera = run.camera
-    cost = run.settings.cost
     grid = SceneGrid(*run.scene.shape, run.described.config.patch)
-    along, _, _ = cheapest_full(grid, camera, cost)
+    along, _, _ = cheapest_full(grid, run.camera, run.settings.cost)
     passes: dict[Setting, PlannedPass] = {}
     for words, (step, exposure_ms) in SCANS.items():
-        sweeps = uniform_sweeps(grid, camera, along, step=step, exposure_ms=exposure_ms)
+        sweeps = uniform_sweeps(grid, run.camera, along, step=step, exposure_ms=exposure_ms)
         scan = LineSpec(exposure_ms / DEFAULT_EXPOSURE_MS, step)
-        passes[words] = uniform_pass(run.weights, run.simulated, sweeps, grid, cost, scan)
+        passes[words] = uniform_pass(run.weights, run.simulated, sweeps, grid, run.settings.cost, scan)
     whole = passes[format_scan(*PART_OF)]
     scores = score_patches(POLICY, whole.coarse)
     for words, fraction in PARTS.items():

@@ -287,8 +287,9 @@ def _condensed(scan: ScanLines, condenser: Condenser, statistics: SignalStatisti
     cube = SignalCubeInMemory(header, components, step=condenser.step, largest=largest)
     done = condenser.sweep(lines, cube.writer.write)
     exposure_ms = np.full(len(lines.data), scan.camera.exposure_ms)
-    x, y = lines.position.T
-    cube.writer.close(LineRows(lines.time_s, x, y, exposure_ms, lines.valid_line), done.rare, done.residuals)
+    cube.writer.close(
+        LineRows(lines.time_s, *lines.position.T, exposure_ms, lines.valid_line), done.rare, done.residuals
+    )
     return KeptLines(cube.size, lambda: cube.open().spectra(0, len(lines.data))), done
 
 
@@ -361,39 +362,29 @@ def compress_jpeg2000(scan: ScanLines, rate: float, raw: bool) -> KeptLines:
 
     They are the principal components of ``raw`` numbers (Du & Fowler 2007), or the components of condensing.
     """
+    rasterio = importlib.import_module("rasterio")
+    memory_file = importlib.import_module("rasterio.io").MemoryFile
     components, scores = _scored(scan, raw=raw)
     step = np.float32(max(JP2_STEP, float(np.abs(scores).max()) / JP2_LARGEST))
     numbers = (np.rint(scores.transpose(2, 0, 1) / step) + JP2_ZERO).astype(np.uint16)
-    packed = _to_jpeg2000(numbers, 100 * rate / (2 * len(components)))
-
-    def restore() -> Values:
-        back = (_from_jpeg2000(packed).astype(np.float32) - JP2_ZERO) * step
-        restored = components.restore(back.transpose(1, 2, 0))
-        return scan.lines.calibrated(restored) if raw else restored
-
-    return KeptLines(len(packed) + _law_bytes(components), restore)
-
-
-def _to_jpeg2000(numbers: NDArray[np.uint16], percent: float) -> bytes:
-    """Return an image (band, y, x) as JPEG 2000, in a percentage of its bytes."""
-    rasterio = importlib.import_module("rasterio")
     count, height, width = numbers.shape
     shape: dict[str, Any] = {"count": count, "height": height, "width": width, "dtype": "uint16"}
-    with warnings.catch_warnings(), importlib.import_module("rasterio.io").MemoryFile() as file:
+    percent = 100 * rate / (2 * count)  # of the bytes of these numbers
+    with warnings.catch_warnings(), memory_file() as file:
         warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
         with file.open(driver=JP2_DRIVER, QUALITY=percent, REVERSIBLE="NO", YCC="NO", **shape) as image:
             image.write(numbers)
         packed: bytes = file.read()
-    return packed
 
+    def restore() -> Values:
+        with warnings.catch_warnings(), memory_file(packed) as file:
+            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+            with file.open() as image:
+                back = (image.read().astype(np.float32) - JP2_ZERO) * step
+        restored = components.restore(back.transpose(1, 2, 0))
+        return scan.lines.calibrated(restored) if raw else restored
 
-def _from_jpeg2000(packed: bytes) -> NDArray[np.uint16]:
-    rasterio = importlib.import_module("rasterio")
-    with warnings.catch_warnings(), importlib.import_module("rasterio.io").MemoryFile(packed) as file:
-        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-        with file.open() as image:
-            numbers: NDArray[np.uint16] = image.read()
-    return numbers
+    return KeptLines(len(packed) + _law_bytes(components), restore)
 
 
 _PCODEC: Mapping[Setting, Callable[[ScanLines], KeptLines]] = {

@@ -89,9 +89,8 @@ class DataSet:
     def classes(self) -> dict[str, ClassValue]:
         """Return the classes of several label files together; empty if scene.toml names them."""
         settings = find_scene_settings(Path(next(iter(self.files.values()))))
-        if len(self.label_files) < 2 or settings.classes:
-            return {}
-        return classes_of_files(tuple(self.label_files.values()), settings)
+        named = len(self.label_files) < 2 or settings.classes
+        return {} if named else classes_of_files(tuple(self.label_files.values()), settings)
 
     def load(self, name: str, part: Literal["train", "test"] | None = None) -> SceneFile:
         """Read one scene by its name with all labels, or with those inside or outside of the training mask.
@@ -281,10 +280,8 @@ def _built_in_days(laws: tuple[str, ...], first_seed: int, count: int, *, odd: b
     names: list[str] = []
     for number, law in enumerate(laws):
         own = len(range(number, count, len(laws)))
-        if law == FARM_LAW:
-            names += farm_days(first_seed, own, odd=odd)
-        else:
-            names += [_SCOUTED + name for name in farm_days(first_seed, own, odd=odd, season=SCOUTED_DAYS)]
+        prefix, season = ("", SEASON_DAYS) if law == FARM_LAW else (_SCOUTED, SCOUTED_DAYS)
+        names += [prefix + name for name in farm_days(first_seed, own, odd=odd, season=season)]
     return tuple(names)
 
 
@@ -312,37 +309,14 @@ def read_farm_name(name: str) -> tuple[int, int, float]:
     return int(seed), int(day), float(hour)
 
 
-def file_data(files: DataSet, validation: int | None, camera: LineCamera) -> TrainingData:
-    """Split the scenes of a data set; every n-th of those not held out is for validation, by default one in eight.
-
-    Scenes without labels are left out, with a note, where others have some.
-    """
-    names = tuple(name for name in files.files if name not in (*files.held_out, *files.unlabelled))
-    if not names:
-        raise SceneError(f"{files.path}: {'; '.join(files.notes)}; held-out scenes cannot be trained on")
-    if validation is None:
-        validation = min(4, len(names) // 8)
-    if validation >= len(names) and validation:
-        raise SceneError(f"{validation} scenes for validation leave none of {len(names)} to train on; take fewer")
-    kept = names[:: max(len(names) // validation, 1)][:validation] if validation else ()
-    return TrainingData(
-        law=files.path.stem,
-        train=tuple(name for name in names if name not in kept),
-        validation=kept,
-        held_out=files.held_out,
-        camera=camera,
-        files=files,
-        notes=files.notes,
-    )
-
-
 def open_training_data(
     dataset: str, validation: int | None, scenes: int | None, camera: LineCamera, **choices: object
 ) -> TrainingData:
     """Open built-in scenes, separated by commas, or a path with the choices of `load_data_set`.
 
-    One scene in eight (at most 4) is for validation by default. Raises SettingsError: a choice of files for built-in
-    scenes, or the other way round.
+    Every n-th scene that is not held out is for validation: one in eight (at most 4) by default. Scenes without labels
+    are left out, with a note, where others have some. Raises SettingsError: a choice of files for built-in scenes, or
+    the other way round.
     """
     if laws := built_in_laws(dataset):
         for choice, value in choices.items():
@@ -356,7 +330,17 @@ def open_training_data(
         )
     if scenes is not None:
         raise SettingsError(f"--scenes is for built-in scenes; {dataset} has its own scenes")
-    return file_data(load_data_set(Path(dataset), **choices), validation, camera)  # type: ignore[arg-type]
+    files = load_data_set(Path(dataset), **choices)  # type: ignore[arg-type]
+    names = tuple(name for name in files.files if name not in (*files.held_out, *files.unlabelled))
+    if not names:
+        raise SceneError(f"{files.path}: {'; '.join(files.notes)}; held-out scenes cannot be trained on")
+    if validation is None:
+        validation = min(4, len(names) // 8)
+    if validation >= len(names) and validation:
+        raise SceneError(f"{validation} scenes for validation leave none of {len(names)} to train on; take fewer")
+    kept = names[:: max(len(names) // validation, 1)][:validation] if validation else ()
+    train = tuple(name for name in names if name not in kept)
+    return TrainingData(files.path.stem, train, kept, files.held_out, camera, files, files.notes)
 
 
 def pack_mask(mask: NDArray[np.bool_]) -> str:

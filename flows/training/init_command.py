@@ -98,8 +98,8 @@ def run_init(source: str, console: Console, *, force: bool = False) -> dict[str,
         first = f"repair these label files, or write what is missing into {path}"
         following = shlex.join(["spectralzoom", "init", source, "--force"])
     elif bands.wavelength_nm is None:
-        what = f"the {draft.cube.shape[2]} wavelengths"
-        first = f"write {what} into {path}: wavelengths_nm or wavelengths_file, as its lines say"
+        count = draft.cube.shape[2]
+        first = f"write the {count} wavelengths into {path}: wavelengths_nm or wavelengths_file, as its lines say"
     return {
         "file": str(path),
         "images": len(found.images),
@@ -190,10 +190,13 @@ def _class_lines(draft: SceneDraft) -> list[str]:
     lines = [
         f"# unlabelled = {_value(one)}   # if it means no class: remove the #, and its line below" for one in guess[:1]
     ]
-    parts = "name = value in the label files; rename them as you like"
-    if all(is_polygon_file(label) for label in draft.files.labels.values()):
-        parts = "name = number; polygons have the name or the number"
-    lines += ["", f"[classes]   # with its fraction of the labelled pixels: {parts}"]
+    polygons = all(is_polygon_file(label) for label in draft.files.labels.values())
+    parts = (
+        "number; polygons have the name or the number"
+        if polygons
+        else "value in the label files; rename them as you like"
+    )
+    lines += ["", f"[classes]   # with its fraction of the labelled pixels: name = {parts}"]
     return lines + [f"{_key(one.name)} = {_value(one.value)}   # {one.fraction:.1%}" for one in classes]
 
 
@@ -214,8 +217,9 @@ def _unseen(draft: SceneDraft) -> list[str]:
     found = draft.files
     parts = []
     if found.labels and found.bare:
-        images = counted(len(found.bare), "image")
-        parts.append(f"labels of {images}, left out of the training: {listed_names(found.bare)}")
+        parts.append(
+            f"labels of {counted(len(found.bare), 'image')}, left out of the training: {listed_names(found.bare)}"
+        )
     if not found.labels:
         parts.append("label files: beside an image NAME.png they are called NAME_mask.png, or labels/NAME.png")
     if found.alone:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from models.network.spectral import SpectralBasis, project
 from models.training.capture_augmentation import ColumnNoise, SceneSpectra
-from models.training.examples import Example, noise_of, observe, value_of_electron
+from models.training.examples import Example, observe, value_of_electron
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
@@ -94,12 +94,14 @@ def observe_finely(
         raise SceneError(f"scene {scene.name} has pixels that no line reached; training needs all of it")
     mean = total / count
     covariance = products / count - np.outer(mean, mean)
-    spectra = SceneSpectra(mean, covariance, matrix, value_of_electron(scene), camera.read_noise_e)
+    value = value_of_electron(scene)
+    spectra = SceneSpectra(mean, covariance, matrix, value, camera.read_noise_e)
     noise = np.sum(spectra.noise(1.0), axis=0)
     power = np.linalg.eigvalsh(covariance / np.sqrt(np.outer(noise, noise)))
     floor = np.quantile(power, 0.1)  # of directions without a signal
     spectra = replace(spectra, covariance=covariance - floor * np.diag(noise))
-    return columns, replace(noise_of(scene, matrix, camera), spectra=spectra if bands > FEW_BANDS else None)
+    of_columns = ColumnNoise.of_bands(matrix, value, camera.read_noise_e)
+    return columns, replace(of_columns, spectra=spectra if bands > FEW_BANDS else None)
 
 
 def chosen_effects(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep]) -> Choice:

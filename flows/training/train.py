@@ -125,9 +125,14 @@ def train_weights(
 def _trained_on(data: TrainingData, scenes: Scenes, darkest_ms: float) -> TrainedOn:
     """Return the ranges of the training data; season, sun and scale are known for built-in farms alone."""
     nm = scenes.common.wavelength_nm
-    span = float(nm.min()), float(nm.max())
-    exposures = darkest_ms, max(darkest_ms, data.camera.exposure_ms)
-    trained = TrainedOn(len(nm), span, exposures, len(data.train), scenes.common.names, bands_nm=tuple(nm.tolist()))
+    trained = TrainedOn(
+        bands=len(nm),
+        wavelength_nm=(float(nm.min()), float(nm.max())),
+        exposure_ms=(darkest_ms, max(darkest_ms, data.camera.exposure_ms)),
+        scenes=len(data.train),
+        classes=scenes.common.names,
+        bands_nm=tuple(nm.tolist()),
+    )
     if data.files is not None:
         return trained
     moments = [read_farm_name(name)[1:] for name in data.train]
@@ -147,14 +152,13 @@ def check_start(request: TrainRequest, begun: Weights, scenes: Scenes) -> None:
     split = begun.record.get("split", {})
     known = set(split.get("train", {}).values())
     masks = split.get("pixels", {})
-    common = scenes.common
     now = scenes.train
     for what, kept in {
         "training scenes": known <= set(now.keys.values()),
         "training pixels": all(masks_contain(now.pixels[key], masks.get(key)) for key in known & now.pixels.keys()),
-        "bands": begun.basis == common.basis,
-        "classes": begun.class_names == common.names,
-        "sizes of the network": begun.config == network_config(request, common),
+        "bands": begun.basis == scenes.common.basis,
+        "classes": begun.class_names == scenes.common.names,
+        "sizes of the network": begun.config == network_config(request, scenes.common),
     }.items():
         if not kept:
             raise SettingsError(

@@ -194,7 +194,6 @@ def suggested_patch(shape: tuple[int, int], *, built_in: bool) -> int:
 def network_config(request: TrainRequest, common: Common) -> SegmenterConfig:
     """Return the sizes of the network. Raises SettingsError where they do not fit each other."""
     deep = common.patch >= DEEP_PATCH_PX
-    usual = {"layers": 1 if deep else SegmenterConfig.layers}
     try:
         return SegmenterConfig(
             classes=len(common.names),
@@ -203,7 +202,7 @@ def network_config(request: TrainRequest, common: Common) -> SegmenterConfig:
             width=request.width,
             overview_width=request.overview_width,
             deep=deep,
-            **usual | request.tokens,
+            **{"layers": 1 if deep else SegmenterConfig.layers, **request.tokens},
         )
     except ValueError as error:
         raise SettingsError(f"{error}; choose another --patch, --dim or --heads") from error

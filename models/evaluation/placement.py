@@ -22,7 +22,6 @@ from pipeline.geometry.grid import UNLABELLED, SceneGrid, patch_pixels
 from pipeline.lazy import torch
 from pipeline.planning.coverage import frame_patches
 
-Values = NDArray[np.floating]
 RANDOM_DRAWS = 5
 COMPARED = ("gain", "entropy", "sobel")  # policies beside the random one
 MOST_GAIN = 5.0  # gains are clipped to this [nat per px]; one confident error would outweigh a field
@@ -66,7 +65,7 @@ def _losses(logits: NDArray[np.float32], truth: NDArray[np.uint8]) -> NDArray[np
     return np.where(labelled, loss, 0.0)
 
 
-def gain_sums(gain: Values, chosen: NDArray[np.integer]) -> tuple[float, float]:
+def gain_sums(gain: NDArray[np.floating], chosen: NDArray[np.integer]) -> tuple[float, float]:
     """Return the gain of the chosen patches, and of as many of the best ones; sum over frames, then divide."""
     return float(gain[chosen].sum()), float(np.sort(gain)[::-1][: len(chosen)].sum())
 
@@ -116,9 +115,8 @@ class ReadTwice:
 
     def counts(self, chosen: NDArray[np.bool_], classes: int) -> Counts:
         """Return the confusion of the map whose ``chosen`` (patch_y, patch_x) patches are read in full."""
-        p = self.grid.patch
         y, x = self.labels.shape
-        pixels = chosen.repeat(p, 0).repeat(p, 1)[:y, :x]
+        pixels = chosen.repeat(self.grid.patch, 0).repeat(self.grid.patch, 1)[:y, :x]
         return confusion(self.labels, np.where(pixels, self.full, self.overview), classes)
 
 

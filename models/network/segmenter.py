@@ -19,8 +19,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor, nn
 
-from models.network.sizes import AROUND_PX, BOTTOM, PLANES, TOKEN_PX, level_widths
-from models.network.sizes import SegmenterConfig as SegmenterConfig
+from models.network.sizes import AROUND_PX, BOTTOM, PLANES, TOKEN_PX, SegmenterConfig, level_widths
 from pipeline.errors import ShapeError
 
 LONGEST_PERIOD = 128.0  # cells of a token; the shortest is 2
@@ -259,8 +258,8 @@ class Segmenter(nn.Module):
         features[-1] = features[-1] + F.pixel_shuffle(context, BOTTOM)
         drawn = self.overview_head(features)[:, :, :height, :width]
         columns = image[:, : self.config.columns].permute(0, 2, 3, 1)
-        alone = F.linear(columns, self.spectral.weight.flatten(1), self.spectral.bias).permute(0, 3, 1, 2)
-        alone = mean_around(alone)  # the logits' mean is that of the mean spectrum
+        # the mean of the logits is that of the mean spectrum
+        alone = mean_around(F.linear(columns, self.spectral.weight.flatten(1), self.spectral.bias).permute(0, 3, 1, 2))
         return Overview(drawn, self.overview_classes(F.gelu(drawn)) + alone[:, :, :height, :width])
 
     def read_patches(self, overview: Overview, patches: Tensor, patch_index: Tensor) -> Tensor:

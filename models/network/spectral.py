@@ -48,10 +48,9 @@ class SpectralBasis:
         Raises WavelengthError for a wavelength that is not finite, or outside 200-3000 nm (micrometres?).
         """
         wavelength = checked_wavelengths(wavelength_nm, len(wavelength_nm))
-        centres = np.linspace(self.low_nm, self.high_nm, self.columns)
         span_nm = self.high_nm - self.low_nm
         apart_nm = span_nm / (self.columns - 1) if self.columns > 1 else max(span_nm, LONGEST_NM)  # one covers all
-        distance = (wavelength[:, None] - centres[None, :]) / apart_nm
+        distance = (wavelength[:, None] - np.linspace(self.low_nm, self.high_nm, self.columns)) / apart_nm
         bump = np.where(np.abs(distance) <= REACH, np.exp(-0.5 * (distance / 0.5) ** 2), 0.0)
         weight = bump * band_widths(wavelength)[:, None]
         total = weight.sum(axis=0)
@@ -92,16 +91,6 @@ def checked_wavelengths(wavelength_nm: NDArray[np.floating], bands: int) -> NDAr
             " give nanometres (multiply micrometres by 1000)"
         )
     return wavelength
-
-
-def check_basis(basis: SpectralBasis, columns: int) -> None:
-    """Raise WavelengthError unless a basis has this number of columns and a valid wavelength range."""
-    checked_wavelengths(np.array([basis.low_nm, basis.high_nm]), 2)
-    if basis.columns != columns or basis.low_nm > basis.high_nm:
-        raise WavelengthError(
-            f"a basis of {basis.columns} columns from {basis.low_nm:g} to {basis.high_nm:g} nm, expected {columns} of"
-            " them between ascending wavelengths"
-        )
 
 
 def band_widths(wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:

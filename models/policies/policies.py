@@ -47,17 +47,12 @@ def score_patches(
         scores = _patch_means(of(seen), seen)
     else:
         raise SettingsError(f"unknown policy {policy!r}; choose one of {', '.join(POLICIES)}")
-    return _on_scene(scores, seen.grid)
+    return (scores * seen.grid.valid_fraction()).ravel()
 
 
 def random_scores(grid: SceneGrid, seed: int) -> Scores:
     """Return random scores of every patch of the padded grid, (patches,), weighted by its fraction on the scene."""
-    return _on_scene(np.random.default_rng([seed, 0x5EA7]).random(grid.patch_shape), grid)
-
-
-def _on_scene(scores: Scores, grid: SceneGrid) -> Scores:
-    """Return (patch_y, patch_x) scores times the fraction of each patch on the scene, (patches,)."""
-    return (scores * grid.valid_fraction()).ravel()
+    return (np.random.default_rng([seed, 0x5EA7]).random(grid.patch_shape) * grid.valid_fraction()).ravel()
 
 
 def score_multiply_adds(policy: str, config: SegmenterConfig, grid: SceneGrid) -> int:
@@ -65,8 +60,8 @@ def score_multiply_adds(policy: str, config: SegmenterConfig, grid: SceneGrid) -
     score = PIXEL_SCORES.get(policy)
     if score is None:  # random or mask
         return 0
-    pixels = grid.padded_shape[0] * grid.padded_shape[1]
-    return (score.adds + score.per_class * config.classes + score.per_column * config.columns) * pixels
+    a_pixel = score.adds + score.per_class * config.classes + score.per_column * config.columns
+    return a_pixel * grid.padded_shape[0] * grid.padded_shape[1]
 
 
 def pixel_entropy(probability: NDArray[np.floating]) -> NDArray[np.float64]:

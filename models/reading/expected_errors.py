@@ -72,8 +72,9 @@ class PatchExpectedErrors:
             sums += np.bincount(place[counts], wrong[counts], minlength=sums.size)
             place = place + patch_number * sums.size
             pixels[here] = np.bincount(place[counts], minlength=pixels[here].size).reshape(pixels[here].shape)
-            known_age = np.where(asked & captured, age, -np.inf)
-            np.maximum.at(ages[here].reshape(-1), patch_number.ravel(), known_age.ravel())
+            np.maximum.at(
+                ages[here].reshape(-1), patch_number.ravel(), np.where(asked & captured, age, -np.inf).ravel()
+            )
             top += len(probabilities)
         age_days = np.where(ages < 0, np.inf, ages).ravel()
         return PatchExpectedErrors(pixels.reshape(-1, kinds, STEPS), sums.reshape(kinds, STEPS), age_days)

@@ -57,9 +57,9 @@ class CoarsePass:
     @property
     def seen_columns(self) -> NDArray[np.float32]:
         """Return the columns with NaN in filled pixels."""
-        if self.filled is None:
-            return self.columns
-        return np.where(self.filled[..., None], np.float32(np.nan), self.columns)
+        return (
+            self.columns if self.filled is None else np.where(self.filled[..., None], np.float32(np.nan), self.columns)
+        )
 
     def patches(self, patch_index: NDArray[np.integer]) -> NDArray[np.float32]:
         """Return the columns of some patches, (patch, p, p, column)."""

@@ -160,7 +160,12 @@ def _fused(
         after = _more_confident(old, new, seen, days)
     else:
         images = old, np.where(seen[..., None], new, 0), seen, days, rests_on
-        after = _phased_in(old, _read(reader, prior_map, observation, images, rows), seen, days)
+        after = _read(reader, prior_map, observation, images, rows)
+        # The reader was trained on visits that are days apart: without a capture it is phased in over the first day.
+        fraction = np.where(seen, 1, np.minimum(days / np.float32(SETTLED_DAYS), 1))[..., None]
+        if not (fraction == 1).all():
+            mixed = np.log((1 - fraction) * np.exp(old) + fraction * np.exp(after)).astype(np.float32)
+            after = np.where(fraction == 1, after, mixed)
     after = np.where(known[..., None], after, today)  # the visit alone; NaN where that is unknown too
     kept = np.maximum(after, np.float32(FAINTEST)).astype(np.float32)
     own_light = np.where(seen, observation.light_of(rows), 0).astype(np.float32)
@@ -171,18 +176,6 @@ def as_captured(prior_map: PriorMap, after: ClassProbabilities) -> ClassProbabil
     """Return what is stored for the next visit: pixels that this one did not capture are as at their last capture."""
     before = prior_map.probabilities.log_probability
     return replace(after, log_probability=np.where(after.age_days[..., None] > 0, before, after.log_probability))
-
-
-def _phased_in(old: Floats, after: Floats, seen: NDArray[np.bool_], days: Floats) -> Floats:
-    """Return the reader's output (y, x, class), phased in over the first day in pixels without a capture.
-
-    The reader was trained on visits that are days apart.
-    """
-    fraction = np.where(seen, 1, np.minimum(days / np.float32(SETTLED_DAYS), 1))[..., None]
-    if (fraction == 1).all():
-        return after
-    mixed = np.log((1 - fraction) * np.exp(old) + fraction * np.exp(after)).astype(np.float32)
-    return np.where(fraction == 1, after, mixed)
 
 
 def _normalised(log_probability: Floats) -> Floats:

@@ -125,19 +125,19 @@ def plan_regions(
         _cuts(size, math.lcm(step, unit), most)
         for size, unit, most in zip((field.height, field.width), shard, most_px, strict=True)
     )
-    kept = [Box(top, left, bottom, right) for top, bottom in down for left, right in across]
     return [
         Region(
             field,
-            box,
-            Box(
-                max(box.top - margin, 0),
-                max(box.left - margin, 0),
-                min(box.bottom + margin, field.height),
-                min(box.right + margin, field.width),
+            kept=Box(top, left, bottom, right),
+            read=Box(
+                max(top - margin, 0),
+                max(left - margin, 0),
+                min(bottom + margin, field.height),
+                min(right + margin, field.width),
             ),
         )
-        for box in kept
+        for top, bottom in down
+        for left, right in across
     ]
 
 
@@ -165,8 +165,7 @@ def region_bytes(config: SegmenterConfig, region: Region, patch_index: int, band
     drawn = MAP_COPIES * config.classes
     chunk = min(PATCHES_AT_ONCE, patch_index) * config.patch**2 * (full + inputs + config.overview_width)
     strip = STRIP_COPIES * bands * min(STRIP_ROWS, y) * x
-    most: int = 4 * round(y * x * (IMAGE_COPIES * inputs + overview + drawn) + chunk + strip)
-    return most
+    return int(4 * round(y * x * (IMAGE_COPIES * inputs + overview + drawn) + chunk + strip))
 
 
 def most_bytes(config: SegmenterConfig, regions: Sequence[Region], patch_index: NDArray[np.integer], bands: int) -> int:

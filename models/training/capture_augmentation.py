@@ -105,18 +105,6 @@ class SceneSpectra:
         spectra = np.linalg.solve(seen, matrix.T @ self.covariance)  # (column, band) expected from columns
         return Condensing(((spectra / sigma) @ axes).astype(np.float32), back, mean, power)
 
-    def added(self, light: float, unit: float, samples: int) -> tuple[float, float]:
-        """Return the shot and read noise that an exposure adds to means of ``samples`` pixels of the reference.
-
-        They are means over the bands, in variances of the noise of the exposure ``unit``.
-        """
-        whole = np.sum(self.noise(unit), axis=0)
-        more = [
-            np.mean((own - before / samples) / whole)
-            for own, before in zip(self.noise(light), self.noise(1.0), strict=True)
-        ]
-        return float(more[0]), float(more[1])
-
 
 class CaptureAugmentation:
     """Turn crops of the reference exposure into captures of shorter exposures and wider line spacings.
@@ -241,7 +229,10 @@ class CaptureAugmentation:
         centre, spread = (beside(scaled, one) for one in (self.normalisation.centre, self.normalisation.spread))
         values = scaled * spread + centre
         mean = beside(scaled, law.mean)
-        shot, read = noise.spectra.added(light, unit, samples)
+        whole = np.sum(noise.spectra.noise(unit), axis=0)
+        variances = zip(noise.spectra.noise(light), noise.spectra.noise(1.0), strict=True)
+        # added noise, as means over the bands, in variances of the exposure ``unit``
+        shot, read = (float(np.mean((own - before / samples) / whole)) for own, before in variances)
         brightness = values.mean(dim=-1, keepdim=True) / max(float(law.mean.mean()), TINY)
         size = ((read + shot * brightness.clamp(min=0)).clamp(min=0) + ROUNDED).sqrt()
         scores = (values - mean) @ beside(scaled, law.of_columns[:, :kept])

@@ -24,7 +24,6 @@ GAIN = 0.04  # standard deviation of the brightness of crops in training
 USUAL = 0.98  # fraction of a component's spectra within its unit distance
 LEAST_SPECTRA = 200  # least number to fit to
 RIDGE = 1e-6  # of the mean variance: makes the covariance of equal columns invertible
-Report = Callable[[float], None]
 Spectra = NDArray[np.float32]  # (pixel, column)
 Classes = NDArray[np.uint8]  # (pixel,)
 
@@ -37,7 +36,7 @@ def fit_ood(
     darkest_ms: float,
     bands: int,
     seed: int,
-    report: Report = lambda done: None,
+    report: Callable[[float], None] = lambda done: None,
 ) -> OodDetector:
     """Fit components to training scenes, and limits to validation scenes, at the exposures of the training.
 
@@ -127,7 +126,7 @@ def measured_limits(
     examples: Sequence[Example],
     augmentation: CaptureAugmentation,
     rng: np.random.Generator,
-    report: Report = lambda done: None,
+    report: Callable[[float], None] = lambda done: None,
 ) -> Limits:
     """Return quantiles of the distances of labelled pixels, for each line spacing and exposure."""
     noisy = all(example.noise is not None for example in examples)

@@ -133,7 +133,7 @@ def _learn(reader: TemporalReader, visits: Sequence[_Batch], weight: Tensor, rng
     start = visits[0]
     state, coarse = start.observation, start.coarse
     age = torch.zeros_like(start.seen)
-    rests_on = age + _light_a_pixel(start)
+    rests_on = age + (start.light / start.step**2)[:, None, None, None]
     total = 0.0
     for now in visits[1:]:
         age = age + now.days
@@ -149,13 +149,9 @@ def _learn(reader: TemporalReader, visits: Sequence[_Batch], weight: Tensor, rng
         state = found.detach().clamp(min=FAINTEST)
         state = state - state.logsumexp(dim=1, keepdim=True)
         age = age.where(now.seen == 0, 0)
-        rests_on = rests_on + now.seen * _light_a_pixel(now)
+        rests_on = rests_on + now.seen * (now.light / now.step**2)[:, None, None, None]
         coarse = now.coarse.where(small > 0, coarse)
     return total
-
-
-def _light_a_pixel(visit: _Batch) -> Tensor:
-    return (visit.light / visit.step**2)[:, None, None, None]
 
 
 def _wrong(state: Tensor, coarse: Tensor, rng: np.random.Generator) -> tuple[Tensor, Tensor]:

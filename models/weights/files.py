@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from models.evaluation.expected_scores import MapScores
 from models.network.sizes import SegmenterConfig, TemporalSizes
-from models.network.spectral import Normalisation, SpectralBasis, check_basis, project
+from models.network.spectral import Normalisation, SpectralBasis, checked_wavelengths, project
 from models.reading.ood import Limits, OodDetector
 from models.weights.checksummed_files import key_of, read_about, read_tensors, refusing, write_checksummed
-from pipeline.errors import WeightsError
+from pipeline.errors import WavelengthError, WeightsError
 from pipeline.lazy import Tensor, deferred, torch
 from pipeline.readings import readings_alone
 from pipeline.signal.components import Components
@@ -27,7 +27,6 @@ from pipeline.signal.components import Components
 if TYPE_CHECKING:
     from models.network import segmenter, temporal_reader
     from models.network.segmenter import Segmenter
-    from models.network.temporal_reader import TemporalReader
 else:
     temporal_reader = deferred("models.network.temporal_reader")
     segmenter = deferred("models.network.segmenter")
@@ -216,7 +215,7 @@ def add_ood(weights: Path, ood_detector: OodDetector, trained_on: TrainedOn, rec
     _add_part(weights, weights, OOD, {**about, "record": dict(record)}, tensors)
 
 
-def add_reader(weights: Path, out: Path, reader: TemporalReader, record: Mapping[str, Any]) -> None:
+def add_reader(weights: Path, out: Path, reader: temporal_reader.TemporalReader, record: Mapping[str, Any]) -> None:
     """Write the weights of a file with a temporal reader to ``out``. Raises as `add_ood`."""
     _add_part(weights, out, READER, {"sizes": asdict(reader.sizes), "record": dict(record)}, dict(reader.state_dict()))
 
@@ -246,7 +245,7 @@ def load_ood(weights: Path) -> OodDetector:
     return found
 
 
-def load_reader(weights: Path) -> TemporalReader:
+def load_reader(weights: Path) -> temporal_reader.TemporalReader:
     """Load the temporal reader of weights. WeightsError: their file has none, or it is damaged."""
     described = describe_weights(weights)
     if described.reader is None:
@@ -310,7 +309,12 @@ def describe_weights(path: Path) -> Description:
         basis = SpectralBasis(**about["basis"])
         names = tuple(map(str, about["class_names"]))
         record = dict(about["record"])
-        check_basis(basis, config.columns)
+        checked_wavelengths(np.array([basis.low_nm, basis.high_nm]), 2)
+        if basis.columns != config.columns or basis.low_nm > basis.high_nm:
+            raise WavelengthError(
+                f"a basis of {basis.columns} columns from {basis.low_nm:g} to {basis.high_nm:g} nm, expected "
+                f"{config.columns} of them between ascending wavelengths"
+            )
         keys = about["keys"]
         ood_detector = OodPart.read(keys[OOD], about[OOD]) if OOD in about else None
         reader = ReaderPart.read(keys[READER], about[READER], config) if READER in about else None
