@@ -85,10 +85,9 @@ def evaluate_weights(request: EvaluateRequest, show: Report = lambda what, done,
         "seeds": [[candidates[number].path.name for number in one] for one in seeds_of(runs)],
         **summarise(runs, candidates[0].described.class_names, request),
         "data_notes": [*data.notes, *jobs.notes],
-        "files": [],
+        "files": [] if request.out is None else [str(request.out / "evaluation.json")],
     }
     if request.out is not None:
-        content["files"] = [str(request.out / "evaluation.json")]
         write_whole(request.out / "evaluation.json", to_json(content))
     return content
 

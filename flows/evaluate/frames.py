@@ -103,10 +103,6 @@ class Candidate:
         with refusing(self.path):
             return LineCamera(**self.described.record.get("camera", {}))
 
-    def pixels_of(self, scene: RasterScene) -> str | None:
-        """Return the packed mask of a scene's training pixels; None for all pixels."""
-        return cast(str | None, self.split.get("pixels", {}).get(scene.key))
-
     @property
     def split(self) -> dict[str, Any]:
         """Return the training, validation and held-out scenes of the record."""
@@ -198,8 +194,7 @@ def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[
     Raises SceneError: no frame or labelled pixel is left, a named frame has no weights left, or a frame has no labels;
     SettingsError: weights were trained on different pixels of a frame.
     """
-    frames: dict[str, tuple[int, ...]] = {}
-    left_out: list[str] = []
+    jobs = Jobs()
     alike: dict[str, str] = {}
     empty: list[str] = []
     regridded: list[str] = []
@@ -227,35 +222,36 @@ def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[
             if seen_in_training(scene, one.described) != "all" and not (in_turn and one.validated_on(scene))
         ]
         if not fit:
-            left_out.append(name)
+            jobs.left_out.append(name)
             continue
         first = weights[fit[0]]
-        for one in (weights[at] for at in fit[1:]):
-            if one.pixels_of(scene) != first.pixels_of(scene):
+        masks = [weights[at].split.get("pixels", {}).get(scene.key) for at in fit]  # packed; None: all pixels
+        for one, mask in zip((weights[at] for at in fit), masks, strict=True):
+            if mask != masks[0]:
                 raise SettingsError(
                     f"{one.path} and {first.path} were trained on different pixels of {scene.name}; evaluate them "
                     "separately"
                 )
-        frames[name] = tuple(fit)
+        jobs.frames[name] = tuple(fit)
         if any(weights[at].validated_on(scene) for at in fit):
             validated.append(name)
         if scene.regridded:
             regridded.append(name)
         labels = judged_labels(scene, first.described)
         labelled = labelled or (labels is not None and bool((labels != UNLABELLED).any()))
-    show("looking for frames", 1.0, f"{len(frames)} of {len(data.train)}")
-    if left_out and (request.frames or not frames):
+    show("looking for frames", 1.0, f"{len(jobs.frames)} of {len(data.train)}")
+    if jobs.left_out and (request.frames or not jobs.frames):
         raise SceneError(
-            f"no weights are left for {', '.join(left_out)}: {', '.join(str(one.path) for one in weights)} was trained"
-            " on it, and frames trained on are refused: judge by others, or train with some held out: spectralzoom"
-            " train ... --hold-out NAMES"
+            f"no weights are left for {', '.join(jobs.left_out)}: {', '.join(str(one.path) for one in weights)} was "
+            "trained on it, and frames trained on are refused: judge by others, or train with some held out: "
+            "spectralzoom train ... --hold-out NAMES"
         )
     if not labelled:
-        raise SceneError(f"no labelled pixel is left on the {len(frames)} frames of {request.dataset} to judge by")
+        raise SceneError(f"no labelled pixel is left on the {len(jobs.frames)} frames of {request.dataset} to judge by")
     notes = [*alike_notes(alike), *scene_notes(empty, regridded)]
     if validated:
         notes.append(
             f"the training chose reading, calibration and thresholds by {list_some(validated)}: scores of these"
             " validation frames may be too good; --frames names others"
         )
-    return Jobs(frames, left_out, tuple(notes))
+    return replace(jobs, notes=tuple(notes))

@@ -167,8 +167,7 @@ def _draw_tradeoff(axes: Axes, result: Result) -> None:
     exact = any(point.error == 0 for point in result.points)  # 0 has no logarithm
     axes.set(xscale="log", yscale="linear" if exact else "log", facecolor=PAPER, axisbelow=True)
     if exact:
-        smallest = min((point.error for point in result.points if point.error > 0), default=1.0)
-        axes.set_yscale("symlog", linthresh=smallest)
+        axes.set_yscale("symlog", linthresh=min((one.error for one in result.points if one.error > 0), default=1.0))
     axes.set_title(f"{result.stage}: {result.knob}", loc="left", weight="bold", color=INK, size=13)
     axes.set_xlabel(result.cost, color=INK)
     axes.set_ylabel(result.error, color=INK)

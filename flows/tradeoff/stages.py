@@ -50,9 +50,7 @@ from storage.archive.archive import Archive
 
 # rectify: kernels on plane waves, whose values are known at every point
 
-SIDE = 256  # of the grid of samples
-BANDS = 64
-POINTS = 40_000
+SIDE, BANDS, POINTS = 256, 64, 40_000  # of the samples
 PERIODS_PX = (4.0, 40.0)
 CONTRAST = 0.2  # standard deviation of the scene over its mean, which fills half of the converter's range
 WAVES = 24
@@ -224,10 +222,12 @@ class PlannedField:
     def judge(self, plan: Setting, drawn: DrawnMap) -> Figures:
         """Return 1 - mIoU of a map, the seconds of its scan, and the multiply-adds of the network."""
         one = self.passes[plan]
-        macs = self.costs.of_map(one.patch_index).total
         raw = {} if one.seconds is None else {"MB raw": one.bytes_raw / 1e6}
-        error = 1 - mean_iou(confusion(self.labels, drawn.classes, one.weights.config.classes))
-        return Figures(error, one.seconds, {**raw, "billion multiply-adds": macs / 1e9})
+        return Figures(
+            error=1 - mean_iou(confusion(self.labels, drawn.classes, one.weights.config.classes)),
+            cost=one.seconds,
+            beside={**raw, "billion multiply-adds": self.costs.of_map(one.patch_index).total / 1e9},
+        )
 
 
 def uniform_pass(

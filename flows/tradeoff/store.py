@@ -113,12 +113,14 @@ class ScanLines:
         """Compare restored scene values with the truth: root mean square, means of blocks, and the map."""
         restored = stored.restore()
         off = (restored - self.truth) / self.sigma
-        beside = {
-            f"mean of {BLOCK_PX}² [σ]": float(np.abs(block_means_of(off, BLOCK_PX)).max()),  # noqa: RUF001
-            "mIoU [%]": 100 * self.miou(restored),
-        }
-        error = float(np.sqrt(np.mean(np.square(off), dtype=np.float64)))
-        return Figures(error, stored.size / off[..., 0].size, beside)
+        return Figures(
+            error=float(np.sqrt(np.mean(np.square(off), dtype=np.float64))),
+            cost=stored.size / off[..., 0].size,
+            beside={
+                f"mean of {BLOCK_PX}² [σ]": float(np.abs(block_means_of(off, BLOCK_PX)).max()),  # noqa: RUF001
+                "mIoU [%]": 100 * self.miou(restored),
+            },
+        )
 
 
 def block_means_of(values: Values, side: int) -> NDArray[np.float32]:
@@ -144,13 +146,13 @@ def scan_farm(seed: int, shape: tuple[int, int] = FIELD_SHAPE, camera: LineCamer
     raw = read_out(light, block, source.choice)
     noise_dn = noise_electrons(light, block.rig) / per_dn
     lines = HeldLines(sweep, simulated.references, simulated.position, simulated.time_s, raw)
-    labels = np.asarray(source.scene.labels, np.uint8)
 
     def miou(values: Values) -> float:
         """Rectify scene values and read them, as a survey does."""
         plain = replace(lines, references=_unit_references(values.shape), data=values)
         capture = LineSpec(EXPOSURE_MS / DEFAULT_EXPOSURE_MS)
-        return _miou(weights, coarse_of_sweeps([plain], camera, source.wavelength_nm, grid, weights, capture), labels)
+        coarse = coarse_of_sweeps([plain], camera, source.wavelength_nm, grid, weights, capture)
+        return _miou(weights, coarse, np.asarray(source.scene.labels, np.uint8))
 
     dark = dark_frame(block, source.choice)
     return ScanLines(
@@ -287,9 +289,8 @@ def _condensed(scan: ScanLines, condenser: Condenser, statistics: SignalStatisti
     cube = SignalCubeInMemory(header, components, step=condenser.step, largest=largest)
     done = condenser.sweep(lines, cube.writer.write)
     exposure_ms = np.full(len(lines.data), scan.camera.exposure_ms)
-    cube.writer.close(
-        LineRows(lines.time_s, *lines.position.T, exposure_ms, lines.valid_line), done.rare, done.residuals
-    )
+    x, y = lines.position.T
+    cube.writer.close(LineRows(lines.time_s, x, y, exposure_ms, lines.valid_line), done.rare, done.residuals)
     return KeptLines(cube.size, lambda: cube.open().spectra(0, len(lines.data))), done
 
 
@@ -331,7 +332,8 @@ def keep_principal(scan: ScanLines, step: float) -> KeptLines:
         back = np.asarray(array[...], np.float32).transpose(1, 2, 0) * np.float32(step)
         return scan.lines.calibrated(components.restore(back))
 
-    return KeptLines(size + _law_bytes(components), restore)
+    axes_and_mean = 4 * (len(components) + 1) * components.bands  # bytes of float32
+    return KeptLines(size + axes_and_mean, restore)
 
 
 def _scored(scan: ScanLines, *, raw: bool) -> tuple[Components, Values]:
@@ -350,11 +352,6 @@ def _scored(scan: ScanLines, *, raw: bool) -> tuple[Components, Values]:
         components = Components(statistics.origin + mean, axes[:, : len(components)].T, noise)
     blocks = _raw_blocks(scan) if raw else calibrated_blocks(scan.lines, scan.camera)
     return components, np.concatenate([score_lines(values, valid, components).scores for _, values, valid in blocks])
-
-
-def _law_bytes(components: Components) -> int:
-    """Return the bytes of axes and mean, float32."""
-    return 4 * (len(components) + 1) * components.bands
 
 
 def compress_jpeg2000(scan: ScanLines, rate: float, raw: bool) -> KeptLines:
@@ -384,7 +381,8 @@ def compress_jpeg2000(scan: ScanLines, rate: float, raw: bool) -> KeptLines:
         restored = components.restore(back.transpose(1, 2, 0))
         return scan.lines.calibrated(restored) if raw else restored
 
-    return KeptLines(len(packed) + _law_bytes(components), restore)
+    axes_and_mean = 4 * (count + 1) * components.bands  # bytes of float32
+    return KeptLines(len(packed) + axes_and_mean, restore)
 
 
 _PCODEC: Mapping[Setting, Callable[[ScanLines], KeptLines]] = {

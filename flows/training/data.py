@@ -99,8 +99,9 @@ class DataSet:
         """
         if name not in self.files:
             raise SceneError(f"{self.path} has no scene {name}; it has {', '.join(self.files)}")
-        labels = {"labels": self.label_files.get(name), **self.choices}
-        scene = load_scene_file(self.files[name], classes=self.classes, **labels)
+        scene = load_scene_file(
+            self.files[name], classes=self.classes, **{"labels": self.label_files.get(name), **self.choices}
+        )
         if part is None or self.train_mask is None:
             return scene
         train, rest = split_labels(scene, self.train_mask, self.mask_classes)

@@ -80,9 +80,7 @@ def observe_finely(
     matrix, _ = basis.matrix(scene.wavelength_nm)
     bands = len(matrix)
     rows: list[Columns] = []
-    count = 0
-    total = np.zeros(bands)
-    products = np.zeros((bands, bands))
+    count, total, products = 0, np.zeros(bands), np.zeros((bands, bands))  # sums of the powers 0, 1 and 2
     for part in mosaic_rows([_Taken(source, sweep) for sweep in full], camera, grid, rows=_ROWS):
         rows.append(project(part, matrix))
         some = part[::2, ::2].reshape(-1, bands).astype(np.float64)

@@ -91,12 +91,11 @@ def train_temporal(request: TemporalRequest, report: Report = lambda what, done,
         rng = np.random.default_rng([request.settings.seed, seed])
         lands.append([_visit(weights, augmentation, request.shape, seed, *moment, rng) for moment in _moments(rng)])
     known = describe_weights(request.weights).reader
-    start = None if known is None else load_reader(request.weights)
     reader, steps = train_reader(
         lands,
         request.settings,
         lambda now: report("training", now.done, f"step {now.step}, loss {now.loss:.3f}"),
-        start=start,
+        start=None if known is None else load_reader(request.weights),
     )
     record = {
         "command": request.command,

@@ -122,9 +122,13 @@ class MapScores:
     def fitted(maps: Mapping[tuple[int, float], Sequence[ScoredMap]]) -> MapScores:
         """Fit corrections to maps by step and exposure; each pair has maps of the same scenes."""
         steps, exposures = sorted({step for step, _ in maps}), sorted({exposure for _, exposure in maps})
-        bias = np.array([[fitted_bias(maps[step, ms]) for ms in exposures] for step in steps])
-        error = np.array([[error_of_passes(maps[step, ms], step, ms) for ms in exposures] for step in steps])
-        return MapScores(tuple(steps), tuple(exposures), bias, error, len(maps[steps[0], exposures[0]]))
+        return MapScores(
+            steps=tuple(steps),
+            exposures_ms=tuple(exposures),
+            bias=np.array([[fitted_bias(maps[step, ms]) for ms in exposures] for step in steps]),
+            error=np.array([[error_of_passes(maps[step, ms], step, ms) for ms in exposures] for step in steps]),
+            scenes=len(maps[steps[0], exposures[0]]),
+        )
 
     @staticmethod
     def read(content: Mapping[str, Any]) -> MapScores:

@@ -83,14 +83,12 @@ class Encoder(nn.Module):
 
     def __init__(self, dim: int, layers: int, heads: int, mlp_ratio: int) -> None:
         super().__init__()
-        self.blocks = nn.ModuleList(EncoderBlock(dim, heads, mlp_ratio) for _ in range(layers))
+        self.blocks = nn.Sequential(*(EncoderBlock(dim, heads, mlp_ratio) for _ in range(layers)))
         self.norm = nn.LayerNorm(dim)
 
     def forward(self, x: Tensor) -> Tensor:
         """Encode tokens, (B, N, d) -> (B, N, d)."""
-        for block in self.blocks:
-            x = block(x)
-        return cast(Tensor, self.norm(x))
+        return cast(Tensor, self.norm(self.blocks(x)))
 
 
 def cut(image: Tensor, patch: int) -> Tensor:
@@ -254,8 +252,7 @@ class Segmenter(nn.Module):
         else:
             read = torch.zeros_like(tokens)
             read[:, living] = self.encoder(tokens[:, living])
-        context = self.from_token(read.transpose(1, 2).reshape(grid.shape))
-        features[-1] = features[-1] + F.pixel_shuffle(context, BOTTOM)
+        features[-1] = features[-1] + F.pixel_shuffle(self.from_token(read.transpose(1, 2).reshape(grid.shape)), BOTTOM)
         drawn = self.overview_head(features)[:, :, :height, :width]
         columns = image[:, : self.config.columns].permute(0, 2, 3, 1)
         # the mean of the logits is that of the mean spectrum

@@ -84,8 +84,7 @@ class TemporalSizes:
 
     def multiply_adds(self, pixels: int) -> int:
         """Multiply-adds of reading so many fine pixels."""
-        entered = 2 * self.classes + OTHERS + self.coarse_width
-        fine = self.width * (entered + 9 + self.classes + GATES)
+        fine = self.width * (2 * self.classes + OTHERS + self.coarse_width + 9 + self.classes + GATES)
         coarse = self.width * (2 * self.columns + 1 + 9 + self.coarse_width + self.width + 9) + 9 * self.coarse_width
         return pixels * fine + pixels // CELL_PX**2 * coarse
 

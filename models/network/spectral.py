@@ -224,11 +224,6 @@ class CaptureMap:
         """Return the most frequent capture."""
         return self.specs[int(np.bincount(self.number.ravel(), minlength=1).argmax())]
 
-    def padded(self, shape: tuple[int, int]) -> CaptureMap:
-        """Extend the map to a padded image by repeating its border."""
-        gap = [(0, whole - size) for whole, size in zip(shape, self.number.shape, strict=True)]
-        return CaptureMap(self.specs, np.pad(self.number, gap, mode="edge"))
-
     def of_patches(self, patch_index: NDArray[np.integer], patch: int) -> CaptureMap:
         """Return the captures of some patches of an image, (patch, p, p)."""
         return CaptureMap(self.specs, patches_of(self.number, patch)[patch_index])

@@ -116,13 +116,16 @@ def read_coarse_pass(
             columns[filled:last] = weights.columns_of_scores(strip, components, wavelength_nm)
         known[filled:last] = ~np.isnan(strip).all(axis=-1)
         filled = last
+    if isinstance(capture, CaptureMap):
+        gap = [(0, whole - size) for whole, size in zip(grid.padded_shape, capture.number.shape, strict=True)]
+        capture = CaptureMap(capture.specs, np.pad(capture.number, gap, mode="edge"))
     wild = dead_pixels(columns) & known
     columns = np.ascontiguousarray(pad_by_reflection(columns, grid.padded_shape), np.float32)
     dead = dead_pixels(columns)
     return CoarsePass(
         grid,
         columns,
-        capture=capture.padded(grid.padded_shape) if isinstance(capture, CaptureMap) else capture,
+        capture=capture,
         origin=origin,
         living=_mend(columns, grid.patch),
         out_of_range=wild if wild.any() else None,

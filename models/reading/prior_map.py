@@ -137,8 +137,7 @@ CARRIED_AS_BY = (0.05, 2)  # light and line spacing for the reader without a vis
 def carried(prior_map: PriorMap, reader: TemporalReader | None) -> ClassProbabilities:
     """Return the class probabilities of today without a visit."""
     shape = prior_map.probabilities.log_probability.shape
-    columns = 1 if reader is None else reader.sizes.columns
-    coarse = (-(-shape[0] // CELL_PX), -(-shape[1] // CELL_PX), columns)
+    coarse = (-(-shape[0] // CELL_PX), -(-shape[1] // CELL_PX), 1 if reader is None else reader.sizes.columns)
     nothing, features = (np.full(size, np.nan, np.float32) for size in (shape, coarse))
     return fuse(prior_map, CurrentVisit(nothing, np.zeros(shape[:2], np.bool_), features, *CARRIED_AS_BY), reader)
 

@@ -93,8 +93,7 @@ class Region:
 
     def crop(self, image: NDArray[Scalar]) -> NDArray[Scalar]:
         """Crop a (y, x, ...) image of the box that is read to the box that is kept."""
-        rows, columns = self.kept_here
-        return image[rows, columns]
+        return image[self.kept_here]
 
     @property
     def kept_here(self) -> tuple[slice, slice]:

@@ -219,15 +219,20 @@ class CaptureAugmentation:
     ) -> Tensor:
         """Add the noise of an exposure ``light``, and condense by the components of an exposure ``unit``.
 
-        Components of less than ``least_power`` are left out. With 0, or without spectra, nothing is condensed.
+        ``scaled`` are means of ``samples`` pixels of the reference exposure. Components of less than ``least_power``
+        are left out. With 0, or without spectra, nothing is condensed.
         """
+        centre, spread = (beside(scaled, one) for one in (self.normalisation.centre, self.normalisation.spread))
+        values = scaled * spread + centre
         if noise.spectra is None or least_power == 0:
-            return self._noisy(scaled, noise, light, rng, samples=samples)
+            of_light = beside(scaled, noise.shot * (1 / light - 1 / samples))
+            of_reading = beside(scaled, np.diag(noise.read) * (1 / light**2 - 1 / samples))
+            added = (values.clamp(min=0) * of_light + of_reading).clamp(min=0).sqrt() / spread
+            mixing = np.linalg.cholesky(noise.correlation() + TINY * np.eye(len(noise.shot))).T
+            return scaled + added * (normal(scaled, rng) @ beside(scaled, mixing))
         unit = float(2 ** (np.round(4 * np.log2(unit)) / 4))  # a quarter of an octave
         law = noise.spectra.condensing(unit)
         kept = max(np.count_nonzero(law.power > least_power), LEAST_COMPONENTS)
-        centre, spread = (beside(scaled, one) for one in (self.normalisation.centre, self.normalisation.spread))
-        values = scaled * spread + centre
         mean = beside(scaled, law.mean)
         whole = np.sum(noise.spectra.noise(unit), axis=0)
         variances = zip(noise.spectra.noise(light), noise.spectra.noise(1.0), strict=True)
@@ -238,18 +243,6 @@ class CaptureAugmentation:
         scores = (values - mean) @ beside(scaled, law.of_columns[:, :kept])
         scores += size * normal(scores, rng)
         return (scores @ beside(scaled, law.back[:kept]) + mean - centre) / spread
-
-    def _noisy(
-        self, scaled: Tensor, noise: ColumnNoise, light: float, rng: np.random.Generator, *, samples: int = 1
-    ) -> Tensor:
-        """Add the noise of an exposure ``light`` to means of ``samples`` pixels of the reference exposure."""
-        spread = beside(scaled, self.normalisation.spread)
-        values = scaled * spread + beside(scaled, self.normalisation.centre)
-        shot = beside(scaled, noise.shot * (1 / light - 1 / samples))
-        read = beside(scaled, np.diag(noise.read) * (1 / light**2 - 1 / samples))
-        size = (values.clamp(min=0) * shot + read).clamp(min=0).sqrt() / spread
-        mixing = np.linalg.cholesky(noise.correlation() + TINY * np.eye(len(noise.shot))).T
-        return scaled + size * (normal(scaled, rng) @ beside(scaled, mixing))
 
 
 def beside(image: Tensor, numbers: NDArray[np.floating]) -> Tensor:

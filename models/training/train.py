@@ -133,12 +133,11 @@ class Trainer:
         phase = phase_at(done)
         fewer = phase.larger if self.sampler.size(phase.larger) > self.sampler.size() else 1  # in large scenes
         batch = self.sampler.draw(max(1, self.settings.batch // fewer), self.rng, self.gain_shift, larger=phase.larger)
+        course.step += 1
         if not (batch.labels != UNLABELLED).any():  # decay and momentum alone would move the weights
-            course.step += 1
             course.unlabelled += 1
             return
         loss = batch_loss(self.model, batch, self.weight, self.rng, phase, soft_dice=done > 0.3)
-        course.step += 1
         course.in_a_row = 0 if _step(self.model, self.optimiser, loss) else course.in_a_row + 1
         course.skipped += course.in_a_row > 0
         if course.in_a_row == 3:

@@ -279,8 +279,7 @@ def load_weights(path: Path) -> Weights:
     config = described.config
     with torch.device("meta"):
         network = segmenter.Segmenter(config)
-    parts = (f"{OOD}.", f"{READER}.")
-    tensors = read_tensors(path, described.about, lambda name: not name.startswith(parts))
+    tensors = read_tensors(path, described.about, lambda name: not name.startswith((f"{OOD}.", f"{READER}.")))
     with refusing(path):
         _check_numbers(tensors)
         normalisation = Normalisation(*(tensors.pop(f"normalisation.{name}").numpy() for name in NORMALISATION))
