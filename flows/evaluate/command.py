@@ -72,7 +72,7 @@ def evaluate_weights(request: EvaluateRequest, show: Report = lambda what, done,
         "weights": [
             {
                 "file": one.path.name,
-                "key": one.key,
+                "key": one.described.key[:16],
                 "frames": len(covers := [name for name, judges in jobs.frames.items() if number in judges]),
                 "covers": covers,
                 "left_out": sorted({*jobs.frames, *jobs.left_out} - set(covers)),

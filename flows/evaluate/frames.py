@@ -93,11 +93,6 @@ class Candidate:
     described: Description
 
     @property
-    def key(self) -> str:
-        """Return the hash of the weights, shortened."""
-        return self.described.key[:16]
-
-    @property
     def camera(self) -> LineCamera:
         """Return the camera model of the training. Raises WeightsError: its record is damaged."""
         with refusing(self.path):
@@ -142,7 +137,7 @@ def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
                 f"{one.path} differs from {first.path} in camera, sizes or classes; several --weights are seeds of one"
                 " training: evaluate different ones separately"
             )
-    if len({one.key for one in found}) < len(found):
+    if len({one.described.key for one in found}) < len(found):
         raise SettingsError("the same weights are given twice in --weights, which would count as two seeds")
     return found
 

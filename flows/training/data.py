@@ -89,8 +89,9 @@ class DataSet:
     def classes(self) -> dict[str, ClassValue]:
         """Return the classes of several label files together; empty if scene.toml names them."""
         settings = find_scene_settings(Path(next(iter(self.files.values()))))
-        named = len(self.label_files) < 2 or settings.classes
-        return {} if named else classes_of_files(tuple(self.label_files.values()), settings)
+        if len(self.label_files) < 2 or settings.classes:
+            return {}
+        return classes_of_files(tuple(self.label_files.values()), settings)
 
     def load(self, name: str, part: Literal["train", "test"] | None = None) -> SceneFile:
         """Read one scene by its name with all labels, or with those inside or outside of the training mask.
@@ -99,9 +100,8 @@ class DataSet:
         """
         if name not in self.files:
             raise SceneError(f"{self.path} has no scene {name}; it has {', '.join(self.files)}")
-        scene = load_scene_file(
-            self.files[name], classes=self.classes, **{"labels": self.label_files.get(name), **self.choices}
-        )
+        labels = {"labels": self.label_files.get(name), **self.choices}
+        scene = load_scene_file(self.files[name], classes=self.classes, **labels)
         if part is None or self.train_mask is None:
             return scene
         train, rest = split_labels(scene, self.train_mask, self.mask_classes)
