@@ -14,7 +14,6 @@ from rich.table import Table
 from flows.evaluate.frames import (
     Candidate,
     EvaluateRequest,
-    Show,
     checked_request,
     observe_frame,
     open_candidates,
@@ -25,7 +24,7 @@ from flows.evaluate.judge import ENDS, Record, judge_frame, seeds_of, summarise
 from flows.terminal.figures import DASH, counted, format_count, format_percent, format_points
 from flows.terminal.processes import writing
 from flows.terminal.progress import StageProgress, put_out, table
-from flows.training.data import TrainingData
+from flows.training.data import Report, TrainingData
 from models.evaluation.metrics import LEVEL
 from models.network.machine import choose_device, keep_freed_memory
 from models.weights.files import Weights, load_weights
@@ -52,7 +51,7 @@ def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = 
     return content
 
 
-def evaluate_weights(request: EvaluateRequest, show: Show = lambda what, done, words: None) -> dict[str, Any]:
+def evaluate_weights(request: EvaluateRequest, show: Report = lambda what, done, words: None) -> dict[str, Any]:
     """Judge weights on every frame of a data set that they were not trained on.
 
     Raises SettingsError: invalid fractions, policies or weights; SceneError: no frame is left, a named frame has no
@@ -73,8 +72,8 @@ def evaluate_weights(request: EvaluateRequest, show: Show = lambda what, done, w
         "weights": [
             {
                 "file": one.path.name,
-                "key": one.key,
-                "frames": len(covers := jobs.covered(number)),
+                "key": one.described.key[:16],
+                "frames": len(covers := [name for name, judges in jobs.frames.items() if number in judges]),
                 "covers": covers,
                 "left_out": sorted({*jobs.frames, *jobs.left_out} - set(covers)),
             }
@@ -86,10 +85,9 @@ def evaluate_weights(request: EvaluateRequest, show: Show = lambda what, done, w
         "seeds": [[candidates[number].path.name for number in one] for one in seeds_of(runs)],
         **summarise(runs, candidates[0].described.class_names, request),
         "data_notes": [*data.notes, *jobs.notes],
-        "files": [],
+        "files": [] if request.out is None else [str(request.out / "evaluation.json")],
     }
     if request.out is not None:
-        content["files"] = [str(request.out / "evaluation.json")]
         write_whole(request.out / "evaluation.json", to_json(content))
     return content
 
@@ -99,10 +97,11 @@ def _judge_frames(
     data: TrainingData,
     candidates: Sequence[Candidate],
     frames: dict[str, tuple[int, ...]],
-    show: Show,
+    show: Report,
 ) -> list[list[Record]]:
     """Judge every frame by its weights; return the records of each of the weights."""
-    device, loaded = choose_device(request.device), dict[int, Weights]()
+    device = choose_device(request.device)
+    loaded: dict[int, Weights] = {}
     runs: list[list[Record]] = [[] for _ in candidates]
     for number, (name, judges) in enumerate(frames.items()):
         scene = data.scene(name)

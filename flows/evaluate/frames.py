@@ -7,7 +7,7 @@ by another file.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
@@ -16,7 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.tasks.scene import check_labels, judged_labels, seen_in_training
-from flows.training.data import TrainingData, alike_notes, farm_test_data, only_class, open_training_data, scene_notes
+from flows.training.data import (
+    Report,
+    TrainingData,
+    alike_notes,
+    farm_test_data,
+    only_class,
+    open_training_data,
+    scene_notes,
+)
 from flows.training.observed_scenes import observe_scene
 from models.evaluation.metrics import DRAWS
 from models.network.machine import PROCESSOR
@@ -85,19 +93,10 @@ class Candidate:
     described: Description
 
     @property
-    def key(self) -> str:
-        """Return the hash of the weights, shortened."""
-        return self.described.key[:16]
-
-    @property
     def camera(self) -> LineCamera:
         """Return the camera model of the training. Raises WeightsError: its record is damaged."""
         with refusing(self.path):
             return LineCamera(**self.described.record.get("camera", {}))
-
-    def pixels_of(self, scene: RasterScene) -> str | None:
-        """Return the packed mask of a scene's training pixels; None for all pixels."""
-        return cast(str | None, self.split.get("pixels", {}).get(scene.key))
 
     @property
     def split(self) -> dict[str, Any]:
@@ -138,7 +137,7 @@ def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
                 f"{one.path} differs from {first.path} in camera, sizes or classes; several --weights are seeds of one"
                 " training: evaluate different ones separately"
             )
-    if len({one.key for one in found}) < len(found):
+    if len({one.described.key for one in found}) < len(found):
         raise SettingsError("the same weights are given twice in --weights, which would count as two seeds")
     return found
 
@@ -158,7 +157,7 @@ def open_frames(
     if unknown:
         raise SettingsError(f"{dataset} has no frame {', '.join(unknown)}; it has {', '.join(data.train)}")
     names = tuple(name for name in data.train if not frames or name in frames)
-    return TrainingData(data.law, names, (), (), data.camera, data.files, data.notes)
+    return replace(data, train=names, validation=(), held_out=())
 
 
 def observe_frame(scene: RasterScene, name: str, weights: Weights, camera: LineCamera, seed: int) -> ObservedFrame:
@@ -175,9 +174,6 @@ def observe_frame(scene: RasterScene, name: str, weights: Weights, camera: LineC
     return ObservedFrame(name, seen, fine, labels, len(scene.wavelength_nm))
 
 
-Show = Callable[[str, float, str], None]
-
-
 @dataclass(frozen=True)
 class Jobs:
     """Frames with the indices of their weights, and frames that all weights were trained on."""
@@ -186,19 +182,19 @@ class Jobs:
     left_out: list[str] = field(default_factory=list)
     notes: tuple[str, ...] = ()  # on frames with a single class, without any value, or with labels of another grid
 
-    def covered(self, number: int) -> list[str]:
-        """Return the frames that these weights judge."""
-        return [name for name, fit in self.frames.items() if number in fit]
 
-
-def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[Candidate], show: Show) -> Jobs:
+def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[Candidate], show: Report) -> Jobs:
     """Assign to each frame the weights that were not trained on it.
 
     Raises SceneError: no frame or labelled pixel is left, a named frame has no weights left, or a frame has no labels;
     SettingsError: weights were trained on different pixels of a frame.
     """
-    frames, left_out, labelled = dict[str, tuple[int, ...]](), list[str](), False
-    alike, empty, regridded, validated = dict[str, str](), list[str](), list[str](), list[str]()
+    jobs = Jobs()
+    alike: dict[str, str] = {}
+    empty: list[str] = []
+    regridded: list[str] = []
+    validated: list[str] = []
+    labelled = False
     in_turn = len({tuple(one.split.get("held_out", ())) for one in weights}) > 1
     for number, name in enumerate(data.train):
         show("looking for frames", number / len(data.train), name)
@@ -221,35 +217,36 @@ def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[
             if seen_in_training(scene, one.described) != "all" and not (in_turn and one.validated_on(scene))
         ]
         if not fit:
-            left_out.append(name)
+            jobs.left_out.append(name)
             continue
         first = weights[fit[0]]
-        for one in (weights[at] for at in fit[1:]):
-            if one.pixels_of(scene) != first.pixels_of(scene):
+        masks = [weights[at].split.get("pixels", {}).get(scene.key) for at in fit]  # packed; None: all pixels
+        for one, mask in zip((weights[at] for at in fit), masks, strict=True):
+            if mask != masks[0]:
                 raise SettingsError(
                     f"{one.path} and {first.path} were trained on different pixels of {scene.name}; evaluate them "
                     "separately"
                 )
-        frames[name] = tuple(fit)
+        jobs.frames[name] = tuple(fit)
         if any(weights[at].validated_on(scene) for at in fit):
             validated.append(name)
         if scene.regridded:
             regridded.append(name)
         labels = judged_labels(scene, first.described)
         labelled = labelled or (labels is not None and bool((labels != UNLABELLED).any()))
-    show("looking for frames", 1.0, f"{len(frames)} of {len(data.train)}")
-    if left_out and (request.frames or not frames):
+    show("looking for frames", 1.0, f"{len(jobs.frames)} of {len(data.train)}")
+    if jobs.left_out and (request.frames or not jobs.frames):
         raise SceneError(
-            f"no weights are left for {', '.join(left_out)}: {', '.join(str(one.path) for one in weights)} was trained"
-            " on it, and frames trained on are refused: judge by others, or train with some held out: spectralzoom"
-            " train ... --hold-out NAMES"
+            f"no weights are left for {', '.join(jobs.left_out)}: {', '.join(str(one.path) for one in weights)} was "
+            "trained on it, and frames trained on are refused: judge by others, or train with some held out: "
+            "spectralzoom train ... --hold-out NAMES"
         )
     if not labelled:
-        raise SceneError(f"no labelled pixel is left on the {len(frames)} frames of {request.dataset} to judge by")
+        raise SceneError(f"no labelled pixel is left on the {len(jobs.frames)} frames of {request.dataset} to judge by")
     notes = [*alike_notes(alike), *scene_notes(empty, regridded)]
     if validated:
         notes.append(
             f"the training chose reading, calibration and thresholds by {list_some(validated)}: scores of these"
             " validation frames may be too good; --frames names others"
         )
-    return Jobs(frames, left_out, tuple(notes))
+    return replace(jobs, notes=tuple(notes))

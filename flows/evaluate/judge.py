@@ -38,10 +38,12 @@ Record = dict[str, Any]
 
 def judge_frame(request: EvaluateRequest, frame: ObservedFrame, weights: Weights) -> Record:
     """Return the confusion counts, gain and multiply-adds of every policy and fraction."""
-    grid, every = frame.seen.grid, frame.seen.grid.every_patch()
+    grid = frame.seen.grid
+    every = grid.every_patch()
     gain = oracle_gain(weights, frame.seen, frame.fine, frame.labels)
     overview, full = (segment(weights, frame.seen, frame.fine[some], some).classes for some in (every[:0], every))
-    scene, rows = ReadTwice(overview, full, {}, frame.labels, grid), list[Record]()
+    scene = ReadTwice(overview, full, {}, frame.labels, grid)
+    rows: list[Record] = []
     for policy, draw, fraction, patch_index in _rows(request, frame, gain):
         scored = 0 if policy in (*ENDS, ORACLE) else score_multiply_adds(policy, weights.config, grid)
         bought, best = gain_sums(gain, patch_index)
@@ -75,7 +77,6 @@ def _rows(
 
 
 Runs = Sequence[Sequence[Record]]  # records of the frames, of each of the weights or seeds
-COSTS = ("patches", "multiply_adds")
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,8 @@ def collect_row(seeds: Runs, policy: str, fraction: float) -> Row:
         if (row["policy"], row["fraction"]) == (policy, fraction)
     ]
     order = sorted({frame for _, frame, row in found if np.any(row["counts"])})
-    draws, classes = 1 + max(row["draw"] for _, _, row in found), len(found[0][2]["counts"])
+    draws = 1 + max(row["draw"] for _, _, row in found)
+    classes = len(found[0][2]["counts"])
     counts = np.zeros((len(seeds) * draws, len(order), classes, classes), np.int64)
     for number, frame, row in found:
         if frame in order:
@@ -149,25 +151,33 @@ def summarise(runs: Runs, class_names: Sequence[str], request: EvaluateRequest) 
     support = whole.counts.sum(axis=3).max(axis=0).sum(axis=0)  # labelled pixels of each class, each frame once
     table = []
     for (policy, fraction), row in rows.items():
-        figures: Record = {"policy": policy, "fraction": fraction, "uses_labels": policy == ORACLE}
-        figures |= _accuracy(row, class_names)
-        figures["gap_closed"] = None if policy in ENDS else gap_closed(figures["miou"], *ends)
+        accuracy = _accuracy(row, class_names)
         bought, best = (sum(part[name] for part in row.parts) for name in ("gain", "best_gain"))
-        figures["captured_gain"] = bought / best if best > 0 else None
-        figures["against_all"] = difference(row, whole, request)
-        figures["against_random"] = difference(row, rows.get(("random", fraction)), request)
         cost = {}  # means of a frame, and their ratio to those of all patches
-        for name in COSTS:
+        for name in ("patches", "multiply_adds"):
             done, full = (float(np.mean([one[name] for one in some.parts])) for some in (row, whole))
             cost[name] = {"done": done, "ratio": done / full if full else None}
-        table.append(figures | {"cost": cost})
+        table.append(
+            {
+                "policy": policy,
+                "fraction": fraction,
+                "uses_labels": policy == ORACLE,
+                **accuracy,
+                "gap_closed": None if policy in ENDS else gap_closed(accuracy["miou"], *ends),
+                "captured_gain": bought / best if best > 0 else None,
+                "against_all": difference(row, whole, request),
+                "against_random": difference(row, rows.get(("random", fraction)), request),
+                "cost": cost,
+            }
+        )
     return {"rows": table, "support": dict(zip(class_names, support.tolist(), strict=True))}
 
 
 def _accuracy(row: Row, class_names: Sequence[str]) -> Record:
     each = row.over_runs(mean_iou)
     drawn = [each[row.of_seed == number] for number in np.unique(row.of_seed)]
-    seeds, classes = np.array([_mean(some) for some in drawn]), row.over_runs(iou_per_class)
+    seeds = np.array([_mean(some) for some in drawn])
+    classes = row.over_runs(iou_per_class)
     false = row.over_runs(false_pixels).mean(axis=0).tolist()  # of a run
     return {
         "frames": row.counts.shape[1],

@@ -98,7 +98,8 @@ def choose_tradeoffs(stage: str | None, scene: str | None, weights: Path | None)
 def print_tradeoff(result: Result, console: Console) -> None:
     """Print the settings from the most to the least exact, with the Pareto front marked."""
     points = sorted(result.points, key=lambda point: point.error)
-    priced, rows = [] if result.cost == Tradeoff.cost else [result.cost], []
+    priced = [] if result.cost == Tradeoff.cost else [result.cost]
+    rows = []
     for point in points:
         further = [*point.beside.values(), *([point.cost] if priced else [])]
         figures = ["-" if math.isnan(one) else f"{one:.2g}" if abs(one) < 10 else f"{one:.1f}" for one in further]
@@ -164,14 +165,11 @@ def _draw_tradeoff(axes: Axes, result: Result) -> None:
         place: Any = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
         axes.annotate(result.level[0], (1, result.level[1]), (-2, 3), **place, ha="right", color=_LEVEL, size=9)
     exact = any(point.error == 0 for point in result.points)  # 0 has no logarithm
-    axes.set(xscale="log", yscale="linear" if exact else "log")
+    axes.set(xscale="log", yscale="linear" if exact else "log", facecolor=PAPER, axisbelow=True)
     if exact:
-        smallest = min((point.error for point in result.points if point.error > 0), default=1.0)
-        axes.set_yscale("symlog", linthresh=smallest)
+        axes.set_yscale("symlog", linthresh=min((one.error for one in result.points if one.error > 0), default=1.0))
     axes.set_title(f"{result.stage}: {result.knob}", loc="left", weight="bold", color=INK, size=13)
     axes.set_xlabel(result.cost, color=INK)
     axes.set_ylabel(result.error, color=INK)
-    axes.set_facecolor(PAPER)
     axes.grid(visible=True, which="major", color=GRID, linewidth=0.8)
-    axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)

@@ -142,21 +142,21 @@ class Result:
 def measure_tradeoff(tradeoff: Tradeoff, *, repeats: int | None = None, seed: int = 0) -> Result:
     """Judge every setting by one run, then time ``repeats`` runs of each in turn, on one thread."""
     repeats = tradeoff.repeats if repeats is None else repeats
-    state, settings = tradeoff.prepare(seed), tradeoff.settings
+    state = tradeoff.prepare(seed)
     with one_thread():
         load_before = mean_load()
-        figures = {one: tradeoff.judge(state, one, tradeoff.run(state, one)) for one in settings}
-        clocks = time_in_turn({one: partial(tradeoff.run, state, one) for one in settings}, repeats)
+        figures = {one: tradeoff.judge(state, one, tradeoff.run(state, one)) for one in tradeoff.settings}
+        clocks = time_in_turn({one: partial(tradeoff.run, state, one) for one in tradeoff.settings}, repeats)
         machine = describe_machine(threads=1) | {"load_before": load_before, "load_after": mean_load()}
-    points = list[Point]()
+    points: list[Point] = []
     for one, judged in figures.items():
-        time_s, cost, relative = clocks[one].cpu_min_s, judged.cost, ratio(clocks, one, settings[0])
-        if cost is not None:
+        time_s = clocks[one].cpu_min_s
+        cost = time_s if judged.cost is None else judged.cost
+        relative = ratio(clocks, one, tradeoff.settings[0])
+        if judged.cost is not None:
             first = points[0].cost if points else cost
             relative = cost / first if first else math.nan  # a cube of one value takes no bytes
-        points.append(
-            Point(one, judged.error, time_s if cost is None else cost, time_s, relative, beside=judged.beside)
-        )
+        points.append(Point(one, judged.error, cost, time_s, relative, beside=judged.beside))
     return Result(
         tradeoff.stage,
         tradeoff.knob,

@@ -50,7 +50,7 @@ from storage.archive.archive import Archive
 
 # rectify: kernels on plane waves, whose values are known at every point
 
-SIDE, BANDS, POINTS = 256, 64, 40_000
+SIDE, BANDS, POINTS = 256, 64, 40_000  # of the samples
 PERIODS_PX = (4.0, 40.0)
 CONTRAST = 0.2  # standard deviation of the scene over its mean, which fills half of the converter's range
 WAVES = 24
@@ -157,7 +157,8 @@ def _dark(block: SweepBlock, chosen: Mapping[Effect, str]) -> Values:
 
 def decide_for_lines(seed: int) -> FarmLines:
     """Plan the full scan of a farm, decide on effects for every tolerance, and take lines of the first sweep."""
-    scene, rig = farm_scene(seed, LAND_SHAPE), Rig()
+    scene = farm_scene(seed, LAND_SHAPE)
+    rig = Rig()
     sweeps = full_sweeps(SceneGrid(*LAND_SHAPE, PATCH), rig.camera, "x")
     probe = probe_scene(scene, rig, sweeps)
     starts = (0, (sweeps[0].lines - LINES) // 2, sweeps[0].lines - LINES)
@@ -221,10 +222,12 @@ class PlannedField:
     def judge(self, plan: Setting, drawn: DrawnMap) -> Figures:
         """Return 1 - mIoU of a map, the seconds of its scan, and the multiply-adds of the network."""
         one = self.passes[plan]
-        macs = self.costs.of_map(one.patch_index).total
         raw = {} if one.seconds is None else {"MB raw": one.bytes_raw / 1e6}
-        error = 1 - mean_iou(confusion(self.labels, drawn.classes, one.weights.config.classes))
-        return Figures(error, one.seconds, {**raw, "billion multiply-adds": macs / 1e9})
+        return Figures(
+            error=1 - mean_iou(confusion(self.labels, drawn.classes, one.weights.config.classes)),
+            cost=one.seconds,
+            beside={**raw, "billion multiply-adds": self.costs.of_map(one.patch_index).total / 1e9},
+        )
 
 
 def uniform_pass(
@@ -255,14 +258,13 @@ def open_field(seed: int, scene: str | None, weights: Path | None, source: str) 
 def plan_every_way(seed: int, scene: str | None = None, weights: Path | None = None) -> PlannedField:
     """Scan a farm or another scene by every uniform scan, and read parts of one of them."""
     run = open_field(seed, scene, weights, "sim")
-    camera, cost = run.camera, run.settings.cost
     grid = SceneGrid(*run.scene.shape, run.described.config.patch)
-    along, _, _ = cheapest_full(grid, camera, cost)
+    along, _, _ = cheapest_full(grid, run.camera, run.settings.cost)
     passes: dict[Setting, PlannedPass] = {}
     for words, (step, exposure_ms) in SCANS.items():
-        sweeps = uniform_sweeps(grid, camera, along, step=step, exposure_ms=exposure_ms)
+        sweeps = uniform_sweeps(grid, run.camera, along, step=step, exposure_ms=exposure_ms)
         scan = LineSpec(exposure_ms / DEFAULT_EXPOSURE_MS, step)
-        passes[words] = uniform_pass(run.weights, run.simulated, sweeps, grid, cost, scan)
+        passes[words] = uniform_pass(run.weights, run.simulated, sweeps, grid, run.settings.cost, scan)
     whole = passes[format_scan(*PART_OF)]
     scores = score_patches(POLICY, whole.coarse)
     for words, fraction in PARTS.items():
@@ -292,7 +294,9 @@ FRACTIONS = (1.0, 0.35, 0.2, 0.15, 0.1, 0.05, 0.0)
 def plan_every_fraction(seed: int, scene: str | None = None, weights: Path | None = None) -> PlannedField:
     """Scan a farm by every line, or take a raster as it is; choose every fraction of its patches by expected gain."""
     run = open_field(seed, scene, weights, "sim" if scene is None else RASTER)
-    grid, raster, wavelength_nm = run.grid, run.raster, run.scene.wavelength_nm
+    grid = run.grid
+    raster = run.raster
+    wavelength_nm = run.scene.wavelength_nm
     keep_freed_memory()  # as surveys do
     if raster is not None:
         parts = cuts(grid.height, raster.rows_at_once(run.settings.memory))

@@ -63,7 +63,9 @@ RATES = (1.0, 2.0, 4.0)  # bytes a spectrum
 BLOCK_LINES = 64
 JP2_DRIVER = "JP2OpenJPEG"
 JP2_STEP = 0.25  # of scores before JPEG 2000 [deviations of the noise]
-JP2_LARGEST, JP2_ZERO = 32_000, 1 << 15
+JP2_LARGEST = 32_000  # score in steps, before ``JP2_ZERO`` is added
+JP2_ZERO = 1 << 15
+USUAL = SignalChoice()  # of a survey
 
 
 # lines of a scan, and the error of restored ones
@@ -111,12 +113,14 @@ class ScanLines:
         """Compare restored scene values with the truth: root mean square, means of blocks, and the map."""
         restored = stored.restore()
         off = (restored - self.truth) / self.sigma
-        beside = {
-            f"mean of {BLOCK_PX}² [σ]": float(np.abs(block_means_of(off, BLOCK_PX)).max()),  # noqa: RUF001
-            "mIoU [%]": 100 * self.miou(restored),
-        }
-        error = float(np.sqrt(np.mean(np.square(off), dtype=np.float64)))
-        return Figures(error, stored.size / off[..., 0].size, beside)
+        return Figures(
+            error=float(np.sqrt(np.mean(np.square(off), dtype=np.float64))),
+            cost=stored.size / off[..., 0].size,
+            beside={
+                f"mean of {BLOCK_PX}² [σ]": float(np.abs(block_means_of(off, BLOCK_PX)).max()),  # noqa: RUF001
+                "mIoU [%]": 100 * self.miou(restored),
+            },
+        )
 
 
 def block_means_of(values: Values, side: int) -> NDArray[np.float32]:
@@ -129,28 +133,38 @@ def block_means_of(values: Values, side: int) -> NDArray[np.float32]:
 
 def scan_farm(seed: int, shape: tuple[int, int] = FIELD_SHAPE, camera: LineCamera | None = None) -> ScanLines:
     """Scan a farm of one swath by every line at 10 ms; the simulator also gives the values without noise."""
-    camera, weights = camera or LineCamera(), load_weights(shipped_weights())
+    camera = camera or LineCamera()
+    weights = load_weights(shipped_weights())
     grid = SceneGrid(*shape, weights.config.patch)
     source = SimulatedSource(farm_scene(seed, shape, camera=camera), Rig(camera), seed)
     along, _, _ = cheapest_full(grid, camera, CostModel())
     (sweep,) = uniform_sweeps(grid, camera, along, step=1, exposure_ms=EXPOSURE_MS)
     block = sweep_block(source.scene, source.rig, sweep, range(sweep.lines), seed=seed)
     light = expected_light(source.scene, block, source.choice)
-    simulated, per_dn = SimulatedSweep(source, sweep), np.float32(camera.electrons_per_dn)
-    raw, noise_dn = read_out(light, block, source.choice), noise_electrons(light, block.rig) / per_dn
+    simulated = SimulatedSweep(source, sweep)
+    per_dn = np.float32(camera.electrons_per_dn)
+    raw = read_out(light, block, source.choice)
+    noise_dn = noise_electrons(light, block.rig) / per_dn
     lines = HeldLines(sweep, simulated.references, simulated.position, simulated.time_s, raw)
-    labels = np.asarray(source.scene.labels, np.uint8)
 
     def miou(values: Values) -> float:
         """Rectify scene values and read them, as a survey does."""
         plain = replace(lines, references=_unit_references(values.shape), data=values)
         capture = LineSpec(EXPOSURE_MS / DEFAULT_EXPOSURE_MS)
-        return _miou(weights, coarse_of_sweeps([plain], camera, source.wavelength_nm, grid, weights, capture), labels)
+        coarse = coarse_of_sweeps([plain], camera, source.wavelength_nm, grid, weights, capture)
+        return _miou(weights, coarse, np.asarray(source.scene.labels, np.uint8))
 
     dark = dark_frame(block, source.choice)
-    truth, sigma = lines.calibrated(light / per_dn + dark), lines.calibrated(noise_dn + dark)
-    mean_dn = np.sqrt(np.mean(np.square(noise_dn), axis=(0, 1), dtype=np.float64))
-    return ScanLines(lines, camera, source.wavelength_nm, lines.calibrated(raw), truth, sigma, mean_dn, miou)
+    return ScanLines(
+        lines,
+        camera,
+        source.wavelength_nm,
+        values=lines.calibrated(raw),
+        truth=lines.calibrated(light / per_dn + dark),
+        sigma=lines.calibrated(noise_dn + dark),
+        noise_dn=np.sqrt(np.mean(np.square(noise_dn), axis=(0, 1), dtype=np.float64)),
+        miou=miou,
+    )
 
 
 def scan_raster(path: str, weights_path: Path | None) -> ScanLines:
@@ -165,12 +179,16 @@ def scan_raster(path: str, weights_path: Path | None) -> ScanLines:
             f"{path} holds missing values, or numbers other than whole ones from 0 to 65534. Choose a cube of raw "
             "numbers, or scale it"
         )
-    sweep = Sweep("raster", "coarse", "x", 0.0, 0.0, len(values))
-    position, time_s = np.zeros((len(values), 2)), np.arange(len(values), dtype=np.float64)
-    lines = HeldLines(sweep, _unit_references(values.shape), position, time_s, values.astype(np.uint16))
-    statistics, choice = SignalStatistics(values.shape[2], values[..., 0].size), SignalChoice()
+    lines = HeldLines(
+        Sweep("raster", "coarse", "x", 0.0, 0.0, len(values)),
+        _unit_references(values.shape),
+        position=np.zeros((len(values), 2)),
+        time_s=np.arange(len(values), dtype=np.float64),
+        data=values.astype(np.uint16),
+    )
+    statistics = SignalStatistics(values.shape[2], values[..., 0].size)
     statistics.add(values, np.ones(values.shape[:2], np.bool_))
-    noise = find_components(statistics, false_alarm=choice.false_alarm, least=choice.least).noise
+    noise = find_components(statistics, false_alarm=USUAL.false_alarm, least=USUAL.least).noise
     known = np.where(np.isfinite(noise) & (noise > 0), noise, 1.0)
     scene = scene_of_file(file, LineCamera())
     notes = () if weights_path is None else check_labels(scene, describe_weights(weights_path))
@@ -235,12 +253,12 @@ def keep_raw(scan: ScanLines) -> KeptLines:
 
 def condense(scan: ScanLines, step: float) -> KeptLines:
     """Condense the lines as a survey does."""
-    choice, statistics = SignalChoice(), _statistics(calibrated_blocks(scan.lines, scan.camera), scan)
-    components = find_components(statistics, false_alarm=choice.false_alarm, least=choice.least)
+    statistics = _statistics(calibrated_blocks(scan.lines, scan.camera), scan)
+    components = find_components(statistics, false_alarm=USUAL.false_alarm, least=USUAL.least)
     law = ResidualLaw.learned(statistics.spectra, components)
-    condenser = Condenser(components, law, scan.camera, choice.rare_spectra, step)
+    condenser = Condenser(components, law, scan.camera, USUAL.rare_spectra, step)
     kept, condensed = _condensed(scan, condenser, statistics)
-    better = with_shared_directions(condenser, [condensed], statistics, choice.false_alarm)
+    better = with_shared_directions(condenser, [condensed], statistics, USUAL.false_alarm)
     return kept if better is None else _condensed(scan, better, statistics)[0]
 
 
@@ -264,12 +282,14 @@ def _raw_blocks(scan: ScanLines) -> Iterator[Block]:
 def _condensed(scan: ScanLines, condenser: Condenser, statistics: SignalStatistics) -> tuple[KeptLines, CondensedSweep]:
     """Store the scores of all lines and the residuals of rare spectra."""
     assert statistics.origin is not None
-    lines, components, (x, y) = scan.lines, condenser.components, scan.lines.position.T
+    lines = scan.lines
+    components = condenser.components
     header = SweepHeader(lines.sweep, lines.references, scan.wavelength_nm)
     largest = components.largest(statistics.largest + np.abs(statistics.origin - components.mean))
     cube = SignalCubeInMemory(header, components, step=condenser.step, largest=largest)
     done = condenser.sweep(lines, cube.writer.write)
     exposure_ms = np.full(len(lines.data), scan.camera.exposure_ms)
+    x, y = lines.position.T
     cube.writer.close(LineRows(lines.time_s, x, y, exposure_ms, lines.valid_line), done.rare, done.residuals)
     return KeptLines(cube.size, lambda: cube.open().spectra(0, len(lines.data))), done
 
@@ -289,7 +309,8 @@ def bin_bands(scan: ScanLines, width: int) -> KeptLines:
 def pack_pcodec(scan: ScanLines, step: float | None) -> KeptLines:
     """Store raw numbers by pcodec, exactly or in whole steps, each a fraction of its band's noise."""
     pcodec = importlib.import_module("pcodec")
-    unit, numbers = np.ones(1, np.float32), scan.lines.data
+    unit = np.ones(1, np.float32)
+    numbers = scan.lines.data
     if step is not None:
         unit = (step * scan.noise_dn).astype(np.float32)
         numbers = np.rint(numbers / unit).astype(np.uint32)
@@ -311,7 +332,8 @@ def keep_principal(scan: ScanLines, step: float) -> KeptLines:
         back = np.asarray(array[...], np.float32).transpose(1, 2, 0) * np.float32(step)
         return scan.lines.calibrated(components.restore(back))
 
-    return KeptLines(size + _law_bytes(components), restore)
+    axes_and_mean = 4 * (len(components) + 1) * components.bands  # bytes of float32
+    return KeptLines(size + axes_and_mean, restore)
 
 
 def _scored(scan: ScanLines, *, raw: bool) -> tuple[Components, Values]:
@@ -319,8 +341,8 @@ def _scored(scan: ScanLines, *, raw: bool) -> tuple[Components, Values]:
 
     The unit of principal scores is the mean noise of all bands.
     """
-    choice, statistics = SignalChoice(), _statistics(calibrated_blocks(scan.lines, scan.camera), scan)
-    components = find_components(statistics, false_alarm=choice.false_alarm, least=choice.least)
+    statistics = _statistics(calibrated_blocks(scan.lines, scan.camera), scan)
+    components = find_components(statistics, false_alarm=USUAL.false_alarm, least=USUAL.least)
     if raw:
         statistics = _statistics(_raw_blocks(scan), scan)
         assert statistics.origin is not None
@@ -332,49 +354,35 @@ def _scored(scan: ScanLines, *, raw: bool) -> tuple[Components, Values]:
     return components, np.concatenate([score_lines(values, valid, components).scores for _, values, valid in blocks])
 
 
-def _law_bytes(components: Components) -> int:
-    """Return the bytes of axes and mean, float32."""
-    return 4 * (len(components) + 1) * components.bands
-
-
 def compress_jpeg2000(scan: ScanLines, rate: float, raw: bool) -> KeptLines:
     """Store components as the bands of a JPEG 2000 image of ``rate`` bytes a spectrum.
 
     They are the principal components of ``raw`` numbers (Du & Fowler 2007), or the components of condensing.
     """
+    rasterio = importlib.import_module("rasterio")
+    memory_file = importlib.import_module("rasterio.io").MemoryFile
     components, scores = _scored(scan, raw=raw)
     step = np.float32(max(JP2_STEP, float(np.abs(scores).max()) / JP2_LARGEST))
     numbers = (np.rint(scores.transpose(2, 0, 1) / step) + JP2_ZERO).astype(np.uint16)
-    packed = _to_jpeg2000(numbers, 100 * rate / (2 * len(components)))
-
-    def restore() -> Values:
-        back = (_from_jpeg2000(packed).astype(np.float32) - JP2_ZERO) * step
-        restored = components.restore(back.transpose(1, 2, 0))
-        return scan.lines.calibrated(restored) if raw else restored
-
-    return KeptLines(len(packed) + _law_bytes(components), restore)
-
-
-def _to_jpeg2000(numbers: NDArray[np.uint16], percent: float) -> bytes:
-    """Return an image (band, y, x) as JPEG 2000, in a percentage of its bytes."""
-    rasterio = importlib.import_module("rasterio")
     count, height, width = numbers.shape
     shape: dict[str, Any] = {"count": count, "height": height, "width": width, "dtype": "uint16"}
-    with warnings.catch_warnings(), importlib.import_module("rasterio.io").MemoryFile() as file:
+    percent = 100 * rate / (2 * count)  # of the bytes of these numbers
+    with warnings.catch_warnings(), memory_file() as file:
         warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
         with file.open(driver=JP2_DRIVER, QUALITY=percent, REVERSIBLE="NO", YCC="NO", **shape) as image:
             image.write(numbers)
         packed: bytes = file.read()
-    return packed
 
+    def restore() -> Values:
+        with warnings.catch_warnings(), memory_file(packed) as file:
+            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+            with file.open() as image:
+                back = (image.read().astype(np.float32) - JP2_ZERO) * step
+        restored = components.restore(back.transpose(1, 2, 0))
+        return scan.lines.calibrated(restored) if raw else restored
 
-def _from_jpeg2000(packed: bytes) -> NDArray[np.uint16]:
-    rasterio = importlib.import_module("rasterio")
-    with warnings.catch_warnings(), importlib.import_module("rasterio.io").MemoryFile(packed) as file:
-        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-        with file.open() as image:
-            numbers: NDArray[np.uint16] = image.read()
-    return numbers
+    axes_and_mean = 4 * (count + 1) * components.bands  # bytes of float32
+    return KeptLines(len(packed) + axes_and_mean, restore)
 
 
 _PCODEC: Mapping[Setting, Callable[[ScanLines], KeptLines]] = {
@@ -399,7 +407,7 @@ STORE = Tradeoff(
     reference=f"light and labels of a farm of {FIELD_SHAPE[1]} x {FIELD_SHAPE[0]} px, every line, {EXPOSURE_MS:g} ms",
     cost="bytes a spectrum",
     settings=tuple(WAYS),
-    default=f"condensed, step {SignalChoice().step:g}",
+    default=f"condensed, step {USUAL.step:g}",
     prepare=scan_farm,
     run=lambda scan, setting: WAYS[setting](scan),
     judge=ScanLines.judge,

@@ -93,11 +93,6 @@ class DataSet:
             return {}
         return classes_of_files(tuple(self.label_files.values()), settings)
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Return the names of all scenes, in the order of their files."""
-        return tuple(self.files)
-
     def load(self, name: str, part: Literal["train", "test"] | None = None) -> SceneFile:
         """Read one scene by its name with all labels, or with those inside or outside of the training mask.
 
@@ -111,10 +106,10 @@ class DataSet:
             return scene
         train, rest = split_labels(scene, self.train_mask, self.mask_classes)
         if part == "train":
-            chosen, note = train, f"labels inside {self.train_mask}: training"
-        else:
-            chosen, note = rest, f"labels outside {self.train_mask}: test"
-        return replace(scene, labels=chosen, provenance=(*scene.provenance, note))
+            return replace(
+                scene, labels=train, provenance=(*scene.provenance, f"labels inside {self.train_mask}: training")
+            )
+        return replace(scene, labels=rest, provenance=(*scene.provenance, f"labels outside {self.train_mask}: test"))
 
 
 def load_data_set(
@@ -177,7 +172,8 @@ def split_labels(
             f"mask {train_mask}: class {unknown} is none of the labels' {sorted(numbers)}; correct the mask classes"
         )
     index = np.array([UNLABELLED, *(numbers[number] for number in classes[:highest])], np.uint8)
-    trains, named = scene.labels == index[np.maximum(mask, 0)], (mask > 0) & (scene.labels != UNLABELLED)
+    trains = scene.labels == index[np.maximum(mask, 0)]
+    named = (mask > 0) & (scene.labels != UNLABELLED)
     if named.any() and (agree := trains[named].mean()) < 0.5:
         known = f"mask {train_mask} has the class of the labels in {agree:.0%} of its pixels"
         raise SceneError(f"{known}; give mask classes: the labels' number of each number of the mask, from 1 on")
@@ -285,10 +281,8 @@ def _built_in_days(laws: tuple[str, ...], first_seed: int, count: int, *, odd: b
     names: list[str] = []
     for number, law in enumerate(laws):
         own = len(range(number, count, len(laws)))
-        if law == FARM_LAW:
-            names += farm_days(first_seed, own, odd=odd)
-        else:
-            names += [_SCOUTED + name for name in farm_days(first_seed, own, odd=odd, season=SCOUTED_DAYS)]
+        prefix, season = ("", SEASON_DAYS) if law == FARM_LAW else (_SCOUTED, SCOUTED_DAYS)
+        names += [prefix + name for name in farm_days(first_seed, own, odd=odd, season=season)]
     return tuple(names)
 
 
@@ -300,7 +294,8 @@ def farm_days(
     Days follow the golden section, which covers the season evenly for any number of scenes. Training has even days,
     evaluation ``odd`` ones.
     """
-    (first, last), (morning, evening) = season, SEASON_HOURS
+    first, last = season
+    morning, evening = SEASON_HOURS
     names = []
     for i in range(count):
         day = first + 2 * int((0.5 + i * _GOLDEN) % 1 * ((last - first) // 2)) + odd
@@ -315,40 +310,14 @@ def read_farm_name(name: str) -> tuple[int, int, float]:
     return int(seed), int(day), float(hour)
 
 
-def file_data(files: DataSet, validation: int, camera: LineCamera) -> TrainingData:
-    """Split the scenes of a data set; every n-th of those not held out is for validation.
-
-    Scenes without labels are left out, with a note, where others have some.
-    """
-    names = _labelled_names(files)
-    if validation >= len(names) and validation:
-        raise SceneError(f"{validation} scenes for validation leave none of {len(names)} to train on; take fewer")
-    kept = names[:: max(len(names) // validation, 1)][:validation] if validation else ()
-    return TrainingData(
-        law=files.path.stem,
-        train=tuple(name for name in names if name not in kept),
-        validation=kept,
-        held_out=files.held_out,
-        camera=camera,
-        files=files,
-        notes=files.notes,
-    )
-
-
-def _labelled_names(files: DataSet) -> tuple[str, ...]:
-    names = tuple(name for name in files.files if name not in (*files.held_out, *files.unlabelled))
-    if not names:
-        raise SceneError(f"{files.path}: {'; '.join(files.notes)}; held-out scenes cannot be trained on")
-    return names
-
-
 def open_training_data(
     dataset: str, validation: int | None, scenes: int | None, camera: LineCamera, **choices: object
 ) -> TrainingData:
     """Open built-in scenes, separated by commas, or a path with the choices of `load_data_set`.
 
-    One scene in eight (at most 4) is for validation by default. Raises SettingsError: a choice of files for built-in
-    scenes, or the other way round.
+    Every n-th scene that is not held out is for validation: one in eight (at most 4) by default. Scenes without labels
+    are left out, with a note, where others have some. Raises SettingsError: a choice of files for built-in scenes, or
+    the other way round.
     """
     if laws := built_in_laws(dataset):
         for choice, value in choices.items():
@@ -363,7 +332,16 @@ def open_training_data(
     if scenes is not None:
         raise SettingsError(f"--scenes is for built-in scenes; {dataset} has its own scenes")
     files = load_data_set(Path(dataset), **choices)  # type: ignore[arg-type]
-    return file_data(files, min(4, len(_labelled_names(files)) // 8) if validation is None else validation, camera)
+    names = tuple(name for name in files.files if name not in (*files.held_out, *files.unlabelled))
+    if not names:
+        raise SceneError(f"{files.path}: {'; '.join(files.notes)}; held-out scenes cannot be trained on")
+    if validation is None:
+        validation = min(4, len(names) // 8)
+    if validation >= len(names) and validation:
+        raise SceneError(f"{validation} scenes for validation leave none of {len(names)} to train on; take fewer")
+    kept = names[:: max(len(names) // validation, 1)][:validation] if validation else ()
+    train = tuple(name for name in names if name not in kept)
+    return TrainingData(files.path.stem, train, kept, files.held_out, camera, files, files.notes)
 
 
 def pack_mask(mask: NDArray[np.bool_]) -> str:

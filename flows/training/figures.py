@@ -70,7 +70,8 @@ def judge_calibration(weights: Weights, examples: Iterable[Example], seed: int) 
     for example in examples:
         grid, labels = _parts(weights, example)
         _, every_class = map_of_columns(weights, example.columns.astype(np.float32), grid)
-        maps.append(JudgedMap.of(every_class, labels))
+        valid = (labels != UNLABELLED) & np.isfinite(every_class[..., 0])
+        maps.append(JudgedMap(every_class[valid], labels[valid]))
     return judge_confidence(maps, seed) if maps else None
 
 
@@ -95,10 +96,8 @@ def judge_scans(
     if not known or augmentation is None:
         return None
     steps = [step for step in STEPS if all(len(one.labels) % step == 0 for one in known)]
-    lighter = [
-        fraction * REFERENCE_MS for fraction in SCAN_EXPOSURES if fraction * REFERENCE_MS > augmentation.darkest_ms
-    ]
-    exposures = [*lighter, augmentation.darkest_ms]
+    usual = [fraction * REFERENCE_MS for fraction in SCAN_EXPOSURES]
+    exposures = [*(ms for ms in usual if ms > augmentation.darkest_ms), augmentation.darkest_ms]
     miou, spread, calibration = np.zeros((3, len(steps), len(exposures)))
     of_classes = np.zeros((len(weights.class_names), len(steps), len(exposures)))
     maps: dict[tuple[int, float], list[ScoredMap]] = {}
@@ -109,7 +108,8 @@ def judge_scans(
             counts = [one.counts for one, _ in judged]
             calibration[i, j] = calibration_error(np.sum([sure for _, sure in judged], axis=0))
             own = [mean_iou(one) for one in counts]
-            miou[i, j], spread[i, j] = np.nanmean(own), np.nanstd(own, ddof=1) if len(own) > 1 else np.nan
+            miou[i, j] = np.nanmean(own)
+            spread[i, j] = np.nanstd(own, ddof=1) if len(own) > 1 else np.nan
             with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of an absent class
                 of_classes[:, i, j] = np.nanmean([iou_per_class(one) for one in counts], axis=0)
             maps[step, exposure_ms] = [one for one, _ in judged]
@@ -203,7 +203,8 @@ def judge_baselines(
     rng = np.random.default_rng([seed, 0xBA5])
     if not validation or len(np.unique((learnt := LabelledPixels.drawn(train, rng)).labels)) < 2:
         return None
-    judged, found = LabelledPixels.drawn(validation, rng), dict[str, float]()
+    judged = LabelledPixels.drawn(validation, rng)
+    found: dict[str, float] = {}
     for name, classifier in {
         "logistic regression": LogisticRegression(max_iter=200),
         "random forest": RandomForestClassifier(100, min_samples_leaf=2, random_state=seed),

@@ -90,13 +90,16 @@ def run_init(source: str, console: Console, *, force: bool = False) -> dict[str,
             _class_lines(draft),
         ]
         write_whole(path, ("\n\n".join("\n".join(lines) for lines in parts if lines) + "\n"))
-    found, bands = draft.files, draft.cube.bands
-    count = draft.cube.shape[2]
-    first = f"write the {count} wavelengths into {path}: wavelengths_nm or wavelengths_file, as its lines say"
+    found = draft.files
+    bands = draft.cube.bands
+    first = None
+    following = _next(source, draft)
     if found.labels and not draft.classes:
-        first, again = f"repair these label files, or write what is missing into {path}", ["init", source, "--force"]
-    else:
-        first, again = "" if bands.wavelength_nm is not None else first, []
+        first = f"repair these label files, or write what is missing into {path}"
+        following = shlex.join(["spectralzoom", "init", source, "--force"])
+    elif bands.wavelength_nm is None:
+        count = draft.cube.shape[2]
+        first = f"write the {count} wavelengths into {path}: wavelengths_nm or wavelengths_file, as its lines say"
     return {
         "file": str(path),
         "images": len(found.images),
@@ -108,8 +111,8 @@ def run_init(source: str, console: Console, *, force: bool = False) -> dict[str,
         "classes": [{"name": one.name, "value": one.value, "fraction": one.fraction} for one in draft.classes],
         "notes": list(draft.notes),
         "unseen": _unseen(draft),
-        "first": first or None,
-        "next": shlex.join(["spectralzoom", *again]) if again else _next(source, draft),
+        "first": first,
+        "next": following,
     }
 
 
@@ -134,7 +137,7 @@ def _set_aside(path: Path, *, force: bool) -> Iterator[None]:
 
 
 def _label_lines(draft: SceneDraft, known: SceneSettings) -> list[str]:
-    images, labels = draft.files.images, draft.files.labels
+    labels = draft.files.labels
     if not labels:
         return ['# labels = "labels/{name}.png"   # no label files were found: {name} is an image\'s name']
     kept = [] if known.class_attribute is None else [f"class_attribute = {_quoted(known.class_attribute)}"]
@@ -144,8 +147,8 @@ def _label_lines(draft: SceneDraft, known: SceneSettings) -> list[str]:
         pair = next(iter(labels.items()))
         return [
             *kept,
-            f"# labels of {len(labels)} of {len(images)} images were found by their names: {_printable(pair[0].name)}"
-            f" has {_printable(pair[1].name)}",
+            f"# labels of {len(labels)} of {len(draft.files.images)} images were found by their names: "
+            f"{_printable(pair[0].name)} has {_printable(pair[1].name)}",
         ]
     return [*kept, f"labels = {_quoted(draft.only_label)}   # of all images"]
 
@@ -187,10 +190,13 @@ def _class_lines(draft: SceneDraft) -> list[str]:
     lines = [
         f"# unlabelled = {_value(one)}   # if it means no class: remove the #, and its line below" for one in guess[:1]
     ]
-    parts = "name = value in the label files; rename them as you like"
-    if all(is_polygon_file(label) for label in draft.files.labels.values()):
-        parts = "name = number; polygons have the name or the number"
-    lines += ["", f"[classes]   # with its fraction of the labelled pixels: {parts}"]
+    polygons = all(is_polygon_file(label) for label in draft.files.labels.values())
+    parts = (
+        "number; polygons have the name or the number"
+        if polygons
+        else "value in the label files; rename them as you like"
+    )
+    lines += ["", f"[classes]   # with its fraction of the labelled pixels: name = {parts}"]
     return lines + [f"{_key(one.name)} = {_value(one.value)}   # {one.fraction:.1%}" for one in classes]
 
 
@@ -208,10 +214,12 @@ def _quoted(text: str) -> str:
 
 def _unseen(draft: SceneDraft) -> list[str]:
     """Return the missing or inconsistent properties."""
-    found, parts = draft.files, []
+    found = draft.files
+    parts = []
     if found.labels and found.bare:
-        images = counted(len(found.bare), "image")
-        parts.append(f"labels of {images}, left out of the training: {listed_names(found.bare)}")
+        parts.append(
+            f"labels of {counted(len(found.bare), 'image')}, left out of the training: {listed_names(found.bare)}"
+        )
     if not found.labels:
         parts.append("label files: beside an image NAME.png they are called NAME_mask.png, or labels/NAME.png")
     if found.alone:
@@ -237,7 +245,8 @@ def _show(record: dict[str, Any], console: Console) -> None:
     """Print the findings, what is missing, the file, and the next command."""
     height, width, bands = record["shape"]
     images = counted(record["images"], "image")
-    names, first = list_some([one["name"] for one in record["classes"]], 8), record["first"]
+    names = list_some([one["name"] for one in record["classes"]], 8)
+    first = record["first"]
     lines = [
         f"{images}, {record['labelled']} with labels; the first has {height} x {width} px, {bands} bands",
         *([f"classes: {names}"] if names else []),
@@ -302,7 +311,8 @@ def draft_scene(
     folder = path.parent if alone else path
     first, series = _named_step(address if alone else found.images[0])
     source = with_wavelengths(open_cube(first), first, None)
-    found, unseen = _shared_labels(found, source.shape[:2]), list[str]()
+    found = _shared_labels(found, source.shape[:2])
+    unseen: list[str] = []
     # one file may have the labels of all images; else names find them
     of_all = set(found.labels.values())
     label_path = os.path.relpath(of_all.pop(), folder) if len(of_all) == 1 and not found.bare else ""
@@ -342,7 +352,8 @@ def _classes(
     found: MatchedFiles, bands: int, settings: SceneSettings, unseen: list[str], report: Report
 ) -> tuple[FoundClass, ...]:
     """Return all classes of the label files; ``unseen`` gets notes on files that cannot be used."""
-    counts, used = Counter[str](), list[Path]()
+    counts: Counter[str] = Counter()
+    used: list[Path] = []
     for number, (image, label) in enumerate(found.labels.items()):
         report(number / len(found.labels), label.name)
         try:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from models.network.spectral import SpectralBasis, project
 from models.training.capture_augmentation import ColumnNoise, SceneSpectra
-from models.training.examples import Example, noise_of, observe, value_of_electron
+from models.training.examples import Example, observe, value_of_electron
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
@@ -73,36 +73,35 @@ def observe_finely(
     scene: RasterScene, camera: LineCamera, grid: SceneGrid, basis: SpectralBasis, seed: int
 ) -> tuple[Columns, ColumnNoise]:
     """Scan a farm by every line; return columns on the basis, (y, x, column), and their noise."""
-    rig, cost = Rig(camera), CostModel()
+    rig = Rig(camera)
+    cost = CostModel()
     _, full, _ = cheapest_full(grid, camera, cost)
     source = SimulatedSource(scene, rig, seed, chosen_effects(scene, rig, full), clock=sweep_starts(full, camera, cost))
     matrix, _ = basis.matrix(scene.wavelength_nm)
-    columns, spectra = _columns(source, full, grid, matrix)
-    return columns, replace(noise_of(scene, matrix, camera), spectra=spectra if len(matrix) > FEW_BANDS else None)
+    bands = len(matrix)
+    rows: list[Columns] = []
+    count, total, products = 0, np.zeros(bands), np.zeros((bands, bands))  # sums of the powers 0, 1 and 2
+    for part in mosaic_rows([_Taken(source, sweep) for sweep in full], camera, grid, rows=_ROWS):
+        rows.append(project(part, matrix))
+        some = part[::2, ::2].reshape(-1, bands).astype(np.float64)
+        count += len(some)
+        total += some.sum(axis=0)
+        products += some.T @ some
+    columns = np.concatenate(rows)
+    if not np.isfinite(columns).all():
+        raise SceneError(f"scene {scene.name} has pixels that no line reached; training needs all of it")
+    mean = total / count
+    covariance = products / count - np.outer(mean, mean)
+    value = value_of_electron(scene)
+    spectra = SceneSpectra(mean, covariance, matrix, value, camera.read_noise_e)
+    noise = np.sum(spectra.noise(1.0), axis=0)
+    power = np.linalg.eigvalsh(covariance / np.sqrt(np.outer(noise, noise)))
+    floor = np.quantile(power, 0.1)  # of directions without a signal
+    spectra = replace(spectra, covariance=covariance - floor * np.diag(noise))
+    of_columns = ColumnNoise.of_bands(matrix, value, camera.read_noise_e)
+    return columns, replace(of_columns, spectra=spectra if bands > FEW_BANDS else None)
 
 
 def chosen_effects(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep]) -> Choice:
     """Choose effects as a survey of these sweeps does."""
     return Choice.of(decide(probe_survey(scene, rig, sweeps, "sigma"), rig, EFFECTS, TOLERANCE_SIGMA).chosen)
-
-
-def _columns(
-    source: SimulatedSource, sweeps: Sequence[Sweep], grid: SceneGrid, matrix: Columns
-) -> tuple[Columns, SceneSpectra]:
-    """Return the rectified pass on the basis, (y, x, column), and the moments of its spectra."""
-    bands, rows = len(matrix), list[Columns]()
-    count, total, products = 0, np.zeros(bands), np.zeros((bands, bands))
-    for part in mosaic_rows([_Taken(source, sweep) for sweep in sweeps], source.camera, grid, rows=_ROWS):
-        rows.append(project(part, matrix))
-        some = part[::2, ::2].reshape(-1, bands).astype(np.float64)
-        count, total, products = count + len(some), total + some.sum(axis=0), products + some.T @ some
-    seen = np.concatenate(rows)
-    if not np.isfinite(seen).all():
-        raise SceneError(f"scene {source.scene.name} has pixels that no line reached; training needs all of it")
-    mean = total / count
-    covariance = products / count - np.outer(mean, mean)
-    spectra = SceneSpectra(mean, covariance, matrix, value_of_electron(source.scene), source.camera.read_noise_e)
-    noise = np.sum(spectra.noise(1.0), axis=0)
-    power = np.linalg.eigvalsh(covariance / np.sqrt(np.outer(noise, noise)))
-    floor = np.quantile(power, 0.1)  # of directions without a signal
-    return seen, replace(spectra, covariance=covariance - floor * np.diag(noise))

@@ -31,7 +31,7 @@ from models.network.spectral import Normalisation
 from models.training.capture_augmentation import REFERENCE_MS
 from models.training.examples import measured_normalisation
 from models.training.ood_fit import fit_ood
-from models.training.train import PIXELS, LabelledPixels, Progress, linear_discriminants, train
+from models.training.train import PIXELS, LabelledPixels, linear_discriminants, train
 from models.weights.checksummed_files import load_checkpoint
 from models.weights.files import (
     CALIBRATION,
@@ -68,7 +68,8 @@ def train_weights(
     check_out(request.out)
     load_checkpoint(checkpoint)  # a damaged one fails before minutes are spent
     begun = None if request.start is None else load_weights(request.start)
-    device, settings = choose_device(request.device), request.settings
+    device = choose_device(request.device)
+    settings = request.settings
     hold_out = {"hold_out": request.hold_out, **request.choices}
     data = open_training_data(request.dataset, request.validation, request.scenes, request.camera, **hold_out)
     for note in data.notes:
@@ -124,13 +125,19 @@ def train_weights(
 def _trained_on(data: TrainingData, scenes: Scenes, darkest_ms: float) -> TrainedOn:
     """Return the ranges of the training data; season, sun and scale are known for built-in farms alone."""
     nm = scenes.common.wavelength_nm
-    span = float(nm.min()), float(nm.max())
-    exposures = darkest_ms, max(darkest_ms, data.camera.exposure_ms)
-    trained = TrainedOn(len(nm), span, exposures, len(data.train), scenes.common.names, bands_nm=tuple(nm.tolist()))
+    trained = TrainedOn(
+        bands=len(nm),
+        wavelength_nm=(float(nm.min()), float(nm.max())),
+        exposure_ms=(darkest_ms, max(darkest_ms, data.camera.exposure_ms)),
+        scenes=len(data.train),
+        classes=scenes.common.names,
+        bands_nm=tuple(nm.tolist()),
+    )
     if data.files is not None:
         return trained
     moments = [read_farm_name(name)[1:] for name in data.train]
-    days, heights = [day for day, _ in moments], [sun_over_farm(*moment).elevation_deg for moment in moments]
+    days = [day for day, _ in moments]
+    heights = [sun_over_farm(*moment).elevation_deg for moment in moments]
     return replace(
         trained, day=(min(days), max(days)), sun_elevation_deg=(min(heights), max(heights)), ground_pixel_m=FARM_PIXEL_M
     )
@@ -142,14 +149,16 @@ def check_start(request: TrainRequest, begun: Weights, scenes: Scenes) -> None:
     Bands, classes and sizes must be theirs, and the training must contain the pixels that they know, by the content of
     the scenes. So none of these pixels judges the result, and the record names them all.
     """
-    split, common, now = begun.record.get("split", {}), scenes.common, scenes.train
-    known, masks = set(split.get("train", {}).values()), split.get("pixels", {})
+    split = begun.record.get("split", {})
+    known = set(split.get("train", {}).values())
+    masks = split.get("pixels", {})
+    now = scenes.train
     for what, kept in {
         "training scenes": known <= set(now.keys.values()),
         "training pixels": all(masks_contain(now.pixels[key], masks.get(key)) for key in known & now.pixels.keys()),
-        "bands": begun.basis == common.basis,
-        "classes": begun.class_names == common.names,
-        "sizes of the network": begun.config == network_config(request, common),
+        "bands": begun.basis == scenes.common.basis,
+        "classes": begun.class_names == scenes.common.names,
+        "sizes of the network": begun.config == network_config(request, scenes.common),
     }.items():
         if not kept:
             raise SettingsError(
@@ -167,12 +176,10 @@ def _learned(
     report: Report,
 ) -> tuple[Weights, dict[str, Any]]:
     """Train the network; return weights, and their figures on the validation scenes for the record."""
-
-    def progress(now: Progress) -> None:
-        report("training", now.done, f"step {now.step}, loss {now.loss:.3f}")
-
-    common, settings, examples = scenes.common, request.settings, scenes.train.examples
-    config, seed = network_config(request, common), settings.seed
+    common = scenes.common
+    settings = request.settings
+    examples = scenes.train.examples
+    config = network_config(request, common)
     rng = np.random.default_rng([0x1DA])
     augmentation = training_capture(normalisation, settings.darkest_ms)
     pixels = LabelledPixels.drawn(examples, rng, augmentation).brightened(normalisation.gain_shift, rng)
@@ -182,26 +189,27 @@ def _learned(
         examples,
         normalisation.gain_shift,
         settings,
-        progress,
+        lambda now: report("training", now.done, f"step {now.step}, loss {now.loss:.3f}"),
         start=start if begun is None else begun.segmenter.state_dict(),
         augmentation=augmentation,
         checkpoint=checkpoint,
         device=device,
     )
     weights = Weights(model, common.basis, normalisation, common.names, common.colours).on(device)
-    frames, found = scenes.validation.examples, dict[str, Any]()
+    frames = scenes.validation.examples
+    found: dict[str, Any] = {}
     labelled = sum(int(np.count_nonzero(one.labels != UNLABELLED)) for one in examples)
     weights, found["readings"] = better_reading(
         weights, start, frames, few=begun is None and labelled < FEW_PIXELS, begun=begun
     )
     if frames:
-        found["baselines"] = judge_baselines(examples, frames, config.classes, seed, report)
+        found["baselines"] = judge_baselines(examples, frames, config.classes, settings.seed, report)
         report("validating", 0.0, f"{len(frames)} scenes")
-        found[CALIBRATION] = judge_calibration(weights, frames, seed)
+        found[CALIBRATION] = judge_calibration(weights, frames, settings.seed)
     twice = read_twice(weights, frames)
     if twice:
         found[CASCADE] = asdict(CascadeTable.judged(twice, config.classes))
-    found["validation"] = validate(twice, config.classes, seed)
+    found["validation"] = validate(twice, config.classes, settings.seed)
     return weights, {"training": summary, **found}
 
 
@@ -246,7 +254,7 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
     console.print(f"weights: {out} ({out.stat().st_size / 1e6:.1f} MB), {steps} steps", markup=False, soft_wrap=True)
     if "familiar" in record:
         console.print(record["familiar"], markup=False, soft_wrap=True)
-    readings, figures = record["readings"], record["validation"]
+    readings = record["readings"]
     of_readings, of_baselines = (
         ", ".join(f"{name} {100 * miou:.1f}" for name, miou in scores.items())
         for scores in (readings["miou"], record.get("baselines") or {})
@@ -255,6 +263,7 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
     console.print(f"{words}kept: {readings['kept']}", soft_wrap=True)
     if of_baselines:
         console.print(f"on at most {PIXELS} of their pixels at full exposure: {of_baselines}", soft_wrap=True)
+    figures = record["validation"]
     if figures is None:
         left = built_in_laws(request.dataset) or request.hold_out or request.choices.get("train_mask") is not None
         on = request.dataset if left else "OTHER_SCENES"

@@ -121,8 +121,12 @@ def _imaged(
 
     With ``trained`` scenes, these are for validation: those without a label, or of a trained image, are left out.
     """
-    found, empty, regridded, alike = Imaged(), list[str](), list[str](), dict[str, str]()
-    unfit, negative = list[str](), list[str]()
+    found = Imaged()
+    alike: dict[str, str] = {}
+    empty: list[str] = []
+    unfit: list[str] = []
+    regridded: list[str] = []
+    negative: list[str] = []
     stream = 0x0B5 if trained is None else 0x0B6  # validation has noise of its own
     for number, name in enumerate(names):
         report(what, number / len(names), name)
@@ -190,7 +194,6 @@ def suggested_patch(shape: tuple[int, int], *, built_in: bool) -> int:
 def network_config(request: TrainRequest, common: Common) -> SegmenterConfig:
     """Return the sizes of the network. Raises SettingsError where they do not fit each other."""
     deep = common.patch >= DEEP_PATCH_PX
-    usual = {"layers": 1 if deep else SegmenterConfig.layers}
     try:
         return SegmenterConfig(
             classes=len(common.names),
@@ -199,7 +202,7 @@ def network_config(request: TrainRequest, common: Common) -> SegmenterConfig:
             width=request.width,
             overview_width=request.overview_width,
             deep=deep,
-            **usual | request.tokens,
+            **{"layers": 1 if deep else SegmenterConfig.layers, **request.tokens},
         )
     except ValueError as error:
         raise SettingsError(f"{error}; choose another --patch, --dim or --heads") from error

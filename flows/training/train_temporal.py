@@ -25,7 +25,6 @@ from models.reading.inference import map_of_columns
 from models.reading.prior_map import CurrentVisit, PriorMap, first_probabilities, fuse, pooled
 from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation, ColumnNoise
 from models.training.temporal import PastPass, TemporalTraining, Visit, train_reader
-from models.training.train import Progress
 from models.weights.files import Weights, add_reader, describe_weights, load_reader, load_weights
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
@@ -34,16 +33,21 @@ from pipeline.simulator.scenes.farm.farm_plan import CLASSES
 from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES, farm_scene
 
 SHAPE = (512, 640)  # (y, x) of a land
-LANDS, FIRST_SEED, JUDGED_SEED = 40, 200_000, 300_000
+LANDS = 40
+FIRST_SEED, JUDGED_SEED = 200_000, 300_000  # of lands of the training, and of those that judge it
 VISITS = 5  # of each land
-DAYS, LAST_DAY = (95, 290), 318  # of the year: of first visits, and of any
-SPRING, IN_SPRING = (95, 135), 0.4  # days when most changes, and the fraction of lands first visited then in any case
+DAYS = (95, 290)  # of the year, of first visits
+LAST_DAY = 318  # of any visit
+SPRING = (95, 135)  # days when most changes
+IN_SPRING = 0.4  # fraction of lands that are first visited then in any case
 GAPS = (0, 1, 1, 2, 3, 3, 5, 6, 6, 7, 7, 10, 14)  # days between two
 HOURS = (9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0)
 SPACINGS = {1: 0.3, 2: 0.5, 4: 0.2}  # line spacing [px] -> fraction of the passes
 DARKEST_MS, BRIGHTEST_MS = 3.0, 50.0
 PASSES = 2  # of each visit
-JUDGED_DAY, JUDGED_AFTER, JUDGED_LANDS = 172, (1, 3, 7), 3
+JUDGED_DAY = 172
+JUDGED_AFTER = (1, 3, 7)  # days
+JUDGED_LANDS = 3
 BEFORE, NOW = (1, 25.0), (2, 5.0)  # line spacing [px] and exposure [ms] of the judged scans
 
 
@@ -79,19 +83,20 @@ def train_temporal(request: TemporalRequest, report: Report = lambda what, done,
         raise SettingsError(
             f"--train-temporal {request.weights}: expected weights of the farm's classes, {', '.join(CLASSES)}"
         )
-    augmentation, lands = CaptureAugmentation(weights.normalisation), []
+    augmentation = CaptureAugmentation(weights.normalisation)
+    lands = []
     for number in range(request.lands):
         seed = FIRST_SEED + number
         report("visiting lands", number / request.lands, f"land {seed}")
         rng = np.random.default_rng([request.settings.seed, seed])
         lands.append([_visit(weights, augmentation, request.shape, seed, *moment, rng) for moment in _moments(rng)])
-
-    def progress(now: Progress) -> None:
-        report("training", now.done, f"step {now.step}, loss {now.loss:.3f}")
-
     known = describe_weights(request.weights).reader
-    start = None if known is None else load_reader(request.weights)
-    reader, steps = train_reader(lands, request.settings, progress, start=start)
+    reader, steps = train_reader(
+        lands,
+        request.settings,
+        lambda now: report("training", now.done, f"step {now.step}, loss {now.loss:.3f}"),
+        start=None if known is None else load_reader(request.weights),
+    )
     record = {
         "command": request.command,
         "lands": [FIRST_SEED + number for number in range(request.lands)],
@@ -122,7 +127,8 @@ def _visit(
     rng: np.random.Generator,
 ) -> Visit:
     """Return a land on a day, as scans drawn at random show it."""
-    seen, drawn = _Land.observed(weights, shape, seed, day, hour, rng), []
+    seen = _Land.observed(weights, shape, seed, day, hour, rng)
+    drawn = []
     for _ in range(PASSES):
         step = int(rng.choice(list(SPACINGS), p=list(SPACINGS.values())))
         exposure_ms = float(np.exp(rng.uniform(np.log(DARKEST_MS), np.log(BRIGHTEST_MS))))
@@ -201,10 +207,12 @@ def judge_temporal(
                 "prior_map": fuse(prior_map, now, reader),
                 "anew": first_probabilities(anew),
             }
-            counts = {
-                name: confusion(later.labels, one.classes()[0], len(CLASSES)) for name, one in probabilities.items()
-            }
-            rows[days].append({name: mean_iou(one) for name, one in counts.items()})
+            rows[days].append(
+                {
+                    name: mean_iou(confusion(later.labels, one.classes()[0], len(CLASSES)))
+                    for name, one in probabilities.items()
+                }
+            )
     if not request.judged:
         return None
     return [

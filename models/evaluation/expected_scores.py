@@ -24,7 +24,8 @@ from models.evaluation.metrics import Floats, iou_per_class, labelled_classes, m
 # Logit of the probability that a class is present: a constant, and factors of the logarithm of its expected pixels, the
 # logit of its expected IoU, the logarithm of the exposure (more for wider line spacings), and octaves of line spacing.
 PRESENT = (-4.33, 2.0, 2.38, 0.94, 2.45)  # least errors of the mIoU of scans of 32 validation scenes
-FULL_MS, FEW_PX = 100.0, 10.0  # exposure of logarithm 0; pixels of other classes that its expected IoU adds
+FULL_MS = 100.0  # exposure of logarithm 0
+FEW_PX = 10.0  # pixels of other classes that the expected IoU of a class adds
 SURE_PX = 2000.0  # of a class: a scene with so many counts in full; fewer in all scenes shrink the bias
 SMALL_PX, SMALL_ERROR = 300.0, 0.3  # the IoU of a class of so few pixels has half of this error
 LEAST_IOU = 0.005  # IoU is kept as far from 0 and 1
@@ -61,7 +62,9 @@ def expected_score(counts: Floats, bias: Floats, error: float, step: int, exposu
 
     NaN where no class has a pixel.
     """
-    area, own, octaves = counts.sum(axis=1), counts.diagonal(), math.log2(step)
+    area = counts.sum(axis=1)
+    own = counts.diagonal()
+    octaves = math.log2(step)
     iou = scipy.special.expit(_logit(iou_per_class(counts)) + bias)
     sure = _logit(own / (area + counts.sum(axis=0) - own + FEW_PX))
     factors = np.log1p(area), sure, (1 + octaves) * math.log(exposure_ms / FULL_MS), octaves
@@ -119,9 +122,13 @@ class MapScores:
     def fitted(maps: Mapping[tuple[int, float], Sequence[ScoredMap]]) -> MapScores:
         """Fit corrections to maps by step and exposure; each pair has maps of the same scenes."""
         steps, exposures = sorted({step for step, _ in maps}), sorted({exposure for _, exposure in maps})
-        bias = np.array([[fitted_bias(maps[step, ms]) for ms in exposures] for step in steps])
-        error = np.array([[error_of_passes(maps[step, ms], step, ms) for ms in exposures] for step in steps])
-        return MapScores(tuple(steps), tuple(exposures), bias, error, len(maps[steps[0], exposures[0]]))
+        return MapScores(
+            steps=tuple(steps),
+            exposures_ms=tuple(exposures),
+            bias=np.array([[fitted_bias(maps[step, ms]) for ms in exposures] for step in steps]),
+            error=np.array([[error_of_passes(maps[step, ms], step, ms) for ms in exposures] for step in steps]),
+            scenes=len(maps[steps[0], exposures[0]]),
+        )
 
     @staticmethod
     def read(content: Mapping[str, Any]) -> MapScores:
@@ -148,7 +155,8 @@ class MapScores:
         if step not in self.steps or not within or len(counts) != self.bias.shape[-1]:
             return None
         row = self.steps.index(step)
-        at, known = math.log(exposure_ms), np.log(self.exposures_ms)
+        at = math.log(exposure_ms)
+        known = np.log(self.exposures_ms)
         bias = np.array([np.interp(at, known, one) for one in self.bias[row].T])
         return expected_score(counts, bias, float(np.interp(at, known, self.error[row])), step, exposure_ms)
 

@@ -78,8 +78,8 @@ def mean_iou(counts: Numbers) -> float:
 def mean_iou_of_each(counts: Numbers) -> Floats:
     """Return `mean_iou` of many confusion counts at once, (..., class, class) -> (...)."""
     held = labelled_classes(counts)
-    total, number = np.where(held, iou_per_class(counts), 0).sum(axis=-1), held.sum(axis=-1)
-    return _divided(total, number, where=number > 0)
+    number = held.sum(axis=-1)
+    return _divided(np.where(held, iou_per_class(counts), 0).sum(axis=-1), number, where=number > 0)
 
 
 def agreement(counts: Counts) -> dict[str, float]:
@@ -142,7 +142,8 @@ def paired_interval(
     difference = float((_means(first, once) - _means(second, once))[0])
     if frames < 2:
         return Interval(difference, None, None)
-    times, changes = _drawn(frames, draws, [seed, 0xB007]), []
+    times = _drawn(frames, draws, [seed, 0xB007])
+    changes = []
     for counts, of in zip((first, second), of_runs, strict=True):
         trainings = int(of.max()) + 1
         changes.append(_means(counts, times, _drawn(trainings, draws, [seed, 0x5EED, trainings])[:, of]))
@@ -197,12 +198,6 @@ class JudgedMap:
     log_probability: NDArray[np.float32]  # (pixel, class)
     labels: NDArray[np.uint8]  # (pixel,)
 
-    @staticmethod
-    def of(log_probability: NDArray[np.float32], labels: NDArray[np.uint8]) -> JudgedMap:
-        """Take the labelled pixels of (y, x, class) and (y, x)."""
-        valid = (labels != UNLABELLED) & np.isfinite(log_probability[..., 0])
-        return JudgedMap(log_probability[valid], labels[valid])
-
 
 def judge_confidence(maps: list[JudgedMap], seed: int) -> dict[str, Any]:
     """Return the expected calibration error of maps for a record, with a ``temperature`` where it is above 0.02.
@@ -256,9 +251,11 @@ def stratified_fractions(mapped: ArrayLike, confusion: ArrayLike) -> tuple[Float
     .. [1] Olofsson et al., "Good practices for estimating area and assessing accuracy of land change", Remote Sensing
        of Environment 148, 2014. doi:10.1016/j.rse.2014.02.015
     """
-    weight, counts = np.asarray(mapped, np.float64), np.asarray(confusion, np.float64)
+    weight = np.asarray(mapped, np.float64)
+    counts = np.asarray(confusion, np.float64)
     there = weight > 0
-    strata, number = weight[there], counts[:, there].sum(axis=0)
+    strata = weight[there]
+    number = counts[:, there].sum(axis=0)
     if (number < 2).any():
         return np.full(len(weight), np.nan), np.full(len(weight), np.nan)
     of_map = counts[:, there] / number

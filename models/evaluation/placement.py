@@ -22,7 +22,6 @@ from pipeline.geometry.grid import UNLABELLED, SceneGrid, patch_pixels
 from pipeline.lazy import torch
 from pipeline.planning.coverage import frame_patches
 
-Values = NDArray[np.floating]
 RANDOM_DRAWS = 5
 COMPARED = ("gain", "entropy", "sobel")  # policies beside the random one
 MOST_GAIN = 5.0  # gains are clipped to this [nat per px]; one confident error would outweigh a field
@@ -41,13 +40,14 @@ def oracle_gain(
     ``fine`` (patch, p, p, column) are normalised columns of every patch of the padded grid, ``labels`` (y, x) class
     indices of the scene, 255 unlabelled.
     """
-    grid, p = seen.grid, seen.grid.patch
-    truth = patch_pixels(grid, labels, UNLABELLED)
+    p = seen.grid.patch
+    truth = patch_pixels(seen.grid, labels, UNLABELLED)
     gain = np.zeros(len(truth))
-    patches, patch_index = captured(fine, grid.every_patch())
+    patches, patch_index = captured(fine, seen.grid.every_patch())
     with torch.inference_mode():
-        overview, first = overview_of(weights, seen), 0
+        overview = overview_of(weights, seen)
         before = patches_of(overview.logits[0].permute(1, 2, 0).cpu().numpy(), p).transpose(0, 3, 1, 2)
+        first = 0
         for after in patch_logits(weights, overview, patches, patch_index, seen.capture):
             some = patch_index[first : first + len(after)]
             lower = _losses(before[some], truth[some]) - _losses(after.numpy(), truth[some])
@@ -59,12 +59,13 @@ def oracle_gain(
 def _losses(logits: NDArray[np.float32], truth: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Return the cross-entropy of each pixel, (patch, class, y, x) -> (patch, y, x); 0 if unlabelled."""
     labelled = truth != UNLABELLED
-    index, exact = np.where(labelled, truth, 0).astype(np.intp)[:, None], logits.astype(np.float64)
+    index = np.where(labelled, truth, 0).astype(np.intp)[:, None]
+    exact = logits.astype(np.float64)
     loss = scipy.special.logsumexp(exact, axis=1) - np.take_along_axis(exact, index, axis=1)[:, 0]
     return np.where(labelled, loss, 0.0)
 
 
-def gain_sums(gain: Values, chosen: NDArray[np.integer]) -> tuple[float, float]:
+def gain_sums(gain: NDArray[np.floating], chosen: NDArray[np.integer]) -> tuple[float, float]:
     """Return the gain of the chosen patches, and of as many of the best ones; sum over frames, then divide."""
     return float(gain[chosen].sum()), float(np.sort(gain)[::-1][: len(chosen)].sum())
 
@@ -114,8 +115,8 @@ class ReadTwice:
 
     def counts(self, chosen: NDArray[np.bool_], classes: int) -> Counts:
         """Return the confusion of the map whose ``chosen`` (patch_y, patch_x) patches are read in full."""
-        p, (y, x) = self.grid.patch, self.labels.shape
-        pixels = chosen.repeat(p, 0).repeat(p, 1)[:y, :x]
+        y, x = self.labels.shape
+        pixels = chosen.repeat(self.grid.patch, 0).repeat(self.grid.patch, 1)[:y, :x]
         return confusion(self.labels, np.where(pixels, self.full, self.overview), classes)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Literal, get_args
 
 from pipeline.errors import SettingsError
@@ -24,11 +24,12 @@ def choose_device(asked: str) -> Present:
     """
     if asked == PROCESSOR:  # without loading torch
         return PROCESSOR
-    there: list[Present] = [PROCESSOR]
-    if torch.backends.mps.is_available():
-        there.insert(0, "mps")
-    if torch.cuda.is_available():
-        there.insert(0, "cuda")
+    kinds: tuple[tuple[Present, bool], ...] = (
+        ("cuda", torch.cuda.is_available()),
+        ("mps", torch.backends.mps.is_available()),
+        (PROCESSOR, True),
+    )
+    there = [name for name, available in kinds if available]
     found = next((name for name in there if asked in ("auto", name)), None)
     if found is None:
         known = ", ".join(get_args(Device))
@@ -55,17 +56,13 @@ def one_thread() -> Iterator[None]:
 
 def keep_freed_memory() -> None:
     """Let the C library keep freed memory: page faults of large arrays would take longer than the arithmetic."""
-    try:
+    with suppress(OSError, AttributeError):  # another C library is slower
         libc = ctypes.CDLL("libc.so.6")
         for option, value in KEPT:
             libc.mallopt(option, value)
-    except (OSError, AttributeError):
-        return  # another C library is slower
 
 
 def give_back_freed_memory() -> None:
     """Return kept memory to the system at the end of a stage: the next one needs blocks of other sizes."""
-    try:
+    with suppress(OSError, AttributeError):  # another C library
         ctypes.CDLL("libc.so.6").malloc_trim(0)
-    except (OSError, AttributeError):
-        return  # another C library

@@ -19,8 +19,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor, nn
 
-from models.network.sizes import AROUND_PX, BOTTOM, PLANES, TOKEN_PX, level_widths
-from models.network.sizes import SegmenterConfig as SegmenterConfig
+from models.network.sizes import AROUND_PX, BOTTOM, PLANES, TOKEN_PX, SegmenterConfig, level_widths
 from pipeline.errors import ShapeError
 
 LONGEST_PERIOD = 128.0  # cells of a token; the shortest is 2
@@ -84,14 +83,12 @@ class Encoder(nn.Module):
 
     def __init__(self, dim: int, layers: int, heads: int, mlp_ratio: int) -> None:
         super().__init__()
-        self.blocks = nn.ModuleList(EncoderBlock(dim, heads, mlp_ratio) for _ in range(layers))
+        self.blocks = nn.Sequential(*(EncoderBlock(dim, heads, mlp_ratio) for _ in range(layers)))
         self.norm = nn.LayerNorm(dim)
 
     def forward(self, x: Tensor) -> Tensor:
         """Encode tokens, (B, N, d) -> (B, N, d)."""
-        for block in self.blocks:
-            x = block(x)
-        return cast(Tensor, self.norm(x))
+        return cast(Tensor, self.norm(self.blocks(x)))
 
 
 def cut(image: Tensor, patch: int) -> Tensor:
@@ -198,12 +195,12 @@ class Segmenter(nn.Module):
     def __init__(self, config: SegmenterConfig) -> None:
         super().__init__()
         self.config = config
-        inputs, dim = config.columns + PLANES, config.dim
+        inputs = config.columns + PLANES
         widths = level_widths(config.overview_width, TOKEN_PX, config.deep)
         self.overview_stem = Stem(inputs, widths, config.deep)
-        self.to_token = nn.Conv2d(widths[-1], dim, BOTTOM, stride=BOTTOM)
-        self.encoder = Encoder(dim, config.layers, config.heads, config.mlp_ratio)
-        self.from_token = nn.Conv2d(dim, widths[-1] * BOTTOM**2, 1)
+        self.to_token = nn.Conv2d(widths[-1], config.dim, BOTTOM, stride=BOTTOM)
+        self.encoder = Encoder(config.dim, config.layers, config.heads, config.mlp_ratio)
+        self.from_token = nn.Conv2d(config.dim, widths[-1] * BOTTOM**2, 1)
         self.overview_head = Head(widths, config.deep)
         self.overview_classes = nn.Conv2d(config.overview_width, config.classes, 1)
         self.spectral = nn.Conv2d(config.columns, config.classes, 1)  # linear classifier that the U-Net corrects
@@ -229,7 +226,8 @@ class Segmenter(nn.Module):
         ``image`` is the input of the overview, ``detail`` that of the full network. ``patch_index`` (B, K) are int64
         patch numbers, ``origin`` (B, 2) the tokens above and left of a crop.
         """
-        overview, cells = self.read_overview(image, origin), cut(detail, self.config.patch)
+        overview = self.read_overview(image, origin)
+        cells = cut(detail, self.config.patch)
         index = patch_index[:, :, None, None, None].expand(-1, -1, *cells.shape[2:])
         return overview.logits, self.read_patches(overview, cells.gather(1, index), patch_index)
 
@@ -245,27 +243,21 @@ class Segmenter(nn.Module):
         features = self.overview_stem(image)
         # In bfloat16, channels last, a kernel that covers its whole input gives wrong sums (torch 2.13, CPU).
         grid = self.to_token(features[-1].contiguous())
-        tokens = self._coded(grid, origin)
+        places = torch.cartesian_prod(*(torch.arange(size) for size in grid.shape[2:])).double() + 0.5
+        if origin is not None:
+            places = places + origin.cpu().double()[:, None]
+        tokens = grid.flatten(2).transpose(1, 2) + code_2d(places, self.config.dim).to(grid.device)
         if living is None:
             read = self.encoder(tokens)
         else:
             read = torch.zeros_like(tokens)
             read[:, living] = self.encoder(tokens[:, living])
-        context = self.from_token(read.transpose(1, 2).reshape(grid.shape))
-        features[-1] = features[-1] + F.pixel_shuffle(context, BOTTOM)
+        features[-1] = features[-1] + F.pixel_shuffle(self.from_token(read.transpose(1, 2).reshape(grid.shape)), BOTTOM)
         drawn = self.overview_head(features)[:, :, :height, :width]
         columns = image[:, : self.config.columns].permute(0, 2, 3, 1)
-        alone = F.linear(columns, self.spectral.weight.flatten(1), self.spectral.bias).permute(0, 3, 1, 2)
-        alone = mean_around(alone)  # the logits' mean is that of the mean spectrum
+        # the mean of the logits is that of the mean spectrum
+        alone = mean_around(F.linear(columns, self.spectral.weight.flatten(1), self.spectral.bias).permute(0, 3, 1, 2))
         return Overview(drawn, self.overview_classes(F.gelu(drawn)) + alone[:, :, :height, :width])
-
-    def _coded(self, grid: Tensor, origin: Tensor | None) -> Tensor:
-        """Add the code of its place to each token, (B, d, rows, columns) -> (B, rows * columns, d)."""
-        rows, columns = grid.shape[2:]
-        places = torch.cartesian_prod(torch.arange(rows), torch.arange(columns)).double() + 0.5
-        if origin is not None:
-            places = places + origin.cpu().double()[:, None]
-        return grid.flatten(2).transpose(1, 2) + code_2d(places, self.config.dim).to(grid.device)
 
     def read_patches(self, overview: Overview, patches: Tensor, patch_index: Tensor) -> Tensor:
         """Return logits (B, K, classes, p, p) of patches (B, K, J + PLANES, p, p) at ``patch_index`` (B, K)."""
@@ -273,7 +265,8 @@ class Segmenter(nn.Module):
         p = self.config.patch
         if k == 0:  # convolutions have no backward pass of an empty batch
             return overview.logits.new_zeros(b, 0, self.config.classes, p, p)
-        across, within = overview.logits.shape[-1] // p, torch.arange(p, device=patch_index.device)
+        across = overview.logits.shape[-1] // p
+        within = torch.arange(p, device=patch_index.device)
         y = (patch_index // across * p)[..., None] + within  # (B, K, p)
         x = (patch_index % across * p)[..., None] + within
         scene = torch.arange(b, device=patch_index.device)[:, None, None, None]

@@ -84,8 +84,7 @@ class TemporalSizes:
 
     def multiply_adds(self, pixels: int) -> int:
         """Multiply-adds of reading so many fine pixels."""
-        entered = 2 * self.classes + OTHERS + self.coarse_width
-        fine = self.width * (entered + 9 + self.classes + GATES)
+        fine = self.width * (2 * self.classes + OTHERS + self.coarse_width + 9 + self.classes + GATES)
         coarse = self.width * (2 * self.columns + 1 + 9 + self.coarse_width + self.width + 9) + 9 * self.coarse_width
         return pixels * fine + pixels // CELL_PX**2 * coarse
 
@@ -113,15 +112,15 @@ def multiply_adds(
     """
     basis = bands * config.columns
     rows, columns = (-(-size // TOKEN_PX) for size in grid.padded_shape)
-    tokens, cell, p, deep = rows * columns, TOKEN_PX**2, config.patch, config.deep
-    inputs, pixels = config.columns + PLANES, math.prod(grid.padded_shape)
-    lowest = level_widths(config.overview_width, TOKEN_PX, deep)[-1] * BOTTOM**2
-    spectral, bottom = cell * config.columns * config.classes, 2 * lowest * config.dim  # to a token and back
-    overview = spectral + _pyramid(inputs, config.overview_width, TOKEN_PX, deep) + bottom
-    drawn = pixels * (basis + config.overview_width * config.classes)
-    patch = p * p * (apart * basis + config.width * config.classes) + _pyramid(
-        inputs + config.overview_width, config.width, p, deep=False
-    )
+    tokens = rows * columns
+    inputs = config.columns + PLANES
+    lowest = level_widths(config.overview_width, TOKEN_PX, config.deep)[-1] * BOTTOM**2
+    overview = TOKEN_PX**2 * config.columns * config.classes  # spectral classifier
+    overview += _pyramid(inputs, config.overview_width, TOKEN_PX, config.deep)
+    overview += 2 * lowest * config.dim  # to a token and back
+    drawn = math.prod(grid.padded_shape) * (basis + config.overview_width * config.classes)
+    patch = config.patch**2 * (apart * basis + config.width * config.classes)
+    patch += _pyramid(inputs + config.overview_width, config.width, config.patch, deep=False)
     dim = config.dim  # tokens read each other: L ((4 + 2 r) d^2 N + 2 N^2 d)
     read = config.layers * ((4 + 2 * config.mlp_ratio) * dim * dim * tokens + 2 * tokens * tokens * dim)
     return MultiplyAdds(tokens * overview + drawn + read, score, patches * patch)

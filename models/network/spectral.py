@@ -48,9 +48,9 @@ class SpectralBasis:
         Raises WavelengthError for a wavelength that is not finite, or outside 200-3000 nm (micrometres?).
         """
         wavelength = checked_wavelengths(wavelength_nm, len(wavelength_nm))
-        centres, span_nm = np.linspace(self.low_nm, self.high_nm, self.columns), self.high_nm - self.low_nm
+        span_nm = self.high_nm - self.low_nm
         apart_nm = span_nm / (self.columns - 1) if self.columns > 1 else max(span_nm, LONGEST_NM)  # one covers all
-        distance = (wavelength[:, None] - centres[None, :]) / apart_nm
+        distance = (wavelength[:, None] - np.linspace(self.low_nm, self.high_nm, self.columns)) / apart_nm
         bump = np.where(np.abs(distance) <= REACH, np.exp(-0.5 * (distance / 0.5) ** 2), 0.0)
         weight = bump * band_widths(wavelength)[:, None]
         total = weight.sum(axis=0)
@@ -91,16 +91,6 @@ def checked_wavelengths(wavelength_nm: NDArray[np.floating], bands: int) -> NDAr
             " give nanometres (multiply micrometres by 1000)"
         )
     return wavelength
-
-
-def check_basis(basis: SpectralBasis, columns: int) -> None:
-    """Raise WavelengthError unless a basis has this number of columns and a valid wavelength range."""
-    checked_wavelengths(np.array([basis.low_nm, basis.high_nm]), 2)
-    if basis.columns != columns or basis.low_nm > basis.high_nm:
-        raise WavelengthError(
-            f"a basis of {basis.columns} columns from {basis.low_nm:g} to {basis.high_nm:g} nm, expected {columns} of"
-            " them between ascending wavelengths"
-        )
 
 
 def band_widths(wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -155,7 +145,8 @@ class Normalisation:
         there = reached & np.isfinite(normal)
         if there.all():
             return np.asarray(normal @ self.whitening, np.float32)
-        known, alike = np.where(there, normal, np.float32(0)), (there == reached).all(axis=-1)
+        known = np.where(there, normal, np.float32(0))
+        alike = (there == reached).all(axis=-1)
         self._complete(known, alike, reached)
         partly = ~alike & there.any(axis=-1)  # a pixel without a column keeps the medians
         for pattern in np.unique(there[partly], axis=0):
@@ -167,7 +158,8 @@ class Normalisation:
         if reached.all() or not reached.any() or not pixels.any():
             return
         rows = known[pixels]
-        rest, whitening = ~reached, self.whitening.astype(np.float64)
+        rest = ~reached
+        whitening = self.whitening.astype(np.float64)
         inverse = whitening @ whitening  # of the covariance of a normal law
         weights = -np.linalg.solve(inverse[np.ix_(rest, rest)], inverse[np.ix_(rest, reached)]).T
         rows[:, rest] = rows[:, reached] @ np.asarray(weights, np.float32)  # conditional mean
@@ -231,11 +223,6 @@ class CaptureMap:
     def usual(self) -> LineSpec:
         """Return the most frequent capture."""
         return self.specs[int(np.bincount(self.number.ravel(), minlength=1).argmax())]
-
-    def padded(self, shape: tuple[int, int]) -> CaptureMap:
-        """Extend the map to a padded image by repeating its border."""
-        gap = [(0, whole - size) for whole, size in zip(shape, self.number.shape, strict=True)]
-        return CaptureMap(self.specs, np.pad(self.number, gap, mode="edge"))
 
     def of_patches(self, patch_index: NDArray[np.integer], patch: int) -> CaptureMap:
         """Return the captures of some patches of an image, (patch, p, p)."""

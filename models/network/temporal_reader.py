@@ -30,12 +30,12 @@ class TemporalReader(nn.Module):
     def __init__(self, sizes: TemporalSizes) -> None:
         super().__init__()
         self.sizes = sizes
-        width, classes = sizes.width, sizes.classes
+        width = sizes.width
         self.coarse_enter = Separable(2 * sizes.columns + 1, width)
         self.coarse_leave = Separable(width, sizes.coarse_width)
-        self.enter = Separable(2 * classes + OTHERS + sizes.coarse_width, width)
+        self.enter = Separable(2 * sizes.classes + OTHERS + sizes.coarse_width, width)
         self.middle = Separable(width, width)
-        self.leave = nn.Conv2d(width, classes + GATES, 1)
+        self.leave = nn.Conv2d(width, sizes.classes + GATES, 1)
         for start in self.leave.parameters():
             nn.init.zeros_(start)
         self.gates = nn.Parameter(torch.tensor(STARTS))
@@ -63,18 +63,16 @@ class TemporalReader(nn.Module):
         `models.reading.prior_map.season_of` returns it. ``coarse_before`` and ``coarse_now`` (B, column, y / s, x / s)
         are spectral features. ``comparable`` (B, 1, y / s, x / s) is 1 where both may be compared.
         """
-        size, change = prior_map.shape[-2:], (coarse_now - coarse_before) * comparable
+        change = (coarse_now - coarse_before) * comparable
         below = F.gelu(self.coarse_enter(torch.cat([coarse_now * comparable, change, comparable], dim=1)))
         below = F.gelu(self.coarse_leave(below))
-        below, today = F.interpolate(below, scale_factor=float(CELL_PX), mode="nearest"), observation * seen
+        below = F.interpolate(below, scale_factor=float(CELL_PX), mode="nearest")
+        today = observation * seen
         taken = torch.cat([torch.stack([light.log(), step.log2()], dim=1), season], dim=1)[:, :, None, None]
         scaled = [(part / 4).clamp(-FAINT / 4, 0) for part in (prior_map, today)]
         known = rests_on.clamp(min=LEAST_LIGHT).log() / 2
-        features = F.gelu(
-            self.enter(
-                torch.cat([*scaled, seen, torch.log1p(age) / 2, known, taken.expand(-1, -1, *size), below], dim=1)
-            )
-        )
+        inputs = [*scaled, seen, torch.log1p(age) / 2, known, taken.expand(-1, -1, *prior_map.shape[-2:]), below]
+        features = F.gelu(self.enter(torch.cat(inputs, dim=1)))
         wider = self.middle(F.avg_pool2d(features, CELL_PX))
         features = F.gelu(features + F.interpolate(wider, scale_factor=float(CELL_PX), mode="nearest"))
         added, gates = self.leave(features).split([self.sizes.classes, GATES], dim=1)

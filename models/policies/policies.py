@@ -47,17 +47,12 @@ def score_patches(
         scores = _patch_means(of(seen), seen)
     else:
         raise SettingsError(f"unknown policy {policy!r}; choose one of {', '.join(POLICIES)}")
-    return _on_scene(scores, seen.grid)
+    return (scores * seen.grid.valid_fraction()).ravel()
 
 
 def random_scores(grid: SceneGrid, seed: int) -> Scores:
     """Return random scores of every patch of the padded grid, (patches,), weighted by its fraction on the scene."""
-    return _on_scene(np.random.default_rng([seed, 0x5EA7]).random(grid.patch_shape), grid)
-
-
-def _on_scene(scores: Scores, grid: SceneGrid) -> Scores:
-    """Return (patch_y, patch_x) scores times the fraction of each patch on the scene, (patches,)."""
-    return (scores * grid.valid_fraction()).ravel()
+    return (np.random.default_rng([seed, 0x5EA7]).random(grid.patch_shape) * grid.valid_fraction()).ravel()
 
 
 def score_multiply_adds(policy: str, config: SegmenterConfig, grid: SceneGrid) -> int:
@@ -65,8 +60,8 @@ def score_multiply_adds(policy: str, config: SegmenterConfig, grid: SceneGrid) -
     score = PIXEL_SCORES.get(policy)
     if score is None:  # random or mask
         return 0
-    pixels = grid.padded_shape[0] * grid.padded_shape[1]
-    return (score.adds + score.per_class * config.classes + score.per_column * config.columns) * pixels
+    a_pixel = score.adds + score.per_class * config.classes + score.per_column * config.columns
+    return a_pixel * grid.padded_shape[0] * grid.padded_shape[1]
 
 
 def pixel_entropy(probability: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -81,8 +76,10 @@ def class_errors(seen: CoarsePrediction) -> NDArray[np.float64]:
     A pixel with class probabilities p has the expected errors p (1 - p). Both are means over the pixels of a patch.
     Pixels outside of the scene count as 0. The expected pixels of a class are those with data.
     """
-    grid, shown = seen.grid, seen.probability.copy()
-    shown[grid.height :], shown[:, grid.width :] = 0, 0
+    grid = seen.grid
+    shown = seen.probability.copy()
+    shown[grid.height :] = 0
+    shown[:, grid.width :] = 0
     known = shown if seen.filled is None else np.where(seen.filled[..., None], np.float32(0), shown)
     images = (shown * (1 - shown), known)
     return np.stack([patches_of(one, grid.patch).mean(axis=(1, 2), dtype=np.float64) for one in images], axis=1)

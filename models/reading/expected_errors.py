@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.grid import SceneGrid
 
-LEAST_EXPECTED_ERROR, STEPS = 1e-4, 24  # of a histogram of expected errors, even in their logarithm
+LEAST_EXPECTED_ERROR = 1e-4  # of a histogram of expected errors, even in their logarithm
+STEPS = 24  # of this histogram
 Floats = NDArray[np.float64]
 
 
@@ -50,14 +51,16 @@ class PatchExpectedErrors:
         Every strip but the last is a number of whole patches high. ``come_true`` is the ratio of true to expected
         errors of known pixels. Pixels of ``left_out`` (y, x) do not count.
         """
-        edges, kinds = np.geomspace(LEAST_EXPECTED_ERROR, 1.0, STEPS), classes + 1
-        rows, columns = grid.patch_shape
-        pixels, ages = np.zeros((rows, columns, kinds, STEPS), np.float32), np.full((rows, columns), -np.inf)
-        sums, top = np.zeros(kinds * STEPS), 0
+        edges = np.geomspace(LEAST_EXPECTED_ERROR, 1.0, STEPS)
+        kinds = classes + 1
+        pixels = np.zeros((*grid.patch_shape, kinds, STEPS), np.float32)
+        ages = np.full(grid.patch_shape, -np.inf)
+        sums = np.zeros(kinds * STEPS)
+        top = 0
         for probabilities, age in strips:
             first = top // grid.patch
             down, across = (np.arange(size) // grid.patch for size in (len(probabilities), grid.width))
-            patch_number = down[:, None] * columns + across  # of each pixel, from the first of the strip
+            patch_number = down[:, None] * grid.patch_shape[1] + across  # of each pixel, from the first of the strip
             here = slice(first, first + math.ceil(len(probabilities) / grid.patch))
             known = ~np.isnan(probabilities).all(axis=-1)
             captured = np.isfinite(age)  # and without probabilities of no class: another capture would gain nothing
@@ -69,8 +72,9 @@ class PatchExpectedErrors:
             sums += np.bincount(place[counts], wrong[counts], minlength=sums.size)
             place = place + patch_number * sums.size
             pixels[here] = np.bincount(place[counts], minlength=pixels[here].size).reshape(pixels[here].shape)
-            known_age = np.where(asked & captured, age, -np.inf)
-            np.maximum.at(ages[here].reshape(-1), patch_number.ravel(), known_age.ravel())
+            np.maximum.at(
+                ages[here].reshape(-1), patch_number.ravel(), np.where(asked & captured, age, -np.inf).ravel()
+            )
             top += len(probabilities)
         age_days = np.where(ages < 0, np.inf, ages).ravel()
         return PatchExpectedErrors(pixels.reshape(-1, kinds, STEPS), sums.reshape(kinds, STEPS), age_days)
@@ -97,7 +101,8 @@ class PatchExpectedErrors:
         are expected to have the classes of the others, in the same proportions.
         """
         count = self.pixels.sum(axis=(0, 2), dtype=np.float64)
-        every, there = max(count.sum(), 1.0), count[:-1] > 0
+        every = max(count.sum(), 1.0)
+        there = count[:-1] > 0
         known = count[:-1].sum() / every
         weight = np.divide(known, count, out=np.full_like(count, 1 / every), where=[*there, False])
         weight[:-1] /= max(int(there.sum()), 1)

@@ -57,9 +57,9 @@ class CoarsePass:
     @property
     def seen_columns(self) -> NDArray[np.float32]:
         """Return the columns with NaN in filled pixels."""
-        if self.filled is None:
-            return self.columns
-        return np.where(self.filled[..., None], np.float32(np.nan), self.columns)
+        return (
+            self.columns if self.filled is None else np.where(self.filled[..., None], np.float32(np.nan), self.columns)
+        )
 
     def patches(self, patch_index: NDArray[np.integer]) -> NDArray[np.float32]:
         """Return the columns of some patches, (patch, p, p, column)."""
@@ -105,8 +105,9 @@ def read_coarse_pass(
     ``components``. ``origin`` is the row and column of the grid's first patch in a larger field. A value beyond
     `Normalisation.most_value` counts as NaN.
     """
-    shape, filled = (grid.height, grid.width), 0
-    columns, known = np.empty((*shape, weights.config.columns), np.float32), np.zeros(shape, np.bool_)
+    columns = np.empty((grid.height, grid.width, weights.config.columns), np.float32)
+    known = np.zeros((grid.height, grid.width), np.bool_)
+    filled = 0
     for strip in strips:
         last = filled + len(strip)
         if components is None:
@@ -115,13 +116,16 @@ def read_coarse_pass(
             columns[filled:last] = weights.columns_of_scores(strip, components, wavelength_nm)
         known[filled:last] = ~np.isnan(strip).all(axis=-1)
         filled = last
+    if isinstance(capture, CaptureMap):
+        gap = [(0, whole - size) for whole, size in zip(grid.padded_shape, capture.number.shape, strict=True)]
+        capture = CaptureMap(capture.specs, np.pad(capture.number, gap, mode="edge"))
     wild = dead_pixels(columns) & known
     columns = np.ascontiguousarray(pad_by_reflection(columns, grid.padded_shape), np.float32)
     dead = dead_pixels(columns)
     return CoarsePass(
         grid,
         columns,
-        capture=capture.padded(grid.padded_shape) if isinstance(capture, CaptureMap) else capture,
+        capture=capture,
         origin=origin,
         living=_mend(columns, grid.patch),
         out_of_range=wild if wild.any() else None,

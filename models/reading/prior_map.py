@@ -99,7 +99,8 @@ def pooled(columns: Floats) -> Floats:
     whole = np.pad(columns, [(0, y), (0, x), (0, 0)], mode="edge") if y or x else columns
     parts = np.stack([whole[i::CELL_PX, j::CELL_PX] for i in range(CELL_PX) for j in range(CELL_PX)])
     known = np.isfinite(parts)
-    sums, count = np.where(known, parts, np.float32(0)).sum(axis=0), known.sum(axis=0, dtype=np.float32)
+    sums = np.where(known, parts, np.float32(0)).sum(axis=0)
+    count = known.sum(axis=0, dtype=np.float32)
     return np.where(count > 0, sums / np.maximum(count, 1), np.float32(np.nan))
 
 
@@ -117,7 +118,8 @@ def fuse(prior_map: PriorMap, observation: CurrentVisit, reader: TemporalReader 
     """
     today = observation.log_probability
     y = len(today)
-    kept, ages, light = np.empty_like(today), *np.empty((2, *observation.seen.shape), np.float32)
+    kept = np.empty_like(today)
+    ages, light = np.empty((2, *observation.seen.shape), np.float32)
     high = max(ROWS // CELL_PX, 1) * CELL_PX
     for top in range(0, y, high):  # limits the memory of intermediate arrays
         first, last, stop = max(top - HALO, 0), min(top + high + HALO, y), min(top + high, y)
@@ -135,8 +137,7 @@ CARRIED_AS_BY = (0.05, 2)  # light and line spacing for the reader without a vis
 def carried(prior_map: PriorMap, reader: TemporalReader | None) -> ClassProbabilities:
     """Return the class probabilities of today without a visit."""
     shape = prior_map.probabilities.log_probability.shape
-    columns = 1 if reader is None else reader.sizes.columns
-    coarse = (-(-shape[0] // CELL_PX), -(-shape[1] // CELL_PX), columns)
+    coarse = (-(-shape[0] // CELL_PX), -(-shape[1] // CELL_PX), 1 if reader is None else reader.sizes.columns)
     nothing, features = (np.full(size, np.nan, np.float32) for size in (shape, coarse))
     return fuse(prior_map, CurrentVisit(nothing, np.zeros(shape[:2], np.bool_), features, *CARRIED_AS_BY), reader)
 
@@ -149,7 +150,8 @@ def _fused(
     known, shown = _finite(before), _finite(today)
     seen = observation.seen[rows] & shown
     age = prior_map.probabilities.age_days[rows] + np.float32(prior_map.days)
-    days, flat = np.nan_to_num(age, nan=0.0), np.float32(-math.log(before.shape[-1]))
+    days = np.nan_to_num(age, nan=0.0)
+    flat = np.float32(-math.log(before.shape[-1]))
     old, new = (_normalised(np.where(where[..., None], one, flat)) for where, one in ((known, before), (seen, today)))
     left = np.float32(math.exp(-prior_map.days / LIGHT_FADES_DAYS))
     rests_on = np.where(known, prior_map.probabilities.light[rows] * left, 0).astype(np.float32)
@@ -157,7 +159,12 @@ def _fused(
         after = _more_confident(old, new, seen, days)
     else:
         images = old, np.where(seen[..., None], new, 0), seen, days, rests_on
-        after = _phased_in(old, _read(reader, prior_map, observation, images, rows), seen, days)
+        after = _read(reader, prior_map, observation, images, rows)
+        # The reader was trained on visits that are days apart: without a capture it is phased in over the first day.
+        fraction = np.where(seen, 1, np.minimum(days / np.float32(SETTLED_DAYS), 1))[..., None]
+        if not (fraction == 1).all():
+            mixed = np.log((1 - fraction) * np.exp(old) + fraction * np.exp(after)).astype(np.float32)
+            after = np.where(fraction == 1, after, mixed)
     after = np.where(known[..., None], after, today)  # the visit alone; NaN where that is unknown too
     kept = np.maximum(after, np.float32(FAINTEST)).astype(np.float32)
     own_light = np.where(seen, observation.light_of(rows), 0).astype(np.float32)
@@ -168,18 +175,6 @@ def as_captured(prior_map: PriorMap, after: ClassProbabilities) -> ClassProbabil
     """Return what is stored for the next visit: pixels that this one did not capture are as at their last capture."""
     before = prior_map.probabilities.log_probability
     return replace(after, log_probability=np.where(after.age_days[..., None] > 0, before, after.log_probability))
-
-
-def _phased_in(old: Floats, after: Floats, seen: NDArray[np.bool_], days: Floats) -> Floats:
-    """Return the reader's output (y, x, class), phased in over the first day in pixels without a capture.
-
-    The reader was trained on visits that are days apart.
-    """
-    fraction = np.where(seen, 1, np.minimum(days / np.float32(SETTLED_DAYS), 1))[..., None]
-    if (fraction == 1).all():
-        return after
-    mixed = np.log((1 - fraction) * np.exp(old) + fraction * np.exp(after)).astype(np.float32)
-    return np.where(fraction == 1, after, mixed)
 
 
 def _normalised(log_probability: Floats) -> Floats:
@@ -224,19 +219,17 @@ def _read(
     rows: slice,
 ) -> Floats:
     """Return the reader's log-probabilities of some rows; the first row begins a coarse pixel."""
-    s, (y, x) = CELL_PX, images[2].shape
-    down, across = -(-y // s), -(-x // s)
-    cells = slice(rows.start // s, rows.start // s + down)
+    y, x = images[2].shape
+    down, across = -(-y // CELL_PX), -(-x // CELL_PX)
+    cells = slice(rows.start // CELL_PX, rows.start // CELL_PX + down)
     now = observation.coarse[cells, :across]
     past = now if prior_map.coarse is None else prior_map.coarse[cells, :across]
-    both = _finite(past) & _finite(now)
-    if prior_map.coarse is None:
-        both[...] = False
+    both = _finite(past) & _finite(now) & (prior_map.coarse is not None)
     season = torch.tensor([season_of(prior_map.day_of_year)], dtype=torch.float32)
     taken = torch.tensor([observation.light]), torch.tensor([float(observation.step)]), season
 
     def fine(values: NDArray[np.generic]) -> Tensor:
-        fill = [(0, s * down - y), (0, s * across - x), *[(0, 0)] * (values.ndim - 2)]
+        fill = [(0, CELL_PX * down - y), (0, CELL_PX * across - x), *[(0, 0)] * (values.ndim - 2)]
         return _image(np.pad(values, fill, mode="edge"))
 
     with torch.inference_mode():
@@ -327,8 +320,8 @@ def compare(
 
 def changed_from(prior_map: PriorMap, after: ClassProbabilities) -> NDArray[np.uint8]:
     """Return the earlier class of captured pixels (y, x) whose prior map and map are confident of two; else 255."""
-    before, now = prior_map.probabilities.log_probability, after.log_probability
-    (old, old_sure), (new, new_sure) = map(likeliest, (before, now))
+    old, old_sure = likeliest(prior_map.probabilities.log_probability)
+    new, new_sure = likeliest(after.log_probability)
     sure = np.minimum(old_sure, new_sure) > math.log(CERTAIN)  # NaN is not
     return np.where(sure & (old != new) & (after.age_days == 0), old, UNLABELLED).astype(np.uint8)
 

@@ -85,15 +85,15 @@ class Region:
 
         The full network reads none of the halo: a patch depends on the overview and its own pixels alone.
         """
-        (top, left), kept = self.origin, self.kept_patches
+        top, left = self.origin
+        kept = self.kept_patches
         row, column = np.divmod(np.asarray(patch_index, np.int64), self.field.patch_shape[1])
         inside = (row >= kept.top) & (row < kept.bottom) & (column >= kept.left) & (column < kept.right)
         return np.where(inside, (row - top) * self.grid.patch_shape[1] + column - left, -1)
 
     def crop(self, image: NDArray[Scalar]) -> NDArray[Scalar]:
         """Crop a (y, x, ...) image of the box that is read to the box that is kept."""
-        rows, columns = self.kept_here
-        return image[rows, columns]
+        return image[self.kept_here]
 
     @property
     def kept_here(self) -> tuple[slice, slice]:
@@ -103,7 +103,8 @@ class Region:
 
     def crop_patches(self, values: NDArray[Scalar]) -> NDArray[Scalar]:
         """Crop values of all patches that are read, (patch, ...), to the kept ones, (y, x, ...)."""
-        (top, left), kept = self.origin, self.kept_patches
+        top, left = self.origin
+        kept = self.kept_patches
         image = values.reshape(*self.grid.patch_shape, *values.shape[1:])
         return image[kept.top - top : kept.bottom - top, kept.left - left : kept.right - left]
 
@@ -123,19 +124,19 @@ def plan_regions(
         _cuts(size, math.lcm(step, unit), most)
         for size, unit, most in zip((field.height, field.width), shard, most_px, strict=True)
     )
-    kept = [Box(top, left, bottom, right) for top, bottom in down for left, right in across]
     return [
         Region(
             field,
-            box,
-            Box(
-                max(box.top - margin, 0),
-                max(box.left - margin, 0),
-                min(box.bottom + margin, field.height),
-                min(box.right + margin, field.width),
+            kept=Box(top, left, bottom, right),
+            read=Box(
+                max(top - margin, 0),
+                max(left - margin, 0),
+                min(bottom + margin, field.height),
+                min(right + margin, field.width),
             ),
         )
-        for box in kept
+        for top, bottom in down
+        for left, right in across
     ]
 
 
@@ -154,17 +155,16 @@ def region_bytes(config: SegmenterConfig, region: Region, patch_index: int, band
     It counts the image and its features, those of some patches, all class probabilities, and rows of values from the
     stores.
     """
-    p, (y, x) = config.patch, region.grid.padded_shape
+    y, x = region.grid.padded_shape
     inputs = config.columns + PLANES
     overview, full = (
         FEATURE_COPIES * sum(channels / 4**level for level, channels in enumerate(level_widths(width, size, deep)))
-        for width, size, deep in ((config.overview_width, TOKEN_PX, config.deep), (config.width, p, False))
+        for width, size, deep in ((config.overview_width, TOKEN_PX, config.deep), (config.width, config.patch, False))
     )
     drawn = MAP_COPIES * config.classes
-    chunk = min(PATCHES_AT_ONCE, patch_index) * p**2 * (full + inputs + config.overview_width)
+    chunk = min(PATCHES_AT_ONCE, patch_index) * config.patch**2 * (full + inputs + config.overview_width)
     strip = STRIP_COPIES * bands * min(STRIP_ROWS, y) * x
-    most: int = 4 * round(y * x * (IMAGE_COPIES * inputs + overview + drawn) + chunk + strip)
-    return most
+    return int(4 * round(y * x * (IMAGE_COPIES * inputs + overview + drawn) + chunk + strip))
 
 
 def most_bytes(config: SegmenterConfig, regions: Sequence[Region], patch_index: NDArray[np.integer], bands: int) -> int:

@@ -48,9 +48,9 @@ class ColumnNoise:
         matrix: NDArray[np.floating], value_of_electron: NDArray[np.floating], read_noise_e: float
     ) -> ColumnNoise:
         """Return the noise of weights (band, column); an electron at the reference exposure has a value of (band,)."""
-        weight, value = matrix.astype(np.float64), value_of_electron.astype(np.float64)
-        shot, read = (weight**2).T @ value, (weight * (read_noise_e * value[:, None]) ** 2).T @ weight
-        return ColumnNoise(shot, read)
+        weight = matrix.astype(np.float64)
+        value = value_of_electron.astype(np.float64)
+        return ColumnNoise((weight**2).T @ value, (weight * (read_noise_e * value[:, None]) ** 2).T @ weight)
 
     def correlation(self) -> Matrix:
         """Return the correlation of the noise, (column, column): columns share bands."""
@@ -95,7 +95,8 @@ class SceneSpectra:
     @lru_cache(maxsize=2048)  # noqa: B019 - a training has some dozens of scenes, which stay
     def condensing(self, light: float) -> Condensing:
         """Return the components of a survey with this exposure, at most one for each column."""
-        sigma, most = np.sqrt(np.sum(self.noise(light), axis=0)), self.matrix.shape[1]
+        sigma = np.sqrt(np.sum(self.noise(light), axis=0))
+        most = self.matrix.shape[1]
         power, axes = np.linalg.eigh(self.covariance / np.outer(sigma, sigma))
         power, axes = power[::-1][:most], axes[:, ::-1][:, :most]
         back, mean = Components(self.centre, axes.T, sigma).onto(self.matrix)
@@ -103,18 +104,6 @@ class SceneSpectra:
         seen = matrix.T @ self.covariance @ matrix + (matrix.T * np.sum(self.noise(1.0), axis=0)) @ matrix
         spectra = np.linalg.solve(seen, matrix.T @ self.covariance)  # (column, band) expected from columns
         return Condensing(((spectra / sigma) @ axes).astype(np.float32), back, mean, power)
-
-    def added(self, light: float, unit: float, samples: int) -> tuple[float, float]:
-        """Return the shot and read noise that an exposure adds to means of ``samples`` pixels of the reference.
-
-        They are means over the bands, in variances of the noise of the exposure ``unit``.
-        """
-        whole = np.sum(self.noise(unit), axis=0)
-        more = [
-            np.mean((own - before / samples) / whole)
-            for own, before in zip(self.noise(light), self.noise(1.0), strict=True)
-        ]
-        return float(more[0]), float(more[1])
 
 
 class CaptureAugmentation:
@@ -125,7 +114,8 @@ class CaptureAugmentation:
     """
 
     def __init__(self, normalisation: Normalisation, *, darkest_ms: float = 3.0) -> None:
-        self.normalisation, self.darkest_ms = normalisation, darkest_ms
+        self.normalisation = normalisation
+        self.darkest_ms = darkest_ms
         self.unwhiten = np.linalg.inv(normalisation.whitening.astype(np.float64)).astype(np.float32)
 
     def draw(self, columns: Tensor, noise: ColumnNoise, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
@@ -189,15 +179,18 @@ class CaptureAugmentation:
 
         Lines of the first pass stay among the closer lines of an area, each with its own exposure.
         """
-        scaled, size = columns @ beside(columns, self.unwhiten), len(columns)
-        light, first = self._light(rng), int(rng.integers(step))
+        scaled = columns @ beside(columns, self.unwhiten)
+        size = len(columns)
+        light = self._light(rng)
+        first = int(rng.integers(step))
         lines = self._captured(scaled[first::step], noise, light, rng, unit=light, least_power=least_power)
         image = self._input(rows_between(lines, size, first=first, apart=step), LineSpec(light, step).planes)
         for _ in range(rng.choice(len(AREAS), p=AREAS)):
             rows = slice(*np.sort(rng.integers(0, size + 1, 2)).tolist())
             samples = slice(*np.sort(rng.integers(0, columns.shape[1] + 1, 2)).tolist())
             samples = slice(None) if rng.random() < ACROSS else samples
-            closer, later = step // int(rng.choice([own for own in (2, 4, 8) if own <= step])), self._light(rng)
+            closer = step // int(rng.choice([own for own in (2, 4, 8) if own <= step]))
+            later = self._light(rng)
             start = first % closer
             area = scaled[start::closer, samples]
             taken = self._captured(area, noise, later, rng, unit=light, least_power=least_power)
@@ -226,33 +219,30 @@ class CaptureAugmentation:
     ) -> Tensor:
         """Add the noise of an exposure ``light``, and condense by the components of an exposure ``unit``.
 
-        Components of less than ``least_power`` are left out. With 0, or without spectra, nothing is condensed.
+        ``scaled`` are means of ``samples`` pixels of the reference exposure. Components of less than ``least_power``
+        are left out. With 0, or without spectra, nothing is condensed.
         """
+        centre, spread = (beside(scaled, one) for one in (self.normalisation.centre, self.normalisation.spread))
+        values = scaled * spread + centre
         if noise.spectra is None or least_power == 0:
-            return self._noisy(scaled, noise, light, rng, samples=samples)
+            of_light = beside(scaled, noise.shot * (1 / light - 1 / samples))
+            of_reading = beside(scaled, np.diag(noise.read) * (1 / light**2 - 1 / samples))
+            added = (values.clamp(min=0) * of_light + of_reading).clamp(min=0).sqrt() / spread
+            mixing = np.linalg.cholesky(noise.correlation() + TINY * np.eye(len(noise.shot))).T
+            return scaled + added * (normal(scaled, rng) @ beside(scaled, mixing))
         unit = float(2 ** (np.round(4 * np.log2(unit)) / 4))  # a quarter of an octave
         law = noise.spectra.condensing(unit)
         kept = max(np.count_nonzero(law.power > least_power), LEAST_COMPONENTS)
-        centre, spread = (beside(scaled, one) for one in (self.normalisation.centre, self.normalisation.spread))
-        values, mean = scaled * spread + centre, beside(scaled, law.mean)
-        shot, read = noise.spectra.added(light, unit, samples)
+        mean = beside(scaled, law.mean)
+        whole = np.sum(noise.spectra.noise(unit), axis=0)
+        variances = zip(noise.spectra.noise(light), noise.spectra.noise(1.0), strict=True)
+        # added noise, as means over the bands, in variances of the exposure ``unit``
+        shot, read = (float(np.mean((own - before / samples) / whole)) for own, before in variances)
         brightness = values.mean(dim=-1, keepdim=True) / max(float(law.mean.mean()), TINY)
         size = ((read + shot * brightness.clamp(min=0)).clamp(min=0) + ROUNDED).sqrt()
         scores = (values - mean) @ beside(scaled, law.of_columns[:, :kept])
         scores += size * normal(scores, rng)
         return (scores @ beside(scaled, law.back[:kept]) + mean - centre) / spread
-
-    def _noisy(
-        self, scaled: Tensor, noise: ColumnNoise, light: float, rng: np.random.Generator, *, samples: int = 1
-    ) -> Tensor:
-        """Add the noise of an exposure ``light`` to means of ``samples`` pixels of the reference exposure."""
-        spread = beside(scaled, self.normalisation.spread)
-        values = scaled * spread + beside(scaled, self.normalisation.centre)
-        shot = beside(scaled, noise.shot * (1 / light - 1 / samples))
-        read = beside(scaled, np.diag(noise.read) * (1 / light**2 - 1 / samples))
-        size = (values.clamp(min=0) * shot + read).clamp(min=0).sqrt() / spread
-        mixing = np.linalg.cholesky(noise.correlation() + TINY * np.eye(len(noise.shot))).T
-        return scaled + size * (normal(scaled, rng) @ beside(scaled, mixing))
 
 
 def beside(image: Tensor, numbers: NDArray[np.floating]) -> Tensor:

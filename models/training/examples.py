@@ -29,8 +29,10 @@ from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 
 NOISY = 0.25  # fraction of crops with added noise
 BRIGHTNESS = 0.04  # standard deviation of the factor of a crop's light
-ZOOMED, ZOOMS = 0.7, (-0.6, 0.5)  # fraction of crops that are zoomed, if any; octaves of their pixels
-HALO, STRIP_ROWS = 8, 64  # rows around a strip that its footprint reaches; most rows of a strip
+ZOOMED = 0.7  # fraction of crops that are zoomed, if any
+ZOOMS = (-0.6, 0.5)  # octaves of their pixels
+HALO = 8  # rows around a strip that its footprint reaches
+STRIP_ROWS = 64  # most rows of a strip
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,8 @@ def observe(
     labels = np.full(grid.padded_shape, UNLABELLED, np.uint8)
     labels[: grid.height, : grid.width] = scene.labels
     rows, width = grid.padded_shape
-    strip, columns = math.gcd(rows, STRIP_ROWS), np.empty((rows, width, basis.columns), np.float32)
+    strip = math.gcd(rows, STRIP_ROWS)
+    columns = np.empty((rows, width, basis.columns), np.float32)
     exposure = camera.exposure_ms / DEFAULT_EXPOSURE_MS
     scale = (scene.white_reference / (scene.white_reference_electrons * exposure)).astype(np.float32)
     for top, stream in zip(range(0, rows, strip), rng.spawn(rows // strip), strict=True):
@@ -68,12 +71,8 @@ def observe(
         blurred = footprint(planes[first:last], camera)[top - first : top - first + strip]
         electrons = electrons_of(scene, blurred, camera)
         columns[top : top + strip] = (expose(electrons, camera, step=1, rng=stream) * scale) @ matrix
-    return Example(scene.name, columns, labels, (grid.height, grid.width), noise_of(scene, matrix, camera))
-
-
-def noise_of(scene: RasterScene, matrix: NDArray[np.float32], camera: LineCamera) -> ColumnNoise:
-    """Return the shot and read noise of a camera in the columns of a scene."""
-    return ColumnNoise.of_bands(matrix, value_of_electron(scene), camera.read_noise_e)
+    noise = ColumnNoise.of_bands(matrix, value_of_electron(scene), camera.read_noise_e)
+    return Example(scene.name, columns, labels, (grid.height, grid.width), noise)
 
 
 def value_of_electron(scene: RasterScene) -> NDArray[np.float64]:
@@ -83,10 +82,9 @@ def value_of_electron(scene: RasterScene) -> NDArray[np.float64]:
 
 def electrons_of(scene: RasterScene, planes: NDArray[np.float32], camera: LineCamera) -> NDArray[np.float32]:
     """Return expected electrons of component planes, (y, x, component) -> (y, x, band)."""
-    exposure = np.float32(camera.exposure_ms / DEFAULT_EXPOSURE_MS)
-    if scene.electrons.ndim == 1:  # a plane for each band
-        return np.asarray(planes * scene.electrons * exposure, np.float32)
-    return np.asarray(planes @ scene.electrons * exposure, np.float32)
+    own_planes = scene.electrons.ndim == 1  # a plane for each band
+    electrons = planes * scene.electrons if own_planes else planes @ scene.electrons
+    return np.asarray(electrons * np.float32(camera.exposure_ms / DEFAULT_EXPOSURE_MS), np.float32)
 
 
 def measured_normalisation(observations: list[Example], exposure_ms: float = REFERENCE_MS) -> Normalisation:
@@ -115,30 +113,24 @@ class Batch:
     origin: Tensor  # (B, 2) random offsets of the places [tokens]
 
 
+@dataclass(eq=False)
 class CropSampler:
     """Draw random crops: place, scale, flips, transposition, brightness and noise."""
 
-    def __init__(
-        self,
-        examples: list[Example],
-        patch: int,
-        crop: int,
-        noise: float = 0.0,
-        zoomed: bool = False,
-        augmentation: CaptureAugmentation | None = None,
-        device: str = PROCESSOR,
-    ) -> None:
-        """Set up the crops. ``noise`` [spreads of the columns] is the largest added without an ``augmentation``.
+    examples: list[Example]
+    patch: int
+    crop: int
+    noise: float = 0.0  # largest that is added without an augmentation [spreads of the columns]
+    zoomed: bool = False  # most crops are enlarged or reduced
+    augmentation: CaptureAugmentation | None = None
+    device: str = PROCESSOR  # where the scenes stay and crops are made
 
-        With ``zoomed`` most crops are enlarged or reduced. The scenes stay on the ``device``, where crops are made.
-        """
-        self.smallest: int = min(min(example.labels.shape) for example in examples)
-        self.examples, self.patch, self.crop, self.noise, self.zoomed = examples, patch, crop, noise, zoomed
-        self.augmentation, self.device = augmentation, device
-        self.columns = [torch.from_numpy(example.columns).to(device) for example in examples]
-        areas = np.array([np.count_nonzero(example.labels != UNLABELLED) for example in examples], np.float64)
+    def __post_init__(self) -> None:
+        self.smallest: int = min(min(example.labels.shape) for example in self.examples)
+        self.columns = [torch.from_numpy(example.columns).to(self.device) for example in self.examples]
+        areas = np.array([np.count_nonzero(example.labels != UNLABELLED) for example in self.examples], np.float64)
         if not areas.any():
-            raise SceneError(f"none of {len(examples)} scenes has a labelled pixel; training needs some")
+            raise SceneError(f"none of {len(self.examples)} scenes has a labelled pixel; training needs some")
         self.fraction = areas / areas.sum()
 
     def size(self, larger: int = 1) -> int:
@@ -184,5 +176,4 @@ class CropSampler:
             if rng.random() < NOISY:
                 columns += normal(columns, rng) * rng.uniform(0, self.noise)
             image = detail = with_capture(columns, LineSpec().planes)
-        turned = turn(torch.from_numpy(labels).to(self.device))
-        return image.permute(2, 0, 1), detail.permute(2, 0, 1), turned
+        return image.permute(2, 0, 1), detail.permute(2, 0, 1), turn(torch.from_numpy(labels).to(self.device))

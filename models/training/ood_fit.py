@@ -24,7 +24,6 @@ GAIN = 0.04  # standard deviation of the brightness of crops in training
 USUAL = 0.98  # fraction of a component's spectra within its unit distance
 LEAST_SPECTRA = 200  # least number to fit to
 RIDGE = 1e-6  # of the mean variance: makes the covariance of equal columns invertible
-Report = Callable[[float], None]
 Spectra = NDArray[np.float32]  # (pixel, column)
 Classes = NDArray[np.uint8]  # (pixel,)
 
@@ -37,7 +36,7 @@ def fit_ood(
     darkest_ms: float,
     bands: int,
     seed: int,
-    report: Report = lambda done: None,
+    report: Callable[[float], None] = lambda done: None,
 ) -> OodDetector:
     """Fit components to training scenes, and limits to validation scenes, at the exposures of the training.
 
@@ -48,7 +47,8 @@ def fit_ood(
             "no scene was kept for validation, which the false-alarm rate needs; train with --validation 1 or more"
         )
     rng = np.random.default_rng([seed, 0xFA3])
-    augmentation, gathered = CaptureAugmentation(normalisation, darkest_ms=darkest_ms), []
+    augmentation = CaptureAugmentation(normalisation, darkest_ms=darkest_ms)
+    gathered = []
     for number, example in enumerate(train):
         gathered += _drawn_spectra(example, normalisation, rng, SPECTRA // len(train) + 1)
         report(0.3 * (number + 1) / len(train))
@@ -97,7 +97,8 @@ def components(pixels: Spectra, classes: Classes, seed: int) -> tuple[Exact, Exa
     """
     if len(pixels) < LEAST_SPECTRA:
         raise SceneError(f"{len(pixels)} labelled pixels are too few to fit a detector; it takes {LEAST_SPECTRA}")
-    exact, columns = pixels.astype(np.float64), pixels.shape[1]
+    exact = pixels.astype(np.float64)
+    columns = pixels.shape[1]
     middles = []
     for number in np.unique(classes):
         own = exact[classes == number]
@@ -125,7 +126,7 @@ def measured_limits(
     examples: Sequence[Example],
     augmentation: CaptureAugmentation,
     rng: np.random.Generator,
-    report: Report = lambda done: None,
+    report: Callable[[float], None] = lambda done: None,
 ) -> Limits:
     """Return quantiles of the distances of labelled pixels, for each line spacing and exposure."""
     noisy = all(example.noise is not None for example in examples)

@@ -107,7 +107,9 @@ def train_reader(
     weight = class_weights([visit.labels for land in lands for visit in land], sizes.classes, settings.weight_cap)
     rng = np.random.default_rng([settings.seed, 0x3E3])
     optimiser = torch.optim.AdamW(reader.parameters(), settings.learning_rate, weight_decay=settings.weight_decay)
-    started, step, loss = time.monotonic(), 0, math.nan
+    step = 0
+    loss = math.nan
+    started = time.monotonic()
     while (done := max(step / settings.steps, (time.monotonic() - started) / (60 * settings.minutes))) < 1:
         rate = min(1, (step + 1) / WARM_UP) * (1 + math.cos(math.pi * done)) / 2
         for group in optimiser.param_groups:
@@ -128,14 +130,16 @@ def train_reader(
 
 def _learn(reader: TemporalReader, visits: Sequence[_Batch], weight: Tensor, rng: np.random.Generator) -> float:
     """Carry prior maps through visits, learn from the labels of each but the first, and return the mean loss."""
-    start, factor = visits[0], CELL_PX
+    start = visits[0]
     state, coarse = start.observation, start.coarse
     age = torch.zeros_like(start.seen)
-    rests_on, total = age + _light_a_pixel(start), 0.0
+    rests_on = age + (start.light / start.step**2)[:, None, None, None]
+    total = 0.0
     for now in visits[1:]:
-        age, rests_on = age + now.days, rests_on * torch.exp(-now.days / LIGHT_FADES_DAYS)
-        small = now.seen[:, :, factor // 2 :: factor, factor // 2 :: factor]
-        before_map, coarse_before = _wrong(state, coarse, factor, rng)
+        age = age + now.days
+        rests_on = rests_on * torch.exp(-now.days / LIGHT_FADES_DAYS)
+        small = now.seen[:, :, CELL_PX // 2 :: CELL_PX, CELL_PX // 2 :: CELL_PX]
+        before_map, coarse_before = _wrong(state, coarse, rng)
         images = before_map, now.observation, now.seen, age, rests_on
         found = reader(*images, now.light, now.step, now.season, coarse_before, now.coarse, small * now.comparable)
         losses = F.nll_loss(found, now.labels.where(now.labels != UNLABELLED, 0), reduction="none")
@@ -143,17 +147,14 @@ def _learn(reader: TemporalReader, visits: Sequence[_Batch], weight: Tensor, rng
         torch.autograd.backward(loss)
         total += float(loss.detach()) / (len(visits) - 1)
         state = found.detach().clamp(min=FAINTEST)
-        state, age = state - state.logsumexp(dim=1, keepdim=True), age.where(now.seen == 0, 0)
-        rests_on = rests_on + now.seen * _light_a_pixel(now)
+        state = state - state.logsumexp(dim=1, keepdim=True)
+        age = age.where(now.seen == 0, 0)
+        rests_on = rests_on + now.seen * (now.light / now.step**2)[:, None, None, None]
         coarse = now.coarse.where(small > 0, coarse)
     return total
 
 
-def _light_a_pixel(visit: _Batch) -> Tensor:
-    return (visit.light / visit.step**2)[:, None, None, None]
-
-
-def _wrong(state: Tensor, coarse: Tensor, factor: int, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+def _wrong(state: Tensor, coarse: Tensor, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
     """Replace some prior maps by those of another land, or shift them, in a fraction of the batches."""
     drawn = rng.random()
     if drawn >= OTHER_LAND + BESIDE:
@@ -163,7 +164,7 @@ def _wrong(state: Tensor, coarse: Tensor, factor: int, rng: np.random.Generator)
         by = int(rng.integers(1, max(len(state), 2)))
         return state.roll(by, 0).where(those, state), coarse.roll(by, 0).where(those, coarse)
     down, across = (int(by) for by in rng.integers(-BESIDE_CELLS, BESIDE_CELLS + 1, 2))
-    moved = state.roll((factor * down, factor * across), (2, 3))
+    moved = state.roll((CELL_PX * down, CELL_PX * across), (2, 3))
     return moved.where(those, state), coarse.roll((down, across), (2, 3)).where(those, coarse)
 
 
@@ -183,15 +184,16 @@ def _sequences(lands: Sequence[Sequence[Visit]], settings: TemporalTraining, rng
 
 def _sequence(land: Sequence[Visit], settings: TemporalTraining, rng: np.random.Generator) -> list[tuple[Any, ...]]:
     """Return one crop through visits of a land; the last visit is repeated if there are too few."""
-    side, shape = settings.crop, land[0].labels.shape
+    side = settings.crop
     first = int(rng.integers(0, max(len(land) - settings.visits, 0) + 1))
-    factor, visits = CELL_PX, [land[min(first + number, len(land) - 1)] for number in range(settings.visits)]
-    y, x = (factor * int(rng.integers(0, (size - side) // factor + 1)) for size in shape)
+    visits = [land[min(first + number, len(land) - 1)] for number in range(settings.visits)]
+    y, x = (CELL_PX * int(rng.integers(0, (size - side) // CELL_PX + 1)) for size in land[0].labels.shape)
     fine = np.s_[y : y + side, x : x + side]
-    small = np.s_[y // factor : (y + side) // factor, x // factor : (x + side) // factor]
+    small = np.s_[y // CELL_PX : (y + side) // CELL_PX, x // CELL_PX : (x + side) // CELL_PX]
     turns, mirrored = int(rng.integers(4)), bool(rng.integers(2))
     sequence: list[tuple[Any, ...]] = []
-    before, dated = visits[0].moment, rng.random() >= UNDATED
+    before = visits[0].moment
+    dated = rng.random() >= UNDATED
     for number, visit in enumerate(visits):
         coarse_pass = visit.scan_passes[int(rng.integers(len(visit.scan_passes)))]
         if number == 0 and rng.random() < 0.5:  # prior maps are often of the best scan
@@ -200,7 +202,7 @@ def _sequence(land: Sequence[Visit], settings: TemporalTraining, rng: np.random.
             np.log(np.maximum(coarse_pass.probability[fine].astype(np.float32), FAINT)),
             coarse_pass.coarse[small].astype(np.float32),
             visit.labels[fine],
-            _seen(side, number > 0 and rng.random() < PARTLY_SEEN, factor, rng),
+            _seen(side, number > 0 and rng.random() < PARTLY_SEEN, rng),
         )
         turned = [np.rot90(image[::-1] if mirrored else image, turns) for image in images]
         channels_first = [image.transpose(2, 0, 1) if image.ndim == 3 else image for image in turned]
@@ -211,14 +213,15 @@ def _sequence(land: Sequence[Visit], settings: TemporalTraining, rng: np.random.
     return sequence
 
 
-def _seen(side: int, partly: bool, factor: int, rng: np.random.Generator) -> NDArray[np.float32]:
+def _seen(side: int, partly: bool, rng: np.random.Generator) -> NDArray[np.float32]:
     """Draw the captured part of a visit, (y, x, 1): everything, a block of rows, or all other rows."""
     seen = np.ones((side, side, 1), np.float32)
     if partly:
-        cell = 4 * factor
+        cell = 4 * CELL_PX
         low, high = sorted(cell * int(at) for at in rng.integers(0, side // cell + 1, 2))
         if rng.random() < 0.5:
-            seen[:low], seen[high:] = 0, 0
+            seen[:low] = 0
+            seen[high:] = 0
         else:
             seen[low:high] = 0
     return seen

@@ -93,7 +93,8 @@ class Trainer:
         augmentation: CaptureAugmentation | None = None,
         device: str = PROCESSOR,
     ) -> None:
-        self.settings, self.gain_shift = settings, gain_shift
+        self.settings = settings
+        self.gain_shift = gain_shift
         self.rng = np.random.default_rng([settings.seed, 0x7EA])
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(settings.seed)
@@ -132,11 +133,11 @@ class Trainer:
         phase = phase_at(done)
         fewer = phase.larger if self.sampler.size(phase.larger) > self.sampler.size() else 1  # in large scenes
         batch = self.sampler.draw(max(1, self.settings.batch // fewer), self.rng, self.gain_shift, larger=phase.larger)
+        course.step += 1
         if not (batch.labels != UNLABELLED).any():  # decay and momentum alone would move the weights
-            course.step, course.unlabelled = course.step + 1, course.unlabelled + 1
+            course.unlabelled += 1
             return
         loss = batch_loss(self.model, batch, self.weight, self.rng, phase, soft_dice=done > 0.3)
-        course.step += 1
         course.in_a_row = 0 if _step(self.model, self.optimiser, loss) else course.in_a_row + 1
         course.skipped += course.in_a_row > 0
         if course.in_a_row == 3:
@@ -181,7 +182,8 @@ class Trainer:
         self.averaged.load_state_dict(parts["averaged"])
         self.optimiser.load_state_dict({"state": state, "param_groups": self.optimiser.state_dict()["param_groups"]})
         self.rng.bit_generator.state = about["rng"]
-        self.course, self._started, self._worked = Course(**about["course"]), time.monotonic(), time.process_time()
+        self.course = Course(**about["course"])
+        self._started, self._worked = time.monotonic(), time.process_time()
         return True
 
     def summary(self) -> dict[str, float | int]:

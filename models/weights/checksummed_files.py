@@ -31,8 +31,7 @@ def write_checksummed(path: Path, about: Mapping[str, Any], tensors: Mapping[str
     Raises WeightsError for an error of the disk.
     """
     whole = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    plain = {name: value for name, value in about.items() if name not in (TENSORS, SEAL)}
-    hashed = {**plain, TENSORS: {name: hash_of(tensor) for name, tensor in whole.items()}}
+    hashed = {**about, TENSORS: {name: hash_of(tensor) for name, tensor in whole.items()}}
     text = json.dumps({**hashed, SEAL: _seal(hashed)}, sort_keys=True)
     temporary = path.with_name(path.name + ".part")
     try:

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from models.evaluation.expected_scores import MapScores
 from models.network.sizes import SegmenterConfig, TemporalSizes
-from models.network.spectral import Normalisation, SpectralBasis, check_basis, project
+from models.network.spectral import Normalisation, SpectralBasis, checked_wavelengths, project
 from models.reading.ood import Limits, OodDetector
 from models.weights.checksummed_files import key_of, read_about, read_tensors, refusing, write_checksummed
-from pipeline.errors import WeightsError
+from pipeline.errors import WavelengthError, WeightsError
 from pipeline.lazy import Tensor, deferred, torch
 from pipeline.readings import readings_alone
 from pipeline.signal.components import Components
@@ -27,7 +27,6 @@ from pipeline.signal.components import Components
 if TYPE_CHECKING:
     from models.network import segmenter, temporal_reader
     from models.network.segmenter import Segmenter
-    from models.network.temporal_reader import TemporalReader
 else:
     temporal_reader = deferred("models.network.temporal_reader")
     segmenter = deferred("models.network.segmenter")
@@ -208,14 +207,15 @@ def add_ood(weights: Path, ood_detector: OodDetector, trained_on: TrainedOn, rec
 
     Raises WeightsError: the file cannot be read or written.
     """
-    limits, arrays = ood_detector.limits, {name: getattr(ood_detector, name) for name in OF_COMPONENTS}
+    limits = ood_detector.limits
+    arrays = {name: getattr(ood_detector, name) for name in OF_COMPONENTS}
     arrays |= {name: getattr(limits, name) for name in OF_LIMITS}
     tensors = {name: torch.from_numpy(np.ascontiguousarray(one, np.float32)) for name, one in arrays.items()}
     about = {"bands": ood_detector.bands, "steps": list(limits.steps), "trained_on": trained_on.as_dict()}
     _add_part(weights, weights, OOD, {**about, "record": dict(record)}, tensors)
 
 
-def add_reader(weights: Path, out: Path, reader: TemporalReader, record: Mapping[str, Any]) -> None:
+def add_reader(weights: Path, out: Path, reader: temporal_reader.TemporalReader, record: Mapping[str, Any]) -> None:
     """Write the weights of a file with a temporal reader to ``out``. Raises as `add_ood`."""
     _add_part(weights, out, READER, {"sizes": asdict(reader.sizes), "record": dict(record)}, dict(reader.state_dict()))
 
@@ -245,7 +245,7 @@ def load_ood(weights: Path) -> OodDetector:
     return found
 
 
-def load_reader(weights: Path) -> TemporalReader:
+def load_reader(weights: Path) -> temporal_reader.TemporalReader:
     """Load the temporal reader of weights. WeightsError: their file has none, or it is damaged."""
     described = describe_weights(weights)
     if described.reader is None:
@@ -279,15 +279,14 @@ def load_weights(path: Path) -> Weights:
     config = described.config
     with torch.device("meta"):
         network = segmenter.Segmenter(config)
-    parts = (f"{OOD}.", f"{READER}.")
-    tensors = read_tensors(path, described.about, lambda name: not name.startswith(parts))
+    tensors = read_tensors(path, described.about, lambda name: not name.startswith((f"{OOD}.", f"{READER}.")))
     with refusing(path):
         _check_numbers(tensors)
         normalisation = Normalisation(*(tensors.pop(f"normalisation.{name}").numpy() for name in NORMALISATION))
         colours = tensors.pop(COLOURS).numpy()
         network.load_state_dict(tensors, assign=True)
-        own, of_columns = normalisation, (config.columns,)
-        shapes = [one.shape for one in (own.centre, own.spread, own.whitening, colours)]
+        of_columns = (config.columns,)
+        shapes = [*(getattr(normalisation, name).shape for name in NORMALISATION), colours.shape]
         if shapes != [of_columns, of_columns, of_columns * 2, (config.classes, 3)]:
             raise ValueError(f"normalisation and colours {shapes} do not fit {config.columns} columns")
         if not (normalisation.spread > 0).all():
@@ -305,9 +304,16 @@ def describe_weights(path: Path) -> Description:
         raise WeightsError(f"{what}; train some with: spectralzoom train DATASET -o FILE.safetensors")
     about = read_about(path, FORMAT)
     with refusing(path):
-        config, basis = SegmenterConfig(**about["config"]), SpectralBasis(**about["basis"])
-        names, record = tuple(map(str, about["class_names"])), dict(about["record"])
-        check_basis(basis, config.columns)
+        config = SegmenterConfig(**about["config"])
+        basis = SpectralBasis(**about["basis"])
+        names = tuple(map(str, about["class_names"]))
+        record = dict(about["record"])
+        checked_wavelengths(np.array([basis.low_nm, basis.high_nm]), 2)
+        if basis.columns != config.columns or basis.low_nm > basis.high_nm:
+            raise WavelengthError(
+                f"a basis of {basis.columns} columns from {basis.low_nm:g} to {basis.high_nm:g} nm, expected "
+                f"{config.columns} of them between ascending wavelengths"
+            )
         keys = about["keys"]
         ood_detector = OodPart.read(keys[OOD], about[OOD]) if OOD in about else None
         reader = ReaderPart.read(keys[READER], about[READER], config) if READER in about else None

@@ -133,8 +133,8 @@ def farm_all(side: int = SIDE, seeds: Sequence[int] = FARM_SEEDS) -> DataSet:
 def folder(path: Path, held_out: Sequence[str], steps: int, patch: int, say: Say, given: Path | None) -> DataSet:
     """Return the held-out frames of a folder, by default every third, and weights of the other frames."""
     files = load_data_set(path)
-    held_out = held_out or files.names[1::3]
-    scenes = {name: partial(lambda name: scene_of_file(files.load(name), CAMERA), name) for name in files.names}
+    held_out = held_out or tuple(files.files)[1::3]
+    scenes = {name: partial(lambda name: scene_of_file(files.load(name), CAMERA), name) for name in files.files}
     taught = {name: make for name, make in scenes.items() if name not in held_out}
     weights = load_weights(given) if given else trained(f"{path.resolve()}", taught, patch, steps, say)
     split = weights.record.get("split", {})

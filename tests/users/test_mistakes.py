@@ -207,5 +207,5 @@ FOLDERS = {  # names of scenes and of their label files
 def test_images_find_their_labels_by_name(folder: str, files: Path) -> None:
     """Suffixes such as _mask and case do not matter; hidden files and labels without an image are ignored."""
     data = load_data_set(files / folder)
-    found, root = {name: data.label_files.get(name) for name in data.names}, files / folder
+    found, root = {name: data.label_files.get(name) for name in data.files}, files / folder
     assert {name: path and path.relative_to(root).as_posix() for name, path in found.items()} == FOLDERS[folder]

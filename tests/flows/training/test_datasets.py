@@ -30,7 +30,7 @@ def _folder(root: Path) -> Path:
 def test_scenes_are_named_by_number(tmp_path: Path) -> None:
     """Each image is a scene with its own labels; held-out scenes are listed by name."""
     data = load_data_set(_folder(tmp_path), hold_out=["010"])
-    assert data.names == ("003", "010", "021")
+    assert tuple(data.files) == ("003", "010", "021")
     assert data.held_out == ("010",)
     scene = data.load("010")
     assert scene.labels is not None
@@ -57,7 +57,7 @@ def test_a_mask_splits_the_labels(tmp_path: Path) -> None:
     train, test = data.load("a", "train"), data.load("a", "test")
     assert train.labels.tolist() == [[255, 255, 1], [255, 255, 0]]
     assert test.labels.tolist() == [[255, 0, 255], [1, 0, 255]]
-    assert load_data_set(tmp_path, train_mask=tmp_path / "mask.mat").names == ("a",)
+    assert tuple(load_data_set(tmp_path, train_mask=tmp_path / "mask.mat").files) == ("a",)
     np.save(tmp_path / "binary.npy", np.array([[255, 0, 255], [0, 255, 255]], np.uint8))
     data = load_data_set(tmp_path / "a.npy", train_mask=tmp_path / "binary.npy")
     assert data.load("a", "train").labels.tolist() == [[255, 255, 1], [255, 0, 0]]
@@ -90,7 +90,7 @@ def test_indian_pines_splits_by_the_disjoint_mask(real_data: Path) -> None:
     folder = real_data / "indian_pines"
     mask = folder / "indianpines_disjoint_dset.mat"
     data = load_data_set(folder / "Indian_pines_corrected.npy", train_mask=mask, mask_classes=MASK_TO_CLASS)
-    (name,) = data.names
+    (name,) = data.files
     train, test = data.load(name, "train"), data.load(name, "test")
     assert np.count_nonzero(np.asarray(train.labels) != 255) == 5528
     assert np.count_nonzero(np.asarray(test.labels) != 255) == 10249 - 5528
